@@ -1,0 +1,55 @@
+"""The command `uwb-mitigation`: assembles the sub-commands and turns errors into one clear line."""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated
+
+import typer
+
+import uwb_mitigation
+from uwb_mitigation.commands import console
+from uwb_mitigation.errors import UwbMitigationError
+
+app = typer.Typer(
+    name="uwb-mitigation",
+    help="Remove the range error of ultra-wideband ranging: import recordings, train and evaluate models.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(uwb_mitigation.__version__)
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool,
+        typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version."),
+    ] = False,
+) -> None:
+    pass
+
+
+def main() -> None:
+    """Run the command line; exit 1 with one line on bad input, 130 on Ctrl-C."""
+    try:
+        app()
+    except UwbMitigationError as error:
+        console.err.print(f"uwb-mitigation: {error}", style="red", markup=False, soft_wrap=True)
+        sys.exit(1)
+    except BrokenPipeError:
+        # The reader of our output (head, less) went away: nothing is left to say, and to nobody.
+        sys.stdout = None  # type: ignore[assignment]
+        sys.exit(141)
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,62 @@
+"""The errors this package raises on purpose: one base, and a subclass for each kind of input.
+
+Each says what is wrong, where in the input, and what would be valid, and carries the three apart so
+that a caller can act on them. No other module defines exceptions.
+"""
+
+from __future__ import annotations
+
+
+class UwbMitigationError(Exception):
+    """Base of every error raised on purpose.
+
+    Attributes:
+        what: what is wrong, with the offending value.
+        where: the place in the input (file, line, byte offset, field); may be empty.
+        valid: what would be valid, or what to do; may be empty.
+    """
+
+    def __init__(self, what: str, *, where: str = "", valid: str = "") -> None:
+        super().__init__(what, where, valid)
+        self.what = what
+        self.where = where
+        self.valid = valid
+
+    def __str__(self) -> str:
+        place = f"{self.where}: " if self.where else ""
+        remedy = f" ({self.valid})" if self.valid else ""
+        return f"{place}{self.what}{remedy}"
+
+    def __reduce__(self) -> tuple[object, ...]:
+        # Keyword arguments do not survive the default pickling that process pools use.
+        return (_rebuild, (type(self), self.what, self.where, self.valid))
+
+
+def _rebuild(
+    kind: type[UwbMitigationError], what: str, where: str, valid: str
+) -> UwbMitigationError:
+    return kind(what, where=where, valid=valid)
+
+
+class RecordingError(UwbMitigationError):
+    """A recording is absent, is of another format, or lacks what was asked of it."""
+
+
+class DamagedRecordingError(RecordingError):
+    """A recording is damaged part-way; everything before the damage has been yielded."""
+
+
+class ModelError(UwbMitigationError):
+    """A model file is absent, corrupt, or does not fit what it is to be used for."""
+
+
+class DatasetError(UwbMitigationError):
+    """Labelled data does not suffice for what was asked: too few, without truth, or not finite."""
+
+
+class ParameterError(UwbMitigationError):
+    """A parameter or option is unknown, of the wrong type, or out of its range."""
+
+
+class MissingDependencyError(UwbMitigationError):
+    """An optional part of the installation is not there."""

@@ -1,0 +1,150 @@
+"""What a UWB ranging exchange yields, and what is made of it: plain immutable values.
+
+Sign convention, everywhere: error = measured - true; corrected = measured - predicted error.
+Units are SI (REP-103) unless a name says otherwise. No I/O and no ROS here.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+DEVICE_TICK_HZ = 128 * 499.2e6
+"""Rate of the DW1000's timestamp counter (DW1000 user manual, section 2.5.8: 1 / 15.65 ps)."""
+
+DEVICE_TIME_WRAP = 1 << 40
+"""The DW1000's timestamp counter has 40 bits: it wraps every 17.2 s."""
+
+SAMPLE_PERIOD_S = 1.0 / (2 * 499.2e6)
+"""Spacing of accumulator samples: half a chip, 1.0016 ns (DW1000 user manual, section 7.2.38)."""
+
+
+class Encoding(enum.IntEnum):
+    """How `Cir.samples` holds the channel impulse response; the values of `Cir.msg`."""
+
+    COMPLEX_INT16 = 0
+    MAGNITUDE = 1
+
+
+class Status(enum.IntEnum):
+    """What a corrected range is worth; the values of `RangeCorrected.msg`.
+
+    On anything but OK the raw range is passed through with a larger variance.
+    """
+
+    OK = 0
+    NO_CIR = 1
+    BAD_CIR = 2
+    OUT_OF_DISTRIBUTION = 3
+    MODEL_ERROR = 4
+
+
+class Origin(enum.IntEnum):
+    """Who computed a correction; the values of the `source` field of `RangeCorrected.msg`."""
+
+    HOST = 0
+    DEVICE = 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cir:
+    """A channel impulse response as the radio's accumulator delivers it.
+
+    Attributes:
+        samples: int16. COMPLEX_INT16: shape (2 n,), interleaved real, imaginary. MAGNITUDE: (n,).
+        encoding: how to read `samples`.
+        start_index: accumulator index of the first sample.
+        first_path_index: accumulator index of the first path, sub-sample; NaN = unknown.
+        sample_period_s: spacing of the samples.
+        scale: accumulator units per count of `samples`.
+        preamble_count: accumulated preamble symbols (RXPACC); 0 = unknown.
+        noise_threshold: the leading-edge detector's threshold (LDE_THRESH), accumulator units.
+        rx_power_dbm: receive signal level; NaN = unknown.
+        first_path_power_dbm: first-path signal level; NaN = unknown.
+        channel: UWB channel number; 0 = unknown.
+        prf_mhz: pulse repetition frequency, 16 or 64; 0 = unknown.
+    """
+
+    samples: NDArray[np.int16]
+    encoding: Encoding = Encoding.COMPLEX_INT16
+    start_index: int = 0
+    first_path_index: float = math.nan
+    sample_period_s: float = SAMPLE_PERIOD_S
+    scale: float = 1.0
+    preamble_count: int = 0
+    noise_threshold: int = 0
+    rx_power_dbm: float = math.nan
+    first_path_power_dbm: float = math.nan
+    channel: int = 0
+    prf_mhz: int = 0
+
+    def __len__(self) -> int:
+        """The number of samples in time (a complex sample counts once)."""
+        return len(self.samples) // (2 if self.encoding == Encoding.COMPLEX_INT16 else 1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RangeMeasurement:
+    """One ranging exchange between an anchor and a tag.
+
+    Attributes:
+        stamp_ns: when the exchange was received, ns since the epoch of the source's clock.
+        tag_id, anchor_id: 64-bit identities.
+        sequence: counts the exchanges of a source; 32 bits.
+        device_time: 40-bit DW1000 ticks (`DEVICE_TICK_HZ`), as received.
+        range_m: the measured range; NaN = the exchange gave none.
+        cir: the channel impulse response that belongs to the range; may hold no samples.
+        frame_id: coordinate frame of the receiving antenna; empty = the consumer's default.
+    """
+
+    stamp_ns: int
+    tag_id: int
+    anchor_id: int
+    sequence: int
+    device_time: int
+    range_m: float
+    cir: Cir
+    frame_id: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """What a surveyed recording knows beside the measurement.
+
+    Attributes:
+        range_m: true distance.
+        label: propagation condition, such as `LOS`, `NLOS` or `NDP NLOS`; may be empty.
+        configuration: name of the placement of both antennas. Measurements of one configuration
+            are not independent: a split never puts one on both sides.
+    """
+
+    range_m: float
+    label: str = ""
+    configuration: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class CorrectedRange:
+    """A range after mitigation: `range_m = range_raw_m - correction_m`.
+
+    Attributes:
+        range_m: corrected range; the raw one on any status but OK.
+        range_raw_m: the range as measured.
+        correction_m: predicted error; 0 when passed through.
+        variance_m2: variance of `range_m`; infinite where the range itself is not valid.
+        status: what the value is worth.
+        origin: who computed it.
+        model_id: identity of the model; 0 = none.
+    """
+
+    range_m: float
+    range_raw_m: float
+    correction_m: float
+    variance_m2: float
+    status: Status
+    origin: Origin
+    model_id: int

@@ -1,0 +1,72 @@
+"""The shape of REMNet (paper, section II-A, Fig. 2), from which training, export and firmware derive sizes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from uwb_mitigation.errors import ParameterError
+
+
+@dataclass(frozen=True, slots=True)
+class Remnet:
+    """REMNet without attention: conv k0; N residual reduction modules; flatten; dense.
+
+    Each module computes `r = relu(conv_kn(x)) + x; out = relu(conv_kn,s2(r)) + relu(conv_k1,s2(r))`
+    with 'same' padding as TensorFlow's: total = max((ceil(L/s) - 1) s + k - L, 0), the smaller half
+    before. The module keeps F channels and takes length L to ceil(L/2).
+
+    Attributes:
+        samples: input length K.
+        first_kernel: k0. The paper's text says 5; its parameter counts need 3.
+        kernel: kn.
+        filters: F.
+        modules: N.
+    """
+
+    samples: int = 157
+    first_kernel: int = 3
+    kernel: int = 3
+    filters: int = 16
+    modules: int = 3
+
+    def __post_init__(self) -> None:
+        for name, value, low, high in (
+            ("samples", self.samples, 1, 1016),
+            ("first_kernel", self.first_kernel, 1, 31),
+            ("kernel", self.kernel, 1, 31),
+            ("filters", self.filters, 1, 256),
+            ("modules", self.modules, 1, 6),
+        ):
+            if not low <= value <= high:
+                raise ParameterError(f"{name} = {value}", where="REMNet", valid=f"{low} to {high}")
+
+    @property
+    def lengths(self) -> tuple[int, ...]:
+        """Length in time at the input of each module, and of the last one's output."""
+        lengths = [self.samples]
+        for _ in range(self.modules):
+            lengths.append(-(-lengths[-1] // 2))
+        return tuple(lengths)
+
+    @property
+    def parameters(self) -> int:
+        """Trainable parameters (paper, Table 1)."""
+        f, k = self.filters, self.kernel
+        first = self.first_kernel * f + f
+        module = 2 * (k * f * f + f) + (f * f + f)
+        return first + self.modules * module + self.lengths[-1] * f + 1
+
+    @property
+    def multiply_accumulates(self) -> int:
+        """Multiply-accumulates of one inference, padding counted as work."""
+        f, k = self.filters, self.kernel
+        total = self.samples * self.first_kernel * f
+        for length, half in zip(self.lengths, self.lengths[1:], strict=False):
+            total += length * k * f * f + half * (k + 1) * f * f
+        return total + self.lengths[-1] * f
+
+
+def same_padding(length: int, kernel: int, stride: int) -> tuple[int, int]:
+    """Zeros before and after that make 'same' padding (see `Remnet`)."""
+    total = max((-(-length // stride) - 1) * stride + kernel - length, 0)
+    return total // 2, total - total // 2

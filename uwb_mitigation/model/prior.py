@@ -1,0 +1,39 @@
+"""The part of the predicted error that needs no network: a line in what the radio reports beside the CIR."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True, slots=True)
+class LinePrior:
+    """`offset_m + per_rx_power * rx_power + per_power_gap * (rx_power - first_path_power)`.
+
+    Coefficients are held as float32 values and the line is evaluated in float32, each product and
+    sum rounded once and in this order, so that host and microcontroller agree to the last bit.
+    With both slopes zero it is a constant, and the powers are not needed.
+
+    Attributes:
+        offset_m: m.
+        per_rx_power: m per dBm.
+        per_power_gap: m per dB.
+    """
+
+    offset_m: float
+    per_rx_power: float = 0.0
+    per_power_gap: float = 0.0
+
+    @property
+    def needs_power(self) -> bool:
+        return self.per_rx_power != 0.0 or self.per_power_gap != 0.0
+
+    def predict_m(self, rx_power_dbm: float, first_path_power_dbm: float) -> np.float32:
+        """The prior's predicted error, m; NaN where a power that it needs is not finite."""
+        if not self.needs_power:
+            return np.float32(self.offset_m)
+        rx = np.float32(rx_power_dbm)
+        gap = rx - np.float32(first_path_power_dbm)
+        level = np.float32(self.offset_m) + np.float32(self.per_rx_power) * rx
+        return level + np.float32(self.per_power_gap) * gap
