@@ -45,7 +45,7 @@ def main() -> None:
         sys.exit(1)
     except BrokenPipeError:
         # The reader of our output (head, less) went away: nothing is left to say, and to nobody.
-        sys.stdout = None  # type: ignore[assignment]
+        sys.stdout = None
         sys.exit(141)
     except KeyboardInterrupt:
         sys.exit(130)

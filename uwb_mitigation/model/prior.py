@@ -32,8 +32,10 @@ class LinePrior:
     def predict_m(self, rx_power_dbm: float, first_path_power_dbm: float) -> np.float32:
         """The prior's predicted error, m; NaN where a power that it needs is not finite."""
         if not self.needs_power:
-            return np.float32(self.offset_m)
-        rx = np.float32(rx_power_dbm)
+            constant: np.float32 = np.float32(self.offset_m)
+            return constant
+        rx: np.float32 = np.float32(rx_power_dbm)
         gap = rx - np.float32(first_path_power_dbm)
-        level = np.float32(self.offset_m) + np.float32(self.per_rx_power) * rx
-        return level + np.float32(self.per_power_gap) * gap
+        level: np.float32 = np.float32(self.offset_m) + np.float32(self.per_rx_power) * rx
+        predicted: np.float32 = level + np.float32(self.per_power_gap) * gap
+        return predicted
