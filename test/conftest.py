@@ -1,0 +1,20 @@
+"""Fixtures that more than one test module uses."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture(scope="session")
+def apartment() -> Path:
+    """The folder of real EVK1000 logs; skips, and says so, where it is absent."""
+    root = Path(os.environ.get("UWB_MITIGATION_DATA", REPOSITORY.parent / "shared" / "data"))
+    folder = root / "evk1000_apartment"
+    if not (folder / "logs").is_dir():
+        pytest.skip(f"the EVK1000 logs are not at {folder}: set UWB_MITIGATION_DATA to run this test")
+    return folder
