@@ -1,0 +1,42 @@
+# make demo    all the set-up, then a driver and a mitigator over real ROS 2, live
+# make test    all the set-up, then every test
+# make setup   the set-up alone; make help lists the rest
+
+PYTHON ?= python3
+RECORDING ?=
+RATE ?=
+VENV := .venv
+# Empty unless ROS is the system's: bootstrap.py writes it.
+IN_ROS = . $(VENV)/environment.sh;
+
+.DEFAULT_GOAL := help
+.PHONY: help setup setup-training demo test lint lock clean
+
+help:  ## show this list
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 24
+
+setup:  ## install everything that running needs into .venv
+	@$(PYTHON) bootstrap.py run
+
+setup-training:  ## the same, with torch and the test tools
+	@$(PYTHON) bootstrap.py develop
+
+demo: setup  ## replay RECORDING=path (default: simulated) through driver and mitigator, live
+	@$(IN_ROS) $(VENV)/bin/python -m uwb_mitigation.nodes.demo $(if $(RECORDING),--recording '$(RECORDING)') $(if $(RATE),--rate $(RATE))
+
+test: setup-training  ## run every test
+	@$(IN_ROS) $(VENV)/bin/python -m pytest
+
+lint: setup-training  ## ruff and mypy
+	@$(VENV)/bin/ruff check .
+	@$(VENV)/bin/ruff format --check .
+	@$(VENV)/bin/mypy
+
+lock:  ## write requirements/*.txt anew from requirements/*.in (needs uv)
+	cd requirements && for part in runtime ros develop training; do \
+	  uv pip compile --quiet --universal --python-version 3.10 --no-header --no-annotate \
+	    $$(for done in runtime ros develop; do [ $$done = $$part ] && break; echo -c $$done.txt; done) \
+	    $$part.in -o $$part.txt || exit 1; done
+
+clean:  ## remove .venv and everything built
+	rm -rf $(VENV) build install log .pytest_cache .mypy_cache .ruff_cache

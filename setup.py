@@ -1,0 +1,42 @@
+"""Build description, as ament_python expects it."""
+
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+PACKAGE = "uwb_mitigation"
+
+
+def files(folder: str, *patterns: str) -> list[str]:
+    return sorted(str(path) for pattern in patterns for path in Path(folder).glob(pattern))
+
+
+setup(
+    name=PACKAGE,
+    version="0.1.0",
+    packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
+    package_data={PACKAGE: ["py.typed", "interfaces/*.msg"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
+        (f"share/{PACKAGE}", ["package.xml"]),
+        (f"share/{PACKAGE}/launch", files("launch", "*.launch.py")),
+        (f"share/{PACKAGE}/params", files("params", "*.yaml")),
+        (f"share/{PACKAGE}/models", files("models", "*.onnx", "*.md")),
+    ],
+    install_requires=["setuptools"],
+    zip_safe=False,
+    author="uwb_mitigation maintainers",
+    maintainer="uwb_mitigation maintainers",
+    maintainer_email="maintainers@uwb-mitigation.example.org",
+    description="Removes the range error of ultra-wideband ranging with a small int8 network.",
+    license="Apache-2.0",
+    python_requires=">=3.10",
+    entry_points={
+        "console_scripts": [
+            "driver = uwb_mitigation.nodes.driver:main",
+            "mitigator = uwb_mitigation.nodes.mitigator:main",
+            "monitor = uwb_mitigation.nodes.monitor:main",
+            "uwb-mitigation = uwb_mitigation.cli:main",
+        ],
+    },
+)
