@@ -58,5 +58,9 @@ class ParameterError(UwbMitigationError):
     """A parameter or option is unknown, of the wrong type, or out of its range."""
 
 
+class LinkError(UwbMitigationError):
+    """What came over the link to a board is not what the protocol allows, or its port cannot be used."""
+
+
 class MissingDependencyError(UwbMitigationError):
     """An optional part of the installation is not there."""
