@@ -43,7 +43,7 @@ def main(goal: str) -> None:
         requirements.insert(0, REQUIREMENTS / "ros.txt")
     step("environment", [str(ROOT), sys.version, str(SYSTEM_ROS)], create_environment)
     step("packages", requirements, lambda: install(requirements))
-    step("messages", sorted((ROOT / "msg_defs").rglob("*.*")) + [ROOT / "cmake"], build_messages)
+    step("messages", [ROOT / "msg_defs", ROOT / "cmake"], build_messages)
     step("package", [ROOT / name for name in ("setup.py", "setup.cfg")], install_package)
     if goal == "develop":
         tools = [REQUIREMENTS / "develop.txt", REQUIREMENTS / "training.txt"]
