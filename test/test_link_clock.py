@@ -1,0 +1,207 @@
+"""A board's clock on the host's: error under jitter, gaps, wraps, resets, steps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from uwb_mitigation.link.clock import DeviceClock
+from uwb_mitigation.measurement import DEVICE_TICK_HZ, DEVICE_TIME_WRAP
+
+SECOND = 10**9
+EPOCH = 1_760_000_000 * SECOND
+
+
+@dataclass
+class JitteryLink:
+    """Simulated: a crystal 40 ppm off that warms, and a bus that stalls for 10 ms, 25 times a second."""
+
+    random: np.random.Generator
+    stalls: np.ndarray = field(init=False)
+    tick_hz: float = 1e6
+    wrap: int | None = None
+    drift: float = 40e-6
+
+    def __post_init__(self) -> None:
+        self.stalls = np.sort(self.random.uniform(0, 310, 310 * 25))
+
+    def ticks(self, true_s: float) -> int:
+        wander = 0.5e-6 * 100 * (1 - np.cos(true_s / 100))
+        ticks = int((5.0 + true_s * (1 + self.drift) + wander) * self.tick_hz)
+        return ticks % self.wrap if self.wrap else ticks
+
+    def delivered_s(self, true_s: float) -> float:
+        """When something sent at `true_s` is there: at the end of the last stall that it falls into."""
+        arrival = true_s + 150e-6 + self.random.exponential(100e-6)
+        last = np.searchsorted(self.stalls, arrival) - 1
+        return max(arrival, self.stalls[last] + 10e-3) if last >= 0 else arrival
+
+    def ns(self, true_s: float) -> int:
+        return EPOCH + round(true_s * 1e9)
+
+    def exchange(self, clock: DeviceClock, true_s: float) -> None:
+        received_s = self.delivered_s(true_s)
+        replied_s = received_s + 50e-6
+        clock.exchange(
+            self.ns(true_s),
+            self.ticks(received_s),
+            self.ticks(replied_s),
+            self.ns(self.delivered_s(replied_s)),
+        )
+
+    def stamp_error_s(self, clock: DeviceClock, true_s: float) -> float:
+        """Of a measurement that takes the board 4 ms to read out before it is sent."""
+        stamp = clock.stamp(self.ticks(true_s), self.ns(self.delivered_s(true_s + 4e-3)))
+        return (stamp - self.ns(true_s)) / 1e9
+
+
+def run(link: JitteryLink, clock: DeviceClock, begin: float, end: float) -> Iterator[float]:
+    """Errors of the stamps of measurements at 100 Hz, with a round trip a second."""
+    for step in range(round(begin * 100), round(end * 100)):
+        true_s = step / 100 + link.random.uniform(0, 1e-3)
+        if step % 100 == 0:
+            link.exchange(clock, true_s)
+        yield link.stamp_error_s(clock, true_s)
+
+
+@pytest.mark.parametrize(
+    ("tick_hz", "wrap"), [(1e6, None), (DEVICE_TICK_HZ, DEVICE_TIME_WRAP)], ids=["uptime", "40-bit ticks"]
+)
+def test_the_99th_percentile_of_the_stamp_error_is_under_1_ms_with_bursts_of_10_ms(tick_hz, wrap):
+    link = JitteryLink(np.random.default_rng(1), tick_hz, wrap)
+    clock = DeviceClock(tick_hz, wrap)
+    for burst in range(8):
+        link.exchange(clock, burst * 0.05)
+
+    errors = np.abs(list(run(link, clock, 1, 300)))
+
+    print(f"error in us: p50 {1e6 * np.median(errors):.0f}, p99 {1e6 * np.quantile(errors, 0.99):.0f}, "
+          f"max {1e6 * errors.max():.0f}")  # fmt: skip
+    assert np.quantile(errors, 0.99) < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("tick_hz", "wrap"), [(1e6, None), (DEVICE_TICK_HZ, DEVICE_TIME_WRAP)], ids=["uptime", "40-bit ticks"]
+)
+def test_after_a_gap_of_30_s_the_first_stamps_are_still_within_1_ms(tick_hz, wrap):
+    link = JitteryLink(np.random.default_rng(2), tick_hz, wrap)
+    clock = DeviceClock(tick_hz, wrap)
+    list(run(link, clock, 0, 60))
+
+    errors = [abs(link.stamp_error_s(clock, 90 + i / 100)) for i in range(20)]
+
+    print(f"error in us after the gap: max {1e6 * max(errors):.0f}")
+    assert max(errors) < 1e-3
+
+
+def test_without_round_trips_the_fastest_arrivals_tell_the_offset():
+    link = JitteryLink(np.random.default_rng(3))
+    clock = DeviceClock()
+
+    errors = []
+    for step in range(6000):
+        true_s = step / 100 + link.random.uniform(0, 9e-3)
+        stamp = clock.stamp(link.ticks(true_s), link.ns(link.delivered_s(true_s)))
+        errors.append((stamp - link.ns(true_s)) / 1e9)
+
+    assert not clock.synchronised
+    assert np.quantile(np.abs(errors[1000:]), 0.99) < 1.5e-3
+
+
+def test_the_drift_is_found():
+    link = JitteryLink(np.random.default_rng(4), drift=-60e-6)
+    clock = DeviceClock()
+
+    list(run(link, clock, 0, 120))
+
+    assert clock.drift == pytest.approx(60e-6, abs=2e-6)
+
+
+def test_jitter_cannot_move_stamps_backwards():
+    link = JitteryLink(np.random.default_rng(5))
+    clock = DeviceClock()
+    stamps = []
+    for step in range(3000):
+        true_s = step / 1000
+        if step % 10 == 0:
+            link.exchange(clock, true_s)
+        stamps.append(clock.stamp(link.ticks(true_s), link.ns(link.delivered_s(true_s))))
+
+    assert min(np.diff(stamps)) > 0
+
+
+def test_a_stamp_is_never_after_the_arrival():
+    link = JitteryLink(np.random.default_rng(6))
+    clock = DeviceClock()
+    for step in range(500):
+        true_s = step / 100
+        arrived = link.ns(link.delivered_s(true_s))
+        assert clock.stamp(link.ticks(true_s), arrived) <= arrived
+
+
+def test_the_same_ticks_give_the_same_stamp_after_the_estimate_has_moved():
+    link = JitteryLink(np.random.default_rng(7))
+    clock = DeviceClock()
+    list(run(link, clock, 0, 2))
+    first = clock.stamp(link.ticks(2.0), link.ns(2.005))
+
+    for step in range(5):
+        link.exchange(clock, 2.01 + step / 100)
+
+    assert clock.stamp(link.ticks(2.0), link.ns(2.07)) == first
+
+
+def test_ticks_that_come_late_are_stamped_between_their_neighbours():
+    link = JitteryLink(np.random.default_rng(8))
+    clock = DeviceClock()
+    before = clock.stamp(link.ticks(1.0), link.ns(1.001))
+    after = clock.stamp(link.ticks(1.2), link.ns(1.201))
+
+    assert before < clock.stamp(link.ticks(1.1), link.ns(1.202)) < after
+
+
+@pytest.mark.parametrize("step_s", [-3600, 3600])
+def test_a_host_clock_that_is_set_is_followed(step_s):
+    clock = DeviceClock()
+    for step in range(50):
+        at = EPOCH + step * SECOND // 10
+        clock.exchange(at, step * 100_000 + 100, step * 100_000 + 100, at + 200_000)
+        clock.stamp(step * 100_000, at)
+
+    at = EPOCH + 5 * SECOND + step_s * SECOND
+    clock.exchange(at, 5_000_100, 5_000_100, at + 200_000)
+
+    assert clock.stamp(5_010_000, at + 20_000_000) == pytest.approx(at + 10_000_000, abs=1e6)
+
+
+def test_a_board_clock_that_jumps_back_costs_no_stamp_from_the_past():
+    clock = DeviceClock()
+    wrapped = 1 << 32
+    clock.stamp(wrapped, EPOCH)
+
+    assert clock.stamp(5_000, EPOCH + 5_000_000) == EPOCH + 5_000_000
+
+
+def test_a_round_trip_that_contradicts_itself_is_ignored():
+    clock = DeviceClock()
+    clock.exchange(EPOCH, 1000, 2000, EPOCH + 500_000)
+
+    assert not clock.synchronised
+
+
+times = st.integers(0, 2**64 - 1)
+
+
+@given(st.lists(st.tuples(times, times, st.integers(0, 2**60), st.integers(0, 10**10)), max_size=20))
+def test_no_counter_values_make_the_clock_fail_or_stamp_after_the_arrival(trips):
+    clock = DeviceClock()
+    now = EPOCH
+    for received, replied, pause, duration in trips:
+        clock.exchange(now + pause, received, replied, now + pause + duration)
+        now += pause + duration
+        assert clock.stamp(replied, now) <= now + len(trips)

@@ -1,0 +1,232 @@
+"""Frames through a byte stream: every intact one is delivered, damage is counted, memory is bounded."""
+
+from __future__ import annotations
+
+import tracemalloc
+import zlib
+
+import numpy as np
+import pytest
+from cobs import cobs
+from hypothesis import given
+from hypothesis import strategies as st
+
+from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.link.faults import ByteFaults, damage, loopback
+from uwb_mitigation.link.framing import Frame, FrameDecoder, FrameEncoder, encode_frame
+from uwb_mitigation.link.layout import MAX_ENCODED_BYTES, MAX_PAYLOAD_BYTES, MessageType
+
+A = Frame(MessageType.LOG, 0, 7, 123_456, b"first\0\0")
+B = Frame(MessageType.RANGE_CIR, 1, 8, 2**63, bytes(range(256)) * 3)
+
+frames = st.builds(
+    Frame,
+    st.integers(0, 255),
+    st.integers(0, 2**16 - 1),
+    st.integers(0, 2**32 - 1),
+    st.integers(0, 2**64 - 1),
+    st.binary(max_size=600),
+)
+
+
+def decode(data: bytes) -> list[Frame]:
+    return FrameDecoder().feed(data)
+
+
+@given(frames)
+def test_a_frame_arrives_as_it_was_sent(frame):
+    assert decode(encode_frame(frame)) == [frame]
+
+
+@given(frames)
+def test_a_frame_holds_no_delimiter_but_at_its_ends(frame):
+    wire = encode_frame(frame)
+
+    assert wire[0] == wire[-1] == 0
+    assert 0 not in wire[1:-1]
+
+
+def test_the_longest_payload_fits_the_longest_frame():
+    frame = A._replace(payload=b"\1" * MAX_PAYLOAD_BYTES)
+    wire = encode_frame(frame)
+
+    assert len(wire) <= MAX_ENCODED_BYTES + 2
+    assert decode(wire) == [frame]
+
+
+def test_a_longer_payload_is_refused():
+    with pytest.raises(ParameterError, match="4225"):
+        encode_frame(A._replace(payload=bytes(MAX_PAYLOAD_BYTES + 1)))
+
+
+def test_an_encoder_numbers_its_frames_and_wraps_at_32_bits():
+    encoder = FrameEncoder()
+    encoder.sequence = 2**32 - 1
+
+    received = decode(encoder.encode(1, b"") + encoder.encode(1, b""))
+
+    assert [frame.sequence for frame in received] == [2**32 - 1, 0]
+
+
+@given(st.lists(frames, max_size=5), st.binary(max_size=300), st.lists(st.integers(1, 50), min_size=1))
+def test_how_the_stream_is_cut_changes_nothing(sent, noise, sizes):
+    stream = noise + b"".join(map(encode_frame, sent)) + noise + b"\0"
+    whole, cut = FrameDecoder(), FrameDecoder()
+    received, at, turn = [], 0, 0
+    while at < len(stream):
+        size = sizes[turn % len(sizes)]
+        received += cut.feed(stream[at : at + size])
+        at += size
+        turn += 1
+
+    assert received == whole.feed(stream)
+    assert cut.counts == whole.counts
+
+
+@given(st.binary(max_size=200).filter(lambda noise: b"\0" not in noise))
+def test_noise_before_a_frame_does_not_harm_it(noise):
+    assert decode(noise + encode_frame(A)) == [A]
+
+
+def test_half_a_frame_does_not_harm_the_next():
+    assert decode(encode_frame(A)[:9] + encode_frame(B)) == [B]
+
+
+def test_a_lost_delimiter_between_two_frames_harms_neither():
+    assert decode(encode_frame(A)[:-1] + encode_frame(B)) == [A, B]
+
+
+@pytest.mark.parametrize("at", range(1, len(encode_frame(A)) - 1))
+def test_any_flipped_bit_costs_its_frame_and_no_other(at):
+    for bit in range(8):
+        wire = bytearray(encode_frame(A))
+        wire[at] ^= 1 << bit
+        assert decode(bytes(wire) + encode_frame(B)) == [B]
+
+
+def counts_after(data: bytes) -> dict[str, int]:
+    decoder = FrameDecoder()
+    decoder.feed(data)
+    counts = decoder.counts
+    return {
+        name: getattr(counts, name)
+        for name in ("frames", "bad_cobs", "bad_length", "bad_crc", "oversize")
+        if getattr(counts, name)
+    }
+
+
+def test_what_is_no_cobs_is_counted():
+    assert counts_after(b"\x05ab\0") == {"bad_cobs": 1}
+
+
+def test_what_is_too_short_for_a_header_is_counted():
+    assert counts_after(cobs.encode(b"boot") + b"\0") == {"bad_length": 1}
+
+
+def test_a_wrong_crc_is_counted():
+    wire = bytearray(encode_frame(A))
+    wire[-2] ^= 1
+    assert counts_after(bytes(wire)) == {"bad_crc": 1}
+
+
+@pytest.mark.parametrize("chunk", [1, 1000, 10**6])
+def test_an_endless_frame_is_counted_once_and_its_end_found(chunk):
+    stream = b"\1" * 20_000 + encode_frame(A)
+    decoder = FrameDecoder()
+    received = []
+    for at in range(0, len(stream), chunk):
+        received += decoder.feed(stream[at : at + chunk])
+
+    assert received == [A]
+    assert decoder.counts.oversize == 1
+    assert decoder.counts.bytes_discarded == 20_000
+
+
+def test_an_intact_frame_of_another_version_is_counted_by_its_version():
+    body = bytearray(cobs.decode(encode_frame(A)[1:-1])[:-4])
+    body[0] = 9
+    crc = zlib.crc32(body).to_bytes(4, "little")
+    decoder = FrameDecoder()
+
+    assert decoder.feed(cobs.encode(bytes(body) + crc) + b"\0") == []
+    assert decoder.counts.foreign_versions == {9: 1}
+    assert decoder.counts.corrupt == 0
+
+
+def test_a_reset_forgets_half_a_frame():
+    wire = encode_frame(A)
+    decoder = FrameDecoder()
+    decoder.feed(wire[:10])
+    decoder.reset()
+
+    assert decoder.feed(wire[10:] + encode_frame(B)) == [B]
+
+
+@given(st.binary(max_size=5000))
+def test_no_bytes_make_the_decoder_fail(data):
+    decoder = FrameDecoder()
+    decoder.feed(data)
+    decoder.feed(b"\0")
+
+    assert decoder.counts.bytes_received == len(data) + 1
+    assert decoder.feed(encode_frame(A)) == [A]
+
+
+@pytest.mark.parametrize("flood", [b"\0", b"\1", b"\xff", b"\1\1\0"], ids=["zeros", "ones", "ff", "short"])
+def test_a_flood_takes_no_memory(flood):
+    data = flood * (4_000_000 // len(flood))
+    decoder = FrameDecoder()
+    tracemalloc.start()
+    decoder.feed(data)
+    held, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+
+    assert held < 50_000
+    assert peak < 10_000_000
+
+
+def test_a_channel_without_faults_changes_nothing():
+    data = bytes(range(256))
+
+    assert damage(data, ByteFaults(), np.random.default_rng(0)).data == data
+
+
+def test_a_channel_drops_and_inserts_where_it_says():
+    data = bytes(range(1, 200))
+    arrived = damage(data, ByteFaults(drop=0.1, insert=0.1), np.random.default_rng(0))
+
+    assert len(arrived.data) == len(data) - len(arrived.changed) + len(arrived.inserted)
+    first = min(arrived.changed[0], arrived.inserted[0])
+    assert arrived.data[:first] == data[:first]
+    assert arrived.data[first] != data[first]
+
+
+@pytest.mark.parametrize(
+    "faults",
+    [
+        ByteFaults(),
+        ByteFaults(flip=1e-3),
+        ByteFaults(drop=1e-3),
+        ByteFaults(insert=1e-3),
+        ByteFaults(1e-4, 1e-4, 1e-4),
+        ByteFaults(0.05, 0.05, 0.05),
+    ],
+    ids=["clean", "flips", "drops", "insertions", "all", "storm"],
+)
+def test_through_a_damaging_channel_what_arrives_intact_is_delivered_and_nothing_else(faults):
+    result = loopback(6000, faults, payload_bytes=200, seed=11)
+
+    assert result.intact_lost == 0
+    assert result.corrupt_delivered == 0
+    assert result.delivered >= result.intact
+    assert result.intact == 6000 or faults != ByteFaults()
+
+
+@pytest.mark.slow
+def test_a_million_frames_through_a_damaging_channel():
+    result = loopback(1_000_000, ByteFaults(2e-4, 2e-4, 2e-4), payload_bytes=300, seed=12)
+
+    assert result.sent == 1_000_000
+    assert result.intact > 500_000
+    assert result.intact_lost == 0
+    assert result.corrupt_delivered == 0

@@ -1,0 +1,231 @@
+"""Messages to payloads and back, and what hostile payloads get."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import shutil
+import struct
+import subprocess
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from uwb_mitigation.errors import LinkError, ParameterError
+from uwb_mitigation.link import layout, messages
+from uwb_mitigation.link.layout import MessageType, Mode
+from uwb_mitigation.link.messages import (
+    BoardStatus,
+    Correction,
+    GetInfo,
+    Hello,
+    Log,
+    SetMode,
+    TimeSync,
+    TimeSyncReply,
+)
+from uwb_mitigation.measurement import Cir, CorrectedRange, Encoding, Origin, RangeMeasurement, Status
+
+HELLO = Hello(0xB0A2D, 0xCAFE, 157, Mode.BOTH, 99, 3, 4224, (1, 2, 3), "uwb-nano33")
+CORRECTION = Correction(
+    5, 1, 2, 3, 2**40 - 1, CorrectedRange(2.5, 3.0, 0.5, 0.25, Status.OK, Origin.DEVICE, 0xCAFE), 7100
+)
+SMALL = [
+    HELLO,
+    CORRECTION,
+    Log(layout.LogLevel.WARNING, "antenna délay"),
+    BoardStatus(1, 2, 3, 4, Mode.DEVICE),
+    TimeSyncReply(17, 2**60),
+    SetMode(Mode.DEVICE),
+    GetInfo(),
+    TimeSync(),
+]
+
+
+def measurement(samples: np.ndarray, **cir: object) -> RangeMeasurement:
+    return RangeMeasurement(
+        11, 2**64 - 1, 2, 2**32 - 1, 2**40 - 1, 3.25, Cir(np.asarray(samples, np.int16), **cir)
+    )
+
+
+def round_trip(message: messages.Message) -> messages.Message | None:
+    return messages.decode(*messages.encode(message), stamp_ns=getattr(message, "stamp_ns", 0))
+
+
+def fields(value: RangeMeasurement) -> dict[str, object]:
+    """All of a measurement, floats rounded to the link's binary32, NaN made comparable."""
+
+    def plain(item: object) -> object:
+        return struct.pack("<f", item) if isinstance(item, float) else item
+
+    outer = {name: plain(getattr(value, name)) for name in value.__slots__ if name != "cir"}
+    cir = {name: plain(getattr(value.cir, name)) for name in value.cir.__slots__}
+    return outer | cir | {"samples": value.cir.samples.tolist()}
+
+
+@pytest.mark.parametrize("message", SMALL, ids=lambda message: type(message).__name__)
+def test_a_message_arrives_as_it_was_sent(message):
+    assert round_trip(message) == message
+
+
+@given(
+    st.lists(st.integers(-32768, 32767), max_size=2032),
+    st.sampled_from(Encoding),
+    st.floats(width=32),
+    st.integers(-(2**31), 2**31 - 1),
+    st.integers(0, 2**16 - 1),
+    st.integers(0, 255),
+)
+def test_a_measurement_arrives_with_all_its_bits(samples, encoding, number, index, word, byte):
+    sent = measurement(
+        samples,
+        encoding=encoding,
+        start_index=index,
+        first_path_index=number,
+        scale=number,
+        preamble_count=word,
+        noise_threshold=word,
+        rx_power_dbm=number,
+        first_path_power_dbm=number,
+        channel=byte,
+        prf_mhz=byte,
+    )
+
+    assert fields(round_trip(sent)) == fields(sent)
+
+
+def test_an_unknown_type_is_no_message():
+    assert messages.decode(200, b"whatever") is None
+
+
+@pytest.mark.parametrize("message", [*SMALL, measurement([])], ids=lambda message: type(message).__name__)
+def test_a_payload_may_grow_at_its_end(message):
+    kind, payload = messages.encode(message)
+    if kind is MessageType.LOG:
+        pytest.skip("a log's text runs to the end")
+
+    assert type(messages.decode(kind, payload + b"later revision")) is type(message)
+
+
+def test_the_samples_are_found_behind_fields_of_a_later_revision():
+    kind, payload = messages.encode(measurement([1, -2, 3, -4]))
+    at = layout.PAYLOADS[MessageType.RANGE_CIR].offsets()["samples_offset"]
+    grown = bytearray(payload[:72] + b"newfield" + payload[72:])
+    struct.pack_into("<H", grown, at, 80)
+
+    assert messages.decode(kind, bytes(grown)).cir.samples.tolist() == [1, -2, 3, -4]
+
+
+@pytest.mark.parametrize("kind", [kind for kind in MessageType if layout.PAYLOADS[kind].fields])
+def test_a_payload_that_is_too_short_is_an_error_that_names_the_type(kind):
+    size = layout.PAYLOADS[kind].packing().size
+
+    with pytest.raises(LinkError, match=rf"{kind.name}: .*{size - 1} bytes.*at least {size}"):
+        messages.decode(kind, bytes(size - 1))
+
+
+@pytest.mark.parametrize(
+    ("field", "code", "value"),
+    [
+        ("sample_count", "H", 2033),
+        ("sample_count", "H", 3),
+        ("samples_offset", "H", 70),
+        ("samples_offset", "H", 73),
+        ("samples_offset", "H", 65534),
+        ("encoding", "B", 2),
+        ("device_time", "Q", 2**40),
+    ],
+)
+def test_a_measurement_with_an_impossible_field_is_an_error(field, code, value):
+    kind, payload = messages.encode(measurement([1, 2]))
+    broken = bytearray(payload)
+    struct.pack_into("<" + code, broken, layout.PAYLOADS[kind].offsets()[field], value)
+
+    with pytest.raises(LinkError, match="RANGE_CIR"):
+        messages.decode(kind, bytes(broken))
+
+
+@pytest.mark.parametrize(
+    ("message", "field"),
+    [(HELLO, "mode"), (SMALL[3], "mode"), (SMALL[5], "mode"), (CORRECTION, "status"), (SMALL[2], "level")],
+)
+def test_an_unknown_value_of_an_enumeration_is_an_error(message, field):
+    kind, payload = messages.encode(message)
+    broken = bytearray(payload)
+    broken[layout.PAYLOADS[kind].offsets()[field]] = 250
+
+    with pytest.raises(LinkError, match="250"):
+        messages.decode(kind, bytes(broken))
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        measurement([0] * 2034),
+        measurement([], preamble_count=65536),
+        measurement([], rx_power_dbm=1e39),
+        SetMode(-1),
+        TimeSyncReply(2**32, 0),
+    ],
+    ids=["samples", "preamble", "float", "negative", "32 bits"],
+)
+def test_what_does_not_fit_its_field_is_refused(message):
+    with pytest.raises(ParameterError):
+        messages.encode(message)
+
+
+def test_text_that_is_not_utf8_is_shown_as_far_as_it_goes():
+    kind, payload = messages.encode(Log(layout.LogLevel.INFO, "ok"))
+
+    assert messages.decode(kind, payload + b"\xff").text == "ok�"
+
+
+def test_a_long_firmware_name_is_cut_between_characters():
+    hello = Hello(1, 0, 0, Mode.HOST, 1, firmware_name="ü" * 8 + "é")
+    assert round_trip(hello).firmware_name == "ü" * 8
+    hello = Hello(1, 0, 0, Mode.HOST, 1, firmware_name="x" * 15 + "é")
+    assert round_trip(hello).firmware_name == "x" * 15
+
+
+def test_not_a_number_stays_so():
+    sent = measurement([])
+
+    assert math.isnan(round_trip(sent).cir.rx_power_dbm)
+
+
+@given(st.integers(0, 255), st.binary(max_size=400))
+def test_no_payload_fails_but_with_the_link_error(kind, payload):
+    with contextlib.suppress(LinkError):
+        messages.decode(kind, payload)
+
+
+@pytest.mark.parametrize("table", [layout.HEADER, *layout.PAYLOADS.values()], ids=lambda table: table.name)
+def test_every_field_is_aligned_and_every_fixed_part_is_a_multiple_of_8(table):
+    codes = {field.name: field.code for field in table.fields}
+    for name, offset in table.offsets().items():
+        code = codes[name]
+        size = 1 if code.endswith("s") else struct.calcsize("<" + code)
+        assert offset % size == 0, name
+    assert table.packing().size % 8 == 0
+
+
+def test_every_type_has_a_layout():
+    assert set(layout.PAYLOADS) == set(MessageType)
+
+
+def test_the_largest_measurement_fits_a_payload():
+    assert len(messages.encode(measurement([1] * layout.MAX_SAMPLES))[1]) <= layout.MAX_PAYLOAD_BYTES
+
+
+@pytest.mark.parametrize(("compiler", "language"), [("cc", "c"), ("c++", "c++")])
+def test_the_c_header_compiles_and_its_assertions_hold(compiler, language, tmp_path):
+    if shutil.which(compiler) is None:
+        pytest.skip(f"no compiler: {compiler}")
+    header = tmp_path / "uwb_protocol.h"
+    header.write_text(layout.c_header())
+
+    subprocess.run(
+        [compiler, "-x", language, "-Wall", "-Wextra", "-Werror", "-fsyntax-only", str(header)], check=True
+    )

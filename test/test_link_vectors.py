@@ -1,0 +1,220 @@
+"""Golden vectors of the wire protocol: the file that Python and C both test against.
+
+`python test/test_link_vectors.py` writes the file anew, for a deliberate change of the protocol only.
+"""
+
+from __future__ import annotations
+
+import binascii
+import math
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from uwb_mitigation.link import layout, messages
+from uwb_mitigation.link.framing import Frame, FrameDecoder, encode_frame
+from uwb_mitigation.link.layout import Flag, LogLevel, MessageType, Mode
+from uwb_mitigation.measurement import Cir, CorrectedRange, Encoding, Origin, RangeMeasurement, Status
+
+FILE = Path(__file__).parent / "data" / "link_vectors.txt"
+
+PREAMBLE = """\
+# Golden vectors of the wire protocol, version 1; docs/protocol.md says what they mean. One per line:
+#   frame NAME TYPE FLAGS SEQUENCE TIME_US PAYLOAD WIRE   decodes to these fields; WIRE holds both delimiters
+#   value NAME FIELD NUMBER                               a field of that frame's payload; floats as their 32 bits
+#   reject NAME KIND WIRE                                 gives no frame; KIND is the count that it raises
+# Numbers are decimal and unsigned, bytes are hexadecimal, - is no bytes.
+"""
+
+MEASUREMENT = RangeMeasurement(
+    stamp_ns=0,
+    tag_id=0x0123456789ABCDEF,
+    anchor_id=0xFEDCBA9876543210,
+    sequence=0xFFFFFFFE,
+    device_time=0xFF00FF00FF,
+    range_m=7.3125,
+    cir=Cir(
+        samples=np.array([0, 0, 256, -256, 32767, -32768, 1, -1], np.int16),
+        start_index=-3,
+        first_path_index=745.671875,
+        scale=0.1,
+        preamble_count=1021,
+        noise_threshold=1800,
+        rx_power_dbm=-81.5,
+        first_path_power_dbm=math.nan,
+        channel=2,
+        prf_mhz=64,
+    ),
+)
+FULL = RangeMeasurement(
+    stamp_ns=0,
+    tag_id=1,
+    anchor_id=2,
+    sequence=3,
+    device_time=4,
+    range_m=math.nan,
+    cir=Cir(samples=np.zeros(layout.MAX_SAMPLES, np.int16), preamble_count=1),
+)
+MAGNITUDES = RangeMeasurement(
+    stamp_ns=0,
+    tag_id=1,
+    anchor_id=2,
+    sequence=3,
+    device_time=4,
+    range_m=-0.25,
+    cir=Cir(samples=np.arange(1, 158, dtype=np.int16), encoding=Encoding.MAGNITUDE),
+)
+SENT = {
+    "get_info": (messages.GetInfo(), 0, 0, 0),
+    "set_mode": (messages.SetMode(Mode.BOTH), 0, 1, 0),
+    "time_sync": (messages.TimeSync(), 0, 0xFFFFFFFF, 0),
+    "hello": (
+        messages.Hello(0x1122334455667788, 0xDEADBEEF, 157, Mode.BOTH, 42, 1, 4224, (1, 2, 3), "nano33"),
+        Flag.ANSWER,
+        0,
+        1_000_000,
+    ),
+    "time_sync_reply": (messages.TimeSyncReply(0xFFFFFFFF, 2**40 + 17), Flag.ANSWER, 1, 2**40 + 20),
+    "log": (messages.Log(LogLevel.WARNING, "first path outside the window"), 0, 2, 3_000_000),
+    "log_empty": (messages.Log(LogLevel.DEBUG, ""), 0, 3, 3_000_000),
+    "status": (messages.BoardStatus(1, 2, 3, 4, Mode.DEVICE), 0, 4, 4_000_000),
+    "range_cir": (MEASUREMENT, 0, 5, 2**63 + 1),
+    "range_cir_magnitude": (MAGNITUDES, 0, 6, 5_000_000),
+    "range_cir_full": (FULL, 0, 7, 6_000_000),
+    "range_corrected": (
+        messages.Correction(
+            0,
+            1,
+            2,
+            3,
+            4,
+            CorrectedRange(6.75, 7.3125, 0.5625, 0.0625, Status.OK, Origin.DEVICE, 0xDEADBEEF),
+            7040,
+        ),
+        0,
+        8,
+        7_000_000,
+    ),
+    "range_corrected_invalid": (
+        messages.Correction(
+            0,
+            1,
+            2,
+            3,
+            4,
+            CorrectedRange(math.nan, math.nan, 0.0, math.inf, Status.BAD_CIR, Origin.DEVICE, 0),
+        ),
+        Flag.ANSWER,
+        9,
+        0,
+    ),
+}
+
+
+def sent_frames() -> Iterator[tuple[str, Frame]]:
+    for name, (message, flags, sequence, time_us) in SENT.items():
+        kind, payload = messages.encode(message)
+        yield name, Frame(int(kind), int(flags), sequence, time_us, payload)
+    # A receiver counts and skips a type it does not know; runs of 254 bytes are where COBS goes wrong.
+    for size in (253, 254, 255, 508):
+        yield f"unknown_{size}", Frame(200, 0x8000, size, 0, bytes(1 + i % 255 for i in range(size)))
+    yield "unknown_zeros", Frame(200, 0, 0, 0, bytes(300))
+
+
+def rejected() -> Iterator[tuple[str, str, bytes]]:
+    log = encode_frame(dict(sent_frames())["log"])
+    yield "flipped_bit", "bad_crc", log[:30] + bytes([log[30] ^ 0x10]) + log[31:]
+    yield "cut_short", "bad_cobs", log[:-8] + b"\0"
+    yield "too_short_for_a_header", "bad_length", b"\0\x05boot\0"
+    yield "endless", "oversize", b"\0" + b"\1" * (layout.MAX_ENCODED_BYTES + 1) + b"\0"
+    body = bytes([2, MessageType.HELLO]) + bytes(14)
+    yield "version_2", "foreign_version", b"\0" + stuffed(body + crc(body)) + b"\0"
+
+
+def value_lines(name: str, frame: Frame) -> Iterator[str]:
+    if frame.type not in layout.PAYLOADS:
+        return
+    table = layout.PAYLOADS[MessageType(frame.type)]
+    unsigned = {"B": "B", "H": "H", "I": "I", "Q": "Q", "i": "I", "f": "I"}
+    codes = {field.name: field.code for field in table.fields}
+    for field, offset in table.offsets().items():
+        if codes[field] in unsigned:
+            (number,) = struct.unpack_from("<" + unsigned[codes[field]], frame.payload, offset)
+            yield f"value {name} {field} {number}"
+
+
+def render() -> str:
+    lines = []
+    for name, frame in sent_frames():
+        lines.append(
+            f"frame {name} {frame.type} {frame.flags} {frame.sequence} {frame.time_us} "
+            f"{frame.payload.hex() or '-'} {encode_frame(frame).hex()}"
+        )
+        lines += value_lines(name, frame)
+    lines += [f"reject {name} {kind} {wire.hex()}" for name, kind, wire in rejected()]
+    return PREAMBLE + "\n".join(lines) + "\n"
+
+
+def crc(body: bytes) -> bytes:
+    return struct.pack("<I", binascii.crc32(body))
+
+
+def stuffed(body: bytes) -> bytes:
+    """COBS written from its definition, apart from the library that the package uses."""
+    out = bytearray()
+    for run in body.split(b"\0"):
+        while len(run) >= 254:
+            out += b"\xff" + run[:254]
+            run = run[254:]
+        out += bytes([len(run) + 1]) + run
+    # A full block at the very end needs no empty one after it.
+    return bytes(out[:-1]) if len(body) >= 254 and out[-1] == 1 and body[-1] != 0 else bytes(out)
+
+
+def lines_of(kind: str) -> list[list[str]]:
+    return [line.split() for line in FILE.read_text().splitlines() if line.startswith(kind + " ")]
+
+
+def test_the_file_is_what_the_protocol_gives():
+    assert render() == FILE.read_text()
+
+
+@pytest.mark.parametrize("line", lines_of("frame"), ids=lambda line: line[1])
+def test_a_vector_decodes_to_its_fields(line):
+    _, _, *numbers, payload, wire = line
+    expected = Frame(*map(int, numbers), bytes.fromhex(payload) if payload != "-" else b"")
+
+    assert FrameDecoder().feed(bytes.fromhex(wire)) == [expected]
+
+
+@pytest.mark.parametrize("line", lines_of("frame"), ids=lambda line: line[1])
+def test_a_vector_is_what_the_specification_says_byte_by_byte(line):
+    _, _, kind, flags, sequence, time_us, payload, wire = line
+    body = bytes([1, int(kind)]) + struct.pack("<HIQ", int(flags), int(sequence), int(time_us))
+    body += bytes.fromhex(payload) if payload != "-" else b""
+
+    assert bytes.fromhex(wire) == b"\0" + stuffed(body + crc(body)) + b"\0"
+
+
+@pytest.mark.parametrize("line", lines_of("reject"), ids=lambda line: line[1])
+def test_a_rejected_vector_raises_its_count(line):
+    _, _, kind, wire = line
+    decoder = FrameDecoder()
+
+    assert decoder.feed(bytes.fromhex(wire)) == []
+    if kind == "foreign_version":
+        assert decoder.counts.foreign_versions.total() == 1
+        assert decoder.counts.corrupt == 0
+    else:
+        assert getattr(decoder.counts, kind) == decoder.counts.corrupt == 1
+
+
+def test_the_file_is_read_with_lines_of_bounded_length():
+    assert max(map(len, FILE.read_text().splitlines())) < 20_000
+
+
+if __name__ == "__main__":
+    FILE.write_text(render())
