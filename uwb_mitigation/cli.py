@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 import uwb_mitigation
-from uwb_mitigation.commands import console
+from uwb_mitigation.commands import console, data
 from uwb_mitigation.errors import UwbMitigationError
 
 app = typer.Typer(
@@ -18,6 +18,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
+app.add_typer(data.app, name="data")
 
 
 def _print_version(wanted: bool) -> None:

@@ -1,0 +1,264 @@
+"""Measurements to and from the CDR bytes of `RangeCir`, `RangeTruth` and `RangeCorrected`.
+
+The layouts are fixed but for strings and one array, so each is a few packed blocks, and every length
+is checked before it is used. CDR aligns each value to its size, counted from the end of the four-byte encapsulation header (OMG DDSI-RTPS 2.5, section 10.2;
+OMG CDR, section 15.3). Little-endian plain CDR only: all that ROS 2 writes.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import NamedTuple
+
+import numpy as np
+
+from uwb_mitigation.errors import RecordingError
+from uwb_mitigation.measurement import Cir, CorrectedRange, Encoding, Origin, RangeMeasurement, Status, Truth
+
+_LITTLE_ENDIAN = b"\x00\x01"
+_NANOSECONDS = 1_000_000_000
+
+# Each block starts on a multiple of 8, where `x` stands for CDR's own padding.
+_PREFIX = struct.Struct("<4siII")  # encapsulation, seconds, nanoseconds, length of frame_id
+_RANGE_CIR = struct.Struct("<QQI4xQffifB3xfI")  # tag, anchor, sequence, ticks, range, Cir to sample count
+_CIR_COUNTS = struct.Struct("<HH")
+_CIR_POWERS = struct.Struct("<ffBB")
+_TRUTH = struct.Struct("<QQIf")
+_CORRECTED = struct.Struct("<QQIffffBB2xI")
+_LENGTH = struct.Struct("<I")
+
+_ENCODINGS = {int(encoding): encoding for encoding in Encoding}
+_STATUSES = {int(status): status for status in Status}
+_ORIGINS = {int(origin): origin for origin in Origin}
+
+
+class Key(NamedTuple):
+    """What truth and corrected ranges share with the measurement they belong to."""
+
+    stamp_ns: int
+    tag_id: int
+    anchor_id: int
+    sequence: int
+
+
+def key_of(measurement: RangeMeasurement) -> Key:
+    """The key of a measurement."""
+    return Key(measurement.stamp_ns, measurement.tag_id, measurement.anchor_id, measurement.sequence)
+
+
+def encode_range(measurement: RangeMeasurement) -> bytes:
+    """`RangeCir` in CDR.
+
+    Raises:
+        RecordingError: a value does not fit its field.
+    """
+    cir = measurement.cir
+    samples = cir.samples
+    if samples.dtype != np.int16 or samples.ndim != 1:
+        raise RecordingError(
+            f"CIR samples are {samples.dtype} of shape {samples.shape}", valid="int16 of one dimension"
+        )
+    try:
+        return b"".join(
+            (
+                _encode_header(measurement),
+                _RANGE_CIR.pack(
+                    measurement.tag_id,
+                    measurement.anchor_id,
+                    measurement.sequence,
+                    measurement.device_time,
+                    measurement.range_m,
+                    cir.sample_period_s,
+                    cir.start_index,
+                    cir.first_path_index,
+                    cir.encoding,
+                    cir.scale,
+                    len(samples),
+                ),
+                samples.astype("<i2", copy=False).tobytes(),
+                _CIR_COUNTS.pack(cir.preamble_count, cir.noise_threshold),
+                b"\0\0" if len(samples) % 2 else b"",
+                _CIR_POWERS.pack(cir.rx_power_dbm, cir.first_path_power_dbm, cir.channel, cir.prf_mhz),
+            )
+        )
+    except (struct.error, OverflowError, UnicodeEncodeError) as error:
+        raise _misfit("RangeCir", measurement, error) from error
+
+
+def encode_truth(measurement: RangeMeasurement, truth: Truth) -> bytes:
+    """`RangeTruth` in CDR, for the measurement it belongs to.
+
+    Raises:
+        RecordingError: a value does not fit its field.
+    """
+    try:
+        data = _encode_header(measurement) + _TRUTH.pack(
+            measurement.tag_id, measurement.anchor_id, measurement.sequence, truth.range_m
+        )
+        data = _append_string(data, truth.label)
+        return _append_string(data, truth.configuration)
+    except (struct.error, OverflowError, UnicodeEncodeError) as error:
+        raise _misfit("RangeTruth", measurement, error) from error
+
+
+def encode_corrected(measurement: RangeMeasurement, corrected: CorrectedRange) -> bytes:
+    """`RangeCorrected` in CDR, for the measurement it belongs to.
+
+    Raises:
+        RecordingError: a value does not fit its field.
+    """
+    try:
+        return _encode_header(measurement) + _CORRECTED.pack(
+            measurement.tag_id,
+            measurement.anchor_id,
+            measurement.sequence,
+            corrected.range_m,
+            corrected.range_raw_m,
+            corrected.correction_m,
+            corrected.variance_m2,
+            corrected.status,
+            corrected.origin,
+            corrected.model_id,
+        )
+    except (struct.error, OverflowError, UnicodeEncodeError) as error:
+        raise _misfit("RangeCorrected", measurement, error) from error
+
+
+def decode_range(data: bytes) -> RangeMeasurement:
+    """A measurement from the CDR of `RangeCir`. Its samples are a read-only view into `data`.
+
+    Raises:
+        RecordingError: the bytes are not a `RangeCir`; `what` is one of few phrases without values,
+            so that a caller can count by it.
+    """
+    stamp_ns, frame_id, at = _decode_header(data)
+    _require(data, at + _RANGE_CIR.size)
+    (tag_id, anchor_id, sequence, ticks, range_m, period, start, first_path, encoding, scale, count) = (
+        _RANGE_CIR.unpack_from(data, at)
+    )
+    if encoding not in _ENCODINGS:
+        raise RecordingError("message with an unknown CIR encoding", where=f"encoding {encoding}")
+    at += _RANGE_CIR.size
+    powers_at = at + 2 * count + _CIR_COUNTS.size + 2 * (count % 2)
+    _require_end(data, powers_at + _CIR_POWERS.size)
+    preamble_count, noise_threshold = _CIR_COUNTS.unpack_from(data, at + 2 * count)
+    rx_power, first_path_power, channel, prf = _CIR_POWERS.unpack_from(data, powers_at)
+    return RangeMeasurement(
+        stamp_ns,
+        tag_id,
+        anchor_id,
+        sequence,
+        ticks,
+        range_m,
+        Cir(
+            np.frombuffer(data, "<i2", count, at),
+            _ENCODINGS[encoding],
+            start,
+            first_path,
+            period,
+            scale,
+            preamble_count,
+            noise_threshold,
+            rx_power,
+            first_path_power,
+            channel,
+            prf,
+        ),
+        frame_id,
+    )
+
+
+def decode_truth(data: bytes) -> tuple[Key, Truth]:
+    """The truth in the CDR of `RangeTruth`, and the key of its measurement.
+
+    Raises:
+        RecordingError: the bytes are not a `RangeTruth`; `what` as for `decode_range`.
+    """
+    stamp_ns, _, at = _decode_header(data)
+    _require(data, at + _TRUTH.size)
+    tag_id, anchor_id, sequence, range_m = _TRUTH.unpack_from(data, at)
+    label, at = _decode_string(data, at + _TRUTH.size)
+    configuration, at = _decode_string(data, at + -at % 4)
+    _require_end(data, at)
+    return Key(stamp_ns, tag_id, anchor_id, sequence), Truth(range_m, label, configuration)
+
+
+def decode_corrected(data: bytes) -> tuple[Key, CorrectedRange]:
+    """The range in the CDR of `RangeCorrected`, and the key of its measurement.
+
+    Raises:
+        RecordingError: the bytes are not a `RangeCorrected`; `what` as for `decode_range`.
+    """
+    stamp_ns, _, at = _decode_header(data)
+    _require_end(data, at + _CORRECTED.size)
+    (tag_id, anchor_id, sequence, range_m, raw_m, correction_m, variance_m2, status, origin, model_id) = (
+        _CORRECTED.unpack_from(data, at)
+    )
+    if status not in _STATUSES:
+        raise RecordingError("message with an unknown status", where=f"status {status}")
+    if origin not in _ORIGINS:
+        raise RecordingError("message with an unknown origin", where=f"source {origin}")
+    return Key(stamp_ns, tag_id, anchor_id, sequence), CorrectedRange(
+        range_m, raw_m, correction_m, variance_m2, _STATUSES[status], _ORIGINS[origin], model_id
+    )
+
+
+def _encode_header(measurement: RangeMeasurement) -> bytes:
+    seconds, nanoseconds = divmod(measurement.stamp_ns, _NANOSECONDS)
+    frame = measurement.frame_id.encode() + b"\0"
+    prefix = _PREFIX.pack(_LITTLE_ENDIAN + b"\0\0", seconds, nanoseconds, len(frame))
+    return prefix + frame + bytes(-(len(prefix) - 4 + len(frame)) % 8)
+
+
+def _decode_header(data: bytes) -> tuple[int, str, int]:
+    """Stamp, frame_id, and where the first 8-byte field after the header starts."""
+    _require(data, _PREFIX.size)
+    encapsulation, seconds, nanoseconds, _ = _PREFIX.unpack_from(data)
+    if not encapsulation.startswith(_LITTLE_ENDIAN):
+        kind = "big-endian CDR" if encapsulation.startswith(b"\0\0") else "an unknown encapsulation"
+        raise RecordingError(f"message in {kind}", where=encapsulation.hex(" "), valid="little-endian CDR")
+    if nanoseconds >= _NANOSECONDS:
+        raise RecordingError("message with an invalid time stamp", where=f"nanosec {nanoseconds}")
+    frame_id, at = _decode_string(data, _PREFIX.size - _LENGTH.size)
+    return seconds * _NANOSECONDS + nanoseconds, frame_id, at + (4 - at) % 8
+
+
+def _append_string(data: bytes, text: str) -> bytes:
+    encoded = text.encode() + b"\0"
+    return data + bytes(-len(data) % 4) + _LENGTH.pack(len(encoded)) + encoded
+
+
+def _decode_string(data: bytes, at: int) -> tuple[str, int]:
+    """The string at `at`, and where it ends."""
+    _require(data, at + _LENGTH.size)
+    (length,) = _LENGTH.unpack_from(data, at)
+    at += _LENGTH.size
+    end = at + length
+    _require(data, end)
+    # Some middleware sends an empty string without its terminator.
+    text = data[at:end]
+    if text and text[-1] != 0:
+        raise RecordingError("message with an unterminated string", where=f"byte {at}")
+    try:
+        return text[:-1].decode(), end
+    except UnicodeDecodeError:
+        raise RecordingError("message with a string that is not UTF-8", where=f"byte {at}") from None
+
+
+def _require(data: bytes, size: int) -> None:
+    if len(data) < size:
+        raise RecordingError("message ends early", where=f"{len(data)} of at least {size} bytes")
+
+
+def _require_end(data: bytes, size: int) -> None:
+    _require(data, size)
+    # A writer may round a message up to a multiple of four.
+    if len(data) > size + 3:
+        raise RecordingError("message longer than its type", where=f"{len(data)} instead of {size} bytes")
+
+
+def _misfit(type_name: str, measurement: RangeMeasurement, error: Exception) -> RecordingError:
+    return RecordingError(
+        f"a value does not fit {type_name}: {error}",
+        where=f"exchange {measurement.sequence} of anchor {measurement.anchor_id}, tag {measurement.tag_id}",
+    )

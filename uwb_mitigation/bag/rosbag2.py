@@ -1,0 +1,160 @@
+"""`metadata.yaml`, by which rosbag2 knows a bag: which files a folder holds, and what is in them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import yaml
+
+from uwb_mitigation.errors import RecordingError
+
+METADATA_NAME = "metadata.yaml"
+VERSION = 9
+"""Of rosbag2's metadata, as Jazzy writes it."""
+
+MAX_METADATA = 4 << 20
+"""Ceiling of a `metadata.yaml`, bytes."""
+
+NO_QOS = "[]"
+"""No recorded quality of service: `ros2 bag play` then offers its default (reliable, volatile)."""
+
+
+@dataclass(frozen=True, slots=True)
+class TopicCount:
+    """A topic of a bag and how many messages it holds."""
+
+    topic: str
+    type_name: str
+    type_hash: str
+    messages: int
+
+
+def describe(
+    file_name: str, topics: Sequence[TopicCount], first_ns: int, last_ns: int, custom: Mapping[str, str]
+) -> dict[str, Any]:
+    """What `metadata.yaml` says of a bag of one file, below its only key."""
+    start = {"nanoseconds_since_epoch": first_ns}
+    duration = {"nanoseconds": last_ns - first_ns}
+    total = sum(topic.messages for topic in topics)
+    return {
+        "version": VERSION,
+        "storage_identifier": "mcap",
+        "duration": duration,
+        "starting_time": start,
+        "message_count": total,
+        "topics_with_message_count": [
+            {
+                "topic_metadata": {
+                    "name": topic.topic,
+                    "type": topic.type_name,
+                    "serialization_format": "cdr",
+                    "offered_qos_profiles": [],
+                    "type_description_hash": topic.type_hash,
+                },
+                "message_count": topic.messages,
+            }
+            for topic in topics
+        ],
+        "compression_format": "",
+        "compression_mode": "",
+        "relative_file_paths": [file_name],
+        "files": [{"path": file_name, "starting_time": start, "duration": duration, "message_count": total}],
+        "custom_data": dict(custom) or None,
+        "ros_distro": "jazzy",
+    }
+
+
+def dump(document: Mapping[str, Any]) -> str:
+    """YAML in the order of the keys, without anchors, which rosbag2 does not write either."""
+    return yaml.dump(document, Dumper=_Plain, sort_keys=False, allow_unicode=True)
+
+
+def described_files(folder: Path) -> list[str] | None:
+    """The file names that `folder/metadata.yaml` lists; None = there is no such file.
+
+    Raises:
+        RecordingError: it cannot be read, is malformed, or describes storage other than MCAP.
+    """
+    path = folder / METADATA_NAME
+    try:
+        with path.open("rb") as stream:
+            text = stream.read(MAX_METADATA + 1)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise RecordingError(f"cannot be read: {error.strerror}", where=str(path)) from error
+    if len(text) > MAX_METADATA:
+        raise RecordingError("too large", where=str(path), valid=f"at most {MAX_METADATA} bytes")
+    try:
+        information = yaml.safe_load(text)["rosbag2_bagfile_information"]
+        storage = information["storage_identifier"]
+        paths = information["relative_file_paths"]
+        compression = information.get("compression_mode") or ""
+        names = [PurePosixPath(entry).name for entry in paths]
+    except (yaml.YAMLError, RecursionError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise RecordingError(
+            "not a rosbag2 metadata file", where=str(path), valid="remove it to read every *.mcap beside it"
+        ) from error
+    if storage != "mcap":
+        raise _foreign_storage(folder, str(storage))
+    if str(compression).lower() == "file":
+        raise RecordingError(
+            "the bag's files are compressed as a whole", where=str(path), valid=_conversion(folder)
+        )
+    return names
+
+
+def bag_files(path: Path) -> list[Path]:
+    """The MCAP files of a bag, in order: of a folder those that `metadata.yaml` lists, else every `*.mcap`.
+
+    Raises:
+        RecordingError: there is nothing of that name, or no MCAP file in it.
+    """
+    if not path.is_dir():
+        if path.suffix == ".db3":
+            raise _foreign_storage(path, "sqlite3")
+        if not path.exists():
+            raise RecordingError("no such file or folder", where=str(path))
+        if not path.is_file():
+            raise RecordingError("not a regular file", where=str(path))
+        return [path]
+    names = described_files(path)
+    if names is None:
+        names = sorted((entry.name for entry in path.glob("*.mcap")), key=_natural)
+        if not names and any(path.glob("*.db3")):
+            raise _foreign_storage(path, "sqlite3")
+    # A listed name is taken within the folder only, whatever path stands before it.
+    files = [path / name for name in names if name]
+    if not files:
+        raise RecordingError("the folder holds no MCAP file", where=str(path))
+    for file in files:
+        if not file.is_file():
+            raise RecordingError(f"{METADATA_NAME} lists a file that is not there", where=str(file))
+    return files
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    """Sorts bag_10 after bag_9."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"([0-9]+)", name)]
+
+
+def _foreign_storage(path: Path, storage: str) -> RecordingError:
+    return RecordingError(
+        f"the bag is stored as {storage[:32]}, not as MCAP", where=str(path), valid=_conversion(path)
+    )
+
+
+def _conversion(path: Path) -> str:
+    return (
+        f"convert it: ros2 bag convert -i {path} -o OPTIONS.yaml, where OPTIONS.yaml says "
+        "output_bags: [{uri: NEW_BAG, storage_id: mcap, all_topics: true}]"
+    )
+
+
+class _Plain(yaml.SafeDumper):
+    def ignore_aliases(self, data: object) -> bool:
+        return True

@@ -1,0 +1,269 @@
+"""Writes a bag that `ros2 bag`, Foxglove and the `rosbags` library open: MCAP, profile ros2, zstd chunks.
+
+Nothing stands under the bag's name until it is whole: data goes to a `.part` file, which is renamed at
+the end and removed when the writer is left by an error or Ctrl-C.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import BinaryIO
+
+from mcap.well_known import MessageEncoding, Profile, SchemaEncoding
+from mcap.writer import CompressionType, Writer
+
+import uwb_mitigation
+from uwb_mitigation.bag import schemas
+from uwb_mitigation.bag.codec import encode_corrected, encode_range, encode_truth
+from uwb_mitigation.bag.container import Channel
+from uwb_mitigation.bag.rosbag2 import METADATA_NAME, NO_QOS, TopicCount, describe, described_files, dump
+from uwb_mitigation.bag.topics import (
+    RANGE_CIR_TYPE,
+    RANGE_CORRECTED,
+    RANGE_CORRECTED_TYPE,
+    RANGE_RAW,
+    RANGE_TRUTH,
+    RANGE_TRUTH_TYPE,
+)
+from uwb_mitigation.errors import RecordingError
+from uwb_mitigation.measurement import CorrectedRange, RangeMeasurement
+from uwb_mitigation.sources.source import Record
+
+METADATA_RECORD = "uwb_mitigation"
+"""Name of the MCAP metadata record that holds the bag's origin."""
+
+CHUNK_SIZE = 1 << 20
+"""Bytes of messages that are compressed together."""
+
+_QOS_KEY = "offered_qos_profiles"
+_HASH_KEY = "topic_type_hash"
+
+
+class BagWriter:
+    """Writes one bag; a context manager, which finishes the bag or, on any exception, removes it.
+
+    A path that ends in `.mcap` becomes that one file, with a `metadata.yaml` beside it unless one that
+    describes another bag is there. Any other path becomes a rosbag2 folder.
+
+    Args:
+        path: where the bag goes.
+        metadata: what to say of its origin, beside the package's version; `source` and `simulated`
+            (`true` or `false`) are what a reader of this package looks for.
+        force: replace a bag that is there.
+
+    Attributes:
+        file: the MCAP file.
+        counts: messages written, {topic: count}.
+        notice: what the user should know once the bag is finished; empty = nothing.
+
+    Raises:
+        RecordingError: a bag is there and `force` is not given, or the path cannot be written.
+    """
+
+    def __init__(self, path: Path, metadata: Mapping[str, str], *, force: bool = False) -> None:
+        self._folder = None if path.suffix == ".mcap" else path
+        self.file = path if self._folder is None else path / f"{path.name}_0.mcap"
+        self._partial = self.file.with_name(self.file.name + ".part")
+        self._metadata = {"version": uwb_mitigation.__version__, **metadata}
+        self.counts: Counter[str] = Counter()
+        self.notice = ""
+        self._channels: dict[str, int] = {}
+        self._topics: dict[str, TopicCount] = {}
+        self._schemas: dict[tuple[str, str, bytes], int] = {}
+        self._first_ns: int | None = None
+        self._last_ns = 0
+        self._stream: BinaryIO | None = None
+
+        if self._folder is not None and path.exists() and not path.is_dir():
+            raise RecordingError("is a file, where a bag folder is wanted", where=str(path))
+        occupied = self.file.exists() or (self._folder is not None and path.is_dir() and any(path.iterdir()))
+        if occupied and not force:
+            raise RecordingError("exists already", where=str(path), valid="--force replaces it")
+        with self._writing():
+            self._made_folder = self._folder is not None and not self._folder.exists()
+            if self._folder is not None:
+                self._folder.mkdir(parents=True, exist_ok=True)
+            self._stream = self._partial.open("wb")
+        self._mcap = Writer(
+            self._stream, chunk_size=CHUNK_SIZE, compression=CompressionType.ZSTD, enable_data_crcs=True
+        )
+        with self._writing():
+            self._mcap.start(profile=Profile.ROS2, library=f"uwb_mitigation {uwb_mitigation.__version__}")
+            self._mcap.add_metadata(METADATA_RECORD, self._metadata)
+
+    def write(self, record: Record) -> None:
+        """Write a measurement to `/uwb/range_raw` and, if known, its truth to `/uwb/range_truth`.
+
+        Raises:
+            RecordingError: a value does not fit its field, or the bag cannot be written.
+        """
+        measurement = record.measurement
+        self._write_ours(RANGE_RAW, RANGE_CIR_TYPE, measurement, encode_range(measurement))
+        if record.truth is not None:
+            truth = encode_truth(measurement, record.truth)
+            self._write_ours(RANGE_TRUTH, RANGE_TRUTH_TYPE, measurement, truth)
+
+    def write_corrected(
+        self, measurement: RangeMeasurement, corrected: CorrectedRange, log_time_ns: int | None = None
+    ) -> None:
+        """Write what was made of a measurement to `/uwb/range_corrected`.
+
+        The log time is the measurement's own stamp unless given.
+
+        Raises:
+            RecordingError: a value does not fit its field, or the bag cannot be written.
+        """
+        data = encode_corrected(measurement, corrected)
+        self._write_ours(RANGE_CORRECTED, RANGE_CORRECTED_TYPE, measurement, data, log_time_ns)
+
+    def copy_channel(self, channel: Channel, topic: str | None = None) -> int:
+        """Register a channel of another bag as it is, under its own name or `topic`; returns its number.
+
+        Raises:
+            RecordingError: the channel has no schema, or the topic is registered already.
+        """
+        if channel.schema is None:
+            raise RecordingError(f"topic {channel.topic} has no schema")
+        return self._add_channel(
+            topic or channel.topic,
+            channel.schema.name,
+            channel.schema.encoding,
+            channel.schema.data,
+            channel.encoding,
+            channel.metadata,
+        )
+
+    def write_serialized(
+        self, channel: int, topic: str, data: bytes, log_time_ns: int, publish_time_ns: int, sequence: int = 0
+    ) -> None:
+        """Write the bytes of a message untouched, to a channel that `copy_channel` gave for `topic`.
+
+        Raises:
+            RecordingError: a time is negative, or the bag cannot be written.
+        """
+        if log_time_ns < 0 or publish_time_ns < 0:
+            raise RecordingError(f"time {min(log_time_ns, publish_time_ns)} ns is before the epoch")
+        with self._writing():
+            self._mcap.add_message(channel, log_time_ns, data, publish_time_ns, sequence)
+        self.counts[topic] += 1
+        self._first_ns = log_time_ns if self._first_ns is None else min(self._first_ns, log_time_ns)
+        self._last_ns = max(self._last_ns, log_time_ns)
+
+    def __enter__(self) -> BagWriter:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if kind is not None:
+            self._abandon()
+            return
+        try:
+            self._finish()
+        except BaseException:
+            self._abandon()
+            raise
+
+    def _write_ours(
+        self,
+        topic: str,
+        type_name: str,
+        measurement: RangeMeasurement,
+        data: bytes,
+        log_time_ns: int | None = None,
+    ) -> None:
+        channel = self._channels.get(topic)
+        if channel is None:
+            channel = self._add_channel(
+                topic,
+                type_name,
+                SchemaEncoding.ROS2,
+                schemas.definition(type_name).encode(),
+                MessageEncoding.CDR,
+                {_QOS_KEY: NO_QOS, _HASH_KEY: schemas.type_hash(type_name)},
+            )
+        stamp_ns = measurement.stamp_ns if log_time_ns is None else log_time_ns
+        self.write_serialized(channel, topic, data, stamp_ns, measurement.stamp_ns, measurement.sequence)
+
+    def _add_channel(
+        self,
+        topic: str,
+        type_name: str,
+        schema_encoding: str,
+        schema: bytes,
+        encoding: str,
+        metadata: Mapping[str, str],
+    ) -> int:
+        if topic in self._channels:
+            raise RecordingError(f"topic {topic} is in the bag already")
+        with self._writing():
+            key = (type_name, schema_encoding, schema)
+            if key not in self._schemas:
+                self._schemas[key] = self._mcap.register_schema(type_name, schema_encoding, schema)
+            number = self._mcap.register_channel(topic, encoding, self._schemas[key], dict(metadata))
+        self._channels[topic] = number
+        self._topics[topic] = TopicCount(topic, type_name, metadata.get(_HASH_KEY, ""), 0)
+        return number
+
+    def _finish(self) -> None:
+        topics = [
+            TopicCount(topic.topic, topic.type_name, topic.type_hash, self.counts[topic.topic])
+            for topic in self._topics.values()
+        ]
+        first_ns = 0 if self._first_ns is None else self._first_ns
+        document = describe(self.file.name, topics, first_ns, self._last_ns, self._metadata)
+        with self._writing():
+            self._mcap.add_metadata("rosbag2", {"serialized_metadata": dump(document)})
+            self._mcap.finish()  # type: ignore[no-untyped-call]
+            self._close()
+            self._partial.replace(self.file)
+            if self._may_describe():
+                partial = self.file.with_name(METADATA_NAME + ".part")
+                partial.write_text(dump({"rosbag2_bagfile_information": document}), encoding="utf-8")
+                partial.replace(self.file.with_name(METADATA_NAME))
+
+    def _may_describe(self) -> bool:
+        """Whether `metadata.yaml` is ours to write; leaves a notice where it is not."""
+        if self._folder is not None:
+            return True
+        try:
+            described = described_files(self.file.parent)
+        except RecordingError:
+            described = []
+        if described is None or described == [self.file.name]:
+            return True
+        self.notice = (
+            f"{self.file.with_name(METADATA_NAME)} describes another bag and was left as it is; "
+            f"open {self.file} by its own name"
+        )
+        return False
+
+    def _close(self) -> None:
+        stream, self._stream = self._stream, None
+        if stream is not None:
+            stream.close()
+
+    def _abandon(self) -> None:
+        with contextlib.suppress(OSError):
+            self._close()
+        # What cannot be removed is no reason to hide the error that led here.
+        with contextlib.suppress(OSError):
+            self._partial.unlink(missing_ok=True)
+        if self._made_folder and self._folder is not None:
+            with contextlib.suppress(OSError):
+                self._folder.rmdir()
+
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            self._abandon()
+            raise RecordingError(f"cannot be written: {error.strerror}", where=str(self.file)) from error

@@ -1,0 +1,169 @@
+"""`uwb-mitigation data`: bring recordings into bags, and show what a recording holds."""
+
+from __future__ import annotations
+
+import enum
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from uwb_mitigation.commands import console
+from uwb_mitigation.commands.console import JsonOption
+from uwb_mitigation.errors import DamagedRecordingError, RecordingError
+
+if TYPE_CHECKING:
+    from uwb_mitigation.sources.inventory import Inventory
+    from uwb_mitigation.sources.source import Source
+
+app = typer.Typer(help="Bring recordings into bags, and show what a recording holds.", no_args_is_help=True)
+
+_STRIDE = 100
+"""Ranges between two updates of a progress bar."""
+
+
+class CirChoice(str, enum.Enum):
+    """Which frame of a DecaRanging exchange gives the CIR."""
+
+    FINAL = "final"
+    POLL = "poll"
+
+
+CirOption = Annotated[
+    CirChoice, typer.Option(help="Of a DecaRanging exchange, take the CIR of this frame: final or poll.")
+]
+
+
+@app.command("import")
+def import_recordings(
+    sources: Annotated[list[Path], typer.Argument(metavar="SRC...", help="Recordings: logs, folders, bags.")],
+    output: Annotated[
+        Path,
+        typer.Option(
+            "-o", "--output", metavar="OUT", help="OUT.mcap for one file, any other name for a bag folder."
+        ),
+    ],
+    cir: CirOption = CirChoice.FINAL,
+    force: Annotated[bool, typer.Option("--force", help="Replace OUT if it exists.")] = False,
+    json: JsonOption = None,
+) -> None:
+    """Write recordings into one MCAP bag, with their truth where it is known."""
+    from uwb_mitigation.bag.writer import BagWriter
+    from uwb_mitigation.sources.inventory import Inventory
+    from uwb_mitigation.sources.opening import open_recording
+
+    opened = [open_recording(path, cir=cir.value) for path in sources]
+    inventory = Inventory()
+    origin = {
+        "source": "; ".join(source.name for source in opened),
+        "simulated": "true" if any(source.simulated for source in opened) else "false",
+    }
+    damage: list[DamagedRecordingError] = []
+    with BagWriter(output, origin, force=force) as bag, console.progress() as bar:
+        task = bar.add_task("importing", total=None)
+        for source in opened:
+            try:
+                with source:
+                    for record in inventory.watch(source):
+                        bag.write(record)
+                        if inventory.ranges % _STRIDE == 0:
+                            bar.update(task, description=f"importing: {inventory.ranges} ranges")
+            except DamagedRecordingError as error:  # noqa: PERF203 - once a source
+                damage.append(error)
+        if inventory.ranges == 0:
+            raise (
+                damage[0] if damage else RecordingError("no ranges in it", where=", ".join(map(str, sources)))
+            )
+    for source in opened:
+        _show(source, inventory if len(opened) == 1 else None)
+    if len(opened) > 1:
+        _show_inventory(inventory)
+    messages = bag.counts.total()
+    console.out.print(f"Wrote {messages} messages to {bag.file}.", markup=False, soft_wrap=True)
+    if bag.notice:
+        console.err.print(bag.notice, style="yellow", markup=False, soft_wrap=True)
+    console.write_json(json, {"messages": messages, "output": str(bag.file), **inventory.as_json()})
+    # What was readable is kept; that it is not everything must not pass unnoticed.
+    if damage:
+        raise damage[0]
+
+
+@app.command()
+def info(
+    path: Annotated[Path, typer.Argument(metavar="PATH", help="A recording: log, folder or bag.")],
+    cir: CirOption = CirChoice.FINAL,
+    json: JsonOption = None,
+) -> None:
+    """Show what a recording holds: pairs, counts, times and oddities."""
+    from uwb_mitigation.sources.inventory import Inventory
+    from uwb_mitigation.sources.mcap import McapRecording
+    from uwb_mitigation.sources.opening import open_recording
+
+    source = open_recording(path, cir=cir.value)
+    inventory = Inventory()
+    try:
+        with source, console.progress() as bar:
+            task = bar.add_task("reading", total=None)
+            for _ in inventory.watch(source):
+                if inventory.ranges % _STRIDE == 0:
+                    bar.update(task, description=f"reading: {inventory.ranges} ranges")
+    finally:
+        # What was readable is shown before an error of the rest.
+        if inventory.ranges or inventory.skipped:
+            _show(source, inventory)
+    messages = source.message_count if isinstance(source, McapRecording) else inventory.ranges
+    console.write_json(
+        json,
+        {
+            "messages": messages,
+            "source": source.name,
+            "simulated": source.simulated,
+            **inventory.as_json(),
+        },
+    )
+
+
+def _show(source: Source, inventory: Inventory | None) -> None:
+    console.out.print(source.name, style="bold", markup=False, soft_wrap=True)
+    console.out.print("simulated: no radio was involved" if source.simulated else "measured by radios")
+    if inventory is not None:
+        _show_inventory(inventory)
+
+
+def _show_inventory(inventory: Inventory) -> None:
+    from rich.table import Table
+
+    console.out.print(
+        f"{inventory.ranges} ranges, {inventory.with_truth} with truth, {inventory.pair_count} pairs, "
+        f"{inventory.duration_s:.1f} s"
+    )
+    pairs = Table("anchor", "tag", "label", title="Pairs", title_justify="left")
+    for column in ("ranges", "rate (Hz)", "mean range (m)", "true range (m)"):
+        pairs.add_column(column, justify="right")
+    for pair in inventory.pairs.values():
+        pairs.add_row(
+            _identity(pair.anchor_id),
+            _identity(pair.tag_id),
+            pair.label,
+            str(pair.ranges),
+            _number(pair.rate_hz, 1),
+            _number(pair.mean_m, 3),
+            _number(pair.true_m, 3),
+        )
+    console.out.print(pairs)
+    if inventory.skipped:
+        oddities = Table("oddity", title="Oddities", title_justify="left")
+        oddities.add_column("count", justify="right")
+        for kind, count in inventory.skipped.most_common():
+            oddities.add_row(kind, str(count))
+        console.out.print(oddities)
+
+
+def _identity(number: int) -> str:
+    """Small numbers as they are; long addresses as the radio's tools print them."""
+    return str(number) if number < 1 << 16 else f"{number:016x}"
+
+
+def _number(value: float, digits: int) -> str:
+    return f"{value:.{digits}f}" if math.isfinite(value) else "-"

@@ -1,0 +1,67 @@
+"""Opens a recording by its path: which kind of source it is, nobody should have to say."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from uwb_mitigation.errors import RecordingError
+from uwb_mitigation.sources.source import Source
+
+ACCEPTED = (
+    "an MCAP bag (.mcap, or a folder with metadata.yaml), "
+    "or DecaRanging logs (.log, .log.xz, or a folder of them)"
+)
+
+_MCAP_MAGIC = b"\x89MCAP0\r\n"
+_XZ_MAGIC = b"\xfd7zXZ\x00"
+_SQLITE_MAGIC = b"SQLite format 3\x00"
+
+
+def open_recording(path: Path, *, cir: Literal["final", "poll"] = "final") -> Source:
+    """The source that reads `path`, picked by what the path holds; the suffix decides only for logs.
+
+    Args:
+        path: a file or folder.
+        cir: of a DecaRanging exchange, which frame's CIR to take: `final` or `poll`.
+
+    Raises:
+        RecordingError: there is nothing at `path`, or no source reads it.
+    """
+    try:
+        is_bag = _is_bag(path)
+    except OSError as error:
+        raise RecordingError(
+            f"cannot be opened: {error.strerror}", where=str(path), valid=ACCEPTED
+        ) from error
+    if is_bag:
+        from uwb_mitigation.sources.mcap import McapRecording
+
+        return McapRecording(path)
+    if path.is_dir() or path.name.endswith((".log", ".log.xz")) or _looks_like_log(path):
+        from uwb_mitigation.sources.decaranging import CirOf, open_decaranging
+
+        return open_decaranging(path, cir=CirOf[cir.upper()])
+    raise RecordingError("not a recording that can be read", where=str(path), valid=ACCEPTED)
+
+
+def _is_bag(path: Path) -> bool:
+    if path.is_dir():
+        names = [entry.name for entry in path.iterdir()]
+        return any(name == "metadata.yaml" or name.endswith((".mcap", ".db3")) for name in names)
+    if path.suffix in (".mcap", ".db3"):
+        return True
+    return _head(path).startswith((_MCAP_MAGIC, _SQLITE_MAGIC))
+
+
+def _looks_like_log(path: Path) -> bool:
+    head = _head(path)
+    return head.startswith(_XZ_MAGIC) or b"DecaRanging" in head
+
+
+def _head(path: Path) -> bytes:
+    if not path.is_file():
+        path.stat()
+        raise RecordingError("neither a file nor a folder", where=str(path), valid=ACCEPTED)
+    with path.open("rb") as stream:
+        return stream.read(4096)
