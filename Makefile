@@ -10,7 +10,7 @@ VENV := .venv
 IN_ROS = . $(VENV)/environment.sh;
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-training demo test lint lock clean
+.PHONY: help setup setup-training demo test colcon lint lock clean
 
 help:  ## show this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 24
@@ -26,6 +26,15 @@ demo: setup  ## replay RECORDING=path (default: simulated) through driver and mi
 
 test: setup-training  ## run every test
 	@$(IN_ROS) $(VENV)/bin/python -m pytest
+
+# What a machine with ROS 2 does by hand; without one, the environment stands in for /opt/ros/jazzy.
+COLCON = $(IN_ROS) PATH="$(CURDIR)/$(VENV)/bin:$$PATH" \
+  AMENT_PREFIX_PATH="$${AMENT_PREFIX_PATH:-$(CURDIR)/$(VENV)}" CMAKE_TOOLCHAIN_FILE="$(CURDIR)/cmake/ros_wheels.cmake" colcon
+
+colcon: setup-training  ## colcon build and colcon test (the tests that start no nodes)
+	@$(COLCON) build
+	@$(COLCON) test --event-handlers console_cohesion+ --return-code-on-test-failure \
+	  --packages-select uwb_mitigation --pytest-args -m "not ros and not slow"
 
 lint: setup-training  ## ruff and mypy
 	@$(VENV)/bin/ruff check .

@@ -127,7 +127,7 @@ def install(requirements: list[Path]) -> None:
 
 def build_messages() -> None:
     """Build and install `uwb_mitigation_msgs` into the environment with CMake."""
-    build = ROOT / "build" / "setup_msgs"
+    build = VENV / "build_msgs"
     shutil.rmtree(build, ignore_errors=True)
     variables = dict(os.environ)
     variables["PATH"] = f"{VENV / 'bin'}{os.pathsep}{variables.get('PATH', '')}"

@@ -1,0 +1,159 @@
+"""Real nodes for tests: a DDS domain of their own, nodes as processes, and a client to talk to them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from lifecycle_msgs.srv import ChangeState, GetState
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+
+TIMEOUT_S = 30.0
+
+
+class Process:
+    """A node, or another program, whose output is kept."""
+
+    def __init__(self, command: list[str], domain: int, log: Path) -> None:
+        self.log = log
+        self._file = log.open("wb")
+        environment = os.environ | {
+            "ROS_DOMAIN_ID": str(domain),
+            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+            "ROS_PYTHON_CHECK_FIELDS": "1",
+            "PYTHONUNBUFFERED": "1",
+        }
+        self.popen = subprocess.Popen(command, env=environment, stdout=self._file, stderr=subprocess.STDOUT)
+
+    @property
+    def output(self) -> str:
+        return self.log.read_text(errors="replace")
+
+    def wait(self, timeout_s: float = TIMEOUT_S) -> int:
+        try:
+            return self.popen.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            raise AssertionError(f"still running after {timeout_s} s:\n{self.output}") from None
+
+    def signal(self, number: signal.Signals) -> int:
+        self.popen.send_signal(number)
+        return self.wait(10)
+
+    def wait_for_output(self, text: str) -> None:
+        deadline = time.monotonic() + TIMEOUT_S
+        while text not in self.output:
+            assert self.popen.poll() is None or text in self.output, f"ended without {text!r}:\n{self.output}"
+            assert time.monotonic() < deadline, f"no {text!r} in:\n{self.output}"
+            time.sleep(0.02)
+
+    def end(self) -> None:
+        if self.popen.poll() is None:
+            self.popen.kill()
+            self.popen.wait()
+        self._file.close()
+
+
+class Ros:
+    """One DDS domain: starts processes in it, and is itself a node in it."""
+
+    def __init__(self, domain: int, folder: Path) -> None:
+        self.domain = domain
+        self._folder = folder
+        self._processes: list[Process] = []
+        self._context = Context()
+        rclpy.init(context=self._context, domain_id=domain)
+        self.node = Node("test_client", context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+
+    def start(self, node: str, *parameters: str, arguments: tuple[str, ...] = ()) -> Process:
+        """Start one of the package's nodes."""
+        words = [word for parameter in parameters for word in ("-p", parameter)]
+        code = f"from uwb_mitigation.nodes.{node} import main; main()"
+        return self.run([sys.executable, "-c", code, "--ros-args", *words, *arguments])
+
+    def run(self, command: list[str]) -> Process:
+        process = Process(command, self.domain, self._folder / f"process_{len(self._processes)}.log")
+        self._processes.append(process)
+        return process
+
+    def collect(self, kind: type, topic: str, depth: int = 10_000) -> list:
+        """A list that fills with the messages of a topic while the client spins."""
+        received: list = []
+        self.node.create_subscription(kind, topic, received.append, QoSProfile(depth=depth))
+        return received
+
+    def spin_until(self, condition: Callable[[], bool], timeout_s: float = TIMEOUT_S) -> None:
+        deadline = time.monotonic() + timeout_s
+        while not condition():
+            assert time.monotonic() < deadline, "timed out:\n" + "\n".join(p.output for p in self._processes)
+            self._executor.spin_once(timeout_sec=0.05)
+
+    def spin_for(self, seconds: float) -> None:
+        deadline = time.monotonic() + seconds
+        while time.monotonic() < deadline:
+            self._executor.spin_once(timeout_sec=0.05)
+
+    def wait_for_subscribers(self, topic: str, count: int) -> None:
+        self.spin_until(lambda: self.node.count_subscribers(topic) >= count)
+
+    def wait_for_publishers(self, topic: str, count: int) -> None:
+        self.spin_until(lambda: self.node.count_publishers(topic) >= count)
+
+    def call(self, kind: type, name: str, request: object) -> object:
+        client = self.node.create_client(kind, name)
+        self.spin_until(client.service_is_ready)
+        future = client.call_async(request)
+        self.spin_until(future.done)
+        self.node.destroy_client(client)
+        return future.result()
+
+    def state_of(self, node: str) -> str:
+        return self.call(GetState, f"/{node}/get_state", GetState.Request()).current_state.label
+
+    def change_state(self, node: str, transition: int) -> bool:
+        request = ChangeState.Request()
+        request.transition.id = transition
+        return self.call(ChangeState, f"/{node}/change_state", request).success
+
+    def diagnosis(self, node: str, matches: Callable[[DiagnosticStatus], bool]) -> DiagnosticStatus:
+        """The first diagnostic status of a node that matches."""
+        arrays = self.collect(DiagnosticArray, "/diagnostics", 100)
+        found: list[DiagnosticStatus] = []
+
+        def look() -> bool:
+            while arrays:
+                found.extend(s for s in arrays.pop().status if s.name.startswith(node) and matches(s))
+            return bool(found)
+
+        self.spin_until(look)
+        return found[0]
+
+    def close(self) -> None:
+        for process in self._processes:
+            process.end()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self._context)
+
+
+@contextmanager
+def domain(folder: Path) -> Iterator[Ros]:
+    """A domain that no other test of this run, and hopefully nobody else, uses."""
+    worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
+    domain.used = getattr(domain, "used", os.getpid()) + 1  # type: ignore[attr-defined]
+    ros = Ros(101 + (domain.used * 8 + worker) % 130, folder)  # type: ignore[attr-defined]
+    try:
+        yield ros
+    finally:
+        ros.close()

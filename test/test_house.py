@@ -1,0 +1,69 @@
+"""The rules that keep the house in order: layers, generated files, and what an import may pull in."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from conftest import REPOSITORY
+
+PACKAGE = REPOSITORY / "uwb_mitigation"
+
+
+def importers(module: str) -> set[str]:
+    """The package's top-level entries with a file that imports `module`."""
+    pattern = re.compile(rf"^\s*(import|from)\s+{module}\b", re.MULTILINE)
+    files = (path for path in PACKAGE.rglob("*.py") if pattern.search(path.read_text(encoding="utf-8")))
+    return {path.relative_to(PACKAGE).parts[0] for path in files}
+
+
+def test_only_nodes_import_rclpy():
+    assert importers("rclpy") == {"nodes"}
+
+
+def test_only_training_imports_torch():
+    assert importers("torch") == {"training"}
+
+
+def test_importing_the_package_and_its_command_line_needs_neither_ros_nor_torch():
+    code = (
+        "import sys; sys.modules.update(dict.fromkeys(['rclpy', 'torch', 'uwb_mitigation_msgs']))\n"
+        "import uwb_mitigation.cli, uwb_mitigation.mitigation, uwb_mitigation.sources.opening\n"
+        "import uwb_mitigation.sources.mcap, uwb_mitigation.sources.decaranging"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=REPOSITORY)
+
+
+@pytest.mark.parametrize("module", ["measurement", "preprocessing", "errors"])
+def test_pure_modules_do_no_input_or_output(module: str):
+    text = (PACKAGE / f"{module}.py").read_text(encoding="utf-8")
+    assert not re.search(r"\b(open\(|Path\b|import (os|sys|io|socket|logging)\b|print\()", text)
+
+
+def test_parameter_files_and_reference_agree_with_the_tables():
+    pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
+    from uwb_mitigation.nodes.parameter_files import files
+
+    stale = [path.name for path, text in files().items() if path.read_text(encoding="utf-8") != text]
+    assert not stale, "run: python -m uwb_mitigation.nodes.parameter_files"
+
+
+def test_versions_agree():
+    import uwb_mitigation
+
+    texts = {
+        name: (REPOSITORY / name).read_text() for name in ("package.xml", "msg_defs/package.xml", "setup.py")
+    }
+    assert f"<version>{uwb_mitigation.__version__}</version>" in texts["package.xml"]
+    assert f"<version>{uwb_mitigation.__version__}</version>" in texts["msg_defs/package.xml"]
+    assert f'version="{uwb_mitigation.__version__}"' in texts["setup.py"]
+
+
+def test_every_message_field_says_what_it_is():
+    for path in (REPOSITORY / "msg_defs" / "msg").glob("*.msg"):
+        for line in Path(path).read_text().splitlines():
+            if line.strip() and not line.startswith("#") and "=" not in line.split("#")[0]:
+                assert "#" in line, f"{path.name}: {line}"

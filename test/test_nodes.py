@@ -1,0 +1,323 @@
+"""Driver and mitigator as real processes over real DDS."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from array import array
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from lifecycle_msgs.msg import Transition
+from ros_harness import Ros, domain
+from rosgraph_msgs.msg import Clock
+from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
+
+from uwb_mitigation.measurement import Status
+from uwb_mitigation.mitigation import Mitigation
+from uwb_mitigation.model.bundle import load_bundle
+from uwb_mitigation.model.shipped import default_model_path
+from uwb_mitigation.nodes import messages
+from uwb_mitigation.sources.decaranging import open_decaranging
+from uwb_mitigation.sources.opening import open_recording
+from uwb_mitigation.sources.simulated import SimulatedSource
+
+pytestmark = pytest.mark.ros
+
+HERE = Path(__file__).parent
+RAW = "/uwb/range_raw"
+CORRECTED = "/uwb/range_corrected"
+
+
+@pytest.fixture
+def ros(tmp_path: Path):
+    with domain(tmp_path) as ros:
+        yield ros
+
+
+@pytest.fixture(scope="session")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """300 simulated ranges in a bag, 40 a second."""
+    from uwb_mitigation.bag.writer import BagWriter
+
+    path = tmp_path_factory.mktemp("bag") / "simulated.mcap"
+    source = SimulatedSource(seed=3, count=300, rate_hz=40.0)
+    with BagWriter(path, {"source": source.name, "simulated": "true"}) as writer:
+        for record in source:
+            writer.write(record)
+    return path
+
+
+def listen_to_replay(ros: Ros, count: int, *driver: str) -> tuple[list[dict], list[dict]]:
+    """Replay through both nodes with a separate subscriber process; its raw and corrected lines."""
+    listener = ros.run([sys.executable, str(HERE / "range_listener.py"), str(count)])
+    listener.wait_for_output("ready")
+    mitigator = ros.start("mitigator")
+    replay = ros.start("driver", *driver)
+    assert listener.wait(60) == 0, listener.output
+    assert replay.wait() == 0, replay.output
+    assert mitigator.signal(signal.SIGINT) == 0, mitigator.output
+    lines = [json.loads(line) for line in listener.output.splitlines()]
+    return tuple([line for line in lines if line["kind"] == kind] for kind in ("raw", "corrected"))
+
+
+def test_a_subscriber_receives_every_corrected_range_of_a_bag(ros: Ros, bag: Path):
+    raw, corrected = listen_to_replay(ros, 300, "source:=mcap", f"path:={bag}", "rate:=4.0")
+    assert len(corrected) == 300
+    same = ("stamp", "frame_id", "sequence", "pair")
+    assert [[line[key] for key in same] for line in corrected] == [
+        [line[key] for key in same] for line in raw
+    ]
+    assert all(line["range_raw"] == r["range"] for line, r in zip(corrected, raw, strict=True))
+
+
+def test_the_nodes_give_what_the_library_gives_on_a_real_log(ros: Ros, apartment: Path):
+    log = apartment / "logs" / "19.log.xz"
+    mitigation = Mitigation(load_bundle(default_model_path()))
+    with open_decaranging(log) as source:
+        expected = [mitigation.correct(record.measurement) for record in source]
+    _, corrected = listen_to_replay(ros, len(expected), "source:=decaranging", f"path:={log}", "rate:=60.0")
+    assert [line["range"] for line in corrected] == [np.float32(item.range_m) for item in expected]
+    assert [line["variance"] for line in corrected] == [np.float32(item.variance_m2) for item in expected]
+    assert {line["status"] for line in corrected} == {int(Status.OK)}
+    assert {line["model_id"] for line in corrected} == {mitigation.bundle.model_id}
+
+
+def test_stamps_are_on_the_nodes_clock_and_spaced_as_recorded(ros: Ros, bag: Path):
+    with open_recording(bag) as source:
+        recorded = [record.measurement.stamp_ns for record in source]
+    received = ros.collect(RangeCir, RAW)
+    ros.start("driver", "source:=mcap", f"path:={bag}", "rate:=10.0", "start_delay:=0.5")
+    ros.spin_until(lambda: len(received) == 300)
+    stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in received]
+    assert abs(time.time_ns() - stamps[-1]) < 60e9
+    spacing = np.diff(stamps) * 10
+    assert np.abs(spacing - np.diff(recorded)).max() <= 10
+
+
+def test_recorded_stamps_and_clock_on_request(ros: Ros, bag: Path):
+    with open_recording(bag) as source:
+        recorded = [record.measurement.stamp_ns for record in source]
+    received = ros.collect(RangeCir, RAW)
+    clock = ros.collect(Clock, "/clock")
+    ros.start(
+        "driver", "source:=mcap", f"path:={bag}", "rate:=10.0", "start_delay:=0.5", "publish_clock:=true"
+    )
+    ros.spin_until(lambda: len(received) == 300)
+    assert [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in received] == recorded
+    times = [m.clock.sec * 10**9 + m.clock.nanosec for m in clock]
+    assert times == sorted(times)
+    assert recorded[0] <= times[-1] <= recorded[-1]
+
+
+def test_truth_is_published_beside_the_ranges(ros: Ros, bag: Path):
+    truths = ros.collect(RangeTruth, "/uwb/range_truth")
+    received = ros.collect(RangeCir, RAW)
+    ros.start("driver", "source:=mcap", f"path:={bag}", "rate:=10.0", "start_delay:=0.5")
+    ros.spin_until(lambda: len(received) == 300 and len(truths) == 300)
+    assert [t.header for t in truths] == [m.header for m in received]
+    assert all(t.range > 0 for t in truths)
+
+
+def test_a_loop_goes_on(ros: Ros, bag: Path):
+    received = ros.collect(RangeCir, RAW)
+    driver = ros.start(
+        "driver", "source:=mcap", f"path:={bag}", "rate:=20.0", "start_delay:=0.2", "loop:=true"
+    )
+    ros.spin_until(lambda: len(received) > 650)
+    assert driver.signal(signal.SIGINT) == 0, driver.output
+
+
+def test_the_simulated_source_runs_until_it_is_told_to_stop(ros: Ros):
+    received = ros.collect(RangeCir, RAW)
+    driver = ros.start("driver", "simulated_rate:=100.0", "start_delay:=0.2")
+    ros.spin_until(lambda: len(received) > 50)
+    status = ros.diagnosis("driver", lambda status: bool(status.values))
+    assert status.hardware_id == "simulated"
+    assert driver.signal(signal.SIGTERM) == 0, driver.output
+    assert "Traceback" not in driver.output
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_mitigator_cleanly(ros: Ros, number: signal.Signals):
+    mitigator = ros.start("mitigator")
+    mitigator.wait_for_output("correcting with model")
+    assert mitigator.signal(number) == 0, mitigator.output
+    assert "Traceback" not in mitigator.output
+
+
+@pytest.mark.parametrize(
+    ("parameters", "named"),
+    [
+        (("source:=mcap", "path:=/nonexistent/bag.mcap"), "/nonexistent/bag.mcap"),
+        (("source:=mcap",), "path"),
+        (("source:=carrier_pigeon",), "one of mcap, decaranging, simulated"),
+        (("rate:=-1.0",), "rate"),
+        (("rate:=.nan",), "rate"),
+        (("loop:=3",), "loop"),
+    ],
+)
+def test_a_driver_without_a_source_says_why_and_leaves(ros: Ros, parameters: tuple[str, ...], named: str):
+    driver = ros.start("driver", *parameters)
+    assert driver.wait() == 1
+    assert named in driver.output
+    assert "Traceback" not in driver.output
+
+
+def test_a_damaged_bag_is_played_up_to_the_damage(ros: Ros, bag: Path, tmp_path: Path):
+    torn = tmp_path / "torn.mcap"
+    torn.write_bytes(bag.read_bytes()[: bag.stat().st_size // 2])
+    received = ros.collect(RangeCir, RAW)
+    driver = ros.start("driver", "source:=mcap", f"path:={torn}", "rate:=20.0", "start_delay:=0.5")
+    assert driver.wait() == 1
+    ros.spin_for(0.3)
+    assert 0 < len(received) < 300
+    assert "torn.mcap" in driver.output
+
+
+def test_without_autostart_nothing_happens_until_asked(ros: Ros, bag: Path):
+    received = ros.collect(RangeCir, RAW)
+    ros.start("driver", "source:=mcap", f"path:={bag}", "rate:=20.0", "start_delay:=0.2", "autostart:=false")
+    assert ros.state_of("driver") == "unconfigured"
+    assert ros.change_state("driver", Transition.TRANSITION_CONFIGURE)
+    assert ros.state_of("driver") == "inactive"
+    assert received == []
+    assert ros.change_state("driver", Transition.TRANSITION_ACTIVATE)
+    ros.spin_until(lambda: len(received) == 300)
+
+
+def test_a_mitigator_without_a_usable_model_stays_inactive_and_can_be_mended(ros: Ros, tmp_path: Path):
+    model = tmp_path / "model.onnx"
+    model.write_bytes(default_model_path().read_bytes()[:-100])
+    mitigator = ros.start("mitigator", f"model:={model}")
+    status = ros.diagnosis("mitigator", lambda status: status.level == DiagnosticStatus.ERROR)
+    assert str(model) in status.message
+    assert ros.state_of("mitigator") == "inactive"
+    shutil.copy(default_model_path(), model)
+    assert ros.change_state("mitigator", Transition.TRANSITION_ACTIVATE)
+    assert ros.state_of("mitigator") == "active"
+    assert mitigator.popen.poll() is None
+
+
+def test_every_transition_can_be_repeated(ros: Ros):
+    ros.start("mitigator")
+    for _ in range(2):
+        ros.spin_until(lambda: ros.state_of("mitigator") == "active")
+        assert ros.change_state("mitigator", Transition.TRANSITION_DEACTIVATE)
+        assert ros.change_state("mitigator", Transition.TRANSITION_CLEANUP)
+        assert ros.state_of("mitigator") == "unconfigured"
+        assert ros.change_state("mitigator", Transition.TRANSITION_CONFIGURE)
+        assert ros.change_state("mitigator", Transition.TRANSITION_ACTIVATE)
+    publisher = ros.node.create_publisher(RangeCir, RAW, 10)
+    corrected = ros.collect(RangeCorrected, CORRECTED)
+    ros.spin_until(lambda: publisher.get_subscription_count() == 1)
+    ros.wait_for_publishers(CORRECTED, 1)
+    ros.spin_for(0.5)
+    publisher.publish(good_message())
+    ros.spin_until(lambda: len(corrected) == 1)
+
+
+def good_message() -> RangeCir:
+    record = next(iter(SimulatedSource(seed=5, count=1)))
+    return messages.to_range_cir(record.measurement, messages.to_header(1_500_000_000, "antenna"))
+
+
+def changed(**fields) -> RangeCir:
+    message = good_message()
+    for name, value in fields.items():
+        owner = message.cir if hasattr(message.cir, name) else message
+        setattr(owner, name, value)
+    return message
+
+
+@pytest.mark.parametrize(
+    ("message", "status"),
+    [
+        pytest.param(changed(samples=array("h")), Status.NO_CIR, id="no samples"),
+        pytest.param(changed(samples=array("h", [1, 2, 3])), Status.BAD_CIR, id="too short"),
+        pytest.param(changed(samples=array("h", bytes(4064))), Status.BAD_CIR, id="all zero"),
+        pytest.param(changed(samples=array("h", [32767] * 2032)), Status.BAD_CIR, id="saturated"),
+        pytest.param(changed(first_path_index=2000.0), Status.BAD_CIR, id="first path outside"),
+        pytest.param(changed(first_path_index=math.nan), Status.BAD_CIR, id="no first path"),
+        pytest.param(changed(preamble_count=0), Status.BAD_CIR, id="no preamble count"),
+        pytest.param(changed(rx_power=math.nan), Status.BAD_CIR, id="no receive power"),
+        pytest.param(changed(encoding=9), Status.NO_CIR, id="unknown encoding"),
+        pytest.param(changed(scale=math.inf), Status.BAD_CIR, id="infinite scale"),
+    ],
+)
+def test_a_range_that_cannot_be_corrected_passes_through(quiet_mitigator, message: RangeCir, status: Status):
+    answer = quiet_mitigator(message)
+    assert answer.status == status
+    assert answer.range == answer.range_raw == message.range
+    assert answer.correction == 0.0
+    assert answer.variance > quiet_mitigator(good_message()).variance
+
+
+@pytest.mark.parametrize("range_m", [math.nan, math.inf, -1.0])
+def test_a_range_that_is_none_passes_through_without_weight(quiet_mitigator, range_m: float):
+    answer = quiet_mitigator(changed(range=range_m))
+    assert answer.status != Status.OK
+    assert np.array_equal([answer.range], [range_m], equal_nan=True)
+    assert answer.variance == math.inf
+
+
+@pytest.fixture(scope="module")
+def quiet_mitigator(tmp_path_factory: pytest.TempPathFactory):
+    """A function that sends one raw range to a running mitigator and returns its answer."""
+    with domain(tmp_path_factory.mktemp("mitigator")) as ros:
+        ros.start("mitigator")
+        publisher = ros.node.create_publisher(RangeCir, RAW, 10)
+        corrected = ros.collect(RangeCorrected, CORRECTED)
+        ros.spin_until(lambda: publisher.get_subscription_count() == 1)
+        ros.wait_for_publishers(CORRECTED, 1)
+        ros.spin_for(0.5)
+
+        def ask(message: RangeCir) -> RangeCorrected:
+            corrected.clear()
+            publisher.publish(message)
+            ros.spin_until(lambda: len(corrected) == 1)
+            return corrected[0]
+
+        yield ask
+
+
+def test_nodes_of_a_namespace_keep_to_themselves(ros: Ros):
+    raw = ros.collect(RangeCir, "/board1/uwb/range_raw")
+    corrected = ros.collect(RangeCorrected, "/board1/uwb/range_corrected")
+    elsewhere = ros.collect(RangeCir, RAW)
+    namespace = ("-r", "__ns:=/board1")
+    mitigator = ros.start("mitigator", arguments=namespace)
+    mitigator.wait_for_output("correcting with model")
+    ros.start("driver", "count:=20", "simulated_rate:=100.0", arguments=namespace)
+    ros.spin_until(lambda: len(raw) == 20 and len(corrected) == 20)
+    assert elsewhere == []
+
+
+def run_demo(*arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "uwb_mitigation.nodes.demo", *arguments]
+    environment = {k: v for k, v in os.environ.items() if k != "ROS_DOMAIN_ID"}
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment, check=False)
+
+
+def test_the_demo_replays_a_log_and_sums_it_up(apartment: Path):
+    result = run_demo("--recording", str(apartment / "logs" / "19.log.xz"), "--rate", "40")
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert "0 lost" in result.stdout
+    assert "corrected MAE" in result.stdout
+
+
+def test_the_demo_names_a_recording_that_is_not_there():
+    result = run_demo("--recording", "/nonexistent.log")
+    assert result.returncode == 1
+    assert "/nonexistent.log" in result.stdout

@@ -1,0 +1,145 @@
+"""Playing a source at its pace: order, times, pauses, looping, stopping and errors."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
+
+from rclpy.clock import Clock, ClockType
+
+from uwb_mitigation.errors import DamagedRecordingError, UwbMitigationError
+from uwb_mitigation.measurement import Cir, RangeMeasurement
+from uwb_mitigation.nodes.playback import Playback
+from uwb_mitigation.sources.source import Record
+
+NO_CIR = Cir(np.zeros(0, np.int16))
+
+
+class ListSource:
+    """Records at given times; may end in damage."""
+
+    name = "list"
+    simulated = True
+
+    def __init__(self, stamps_ns: list[int], error: UwbMitigationError | None = None) -> None:
+        self.stamps_ns = stamps_ns
+        self.error = error
+        self.skipped: Counter[str] = Counter()
+
+    def __iter__(self):
+        for index, stamp_ns in enumerate(self.stamps_ns):
+            yield Record(RangeMeasurement(stamp_ns, 1, 2, index, 0, 1.0, NO_CIR))
+        if self.error is not None:
+            raise self.error
+
+    def close(self) -> None:
+        pass
+
+
+class Player:
+    """A playback whose calls are noted."""
+
+    def __init__(self, source: ListSource, stop_after: int = 0, **options) -> None:
+        self.clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self.published: list[tuple[int, int]] = []
+        self.clock_times: list[int] = []
+        self.ends: list[UwbMitigationError | None] = []
+        self.ended = threading.Event()
+        self.stop_after = stop_after
+        settings = {"rate": 1.0, "loop": False, "longest_pause_s": 100.0, "recorded_stamps": False}
+        self.playback = Playback(
+            source,
+            self.clock,
+            **(settings | options),
+            ready=lambda: True,
+            publish=self.publish,
+            on_time=self.clock_times.append,
+            on_end=self.end,
+        )
+
+    def publish(self, record: Record, stamp_ns: int) -> None:
+        self.published.append((record.measurement.stamp_ns, stamp_ns))
+        if len(self.published) == self.stop_after:
+            self.playback.stop()
+            self.ended.set()
+
+    def end(self, error: UwbMitigationError | None) -> None:
+        self.ends.append(error)
+        self.ended.set()
+
+    def play(self) -> Player:
+        self.playback.start()
+        assert self.ended.wait(20)
+        self.playback.stop()
+        return self
+
+
+def offsets(player: Player) -> list[int]:
+    first = player.published[0][1]
+    return [stamp - first for _, stamp in player.published]
+
+
+def test_records_come_in_order_and_the_end_is_told_once():
+    player = Player(ListSource([5, 10, 20])).play()
+    assert [recorded for recorded, _ in player.published] == [5, 10, 20]
+    assert player.ends == [None]
+
+
+def test_stamps_keep_the_recorded_distances_divided_by_the_rate():
+    player = Player(ListSource([1_000_000_000, 1_020_000_000, 1_080_000_000]), rate=2.0).play()
+    assert offsets(player) == [0, 10_000_000, 40_000_000]
+
+
+def test_a_record_is_never_published_before_its_stamp():
+    source = ListSource([0, 30_000_000, 60_000_000])
+    player = Player(source)
+    early = []
+    publish = player.publish
+    player.playback._publish = lambda record, stamp_ns: (
+        early.append(player.clock.now().nanoseconds < stamp_ns),
+        publish(record, stamp_ns),
+    )
+    player.play()
+    assert early == [False, False, False]
+
+
+def test_a_long_pause_is_cut():
+    player = Player(ListSource([0, 3_600_000_000_000]), longest_pause_s=0.05).play()
+    assert offsets(player) == [0, 50_000_000]
+
+
+def test_recorded_stamps_stay_and_the_clock_leads_up_to_them():
+    stamps = [1_000_000_000, 1_100_000_000]
+    player = Player(ListSource(stamps), recorded_stamps=True).play()
+    assert [stamp for _, stamp in player.published] == stamps
+    assert player.clock_times == sorted(player.clock_times)
+    assert player.clock_times[0] == stamps[0]
+    assert player.clock_times[-1] == stamps[1]
+    assert len(player.clock_times) >= 4
+
+
+def test_a_loop_goes_on_in_time():
+    player = Player(ListSource([0, 10_000_000, 20_000_000]), stop_after=7, loop=True).play()
+    assert offsets(player) == [step * 10_000_000 for step in range(7)]
+
+
+def test_damage_is_told_after_everything_before_it_was_played():
+    damage = DamagedRecordingError("torn", where="file:7")
+    player = Player(ListSource([0, 1], damage)).play()
+    assert len(player.published) == 2
+    assert player.ends == [damage]
+
+
+def test_a_stop_during_a_pause_ends_the_thread_and_tells_no_end():
+    player = Player(ListSource([0, 3_000_000_000_000]), longest_pause_s=1e4)
+    player.playback.start()
+    while not player.published:
+        pass
+    player.playback.stop()
+    assert not player.playback._thread.is_alive()
+    assert player.ends == []
