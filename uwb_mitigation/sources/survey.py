@@ -1,0 +1,161 @@
+"""Surveyed positions that lie beside a folder of logs: which log was made where, and what is true there.
+
+Three or four small CSV files with a header row: `pairs.csv` (file_number, anchor_location,
+tag_location), `anchors.csv` and `tags.csv` (location, x, y in metres), and optionally `labels.csv`
+(file_id, label). The true distance is the Euclidean one in the plane: the antennas stand level.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+from uwb_mitigation.errors import RecordingError
+from uwb_mitigation.measurement import Truth
+
+MAX_CSV_BYTES = 1 << 20
+MAX_LOCATION = (1 << 64) - 1
+"""A location's number serves as a 64-bit identity."""
+
+_Value = TypeVar("_Value")
+
+
+@dataclass(frozen=True, slots=True)
+class Placement:
+    """Where one log was made: location numbers of anchor and tag, and the truth that follows."""
+
+    anchor: int
+    tag: int
+    truth: Truth
+
+
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """The surveyed placements of a folder's logs, by log number."""
+
+    folder: Path
+    placements: dict[int, Placement]
+
+    @classmethod
+    def find(cls, folder: Path) -> Survey | None:
+        """The survey in `folder` or else in its parent; None where neither holds a `pairs.csv`.
+
+        Raises:
+            RecordingError: the survey is incomplete or malformed.
+        """
+        folder = folder.resolve()
+        for candidate in (folder, folder.parent):
+            if (candidate / "pairs.csv").is_file():
+                return cls.load(candidate)
+        return None
+
+    @classmethod
+    def load(cls, folder: Path) -> Survey:
+        """Read the survey of `folder`; configurations are named `<folder name>/<log number>`.
+
+        Raises:
+            RecordingError: a file is absent (`labels.csv` may be), malformed, names a location
+                that was not surveyed, or says two things of one number.
+        """
+        anchors = _positions(folder / "anchors.csv")
+        tags = _positions(folder / "tags.csv")
+        labels = _labels(folder / "labels.csv") if (folder / "labels.csv").is_file() else {}
+        placements: dict[int, Placement] = {}
+        path = folder / "pairs.csv"
+        for line, (number_text, anchor_text, tag_text) in _rows(
+            path, ("file_number", "anchor_location", "tag_location")
+        ):
+            where = f"{path}: line {line}"
+            number, anchor, tag = (_count(text, where) for text in (number_text, anchor_text, tag_text))
+            for kind, location, surveyed in (("anchor", anchor, anchors), ("tag", tag, tags)):
+                if location not in surveyed:
+                    raise RecordingError(
+                        f"{kind} location {location} was not surveyed",
+                        where=where,
+                        valid=f"a location of {kind}s.csv",
+                    )
+            truth = Truth(
+                range_m=math.dist(anchors[anchor], tags[tag]),
+                label=labels.get(number, ""),
+                configuration=f"{folder.name}/{number}",
+            )
+            _put(placements, number, Placement(anchor, tag, truth), where)
+        return cls(folder, placements)
+
+
+def _positions(path: Path) -> dict[int, tuple[float, float]]:
+    positions: dict[int, tuple[float, float]] = {}
+    for line, (location, x, y) in _rows(path, ("location", "x", "y")):
+        where = f"{path}: line {line}"
+        _put(positions, _count(location, where), (_metres(x, where), _metres(y, where)), where)
+    return positions
+
+
+def _labels(path: Path) -> dict[int, str]:
+    labels: dict[int, str] = {}
+    for line, (number, label) in _rows(path, ("file_id", "label")):
+        where = f"{path}: line {line}"
+        _put(labels, _count(number, where), label.strip(), where)
+    return labels
+
+
+def _rows(path: Path, columns: tuple[str, ...]) -> list[tuple[int, list[str]]]:
+    """Line number and the values of `columns` of each row; blank rows are passed over."""
+    try:
+        with path.open("rb") as file:
+            data = file.read(MAX_CSV_BYTES + 1)
+    except OSError as error:
+        raise RecordingError(
+            f"cannot read the survey: {error.strerror}",
+            where=str(path),
+            valid=f"a CSV file with the columns {', '.join(columns)}",
+        ) from error
+    if len(data) > MAX_CSV_BYTES:
+        raise RecordingError("the file is too large", where=str(path), valid=f"{MAX_CSV_BYTES} bytes at most")
+    rows: list[tuple[int, list[str]]] = []
+    try:
+        reader = csv.DictReader(io.StringIO(data.decode("utf-8-sig"), newline=""), strict=True)
+        absent = [name for name in columns if name not in (reader.fieldnames or ())]
+        if absent:
+            raise RecordingError(
+                f"the column {absent[0]} is absent", where=str(path), valid=", ".join(columns)
+            )
+        for row in reader:
+            values = [row[name] for name in columns]
+            if None in values:
+                raise RecordingError(
+                    "the row is too short",
+                    where=f"{path}: line {reader.line_num}",
+                    valid=", ".join(columns),
+                )
+            rows.append((reader.line_num, values))
+    except (csv.Error, UnicodeDecodeError) as error:
+        raise RecordingError(f"not a CSV file: {error}", where=str(path), valid=", ".join(columns)) from error
+    return rows
+
+
+def _put(table: dict[int, _Value], key: int, value: _Value, where: str) -> None:
+    if key in table:
+        raise RecordingError(f"the number {key} is there twice", where=where, valid="one row for each")
+    table[key] = value
+
+
+def _count(text: str, where: str) -> int:
+    stripped = text.strip()
+    if stripped.isascii() and stripped.isdigit() and len(stripped) <= 20 and int(stripped) <= MAX_LOCATION:
+        return int(stripped)
+    raise RecordingError(f"{text!r} is not a number of a file or location", where=where, valid="0, 1, 2, ...")
+
+
+def _metres(text: str, where: str) -> float:
+    try:
+        metres = float(text)
+    except ValueError:
+        metres = math.nan
+    if not math.isfinite(metres):
+        raise RecordingError(f"the coordinate {text!r} is not finite", where=where, valid="metres")
+    return metres
