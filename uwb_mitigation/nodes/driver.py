@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import State
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
@@ -79,7 +80,7 @@ def open_source(value: Callable[[str], Any]) -> Source:
     return SimulatedSource(seed=value("seed"), count=value("count"), rate_hz=value("simulated_rate"))
 
 
-class Driver(LifecycleNode):  # type: ignore[misc]
+class Driver(LifecycleNode):
     """Lifecycle: configure opens the source, activate plays it from its start, cleanup closes it.
 
     Attributes:
@@ -93,9 +94,7 @@ class Driver(LifecycleNode):  # type: ignore[misc]
         self._source: Source | None = None
         self._playback: Playback | None = None
         self._error: UwbMitigationError | None = None
-        self._diagnostics = self.create_publisher(
-            diagnostics.DiagnosticArray, topics.DIAGNOSTICS, topics.RANGES
-        )
+        self._diagnostics = self.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, topics.RANGES)
         self.create_timer(1.0, self._publish_diagnostics)
         if self._value("autostart"):
             self._autostart()
@@ -193,7 +192,7 @@ class Driver(LifecycleNode):  # type: ignore[misc]
                 )
                 return True
             return False
-        return now_ns - self._connected_ns >= self._value("start_delay") * 1e9
+        return bool(now_ns - self._connected_ns >= self._value("start_delay") * 1e9)
 
     def _publish(self, record: Record, stamp_ns: int) -> None:
         measurement = record.measurement

@@ -7,8 +7,10 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import State
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.subscription import Subscription
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
 from uwb_mitigation.errors import UwbMitigationError
@@ -26,7 +28,7 @@ PARAMETERS = (
 )
 
 
-class Mitigator(LifecycleNode):  # type: ignore[misc]
+class Mitigator(LifecycleNode):
     """Lifecycle: configure makes publisher and subscription, activate loads the model.
 
     A model that cannot be loaded leaves the node inactive and says so in the log and in the
@@ -40,10 +42,10 @@ class Mitigator(LifecycleNode):  # type: ignore[misc]
         self._mitigation: Mitigation | None = None
         self._error: UwbMitigationError | None = None
         self._statuses: Counter[Status] = Counter()
+        # rclpy serialises at once: one message serves every publication.
         self._message = RangeCorrected()
-        self._diagnostics = self.create_publisher(
-            diagnostics.DiagnosticArray, topics.DIAGNOSTICS, topics.RANGES
-        )
+        self._raw: Subscription | None = None
+        self._diagnostics = self.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, topics.RANGES)
         self.create_timer(1.0, self._publish_diagnostics)
         if self._value("autostart"):
             self.trigger_configure()

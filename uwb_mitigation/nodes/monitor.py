@@ -23,7 +23,7 @@ from uwb_mitigation.nodes.tally import Tally
 REFRESH_HZ = 5
 
 
-class Monitor(Node):  # type: ignore[misc]
+class Monitor(Node):
     """Feeds a tally from the three range topics."""
 
     def __init__(self) -> None:

@@ -57,14 +57,15 @@ class Parameter:
         if self.choices:
             return "one of " + ", ".join(self.choices)
         if self.low is not None and self.high is not None:
-            return f"{_TYPE_NAMES[type(self.default)]}, {self.low:g} to {self.high:g}"
+            low, high = (f"{bound:.10g}" for bound in (self.low, self.high))
+            return f"{_TYPE_NAMES[type(self.default)]}, {low} to {high}"
         return _TYPE_NAMES[type(self.default)]
 
     def check(self, value: Any) -> None:
         """Raise ParameterError unless `value` has the right type and lies in the range."""
         numeric = isinstance(self.default, float) and type(value) is int
         if type(value) is not type(self.default) and not numeric:
-            raise ParameterError(f"parameter {self.name} = {value!r}", valid=_TYPE_NAMES[type(self.default)])
+            raise ParameterError(f"parameter {self.name} = {value!r}", valid=self.valid)
         inside = True
         if self.choices:
             inside = value in self.choices
