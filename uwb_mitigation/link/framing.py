@@ -57,6 +57,7 @@ class DecoderCounts:
         bad_crc: of a frame's length, but damaged.
         oversize: stretches longer than the longest frame.
         foreign_versions: intact frames of other protocol versions, {version: count}.
+        last_foreign_version: the last one of them; None = there was none.
         bytes_received: all bytes fed.
         bytes_discarded: bytes of stretches that gave no frame, delimiters not counted.
     """
@@ -67,6 +68,7 @@ class DecoderCounts:
     bad_crc: int = 0
     oversize: int = 0
     foreign_versions: Counter[int] = field(default_factory=Counter)
+    last_foreign_version: int | None = None
     bytes_received: int = 0
     bytes_discarded: int = 0
 
@@ -76,7 +78,7 @@ class DecoderCounts:
         return self.bad_cobs + self.bad_length + self.bad_crc + self.oversize
 
 
-def encode_frame(frame: Frame) -> bytes:
+def encode_frame(frame: Frame, version: int = PROTOCOL_VERSION) -> bytes:
     """The frame as it goes on the wire, with a delimiter before and after.
 
     The leading one closes whatever noise, boot text or half a frame lies before it, so that a frame
@@ -87,24 +89,26 @@ def encode_frame(frame: Frame) -> bytes:
     """
     if len(frame.payload) > MAX_PAYLOAD_BYTES:
         raise ParameterError(f"a payload of {len(frame.payload)} bytes", valid=f"at most {MAX_PAYLOAD_BYTES}")
-    body = (
-        _header.pack(PROTOCOL_VERSION, frame.type, frame.flags, frame.sequence, frame.time_us) + frame.payload
-    )
+    body = _header.pack(version, frame.type, frame.flags, frame.sequence, frame.time_us) + frame.payload
     return b"".join(
         (DELIMITER, cobs.encode(body + zlib.crc32(body).to_bytes(CRC_BYTES, "little")), DELIMITER)
     )
 
 
 class FrameEncoder:
-    """Numbers and encodes the frames of one sender, from its start."""
+    """Numbers and encodes the frames of one sender, from its start.
 
-    def __init__(self) -> None:
+    Attributes:
+        sequence: of the next frame.
+    """
+
+    def __init__(self, version: int = PROTOCOL_VERSION) -> None:
         self.sequence = 0
-        """Of the next frame."""
+        self._version = version
 
     def encode(self, kind: int, payload: bytes, *, flags: int = 0, time_us: int = 0) -> bytes:
         """The next frame on the wire; see `encode_frame`."""
-        wire = encode_frame(Frame(kind, flags, self.sequence, time_us, payload))
+        wire = encode_frame(Frame(kind, flags, self.sequence, time_us, payload), self._version)
         self.sequence = (self.sequence + 1) % (1 << 32)
         return wire
 
@@ -180,6 +184,7 @@ class FrameDecoder:
         version, kind, flags, sequence, time_us = _header.unpack_from(body)
         if version != PROTOCOL_VERSION:
             counts.foreign_versions[version] += 1
+            counts.last_foreign_version = version
             return None
         counts.frames += 1
         return Frame(kind, flags, sequence, time_us, body[HEADER_BYTES:-CRC_BYTES])

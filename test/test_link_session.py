@@ -1,0 +1,461 @@
+"""A session with a board: handshake, versions, modes, stamps, losses; time and bytes are simulated."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from uwb_mitigation.errors import LinkError, ParameterError
+from uwb_mitigation.link import messages
+from uwb_mitigation.link.board import Board, Identity
+from uwb_mitigation.link.events import (
+    Answer,
+    Connected,
+    Disconnected,
+    Event,
+    Loss,
+    ModeChanged,
+    ModeRefused,
+    State,
+    VersionMismatch,
+)
+from uwb_mitigation.link.framing import Frame, FrameDecoder, FrameEncoder, encode_frame
+from uwb_mitigation.link.layout import Flag, LogLevel, MessageType, Mode
+from uwb_mitigation.link.messages import BoardStatus, Correction, Log
+from uwb_mitigation.link.session import BoardSession
+from uwb_mitigation.measurement import Cir, CorrectedRange, Origin, RangeMeasurement, Status
+
+MS = 10**6
+EPOCH = 1_760_000_000 * 10**9
+IDENTITY = Identity(board_id=0xB0, model_id=0xCAFE, window=157, firmware_name="simulated")
+
+
+class HalfMetre:
+    """A model that predicts half a metre of error for everything."""
+
+    def correct(self, measurement: RangeMeasurement) -> CorrectedRange:
+        range_m = measurement.range_m - 0.5
+        return CorrectedRange(
+            range_m, measurement.range_m, 0.5, 0.01, Status.OK, Origin.HOST, IDENTITY.model_id
+        )
+
+
+def measurement(sequence: int) -> RangeMeasurement:
+    return RangeMeasurement(
+        77, 1, 2, sequence, 1000 + sequence, 4.0, Cir(np.arange(314, dtype=np.int16), preamble_count=9)
+    )
+
+
+class Bench:
+    """A session and a board, joined by a link without delay; the board boots at time 0."""
+
+    def __init__(self, session: BoardSession, corrector: HalfMetre | None = None, **board: object) -> None:
+        self.session = session
+        self.now = 0
+        self.booted = 0
+        self.board = Board(IDENTITY, corrector, **board)
+        self.events: list[Event] = session.opened(0)
+
+    @property
+    def uptime_us(self) -> int:
+        return (self.now - self.booted) // 1000
+
+    def host_hears(self, data: bytes) -> list[Event]:
+        events = self.session.receive(data, self.now, EPOCH + self.now)
+        self.events += events
+        return events
+
+    def run(self, milliseconds: int, deaf: bool = False) -> None:
+        """Pass time in steps of 10 ms; `deaf`: nothing of what the host sends arrives."""
+        for _ in range(milliseconds // 10):
+            self.now += 10 * MS
+            self.events += self.session.tick(self.now, EPOCH + self.now)
+            request = self.session.outgoing()
+            answer = b"" if deaf else self.board.receive(request, self.uptime_us)
+            self.host_hears(answer + self.board.tick(self.uptime_us))
+
+    def measure(self, sequence: int, late_ns: int = 0) -> list[Event]:
+        data = self.board.measure(measurement(sequence), self.uptime_us)
+        self.now += late_ns
+        return self.host_hears(data)
+
+    def reboot(self, boot_id: int = 2, **board: object) -> None:
+        self.booted = self.now
+        self.board = Board(IDENTITY, HalfMetre(), boot_id=boot_id, **board)
+
+    def seen(self, kind: type) -> list[Event]:
+        return [event for event in self.events if isinstance(event, kind)]
+
+
+def connected(**session: object) -> Bench:
+    bench = Bench(BoardSession(**session), HalfMetre())
+    bench.run(500)
+    assert bench.session.state is State.READY
+    return bench
+
+
+def test_a_session_asks_who_is_there_and_is_connected_by_the_answer():
+    bench = Bench(BoardSession())
+    bench.run(20)
+
+    assert [type(event) for event in bench.events] == [Connected]
+    assert bench.session.hello.firmware_name == "simulated"
+    assert bench.session.hello.window == 157
+
+
+def test_it_asks_again_until_it_is_answered():
+    bench = Bench(BoardSession())
+    bench.run(2000, deaf=True)
+    assert bench.session.state is State.CONNECTING
+
+    bench.run(600)
+
+    assert bench.session.state is State.READY
+
+
+def test_the_hello_of_a_board_that_boots_connects_too():
+    bench = Bench(BoardSession())
+
+    assert isinstance(bench.host_hears(bench.board.hello(0))[0], Connected)
+
+
+def test_before_the_hello_nothing_is_delivered_but_counted():
+    bench = Bench(BoardSession())
+
+    assert bench.host_hears(b"boot: radio ok\r\n" + bench.board.measure(measurement(1), 0)) == []
+    assert bench.session.counts.withheld == 1
+
+
+def test_a_measurement_arrives_with_its_stamp_on_the_nodes_clock():
+    bench = connected()
+    took_place = EPOCH + bench.now
+
+    (event,) = bench.measure(5, late_ns=30 * MS)
+
+    assert event.sequence == 5
+    assert event.range_m == 4.0
+    assert event.stamp_ns == pytest.approx(took_place, abs=0.1 * MS)
+
+
+def test_in_both_mode_a_correction_has_the_stamp_of_its_measurement():
+    bench = connected(mode=Mode.BOTH)
+
+    raw, corrected = bench.measure(5)
+
+    assert isinstance(corrected, Correction)
+    assert corrected.stamp_ns == raw.stamp_ns
+    assert corrected.corrected.origin is Origin.DEVICE
+    assert corrected.corrected.range_m == 3.5
+
+
+@pytest.mark.parametrize(
+    ("mode", "kinds"),
+    [
+        (Mode.HOST, [RangeMeasurement]),
+        (Mode.DEVICE, [Correction]),
+        (Mode.BOTH, [RangeMeasurement, Correction]),
+    ],
+)
+def test_each_mode_sends_what_it_says(mode, kinds):
+    bench = connected(mode=mode)
+
+    assert [type(event) for event in bench.measure(1)] == kinds
+
+
+def test_a_mode_is_confirmed():
+    bench = connected()
+    bench.session.set_mode(Mode.DEVICE)
+    bench.run(100)
+
+    assert bench.seen(ModeChanged) == [ModeChanged(Mode.DEVICE)]
+    assert bench.board.mode is Mode.DEVICE
+
+
+def test_a_lost_request_for_a_mode_is_repeated():
+    bench = connected()
+    bench.session.set_mode(Mode.DEVICE)
+    bench.run(800, deaf=True)
+    bench.run(600)
+
+    assert bench.seen(ModeChanged) == [ModeChanged(Mode.DEVICE)]
+
+
+def test_a_board_without_a_model_refuses_to_correct_and_is_asked_once():
+    bench = Bench(BoardSession(mode=Mode.DEVICE))
+    bench.run(3000)
+
+    assert bench.seen(ModeRefused) == [ModeRefused(Mode.DEVICE, Mode.HOST)]
+    assert [type(event) for event in bench.measure(1)] == [RangeMeasurement]
+
+
+def test_after_a_reset_the_mode_is_asked_for_again():
+    bench = connected(mode=Mode.BOTH)
+    bench.reboot()
+    bench.host_hears(bench.board.hello(0))
+    bench.run(600)
+
+    assert bench.board.mode is Mode.BOTH
+
+
+def test_corrections_by_another_model_than_expected_are_withheld_and_ranges_are_not():
+    bench = connected(mode=Mode.BOTH, expected_model_id=0xBEEF)
+
+    assert [type(event) for event in bench.measure(1)] == [RangeMeasurement]
+    assert not bench.session.model_matches
+    assert bench.session.counts.wrong_model == 1
+
+
+def test_corrections_by_the_expected_model_are_delivered():
+    bench = connected(mode=Mode.DEVICE, expected_model_id=IDENTITY.model_id)
+
+    assert [type(event) for event in bench.measure(1)] == [Correction]
+    assert bench.session.model_matches
+
+
+def test_a_board_of_another_version_is_named_once_and_nothing_of_it_delivered():
+    bench = Bench(BoardSession(), version=7)
+    bench.run(5000)
+
+    assert bench.events == [VersionMismatch(7)]
+    assert bench.session.state is State.WRONG_VERSION
+    assert bench.session.foreign_version == 7
+    assert bench.measure(1) == []
+
+
+def test_a_board_that_gets_the_right_firmware_is_connected():
+    bench = Bench(BoardSession(), version=7)
+    bench.run(1000)
+    bench.reboot()
+    bench.run(1000)
+
+    assert bench.session.state is State.READY
+    assert bench.session.foreign_version is None
+
+
+def test_a_connected_board_that_is_flashed_with_another_version_is_noticed():
+    bench = connected()
+    bench.reboot(version=2)
+    bench.run(5000)
+
+    assert bench.seen(Disconnected) == [Disconnected(Loss.SILENT)]
+    assert bench.session.state is State.WRONG_VERSION
+
+
+def test_a_board_that_says_nothing_for_3_s_is_gone_and_comes_back():
+    bench = connected()
+    sleeping, bench.board = bench.board, Board(IDENTITY, version=1)
+    for _ in range(310):
+        bench.now += 10 * MS
+        bench.events += bench.session.tick(bench.now, EPOCH + bench.now)
+        bench.session.outgoing()
+    assert bench.seen(Disconnected) == [Disconnected(Loss.SILENT)]
+    assert bench.session.silent_ns(bench.now) > 3000 * MS
+
+    bench.board = sleeping
+    bench.run(600)
+
+    assert bench.session.state is State.READY
+
+
+def test_a_status_once_a_second_keeps_a_board_without_measurements_connected():
+    bench = connected()
+    bench.run(20_000)
+
+    assert bench.seen(Disconnected) == []
+    assert len(bench.seen(BoardStatus)) >= 19
+
+
+def test_a_reset_is_known_by_the_boot_id_and_restarts_the_clock():
+    bench = connected()
+    bench.run(10_000)
+    bench.reboot()
+    bench.host_hears(bench.board.hello(0))
+
+    assert bench.events[-2:] == [Disconnected(Loss.RESET), bench.seen(Connected)[-1]]
+    bench.run(1000)
+    took_place = EPOCH + bench.now
+    (event,) = bench.measure(1, late_ns=20 * MS)
+    assert event.stamp_ns == pytest.approx(took_place, abs=0.1 * MS)
+
+
+def test_a_reset_whose_hello_is_lost_is_known_by_the_numbering():
+    bench = connected()
+    bench.run(20_000)
+    bench.reboot()
+    bench.board.hello(0)
+    for sequence in range(3):
+        bench.measure(sequence)
+    assert bench.seen(Disconnected) == [Disconnected(Loss.OUT_OF_STEP)]
+
+    bench.run(100)
+
+    assert bench.session.state is State.READY
+
+
+def test_missing_frames_are_counted():
+    bench = connected()
+    bench.measure(1)
+    for lost in range(4):
+        bench.board.measure(measurement(lost), 0)
+
+    assert len(bench.measure(6)) == 1
+    assert bench.session.counts.lost == 4
+
+
+def test_a_frame_that_arrives_twice_is_delivered_once():
+    bench = connected()
+    data = bench.board.measure(measurement(1), bench.uptime_us)
+
+    assert len(bench.host_hears(data + data)) == 1
+    assert bench.session.counts.stale == 1
+
+
+def test_the_numbering_may_wrap():
+    bench = connected()
+    encoder = FrameEncoder()
+    encoder.sequence = 2**32 - 1
+    hello = messages.Hello(0xB0, 0, 0, Mode.HOST, boot_id=9)
+    bench.host_hears(encoder.encode(*messages.encode(hello)))
+
+    events = bench.host_hears(encoder.encode(*messages.encode(Log(LogLevel.INFO, "wrapped"))))
+
+    assert events == [Log(LogLevel.INFO, "wrapped")]
+    assert bench.session.counts.lost == 0
+
+
+def test_unknown_types_are_counted_and_skipped():
+    bench = connected()
+    sequence = bench.session._next_sequence
+    strange = encode_frame(Frame(99, 0, sequence, 0, b"from the future"))
+    own = encode_frame(Frame(MessageType.GET_INFO, 0, sequence + 1, 0, b""))
+
+    assert bench.host_hears(strange + own) == []
+    assert bench.session.counts.unknown_types == {99: 1, MessageType.GET_INFO: 1}
+
+
+def test_a_malformed_message_is_counted_and_explained():
+    bench = connected()
+    sequence = bench.session._next_sequence
+
+    assert bench.host_hears(encode_frame(Frame(MessageType.RANGE_CIR, 0, sequence, 0, b"short"))) == []
+    assert bench.session.counts.malformed == 1
+    assert "RANGE_CIR" in bench.session.last_malformed
+
+
+def test_the_board_corrects_what_the_host_sends_and_the_answer_bears_its_stamp():
+    bench = connected()
+
+    assert bench.session.correct(measurement(41))
+    bench.run(10)
+
+    (answer,) = bench.seen(Answer)
+    assert answer.correction.sequence == 41
+    assert answer.correction.stamp_ns == 77
+    assert answer.correction.corrected.correction_m == 0.5
+
+
+def test_an_answer_to_nothing_is_counted():
+    bench = connected()
+    correction = Correction(0, 1, 2, 3, 4, HalfMetre().correct(measurement(1)))
+    kind, payload = messages.encode(correction)
+    frame = Frame(int(kind), Flag.ANSWER, bench.session._next_sequence, 0, payload)
+
+    assert bench.host_hears(encode_frame(frame)) == []
+    assert bench.session.counts.unasked == 1
+
+
+def test_without_a_connection_nothing_is_sent_to_be_corrected():
+    assert not BoardSession().correct(measurement(1))
+
+
+def test_a_measurement_longer_than_the_board_accepts_is_refused():
+    session = BoardSession()
+    hello = messages.Hello(1, 1, 8, Mode.HOST, 1, max_payload=100)
+    session.receive(FrameEncoder().encode(*messages.encode(hello)), 0, 0)
+
+    with pytest.raises(LinkError, match="at most 100"):
+        session.correct(measurement(1))
+
+
+def test_a_measurement_that_fits_no_frame_is_refused():
+    bench = connected()
+    huge = RangeMeasurement(0, 1, 2, 3, 4, 5.0, Cir(np.zeros(4000, np.int16)))
+
+    with pytest.raises(ParameterError, match="4000"):
+        bench.session.correct(huge)
+
+
+def test_what_waits_to_be_sent_is_bounded():
+    bench = connected()
+    accepted = sum(bench.session.correct(measurement(i)) for i in range(1000))
+
+    assert len(bench.session.outgoing()) < 1 << 17
+    assert accepted < 1000
+    assert bench.session.counts.unsent == 1000 - accepted
+
+
+def test_opening_the_port_anew_ends_the_connection_and_voids_half_a_frame():
+    bench = connected()
+    data = bench.board.measure(measurement(1), bench.uptime_us)
+    bench.host_hears(data[:100])
+
+    assert bench.session.opened(bench.now) == [Disconnected(Loss.CLOSED)]
+    assert bench.host_hears(data[100:]) == []
+
+
+def test_the_clock_is_synchronised_soon_and_then_once_a_second():
+    bench = Bench(BoardSession())
+    requests = 0
+    for _ in range(1050):
+        bench.now += 10 * MS
+        bench.session.tick(bench.now, EPOCH + bench.now)
+        request = bench.session.outgoing()
+        requests += sum(frame.type == MessageType.TIME_SYNC for frame in FrameDecoder().feed(request))
+        bench.host_hears(bench.board.receive(request, bench.uptime_us))
+
+    assert bench.session.clock.synchronised
+    assert 8 + 8 <= requests <= 8 + 14
+
+
+encoded = st.builds(
+    lambda kind, flags, sequence, time_us, payload: encode_frame(
+        Frame(kind, flags, sequence, time_us, payload)
+    ),
+    st.sampled_from([*MessageType, 0, 99]),
+    st.integers(0, 3),
+    st.one_of(st.integers(0, 20), st.integers(0, 2**32 - 1)),
+    st.integers(0, 2**64 - 1),
+    st.one_of(st.binary(max_size=120), st.binary(min_size=48, max_size=90)),
+)
+hello = st.builds(
+    lambda boot, mode, sequence: encode_frame(
+        Frame(
+            MessageType.HELLO,
+            1,
+            sequence,
+            0,
+            messages.encode(messages.Hello(1, 2, 157, Mode(mode), boot, sequence, 4224))[1],
+        )
+    ),
+    st.integers(0, 3),
+    st.integers(0, 2),
+    st.integers(0, 20),
+)
+
+
+@settings(max_examples=200)
+@given(
+    st.lists(
+        st.tuples(st.one_of(encoded, hello, st.binary(max_size=60)), st.integers(0, 4 * 10**9)), max_size=30
+    )
+)
+def test_no_board_makes_a_session_fail(conversation):
+    session = BoardSession(mode=Mode.BOTH)
+    now = 0
+    for data, pause in conversation:
+        now += pause
+        session.receive(data, now, EPOCH + now)
+        assert len(session.outgoing()) < 1000
+    assert (session.hello is not None) == (session.state is State.READY)

@@ -1,0 +1,185 @@
+"""The board's side of the protocol, as firmware has it. No I/O.
+
+It is what the emulated board runs, and the shortest way to see what firmware must do.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Protocol
+
+from uwb_mitigation.errors import LinkError
+from uwb_mitigation.link import messages
+from uwb_mitigation.link.framing import Frame, FrameDecoder, FrameEncoder
+from uwb_mitigation.link.layout import (
+    MAX_PAYLOAD_BYTES,
+    PROTOCOL_VERSION,
+    Flag,
+    LogLevel,
+    Mode,
+)
+from uwb_mitigation.link.messages import (
+    BoardStatus,
+    Correction,
+    GetInfo,
+    Hello,
+    Log,
+    SetMode,
+    TimeSync,
+    TimeSyncReply,
+)
+from uwb_mitigation.measurement import CorrectedRange, RangeMeasurement
+
+STATUS_INTERVAL_US = 1_000_000
+
+_UNASKED = Flag(0)
+
+
+class Corrector(Protocol):
+    """What corrects on the board, such as `Mitigation`."""
+
+    def correct(self, measurement: RangeMeasurement) -> CorrectedRange: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """What a board says of itself in its HELLO; see `messages.Hello`."""
+
+    board_id: int = 0xE0
+    model_id: int = 0
+    window: int = 0
+    firmware_version: tuple[int, int, int] = (0, 1, 0)
+    firmware_name: str = "emulated"
+
+
+class Board:
+    """One start of a board, from boot to reset. `now_us` is its uptime.
+
+    Every method returns bytes to send, whole frames.
+
+    Args:
+        identity: what HELLO says.
+        corrector: the board's model; None = it has none and refuses any mode but HOST.
+        mode: the mode that it starts in.
+        boot_id: differs from one start to the next.
+        version: protocol version that it speaks; another than the host's shows a mismatch.
+    """
+
+    def __init__(
+        self,
+        identity: Identity,
+        corrector: Corrector | None = None,
+        *,
+        mode: Mode = Mode.HOST,
+        boot_id: int = 1,
+        version: int = PROTOCOL_VERSION,
+    ) -> None:
+        self._identity = identity
+        self._corrector = corrector
+        self._boot_id = boot_id
+        self._decoder = FrameDecoder()
+        self._encoder = FrameEncoder(version)
+        self._status_due_us = STATUS_INTERVAL_US
+        self._dropped = 0
+        self._measurements = 0
+        self.mode = mode if corrector is not None else Mode.HOST
+        self.measurements_lost = 0
+
+    def hello(self, now_us: int) -> bytes:
+        """The HELLO that follows the boot."""
+        return self._hello(now_us, None)
+
+    def measure(self, measurement: RangeMeasurement, now_us: int) -> bytes:
+        """Send a measurement received at `now_us`, as the mode says."""
+        self._measurements += 1
+        kind, payload = messages.encode(measurement)
+        sent = b""
+        if self.mode is not Mode.DEVICE:
+            sent += self._encoder.encode(kind, payload, time_us=now_us)
+        if self.mode is not Mode.HOST:
+            # A board computes from the binary32 values that it also sends.
+            held = messages.decode(kind, payload)
+            assert isinstance(held, RangeMeasurement)
+            sent += self._correct(held, now_us, _UNASKED)
+        return sent
+
+    def log(self, level: LogLevel, text: str, now_us: int) -> bytes:
+        """Send a line for a person."""
+        return self._send(Log(level, text), now_us)
+
+    def tick(self, now_us: int) -> bytes:
+        """The STATUS, when it is due."""
+        if now_us < self._status_due_us:
+            return b""
+        self._status_due_us = now_us + STATUS_INTERVAL_US
+        received = self._decoder.counts
+        status = BoardStatus(
+            frames_received=received.frames,
+            frames_dropped=received.corrupt + self._dropped,
+            measurements=self._measurements,
+            measurements_lost=self.measurements_lost,
+            mode=self.mode,
+        )
+        return self._send(status, now_us)
+
+    def receive(self, data: bytes, now_us: int) -> bytes:
+        """Answer what the host sent."""
+        foreign = self._decoder.counts.foreign_versions.total()
+        sent = b"".join(self._answer(frame, now_us) for frame in self._decoder.feed(data))
+        if self._decoder.counts.foreign_versions.total() > foreign:
+            # A host of another version learns from this which one the board speaks.
+            sent += self.hello(now_us)
+        return sent
+
+    def _answer(self, frame: Frame, now_us: int) -> bytes:
+        try:
+            message = messages.decode(frame.type, frame.payload)
+        except LinkError:
+            message = None
+        if isinstance(message, GetInfo):
+            return self._hello(now_us, frame.sequence)
+        if isinstance(message, SetMode):
+            if self._corrector is not None or message.mode is Mode.HOST:
+                self.mode = message.mode
+            return self._hello(now_us, frame.sequence)
+        if isinstance(message, TimeSync):
+            return self._send(TimeSyncReply(frame.sequence, now_us), now_us, Flag.ANSWER)
+        if isinstance(message, RangeMeasurement) and self._corrector is not None:
+            return self._correct(message, now_us, Flag.ANSWER)
+        self._dropped += 1
+        return b""
+
+    def _correct(self, measurement: RangeMeasurement, now_us: int, flags: Flag) -> bytes:
+        if self._corrector is None:
+            return b""
+        began_ns = time.perf_counter_ns()
+        corrected = self._corrector.correct(measurement)
+        correction = Correction(
+            0,
+            measurement.tag_id,
+            measurement.anchor_id,
+            measurement.sequence,
+            measurement.device_time,
+            corrected,
+            compute_us=(time.perf_counter_ns() - began_ns) // 1000,
+        )
+        return self._send(correction, now_us, flags)
+
+    def _hello(self, now_us: int, request: int | None) -> bytes:
+        hello = Hello(
+            board_id=self._identity.board_id,
+            model_id=self._identity.model_id,
+            window=self._identity.window,
+            mode=self.mode,
+            boot_id=self._boot_id,
+            request_sequence=request or 0,
+            max_payload=MAX_PAYLOAD_BYTES,
+            firmware_version=self._identity.firmware_version,
+            firmware_name=self._identity.firmware_name,
+        )
+        return self._send(hello, now_us, _UNASKED if request is None else Flag.ANSWER)
+
+    def _send(self, message: messages.Message, now_us: int, flags: Flag = _UNASKED) -> bytes:
+        kind, payload = messages.encode(message)
+        return self._encoder.encode(kind, payload, flags=flags, time_us=now_us)

@@ -1,0 +1,322 @@
+"""A board without hardware: plays measurements over a pseudo-terminal, with faults on demand.
+
+Linux and macOS only, as pseudo-terminals are.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import threading
+import time
+import tty
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+
+from uwb_mitigation.errors import ParameterError, RecordingError, UwbMitigationError
+from uwb_mitigation.link.board import Board, Corrector, Identity
+from uwb_mitigation.link.faults import ByteFaults, damage
+from uwb_mitigation.link.layout import PROTOCOL_VERSION, Mode
+from uwb_mitigation.measurement import RangeMeasurement
+from uwb_mitigation.sources.source import Source
+
+_READ_BYTES = 4096
+_FLOOD_BYTES = 4096
+_CLEAN = ByteFaults()
+_IDENTITY = Identity()
+
+MAX_BACKLOG_BYTES = 1 << 16
+"""What waits for a host that does not read; measurements beyond it are lost, and counted."""
+
+
+@dataclass(frozen=True, slots=True)
+class BoardFaults:
+    """What goes wrong on the way to the host.
+
+    Attributes:
+        channel: damage to bytes.
+        lose, duplicate: probabilities that what is sent at once is lost, or arrives twice.
+        stall_s: longest time that the bus holds back what is sent, at random.
+        boot_noise: bytes of noise before each HELLO.
+        version: protocol version that the board speaks.
+
+    Raises:
+        ParameterError: a probability is outside 0 to 1, or a length negative.
+    """
+
+    channel: ByteFaults = _CLEAN
+    lose: float = 0.0
+    duplicate: float = 0.0
+    stall_s: float = 0.0
+    boot_noise: int = 0
+    version: int = PROTOCOL_VERSION
+
+    def __post_init__(self) -> None:
+        for name in ("lose", "duplicate"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ParameterError(f"{name} = {getattr(self, name)}", valid="0 to 1")
+        for name in ("stall_s", "boot_noise"):
+            if not getattr(self, name) >= 0:
+                raise ParameterError(f"{name} = {getattr(self, name)}", valid="0 or more")
+
+
+_HEALTHY = BoardFaults()
+
+
+class EmulatedBoard:
+    """Opens a pseudo-terminal and behaves there as a board that plays `source` over and over.
+
+    Measurements keep their ids, sequence and device time; what they were stamped with is replaced by
+    the time of playing. The methods that make something go wrong may be called from any thread.
+
+    Args:
+        source: what the board measures; None = it never measures.
+        rate_hz: measurements per second.
+        identity, corrector, mode: see `Board`.
+        faults: what goes wrong all the time.
+        link: path of a symbolic link to the port, kept up to date; None = no link.
+        seed: of everything random.
+
+    Raises:
+        ParameterError: the rate is not finite and positive, or `link` names what is no symbolic link.
+
+    Attributes:
+        port: path of the port for the host to open; empty while unplugged.
+        failure: why playing ended early; None while all is well.
+    """
+
+    def __init__(
+        self,
+        source: Source | None = None,
+        *,
+        rate_hz: float = 50.0,
+        identity: Identity = _IDENTITY,
+        corrector: Corrector | None = None,
+        mode: Mode = Mode.HOST,
+        faults: BoardFaults = _HEALTHY,
+        link: Path | None = None,
+        seed: int = 0,
+    ) -> None:
+        if not 0 < rate_hz <= 1e6:
+            raise ParameterError(f"a rate of {rate_hz} Hz", valid="above 0, at most 1e6")
+        if link is not None and link.exists() and not link.is_symlink():
+            raise ParameterError("the port's link would replace a file", where=str(link))
+        self.port = ""
+        self.failure: UwbMitigationError | None = None
+        self.sent_measurements = 0
+        self._source = source
+        self._records = _endless(source)
+        self._period_s = 1 / rate_hz
+        self._identity = identity
+        self._corrector = corrector
+        self._mode = mode
+        self._faults = faults
+        self._link = link
+        self._random = np.random.default_rng(seed)
+        self._boots = int(self._random.integers(1, 1 << 31))
+        self._lock = threading.RLock()
+        self._stop = threading.Event()
+        self._fds: tuple[int, int] | None = None
+        self._backlog = bytearray()
+        self._mute_until = 0.0
+        self._flood_until = 0.0
+        self._stalled_until = 0.0
+        self.plug()
+        self._thread = threading.Thread(target=self._run, name="emulated board", daemon=True)
+        self._thread.start()
+
+    def plug(self) -> None:
+        """Plug the board in, usually under another name than before: it boots."""
+        with self._lock:
+            if self._fds is not None:
+                return
+            controller, port = os.openpty()
+            tty.setraw(port)
+            os.set_blocking(controller, False)
+            self._fds = (controller, port)
+            self.port = os.ttyname(port)
+            self._show_link()
+            self.reset()
+
+    def unplug(self) -> None:
+        """Pull the cable: the port is gone, and the board without power."""
+        with self._lock:
+            if self._fds is None:
+                return
+            for fd in self._fds:
+                os.close(fd)
+            self._fds = None
+            self.port = ""
+            if self._link is not None:
+                self._link.unlink(missing_ok=True)
+
+    def reset(self) -> None:
+        """Restart the firmware; the port stays."""
+        with self._lock:
+            self._boots += 1
+            self._booted_ns = time.monotonic_ns()
+            self._board = Board(
+                self._identity,
+                self._corrector,
+                mode=self._mode,
+                boot_id=self._boots,
+                version=self._faults.version,
+            )
+            # What the firmware had not yet sent is lost, in the middle of a frame or not.
+            self._backlog.clear()
+            self._backlog += self._random.bytes(self._faults.boot_noise)
+            self._transmit(self._board.hello(0))
+
+    def set_faults(self, faults: BoardFaults) -> None:
+        """Change what goes wrong; another protocol version holds from the next reset."""
+        with self._lock:
+            self._faults = faults
+
+    def mute(self, seconds: float) -> None:
+        """Send nothing for a while, as firmware that hangs."""
+        with self._lock:
+            self._mute_until = time.monotonic() + seconds
+
+    def flood(self, seconds: float) -> None:
+        """Send noise as fast as the port takes it."""
+        with self._lock:
+            self._flood_until = time.monotonic() + seconds
+
+    @property
+    def mode(self) -> Mode:
+        """The mode in force."""
+        return self._board.mode
+
+    def close(self) -> None:
+        """Unplug, and end the thread; may be called twice."""
+        self._stop.set()
+        self._thread.join()
+        self.unplug()
+
+    def __enter__(self) -> EmulatedBoard:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _show_link(self) -> None:
+        if self._link is None:
+            return
+        try:
+            self._link.unlink(missing_ok=True)
+            self._link.symlink_to(self.port)
+        except OSError as error:
+            self.unplug()
+            raise ParameterError(
+                f"cannot link to the port: {error.strerror}", where=str(self._link)
+            ) from error
+
+    def _run(self) -> None:
+        due = time.monotonic()
+        while not self._stop.is_set():
+            now = time.monotonic()
+            with self._lock:
+                plugged = self._fds is not None
+                if plugged and now >= due:
+                    self._measure()
+            if now >= due:
+                # After a pause the board does not make up for what it missed.
+                due = max(due + self._period_s, now - 0.1)
+            if plugged:
+                self._exchange(min(max(due - time.monotonic(), 0.0), 0.02))
+            else:
+                self._stop.wait(0.01)
+
+    def _measure(self) -> None:
+        try:
+            measurement = next(self._records, None)
+        except UwbMitigationError as error:
+            self.failure = error
+            self._records = iter(())
+            return
+        if measurement is not None:
+            if len(self._backlog) > MAX_BACKLOG_BYTES:
+                self._board.measurements_lost += 1
+            else:
+                self.sent_measurements += 1
+                self._transmit(self._board.measure(measurement, self._uptime_us()))
+
+    def _exchange(self, patience_s: float) -> None:
+        """Read from and write to the host, for at most `patience_s`."""
+        with self._lock:
+            if self._fds is None:
+                return
+            controller = self._fds[0]
+            held = time.monotonic() < max(self._mute_until, self._stalled_until)
+            sending = bool(self._backlog) and not held
+        try:
+            readable, writable, _ = select.select(
+                [controller], [controller] if sending else [], [], patience_s
+            )
+        except (OSError, ValueError):
+            return
+        with self._lock:
+            # While this waited, the cable may have been pulled, and plugged again.
+            if self._fds is None or self._fds[0] != controller:
+                return
+            if readable:
+                data = _read(controller)
+                self._transmit(self._board.receive(data, self._uptime_us()))
+            if time.monotonic() < self._flood_until and len(self._backlog) < _FLOOD_BYTES:
+                self._backlog += self._random.bytes(_FLOOD_BYTES)
+            self._transmit(self._board.tick(self._uptime_us()))
+            if writable:
+                written = _write(controller, self._backlog)
+                del self._backlog[:written]
+
+    def _transmit(self, data: bytes) -> None:
+        if not data or time.monotonic() < self._mute_until:
+            return
+        faults = self._faults
+        chances = self._random.random(3)
+        if chances[0] < faults.lose:
+            return
+        if chances[1] < faults.duplicate:
+            data += data
+        if faults.stall_s:
+            self._stalled_until = time.monotonic() + faults.stall_s * chances[2]
+        if faults.channel != _CLEAN:
+            data = damage(data, faults.channel, self._random).data
+        self._backlog += data
+
+    def _uptime_us(self) -> int:
+        return (time.monotonic_ns() - self._booted_ns) // 1000
+
+
+def _endless(source: Source | None) -> Iterator[RangeMeasurement]:
+    empty = True
+    while source is not None:
+        for record in source:
+            empty = False
+            yield record.measurement
+        if empty:
+            raise RecordingError("the source holds no measurements", where=source.name)
+
+
+def _read(fd: int) -> bytes:
+    try:
+        return os.read(fd, _READ_BYTES)
+    except OSError:
+        # A pseudo-terminal reports EIO while nobody has its other end open.
+        return b""
+
+
+def _write(fd: int, data: bytearray) -> int:
+    try:
+        return os.write(fd, data)
+    except OSError:
+        return 0

@@ -1,0 +1,347 @@
+"""What the host has to remember of a board: handshake, mode, clock, losses. No I/O.
+
+A `BoardSession` is handed the bytes that arrived and the time, and gives events and bytes to send; who
+owns the port calls `receive` after each read, `tick` at least ten times a second, and sends `outgoing`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TypeVar
+
+from uwb_mitigation.errors import LinkError
+from uwb_mitigation.link import messages
+from uwb_mitigation.link.clock import DeviceClock
+from uwb_mitigation.link.events import (
+    Answer,
+    Connected,
+    Disconnected,
+    Event,
+    Loss,
+    ModeChanged,
+    ModeRefused,
+    SessionCounts,
+    State,
+    VersionMismatch,
+)
+from uwb_mitigation.link.framing import DecoderCounts, Frame, FrameDecoder, FrameEncoder
+from uwb_mitigation.link.layout import Flag, MessageType, Mode
+from uwb_mitigation.link.messages import BoardStatus, Correction, Hello, Log, TimeSyncReply
+from uwb_mitigation.measurement import RangeMeasurement
+
+_MS = 10**6
+REQUEST_INTERVAL_NS = 500 * _MS
+"""Between two tries of a request that is not answered."""
+
+SYNC_INTERVAL_NS = 1000 * _MS
+"""Between two round trips for the clock, more or less: an even pace could beat with the board's work."""
+
+FIRST_SYNC_INTERVAL_NS = 47 * _MS
+FIRST_SYNCS = 8
+"""Round trips in quick succession after a HELLO, until the clock stands."""
+
+SILENCE_NS = 3000 * _MS
+"""A board says something at least once a second; after this long without it is taken for gone."""
+
+MAX_GAP = 1 << 20
+"""More frames missing at once than a link can carry in any silence: the numbers are those of another start."""
+
+_MAX_STALE = 3
+_MAX_AWAITED = 1024
+_GOLDEN = 0.618
+_MAX_OUTGOING_BYTES = 1 << 16
+_SEQUENCES = 1 << 32
+_STAMPED = (MessageType.RANGE_CIR, MessageType.RANGE_CORRECTED)
+
+_Key = TypeVar("_Key")
+_Value = TypeVar("_Value")
+
+
+class BoardSession:
+    """The host's side of the protocol with one board.
+
+    Two clocks are handed in: `now_ns` is steady and measures intervals; `stamp_ns` is the node's clock,
+    which the stamps of measurements are on. Both are to be read just after the bytes were.
+
+    Args:
+        mode: what the board is to send; None leaves that to the board.
+        expected_model_id: identity of the model that the board should hold; corrections by another are
+            counted and not delivered. None accepts any.
+
+    Attributes:
+        state: where the session stands.
+        hello: what the board last said of itself; None while not connected.
+        foreign_version: with WRONG_VERSION, the version that the board speaks.
+        last_malformed: what was wrong with the last frame counted as malformed.
+        counts: of frames; those of damaged bytes are in `decoder_counts`.
+        clock: the board's clock on the node's.
+    """
+
+    def __init__(self, *, mode: Mode | None = None, expected_model_id: int | None = None) -> None:
+        self.state = State.CONNECTING
+        self.hello: Hello | None = None
+        self.foreign_version: int | None = None
+        self.last_malformed = ""
+        self.counts = SessionCounts()
+        self.clock = DeviceClock()
+        self._decoder = FrameDecoder()
+        self._encoder = FrameEncoder()
+        self._expected_model_id = expected_model_id
+        self._outgoing = bytearray()
+        self._mode = mode
+        self._mode_pending: Mode | None = None
+        self._mode_requests: dict[int, None] = {}
+        self._boot: tuple[int, int] | None = None
+        self._next_request_ns = 0
+        self._next_sync_ns = 0
+        self._syncs = 0
+        self._syncs_sent: dict[int, int] = {}
+        self._awaited: dict[tuple[int, int, int, int], int] = {}
+        self._next_sequence = 0
+        self._stale_run = 0
+        self._foreign_frames = 0
+        self._heard_ns = 0
+
+    @property
+    def decoder_counts(self) -> DecoderCounts:
+        """What became of the bytes received."""
+        return self._decoder.counts
+
+    @property
+    def model_matches(self) -> bool:
+        """False if the connected board holds another model than the expected one."""
+        return (
+            self.hello is None
+            or self._expected_model_id is None
+            or self.hello.model_id == self._expected_model_id
+        )
+
+    def opened(self, now_ns: int) -> list[Event]:
+        """The port was opened: begin the handshake."""
+        return self.closed(now_ns)
+
+    def closed(self, now_ns: int) -> list[Event]:
+        """The port was lost or closed: what was half received or not yet sent is void."""
+        self._decoder.reset()
+        self._outgoing.clear()
+        self._heard_ns = now_ns
+        return self._disconnect(Loss.CLOSED, now_ns)
+
+    def silent_ns(self, now_ns: int) -> int:
+        """How long nothing intact has been received."""
+        return now_ns - self._heard_ns
+
+    def set_mode(self, mode: Mode) -> None:
+        """Ask the board for `mode`, until it answers; a `ModeChanged` or `ModeRefused` follows."""
+        self._mode = mode
+        self._mode_pending = mode
+        self._mode_requests.clear()
+        self._next_request_ns = 0
+
+    def correct(self, measurement: RangeMeasurement) -> bool:
+        """Have the board correct `measurement`; an `Answer` follows if it is lost on neither way.
+
+        Returns False, and sends nothing, while not connected or while too much waits to be sent.
+
+        Raises:
+            ParameterError: the measurement does not fit a frame.
+            LinkError: it is longer than the board accepts.
+        """
+        kind, payload = messages.encode(measurement)
+        if self.hello is None:
+            return False
+        if len(payload) > self.hello.max_payload:
+            raise LinkError(
+                f"a measurement of {len(payload)} bytes for the board {self.hello.board_id:#x}",
+                valid=f"at most {self.hello.max_payload}",
+            )
+        if self._send(kind, payload) is None:
+            return False
+        _remember(self._awaited, _identity(measurement), measurement.stamp_ns)
+        return True
+
+    def outgoing(self) -> bytes:
+        """Take what is to be sent; to be called, and its bytes sent, right after `receive` and `tick`."""
+        data = bytes(self._outgoing)
+        self._outgoing.clear()
+        return data
+
+    def receive(self, data: bytes, now_ns: int, stamp_ns: int) -> list[Event]:
+        """What the bytes that just arrived tell, in order. Raises nothing on any bytes."""
+        events: list[Event] = []
+        frames = self._decoder.feed(data)
+        if frames:
+            self._heard_ns = now_ns
+        for frame in frames:
+            events += self._accept(frame, now_ns, stamp_ns)
+        events += self._notice_foreign(now_ns)
+        return events + self.tick(now_ns, stamp_ns)
+
+    def tick(self, now_ns: int, stamp_ns: int) -> list[Event]:
+        """Let time pass: repeat requests, keep the clock, notice silence."""
+        events: list[Event] = []
+        if self.state is State.READY and self.silent_ns(now_ns) > SILENCE_NS:
+            events += self._disconnect(Loss.SILENT, now_ns)
+        if now_ns >= self._next_request_ns:
+            self._next_request_ns = now_ns + REQUEST_INTERVAL_NS
+            if self.state is not State.READY:
+                self._send(*messages.encode(messages.GetInfo()))
+            elif self._mode_pending is not None:
+                request = self._send(*messages.encode(messages.SetMode(self._mode_pending)))
+                if request is not None:
+                    _remember(self._mode_requests, request, None)
+        if self.state is State.READY and now_ns >= self._next_sync_ns:
+            self._sync(now_ns, stamp_ns)
+        return events
+
+    def _accept(self, frame: Frame, now_ns: int, stamp_ns: int) -> list[Event]:
+        try:
+            return self._understand(frame, now_ns, stamp_ns)
+        except LinkError as error:
+            self.counts.malformed += 1
+            self.last_malformed = str(error)
+            return []
+
+    def _understand(self, frame: Frame, now_ns: int, stamp_ns: int) -> list[Event]:
+        if frame.type == MessageType.HELLO:
+            return self._accept_hello(frame, now_ns)
+        if self.state is not State.READY:
+            self.counts.withheld += 1
+            return []
+        if not self._in_step(frame):
+            return self._disconnect(Loss.OUT_OF_STEP, now_ns) if self._stale_run >= _MAX_STALE else []
+        at_ns = 0
+        if frame.type in _STAMPED and not frame.flags & Flag.ANSWER:
+            at_ns = self.clock.stamp(frame.time_us, stamp_ns)
+        message = messages.decode(frame.type, frame.payload, stamp_ns=at_ns)
+        if isinstance(message, Correction):
+            return self._accept_correction(message, bool(frame.flags & Flag.ANSWER))
+        if isinstance(message, TimeSyncReply):
+            self._accept_sync(message, frame.time_us, stamp_ns)
+            return []
+        if isinstance(message, RangeMeasurement | Log | BoardStatus):
+            return [message]
+        # The host's own types are as strange from a board as those that nobody knows.
+        self.counts.unknown_types[frame.type] += 1
+        return []
+
+    def _accept_hello(self, frame: Frame, now_ns: int) -> list[Event]:
+        hello = messages.decode(frame.type, frame.payload)
+        assert isinstance(hello, Hello)
+        boot = (hello.board_id, hello.boot_id)
+        events: list[Event] = []
+        if self.state is State.READY:
+            if boot != self._boot:
+                events += self._disconnect(Loss.RESET, now_ns)
+            elif not self._in_step(frame):
+                return []
+        if boot != self._boot:
+            self.clock.reset()
+            self._boot = boot
+        self.hello = hello
+        if self.state is not State.READY:
+            self.state = State.READY
+            self.counts.connections += 1
+            self.foreign_version = None
+            self._next_sequence = (frame.sequence + 1) % _SEQUENCES
+            self._stale_run = 0
+            self._syncs = 0
+            self._next_sync_ns = now_ns
+            self._mode_pending = None if self._mode == hello.mode else self._mode
+            self._next_request_ns = now_ns
+            events.append(Connected(hello))
+        elif frame.flags & Flag.ANSWER and hello.request_sequence in self._mode_requests:
+            wanted, self._mode_pending = self._mode_pending, None
+            self._mode_requests.clear()
+            if wanted is not None:
+                changed = hello.mode == wanted
+                events.append(ModeChanged(wanted) if changed else ModeRefused(wanted, hello.mode))
+        return events
+
+    def _accept_correction(self, correction: Correction, answer: bool) -> list[Event]:
+        if not self.model_matches:
+            self.counts.wrong_model += 1
+            return []
+        if not answer:
+            return [correction]
+        stamp_ns = self._awaited.pop(_identity(correction), None)
+        if stamp_ns is None:
+            self.counts.unasked += 1
+            return []
+        return [Answer(replace(correction, stamp_ns=stamp_ns))]
+
+    def _accept_sync(self, reply: TimeSyncReply, replied_us: int, stamp_ns: int) -> None:
+        sent_ns = self._syncs_sent.pop(reply.request_sequence, None)
+        if sent_ns is None:
+            self.counts.unasked += 1
+        else:
+            self.clock.exchange(sent_ns, reply.received_us, replied_us, stamp_ns)
+
+    def _in_step(self, frame: Frame) -> bool:
+        gap = (frame.sequence - self._next_sequence) % _SEQUENCES
+        if gap > MAX_GAP:
+            self.counts.stale += 1
+            self._stale_run += 1
+            return False
+        self.counts.lost += gap
+        self._next_sequence = (frame.sequence + 1) % _SEQUENCES
+        self._stale_run = 0
+        return True
+
+    def _notice_foreign(self, now_ns: int) -> list[Event]:
+        counts = self._decoder.counts
+        seen = counts.foreign_versions.total()
+        if seen == self._foreign_frames:
+            return []
+        self._foreign_frames = seen
+        version = counts.last_foreign_version
+        # A connected board of the right version may be preceded in the buffers by what ran before it.
+        if self.state is State.READY or version is None:
+            return []
+        self._heard_ns = now_ns
+        if self.state is State.WRONG_VERSION and version == self.foreign_version:
+            return []
+        self.state = State.WRONG_VERSION
+        self.foreign_version = version
+        return [VersionMismatch(version)]
+
+    def _disconnect(self, loss: Loss, now_ns: int) -> list[Event]:
+        was_ready = self.state is State.READY
+        self.state = State.CONNECTING
+        self.hello = None
+        self.foreign_version = None
+        self._mode_requests.clear()
+        self._syncs_sent.clear()
+        self._awaited.clear()
+        self._next_request_ns = now_ns
+        return [Disconnected(loss)] if was_ready else []
+
+    def _sync(self, now_ns: int, stamp_ns: int) -> None:
+        request = self._send(*messages.encode(messages.TimeSync()))
+        if request is not None:
+            _remember(self._syncs_sent, request, stamp_ns)
+        self._syncs += 1
+        if self._syncs < FIRST_SYNCS:
+            self._next_sync_ns = now_ns + FIRST_SYNC_INTERVAL_NS
+        else:
+            self._next_sync_ns = now_ns + round(SYNC_INTERVAL_NS * (0.7 + self._syncs * _GOLDEN % 0.6))
+
+    def _send(self, kind: MessageType, payload: bytes) -> int | None:
+        """Queue a frame; its sequence number, or None if too much waits already."""
+        if len(self._outgoing) + len(payload) > _MAX_OUTGOING_BYTES:
+            self.counts.unsent += 1
+            return None
+        sequence = self._encoder.sequence
+        self._outgoing += self._encoder.encode(kind, payload)
+        return sequence
+
+
+def _identity(exchange: RangeMeasurement | Correction) -> tuple[int, int, int, int]:
+    return exchange.tag_id, exchange.anchor_id, exchange.sequence, exchange.device_time
+
+
+def _remember(memory: dict[_Key, _Value], key: _Key, value: _Value) -> None:
+    """Add to a memory of bounded size, which forgets the oldest."""
+    memory[key] = value
+    if len(memory) > _MAX_AWAITED:
+        del memory[next(iter(memory))]
