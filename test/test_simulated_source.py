@@ -1,0 +1,181 @@
+"""Simulated measurements: seeded, honest about what they are, with a truth that fits."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.measurement import DEVICE_TICK_HZ
+from uwb_mitigation.preprocessing import Preprocessing
+from uwb_mitigation.simulation.radio import TAPS, Radio
+from uwb_mitigation.simulation.scene import ROUTE, FloorPlan, along_route
+from uwb_mitigation.sources.simulated import FIRST_TAG_ID, NOT_RECEIVED, SimulatedSource, SimulatedSurvey
+from uwb_mitigation.sources.source import Record
+
+
+def values(record: Record) -> tuple[object, ...]:
+    """All that a record holds, comparable: `Cir` and `RangeMeasurement` compare by identity."""
+    m = record.measurement
+    fields = [getattr(m, name) for name in m.__slots__ if name != "cir"]
+    fields += [getattr(m.cir, name) for name in m.cir.__slots__ if name != "samples"]
+    return (*fields, m.cir.samples.tobytes(), record.truth)
+
+
+@pytest.fixture(scope="module")
+def drive() -> list[Record]:
+    return list(SimulatedSource(seed=3, count=1500))
+
+
+@pytest.fixture(scope="module")
+def survey() -> list[Record]:
+    return list(SimulatedSurvey(seed=3, configurations=300, exchanges=5))
+
+
+def errors_of(records: list[Record], label: str) -> np.ndarray:
+    return np.array(
+        [r.measurement.range_m - r.truth.range_m for r in records if r.truth and r.truth.label == label]
+    )
+
+
+@pytest.mark.parametrize("rate_hz", [20.0, 333.0])
+def test_the_same_seed_gives_the_same_whatever_is_consumed(rate_hz: float) -> None:
+    endless = SimulatedSource(seed=5, rate_hz=rate_hz, tags=2)
+    first = [values(r) for r in itertools.islice(endless, 90)]
+    assert [values(r) for r in itertools.islice(endless, 90)] == first
+    counted = [values(r) for r in SimulatedSource(seed=5, rate_hz=rate_hz, tags=2, count=70)]
+    assert counted == first[: len(counted)]
+
+
+def test_a_survey_is_the_same_however_many_placements_are_asked_for() -> None:
+    few = [values(r) for r in SimulatedSurvey(seed=5, configurations=7, exchanges=5)]
+    many = [values(r) for r in SimulatedSurvey(seed=5, configurations=80, exchanges=5)]
+    assert many[: len(few)] == few
+
+
+def test_another_seed_gives_another_scene_of_errors() -> None:
+    a = next(iter(SimulatedSource(seed=1)))
+    b = next(iter(SimulatedSource(seed=2)))
+    assert a.measurement.cir.samples.tobytes() != b.measurement.cir.samples.tobytes()
+
+
+def test_it_says_that_it_is_simulated(drive: list[Record]) -> None:
+    for source in (SimulatedSource(), SimulatedSurvey()):
+        assert source.simulated
+        assert "simulated" in source.name
+    assert all(r.truth and "simulated" in r.truth.configuration for r in drive)
+
+
+def test_stamps_start_at_the_epoch_and_keep_the_rate(drive: list[Record]) -> None:
+    for record in drive:
+        m = record.measurement
+        assert m.stamp_ns == m.sequence * 50_000_000
+        assert m.device_time == round(m.stamp_ns * DEVICE_TICK_HZ / 1e9) % 2**40
+    assert drive[0].measurement.stamp_ns == 0
+
+
+def test_truth_is_the_distance_between_anchor_and_robot() -> None:
+    anchors = ((1.0, 1.0), (6.0, 5.0))
+    for record in SimulatedSource(count=200, anchors=anchors):
+        m, truth = record.measurement, record.truth
+        assert truth is not None
+        place = along_route(ROUTE, np.array([0.5 * m.stamp_ns / 1e9]))[0]
+        assert truth.range_m == pytest.approx(math.dist(place, anchors[m.anchor_id - 1]))
+        assert m.tag_id == FIRST_TAG_ID
+
+
+def test_exchanges_that_are_not_received_are_counted() -> None:
+    source = SimulatedSource(count=400, radio=Radio(tx_power_dbm=-30.0))
+    received = len(list(source))
+    assert 0 < received < 400
+    assert source.skipped == {NOT_RECEIVED: 400 - received}
+    assert len(list(source)) == received
+    assert source.skipped[NOT_RECEIVED] == 400 - received
+
+
+def test_line_of_sight_errors_centre_on_the_offset(survey: list[Record]) -> None:
+    error = errors_of(survey, "LOS")
+    assert np.median(error) == pytest.approx(Radio().range_offset_m, abs=0.02)
+    assert np.percentile(error, 90) - np.percentile(error, 10) < 0.15
+
+
+def test_obstacles_make_the_range_long_and_a_lost_direct_path_longer(
+    drive: list[Record], survey: list[Record]
+) -> None:
+    for records in (drive, survey):
+        los, nlos, ndp = (errors_of(records, label) for label in ("LOS", "NLOS", "NDP NLOS"))
+        assert min(len(los), len(nlos), len(ndp)) >= 20
+        assert los.mean() + 0.1 < nlos.mean() < ndp.mean()
+        assert nlos.mean() - 0.22 == pytest.approx(0.35, abs=0.25)
+
+
+def test_within_a_placement_at_rest_the_error_is_nearly_constant(survey: list[Record]) -> None:
+    spread: dict[str, list[float]] = {}
+    for r in survey:
+        assert r.truth is not None
+        spread.setdefault(r.truth.configuration, []).append(r.measurement.range_m - r.truth.range_m)
+    stds = [float(np.std(v)) for v in spread.values() if len(v) == 5]
+    assert len(stds) > 250
+    assert 0.005 < np.median(stds) < 0.04
+
+
+def test_placements_have_their_own_configuration_and_a_sensible_distance(survey: list[Record]) -> None:
+    distance: dict[str, set[float]] = {}
+    for r in survey:
+        assert r.truth is not None
+        distance.setdefault(r.truth.configuration, set()).add(r.truth.range_m)
+    assert all(len(v) == 1 for v in distance.values())
+    assert len({next(iter(v)) for v in distance.values()}) == len(distance)
+    assert min(next(iter(v)) for v in distance.values()) >= 0.5
+
+
+def test_every_measurement_is_finite_and_fit_for_a_network(drive: list[Record], survey: list[Record]) -> None:
+    preprocessing = Preprocessing()
+    out = np.empty(preprocessing.samples, np.float32)
+    for r in drive + survey:
+        m = r.measurement
+        assert len(m.cir) == TAPS
+        assert math.isfinite(m.range_m)
+        assert math.isfinite(m.cir.rx_power_dbm)
+        assert math.isfinite(m.cir.first_path_power_dbm)
+        assert preprocessing.apply(m.cir, out) is None
+        assert np.isfinite(out).all()
+
+
+def test_levels_are_of_the_order_of_real_logs(survey: list[Record]) -> None:
+    rx = np.array([r.measurement.cir.rx_power_dbm for r in survey])
+    gap = rx - [r.measurement.cir.first_path_power_dbm for r in survey]
+    out = np.empty(157, np.float32)
+    peaks = []
+    for r in survey[::5]:
+        Preprocessing().apply(r.measurement.cir, out)
+        peaks.append(out.max())
+    assert -101.5 < rx.min() < rx.max() < -77.5
+    assert -1.0 < np.percentile(gap, 1) < np.percentile(gap, 99) < 25.0
+    assert 0.2 < np.min(peaks) < np.max(peaks) < 1.6
+
+
+@pytest.mark.parametrize(
+    ("make", "name", "value", "valid"),
+    [
+        (lambda: SimulatedSource(seed=-1), "seed", "-1", "0 to"),
+        (lambda: SimulatedSource(seed=1.5), "seed", "1.5", "whole number"),  # type: ignore[arg-type]
+        (lambda: SimulatedSource(count=-5), "count", "-5", "0 to"),
+        (lambda: SimulatedSource(rate_hz=math.nan), "rate_hz", "nan", "0.1 to 100000"),
+        (lambda: SimulatedSource(tags=0), "tags", "0", "1 to 64"),
+        (lambda: SimulatedSource(anchors=()), "anchors", "()", "pairs of finite"),
+        (lambda: SimulatedSource(anchors=((math.nan, 0.0),)), "anchors", "nan", "pairs of finite"),
+        (lambda: SimulatedSource(route=((0.0, 0.0), (1.0, 1.0))), "route", "2", "3 to 10000"),
+        (lambda: SimulatedSurvey(configurations=0), "configurations", "0", "1 to"),
+        (lambda: SimulatedSurvey(exchanges=1001), "exchanges", "1001", "1 to 1000"),
+        (lambda: SimulatedSurvey(plan=FloorPlan((1.0, 9.0))), "plan size in x", "1.0", "2 to 1000"),
+    ],
+)
+def test_a_bad_parameter_is_refused_by_name_value_and_range(make, name, value, valid) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(ParameterError) as caught:
+        make()
+    for part in (name, value, valid):
+        assert part in str(caught.value)

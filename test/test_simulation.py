@@ -1,0 +1,307 @@
+"""The simulator: its channel follows its parameters, its radio makes the error."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.simulation.channel import (
+    FREE_SPACE_LOSS_1M_DB,
+    RAYS_PER_CLUSTER,
+    RESIDENTIAL_LOS,
+    RESIDENTIAL_NLOS,
+    WAVELENGTH_M,
+    Environment,
+    Multipath,
+    direct_power_db,
+    draw_diffuse_field,
+    propagate,
+)
+from uwb_mitigation.simulation.radio import (
+    EDGE_LEAD_TAPS,
+    NOISE_TAPS,
+    POWER_CONSTANT_DB,
+    PULSE_PEAK,
+    TAP_NS,
+    TAPS,
+    Radio,
+    pulse,
+)
+from uwb_mitigation.simulation.scene import (
+    BRICK,
+    CONCRETE,
+    FLAT,
+    ROUTE,
+    FloorPlan,
+    Material,
+    Screen,
+    Wall,
+    along_route,
+    knife_edge_loss_db,
+    through_slab,
+)
+
+QUIET = Radio(range_offset_m=0.0, timestamp_std_m=0.0)
+
+
+def rng(seed: int = 7) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+def lone_paths(n: int, power_db: float, delay_ns: float = 0.0) -> Multipath:
+    gain = 10 ** (power_db / 20) * np.exp(1j * rng().uniform(0, 2 * math.pi, (n, 1)))
+    return Multipath(np.full((n, 1), delay_ns), gain)
+
+
+# --- channel ---------------------------------------------------------------------------------------
+
+
+def test_the_diffuse_field_holds_unit_power_and_no_ray_comes_before_the_straight_line() -> None:
+    for environment in (RESIDENTIAL_LOS, RESIDENTIAL_NLOS):
+        field = draw_diffuse_field(environment, 500, rng())
+        np.testing.assert_allclose(field.mean_power.sum(axis=1), 1.0)
+        assert field.delay_ns.min() >= 0.0
+        assert np.isfinite(field.delay_ns).all()
+
+
+@pytest.mark.parametrize("environment", [RESIDENTIAL_LOS, RESIDENTIAL_NLOS])
+def test_the_number_of_clusters_is_poisson_and_at_least_one(environment: Environment) -> None:
+    field = draw_diffuse_field(environment, 5000, rng())
+    clusters = (field.mean_power.reshape(5000, -1, RAYS_PER_CLUSTER)[:, :, 0] > 0).sum(axis=1)
+    # A Poisson number with its zeros raised to one.
+    expected = environment.mean_clusters + math.exp(-environment.mean_clusters)
+    assert clusters.min() == 1
+    assert clusters.mean() == pytest.approx(expected, rel=0.03)
+
+
+def test_cluster_starts_and_rays_arrive_at_the_given_rates() -> None:
+    e = RESIDENTIAL_NLOS
+    delay = draw_diffuse_field(e, 3000, rng()).delay_ns.reshape(3000, -1, RAYS_PER_CLUSTER)
+    assert np.diff(delay[:, :, 0], axis=1).mean() == pytest.approx(1 / e.cluster_rate_per_ns, rel=0.03)
+    gap = e.ray_mix / e.ray_rates_per_ns[0] + (1 - e.ray_mix) / e.ray_rates_per_ns[1]
+    assert np.diff(delay, axis=2).mean() == pytest.approx(gap, rel=0.03)
+    assert delay[:, 0, 0].mean() == pytest.approx(e.first_cluster_delay_ns, rel=0.05)
+
+
+def test_rays_decay_with_the_ray_constant_and_clusters_with_the_cluster_constant() -> None:
+    e = RESIDENTIAL_LOS
+    field = draw_diffuse_field(e, 4000, rng())
+    shape = (4000, -1, RAYS_PER_CLUSTER)
+    delay, power = field.delay_ns.reshape(shape), field.mean_power.reshape(shape)
+    rays = np.log(power[:, 0, 1:10] / power[:, 0, :1])
+    np.testing.assert_allclose(rays, -(delay[:, 0, 1:10] - delay[:, 0, :1]) / e.ray_decay_ns, rtol=1e-6)
+    there = power[:, 1, 0] > 0
+    ratio = np.log(power[there, 1, 0] / power[there, 0, 0])
+    slope = np.polyfit(delay[there, 1, 0], ratio, 1)[0]
+    assert slope == pytest.approx(-1 / e.cluster_decay_ns, rel=0.05)
+    left = ratio + delay[there, 1, 0] / e.cluster_decay_ns
+    # Two independent clusters' shadowing, in dB.
+    assert left.std() * 10 / math.log(10) == pytest.approx(e.cluster_shadowing_db * math.sqrt(2), rel=0.05)
+
+
+def test_the_rays_left_out_hold_next_to_no_power() -> None:
+    for e in (RESIDENTIAL_LOS, RESIDENTIAL_NLOS):
+        power = draw_diffuse_field(e, 2000, rng()).mean_power.reshape(2000, -1, RAYS_PER_CLUSTER)
+        assert power[:, :, -1].sum(axis=1).mean() < 1e-3
+
+
+def test_fading_is_nakagami_with_the_drawn_m_and_a_uniform_phase() -> None:
+    field = draw_diffuse_field(RESIDENTIAL_LOS, 1, rng())
+    repeated = field.take(np.zeros(20_000, np.intp))
+    gain = repeated.fade(rng())[:, 0]
+    power, m = np.abs(gain) ** 2, field.nakagami_m[0, 0]
+    assert power.mean() == pytest.approx(field.mean_power[0, 0], rel=0.03)
+    # m is the inverse of the normalised variance of power.
+    assert power.mean() ** 2 / power.var() == pytest.approx(m, rel=0.05)
+    assert abs(np.exp(1j * np.angle(gain)).mean()) < 0.02
+
+
+def test_nakagami_m_is_log_normal() -> None:
+    log_m = np.log(draw_diffuse_field(RESIDENTIAL_LOS, 100, rng()).nakagami_m)
+    assert log_m.mean() == pytest.approx(RESIDENTIAL_LOS.nakagami_log_mean, abs=0.01)
+    assert log_m.std() == pytest.approx(RESIDENTIAL_LOS.nakagami_log_std, abs=0.01)
+
+
+def test_the_direct_path_loses_free_space_and_obstacles() -> None:
+    power = direct_power_db(np.array([1.0, 10.0]), np.array([0.0, 6.0]))
+    np.testing.assert_allclose(power, [-FREE_SPACE_LOSS_1M_DB, -FREE_SPACE_LOSS_1M_DB - 26.0])
+    assert pytest.approx(44.5, abs=0.1) == FREE_SPACE_LOSS_1M_DB
+
+
+def test_mean_diffuse_power_out_of_sight_follows_the_path_loss_law() -> None:
+    n, e = 20_000, RESIDENTIAL_NLOS
+    field = draw_diffuse_field(e, 1, rng()).take(np.zeros(n, np.intp))
+    distance = np.full(n, 4.0)
+    paths = propagate(distance, np.full(n, 60.0), np.zeros(n), e, field, field.fade(rng()), rng())
+    diffuse_db = 10 * math.log10((np.abs(paths.gain[:, 1:]) ** 2).sum(axis=1).mean())
+    expected = -e.path_loss_db(distance)[0] + field.shadowing_db[0]
+    assert diffuse_db == pytest.approx(expected, abs=0.1)
+
+
+def test_a_distance_of_nothing_is_refused() -> None:
+    field = draw_diffuse_field(RESIDENTIAL_LOS, 1, rng())
+    zero = np.zeros(1)
+    with pytest.raises(ParameterError, match="distance"):
+        propagate(zero, zero, zero, RESIDENTIAL_LOS, field, field.fade(rng()), rng())
+
+
+# --- scene -----------------------------------------------------------------------------------------
+
+
+def test_a_wall_delays_by_its_optical_thickness_and_weakens() -> None:
+    loss, excess = through_slab(Wall((0, 0), (0, 1), BRICK, 0.12), np.array([1.0]))
+    assert excess[0] == pytest.approx((math.sqrt(BRICK.permittivity) - 1) * 0.12)
+    # ITU-R P.2040-1: attenuation 1636 sigma / sqrt(eps) dB/m, and two faces that reflect 10 % each.
+    absorbed = 1636 * BRICK.conductivity / math.sqrt(BRICK.permittivity) * 0.12
+    assert loss[0] == pytest.approx(absorbed + 0.93, abs=0.02)
+
+
+def test_a_slanting_path_is_longer_inside_the_wall() -> None:
+    wall = Wall((0, 0), (0, 1), CONCRETE, 0.2)
+    loss, excess = through_slab(wall, np.array([1.0, 0.5]))
+    assert loss[1] > loss[0]
+    assert excess[1] > excess[0]
+
+
+def test_walls_count_only_where_the_line_crosses_them() -> None:
+    plan = FloorPlan((4.0, 4.0), (Wall((2, 0), (2, 2), BRICK, 0.1), Wall((3, 0), (3, 2), BRICK, 0.1)))
+    a = np.array([[1.0, 1.0], [1.0, 3.0], [2.5, 1.0]])
+    b = np.array([[3.5, 1.0], [3.5, 3.0], [3.5, 1.0]])
+    path = plan.direct_path(a, b)
+    assert path.crossings.tolist() == [2, 0, 1]
+    assert path.loss_db[0] == pytest.approx(2 * path.loss_db[2])
+    assert path.loss_db[1] == path.excess_m[1] == 0.0
+
+
+def test_a_screen_is_gone_around_at_its_nearer_edge() -> None:
+    plan = FloorPlan((4.0, 4.0), screens=(Screen("cabinet", (2.0, 0.0), (2.0, 1.5)),))
+    path = plan.direct_path(np.array([[1.0, 1.0]]), np.array([[3.0, 1.0]]))
+    detour = 2 * math.hypot(1.0, 0.5) - 2.0
+    assert path.excess_m[0] == pytest.approx(detour)
+    v = 2 * math.sqrt(detour / WAVELENGTH_M)
+    # Deep in the shadow the loss is 13 + 20 log10 v.
+    assert path.loss_db[0] == pytest.approx(13 + 20 * math.log10(v), abs=0.3)
+    assert knife_edge_loss_db(np.zeros(1))[0] == pytest.approx(6.0, abs=0.1)
+
+
+def test_the_robot_stays_inside_the_flat_moves_steadily_and_drives_through_nothing() -> None:
+    travelled = np.arange(0.0, 60.0, 0.05)
+    position = along_route(ROUTE, travelled)
+    assert (position > 0).all()
+    assert (position < FLAT.size).all()
+    step = np.hypot(*np.diff(position, axis=0).T)
+    assert step.max() <= 0.05 + 1e-9
+    assert FLAT.direct_path(position[:-1], position[1:]).crossings.max() == 0
+
+
+# --- radio -----------------------------------------------------------------------------------------
+
+
+def test_the_pulse_has_unit_energy_over_the_taps_and_no_sidelobes() -> None:
+    taps = np.arange(-20, 21) + 0.3
+    assert (pulse(taps) ** 2).sum() == pytest.approx(1.0, abs=1e-3)
+    assert pulse(np.array([3.0]))[0] < 0.02 * PULSE_PEAK
+    assert pulse(np.array([EDGE_LEAD_TAPS]))[0] == pytest.approx(PULSE_PEAK / 2, rel=1e-3)
+
+
+@pytest.mark.parametrize("power_db", [-50.0, -65.0, -80.0])
+def test_a_lone_pulse_is_found_within_a_tenth_of_a_tap(power_db: float) -> None:
+    error_m = QUIET.receive(lone_paths(400, power_db), rng()).error_m
+    assert np.abs(error_m).max() < 0.1 * TAP_NS * 0.299792458
+
+
+def test_a_delayed_lone_pulse_is_found_late_by_its_delay() -> None:
+    error_m = QUIET.receive(lone_paths(50, -60.0, delay_ns=10.0), rng()).error_m
+    np.testing.assert_allclose(error_m, 10.0 * 0.299792458, atol=0.03)
+
+
+@pytest.mark.parametrize(("direct_db", "late"), [(-75.0, False), (-112.0, True)])
+def test_a_direct_path_below_the_threshold_makes_the_range_long(direct_db: float, late: bool) -> None:
+    strong = lone_paths(200, -70.0, delay_ns=12.0)
+    weak = lone_paths(200, direct_db)
+    both = Multipath(np.hstack([weak.delay_ns, strong.delay_ns]), np.hstack([weak.gain, strong.gain]))
+    reception = QUIET.receive(both, rng())
+    assert (reception.direct_above_threshold == (not late)).all()
+    np.testing.assert_allclose(reception.error_m, 12.0 * 0.299792458 if late else 0.0, atol=0.05)
+
+
+def test_the_threshold_is_the_noise_times_its_multiplier() -> None:
+    reception = QUIET.receive(lone_paths(50, -80.0), rng())
+    magnitude = np.hypot(reception.samples[:, 0::2].astype(float), reception.samples[:, 1::2])
+    expected = QUIET.noise_multiplier * magnitude[:, NOISE_TAPS].std(axis=1)
+    np.testing.assert_allclose(reception.noise_threshold, expected, atol=1.0)
+
+
+def test_levels_follow_the_manuals_formulas() -> None:
+    reception = QUIET.receive(lone_paths(20, -70.0), rng())
+    taps = reception.samples.astype(float).reshape(20, TAPS, 2)
+    magnitude = np.hypot(taps[..., 0], taps[..., 1])
+    n2 = reception.preamble_count.astype(float) ** 2
+    for i in range(20):
+        first = math.floor(reception.first_path_index[i])
+        f2 = sum(round(magnitude[i, first + k]) ** 2 for k in (1, 2, 3))
+        assert reception.first_path_power_dbm[i] == pytest.approx(
+            10 * math.log10(f2 / n2[i]) - POWER_CONSTANT_DB, abs=0.01
+        )
+        noise = (magnitude[i, NOISE_TAPS] ** 2).mean() * TAPS
+        c = round(((magnitude[i] ** 2).sum() - noise) / 2**17)
+        assert reception.rx_power_dbm[i] == pytest.approx(
+            10 * math.log10(c * 2**17 / n2[i]) - POWER_CONSTANT_DB, abs=0.01
+        )
+
+
+def test_a_weak_level_is_reported_as_sent_and_a_strong_one_is_compressed() -> None:
+    weak = QUIET.receive(lone_paths(50, -80.0), rng())
+    np.testing.assert_allclose(weak.rx_power_dbm, QUIET.tx_power_dbm - 80.0, atol=1.0)
+    strong = QUIET.receive(lone_paths(50, -40.0), rng())
+    np.testing.assert_allclose(strong.rx_power_dbm, QUIET.compression_dbm, atol=0.5)
+
+
+def test_a_strong_signal_fills_the_accumulator_in_fewer_symbols() -> None:
+    strong = QUIET.receive(lone_paths(50, -50.0), rng())
+    weak = QUIET.receive(lone_paths(50, -85.0), rng())
+    assert strong.preamble_count.max() < 400
+    assert np.abs(strong.samples.astype(int)).max() == pytest.approx(QUIET.accumulator_limit, rel=0.05)
+    assert (weak.preamble_count == QUIET.preamble_symbols).all()
+
+
+def test_an_accumulator_without_a_limit_saturates_at_int16() -> None:
+    samples = Radio(accumulator_limit=65536).receive(lone_paths(20, -50.0), rng()).samples
+    assert samples.dtype == np.int16
+    peaks = np.abs(samples.astype(int)).max(axis=1)
+    assert (peaks >= 32767).all()
+
+
+def test_thermal_noise_is_that_of_the_noise_figure() -> None:
+    radio = Radio(self_noise_db=-120.0)
+    reception = radio.receive(lone_paths(50, -86.0), rng())
+    noise = reception.samples[:, 2 * NOISE_TAPS.start : 2 * NOISE_TAPS.stop].astype(float)
+    level = 10 * math.log10(2 * noise.var() / radio.preamble_symbols) - POWER_CONSTANT_DB
+    # A frame this weak is compressed by little.
+    assert level == pytest.approx(radio.noise_level_dbm(), abs=0.3)
+
+
+def test_a_frame_below_the_sensitivity_is_not_received() -> None:
+    reception = QUIET.receive(lone_paths(5, -90.0), rng())
+    assert np.isnan(reception.first_path_index).all()
+    assert np.isnan(reception.rx_power_dbm).all()
+
+
+@pytest.mark.parametrize(
+    ("make", "name", "value", "valid"),
+    [
+        (lambda: Radio(noise_multiplier=0.0), "noise_multiplier", "0.0", "1 to 31"),
+        (lambda: Radio(preamble_symbols=8), "preamble_symbols", "8", "16 to 4096"),
+        (lambda: Wall((0, 0), (1, 0), BRICK, -1.0), "thickness_m", "-1.0", "0 to 2"),
+        (lambda: Wall((0, 0), (0, 0), BRICK, 0.1), "wall of brick", "(0, 0)", "two different"),
+        (lambda: Material("vacuum", 0.5, 0.0), "permittivity", "0.5", "1 to 100"),
+    ],
+)
+def test_a_bad_parameter_is_refused_by_name_value_and_range(make, name, value, valid) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(ParameterError) as caught:
+        make()
+    for part in (name, value, valid):
+        assert part in str(caught.value)

@@ -1,0 +1,274 @@
+"""Multipath propagation: the direct path, and a diffuse field of clusters and rays behind it.
+
+The direct path is deterministic (free space, and what the obstacles on it take); the diffuse field
+follows the IEEE 802.15.4a channel model. What a receiver makes of them is in `simulation.radio`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from numbers import Integral, Real
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.errors import ParameterError
+
+SPEED_OF_LIGHT_M_PER_NS = 0.299792458
+
+CENTRE_FREQUENCY_HZ = 3993.6e6
+"""Channel 2 (IEEE 802.15.4-2015, UWB PHY)."""
+
+WAVELENGTH_M = SPEED_OF_LIGHT_M_PER_NS * 1e9 / CENTRE_FREQUENCY_HZ
+
+FREE_SPACE_LOSS_1M_DB = 20.0 * math.log10(4.0 * math.pi / WAVELENGTH_M)
+"""Friis, isotropic antennas, at 1 m."""
+
+PATTERN_LOSS_DB = (4.0, 1.0)
+"""Shape and scale of the gamma-distributed loss that two small antennas' patterns add to the direct
+path. They see it from one direction each, and the diffuse field from all, so only their ratio counts.
+Its mean of 4 dB is that of the receive over first-path level in line of sight in the EVK1000 logs."""
+
+MAX_CLUSTERS = 10
+RAYS_PER_CLUSTER = 28
+"""Enough that the rays left out hold less than 0.1 % of a residential cluster's mean power."""
+
+
+def check_range(where: str, name: str, value: float, low: float, high: float, *, whole: bool = False) -> None:
+    """Raise ParameterError, naming all three, unless `value` is a number from `low` to `high`.
+
+    NaN is refused, and with `whole` so is what is not an integer.
+    """
+    given: object = value
+    if not isinstance(given, Integral if whole else Real) or not low <= value <= high:
+        kind = "a whole number from " if whole else ""
+        raise ParameterError(f"{name} = {value!r}", where=where, valid=f"{kind}{low:g} to {high:g}")
+
+
+@dataclass(frozen=True, slots=True)
+class Environment:
+    """Statistics of the diffuse field and of path loss, in the notation of the 802.15.4a report.
+
+    Attributes:
+        name: for people.
+        path_loss_1m_db: PL0. path_loss_exponent: n. shadowing_db: sigma_S.
+        frequency_exponent: kappa, of the path loss.
+        mean_clusters: L. cluster_rate_per_ns: Lambda.
+        ray_rates_per_ns: lambda_1, lambda_2. ray_mix: beta, the probability of lambda_1.
+        cluster_decay_ns: Gamma. ray_decay_ns: gamma_0. cluster_shadowing_db: sigma_cluster.
+        nakagami_log_mean, nakagami_log_std: m is log-normal, exp of a normal with these.
+        first_cluster_delay_ns: mean (exponential) delay of the first cluster behind the straight line.
+
+    Raises:
+        ParameterError: a value is not finite or is out of its range.
+    """
+
+    name: str
+    path_loss_1m_db: float
+    path_loss_exponent: float
+    shadowing_db: float
+    frequency_exponent: float
+    mean_clusters: float
+    cluster_rate_per_ns: float
+    ray_rates_per_ns: tuple[float, float]
+    ray_mix: float
+    cluster_decay_ns: float
+    ray_decay_ns: float
+    cluster_shadowing_db: float
+    nakagami_log_mean: float
+    nakagami_log_std: float
+    first_cluster_delay_ns: float
+
+    def __post_init__(self) -> None:
+        for name, value, low, high in (
+            ("path_loss_1m_db", self.path_loss_1m_db, 20, 100),
+            ("path_loss_exponent", self.path_loss_exponent, 1, 8),
+            ("shadowing_db", self.shadowing_db, 0, 20),
+            ("frequency_exponent", self.frequency_exponent, -10, 10),
+            ("mean_clusters", self.mean_clusters, 1, 6),
+            ("cluster_rate_per_ns", self.cluster_rate_per_ns, 1e-3, 10),
+            ("ray_rates_per_ns[0]", self.ray_rates_per_ns[0], 1e-2, 10),
+            ("ray_rates_per_ns[1]", self.ray_rates_per_ns[1], 1e-2, 10),
+            ("ray_mix", self.ray_mix, 0, 1),
+            ("cluster_decay_ns", self.cluster_decay_ns, 0.1, 200),
+            ("ray_decay_ns", self.ray_decay_ns, 0.1, 200),
+            ("cluster_shadowing_db", self.cluster_shadowing_db, 0, 20),
+            ("nakagami_log_mean", self.nakagami_log_mean, -0.6, 4),
+            ("nakagami_log_std", self.nakagami_log_std, 0, 2),
+            ("first_cluster_delay_ns", self.first_cluster_delay_ns, 0, 100),
+        ):
+            check_range(f"environment {self.name}", name, value, low, high)
+
+    def path_loss_db(self, distance_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Mean path loss at channel 2, dB, by the report's section II-A: a power law in distance and
+        in frequency, and a factor of 1/2 for what stands close to an antenna."""
+        frequency = 20.0 * (self.frequency_exponent + 1.0) * math.log10(CENTRE_FREQUENCY_HZ / 5e9)
+        at_1m = self.path_loss_1m_db + frequency + 10.0 * math.log10(2.0)
+        return at_1m + 10.0 * self.path_loss_exponent * np.log10(distance_m)
+
+
+# Molisch et al., "IEEE 802.15.4a channel model - final report", 2004, residential environments (CM1, CM2);
+# only the last figure of each is not from there. In line of sight the diffuse field starts with the
+# direct path; out of it, its mean delay is that of the EVK1000 logs' range errors without a direct
+# path, beyond the error in line of sight (0.8 m; the report's own program uses 1 / Lambda = 8.3 ns).
+RESIDENTIAL_LOS = Environment(
+    "residential LOS",
+    43.9,
+    1.79,
+    2.22,
+    1.12,
+    3.0,
+    0.047,
+    (1.54, 0.15),
+    0.095,
+    22.61,
+    12.53,
+    2.75,
+    0.67,
+    0.28,
+    0.0,
+)
+RESIDENTIAL_NLOS = Environment(
+    "residential NLOS",
+    48.7,
+    4.58,
+    3.51,
+    1.53,
+    3.5,
+    0.12,
+    (1.77, 0.15),
+    0.045,
+    26.27,
+    17.5,
+    2.93,
+    0.69,
+    0.32,
+    2.7,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class DiffuseField:
+    """Where the rays of n placements lie and what they carry on average: it changes over metres.
+
+    Attributes:
+        delay_ns: float64 (n, rays), behind the straight line.
+        mean_power: float64 (n, rays), sums to 1 over the rays.
+        nakagami_m: float64 (n, rays), fading parameter, at least 0.5.
+        shadowing_db: float64 (n,), of the total.
+        pattern_loss_db: float64 (n,), of the direct path (`PATTERN_LOSS_DB`).
+    """
+
+    delay_ns: NDArray[np.float64]
+    mean_power: NDArray[np.float64]
+    nakagami_m: NDArray[np.float64]
+    shadowing_db: NDArray[np.float64]
+    pattern_loss_db: NDArray[np.float64]
+
+    def take(self, index: NDArray[np.intp]) -> DiffuseField:
+        """The placements at `index`, in that order."""
+        return DiffuseField(
+            self.delay_ns[index],
+            self.mean_power[index],
+            self.nakagami_m[index],
+            self.shadowing_db[index],
+            self.pattern_loss_db[index],
+        )
+
+    def fade(self, rng: np.random.Generator) -> NDArray[np.complex128]:
+        """Draw the rays' gains, complex128 (n, rays): Nakagami magnitude, uniform phase.
+
+        Fading changes over half a wavelength: one draw serves a placement at rest, a moving antenna
+        needs one for each exchange.
+        """
+        power = rng.standard_gamma(self.nakagami_m) * (self.mean_power / self.nakagami_m)
+        phase = rng.uniform(0.0, 2.0 * math.pi, power.shape)
+        gains: NDArray[np.complex128] = np.sqrt(power) * np.exp(1j * phase)
+        return gains
+
+
+def draw_diffuse_field(environment: Environment, n: int, rng: np.random.Generator) -> DiffuseField:
+    """Draw the diffuse fields of `n` independent placements.
+
+    Clusters: a Poisson number (at least one), exponential gaps, exponential decay, log-normal power.
+    Rays: gaps from a mixture of two exponentials, exponential decay, log-normal Nakagami m
+    (802.15.4a report, sections II-C to II-E). The first ray of a cluster lies at its start.
+    """
+    e = environment
+    count = np.clip(rng.poisson(e.mean_clusters, n), 1, MAX_CLUSTERS)
+    start = np.zeros((n, MAX_CLUSTERS))
+    start[:, 1:] = np.cumsum(rng.exponential(1.0 / e.cluster_rate_per_ns, (n, MAX_CLUSTERS - 1)), axis=1)
+    cluster_power = np.exp(-start / e.cluster_decay_ns)
+    cluster_power *= 10.0 ** (rng.normal(0.0, e.cluster_shadowing_db, start.shape) / 10.0)
+    cluster_power *= np.arange(MAX_CLUSTERS) < count[:, None]
+
+    shape = (n, MAX_CLUSTERS, RAYS_PER_CLUSTER)
+    rate = np.where(rng.random(shape) < e.ray_mix, *e.ray_rates_per_ns)
+    gap = rng.standard_exponential(shape) / rate
+    gap[..., 0] = 0.0
+    offset = np.cumsum(gap, axis=2)
+    power = (cluster_power[..., None] * np.exp(-offset / e.ray_decay_ns)).reshape(n, -1)
+    delay = (start[..., None] + offset).reshape(n, -1)
+    delay += rng.exponential(1.0, (n, 1)) * e.first_cluster_delay_ns
+    m = np.maximum(np.exp(rng.normal(e.nakagami_log_mean, e.nakagami_log_std, power.shape)), 0.5)
+    shadowing = rng.normal(0.0, e.shadowing_db, n)
+    pattern_loss = rng.gamma(*PATTERN_LOSS_DB, n)
+    return DiffuseField(delay, power / power.sum(axis=1, keepdims=True), m, shadowing, pattern_loss)
+
+
+@dataclass(frozen=True, slots=True)
+class Multipath:
+    """What arrives at the receiver over n links, for each 1 mW sent.
+
+    Attributes:
+        delay_ns: float64 (n, paths), behind a straight line through air; the direct path is first.
+        gain: complex128 (n, paths), field: its squared magnitude is a power.
+    """
+
+    delay_ns: NDArray[np.float64]
+    gain: NDArray[np.complex128]
+
+
+def direct_power_db(distance_m: NDArray[np.float64], loss_db: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Power of the direct path relative to what was sent, dB: Friis, less what obstacles take."""
+    return -FREE_SPACE_LOSS_1M_DB - 20.0 * np.log10(distance_m) - loss_db
+
+
+def propagate(
+    distance_m: NDArray[np.float64],
+    loss_db: NDArray[np.float64],
+    excess_m: NDArray[np.float64],
+    environment: Environment,
+    field: DiffuseField,
+    fading: NDArray[np.complex128],
+    rng: np.random.Generator,
+) -> Multipath:
+    """Join the direct path and the diffuse field of n links.
+
+    The environment's path loss gives the power of all paths of a link that nothing blocks, so in
+    line of sight the diffuse field carries that less the direct path's; where the direct path holds
+    all of it (close by), the diffuse field keeps a twentieth. Out of line of sight the environment's
+    figures are those of the diffuse field itself.
+
+    Args:
+        distance_m, loss_db, excess_m: (n,), straight-line distance; loss and extra optical length of
+            the direct path (`simulation.scene`).
+        environment, field, fading: (n, ...) of one environment; see `draw_diffuse_field`.
+
+    Raises:
+        ParameterError: a distance is not finite and positive.
+    """
+    if not bool(np.all(np.isfinite(distance_m) & (distance_m > 0))):
+        raise ParameterError("distance that is not finite and positive", where="channel", valid="> 0 m")
+    direct = 10.0 ** (direct_power_db(distance_m, loss_db + field.pattern_loss_db) / 10.0)
+    diffuse = 10.0 ** (-environment.path_loss_db(distance_m) / 10.0)
+    if environment.first_cluster_delay_ns == 0.0:
+        diffuse = np.maximum(diffuse - direct, 0.05 * diffuse)
+    diffuse = diffuse * 10.0 ** (field.shadowing_db / 10.0)
+    phase = rng.uniform(0.0, 2.0 * math.pi, len(distance_m))
+    gain = np.concatenate(
+        [(np.sqrt(direct) * np.exp(1j * phase))[:, None], np.sqrt(diffuse)[:, None] * fading], axis=1
+    )
+    delay = np.concatenate([(excess_m / SPEED_OF_LIGHT_M_PER_NS)[:, None], field.delay_ns], axis=1)
+    return Multipath(delay, gain)

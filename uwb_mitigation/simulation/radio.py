@@ -1,0 +1,293 @@
+"""A DW1000-like reception: multipath to accumulator, first path, and what the radio reports beside it.
+
+Channel 2, PRF 64 MHz. The range error is not drawn from a distribution: it is where the leading-edge
+detector finds the first path, less where the straight line would have put it. What was fitted to the
+EVK1000 logs, and how well, is in docs/simulator.md.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.measurement import SAMPLE_PERIOD_S
+from uwb_mitigation.simulation.channel import SPEED_OF_LIGHT_M_PER_NS, Multipath, check_range
+
+TAPS = 1016
+"""Accumulator length: one preamble symbol at PRF 64 MHz (DW1000 user manual, section 7.2.38)."""
+
+POWER_CONSTANT_DB = 121.74
+"""A of the manual's power estimates at PRF 64 MHz (section 4.7)."""
+
+TAP_NS = SAMPLE_PERIOD_S * 1e9
+SYMBOL_S = TAPS * SAMPLE_PERIOD_S
+BOLTZMANN_290K_DBM_HZ = -173.98
+INDEX_STEPS = 64
+"""The detector reports the first path in 1/64 of a tap (FP_INDEX, section 7.2.22)."""
+
+PULSE_WIDTH_TAPS = 2.4
+"""Full width at half amplitude of a lone path, and so near the inverse of the 499.2 MHz bandwidth."""
+
+PLACE = (739.0, 751.0)
+"""Where the straight line falls in the accumulator: the middle 90 % of the logs' first paths."""
+NOISE_TAPS = slice(64, 576)
+SEARCH_FROM = 640
+"""Noise is measured well before the first path can arrive, and the search begins after it."""
+
+_SPAN = 8
+_PHASES = 64
+_EDGE_STEPS = 32
+_EDGE_TAPS = (-3, 5)
+_KERNEL_REACH = 10
+
+
+def pulse(taps: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The accumulator's response to a lone path, at `taps` from its peak; unit energy over the taps.
+
+    Gaussian, as wide as the first path of the EVK1000 logs in line of sight: it falls off as theirs
+    does. The raised cosine that the standard's reference pulse would give has sidelobes of 12 %,
+    which the logs do not show and which the detector would take for paths.
+    """
+    x = np.asarray(taps, np.float64) / PULSE_WIDTH_TAPS
+    shape: NDArray[np.float64] = np.exp(-4.0 * math.log(2.0) * x * x)
+    return shape / math.sqrt(PULSE_WIDTH_TAPS * math.sqrt(math.pi / (8.0 * math.log(2.0))))
+
+
+PULSE_PEAK = float(pulse(np.zeros(1))[0])
+_OFFSETS = np.arange(1 - _SPAN, _SPAN + 1)
+_PULSE_TABLE = pulse(_OFFSETS[None, :] - np.arange(_PHASES)[:, None] / _PHASES)
+_FINE = np.arange(_EDGE_TAPS[0], _EDGE_TAPS[1], 1.0 / _EDGE_STEPS)
+_NEAR = np.arange(_EDGE_TAPS[0] - _KERNEL_REACH, _EDGE_TAPS[1] + _KERNEL_REACH)
+_LAG = _NEAR[:, None] - _FINE[None, :]
+# At half the tap rate the pulse's spectrum is down to 1 %, so a tapered sinc interpolates it well.
+_INTERPOLATE = (
+    np.sinc(_LAG) * np.where(np.abs(_LAG) < _KERNEL_REACH, np.cos(math.pi * _LAG / (2 * _KERNEL_REACH)), 0.0)
+).astype(np.float32)
+
+
+def _half_amplitude_lead() -> float:
+    """Taps from the leading edge's half-amplitude point to the peak of a lone pulse."""
+    lead = np.linspace(0.0, 2.0, 20001)
+    return float(np.interp(-0.5, -pulse(lead) / PULSE_PEAK, lead))
+
+
+EDGE_LEAD_TAPS = _half_amplitude_lead()
+
+
+@dataclass(frozen=True, slots=True)
+class Reception:
+    """What n receptions report. Levels, index and error are NaN where the frame was not received: too
+    weak for the radio, or no path above the threshold.
+
+    Attributes:
+        samples: int16 (n, 2 TAPS), interleaved real, imaginary.
+        first_path_index: float64 (n,), accumulator index, the half-amplitude point of the edge.
+        preamble_count, noise_threshold: int64 (n,), RXPACC and LDE_THRESH.
+        rx_power_dbm, first_path_power_dbm: float64 (n,), by the manual's formulas.
+        direct_above_threshold: bool (n,), whether the direct path alone would have been detected.
+        error_m: float64 (n,), detected less straight-line path length, plus the radio's offset.
+    """
+
+    samples: NDArray[np.int16]
+    first_path_index: NDArray[np.float64]
+    preamble_count: NDArray[np.int64]
+    noise_threshold: NDArray[np.int64]
+    rx_power_dbm: NDArray[np.float64]
+    first_path_power_dbm: NDArray[np.float64]
+    direct_above_threshold: NDArray[np.bool_]
+    error_m: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Radio:
+    """A receiver and the transmitter it hears.
+
+    Attributes:
+        tx_power_dbm: -41.3 dBm/MHz over 500 MHz.
+        noise_figure_db: receiver noise and implementation loss together; gives the logs' tap noise.
+        compression_dbm: level that strong signals are compressed towards by the receiver's gain
+            control; the manual's section 4.7.1 describes the same.
+        self_noise_db: residue of the preamble's correlation, for each tap, relative to all power.
+        sensitivity_dbm: frames below this are lost; the DW1000 at 850 kbit/s (datasheet, section 5.3).
+        preamble_symbols: accumulated at most (1024 sent, the first ones spent on detection).
+        accumulator_limit: accumulation stops when a component reaches this.
+        noise_multiplier: NTM of LDE_CFG1; the threshold is this times the noise's standard deviation.
+        range_offset_m: mean error of uncalibrated antenna delays, as the logs have it.
+        timestamp_std_m: scatter of a range that no change of the channel explains.
+
+    Raises:
+        ParameterError: a value is not finite or is out of its range.
+    """
+
+    tx_power_dbm: float = -14.3
+    noise_figure_db: float = 9.8
+    compression_dbm: float = -78.0
+    self_noise_db: float = -47.0
+    sensitivity_dbm: float = -101.0
+    preamble_symbols: int = 1000
+    accumulator_limit: float = 16384.0
+    noise_multiplier: float = 13.0
+    range_offset_m: float = 0.22
+    timestamp_std_m: float = 0.02
+
+    def __post_init__(self) -> None:
+        for name, value, low, high in (
+            ("tx_power_dbm", self.tx_power_dbm, -60, 20),
+            ("noise_figure_db", self.noise_figure_db, 0, 40),
+            ("compression_dbm", self.compression_dbm, -90, 0),
+            ("self_noise_db", self.self_noise_db, -120, -30),
+            ("sensitivity_dbm", self.sensitivity_dbm, -130, 0),
+            ("accumulator_limit", self.accumulator_limit, 1000, 65536),
+            ("noise_multiplier", self.noise_multiplier, 1, 31),
+            ("range_offset_m", self.range_offset_m, -10, 10),
+            ("timestamp_std_m", self.timestamp_std_m, 0, 1),
+        ):
+            check_range("radio", name, value, low, high)
+        check_range("radio", "preamble_symbols", self.preamble_symbols, 16, 4096, whole=True)
+
+    def noise_level_dbm(self) -> float:
+        """Thermal noise of one tap over one symbol, on the scale of the paths' powers.
+
+        A matched filter's peak has a signal-to-noise ratio of P T / (k T0 F); a lone path's peak tap
+        holds pulse(0)^2 of its power.
+        """
+        matched = BOLTZMANN_290K_DBM_HZ + self.noise_figure_db - 10.0 * math.log10(SYMBOL_S)
+        return matched + 20.0 * math.log10(PULSE_PEAK)
+
+    def receive(self, multipath: Multipath, rng: np.random.Generator) -> Reception:
+        """Receive n frames over n links, each with its own sampling phase and noise.
+
+        Amplitudes are scaled so that the sum of squares over the taps, divided by the square of the
+        preamble count, is the received power by the manual's formula.
+        """
+        place = rng.uniform(*PLACE, len(multipath.delay_ns))
+        symbol = _place_paths(place[:, None] + multipath.delay_ns / TAP_NS, multipath.gain)
+        scale = 10.0 ** ((self.tx_power_dbm + POWER_CONSTANT_DB) / 20.0)
+        symbol *= np.float32(scale)
+
+        components = symbol.view(np.float32)
+        power = np.einsum("ij,ij->i", components, components).astype(np.float64)
+        audible = power >= 10.0 ** ((self.sensitivity_dbm + POWER_CONSTANT_DB) / 10.0)
+        limit = 10.0 ** ((self.compression_dbm + POWER_CONSTANT_DB) / 20.0)
+        gain = (1.0 + (np.sqrt(power) / limit) ** 1.5) ** (-1.0 / 1.5)
+        power *= gain * gain
+        symbol *= gain[:, None].astype(np.float32)
+
+        peak = np.maximum(components.max(axis=1), -components.min(axis=1)).astype(np.float64)
+        # A strong signal fills the accumulator in fewer symbols; at least one is always taken.
+        most = np.minimum(self.accumulator_limit / np.maximum(peak, 1e-9), self.preamble_symbols)
+        count = np.maximum(most, 1.0).astype(np.int64)
+
+        thermal = 10.0 ** ((self.noise_level_dbm() + POWER_CONSTANT_DB) / 10.0)
+        # Thermal noise adds up in power over the symbols, the preamble's own residue in amplitude.
+        noise = thermal * count * gain * gain + power * count**2.0 * 10.0 ** (self.self_noise_db / 10.0)
+        accumulator = rng.standard_normal(components.shape, dtype=np.float32)
+        accumulator *= np.sqrt(noise / 2.0).astype(np.float32)[:, None]
+        accumulator += components * count.astype(np.float32)[:, None]
+        samples = np.clip(np.rint(accumulator), -32768, 32767).astype(np.int16)
+        direct = np.abs(multipath.gain[:, 0]) * scale * gain * count * PULSE_PEAK
+        return self._report(samples, count, direct, place, audible, rng)
+
+    def _report(
+        self,
+        samples: NDArray[np.int16],
+        count: NDArray[np.int64],
+        direct: NDArray[np.float64],
+        place: NDArray[np.float64],
+        audible: NDArray[np.bool_],
+        rng: np.random.Generator,
+    ) -> Reception:
+        quantised = samples.astype(np.float32)
+        taps = quantised.view(np.complex64)
+        magnitude = np.abs(taps)
+        threshold = noise_threshold(magnitude, self.noise_multiplier)
+        index = np.where(audible, detect_first_path(taps, magnitude, threshold), np.nan)
+        rx_power, first_path_power = power_levels(magnitude, index, count)
+        error = (index + EDGE_LEAD_TAPS - place) * TAP_NS * SPEED_OF_LIGHT_M_PER_NS
+        error += self.range_offset_m + rng.normal(0.0, self.timestamp_std_m, len(error))
+        return Reception(
+            samples, index, count, threshold, rx_power, first_path_power, direct >= threshold, error
+        )
+
+
+def _place_paths(position: NDArray[np.float64], gain: NDArray[np.complex128]) -> NDArray[np.complex64]:
+    """Sum pulses at fractional tap positions (n, paths) into complex64 (n, TAPS)."""
+    n = len(position)
+    step = np.rint(position * _PHASES).astype(np.int64)
+    tap, phase = step // _PHASES, step % _PHASES
+    row, path = np.nonzero((tap < TAPS - _SPAN) & (gain != 0))
+    where = ((row * TAPS + tap[row, path])[:, None] + _OFFSETS).ravel()
+    shape = _PULSE_TABLE[phase[row, path]]
+    value = gain[row, path]
+    result = np.empty((n, TAPS), np.complex64)
+    for part, weight in ((result.real, value.real), (result.imag, value.imag)):
+        part[:] = np.bincount(where, (shape * weight[:, None]).ravel(), n * TAPS).reshape(n, TAPS)
+    return result
+
+
+def noise_threshold(magnitude: NDArray[np.float32], multiplier: float) -> NDArray[np.int64]:
+    """LDE_THRESH of (n, TAPS) magnitudes: the noise's standard deviation times NTM, at least 1."""
+    deviation = magnitude[:, NOISE_TAPS].std(axis=1)
+    threshold: NDArray[np.int64] = np.clip(np.rint(multiplier * deviation), 1, 65535).astype(np.int64)
+    return threshold
+
+
+def detect_first_path(
+    taps: NDArray[np.complex64], magnitude: NDArray[np.float32], threshold: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """The first path's index for (n, TAPS) accumulators, float64 (n,); NaN where nothing is found.
+
+    The first tap above the threshold starts the edge; on the interpolated magnitude around it, the
+    edge's first maximum is sought and the index is where the edge reaches half of it, so that the
+    index depends little on how strong the path is or on what follows it.
+    """
+    above = magnitude[:, SEARCH_FROM:] > threshold[:, None]
+    found = above.any(axis=1)
+    crossing = above.argmax(axis=1) + SEARCH_FROM
+    crossing = np.minimum(crossing, TAPS - 1 - int(_NEAR[-1]))
+    rows = np.arange(len(taps))
+    near = taps[rows[:, None], crossing[:, None] + _NEAR]
+    fine = np.hypot(near.real @ _INTERPOLATE, near.imag @ _INTERPOLATE)
+
+    # The edge may pass the threshold between the tap before and the crossing one.
+    rising = fine[:, 1:-1]
+    peaked = (rising >= threshold[:, None]) & (rising >= fine[:, 2:])
+    peaked[:, : (-1 - _EDGE_TAPS[0]) * _EDGE_STEPS] = False
+    peaked[:, -1] = True
+    top = peaked.argmax(axis=1) + 1
+    half = fine[rows, top] / 2.0
+    below = (fine <= half[:, None]) & (np.arange(fine.shape[1]) < top[:, None])
+    last = np.where(below.any(axis=1), fine.shape[1] - 1 - below[:, ::-1].argmax(axis=1), 0)
+    low, high = fine[rows, last], fine[rows, last + 1]
+    rise = np.where(high > low, high - low, 1.0)
+    fraction = np.clip((half - low) / rise, 0.0, 1.0)
+    index = crossing + _FINE[last] + fraction / _EDGE_STEPS
+    index = np.rint(index * INDEX_STEPS) / INDEX_STEPS
+    located: NDArray[np.float64] = np.where(found, index, np.nan)
+    return located
+
+
+def power_levels(
+    magnitude: NDArray[np.float32], index: NDArray[np.float64], count: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Receive and first-path level, dBm (DW1000 user manual, section 4.7), NaN where index is NaN.
+
+    RSL = 10 log10(C 2^17 / N^2) - A and FSL = 10 log10((F1^2 + F2^2 + F3^2) / N^2) - A, with C the
+    power over all taps less that of the noise, in units of 2^17, F1 to F3 the magnitudes one to three
+    taps after the index, and N the preamble count.
+    """
+    energy = np.einsum("ij,ij->i", magnitude, magnitude, dtype=np.float64)
+    noise_taps = magnitude[:, NOISE_TAPS].astype(np.float64)
+    noise = np.einsum("ij,ij->i", noise_taps, noise_taps) / noise_taps.shape[1] * magnitude.shape[1]
+    cir_power = np.maximum(np.rint((energy - noise) / 2.0**17), 1.0)
+    found = np.isfinite(index)
+    first = np.floor(np.where(found, index, 0.0)).astype(np.int64)
+    near = np.rint(magnitude[np.arange(len(index))[:, None], first[:, None] + np.arange(1, 4)])
+    first_power = np.maximum((near.astype(np.float64) ** 2).sum(axis=1), 1.0)
+    squared = count.astype(np.float64) ** 2
+    receive = 10.0 * np.log10(cir_power * 2.0**17 / squared) - POWER_CONSTANT_DB
+    first_path = 10.0 * np.log10(first_power / squared) - POWER_CONSTANT_DB
+    return np.where(found, receive, np.nan), np.where(found, first_path, np.nan)
