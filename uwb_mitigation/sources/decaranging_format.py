@@ -71,7 +71,7 @@ class Oddity(str, enum.Enum):
     UNREADABLE = "log that could not be read to its end"
 
 
-_FILE = re.compile(rb"File:(\d{8}-\d{6})?")
+_FILE = re.compile(rb"File:(\d{8}-\d{6})")
 _MODE = re.compile(rb"Mode: .*?Chan ([1-7]), .*?PRF (16|64),")
 _FRAME = re.compile(rb"RX DATA: ?((?:[0-9A-Fa-f]{2}){22,1024})")
 _RX_OK = re.compile(
