@@ -101,6 +101,7 @@ class Survey:
         metadata: the metadata records by name.
         messages: how many messages the spans hold, as far as the file says.
         damage: (byte offset, what is wrong) of the first damage; None = intact to the end.
+        complete: whether the summary repeated the channels, so that all are known before a chunk is read.
         oddities: what was found beside, {kind: count}.
     """
 
@@ -110,6 +111,7 @@ class Survey:
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     messages: int = 0
     damage: tuple[int, str] | None = None
+    complete: bool = False
     oddities: Counter[str] = field(default_factory=Counter)
     _definition_bytes: int = 0
 
@@ -242,6 +244,7 @@ def _read_summary(stream: BinaryIO, found: Survey, offset: int, size: int) -> No
         length = end - offset - _RECORD.size
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             found.define(opcode, _read_definition(stream, length))
+            found.complete = True
         elif opcode == Opcode.STATISTICS:
             (found.messages,) = struct.unpack("<Q", _read(stream, 8, length))
         elif opcode == Opcode.FOOTER:

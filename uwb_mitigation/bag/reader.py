@@ -5,6 +5,7 @@ A bag is one MCAP file or a rosbag2 folder. Nothing but the surveys and a few ch
 
 from __future__ import annotations
 
+import contextlib
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Collection, Iterator
@@ -81,11 +82,8 @@ class BagReader:
             try:
                 with path.open("rb") as stream:
                     yield from self._ordered(stream, path, found, topics, start_ns, stop_ns)
-            except OSError as error:
+            except OSError as error:  # noqa: PERF203 - once a file
                 raise RecordingError(f"cannot be read: {error.strerror}", where=str(path)) from error
-            if found.damage:
-                offset, what = found.damage
-                raise _damaged(path, offset, what)
 
     def _ordered(
         self,
@@ -100,9 +98,13 @@ class BagReader:
             (span for span in found.spans if _overlaps(span, start_ns, stop_ns)),
             key=lambda span: (span.first_ns, span.offset),
         )
+        if not found.complete and spans != found.spans:
+            _learn_channels(stream, found)
+        damage = found.damage
         pending: list[RawMessage] = []
         for number, span in enumerate(spans):
-            if not _may_hold(found, span, topics):
+            # A damaged chunk may claim any time; those before it in the file are read all the same.
+            if (damage and span.offset > damage[0]) or not _may_hold(found, span, topics):
                 continue
             try:
                 for message in read_span(stream, found, span):
@@ -114,9 +116,7 @@ class BagReader:
                         # Not extend(): what was read before damage inside a run must stay.
                         pending.append(message)  # noqa: PERF401
             except ValueError as error:
-                pending.sort(key=_log_time)
-                yield from pending
-                raise _damaged(path, span.offset, str(error)) from error
+                damage = (span.offset, str(error))
             pending.sort(key=_log_time)
             if number + 1 == len(spans):
                 break
@@ -127,6 +127,13 @@ class BagReader:
             yield from pending[:ready]
             del pending[:ready]
         yield from pending
+        if damage:
+            offset, what = damage
+            raise DamagedRecordingError(
+                f"damaged: {what}",
+                where=f"{path}, byte {offset}",
+                valid="everything before that byte was read",
+            )
 
 
 def _survey(path: Path) -> Survey:
@@ -150,15 +157,17 @@ def _overlaps(span: Span, start_ns: int | None, stop_ns: int | None) -> bool:
     return (start_ns is None or span.last_ns >= start_ns) and (stop_ns is None or span.first_ns < stop_ns)
 
 
+def _learn_channels(stream: BinaryIO, found: Survey) -> None:
+    """Read what only the chunks define, before chunks are read in another order or left out."""
+    with contextlib.suppress(ValueError):
+        for span in found.spans:
+            for _ in read_span(stream, found, span):
+                pass
+
+
 def _may_hold(found: Survey, span: Span, topics: Collection[str] | None) -> bool:
     """False where the file's index shows that a span holds none of `topics`, so that it need not be unpacked."""
     if topics is None or not span.channel_ids:
         return True
     channels = [found.channels.get(number) for number in span.channel_ids]
     return any(channel is None or channel.topic in topics for channel in channels)
-
-
-def _damaged(path: Path, offset: int, what: str) -> DamagedRecordingError:
-    return DamagedRecordingError(
-        f"damaged: {what}", where=f"{path}, byte {offset}", valid="everything before that byte was read"
-    )

@@ -147,8 +147,10 @@ class BagWriter:
         """
         if log_time_ns < 0 or publish_time_ns < 0:
             raise RecordingError(f"time {min(log_time_ns, publish_time_ns)} ns is before the epoch")
-        with self._writing():
+        try:
             self._mcap.add_message(channel, log_time_ns, data, publish_time_ns, sequence)
+        except OSError as error:
+            raise self._unwritable(error) from error
         self.counts[topic] += 1
         self._first_ns = log_time_ns if self._first_ns is None else min(self._first_ns, log_time_ns)
         self._last_ns = max(self._last_ns, log_time_ns)
@@ -265,5 +267,8 @@ class BagWriter:
         try:
             yield
         except OSError as error:
-            self._abandon()
-            raise RecordingError(f"cannot be written: {error.strerror}", where=str(self.file)) from error
+            raise self._unwritable(error) from error
+
+    def _unwritable(self, error: OSError) -> RecordingError:
+        self._abandon()
+        return RecordingError(f"cannot be written: {error.strerror}", where=str(self.file))

@@ -1,0 +1,419 @@
+"""Bags as written: the codec, and what the rosbags and mcap libraries make of a bag of ours."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import re
+from collections.abc import Callable
+from dataclasses import astuple, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import SeekingReader
+from rosbags.rosbag2 import Reader
+
+from uwb_mitigation.bag import codec, schemas
+from uwb_mitigation.bag.reader import BagReader
+from uwb_mitigation.bag.topics import (
+    RANGE_CIR_TYPE,
+    RANGE_CORRECTED,
+    RANGE_CORRECTED_TYPE,
+    RANGE_RAW,
+    RANGE_TRUTH,
+    RANGE_TRUTH_TYPE,
+)
+from uwb_mitigation.bag.writer import BagWriter
+from uwb_mitigation.errors import RecordingError
+from uwb_mitigation.measurement import (
+    SAMPLE_PERIOD_S,
+    Cir,
+    CorrectedRange,
+    Encoding,
+    Origin,
+    RangeMeasurement,
+    Status,
+    Truth,
+)
+from uwb_mitigation.sources.source import Record
+
+START_NS = 1_700_000_000_000_000_000
+TYPES = (RANGE_CIR_TYPE, RANGE_TRUTH_TYPE, RANGE_CORRECTED_TYPE)
+
+# The machine may be busy, and a failure must come again.
+examples = settings(deadline=None, derandomize=True)
+
+float32 = st.floats(width=32)
+uint64 = st.integers(0, 2**64 - 1)
+uint16 = st.integers(0, 2**16 - 1)
+texts = st.text(max_size=12)
+cirs = st.builds(
+    Cir,
+    samples=st.lists(st.integers(-(2**15), 2**15 - 1), max_size=9).map(lambda x: np.array(x, np.int16)),
+    encoding=st.sampled_from(Encoding),
+    start_index=st.integers(-(2**31), 2**31 - 1),
+    first_path_index=float32,
+    sample_period_s=float32,
+    scale=float32,
+    preamble_count=uint16,
+    noise_threshold=uint16,
+    rx_power_dbm=float32,
+    first_path_power_dbm=float32,
+    channel=st.integers(0, 255),
+    prf_mhz=st.integers(0, 255),
+)
+measurements = st.builds(
+    RangeMeasurement,
+    stamp_ns=st.integers(-(2**31) * 10**9, (2**31) * 10**9 - 1),
+    tag_id=uint64,
+    anchor_id=uint64,
+    sequence=st.integers(0, 2**32 - 1),
+    device_time=uint64,
+    range_m=float32,
+    cir=cirs,
+    frame_id=texts,
+)
+truths = st.builds(Truth, range_m=float32, label=texts, configuration=texts)
+corrections = st.builds(
+    CorrectedRange,
+    range_m=float32,
+    range_raw_m=float32,
+    correction_m=float32,
+    variance_m2=float32,
+    status=st.sampled_from(Status),
+    origin=st.sampled_from(Origin),
+    model_id=st.integers(0, 2**32 - 1),
+)
+
+
+def record(number: int, samples: int = 157, truth: bool = True) -> Record:
+    rng = np.random.default_rng(number)
+    cir = Cir(
+        rng.integers(-900, 900, 2 * samples).astype(np.int16),
+        first_path_index=740.25 + number,
+        preamble_count=200 + number,
+        noise_threshold=1500,
+        rx_power_dbm=-79.5,
+        first_path_power_dbm=-83.25,
+        channel=2,
+        prf_mhz=64,
+        start_index=700,
+        sample_period_s=float(np.float32(SAMPLE_PERIOD_S)),
+    )
+    measurement = RangeMeasurement(
+        START_NS + number * 10_000_000, 7, 1 + number % 2, number, number * 1000, 4.5 + number, cir, "antenna"
+    )
+    known = Truth(4.0 + number, "NDP NLOS", f"place {number % 2}") if truth else None
+    return Record(measurement, known)
+
+
+def corrected(number: int) -> CorrectedRange:
+    return CorrectedRange(4.25 + number, 4.5 + number, 0.25, 0.0625, Status.OK, Origin.DEVICE, 77)
+
+
+def write_bag(path: Path, count: int = 5, **options: bool) -> Path:
+    with BagWriter(path, {"source": "a test", "simulated": "true"}, **options) as bag:
+        for number in range(count):
+            bag.write(record(number))
+            bag.write_corrected(record(number).measurement, corrected(number))
+    return path
+
+
+def same(one: RangeMeasurement, other: RangeMeasurement) -> bool:
+    def flat(measurement: RangeMeasurement) -> list[object]:
+        cir = measurement.cir
+        fields = [*astuple(replace(measurement, cir=None)), *astuple(replace(cir, samples=None))]
+        return ["NaN" if isinstance(value, float) and math.isnan(value) else value for value in fields]
+
+    return flat(one) == flat(other) and np.array_equal(one.cir.samples, other.cir.samples)
+
+
+@examples
+@given(measurements)
+def test_a_measurement_survives_its_message(measurement: RangeMeasurement) -> None:
+    assert same(codec.decode_range(codec.encode_range(measurement)), measurement)
+
+
+@examples
+@given(measurements, truths)
+def test_truth_survives_its_message(measurement: RangeMeasurement, truth: Truth) -> None:
+    key, decoded = codec.decode_truth(codec.encode_truth(measurement, truth))
+    assert key == codec.key_of(measurement)
+    assert repr(decoded) == repr(truth)
+
+
+@examples
+@given(measurements, corrections)
+def test_a_corrected_range_survives_its_message(
+    measurement: RangeMeasurement, correction: CorrectedRange
+) -> None:
+    key, decoded = codec.decode_corrected(codec.encode_corrected(measurement, correction))
+    assert key == codec.key_of(measurement)
+    assert repr(decoded) == repr(correction)
+
+
+@examples
+@given(measurements, truths, corrections)
+def test_messages_equal_those_of_the_rosbags_library(
+    measurement: RangeMeasurement, truth: Truth, correction: CorrectedRange
+) -> None:
+    store = schemas.typestore()
+    ours = (
+        codec.encode_range(measurement),
+        codec.encode_truth(measurement, truth),
+        codec.encode_corrected(measurement, correction),
+    )
+    for data, type_name in zip(ours, TYPES, strict=True):
+        theirs = store.serialize_cdr(store.deserialize_cdr(data, type_name), type_name)
+        assert bytes(theirs) == data
+
+
+@examples
+@given(measurements, st.data())
+def test_a_message_cut_anywhere_is_refused(measurement: RangeMeasurement, data: st.DataObject) -> None:
+    whole = codec.encode_range(measurement)
+    cut = data.draw(st.integers(0, len(whole) - 1))
+    with pytest.raises(RecordingError, match="ends early"):
+        codec.decode_range(whole[:cut])
+
+
+@pytest.mark.parametrize("decode", [codec.decode_range, codec.decode_truth, codec.decode_corrected])
+@examples
+@given(noise=st.binary(max_size=200), start=st.sampled_from([b"", b"\0\1\0\0"]))
+def test_arbitrary_bytes_decode_or_are_refused(
+    decode: Callable[[bytes], object], noise: bytes, start: bytes
+) -> None:
+    with contextlib.suppress(RecordingError):
+        decode(start + noise)
+
+
+@pytest.mark.parametrize(
+    ("at", "value", "what"),
+    [
+        (0, b"\0\0", "big-endian"),
+        (0, b"\0\7", "unknown encapsulation"),
+        (8, b"\0\xca\x9a\x3b", "time stamp"),
+        (12, b"\xff\xff\xff\xff", "ends early"),
+        (16, b"\xff", "not UTF-8"),
+        (23, b"x", "unterminated"),
+        (28 + 48, b"\2", "unknown CIR encoding"),
+        (28 + 56, b"\xff\xff\xff\xff", "ends early"),
+    ],
+)
+def test_a_hostile_field_is_refused_by_name(at: int, value: bytes, what: str) -> None:
+    data = bytearray(codec.encode_range(record(0).measurement))
+    data[at : at + len(value)] = value
+    with pytest.raises(RecordingError, match=what):
+        codec.decode_range(bytes(data))
+
+
+def test_trailing_bytes_are_refused() -> None:
+    with pytest.raises(RecordingError, match="longer than its type"):
+        codec.decode_range(codec.encode_range(record(0).measurement) + bytes(4))
+
+
+@pytest.mark.parametrize(
+    "field", [{"tag_id": 2**64}, {"sequence": -1}, {"stamp_ns": 2**63}, {"range_m": 1e39}]
+)
+def test_a_value_that_does_not_fit_is_refused(field: dict[str, float]) -> None:
+    with pytest.raises(RecordingError, match="does not fit RangeCir"):
+        codec.encode_range(replace(record(0).measurement, **field))
+
+
+def test_samples_of_another_type_are_refused() -> None:
+    measurement = record(0).measurement
+    with pytest.raises(RecordingError, match="float64"):
+        codec.encode_range(replace(measurement, cir=replace(measurement.cir, samples=np.zeros(4))))
+
+
+@pytest.mark.parametrize("name", ["bag.mcap", "folder"])
+def test_rosbags_opens_a_bag_and_agrees_on_every_field(tmp_path: Path, name: str) -> None:
+    path = write_bag(tmp_path / name)
+    store = schemas.typestore()
+    with Reader(path) as reader:
+        assert {topic: info.msgcount for topic, info in reader.topics.items()} == {
+            RANGE_RAW: 5,
+            RANGE_TRUTH: 5,
+            RANGE_CORRECTED: 5,
+        }
+        for connection, stamp_ns, data in reader.messages():
+            message = store.deserialize_cdr(data, connection.msgtype)
+            number = message.sequence
+            expected = record(number)
+            assert stamp_ns == expected.measurement.stamp_ns
+            assert (
+                message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+                == expected.measurement.stamp_ns
+            )
+            assert message.header.frame_id == "antenna"
+            assert (message.tag_id, message.anchor_id) == (7, 1 + number % 2)
+            if connection.topic == RANGE_RAW:
+                cir, wanted = message.cir, expected.measurement.cir
+                assert (message.device_time, message.range) == (number * 1000, 4.5 + number)
+                assert np.array_equal(cir.samples, wanted.samples)
+                assert cir.sample_period == np.float32(wanted.sample_period_s)
+                assert (cir.start_index, cir.first_path_index, cir.encoding, cir.scale) == (
+                    700,
+                    740.25 + number,
+                    0,
+                    1.0,
+                )
+                assert (cir.preamble_count, cir.noise_threshold) == (200 + number, 1500)
+                assert (cir.rx_power, cir.first_path_power) == (-79.5, -83.25)
+                assert (cir.channel, cir.prf) == (2, 64)
+            elif connection.topic == RANGE_TRUTH:
+                assert (message.range, message.label) == (4.0 + number, "NDP NLOS")
+                assert message.configuration == f"place {number % 2}"
+            else:
+                assert (message.range, message.range_raw, message.correction) == (
+                    4.25 + number,
+                    4.5 + number,
+                    0.25,
+                )
+                assert (message.variance, message.status, message.source, message.model_id) == (
+                    0.0625,
+                    0,
+                    1,
+                    77,
+                )
+
+
+def test_the_schemas_in_the_bag_carry_the_hash_that_ros_computes(tmp_path: Path) -> None:
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    with Reader(write_bag(tmp_path / "folder")) as reader:
+        for connection in reader.connections:
+            store = get_typestore(Stores.ROS2_JAZZY)
+            store.register(get_types_from_msg(connection.msgdef.data, connection.msgtype))
+            assert store.hash_rihs01(connection.msgtype) == connection.digest
+
+
+def test_the_mcap_library_reads_a_bag_with_every_checksum_tested(tmp_path: Path) -> None:
+    with write_bag(tmp_path / "bag.mcap", 20).open("rb") as stream:
+        reader = SeekingReader(stream, validate_crcs=True)
+        assert reader.get_header().profile == "ros2"
+        messages = list(reader.iter_messages(RANGE_RAW))
+        summary = reader.get_summary()
+        records = {item.name: item.metadata for item in reader.iter_metadata()}
+    assert len(messages) == 20
+    assert {index.compression for index in summary.chunk_indexes} == {"zstd"}
+    schema, channel, message = messages[3]
+    assert (schema.name, schema.encoding, channel.message_encoding) == (RANGE_CIR_TYPE, "ros2msg", "cdr")
+    assert b"MSG: builtin_interfaces/Time" in schema.data
+    assert channel.metadata == {
+        "offered_qos_profiles": "[]",
+        "topic_type_hash": schemas.type_hash(RANGE_CIR_TYPE),
+    }
+    assert same(codec.decode_range(message.data), record(3).measurement)
+    assert records["uwb_mitigation"]["simulated"] == "true"
+    described = yaml.safe_load((tmp_path / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    assert yaml.safe_load(records["rosbag2"]["serialized_metadata"]) == described
+
+
+def test_metadata_yaml_says_what_rosbag2_asks_for(tmp_path: Path) -> None:
+    write_bag(tmp_path / "folder")
+    information = yaml.safe_load((tmp_path / "folder" / "metadata.yaml").read_text())[
+        "rosbag2_bagfile_information"
+    ]
+    assert information["version"] == 9
+    assert information["storage_identifier"] == "mcap"
+    assert information["relative_file_paths"] == ["folder_0.mcap"]
+    assert information["message_count"] == 15
+    assert information["starting_time"] == {"nanoseconds_since_epoch": START_NS}
+    assert information["duration"] == {"nanoseconds": 40_000_000}
+
+
+def test_messages_of_another_bag_are_copied_byte_for_byte(tmp_path: Path) -> None:
+    original = BagReader(write_bag(tmp_path / "one.mcap"))
+    before = list(original.messages())
+    with BagWriter(tmp_path / "two", {}) as bag:
+        channels: dict[str, int] = {}
+        for channel, sequence, log_ns, publish_ns, data in before:
+            if channel.topic not in channels:
+                channels[channel.topic] = bag.copy_channel(channel)
+            bag.write_serialized(channels[channel.topic], channel.topic, data, log_ns, publish_ns, sequence)
+    after = list(BagReader(tmp_path / "two").messages())
+    assert [message[1:] for message in after] == [message[1:] for message in before]
+    assert {m.channel.topic: m.channel.schema for m in after} == {
+        m.channel.topic: m.channel.schema for m in before
+    }
+
+
+@pytest.mark.parametrize("name", ["bag.mcap", "folder"])
+def test_a_bag_that_is_there_is_kept_unless_forced(tmp_path: Path, name: str) -> None:
+    path = write_bag(tmp_path / name, 5)
+    with pytest.raises(RecordingError, match="--force"):
+        write_bag(path, 2)
+    assert BagReader(path).message_count == 15
+    write_bag(path, 2, force=True)
+    assert BagReader(path).message_count == 6
+
+
+@pytest.mark.parametrize("name", ["bag.mcap", "folder"])
+def test_an_interrupted_writer_leaves_nothing(tmp_path: Path, name: str) -> None:
+    def interrupted() -> None:
+        with BagWriter(tmp_path / name, {}) as bag:
+            bag.write(record(0))
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_failed_rewrite_leaves_the_old_bag(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "bag.mcap")
+    before = path.read_bytes()
+    with pytest.raises(RecordingError), BagWriter(path, {}, force=True) as bag:
+        bag.write(Record(replace(record(0).measurement, tag_id=-1)))
+    assert path.read_bytes() == before
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["bag.mcap", "metadata.yaml"]
+
+
+def test_metadata_of_another_bag_beside_ours_is_left_and_told(tmp_path: Path) -> None:
+    write_bag(tmp_path / "one.mcap")
+    before = (tmp_path / "metadata.yaml").read_text()
+    with BagWriter(tmp_path / "two.mcap", {}) as bag:
+        bag.write(record(0))
+    assert (tmp_path / "metadata.yaml").read_text() == before
+    assert "describes another bag" in bag.notice
+
+
+def test_a_path_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="cannot be written"):
+        BagWriter(tmp_path / "absent" / "bag.mcap", {})
+
+
+def test_a_full_disk_is_told_in_our_own_error(tmp_path: Path) -> None:
+    if not Path("/dev/full").exists():
+        pytest.skip("no /dev/full on this system")
+    (tmp_path / "bag.mcap.part").symlink_to("/dev/full")
+    with pytest.raises(RecordingError, match="No space left"):
+        write_bag(tmp_path / "bag.mcap")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (("uint64 device_time", "uint32 device_time"), "field 5 .* is 'uint32 device_time'"),
+        (("Cir cir ", "Cir cir\nfloat32 extra "), "further field 'float32 extra'"),
+        (("uint64 anchor_id", "# uint64 anchor_id"), "field 3 .* is 'uint32 sequence'"),
+        (("MSG: uwb_mitigation_msgs/Cir", "MSG: uwb_mitigation_msgs/Other"), "Cir is not defined"),
+    ],
+)
+def test_a_schema_of_other_fields_is_told_apart(change: tuple[str, str], told: str) -> None:
+    text = schemas.definition(RANGE_CIR_TYPE)
+    assert change[0] in text
+    assert re.search(told, schemas.difference(text.replace(*change), RANGE_CIR_TYPE) or "")
+
+
+@pytest.mark.parametrize("type_name", TYPES)
+def test_comments_and_constants_do_not_make_another_schema(type_name: str) -> None:
+    bare, _ = schemas.typestore().generate_msgdef(type_name, ros_version=2)
+    assert bare != schemas.definition(type_name)
+    assert schemas.difference(bare, type_name) is None
