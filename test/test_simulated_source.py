@@ -122,6 +122,19 @@ def test_within_a_placement_at_rest_the_error_is_nearly_constant(survey: list[Re
     assert 0.005 < np.median(stds) < 0.04
 
 
+def test_fading_rests_with_the_antennas_and_changes_as_they_move(
+    drive: list[Record], survey: list[Record]
+) -> None:
+    def spread_db(records: list[Record]) -> float:
+        level: dict[str, list[float]] = {}
+        for r in records:
+            if r.truth is not None and r.truth.label != "LOS":
+                level.setdefault(r.truth.configuration, []).append(r.measurement.cir.rx_power_dbm)
+        return float(np.median([np.std(v) for v in level.values() if len(v) >= 4]))
+
+    assert spread_db(survey) < 0.2 < 0.5 < spread_db(drive)
+
+
 def test_placements_have_their_own_configuration_and_a_sensible_distance(survey: list[Record]) -> None:
     distance: dict[str, set[float]] = {}
     for r in survey:

@@ -163,7 +163,8 @@ def test_a_slanting_path_is_longer_inside_the_wall() -> None:
     wall = Wall((0, 0), (0, 1), CONCRETE, 0.2)
     loss, excess = through_slab(wall, np.array([1.0, 0.5]))
     assert loss[1] > loss[0]
-    assert excess[1] > excess[0]
+    # At 60 degrees: t (sqrt(eps - sin^2) - cos).
+    assert excess[1] == pytest.approx(0.2 * (math.sqrt(CONCRETE.permittivity - 0.75) - 0.5))
 
 
 def test_walls_count_only_where_the_line_crosses_them() -> None:
