@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 import uwb_mitigation
-from uwb_mitigation.commands import console, data
+from uwb_mitigation.commands import console, data, model
 from uwb_mitigation.errors import UwbMitigationError
 
 app = typer.Typer(
@@ -19,6 +19,7 @@ app = typer.Typer(
     add_completion=False,
 )
 app.add_typer(data.app, name="data")
+app.add_typer(model.app)
 
 
 def _print_version(wanted: bool) -> None:

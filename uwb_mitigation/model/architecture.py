@@ -6,6 +6,33 @@ from dataclasses import dataclass
 
 from uwb_mitigation.errors import ParameterError
 
+HEAD = "head"
+"""Name of the dense layer that reads the last module's output, flattened channel by channel."""
+
+
+@dataclass(frozen=True, slots=True)
+class Convolution:
+    """One convolution of the network; each is followed by a ReLU.
+
+    Attributes:
+        name: `first`, or `module1.residual`, `module1.reduce`, `module1.skip` and so on.
+        inputs, filters: channels in and out.
+        kernel, stride: in samples.
+        length: samples in time at its input.
+    """
+
+    name: str
+    inputs: int
+    filters: int
+    kernel: int
+    stride: int
+    length: int
+
+    @property
+    def padding(self) -> tuple[int, int]:
+        """Zeros before and after the input."""
+        return same_padding(self.length, self.kernel, self.stride)
+
 
 @dataclass(frozen=True, slots=True)
 class Remnet:
@@ -47,6 +74,24 @@ class Remnet:
         for _ in range(self.modules):
             lengths.append(-(-lengths[-1] // 2))
         return tuple(lengths)
+
+    @property
+    def convolutions(self) -> tuple[Convolution, ...]:
+        """Every convolution in the order of evaluation: first, then residual, reduce, skip a module."""
+        f, k = self.filters, self.kernel
+        layers = [Convolution("first", 1, f, self.first_kernel, 1, self.samples)]
+        for number, length in enumerate(self.lengths[:-1], start=1):
+            layers += [
+                Convolution(f"module{number}.residual", f, f, k, 1, length),
+                Convolution(f"module{number}.reduce", f, f, k, 2, length),
+                Convolution(f"module{number}.skip", f, f, 1, 2, length),
+            ]
+        return tuple(layers)
+
+    @property
+    def features(self) -> int:
+        """Inputs of the head."""
+        return self.lengths[-1] * self.filters
 
     @property
     def parameters(self) -> int:

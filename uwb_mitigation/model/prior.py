@@ -5,6 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+
+MAX_POWER_DBM = 1000.0
+"""A level beyond, of either sign, is none: also keeps the line clear of float32 overflow."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,12 +34,29 @@ class LinePrior:
         return self.per_rx_power != 0.0 or self.per_power_gap != 0.0
 
     def predict_m(self, rx_power_dbm: float, first_path_power_dbm: float) -> np.float32:
-        """The prior's predicted error, m; NaN where a power that it needs is not finite."""
+        """The prior's predicted error, m; NaN where a power that it needs is not finite, or no power."""
         if not self.needs_power:
             constant: np.float32 = np.float32(self.offset_m)
             return constant
+        if not (abs(rx_power_dbm) <= MAX_POWER_DBM and abs(first_path_power_dbm) <= MAX_POWER_DBM):
+            unknown: np.float32 = np.float32(np.nan)
+            return unknown
         rx: np.float32 = np.float32(rx_power_dbm)
         gap = rx - np.float32(first_path_power_dbm)
         level: np.float32 = np.float32(self.offset_m) + np.float32(self.per_rx_power) * rx
         predicted: np.float32 = level + np.float32(self.per_power_gap) * gap
+        return predicted
+
+    def predict_batch_m(
+        self, rx_power_dbm: NDArray[np.float32], first_path_power_dbm: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """`predict_m` of arrays of shape (n,), to the bit."""
+        if not self.needs_power:
+            return np.full(len(rx_power_dbm), self.offset_m, np.float32)
+        known = np.abs(rx_power_dbm) <= MAX_POWER_DBM
+        known &= np.abs(first_path_power_dbm) <= MAX_POWER_DBM
+        rx = np.where(known, rx_power_dbm, np.float32(np.nan))
+        gap = rx - first_path_power_dbm
+        level = np.float32(self.offset_m) + np.float32(self.per_rx_power) * rx
+        predicted: NDArray[np.float32] = level + np.float32(self.per_power_gap) * gap
         return predicted

@@ -1,0 +1,117 @@
+"""Labelled measurements as arrays: what training, calibration and baselines work on."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.errors import DatasetError
+from uwb_mitigation.preprocessing import Preprocessing
+from uwb_mitigation.sources.source import Record
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Dataset:
+    """Measurements with truth, preprocessed; every array has n rows.
+
+    Attributes:
+        preprocessing: what made the inputs.
+        inputs: float32 (n, K).
+        rx_power_dbm, first_path_power_dbm: float32; NaN = unknown.
+        range_m: as measured.
+        error_m: measured - true.
+        configurations: name of the placement; measurements of one are not independent, and those
+            without a name count as one.
+        labels: propagation condition; may be empty.
+        refused: measurements left out, {why: count}.
+    """
+
+    preprocessing: Preprocessing
+    inputs: NDArray[np.float32]
+    rx_power_dbm: NDArray[np.float32]
+    first_path_power_dbm: NDArray[np.float32]
+    range_m: NDArray[np.float64]
+    error_m: NDArray[np.float64]
+    configurations: NDArray[np.str_]
+    labels: NDArray[np.str_]
+    refused: Mapping[str, int] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.error_m)
+
+    def rows(self, chosen: NDArray[np.intp] | NDArray[np.bool_]) -> Dataset:
+        """The part with these rows."""
+        return Dataset(
+            self.preprocessing,
+            self.inputs[chosen],
+            self.rx_power_dbm[chosen],
+            self.first_path_power_dbm[chosen],
+            self.range_m[chosen],
+            self.error_m[chosen],
+            self.configurations[chosen],
+            self.labels[chosen],
+        )
+
+    @property
+    def names(self) -> list[str]:
+        """The configurations, sorted."""
+        return [str(name) for name in np.unique(self.configurations)]
+
+
+def build_dataset(records: Iterable[Record], preprocessing: Preprocessing) -> Dataset:
+    """Preprocess every measurement that has a true range; count by reason what is left out.
+
+    Raises:
+        DatasetError: nothing is left.
+    """
+    refused: Counter[str] = Counter()
+    inputs, numbers, configurations, labels = [], [], [], []
+    for record in records:
+        measurement, truth = record.measurement, record.truth
+        if truth is None or not math.isfinite(truth.range_m):
+            refused["no true range"] += 1
+            continue
+        if not (math.isfinite(measurement.range_m) and measurement.range_m >= 0):
+            refused["no valid range"] += 1
+            continue
+        window = np.empty(preprocessing.samples, np.float32)
+        fault = preprocessing.apply(measurement.cir, window)
+        if fault is not None:
+            refused[fault.value] += 1
+            continue
+        inputs.append(window)
+        numbers.append(
+            (
+                measurement.cir.rx_power_dbm,
+                measurement.cir.first_path_power_dbm,
+                measurement.range_m,
+                measurement.range_m - truth.range_m,
+            )
+        )
+        configurations.append(truth.configuration)
+        labels.append(truth.label)
+    if not inputs:
+        reasons = ", ".join(f"{count} x {why}" for why, count in refused.items()) or "no measurements"
+        raise DatasetError(f"no labelled measurement that can be used: {reasons}")
+    rx_power, first_path_power, range_m, error_m = np.array(numbers, np.float64).T
+    return Dataset(
+        preprocessing,
+        np.stack(inputs),
+        _power(rx_power),
+        _power(first_path_power),
+        range_m,
+        error_m,
+        np.array(configurations),
+        np.array(labels),
+        dict(refused),
+    )
+
+
+def _power(levels: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Levels as float32, NaN where not finite: a log writes -inf for a signal that it did not see."""
+    return np.where(np.isfinite(levels), levels, np.nan).astype(np.float32)

@@ -1,0 +1,59 @@
+"""Statistics of range errors (measured - true, or corrected - true), in metres."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.errors import DatasetError
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorStatistics:
+    """Attributes:
+    mae: mean absolute error.
+    std: standard deviation of the signed error.
+    p95: 95th percentile of the absolute error.
+    """
+
+    mae: float
+    std: float
+    p95: float
+
+    @classmethod
+    def of(cls, error_m: NDArray[np.floating]) -> ErrorStatistics:
+        """The statistics of errors of shape (n,).
+
+        Raises:
+            DatasetError: there are none, or one is not finite.
+        """
+        if len(error_m) == 0 or not np.isfinite(error_m).all():
+            raise DatasetError(
+                f"statistics of {len(error_m)} errors", valid="at least one, all of them finite"
+            )
+        magnitude = np.abs(error_m)
+        return cls(float(magnitude.mean()), float(np.std(error_m)), float(np.percentile(magnitude, 95)))
+
+
+def mae_by_group(
+    names: NDArray[np.str_], raw_m: NDArray[np.floating], corrected_m: NDArray[np.floating]
+) -> dict[str, tuple[int, float, float]]:
+    """{name: (n, MAE of `raw_m`, MAE of `corrected_m`)} of errors of shape (n,), in order of first use."""
+    groups = {}
+    for name in dict.fromkeys(names.tolist()):
+        rows = names == name
+        groups[name] = (
+            int(rows.sum()),
+            float(np.abs(raw_m[rows]).mean()),
+            float(np.abs(corrected_m[rows]).mean()),
+        )
+    return groups
+
+
+def coverage(
+    error_m: NDArray[np.floating], variance_m2: NDArray[np.floating] | float, sigmas: float
+) -> float:
+    """The share of errors within `sigmas` standard deviations of zero."""
+    return float(np.mean(np.abs(error_m) <= sigmas * np.sqrt(variance_m2)))

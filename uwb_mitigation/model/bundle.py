@@ -1,0 +1,250 @@
+"""A model bundle: one ONNX file with everything that running it takes in its metadata.
+
+The metadata property `uwb_mitigation` holds canonical JSON. Its `model_id` is the CRC-32 of the whole
+file with the id's eight hexadecimal digits set to zero: it names the model in every corrected range, and
+a file that was changed by a single bit does not load. It guards against damage, not against forgery.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import zlib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from uwb_mitigation.errors import ModelError, UwbMitigationError
+from uwb_mitigation.model import onnx_file
+from uwb_mitigation.model.architecture import Remnet
+from uwb_mitigation.model.prior import LinePrior
+from uwb_mitigation.model.wire import WireError, delimited
+from uwb_mitigation.preprocessing import Preprocessing, Scaling
+
+FORMAT = 1
+METADATA_KEY = "uwb_mitigation"
+MAX_BYTES = 64 << 20
+
+_METADATA_FIELD = 14
+_MARKER = re.compile(rb'"model_id":"([0-9a-f]{8})"')
+_BLANK = b"00000000"
+_REMEDY = "write one with `uwb-mitigation train` and `quantize`"
+
+
+@dataclass(frozen=True, slots=True)
+class Card:
+    """What a bundle says of its network.
+
+    Attributes:
+        name: for people.
+        architecture: the network's shape.
+        preprocessing: what makes the network's input; its window is the architecture's K.
+        prior: predicts the part of the error that the network does not.
+        quantised: int8, or float32.
+        variance_m2: of a corrected range, m^2: expected squared error on unseen configurations.
+        variance_uncorrected_m2: of a range passed through, m^2.
+        correction_limits_m: predicted errors outside of these mean an input unlike the training data.
+        training: data, split, seed, recipe and metrics; for people, JSON values only.
+    """
+
+    name: str
+    architecture: Remnet
+    preprocessing: Preprocessing
+    prior: LinePrior
+    quantised: bool
+    variance_m2: float
+    variance_uncorrected_m2: float
+    correction_limits_m: tuple[float, float]
+    training: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.architecture.samples != self.preprocessing.samples:
+            raise ModelError(
+                f"the network reads {self.architecture.samples} samples, "
+                f"the preprocessing makes {self.preprocessing.samples}"
+            )
+        numbers = {
+            "prior.offset_m": self.prior.offset_m,
+            "prior.per_rx_power": self.prior.per_rx_power,
+            "prior.per_power_gap": self.prior.per_power_gap,
+            "correction_limits_m[0]": self.correction_limits_m[0],
+            "correction_limits_m[1]": self.correction_limits_m[1],
+            "variance_m2": self.variance_m2,
+            "variance_uncorrected_m2": self.variance_uncorrected_m2,
+        }
+        for name, value in numbers.items():
+            if not math.isfinite(value):
+                raise ModelError(f"{name} = {value}", valid="a finite number")
+            # Both sides of the link compute in float32: what the file says is what is used.
+            if float(np.float32(value)) != value:
+                raise ModelError(f"{name} = {value!r} is no float32 value")
+        for name in ("variance_m2", "variance_uncorrected_m2"):
+            if numbers[name] <= 0:
+                raise ModelError(f"{name} = {numbers[name]}", valid="a positive number")
+        if self.correction_limits_m[0] >= self.correction_limits_m[1]:
+            raise ModelError(f"correction_limits_m = {self.correction_limits_m}", valid="low, high")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bundle:
+    """A loaded model: its card, the bytes of the file, and where they came from."""
+
+    path: Path
+    model: bytes
+    model_id: int
+    card: Card
+
+    @property
+    def name(self) -> str:
+        return self.card.name
+
+    @property
+    def architecture(self) -> Remnet:
+        return self.card.architecture
+
+    @property
+    def preprocessing(self) -> Preprocessing:
+        return self.card.preprocessing
+
+    @property
+    def prior(self) -> LinePrior:
+        return self.card.prior
+
+    @property
+    def quantised(self) -> bool:
+        return self.card.quantised
+
+
+def load_bundle(path: Path | str) -> Bundle:
+    """Read and check a bundle.
+
+    Raises:
+        ModelError: the file is absent, too large, damaged, no ONNX model, not one of ours, or its
+            metadata and its graph contradict each other.
+    """
+    path = Path(path)
+    try:
+        if not path.is_file():
+            raise ModelError("no such model file", where=str(path), valid=_REMEDY)
+        with path.open("rb") as file:
+            data = file.read(MAX_BYTES + 1)
+    except OSError as error:
+        raise ModelError(f"cannot be read: {error.strerror}", where=str(path)) from error
+    if not data:
+        raise ModelError("the model file is empty", where=str(path), valid=_REMEDY)
+    if len(data) > MAX_BYTES:
+        raise ModelError(f"more than {MAX_BYTES} bytes", where=str(path), valid="a model of REMNet")
+    return parse_bundle(data, path)
+
+
+def parse_bundle(data: bytes, path: Path) -> Bundle:
+    """Check the bytes of a bundle; `path` names them in errors.
+
+    Raises:
+        ModelError: see `load_bundle`.
+    """
+    where = str(path)
+    markers = list(_MARKER.finditer(data))
+    if len(markers) == 1:
+        promised = int(markers[0].group(1), 16)
+        actual = _checksum(data, markers[0].start(1))
+        if promised != actual:
+            raise ModelError(
+                f"the model file is damaged: its checksum is {actual:08x}, it says {promised:08x}",
+                where=where,
+                valid="copy or build it anew",
+            )
+    try:
+        contents = onnx_file.read(data)
+    except WireError as error:
+        raise ModelError(f"not a usable ONNX model: {error}", where=where, valid=_REMEDY) from error
+    if METADATA_KEY not in contents.metadata or len(markers) != 1:
+        raise ModelError(f"an ONNX model without the metadata {METADATA_KEY!r}", where=where, valid=_REMEDY)
+    try:
+        card = _card(json.loads(contents.metadata[METADATA_KEY]))
+    except (ValueError, KeyError, TypeError, RecursionError, UwbMitigationError) as error:
+        reason = f"no {error}" if isinstance(error, KeyError) else str(error)
+        raise ModelError(f"bad metadata: {reason}", where=where, valid=_REMEDY) from error
+    problem = onnx_file.mismatch(contents, card.architecture)
+    if not problem and contents.quantised != card.quantised:
+        problem = f"the metadata says quantised = {card.quantised}, the graph disagrees"
+    if problem:
+        raise ModelError(problem, where=where, valid=_REMEDY)
+    return Bundle(path, data, promised, card)
+
+
+def save_bundle(path: Path, graph: bytes, card: Card) -> Bundle:
+    """Write a bundle whole or not at all, and return it as `load_bundle` would.
+
+    Args:
+        graph: a serialised ONNX model, without metadata of ours.
+
+    Raises:
+        ModelError: the card does not fit the graph, or the file cannot be written.
+    """
+    data = assemble_bundle(graph, card)
+    bundle = parse_bundle(data, path)
+    partial = path.with_name(path.name + ".part")
+    try:
+        partial.write_bytes(data)
+        partial.replace(path)
+    except OSError as error:
+        raise ModelError(f"cannot be written: {error.strerror}", where=str(path)) from error
+    return bundle
+
+
+def assemble_bundle(graph: bytes, card: Card) -> bytes:
+    """The bytes of a bundle."""
+    metadata = asdict(card) | {
+        "format": FORMAT,
+        "model_id": _BLANK.decode(),
+        "preprocessing": {
+            "samples": card.preprocessing.samples,
+            "scaling": card.preprocessing.scaling.value,
+        },
+    }
+    text = json.dumps(metadata, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    entry = delimited(1, METADATA_KEY.encode()) + delimited(2, text.encode())
+    # A protocol-buffers message may be extended by appending a field to it.
+    data = graph + delimited(_METADATA_FIELD, entry)
+    (marker,) = _MARKER.finditer(data)
+    start = marker.start(1)
+    return data[:start] + b"%08x" % _checksum(data, start) + data[start + len(_BLANK) :]
+
+
+def _checksum(data: bytes, digits: int) -> int:
+    """CRC-32 of `data` with the eight digits at `digits` zeroed; never 0, which means no model."""
+    view = memoryview(data)
+    crc = zlib.crc32(view[digits + len(_BLANK) :], zlib.crc32(_BLANK, zlib.crc32(view[:digits])))
+    return crc or 1
+
+
+def _card(metadata: dict[str, Any]) -> Card:
+    if metadata["format"] != FORMAT:
+        raise ModelError(f"metadata format {metadata['format']!r}", valid=f"{FORMAT}")
+    prior = metadata["prior"]
+    low, high = metadata["correction_limits_m"]
+    return Card(
+        name=str(metadata["name"]),
+        architecture=Remnet(**{key: _integer(v) for key, v in metadata["architecture"].items()}),
+        preprocessing=Preprocessing(
+            _integer(metadata["preprocessing"]["samples"]),
+            Scaling(metadata["preprocessing"]["scaling"]),
+        ),
+        prior=LinePrior(**{key: float(value) for key, value in (prior or {"offset_m": 0}).items()}),
+        quantised=metadata["quantised"] is True,
+        variance_m2=float(metadata["variance_m2"]),
+        variance_uncorrected_m2=float(metadata["variance_uncorrected_m2"]),
+        correction_limits_m=(float(low), float(high)),
+        training=dict(metadata["training"]),
+    )
+
+
+def _integer(value: object) -> int:
+    if not isinstance(value, int) or isinstance(value, bool):
+        raise ModelError(f"{value!r} is not an integer")
+    return value

@@ -1,0 +1,224 @@
+"""REMNet as an ONNX graph, in float32 and in int8, and back from the graph to its weights.
+
+Both graphs take `cir`, float32 (n, 1, K), and yield `error`, float32 (n, 1), in metres. The int8 one
+is written with QuantizeLinear and DequantizeLinear around float operators, in the pattern that ONNX
+Runtime fuses into QLinearConv, QLinearAdd and QGemm. Activations are uint8 with zero point 0, so that
+padding is a literal zero and the ReLU is the saturation; weights are int8 with zero point 0.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from typing import TypeVar
+
+import numpy as np
+import onnx
+from numpy.typing import NDArray
+from onnx import TensorProto, helper, numpy_helper
+
+from uwb_mitigation.errors import ModelError
+from uwb_mitigation.model.architecture import HEAD, Remnet
+from uwb_mitigation.model.weights import (
+    FloatWeights,
+    Int8Weights,
+    activation_tensors,
+    layer_inputs,
+)
+
+INPUT = "cir"
+OUTPUT = "error"
+
+Number = TypeVar("Number", bound=np.generic)
+
+# The oldest pair that has all these operators as they are used here; every ONNX Runtime in use reads it.
+OPSET = 13
+IR_VERSION = 7
+
+
+class _Graph:
+    """Collects nodes and initializers."""
+
+    def __init__(self) -> None:
+        self.nodes: list[onnx.NodeProto] = []
+        self.constants: list[onnx.TensorProto] = []
+
+    def constant(self, name: str, value: NDArray[np.generic]) -> str:
+        self.constants.append(numpy_helper.from_array(np.asarray(value), name))
+        return name
+
+    def node(self, operator: str, inputs: list[str], output: str, **attributes: object) -> str:
+        self.nodes.append(helper.make_node(operator, inputs, [output], output, **attributes))
+        return output
+
+    def model(self, architecture: Remnet, name: str) -> bytes:
+        graph = helper.make_graph(
+            self.nodes,
+            name,
+            [helper.make_tensor_value_info(INPUT, TensorProto.FLOAT, ["n", 1, architecture.samples])],
+            [helper.make_tensor_value_info(OUTPUT, TensorProto.FLOAT, ["n", 1])],
+            self.constants,
+        )
+        model = helper.make_model(
+            graph,
+            producer_name="uwb_mitigation",
+            ir_version=IR_VERSION,
+            opset_imports=[helper.make_opsetid("", OPSET)],
+        )
+        onnx.checker.check_model(model, full_check=True)
+        # Repeatable bytes, so that the same training gives the same model id.
+        serialised: bytes = model.SerializeToString(deterministic=True)
+        return serialised
+
+
+def float_model(weights: FloatWeights) -> bytes:
+    """The serialised float32 graph."""
+    graph = _Graph()
+
+    def parameters(layer: str) -> list[str]:
+        return [
+            graph.constant(f"{layer}.weight", weights.weight[layer]),
+            graph.constant(f"{layer}.bias", weights.bias[layer]),
+        ]
+
+    _write(graph, weights.architecture, parameters, lambda tensor, value: value)
+    return graph.model(weights.architecture, "remnet")
+
+
+def int8_model(weights: Int8Weights) -> bytes:
+    """The serialised int8 graph, in QDQ form."""
+    graph = _Graph()
+    zero = graph.constant("zero_uint8", np.uint8(0))
+    for tensor in activation_tensors(weights.architecture):
+        graph.constant(f"{tensor}.scale", np.float32(weights.activation_scale[tensor]))
+    reads = layer_inputs(weights.architecture)
+    # The same scale on both sides of Flatten lets the runtime flatten the integers.
+    graph.constant("flat.scale", np.float32(weights.activation_scale[reads[HEAD]]))
+
+    def parameters(layer: str) -> list[str]:
+        scale = weights.weight_scale[layer]
+        accumulator = np.float32(weights.activation_scale[reads[layer]]) * scale
+        # The head is one output: a scale for its tensor. A convolution has one for each filter.
+        axis = {} if layer == HEAD else {"axis": 0}
+        if layer == HEAD:
+            scale, accumulator = scale[0], accumulator[0]
+        names = []
+        for part, integers, unit in (
+            ("weight", weights.weight[layer], scale),
+            ("bias", weights.bias[layer], accumulator),
+        ):
+            names.append(
+                graph.node(
+                    "DequantizeLinear",
+                    [
+                        graph.constant(f"{layer}.{part}", integers),
+                        graph.constant(f"{layer}.{part}.scale", unit),
+                        graph.constant(f"{layer}.{part}.zero", np.zeros(np.shape(unit), integers.dtype)),
+                    ],
+                    f"{layer}.{part}.dequantised",
+                    **axis,
+                )
+            )
+        return names
+
+    copies: dict[str, Callable[[], int]] = {}
+
+    def quantised(tensor: str, value: str) -> str:
+        """Quantise `value` where it is first named, and dequantise it anew for each reader."""
+        pair = [f"{tensor}.scale", zero]
+        if tensor not in copies:
+            graph.node("QuantizeLinear", [value, *pair], f"{tensor}.quantised")
+            copies[tensor] = itertools.count(1).__next__
+        copy = copies[tensor]()
+        return graph.node("DequantizeLinear", [f"{tensor}.quantised", *pair], f"{tensor}.dequantised{copy}")
+
+    _write(graph, weights.architecture, parameters, quantised)
+    return graph.model(weights.architecture, "remnet_int8")
+
+
+def float_weights(model: bytes, architecture: Remnet) -> FloatWeights:
+    """The weights of a graph that `float_model` wrote.
+
+    Raises:
+        ModelError: an initializer is absent or of another shape or type.
+    """
+    constants = _constants(model)
+    layers = [layer.name for layer in architecture.convolutions] + [HEAD]
+    return FloatWeights(
+        architecture,
+        {name: _take(constants, f"{name}.weight", np.float32) for name in layers},
+        {name: _take(constants, f"{name}.bias", np.float32) for name in layers},
+    )
+
+
+def int8_weights(model: bytes, architecture: Remnet) -> Int8Weights:
+    """The integers and scales of a graph that `int8_model` wrote.
+
+    Raises:
+        ModelError: an initializer is absent or of another shape or type.
+    """
+    constants = _constants(model)
+    layers = [layer.name for layer in architecture.convolutions] + [HEAD]
+    return Int8Weights(
+        architecture,
+        {name: _take(constants, f"{name}.weight", np.int8) for name in layers},
+        {name: np.atleast_1d(_take(constants, f"{name}.weight.scale", np.float32)) for name in layers},
+        {name: _take(constants, f"{name}.bias", np.int32) for name in layers},
+        {
+            tensor: np.float32(_take(constants, f"{tensor}.scale", np.float32))
+            for tensor in activation_tensors(architecture)
+        },
+    )
+
+
+def _constants(model: bytes) -> dict[str, NDArray[np.generic]]:
+    try:
+        graph = onnx.load_model_from_string(model).graph
+        return {tensor.name: numpy_helper.to_array(tensor) for tensor in graph.initializer}
+    except Exception as error:  # protobuf's errors are not part of onnx's interface
+        raise ModelError(f"not an ONNX graph: {error}") from error
+
+
+def _take(constants: dict[str, NDArray[np.generic]], name: str, kind: type[Number]) -> NDArray[Number]:
+    array = constants.get(name)
+    if array is None or array.dtype != kind:
+        found = "absent" if array is None else f"of type {array.dtype}"
+        raise ModelError(f"initializer {name} is {found}", valid=np.dtype(kind).name)
+    return array.astype(kind, copy=False)
+
+
+def _write(
+    graph: _Graph,
+    architecture: Remnet,
+    parameters: Callable[[str], list[str]],
+    read: Callable[[str, str], str],
+) -> None:
+    """Write REMNet's nodes. `read(tensor, value)` names what a reader of `tensor` is given."""
+    layers = {layer.name: layer for layer in architecture.convolutions}
+
+    def convolution(name: str, tensor: str, value: str) -> str:
+        layer = layers[name]
+        before, after = layer.padding
+        output = graph.node(
+            "Conv",
+            [read(tensor, value), *parameters(name)],
+            f"{name}.accumulated",
+            kernel_shape=[layer.kernel],
+            strides=[layer.stride],
+            pads=[before, after],
+        )
+        return graph.node("Relu", [output], name)
+
+    def total(name: str, first: str, second: str) -> str:
+        return graph.node("Add", [read(first, first), read(second, second)], name)
+
+    tensor = convolution("first", "input", INPUT)
+    for module in range(1, architecture.modules + 1):
+        prefix = f"module{module}"
+        residual = convolution(f"{prefix}.residual", tensor, tensor)
+        summed = total(f"{prefix}.sum", residual, tensor)
+        reduced = convolution(f"{prefix}.reduce", summed, summed)
+        skipped = convolution(f"{prefix}.skip", summed, summed)
+        tensor = total(prefix, reduced, skipped)
+    flat = graph.node("Flatten", [read(tensor, tensor)], "flat", axis=1)
+    graph.node("Gemm", [read("flat", flat), *parameters(HEAD)], OUTPUT)

@@ -1,0 +1,108 @@
+"""The int8 network in numpy: the oracle that ONNX Runtime and the firmware are tested against.
+
+It computes with integers and rounds where, and as, ONNX Runtime rounds (its MLAS kernels):
+a convolution requantises its int32 accumulator with `rint(float32(acc) * s)`, `s = fl(fl(sx sw) / sy)`;
+a sum is `rint(fma(a, ra, fl(b rb)))` with `ra = fl(sa / sy)`; all to uint8, half to even, saturating; the
+head's output is `float32(acc) * fl(sx sw)`. The quantiser leaves only sums that are the same without
+a fused multiply-add, so that old processors agree too.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.errors import ModelError
+from uwb_mitigation.model import graph
+from uwb_mitigation.model.architecture import HEAD, Convolution
+from uwb_mitigation.model.bundle import Bundle
+from uwb_mitigation.model.weights import Int8Weights, layer_inputs, sum_operands
+
+
+class IntegerNetwork:
+    """Runs an int8 network in integer arithmetic; slow and plain."""
+
+    def __init__(self, weights: Int8Weights) -> None:
+        self.weights = weights
+        self._layers = {layer.name: layer for layer in weights.architecture.convolutions}
+        self._reads = layer_inputs(weights.architecture)
+
+    @classmethod
+    def from_bundle(cls, bundle: Bundle) -> IntegerNetwork:
+        """The network of an int8 bundle.
+
+        Raises:
+            ModelError: the bundle is not quantised.
+        """
+        if not bundle.quantised:
+            raise ModelError("the network is in float", where=str(bundle.path), valid="an int8 bundle")
+        return cls(graph.int8_weights(bundle.model, bundle.architecture))
+
+    def predict_m(self, inputs: NDArray[np.float32]) -> NDArray[np.float32]:
+        """The network's outputs, float32 (n,), for inputs of shape (n, K), m."""
+        return self.head(self.tensors(inputs)[self._reads[HEAD]])
+
+    def tensors(self, inputs: NDArray[np.float32]) -> dict[str, NDArray[np.uint8]]:
+        """Every activation, {tensor: uint8 (n, channels, length)}, for inputs of shape (n, K)."""
+        scale = self.weights.activation_scale
+        quotient = np.divide(inputs[:, None, :], scale["input"], dtype=np.float32)
+        values = {"input": _saturate(quotient)}
+        values["first"] = self.convolve("first", values["input"])
+        tensor = "first"
+        for module in range(1, self.weights.architecture.modules + 1):
+            prefix = f"module{module}"
+            residual, summed = f"{prefix}.residual", f"{prefix}.sum"
+            values[residual] = self.convolve(residual, values[tensor])
+            values[summed] = self.add(summed, values)
+            for branch in (f"{prefix}.reduce", f"{prefix}.skip"):
+                values[branch] = self.convolve(branch, values[summed])
+            values[prefix] = self.add(prefix, values)
+            tensor = prefix
+        return values
+
+    def accumulate(self, name: str, values: NDArray[np.uint8]) -> NDArray[np.int32]:
+        """The accumulators of convolution `name`, bias included, (n, filters, length out)."""
+        layer: Convolution = self._layers[name]
+        padded = np.pad(values.astype(np.int32), ((0, 0), (0, 0), layer.padding))
+        windows = np.lib.stride_tricks.sliding_window_view(padded, layer.kernel, axis=2)
+        windows = windows[:, :, :: layer.stride]
+        weight = self.weights.weight[name].astype(np.int32)
+        # Products of integers below 2^53 are exact in float64, where numpy has a fast product.
+        sums = np.einsum("ncpk,fck->nfp", windows.astype(float), weight.astype(float), optimize=True)
+        total: NDArray[np.int32] = sums.astype(np.int32) + self.weights.bias[name][:, None]
+        return total
+
+    def requantisation(self, name: str) -> NDArray[np.float32]:
+        """The factors from accumulator to output of convolution `name`, float32 (filters,)."""
+        scale = self.weights.activation_scale
+        factors: NDArray[np.float32] = (scale[self._reads[name]] * self.weights.weight_scale[name]) / scale[
+            name
+        ]
+        return factors
+
+    def convolve(self, name: str, values: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Convolution `name` with its ReLU."""
+        accumulator = self.accumulate(name, values).astype(np.float32)
+        return _saturate(accumulator * self.requantisation(name)[:, None])
+
+    def add(self, name: str, values: dict[str, NDArray[np.uint8]]) -> NDArray[np.uint8]:
+        """The sum `name` of its two operands."""
+        scale = self.weights.activation_scale
+        first, second = sum_operands(name)
+        left = values[first] * np.float64(scale[first] / scale[name])
+        right = values[second].astype(np.float32) * (scale[second] / scale[name])
+        # Exact in binary64; the one rounding to binary32 is the fused multiply-add's.
+        return _saturate((left + right.astype(np.float64)).astype(np.float32))
+
+    def head(self, values: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """The head's output, float32 (n,), of the last module's (n, filters, length), m."""
+        flat = values.reshape(len(values), -1).astype(np.int64)
+        accumulator = flat @ self.weights.weight[HEAD].astype(np.int64) + self.weights.bias[HEAD]
+        factor = self.weights.activation_scale[self._reads[HEAD]] * self.weights.weight_scale[HEAD]
+        output: NDArray[np.float32] = accumulator[:, 0].astype(np.float32) * factor
+        return output
+
+
+def _saturate(values: NDArray[np.float32]) -> NDArray[np.uint8]:
+    clipped: NDArray[np.uint8] = np.clip(np.rint(values), 0, 255).astype(np.uint8)
+    return clipped

@@ -1,0 +1,40 @@
+"""Finds the model that ships with the package, wherever it is installed."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+from uwb_mitigation.errors import ModelError
+
+SHIPPED = "evk1000_apartment.onnx"
+_SHARE = Path("share", "uwb_mitigation", "models")
+
+
+def default_model_path() -> Path:
+    """The shipped model: of a source checkout, of this installation, or of a sourced ROS workspace.
+
+    Raises:
+        ModelError: it is in none of these; the message lists them.
+    """
+    candidates = [folder / SHIPPED for folder in _folders()]
+    for candidate in candidates:
+        if candidate.is_file():
+            return candidate
+    raise ModelError(
+        f"the shipped model {SHIPPED} is not installed",
+        where=", ".join(str(candidate.parent) for candidate in candidates),
+        valid="install the package again, or name a model",
+    )
+
+
+def _folders() -> list[Path]:
+    package = Path(__file__).resolve().parent.parent
+    folders = [package.parent / "models"]
+    # lib/python3.x/site-packages/uwb_mitigation, or Debian's local/lib/python3.x/dist-packages.
+    folders += [prefix / _SHARE for prefix in list(package.parents)[3:5]]
+    prefixes = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
+    folders += [Path(prefix) / _SHARE for prefix in prefixes if prefix]
+    folders.append(Path(sys.prefix) / _SHARE)
+    return list(dict.fromkeys(folders))

@@ -1,0 +1,114 @@
+"""The network's parameters as plain numpy arrays: what training yields, and what the graphs are written from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.errors import ModelError
+from uwb_mitigation.model.architecture import HEAD, Remnet
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FloatWeights:
+    """Parameters in float32.
+
+    Attributes:
+        architecture: the network they belong to.
+        weight: {layer: (filters, inputs, kernel)}; the head's is (features, 1).
+        bias: {layer: (filters,)}; the head's is (1,).
+    """
+
+    architecture: Remnet
+    weight: Mapping[str, NDArray[np.float32]]
+    bias: Mapping[str, NDArray[np.float32]]
+
+    def __post_init__(self) -> None:
+        _check_shapes(self.architecture, self.weight, self.bias)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Int8Weights:
+    """Parameters in integers, with the scales that give them their meaning.
+
+    A value is `scale * integer` everywhere: weights are symmetric, and activations are non-negative,
+    so that no zero point is needed. A layer's bias is in units of its input's scale times its
+    weight's scale, that is, of its accumulator.
+
+    Attributes:
+        architecture: the network they belong to.
+        weight: {layer: int8, shapes as in `FloatWeights`}.
+        weight_scale: {layer: (filters,) float32}; the head's is (1,).
+        bias: {layer: int32}.
+        activation_scale: {tensor: float32}; tensors are named as `graph.py` names them.
+    """
+
+    architecture: Remnet
+    weight: Mapping[str, NDArray[np.int8]]
+    weight_scale: Mapping[str, NDArray[np.float32]]
+    bias: Mapping[str, NDArray[np.int32]]
+    activation_scale: Mapping[str, np.float32]
+
+    def __post_init__(self) -> None:
+        _check_shapes(self.architecture, self.weight, self.bias)
+        for tensor in activation_tensors(self.architecture):
+            scale = self.activation_scale.get(tensor)
+            if scale is None or not (np.isfinite(scale) and scale > 0):
+                raise ModelError(f"scale {scale} of {tensor}", valid="a finite positive scale")
+
+
+def activation_tensors(architecture: Remnet) -> tuple[str, ...]:
+    """Every tensor that int8 quantisation gives a scale, in the order of evaluation.
+
+    `input`; `first`; then for each module its convolutions, `moduleN.sum` (the residual's sum) and
+    `moduleN` (its output).
+    """
+    names = ["input", "first"]
+    for module in range(1, architecture.modules + 1):
+        prefix = f"module{module}"
+        names += [f"{prefix}.{part}" for part in ("residual", "sum", "reduce", "skip")]
+        names.append(prefix)
+    return tuple(names)
+
+
+def layer_inputs(architecture: Remnet) -> dict[str, str]:
+    """{layer: the tensor that it reads}."""
+    reads = {"first": "input"}
+    tensor = "first"
+    for module in range(1, architecture.modules + 1):
+        prefix = f"module{module}"
+        reads[f"{prefix}.residual"] = tensor
+        reads[f"{prefix}.reduce"] = reads[f"{prefix}.skip"] = f"{prefix}.sum"
+        tensor = prefix
+    reads[HEAD] = tensor
+    return reads
+
+
+def sum_operands(tensor: str) -> tuple[str, str]:
+    """The two tensors that `moduleN.sum` or `moduleN` adds."""
+    module, _, part = tensor.partition(".")
+    if not part:
+        return f"{module}.reduce", f"{module}.skip"
+    number = int(module.removeprefix("module"))
+    return f"{module}.residual", "first" if number == 1 else f"module{number - 1}"
+
+
+def _check_shapes(
+    architecture: Remnet,
+    weight: Mapping[str, NDArray[np.generic]],
+    bias: Mapping[str, NDArray[np.generic]],
+) -> None:
+    expected: dict[str, tuple[tuple[int, ...], tuple[int, ...]]] = {
+        layer.name: ((layer.filters, layer.inputs, layer.kernel), (layer.filters,))
+        for layer in architecture.convolutions
+    }
+    expected[HEAD] = ((architecture.features, 1), (1,))
+    for name, (weight_shape, bias_shape) in expected.items():
+        for part, arrays, shape in (("weight", weight, weight_shape), ("bias", bias, bias_shape)):
+            if name not in arrays:
+                raise ModelError(f"no {part} of layer {name}")
+            if arrays[name].shape != shape:
+                raise ModelError(f"{part} of layer {name} has shape {arrays[name].shape}", valid=f"{shape}")

@@ -1,0 +1,114 @@
+"""From float weights to int8: scales from calibration inputs, integers from the scales. No torch here.
+
+Weights are symmetric, a scale for each filter, and kept to 7 bits: two products of an unsigned and a
+signed byte then fit the 16-bit sums of processors without VNNI, so that every processor agrees.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.dataset import Dataset
+from uwb_mitigation.errors import DatasetError
+from uwb_mitigation.evaluation import splits
+from uwb_mitigation.firmware_export.requantisation import nudge
+from uwb_mitigation.model import floating
+from uwb_mitigation.model.architecture import HEAD
+from uwb_mitigation.model.weights import FloatWeights, Int8Weights, layer_inputs, sum_operands
+
+WEIGHT_LIMIT = 63
+"""Largest magnitude of an integer weight: 7 bits."""
+
+CALIBRATION_PER_CONFIGURATION = 40
+"""Inputs of each configuration that the scales of the activations are found from."""
+
+
+def calibration_inputs(dataset: Dataset, seed: int) -> NDArray[np.float32]:
+    """Inputs of every configuration, for `quantize`."""
+    rows = splits.thinned(dataset.configurations, CALIBRATION_PER_CONFIGURATION, seed)
+    return dataset.inputs[rows]
+
+
+def quantize(
+    weights: FloatWeights,
+    calibration: NDArray[np.float32],
+    percentile: float = 100.0,
+    *,
+    exact: bool = True,
+) -> Int8Weights:
+    """The int8 network that stands for `weights` on inputs such as `calibration`, float32 (n, K).
+
+    Args:
+        percentile: of each activation's values, what the largest integer stands for; 100 is the maximum.
+        exact: move scales by a few ulps where the firmware's integer arithmetic needs it to agree to
+            the bit (see `nudge`). Takes seconds, and no metric can tell.
+
+    Raises:
+        DatasetError: there are no calibration inputs, or they are not finite or of another length.
+        ModelError: no scales let integer arithmetic stand for the network.
+    """
+    architecture = weights.architecture
+    if calibration.ndim != 2 or calibration.shape[1] != architecture.samples or not len(calibration):
+        raise DatasetError(
+            f"calibration inputs of shape {calibration.shape}",
+            valid=f"at least one of {architecture.samples} samples",
+        )
+    if not np.isfinite(calibration).all():
+        raise DatasetError("calibration inputs hold values that are not finite")
+    weight_scale = {name: _weight_scale(name, weight) for name, weight in weights.weight.items()}
+    reads = layer_inputs(architecture)
+    scale = _activation_scales(_peaks(weights, calibration, percentile), weight_scale, reads)
+    integers, biases = {}, {}
+    limits = np.iinfo(np.int32)
+    for name, weight in weights.weight.items():
+        unit = weight_scale[name] if name == HEAD else weight_scale[name][:, None, None]
+        rounded = np.clip(np.rint(weight / unit), -WEIGHT_LIMIT, WEIGHT_LIMIT)
+        integers[name] = rounded.astype(np.int8)
+        bias = np.rint(weights.bias[name].astype(float) / (scale[reads[name]] * weight_scale[name]))
+        biases[name] = np.clip(bias, limits.min, limits.max).astype(np.int32)
+    quantized = Int8Weights(architecture, integers, weight_scale, biases, scale)
+    return nudge(quantized) if exact else quantized
+
+
+def _weight_scale(name: str, weight: NDArray[np.float32]) -> NDArray[np.float32]:
+    """One scale for each filter; the head is one output."""
+    peak = np.atleast_1d(np.abs(weight).max(axis=None if name == HEAD else (1, 2)))
+    # A filter of zeros has no peak: any scale stands for it, its neighbours' causes no surprise.
+    peak = np.where(peak > 0, peak, peak.max() if peak.any() else 1.0)
+    scale: NDArray[np.float32] = (peak / WEIGHT_LIMIT).astype(np.float32)
+    return scale
+
+
+def _peaks(weights: FloatWeights, calibration: NDArray[np.float32], percentile: float) -> dict[str, float]:
+    """The chosen percentile of each activation; of each chunk's, the largest."""
+    peaks: dict[str, float] = {}
+    for start in range(0, len(calibration), floating.CHUNK):
+        chunk = calibration[start : start + floating.CHUNK]
+        for tensor, values in floating.activations(weights, chunk).items():
+            peak = float(np.percentile(values, percentile))
+            peaks[tensor] = max(peaks.get(tensor, 0.0), peak)
+    return peaks
+
+
+def _activation_scales(
+    peaks: Mapping[str, float], weight_scale: Mapping[str, NDArray[np.float32]], reads: Mapping[str, str]
+) -> dict[str, np.float32]:
+    """Scales at which 255 stands for the peaks, or for more where integer arithmetic asks for it.
+
+    It asks that a convolution's output has steps of at least 16 of its accumulator's, and that the scales of a
+    sum's operands add up to at most twice its own. Only a tensor that is hardly ever active, or operands
+    that never peak together, are touched by it.
+    """
+    scale: dict[str, np.float32] = {}
+    for tensor, peak in peaks.items():
+        wanted = max(peak, 1e-6) / 255
+        if tensor in reads and tensor != HEAD:
+            wanted = max(wanted, 17 * float(scale[reads[tensor]]) * float(weight_scale[tensor].max()))
+        elif tensor != "input":
+            first, second = sum_operands(tensor)
+            wanted = max(wanted, 0.501 * (float(scale[first]) + float(scale[second])))
+        scale[tensor] = np.float32(wanted)
+    return scale
