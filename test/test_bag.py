@@ -1,19 +1,15 @@
-"""Bags as written: the codec, and what the rosbags and mcap libraries make of a bag of ours."""
+"""Bags as written, and what the rosbags and mcap libraries make of a bag of ours."""
 
 from __future__ import annotations
 
-import contextlib
-import math
 import re
-from collections.abc import Callable
-from dataclasses import astuple, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from bag_material import START_NS, corrected, record, same
 from mcap.reader import SeekingReader
 from rosbags.rosbag2 import Reader
 
@@ -29,90 +25,9 @@ from uwb_mitigation.bag.topics import (
 )
 from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.measurement import (
-    SAMPLE_PERIOD_S,
-    Cir,
-    CorrectedRange,
-    Encoding,
-    Origin,
-    RangeMeasurement,
-    Status,
-    Truth,
-)
 from uwb_mitigation.sources.source import Record
 
-START_NS = 1_700_000_000_000_000_000
 TYPES = (RANGE_CIR_TYPE, RANGE_TRUTH_TYPE, RANGE_CORRECTED_TYPE)
-
-# The machine may be busy, and a failure must come again.
-examples = settings(deadline=None, derandomize=True)
-
-float32 = st.floats(width=32)
-uint64 = st.integers(0, 2**64 - 1)
-uint16 = st.integers(0, 2**16 - 1)
-texts = st.text(max_size=12)
-cirs = st.builds(
-    Cir,
-    samples=st.lists(st.integers(-(2**15), 2**15 - 1), max_size=9).map(lambda x: np.array(x, np.int16)),
-    encoding=st.sampled_from(Encoding),
-    start_index=st.integers(-(2**31), 2**31 - 1),
-    first_path_index=float32,
-    sample_period_s=float32,
-    scale=float32,
-    preamble_count=uint16,
-    noise_threshold=uint16,
-    rx_power_dbm=float32,
-    first_path_power_dbm=float32,
-    channel=st.integers(0, 255),
-    prf_mhz=st.integers(0, 255),
-)
-measurements = st.builds(
-    RangeMeasurement,
-    stamp_ns=st.integers(-(2**31) * 10**9, (2**31) * 10**9 - 1),
-    tag_id=uint64,
-    anchor_id=uint64,
-    sequence=st.integers(0, 2**32 - 1),
-    device_time=uint64,
-    range_m=float32,
-    cir=cirs,
-    frame_id=texts,
-)
-truths = st.builds(Truth, range_m=float32, label=texts, configuration=texts)
-corrections = st.builds(
-    CorrectedRange,
-    range_m=float32,
-    range_raw_m=float32,
-    correction_m=float32,
-    variance_m2=float32,
-    status=st.sampled_from(Status),
-    origin=st.sampled_from(Origin),
-    model_id=st.integers(0, 2**32 - 1),
-)
-
-
-def record(number: int, samples: int = 157, truth: bool = True) -> Record:
-    rng = np.random.default_rng(number)
-    cir = Cir(
-        rng.integers(-900, 900, 2 * samples).astype(np.int16),
-        first_path_index=740.25 + number,
-        preamble_count=200 + number,
-        noise_threshold=1500,
-        rx_power_dbm=-79.5,
-        first_path_power_dbm=-83.25,
-        channel=2,
-        prf_mhz=64,
-        start_index=700,
-        sample_period_s=float(np.float32(SAMPLE_PERIOD_S)),
-    )
-    measurement = RangeMeasurement(
-        START_NS + number * 10_000_000, 7, 1 + number % 2, number, number * 1000, 4.5 + number, cir, "antenna"
-    )
-    known = Truth(4.0 + number, "NDP NLOS", f"place {number % 2}") if truth else None
-    return Record(measurement, known)
-
-
-def corrected(number: int) -> CorrectedRange:
-    return CorrectedRange(4.25 + number, 4.5 + number, 0.25, 0.0625, Status.OK, Origin.DEVICE, 77)
 
 
 def write_bag(path: Path, count: int = 5, **options: bool) -> Path:
@@ -121,113 +36,6 @@ def write_bag(path: Path, count: int = 5, **options: bool) -> Path:
             bag.write(record(number))
             bag.write_corrected(record(number).measurement, corrected(number))
     return path
-
-
-def same(one: RangeMeasurement, other: RangeMeasurement) -> bool:
-    def flat(measurement: RangeMeasurement) -> list[object]:
-        cir = measurement.cir
-        fields = [*astuple(replace(measurement, cir=None)), *astuple(replace(cir, samples=None))]
-        return ["NaN" if isinstance(value, float) and math.isnan(value) else value for value in fields]
-
-    return flat(one) == flat(other) and np.array_equal(one.cir.samples, other.cir.samples)
-
-
-@examples
-@given(measurements)
-def test_a_measurement_survives_its_message(measurement: RangeMeasurement) -> None:
-    assert same(codec.decode_range(codec.encode_range(measurement)), measurement)
-
-
-@examples
-@given(measurements, truths)
-def test_truth_survives_its_message(measurement: RangeMeasurement, truth: Truth) -> None:
-    key, decoded = codec.decode_truth(codec.encode_truth(measurement, truth))
-    assert key == codec.key_of(measurement)
-    assert repr(decoded) == repr(truth)
-
-
-@examples
-@given(measurements, corrections)
-def test_a_corrected_range_survives_its_message(
-    measurement: RangeMeasurement, correction: CorrectedRange
-) -> None:
-    key, decoded = codec.decode_corrected(codec.encode_corrected(measurement, correction))
-    assert key == codec.key_of(measurement)
-    assert repr(decoded) == repr(correction)
-
-
-@examples
-@given(measurements, truths, corrections)
-def test_messages_equal_those_of_the_rosbags_library(
-    measurement: RangeMeasurement, truth: Truth, correction: CorrectedRange
-) -> None:
-    store = schemas.typestore()
-    ours = (
-        codec.encode_range(measurement),
-        codec.encode_truth(measurement, truth),
-        codec.encode_corrected(measurement, correction),
-    )
-    for data, type_name in zip(ours, TYPES, strict=True):
-        theirs = store.serialize_cdr(store.deserialize_cdr(data, type_name), type_name)
-        assert bytes(theirs) == data
-
-
-@examples
-@given(measurements, st.data())
-def test_a_message_cut_anywhere_is_refused(measurement: RangeMeasurement, data: st.DataObject) -> None:
-    whole = codec.encode_range(measurement)
-    cut = data.draw(st.integers(0, len(whole) - 1))
-    with pytest.raises(RecordingError, match="ends early"):
-        codec.decode_range(whole[:cut])
-
-
-@pytest.mark.parametrize("decode", [codec.decode_range, codec.decode_truth, codec.decode_corrected])
-@examples
-@given(noise=st.binary(max_size=200), start=st.sampled_from([b"", b"\0\1\0\0"]))
-def test_arbitrary_bytes_decode_or_are_refused(
-    decode: Callable[[bytes], object], noise: bytes, start: bytes
-) -> None:
-    with contextlib.suppress(RecordingError):
-        decode(start + noise)
-
-
-@pytest.mark.parametrize(
-    ("at", "value", "what"),
-    [
-        (0, b"\0\0", "big-endian"),
-        (0, b"\0\7", "unknown encapsulation"),
-        (8, b"\0\xca\x9a\x3b", "time stamp"),
-        (12, b"\xff\xff\xff\xff", "ends early"),
-        (16, b"\xff", "not UTF-8"),
-        (23, b"x", "unterminated"),
-        (28 + 48, b"\2", "unknown CIR encoding"),
-        (28 + 56, b"\xff\xff\xff\xff", "ends early"),
-    ],
-)
-def test_a_hostile_field_is_refused_by_name(at: int, value: bytes, what: str) -> None:
-    data = bytearray(codec.encode_range(record(0).measurement))
-    data[at : at + len(value)] = value
-    with pytest.raises(RecordingError, match=what):
-        codec.decode_range(bytes(data))
-
-
-def test_trailing_bytes_are_refused() -> None:
-    with pytest.raises(RecordingError, match="longer than its type"):
-        codec.decode_range(codec.encode_range(record(0).measurement) + bytes(4))
-
-
-@pytest.mark.parametrize(
-    "field", [{"tag_id": 2**64}, {"sequence": -1}, {"stamp_ns": 2**63}, {"range_m": 1e39}]
-)
-def test_a_value_that_does_not_fit_is_refused(field: dict[str, float]) -> None:
-    with pytest.raises(RecordingError, match="does not fit RangeCir"):
-        codec.encode_range(replace(record(0).measurement, **field))
-
-
-def test_samples_of_another_type_are_refused() -> None:
-    measurement = record(0).measurement
-    with pytest.raises(RecordingError, match="float64"):
-        codec.encode_range(replace(measurement, cir=replace(measurement.cir, samples=np.zeros(4))))
 
 
 @pytest.mark.parametrize("name", ["bag.mcap", "folder"])
@@ -267,7 +75,7 @@ def test_rosbags_opens_a_bag_and_agrees_on_every_field(tmp_path: Path, name: str
                 assert (cir.channel, cir.prf) == (2, 64)
             elif connection.topic == RANGE_TRUTH:
                 assert (message.range, message.label) == (4.0 + number, "NDP NLOS")
-                assert message.configuration == f"place {number % 2}"
+                assert message.configuration == f"place {number}"
             else:
                 assert (message.range, message.range_raw, message.correction) == (
                     4.25 + number,
@@ -417,3 +225,18 @@ def test_comments_and_constants_do_not_make_another_schema(type_name: str) -> No
     bare, _ = schemas.typestore().generate_msgdef(type_name, ros_version=2)
     assert bare != schemas.definition(type_name)
     assert schemas.difference(bare, type_name) is None
+
+
+def test_the_examples_in_the_documentation_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (Path(__file__).parent.parent / "docs" / "bags.md").read_text(encoding="utf-8")
+    examples = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
+    assert len(examples) == 2
+    write_bag(tmp_path / "apartment.mcap")
+    monkeypatch.chdir(tmp_path)
+    for example in examples:
+        exec(compile(example, "docs/bags.md", "exec"), {})
+    shown = capsys.readouterr().out
+    assert "2 7 5.5 40" in shown
+    assert f"{START_NS} 0.5 NDP NLOS" in shown

@@ -1,0 +1,145 @@
+"""Records and bags that the tests of bags share."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import astuple, replace
+from pathlib import Path
+
+import numpy as np
+from mcap.writer import Writer
+
+from uwb_mitigation.bag import codec, container, schemas
+from uwb_mitigation.bag.topics import RANGE_CIR_TYPE, RANGE_RAW, RANGE_TRUTH, RANGE_TRUTH_TYPE
+from uwb_mitigation.bag.writer import BagWriter
+from uwb_mitigation.errors import RecordingError
+from uwb_mitigation.measurement import (
+    SAMPLE_PERIOD_S,
+    Cir,
+    CorrectedRange,
+    Origin,
+    RangeMeasurement,
+    Status,
+    Truth,
+)
+from uwb_mitigation.sources.mcap import McapRecording
+from uwb_mitigation.sources.source import Record
+
+START_NS = 1_700_000_000_000_000_000
+STEP_NS = 10_000_000
+
+
+def record(number: int, samples: int = 20) -> Record:
+    rng = np.random.default_rng(number)
+    cir = Cir(
+        rng.integers(-900, 900, 2 * samples).astype(np.int16),
+        first_path_index=740.25 + number,
+        preamble_count=200 + number,
+        noise_threshold=1500,
+        rx_power_dbm=-79.5,
+        first_path_power_dbm=-83.25,
+        channel=2,
+        prf_mhz=64,
+        start_index=700,
+        sample_period_s=float(np.float32(SAMPLE_PERIOD_S)),
+    )
+    measurement = RangeMeasurement(
+        START_NS + number * STEP_NS, 7, 1 + number % 2, number, number * 1000, 4.5 + number, cir, "antenna"
+    )
+    return Record(measurement, Truth(4.0 + number, "NDP NLOS", f"place {number}"))
+
+
+def corrected(number: int) -> CorrectedRange:
+    return CorrectedRange(4.25 + number, 4.5 + number, 0.25, 0.0625, Status.OK, Origin.DEVICE, 77)
+
+
+def same(one: RangeMeasurement, other: RangeMeasurement) -> bool:
+    def flat(measurement: RangeMeasurement) -> list[object]:
+        cir = measurement.cir
+        fields = [*astuple(replace(measurement, cir=None)), *astuple(replace(cir, samples=None))]
+        return ["NaN" if isinstance(value, float) and math.isnan(value) else value for value in fields]
+
+    return flat(one) == flat(other) and np.array_equal(one.cir.samples, other.cir.samples)
+
+
+def write_bag(path: Path, count: int = 5, simulated: str = "false") -> Path:
+    with BagWriter(path, {"source": "a test", "simulated": simulated}) as bag:
+        for number in range(count):
+            bag.write(record(number))
+    return path
+
+
+class Foreign:
+    """A bag such as another recorder might write, message by message."""
+
+    def __init__(self, path: Path, **options: object) -> None:
+        self.path = path
+        self._stream = path.open("wb")
+        self._writer = Writer(self._stream, **options)
+        self._writer.start("ros2", "another recorder")
+        self._channels: dict[str, int] = {}
+
+    def channel(
+        self,
+        topic: str,
+        type_name: str,
+        schema: str | None,
+        *,
+        encoding: str = "cdr",
+        language: str = "ros2msg",
+    ) -> None:
+        number = 0
+        if schema is not None:
+            number = self._writer.register_schema(type_name, language, schema.encode())
+        self._channels[topic] = self._writer.register_channel(topic, encoding, number, {})
+
+    def ours(self) -> Foreign:
+        self.channel(RANGE_RAW, RANGE_CIR_TYPE, schemas.definition(RANGE_CIR_TYPE))
+        self.channel(RANGE_TRUTH, RANGE_TRUTH_TYPE, schemas.definition(RANGE_TRUTH_TYPE))
+        return self
+
+    def add(self, topic: str, log_time_ns: int, data: bytes) -> None:
+        self._writer.add_message(self._channels[topic], log_time_ns, data, log_time_ns)
+
+    def range(self, number: int) -> None:
+        measurement = record(number).measurement
+        self.add(RANGE_RAW, measurement.stamp_ns, codec.encode_range(measurement))
+
+    def truth(self, number: int) -> None:
+        known = record(number)
+        assert known.truth is not None
+        self.add(RANGE_TRUTH, known.measurement.stamp_ns, codec.encode_truth(known.measurement, known.truth))
+
+    def flush(self) -> None:
+        self._writer.flush()
+
+    def finish(self) -> Path:
+        self._writer.finish()
+        self._stream.close()
+        return self.path
+
+    def cut(self) -> Path:
+        self._writer.flush()
+        self._stream.close()
+        return self.path
+
+
+def numbers(source: McapRecording) -> list[int]:
+    return [item.measurement.sequence for item in source]
+
+
+def prefix(path: Path) -> tuple[list[int], RecordingError | None]:
+    """What is read of a bag, and the error that ends it; any other exception fails the test."""
+    read: list[int] = []
+    try:
+        for item in McapRecording(path):
+            assert item.measurement.frame_id == "antenna"
+            read.append(item.measurement.sequence)
+    except RecordingError as error:
+        return read, error
+    return read, None
+
+
+def spans_of(path: Path) -> list[container.Span]:
+    with path.open("rb") as stream:
+        return container.survey(stream).spans

@@ -1,0 +1,175 @@
+"""Measurements to CDR and back: exact, equal to rosbags, and safe against any bytes."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from bag_material import record, same
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from uwb_mitigation.bag import codec, schemas
+from uwb_mitigation.bag.topics import (
+    RANGE_CIR_TYPE,
+    RANGE_CORRECTED_TYPE,
+    RANGE_TRUTH_TYPE,
+)
+from uwb_mitigation.errors import RecordingError
+from uwb_mitigation.measurement import (
+    Cir,
+    CorrectedRange,
+    Encoding,
+    Origin,
+    RangeMeasurement,
+    Status,
+    Truth,
+)
+
+TYPES = (RANGE_CIR_TYPE, RANGE_TRUTH_TYPE, RANGE_CORRECTED_TYPE)
+
+# The machine may be busy, and a failure must come again.
+examples = settings(deadline=None, derandomize=True)
+
+float32 = st.floats(width=32)
+uint64 = st.integers(0, 2**64 - 1)
+uint16 = st.integers(0, 2**16 - 1)
+texts = st.text(max_size=12)
+cirs = st.builds(
+    Cir,
+    samples=st.lists(st.integers(-(2**15), 2**15 - 1), max_size=9).map(lambda x: np.array(x, np.int16)),
+    encoding=st.sampled_from(Encoding),
+    start_index=st.integers(-(2**31), 2**31 - 1),
+    first_path_index=float32,
+    sample_period_s=float32,
+    scale=float32,
+    preamble_count=uint16,
+    noise_threshold=uint16,
+    rx_power_dbm=float32,
+    first_path_power_dbm=float32,
+    channel=st.integers(0, 255),
+    prf_mhz=st.integers(0, 255),
+)
+measurements = st.builds(
+    RangeMeasurement,
+    stamp_ns=st.integers(-(2**31) * 10**9, (2**31) * 10**9 - 1),
+    tag_id=uint64,
+    anchor_id=uint64,
+    sequence=st.integers(0, 2**32 - 1),
+    device_time=uint64,
+    range_m=float32,
+    cir=cirs,
+    frame_id=texts,
+)
+truths = st.builds(Truth, range_m=float32, label=texts, configuration=texts)
+corrections = st.builds(
+    CorrectedRange,
+    range_m=float32,
+    range_raw_m=float32,
+    correction_m=float32,
+    variance_m2=float32,
+    status=st.sampled_from(Status),
+    origin=st.sampled_from(Origin),
+    model_id=st.integers(0, 2**32 - 1),
+)
+
+
+@examples
+@given(measurements)
+def test_a_measurement_survives_its_message(measurement: RangeMeasurement) -> None:
+    assert same(codec.decode_range(codec.encode_range(measurement)), measurement)
+
+
+@examples
+@given(measurements, truths)
+def test_truth_survives_its_message(measurement: RangeMeasurement, truth: Truth) -> None:
+    key, decoded = codec.decode_truth(codec.encode_truth(measurement, truth))
+    assert key == codec.key_of(measurement)
+    assert repr(decoded) == repr(truth)
+
+
+@examples
+@given(measurements, corrections)
+def test_a_corrected_range_survives_its_message(
+    measurement: RangeMeasurement, correction: CorrectedRange
+) -> None:
+    key, decoded = codec.decode_corrected(codec.encode_corrected(measurement, correction))
+    assert key == codec.key_of(measurement)
+    assert repr(decoded) == repr(correction)
+
+
+@examples
+@given(measurements, truths, corrections)
+def test_messages_equal_those_of_the_rosbags_library(
+    measurement: RangeMeasurement, truth: Truth, correction: CorrectedRange
+) -> None:
+    store = schemas.typestore()
+    ours = (
+        codec.encode_range(measurement),
+        codec.encode_truth(measurement, truth),
+        codec.encode_corrected(measurement, correction),
+    )
+    for data, type_name in zip(ours, TYPES, strict=True):
+        theirs = store.serialize_cdr(store.deserialize_cdr(data, type_name), type_name)
+        assert bytes(theirs) == data
+
+
+@examples
+@given(measurements, st.data())
+def test_a_message_cut_anywhere_is_refused(measurement: RangeMeasurement, data: st.DataObject) -> None:
+    whole = codec.encode_range(measurement)
+    cut = data.draw(st.integers(0, len(whole) - 1))
+    with pytest.raises(RecordingError, match="ends early"):
+        codec.decode_range(whole[:cut])
+
+
+@pytest.mark.parametrize("decode", [codec.decode_range, codec.decode_truth, codec.decode_corrected])
+@examples
+@given(noise=st.binary(max_size=200), start=st.sampled_from([b"", b"\0\1\0\0"]))
+def test_arbitrary_bytes_decode_or_are_refused(
+    decode: Callable[[bytes], object], noise: bytes, start: bytes
+) -> None:
+    with contextlib.suppress(RecordingError):
+        decode(start + noise)
+
+
+@pytest.mark.parametrize(
+    ("at", "value", "what"),
+    [
+        (0, b"\0\0", "big-endian"),
+        (0, b"\0\7", "unknown encapsulation"),
+        (8, b"\0\xca\x9a\x3b", "time stamp"),
+        (12, b"\xff\xff\xff\xff", "ends early"),
+        (16, b"\xff", "not UTF-8"),
+        (23, b"x", "unterminated"),
+        (28 + 48, b"\2", "unknown CIR encoding"),
+        (28 + 56, b"\xff\xff\xff\xff", "ends early"),
+    ],
+)
+def test_a_hostile_field_is_refused_by_name(at: int, value: bytes, what: str) -> None:
+    data = bytearray(codec.encode_range(record(0).measurement))
+    data[at : at + len(value)] = value
+    with pytest.raises(RecordingError, match=what):
+        codec.decode_range(bytes(data))
+
+
+def test_trailing_bytes_are_refused() -> None:
+    with pytest.raises(RecordingError, match="longer than its type"):
+        codec.decode_range(codec.encode_range(record(0).measurement) + bytes(4))
+
+
+@pytest.mark.parametrize(
+    "field", [{"tag_id": 2**64}, {"sequence": -1}, {"stamp_ns": 2**63}, {"range_m": 1e39}]
+)
+def test_a_value_that_does_not_fit_is_refused(field: dict[str, float]) -> None:
+    with pytest.raises(RecordingError, match="does not fit RangeCir"):
+        codec.encode_range(replace(record(0).measurement, **field))
+
+
+def test_samples_of_another_type_are_refused() -> None:
+    measurement = record(0).measurement
+    with pytest.raises(RecordingError, match="float64"):
+        codec.encode_range(replace(measurement, cir=replace(measurement.cir, samples=np.zeros(4))))
