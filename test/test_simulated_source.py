@@ -99,7 +99,7 @@ def test_exchanges_that_are_not_received_are_counted() -> None:
 def test_line_of_sight_errors_centre_on_the_offset(survey: list[Record]) -> None:
     error = errors_of(survey, "LOS")
     assert np.median(error) == pytest.approx(Radio().range_offset_m, abs=0.02)
-    assert np.percentile(error, 90) - np.percentile(error, 10) < 0.15
+    assert np.percentile(error, 75) - np.percentile(error, 25) < 0.06
 
 
 def test_obstacles_make_the_range_long_and_a_lost_direct_path_longer(

@@ -182,9 +182,13 @@ class DiffuseField:
         Fading changes over half a wavelength: one draw serves a placement at rest, a moving antenna
         needs one for each exchange.
         """
-        power = rng.standard_gamma(self.nakagami_m) * (self.mean_power / self.nakagami_m)
+        # Most rays are of clusters that are not there, or have decayed by 60 dB and more.
+        heard = self.mean_power > 1e-6
+        m = self.nakagami_m[heard]
+        power = rng.standard_gamma(m) * (self.mean_power[heard] / m)
         phase = rng.uniform(0.0, 2.0 * math.pi, power.shape)
-        gains: NDArray[np.complex128] = np.sqrt(power) * np.exp(1j * phase)
+        gains = np.zeros(heard.shape, np.complex128)
+        gains[heard] = np.sqrt(power) * np.exp(1j * phase)
         return gains
 
 
