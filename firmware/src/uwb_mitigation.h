@@ -1,0 +1,154 @@
+/* Removes the range error of ultra-wideband ranging with an int8 network, bit for bit as on the host.
+ *
+ * No allocation and no globals: a model is constant data that `uwb-mitigation export-c` writes, and
+ * memory to work in is the caller's. Functions are reentrant as long as arenas are not shared. */
+#ifndef UWB_MITIGATION_H
+#define UWB_MITIGATION_H
+
+#include <stddef.h>
+#include <stdint.h>
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+#define UWB_FILTERS 16
+#define UWB_WINDOW_LEAD 5 /* samples of the window before floor(first path) */
+
+typedef enum {
+    UWB_OK = 0,
+    UWB_BAD_ARGUMENT,        /* a null pointer, or a model that this library cannot run */
+    UWB_BAD_ARENA,           /* smaller than uwb_arena_size, or not aligned to 4 bytes */
+    UWB_EMPTY,               /* the CIR holds no samples */
+    UWB_ODD_LENGTH,          /* a complex CIR holds an odd number of values */
+    UWB_BAD_SCALE,           /* the CIR's scale is not finite and positive */
+    UWB_NO_FIRST_PATH,       /* the first-path index is not finite */
+    UWB_OUTSIDE,             /* the window around the first path lies outside the CIR */
+    UWB_ALL_ZERO,            /* the window holds only zeros */
+    UWB_NEGATIVE,            /* a magnitude is negative */
+    UWB_SATURATED,           /* the window holds a saturated sample */
+    UWB_NO_PREAMBLE_COUNT,   /* unknown, and the model's scaling needs it */
+    UWB_NO_POWER,            /* receive or first-path power unknown, and the model's prior needs it */
+    UWB_OUT_OF_DISTRIBUTION, /* the predicted error lies outside the model's limits */
+    UWB_BAD_RANGE            /* the range is not finite, negative, or beyond 1000 km */
+} uwb_status;
+
+typedef enum { UWB_COMPLEX_INT16 = 0, UWB_MAGNITUDE = 1 } uwb_encoding;
+typedef enum { UWB_SCALE_MAX = 0, UWB_SCALE_PREAMBLE = 1 } uwb_scaling;
+
+/* A channel impulse response as the radio's accumulator delivers it. */
+typedef struct {
+    const int16_t *samples; /* interleaved re, im, or magnitudes */
+    size_t count;           /* int16 values, not samples in time */
+    uwb_encoding encoding;
+    int32_t start_index;     /* accumulator index of the first sample */
+    float first_path_index;  /* accumulator index, sub-sample */
+    float scale;             /* accumulator units per count */
+    uint16_t preamble_count; /* RXPACC; 0 = unknown */
+    float rx_power_dbm;      /* NaN = unknown */
+    float first_path_power_dbm;
+} uwb_cir;
+
+/* What becomes of a 256-fold accumulator: clip((acc + bias) * multiplier >> 43, 0, 255). */
+typedef struct {
+    int32_t bias;
+    int32_t multiplier;
+} uwb_channel;
+
+/* Sum of two uint8: clip(first * a + second * b + offset >> 22, 0, 255). */
+typedef struct {
+    int32_t first;
+    int32_t second;
+    int32_t offset;
+} uwb_sum;
+
+/* One residual reduction module. Weights are pairs of int8 for pairs of inputs, and two pairs (p, q) share
+ * a word as the bytes p0 q0 p1 q1: two ANDs unpack them to int16 pairs, scaled by 256. */
+typedef struct {
+    const int8_t *residual_weights; /* [filter][channel pair][tap 0..2] pairs */
+    const uwb_channel *residual;
+    uwb_sum residual_sum; /* of the convolution (first) and the module's input (second) */
+    const int8_t *reduce_weights; /* [filter][channel pair][tap 0, tap 2, tap 1, skip] pairs */
+    const uwb_channel *reduce;
+    const uwb_channel *skip;
+    uwb_sum output_sum; /* of reduce (first) and skip (second) */
+} uwb_module;
+
+/* Dense layer with ReLU. Inputs a multiple of 8, outputs of 4, both padded with zeros. */
+typedef struct {
+    const int8_t *weights; /* [output / 4][input / 4][output % 4] words of two pairs */
+    const uwb_channel *channels;
+    uint16_t inputs;
+    uint16_t outputs;
+} uwb_dense_layer;
+
+/* Either a REMNet (modules > 0) or dense layers, then a head with one output. */
+typedef struct {
+    uint32_t model_id;
+    uint16_t samples; /* window length K */
+    uwb_scaling scaling;
+    float input_scale;
+
+    uint16_t first_kernel; /* 3 or 5 */
+    uint16_t module_count;
+    const int16_t *first_weights; /* [filter][first_kernel + 1], times 256, the last one zero */
+    const uwb_channel *first;
+    const uwb_module *modules;
+
+    uint16_t layer_count;
+    const uwb_dense_layer *layers;
+
+    const int8_t *head_weights; /* pairs, in the order of the last activation in memory */
+    uint16_t head_inputs;       /* a multiple of 4 */
+    int32_t head_bias;          /* times 256 */
+    float head_scale;           /* m per unit of the accumulator */
+
+    float prior_offset_m;
+    float prior_per_rx_power; /* m per dBm */
+    float prior_per_power_gap;
+    float correction_low_m; /* a predicted error outside means an input unlike the training data */
+    float correction_high_m;
+    float variance_m2;
+    float variance_uncorrected_m2;
+} uwb_model;
+
+/* Bytes of arena that the other functions need for `model`; 0 if it is null or cannot be run. */
+size_t uwb_arena_size(const uwb_model *model);
+
+/* Write the network's input for `cir`, model->samples values, to `window`; undefined on failure. */
+uwb_status uwb_preprocess(const uwb_model *model, const uwb_cir *cir, float *window);
+
+/* The network's output for a window of model->samples values, m, without the prior. */
+uwb_status uwb_network(const uwb_model *model, const float *window, void *arena, size_t arena_bytes,
+                       float *output_m);
+
+/* The part of the predicted error that needs no network, m; NaN where a power that it needs is not finite, or
+ * beyond 1000 dBm. */
+float uwb_prior_m(const uwb_model *model, float rx_power_dbm, float first_path_power_dbm);
+
+/* What a corrected range is worth; the values of RangeCorrected.msg and of the wire protocol. */
+typedef enum {
+    UWB_RANGE_OK = 0,
+    UWB_RANGE_NO_CIR = 1,
+    UWB_RANGE_BAD_CIR = 2,
+    UWB_RANGE_OUT_OF_DISTRIBUTION = 3,
+    UWB_RANGE_MODEL_ERROR = 4
+} uwb_range_status;
+
+/* On any status but OK the raw range is passed through, and the variance is larger. */
+typedef struct {
+    float range_m;
+    float correction_m; /* predicted error, measured - true: prior + network; 0 when passed through */
+    float variance_m2;  /* infinite where the range is not valid */
+    uwb_range_status status;
+} uwb_corrected;
+
+/* Correct one range. The result is always usable; what is returned says in more detail why one was
+ * passed through. */
+uwb_status uwb_correct(const uwb_model *model, float range_m, const uwb_cir *cir, void *arena,
+                       size_t arena_bytes, uwb_corrected *corrected);
+
+#ifdef __cplusplus
+}
+#endif
+#endif

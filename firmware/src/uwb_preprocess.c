@@ -1,0 +1,92 @@
+#include <float.h>
+#include <math.h>
+
+#include "uwb_mitigation.h"
+
+/* Every step is one IEEE-754 operation, as in uwb_mitigation/preprocessing.py; checks are in its order. */
+
+enum { SATURATED = INT16_MAX, PREAMBLE_DIVISOR = 60 };
+
+static int finite(float value) {
+    return value >= -FLT_MAX && value <= FLT_MAX;
+}
+
+/* Magnitudes of `count` samples in counts; sets the largest absolute value among them. */
+static uwb_status magnitudes(const uwb_cir *cir, size_t start, size_t count, float *out, int32_t *peak) {
+    int32_t largest = 0;
+    if (cir->encoding == UWB_COMPLEX_INT16) {
+        const int16_t *sample = cir->samples + 2 * start;
+        for (size_t i = 0; i < count; i++, sample += 2) {
+            const int32_t re = sample[0] < 0 ? -sample[0] : sample[0];
+            const int32_t im = sample[1] < 0 ? -sample[1] : sample[1];
+            largest = re > largest ? re : largest;
+            largest = im > largest ? im : largest;
+            out[i] = sqrtf((float)((uint32_t)(re * re) + (uint32_t)(im * im)));
+        }
+    } else {
+        const int16_t *sample = cir->samples + start;
+        for (size_t i = 0; i < count; i++) {
+            if (sample[i] < 0) {
+                return UWB_NEGATIVE;
+            }
+            largest = sample[i] > largest ? sample[i] : largest;
+            out[i] = (float)sample[i];
+        }
+    }
+    *peak = largest;
+    return UWB_OK;
+}
+
+uwb_status uwb_preprocess(const uwb_model *model, const uwb_cir *cir, float *window) {
+    if (model == NULL || cir == NULL || window == NULL || (cir->samples == NULL && cir->count != 0)) {
+        return UWB_BAD_ARGUMENT;
+    }
+    if (cir->count == 0) {
+        return UWB_EMPTY;
+    }
+    if (!(finite(cir->scale) && cir->scale > 0.0f)) {
+        return UWB_BAD_SCALE;
+    }
+    if (!finite(cir->first_path_index)) {
+        return UWB_NO_FIRST_PATH;
+    }
+    if (model->scaling == UWB_SCALE_PREAMBLE && cir->preamble_count == 0) {
+        return UWB_NO_PREAMBLE_COUNT;
+    }
+    /* start_index has 32 bits: a first path beyond 2^40 cannot be inside, and below it int64 is exact. */
+    if (cir->first_path_index > 1.0e12f || cir->first_path_index < -1.0e12f) {
+        return UWB_OUTSIDE;
+    }
+    const size_t length = cir->encoding == UWB_COMPLEX_INT16 ? cir->count / 2 : cir->count;
+    const size_t samples = model->samples;
+    const int64_t start = (int64_t)floorf(cir->first_path_index) - UWB_WINDOW_LEAD - cir->start_index;
+    if (length < samples || start < 0 || (uint64_t)start > length - samples) {
+        return UWB_OUTSIDE;
+    }
+    if (cir->encoding == UWB_COMPLEX_INT16 && cir->count % 2 != 0) {
+        return UWB_ODD_LENGTH;
+    }
+
+    int32_t peak = 0;
+    const uwb_status status = magnitudes(cir, (size_t)start, samples, window, &peak);
+    if (status != UWB_OK) {
+        return status;
+    }
+    if (peak == 0) {
+        return UWB_ALL_ZERO;
+    }
+    if (peak >= SATURATED) {
+        return UWB_SATURATED;
+    }
+    /* Multiplying by 1 changes nothing, so that the host's shortcut needs no counterpart. */
+    float largest = 0.0f;
+    for (size_t i = 0; i < samples; i++) {
+        window[i] *= cir->scale;
+        largest = window[i] > largest ? window[i] : largest;
+    }
+    const float count = (float)(PREAMBLE_DIVISOR * (int32_t)cir->preamble_count);
+    for (size_t i = 0; i < samples; i++) {
+        window[i] = model->scaling == UWB_SCALE_MAX ? window[i] / largest : sqrtf(window[i] / count);
+    }
+    return UWB_OK;
+}

@@ -1,0 +1,79 @@
+"""From a model bundle to a folder with the C header that the firmware is built with."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.errors import ModelError, UwbMitigationError
+from uwb_mitigation.firmware_export.header import Golden, Identity, render
+from uwb_mitigation.firmware_export.host import MODEL_HEADER
+from uwb_mitigation.firmware_export.packing import PackedNetwork, pack_remnet
+from uwb_mitigation.model import graph
+from uwb_mitigation.model.bundle import Bundle
+from uwb_mitigation.model.integer import IntegerNetwork
+
+GOLDEN_VECTORS = 8
+
+
+def export_bundle(bundle: Bundle, folder: Path) -> Path:
+    """Write `uwb_model.h` for an int8 bundle to `folder`, and return its path.
+
+    Raises:
+        ModelError: the bundle is in float, of a shape without kernels, or has a layer without exact
+            integer constants; the message says which.
+        UwbMitigationError: the header cannot be written.
+    """
+    if not bundle.quantised:
+        raise ModelError(
+            "the firmware runs int8 networks only",
+            where=str(bundle.path),
+            valid="run `uwb-mitigation quantize`",
+        )
+    weights = graph.int8_weights(bundle.model, bundle.architecture)
+    try:
+        network = pack_remnet(weights)
+    except ModelError as error:
+        where = f"{bundle.path}, {error.where}" if error.where else str(bundle.path)
+        raise ModelError(error.what, where=where, valid=error.valid) from error
+    windows = golden_windows(network)
+    golden = Golden(windows, IntegerNetwork(weights).predict_m(windows))
+    return write_header(folder, network, identity(bundle), golden)
+
+
+def write_header(folder: Path, network: PackedNetwork, identity: Identity, golden: Golden) -> Path:
+    """Write `uwb_model.h` to `folder`, which is made if need be; whole or not at all."""
+    path = folder / MODEL_HEADER
+    partial = path.with_name(path.name + ".part")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        partial.write_text(render(network, identity, golden), encoding="utf-8")
+        partial.replace(path)
+    except OSError as error:
+        raise UwbMitigationError(f"cannot be written: {error.strerror}", where=str(path)) from error
+    return path
+
+
+def identity(bundle: Bundle) -> Identity:
+    """What the header says of a bundle beside its network."""
+    card = bundle.card
+    return Identity(
+        name=card.name,
+        model_id=bundle.model_id,
+        scaling=card.preprocessing.scaling,
+        prior=card.prior,
+        correction_limits_m=card.correction_limits_m,
+        variance_m2=card.variance_m2,
+        variance_uncorrected_m2=card.variance_uncorrected_m2,
+    )
+
+
+def golden_windows(network: PackedNetwork) -> NDArray[np.float32]:
+    """Inputs that are all zero, all saturated, and random at rising levels; the same every time."""
+    random = np.random.default_rng(network.samples)
+    levels = np.geomspace(8, 512, GOLDEN_VECTORS - 2)
+    noise = random.uniform(0, 1, (GOLDEN_VECTORS - 2, network.samples)) * levels[:, None]
+    rows = np.concatenate([np.zeros((1, network.samples)), np.full((1, network.samples), 1e4), noise])
+    return (rows * float(network.input_scale)).astype(np.float32)

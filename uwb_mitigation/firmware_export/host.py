@@ -1,0 +1,205 @@
+"""Runs the very C that ships, compiled for this computer: for tests of parity, and as a host backend."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import os
+import shutil
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.errors import MissingDependencyError, ModelError, UwbMitigationError
+from uwb_mitigation.measurement import Cir
+from uwb_mitigation.preprocessing import CirFault
+
+MODEL_HEADER = "uwb_model.h"
+
+WARNINGS = ("-Wall", "-Wextra", "-Wconversion", "-Wpedantic", "-Werror")
+
+_SHIM = (
+    '#include "uwb_model.h"\n'
+    "const uwb_model *uwb_exported_model(void);\n"
+    "const uwb_model *uwb_exported_model(void) { return &uwb_model_data; }\n"
+)
+
+_FAULTS = {
+    3: CirFault.EMPTY,
+    4: CirFault.ODD_LENGTH,
+    5: CirFault.BAD_SCALE,
+    6: CirFault.NO_FIRST_PATH,
+    7: CirFault.OUTSIDE,
+    8: CirFault.ALL_ZERO,
+    9: CirFault.NEGATIVE,
+    10: CirFault.SATURATED,
+    11: CirFault.NO_PREAMBLE_COUNT,
+    12: CirFault.NO_POWER,
+}
+"""Values of `uwb_status` for which the host has the same fault."""
+
+
+def firmware_folder() -> Path:
+    """The folder `firmware/` of this checkout.
+
+    Raises:
+        MissingDependencyError: the package was installed without it.
+    """
+    folder = Path(__file__).resolve().parent.parent.parent / "firmware"
+    if not (folder / "src" / "uwb_mitigation.h").is_file():
+        raise MissingDependencyError(
+            "the firmware's sources are not installed", where=str(folder), valid="run from a source checkout"
+        )
+    return folder
+
+
+class _Cir(ctypes.Structure):
+    _fields_ = (
+        ("samples", ctypes.POINTER(ctypes.c_int16)),
+        ("count", ctypes.c_size_t),
+        ("encoding", ctypes.c_int),
+        ("start_index", ctypes.c_int32),
+        ("first_path_index", ctypes.c_float),
+        ("scale", ctypes.c_float),
+        ("preamble_count", ctypes.c_uint16),
+        ("rx_power_dbm", ctypes.c_float),
+        ("first_path_power_dbm", ctypes.c_float),
+    )
+
+
+class _Corrected(ctypes.Structure):
+    _fields_ = (
+        ("range_m", ctypes.c_float),
+        ("correction_m", ctypes.c_float),
+        ("variance_m2", ctypes.c_float),
+        ("status", ctypes.c_int),
+    )
+
+
+class HostFirmware:
+    """An exported model in the portable C library.
+
+    Args:
+        export: folder with `uwb_model.h`.
+        build: folder for the shared library.
+        flags: further compiler flags.
+
+    Raises:
+        MissingDependencyError: there is no C compiler.
+        UwbMitigationError: it does not compile; carries the compiler's first error.
+    """
+
+    def __init__(self, export: Path, build: Path, flags: Sequence[str] = ()) -> None:
+        library = ctypes.CDLL(str(build_shared_library(export, build, flags)))
+        library.uwb_exported_model.restype = ctypes.c_void_p
+        library.uwb_arena_size.restype = ctypes.c_size_t
+        library.uwb_arena_size.argtypes = (ctypes.c_void_p,)
+        library.uwb_network.argtypes = (
+            *(ctypes.c_void_p,) * 3,
+            ctypes.c_size_t,
+            ctypes.POINTER(ctypes.c_float),
+        )
+        library.uwb_preprocess.argtypes = (ctypes.c_void_p, ctypes.POINTER(_Cir), ctypes.c_void_p)
+        library.uwb_correct.argtypes = (
+            ctypes.c_void_p,
+            ctypes.c_float,
+            ctypes.POINTER(_Cir),
+            ctypes.c_void_p,
+            ctypes.c_size_t,
+            ctypes.POINTER(_Corrected),
+        )
+        self._library = library
+        self._model = library.uwb_exported_model()
+        self.arena_bytes: int = library.uwb_arena_size(self._model)
+        self._arena = ctypes.create_string_buffer(self.arena_bytes)
+
+    def predict_m(self, windows: NDArray[np.float32]) -> NDArray[np.float32]:
+        """The network's outputs, float32 (n,), for windows float32 (n, K), m."""
+        windows = np.ascontiguousarray(windows, np.float32)
+        outputs = np.empty(len(windows), np.float32)
+        value = ctypes.c_float()
+        for index, window in enumerate(windows):
+            status = self._library.uwb_network(
+                self._model, window.ctypes.data, self._arena, self.arena_bytes, ctypes.byref(value)
+            )
+            if status:
+                raise ModelError(f"the firmware refuses the model: status {status}")
+            outputs[index] = value.value
+        return outputs
+
+    def preprocess(self, cir: Cir, out: NDArray[np.float32]) -> CirFault | None:
+        """As `Preprocessing.apply`."""
+        status = self._library.uwb_preprocess(self._model, ctypes.byref(_c_cir(cir)), out.ctypes.data)
+        return _FAULTS[status] if status else None
+
+    def correct(self, range_m: float, cir: Cir) -> tuple[float, float, float, int]:
+        """Range, correction, variance and status, as `Mitigation.correct` gives them."""
+        result = _Corrected()
+        self._library.uwb_correct(
+            self._model,
+            range_m,
+            ctypes.byref(_c_cir(cir)),
+            self._arena,
+            self.arena_bytes,
+            ctypes.byref(result),
+        )
+        return result.range_m, result.correction_m, result.variance_m2, result.status
+
+
+def build_shared_library(export: Path, build: Path, flags: Sequence[str] = ()) -> Path:
+    """Compile the library and the model in `export` to a shared library in `build`."""
+    compiler = os.environ.get("CC") or shutil.which("cc") or shutil.which("gcc")
+    if compiler is None:
+        raise MissingDependencyError("there is no C compiler", valid="apt install gcc, or set CC")
+    sources = firmware_folder() / "src"
+    shim = build / "exported_model.c"
+    shim.write_text(_SHIM, encoding="utf-8")
+    output = build / "libuwb_mitigation.so"
+    command = [compiler, "-std=c99", "-O2", "-fPIC", "-shared", *WARNINGS, *flags]
+    command += [f"-I{sources}", f"-I{export}", *map(str, sorted(sources.glob("*.c"))), str(shim)]
+    run([*command, "-o", str(output), "-lm"])
+    return output
+
+
+def run(command: Sequence[str], timeout_s: float = 300) -> str:
+    """Run a tool and return its standard output.
+
+    Raises:
+        UwbMitigationError: it fails or takes too long; carries the first line that says why.
+    """
+    try:
+        done = subprocess.run(
+            command, capture_output=True, text=True, timeout=timeout_s, check=False, stdin=subprocess.DEVNULL
+        )
+    except subprocess.TimeoutExpired as error:
+        raise UwbMitigationError(f"took more than {timeout_s} s", where=command[0]) from error
+    except OSError as error:
+        raise MissingDependencyError(f"cannot be run: {error.strerror}", where=command[0]) from error
+    if done.returncode:
+        lines = done.stderr.splitlines()
+        reason = next(
+            (line for line in lines if "error" in line.lower()), lines[-1] if lines else "no message"
+        )
+        raise UwbMitigationError(f"exit {done.returncode}: {reason}", where=Path(command[0]).name)
+    return done.stdout
+
+
+def _c_cir(cir: Cir) -> _Cir:
+    samples = np.ascontiguousarray(cir.samples, np.int16)
+    result = _Cir(
+        samples.ctypes.data_as(ctypes.POINTER(ctypes.c_int16)),
+        len(samples),
+        int(cir.encoding),
+        cir.start_index,
+        cir.first_path_index if math.isfinite(cir.first_path_index) else math.nan,
+        cir.scale,
+        cir.preamble_count,
+        cir.rx_power_dbm,
+        cir.first_path_power_dbm,
+    )
+    # The structure holds a bare pointer: keep what it points to.
+    result.owner = samples
+    return result

@@ -1,0 +1,298 @@
+"""Integer constants that reproduce ONNX Runtime's float requantisation, output for output.
+
+ONNX Runtime (MLAS) computes, in float32:
+
+- after a convolution or a dense layer: `clip(rint(acc * s), 0, 255)`, `s = fl(fl(x * w) / y)` of the
+  scales of input, weight and output;
+- a sum of two uint8 tensors: `clip(rint(fma(a, ra, fl(rb * b))), 0, 255)`, `ra = fl(sa / sy)`, `rb = fl(sb / sy)`.
+
+`rint` rounds half to even. As a function of integers each is a staircase of at most 255 steps, so a
+line through the right integer gaps is the same function:
+
+- `clip((256 acc + offset) * multiplier >> 32 + REQUANTISATION_SHIFT, 0, 255)`: SMMUL, then USAT with
+  its shift. Weights come scaled by 256, and bias and offset make one constant;
+- `clip(first * a + second * b + offset >> SUM_SHIFT, 0, 255)`: two MLA, then USAT.
+
+`solve_*` find such constants or say that none exist, which happens where two steps differ by less
+than the line can express. `nudge_*` then move a scale by as little as makes them exist; a quantiser
+calls `nudge` on its result, so that the ONNX file and the C code hold the same scales.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.errors import ModelError
+from uwb_mitigation.model.architecture import HEAD
+from uwb_mitigation.model.weights import Int8Weights, layer_inputs
+
+WEIGHT_SCALE_BITS = 8
+"""Weights are multiplied by 2^8 before the dot product, to give the offset a place."""
+
+REQUANTISATION_SHIFT = 11
+"""Right shift after the high word of the product: scales below 2^-4 keep 31 bits of multiplier."""
+
+SUM_SHIFT = 22
+"""Fraction bits of a sum's multipliers: 510 * 2^22 still fits 31 bits."""
+
+_LEVELS = 255
+_MAX_ULPS = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Requantisation:
+    """`clip((256 acc + offset) * multiplier >> 32 + REQUANTISATION_SHIFT, 0, 255)`."""
+
+    multiplier: int
+    offset: int
+
+    def apply(self, accumulator: NDArray[np.int64]) -> NDArray[np.uint8]:
+        product = ((accumulator << WEIGHT_SCALE_BITS) + self.offset) * self.multiplier
+        return _saturate(product >> (32 + REQUANTISATION_SHIFT))
+
+
+@dataclass(frozen=True, slots=True)
+class Sum:
+    """`clip(first * a + second * b + offset >> SUM_SHIFT, 0, 255)`."""
+
+    first: int
+    second: int
+    offset: int
+
+    def table(self) -> NDArray[np.uint8]:
+        """The result for every a (rows) and b (columns), uint8 of shape (256, 256)."""
+        a = np.arange(256, dtype=np.int64)[:, None]
+        b = np.arange(256, dtype=np.int64)[None, :]
+        total = (self.first * a + self.second * b + self.offset) >> SUM_SHIFT
+        return _saturate(total)
+
+
+def requantise(accumulator: NDArray[np.int64], scale: np.float32) -> NDArray[np.uint8]:
+    """ONNX Runtime's requantisation of int32 values: the formula that `solve_requantisation` meets."""
+    scaled = np.rint(accumulator.astype(np.float32) * np.float32(scale))
+    return _saturate(scaled)
+
+
+def sum_table(first: np.float32, second: np.float32, *, fused: bool = True) -> NDArray[np.uint8]:
+    """ONNX Runtime's sum for every a (rows) and b (columns), from the two ratios of scales.
+
+    `fused` is what processors with a fused multiply-add compute; others round `a * ra` as well.
+    """
+    values = np.arange(256, dtype=np.float32)
+    products = np.float32(second) * values
+    if fused:
+        # Both terms are exact in binary64, and so is their sum: one rounding to binary32 is the fma.
+        exact = values.astype(np.float64)[:, None] * np.float64(first) + products.astype(np.float64)
+        total = exact.astype(np.float32)
+    else:
+        total = (values * np.float32(first))[:, None] + products
+    return _saturate(np.rint(total))
+
+
+def requantisation_scale(
+    input_scale: np.float32, weight_scale: NDArray[np.float32] | np.float32, output_scale: np.float32
+) -> NDArray[np.float32]:
+    """`fl(fl(x * w) / y)`, float32 of the shape of `weight_scale`."""
+    product = np.float32(input_scale) * np.asarray(weight_scale, np.float32)
+    return np.asarray(product / np.float32(output_scale), np.float32)
+
+
+def _thresholds(scale: np.float32, low: int, high: int) -> NDArray[np.int64]:
+    """The smallest accumulator that gives at least k, for k = 1, 2, ... while it is in (low, high]."""
+    steps = np.arange(1, _LEVELS + 1)
+    # Float rounding moves a step by less than one accumulator: three candidates bracket it.
+    candidates = np.floor((steps - 0.5) / np.float64(scale)).astype(np.int64)[:, None] + np.arange(-1, 3)
+    candidates = np.clip(candidates, -(1 << 24), 1 << 24)
+    reached = np.rint(candidates.astype(np.float32) * np.float32(scale)) >= steps[:, None]
+    first = candidates[np.arange(_LEVELS), reached.argmax(axis=1)]
+    in_reach: NDArray[np.int64] = first[reached.any(axis=1) & (first > low) & (first <= high)]
+    return in_reach
+
+
+def solve_requantisation(scale: np.float32, low: int, high: int) -> Requantisation | None:
+    """Constants equal to `requantise` for every accumulator from `low` to `high`; None if there are none.
+
+    Also None where an accumulator, times 256, leaves 31 bits, or the scale is 2^-4 or more.
+    """
+    scale = np.float32(scale)
+    nominal = float(scale) * 2.0 ** (32 - WEIGHT_SCALE_BITS + REQUANTISATION_SHIFT)
+    if not 1.0 <= nominal < 2**31 - 1:
+        return None
+    steps = _thresholds(scale, low, high)
+    # Steps are counted from the level of `low`, which need not be 0: a bias may lift every output.
+    level = int(requantise(np.array([low]), scale)[0])
+    k = np.arange(level + 1, level + 1 + len(steps), dtype=np.int64)
+    # Past this the last step leaves its gap for certain.
+    reach = max(1.0, nominal / max(1, abs(low), abs(high)))
+    trials = np.unique(np.rint(nominal + np.linspace(-reach, reach, 129)).astype(np.int64))
+    trials = trials[(trials > 0) & (trials < 2**31)]
+    for multiplier in trials[np.argsort(np.abs(trials - nominal), kind="stable")].tolist():
+        # Accumulator t reaches level k when 256 t + offset >= ceil(k D / multiplier).
+        offset = _offset_between(
+            _reaching(k, multiplier) - (steps << WEIGHT_SCALE_BITS),
+            at_least=int(_reaching(level, multiplier)) - 256 * low if level > 0 else None,
+            at_most=int(_reaching(level + len(k) + 1, multiplier)) - 1 - 256 * high
+            if level + len(k) < _LEVELS
+            else None,
+            nominal=round(128 / float(scale)),
+        )
+        if offset is not None:
+            fits = all(-(2**31) <= 256 * end + offset < 2**31 for end in (low, high))
+            return Requantisation(multiplier, offset) if fits else None
+    return None
+
+
+def _reaching(level: NDArray[np.int64] | int, multiplier: int) -> NDArray[np.int64]:
+    """The smallest scaled accumulator whose product reaches `level`."""
+    return -((-(np.asarray(level, np.int64) << (32 + REQUANTISATION_SHIFT))) // multiplier)
+
+
+def _offset_between(
+    lowest: NDArray[np.int64], *, at_least: int | None, at_most: int | None, nominal: int
+) -> int | None:
+    """The middle of the offsets that put every step in its gap, which is 256 wide; None if empty."""
+    floors = [int(lowest.max())] if lowest.size else []
+    ceilings = [int(lowest.min()) + 255] if lowest.size else []
+    floors += [at_least] if at_least is not None else []
+    ceilings += [at_most] if at_most is not None else []
+    if not (floors and ceilings):
+        return max([nominal, *floors]) if floors else min([nominal, *ceilings])
+    if max(floors) > min(ceilings):
+        return None
+    return (max(floors) + min(ceilings)) // 2
+
+
+def solve_sum(first: np.float32, second: np.float32) -> Sum | None:
+    """Constants equal to `sum_table(first, second)` for all 65,536 pairs; None if there are none near.
+
+    `first` and `second` are the ratios of the operands' scales to the result's. Also None where
+    their sum exceeds 2, which would leave 31 bits, and where fused and separate arithmetic differ.
+    """
+    ratios = np.array([first, second], np.float32).astype(np.float64)
+    if not (np.all(ratios > 0) and float(ratios.sum()) <= 2.0):
+        return None
+    table = sum_table(first, second).astype(np.int64)
+    if not np.array_equal(table, sum_table(first, second, fused=False)):
+        return None
+    a, b = np.meshgrid(np.arange(256), np.arange(256), indexing="ij")
+    exact = ratios[0] * a + ratios[1] * b + 0.5
+    # Only pairs beside a step can go wrong: coefficients are off by at most 17 * 2^-22.
+    critical = np.abs(exact - np.rint(exact)) < 2.0**-9
+    a, b, k = (values[critical].astype(np.int64) for values in (a, b, table))
+    unit = np.int64(1) << SUM_SHIFT
+    spread = np.arange(-16, 17)
+    spread = spread[np.argsort(np.abs(spread), kind="stable")]
+    alpha, beta = (round(ratio * int(unit)) for ratio in ratios)
+    for shift in spread.tolist():
+        base = (alpha + shift) * a - k * unit
+        scaled = base[None, :] + (beta + spread)[:, None] * b[None, :]
+        floor = np.where(k > 0, -scaled, -(2**40)).max(axis=1, initial=-(2**40))
+        ceiling = np.where(k < _LEVELS, unit - 1 - scaled, 2**40).min(axis=1, initial=2**40)
+        for index in np.flatnonzero(floor <= ceiling).tolist():
+            offset = min(max(int(unit) // 2, int(floor[index])), int(ceiling[index]))
+            found = Sum(alpha + shift, beta + int(spread[index]), offset)
+            if np.array_equal(found.table(), table):
+                return found
+    return None
+
+
+def accumulator_range(
+    weight: NDArray[np.int8], bias: NDArray[np.int32]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Smallest and largest accumulator of each output for uint8 inputs; `weight` has outputs first."""
+    rows = weight.reshape(len(weight), -1).astype(np.int64)
+    return (
+        bias + 255 * np.minimum(rows, 0).sum(axis=1),
+        bias + 255 * np.maximum(rows, 0).sum(axis=1),
+    )
+
+
+def nudge_weight_scale(
+    input_scale: np.float32,
+    weight_scale: NDArray[np.float32],
+    output_scale: np.float32,
+    low: NDArray[np.int64],
+    high: NDArray[np.int64],
+) -> NDArray[np.float32]:
+    """`weight_scale` with each channel's value moved by the fewest ulps that make it solvable.
+
+    Raises:
+        ModelError: no value within 64 ulps is; the channel's scale is then out of range.
+    """
+    nudged = np.array(weight_scale, np.float32)
+    for channel in range(len(nudged)):
+        for candidate in _neighbours(nudged[channel]):
+            scale = requantisation_scale(input_scale, candidate, output_scale)
+            if solve_requantisation(np.float32(scale), int(low[channel]), int(high[channel])):
+                nudged[channel] = candidate
+                break
+        else:
+            raise ModelError(
+                f"no exact integer requantisation near weight scale {nudged[channel]!r} of channel {channel}",
+                valid="input scale * weight scale / output scale below 1/16, accumulators below 2^23",
+            )
+    return nudged
+
+
+def nudge_sum_scale(first: np.float32, second: np.float32, total: np.float32) -> np.float32:
+    """The scale nearest to `total` for which the sum of tensors of the other two scales is solvable.
+
+    Raises:
+        ModelError: none within 64 ulps is; the operands' scales then exceed the result's too far.
+    """
+    for candidate in _neighbours(total):
+        if solve_sum(np.float32(first / candidate), np.float32(second / candidate)):
+            return candidate
+    raise ModelError(
+        f"no exact integer sum near scale {total!r} of operands {first!r} and {second!r}",
+        valid="operands' scales that add up to at most twice the result's",
+    )
+
+
+def nudge(weights: Int8Weights) -> Int8Weights:
+    """`weights` with scales moved by a few ulps, so that every layer has exact integer constants.
+
+    The integers stay as they are. A network that is exact already is returned with equal scales.
+
+    Raises:
+        ModelError: a scale is far outside of what the integer forms can express; names the layer.
+    """
+    activation = dict(weights.activation_scale)
+    weight_scale = dict(weights.weight_scale)
+    tensor = "first"
+    for module in range(1, weights.architecture.modules + 1):
+        name = f"module{module}"
+        for total, first, second in (
+            (f"{name}.sum", f"{name}.residual", tensor),
+            (name, f"{name}.reduce", f"{name}.skip"),
+        ):
+            activation[total] = nudge_sum_scale(activation[first], activation[second], activation[total])
+        tensor = name
+    for layer, read in layer_inputs(weights.architecture).items():
+        if layer != HEAD:
+            low, high = accumulator_range(weights.weight[layer], weights.bias[layer])
+            try:
+                weight_scale[layer] = nudge_weight_scale(
+                    activation[read], weight_scale[layer], activation[layer], low, high
+                )
+            except ModelError as error:
+                raise ModelError(error.what, where=layer, valid=error.valid) from error
+    return replace(weights, weight_scale=weight_scale, activation_scale=activation)
+
+
+def _neighbours(value: np.float32) -> list[np.float32]:
+    """`value` and the float32 values around it, nearest first."""
+    around = [np.float32(value)]
+    up = down = np.float32(value)
+    for _ in range(_MAX_ULPS):
+        up, down = np.nextafter(up, np.float32(np.inf)), np.nextafter(down, np.float32(0))
+        around += [up, down]
+    return around
+
+
+def _saturate(values: NDArray[np.int64] | NDArray[np.float32]) -> NDArray[np.uint8]:
+    clipped: NDArray[np.uint8] = np.clip(values, 0, _LEVELS).astype(np.uint8)
+    return clipped
