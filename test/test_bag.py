@@ -143,7 +143,7 @@ def test_messages_of_another_bag_are_copied_byte_for_byte(tmp_path: Path) -> Non
         for channel, sequence, log_ns, publish_ns, data in before:
             if channel.topic not in channels:
                 channels[channel.topic] = bag.copy_channel(channel)
-            bag.write_serialized(channels[channel.topic], channel.topic, data, log_ns, publish_ns, sequence)
+            bag.write_serialized(channels[channel.topic], data, log_ns, publish_ns, sequence)
     after = list(BagReader(tmp_path / "two").messages())
     assert [message[1:] for message in after] == [message[1:] for message in before]
     assert {m.channel.topic: m.channel.schema for m in after} == {

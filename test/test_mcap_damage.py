@@ -98,9 +98,16 @@ def test_no_flipped_bit_goes_unnoticed_in_the_data(tmp_path: Path) -> None:
     expected = [codec.encode_range(record(number).measurement) for number in range(8)]
     rng = np.random.default_rng(5)
     flipped = tmp_path / "flipped.mcap"
-    for at in rng.integers(0, len(whole), 1500):
+    flips = [
+        (at, bit)
+        for span in spans_of(tmp_path / "whole.mcap")
+        for at in (span.offset, span.end)
+        for bit in range(8)
+    ]
+    flips += zip(rng.integers(0, len(whole), 300).tolist(), rng.integers(0, 8, 300).tolist(), strict=True)
+    for at, bit in flips:
         broken = bytearray(whole)
-        broken[at] ^= 1 << int(rng.integers(8))
+        broken[at] ^= 1 << bit
         flipped.write_bytes(broken)
         read: list[bytes] = []
         try:

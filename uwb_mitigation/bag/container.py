@@ -36,6 +36,7 @@ _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
 _CHUNK_TIMES = struct.Struct("<QQ")
 _INDEX = struct.Struct("<HI")
+_DATA_END_SIZE = 4
 
 _UNEXPECTED = {Opcode.HEADER, Opcode.FOOTER, Opcode.STATISTICS, Opcode.SUMMARY_OFFSET}
 _UNEXPECTED |= {Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX}
@@ -153,6 +154,9 @@ def survey(stream: BinaryIO) -> Survey:
         try:
             opcode, end = _record_at(stream, offset, size)
             if opcode == Opcode.DATA_END:
+                # Another length is another kind of record, its opcode flipped: data would be lost unnoticed.
+                if end - offset - _RECORD.size != _DATA_END_SIZE:
+                    raise ValueError("a record that ends the data, but of the wrong length")
                 break
             _take_in(stream, found, opcode, offset, end)
         except ValueError as error:

@@ -72,6 +72,7 @@ class BagWriter:
         self.counts: Counter[str] = Counter()
         self.notice = ""
         self._channels: dict[str, int] = {}
+        self._names: dict[int, str] = {}
         self._topics: dict[str, TopicCount] = {}
         self._schemas: dict[tuple[str, str, bytes], int] = {}
         self._first_ns: int | None = None
@@ -121,7 +122,9 @@ class BagWriter:
         self._write_ours(RANGE_CORRECTED, RANGE_CORRECTED_TYPE, measurement, data, log_time_ns)
 
     def copy_channel(self, channel: Channel, topic: str | None = None) -> int:
-        """Register a channel of another bag as it is, under its own name or `topic`; returns its number.
+        """Register a channel of another bag, under its own name or `topic`; returns its number.
+
+        Its recorded quality of service stays behind: how that is spelt depends on the other bag's version.
 
         Raises:
             RecordingError: the channel has no schema, or the topic is registered already.
@@ -134,13 +137,13 @@ class BagWriter:
             channel.schema.encoding,
             channel.schema.data,
             channel.encoding,
-            channel.metadata,
+            channel.metadata | {_QOS_KEY: NO_QOS},
         )
 
     def write_serialized(
-        self, channel: int, topic: str, data: bytes, log_time_ns: int, publish_time_ns: int, sequence: int = 0
+        self, channel: int, data: bytes, log_time_ns: int, publish_time_ns: int, sequence: int = 0
     ) -> None:
-        """Write the bytes of a message untouched, to a channel that `copy_channel` gave for `topic`.
+        """Write the bytes of a message untouched, to a channel that `copy_channel` gave.
 
         Raises:
             RecordingError: a time is negative, or the bag cannot be written.
@@ -151,7 +154,7 @@ class BagWriter:
             self._mcap.add_message(channel, log_time_ns, data, publish_time_ns, sequence)
         except OSError as error:
             raise self._unwritable(error) from error
-        self.counts[topic] += 1
+        self.counts[self._names[channel]] += 1
         self._first_ns = log_time_ns if self._first_ns is None else min(self._first_ns, log_time_ns)
         self._last_ns = max(self._last_ns, log_time_ns)
 
@@ -192,7 +195,7 @@ class BagWriter:
                 {_QOS_KEY: NO_QOS, _HASH_KEY: schemas.type_hash(type_name)},
             )
         stamp_ns = measurement.stamp_ns if log_time_ns is None else log_time_ns
-        self.write_serialized(channel, topic, data, stamp_ns, measurement.stamp_ns, measurement.sequence)
+        self.write_serialized(channel, data, stamp_ns, measurement.stamp_ns, measurement.sequence)
 
     def _add_channel(
         self,
@@ -211,6 +214,7 @@ class BagWriter:
                 self._schemas[key] = self._mcap.register_schema(type_name, schema_encoding, schema)
             number = self._mcap.register_channel(topic, encoding, self._schemas[key], dict(metadata))
         self._channels[topic] = number
+        self._names[number] = topic
         self._topics[topic] = TopicCount(topic, type_name, metadata.get(_HASH_KEY, ""), 0)
         return number
 

@@ -123,7 +123,7 @@ class McapRecording:
             while waiting:
                 yield leave()
             raise
-        while waiting:
+        while waiting and not self._closed:
             yield leave()
         if early:
             self.skipped["truth without its range"] += len(early)
