@@ -1,0 +1,332 @@
+"""A board on a real pseudo-terminal: connected, lost, found again, closed."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import serial
+
+from uwb_mitigation.errors import ParameterError, RecordingError
+from uwb_mitigation.link.board import Identity
+from uwb_mitigation.link.emulated_board import BoardFaults, EmulatedBoard
+from uwb_mitigation.link.events import Answer, Connected, Disconnected, Event, Loss
+from uwb_mitigation.link.faults import ByteFaults
+from uwb_mitigation.link.layout import Mode
+from uwb_mitigation.link.messages import Correction
+from uwb_mitigation.link.port import BoardPort, PortAddress
+from uwb_mitigation.measurement import Cir, CorrectedRange, Origin, RangeMeasurement, Status
+from uwb_mitigation.sources.serial import SerialSource
+from uwb_mitigation.sources.source import Record
+
+PATIENCE_S = 20
+"""How long a test waits for what must come; nothing is asserted about how soon it does."""
+
+IDENTITY = Identity(board_id=0xB0, model_id=0xCAFE, window=157)
+
+
+class Recording:
+    """A source of numbered measurements."""
+
+    name = "recording"
+    simulated = True
+
+    def __init__(self, count: int = 1000) -> None:
+        self.count = count
+        self.skipped: Counter[str] = Counter()
+
+    def __iter__(self) -> Iterator[Record]:
+        for i in range(self.count):
+            samples = np.full(314, i % 100, np.int16)
+            yield Record(RangeMeasurement(0, 1, 2, i, i * 7, 4.0, Cir(samples, preamble_count=9)))
+
+
+class HalfMetre:
+    """A model that predicts half a metre of error for everything."""
+
+    def correct(self, measurement: RangeMeasurement) -> CorrectedRange:
+        raw = measurement.range_m
+        return CorrectedRange(raw - 0.5, raw, 0.5, 0.01, Status.OK, Origin.HOST, IDENTITY.model_id)
+
+
+@pytest.fixture
+def link(tmp_path: Path) -> Path:
+    return tmp_path / "uwb_board"
+
+
+@pytest.fixture
+def board(link: Path) -> Iterator[EmulatedBoard]:
+    with EmulatedBoard(
+        Recording(), rate_hz=200, identity=IDENTITY, corrector=HalfMetre(), link=link
+    ) as emulated:
+        yield emulated
+
+
+@pytest.fixture
+def port(board: EmulatedBoard, link: Path) -> Iterator[BoardPort]:
+    opened = BoardPort(PortAddress(str(link)))
+    yield opened
+    opened.close()
+
+
+def wait_for(port: BoardPort, wanted: Callable[[Event], bool]) -> Event:
+    deadline = time.monotonic() + PATIENCE_S
+    while time.monotonic() < deadline:
+        event = port.get(0.1)
+        if event is not None and wanted(event):
+            return event
+    raise AssertionError(f"what was waited for did not come: {port.report()}")
+
+
+def of(kind: type) -> Callable[[Event], bool]:
+    return lambda event: isinstance(event, kind)
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def test_measurements_arrive_complete_and_in_order(port):
+    first = wait_for(port, of(RangeMeasurement))
+    sequences = [wait_for(port, of(RangeMeasurement)).sequence for _ in range(50)]
+
+    assert sequences == list(range(first.sequence + 1, first.sequence + 51))
+    assert first.cir.samples.tolist() == [first.sequence % 100] * 314
+    assert first.device_time == first.sequence * 7
+
+
+def test_a_stamp_is_the_time_of_the_measurement_on_the_hosts_clock(port):
+    before = time.time_ns()
+    wait_until(lambda: port._session.clock.synchronised)
+    event = wait_for(port, lambda event: isinstance(event, RangeMeasurement) and event.stamp_ns > before)
+
+    assert event.stamp_ns <= time.time_ns()
+
+
+def test_the_board_corrects_when_it_is_told_to(port):
+    port.set_mode(Mode.DEVICE)
+
+    correction = wait_for(port, of(Correction))
+
+    assert correction.corrected.range_m == 3.5
+    assert correction.corrected.origin is Origin.DEVICE
+
+
+def test_the_board_corrects_what_the_host_sends(port):
+    wait_for(port, of(Connected))
+    measurement = RangeMeasurement(12, 5, 6, 7, 8, 2.0, Cir(np.zeros(4, np.int16)))
+
+    assert port.correct(measurement)
+    answer = wait_for(port, of(Answer))
+
+    assert answer.correction.corrected.range_m == 1.5
+    assert answer.correction.stamp_ns == 12
+
+
+def test_a_board_that_is_unplugged_and_comes_back_under_another_name_is_found_again(board, port, tmp_path):
+    wait_for(port, of(RangeMeasurement))
+    first = board.port
+    board.unplug()
+    wait_for(port, lambda event: event == Disconnected(Loss.CLOSED))
+    holder = EmulatedBoard(link=tmp_path / "other")  # Takes the name that has become free.
+    board.plug()
+
+    wait_for(port, of(Connected))
+    wait_for(port, of(RangeMeasurement))
+
+    assert board.port != first
+    holder.close()
+
+
+def test_a_board_that_resets_is_connected_again(board, port):
+    wait_for(port, of(RangeMeasurement))
+    board.reset()
+
+    loss = wait_for(port, of(Disconnected))
+
+    assert loss.loss in (Loss.RESET, Loss.OUT_OF_STEP)
+    wait_for(port, of(RangeMeasurement))
+
+
+def test_noise_before_the_hello_does_no_harm(board, port):
+    board.set_faults(BoardFaults(boot_noise=5000))
+    wait_for(port, of(RangeMeasurement))
+    board.reset()
+    wait_for(port, of(Disconnected))
+
+    wait_for(port, of(RangeMeasurement))
+
+    assert port.report().counts["corrupt"] > 0
+
+
+def test_a_board_that_falls_silent_is_reported_and_taken_back(board, port):
+    wait_for(port, of(RangeMeasurement))
+    board.mute(3.5)
+
+    wait_for(port, lambda event: event == Disconnected(Loss.SILENT))
+    assert port.report().problem == "waiting for the board's HELLO"
+
+    wait_for(port, of(RangeMeasurement))
+    assert port.report().problem == ""
+
+
+def test_after_a_flood_of_noise_measurements_arrive_again(board, port):
+    before = wait_for(port, of(RangeMeasurement)).sequence
+    board.flood(0.3)
+    wait_until(lambda: port.report().counts["corrupt"] > 100)
+
+    wait_for(port, lambda event: isinstance(event, RangeMeasurement) and event.sequence > before + 150)
+
+
+def test_a_board_of_another_version_is_reported(link):
+    with EmulatedBoard(link=link, faults=BoardFaults(version=3)):
+        port = BoardPort(PortAddress(str(link)))
+        wait_until(lambda: port.report().problem.endswith("another version of the protocol: 3"))
+        port.close()
+
+
+def test_through_a_channel_that_damages_loses_and_repeats_only_what_was_sent_arrives(link):
+    faults = BoardFaults(channel=ByteFaults(2e-4, 2e-4, 2e-4), lose=0.05, duplicate=0.05)
+    with EmulatedBoard(Recording(), rate_hz=1000, faults=faults, link=link, seed=4):
+        port = BoardPort(PortAddress(str(link)))
+        received = [wait_for(port, of(RangeMeasurement)) for _ in range(300)]
+        counts = port.report().counts
+        port.close()
+
+    sequences = [event.sequence for event in received]
+    assert all(event.cir.samples.tolist() == [event.sequence % 100] * 314 for event in received)
+    assert len(set(sequences)) == len(sequences)
+    assert sequences == sorted(sequences)
+    assert counts["lost"] > 0
+    assert counts["corrupt"] > 0
+    assert counts["stale"] > 0
+
+
+def test_a_port_that_is_not_there_is_reported_and_awaited(tmp_path):
+    path = tmp_path / "later"
+    port = BoardPort(PortAddress(str(path)))
+    assert port.get(0.01) is None
+    assert port.report().problem == f"{path} is not there"
+
+    with EmulatedBoard(link=path):
+        wait_for(port, of(Connected))
+        port.close()
+
+
+def test_a_file_that_is_no_port_is_reported(tmp_path):
+    path = tmp_path / "file"
+    path.write_text("no port")
+    port = BoardPort(PortAddress(str(path)))
+
+    wait_until(lambda: "cannot be opened" in port.report().problem)
+    port.close()
+
+
+def test_a_port_that_another_program_holds_is_reported(board, link):
+    with serial.Serial(str(link), exclusive=True):
+        port = BoardPort(PortAddress(str(link)))
+        wait_until(lambda: "cannot be opened" in port.report().problem)
+        port.close()
+
+
+def test_closing_ends_an_iteration_in_another_thread(port):
+    source = SerialSource("board", port)
+    records = []
+    reader = threading.Thread(target=lambda: records.extend(source))
+    reader.start()
+    wait_until(lambda: len(records) > 3)
+
+    source.close()
+    reader.join(PATIENCE_S)
+
+    assert not reader.is_alive()
+    assert all(isinstance(record, Record) for record in records)
+
+
+def test_closing_twice_does_no_harm(port):
+    port.close()
+    port.close()
+
+    assert port.get(1) is None
+
+
+def test_events_that_nobody_fetches_are_dropped_and_counted(board, link):
+    port = BoardPort(PortAddress(str(link)), capacity=5)
+    wait_until(lambda: port.report().counts["overflowed"] > 20)
+
+    left = 0
+    port.close()
+    while port.get(0) is not None:
+        left += 1
+    assert left <= 5
+
+
+def test_a_board_that_nobody_reads_loses_measurements_and_not_memory(link):
+    with EmulatedBoard(Recording(), rate_hz=5000, link=link) as board:
+        wait_until(lambda: board._board.measurements_lost > 100)
+        assert len(board._backlog) < 100_000
+
+
+def test_a_source_without_measurements_is_reported(link):
+    with EmulatedBoard(Recording(count=0), link=link) as board:
+        wait_until(lambda: board.failure is not None)
+
+    assert isinstance(board.failure, RecordingError)
+
+
+def test_the_link_to_the_port_is_not_made_over_a_file(link):
+    link.write_text("precious")
+
+    with pytest.raises(ParameterError, match="replace a file"):
+        EmulatedBoard(link=link)
+    assert link.read_text() == "precious"
+
+
+def test_closing_the_board_removes_the_link(link):
+    EmulatedBoard(link=link).close()
+
+    assert not link.is_symlink()
+
+
+@pytest.mark.parametrize(
+    ("text", "address"),
+    [
+        ("/dev/ttyACM0", PortAddress("/dev/ttyACM0")),
+        ("usb:2341:805a", PortAddress("", 0x2341, 0x805A)),
+        ("usb:2341:805A:AB:12", PortAddress("", 0x2341, 0x805A, "AB:12")),
+    ],
+)
+def test_an_address_names_a_file_or_a_usb_device(text, address):
+    assert PortAddress.parse(text) == address
+    assert PortAddress.parse(str(address)) == address
+
+
+@pytest.mark.parametrize("text", ["", "COM3", "usb:", "usb:2341", "usb:xyz:1", "usb:12345:1", "usb:-1:1"])
+def test_any_other_address_is_refused(text):
+    with pytest.raises(ParameterError, match="usb:VENDOR:PRODUCT"):
+        PortAddress.parse(text)
+
+
+def test_a_usb_device_is_found_by_its_ids_and_serial_number(monkeypatch):
+    class Info:
+        def __init__(self, device: str, vid: int | None, serial_number: str | None) -> None:
+            self.device, self.vid, self.pid, self.serial_number = device, vid, 0x805A, serial_number
+
+    ports = [
+        Info("/dev/ttyS0", None, None),
+        Info("/dev/ttyACM0", 0x2341, "A"),
+        Info("/dev/ttyACM1", 0x2341, "B"),
+    ]
+    monkeypatch.setattr("serial.tools.list_ports.comports", lambda: ports)
+
+    assert PortAddress.parse("usb:2341:805a").find() == "/dev/ttyACM0"
+    assert PortAddress.parse("usb:2341:805a:B").find() == "/dev/ttyACM1"
+    assert PortAddress.parse("usb:2341:805a:C").find() is None
