@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 import uwb_mitigation
-from uwb_mitigation.commands import console, data, model
+from uwb_mitigation.commands import console, data, link, model
 from uwb_mitigation.errors import UwbMitigationError
 
 app = typer.Typer(
@@ -20,6 +20,10 @@ app = typer.Typer(
 )
 app.add_typer(data.app, name="data")
 app.add_typer(model.app)
+bench = typer.Typer(help="Measure what the parts of the system can do.", no_args_is_help=True)
+app.add_typer(bench, name="bench")
+bench.command("link")(link.bench_link)
+app.command("emulate-board")(link.emulate_board)
 
 
 def _print_version(wanted: bool) -> None:
