@@ -64,7 +64,8 @@ def listen_to_replay(ros: Ros, count: int, *driver: str) -> tuple[list[dict], li
     listener = ros.run([sys.executable, str(HERE / "range_listener.py"), str(count)])
     listener.wait_for_output("ready")
     mitigator = ros.start("mitigator")
-    replay = ros.start("driver", *driver)
+    mitigator.wait_for_output("correcting with model")
+    replay = ros.start("driver", "wait_for_subscribers:=2", *driver)
     assert listener.wait(60) == 0, listener.output
     assert replay.wait() == 0, replay.output
     assert mitigator.signal(signal.SIGINT) == 0, mitigator.output

@@ -107,7 +107,8 @@ def watch(programme: Programme, console: Console) -> int:
     codes: dict[str, int] = {}
     try:
         wait_for_mitigator(monitor, mitigator)
-        driver = start("driver", *programme.parameters, "start_delay:=1.0")
+        # Both the mitigator and this process are to receive the first range too.
+        driver = start("driver", *programme.parameters, "wait_for_subscribers:=2", "start_delay:=1.0")
         with Live(console=console, refresh_per_second=REFRESH_HZ) as live:
             while driver.poll() is None and mitigator.poll() is None:
                 live.update(live_table(monitor.tally, programme.title))

@@ -44,10 +44,12 @@ PARAMETERS = (
               low=0.0, high=1e6),
     Parameter("publish_clock", False, "Publish the recording's time on /clock, and stamp with it. "
               "Run the other nodes with use_sim_time."),
-    Parameter("wait_for_subscriber", 10.0, "Longest wait for a first subscriber before a replay starts, s.",
+    Parameter("wait_for_subscribers", 1, "A replay waits until so many subscribe to its ranges.",
+              low=0, high=1000),
+    Parameter("longest_wait", 10.0, "A replay starts all the same after this long without them, s.",
               low=0.0, high=3600.0),
-    Parameter("start_delay", 2.0, "Pause between the first subscriber and the first measurement of a "
-              "replay, s: time for the rest of the graph to connect.", low=0.0, high=3600.0),
+    Parameter("start_delay", 3.0, "Pause before the first range of a replay once they are there, s: time "
+              "for the rest of the graph to start and connect.", low=0.0, high=3600.0),
     Parameter("frame_id", "uwb_antenna", "Frame of the receiving antenna, where the source names none."),
     Parameter("autostart", True, "Configure and activate without a lifecycle manager."),
 )  # fmt: skip
@@ -128,7 +130,7 @@ class Driver(LifecycleNode):
         assert self._source is not None
         self.get_logger().info(f"replaying {self._source.name}")
         own_clock = self._value("publish_clock")
-        self._configured_ns = time.monotonic_ns()
+        self._activated_ns = time.monotonic_ns()
         self._connected_ns: int | None = None
         self._playback = Playback(
             self._source,
@@ -181,14 +183,15 @@ class Driver(LifecycleNode):
             self.destroy_publisher(self._clock_publisher)
 
     def _is_ready(self) -> bool:
-        """True once somebody listens and the graph had time to settle, or nobody came."""
+        """True once enough others listen and the graph had time to settle, or they did not come."""
         now_ns = time.monotonic_ns()
         if self._connected_ns is None:
-            if self._ranges.get_subscription_count():
+            if self._ranges.get_subscription_count() >= self._value("wait_for_subscribers"):
                 self._connected_ns = now_ns
-            elif now_ns - self._configured_ns >= self._value("wait_for_subscriber") * 1e9:
+            elif now_ns - self._activated_ns >= self._value("longest_wait") * 1e9:
                 self.get_logger().warning(
-                    f"nobody subscribes to {self._ranges.topic_name}; playing all the same"
+                    f"{self._ranges.get_subscription_count()} subscribe to {self._ranges.topic_name} "
+                    f"instead of {self._value('wait_for_subscribers')}; playing all the same"
                 )
                 return True
             return False

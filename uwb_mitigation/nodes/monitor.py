@@ -74,7 +74,7 @@ def live_table(tally: Tally, title: str) -> Table:
     for column in (
         "anchor",
         "tag",
-        "rate Hz",
+        "Hz",
         "raw m",
         "corrected m",
         "sigma m",

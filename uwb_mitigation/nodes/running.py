@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 from collections.abc import Callable, Sequence
 
@@ -24,8 +25,9 @@ def spin(node: LifecycleNode) -> None:
         from rclpy.executors import SingleThreadedExecutor as Executor
     executor = Executor()
     executor.add_node(node)
-    while rclpy.ok():
-        executor.spin_once(timeout_sec=0.2)
+    with contextlib.suppress(ExternalShutdownException):
+        while rclpy.ok():
+            executor.spin_once(timeout_sec=0.2)
 
 
 def run(make_node: Callable[[], LifecycleNode], arguments: Sequence[str] | None = None) -> int:
@@ -38,7 +40,7 @@ def run(make_node: Callable[[], LifecycleNode], arguments: Sequence[str] | None 
     try:
         node = make_node()
         spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
+    except KeyboardInterrupt:
         pass
     except UwbMitigationError as error:
         print(f"error: {error}", file=sys.stderr)
