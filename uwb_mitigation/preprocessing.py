@@ -27,6 +27,9 @@ WINDOW_SIZES = (157, 128, 64, 32, 16, 8)
 PREAMBLE_DIVISOR = 60
 """Brings `magnitude / preamble_count` of the DW1000 to order one before the square root."""
 
+MIN_SCALE, MAX_SCALE = 1e-30, 1e30
+"""Accumulator units per count: any int16 magnitude times these is a normal float32."""
+
 SATURATED = np.iinfo(np.int16).max
 
 
@@ -46,7 +49,7 @@ class CirFault(str, enum.Enum):
 
     EMPTY = "the CIR holds no samples"
     ODD_LENGTH = "a complex CIR holds an odd number of values"
-    BAD_SCALE = "the CIR's scale is not finite and positive"
+    BAD_SCALE = "the CIR's scale is no positive number that float32 can multiply with"
     NO_FIRST_PATH = "the first-path index is not finite"
     OUTSIDE = "the window around the first path lies outside the CIR"
     ALL_ZERO = "the window holds only zeros"
@@ -88,7 +91,7 @@ class Preprocessing:
         total = len(cir.samples)
         if total == 0:
             return CirFault.EMPTY
-        if not (math.isfinite(cir.scale) and cir.scale > 0):
+        if not MIN_SCALE <= cir.scale <= MAX_SCALE:
             return CirFault.BAD_SCALE
         if not math.isfinite(cir.first_path_index):
             return CirFault.NO_FIRST_PATH
@@ -99,15 +102,16 @@ class Preprocessing:
         if start < 0 or stop > len(cir):
             return CirFault.OUTSIDE
 
-        # One reduction finds both an all-zero and a saturated window.
+        # One reduction finds both an all-zero and a saturated window, before anything can overflow.
         if cir.encoding == Encoding.COMPLEX_INT16:
             if total % 2:
                 return CirFault.ODD_LENGTH
             power = cir.samples[2 * start : 2 * stop].astype(np.int32)
             np.multiply(power, power, out=power)
             peak = math.isqrt(int(np.maximum.reduce(power)))
-            out[:] = power[0::2] + power[1::2]
-            np.sqrt(out, out=out)
+            if 0 < peak < SATURATED:
+                out[:] = power[0::2] + power[1::2]
+                np.sqrt(out, out=out)
         else:
             window = cir.samples[start:stop]
             if int(np.minimum.reduce(window)) < 0:

@@ -48,7 +48,7 @@ def train(
     first_kernel: Annotated[int, typer.Option(help="Kernel k0 of the first convolution.")] = 3,
     epochs: Annotated[int | None, typer.Option(help="Passes over the data.")] = None,
     learning_rate: Annotated[float | None, typer.Option(help="Of Adam.")] = None,
-    per_configuration: Annotated[int, typer.Option(help="Fit to at most so many of a configuration.")] = 80,
+    per_configuration: Annotated[int, typer.Option(help="Fit to at most so many of a configuration.")] = 20,
     seed: Annotated[int, typer.Option(help="Of the split, the weights and the order.")] = 0,
     folds: Annotated[int, typer.Option(help="Folds of the cross-validation.")] = 6,
     prior: Annotated[

@@ -45,7 +45,8 @@ class IntegerNetwork:
     def tensors(self, inputs: NDArray[np.float32]) -> dict[str, NDArray[np.uint8]]:
         """Every activation, {tensor: uint8 (n, channels, length)}, for inputs of shape (n, K)."""
         scale = self.weights.activation_scale
-        quotient = np.divide(inputs[:, None, :], scale["input"], dtype=np.float32)
+        with np.errstate(over="ignore"):  # An infinite quotient saturates as any other large one.
+            quotient = np.divide(inputs[:, None, :], scale["input"], dtype=np.float32)
         values = {"input": _saturate(quotient)}
         values["first"] = self.convolve("first", values["input"])
         tensor = "first"

@@ -36,13 +36,15 @@ class Session:
         binding.bind_ortvalue_input(source.name, onnxruntime.OrtValue.ortvalue_from_numpy(self._input))
         binding.bind_ortvalue_output(result.name, onnxruntime.OrtValue.ortvalue_from_numpy(self._output))
         self._binding = binding
+        # Views of the bound buffers: indexing them anew costs as much as a node of the network.
+        self._window, self._result = self._input[0, 0], self._output[0]
         self._names = ([result.name], source.name)
 
     def predict_m(self, window: NDArray[np.float32]) -> np.float32:
         """The network's output for one input, float32 (K,), m."""
-        self._input[0, 0] = window
+        self._window[:] = window
         self._session.run_with_iobinding(self._binding)
-        output: np.float32 = self._output[0, 0]
+        output: np.float32 = self._result[0]
         return output
 
     def predict_batch_m(self, windows: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -94,7 +94,7 @@ def _fit(
             loss = torch.nn.functional.l1_loss(network(source[rows]), wanted[rows])
             if not torch.isfinite(loss):
                 raise DatasetError(
-                    f"the loss is {float(loss)} in epoch {epoch}", valid="try a lower learning rate"
+                    f"the loss is {loss.item()} in epoch {epoch}", valid="try a lower learning rate"
                 )
             optimizer.zero_grad()
             loss.backward()

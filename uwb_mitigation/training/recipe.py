@@ -38,7 +38,7 @@ class Recipe:
     architecture: Remnet
     fit: FitOptions
     line: bool = True
-    per_configuration: int = 80
+    per_configuration: int = 20
 
 
 @dataclass(frozen=True, slots=True, eq=False)

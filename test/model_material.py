@@ -1,0 +1,127 @@
+"""Networks, bundles and measurements that tests of the model are made of; all seeded."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from uwb_mitigation.dataset import Dataset
+from uwb_mitigation.measurement import Cir, RangeMeasurement, Truth
+from uwb_mitigation.model import graph
+from uwb_mitigation.model.architecture import HEAD, Remnet
+from uwb_mitigation.model.bundle import Bundle, Card, save_bundle
+from uwb_mitigation.model.prior import LinePrior
+from uwb_mitigation.model.weights import FloatWeights, Int8Weights
+from uwb_mitigation.preprocessing import Preprocessing, Scaling
+from uwb_mitigation.sources.source import Record
+from uwb_mitigation.training.quantization import quantize
+
+LINE = LinePrior(*(float(np.float32(value)) for value in (-5.0, -0.0691, -0.0126)))
+
+
+def random_weights(architecture: Remnet, seed: int = 0) -> FloatWeights:
+    """Weights of a freshly initialised network, with biases and a head that are not zero."""
+    generator = np.random.default_rng(seed)
+    weight, bias = {}, {}
+    for layer in architecture.convolutions:
+        spread = math.sqrt(2 / (layer.inputs * layer.kernel))
+        shape = (layer.filters, layer.inputs, layer.kernel)
+        weight[layer.name] = generator.normal(0, spread, shape).astype(np.float32)
+        bias[layer.name] = generator.normal(0, 0.1, layer.filters).astype(np.float32)
+    weight[HEAD] = generator.normal(0, 0.02, (architecture.features, 1)).astype(np.float32)
+    bias[HEAD] = generator.normal(0, 0.1, 1).astype(np.float32)
+    return FloatWeights(architecture, weight, bias)
+
+
+def windows(count: int, samples: int, seed: int = 0) -> np.ndarray:
+    """Network inputs with the level and the decay of real ones, float32 (count, samples)."""
+    generator = np.random.default_rng(seed)
+    decay = 0.1 + np.exp(-np.arange(samples) / 12)
+    return (generator.gamma(2.0, 0.3, (count, samples)) * decay).astype(np.float32)
+
+
+def random_int8(architecture: Remnet, seed: int = 0) -> Int8Weights:
+    """A quantised network; its scales are not those that the firmware needs."""
+    weights = random_weights(architecture, seed)
+    return quantize(weights, windows(64, architecture.samples, seed), exact=False)
+
+
+def card(architecture: Remnet, *, quantised: bool = True, **changes: object) -> Card:
+    options: dict[str, object] = {
+        "name": "material",
+        "architecture": architecture,
+        "preprocessing": Preprocessing(architecture.samples, Scaling.PREAMBLE),
+        "prior": LINE,
+        "quantised": quantised,
+        "variance_m2": 0.0625,
+        "variance_uncorrected_m2": 0.5,
+        "correction_limits_m": (-4.0, 8.0),
+        "training": {"data": "none"},
+    }
+    return Card(**(options | changes))  # type: ignore[arg-type]
+
+
+def bundle(folder: Path, architecture: Remnet | None = None, *, seed: int = 0, **changes: object) -> Bundle:
+    """An int8 bundle of random weights in `folder`."""
+    architecture = architecture or Remnet(samples=32)
+    model = graph.int8_model(random_int8(architecture, seed))
+    return save_bundle(folder / "material.onnx", model, card(architecture, **changes))
+
+
+def cir(seed: int = 0, **changes: object) -> Cir:
+    """A complex CIR of 1016 samples with its first path at 745.3."""
+    generator = np.random.default_rng(seed)
+    samples = generator.normal(0, 60, 2 * 1016)
+    samples[2 * 745 : 2 * 785] += generator.normal(0, 2500, 80)
+    options: dict[str, object] = {
+        "samples": samples.clip(-30000, 30000).astype(np.int16),
+        "first_path_index": 745.3125,
+        "preamble_count": 300,
+        "noise_threshold": 1500,
+        "rx_power_dbm": -82.0,
+        "first_path_power_dbm": -88.0,
+        "channel": 2,
+        "prf_mhz": 64,
+    }
+    return Cir(**(options | changes))  # type: ignore[arg-type]
+
+
+def measurement(range_m: float = 3.0, seed: int = 0, **changes: object) -> RangeMeasurement:
+    """A measurement; `changes` are of its CIR."""
+    return RangeMeasurement(
+        stamp_ns=seed,
+        tag_id=1,
+        anchor_id=2,
+        sequence=seed,
+        device_time=seed,
+        range_m=range_m,
+        cir=cir(seed, **changes),
+    )
+
+
+def record(seed: int = 0, configuration: str = "1", **changes: object) -> Record:
+    """A measurement that errs by 0.25 m."""
+    return Record(measurement(3.25, seed, **changes), Truth(3.0, "LOS", configuration))
+
+
+def dataset(configurations: int = 12, each: int = 20, samples: int = 32, seed: int = 0) -> Dataset:
+    """A synthetic dataset: the error is a line in the powers plus the level of the first inputs."""
+    generator = np.random.default_rng(seed)
+    count = configurations * each
+    names = np.repeat([f"c{number}" for number in range(configurations)], each)
+    rx_power = np.repeat(generator.uniform(-95, -78, configurations), each) + generator.normal(0, 0.2, count)
+    gap = np.repeat(generator.uniform(3, 15, configurations), each) + generator.normal(0, 0.2, count)
+    inputs = windows(count, samples, seed)
+    error = -5.1 - 0.069 * rx_power - 0.0126 * gap + 0.3 * inputs[:, :6].mean(axis=1)
+    return Dataset(
+        Preprocessing(samples),
+        inputs,
+        rx_power.astype(np.float32),
+        (rx_power - gap).astype(np.float32),
+        3.0 + error,
+        error,
+        names,
+        np.where(error > 0.5, "NLOS", "LOS"),
+    )

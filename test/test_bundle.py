@@ -1,0 +1,260 @@
+"""Bundles: what is written reads back to the bit, and nothing damaged or foreign loads."""
+
+from __future__ import annotations
+
+import json
+import random
+import zlib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+from model_material import LINE, bundle, card, random_int8, random_weights
+from onnx import TensorProto, helper
+
+from uwb_mitigation.errors import ModelError
+from uwb_mitigation.model import bundle as bundles
+from uwb_mitigation.model import graph
+from uwb_mitigation.model.architecture import Remnet
+from uwb_mitigation.model.bundle import METADATA_KEY, assemble_bundle, load_bundle, parse_bundle, save_bundle
+from uwb_mitigation.model.prior import LinePrior
+from uwb_mitigation.preprocessing import Preprocessing, Scaling
+
+SHAPE = Remnet(samples=16, filters=4)
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory) -> bundles.Bundle:
+    return bundle(tmp_path_factory.mktemp("bundle"), SHAPE)
+
+
+def refusal(data: bytes) -> str:
+    with pytest.raises(ModelError) as caught:
+        parse_bundle(data, Path("some.onnx"))
+    assert caught.value.where == "some.onnx"
+    return str(caught.value)
+
+
+def with_metadata(data: bytes, change) -> bytes:
+    """A bundle whose metadata was changed and whose checksum was made to fit."""
+    model = onnx.load_model_from_string(data)
+    metadata = json.loads(model.metadata_props[0].value)
+    change(metadata)
+    metadata["model_id"] = "00000000"
+    model.metadata_props[0].value = json.dumps(metadata, sort_keys=True, separators=(",", ":"))
+    return sealed(model)
+
+
+def sealed(model: onnx.ModelProto) -> bytes:
+    data = model.SerializeToString()
+    start = data.index(b'"model_id":"') + len(b'"model_id":"')
+    blank = data[:start] + b"00000000" + data[start + 8 :]
+    return data[:start] + b"%08x" % zlib.crc32(blank) + data[start + 8 :]
+
+
+def test_what_is_saved_is_what_loads(saved):
+    loaded = load_bundle(saved.path)
+    assert loaded.card == saved.card
+    assert loaded.model_id == saved.model_id
+    assert loaded.model == saved.path.read_bytes()
+
+
+def test_float32_numbers_read_back_to_the_bit(tmp_path):
+    awkward = [float(np.float32(value)) for value in (0.1, -1e-7, 1 / 3)]
+    written = bundle(tmp_path, SHAPE, prior=LinePrior(*awkward), variance_m2=float(np.float32(0.3)))
+    loaded = load_bundle(written.path)
+    assert loaded.prior == LinePrior(*awkward)
+    assert loaded.card.variance_m2 == float(np.float32(0.3))
+
+
+def test_the_same_model_has_the_same_id():
+    first, second = (assemble_bundle(graph.int8_model(random_int8(SHAPE)), card(SHAPE)) for _ in range(2))
+    assert first == second
+
+
+def test_another_model_has_another_id(saved, tmp_path):
+    assert bundle(tmp_path, SHAPE, seed=1).model_id != saved.model_id
+
+
+def test_the_id_is_the_checksum_of_the_file_with_the_id_blank(saved):
+    data = saved.model.replace(b"%08x" % saved.model_id, b"00000000")
+    assert zlib.crc32(data) == saved.model_id
+
+
+def test_onnx_reads_the_file(saved):
+    onnx.checker.check_model(onnx.load_model_from_string(saved.model), full_check=True)
+
+
+def test_any_changed_byte_is_found(saved):
+    generator = random.Random(1)
+    for _ in range(400):
+        position = generator.randrange(len(saved.model))
+        damaged = bytearray(saved.model)
+        damaged[position] ^= 1 << generator.randrange(8)
+        refusal(bytes(damaged))
+
+
+def test_any_truncation_is_found(saved):
+    for length in range(0, len(saved.model), 97):
+        if length:
+            refusal(saved.model[:length])
+
+
+def test_damage_is_called_damage(saved):
+    damaged = bytearray(saved.model)
+    damaged[200] ^= 1
+    assert "is damaged: its checksum is" in refusal(bytes(damaged))
+
+
+def test_random_bytes_are_refused():
+    generator = random.Random(2)
+    for length in (1, 10, 1000):
+        refusal(generator.randbytes(length))
+
+
+def test_an_absent_file_is_named(tmp_path):
+    with pytest.raises(ModelError, match=r"nowhere\.onnx: no such model file"):
+        load_bundle(tmp_path / "nowhere.onnx")
+
+
+def test_a_folder_is_no_model(tmp_path):
+    with pytest.raises(ModelError, match="no such model file"):
+        load_bundle(tmp_path)
+
+
+def test_an_empty_file_is_refused(tmp_path):
+    (tmp_path / "empty.onnx").touch()
+    with pytest.raises(ModelError, match="is empty"):
+        load_bundle(tmp_path / "empty.onnx")
+
+
+def test_a_huge_file_is_refused_without_reading_it_whole(tmp_path):
+    path = tmp_path / "huge.onnx"
+    with path.open("wb") as file:
+        file.truncate(1 << 40)
+    with pytest.raises(ModelError, match="more than 67108864 bytes"):
+        load_bundle(path)
+
+
+def test_a_foreign_model_is_refused(saved):
+    foreign = onnx.load_model_from_string(saved.model)
+    del foreign.metadata_props[:]
+    assert f"without the metadata '{METADATA_KEY}'" in refusal(foreign.SerializeToString())
+
+
+def test_a_foreign_operator_is_refused(saved):
+    model = onnx.load_model_from_string(saved.model)
+    model.graph.node.append(helper.make_node("Loop", ["a"], ["b"]))
+    assert "operators that no model of ours has: ['Loop']" in refusal(sealed(model))
+
+
+def test_an_operator_of_another_domain_is_refused(saved):
+    model = onnx.load_model_from_string(saved.model)
+    model.graph.node[0].domain = "evil"
+    assert "['evil." in refusal(sealed(model))
+
+
+def test_external_data_is_refused(saved):
+    model = onnx.load_model_from_string(saved.model)
+    tensor = model.graph.initializer[0]
+    tensor.data_location = TensorProto.EXTERNAL
+    tensor.external_data.add(key="location", value="/etc/passwd")
+    assert "lies in another file" in refusal(sealed(model))
+
+
+def test_a_tensor_hidden_in_an_attribute_is_refused(saved):
+    model = onnx.load_model_from_string(saved.model)
+    value = helper.make_tensor("x", TensorProto.FLOAT, [1], [0.0])
+    model.graph.node[0].attribute.append(helper.make_attribute("value", value))
+    assert "a tensor or a graph of its own" in refusal(sealed(model))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda m: m.update(format=2), "metadata format 2 (1)"),
+        (lambda m: m.pop("prior"), "bad metadata: no 'prior'"),
+        (lambda m: m["preprocessing"].update(scaling="log"), "'log' is not a valid Scaling"),
+        (lambda m: m["preprocessing"].update(samples=32), "the preprocessing makes 32"),
+        (lambda m: m["architecture"].update(samples="16"), "'16' is not an integer"),
+        (lambda m: m["architecture"].update(samples=10**9), "1 to 1016"),
+        (lambda m: m["architecture"].update(depth=1), "bad metadata"),
+        (lambda m: m["architecture"].update(filters=8), "layer first has weights of shape"),
+        (lambda m: m["prior"].update(offset_m=0.1), "is no float32 value"),
+        (lambda m: m["prior"].update(offset_m=1e400), "offset_m = inf"),
+        (lambda m: m.update(variance_m2=-1), "a positive number"),
+        (lambda m: m.update(correction_limits_m=[1, 0]), "low, high"),
+        (lambda m: m.update(correction_limits_m=[1]), "bad metadata"),
+        (lambda m: m.update(quantised=False), "the graph disagrees"),
+        (lambda m: m.update(training=3), "bad metadata"),
+    ],
+)
+def test_metadata_that_cannot_be_is_refused(saved, change, message):
+    assert message in refusal(with_metadata(saved.model, change))
+
+
+def test_another_window_than_the_graphs_is_refused(saved):
+    def change(metadata):
+        metadata["architecture"]["samples"] = metadata["preprocessing"]["samples"] = 32
+
+    message = refusal(with_metadata(saved.model, change))
+    assert "inputs of shape (0, 1, 16), the metadata promises K = 32" in message
+
+
+def test_metadata_that_is_no_json_is_refused(saved):
+    model = onnx.load_model_from_string(saved.model)
+    model.metadata_props[0].value = '{"model_id":"00000000"'
+    assert "bad metadata" in refusal(sealed(model))
+
+
+def test_deeply_nested_metadata_is_refused(saved):
+    model = onnx.load_model_from_string(saved.model)
+    model.metadata_props[0].value = '{"model_id":"00000000","a":' + "[" * 100_000
+    assert "bad metadata" in refusal(sealed(model))
+
+
+def test_without_a_prior_the_network_predicts_alone(saved):
+    data = with_metadata(saved.model, lambda metadata: metadata.update(prior=None))
+    loaded = parse_bundle(data, Path("some.onnx"))
+    assert loaded.prior == LinePrior(0.0)
+    assert not loaded.prior.needs_power
+
+
+def test_a_card_that_does_not_fit_its_graph_is_not_written(tmp_path):
+    path = tmp_path / "wrong.onnx"
+    with pytest.raises(ModelError, match="the graph disagrees"):
+        save_bundle(path, graph.float_model(random_weights(SHAPE)), card(SHAPE))
+    assert not path.exists()
+
+
+def test_window_and_network_must_agree():
+    with pytest.raises(ModelError, match="the network reads 16 samples, the preprocessing makes 32"):
+        replace(card(SHAPE), preprocessing=Preprocessing(32, Scaling.MAX))
+
+
+def test_weights_read_back_from_either_graph():
+    floats, integers = random_weights(SHAPE), random_int8(SHAPE)
+    read = graph.float_weights(graph.float_model(floats), SHAPE)
+    assert all(np.array_equal(read.weight[name], floats.weight[name]) for name in floats.weight)
+    again = graph.int8_weights(graph.int8_model(integers), SHAPE)
+    assert all(np.array_equal(again.weight[name], integers.weight[name]) for name in integers.weight)
+    assert all(np.array_equal(again.bias[name], integers.bias[name]) for name in integers.bias)
+    assert dict(again.activation_scale) == dict(integers.activation_scale)
+
+
+def test_integers_are_not_read_from_a_float_graph():
+    with pytest.raises(ModelError, match="float32"):
+        graph.int8_weights(graph.float_model(random_weights(SHAPE)), SHAPE)
+
+
+def test_the_prior_is_the_same_one_by_one_and_in_batches():
+    generator = np.random.default_rng(0)
+    rx = generator.uniform(-100, -70, 500).astype(np.float32)
+    first = (rx - generator.uniform(0, 20, 500)).astype(np.float32)
+    first[3], rx[4] = np.nan, np.inf
+    batch = LINE.predict_batch_m(rx, first)
+    single = np.array([LINE.predict_m(*pair) for pair in zip(rx, first, strict=True)], np.float32)
+    assert np.array_equal(batch, single, equal_nan=True)
+    assert np.isnan(batch[[3, 4]]).all()

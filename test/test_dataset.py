@@ -1,0 +1,108 @@
+"""Datasets: what is kept, what is left out and counted, and splits that share no configuration."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from model_material import dataset, record
+
+from uwb_mitigation.dataset import build_dataset
+from uwb_mitigation.errors import DatasetError, ParameterError
+from uwb_mitigation.evaluation import splits
+from uwb_mitigation.measurement import Truth
+from uwb_mitigation.preprocessing import CirFault, Preprocessing
+
+
+def test_a_record_becomes_a_row():
+    records = [record(seed, f"c{seed}") for seed in range(3)]
+    built = build_dataset(records, Preprocessing(157))
+    expected = np.empty(157, np.float32)
+    Preprocessing(157).apply(records[1].measurement.cir, expected)
+    assert np.array_equal(built.inputs[1], expected)
+    assert built.error_m.tolist() == [0.25] * 3
+    assert built.rx_power_dbm.tolist() == [-82.0] * 3
+    assert built.first_path_power_dbm.tolist() == [-88.0] * 3
+    assert built.configurations.tolist() == ["c0", "c1", "c2"]
+    assert built.labels.tolist() == ["LOS"] * 3
+
+
+def test_what_is_left_out_is_counted_by_reason():
+    records = [
+        record(),
+        replace(record(), truth=None),
+        replace(record(), truth=Truth(math.nan)),
+        replace(record(), measurement=replace(record().measurement, range_m=math.nan)),
+        record(preamble_count=0),
+        record(samples=np.zeros(0, np.int16)),
+    ]
+    assert build_dataset(records, Preprocessing(157)).refused == {
+        "no true range": 2,
+        "no valid range": 1,
+        CirFault.NO_PREAMBLE_COUNT.value: 1,
+        CirFault.EMPTY.value: 1,
+    }
+
+
+def test_a_power_that_is_not_finite_is_unknown():
+    built = build_dataset([record(rx_power_dbm=-math.inf)], Preprocessing(157))
+    assert np.isnan(built.rx_power_dbm).all()
+
+
+def test_nothing_usable_is_an_error_that_says_why():
+    with pytest.raises(DatasetError, match="1 x no true range"):
+        build_dataset([replace(record(), truth=None)], Preprocessing(157))
+    with pytest.raises(DatasetError, match="no measurements"):
+        build_dataset([], Preprocessing(157))
+
+
+def test_rows_picks_from_every_array():
+    whole = dataset(3, 4)
+    part = whole.rows(np.array([1, 5]))
+    assert part.configurations.tolist() == ["c0", "c1"]
+    assert np.array_equal(part.inputs, whole.inputs[[1, 5]])
+    assert len(part) == 2
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    names=st.lists(st.sampled_from("abcdefgh"), min_size=4, max_size=80),
+    folds=st.integers(2, 8),
+    seed=st.integers(0, 1000),
+)
+def test_no_configuration_is_on_both_sides_and_each_is_tested_once(names, folds, seed):
+    configurations = np.array(names)
+    if len(set(names)) < folds:
+        with pytest.raises(DatasetError):
+            splits.by_configuration(configurations, folds, seed)
+        return
+    parts = splits.by_configuration(configurations, folds, seed)
+    for part in parts:
+        assert not set(configurations[part.train]) & set(configurations[part.test])
+        assert len(part.train) + len(part.test) == len(names)
+    tested = np.concatenate([part.test for part in parts])
+    assert np.array_equal(np.sort(tested), np.arange(len(names)))
+
+
+def test_a_split_depends_on_the_seed_alone():
+    names = dataset(12, 2).configurations
+    first, again, other = (splits.by_configuration(names, 4, seed)[0].test for seed in (1, 1, 2))
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first, other)
+
+
+def test_one_fold_is_no_split():
+    with pytest.raises(ParameterError, match="at least 2"):
+        splits.by_configuration(np.array(["a", "b"]), 1, 0)
+
+
+def test_thinning_leaves_at_most_so_many_of_each():
+    names = np.array(["a"] * 50 + ["b"] * 3)
+    rows = splits.thinned(names, 10, 0)
+    assert np.count_nonzero(names[rows] == "a") == 10
+    assert np.count_nonzero(names[rows] == "b") == 3
+    assert (np.diff(rows) > 0).all()

@@ -1,0 +1,172 @@
+"""Metrics, and the commands train, quantize and evaluate from data to result."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from model_material import bundle, record
+from typer.testing import CliRunner
+
+from uwb_mitigation.cli import app
+from uwb_mitigation.errors import DatasetError, MissingDependencyError, ModelError, ParameterError
+from uwb_mitigation.evaluation.metrics import ErrorStatistics, coverage, mae_by_group
+from uwb_mitigation.evaluation.outcome import evaluate
+from uwb_mitigation.mitigation import Mitigation
+from uwb_mitigation.model.architecture import Remnet
+from uwb_mitigation.model.bundle import load_bundle
+from uwb_mitigation.model.shipped import default_model_path
+from uwb_mitigation.sources import opening
+
+
+def run(*arguments: object):
+    return CliRunner().invoke(app, [str(value) for value in arguments], catch_exceptions=True)
+
+
+class Recorded:
+    """A source of records made here."""
+
+    def __init__(self, records):
+        self.records = records
+
+    def __iter__(self):
+        return iter(self.records)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        return None
+
+
+@pytest.fixture
+def recording(monkeypatch):
+    records = [
+        record(10 * place + number, f"c{place}", rx_power_dbm=-78.0 - place)
+        for place in range(8)
+        for number in range(6)
+    ]
+    records = [
+        replace(item, truth=replace(item.truth, label="NLOS" if index >= 24 else "LOS"))
+        for index, item in enumerate(records)
+    ]
+    monkeypatch.setattr(opening, "open_recording", lambda path: Recorded(records))
+    return records
+
+
+def test_statistics_of_known_errors():
+    found = ErrorStatistics.of(np.array([1.0, -1.0, 3.0, -3.0]))
+    assert found.mae == 2.0
+    assert found.std == pytest.approx(np.sqrt(5.0))
+    assert found.p95 == pytest.approx(3.0)
+
+
+@pytest.mark.parametrize("errors", [[], [np.nan], [1.0, np.inf]])
+def test_statistics_of_nothing_are_refused(errors):
+    with pytest.raises(DatasetError):
+        ErrorStatistics.of(np.array(errors))
+
+
+def test_groups_are_told_apart():
+    groups = mae_by_group(np.array(["b", "a", "b"]), np.array([1.0, 2.0, -3.0]), np.array([0.5, 0.0, 0.5]))
+    assert groups == {"b": (2, 2.0, 0.5), "a": (1, 2.0, 0.0)}
+
+
+def test_coverage_counts_errors_within_the_deviations():
+    assert coverage(np.array([0.5, -1.5, 0.9, 4.0]), 1.0, 1.0) == 0.5
+
+
+def test_evaluation_is_the_live_path(tmp_path, recording):
+    mitigation = Mitigation(bundle(tmp_path, Remnet(samples=157)))
+    outcome = evaluate(mitigation, recording)
+    left = [mitigation.correct(item.measurement).range_m - item.truth.range_m for item in recording]
+    assert outcome.n == 48
+    assert outcome.raw.mae == 0.25
+    assert outcome.corrected.mae == pytest.approx(np.abs(left).mean())
+    assert outcome.statuses == {"OK": 48}
+
+
+def test_a_range_passed_through_counts_as_it_is(tmp_path):
+    mitigation = Mitigation(bundle(tmp_path, Remnet(samples=157)))
+    outcome = evaluate(mitigation, [record(preamble_count=0)])
+    assert outcome.corrected.mae == 0.25
+    assert outcome.statuses == {"BAD_CIR": 1}
+
+
+def test_what_has_no_truth_or_no_range_is_left_out(tmp_path):
+    mitigation = Mitigation(bundle(tmp_path, Remnet(samples=157)))
+    without_range = replace(record(), measurement=replace(record().measurement, range_m=np.nan))
+    assert evaluate(mitigation, [record(), replace(record(), truth=None), without_range]).n == 1
+    with pytest.raises(DatasetError, match="none of 1 measurements"):
+        evaluate(mitigation, [replace(record(), truth=None)])
+
+
+def test_evaluate_writes_the_documented_keys(tmp_path, recording):
+    saved = bundle(tmp_path, Remnet(samples=157))
+    result = run("evaluate", "--data", "any", "--model", saved.path, "--json", tmp_path / "e.json")
+    assert result.exit_code == 0, result.output
+    found = json.loads((tmp_path / "e.json").read_text())
+    assert found["n"] == 48
+    for part in ("raw", "corrected"):
+        assert set(found[part]) == {"mae", "std", "p95"}
+    assert set(found["by_label"]) == {"LOS", "NLOS"}
+    assert set(found["by_label"]["LOS"]) == {"n", "raw_mae", "corrected_mae"}
+    assert found["model_id"] == saved.model_id
+
+
+def test_train_quantize_evaluate_from_end_to_end(tmp_path, recording):
+    pytest.importorskip("torch", reason="run `make setup-training`")
+    floats, integers = tmp_path / "float.onnx", tmp_path / "int8.onnx"
+    result = run(
+        "train", "--data", "any", "-o", floats, "--samples", 8, "--epochs", 1, "--folds", 2,
+        "--json", tmp_path / "t.json",
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    names = [row["name"] for row in json.loads((tmp_path / "t.json").read_text())["rows"]]
+    assert names == ["raw", "overall_median", "l1_line", "float", "int8"]
+    assert run("quantize", floats, "--data", "any", "-o", integers).exit_code == 0
+    assert load_bundle(integers).quantised
+    assert load_bundle(integers).prior == load_bundle(floats).prior
+    assert run("evaluate", "--data", "any", "--model", integers).exit_code == 0
+
+
+def test_train_without_a_prior_leaves_all_to_the_network(tmp_path, recording):
+    pytest.importorskip("torch", reason="run `make setup-training`")
+    path = tmp_path / "alone.onnx"
+    result = run(
+        "train", "--data", "any", "-o", path, "--samples", 8, "--epochs", 1, "--folds", 2, "--no-prior"
+    )
+    assert result.exit_code == 0, result.output
+    assert not load_bundle(path).prior.needs_power
+
+
+def test_train_without_torch_says_how_to_install_it(tmp_path, recording, monkeypatch):
+    for name in [name for name in sys.modules if name.startswith("uwb_mitigation.training")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "torch", None)
+    result = run("train", "--data", "any", "-o", tmp_path / "x.onnx")
+    assert isinstance(result.exception, MissingDependencyError)
+    assert "make setup-training" in str(result.exception)
+
+
+def test_an_int8_bundle_is_not_quantised_again(tmp_path, recording):
+    saved = bundle(tmp_path)
+    result = run("quantize", saved.path, "--data", "any", "-o", tmp_path / "y.onnx")
+    assert isinstance(result.exception, ModelError)
+
+
+@pytest.mark.parametrize("output", ["nowhere/x.onnx", "x.txt", "."])
+def test_a_place_that_cannot_be_written_is_refused_before_training(tmp_path, recording, output):
+    result = run("train", "--data", "any", "-o", tmp_path / output)
+    assert isinstance(result.exception, ParameterError)
+
+
+def test_the_shipped_model_takes_the_error_of_the_real_logs_down(apartment):
+    shipped = load_bundle(default_model_path())
+    with opening.open_recording(apartment) as source:
+        records = [item for _, item in zip(range(400), source, strict=False)]
+    outcome = evaluate(Mitigation(shipped), records)
+    assert outcome.corrected.mae < 0.6 * outcome.raw.mae

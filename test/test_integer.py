@@ -1,0 +1,88 @@
+"""The integer reference and ONNX Runtime agree on every bit, on every size, on every kind of input."""
+
+from __future__ import annotations
+
+import numpy as np
+import onnxruntime
+import pytest
+from model_material import bundle, card, random_int8, random_weights, windows
+
+from uwb_mitigation.errors import ModelError
+from uwb_mitigation.model import graph
+from uwb_mitigation.model.architecture import Remnet
+from uwb_mitigation.model.bundle import load_bundle, save_bundle
+from uwb_mitigation.model.integer import IntegerNetwork
+from uwb_mitigation.model.session import Session, session_options
+from uwb_mitigation.model.shipped import default_model_path
+
+
+def hostile_inputs(samples: int, seed: int) -> np.ndarray:
+    """Plausible, flat, saturating, sparse, tiny, zero and huge windows."""
+    generator = np.random.default_rng(seed)
+    sparse = generator.random((60, samples)) * (generator.random((60, samples)) < 0.05)
+    rows = [
+        windows(200, samples, seed),
+        generator.random((60, samples)),
+        generator.random((60, samples)) * 50,
+        sparse * 20,
+        generator.random((20, samples)) * 1e-3,
+        np.zeros((1, samples)),
+        np.full((1, samples), 3e38),
+        np.tile([0.0, 1e9], (1, samples))[:, :samples],
+    ]
+    return np.concatenate(rows).astype(np.float32)
+
+
+@pytest.mark.parametrize("first_kernel", [3, 5])
+@pytest.mark.parametrize("samples", [157, 128, 64, 32, 16, 8])
+def test_it_equals_onnx_runtime(samples, first_kernel):
+    shape = Remnet(samples=samples, first_kernel=first_kernel)
+    weights = random_int8(shape, seed=samples)
+    inputs = hostile_inputs(samples, seed=first_kernel)
+    runtime = onnxruntime.InferenceSession(
+        graph.int8_model(weights), session_options(), providers=["CPUExecutionProvider"]
+    )
+    computed = runtime.run(None, {"cir": inputs[:, None, :]})[0][:, 0]
+    assert np.array_equal(computed, IntegerNetwork(weights).predict_m(inputs))
+
+
+def test_the_shipped_network_equals_onnx_runtime():
+    shipped = load_bundle(default_model_path())
+    session, reference = Session(shipped), IntegerNetwork.from_bundle(shipped)
+    inputs = np.concatenate([windows(1500, 157, 4), hostile_inputs(157, 5)])
+    expected = reference.predict_m(inputs)
+    assert np.array_equal(session.predict_batch_m(inputs), expected)
+    single = np.array([session.predict_m(row) for row in inputs[-500:]], np.float32)
+    assert np.array_equal(single, expected[-500:])
+
+
+def test_it_saturates_and_never_wraps():
+    weights = random_int8(Remnet(samples=16))
+    tensors = IntegerNetwork(weights).tensors(np.full((1, 16), 1e30, np.float32))
+    assert tensors["input"].min() == 255
+    assert max(int(values.max()) for values in tensors.values()) == 255
+
+
+def test_padding_is_a_literal_zero():
+    weights = random_int8(Remnet(samples=16))
+    network = IntegerNetwork(weights)
+    values = np.zeros((1, 1, 16), np.uint8)
+    values[0, 0, 0] = 7
+    first = network.accumulate("first", values)[0, :, 0]
+    kernel = weights.weight["first"][:, 0, :].astype(int)
+    assert np.array_equal(first, 7 * kernel[:, 1] + weights.bias["first"])
+
+
+def test_a_float_bundle_has_no_integers(tmp_path):
+    shape = Remnet(samples=8)
+    model = graph.float_model(random_weights(shape))
+    saved = save_bundle(tmp_path / "float.onnx", model, card(shape, quantised=False))
+    with pytest.raises(ModelError, match="an int8 bundle"):
+        IntegerNetwork.from_bundle(saved)
+
+
+def test_it_reads_what_a_bundle_holds(tmp_path):
+    saved = bundle(tmp_path, Remnet(samples=8), seed=3)
+    inputs = windows(20, 8)
+    expected = IntegerNetwork(random_int8(Remnet(samples=8), seed=3)).predict_m(inputs)
+    assert np.array_equal(IntegerNetwork.from_bundle(saved).predict_m(inputs), expected)

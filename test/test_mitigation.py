@@ -1,0 +1,139 @@
+"""Mitigation: what a consumer gets for good measurements and for bad ones."""
+
+from __future__ import annotations
+
+import math
+import warnings
+
+import numpy as np
+import pytest
+from model_material import LINE, bundle, measurement
+
+from uwb_mitigation.measurement import Encoding, Origin, Status
+from uwb_mitigation.mitigation import Mitigation
+from uwb_mitigation.model.architecture import Remnet
+from uwb_mitigation.model.prior import LinePrior
+from uwb_mitigation.preprocessing import Preprocessing
+
+
+@pytest.fixture(scope="module")
+def mitigation(tmp_path_factory) -> Mitigation:
+    return Mitigation(bundle(tmp_path_factory.mktemp("bundle"), Remnet(samples=157)))
+
+
+@pytest.fixture(autouse=True)
+def _no_warnings():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        yield
+
+
+BAD = [
+    ({"samples": np.zeros(0, np.int16)}, 3.0, Status.NO_CIR),
+    ({"samples": np.zeros(2032, np.int16)}, 3.0, Status.BAD_CIR),
+    ({"samples": np.full(2032, -32768, np.int16)}, 3.0, Status.BAD_CIR),
+    ({"samples": np.ones(20, np.int16)}, 3.0, Status.BAD_CIR),
+    ({"encoding": Encoding.MAGNITUDE}, 3.0, Status.BAD_CIR),
+    ({"first_path_index": math.nan}, 3.0, Status.BAD_CIR),
+    ({"preamble_count": 0}, 3.0, Status.BAD_CIR),
+    ({"rx_power_dbm": math.nan}, 3.0, Status.BAD_CIR),
+    ({"rx_power_dbm": -math.inf}, 3.0, Status.BAD_CIR),
+    ({"first_path_power_dbm": math.nan}, 3.0, Status.BAD_CIR),
+    ({"first_path_power_dbm": 1e300}, 3.0, Status.BAD_CIR),
+    ({"rx_power_dbm": 300.0}, 3.0, Status.OUT_OF_DISTRIBUTION),
+    ({}, math.nan, Status.OUT_OF_DISTRIBUTION),
+    ({}, math.inf, Status.OUT_OF_DISTRIBUTION),
+    ({}, -math.inf, Status.OUT_OF_DISTRIBUTION),
+    ({}, -0.5, Status.OUT_OF_DISTRIBUTION),
+    ({}, 1e300, Status.OUT_OF_DISTRIBUTION),
+    ({"samples": np.zeros(0, np.int16)}, math.nan, Status.NO_CIR),
+]
+
+
+def test_the_correction_is_prior_plus_network_in_float32(mitigation):
+    subject = measurement(3.1)
+    window = np.empty(157, np.float32)
+    assert Preprocessing(157).apply(subject.cir, window) is None
+    predicted = LINE.predict_m(-82.0, -88.0) + mitigation._session.predict_m(window)
+    result = mitigation.correct(subject)
+    assert result.status is Status.OK
+    assert result.correction_m == float(predicted)
+    assert result.range_m == float(np.float32(3.1) - predicted)
+    assert result.range_raw_m == 3.1
+    assert result.variance_m2 == 0.0625
+    assert result.origin is Origin.HOST
+    assert result.model_id == mitigation.bundle.model_id
+
+
+@pytest.mark.parametrize(("changes", "range_m", "status"), BAD)
+def test_a_bad_measurement_passes_through(mitigation, changes, range_m, status):
+    result = mitigation.correct(measurement(range_m, **changes))
+    assert result.status is status
+    assert result.range_m == range_m or math.isnan(range_m)
+    assert math.isnan(result.range_m) == math.isnan(range_m)
+    assert result.correction_m == 0.0
+
+
+def test_a_valid_range_passes_through_with_the_variance_of_raw_ranges(mitigation):
+    assert mitigation.correct(measurement(preamble_count=0)).variance_m2 == 0.5
+
+
+@pytest.mark.parametrize("range_m", [math.nan, math.inf, -1.0])
+def test_an_invalid_range_has_infinite_variance(mitigation, range_m):
+    assert mitigation.correct(measurement(range_m)).variance_m2 == math.inf
+
+
+def test_a_range_of_zero_is_corrected(mitigation):
+    assert mitigation.correct(measurement(0.0)).status is Status.OK
+
+
+def test_a_constant_prior_needs_no_power(tmp_path):
+    subject = Mitigation(bundle(tmp_path, Remnet(samples=157), prior=LinePrior(0.25)))
+    result = subject.correct(measurement(rx_power_dbm=math.nan, first_path_power_dbm=math.nan))
+    assert result.status is Status.OK
+
+
+def test_a_prediction_beyond_the_limits_is_out_of_distribution(tmp_path):
+    subject = Mitigation(bundle(tmp_path, Remnet(samples=157), correction_limits_m=(50.0, 60.0)))
+    result = subject.correct(measurement(3.0))
+    assert (result.status, result.range_m) == (Status.OUT_OF_DISTRIBUTION, 3.0)
+
+
+def test_a_batch_has_the_bits_of_single_measurements(mitigation):
+    subjects = [measurement(2 + 0.01 * seed, seed) for seed in range(60)]
+    subjects[5:5] = [measurement(range_m, **changes) for changes, range_m, _ in BAD]
+    single = [mitigation.correct(subject) for subject in subjects]
+    assert [repr(result) for result in mitigation.correct_batch(subjects)] == [repr(r) for r in single]
+
+
+def test_an_empty_batch_is_empty(mitigation):
+    assert mitigation.correct_batch([]) == []
+
+
+def test_a_batch_of_bad_measurements_needs_no_network(mitigation):
+    assert [result.status for result in mitigation.correct_batch([measurement(math.nan)])] == [
+        Status.OUT_OF_DISTRIBUTION
+    ]
+
+
+class FailingSession:
+    def predict_m(self, window):
+        raise RuntimeError("out of memory")
+
+    predict_batch_m = predict_m
+
+
+class NotANumberSession:
+    def predict_m(self, window):
+        return np.float32(np.nan)
+
+    def predict_batch_m(self, windows):
+        return np.full(len(windows), np.nan, np.float32)
+
+
+@pytest.mark.parametrize("session", [FailingSession(), NotANumberSession()])
+def test_a_network_that_fails_lets_the_range_through(tmp_path, session):
+    subject = Mitigation(bundle(tmp_path, Remnet(samples=157)))
+    subject._session = session
+    results = [subject.correct(measurement(3.0)), *subject.correct_batch([measurement(3.0)] * 2)]
+    assert [(result.status, result.range_m) for result in results] == [(Status.MODEL_ERROR, 3.0)] * 3

@@ -1,0 +1,168 @@
+"""Preprocessing: the window, the scalings to the bit, and every fault."""
+
+from __future__ import annotations
+
+import math
+import struct
+import warnings
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from model_material import cir
+
+from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.measurement import Cir, Encoding, Status
+from uwb_mitigation.preprocessing import CirFault, Preprocessing, Scaling
+
+
+def single(value: float) -> float:
+    """Round to float32. A float64 product, quotient or root rounds to float32 as if computed exactly."""
+    return float(struct.unpack("f", struct.pack("f", value))[0])
+
+
+def reference(cir: Cir, samples: int, scaling: Scaling) -> list[float]:
+    """The contract in plain Python: one rounding to float32 an operation."""
+    start = math.floor(cir.first_path_index) - 5 - cir.start_index
+    values = []
+    for index in range(start, start + samples):
+        if cir.encoding == Encoding.COMPLEX_INT16:
+            re, im = int(cir.samples[2 * index]), int(cir.samples[2 * index + 1])
+            magnitude = single(math.sqrt(single(re * re + im * im)))
+        else:
+            magnitude = float(cir.samples[index])
+        values.append(single(magnitude * single(cir.scale)))
+    if scaling is Scaling.MAX:
+        return [single(value / max(values)) for value in values]
+    return [single(math.sqrt(single(value / (60 * cir.preamble_count)))) for value in values]
+
+
+def apply(cir: Cir, samples: int = 157, scaling: Scaling = Scaling.PREAMBLE):
+    out = np.full(samples, np.nan, np.float32)
+    return Preprocessing(samples, scaling).apply(cir, out), out
+
+
+def fault(cir: Cir, samples: int = 157, scaling: Scaling = Scaling.PREAMBLE):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        return apply(cir, samples, scaling)[0]
+
+
+@pytest.mark.parametrize("scaling", list(Scaling))
+@pytest.mark.parametrize("encoding", list(Encoding))
+@settings(max_examples=25, deadline=None)
+@given(data=st.data())
+def test_inputs_are_the_contract_to_the_bit(scaling, encoding, data):
+    seed = data.draw(st.integers(0, 2**32 - 1))
+    generator = np.random.default_rng(seed)
+    low = -32766 if encoding == Encoding.COMPLEX_INT16 else 0
+    samples = generator.integers(low, 32767, 128).astype(np.int16)
+    subject = Cir(
+        samples,
+        encoding,
+        start_index=data.draw(st.integers(-2000, 2000)),
+        scale=data.draw(st.sampled_from([1.0, 0.37, 1e-3, 16.5])),
+        preamble_count=data.draw(st.integers(1, 65535)),
+    )
+    first_path = subject.start_index + data.draw(st.floats(5, 61.99))
+    subject = Cir(
+        samples,
+        encoding,
+        subject.start_index,
+        first_path,
+        scale=subject.scale,
+        preamble_count=subject.preamble_count,
+    )
+    found, out = apply(subject, 8, scaling)
+    if found is CirFault.OUTSIDE:
+        assert math.floor(first_path) - subject.start_index + 3 > len(subject)
+    else:
+        assert found is None
+        assert out.tolist() == reference(subject, 8, scaling)
+
+
+def test_the_window_starts_five_samples_before_the_first_path():
+    samples = np.zeros(100, np.int16)
+    samples[20] = 100
+    subject = Cir(samples, Encoding.MAGNITUDE, first_path_index=25.9, preamble_count=1)
+    _, out = apply(subject, 8, Scaling.MAX)
+    assert out.tolist() == [1, 0, 0, 0, 0, 0, 0, 0]
+
+
+@pytest.mark.parametrize("start_index", [0, 700, -3])
+def test_the_window_follows_the_start_index(start_index):
+    samples = np.arange(1, 101, dtype=np.int16)
+    subject = Cir(samples, Encoding.MAGNITUDE, start_index, start_index + 5.0, preamble_count=1)
+    _, out = apply(subject, 8, Scaling.MAX)
+    assert out[0] == np.float32(1) / np.float32(8)
+
+
+@pytest.mark.parametrize("first_path", [5.0, 97.99])
+def test_a_window_may_touch_either_end(first_path):
+    samples = np.ones(100, np.int16)
+    subject = Cir(samples, Encoding.MAGNITUDE, first_path_index=first_path, preamble_count=1)
+    assert fault(subject, 8) is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"samples": np.zeros(0, np.int16)}, CirFault.EMPTY),
+        ({"samples": np.ones(2033, np.int16)}, CirFault.ODD_LENGTH),
+        ({"scale": 0.0}, CirFault.BAD_SCALE),
+        ({"scale": -1.0}, CirFault.BAD_SCALE),
+        ({"scale": math.nan}, CirFault.BAD_SCALE),
+        ({"scale": math.inf}, CirFault.BAD_SCALE),
+        ({"scale": 1e38}, CirFault.BAD_SCALE),
+        ({"first_path_index": math.nan}, CirFault.NO_FIRST_PATH),
+        ({"first_path_index": -math.inf}, CirFault.NO_FIRST_PATH),
+        ({"first_path_index": 4.99}, CirFault.OUTSIDE),
+        ({"first_path_index": 865.0}, CirFault.OUTSIDE),
+        ({"first_path_index": 1e300}, CirFault.OUTSIDE),
+        ({"first_path_index": -1e300}, CirFault.OUTSIDE),
+        ({"start_index": 2**31 - 1}, CirFault.OUTSIDE),
+        ({"samples": np.zeros(2032, np.int16)}, CirFault.ALL_ZERO),
+        ({"samples": np.full(2032, -32768, np.int16)}, CirFault.SATURATED),
+        ({"samples": np.full(2032, 32767, np.int16)}, CirFault.SATURATED),
+        ({"samples": np.full(1016, 32767, np.int16), "encoding": Encoding.MAGNITUDE}, CirFault.SATURATED),
+        ({"samples": np.full(1016, -1, np.int16), "encoding": Encoding.MAGNITUDE}, CirFault.NEGATIVE),
+        ({"samples": np.zeros(1016, np.int16), "encoding": Encoding.MAGNITUDE}, CirFault.ALL_ZERO),
+        ({"preamble_count": 0}, CirFault.NO_PREAMBLE_COUNT),
+    ],
+)
+def test_each_fault_is_found(changes, expected):
+    assert fault(cir(**changes)) is expected
+
+
+def test_the_last_window_that_fits_is_read():
+    assert fault(cir(first_path_index=864.99)) is None
+
+
+def test_a_saturated_sample_outside_the_window_does_no_harm():
+    samples = cir().samples.copy()
+    samples[0] = 32767
+    assert fault(cir(samples=samples)) is None
+
+
+def test_the_scaling_by_maximum_needs_no_preamble_count():
+    assert fault(cir(preamble_count=0), scaling=Scaling.MAX) is None
+
+
+def test_inputs_of_any_valid_scale_are_finite():
+    for scale in (1e-30, 1e30):
+        for scaling in Scaling:
+            found, out = apply(cir(scale=scale), scaling=scaling)
+            assert found is None
+            assert np.isfinite(out).all()
+
+
+def test_only_an_absent_cir_has_its_own_status():
+    assert CirFault.EMPTY.status is Status.NO_CIR
+    assert {kind.status for kind in CirFault if kind is not CirFault.EMPTY} == {Status.BAD_CIR}
+
+
+@pytest.mark.parametrize("samples", [0, 1017, -1])
+def test_a_window_length_out_of_range_is_refused(samples):
+    with pytest.raises(ParameterError, match="1 to 1016"):
+        Preprocessing(samples)

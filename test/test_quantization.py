@@ -1,0 +1,97 @@
+"""Quantisation: close to float, 7-bit weights, and scales that integer arithmetic can stand for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from model_material import random_weights, windows
+
+from uwb_mitigation.errors import DatasetError
+from uwb_mitigation.firmware_export.requantisation import nudge
+from uwb_mitigation.model import floating
+from uwb_mitigation.model.architecture import HEAD, Remnet
+from uwb_mitigation.model.integer import IntegerNetwork
+from uwb_mitigation.model.weights import FloatWeights, sum_operands
+from uwb_mitigation.training.quantization import calibration_inputs, quantize
+
+SHAPE = Remnet(samples=32)
+
+
+@pytest.mark.parametrize("samples", [157, 32])
+def test_int8_is_close_to_float(samples):
+    shape = Remnet(samples=samples)
+    weights = random_weights(shape)
+    integers = quantize(weights, windows(200, samples, seed=1), exact=False)
+    unseen = windows(200, samples, seed=2)
+    expected = floating.predict_m(weights, unseen)
+    difference = np.abs(IntegerNetwork(integers).predict_m(unseen) - expected)
+    assert difference.mean() < 0.25 * expected.std()
+
+
+def test_weights_have_seven_bits():
+    integers = quantize(random_weights(SHAPE), windows(10, 32), exact=False)
+    assert all(np.abs(weight).max() == 63 for weight in integers.weight.values())
+
+
+def test_each_filter_has_its_own_scale():
+    weights = random_weights(SHAPE)
+    weights.weight["first"][3] *= 0.01
+    integers = quantize(weights, windows(10, 32), exact=False)
+    assert np.abs(integers.weight["first"][3]).max() == 63
+
+
+def test_the_integers_are_exact_for_the_firmware_already():
+    integers = quantize(random_weights(Remnet(samples=8)), windows(50, 8))
+    again = nudge(integers)
+    assert dict(again.activation_scale) == dict(integers.activation_scale)
+    for name in integers.weight:
+        assert np.array_equal(again.weight_scale[name], integers.weight_scale[name])
+
+
+def test_a_network_with_dead_filters_can_be_quantised():
+    weights = random_weights(SHAPE)
+    weights.weight["module1.residual"][:] = 0
+    weights.bias["module1.residual"][:] = -1
+    weights.weight["module2.skip"][5] = 0
+    weights.weight[HEAD][:] = 0
+    inputs = windows(30, 32)
+    integers = quantize(weights, inputs, exact=False)
+    expected = np.full(30, weights.bias[HEAD][0])
+    assert np.allclose(IntegerNetwork(integers).predict_m(inputs), expected, atol=1e-3)
+
+
+def test_operands_never_outweigh_their_sum():
+    integers = quantize(random_weights(SHAPE), windows(30, 32), exact=False)
+    for total in ("module1.sum", "module1", "module3"):
+        scale = integers.activation_scale
+        ratios = [float(scale[name] / scale[total]) for name in sum_operands(total)]
+        assert sum(ratios) <= 2
+
+
+def test_a_percentile_clips_the_rare_peak():
+    inputs = windows(30, 32)
+    inputs[0, 0] = 100.0
+    weights = random_weights(SHAPE)
+    largest, most = (quantize(weights, inputs, value, exact=False) for value in (100.0, 99.0))
+    assert most.activation_scale["input"] < 0.1 * largest.activation_scale["input"]
+
+
+@pytest.mark.parametrize(
+    "inputs", [np.zeros((0, 32)), np.zeros((4, 31)), np.zeros(32), np.full((2, 32), np.nan)]
+)
+def test_calibration_inputs_that_cannot_be_are_refused(inputs):
+    with pytest.raises(DatasetError, match="calibration inputs"):
+        quantize(random_weights(SHAPE), inputs.astype(np.float32))
+
+
+def test_weights_of_another_shape_are_refused():
+    good = random_weights(SHAPE)
+    with pytest.raises(Exception, match="weight of layer head has shape"):
+        FloatWeights(Remnet(samples=64), good.weight, good.bias)
+
+
+def test_calibration_takes_from_every_configuration():
+    from model_material import dataset
+
+    data = dataset(5, 100)
+    assert len(calibration_inputs(data, 0)) == 5 * 40

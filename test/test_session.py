@@ -1,0 +1,111 @@
+"""The session: what ONNX Runtime makes of our graphs, and that one input or many make no difference."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+from model_material import bundle, card, random_weights, windows
+
+from uwb_mitigation.errors import ModelError
+from uwb_mitigation.model import floating, graph
+from uwb_mitigation.model.architecture import Remnet
+from uwb_mitigation.model.bundle import save_bundle
+from uwb_mitigation.model.session import Session, session_options
+from uwb_mitigation.model.shipped import SHIPPED, default_model_path
+
+
+def test_the_int8_graph_fuses_to_integer_operators(tmp_path):
+    model = bundle(tmp_path, Remnet())
+    options = session_options()
+    options.optimized_model_filepath = str(tmp_path / "optimised.onnx")
+    onnxruntime.InferenceSession(model.model, options, providers=["CPUExecutionProvider"])
+    nodes = Counter(node.op_type for node in onnx.load(tmp_path / "optimised.onnx").graph.node)
+    assert nodes == {
+        "QuantizeLinear": 1,
+        "Transpose": 2,
+        "QLinearConv": 10,
+        "QLinearAdd": 6,
+        "Flatten": 1,
+        "QGemm": 1,
+    }
+
+
+def test_a_batch_has_the_bits_of_single_inputs(tmp_path):
+    session = Session(bundle(tmp_path, Remnet(samples=64)))
+    inputs = windows(300, 64, seed=3)
+    single = np.array([session.predict_m(row) for row in inputs], np.float32)
+    assert np.array_equal(session.predict_batch_m(inputs), single)
+
+
+def test_a_result_is_not_overwritten_by_the_next(tmp_path):
+    session = Session(bundle(tmp_path))
+    first, second = windows(2, 32)
+    kept = session.predict_m(first)
+    value = float(kept)
+    session.predict_m(second)
+    assert float(kept) == value
+
+
+def test_the_callers_input_may_change_afterwards(tmp_path):
+    session = Session(bundle(tmp_path))
+    window = windows(1, 32)[0]
+    before = session.predict_m(window)
+    window[:] = 0
+    session.predict_m(windows(1, 32, seed=9)[0])
+    assert session.predict_m(windows(1, 32)[0]) == before
+
+
+@pytest.mark.parametrize("samples", [157, 8])
+def test_the_float_graph_computes_what_numpy_computes(tmp_path, samples):
+    shape = Remnet(samples=samples)
+    weights = random_weights(shape)
+    model = save_bundle(tmp_path / "float.onnx", graph.float_model(weights), card(shape, quantised=False))
+    inputs = windows(50, samples)
+    assert np.allclose(Session(model).predict_batch_m(inputs), floating.predict_m(weights, inputs), atol=1e-5)
+
+
+def test_a_graph_that_onnx_runtime_refuses_is_a_model_error(tmp_path):
+    good = bundle(tmp_path)
+    broken = onnx.load_model_from_string(good.model)
+    del broken.metadata_props[:]
+    broken.graph.node[0].input[0] = "nowhere"
+    model = save_bundle(tmp_path / "broken.onnx", broken.SerializeToString(), good.card)
+    with pytest.raises(ModelError, match=r"broken\.onnx: ONNX Runtime .* refuses the model"):
+        Session(model)
+
+
+def test_the_shipped_model_is_found_in_a_checkout():
+    assert default_model_path().name == SHIPPED
+
+
+def test_the_shipped_model_is_found_in_a_sourced_workspace(tmp_path, monkeypatch):
+    folder = tmp_path / "share" / "uwb_mitigation" / "models"
+    folder.mkdir(parents=True)
+    (folder / SHIPPED).touch()
+    monkeypatch.setattr("uwb_mitigation.model.shipped.__file__", "/nowhere/else/at/all/m/shipped.py")
+    monkeypatch.setenv("AMENT_PREFIX_PATH", f"/none:{tmp_path}")
+    assert default_model_path() == folder / SHIPPED
+
+
+def test_the_shipped_model_is_found_beside_an_installation(tmp_path, monkeypatch):
+    folder = tmp_path / "share" / "uwb_mitigation" / "models"
+    folder.mkdir(parents=True)
+    (folder / SHIPPED).touch()
+    module = tmp_path / "lib/python3.12/site-packages/uwb_mitigation/model/shipped.py"
+    monkeypatch.setattr("uwb_mitigation.model.shipped.__file__", str(module))
+    monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
+    assert default_model_path() == folder / SHIPPED
+
+
+def test_a_model_that_is_nowhere_lists_where_it_was_sought(monkeypatch):
+    monkeypatch.setattr("uwb_mitigation.model.shipped.__file__", "/a/b/c/d/uwb_mitigation/model/shipped.py")
+    monkeypatch.setattr("sys.prefix", "/prefix")
+    monkeypatch.setenv("AMENT_PREFIX_PATH", "/ament")
+    with pytest.raises(ModelError) as caught:
+        default_model_path()
+    assert "/ament/share/uwb_mitigation/models" in str(caught.value)
+    assert "/prefix/share/uwb_mitigation/models" in str(caught.value)

@@ -1,0 +1,191 @@
+"""Training: the line prior, the network, and the recipe that joins them."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+from model_material import dataset, windows
+
+from uwb_mitigation.errors import DatasetError, ParameterError
+from uwb_mitigation.evaluation.lad import fit_prior, least_absolute_deviations
+from uwb_mitigation.model import floating
+from uwb_mitigation.model.architecture import Remnet
+from uwb_mitigation.model.prior import LinePrior
+
+SHAPE = Remnet(samples=32)
+
+
+def test_least_absolute_deviations_recovers_a_line_under_outliers():
+    generator = np.random.default_rng(0)
+    design = np.column_stack([np.ones(40), generator.uniform(-95, -75, 40), generator.uniform(2, 15, 40)])
+    truth = np.array([-5.0, -0.07, -0.01])
+    target = design @ truth
+    target[:12] += generator.uniform(2, 9, 12)
+    assert np.allclose(least_absolute_deviations(design, target), truth, atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_least_absolute_deviations_is_no_worse_than_any_line_through_points(seed):
+    generator = np.random.default_rng(seed)
+    design = np.column_stack([np.ones(14), generator.normal(-85, 6, 14), generator.normal(8, 4, 14)])
+    target = generator.standard_cauchy(14)
+    vertices = [
+        np.abs(target - design @ np.linalg.solve(design[list(rows)], target[list(rows)])).sum()
+        for rows in combinations(range(14), 3)
+    ]
+    found = np.abs(target - design @ least_absolute_deviations(design, target)).sum()
+    assert found <= min(vertices) * (1 + 1e-6)
+
+
+def test_a_configuration_counts_once_however_long_it_was_recorded():
+    data = dataset(8, 10)
+    rows = np.concatenate([np.arange(80), np.repeat(np.arange(10), 30)])
+    once, long = (
+        fit_prior(part.configurations, part.rx_power_dbm, part.first_path_power_dbm, part.error_m)
+        for part in (data, data.rows(rows))
+    )
+    assert np.allclose(
+        [once.offset_m, once.per_rx_power, once.per_power_gap],
+        [long.offset_m, long.per_rx_power, long.per_power_gap],
+        rtol=1e-3,
+    )
+
+
+def test_without_powers_the_prior_is_the_median_over_configurations():
+    names = np.array(["a", "a", "b", "c"])
+    unknown = np.full(4, np.nan)
+    prior = fit_prior(names, unknown, unknown, np.array([1.0, 2.0, 0.5, 9.0]))
+    assert prior == LinePrior(1.5)
+
+
+def test_powers_that_are_all_alike_bear_no_line():
+    names = np.array(list("abcdefgh"))
+    prior = fit_prior(names, np.full(8, -80.0), np.full(8, -85.0), np.arange(8.0))
+    assert prior == LinePrior(3.5)
+
+
+def test_a_prior_of_nothing_is_refused():
+    with pytest.raises(DatasetError, match="no measurements"):
+        fit_prior(np.array([]), np.array([]), np.array([]), np.array([]))
+
+
+torch = pytest.importorskip("torch", reason="run `make setup-training`")
+from uwb_mitigation.training import recipe as recipes  # noqa: E402
+from uwb_mitigation.training.fitting import FitOptions, fit  # noqa: E402
+from uwb_mitigation.training.networks import RemnetModule  # noqa: E402
+
+
+@pytest.mark.parametrize("samples", [157, 64, 8])
+@pytest.mark.parametrize("first_kernel", [3, 5])
+def test_torch_and_numpy_compute_the_same(samples, first_kernel):
+    torch.manual_seed(0)
+    network = RemnetModule(Remnet(samples=samples, first_kernel=first_kernel), dropout=0.5).eval()
+    torch.nn.init.normal_(network.head.weight, std=0.05)
+    inputs = windows(20, samples)
+    with torch.no_grad():
+        expected = network(torch.from_numpy(inputs)).numpy()
+    assert np.allclose(floating.predict_m(network.weights(), inputs), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("samples", "parameters"), [(157, 5905), (128, 5841), (64, 5713), (32, 5649), (16, 5617)]
+)
+def test_the_network_has_the_parameters_of_the_paper(samples, parameters):
+    network = RemnetModule(Remnet(samples=samples), dropout=0.0)
+    assert sum(values.numel() for values in network.parameters()) == parameters
+    assert Remnet(samples=samples).parameters == parameters
+
+
+def test_an_unfitted_network_corrects_nothing():
+    weights = RemnetModule(SHAPE, 0.5).weights()
+    assert not floating.predict_m(weights, windows(5, 32)).any()
+
+
+def test_a_seed_gives_the_same_weights():
+    data = dataset(4, 30)
+    options = FitOptions(epochs=2, seed=3)
+    first, again, other = (
+        fit(SHAPE, data.inputs, data.error_m, choice)
+        for choice in (options, options, FitOptions(epochs=2, seed=4))
+    )
+    assert all(np.array_equal(first.weight[name], again.weight[name]) for name in first.weight)
+    assert not np.array_equal(first.weight["first"], other.weight["first"])
+
+
+def test_fitting_leaves_the_callers_randomness_alone():
+    torch.manual_seed(5)
+    expected = torch.rand(1)
+    torch.manual_seed(5)
+    fit(SHAPE, windows(4, 32), np.zeros(4), FitOptions(epochs=1))
+    assert torch.equal(torch.rand(1), expected)
+
+
+def test_a_network_learns_what_its_inputs_tell():
+    inputs = windows(400, 32)
+    targets = inputs[:, :8].mean(axis=1)
+    weights = fit(SHAPE, inputs, targets, FitOptions(epochs=12, learning_rate=2e-3, dropout=0.1))
+    left = np.abs(targets - floating.predict_m(weights, inputs)).mean()
+    assert left < 0.4 * np.abs(targets - np.median(targets)).mean()
+
+
+def test_every_epoch_is_reported():
+    calls = []
+    fit(SHAPE, windows(4, 32), np.zeros(4), FitOptions(epochs=3), lambda: calls.append(1))
+    assert len(calls) == 3
+
+
+def test_a_loss_that_diverges_ends_the_training():
+    targets = np.full(64, 3e38)
+    with pytest.raises(DatasetError, match="in epoch"):
+        fit(SHAPE, windows(64, 32) * 1e30, targets, FitOptions(epochs=50, learning_rate=1.0))
+
+
+def test_inputs_that_are_not_finite_are_refused():
+    with pytest.raises(DatasetError, match="all finite"):
+        fit(SHAPE, np.full((2, 32), np.nan, np.float32), np.zeros(2), FitOptions())
+
+
+@pytest.mark.parametrize("change", [{"epochs": 0}, {"learning_rate": 0.0}, {"dropout": 1.0}, {"seed": -1}])
+def test_options_out_of_range_are_refused(change):
+    with pytest.raises(ParameterError, match=next(iter(change))):
+        FitOptions(**change)
+
+
+def test_cross_validation_finds_the_line_on_configurations_not_seen():
+    data = dataset(12, 20)
+    recipe = recipes.Recipe(SHAPE, FitOptions(epochs=1))
+    validation = recipes.cross_validate(data, recipe, folds=4, seed=0)
+    statistics = validation.statistics()
+    assert list(statistics) == ["raw", "overall_median", "l1_line", "float", "int8"]
+    assert statistics["l1_line"]["mae"] < 0.25 * statistics["overall_median"]["mae"]
+    assert abs(statistics["int8"]["mae"] - statistics["float"]["mae"]) < 0.01
+    assert len(validation.by_configuration("int8")) == 12
+
+
+def test_the_card_tells_the_errors_on_configurations_not_seen():
+    data = dataset(12, 20)
+    recipe = recipes.Recipe(SHAPE, FitOptions(epochs=1))
+    validation = recipes.cross_validate(data, recipe, folds=4, seed=0)
+    card = recipes.describe("name", recipe, LinePrior(0.5), validation, "data")
+    within = np.mean(np.abs(validation.errors["float"]) <= 1.96 * np.sqrt(card.variance_m2))
+    assert abs(within - 0.95) < 0.01
+    assert card.variance_m2 < card.variance_uncorrected_m2
+    assert card.training["metrics_m"]["raw"]["mae"] == round(float(np.abs(data.error_m).mean()), 4)
+
+
+def test_without_a_line_the_network_is_alone():
+    data = dataset(6, 10)
+    recipe = recipes.Recipe(SHAPE, FitOptions(epochs=1), line=False)
+    prior, _ = recipes.fit_model(data, recipe)
+    assert prior == LinePrior(0.0)
+    assert "l1_line" not in recipes.cross_validate(data, recipe, 2, 0).errors
+
+
+def test_measurements_without_power_do_not_spoil_the_network():
+    data = dataset(8, 20)
+    data.rx_power_dbm[3] = np.nan
+    prior, network = recipes.fit_model(data, recipes.Recipe(SHAPE, FitOptions(epochs=1)))
+    assert prior.needs_power
+    assert np.isfinite(floating.predict_m(network, data.inputs)).all()
