@@ -25,7 +25,7 @@ demo: setup  ## replay RECORDING=path (default: simulated) through driver and mi
 	@$(IN_ROS) $(VENV)/bin/python -m uwb_mitigation.nodes.demo $(if $(RECORDING),--recording '$(RECORDING)') $(if $(RATE),--rate $(RATE))
 
 test: setup-training  ## run every test
-	@$(IN_ROS) $(VENV)/bin/python -m pytest
+	@$(IN_ROS) $(VENV)/bin/python -m pytest -n auto
 
 # What a machine with ROS 2 does by hand; without one, the environment stands in for /opt/ros/jazzy.
 COLCON = $(IN_ROS) PATH="$(CURDIR)/$(VENV)/bin:$$PATH" \

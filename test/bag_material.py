@@ -101,8 +101,8 @@ class Foreign:
     def add(self, topic: str, log_time_ns: int, data: bytes) -> None:
         self._writer.add_message(self._channels[topic], log_time_ns, data, log_time_ns)
 
-    def range(self, number: int) -> None:
-        measurement = record(number).measurement
+    def range(self, number: int, samples: int = 20) -> None:
+        measurement = record(number, samples).measurement
         self.add(RANGE_RAW, measurement.stamp_ns, codec.encode_range(measurement))
 
     def truth(self, number: int) -> None:

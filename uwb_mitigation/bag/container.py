@@ -11,7 +11,7 @@ from __future__ import annotations
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import BinaryIO, NamedTuple
 
@@ -82,6 +82,7 @@ class Span:
         first_ns, last_ns: log times of the messages within, as the file claims.
         channel_ids: who is in it; empty = not known.
         chunk: whether the span is one compressed record.
+        torn: whether the file ends inside that record.
     """
 
     offset: int
@@ -89,6 +90,7 @@ class Span:
     first_ns: int
     last_ns: int
     chunk: bool
+    torn: bool = False
     channel_ids: set[int] = field(default_factory=set)
 
 
@@ -161,6 +163,7 @@ def survey(stream: BinaryIO) -> Survey:
             _take_in(stream, found, opcode, offset, end)
         except ValueError as error:
             found.damage = (offset, str(error))
+            _note_torn_chunk(stream, found, offset, size)
             return found
         offset = end
     try:
@@ -174,16 +177,20 @@ def survey(stream: BinaryIO) -> Survey:
 def read_span(stream: BinaryIO, found: Survey, span: Span) -> Iterator[RawMessage]:
     """The messages of one span, in the order of the file.
 
+    Of a torn chunk, those that stand before the tear; its checksum cannot be tested.
+
     Raises:
-        ValueError: the span is damaged. A chunk's checksum is tested before its first message.
+        ValueError: the span is damaged. A whole chunk's checksum is tested before its first message.
     """
     stream.seek(span.offset)
     data = _read(stream, span.end - span.offset)
     if span.chunk:
-        data = _decompress(data[_RECORD.size :])
+        data = _decompress(data[_RECORD.size :], torn=span.torn)
     position, size = 0, len(data)
     channels = found.channels
     while position < size:
+        if span.torn and not _whole_record(data, position):
+            return
         if size - position < _RECORD.size:
             raise ValueError("a record inside is cut off")
         opcode, length = _RECORD.unpack_from(data, position)
@@ -204,6 +211,25 @@ def read_span(stream: BinaryIO, found: Survey, span: Span) -> Iterator[RawMessag
         elif span.chunk:
             raise ValueError(f"a record of kind {opcode:#04x} inside a chunk")
         position = end
+
+
+def _note_torn_chunk(stream: BinaryIO, found: Survey, offset: int, size: int) -> None:
+    """A recorder that was killed leaves its last chunk torn: what was packed before the tear is still good."""
+    stream.seek(offset)
+    head = stream.read(_RECORD.size + _CHUNK_TIMES.size)
+    if len(head) < _RECORD.size + _CHUNK_TIMES.size:
+        return
+    opcode, length = _RECORD.unpack_from(head)
+    if opcode == Opcode.CHUNK and length <= MAX_CHUNK and offset + _RECORD.size + length > size:
+        first, last = _CHUNK_TIMES.unpack_from(head, _RECORD.size)
+        found.spans.append(Span(offset, size, first, last, chunk=True, torn=True))
+
+
+def _whole_record(data: bytes, position: int) -> bool:
+    if len(data) - position < _RECORD.size:
+        return False
+    _, length = _RECORD.unpack_from(data, position)
+    return bool(position + _RECORD.size + length <= len(data))
 
 
 def _take_in(stream: BinaryIO, found: Survey, opcode: int, offset: int, end: int) -> None:
@@ -289,8 +315,8 @@ def _read_definition(stream: BinaryIO, length: int) -> bytes:
     return _read(stream, length)
 
 
-def _decompress(record: bytes) -> bytes:
-    """The records inside a chunk record.
+def _decompress(record: bytes, *, torn: bool) -> bytes:
+    """The records inside a chunk record; of a torn one, as far as they can be unpacked.
 
     Raises:
         ValueError: it is malformed, of unknown compression, larger than it says, or fails its checksum.
@@ -298,22 +324,20 @@ def _decompress(record: bytes) -> bytes:
     cursor = _Cursor(record)
     _, _, size, checksum = cursor.unpack("<QQQI")
     compression = cursor.string()
-    packed = cursor.take(*cursor.unpack("<Q"))
+    length = cursor.unpack("<Q")[0]
+    packed = cursor.rest() if torn else cursor.take(length)
     cursor.finish()
     if size > MAX_CHUNK:
         raise ValueError(f"a chunk that unpacks to {size} bytes, more than the ceiling of {MAX_CHUNK}")
-    if compression == "":
-        data = packed
-    elif compression == "zstd":
-        data = _unpack_zstd(packed, size)
-    elif compression == "lz4":
-        try:
-            # One byte more than promised, so that a chunk that holds more is found out.
-            data = lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size + 1)
-        except (RuntimeError, EOFError) as error:
-            raise ValueError(f"a chunk that does not unpack: {error}") from error
-    else:
+    if compression not in _UNPACKERS:
         raise ValueError(f"a chunk of unknown compression {compression[:32]!r}, not zstd, lz4 or none")
+    try:
+        # One byte more than promised, so that a chunk that holds more is found out.
+        data = _UNPACKERS[compression](packed, size + 1)
+    except (zstandard.ZstdError, RuntimeError, EOFError) as error:
+        raise ValueError(f"a chunk that does not unpack: {error}") from error
+    if torn:
+        return data
     if len(data) != size:
         raise ValueError(f"a chunk that does not unpack to the {size} bytes it promises")
     if checksum and zlib.crc32(data) != checksum:
@@ -321,15 +345,16 @@ def _decompress(record: bytes) -> bytes:
     return data
 
 
-def _unpack_zstd(packed: bytes, size: int) -> bytes:
-    try:
-        # The library allocates what the frame's own header claims, before it unpacks a byte.
-        claimed = zstandard.frame_content_size(packed)
-        if claimed not in (-1, size):
-            raise ValueError(f"a chunk whose frame claims {claimed} bytes instead of {size}")
-        return zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
-    except zstandard.ZstdError as error:
-        raise ValueError(f"a chunk that does not unpack: {error}") from error
+def _unpack_zstd(packed: bytes, limit: int) -> bytes:
+    # As a stream: the one-shot call allocates what the frame's own header claims, and gives nothing of a torn frame.
+    return zstandard.ZstdDecompressor().stream_reader(packed, closefd=False).read(limit)
+
+
+_UNPACKERS: dict[str, Callable[[bytes, int], bytes]] = {
+    "": lambda packed, limit: packed[:limit],
+    "zstd": _unpack_zstd,
+    "lz4": lambda packed, limit: lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=limit),
+}
 
 
 class _Cursor:
@@ -344,6 +369,9 @@ class _Cursor:
             raise ValueError(f"a field of {size} bytes in a record with {len(self._data) - self._at} left")
         self._at += size
         return self._data[self._at - size : self._at]
+
+    def rest(self) -> bytes:
+        return self.take(len(self._data) - self._at)
 
     def unpack(self, layout: str) -> tuple[int, ...]:
         return struct.unpack(layout, self.take(struct.calcsize(layout)))

@@ -76,7 +76,7 @@ class BagReader:
 
         Raises:
             DamagedRecordingError: a file is damaged; every message before the damage has been yielded.
-                A chunk is the smallest unit: one that is cut or fails its checksum yields none.
+                A chunk that fails its checksum yields none; one that the file ends in, those before the cut.
         """
         for path, found in zip(self.files, self._surveys, strict=True):
             try:
