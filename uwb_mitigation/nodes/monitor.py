@@ -75,10 +75,10 @@ def live_table(tally: Tally, title: str) -> Table:
         "anchor",
         "tag",
         "Hz",
-        "raw m",
-        "corrected m",
-        "sigma m",
-        "true m",
+        "raw",
+        "corrected",
+        "sigma",
+        "true",
         "status",
         "label",
     ):
@@ -105,6 +105,7 @@ def summary(tally: Tally) -> Group:
         f"{tally.statuses[status]} {status.name}" for status in Status if tally.statuses[status]
     )
     lines: list[Text | Table] = [
+        Text(),
         Text(f"{tally.raw} ranges received, {tally.corrected} corrected ({statuses}), {tally.missing} lost"),
         Text(
             "latency from stamp to corrected range: "
