@@ -12,6 +12,7 @@
 #define UWB_KERNELS_H
 
 #include "uwb_mitigation.h"
+#include "uwb_target.h"
 
 #ifdef __cplusplus
 extern "C" {
@@ -19,16 +20,6 @@ extern "C" {
 
 #define UWB_BLOCK 8                                 /* positions */
 #define UWB_BLOCK_VALUES (UWB_BLOCK * UWB_FILTERS)  /* uint16 */
-#define UWB_REQUANTISATION_SHIFT 11
-#define UWB_SUM_SHIFT 22
-
-/* The assembly holds weights in FPU registers and multiplies with the DSP extension. */
-#if defined(__ARM_FEATURE_DSP) && defined(__thumb2__) && defined(__ARM_FP) && !defined(UWB_PORTABLE) && \
-    defined(__ARM_ARCH_7EM__)
-#define UWB_CORTEX_M4 1
-#else
-#define UWB_CORTEX_M4 0
-#endif
 
 /* x: uint8 samples, padded in front; 8 blocks + kernel + 1 of them are read. */
 void uwb_conv_first(const uint16_t *x, uint16_t *y, uint32_t blocks, const int16_t *weights,

@@ -99,7 +99,7 @@ typedef struct {
     const uwb_dense_layer *layers;
 
     const int8_t *head_weights; /* pairs, in the order of the last activation in memory */
-    uint16_t head_inputs;       /* a multiple of 4 */
+    uint16_t head_inputs;       /* a multiple of 8 */
     int32_t head_bias;          /* times 256 */
     float head_scale;           /* m per unit of the accumulator */
 

@@ -7,7 +7,7 @@
 
 enum { SATURATED = INT16_MAX, PREAMBLE_DIVISOR = 60 };
 
-static int finite(float value) {
+static int is_finite(float value) {
     return value >= -FLT_MAX && value <= FLT_MAX;
 }
 
@@ -44,10 +44,10 @@ uwb_status uwb_preprocess(const uwb_model *model, const uwb_cir *cir, float *win
     if (cir->count == 0) {
         return UWB_EMPTY;
     }
-    if (!(finite(cir->scale) && cir->scale > 0.0f)) {
+    if (!(is_finite(cir->scale) && cir->scale > 0.0f)) {
         return UWB_BAD_SCALE;
     }
-    if (!finite(cir->first_path_index)) {
+    if (!is_finite(cir->first_path_index)) {
         return UWB_NO_FIRST_PATH;
     }
     if (model->scaling == UWB_SCALE_PREAMBLE && cir->preamble_count == 0) {

@@ -1,0 +1,160 @@
+/* Runs a model over a file of inputs in the emulator. Arguments: program, input file, output file.
+ *
+ * Input: uint32 kind, uint32 count, then records. Kind 0: float window[K]. Kind 1: struct cir_record.
+ * Output: for each record, kind 0: uint32 status, float output. Kind 1: uint32 status,
+ * uwb_corrected, float window[K] after preprocessing. Then struct report.
+ *
+ * Counts are ticks of SysTick around uwb_network, with interrupts off. Run with -icount shift=6, a tick is
+ * 40 ns and an instruction 64 ns: one instruction is told from the next. */
+#include <string.h>
+
+#include "semihosting.h"
+#include "uwb_model.h"
+
+enum { WINDOWS = 0, CIRS = 1, MAX_SAMPLES = 1016, MAX_WINDOW = 256, ARENA_BYTES = 12288, STACK_PROBE_BYTES = 4096 };
+
+typedef struct {
+    uint32_t count; /* int16 values */
+    uint32_t encoding;
+    int32_t start_index;
+    float first_path_index;
+    float scale;
+    uint32_t preamble_count;
+    float rx_power_dbm;
+    float first_path_power_dbm;
+    float range_m;
+    int16_t samples[2 * MAX_SAMPLES];
+} cir_record;
+
+typedef struct {
+    uint32_t model_id;
+    uint32_t arena_bytes;
+    uint32_t stack_bytes;  /* of uwb_network */
+    uint32_t ticks_empty;  /* of a measurement of nothing */
+    uint32_t ticks_lowest; /* of uwb_network */
+    uint32_t ticks_highest;
+    uint32_t ticks_correct; /* of uwb_correct, the highest; kind 1 */
+} report;
+
+#define SYST_CSR (*(volatile uint32_t *)0xE000E010u)
+#define SYST_RVR (*(volatile uint32_t *)0xE000E014u)
+#define SYST_CVR (*(volatile uint32_t *)0xE000E018u)
+#define SYST_MAX 0xFFFFFFu
+
+void board_exit(int code);
+
+static uint32_t arena[ARENA_BYTES / sizeof(uint32_t)];
+
+__attribute__((noreturn)) void board_exit(int code) {
+    semihosting_exit(code);
+}
+
+static uint32_t ticks_since(uint32_t start) {
+    return (start - SYST_CVR) & SYST_MAX;
+}
+
+/* Stack that uwb_network takes: fill what is free below this frame, call, and see how far it reached. */
+static __attribute__((noinline)) uint32_t stack_bytes(const float *window) {
+    float output_m;
+    volatile uint8_t *top;
+    __asm volatile("mov %0, sp" : "=r"(top));
+    for (volatile uint8_t *free = top - STACK_PROBE_BYTES; free < top; free++) {
+        *free = 0xA5;
+    }
+    (void)uwb_network(&uwb_model_data, window, arena, sizeof arena, &output_m);
+    volatile uint8_t *reached = top - STACK_PROBE_BYTES;
+    while (reached < top && *reached == 0xA5) {
+        reached++;
+    }
+    return (uint32_t)(top - reached);
+}
+
+static void run_window(const float *window, report *seen, uint32_t answer[2]) {
+    float output_m = 0.0f;
+    const uint32_t start = SYST_CVR;
+    const uwb_status status = uwb_network(&uwb_model_data, window, arena, sizeof arena, &output_m);
+    const uint32_t ticks = ticks_since(start);
+    seen->ticks_lowest = ticks < seen->ticks_lowest ? ticks : seen->ticks_lowest;
+    seen->ticks_highest = ticks > seen->ticks_highest ? ticks : seen->ticks_highest;
+    answer[0] = (uint32_t)status;
+    memcpy(&answer[1], &output_m, sizeof output_m);
+}
+
+static int run_windows(int32_t input, int32_t output, uint32_t count, report *seen) {
+    static float windows[64][MAX_WINDOW];
+    static uint32_t answers[64][2];
+    const uint32_t samples = uwb_model_data.samples;
+    for (uint32_t done = 0; done < count;) {
+        const uint32_t chunk = count - done < 64u ? count - done : 64u;
+        for (uint32_t i = 0; i < chunk; i++) {
+            if (!semihosting_read(input, windows[i], samples * sizeof(float))) {
+                return 3;
+            }
+        }
+        for (uint32_t i = 0; i < chunk; i++) {
+            run_window(windows[i], seen, answers[i]);
+        }
+        if (!semihosting_write(output, answers, chunk * sizeof answers[0])) {
+            return 4;
+        }
+        done += chunk;
+    }
+    seen->stack_bytes = stack_bytes(windows[0]);
+    return 0;
+}
+
+static int run_cirs(int32_t input, int32_t output, uint32_t count, report *seen) {
+    static cir_record record;
+    static float window[MAX_WINDOW];
+    for (uint32_t i = 0; i < count; i++) {
+        if (!semihosting_read(input, &record, sizeof record) || record.count > 2 * MAX_SAMPLES) {
+            return 3;
+        }
+        const uwb_cir cir = {
+            record.samples,         record.count,      (uwb_encoding)record.encoding,
+            record.start_index,     record.first_path_index, record.scale,
+            (uint16_t)record.preamble_count, record.rx_power_dbm, record.first_path_power_dbm,
+        };
+        memset(window, 0, sizeof window);
+        (void)uwb_preprocess(&uwb_model_data, &cir, window);
+        uwb_corrected corrected;
+        const uint32_t start = SYST_CVR;
+        const uint32_t status =
+            (uint32_t)uwb_correct(&uwb_model_data, record.range_m, &cir, arena, sizeof arena, &corrected);
+        const uint32_t ticks = ticks_since(start);
+        seen->ticks_correct = ticks > seen->ticks_correct ? ticks : seen->ticks_correct;
+        if (!semihosting_write(output, &status, sizeof status) ||
+            !semihosting_write(output, &corrected, sizeof corrected) ||
+            !semihosting_write(output, window, uwb_model_data.samples * sizeof(float))) {
+            return 4;
+        }
+    }
+    return 0;
+}
+
+int main(void) {
+    static char line[1024];
+    char *arguments[3];
+    if (semihosting_arguments(line, sizeof line, arguments, 3) != 3) {
+        return 1;
+    }
+    const int32_t input = semihosting_open(arguments[1], SEMIHOSTING_READ);
+    const int32_t output = semihosting_open(arguments[2], SEMIHOSTING_WRITE);
+    uint32_t header[2];
+    if (input < 0 || output < 0 || !semihosting_read(input, header, sizeof header)) {
+        return 2;
+    }
+    SYST_RVR = SYST_MAX;
+    SYST_CVR = 0;
+    SYST_CSR = 5; /* processor clock, no interrupt */
+
+    report seen = {uwb_model_data.model_id, (uint32_t)uwb_arena_size(&uwb_model_data), 0, 0, UINT32_MAX, 0, 0};
+    const uint32_t start = SYST_CVR;
+    seen.ticks_empty = ticks_since(start);
+    const int code = header[0] == WINDOWS ? run_windows(input, output, header[1], &seen)
+                                          : run_cirs(input, output, header[1], &seen);
+    if (code == 0 && !semihosting_write(output, &seen, sizeof seen)) {
+        return 4;
+    }
+    return code;
+}

@@ -1,0 +1,35 @@
+/* y = relu(conv3 stride 2(r)) + relu(conv1 stride 2(r)) for even lengths: windows begin on even positions. */
+#include "uwb_reduce.h"
+
+#if UWB_CORTEX_M4
+
+        .macro taps pair, wide0, wide1, wide2, narrow0, narrow1, narrow2
+        fetch_pair r8, r9, 4 * \pair            /* tap 0, tap 2: even positions */
+        fetch   r10, 4 * \pair + 3              /* skip: the same */
+        ldrd    r11, r12, [lr, #(ROW_BYTES * \pair)]
+        smlad   r0, r11, r8, \wide0
+        smlad   r4, r11, r10, \narrow0
+        smlad   r0, r12, r9, r0
+        smlad   r1, r12, r8, \wide1
+        smlad   r5, r12, r10, \narrow1
+        ldrd    r11, r12, [lr, #(ROW_BYTES * \pair + 8)]
+        smlad   r1, r11, r9, r1
+        smlad   r2, r11, r8, \wide2
+        smlad   r6, r11, r10, \narrow2
+        smlad   r2, r12, r9, r2
+        smlad   r3, r12, r8, r3
+        smlad   r7, r12, r10, r7
+        ldr     r11, [lr, #(ROW_BYTES * \pair + BLOCK_BYTES)]
+        smlad   r3, r11, r9, r3
+        fetch   r8, 4 * \pair + 2               /* tap 1: odd positions */
+        ldrd    r11, r12, [lr, #(ROW_BYTES * \pair + 16)]
+        smlad   r0, r11, r8, r0
+        smlad   r1, r12, r8, r1
+        ldrd    r11, r12, [lr, #(ROW_BYTES * \pair + 24)]
+        smlad   r2, r11, r8, r2
+        smlad   r3, r12, r8, r3
+        .endm
+
+        reduce  uwb_conv_reduce_even
+
+#endif
