@@ -99,8 +99,9 @@ def test_after_a_gap_of_30_s_the_first_stamps_are_still_within_1_ms(tick_hz, wra
     assert max(errors) < 1e-3
 
 
-def test_without_round_trips_the_fastest_arrivals_tell_the_offset():
-    link = JitteryLink(np.random.default_rng(3))
+@pytest.mark.parametrize("drift", [-80e-6, 80e-6])
+def test_without_round_trips_the_fastest_arrivals_tell_the_offset(drift):
+    link = JitteryLink(np.random.default_rng(3), drift=drift)
     clock = DeviceClock()
 
     errors = []
@@ -133,6 +134,32 @@ def test_jitter_cannot_move_stamps_backwards():
         stamps.append(clock.stamp(link.ticks(true_s), link.ns(link.delivered_s(true_s))))
 
     assert min(np.diff(stamps)) > 0
+
+
+def test_an_estimate_that_moves_back_does_not_take_stamps_with_it():
+    clock = DeviceClock()
+    late = clock.stamp(0, EPOCH + 50_000_000)
+    clock.exchange(EPOCH + 60_000_000, 60_000, 60_000, EPOCH + 60_000_000)
+
+    assert clock.stamp(10_000, EPOCH + 70_000_000) > late
+    assert clock.stamp(70_000, EPOCH + 71_000_000) == pytest.approx(EPOCH + 70_000_000, abs=1e6)
+
+
+def test_an_estimate_that_moves_on_does_not_take_late_stamps_past_their_successors():
+    clock = DeviceClock()
+    clock.stamp(0, EPOCH)
+    after = clock.stamp(20_000, EPOCH + 20_000_000)
+    clock.exchange(EPOCH + 80_000_000, 30_000, 30_000, EPOCH + 80_000_000)
+
+    assert clock.stamp(10_000, EPOCH + 90_000_000) < after
+
+
+def test_one_arrival_that_is_seconds_late_does_not_move_the_estimate():
+    clock = DeviceClock()
+    clock.stamp(0, EPOCH)
+    clock.stamp(10_000, EPOCH + 3 * SECOND)
+
+    assert clock.stamp(20_000, EPOCH + 3 * SECOND) == pytest.approx(EPOCH + 20_000_000, abs=1e6)
 
 
 def test_a_stamp_is_never_after_the_arrival():

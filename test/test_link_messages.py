@@ -100,11 +100,13 @@ def test_an_unknown_type_is_no_message():
     assert messages.decode(200, b"whatever") is None
 
 
-@pytest.mark.parametrize("message", [*SMALL, measurement([])], ids=lambda message: type(message).__name__)
-def test_a_payload_may_grow_at_its_end(message):
+@pytest.mark.parametrize(
+    "message",
+    [*(message for message in SMALL if not isinstance(message, Log)), measurement([])],
+    ids=lambda message: type(message).__name__,
+)
+def test_a_payload_may_grow_at_its_end_unless_its_tail_runs_to_the_end(message):
     kind, payload = messages.encode(message)
-    if kind is MessageType.LOG:
-        pytest.skip("a log's text runs to the end")
 
     assert type(messages.decode(kind, payload + b"later revision")) is type(message)
 
@@ -141,6 +143,8 @@ def test_a_payload_that_is_too_short_is_an_error_that_names_the_type(kind):
 def test_a_measurement_with_an_impossible_field_is_an_error(field, code, value):
     kind, payload = messages.encode(measurement([1, 2]))
     broken = bytearray(payload)
+    if field == "samples_offset":
+        broken += bytes(6)  # So that the samples still end inside.
     struct.pack_into("<" + code, broken, layout.PAYLOADS[kind].offsets()[field], value)
 
     with pytest.raises(LinkError, match="RANGE_CIR"):

@@ -221,6 +221,7 @@ def test_a_board_of_another_version_is_named_once_and_nothing_of_it_delivered():
     assert bench.events == [VersionMismatch(7)]
     assert bench.session.state is State.WRONG_VERSION
     assert bench.session.foreign_version == 7
+    assert bench.session.silent_ns(bench.now) < 1000 * MS
     assert bench.measure(1) == []
 
 
@@ -280,6 +281,21 @@ def test_a_reset_is_known_by_the_boot_id_and_restarts_the_clock():
     assert event.stamp_ns == pytest.approx(took_place, abs=0.1 * MS)
 
 
+def test_after_a_reset_the_same_uptime_is_another_time():
+    bench = Bench(BoardSession())
+    bench.host_hears(bench.board.hello(0))
+    bench.now = 50 * MS
+    bench.measure(1)
+    bench.now = 60 * MS
+    bench.reboot()
+    bench.host_hears(bench.board.hello(0))
+    bench.now = 110 * MS
+
+    (event,) = bench.measure(1)
+
+    assert event.stamp_ns == EPOCH + 110 * MS
+
+
 def test_a_reset_whose_hello_is_lost_is_known_by_the_numbering():
     bench = connected()
     bench.run(20_000)
@@ -310,6 +326,29 @@ def test_a_frame_that_arrives_twice_is_delivered_once():
 
     assert len(bench.host_hears(data + data)) == 1
     assert bench.session.counts.stale == 1
+
+
+def test_a_hello_that_arrives_twice_counts_once():
+    bench = connected()
+    again = bench.board.hello(bench.uptime_us)
+
+    assert bench.host_hears(again + again) == []
+    assert bench.session.counts.stale == 1
+    assert bench.session.counts.lost == 0
+
+
+def test_an_answer_that_was_on_its_way_when_the_numbering_broke_is_still_an_answer():
+    bench = connected()
+    bench.session.correct(measurement(41))
+    request = bench.session.outgoing()
+    for _ in range(3):
+        bench.host_hears(encode_frame(Frame(MessageType.LOG, 0, 0, 0, bytes(8))))
+    assert bench.session.state is State.CONNECTING
+    bench.run(10)
+
+    (answer,) = bench.host_hears(bench.board.receive(request, bench.uptime_us))
+
+    assert isinstance(answer, Answer)
 
 
 def test_the_numbering_may_wrap():

@@ -312,7 +312,6 @@ class BoardSession:
         self.foreign_version = None
         self._mode_requests.clear()
         self._syncs_sent.clear()
-        self._awaited.clear()
         self._next_request_ns = now_ns
         return [Disconnected(loss)] if was_ready else []
 

@@ -1,0 +1,62 @@
+"""`uwb-mitigation emulate-board` and `bench link`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from uwb_mitigation.cli import app
+from uwb_mitigation.errors import ParameterError, UwbMitigationError
+
+
+def run(*arguments: str) -> str:
+    return CliRunner().invoke(app, list(arguments), catch_exceptions=False).output
+
+
+def test_bench_link_writes_what_came_of_the_frames(tmp_path):
+    result = tmp_path / "link.json"
+    run("bench", "link", "--frames", "3000", "--damage", "0.0005", "--json", str(result))
+
+    written = json.loads(result.read_text())
+    assert written["sent"] == 3000
+    assert written["delivered"] + written["lost"] == 3000
+    assert 0 < written["lost"] < 3000
+    assert written["intact_lost"] == written["corrupt_delivered"] == 0
+    assert written["decoder_mb_per_s"] > 0
+
+
+def test_an_emulated_board_plays_for_the_time_it_is_given(tmp_path):
+    result = tmp_path / "board.json"
+    output = run("emulate-board", "--duration", "0.5", "--rate", "100", "--json", str(result))
+
+    assert "simulated" in output
+    assert "/dev/" in output
+    assert json.loads(result.read_text())["sent"] > 0
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("bench", "link", "--frames", "0"),
+        ("bench", "link", "--damage", "2"),
+        ("bench", "link", "--seed", "-1"),
+        ("emulate-board", "--mode", "neither"),
+        ("emulate-board", "--rate", "0"),
+        ("emulate-board", "--duration", "-1"),
+        ("emulate-board", "--lose", "nan"),
+        ("emulate-board", "--seed", "-1"),
+        ("emulate-board", "--link", "/nonexistent/board"),
+    ],
+    ids=" ".join,
+)
+def test_an_option_out_of_its_range_is_refused(arguments):
+    with pytest.raises(ParameterError):
+        run(*arguments)
+
+
+def test_a_recording_that_is_not_there_is_refused(tmp_path: Path):
+    with pytest.raises(UwbMitigationError, match="absent"):
+        run("emulate-board", str(tmp_path / "absent.mcap"), "--duration", "1")
