@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from fractions import Fraction
+
 import numpy as np
 import onnxruntime
 import pytest
@@ -54,6 +57,21 @@ def test_the_shipped_network_equals_onnx_runtime():
     assert np.array_equal(session.predict_batch_m(inputs), expected)
     single = np.array([session.predict_m(row) for row in inputs[-500:]], np.float32)
     assert np.array_equal(single, expected[-500:])
+
+
+def test_a_sum_is_rounded_as_by_a_fused_multiply_add():
+    shape = Remnet(samples=16)
+    weights = random_int8(shape)
+    first, second = np.float32(0.87686104), np.float32(0.5873151)
+    scale = dict(weights.activation_scale)
+    scale |= {"module1": np.float32(1), "module1.reduce": first, "module1.skip": second}
+    network = IntegerNetwork(replace(weights, activation_scale=scale))
+    a, b = (np.full((1, 16, 8), value, np.uint8) for value in (47, 135))
+    exact = Fraction(float(first)) * 47 + Fraction(float(np.float32(second * np.float32(135))))
+    fused = float(np.rint(np.float32(float(exact))))
+    apart = float(np.rint(first * np.float32(47) + second * np.float32(135)))
+    assert fused != apart
+    assert (network.add("module1", {"module1.reduce": a, "module1.skip": b}) == fused).all()
 
 
 def test_it_saturates_and_never_wraps():
