@@ -282,6 +282,17 @@ def test_a_source_without_measurements_is_reported(link):
     assert isinstance(board.failure, RecordingError)
 
 
+def test_a_measurement_that_no_frame_holds_is_reported(link):
+    class Monstrous(Recording):
+        def __iter__(self) -> Iterator[Record]:
+            yield Record(RangeMeasurement(0, 1, 2, 3, 4, 5.0, Cir(np.zeros(5000, np.int16))))
+
+    with EmulatedBoard(Monstrous(), link=link) as board:
+        wait_until(lambda: board.failure is not None)
+
+    assert isinstance(board.failure, ParameterError)
+
+
 def test_the_link_to_the_port_is_not_made_over_a_file(link):
     link.write_text("precious")
 

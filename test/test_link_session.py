@@ -139,6 +139,16 @@ def test_a_measurement_arrives_with_its_stamp_on_the_nodes_clock():
     assert event.stamp_ns == pytest.approx(took_place, abs=0.1 * MS)
 
 
+def test_the_hello_already_tells_the_clocks_offset():
+    bench = Bench(BoardSession())
+    bench.host_hears(bench.board.hello(0))
+    took_place = EPOCH + bench.now
+
+    (event,) = bench.measure(5, late_ns=30 * MS)
+
+    assert event.stamp_ns == pytest.approx(took_place, abs=0.1 * MS)
+
+
 def test_in_both_mode_a_correction_has_the_stamp_of_its_measurement():
     bench = connected(mode=Mode.BOTH)
 

@@ -16,6 +16,9 @@ _FLOOR_NS = 20e3
 _LATE_ARRIVAL_NS = 20e6
 """How late a frame may well arrive: the weight of one-way arrivals while there was no round trip."""
 
+_FIRST_ARRIVAL_NS = 1e6
+"""Weight of the first arrival: if it was late, the next early one corrects it, whatever its weight."""
+
 _START_DRIFT = 100e-6
 """Twice the tolerance of a common crystal."""
 
@@ -149,7 +152,7 @@ class DeviceClock:
         if self._origin is None:
             self._origin = arrived_ns - board_ns
             self._at = board_ns
-            self._p_offset = _LATE_ARRIVAL_NS**2
+            self._p_offset = _FIRST_ARRIVAL_NS**2
             return
         high = float(arrived_ns - board_ns - self._origin)
         if late_ns < 0:

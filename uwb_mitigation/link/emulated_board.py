@@ -239,16 +239,17 @@ class EmulatedBoard:
     def _measure(self) -> None:
         try:
             measurement = next(self._records, None)
-        except UwbMitigationError as error:
-            self.failure = error
-            self._records = iter(())
-            return
-        if measurement is not None:
+            if measurement is None:
+                return
             if len(self._backlog) > MAX_BACKLOG_BYTES:
                 self._board.measurements_lost += 1
             else:
-                self.sent_measurements += 1
                 self._transmit(self._board.measure(measurement, self._uptime_us()))
+                self.sent_measurements += 1
+        except UwbMitigationError as error:
+            # A recording that ends in damage, or a measurement that no frame holds.
+            self.failure = error
+            self._records = iter(())
 
     def _exchange(self, patience_s: float) -> None:
         """Read from and write to the host, for at most `patience_s`."""

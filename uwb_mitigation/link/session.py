@@ -204,7 +204,7 @@ class BoardSession:
 
     def _understand(self, frame: Frame, now_ns: int, stamp_ns: int) -> list[Event]:
         if frame.type == MessageType.HELLO:
-            return self._accept_hello(frame, now_ns)
+            return self._accept_hello(frame, now_ns, stamp_ns)
         if self.state is not State.READY:
             self.counts.withheld += 1
             return []
@@ -225,7 +225,7 @@ class BoardSession:
         self.counts.unknown_types[frame.type] += 1
         return []
 
-    def _accept_hello(self, frame: Frame, now_ns: int) -> list[Event]:
+    def _accept_hello(self, frame: Frame, now_ns: int, stamp_ns: int) -> list[Event]:
         hello = messages.decode(frame.type, frame.payload)
         assert isinstance(hello, Hello)
         boot = (hello.board_id, hello.boot_id)
@@ -238,6 +238,7 @@ class BoardSession:
         if boot != self._boot:
             self.clock.reset()
             self._boot = boot
+        self.clock.arrival(frame.time_us, stamp_ns)
         self.hello = hello
         if self.state is not State.READY:
             self.state = State.READY
