@@ -11,6 +11,7 @@ import typer
 
 from uwb_mitigation.commands import console
 from uwb_mitigation.commands.console import JsonOption
+from uwb_mitigation.commands.fetch import fetch
 from uwb_mitigation.errors import DamagedRecordingError, RecordingError
 
 if TYPE_CHECKING:
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from uwb_mitigation.sources.source import Source
 
 app = typer.Typer(help="Bring recordings into bags, and show what a recording holds.", no_args_is_help=True)
+app.command()(fetch)
 
 _STRIDE = 100
 """Ranges between two updates of a progress bar."""

@@ -10,7 +10,7 @@ from uwb_mitigation.sources.source import Source
 
 ACCEPTED = (
     "an MCAP bag (.mcap, or a folder with metadata.yaml), "
-    "or DecaRanging logs (.log, .log.xz, or a folder of them)"
+    "DecaRanging logs (.log, .log.xz, or a folder of them), or DeepUWB's pickle (.pkl)"
 )
 
 _MCAP_MAGIC = b"\x89MCAP0\r\n"
@@ -42,6 +42,10 @@ def open_recording(path: Path, *, cir: Literal["final", "poll"] = "final") -> So
         from uwb_mitigation.sources.decaranging import CirOf, open_decaranging
 
         return open_decaranging(path, cir=CirOf[cir.upper()])
+    if path.suffix == ".pkl" or _looks_like_pickle(path):
+        from uwb_mitigation.sources.deepuwb import DeepUwbRecording
+
+        return DeepUwbRecording(path)
     raise RecordingError("not a recording that can be read", where=str(path), valid=ACCEPTED)
 
 
@@ -57,6 +61,11 @@ def _is_bag(path: Path) -> bool:
 def _looks_like_log(path: Path) -> bool:
     head = _head(path)
     return head.startswith(_XZ_MAGIC) or b"DecaRanging" in head
+
+
+def _looks_like_pickle(path: Path) -> bool:
+    head = _head(path)
+    return len(head) > 1 and head[0] == 0x80 and head[1] in range(2, 6)  # the opcode PROTO and its number
 
 
 def _head(path: Path) -> bytes:
