@@ -163,7 +163,7 @@ def test_a_signal_ends_the_mitigator_cleanly(ros: Ros, number: signal.Signals):
     [
         (("source:=mcap", "path:=/nonexistent/bag.mcap"), "/nonexistent/bag.mcap"),
         (("source:=mcap",), "path"),
-        (("source:=carrier_pigeon",), "one of mcap, decaranging, simulated"),
+        (("source:=carrier_pigeon",), "one of mcap, decaranging, simulated, serial"),
         (("rate:=-1.0",), "rate"),
         (("rate:=.nan",), "rate"),
         (("loop:=3",), "loop"),

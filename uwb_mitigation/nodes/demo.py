@@ -17,6 +17,7 @@ from typing import Annotated
 
 import rclpy
 import typer
+from rclpy.signals import SignalHandlerOptions
 from rich.console import Console
 from rich.live import Live
 
@@ -98,9 +99,10 @@ def stop(process: subprocess.Popen[bytes]) -> int:
 
 def watch(programme: Programme, console: Console) -> int:
     """Run the nodes and show what they say. Returns the exit code."""
-    rclpy.init()
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     monitor = Monitor()
-    thread = threading.Thread(target=spin, args=(monitor,), daemon=True)
+    seen = threading.Event()
+    thread = threading.Thread(target=spin, args=(monitor, seen), daemon=True)
     thread.start()
     mitigator = start("mitigator")
     driver: subprocess.Popen[bytes] | None = None
@@ -122,9 +124,10 @@ def watch(programme: Programme, console: Console) -> int:
         codes["mitigator"] = stop(mitigator)
         if driver is not None:
             codes["driver"] = stop(driver)
-        rclpy.try_shutdown()
+        seen.set()
         thread.join()
         monitor.destroy_node()
+        rclpy.try_shutdown()
     console.print(summary(monitor.tally))
     failed = [f"{name} ended with exit code {code}" for name, code in codes.items() if code]
     if monitor.tally.missing or not monitor.tally.corrected:

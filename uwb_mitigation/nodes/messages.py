@@ -14,7 +14,8 @@ from std_msgs.msg import Header
 from uwb_mitigation_msgs.msg import Cir as CirMessage
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
 
-from uwb_mitigation.measurement import Cir, CorrectedRange, Encoding, RangeMeasurement, Truth
+from uwb_mitigation.link.messages import Correction
+from uwb_mitigation.measurement import Cir, CorrectedRange, Encoding, Origin, RangeMeasurement, Status, Truth
 
 NANOSECONDS = 1_000_000_000
 _COMPLEX = Encoding.COMPLEX_INT16
@@ -99,6 +100,47 @@ def fill_range_corrected(message: RangeCorrected, raw: RangeCir, corrected: Corr
     message.status = int(corrected.status)
     message.source = int(corrected.origin)
     message.model_id = int(corrected.model_id)
+
+
+def to_range_corrected(correction: Correction, header: Header) -> RangeCorrected:
+    """The message of a range that a board corrected."""
+    corrected = correction.corrected
+    return RangeCorrected(
+        header=header,
+        tag_id=correction.tag_id,
+        anchor_id=correction.anchor_id,
+        sequence=correction.sequence,
+        range=float(corrected.range_m),
+        range_raw=float(corrected.range_raw_m),
+        correction=float(corrected.correction_m),
+        variance=float(corrected.variance_m2),
+        status=int(corrected.status),
+        source=int(corrected.origin),
+        model_id=int(corrected.model_id),
+    )
+
+
+def from_range_corrected(message: RangeCorrected) -> CorrectedRange:
+    """The corrected range in a message; its status and source must be known ones.
+
+    Raises:
+        ValueError: they are not.
+    """
+    return CorrectedRange(
+        range_m=message.range,
+        range_raw_m=message.range_raw,
+        correction_m=message.correction,
+        variance_m2=message.variance,
+        status=Status(message.status),
+        origin=Origin(message.source),
+        model_id=message.model_id,
+    )
+
+
+def key_of(message: RangeCir | RangeCorrected | RangeTruth) -> tuple[int, ...]:
+    """What identifies an exchange on every topic."""
+    stamp = message.header.stamp
+    return (stamp.sec, stamp.nanosec, message.anchor_id, message.tag_id, message.sequence)
 
 
 def to_range_truth(truth: Truth, measurement: RangeMeasurement, header: Header) -> RangeTruth:

@@ -42,6 +42,7 @@ class Mitigator(LifecycleNode):
         self._mitigation: Mitigation | None = None
         self._error: UwbMitigationError | None = None
         self._statuses: Counter[Status] = Counter()
+        self._meter = diagnostics.Meter()
         # rclpy serialises at once: one message serves every publication.
         self._message = RangeCorrected()
         self._raw: Subscription | None = None
@@ -97,10 +98,12 @@ class Mitigator(LifecycleNode):
         # Subscriptions go on firing while a lifecycle node is inactive.
         if self._mitigation is None:
             return
-        corrected = self._mitigation.correct(messages.from_range_cir(raw))
+        measurement = messages.from_range_cir(raw)
+        corrected = self._mitigation.correct(measurement)
         messages.fill_range_corrected(self._message, raw, corrected)
         self._corrected.publish(self._message)
         self._statuses[corrected.status] += 1
+        self._meter.add(self.get_clock().now().nanoseconds - measurement.stamp_ns)
 
     def _publish_diagnostics(self) -> None:
         state = self._state_machine.current_state
@@ -110,6 +113,7 @@ class Mitigator(LifecycleNode):
         elif state[0] != State.PRIMARY_STATE_ACTIVE:
             level, text = diagnostics.WARN, f"not active: {state[1]}"
         facts: dict[str, object] = {f"ranges {status.name}": self._statuses[status] for status in Status}
+        facts |= self._meter.facts()
         if self._mitigation is not None:
             bundle = self._mitigation.bundle
             facts |= {"model": bundle.name, "model id": f"{bundle.model_id:08x}"}
@@ -117,4 +121,4 @@ class Mitigator(LifecycleNode):
 
 
 def main() -> None:
-    sys.exit(run(Mitigator))
+    sys.exit(run(lambda stop: Mitigator()))

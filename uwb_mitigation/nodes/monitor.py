@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-import sys
 import threading
+import time
 
 import rclpy
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 from rich.console import Console, Group
 from rich.live import Live
 from rich.table import Table
@@ -16,7 +17,7 @@ from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
 
 from uwb_mitigation.measurement import Status
 from uwb_mitigation.nodes import topics
-from uwb_mitigation.nodes.messages import NANOSECONDS
+from uwb_mitigation.nodes.messages import NANOSECONDS, key_of
 from uwb_mitigation.nodes.running import spin
 from uwb_mitigation.nodes.tally import Tally
 
@@ -37,13 +38,13 @@ class Monitor(Node):
         self.tally.add_raw()
 
     def _on_truth(self, message: RangeTruth) -> None:
-        self.tally.add_truth(_key(message), message.range, message.label)
+        self.tally.add_truth(key_of(message), message.range, message.label)
 
     def _on_corrected(self, message: RangeCorrected) -> None:
         now_ns = self.get_clock().now().nanoseconds
         stamp = message.header.stamp
         self.tally.add_corrected(
-            _key(message),
+            key_of(message),
             (message.anchor_id, message.tag_id),
             arrival_s=now_ns / NANOSECONDS,
             latency_s=(now_ns - stamp.sec * NANOSECONDS - stamp.nanosec) / NANOSECONDS,
@@ -52,11 +53,6 @@ class Monitor(Node):
             variance_m2=message.variance,
             status=Status(message.status),
         )
-
-
-def _key(message: RangeCorrected | RangeTruth) -> tuple[int, ...]:
-    stamp = message.header.stamp
-    return (stamp.sec, stamp.nanosec, message.anchor_id, message.tag_id, message.sequence)
 
 
 def metres(value: float) -> str:
@@ -133,21 +129,22 @@ def summary(tally: Tally) -> Group:
 
 def main() -> None:
     """Show what passes on the topics until Ctrl-C."""
-    rclpy.init()
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = Monitor()
+    stop = threading.Event()
     # The screen is drawn by this thread, messages are counted by another.
-    thread = threading.Thread(target=spin, args=(node,), daemon=True)
+    thread = threading.Thread(target=spin, args=(node, stop), daemon=True)
     thread.start()
     console = Console()
     try:
         with Live(console=console, refresh_per_second=REFRESH_HZ) as live:
-            while thread.is_alive():
+            while True:
                 live.update(live_table(node.tally, "UWB ranges"))
-                thread.join(1 / REFRESH_HZ)
+                time.sleep(1 / REFRESH_HZ)
     except KeyboardInterrupt:
         pass
-    rclpy.try_shutdown()
+    stop.set()
     thread.join()
     console.print(summary(node.tally))
     node.destroy_node()
-    sys.exit(0)
+    rclpy.try_shutdown()

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-import contextlib
+import signal
 import sys
+import threading
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import rclpy
-from rclpy.executors import ExternalShutdownException
-from rclpy.lifecycle import LifecycleNode
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 
 from uwb_mitigation.errors import UwbMitigationError
 
+PATIENCE_S = 0.2
 
-def spin(node: LifecycleNode) -> None:
-    """Serve callbacks until the context shuts down (Ctrl-C, SIGTERM, or the node itself).
+
+def spin(node: Node, stop: threading.Event) -> None:
+    """Serve a node's callbacks until `stop` is set.
 
     The events executor costs a quarter of the default executor's time a message; its own `spin()`
     never returns on shutdown, so it is turned here. Older rclpy releases lack it.
@@ -25,23 +29,30 @@ def spin(node: LifecycleNode) -> None:
         from rclpy.executors import SingleThreadedExecutor as Executor
     executor = Executor()
     executor.add_node(node)
-    with contextlib.suppress(ExternalShutdownException):
-        while rclpy.ok():
-            executor.spin_once(timeout_sec=0.2)
+    while not stop.is_set():
+        executor.spin_once(timeout_sec=PATIENCE_S)
 
 
-def run(make_node: Callable[[], LifecycleNode], arguments: Sequence[str] | None = None) -> int:
+def run(make_node: Callable[[threading.Event], Node], arguments: Sequence[str] | None = None) -> int:
     """Initialise ROS, make a node, spin it, and end cleanly. Returns the process's exit code.
 
-    A node may set `exit_code` before it shuts the context down.
+    SIGINT and SIGTERM set the event that `make_node` is given; so may the node, with its `exit_code`
+    set before. ROS's own handlers would tear the context down under callbacks that still publish.
     """
-    rclpy.init(args=arguments)
-    node: LifecycleNode | None = None
+    stop = threading.Event()
+
+    def on_signal(number: int, frame: Any) -> None:
+        stop.set()
+        # A second one ends the process the hard way.
+        signal.signal(number, signal.SIG_DFL)
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, on_signal)
+    rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+    node: Node | None = None
     try:
-        node = make_node()
-        spin(node)
-    except KeyboardInterrupt:
-        pass
+        node = make_node(stop)
+        spin(node, stop)
     except UwbMitigationError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

@@ -1,0 +1,135 @@
+"""Hands what a board sends to the driver's publishers, from a thread of its own, and keeps its diagnosis.
+
+The port and the protocol are `link`'s; topics and messages are the driver's.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import Any
+
+from uwb_mitigation.link.events import (
+    Connected,
+    Disconnected,
+    Event,
+    ModeChanged,
+    ModeRefused,
+    VersionMismatch,
+)
+from uwb_mitigation.link.layout import PROTOCOL_VERSION, LogLevel
+from uwb_mitigation.link.messages import BoardStatus, Correction, Log
+from uwb_mitigation.link.port import BoardPort
+from uwb_mitigation.measurement import RangeMeasurement
+from uwb_mitigation.nodes import diagnostics
+
+PATIENCE_S = 0.5
+
+
+class BoardFeed:
+    """Calls `on_range` and `on_correction` for what arrives, and logs what happens to the board.
+
+    Args:
+        port: closed by `stop`.
+        now_ns: the clock that stamps are on.
+        logger: with `info`, `warning`, `error`, as rclpy's.
+
+    Attributes:
+        ranges, corrections: how many were handed on.
+        status: the board's latest STATUS; None before the first.
+    """
+
+    def __init__(
+        self,
+        port: BoardPort,
+        *,
+        on_range: Callable[[RangeMeasurement], None],
+        on_correction: Callable[[Correction], None],
+        now_ns: Callable[[], int],
+        logger: Any,
+    ) -> None:
+        self.port = port
+        self.ranges = 0
+        self.corrections = 0
+        self.meter = diagnostics.Meter()
+        self.status: BoardStatus | None = None
+        self._on_range = on_range
+        self._on_correction = on_correction
+        self._now_ns = now_ns
+        self._logger = logger
+        self._thread = threading.Thread(target=self._run, name="board feed", daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Close the port and wait for the thread; may be called twice."""
+        self.port.close()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def describe(self) -> tuple[str, bytes, str, dict[str, object]]:
+        """Hardware id, level, message and facts for the diagnostics."""
+        report = self.port.report()
+        facts: dict[str, object] = {
+            "port": report.port or "none",
+            "ranges published": self.ranges,
+            "corrections published": self.corrections,
+        }
+        hardware = "no board"
+        if report.hello is not None:
+            hardware = f"board {report.hello.board_id:x}"
+            facts |= {
+                "firmware": f"{report.hello.firmware_name} {'.'.join(map(str, report.hello.firmware_version))}",
+                "model id": f"{report.hello.model_id:08x}",
+                "mode": report.hello.mode.name.lower(),
+            }
+        facts |= self.meter.facts()
+        facts |= report.counts
+        if self.status is not None:
+            facts |= {f"board: {name}": value for name, value in asdict(self.status).items()}
+        level = diagnostics.ERROR if report.problem else diagnostics.OK
+        return hardware, level, report.problem or "connected", facts
+
+    def _run(self) -> None:
+        while not self.port.closed:
+            event = self.port.get(PATIENCE_S)
+            if event is not None:
+                self._handle(event)
+
+    def _handle(self, event: Event) -> None:
+        if isinstance(event, RangeMeasurement):
+            self.ranges += 1
+            self._on_range(event)
+            self.meter.add(self._now_ns() - event.stamp_ns)
+        elif isinstance(event, Correction):
+            self.corrections += 1
+            self._on_correction(event)
+            self.meter.add(self._now_ns() - event.stamp_ns)
+        elif isinstance(event, BoardStatus):
+            self.status = event
+        elif isinstance(event, Connected):
+            hello = event.hello
+            self._logger.info(
+                f"connected to board {hello.board_id:x}, model {hello.model_id:08x}, mode {hello.mode.name}"
+            )
+        elif isinstance(event, Disconnected):
+            self._logger.warning(f"the board is gone: {event.loss.value}; waiting for it")
+        elif isinstance(event, VersionMismatch):
+            self._logger.error(
+                f"the board speaks version {event.version} of the protocol, this driver version "
+                f"{PROTOCOL_VERSION}: update the older of the two"
+            )
+        elif isinstance(event, ModeChanged):
+            self._logger.info(f"the board is in mode {event.mode.name}")
+        elif isinstance(event, ModeRefused):
+            self._logger.warning(
+                f"the board stays in mode {event.mode.name} instead of {event.wanted.name}: has it a model?"
+            )
+        elif isinstance(event, Log):
+            # rclpy ties a severity to a line of code, hence two of them.
+            if event.level >= LogLevel.WARNING:
+                self._logger.warning(f"board: {event.text}")
+            else:
+                self._logger.info(f"board: {event.text}")
