@@ -1,22 +1,28 @@
-"""Random int8 networks, inputs that press on every rounding, and bundles of them, for the firmware's tests."""
+"""Exported random networks, measurements good and hostile, and real ones, for the firmware's tests."""
 
 from __future__ import annotations
 
+import itertools
+import math
+from dataclasses import replace
 from pathlib import Path
 
+import model_material
 import numpy as np
 
+from uwb_mitigation.firmware_export import synthetic
 from uwb_mitigation.firmware_export.export import golden_windows, write_header
 from uwb_mitigation.firmware_export.header import Golden, Identity
-from uwb_mitigation.firmware_export.mlp import PAPER_LAYERS, Int8Dense, Int8Mlp, nudge_mlp
+from uwb_mitigation.firmware_export.mlp import Int8Mlp
 from uwb_mitigation.firmware_export.packing import pack_mlp, pack_remnet
-from uwb_mitigation.firmware_export.requantisation import nudge
-from uwb_mitigation.model.architecture import HEAD, Remnet
+from uwb_mitigation.measurement import Cir, Encoding, RangeMeasurement
+from uwb_mitigation.model import graph
+from uwb_mitigation.model.bundle import Bundle, save_bundle
 from uwb_mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.model.prior import LinePrior
-from uwb_mitigation.model.weights import FloatWeights, Int8Weights
+from uwb_mitigation.model.weights import Int8Weights
 from uwb_mitigation.preprocessing import Scaling
-from uwb_mitigation.training.quantization import quantize
+from uwb_mitigation.sources.decaranging import open_decaranging
 
 
 def identity(
@@ -27,62 +33,68 @@ def identity(
     return Identity("random", 0x1234ABCD, scaling, prior or LinePrior(0.25), limits_m, 0.0625, 0.25)
 
 
-def random_remnet(samples: int, first_kernel: int, modules: int = 3, seed: int = 0) -> Int8Weights:
-    random = np.random.default_rng([seed, samples, first_kernel, modules])
-    architecture = Remnet(samples, first_kernel=first_kernel, modules=modules)
-    weight, bias = {}, {}
-    for layer in architecture.convolutions:
-        fan_in = layer.inputs * layer.kernel
-        shape = (layer.filters, layer.inputs, layer.kernel)
-        weight[layer.name] = random.normal(0.1, np.sqrt(2 / fan_in), shape).astype(np.float32)
-        bias[layer.name] = random.normal(0, 0.1, layer.filters).astype(np.float32)
-    weight[HEAD] = random.normal(0, 0.05, (architecture.features, 1)).astype(np.float32)
-    bias[HEAD] = random.normal(0, 0.1, 1).astype(np.float32)
-    calibration = random.gamma(0.5, 0.5, (64, samples)).astype(np.float32)
-    return nudge(quantize(FloatWeights(architecture, weight, bias), calibration))
-
-
-def random_mlp(samples: int = 157, seed: int = 0) -> Int8Mlp:
-    random = np.random.default_rng([seed, samples])
-    layers, inputs, input_scale = [], samples, np.float32(0.011)
-    values = random.integers(0, 256, (256, samples))
-    scale = input_scale
-    for outputs in PAPER_LAYERS:
-        weight = random.integers(-63, 64, (outputs, inputs)).astype(np.int8)
-        bias = random.integers(-20000, 20000, outputs).astype(np.int32)
-        weight_scale = random.uniform(0.001, 0.003, outputs).astype(np.float32)
-        reals = np.maximum(values @ weight.T.astype(int) + bias, 0) * (scale * weight_scale)
-        output_scale = np.float32(np.percentile(reals, 99) / 255)
-        values = np.clip(np.rint(reals / output_scale), 0, 255).astype(int)
-        layers.append(Int8Dense(weight, bias, weight_scale, output_scale))
-        inputs, scale = outputs, output_scale
-    head = random.integers(-63, 64, inputs).astype(np.int8)
-    return nudge_mlp(Int8Mlp(input_scale, tuple(layers), head, -1234, np.float32(0.002)))
-
-
-def pressing_windows(samples: int, input_scale: float, count: int, seed: int = 1) -> np.ndarray:
-    """Windows: noise at every level, impulses, zeros, saturation, ties of the input's rounding."""
-    random = np.random.default_rng([seed, samples])
-    levels = np.exp(random.uniform(np.log(2), np.log(600), count))
-    windows = random.uniform(0, 1, (count, samples)) * levels[:, None]
-    windows[::5] = random.gamma(0.3, 1.0, windows[::5].shape) * levels[::5, None]
-    windows[1::5] = random.integers(0, 2, windows[1::5].shape) * 255
-    windows[2::5] = random.integers(0, 256, windows[2::5].shape) + 0.5
-    sparse = windows[3::5]
-    sparse[random.uniform(size=sparse.shape) < 0.95] = 0
-    windows[0], windows[-1] = 0, 1e6
-    return (windows * input_scale).astype(np.float32)
-
-
 def write_remnet(folder: Path, weights: Int8Weights, card: Identity | None = None) -> Path:
     network = pack_remnet(weights)
     windows = golden_windows(network)
-    return write_header(
-        folder, network, card or identity(), Golden(windows, IntegerNetwork(weights).predict_m(windows))
-    )
+    golden = Golden(windows, IntegerNetwork(weights).predict_m(windows))
+    return write_header(folder, network, card or identity(), golden)
 
 
 def write_mlp(folder: Path, weights: Int8Mlp, card: Identity | None = None) -> Path:
     network = pack_mlp(weights)
     windows = golden_windows(network)
     return write_header(folder, network, card or identity(), Golden(windows, weights.predict_m(windows)))
+
+
+def exact_bundle(folder: Path, samples: int = 32) -> Bundle:
+    """A bundle of random weights, with scales that the firmware can equal, and a prior that needs powers."""
+    weights = synthetic.random_remnet(samples, 3)
+    card = model_material.card(weights.architecture, correction_limits_m=(-500.0, 500.0))
+    return save_bundle(folder / "exact.onnx", graph.int8_model(weights), card)
+
+
+def random_cir(random: np.random.Generator) -> Cir:
+    """A CIR that is usable about half of the time; float fields hold binary32 values."""
+
+    def single(value: float) -> float:
+        return float(np.float32(value))
+
+    encoding = Encoding(random.integers(0, 2))
+    samples = random.integers(-3000, 3000, random.choice([0, 1, 60, 200, 315, 2032])).astype(np.int16)
+    if encoding is Encoding.MAGNITUDE and random.random() < 0.9:
+        samples = np.abs(samples)
+    if random.random() < 0.1:
+        samples[:] = 0
+    if random.random() < 0.1 and len(samples):
+        samples[random.integers(0, len(samples), 30)] = random.choice([32767, -32768, 32766])
+    start = int(random.choice([0, 700, -5, 2**31 - 1, -(2**31)]))
+    first = random.choice(
+        [math.nan, math.inf, 1e30, -1e30, 3e9, start + random.uniform(0, 120)], p=[0.05] * 5 + [0.75]
+    )
+    scale = random.choice([1.0, 0.37, 12.5, 0.0, -1.0, math.nan, math.inf], p=[0.5, 0.2, 0.2] + [0.025] * 4)
+    preamble = int(random.choice([0, 1, 118, 65535], p=[0.1, 0.2, 0.6, 0.1]))
+    return Cir(
+        samples,
+        encoding,
+        start_index=start,
+        first_path_index=single(first),
+        scale=single(scale),
+        preamble_count=preamble,
+    )
+
+
+def random_measurement(random: np.random.Generator) -> RangeMeasurement:
+    """A measurement that is hostile about half of the time."""
+    usual = model_material.cir(int(random.integers(0, 50)))
+    cir = random_cir(random) if random.random() < 0.4 else usual
+    powers = random.choice([-80.5, -91.25, -1e4, math.nan, math.inf], 2, p=[0.45, 0.45, 0.04, 0.03, 0.03])
+    cir = replace(cir, rx_power_dbm=float(powers[0]), first_path_power_dbm=float(powers[1]))
+    range_m = random.choice([3.25, 0.0, -1.0, math.nan, 1e7], p=[0.8, 0.05, 0.05, 0.05, 0.05])
+    return RangeMeasurement(1, 2, 3, 4, 5, float(range_m), cir)
+
+
+def real_measurements(apartment: Path, count: int) -> list[RangeMeasurement]:
+    """Measurements spread over the logs."""
+    with open_decaranging(apartment) as source:
+        records = [record.measurement for record in itertools.islice(source, 0, None, 4)]
+    return records[:: max(1, len(records) // count)][:count]

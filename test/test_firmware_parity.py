@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import shutil
 from pathlib import Path
 
@@ -11,11 +10,18 @@ import numpy as np
 import onnxruntime
 import pytest
 
-from uwb_mitigation.firmware_export.host import HostFirmware
-from uwb_mitigation.measurement import Cir, Encoding
+from uwb_mitigation.errors import UwbMitigationError
+from uwb_mitigation.firmware_export import synthetic
+from uwb_mitigation.firmware_export.export import export_bundle
+from uwb_mitigation.firmware_export.host import WARNINGS, HostFirmware, firmware_folder, run
+from uwb_mitigation.firmware_export.mlp_graph import mlp_model
+from uwb_mitigation.measurement import Status
+from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model import graph
+from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.model.session import session_options
+from uwb_mitigation.model.shipped import default_model_path
 from uwb_mitigation.preprocessing import WINDOW_SIZES, Preprocessing, Scaling
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc")
@@ -29,17 +35,17 @@ def bits(values: np.ndarray) -> np.ndarray:
 
 
 def test_oracle_windows_are_not_all_alike():
-    weights = firmware_models.random_remnet(157, 3)
-    windows = firmware_models.pressing_windows(157, float(weights.activation_scale["input"]), 500)
+    weights = synthetic.random_remnet(157, 3)
+    windows = synthetic.pressing_windows(157, weights.activation_scale["input"], 500)
     assert len(np.unique(IntegerNetwork(weights).predict_m(windows))) > 300
 
 
 @pytest.mark.parametrize("first_kernel", [3, 5])
 @pytest.mark.parametrize("samples", WINDOW_SIZES)
 def test_c_equals_oracle_and_onnx_runtime(samples: int, first_kernel: int, tmp_path: Path):
-    weights = firmware_models.random_remnet(samples, first_kernel)
+    weights = synthetic.random_remnet(samples, first_kernel)
     firmware_models.write_remnet(tmp_path, weights)
-    windows = firmware_models.pressing_windows(samples, float(weights.activation_scale["input"]), 5000)
+    windows = synthetic.pressing_windows(samples, weights.activation_scale["input"], 5000)
     session = onnxruntime.InferenceSession(
         graph.int8_model(weights), session_options(), providers=["CPUExecutionProvider"]
     )
@@ -53,22 +59,27 @@ def test_c_equals_oracle_and_onnx_runtime(samples: int, first_kernel: int, tmp_p
     assert np.array_equal(bits(computed), expected[: len(checked)])
 
 
-@pytest.mark.parametrize("samples", [9, 12, 23, 40, 81, 156])
-@pytest.mark.parametrize("modules", [1, 2, 3])
+@pytest.mark.parametrize(("samples", "modules"), [(9, 1), (12, 2), (23, 3), (40, 2), (81, 3), (156, 1)])
 def test_any_length_and_number_of_modules(samples: int, modules: int, tmp_path: Path):
-    weights = firmware_models.random_remnet(samples, 3, modules)
+    weights = synthetic.random_remnet(samples, 3, modules)
     firmware_models.write_remnet(tmp_path, weights)
-    windows = firmware_models.pressing_windows(samples, float(weights.activation_scale["input"]), 40)
+    windows = synthetic.pressing_windows(samples, weights.activation_scale["input"], 40)
     computed = HostFirmware(tmp_path, tmp_path, SANITIZED).predict_m(windows)
     assert np.array_equal(bits(computed), bits(IntegerNetwork(weights).predict_m(windows)))
 
 
-def test_mlp_equals_its_oracle(tmp_path: Path):
-    weights = firmware_models.random_mlp()
+def test_mlp_equals_oracle_and_onnx_runtime(tmp_path: Path):
+    weights = synthetic.random_mlp()
     firmware_models.write_mlp(tmp_path, weights)
-    windows = firmware_models.pressing_windows(157, float(weights.input_scale), 2000)
-    computed = HostFirmware(tmp_path, tmp_path, SANITIZED).predict_m(windows)
-    assert np.array_equal(bits(computed), bits(weights.predict_m(windows)))
+    windows = synthetic.pressing_windows(157, weights.input_scale, 1000)
+    session = onnxruntime.InferenceSession(
+        mlp_model(weights), session_options(), providers=["CPUExecutionProvider"]
+    )
+
+    expected = bits(session.run(None, {"cir": windows})[0][:, 0])
+
+    assert np.array_equal(bits(weights.predict_m(windows)), expected)
+    assert np.array_equal(bits(HostFirmware(tmp_path, tmp_path).predict_m(windows)), expected)
 
 
 @pytest.fixture(scope="module")
@@ -78,39 +89,9 @@ def firmware(tmp_path_factory: pytest.TempPathFactory) -> dict[Scaling, HostFirm
     for scaling in Scaling:
         folder = tmp_path_factory.mktemp(scaling.value)
         identity = firmware_models.identity(scaling=scaling)
-        firmware_models.write_remnet(folder, firmware_models.random_remnet(32, 3), identity)
+        firmware_models.write_remnet(folder, synthetic.random_remnet(32, 3), identity)
         built[scaling] = HostFirmware(folder, folder, SANITIZED)
     return built
-
-
-def random_cir(random: np.random.Generator) -> Cir:
-    """A CIR that is usable about half of the time; float fields hold binary32 values."""
-
-    def single(value: float) -> float:
-        return float(np.float32(value))
-
-    encoding = Encoding(random.integers(0, 2))
-    samples = random.integers(-3000, 3000, random.choice([0, 1, 60, 200, 315, 2032])).astype(np.int16)
-    if encoding is Encoding.MAGNITUDE and random.random() < 0.9:
-        samples = np.abs(samples)
-    if random.random() < 0.1:
-        samples[:] = 0
-    if random.random() < 0.1 and len(samples):
-        samples[random.integers(0, len(samples), 30)] = random.choice([32767, -32768, 32766])
-    start = int(random.choice([0, 700, -5, 2**31 - 1, -(2**31)]))
-    first = random.choice(
-        [math.nan, math.inf, 1e30, -1e30, 3e9, start + random.uniform(0, 120)], p=[0.05] * 5 + [0.75]
-    )
-    scale = random.choice([1.0, 0.37, 12.5, 0.0, -1.0, math.nan, math.inf], p=[0.5, 0.2, 0.2] + [0.025] * 4)
-    preamble = int(random.choice([0, 1, 118, 65535], p=[0.1, 0.2, 0.6, 0.1]))
-    return Cir(
-        samples,
-        encoding,
-        start_index=start,
-        first_path_index=single(first),
-        scale=single(scale),
-        preamble_count=preamble,
-    )
 
 
 @pytest.mark.parametrize("scaling", list(Scaling))
@@ -122,7 +103,7 @@ def test_preprocessing_gives_the_same_bits_and_the_same_faults(
     expected, computed = np.zeros(32, np.float32), np.zeros(32, np.float32)
     faults = set()
     for _ in range(3000):
-        cir = random_cir(random)
+        cir = firmware_models.random_cir(random)
         fault = preprocessing.apply(cir, expected)
         assert firmware[scaling].preprocess(cir, computed) == fault
         if fault is None:
@@ -130,3 +111,85 @@ def test_preprocessing_gives_the_same_bits_and_the_same_faults(
         faults.add(fault)
     assert len(faults) >= 8
     assert None in faults
+
+
+def test_corrected_ranges_equal_the_mitigators(tmp_path: Path):
+    bundle = firmware_models.exact_bundle(tmp_path)
+    export_bundle(bundle, tmp_path)
+    firmware, mitigation = HostFirmware(tmp_path, tmp_path, SANITIZED), Mitigation(bundle)
+    random = np.random.default_rng(11)
+    seen = set()
+    for _ in range(2000):
+        measurement = firmware_models.random_measurement(random)
+        expected = mitigation.correct(measurement)
+        computed = firmware.correct(measurement.range_m, measurement.cir)
+        assert computed[3] == int(expected.status)
+        values = [expected.range_m, expected.correction_m, expected.variance_m2]
+        assert np.array_equal(bits(np.array(computed[:3])), bits(np.array(values)))
+        seen.add(expected.status)
+    assert seen == {Status.OK, Status.NO_CIR, Status.BAD_CIR, Status.OUT_OF_DISTRIBUTION}
+
+
+def test_real_logs_are_corrected_as_by_the_mitigator(apartment: Path, tmp_path: Path):
+    bundle = load_bundle(default_model_path())
+    export_bundle(bundle, tmp_path)
+    firmware, mitigation = HostFirmware(tmp_path, tmp_path), Mitigation(bundle)
+    corrected = 0
+    for measurement in firmware_models.real_measurements(apartment, 300):
+        expected = mitigation.correct(measurement)
+        computed = firmware.correct(measurement.range_m, measurement.cir)
+        values = [expected.range_m, expected.correction_m, expected.variance_m2]
+        assert np.array_equal(bits(np.array(computed[:3])), bits(np.array(values)))
+        corrected += expected.status is Status.OK
+    assert corrected > 200
+
+
+def test_golden_vectors_pass_under_the_sanitizers(tmp_path: Path):
+    firmware_models.write_remnet(tmp_path, synthetic.random_remnet(64, 5))
+    sources = firmware_folder()
+    program = tmp_path / "golden"
+    run(
+        [
+            "cc",
+            *(
+                "-std=c99",
+                "-g",
+                "-O1",
+                "-fsanitize=address,undefined",
+                "-fno-sanitize-recover=all",
+                *WARNINGS,
+            ),
+            *(f"-I{sources / 'src'}", f"-I{tmp_path}", str(sources / "test" / "golden.c")),
+            *map(str, (sources / "src").glob("*.c")),
+            *("-o", str(program), "-lm"),
+        ]
+    )
+    assert "0 of 8 golden vectors wrong" in run([str(program)])
+
+
+def test_golden_vectors_notice_a_changed_weight(tmp_path: Path):
+    header = firmware_models.write_remnet(tmp_path, synthetic.random_remnet(16, 3))
+    text = header.read_text()
+    start = text.index("{\n", text.index("uwb_module1_residual_weights[")) + 2
+    first = text[start : text.index(",", start)].strip()
+    header.write_text(text[:start] + text[start:].replace(first, str(int(first) ^ 32), 1))
+    sources = firmware_folder()
+    program = tmp_path / "golden"
+    run(
+        [
+            *("cc", "-std=c99", f"-I{sources / 'src'}", f"-I{tmp_path}", str(sources / "test" / "golden.c")),
+            *map(str, (sources / "src").glob("*.c")),
+            *("-o", str(program), "-lm"),
+        ]
+    )
+    with pytest.raises(UwbMitigationError, match="exit 1"):
+        run([str(program)])
+
+
+@pytest.mark.skipif(shutil.which("cmake") is None, reason="no CMake: apt install cmake")
+def test_plain_cmake_builds_the_library_and_passes_its_test(tmp_path: Path):
+    firmware_models.write_remnet(tmp_path, synthetic.random_remnet(16, 3))
+    build = tmp_path / "build"
+    run(["cmake", "-S", str(firmware_folder()), "-B", str(build), f"-DUWB_MODEL_DIR={tmp_path}"])
+    run(["cmake", "--build", str(build)])
+    run(["ctest", "--test-dir", str(build)])

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import firmware_models
 import numpy as np
 import pytest
 
 from uwb_mitigation.errors import ModelError
-from uwb_mitigation.firmware_export import requantisation
+from uwb_mitigation.firmware_export import requantisation, synthetic
 from uwb_mitigation.firmware_export.packing import pack_remnet
 
 
@@ -75,7 +74,7 @@ def test_sums_out_of_range_are_not_solved(ratios: tuple[float, float]):
 
 
 def test_nudge_makes_a_network_exportable_and_moves_no_scale_by_more_than_64_ulps():
-    weights = firmware_models.random_remnet(64, 3)
+    weights = synthetic.random_remnet(64, 3)
     halved = {**weights.weight_scale, "first": weights.weight_scale["first"] * np.float32(1.0009)}
     before = type(weights)(
         weights.architecture, weights.weight, halved, weights.bias, weights.activation_scale
@@ -91,7 +90,7 @@ def test_nudge_makes_a_network_exportable_and_moves_no_scale_by_more_than_64_ulp
 
 
 def test_nudge_leaves_an_exact_network_as_it_is():
-    weights = firmware_models.random_remnet(32, 3)
+    weights = synthetic.random_remnet(32, 3)
     again = requantisation.nudge(weights)
     assert again.activation_scale == weights.activation_scale
     for name, scale in weights.weight_scale.items():

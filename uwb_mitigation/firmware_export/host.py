@@ -164,15 +164,21 @@ def build_shared_library(export: Path, build: Path, flags: Sequence[str] = ()) -
     return output
 
 
-def run(command: Sequence[str], timeout_s: float = 300) -> str:
-    """Run a tool and return its standard output.
+def run(command: Sequence[str], timeout_s: float = 300, folder: Path | None = None) -> str:
+    """Run a tool, in `folder`, and return its standard output.
 
     Raises:
         UwbMitigationError: it fails or takes too long; carries the first line that says why.
     """
     try:
         done = subprocess.run(
-            command, capture_output=True, text=True, timeout=timeout_s, check=False, stdin=subprocess.DEVNULL
+            command,
+            capture_output=True,
+            text=True,
+            timeout=timeout_s,
+            check=False,
+            stdin=subprocess.DEVNULL,
+            cwd=folder,
         )
     except subprocess.TimeoutExpired as error:
         raise UwbMitigationError(f"took more than {timeout_s} s", where=command[0]) from error

@@ -43,10 +43,25 @@ typedef struct {
 
 void board_exit(int code);
 
+/* A guard follows what the library is given of it. */
 static uint32_t arena[ARENA_BYTES / sizeof(uint32_t)];
+static size_t arena_bytes;
 
 __attribute__((noreturn)) void board_exit(int code) {
     semihosting_exit(code);
+}
+
+static uint8_t *guard(void) {
+    return (uint8_t *)arena + arena_bytes;
+}
+
+static int guard_is_whole(void) {
+    for (const uint8_t *byte = guard(); byte < (const uint8_t *)arena + sizeof arena; byte++) {
+        if (*byte != 0x5A) {
+            return 0;
+        }
+    }
+    return 1;
 }
 
 static uint32_t ticks_since(uint32_t start) {
@@ -61,7 +76,7 @@ static __attribute__((noinline)) uint32_t stack_bytes(const float *window) {
     for (volatile uint8_t *free = top - STACK_PROBE_BYTES; free < top; free++) {
         *free = 0xA5;
     }
-    (void)uwb_network(&uwb_model_data, window, arena, sizeof arena, &output_m);
+    (void)uwb_network(&uwb_model_data, window, arena, arena_bytes, &output_m);
     volatile uint8_t *reached = top - STACK_PROBE_BYTES;
     while (reached < top && *reached == 0xA5) {
         reached++;
@@ -69,10 +84,10 @@ static __attribute__((noinline)) uint32_t stack_bytes(const float *window) {
     return (uint32_t)(top - reached);
 }
 
-static void run_window(const float *window, report *seen, uint32_t answer[2]) {
+static __attribute__((noinline)) void run_window(const float *window, report *seen, uint32_t answer[2]) {
     float output_m = 0.0f;
     const uint32_t start = SYST_CVR;
-    const uwb_status status = uwb_network(&uwb_model_data, window, arena, sizeof arena, &output_m);
+    const uwb_status status = uwb_network(&uwb_model_data, window, arena, arena_bytes, &output_m);
     const uint32_t ticks = ticks_since(start);
     seen->ticks_lowest = ticks < seen->ticks_lowest ? ticks : seen->ticks_lowest;
     seen->ticks_highest = ticks > seen->ticks_highest ? ticks : seen->ticks_highest;
@@ -120,7 +135,7 @@ static int run_cirs(int32_t input, int32_t output, uint32_t count, report *seen)
         uwb_corrected corrected;
         const uint32_t start = SYST_CVR;
         const uint32_t status =
-            (uint32_t)uwb_correct(&uwb_model_data, record.range_m, &cir, arena, sizeof arena, &corrected);
+            (uint32_t)uwb_correct(&uwb_model_data, record.range_m, &cir, arena, arena_bytes, &corrected);
         const uint32_t ticks = ticks_since(start);
         seen->ticks_correct = ticks > seen->ticks_correct ? ticks : seen->ticks_correct;
         if (!semihosting_write(output, &status, sizeof status) ||
@@ -144,15 +159,23 @@ int main(void) {
     if (input < 0 || output < 0 || !semihosting_read(input, header, sizeof header)) {
         return 2;
     }
+    arena_bytes = uwb_arena_size(&uwb_model_data);
+    if (arena_bytes == 0 || arena_bytes >= sizeof arena) {
+        return 5;
+    }
+    memset(guard(), 0x5A, sizeof arena - arena_bytes);
     SYST_RVR = SYST_MAX;
     SYST_CVR = 0;
     SYST_CSR = 5; /* processor clock, no interrupt */
 
-    report seen = {uwb_model_data.model_id, (uint32_t)uwb_arena_size(&uwb_model_data), 0, 0, UINT32_MAX, 0, 0};
+    report seen = {uwb_model_data.model_id, (uint32_t)arena_bytes, 0, 0, UINT32_MAX, 0, 0};
     const uint32_t start = SYST_CVR;
     seen.ticks_empty = ticks_since(start);
     const int code = header[0] == WINDOWS ? run_windows(input, output, header[1], &seen)
                                           : run_cirs(input, output, header[1], &seen);
+    if (!guard_is_whole()) {
+        return 6;
+    }
     if (code == 0 && !semihosting_write(output, &seen, sizeof seen)) {
         return 4;
     }

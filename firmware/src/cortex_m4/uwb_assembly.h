@@ -6,6 +6,8 @@
 
 #include "../uwb_target.h"
 
+#if UWB_CORTEX_M4
+
 #define BLOCK_BYTES 256
 #define ROW_BYTES 32
 /* Position -1 is the last slot of the row in the block before. */
@@ -81,4 +83,5 @@
         addeq   \offset, \offset, #ROW_BYTES
         .endm
 
+#endif
 #endif

@@ -1,7 +1,12 @@
 /* The frame of the two stride-2 kernels, which differ in their taps only: a block of r becomes four
  * positions of both branches, wide in r0 to r3 and narrow in r4 to r7. All 32 FPU registers hold
  * weights: for each channel pair tap 0, tap 2, tap 1, skip. */
+#ifndef UWB_REDUCE_H
+#define UWB_REDUCE_H
+
 #include "uwb_assembly.h"
+
+#if UWB_CORTEX_M4
 
 /* Frame */
 #define BIAS 0        /* wide, narrow */
@@ -112,3 +117,6 @@
         pop     {r4-r11, pc}
         end_function \name
         .endm
+
+#endif
+#endif

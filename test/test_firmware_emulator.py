@@ -1,0 +1,133 @@
+"""The Cortex-M4 kernels, in an emulated processor, equal ONNX Runtime on every output bit, within their budgets.
+
+An emulator counts instructions exactly; of wait states, caches and power it knows nothing.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import firmware_models
+import numpy as np
+import pytest
+
+from uwb_mitigation.firmware_export import emulator, measurement, synthetic, toolchain
+from uwb_mitigation.firmware_export.export import export_bundle
+from uwb_mitigation.firmware_export.toolchain import Board, Kernels
+from uwb_mitigation.measurement import RangeMeasurement
+from uwb_mitigation.mitigation import Mitigation
+from uwb_mitigation.model.bundle import Bundle, load_bundle
+from uwb_mitigation.model.integer import IntegerNetwork
+from uwb_mitigation.model.shipped import default_model_path
+from uwb_mitigation.preprocessing import WINDOW_SIZES
+
+MISSING = toolchain.missing_tools()
+pytestmark = pytest.mark.skipif(bool(MISSING), reason=f"{', '.join(MISSING)} not found: {toolchain.APT}")
+
+# Instructions of one inference, k0 = 3. The paper's rate at K = 157 means about 3.7 million cycles.
+BUDGET = {157: 360_000, 128: 320_000, 64: 162_000, 32: 82_000, 16: 48_000, 8: 40_000}
+
+
+def bits(values: np.ndarray) -> np.ndarray:
+    return np.asarray(values, np.float32).view(np.uint32)
+
+
+@pytest.mark.parametrize("samples", WINDOW_SIZES)
+def test_five_thousand_windows_equal_onnx_runtime_within_the_budget_of_instructions(samples: int):
+    (subject,) = measurement.subjects([samples], [3], mlp=False)
+    row = measurement.measure(subject, inputs=5000)
+    assert (row.mismatches, row.inputs) == (0, 5000)
+    assert row.instructions <= BUDGET[samples]
+    assert row.instructions < row.cycles_estimated < 2 * row.instructions
+
+
+@pytest.mark.parametrize("samples", WINDOW_SIZES)
+def test_first_kernel_of_five_equals_onnx_runtime(samples: int):
+    (subject,) = measurement.subjects([samples], [5], mlp=False)
+    row = measurement.measure(subject, inputs=1000)
+    assert row.mismatches == 0
+    assert row.instructions <= 1.05 * BUDGET[samples]
+
+
+def test_mlp_equals_onnx_runtime():
+    (subject,) = measurement.subjects([], [])
+    row = measurement.measure(subject, inputs=5000)
+    assert row.mismatches == 0
+    assert row.instructions <= 75_000
+
+
+def test_memory_fits_its_budget_at_the_longest_window():
+    (subject,) = measurement.subjects([157], [3], mlp=False)
+    row = measurement.measure(subject, inputs=2)
+    assert row.ram_bytes <= 11_000
+    assert row.flash_bytes <= 20_000
+    assert row.stack_bytes <= 512
+
+
+@pytest.mark.parametrize(("samples", "modules"), [(9, 1), (12, 2), (23, 3), (40, 2), (81, 3), (156, 1)])
+def test_any_length_and_number_of_modules(samples: int, modules: int, tmp_path: Path):
+    weights = synthetic.random_remnet(samples, 3, modules)
+    firmware_models.write_remnet(tmp_path, weights)
+    windows = synthetic.pressing_windows(samples, weights.activation_scale["input"], 200)
+    image = toolchain.build_image(tmp_path, tmp_path, Board.QEMU_MPS2)
+    result = emulator.run_windows(image, windows)
+    assert np.array_equal(bits(result.records["output_m"]), bits(IntegerNetwork(weights).predict_m(windows)))
+
+
+def test_a_wrong_weight_is_a_mismatch(tmp_path: Path):
+    (subject,) = measurement.subjects([16], [3], mlp=False)
+    subject.packed.head_weights[0] ^= 1
+    assert measurement.measure(subject, inputs=50).mismatches > 10
+
+
+def test_portable_c_and_trace_agree_with_the_kernels_and_the_counter(tmp_path: Path):
+    weights = synthetic.random_remnet(16, 3)
+    firmware_models.write_remnet(tmp_path, weights)
+    windows = synthetic.pressing_windows(16, weights.activation_scale["input"], 50)
+    results = {}
+    for kernels in Kernels:
+        image = toolchain.build_image(tmp_path, tmp_path, Board.QEMU_MPS2, kernels)
+        results[kernels] = emulator.run_windows(image, windows[:1])
+        traced = sum(emulator.count_executed(image, windows[0]).values())
+        # The counter also sees the instructions that set up the call.
+        assert abs(results[kernels].instructions - traced) <= 10
+        outputs = emulator.run_windows(image, windows).records["output_m"]
+        assert np.array_equal(bits(outputs), bits(IntegerNetwork(weights).predict_m(windows)))
+    assert results[Kernels.PORTABLE].instructions > 4 * results[Kernels.CORTEX_M4].instructions
+
+
+def check_corrections(bundle: Bundle, measurements: list[RangeMeasurement], folder: Path) -> set[int]:
+    """Compare the board's corrections with the mitigator's; return the statuses seen."""
+    export_bundle(bundle, folder)
+    image = toolchain.build_image(folder, folder, Board.QEMU_MPS2)
+    result = emulator.run_measurements(image, measurements, bundle.architecture.samples)
+    assert result.model_id == bundle.model_id
+    mitigation = Mitigation(bundle)
+    window = np.zeros(bundle.architecture.samples, np.float32)
+    for measured, row in zip(measurements, result.records, strict=True):
+        expected = mitigation.correct(measured)
+        assert row["range_status"] == int(expected.status)
+        values = [expected.range_m, expected.correction_m, expected.variance_m2]
+        computed = [row["range_m"], row["correction_m"], row["variance_m2"]]
+        assert np.array_equal(bits(np.array(computed)), bits(np.array(values)))
+        if bundle.preprocessing.apply(measured.cir, window) is None:
+            assert np.array_equal(bits(row["window"]), bits(window))
+    return set(result.records["range_status"].tolist())
+
+
+def test_good_and_hostile_measurements_are_corrected_as_by_the_mitigator(tmp_path: Path):
+    random = np.random.default_rng(3)
+    measurements = [firmware_models.random_measurement(random) for _ in range(500)]
+    assert check_corrections(firmware_models.exact_bundle(tmp_path), measurements, tmp_path) == {0, 1, 2, 3}
+
+
+def test_real_logs_are_corrected_as_by_the_mitigator(apartment: Path, tmp_path: Path):
+    measurements = firmware_models.real_measurements(apartment, 1000)
+    assert 0 in check_corrections(load_bundle(default_model_path()), measurements, tmp_path)
+
+
+def test_the_shipped_model_fits_the_dwm1001c(tmp_path: Path):
+    export_bundle(load_bundle(default_model_path()), tmp_path)
+    image = toolchain.build_image(tmp_path, tmp_path, Board.DWM1001C)
+    assert image.flash_bytes < 24 << 10
+    assert image.static_bytes < 12 << 10

@@ -1,0 +1,109 @@
+"""The C header: what is refused, and floats that read back to the same bits."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import firmware_models
+import model_material
+import numpy as np
+import pytest
+
+from uwb_mitigation.errors import ModelError, UwbMitigationError
+from uwb_mitigation.firmware_export import header, synthetic
+from uwb_mitigation.firmware_export.export import export_bundle
+from uwb_mitigation.firmware_export.packing import pack_remnet
+from uwb_mitigation.model import graph
+from uwb_mitigation.model.architecture import Remnet
+from uwb_mitigation.model.bundle import load_bundle, save_bundle
+from uwb_mitigation.model.shipped import default_model_path
+
+
+def test_floats_read_back_to_the_same_bits():
+    random = np.random.default_rng(0)
+    patterns = random.integers(0, 2**32, 20_000, np.uint32).view(np.float32)
+    for value in [*patterns[np.isfinite(patterns)], np.float32(0), np.float32(-0.0), np.float32(1e-45)]:
+        text = header.number(value)
+        assert re.fullmatch(r"-?\d+(\.\d+)?(e[+-]\d+)?f", text)
+        assert re.search(r"[.e]", text), "an integer with the suffix f is no C"
+        assert np.float32(text[:-1]).view(np.uint32) == value.view(np.uint32)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), 0.1, 1e300])
+def test_what_is_no_finite_float32_is_refused(value: float):
+    with pytest.raises(ModelError, match="float32"):
+        header.number(value)
+
+
+def test_the_shipped_model_is_exported_with_its_identity(tmp_path: Path):
+    bundle = load_bundle(default_model_path())
+    text = export_bundle(bundle, tmp_path / "new" / "folder").read_text()
+    assert f"0x{bundle.model_id:08x}u" in text
+    assert header.number(bundle.prior.per_rx_power) in text
+
+
+def test_exporting_twice_gives_the_same_bytes(tmp_path: Path):
+    bundle = firmware_models.exact_bundle(tmp_path)
+    assert (
+        export_bundle(bundle, tmp_path / "a").read_bytes()
+        == export_bundle(bundle, tmp_path / "b").read_bytes()
+    )
+
+
+def test_a_float_bundle_is_refused_with_the_remedy(tmp_path: Path):
+    architecture = Remnet(samples=32)
+    model = graph.float_model(model_material.random_weights(architecture))
+    bundle = save_bundle(tmp_path / "float.onnx", model, model_material.card(architecture, quantised=False))
+    with pytest.raises(ModelError, match="quantize"):
+        export_bundle(bundle, tmp_path)
+    assert not (tmp_path / "uwb_model.h").exists()
+
+
+@pytest.mark.parametrize(
+    ("architecture", "names"),
+    [
+        (Remnet(samples=32, filters=8), "filters = 8 .*16"),
+        (Remnet(samples=32, first_kernel=7), "first_kernel = 7 .*3 or 5"),
+        (Remnet(samples=7, modules=1), "samples = 7 .*8 to 157"),
+        (Remnet(samples=158), "samples = 158 .*8 to 157"),
+        (Remnet(samples=32, modules=4), "modules = 4 .*1 to 3"),
+        (Remnet(samples=32, kernel=5), "kernel = 5"),
+    ],
+)
+def test_shapes_without_kernels_are_refused(architecture: Remnet, names: str):
+    with pytest.raises(ModelError, match=names):
+        pack_remnet(model_material.random_int8(architecture))
+
+
+def test_a_scale_without_exact_integers_is_refused_by_layer_and_channel():
+    weights = synthetic.random_remnet(16, 3)
+    scales = weights.weight_scale["module2.skip"].copy()
+    # A requantisation by 1/64: every 64th accumulator is a tie, and ties go to even.
+    unit = weights.activation_scale["module2.skip"] / weights.activation_scale["module2.sum"]
+    scales[5] = unit / np.float32(64)
+    inexact = replace(weights, weight_scale={**weights.weight_scale, "module2.skip": scales})
+    with pytest.raises(ModelError, match=r"module2\.skip.*channel 5"):
+        pack_remnet(inexact)
+
+
+def test_a_sum_without_exact_integers_is_refused_by_name():
+    weights = synthetic.random_remnet(16, 3)
+    scales = {**weights.activation_scale, "module1.sum": weights.activation_scale["first"] / np.float32(3)}
+    with pytest.raises(ModelError, match=r"module1\.sum"):
+        pack_remnet(replace(weights, activation_scale=scales))
+
+
+def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UwbMitigationError, match="file"):
+        export_bundle(firmware_models.exact_bundle(tmp_path), tmp_path / "file")
+
+
+def test_a_hostile_name_cannot_end_the_comment(tmp_path: Path):
+    weights = synthetic.random_remnet(16, 3)
+    card = replace(firmware_models.identity(), name='*/ #include "/etc/passwd" /*\n')
+    text = firmware_models.write_remnet(tmp_path, weights, card).read_text()
+    assert "passwd" in text.splitlines()[0]
+    assert text.splitlines()[0].count("*/") == 1

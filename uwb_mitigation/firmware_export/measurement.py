@@ -1,0 +1,186 @@
+"""Measures exported models in the emulator: instructions, estimated cycles, memory, and equality with
+ONNX Runtime."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+from numpy.typing import NDArray
+
+from uwb_mitigation.firmware_export import emulator
+from uwb_mitigation.firmware_export.cycles import estimate_cycles
+from uwb_mitigation.firmware_export.export import golden_windows, identity, write_header
+from uwb_mitigation.firmware_export.header import Golden, Identity
+from uwb_mitigation.firmware_export.mlp_graph import mlp_model
+from uwb_mitigation.firmware_export.packing import PackedNetwork, pack_mlp, pack_remnet
+from uwb_mitigation.firmware_export.synthetic import pressing_windows, random_mlp, random_remnet
+from uwb_mitigation.firmware_export.toolchain import Board, Kernels, build_image, measure_size
+from uwb_mitigation.model import graph
+from uwb_mitigation.model.bundle import Bundle
+from uwb_mitigation.model.prior import LinePrior
+from uwb_mitigation.model.session import session_options
+from uwb_mitigation.model.weights import Int8Weights
+from uwb_mitigation.preprocessing import WINDOW_SIZES, Scaling
+
+CLOCK_HZ = 64e6
+"""Of the paper's board, an Arduino Nano 33 BLE Sense."""
+
+PAPER = {
+    ("remnet", 157): (17.2, 53.4),
+    ("remnet", 128): (21.2, 52.8),
+    ("remnet", 64): (41.0, 52.2),
+    ("remnet", 32): (77.8, 51.6),
+    ("remnet", 16): (140.0, 51.6),
+    ("mlp", 157): (184.1, 53.4),
+}
+"""Inferences a second and power in mW, by network and window length (paper, Table 3)."""
+
+DEFAULT_INPUTS = 5000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Subject:
+    """A network to measure.
+
+    Attributes:
+        network: `remnet` or `mlp`, as in `PAPER`.
+        first_kernel: k0; 0 for an MLP.
+        packed: what the firmware is given.
+        card: what the header says beside it.
+        onnx: the serialised ONNX model.
+        windows_shape: of its input after the number of windows.
+    """
+
+    network: str
+    first_kernel: int
+    packed: PackedNetwork
+    card: Identity
+    onnx: bytes
+    windows_shape: tuple[int, ...]
+
+    def expect(self, windows: NDArray[np.float32]) -> NDArray[np.float32]:
+        """ONNX Runtime's outputs for windows (n, K)."""
+        session = onnxruntime.InferenceSession(
+            self.onnx, session_options(), providers=["CPUExecutionProvider"]
+        )
+        shaped = windows.reshape(len(windows), *self.windows_shape)
+        outputs: NDArray[np.float32] = session.run(None, {graph.INPUT: shaped})[0][:, 0]
+        return outputs
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One measurement; the keys of `bench firmware`.
+
+    Attributes:
+        model: `remnet` or `mlp`.
+        k, k0: window length and first kernel; k0 is 0 for an MLP.
+        kernels: `cortex_m4` (assembly) or `portable` (C, -O3).
+        instructions: of one inference from a window of floats, the most over all inputs.
+        cycles_estimated: at zero wait states, see `cycles`.
+        ram_bytes: the arena; `stack_bytes` come on top.
+        flash_bytes: an image that does nothing but correct ranges.
+        mismatches, inputs: outputs that differ from ONNX Runtime's in any bit, of how many.
+        hz: at 64 MHz; `energy_mj` at the paper's power; `paper_hz`; None where the paper has none.
+    """
+
+    model: str
+    k: int
+    k0: int
+    kernels: str
+    instructions: int
+    cycles_estimated: int
+    ram_bytes: int
+    stack_bytes: int
+    flash_bytes: int
+    mismatches: int
+    inputs: int
+    hz: float
+    energy_mj: float | None
+    paper_hz: float | None
+
+
+def subjects(
+    windows: Sequence[int] = WINDOW_SIZES, first_kernels: Sequence[int] = (3, 5), mlp: bool = True
+) -> Iterator[Subject]:
+    """A random network of every shape asked for."""
+    for first_kernel in first_kernels:
+        for samples in windows:
+            weights = random_remnet(samples, first_kernel)
+            yield remnet_subject(weights, _nameless(), graph.int8_model(weights))
+    if mlp:
+        dense = random_mlp()
+        yield Subject("mlp", 0, pack_mlp(dense), _nameless(), mlp_model(dense), (dense.samples,))
+
+
+def bundle_subject(bundle: Bundle) -> Subject:
+    """A trained model.
+
+    Raises:
+        ModelError: as `export_bundle`.
+    """
+    return remnet_subject(
+        graph.int8_weights(bundle.model, bundle.architecture), identity(bundle), bundle.model
+    )
+
+
+def remnet_subject(weights: Int8Weights, card: Identity, onnx: bytes) -> Subject:
+    shape = weights.architecture
+    return Subject("remnet", shape.first_kernel, pack_remnet(weights), card, onnx, (1, shape.samples))
+
+
+def measure(
+    subject: Subject,
+    windows: NDArray[np.float32] | None = None,
+    kernels: Kernels = Kernels.CORTEX_M4,
+    inputs: int = DEFAULT_INPUTS,
+) -> Row:
+    """Measure one network on `windows`, float32 (n, K), or on `inputs` windows that press on every rounding.
+
+    Raises:
+        MissingDependencyError: compiler or emulator are missing; names the line that installs them.
+        UwbMitigationError: building or running fails.
+    """
+    packed = subject.packed
+    if windows is None:
+        windows = pressing_windows(packed.samples, packed.input_scale, inputs)
+    expected = subject.expect(windows)
+    examples = golden_windows(packed)
+    with tempfile.TemporaryDirectory(prefix="uwb_firmware_") as name:
+        folder = Path(name)
+        write_header(folder, packed, subject.card, Golden(examples, subject.expect(examples)))
+        optimisation = "-O3" if kernels is Kernels.PORTABLE else "-Os"
+        image = build_image(folder, folder, Board.QEMU_MPS2, kernels, optimisation)
+        result = emulator.run_windows(image, windows)
+        cycles = estimate_cycles(image, emulator.count_executed(image, windows[len(windows) // 2]))
+        flash = measure_size(folder, folder, kernels, optimisation).flash_bytes
+    paper_hz, paper_mw = PAPER.get((subject.network, packed.samples), (None, None))
+    hz = CLOCK_HZ / cycles
+    wrong = (result.records["output_m"].view(np.uint32) != expected.view(np.uint32)) | (
+        result.records["status"] != 0
+    )
+    return Row(
+        model=subject.network,
+        k=packed.samples,
+        k0=subject.first_kernel,
+        kernels=kernels.value,
+        instructions=result.instructions,
+        cycles_estimated=cycles,
+        ram_bytes=result.arena_bytes,
+        stack_bytes=result.stack_bytes,
+        flash_bytes=flash,
+        mismatches=int(np.count_nonzero(wrong)),
+        inputs=len(windows),
+        hz=hz,
+        energy_mj=None if paper_mw is None else paper_mw / hz,
+        paper_hz=paper_hz,
+    )
+
+
+def _nameless() -> Identity:
+    return Identity("random weights", 0, Scaling.PREAMBLE, LinePrior(0.0), (-1e3, 1e3), 1.0, 1.0)
