@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from uwb_mitigation.errors import DatasetError, RecordingError
 from uwb_mitigation.measurement import Cir, Encoding, RangeMeasurement, Truth
 from uwb_mitigation.preprocessing import WINDOW_LEAD
+from uwb_mitigation.sources.pickle_machine import Name
 from uwb_mitigation.sources.pickled_frame import Column, numbers, read_columns
 from uwb_mitigation.sources.source import Record
 
@@ -258,9 +259,11 @@ class _Rows:
 
 def _kind(cell: object) -> str:
     """What a cell is that is not what it should be; never its value, which may be huge."""
-    if cell is None:
+    if cell is None or type(cell) is Name:  # pandas.NA
         return "missing"
-    return "text" if type(cell) is str else f"a {type(cell).__name__} without numbers of its own"
+    if type(cell) is str:
+        return "text"
+    return "a number" if type(cell) in (bool, int, float) else "no array of numbers"
 
 
 class DeepUwbRecording:

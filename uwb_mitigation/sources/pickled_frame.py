@@ -43,6 +43,7 @@ _MODULES = {
     "CategoricalDtype": ("pandas", _CORE + "dtypes.dtypes"),
     "StringArray": ("pandas.arrays", _CORE + "arrays.string_"),
     "StringDtype": ("pandas", _CORE + "arrays.string_"),
+    "NA": ("pandas", "pandas._libs.missing"),
     "__pyx_unpickle_NDArrayBacked": ("pandas._libs.arrays",),
     "slice": ("builtins", "__builtin__"),
     "ndarray": ("numpy",),

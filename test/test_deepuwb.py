@@ -1,0 +1,515 @@
+"""DeepUWB's pickle: what is read of it, what each row becomes, and what is refused without being run."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import struct
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from uwb_mitigation.bag.reader import BagReader
+from uwb_mitigation.bag.writer import BagWriter
+from uwb_mitigation.dataset import build_dataset
+from uwb_mitigation.errors import DatasetError, RecordingError
+from uwb_mitigation.measurement import Encoding
+from uwb_mitigation.preprocessing import Preprocessing, Scaling
+from uwb_mitigation.sources import deepuwb, pickle_machine, pickled_frame
+from uwb_mitigation.sources.deepuwb import (
+    MATERIALS,
+    NOMINAL_RANGE_M,
+    DeepUwbRecording,
+    RoomSplit,
+    materials_of,
+    read_deepuwb,
+    room_of,
+    split_rows,
+)
+from uwb_mitigation.sources.opening import open_recording
+
+OBSTACLES = ("0000000000", "1000000000", "0000001001", "0000000001")
+
+
+def frame(count: int = 12) -> pd.DataFrame:
+    """A frame as the data's description has it; its values are drawn."""
+    generator = np.random.default_rng(5)
+    amplitudes = generator.random((count, 157))
+    amplitudes /= amplitudes.max(axis=1, keepdims=True)
+    return pd.DataFrame(
+        {
+            "CIR": [row.copy() for row in amplitudes],
+            "Error": generator.normal(0.1, 0.5, count),
+            "Room": np.arange(count) % 5,
+            "Obstacles": [OBSTACLES[row % 4] for row in range(count)],
+        }
+    )
+
+
+def written(path: Path, data: pd.DataFrame, protocol: int = 4) -> Path:
+    data.to_pickle(path / "dataset.pkl", protocol=protocol)
+    return path / "dataset.pkl"
+
+
+def with_cell(column: str, row: int, value: object) -> pd.DataFrame:
+    data = frame()
+    cells = list(data[column])
+    cells[row] = value
+    data[column] = pd.Series(cells, dtype=None if isinstance(value, float) else object)
+    return data
+
+
+def amplitudes_of(data: deepuwb.DeepUwb) -> np.ndarray:
+    return data.samples * data.scale[:, None].astype(np.float64)
+
+
+WRITINGS: dict[str, Callable[[pd.DataFrame], pd.DataFrame]] = {
+    "arrays": lambda data: data,
+    "arrays of float32": lambda data: data.assign(CIR=[row.astype(np.float32) for row in data["CIR"]]),
+    "rows of one matrix": lambda data: data.assign(CIR=list(np.stack(list(data["CIR"])))),
+    "every other element": lambda data: data.assign(CIR=[np.repeat(row, 2)[::2] for row in data["CIR"]]),
+    "arrays of big-endian numbers": lambda data: data.assign(CIR=[row.astype(">f8") for row in data["CIR"]]),
+    "lists": lambda data: data.assign(CIR=[row.tolist() for row in data["CIR"]]),
+    "lists of numpy scalars": lambda data: data.assign(CIR=[list(row) for row in data["CIR"]]),
+    "tuples": lambda data: data.assign(CIR=[tuple(row.tolist()) for row in data["CIR"]]),
+    "arrays of objects": lambda data: data.assign(CIR=[row.astype(object) for row in data["CIR"]]),
+    "every column of objects": lambda data: data.astype(object),
+    "categories": lambda data: data.astype({"Room": "category", "Obstacles": "category"}),
+    "text as objects": lambda data: data.astype({"Obstacles": object}),
+    "text as strings": lambda data: data.astype({"Obstacles": pd.StringDtype("python")}),
+    "rooms as int8": lambda data: data.astype({"Room": np.int8}),
+    "rooms as float": lambda data: data.astype({"Room": float}),
+    "errors as float32": lambda data: data.astype({"Error": np.float32}),
+    "columns in another order": lambda data: data[["Obstacles", "Room", "Error", "CIR"]],
+    "a further column": lambda data: data.assign(Note="x", When=3.5),
+    "an index of text": lambda data: data.set_index(pd.Index([f"r{i}" for i in range(len(data))])),
+    "blocks in Fortran order": lambda data: data.sample(frac=1, random_state=1).sort_index(),
+}
+
+
+@pytest.mark.parametrize("protocol", [2, 3, 4, 5])
+@pytest.mark.parametrize("writing", WRITINGS)
+def test_a_frame_is_read_however_pandas_wrote_it(tmp_path: Path, writing: str, protocol: int) -> None:
+    data = frame()
+    read = read_deepuwb(written(tmp_path, WRITINGS[writing](data), protocol))
+    assert np.allclose(amplitudes_of(read), np.stack(list(data["CIR"])), atol=2e-5)
+    assert np.allclose(read.error_m, data["Error"], rtol=1e-6)
+    assert list(read.room) == list(data["Room"])
+    assert list(read.obstacles) == list(data["Obstacles"])
+
+
+@pytest.mark.parametrize("version", ["0.25.3", "1.1.5", "1.5.3", "2.2.3"])
+def test_frames_of_older_pandas_are_read(version: str) -> None:
+    read = read_deepuwb(Path(__file__).parent / "data" / f"deepuwb_pandas_{version}.pkl")
+    expected = [np.arange(157) * (row + 1) % 157 / 156 for row in range(4)]
+    assert np.allclose(amplitudes_of(read), expected, atol=2e-5)
+    assert list(read.error_m) == [0.25, -0.125, 1.5, 0.0]
+    assert list(read.room) == [0, 2, 4, 2]
+    assert read.obstacles == ("1000000000", "0000001001", "0000000000", "0000000001")
+
+
+def test_reading_needs_no_pandas(tmp_path: Path) -> None:
+    path = written(tmp_path, frame())
+    code = (
+        "import sys; sys.modules['pandas'] = None\n"
+        "from uwb_mitigation.sources.opening import open_recording\n"
+        f"from pathlib import Path; print(sum(1 for _ in open_recording(Path({str(path)!r}))))"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent.parent)}
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False, timeout=60
+    )
+    assert done.stdout.strip() == "12", done.stderr
+
+
+# What a row becomes.
+
+
+def test_a_record_carries_the_error_over_a_nominal_distance(tmp_path: Path) -> None:
+    data = frame()
+    for record, error in zip(DeepUwbRecording(written(tmp_path, data)), data["Error"], strict=True):
+        assert record.truth is not None
+        assert record.truth.range_m == NOMINAL_RANGE_M
+        assert record.measurement.range_m - record.truth.range_m == pytest.approx(error, abs=1e-12)
+
+
+@pytest.mark.parametrize("error", [-9.9, -1.234567, 1e-4, 0.1, 5.999999, 21.9])
+def test_an_error_survives_the_float32_of_a_bag_to_a_micrometre(tmp_path: Path, error: float) -> None:
+    recording = DeepUwbRecording(written(tmp_path, frame(1).assign(Error=[error])))
+    with BagWriter(tmp_path / "bag.mcap", {"source": "a test", "simulated": "false"}) as bag:
+        for record in recording:
+            bag.write(record)
+    (record,) = open_recording(tmp_path / "bag.mcap")
+    assert record.truth is not None
+    assert abs(record.measurement.range_m - record.truth.range_m - error) < 1e-6
+
+
+def test_the_window_of_the_preprocessing_is_the_whole_cir(tmp_path: Path) -> None:
+    data = frame()
+    dataset = build_dataset(DeepUwbRecording(written(tmp_path, data)), Preprocessing(157, Scaling.MAX))
+    assert not dataset.refused
+    assert np.allclose(dataset.inputs, np.stack(list(data["CIR"])), atol=2e-5)
+    # From the largest of a row, each amplitude is within half a count.
+    assert np.abs(dataset.inputs - np.stack(list(data["CIR"]))).max() < 0.51 / 32766
+
+
+def test_what_the_data_lacks_is_unknown_or_made_up_as_documented(tmp_path: Path) -> None:
+    records = list(DeepUwbRecording(written(tmp_path, frame())))
+    first, third = records[0].measurement, records[2].measurement
+    assert first.cir.encoding is Encoding.MAGNITUDE
+    assert first.cir.preamble_count == 0
+    assert np.isnan([first.cir.rx_power_dbm, first.cir.first_path_power_dbm]).all()
+    assert [record.measurement.sequence for record in records] == list(range(12))
+    assert third.stamp_ns - first.stamp_ns == 2 * deepuwb.STAMP_STEP_NS
+    assert {r.measurement.anchor_id for r in records} == {1000, 1001, 1002, 1003, 1004}
+
+
+def test_rooms_and_materials_can_be_read_back(tmp_path: Path) -> None:
+    truths = [record.truth for record in DeepUwbRecording(written(tmp_path, frame()))]
+    assert [truth.label for truth in truths if truth][:3] == ["LOS", "NLOS", "NLOS"]
+    names = [truth.configuration for truth in truths if truth]
+    assert names[:3] == [
+        "deepuwb/room0/clear",
+        "deepuwb/room1/wall",
+        "deepuwb/room2/metal plate+metal window",
+    ]
+    assert [room_of(name) for name in names[:3]] == [0, 1, 2]
+    assert [materials_of(name) for name in names[:3]] == [(), ("wall",), ("metal plate", "metal window")]
+
+
+@pytest.mark.parametrize("number", range(10))
+def test_each_character_stands_for_its_material(number: int) -> None:
+    digits = "".join("1" if place == number else "0" for place in range(10))
+    assert materials_of(deepuwb.configuration_of(3, digits)) == (MATERIALS[number],)
+
+
+@pytest.mark.parametrize("name", ["", "deepuwb", "deepuwb/room5/wall", "deepuwb/room1/gold", "by the door"])
+def test_a_configuration_of_other_data_is_refused(name: str) -> None:
+    with pytest.raises(DatasetError, match="not of DeepUWB"):
+        room_of(name)
+
+
+def test_the_splits_have_the_sizes_of_the_paper() -> None:
+    sizes = (954, 18_422, 13_210, 17_601, 4_971)
+    names = np.repeat([deepuwb.configuration_of(room, OBSTACLES[0]) for room in range(5)], sizes)
+    train, test = split_rows(names, RoomSplit.PAPER)
+    assert (train.sum(), test.sum()) == (36_023, 13_210)
+    train, test = split_rows(names, RoomSplit.ALL_BUT_ROOM_2)
+    assert (train.sum(), test.sum()) == (41_948, 13_210)
+    assert not (train & test).any()
+
+
+def test_a_split_without_test_rows_is_refused() -> None:
+    with pytest.raises(DatasetError, match="0 to test on"):
+        split_rows(["deepuwb/room1/clear"] * 3, RoomSplit.PAPER)
+
+
+def test_a_recording_can_be_iterated_again_until_it_is_closed(tmp_path: Path) -> None:
+    with open_recording(written(tmp_path, frame())) as recording:
+        assert len(list(recording)) == len(list(recording)) == 12
+    with pytest.raises(RecordingError, match="closed"):
+        next(iter(recording))
+
+
+def test_a_pickle_is_known_by_its_content(tmp_path: Path) -> None:
+    path = written(tmp_path, frame()).rename(tmp_path / "dataset.bin")
+    assert isinstance(open_recording(path), DeepUwbRecording)
+
+
+def test_the_command_line_imports_it_into_a_bag(tmp_path: Path) -> None:
+    written(tmp_path, frame())
+    done = subprocess.run(
+        [sys.executable, "-m", "uwb_mitigation.cli", "data", "import", "dataset.pkl", "-o", "deepuwb.mcap"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parent.parent)},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    assert BagReader(tmp_path / "deepuwb.mcap").message_count == 24
+
+
+def test_odd_cirs_are_kept_and_counted(tmp_path: Path) -> None:
+    data = with_cell("CIR", 1, np.zeros(157))
+    data.at[4, "CIR"] = -data.at[4, "CIR"]
+    recording = DeepUwbRecording(written(tmp_path, data))
+    assert len(list(recording)) == 12
+    assert recording.skipped == {deepuwb.ALL_ZERO: 1, deepuwb.NEGATIVE: 1}
+
+
+# What is refused.
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "told"),
+    [
+        ("CIR", np.zeros(156), "156 samples"),
+        ("CIR", [0.5] * 1016, "1016 samples"),
+        ("CIR", np.zeros((157, 1)), "no array of numbers"),
+        ("CIR", ["0.5"] * 157, "no array of numbers"),
+        ("CIR", [[0.5]] * 157, "no array of numbers"),
+        ("CIR", None, "missing"),
+        ("CIR", "0" * 157, "text"),
+        ("CIR", np.array([0.5] * 100 + [np.nan] * 57), "sample 100 is not finite"),
+        ("CIR", np.full(157, 1e300), "a peak of 1e"),
+        ("Error", float("nan"), "nan"),
+        ("Error", float("inf"), "inf"),
+        ("Error", 1e6, "1e+06"),
+        ("Error", "0.3", "text"),
+        ("Room", 5, "5"),
+        ("Room", -1, "-1"),
+        ("Room", 1.5, "1.5"),
+        ("Room", "big", "text"),
+        ("Obstacles", "000000000", "'000000000'"),
+        ("Obstacles", "00000000000", "'00000000000'"),
+        ("Obstacles", "0000000002", "'0000000002'"),
+        ("Obstacles", "000000000\n", "'000000000\\n'"),
+        ("Obstacles", "٠٠٠٠٠٠٠٠٠٠", "10 characters of 0 or 1"),
+        ("Obstacles", 1000000000, "a number"),
+    ],
+)
+def test_a_wrong_cell_is_refused_with_its_row_and_column(
+    tmp_path: Path, column: str, value: object, told: str
+) -> None:
+    path = written(tmp_path, with_cell(column, 7, value))
+    with pytest.raises(RecordingError) as caught:
+        read_deepuwb(path)
+    assert caught.value.where == f"{path}, row 7"
+    assert column in caught.value.what
+    assert told in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("data", "told"),
+    [
+        (frame().drop(columns="Room"), "no column 'Room' among 'CIR', 'Error', 'Obstacles'"),
+        (frame().rename(columns={"CIR": "cir"}), "no column 'CIR' among 'cir'"),
+        (frame().iloc[:0], "0 rows"),
+        (pd.DataFrame(np.zeros((3, 4))), "no column 'CIR' among none"),
+        (frame()["CIR"], "pandas.Series"),
+        ({"CIR": [1]}, "no DataFrame"),
+        (np.zeros(3), "no DataFrame"),
+        (None, "no DataFrame"),
+    ],
+)
+def test_what_is_not_the_data_is_refused_by_what_it_lacks(tmp_path: Path, data: Any, told: str) -> None:
+    path = tmp_path / "dataset.pkl"
+    path.write_bytes(pickle.dumps(data, protocol=4))
+    with pytest.raises(RecordingError) as caught:
+        read_deepuwb(path)
+    assert str(path) in str(caught.value)
+    assert told in str(caught.value).replace("pandas.core.series.", "pandas.")
+
+
+class Runs:
+    """What a hostile pickle wants called."""
+
+    def __init__(self, function: Callable[..., object], *args: object) -> None:
+        self.call = (function, args)
+
+    def __reduce__(self) -> tuple[Callable[..., object], tuple[object, ...]]:
+        return self.call
+
+
+def hostile(mark: Path) -> dict[str, tuple[object, str]]:
+    touch = f"touch {mark}"
+    code = f"open({str(mark)!r}, 'w')"
+    return {
+        "os.system": (Runs(os.system, touch), f"{os.name}.system"),
+        "eval": (Runs(eval, code), "builtins.eval"),
+        "exec": (Runs(exec, code), "builtins.exec"),
+        "subprocess": (Runs(subprocess.Popen, ["touch", str(mark)]), ".Popen"),
+        "pandas.eval": (Runs(pd.eval, f"@pd.io.common.os.system({touch!r})"), "eval"),
+        "pandas.read_pickle": (Runs(pd.read_pickle, "http://localhost/x"), "read_pickle"),
+        "numpy.load": (Runs(np.load, "x.npy"), ".load"),
+        "getattr": (
+            Runs(getattr, os, "system") if False else Runs(getattr, "x", "upper"),
+            "builtins.getattr",
+        ),
+        "in an array of objects": (np.array([1, Runs(os.system, touch)], object), f"{os.name}.system"),
+        "in a cell of the frame": (with_cell("CIR", 2, Runs(os.system, touch)), f"{os.name}.system"),
+        "in an index": (frame().set_index(pd.Index([Runs(os.system, touch)] * 12)), f"{os.name}.system"),
+    }
+
+
+@pytest.mark.parametrize("protocol", [2, 3, 4, 5])
+@pytest.mark.parametrize("kind", hostile(Path("x")))
+def test_a_hostile_pickle_is_refused_by_name_and_nothing_runs(
+    tmp_path: Path, kind: str, protocol: int
+) -> None:
+    mark = tmp_path / "ran"
+    value, name = hostile(mark)[kind]
+    path = tmp_path / "dataset.pkl"
+    path.write_bytes(pickle.dumps(value, protocol=protocol))
+    with pytest.raises(RecordingError, match="refers to") as caught:
+        read_deepuwb(path)
+    # Protocol 2 has the names that Python 2 had for some modules.
+    assert name in caught.value.what.replace("__builtin__", "builtins").replace("commands", "subprocess")
+    assert not mark.exists()
+
+
+def test_a_name_that_walks_attributes_is_refused(tmp_path: Path) -> None:
+    # STACK_GLOBAL lets a name walk: pandas has os within its reach.
+    assert_refused(tmp_path, PROTO + b"\x8c\x06pandas\x8c\x13io.common.os.system\x93.", "io.common.os.system")
+
+
+def assert_refused(tmp_path: Path, content: bytes, told: str) -> None:
+    path = tmp_path / "dataset.pkl"
+    path.write_bytes(content)
+    with pytest.raises(RecordingError) as caught:
+        read_deepuwb(path)
+    assert told in str(caught.value)
+
+
+PROTO = b"\x80\x04"
+NDARRAY = b"cnumpy.core.multiarray\n_reconstruct\n"
+
+
+@pytest.mark.parametrize(
+    ("body", "told"),
+    [
+        (b"\x8e" + struct.pack("<Q", 1 << 62) + b"x.", "ends early"),
+        (b"\x96" + struct.pack("<Q", 1 << 40) + b"x.", "ends early"),
+        (b"\x8d" + struct.pack("<Q", (1 << 64) - 1) + b"x.", "ends early"),
+        (b"B" + struct.pack("<I", (1 << 32) - 1) + b"x.", "ends early"),
+        (b"Nr" + struct.pack("<I", (1 << 32) - 1) + b".", "no DataFrame"),
+        (b"\x8b" + struct.pack("<i", 1 << 30), "opcode 0x8b"),
+        (b"\x8a\xff" + bytes(255) + b".", "an integer of 255 bytes"),
+        (b"(" * 1000 + b"t" * 1000 + b".", "no DataFrame"),
+        (b"]" * 200_000 + b"a" * 199_999 + b".", "no DataFrame"),
+        (b")" + b"\x85" * 200_000 + b".", "no DataFrame"),
+        (b")" + b"\x94\x86" * 60 + b".", "empty stack"),
+        (b")" + b"2\x86" * 60 + b".", "opcode 0x32"),
+        (b"})Ns.", "key of a dictionary is a tuple"),
+        (b"P1\n.", "opcode 0x50"),
+        (b"NNb.", "given its state where there is none"),
+        (b".", "empty stack"),
+        (b"e.", "mark"),
+        (b"h\x05.", "recalled before"),
+        (b"\x94.", "nothing to remember"),
+        (b"NNR.", "a call"),
+        (b"c" + b"a" * 4096 + b"\nb\n.", "without an end"),
+        (b"X\x02\x00\x00\x00\xff\xfe.", "not UTF-8"),
+        (b"\x80\x09.", "pickle protocol 9"),
+        (NDARRAY + b")R)b)b.", "twice"),
+    ],
+)
+def test_a_bomb_is_refused_before_it_goes_off(tmp_path: Path, body: bytes, told: str) -> None:
+    assert_refused(tmp_path, PROTO + body, told)
+
+
+def test_nested_tuples_as_a_key_do_not_cost_their_hash(tmp_path: Path) -> None:
+    doubling = b"".join(b"h" + bytes([n]) + b"h" + bytes([n]) + b"\x86\x94" for n in range(200))
+    assert_refused(tmp_path, PROTO + b")\x94" + doubling + b"}h\xc8Ns.", "key of a dictionary is a tuple")
+
+
+@pytest.mark.parametrize(
+    ("ceiling", "body", "told"),
+    [
+        ("MAX_OPCODES", b"N" * 200 + b".", "opcodes"),
+        ("MAX_OBJECTS", b"]" * 200 + b".", "no numbers"),
+        ("MAX_OBJECTS", b"N" + b"\x94" * 200 + b".", "remembered"),
+    ],
+)
+def test_the_ceilings_on_memory_hold(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ceiling: str, body: bytes, told: str
+) -> None:
+    monkeypatch.setattr(pickle_machine, ceiling, 100)
+    assert_refused(tmp_path, PROTO + body, told)
+
+
+def test_a_file_beyond_the_ceiling_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = written(tmp_path, frame())
+    monkeypatch.setattr(pickled_frame, "MAX_FILE_BYTES", 1000)
+    with pytest.raises(RecordingError, match="more than 1000 bytes"):
+        read_deepuwb(path)
+
+
+def test_a_pickle_of_protocol_0_is_refused_with_what_is_read(tmp_path: Path) -> None:
+    assert_refused(tmp_path, pickle.dumps({"a": [1.5, 2]}, protocol=0), "protocol 2, 3, 4 or 5")
+
+
+@pytest.mark.parametrize("protocol", [2, 4, 5])
+def test_a_pickle_cut_anywhere_is_refused(tmp_path: Path, protocol: int) -> None:
+    content = written(tmp_path, frame(2), protocol).read_bytes()
+    for size in range(0, len(content) - 1, 7):
+        assert_refused(tmp_path, content[:size], "dataset.pkl")
+
+
+@pytest.mark.parametrize("name", ["absent.pkl", "empty.pkl", "folder.pkl"])
+def test_what_is_no_file_is_refused(tmp_path: Path, name: str) -> None:
+    (tmp_path / "empty.pkl").touch()
+    (tmp_path / "folder.pkl").mkdir()
+    with pytest.raises(RecordingError, match=name):
+        read_deepuwb(tmp_path / name)
+
+
+FUZZ = settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+@FUZZ
+@given(content=st.binary(max_size=200))
+def test_any_bytes_give_a_value_or_a_typed_error(tmp_path: Path, content: bytes) -> None:
+    assert_reads_or_refuses(tmp_path, PROTO + content)
+
+
+@FUZZ
+@given(data=st.data(), protocol=st.sampled_from([2, 4, 5]))
+def test_a_damaged_frame_gives_a_value_or_a_typed_error(
+    tmp_path: Path, data: st.DataObject, protocol: int
+) -> None:
+    content = bytearray(pickle.dumps(SMALL, protocol=protocol))
+    for _ in range(data.draw(st.integers(1, 4))):
+        # Beyond the last numbers of the CIR lies most of the structure; both are hit.
+        place = data.draw(st.one_of(st.integers(0, len(content) - 1), st.sampled_from(STRUCTURE[protocol])))
+        content[place] = data.draw(st.integers(0, 255))
+    assert_reads_or_refuses(tmp_path, bytes(content))
+
+
+SMALL = frame(2).astype({"Room": "category"})
+
+
+def _structure(protocol: int) -> list[int]:
+    """The bytes of the pickle that are not the CIR's own numbers."""
+    content = pickle.dumps(SMALL, protocol=protocol)
+    numbers = set()
+    for row in SMALL["CIR"]:
+        at = content.find(row.tobytes())
+        numbers.update(range(at, at + 157 * 8) if at >= 0 else ())
+    return [place for place in range(len(content)) if place not in numbers]
+
+
+STRUCTURE = {protocol: _structure(protocol) for protocol in (2, 4, 5)}
+
+
+def assert_reads_or_refuses(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "dataset.pkl"
+    path.write_bytes(content)
+    try:
+        data = read_deepuwb(path)
+    except RecordingError as error:
+        assert str(path) in error.where  # noqa: PT017 - either outcome is right
+    else:
+        assert np.isfinite(data.error_m).all()
+
+
+@pytest.mark.parametrize("protocol", [2, 3, 4, 5])
+@given(
+    value=st.recursive(
+        st.none() | st.booleans() | st.integers(-(2**100), 2**100) | st.floats(allow_nan=False) | st.text(),
+        lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner) | st.tuples(inner, inner),
+    )
+)
+@settings(max_examples=60, deadline=None)
+def test_plain_values_are_interpreted_as_pickle_reads_them(protocol: int, value: object) -> None:
+    assert pickle_machine.interpret(pickle.dumps(value, protocol=protocol), (), "here") == value
