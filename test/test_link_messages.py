@@ -36,7 +36,7 @@ SMALL = [
     HELLO,
     CORRECTION,
     Log(layout.LogLevel.WARNING, "antenna délay"),
-    BoardStatus(1, 2, 3, 4, Mode.DEVICE),
+    BoardStatus(1, 2, 3, 4, Mode.DEVICE, 41.5),
     TimeSyncReply(17, 2**60),
     SetMode(Mode.DEVICE),
     GetInfo(),

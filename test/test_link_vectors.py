@@ -80,7 +80,7 @@ SENT = {
     "time_sync_reply": (messages.TimeSyncReply(0xFFFFFFFF, 2**40 + 17), Flag.ANSWER, 1, 2**40 + 20),
     "log": (messages.Log(LogLevel.WARNING, "first path outside the window"), 0, 2, 3_000_000),
     "log_empty": (messages.Log(LogLevel.DEBUG, ""), 0, 3, 3_000_000),
-    "status": (messages.BoardStatus(1, 2, 3, 4, Mode.DEVICE), 0, 4, 4_000_000),
+    "status": (messages.BoardStatus(1, 2, 3, 4, Mode.DEVICE, 41.5), 0, 4, 4_000_000),
     "range_cir": (MEASUREMENT, 0, 5, 2**63 + 1),
     "range_cir_magnitude": (MAGNITUDES, 0, 6, 5_000_000),
     "range_cir_full": (FULL, 0, 7, 6_000_000),

@@ -80,6 +80,11 @@ class DeviceClock:
         return self._drift
 
     @property
+    def offset_ns(self) -> int:
+        """Host's clock minus board's, at the last update; 0 before the first."""
+        return (self._origin or 0) + round(self._offset)
+
+    @property
     def uncertainty_ns(self) -> float:
         """Standard deviation of the estimate at the last update."""
         return float(max(self._p_offset, 0.0) ** 0.5)

@@ -187,8 +187,9 @@ PAYLOADS = {
             Field("frames_dropped", "I", "damaged or unknown frames from the host since the start"),
             Field("measurements", "I", "exchanges since the start"),
             Field("measurements_lost", "I", "exchanges not sent because the link was full"),
+            Field("temperature", "f", "degrees Celsius; NaN = not measured"),
             Field("mode", "B", "Mode in force"),
-            Field("reserved", "7x", ""),
+            Field("reserved", "3x", ""),
         ),
     ),
     MessageType.TIME_SYNC_REPLY: Layout(

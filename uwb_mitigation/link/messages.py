@@ -6,6 +6,7 @@ link starts from the same bits.
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -88,13 +89,17 @@ class Log:
 
 @dataclass(frozen=True, slots=True)
 class BoardStatus:
-    """Sign of life and counts since the board's start; the fields of `layout.PAYLOADS[STATUS]`."""
+    """Sign of life and counts since the board's start; the fields of `layout.PAYLOADS[STATUS]`.
+
+    `temperature_c` is NaN where the board measures none.
+    """
 
     frames_received: int
     frames_dropped: int
     measurements: int
     measurements_lost: int
     mode: Mode
+    temperature_c: float = math.nan
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,6 +189,7 @@ def _encode(message: Message) -> tuple[MessageType, bytes]:
             message.frames_dropped,
             message.measurements,
             message.measurements_lost,
+            message.temperature_c,
             message.mode,
         )
     if isinstance(message, TimeSyncReply):
@@ -345,13 +351,14 @@ def _decode_log(payload: bytes, values: tuple[Any, ...], _: int) -> Log:
 
 
 def _decode_status(_: bytes, values: tuple[Any, ...], __: int) -> BoardStatus:
-    frames_received, frames_dropped, measurements, measurements_lost, mode = values
+    frames_received, frames_dropped, measurements, measurements_lost, temperature_c, mode = values
     return BoardStatus(
         frames_received,
         frames_dropped,
         measurements,
         measurements_lost,
         _member(Mode, mode, "STATUS mode"),
+        temperature_c,
     )
 
 

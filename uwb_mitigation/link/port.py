@@ -6,6 +6,7 @@ What the bytes mean is for `session`.
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import select
 import threading
@@ -97,12 +98,18 @@ class PortReport:
         port: the device file in use; empty while there is none.
         problem: what keeps the board from being connected; empty while it is.
         hello: what the connected board says of itself.
+        clock_offset_s: host's clock minus the board's uptime.
+        clock_drift_ppm: what the host's clock gains on the board's.
+        clock_uncertainty_us: standard deviation of the offset; NaN before the first round trip.
         counts: {name: count} of frames and events that were lost, and why.
     """
 
     port: str
     problem: str
     hello: Hello | None
+    clock_offset_s: float
+    clock_drift_ppm: float
+    clock_uncertainty_us: float
     counts: dict[str, int]
 
 
@@ -182,6 +189,11 @@ class BoardPort:
                 port=self._port,
                 problem=problem,
                 hello=session.hello,
+                clock_offset_s=session.clock.offset_ns / 1e9,
+                clock_drift_ppm=session.clock.drift * 1e6,
+                clock_uncertainty_us=session.clock.uncertainty_ns / 1e3
+                if session.clock.synchronised
+                else math.nan,
                 counts={
                     "frames": decoder.frames,
                     "corrupt": decoder.corrupt,

@@ -86,6 +86,11 @@ class BoardFeed:
                 "mode": report.hello.mode.name.lower(),
             }
         facts |= self.meter.facts()
+        facts |= {
+            "clock offset s": f"{report.clock_offset_s:.6f}",
+            "clock drift ppm": f"{report.clock_drift_ppm:.2f}",
+            "clock uncertainty us": f"{report.clock_uncertainty_us:.1f}",
+        }
         facts |= report.counts
         if self.status is not None:
             facts |= {f"board: {name}": value for name, value in asdict(self.status).items()}
