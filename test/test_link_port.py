@@ -21,7 +21,6 @@ from uwb_mitigation.link.layout import Mode
 from uwb_mitigation.link.messages import Correction
 from uwb_mitigation.link.port import BoardPort, PortAddress
 from uwb_mitigation.measurement import Cir, CorrectedRange, Origin, RangeMeasurement, Status
-from uwb_mitigation.sources.serial import SerialSource
 from uwb_mitigation.sources.source import Record
 
 PATIENCE_S = 20
@@ -237,18 +236,18 @@ def test_a_port_that_another_program_holds_is_reported(board, link):
         port.close()
 
 
-def test_closing_ends_an_iteration_in_another_thread(port):
-    source = SerialSource("board", port)
-    records = []
-    reader = threading.Thread(target=lambda: records.extend(source))
+def test_closing_ends_a_wait_for_events_in_another_thread(link):
+    port = BoardPort(PortAddress(str(link)))
+    events = []
+    reader = threading.Thread(target=lambda: events.append(port.get(60.0)))
     reader.start()
-    wait_until(lambda: len(records) > 3)
+    time.sleep(0.05)
 
-    source.close()
+    port.close()
     reader.join(PATIENCE_S)
 
     assert not reader.is_alive()
-    assert all(isinstance(record, Record) for record in records)
+    assert events == [None]
 
 
 def test_closing_twice_does_no_harm(port):

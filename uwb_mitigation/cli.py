@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 import uwb_mitigation
-from uwb_mitigation.commands import console, data, link, model
+from uwb_mitigation.commands import bench_serial, console, data, link, model, process
 from uwb_mitigation.errors import UwbMitigationError
 
 app = typer.Typer(
@@ -23,6 +23,8 @@ app.add_typer(model.app)
 bench = typer.Typer(help="Measure what the parts of the system can do.", no_args_is_help=True)
 app.add_typer(bench, name="bench")
 bench.command("link")(link.bench_link)
+bench.command("serial")(bench_serial.bench_serial)
+app.command("process")(process.process)
 app.command("emulate-board")(link.emulate_board)
 
 

@@ -108,6 +108,7 @@ class EmulatedBoard:
         self.port = ""
         self.failure: UwbMitigationError | None = None
         self.sent_measurements = 0
+        self._measuring = True
         self._source = source
         self._records = _endless(source)
         self._period_s = 1 / rate_hz
@@ -186,6 +187,14 @@ class EmulatedBoard:
         with self._lock:
             self._flood_until = time.monotonic() + seconds
 
+    def pause(self) -> None:
+        """Measure nothing until `resume`; all else goes on."""
+        self._measuring = False
+
+    def resume(self) -> None:
+        """Measure again."""
+        self._measuring = True
+
     @property
     def mode(self) -> Mode:
         """The mode in force."""
@@ -226,7 +235,7 @@ class EmulatedBoard:
             now = time.monotonic()
             with self._lock:
                 plugged = self._fds is not None
-                if plugged and now >= due:
+                if plugged and self._measuring and now >= due:
                     self._measure()
             if now >= due:
                 # After a pause the board does not make up for what it missed.

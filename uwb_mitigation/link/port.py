@@ -26,7 +26,8 @@ from uwb_mitigation.link.session import BoardSession
 from uwb_mitigation.measurement import RangeMeasurement
 
 FIRST_RETRY_S = 0.1
-LAST_RETRY_S = 2.0
+LAST_RETRY_S = 0.5
+"""A port that came back is to be noticed well within a second; looking costs next to nothing."""
 
 REOPEN_AFTER_SILENCE_NS = 10 * 10**9
 """A port that stays open but dead, as after a suspend, works again only when it is opened anew."""

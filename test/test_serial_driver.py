@@ -1,0 +1,289 @@
+"""The driver on a board's serial link: an emulated board on a pseudo-terminal, real nodes over real DDS."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.msg import ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
+from ros_harness import Process, Ros, domain
+from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
+
+from uwb_mitigation.link.board import Identity
+from uwb_mitigation.link.emulated_board import BoardFaults, EmulatedBoard
+from uwb_mitigation.link.faults import ByteFaults
+from uwb_mitigation.measurement import Origin, Status
+from uwb_mitigation.mitigation import Mitigation
+from uwb_mitigation.model.bundle import load_bundle
+from uwb_mitigation.model.shipped import default_model_path
+from uwb_mitigation.nodes.messages import key_of
+from uwb_mitigation.sources.simulated import SimulatedSource
+
+pytestmark = pytest.mark.ros
+
+RAW = "/uwb/range_raw"
+CORRECTED = "/uwb/range_corrected"
+
+
+@pytest.fixture
+def ros(tmp_path: Path):
+    with domain(tmp_path) as ros:
+        yield ros
+
+
+@pytest.fixture
+def link(tmp_path: Path) -> Path:
+    """Where the driver looks for the port."""
+    return tmp_path / "port"
+
+
+def board(link: Path, *, model: bool = False, rate_hz: float = 50.0, **options) -> EmulatedBoard:
+    if model:
+        mitigation = Mitigation(load_bundle(default_model_path()))
+        options |= {
+            "corrector": mitigation,
+            "identity": Identity(
+                0xB0A2D, mitigation.bundle.model_id, mitigation.bundle.preprocessing.samples
+            ),
+        }
+    return EmulatedBoard(SimulatedSource(seed=4, count=200), rate_hz=rate_hz, link=link, **options)
+
+
+def drive(ros: Ros, link: Path, *parameters: str) -> Process:
+    return ros.start("driver", "source:=serial", f"port:={link}", *parameters)
+
+
+def set_mode(ros: Ros, mode: str) -> bool:
+    value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=mode)
+    request = SetParameters.Request(parameters=[ParameterMessage(name="mode", value=value)])
+    return ros.call(SetParameters, "/driver/set_parameters", request).results[0].successful
+
+
+def fact(status: DiagnosticStatus, key: str) -> str:
+    return next((value.value for value in status.values if value.key == key), "")
+
+
+def test_what_the_board_measures_is_published_with_stamps_of_the_measurement(ros: Ros, link: Path):
+    received: list[tuple[int, RangeCir]] = []
+    ros.node.create_subscription(RangeCir, RAW, lambda m: received.append((time.time_ns(), m)), 1000)
+    with board(link):
+        driver = drive(ros, link)
+        ros.spin_until(lambda: len(received) >= 100)
+    # The board plays them over and over; the simulator leaves out what was too weak to be received.
+    played = [
+        (r.measurement.sequence, np.float32(r.measurement.range_m))
+        for r in SimulatedSource(seed=4, count=200)
+    ]
+    published = [(m.sequence, np.float32(m.range)) for _, m in received]
+    first = played.index(published[0])
+    assert published == [played[(first + index) % len(played)] for index in range(len(published))]
+    stamps = np.array([m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for _, m in received])
+    assert (np.diff(stamps) > 0).all()
+    assert all(arrival > stamp for (arrival, _), stamp in zip(received, stamps, strict=True))
+    assert driver.signal(signal.SIGINT) == 0, driver.output
+
+
+def test_a_board_that_runs_the_model_gives_what_the_host_gives(ros: Ros, link: Path):
+    raw = ros.collect(RangeCir, RAW)
+    corrected = ros.collect(RangeCorrected, CORRECTED)
+    host = Mitigation(load_bundle(default_model_path()))
+    expected = {
+        r.measurement.sequence: host.correct(r.measurement) for r in SimulatedSource(seed=4, count=200)
+    }
+    with board(link, model=True):
+        drive(ros, link, "mode:=device")
+        ros.spin_until(lambda: len(corrected) >= 60)
+    for message in corrected:
+        assert message.source == Origin.DEVICE
+        assert message.model_id == host.bundle.model_id
+        assert message.range == np.float32(expected[message.sequence].range_m)
+        assert message.variance == np.float32(expected[message.sequence].variance_m2)
+    # Until the board has taken the mode it may have sent a few ranges the other way.
+    assert len(raw) < 60
+
+
+def test_the_mode_changes_without_a_restart(ros: Ros, link: Path):
+    corrected = ros.collect(RangeCorrected, CORRECTED)
+    ros.start("mitigator").wait_for_output("correcting with model")
+    with board(link, model=True):
+        driver = drive(ros, link)
+        for mode, origin in (("host", Origin.HOST), ("device", Origin.DEVICE), ("host", Origin.HOST)):
+            assert set_mode(ros, mode)
+            ros.spin_until(lambda o=origin: [m.source for m in corrected[-20:]] == [o] * 20)
+        assert not set_mode(ros, "sideways")
+        assert driver.popen.poll() is None
+    keys = Counter(key_of(message) for message in corrected)
+    assert max(keys.values()) == 1
+
+
+def test_in_both_mode_the_diagnostics_tell_that_board_and_host_agree(ros: Ros, link: Path):
+    ros.start("mitigator").wait_for_output("correcting with model")
+    with board(link, model=True):
+        drive(ros, link, "mode:=both")
+        status = ros.diagnosis("driver", lambda s: int(fact(s, "board and host agree") or 0) > 50)
+    assert fact(status, "board and host differ") == "0"
+    assert status.level == DiagnosticStatus.OK
+
+
+def test_a_board_that_corrects_otherwise_is_found_out(ros: Ros, link: Path):
+    class Careless:
+        """Rounds its corrections to millimetres."""
+
+        def __init__(self) -> None:
+            self.mitigation = Mitigation(load_bundle(default_model_path()))
+
+        def correct(self, measurement):
+            from dataclasses import replace
+
+            result = self.mitigation.correct(measurement)
+            return replace(result, range_m=round(result.range_m, 3))
+
+    careless = Careless()
+    ros.start("mitigator").wait_for_output("correcting with model")
+    identity = Identity(0xBAD, careless.mitigation.bundle.model_id, 157)
+    with EmulatedBoard(SimulatedSource(count=100), corrector=careless, identity=identity, link=link):
+        drive(ros, link, "mode:=both")
+        status = ros.diagnosis("driver", lambda s: int(fact(s, "board and host differ") or 0) > 0)
+    assert status.level == DiagnosticStatus.ERROR
+    assert "disagree" in status.message
+
+
+def test_corrections_by_another_model_than_the_expected_one_are_withheld(ros: Ros, link: Path):
+    corrected = ros.collect(RangeCorrected, CORRECTED)
+    with board(link, model=True):
+        drive(ros, link, "mode:=device", "board_model:='0badf00d'")
+        status = ros.diagnosis("driver", lambda s: int(fact(s, "wrong_model") or 0) > 10)
+    assert status.level == DiagnosticStatus.ERROR
+    assert "another model" in status.message
+    assert corrected == []
+
+
+def test_an_absent_port_is_waited_for(ros: Ros, link: Path):
+    received = ros.collect(RangeCir, RAW)
+    driver = drive(ros, link)
+    status = ros.diagnosis("driver", lambda s: s.level == DiagnosticStatus.ERROR)
+    assert str(link) in status.message
+    with board(link):
+        ros.spin_until(lambda: len(received) >= 10)
+    assert driver.popen.poll() is None
+
+
+def test_a_board_of_another_protocol_version_is_named(ros: Ros, link: Path):
+    with board(link, faults=BoardFaults(version=9)):
+        driver = drive(ros, link)
+        status = ros.diagnosis("driver", lambda s: "version" in s.message)
+    assert status.level == DiagnosticStatus.ERROR
+    assert "9" in status.message
+    assert driver.signal(signal.SIGTERM) == 0
+
+
+def open_files_and_threads(driver: Process) -> tuple[int, int]:
+    process = Path("/proc", str(driver.popen.pid))
+    return len(os.listdir(process / "fd")), len(os.listdir(process / "task"))
+
+
+def test_unplugging_costs_neither_descriptors_nor_threads(ros: Ros, link: Path):
+    received = ros.collect(RangeCir, RAW)
+    with board(link, rate_hz=200.0) as device:
+        driver = drive(ros, link)
+        ros.spin_until(lambda: len(received) >= 10)
+        before = open_files_and_threads(driver)
+        for _ in range(8):
+            device.unplug()
+            ros.spin_for(0.1)
+            received.clear()
+            device.plug()
+            ros.spin_until(lambda: len(received) >= 10)
+        assert open_files_and_threads(driver) == before
+        status = ros.diagnosis("driver", lambda s: int(fact(s, "connections") or 0) >= 9)
+    assert int(fact(status, "openings")) >= 9
+
+
+def test_resets_noise_and_damage_cost_frames_but_not_the_driver(ros: Ros, link: Path):
+    received = ros.collect(RangeCir, RAW)
+    faults = BoardFaults(ByteFaults(2e-5, 2e-5, 2e-5), lose=0.05, duplicate=0.05, boot_noise=500)
+    known = {
+        r.measurement.sequence: np.float32(r.measurement.range_m) for r in SimulatedSource(seed=4, count=200)
+    }
+    with board(link, rate_hz=200.0, faults=faults) as device:
+        driver = drive(ros, link)
+        for _ in range(3):
+            received_before = len(received)
+            ros.spin_until(lambda n=received_before: len(received) >= n + 60)
+            device.reset()
+        device.flood(0.3)
+        received_before = len(received)
+        ros.spin_until(lambda: len(received) >= received_before + 60)
+        status = ros.diagnosis("driver", lambda s: int(fact(s, "lost") or 0) > 0)
+    assert all(message.range == known[message.sequence] for message in received)
+    assert status.hardware_id.startswith("board")
+    assert driver.signal(signal.SIGINT) == 0, driver.output
+    assert "Traceback" not in driver.output
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("state", ["absent", "silent", "flooding", "measuring"])
+def test_a_signal_ends_the_driver_at_once_in_any_state(
+    ros: Ros, link: Path, number: signal.Signals, state: str
+):
+    device = None
+    if state != "absent":
+        device = board(link) if state != "silent" else EmulatedBoard(None, link=link)
+    try:
+        driver = drive(ros, link)
+        ros.diagnosis("driver", lambda s: True)
+        if device is not None and state == "silent":
+            device.mute(60)
+        if device is not None and state == "flooding":
+            device.flood(60)
+        ros.spin_for(0.3)
+        assert driver.signal(number) == 0, driver.output
+        assert "Traceback" not in driver.output
+    finally:
+        if device is not None:
+            device.close()
+
+
+@pytest.mark.parametrize(
+    ("parameters", "named"),
+    [
+        (("source:=serial",), "port"),
+        (("source:=serial", "port:=COM1"), "usb:VENDOR:PRODUCT"),
+        (("source:=serial", "port:=/dev/ttyACM0", "board_model:=xyz"), "eight hexadecimal digits"),
+        (("source:=serial", "port:=/dev/ttyACM0", "baud:=3"), "baud"),
+    ],
+)
+def test_a_port_that_cannot_be_meant_is_refused(ros: Ros, parameters: tuple[str, ...], named: str):
+    driver = ros.start("driver", *parameters)
+    assert driver.wait() == 1
+    assert named in driver.output
+    assert "Traceback" not in driver.output
+
+
+def test_a_range_that_the_board_cannot_correct_says_why(ros: Ros, link: Path):
+    from dataclasses import replace
+
+    class Empty(SimulatedSource):
+        def __iter__(self):
+            for record in super().__iter__():
+                cir = replace(record.measurement.cir, samples=record.measurement.cir.samples[:0])
+                yield replace(record, measurement=replace(record.measurement, cir=cir))
+
+    mitigation = Mitigation(load_bundle(default_model_path()))
+    corrected = ros.collect(RangeCorrected, CORRECTED)
+    with EmulatedBoard(Empty(count=50), corrector=mitigation, identity=Identity(1, 2, 157), link=link):
+        drive(ros, link, "mode:=device")
+        ros.spin_until(lambda: len(corrected) >= 5)
+    assert {message.status for message in corrected} == {Status.NO_CIR}
+    assert all(message.range == message.range_raw for message in corrected)

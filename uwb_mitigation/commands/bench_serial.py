@@ -1,0 +1,52 @@
+"""`uwb-mitigation bench serial`: what the driver stands on a board's serial link."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from uwb_mitigation.commands import console
+from uwb_mitigation.commands.console import JsonOption
+from uwb_mitigation.errors import MissingDependencyError
+
+
+def bench_serial(
+    rate: Annotated[
+        float, typer.Option(min=1.0, max=10_000.0, help="Ranges a second from the board.")
+    ] = 1000.0,
+    seconds: Annotated[float, typer.Option(min=1.0, help="Length of the steady stream.")] = 60.0,
+    unplugs: Annotated[int, typer.Option(min=1, help="How often the cable is pulled.")] = 50,
+    json: JsonOption = None,
+) -> None:
+    """Stream ranges of an emulated board through the driver; then pull its cable again and again."""
+    try:
+        from uwb_mitigation.nodes import bench_serial as bench
+    except ModuleNotFoundError as error:
+        raise MissingDependencyError(
+            f"this needs ROS 2: {error}", valid="run `make setup`, or source ROS's setup.sh"
+        ) from error
+
+    with console.progress() as bar:
+        task = bar.add_task("streaming", total=None)
+        steady = bench.steady(rate, seconds)
+        bar.update(task, description="unplugging")
+        unplug = bench.unplug(unplugs)
+    table = Table("serial link, emulated board", "", title_justify="left")
+    table.add_row("ranges sent / received / lost", f"{steady.sent} / {steady.received} / {steady.lost}")
+    table.add_row("rate, Hz", f"{steady.sent / steady.seconds:.0f}")
+    table.add_row("driver's share of a core", f"{steady.driver_cpu:.2f}")
+    table.add_row("stamp to arrival, ms, p50 / p99", f"{steady.late_ms_p50:.2f} / {steady.late_ms_p99:.2f}")
+    table.add_section()
+    table.add_row("unplugged and plugged in", str(unplug.cycles))
+    table.add_row(
+        "port's return to range, ms, p50 / max",
+        f"{unplug.resumed_ms_p50:.0f} / {unplug.resumed_ms_max:.0f}",
+    )
+    for name in ("descriptors", "threads", "memory_kb"):
+        before, after = getattr(unplug, name)
+        table.add_row(f"{name.replace('_', ', ')}, before / after", f"{before} / {after}")
+    console.out.print(table)
+    console.write_json(json, {"steady": asdict(steady), "unplug": asdict(unplug)})
