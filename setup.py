@@ -21,6 +21,7 @@ setup(
         (f"share/{PACKAGE}", ["package.xml"]),
         (f"share/{PACKAGE}/launch", files("launch", "*.launch.py")),
         (f"share/{PACKAGE}/params", files("params", "*.yaml")),
+        (f"share/{PACKAGE}/udev", files("udev", "*.rules")),
         (f"share/{PACKAGE}/models", files("models", "*.onnx", "*.md")),
     ],
     install_requires=["setuptools"],
