@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from dataclasses import replace
@@ -71,7 +72,9 @@ def random_cir(random: np.random.Generator) -> Cir:
     first = random.choice(
         [math.nan, math.inf, 1e30, -1e30, 3e9, start + random.uniform(0, 120)], p=[0.05] * 5 + [0.75]
     )
-    scale = random.choice([1.0, 0.37, 12.5, 0.0, -1.0, math.nan, math.inf], p=[0.5, 0.2, 0.2] + [0.025] * 4)
+    limits = [np.nextafter(np.float32(limit), np.float32(1)) for limit in (1e-30, 1e30)]
+    odd = [0.0, -1.0, math.nan, math.inf, 1e-30, 1e30, 1e-40, 1e-29, *limits]
+    scale = random.choice([1.0, 0.37, 12.5, *odd], p=[0.4, 0.2, 0.2, *[0.2 / len(odd)] * len(odd)])
     preamble = int(random.choice([0, 1, 118, 65535], p=[0.1, 0.2, 0.6, 0.1]))
     return Cir(
         samples,
@@ -93,8 +96,9 @@ def random_measurement(random: np.random.Generator) -> RangeMeasurement:
     return RangeMeasurement(1, 2, 3, 4, 5, float(range_m), cir)
 
 
-def real_measurements(apartment: Path, count: int) -> list[RangeMeasurement]:
-    """Measurements spread over the logs."""
+@functools.cache
+def real_measurements(apartment: Path) -> tuple[RangeMeasurement, ...]:
+    """A thousand measurements spread over the logs; read once, because unpacking takes seconds."""
     with open_decaranging(apartment) as source:
-        records = [record.measurement for record in itertools.islice(source, 0, None, 4)]
-    return records[:: max(1, len(records) // count)][:count]
+        measurements = [record.measurement for record in itertools.islice(source, 0, None, 4)]
+    return tuple(measurements[:: max(1, len(measurements) // 1000)][:1000])

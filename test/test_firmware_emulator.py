@@ -5,6 +5,7 @@ An emulator counts instructions exactly; of wait states, caches and power it kno
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import firmware_models
@@ -13,6 +14,7 @@ import pytest
 
 from uwb_mitigation.firmware_export import emulator, measurement, synthetic, toolchain
 from uwb_mitigation.firmware_export.export import export_bundle
+from uwb_mitigation.firmware_export.host import WARNINGS, compile_objects, firmware_folder
 from uwb_mitigation.firmware_export.toolchain import Board, Kernels
 from uwb_mitigation.measurement import RangeMeasurement
 from uwb_mitigation.mitigation import Mitigation
@@ -33,12 +35,15 @@ def bits(values: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("samples", WINDOW_SIZES)
-def test_five_thousand_windows_equal_onnx_runtime_within_the_budget_of_instructions(samples: int):
+def test_five_thousand_windows_equal_onnx_runtime_within_the_budgets(samples: int):
     (subject,) = measurement.subjects([samples], [3], mlp=False)
     row = measurement.measure(subject, inputs=5000)
     assert (row.mismatches, row.inputs) == (0, 5000)
     assert row.instructions <= BUDGET[samples]
     assert row.instructions < row.cycles_estimated < 2 * row.instructions
+    assert row.ram_bytes <= 11_000
+    assert row.flash_bytes <= 20_000
+    assert row.stack_bytes <= 512
 
 
 @pytest.mark.parametrize("samples", WINDOW_SIZES)
@@ -54,14 +59,6 @@ def test_mlp_equals_onnx_runtime():
     row = measurement.measure(subject, inputs=5000)
     assert row.mismatches == 0
     assert row.instructions <= 75_000
-
-
-def test_memory_fits_its_budget_at_the_longest_window():
-    (subject,) = measurement.subjects([157], [3], mlp=False)
-    row = measurement.measure(subject, inputs=2)
-    assert row.ram_bytes <= 11_000
-    assert row.flash_bytes <= 20_000
-    assert row.stack_bytes <= 512
 
 
 @pytest.mark.parametrize(("samples", "modules"), [(9, 1), (12, 2), (23, 3), (40, 2), (81, 3), (156, 1)])
@@ -81,9 +78,9 @@ def test_a_wrong_weight_is_a_mismatch(tmp_path: Path):
 
 
 def test_portable_c_and_trace_agree_with_the_kernels_and_the_counter(tmp_path: Path):
-    weights = synthetic.random_remnet(16, 3)
+    weights = synthetic.random_remnet(8, 3)
     firmware_models.write_remnet(tmp_path, weights)
-    windows = synthetic.pressing_windows(16, weights.activation_scale["input"], 50)
+    windows = synthetic.pressing_windows(8, weights.activation_scale["input"], 50)
     results = {}
     for kernels in Kernels:
         image = toolchain.build_image(tmp_path, tmp_path, Board.QEMU_MPS2, kernels)
@@ -96,7 +93,7 @@ def test_portable_c_and_trace_agree_with_the_kernels_and_the_counter(tmp_path: P
     assert results[Kernels.PORTABLE].instructions > 4 * results[Kernels.CORTEX_M4].instructions
 
 
-def check_corrections(bundle: Bundle, measurements: list[RangeMeasurement], folder: Path) -> set[int]:
+def check_corrections(bundle: Bundle, measurements: Sequence[RangeMeasurement], folder: Path) -> set[int]:
     """Compare the board's corrections with the mitigator's; return the statuses seen."""
     export_bundle(bundle, folder)
     image = toolchain.build_image(folder, folder, Board.QEMU_MPS2)
@@ -122,7 +119,7 @@ def test_good_and_hostile_measurements_are_corrected_as_by_the_mitigator(tmp_pat
 
 
 def test_real_logs_are_corrected_as_by_the_mitigator(apartment: Path, tmp_path: Path):
-    measurements = firmware_models.real_measurements(apartment, 1000)
+    measurements = firmware_models.real_measurements(apartment)
     assert 0 in check_corrections(load_bundle(default_model_path()), measurements, tmp_path)
 
 
@@ -131,3 +128,11 @@ def test_the_shipped_model_fits_the_dwm1001c(tmp_path: Path):
     image = toolchain.build_image(tmp_path, tmp_path, Board.DWM1001C)
     assert image.flash_bytes < 24 << 10
     assert image.static_bytes < 12 << 10
+
+
+@pytest.mark.parametrize("cpu", ["cortex-m0", "cortex-m3", "cortex-m7", "cortex-m33"])
+def test_the_library_compiles_without_warnings_for_other_processors(cpu: str):
+    sources = firmware_folder() / "src"
+    files = [*sources.glob("*.c"), *(sources / "cortex_m4").glob("*.S")]
+    flags = (f"-mcpu={cpu}", "-mthumb", "-std=c99", "-Os", *WARNINGS, f"-I{sources}")
+    assert compile_objects("arm-none-eabi-gcc", flags, tuple(files))

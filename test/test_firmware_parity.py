@@ -135,7 +135,7 @@ def test_real_logs_are_corrected_as_by_the_mitigator(apartment: Path, tmp_path: 
     export_bundle(bundle, tmp_path)
     firmware, mitigation = HostFirmware(tmp_path, tmp_path), Mitigation(bundle)
     corrected = 0
-    for measurement in firmware_models.real_measurements(apartment, 300):
+    for measurement in firmware_models.real_measurements(apartment)[::3]:
         expected = mitigation.correct(measurement)
         computed = firmware.correct(measurement.range_m, measurement.cir)
         values = [expected.range_m, expected.correction_m, expected.variance_m2]
@@ -193,3 +193,12 @@ def test_plain_cmake_builds_the_library_and_passes_its_test(tmp_path: Path):
     run(["cmake", "-S", str(firmware_folder()), "-B", str(build), f"-DUWB_MODEL_DIR={tmp_path}"])
     run(["cmake", "--build", str(build)])
     run(["ctest", "--test-dir", str(build)])
+
+
+@pytest.mark.skipif(shutil.which("c++") is None, reason="no C++ compiler: apt install g++")
+def test_a_sketch_in_cpp_can_include_the_model(tmp_path: Path):
+    firmware_models.write_remnet(tmp_path, synthetic.random_remnet(16, 3))
+    sketch = tmp_path / "sketch.cpp"
+    sketch.write_text('#include "uwb_model.h"\nuint32_t id() { return uwb_model_data.model_id; }\n')
+    warnings = ("-std=gnu++14", "-Wall", "-Wextra", "-Werror")
+    run(["c++", *warnings, "-fsyntax-only", f"-I{firmware_folder() / 'src'}", f"-I{tmp_path}", str(sketch)])

@@ -21,7 +21,7 @@ typedef enum {
     UWB_BAD_ARENA,           /* smaller than uwb_arena_size, or not aligned to 4 bytes */
     UWB_EMPTY,               /* the CIR holds no samples */
     UWB_ODD_LENGTH,          /* a complex CIR holds an odd number of values */
-    UWB_BAD_SCALE,           /* the CIR's scale is not finite and positive */
+    UWB_BAD_SCALE,           /* the CIR's scale is not between 1e-30 and 1e30 */
     UWB_NO_FIRST_PATH,       /* the first-path index is not finite */
     UWB_OUTSIDE,             /* the window around the first path lies outside the CIR */
     UWB_ALL_ZERO,            /* the window holds only zeros */

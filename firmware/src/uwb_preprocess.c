@@ -7,10 +7,6 @@
 
 enum { SATURATED = INT16_MAX, PREAMBLE_DIVISOR = 60 };
 
-static int is_finite(float value) {
-    return value >= -FLT_MAX && value <= FLT_MAX;
-}
-
 /* Magnitudes of `count` samples in counts; sets the largest absolute value among them. */
 static uwb_status magnitudes(const uwb_cir *cir, size_t start, size_t count, float *out, int32_t *peak) {
     int32_t largest = 0;
@@ -44,10 +40,11 @@ uwb_status uwb_preprocess(const uwb_model *model, const uwb_cir *cir, float *win
     if (cir->count == 0) {
         return UWB_EMPTY;
     }
-    if (!(is_finite(cir->scale) && cir->scale > 0.0f)) {
+    /* The host's limits are the binary64 numbers 1e-30 and 1e30, which lie below these binary32 ones. */
+    if (!(cir->scale >= 1e-30f && cir->scale < 1e30f)) {
         return UWB_BAD_SCALE;
     }
-    if (!is_finite(cir->first_path_index)) {
+    if (!(cir->first_path_index >= -FLT_MAX && cir->first_path_index <= FLT_MAX)) {
         return UWB_NO_FIRST_PATH;
     }
     if (model->scaling == UWB_SCALE_PREAMBLE && cir->preamble_count == 0) {

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import atexit
 import ctypes
+import functools
 import math
 import os
+import re
 import shutil
 import subprocess
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -155,13 +159,24 @@ def build_shared_library(export: Path, build: Path, flags: Sequence[str] = ()) -
     if compiler is None:
         raise MissingDependencyError("there is no C compiler", valid="apt install gcc, or set CC")
     sources = firmware_folder() / "src"
+    options = ("-std=c99", "-O2", "-fPIC", *WARNINGS, *flags, f"-I{sources}")
+    objects = compile_objects(compiler, options, tuple(sorted(sources.glob("*.c"))))
     shim = build / "exported_model.c"
     shim.write_text(_SHIM, encoding="utf-8")
     output = build / "libuwb_mitigation.so"
-    command = [compiler, "-std=c99", "-O2", "-fPIC", "-shared", *WARNINGS, *flags]
-    command += [f"-I{sources}", f"-I{export}", *map(str, sorted(sources.glob("*.c"))), str(shim)]
-    run([*command, "-o", str(output), "-lm"])
+    run([compiler, *options, f"-I{export}", "-shared", str(shim), *objects, "-o", str(output), "-lm"])
     return output
+
+
+@functools.cache
+def compile_objects(compiler: str, options: tuple[str, ...], sources: tuple[Path, ...]) -> tuple[str, ...]:
+    """Compile sources once a process: many models are linked with the same library."""
+    folder = tempfile.mkdtemp(prefix="uwb_firmware_objects_")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    objects = tuple(f"{folder}/{source.name}.o" for source in sources)
+    for source, output in zip(sources, objects, strict=True):
+        run([compiler, *options, "-c", str(source), "-o", output])
+    return objects
 
 
 def run(command: Sequence[str], timeout_s: float = 300, folder: Path | None = None) -> str:
@@ -186,9 +201,8 @@ def run(command: Sequence[str], timeout_s: float = 300, folder: Path | None = No
         raise MissingDependencyError(f"cannot be run: {error.strerror}", where=command[0]) from error
     if done.returncode:
         lines = done.stderr.splitlines()
-        reason = next(
-            (line for line in lines if "error" in line.lower()), lines[-1] if lines else "no message"
-        )
+        telling = (line for line in lines if re.search("error:|undefined reference", line))
+        reason = next(telling, lines[-1] if lines else "no message")
         raise UwbMitigationError(f"exit {done.returncode}: {reason}", where=Path(command[0]).name)
     return done.stdout
 

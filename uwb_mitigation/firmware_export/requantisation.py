@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ModelError
 from uwb_mitigation.model.architecture import HEAD
-from uwb_mitigation.model.weights import Int8Weights, layer_inputs
+from uwb_mitigation.model.weights import Int8Weights, activation_tensors, layer_inputs, sum_operands
 
 WEIGHT_SCALE_BITS = 8
 """Weights are multiplied by 2^8 before the dot product, to give the offset a place."""
@@ -262,16 +262,12 @@ def nudge(weights: Int8Weights) -> Int8Weights:
     """
     activation = dict(weights.activation_scale)
     weight_scale = dict(weights.weight_scale)
-    tensor = "first"
-    for module in range(1, weights.architecture.modules + 1):
-        name = f"module{module}"
-        for total, first, second in (
-            (f"{name}.sum", f"{name}.residual", tensor),
-            (name, f"{name}.reduce", f"{name}.skip"),
-        ):
-            activation[total] = nudge_sum_scale(activation[first], activation[second], activation[total])
-        tensor = name
-    for layer, read in layer_inputs(weights.architecture).items():
+    reads = layer_inputs(weights.architecture)
+    for tensor in activation_tensors(weights.architecture)[1:]:
+        if tensor not in reads:
+            first, second = sum_operands(tensor)
+            activation[tensor] = nudge_sum_scale(activation[first], activation[second], activation[tensor])
+    for layer, read in reads.items():
         if layer != HEAD:
             low, high = accumulator_range(weights.weight[layer], weights.bias[layer])
             try:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from uwb_mitigation.errors import MissingDependencyError, UwbMitigationError
-from uwb_mitigation.firmware_export.host import WARNINGS, firmware_folder, run
+from uwb_mitigation.firmware_export.host import WARNINGS, compile_objects, firmware_folder, run
 
 APT = "apt install gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm"
 
@@ -17,6 +17,8 @@ _PREFIX = "arm-none-eabi-"
 _CPU = ("-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16")
 # GNU C11 as Arduino builds: there the compiler may fuse float operations that the sources must prevent.
 _COMMON = ("-std=gnu11", "-g0", "-ffunction-sections", "-fdata-sections", "-fno-math-errno")
+
+_WARNINGS = tuple(flag for flag in WARNINGS if flag != "-Wpedantic")
 
 _SIZE_STUB = """\
 #include "uwb_model.h"
@@ -112,20 +114,18 @@ def _link(
     library, boards = firmware / "src", firmware / "boards"
     (script,) = (boards / board).glob("*.ld")
     elf = build / f"{name or board}_{kernels.value}.elf"
-    flags = [*_CPU, *_COMMON, optimisation, *(flag for flag in WARNINGS if flag != "-Wpedantic")]
-    if kernels is Kernels.PORTABLE:
-        flags.append("-DUWB_PORTABLE")
+    portable = ("-DUWB_PORTABLE",) if kernels is Kernels.PORTABLE else ()
+    options = (*_CPU, *_COMMON, optimisation, *_WARNINGS, *portable, f"-I{library}")
+    layers = (*library.glob("*.c"), *(library / "cortex_m4").glob("*.S"), boards / "cortex_m4" / "startup.c")
+    objects = compile_objects(f"{_PREFIX}gcc", options, tuple(sorted(layers)))
     run(
         [
             f"{_PREFIX}gcc",
-            *flags,
-            f"-I{library}",
+            *options,
             f"-I{export}",
             f"-L{boards / 'cortex_m4'}",
-            *map(str, sorted(library.glob("*.c"))),
-            *map(str, sorted((library / "cortex_m4").glob("*.S"))),
-            str(boards / "cortex_m4" / "startup.c"),
             *map(str, sources),
+            *objects,
             *("-nostartfiles", "--specs=nano.specs", "-Wl,--gc-sections"),
             *("-T", str(script), "-o", str(elf), "-lm"),
         ]
