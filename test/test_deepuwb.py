@@ -25,7 +25,6 @@ from uwb_mitigation.measurement import Encoding
 from uwb_mitigation.preprocessing import Preprocessing, Scaling
 from uwb_mitigation.sources import deepuwb, pickle_machine, pickled_frame
 from uwb_mitigation.sources.deepuwb import (
-    MATERIALS,
     NOMINAL_RANGE_M,
     DeepUwbRecording,
     RoomSplit,
@@ -104,6 +103,13 @@ def test_a_frame_is_read_however_pandas_wrote_it(tmp_path: Path, writing: str, p
     assert np.allclose(read.error_m, data["Error"], rtol=1e-6)
     assert list(read.room) == list(data["Room"])
     assert list(read.obstacles) == list(data["Obstacles"])
+
+
+def test_thousands_of_rows_stay_in_their_order(tmp_path: Path) -> None:
+    data = frame(5000)
+    read = read_deepuwb(written(tmp_path, data))
+    assert np.array_equal(read.error_m, data["Error"])
+    assert np.array_equal(read.samples.argmax(axis=1), [row.argmax() for row in data["CIR"]])
 
 
 @pytest.mark.parametrize("version", ["0.25.3", "1.1.5", "1.5.3", "2.2.3"])
@@ -185,10 +191,23 @@ def test_rooms_and_materials_can_be_read_back(tmp_path: Path) -> None:
     assert [materials_of(name) for name in names[:3]] == [(), ("wall",), ("metal plate", "metal window")]
 
 
-@pytest.mark.parametrize("number", range(10))
-def test_each_character_stands_for_its_material(number: int) -> None:
-    digits = "".join("1" if place == number else "0" for place in range(10))
-    assert materials_of(deepuwb.configuration_of(3, digits)) == (MATERIALS[number],)
+@pytest.mark.parametrize(
+    ("obstacles", "material"),
+    [
+        ("1000000000", "wall"),
+        ("0100000000", "polystyrene plate"),
+        ("0010000000", "plastic"),
+        ("0001000000", "plywood plate"),
+        ("0000100000", "cardboard box"),
+        ("0000010000", "LCD TV"),
+        ("0000001000", "metal plate"),
+        ("0000000100", "wood door"),
+        ("0000000010", "glass plate"),
+        ("0000000001", "metal window"),
+    ],
+)
+def test_each_character_stands_for_its_material(obstacles: str, material: str) -> None:
+    assert materials_of(deepuwb.configuration_of(3, obstacles)) == (material,)
 
 
 @pytest.mark.parametrize("name", ["", "deepuwb", "deepuwb/room5/wall", "deepuwb/room1/gold", "by the door"])
