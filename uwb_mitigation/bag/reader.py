@@ -15,7 +15,8 @@ from typing import BinaryIO
 
 from mcap.writer import MCAP0_MAGIC
 
-from uwb_mitigation.bag.container import RawMessage, Span, Survey, read_span, survey
+from uwb_mitigation.bag import schemas
+from uwb_mitigation.bag.container import Channel, RawMessage, Span, Survey, read_span, survey
 from uwb_mitigation.bag.rosbag2 import bag_files
 from uwb_mitigation.errors import DamagedRecordingError, RecordingError
 
@@ -134,6 +135,32 @@ class BagReader:
                 where=f"{path}, byte {offset}",
                 valid="everything before that byte was read",
             )
+
+
+def check_channel(channel: Channel, type_name: str, path: Path) -> None:
+    """Refuse a channel of the bag at `path` whose messages this package would misread as `type_name`.
+
+    Raises:
+        RecordingError: it has no schema, or its type, encoding or fields are others.
+    """
+    place = f"{path}, topic {channel.topic}"
+    if channel.schema is None:
+        raise RecordingError("the bag holds no schema for it", where=place, valid=type_name)
+    if channel.schema.name.replace("/msg/", "/") != type_name.replace("/msg/", "/"):
+        raise RecordingError(f"messages of type {channel.schema.name!r}", where=place, valid=type_name)
+    if channel.encoding != "cdr" or channel.schema.encoding != "ros2msg":
+        raise RecordingError(
+            f"messages in {channel.encoding!r}, defined in {channel.schema.encoding!r}",
+            where=place,
+            valid="'cdr', defined in 'ros2msg'",
+        )
+    differs = schemas.difference(channel.schema.data.decode(errors="replace"), type_name)
+    if differs:
+        raise RecordingError(
+            f"another version of {type_name}: {differs}",
+            where=place,
+            valid="record again, or read it with the version that wrote it",
+        )
 
 
 def _survey(path: Path) -> Survey:

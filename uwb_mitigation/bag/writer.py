@@ -14,10 +14,10 @@ from types import TracebackType
 from typing import BinaryIO
 
 from mcap.well_known import MessageEncoding, Profile, SchemaEncoding
-from mcap.writer import CompressionType, Writer
 
 import uwb_mitigation
 from uwb_mitigation.bag import schemas
+from uwb_mitigation.bag.chunks import ChunkWriter
 from uwb_mitigation.bag.codec import encode_corrected, encode_range, encode_truth
 from uwb_mitigation.bag.container import Channel
 from uwb_mitigation.bag.rosbag2 import METADATA_NAME, NO_QOS, TopicCount, describe, described_files, dump
@@ -36,11 +36,19 @@ from uwb_mitigation.sources.source import Record
 METADATA_RECORD = "uwb_mitigation"
 """Name of the MCAP metadata record that holds the bag's origin."""
 
-CHUNK_SIZE = 1 << 20
-"""Bytes of messages that are compressed together."""
-
 _QOS_KEY = "offered_qos_profiles"
 _HASH_KEY = "topic_type_hash"
+_NO_SCHEMA = 0
+
+
+def partial_file(path: Path) -> Path:
+    """Where the data of a bag at `path` is until the bag is whole."""
+    file = _bag_file(path)
+    return file.with_name(file.name + ".part")
+
+
+def _bag_file(path: Path) -> Path:
+    return path if path.suffix == ".mcap" else path / f"{path.name}_0.mcap"
 
 
 class BagWriter:
@@ -54,6 +62,7 @@ class BagWriter:
         metadata: what to say of its origin, beside the package's version; `source` and `simulated`
             (`true` or `false`) are what a reader of this package looks for.
         force: replace a bag that is there.
+        described: write `metadata.yaml`; False where several one-file bags share a folder.
 
     Attributes:
         file: the MCAP file.
@@ -64,14 +73,18 @@ class BagWriter:
         RecordingError: a bag is there and `force` is not given, or the path cannot be written.
     """
 
-    def __init__(self, path: Path, metadata: Mapping[str, str], *, force: bool = False) -> None:
+    def __init__(
+        self, path: Path, metadata: Mapping[str, str], *, force: bool = False, described: bool = True
+    ) -> None:
         self._folder = None if path.suffix == ".mcap" else path
-        self.file = path if self._folder is None else path / f"{path.name}_0.mcap"
-        self._partial = self.file.with_name(self.file.name + ".part")
+        self.file = _bag_file(path)
+        self._partial = partial_file(path)
+        self._described = described
         self._metadata = {"version": uwb_mitigation.__version__, **metadata}
         self.counts: Counter[str] = Counter()
         self.notice = ""
         self._channels: dict[str, int] = {}
+        self._copied: dict[tuple[object, ...], int] = {}
         self._names: dict[int, str] = {}
         self._topics: dict[str, TopicCount] = {}
         self._schemas: dict[tuple[str, str, bytes], int] = {}
@@ -89,11 +102,8 @@ class BagWriter:
             if self._folder is not None:
                 self._folder.mkdir(parents=True, exist_ok=True)
             self._stream = self._partial.open("wb")
-        self._mcap = Writer(
-            self._stream, chunk_size=CHUNK_SIZE, compression=CompressionType.ZSTD, enable_data_crcs=True
-        )
-        with self._writing():
-            self._mcap.start(profile=Profile.ROS2, library=f"uwb_mitigation {uwb_mitigation.__version__}")
+            library = f"uwb_mitigation {uwb_mitigation.__version__}"
+            self._mcap = ChunkWriter(self._stream, Profile.ROS2, library)
             self._mcap.add_metadata(METADATA_RECORD, self._metadata)
 
     def write(self, record: Record) -> None:
@@ -124,26 +134,32 @@ class BagWriter:
     def copy_channel(self, channel: Channel, topic: str | None = None) -> int:
         """Register a channel of another bag, under its own name or `topic`; returns its number.
 
+        A channel that is the same in all but its id gets the same number: files of one bag share it.
         Its recorded quality of service stays behind: how that is spelt depends on the other bag's version.
-
-        Raises:
-            RecordingError: the channel has no schema, or the topic is registered already.
         """
-        if channel.schema is None:
-            raise RecordingError(f"topic {channel.topic} has no schema")
-        return self._add_channel(
-            topic or channel.topic,
-            channel.schema.name,
-            channel.schema.encoding,
-            channel.schema.data,
-            channel.encoding,
-            channel.metadata | {_QOS_KEY: NO_QOS},
-        )
+        topic = topic or channel.topic
+        metadata = channel.metadata | {_QOS_KEY: NO_QOS}
+        key = (topic, channel.encoding, channel.schema, *sorted(metadata.items()))
+        if key not in self._copied:
+            schema = channel.schema
+            self._copied[key] = self._add_channel(
+                topic,
+                schema.name if schema else "",
+                schema.encoding if schema else "",
+                schema.data if schema else None,
+                channel.encoding,
+                metadata,
+            )
+        return self._copied[key]
+
+    def corrected_channel(self) -> int:
+        """Register `/uwb/range_corrected`, for messages that are serialised already; returns its number."""
+        return self._our_channel(RANGE_CORRECTED, RANGE_CORRECTED_TYPE)
 
     def write_serialized(
         self, channel: int, data: bytes, log_time_ns: int, publish_time_ns: int, sequence: int = 0
     ) -> None:
-        """Write the bytes of a message untouched, to a channel that `copy_channel` gave.
+        """Write the bytes of a message untouched, to a channel that `copy_channel` or `corrected_channel` gave.
 
         Raises:
             RecordingError: a time is negative, or the bag cannot be written.
@@ -184,9 +200,14 @@ class BagWriter:
         data: bytes,
         log_time_ns: int | None = None,
     ) -> None:
+        channel = self._our_channel(topic, type_name)
+        stamp_ns = measurement.stamp_ns if log_time_ns is None else log_time_ns
+        self.write_serialized(channel, data, stamp_ns, measurement.stamp_ns, measurement.sequence)
+
+    def _our_channel(self, topic: str, type_name: str) -> int:
         channel = self._channels.get(topic)
         if channel is None:
-            channel = self._add_channel(
+            channel = self._channels[topic] = self._add_channel(
                 topic,
                 type_name,
                 SchemaEncoding.ROS2,
@@ -194,28 +215,28 @@ class BagWriter:
                 MessageEncoding.CDR,
                 {_QOS_KEY: NO_QOS, _HASH_KEY: schemas.type_hash(type_name)},
             )
-        stamp_ns = measurement.stamp_ns if log_time_ns is None else log_time_ns
-        self.write_serialized(channel, data, stamp_ns, measurement.stamp_ns, measurement.sequence)
+        return channel
 
     def _add_channel(
         self,
         topic: str,
         type_name: str,
         schema_encoding: str,
-        schema: bytes,
+        schema: bytes | None,
         encoding: str,
         metadata: Mapping[str, str],
     ) -> int:
-        if topic in self._channels:
-            raise RecordingError(f"topic {topic} is in the bag already")
         with self._writing():
-            key = (type_name, schema_encoding, schema)
-            if key not in self._schemas:
-                self._schemas[key] = self._mcap.register_schema(type_name, schema_encoding, schema)
-            number = self._mcap.register_channel(topic, encoding, self._schemas[key], dict(metadata))
-        self._channels[topic] = number
+            schema_id = _NO_SCHEMA
+            if schema is not None:
+                key = (type_name, schema_encoding, schema)
+                if key not in self._schemas:
+                    self._schemas[key] = self._mcap.register_schema(type_name, schema_encoding, schema)
+                schema_id = self._schemas[key]
+            number = self._mcap.register_channel(topic, encoding, schema_id, dict(metadata))
         self._names[number] = topic
-        self._topics[topic] = TopicCount(topic, type_name, metadata.get(_HASH_KEY, ""), 0)
+        # A topic may have several channels, of several publishers; rosbag2 lists it once.
+        self._topics.setdefault(topic, TopicCount(topic, type_name, metadata.get(_HASH_KEY, ""), 0))
         return number
 
     def _finish(self) -> None:
@@ -227,7 +248,7 @@ class BagWriter:
         document = describe(self.file.name, topics, first_ns, self._last_ns, self._metadata)
         with self._writing():
             self._mcap.add_metadata("rosbag2", {"serialized_metadata": dump(document)})
-            self._mcap.finish()  # type: ignore[no-untyped-call]
+            self._mcap.finish()
             self._close()
             self._partial.replace(self.file)
             if self._may_describe():
@@ -236,7 +257,9 @@ class BagWriter:
                 partial.replace(self.file.with_name(METADATA_NAME))
 
     def _may_describe(self) -> bool:
-        """Whether `metadata.yaml` is ours to write; leaves a notice where it is not."""
+        """Whether `metadata.yaml` is ours to write; leaves a notice where it is another's."""
+        if not self._described:
+            return False
         if self._folder is not None:
             return True
         try:

@@ -8,10 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 
-from uwb_mitigation.bag import schemas
 from uwb_mitigation.bag.codec import Key, decode_range, decode_truth, key_of
-from uwb_mitigation.bag.container import Channel
-from uwb_mitigation.bag.reader import BagReader
+from uwb_mitigation.bag.reader import BagReader, check_channel
 from uwb_mitigation.bag.topics import RANGE_CIR_TYPE, RANGE_RAW, RANGE_TRUTH, RANGE_TRUTH_TYPE
 from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.measurement import RangeMeasurement, Truth
@@ -137,33 +135,12 @@ class McapRecording:
             is_range = message.channel.topic == self._topic
             # The bag keeps its channels, so that an identity stands for one channel of one file.
             if id(message.channel) not in checked:
-                self._check(message.channel, RANGE_CIR_TYPE if is_range else RANGE_TRUTH_TYPE)
+                check_channel(message.channel, RANGE_CIR_TYPE if is_range else RANGE_TRUTH_TYPE, self._path)
                 checked.add(id(message.channel))
             try:
                 yield decode_range(message.data) if is_range else decode_truth(message.data)
             except RecordingError as error:
                 self.skipped[error.what] += 1
-
-    def _check(self, channel: Channel, type_name: str) -> None:
-        """Refuse a channel whose messages this package would misread."""
-        place = f"{self._path}, topic {channel.topic}"
-        if channel.schema is None:
-            raise RecordingError("the bag holds no schema for it", where=place, valid=type_name)
-        if channel.schema.name.replace("/msg/", "/") != type_name.replace("/msg/", "/"):
-            raise RecordingError(f"messages of type {channel.schema.name!r}", where=place, valid=type_name)
-        if channel.encoding != "cdr" or channel.schema.encoding != "ros2msg":
-            raise RecordingError(
-                f"messages in {channel.encoding!r}, defined in {channel.schema.encoding!r}",
-                where=place,
-                valid="'cdr', defined in 'ros2msg'",
-            )
-        differs = schemas.difference(channel.schema.data.decode(errors="replace"), type_name)
-        if differs:
-            raise RecordingError(
-                f"another version of {type_name}: {differs}",
-                where=place,
-                valid="record again, or read it with the version that wrote it",
-            )
 
 
 @dataclass(slots=True)
