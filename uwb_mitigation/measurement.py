@@ -148,3 +148,31 @@ class CorrectedRange:
     status: Status
     origin: Origin
     model_id: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RangeColumns:
+    """n exchanges whose CIRs have one encoding and one length, field by field: what correcting them takes.
+
+    Attributes:
+        range_m: float32 (n,), as in `RangeMeasurement`.
+        encoding: of every CIR; the fields below as in `Cir`.
+        samples: int16 (n, m).
+        start_index: int32 (n,).
+        first_path_index, scale, rx_power_dbm, first_path_power_dbm: float32 (n,).
+        preamble_count: uint16 (n,).
+    """
+
+    range_m: NDArray[np.float32]
+    encoding: Encoding
+    samples: NDArray[np.int16]
+    start_index: NDArray[np.int32]
+    first_path_index: NDArray[np.float32]
+    scale: NDArray[np.float32]
+    preamble_count: NDArray[np.uint16]
+    rx_power_dbm: NDArray[np.float32]
+    first_path_power_dbm: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        """The number of exchanges."""
+        return len(self.range_m)

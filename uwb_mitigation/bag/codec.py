@@ -15,7 +15,8 @@ import numpy as np
 from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.measurement import Cir, CorrectedRange, Encoding, Origin, RangeMeasurement, Status, Truth
 
-_LITTLE_ENDIAN = b"\x00\x01"
+LITTLE_ENDIAN = b"\x00\x01"
+"""The encapsulation that is read and written (OMG DDSI-RTPS 2.5, section 10.2)."""
 _NANOSECONDS = 1_000_000_000
 
 # Each block starts on a multiple of 8, where `x` stands for CDR's own padding.
@@ -26,6 +27,9 @@ _CIR_POWERS = struct.Struct("<ffBB")
 _TRUTH = struct.Struct("<QQIf")
 _CORRECTED = struct.Struct("<QQIffffBB2xI")
 _LENGTH = struct.Struct("<I")
+
+CORRECTED_SIZE = _CORRECTED.size
+"""Bytes of a `RangeCorrected` behind its header."""
 
 _ENCODINGS = {int(encoding): encoding for encoding in Encoding}
 _STATUSES = {int(status): status for status in Status}
@@ -203,10 +207,15 @@ def decode_corrected(data: bytes) -> tuple[Key, CorrectedRange]:
     )
 
 
+def after_frame(end: int) -> int:
+    """Where the first 8-byte field is, of a message whose frame_id ends at `end`."""
+    return end + (4 - end) % 8
+
+
 def _encode_header(measurement: RangeMeasurement) -> bytes:
     seconds, nanoseconds = divmod(measurement.stamp_ns, _NANOSECONDS)
     frame = measurement.frame_id.encode() + b"\0"
-    prefix = _PREFIX.pack(_LITTLE_ENDIAN + b"\0\0", seconds, nanoseconds, len(frame))
+    prefix = _PREFIX.pack(LITTLE_ENDIAN + b"\0\0", seconds, nanoseconds, len(frame))
     return prefix + frame + bytes(-(len(prefix) - 4 + len(frame)) % 8)
 
 
@@ -214,13 +223,13 @@ def _decode_header(data: bytes) -> tuple[int, str, int]:
     """Stamp, frame_id, and where the first 8-byte field after the header starts."""
     _require(data, _PREFIX.size)
     encapsulation, seconds, nanoseconds, _ = _PREFIX.unpack_from(data)
-    if not encapsulation.startswith(_LITTLE_ENDIAN):
+    if not encapsulation.startswith(LITTLE_ENDIAN):
         kind = "big-endian CDR" if encapsulation.startswith(b"\0\0") else "an unknown encapsulation"
         raise RecordingError(f"message in {kind}", where=encapsulation.hex(" "), valid="little-endian CDR")
     if nanoseconds >= _NANOSECONDS:
         raise RecordingError("message with an invalid time stamp", where=f"nanosec {nanoseconds}")
     frame_id, at = _decode_string(data, _PREFIX.size - _LENGTH.size)
-    return seconds * _NANOSECONDS + nanoseconds, frame_id, at + (4 - at) % 8
+    return seconds * _NANOSECONDS + nanoseconds, frame_id, after_frame(at)
 
 
 def _append_string(data: bytes, text: str) -> bytes:
