@@ -25,7 +25,7 @@ err = Console(stderr=True)
 
 
 def progress() -> Progress:
-    """A progress bar with elapsed and remaining time, on standard error."""
+    """A progress bar with elapsed and remaining time, on standard error where that is a terminal."""
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -34,6 +34,7 @@ def progress() -> Progress:
         TimeRemainingColumn(),
         console=err,
         transient=True,
+        disable=not err.is_terminal,
     )
 
 

@@ -1,0 +1,580 @@
+"""`uwb-mitigation process`: every message kept, every range corrected as one by one, and nothing half-done."""
+
+from __future__ import annotations
+
+import json
+import math
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bag_material import Foreign, spans_of
+from model_material import bundle, cir
+
+from uwb_mitigation.bag import codec, columns, schemas
+from uwb_mitigation.bag.reader import BagReader
+from uwb_mitigation.bag.topics import RANGE_CIR_TYPE, RANGE_CORRECTED, RANGE_RAW
+from uwb_mitigation.bag.writer import BagWriter
+from uwb_mitigation.errors import MissingDependencyError, ParameterError, RecordingError
+from uwb_mitigation.measurement import Cir, CorrectedRange, Encoding, Origin, RangeMeasurement, Status, Truth
+from uwb_mitigation.mitigation import Mitigation
+from uwb_mitigation.model.architecture import Remnet
+from uwb_mitigation.model.bundle import load_bundle
+from uwb_mitigation.model.shipped import default_model_path
+from uwb_mitigation.preprocessing import Preprocessing, Scaling
+from uwb_mitigation.processing import running
+from uwb_mitigation.processing.job import Job, Outcome, process_bag
+from uwb_mitigation.processing.planning import plan
+from uwb_mitigation.processing.running import run_here, run_on_dask
+from uwb_mitigation.sources.source import Record
+
+REPOSITORY = Path(__file__).parent.parent
+START_NS = 1_700_000_000_000_000_000
+LIKE = CorrectedRange(0.0, 0.0, 0.0, 0.0625, Status.OK, Origin.HOST, 77)
+
+# What a row of a batch may be: changes to the CIR, and the range.
+ROWS: list[tuple[dict[str, object], float]] = [
+    ({}, 3.0),
+    ({"scale": 0.37}, 3.0),
+    ({"first_path_index": 744.0}, 3.0),
+    ({"first_path_index": 900.99}, 3.0),
+    ({"start_index": -4, "first_path_index": 1.5}, 3.0),
+    ({"start_index": 2**31 - 1}, 3.0),
+    ({"start_index": -(2**31)}, 3.0),
+    ({"first_path_index": math.nan}, 3.0),
+    ({"first_path_index": math.inf}, 3.0),
+    ({"first_path_index": -math.inf}, 3.0),
+    ({"first_path_index": 3e38}, 3.0),
+    ({"first_path_index": 4.99}, 3.0),
+    ({"first_path_index": 864.0}, 3.0),
+    ({"first_path_index": 865.0}, 3.0),
+    ({"scale": math.nan}, 3.0),
+    ({"scale": 0.0}, 3.0),
+    ({"scale": -1.0}, 3.0),
+    ({"scale": 1e-31}, 3.0),
+    ({"scale": 1e30}, 3.0),
+    ({"scale": math.inf}, 3.0),
+    ({"preamble_count": 0}, 3.0),
+    ({"preamble_count": 65535}, 3.0),
+    ({"samples": np.zeros(2032, np.int16)}, 3.0),
+    ({"samples": np.full(2032, -32768, np.int16)}, 3.0),
+    ({"samples": np.full(2032, -32767, np.int16)}, 3.0),
+    ({"samples": np.full(2032, 32767, np.int16)}, 3.0),
+    ({"samples": np.full(2032, 32766, np.int16)}, 3.0),
+    ({"samples": np.full(2032, -1, np.int16)}, 3.0),
+    ({"rx_power_dbm": math.nan}, 3.0),
+    ({"rx_power_dbm": 300.0}, 3.0),
+    ({"first_path_power_dbm": math.inf}, 3.0),
+    ({}, math.nan),
+    ({}, math.inf),
+    ({}, -0.5),
+    ({}, -0.0),
+    ({}, 1e6),
+    ({}, 1.1e6),
+]
+
+
+def single(value: object) -> object:
+    """As a bag holds it: float32."""
+    return float(np.float32(value)) if isinstance(value, float) else value
+
+
+def exchange(number: int, changes: dict[str, object] | None = None, range_m: float = 3.0) -> RangeMeasurement:
+    fields = {name: single(value) for name, value in (changes or {}).items()}
+    return RangeMeasurement(
+        START_NS + number * 10_000_000,
+        7,
+        1 + number % 3,
+        number,
+        number,
+        float(np.float32(range_m + number * 0.125)),
+        cir(number, **({"sample_period_s": single(1.0016e-9)} | fields)),
+        "antenna",
+    )
+
+
+def odd_exchanges() -> list[RangeMeasurement]:
+    return [
+        replace(exchange(n, changes), range_m=single(range_m)) for n, (changes, range_m) in enumerate(ROWS)
+    ]
+
+
+def write_bag(path: Path, measurements: list[RangeMeasurement]) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with BagWriter(path, {"source": "a test", "simulated": "true"}, described=path.suffix != ".mcap") as bag:
+        for measurement in measurements:
+            bag.write(Record(measurement, Truth(2.5, "LOS", "here")))
+    return path
+
+
+def exchanges(count: int) -> list[RangeMeasurement]:
+    return [exchange(number) for number in range(count)]
+
+
+def job(source: Path, output: Path, **options: object) -> Job:
+    return Job(source, output, default_model_path(), **options)  # type: ignore[arg-type]
+
+
+def corrected_of(path: Path) -> list[bytes]:
+    return [message.data for message in BagReader(path).messages([RANGE_CORRECTED])]
+
+
+def one_by_one(measurements: list[RangeMeasurement]) -> list[bytes]:
+    mitigation = Mitigation(load_bundle(default_model_path()))
+    return [codec.encode_corrected(m, mitigation.correct(m)) for m in measurements]
+
+
+def arguments(*given: object) -> list[str]:
+    return [sys.executable, "-m", "uwb_mitigation.cli", "process", *map(str, given)]
+
+
+def environment() -> dict[str, str]:
+    return os.environ | {"PYTHONPATH": str(REPOSITORY), "COLUMNS": "160"}
+
+
+def run(*given: object, folder: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        arguments(*given),
+        cwd=folder,
+        env=environment(),
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+@pytest.mark.parametrize("scaling", list(Scaling))
+@pytest.mark.parametrize("samples", [157, 8])
+def test_inputs_of_a_batch_are_those_of_single_cirs_to_the_bit(scaling: Scaling, samples: int) -> None:
+    preprocessing = Preprocessing(samples, scaling)
+    measurements = odd_exchanges()
+    (block,) = columns.blocks([codec.encode_range(m) for m in measurements])
+    rows, inputs = preprocessing.apply_batch(block.columns)
+    expected = {}
+    for number, measurement in enumerate(measurements):
+        out = np.empty(samples, np.float32)
+        if preprocessing.apply(measurement.cir, out) is None:
+            expected[number] = out.tobytes()
+    assert {row: line.tobytes() for row, line in zip(rows.tolist(), inputs, strict=True)} == expected
+    assert 5 < len(expected) < len(ROWS) - 5
+
+
+@pytest.mark.parametrize("scaling", list(Scaling))
+def test_a_batch_of_magnitudes_too(scaling: Scaling) -> None:
+    generator = np.random.default_rng(4)
+    windows = generator.integers(0, 9000, (20, 41)).astype(np.int16)
+    windows[3, 7], windows[4], windows[5, 0], windows[6, 30] = -1, 0, 32767, -32768
+    measurements = [
+        replace(
+            exchange(number),
+            cir=Cir(row, Encoding.MAGNITUDE, first_path_index=7.5, preamble_count=9, scale=0.5),
+        )
+        for number, row in enumerate(windows)
+    ]
+    preprocessing = Preprocessing(32, scaling)
+    (block,) = columns.blocks([codec.encode_range(m) for m in measurements])
+    rows, inputs = preprocessing.apply_batch(block.columns)
+    out = np.empty(32, np.float32)
+    usable = [n for n, m in enumerate(measurements) if preprocessing.apply(m.cir, out) is None]
+    assert rows.tolist() == usable
+    assert 3 not in usable
+    for row, line in zip(rows.tolist(), inputs, strict=True):
+        preprocessing.apply(measurements[row].cir, out)
+        assert line.tobytes() == out.tobytes()
+
+
+def test_columns_are_corrected_as_one_by_one_and_the_rest_is_left_out(tmp_path: Path) -> None:
+    mitigation = Mitigation(bundle(tmp_path, Remnet(samples=157), correction_limits_m=(-0.5, 0.5)))
+    measurements = [
+        *odd_exchanges(),
+        *(exchange(n, {"rx_power_dbm": -70.0 - n}) for n in range(50)),
+    ]
+    (block,) = columns.blocks([codec.encode_range(m) for m in measurements])
+    rows, range_m, correction_m = mitigation.correct_columns(block.columns)
+    answers = dict(zip(rows.tolist(), zip(range_m.tolist(), correction_m.tolist(), strict=True), strict=True))
+    single_answers = [mitigation.correct(m) for m in measurements]
+    assert answers == {
+        n: (answer.range_m, answer.correction_m)
+        for n, answer in enumerate(single_answers)
+        if answer.status is Status.OK
+    }
+    assert {answer.status for answer in single_answers} >= {
+        Status.OK,
+        Status.BAD_CIR,
+        Status.OUT_OF_DISTRIBUTION,
+    }
+
+
+@pytest.mark.parametrize("frame", ["", "a", "antenna", "antenna of the third anchor", "Küche"])
+@pytest.mark.parametrize("samples", [40, 41])
+def test_encoded_blocks_are_what_the_codec_encodes(frame: str, samples: int) -> None:
+    measurements = [
+        replace(exchange(n), frame_id=frame, cir=Cir(np.arange(samples, dtype=np.int16))) for n in range(9)
+    ]
+    measurements[3] = replace(measurements[3], stamp_ns=-1)
+    (block,) = columns.blocks([codec.encode_range(m) for m in measurements])
+    rows = np.array([0, 3, 8])
+    correction = np.array([0.25, -0.5, 1.0], np.float32)
+    encoded = block.encode_corrected(rows, block.columns.range_m[rows] - correction, correction, LIKE)
+    assert encoded == [
+        codec.encode_corrected(
+            measurements[row],
+            replace(
+                LIKE,
+                range_m=measurements[row].range_m - shift,
+                range_raw_m=measurements[row].range_m,
+                correction_m=shift,
+            ),
+        )
+        for row, shift in zip(rows.tolist(), correction.tolist(), strict=True)
+    ]
+
+
+def test_a_block_holds_one_layout_and_nothing_that_does_not_decode() -> None:
+    good = [codec.encode_range(exchange(n)) for n in range(10)]
+    short = [codec.encode_range(exchange(n, {"samples": np.ones(40, np.int16)})) for n in range(10)]
+    frame_end = 16 + len("antenna") + 1
+    broken = []
+    for place, value in ((1, 0), (11, 0xFF), (frame_end + 4 + 48, 9), (frame_end + 4 + 56, 1)):
+        message = bytearray(good[0])
+        message[place] = value
+        broken.append(bytes(message))
+    unterminated = [message[:23] + b"!" + message[24:] for message in good]
+    messages = [*good, *short, *broken, *unterminated, b"", b"\0\1\0\0"]
+    found = columns.blocks(messages)
+    assert [block.rows.tolist() for block in found] == [list(range(10)), list(range(10, 20))]
+
+
+def test_corrected_ranges_are_those_of_one_by_one_to_the_bit(tmp_path: Path) -> None:
+    measurements = odd_exchanges() + exchanges(300)
+    measurements += [exchange(n, {"samples": np.zeros(0, np.int16)}) for n in range(3)]
+    measurements = [replace(m, stamp_ns=START_NS + n) for n, m in enumerate(measurements)]
+    source = write_bag(tmp_path / "in.mcap", measurements)
+    outcome = process_bag(job(source, tmp_path / "out.mcap"))
+    assert corrected_of(tmp_path / "out.mcap") == one_by_one(measurements)
+    assert outcome.ranges == len(measurements) == outcome.statuses.total()
+    assert set(outcome.statuses) >= {"OK", "NO_CIR", "BAD_CIR", "OUT_OF_DISTRIBUTION"}
+
+
+def test_each_corrected_range_stands_behind_its_raw_one_with_its_log_time(tmp_path: Path) -> None:
+    process_bag(job(write_bag(tmp_path / "in.mcap", exchanges(20)), tmp_path / "out.mcap"))
+    messages = list(BagReader(tmp_path / "out.mcap").messages())
+    for number, message in enumerate(messages):
+        if message.channel.topic == RANGE_RAW:
+            behind = messages[number + 1]
+            assert behind.channel.topic == RANGE_CORRECTED
+            assert behind.log_time_ns == message.log_time_ns
+            key, _ = codec.decode_corrected(behind.data)
+            assert key == codec.key_of(codec.decode_range(message.data))
+    times = [message.log_time_ns for message in messages]
+    assert times == sorted(times)
+
+
+def test_everything_else_is_copied_byte_for_byte(tmp_path: Path) -> None:
+    foreign = Foreign(tmp_path / "in.mcap").ours()
+    foreign.channel("/picture", "sensor_msgs/msg/Image", "uint8[] data")
+    foreign.channel("/notes", "", None, encoding="json")
+    for number in range(40):
+        foreign.range(number)
+        foreign.add("/picture", START_NS + number, bytes([number]) * number)
+        foreign.add("/notes", START_NS + number, b"{}")
+    source = foreign.finish()
+    process_bag(job(source, tmp_path / "out.mcap"))
+
+    def others(path: Path) -> Counter[object]:
+        return Counter(
+            (m.channel.topic, m.channel.encoding, m.channel.schema, m[1:])
+            for m in BagReader(path).messages()
+            if m.channel.topic != RANGE_CORRECTED
+        )
+
+    assert others(tmp_path / "out.mcap") == others(source)
+
+
+def test_two_publishers_of_one_topic_stay_apart(tmp_path: Path) -> None:
+    foreign = Foreign(tmp_path / "in.mcap").ours()
+    foreign.range(0)
+    for kind in ("a/msg/One", "a/msg/Two"):
+        foreign.channel("/other", kind, "uint8 data")
+        foreign.add("/other", START_NS, b"x")
+    process_bag(job(foreign.finish(), tmp_path / "out.mcap"))
+    kinds = [m.channel.schema.name for m in BagReader(tmp_path / "out.mcap").messages(["/other"])]
+    assert sorted(kinds) == ["a/msg/One", "a/msg/Two"]
+
+
+def test_messages_that_do_not_decode_are_copied_and_counted(tmp_path: Path) -> None:
+    foreign = Foreign(tmp_path / "in.mcap").ours()
+    foreign.range(0)
+    foreign.add(RANGE_RAW, START_NS + 1, b"\0\1\0\0garbage")
+    outcome = process_bag(job(foreign.finish(), tmp_path / "out.mcap"))
+    assert outcome.skipped == {"message ends early": 1}
+    assert outcome.ranges == 1
+    raw = [m.data for m in BagReader(tmp_path / "out.mcap").messages([RANGE_RAW])]
+    assert b"\0\1\0\0garbage" in raw
+
+
+def test_corrected_ranges_of_the_input_are_replaced_and_counted(tmp_path: Path) -> None:
+    source = write_bag(tmp_path / "in.mcap", exchanges(30))
+    process_bag(job(source, tmp_path / "once.mcap"))
+    outcome = process_bag(job(tmp_path / "once.mcap", tmp_path / "twice.mcap"))
+    assert outcome.replaced == 30
+    assert [m[1:] for m in BagReader(tmp_path / "once.mcap").messages()] == [
+        m[1:] for m in BagReader(tmp_path / "twice.mcap").messages()
+    ]
+
+
+def test_a_bag_can_be_replaced_by_its_corrected_self(tmp_path: Path) -> None:
+    source = write_bag(tmp_path / "in.mcap", exchanges(10))
+    process_bag(job(source, source, force=True))
+    assert len(corrected_of(source)) == 10
+
+
+def test_an_output_says_where_it_comes_from_and_that_it_was_simulated(tmp_path: Path) -> None:
+    process_bag(job(write_bag(tmp_path / "in.mcap", exchanges(2)), tmp_path / "out"))
+    known = BagReader(tmp_path / "out").metadata["uwb_mitigation"]
+    assert known["simulated"] == "true"
+    assert known["source"].startswith("in.mcap, corrected by model ")
+
+
+@pytest.mark.parametrize("library", ["rosbags", "mcap"])
+def test_other_readers_open_the_output(tmp_path: Path, library: str) -> None:
+    process_bag(job(write_bag(tmp_path / "in.mcap", exchanges(12)), tmp_path / "out"))
+    file = tmp_path / "out" / "out_0.mcap"
+    if library == "rosbags":
+        from rosbags.rosbag2 import Reader
+
+        with Reader(tmp_path / "out") as reader:
+            found = Counter(connection.topic for connection, _, _ in reader.messages())
+    else:
+        from mcap.reader import make_reader
+
+        with file.open("rb") as stream:
+            reader = make_reader(stream, validate_crcs=True)
+            found = Counter(channel.topic for _, channel, _ in reader.iter_messages())
+            statistics = reader.get_summary().statistics
+            assert statistics.message_count == found.total()
+            assert statistics.message_start_time == START_NS
+            assert statistics.message_end_time == START_NS + 11 * 10_000_000
+    assert found[RANGE_RAW] == found[RANGE_CORRECTED] == 12
+
+
+@pytest.mark.parametrize(
+    ("make", "told"),
+    [
+        (lambda path: path.write_bytes(b"nothing of the kind"), "not an MCAP file"),
+        (lambda path: path.write_bytes(b""), "empty"),
+        (lambda path: Foreign(path).finish(), "no topic /uwb/range_raw"),
+    ],
+)
+def test_what_is_no_recording_of_ranges_leaves_no_output(tmp_path: Path, make, told: str) -> None:
+    make(tmp_path / "in.mcap")
+    with pytest.raises(RecordingError, match=told):
+        process_bag(job(tmp_path / "in.mcap", tmp_path / "out.mcap"))
+    assert [path.name for path in tmp_path.iterdir()] == ["in.mcap"]
+
+
+def test_another_version_of_the_message_is_refused(tmp_path: Path) -> None:
+    foreign = Foreign(tmp_path / "in.mcap")
+    text = schemas.definition(RANGE_CIR_TYPE).replace("uint64 anchor_id", "uint32 anchor_id")
+    foreign.channel(RANGE_RAW, RANGE_CIR_TYPE, text)
+    foreign.range(0)
+    with pytest.raises(RecordingError, match="another version of"):
+        process_bag(job(foreign.finish(), tmp_path / "out.mcap"))
+    assert not (tmp_path / "out.mcap").exists()
+
+
+def cut(path: Path) -> int:
+    """Break a bag behind its first chunk; returns where."""
+    end = spans_of(path)[0].end
+    path.write_bytes(path.read_bytes()[:end] + b"\x06\xff\xff\xff")
+    return end
+
+
+def test_a_damaged_bag_is_processed_as_far_as_it_goes(tmp_path: Path) -> None:
+    source = write_bag(tmp_path / "in.mcap", exchanges(400))
+    end = cut(source)
+    outcome = process_bag(job(source, tmp_path / "out.mcap"))
+    assert outcome.written
+    assert f"in.mcap, byte {end}" in str(outcome.error)
+    assert 0 < outcome.ranges < 400
+    assert corrected_of(tmp_path / "out.mcap") == one_by_one(exchanges(outcome.ranges))
+
+
+def test_the_command_writes_a_bag_and_its_result(tmp_path: Path) -> None:
+    write_bag(tmp_path / "in.mcap", exchanges(40))
+    done = run("in.mcap", "-o", "out.mcap", "--compare-copy", "--json", "out.json", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "40 ranges" in done.stdout
+    result = json.loads((tmp_path / "out.json").read_text())
+    assert (result["ranges"], result["messages"], result["failed"]) == (40, 80, 0)
+    assert result["ranges_per_s"] > 0
+    assert result["copy_only_ranges_per_s"] > 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "in.mcap",
+        "metadata.yaml",
+        "out.json",
+        "out.mcap",
+    ]
+    assert corrected_of(tmp_path / "out.mcap") == one_by_one(exchanges(40))
+
+
+def test_an_output_that_is_there_is_kept_unless_forced(tmp_path: Path) -> None:
+    source = write_bag(tmp_path / "in.mcap", exchanges(4))
+    output = write_bag(tmp_path / "out.mcap", exchanges(1))
+    refused = run(source, "-o", output, folder=tmp_path)
+    assert refused.returncode == 1
+    assert "--force" in refused.stderr
+    assert len(refused.stderr.splitlines()) == 1
+    assert corrected_of(output) == []
+    assert run(source, "-o", output, "--force", folder=tmp_path).returncode == 0
+    assert len(corrected_of(output)) == 4
+
+
+def test_one_bad_bag_is_reported_and_does_not_stop_the_rest(tmp_path: Path) -> None:
+    folder = tmp_path / "monday"
+    write_bag(folder / "a.mcap", exchanges(9))
+    write_bag(folder / "later" / "b", exchanges(8))
+    write_bag(folder / "cut.mcap", exchanges(400))
+    cut(folder / "cut.mcap")
+    (folder / "bad.mcap").write_bytes(b"nothing")
+    done = run("monday", "-o", "out", "--json", "out.json", folder=tmp_path)
+    assert done.returncode == 1
+    assert "bad.mcap: not an MCAP file" in done.stderr
+    assert "cut.mcap, byte" in done.stderr
+    assert "2 of 4 bags failed" in done.stderr
+    files = sorted(str(p.relative_to(tmp_path / "out")) for p in (tmp_path / "out").rglob("*") if p.is_file())
+    assert files == ["a.mcap", "cut.mcap", "later/b/b_0.mcap", "later/b/metadata.yaml"]
+    result = json.loads((tmp_path / "out.json").read_text())
+    errors = {Path(bag["source"]).name: bag["error"] for bag in result["bags"]}
+    assert result["failed"] == 2
+    assert errors["a.mcap"] is errors["b"] is None
+    assert "not an MCAP file" in errors["bad.mcap"]
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        (["absent.mcap", "-o", "out.mcap"], "absent.mcap: no such file"),
+        (["in.mcap", "in.mcap", "-o", "out"], "have one name"),
+        (["in.mcap", "other.mcap", "-o", "out.mcap"], "one file for several bags"),
+        (["empty", "-o", "out"], "holds no MCAP bag"),
+        (["in.mcap", "-o", "out.mcap", "--jobs", "0"], "jobs = 0"),
+        (["in.mcap", "-o", "out.mcap", "--model", "absent.onnx"], "absent.onnx"),
+        (["in.mcap", "-o", "no/such/folder.mcap"], "cannot be written"),
+    ],
+)
+def test_bad_arguments_are_one_clear_line_and_exit_1(tmp_path: Path, given: list[str], told: str) -> None:
+    write_bag(tmp_path / "in.mcap", exchanges(1))
+    write_bag(tmp_path / "other.mcap", exchanges(1))
+    (tmp_path / "empty").mkdir()
+    done = run(*given, folder=tmp_path)
+    assert done.returncode == 1
+    assert told in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+    assert not (tmp_path / "out.mcap").exists()
+
+
+def test_names_of_several_sources_are_kept_and_earlier_outputs_left_out(tmp_path: Path) -> None:
+    for name in ("one/a.mcap", "one/sub/b.mcap", "two/a.mcap", "one/out/c.mcap"):
+        write_bag(tmp_path / name, [])
+    several = plan([tmp_path / "one", tmp_path / "two"], tmp_path / "one" / "out")
+    assert [str(p.output.relative_to(tmp_path / "one" / "out")) for p in several] == [
+        "one/a.mcap",
+        "one/sub/b.mcap",
+        "two/a.mcap",
+    ]
+    assert [str(p.output.relative_to(tmp_path)) for p in plan([tmp_path / "two"], tmp_path / "x")] == [
+        "x/a.mcap"
+    ]
+
+
+def test_ctrl_c_ends_cleanly_and_leaves_no_partial_file(tmp_path: Path) -> None:
+    source = write_bag(tmp_path / "in.mcap", exchanges(200))
+    data, (span, *_) = source.read_bytes(), spans_of(source)
+    # The same chunk a thousand times over: more than is done before the signal.
+    source.write_bytes(data[: span.end] + data[span.offset : span.end] * 1000)
+    process = subprocess.Popen(
+        arguments(source, "-o", "out.mcap"),
+        cwd=tmp_path,
+        env=environment(),
+        stderr=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        start_new_session=True,
+    )
+    deadline = time.monotonic() + 60
+    while not (tmp_path / "out.mcap.part").exists():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    os.killpg(process.pid, signal.SIGINT)
+    _, stderr = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert b"Traceback" not in stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["in.mcap"]
+
+
+def test_a_worker_that_dies_costs_its_own_bag_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    jobs = [
+        job(write_bag(tmp_path / f"in{n}.mcap", exchanges(300)), tmp_path / f"out{n}.mcap") for n in range(3)
+    ]
+    outcomes: dict[str, Outcome] = {}
+    for event in run_here(jobs, 1):
+        if isinstance(event, Outcome):
+            outcomes[event.job.source.name] = event
+        elif event.job is jobs[1] and event.done == 0:
+            for child in multiprocessing.active_children():
+                child.kill()
+    assert "died (SIGKILL" in str(outcomes["in1.mcap"].error)
+    assert [outcomes[f"in{n}.mcap"].error for n in (0, 2)] == [None, None]
+    assert not list(tmp_path.glob("*.part"))
+
+
+def test_a_cluster_does_the_same_and_one_bad_bag_does_not_stop_it(tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed", reason="python -m pip install distributed")
+    sources = [write_bag(tmp_path / f"in{n}.mcap", exchanges(50)) for n in range(3)]
+    sources[1].write_bytes(b"nothing of the kind")
+    jobs = [job(source, tmp_path / f"{source.stem}_out.mcap") for source in sources]
+    with distributed.LocalCluster(
+        n_workers=2,
+        threads_per_worker=1,
+        processes=True,
+        dashboard_address=None,
+        host="127.0.0.1",
+        env={"PYTHONPATH": str(REPOSITORY)},
+    ) as cluster:
+        outcomes = {event.job: event for event in run_on_dask(jobs, cluster.scheduler_address)}
+    assert "not an MCAP file" in str(outcomes[jobs[1]].error)
+    for number in (0, 2):
+        assert outcomes[jobs[number]].error is None
+        assert corrected_of(jobs[number].output) == one_by_one(exchanges(50))
+
+
+def test_a_scheduler_that_does_not_answer_is_named(tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed", reason="python -m pip install distributed")
+    import dask
+
+    with dask.config.set({"distributed.comm.timeouts.connect": "200ms"}):
+        for address in ("tcp://127.0.0.1:9", "no such address"):
+            with pytest.raises(ParameterError, match="no Dask scheduler"):
+                list(run_on_dask([job(tmp_path / "a", tmp_path / "b")], address))
+    assert distributed
+
+
+def test_without_dask_the_error_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(MissingDependencyError, match="pip install distributed"):
+        list(run_on_dask([job(tmp_path / "a", tmp_path / "b")], "tcp://127.0.0.1:8786"))
+
+
+def test_every_core_that_may_be_used_is_used() -> None:
+    assert running.cores() == len(os.sched_getaffinity(0))

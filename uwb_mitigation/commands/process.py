@@ -1,0 +1,194 @@
+"""`uwb-mitigation process`: recorded bags to corrected bags."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from uwb_mitigation.commands import console
+from uwb_mitigation.commands.console import JsonOption
+from uwb_mitigation.errors import ParameterError, RecordingError, UwbMitigationError
+
+if TYPE_CHECKING:
+    from uwb_mitigation.processing.job import Job, Outcome
+    from uwb_mitigation.processing.running import Event
+
+
+def process(
+    sources: Annotated[
+        list[Path], typer.Argument(metavar="IN...", help="Bags, or folders of bags at any depth.")
+    ],
+    output: Annotated[
+        Path,
+        typer.Option(
+            "-o",
+            "--output",
+            metavar="OUT",
+            help="Of one bag: OUT.mcap for one file, any other name for a bag folder. Of several: a folder.",
+        ),
+    ],
+    model: Annotated[Path | None, typer.Option(help="Bundle; without it, the shipped one.")] = None,
+    workers: Annotated[
+        int | None, typer.Option("-j", "--jobs", help="Bags at a time; without it, one for each core.")
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS", help="Let the Dask cluster of this scheduler do it: tcp://HOST:8786."
+        ),
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace outputs that exist.")] = False,
+    compare_copy: Annotated[
+        bool, typer.Option("--compare-copy", help="Also time loops that only read and rewrite the bags.")
+    ] = False,
+    json: JsonOption = None,
+) -> None:
+    """Copy bags with a corrected range behind each raw one; all other messages stay as they are."""
+    from uwb_mitigation.model.bundle import load_bundle
+    from uwb_mitigation.model.shipped import default_model_path
+    from uwb_mitigation.processing import planning, running
+    from uwb_mitigation.processing.job import Job
+
+    if workers is not None and workers < 1:
+        raise ParameterError(f"jobs = {workers}", valid="1 or more")
+    # A model that does not load would fail every bag in the same way.
+    bundle = load_bundle(model or default_model_path())
+    jobs = []
+    for planned in planning.plan(sources, output):
+        described = planned.alone or planned.output.suffix != ".mcap"
+        # Absolute, since a worker of a cluster has a working directory of its own.
+        source, place, path = planned.source.absolute(), planned.output.absolute(), bundle.path.absolute()
+        jobs.append(Job(source, place, path, force, described, compare_copy))
+        if not planned.alone:
+            _make_folder(place.parent)
+
+    started = time.perf_counter()
+    if scheduler is None:
+        events = running.run_here(jobs, min(workers or running.cores(), len(jobs)))
+    else:
+        events = running.run_on_dask(jobs, scheduler)
+    outcomes = _follow(jobs, events)
+    seconds = outcomes[0].seconds if len(jobs) == 1 else time.perf_counter() - started
+    result = _result(outcomes, seconds, bundle.model_id)
+    if any(outcome.written for outcome in outcomes):
+        _show(outcomes, result)
+    console.write_json(json, result)
+    _raise_failures(outcomes)
+
+
+def _make_folder(path: Path) -> None:
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ParameterError(
+            f"cannot be made: {error.strerror}", where=str(path), valid="a folder"
+        ) from error
+
+
+def _follow(jobs: list[Job], events: Iterable[Event]) -> list[Outcome]:
+    """Show the progress; return the outcomes in the order of the jobs."""
+    from uwb_mitigation.processing.running import Progress
+
+    outcomes: dict[Job, Outcome] = {}
+    with console.progress() as bar:
+        whole = bar.add_task(f"0 of {len(jobs)} bags", total=len(jobs), visible=len(jobs) > 1)
+        tasks = {}
+        for event in events:
+            if isinstance(event, Progress):
+                if event.job not in tasks:
+                    tasks[event.job] = bar.add_task(escape(event.job.source.name), total=None)
+                if event.total:
+                    bar.update(tasks[event.job], completed=event.done, total=event.total)
+                continue
+            outcomes[event.job] = event
+            if event.job in tasks:
+                bar.remove_task(tasks.pop(event.job))
+            bar.update(whole, completed=len(outcomes), description=f"{len(outcomes)} of {len(jobs)} bags")
+    return [outcomes[job] for job in jobs]
+
+
+def _result(outcomes: list[Outcome], seconds: float, model_id: int) -> dict[str, Any]:
+    ranges = sum(outcome.ranges for outcome in outcomes)
+    result: dict[str, Any] = {
+        "ranges": ranges,
+        "ranges_per_s": ranges / seconds if seconds else 0.0,
+        "messages": sum(outcome.messages for outcome in outcomes),
+        "seconds": seconds,
+        "model_id": model_id,
+        "failed": sum(outcome.error is not None for outcome in outcomes),
+        "bags": [_bag(outcome) for outcome in outcomes],
+    }
+    # Bags that run side by side share the cores: rates of the copies are means over the bags' own times.
+    timed = [outcome for outcome in outcomes if outcome.copy_seconds and outcome.own_copy_seconds]
+    if timed:
+        copied = sum(outcome.ranges for outcome in timed)
+        result["copy_only_ranges_per_s"] = copied / sum(outcome.copy_seconds or 0.0 for outcome in timed)
+        result["own_copy_only_ranges_per_s"] = copied / sum(
+            outcome.own_copy_seconds or 0.0 for outcome in timed
+        )
+    return result
+
+
+def _bag(outcome: Outcome) -> dict[str, Any]:
+    return {
+        "source": str(outcome.job.source),
+        "output": str(outcome.job.output) if outcome.written else None,
+        "messages": outcome.messages,
+        "ranges": outcome.ranges,
+        "statuses": dict(outcome.statuses),
+        "replaced": outcome.replaced,
+        "skipped": dict(outcome.skipped),
+        "seconds": outcome.seconds,
+        "error": str(outcome.error) if outcome.error else None,
+    }
+
+
+def _show(outcomes: list[Outcome], result: dict[str, Any]) -> None:
+    table = Table("bag", title=f"Corrected by model {result['model_id']:08x}", title_justify="left")
+    for column in ("messages", "ranges", "OK", "passed through", "replaced", "skipped"):
+        table.add_column(column, justify="right")
+    table.add_column("")
+    for outcome in outcomes:
+        passed = outcome.ranges - outcome.statuses["OK"]
+        numbers = (outcome.messages, outcome.ranges, outcome.statuses["OK"], passed, outcome.replaced)
+        state = "failed" if not outcome.written else "damaged" if outcome.error else ""
+        table.add_row(
+            escape(outcome.job.source.name), *map(str, numbers), str(outcome.skipped.total()), state
+        )
+    console.out.print(table)
+    console.out.print(f"{result['ranges']} ranges, {result['ranges_per_s']:.0f} ranges/s", highlight=False)
+    if "copy_only_ranges_per_s" in result:
+        console.out.print(
+            f"only copied: {result['copy_only_ranges_per_s']:.0f} ranges/s by the mcap library, "
+            f"{result['own_copy_only_ranges_per_s']:.0f} by this package",
+            highlight=False,
+        )
+    for outcome in outcomes:
+        if outcome.replaced:
+            _note(outcome.job.source, f"{outcome.replaced} corrected ranges that it held were replaced")
+        for kind, count in outcome.skipped.items():
+            _note(outcome.job.source, f"{count} x {kind}")
+        if outcome.notice:
+            _note(outcome.job.output, outcome.notice)
+
+
+def _note(path: Path, text: str) -> None:
+    console.err.print(f"{path}: {text}", style="yellow", markup=False, soft_wrap=True, highlight=False)
+
+
+def _raise_failures(outcomes: list[Outcome]) -> None:
+    """One line for one bag; for several a line for each, and how many."""
+    errors: list[UwbMitigationError] = [outcome.error for outcome in outcomes if outcome.error is not None]
+    if not errors:
+        return
+    if len(outcomes) == 1:
+        raise errors[0]
+    for error in errors:
+        console.err.print(str(error), style="red", markup=False, soft_wrap=True, highlight=False)
+    raise RecordingError(f"{len(errors)} of {len(outcomes)} bags failed")

@@ -1,0 +1,231 @@
+"""One bag in, one corrected bag out.
+
+Every message is copied as it is; behind each raw range goes what the mitigation makes of it, with the same
+log time. The bytes are those that correcting one by one would give.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+
+from uwb_mitigation.bag import columns
+from uwb_mitigation.bag.codec import decode_range, encode_corrected
+from uwb_mitigation.bag.container import RawMessage
+from uwb_mitigation.bag.reader import BagReader, check_channel
+from uwb_mitigation.bag.topics import RANGE_CIR_TYPE, RANGE_CORRECTED, RANGE_RAW
+from uwb_mitigation.bag.writer import METADATA_RECORD, BagWriter
+from uwb_mitigation.errors import DamagedRecordingError, RecordingError, UwbMitigationError
+from uwb_mitigation.measurement import CorrectedRange, Origin, Status
+from uwb_mitigation.mitigation import Mitigation
+from uwb_mitigation.model.bundle import load_bundle
+from uwb_mitigation.processing import copying
+
+BATCH = 256
+"""Messages taken together: enough to vectorise, little enough that the network's inputs stay in cache."""
+
+Report = Callable[[int, int], None]
+"""Called with (messages done, messages in all, as the bag's index says)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """What to make of which bag.
+
+    Attributes:
+        source: an MCAP file or rosbag2 folder.
+        output: an MCAP file or, without `.mcap`, a rosbag2 folder.
+        model: the bundle to correct with.
+        force: replace `output` if it is there.
+        described: write `metadata.yaml` beside a one-file output.
+        compare_copy: also time loops that only read and rewrite the bag.
+    """
+
+    source: Path
+    output: Path
+    model: Path
+    force: bool = False
+    described: bool = True
+    compare_copy: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What became of a job.
+
+    Attributes:
+        job: the job.
+        messages: messages read.
+        ranges: raw ranges that were corrected or passed through.
+        statuses: corrected ranges by status, {name: count}.
+        replaced: corrected ranges of the input, left out for the new ones.
+        skipped: oddities, {kind: count}.
+        seconds: wall time of reading, correcting and writing.
+        copy_seconds: wall time of reading and rewriting alone, with the `mcap` library; None = not asked for.
+        own_copy_seconds: the same with this package's reader and writer.
+        notice: what the user should know; may be empty.
+        error: why there is no output or, after damage, why it is not the whole bag; None = success.
+        written: whether there is an output.
+    """
+
+    job: Job
+    messages: int = 0
+    ranges: int = 0
+    statuses: Counter[str] = field(default_factory=Counter)
+    replaced: int = 0
+    skipped: Counter[str] = field(default_factory=Counter)
+    seconds: float = 0.0
+    copy_seconds: float | None = None
+    own_copy_seconds: float | None = None
+    notice: str = ""
+    error: UwbMitigationError | None = None
+    written: bool = False
+
+
+def attempt(job: Job, report: Report | None = None) -> Outcome:
+    """`process_bag`, with what prevents it as the outcome's error: one bag must not stop the rest."""
+    try:
+        return process_bag(job, report)
+    except UwbMitigationError as error:
+        return Outcome(job, error=error)
+    except MemoryError:
+        return Outcome(job, error=RecordingError("not enough memory", where=str(job.source)))
+    except OSError as error:
+        problem = RecordingError(f"cannot be processed: {error.strerror}", where=str(job.source))
+        return Outcome(job, error=problem)
+
+
+def process_bag(job: Job, report: Report | None = None) -> Outcome:
+    """Do the job. Damage in the input ends the output there, and is the outcome's error.
+
+    Raises:
+        RecordingError: the input is no bag of ours or holds no raw ranges, or the output is there already
+            or cannot be written. Nothing is left of an output then.
+        ModelError: the model cannot be used.
+    """
+    mitigation = Mitigation(load_bundle(job.model))
+    started = time.perf_counter()
+    bag = BagReader(job.source)
+    known = bag.metadata.get(METADATA_RECORD, {})
+    origin = {
+        "source": f"{job.source.name}, corrected by model {mitigation.bundle.model_id:08x}",
+        "simulated": known.get("simulated", "false"),
+    }
+    with BagWriter(job.output, origin, force=job.force, described=job.described) as out:
+        corrector = _Corrector(job.source, mitigation, out)
+        damage = None
+        total, done = bag.message_count, 0
+        messages = bag.messages()
+        while True:
+            batch: list[RawMessage] = []
+            try:
+                # Not list(islice()): what was read before damage must stay.
+                for message in islice(messages, BATCH):
+                    batch.append(message)  # noqa: PERF402
+            except DamagedRecordingError as error:
+                damage = error
+            if not batch:
+                break
+            corrector.write(batch)
+            done += len(batch)
+            if report is not None:
+                report(done, total)
+            if damage is not None:
+                break
+        if damage is not None and done == 0:
+            raise damage
+        if RANGE_RAW not in bag.topics:
+            held = ", ".join(sorted(bag.topics)) or "no topic"
+            raise RecordingError(
+                f"no topic {RANGE_RAW}", where=str(job.source), valid=f"the bag holds: {held}"
+            )
+    seconds = time.perf_counter() - started
+    copy_seconds = own_copy_seconds = None
+    if job.compare_copy:
+        copy_seconds = copying.time_library_copy(job.source, job.output)
+        own_copy_seconds = copying.time_own_copy(job.source, job.output)
+    return Outcome(
+        job,
+        messages=done,
+        ranges=corrector.statuses.total(),
+        statuses=corrector.statuses,
+        replaced=corrector.replaced,
+        skipped=corrector.skipped + bag.oddities,
+        seconds=seconds,
+        copy_seconds=copy_seconds,
+        own_copy_seconds=own_copy_seconds,
+        notice=out.notice,
+        error=damage,
+        written=True,
+    )
+
+
+class _Corrector:
+    """Writes batches of messages with the corrected ranges among them."""
+
+    def __init__(self, source: Path, mitigation: Mitigation, out: BagWriter) -> None:
+        self._source = source
+        self._mitigation = mitigation
+        self._out = out
+        card = mitigation.bundle.card
+        self._like = CorrectedRange(
+            0.0, 0.0, 0.0, card.variance_m2, Status.OK, Origin.HOST, mitigation.bundle.model_id
+        )
+        # The bag keeps its channels, so that an identity stands for one channel of one file.
+        self._channels: dict[int, int] = {}
+        self._corrected = out.corrected_channel()
+        self.statuses: Counter[str] = Counter()
+        self.skipped: Counter[str] = Counter()
+        self.replaced = 0
+
+    def write(self, batch: list[RawMessage]) -> None:
+        raw = [message for message in batch if message.channel.topic == RANGE_RAW]
+        for message in raw:
+            if id(message.channel) not in self._channels:
+                check_channel(message.channel, RANGE_CIR_TYPE, self._source)
+                self._channels[id(message.channel)] = self._out.copy_channel(message.channel)
+        corrected = iter(self._correct([message.data for message in raw]))
+        out = self._out
+        for message in batch:
+            channel, sequence, log_ns, publish_ns, data = message
+            if channel.topic == RANGE_CORRECTED:
+                self.replaced += 1
+                continue
+            number = self._channels.get(id(channel))
+            if number is None:
+                number = self._channels[id(channel)] = out.copy_channel(channel)
+            out.write_serialized(number, data, log_ns, publish_ns, sequence)
+            if channel.topic == RANGE_RAW:
+                answer = next(corrected)
+                if answer is not None:
+                    out.write_serialized(self._corrected, answer, log_ns, publish_ns, sequence)
+
+    def _correct(self, messages: list[bytes]) -> list[bytes | None]:
+        """`RangeCorrected` for each message; None where it does not decode."""
+        answers: list[bytes | None] = [None] * len(messages)
+        left = set(range(len(messages)))
+        for block in columns.blocks(messages):
+            rows, range_m, correction_m = self._mitigation.correct_columns(block.columns)
+            encoded = block.encode_corrected(rows, range_m, correction_m, self._like)
+            numbers = block.rows[rows].tolist()
+            for number, answer in zip(numbers, encoded, strict=True):
+                answers[number] = answer
+            left.difference_update(numbers)
+            self.statuses[Status.OK.name] += len(numbers)
+        # What is odd in any way is left to the one definition.
+        numbers, measurements = [], []
+        for number in sorted(left):
+            try:
+                measurements.append(decode_range(messages[number]))
+                numbers.append(number)
+            except RecordingError as error:  # noqa: PERF203 - few
+                self.skipped[error.what] += 1
+        for number, measurement in zip(numbers, measurements, strict=True):
+            result = self._mitigation.correct(measurement)
+            answers[number] = encode_corrected(measurement, result)
+            self.statuses[result.status.name] += 1
+        return answers
