@@ -36,6 +36,7 @@ setup(
         "console_scripts": [
             "driver = uwb_mitigation.nodes.driver:main",
             "mitigator = uwb_mitigation.nodes.mitigator:main",
+            "pipeline = uwb_mitigation.nodes.pipeline:main",
             "monitor = uwb_mitigation.nodes.monitor:main",
             "uwb-mitigation = uwb_mitigation.cli:main",
         ],

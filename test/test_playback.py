@@ -62,11 +62,12 @@ class Player:
             on_end=self.end,
         )
 
-    def publish(self, record: Record, stamp_ns: int) -> None:
-        self.published.append((record.measurement.stamp_ns, stamp_ns))
-        if len(self.published) == self.stop_after:
-            self.playback.stop()
-            self.ended.set()
+    def publish(self, records: list[tuple[Record, int]]) -> None:
+        for record, stamp_ns in records:
+            self.published.append((record.measurement.stamp_ns, stamp_ns))
+            if len(self.published) == self.stop_after:
+                self.playback.stop()
+                self.ended.set()
 
     def end(self, error: UwbMitigationError | None) -> None:
         self.ends.append(error)
@@ -100,9 +101,9 @@ def test_a_record_is_never_published_before_its_stamp():
     player = Player(source)
     early = []
     publish = player.publish
-    player.playback._publish = lambda record, stamp_ns: (
-        early.append(player.clock.now().nanoseconds < stamp_ns),
-        publish(record, stamp_ns),
+    player.playback._publish = lambda records: (
+        early.append(player.clock.now().nanoseconds < records[-1][1]),
+        publish(records),
     )
     player.play()
     assert early == [False, False, False]

@@ -52,7 +52,7 @@ class BoardFeed:
         self.port = port
         self.ranges = 0
         self.corrections = 0
-        self.meter = diagnostics.Meter()
+        self.meter = diagnostics.Meter(now_ns)
         self.status: BoardStatus | None = None
         self._on_range = on_range
         self._on_correction = on_correction

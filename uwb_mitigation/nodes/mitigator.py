@@ -3,122 +3,213 @@
 from __future__ import annotations
 
 import sys
-from collections import Counter
+import threading
+import time
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray
-from lifecycle_msgs.msg import State
-from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.duration import Duration
+from rclpy.publisher import Publisher
+from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
-from uwb_mitigation.errors import UwbMitigationError
-from uwb_mitigation.measurement import Status
+from uwb_mitigation.bag.codec import decode_range, encode_corrected
+from uwb_mitigation.errors import RecordingError, UwbMitigationError
+from uwb_mitigation.measurement import RangeMeasurement, Status
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.shipped import default_model_path
 from uwb_mitigation.nodes import diagnostics, messages, topics
-from uwb_mitigation.nodes.parameters import Parameter, declare
+from uwb_mitigation.nodes.health import Health
+from uwb_mitigation.nodes.lifecycle import ManagedNode
+from uwb_mitigation.nodes.parameters import Parameter
 from uwb_mitigation.nodes.running import run
 
 PARAMETERS = (
-    Parameter("model", "", "Model bundle to correct with; empty = the shipped one."),
+    Parameter("model", "", "Model bundle to correct with; empty = the shipped one. A bundle that cannot be "
+              "used is refused, and the one before stays.", live=True),
     Parameter("autostart", True, "Configure and activate without a lifecycle manager."),
-)
+)  # fmt: skip
+
+BATCH = 16
+"""Ranges that have queued up are corrected so many at once: a batch costs half of its ranges one by one."""
 
 
-class Mitigator(LifecycleNode):
+def load(model: str) -> Mitigation:
+    """The bundle that the parameter `model` names, ready to correct.
+
+    Raises:
+        ModelError: it is absent, corrupt, or refused by ONNX Runtime.
+    """
+    return Mitigation(load_bundle(Path(model).expanduser() if model else default_model_path()))
+
+
+class Mitigator(ManagedNode):
     """Lifecycle: configure makes publisher and subscription, activate loads the model.
 
     A model that cannot be loaded leaves the node inactive and says so in the log and in the
     diagnostics; activating again, when the file is mended, loads it. Nothing is published while
-    inactive, and nothing is queued.
+    inactive, and nothing is queued. Ranges come from the topic or, in one process with their driver,
+    through `correct`.
+
+    Args:
+        subscribe: take ranges from the topic.
+        foreign: see `ManagedNode`.
     """
 
-    def __init__(self) -> None:
-        super().__init__("mitigator")
-        declare(self, PARAMETERS)
-        self._mitigation: Mitigation | None = None
-        self._error: UwbMitigationError | None = None
-        self._statuses: Counter[Status] = Counter()
-        self._meter = diagnostics.Meter()
-        # rclpy serialises at once: one message serves every publication.
-        self._message = RangeCorrected()
+    def __init__(self, *, subscribe: bool = True, foreign: Collection[str] = ()) -> None:
+        super().__init__("mitigator", PARAMETERS, foreign)
+        self.health = Health()
+        self._subscribe = subscribe
         self._raw: Subscription | None = None
-        self._diagnostics = self.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, topics.RANGES)
-        self.create_timer(1.0, self._publish_diagnostics)
-        if self._value("autostart"):
-            self.trigger_configure()
-            self.trigger_activate()
+        self._corrected: Publisher | None = None
+        self._mitigation: Mitigation | None = None
+        self._prepared: tuple[str, Mitigation] | None = None
+        # A driver in the same process corrects from its own thread, while transitions run in the executor's.
+        self._lock = threading.Lock()
+        self._now_ns = diagnostics.clock_reader(self)
+        self._meter = diagnostics.Meter(self._now_ns)
+        self.add_on_set_parameters_callback(self._prepare)
+        self.add_post_set_parameters_callback(self._swap)
+        self.autostart()
 
-    def _value(self, name: str) -> Any:
-        return self.get_parameter(name).value
+    def open(self) -> None:
+        self._corrected = topics.create_publisher(self, RangeCorrected, topics.RANGE_CORRECTED)
+        if self._subscribe:
+            # Serialised messages: decoding them here takes a third of what rclpy takes for its objects.
+            self._raw = topics.create_subscription(
+                self, RangeCir, topics.RANGE_RAW, self._on_raw, raw=True, on_lost=self._on_lost
+            )
 
-    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        self._corrected = self.create_lifecycle_publisher(
-            RangeCorrected, topics.RANGE_CORRECTED, topics.RANGES
-        )
-        self._raw = self.create_subscription(RangeCir, topics.RANGE_RAW, self._correct, topics.RANGES)
-        return TransitionCallbackReturn.SUCCESS
+    def begin(self) -> None:
+        self._use(load(self.value("model")))
 
-    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        path = Path(self._value("model")).expanduser() if self._value("model") else None
-        try:
-            bundle = load_bundle(path or default_model_path())
-            self._mitigation = Mitigation(bundle)
-        except UwbMitigationError as error:
-            self._error = error
-            self.get_logger().error(f"stays inactive: {error}")
-            return TransitionCallbackReturn.FAILURE
-        self._error = None
-        self.get_logger().info(f"correcting with model {bundle.name}, id {bundle.model_id:08x}")
-        return super().on_activate(state)
+    def end(self) -> None:
+        with self._lock:
+            self._mitigation = None
 
-    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        self._mitigation = None
-        return super().on_deactivate(state)
-
-    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        self._close()
-        return TransitionCallbackReturn.SUCCESS
-
-    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        self._close()
-        return TransitionCallbackReturn.SUCCESS
-
-    def _close(self) -> None:
-        self._mitigation = None
+    def close(self) -> None:
         if self._raw is not None:
             self.destroy_subscription(self._raw)
-            self.destroy_lifecycle_publisher(self._corrected)
             self._raw = None
+        if self._corrected is not None:
+            self.destroy_lifecycle_publisher(self._corrected)
+            self._corrected = None
 
-    def _correct(self, raw: RangeCir) -> None:
-        # Subscriptions go on firing while a lifecycle node is inactive.
-        if self._mitigation is None:
-            return
-        measurement = messages.from_range_cir(raw)
-        corrected = self._mitigation.correct(measurement)
-        messages.fill_range_corrected(self._message, raw, corrected)
-        self._corrected.publish(self._message)
-        self._statuses[corrected.status] += 1
-        self._meter.add(self.get_clock().now().nanoseconds - measurement.stamp_ns)
+    def correct(self, measurements: Sequence[RangeMeasurement]) -> None:
+        """Publish the corrected ranges of measurements; while inactive, do nothing."""
+        began_ns = time.perf_counter_ns()
+        with self._lock:
+            mitigation, publisher = self._mitigation, self._corrected
+            if mitigation is None or publisher is None:
+                return
+            if len(measurements) == 1:
+                results = [mitigation.correct(measurements[0])]
+            else:
+                results = mitigation.correct_batch(measurements)
+            for measurement, corrected in zip(measurements, results, strict=True):
+                publisher.publish(encode_corrected(measurement, corrected))
+        now_ns = self._now_ns()
+        self.health.add_time(time.perf_counter_ns() - began_ns)
+        for measurement, corrected in zip(measurements, results, strict=True):
+            self.health.add(measurement.frame_id, measurement.sequence, corrected.status)
+            self._meter.add(now_ns - measurement.stamp_ns)
 
-    def _publish_diagnostics(self) -> None:
-        state = self._state_machine.current_state
+    def subscription_count(self) -> int:
+        """How many listen to the corrected ranges."""
+        return self._corrected.get_subscription_count() if self._corrected is not None else 0
+
+    def wait_for_all_acked(self, timeout: Duration) -> None:
+        """Wait until every subscriber has what was published."""
+        if self._corrected is not None:
+            self._corrected.wait_for_all_acked(timeout)
+
+    def describe(self) -> tuple[str, bytes, str, dict[str, object]]:
+        period = self.health.period()
         level, text = diagnostics.OK, "correcting"
-        if self._error is not None:
-            level, text = diagnostics.ERROR, f"inactive: {self._error}"
-        elif state[0] != State.PRIMARY_STATE_ACTIVE:
-            level, text = diagnostics.WARN, f"not active: {state[1]}"
-        facts: dict[str, object] = {f"ranges {status.name}": self._statuses[status] for status in Status}
+        if warnings := period.warnings():
+            level, text = diagnostics.WARN, "; ".join(warnings)
+        if period.statuses[Status.MODEL_ERROR]:
+            level, text = diagnostics.ERROR, "the model fails on some ranges"
+        facts: dict[str, object] = {
+            f"ranges {status.name}": self.health.statuses[status] for status in Status
+        }
+        facts |= {
+            "out of distribution": f"{period.share(Status.OUT_OF_DISTRIBUTION):.3f}",
+            "missing by sequence": self.health.missing,
+            "lost by the middleware": self.health.lost,
+            "malformed": self.health.malformed,
+        }
         facts |= self._meter.facts()
-        if self._mitigation is not None:
-            bundle = self._mitigation.bundle
+        facts |= diagnostics.percentiles("processing", period.processing_ns)
+        if (mitigation := self._mitigation) is not None:
+            bundle = mitigation.bundle
             facts |= {"model": bundle.name, "model id": f"{bundle.model_id:08x}"}
-        self._diagnostics.publish(diagnostics.report(self, "host", level, text, facts))
+        return "host", level, text, facts
+
+    def _on_raw(self, data: bytes) -> None:
+        # Subscriptions go on firing while a lifecycle node is inactive.
+        if self._mitigation is None or self._raw is None:
+            return
+        batch = []
+        take = self._raw.handle.take_message
+        while True:
+            measurement = self._decode(data)
+            if measurement is not None:
+                batch.append(measurement)
+            # What else has queued up comes with it; the executor then finds its own turn empty.
+            if len(batch) == BATCH or (taken := take(RangeCir, True)) is None:
+                break
+            data = taken[0]
+        if batch:
+            self.correct(batch)
+
+    def _decode(self, data: bytes) -> RangeMeasurement | None:
+        try:
+            return decode_range(data)
+        except RecordingError:
+            pass
+        # Of another byte order, or with an encoding of a later version: rclpy may still read it.
+        try:
+            return messages.from_range_cir(deserialize_message(data, RangeCir))
+        except Exception as error:  # Of no common type, and no message may end the node.
+            self.health.malformed += 1
+            self.get_logger().warning(f"a message cannot be read: {error}", throttle_duration_sec=10.0)
+            return None
+
+    def _on_lost(self, info: Any) -> None:
+        self.health.lost += info.total_count_change
+
+    def _use(self, mitigation: Mitigation) -> None:
+        # Between two ranges, never within one: none is lost, none is corrected by half a model.
+        with self._lock:
+            self._mitigation = mitigation
+        bundle = mitigation.bundle
+        self.get_logger().info(f"correcting with model {bundle.name}, id {bundle.model_id:08x}")
+
+    def _prepare(self, changes: list[Any]) -> SetParametersResult:
+        """Load a model that is to be set, or refuse it; ranges wait in the queue meanwhile."""
+        for change in changes:
+            if change.name == "model" and isinstance(change.value, str):
+                try:
+                    self._prepared = change.value, load(change.value)
+                except UwbMitigationError as error:
+                    reason = f"parameter model = {change.value!r}: {error}"
+                    return SetParametersResult(successful=False, reason=reason)
+        return SetParametersResult(successful=True)
+
+    def _swap(self, changes: list[Any]) -> None:
+        # Called once the whole set was accepted; another callback may have refused what was prepared before.
+        prepared, self._prepared = self._prepared, None
+        for change in changes:
+            if change.name == "model" and prepared is not None and prepared[0] == change.value:
+                self.error = None
+                if self._mitigation is not None:
+                    self._use(prepared[1])
 
 
 def main() -> None:
-    sys.exit(run(lambda stop: Mitigator()))
+    sys.exit(run(lambda stop: [Mitigator()]))

@@ -35,20 +35,23 @@ def reference() -> str:
         "# Parameters",
         "",
         "Set with `--ros-args -p name:=value`, or in a parameter file such as those in `params/`.",
-        "A value of the wrong type or out of its range is refused, at start-up and at set time.",
+        "A value of the wrong type or out of its range is refused, at start-up and at set time; a parameter that no",
+        "node knows is named in a warning. The node `pipeline` takes those of both nodes.",
     ]
     for node, table in TABLES.items():
         lines += [
             "",
             f"## `{node}`",
             "",
-            "| name | default | valid | changes live | meaning |",
-            "|---|---|---|---|---|",
+            "| name | default | unit | valid | changes live | meaning |",
+            "|---|---|---|---|---|---|",
         ]
         for row in table:
             default = yaml.safe_dump(row.default, default_flow_style=True).removesuffix("...\n").strip()
             live = "yes" if row.live else "no"
-            lines.append(f"| `{row.name}` | `{default}` | {row.valid} | {live} | {row.description} |")
+            lines.append(
+                f"| `{row.name}` | `{default}` | {row.unit or '-'} | {row.valid} | {live} | {row.description} |"
+            )
     return "\n".join(lines) + "\n"
 
 

@@ -6,7 +6,8 @@ parameter, value and range in the refusal.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import difflib
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +21,8 @@ from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValu
 from rclpy.node import Node
 
 from uwb_mitigation.errors import ParameterError
+
+_QOS = "qos_overrides."
 
 Value = bool | int | float | str
 
@@ -37,7 +40,8 @@ class Parameter:
 
     Attributes:
         name, default: as declared; the default's type is the parameter's type.
-        description: what it does, with the unit.
+        description: what it does.
+        unit: of a number; empty = none.
         low, high: inclusive range of a number.
         choices: the values a string may take; empty = any.
         live: may be set while the node runs; otherwise it is read-only after start-up.
@@ -50,6 +54,7 @@ class Parameter:
     high: float | None = None
     choices: tuple[str, ...] = ()
     live: bool = False
+    unit: str = ""
 
     @property
     def valid(self) -> str:
@@ -58,7 +63,7 @@ class Parameter:
             return "one of " + ", ".join(self.choices)
         if self.low is not None and self.high is not None:
             low, high = (f"{bound:.10g}" for bound in (self.low, self.high))
-            return f"{_TYPE_NAMES[type(self.default)]}, {low} to {high}"
+            return f"{_TYPE_NAMES[type(self.default)]}, {low} to {high} {self.unit}".rstrip()
         return _TYPE_NAMES[type(self.default)]
 
     def check(self, value: Any) -> None:
@@ -75,12 +80,12 @@ class Parameter:
             raise ParameterError(f"parameter {self.name} = {value!r}", valid=self.valid)
 
     def descriptor(self) -> ParameterDescriptor:
-        # A number may be given as `2` or `2.0`: rclpy would refuse the first for a float, so the
-        # type is left open to it and checked here.
+        # The type is left open to rclpy and checked here: it would refuse `2` for a float, and names
+        # no parameter when it refuses a type.
         descriptor = ParameterDescriptor(
             description=self.description,
             read_only=not self.live,
-            dynamic_typing=isinstance(self.default, float),
+            dynamic_typing=True,
         )
         descriptor.additional_constraints = self.valid if self.choices else ""
         if self.low is not None and self.high is not None:
@@ -93,8 +98,11 @@ class Parameter:
         return descriptor
 
 
-def declare(node: Node, table: Sequence[Parameter]) -> None:
-    """Declare a table on a node and guard later changes.
+def declare(node: Node, table: Sequence[Parameter], foreign: Collection[str] = ()) -> None:
+    """Declare a table on a node, warn of parameters that it does not know, and guard later changes.
+
+    Args:
+        foreign: names that belong to another node of this process.
 
     Raises:
         ParameterError: a value given at start-up has the wrong type or lies out of its range.
@@ -106,6 +114,7 @@ def declare(node: Node, table: Sequence[Parameter]) -> None:
         except (InvalidParameterTypeException, InvalidParameterValueException) as error:
             raise ParameterError(f"parameter {row.name}: {error}", valid=row.valid) from error
         row.check(node.get_parameter(row.name).value)
+    warn_of_unknown(node, foreign)
 
     def guard(changes: list[Any]) -> SetParametersResult:
         for change in changes:
@@ -119,3 +128,21 @@ def declare(node: Node, table: Sequence[Parameter]) -> None:
         return SetParametersResult(successful=True)
 
     node.add_on_set_parameters_callback(guard)
+
+
+def warn_of_unknown(node: Node, foreign: Collection[str] = (), *, qos: bool = False) -> None:
+    """Log every parameter that was given at start-up but is not declared, with the names it may have meant.
+
+    Args:
+        foreign: names that are no mistake.
+        qos: look at the overrides of quality of service, which are declared with their publisher or
+            subscription, instead of all others.
+    """
+    # rclpy offers no other way to the parameters given.
+    for name in sorted(node._parameter_overrides):
+        if name.startswith(_QOS) is not qos or node.has_parameter(name) or name in foreign:
+            continue
+        known = [known for known in node._parameters if known.startswith(_QOS) is qos]
+        meant = " or ".join(difflib.get_close_matches(name, known, n=2))
+        hint = f": meant is perhaps {meant}" if meant else ""
+        node.get_logger().warning(f"parameter {name} is unknown and has no effect{hint}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from rclpy.clock import Clock
@@ -19,11 +19,14 @@ class ReplayFeed:
 
     Args:
         source: closed by who opened it.
-        clock, rate, loop, longest_pause_s, recorded_stamps, publish, on_time, on_end: see `Playback`.
+        clock, rate, loop, longest_pause_s, recorded_stamps, paused, from_s, publish, on_time, on_end: see `Playback`.
         logger: with `info` and `warning`, as rclpy's.
         subscribers: how many listen now.
         wanted_subscribers: playing waits for so many, but no longer than `longest_wait_s`.
         start_delay_s: then it waits so long again, for the rest of the graph to start and connect.
+
+    Attributes:
+        playback: what plays; its rate and pause may be changed.
     """
 
     def __init__(
@@ -40,7 +43,9 @@ class ReplayFeed:
         wanted_subscribers: int,
         longest_wait_s: float,
         start_delay_s: float,
-        publish: Callable[[Record, int], None],
+        paused: bool,
+        from_s: float,
+        publish: Callable[[Sequence[tuple[Record, int]]], None],
         on_time: Callable[[int], None],
         on_end: Callable[[UwbMitigationError | None], None],
     ) -> None:
@@ -53,13 +58,15 @@ class ReplayFeed:
         self._on_end = on_end
         self._started_s = 0.0
         self._heard_s: float | None = None
-        self._playback = Playback(
+        self.playback = Playback(
             source,
             clock,
             rate=rate,
             loop=loop,
             longest_pause_s=longest_pause_s,
             recorded_stamps=recorded_stamps,
+            paused=paused,
+            from_s=from_s,
             ready=self._is_ready,
             publish=publish,
             on_time=on_time,
@@ -69,21 +76,22 @@ class ReplayFeed:
     def start(self) -> None:
         self._logger.info(f"replaying {self._source.name}")
         self._started_s = time.monotonic()
-        self._playback.start()
+        self.playback.start()
 
     def stop(self) -> None:
         """End playing; may be called twice."""
-        self._playback.stop()
+        self.playback.stop()
 
     def describe(self) -> tuple[str, bytes, str, dict[str, object]]:
         """Hardware id, level, message and facts for the diagnostics."""
         facts: dict[str, object] = {
             "source": self._source.name,
             "simulated": self._source.simulated,
-            "ranges published": self._playback.played,
+            "ranges published": self.playback.played,
         }
         facts |= {f"oddity: {kind}": count for kind, count in self._source.skipped.copy().items()}
-        return "simulated" if self._source.simulated else "recording", diagnostics.OK, "replaying", facts
+        text = "paused" if self.playback.paused else "replaying"
+        return "simulated" if self._source.simulated else "recording", diagnostics.OK, text, facts
 
     def _is_ready(self) -> bool:
         """True once enough others listen and the graph had time to settle, or they did not come."""
@@ -103,6 +111,6 @@ class ReplayFeed:
     def _finish(self, error: UwbMitigationError | None) -> None:
         skipped = ", ".join(f"{count} x {kind}" for kind, count in sorted(self._source.skipped.items()))
         self._logger.info(
-            f"played {self._playback.played} ranges" + (f"; oddities: {skipped}" if skipped else "")
+            f"played {self.playback.played} ranges" + (f"; oddities: {skipped}" if skipped else "")
         )
         self._on_end(error)

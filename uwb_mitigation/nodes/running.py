@@ -17,8 +17,8 @@ from uwb_mitigation.errors import UwbMitigationError
 PATIENCE_S = 0.2
 
 
-def spin(node: Node, stop: threading.Event) -> None:
-    """Serve a node's callbacks until `stop` is set.
+def spin(nodes: Node | Sequence[Node], stop: threading.Event) -> None:
+    """Serve the callbacks of one node, or of several, until `stop` is set.
 
     The events executor costs a quarter of the default executor's time a message; its own `spin()`
     never returns on shutdown, so it is turned here. Older rclpy releases lack it.
@@ -28,16 +28,19 @@ def spin(node: Node, stop: threading.Event) -> None:
     except ImportError:
         from rclpy.executors import SingleThreadedExecutor as Executor
     executor = Executor()
-    executor.add_node(node)
+    for node in nodes if isinstance(nodes, Sequence) else [nodes]:
+        executor.add_node(node)
     while not stop.is_set():
         executor.spin_once(timeout_sec=PATIENCE_S)
 
 
-def run(make_node: Callable[[threading.Event], Node], arguments: Sequence[str] | None = None) -> int:
-    """Initialise ROS, make a node, spin it, and end cleanly. Returns the process's exit code.
+def run(
+    make_nodes: Callable[[threading.Event], Sequence[Node]], arguments: Sequence[str] | None = None
+) -> int:
+    """Initialise ROS, make nodes, spin them, and end cleanly. Returns the process's exit code.
 
-    SIGINT and SIGTERM set the event that `make_node` is given; so may the node, with its `exit_code`
-    set before. ROS's own handlers would tear the context down under callbacks that still publish.
+    SIGINT and SIGTERM set the event that `make_nodes` is given; so may a node, with its `exit_code`
+    set before. Nodes are destroyed in their order. ROS's own handlers would tear the context down under callbacks that still publish.
     """
     stop = threading.Event()
 
@@ -49,15 +52,15 @@ def run(make_node: Callable[[threading.Event], Node], arguments: Sequence[str] |
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, on_signal)
     rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
-    node: Node | None = None
+    nodes: Sequence[Node] = ()
     try:
-        node = make_node(stop)
-        spin(node, stop)
+        nodes = make_nodes(stop)
+        spin(nodes, stop)
     except UwbMitigationError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     finally:
-        if node is not None:
+        for node in nodes:
             node.destroy_node()
         rclpy.try_shutdown()
-    return int(getattr(node, "exit_code", 0))
+    return max((int(getattr(node, "exit_code", 0)) for node in nodes), default=0)

@@ -1,11 +1,25 @@
-"""Topic names and qualities of service (REP-2003).
+"""Topic names and qualities of service (REP-2003), and the publishers and subscriptions of ranges.
 
 The names are relative: `/uwb/range_raw` without a namespace, `/board1/uwb/range_raw` under `board1`.
+History, depth and reliability can be overridden by the standard parameters
+`qos_overrides.TOPIC.publisher.POLICY` and `qos_overrides.TOPIC.subscription.POLICY`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.exceptions import ParameterException
+from rclpy.lifecycle import LifecycleNode
+from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.subscription import Subscription
+
+from uwb_mitigation.errors import ParameterError
 
 RANGE_RAW = "uwb/range_raw"
 RANGE_CORRECTED = "uwb/range_corrected"
@@ -14,9 +28,67 @@ DIAGNOSTICS = "/diagnostics"
 CLOCK = "/clock"
 
 # A reader that stalls loses nothing until it is this many ranges behind: 1 s at 1 kHz.
-RANGES = QoSProfile(
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.VOLATILE,
-    history=HistoryPolicy.KEEP_LAST,
-    depth=1000,
-)
+DEPTH = 1000
+
+
+def _ranges() -> QoSProfile:
+    return QoSProfile(
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.VOLATILE,
+        history=HistoryPolicy.KEEP_LAST,
+        depth=DEPTH,
+    )
+
+
+RANGES = _ranges()
+
+
+def create_publisher(node: LifecycleNode, kind: type, topic: str) -> Publisher:
+    """A lifecycle publisher of ranges.
+
+    Raises:
+        ParameterError: an overridden quality of service is none.
+    """
+    with _checked(node, topic):
+        # rclpy writes overrides into the profile it is given: each gets one of its own.
+        return node.create_lifecycle_publisher(
+            kind, topic, _ranges(), qos_overriding_options=QoSOverridingOptions.with_default_policies()
+        )
+
+
+def create_subscription(
+    node: LifecycleNode,
+    kind: type,
+    topic: str,
+    callback: Callable[[Any], None],
+    *,
+    raw: bool = False,
+    on_lost: Callable[[Any], None] | None = None,
+) -> Subscription:
+    """A subscription of ranges; `raw` hands the callback serialised bytes.
+
+    Raises:
+        ParameterError: an overridden quality of service is none.
+    """
+    with _checked(node, topic):
+        return node.create_subscription(
+            kind,
+            topic,
+            callback,
+            _ranges(),
+            raw=raw,
+            event_callbacks=SubscriptionEventCallbacks(message_lost=on_lost),
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+        )
+
+
+@contextmanager
+def _checked(node: LifecycleNode, topic: str) -> Iterator[None]:
+    # rclpy raises a different type for each way of being wrong.
+    try:
+        yield
+    except (RuntimeError, ValueError, TypeError, AttributeError, AssertionError, ParameterException) as error:
+        raise ParameterError(
+            f"qos_overrides of {node.resolve_topic_name(topic)}: {error}",
+            valid="history keep_last or keep_all, depth a whole number, reliability reliable or best_effort",
+        ) from error

@@ -1,0 +1,140 @@
+"""What the lifecycle nodes of this package share: transitions that can be repeated, and errors that show.
+
+rclpy swallows what a transition raises. Here it is logged, kept for the diagnostics, and whatever the
+transition had opened is closed again, so that the same transition may be asked for once more.
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable, Collection, Sequence
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from lifecycle_msgs.msg import State
+from rclpy.clock import Clock, ClockType
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+
+from uwb_mitigation.errors import UwbMitigationError
+from uwb_mitigation.nodes import diagnostics, topics
+from uwb_mitigation.nodes.parameters import Parameter, declare, warn_of_unknown
+
+
+class ManagedNode(LifecycleNode):
+    """A lifecycle node with a parameter table and one diagnostic status a second.
+
+    A subclass says what each transition does: `open` (configure), `begin` (activate), `end` (deactivate) and
+    `close` (cleanup, shutdown). `end` and `close` must stand being called when there is nothing to end
+    or to close.
+
+    Args:
+        table: the node's parameters.
+        foreign: names of parameters that belong to another node of this process, and are no mistake.
+
+    Attributes:
+        error: why the latest transition failed; None after one that succeeded.
+    """
+
+    def __init__(self, name: str, table: Sequence[Parameter], foreign: Collection[str] = ()) -> None:
+        super().__init__(name)
+        declare(self, table, foreign)
+        self.error: UwbMitigationError | None = None
+        self._diagnostics = self.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, 10)
+        # By a steady clock: diagnostics are wanted most when the node's own clock stands still.
+        self.create_timer(1.0, self._publish_diagnostics, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def open(self) -> None:
+        raise NotImplementedError
+
+    def begin(self) -> None:
+        raise NotImplementedError
+
+    def end(self) -> None:
+        raise NotImplementedError
+
+    def close(self) -> None:
+        raise NotImplementedError
+
+    def describe(self) -> tuple[str, bytes, str, dict[str, object]]:
+        """Hardware id, level, message and facts for the diagnostics."""
+        raise NotImplementedError
+
+    def autostart(self) -> None:
+        """Configure and activate, if the parameter `autostart` says so.
+
+        Raises:
+            UwbMitigationError: configure failed, and without a lifecycle manager nobody will mend it.
+        """
+        if not self.value("autostart"):
+            return
+        if self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
+            self.trigger_activate()
+        elif self.error is not None:
+            raise self.error
+
+    def value(self, name: str) -> Any:
+        """The value of a parameter."""
+        return self.get_parameter(name).value
+
+    @property
+    def is_active(self) -> bool:
+        return bool(self._state_machine.current_state[0] == State.PRIMARY_STATE_ACTIVE)
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        result = self._attempt(self.open, self.close)
+        if result == TransitionCallbackReturn.SUCCESS:
+            # Those of quality of service are declared with the publishers and subscriptions.
+            warn_of_unknown(self, qos=True)
+        return result
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        # Publishers first: `begin` may start threads that publish.
+        super().on_activate(state)
+        result = self._attempt(self.begin, self.end)
+        if result != TransitionCallbackReturn.SUCCESS:
+            super().on_deactivate(state)
+        return result
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        result = self._attempt(self.end)
+        super().on_deactivate(state)
+        return result
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        return self._attempt(self._end_and_close)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        return self._attempt(self._end_and_close)
+
+    def destroy_node(self) -> None:
+        self._end_and_close()
+        super().destroy_node()
+
+    def _end_and_close(self) -> None:
+        self.end()
+        self.close()
+
+    def _attempt(self, step: Callable[[], None], undo: Callable[[], None] | None = None) -> Any:
+        try:
+            step()
+        except UwbMitigationError as error:
+            self.error = error
+        except Exception as error:
+            self.get_logger().error(traceback.format_exc())
+            self.error = UwbMitigationError(f"{type(error).__name__}: {error}", valid="see the log: a bug")
+        else:
+            self.error = None
+            return TransitionCallbackReturn.SUCCESS
+        self.get_logger().error(str(self.error))
+        if undo is not None:
+            undo()
+        return TransitionCallbackReturn.FAILURE
+
+    def _publish_diagnostics(self) -> None:
+        label = self._state_machine.current_state[1]
+        hardware, level, text, facts = self.describe()
+        if self.error is not None:
+            level, text = diagnostics.ERROR, f"{label}: {self.error}"
+        elif not self.is_active:
+            level, text = diagnostics.WARN, f"not active: {label}"
+        self._diagnostics.publish(diagnostics.report(self, hardware, level, text, facts))
