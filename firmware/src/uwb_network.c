@@ -29,11 +29,10 @@ static const uint16_t *run_remnet(const uwb_model *model, const float *window, u
         const uwb_module *const module = &model->modules[i];
         clear_position(x, (int32_t)length, 0);
         uwb_conv_residual(x, r, blocks, module);
+        clear_position(r, (int32_t)length, 1);
         if (length % 2 != 0) {
-            clear_position(r, (int32_t)length, 1);
             uwb_conv_reduce_odd(r, x, blocks, module);
         } else {
-            clear_position(r, (int32_t)length, 1);
             uwb_conv_reduce_even(r, x, blocks, module);
         }
         length = (length + 1) / 2;
