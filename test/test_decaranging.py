@@ -734,12 +734,14 @@ def naive(data: bytes) -> tuple[Counter[str], list[tuple[float, list[bytes] | No
     return +counts, exchanges
 
 
+ODD_LOGS = (6, 11, 27, 29, 36, 37, 46)
+"""Of the real logs, those with an oddity of their own (the data's README names them)."""
+
+
 @pytest.mark.slow
 def test_the_real_logs_equal_a_naive_reading(apartment):
     total: Counter[str] = Counter()
-    ranges = 0
-    paths = sorted((apartment / "logs").glob("*.log.xz"))
-    for path in paths:
+    for path in (apartment / "logs" / f"{number}.log.xz" for number in (*ODD_LOGS, 19)):
         counts, exchanges = naive(lzma.decompress(path.read_bytes()))
         with open_decaranging(path) as log:
             measurements = [record.measurement for record in log]
@@ -750,8 +752,6 @@ def test_the_real_logs_equal_a_naive_reading(apartment):
             expected = [int(value) for line in lines or [] for value in line.split(b", ")]
             assert measurement.cir.samples.tolist() == expected
         total += counts
-        ranges += len(exchanges)
-    assert ranges == 4151
     assert total[Oddity.RECEPTION_ERROR_CODED.value] == 19
     assert total[Oddity.POWER_NOT_A_NUMBER.value] == 2
 
@@ -760,6 +760,7 @@ def test_the_real_logs_equal_a_naive_reading(apartment):
 def test_the_real_folder_is_in_order_of_time_and_has_all_truth(apartment):
     with open_decaranging(apartment) as folder:
         records = list(folder)
+    assert len(records) == 4151
     stamps = np.array([record.measurement.stamp_ns for record in records])
     assert (np.diff(stamps) >= 0).all()
     assert Oddity.MOVED.value not in folder.skipped

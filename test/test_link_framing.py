@@ -222,11 +222,11 @@ def test_through_a_damaging_channel_what_arrives_intact_is_delivered_and_nothing
     assert result.intact == 6000 or faults != ByteFaults()
 
 
-@pytest.mark.slow
-def test_a_million_frames_through_a_damaging_channel():
-    result = loopback(1_000_000, ByteFaults(2e-4, 2e-4, 2e-4), payload_bytes=300, seed=12)
+def test_every_intact_frame_and_no_other_comes_through_a_damaging_channel():
+    # `uwb-mitigation bench link --frames 1000000` sends more of them.
+    result = loopback(150_000, ByteFaults(2e-4, 2e-4, 2e-4), payload_bytes=300, seed=12)
 
-    assert result.sent == 1_000_000
-    assert result.intact > 500_000
+    assert result.sent == 150_000
+    assert result.intact > 75_000
     assert result.intact_lost == 0
     assert result.corrupt_delivered == 0
