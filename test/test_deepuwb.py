@@ -90,7 +90,9 @@ WRITINGS: dict[str, Callable[[pd.DataFrame], pd.DataFrame]] = {
     "columns in another order": lambda data: data[["Obstacles", "Room", "Error", "CIR"]],
     "a further column": lambda data: data.assign(Note="x", When=3.5),
     "an index of text": lambda data: data.set_index(pd.Index([f"r{i}" for i in range(len(data))])),
-    "blocks in Fortran order": lambda data: data.sample(frac=1, random_state=1).sort_index(),
+    "a block in Fortran order": lambda data: pd.DataFrame(
+        np.column_stack([data["Error"], data["Room"]]), columns=["Error", "Room"]
+    ).assign(CIR=data["CIR"], Obstacles=data["Obstacles"]),
 }
 
 
@@ -447,6 +449,19 @@ def test_the_ceilings_on_memory_hold(
     assert_refused(tmp_path, PROTO + body, told)
 
 
+def test_a_frame_of_too_many_columns_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pickled_frame, "MAX_COLUMNS", 3)
+    with pytest.raises(RecordingError, match="more than 3 columns"):
+        read_deepuwb(written(tmp_path, frame()))
+
+
+def test_a_missing_category_is_refused_as_missing(tmp_path: Path) -> None:
+    data = frame().astype({"Obstacles": "category"})
+    data.loc[3, "Obstacles"] = None
+    with pytest.raises(RecordingError, match="row 3: Obstacles: missing"):
+        read_deepuwb(written(tmp_path, data))
+
+
 def test_a_file_beyond_the_ceiling_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = written(tmp_path, frame())
     monkeypatch.setattr(pickled_frame, "MAX_FILE_BYTES", 1000)
@@ -532,3 +547,7 @@ def assert_reads_or_refuses(tmp_path: Path, content: bytes) -> None:
 @settings(max_examples=60, deadline=None)
 def test_plain_values_are_interpreted_as_pickle_reads_them(protocol: int, value: object) -> None:
     assert pickle_machine.interpret(pickle.dumps(value, protocol=protocol), (), "here") == value
+
+
+def test_text_with_half_a_surrogate_pair_is_text() -> None:
+    assert pickle_machine.interpret(pickle.dumps("\ud800", protocol=4), (), "here") == "\ud800"

@@ -136,7 +136,7 @@ class _Machine:
 
     def _bytes(self, size: int) -> memoryview:
         end = self._at + size
-        if size > len(self._data) or end > len(self._data):
+        if end > len(self._data):
             raise IndexError
         taken = self._view[self._at : end]
         self._at = end
