@@ -91,7 +91,7 @@ WRITINGS: dict[str, Callable[[pd.DataFrame], pd.DataFrame]] = {
     "a further column": lambda data: data.assign(Note="x", When=3.5),
     "an index of text": lambda data: data.set_index(pd.Index([f"r{i}" for i in range(len(data))])),
     "a block in Fortran order": lambda data: pd.DataFrame(
-        np.column_stack([data["Error"], data["Room"]]), columns=["Error", "Room"]
+        np.column_stack([data["Error"], data["Room"]]), columns=["Error", "Room"], copy=False
     ).assign(CIR=data["CIR"], Obstacles=data["Obstacles"]),
 }
 
