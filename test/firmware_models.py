@@ -14,8 +14,7 @@ import numpy as np
 from uwb_mitigation.firmware_export import synthetic
 from uwb_mitigation.firmware_export.export import golden_windows, write_header
 from uwb_mitigation.firmware_export.header import Golden, Identity
-from uwb_mitigation.firmware_export.mlp import Int8Mlp
-from uwb_mitigation.firmware_export.packing import pack_mlp, pack_remnet
+from uwb_mitigation.firmware_export.packing import pack
 from uwb_mitigation.measurement import Cir, Encoding, RangeMeasurement
 from uwb_mitigation.model import graph
 from uwb_mitigation.model.bundle import Bundle, save_bundle
@@ -34,17 +33,11 @@ def identity(
     return Identity("random", 0x1234ABCD, scaling, prior or LinePrior(0.25), limits_m, 0.0625, 0.25)
 
 
-def write_remnet(folder: Path, weights: Int8Weights, card: Identity | None = None) -> Path:
-    network = pack_remnet(weights)
+def write_model(folder: Path, weights: Int8Weights, card: Identity | None = None) -> Path:
+    network = pack(weights)
     windows = golden_windows(network)
     golden = Golden(windows, IntegerNetwork(weights).predict_m(windows))
     return write_header(folder, network, card or identity(), golden)
-
-
-def write_mlp(folder: Path, weights: Int8Mlp, card: Identity | None = None) -> Path:
-    network = pack_mlp(weights)
-    windows = golden_windows(network)
-    return write_header(folder, network, card or identity(), Golden(windows, weights.predict_m(windows)))
 
 
 def exact_bundle(folder: Path, samples: int = 32) -> Bundle:

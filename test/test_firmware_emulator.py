@@ -64,7 +64,7 @@ def test_mlp_equals_onnx_runtime():
 @pytest.mark.parametrize(("samples", "modules"), [(9, 1), (12, 2), (23, 3), (40, 2), (81, 3), (156, 1)])
 def test_any_length_and_number_of_modules(samples: int, modules: int, tmp_path: Path):
     weights = synthetic.random_remnet(samples, 3, modules)
-    firmware_models.write_remnet(tmp_path, weights)
+    firmware_models.write_model(tmp_path, weights)
     windows = synthetic.pressing_windows(samples, weights.activation_scale["input"], 200)
     image = toolchain.build_image(tmp_path, tmp_path, Board.QEMU_MPS2)
     result = emulator.run_windows(image, windows)
@@ -79,7 +79,7 @@ def test_a_wrong_weight_is_a_mismatch(tmp_path: Path):
 
 def test_portable_c_and_trace_agree_with_the_kernels_and_the_counter(tmp_path: Path):
     weights = synthetic.random_remnet(8, 3)
-    firmware_models.write_remnet(tmp_path, weights)
+    firmware_models.write_model(tmp_path, weights)
     windows = synthetic.pressing_windows(8, weights.activation_scale["input"], 50)
     results = {}
     for kernels in Kernels:

@@ -14,7 +14,7 @@ import pytest
 from uwb_mitigation.errors import ModelError, UwbMitigationError
 from uwb_mitigation.firmware_export import header, synthetic
 from uwb_mitigation.firmware_export.export import export_bundle
-from uwb_mitigation.firmware_export.packing import pack_remnet
+from uwb_mitigation.firmware_export.packing import pack
 from uwb_mitigation.model import graph
 from uwb_mitigation.model.architecture import Remnet
 from uwb_mitigation.model.bundle import load_bundle, save_bundle
@@ -74,7 +74,7 @@ def test_a_float_bundle_is_refused_with_the_remedy(tmp_path: Path):
 )
 def test_shapes_without_kernels_are_refused(architecture: Remnet, names: str):
     with pytest.raises(ModelError, match=names):
-        pack_remnet(model_material.random_int8(architecture))
+        pack(model_material.random_int8(architecture))
 
 
 def test_a_scale_without_exact_integers_is_refused_by_layer_and_channel():
@@ -85,14 +85,14 @@ def test_a_scale_without_exact_integers_is_refused_by_layer_and_channel():
     scales[5] = unit / np.float32(64)
     inexact = replace(weights, weight_scale={**weights.weight_scale, "module2.skip": scales})
     with pytest.raises(ModelError, match=r"module2\.skip.*channel 5"):
-        pack_remnet(inexact)
+        pack(inexact)
 
 
 def test_a_sum_without_exact_integers_is_refused_by_name():
     weights = synthetic.random_remnet(16, 3)
     scales = {**weights.activation_scale, "module1.sum": weights.activation_scale["first"] / np.float32(3)}
     with pytest.raises(ModelError, match=r"module1\.sum"):
-        pack_remnet(replace(weights, activation_scale=scales))
+        pack(replace(weights, activation_scale=scales))
 
 
 def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path):
@@ -104,6 +104,6 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path):
 def test_a_hostile_name_cannot_end_the_comment(tmp_path: Path):
     weights = synthetic.random_remnet(16, 3)
     card = replace(firmware_models.identity(), name='*/ #include "/etc/passwd" /*\n')
-    text = firmware_models.write_remnet(tmp_path, weights, card).read_text()
+    text = firmware_models.write_model(tmp_path, weights, card).read_text()
     assert "passwd" in text.splitlines()[0]
     assert text.splitlines()[0].count("*/") == 1

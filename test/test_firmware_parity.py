@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 import firmware_models
+import model_material
 import numpy as np
 import onnxruntime
 import pytest
@@ -14,7 +16,6 @@ from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.firmware_export import synthetic
 from uwb_mitigation.firmware_export.export import export_bundle
 from uwb_mitigation.firmware_export.host import WARNINGS, HostFirmware, firmware_folder, run
-from uwb_mitigation.firmware_export.mlp_graph import mlp_model
 from uwb_mitigation.measurement import Status
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model import graph
@@ -44,7 +45,7 @@ def test_oracle_windows_are_not_all_alike():
 @pytest.mark.parametrize("samples", WINDOW_SIZES)
 def test_c_equals_oracle_and_onnx_runtime(samples: int, first_kernel: int, tmp_path: Path):
     weights = synthetic.random_remnet(samples, first_kernel)
-    firmware_models.write_remnet(tmp_path, weights)
+    firmware_models.write_model(tmp_path, weights)
     windows = synthetic.pressing_windows(samples, weights.activation_scale["input"], 5000)
     session = onnxruntime.InferenceSession(
         graph.int8_model(weights), session_options(), providers=["CPUExecutionProvider"]
@@ -62,7 +63,7 @@ def test_c_equals_oracle_and_onnx_runtime(samples: int, first_kernel: int, tmp_p
 @pytest.mark.parametrize(("samples", "modules"), [(9, 1), (12, 2), (23, 3), (40, 2), (81, 3), (156, 1)])
 def test_any_length_and_number_of_modules(samples: int, modules: int, tmp_path: Path):
     weights = synthetic.random_remnet(samples, 3, modules)
-    firmware_models.write_remnet(tmp_path, weights)
+    firmware_models.write_model(tmp_path, weights)
     windows = synthetic.pressing_windows(samples, weights.activation_scale["input"], 40)
     computed = HostFirmware(tmp_path, tmp_path, SANITIZED).predict_m(windows)
     assert np.array_equal(bits(computed), bits(IntegerNetwork(weights).predict_m(windows)))
@@ -70,15 +71,15 @@ def test_any_length_and_number_of_modules(samples: int, modules: int, tmp_path: 
 
 def test_mlp_equals_oracle_and_onnx_runtime(tmp_path: Path):
     weights = synthetic.random_mlp()
-    firmware_models.write_mlp(tmp_path, weights)
-    windows = synthetic.pressing_windows(157, weights.input_scale, 1000)
+    firmware_models.write_model(tmp_path, weights)
+    windows = synthetic.pressing_windows(157, weights.activation_scale["input"], 1000)
     session = onnxruntime.InferenceSession(
-        mlp_model(weights), session_options(), providers=["CPUExecutionProvider"]
+        graph.int8_model(weights), session_options(), providers=["CPUExecutionProvider"]
     )
 
-    expected = bits(session.run(None, {"cir": windows})[0][:, 0])
+    expected = bits(session.run(None, {"cir": windows[:, None, :]})[0][:, 0])
 
-    assert np.array_equal(bits(weights.predict_m(windows)), expected)
+    assert np.array_equal(bits(IntegerNetwork(weights).predict_m(windows)), expected)
     assert np.array_equal(bits(HostFirmware(tmp_path, tmp_path).predict_m(windows)), expected)
 
 
@@ -89,7 +90,7 @@ def firmware(tmp_path_factory: pytest.TempPathFactory) -> dict[Scaling, HostFirm
     for scaling in Scaling:
         folder = tmp_path_factory.mktemp(scaling.value)
         identity = firmware_models.identity(scaling=scaling)
-        firmware_models.write_remnet(folder, synthetic.random_remnet(32, 3), identity)
+        firmware_models.write_model(folder, synthetic.random_remnet(32, 3), identity)
         built[scaling] = HostFirmware(folder, folder, SANITIZED)
     return built
 
@@ -144,51 +145,52 @@ def test_real_logs_are_corrected_as_by_the_mitigator(apartment: Path, tmp_path: 
     assert corrected > 200
 
 
-def test_golden_vectors_pass_under_the_sanitizers(tmp_path: Path):
-    firmware_models.write_remnet(tmp_path, synthetic.random_remnet(64, 5))
+def build_program(name: str, export: Path, flags: Sequence[str] = ()) -> Path:
+    """A program of `firmware/test/`, linked with the model in `export`."""
     sources = firmware_folder()
-    program = tmp_path / "golden"
+    program = export / name
     run(
         [
-            "cc",
-            *(
-                "-std=c99",
-                "-g",
-                "-O1",
-                "-fsanitize=address,undefined",
-                "-fno-sanitize-recover=all",
-                *WARNINGS,
-            ),
-            *(f"-I{sources / 'src'}", f"-I{tmp_path}", str(sources / "test" / "golden.c")),
+            *("cc", "-std=c99", *flags, f"-I{sources / 'src'}", f"-I{export}"),
+            str(sources / "test" / f"{name}.c"),
             *map(str, (sources / "src").glob("*.c")),
             *("-o", str(program), "-lm"),
         ]
     )
+    return program
+
+
+ADDRESS_SANITIZED = ("-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", *WARNINGS)
+
+
+def test_golden_vectors_pass_under_the_sanitizers(tmp_path: Path):
+    firmware_models.write_model(tmp_path, synthetic.random_remnet(64, 5))
+    program = build_program("golden", tmp_path, ADDRESS_SANITIZED)
     assert "0 of 8 golden vectors wrong" in run([str(program)])
 
 
 def test_golden_vectors_notice_a_changed_weight(tmp_path: Path):
-    header = firmware_models.write_remnet(tmp_path, synthetic.random_remnet(16, 3))
+    header = firmware_models.write_model(tmp_path, synthetic.random_remnet(16, 3))
     text = header.read_text()
     start = text.index("{\n", text.index("uwb_module1_residual_weights[")) + 2
     first = text[start : text.index(",", start)].strip()
     header.write_text(text[:start] + text[start:].replace(first, str(int(first) ^ 32), 1))
-    sources = firmware_folder()
-    program = tmp_path / "golden"
-    run(
-        [
-            *("cc", "-std=c99", f"-I{sources / 'src'}", f"-I{tmp_path}", str(sources / "test" / "golden.c")),
-            *map(str, (sources / "src").glob("*.c")),
-            *("-o", str(program), "-lm"),
-        ]
-    )
     with pytest.raises(UwbMitigationError, match="exit 1"):
-        run([str(program)])
+        run([str(build_program("golden", tmp_path))])
+
+
+@pytest.mark.parametrize("scaling", list(Scaling))
+def test_arbitrary_cirs_break_no_promise_under_the_sanitizers(scaling: Scaling, tmp_path: Path):
+    card = firmware_models.identity(scaling, model_material.LINE, (-1e4, 1e4))
+    firmware_models.write_model(tmp_path, synthetic.random_remnet(16, 3), card)
+    seen = run([str(build_program("fuzz_correct", tmp_path, ADDRESS_SANITIZED)), "10000", "1"])
+    statuses = {int(line.split()[1].rstrip(":")) for line in seen.splitlines()}
+    assert {0, 4, 5, 6, 7, 9, 12, 14} <= statuses
 
 
 @pytest.mark.skipif(shutil.which("cmake") is None, reason="no CMake: apt install cmake")
 def test_plain_cmake_builds_the_library_and_passes_its_test(tmp_path: Path):
-    firmware_models.write_remnet(tmp_path, synthetic.random_remnet(16, 3))
+    firmware_models.write_model(tmp_path, synthetic.random_remnet(16, 3))
     build = tmp_path / "build"
     run(["cmake", "-S", str(firmware_folder()), "-B", str(build), f"-DUWB_MODEL_DIR={tmp_path}"])
     run(["cmake", "--build", str(build)])
@@ -197,7 +199,7 @@ def test_plain_cmake_builds_the_library_and_passes_its_test(tmp_path: Path):
 
 @pytest.mark.skipif(shutil.which("c++") is None, reason="no C++ compiler: apt install g++")
 def test_a_sketch_in_cpp_can_include_the_model(tmp_path: Path):
-    firmware_models.write_remnet(tmp_path, synthetic.random_remnet(16, 3))
+    firmware_models.write_model(tmp_path, synthetic.random_remnet(16, 3))
     sketch = tmp_path / "sketch.cpp"
     sketch.write_text('#include "uwb_model.h"\nuint32_t id() { return uwb_model_data.model_id; }\n')
     warnings = ("-std=gnu++14", "-Wall", "-Wextra", "-Werror")

@@ -7,7 +7,7 @@ import pytest
 
 from uwb_mitigation.errors import ModelError
 from uwb_mitigation.firmware_export import requantisation, synthetic
-from uwb_mitigation.firmware_export.packing import pack_remnet
+from uwb_mitigation.firmware_export.packing import pack
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -82,7 +82,7 @@ def test_nudge_makes_a_network_exportable_and_moves_no_scale_by_more_than_64_ulp
 
     after = requantisation.nudge(before)
 
-    pack_remnet(after)
+    pack(after)
     for name, scale in before.weight_scale.items():
         moved = np.abs(after.weight_scale[name].view(np.int32) - scale.view(np.int32))
         assert moved.max() <= 64

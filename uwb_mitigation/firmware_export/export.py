@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from uwb_mitigation.errors import ModelError, UwbMitigationError
 from uwb_mitigation.firmware_export.header import Golden, Identity, render
 from uwb_mitigation.firmware_export.host import MODEL_HEADER
-from uwb_mitigation.firmware_export.packing import PackedNetwork, pack_remnet
+from uwb_mitigation.firmware_export.packing import PackedNetwork, pack
 from uwb_mitigation.model import graph
 from uwb_mitigation.model.bundle import Bundle
 from uwb_mitigation.model.integer import IntegerNetwork
@@ -34,7 +34,7 @@ def export_bundle(bundle: Bundle, folder: Path) -> Path:
         )
     weights = graph.int8_weights(bundle.model, bundle.architecture)
     try:
-        network = pack_remnet(weights)
+        network = pack(weights)
     except ModelError as error:
         where = f"{bundle.path}, {error.where}" if error.where else str(bundle.path)
         raise ModelError(error.what, where=where, valid=error.valid) from error

@@ -16,11 +16,11 @@ from uwb_mitigation.firmware_export import emulator
 from uwb_mitigation.firmware_export.cycles import estimate_cycles
 from uwb_mitigation.firmware_export.export import golden_windows, identity, write_header
 from uwb_mitigation.firmware_export.header import Golden, Identity
-from uwb_mitigation.firmware_export.mlp_graph import mlp_model
-from uwb_mitigation.firmware_export.packing import PackedNetwork, pack_mlp, pack_remnet
+from uwb_mitigation.firmware_export.packing import PackedNetwork, pack
 from uwb_mitigation.firmware_export.synthetic import pressing_windows, random_mlp, random_remnet
 from uwb_mitigation.firmware_export.toolchain import Board, Kernels, build_image, measure_size
 from uwb_mitigation.model import graph
+from uwb_mitigation.model.architecture import Mlp
 from uwb_mitigation.model.bundle import Bundle
 from uwb_mitigation.model.prior import LinePrior
 from uwb_mitigation.model.session import session_options
@@ -53,7 +53,6 @@ class Subject:
         packed: what the firmware is given.
         card: what the header says beside it.
         onnx: the serialised ONNX model.
-        windows_shape: of its input after the number of windows.
     """
 
     network: str
@@ -61,15 +60,13 @@ class Subject:
     packed: PackedNetwork
     card: Identity
     onnx: bytes
-    windows_shape: tuple[int, ...]
 
     def expect(self, windows: NDArray[np.float32]) -> NDArray[np.float32]:
         """ONNX Runtime's outputs for windows (n, K)."""
         session = onnxruntime.InferenceSession(
             self.onnx, session_options(), providers=["CPUExecutionProvider"]
         )
-        shaped = windows.reshape(len(windows), *self.windows_shape)
-        outputs: NDArray[np.float32] = session.run(None, {graph.INPUT: shaped})[0][:, 0]
+        outputs: NDArray[np.float32] = session.run(None, {graph.INPUT: windows[:, None, :]})[0][:, 0]
         return outputs
 
 
@@ -112,10 +109,10 @@ def subjects(
     for first_kernel in first_kernels:
         for samples in windows:
             weights = random_remnet(samples, first_kernel)
-            yield remnet_subject(weights, _nameless(), graph.int8_model(weights))
+            yield subject_of(weights, _nameless(), graph.int8_model(weights))
     if mlp:
         dense = random_mlp()
-        yield Subject("mlp", 0, pack_mlp(dense), _nameless(), mlp_model(dense), (dense.samples,))
+        yield subject_of(dense, _nameless(), graph.int8_model(dense))
 
 
 def bundle_subject(bundle: Bundle) -> Subject:
@@ -124,14 +121,13 @@ def bundle_subject(bundle: Bundle) -> Subject:
     Raises:
         ModelError: as `export_bundle`.
     """
-    return remnet_subject(
-        graph.int8_weights(bundle.model, bundle.architecture), identity(bundle), bundle.model
-    )
+    return subject_of(graph.int8_weights(bundle.model, bundle.architecture), identity(bundle), bundle.model)
 
 
-def remnet_subject(weights: Int8Weights, card: Identity, onnx: bytes) -> Subject:
+def subject_of(weights: Int8Weights, card: Identity, onnx: bytes) -> Subject:
     shape = weights.architecture
-    return Subject("remnet", shape.first_kernel, pack_remnet(weights), card, onnx, (1, shape.samples))
+    network, first_kernel = ("mlp", 0) if isinstance(shape, Mlp) else ("remnet", shape.first_kernel)
+    return Subject(network, first_kernel, pack(weights), card, onnx)
 
 
 def measure(

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ModelError
-from uwb_mitigation.firmware_export.mlp import Int8Mlp
 from uwb_mitigation.firmware_export.requantisation import (
     Sum,
     accumulator_range,
@@ -20,7 +19,7 @@ from uwb_mitigation.firmware_export.requantisation import (
     solve_requantisation,
     solve_sum,
 )
-from uwb_mitigation.model.architecture import HEAD, Remnet
+from uwb_mitigation.model.architecture import HEAD, Mlp, Remnet
 from uwb_mitigation.model.weights import Int8Weights, layer_inputs
 
 FILTERS = 16
@@ -77,14 +76,19 @@ class PackedNetwork:
     layers: tuple[PackedLayer, ...] = ()
 
 
-def pack_remnet(weights: Int8Weights) -> PackedNetwork:
-    """Pack a REMNet.
+def pack(weights: Int8Weights) -> PackedNetwork:
+    """Pack a network.
 
     Raises:
         ModelError: its shape is none that the firmware has kernels for, or a layer has no exact
             integer constants; the message names the layer and channel.
     """
-    shape = weights.architecture
+    if isinstance(weights.architecture, Mlp):
+        return _pack_mlp(weights, weights.architecture)
+    return _pack_remnet(weights, weights.architecture)
+
+
+def _pack_remnet(weights: Int8Weights, shape: Remnet) -> PackedNetwork:
     for name, value, valid in (
         ("filters", shape.filters, (FILTERS,)),
         ("kernel", shape.kernel, (3,)),
@@ -149,24 +153,22 @@ def pack_remnet(weights: Int8Weights) -> PackedNetwork:
     )
 
 
-def pack_mlp(weights: Int8Mlp) -> PackedNetwork:
-    """Pack dense layers; inputs and outputs are padded with zeros to multiples of 8.
-
-    Raises:
-        ModelError: a layer has no exact integer constants.
-    """
+def _pack_mlp(weights: Int8Weights, shape: Mlp) -> PackedNetwork:
+    """Inputs and outputs are padded with zeros to multiples of 8."""
     layers = []
-    scale = weights.input_scale
-    for number, layer in enumerate(weights.layers, start=1):
+    scale = weights.activation_scale["input"]
+    for dense in shape.layers:
+        name = dense.name
+        output_scale = weights.activation_scale[name]
         channels = _channels(
-            f"dense{number}",
-            layer.weight,
-            layer.bias,
-            requantisation_scale(scale, layer.weight_scale, layer.output_scale),
+            name,
+            weights.weight[name],
+            weights.bias[name],
+            requantisation_scale(scale, weights.weight_scale[name], output_scale),
         )
-        outputs, inputs = (-(-size // 8) * 8 for size in layer.weight.shape)
+        outputs, inputs = (-(-size // 8) * 8 for size in (dense.outputs, dense.inputs))
         padded = np.zeros((outputs, inputs), np.int8)
-        padded[: layer.weight.shape[0], : layer.weight.shape[1]] = layer.weight
+        padded[: dense.outputs, : dense.inputs] = weights.weight[name]
         quads = padded.reshape(outputs // 4, 4, inputs // 4, 4).transpose(0, 2, 1, 3)
         layers.append(
             PackedLayer(
@@ -176,14 +178,14 @@ def pack_mlp(weights: Int8Mlp) -> PackedNetwork:
                 outputs,
             )
         )
-        scale = layer.output_scale
-    head = _padded(weights.head_weight, -(-len(weights.head_weight) // 8) * 8)
+        scale = output_scale
+    head = _padded(weights.weight[HEAD][:, 0], -(-shape.features // 8) * 8)
     return PackedNetwork(
-        samples=weights.samples,
-        input_scale=weights.input_scale,
+        samples=shape.samples,
+        input_scale=weights.activation_scale["input"],
         head_weights=_share_words(head.reshape(-1, 2)),
-        head_bias=_head_bias(weights.head_weight[None], np.array([weights.head_bias], np.int32)),
-        head_scale=np.float32(scale * weights.head_scale),
+        head_bias=_head_bias(weights.weight[HEAD].T, weights.bias[HEAD]),
+        head_scale=np.float32(scale * weights.weight_scale[HEAD][0]),
         layers=tuple(layers),
     )
 

@@ -9,10 +9,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.firmware_export.mlp import PAPER_LAYERS, Int8Dense, Int8Mlp, nudge_mlp
-from uwb_mitigation.model.architecture import HEAD, Remnet
+from uwb_mitigation.model.architecture import HEAD, Mlp, Remnet
 from uwb_mitigation.model.weights import FloatWeights, Int8Weights
-from uwb_mitigation.training.quantization import WEIGHT_LIMIT, quantize
+from uwb_mitigation.training.quantization import quantize
 
 
 def random_remnet(samples: int, first_kernel: int, modules: int = 3, seed: int = 0) -> Int8Weights:
@@ -31,24 +30,19 @@ def random_remnet(samples: int, first_kernel: int, modules: int = 3, seed: int =
     return quantize(FloatWeights(architecture, weight, bias), calibration)
 
 
-def random_mlp(samples: int = 157, seed: int = 0) -> Int8Mlp:
-    """The paper's MLP with random weights, and scales that use the range of its activations."""
+def random_mlp(samples: int = 157, seed: int = 0) -> Int8Weights:
+    """The paper's MLP with random weights, quantised on random calibration inputs."""
     random = np.random.default_rng([seed, samples])
-    input_scale = scale = np.float32(0.011)
-    values = random.integers(0, 256, (256, samples))
-    layers = []
-    for outputs in PAPER_LAYERS:
-        weight = random.integers(-WEIGHT_LIMIT, WEIGHT_LIMIT + 1, (outputs, values.shape[1])).astype(np.int8)
-        bias = random.integers(-20_000, 20_000, outputs).astype(np.int32)
-        weight_scale = random.uniform(0.001, 0.003, outputs).astype(np.float32)
-        reals = np.maximum(values @ weight.T.astype(int) + bias, 0) * (scale * weight_scale)
-        scale = np.float32(np.percentile(reals, 99) / 255)
-        values = np.clip(np.rint(reals / scale), 0, 255).astype(int)
-        layers.append(Int8Dense(weight, bias, weight_scale, scale))
-    head: NDArray[np.int8] = random.integers(-WEIGHT_LIMIT, WEIGHT_LIMIT + 1, (values.shape[1],)).astype(
-        np.int8
-    )
-    return nudge_mlp(Int8Mlp(input_scale, tuple(layers), head, -1234, np.float32(0.002)))
+    architecture = Mlp(samples)
+    weight, bias = {}, {}
+    for layer in architecture.layers:
+        deviation = np.sqrt(2 / layer.inputs)
+        weight[layer.name] = random.normal(0, deviation, (layer.outputs, layer.inputs)).astype(np.float32)
+        bias[layer.name] = random.normal(0, 0.1, layer.outputs).astype(np.float32)
+    weight[HEAD] = random.normal(0, 0.2, (architecture.features, 1)).astype(np.float32)
+    bias[HEAD] = random.normal(0, 0.1, 1).astype(np.float32)
+    calibration = random.gamma(0.5, 0.5, (64, samples)).astype(np.float32)
+    return quantize(FloatWeights(architecture, weight, bias), calibration)
 
 
 def pressing_windows(samples: int, input_scale: np.float32, count: int, seed: int = 1) -> NDArray[np.float32]:

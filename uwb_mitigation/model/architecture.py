@@ -1,8 +1,9 @@
-"""The shape of REMNet (paper, section II-A, Fig. 2), from which training, export and firmware derive sizes."""
+"""The shapes of REMNet (paper, section II-A, Fig. 2) and of its baseline, from which all else derives sizes."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 from uwb_mitigation.errors import ParameterError
 
@@ -109,6 +110,63 @@ class Remnet:
         for length, half in zip(self.lengths, self.lengths[1:], strict=False):
             total += length * k * f * f + half * (k + 1) * f * f
         return total + self.lengths[-1] * f
+
+
+@dataclass(frozen=True, slots=True)
+class Dense:
+    """One dense layer of the MLP, followed by a ReLU."""
+
+    name: str
+    inputs: int
+    outputs: int
+
+
+@dataclass(frozen=True, slots=True)
+class Mlp:
+    """The paper's baseline: dense layers with ReLU on the window, then the head.
+
+    The paper gives a count of parameters, 54,401, and no sizes; the default has exactly that many.
+
+    Attributes:
+        samples: input length K.
+        hidden: outputs of each dense layer.
+    """
+
+    samples: int = 157
+    hidden: tuple[int, ...] = (240, 64, 16)
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.samples <= 1016:
+            raise ParameterError(f"samples = {self.samples}", where="MLP", valid="1 to 1016")
+        if not 1 <= len(self.hidden) <= 6 or not all(1 <= size <= 1024 for size in self.hidden):
+            raise ParameterError(f"hidden = {self.hidden}", where="MLP", valid="1 to 6 sizes of 1 to 1024")
+
+    @property
+    def layers(self) -> tuple[Dense, ...]:
+        """Every dense layer before the head, in the order of evaluation: `dense1`, `dense2`, ..."""
+        sizes = (self.samples, *self.hidden)
+        return tuple(
+            Dense(f"dense{number}", inputs, outputs)
+            for number, (inputs, outputs) in enumerate(zip(sizes, self.hidden, strict=False), start=1)
+        )
+
+    @property
+    def features(self) -> int:
+        """Inputs of the head."""
+        return self.hidden[-1]
+
+    @property
+    def parameters(self) -> int:
+        """Trainable parameters (paper, Table 1)."""
+        return sum((layer.inputs + 1) * layer.outputs for layer in self.layers) + self.features + 1
+
+    @property
+    def multiply_accumulates(self) -> int:
+        """Multiply-accumulates of one inference."""
+        return sum(layer.inputs * layer.outputs for layer in self.layers) + self.features
+
+
+Architecture: TypeAlias = Remnet | Mlp
 
 
 def same_padding(length: int, kernel: int, stride: int) -> tuple[int, int]:

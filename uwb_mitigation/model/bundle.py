@@ -20,7 +20,7 @@ import numpy as np
 
 from uwb_mitigation.errors import ModelError, UwbMitigationError
 from uwb_mitigation.model import onnx_file
-from uwb_mitigation.model.architecture import Remnet
+from uwb_mitigation.model.architecture import Architecture, Mlp, Remnet
 from uwb_mitigation.model.prior import LinePrior
 from uwb_mitigation.model.wire import WireError, delimited
 from uwb_mitigation.preprocessing import Preprocessing, Scaling
@@ -52,7 +52,7 @@ class Card:
     """
 
     name: str
-    architecture: Remnet
+    architecture: Architecture
     preprocessing: Preprocessing
     prior: LinePrior
     quantised: bool
@@ -103,7 +103,7 @@ class Bundle:
         return self.card.name
 
     @property
-    def architecture(self) -> Remnet:
+    def architecture(self) -> Architecture:
         return self.card.architecture
 
     @property
@@ -137,7 +137,7 @@ def load_bundle(path: Path | str) -> Bundle:
     if not data:
         raise ModelError("the model file is empty", where=str(path), valid=_REMEDY)
     if len(data) > MAX_BYTES:
-        raise ModelError(f"more than {MAX_BYTES} bytes", where=str(path), valid="a model of REMNet")
+        raise ModelError(f"more than {MAX_BYTES} bytes", where=str(path), valid="a model of ours")
     return parse_bundle(data, path)
 
 
@@ -202,6 +202,7 @@ def assemble_bundle(graph: bytes, card: Card) -> bytes:
     metadata = asdict(card) | {
         "format": FORMAT,
         "model_id": _BLANK.decode(),
+        "architecture": _architecture_metadata(card.architecture),
         "preprocessing": {
             "samples": card.preprocessing.samples,
             "scaling": card.preprocessing.scaling.value,
@@ -230,7 +231,7 @@ def _card(metadata: dict[str, Any]) -> Card:
     low, high = metadata["correction_limits_m"]
     return Card(
         name=str(metadata["name"]),
-        architecture=Remnet(**{key: _integer(v) for key, v in metadata["architecture"].items()}),
+        architecture=_architecture(metadata["architecture"]),
         preprocessing=Preprocessing(
             _integer(metadata["preprocessing"]["samples"]),
             Scaling(metadata["preprocessing"]["scaling"]),
@@ -242,6 +243,22 @@ def _card(metadata: dict[str, Any]) -> Card:
         correction_limits_m=(float(low), float(high)),
         training=dict(metadata["training"]),
     )
+
+
+def _architecture_metadata(architecture: Architecture) -> dict[str, Any]:
+    """REMNet's goes without saying: the first bundles knew no other."""
+    return asdict(architecture) | ({"kind": "mlp"} if isinstance(architecture, Mlp) else {})
+
+
+def _architecture(metadata: dict[str, Any]) -> Architecture:
+    shape = dict(metadata)
+    kind = shape.pop("kind", "remnet")
+    if kind == "mlp":
+        hidden = tuple(_integer(size) for size in shape.pop("hidden"))
+        return Mlp(hidden=hidden, **{key: _integer(value) for key, value in shape.items()})
+    if kind != "remnet":
+        raise ModelError(f"architecture {kind!r}", valid="remnet or mlp")
+    return Remnet(**{key: _integer(value) for key, value in shape.items()})
 
 
 def _integer(value: object) -> int:

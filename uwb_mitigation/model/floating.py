@@ -5,38 +5,44 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.model.architecture import HEAD
-from uwb_mitigation.model.weights import FloatWeights, activation_tensors
+from uwb_mitigation.model.architecture import HEAD, Convolution, Mlp
+from uwb_mitigation.model.weights import FloatWeights, activation_tensors, layer_inputs, sum_operands
 
 CHUNK = 256
 """Inputs evaluated at once: bounds the memory."""
 
 
 def activations(weights: FloatWeights, inputs: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
-    """Every activation of the float network, {tensor: (n, channels, length)}, for inputs (n, K)."""
-    layers = {layer.name: layer for layer in weights.architecture.convolutions}
-
-    def convolve(name: str, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        layer = layers[name]
-        padded = np.pad(values, ((0, 0), (0, 0), layer.padding))
-        windows = np.lib.stride_tricks.sliding_window_view(padded, layer.kernel, axis=2)
-        windows = windows[:, :, :: layer.stride]
-        sums = np.einsum("ncpk,fck->nfp", windows, weights.weight[name], optimize=True)
-        activation: NDArray[np.float32] = np.maximum(sums + weights.bias[name][:, None], np.float32(0))
-        return activation
-
+    """Every activation of the float network for inputs (n, K), {tensor: (n, channels, length)}; of an MLP,
+    (n, outputs).
+    """
+    architecture = weights.architecture
+    if isinstance(architecture, Mlp):
+        dense = {"input": inputs}
+        for layer, read in layer_inputs(architecture).items():
+            if layer != HEAD:
+                sums = dense[read] @ weights.weight[layer].T + weights.bias[layer]
+                dense[layer] = np.maximum(sums, np.float32(0))
+        return dense
+    layers = {layer.name: layer for layer in architecture.convolutions}
+    reads = layer_inputs(architecture)
     values = {"input": inputs[:, None, :]}
-    values["first"] = convolve("first", values["input"])
-    tensor = "first"
-    for module in range(1, weights.architecture.modules + 1):
-        prefix = f"module{module}"
-        values[f"{prefix}.residual"] = convolve(f"{prefix}.residual", values[tensor])
-        values[f"{prefix}.sum"] = values[f"{prefix}.residual"] + values[tensor]
-        for branch in (f"{prefix}.reduce", f"{prefix}.skip"):
-            values[branch] = convolve(branch, values[f"{prefix}.sum"])
-        values[prefix] = values[f"{prefix}.reduce"] + values[f"{prefix}.skip"]
-        tensor = prefix
+    for tensor in activation_tensors(architecture)[1:]:
+        if tensor in reads:
+            values[tensor] = _convolve(weights, layers[tensor], values[reads[tensor]])
+        else:
+            first, second = sum_operands(tensor)
+            values[tensor] = values[first] + values[second]
     return values
+
+
+def _convolve(weights: FloatWeights, layer: Convolution, values: NDArray[np.float32]) -> NDArray[np.float32]:
+    padded = np.pad(values, ((0, 0), (0, 0), layer.padding))
+    windows = np.lib.stride_tricks.sliding_window_view(padded, layer.kernel, axis=2)
+    windows = windows[:, :, :: layer.stride]
+    sums = np.einsum("ncpk,fck->nfp", windows, weights.weight[layer.name], optimize=True)
+    activation: NDArray[np.float32] = np.maximum(sums + weights.bias[layer.name][:, None], np.float32(0))
+    return activation
 
 
 def predict_m(weights: FloatWeights, inputs: NDArray[np.float32]) -> NDArray[np.float32]:

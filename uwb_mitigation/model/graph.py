@@ -1,4 +1,4 @@
-"""REMNet as an ONNX graph, in float32 and in int8, and back from the graph to its weights.
+"""REMNet, or its baseline, as an ONNX graph, in float32 and in int8, and back from the graph to its weights.
 
 Both graphs take `cir`, float32 (n, 1, K), and yield `error`, float32 (n, 1), in metres. The int8 one
 is written with QuantizeLinear and DequantizeLinear around float operators, in the pattern that ONNX
@@ -18,12 +18,14 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
 from uwb_mitigation.errors import ModelError
-from uwb_mitigation.model.architecture import HEAD, Remnet
+from uwb_mitigation.model.architecture import HEAD, Architecture, Mlp, Remnet
 from uwb_mitigation.model.weights import (
     FloatWeights,
     Int8Weights,
     activation_tensors,
     layer_inputs,
+    sum_operands,
+    weight_shapes,
 )
 
 INPUT = "cir"
@@ -51,7 +53,7 @@ class _Graph:
         self.nodes.append(helper.make_node(operator, inputs, [output], output, **attributes))
         return output
 
-    def model(self, architecture: Remnet, name: str) -> bytes:
+    def model(self, architecture: Architecture, name: str) -> bytes:
         graph = helper.make_graph(
             self.nodes,
             name,
@@ -77,12 +79,12 @@ def float_model(weights: FloatWeights) -> bytes:
 
     def parameters(layer: str) -> list[str]:
         return [
-            graph.constant(f"{layer}.weight", weights.weight[layer]),
+            graph.constant(f"{layer}.weight", _as_written(layer, weights.weight[layer])),
             graph.constant(f"{layer}.bias", weights.bias[layer]),
         ]
 
     _write(graph, weights.architecture, parameters, lambda tensor, value: value)
-    return graph.model(weights.architecture, "remnet")
+    return graph.model(weights.architecture, _name(weights.architecture))
 
 
 def int8_model(weights: Int8Weights) -> bytes:
@@ -92,21 +94,24 @@ def int8_model(weights: Int8Weights) -> bytes:
     for tensor in activation_tensors(weights.architecture):
         graph.constant(f"{tensor}.scale", np.float32(weights.activation_scale[tensor]))
     reads = layer_inputs(weights.architecture)
-    # The same scale on both sides of Flatten lets the runtime flatten the integers.
-    graph.constant("flat.scale", np.float32(weights.activation_scale[reads[HEAD]]))
+    if isinstance(weights.architecture, Remnet):
+        # The same scale on both sides of Flatten lets the runtime flatten the integers.
+        graph.constant("flat.scale", np.float32(weights.activation_scale[reads[HEAD]]))
 
     def parameters(layer: str) -> list[str]:
         scale = weights.weight_scale[layer]
         accumulator = np.float32(weights.activation_scale[reads[layer]]) * scale
-        # The head is one output: a scale for its tensor. A convolution has one for each filter.
-        axis = {} if layer == HEAD else {"axis": 0}
+        # The head is one output: a scale for its tensor. Other layers have one for each filter.
         if layer == HEAD:
             scale, accumulator = scale[0], accumulator[0]
+        written = _as_written(layer, weights.weight[layer])
+        dense = layer != HEAD and written.ndim == 2
         names = []
-        for part, integers, unit in (
-            ("weight", weights.weight[layer], scale),
-            ("bias", weights.bias[layer], accumulator),
+        for part, integers, unit, along in (
+            ("weight", written, scale, int(dense)),
+            ("bias", weights.bias[layer], accumulator, 0),
         ):
+            axis = {} if layer == HEAD else {"axis": along}
             names.append(
                 graph.node(
                     "DequantizeLinear",
@@ -133,35 +138,35 @@ def int8_model(weights: Int8Weights) -> bytes:
         return graph.node("DequantizeLinear", [f"{tensor}.quantised", *pair], f"{tensor}.dequantised{copy}")
 
     _write(graph, weights.architecture, parameters, quantised)
-    return graph.model(weights.architecture, "remnet_int8")
+    return graph.model(weights.architecture, f"{_name(weights.architecture)}_int8")
 
 
-def float_weights(model: bytes, architecture: Remnet) -> FloatWeights:
+def float_weights(model: bytes, architecture: Architecture) -> FloatWeights:
     """The weights of a graph that `float_model` wrote.
 
     Raises:
         ModelError: an initializer is absent or of another shape or type.
     """
     constants = _constants(model)
-    layers = [layer.name for layer in architecture.convolutions] + [HEAD]
+    layers = list(weight_shapes(architecture))
     return FloatWeights(
         architecture,
-        {name: _take(constants, f"{name}.weight", np.float32) for name in layers},
+        {name: _as_written(name, _take(constants, f"{name}.weight", np.float32)) for name in layers},
         {name: _take(constants, f"{name}.bias", np.float32) for name in layers},
     )
 
 
-def int8_weights(model: bytes, architecture: Remnet) -> Int8Weights:
+def int8_weights(model: bytes, architecture: Architecture) -> Int8Weights:
     """The integers and scales of a graph that `int8_model` wrote.
 
     Raises:
         ModelError: an initializer is absent or of another shape or type.
     """
     constants = _constants(model)
-    layers = [layer.name for layer in architecture.convolutions] + [HEAD]
+    layers = list(weight_shapes(architecture))
     return Int8Weights(
         architecture,
-        {name: _take(constants, f"{name}.weight", np.int8) for name in layers},
+        {name: _as_written(name, _take(constants, f"{name}.weight", np.int8)) for name in layers},
         {name: np.atleast_1d(_take(constants, f"{name}.weight.scale", np.float32)) for name in layers},
         {name: _take(constants, f"{name}.bias", np.int32) for name in layers},
         {
@@ -187,38 +192,56 @@ def _take(constants: dict[str, NDArray[np.generic]], name: str, kind: type[Numbe
     return array.astype(kind, copy=False)
 
 
+def _name(architecture: Architecture) -> str:
+    return "mlp" if isinstance(architecture, Mlp) else "remnet"
+
+
+def _as_written(layer: str, weight: NDArray[Number]) -> NDArray[Number]:
+    """Weights as the graph holds them, or back: a dense layer's are transposed, inputs first."""
+    return np.ascontiguousarray(weight.T) if layer != HEAD and weight.ndim == 2 else weight
+
+
 def _write(
     graph: _Graph,
-    architecture: Remnet,
+    architecture: Architecture,
     parameters: Callable[[str], list[str]],
     read: Callable[[str, str], str],
 ) -> None:
-    """Write REMNet's nodes. `read(tensor, value)` names what a reader of `tensor` is given."""
+    """Write a network's nodes. `read(tensor, value)` names what a reader of `tensor` is given."""
+    if isinstance(architecture, Mlp):
+        _write_mlp(graph, architecture, parameters, read)
+        return
     layers = {layer.name: layer for layer in architecture.convolutions}
-
-    def convolution(name: str, tensor: str, value: str) -> str:
-        layer = layers[name]
-        before, after = layer.padding
+    reads = layer_inputs(architecture)
+    tensor = "input"
+    for tensor in activation_tensors(architecture)[1:]:
+        if tensor not in reads:
+            graph.node("Add", [read(name, name) for name in sum_operands(tensor)], tensor)
+            continue
+        layer, source = layers[tensor], reads[tensor]
         output = graph.node(
             "Conv",
-            [read(tensor, value), *parameters(name)],
-            f"{name}.accumulated",
+            [read(source, INPUT if source == "input" else source), *parameters(tensor)],
+            f"{tensor}.accumulated",
             kernel_shape=[layer.kernel],
             strides=[layer.stride],
-            pads=[before, after],
+            pads=list(layer.padding),
         )
-        return graph.node("Relu", [output], name)
-
-    def total(name: str, first: str, second: str) -> str:
-        return graph.node("Add", [read(first, first), read(second, second)], name)
-
-    tensor = convolution("first", "input", INPUT)
-    for module in range(1, architecture.modules + 1):
-        prefix = f"module{module}"
-        residual = convolution(f"{prefix}.residual", tensor, tensor)
-        summed = total(f"{prefix}.sum", residual, tensor)
-        reduced = convolution(f"{prefix}.reduce", summed, summed)
-        skipped = convolution(f"{prefix}.skip", summed, summed)
-        tensor = total(prefix, reduced, skipped)
+        graph.node("Relu", [output], tensor)
     flat = graph.node("Flatten", [read(tensor, tensor)], "flat", axis=1)
     graph.node("Gemm", [read("flat", flat), *parameters(HEAD)], OUTPUT)
+
+
+def _write_mlp(
+    graph: _Graph,
+    architecture: Mlp,
+    parameters: Callable[[str], list[str]],
+    read: Callable[[str, str], str],
+) -> None:
+    flat = graph.node("Flatten", [INPUT], "flat", axis=1)
+    for layer, source in layer_inputs(architecture).items():
+        inputs = [read(source, flat if source == "input" else source), *parameters(layer)]
+        if layer == HEAD:
+            graph.node("Gemm", inputs, OUTPUT)
+        else:
+            graph.node("Relu", [graph.node("Gemm", inputs, f"{layer}.accumulated")], layer)

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ModelError
 from uwb_mitigation.model import graph
-from uwb_mitigation.model.architecture import HEAD, Convolution
+from uwb_mitigation.model.architecture import HEAD, Convolution, Mlp, Remnet
 from uwb_mitigation.model.bundle import Bundle
-from uwb_mitigation.model.weights import Int8Weights, layer_inputs, sum_operands
+from uwb_mitigation.model.weights import Int8Weights, activation_tensors, layer_inputs, sum_operands
 
 
 class IntegerNetwork:
@@ -24,7 +24,9 @@ class IntegerNetwork:
 
     def __init__(self, weights: Int8Weights) -> None:
         self.weights = weights
-        self._layers = {layer.name: layer for layer in weights.architecture.convolutions}
+        self._layers = {}
+        if isinstance(weights.architecture, Remnet):
+            self._layers = {layer.name: layer for layer in weights.architecture.convolutions}
         self._reads = layer_inputs(weights.architecture)
 
     @classmethod
@@ -43,22 +45,20 @@ class IntegerNetwork:
         return self.head(self.tensors(inputs)[self._reads[HEAD]])
 
     def tensors(self, inputs: NDArray[np.float32]) -> dict[str, NDArray[np.uint8]]:
-        """Every activation, {tensor: uint8 (n, channels, length)}, for inputs of shape (n, K)."""
-        scale = self.weights.activation_scale
+        """Every activation for inputs of shape (n, K), {tensor: uint8 (n, channels, length)}; of an MLP,
+        (n, outputs).
+        """
+        architecture = self.weights.architecture
         with np.errstate(over="ignore"):  # An infinite quotient saturates as any other large one.
-            quotient = np.divide(inputs[:, None, :], scale["input"], dtype=np.float32)
-        values = {"input": _saturate(quotient)}
-        values["first"] = self.convolve("first", values["input"])
-        tensor = "first"
-        for module in range(1, self.weights.architecture.modules + 1):
-            prefix = f"module{module}"
-            residual, summed = f"{prefix}.residual", f"{prefix}.sum"
-            values[residual] = self.convolve(residual, values[tensor])
-            values[summed] = self.add(summed, values)
-            for branch in (f"{prefix}.reduce", f"{prefix}.skip"):
-                values[branch] = self.convolve(branch, values[summed])
-            values[prefix] = self.add(prefix, values)
-            tensor = prefix
+            quotient = np.divide(inputs, self.weights.activation_scale["input"], dtype=np.float32)
+        values = {"input": _saturate(quotient if isinstance(architecture, Mlp) else quotient[:, None, :])}
+        for tensor in activation_tensors(architecture)[1:]:
+            if tensor not in self._reads:
+                values[tensor] = self.add(tensor, values)
+            elif isinstance(architecture, Mlp):
+                values[tensor] = self.connect(tensor, values[self._reads[tensor]])
+            else:
+                values[tensor] = self.convolve(tensor, values[self._reads[tensor]])
         return values
 
     def accumulate(self, name: str, values: NDArray[np.uint8]) -> NDArray[np.int32]:
@@ -74,7 +74,7 @@ class IntegerNetwork:
         return total
 
     def requantisation(self, name: str) -> NDArray[np.float32]:
-        """The factors from accumulator to output of convolution `name`, float32 (filters,)."""
+        """The factors from accumulator to output of layer `name`, float32 (filters,)."""
         scale = self.weights.activation_scale
         factors: NDArray[np.float32] = (scale[self._reads[name]] * self.weights.weight_scale[name]) / scale[
             name
@@ -86,6 +86,12 @@ class IntegerNetwork:
         accumulator = self.accumulate(name, values).astype(np.float32)
         return _saturate(accumulator * self.requantisation(name)[:, None])
 
+    def connect(self, name: str, values: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Dense layer `name` with its ReLU, (n, outputs), of (n, inputs)."""
+        # Exact in float64, as in `accumulate`.
+        sums = values.astype(float) @ self.weights.weight[name].T.astype(float) + self.weights.bias[name]
+        return _saturate(sums.astype(np.float32) * self.requantisation(name))
+
     def add(self, name: str, values: dict[str, NDArray[np.uint8]]) -> NDArray[np.uint8]:
         """The sum `name` of its two operands."""
         scale = self.weights.activation_scale
@@ -96,7 +102,7 @@ class IntegerNetwork:
         return _saturate((left + right.astype(np.float64)).astype(np.float32))
 
     def head(self, values: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """The head's output, float32 (n,), of the last module's (n, filters, length), m."""
+        """The head's output, float32 (n,), of the last tensor, m."""
         flat = values.reshape(len(values), -1).astype(np.int64)
         accumulator = flat @ self.weights.weight[HEAD].astype(np.int64) + self.weights.bias[HEAD]
         factor = self.weights.activation_scale[self._reads[HEAD]] * self.weights.weight_scale[HEAD]

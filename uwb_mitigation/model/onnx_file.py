@@ -10,7 +10,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from uwb_mitigation.model import wire
-from uwb_mitigation.model.architecture import HEAD, Remnet
+from uwb_mitigation.model.architecture import HEAD, Architecture, Mlp
+from uwb_mitigation.model.weights import weight_shapes
 
 # Field numbers of onnx.proto.
 _MODEL_GRAPH, _MODEL_METADATA, _MODEL_FUNCTIONS = 7, 14, 25
@@ -75,18 +76,16 @@ def read(data: bytes) -> Contents:
     return Contents(metadata, _shape(inputs[0]), shapes, "QuantizeLinear" in operators)
 
 
-def mismatch(contents: Contents, architecture: Remnet) -> str:
+def mismatch(contents: Contents, architecture: Architecture) -> str:
     """How a graph differs from `architecture`: one sentence, or empty where it does not."""
     if contents.input_shape[1:] != (1, architecture.samples):
         return (
             f"the graph reads inputs of shape {contents.input_shape}, "
             f"the metadata promises K = {architecture.samples}"
         )
-    expected: dict[str, tuple[int, ...]] = {
-        layer.name: (layer.filters, layer.inputs, layer.kernel) for layer in architecture.convolutions
-    }
-    expected[HEAD] = (architecture.features, 1)
-    for layer, shape in expected.items():
+    for layer, shape in weight_shapes(architecture).items():
+        if isinstance(architecture, Mlp) and layer != HEAD:
+            shape = shape[::-1]  # a product of matrices reads them so
         found = contents.shapes.get(f"{layer}.weight")
         if found != shape:
             return f"layer {layer} has weights of shape {found}, the metadata promises {shape}"

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ModelError
-from uwb_mitigation.model.architecture import HEAD, Remnet
+from uwb_mitigation.model.architecture import HEAD, Architecture, Mlp
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -18,11 +18,11 @@ class FloatWeights:
 
     Attributes:
         architecture: the network they belong to.
-        weight: {layer: (filters, inputs, kernel)}; the head's is (features, 1).
+        weight: {layer: (filters, inputs, kernel)}; a dense layer's is (outputs, inputs), the head's (features, 1).
         bias: {layer: (filters,)}; the head's is (1,).
     """
 
-    architecture: Remnet
+    architecture: Architecture
     weight: Mapping[str, NDArray[np.float32]]
     bias: Mapping[str, NDArray[np.float32]]
 
@@ -46,7 +46,7 @@ class Int8Weights:
         activation_scale: {tensor: float32}; tensors are named as `graph.py` names them.
     """
 
-    architecture: Remnet
+    architecture: Architecture
     weight: Mapping[str, NDArray[np.int8]]
     weight_scale: Mapping[str, NDArray[np.float32]]
     bias: Mapping[str, NDArray[np.int32]]
@@ -60,12 +60,15 @@ class Int8Weights:
                 raise ModelError(f"scale {scale} of {tensor}", valid="a finite positive scale")
 
 
-def activation_tensors(architecture: Remnet) -> tuple[str, ...]:
+def activation_tensors(architecture: Architecture) -> tuple[str, ...]:
     """Every tensor that int8 quantisation gives a scale, in the order of evaluation.
 
-    `input`; `first`; then for each module its convolutions, `moduleN.sum` (the residual's sum) and
-    `moduleN` (its output).
+    `input`; of a REMNet `first`, then for each module its convolutions, `moduleN.sum` (the residual's
+    sum) and `moduleN` (its output); of an MLP its layers. A layer's output has the layer's name; a
+    tensor that is no layer's is the sum of its `sum_operands`.
     """
+    if isinstance(architecture, Mlp):
+        return ("input", *(layer.name for layer in architecture.layers))
     names = ["input", "first"]
     for module in range(1, architecture.modules + 1):
         prefix = f"module{module}"
@@ -74,8 +77,11 @@ def activation_tensors(architecture: Remnet) -> tuple[str, ...]:
     return tuple(names)
 
 
-def layer_inputs(architecture: Remnet) -> dict[str, str]:
-    """{layer: the tensor that it reads}."""
+def layer_inputs(architecture: Architecture) -> dict[str, str]:
+    """{layer: the tensor that it reads}, in the order of evaluation."""
+    if isinstance(architecture, Mlp):
+        tensors = activation_tensors(architecture)
+        return dict(zip((*tensors[1:], HEAD), tensors, strict=True))
     reads = {"first": "input"}
     tensor = "first"
     for module in range(1, architecture.modules + 1):
@@ -96,17 +102,26 @@ def sum_operands(tensor: str) -> tuple[str, str]:
     return f"{module}.residual", "first" if number == 1 else f"module{number - 1}"
 
 
+def weight_shapes(architecture: Architecture) -> dict[str, tuple[int, ...]]:
+    """{layer: shape of its weights}; its outputs come first, but for the head's."""
+    shapes: dict[str, tuple[int, ...]]
+    if isinstance(architecture, Mlp):
+        shapes = {layer.name: (layer.outputs, layer.inputs) for layer in architecture.layers}
+    else:
+        shapes = {
+            layer.name: (layer.filters, layer.inputs, layer.kernel) for layer in architecture.convolutions
+        }
+    shapes[HEAD] = (architecture.features, 1)
+    return shapes
+
+
 def _check_shapes(
-    architecture: Remnet,
+    architecture: Architecture,
     weight: Mapping[str, NDArray[np.generic]],
     bias: Mapping[str, NDArray[np.generic]],
 ) -> None:
-    expected: dict[str, tuple[tuple[int, ...], tuple[int, ...]]] = {
-        layer.name: ((layer.filters, layer.inputs, layer.kernel), (layer.filters,))
-        for layer in architecture.convolutions
-    }
-    expected[HEAD] = ((architecture.features, 1), (1,))
-    for name, (weight_shape, bias_shape) in expected.items():
+    for name, weight_shape in weight_shapes(architecture).items():
+        bias_shape = (1,) if name == HEAD else weight_shape[:1]
         for part, arrays, shape in (("weight", weight, weight_shape), ("bias", bias, bias_shape)):
             if name not in arrays:
                 raise ModelError(f"no {part} of layer {name}")

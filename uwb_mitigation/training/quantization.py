@@ -64,7 +64,7 @@ def quantize(
     integers, biases = {}, {}
     limits = np.iinfo(np.int32)
     for name, weight in weights.weight.items():
-        unit = weight_scale[name] if name == HEAD else weight_scale[name][:, None, None]
+        unit = weight_scale[name] if name == HEAD else _by_output(weight_scale[name], weight)
         rounded = np.clip(np.rint(weight / unit), -WEIGHT_LIMIT, WEIGHT_LIMIT)
         integers[name] = rounded.astype(np.int8)
         bias = np.rint(weights.bias[name].astype(float) / (scale[reads[name]] * weight_scale[name]))
@@ -75,11 +75,16 @@ def quantize(
 
 def _weight_scale(name: str, weight: NDArray[np.float32]) -> NDArray[np.float32]:
     """One scale for each filter; the head is one output."""
-    peak = np.atleast_1d(np.abs(weight).max(axis=None if name == HEAD else (1, 2)))
+    peak = np.atleast_1d(np.abs(weight).max(axis=None if name == HEAD else tuple(range(1, weight.ndim))))
     # A filter of zeros has no peak: any scale stands for it, its neighbours' causes no surprise.
     peak = np.where(peak > 0, peak, peak.max() if peak.any() else 1.0)
     scale: NDArray[np.float32] = (peak / WEIGHT_LIMIT).astype(np.float32)
     return scale
+
+
+def _by_output(scale: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArray[np.float32]:
+    """`scale` (outputs,) shaped to go with `weight`, whose outputs come first."""
+    return scale.reshape(-1, *[1] * (weight.ndim - 1))
 
 
 def _peaks(weights: FloatWeights, calibration: NDArray[np.float32], percentile: float) -> dict[str, float]:

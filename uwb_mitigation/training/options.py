@@ -1,0 +1,40 @@
+"""How a network is fitted. No torch here, so that a command line can check options before it is needed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from uwb_mitigation.errors import ParameterError
+
+
+@dataclass(frozen=True, slots=True)
+class FitOptions:
+    """How a network is fitted; the defaults are what the shipped bundle was trained with.
+
+    Attributes:
+        epochs: passes over the data.
+        learning_rate: of Adam with decoupled weight decay (paper, section III-B).
+        batch: inputs a step.
+        dropout: share of the head's inputs that are dropped; REMNet's alone.
+        weight_decay: decoupled.
+        seed: of the initial weights, the order and the dropout.
+    """
+
+    epochs: int = 5
+    learning_rate: float = 3e-4
+    batch: int = 32
+    dropout: float = 0.5
+    weight_decay: float = 1e-2
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, value, low, high in (
+            ("epochs", self.epochs, 1, 10_000),
+            ("learning_rate", self.learning_rate, 1e-8, 1.0),
+            ("batch", self.batch, 1, 65_536),
+            ("dropout", self.dropout, 0.0, 0.95),
+            ("weight_decay", self.weight_decay, 0.0, 10.0),
+            ("seed", self.seed, 0, 2**32 - 1),
+        ):
+            if not low <= value <= high:
+                raise ParameterError(f"{name} = {value}", valid=f"{low} to {high}")
