@@ -564,7 +564,7 @@ def test_a_scheduler_that_does_not_answer_is_named(tmp_path: Path) -> None:
     import dask
 
     with dask.config.set({"distributed.comm.timeouts.connect": "200ms"}):
-        for address in ("tcp://127.0.0.1:9", "no such address"):
+        for address in ("tcp://127.0.0.1:9", "nonsense://127.0.0.1:9"):
             with pytest.raises(ParameterError, match="no Dask scheduler"):
                 list(run_on_dask([job(tmp_path / "a", tmp_path / "b")], address))
     assert distributed

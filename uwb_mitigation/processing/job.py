@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 
-from uwb_mitigation.bag import columns
+from uwb_mitigation.bag import columns, schemas
 from uwb_mitigation.bag.codec import decode_range, encode_corrected
 from uwb_mitigation.bag.container import RawMessage
 from uwb_mitigation.bag.reader import BagReader, check_channel
@@ -108,6 +108,8 @@ def process_bag(job: Job, report: Report | None = None) -> Outcome:
         ModelError: the model cannot be used.
     """
     mitigation = Mitigation(load_bundle(job.model))
+    # Once a process, and as long as thousands of ranges take: no part of a bag's own time.
+    schemas.typestore()
     started = time.perf_counter()
     bag = BagReader(job.source)
     known = bag.metadata.get(METADATA_RECORD, {})

@@ -95,11 +95,14 @@ def run_on_dask(jobs: Sequence[Job], address: str) -> Iterator[Event]:
     """
     try:
         from distributed import Client, as_completed
+        from distributed.comm import get_address_host
     except ModuleNotFoundError as error:
         raise MissingDependencyError(
             "a scheduler needs Dask", valid="python -m pip install distributed"
         ) from error
     try:
+        # A client that fails on the address itself takes a minute to be disposed of.
+        get_address_host(address)
         client = Client(address, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:
         reason = str(error) or type(error).__name__
