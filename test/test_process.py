@@ -199,11 +199,13 @@ def test_columns_are_corrected_as_one_by_one_and_the_rest_is_left_out(tmp_path: 
         *(exchange(n, {"rx_power_dbm": -70.0 - n}) for n in range(50)),
     ]
     (block,) = columns.blocks([codec.encode_range(m) for m in measurements])
-    rows, range_m, correction_m = mitigation.correct_columns(block.columns)
-    answers = dict(zip(rows.tolist(), zip(range_m.tolist(), correction_m.tolist(), strict=True), strict=True))
+    rows, *results = mitigation.correct_columns(block.columns)
+    answers = dict(
+        zip(rows.tolist(), zip(*(values.tolist() for values in results), strict=True), strict=True)
+    )
     single_answers = [mitigation.correct(m) for m in measurements]
     assert answers == {
-        n: (answer.range_m, answer.correction_m)
+        n: (answer.range_m, answer.correction_m, answer.variance_m2)
         for n, answer in enumerate(single_answers)
         if answer.status is Status.OK
     }
@@ -224,7 +226,10 @@ def test_encoded_blocks_are_what_the_codec_encodes(frame: str, samples: int) -> 
     (block,) = columns.blocks([codec.encode_range(m) for m in measurements])
     rows = np.array([0, 3, 8])
     correction = np.array([0.25, -0.5, 1.0], np.float32)
-    encoded = block.encode_corrected(rows, block.columns.range_m[rows] - correction, correction, LIKE)
+    variance = np.array([0.25, 0.5, 2.0], np.float32)
+    encoded = block.encode_corrected(
+        rows, block.columns.range_m[rows] - correction, correction, variance, LIKE
+    )
     assert encoded == [
         codec.encode_corrected(
             measurements[row],
@@ -233,9 +238,10 @@ def test_encoded_blocks_are_what_the_codec_encodes(frame: str, samples: int) -> 
                 range_m=measurements[row].range_m - shift,
                 range_raw_m=measurements[row].range_m,
                 correction_m=shift,
+                variance_m2=spread,
             ),
         )
-        for row, shift in zip(rows.tolist(), correction.tolist(), strict=True)
+        for row, shift, spread in zip(rows.tolist(), correction.tolist(), variance.tolist(), strict=True)
     ]
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.measurement import CorrectedRange, Origin, RangeColumns, RangeMeasurement, Status
 from uwb_mitigation.model.bundle import Bundle
+from uwb_mitigation.model.familiarity import Strangeness, features
 from uwb_mitigation.model.session import Session
 
 MAX_RANGE_M = 1e6
@@ -23,6 +24,10 @@ class Mitigation:
     operation, so that a microcontroller gets the same bits. No measurement is refused: where one
     cannot be corrected its raw range passes through, with a status that says why and a larger variance.
 
+    The further a measurement lies outside of what the bundle was trained on (`familiarity`), the more its
+    correction shrinks from the predicted error to the offset that the training data had on the whole, and
+    the larger its variance is, status OK. Wholly outside, the raw range passes through.
+
     Raises:
         ModelError: ONNX Runtime refuses the bundle's network.
     """
@@ -33,15 +38,21 @@ class Mitigation:
         self._window = np.zeros(bundle.preprocessing.samples, np.float32)
         self._preprocessing = bundle.preprocessing
         self._prior = bundle.prior
-        self._low, self._high = bundle.card.correction_limits_m
-        self._variance = bundle.card.variance_m2
-        self._variance_uncorrected = bundle.card.variance_uncorrected_m2
+        card = bundle.card
+        self._low, self._high = (np.float32(limit) for limit in card.correction_limits_m)
+        self._variance = np.float32(card.variance_m2)
+        self._variance_per_m2 = np.float32(card.variance_per_m2)
+        self._variance_uncorrected = np.float32(card.variance_uncorrected_m2)
+        familiarity = card.familiarity
+        self._strangeness = None if familiarity is None else Strangeness(familiarity.bands)
+        self._known_offset = np.float32(0.0 if familiarity is None else familiarity.known_offset_m)
 
     def correct(self, measurement: RangeMeasurement) -> CorrectedRange:
         """The corrected range; never raises on what a measurement holds.
 
         Status NO_CIR, BAD_CIR: see `CirFault`. OUT_OF_DISTRIBUTION: the range is negative or not finite,
-        or the predicted error lies outside the bundle's limits. MODEL_ERROR: the network failed, or
+        the predicted error lies outside the bundle's limits, or the measurement is wholly unlike the
+        bundle's training data. MODEL_ERROR: the network failed, or
         its output is not finite.
         """
         prior, status = self._prepare(measurement, self._window)
@@ -51,7 +62,8 @@ class Mitigation:
             predicted = self._session.predict_m(self._window)
         except Exception:  # Whatever ONNX Runtime raises, a consumer must still get its range.
             return self._passed(measurement, Status.MODEL_ERROR)
-        return self._corrected(measurement, prior + predicted)
+        score = self._scores([measurement], self._window[None])[0]
+        return self._corrected(measurement, prior + predicted, score)
 
     def correct_batch(self, measurements: Sequence[RangeMeasurement]) -> list[CorrectedRange]:
         """`correct` of each measurement, to the bit; faster on many."""
@@ -60,28 +72,27 @@ class Mitigation:
             self._prepare(measurement, window)
             for measurement, window in zip(measurements, windows, strict=True)
         ]
+        results = [
+            self._passed(measurement, status)
+            for measurement, (_, status) in zip(measurements, prepared, strict=True)
+        ]
         usable = [index for index, (_, status) in enumerate(prepared) if status is Status.OK]
-        predicted: NDArray[np.float32] | None = None
-        if usable:
-            try:
-                predicted = self._session.predict_batch_m(windows[usable])
-            except Exception:  # As in `correct`.
-                predicted = None
-        results = []
-        outputs = iter(()) if predicted is None else iter(predicted)
-        for measurement, (prior, status) in zip(measurements, prepared, strict=True):
-            if status is not Status.OK:
-                results.append(self._passed(measurement, status))
-            elif predicted is None:
-                results.append(self._passed(measurement, Status.MODEL_ERROR))
-            else:
-                results.append(self._corrected(measurement, prior + next(outputs)))
+        if not usable:
+            return results
+        try:
+            predicted = self._session.predict_batch_m(windows[usable])
+        except Exception:  # As in `correct`.
+            predicted = np.full(len(usable), np.nan, np.float32)
+        scores = self._scores([measurements[index] for index in usable], windows[usable])
+        for index, network_m, score in zip(usable, predicted, scores, strict=True):
+            results[index] = self._corrected(measurements[index], prepared[index][0] + network_m, score)
         return results
 
     def correct_columns(
         self, ranges: RangeColumns
-    ) -> tuple[NDArray[np.intp], NDArray[np.float32], NDArray[np.float32]]:
-        """The rows that `correct` gives status OK, ascending; their ranges and corrections, m, to the bit.
+    ) -> tuple[NDArray[np.intp], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        """The rows that `correct` gives status OK, ascending; their ranges, corrections, m, and variances, m^2,
+        to the bit.
 
         Every other row passes through: ask `correct` for its status.
         """
@@ -92,15 +103,54 @@ class Mitigation:
         if not wanted.all():
             rows, windows, prior, range_m = rows[wanted], windows[wanted], prior[wanted], range_m[wanted]
         if not len(rows):
-            return rows, range_m, prior
+            return rows, range_m, prior, prior
         try:
             predicted = prior + self._session.predict_batch_m(windows)
         except Exception:  # As in `correct`.
-            return rows[:0], range_m[:0], prior[:0]
+            return rows[:0], range_m[:0], prior[:0], prior[:0]
+        score = self._score(windows, range_m, ranges.rx_power_dbm[rows], ranges.first_path_power_dbm[rows])
         # NaN is inside of no limits.
-        inside = (predicted >= np.float32(self._low)) & (predicted <= np.float32(self._high))
-        rows, range_m, predicted = rows[inside], range_m[inside], predicted[inside]
-        return rows, range_m - predicted, predicted
+        inside = (predicted >= self._low) & (predicted <= self._high) & (score < 1.0)
+        rows, range_m = rows[inside], range_m[inside]
+        correction, variance = self._graded(predicted[inside], score[inside])
+        return rows, range_m - correction, correction, variance
+
+    def _scores(
+        self, measurements: Sequence[RangeMeasurement], windows: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """`_score` of measurements whose inputs are `windows`."""
+        if self._strangeness is None:
+            return np.zeros(len(windows), np.float32)
+        with np.errstate(over="ignore"):  # a power beyond float32 is as strange as an infinite one
+            numbers = np.array(
+                [(m.range_m, m.cir.rx_power_dbm, m.cir.first_path_power_dbm) for m in measurements],
+                np.float32,
+            )
+        return self._score(windows, *numbers.T)
+
+    def _score(
+        self,
+        windows: NDArray[np.float32],
+        range_m: NDArray[np.float32],
+        rx_power_dbm: NDArray[np.float32],
+        first_path_power_dbm: NDArray[np.float32],
+    ) -> NDArray[np.float32]:
+        """How strange n measurements are to the bundle, float32 (n,); 0 where it does not say what is familiar."""
+        if self._strangeness is None:
+            return np.zeros(len(windows), np.float32)
+        return self._strangeness.score(features(windows, range_m, rx_power_dbm, first_path_power_dbm))
+
+    def _graded(
+        self, predicted: NDArray[np.float32], score: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Corrections and variances of predicted errors within the limits, at scores below 1; also of scalars."""
+        correction: NDArray[np.float32] = predicted
+        variance: NDArray[np.float32] = self._variance + self._variance_per_m2 * (predicted * predicted)
+        if self._strangeness is not None:
+            shrunk = self._known_offset + (np.float32(1.0) - score) * (predicted - self._known_offset)
+            correction = np.where(score > 0.0, shrunk, predicted)
+            variance = variance + np.maximum(score, np.float32(0.0)) * self._variance_uncorrected
+        return correction, variance
 
     def _prepare(
         self, measurement: RangeMeasurement, window: NDArray[np.float32]
@@ -118,16 +168,19 @@ class Mitigation:
             return prior, Status.BAD_CIR
         return prior, Status.OK
 
-    def _corrected(self, measurement: RangeMeasurement, predicted: np.float32) -> CorrectedRange:
+    def _corrected(
+        self, measurement: RangeMeasurement, predicted: np.float32, score: np.float32
+    ) -> CorrectedRange:
         if not math.isfinite(predicted):
             return self._passed(measurement, Status.MODEL_ERROR)
-        if not self._low <= predicted <= self._high:
+        if not (self._low <= predicted <= self._high and score < 1.0):
             return self._passed(measurement, Status.OUT_OF_DISTRIBUTION)
+        correction, variance = self._graded(predicted, score)  # type: ignore[arg-type]
         return CorrectedRange(
-            range_m=float(np.float32(measurement.range_m) - predicted),
+            range_m=float(np.float32(measurement.range_m) - correction),
             range_raw_m=measurement.range_m,
-            correction_m=float(predicted),
-            variance_m2=self._variance,
+            correction_m=float(correction),
+            variance_m2=float(variance),
             status=Status.OK,
             origin=Origin.HOST,
             model_id=self.bundle.model_id,
@@ -139,7 +192,7 @@ class Mitigation:
             range_m=measurement.range_m,
             range_raw_m=measurement.range_m,
             correction_m=0.0,
-            variance_m2=self._variance_uncorrected if valid else math.inf,
+            variance_m2=float(self._variance_uncorrected) if valid else math.inf,
             status=status,
             origin=Origin.HOST,
             model_id=self.bundle.model_id,

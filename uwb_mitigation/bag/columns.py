@@ -44,6 +44,7 @@ _CORRECTED_FIELDS = {
     "range": ("<f4", 20),
     "range_raw": ("<f4", 24),
     "correction": ("<f4", 28),
+    "variance": ("<f4", 32),
 }
 _HEADER_FIELDS = {"encapsulation": ("S2", 0), "seconds": ("<i4", 4), "nanoseconds": ("<u4", 8)}
 _COPIED = ("seconds", "nanoseconds", "tag_id", "anchor_id", "sequence")
@@ -84,11 +85,12 @@ class Block:
         rows: NDArray[np.intp],
         range_m: NDArray[np.float32],
         correction_m: NDArray[np.float32],
+        variance_m2: NDArray[np.float32],
         like: CorrectedRange,
     ) -> list[bytes]:
         """`RangeCorrected` of some of the block's own `rows`: the bytes of `codec.encode_corrected`.
 
-        What is not given (variance, status, origin, model) is as in `like`.
+        What is not given (status, origin, model) is as in `like`.
         """
         template = codec.encode_corrected(self.first, like)
         at = len(template) - codec.CORRECTED_SIZE
@@ -101,6 +103,7 @@ class Block:
         out["range"] = range_m
         out["range_raw"] = self.fields["range"][rows]
         out["correction"] = correction_m
+        out["variance"] = variance_m2
         data = bytes(buffer)
         return [data[start : start + size] for start in range(0, len(data), size)]
 

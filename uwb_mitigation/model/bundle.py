@@ -21,6 +21,7 @@ import numpy as np
 from uwb_mitigation.errors import ModelError, UwbMitigationError
 from uwb_mitigation.model import onnx_file
 from uwb_mitigation.model.architecture import Architecture, Mlp, Remnet
+from uwb_mitigation.model.familiarity import Band, Familiarity
 from uwb_mitigation.model.prior import LinePrior
 from uwb_mitigation.model.wire import WireError, delimited
 from uwb_mitigation.preprocessing import Preprocessing, Scaling
@@ -45,10 +46,14 @@ class Card:
         preprocessing: what makes the network's input; its window is the architecture's K.
         prior: predicts the part of the error that the network does not.
         quantised: int8, or float32.
-        variance_m2: of a corrected range, m^2: expected squared error on unseen configurations.
+        variance_m2: of a corrected range whose predicted error is 0, m^2: one standard deviation covers 68 %
+            of the errors on unseen configurations.
         variance_uncorrected_m2: of a range passed through, m^2.
         correction_limits_m: predicted errors outside of these mean an input unlike the training data.
         training: data, split, seed, recipe and metrics; for people, JSON values only.
+        variance_per_m2: the variance grows by so much times the square of the predicted error, without unit.
+        interval95_sigmas: standard deviations that cover 95 % of the errors on unseen configurations.
+        familiarity: bands outside of which a measurement is unlike the training data; None = not known.
     """
 
     name: str
@@ -60,6 +65,9 @@ class Card:
     variance_uncorrected_m2: float
     correction_limits_m: tuple[float, float]
     training: Mapping[str, Any] = field(default_factory=dict)
+    variance_per_m2: float = 0.0
+    interval95_sigmas: float = 1.96
+    familiarity: Familiarity | None = None
 
     def __post_init__(self) -> None:
         if self.architecture.samples != self.preprocessing.samples:
@@ -75,6 +83,7 @@ class Card:
             "correction_limits_m[1]": self.correction_limits_m[1],
             "variance_m2": self.variance_m2,
             "variance_uncorrected_m2": self.variance_uncorrected_m2,
+            "variance_per_m2": self.variance_per_m2,
         }
         for name, value in numbers.items():
             if not math.isfinite(value):
@@ -85,6 +94,12 @@ class Card:
         for name in ("variance_m2", "variance_uncorrected_m2"):
             if numbers[name] <= 0:
                 raise ModelError(f"{name} = {numbers[name]}", valid="a positive number")
+        if self.variance_per_m2 < 0:
+            raise ModelError(f"variance_per_m2 = {self.variance_per_m2}", valid="0 or more")
+        if not 1.0 <= self.interval95_sigmas <= 1e3:
+            raise ModelError(f"interval95_sigmas = {self.interval95_sigmas}", valid="1 to 1000")
+        if self.familiarity is not None and self.preprocessing.scaling is not Scaling.PREAMBLE:
+            raise ModelError("familiarity of windows without level", valid="the scaling preamble")
         if self.correction_limits_m[0] >= self.correction_limits_m[1]:
             raise ModelError(f"correction_limits_m = {self.correction_limits_m}", valid="low, high")
 
@@ -242,7 +257,19 @@ def _card(metadata: dict[str, Any]) -> Card:
         variance_uncorrected_m2=float(metadata["variance_uncorrected_m2"]),
         correction_limits_m=(float(low), float(high)),
         training=dict(metadata["training"]),
+        # Bundles made before there were these hold none.
+        variance_per_m2=float(metadata.get("variance_per_m2", 0.0)),
+        interval95_sigmas=float(metadata.get("interval95_sigmas", 1.96)),
+        familiarity=_familiarity(metadata.get("familiarity")),
     )
+
+
+def _familiarity(metadata: dict[str, Any] | None) -> Familiarity | None:
+    if metadata is None:
+        return None
+    bands = dict(metadata)
+    offset = float(bands.pop("known_offset_m"))
+    return Familiarity(offset, **{name: Band(**band) for name, band in bands.items()})
 
 
 def _architecture_metadata(architecture: Architecture) -> dict[str, Any]:

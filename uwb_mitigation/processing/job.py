@@ -211,8 +211,8 @@ class _Corrector:
         answers: list[bytes | None] = [None] * len(messages)
         left = set(range(len(messages)))
         for block in columns.blocks(messages):
-            rows, range_m, correction_m = self._mitigation.correct_columns(block.columns)
-            encoded = block.encode_corrected(rows, range_m, correction_m, self._like)
+            rows, range_m, correction_m, variance_m2 = self._mitigation.correct_columns(block.columns)
+            encoded = block.encode_corrected(rows, range_m, correction_m, variance_m2, self._like)
             numbers = block.rows[rows].tolist()
             for number, answer in zip(numbers, encoded, strict=True):
                 answers[number] = answer

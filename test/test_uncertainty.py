@@ -1,0 +1,143 @@
+"""Variance, and what happens to measurements that are unlike the training data."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from model_material import bundle, measurement
+
+from uwb_mitigation.errors import ModelError
+from uwb_mitigation.measurement import Status
+from uwb_mitigation.mitigation import Mitigation
+from uwb_mitigation.model.architecture import Remnet
+from uwb_mitigation.model.bundle import load_bundle
+from uwb_mitigation.model.familiarity import Band, Familiarity, Strangeness, features
+from uwb_mitigation.preprocessing import Preprocessing
+
+WIDE = Band(-1000.0, 1000.0, 1.0)
+SHAPE = Remnet(samples=157)
+
+
+def bands(**changes: Band) -> Familiarity:
+    every = dict.fromkeys(
+        ("range_m", "rx_power_dbm", "power_gap_db", "cir_level_db", "first_path_level_db"), WIDE
+    )
+    return Familiarity(0.25, **(every | changes))
+
+
+def mitigation(folder, **changes: Band) -> Mitigation:
+    return Mitigation(bundle(folder, SHAPE, familiarity=bands(**changes), variance_per_m2=0.5))
+
+
+@pytest.fixture(autouse=True)
+def _no_warnings():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        yield
+
+
+def test_the_features_are_levels_in_decibels():
+    window = np.zeros((1, 157), np.float32)
+    window[0, 6:9] = (0.5, 1.0, 0.75)
+    window[0, 50] = 0.9
+    found = features(window, *(np.float32([value]) for value in (3.0, -80.0, -85.0)))
+    fourth = window.astype(float) ** 4
+    assert found[0, :3].tolist() == [3.0, -80.0, 5.0]
+    assert found[0, 3] == pytest.approx(10 * math.log10(fourth.sum()) + 80, abs=0.05)
+    assert found[0, 4] == pytest.approx(10 * math.log10(fourth[0, 6:9].sum()) + 85, abs=0.05)
+
+
+@pytest.mark.parametrize("level", [0.0, 1e-20, 1e16])
+def test_a_level_is_finite_whatever_the_window_holds(level):
+    window = np.full((1, 157), level, np.float32)
+    assert np.isfinite(features(window, *(np.float32([value]) for value in (3.0, -80.0, -85.0)))).all()
+
+
+def test_the_score_is_the_largest_excess_in_margins():
+    scale = Strangeness(bands(range_m=Band(1.0, 6.0, 2.0), rx_power_dbm=Band(-90.0, -80.0, 4.0)).bands)
+    rows = [(3.0, -85.0), (7.0, -85.0), (7.0, -77.0), (3.0, -96.0), (math.nan, -85.0)]
+    values = np.array([(range_m, power, 0.0, 0.0, 0.0) for range_m, power in rows], np.float32)
+    assert scale.score(values).tolist()[1:4] == [0.5, 0.75, 1.5]
+    assert scale.score(values)[0] <= 0
+    assert np.isnan(scale.score(values)[4])
+
+
+def test_familiar_measurements_are_corrected_by_the_predicted_error(tmp_path):
+    subject, plain = mitigation(tmp_path), Mitigation(bundle(tmp_path, SHAPE))
+    found, expected = subject.correct(measurement()), plain.correct(measurement())
+    assert found.correction_m == expected.correction_m
+
+
+def test_the_variance_grows_with_the_predicted_error(tmp_path):
+    result = mitigation(tmp_path).correct(measurement())
+    squared = np.float32(result.correction_m) * np.float32(result.correction_m)
+    assert result.variance_m2 == float(np.float32(0.0625) + np.float32(0.5) * squared)
+
+
+def test_a_strange_measurement_is_corrected_less_and_has_a_larger_variance(tmp_path):
+    familiar = mitigation(tmp_path).correct(measurement(3.0))
+    strange = mitigation(tmp_path, range_m=Band(1.0, 2.0, 4.0)).correct(measurement(3.0))
+    assert strange.status is Status.OK
+    assert strange.correction_m == pytest.approx(0.25 + 0.75 * (familiar.correction_m - 0.25), abs=1e-6)
+    assert strange.variance_m2 == pytest.approx(familiar.variance_m2 + 0.25 * 0.5, abs=1e-6)
+
+
+@pytest.mark.parametrize("name", ["range_m", "rx_power_dbm", "power_gap_db", "cir_level_db"])
+def test_a_wholly_strange_measurement_passes_through(tmp_path, name):
+    result = mitigation(tmp_path, **{name: Band(500.0, 501.0, 1.0)}).correct(measurement(3.0))
+    assert (result.status, result.range_m, result.correction_m) == (Status.OUT_OF_DISTRIBUTION, 3.0, 0.0)
+    assert result.variance_m2 == 0.5
+
+
+def test_batches_grade_to_the_bit_as_single_measurements(tmp_path):
+    subject = mitigation(
+        tmp_path, range_m=Band(1.0, 2.0, 4.0), rx_power_dbm=Band(-84.0, -80.0, 5.0), cir_level_db=WIDE
+    )
+    subjects = [measurement(0.2 * n, n, rx_power_dbm=-75.0 - n / 2) for n in range(40)]
+    subjects.append(measurement(rx_power_dbm=1e300))
+    single = [subject.correct(item) for item in subjects]
+    assert {result.status for result in single} >= {Status.OK, Status.OUT_OF_DISTRIBUTION}
+    assert [repr(result) for result in subject.correct_batch(subjects)] == [repr(r) for r in single]
+
+
+def test_a_bundle_keeps_its_familiarity(tmp_path):
+    saved = bundle(tmp_path, SHAPE, familiarity=bands(), variance_per_m2=0.5, interval95_sigmas=3.25)
+    card = load_bundle(saved.path).card
+    assert (card.familiarity, card.variance_per_m2, card.interval95_sigmas) == (bands(), 0.5, 3.25)
+
+
+@pytest.mark.parametrize("band", [(2.0, 1.0, 1.0), (0.0, 1.0, 0.0), (math.nan, 1.0, 1.0), (0.1, 1.0, 1.0)])
+def test_a_band_that_is_none_is_refused(band):
+    with pytest.raises(ModelError, match="band"):
+        Band(*band)
+
+
+@pytest.mark.parametrize("change", [{"variance_per_m2": -1.0}, {"interval95_sigmas": 0.5}])
+def test_a_card_with_an_impossible_variance_is_refused(tmp_path, change):
+    with pytest.raises(ModelError, match=next(iter(change))):
+        bundle(tmp_path, SHAPE, **change)
+
+
+def test_familiarity_of_measurements_covers_them():
+    windows = np.random.default_rng(0).uniform(0.1, 1, (50, 157)).astype(np.float32)
+    power = np.linspace(-95, -80, 50, dtype=np.float32)
+    values = features(windows, np.linspace(1, 6, 50, dtype=np.float32), power, power - np.float32(5))
+    found = Familiarity.of(0.3, values)
+    assert (Strangeness(found.bands).score(values) <= 0).all()
+    assert replace(found, known_offset_m=0.0).bands == found.bands
+
+
+def test_the_window_that_is_scored_is_the_networks_input(tmp_path):
+    subject = measurement()
+    window = np.empty(157, np.float32)
+    assert Preprocessing(157).apply(subject.cir, window) is None
+    (row,) = features(window[None], *(np.float32([v]) for v in (3.0, -82.0, -88.0)))
+    level = float(row[3])
+    edge = Band(float(np.float32(level + 1)), 500.0, 2.0)
+    result = mitigation(tmp_path, cir_level_db=edge).correct(subject)
+    familiar = mitigation(tmp_path).correct(subject)
+    assert result.correction_m == pytest.approx((familiar.correction_m + 0.25) / 2, abs=1e-4)

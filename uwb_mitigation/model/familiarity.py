@@ -1,0 +1,153 @@
+"""How far a measurement lies outside of what a model was trained on: cheap enough for a microcontroller.
+
+Five features, each with the band that it had in training: the range, the receive power, its excess over the
+first-path power, and two levels of the CIR less the powers that the radio reports of the same signal.
+The radio computes both powers from the very accumulator, so the last two hardly vary (DW1000 user
+manual, section 4.7): a CIR that is noise, clipped, or cut at the wrong place contradicts them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import astuple, dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.errors import ModelError
+
+FIRST_PATH_TAPS = slice(6, 9)
+"""The three taps of a window that the first-path power is computed from."""
+
+MIN_POWER, MAX_POWER = np.float32(1e-30), np.float32(1e30)
+"""Bounds on summed fourth powers of the inputs, so that a level is always finite."""
+
+_DB_PER_OCTAVE = np.float32(10 * math.log10(2))
+_SQUARE, _LINEAR, _CONSTANT = np.float32(-4 / 3), np.float32(4), np.float32(8 / 3)
+
+
+@dataclass(frozen=True, slots=True)
+class Band:
+    """Values from `low` to `high` are familiar; `margin` beyond them they are wholly strange."""
+
+    low: float
+    high: float
+    margin: float
+
+    def __post_init__(self) -> None:
+        for value in astuple(self):
+            if not math.isfinite(value) or float(np.float32(value)) != value:
+                raise ModelError(f"a band with {value!r}", valid="finite float32 values")
+        if self.low > self.high or self.margin <= 0 or not math.isfinite(np.float32(1) / self.margin):
+            raise ModelError(f"the band {astuple(self)}", valid="low <= high, and a positive margin")
+
+    @classmethod
+    def of(cls, values: NDArray[np.floating], least_margin: float) -> Band:
+        """The band of finite values (n,); its margin is half its width, or `least_margin` where that is more."""
+        low, high = float(values.min()), float(values.max())
+        return cls(*(float(np.float32(value)) for value in (low, high, max((high - low) / 2, least_margin))))
+
+
+@dataclass(frozen=True, slots=True)
+class Familiarity:
+    """The bands of the training data, and where a correction shrinks to outside of them.
+
+    Attributes:
+        known_offset_m: the median error over the configurations of the training data.
+        range_m: of the measured range.
+        rx_power_dbm, power_gap_db: of the receive power, and of it less the first-path power.
+        cir_level_db: of the window's energy less the receive power.
+        first_path_level_db: of the energy at the first path less the first-path power.
+    """
+
+    known_offset_m: float
+    range_m: Band
+    rx_power_dbm: Band
+    power_gap_db: Band
+    cir_level_db: Band
+    first_path_level_db: Band
+
+    def __post_init__(self) -> None:
+        offset = self.known_offset_m
+        if not math.isfinite(offset) or float(np.float32(offset)) != offset:
+            raise ModelError(f"known_offset_m = {offset!r}", valid="a finite float32 value")
+
+    @property
+    def bands(self) -> tuple[Band, ...]:
+        """In the order of the columns of `features`."""
+        return tuple(getattr(self, field.name) for field in fields(self)[1:])
+
+    @classmethod
+    def of(cls, known_offset_m: float, values: NDArray[np.float32]) -> Familiarity:
+        """The familiarity of training data with these `features`; rows that are not finite count for nothing.
+
+        Raises:
+            ModelError: no row is finite.
+        """
+        values = values[np.isfinite(values).all(axis=1)]
+        if not len(values):
+            raise ModelError("no measurement has all the features of familiarity")
+        bands = (Band.of(column, least) for column, least in zip(values.T, _LEAST_MARGINS, strict=True))
+        return cls(float(np.float32(known_offset_m)), *bands)
+
+
+_LEAST_MARGINS = (1.0, 3.0, 3.0, 3.0, 3.0)
+
+
+def features(
+    windows: NDArray[np.float32],
+    range_m: NDArray[np.float32],
+    rx_power_dbm: NDArray[np.float32],
+    first_path_power_dbm: NDArray[np.float32],
+) -> NDArray[np.float32]:
+    """The features of n measurements, float32 (n, 5).
+
+    Args:
+        windows: inputs of the network, (n, K), scaled by the preamble count: their fourth power is energy.
+        range_m, rx_power_dbm, first_path_power_dbm: (n,); where one is not finite, so is a feature.
+
+    Every step is one float32 operation, and sums are taken from the first tap to the last.
+    """
+    with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+        energy = windows * windows
+        np.multiply(energy, energy, out=energy)
+        sums = np.empty((len(windows), 2), np.float32)
+        sums[:, 0] = np.add.accumulate(energy, axis=1)[:, -1]
+        sums[:, 1] = np.add.accumulate(energy[:, FIRST_PATH_TAPS], axis=1)[:, -1]
+        level = _level_db(sums)
+        out = np.empty((len(windows), 5), np.float32)
+        out[:, 0] = range_m
+        out[:, 1] = rx_power_dbm
+        np.subtract(rx_power_dbm, first_path_power_dbm, out=out[:, 2])
+        np.subtract(level[:, 0], rx_power_dbm, out=out[:, 3])
+        np.subtract(level[:, 1], first_path_power_dbm, out=out[:, 4])
+    return out
+
+
+class Strangeness:
+    """Scores features against the bands of a `Familiarity`."""
+
+    def __init__(self, bands: Iterable[Band]) -> None:
+        table = np.array([astuple(band) for band in bands], np.float32)
+        self._low, self._high = table[:, 0], table[:, 1]
+        self._per_unit = np.float32(1) / table[:, 2]
+
+    def score(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """The largest excess over a band, in margins, of `features` (n, 5): float32 (n,).
+
+        0 or less: all are familiar; 1 or more, or NaN: wholly strange.
+        """
+        with np.errstate(over="ignore", invalid="ignore"):
+            excess = np.maximum(self._low - values, values - self._high)
+            np.multiply(excess, self._per_unit, out=excess)
+            score: NDArray[np.float32] = excess.max(axis=1)
+        return score
+
+
+def _level_db(power: NDArray[np.float32]) -> NDArray[np.float32]:
+    """10 log10 of a power, within 0.03 dB: the exponent is exact, and a parabola stands for the mantissa's logarithm."""
+    mantissa, exponent = np.frexp(np.minimum(np.maximum(power, MIN_POWER), MAX_POWER))
+    octaves = (_SQUARE * mantissa + _LINEAR) * mantissa - _CONSTANT
+    level: NDArray[np.float32] = (exponent.astype(np.float32) + octaves) * _DB_PER_OCTAVE
+    return level
