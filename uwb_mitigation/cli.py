@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 import uwb_mitigation
-from uwb_mitigation.commands import bench_serial, console, data, link, model, process
+from uwb_mitigation.commands import bench_nodes, bench_serial, console, data, link, model, process
 from uwb_mitigation.errors import UwbMitigationError
 
 app = typer.Typer(
@@ -24,6 +24,8 @@ bench = typer.Typer(help="Measure what the parts of the system can do.", no_args
 app.add_typer(bench, name="bench")
 bench.command("link")(link.bench_link)
 bench.command("serial")(bench_serial.bench_serial)
+bench.command("nodes")(bench_nodes.bench_nodes)
+bench.command("soak")(bench_nodes.bench_soak)
 app.command("process")(process.process)
 app.command("emulate-board")(link.emulate_board)
 

@@ -1,0 +1,358 @@
+"""Measures what the nodes add to what rclpy takes anyway: latency, highest rate, processor time, memory.
+
+Four subjects take the same recorded ranges, in one run and by turns, so that they share whatever else the
+machine is doing: a relay that only republishes, one that does so without looking, the mitigator, and the
+one-process pipeline. The first three have a driver process before them; all drivers loop over one bag, and
+their live parameters set the rate.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
+from itertools import islice
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+import rclpy
+from rcl_interfaces.srv import SetParameters
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile
+from rclpy.signals import SignalHandlerOptions
+from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
+
+from uwb_mitigation.bag.codec import after_frame
+from uwb_mitigation.bag.writer import BagWriter
+from uwb_mitigation.errors import UwbMitigationError
+from uwb_mitigation.nodes import relay, topics, vitals
+from uwb_mitigation.nodes.running import make_executor
+from uwb_mitigation.sources.simulated import SimulatedSource
+from uwb_mitigation.sources.source import Record
+
+WINDOW = 157
+"""Complex samples of each range: what the network reads."""
+RANGES = 5000
+RECORDED_HZ = 1000.0
+RATES_HZ = (100, 500, 1000)
+
+_DISTINCT = 500
+_START_S = 30.0
+_SETTLE_S = 0.3
+_TRIAL_S = 1.0
+_LATE_NS = 100_000_000
+_LOWEST_HZ, _STEP, _HALVINGS, _HIGHEST_HZ = 1000.0, 1.5, 3, 50_000.0
+_STAMP = struct.Struct("<4xiII")
+_SEQUENCE = struct.Struct("<16xI")
+
+
+@dataclass(frozen=True, slots=True)
+class Latency:
+    """From a range's stamp, when it was due, to its arrival at the subscriber, us."""
+
+    p50: float
+    p99: float
+    max: float
+
+
+@dataclass(slots=True)
+class Figures:
+    """Of one subject.
+
+    Attributes:
+        rates_hz: the highest rate without loss, of each search.
+        latency_us: at each rate, the median over the repeats.
+        cpu_us_per_message: of the subject's process, at the highest of the rates for latency.
+        chain_cpu_us_per_message: the same with its driver's process.
+        memory_mb: resident, of the subject's process at the end.
+    """
+
+    rates_hz: list[float] = field(default_factory=list)
+    latency_us: dict[int, Latency] = field(default_factory=dict)
+    cpu_us_per_message: float = math.nan
+    chain_cpu_us_per_message: float = math.nan
+    memory_mb: float = math.nan
+
+    @property
+    def max_lossless_rate_hz(self) -> float:
+        return median(self.rates_hz) if self.rates_hz else math.nan
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """What arrived at one rate.
+
+    Attributes:
+        received, lost: ranges that arrived, and that are missing between them.
+        late_ns: of each that arrived.
+        kept_up: none was lost, they came at the rate asked for, and the last ones were not late.
+    """
+
+    received: int
+    lost: int
+    late_ns: list[int]
+    kept_up: bool
+
+
+class Subject:
+    """Processes in a namespace of their own, and what comes out of them."""
+
+    def __init__(self, bench: Bench, name: str, kind: type, topic: str, *nodes: str) -> None:
+        self.name = name
+        self.figures = Figures()
+        self._bench = bench
+        self._arrivals: list[tuple[int, bytes]] = []
+        self._carried = 0
+        arrived, now_ns = self._arrivals.append, time.time_ns
+        qos = QoSProfile(depth=50_000)
+        bench.node.create_subscription(
+            kind, f"/{name}/{topic}", lambda data: arrived((now_ns(), data)), qos, raw=True
+        )
+        # The node that is measured comes first.
+        self.processes = [bench.start(node, name) for node in nodes]
+        self._client = bench.node.create_client(SetParameters, f"/{name}/driver/set_parameters")
+        bench.wait(self._client.service_is_ready, self.processes, f"{name}: no driver")
+        self.play(50.0)
+        bench.wait(lambda: len(self._arrivals) > 5, self.processes, f"{name}: nothing arrives")
+        self.pause()
+
+    def play(self, rate_hz: float) -> None:
+        self._set(Parameter("rate", value=rate_hz / RECORDED_HZ), Parameter("paused", value=False))
+
+    def pause(self) -> None:
+        """Stop, and let everything that is queued arrive."""
+        self._set(Parameter("paused", value=True))
+        before = -1
+        while before != len(self._arrivals):
+            before = len(self._arrivals)
+            self._bench.spin_for(0.1)
+
+    def forget(self) -> None:
+        """Begin to count anew."""
+        self._arrivals.clear()
+        self._carried = 0
+
+    def count(self) -> tuple[int, int]:
+        """How many arrived since the last call, and how many are missing between them."""
+        # The last one stays, for what comes between it and the next.
+        sequences = [read_head(data)[1] for _, data in self._arrivals]
+        fresh = len(sequences) - self._carried
+        self._carried = min(len(sequences), 1)
+        del self._arrivals[:-1]
+        return fresh, missing_between(sequences)
+
+    def trial(self, rate_hz: float, seconds: float) -> Trial:
+        self.play(rate_hz)
+        self._bench.spin_for(_SETTLE_S)
+        self._arrivals.clear()
+        began_ns = time.time_ns()
+        self._bench.spin_for(seconds)
+        passed_s = (time.time_ns() - began_ns) / 1e9
+        arrivals = self._arrivals.copy()
+        self.pause()
+        late_ns, sequences = [], []
+        for arrived_ns, data in arrivals:
+            stamp_ns, sequence = read_head(data)
+            late_ns.append(arrived_ns - stamp_ns)
+            sequences.append(sequence)
+        lost = missing_between(sequences)
+        kept_up = lost == 0 and len(arrivals) >= 0.97 * rate_hz * passed_s and max(late_ns[-20:]) < _LATE_NS
+        return Trial(len(arrivals), lost, late_ns, kept_up)
+
+    def measure_latency(self, rate_hz: int, seconds: float) -> Latency:
+        before = [vitals.cpu_ns(process.pid) for process in self.processes]
+        trial = self.trial(rate_hz, seconds)
+        after = [vitals.cpu_ns(process.pid) for process in self.processes]
+        if not trial.received:
+            raise UwbMitigationError(f"{self.name}: nothing arrives at {rate_hz} Hz")
+        # The settling before, and the pause after, play at the same rate and are counted along.
+        spent_us = [(b - a) / 1e3 / trial.received for a, b in zip(before, after, strict=True)]
+        share = seconds / (seconds + _SETTLE_S)
+        self.figures.cpu_us_per_message = spent_us[0] * share
+        self.figures.chain_cpu_us_per_message = sum(spent_us) * share
+        p50, p99 = np.percentile(trial.late_ns, (50, 99)) / 1e3
+        return Latency(float(p50), float(p99), max(trial.late_ns) / 1e3)
+
+    def search_rate(self) -> float:
+        """The highest rate that is kept up with, to within a few per cent; 0 if not even the lowest."""
+
+        def holds(rate_hz: float) -> bool:
+            # Twice: something else on the machine may have been in the way.
+            return self.trial(rate_hz, _TRIAL_S).kept_up or self.trial(rate_hz, _TRIAL_S).kept_up
+
+        low, high = 0.0, _LOWEST_HZ
+        while high < _HIGHEST_HZ and holds(high):
+            low, high = high, high * _STEP
+        for _ in range(_HALVINGS if low else 0):
+            middle = math.sqrt(low * high)
+            low, high = (middle, high) if holds(middle) else (low, middle)
+        return low
+
+    def _set(self, *parameters: Parameter) -> None:
+        request = SetParameters.Request(parameters=[p.to_parameter_msg() for p in parameters])
+        future = self._client.call_async(request)
+        self._bench.wait(future.done, self.processes, f"{self.name}: the driver does not answer")
+        for result in future.result().results:
+            if not result.successful:
+                raise UwbMitigationError(f"{self.name}: {result.reason}")
+
+
+class Bench:
+    """A subscriber in this process, and the subjects in theirs."""
+
+    def __init__(self, node: Node, context: Context, bag: Path, domain: str) -> None:
+        self.node = node
+        self.processes: list[subprocess.Popen[bytes]] = []
+        self._executor = make_executor(context)
+        self._executor.add_node(node)
+        self._bag = bag
+        self._environment = os.environ | {
+            "ROS_DOMAIN_ID": domain,
+            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        }
+
+    def start(self, node: str, namespace: str) -> subprocess.Popen[bytes]:
+        """Start a node; a driver, or a pipeline, waits to be told to play."""
+        node, _, parameter = node.partition(" ")
+        words = [parameter] if parameter else []
+        if node in ("driver", "pipeline"):
+            words = ["source:=mcap", f"path:={self._bag}", "loop:=true", "paused:=true"]
+            words += ["wait_for_subscribers:=0", "start_delay:=0.0"]
+        command = [sys.executable, "-c", f"from uwb_mitigation.nodes.{node} import main; main()"]
+        command += ["--ros-args", "--log-level", "error", "-r", f"__ns:=/{namespace}"]
+        for word in words:
+            command += ["-p", word]
+        process = subprocess.Popen(command, env=self._environment, start_new_session=True)
+        self.processes.append(process)
+        return process
+
+    def spin_for(self, seconds: float) -> None:
+        deadline = time.monotonic() + seconds
+        while (left := deadline - time.monotonic()) > 0:
+            self._executor.spin_once(timeout_sec=left)
+
+    def wait(
+        self, condition: Callable[[], bool], processes: Sequence[subprocess.Popen[bytes]], failure: str
+    ) -> None:
+        """Spin until something holds.
+
+        Raises:
+            UwbMitigationError: it does not, or a process has ended.
+        """
+        deadline = time.monotonic() + _START_S
+        while not condition():
+            self._executor.spin_once(timeout_sec=0.05)
+            if time.monotonic() > deadline or any(p.poll() is not None for p in processes):
+                raise UwbMitigationError(failure)
+
+    def close(self) -> None:
+        for process in self.processes:
+            process.terminate()
+        for process in self.processes:
+            _await_end(process)
+
+
+def _await_end(process: subprocess.Popen[bytes]) -> None:
+    try:
+        process.wait(10)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+@contextmanager
+def open_bench() -> Iterator[Bench]:
+    """A bench on a domain of its own, with a bag to play."""
+    domain = os.environ.get("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
+    # Read by the middleware when the first node is made.
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    context = Context()
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        write_bag(folder / "ranges.mcap")
+        rclpy.init(context=context, domain_id=int(domain), signal_handler_options=SignalHandlerOptions.NO)
+        stack.callback(rclpy.shutdown, context=context)
+        node = Node("bench", context=context)
+        stack.callback(node.destroy_node)
+        bench = Bench(node, context, folder / "ranges.mcap", domain)
+        stack.callback(bench.close)
+        yield bench
+
+
+def read_head(data: bytes) -> tuple[int, int]:
+    """Stamp, ns, and sequence of a serialised RangeCir or RangeCorrected: their beginnings are the same."""
+    seconds, nanoseconds, length = _STAMP.unpack_from(data)
+    (sequence,) = _SEQUENCE.unpack_from(data, after_frame(_STAMP.size + length))
+    return seconds * 10**9 + nanoseconds, sequence
+
+
+def missing_between(sequences: Sequence[int]) -> int:
+    """How many of the bag's ranges are missing between those that arrived in order."""
+    return int(((np.diff(sequences) - 1) % RANGES).sum()) if len(sequences) > 1 else 0
+
+
+def write_bag(path: Path) -> None:
+    """A bag of windows of simulated CIRs, `RANGES` of them, numbered from 0, `RECORDED_HZ` a second."""
+    records = [_cut(record) for record in islice(SimulatedSource(seed=1), _DISTINCT)]
+    with BagWriter(path, {"source": "simulated windows", "simulated": "true"}) as writer:
+        for sequence in range(RANGES):
+            measurement = records[sequence % _DISTINCT].measurement
+            stamp_ns = int(sequence * 1e9 / RECORDED_HZ)
+            writer.write(Record(replace(measurement, stamp_ns=stamp_ns, sequence=sequence)))
+
+
+def _cut(record: Record) -> Record:
+    cir = record.measurement.cir
+    start = int(cir.first_path_index) - 10
+    samples = cir.samples[2 * start : 2 * (start + WINDOW)]
+    return Record(replace(record.measurement, cir=replace(cir, samples=samples, start_index=start)))
+
+
+def measure(repeats: int, seconds: float, advance: Callable[[str], None]) -> dict[str, Figures]:
+    """All figures, by subject.
+
+    Args:
+        repeats: how often everything is measured.
+        seconds: of each measurement of latency.
+        advance: told what is measured next.
+
+    Raises:
+        UwbMitigationError: a node did not start, or nothing arrives.
+    """
+    with open_bench() as bench:
+        subjects = [
+            Subject(bench, "relay", RangeCir, relay.RELAYED, "relay", "driver"),
+            Subject(bench, "relay_serialised", RangeCir, relay.RELAYED, "relay serialised:=true", "driver"),
+            Subject(bench, "mitigator", RangeCorrected, topics.RANGE_CORRECTED, "mitigator", "driver"),
+            Subject(bench, "pipeline", RangeCorrected, topics.RANGE_CORRECTED, "pipeline"),
+        ]
+        latencies: dict[tuple[str, int], list[Latency]] = {}
+        for _ in range(repeats):
+            for rate_hz in RATES_HZ:
+                for subject in subjects:
+                    advance(f"latency of {subject.name} at {rate_hz} Hz")
+                    latency = subject.measure_latency(rate_hz, seconds)
+                    latencies.setdefault((subject.name, rate_hz), []).append(latency)
+            for subject in subjects:
+                advance(f"highest rate of {subject.name}")
+                subject.figures.rates_hz.append(subject.search_rate())
+        for subject in subjects:
+            for rate_hz in RATES_HZ:
+                of_rate = latencies[subject.name, rate_hz]
+                subject.figures.latency_us[rate_hz] = Latency(
+                    median(latency.p50 for latency in of_rate),
+                    median(latency.p99 for latency in of_rate),
+                    max(latency.max for latency in of_rate),
+                )
+            subject.figures.memory_mb = vitals.memory_kb(subject.processes[0].pid) / 1024
+        return {subject.name: subject.figures for subject in subjects}
