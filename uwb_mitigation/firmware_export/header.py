@@ -148,7 +148,8 @@ def number(value: float | np.floating[Any]) -> str:
     Raises:
         ModelError: it is not finite, or no float32 value.
     """
-    single = np.float32(value)
+    with np.errstate(over="ignore"):
+        single = np.float32(value)
     if not np.isfinite(single) or float(single) != float(value):
         raise ModelError(f"{value!r} is no finite float32 value")
     digits = f"{float(single):.9g}"
