@@ -11,10 +11,20 @@ import pytest
 import yaml
 from bag_material import START_NS, corrected, record, same
 from mcap.reader import SeekingReader
-from rosbags.rosbag2 import Reader
+from rosbags.interfaces import (
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+from rosbags.rosbag2 import Reader, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
 
 from uwb_mitigation.bag import codec, schemas
 from uwb_mitigation.bag.reader import BagReader
+from uwb_mitigation.bag.rosbag2 import recorded_qos
 from uwb_mitigation.bag.topics import (
     RANGE_CIR_TYPE,
     RANGE_CORRECTED,
@@ -240,3 +250,36 @@ def test_the_examples_in_the_documentation_run(
     shown = capsys.readouterr().out
     assert "2 7 5.5 40" in shown
     assert f"{START_NS} 0.5 NDP NLOS" in shown
+
+
+@pytest.mark.parametrize("version", [8, 9])
+def test_the_quality_of_service_of_a_copied_topic_comes_with_it(tmp_path: Path, version: int) -> None:
+    latched = Qos(
+        QosHistory.KEEP_LAST,
+        1,
+        QosReliability.RELIABLE,
+        QosDurability.TRANSIENT_LOCAL,
+        QosTime(0, 0),
+        QosTime(0, 0),
+        QosLiveliness.AUTOMATIC,
+        QosTime(0, 0),
+        False,
+    )
+    store = get_typestore(Stores.ROS2_JAZZY)
+    with Writer(tmp_path / "in", version=version, storage_plugin=StoragePlugin.MCAP) as writer:
+        topic = writer.add_connection(
+            "/tf_static", "std_msgs/msg/Empty", typestore=store, offered_qos_profiles=[latched]
+        )
+        writer.write(topic, 5, b"\x00\x01\x00\x00\x00")
+    with BagWriter(tmp_path / "out", {}) as bag:
+        for message in BagReader(tmp_path / "in").messages():
+            bag.write_serialized(bag.copy_channel(message.channel), message.data, message.log_time_ns, 5)
+    for path in (tmp_path / "out", tmp_path / "out" / "out_0.mcap"):
+        with Reader(path) as reader:
+            (connection,) = reader.connections
+            assert connection.ext.offered_qos_profiles == [latched]
+
+
+@pytest.mark.parametrize("text", ["", "[]", "5", "- history: 1", "{", "- [1, 2]", "\x00"])
+def test_quality_of_service_that_cannot_be_read_is_none(text: str) -> None:
+    assert recorded_qos(text) == []

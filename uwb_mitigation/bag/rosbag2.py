@@ -9,6 +9,8 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import yaml
+from rosbags.rosbag2.errors import ReaderError
+from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 
 from uwb_mitigation.errors import RecordingError
 
@@ -31,6 +33,18 @@ class TopicCount:
     type_name: str
     type_hash: str
     messages: int
+    qos: Sequence[Mapping[str, Any]] = ()
+
+
+def recorded_qos(text: str) -> list[dict[str, Any]]:
+    """The offered quality of service that a channel's metadata holds, as this metadata version spells it.
+
+    Earlier versions of rosbag2 write numbers for names. Empty where nothing can be made of it.
+    """
+    try:
+        return [dict(profile) for profile in dump_qos_v9(parse_qos(text[:MAX_METADATA]))]
+    except (ReaderError, LookupError, TypeError, ValueError, AttributeError):
+        return []
 
 
 def describe(
@@ -52,7 +66,7 @@ def describe(
                     "name": topic.topic,
                     "type": topic.type_name,
                     "serialization_format": "cdr",
-                    "offered_qos_profiles": [],
+                    "offered_qos_profiles": list(topic.qos),
                     "type_description_hash": topic.type_hash,
                 },
                 "message_count": topic.messages,
@@ -68,7 +82,7 @@ def describe(
     }
 
 
-def dump(document: Mapping[str, Any]) -> str:
+def dump(document: Mapping[str, Any] | Sequence[Any]) -> str:
     """YAML in the order of the keys, without anchors, which rosbag2 does not write either."""
     return yaml.dump(document, Dumper=_Plain, sort_keys=False, allow_unicode=True)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO
@@ -20,7 +21,15 @@ from uwb_mitigation.bag import schemas
 from uwb_mitigation.bag.chunks import ChunkWriter
 from uwb_mitigation.bag.codec import encode_corrected, encode_range, encode_truth
 from uwb_mitigation.bag.container import Channel
-from uwb_mitigation.bag.rosbag2 import METADATA_NAME, NO_QOS, TopicCount, describe, described_files, dump
+from uwb_mitigation.bag.rosbag2 import (
+    METADATA_NAME,
+    NO_QOS,
+    TopicCount,
+    describe,
+    described_files,
+    dump,
+    recorded_qos,
+)
 from uwb_mitigation.bag.topics import (
     RANGE_CIR_TYPE,
     RANGE_CORRECTED,
@@ -135,10 +144,10 @@ class BagWriter:
         """Register a channel of another bag, under its own name or `topic`; returns its number.
 
         A channel that is the same in all but its id gets the same number: files of one bag share it.
-        Its recorded quality of service stays behind: how that is spelt depends on the other bag's version.
+        Its recorded quality of service comes with it, spelt as by the current rosbag2.
         """
         topic = topic or channel.topic
-        metadata = channel.metadata | {_QOS_KEY: NO_QOS}
+        metadata = channel.metadata | {_QOS_KEY: dump(recorded_qos(channel.metadata.get(_QOS_KEY, "")))}
         key = (topic, channel.encoding, channel.schema, *sorted(metadata.items()))
         if key not in self._copied:
             schema = channel.schema
@@ -236,14 +245,12 @@ class BagWriter:
             number = self._mcap.register_channel(topic, encoding, schema_id, dict(metadata))
         self._names[number] = topic
         # A topic may have several channels, of several publishers; rosbag2 lists it once.
-        self._topics.setdefault(topic, TopicCount(topic, type_name, metadata.get(_HASH_KEY, ""), 0))
+        qos = recorded_qos(metadata[_QOS_KEY])
+        self._topics.setdefault(topic, TopicCount(topic, type_name, metadata.get(_HASH_KEY, ""), 0, qos))
         return number
 
     def _finish(self) -> None:
-        topics = [
-            TopicCount(topic.topic, topic.type_name, topic.type_hash, self.counts[topic.topic])
-            for topic in self._topics.values()
-        ]
+        topics = [replace(topic, messages=self.counts[topic.topic]) for topic in self._topics.values()]
         first_ns = 0 if self._first_ns is None else self._first_ns
         document = describe(self.file.name, topics, first_ns, self._last_ns, self._metadata)
         with self._writing():
