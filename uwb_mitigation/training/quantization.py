@@ -22,6 +22,9 @@ from uwb_mitigation.model.weights import FloatWeights, Int8Weights, layer_inputs
 WEIGHT_LIMIT = 63
 """Largest magnitude of an integer weight: 7 bits."""
 
+MSE = None
+"""In place of a percentile: of each activation, the scale with the least mean squared rounding error."""
+
 CALIBRATION_PER_CONFIGURATION = 40
 """Inputs of each configuration that the scales of the activations are found from."""
 
@@ -35,14 +38,15 @@ def calibration_inputs(dataset: Dataset, seed: int) -> NDArray[np.float32]:
 def quantize(
     weights: FloatWeights,
     calibration: NDArray[np.float32],
-    percentile: float = 100.0,
+    percentile: float | None = 100.0,
     *,
     exact: bool = True,
 ) -> Int8Weights:
     """The int8 network that stands for `weights` on inputs such as `calibration`, float32 (n, K).
 
     Args:
-        percentile: of each activation's values, what the largest integer stands for; 100 is the maximum.
+        percentile: of each activation's values, what the largest integer stands for; 100 is the maximum. `MSE`
+            weighs what is clipped against what is rounded.
         exact: move scales by a few ulps where the firmware's integer arithmetic needs it to agree to
             the bit (see `nudge`). Takes seconds, and no metric can tell.
 
@@ -87,15 +91,33 @@ def _by_output(scale: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArr
     return scale.reshape(-1, *[1] * (weight.ndim - 1))
 
 
-def _peaks(weights: FloatWeights, calibration: NDArray[np.float32], percentile: float) -> dict[str, float]:
-    """The chosen percentile of each activation; of each chunk's, the largest."""
+def _peaks(
+    weights: FloatWeights, calibration: NDArray[np.float32], percentile: float | None
+) -> dict[str, float]:
+    """What the largest integer is to stand for in each activation; of each chunk's, the largest."""
     peaks: dict[str, float] = {}
     for start in range(0, len(calibration), floating.CHUNK):
         chunk = calibration[start : start + floating.CHUNK]
         for tensor, values in floating.activations(weights, chunk).items():
-            peak = float(np.percentile(values, percentile))
+            peak = _mse_peak(values) if percentile is None else float(np.percentile(values, percentile))
             peaks[tensor] = max(peaks.get(tensor, 0.0), peak)
     return peaks
+
+
+def _mse_peak(values: NDArray[np.float32]) -> float:
+    """The share of the maximum that quantises `values` with the least mean squared error."""
+    most = float(values.max())
+    if most <= 0:
+        return 0.0
+    # A histogram makes the search independent of how many values there are.
+    counts, edges = np.histogram(values, bins=2048, range=(0.0, most))
+    centres = (edges[:-1] + edges[1:]) / 2
+    candidates = most * np.linspace(0.3, 1.0, 71)
+    errors = [
+        float((counts * (centres - np.clip(np.rint(centres * 255 / peak), 0, 255) * peak / 255) ** 2).sum())
+        for peak in candidates
+    ]
+    return float(candidates[int(np.argmin(errors))])
 
 
 def _activation_scales(

@@ -1,0 +1,171 @@
+"""The paper's experiment on small data: resumable, whole, and the same on one process or two."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from model_material import dataset
+
+from uwb_mitigation.errors import DatasetError, ParameterError, UwbMitigationError
+from uwb_mitigation.model.bundle import load_bundle
+from uwb_mitigation.model.integer import IntegerNetwork
+from uwb_mitigation.preprocessing import Preprocessing, Scaling
+from uwb_mitigation.training import protocol, results
+from uwb_mitigation.training.options import FitOptions
+
+QUICK = FitOptions(epochs=2, learning_rate=1e-3, weight_decay=0.0)
+
+
+def parts(seed: int = 0) -> protocol.Parts:
+    return protocol.Parts("made up", "by seed", dataset(6, 20, seed=seed), dataset(3, 20, seed=seed + 1))
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("protocol")
+    wanted = protocol.jobs(["remnet", "remnet_attention", "mlp"], [32], seeds=1)
+    return folder, protocol.run(parts(), folder, wanted, QUICK)
+
+
+def test_the_papers_settings():
+    paper = protocol.PAPER
+    assert (paper.epochs, paper.learning_rate, paper.batch, paper.weight_decay) == (30, 3e-4, 32, 0.0)
+
+
+def test_jobs_are_every_window_and_seed_of_remnet_and_the_longest_of_the_rest():
+    names = [job.name for job in protocol.jobs(["remnet", "mlp"], [157, 8], seeds=2)]
+    assert names == [
+        "remnet_157_seed0",
+        "remnet_157_seed1",
+        "remnet_8_seed0",
+        "remnet_8_seed1",
+        "mlp_157_seed0",
+        "mlp_157_seed1",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("networks", "windows", "seeds"), [(["cnn"], [8], 1), (["mlp"], [], 1), (["mlp"], [8], 0)]
+)
+def test_jobs_that_cannot_be_are_refused(networks, windows, seeds):
+    with pytest.raises(ParameterError):
+        protocol.jobs(networks, windows, seeds)
+
+
+def test_every_form_of_a_network_is_measured(finished):
+    _, result = finished
+    model = next(model for model in result.models if model.network == "remnet" and model.samples == 32)
+    assert model.mae_optimised == pytest.approx(model.mae_float, abs=1e-6)
+    assert model.mae_int8 == pytest.approx(model.mae_float, abs=0.02)
+    assert model.bytes_int8 < model.bytes_float
+    assert model.float_errors["all"].n == model.float_errors["los"].n + model.float_errors["nlos"].n
+    assert model.parameters == 5649
+
+
+def test_attention_is_in_float_alone(finished):
+    _, result = finished
+    (model,) = (model for model in result.models if model.network == "remnet_attention")
+    assert model.mae_float > 0
+    assert model.mae_int8 is None
+    assert model.parameters == 5649 + 3 * 82
+
+
+def test_sizes_are_those_of_the_files(finished):
+    folder, result = finished
+    for model in result.models:
+        if model.bytes_int8 is not None:
+            name = f"{model.network}_{model.samples}_seed{model.seed}"
+            assert (folder / f"{name}_int8.onnx").stat().st_size == model.bytes_int8
+            assert (folder / f"{name}_optimised.onnx").stat().st_size == model.bytes_optimised
+
+
+def test_the_bundles_give_the_measured_errors(finished):
+    folder, result = finished
+    test = parts().test
+    for model in result.models:
+        if model.network != "remnet_attention":
+            bundle = load_bundle(folder / f"{model.network}_{model.samples}_seed0_int8.onnx")
+            inputs = protocol.narrowed(test, model.samples).inputs
+            left = test.error_m - IntegerNetwork.from_bundle(bundle).predict_m(inputs)
+            assert np.abs(left).mean() == pytest.approx(model.mae_int8, abs=1e-9)
+
+
+def test_the_best_calibration_on_the_training_part_is_taken(finished):
+    _, result = finished
+    model = result.models[0]
+    assert set(model.calibration_mae) == {"max", "p99.99", "p99.9", "p99", "mse"}
+    assert model.calibration_mae[model.calibration] == min(model.calibration_mae.values())
+
+
+def test_results_are_read_as_they_were_written(finished):
+    folder, result = finished
+    assert results.read(folder) == result
+
+
+def test_what_is_done_is_not_done_again(finished, monkeypatch):
+    folder, result = finished
+    monkeypatch.setattr(protocol, "train_job", lambda *_: pytest.fail("trained again"))
+    wanted = [protocol.Job(model.network, model.samples, model.seed) for model in result.models]
+    assert protocol.run(parts(), folder, wanted, QUICK) == result
+
+
+@pytest.mark.parametrize(
+    "damage", ["", "{", '{"fingerprint": 1}', '{"fingerprint": 1, "model": {"network": 3}}']
+)
+def test_a_damaged_result_is_done_again(tmp_path, damage):
+    job = protocol.Job("mlp", 16, 0)
+    small = protocol.Parts("", "", protocol.narrowed(parts().train, 16), protocol.narrowed(parts().test, 16))
+    first = protocol.run(small, tmp_path, [job], QUICK)
+    (tmp_path / f"{job.name}.json").write_text(damage)
+    again = protocol.run(small, tmp_path, [job], QUICK)
+    assert again.models[0].mae_int8 == first.models[0].mae_int8
+
+
+def test_other_data_is_trained_on_anew(tmp_path):
+    job = protocol.Job("mlp", 32, 0)
+    first = protocol.run(parts(), tmp_path, [job], QUICK)
+    other = protocol.run(parts(seed=5), tmp_path, [job], QUICK)
+    assert first.models[0].mae_raw != other.models[0].mae_raw
+
+
+def test_two_processes_give_the_same_models(tmp_path):
+    wanted = protocol.jobs(["mlp"], [32], seeds=2)
+    shares: list[float] = []
+    alone, together = (
+        protocol.run(parts(), tmp_path / str(workers), wanted, QUICK, workers, shares.append)
+        for workers in (1, 2)
+    )
+    assert [m.mae_int8 for m in alone.models] == [m.mae_int8 for m in together.models]
+    assert shares[-1] == pytest.approx(1.0)
+
+
+def test_a_loss_that_diverges_ends_the_run(tmp_path):
+    bad = parts()
+    bad = replace(bad, train=replace(bad.train, error_m=bad.train.error_m + 3e38))
+    with pytest.raises(DatasetError, match="the loss is"):
+        protocol.run(bad, tmp_path, protocol.jobs(["mlp"], [32], 2), QUICK)
+
+
+def test_shorter_windows_are_scaled_by_their_own_maximum():
+    data = replace(dataset(2, 5), preprocessing=Preprocessing(32, Scaling.MAX))
+    data.inputs[0, 20] = 50.0
+    short = protocol.narrowed(data, 8)
+    assert short.inputs.shape == (10, 8)
+    assert np.allclose(short.inputs.max(axis=1), 1.0)
+    assert short.preprocessing.samples == 8
+
+
+def test_longer_windows_cannot_be_made():
+    with pytest.raises(ParameterError, match="window of 64"):
+        protocol.narrowed(dataset(2, 5), 64)
+
+
+def test_results_that_are_none_are_named(tmp_path):
+    with pytest.raises(UwbMitigationError, match="run `uwb-mitigation protocol` first"):
+        results.read(tmp_path)
+    (tmp_path / results.RESULTS).write_text(json.dumps({"models": [{}]}))
+    with pytest.raises(UwbMitigationError, match="not results of a run"):
+        results.read(tmp_path)
