@@ -14,9 +14,12 @@ from pathlib import Path
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from lifecycle_msgs.srv import ChangeState, GetState
+from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.srv import SetParameters
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 
 TIMEOUT_S = 30.0
@@ -126,6 +129,11 @@ class Ros:
         request = ChangeState.Request()
         request.transition.id = transition
         return self.call(ChangeState, f"/{node}/change_state", request).success
+
+    def set_parameter(self, node: str, name: str, value: object) -> SetParametersResult:
+        """Set a parameter as any other node would."""
+        request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
+        return self.call(SetParameters, f"/{node}/set_parameters", request).results[0]
 
     def diagnosis(self, node: str, matches: Callable[[DiagnosticStatus], bool]) -> DiagnosticStatus:
         """The first diagnostic status of a node that matches."""

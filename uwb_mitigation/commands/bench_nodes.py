@@ -18,8 +18,11 @@ if TYPE_CHECKING:
 
 
 def bench_nodes(
-    repeats: Annotated[int, typer.Option(min=1, help="Rounds; the table holds their medians.")] = 3,
-    seconds: Annotated[float, typer.Option(min=0.5, help="Of each measurement of latency.")] = 3.0,
+    repeats: Annotated[
+        int, typer.Option(min=1, help="Searches of the highest rate; their median counts.")
+    ] = 3,
+    slices: Annotated[int, typer.Option(min=1, help="Of each latency; their medians count.")] = 7,
+    seconds: Annotated[float, typer.Option(min=0.5, help="Length of a slice.")] = 2.0,
     json: JsonOption = None,
 ) -> None:
     """Put the same ranges through a relay, the mitigator and the one-process pipeline, by turns."""
@@ -27,7 +30,7 @@ def bench_nodes(
     with console.progress() as bar:
         task = bar.add_task("starting the nodes", total=None)
         figures: dict[str, Figures] = bench.measure(
-            repeats, seconds, lambda text: bar.update(task, description=text)
+            repeats, slices, seconds, lambda text: bar.update(task, description=text)
         )
     ratios = ratios_of(figures)
     console.out.print(_table(figures))
@@ -100,7 +103,7 @@ def _as_json(figures: Figures) -> dict[str, Any]:
 def _table(figures: dict[str, Figures]) -> Table:
     table = Table(title="ranges of 157 complex samples; latency from when one was due, us: p50 / p99 / max")
     rates = list(next(iter(figures.values())).latency_us)
-    for column in ("", *(f"{rate} Hz" for rate in rates), "highest rate, Hz", "CPU, us", "memory, MB"):
+    for column in ("", *(f"{rate} Hz" for rate in rates), "max Hz", "CPU us", "MB"):
         table.add_column(column, justify="right" if column else "left")
     for name, of in figures.items():
         latencies = (

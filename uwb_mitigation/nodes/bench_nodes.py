@@ -71,7 +71,7 @@ class Figures:
 
     Attributes:
         rates_hz: the highest rate without loss, of each search.
-        latency_us: at each rate, the median over the repeats.
+        latency_us: at each rate, the median over the slices; `max` the highest of all.
         cpu_us_per_message: of the subject's process, at the highest of the rates for latency.
         chain_cpu_us_per_message: the same with its driver's process.
         memory_mb: resident, of the subject's process at the end.
@@ -168,6 +168,9 @@ class Subject:
         lost = missing_between(sequences)
         kept_up = lost == 0 and len(arrivals) >= 0.97 * rate_hz * passed_s and max(late_ns[-20:]) < _LATE_NS
         return Trial(len(arrivals), lost, late_ns, kept_up)
+
+    def warm_up(self) -> None:
+        self.trial(RECORDED_HZ, _TRIAL_S)
 
     def measure_latency(self, rate_hz: int, seconds: float) -> Latency:
         before = [vitals.cpu_ns(process.pid) for process in self.processes]
@@ -318,12 +321,16 @@ def _cut(record: Record) -> Record:
     return Record(replace(record.measurement, cir=replace(cir, samples=samples, start_index=start)))
 
 
-def measure(repeats: int, seconds: float, advance: Callable[[str], None]) -> dict[str, Figures]:
+def measure(repeats: int, slices: int, seconds: float, advance: Callable[[str], None]) -> dict[str, Figures]:
     """All figures, by subject.
 
+    Percentiles are medians over slices of time in which the subjects take turns: what else happens on
+    the machine for a moment meets one slice of one subject, not its result.
+
     Args:
-        repeats: how often everything is measured.
-        seconds: of each measurement of latency.
+        repeats: how often each highest rate is searched.
+        slices: in how many each latency is measured.
+        seconds: of each slice.
         advance: told what is measured next.
 
     Raises:
@@ -336,13 +343,16 @@ def measure(repeats: int, seconds: float, advance: Callable[[str], None]) -> dic
             Subject(bench, "mitigator", RangeCorrected, topics.RANGE_CORRECTED, "mitigator", "driver"),
             Subject(bench, "pipeline", RangeCorrected, topics.RANGE_CORRECTED, "pipeline"),
         ]
+        for subject in subjects:
+            subject.warm_up()
         latencies: dict[tuple[str, int], list[Latency]] = {}
-        for _ in range(repeats):
-            for rate_hz in RATES_HZ:
+        for rate_hz in RATES_HZ:
+            for _ in range(slices):
                 for subject in subjects:
                     advance(f"latency of {subject.name} at {rate_hz} Hz")
                     latency = subject.measure_latency(rate_hz, seconds)
                     latencies.setdefault((subject.name, rate_hz), []).append(latency)
+        for _ in range(repeats):
             for subject in subjects:
                 advance(f"highest rate of {subject.name}")
                 subject.figures.rates_hz.append(subject.search_rate())

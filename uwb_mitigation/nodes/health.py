@@ -8,10 +8,6 @@ from dataclasses import dataclass
 
 from uwb_mitigation.measurement import Status
 
-SEQUENCE_WRAP = 1 << 32
-LARGEST_GAP = 1000
-"""A larger step in a source's sequence is a restart or a seek, not ranges that were lost."""
-
 
 @dataclass(frozen=True, slots=True)
 class Threshold:
@@ -32,10 +28,10 @@ OUT_OF_DISTRIBUTION = Threshold(
     "share of ranges OUT_OF_DISTRIBUTION", 0.2, "many ranges are unlike the model's training data"
 )
 UNUSABLE = Threshold("share of ranges NO_CIR or BAD_CIR", 0.2, "many ranges have no usable CIR")
-MISSING = Threshold("share of ranges missing or lost", 0.01, "ranges are missing: the queue is too short")
+DROPPED = Threshold("share of ranges dropped", 0.0, "ranges were dropped: the queue was too short")
 SLOW = Threshold("p99 of the processing time, ms", 20.0, "correcting takes long: the processor is overloaded")
 SILENT = Threshold("s without a range", 5.0, "no ranges arrive")
-THRESHOLDS = (OUT_OF_DISTRIBUTION, UNUSABLE, MISSING, SLOW, SILENT)
+THRESHOLDS = (OUT_OF_DISTRIBUTION, UNUSABLE, DROPPED, SLOW, SILENT)
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,13 +40,13 @@ class Period:
 
     Attributes:
         statuses: ranges by status.
-        missing: ranges missing from a source's sequence, or lost by the middleware.
+        dropped: ranges that a queue has dropped.
         processing_ns: from taking a range to having published it, for each.
         silent_s: since the last range.
     """
 
     statuses: Counter[Status]
-    missing: int
+    dropped: int
     processing_ns: list[int]
     silent_s: float
 
@@ -67,11 +63,42 @@ class Period:
         values = {
             OUT_OF_DISTRIBUTION: self.share(Status.OUT_OF_DISTRIBUTION),
             UNUSABLE: self.share(Status.NO_CIR, Status.BAD_CIR),
-            MISSING: self.missing / max(self.total + self.missing, 1),
+            DROPPED: self.dropped / max(self.total + self.dropped, 1),
             SLOW: _p99(self.processing_ns) / 1e6,
             SILENT: self.silent_s,
         }
         return [threshold.text for threshold, value in values.items() if value > threshold.limit]
+
+
+class Numbering:
+    """Finds what was dropped, by the numbers that a publisher gives its messages.
+
+    A queue that keeps the last ones drops the others without a word. Not every message comes with its
+    number; a gap is what is left of a step once those in between are counted.
+
+    Attributes:
+        missing: numbers that never came.
+    """
+
+    def __init__(self) -> None:
+        self.missing = 0
+        self._last: int | None = None
+        self._between = 0
+
+    def add(self) -> None:
+        """Note a message whose number is not known."""
+        self._between += 1
+
+    def add_number(self, number: int) -> None:
+        """Note a message with its number."""
+        if self._last is not None:
+            # A publisher that has started anew counts from 1 again.
+            self.missing += max(number - self._last - 1 - self._between, 0)
+        self._last, self._between = number, 0
+
+    def restart(self) -> None:
+        """Forget the number of the last message: the publishers have changed, or are several."""
+        self._last, self._between = None, 0
 
 
 class Health:
@@ -79,32 +106,24 @@ class Health:
 
     Attributes:
         statuses: ranges by status, since the start.
-        missing: gaps in the sources' sequences: ranges that never came here. A source is told by its frame_id.
-        lost: ranges that the middleware says it has dropped; some of them are in `missing` too.
+        lost: ranges that the middleware says it has lost: the publisher's queue was too short.
+        numbering: finds those, and what the subscription's own queue has dropped.
         malformed: messages that could not be read at all.
     """
 
     def __init__(self) -> None:
         self.statuses: Counter[Status] = Counter()
-        self.missing = 0
         self.lost = 0
+        self.numbering = Numbering()
         self.malformed = 0
-        self._sequences: dict[str, int] = {}
         self._processing_ns: deque[int] = deque(maxlen=20_000)
         self._last_s = time.monotonic()
         self._before: tuple[Counter[Status], int] = (Counter(), 0)
 
-    def add(self, frame_id: str, sequence: int, status: Status) -> None:
-        """Count a range that was published."""
-        self.statuses[status] += 1
-        expected = self._sequences.get(frame_id, sequence)
-        gap = (sequence - expected) % SEQUENCE_WRAP
-        if 0 < gap <= LARGEST_GAP:
-            self.missing += gap
-        self._sequences[frame_id] = (sequence + 1) % SEQUENCE_WRAP
-        if len(self._sequences) > LARGEST_GAP:
-            # Frame ids that never repeat must not fill the memory.
-            self._sequences.pop(next(iter(self._sequences)))
+    @property
+    def dropped(self) -> int:
+        """Ranges that a queue has dropped, as far as can be told."""
+        return max(self.lost, self.numbering.missing)
 
     def add_time(self, processing_ns: int) -> None:
         """Note how long a range, or each of a batch, took."""
@@ -113,11 +132,11 @@ class Health:
 
     def period(self) -> Period:
         """Begin a new period, and return the one that ends."""
-        statuses, missing = self.statuses.copy(), max(self.missing, self.lost)
-        before, missing_before = self._before
-        self._before = statuses, missing
+        statuses, dropped = self.statuses.copy(), self.dropped
+        before, dropped_before = self._before
+        self._before = statuses, dropped
         times = [self._processing_ns.popleft() for _ in range(len(self._processing_ns))]
-        return Period(statuses - before, missing - missing_before, times, time.monotonic() - self._last_s)
+        return Period(statuses - before, dropped - dropped_before, times, time.monotonic() - self._last_s)
 
 
 def _p99(values: list[int]) -> float:

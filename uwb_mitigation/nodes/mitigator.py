@@ -115,7 +115,7 @@ class Mitigator(ManagedNode):
         now_ns = self._now_ns()
         self.health.add_time(time.perf_counter_ns() - began_ns)
         for measurement, corrected in zip(measurements, results, strict=True):
-            self.health.add(measurement.frame_id, measurement.sequence, corrected.status)
+            self.health.statuses[corrected.status] += 1
             self._meter.add(now_ns - measurement.stamp_ns)
 
     def subscription_count(self) -> int:
@@ -128,6 +128,8 @@ class Mitigator(ManagedNode):
             self._corrected.wait_for_all_acked(timeout)
 
     def describe(self) -> tuple[str, bytes, str, dict[str, object]]:
+        if self._raw is not None and self._raw.get_publisher_count() != 1:
+            self.health.numbering.restart()
         period = self.health.period()
         level, text = diagnostics.OK, "correcting"
         if warnings := period.warnings():
@@ -139,8 +141,7 @@ class Mitigator(ManagedNode):
         }
         facts |= {
             "out of distribution": f"{period.share(Status.OUT_OF_DISTRIBUTION):.3f}",
-            "missing by sequence": self.health.missing,
-            "lost by the middleware": self.health.lost,
+            "dropped by a queue": self.health.dropped,
             "malformed": self.health.malformed,
         }
         facts |= self._meter.facts()
@@ -155,6 +156,7 @@ class Mitigator(ManagedNode):
         if self._mitigation is None or self._raw is None:
             return
         batch = []
+        self.health.numbering.add()
         take = self._raw.handle.take_message
         while True:
             measurement = self._decode(data)
@@ -163,7 +165,8 @@ class Mitigator(ManagedNode):
             # What else has queued up comes with it; the executor then finds its own turn empty.
             if len(batch) == BATCH or (taken := take(RangeCir, True)) is None:
                 break
-            data = taken[0]
+            data, info = taken
+            self.health.numbering.add_number(info["publication_sequence_number"])
         if batch:
             self.correct(batch)
 

@@ -1,0 +1,106 @@
+"""The bench of the nodes: what it counts, what it tells, and that its subjects run."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
+
+from ros_harness import domain
+from uwb_mitigation_msgs.msg import RangeCorrected
+
+from uwb_mitigation.commands.bench_nodes import _as_json, ratios_of
+from uwb_mitigation.errors import UwbMitigationError
+from uwb_mitigation.nodes import bench_nodes, topics, vitals
+from uwb_mitigation.nodes.bench_nodes import RANGES, RATES_HZ, Figures, Latency, Subject, missing_between
+
+pytestmark = pytest.mark.ros
+
+
+@pytest.fixture
+def own_domain(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    with domain(tmp_path) as ros:
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(ros.domain))
+        yield
+
+
+def test_ranges_that_are_missing_are_counted_across_the_bags_end():
+    assert missing_between([5, 6, 7]) == 0
+    assert missing_between([5, 6, 9]) == 2
+    assert missing_between([RANGES - 2, RANGES - 1, 0, 1]) == 0
+    assert missing_between([RANGES - 2, 1]) == 2
+    assert missing_between([]) == missing_between([3]) == 0
+
+
+def figures(rate_hz: float, p99: float) -> Figures:
+    latency = {rate: Latency(100.0, p99, 2 * p99) for rate in RATES_HZ}
+    return Figures([rate_hz, 2 * rate_hz, 3 * rate_hz], latency, 50.0, 90.0, 70.0)
+
+
+def test_ratios_compare_medians_and_latencies():
+    of = {"relay": figures(1000, 300.0), "mitigator": figures(800, 400.0), "pipeline": figures(2000, 200.0)}
+    assert ratios_of(of) == {
+        "mitigator_rate_over_relay": 0.8,
+        "pipeline_rate_over_mitigator": 2.5,
+        "added_p99_us_at_500_hz": 100.0,
+    }
+
+
+def test_the_result_has_the_documented_keys():
+    result = json.loads(json.dumps(_as_json(figures(1000, 300.0))))
+    assert result["max_lossless_rate_hz"] == 2000
+    assert set(result["latency_us"]) == {"100", "500", "1000"}
+    assert set(result["latency_us"]["500"]) == {"p50", "p99", "max"}
+    assert result["cpu_us_per_message"] == 50.0
+
+
+def test_a_subject_is_measured_at_a_rate_it_can_keep(own_domain: None):
+    with bench_nodes.open_bench() as bench:
+        subject = Subject(bench, "pipeline", RangeCorrected, topics.RANGE_CORRECTED, "pipeline")
+        trial = subject.trial(200.0, 1.0)
+        assert trial.lost == 0
+        assert 150 <= trial.received <= 250
+        assert min(trial.late_ns) > 0
+        latency = subject.measure_latency(100, 0.5)
+        assert 0 < latency.p50 <= latency.p99 <= latency.max
+        assert subject.figures.cpu_us_per_message > 0
+        pid = subject.processes[0].pid
+        subject.processes[0].kill()
+        subject.processes[0].wait()
+        with pytest.raises(UwbMitigationError, match="has ended"):
+            vitals.memory_kb(pid)
+        with pytest.raises(UwbMitigationError, match="driver does not answer"):
+            subject.play(100.0)
+
+
+def test_a_soak_tells_what_the_processes_took(own_domain: None, tmp_path: Path):
+    result = tmp_path / "soak.json"
+    command = [sys.executable, "-m", "uwb_mitigation.cli", "bench", "soak", "--one-process"]
+    command += ["--messages", "1500", "--rate", "1000", "--json", str(result)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    outcome = json.loads(result.read_text())
+    assert outcome["received"] >= 1500
+    assert outcome["settled"]["ranges"] < outcome["end"]["ranges"] == outcome["received"]
+    assert outcome["end"]["threads"] > 0
+    assert outcome["end"]["memory_mb"] > 10
+
+
+def test_without_ros_the_bench_says_what_is_missing(tmp_path: Path):
+    (tmp_path / "rclpy.py").write_text("raise ModuleNotFoundError('no rclpy here', name='rclpy')\n")
+    done = subprocess.run(
+        [sys.executable, "-m", "uwb_mitigation.cli", "bench", "nodes"],
+        env={"PYTHONPATH": f"{tmp_path}:{Path(__file__).parent.parent}", "COLUMNS": "160"},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 1
+    assert "needs ROS 2" in done.stderr
+    assert "Traceback" not in done.stderr

@@ -1,0 +1,134 @@
+"""Parameters of the nodes: refused by name, value and range; unknown ones reported; QoS overridable."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
+
+from rclpy.qos import ReliabilityPolicy
+from ros_harness import Ros, domain
+from uwb_mitigation_msgs.msg import RangeCir
+
+from uwb_mitigation.bag.writer import BagWriter
+from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.nodes.parameter_files import TABLES
+from uwb_mitigation.nodes.parameters import Parameter
+from uwb_mitigation.sources.simulated import SimulatedSource
+from uwb_mitigation.sources.source import Record
+
+pytestmark = pytest.mark.ros
+
+
+@pytest.fixture
+def ros(tmp_path: Path):
+    with domain(tmp_path) as ros:
+        yield ros
+
+
+@pytest.fixture(scope="module")
+def replaying(tmp_path_factory: pytest.TempPathFactory):
+    """A domain with a driver that waits to be told to play."""
+    with domain(tmp_path_factory.mktemp("driver")) as ros:
+        ros.start("driver", "paused:=true", "wait_for_subscribers:=0", "start_delay:=0.0")
+        yield ros
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "told"),
+    [
+        ("rate", -1.0, ("rate", "-1.0", "0.001", "10000")),
+        ("rate", 20_000, ("rate", "20000", "0.001", "10000")),
+        ("rate", math.nan, ("rate", "nan", "0.001", "10000")),
+        ("rate", "fast", ("rate", "fast", "0.001", "10000")),
+        ("paused", 1, ("paused", "1", "true or false")),
+        ("mode", "cloud", ("mode", "cloud", "host, device, both")),
+        ("seek_to", -5.0, ("seek_to", "-5.0", "1000000000")),
+        ("seed", 7, ("seed", "read-only")),
+    ],
+)
+def test_a_value_is_refused_by_name_value_and_range(replaying: Ros, name: str, value: object, told: tuple):
+    result = replaying.set_parameter("driver", name, value)
+    assert not result.successful
+    assert all(word in result.reason for word in told), result.reason
+
+
+def test_a_whole_number_is_good_enough_for_a_number(replaying: Ros):
+    assert replaying.set_parameter("driver", "rate", 3).successful
+
+
+def test_a_parameter_that_no_node_knows_is_reported_with_what_was_meant(ros: Ros, tmp_path: Path):
+    file = tmp_path / "parameters.yaml"
+    file.write_text("/**:\n  ros__parameters:\n    simulatd_rate: 10.0\n    wholly_else: 1\n")
+    driver = ros.start("driver", "raet:=2.0", arguments=("--params-file", str(file)))
+    driver.wait_for_output("parameter raet is unknown and has no effect: meant is perhaps rate")
+    driver.wait_for_output("parameter simulatd_rate is unknown")
+    driver.wait_for_output("simulated_rate")
+    driver.wait_for_output("parameter wholly_else is unknown")
+
+
+def test_known_parameters_are_not_reported(ros: Ros):
+    driver = ros.start("driver", "rate:=2.0", "use_sim_time:=false")
+    driver.wait_for_output("replaying")
+    assert "unknown" not in driver.output
+
+
+def test_quality_of_service_can_be_overridden(ros: Ros):
+    ros.start("mitigator", "qos_overrides./uwb/range_raw.subscription.reliability:=best_effort")
+    ros.wait_for_subscribers("/uwb/range_raw", 1)
+    ros.wait_for_publishers("/uwb/range_corrected", 1)
+    (raw,) = ros.node.get_subscriptions_info_by_topic("/uwb/range_raw")
+    (corrected,) = ros.node.get_publishers_info_by_topic("/uwb/range_corrected")
+    assert raw.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
+    assert corrected.qos_profile.reliability == ReliabilityPolicy.RELIABLE
+
+
+@pytest.mark.parametrize("value", ["reliability:=perhaps", "depth:=deep"])
+def test_a_quality_of_service_that_is_none_is_refused(ros: Ros, value: str):
+    mitigator = ros.start("mitigator", f"qos_overrides./uwb/range_raw.subscription.{value}")
+    assert mitigator.wait() == 1
+    assert "qos_overrides of /uwb/range_raw" in mitigator.output
+    assert "Traceback" not in mitigator.output
+
+
+def test_an_override_for_a_topic_that_a_node_lacks_is_reported(ros: Ros):
+    mitigator = ros.start("mitigator", "qos_overrides./uwb/range_rwa.subscription.depth:=5")
+    mitigator.wait_for_output("/uwb/range_raw.subscription.depth")
+
+
+def test_topics_can_be_remapped_and_the_frame_is_a_parameter(ros: Ros, tmp_path: Path):
+    bag = tmp_path / "no_frames.mcap"
+    with BagWriter(bag, {"source": "a test", "simulated": "true"}) as writer:
+        for record in SimulatedSource(seed=1, count=5):
+            writer.write(Record(replace(record.measurement, frame_id="")))
+    received = ros.collect(RangeCir, "/elsewhere")
+    ros.start(
+        "driver",
+        "source:=mcap",
+        f"path:={bag}",
+        "frame_id:=mast",
+        "start_delay:=0.5",
+        arguments=("-r", "uwb/range_raw:=/elsewhere"),
+    )
+    ros.spin_until(lambda: len(received) == 5)
+    assert {message.header.frame_id for message in received} == {"mast"}
+
+
+@pytest.mark.parametrize("row", [row for table in TABLES.values() for row in table], ids=lambda row: row.name)
+def test_every_default_is_valid_and_every_physical_number_has_a_unit(row: Parameter):
+    row.check(row.default)
+    assert row.description.endswith(".") or row.description.endswith(")")
+    if row.name.endswith(("delay", "wait", "pause", "seek_to", "simulated_rate", "baud")):
+        assert row.unit in row.valid
+        assert row.unit
+
+
+def test_a_value_of_another_type_is_refused():
+    row = Parameter("depth", 3, "How deep.", low=0, high=5)
+    for value in (True, "3", 3.0, None):
+        with pytest.raises(ParameterError, match="depth"):
+            row.check(value)

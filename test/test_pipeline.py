@@ -1,0 +1,102 @@
+"""Driver and mitigator in one process: the same ranges, and no CIR on the wire that nobody asked for."""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
+
+from ros_harness import Ros, domain
+from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
+
+from uwb_mitigation.mitigation import Mitigation
+from uwb_mitigation.model.bundle import load_bundle
+from uwb_mitigation.model.shipped import default_model_path
+from uwb_mitigation.sources.simulated import SimulatedSource
+
+pytestmark = pytest.mark.ros
+
+CORRECTED = "/uwb/range_corrected"
+PLAY = ("count:=200", "seed:=1", "simulated_rate:=200.0", "start_delay:=0.5")
+
+
+@pytest.fixture
+def ros(tmp_path: Path):
+    with domain(tmp_path) as ros:
+        yield ros
+
+
+def test_the_ranges_are_those_of_the_library_to_the_bit(ros: Ros):
+    mitigation = Mitigation(load_bundle(default_model_path()))
+    source = SimulatedSource(seed=1, count=200, rate_hz=200.0)
+    expected = [mitigation.correct(record.measurement) for record in source]
+    received = ros.collect(RangeCorrected, CORRECTED)
+    pipeline = ros.start("pipeline", *PLAY)
+    assert pipeline.wait() == 0, pipeline.output
+    ros.spin_until(lambda: len(received) == 200)
+    assert [m.sequence for m in received] == list(range(200))
+    assert [m.range for m in received] == [np.float32(e.range_m) for e in expected]
+    assert [m.variance for m in received] == [np.float32(e.variance_m2) for e in expected]
+    assert "unknown" not in pipeline.output
+
+
+def test_the_raw_ranges_are_there_for_who_subscribes(ros: Ros):
+    raw = ros.collect(RangeCir, "/uwb/range_raw")
+    corrected = ros.collect(RangeCorrected, CORRECTED)
+    ros.start("pipeline", *PLAY)
+    ros.spin_until(lambda: len(raw) == 200 and len(corrected) == 200)
+    assert [m.header for m in raw] == [m.header for m in corrected]
+    assert [m.range for m in raw] == [m.range_raw for m in corrected]
+    assert all(len(m.cir.samples) for m in raw)
+
+
+def test_no_raw_range_is_built_while_nobody_subscribes(ros: Ros, monkeypatch: pytest.MonkeyPatch):
+    from uwb_mitigation.nodes.driver import Driver
+
+    built, handed = [], []
+    driver = Driver.__new__(Driver)
+    driver._consumer = type("Consumer", (), {"correct": lambda self, items: handed.extend(items)})()
+    subscribers = 0
+    driver._ranges = type(
+        "Publisher",
+        (),
+        {
+            "get_subscription_count": lambda self: subscribers,
+            "publish": lambda self, data: built.append(data),
+        },
+    )()
+    measurement = next(iter(SimulatedSource(seed=1))).measurement
+    driver._publish_measurements([measurement])
+    assert (len(handed), len(built)) == (1, 0)
+    subscribers = 1
+    driver._publish_measurements([measurement])
+    assert (len(handed), len(built)) == (2, 1)
+
+
+def test_several_pipelines_side_by_side_keep_to_themselves(ros: Ros):
+    received = {name: ros.collect(RangeCorrected, f"/{name}{CORRECTED}") for name in ("left", "right")}
+    pipelines = [ros.start("pipeline", *PLAY, arguments=("-r", f"__ns:=/{name}")) for name in received]
+    for pipeline in pipelines:
+        assert pipeline.wait() == 0, pipeline.output
+    ros.spin_until(lambda: all(len(messages) == 200 for messages in received.values()))
+    for messages in received.values():
+        assert [m.sequence for m in messages] == list(range(200))
+
+
+def test_a_pipeline_without_a_source_says_why_and_leaves(ros: Ros):
+    pipeline = ros.start("pipeline", "source:=mcap", "path:=/nonexistent.mcap")
+    assert pipeline.wait() == 1
+    assert "/nonexistent.mcap" in pipeline.output
+    assert "Traceback" not in pipeline.output
+
+
+def test_a_signal_ends_it_cleanly(ros: Ros):
+    received = ros.collect(RangeCorrected, CORRECTED)
+    pipeline = ros.start("pipeline", "simulated_rate:=200.0", "start_delay:=0.2")
+    ros.spin_until(lambda: len(received) > 20)
+    assert pipeline.signal(signal.SIGINT) == 0, pipeline.output
+    assert "Traceback" not in pipeline.output

@@ -1,0 +1,218 @@
+"""Replay: pause, seek, rate and loop while it plays, and the same ranges every time."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
+
+from rclpy.clock import Clock, ClockType
+from ros_harness import Ros, domain
+from rosgraph_msgs.msg import Clock as ClockMessage
+from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
+
+from uwb_mitigation.bag.writer import BagWriter
+from uwb_mitigation.measurement import Cir, RangeMeasurement
+from uwb_mitigation.nodes.playback import Playback
+from uwb_mitigation.sources.simulated import SimulatedSource
+from uwb_mitigation.sources.source import Record
+
+MS = 1_000_000
+COUNT = 400
+
+
+class Steps:
+    """Records `step_ns` apart, numbered from 0."""
+
+    name = "steps"
+    simulated = True
+
+    def __init__(self, count: int, step_ns: int) -> None:
+        self.count, self.step_ns = count, step_ns
+        self.skipped: Counter[str] = Counter()
+
+    def __iter__(self):
+        cir = Cir(np.zeros(0, np.int16))
+        for index in range(self.count):
+            yield Record(RangeMeasurement(10**18 + index * self.step_ns, 1, 2, index, 0, 1.0, cir))
+
+    def close(self) -> None:
+        pass
+
+
+class Player:
+    """Plays steps; `on_record(player, sequence)` is called for each from the playing thread."""
+
+    def __init__(self, count: int, step_ns: int, on_record=lambda player, sequence: None, **options) -> None:
+        self.sequences: list[int] = []
+        self.stamps: list[int] = []
+        self.clock_times: list[int] = []
+        self.batches: list[int] = []
+        self.ended = threading.Event()
+        self.on_record = on_record
+        settings = {"rate": 1.0, "loop": False, "longest_pause_s": 100.0, "recorded_stamps": False}
+        self.playback = Playback(
+            Steps(count, step_ns),
+            Clock(clock_type=ClockType.STEADY_TIME),
+            **(settings | options),
+            ready=lambda: True,
+            publish=self.publish,
+            on_time=self.clock_times.append,
+            on_end=lambda error: self.ended.set(),
+        )
+
+    def publish(self, records) -> None:
+        self.batches.append(len(records))
+        for record, stamp_ns in records:
+            self.sequences.append(record.measurement.sequence)
+            self.stamps.append(stamp_ns)
+            self.on_record(self, record.measurement.sequence)
+
+    def play(self) -> Player:
+        self.playback.start()
+        assert self.ended.wait(20)
+        self.playback.stop()
+        return self
+
+
+def test_a_seek_forwards_leaves_records_out_and_stamps_go_on():
+    player = Player(
+        100, 10 * MS, lambda player, sequence: player.playback.seek(0.9) if sequence == 3 else None
+    ).play()
+    assert player.sequences == [0, 1, 2, 3, *range(90, 100)]
+    assert player.stamps == sorted(player.stamps)
+    assert player.stamps[-1] - player.stamps[0] < 500 * MS
+
+
+def test_a_seek_backwards_plays_again():
+    seeks = iter([True])
+
+    def back(player: Player, sequence: int) -> None:
+        if sequence == 5 and next(seeks, False):
+            player.playback.seek(0.02)
+
+    player = Player(8, 10 * MS, back).play()
+    assert player.sequences == [0, 1, 2, 3, 4, 5, 2, 3, 4, 5, 6, 7]
+    assert player.stamps == sorted(player.stamps)
+
+
+def test_a_replay_can_start_anywhere_and_ends_at_once_beyond_the_end():
+    assert Player(20, 10 * MS, from_s=0.15).play().sequences == [15, 16, 17, 18, 19]
+    assert Player(20, 10 * MS, from_s=5.0).play().sequences == []
+
+
+def test_a_loop_plays_from_the_start_after_a_seek():
+    def stop(player: Player, sequence: int) -> None:
+        if len(player.sequences) == 7:
+            player.playback.stop()
+            player.ended.set()
+
+    player = Player(10, 5 * MS, stop, from_s=0.04, loop=True).play()
+    assert player.sequences == [8, 9, 0, 1, 2, 3, 4]
+
+
+def test_a_pause_holds_the_records_and_their_time():
+    resumed = threading.Event()
+
+    def pause(player: Player, sequence: int) -> None:
+        if sequence == 2:
+            player.playback.paused = True
+            threading.Timer(0.3, lambda: (resumed.set(), setattr(player.playback, "paused", False))).start()
+        if sequence == 3:
+            assert resumed.is_set()
+
+    player = Player(6, 10 * MS, pause).play()
+    assert player.sequences == [0, 1, 2, 3, 4, 5]
+    gaps = np.diff(player.stamps)
+    assert gaps[2] > 250 * MS
+    assert list(gaps[3:]) == [10 * MS] * 2
+
+
+def test_the_clock_stands_still_in_a_pause():
+    def pause(player: Player, sequence: int) -> None:
+        if sequence == 1:
+            player.playback.paused = True
+            threading.Timer(0.2, lambda: setattr(player.playback, "paused", False)).start()
+
+    player = Player(3, 100 * MS, pause, recorded_stamps=True).play()
+    assert player.clock_times == sorted(player.clock_times)
+    (_, most), *_ = Counter(player.clock_times).most_common()
+    assert most >= 5
+
+
+def test_another_rate_changes_the_distances_from_there_on():
+    def faster(player: Player, sequence: int) -> None:
+        if sequence == 2:
+            player.playback.rate = 10.0
+
+    player = Player(12, 50 * MS, faster).play()
+    gaps = np.diff(player.stamps)
+    assert list(gaps[:2]) == [50 * MS] * 2
+    assert list(gaps[4:]) == [5 * MS] * 7
+
+
+def test_late_records_come_several_at_once_and_in_order():
+    player = Player(500, 1000).play()
+    assert player.sequences == list(range(500))
+    assert max(player.batches) > 1
+    assert player.batches[0] == 1
+
+
+@pytest.fixture(scope="session")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("replay") / "simulated.mcap"
+    source = SimulatedSource(seed=1, count=COUNT, rate_hz=100.0)
+    with BagWriter(path, {"source": source.name, "simulated": "true"}) as writer:
+        for record in source:
+            writer.write(record)
+    return path
+
+
+@pytest.fixture
+def ros(tmp_path: Path):
+    with domain(tmp_path) as ros:
+        yield ros
+
+
+@pytest.mark.ros
+def test_the_same_bag_gives_the_same_corrected_ranges_twice(ros: Ros, bag: Path):
+    def play(rate: str) -> list[tuple]:
+        received = ros.collect(RangeCorrected, "/uwb/range_corrected")
+        pipeline = ros.start(
+            "pipeline",
+            "source:=mcap",
+            f"path:={bag}",
+            f"rate:={rate}",
+            "publish_clock:=true",
+            "start_delay:=0.5",
+        )
+        assert pipeline.wait() == 0, pipeline.output
+        ros.spin_until(lambda: len(received) == COUNT)
+        return [
+            (m.header.stamp.sec, m.header.stamp.nanosec, m.sequence, m.range, m.variance, m.status)
+            for m in received
+        ]
+
+    assert play("8.0") == play("40.0")
+
+
+@pytest.mark.ros
+def test_a_running_replay_is_paused_sought_and_sped_up_by_parameters(ros: Ros, bag: Path):
+    received = ros.collect(RangeCir, "/uwb/range_raw")
+    clock = ros.collect(ClockMessage, "/clock")
+    driver = ros.start(
+        "driver", "source:=mcap", f"path:={bag}", "paused:=true", "publish_clock:=true", "start_delay:=0.2"
+    )
+    ros.spin_until(lambda: len(clock) > 5)
+    assert received == []
+    assert ros.set_parameter("driver", "seek_to", 3.0).successful
+    assert ros.set_parameter("driver", "rate", 5.0).successful
+    assert ros.set_parameter("driver", "paused", False).successful
+    assert driver.wait() == 0, driver.output
+    ros.spin_until(lambda: len(received) == COUNT // 4)
+    assert [m.sequence for m in received] == list(range(300, COUNT))
