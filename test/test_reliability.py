@@ -26,6 +26,7 @@ from uwb_mitigation.nodes.health import (
     OUT_OF_DISTRIBUTION,
     SILENT,
     SLOW,
+    THRESHOLDS,
     UNUSABLE,
     Health,
     Numbering,
@@ -197,6 +198,12 @@ def test_many_ranges_of_a_bad_status_are_warned_of(statuses: dict[Status, int], 
     assert health(statuses).period().warnings() == [threshold.text]
     statuses[Status.OK] += 10
     assert health(statuses).period().warnings() == []
+
+
+def test_the_documented_thresholds_are_those_in_force():
+    document = (Path(__file__).parent.parent / "docs" / "nodes.md").read_text()
+    for threshold in THRESHOLDS:
+        assert f"| WARN | {threshold.fact} above {threshold.limit:g} | {threshold.text} |" in document
 
 
 def test_slow_correcting_and_silence_are_warned_of():
