@@ -19,14 +19,14 @@ def generate_launch_description():
         DeclareLaunchArgument("namespace", default_value="", description="Namespace of both nodes."),
         DeclareLaunchArgument("one_process", default_value="false", description="Run both in one process."),
     ]
-    for name in ("driver", "mitigator"):
-        arguments.append(
-            DeclareLaunchArgument(
-                f"{name}_params",
-                default_value=PathJoinSubstitution([params, f"{name}.yaml"]),
-                description=f"Parameter file of the {name}.",
-            )
+    arguments += [
+        DeclareLaunchArgument(
+            f"{name}_params",
+            default_value=PathJoinSubstitution([params, f"{name}.yaml"]),
+            description=f"Parameter file of the {name}.",
         )
+        for name in ("driver", "mitigator")
+    ]
     one_process = LaunchConfiguration("one_process")
     nodes = [
         Node(

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import signal
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
@@ -16,8 +18,10 @@ from ros_harness import Ros, domain
 from rosgraph_msgs.msg import Clock
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
+from uwb_mitigation.bag.codec import encode_range
 from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.measurement import Status
+from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.shipped import default_model_path
 from uwb_mitigation.nodes.diagnostics import Meter
@@ -83,6 +87,48 @@ def test_a_driver_that_is_killed_leaves_the_mitigator_running_and_another_joins(
     ros.spin_until(lambda: len(corrected) > 20)
     record_property("joined_after_s", time.monotonic() - began_s)
     assert mitigator.popen.poll() is None
+
+
+@pytest.mark.ros
+def test_ranges_that_queue_up_are_all_corrected_in_order_and_to_the_bit(ros: Ros):
+    mitigation = Mitigation(load_bundle(default_model_path()))
+    measurements = [record.measurement for record in SimulatedSource(seed=2, count=300)]
+    corrected = ros.collect(RangeCorrected, CORRECTED)
+    mitigator = ros.start("mitigator")
+    publisher = ros.node.create_publisher(RangeCir, RAW, 1000)
+    ros.wait_for_publishers(CORRECTED, 1)
+    ros.spin_until(lambda: publisher.get_subscription_count() == 1)
+    ros.spin_for(0.5)
+    # Stopped meanwhile, it finds all of them in its queue.
+    mitigator.popen.send_signal(signal.SIGSTOP)
+    for measurement in measurements:
+        publisher.publish(encode_range(measurement))
+    mitigator.popen.send_signal(signal.SIGCONT)
+    ros.spin_until(lambda: len(corrected) == len(measurements))
+    assert [m.sequence for m in corrected] == [m.sequence for m in measurements]
+    expected = [np.float32(mitigation.correct(m).range_m) for m in measurements]
+    assert np.array_equal([m.range for m in corrected], expected, equal_nan=True)
+
+
+@pytest.mark.ros
+def test_what_a_queue_has_dropped_is_told(ros: Ros):
+    measurement = next(iter(SimulatedSource(seed=2)))
+    data = encode_range(measurement.measurement)
+    ros.start("mitigator", "qos_overrides./uwb/range_raw.subscription.depth:=10").wait_for_output(
+        "correcting"
+    )
+    publisher = ros.node.create_publisher(RangeCir, RAW, 10)
+    ros.spin_until(lambda: publisher.get_subscription_count() == 1)
+    ros.spin_for(0.5)
+
+    def told(status: DiagnosticStatus) -> bool:
+        # More at once than the queue holds.
+        for _ in range(300):
+            publisher.publish(data)
+        return status.message == DROPPED.text
+
+    status = ros.diagnosis("mitigator", told)
+    assert status.level == DiagnosticStatus.WARN
 
 
 @pytest.mark.ros
