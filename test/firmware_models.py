@@ -18,6 +18,7 @@ from uwb_mitigation.firmware_export.packing import pack
 from uwb_mitigation.measurement import Cir, Encoding, RangeMeasurement
 from uwb_mitigation.model import graph
 from uwb_mitigation.model.bundle import Bundle, save_bundle
+from uwb_mitigation.model.familiarity import Band, Familiarity
 from uwb_mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.model.prior import LinePrior
 from uwb_mitigation.model.weights import Int8Weights
@@ -40,11 +41,24 @@ def write_model(folder: Path, weights: Int8Weights, card: Identity | None = None
     return write_header(folder, network, card or identity(), golden)
 
 
-def exact_bundle(folder: Path, samples: int = 32) -> Bundle:
+def exact_bundle(folder: Path, samples: int = 32, **changes: object) -> Bundle:
     """A bundle of random weights, with scales that the firmware can equal, and a prior that needs powers."""
     weights = synthetic.random_remnet(samples, 3)
-    card = model_material.card(weights.architecture, correction_limits_m=(-500.0, 500.0))
+    card = model_material.card(weights.architecture, correction_limits_m=(-500.0, 500.0), **changes)
     return save_bundle(folder / "exact.onnx", graph.int8_model(weights), card)
+
+
+def choosy_bundle(folder: Path, samples: int = 32) -> Bundle:
+    """The same with a familiarity that finds random measurements familiar, strange in part, and wholly strange."""
+    familiarity = Familiarity(
+        0.125,
+        Band(0.5, 3.0, 2.0),
+        Band(-90.0, -81.0, 40.0),
+        Band(-5.0, 8.0, 20.0),
+        Band(-10.0, 200.0, 50.0),
+        Band(20.0, 101.0, 70.0),
+    )
+    return exact_bundle(folder, samples, variance_per_m2=0.0078125, familiarity=familiarity)
 
 
 def random_cir(random: np.random.Generator) -> Cir:

@@ -10,17 +10,14 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from uwb_mitigation.commands import firmware
+from uwb_mitigation import cli
 from uwb_mitigation.errors import MissingDependencyError, ModelError, ParameterError
 from uwb_mitigation.firmware_export import toolchain
 
 
 @pytest.fixture
 def app() -> typer.Typer:
-    app = typer.Typer()
-    app.command("export-c")(firmware.export_c)
-    app.command("bench-firmware")(firmware.bench_firmware)
-    return app
+    return cli.app
 
 
 def test_export_c_writes_the_header_and_says_where(app: typer.Typer, tmp_path: Path):
@@ -45,7 +42,7 @@ def test_export_c_of_an_absent_model_names_it(app: typer.Typer, tmp_path: Path):
 def test_bench_firmware_reports_the_promised_keys(app: typer.Typer, tmp_path: Path):
     bundle = firmware_models.exact_bundle(tmp_path)
     result = tmp_path / "result.json"
-    arguments = ["bench-firmware", "--model", str(bundle.path), "--inputs", "20", "--json", str(result)]
+    arguments = ["bench", "firmware", "--model", str(bundle.path), "--inputs", "20", "--json", str(result)]
     done = CliRunner().invoke(app, arguments)
     assert done.exit_code == 0, done.output
     rows = json.loads(result.read_text())["rows"]
@@ -65,7 +62,7 @@ def test_bench_firmware_reports_the_promised_keys(app: typer.Typer, tmp_path: Pa
 
 
 def test_bench_firmware_refuses_a_number_of_inputs_out_of_range(app: typer.Typer):
-    done = CliRunner().invoke(app, ["bench-firmware", "--inputs", "0"])
+    done = CliRunner().invoke(app, ["bench", "firmware", "--inputs", "0"])
     assert isinstance(done.exception, (ParameterError, MissingDependencyError))
 
 

@@ -118,6 +118,12 @@ def test_good_and_hostile_measurements_are_corrected_as_by_the_mitigator(tmp_pat
     assert check_corrections(firmware_models.exact_bundle(tmp_path), measurements, tmp_path) == {0, 1, 2, 3}
 
 
+def test_what_is_strange_to_the_model_is_graded_as_by_the_mitigator(tmp_path: Path):
+    random = np.random.default_rng(4)
+    measurements = [firmware_models.random_measurement(random) for _ in range(300)]
+    check_corrections(firmware_models.choosy_bundle(tmp_path), measurements, tmp_path)
+
+
 def test_real_logs_are_corrected_as_by_the_mitigator(apartment: Path, tmp_path: Path):
     measurements = firmware_models.real_measurements(apartment)
     assert 0 in check_corrections(load_bundle(default_model_path()), measurements, tmp_path)

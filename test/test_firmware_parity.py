@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import firmware_models
@@ -129,6 +130,27 @@ def test_corrected_ranges_equal_the_mitigators(tmp_path: Path):
         assert np.array_equal(bits(np.array(computed[:3])), bits(np.array(values)))
         seen.add(expected.status)
     assert seen == {Status.OK, Status.NO_CIR, Status.BAD_CIR, Status.OUT_OF_DISTRIBUTION}
+
+
+@pytest.mark.parametrize("samples", [8, 32])
+def test_what_is_strange_to_the_model_is_graded_as_by_the_mitigator(samples: int, tmp_path: Path):
+    bundle = firmware_models.choosy_bundle(tmp_path, samples)
+    export_bundle(bundle, tmp_path)
+    firmware, mitigation = HostFirmware(tmp_path, tmp_path, SANITIZED), Mitigation(bundle)
+    random = np.random.default_rng(12)
+    variances, statuses = set(), set()
+    for _ in range(1500):
+        measurement = firmware_models.random_measurement(random)
+        measurement = replace(measurement, range_m=float(np.float32(random.uniform(0, 6))))
+        expected = mitigation.correct(measurement)
+        computed = firmware.correct(measurement.range_m, measurement.cir)
+        assert computed[3] == int(expected.status)
+        values = [expected.range_m, expected.correction_m, expected.variance_m2]
+        assert np.array_equal(bits(np.array(computed[:3])), bits(np.array(values)))
+        variances.add(expected.variance_m2)
+        statuses.add(expected.status)
+    assert len(variances) > 100
+    assert statuses >= {Status.OK, Status.OUT_OF_DISTRIBUTION}
 
 
 def test_real_logs_are_corrected_as_by_the_mitigator(apartment: Path, tmp_path: Path):

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 import uwb_mitigation
-from uwb_mitigation.commands import bench_nodes, bench_serial, console, data, link, model, process
+from uwb_mitigation.commands import bench_nodes, bench_serial, console, data, firmware, link, model, process
 from uwb_mitigation.errors import UwbMitigationError
 
 app = typer.Typer(
@@ -26,8 +26,10 @@ bench.command("link")(link.bench_link)
 bench.command("serial")(bench_serial.bench_serial)
 bench.command("nodes")(bench_nodes.bench_nodes)
 bench.command("soak")(bench_nodes.bench_soak)
+bench.command("firmware")(firmware.bench_firmware)
 app.command("process")(process.process)
 app.command("emulate-board")(link.emulate_board)
+app.command("export-c")(firmware.export_c)
 
 
 def _print_version(wanted: bool) -> None:

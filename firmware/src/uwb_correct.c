@@ -26,9 +26,9 @@ static uwb_range_status range_status(uwb_status status) {
     }
 }
 
-/* The predicted error of the range, m. The order of checks is the host's: it decides the status. */
+/* The predicted error of the range, m, and how strange the measurement is. The order of checks is the host's: it decides the status. */
 static uwb_status predict(const uwb_model *model, float range_m, const uwb_cir *cir, void *arena,
-                          size_t arena_bytes, float *error_m) {
+                          size_t arena_bytes, float *error_m, float *score) {
     const size_t needed = uwb_arena_size(model);
     if (needed == 0) {
         return UWB_BAD_ARGUMENT;
@@ -48,6 +48,8 @@ static uwb_status predict(const uwb_model *model, float range_m, const uwb_cir *
     if (!in_limits(prior, -FLT_MAX, FLT_MAX)) {
         return UWB_NO_POWER;
     }
+    /* Before the network overwrites the window. */
+    *score = uwb_strangeness(model, window, range_m, cir->rx_power_dbm, cir->first_path_power_dbm);
     /* volatile: the host rounds the network's product before it adds the prior. */
     volatile float rounded;
     float network_m;
@@ -57,8 +59,27 @@ static uwb_status predict(const uwb_model *model, float range_m, const uwb_cir *
     }
     rounded = network_m;
     *error_m = prior + rounded;
-    return in_limits(*error_m, model->correction_low_m, model->correction_high_m) ? UWB_OK
-                                                                                  : UWB_OUT_OF_DISTRIBUTION;
+    const int usual = in_limits(*error_m, model->correction_low_m, model->correction_high_m) && *score < 1.0f;
+    return usual ? UWB_OK : UWB_OUT_OF_DISTRIBUTION;
+}
+
+/* The stranger a measurement is, the less of its predicted error is believed. As in the host's Grader: every
+ * product and every sum is rounded, for which volatile keeps a compiler from fusing them. */
+static void grade(const uwb_model *model, float range_m, float error_m, float score, uwb_corrected *corrected) {
+    const volatile float square = error_m * error_m;
+    const volatile float growth = model->variance_per_m2 * square;
+    float correction_m = error_m;
+    float variance_m2 = model->variance_m2 + growth;
+    if (score > 0.0f) {
+        const float offset_m = model->familiarity->known_offset_m;
+        const volatile float shrunk = (1.0f - score) * (error_m - offset_m);
+        const volatile float strange = score * model->variance_uncorrected_m2;
+        correction_m = offset_m + shrunk;
+        variance_m2 += strange;
+    }
+    corrected->range_m = range_m - correction_m;
+    corrected->correction_m = correction_m;
+    corrected->variance_m2 = variance_m2;
 }
 
 uwb_status uwb_correct(const uwb_model *model, float range_m, const uwb_cir *cir, void *arena,
@@ -67,12 +88,11 @@ uwb_status uwb_correct(const uwb_model *model, float range_m, const uwb_cir *cir
         return UWB_BAD_ARGUMENT;
     }
     float error_m = 0.0f;
-    const uwb_status status = predict(model, range_m, cir, arena, arena_bytes, &error_m);
+    float score = 0.0f;
+    const uwb_status status = predict(model, range_m, cir, arena, arena_bytes, &error_m, &score);
     corrected->status = range_status(status);
     if (status == UWB_OK) {
-        corrected->range_m = range_m - error_m;
-        corrected->correction_m = error_m;
-        corrected->variance_m2 = model->variance_m2;
+        grade(model, range_m, error_m, score, corrected);
     } else {
         const int valid = model != NULL && in_limits(range_m, 0.0f, MAX_RANGE_M);
         corrected->range_m = range_m;

@@ -29,7 +29,7 @@ typedef enum {
     UWB_SATURATED,           /* the window holds a saturated sample */
     UWB_NO_PREAMBLE_COUNT,   /* unknown, and the model's scaling needs it */
     UWB_NO_POWER,            /* receive or first-path power unknown, and the model's prior needs it */
-    UWB_OUT_OF_DISTRIBUTION, /* the predicted error lies outside the model's limits */
+    UWB_OUT_OF_DISTRIBUTION, /* the predicted error lies outside the model's limits, or all is strange to it */
     UWB_BAD_RANGE            /* the range is not finite, negative, or beyond 1000 km */
 } uwb_status;
 
@@ -82,6 +82,21 @@ typedef struct {
     uint16_t outputs;
 } uwb_dense_layer;
 
+enum { UWB_FEATURES = 5 };
+
+/* Values from low to high are familiar; 1 / per_unit beyond them they are wholly strange. */
+typedef struct {
+    float low;
+    float high;
+    float per_unit;
+} uwb_band;
+
+/* What the model was trained on; uwb_mitigation/model/familiarity.py says what the features are. */
+typedef struct {
+    float known_offset_m; /* a strange measurement's correction shrinks to it */
+    uwb_band bands[UWB_FEATURES];
+} uwb_familiarity;
+
 /* Either a REMNet (modules > 0) or dense layers, then a head with one output. */
 typedef struct {
     uint32_t model_id;
@@ -109,7 +124,9 @@ typedef struct {
     float correction_low_m; /* a predicted error outside means an input unlike the training data */
     float correction_high_m;
     float variance_m2;
+    float variance_per_m2; /* times the square of the predicted error */
     float variance_uncorrected_m2;
+    const uwb_familiarity *familiarity; /* NULL = not known: nothing is strange */
 } uwb_model;
 
 /* Bytes of arena that the other functions need for `model`; 0 if it is null or cannot be run. */
@@ -125,6 +142,11 @@ uwb_status uwb_network(const uwb_model *model, const float *window, void *arena,
 /* The part of the predicted error that needs no network, m; NaN where a power that it needs is not finite, or
  * beyond 1000 dBm. */
 float uwb_prior_m(const uwb_model *model, float rx_power_dbm, float first_path_power_dbm);
+
+/* How strange a measurement with the input `window` is to the model: 0 or less, not at all; 1 or more, or NaN:
+ * wholly. */
+float uwb_strangeness(const uwb_model *model, const float *window, float range_m, float rx_power_dbm,
+                      float first_path_power_dbm);
 
 /* What a corrected range is worth; the values of RangeCorrected.msg and of the wire protocol. */
 typedef enum {

@@ -67,6 +67,8 @@ def identity(bundle: Bundle) -> Identity:
         correction_limits_m=card.correction_limits_m,
         variance_m2=card.variance_m2,
         variance_uncorrected_m2=card.variance_uncorrected_m2,
+        variance_per_m2=card.variance_per_m2,
+        familiarity=card.familiarity,
     )
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from uwb_mitigation.errors import ModelError
 from uwb_mitigation.firmware_export.packing import Channels, PackedNetwork
 from uwb_mitigation.firmware_export.requantisation import Sum
+from uwb_mitigation.model.familiarity import Familiarity
 from uwb_mitigation.model.prior import LinePrior
 from uwb_mitigation.preprocessing import Scaling
 
@@ -31,6 +32,8 @@ class Identity:
         prior: predicts the part of the error that the network does not.
         correction_limits_m: predicted errors outside mean an input unlike the training data.
         variance_m2, variance_uncorrected_m2: of a range corrected, and passed through.
+        variance_per_m2: by which the former grows with the square of the predicted error.
+        familiarity: what the training data was like; None = not known.
     """
 
     name: str
@@ -40,6 +43,8 @@ class Identity:
     correction_limits_m: tuple[float, float]
     variance_m2: float
     variance_uncorrected_m2: float
+    variance_per_m2: float = 0.0
+    familiarity: Familiarity | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,6 +70,8 @@ def render(network: PackedNetwork, identity: Identity, golden: Golden) -> str:
     else:
         parts += _mlp(network)
     parts.append(_array("int8_t", "uwb_head_weights", network.head_weights))
+    if identity.familiarity is not None:
+        parts.append(_familiarity(identity.familiarity))
     parts.append(_model(network, identity))
     parts.append(_golden(golden))
     parts.append("#endif")
@@ -100,6 +107,15 @@ def _mlp(network: PackedNetwork) -> Iterable[str]:
     yield "};\n"
 
 
+def _familiarity(familiarity: Familiarity) -> str:
+    bands = "".join(
+        f"    {{{number(band.low)}, {number(band.high)}, {number(np.float32(1) / np.float32(band.margin))}}},\n"
+        for band in familiarity.bands
+    )
+    offset = number(familiarity.known_offset_m)
+    return f"static const uwb_familiarity uwb_familiar = {{{offset}, {{\n{bands}}}}};\n"
+
+
 def _model(network: PackedNetwork, identity: Identity) -> str:
     remnet = bool(network.modules)
     prior, (low, high) = identity.prior, identity.correction_limits_m
@@ -125,7 +141,9 @@ def _model(network: PackedNetwork, identity: Identity) -> str:
         number(low),
         number(high),
         number(identity.variance_m2),
+        number(identity.variance_per_m2),
         number(identity.variance_uncorrected_m2),
+        "NULL" if identity.familiarity is None else "&uwb_familiar",
     ]
     return f"static const uwb_model uwb_model_data = {{\n{_wrapped(values)}}};\n"
 
