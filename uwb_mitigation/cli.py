@@ -8,7 +8,18 @@ from typing import Annotated
 import typer
 
 import uwb_mitigation
-from uwb_mitigation.commands import bench_nodes, bench_serial, console, data, firmware, link, model, process
+from uwb_mitigation.commands import (
+    bench_nodes,
+    bench_serial,
+    bench_training,
+    console,
+    data,
+    firmware,
+    link,
+    model,
+    process,
+    training,
+)
 from uwb_mitigation.errors import UwbMitigationError
 
 app = typer.Typer(
@@ -28,6 +39,11 @@ bench.command("nodes")(bench_nodes.bench_nodes)
 bench.command("soak")(bench_nodes.bench_soak)
 bench.command("firmware")(firmware.bench_firmware)
 app.command("process")(process.process)
+app.command("protocol")(training.protocol)
+app.command("search")(training.search)
+app.command("train-lr-range")(training.train_lr_range)
+app.command("prune")(training.prune)
+bench.command("training")(bench_training.bench_training)
 app.command("emulate-board")(link.emulate_board)
 app.command("export-c")(firmware.export_c)
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 import multiprocessing
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from typing import Any, Protocol, TypeVar
 
-from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.errors import ParameterError, UwbMitigationError
 
 J = TypeVar("J", contravariant=True)
 
@@ -29,6 +30,7 @@ def each(work: Work[J], jobs: Sequence[J], workers: int, on_progress: Callable[[
 
     Raises:
         ParameterError: `workers` is less than 1.
+        UwbMitigationError: a process was killed.
     """
     if workers < 1:
         raise ParameterError(f"{workers} workers", valid="1 or more")
@@ -53,6 +55,10 @@ def each(work: Work[J], jobs: Sequence[J], workers: int, on_progress: Callable[[
                 on_progress(counter.value)
                 for future in done:
                     future.result()
+        except BrokenProcessPool as error:
+            raise UwbMitigationError(
+                "a training process ended abruptly", valid="fewer workers, or more memory"
+            ) from error
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             for process in multiprocessing.active_children():

@@ -311,8 +311,8 @@ def _card(
         preprocessing=train.preprocessing,
         prior=LinePrior(0.0),
         quantised=False,
-        variance_m2=single(max(float(np.mean(left_m**2)), 1e-6)),
-        variance_uncorrected_m2=single(max(float(np.mean(test.error_m**2)), 1e-6)),
+        variance_m2=single(max(float(np.percentile(np.abs(left_m), 68)), 1e-3) ** 2),
+        variance_uncorrected_m2=single(max(float(np.percentile(np.abs(test.error_m), 68)), 1e-3) ** 2),
         correction_limits_m=(single(low - margin), single(high + margin)),
         training={"recipe": asdict(options), "measurements": len(train), "tested_on": len(test)},
     )

@@ -200,7 +200,9 @@ def _parse(line: str, mark: int) -> Trial | None:
         if values["fingerprint"] != mark:
             return None
         mae_m = values["mae_m"]
-        return Trial(Remnet(**values["architecture"]), None if mae_m is None else float(mae_m), values["stage"])
+        return Trial(
+            Remnet(**values["architecture"]), None if mae_m is None else float(mae_m), values["stage"]
+        )
     except (ValueError, TypeError, KeyError, AttributeError, ParameterError):
         return None
 

@@ -1,0 +1,371 @@
+"""`uwb-mitigation protocol`, `search`, `train-lr-range` and `prune`."""
+
+from __future__ import annotations
+
+import os
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.table import Table
+
+from uwb_mitigation.commands import console
+from uwb_mitigation.commands.console import JsonOption
+from uwb_mitigation.errors import MissingDependencyError, ModelError, ParameterError, UwbMitigationError
+from uwb_mitigation.preprocessing import WINDOW_SIZES, Preprocessing, Scaling
+
+if TYPE_CHECKING:
+    from uwb_mitigation.dataset import Dataset
+    from uwb_mitigation.training.results import Protocol
+    from uwb_mitigation.training.search import Trial
+
+DataOption = Annotated[
+    Path, typer.Option(help="Recording with true ranges: DeepUWB's dataset.pkl, a bag, or a folder of logs.")
+]
+SplitOption = Annotated[
+    str,
+    typer.Option(
+        help="paper or all_but_room_2 (DeepUWB: test in the medium room), configurations (a quarter held out), "
+        "or auto: paper for DeepUWB, else configurations."
+    ),
+]
+ScalingOption = Annotated[str, typer.Option(help="max or preamble.")]
+WorkersOption = Annotated[
+    int | None, typer.Option(help="Processes of one thread each; without it, one a processor.")
+]
+
+
+def protocol(
+    data: DataOption,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of the results.")],
+    networks: Annotated[
+        str, typer.Option(help="Of remnet, remnet_k5, remnet_attention, mlp; with commas.")
+    ] = "remnet,mlp",
+    windows: Annotated[str, typer.Option(help="Window lengths K, with commas.")] = ",".join(
+        map(str, WINDOW_SIZES)
+    ),
+    seeds: Annotated[int, typer.Option(help="Networks of each kind.")] = 5,
+    epochs: Annotated[int, typer.Option(help="Passes over the data.")] = 30,
+    learning_rate: Annotated[float, typer.Option(help="Of Adam.")] = 3e-4,
+    split: SplitOption = "auto",
+    scaling: ScalingOption = "max",
+    workers: WorkersOption = None,
+    json: JsonOption = None,
+) -> None:
+    """The paper's experiment: train every network at every K and seed, optimise, quantise, test.
+
+    Run it again to go on with an interrupted run: what is in DIR already is not trained again.
+    """
+    lengths = _lengths(windows)
+    with needs_torch():
+        from uwb_mitigation.training import protocol as protocols
+
+    wanted = protocols.jobs([name.strip() for name in networks.split(",")], lengths, seeds)
+    options = replace(protocols.PAPER, epochs=epochs, learning_rate=learning_rate)
+    if output.exists() and not output.is_dir():
+        raise ParameterError("not a folder", where=str(output), valid="a folder, or a name for one")
+    dataset = _labelled(data, max(lengths), scaling)
+    train, test, name = _divide(dataset, split)
+    parts = protocols.Parts(data.resolve().name, name, train, test)
+    with share_bar(f"{len(wanted)} networks") as update:
+        result = protocols.run(parts, output, wanted, options, _workers(workers), update)
+    _show_protocol(result)
+    console.write_json(json, asdict(result))
+
+
+def search(
+    data: DataOption,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of journal and front.")
+    ],
+    random: Annotated[int, typer.Option(help="Networks drawn at random.")] = 24,
+    grid: Annotated[int, typer.Option(help="At most so many neighbours of the best of them.")] = 16,
+    windows: Annotated[str, typer.Option(help="Window lengths K to draw from, with commas.")] = "157,64,32",
+    epochs: Annotated[int, typer.Option(help="Passes over the data, each network.")] = 8,
+    learning_rate: Annotated[float, typer.Option(help="Of Adam.")] = 3e-4,
+    seed: Annotated[int, typer.Option(help="Of the draw and of every network.")] = 0,
+    split: SplitOption = "auto",
+    scaling: ScalingOption = "max",
+    workers: WorkersOption = None,
+    json: JsonOption = None,
+) -> None:
+    """Random search, then a grid, over N, k0, kn, F and K: MAE against multiply-accumulates.
+
+    Networks are judged on a fifth of the training part's configurations; the test part has no say. Writes
+    journal.jsonl, with which an interrupted search goes on, and front.png.
+    """
+    lengths = _lengths(windows)
+    with needs_torch():
+        from uwb_mitigation.training import figures
+        from uwb_mitigation.training import search as searches
+        from uwb_mitigation.training.protocol import PAPER
+
+    options = replace(PAPER, epochs=epochs, learning_rate=learning_rate, seed=seed)
+    _make_folder(output)
+    train, _, _ = _divide(_labelled(data, max(lengths), scaling), split)
+    train, validation, _ = _divide(train, "configurations", folds=5)
+    with share_bar("searching") as update:
+        trials = searches.search(
+            train,
+            validation,
+            output / "journal.jsonl",
+            options,
+            random=random,
+            grid=grid,
+            windows=lengths,
+            workers=_workers(workers),
+            on_progress=update,
+        )
+    best = searches.front(trials)
+    _show_front(best, len(trials))
+    figures.draw_front(trials, output / "front.png")
+    console.write_json(
+        json,
+        {"trials": [_trial_json(trial) for trial in trials], "front": [_trial_json(trial) for trial in best]},
+    )
+
+
+def train_lr_range(
+    data: DataOption,
+    samples: Annotated[int, typer.Option(help="Window length K.")] = 157,
+    low: Annotated[float, typer.Option(help="First learning rate.")] = 1e-6,
+    high: Annotated[float, typer.Option(help="Last learning rate.")] = 0.3,
+    steps: Annotated[int, typer.Option(help="Batches.")] = 600,
+    seed: Annotated[int, typer.Option(help="Of the weights and the batches.")] = 0,
+    split: SplitOption = "auto",
+    scaling: ScalingOption = "max",
+    plot: Annotated[Path | None, typer.Option(metavar="PNG", help="Draw the loss against the rate.")] = None,
+    json: JsonOption = None,
+) -> None:
+    """The learning-rate range test of Smith (2017), on the training part."""
+    with needs_torch():
+        from uwb_mitigation.training import figures
+        from uwb_mitigation.training.learning_rate import range_test
+        from uwb_mitigation.training.protocol import PAPER
+    from uwb_mitigation.model.architecture import Remnet
+
+    shape = Remnet(samples)
+    train, _, _ = _divide(_labelled(data, samples, scaling), split)
+    done = 0
+    with share_bar("range test") as update:
+
+        def on_step() -> None:
+            nonlocal done
+            done += 1
+            update(done / steps)
+
+        result = range_test(
+            shape,
+            train.inputs,
+            train.error_m,
+            replace(PAPER, seed=seed),
+            low=low,
+            high=high,
+            steps=steps,
+            on_step=on_step,
+        )
+    console.out.print(
+        f"the loss falls steepest at {result.suggested:.2g} and is least at {result.highest:.2g}"
+        f"{'; it diverges beyond' if result.diverged else ''}",
+        highlight=False,
+    )
+    if plot is not None:
+        figures.draw_range_test(result, plot)
+    console.write_json(json, asdict(result))
+
+
+def prune(
+    model: Annotated[Path, typer.Argument(metavar="MODEL_FLOAT", help="Float bundle of a REMNet.")],
+    data: DataOption,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="Bundle to write.")],
+    filters: Annotated[int, typer.Option(help="Filters F to keep.")] = 8,
+    epochs: Annotated[int, typer.Option(help="Passes over the data to tune what is left.")] = 10,
+    learning_rate: Annotated[float, typer.Option(help="Of Adam.")] = 3e-4,
+    seed: Annotated[int, typer.Option(help="Of the order and the dropout.")] = 0,
+    split: SplitOption = "auto",
+    json: JsonOption = None,
+) -> None:
+    """Drop the weakest filters of a trained REMNet, and train what is left: a smaller float bundle.
+
+    Trains on the training part of the split, and tells the error on its test part.
+    """
+    import numpy as np
+
+    with needs_torch():
+        from uwb_mitigation.training import pruning
+        from uwb_mitigation.training.protocol import PAPER
+    from uwb_mitigation.model import floating, graph
+    from uwb_mitigation.model.bundle import load_bundle, save_bundle
+
+    source = load_bundle(model)
+    if source.quantised:
+        raise ModelError("already quantised", where=str(model), valid="the float bundle it was made of")
+    if output.suffix != ".onnx" or output.is_dir() or not output.resolve().parent.is_dir():
+        raise ParameterError(
+            "not a place for a bundle", where=str(output), valid="a file .onnx in a folder that exists"
+        )
+    weights = graph.float_weights(source.model, source.architecture)
+    smaller = pruning.prune(weights, filters)
+    dataset = _labelled(data, source.preprocessing.samples, source.preprocessing.scaling.value)
+    known = np.isfinite(_left(dataset, source.prior))
+    train, test, _ = _divide(dataset.rows(known), split)
+    options = replace(PAPER, epochs=epochs, learning_rate=learning_rate, seed=seed)
+    done = 0
+    with share_bar("tuning") as update:
+
+        def on_epoch() -> None:
+            nonlocal done
+            done += 1
+            update(done / epochs)
+
+        tuned = pruning.prune_and_tune(
+            weights, filters, train.inputs, _left(train, source.prior), options, on_epoch
+        )
+    left = _left(test, source.prior)
+    mae = {
+        name: float(np.abs(left - floating.predict_m(network, test.inputs)).mean())
+        for name, network in (("before", weights), ("pruned", smaller), ("tuned", tuned))
+    }
+    card = replace(source.card, name=output.stem, architecture=tuned.architecture)
+    bundle = save_bundle(output, graph.float_model(tuned), card)
+    cost = {
+        "multiply_accumulates": tuned.architecture.multiply_accumulates,
+        "multiply_accumulates_before": weights.architecture.multiply_accumulates,
+        "parameters": tuned.architecture.parameters,
+    }
+    console.out.print(
+        f"{output}: {filters} filters, {cost['parameters']} parameters, "
+        f"{cost['multiply_accumulates_before'] / cost['multiply_accumulates']:.1f} x fewer multiply-accumulates",
+        markup=False,
+        highlight=False,
+    )
+    console.out.print(
+        f"test MAE {mae['before']:.4f} m before, {mae['pruned']:.4f} m pruned, {mae['tuned']:.4f} m tuned",
+        highlight=False,
+    )
+    console.write_json(json, {"model_id": bundle.model_id, "mae": mae, **cost})
+
+
+@contextmanager
+def needs_torch() -> Iterator[None]:
+    """Say which command installs torch where it is missing."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if error.name != "torch":
+            raise
+        raise MissingDependencyError("training needs torch", valid="run `make setup-training`") from error
+
+
+@contextmanager
+def share_bar(name: str) -> Iterator[Callable[[float], None]]:
+    """A progress bar with remaining time; yields what takes the share that is done."""
+    with console.progress() as bar:
+        task = bar.add_task(name, total=1.0)
+        yield lambda share: bar.update(task, completed=share)
+
+
+def _labelled(data: Path, samples: int, scaling: str) -> Dataset:
+    """The recording as arrays; tells what is left out."""
+    from uwb_mitigation.dataset import build_dataset
+    from uwb_mitigation.sources.opening import open_recording
+
+    if scaling not in {kind.value for kind in Scaling}:
+        raise ParameterError(f"scaling {scaling!r}", valid=", ".join(kind.value for kind in Scaling))
+    with open_recording(data) as source:
+        dataset = build_dataset(source, Preprocessing(samples, Scaling(scaling)))
+    for reason, count in dataset.refused.items():
+        console.err.print(f"left out: {count} x {reason}", markup=False)
+    return dataset
+
+
+def _divide(dataset: Dataset, split: str, folds: int = 4) -> tuple[Dataset, Dataset, str]:
+    """Training part, test part, and the split's name."""
+    from uwb_mitigation.evaluation import splits
+    from uwb_mitigation.sources.deepuwb import RoomSplit, split_rows
+
+    rooms = [room.value for room in RoomSplit]
+    if split == "auto":
+        is_deepuwb = dataset.configurations[0].startswith("deepuwb/")
+        split = RoomSplit.PAPER.value if is_deepuwb else "configurations"
+    if split in rooms:
+        train, test = split_rows(dataset.configurations, RoomSplit(split))
+        return dataset.rows(train), dataset.rows(test), split
+    if split != "configurations":
+        raise ParameterError(f"split {split!r}", valid=", ".join(["auto", "configurations", *rooms]))
+    fold = splits.by_configuration(dataset.configurations, folds, seed=0)[0]
+    name = f"configurations: 1 of {folds} parts held out"
+    return dataset.rows(fold.train), dataset.rows(fold.test), name
+
+
+def _left(dataset: Dataset, prior: Any) -> Any:
+    return dataset.error_m - prior.predict_batch_m(dataset.rx_power_dbm, dataset.first_path_power_dbm)
+
+
+def _lengths(text: str) -> list[int]:
+    try:
+        lengths = [int(part) for part in text.split(",")]
+    except ValueError:
+        raise ParameterError(f"windows {text!r}", valid="numbers with commas, such as 157,64") from None
+    for samples in lengths:
+        Preprocessing(samples)
+    return list(dict.fromkeys(lengths))
+
+
+def _workers(given: int | None) -> int:
+    if given is None:
+        return os.cpu_count() or 1
+    if not 1 <= given <= 256:
+        raise ParameterError(f"workers = {given}", valid="1 to 256")
+    return given
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UwbMitigationError(f"cannot be made: {error.strerror}", where=str(folder)) from error
+
+
+def _show_protocol(result: Protocol) -> None:
+    groups = defaultdict(list)
+    for model in result.models:
+        groups[model.network, model.samples].append(model)
+    table = Table(
+        title=f"{result.data}, split {result.split}: {result.train} to train on, {result.test} to test, "
+        f"{result.options.epochs} epochs; MAE in m, mean over seeds"
+    )
+    for column in ("network", "K", "seeds", "parameters", "raw", "float", "optimised", "int8", "int8 bytes"):
+        table.add_column(column, justify="left" if column == "network" else "right")
+    for (network, samples), models in groups.items():
+        row = [network, f"{samples}", f"{len(models)}", f"{models[0].parameters}", f"{models[0].mae_raw:.4f}"]
+        forms = ("mae_float", "mae_optimised", "mae_int8")
+        row += [_mean([getattr(model, form) for model in models], ".4f") for form in forms]
+        table.add_row(*row, _mean([model.bytes_int8 for model in models], ".0f"))
+    console.out.print(table)
+
+
+def _mean(values: list[float | None], form: str) -> str:
+    known = [value for value in values if value is not None]
+    return format(sum(known) / len(known), form) if known else "-"
+
+
+def _show_front(best: list[Trial], tried: int) -> None:
+    table = Table(title=f"best of {tried} networks, cheapest first")
+    for column in ("K", "N", "k0", "kn", "F", "parameters", "multiply-accumulates", "MAE, m"):
+        table.add_column(column, justify="right")
+    for trial in best:
+        shape = trial.architecture
+        sizes = (shape.samples, shape.modules, shape.first_kernel, shape.kernel, shape.filters)
+        cost = (f"{shape.parameters}", f"{shape.multiply_accumulates}")
+        table.add_row(*map(str, sizes), *cost, f"{trial.mae_m:.4f}")
+    console.out.print(table)
+
+
+def _trial_json(trial: Trial) -> dict[str, Any]:
+    costs = ("parameters", "multiply_accumulates")
+    return asdict(trial) | {name: getattr(trial.architecture, name) for name in costs}
