@@ -31,17 +31,6 @@ def report(
     return array
 
 
-def clock_reader(node: Node) -> Callable[[], int]:
-    """A function that reads the node's clock, ns: straight from the system unless time is simulated."""
-    clock = node.get_clock()
-
-    def now_ns() -> int:
-        # rclpy takes several times as long as the system to say the same.
-        return int(clock.now().nanoseconds) if clock.ros_time_is_active else time.time_ns()
-
-    return now_ns
-
-
 def percentiles(name: str, values_ns: list[int]) -> dict[str, object]:
     """Facts `NAME p50 ms` and `NAME p99 ms`; none without values."""
     if not values_ns:

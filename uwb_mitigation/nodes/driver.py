@@ -28,7 +28,7 @@ from uwb_mitigation.link.layout import Mode
 from uwb_mitigation.link.messages import Correction
 from uwb_mitigation.link.port import BoardPort, PortAddress
 from uwb_mitigation.measurement import Origin, RangeMeasurement
-from uwb_mitigation.nodes import diagnostics, messages, topics
+from uwb_mitigation.nodes import clocks, diagnostics, messages, topics
 from uwb_mitigation.nodes.agreement import Agreement
 from uwb_mitigation.nodes.board_feed import BoardFeed
 from uwb_mitigation.nodes.lifecycle import ManagedNode
@@ -232,20 +232,20 @@ class Driver(ManagedNode):
 
     def _make_board_feed(self) -> BoardFeed:
         assert self._address is not None
-        clock = self.get_clock()
+        now_ns = clocks.reader(self.get_clock())
         port = BoardPort(
             self._address,
             baud=self.value("baud"),
             dtr=self.value("dtr"),
             mode=Mode[self.value("mode").upper()],
             expected_model_id=self._board_model,
-            stamp_clock=lambda: int(clock.now().nanoseconds),
+            stamp_clock=now_ns,
         )
         return BoardFeed(
             port,
             on_range=self._publish_range,
             on_correction=self._publish_correction,
-            now_ns=diagnostics.clock_reader(self),
+            now_ns=now_ns,
             logger=self.get_logger(),
         )
 

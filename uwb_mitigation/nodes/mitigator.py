@@ -22,7 +22,7 @@ from uwb_mitigation.measurement import RangeMeasurement, Status
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.shipped import default_model_path
-from uwb_mitigation.nodes import diagnostics, messages, topics
+from uwb_mitigation.nodes import clocks, diagnostics, messages, topics
 from uwb_mitigation.nodes.health import Health
 from uwb_mitigation.nodes.lifecycle import ManagedNode
 from uwb_mitigation.nodes.parameters import Parameter
@@ -70,7 +70,7 @@ class Mitigator(ManagedNode):
         self._prepared: tuple[str, Mitigation] | None = None
         # A driver in the same process corrects from its own thread, while transitions run in the executor's.
         self._lock = threading.Lock()
-        self._now_ns = diagnostics.clock_reader(self)
+        self._now_ns = clocks.reader(self.get_clock())
         self._meter = diagnostics.Meter(self._now_ns)
         self.add_on_set_parameters_callback(self._prepare)
         self.add_post_set_parameters_callback(self._swap)

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from rclpy.clock import Clock
 
 from uwb_mitigation.errors import UwbMitigationError
+from uwb_mitigation.nodes import clocks
 from uwb_mitigation.sources.source import Record, Source
 
 # How often the pace is checked against a clock that may be simulated, and /clock is published.
@@ -59,7 +60,7 @@ class Playback:
         self.paused = paused
         self.played = 0
         self._source = source
-        self._clock = clock
+        self._now_ns = clocks.reader(clock)
         self._loop = loop
         self._longest_pause_ns = int(longest_pause_s * 1e9)
         self._recorded_stamps = recorded_stamps
@@ -104,7 +105,7 @@ class Playback:
             self._on_end(error)
 
     def _play(self) -> None:
-        self._place_clock_ns = self._clock.now().nanoseconds
+        self._place_clock_ns = self._now_ns()
         due_ns = 0
         while not self._stopping.is_set():
             from_ns = self._seeks.popleft() if self._seeks else 0
@@ -135,7 +136,7 @@ class Playback:
                 last_ns = recorded_ns
                 late_ns = self._wait_until(due_ns, recorded_ns)
                 if late_ns is None:
-                    return True, min(due_ns, self._position_ns(self._clock.now().nanoseconds))
+                    return True, min(due_ns, self._position_ns(self._now_ns()))
                 stamp_ns = recorded_ns if self._recorded_stamps else self._clock_ns(due_ns)
                 self._late.append((record, stamp_ns))
                 if late_ns < LATE_NS or len(self._late) == BATCH:
@@ -161,7 +162,7 @@ class Playback:
         while True:
             if self._stopping.is_set() or self._seeks:
                 return None
-            now_ns = int(self._clock.now().nanoseconds)
+            now_ns = self._now_ns()
             if self.paused or self._standing or self.rate != self._pace:
                 self._keep_pace(now_ns, due_ns)
             ahead_ns = self._clock_ns(due_ns) - now_ns
