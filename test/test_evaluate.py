@@ -122,7 +122,7 @@ def test_train_quantize_evaluate_from_end_to_end(tmp_path, recording):
     floats, integers = tmp_path / "float.onnx", tmp_path / "int8.onnx"
     result = run(
         "train", "--data", "any", "-o", floats, "--samples", 8, "--epochs", 1, "--folds", 2,
-        "--json", tmp_path / "t.json",
+        "--recipe", "line+network", "--json", tmp_path / "t.json",
     )  # fmt: skip
     assert result.exit_code == 0, result.output
     names = [row["name"] for row in json.loads((tmp_path / "t.json").read_text())["rows"]]

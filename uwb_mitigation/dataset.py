@@ -29,6 +29,8 @@ class Dataset:
             without a name count as one.
         labels: propagation condition; may be empty.
         refused: measurements left out, {why: count}.
+        headers: float32 (n, 2), preamble count and noise threshold; None = not kept.
+        tags, anchors: identities, int (n,), for splits by place; None = not kept.
     """
 
     preprocessing: Preprocessing
@@ -40,6 +42,9 @@ class Dataset:
     configurations: NDArray[np.str_]
     labels: NDArray[np.str_]
     refused: Mapping[str, int] = field(default_factory=dict)
+    headers: NDArray[np.float32] | None = None
+    tags: NDArray[np.uint64] | None = None
+    anchors: NDArray[np.uint64] | None = None
 
     def __len__(self) -> int:
         return len(self.error_m)
@@ -55,6 +60,9 @@ class Dataset:
             self.error_m[chosen],
             self.configurations[chosen],
             self.labels[chosen],
+            headers=None if self.headers is None else self.headers[chosen],
+            tags=None if self.tags is None else self.tags[chosen],
+            anchors=None if self.anchors is None else self.anchors[chosen],
         )
 
     @property
@@ -70,7 +78,7 @@ def build_dataset(records: Iterable[Record], preprocessing: Preprocessing) -> Da
         DatasetError: nothing is left.
     """
     refused: Counter[str] = Counter()
-    inputs, numbers, configurations, labels = [], [], [], []
+    inputs, numbers, headers, identities, configurations, labels = [], [], [], [], [], []
     for record in records:
         measurement, truth = record.measurement, record.truth
         if truth is None or not math.isfinite(truth.range_m):
@@ -93,6 +101,8 @@ def build_dataset(records: Iterable[Record], preprocessing: Preprocessing) -> Da
                 measurement.range_m - truth.range_m,
             )
         )
+        headers.append((measurement.cir.preamble_count, measurement.cir.noise_threshold))
+        identities.append((measurement.tag_id, measurement.anchor_id))
         configurations.append(truth.configuration)
         labels.append(truth.label)
     if not inputs:
@@ -109,6 +119,8 @@ def build_dataset(records: Iterable[Record], preprocessing: Preprocessing) -> Da
         np.array(configurations),
         np.array(labels),
         dict(refused),
+        np.array(headers, np.float32),
+        *np.array(identities, np.uint64).T,
     )
 
 

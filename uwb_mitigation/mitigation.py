@@ -9,12 +9,59 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.measurement import CorrectedRange, Origin, RangeColumns, RangeMeasurement, Status
-from uwb_mitigation.model.bundle import Bundle
+from uwb_mitigation.model.bundle import Bundle, Card
 from uwb_mitigation.model.familiarity import Strangeness, features
 from uwb_mitigation.model.session import Session
 
 MAX_RANGE_M = 1e6
 """What lies beyond is no range: the radio reaches a few hundred metres."""
+
+
+class Grader:
+    """How much of a predicted error a bundle's card lets through, and with what variance."""
+
+    def __init__(self, card: Card) -> None:
+        self._low, self._high = (np.float32(limit) for limit in card.correction_limits_m)
+        self._variance = np.float32(card.variance_m2)
+        self._variance_per_m2 = np.float32(card.variance_per_m2)
+        self._variance_uncorrected = np.float32(card.variance_uncorrected_m2)
+        familiarity = card.familiarity
+        self._strangeness = None if familiarity is None else Strangeness(familiarity.bands)
+        self._known_offset = np.float32(0.0 if familiarity is None else familiarity.known_offset_m)
+
+    @property
+    def judges(self) -> bool:
+        """Whether the card says what is familiar."""
+        return self._strangeness is not None
+
+    def passes(self, predicted: NDArray[np.float32], score: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Which predicted errors lie within the limits, at scores below 1; NaN does not. Also of scalars."""
+        inside: NDArray[np.bool_] = (predicted >= self._low) & (predicted <= self._high) & (score < 1.0)
+        return inside
+
+    def score(
+        self,
+        windows: NDArray[np.float32],
+        range_m: NDArray[np.float32],
+        rx_power_dbm: NDArray[np.float32],
+        first_path_power_dbm: NDArray[np.float32],
+    ) -> NDArray[np.float32]:
+        """How strange n measurements are to the bundle, float32 (n,); 0 where it does not say what is familiar."""
+        if self._strangeness is None:
+            return np.zeros(len(windows), np.float32)
+        return self._strangeness.score(features(windows, range_m, rx_power_dbm, first_path_power_dbm))
+
+    def grade(
+        self, predicted: NDArray[np.float32], score: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Corrections and variances of predicted errors within the limits, at scores below 1; also of scalars."""
+        correction: NDArray[np.float32] = predicted
+        variance: NDArray[np.float32] = self._variance + self._variance_per_m2 * (predicted * predicted)
+        if self._strangeness is not None:
+            shrunk = self._known_offset + (np.float32(1.0) - score) * (predicted - self._known_offset)
+            correction = np.where(score > 0.0, shrunk, predicted)
+            variance = variance + np.maximum(score, np.float32(0.0)) * self._variance_uncorrected
+        return correction, variance
 
 
 class Mitigation:
@@ -39,13 +86,8 @@ class Mitigation:
         self._preprocessing = bundle.preprocessing
         self._prior = bundle.prior
         card = bundle.card
-        self._low, self._high = (np.float32(limit) for limit in card.correction_limits_m)
-        self._variance = np.float32(card.variance_m2)
-        self._variance_per_m2 = np.float32(card.variance_per_m2)
-        self._variance_uncorrected = np.float32(card.variance_uncorrected_m2)
-        familiarity = card.familiarity
-        self._strangeness = None if familiarity is None else Strangeness(familiarity.bands)
-        self._known_offset = np.float32(0.0 if familiarity is None else familiarity.known_offset_m)
+        self._variance_uncorrected = float(np.float32(card.variance_uncorrected_m2))
+        self._grader = Grader(card)
 
     def correct(self, measurement: RangeMeasurement) -> CorrectedRange:
         """The corrected range; never raises on what a measurement holds.
@@ -108,49 +150,26 @@ class Mitigation:
             predicted = prior + self._session.predict_batch_m(windows)
         except Exception:  # As in `correct`.
             return rows[:0], range_m[:0], prior[:0], prior[:0]
-        score = self._score(windows, range_m, ranges.rx_power_dbm[rows], ranges.first_path_power_dbm[rows])
-        # NaN is inside of no limits.
-        inside = (predicted >= self._low) & (predicted <= self._high) & (score < 1.0)
+        score = self._grader.score(
+            windows, range_m, ranges.rx_power_dbm[rows], ranges.first_path_power_dbm[rows]
+        )
+        inside = self._grader.passes(predicted, score)
         rows, range_m = rows[inside], range_m[inside]
-        correction, variance = self._graded(predicted[inside], score[inside])
+        correction, variance = self._grader.grade(predicted[inside], score[inside])
         return rows, range_m - correction, correction, variance
 
     def _scores(
         self, measurements: Sequence[RangeMeasurement], windows: NDArray[np.float32]
     ) -> NDArray[np.float32]:
-        """`_score` of measurements whose inputs are `windows`."""
-        if self._strangeness is None:
+        """The grader's scores of measurements whose inputs are `windows`."""
+        if not self._grader.judges:
             return np.zeros(len(windows), np.float32)
         with np.errstate(over="ignore"):  # a power beyond float32 is as strange as an infinite one
             numbers = np.array(
                 [(m.range_m, m.cir.rx_power_dbm, m.cir.first_path_power_dbm) for m in measurements],
                 np.float32,
             )
-        return self._score(windows, *numbers.T)
-
-    def _score(
-        self,
-        windows: NDArray[np.float32],
-        range_m: NDArray[np.float32],
-        rx_power_dbm: NDArray[np.float32],
-        first_path_power_dbm: NDArray[np.float32],
-    ) -> NDArray[np.float32]:
-        """How strange n measurements are to the bundle, float32 (n,); 0 where it does not say what is familiar."""
-        if self._strangeness is None:
-            return np.zeros(len(windows), np.float32)
-        return self._strangeness.score(features(windows, range_m, rx_power_dbm, first_path_power_dbm))
-
-    def _graded(
-        self, predicted: NDArray[np.float32], score: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Corrections and variances of predicted errors within the limits, at scores below 1; also of scalars."""
-        correction: NDArray[np.float32] = predicted
-        variance: NDArray[np.float32] = self._variance + self._variance_per_m2 * (predicted * predicted)
-        if self._strangeness is not None:
-            shrunk = self._known_offset + (np.float32(1.0) - score) * (predicted - self._known_offset)
-            correction = np.where(score > 0.0, shrunk, predicted)
-            variance = variance + np.maximum(score, np.float32(0.0)) * self._variance_uncorrected
-        return correction, variance
+        return self._grader.score(windows, *numbers.T)
 
     def _prepare(
         self, measurement: RangeMeasurement, window: NDArray[np.float32]
@@ -173,9 +192,9 @@ class Mitigation:
     ) -> CorrectedRange:
         if not math.isfinite(predicted):
             return self._passed(measurement, Status.MODEL_ERROR)
-        if not (self._low <= predicted <= self._high and score < 1.0):
+        if not self._grader.passes(predicted, score):  # type: ignore[arg-type]
             return self._passed(measurement, Status.OUT_OF_DISTRIBUTION)
-        correction, variance = self._graded(predicted, score)  # type: ignore[arg-type]
+        correction, variance = self._grader.grade(predicted, score)  # type: ignore[arg-type]
         return CorrectedRange(
             range_m=float(np.float32(measurement.range_m) - correction),
             range_raw_m=measurement.range_m,
@@ -192,7 +211,7 @@ class Mitigation:
             range_m=measurement.range_m,
             range_raw_m=measurement.range_m,
             correction_m=0.0,
-            variance_m2=float(self._variance_uncorrected) if valid else math.inf,
+            variance_m2=self._variance_uncorrected if valid else math.inf,
             status=status,
             origin=Origin.HOST,
             model_id=self.bundle.model_id,

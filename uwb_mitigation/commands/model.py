@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.table import Table
 
-from uwb_mitigation.commands import console
+from uwb_mitigation.commands import console, model_tables
 from uwb_mitigation.commands.console import JsonOption
 from uwb_mitigation.errors import MissingDependencyError, ModelError, ParameterError
 
 if TYPE_CHECKING:
     from uwb_mitigation.dataset import Dataset
-    from uwb_mitigation.evaluation.outcome import Outcome
-    from uwb_mitigation.model.bundle import Bundle
     from uwb_mitigation.preprocessing import Preprocessing
     from uwb_mitigation.sources.source import Record
-    from uwb_mitigation.training.recipe import CrossValidation
+    from uwb_mitigation.training.choosing import Candidate, Choice
+    from uwb_mitigation.training.options import FitOptions
+    from uwb_mitigation.training.recipe import Recipe
 
 app = typer.Typer()
 
@@ -29,20 +28,35 @@ DataOption = Annotated[
 ]
 OutputOption = Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="Bundle to write.")]
 
-# Seen in rows of the cross-validation table, in this order.
-_ROWS = {
-    "raw": "raw",
-    "overall_median": "overall median",
-    "l1_line": "line",
-    "float": "model, float",
-    "int8": "model, int8",
-}
-
 
 @app.command()
 def train(
-    data: DataOption,
     output: OutputOption,
+    data: Annotated[
+        Path | None,
+        typer.Option(help="Recording with true ranges: a bag, or a folder of DecaRanging logs."),
+    ] = None,
+    from_bag: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="BAG", help="Instead: start from a model, and fit it to the boards and walls of this bag."
+        ),
+    ] = None,
+    truth: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="CSV",
+            help="With --from-bag: true ranges of its pairs (tag_id, anchor_id, range_m, and optionally start_s, "
+            "stop_s, configuration, label); may be given several times.",
+        ),
+    ] = None,
+    model: Annotated[
+        Path | None,
+        typer.Option(help="With --from-bag: int8 bundle to start from; without it, the shipped one."),
+    ] = None,
+    choose: Annotated[
+        str, typer.Option("--recipe", help="auto, constant, line, line+network, or network.")
+    ] = "auto",
     samples: Annotated[int, typer.Option(help="Window length K.")] = 157,
     scaling: Annotated[str, typer.Option(help="preamble or max.")] = "preamble",
     first_kernel: Annotated[int, typer.Option(help="Kernel k0 of the first convolution.")] = 3,
@@ -51,38 +65,69 @@ def train(
     per_configuration: Annotated[int, typer.Option(help="Fit to at most so many of a configuration.")] = 20,
     seed: Annotated[int, typer.Option(help="Of the split, the weights and the order.")] = 0,
     folds: Annotated[int, typer.Option(help="Folds of the cross-validation.")] = 6,
-    prior: Annotated[
-        bool, typer.Option("--prior/--no-prior", help="Fit the line prior, or leave all to the network.")
-    ] = True,
+    prior: Annotated[bool, typer.Option("--prior/--no-prior", help="--no-prior is --recipe network.")] = True,
     json: JsonOption = None,
 ) -> None:
-    """Cross-validate the recipe by configuration, then train it on all of the data: a float bundle."""
+    """Choose by cross-validation over configurations what the data can carry, then train it on all of the data:
+    a float bundle."""
     from uwb_mitigation.model.architecture import Remnet
-    from uwb_mitigation.model.bundle import save_bundle
     from uwb_mitigation.preprocessing import Preprocessing, Scaling
+    from uwb_mitigation.training.options import FitOptions
 
-    try:
-        from uwb_mitigation.training import recipe as recipes
-        from uwb_mitigation.training.fitting import FitOptions
-    except ModuleNotFoundError as error:
-        if error.name != "torch":
-            raise
-        raise MissingDependencyError("training needs torch", valid="run `make setup-training`") from error
-    from uwb_mitigation.model import graph
-
+    if (data is None) == (from_bag is None):
+        raise ParameterError("what to train on", valid="one of --data and --from-bag")
+    if from_bag is None and (truth or model):
+        raise ParameterError("--truth and --model", valid="with --from-bag")
     if scaling not in {kind.value for kind in Scaling}:
         raise ParameterError(f"scaling {scaling!r}", valid=", ".join(kind.value for kind in Scaling))
     if per_configuration < 1:
         raise ParameterError(f"per-configuration = {per_configuration}", valid="1 or more")
     given = {"epochs": epochs, "learning_rate": learning_rate, "seed": seed}
     options = FitOptions(**{key: value for key, value in given.items() if value is not None})  # type: ignore[arg-type]
-    recipe = recipes.Recipe(
-        Remnet(samples=samples, first_kernel=first_kernel), options, prior, per_configuration
-    )
+    architecture = Remnet(samples=samples, first_kernel=first_kernel)
     _check_output(output)
+    _needs_torch()
+    if from_bag is not None:
+        _site(from_bag, truth or [], model, output, options, folds, seed, json)
+        return
+    assert data is not None
+    from uwb_mitigation.training import choosing
+    from uwb_mitigation.training import recipe as recipes
+
+    if choose not in ("auto", *choosing.STANDARD):
+        raise ParameterError(f"recipe {choose!r}", valid=", ".join(("auto", *choosing.STANDARD)))
+    choose = choose if prior else choosing.NETWORK
+    recipe = recipes.Recipe(architecture, options, per_configuration=per_configuration)
     dataset, name = _dataset(data, Preprocessing(samples, Scaling(scaling)))
+    choice = None
+    if choose == "auto":
+        choice = _choose(dataset, choosing.standard(recipe), folds, seed)
+        recipe = choosing.recipe_of(choice.chosen, recipe)
+    else:
+        recipe = replace(
+            recipe,
+            line=choose in (choosing.LINE, choosing.LINE_NETWORK),
+            network=choose in (choosing.LINE_NETWORK, choosing.NETWORK),
+        )
+    _train(dataset, name, recipe, choice, output, folds, seed, json)
+
+
+def _train(
+    dataset: Dataset,
+    name: str,
+    recipe: Recipe,
+    choice: Choice | None,
+    output: Path,
+    folds: int,
+    seed: int,
+    json: Path | None,
+) -> None:
+    from uwb_mitigation.model import graph
+    from uwb_mitigation.model.bundle import save_bundle
+    from uwb_mitigation.training import recipe as recipes
+
     with console.progress() as bar:
-        task = bar.add_task("training", total=options.epochs * (folds + 1))
+        task = bar.add_task("training", total=recipe.fit.epochs * (folds + 1))
 
         def advance() -> None:
             bar.advance(task)
@@ -91,8 +136,8 @@ def train(
         line, network = recipes.fit_model(dataset, recipe, advance)
     card = recipes.describe(output.stem, recipe, line, validation, name)
     bundle = save_bundle(output, graph.float_model(network), card)
-    _show_validation(validation)
-    _show_bundle(bundle)
+    model_tables.show_validation(validation)
+    model_tables.show_bundle(bundle)
     console.write_json(
         json,
         {
@@ -104,6 +149,67 @@ def train(
                 key: {"n": n, "raw_mae": before, "corrected_mae": after}
                 for key, (n, before, after) in validation.by_configuration("int8").items()
             },
+            **({} if choice is None else {"choice": choice.as_json()}),
+        },
+    )
+
+
+def _choose(dataset: Dataset, candidates: Sequence[Candidate], folds: int, seed: int) -> Choice:
+    from uwb_mitigation.training import choosing
+
+    with console.progress() as bar:
+        total = choosing.fits(folds, len(dataset.names), len(candidates))
+        task = bar.add_task("choosing", total=total)
+        choice = choosing.choose(dataset, candidates, folds, seed, lambda: bar.advance(task))
+    model_tables.show_choice(choice, len(dataset.names))
+    return choice
+
+
+def _site(
+    bag: Path,
+    truth: list[Path],
+    model: Path | None,
+    output: Path,
+    options: FitOptions,
+    folds: int,
+    seed: int,
+    json: Path | None,
+) -> None:
+    from uwb_mitigation.dataset import build_dataset
+    from uwb_mitigation.model import graph
+    from uwb_mitigation.model.bundle import load_bundle, save_bundle
+    from uwb_mitigation.model.shipped import default_model_path
+    from uwb_mitigation.sources.truth_table import load_truth, with_truth
+    from uwb_mitigation.training import site
+
+    source = load_bundle(model or default_model_path())
+    candidates = site.candidates(source, options)
+    stretches = [row for path in truth for row in load_truth(path)]
+    records = _records(bag)
+    dataset = build_dataset(with_truth(records, stretches) if stretches else records, source.preprocessing)
+    for reason, count in dataset.refused.items():
+        console.err.print(f"left out: {count} x {reason}", markup=False)
+    folds = min(folds, len(dataset.names))
+    choice = _choose(dataset, candidates, folds, seed)
+    graded = site.fit_chosen(dataset, choice, candidates, source, options, output.stem, bag.resolve().name)
+    bundle = save_bundle(output, graph.float_model(graded.network), graded.card)
+    mae = choice.mae()
+    for before in ("raw", candidates[0].name):
+        change = mae[site.NESTED] / mae[before] - 1
+        console.out.print(
+            f"on configurations not seen, {mae[site.NESTED]:.3f} m against {mae[before]:.3f} m {before}: "
+            f"{abs(change):.0%} {'lower' if change < 0 else 'higher: this did not help'}",
+            highlight=False,
+        )
+    model_tables.show_bundle(bundle)
+    console.write_json(
+        json,
+        {
+            "model_id": bundle.model_id,
+            "n": len(dataset),
+            "refused": dict(dataset.refused),
+            "helped": mae[site.NESTED] < min(mae["raw"], mae[candidates[0].name]),
+            "choice": choice.as_json(),
         },
     )
 
@@ -139,7 +245,7 @@ def quantize(
     difference = np.abs(IntegerNetwork(integers).predict_m(inputs) - floating.predict_m(network, inputs))
     card = replace(source.card, name=output.stem, quantised=True)
     bundle = save_bundle(output, graph.int8_model(integers), card)
-    _show_bundle(bundle)
+    model_tables.show_bundle(bundle)
     console.out.print(
         f"int8 differs from float by {difference.mean():.4f} m on average, {difference.max():.4f} m at most"
     )
@@ -160,9 +266,26 @@ def quantize(
 def evaluate(
     data: DataOption,
     model: Annotated[Path | None, typer.Option(help="Bundle; without it, the shipped one.")] = None,
+    cross_validate: Annotated[
+        str | None,
+        typer.Option(
+            metavar="GROUP",
+            help="Instead, fit the shipped recipe and what it must beat anew, and test them on what was held "
+            "out: configuration, tag (each location in turn) or half (of the anchors).",
+        ),
+    ] = None,
+    seeds: Annotated[int, typer.Option(help="With --cross-validate: splits and networks.")] = 3,
+    folds: Annotated[int, typer.Option(help="With --cross-validate configuration.")] = 6,
     json: JsonOption = None,
 ) -> None:
     """Correct a recording that knows its true ranges, and tell the error before and after."""
+    if cross_validate is not None:
+        if model is not None:
+            raise ParameterError(
+                "--model with --cross-validate", valid="one of them: cross-validation fits models of its own"
+            )
+        _contest(data, cross_validate, folds, seeds, json)
+        return
     from uwb_mitigation.evaluation import outcome
     from uwb_mitigation.mitigation import Mitigation
     from uwb_mitigation.model.bundle import load_bundle
@@ -170,8 +293,45 @@ def evaluate(
 
     mitigation = Mitigation(load_bundle(model or default_model_path()))
     result = outcome.evaluate(mitigation, _records(data))
-    _show_outcome(result)
+    model_tables.show_outcome(result)
     console.write_json(json, result.as_json())
+
+
+def _contest(data: Path, group: str, folds: int, seeds: int, json: Path | None) -> None:
+    from uwb_mitigation.evaluation import splits
+    from uwb_mitigation.model.architecture import Remnet
+    from uwb_mitigation.preprocessing import Preprocessing
+    from uwb_mitigation.training.options import FitOptions
+
+    if group not in {kind.value for kind in splits.Group}:
+        raise ParameterError(
+            f"cross-validate = {group!r}", valid=", ".join(kind.value for kind in splits.Group)
+        )
+    if not 1 <= seeds <= 100:
+        raise ParameterError(f"seeds = {seeds}", valid="1 to 100")
+    _needs_torch()
+    from uwb_mitigation.training import contest
+    from uwb_mitigation.training.recipe import Recipe
+
+    dataset, _ = _dataset(data, Preprocessing())
+    kind = splits.Group(group)
+    with console.progress() as bar:
+        total = seeds * len(splits.by_group(dataset, kind, folds, 0))
+        task = bar.add_task("cross-validating", total=total)
+        result = contest.run(
+            dataset, Recipe(Remnet(), FitOptions()), kind, folds, seeds, lambda: bar.advance(task)
+        )
+    model_tables.show_contest(result)
+    console.write_json(json, result.as_json())
+
+
+def _needs_torch() -> None:
+    try:
+        import torch  # noqa: F401
+    except ModuleNotFoundError as error:
+        if error.name != "torch":
+            raise
+        raise MissingDependencyError("training needs torch", valid="run `make setup-training`") from error
 
 
 def _records(data: Path) -> Iterator[Record]:
@@ -202,45 +362,3 @@ def _check_output(output: Path) -> None:
         raise ParameterError(
             "not a place for a bundle", where=str(output), valid="a file .onnx in a folder that exists"
         )
-
-
-def _show_validation(validation: CrossValidation) -> None:
-    table = Table(title=f"{validation.folds}-fold cross-validation by configuration, m")
-    table.add_column("")
-    for column in ("MAE", "std", "p95"):
-        table.add_column(column, justify="right")
-    for row, statistics in validation.statistics().items():
-        table.add_row(_ROWS[row], *(f"{value:.3f}" for value in statistics.values()))
-    console.out.print(table)
-
-
-def _show_bundle(bundle: Bundle) -> None:
-    kind = "int8" if bundle.quantised else "float32"
-    console.out.print(
-        f"{bundle.path}: {kind}, {len(bundle.model)} bytes, model id {bundle.model_id:08x}",
-        markup=False,
-        soft_wrap=True,
-        highlight=False,
-    )
-
-
-def _show_outcome(result: Outcome) -> None:
-    table = Table(title=f"{result.n} ranges, model {result.model_id:08x}, m")
-    table.add_column("")
-    for column in ("n", "raw MAE", "corrected MAE", "std", "p95"):
-        table.add_column(column, justify="right")
-    table.add_row(
-        "all",
-        f"{result.n}",
-        f"{result.raw.mae:.3f}",
-        f"{result.corrected.mae:.3f}",
-        f"{result.corrected.std:.3f}",
-        f"{result.corrected.p95:.3f}",
-        end_section=True,
-    )
-    for label, (n, before, after) in result.by_label.items():
-        table.add_row(label or "no label", f"{n}", f"{before:.3f}", f"{after:.3f}")
-    console.out.print(table)
-    for status, count in result.statuses.items():
-        if status != "OK":
-            console.out.print(f"{status}: {count} ranges passed through as measured", highlight=False)

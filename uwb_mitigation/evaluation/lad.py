@@ -36,13 +36,13 @@ def fit_prior(
     known = np.isfinite(gap)
     names = np.unique(configurations[known])
     if len(names) < MIN_CONFIGURATIONS:
-        return _constant(configurations, error_m)
+        return constant(configurations, error_m)
     rows = [known & (configurations == name) for name in names]
     design = np.array(
         [(1.0, rx_power_dbm[row].mean(dtype=float), gap[row].mean(dtype=float)) for row in rows]
     )
     if np.linalg.matrix_rank(design, tol=1e-3) < design.shape[1]:
-        return _constant(configurations, error_m)
+        return constant(configurations, error_m)
     target = np.array([error_m[row].mean(dtype=float) for row in rows])
     offset, per_rx_power, per_power_gap = (
         float(np.float32(value)) for value in least_absolute_deviations(design, target)
@@ -79,6 +79,7 @@ def least_absolute_deviations(
     return coefficients / np.where(size > 0, size, 1)
 
 
-def _constant(configurations: NDArray[np.str_], error_m: NDArray[np.floating]) -> LinePrior:
+def constant(configurations: NDArray[np.str_], error_m: NDArray[np.floating]) -> LinePrior:
+    """The median over configurations of their mean errors; arguments of shape (n,), n > 0."""
     means = [error_m[configurations == name].mean(dtype=float) for name in np.unique(configurations)]
     return LinePrior(float(np.float32(np.median(means))))

@@ -57,3 +57,23 @@ def coverage(
 ) -> float:
     """The share of errors within `sigmas` standard deviations of zero."""
     return float(np.mean(np.abs(error_m) <= sigmas * np.sqrt(variance_m2)))
+
+
+def bootstrap_interval(
+    error_m: NDArray[np.floating], configurations: NDArray[np.str_], seed: int, draws: int = 2000
+) -> tuple[float, float]:
+    """The 95 % interval of the mean absolute error of errors (n,), by drawing whole configurations with replacement.
+
+    Percentile bootstrap (Efron and Tibshirani, "An Introduction to the Bootstrap", chapter 13) over clusters.
+    """
+    _, of, count = np.unique(configurations, return_inverse=True, return_counts=True)
+    total = np.bincount(of, np.abs(error_m))
+    drawn = np.random.default_rng(seed).integers(0, len(count), (draws, len(count)))
+    low, high = np.percentile(total[drawn].sum(axis=1) / count[drawn].sum(axis=1), (2.5, 97.5))
+    return float(low), float(high)
+
+
+def kept_mae(error_m: NDArray[np.floating], variance_m2: NDArray[np.floating], rejected: float) -> float:
+    """MAE of errors (n,) that are left when the share `rejected` of them, largest variance first, is not used."""
+    kept = np.argsort(variance_m2, kind="stable")[: max(1, round((1 - rejected) * len(error_m)))]
+    return float(np.abs(error_m[kept]).mean())

@@ -6,12 +6,25 @@ would test whether a model remembers the place, not whether it corrects a range.
 
 from __future__ import annotations
 
+import enum
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError, ParameterError
+
+if TYPE_CHECKING:
+    from uwb_mitigation.dataset import Dataset
+
+
+class Group(str, enum.Enum):
+    """What is held out as a whole."""
+
+    CONFIGURATION = "configuration"
+    TAG = "tag"
+    HALF = "half"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,6 +55,36 @@ def by_configuration(configurations: NDArray[np.str_], folds: int, seed: int) ->
     for part in np.array_split(order, folds):
         held_out = np.isin(configurations, names[part])
         splits.append(Split(np.flatnonzero(~held_out), np.flatnonzero(held_out)))
+    return splits
+
+
+def by_group(dataset: Dataset, group: Group, folds: int, seed: int) -> list[Split]:
+    """The splits that `group` names; every configuration lies on one side of each.
+
+    CONFIGURATION: `folds` folds of configurations. TAG: each tag location is left out in turn. HALF: the
+    anchors in the order of their identities, those of the first half against the others, both ways.
+
+    Raises:
+        ParameterError, DatasetError: see `by_configuration`; a tag's or anchor's split needs two of them.
+    """
+    if group is Group.CONFIGURATION:
+        return by_configuration(dataset.configurations, folds, seed)
+    ids = dataset.tags if group is Group.TAG else dataset.anchors
+    found = np.unique(ids) if ids is not None else np.zeros(0, np.uint64)
+    if ids is None or len(found) < 2:
+        raise DatasetError(
+            f"{len(found)} {'tags' if group is Group.TAG else 'anchors'} do not make a split",
+            valid="2 or more",
+        )
+    parts = found[:, None] if group is Group.TAG else np.array_split(found, 2)
+    splits = []
+    for part in parts:
+        held_out = np.isin(ids, part)
+        # Measurements without a configuration's name count as one: they must not lie on both sides.
+        apart = ~np.isin(dataset.configurations, np.unique(dataset.configurations[held_out]))
+        if not apart.any():
+            raise DatasetError("one configuration holds every tag or anchor", valid="named configurations")
+        splits.append(Split(np.flatnonzero(apart), np.flatnonzero(held_out)))
     return splits
 
 

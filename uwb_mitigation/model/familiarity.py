@@ -28,6 +28,31 @@ _SQUARE, _LINEAR, _CONSTANT = np.float32(-4 / 3), np.float32(4), np.float32(8 / 
 
 
 @dataclass(frozen=True, slots=True)
+class Widening:
+    """How far beyond the training data a feature still counts as familiar, in half widths of the data.
+
+    Attributes:
+        below, above: of the lowest and the highest value.
+        least: the half width counts as at least so much.
+    """
+
+    below: float
+    above: float
+    least: float
+
+
+# A placement farther off or behind one more wall is what a model is for, and its error itself lengthens the range. A signal stronger than any of the training
+# data, or a first path stronger than the line of sight had, is another radio's.
+_WIDENINGS = (
+    Widening(1.0, 2.0, 1.0),
+    Widening(1.0, 0.0, 3.0),
+    Widening(0.0, 1.0, 3.0),
+    Widening(1.0, 1.0, 1.5),
+    Widening(1.0, 1.0, 1.5),
+)
+
+
+@dataclass(frozen=True, slots=True)
 class Band:
     """Values from `low` to `high` are familiar; `margin` beyond them they are wholly strange."""
 
@@ -43,10 +68,12 @@ class Band:
             raise ModelError(f"the band {astuple(self)}", valid="low <= high, and a positive margin")
 
     @classmethod
-    def of(cls, values: NDArray[np.floating], least_margin: float) -> Band:
-        """The band of finite values (n,); its margin is half its width, or `least_margin` where that is more."""
+    def of(cls, values: NDArray[np.floating], widening: Widening) -> Band:
+        """The band of finite values (n,), widened; its margin is half the width that they have."""
         low, high = float(values.min()), float(values.max())
-        return cls(*(float(np.float32(value)) for value in (low, high, max((high - low) / 2, least_margin))))
+        half = max((high - low) / 2, widening.least)
+        bounds = (low - widening.below * half, high + widening.above * half, half)
+        return cls(*(float(np.float32(value)) for value in bounds))
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,11 +115,8 @@ class Familiarity:
         values = values[np.isfinite(values).all(axis=1)]
         if not len(values):
             raise ModelError("no measurement has all the features of familiarity")
-        bands = (Band.of(column, least) for column, least in zip(values.T, _LEAST_MARGINS, strict=True))
+        bands = (Band.of(column, widening) for column, widening in zip(values.T, _WIDENINGS, strict=True))
         return cls(float(np.float32(known_offset_m)), *bands)
-
-
-_LEAST_MARGINS = (1.0, 3.0, 3.0, 3.0, 3.0)
 
 
 def features(

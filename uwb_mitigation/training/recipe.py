@@ -12,14 +12,18 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.dataset import Dataset
 from uwb_mitigation.evaluation import lad, splits
+from uwb_mitigation.evaluation.intervals import calibrate
 from uwb_mitigation.evaluation.metrics import ErrorStatistics, mae_by_group
 from uwb_mitigation.model import floating
 from uwb_mitigation.model.architecture import Remnet
 from uwb_mitigation.model.bundle import Card
+from uwb_mitigation.model.familiarity import Familiarity, features
 from uwb_mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.model.prior import LinePrior
 from uwb_mitigation.model.weights import FloatWeights
-from uwb_mitigation.training.fitting import FitOptions, fit
+from uwb_mitigation.preprocessing import Scaling
+from uwb_mitigation.training.fitting import FitOptions, fit, single_thread
+from uwb_mitigation.training.networks import RemnetModule
 from uwb_mitigation.training.quantization import calibration_inputs, quantize
 
 
@@ -31,6 +35,8 @@ class Recipe:
         architecture: the network.
         fit: how it is fitted.
         line: fit a line prior; False = the network predicts the whole error.
+        network: fit the network; False = it is left as it is initialised, and predicts 0. With neither, the
+            prior is a constant.
         per_configuration: at most so many measurements of one configuration are fitted to, so that
             a long recording of one place does not outweigh a short one.
     """
@@ -39,6 +45,7 @@ class Recipe:
     fit: FitOptions
     line: bool = True
     per_configuration: int = 20
+    network: bool = True
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,24 +78,29 @@ def cross_validate(
     folds: int,
     seed: int,
     on_epoch: Callable[[], None] = lambda: None,
+    *,
+    quantised: bool = True,
 ) -> CrossValidation:
     """Make the model once for each fold of configurations, without them, and test it on them.
 
     Raises:
         DatasetError, ParameterError: see `splits.by_configuration` and `fit`.
     """
-    names = ("raw", "overall_median", *(("l1_line",) if recipe.line else ()), "float", "int8")
+    names = ("raw", "overall_median", *(("l1_line",) if recipe.line else ()), "float")
+    if quantised:
+        names = (*names, "int8")
     errors = {name: dataset.error_m.copy() for name in names}
     for split in splits.by_configuration(dataset.configurations, folds, seed):
         part, held_out = dataset.rows(split.train), dataset.rows(split.test)
         prior, network = fit_model(part, recipe, on_epoch)
-        integers = quantize(network, calibration_inputs(part, seed), exact=False)
-        left = held_out.error_m - _prior_m(prior, held_out)
+        left = held_out.error_m - prior_m(prior, held_out)
         errors["overall_median"][split.test] -= np.median(part.error_m)
         if recipe.line:
             errors["l1_line"][split.test] = left
         errors["float"][split.test] = left - floating.predict_m(network, held_out.inputs)
-        errors["int8"][split.test] = left - IntegerNetwork(integers).predict_m(held_out.inputs)
+        if quantised:
+            integers = quantize(network, calibration_inputs(part, seed), exact=False)
+            errors["int8"][split.test] = left - IntegerNetwork(integers).predict_m(held_out.inputs)
     return CrossValidation(dataset, errors, folds, seed)
 
 
@@ -101,39 +113,68 @@ def fit_model(
         DatasetError: see `fit`.
     """
     prior = LinePrior(0.0)
-    if recipe.line:
+    if not (recipe.line or recipe.network):
+        prior = lad.constant(dataset.configurations, dataset.error_m)
+    elif recipe.line:
         prior = lad.fit_prior(
             dataset.configurations,
             dataset.rx_power_dbm,
             dataset.first_path_power_dbm,
             dataset.error_m,
         )
+    if not recipe.network:
+        with single_thread(recipe.fit.seed):
+            return prior, RemnetModule(recipe.architecture, 0).weights()
     part = dataset.rows(splits.thinned(dataset.configurations, recipe.per_configuration, recipe.fit.seed))
-    left = part.error_m - _prior_m(prior, part)
+    left = part.error_m - prior_m(prior, part)
     # Measurements whose power is unknown have no prior, and are passed through where it is needed.
     known = np.isfinite(left)
     network = fit(recipe.architecture, part.inputs[known], left[known], recipe.fit, on_epoch)
     return prior, network
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class GradedModel:
+    """A float network and a card whose prior, intervals and familiarity belong to it."""
+
+    card: Card
+    network: FloatWeights
+
+
+def fit_graded(
+    dataset: Dataset, recipe: Recipe, inner_folds: int, on_epoch: Callable[[], None] = lambda: None
+) -> GradedModel:
+    """The model of all of the dataset; its intervals are calibrated by cross-validation within it.
+
+    Raises:
+        DatasetError: see `cross_validate`.
+    """
+    folds = min(inner_folds, len(dataset.names))
+    validation = cross_validate(dataset, recipe, folds, recipe.fit.seed, on_epoch, quantised=False)
+    prior, network = fit_model(dataset, recipe, on_epoch)
+    return GradedModel(describe("", recipe, prior, validation, ""), network)
+
+
 def describe(name: str, recipe: Recipe, prior: LinePrior, validation: CrossValidation, data: str) -> Card:
     """The card of the float model that `recipe` makes of the whole dataset.
 
-    The variances are those of a Gaussian with the 95th percentile that the absolute errors on held-out
-    configurations have: the errors have heavy tails, which would make the mean square tell of the
-    one or two worst configurations alone.
+    Variances are conformal (see `intervals`): of corrected ranges from the errors left on held-out configurations;
+    of ranges passed through from the raw errors.
     """
     dataset = validation.dataset
     low, high = float(dataset.error_m.min()), float(dataset.error_m.max())
     margin = max(high - low, 0.1) / 2
+    left = validation.errors["float"]
+    corrected = calibrate(left, dataset.error_m - left, dataset.configurations)
+    raw = calibrate(dataset.error_m, np.zeros(len(dataset)), dataset.configurations)
     return Card(
         name=name,
         architecture=recipe.architecture,
         preprocessing=dataset.preprocessing,
         prior=prior,
         quantised=False,
-        variance_m2=_variance(validation.errors["float"]),
-        variance_uncorrected_m2=_variance(validation.errors["raw"]),
+        variance_m2=corrected.variance_m2,
+        variance_uncorrected_m2=raw.variance_m2,
         correction_limits_m=(_float32(low - margin), _float32(high + margin)),
         training={
             "data": data,
@@ -142,22 +183,37 @@ def describe(name: str, recipe: Recipe, prior: LinePrior, validation: CrossValid
             "split": f"{validation.folds} folds by configuration",
             "seed": validation.seed,
             "recipe": asdict(recipe.fit)
-            | {"line": recipe.line, "per_configuration": recipe.per_configuration},
+            | {"line": recipe.line, "network": recipe.network, "per_configuration": recipe.per_configuration},
             "metrics_m": {
                 row: {key: round(value, 4) for key, value in statistics.items()}
                 for row, statistics in validation.statistics().items()
             },
         },
+        variance_per_m2=corrected.variance_per_m2,
+        interval95_sigmas=corrected.sigmas95,
+        familiarity=_familiarity(dataset),
     )
 
 
-def _prior_m(prior: LinePrior, dataset: Dataset) -> NDArray[np.float32]:
+def _familiarity(dataset: Dataset) -> Familiarity | None:
+    """None where the inputs have no level, or no measurement has both powers."""
+    if dataset.preprocessing.scaling is not Scaling.PREAMBLE:
+        return None
+    values = features(
+        dataset.inputs,
+        dataset.range_m.astype(np.float32),
+        dataset.rx_power_dbm,
+        dataset.first_path_power_dbm,
+    )
+    if not np.isfinite(values).all(axis=1).any():
+        return None
+    means = [dataset.error_m[dataset.configurations == name].mean() for name in dataset.names]
+    return Familiarity.of(float(np.median(means)), values)
+
+
+def prior_m(prior: LinePrior, dataset: Dataset) -> NDArray[np.float32]:
+    """What the prior predicts of each measurement, m; NaN where it needs a power that is unknown."""
     return prior.predict_batch_m(dataset.rx_power_dbm, dataset.first_path_power_dbm)
-
-
-def _variance(error_m: NDArray[np.float64]) -> float:
-    known = np.abs(error_m[np.isfinite(error_m)])
-    return _float32(max(float(np.percentile(known, 95)) / 1.96, 1e-3) ** 2)
 
 
 def _float32(value: float) -> float:

@@ -1,0 +1,186 @@
+"""Choosing what a data set can carry, and fitting a model to a site of one's own."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from model_material import bundle, dataset, measurement, record
+from typer.testing import CliRunner
+
+from uwb_mitigation.cli import app
+from uwb_mitigation.errors import ParameterError, RecordingError
+from uwb_mitigation.model.architecture import Remnet
+from uwb_mitigation.model.bundle import load_bundle
+from uwb_mitigation.model.prior import LinePrior
+from uwb_mitigation.sources import opening
+from uwb_mitigation.sources.source import Record
+from uwb_mitigation.sources.truth_table import load_truth, with_truth
+
+pytest.importorskip("torch", reason="run `make setup-training`")
+from uwb_mitigation.training import choosing
+from uwb_mitigation.training.choosing import Candidate, Choice
+from uwb_mitigation.training.fitting import FitOptions
+from uwb_mitigation.training.recipe import Recipe, fit_model
+
+SHAPE = Remnet(samples=8)
+CONSTANTS = [
+    Candidate(name, lambda data, seed, offset=offset: (LinePrior(offset), None))
+    for name, offset in (("none", 0.0), ("half", 0.5), ("quarter", 0.25))
+]
+
+
+def numbered(error_of) -> object:
+    """A dataset of 12 configurations whose errors are those of `error_of`(configuration number)."""
+    data = dataset(12, 5, samples=8)
+    error = np.array([error_of(int(name[1:])) for name in data.configurations], float)
+    return replace(data, error_m=error, range_m=3.0 + error)
+
+
+def test_the_simplest_is_kept_unless_a_richer_one_gains():
+    assert choosing.simplest({"a": np.array([1.0]), "b": np.array([0.99]), "c": np.array([0.9])}) == "c"
+    assert choosing.simplest({"a": np.array([1.0]), "b": np.array([0.99])}) == "a"
+
+
+def test_a_constant_error_needs_no_line():
+    recipe = Recipe(SHAPE, FitOptions(epochs=1))
+    choice = choosing.choose(numbered(lambda number: 0.3), choosing.standard(recipe), 3, 0)
+    assert choice.chosen == choosing.CONSTANT
+    assert choice.mae()[choosing.NESTED] < 1e-6
+
+
+def test_an_error_that_follows_the_power_needs_a_line():
+    data = dataset(14, 5, samples=8)
+    error = -5.1 - 0.069 * data.rx_power_dbm.astype(float)
+    recipe = Recipe(SHAPE, FitOptions(epochs=1))
+    choice = choosing.choose(replace(data, error_m=error), choosing.standard(recipe), 3, 0)
+    assert choice.chosen == choosing.LINE
+
+
+def test_what_is_told_of_the_choice_was_not_chosen_on():
+    # The candidate that is best in each fold is worst elsewhere: only a nested test can tell.
+    data = numbered(lambda number: 0.5 if number < 6 else 0.0)
+    choice = choosing.choose(data, CONSTANTS[:2], 2, 0)
+    names = data.configurations
+    for part in (names == "c0", names == "c11"):
+        assert np.isin(np.abs(choice.errors[choosing.NESTED][part]), (0.0, 0.5)).all()
+    assert choice.mae()[choosing.NESTED] >= min(choice.mae()[name] for name in ("none", "half"))
+
+
+def test_the_curve_tells_how_many_configurations_would_do():
+    points = tuple((n, 0.1 + 1.0 / n) for n in (5, 10, 20))
+    choice = Choice("line", {}, points, 3, 0)
+    # 0.95 x 0.15 = 0.1425 = 0.1 + 1 / n
+    assert choice.needed() == pytest.approx(24, abs=1)
+
+
+@pytest.mark.parametrize("points", [((5, 0.2), (10, 0.2), (20, 0.2)), ((5, 0.1), (10, 0.2), (20, 0.3)), ()])
+def test_a_curve_that_is_flat_promises_nothing(points):
+    assert Choice("line", {}, points, 3, 0).needed() is None
+
+
+@pytest.mark.parametrize("name", [choosing.CONSTANT, choosing.LINE])
+def test_a_recipe_without_network_leaves_it_silent(name):
+    data = dataset(8, 5, samples=8)
+    prior, network = fit_model(data, choosing.recipe_of(name, Recipe(SHAPE, FitOptions(epochs=1))))
+    assert not any(values.any() for key, values in network.weight.items() if key == "head")
+    assert prior.needs_power == (name == choosing.LINE)
+
+
+def write(folder, *rows: str, header: str = "tag_id,anchor_id,range_m,start_s,stop_s,configuration"):
+    path = folder / "truth.csv"
+    path.write_text("\n".join((header, *rows)) + "\n")
+    return path
+
+
+def at(seconds: float) -> Record:
+    return Record(replace(measurement(3.0), stamp_ns=10**18 + round(seconds * 1e9)))
+
+
+def test_a_truth_table_gives_pairs_and_times_their_ranges(tmp_path):
+    table = load_truth(write(tmp_path, "1,2,2.5,0,10,door", "1,2,3.5,10,,"))
+    truths = [item.truth for item in with_truth([at(0), at(9.9), at(10), at(500)], table)]
+    assert [truth.range_m for truth in truths] == [2.5, 2.5, 3.5, 3.5]
+    assert truths[0].configuration == "door"
+    assert truths[2].configuration == "truth.csv line 3"
+
+
+def test_a_pair_that_is_not_in_the_table_has_no_truth(tmp_path):
+    table = load_truth(write(tmp_path, "1,3,2.5,,,"))
+    assert next(with_truth([at(0)], table)).truth is None
+
+
+@pytest.mark.parametrize(
+    ("row", "named"),
+    [
+        ("1,2,nan,,,", "range_m"),
+        ("1,2,-1,,,", "range_m"),
+        ("one,2,3,,,", "tag_id"),
+        ("1,99999999999999999999,3,,,", "anchor_id"),
+        ("1,2,3,5,5,", "start_s"),
+        ("1,2", "range_m"),
+    ],
+)
+def test_a_row_that_is_wrong_is_named(tmp_path, row, named):
+    with pytest.raises(RecordingError, match=named) as caught:
+        load_truth(write(tmp_path, row))
+    assert "line 2" in str(caught.value)
+
+
+def test_a_table_that_is_none_is_refused(tmp_path):
+    (tmp_path / "binary.csv").write_bytes(b"\xff\x00\xfe")
+    for path in (tmp_path / "absent.csv", tmp_path / "binary.csv", write(tmp_path)):
+        with pytest.raises(RecordingError):
+            load_truth(path)
+    with pytest.raises(RecordingError, match="anchor_id"):
+        load_truth(write(tmp_path, "1,2", header="tag_id,range_m"))
+
+
+class Recorded(list):
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        return None
+
+
+def run(*arguments: object):
+    return CliRunner().invoke(app, [str(value) for value in arguments], catch_exceptions=True)
+
+
+def test_a_bag_of_ones_own_refits_the_offset_and_says_what_it_helped(tmp_path, monkeypatch):
+    started = bundle(tmp_path, Remnet(samples=32), prior=LinePrior(5.0))
+    records = [
+        replace(record(10 * place + number), truth=None, measurement=replace(
+            measurement(3.25, 10 * place + number), tag_id=place))
+        for place in range(8)
+        for number in range(4)
+    ]  # fmt: skip
+    monkeypatch.setattr(opening, "open_recording", lambda path: Recorded(records))
+    table = write(tmp_path, *(f"{place},2,3.0,,,place {place}" for place in range(8)))
+    output, result = tmp_path / "own.onnx", tmp_path / "own.json"
+    done = run(
+        "train", "--from-bag", "bag", "--truth", table, "--model", started.path, "-o", output,
+        "--epochs", 1, "--folds", 2, "--json", result,
+    )  # fmt: skip
+    assert done.exit_code == 0, done.output
+    found = json.loads(result.read_text())
+    assert found["helped"]
+    assert found["choice"]["chosen"] in ("own offset", "constant")
+    assert load_bundle(output).card.training["started_from"] == f"{started.model_id:08x}"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        (),
+        ("--data", "a", "--from-bag", "b"),
+        ("--data", "a", "--truth", "c"),
+        ("--data", "a", "--recipe", "best"),
+    ],
+)
+def test_contradictory_requests_are_refused(tmp_path, arguments):
+    result = run("train", *arguments, "-o", tmp_path / "x.onnx")
+    assert isinstance(result.exception, ParameterError)

@@ -1,0 +1,122 @@
+"""The tables in which `train` and `evaluate` show their results to a person."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rich.table import Table
+
+from uwb_mitigation.commands import console
+
+if TYPE_CHECKING:
+    from uwb_mitigation.evaluation.outcome import Outcome
+    from uwb_mitigation.model.bundle import Bundle
+    from uwb_mitigation.training.choosing import Choice
+    from uwb_mitigation.training.contest import Contest
+    from uwb_mitigation.training.recipe import CrossValidation
+
+# Seen in rows of the cross-validation table, in this order.
+_ROWS = {
+    "raw": "raw",
+    "overall_median": "overall median",
+    "l1_line": "line",
+    "float": "model, float",
+    "int8": "model, int8",
+}
+
+
+def show_choice(choice: Choice, configurations: int) -> None:
+    table = Table(title=f"{configurations} configurations, {choice.folds} folds by configuration, m")
+    table.add_column("")
+    table.add_column("MAE", justify="right")
+    for row, mae in choice.mae().items():
+        table.add_row(row + (" <- chosen" if row == choice.chosen else ""), f"{mae:.3f}")
+    console.out.print(table)
+    curve = ", ".join(f"{count}: {mae:.3f}" for count, mae in choice.curve)
+    needed = choice.needed()
+    outlook = (
+        "more configurations of this kind are not expected to lower it by 5 %"
+        if needed is None
+        else f"some {needed} would be needed to lower it by 5 %"
+    )
+    console.out.print(
+        f"{choice.chosen}, MAE by number of configurations: {curve}; {outlook}",
+        highlight=False,
+        soft_wrap=True,
+    )
+
+
+def show_validation(validation: CrossValidation) -> None:
+    table = Table(title=f"{validation.folds}-fold cross-validation by configuration, m")
+    table.add_column("")
+    for column in ("MAE", "std", "p95"):
+        table.add_column(column, justify="right")
+    for row, statistics in validation.statistics().items():
+        table.add_row(_ROWS[row], *(f"{value:.3f}" for value in statistics.values()))
+    console.out.print(table)
+
+
+def show_contest(result: Contest) -> None:
+    labels = list(result.rows[0].by_label)
+    table = Table(
+        title=f"{result.configurations} configurations, {result.folds} splits by {result.group.value}, "
+        f"mean of {result.seeds} seeds, MAE in m"
+    )
+    table.add_column("")
+    for column in ("MAE", "std", "95 % interval", *(label or "no label" for label in labels)):
+        table.add_column(column, justify="right")
+    for row in result.rows:
+        low, high = row.ci95
+        table.add_row(
+            row.name,
+            f"{row.mae_mean:.3f}",
+            f"{row.mae_std:.3f}",
+            f"{low:.3f}-{high:.3f}",
+            *(f"{row.by_label[label]:.3f}" for label in labels),
+        )
+    console.out.print(table)
+    by_label = ", ".join(
+        f"{label or 'no label'} {narrow:.0%} and {wide:.0%}"
+        for label, (narrow, wide) in result.coverage_by_label.items()
+    )
+    kept = ", ".join(f"{share:.0%}: {mae:.3f}" for share, mae in result.rejection)
+    console.out.print(
+        f"shipped_int8: 68 % intervals cover {result.coverage68:.1%}, 95 % intervals {result.coverage95:.1%} "
+        f"({by_label})\n"
+        f"MAE without the ranges of largest variance, by share rejected: {kept}\n"
+        f"passed through as unlike the training data: {result.passed_through:.1%}",
+        highlight=False,
+        soft_wrap=True,
+    )
+
+
+def show_bundle(bundle: Bundle) -> None:
+    kind = "int8" if bundle.quantised else "float32"
+    console.out.print(
+        f"{bundle.path}: {kind}, {len(bundle.model)} bytes, model id {bundle.model_id:08x}",
+        markup=False,
+        soft_wrap=True,
+        highlight=False,
+    )
+
+
+def show_outcome(result: Outcome) -> None:
+    table = Table(title=f"{result.n} ranges, model {result.model_id:08x}, m")
+    table.add_column("")
+    for column in ("n", "raw MAE", "corrected MAE", "std", "p95"):
+        table.add_column(column, justify="right")
+    table.add_row(
+        "all",
+        f"{result.n}",
+        f"{result.raw.mae:.3f}",
+        f"{result.corrected.mae:.3f}",
+        f"{result.corrected.std:.3f}",
+        f"{result.corrected.p95:.3f}",
+        end_section=True,
+    )
+    for label, (n, before, after) in result.by_label.items():
+        table.add_row(label or "no label", f"{n}", f"{before:.3f}", f"{after:.3f}")
+    console.out.print(table)
+    for status, count in result.statuses.items():
+        if status != "OK":
+            console.out.print(f"{status}: {count} ranges passed through as measured", highlight=False)

@@ -1,0 +1,114 @@
+"""A site of one's own: from a model that was trained elsewhere to one that fits other boards and other walls."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from uwb_mitigation.dataset import Dataset
+from uwb_mitigation.errors import ModelError
+from uwb_mitigation.evaluation import lad, splits
+from uwb_mitigation.model import floating, graph
+from uwb_mitigation.model.architecture import HEAD, Remnet
+from uwb_mitigation.model.bundle import Bundle
+from uwb_mitigation.model.weights import FloatWeights, layer_inputs
+from uwb_mitigation.training import choosing
+from uwb_mitigation.training.choosing import NESTED, Candidate, Choice, Fitted
+from uwb_mitigation.training.fitting import FitOptions, fit
+from uwb_mitigation.training.recipe import CrossValidation, GradedModel, Recipe, describe, prior_m
+
+__all__ = ["NESTED", "candidates", "fit_chosen"]
+
+PER_CONFIGURATION = 20
+
+
+def candidates(source: Bundle, options: FitOptions) -> list[Candidate]:
+    """The source's model as it is, with another offset, a constant, a line, and a line with the source's network
+    trained further.
+
+    Raises:
+        ModelError: the source's network is no REMNet.
+    """
+    if not isinstance(source.architecture, Remnet):
+        raise ModelError("no REMNet to start from", where=str(source.path), valid="a bundle of `train`")
+    network = _float_network(source)
+
+    def shifted(data: Dataset, seed: int) -> Fitted:
+        left = data.error_m - prior_m(source.prior, data) - floating.predict_m(network, data.inputs)
+        known = np.isfinite(left)
+        shift = lad.constant(data.configurations[known], left[known]).offset_m if known.any() else 0.0
+        return replace(source.prior, offset_m=float(np.float32(source.prior.offset_m + shift))), network
+
+    def trained(data: Dataset, seed: int) -> Fitted:
+        prior = choosing.line(data)
+        part = data.rows(splits.thinned(data.configurations, PER_CONFIGURATION, seed))
+        left = part.error_m - prior_m(prior, part)
+        known = np.isfinite(left)
+        chosen = replace(options, seed=seed)
+        return prior, fit(source.architecture, part.inputs[known], left[known], chosen, start=network)
+
+    return [
+        Candidate("as shipped", lambda data, seed: (source.prior, network)),
+        Candidate("own offset", shifted),
+        Candidate(
+            choosing.CONSTANT, lambda data, seed: (lad.constant(data.configurations, data.error_m), None)
+        ),
+        Candidate(choosing.LINE, lambda data, seed: (choosing.line(data), None)),
+        Candidate(choosing.LINE_NETWORK, trained),
+    ]
+
+
+def fit_chosen(
+    dataset: Dataset,
+    choice: Choice,
+    every: Sequence[Candidate],
+    source: Bundle,
+    options: FitOptions,
+    name: str,
+    data: str,
+) -> GradedModel:
+    """The chosen model of all of the dataset, its intervals from the errors on held-out configurations."""
+    assert isinstance(source.architecture, Remnet)
+    (candidate,) = (item for item in every if item.name == choice.chosen)
+    prior, network = candidate.fit(dataset, choice.seed)
+    recipe = Recipe(
+        source.architecture,
+        options,
+        line=prior.needs_power,
+        per_configuration=PER_CONFIGURATION,
+        network=network is not None,
+    )
+    validation = CrossValidation(
+        dataset, {**choice.errors, "float": choice.errors[choice.chosen]}, choice.folds, choice.seed
+    )
+    card = describe(name, recipe, prior, validation, data)
+    started = {"started_from": f"{source.model_id:08x}", "chosen": choice.chosen}
+    return GradedModel(
+        replace(card, training={**card.training, **started}),
+        network if network is not None else _silent(_float_network(source)),
+    )
+
+
+def _float_network(source: Bundle) -> FloatWeights:
+    """The float network that an int8 bundle stands for; of a float bundle its own."""
+    if not source.quantised:
+        return graph.float_weights(source.model, source.architecture)
+    integers = graph.int8_weights(source.model, source.architecture)
+    reads = layer_inputs(source.architecture)
+    weight, bias = {}, {}
+    for layer, values in integers.weight.items():
+        scale = integers.weight_scale[layer]
+        shaped = scale if layer == HEAD else scale[:, None, None]
+        weight[layer] = (values * shaped).astype(np.float32)
+        unit = integers.activation_scale[reads[layer]] * scale
+        bias[layer] = (integers.bias[layer] * unit).astype(np.float32)
+    return FloatWeights(source.architecture, weight, bias)
+
+
+def _silent(network: FloatWeights) -> FloatWeights:
+    """The same network with a head that predicts 0."""
+    weight = {**network.weight, HEAD: np.zeros_like(network.weight[HEAD])}
+    bias = {**network.bias, HEAD: np.zeros_like(network.bias[HEAD])}
+    return FloatWeights(network.architecture, weight, bias)
