@@ -119,18 +119,34 @@ def test_a_loop_plays_from_the_start_after_a_seek():
 def test_a_pause_holds_the_records_and_their_time():
     resumed = threading.Event()
 
+    def resume(player: Player) -> None:
+        resumed.set()
+        player.playback.paused = False
+
     def pause(player: Player, sequence: int) -> None:
-        if sequence == 2:
+        if sequence == 1:
             player.playback.paused = True
-            threading.Timer(0.3, lambda: (resumed.set(), setattr(player.playback, "paused", False))).start()
-        if sequence == 3:
+            threading.Timer(0.3, resume, [player]).start()
+        if sequence == 2:
             assert resumed.is_set()
 
-    player = Player(6, 10 * MS, pause).play()
-    assert player.sequences == [0, 1, 2, 3, 4, 5]
+    player = Player(5, 200 * MS, pause).play()
+    assert player.sequences == [0, 1, 2, 3, 4]
     gaps = np.diff(player.stamps)
-    assert gaps[2] > 250 * MS
-    assert list(gaps[3:]) == [10 * MS] * 2
+    # The rest of the wait for the next record comes after the pause.
+    assert gaps[1] > 450 * MS
+    assert list(gaps[2:]) == [200 * MS] * 2
+
+
+def test_a_seek_does_not_wait_for_the_record_that_was_next():
+    def skip(player: Player, sequence: int) -> None:
+        if sequence == 0:
+            player.playback.seek(120.0)
+
+    player = Player(4, 60_000 * MS, skip, loop=False, longest_pause_s=0.3).play()
+    assert player.sequences == [0, 2, 3]
+    first, second, _ = player.stamps
+    assert second - first < 100 * MS
 
 
 def test_the_clock_stands_still_in_a_pause():
