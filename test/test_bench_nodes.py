@@ -16,8 +16,13 @@ from uwb_mitigation_msgs.msg import RangeCorrected
 
 from uwb_mitigation.commands.bench_nodes import _as_json, ratios_of
 from uwb_mitigation.errors import UwbMitigationError
+from uwb_mitigation.measurement import Status
+from uwb_mitigation.mitigation import Mitigation
+from uwb_mitigation.model.bundle import load_bundle
+from uwb_mitigation.model.shipped import default_model_path
 from uwb_mitigation.nodes import bench_nodes, topics, vitals
 from uwb_mitigation.nodes.bench_nodes import RANGES, RATES_HZ, Figures, Latency, Subject, missing_between
+from uwb_mitigation.sources.opening import open_recording
 
 pytestmark = pytest.mark.ros
 
@@ -35,6 +40,17 @@ def test_ranges_that_are_missing_are_counted_across_the_bags_end():
     assert missing_between([RANGES - 2, RANGES - 1, 0, 1]) == 0
     assert missing_between([RANGES - 2, 1]) == 2
     assert missing_between([]) == missing_between([3]) == 0
+
+
+def test_the_benchs_ranges_are_ones_that_the_model_corrects(tmp_path: Path):
+    bench_nodes.write_bag(tmp_path / "ranges.mcap")
+    mitigation = Mitigation(load_bundle(default_model_path()))
+    with open_recording(tmp_path / "ranges.mcap") as source:
+        measurements = [record.measurement for record in source]
+    assert [m.sequence for m in measurements] == list(range(RANGES))
+    assert {len(m.cir) for m in measurements} == {157}
+    statuses = [result.status for result in mitigation.correct_batch(measurements[:500])]
+    assert statuses.count(Status.OK) > 450
 
 
 def figures(rate_hz: float, p99: float) -> Figures:

@@ -37,6 +37,7 @@ from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.nodes import relay, topics, vitals
 from uwb_mitigation.nodes.running import make_executor
+from uwb_mitigation.preprocessing import WINDOW_LEAD
 from uwb_mitigation.sources.simulated import SimulatedSource
 from uwb_mitigation.sources.source import Record
 
@@ -316,7 +317,7 @@ def write_bag(path: Path) -> None:
 
 def _cut(record: Record) -> Record:
     cir = record.measurement.cir
-    start = int(cir.first_path_index) - 10
+    start = int(cir.first_path_index) - WINDOW_LEAD
     samples = cir.samples[2 * start : 2 * (start + WINDOW)]
     return Record(replace(record.measurement, cir=replace(cir, samples=samples, start_index=start)))
 
