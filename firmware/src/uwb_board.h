@@ -1,0 +1,76 @@
+/* The board's side of the wire protocol: what a sketch and bare metal share. uwb_mitigation/link/board.py is the same
+ * in Python.
+ *
+ * No allocation, no globals, and nothing here waits: what the host does not read in time is lost whole frame by whole
+ * frame, and counted. `now_us` is the board's uptime, of 64 bits. */
+#ifndef UWB_BOARD_H
+#define UWB_BOARD_H
+
+#include "uwb_link.h"
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+#define UWB_STATUS_INTERVAL_US 1000000u
+#define UWB_ANSWER_RESERVE_BYTES 512u /* of the queue, which measurements leave to answers and STATUS */
+
+/* What a board is made of. Memory stays the caller's, as long as the board is in use. */
+typedef struct {
+    uint64_t board_id;
+    uint32_t boot_id; /* differs from one start to the next */
+    uint8_t firmware_version[3];
+    uint8_t mode; /* UWB_MODE_* to start in; HOST if there is no model */
+    char firmware_name[16];
+    const uwb_model *model; /* NULL = it has none */
+    void *arena;            /* as for uwb_correct */
+    size_t arena_bytes;
+    uint8_t *queue; /* for bytes to the host; two of the longest frames and the reserve are ample */
+    size_t queue_bytes;
+    uint32_t (*clock_us)(void); /* for compute_us; NULL = it is sent as 0 */
+} uwb_board_config;
+
+typedef struct {
+    uwb_board_config config;
+    uwb_decoder host;
+    uwb_decoder radio;
+    uwb_queue queue;
+    uint64_t status_due_us;
+    uint64_t radio_began_us; /* when the frame from the radio that is being received began */
+    uint32_t sequence;
+    uint32_t dropped;
+    uint32_t measurements;
+    uint32_t measurements_lost;
+    uint32_t radio_faults; /* frames from the radio's side that were damaged or no measurement */
+    uint32_t radio_faults_told;
+    float temperature; /* degrees Celsius, for STATUS; the caller may set it */
+    uint8_t mode;
+} uwb_board;
+
+/* Start, and send HELLO. */
+void uwb_board_start(uwb_board *board, const uwb_board_config *config, uint64_t now_us);
+
+/* Take bytes from the host, and answer. */
+void uwb_board_receive(uwb_board *board, const uint8_t *bytes, size_t count, uint64_t now_us);
+
+/* Take bytes from the radio's side: frames RANGE_CIR. Send them on, corrected or not, as the mode says. */
+void uwb_board_measure(uwb_board *board, const uint8_t *bytes, size_t count, uint64_t now_us);
+
+/* Send what is due: STATUS once a second. */
+void uwb_board_tick(uwb_board *board, uint64_t now_us);
+
+/* Send one frame, if it fits and leaves `reserve` bytes of the queue free; returns whether it did. */
+int uwb_board_send(uwb_board *board, uint8_t type, uint16_t flags, uint64_t time_us, const void *payload,
+                   size_t payload_bytes, size_t reserve);
+
+/* Send HELLO, as an answer to the host's frame `*request`, or of its own accord where that is NULL. */
+void uwb_board_hello(uwb_board *board, const uint32_t *request, uint64_t now_us);
+
+/* Correct a measurement and send the result; returns whether it fitted. */
+int uwb_board_correct(uwb_board *board, const uwb_range_cir_t *fields, const uwb_cir *cir, uint16_t flags,
+                      uint64_t time_us);
+
+#ifdef __cplusplus
+}
+#endif
+#endif

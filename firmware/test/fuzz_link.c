@@ -1,0 +1,83 @@
+/* Feeds arbitrary bytes, as from the host and as from the radio's side, to a board, and stops on what breaks its promises.
+ *
+ *     clang -fsanitize=fuzzer,address,undefined -Isrc -I<export> test/fuzz_link.c src/uwb_*.c
+ *
+ * Half of the stretches are made into intact frames, so that inputs get past the CRC. */
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "uwb_board.h"
+#include "uwb_model.h"
+
+int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size);
+
+static void check(int promise, const char *what) {
+    if (!promise) {
+        fprintf(stderr, "broken: %s\n", what);
+        abort();
+    }
+}
+
+static void drain(uwb_board *board, uwb_decoder *host) {
+    while (board->queue.used != 0) {
+        const uint8_t *bytes;
+        const size_t count = uwb_queue_peek(&board->queue, &bytes);
+        for (size_t i = 0; i < count; i++) {
+            uwb_header_t header;
+            (void)uwb_decoder_push(host, bytes[i], &header);
+        }
+        uwb_queue_drop(&board->queue, count);
+    }
+    check(host->bad_cobs + host->bad_length + host->bad_crc + host->oversize == 0, "the board sends intact frames");
+}
+
+int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
+    const size_t arena_bytes = uwb_arena_size(&uwb_model_data);
+    uwb_board *const board = malloc(sizeof *board);
+    uwb_decoder *const host = calloc(1, sizeof *host);
+    uint8_t *const queue = malloc(9000);
+    uint8_t *const wire = malloc(UWB_MAX_ENCODED_BYTES + 2);
+    void *const arena = malloc(arena_bytes);
+    check(board != NULL && host != NULL && queue != NULL && wire != NULL && arena != NULL, "memory");
+    const uwb_board_config config = {1, 2, {0, 1, 0}, UWB_MODE_BOTH, "fuzzed",   &uwb_model_data,
+                                     arena, arena_bytes, queue, 9000, NULL};
+    uwb_board_start(board, &config, 0);
+    uint64_t now_us = 0;
+    while (size > 4) {
+        const uint8_t how = data[0];
+        size_t length = (size_t)data[1] | (size_t)(data[2] & 15) << 8;
+        const uint8_t type = data[3] % 8 < 4 ? UWB_TYPE_RANGE_CIR : data[3];
+        data += 4;
+        size -= 4;
+        length = length < size ? length : size;
+        const uint8_t *bytes = data;
+        size_t count = length;
+        uwb_queue encoded = {wire, UWB_MAX_ENCODED_BYTES + 2, 0, 0};
+        const uwb_header_t header = {(uint8_t)((how & 4) ? 1 : how), type, 0, 7, 0};
+        if ((how & 1) && uwb_queue_frame(&encoded, &header, data, length, 0)) {
+            bytes = wire;
+            count = encoded.used;
+        }
+        if (how & 2) {
+            uwb_board_receive(board, bytes, count, now_us);
+        } else {
+            uwb_board_measure(board, bytes, count, now_us);
+        }
+        now_us += 300000u;
+        uwb_board_tick(board, now_us);
+        check(board->queue.used <= board->queue.capacity && board->mode <= UWB_MODE_BOTH, "bounds");
+        if (how & 8) {
+            drain(board, host);
+        }
+        data += length;
+        size -= length;
+    }
+    drain(board, host);
+    free(arena);
+    free(wire);
+    free(queue);
+    free(host);
+    free(board);
+    return 0;
+}

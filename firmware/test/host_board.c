@@ -1,0 +1,94 @@
+/* A board with the model of uwb_model.h, and a decoder, behind functions that are easy to call from another language:
+ * for the tests. */
+#include <stdlib.h>
+#include <string.h>
+
+#include "uwb_board.h"
+#include "uwb_model.h"
+
+typedef struct {
+    uwb_board board;
+    uint32_t arena[4096];
+    uint8_t queue[16384];
+} host_board;
+
+host_board *host_board_new(int mode, int with_model, size_t queue_bytes);
+void host_board_free(host_board *host);
+void host_board_receive(host_board *host, const uint8_t *bytes, size_t count, uint64_t now_us);
+void host_board_measure(host_board *host, const uint8_t *bytes, size_t count, uint64_t now_us);
+void host_board_tick(host_board *host, uint64_t now_us);
+size_t host_board_output(host_board *host, uint8_t *bytes, size_t limit);
+int host_decode(const uint8_t *bytes, size_t count, uwb_header_t *header, uint8_t *payload, uint32_t *counts);
+size_t host_encode(const uwb_header_t *header, const uint8_t *payload, size_t payload_bytes, uint8_t *wire,
+                   size_t limit);
+
+host_board *host_board_new(int mode, int with_model, size_t queue_bytes) {
+    host_board *const host = calloc(1, sizeof *host);
+    if (host == NULL || queue_bytes > sizeof host->queue) {
+        abort();
+    }
+    uwb_board_config config = {0xE0, 1, {0, 1, 0}, (uint8_t)mode, "emulated", NULL, NULL, 0, NULL, 0, NULL};
+    config.model = with_model ? &uwb_model_data : NULL;
+    config.arena = host->arena;
+    config.arena_bytes = sizeof host->arena;
+    config.queue = host->queue;
+    config.queue_bytes = queue_bytes;
+    uwb_board_start(&host->board, &config, 0);
+    return host;
+}
+
+void host_board_free(host_board *host) {
+    free(host);
+}
+
+void host_board_receive(host_board *host, const uint8_t *bytes, size_t count, uint64_t now_us) {
+    uwb_board_receive(&host->board, bytes, count, now_us);
+}
+
+void host_board_measure(host_board *host, const uint8_t *bytes, size_t count, uint64_t now_us) {
+    uwb_board_measure(&host->board, bytes, count, now_us);
+}
+
+void host_board_tick(host_board *host, uint64_t now_us) {
+    uwb_board_tick(&host->board, now_us);
+}
+
+/* Take what waits to be sent, at most `limit` bytes. */
+size_t host_board_output(host_board *host, uint8_t *bytes, size_t limit) {
+    size_t taken = 0;
+    while (host->board.queue.used != 0 && taken < limit) {
+        const uint8_t *piece;
+        size_t count = uwb_queue_peek(&host->board.queue, &piece);
+        count = count < limit - taken ? count : limit - taken;
+        memcpy(bytes + taken, piece, count);
+        uwb_queue_drop(&host->board.queue, count);
+        taken += count;
+    }
+    return taken;
+}
+
+/* Decode one wire; returns the last frame's bytes of payload, or -1. Counts: frames, bad_cobs, bad_length, bad_crc,
+ * oversize, foreign_versions. */
+int host_decode(const uint8_t *bytes, size_t count, uwb_header_t *header, uint8_t *payload, uint32_t *counts) {
+    uwb_decoder *const decoder = calloc(1, sizeof *decoder);
+    if (decoder == NULL) {
+        abort();
+    }
+    int32_t last = -1;
+    for (size_t i = 0; i < count; i++) {
+        const int32_t bytes_of_payload = uwb_decoder_push(decoder, bytes[i], header);
+        if (bytes_of_payload >= 0) {
+            last = bytes_of_payload;
+            memcpy(payload, decoder->body.bytes + UWB_HEADER_BYTES, (size_t)last);
+        }
+    }
+    memcpy(counts, &decoder->frames, 6 * sizeof *counts);
+    free(decoder);
+    return (int)last;
+}
+
+size_t host_encode(const uwb_header_t *header, const uint8_t *payload, size_t payload_bytes, uint8_t *wire,
+                   size_t limit) {
+    uwb_queue queue = {wire, limit, 0, 0};
+    return uwb_queue_frame(&queue, header, payload, payload_bytes, 0) ? queue.used : 0;
+}

@@ -1,0 +1,276 @@
+"""The wire protocol and the board's logic in C: the golden vectors, and byte for byte what `link.board.Board` sends."""
+
+from __future__ import annotations
+
+import ctypes
+import shutil
+import subprocess
+from pathlib import Path
+
+import firmware_models
+import numpy as np
+import pytest
+
+from uwb_mitigation.firmware_export.export import export_bundle
+from uwb_mitigation.firmware_export.host import WARNINGS, firmware_folder, run
+from uwb_mitigation.link import messages
+from uwb_mitigation.link.board import Board, Identity
+from uwb_mitigation.link.framing import Frame, FrameDecoder, FrameEncoder, encode_frame
+from uwb_mitigation.link.layout import HEADER, MAX_PAYLOAD_BYTES, Flag, MessageType, Mode, c_header
+from uwb_mitigation.link.messages import GetInfo, SetMode, TimeSync
+from uwb_mitigation.measurement import RangeMeasurement
+from uwb_mitigation.mitigation import Mitigation
+from uwb_mitigation.model.bundle import Bundle
+
+pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc")
+
+VECTORS = Path(__file__).parent / "data" / "link_vectors.txt"
+KINDS = ("frames", "bad_cobs", "bad_length", "bad_crc", "oversize", "foreign_versions")
+
+
+class BoardInC:
+    """`firmware/test/host_board.c`; every method returns what the board then sends."""
+
+    def __init__(self, library: ctypes.CDLL, mode: Mode, with_model: bool = True, queue: int = 16384) -> None:
+        self._library = library
+        self._board = library.host_board_new(int(mode), int(with_model), queue)
+        self.sent = self._output()
+
+    def receive(self, data: bytes, now_us: int) -> bytes:
+        self._library.host_board_receive(self._board, data, len(data), now_us)
+        return self._output()
+
+    def measure(self, data: bytes, now_us: int, *, read: bool = True) -> bytes:
+        self._library.host_board_measure(self._board, data, len(data), now_us)
+        return self._output() if read else b""
+
+    def tick(self, now_us: int) -> bytes:
+        self._library.host_board_tick(self._board, now_us)
+        return self._output()
+
+    def close(self) -> None:
+        self._library.host_board_free(self._board)
+
+    def _output(self) -> bytes:
+        out = ctypes.create_string_buffer(16384)
+        count = self._library.host_board_output(self._board, out, 16384)
+        return out.raw[:count]
+
+
+@pytest.fixture(scope="module")
+def bundle(tmp_path_factory: pytest.TempPathFactory) -> Bundle:
+    return firmware_models.choosy_bundle(tmp_path_factory.mktemp("bundle"))
+
+
+@pytest.fixture(scope="module")
+def library(bundle: Bundle, tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
+    folder = tmp_path_factory.mktemp("board")
+    export_bundle(bundle, folder)
+    source = firmware_folder() / "src"
+    program = firmware_folder() / "test" / "host_board.c"
+    flags = ("-std=c99", "-O1", "-fPIC", "-fsanitize=undefined", "-fno-sanitize-recover=all", *WARNINGS)
+    files = [str(program), *map(str, sorted(source.glob("*.c")))]
+    output = folder / "board.so"
+    run(["cc", *flags, f"-I{source}", f"-I{folder}", "-shared", *files, "-lm", "-o", str(output)])
+    library = ctypes.CDLL(str(output))
+    size, time, pointer = ctypes.c_size_t, ctypes.c_uint64, ctypes.c_void_p
+    library.host_board_new.restype = pointer
+    library.host_board_new.argtypes = (ctypes.c_int, ctypes.c_int, size)
+    library.host_board_free.argtypes = (pointer,)
+    library.host_board_receive.argtypes = (pointer, ctypes.c_char_p, size, time)
+    library.host_board_measure.argtypes = (pointer, ctypes.c_char_p, size, time)
+    library.host_board_tick.argtypes = (pointer, time)
+    library.host_board_output.argtypes = (pointer, pointer, size)
+    library.host_board_output.restype = size
+    library.host_decode.argtypes = (ctypes.c_char_p, size, pointer, pointer, pointer)
+    library.host_encode.argtypes = (ctypes.c_char_p, ctypes.c_char_p, size, pointer, size)
+    library.host_encode.restype = size
+    return library
+
+
+def decode(library: ctypes.CDLL, wire: bytes) -> tuple[Frame | None, dict[str, int]]:
+    header, payload = ctypes.create_string_buffer(16), ctypes.create_string_buffer(MAX_PAYLOAD_BYTES)
+    counts = (ctypes.c_uint32 * len(KINDS))()
+    length = library.host_decode(wire, len(wire), header, payload, counts)
+    counted = dict(zip(KINDS, counts, strict=True))
+    if length < 0:
+        return None, counted
+    _, *fields = HEADER.packing().unpack(header.raw)
+    return Frame(*fields, payload.raw[:length]), counted
+
+
+def encode(library: ctypes.CDLL, frame: Frame) -> bytes:
+    header = HEADER.packing().pack(1, *frame[:4])
+    wire = ctypes.create_string_buffer(8192)
+    count = library.host_encode(header, frame.payload, len(frame.payload), wire, 8192)
+    return wire.raw[:count]
+
+
+def words(kind: str) -> list[list[str]]:
+    lines = (line.split(" ") for line in VECTORS.read_text().splitlines())
+    return [line[1:] for line in lines if line[0] == kind]
+
+
+def test_the_protocols_header_is_the_generated_one():
+    committed = (firmware_folder() / "src" / "uwb_protocol.h").read_text()
+    assert committed == c_header(), "write it anew: link.layout.c_header()"
+
+
+@pytest.mark.parametrize("vector", words("frame"), ids=lambda vector: vector[0])
+def test_golden_frames_are_decoded_and_encoded_to_the_byte(library: ctypes.CDLL, vector: list[str]):
+    _, *numbers, payload, wire = vector
+    frame = Frame(*map(int, numbers), b"" if payload == "-" else bytes.fromhex(payload))
+    assert decode(library, bytes.fromhex(wire)) == (frame, dict.fromkeys(KINDS, 0) | {"frames": 1})
+    assert encode(library, frame) == bytes.fromhex(wire)
+
+
+@pytest.mark.parametrize("vector", words("reject"), ids=lambda vector: vector[0])
+def test_golden_rejects_raise_their_count(library: ctypes.CDLL, vector: list[str]):
+    _, kind, wire = vector
+    frame, counts = decode(library, bytes.fromhex(wire))
+    if kind in KINDS:
+        assert frame is None
+        assert counts[kind] == 1
+    assert sum(counts.values()) <= 1
+
+
+def test_frames_of_any_length_and_content_are_encoded_as_in_python(library: ctypes.CDLL):
+    random = np.random.default_rng(1)
+    lengths = [*range(225, 260), *range(490, 520), MAX_PAYLOAD_BYTES, *random.integers(0, 4224, 100).tolist()]
+    for length in lengths:
+        payload = random.integers(0, random.choice([2, 256]), length, np.uint8)
+        if length % 2:
+            payload[:] = np.maximum(payload, 1)
+        frame = Frame(2, 0, 0x01010101, 0x0101010101010101, payload.tobytes())
+        assert encode(library, frame) == encode_frame(frame)
+
+
+def test_damaged_streams_give_the_frames_and_counts_that_python_gives(library: ctypes.CDLL):
+    random = np.random.default_rng(2)
+    for _ in range(300):
+        frames = [Frame(3, 0, i, i, random.bytes(random.integers(0, 600))) for i in range(3)]
+        stream = bytearray(b"".join(map(encode_frame, frames)))
+        for at in random.integers(0, len(stream), random.integers(0, 4)):
+            stream[at] = random.choice([0, 1, 255, random.integers(0, 256)])
+        if random.random() < 0.1:
+            stream[:0] = bytes([1]) * int(random.integers(4255, 4270)) + b"\0"
+        decoder = FrameDecoder()
+        expected = decoder.feed(bytes(stream))
+        frame, counts = decode(library, bytes(stream))
+        assert frame == (expected[-1] if expected else None)
+        for kind in ("frames", "bad_cobs", "bad_length", "bad_crc", "oversize"):
+            assert counts[kind] == getattr(decoder.counts, kind)
+
+
+def python_board(bundle: Bundle, mode: Mode) -> Board:
+    identity = Identity(0xE0, bundle.model_id, bundle.architecture.samples)
+    return Board(identity, Mitigation(bundle), mode=mode)
+
+
+def same(sent: bytes, expected: bytes) -> bool:
+    """Frame for frame and byte for byte, but for the time that Python measures of its own computing."""
+
+    def frames(data: bytes) -> list[Frame]:
+        decoded = FrameDecoder().feed(data)
+        return [
+            frame._replace(payload=frame.payload[:48] + bytes(4) + frame.payload[52:])
+            if frame.type == MessageType.RANGE_CORRECTED
+            else frame
+            for frame in decoded
+        ]
+
+    return frames(sent) == frames(expected)
+
+
+@pytest.mark.parametrize("mode", list(Mode))
+def test_a_board_in_c_sends_what_the_board_in_python_sends(library: ctypes.CDLL, bundle: Bundle, mode: Mode):
+    random = np.random.default_rng(5)
+    python, c, host, radio = (
+        python_board(bundle, mode),
+        BoardInC(library, mode),
+        FrameEncoder(),
+        FrameEncoder(),
+    )
+    assert same(c.sent, python.hello(0))
+    for step in range(250):
+        now_us = 20_000 * step
+        measured = firmware_models.random_measurement(random)
+        wire = radio.encode(*messages.encode(measured))
+        assert same(c.measure(wire, now_us), python.measure(measured, now_us))
+        requests = [GetInfo(), TimeSync(), measured, SetMode(Mode(int(random.integers(0, 3)))), None]
+        request = requests[int(random.choice(5, p=[0.2, 0.2, 0.3, 0.1, 0.2]))]
+        if request is None:
+            kind, payload = int(random.integers(0, 256)), random.bytes(int(random.integers(0, 120)))
+        else:
+            kind, payload = messages.encode(request)
+        data = host.encode(kind, payload)
+        if random.random() < 0.1:
+            data = data[:5] + b"\x05" + data[6:]
+        assert same(c.receive(data, now_us), python.receive(data, now_us))
+        assert same(c.tick(now_us), python.tick(now_us))
+    c.close()
+
+
+def test_a_host_of_another_version_is_told_this_one(library: ctypes.CDLL, bundle: Bundle):
+    python, c = python_board(bundle, Mode.HOST), BoardInC(library, Mode.HOST)
+    python.hello(0)
+    data = FrameEncoder(version=9).encode(MessageType.GET_INFO, b"")
+    assert same(c.receive(data, 7), python.receive(data, 7))
+    c.close()
+
+
+def test_a_board_without_a_model_stays_in_host_mode(library: ctypes.CDLL):
+    c = BoardInC(library, Mode.DEVICE, with_model=False)
+    (frame,) = FrameDecoder().feed(
+        c.receive(FrameEncoder().encode(*messages.encode(SetMode(Mode.DEVICE))), 1)
+    )
+    hello = messages.decode(frame.type, frame.payload)
+    assert isinstance(hello, messages.Hello)
+    assert (hello.mode, hello.model_id, hello.window, frame.flags) == (Mode.HOST, 0, 0, Flag.ANSWER)
+    c.close()
+
+
+def test_a_host_that_does_not_read_costs_whole_measurements_and_leaves_room_for_status(library: ctypes.CDLL):
+    c = BoardInC(library, Mode.HOST, queue=9000)
+    measured = firmware_models.random_measurement(np.random.default_rng(3))
+    wire = FrameEncoder().encode(*messages.encode(measured))
+    for _ in range(200):
+        c.measure(wire, 5, read=False)
+    frames = FrameDecoder().feed(c.tick(2_000_000))
+    *ranges, status = [messages.decode(frame.type, frame.payload) for frame in frames]
+    assert all(isinstance(message, RangeMeasurement) for message in ranges)
+    assert isinstance(status, messages.BoardStatus)
+    assert status.measurements == 200
+    assert status.measurements_lost == 200 - len(ranges) > 0
+    assert [frame.sequence for frame in frames] == list(range(1, len(frames) + 1))
+    c.close()
+
+
+def test_damage_on_the_radios_side_is_told_in_a_log(library: ctypes.CDLL):
+    c = BoardInC(library, Mode.HOST)
+    assert c.measure(b"\0\x05ab\0", 5) == b""
+    status, log = FrameDecoder().feed(c.tick(1_000_000))
+    assert status.type == MessageType.STATUS
+    assert b"radio" in log.payload
+    assert len(FrameDecoder().feed(c.tick(2_000_000))) == 1
+    c.close()
+
+
+@pytest.mark.skipif(shutil.which("clang") is None, reason="no libFuzzer: apt install clang")
+@pytest.mark.parametrize("target", ["fuzz_link", "fuzz_correct"])
+def test_fuzzing_for_a_moment_finds_nothing(target: str, bundle: Bundle, tmp_path: Path):
+    export_bundle(bundle, tmp_path)
+    source = firmware_folder() / "src"
+    program = tmp_path / target
+    flags = (
+        "-g",
+        "-O1",
+        "-fsanitize=fuzzer,address,undefined",
+        "-fno-sanitize-recover=all",
+        "-DUWB_LIBFUZZER",
+    )
+    files = [str(firmware_folder() / "test" / f"{target}.c"), *map(str, sorted(source.glob("*.c")))]
+    run(["clang", *flags, f"-I{source}", f"-I{tmp_path}", *files, "-lm", "-o", str(program)])
+    options = ("-runs=1500", "-seed=1", "-max_len=4096", "-len_control=0")
+    done = subprocess.run([program, *options], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
