@@ -10,7 +10,7 @@ VENV := .venv
 IN_ROS = . $(VENV)/environment.sh;
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-training demo test colcon lint lock clean
+.PHONY: help setup setup-training demo firmware-demo test colcon lint lock clean
 
 help:  ## show this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 24
@@ -23,6 +23,9 @@ setup-training:  ## the same, with torch and the test tools
 
 demo: setup  ## replay RECORDING=path (default: simulated) through driver and mitigator, live
 	@$(IN_ROS) $(VENV)/bin/python -m uwb_mitigation.nodes.demo $(if $(RECORDING),--recording '$(RECORDING)') $(if $(RATE),--rate $(RATE))
+
+firmware-demo: setup  ## the firmware in an emulated Cortex-M4 as the driver's board (RECORDING=path), compared with the host
+	@$(IN_ROS) $(VENV)/bin/python -m uwb_mitigation.nodes.firmware_demo $(if $(RECORDING),--recording '$(RECORDING)')
 
 test: setup-training  ## run every test
 	@$(IN_ROS) $(VENV)/bin/python -m pytest -n auto

@@ -38,6 +38,7 @@ class Board(str, enum.Enum):
     """The boards that there is a start-up and a linker script for, in `firmware/boards/`."""
 
     QEMU_MPS2 = "qemu_mps2"
+    QEMU_MPS2_LINK = "qemu_mps2_link"
     DWM1001C = "dwm1001c"
 
 

@@ -1,0 +1,34 @@
+"""`make firmware-demo`, short: the firmware in an emulated processor, the driver on its port, the host's bits."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
+
+from uwb_mitigation.firmware_export import toolchain
+
+MISSING = toolchain.missing_tools()
+pytestmark = pytest.mark.ros
+
+
+@pytest.mark.skipif(bool(MISSING), reason=f"{', '.join(MISSING)} not found: {toolchain.APT}")
+def test_the_demo_ends_by_itself_with_every_range_equal_to_the_hosts():
+    command = [sys.executable, "-m", "uwb_mitigation.nodes.firmware_demo", "--count", "20"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=150, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "20 corrected by the board, 0 lost" in done.stdout
+    assert "20 equal to the host's to the bit, 0 different" in done.stdout
+
+
+def test_without_the_tools_the_demo_names_the_line_that_installs_them(tmp_path: Path):
+    command = [sys.executable, "-m", "uwb_mitigation.nodes.firmware_demo", "--count", "1"]
+    environment = os.environ | {"PATH": str(tmp_path)}
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False, env=environment)
+    assert done.returncode == 1
+    assert "apt install gcc-arm-none-eabi" in " ".join(done.stdout.split())

@@ -1,0 +1,130 @@
+"""The firmware as a board on the serial link, in an emulated Cortex-M4.
+
+`boards/qemu_mps2_link` runs the library and the board's side of the protocol; its first UART is a pseudo-terminal
+for the driver, and into the second the radio's frames are played, as an EVB1000 would send them.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import socket
+import subprocess
+import tempfile
+import time
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+
+from uwb_mitigation.errors import UwbMitigationError
+from uwb_mitigation.firmware_export.export import export_bundle
+from uwb_mitigation.firmware_export.toolchain import Board, build_image, require_tools
+from uwb_mitigation.link import messages
+from uwb_mitigation.link.framing import FrameEncoder
+from uwb_mitigation.measurement import RangeMeasurement
+from uwb_mitigation.model.bundle import Bundle
+
+_START_TIMEOUT_S = 20.0
+_PORT = re.compile(rb"char device redirected to (\S+)")
+
+
+class EmulatedFirmware:
+    """Builds the firmware with `bundle`'s model and starts it; `close`, or leaving the context, ends it.
+
+    Raises:
+        MissingDependencyError: compiler or emulator are missing; names the line that installs them.
+        ModelError: the firmware cannot run the model.
+        UwbMitigationError: it does not build, or does not start.
+
+    Attributes:
+        port: path of the pseudo-terminal for the driver.
+    """
+
+    def __init__(self, bundle: Bundle) -> None:
+        require_tools()
+        self._folder = tempfile.TemporaryDirectory(prefix="uwb_emulated_firmware_")
+        self._encoder = FrameEncoder()
+        self._process: subprocess.Popen[bytes] | None = None
+        self._radio: socket.socket | None = None
+        self.port = ""
+        try:
+            folder = Path(self._folder.name)
+            export_bundle(bundle, folder)
+            self._start(build_image(folder, folder, Board.QEMU_MPS2_LINK).elf, folder / "radio")
+        except BaseException:
+            self.close()
+            raise
+
+    def measure(self, measurement: RangeMeasurement) -> None:
+        """Let the board's radio measure; waits while the board is busy.
+
+        Raises:
+            UwbMitigationError: the emulator has ended.
+        """
+        assert self._radio is not None
+        kind, payload = messages.encode(measurement)
+        try:
+            self._radio.sendall(self._encoder.encode(kind, payload))
+        except OSError as error:
+            raise UwbMitigationError(f"the emulated board is gone: {error.strerror or error}") from error
+
+    def close(self) -> None:
+        """End the emulator; may be called twice."""
+        if self._radio is not None:
+            self._radio.close()
+        if self._process is not None:
+            self._process.terminate()
+            try:
+                self._process.wait(timeout=5)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+            if self._process.stdout is not None:
+                self._process.stdout.close()
+        self._folder.cleanup()
+
+    def __enter__(self) -> EmulatedFirmware:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _start(self, elf: Path, radio: Path) -> None:
+        self._process = subprocess.Popen(
+            [
+                *("qemu-system-arm", "-M", "mps2-an386", "-display", "none", "-monitor", "none"),
+                *("-chardev", "pty,id=host", "-serial", "chardev:host"),
+                *("-chardev", f"socket,id=radio,path={radio},server=on,wait=off", "-serial", "chardev:radio"),
+                *("-kernel", str(elf)),
+            ],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            # Ctrl-C is for the program that runs the board.
+            start_new_session=True,
+        )
+        assert self._process.stdout is not None
+        said = b""
+        deadline = time.monotonic() + _START_TIMEOUT_S
+        os.set_blocking(self._process.stdout.fileno(), False)
+        while not (found := _PORT.search(said)):
+            said += self._process.stdout.read() or b""
+            if self._process.poll() is not None or time.monotonic() > deadline:
+                raise UwbMitigationError(
+                    f"the emulator did not start: {said.decode(errors='replace').strip()[-300:]}"
+                )
+            time.sleep(0.02)
+        self.port = found.group(1).decode()
+        self._radio = socket.socket(socket.AF_UNIX)
+        while True:
+            with suppress(OSError):
+                self._radio.connect(str(radio))
+                return
+            if time.monotonic() > deadline:
+                raise UwbMitigationError("the emulator does not accept the radio's side")
+            time.sleep(0.02)
