@@ -18,6 +18,7 @@ from uwb_mitigation.commands import (
     link,
     model,
     process,
+    report,
     training,
 )
 from uwb_mitigation.errors import UwbMitigationError
@@ -44,6 +45,7 @@ app.command("search")(training.search)
 app.command("train-lr-range")(training.train_lr_range)
 app.command("prune")(training.prune)
 bench.command("training")(bench_training.bench_training)
+app.command("report")(report.report)
 app.command("emulate-board")(link.emulate_board)
 app.command("export-c")(firmware.export_c)
 
