@@ -8,6 +8,7 @@ on anything but arithmetic; `uwb-mitigation bench training` measures both. The g
 
 from __future__ import annotations
 
+import math
 from typing import Protocol
 
 import torch
@@ -18,11 +19,37 @@ from uwb_mitigation.model.weights import FloatWeights
 from uwb_mitigation.training import networks
 from uwb_mitigation.training.options import FitOptions
 
+BETAS = (0.9, 0.999)
+EPSILON = 1e-8
+"""Of Adam (paper, section III-B)."""
+
+
+class Adam:
+    """Adam with decoupled weight decay, as `torch.optim.AdamW`, whose import alone takes seconds."""
+
+    def __init__(self, parameters: list[Tensor], options: FitOptions) -> None:
+        self.learning_rate = options.learning_rate
+        self._decay = options.weight_decay
+        self._states = [(values, torch.zeros_like(values), torch.zeros_like(values)) for values in parameters]
+        self._steps = 0
+
+    def step(self, gradients: list[Tensor]) -> None:
+        """Update the parameters in place by gradients in the same order."""
+        self._steps += 1
+        first, second = 1 - BETAS[0] ** self._steps, 1 - BETAS[1] ** self._steps
+        with torch.no_grad():
+            for (values, mean, square), gradient in zip(self._states, gradients, strict=True):
+                values.mul_(1 - self.learning_rate * self._decay)
+                mean.lerp_(gradient, 1 - BETAS[0])
+                square.mul_(BETAS[1]).addcmul_(gradient, gradient, value=1 - BETAS[1])
+                spread = square.sqrt().div_(math.sqrt(second)).add_(EPSILON)
+                values.addcdiv_(mean, spread, value=-self.learning_rate / first)
+
 
 class Learner(Protocol):
     """A network in training."""
 
-    optimizer: torch.optim.Optimizer
+    optimizer: Adam
 
     def step(self, inputs: Tensor, targets: Tensor) -> float:
         """Update the network by one batch, (n, K) and (n,); returns the mean absolute error before, m."""
@@ -45,13 +72,12 @@ class ModuleLearner:
 
     def __init__(self, module: nn.Module, options: FitOptions) -> None:
         self.module = module.train()
-        self.optimizer = _adam(module.parameters(), options)
+        self._parameters = list(module.parameters())
+        self.optimizer = Adam([values.detach() for values in self._parameters], options)
 
     def step(self, inputs: Tensor, targets: Tensor) -> float:
         loss = torch.nn.functional.l1_loss(self.module(inputs), targets)
-        self.optimizer.zero_grad()
-        loss.backward()
-        self.optimizer.step()
+        self.optimizer.step(list(torch.autograd.grad(loss, self._parameters)))
         return float(loss.item())
 
     def weights(self) -> FloatWeights:
@@ -68,12 +94,12 @@ class RemnetLearner:
         self.architecture = weights.architecture
         self._keep = 1 - options.dropout
         self._parameters = _Parameters(weights)
-        self.optimizer = _adam([self._parameters.values], options)
+        self.optimizer = Adam([self._parameters.values], options)
         self._passes: dict[int, _Pass] = {}
 
     def step(self, inputs: Tensor, targets: Tensor) -> float:
         loss = self.gradients(inputs, targets)
-        self.optimizer.step()
+        self.optimizer.step([self._parameters.gradient])
         return loss
 
     def gradients(self, inputs: Tensor, targets: Tensor) -> float:
@@ -85,22 +111,11 @@ class RemnetLearner:
             return self._passes[count].run(inputs, targets)
 
     def weights(self) -> FloatWeights:
-        return self._parameters.as_weights(self._parameters.values.detach())
+        return self._parameters.as_weights(self._parameters.values)
 
     def gradient(self) -> FloatWeights:
         """The last gradients, in the place of the parameters that they are of."""
         return self._parameters.as_weights(self._parameters.gradient)
-
-
-def _adam(parameters: object, options: FitOptions) -> torch.optim.Optimizer:
-    return torch.optim.AdamW(
-        parameters,
-        lr=options.learning_rate,
-        betas=(0.9, 0.999),
-        eps=1e-8,
-        weight_decay=options.weight_decay,
-        fused=True,
-    )
 
 
 class _Parameters:
@@ -114,9 +129,8 @@ class _Parameters:
         self._last = (shape.filters, shape.lengths[-1])
         sizes = {name: weight.size for name, weight in weights.weight.items()}
         total = sum(sizes.values()) + sum(bias.size for bias in weights.bias.values())
-        self.values = nn.Parameter(torch.empty(total), requires_grad=False)
-        self.values.grad = self.gradient = torch.zeros(total)
-        self.weight, self.bias = self._views(self.values.data)
+        self.values, self.gradient = torch.empty(total), torch.zeros(total)
+        self.weight, self.bias = self._views(self.values)
         self.weight_gradient, self.bias_gradient = self._views(self.gradient)
         for name, bias in weights.bias.items():
             values = torch.from_numpy(weights.weight[name])

@@ -70,7 +70,7 @@ def range_test(
     with single_thread(options.seed):
         network = learner(architecture, replace(options, learning_rate=1e-3))
         for step, rate in enumerate(np.geomspace(low, high, steps).tolist()):
-            network.optimizer.param_groups[0]["lr"] = rate
+            network.optimizer.learning_rate = rate
             rows = torch.randint(len(source), (options.batch,))
             loss = network.step(source[rows], wanted[rows])
             on_step()

@@ -1,0 +1,216 @@
+"""The networks: counts of the paper's Table 1, and hand-written gradients that are those of torch."""
+
+from __future__ import annotations
+
+import numpy as np
+import onnxruntime
+import pytest
+from model_material import card, random_weights, windows
+
+from uwb_mitigation.errors import ModelError, ParameterError
+from uwb_mitigation.model import floating, graph
+from uwb_mitigation.model.architecture import HEAD, Mlp, Remnet
+from uwb_mitigation.model.bundle import load_bundle, save_bundle
+from uwb_mitigation.model.integer import IntegerNetwork
+from uwb_mitigation.model.session import Session, session_options
+from uwb_mitigation.model.weights import FloatWeights
+from uwb_mitigation.training.options import FitOptions
+from uwb_mitigation.training.quantization import quantize
+
+torch = pytest.importorskip("torch", reason="training is not set up: run make setup-training")
+
+from uwb_mitigation.training.learner import Adam, ModuleLearner, RemnetLearner  # noqa: E402
+from uwb_mitigation.training.networks import MlpModule, RemnetModule  # noqa: E402
+
+PLAIN = FitOptions(dropout=0.0, weight_decay=0.0)
+
+
+def mlp_weights(shape: Mlp, seed: int = 0) -> FloatWeights:
+    generator = np.random.default_rng(seed)
+    weight = {
+        layer.name: generator.normal(0, (2 / layer.inputs) ** 0.5, (layer.outputs, layer.inputs))
+        for layer in shape.layers
+    }
+    weight[HEAD] = generator.normal(0, 0.3, (shape.features, 1))
+    bias = {layer.name: generator.normal(0, 0.1, layer.outputs) for layer in shape.layers}
+    bias[HEAD] = generator.normal(0, 0.1, 1)
+    return FloatWeights(
+        shape,
+        {name: values.astype(np.float32) for name, values in weight.items()},
+        {name: values.astype(np.float32) for name, values in bias.items()},
+    )
+
+
+def parameters(module: object) -> int:
+    return sum(values.numel() for values in module.parameters())
+
+
+@pytest.mark.parametrize(
+    ("samples", "count"), [(157, 5905), (128, 5841), (64, 5713), (32, 5649), (16, 5617), (8, 5601)]
+)
+def test_remnet_has_the_papers_parameters(samples, count):
+    assert Remnet(samples).parameters == count
+    assert parameters(RemnetModule(Remnet(samples), 0.5)) == count
+
+
+def test_the_mlp_has_the_papers_parameters():
+    assert Mlp().parameters == 54_401
+    assert parameters(MlpModule(Mlp())) == 54_401
+    assert Mlp().multiply_accumulates == 157 * 240 + 240 * 64 + 64 * 16 + 16
+
+
+def test_a_first_kernel_of_five_has_32_parameters_more():
+    assert parameters(RemnetModule(Remnet(first_kernel=5), 0.5)) == 5905 + 32
+
+
+def test_attention_adds_82_parameters_a_module_and_weighs_channels_between_0_and_1():
+    torch.manual_seed(0)
+    module = RemnetModule(Remnet(32), 0.0, attention=True)
+    assert parameters(module) == 5649 + 3 * 82
+    values = torch.rand(4, 16, 32)
+    ratio = module.attention[0](values) / values
+    assert torch.allclose(ratio, ratio[:, :, :1].expand_as(ratio), rtol=1e-3)
+    assert 0 < ratio.min() < ratio.max() < 1
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        Remnet(157),
+        Remnet(128, first_kernel=5),
+        Remnet(8),
+        Remnet(33, kernel=5, filters=8, modules=2),
+        Remnet(5, kernel=1, modules=4),
+        Remnet(1, kernel=7, first_kernel=9),
+    ],
+)
+def test_the_gradients_are_those_of_torch(shape):
+    torch.manual_seed(1)
+    module = RemnetModule(shape, 0.0)
+    torch.nn.init.normal_(module.head.weight)
+    learner = RemnetLearner(module.weights(), PLAIN)
+    inputs, targets = torch.rand(32, shape.samples), torch.randn(32)
+    loss = torch.nn.functional.l1_loss(module(inputs), targets)
+    loss.backward()
+    assert learner.gradients(inputs, targets) == pytest.approx(loss.item(), rel=1e-5)
+    for values in module.parameters():
+        values.data = values.grad
+    expected, computed = module.weights(), learner.gradient()
+    for name in expected.weight:
+        largest = np.abs(expected.weight[name]).max() + 1e-6
+        assert np.abs(expected.weight[name] - computed.weight[name]).max() < 1e-4 * largest
+        assert np.allclose(expected.bias[name], computed.bias[name], rtol=1e-3, atol=1e-3)
+
+
+def test_steps_are_those_of_torch():
+    torch.manual_seed(2)
+    module = RemnetModule(Remnet(32), 0.0)
+    learner, plain = RemnetLearner(module.weights(), PLAIN), ModuleLearner(module, PLAIN)
+    data = torch.rand(10, 7, 32), torch.randn(10, 7)
+    for inputs, targets in zip(*data, strict=True):
+        assert learner.step(inputs, targets) == pytest.approx(plain.step(inputs, targets), rel=1e-4)
+    expected, computed = plain.weights(), learner.weights()
+    assert all(np.allclose(expected.weight[n], computed.weight[n], atol=2e-5) for n in expected.weight)
+
+
+def test_adam_with_decoupled_decay():
+    # In float64 from the paper of Kingma and Ba; importing torch.optim's takes seconds.
+    rate, decay, generator = 0.01, 0.1, np.random.default_rng(3)
+    expected, gradients = generator.normal(size=50), generator.normal(size=(20, 50))
+    values = torch.tensor(expected, dtype=torch.float32)
+    subject = Adam([values], FitOptions(learning_rate=rate, weight_decay=decay))
+    mean, square = np.zeros(50), np.zeros(50)
+    for step, gradient in enumerate(gradients, start=1):
+        subject.step([torch.tensor(gradient, dtype=torch.float32)])
+        mean, square = 0.9 * mean + 0.1 * gradient, 0.999 * square + 0.001 * gradient**2
+        update = mean / (1 - 0.9**step) / (np.sqrt(square / (1 - 0.999**step)) + 1e-8)
+        expected = expected * (1 - rate * decay) - rate * update
+    assert np.allclose(values.numpy(), expected, atol=1e-5)
+
+
+def test_batches_of_any_size_are_taken():
+    learner = RemnetLearner(random_weights(Remnet(16)), PLAIN)
+    for count in (32, 5, 1, 32):
+        assert np.isfinite(learner.step(torch.rand(count, 16), torch.zeros(count)))
+
+
+def test_dropout_drops_its_share_and_keeps_the_mean():
+    learner = RemnetLearner(random_weights(Remnet(157)), FitOptions(dropout=0.75))
+    learner.gradients(torch.rand(64, 157), torch.zeros(64))
+    mask = learner._passes[64]._mask
+    assert set(mask.unique().tolist()) == {0.0, 4.0}
+    assert float(mask.mean()) == pytest.approx(1.0, abs=0.05)
+
+
+def test_weights_go_in_and_out_unchanged():
+    weights = random_weights(Remnet(20, first_kernel=5, filters=6, modules=2))
+    again = RemnetLearner(weights, PLAIN).weights()
+    assert all(np.array_equal(weights.weight[name], again.weight[name]) for name in weights.weight)
+    assert all(np.array_equal(weights.bias[name], again.bias[name]) for name in weights.bias)
+
+
+def test_the_mlp_is_the_same_in_torch_numpy_and_onnx():
+    shape = Mlp(32)
+    module = MlpModule(shape)
+    torch.nn.init.normal_(module.head.weight)
+    weights, inputs = module.weights(), windows(40, 32)
+    expected = module(torch.from_numpy(inputs)).detach().numpy()
+    assert np.allclose(floating.predict_m(weights, inputs), expected, atol=1e-5)
+    session = onnxruntime.InferenceSession(
+        graph.float_model(weights), session_options(), providers=["CPUExecutionProvider"]
+    )
+    assert np.allclose(session.run(None, {"cir": inputs[:, None, :]})[0][:, 0], expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("shape", [Mlp(157), Mlp(8, (5,)), Mlp(33, (64, 7, 9))])
+def test_the_int8_mlp_equals_onnx_runtime_on_every_bit(shape):
+    weights = quantize(mlp_weights(shape), windows(100, shape.samples), exact=False)
+    session = onnxruntime.InferenceSession(
+        graph.int8_model(weights), session_options(), providers=["CPUExecutionProvider"]
+    )
+    inputs = np.concatenate([windows(500, shape.samples, 1), windows(500, shape.samples, 2) * 9])
+    inputs[0], inputs[1] = 0, 1e30
+    computed = session.run(None, {"cir": inputs[:, None, :]})[0][:, 0]
+    assert np.array_equal(computed, IntegerNetwork(weights).predict_m(inputs))
+
+
+def test_the_int8_mlp_runs_fused():
+    options = session_options()
+    weights = quantize(mlp_weights(Mlp(16, (8, 4))), windows(20, 16), exact=False)
+    session = onnxruntime.InferenceSession(
+        graph.int8_model(weights), options, providers=["CPUExecutionProvider"]
+    )
+    expected = IntegerNetwork(weights).predict_m(windows(9, 16))
+    assert np.array_equal(session.run(None, {"cir": windows(9, 16)[:, None, :]})[0][:, 0], expected)
+
+
+@pytest.mark.parametrize("quantised", [True, False])
+def test_an_mlp_bundle_loads_and_runs(tmp_path, quantised):
+    shape = Mlp(16, (12, 8))
+    weights = mlp_weights(shape)
+    integers = quantize(weights, windows(50, 16), exact=False)
+    model = graph.int8_model(integers) if quantised else graph.float_model(weights)
+    save_bundle(tmp_path / "mlp.onnx", model, card(shape, quantised=quantised))
+    bundle = load_bundle(tmp_path / "mlp.onnx")
+    assert bundle.architecture == shape
+    inputs = windows(20, 16, 3)
+    expected = (
+        IntegerNetwork(integers).predict_m(inputs) if quantised else floating.predict_m(weights, inputs)
+    )
+    computed = np.array([Session(bundle).predict_m(row) for row in inputs])
+    assert np.allclose(computed, expected, atol=0 if quantised else 1e-5)
+    if not quantised:
+        read = graph.float_weights(bundle.model, shape)
+        assert all(np.array_equal(weights.weight[name], read.weight[name]) for name in weights.weight)
+
+
+def test_an_mlp_of_another_shape_than_its_metadata_is_refused(tmp_path):
+    model = graph.float_model(mlp_weights(Mlp(16, (12, 8))))
+    with pytest.raises(ModelError, match=r"layer dense1 has weights of shape \(16, 12\)"):
+        save_bundle(tmp_path / "mlp.onnx", model, card(Mlp(16, (13, 8)), quantised=False))
+
+
+@pytest.mark.parametrize("options", [{"samples": 0}, {"hidden": ()}, {"hidden": (0,)}, {"hidden": (1,) * 7}])
+def test_an_mlp_that_cannot_be_is_refused(options):
+    with pytest.raises(ParameterError, match="MLP"):
+        Mlp(**options)
