@@ -77,8 +77,8 @@ def differences(expected: CorrectedRange, message: RangeCorrected) -> bool:
     """Whether board and host differ in any bit, or the message does not say that the board corrected."""
     values = [expected.range_m, expected.correction_m, expected.variance_m2]
     computed = [message.range, message.correction, message.variance]
-    bits = [np.array(row, np.float32).view(np.uint32) for row in (values, computed)]
-    same = np.array_equal(*bits) and message.status == int(expected.status)
+    first, second = (np.array(row, np.float32).tobytes() for row in (values, computed))
+    same = first == second and message.status == int(expected.status)
     return not (same and message.source == Origin.DEVICE and message.model_id == expected.model_id)
 
 

@@ -1,0 +1,70 @@
+"""The Arduino sketch, compiled against a minimal stand-in for the Arduino API; no board was at hand."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from uwb_mitigation.firmware_export.export import export_bundle
+from uwb_mitigation.firmware_export.host import compile_objects, firmware_folder, run
+from uwb_mitigation.link import messages
+from uwb_mitigation.link.framing import FrameDecoder, FrameEncoder
+from uwb_mitigation.link.messages import Correction, Hello
+from uwb_mitigation.measurement import RangeMeasurement
+from uwb_mitigation.mitigation import Mitigation
+from uwb_mitigation.model.bundle import load_bundle
+from uwb_mitigation.model.shipped import default_model_path
+from uwb_mitigation.sources.simulated import SimulatedSource
+
+SKETCH = Path(__file__).parent.parent / "firmware" / "examples" / "UwbMitigation"
+
+
+def test_the_sketchs_model_is_the_shipped_one(tmp_path: Path):
+    export_bundle(load_bundle(default_model_path()), tmp_path)
+    expected = (tmp_path / "uwb_model.h").read_text()
+    assert (SKETCH / "uwb_model.h").read_text() == expected, f"uwb-mitigation export-c -o {SKETCH}"
+
+
+@pytest.mark.skipif(shutil.which("c++") is None, reason="no C++ compiler: apt install g++")
+def test_the_sketch_corrects_what_the_radio_sends_in_writes_that_are_safe_on_usb(tmp_path: Path):
+    firmware = firmware_folder()
+    stub, library = firmware / "test" / "arduino_stub", firmware / "src"
+    objects = compile_objects("cc", ("-std=c99", "-O1", f"-I{library}"), tuple(sorted(library.glob("*.c"))))
+    export_bundle(load_bundle(default_model_path()), tmp_path)
+    program = tmp_path / "sketch"
+    flags = ("-std=gnu++14", "-O1", "-Wall", "-Wextra", "-Werror", "-include", str(stub / "Arduino.h"))
+    # The fresh export, not the committed header: that one has a test of its own.
+    sketch = tmp_path / "UwbMitigation.cpp"
+    sketch.write_text((SKETCH / "UwbMitigation.ino").read_text())
+    includes = (f"-I{stub}", f"-I{library}", f"-I{tmp_path}")
+    files = (str(sketch), str(stub / "main.cpp"), *objects)
+    run(["c++", *flags, *includes, *files, "-lm", "-o", str(program)])
+
+    encoder = FrameEncoder()
+    wires = [encoder.encode(*messages.encode(r.measurement)) for r in SimulatedSource(seed=2, count=25)]
+    done = subprocess.run(
+        [program], input=b"".join(wires)[:60_000], capture_output=True, timeout=60, check=False
+    )
+    assert done.returncode == 0
+
+    decoder, host = FrameDecoder(), Mitigation(load_bundle(default_model_path()))
+    received = [messages.decode(frame.type, frame.payload) for frame in decoder.feed(done.stdout)]
+    assert decoder.counts.corrupt == 0
+    assert isinstance(received[0], Hello)
+    corrections = [message for message in received if isinstance(message, Correction)]
+    sent = [
+        messages.decode(frame.type, frame.payload) for frame in FrameDecoder().feed(b"".join(wires)[:60_000])
+    ]
+    assert len(corrections) == len(sent) >= 10
+    for measurement, correction in zip(sent, corrections, strict=True):
+        assert isinstance(measurement, RangeMeasurement)
+        expected = host.correct(measurement)
+        # Through binary32, as a board holds them.
+        wanted = Correction(
+            0, correction.tag_id, correction.anchor_id, correction.sequence, correction.device_time,
+            expected, correction.compute_us,
+        )  # fmt: skip
+        assert messages.encode(correction) == messages.encode(wanted)
