@@ -31,6 +31,8 @@ from uwb_mitigation.nodes.running import run
 PARAMETERS = (
     Parameter("model", "", "Model bundle to correct with; empty = the shipped one. A bundle that cannot be "
               "used is refused, and the one before stays.", live=True),
+    Parameter("backend", "onnxruntime", "What computes: ONNX Runtime, or the firmware's C compiled for this "
+              "computer at activation, to the same bits.", choices=("onnxruntime", "firmware")),
     Parameter("autostart", True, "Configure and activate without a lifecycle manager."),
 )  # fmt: skip
 
@@ -38,13 +40,20 @@ BATCH = 16
 """Ranges that have queued up are corrected so many at once: a batch costs half of its ranges one by one."""
 
 
-def load(model: str) -> Mitigation:
-    """The bundle that the parameter `model` names, ready to correct.
+def load(model: str, backend: str = "onnxruntime") -> Mitigation:
+    """The bundle that the parameter `model` names, ready to correct by `backend`.
 
     Raises:
-        ModelError: it is absent, corrupt, or refused by ONNX Runtime.
+        ModelError: it is absent, corrupt, or refused by the backend.
+        MissingDependencyError: the firmware is asked for where there is no C compiler.
     """
-    return Mitigation(load_bundle(Path(model).expanduser() if model else default_model_path()))
+    bundle = load_bundle(Path(model).expanduser() if model else default_model_path())
+    if backend == "firmware":
+        # Only here: it compiles.
+        from uwb_mitigation.firmware_export.backend import FirmwareMitigation
+
+        return FirmwareMitigation(bundle)
+    return Mitigation(bundle)
 
 
 class Mitigator(ManagedNode):
@@ -85,7 +94,7 @@ class Mitigator(ManagedNode):
             )
 
     def begin(self) -> None:
-        self._use(load(self.value("model")))
+        self._use(load(self.value("model"), self.value("backend")))
 
     def end(self) -> None:
         with self._lock:
@@ -198,7 +207,7 @@ class Mitigator(ManagedNode):
         for change in changes:
             if change.name == "model" and isinstance(change.value, str):
                 try:
-                    self._prepared = change.value, load(change.value)
+                    self._prepared = change.value, load(change.value, self.value("backend"))
                 except UwbMitigationError as error:
                     reason = f"parameter model = {change.value!r}: {error}"
                     return SetParametersResult(successful=False, reason=reason)
