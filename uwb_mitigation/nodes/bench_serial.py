@@ -28,6 +28,7 @@ from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.link.emulated_board import EmulatedBoard
 from uwb_mitigation.nodes import topics
 from uwb_mitigation.nodes.running import spin
+from uwb_mitigation.preprocessing import WINDOW_LEAD
 from uwb_mitigation.sources.simulated import SimulatedSource
 from uwb_mitigation.sources.source import Record
 
@@ -90,7 +91,7 @@ class _Window:
     @staticmethod
     def _cut(record: Record) -> Record:
         cir = record.measurement.cir
-        start = int(cir.first_path_index) - 10
+        start = int(cir.first_path_index) - WINDOW_LEAD
         cut = replace(cir, samples=cir.samples[2 * start : 2 * (start + WINDOW)], start_index=start)
         return Record(replace(record.measurement, cir=cut))
 
