@@ -1,4 +1,4 @@
-"""The report: every table and figure of the paper beside what was measured, as one HTML page and as JSON.
+"""The report: every table and figure of the paper beside what was measured.
 
 Everything is text and numbers from memory here; the command reads the files and writes the page.
 """
@@ -8,13 +8,12 @@ from __future__ import annotations
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.errors import MissingDependencyError
 from uwb_mitigation.evaluation import figures, paper, tables
+from uwb_mitigation.evaluation.page import Picture, Report
 from uwb_mitigation.evaluation.projection import Projection, principal_components
 from uwb_mitigation.evaluation.results import FirmwareRow, Spread, Trainings, clean
 from uwb_mitigation.evaluation.study import LOS, PAPER_SPLIT, Box, Study, examples
@@ -22,41 +21,15 @@ from uwb_mitigation.evaluation.tables import Cell, Provenance, Table
 from uwb_mitigation.preprocessing import WINDOW_SIZES
 from uwb_mitigation.sources.deepuwb import ROOMS
 
-_TEMPLATES = Path(__file__).parent / "templates"
+STEPS = 5
+"""How often `build` tells of its progress."""
+
 _NO_SEEDS = "none: nothing is drawn or trained"
 _POINTS_SEED = 0
 _SPLITS = {
     "paper": f"paper ({PAPER_SPLIT})",
     "all_but_room_2": "all_but_room_2 (trained in all rooms but the medium one, tested there)",
 }
-
-
-@dataclass(frozen=True, slots=True)
-class Picture:
-    """A figure of the report.
-
-    Attributes:
-        id, title: which of the paper's it stands beside.
-        alt: for who does not see it.
-        note: how to read it; `paper_note`: what the paper's own shows.
-        uri: the image, `data:`.
-        numbers: what is drawn, for a program.
-        provenance, missing: as of a table.
-    """
-
-    id: str
-    title: str
-    alt: str
-    note: str
-    paper_note: str
-    uri: str
-    numbers: Mapping[str, object]
-    provenance: Provenance
-    missing: str = ""
-
-    def as_json(self) -> dict[str, object]:
-        """All but the image."""
-        return {key: value for key, value in asdict(self).items() if key != "uri"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,52 +74,6 @@ class Commands:
         return _shell(["uwb-mitigation", "bench", "firmware", "--json", self.firmware or "firmware.json"])
 
 
-@dataclass(frozen=True, slots=True)
-class Report:
-    """A page: what it says above, its tables and its figures."""
-
-    title: str
-    data: str
-    simulated: bool
-    command: str
-    notices: tuple[str, ...]
-    tables: tuple[Table, ...]
-    pictures: tuple[Picture, ...]
-
-    def as_json(self) -> dict[str, object]:
-        """The same content for a program, without the images."""
-        return {
-            "title": self.title,
-            "data": self.data,
-            "simulated": self.simulated,
-            "command": self.command,
-            "notices": list(self.notices),
-            "tables": [table.as_json() for table in self.tables],
-            "figures": [picture.as_json() for picture in self.pictures],
-        }
-
-    def html(self) -> str:
-        """One page that needs nothing else.
-
-        Raises:
-            MissingDependencyError: jinja2 is not installed.
-        """
-        try:
-            import jinja2
-        except ModuleNotFoundError as error:
-            raise MissingDependencyError(
-                "a report's page needs jinja2", valid="run `make setup-training`"
-            ) from error
-        environment = jinja2.Environment(
-            loader=jinja2.FileSystemLoader(_TEMPLATES),
-            autoescape=True,
-            undefined=jinja2.StrictUndefined,
-            trim_blocks=True,
-            lstrip_blocks=True,
-        )
-        return environment.get_template("report.html.j2").render(report=self) + "\n"
-
-
 def build(
     study: Study,
     commands: Commands,
@@ -159,7 +86,7 @@ def build(
 
     Args:
         left_m: {K: errors that REMNet left on the test part, m, of all seeds}, for Fig. 5's boxes.
-        on_step: called after each of the `STEPS`.
+        on_step: called `STEPS` times.
     """
     trained = _trained_provenance(trainings, commands)
     to_train = f"{commands.protocol}, then {_with(commands, models=True)}"
@@ -192,9 +119,6 @@ def build(
         shown,
         tuple(pictures),
     )
-
-
-STEPS = 5
 
 
 def _shell(words: Sequence[str]) -> str:
