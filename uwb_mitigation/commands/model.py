@@ -327,7 +327,7 @@ def _contest(data: Path, group: str, folds: int, seeds: int, json: Path | None) 
 
 def _needs_torch() -> None:
     try:
-        import torch  # noqa: F401
+        import uwb_mitigation.training.learner  # noqa: F401  (brings torch)
     except ModuleNotFoundError as error:
         if error.name != "torch":
             raise
