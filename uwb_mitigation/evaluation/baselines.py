@@ -6,6 +6,7 @@ The nine features of the CIR are those that the literature classifies propagatio
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable
 
 import numpy as np
@@ -49,7 +50,9 @@ def gradient_boosting(train: Dataset, seed: int) -> Predict:
     model = _scikit("ensemble").HistGradientBoostingRegressor(
         loss="absolute_error", max_iter=TREES, max_leaf_nodes=LEAVES, random_state=seed
     )
-    model.fit(features(train, header=True), train.error_m, sample_weight=_weights(train))
+    # On data this small its threads spend their time waiting for each other.
+    with importlib.import_module("threadpoolctl").threadpool_limits(1):
+        model.fit(features(train, header=True), train.error_m, sample_weight=_weights(train))
     return lambda part: np.asarray(model.predict(features(part, header=True)), np.float64)
 
 
@@ -100,8 +103,6 @@ def _weights(train: Dataset) -> NDArray[np.float64]:
 
 def _scikit(module: str):  # type: ignore[no-untyped-def]
     try:
-        import importlib
-
         return importlib.import_module(f"sklearn.{module}")
     except ModuleNotFoundError as error:
         raise MissingDependencyError(

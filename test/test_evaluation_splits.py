@@ -1,0 +1,135 @@
+"""What is held out as a whole, and what the table is made of."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from model_material import dataset
+
+from uwb_mitigation.errors import DatasetError
+from uwb_mitigation.evaluation import baselines, splits
+from uwb_mitigation.evaluation.intervals import calibrate
+from uwb_mitigation.evaluation.metrics import bootstrap_interval, kept_mae
+from uwb_mitigation.evaluation.splits import Group
+
+NAMES = np.repeat([f"c{number}" for number in range(40)], 5)
+
+
+def placed(tags: list[int], anchors: list[int]):
+    """A dataset of one configuration for each tag and anchor."""
+    data = dataset(len(tags), 4, samples=8)
+    return replace(data, tags=np.repeat(np.uint64(tags), 4), anchors=np.repeat(np.uint64(anchors), 4))
+
+
+@pytest.mark.parametrize("group", list(Group))
+def test_no_configuration_lies_on_both_sides(group):
+    data = placed([1, 1, 2, 2, 3, 4], [1, 2, 1, 2, 3, 4])
+    for split in splits.by_group(data, group, 3, 0):
+        assert not set(data.configurations[split.train]) & set(data.configurations[split.test])
+        assert min(len(split.train), len(split.test)) > 0
+
+
+def test_each_tag_location_is_left_out_once():
+    data = placed([1, 1, 2, 3], [1, 2, 1, 2])
+    held = [set(data.tags[split.test].tolist()) for split in splits.by_group(data, Group.TAG, 6, 0)]
+    assert held == [{1}, {2}, {3}]
+
+
+def test_halves_are_of_anchors_both_ways():
+    data = placed([1, 2, 3, 4], [1, 2, 7, 8])
+    held = [set(data.anchors[split.test].tolist()) for split in splits.by_group(data, Group.HALF, 6, 0)]
+    assert held == [{1, 2}, {7, 8}]
+
+
+def test_a_configuration_that_holds_two_tags_is_not_split():
+    data = replace(placed([1, 2, 3, 4], [1, 1, 2, 2]))
+    data.configurations[:8] = "c0"
+    for split in splits.by_group(data, Group.TAG, 6, 0):
+        assert not (
+            {"c0"} <= set(data.configurations[split.train]) and "c0" in data.configurations[split.test]
+        )
+
+
+@pytest.mark.parametrize("group", [Group.TAG, Group.HALF])
+def test_one_place_does_not_make_a_split(group):
+    with pytest.raises(DatasetError, match="2 or more"):
+        splits.by_group(placed([1, 1], [1, 1]), group, 6, 0)
+    with pytest.raises(DatasetError):
+        splits.by_group(dataset(4, 2, samples=8), group, 6, 0)
+
+
+def test_the_bootstrap_draws_configurations_not_ranges():
+    spread = np.random.default_rng(0).normal(0, 1, 40)
+    few, many = (
+        bootstrap_interval(np.repeat(spread, n), np.repeat(np.arange(40).astype(str), n), 0) for n in (1, 50)
+    )
+    assert few == pytest.approx(many)
+    assert few[0] < np.abs(spread).mean() < few[1]
+
+
+def test_the_largest_variances_are_rejected_first():
+    errors = np.array([1.0, -5.0, 2.0, 4.0])
+    assert kept_mae(errors, np.array([1.0, 4.0, 2.0, 3.0]), 0.5) == 1.5
+    assert kept_mae(errors, errors**2, 0.0) == 3.0
+
+
+def test_intervals_cover_configurations_to_come():
+    generator = np.random.default_rng(1)
+    narrow, wide = [], []
+    for _ in range(60):
+        errors = np.repeat(generator.standard_t(3, 40), 5) * 0.2
+        found = calibrate(errors[:100], np.zeros(100), NAMES[:100])
+        ratio = np.abs(errors[100:]) / np.sqrt(found.variance_m2)
+        narrow.append(np.mean(ratio <= 1))
+        wide.append(np.mean(ratio <= found.sigmas95))
+    assert 0.60 <= np.mean(narrow) <= 0.76
+    assert 0.90 <= np.mean(wide) <= 0.98
+
+
+def test_a_configuration_counts_once_however_long_it_was_recorded():
+    errors = np.where(NAMES == "c0", 3.0, 0.1)
+    once = calibrate(errors, np.zeros(200), NAMES)
+    long = np.concatenate([errors, np.full(2000, 3.0)])
+    names = np.concatenate([NAMES, np.full(2000, "c0")])
+    assert calibrate(long, np.zeros(2200), names).sigmas95 < 100
+    assert once.variance_m2 == pytest.approx(0.01, rel=1e-3)
+
+
+def test_larger_predicted_errors_have_larger_variances():
+    errors = np.random.default_rng(0).normal(0, 0.1, 200)
+    found = calibrate(errors, np.ones(200), NAMES)
+    assert found.variance_per_m2 > 0
+
+
+def test_intervals_of_nothing_are_refused():
+    with pytest.raises(DatasetError):
+        calibrate(np.array([np.nan]), np.array([0.0]), np.array(["a"]))
+
+
+def test_medians_are_of_what_they_say():
+    data = dataset(6, 4, samples=8)
+    error = np.where(data.configurations == "c0", 0.2, 1.0)
+    data = replace(data, error_m=error, labels=np.where(error < 0.5, "LOS", "NLOS"))
+    assert baselines.los_median(data)(data)[0] == 0.2
+    assert baselines.overall_median(data)(data)[0] == 1.0
+    unlabelled = replace(data, labels=np.full(len(data), ""))
+    assert baselines.los_median(unlabelled)(data)[0] == 1.0
+
+
+def test_features_are_finite_whatever_a_header_leaves_out():
+    data = dataset(3, 4, samples=64)
+    data.rx_power_dbm[:] = np.nan
+    data.inputs[0] = 0
+    assert baselines.features(data, header=True).shape == (12, 15)
+    assert np.isfinite(baselines.features(data, header=True)).all()
+
+
+def test_regressions_find_what_the_header_tells(monkeypatch):
+    monkeypatch.setattr(baselines, "TREES", 20)
+    pytest.importorskip("sklearn", reason="run `make setup-training`")
+    data = dataset(30, 8, samples=32)
+    spread = np.abs(data.error_m - np.median(data.error_m)).mean()
+    for predict in (baselines.ridge(data, header=True), baselines.gradient_boosting(data, 0)):
+        assert np.abs(data.error_m - predict(data)).mean() < 0.5 * spread
