@@ -25,6 +25,8 @@ setup(
         (f"share/{PACKAGE}/models", files("models", "*.onnx", "*.md")),
     ],
     install_requires=["setuptools"],
+    # colcon looks here to tell that pytest runs the tests.
+    extras_require={"test": ["pytest"]},
     zip_safe=False,
     author="uwb_mitigation maintainers",
     maintainer="uwb_mitigation maintainers",
@@ -34,9 +36,9 @@ setup(
     python_requires=">=3.10",
     entry_points={
         "console_scripts": [
-            "driver = uwb_mitigation.nodes.driver:main",
-            "mitigator = uwb_mitigation.nodes.mitigator:main",
-            "pipeline = uwb_mitigation.nodes.pipeline:main",
+            "driver = uwb_mitigation.nodes.entry:driver",
+            "mitigator = uwb_mitigation.nodes.entry:mitigator",
+            "pipeline = uwb_mitigation.nodes.entry:pipeline",
             "monitor = uwb_mitigation.nodes.monitor:main",
             "uwb-mitigation = uwb_mitigation.cli:main",
         ],

@@ -32,9 +32,7 @@ class UwbMitigationError(Exception):
         return (_rebuild, (type(self), self.what, self.where, self.valid))
 
 
-def _rebuild(
-    kind: type[UwbMitigationError], what: str, where: str, valid: str
-) -> UwbMitigationError:
+def _rebuild(kind: type[UwbMitigationError], what: str, where: str, valid: str) -> UwbMitigationError:
     return kind(what, where=where, valid=valid)
 
 

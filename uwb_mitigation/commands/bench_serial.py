@@ -17,8 +17,8 @@ def bench_serial(
     rate: Annotated[
         float, typer.Option(min=1.0, max=10_000.0, help="Ranges a second from the board.")
     ] = 1000.0,
-    seconds: Annotated[float, typer.Option(min=1.0, help="Length of the steady stream.")] = 60.0,
-    unplugs: Annotated[int, typer.Option(min=1, help="How often the cable is pulled.")] = 50,
+    seconds: Annotated[float, typer.Option(min=1.0, max=1e6, help="Length of the steady stream.")] = 60.0,
+    unplugs: Annotated[int, typer.Option(min=1, max=1_000_000, help="How often the cable is pulled.")] = 50,
     json: JsonOption = None,
 ) -> None:
     """Stream ranges of an emulated board through the driver; then pull its cable again and again."""

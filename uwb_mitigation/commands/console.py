@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,11 +13,6 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from uwb_mitigation.errors import UwbMitigationError
-
-JsonOption = Annotated[
-    Path | None,
-    typer.Option("--json", metavar="FILE", help="Also write the result to FILE as JSON."),
-]
 
 # Results go to standard output, progress to standard error, so that a pipe carries results alone.
 # rich leaves colours and cursor movement out where a stream is not a terminal.
@@ -41,16 +37,44 @@ def progress() -> Progress:
 def write_json(path: Path | None, result: Mapping[str, Any]) -> None:
     """Write `result` to `path`, whole or not at all; do nothing without a path.
 
+    A link is followed, and a device or pipe written to rather than replaced.
+
     Raises:
         UwbMitigationError: the file cannot be written.
     """
     if path is None:
         return
-    partial = path.with_name(path.name + ".part")
+    text = json.dumps(result, indent=2, allow_nan=False) + "\n"
+    partial: Path | None = None
     try:
-        partial.write_text(json.dumps(result, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-        partial.replace(path)
-    except OSError as error:
-        raise UwbMitigationError(
-            f"cannot write the result: {error.strerror}", where=str(path)
-        ) from error
+        target = path.resolve()
+        if target.exists() and not target.is_file():
+            target.write_text(text, encoding="utf-8")
+            return
+        partial = target.with_name(target.name + ".part")
+        partial.write_text(text, encoding="utf-8")
+        partial.replace(target)
+    except (OSError, RuntimeError, ValueError) as error:
+        if partial is not None:
+            with contextlib.suppress(OSError):
+                partial.unlink(missing_ok=True)
+        reason = getattr(error, "strerror", None) or error
+        raise UwbMitigationError(f"cannot write the result: {reason}", where=str(path)) from error
+
+
+def _check_json_target(path: Path | None) -> Path | None:
+    """Refuse a place that cannot hold the result before the work begins, not after."""
+    if path is not None and (path.is_dir() or not path.absolute().parent.is_dir()):
+        raise typer.BadParameter(f"{path} is a folder, or lies in one that is not there")
+    return path
+
+
+JsonOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--json",
+        metavar="FILE",
+        callback=_check_json_target,
+        help="Also write the result to FILE as JSON.",
+    ),
+]

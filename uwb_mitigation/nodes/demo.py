@@ -24,8 +24,9 @@ from rich.live import Live
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.nodes.monitor import REFRESH_HZ, Monitor, live_table, summary
 from uwb_mitigation.nodes.running import spin
+from uwb_mitigation.sources.simulated import SimulatedSource
 
-SIMULATED_RANGES = 600
+SIMULATED_EXCHANGES = 600
 SIMULATED_RATE_HZ = 40.0
 LONGEST_PAUSE_S = 5.0
 TARGET_S = 15.0
@@ -42,11 +43,13 @@ class Programme:
 
 
 def simulated(rate: float) -> Programme:
+    """The simulator's default scene; what is too weak to be received gives no range, as on the air."""
+    source = SimulatedSource(count=SIMULATED_EXCHANGES, rate_hz=SIMULATED_RATE_HZ)
     return Programme(
-        f"simulated recording, {SIMULATED_RANGES} ranges",
+        f"simulated recording, {len(list(source))} ranges",
         (
             "source:=simulated",
-            f"count:={SIMULATED_RANGES}",
+            f"count:={SIMULATED_EXCHANGES}",
             f"simulated_rate:={SIMULATED_RATE_HZ}",
             f"rate:={rate or 1.0}",
         ),
@@ -86,10 +89,19 @@ def start(node: str, *parameters: str) -> subprocess.Popen[bytes]:
     )
 
 
-def stop(process: subprocess.Popen[bytes]) -> int:
-    """End a node as Ctrl-C would; kill it only if that fails."""
-    if process.poll() is None:
-        process.send_signal(signal.SIGINT)
+def stop(*processes: subprocess.Popen[bytes]) -> list[int]:
+    """End nodes as Ctrl-C would, and return their exit codes; kill only what does not end.
+
+    Another Ctrl-C must not leave one of them behind, so it is not listened to any more.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for process in processes:
+        if process.poll() is None:
+            process.send_signal(signal.SIGINT)
+    return [_exit_code(process) for process in processes]
+
+
+def _exit_code(process: subprocess.Popen[bytes]) -> int:
     try:
         return process.wait(timeout=10)
     except subprocess.TimeoutExpired:
@@ -106,7 +118,6 @@ def watch(programme: Programme, console: Console) -> int:
     thread.start()
     mitigator = start("mitigator")
     driver: subprocess.Popen[bytes] | None = None
-    codes: dict[str, int] = {}
     try:
         wait_for_mitigator(monitor, mitigator)
         # Both the mitigator and this process are to receive the first range too.
@@ -121,15 +132,14 @@ def watch(programme: Programme, console: Console) -> int:
                 time.sleep(0.05)
             live.update(live_table(monitor.tally, programme.title))
     finally:
-        codes["mitigator"] = stop(mitigator)
-        if driver is not None:
-            codes["driver"] = stop(driver)
+        codes = stop(mitigator, *([driver] if driver is not None else []))
         seen.set()
         thread.join()
         monitor.destroy_node()
         rclpy.try_shutdown()
     console.print(summary(monitor.tally))
-    failed = [f"{name} ended with exit code {code}" for name, code in codes.items() if code]
+    names = ("mitigator", "driver")
+    failed = [f"{name} ended with exit code {code}" for name, code in zip(names, codes, strict=False) if code]
     if monitor.tally.missing or not monitor.tally.corrected:
         failed.append(f"{monitor.tally.corrected} of {monitor.tally.raw} ranges came back corrected")
     for failure in failed:

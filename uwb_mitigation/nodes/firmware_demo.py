@@ -136,7 +136,7 @@ def run(console: Console, measured: Sequence[RangeMeasurement]) -> int:
         try:
             play(board, listener, measured)
         finally:
-            code = stop(driver)
+            (code,) = stop(driver)
             seen.set()
             thread.join()
             listener.destroy_node()

@@ -6,6 +6,7 @@ Knows time, pausing, seeking and the end of a recording; knows nothing of messag
 from __future__ import annotations
 
 import threading
+import traceback
 from collections import deque
 from collections.abc import Callable, Sequence
 
@@ -101,6 +102,11 @@ class Playback:
             self._play()
         except UwbMitigationError as problem:
             error = problem
+        except (
+            Exception
+        ) as bug:  # A thread's end must not go unnoticed: the node would publish nothing for ever.
+            traceback.print_exc()
+            error = UwbMitigationError(f"the source failed: {bug!r}", where=self._source.name)
         if not self._stopping.is_set():
             self._on_end(error)
 
@@ -167,7 +173,8 @@ class Playback:
                 self._keep_pace(now_ns, due_ns)
             ahead_ns = self._clock_ns(due_ns) - now_ns
             if self._recorded_stamps:
-                self._on_time(recorded_ns - int(max(ahead_ns, 0) * self._pace))
+                # Before a recording that starts at 0, as simulated ones do, there is no time.
+                self._on_time(max(recorded_ns - int(max(ahead_ns, 0) * self._pace), 0))
             if ahead_ns <= 0 and not self.paused:
                 return -ahead_ns
             self._flush()

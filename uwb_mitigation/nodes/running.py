@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import gc
-import signal
 import sys
 import threading
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import rclpy
 from rclpy.context import Context
+from rclpy.exceptions import NameValidationException
 from rclpy.executors import Executor, SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
 
-from uwb_mitigation.errors import UwbMitigationError
+from uwb_mitigation.errors import ParameterError, UwbMitigationError
+from uwb_mitigation.nodes.signals import stop_event
 
 PATIENCE_S = 0.2
 
@@ -51,21 +53,19 @@ def run(
     """Initialise ROS, make nodes, spin them, and end cleanly. Returns the process's exit code.
 
     SIGINT and SIGTERM set the event that `make_nodes` is given; so may a node, with its `exit_code`
-    set before. Nodes are destroyed in their order. ROS's own handlers would tear the context down under callbacks that still publish.
+    set before. Nodes are destroyed in their order. ROS's own handlers would tear the context down
+    under callbacks that still publish.
     """
-    stop = threading.Event()
-
-    def on_signal(number: int, frame: Any) -> None:
-        stop.set()
-        # A second one ends the process the hard way.
-        signal.signal(number, signal.SIG_DFL)
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, on_signal)
-    rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+    stop = stop_event()
     nodes: Sequence[Node] = ()
     try:
-        nodes = make_nodes(stop)
+        if stop.is_set():
+            return 0
+        _initialise(arguments)
+        try:
+            nodes = make_nodes(stop)
+        except (rclpy_implementation.RCLError, NameValidationException) as error:
+            raise ParameterError(_first_line(error), valid="check the names given to --ros-args") from error
         spin(nodes, stop)
     except UwbMitigationError as error:
         print(f"error: {error}", file=sys.stderr)
@@ -75,3 +75,26 @@ def run(
             node.destroy_node()
         rclpy.try_shutdown()
     return max((int(getattr(node, "exit_code", 0)) for node in nodes), default=0)
+
+
+def _initialise(arguments: Sequence[str] | None) -> None:
+    """Initialise ROS without its signal handlers.
+
+    Raises:
+        ParameterError: an argument that ROS cannot read, or that is none of ROS's.
+    """
+    words = list(sys.argv if arguments is None else arguments)
+    try:
+        rclpy.init(args=words, signal_handler_options=SignalHandlerOptions.NO)
+    except RuntimeError as error:
+        raise ParameterError(_first_line(error), valid="check what follows --ros-args") from error
+    strangers = remove_ros_args(words)[1:]
+    if strangers:
+        raise ParameterError(
+            f"arguments {' '.join(strangers)!r}", valid="parameters follow --ros-args, as in -p name:=value"
+        )
+
+
+def _first_line(error: Exception) -> str:
+    """What ROS says, without the places in its own source files."""
+    return str(error).strip().splitlines()[0].split(", at /")[0]

@@ -14,6 +14,8 @@ import numpy as np
 from uwb_mitigation.measurement import Status
 
 RATE_WINDOW = 20
+LATENCIES = 100_000
+"""The latest of so many are summed up: a monitor may run for days."""
 
 
 @dataclass(slots=True)
@@ -56,7 +58,7 @@ class Tally:
         self.corrected = 0
         self.statuses: Counter[Status] = Counter()
         self.errors: dict[str, Errors] = {}
-        self._latencies_s: list[float] = []
+        self._latencies_s: deque[float] = deque(maxlen=LATENCIES)
         # Truth comes first and is kept until its corrected range does; bounded, should that be lost.
         self._truths: dict[Hashable, tuple[float, str]] = {}
 
