@@ -36,6 +36,10 @@ def generate(monkeypatch: pytest.MonkeyPatch):
             "DeclareLaunchArgument": record("argument"),
             "OpaqueFunction": record("function"),
         },
+        "launch.conditions": {
+            "IfCondition": lambda value: ("if", value.name),
+            "UnlessCondition": lambda value: ("unless", value.name),
+        },
         "launch.substitutions": {
             "LaunchConfiguration": Configuration,
             "PathJoinSubstitution": lambda parts: parts,
@@ -54,9 +58,13 @@ def generate(monkeypatch: pytest.MonkeyPatch):
 def test_the_launch_file_starts_both_nodes_with_their_parameter_files(generate):
     entities = generate("uwb.launch.py")
     nodes = [entity for entity in entities if entity.kind == "node"]
-    assert [node.executable for node in nodes] == ["driver", "mitigator"]
+    assert [(node.executable, node.condition) for node in nodes] == [
+        ("driver", ("unless", "one_process")),
+        ("mitigator", ("unless", "one_process")),
+        ("pipeline", ("if", "one_process")),
+    ]
     arguments = {entity.values[0]: entity for entity in entities if entity.kind == "argument"}
-    assert set(arguments) == {"namespace", "driver_params", "mitigator_params"}
+    assert set(arguments) == {"namespace", "one_process", "driver_params", "mitigator_params"}
     for name in ("driver", "mitigator"):
         assert arguments[f"{name}_params"].default_value == [
             ["share/uwb_mitigation", "params"],
