@@ -38,3 +38,8 @@ def test_every_page_of_the_documentation_can_be_reached():
         read.add(page)
         waiting += [(page.parent / target).resolve() for target in links(page) if "://" not in target]
     assert {page for page in PAGES if page.parent.name == "docs"} <= read
+
+
+def test_no_page_holds_a_placeholder():
+    bare = re.compile(r"^[A-Z]{4,}$", re.MULTILINE)
+    assert [page.name for page in PAGES if bare.search(page.read_text(encoding="utf-8"))] == []
