@@ -27,11 +27,8 @@ demo: setup  ## replay RECORDING=path (default: simulated) through driver and mi
 firmware-demo: setup  ## the firmware in an emulated Cortex-M4 as the driver's board (RECORDING=path), compared with the host
 	@$(IN_ROS) $(VENV)/bin/python -m uwb_mitigation.nodes.firmware_demo $(if $(RECORDING),--recording '$(RECORDING)')
 
-# Two workers a core: the tests that start nodes spend their time waiting for DDS.
-WORKERS = $(shell expr 2 \* $$(nproc))
-
 test: setup-training  ## run every test
-	@$(IN_ROS) $(VENV)/bin/python -m pytest -n $(WORKERS) --dist worksteal
+	@$(IN_ROS) $(VENV)/bin/python -m pytest -n auto
 
 # What a machine with ROS 2 does by hand; without one, the environment stands in for /opt/ros/jazzy.
 COLCON = $(IN_ROS) PATH="$(CURDIR)/$(VENV)/bin:$$PATH" \
