@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from array import array
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,15 +21,16 @@ pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import Transition
+from rclpy.serialization import deserialize_message
 from ros_harness import Ros, domain
 from rosgraph_msgs.msg import Clock
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
 
+from uwb_mitigation.bag.codec import encode_range
 from uwb_mitigation.measurement import Status
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.shipped import default_model_path
-from uwb_mitigation.nodes import messages
 from uwb_mitigation.sources.decaranging import open_decaranging
 from uwb_mitigation.sources.opening import open_recording
 from uwb_mitigation.sources.simulated import SimulatedSource
@@ -231,7 +233,8 @@ def test_every_transition_can_be_repeated(ros: Ros):
 
 def good_message() -> RangeCir:
     record = next(iter(SimulatedSource(seed=5, count=1)))
-    return messages.to_range_cir(record.measurement, messages.to_header(1_500_000_000, "antenna"))
+    measurement = replace(record.measurement, stamp_ns=1_500_000_000, frame_id="antenna")
+    return deserialize_message(encode_range(measurement), RangeCir)
 
 
 def changed(**fields) -> RangeCir:

@@ -22,6 +22,7 @@ from rich.console import Console
 from rich.live import Live
 
 from uwb_mitigation.errors import UwbMitigationError
+from uwb_mitigation.nodes import topics
 from uwb_mitigation.nodes.monitor import REFRESH_HZ, Monitor, live_table, summary
 from uwb_mitigation.nodes.running import spin
 from uwb_mitigation.sources.simulated import SimulatedSource
@@ -154,7 +155,7 @@ def wait_for_mitigator(monitor: Monitor, mitigator: subprocess.Popen[bytes]) -> 
         UwbMitigationError: it ended, or did not come up in time.
     """
     deadline = time.monotonic() + CONNECT_TIMEOUT_S
-    raw, corrected = (monitor.resolve_topic_name(name) for name in ("uwb/range_raw", "uwb/range_corrected"))
+    raw, corrected = (monitor.resolve_topic_name(name) for name in (topics.RANGE_RAW, topics.RANGE_CORRECTED))
     while not (monitor.count_publishers(corrected) and monitor.count_subscribers(raw) >= 2):
         if mitigator.poll() is not None or time.monotonic() > deadline:
             raise UwbMitigationError("the mitigator did not come up", valid="see its message above")

@@ -1,17 +1,14 @@
 """Between this package's values and the ROS messages of `uwb_mitigation_msgs`.
 
 rclpy does not check field types unless told to, and a wrong one is sent as garbage: every assignment
-here converts explicitly, and samples travel as `array.array`, which is a plain copy.
+here converts explicitly. Raw and corrected ranges of the host are serialised by `bag.codec` instead.
 """
 
 from __future__ import annotations
 
-from array import array
-
 import numpy as np
 from builtin_interfaces.msg import Time
 from std_msgs.msg import Header
-from uwb_mitigation_msgs.msg import Cir as CirMessage
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
 
 from uwb_mitigation.link.messages import Correction
@@ -25,33 +22,6 @@ _ENCODINGS = {int(encoding): encoding for encoding in Encoding}
 def to_header(stamp_ns: int, frame_id: str) -> Header:
     seconds, nanoseconds = divmod(stamp_ns, NANOSECONDS)
     return Header(stamp=Time(sec=seconds, nanosec=nanoseconds), frame_id=frame_id)
-
-
-def to_range_cir(measurement: RangeMeasurement, header: Header) -> RangeCir:
-    """The message of a measurement, under a header that the caller has stamped."""
-    cir = measurement.cir
-    return RangeCir(
-        header=header,
-        tag_id=measurement.tag_id,
-        anchor_id=measurement.anchor_id,
-        sequence=measurement.sequence,
-        device_time=measurement.device_time,
-        range=float(measurement.range_m),
-        cir=CirMessage(
-            sample_period=float(cir.sample_period_s),
-            start_index=int(cir.start_index),
-            first_path_index=float(cir.first_path_index),
-            encoding=int(cir.encoding),
-            scale=float(cir.scale),
-            samples=array("h", cir.samples.tobytes()),
-            preamble_count=int(cir.preamble_count),
-            noise_threshold=int(cir.noise_threshold),
-            rx_power=float(cir.rx_power_dbm),
-            first_path_power=float(cir.first_path_power_dbm),
-            channel=int(cir.channel),
-            prf=int(cir.prf_mhz),
-        ),
-    )
 
 
 def from_range_cir(message: RangeCir) -> RangeMeasurement:
@@ -85,21 +55,6 @@ def from_range_cir(message: RangeCir) -> RangeMeasurement:
         ),
         frame_id=message.header.frame_id,
     )
-
-
-def fill_range_corrected(message: RangeCorrected, raw: RangeCir, corrected: CorrectedRange) -> None:
-    """Write a corrected range into a message that the caller keeps for this."""
-    message.header = raw.header
-    message.tag_id = raw.tag_id
-    message.anchor_id = raw.anchor_id
-    message.sequence = raw.sequence
-    message.range = float(corrected.range_m)
-    message.range_raw = float(corrected.range_raw_m)
-    message.correction = float(corrected.correction_m)
-    message.variance = float(corrected.variance_m2)
-    message.status = int(corrected.status)
-    message.source = int(corrected.origin)
-    message.model_id = int(corrected.model_id)
 
 
 def to_range_corrected(correction: Correction, header: Header) -> RangeCorrected:
