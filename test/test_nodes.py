@@ -325,3 +325,16 @@ def test_the_demo_names_a_recording_that_is_not_there():
     result = run_demo("--recording", "/nonexistent.log")
     assert result.returncode == 1
     assert "/nonexistent.log" in result.stdout
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("node", ["driver", "mitigator", "pipeline"])
+def test_a_signal_while_a_node_still_loads_ends_it_cleanly(ros: Ros, node: str, number: signal.Signals):
+    code = (
+        "from uwb_mitigation.nodes.signals import stop_event; stop_event(); print('caught', flush=True)\n"
+        f"from uwb_mitigation.nodes.entry import {node}; {node}()"
+    )
+    process = ros.run([sys.executable, "-c", code])
+    process.wait_for_output("caught")
+    assert process.signal(number) == 0, process.output
+    assert "Traceback" not in process.output

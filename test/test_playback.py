@@ -144,3 +144,22 @@ def test_a_stop_during_a_pause_ends_the_thread_and_tells_no_end():
     player.playback.stop()
     assert not player.playback._thread.is_alive()
     assert player.ends == []
+
+
+def test_the_clock_of_a_recording_that_starts_at_zero_is_never_negative():
+    player = Player(ListSource([0, 30_000_000]), stop_after=5, loop=True, recorded_stamps=True).play()
+    assert player.clock_times
+    assert min(player.clock_times) >= 0
+
+
+def test_a_source_that_fails_in_no_foreseen_way_ends_the_playing_with_an_error(capsys):
+    class Broken(ListSource):
+        def __iter__(self):
+            yield from super().__iter__()
+            raise ZeroDivisionError("a bug")
+
+    player = Player(Broken([0, 1])).play()
+    assert len(player.published) == 2
+    (error,) = player.ends
+    assert "a bug" in str(error)
+    assert "ZeroDivisionError" in capsys.readouterr().err
