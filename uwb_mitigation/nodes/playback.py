@@ -102,9 +102,8 @@ class Playback:
             self._play()
         except UwbMitigationError as problem:
             error = problem
-        except (
-            Exception
-        ) as bug:  # A thread's end must not go unnoticed: the node would publish nothing for ever.
+        except Exception as bug:
+            # A thread's end must not go unnoticed: the node would publish nothing for ever.
             traceback.print_exc()
             error = UwbMitigationError(f"the source failed: {bug!r}", where=self._source.name)
         if not self._stopping.is_set():
