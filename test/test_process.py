@@ -24,7 +24,16 @@ from uwb_mitigation.bag.reader import BagReader
 from uwb_mitigation.bag.topics import RANGE_CIR_TYPE, RANGE_CORRECTED, RANGE_RAW
 from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.errors import MissingDependencyError, ParameterError, RecordingError
-from uwb_mitigation.measurement import Cir, CorrectedRange, Encoding, Origin, RangeMeasurement, Status, Truth
+from uwb_mitigation.measurement import (
+    Cir,
+    CorrectedColumns,
+    CorrectedRange,
+    Encoding,
+    Origin,
+    RangeMeasurement,
+    Status,
+    Truth,
+)
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.architecture import Remnet
 from uwb_mitigation.model.bundle import load_bundle
@@ -199,16 +208,20 @@ def test_columns_are_corrected_as_one_by_one_and_the_rest_is_left_out(tmp_path: 
         *(exchange(n, {"rx_power_dbm": -70.0 - n}) for n in range(50)),
     ]
     (block,) = columns.blocks([codec.encode_range(m) for m in measurements])
-    rows, *results = mitigation.correct_columns(block.columns)
-    answers = dict(
-        zip(rows.tolist(), zip(*(values.tolist() for values in results), strict=True), strict=True)
-    )
+    rows, corrected = mitigation.correct_columns(block.columns)
+    values = (corrected.range_m, corrected.correction_m, corrected.variance_m2, corrected.status)
+    answers = dict(zip(rows.tolist(), zip(*(value.tolist() for value in values), strict=True), strict=True))
     single_answers = [mitigation.correct(m) for m in measurements]
-    assert answers == {
-        n: (answer.range_m, answer.correction_m, answer.variance_m2)
-        for n, answer in enumerate(single_answers)
-        if answer.status is Status.OK
-    }
+    assert (
+        answers.items()
+        <= {
+            n: (answer.range_m, answer.correction_m, answer.variance_m2, answer.status)
+            for n, answer in enumerate(single_answers)
+        }.items()
+    )
+    assert (corrected.origin, corrected.model_id) == (Origin.HOST, mitigation.bundle.model_id)
+    assert answers.keys() >= {n for n, answer in enumerate(single_answers) if answer.status is Status.OK}
+    assert set(corrected.status.tolist()) == {Status.OK, Status.OUT_OF_DISTRIBUTION}
     assert {answer.status for answer in single_answers} >= {
         Status.OK,
         Status.BAD_CIR,
@@ -227,8 +240,12 @@ def test_encoded_blocks_are_what_the_codec_encodes(frame: str, samples: int) -> 
     rows = np.array([0, 3, 8])
     correction = np.array([0.25, -0.5, 1.0], np.float32)
     variance = np.array([0.25, 0.5, 2.0], np.float32)
+    status = np.array([Status.OK, Status.OUT_OF_DISTRIBUTION, Status.OK], np.uint8)
     encoded = block.encode_corrected(
-        rows, block.columns.range_m[rows] - correction, correction, variance, LIKE
+        rows,
+        CorrectedColumns(
+            block.columns.range_m[rows] - correction, correction, variance, status, LIKE.origin, LIKE.model_id
+        ),
     )
     assert encoded == [
         codec.encode_corrected(
@@ -239,9 +256,12 @@ def test_encoded_blocks_are_what_the_codec_encodes(frame: str, samples: int) -> 
                 range_raw_m=measurements[row].range_m,
                 correction_m=shift,
                 variance_m2=spread,
+                status=Status(kind),
             ),
         )
-        for row, shift, spread in zip(rows.tolist(), correction.tolist(), variance.tolist(), strict=True)
+        for row, shift, spread, kind in zip(
+            rows.tolist(), correction.tolist(), variance.tolist(), status.tolist(), strict=True
+        )
     ]
 
 

@@ -176,3 +176,25 @@ class RangeColumns:
     def __len__(self) -> int:
         """The number of exchanges."""
         return len(self.range_m)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CorrectedColumns:
+    """n corrected ranges of one origin and one model, field by field as in `CorrectedRange`.
+
+    Attributes:
+        range_m, correction_m, variance_m2: float32 (n,).
+        status: uint8 (n,), of `Status`.
+        origin, model_id: of every one.
+    """
+
+    range_m: NDArray[np.float32]
+    correction_m: NDArray[np.float32]
+    variance_m2: NDArray[np.float32]
+    status: NDArray[np.uint8]
+    origin: Origin
+    model_id: int
+
+    def __len__(self) -> int:
+        """The number of ranges."""
+        return len(self.range_m)

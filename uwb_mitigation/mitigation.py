@@ -8,7 +8,14 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.measurement import CorrectedRange, Origin, RangeColumns, RangeMeasurement, Status
+from uwb_mitigation.measurement import (
+    CorrectedColumns,
+    CorrectedRange,
+    Origin,
+    RangeColumns,
+    RangeMeasurement,
+    Status,
+)
 from uwb_mitigation.model.bundle import Bundle, Card
 from uwb_mitigation.model.familiarity import Strangeness, features
 from uwb_mitigation.model.session import Session
@@ -130,33 +137,43 @@ class Mitigation:
             results[index] = self._corrected(measurements[index], prepared[index][0] + network_m, score)
         return results
 
-    def correct_columns(
-        self, ranges: RangeColumns
-    ) -> tuple[NDArray[np.intp], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """The rows that `correct` gives status OK, ascending; their ranges, corrections, m, and variances, m^2,
-        to the bit.
+    def correct_columns(self, ranges: RangeColumns) -> tuple[NDArray[np.intp], CorrectedColumns]:
+        """The rows whose error could be predicted, ascending, and what `correct` makes of them, to the bit.
 
-        Every other row passes through: ask `correct` for its status.
+        Each has the status OK or OUT_OF_DISTRIBUTION. Ask `correct` for every other row.
         """
         rows, windows = self._preprocessing.apply_batch(ranges)
         prior = self._prior.predict_batch_m(ranges.rx_power_dbm[rows], ranges.first_path_power_dbm[rows])
         range_m = ranges.range_m[rows]
         wanted = np.isfinite(prior) & (range_m >= 0.0) & (range_m <= MAX_RANGE_M)
-        if not wanted.all():
-            rows, windows, prior, range_m = rows[wanted], windows[wanted], prior[wanted], range_m[wanted]
-        if not len(rows):
-            return rows, range_m, prior, prior
         try:
             predicted = prior + self._session.predict_batch_m(windows)
         except Exception:  # As in `correct`.
-            return rows[:0], range_m[:0], prior[:0], prior[:0]
+            wanted[:] = False
+            predicted = prior
+        wanted &= np.isfinite(predicted)
+        if not wanted.all():
+            rows, windows, predicted, range_m = (
+                rows[wanted],
+                windows[wanted],
+                predicted[wanted],
+                range_m[wanted],
+            )
         score = self._grader.score(
             windows, range_m, ranges.rx_power_dbm[rows], ranges.first_path_power_dbm[rows]
         )
         inside = self._grader.passes(predicted, score)
-        rows, range_m = rows[inside], range_m[inside]
-        correction, variance = self._grader.grade(predicted[inside], score[inside])
-        return rows, range_m - correction, correction, variance
+        correction = np.zeros(len(rows), np.float32)
+        variance = np.full(len(rows), self._variance_uncorrected, np.float32)
+        correction[inside], variance[inside] = self._grader.grade(predicted[inside], score[inside])
+        return rows, CorrectedColumns(
+            range_m - correction,
+            correction,
+            variance,
+            np.where(inside, np.uint8(Status.OK), np.uint8(Status.OUT_OF_DISTRIBUTION)),
+            Origin.HOST,
+            self.bundle.model_id,
+        )
 
     def _scores(
         self, measurements: Sequence[RangeMeasurement], windows: NDArray[np.float32]

@@ -16,7 +16,13 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.bag import codec
 from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.measurement import CorrectedRange, RangeColumns, RangeMeasurement
+from uwb_mitigation.measurement import (
+    CorrectedColumns,
+    CorrectedRange,
+    RangeColumns,
+    RangeMeasurement,
+    Status,
+)
 
 MIN_BLOCK = 8
 """Fewer messages of a layout are faster one by one."""
@@ -45,6 +51,7 @@ _CORRECTED_FIELDS = {
     "range_raw": ("<f4", 24),
     "correction": ("<f4", 28),
     "variance": ("<f4", 32),
+    "status": ("u1", 36),
 }
 _HEADER_FIELDS = {"encapsulation": ("S2", 0), "seconds": ("<i4", 4), "nanoseconds": ("<u4", 8)}
 _COPIED = ("seconds", "nanoseconds", "tag_id", "anchor_id", "sequence")
@@ -80,18 +87,9 @@ class Block:
             first_path_power_dbm=fields["first_path_power"],
         )
 
-    def encode_corrected(
-        self,
-        rows: NDArray[np.intp],
-        range_m: NDArray[np.float32],
-        correction_m: NDArray[np.float32],
-        variance_m2: NDArray[np.float32],
-        like: CorrectedRange,
-    ) -> list[bytes]:
-        """`RangeCorrected` of some of the block's own `rows`: the bytes of `codec.encode_corrected`.
-
-        What is not given (status, origin, model) is as in `like`.
-        """
+    def encode_corrected(self, rows: NDArray[np.intp], corrected: CorrectedColumns) -> list[bytes]:
+        """`RangeCorrected` of some of the block's own `rows`: the bytes of `codec.encode_corrected`."""
+        like = CorrectedRange(0.0, 0.0, 0.0, 0.0, Status.OK, corrected.origin, corrected.model_id)
         template = codec.encode_corrected(self.first, like)
         at = len(template) - codec.CORRECTED_SIZE
         size = len(template)
@@ -100,10 +98,11 @@ class Block:
         out = np.frombuffer(buffer, _structure(at, size, _CORRECTED_FIELDS))
         for name in _COPIED:
             out[name] = self.fields[name][rows]
-        out["range"] = range_m
+        out["range"] = corrected.range_m
         out["range_raw"] = self.fields["range"][rows]
-        out["correction"] = correction_m
-        out["variance"] = variance_m2
+        out["correction"] = corrected.correction_m
+        out["variance"] = corrected.variance_m2
+        out["status"] = corrected.status
         data = bytes(buffer)
         return [data[start : start + size] for start in range(0, len(data), size)]
 

@@ -20,13 +20,15 @@ from uwb_mitigation.bag.reader import BagReader, check_channel
 from uwb_mitigation.bag.topics import RANGE_CIR_TYPE, RANGE_CORRECTED, RANGE_RAW
 from uwb_mitigation.bag.writer import METADATA_RECORD, BagWriter
 from uwb_mitigation.errors import DamagedRecordingError, RecordingError, UwbMitigationError
-from uwb_mitigation.measurement import CorrectedRange, Origin, Status
+from uwb_mitigation.measurement import Status
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.processing import copying
 
 BATCH = 256
 """Messages taken together: enough to vectorise, little enough that the network's inputs stay in cache."""
+
+_NAMES = {int(status): status.name for status in Status}
 
 Report = Callable[[int, int], None]
 """Called with (messages done, messages in all, as the bag's index says)."""
@@ -173,10 +175,6 @@ class _Corrector:
         self._source = source
         self._mitigation = mitigation
         self._out = out
-        card = mitigation.bundle.card
-        self._like = CorrectedRange(
-            0.0, 0.0, 0.0, card.variance_m2, Status.OK, Origin.HOST, mitigation.bundle.model_id
-        )
         # The bag keeps its channels, so that an identity stands for one channel of one file.
         self._channels: dict[int, int] = {}
         self._corrected = out.corrected_channel()
@@ -211,13 +209,13 @@ class _Corrector:
         answers: list[bytes | None] = [None] * len(messages)
         left = set(range(len(messages)))
         for block in columns.blocks(messages):
-            rows, range_m, correction_m, variance_m2 = self._mitigation.correct_columns(block.columns)
-            encoded = block.encode_corrected(rows, range_m, correction_m, variance_m2, self._like)
+            rows, corrected = self._mitigation.correct_columns(block.columns)
+            encoded = block.encode_corrected(rows, corrected)
             numbers = block.rows[rows].tolist()
             for number, answer in zip(numbers, encoded, strict=True):
                 answers[number] = answer
             left.difference_update(numbers)
-            self.statuses[Status.OK.name] += len(numbers)
+            self.statuses.update(_NAMES[status] for status in corrected.status.tolist())
         # What is odd in any way is left to the one definition.
         numbers, measurements = [], []
         for number in sorted(left):
