@@ -55,14 +55,11 @@ def bench_soak(
         outcome = soak.soak(
             messages, rate, one_process=one_process, advance=lambda done: bar.update(task, completed=done)
         )
-    table = Table("", "settled", "end", title=f"{outcome.received} ranges in {outcome.seconds:.0f} s")
-    table.add_row("ranges", str(outcome.settled.ranges), str(outcome.end.ranges))
-    table.add_row("memory, MB", f"{outcome.settled.memory_mb:.1f}", f"{outcome.end.memory_mb:.1f}")
-    table.add_row("descriptors", str(outcome.settled.descriptors), str(outcome.end.descriptors))
-    table.add_row("threads", str(outcome.settled.threads), str(outcome.end.threads))
-    table.add_section()
-    table.add_row("highest memory, MB", "", f"{outcome.highest_mb:.1f}")
-    table.add_row("lost", "", str(outcome.lost))
+    table = Table(title=f"{outcome.received} ranges in {outcome.seconds:.0f} s, {outcome.lost} lost")
+    for column in ("ranges", "memory, MB", "descriptors", "threads"):
+        table.add_column(column, justify="right")
+    for look in outcome.course:
+        table.add_row(str(look.ranges), f"{look.memory_mb:.1f}", str(look.descriptors), str(look.threads))
     console.out.print(table)
     console.write_json(json, asdict(outcome))
 

@@ -13,8 +13,8 @@ from uwb_mitigation.nodes import topics, vitals
 from uwb_mitigation.nodes.bench_nodes import Subject, open_bench
 
 _STALLED_S = 10.0
-_WARM = 0.1
-"""Share of the ranges after which memory is taken as settled: allocators fill their pools first."""
+LOOKS = 10
+"""The processes are looked at after each such part of the ranges. Allocators fill their pools in the first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,16 +34,13 @@ class Outcome:
     Attributes:
         received, lost: ranges that arrived corrected, and that are missing between them.
         seconds: wall time.
-        settled, end: what was taken after a tenth of the ranges, and after all.
-        highest_mb: memory at any time between the two.
+        course: what was taken after each tenth of the ranges, or once a second where that is longer.
     """
 
     received: int
     lost: int
     seconds: float
-    settled: Vitals
-    end: Vitals
-    highest_mb: float
+    course: tuple[Vitals, ...]
 
 
 def soak(messages: int, rate_hz: float, *, one_process: bool, advance: Callable[[int], None]) -> Outcome:
@@ -73,17 +70,13 @@ def soak(messages: int, rate_hz: float, *, one_process: bool, advance: Callable[
         subject.play(rate_hz)
         began_s = moved_s = time.monotonic()
         received = lost = 0
-        settled: Vitals | None = None
-        highest_mb = 0.0
+        course: list[Vitals] = []
         while received < messages:
             bench.spin_for(1.0)
             arrived, missing = subject.count()
             received, lost = received + arrived, lost + missing
-            now = look(received)
-            if settled is None and received >= _WARM * messages:
-                settled = now
-            if settled is not None:
-                highest_mb = max(highest_mb, now.memory_mb)
+            if received * LOOKS >= messages * (len(course) + 1):
+                course.append(look(received))
             if arrived:
                 moved_s = time.monotonic()
             elif time.monotonic() - moved_s > _STALLED_S:
@@ -91,6 +84,4 @@ def soak(messages: int, rate_hz: float, *, one_process: bool, advance: Callable[
             advance(received)
         seconds = time.monotonic() - began_s
         subject.pause()
-        end = look(received)
-    assert settled is not None
-    return Outcome(received, lost, seconds, settled, end, highest_mb)
+    return Outcome(received, lost, seconds, tuple(course))
