@@ -10,7 +10,7 @@ VENV := .venv
 IN_ROS = . $(VENV)/environment.sh;
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-training demo firmware-demo test colcon lint lock clean
+.PHONY: help setup setup-training setup-docs demo firmware-demo test colcon docs docs-links lint lock clean
 
 help:  ## show this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 24
@@ -45,15 +45,27 @@ colcon: setup-training  ## colcon build and colcon test (the tests that start no
 	@$(COLCON) test-result --verbose
 	@grep -q 'tests="[1-9]' build/uwb_mitigation/pytest.xml  # no test at all is a failure too
 
+setup-docs:
+	@$(PYTHON) bootstrap.py docs
+
+SPHINX = $(VENV)/bin/sphinx-build --fail-on-warning --keep-going --nitpicky --fresh-env --quiet -c docs -d build/doctrees .
+
+docs: setup-docs  ## build the documentation into build/site; a warning or a link within that leads nowhere is an error
+	@$(SPHINX) build/site
+	@echo build/site/docs/index.html
+
+docs-links: setup-docs  ## look whether the documentation's links to elsewhere are alive (needs a network)
+	@$(SPHINX) -b linkcheck build/links
+
 lint: setup-training  ## ruff and mypy
 	@$(VENV)/bin/ruff check .
 	@$(VENV)/bin/ruff format --check .
 	@$(VENV)/bin/mypy
 
 lock:  ## write requirements/*.txt anew from requirements/*.in (needs uv)
-	cd requirements && for part in runtime ros develop training; do \
+	cd requirements && for part in runtime ros develop training docs; do \
 	  uv pip compile --quiet --universal --python-version 3.10 --no-header --no-annotate \
-	    $$(for done in runtime ros develop; do [ $$done = $$part ] && break; echo -c $$done.txt; done) \
+	    $$(for done in runtime ros develop training; do [ $$done = $$part ] && break; echo -c $$done.txt; done) \
 	    $$part.in -o $$part.txt || exit 1; done
 
 clean:  ## remove .venv and everything built

