@@ -121,20 +121,20 @@ class Mitigation:
             self._prepare(measurement, window)
             for measurement, window in zip(measurements, windows, strict=True)
         ]
-        results = [
-            self._passed(measurement, status)
-            for measurement, (_, status) in zip(measurements, prepared, strict=True)
-        ]
         usable = [index for index, (_, status) in enumerate(prepared) if status is Status.OK]
-        if not usable:
-            return results
         try:
             predicted = self._session.predict_batch_m(windows[usable])
         except Exception:  # As in `correct`.
             predicted = np.full(len(usable), np.nan, np.float32)
         scores = self._scores([measurements[index] for index in usable], windows[usable])
-        for index, network_m, score in zip(usable, predicted, scores, strict=True):
-            results[index] = self._corrected(measurements[index], prepared[index][0] + network_m, score)
+        judged = zip(predicted, scores, strict=True)
+        results = []
+        for measurement, (prior, status) in zip(measurements, prepared, strict=True):
+            if status is Status.OK:
+                network_m, score = next(judged)
+                results.append(self._corrected(measurement, prior + network_m, score))
+            else:
+                results.append(self._passed(measurement, status))
         return results
 
     def correct_columns(self, ranges: RangeColumns) -> tuple[NDArray[np.intp], CorrectedColumns]:
@@ -185,7 +185,7 @@ class Mitigation:
             numbers = np.array(
                 [(m.range_m, m.cir.rx_power_dbm, m.cir.first_path_power_dbm) for m in measurements],
                 np.float32,
-            )
+            ).reshape(-1, 3)
         return self._grader.score(windows, *numbers.T)
 
     def _prepare(
