@@ -1,4 +1,4 @@
-"""`uwb-mitigation data`: bring recordings into bags, and show what a recording holds."""
+"""`uwb-mitigation data`: bring recordings into bags or simulate them, and show what a recording holds."""
 
 from __future__ import annotations
 
@@ -12,13 +12,15 @@ import typer
 from uwb_mitigation.commands import console
 from uwb_mitigation.commands.console import JsonOption
 from uwb_mitigation.commands.fetch import fetch
-from uwb_mitigation.errors import DamagedRecordingError, RecordingError
+from uwb_mitigation.errors import DamagedRecordingError, ParameterError, RecordingError
 
 if TYPE_CHECKING:
     from uwb_mitigation.sources.inventory import Inventory
     from uwb_mitigation.sources.source import Source
 
-app = typer.Typer(help="Bring recordings into bags, and show what a recording holds.", no_args_is_help=True)
+app = typer.Typer(
+    help="Bring recordings into bags or simulate them, and show what a recording holds.", no_args_is_help=True
+)
 app.command()(fetch)
 
 _STRIDE = 100
@@ -30,6 +32,14 @@ class CirChoice(str, enum.Enum):
 
     FINAL = "final"
     POLL = "poll"
+
+
+class Scene(str, enum.Enum):
+    """What is simulated."""
+
+    DRIVE = "drive"
+    SURVEY = "survey"
+    DEEPUWB = "deepuwb"
 
 
 CirOption = Annotated[
@@ -89,6 +99,94 @@ def import_recordings(
     # What was readable is kept; that it is not everything must not pass unnoticed.
     if damage:
         raise damage[0]
+
+
+@app.command()
+def simulate(
+    output: Annotated[
+        Path,
+        typer.Option(
+            "-o", "--output", metavar="OUT", help="OUT.mcap for one file, any other name for a bag folder."
+        ),
+    ],
+    like: Annotated[
+        Scene,
+        typer.Option(
+            help="deepuwb: five rooms with obstacles, in DeepUWB's shape and size; survey: placements at rest "
+            "in a flat; drive: a robot through that flat."
+        ),
+    ] = Scene.DEEPUWB,
+    seed: Annotated[int, typer.Option(help="The same seed gives the same bag.")] = 1,
+    ranges: Annotated[
+        int | None,
+        typer.Option(
+            help="How many to simulate; without it, 55158 as DeepUWB has. A frame that is too weak to be "
+            "received counts for survey and drive."
+        ),
+    ] = None,
+    exchanges: Annotated[int, typer.Option(help="For each placement at rest; a drive has none.")] = 20,
+    force: Annotated[bool, typer.Option("--force", help="Replace OUT if it exists.")] = False,
+    json: JsonOption = None,
+) -> None:
+    """Simulate ranges with their truth, and write them to an MCAP bag that says it is simulated.
+
+    Try the protocol and the report without hardware or a download:
+
+        uwb-mitigation data simulate --like deepuwb -o sim.mcap
+
+        uwb-mitigation protocol --data sim.mcap -o models
+
+        uwb-mitigation report --data sim.mcap --models models -o report
+    """
+    from uwb_mitigation.bag.writer import BagWriter
+    from uwb_mitigation.sources.deepuwb import ROOM_ROWS
+    from uwb_mitigation.sources.inventory import Inventory
+
+    total = sum(ROOM_ROWS) if ranges is None else ranges
+    source = _simulated(like, seed, total, exchanges)
+    inventory = Inventory()
+    origin = {"source": source.name, "simulated": "true"}
+    with BagWriter(output, origin, force=force) as bag, console.progress() as bar:
+        task = bar.add_task("simulating", total=total)
+        for record in inventory.watch(source):
+            bag.write(record)
+            if inventory.ranges % _STRIDE == 0:
+                bar.update(task, completed=inventory.ranges)
+    _show(source, None)
+    lost = ", ".join(f"{count} x {why}" for why, count in inventory.skipped.items())
+    console.out.print(
+        f"Wrote {inventory.ranges} ranges of {inventory.pair_count} pairs to {bag.file}"
+        + (f"; left out: {lost}." if lost else "."),
+        markup=False,
+        highlight=False,
+        soft_wrap=True,
+    )
+    if bag.notice:
+        console.err.print(bag.notice, style="yellow", markup=False, soft_wrap=True)
+    console.write_json(
+        json, {"output": str(bag.file), "seed": seed, "simulated": True, **inventory.as_json()}
+    )
+
+
+def _simulated(like: Scene, seed: int, ranges: int, exchanges: int) -> Source:
+    """The simulator's source of that many ranges.
+
+    Raises:
+        ParameterError: a number is out of its range.
+    """
+    from uwb_mitigation.sources import simulated
+
+    if like is Scene.DEEPUWB:
+        return simulated.SimulatedDeepUwb(seed=seed, ranges=ranges, exchanges=exchanges)
+    if like is Scene.SURVEY:
+        if exchanges < 1 or ranges % exchanges:
+            raise ParameterError(
+                f"{ranges} ranges of {exchanges} exchanges a placement", valid="a multiple of the exchanges"
+            )
+        return simulated.SimulatedSurvey(seed=seed, configurations=ranges // exchanges, exchanges=exchanges)
+    if ranges < 1:
+        raise ParameterError(f"{ranges} ranges", valid="1 or more: a drive has no end of its own")
+    return simulated.SimulatedSource(seed=seed, count=ranges)
 
 
 @app.command()

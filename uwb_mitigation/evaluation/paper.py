@@ -53,6 +53,3 @@ EPOCHS = 30
 RAW_MAE_M = 0.1242
 RAW_SIGMA_M = 0.1642
 """Of the test room before correction (section III-C)."""
-
-ROOM_ROWS = (954, 18_422, 13_210, 17_601, 4_971)
-"""Rows of each room of the published DeepUWB, in the order of `sources.deepuwb.ROOMS`."""

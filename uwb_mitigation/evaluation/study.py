@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.dataset import Dataset
 from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.evaluation import paper
 from uwb_mitigation.evaluation.results import Trained, clean
 from uwb_mitigation.evaluation.splits import by_configuration
 from uwb_mitigation.preprocessing import Preprocessing, Scaling
@@ -41,12 +40,7 @@ class Study:
     @classmethod
     def of(cls, name: str, simulated: bool, dataset: Dataset) -> Study:
         """Tell by the names of the configurations whether the data has rooms."""
-        try:
-            for configuration in dataset.names:
-                deepuwb.room_of(configuration)
-        except DatasetError:
-            return cls(clean(name), simulated, dataset, False)
-        return cls(clean(name), simulated, dataset, True)
+        return cls(clean(name), simulated, dataset, deepuwb.has_rooms(dataset.configurations))
 
     @property
     def title(self) -> str:
@@ -82,7 +76,7 @@ class Study:
         if not self.has_rooms:
             return False
         counts = {name: int((self.places == name).sum()) for name in deepuwb.ROOMS}
-        return tuple(counts.values()) == paper.ROOM_ROWS
+        return tuple(counts.values()) == deepuwb.ROOM_ROWS
 
     def quick_split(self) -> tuple[str, NDArray[np.intp], NDArray[np.intp]]:
         """What `--train quick` trains and tests on: name, rows to train on, rows to test on.

@@ -7,6 +7,7 @@ cabinet, a person) is opaque, and what gets past it is diffracted around its nea
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,6 +42,8 @@ def _at_centre(c: float, d: float) -> float:
 PLASTERBOARD = Material("plasterboard", 2.94, _at_centre(0.0116, 0.7076))
 BRICK = Material("brick", 3.75, _at_centre(0.038, 0.0))
 CONCRETE = Material("concrete", 5.31, _at_centre(0.0326, 0.8095))
+WOOD = Material("wood", 1.99, _at_centre(0.0047, 1.0718))
+GLASS = Material("glass", 6.27, _at_centre(0.0043, 1.1925))
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +85,16 @@ class DirectPath:
     loss_db: NDArray[np.float64]
     excess_m: NDArray[np.float64]
     crossings: NDArray[np.int64]
+
+    def take(self, index: NDArray[np.intp]) -> DirectPath:
+        """The paths at `index`, in that order."""
+        return DirectPath(self.loss_db[index], self.excess_m[index], self.crossings[index])
+
+    @classmethod
+    def joined(cls, paths: Sequence[DirectPath]) -> DirectPath:
+        """All of `paths`, one or more, one after the other."""
+        loss, excess, crossings = zip(*((p.loss_db, p.excess_m, p.crossings) for p in paths), strict=True)
+        return cls(np.concatenate(loss), np.concatenate(excess), np.concatenate(crossings))
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,6 +36,9 @@ CIR_SAMPLES = 157
 ROOMS = ("cross-room", "big room", "medium room", "small room", "outdoor")
 """What the column `Room` numbers."""
 
+ROOM_ROWS = (954, 18_422, 13_210, 17_601, 4_971)
+"""Published rows of each."""
+
 MATERIALS = (
     "wall",
     "polystyrene plate",
@@ -72,9 +75,9 @@ NEGATIVE = "CIR with negative amplitudes"
 ALL_ZERO = "CIR of zeros only"
 """Oddities that `DeepUwbRecording.skipped` counts; the records are there all the same."""
 
-_FULL_SCALE = np.iinfo(np.int16).max - 1  # the largest itself means a saturated sample
+FULL_SCALE = np.iinfo(np.int16).max - 1  # the largest itself means a saturated sample
 _OBSTACLES = re.compile(f"[01]{{{len(MATERIALS)}}}")
-_CONFIGURATION = re.compile(r"deepuwb/room([0-4])/([^/]+)")
+_CONFIGURATION = re.compile(r"(?:simulated seed [0-9]+/)?deepuwb/room([0-4])/([^/]+)(?:/placement [0-9]+)?")
 _NO_MATERIAL = "clear"
 
 
@@ -142,6 +145,11 @@ def configuration_of(room: int, obstacles: str) -> str:
     """The name of a row's configuration: `deepuwb/room2/wall+metal plate`, `deepuwb/room1/clear`."""
     present = [material for material, digit in zip(MATERIALS, obstacles, strict=True) if digit == "1"]
     return f"deepuwb/room{room}/{'+'.join(present) or _NO_MATERIAL}"
+
+
+def has_rooms(configurations: Sequence[str] | NDArray[np.str_]) -> bool:
+    """Whether all names are of DeepUWB's rooms, or of the simulator's in their place."""
+    return all(_CONFIGURATION.fullmatch(str(name)) for name in np.unique(np.asarray(configurations, np.str_)))
 
 
 def room_of(configuration: str) -> int:
@@ -252,9 +260,9 @@ class _Rows:
             return 1.0
         if not 1e-20 <= peak <= 1e20:
             raise self._error(row, "CIR", f"a peak of {peak:g}", "amplitudes from 1e-20 to 1e20")
-        np.rint(amplitudes * (_FULL_SCALE / peak), out=amplitudes)
+        np.rint(amplitudes * (FULL_SCALE / peak), out=amplitudes)
         out[:] = amplitudes
-        return peak / _FULL_SCALE
+        return peak / FULL_SCALE
 
 
 def _kind(cell: object) -> str:

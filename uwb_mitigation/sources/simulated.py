@@ -1,6 +1,7 @@
-"""Measurements from the simulator: a robot driving through a flat, or a survey of placements at rest.
+"""Measurements from the simulator: a robot driving through a flat, a survey of placements at rest, or one in
+DeepUWB's shape.
 
-Both yield the same for the same arguments, however much is consumed: every stretch of the scene draws
+All yield the same for the same arguments, however much is consumed: every stretch of the scene draws
 from a generator of its own. Stamps begin at 0 and follow the rate; nothing waits for a clock.
 """
 
@@ -9,27 +10,46 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 from itertools import count as counting
+from itertools import islice
 from types import TracebackType
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ParameterError
-from uwb_mitigation.measurement import DEVICE_TICK_HZ, DEVICE_TIME_WRAP, Cir, RangeMeasurement, Truth
+from uwb_mitigation.measurement import (
+    DEVICE_TICK_HZ,
+    DEVICE_TIME_WRAP,
+    Cir,
+    Encoding,
+    RangeMeasurement,
+    Truth,
+)
+from uwb_mitigation.preprocessing import WINDOW_LEAD
 from uwb_mitigation.simulation.channel import (
     RESIDENTIAL_LOS,
     RESIDENTIAL_NLOS,
     DiffuseField,
+    Environment,
     Multipath,
     check_range,
     draw_diffuse_field,
     propagate,
 )
 from uwb_mitigation.simulation.radio import Radio, Reception
+from uwb_mitigation.simulation.rooms import OBSTACLES, ROOMS, draw_obstacles, obstruct
 from uwb_mitigation.simulation.scene import ANCHORS, FLAT, ROUTE, DirectPath, FloorPlan, Point, along_route
+from uwb_mitigation.sources.deepuwb import (
+    CIR_SAMPLES,
+    FIRST_ANCHOR_ID,
+    FIRST_PATH_INDEX,
+    FULL_SCALE,
+    ROOM_ROWS,
+    configuration_of,
+)
 from uwb_mitigation.sources.source import Record
 
 BATCH = 256
@@ -43,14 +63,21 @@ BORDER_M = 0.2
 CLOSEST_M = 0.5
 FIRST_TAG_ID = 101
 NOT_RECEIVED = "frame too weak to be received"
+LATE = "first path too late for a whole window"
+
+RESIDENTIAL = (RESIDENTIAL_LOS, RESIDENTIAL_NLOS)
+"""Diffuse fields in line of sight and out of it."""
+
+SURVEY_RATE_HZ = 20.0
 
 
 @dataclass(frozen=True, slots=True)
 class _Exchanges:
     """n exchanges before the radio: who, where, and which diffuse field they share.
 
-    `anchor`, `tag` are float64 (n, 2) positions in m; `fields` are the diffuse fields in line of sight
-    and out of it, and `field_of`, int (n,), says which of their rows an exchange has.
+    `anchor`, `tag` are float64 (n, 2) positions in m, and `path` is what stands between them;
+    `environments` and `fields` are the diffuse fields in line of sight and out of it, and `field_of`, int
+    (n,), says which of their rows an exchange has.
     """
 
     sequence: NDArray[np.int64]
@@ -58,34 +85,34 @@ class _Exchanges:
     tag_id: NDArray[np.int64]
     anchor: NDArray[np.float64]
     tag: NDArray[np.float64]
+    path: DirectPath
     configuration: list[str]
+    environments: tuple[Environment, Environment]
     fields: tuple[DiffuseField, DiffuseField]
     field_of: NDArray[np.intp]
     at_rest: bool
 
 
 class _Simulated(ABC):
-    """What both sources share: a `sources.source.Source` over batches of exchanges."""
+    """What the sources share: a `sources.source.Source` over batches of exchanges."""
 
     simulated = True
 
-    def __init__(self, name: str, rate_hz: float, plan: FloorPlan, radio: Radio, count: int) -> None:
+    def __init__(self, name: str, rate_hz: float, radio: Radio, count: int) -> None:
         check_range("simulated source", "rate_hz", rate_hz, 0.1, 100_000)
         self.name = name
         self.skipped: Counter[str] = Counter()
         self._rate_hz = rate_hz
         self._count = count
-        self._plan = plan
         self._radio = radio
 
     @abstractmethod
-    def _batches(self) -> Iterator[tuple[_Exchanges, np.random.Generator]]:
-        """Batches in order of time, each with the generator that the radio is to draw from."""
+    def _measurements(self) -> Iterator[Record]:
+        """All of them in order of time; what is left out is counted in `skipped`."""
 
     def __iter__(self) -> Iterator[Record]:
         self.skipped = Counter()
-        for exchanges, rng in self._batches():
-            yield from self._records(exchanges, rng)
+        yield from self._measurements()
 
     def close(self) -> None:
         """Return at once: no file or port is held."""
@@ -102,10 +129,14 @@ class _Simulated(ABC):
     ) -> None:
         self.close()
 
+    def _received(self, batches: Iterable[tuple[_Exchanges, np.random.Generator]]) -> Iterator[Record]:
+        """What the radio makes of batches, each with the generator that it is to draw from."""
+        for exchanges, rng in batches:
+            yield from self._records(exchanges, rng)
+
     def _records(self, exchanges: _Exchanges, rng: np.random.Generator) -> Iterator[Record]:
-        path = self._plan.direct_path(exchanges.anchor, exchanges.tag)
         distance = np.hypot(*(exchanges.tag - exchanges.anchor).T)
-        reception = self._radio.receive(_multipath(exchanges, distance, path, rng), rng)
+        reception = self._radio.receive(_multipath(exchanges, distance, rng), rng)
         for i, sequence in enumerate(exchanges.sequence.tolist()):
             # A batch is always simulated whole: what it draws must not depend on `count`.
             if self._count and sequence >= self._count:
@@ -125,7 +156,7 @@ class _Simulated(ABC):
                 cir=_cir(reception, i),
                 frame_id=f"anchor_{anchor_id}",
             )
-            label = _label(bool(path.crossings[i]), bool(reception.direct_above_threshold[i]))
+            label = _label(bool(exchanges.path.crossings[i]), bool(reception.direct_above_threshold[i]))
             yield Record(measurement, Truth(float(distance[i]), label, exchanges.configuration[i]))
 
 
@@ -165,13 +196,17 @@ class SimulatedSource(_Simulated):
         check_range("simulated source", "tags", tags, 1, 64, whole=True)
         _check_positions("anchors", anchors, 1, 64)
         _check_positions("route", route, 3, 10_000)
-        super().__init__(f"simulated flat, seed {seed}", rate_hz, plan, radio or Radio(), count)
+        super().__init__(f"simulated flat, seed {seed}", rate_hz, radio or Radio(), count)
+        self._plan = plan
         self._seed = seed
         self._tags = tags
         self._anchors = np.asarray(anchors, np.float64)
         self._route = route
         closed = np.asarray([*route, route[0]])
         self._spacing_m = float(np.hypot(*np.diff(closed, axis=0).T).sum()) / tags
+
+    def _measurements(self) -> Iterator[Record]:
+        return self._received(self._batches())
 
     def _batches(self) -> Iterator[tuple[_Exchanges, np.random.Generator]]:
         pairs = self._tags * len(self._anchors)
@@ -180,10 +215,7 @@ class SimulatedSource(_Simulated):
             if self._count and first >= self._count:
                 return
             rng = np.random.default_rng([self._seed, segment, 0])
-            fields = (
-                draw_diffuse_field(RESIDENTIAL_LOS, pairs, rng),
-                draw_diffuse_field(RESIDENTIAL_NLOS, pairs, rng),
-            )
+            fields = _draw_fields(RESIDENTIAL, pairs, rng)
             for batch, start in enumerate(range(first, stop, BATCH)):
                 sequence = np.arange(start, min(start + BATCH, stop))
                 rng = np.random.default_rng([self._seed, segment, 1 + batch])
@@ -201,9 +233,20 @@ class SimulatedSource(_Simulated):
             for t, a in zip(tag_id.tolist(), anchor_id.tolist(), strict=True)
         ]
         pair = tag * len(self._anchors) + anchor
-        positions = along_route(self._route, travelled)
+        anchors, positions = self._anchors[anchor], along_route(self._route, travelled)
+        path = self._plan.direct_path(anchors, positions)
         return _Exchanges(
-            sequence, anchor_id, tag_id, self._anchors[anchor], positions, names, fields, pair, at_rest=False
+            sequence,
+            anchor_id,
+            tag_id,
+            anchors,
+            positions,
+            path,
+            names,
+            RESIDENTIAL,
+            fields,
+            pair,
+            at_rest=False,
         )
 
 
@@ -239,20 +282,21 @@ class SimulatedSurvey(_Simulated):
         for axis, extent in zip("xy", plan.size, strict=True):
             check_range("simulated survey", f"plan size in {axis}", extent, 2.0, 1000.0)
         super().__init__(
-            f"simulated survey, seed {seed}", rate_hz, plan, radio or Radio(), configurations * exchanges
+            f"simulated survey, seed {seed}", rate_hz, radio or Radio(), configurations * exchanges
         )
+        self._plan = plan
         self._seed = seed
         self._exchanges = exchanges
+
+    def _measurements(self) -> Iterator[Record]:
+        return self._received(self._batches())
 
     def _batches(self) -> Iterator[tuple[_Exchanges, np.random.Generator]]:
         placements = -(-BATCH // self._exchanges)
         size = placements * self._exchanges
         for batch in range(-(-self._count // size)):
             rng = np.random.default_rng([self._seed, batch])
-            fields = (
-                draw_diffuse_field(RESIDENTIAL_LOS, placements, rng),
-                draw_diffuse_field(RESIDENTIAL_NLOS, placements, rng),
-            )
+            fields = _draw_fields(RESIDENTIAL, placements, rng)
             anchor, tag = _place(self._plan.size, placements, rng)
             of = np.repeat(np.arange(placements), self._exchanges)
             names = [
@@ -260,12 +304,140 @@ class SimulatedSurvey(_Simulated):
             ]
             sequence = batch * size + np.arange(size)
             ids = np.ones(size, np.int64)
+            path = self._plan.direct_path(anchor, tag).take(of)
             yield (
                 _Exchanges(
-                    sequence, ids, FIRST_TAG_ID * ids, anchor[of], tag[of], names, fields, of, at_rest=True
+                    sequence,
+                    ids,
+                    FIRST_TAG_ID * ids,
+                    anchor[of],
+                    tag[of],
+                    path,
+                    names,
+                    RESIDENTIAL,
+                    fields,
+                    of,
+                    at_rest=True,
                 ),
                 rng,
             )
+
+
+class SimulatedDeepUwb(_Simulated):
+    """Placements at rest in five environments, in DeepUWB's shape; a `Source`.
+
+    Rooms in DeepUWB's order, each with its share of the rows, obstacles among the ten materials between the
+    antennas, and CIRs as DeepUWB has them: 157 amplitudes from five samples before the first path, the largest
+    being 1, without a preamble count. Beyond DeepUWB, distances are true and the radio's levels known, and a
+    configuration is one placement: "simulated seed 1/deepuwb/room2/wall/placement 7", with 7 counted in its room.
+
+    Args:
+        seed: 0 to 2^32 - 1.
+        ranges: rows, 100 to 1,000,000; by default as many as in DeepUWB, with its number in each room.
+        exchanges: 1 to 1000 for each placement.
+
+    Attributes:
+        rows: of each room.
+
+    Raises:
+        ParameterError: an argument is out of its range.
+    """
+
+    def __init__(self, *, seed: int = 1, ranges: int = sum(ROOM_ROWS), exchanges: int = 20) -> None:
+        _check_seed(seed)
+        check_range("simulated DeepUWB", "ranges", ranges, 100, 1_000_000, whole=True)
+        check_range("simulated DeepUWB", "exchanges", exchanges, 1, 1000, whole=True)
+        # Their raw error leaves no room for delays that were not calibrated.
+        radio = Radio(range_offset_m=0.0)
+        super().__init__(f"simulated in the shape of DeepUWB, seed {seed}", SURVEY_RATE_HZ, radio, 0)
+        self._seed = seed
+        self._exchanges = exchanges
+        ends = np.rint(np.cumsum(ROOM_ROWS) * (ranges / sum(ROOM_ROWS))).astype(int)
+        self.rows: tuple[int, ...] = tuple(np.diff(ends, prepend=0).tolist())
+
+    def _measurements(self) -> Iterator[Record]:
+        for room, rows in enumerate(self.rows):
+            # Without end: how many frames are lost is known only as they are.
+            batches = (self._batch(room, batch) for batch in counting())
+            yield from islice(self._shaped(self._received(batches)), rows)
+
+    def _shaped(self, records: Iterable[Record]) -> Iterator[Record]:
+        for record in records:
+            cir, truth = _cut(record.measurement.cir), record.truth
+            if cir is None or truth is None:
+                self.skipped[LATE] += 1
+                continue
+            # DeepUWB tells what stands in the path, not what was received over it.
+            label = "LOS" if truth.label == "LOS" else "NLOS"
+            yield Record(replace(record.measurement, cir=cir), replace(truth, label=label))
+
+    def _batch(self, number: int, batch: int) -> tuple[_Exchanges, np.random.Generator]:
+        room = ROOMS[number]
+        placements = -(-BATCH // self._exchanges)
+        size = placements * self._exchanges
+        rng = np.random.default_rng([self._seed, number, batch])
+        environments = (room.in_sight, room.blocked)
+        fields = _draw_fields(environments, placements, rng)
+        anchor, tag = _place(room.size, placements, rng)
+        chosen = [draw_obstacles(room, rng) for _ in range(placements)]
+        path = DirectPath.joined(
+            [obstruct(a, b, between, rng) for a, b, between in zip(anchor, tag, chosen, strict=True)]
+        )
+        of = np.repeat(np.arange(placements), self._exchanges)
+        names = [
+            f"simulated seed {self._seed}/{configuration_of(number, _digits(between))}"
+            f"/placement {batch * placements + k}"
+            for k, between in enumerate(chosen)
+        ]
+        # Each room on a day of its own.
+        sequence = round(number * 86_400 * SURVEY_RATE_HZ) + batch * size + np.arange(size)
+        ids = np.ones(size, np.int64)
+        return (
+            _Exchanges(
+                sequence,
+                (FIRST_ANCHOR_ID + number) * ids,
+                FIRST_TAG_ID * ids,
+                anchor[of],
+                tag[of],
+                path.take(of),
+                [names[k] for k in of.tolist()],
+                environments,
+                fields,
+                of,
+                at_rest=True,
+            ),
+            rng,
+        )
+
+
+def _digits(chosen: tuple[int, ...]) -> str:
+    return "".join("1" if number in chosen else "0" for number in range(len(OBSTACLES)))
+
+
+def _cut(cir: Cir) -> Cir | None:
+    """A CIR as DeepUWB has it, and the levels that it does not have; None where it ends before the window."""
+    start = math.floor(cir.first_path_index) - WINDOW_LEAD
+    if start < 0 or start + CIR_SAMPLES > len(cir):
+        return None
+    taps = cir.samples[2 * start : 2 * (start + CIR_SAMPLES)].astype(np.float64).reshape(-1, 2)
+    magnitude = np.hypot(*taps.T)
+    samples = np.rint(magnitude * (FULL_SCALE / magnitude.max())).astype(np.int16)
+    return replace(
+        cir,
+        samples=samples,
+        encoding=Encoding.MAGNITUDE,
+        first_path_index=FIRST_PATH_INDEX,
+        scale=1.0 / FULL_SCALE,
+        preamble_count=0,
+        noise_threshold=0,
+    )
+
+
+def _draw_fields(
+    environments: tuple[Environment, Environment], n: int, rng: np.random.Generator
+) -> tuple[DiffuseField, DiffuseField]:
+    in_sight, blocked = environments
+    return draw_diffuse_field(in_sight, n, rng), draw_diffuse_field(blocked, n, rng)
 
 
 def _place(size: Point, n: int, rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -278,16 +450,14 @@ def _place(size: Point, n: int, rng: np.random.Generator) -> tuple[NDArray[np.fl
     return pair[:, 0], pair[:, 1]
 
 
-def _multipath(
-    exchanges: _Exchanges, distance: NDArray[np.float64], path: DirectPath, rng: np.random.Generator
-) -> Multipath:
+def _multipath(exchanges: _Exchanges, distance: NDArray[np.float64], rng: np.random.Generator) -> Multipath:
     """Each exchange's multipath: of the line-of-sight environment where nothing blocks its path."""
+    path = exchanges.path
     rays = exchanges.fields[0].delay_ns.shape[1]
     delay = np.empty((len(distance), 1 + rays))
     gain = np.empty((len(distance), 1 + rays), np.complex128)
-    for environment, field, blocked in (
-        (RESIDENTIAL_LOS, exchanges.fields[0], False),
-        (RESIDENTIAL_NLOS, exchanges.fields[1], True),
+    for environment, field, blocked in zip(
+        exchanges.environments, exchanges.fields, (False, True), strict=True
     ):
         # At rest the fading is drawn once for a field, in motion once for an exchange.
         (here,) = np.nonzero((path.crossings > 0) == blocked)
