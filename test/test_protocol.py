@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from model_material import dataset
 
+from uwb_mitigation.dataset import Dataset
 from uwb_mitigation.errors import DatasetError, ParameterError, UwbMitigationError
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.integer import IntegerNetwork
@@ -103,6 +104,61 @@ def test_the_best_calibration_on_the_training_part_is_taken(finished):
 def test_results_are_read_as_they_were_written(finished):
     folder, result = finished
     assert results.read(folder) == result
+
+
+def left(baselines, name: str) -> float:
+    (found,) = (baseline for baseline in baselines if baseline.name == name)
+    return found.errors["all"].mae
+
+
+def test_medians_and_the_line_stand_beside_the_networks(finished):
+    _, result = finished
+    assert [baseline.name for baseline in result.baselines] == ["los_median", "overall_median", "line"]
+    train, test = parts().train, parts().test
+    for name, rows in (("los_median", train.labels == "LOS"), ("overall_median", train.labels != "")):
+        expected = np.abs(test.error_m - np.median(train.error_m[rows])).mean()
+        assert left(result.baselines, name) == pytest.approx(expected)
+
+
+def with_line(data: Dataset, gap_db: float = 5.0) -> Dataset:
+    """Errors that are a line in the received power, which differs between configurations."""
+    _, of = np.unique(data.configurations, return_inverse=True)
+    power = (-80.0 - of + 0.1 * np.arange(len(data)) % 1).astype(np.float32)
+    gap = (gap_db + of**2).astype(np.float32)
+    return replace(
+        data,
+        rx_power_dbm=power,
+        first_path_power_dbm=power - gap,
+        error_m=0.5 - 0.02 * (power + 80) + gap / 9,
+    )
+
+
+def test_the_line_is_fitted_on_the_training_part_and_told_on_the_test_part():
+    train, test = with_line(dataset(8, 5)), with_line(dataset(4, 5, seed=1), gap_db=9.0)
+    baselines = protocol.baselines_of(train, test)
+    assert left(baselines, "line") < 0.02 < 0.2 < left(baselines, "overall_median")
+
+
+def test_a_range_whose_power_is_unknown_counts_as_measured():
+    train, test = with_line(dataset(8, 5)), with_line(dataset(4, 5, seed=1))
+    test.first_path_power_dbm[0] = np.nan
+    known = np.abs(test.error_m[0]) / len(test)
+    assert left(protocol.baselines_of(train, test), "line") == pytest.approx(known, abs=0.02)
+
+
+@pytest.mark.parametrize("part", ["train", "test"])
+def test_data_without_powers_has_no_line_and_says_why(part: str):
+    two = {"train": with_line(dataset(8, 5)), "test": with_line(dataset(4, 5, seed=1))}
+    two[part].rx_power_dbm[:] = np.nan
+    line = protocol.baselines_of(**two)[-1]
+    assert (line.name, line.errors) == ("line", None)
+    assert "no received power" in line.reason
+
+
+def test_too_few_configurations_have_no_line():
+    line = protocol.baselines_of(with_line(dataset(3, 5)), with_line(dataset(4, 5, seed=1)))[-1]
+    assert line.errors is None
+    assert "too few configurations" in line.reason
 
 
 def test_what_is_done_is_not_done_again(finished, monkeypatch):

@@ -96,6 +96,7 @@ def study(label: str = "LOS", configuration: str = "", **changes: object) -> Stu
 
 
 COMMANDS = report.Commands("logs", "out")
+ORIGIN = tables.Provenance("logs", "half", "0", "uwb-mitigation report")
 
 
 def trained(
@@ -132,6 +133,11 @@ def protocol(*models: dict[str, object], **changes: object) -> dict[str, object]
     }
 
 
+def baseline(name: str, mae: float | None, reason: str = "") -> dict[str, object]:
+    part = {"n": 10, "mae_raw": 0.2, "sigma_raw": 0.1, "mae": mae, "sigma": 0.05}
+    return {"name": name, "errors": None if mae is None else {"all": part}, "reason": reason}
+
+
 def firmware_row(**changes: object) -> dict[str, object]:
     return {
         "model": "remnet",
@@ -153,12 +159,11 @@ def firmware_row(**changes: object) -> dict[str, object]:
 def tabled(name: str, *models: dict[str, object], firmware: tuple[dict[str, object], ...] = ()) -> dict:
     """One of the paper's tables, as JSON."""
     trainings = results.parse_trainings(protocol(*models), "here") if models else None
-    origin = tables.Provenance("logs", "half", "0", "uwb-mitigation report")
     made = {
-        "table1": lambda: tables.accuracy(trainings, origin, "uwb-mitigation protocol"),
-        "table2": lambda: tables.sizes(trainings, origin, "uwb-mitigation protocol"),
+        "table1": lambda: tables.accuracy(trainings, ORIGIN, "uwb-mitigation protocol"),
+        "table2": lambda: tables.sizes(trainings, ORIGIN, "uwb-mitigation protocol"),
         "table3": lambda: tables.firmware(
-            results.parse_firmware({"rows": list(firmware)}, "here"), origin, "uwb-mitigation bench"
+            results.parse_firmware({"rows": list(firmware)}, "here"), ORIGIN, "uwb-mitigation bench"
         ),
     }[name]()
     return json.loads(json.dumps(made.as_json()))
@@ -299,6 +304,23 @@ def test_accuracy_is_the_mean_over_seeds():
     assert cell["text"] == "0.0645 ± 0.0020"
 
 
+def test_what_needs_no_network_stands_below_the_networks():
+    values = protocol(trained(), baselines=[baseline("overall_median", 0.15), baseline("line", 0.125)])
+    table = tables.accuracy(results.parse_trainings(values, "here"), ORIGIN, "uwb-mitigation protocol")
+    rows = {row[0].text: row[7] for row in table.rows}
+    assert rows["L1 line in received and first-path power"].value == 0.125
+    assert rows["Median error"].value == 0.15
+    assert rows["Median error in LOS"].kind == "missing"
+
+
+def test_a_line_that_the_data_does_not_allow_is_said_and_not_called_unmeasured():
+    values = protocol(trained(), baselines=[baseline("line", None, "the data has no received power")])
+    table = tables.accuracy(results.parse_trainings(values, "here"), ORIGIN, "uwb-mitigation protocol")
+    (line,) = (row for row in table.rows if row[0].text.startswith("L1 line"))
+    assert line[7].kind == "none"
+    assert "the data has no received power" in table.note
+
+
 def test_a_form_that_a_network_does_not_have_is_not_called_unmeasured():
     attention = trained("remnet_attention", mae_int8=None, bytes_int8=None, int8_errors=None)
     row = row_of(tabled("table1", attention), "REMNet with attention", "157")
@@ -367,6 +389,8 @@ def test_a_path_with_spaces_can_be_pasted_into_a_shell():
         protocol(trained(samples=1.5)),
         protocol(trained(float_errors=None, int8_errors=None)),
         protocol(models=7),
+        protocol(baselines=[{"name": "line", "errors": None}]),
+        protocol(baselines=[baseline("line", 0.1) | {"errors": {"los": {}}}]),
         protocol(7),
         protocol(data=3),
     ],

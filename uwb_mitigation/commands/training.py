@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import statistics
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -58,7 +59,8 @@ def protocol(
 ) -> None:
     """The paper's experiment: train every network at every K and seed, optimise, quantise, test.
 
-    Run it again to go on with an interrupted run: what is in DIR already is not trained again.
+    Beside them stand the medians and the line in the received power, fitted on the same training part. Run it
+    again to go on with an interrupted run: what is in DIR already is not trained again.
     """
     lengths = _lengths(windows)
     with needs_torch():
@@ -286,12 +288,11 @@ def _labelled(data: Path, samples: int, scaling: str) -> Dataset:
 def _divide(dataset: Dataset, split: str, folds: int = 4) -> tuple[Dataset, Dataset, str]:
     """Training part, test part, and the split's name."""
     from uwb_mitigation.evaluation import splits
-    from uwb_mitigation.sources.deepuwb import RoomSplit, split_rows
+    from uwb_mitigation.sources.deepuwb import RoomSplit, has_rooms, split_rows
 
     rooms = [room.value for room in RoomSplit]
     if split == "auto":
-        is_deepuwb = dataset.configurations[0].startswith("deepuwb/")
-        split = RoomSplit.PAPER.value if is_deepuwb else "configurations"
+        split = RoomSplit.PAPER.value if has_rooms(dataset.configurations) else "configurations"
     if split in rooms:
         train, test = split_rows(dataset.configurations, RoomSplit(split))
         return dataset.rows(train), dataset.rows(test), split
@@ -337,7 +338,7 @@ def _show_protocol(result: Protocol) -> None:
         groups[model.network, model.samples].append(model)
     table = Table(
         title=f"{result.data}, split {result.split}: {result.train} to train on, {result.test} to test, "
-        f"{result.options.epochs} epochs; MAE in m, mean over seeds"
+        f"{result.options.epochs} epochs; MAE in m, mean ± std over seeds"
     )
     for column in ("network", "K", "seeds", "parameters", "raw", "float", "optimised", "int8", "int8 bytes"):
         table.add_column(column, justify="left" if column == "network" else "right")
@@ -346,12 +347,28 @@ def _show_protocol(result: Protocol) -> None:
         forms = ("mae_float", "mae_optimised", "mae_int8")
         row += [_mean([getattr(model, form) for model in models], ".4f") for form in forms]
         table.add_row(*row, _mean([model.bytes_int8 for model in models], ".0f"))
+    for baseline in result.baselines:
+        left = None if baseline.errors is None else baseline.errors["all"]
+        before, after = (None, None) if left is None else (left.mae_raw, left.mae)
+        row = [_BASELINES.get(baseline.name, baseline.name), "-", "-", "-", _mean([before], ".4f")]
+        table.add_row(*row, _mean([after], ".4f"), "-", "-", "-")
     console.out.print(table)
+    for baseline in result.baselines:
+        if baseline.reason:
+            name = _BASELINES.get(baseline.name, baseline.name)
+            console.out.print(f"{name}: not there: {baseline.reason}", markup=False, highlight=False)
+
+
+_BASELINES = {"los_median": "LOS median", "overall_median": "median", "line": "L1 line"}
 
 
 def _mean(values: list[float | None], form: str) -> str:
+    """The mean of those that there are; over several, with their standard deviation."""
     known = [value for value in values if value is not None]
-    return format(sum(known) / len(known), form) if known else "-"
+    if not known:
+        return "-"
+    mean = format(statistics.fmean(known), form)
+    return f"{mean} ± {statistics.stdev(known):{form}}" if len(set(known)) > 1 else mean
 
 
 def _show_front(best: list[Trial], tried: int) -> None:

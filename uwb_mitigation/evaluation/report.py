@@ -19,7 +19,7 @@ from uwb_mitigation.evaluation.results import FirmwareRow, Spread, Trainings, cl
 from uwb_mitigation.evaluation.study import LOS, PAPER_SPLIT, Box, Study, examples
 from uwb_mitigation.evaluation.tables import Cell, Provenance, Table
 from uwb_mitigation.preprocessing import WINDOW_SIZES
-from uwb_mitigation.sources.deepuwb import ROOMS
+from uwb_mitigation.sources.deepuwb import ROOM_ROWS, ROOMS
 
 STEPS = 5
 """How often `build` tells of its progress."""
@@ -199,7 +199,7 @@ def _data_table(study: Study, commands: Commands) -> Table:
     labels = study.labels
     rows = []
     if study.has_rooms:
-        for room, published in zip(ROOMS, paper.ROOM_ROWS, strict=True):
+        for room, published in zip(ROOMS, ROOM_ROWS, strict=True):
             is_test = room == "medium room"
             printed = (paper.RAW_MAE_M, paper.RAW_SIGMA_M) if is_test else (None, None)
             rows.append(_part(study, room, study.places == room, published, *printed))
@@ -207,7 +207,7 @@ def _data_table(study: Study, commands: Commands) -> Table:
         _part(study, f"label {label}", labels == label)
         for label in sorted(np.unique(labels).tolist(), key=lambda name: (name != LOS, name))
     ]
-    every = sum(paper.ROOM_ROWS) if study.has_rooms else None
+    every = sum(ROOM_ROWS) if study.has_rooms else None
     rows.append(_part(study, "all", np.ones(len(labels), np.bool_), every))
     return Table(
         "data",

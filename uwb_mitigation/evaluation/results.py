@@ -63,6 +63,15 @@ class Trained:
 
 
 @dataclass(frozen=True, slots=True)
+class Baseline:
+    """What needs no network: the errors left on the test part; None, and why, where the data does not allow it."""
+
+    name: str
+    left: Left | None
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
 class Trainings:
     """The results of a protocol, and what they were measured on.
 
@@ -71,6 +80,7 @@ class Trainings:
         train, test: measurements in each part.
         epochs: of every fit.
         mae_raw: of the test part before correction, m.
+        baselines: on the same parts; empty in a file of an earlier version.
     """
 
     data: str
@@ -80,6 +90,7 @@ class Trainings:
     epochs: int
     mae_raw: float | None
     models: tuple[Trained, ...]
+    baselines: tuple[Baseline, ...] = ()
 
     def of(self, network: str, samples: int) -> tuple[Trained, ...]:
         """Every seed of a network, in the order of seeds."""
@@ -164,6 +175,7 @@ def parse_trainings(values: object, where: str) -> Trainings:
         epochs=options.count("epochs"),
         mae_raw=_Fields(top.get("models")[0], where).number("mae_raw") if models else None,
         models=models,
+        baselines=top.rows("baselines", _baseline) if top.has("baselines") else (),
     )
 
 
@@ -188,6 +200,12 @@ def _trained(fields: _Fields) -> Trained:
         size_bytes=tuple(fields.optional(f"bytes_{form}") for form in FORMS),
         left={part: _left(_Fields(errors.get(part), f"{errors.where}: {part}")) for part in PARTS},
     )
+
+
+def _baseline(fields: _Fields) -> Baseline:
+    errors = fields.get("errors")
+    left = None if errors is None else _left(_Fields(_Fields(errors, fields.where).get("all"), fields.where))
+    return Baseline(fields.text("name"), left, fields.text("reason"))
 
 
 def _left(fields: _Fields) -> Left:
@@ -222,6 +240,9 @@ class _Fields:
 
     def _refused(self, key: str, valid: str) -> DatasetError:
         return DatasetError(f"entry {key!r} is missing or wrong", where=self.where, valid=valid)
+
+    def has(self, key: str) -> bool:
+        return key in self._values
 
     def get(self, key: str) -> Any:
         if key not in self._values:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 from uwb_mitigation.evaluation import paper
-from uwb_mitigation.evaluation.results import FORMS, FirmwareRow, Spread, Trained, Trainings
+from uwb_mitigation.evaluation.results import FORMS, Baseline, FirmwareRow, Spread, Trained, Trainings
 from uwb_mitigation.model.architecture import Mlp, Remnet
 from uwb_mitigation.preprocessing import WINDOW_SIZES
 
@@ -18,6 +18,11 @@ _NAMES = {
     "remnet_k5": "REMNet, k0 = 5",
     "remnet_attention": "REMNet with attention",
     "mlp": "MLP",
+}
+_BASELINES = {
+    "los_median": "Median error in LOS",
+    "overall_median": "Median error",
+    "line": "L1 line in received and first-path power",
 }
 _ROWS = [*(("remnet", samples) for samples in WINDOW_SIZES), ("mlp", max(WINDOW_SIZES))]
 _FORM_NAMES = ("float", "optimised", "int8")
@@ -107,10 +112,16 @@ def accuracy(trainings: Trainings | None, provenance: Provenance, missing: str) 
                 *(_seeds(models, [m.mae_m[form] for m in models], 1, 4) for form in range(len(FORMS))),
             )
         )
+    known = {baseline.name: baseline for baseline in trainings.baselines} if trainings else {}
+    names = dict.fromkeys([*_BASELINES, *known])
+    rows += [_baseline_row(_BASELINES.get(name, name), known.get(name)) for name in names]
+    reasons = [f" {_BASELINES.get(name, name)}: {b.reason}." for name, b in known.items() if b.reason]
     return Table(
         "table1",
         "Table 1. Accuracy for each length of the CIR, before and after optimisation",
-        "MAE on the test part, m; mean ± standard deviation over seeds. Optimised: ONNX Runtime's graph.",
+        "MAE on the test part, m; mean ± standard deviation over seeds. Optimised: ONNX Runtime's graph. "
+        "Below the networks, what needs none: constants and a line, fitted on the same training part."
+        + "".join(reasons),
         (("Paper", 4), ("Measured", 4)),
         ("Model", "CIR", *(["Params", *(f"MAE {form}, m" for form in _FORM_NAMES)] * 2)),
         2,
@@ -118,6 +129,15 @@ def accuracy(trainings: Trainings | None, provenance: Provenance, missing: str) 
         provenance,
         missing,
     )
+
+
+def _baseline_row(name: str, baseline: Baseline | None) -> tuple[Cell, ...]:
+    """A row of Table 1: neither CIR nor parameters, and one form alone."""
+    none = Cell("–", "none")
+    left = Cell(NOT_MEASURED, "missing")
+    if baseline is not None:
+        left = number(None if baseline.left is None else baseline.left.mae, "{:.4f}", "measured")
+    return (Cell(name, "head"), Cell("–", "head"), none, none, none, none, none, left, none, none)
 
 
 def sizes(trainings: Trainings | None, provenance: Provenance, missing: str) -> Table:

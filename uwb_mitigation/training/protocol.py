@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.dataset import Dataset
 from uwb_mitigation.errors import DatasetError, ParameterError, UwbMitigationError
+from uwb_mitigation.evaluation import baselines, lad
 from uwb_mitigation.model import floating, graph
 from uwb_mitigation.model.architecture import Architecture, Mlp, Remnet
 from uwb_mitigation.model.bundle import Card, save_bundle
@@ -29,7 +30,14 @@ from uwb_mitigation.training import calibration, fitting, networks, parallel
 from uwb_mitigation.training.learner import ModuleLearner
 from uwb_mitigation.training.optimisation import optimise_file, predict_file_m
 from uwb_mitigation.training.options import FitOptions
-from uwb_mitigation.training.results import RESULTS, PartErrors, Protocol, TrainedModel, write_json
+from uwb_mitigation.training.results import (
+    RESULTS,
+    Baseline,
+    PartErrors,
+    Protocol,
+    TrainedModel,
+    write_json,
+)
 
 PAPER = FitOptions(epochs=30, learning_rate=3e-4, batch=32, dropout=0.5, weight_decay=0.0)
 """Section III-B; the paper does not give its dropout."""
@@ -151,7 +159,15 @@ def run(
         lambda amount: on_progress(min((done + amount) / total, 1.0)),
     )
     models = tuple(model for job in wanted if (model := _stored(folder, job, mark)) is not None)
-    result = Protocol(parts.data, parts.split, len(parts.train), len(parts.test), options, models)
+    result = Protocol(
+        parts.data,
+        parts.split,
+        len(parts.train),
+        len(parts.test),
+        options,
+        models,
+        baselines_of(parts.train, parts.test),
+    )
     write_json(folder / RESULTS, asdict(result))
     return result
 
@@ -285,7 +301,26 @@ def _result(
     )
 
 
-def _by_part(test: Dataset, predicted: NDArray[np.float32]) -> dict[str, PartErrors]:
+def baselines_of(train: Dataset, test: Dataset) -> tuple[Baseline, ...]:
+    """What the networks have to beat: constants, and the line in the radio's levels, fitted on `train`.
+
+    A range whose level is unknown has no line, and counts as it was measured.
+
+    Raises:
+        DatasetError: there is nothing to train on.
+    """
+    constants = {"los_median": baselines.los_median, "overall_median": baselines.overall_median}
+    rows = [Baseline(name, _by_part(test, fit(train)(test))) for name, fit in constants.items()]
+    if not all(np.isfinite(part.rx_power_dbm - part.first_path_power_dbm).any() for part in (train, test)):
+        return (*rows, Baseline("line", None, "the data has no received power"))
+    line = lad.fit_prior(train.configurations, train.rx_power_dbm, train.first_path_power_dbm, train.error_m)
+    if not line.needs_power:
+        return (*rows, Baseline("line", None, "too few configurations, or powers that are all alike"))
+    predicted = line.predict_batch_m(test.rx_power_dbm, test.first_path_power_dbm)
+    return (*rows, Baseline("line", _by_part(test, np.nan_to_num(predicted))))
+
+
+def _by_part(test: Dataset, predicted: NDArray[np.floating]) -> dict[str, PartErrors]:
     left, los = test.error_m - predicted, test.labels == LOS
     chosen = {"all": np.ones(len(test), np.bool_), "los": los, "nlos": ~los & (test.labels != "")}
     return {name: PartErrors.of(test.error_m[rows], left[rows]) for name, rows in chosen.items()}

@@ -82,13 +82,28 @@ class TrainedModel:
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> TrainedModel:
         """The model of a results file; raises KeyError, TypeError or ValueError where it is not one."""
-        parts = {
-            key: None
-            if values[key] is None
-            else {name: PartErrors(**part) for name, part in values[key].items()}
-            for key in ("float_errors", "int8_errors")
-        }
+        parts = {key: _errors(values[key]) for key in ("float_errors", "int8_errors")}
         return cls(**(dict(values) | parts))
+
+
+@dataclass(frozen=True, slots=True)
+class Baseline:
+    """What needs no network, on the same split.
+
+    Attributes:
+        name: `los_median`, `overall_median` (of the training part's errors), or `line` (`evaluation.lad`).
+        errors: {`all`, `los`, `nlos`: errors} on the test part; None where the data does not allow it.
+        reason: why not; empty where there are errors.
+    """
+
+    name: str
+    errors: Mapping[str, PartErrors] | None
+    reason: str = ""
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> Baseline:
+        """The baseline of a results file; raises KeyError, TypeError or ValueError where it is not one."""
+        return cls(**(dict(values) | {"errors": _errors(values["errors"])}))
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +114,7 @@ class Protocol:
         data, split: names for people.
         train, test: measurements in each part.
         options: of every fit, but for the seed.
+        baselines: empty in a file of an earlier version.
     """
 
     data: str
@@ -107,6 +123,11 @@ class Protocol:
     test: int
     options: FitOptions
     models: tuple[TrainedModel, ...]
+    baselines: tuple[Baseline, ...] = ()
+
+
+def _errors(values: Any) -> dict[str, PartErrors] | None:
+    return None if values is None else {name: PartErrors(**part) for name, part in values.items()}
 
 
 def read(folder: Path) -> Protocol:
@@ -119,7 +140,9 @@ def read(folder: Path) -> Protocol:
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
         models = tuple(TrainedModel.from_json(model) for model in values["models"])
-        return Protocol(**(values | {"options": FitOptions(**values["options"]), "models": models}))
+        baselines = tuple(Baseline.from_json(baseline) for baseline in values.get("baselines", ()))
+        parts = {"options": FitOptions(**values["options"]), "models": models, "baselines": baselines}
+        return Protocol(**(values | parts))
     except OSError as error:
         reason = error.strerror or str(error)
     except (ValueError, TypeError, KeyError, AttributeError, UwbMitigationError) as error:
