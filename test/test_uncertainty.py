@@ -24,7 +24,7 @@ SHAPE = Remnet(samples=157)
 
 def bands(**changes: Band) -> Familiarity:
     every = dict.fromkeys(
-        ("range_m", "rx_power_dbm", "power_gap_db", "cir_level_db", "first_path_level_db"), WIDE
+        ("range_m", "power_at_1m_dbm", "power_gap_db", "cir_level_db", "first_path_level_db"), WIDE
     )
     return Familiarity(0.25, **(every | changes))
 
@@ -46,7 +46,9 @@ def test_the_features_are_levels_in_decibels():
     window[0, 50] = 0.9
     found = features(window, *(np.float32([value]) for value in (3.0, -80.0, -85.0)))
     fourth = window.astype(float) ** 4
-    assert found[0, :3].tolist() == [3.0, -80.0, 5.0]
+    assert found[0, 0] == 3.0
+    assert found[0, 1] == pytest.approx(-80.0 + 20 * math.log10(3.0), abs=0.05)
+    assert found[0, 2] == 5.0
     assert found[0, 3] == pytest.approx(10 * math.log10(fourth.sum()) + 80, abs=0.05)
     assert found[0, 4] == pytest.approx(10 * math.log10(fourth[0, 6:9].sum()) + 85, abs=0.05)
 
@@ -57,8 +59,17 @@ def test_a_level_is_finite_whatever_the_window_holds(level):
     assert np.isfinite(features(window, *(np.float32([value]) for value in (3.0, -80.0, -85.0)))).all()
 
 
+def test_distance_alone_is_not_strange_and_a_weaker_radio_is(tmp_path):
+    one = mitigation(tmp_path, power_at_1m_dbm=Band(-74.0, -70.0, 2.0))
+    near, far, weak = (
+        one.correct(measurement(range_m, rx_power_dbm=power, first_path_power_dbm=power - 6.0)).status
+        for range_m, power in ((1.0, -72.0), (10.0, -92.0), (1.0, -92.0))
+    )
+    assert (near, far, weak) == (Status.OK, Status.OK, Status.OUT_OF_DISTRIBUTION)
+
+
 def test_the_score_is_the_largest_excess_in_margins():
-    scale = Strangeness(bands(range_m=Band(1.0, 6.0, 2.0), rx_power_dbm=Band(-90.0, -80.0, 4.0)).bands)
+    scale = Strangeness(bands(range_m=Band(1.0, 6.0, 2.0), power_at_1m_dbm=Band(-90.0, -80.0, 4.0)).bands)
     rows = [(3.0, -85.0), (7.0, -85.0), (7.0, -77.0), (3.0, -96.0), (math.nan, -85.0)]
     values = np.array([(range_m, power, 0.0, 0.0, 0.0) for range_m, power in rows], np.float32)
     assert scale.score(values).tolist()[1:4] == [0.5, 0.75, 1.5]
@@ -86,7 +97,7 @@ def test_a_strange_measurement_is_corrected_less_and_has_a_larger_variance(tmp_p
     assert strange.variance_m2 == pytest.approx(familiar.variance_m2 + 0.25 * 0.5, abs=1e-6)
 
 
-@pytest.mark.parametrize("name", ["range_m", "rx_power_dbm", "power_gap_db", "cir_level_db"])
+@pytest.mark.parametrize("name", ["range_m", "power_at_1m_dbm", "power_gap_db", "cir_level_db"])
 def test_a_wholly_strange_measurement_passes_through(tmp_path, name):
     result = mitigation(tmp_path, **{name: Band(500.0, 501.0, 1.0)}).correct(measurement(3.0))
     assert (result.status, result.range_m, result.correction_m) == (Status.OUT_OF_DISTRIBUTION, 3.0, 0.0)
@@ -95,7 +106,7 @@ def test_a_wholly_strange_measurement_passes_through(tmp_path, name):
 
 def test_batches_grade_to_the_bit_as_single_measurements(tmp_path):
     subject = mitigation(
-        tmp_path, range_m=Band(1.0, 2.0, 4.0), rx_power_dbm=Band(-84.0, -80.0, 5.0), cir_level_db=WIDE
+        tmp_path, range_m=Band(1.0, 2.0, 4.0), power_at_1m_dbm=Band(-72.0, -70.0, 5.0), cir_level_db=WIDE
     )
     subjects = [measurement(0.2 * n, n, rx_power_dbm=-75.0 - n / 2) for n in range(40)]
     subjects.append(measurement(rx_power_dbm=1e300))

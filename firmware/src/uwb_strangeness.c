@@ -37,9 +37,10 @@ float uwb_strangeness(const uwb_model *model, const float *window, float range_m
     const volatile float level = level_db(energy(window, model->samples));
     const size_t taps = model->samples < FIRST_PATH_TAP + FIRST_PATH_TAPS ? 2 : FIRST_PATH_TAPS; /* K = 8: two */
     const volatile float first_path_level = level_db(energy(window + FIRST_PATH_TAP, taps));
+    const volatile float free_space_loss = level_db(range_m * range_m); /* beyond that of the first metre */
     const float features[UWB_FEATURES] = {
         range_m,
-        rx_power_dbm,
+        rx_power_dbm + free_space_loss,
         rx_power_dbm - first_path_power_dbm,
         level - rx_power_dbm,
         first_path_level - first_path_power_dbm,

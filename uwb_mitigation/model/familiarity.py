@@ -1,8 +1,9 @@
 """How far a measurement lies outside of what a model was trained on: cheap enough for a microcontroller.
 
-Five features, each with the band that it had in training: the range, the receive power, its excess over the
-first-path power, and two levels of the CIR less the powers that the radio reports of the same signal.
-The radio computes both powers from the very accumulator, so the last two hardly vary (DW1000 user
+Five features, each with the band that it had in training: the range, the receive power brought to 1 m by the law of
+free space (Friis, "A note on a simple transmission formula", Proc. IRE 1946), its excess over the first-path
+power, and two levels of the CIR less the powers that the radio reports of the same signal.
+At 1 m a weaker or a stronger radio differs from walls that the training data had; as received, it does not. The radio computes both powers from the very accumulator, so the last two hardly vary (DW1000 user
 manual, section 4.7): a CIR that is noise, clipped, or cut at the wrong place contradicts them.
 """
 
@@ -21,7 +22,7 @@ FIRST_PATH_TAPS = slice(6, 9)
 """The three taps of a window that the first-path power is computed from."""
 
 MIN_POWER, MAX_POWER = np.float32(1e-30), np.float32(1e30)
-"""Bounds on summed fourth powers of the inputs, so that a level is always finite."""
+"""Bounds on what a level is taken of, so that it is always finite."""
 
 _DB_PER_OCTAVE = np.float32(10 * math.log10(2))
 _SQUARE, _LINEAR, _CONSTANT = np.float32(-4 / 3), np.float32(4), np.float32(8 / 3)
@@ -41,11 +42,11 @@ class Widening:
     least: float
 
 
-# A placement farther off or behind one more wall is what a model is for, and its error itself lengthens the range. A signal stronger than any of the training
-# data, or a first path stronger than the line of sight had, is another radio's.
+# A placement farther off is what a model is for, and its error itself lengthens the range. A signal weaker or stronger than distance and the walls of the
+# training data make it, or a first path stronger than the line of sight had, is another radio's.
 _WIDENINGS = (
     Widening(1.0, 2.0, 1.0),
-    Widening(1.0, 0.0, 3.0),
+    Widening(0.0, 0.0, 3.0),
     Widening(0.0, 1.0, 3.0),
     Widening(1.0, 1.0, 1.5),
     Widening(1.0, 1.0, 1.5),
@@ -83,14 +84,15 @@ class Familiarity:
     Attributes:
         known_offset_m: the median error over the configurations of the training data.
         range_m: of the measured range.
-        rx_power_dbm, power_gap_db: of the receive power, and of it less the first-path power.
+        power_at_1m_dbm: of the receive power + 20 log10 of the measured range.
+        power_gap_db: of the receive power less the first-path power.
         cir_level_db: of the window's energy less the receive power.
         first_path_level_db: of the energy at the first path less the first-path power.
     """
 
     known_offset_m: float
     range_m: Band
-    rx_power_dbm: Band
+    power_at_1m_dbm: Band
     power_gap_db: Band
     cir_level_db: Band
     first_path_level_db: Band
@@ -136,13 +138,14 @@ def features(
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
         energy = windows * windows
         np.multiply(energy, energy, out=energy)
-        sums = np.empty((len(windows), 2), np.float32)
+        sums = np.empty((len(windows), 3), np.float32)
         sums[:, 0] = np.add.accumulate(energy, axis=1)[:, -1]
         sums[:, 1] = np.add.accumulate(energy[:, FIRST_PATH_TAPS], axis=1)[:, -1]
+        np.multiply(range_m, range_m, out=sums[:, 2])
         level = _level_db(sums)
         out = np.empty((len(windows), 5), np.float32)
         out[:, 0] = range_m
-        out[:, 1] = rx_power_dbm
+        np.add(rx_power_dbm, level[:, 2], out=out[:, 1])
         np.subtract(rx_power_dbm, first_path_power_dbm, out=out[:, 2])
         np.subtract(level[:, 0], rx_power_dbm, out=out[:, 3])
         np.subtract(level[:, 1], first_path_power_dbm, out=out[:, 4])
