@@ -17,7 +17,6 @@ from rich.table import Table
 from uwb_mitigation.commands import console
 from uwb_mitigation.commands.console import JsonOption
 from uwb_mitigation.errors import MissingDependencyError, ModelError, ParameterError, UwbMitigationError
-from uwb_mitigation.preprocessing import WINDOW_SIZES, Preprocessing, Scaling
 
 if TYPE_CHECKING:
     from uwb_mitigation.dataset import Dataset
@@ -46,9 +45,7 @@ def protocol(
     networks: Annotated[
         str, typer.Option(help="Of remnet, remnet_k5, remnet_attention, mlp; with commas.")
     ] = "remnet,mlp",
-    windows: Annotated[str, typer.Option(help="Window lengths K, with commas.")] = ",".join(
-        map(str, WINDOW_SIZES)
-    ),
+    windows: Annotated[str, typer.Option(help="Window lengths K, with commas.")] = "157,128,64,32,16,8",
     seeds: Annotated[int, typer.Option(help="Networks of each kind.")] = 5,
     epochs: Annotated[int, typer.Option(help="Passes over the data.")] = 30,
     learning_rate: Annotated[float, typer.Option(help="Of Adam.")] = 3e-4,
@@ -72,7 +69,7 @@ def protocol(
         raise ParameterError("not a folder", where=str(output), valid="a folder, or a name for one")
     dataset = _labelled(data, max(lengths), scaling)
     train, test, name = _divide(dataset, split)
-    parts = protocols.Parts(data.resolve().name, name, train, test)
+    parts = protocols.Parts(_title(data), name, train, test)
     with share_bar(f"{len(wanted)} networks") as update:
         result = protocols.run(parts, output, wanted, options, _workers(workers), update)
     _show_protocol(result)
@@ -274,6 +271,7 @@ def share_bar(name: str) -> Iterator[Callable[[float], None]]:
 def _labelled(data: Path, samples: int, scaling: str) -> Dataset:
     """The recording as arrays; tells what is left out."""
     from uwb_mitigation.dataset import build_dataset
+    from uwb_mitigation.preprocessing import Preprocessing, Scaling
     from uwb_mitigation.sources.opening import open_recording
 
     if scaling not in {kind.value for kind in Scaling}:
@@ -283,6 +281,15 @@ def _labelled(data: Path, samples: int, scaling: str) -> Dataset:
     for reason, count in dataset.refused.items():
         console.err.print(f"left out: {count} x {reason}", markup=False)
     return dataset
+
+
+def _title(data: Path) -> str:
+    """The recording's name, with the word "simulated" where it is."""
+    from uwb_mitigation.sources.opening import open_recording
+
+    with open_recording(data) as source:
+        name = data.resolve().name
+        return f"{name} (simulated)" if source.simulated and "simulated" not in name else name
 
 
 def _divide(dataset: Dataset, split: str, folds: int = 4) -> tuple[Dataset, Dataset, str]:
@@ -308,6 +315,8 @@ def _left(dataset: Dataset, prior: Any) -> Any:
 
 
 def _lengths(text: str) -> list[int]:
+    from uwb_mitigation.preprocessing import Preprocessing
+
     try:
         lengths = [int(part) for part in text.split(",")]
     except ValueError:
