@@ -14,6 +14,7 @@ from uwb_mitigation.commands import (
     bench_training,
     console,
     data,
+    doctor,
     firmware,
     link,
     model,
@@ -48,6 +49,7 @@ bench.command("training")(bench_training.bench_training)
 app.command("report")(report.report)
 app.command("emulate-board")(link.emulate_board)
 app.command("export-c")(firmware.export_c)
+app.command("doctor")(doctor.doctor)
 
 
 def _print_version(wanted: bool) -> None:

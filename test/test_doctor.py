@@ -1,0 +1,141 @@
+"""`uwb-mitigation doctor`: a sound installation passes, and whatever is broken shows, with what mends it."""
+
+from __future__ import annotations
+
+import json
+import sys
+from importlib.metadata import PackageNotFoundError
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from serial.tools import list_ports
+from typer.testing import CliRunner
+
+from uwb_mitigation import installation
+from uwb_mitigation.cli import app
+from uwb_mitigation.errors import ModelError
+from uwb_mitigation.installation import Finding, State
+from uwb_mitigation.model import bundle
+from uwb_mitigation.model.session import Session
+
+NEEDED = ["Python", *installation.PACKAGES, "shipped model", "rclpy", "messages"]
+
+
+@pytest.fixture(autouse=True)
+def no_ports(monkeypatch: pytest.MonkeyPatch):
+    """No port of the computer that runs the tests has a say."""
+    monkeypatch.setattr(list_ports, "comports", list)
+
+
+def findings() -> dict[str, Finding]:
+    return {finding.name: finding for finding in installation.examine()}
+
+
+def test_a_sound_installation_passes(tmp_path: Path):
+    pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
+    result = CliRunner().invoke(app, ["doctor", "--json", str(tmp_path / "result.json")])
+    told = json.loads((tmp_path / "result.json").read_text())
+    assert result.exit_code == 0, result.output
+    assert told["ok"]
+    states = {entry["name"]: entry["state"] for entry in told["findings"]}
+    assert {name: states[name] for name in NEEDED} == dict.fromkeys(NEEDED, "ok")
+
+
+@pytest.mark.parametrize(("distribution", "module"), installation.PACKAGES.items())
+def test_a_package_that_cannot_be_imported_is_broken(
+    monkeypatch: pytest.MonkeyPatch, distribution: str, module: str
+):
+    monkeypatch.setitem(sys.modules, module, None)
+    monkeypatch.setattr(installation, "_model", str)
+    monkeypatch.setattr(installation, "_child", str)
+    found = findings()[distribution]
+    assert found.state is State.BROKEN
+    assert module in found.detail
+    assert "make setup" in found.fix
+
+
+@pytest.mark.parametrize("module", ["rclpy", "uwb_mitigation_msgs"])
+def test_a_ros_that_cannot_be_loaded_is_broken(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, module: str):
+    (tmp_path / f"{module}.py").write_text("raise ImportError('librcl.so is not there')")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    code = installation._RCLPY if module == "rclpy" else installation._MESSAGES
+    found = installation._attempt(module, lambda: installation._child(code), "mend it")
+    assert found == Finding(module, State.BROKEN, "ImportError: librcl.so is not there", "mend it")
+
+
+def test_a_python_that_is_not_supported_is_broken(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(sys, "version_info", (3, 9, 1))
+    finding = installation._attempt("Python", installation._python, "another one")
+    assert finding == Finding("Python", State.BROKEN, "3.9.1: 3.10 to 3.13 are supported", "another one")
+
+
+def test_a_model_that_is_damaged_is_broken(monkeypatch: pytest.MonkeyPatch):
+    def damaged(path: Path):
+        raise ModelError("damaged", where=str(path))
+
+    monkeypatch.setattr(bundle, "load_bundle", damaged)
+    assert findings()["shipped model"].state is State.BROKEN
+    result = CliRunner().invoke(app, ["doctor"])
+    assert result.exit_code == 1
+    assert "shipped model: install the package again" in result.output
+
+
+def test_arithmetic_that_differs_by_one_bit_is_broken(monkeypatch: pytest.MonkeyPatch):
+    honest = Session.predict_batch_m
+
+    def off_by_one_bit(self, windows):
+        outputs = honest(self, windows)
+        outputs[3:4].view(np.uint32)[0] ^= 1
+        return outputs
+
+    monkeypatch.setattr(Session, "predict_batch_m", off_by_one_bit)
+    assert "1 of 8 golden vectors differently" in findings()["shipped model"].detail
+
+
+def test_a_middleware_that_is_not_there_is_broken(monkeypatch: pytest.MonkeyPatch):
+    pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
+    monkeypatch.setenv("RMW_IMPLEMENTATION", "rmw_of_nobody")
+    found = findings()["rclpy"]
+    assert found.state is State.BROKEN
+    assert "rmw_of_nobody" in found.detail
+
+
+@pytest.mark.parametrize(
+    ("vendor", "allowed", "state"),
+    [(0x2341, True, State.OK), (0x2341, False, State.BROKEN), (None, False, State.OPTIONAL)],
+)
+def test_a_board_that_may_not_be_opened_is_broken(
+    monkeypatch: pytest.MonkeyPatch, vendor: int | None, allowed: bool, state: State
+):
+    port = SimpleNamespace(device="/dev/ttyACM7", vid=vendor, description="Nano 33 BLE")
+    monkeypatch.setattr(list_ports, "comports", lambda: [port])
+    monkeypatch.setattr(installation.os, "access", lambda path, mode: allowed)
+    (finding,) = installation._ports()
+    assert (finding.name, finding.state) == ("/dev/ttyACM7", state)
+    assert ("dialout" in finding.fix) is not allowed
+
+
+def test_optional_tools_that_are_absent_break_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    def absent(distribution: str):
+        raise PackageNotFoundError(distribution)
+
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setattr(installation.metadata, "version", absent)
+    monkeypatch.setattr(installation, "UDEV_FOLDERS", (tmp_path,))
+    found = {f.name: f for f in (*installation._udev_rule(), *installation._tools())}
+    for name in ("torch", "cc", "arm-none-eabi-gcc", "qemu-system-arm", "udev rule"):
+        assert found[name].state is State.OPTIONAL
+        assert found[name].detail
+        assert found[name].fix
+
+
+def test_the_udev_rule_is_found_where_it_was_copied_to(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    monkeypatch.setattr(installation, "UDEV_FOLDERS", (tmp_path / "absent", tmp_path))
+    (offered,) = installation._udev_rule()
+    source = Path(offered.fix.split()[2])
+    (tmp_path / source.name).write_bytes(source.read_bytes())
+    (found,) = installation._udev_rule()
+    assert found == Finding("udev rule", State.OK, str(tmp_path / source.name))

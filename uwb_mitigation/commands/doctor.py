@@ -1,0 +1,33 @@
+"""`uwb-mitigation doctor`."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from uwb_mitigation.commands import console
+from uwb_mitigation.commands.console import JsonOption
+
+_STYLES = {"ok": "green", "broken": "red"}
+
+
+def doctor(json: JsonOption = None) -> None:
+    """Look at what is installed, and say how to mend what is broken: then the exit code is 1."""
+    from uwb_mitigation.installation import State, examine
+
+    findings = list(examine())
+    broken = [finding for finding in findings if finding.state is State.BROKEN]
+    table = Table("", "state", "", title_justify="left")
+    for finding in findings:
+        style = _STYLES.get(finding.state.value, "yellow")
+        table.add_row(finding.name, f"[{style}]{finding.state.value}[/]", escape(finding.detail))
+    console.out.print(table)
+    for finding in findings:
+        if finding.fix:
+            console.out.print(f"{finding.name}: {finding.fix}", markup=False, highlight=False, soft_wrap=True)
+    console.write_json(json, {"ok": not broken, "findings": [asdict(finding) for finding in findings]})
+    if broken:
+        raise typer.Exit(1)
