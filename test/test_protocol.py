@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from shutil import copytree
 
 import numpy as np
 import pytest
 from model_material import dataset
+from typer.testing import CliRunner
 
+from uwb_mitigation.cli import app
 from uwb_mitigation.dataset import Dataset
 from uwb_mitigation.errors import DatasetError, ParameterError, UwbMitigationError
 from uwb_mitigation.model.bundle import load_bundle
@@ -168,23 +171,39 @@ def test_what_is_done_is_not_done_again(finished, monkeypatch):
     assert protocol.run(parts(), folder, wanted, QUICK) == result
 
 
+MLP = protocol.Job("mlp", 32, 0)
+
+
 @pytest.mark.parametrize(
     "damage", ["", "{", '{"fingerprint": 1}', '{"fingerprint": 1, "model": {"network": 3}}']
 )
-def test_a_damaged_result_is_done_again(tmp_path, damage):
-    job = protocol.Job("mlp", 16, 0)
-    small = protocol.Parts("", "", protocol.narrowed(parts().train, 16), protocol.narrowed(parts().test, 16))
-    first = protocol.run(small, tmp_path, [job], QUICK)
-    (tmp_path / f"{job.name}.json").write_text(damage)
-    again = protocol.run(small, tmp_path, [job], QUICK)
-    assert again.models[0].mae_int8 == first.models[0].mae_int8
+def test_a_damaged_result_is_done_again(finished, tmp_path, damage):
+    folder, first = finished
+    copied = copytree(folder, tmp_path / "copy")
+    (copied / f"{MLP.name}.json").write_text(damage)
+    (again,) = protocol.run(parts(), copied, [MLP], QUICK).models
+    assert again.mae_int8 == first.models[-1].mae_int8
 
 
-def test_other_data_is_trained_on_anew(tmp_path):
-    job = protocol.Job("mlp", 32, 0)
-    first = protocol.run(parts(), tmp_path, [job], QUICK)
-    other = protocol.run(parts(seed=5), tmp_path, [job], QUICK)
-    assert first.models[0].mae_raw != other.models[0].mae_raw
+def test_other_data_is_trained_on_anew(finished, tmp_path):
+    folder, first = finished
+    (other,) = protocol.run(parts(seed=5), copytree(folder, tmp_path / "copy"), [MLP], QUICK).models
+    assert other.mae_raw != first.models[-1].mae_raw
+
+
+def test_one_command_trains_on_simulated_rooms_and_calls_them_so(tmp_path):
+    data, folder = str(tmp_path / "rooms.mcap"), tmp_path / "models"
+    simulate = ["data", "simulate", "-o", data, "--ranges", "200", "--exchanges", "4"]
+    train = ["protocol", "--data", data, "-o", str(folder), "--networks", "mlp", "--windows", "8"]
+    for words in (simulate, [*train, "--seeds", "1", "--epochs", "1", "--workers", "1"]):
+        done = CliRunner().invoke(app, words)
+        assert done.exit_code == 0, done.output
+    assert "L1 line" in done.output
+    result = results.read(folder)
+    assert (result.data, result.split) == ("rooms.mcap (simulated)", "paper")
+    # As many as the paper's split has of so many rows.
+    assert (result.train, result.test) == (131, 48)
+    assert left(result.baselines, "line") > 0
 
 
 def test_two_processes_give_the_same_models(tmp_path):

@@ -201,6 +201,12 @@ def plain() -> str:
     return report.build(study(), COMMANDS).html()
 
 
+@pytest.fixture
+def without_clouds(monkeypatch) -> None:
+    """Leaves out Fig. 4, which takes most of the time, where a test looks elsewhere."""
+    monkeypatch.setattr(report.figures, "scatter", lambda *_: "data:image/png;base64,")
+
+
 def test_all_tables_and_figures_are_there_for_data_shaped_like_deepuwb(deepuwb):
     page = Page(deepuwb[0])
     assert [values["id"] for values in page.all("section")] == PARTS
@@ -262,6 +268,9 @@ def test_simulated_data_is_called_so(deepuwb):
     assert values["simulated"] is True
     assert "simulated data" in Page(page).text[""]
     assert "(simulated)" in values["data"]
+    for part in ("data", "table1"):
+        assert "Measured on simulated data" in Page(page).text[part]
+    assert any("DeepUWB's shape and none of its radio" in notice for notice in values["notices"])
 
 
 def test_the_same_data_gives_the_same_page(plain):
@@ -340,6 +349,7 @@ def test_rates_and_energy_of_the_emulator_are_called_estimated():
     assert found["groups"][1][0] == "Estimated"
 
 
+@pytest.mark.usefixtures("without_clouds")
 def test_the_box_plot_shows_the_errors_that_are_given():
     errors = np.linspace(-1, 1, 201)
     trainings = results.parse_trainings(protocol(trained()), "here")
@@ -352,6 +362,7 @@ def test_the_box_plot_shows_the_errors_that_are_given():
     assert "K = 64: not measured" in picture.alt
 
 
+@pytest.mark.usefixtures("without_clouds")
 def test_networks_trained_shorter_than_the_papers_are_told():
     trainings = results.parse_trainings(protocol(trained(), options={"epochs": 2}), "here")
     result = report.build(study(), COMMANDS, trainings)
@@ -418,6 +429,7 @@ def test_models_that_are_not_there_are_refused(tmp_path):
     assert "protocol.json" in str(result.exception)
 
 
+@pytest.mark.usefixtures("without_clouds")
 def test_quick_training_fills_tables_and_boxes(tmp_path, monkeypatch):
     from uwb_mitigation.commands import report as command
 

@@ -23,6 +23,7 @@ from uwb_mitigation.preprocessing import WINDOW_LEAD
 try:
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.colors import to_rgba
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
@@ -36,6 +37,8 @@ except ModuleNotFoundError as error:
 MAX_POINTS = 4000
 MAX_NAMED = 12
 """More groups than that get no legend: nobody can tell their colours apart."""
+
+_LAYERS = 4
 
 _COLOURS = (
     "#0072B2",
@@ -96,22 +99,29 @@ def scatter(projection: Projection, groups: NDArray[np.str_], title: str) -> str
     names, counts = np.unique(groups, return_counts=True)
     order = names[np.argsort(-counts, kind="stable")].tolist()
     named = len(order) <= MAX_NAMED
+    # One marker is drawn at a time: groups in layers, a part of each, or the last would hide the rest.
+    members = [np.flatnonzero(groups == name) for name in order]
+    layers = [(rows[start::_LAYERS], n) for start in range(_LAYERS) for n, rows in enumerate(members)]
+    layers = [(rows, n) for rows, n in layers if len(rows)] if named else [(np.arange(len(groups)), 0)]
     with _settings():
         spectrum = matplotlib.colormaps["turbo"](np.linspace(0.03, 0.97, len(order)))
+        colours = np.empty((len(groups), 4))
+        for number, rows in enumerate(members):
+            colours[rows] = to_rgba(_COLOURS[number]) if named else spectrum[number]
         figure = Figure(figsize=(7.6, 4.6 if named else 4.0), dpi=150)
         for side, azimuth in enumerate((-60, 30)):
             bottom = 0.16 if named else 0.03
             place: Any = figure.add_axes((0.51 * side, bottom, 0.44, 0.93 - bottom), projection="3d")
             place.view_init(elev=22, azim=azimuth)
-            place.set_box_aspect((1, 1, 0.8), zoom=1.0)
-            for number, name in enumerate(order):
-                points = projection.points[groups == name]
+            place.set_box_aspect((1, 1, 0.8), zoom=1.1)
+            place.computed_zorder = False
+            for rows, number in layers:
                 place.scatter(
-                    *points.T,
+                    *projection.points[rows].T,
                     s=7,
                     alpha=0.65,
                     linewidths=0,
-                    color=_COLOURS[number] if named else spectrum[number],
+                    c=colours[rows],
                     marker=_MARKERS[number] if named else "o",
                     depthshade=False,
                 )

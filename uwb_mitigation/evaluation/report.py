@@ -100,7 +100,7 @@ def build(
     )
     shown = (
         _data_table(study, commands),
-        tables.accuracy(trainings, trained, to_train),
+        tables.accuracy(trainings, trained, to_train, _measured(study)),
         tables.sizes(trainings, trained, to_train),
         tables.firmware(firmware, emulated if firmware else nothing, to_bench),
     )
@@ -170,7 +170,12 @@ def _notices(study: Study, trainings: Trainings | None, commands: Commands) -> t
         said.append(
             "The data is simulated: no radio was involved. Nothing here says how well a real site would do."
         )
-    if study.has_rooms and not study.published:
+    if study.has_rooms and study.simulated:
+        said.append(
+            "The data has DeepUWB's shape and none of its radio: "
+            "the paper's figures stand beside for orientation, and are not the mark to reach."
+        )
+    elif study.has_rooms and not study.published:
         said.append(
             "The data has DeepUWB's shape, but not the published number of rows in each room: "
             "its figures are not comparable with the paper's."
@@ -215,13 +220,18 @@ def _data_table(study: Study, commands: Commands) -> Table:
         "MAE and standard deviation of the range error, measured minus true. "
         f"{len(study.dataset.names)} configurations (placements of both antennas). "
         "The rows of each room are those that DeepUWB publishes.",
-        (("Paper and DeepUWB", 3), ("Measured", 3)),
+        (("Paper and DeepUWB", 3), (_measured(study), 3)),
         ("Part", *(["Measurements", "MAE, m", "σ, m"] * 2)),
         1,
         tuple(rows),
         _own(study, commands, "none: all measurements"),
         "",
     )
+
+
+def _measured(study: Study) -> str:
+    """Heads the columns that are made of the data."""
+    return "Measured on simulated data" if study.simulated else "Measured"
 
 
 def _part(

@@ -94,8 +94,10 @@ def number(value: float | None, form: str, kind: str) -> Cell:
     return Cell("–", "none") if value is None else Cell(form.format(value), kind, value)
 
 
-def accuracy(trainings: Trainings | None, provenance: Provenance, missing: str) -> Table:
-    """Table 1: MAE before and after graph optimisation and quantisation."""
+def accuracy(
+    trainings: Trainings | None, provenance: Provenance, missing: str, measured: str = "Measured"
+) -> Table:
+    """Table 1: MAE before and after graph optimisation and quantisation; `measured` heads our own columns."""
     rows = []
     for network, samples in _networks(trainings):
         models = trainings.of(network, samples) if trainings else ()
@@ -122,8 +124,8 @@ def accuracy(trainings: Trainings | None, provenance: Provenance, missing: str) 
         "MAE on the test part, m; mean ± standard deviation over seeds. Optimised: ONNX Runtime's graph. "
         "Below the networks, what needs none: constants and a line, fitted on the same training part."
         + "".join(reasons),
-        (("Paper", 4), ("Measured", 4)),
-        ("Model", "CIR", *(["Params", *(f"MAE {form}, m" for form in _FORM_NAMES)] * 2)),
+        (("Paper", 4), (measured, 4)),
+        ("Model", "CIR", *(["Params", *(f"MAE {form}" for form in _FORM_NAMES)] * 2)),
         2,
         tuple(rows),
         provenance,
