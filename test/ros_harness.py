@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+import forked_node
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from lifecycle_msgs.srv import ChangeState, GetState
@@ -24,47 +26,84 @@ from rclpy.qos import QoSProfile
 
 TIMEOUT_S = 30.0
 
+# For this process and for all that it starts; read when messages are loaded and when a context is made.
+os.environ |= {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_PYTHON_CHECK_FIELDS": "1"}
+
+FORKS = multiprocessing.get_context("forkserver")
+FORKS.set_forkserver_preload(forked_node.PRELOADED)
+
 
 class Process:
-    """A node, or another program, whose output is kept."""
+    """A running program whose output is kept."""
 
-    def __init__(self, command: list[str], domain: int, log: Path) -> None:
+    pid: int
+
+    def __init__(self, log: Path) -> None:
         self.log = log
-        self._file = log.open("wb")
-        environment = os.environ | {
-            "ROS_DOMAIN_ID": str(domain),
-            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-            "ROS_PYTHON_CHECK_FIELDS": "1",
-            "PYTHONUNBUFFERED": "1",
-        }
-        self.popen = subprocess.Popen(command, env=environment, stdout=self._file, stderr=subprocess.STDOUT)
+
+    def exit_code(self) -> int | None:
+        """None while it runs; negative: the signal that ended it."""
+        raise NotImplementedError
 
     @property
     def output(self) -> str:
         return self.log.read_text(errors="replace")
 
+    def send(self, number: signal.Signals) -> None:
+        if self.exit_code() is None:
+            os.kill(self.pid, number)
+
     def wait(self, timeout_s: float = TIMEOUT_S) -> int:
-        try:
-            return self.popen.wait(timeout_s)
-        except subprocess.TimeoutExpired:
-            raise AssertionError(f"still running after {timeout_s} s:\n{self.output}") from None
+        deadline = time.monotonic() + timeout_s
+        while (code := self.exit_code()) is None:
+            assert time.monotonic() < deadline, f"still running after {timeout_s} s:\n{self.output}"
+            time.sleep(0.01)
+        return code
 
     def signal(self, number: signal.Signals) -> int:
-        self.popen.send_signal(number)
+        self.send(number)
         return self.wait(10)
 
     def wait_for_output(self, text: str) -> None:
         deadline = time.monotonic() + TIMEOUT_S
         while text not in self.output:
-            assert self.popen.poll() is None or text in self.output, f"ended without {text!r}:\n{self.output}"
+            ended = self.exit_code() is not None
+            assert not ended or text in self.output, f"ended without {text!r}:\n{self.output}"
             assert time.monotonic() < deadline, f"no {text!r} in:\n{self.output}"
             time.sleep(0.02)
 
     def end(self) -> None:
-        if self.popen.poll() is None:
-            self.popen.kill()
-            self.popen.wait()
-        self._file.close()
+        self.send(signal.SIGKILL)
+        self.wait()
+
+
+class Program(Process):
+    """One that is started from its beginning."""
+
+    def __init__(self, command: list[str], domain: int, log: Path) -> None:
+        super().__init__(log)
+        environment = os.environ | {"ROS_DOMAIN_ID": str(domain), "PYTHONUNBUFFERED": "1"}
+        with log.open("wb") as file:
+            self._popen = subprocess.Popen(command, env=environment, stdout=file, stderr=subprocess.STDOUT)
+        self.pid = self._popen.pid
+
+    def exit_code(self) -> int | None:
+        return self._popen.poll()
+
+
+class ForkedNode(Process):
+    """A node of the package, forked from a process that has loaded most of what it imports."""
+
+    def __init__(self, node: str, words: list[str], domain: int, log: Path) -> None:
+        super().__init__(log)
+        log.touch()
+        self._process = FORKS.Process(target=forked_node.run, args=(node, words, domain, log), daemon=True)
+        self._process.start()
+        assert self._process.pid is not None
+        self.pid = self._process.pid
+
+    def exit_code(self) -> int | None:
+        return self._process.exitcode
 
 
 class Ros:
@@ -81,13 +120,21 @@ class Ros:
         self._executor.add_node(self.node)
 
     def start(self, node: str, *parameters: str, arguments: tuple[str, ...] = ()) -> Process:
-        """Start one of the package's nodes."""
-        words = [word for parameter in parameters for word in ("-p", parameter)]
-        code = f"from uwb_mitigation.nodes.{node} import main; main()"
-        return self.run([sys.executable, "-c", code, "--ros-args", *words, *arguments])
+        """Start one of the package's nodes: `forked_node` tells in what it differs from `ros2 run`."""
+        return self._keep(ForkedNode(node, _words(parameters, arguments), self.domain, self._next_log()))
+
+    def launch(self, node: str, *parameters: str, arguments: tuple[str, ...] = ()) -> Process:
+        """Start one of the package's nodes as its executable does, which takes a second of loading."""
+        code = f"from uwb_mitigation.nodes.entry import {node}; {node}()"
+        return self.run([sys.executable, "-c", code, *_words(parameters, arguments)])
 
     def run(self, command: list[str]) -> Process:
-        process = Process(command, self.domain, self._folder / f"process_{len(self._processes)}.log")
+        return self._keep(Program(command, self.domain, self._next_log()))
+
+    def _next_log(self) -> Path:
+        return self._folder / f"process_{len(self._processes)}.log"
+
+    def _keep(self, process: Process) -> Process:
         self._processes.append(process)
         return process
 
@@ -153,6 +200,11 @@ class Ros:
             process.end()
         self.node.destroy_node()
         rclpy.shutdown(context=self._context)
+
+
+def _words(parameters: Sequence[str], arguments: Sequence[str]) -> list[str]:
+    given = [word for parameter in parameters for word in ("-p", parameter)]
+    return ["--ros-args", *given, *arguments]
 
 
 @contextmanager

@@ -210,7 +210,7 @@ def test_a_mitigator_without_a_usable_model_stays_inactive_and_can_be_mended(ros
     shutil.copy(default_model_path(), model)
     assert ros.change_state("mitigator", Transition.TRANSITION_ACTIVATE)
     assert ros.state_of("mitigator") == "active"
-    assert mitigator.popen.poll() is None
+    assert mitigator.exit_code() is None
 
 
 def test_every_transition_can_be_repeated(ros: Ros):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections import Counter
 from pathlib import Path
 
@@ -173,7 +174,11 @@ def test_another_rate_changes_the_distances_from_there_on():
 
 
 def test_late_records_come_several_at_once_and_in_order():
-    player = Player(500, 1000).play()
+    def delay(player: Player, sequence: int) -> None:
+        if sequence == 0:
+            time.sleep(0.02)
+
+    player = Player(500, 1000, delay).play()
     assert player.sequences == list(range(500))
     assert max(player.batches) > 1
     assert player.batches[0] == 1

@@ -122,7 +122,7 @@ def test_the_mode_changes_without_a_restart(ros: Ros, link: Path):
             assert set_mode(ros, mode)
             ros.spin_until(lambda o=origin: [m.source for m in corrected[-20:]] == [o] * 20)
         assert not set_mode(ros, "sideways")
-        assert driver.popen.poll() is None
+        assert driver.exit_code() is None
     keys = Counter(key_of(message) for message in corrected)
     assert max(keys.values()) == 1
 
@@ -176,7 +176,7 @@ def test_an_absent_port_is_waited_for(ros: Ros, link: Path):
     assert str(link) in status.message
     with board(link):
         ros.spin_until(lambda: len(received) >= 10)
-    assert driver.popen.poll() is None
+    assert driver.exit_code() is None
 
 
 def test_a_board_of_another_protocol_version_is_named(ros: Ros, link: Path):
@@ -189,7 +189,7 @@ def test_a_board_of_another_protocol_version_is_named(ros: Ros, link: Path):
 
 
 def open_files_and_threads(driver: Process) -> tuple[int, int]:
-    process = Path("/proc", str(driver.popen.pid))
+    process = Path("/proc", str(driver.pid))
     return len(os.listdir(process / "fd")), len(os.listdir(process / "task"))
 
 
