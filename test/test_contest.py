@@ -1,0 +1,127 @@
+"""`evaluate --cross-validate`: every row of the table on the same held-out configurations, and the JSON of it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from model_material import dataset
+from typer.testing import CliRunner
+
+from uwb_mitigation import dataset as datasets
+from uwb_mitigation.cli import app
+from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.evaluation.splits import Group
+from uwb_mitigation.model.architecture import Remnet
+
+pytest.importorskip("torch", reason="run `make setup-training`")
+pytest.importorskip("sklearn", reason="run `make setup-training`")
+from uwb_mitigation.training import contest
+from uwb_mitigation.training.fitting import FitOptions
+from uwb_mitigation.training.recipe import Recipe
+
+RECIPE = Recipe(Remnet(samples=8), FitOptions(epochs=1))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _short():
+    """The network alone is trained for as long as it needs; here nothing is learnt from that."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(contest.choosing, "alone", lambda options: replace(options, epochs=1))
+        yield
+
+
+@pytest.fixture(scope="module")
+def found() -> contest.Contest:
+    data = dataset(12, 6, samples=8)
+    return contest.run(data, RECIPE, Group.CONFIGURATION, folds=3, seeds=2)
+
+
+def mae(result: contest.Contest) -> dict[str, float]:
+    return {row.name: row.mae_mean for row in result.rows}
+
+
+def test_every_row_is_there_in_order(found):
+    assert tuple(row.name for row in found.rows) == contest.NAMES
+    assert (found.folds, found.seeds, found.configurations) == (3, 2, 12)
+    for row in found.rows:
+        assert set(row.by_label) == {"LOS", "NLOS"}
+        assert row.ci95[0] <= row.ci95[1]
+
+
+def test_the_raw_row_is_the_data_as_measured(found):
+    data = dataset(12, 6, samples=8)
+    (raw,) = (row for row in found.rows if row.name == "raw")
+    assert raw.mae_mean == pytest.approx(np.abs(data.error_m).mean())
+    assert raw.mae_std == pytest.approx(0)
+    for label, value in raw.by_label.items():
+        assert value == pytest.approx(np.abs(data.error_m[data.labels == label]).mean())
+
+
+def test_the_line_finds_the_line(found):
+    maes = mae(found)
+    assert max(maes["l1_line"], maes["shipped_float"], maes["shipped_int8"]) < 0.5 * maes["overall_median"]
+    assert abs(maes["shipped_float"] - maes["shipped_int8"]) < 0.01
+
+
+def test_what_is_tested_was_not_fitted_to():
+    # One configuration alone is in line of sight: what is fitted without it cannot know that it errs by 5 m.
+    data = dataset(6, 4, samples=8)
+    is_seen = data.configurations == "c0"
+    error = np.where(is_seen, 5.0, 0.0)
+    data = replace(data, error_m=error, range_m=5.0 + error, labels=np.where(is_seen, "LOS", "NLOS"))
+    found = contest.run(data, RECIPE, Group.CONFIGURATION, folds=2, seeds=1)
+    (row,) = (row for row in found.rows if row.name == "los_median")
+    assert row.by_label["LOS"] == 5.0
+
+
+def test_coverage_is_of_the_intervals_that_were_promised(found):
+    assert 0 <= found.coverage68 <= found.coverage95 <= 1
+    counts = {label: np.sum(dataset(12, 6, samples=8).labels == label) for label in found.coverage_by_label}
+    both = np.array(list(found.coverage_by_label.values()))
+    weights = np.array(list(counts.values())) / 72
+    assert weights @ both == pytest.approx([found.coverage68, found.coverage95])
+
+
+def test_rejecting_nothing_leaves_the_error_as_it_is(found):
+    share, kept = found.rejection[0]
+    assert share == 0.0
+    assert kept == pytest.approx(mae(found)["shipped_int8"])
+
+
+def test_measurements_without_powers_are_left_out():
+    data = dataset(8, 4, samples=8)
+    data.rx_power_dbm[data.configurations == "c0"] = np.nan
+    found = contest.run(data, RECIPE, Group.CONFIGURATION, folds=2, seeds=1)
+    assert found.configurations == 7
+    assert np.isfinite([row.mae_mean for row in found.rows]).all()
+
+
+def run(*arguments: object):
+    return CliRunner().invoke(app, [str(value) for value in arguments], catch_exceptions=True)
+
+
+def test_the_command_writes_the_documented_keys(tmp_path, monkeypatch, found):
+    monkeypatch.setattr(datasets, "build_dataset", lambda records, preprocessing: dataset(12, 6, samples=8))
+    monkeypatch.setattr(contest, "run", lambda *_: found)
+    result = run(
+        "evaluate", "--data", tmp_path, "--cross-validate", "configuration", "--json", tmp_path / "c.json"
+    )
+    assert result.exit_code == 0, result.output
+    written = json.loads((tmp_path / "c.json").read_text())
+    assert [row["name"] for row in written["rows"]] == list(contest.NAMES)
+    assert all(set(row) == {"name", "mae_mean", "mae_std", "by_label", "ci95"} for row in written["rows"])
+    assert (written["coverage68"], written["coverage95"]) == (found.coverage68, found.coverage95)
+    for name in ("shipped_int8", "68 %", "passed through"):
+        assert name in result.output
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [("--cross-validate", "random"), ("--cross-validate", "tag", "--seeds", 0), ("--cross-validate", "tag", "--model", "x")],
+)  # fmt: skip
+def test_requests_that_cannot_be_are_refused(tmp_path, arguments):
+    result = run("evaluate", "--data", tmp_path, *arguments)
+    assert isinstance(result.exception, ParameterError)
