@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 import pytest
+from real_logs import Reading, read_once
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 
@@ -18,3 +19,9 @@ def apartment() -> Path:
     if not (folder / "logs").is_dir():
         pytest.skip(f"the EVK1000 logs are not at {folder}: set UWB_MITIGATION_DATA to run this test")
     return folder
+
+
+@pytest.fixture(scope="session")
+def apartment_reading(apartment: Path, tmp_path_factory: pytest.TempPathFactory) -> Reading:
+    """All exchanges of the real logs, and what was odd."""
+    return read_once(apartment, tmp_path_factory)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import run, start
+from real_logs import Reading
 
 from uwb_mitigation.bag.container import survey
 from uwb_mitigation.bag.reader import BagReader
@@ -16,18 +16,6 @@ from uwb_mitigation.bag.topics import RANGE_RAW, RANGE_TRUTH
 from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.measurement import Cir, RangeMeasurement, Truth
 from uwb_mitigation.sources.source import Record
-
-
-def run(*arguments: object, folder: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "uwb_mitigation.cli", "data", *map(str, arguments)],
-        cwd=folder,
-        env={"PYTHONPATH": str(Path(__file__).parent.parent), "COLUMNS": "160"},
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
 
 
 def write_bag(path: Path, count: int = 6) -> Path:
@@ -43,7 +31,7 @@ def write_bag(path: Path, count: int = 6) -> Path:
 
 def test_info_shows_and_tells_what_a_bag_holds(tmp_path: Path) -> None:
     write_bag(tmp_path / "bag.mcap")
-    done = run("info", "bag.mcap", "--json", "info.json", folder=tmp_path)
+    done = start("data", "info", "bag.mcap", "--json", "info.json", folder=tmp_path)
     assert done.returncode == 0, done.stderr
     for shown in ("simulated", "6 ranges", "2 pairs", "NLOS", "4.500", "4.250", "5.0"):
         assert shown in done.stdout
@@ -57,7 +45,7 @@ def test_info_shows_and_tells_what_a_bag_holds(tmp_path: Path) -> None:
 def test_import_joins_recordings_and_keeps_that_they_were_simulated(tmp_path: Path) -> None:
     write_bag(tmp_path / "one.mcap")
     write_bag(tmp_path / "two", 3)
-    done = run("import", "one.mcap", "two", "-o", "out", "--json", "import.json", folder=tmp_path)
+    done = start("data", "import", "one.mcap", "two", "-o", "out", "--json", "import.json", folder=tmp_path)
     assert done.returncode == 0, done.stderr
     bag = BagReader(tmp_path / "out")
     assert bag.message_count == 18
@@ -68,17 +56,17 @@ def test_import_joins_recordings_and_keeps_that_they_were_simulated(tmp_path: Pa
 def test_import_does_not_replace_a_bag_unless_forced(tmp_path: Path) -> None:
     write_bag(tmp_path / "one.mcap")
     write_bag(tmp_path / "out.mcap", 1)
-    refused = run("import", "one.mcap", "-o", "out.mcap", folder=tmp_path)
+    refused = run("data", "import", "one.mcap", "-o", "out.mcap", folder=tmp_path)
     assert refused.returncode == 1
     assert "--force" in refused.stderr
     assert BagReader(tmp_path / "out.mcap").message_count == 2
-    assert run("import", "one.mcap", "-o", "out.mcap", "--force", folder=tmp_path).returncode == 0
+    assert run("data", "import", "one.mcap", "-o", "out.mcap", "--force", folder=tmp_path).returncode == 0
     assert BagReader(tmp_path / "out.mcap").message_count == 12
 
 
 def test_a_bag_can_be_replaced_by_an_import_of_itself(tmp_path: Path) -> None:
     write_bag(tmp_path / "bag.mcap")
-    assert run("import", "bag.mcap", "-o", "bag.mcap", "--force", folder=tmp_path).returncode == 0
+    assert run("data", "import", "bag.mcap", "-o", "bag.mcap", "--force", folder=tmp_path).returncode == 0
     assert BagReader(tmp_path / "bag.mcap").message_count == 12
 
 
@@ -87,11 +75,11 @@ def test_a_damaged_bag_is_shown_as_far_as_it_goes_and_exits_1(tmp_path: Path) ->
     with path.open("rb") as stream:
         end = survey(stream).spans[0].end
     path.write_bytes(path.read_bytes()[:end] + b"\x06\xff\xff\xff")
-    done = run("info", "bag.mcap", "--json", "info.json", folder=tmp_path)
+    done = run("data", "info", "bag.mcap", "--json", "info.json", folder=tmp_path)
     assert done.returncode == 1
     assert "6 ranges" in done.stdout
     assert f"bag.mcap, byte {end}" in done.stderr
-    kept = run("import", "bag.mcap", "-o", "kept.mcap", folder=tmp_path)
+    kept = run("data", "import", "bag.mcap", "-o", "kept.mcap", folder=tmp_path)
     assert kept.returncode == 1
     assert f"byte {end}" in kept.stderr
     assert BagReader(tmp_path / "kept.mcap").message_count == 12
@@ -111,7 +99,7 @@ def test_bad_input_is_one_clear_line_and_exit_1(
 ) -> None:
     if content is not None:
         (tmp_path / name).write_bytes(content)
-    done = run(command, name, *(["-o", "out.mcap"] if command == "import" else []), folder=tmp_path)
+    done = run("data", command, name, *(["-o", "out.mcap"] if command == "import" else []), folder=tmp_path)
     assert done.returncode == 1
     assert len(done.stderr.splitlines()) == 1
     assert name in done.stderr
@@ -119,13 +107,14 @@ def test_bad_input_is_one_clear_line_and_exit_1(
     assert not (tmp_path / "out.mcap").exists()
 
 
-def test_all_apartment_logs_become_one_bag_that_rosbags_agrees_with(apartment: Path, tmp_path: Path) -> None:
+def test_all_apartment_logs_become_one_bag_that_rosbags_agrees_with(
+    apartment: Path, apartment_reading: Reading, tmp_path: Path
+) -> None:
     from rosbags.rosbag2 import Reader
 
     from uwb_mitigation.bag import schemas
-    from uwb_mitigation.sources.opening import open_recording
 
-    done = run("import", apartment, "-o", "apartment.mcap", "--json", "import.json", folder=tmp_path)
+    done = run("data", "import", apartment, "-o", "apartment.mcap", "--json", "import.json", folder=tmp_path)
     assert done.returncode == 0, done.stderr
     result = json.loads((tmp_path / "import.json").read_text())
     assert result["pairs"] == 28
@@ -138,7 +127,7 @@ def test_all_apartment_logs_become_one_bag_that_rosbags_agrees_with(apartment: P
         assert connections[RANGE_RAW].msgcount == result["ranges"]
         assert connections[RANGE_TRUTH].msgcount == result["with_truth"] == result["ranges"]
         messages = reader.messages([connections[RANGE_RAW]])
-        for item, (connection, stamp_ns, data) in zip(open_recording(apartment), messages, strict=True):
+        for item, (connection, stamp_ns, data) in zip(apartment_reading.records, messages, strict=True):
             message = store.deserialize_cdr(data, connection.msgtype)
             measurement = item.measurement
             assert (message.tag_id, message.anchor_id) == (measurement.tag_id, measurement.anchor_id)

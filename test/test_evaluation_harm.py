@@ -13,7 +13,6 @@ from uwb_mitigation.measurement import Cir, Encoding
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.shipped import default_model_path
-from uwb_mitigation.sources.opening import open_recording
 from uwb_mitigation.sources.simulated import SimulatedSource
 from uwb_mitigation.sources.source import Record
 
@@ -26,9 +25,8 @@ def mitigation() -> Mitigation:
 
 
 @pytest.fixture(scope="module")
-def records(apartment) -> list[Record]:
-    with open_recording(apartment) as source:
-        return [record for number, record in enumerate(source) if number % EVERY == 0]
+def records(apartment_reading) -> list[Record]:
+    return apartment_reading.records[::EVERY]
 
 
 def magnitudes_without_preamble(cir: Cir) -> Cir:

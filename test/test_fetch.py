@@ -5,9 +5,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-import os
-import subprocess
-import sys
 import threading
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -16,6 +13,7 @@ from typing import Any
 
 import pytest
 import requests
+from command_line import run, start
 
 from uwb_mitigation.errors import ParameterError, RecordingError
 from uwb_mitigation.sources import deepuwb
@@ -231,21 +229,20 @@ def test_an_address_that_is_not_http_is_refused(tmp_path: Path, url: str) -> Non
         download(REMOTE, tmp_path / "a.pkl", url=url, checksum=SHA256)
 
 
-def run(*arguments: object, folder: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "uwb_mitigation.cli", "data", "fetch", *map(str, arguments)],
-        cwd=folder,
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parent.parent)},
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
-
-
 def test_the_command_fetches_and_tells(server: Server, tmp_path: Path) -> None:
     sha256 = SHA256.partition(":")[2]
-    done = run("deepuwb", "--url", server.url(), "--sha256", sha256, "--json", "fetch.json", folder=tmp_path)
+    done = start(
+        "data",
+        "fetch",
+        "deepuwb",
+        "--url",
+        server.url(),
+        "--sha256",
+        sha256,
+        "--json",
+        "fetch.json",
+        folder=tmp_path,
+    )
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "deepuwb.pkl").read_bytes() == CONTENT
     assert json.loads((tmp_path / "fetch.json").read_text()) == {
@@ -259,7 +256,16 @@ def test_the_command_fetches_and_tells(server: Server, tmp_path: Path) -> None:
 
 def test_the_command_fails_with_one_clear_line(server: Server, tmp_path: Path) -> None:
     done = run(
-        "deepuwb", "-o", "x.pkl", "--url", server.url("/absent"), "--sha256", "0" * 64, folder=tmp_path
+        "data",
+        "fetch",
+        "deepuwb",
+        "-o",
+        "x.pkl",
+        "--url",
+        server.url("/absent"),
+        "--sha256",
+        "0" * 64,
+        folder=tmp_path,
     )
     assert done.returncode == 1
     assert len(done.stderr.strip().splitlines()) == 1

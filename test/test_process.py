@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bag_material import Foreign, spans_of
+from command_line import ENVIRONMENT, command, run, start
 from model_material import bundle, cir
 
 from uwb_mitigation.bag import codec, columns, schemas
@@ -139,26 +140,6 @@ def corrected_of(path: Path) -> list[bytes]:
 def one_by_one(measurements: list[RangeMeasurement]) -> list[bytes]:
     mitigation = Mitigation(load_bundle(default_model_path()))
     return [codec.encode_corrected(m, mitigation.correct(m)) for m in measurements]
-
-
-def arguments(*given: object) -> list[str]:
-    return [sys.executable, "-m", "uwb_mitigation.cli", "process", *map(str, given)]
-
-
-def environment() -> dict[str, str]:
-    return os.environ | {"PYTHONPATH": str(REPOSITORY), "COLUMNS": "160"}
-
-
-def run(*given: object, folder: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        arguments(*given),
-        cwd=folder,
-        env=environment(),
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
 
 
 @pytest.mark.parametrize("scaling", list(Scaling))
@@ -437,7 +418,9 @@ def test_a_damaged_bag_is_processed_as_far_as_it_goes(tmp_path: Path) -> None:
 
 def test_the_command_writes_a_bag_and_its_result(tmp_path: Path) -> None:
     write_bag(tmp_path / "in.mcap", exchanges(40))
-    done = run("in.mcap", "-o", "out.mcap", "--compare-copy", "--json", "out.json", folder=tmp_path)
+    done = start(
+        "process", "in.mcap", "-o", "out.mcap", "--compare-copy", "--json", "out.json", folder=tmp_path
+    )
     assert done.returncode == 0, done.stderr
     assert "40 ranges" in done.stdout
     result = json.loads((tmp_path / "out.json").read_text())
@@ -456,12 +439,12 @@ def test_the_command_writes_a_bag_and_its_result(tmp_path: Path) -> None:
 def test_an_output_that_is_there_is_kept_unless_forced(tmp_path: Path) -> None:
     source = write_bag(tmp_path / "in.mcap", exchanges(4))
     output = write_bag(tmp_path / "out.mcap", exchanges(1))
-    refused = run(source, "-o", output, folder=tmp_path)
+    refused = run("process", source, "-o", output, folder=tmp_path)
     assert refused.returncode == 1
     assert "--force" in refused.stderr
     assert len(refused.stderr.splitlines()) == 1
     assert corrected_of(output) == []
-    assert run(source, "-o", output, "--force", folder=tmp_path).returncode == 0
+    assert run("process", source, "-o", output, "--force", folder=tmp_path).returncode == 0
     assert len(corrected_of(output)) == 4
 
 
@@ -472,7 +455,7 @@ def test_one_bad_bag_is_reported_and_does_not_stop_the_rest(tmp_path: Path) -> N
     write_bag(folder / "cut.mcap", exchanges(400))
     cut(folder / "cut.mcap")
     (folder / "bad.mcap").write_bytes(b"nothing")
-    done = run("monday", "-o", "out", "--json", "out.json", folder=tmp_path)
+    done = start("process", "monday", "-o", "out", "--json", "out.json", folder=tmp_path)
     assert done.returncode == 1
     assert "bad.mcap: not an MCAP file" in done.stderr
     assert "cut.mcap, byte" in done.stderr
@@ -502,7 +485,7 @@ def test_bad_arguments_are_one_clear_line_and_exit_1(tmp_path: Path, given: list
     write_bag(tmp_path / "in.mcap", exchanges(1))
     write_bag(tmp_path / "other.mcap", exchanges(1))
     (tmp_path / "empty").mkdir()
-    done = run(*given, folder=tmp_path)
+    done = run("process", *given, folder=tmp_path)
     assert done.returncode == 1
     assert told in done.stderr
     assert len(done.stderr.splitlines()) == 1
@@ -527,12 +510,12 @@ def test_names_of_several_sources_are_kept_and_earlier_outputs_left_out(tmp_path
 def test_ctrl_c_ends_cleanly_and_leaves_no_partial_file(tmp_path: Path) -> None:
     source = write_bag(tmp_path / "in.mcap", exchanges(200))
     data, (span, *_) = source.read_bytes(), spans_of(source)
-    # The same chunk a thousand times over: more than is done before the signal.
-    source.write_bytes(data[: span.end] + data[span.offset : span.end] * 1000)
+    # The same chunk two hundred times over: more than is done before the signal.
+    source.write_bytes(data[: span.end] + data[span.offset : span.end] * 200)
     process = subprocess.Popen(
-        arguments(source, "-o", "out.mcap"),
+        command("process", source, "-o", "out.mcap"),
         cwd=tmp_path,
-        env=environment(),
+        env=ENVIRONMENT,
         stderr=subprocess.PIPE,
         stdout=subprocess.PIPE,
         start_new_session=True,

@@ -1,0 +1,68 @@
+"""`uwb-mitigation` in the test's own process: what a process of its own does, without a second of loading.
+
+Each command has at least one test besides that does start a process (`start`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import NamedTuple
+from unittest import mock
+
+from uwb_mitigation import cli
+
+ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parent.parent), "COLUMNS": "160"}
+"""Of a command in a process of its own: the package of this repository, and columns to print on."""
+
+
+class Finished(NamedTuple):
+    """How a command ended, and what it printed."""
+
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+def run(*arguments: object, folder: Path) -> Finished:
+    """Run the command in `folder`."""
+    out, err = io.StringIO(), io.StringIO()
+    before = Path.cwd()
+    with (
+        mock.patch.object(sys, "argv", ["uwb-mitigation", *map(str, arguments)]),
+        mock.patch.dict(os.environ, COLUMNS="160"),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+    ):
+        os.chdir(folder)
+        try:
+            cli.main()
+            code = 0
+        except SystemExit as end:
+            code = end.code or 0
+        finally:
+            os.chdir(before)
+    return Finished(code, out.getvalue(), err.getvalue())
+
+
+def start(*arguments: object, folder: Path) -> Finished:
+    """Run the command in `folder` in a process of its own."""
+    done = subprocess.run(
+        command(*arguments),
+        cwd=folder,
+        env=ENVIRONMENT,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    return Finished(done.returncode, done.stdout, done.stderr)
+
+
+def command(*arguments: object) -> list[str]:
+    """The words that start the command."""
+    return [sys.executable, "-m", "uwb_mitigation.cli", *map(str, arguments)]
