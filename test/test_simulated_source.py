@@ -188,7 +188,7 @@ def test_levels_are_of_the_order_of_real_logs(survey: list[Record]) -> None:
 
 @pytest.fixture(scope="module")
 def rooms() -> list[Record]:
-    return list(SimulatedDeepUwb(seed=3, ranges=600, exchanges=4))
+    return list(SimulatedDeepUwb(seed=3, ranges=900, exchanges=4))
 
 
 def room(record: Record) -> int:
@@ -204,8 +204,8 @@ def test_rooms_and_obstacles_are_those_of_deepuwb() -> None:
 def test_each_room_has_the_published_number_of_rows_or_its_share(rooms: list[Record]) -> None:
     assert SimulatedDeepUwb().rows == (954, 18_422, 13_210, 17_601, 4_971)
     counted = np.bincount([room(record) for record in rooms])
-    assert counted.tolist() == list(SimulatedDeepUwb(ranges=600).rows)
-    assert np.abs(counted / 600 - np.array(SimulatedDeepUwb().rows) / 55_158).max() < 0.002
+    assert counted.tolist() == list(SimulatedDeepUwb(ranges=900).rows)
+    assert np.abs(counted / 900 - np.array(SimulatedDeepUwb().rows) / 55_158).max() < 0.002
 
 
 def test_the_splits_by_room_apply(rooms: list[Record]) -> None:

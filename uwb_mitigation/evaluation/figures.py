@@ -111,9 +111,9 @@ def scatter(projection: Projection, groups: NDArray[np.str_], title: str) -> str
         figure = Figure(figsize=(7.6, 4.6 if named else 4.0), dpi=150)
         for side, azimuth in enumerate((-60, 30)):
             bottom = 0.16 if named else 0.03
-            place: Any = figure.add_axes((0.51 * side, bottom, 0.44, 0.93 - bottom), projection="3d")
+            place: Any = figure.add_axes((0.02 + 0.51 * side, bottom, 0.44, 0.93 - bottom), projection="3d")
             place.view_init(elev=22, azim=azimuth)
-            place.set_box_aspect((1, 1, 0.8), zoom=1.1)
+            place.set_box_aspect((1, 1, 0.8), zoom=1.0)
             place.computed_zorder = False
             for rows, number in layers:
                 place.scatter(

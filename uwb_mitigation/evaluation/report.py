@@ -218,8 +218,8 @@ def _data_table(study: Study, commands: Commands) -> Table:
         "data",
         "The data before any correction",
         "MAE and standard deviation of the range error, measured minus true. "
-        f"{len(study.dataset.names)} configurations (placements of both antennas). "
-        "The rows of each room are those that DeepUWB publishes.",
+        f"{len(study.dataset.names):,} configurations (placements of both antennas)."
+        + (" The rows of each room are those that DeepUWB publishes." if study.has_rooms else ""),
         (("Paper and DeepUWB", 3), (_measured(study), 3)),
         ("Part", *(["Measurements", "MAE, m", "σ, m"] * 2)),
         1,
