@@ -1,12 +1,27 @@
-"""The documentation points at things that are there."""
+"""The documentation points at things that are there, says what the code says, and its commands can be typed.
+
+`make docs` checks links, anchors and the rest of the markup.
+"""
 
 from __future__ import annotations
 
+import json
 import re
+import shlex
+from itertools import pairwise
 from pathlib import Path
+from xml.etree import ElementTree
 
+import diagram
+import generated
 import pytest
+import typer
+import yaml
 from conftest import REPOSITORY
+
+from uwb_mitigation import cli
+from uwb_mitigation.errors import RecordingError
+from uwb_mitigation.sources.opening import open_recording
 
 PAGES = sorted(
     path
@@ -43,3 +58,227 @@ def test_every_page_of_the_documentation_can_be_reached():
 def test_no_page_holds_a_placeholder():
     bare = re.compile(r"^[A-Z]{4,}$", re.MULTILINE)
     assert [page.name for page in PAGES if bare.search(page.read_text(encoding="utf-8"))] == []
+
+
+# What a page tells the reader to type.
+
+
+NODES = {
+    "driver": ("driver",),
+    "mitigator": ("mitigator",),
+    "pipeline": ("driver", "mitigator"),
+    "monitor": (),
+}
+BLOCK = re.compile(r"^(?:```(?:console|sh|bash)?\n(.*?)^```|((?:    .*\n|\n)+))", re.MULTILINE | re.DOTALL)
+# The name of a node begins lines of drawings, too.
+COMMAND = re.compile(
+    r"\s*(?:\.venv/bin/)?(?:(?:uwb-mitigation|make|ros2) |(?:driver|mitigator|pipeline) --ros)"
+)
+
+
+ALIKE = {f".venv/bin/{node}": ["ros2", "run", "uwb_mitigation", node] for node in NODES}
+
+
+def typed(page: Path) -> list[list[str]]:
+    """Command lines of a page's code blocks, as words; continued lines joined, comments left out."""
+    blocks = BLOCK.findall(page.read_text(encoding="utf-8"))
+    lines = "\n".join(fenced or indented for fenced, indented in blocks).replace("\\\n", " ").splitlines()
+    found = [shlex.split(line, comments=True) for line in lines if COMMAND.match(line)]
+    return [[*ALIKE.get(words[0], [words[0].removeprefix(".venv/bin/")]), *words[1:]] for words in found]
+
+
+def lines_of(*start: str) -> list:
+    return [
+        pytest.param(words[len(start) :], id=f"{page.stem}: {' '.join(words)}")
+        for page in PAGES
+        for words in typed(page)
+        if words[: len(start)] == list(start)
+    ]
+
+
+@pytest.mark.parametrize("words", lines_of("uwb-mitigation"))
+def test_a_command_that_is_typed_exists_with_its_options(words: list[str]):
+    command = typer.main.get_command(cli.app)
+    while hasattr(command, "commands"):
+        assert words[0] in command.commands
+        command, words = command.commands[words[0]], words[1:]
+    known = {name for parameter in command.params for name in (*parameter.opts, *parameter.secondary_opts)}
+    assert {word for word in words if word.startswith("-")} <= known | {"--help"}
+
+
+@pytest.mark.parametrize("words", lines_of("make"))
+def test_a_make_target_that_is_typed_exists(words: list[str]):
+    targets = re.findall(r"^([a-z-]+):", (REPOSITORY / "Makefile").read_text(), re.M)
+    assert [word for word in words if "=" not in word and word not in targets] == []
+
+
+def check_parameters(node: str, values: dict[str, object]) -> None:
+    tables = pytest.importorskip("uwb_mitigation.nodes.parameter_files", reason="run make setup").TABLES
+    rows = {row.name: row for name in NODES[node] for row in tables[name]}
+    for name, value in values.items():
+        if name not in ("use_sim_time", "qos_overrides"):
+            rows[name].check(value)
+
+
+def check_node(words: list[str]) -> None:
+    """Look at what follows `ros2 run uwb_mitigation`."""
+    node, *options = words
+    assert node in NODES
+    given = [option for flag, option in pairwise(options) if flag == "-p"]
+    check_parameters(node, {name: yaml.safe_load(value) for name, value in (g.split(":=") for g in given)})
+    remapped = [option.split(":=")[0] for flag, option in pairwise(options) if flag == "-r"]
+    assert set(remapped) <= {"__node", "uwb/range_raw", "uwb/range_corrected"}
+    values = [*given, *(option for flag, option in pairwise(options) if flag in ("-r", "--params-file"))]
+    assert set(options) <= {"--ros-args", "-p", "-r", "--params-file", *values}
+
+
+@pytest.mark.parametrize("words", lines_of("ros2", "run", "uwb_mitigation"))
+def test_a_node_that_is_run_takes_the_parameters_it_is_given(words: list[str]):
+    check_node(words)
+
+
+@pytest.mark.parametrize("words", lines_of("ros2", "param", "set"))
+def test_a_parameter_that_is_set_changes_live(words: list[str]):
+    tables = pytest.importorskip("uwb_mitigation.nodes.parameter_files", reason="run make setup").TABLES
+    node, name, value = words
+    (row,) = [row for row in tables[node.removeprefix("/")] if row.name == name]
+    assert row.live
+    row.check(yaml.safe_load(value))
+
+
+@pytest.mark.parametrize("words", lines_of("ros2", "launch", "uwb_mitigation"))
+def test_a_launch_file_takes_the_arguments_it_is_given(words: list[str]):
+    text = (REPOSITORY / "launch" / words[0]).read_text()
+    declared = set(re.findall(r'DeclareLaunchArgument\(\s*"(\w+)"', text))
+    if 'f"{name}_params"' in text:
+        declared |= {"driver_params", "mitigator_params"}
+    assert {word.split(":=")[0] for word in words[1:]} <= declared
+
+
+def test_parameter_files_on_pages_hold_known_parameters():
+    found = [
+        yaml.safe_load(block)
+        for page in PAGES
+        for block in re.findall(r"^```yaml\n(.*?)^```", page.read_text(), re.M | re.S)
+    ]
+    assert found
+    for file in found:
+        check_parameters("pipeline", file["/**"]["ros__parameters"])
+
+
+# Pages and the code that they are about.
+
+
+def code_of(page: str) -> list[str]:
+    return re.findall(r"^```python\n(.*?)^```", (REPOSITORY / "docs" / page).read_text(), re.M | re.S)
+
+
+def test_the_source_on_the_page_is_read_corrected_and_written_to_a_bag(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    module, use, _ = code_of("sources.md")
+    (example,) = re.findall(r'^\{"time_s".*\}$', (REPOSITORY / "docs" / "sources.md").read_text(), re.M)
+    row = json.loads(example)
+    row["cir"] = [[abs(900 - 6 * abs(tap - 8)) // (1 + abs(tap - 8)), 40] for tap in range(170)]
+    lost = {**row, "range": None}
+    (tmp_path / "json_lines.py").write_text(module)
+    (tmp_path / "anchor.jsonl").write_text("".join(json.dumps(r) + "\n" for r in (row, lost, row)))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    exec(compile(use, "docs/sources.md", "exec"), {})
+    assert capsys.readouterr().out.count("4.310 m -> ") == 2
+    with open_recording(tmp_path / "anchor.mcap") as recording:
+        records = list(recording)
+    assert [(r.measurement.tag_id, r.measurement.sequence, r.truth.range_m) for r in records] == [
+        (7, 0, pytest.approx(4.02)),
+        (7, 2, pytest.approx(4.02)),
+    ]
+    assert len(records[0].measurement.cir) == 170
+    (tmp_path / "anchor.jsonl").write_text(json.dumps(row) + "\nnonsense\n")
+    from json_lines import JsonLines
+
+    with pytest.raises(RecordingError, match="line 2"):
+        list(JsonLines(tmp_path / "anchor.jsonl"))
+
+
+def test_the_messages_page_holds_every_field():
+    page = generated.fill((REPOSITORY / "docs" / "messages.md").read_text())
+    for path in (REPOSITORY / "msg_defs" / "msg").glob("*.msg"):
+        assert f"## {path.stem}\n" in page
+        for kind, name in re.findall(r"^(\S+) +(\w+)(?= *(?:#|=|$))", path.read_text(), re.M):
+            if kind != "#":
+                assert f"| `{name}` |" in page, path.name
+
+
+def test_the_commands_page_holds_every_command_with_its_options():
+    page = generated.fill((REPOSITORY / "docs" / "commands.md").read_text())
+    waiting = [("uwb-mitigation", typer.main.get_command(cli.app))]
+    while waiting:
+        name, command = waiting.pop()
+        if hasattr(command, "commands"):
+            waiting += [(f"{name} {sub}", of) for sub, of in command.commands.items()]
+        elif not command.hidden:
+            section = page[page.index(f"# `{name}`") :]
+            for parameter in command.params:
+                assert parameter.param_type_name == "argument" or parameter.opts[-1] in section, name
+
+
+def test_a_page_that_asks_for_what_nothing_makes_is_refused():
+    with pytest.raises(KeyError):
+        generated.fill("<!-- generated: nothing -->")
+
+
+def imports() -> set[tuple[str, str]]:
+    """(part, part it imports), by other means than those of the picture."""
+    pairs = set()
+    for path in (REPOSITORY / "uwb_mitigation").rglob("*.py"):
+        text = path.read_text()
+        names = re.findall(r"^\s*(?:from|import) uwb_mitigation\.(\w+)", text, re.M)
+        for several in re.findall(r"^\s*from uwb_mitigation import (\([^)]*\)|.*)", text, re.M):
+            names += re.findall(r"\w+", several)
+        part = path.relative_to(REPOSITORY / "uwb_mitigation").parts[0].removesuffix(".py")
+        pairs |= {(part, name) for name in names}
+    parts = {"cli": "commands"}
+    pairs = {(parts.get(a, a), parts.get(b, b)) for a, b in pairs}
+    return {(a, b) for a, b in pairs if a != b and "errors" not in (a, b)}
+
+
+def closure(pairs: set[tuple[str, str]]) -> set[tuple[str, str]]:
+    while further := {(a, d) for a, b in pairs for c, d in pairs if b == c and a != d} - pairs:
+        pairs = pairs | further
+    return pairs
+
+
+def drawn() -> tuple[set[tuple[str, str]], dict[str, float]]:
+    """Arrows of the picture, both ways where they point both ways, and the height of every part."""
+    root = ElementTree.fromstring((REPOSITORY / "docs" / "architecture.svg").read_text())
+    arrows = set()
+    for line in root.iter("{http://www.w3.org/2000/svg}path"):
+        if a := line.get("data-from"):
+            arrows.add((a, line.get("data-to")))
+            if line.get("marker-start"):
+                arrows.add((line.get("data-to"), a))
+    texts = [text for text in root.iter("{http://www.w3.org/2000/svg}text") if text.get("font-weight")]
+    return arrows, {text.text: float(text.get("y")) for text in texts}
+
+
+def test_the_arrows_of_the_picture_are_the_imports_of_the_code():
+    arrows, heights = drawn()
+    real = imports()
+    hint = "run: python docs/diagram.py"
+    assert arrows <= real, hint
+    assert closure(arrows) == closure(real), hint
+    assert set(heights) == {part for pair in real for part in pair}, hint
+    assert diagram.svg() == diagram.PICTURE.read_text(), hint
+
+
+def test_no_part_imports_what_lies_above_it():
+    arrows, heights = drawn()
+    assert [(a, b) for a, b in arrows if heights[a] > heights[b]] == []
+    level = {tuple(sorted(pair)) for pair in arrows if heights[pair[0]] == heights[pair[1]]}
+    assert level == {("bag", "sources"), ("firmware_export", "training")}
+
+
+def test_the_architecture_page_tells_of_every_part():
+    page = (REPOSITORY / "docs" / "architecture.md").read_text()
+    assert [part for part in diagram.PARTS if not re.search(rf"`{part}(/|\.py)`", page)] == []

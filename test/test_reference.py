@@ -1,0 +1,148 @@
+"""The reference pages beside running nodes: topics, services, diagnostics, and the node that a page tells to write."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
+
+from conftest import REPOSITORY
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from ros_harness import Ros, domain
+from uwb_mitigation_msgs.msg import RangeCorrected
+
+from uwb_mitigation.model.shipped import default_model_path
+from uwb_mitigation.nodes import topics
+
+pytestmark = pytest.mark.ros
+
+DOCS = REPOSITORY / "docs"
+# What the entries of the table of topics mean for the nodes started here.
+ENTRIES = {
+    "`driver`": {"driver", "board"},
+    "`driver` on replay": {"driver"},
+    "`driver` with `publish_clock:=true`": {"driver"},
+    "`driver` with `source:=serial`": {"board"},
+    "`mitigator`": {"mitigator"},
+}
+NODES = ("driver", "board", "mitigator")
+EVERY_NODE = ("/rosout", "/parameter_events", "/transition_event")
+EVERY_SERVICE = re.compile(
+    r".*/(change_state|get_state|get_available_states|get_available_transitions|get_transition_graph|"
+    r"describe_parameters|get_parameters|get_parameter_types|list_parameters|set_parameters|"
+    r"set_parameters_atomically|get_type_description)"
+)
+
+
+def rows(page: str, heading: str) -> list[list[str]]:
+    """The cells of the tables below a heading."""
+    text = (DOCS / page).read_text()
+    section = text[text.index(f"{heading}\n") + len(heading) :].partition("\n#")[0]
+    lines = [line for line in section.splitlines() if line.startswith("| `")]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+
+
+@pytest.fixture(scope="module")
+def ros(tmp_path_factory: pytest.TempPathFactory):
+    """A replay, a board in mode `both`, and a mitigator for the two."""
+    folder = tmp_path_factory.mktemp("reference")
+    port = folder / "port"
+    with domain(folder) as ros:
+        code = "from uwb_mitigation.cli import main; main()"
+        model = str(default_model_path())
+        ros.run([sys.executable, "-c", code, "emulate-board", "--link", str(port), "--model", model])
+        ros.start("mitigator")
+        ros.start("driver", "publish_clock:=true", "start_delay:=0.0")
+        serial = ("source:=serial", f"port:={port}", "mode:=both")
+        ros.start("driver", *serial, arguments=("-r", "__node:=board"))
+        ros.spin_until(lambda: set(NODES) <= set(ros.node.get_node_names()))
+        yield ros
+
+
+@pytest.mark.parametrize(
+    ("column", "of_node"),
+    [(2, "get_publisher_names_and_types_by_node"), (3, "get_subscriber_names_and_types_by_node")],
+)
+def test_the_nodes_have_the_topics_of_the_page(ros: Ros, column: int, of_node: str):
+    documented = {
+        (node, row[0].strip("`"), row[1].strip("`"))
+        for row in rows("topics.md", "# Topics")
+        for entry in re.split("[;,] ", row[column])
+        if entry
+        for node in ENTRIES[entry]
+    }
+
+    def found() -> set[tuple[str, str, str]]:
+        return {
+            (node, topic, kind)
+            for node in NODES
+            for topic, kinds in getattr(ros.node, of_node)(node, "/")
+            for kind in kinds
+            if not topic.endswith(EVERY_NODE)
+        }
+
+    ros.spin_until(lambda: documented <= found())
+    assert found() == documented
+
+
+def test_every_topic_has_the_quality_of_service_of_the_page(ros: Ros):
+    for topic, *_ in rows("topics.md", "# Topics"):
+        ends = ros.node.get_publishers_info_by_topic(topic.strip("`"))
+        assert ends
+        for end in ends:
+            if end.node_name in NODES:
+                assert end.qos_profile.reliability == ReliabilityPolicy.RELIABLE
+                assert end.qos_profile.durability == DurabilityPolicy.VOLATILE
+    text = (DOCS / "topics.md").read_text()
+    assert f"| the three range topics | reliable | volatile | keep last {topics.DEPTH} |" in text
+
+
+def test_the_nodes_have_no_services_but_those_of_every_node(ros: Ros):
+    for node in NODES:
+        services = [name for name, _ in ros.node.get_service_names_and_types_by_node(node, "/")]
+        assert services
+        assert [name for name in services if not EVERY_SERVICE.fullmatch(name)] == []
+
+
+@pytest.mark.parametrize(
+    ("node", "heading"),
+    [
+        ("mitigator", "## `mitigator`"),
+        ("driver", "## `driver`, of a recording or the simulator"),
+        ("board", "## `driver`, of a board"),
+    ],
+)
+def test_the_diagnostics_have_the_keys_of_the_page(ros: Ros, node: str, heading: str):
+    keys = {key for row in rows("diagnostics.md", heading) for key in re.findall("`([^`]+)`", row[0])}
+    open_ended = tuple(key.partition(": ")[0] + ": " for key in keys if ": " in key)
+    expected = {key for key in keys if ": " not in key}
+    arrays = ros.collect(DiagnosticArray, topics.DIAGNOSTICS, 100)
+    seen: set[str] = set()
+
+    def look() -> bool:
+        for array in arrays:
+            for status in array.status:
+                if status.name == f"{node}: ranges":
+                    seen.update(entry.key for entry in status.values)
+        arrays.clear()
+        return expected <= seen
+
+    ros.spin_until(look)
+    assert {key for key in seen if not key.startswith(open_ended or ("none: ",))} == expected
+
+
+def test_the_node_on_the_page_about_sources_is_heard_by_the_mitigator(tmp_path: Path):
+    code = re.findall(r"^```python\n(.*?)^```", (DOCS / "sources.md").read_text(), re.M | re.S)[-1]
+    with domain(tmp_path) as ros:
+        received = ros.collect(RangeCorrected, "/uwb/range_corrected")
+        ros.start("mitigator")
+        ros.run([sys.executable, "-c", code])
+        ros.spin_until(lambda: bool(received))
+    message = received[0]
+    assert (message.tag_id, message.anchor_id, message.status) == (7, 1, RangeCorrected.NO_CIR)
+    assert message.header.frame_id == "my_antenna"
