@@ -407,8 +407,8 @@ NDARRAY = b"cnumpy.core.multiarray\n_reconstruct\n"
         (b"\x8b" + struct.pack("<i", 1 << 30), "opcode 0x8b"),
         (b"\x8a\xff" + bytes(255) + b".", "an integer of 255 bytes"),
         (b"(" * 1000 + b"t" * 1000 + b".", "no DataFrame"),
-        (b"]" * 200_000 + b"a" * 199_999 + b".", "no DataFrame"),
-        (b")" + b"\x85" * 200_000 + b".", "no DataFrame"),
+        (b"]" * 60_000 + b"a" * 59_999 + b".", "no DataFrame"),
+        (b")" + b"\x85" * 60_000 + b".", "no DataFrame"),
         (b")" + b"\x94\x86" * 60 + b".", "empty stack"),
         (b")" + b"2\x86" * 60 + b".", "opcode 0x32"),
         (b"})Ns.", "key of a dictionary is a tuple"),
@@ -476,7 +476,7 @@ def test_a_pickle_of_protocol_0_is_refused_with_what_is_read(tmp_path: Path) -> 
 @pytest.mark.parametrize("protocol", [2, 4, 5])
 def test_a_pickle_cut_anywhere_is_refused(tmp_path: Path, protocol: int) -> None:
     content = written(tmp_path, frame(2), protocol).read_bytes()
-    for size in range(0, len(content) - 1, 7):
+    for size in range(0, len(content) - 1, 17):
         assert_refused(tmp_path, content[:size], "dataset.pkl")
 
 
@@ -488,7 +488,7 @@ def test_what_is_no_file_is_refused(tmp_path: Path, name: str) -> None:
         read_deepuwb(tmp_path / name)
 
 
-FUZZ = settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+FUZZ = settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 @FUZZ
@@ -544,7 +544,7 @@ def assert_reads_or_refuses(tmp_path: Path, content: bytes) -> None:
         lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner) | st.tuples(inner, inner),
     )
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 def test_plain_values_are_interpreted_as_pickle_reads_them(protocol: int, value: object) -> None:
     assert pickle_machine.interpret(pickle.dumps(value, protocol=protocol), (), "here") == value
 
