@@ -5,15 +5,17 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import model_material
 import numpy as np
+from numpy.typing import NDArray
 
 from uwb_mitigation.firmware_export import synthetic
 from uwb_mitigation.firmware_export.export import golden_windows, write_header
 from uwb_mitigation.firmware_export.header import Golden, Identity
+from uwb_mitigation.firmware_export.measurement import Subject, subject_of
 from uwb_mitigation.firmware_export.packing import pack
 from uwb_mitigation.measurement import Cir, Encoding, RangeMeasurement
 from uwb_mitigation.model import graph
@@ -22,7 +24,7 @@ from uwb_mitigation.model.familiarity import Band, Familiarity
 from uwb_mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.model.prior import LinePrior
 from uwb_mitigation.model.weights import Int8Weights
-from uwb_mitigation.preprocessing import Scaling
+from uwb_mitigation.preprocessing import WINDOW_SIZES, Preprocessing, Scaling
 from uwb_mitigation.sources.decaranging import open_decaranging
 
 
@@ -105,7 +107,51 @@ def random_measurement(random: np.random.Generator) -> RangeMeasurement:
 
 @functools.cache
 def real_measurements(apartment: Path) -> tuple[RangeMeasurement, ...]:
-    """A thousand measurements spread over the logs; read once, because unpacking takes seconds."""
-    with open_decaranging(apartment) as source:
-        measurements = [record.measurement for record in itertools.islice(source, 0, None, 4)]
-    return tuple(measurements[:: max(1, len(measurements) // 1000)][:1000])
+    """A thousand measurements, the first of each log; read once a process."""
+    measured: list[RangeMeasurement] = []
+    for log in sorted((apartment / "logs").iterdir()):
+        with open_decaranging(log) as source:
+            measured += [record.measurement for record in itertools.islice(source, 40)]
+    return tuple(measured)
+
+
+def real_windows(apartment: Path, samples: int) -> NDArray[np.float32]:
+    """What a network of this length reads of the real measurements, float32 (n, samples)."""
+    preprocessing, measured = Preprocessing(samples, Scaling.PREAMBLE), real_measurements(apartment)
+    windows = np.zeros((len(measured), samples), np.float32)
+    usable = [preprocessing.apply(m.cir, window) is None for m, window in zip(measured, windows, strict=True)]
+    return windows[usable]
+
+
+@dataclass(frozen=True)
+class Exported:
+    """A network of one shape, with the folder that it was exported to."""
+
+    weights: Int8Weights
+    subject: Subject
+    folder: Path
+    inputs: int
+    """Enough windows for this shape: the usual first kernel and the MLP get the most."""
+
+    def windows(self) -> NDArray[np.float32]:
+        """Windows that press on every rounding; zero, saturating and random ones."""
+        samples = self.weights.architecture.samples
+        return synthetic.pressing_windows(samples, self.weights.activation_scale["input"], self.inputs)
+
+
+SHAPES = [*itertools.product((3, 5), WINDOW_SIZES), (0, 157)]
+"""First kernel and length of every network that must run; 0 is the MLP."""
+
+
+def shape_name(shape: tuple[int, int]) -> str:
+    return f"k0={shape[0]}, K={shape[1]}" if shape[0] else "MLP"
+
+
+def exported(shape: tuple[int, int], folder: Path) -> Exported:
+    first_kernel, samples = shape
+    weights = (
+        synthetic.random_remnet(samples, first_kernel) if first_kernel else synthetic.random_mlp(samples)
+    )
+    write_model(folder, weights)
+    subject = subject_of(weights, identity(), graph.int8_model(weights))
+    return Exported(weights, subject, folder, 1000 if first_kernel == 5 else 5000)

@@ -40,7 +40,7 @@ def test_export_c_of_an_absent_model_names_it(app: typer.Typer, tmp_path: Path):
 
 @pytest.mark.skipif(bool(toolchain.missing_tools()), reason=toolchain.APT)
 def test_bench_firmware_reports_the_promised_keys(app: typer.Typer, tmp_path: Path):
-    bundle = firmware_models.exact_bundle(tmp_path)
+    bundle = firmware_models.exact_bundle(tmp_path, 8)
     result = tmp_path / "result.json"
     arguments = ["bench", "firmware", "--model", str(bundle.path), "--inputs", "20", "--json", str(result)]
     done = CliRunner().invoke(app, arguments)

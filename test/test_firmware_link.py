@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from uwb_mitigation.firmware_export.export import export_bundle
-from uwb_mitigation.firmware_export.host import WARNINGS, firmware_folder, run
+from uwb_mitigation.firmware_export.host import compile_objects, firmware_folder, link, run
 from uwb_mitigation.link import messages
 from uwb_mitigation.link.board import Board, Identity
 from uwb_mitigation.link.framing import Frame, FrameDecoder, FrameEncoder, encode_frame
@@ -25,6 +25,7 @@ from uwb_mitigation.model.bundle import Bundle
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc")
 
 VECTORS = Path(__file__).parent / "data" / "link_vectors.txt"
+SANITIZED = ("-O1", "-fsanitize=undefined", "-fno-sanitize-recover=all")
 KINDS = ("frames", "bad_cobs", "bad_length", "bad_crc", "oversize", "foreign_versions")
 
 
@@ -66,13 +67,8 @@ def bundle(tmp_path_factory: pytest.TempPathFactory) -> Bundle:
 def library(bundle: Bundle, tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
     folder = tmp_path_factory.mktemp("board")
     export_bundle(bundle, folder)
-    source = firmware_folder() / "src"
     program = firmware_folder() / "test" / "host_board.c"
-    flags = ("-std=c99", "-O1", "-fPIC", "-fsanitize=undefined", "-fno-sanitize-recover=all", *WARNINGS)
-    files = [str(program), *map(str, sorted(source.glob("*.c")))]
-    output = folder / "board.so"
-    run(["cc", *flags, f"-I{source}", f"-I{folder}", "-shared", *files, "-lm", "-o", str(output)])
-    library = ctypes.CDLL(str(output))
+    library = ctypes.CDLL(str(link(program, folder, folder / "board.so", SANITIZED, shared=True)))
     size, time, pointer = ctypes.c_size_t, ctypes.c_uint64, ctypes.c_void_p
     library.host_board_new.restype = pointer
     library.host_board_new.argtypes = (ctypes.c_int, ctypes.c_int, size)
@@ -260,17 +256,11 @@ def test_damage_on_the_radios_side_is_told_in_a_log(library: ctypes.CDLL):
 @pytest.mark.parametrize("target", ["fuzz_link", "fuzz_correct"])
 def test_fuzzing_for_a_moment_finds_nothing(target: str, bundle: Bundle, tmp_path: Path):
     export_bundle(bundle, tmp_path)
-    source = firmware_folder() / "src"
-    program = tmp_path / target
-    flags = (
-        "-g",
-        "-O1",
-        "-fsanitize=fuzzer,address,undefined",
-        "-fno-sanitize-recover=all",
-        "-DUWB_LIBFUZZER",
-    )
-    files = [str(firmware_folder() / "test" / f"{target}.c"), *map(str, sorted(source.glob("*.c")))]
-    run(["clang", *flags, f"-I{source}", f"-I{tmp_path}", *files, "-lm", "-o", str(program)])
+    source, program = firmware_folder() / "src", tmp_path / target
+    flags = ("-g", "-O1", "-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=all", f"-I{source}")
+    objects = compile_objects("clang", flags, tuple(sorted(source.glob("*.c"))))
+    main = str(firmware_folder() / "test" / f"{target}.c")
+    run(["clang", *flags, "-DUWB_LIBFUZZER", f"-I{tmp_path}", main, *objects, "-lm", "-o", str(program)])
     options = ("-runs=1500", "-seed=1", "-max_len=4096", "-len_control=0")
     done = subprocess.run([program, *options], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from uwb_mitigation.firmware_export.export import export_bundle
-from uwb_mitigation.firmware_export.host import compile_objects, firmware_folder, run
+from uwb_mitigation.firmware_export.host import firmware_folder, library_objects, run
 from uwb_mitigation.link import messages
 from uwb_mitigation.link.framing import FrameDecoder, FrameEncoder
 from uwb_mitigation.link.messages import Correction, Hello
@@ -32,7 +32,6 @@ def test_the_sketchs_model_is_the_shipped_one(tmp_path: Path):
 def test_the_sketch_corrects_what_the_radio_sends_in_writes_that_are_safe_on_usb(tmp_path: Path):
     firmware = firmware_folder()
     stub, library = firmware / "test" / "arduino_stub", firmware / "src"
-    objects = compile_objects("cc", ("-std=c99", "-O1", f"-I{library}"), tuple(sorted(library.glob("*.c"))))
     export_bundle(load_bundle(default_model_path()), tmp_path)
     program = tmp_path / "sketch"
     flags = ("-std=gnu++14", "-O1", "-Wall", "-Wextra", "-Werror", "-include", str(stub / "Arduino.h"))
@@ -40,7 +39,7 @@ def test_the_sketch_corrects_what_the_radio_sends_in_writes_that_are_safe_on_usb
     sketch = tmp_path / "UwbMitigation.cpp"
     sketch.write_text((SKETCH / "UwbMitigation.ino").read_text())
     includes = (f"-I{stub}", f"-I{library}", f"-I{tmp_path}")
-    files = (str(sketch), str(stub / "main.cpp"), *objects)
+    files = (str(sketch), str(stub / "main.cpp"), *library_objects())
     run(["c++", *flags, *includes, *files, "-lm", "-o", str(program)])
 
     encoder = FrameEncoder()

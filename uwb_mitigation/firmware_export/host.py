@@ -24,6 +24,7 @@ from uwb_mitigation.preprocessing import CirFault
 MODEL_HEADER = "uwb_model.h"
 
 WARNINGS = ("-Wall", "-Wextra", "-Wconversion", "-Wpedantic", "-Werror")
+_OPTIONS = ("-std=c99", "-O3", "-fPIC", *WARNINGS)
 
 _SHIM = (
     '#include "uwb_model.h"\n'
@@ -155,17 +156,40 @@ class HostFirmware:
 
 def build_shared_library(export: Path, build: Path, flags: Sequence[str] = ()) -> Path:
     """Compile the library and the model in `export` to a shared library in `build`."""
+    shim = build / "exported_model.c"
+    shim.write_text(_SHIM, encoding="utf-8")
+    return link(shim, export, build / "libuwb_mitigation.so", flags, shared=True)
+
+
+def link(
+    program: Path, export: Path, output: Path, flags: Sequence[str] = (), *, shared: bool = False
+) -> Path:
+    """Link one C file, which includes the model in `export`, with the library, for this computer."""
+    compiler = c_compiler()
+    objects = library_objects(flags)
+    options = (*_OPTIONS, *flags, f"-I{firmware_folder() / 'src'}", f"-I{export}")
+    kind = ("-shared",) if shared else ()
+    run([compiler, *options, *kind, str(program), *objects, "-o", str(output), "-lm"])
+    return output
+
+
+def library_objects(flags: Sequence[str] = ()) -> tuple[str, ...]:
+    """The object files of the portable library for this computer; compiled once a process."""
+    sources = firmware_folder() / "src"
+    options = (*_OPTIONS, *flags, f"-I{sources}")
+    return compile_objects(c_compiler(), options, tuple(sorted(sources.glob("*.c"))))
+
+
+def c_compiler() -> str:
+    """The C compiler of this computer.
+
+    Raises:
+        MissingDependencyError: there is none.
+    """
     compiler = os.environ.get("CC") or shutil.which("cc") or shutil.which("gcc")
     if compiler is None:
         raise MissingDependencyError("there is no C compiler", valid="apt install gcc, or set CC")
-    sources = firmware_folder() / "src"
-    options = ("-std=c99", "-O2", "-fPIC", *WARNINGS, *flags, f"-I{sources}")
-    objects = compile_objects(compiler, options, tuple(sorted(sources.glob("*.c"))))
-    shim = build / "exported_model.c"
-    shim.write_text(_SHIM, encoding="utf-8")
-    output = build / "libuwb_mitigation.so"
-    run([compiler, *options, f"-I{export}", "-shared", str(shim), *objects, "-o", str(output), "-lm"])
-    return output
+    return compiler
 
 
 @functools.cache

@@ -18,6 +18,9 @@ from uwb_mitigation.model.architecture import HEAD, Convolution, Mlp, Remnet
 from uwb_mitigation.model.bundle import Bundle
 from uwb_mitigation.model.weights import Int8Weights, activation_tensors, layer_inputs, sum_operands
 
+_BATCH = 256
+"""Inputs computed at once: their tensors stay in the processor's cache."""
+
 
 class IntegerNetwork:
     """Runs an int8 network in integer arithmetic; slow and plain."""
@@ -42,7 +45,11 @@ class IntegerNetwork:
 
     def predict_m(self, inputs: NDArray[np.float32]) -> NDArray[np.float32]:
         """The network's outputs, float32 (n,), for inputs of shape (n, K), m."""
-        return self.head(self.tensors(inputs)[self._reads[HEAD]])
+        outputs = [
+            self.head(self.tensors(inputs[start : start + _BATCH])[self._reads[HEAD]])
+            for start in range(0, max(len(inputs), 1), _BATCH)
+        ]
+        return np.concatenate(outputs)
 
     def tensors(self, inputs: NDArray[np.float32]) -> dict[str, NDArray[np.uint8]]:
         """Every activation for inputs of shape (n, K), {tensor: uint8 (n, channels, length)}; of an MLP,
