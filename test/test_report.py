@@ -319,6 +319,7 @@ def test_what_needs_no_network_stands_below_the_networks():
     rows = {row[0].text: row[7] for row in table.rows}
     assert rows["L1 line in received and first-path power"].value == 0.125
     assert rows["Median error"].value == 0.15
+    assert rows["No correction"].value == 0.2
     assert rows["Median error in LOS"].kind == "missing"
 
 

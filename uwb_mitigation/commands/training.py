@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from uwb_mitigation.commands import console
@@ -347,20 +348,32 @@ def _show_protocol(result: Protocol) -> None:
         groups[model.network, model.samples].append(model)
     table = Table(
         title=f"{result.data}, split {result.split}: {result.train} to train on, {result.test} to test, "
-        f"{result.options.epochs} epochs; MAE in m, mean ± std over seeds"
+        f"{result.options.epochs} epochs; MAE in m: mean over seeds, and its standard deviation in the last form",
+        # Without lines between columns it fits a terminal of 80.
+        box=SIMPLE_HEAD,
+        padding=(0, 0, 0, 1),
     )
-    for column in ("network", "K", "seeds", "parameters", "raw", "float", "optimised", "int8", "int8 bytes"):
-        table.add_column(column, justify="left" if column == "network" else "right")
-    for (network, samples), models in groups.items():
-        row = [network, f"{samples}", f"{len(models)}", f"{models[0].parameters}", f"{models[0].mae_raw:.4f}"]
-        forms = ("mae_float", "mae_optimised", "mae_int8")
-        row += [_mean([getattr(model, form) for model in models], ".4f") for form in forms]
-        table.add_row(*row, _mean([model.bytes_int8 for model in models], ".0f"))
+    for column in ("network", "K", "seeds", "params", "float", "optimised", "int8", "std", "bytes"):
+        table.add_column(column, justify="left" if column == "network" else "right", no_wrap=True)
+    if result.models:
+        table.add_row("none", "", "", "", f"{result.models[0].mae_raw:.4f}")
     for baseline in result.baselines:
-        left = None if baseline.errors is None else baseline.errors["all"]
-        before, after = (None, None) if left is None else (left.mae_raw, left.mae)
-        row = [_BASELINES.get(baseline.name, baseline.name), "-", "-", "-", _mean([before], ".4f")]
-        table.add_row(*row, _mean([after], ".4f"), "-", "-", "-")
+        left = None if baseline.errors is None else baseline.errors["all"].mae
+        table.add_row(_BASELINES.get(baseline.name, baseline.name), "", "", "", _mean([left], ".4f"))
+    for (network, samples), models in groups.items():
+        forms = [
+            [getattr(model, form) for model in models] for form in ("mae_float", "mae_optimised", "mae_int8")
+        ]
+        last = [value for value in (forms[2] if any(forms[2]) else forms[0]) if value is not None]
+        table.add_row(
+            network,
+            f"{samples}",
+            f"{len(models)}",
+            f"{models[0].parameters}",
+            *(_mean(values, ".4f") for values in forms),
+            f"{statistics.stdev(last):.4f}" if len(last) > 1 else "-",
+            _mean([model.bytes_int8 for model in models], ".0f"),
+        )
     console.out.print(table)
     for baseline in result.baselines:
         if baseline.reason:
@@ -372,12 +385,8 @@ _BASELINES = {"los_median": "LOS median", "overall_median": "median", "line": "L
 
 
 def _mean(values: list[float | None], form: str) -> str:
-    """The mean of those that there are; over several, with their standard deviation."""
     known = [value for value in values if value is not None]
-    if not known:
-        return "-"
-    mean = format(statistics.fmean(known), form)
-    return f"{mean} ± {statistics.stdev(known):{form}}" if len(set(known)) > 1 else mean
+    return format(statistics.fmean(known), form) if known else "-"
 
 
 def _show_front(best: list[Trial], tried: int) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 from uwb_mitigation.evaluation import paper
-from uwb_mitigation.evaluation.results import FORMS, Baseline, FirmwareRow, Spread, Trained, Trainings
+from uwb_mitigation.evaluation.results import FORMS, Baseline, FirmwareRow, Left, Spread, Trained, Trainings
 from uwb_mitigation.model.architecture import Mlp, Remnet
 from uwb_mitigation.preprocessing import WINDOW_SIZES
 
@@ -20,6 +20,7 @@ _NAMES = {
     "mlp": "MLP",
 }
 _BASELINES = {
+    "raw": "No correction",
     "los_median": "Median error in LOS",
     "overall_median": "Median error",
     "line": "L1 line in received and first-path power",
@@ -115,6 +116,8 @@ def accuracy(
             )
         )
     known = {baseline.name: baseline for baseline in trainings.baselines} if trainings else {}
+    if trainings is not None:
+        known["raw"] = Baseline("raw", Left(trainings.test, trainings.mae_raw, None), "")
     names = dict.fromkeys([*_BASELINES, *known])
     rows += [_baseline_row(_BASELINES.get(name, name), known.get(name)) for name in names]
     reasons = [f" {_BASELINES.get(name, name)}: {b.reason}." for name, b in known.items() if b.reason]
