@@ -29,6 +29,9 @@ myst_heading_anchors = 4
 html_theme = "furo"
 html_title = f"uwb_mitigation {release}"
 html_copy_source = False
+html_show_copyright = False
+html_static_path = ["style"]
+html_css_files = ["tables.css"]
 html_extra_path = ["site"]  # sends the reader of the top folder to docs/index.html
 
 # External links, for `make docs-links`.

@@ -14,6 +14,7 @@ from uwb_mitigation import cli
 MESSAGES = Path(__file__).resolve().parent.parent / "msg_defs" / "msg"
 
 _MARK = re.compile(r"^<!-- generated: (\w+) -->$", re.MULTILINE)
+_LISTS = re.compile(r"^\*\*Commands\*\*:\n\n(?:\* .*\n)+\n*", re.MULTILINE)
 _FIELD = re.compile(r"(?P<type>\S+) +(?P<name>\w+)(?: *= *(?P<value>\S+))?(?: +# (?P<meaning>.*))?")
 
 
@@ -52,8 +53,9 @@ def commands() -> str:
     """Every command with its options, as `--help` has them."""
     command = typer.main.get_command(cli.app)
     text = get_docs_for_click(obj=command, ctx=typer.Context(command), name="uwb-mitigation")
-    # The page has a title of its own.
-    return text.partition("\n")[2]
+    # Sections follow for all that the lists name, in words that were not cut short.
+    sections = _LISTS.sub("", text)
+    return sections[sections.index("\n## ") :]
 
 
 PARTS = {"messages": messages, "commands": commands}
