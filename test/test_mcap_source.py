@@ -242,3 +242,18 @@ def test_what_no_source_reads_is_refused_with_what_is_accepted(tmp_path: Path) -
     for path in (tmp_path / "notes.txt", tmp_path / "absent"):
         with pytest.raises(RecordingError, match=r"MCAP bag.*DecaRanging"):
             open_recording(path)
+
+
+def test_a_folder_is_no_bag_for_a_folder_in_it_that_has_a_bags_name(tmp_path: Path) -> None:
+    (tmp_path / "empty.mcap").mkdir()
+    with pytest.raises(RecordingError, match="holds no logs"):
+        open_recording(tmp_path)
+    (tmp_path / "7.log").write_text("File:7.log, created by DecaRanging\n")
+    assert open_recording(tmp_path).name.startswith("DecaRanging")
+
+
+def test_a_bags_folder_may_hold_a_folder_with_a_bags_name(tmp_path: Path) -> None:
+    write_bag(tmp_path / "bag.mcap")
+    (tmp_path / "metadata.yaml").unlink()
+    (tmp_path / "another.mcap").mkdir()
+    assert len(numbers(open_recording(tmp_path))) == 5

@@ -138,7 +138,8 @@ def bag_files(path: Path) -> list[Path]:
         return [path]
     names = described_files(path)
     if names is None:
-        names = sorted((entry.name for entry in path.glob("*.mcap")), key=_natural)
+        found = (entry.name for entry in path.glob("*.mcap") if entry.is_file())
+        names = sorted(found, key=_natural)
         if not names and any(path.glob("*.db3")):
             raise _foreign_storage(path, "sqlite3")
     # A listed name is taken within the folder only, whatever path stands before it.

@@ -51,7 +51,8 @@ def open_recording(path: Path, *, cir: Literal["final", "poll"] = "final") -> So
 
 def _is_bag(path: Path) -> bool:
     if path.is_dir():
-        names = [entry.name for entry in path.iterdir()]
+        # A folder of such a name may be a bag itself, but does not make one of the folder it lies in.
+        names = [entry.name for entry in path.iterdir() if entry.is_file()]
         return any(name == "metadata.yaml" or name.endswith((".mcap", ".db3")) for name in names)
     if path.suffix in (".mcap", ".db3"):
         return True
