@@ -6,10 +6,11 @@ import json
 from pathlib import Path
 
 import pytest
+from bag_material import Foreign
 from typer.testing import CliRunner
 
 from uwb_mitigation.cli import app
-from uwb_mitigation.errors import ParameterError, UwbMitigationError
+from uwb_mitigation.errors import ParameterError, RecordingError, UwbMitigationError
 
 
 def run(*arguments: str) -> str:
@@ -60,3 +61,12 @@ def test_an_option_out_of_its_range_is_refused(arguments):
 def test_a_recording_that_is_not_there_is_refused(tmp_path: Path):
     with pytest.raises(UwbMitigationError, match="absent"):
         run("emulate-board", str(tmp_path / "absent.mcap"), "--duration", "1")
+
+
+def test_an_empty_recording_is_told_instead_of_a_port(tmp_path: Path):
+    bag = Foreign(tmp_path / "empty.mcap").ours().finish()
+    result = CliRunner().invoke(app, ["emulate-board", str(bag), "--duration", "1"])
+
+    assert isinstance(result.exception, RecordingError)
+    assert "no measurements" in str(result.exception)
+    assert "/dev/" not in result.output

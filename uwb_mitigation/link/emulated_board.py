@@ -5,6 +5,7 @@ Linux and macOS only, as pseudo-terminals are.
 
 from __future__ import annotations
 
+import itertools
 import os
 import select
 import threading
@@ -83,6 +84,7 @@ class EmulatedBoard:
 
     Raises:
         ParameterError: the rate is not finite and positive, or `link` names what is no symbolic link.
+        RecordingError: the source holds no measurement that can be read.
 
     Attributes:
         port: path of the port for the host to open; empty while unplugged.
@@ -110,7 +112,9 @@ class EmulatedBoard:
         self.sent_measurements = 0
         self._measuring = True
         self._source = source
-        self._records = _endless(source)
+        # Before there is a port: what holds nothing is told to who asks for the board.
+        records = _endless(source)
+        self._records = itertools.chain([] if source is None else [next(records)], records)
         self._period_s = 1 / rate_hz
         self._identity = identity
         self._corrector = corrector
