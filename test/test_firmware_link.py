@@ -37,9 +37,9 @@ class BoardInC:
         self._board = library.host_board_new(int(mode), int(with_model), queue)
         self.sent = self._output()
 
-    def receive(self, data: bytes, now_us: int) -> bytes:
+    def receive(self, data: bytes, now_us: int, *, read: bool = True) -> bytes:
         self._library.host_board_receive(self._board, data, len(data), now_us)
-        return self._output()
+        return self._output() if read else b""
 
     def measure(self, data: bytes, now_us: int, *, read: bool = True) -> bytes:
         self._library.host_board_measure(self._board, data, len(data), now_us)
@@ -52,10 +52,13 @@ class BoardInC:
     def close(self) -> None:
         self._library.host_board_free(self._board)
 
-    def _output(self) -> bytes:
-        out = ctypes.create_string_buffer(16384)
-        count = self._library.host_board_output(self._board, out, 16384)
+    def read(self, limit: int) -> bytes:
+        out = ctypes.create_string_buffer(limit)
+        count = self._library.host_board_output(self._board, out, limit)
         return out.raw[:count]
+
+    def _output(self) -> bytes:
+        return self.read(1 << 16)
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +82,7 @@ def library(bundle: Bundle, tmp_path_factory: pytest.TempPathFactory) -> ctypes.
     library.host_board_output.argtypes = (pointer, pointer, size)
     library.host_board_output.restype = size
     library.host_decode.argtypes = (ctypes.c_char_p, size, pointer, pointer, pointer)
-    library.host_encode.argtypes = (ctypes.c_char_p, ctypes.c_char_p, size, pointer, size)
+    library.host_encode.argtypes = (ctypes.c_char_p, ctypes.c_char_p, size, pointer)
     library.host_encode.restype = size
     return library
 
@@ -98,7 +101,7 @@ def decode(library: ctypes.CDLL, wire: bytes) -> tuple[Frame | None, dict[str, i
 def encode(library: ctypes.CDLL, frame: Frame) -> bytes:
     header = HEADER.packing().pack(1, *frame[:4])
     wire = ctypes.create_string_buffer(8192)
-    count = library.host_encode(header, frame.payload, len(frame.payload), wire, 8192)
+    count = library.host_encode(header, frame.payload, len(frame.payload), wire)
     return wire.raw[:count]
 
 
@@ -239,6 +242,40 @@ def test_a_host_that_does_not_read_costs_whole_measurements_and_leaves_room_for_
     assert status.measurements == 200
     assert status.measurements_lost == 200 - len(ranges) > 0
     assert [frame.sequence for frame in frames] == list(range(1, len(frames) + 1))
+    c.close()
+
+
+def test_a_clock_request_is_answered_before_all_that_waits(library: ctypes.CDLL):
+    c = BoardInC(library, Mode.HOST)
+    measured = firmware_models.random_measurement(np.random.default_rng(6))
+    wire = FrameEncoder().encode(*messages.encode(measured))
+    for _ in range(3):
+        c.measure(wire, 5, read=False)
+    sent = c.read(100)
+    c.receive(FrameEncoder().encode(*messages.encode(TimeSync())), 70, read=False)
+    c.measure(b"", 900, read=False)
+    frames = FrameDecoder().feed(sent + c.read(1 << 16))
+
+    # Of the first frame a part had left already.
+    kinds = [MessageType.RANGE_CIR, MessageType.TIME_SYNC_REPLY, MessageType.RANGE_CIR, MessageType.RANGE_CIR]
+    assert [frame.type for frame in frames] == kinds
+    assert [frame.sequence for frame in frames] == [1, 2, 3, 4]
+    reply = messages.decode(frames[1].type, frames[1].payload)
+    assert isinstance(reply, messages.TimeSyncReply)
+    assert (reply.received_us, frames[1].time_us) == (70, 900)
+    c.close()
+
+
+def test_an_answer_that_does_not_fit_is_counted(library: ctypes.CDLL):
+    c = BoardInC(library, Mode.HOST, queue=6000)
+    host = FrameEncoder()
+    measured = firmware_models.random_measurement(np.random.default_rng(3))
+    for _ in range(200):
+        c.receive(host.encode(*messages.encode(measured)), 5, read=False)
+    *answers, status = [messages.decode(f.type, f.payload) for f in FrameDecoder().feed(c.tick(2_000_000))]
+    assert all(isinstance(answer, messages.Correction) for answer in answers)
+    assert isinstance(status, messages.BoardStatus)
+    assert status.measurements_lost == 200 - len(answers) > 0
     c.close()
 
 

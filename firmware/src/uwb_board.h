@@ -25,7 +25,7 @@ typedef struct {
     const uwb_model *model; /* NULL = it has none */
     void *arena;            /* as for uwb_correct */
     size_t arena_bytes;
-    uint8_t *queue; /* for bytes to the host; two of the longest frames and the reserve are ample */
+    uint8_t *queue; /* for frames to the host; two of the longest and the reserve are ample */
     size_t queue_bytes;
     uint32_t (*clock_us)(void); /* for compute_us; NULL = it is sent as 0 */
 } uwb_board_config;
@@ -37,7 +37,6 @@ typedef struct {
     uwb_queue queue;
     uint64_t status_due_us;
     uint64_t radio_began_us; /* when the frame from the radio that is being received began */
-    uint32_t sequence;
     uint32_t dropped;
     uint32_t measurements;
     uint32_t measurements_lost;

@@ -23,7 +23,10 @@ static int answer(uwb_board *board, const uwb_header_t *header, size_t payload_b
         memset(&reply, 0, sizeof reply);
         reply.request_sequence = header->sequence;
         reply.received_us = now_us;
-        (void)uwb_board_send(board, UWB_TYPE_TIME_SYNC_REPLY, UWB_FLAG_ANSWER, now_us, &reply, sizeof reply, 0);
+        /* Before all that waits: the shorter the round trip, the better the host knows the clock. */
+        const uwb_header_t first = {UWB_PROTOCOL_VERSION, UWB_TYPE_TIME_SYNC_REPLY, UWB_FLAG_ANSWER, 0,
+                                    UWB_WHEN_IT_LEAVES};
+        (void)uwb_queue_urgent(&board->queue, &first, &reply, sizeof reply);
         return 1;
     }
     case UWB_TYPE_RANGE_CIR: {
@@ -32,7 +35,9 @@ static int answer(uwb_board *board, const uwb_header_t *header, size_t payload_b
         if (board->config.model == NULL || !uwb_read_measurement(payload, payload_bytes, &fields, &cir)) {
             return 0;
         }
-        (void)uwb_board_correct(board, &fields, &cir, UWB_FLAG_ANSWER, now_us);
+        if (!uwb_board_correct(board, &fields, &cir, UWB_FLAG_ANSWER, now_us)) {
+            board->measurements_lost++;
+        }
         return 1;
     }
     default:

@@ -43,22 +43,41 @@ int32_t uwb_decoder_push(uwb_decoder *decoder, uint8_t byte, uwb_header_t *heade
 /* CRC-32 of IEEE 802.3, continued from `crc`; 0 to begin with. */
 uint32_t uwb_crc32(uint32_t crc, const void *data, size_t bytes);
 
-/* Bytes that wait to be sent, in a ring of the caller's memory. */
+/* A wire buffer: header and payload stand at UWB_WIRE_LEAD before they are encoded in place. */
+#define UWB_WIRE_LEAD 20
+#define UWB_MAX_WIRE_BYTES (UWB_WIRE_LEAD + UWB_MAX_FRAME_BYTES)
+
+/* Make the header and the payload in `wire` a frame, delimiters included; returns its length. At most
+ * UWB_MAX_PAYLOAD_BYTES of payload. */
+size_t uwb_encode_frame(uint8_t *wire, size_t payload_bytes);
+
+/* Frames that wait to be sent, in a ring of the caller's memory, and the one that is being sent. A frame is numbered
+ * when it leaves: the host takes a gap for a frame lost on the way. */
 typedef struct {
-    uint8_t *bytes;
+    uint8_t *bytes; /* for each frame the length of its payload, its header and its payload */
     size_t capacity;
     size_t first;
     size_t used;
+    uint32_t sequence; /* of the frame that leaves next */
+    size_t encoded;    /* bytes in `wire`, of which `sent` are on their way */
+    size_t sent;
+    uint8_t wire[UWB_MAX_WIRE_BYTES];
 } uwb_queue;
 
-/* Append a whole frame if it fits and then leaves `reserve` bytes free, else nothing; returns whether it did. */
+#define UWB_WHEN_IT_LEAVES UINT64_MAX /* as a header's time_us: it becomes that of its leaving */
+
+/* Put a frame behind all others if it fits and then leaves `reserve` bytes free, else do nothing; returns whether it
+ * did. The header's sequence is of no meaning. */
 int uwb_queue_frame(uwb_queue *queue, const uwb_header_t *header, const void *payload, size_t payload_bytes,
                     size_t reserve);
 
-/* The longest stretch that lies in one piece at the front; returns its length. */
-size_t uwb_queue_peek(const uwb_queue *queue, const uint8_t **bytes);
+/* Put a frame before all others if it fits; returns whether it did. */
+int uwb_queue_urgent(uwb_queue *queue, const uwb_header_t *header, const void *payload, size_t payload_bytes);
 
-/* Forget `count` bytes at the front, which have been sent. */
+/* What is left of the frame that is being sent, or else the whole next one; returns its length, 0 if nothing waits. */
+size_t uwb_queue_peek(uwb_queue *queue, uint64_t now_us, const uint8_t **bytes);
+
+/* Forget `count` bytes of that, which have been sent. */
 void uwb_queue_drop(uwb_queue *queue, size_t count);
 
 /* Read a RANGE_CIR at `payload`, which is aligned to 2 bytes: its fields, and a CIR whose samples stay where they

@@ -1,68 +1,48 @@
+#include <string.h>
+
 #include "uwb_link.h"
 
-/* A frame that is being encoded at the end of a queue. */
-typedef struct {
-    uwb_queue *queue;
-    size_t code_at; /* where the length of the block goes that is being written */
-    uint8_t code;
-    int open; /* whether there is such a block */
-} encoder;
-
-static size_t put(uwb_queue *queue, uint8_t byte) {
-    const size_t at = (queue->first + queue->used) % queue->capacity;
-    queue->bytes[at] = byte;
-    queue->used++;
-    return at;
-}
-
-static void open_block(encoder *encoder) {
-    encoder->code_at = put(encoder->queue, 1);
-    encoder->code = 1;
-    encoder->open = 1;
-}
-
-static void encode(encoder *encoder, const void *data, size_t bytes) {
-    const uint8_t *at = data;
-    for (size_t i = 0; i < bytes; i++) {
-        if (!encoder->open) {
-            open_block(encoder);
-        }
-        if (at[i] == 0) {
-            encoder->queue->bytes[encoder->code_at] = encoder->code;
-            open_block(encoder);
-            continue;
-        }
-        (void)put(encoder->queue, at[i]);
-        encoder->code++;
-        if (encoder->code == 0xFF) {
-            encoder->queue->bytes[encoder->code_at] = encoder->code;
-            encoder->open = 0;
-        }
+static size_t put(uwb_queue *queue, size_t at, const void *data, size_t bytes) {
+    const size_t to_end = queue->capacity - at;
+    const size_t piece = bytes < to_end ? bytes : to_end;
+    if (bytes != 0) {
+        memcpy(queue->bytes + at, data, piece);
+        memcpy(queue->bytes, (const uint8_t *)data + piece, bytes - piece);
     }
+    return (at + bytes) % queue->capacity;
+}
+
+/* The bytes that the frame needs, or 0 if it does not fit. */
+static size_t fitting(const uwb_queue *queue, size_t payload_bytes, size_t reserve) {
+    const size_t room = queue->capacity - queue->used;
+    const size_t needed = sizeof(uint16_t) + UWB_HEADER_BYTES + payload_bytes;
+    return payload_bytes <= UWB_MAX_PAYLOAD_BYTES && needed <= room && reserve <= room - needed ? needed : 0;
+}
+
+static void place(uwb_queue *queue, size_t at, const uwb_header_t *header, const void *payload,
+                  size_t payload_bytes) {
+    const uint16_t length = (uint16_t)payload_bytes;
+    at = put(queue, at, &length, sizeof length);
+    at = put(queue, at, header, UWB_HEADER_BYTES);
+    (void)put(queue, at, payload, payload_bytes);
 }
 
 int uwb_queue_frame(uwb_queue *queue, const uwb_header_t *header, const void *payload, size_t payload_bytes,
                     size_t reserve) {
-    if (payload_bytes > UWB_MAX_PAYLOAD_BYTES) {
-        return 0;
+    const size_t needed = fitting(queue, payload_bytes, reserve);
+    if (needed != 0) {
+        place(queue, (queue->first + queue->used) % queue->capacity, header, payload, payload_bytes);
+        queue->used += needed;
     }
-    const size_t body = UWB_HEADER_BYTES + payload_bytes + UWB_CRC_BYTES;
-    const size_t worst = 2 + body + (body + 253) / 254 + 1;
-    const size_t room = queue->capacity - queue->used;
-    if (worst > room || reserve > room - worst) {
-        return 0;
+    return needed != 0;
+}
+
+int uwb_queue_urgent(uwb_queue *queue, const uwb_header_t *header, const void *payload, size_t payload_bytes) {
+    const size_t needed = fitting(queue, payload_bytes, 0);
+    if (needed != 0) {
+        queue->first = (queue->first + queue->capacity - needed) % queue->capacity;
+        place(queue, queue->first, header, payload, payload_bytes);
+        queue->used += needed;
     }
-    uint32_t crc = uwb_crc32(0, header, UWB_HEADER_BYTES);
-    crc = uwb_crc32(crc, payload, payload_bytes);
-    /* The delimiter before closes whatever noise precedes. */
-    (void)put(queue, 0);
-    encoder encoder = {queue, 0, 0, 0};
-    encode(&encoder, header, UWB_HEADER_BYTES);
-    encode(&encoder, payload, payload_bytes);
-    encode(&encoder, &crc, sizeof crc);
-    if (encoder.open) {
-        queue->bytes[encoder.code_at] = encoder.code;
-    }
-    (void)put(queue, 0);
-    return 1;
+    return needed != 0;
 }

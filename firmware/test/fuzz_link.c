@@ -19,15 +19,20 @@ static void check(int promise, const char *what) {
     }
 }
 
-static void drain(uwb_board *board, uwb_decoder *host) {
-    while (board->queue.used != 0) {
-        const uint8_t *bytes;
-        const size_t count = uwb_queue_peek(&board->queue, &bytes);
+/* Read at most `limit` bytes of what the board sends. */
+static void drain(uwb_board *board, uwb_decoder *host, size_t limit) {
+    const uint8_t *bytes;
+    size_t count;
+    while (limit != 0 && (count = uwb_queue_peek(&board->queue, 0, &bytes)) != 0) {
+        count = count < limit ? count : limit;
         for (size_t i = 0; i < count; i++) {
+            const uint32_t frames = host->frames;
             uwb_header_t header;
             (void)uwb_decoder_push(host, bytes[i], &header);
+            check(host->frames == frames || header.sequence == frames, "frames are numbered as they leave");
         }
         uwb_queue_drop(&board->queue, count);
+        limit -= count;
     }
     check(host->bad_cobs + host->bad_length + host->bad_crc + host->oversize == 0, "the board sends intact frames");
 }
@@ -37,7 +42,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
     uwb_board *const board = malloc(sizeof *board);
     uwb_decoder *const host = calloc(1, sizeof *host);
     uint8_t *const queue = malloc(9000);
-    uint8_t *const wire = malloc(UWB_MAX_ENCODED_BYTES + 2);
+    uint8_t *const wire = malloc(UWB_MAX_WIRE_BYTES);
     void *const arena = malloc(arena_bytes);
     check(board != NULL && host != NULL && queue != NULL && wire != NULL && arena != NULL, "memory");
     const uwb_board_config config = {1, 2, {0, 1, 0}, UWB_MODE_BOTH, "fuzzed",   &uwb_model_data,
@@ -53,11 +58,12 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
         length = length < size ? length : size;
         const uint8_t *bytes = data;
         size_t count = length;
-        uwb_queue encoded = {wire, UWB_MAX_ENCODED_BYTES + 2, 0, 0};
         const uwb_header_t header = {(uint8_t)((how & 4) ? 1 : how), type, 0, 7, 0};
-        if ((how & 1) && uwb_queue_frame(&encoded, &header, data, length, 0)) {
+        if (how & 1) {
+            memcpy(wire + UWB_WIRE_LEAD, &header, sizeof header);
+            memcpy(wire + UWB_WIRE_LEAD + sizeof header, data, length);
             bytes = wire;
-            count = encoded.used;
+            count = uwb_encode_frame(wire, length);
         }
         if (how & 2) {
             uwb_board_receive(board, bytes, count, now_us);
@@ -68,12 +74,12 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
         uwb_board_tick(board, now_us);
         check(board->queue.used <= board->queue.capacity && board->mode <= UWB_MODE_BOTH, "bounds");
         if (how & 8) {
-            drain(board, host);
+            drain(board, host, (how & 16) ? (size_t)how * 8 : SIZE_MAX);
         }
         data += length;
         size -= length;
     }
-    drain(board, host);
+    drain(board, host, SIZE_MAX);
     free(arena);
     free(wire);
     free(queue);

@@ -10,6 +10,7 @@ typedef struct {
     uwb_board board;
     uint32_t arena[4096];
     uint8_t queue[16384];
+    uint64_t now_us;
 } host_board;
 
 host_board *host_board_new(int mode, int with_model, size_t queue_bytes);
@@ -19,8 +20,7 @@ void host_board_measure(host_board *host, const uint8_t *bytes, size_t count, ui
 void host_board_tick(host_board *host, uint64_t now_us);
 size_t host_board_output(host_board *host, uint8_t *bytes, size_t limit);
 int host_decode(const uint8_t *bytes, size_t count, uwb_header_t *header, uint8_t *payload, uint32_t *counts);
-size_t host_encode(const uwb_header_t *header, const uint8_t *payload, size_t payload_bytes, uint8_t *wire,
-                   size_t limit);
+size_t host_encode(const uwb_header_t *header, const uint8_t *payload, size_t payload_bytes, uint8_t *wire);
 
 host_board *host_board_new(int mode, int with_model, size_t queue_bytes) {
     host_board *const host = calloc(1, sizeof *host);
@@ -42,23 +42,26 @@ void host_board_free(host_board *host) {
 }
 
 void host_board_receive(host_board *host, const uint8_t *bytes, size_t count, uint64_t now_us) {
+    host->now_us = now_us;
     uwb_board_receive(&host->board, bytes, count, now_us);
 }
 
 void host_board_measure(host_board *host, const uint8_t *bytes, size_t count, uint64_t now_us) {
+    host->now_us = now_us;
     uwb_board_measure(&host->board, bytes, count, now_us);
 }
 
 void host_board_tick(host_board *host, uint64_t now_us) {
+    host->now_us = now_us;
     uwb_board_tick(&host->board, now_us);
 }
 
-/* Take what waits to be sent, at most `limit` bytes. */
+/* Take what waits to be sent, at most `limit` bytes, at the time of the last call. */
 size_t host_board_output(host_board *host, uint8_t *bytes, size_t limit) {
     size_t taken = 0;
-    while (host->board.queue.used != 0 && taken < limit) {
-        const uint8_t *piece;
-        size_t count = uwb_queue_peek(&host->board.queue, &piece);
+    const uint8_t *piece;
+    size_t count;
+    while (taken < limit && (count = uwb_queue_peek(&host->board.queue, host->now_us, &piece)) != 0) {
         count = count < limit - taken ? count : limit - taken;
         memcpy(bytes + taken, piece, count);
         uwb_queue_drop(&host->board.queue, count);
@@ -87,8 +90,9 @@ int host_decode(const uint8_t *bytes, size_t count, uwb_header_t *header, uint8_
     return (int)last;
 }
 
-size_t host_encode(const uwb_header_t *header, const uint8_t *payload, size_t payload_bytes, uint8_t *wire,
-                   size_t limit) {
-    uwb_queue queue = {wire, limit, 0, 0};
-    return uwb_queue_frame(&queue, header, payload, payload_bytes, 0) ? queue.used : 0;
+/* `wire` has UWB_MAX_WIRE_BYTES. */
+size_t host_encode(const uwb_header_t *header, const uint8_t *payload, size_t payload_bytes, uint8_t *wire) {
+    memcpy(wire + UWB_WIRE_LEAD, header, sizeof *header);
+    memcpy(wire + UWB_WIRE_LEAD + sizeof *header, payload, payload_bytes);
+    return uwb_encode_frame(wire, payload_bytes);
 }

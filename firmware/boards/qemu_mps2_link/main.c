@@ -57,9 +57,9 @@ static size_t receive(uart *port, uint8_t *bytes, size_t limit) {
     return count;
 }
 
-static size_t transmit(uart *port, uwb_queue *queue) {
+static size_t transmit(uart *port, uwb_queue *queue, uint64_t now_us) {
     const uint8_t *bytes;
-    const size_t waiting = uwb_queue_peek(queue, &bytes);
+    const size_t waiting = uwb_queue_peek(queue, now_us, &bytes);
     size_t count = 0;
     while (count < waiting && !(port->state & TX_FULL)) {
         port->data = bytes[count++];
@@ -119,9 +119,8 @@ int main(void) {
             moved += count;
         }
         uwb_board_tick(&board, now_us);
-        moved += transmit(HOST_UART, &board.queue);
-        /* Within a frame the next byte is near: to sleep would take longer than to look. */
-        if (moved == 0 && board.radio.encoded == 0 && board.host.encoded == 0) {
+        moved += transmit(HOST_UART, &board.queue, uptime_us(&periods_us));
+        if (moved == 0) {
             __asm volatile("wfi");
         }
     }

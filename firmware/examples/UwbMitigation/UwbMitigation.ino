@@ -96,7 +96,7 @@ void loop() {
     const bool host_reads = (bool)Serial;
     if (host_reads) {
         const uint8_t *waiting;
-        size_t length = uwb_queue_peek(&board.queue, &waiting);
+        size_t length = uwb_queue_peek(&board.queue, uptime_us(), &waiting);
         /* One byte less than a packet: a transfer of full packets would have to end with an empty one. */
         length = length < PACKET - 1 ? length : PACKET - 1;
         if (length != 0 && Serial.availableForWrite() >= (int)length) {
