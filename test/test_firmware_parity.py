@@ -19,8 +19,11 @@ from uwb_mitigation.firmware_export.export import export_bundle
 from uwb_mitigation.firmware_export.host import HostFirmware, firmware_folder, link, run
 from uwb_mitigation.measurement import Status
 from uwb_mitigation.mitigation import Mitigation
-from uwb_mitigation.model.bundle import load_bundle
+from uwb_mitigation.model import graph
+from uwb_mitigation.model.architecture import HEAD
+from uwb_mitigation.model.bundle import load_bundle, save_bundle
 from uwb_mitigation.model.integer import IntegerNetwork
+from uwb_mitigation.model.prior import LinePrior
 from uwb_mitigation.model.shipped import default_model_path
 from uwb_mitigation.preprocessing import Preprocessing, Scaling
 
@@ -123,6 +126,27 @@ def test_corrected_ranges_equal_the_mitigators(tmp_path: Path):
         assert np.array_equal(bits(np.array(computed[:3])), bits(np.array(values)))
         seen.add(expected.status)
     assert seen == {Status.OK, Status.NO_CIR, Status.BAD_CIR, Status.OUT_OF_DISTRIBUTION}
+
+
+@pytest.mark.filterwarnings("ignore:overflow")
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_a_prediction_that_overflows_is_a_failure_of_the_model_as_for_the_mitigator(
+    sign: int, tmp_path: Path
+):
+    weights = synthetic.random_remnet(16, 3)
+    scales = {**weights.weight_scale, HEAD: np.array([1e31], np.float32)}
+    model = graph.int8_model(replace(weights, weight_scale=scales))
+    largest = LinePrior(sign * float(np.finfo(np.float32).max))
+    card = model_material.card(weights.architecture, prior=largest, correction_limits_m=(-500.0, 500.0))
+    bundle = save_bundle(tmp_path / "huge.onnx", model, card)
+    export_bundle(bundle, tmp_path)
+    firmware, mitigation = HostFirmware(tmp_path, tmp_path, SANITIZED), Mitigation(bundle)
+    measurement = model_material.measurement()
+    expected = mitigation.correct(measurement)
+    # This network's output is large and negative: it overflows the one, and keeps the other finite.
+    assert expected.status is (Status.MODEL_ERROR if sign < 0 else Status.OUT_OF_DISTRIBUTION)
+    computed = firmware.correct(measurement.range_m, measurement.cir)
+    assert computed == (expected.range_m, 0.0, expected.variance_m2, int(expected.status))
 
 
 @pytest.mark.parametrize("samples", [8, 32])

@@ -20,6 +20,7 @@ static uwb_range_status range_status(uwb_status status) {
         return UWB_RANGE_OUT_OF_DISTRIBUTION;
     case UWB_BAD_ARGUMENT:
     case UWB_BAD_ARENA:
+    case UWB_NOT_FINITE:
         return UWB_RANGE_MODEL_ERROR;
     default:
         return UWB_RANGE_BAD_CIR;
@@ -59,6 +60,9 @@ static uwb_status predict(const uwb_model *model, float range_m, const uwb_cir *
     }
     rounded = network_m;
     *error_m = prior + rounded;
+    if (!in_limits(*error_m, -FLT_MAX, FLT_MAX)) {
+        return UWB_NOT_FINITE;
+    }
     const int usual = in_limits(*error_m, model->correction_low_m, model->correction_high_m) && *score < 1.0f;
     return usual ? UWB_OK : UWB_OUT_OF_DISTRIBUTION;
 }

@@ -30,7 +30,8 @@ typedef enum {
     UWB_NO_PREAMBLE_COUNT,   /* unknown, and the model's scaling needs it */
     UWB_NO_POWER,            /* receive or first-path power unknown, and the model's prior needs it */
     UWB_OUT_OF_DISTRIBUTION, /* the predicted error lies outside the model's limits, or all is strange to it */
-    UWB_BAD_RANGE            /* the range is not finite, negative, or beyond 1000 km */
+    UWB_BAD_RANGE,           /* the range is not finite, negative, or beyond 1000 km */
+    UWB_NOT_FINITE           /* the predicted error */
 } uwb_status;
 
 typedef enum { UWB_COMPLEX_INT16 = 0, UWB_MAGNITUDE = 1 } uwb_encoding;
