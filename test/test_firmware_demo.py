@@ -8,10 +8,12 @@ import sys
 from pathlib import Path
 
 import pytest
+import typer
 
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
 from uwb_mitigation.firmware_export import toolchain
+from uwb_mitigation.nodes import firmware_demo
 
 MISSING = toolchain.missing_tools()
 pytestmark = pytest.mark.ros
@@ -26,9 +28,13 @@ def test_the_demo_ends_by_itself_with_every_range_equal_to_the_hosts():
     assert "20 equal to the host's to the bit, 0 different" in done.stdout
 
 
-def test_without_the_tools_the_demo_names_the_line_that_installs_them(tmp_path: Path):
-    command = [sys.executable, "-m", "uwb_mitigation.nodes.firmware_demo", "--count", "1"]
-    environment = os.environ | {"PATH": str(tmp_path)}
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False, env=environment)
-    assert done.returncode == 1
-    assert "apt install gcc-arm-none-eabi" in " ".join(done.stdout.split())
+def test_without_the_tools_the_demo_names_the_line_that_installs_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    for name in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE"):
+        monkeypatch.setenv(name, os.environ.get(name, ""))
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(typer.Exit) as end:
+        firmware_demo.firmware_demo(recording=None, count=1)
+    assert end.value.exit_code == 1
+    assert "apt install gcc-arm-none-eabi" in " ".join(capsys.readouterr().out.split())

@@ -5,18 +5,26 @@ An emulator counts instructions exactly; of wait states, caches and power it kno
 
 from __future__ import annotations
 
+import os
+import select
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
 import firmware_models
+import model_material
 import numpy as np
 import pytest
 from firmware_models import Exported
 
 from uwb_mitigation.firmware_export import emulator, measurement, synthetic, toolchain
+from uwb_mitigation.firmware_export.emulated_board import EmulatedFirmware, window_of
 from uwb_mitigation.firmware_export.export import export_bundle
 from uwb_mitigation.firmware_export.host import WARNINGS, firmware_folder, run
 from uwb_mitigation.firmware_export.toolchain import Board, Kernels
+from uwb_mitigation.link import messages
+from uwb_mitigation.link.framing import FrameDecoder, FrameEncoder
+from uwb_mitigation.link.layout import MessageType
 from uwb_mitigation.measurement import RangeMeasurement
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import Bundle, load_bundle
@@ -147,6 +155,32 @@ def test_what_is_strange_to_the_model_is_graded_as_by_the_mitigator(tmp_path: Pa
 def test_real_logs_are_corrected_as_by_the_mitigator(apartment: Path, tmp_path: Path):
     measurements = firmware_models.real_measurements(apartment)
     assert 0 in check_corrections(load_bundle(default_model_path()), measurements, tmp_path)
+
+
+def test_a_burst_into_the_boards_port_is_answered_whole(tmp_path: Path):
+    bundle = firmware_models.exact_bundle(tmp_path, 8)
+    measured = [window_of(model_material.measurement(seed=seed), 8) for seed in range(50)]
+    encoder, decoder, answers = FrameEncoder(), FrameDecoder(), []
+    waiting = b"".join(encoder.encode(*messages.encode(asked)) for asked in measured)
+    with EmulatedFirmware(bundle) as board:
+        port = os.open(board.port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+        # The emulated UART takes a byte when the board has read the one before: a pseudo-terminal's buffer fills.
+        deadline = time.monotonic() + 60
+        while len(answers) < 50 and time.monotonic() < deadline:
+            readable, writable, _ = select.select([port], [port] if waiting else [], [], 0.1)
+            waiting = waiting[os.write(port, waiting) :] if writable else waiting
+            frames = decoder.feed(os.read(port, 4096)) if readable else []
+            answers += [f.payload for f in frames if f.type == MessageType.RANGE_CORRECTED]
+        os.close(port)
+    host = Mitigation(bundle)
+    for asked, answer in zip(measured, answers, strict=True):
+        correction = messages.decode(MessageType.RANGE_CORRECTED, answer)
+        assert isinstance(correction, messages.Correction)
+        expected = host.correct(asked)
+        values = [expected.range_m, expected.correction_m, expected.variance_m2]
+        sent = correction.corrected
+        assert sent.status is expected.status
+        assert np.array_equal(bits([sent.range_m, sent.correction_m, sent.variance_m2]), bits(values))
 
 
 def test_the_shipped_model_fits_the_dwm1001c(tmp_path: Path):

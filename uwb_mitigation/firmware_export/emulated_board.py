@@ -6,6 +6,7 @@ for the driver, and into the second the radio's frames are played, as an EVB1000
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import socket
@@ -13,6 +14,7 @@ import subprocess
 import tempfile
 import time
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 
@@ -21,11 +23,26 @@ from uwb_mitigation.firmware_export.export import export_bundle
 from uwb_mitigation.firmware_export.toolchain import Board, build_image, require_tools
 from uwb_mitigation.link import messages
 from uwb_mitigation.link.framing import FrameEncoder
-from uwb_mitigation.measurement import RangeMeasurement
+from uwb_mitigation.measurement import Encoding, RangeMeasurement
 from uwb_mitigation.model.bundle import Bundle
+from uwb_mitigation.preprocessing import WINDOW_LEAD
 
 _START_TIMEOUT_S = 20.0
 _PORT = re.compile(rb"char device redirected to (\S+)")
+
+
+def window_of(measurement: RangeMeasurement, samples: int) -> RangeMeasurement:
+    """The measurement with only the `samples` that a network reads; all of them where it lacks some of those."""
+    cir = measurement.cir
+    if not math.isfinite(cir.first_path_index):
+        return measurement
+    start = math.floor(cir.first_path_index) - WINDOW_LEAD
+    values = 2 if cir.encoding is Encoding.COMPLEX_INT16 else 1
+    first = values * (start - cir.start_index)
+    window = cir.samples[max(first, 0) : first + values * samples]
+    if first < 0 or len(window) < values * samples:
+        return measurement
+    return replace(measurement, cir=replace(cir, samples=window, start_index=start))
 
 
 class EmulatedFirmware:
@@ -44,6 +61,7 @@ class EmulatedFirmware:
         require_tools()
         self._folder = tempfile.TemporaryDirectory(prefix="uwb_emulated_firmware_")
         self._encoder = FrameEncoder()
+        self._samples = bundle.preprocessing.samples
         self._process: subprocess.Popen[bytes] | None = None
         self._radio: socket.socket | None = None
         self.port = ""
@@ -58,11 +76,14 @@ class EmulatedFirmware:
     def measure(self, measurement: RangeMeasurement) -> None:
         """Let the board's radio measure; waits while the board is busy.
 
+        As an EVB1000 does, the radio sends only the samples that the network reads: the emulated UART takes
+        byte by byte.
+
         Raises:
             UwbMitigationError: the emulator has ended.
         """
         assert self._radio is not None
-        kind, payload = messages.encode(measurement)
+        kind, payload = messages.encode(window_of(measurement, self._samples))
         try:
             self._radio.sendall(self._encoder.encode(kind, payload))
         except OSError as error:

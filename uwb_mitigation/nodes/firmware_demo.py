@@ -82,17 +82,26 @@ def differences(expected: CorrectedRange, message: RangeCorrected) -> bool:
     return not (same and message.source == Origin.DEVICE and message.model_id == expected.model_id)
 
 
-def play(board: EmulatedFirmware, listener: Listener, measured: Sequence[RangeMeasurement]) -> None:
+def play(
+    board: EmulatedFirmware, listener: Listener, measured: Sequence[RangeMeasurement], console: Console
+) -> None:
     """Measure with the board's radio, and wait until all has come back or nothing more does."""
-    if not listener.ready.wait(READY_TIMEOUT_S):
-        raise UwbMitigationError("the driver has not brought the board into mode DEVICE")
-    for measurement in measured:
-        board.measure(measurement)
-    seen, since = -1, time.monotonic()
-    while len(listener.corrected) < len(measured) and time.monotonic() - since < PATIENCE_S:
-        if len(listener.corrected) != seen:
-            seen, since = len(listener.corrected), time.monotonic()
-        time.sleep(0.05)
+    with console.status("waiting for the driver to bring the board into mode DEVICE") as status:
+
+        def show() -> None:
+            status.update(f"{len(listener.corrected)} of {len(measured)} ranges corrected")
+
+        if not listener.ready.wait(READY_TIMEOUT_S):
+            raise UwbMitigationError("the driver has not brought the board into mode DEVICE")
+        for measurement in measured:
+            board.measure(measurement)
+            show()
+        seen, since = -1, time.monotonic()
+        while len(listener.corrected) < len(measured) and time.monotonic() - since < PATIENCE_S:
+            if len(listener.corrected) != seen:
+                seen, since = len(listener.corrected), time.monotonic()
+                show()
+            time.sleep(0.05)
 
 
 def summarise(
@@ -134,7 +143,7 @@ def run(console: Console, measured: Sequence[RangeMeasurement]) -> int:
         thread.start()
         driver = start("driver", "source:=serial", f"port:={board.port}", "mode:=device")
         try:
-            play(board, listener, measured)
+            play(board, listener, measured, console)
         finally:
             (code,) = stop(driver)
             seen.set()
