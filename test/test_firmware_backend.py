@@ -6,15 +6,19 @@ import shutil
 from pathlib import Path
 
 import firmware_models
+import model_material
 import numpy as np
 import pytest
 
+from uwb_mitigation.bag.codec import encode_range
 from uwb_mitigation.errors import MissingDependencyError
 from uwb_mitigation.firmware_export.backend import FirmwareMitigation
 from uwb_mitigation.mitigation import Mitigation
 
+NO_COMPILER = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc")
 
-@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc")
+
+@NO_COMPILER
 def test_the_firmware_gives_the_corrected_ranges_of_onnx_runtime(tmp_path: Path):
     bundle = firmware_models.choosy_bundle(tmp_path)
     random = np.random.default_rng(8)
@@ -29,3 +33,43 @@ def test_without_a_compiler_the_error_says_what_to_install(tmp_path: Path, monke
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(MissingDependencyError, match="apt install gcc"):
         FirmwareMitigation(firmware_models.exact_bundle(tmp_path))
+
+
+@NO_COMPILER
+@pytest.mark.ros
+def test_a_mitigator_that_is_told_to_corrects_with_the_firmware(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
+    from rclpy.serialization import deserialize_message
+    from ros_harness import domain
+    from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
+
+    bundle = firmware_models.choosy_bundle(tmp_path)
+    compiler, traces = tmp_path / "cc", tmp_path / "compiled"
+    compiler.write_text(f'#!/bin/sh\ntouch {traces}\nexec {shutil.which("cc")} "$@"\n')
+    compiler.chmod(0o755)
+    monkeypatch.setenv("CC", str(compiler))
+    measurements = [model_material.measurement(1.0 + seed / 4, seed) for seed in range(20)]
+    with domain(tmp_path) as ros:
+        publisher = ros.node.create_publisher(RangeCir, "/uwb/range_raw", 50)
+        corrected = ros.collect(RangeCorrected, "/uwb/range_corrected")
+        ros.launch("mitigator", f"model:={bundle.path}", "backend:=firmware").wait_for_output(
+            "correcting with"
+        )
+        ros.spin_until(lambda: publisher.get_subscription_count() == 1)
+        ros.wait_for_publishers("/uwb/range_corrected", 1)
+        ros.spin_for(0.5)
+        for measurement in measurements:
+            publisher.publish(deserialize_message(encode_range(measurement), RangeCir))
+        ros.spin_until(lambda: len(corrected) == len(measurements))
+    assert traces.exists()
+    host = Mitigation(bundle)
+    for message, measurement in zip(corrected, measurements, strict=True):
+        expected = host.correct(measurement)
+        values = np.array([expected.range_m, expected.correction_m, expected.variance_m2], np.float32)
+        assert (
+            np.array([message.range, message.correction, message.variance], np.float32).tobytes()
+            == values.tobytes()
+        )
+        assert message.status == expected.status
