@@ -443,6 +443,7 @@ def test_quick_training_fills_tables_and_boxes(tmp_path, monkeypatch):
     row = row_of(values["tables"][1], "REMNet", "8")
     assert [cell["kind"] for cell in row[-3:]] == ["measured"] * 3
     assert set(values["figures"][-1]["numbers"]["errors"]) == {"16", "8"}
+    assert "the data has no received power" in values["tables"][1]["note"]
     assert any("--train quick" in notice for notice in values["notices"])
 
 
