@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from conftest import REPOSITORY
 from serial.tools import list_ports
 from typer.testing import CliRunner
 
@@ -31,6 +32,13 @@ def no_ports(monkeypatch: pytest.MonkeyPatch):
 
 def findings() -> dict[str, Finding]:
     return {finding.name: finding for finding in installation.examine()}
+
+
+def test_everything_that_is_installed_to_run_is_looked_at():
+    """Except what shows the result, and what others bring."""
+    lines = (REPOSITORY / "requirements" / "runtime.in").read_text().splitlines()
+    required = {line.partition("<")[0] for line in lines if line and not line.startswith("#")}
+    assert set(installation.PACKAGES) == required - {"typer", "rich", "markdown-it-py"}
 
 
 def test_a_sound_installation_passes(tmp_path: Path):

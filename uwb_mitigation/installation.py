@@ -50,7 +50,7 @@ class State(str, enum.Enum):
 
     OK = "ok"
     BROKEN = "broken"
-    OPTIONAL = "not there, optional"
+    OPTIONAL = "optional"
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,7 @@ class Finding:
 
     Attributes:
         name: of the thing.
-        state: BROKEN is what has to be mended.
+        state: BROKEN is what has to be mended; OPTIONAL what is absent and need not be there.
         detail: version or place, what is wrong, or what an optional thing is for.
         fix: what to do; empty where there is nothing to do.
     """
