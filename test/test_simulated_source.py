@@ -11,6 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from uwb_mitigation.cli import app
+from uwb_mitigation.commands import data
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.measurement import DEVICE_TICK_HZ, Encoding
 from uwb_mitigation.preprocessing import WINDOW_LEAD, Preprocessing, Scaling
@@ -26,7 +27,7 @@ from uwb_mitigation.sources.simulated import (
     SimulatedSource,
     SimulatedSurvey,
 )
-from uwb_mitigation.sources.source import Record
+from uwb_mitigation.sources.source import Record, Source
 
 
 def values(record: Record) -> tuple[object, ...]:
@@ -274,6 +275,22 @@ def test_every_obstacle_stands_in_the_path_wherever_it_is_put() -> None:
             assert (path.loss_db[0] > 6.0) >= (obstacle.material is None)
 
 
+@pytest.mark.parametrize(("like", "expected"), [("deepuwb", 55_158), ("survey", 20_000), ("drive", 20_000)])
+def test_how_many_ranges_need_not_be_said(monkeypatch, tmp_path, like: str, expected: int) -> None:  # type: ignore[no-untyped-def]
+    asked: list[int] = []
+
+    def few(like: data.Scene, seed: int, ranges: int, exchanges: int) -> Source:
+        asked.append(ranges)
+        whole(like, seed, ranges, exchanges)
+        return SimulatedSource(count=1)
+
+    whole = data.simulated_source
+    monkeypatch.setattr(data, "simulated_source", few)
+    words = ["data", "simulate", "--like", like, "-o", str(tmp_path / "sim.mcap")]
+    assert CliRunner().invoke(app, words).exit_code == 0
+    assert asked == [expected]
+
+
 @pytest.mark.parametrize(("like", "ranges"), [("deepuwb", 100), ("survey", 100), ("drive", 100)])
 def test_the_command_line_writes_a_bag_that_says_it_is_simulated(tmp_path, like: str, ranges: int) -> None:  # type: ignore[no-untyped-def]
     words = ["data", "simulate", "--like", like, "--ranges", str(ranges), "-o", str(tmp_path / "sim.mcap")]
@@ -295,6 +312,7 @@ def test_the_command_line_writes_a_bag_that_says_it_is_simulated(tmp_path, like:
     ("words", "told"),
     [
         (["--ranges", "7"], "100 to"),
+        (["--ranges", "0"], "100 to"),
         (["--like", "survey", "--ranges", "30"], "a multiple of"),
         (["--like", "survey", "--exchanges", "0"], "a multiple of"),
         (["--like", "drive", "--ranges", "0"], "1 or more"),

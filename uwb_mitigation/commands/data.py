@@ -120,8 +120,8 @@ def simulate(
     ranges: Annotated[
         int | None,
         typer.Option(
-            help="How many to simulate; without it, 55158 as DeepUWB has. A frame that is too weak to be "
-            "received counts for survey and drive."
+            help="How many; without it, 55158 as DeepUWB has, or 20000 of a survey or drive, less those "
+            "that are too weak to be received."
         ),
     ] = None,
     exchanges: Annotated[int, typer.Option(help="For each placement at rest; a drive has none.")] = 20,
@@ -139,11 +139,10 @@ def simulate(
         uwb-mitigation report --data sim.mcap --models models -o report
     """
     from uwb_mitigation.bag.writer import BagWriter
-    from uwb_mitigation.sources.deepuwb import ROOM_ROWS
     from uwb_mitigation.sources.inventory import Inventory
 
-    total = sum(ROOM_ROWS) if ranges is None else ranges
-    source = _simulated(like, seed, total, exchanges)
+    total = _RANGES[like] if ranges is None else ranges
+    source = simulated_source(like, seed, total, exchanges)
     inventory = Inventory()
     origin = {"source": source.name, "simulated": "true"}
     with BagWriter(output, origin, force=force) as bag, console.progress() as bar:
@@ -168,7 +167,10 @@ def simulate(
     )
 
 
-def _simulated(like: Scene, seed: int, ranges: int, exchanges: int) -> Source:
+_RANGES = {Scene.DEEPUWB: 55_158, Scene.SURVEY: 20_000, Scene.DRIVE: 20_000}
+
+
+def simulated_source(like: Scene, seed: int, ranges: int, exchanges: int) -> Source:
     """The simulator's source of that many ranges.
 
     Raises:
