@@ -20,7 +20,7 @@ from uwb_mitigation.model import graph
 from uwb_mitigation.model.architecture import Remnet
 from uwb_mitigation.model.bundle import METADATA_KEY, assemble_bundle, load_bundle, parse_bundle, save_bundle
 from uwb_mitigation.model.prior import LinePrior
-from uwb_mitigation.model.shipped import default_model_path
+from uwb_mitigation.model.shipped import default_model_path, simulated_model_path
 from uwb_mitigation.preprocessing import Preprocessing, Scaling
 
 SHAPE = Remnet(samples=16, filters=4)
@@ -261,8 +261,10 @@ def test_the_prior_is_the_same_one_by_one_and_in_batches():
     assert np.isnan(batch[[3, 4]]).all()
 
 
-def test_the_model_card_is_of_the_shipped_model():
-    shipped = default_model_path()
+@pytest.mark.parametrize(
+    "shipped", [default_model_path(), simulated_model_path()], ids=lambda path: path.stem
+)
+def test_the_model_card_is_of_the_shipped_model(shipped):
     text = shipped.with_suffix(".md").read_text(encoding="utf-8")
     assert f"Model id `{load_bundle(shipped).model_id:08x}`" in text
     assert f"{shipped.stat().st_size:,} bytes" in text

@@ -7,23 +7,28 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from model_material import bundle, dataset, measurement, record
+from model_material import bundle, dataset, measurement, record, windows
 from typer.testing import CliRunner
 
+from uwb_mitigation import dataset as datasets
 from uwb_mitigation.cli import app
 from uwb_mitigation.errors import ParameterError, RecordingError
+from uwb_mitigation.evaluation.lad import constant as fit_constant
+from uwb_mitigation.model import floating
 from uwb_mitigation.model.architecture import Remnet
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.prior import LinePrior
+from uwb_mitigation.model.shipped import simulated_model_path
 from uwb_mitigation.sources import opening
 from uwb_mitigation.sources.source import Record
 from uwb_mitigation.sources.truth_table import load_truth, with_truth
 
 pytest.importorskip("torch", reason="run `make setup-training`")
-from uwb_mitigation.training import choosing
+from uwb_mitigation.training import choosing, cold_start
 from uwb_mitigation.training.choosing import Candidate, Choice
 from uwb_mitigation.training.fitting import FitOptions
 from uwb_mitigation.training.recipe import Recipe, fit_model
+from uwb_mitigation.training.site import float_network
 
 SHAPE = Remnet(samples=8)
 CONSTANTS = [
@@ -40,8 +45,9 @@ def numbered(error_of) -> object:
 
 
 def test_the_simplest_is_kept_unless_a_richer_one_gains():
-    assert choosing.simplest({"a": np.array([1.0]), "b": np.array([0.99]), "c": np.array([0.9])}) == "c"
-    assert choosing.simplest({"a": np.array([1.0]), "b": np.array([0.99])}) == "a"
+    errors = {"a": np.array([1.0]), "b": np.array([0.99]), "c": np.array([0.9])}
+    assert choosing.preferred(errors, 0.02) == "c"
+    assert choosing.preferred(errors, 0.2) == "a"
 
 
 def test_a_constant_error_needs_no_line():
@@ -71,14 +77,52 @@ def test_what_is_told_of_the_choice_was_not_chosen_on():
 
 def test_the_curve_tells_how_many_configurations_would_do():
     points = tuple((n, 0.1 + 1.0 / n) for n in (5, 10, 20))
-    choice = Choice("line", {}, points, 3, 0)
+    choice = Choice("line", {}, points, 3, 0, 20)
     # 0.95 x 0.15 = 0.1425 = 0.1 + 1 / n
     assert choice.needed() == pytest.approx(24, abs=1)
+    # With 40 at hand already: 0.95 x 0.125 = 0.11875
+    assert replace(choice, configurations=40).needed() == pytest.approx(54, abs=1)
 
 
 @pytest.mark.parametrize("points", [((5, 0.2), (10, 0.2), (20, 0.2)), ((5, 0.1), (10, 0.2), (20, 0.3)), ()])
 def test_a_curve_that_is_flat_promises_nothing(points):
-    assert Choice("line", {}, points, 3, 0).needed() is None
+    assert Choice("line", {}, points, 3, 0, 20).needed() is None
+
+
+def test_a_network_alone_is_trained_longer_unless_asked_otherwise():
+    assert choosing.alone(FitOptions(seed=3)) == FitOptions(20, 1e-3, dropout=0.2, seed=3)
+    assert choosing.alone(FitOptions(epochs=1, learning_rate=0.1)) == FitOptions(1, 0.1, dropout=0.2)
+
+
+def predicted(fitted, data) -> np.ndarray:
+    prior, network = fitted
+    of_network = 0 if network is None else floating.predict_m(network, data.inputs)
+    return prior.predict_batch_m(data.rx_power_dbm, data.first_path_power_dbm) + of_network
+
+
+def test_the_cold_start_is_the_mean_of_a_line_and_of_a_network_with_an_offset(tmp_path):
+    data, source = dataset(10, 5, samples=32), bundle(tmp_path)
+    line = predicted((choosing.line(data), None), data)
+    network = floating.predict_m(float_network(source), data.inputs)
+    shift = fit_constant(data.configurations, data.error_m - network).offset_m
+    found = predicted(cold_start.candidate(source).fit(data, 0), data)
+    assert np.std(network) > 0.01
+    assert found == pytest.approx((line + network + shift) / 2, abs=1e-5)
+
+
+def test_the_cold_start_is_offered_first_and_to_small_data_alone(tmp_path):
+    source = bundle(tmp_path)
+
+    def names(data) -> list[str]:
+        return [item.name for item in cold_start.offered(CONSTANTS, data, source)]
+
+    usual = [item.name for item in CONSTANTS]
+    assert names(dataset(18, 2)) == [cold_start.NAME, *usual]
+    assert names(dataset(19, 2)) == usual
+    assert names(dataset(18, 2, samples=8)) == usual
+    without = dataset(18, 2)
+    without.rx_power_dbm[0] = np.nan
+    assert names(without) == usual
 
 
 @pytest.mark.parametrize("name", [choosing.CONSTANT, choosing.LINE])
@@ -170,6 +214,26 @@ def test_a_bag_of_ones_own_refits_the_offset_and_says_what_it_helped(tmp_path, m
     assert found["helped"]
     assert found["choice"]["chosen"] in ("own offset", "constant")
     assert load_bundle(output).card.training["started_from"] == f"{started.model_id:08x}"
+
+
+def test_few_configurations_start_from_the_simulator(tmp_path, monkeypatch):
+    monkeypatch.setattr(datasets, "build_dataset", lambda records, preprocessing: dataset(6, 3, samples=157))
+    monkeypatch.setattr(choosing, "standard", lambda recipe: CONSTANTS[:1])
+    output, result = tmp_path / "cold.onnx", tmp_path / "cold.json"
+    done = run("train", "--data", tmp_path, "-o", output, "--folds", 2, "--json", result)
+    assert done.exit_code == 0, done.output
+    assert "kept unless another one is 10% better" in " ".join(done.output.split())
+    found, made, start = (
+        json.loads(result.read_text()),
+        load_bundle(output),
+        load_bundle(simulated_model_path()),
+    )
+    assert found["choice"]["chosen"] == made.card.training["chosen"] == cold_start.NAME
+    assert set(found) == {"model_id", "n", "refused", "rows", "by_configuration", "choice"}
+    assert made.card.training["started_from"] == f"{start.model_id:08x}"
+    inputs = windows(5, 157)
+    half = floating.predict_m(float_network(start), inputs) / 2
+    assert floating.predict_m(float_network(made), inputs) == pytest.approx(half, abs=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -175,7 +175,16 @@ def test_the_card_tells_the_errors_on_configurations_not_seen():
     assert np.mean(np.abs(left) <= deviation) == pytest.approx(0.68 * 13 / 12, abs=0.01)
     assert np.mean(np.abs(left) <= card.interval95_sigmas * deviation) > 0.95
     assert card.variance_m2 < card.variance_uncorrected_m2
+    assert card.training["configurations"] == data.names
     assert card.training["metrics_m"]["raw"]["mae"] == round(float(np.abs(data.error_m).mean()), 4)
+
+
+def test_a_card_names_no_thousands_of_configurations():
+    data = dataset(101, 1, samples=8)
+    recipe = recipes.Recipe(Remnet(samples=8), FitOptions(epochs=1))
+    validation = recipes.CrossValidation(data, {"raw": data.error_m, "float": data.error_m}, 2, 0)
+    card = recipes.describe("name", recipe, LinePrior(0.5), validation, "data")
+    assert card.training["configurations"] == 101
 
 
 def test_without_a_line_the_network_is_alone():

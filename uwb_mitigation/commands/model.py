@@ -15,11 +15,12 @@ from uwb_mitigation.errors import MissingDependencyError, ModelError, ParameterE
 
 if TYPE_CHECKING:
     from uwb_mitigation.dataset import Dataset
+    from uwb_mitigation.model.bundle import Bundle
     from uwb_mitigation.preprocessing import Preprocessing
     from uwb_mitigation.sources.source import Record
     from uwb_mitigation.training.choosing import Candidate, Choice
     from uwb_mitigation.training.options import FitOptions
-    from uwb_mitigation.training.recipe import Recipe
+    from uwb_mitigation.training.recipe import CrossValidation, Recipe
 
 app = typer.Typer()
 
@@ -91,7 +92,10 @@ def train(
         _site(from_bag, truth or [], model, output, options, folds, seed, json)
         return
     assert data is not None
-    from uwb_mitigation.training import choosing
+    from uwb_mitigation.model import graph
+    from uwb_mitigation.model.bundle import load_bundle, save_bundle
+    from uwb_mitigation.model.shipped import simulated_model_path
+    from uwb_mitigation.training import choosing, cold_start, site
     from uwb_mitigation.training import recipe as recipes
 
     if choose not in ("auto", *choosing.STANDARD):
@@ -99,29 +103,42 @@ def train(
     choose = choose if prior else choosing.NETWORK
     recipe = recipes.Recipe(architecture, options, per_configuration=per_configuration)
     dataset, name = _dataset(data, Preprocessing(samples, Scaling(scaling)))
+    folds = min(folds, len(dataset.names))
     choice = None
     if choose == "auto":
-        choice = _choose(dataset, choosing.standard(recipe), folds, seed)
-        recipe = choosing.recipe_of(choice.chosen, recipe)
+        start = load_bundle(simulated_model_path())
+        candidates = cold_start.offered(choosing.standard(recipe), dataset, start)
+        choice = _choose(dataset, candidates, folds, seed)
+        choose = choice.chosen
+    if choice is not None and choose == cold_start.NAME:
+        graded, validation = site.fit_chosen(dataset, choice, candidates, start, options, output.stem, name)
+        bundle = save_bundle(output, graph.float_model(graded.network), graded.card)
+        tested = "float"
     else:
-        recipe = replace(
-            recipe,
-            line=choose in (choosing.LINE, choosing.LINE_NETWORK),
-            network=choose in (choosing.LINE_NETWORK, choosing.NETWORK),
-        )
-    _train(dataset, name, recipe, choice, output, folds, seed, json)
+        recipe = choosing.recipe_of(choose, recipe)
+        bundle, validation = _train(dataset, name, recipe, output, folds, seed)
+        model_tables.show_validation(validation)
+        tested = "int8"
+    model_tables.show_bundle(bundle)
+    console.write_json(
+        json,
+        {
+            "model_id": bundle.model_id,
+            "n": len(dataset),
+            "refused": dict(dataset.refused),
+            "rows": [{"name": row, **statistics} for row, statistics in validation.statistics().items()],
+            "by_configuration": {
+                key: {"n": n, "raw_mae": before, "corrected_mae": after}
+                for key, (n, before, after) in validation.by_configuration(tested).items()
+            },
+            **({} if choice is None else {"choice": choice.as_json()}),
+        },
+    )
 
 
 def _train(
-    dataset: Dataset,
-    name: str,
-    recipe: Recipe,
-    choice: Choice | None,
-    output: Path,
-    folds: int,
-    seed: int,
-    json: Path | None,
-) -> None:
+    dataset: Dataset, name: str, recipe: Recipe, output: Path, folds: int, seed: int
+) -> tuple[Bundle, CrossValidation]:
     from uwb_mitigation.model import graph
     from uwb_mitigation.model.bundle import save_bundle
     from uwb_mitigation.training import recipe as recipes
@@ -135,33 +152,31 @@ def _train(
         validation = recipes.cross_validate(dataset, recipe, folds, seed, advance)
         line, network = recipes.fit_model(dataset, recipe, advance)
     card = recipes.describe(output.stem, recipe, line, validation, name)
-    bundle = save_bundle(output, graph.float_model(network), card)
-    model_tables.show_validation(validation)
-    model_tables.show_bundle(bundle)
-    console.write_json(
-        json,
-        {
-            "model_id": bundle.model_id,
-            "n": len(dataset),
-            "refused": dict(dataset.refused),
-            "rows": [{"name": row, **statistics} for row, statistics in validation.statistics().items()],
-            "by_configuration": {
-                key: {"n": n, "raw_mae": before, "corrected_mae": after}
-                for key, (n, before, after) in validation.by_configuration("int8").items()
-            },
-            **({} if choice is None else {"choice": choice.as_json()}),
-        },
-    )
+    return save_bundle(output, graph.float_model(network), card), validation
 
 
 def _choose(dataset: Dataset, candidates: Sequence[Candidate], folds: int, seed: int) -> Choice:
-    from uwb_mitigation.training import choosing
+    from uwb_mitigation.training import choosing, cold_start
 
+    is_cold = candidates[0].name == cold_start.NAME
     with console.progress() as bar:
         total = choosing.fits(folds, len(dataset.names), len(candidates))
         task = bar.add_task("choosing", total=total)
-        choice = choosing.choose(dataset, candidates, folds, seed, lambda: bar.advance(task))
-    model_tables.show_choice(choice, len(dataset.names))
+        choice = choosing.choose(
+            dataset,
+            candidates,
+            folds,
+            seed,
+            lambda: bar.advance(task),
+            must_gain=cold_start.MUST_GAIN if is_cold else choosing.MUST_GAIN,
+        )
+    model_tables.show_choice(choice)
+    if is_cold:
+        console.out.print(
+            f"With {cold_start.MOST_CONFIGURATIONS} configurations or fewer, a line averaged with a network "
+            f"trained in the simulator is kept unless another one is {cold_start.MUST_GAIN:.0%} better.",
+            highlight=False,
+        )
     return choice
 
 
@@ -178,11 +193,12 @@ def _site(
     from uwb_mitigation.dataset import build_dataset
     from uwb_mitigation.model import graph
     from uwb_mitigation.model.bundle import load_bundle, save_bundle
-    from uwb_mitigation.model.shipped import default_model_path
+    from uwb_mitigation.model.shipped import default_model_path, simulated_model_path
     from uwb_mitigation.sources.truth_table import load_truth, with_truth
-    from uwb_mitigation.training import site
+    from uwb_mitigation.training import cold_start, site
 
     source = load_bundle(model or default_model_path())
+    simulated = load_bundle(simulated_model_path())
     candidates = site.candidates(source, options)
     stretches = [row for path in truth for row in load_truth(path)]
     records = _records(bag)
@@ -190,11 +206,13 @@ def _site(
     for reason, count in dataset.refused.items():
         console.err.print(f"left out: {count} x {reason}", markup=False)
     folds = min(folds, len(dataset.names))
+    candidates = cold_start.offered(candidates, dataset, simulated)
     choice = _choose(dataset, candidates, folds, seed)
-    graded = site.fit_chosen(dataset, choice, candidates, source, options, output.stem, bag.resolve().name)
+    start = simulated if choice.chosen == cold_start.NAME else source
+    graded, _ = site.fit_chosen(dataset, choice, candidates, start, options, output.stem, bag.resolve().name)
     bundle = save_bundle(output, graph.float_model(graded.network), graded.card)
     mae = choice.mae()
-    for before in ("raw", candidates[0].name):
+    for before in ("raw", site.AS_SHIPPED):
         change = mae[site.NESTED] / mae[before] - 1
         console.out.print(
             f"on configurations not seen, {mae[site.NESTED]:.3f} m against {mae[before]:.3f} m {before}: "
@@ -208,7 +226,7 @@ def _site(
             "model_id": bundle.model_id,
             "n": len(dataset),
             "refused": dict(dataset.refused),
-            "helped": mae[site.NESTED] < min(mae["raw"], mae[candidates[0].name]),
+            "helped": mae[site.NESTED] < min(mae["raw"], mae[site.AS_SHIPPED]),
             "choice": choice.as_json(),
         },
     )

@@ -25,29 +25,50 @@ _ROWS = {
 }
 
 
-def show_choice(choice: Choice, configurations: int) -> None:
-    table = Table(title=f"{configurations} configurations, {choice.folds} folds by configuration, m")
+# What the candidates of `train` are, by their names.
+_CANDIDATES = {
+    "raw": "as measured",
+    "as shipped": "the model that was started from",
+    "own offset": "the same with another offset",
+    "line, simulated network": "half of each",
+    "constant": "less one offset",
+    "line": "less a line in the received power",
+    "line+network": "the network on what the line leaves",
+    "network": "the network alone",
+    "chosen (nested)": "of the choice, made without what it is tested on",
+}
+
+
+def show_choice(choice: Choice) -> None:
+    table = Table(
+        title=f"{choice.configurations} configurations, {choice.folds} folds by configuration",
+        title_justify="left",
+    )
+    table.add_column("candidate")
+    table.add_column("MAE, m", justify="right")
     table.add_column("")
-    table.add_column("MAE", justify="right")
     for row, mae in choice.mae().items():
-        table.add_row(row + (" <- chosen" if row == choice.chosen else ""), f"{mae:.3f}")
+        is_chosen = row == choice.chosen
+        table.add_row(
+            row,
+            f"{mae:.3f}",
+            _CANDIDATES.get(row, "") + (" <- chosen" if is_chosen else ""),
+            style="bold" if is_chosen else None,
+        )
     console.out.print(table)
-    curve = ", ".join(f"{count}: {mae:.3f}" for count, mae in choice.curve)
+    curve = ", ".join(f"{mae:.3f} m with {count}" for count, mae in choice.curve)
     needed = choice.needed()
     outlook = (
-        "more configurations of this kind are not expected to lower it by 5 %"
+        "More configurations of this kind are not expected to lower it by 5 %."
         if needed is None
-        else f"some {needed} would be needed to lower it by 5 %"
+        else f"If it goes on like this, some {needed} configurations lower it by 5 %."
     )
-    console.out.print(
-        f"{choice.chosen}, MAE by number of configurations: {curve}; {outlook}",
-        highlight=False,
-        soft_wrap=True,
-    )
+    console.out.print(f"MAE of {choice.chosen} by configurations: {curve}. {outlook}", highlight=False)
 
 
 def show_validation(validation: CrossValidation) -> None:
-    table = Table(title=f"{validation.folds}-fold cross-validation by configuration, m")
+    title = f"{validation.folds}-fold cross-validation by configuration, m"
+    table = Table(title=title, min_width=len(title))
     table.add_column("")
     for column in ("MAE", "std", "p95"):
         table.add_column(column, justify="right")

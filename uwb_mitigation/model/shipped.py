@@ -1,4 +1,4 @@
-"""Finds the model that ships with the package, wherever it is installed."""
+"""Finds the models that ship with the package, wherever it is installed."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 from uwb_mitigation.errors import ModelError
 
 SHIPPED = "evk1000_apartment.onnx"
+SIMULATED = "simulated_flat.onnx"
 _SHARE = Path("share", "uwb_mitigation", "models")
 
 
@@ -18,12 +19,21 @@ def default_model_path() -> Path:
     Raises:
         ModelError: it is in none of these; the message lists them.
     """
-    candidates = [folder / SHIPPED for folder in _folders()]
+    return _find(SHIPPED)
+
+
+def simulated_model_path() -> Path:
+    """The model that was trained in the simulator alone, to start from with few configurations: as above."""
+    return _find(SIMULATED)
+
+
+def _find(name: str) -> Path:
+    candidates = [folder / name for folder in _folders()]
     for candidate in candidates:
         if candidate.is_file():
             return candidate
     raise ModelError(
-        f"the shipped model {SHIPPED} is not installed",
+        f"the shipped model {name} is not installed",
         where=", ".join(str(candidate.parent) for candidate in candidates),
         valid="install the package again, or name a model",
     )

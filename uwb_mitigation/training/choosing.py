@@ -1,4 +1,4 @@
-"""Which model a data set can carry: the simplest of a few that no richer one beats on configurations held out.
+"""Which model a data set can carry: the simplest of a few that no richer one betters on configurations held out.
 
 What chooses is itself cross-validated: in each outer fold the choice is made anew from the other folds alone, so
 that the error that is told of the chosen model was tuned on nothing that it is measured on.
@@ -7,7 +7,7 @@ that the error that is told of the chosen model was tuned on nothing that it is 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +34,7 @@ Fitted = tuple[LinePrior, FloatWeights | None]
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A way to fit a prior and, or not, a network; candidates stand in order from simple to rich.
+    """A way to fit a prior and, or not, a network; candidates stand in order of preference, simple before rich.
 
     Attributes:
         name: in tables.
@@ -54,6 +54,7 @@ class Choice:
         errors: {candidate, `raw` or `chosen (nested)`: errors on held-out configurations}, float64 (n,), m.
         curve: (configurations, MAE on others) of the chosen candidate.
         folds, seed: of the outer splits.
+        configurations: in all of the data.
     """
 
     chosen: str
@@ -61,6 +62,7 @@ class Choice:
     curve: tuple[tuple[int, float], ...]
     folds: int
     seed: int
+    configurations: int
 
     def mae(self) -> dict[str, float]:
         """{name: MAE}, m."""
@@ -76,7 +78,7 @@ class Choice:
         }
 
     def needed(self, share: float = 0.95) -> int | None:
-        """How many configurations it would take for `share` of the error; None = more of the same would not do.
+        """How many configurations it would take for `share` of the error of now; None = more of the same would not do.
 
         From MAE = a + b / n, least squares through the learning curve.
         """
@@ -86,7 +88,7 @@ class Choice:
         (floor, slope), *_ = np.linalg.lstsq(
             np.column_stack([np.ones(len(count)), 1 / count]), mae, rcond=None
         )
-        wanted = share * (floor + slope / count[-1])
+        wanted = share * (floor + slope / self.configurations)
         if slope <= 0 or wanted <= floor:
             return None
         return int(np.ceil(slope / (wanted - floor)))
@@ -114,8 +116,13 @@ def line(data: Dataset) -> LinePrior:
 
 
 def alone(options: FitOptions) -> FitOptions:
-    """How a network without a prior is fitted: it needs more of it than one that only refines a line."""
-    return replace(options, epochs=20, learning_rate=1e-3, dropout=0.2)
+    """How a network without a prior is fitted: it needs more of it than one that only refines a line.
+
+    What differs in `options` from the defaults was asked for, and stays.
+    """
+    defaults = asdict(FitOptions())
+    asked = {name: value for name, value in asdict(options).items() if value != defaults[name]}
+    return replace(FitOptions(epochs=20, learning_rate=1e-3, dropout=0.2), **asked)
 
 
 def recipe_of(name: str, recipe: Recipe) -> Recipe:
@@ -134,8 +141,12 @@ def choose(
     folds: int,
     seed: int,
     on_fit: Callable[[], None] = lambda: None,
+    *,
+    must_gain: float = MUST_GAIN,
 ) -> Choice:
     """Choose by cross-validation over configurations, and tell by a nested one how good the choice is.
+
+    `must_gain`: see `preferred`.
 
     Raises:
         DatasetError, ParameterError: see `splits.by_configuration` and `fit`.
@@ -148,10 +159,11 @@ def choose(
         inner = _held_out(train, candidates, max(2, folds - 2), seed, on_fit)
         for name in names:
             errors[name][split.test] = left[name]
-        errors[NESTED][split.test] = left[simplest(inner)]
-    chosen = simplest({name: errors[name] for name in names})
+        errors[NESTED][split.test] = left[preferred(inner, must_gain)]
+    chosen = preferred({name: errors[name] for name in names}, must_gain)
     (candidate,) = (item for item in candidates if item.name == chosen)
-    return Choice(chosen, errors, _curve(dataset, candidate, seed, on_fit), folds, seed)
+    curve = _curve(dataset, candidate, seed, on_fit)
+    return Choice(chosen, errors, curve, folds, seed, len(dataset.names))
 
 
 NESTED = "chosen (nested)"
@@ -164,12 +176,12 @@ def fits(folds: int, configurations: int, candidates: int) -> int:
     return folds * candidates * (1 + inner) + len(_sizes(configurations)) * CURVE_DRAWS
 
 
-def simplest(errors: Mapping[str, NDArray[np.float64]]) -> str:
-    """The first of candidates, from simple to rich, that no later one betters by `MUST_GAIN`."""
+def preferred(errors: Mapping[str, NDArray[np.float64]], must_gain: float) -> str:
+    """The first of candidates, in order of preference, that no later one betters by the share `must_gain`."""
     best, best_mae = "", np.inf
     for name, error in errors.items():
         mae = float(np.abs(error).mean())
-        if not best or mae < (1 - MUST_GAIN) * best_mae:
+        if not best or mae < (1 - must_gain) * best_mae:
             best, best_mae = name, mae
     return best
 

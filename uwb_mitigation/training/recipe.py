@@ -26,6 +26,9 @@ from uwb_mitigation.training.fitting import FitOptions, fit, single_thread
 from uwb_mitigation.training.networks import RemnetModule
 from uwb_mitigation.training.quantization import calibration_inputs, quantize
 
+MOST_NAMED = 100
+"""Configurations that a card names one by one; of more it tells how many, as they would outweigh the network."""
+
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
@@ -178,7 +181,7 @@ def describe(name: str, recipe: Recipe, prior: LinePrior, validation: CrossValid
         correction_limits_m=(_float32(low - margin), _float32(high + margin)),
         training={
             "data": data,
-            "configurations": dataset.names,
+            "configurations": names if len(names := dataset.names) <= MOST_NAMED else len(names),
             "measurements": len(dataset),
             "split": f"{validation.folds} folds by configuration",
             "seed": validation.seed,

@@ -19,9 +19,10 @@ from uwb_mitigation.training.choosing import NESTED, Candidate, Choice, Fitted
 from uwb_mitigation.training.fitting import FitOptions, fit
 from uwb_mitigation.training.recipe import CrossValidation, GradedModel, Recipe, describe, prior_m
 
-__all__ = ["NESTED", "candidates", "fit_chosen"]
+__all__ = ["NESTED", "candidates", "fit_chosen", "float_network"]
 
 PER_CONFIGURATION = 20
+AS_SHIPPED = "as shipped"
 
 
 def candidates(source: Bundle, options: FitOptions) -> list[Candidate]:
@@ -31,9 +32,7 @@ def candidates(source: Bundle, options: FitOptions) -> list[Candidate]:
     Raises:
         ModelError: the source's network is no REMNet.
     """
-    if not isinstance(source.architecture, Remnet):
-        raise ModelError("no REMNet to start from", where=str(source.path), valid="a bundle of `train`")
-    network = _float_network(source)
+    network = float_network(source)
 
     def shifted(data: Dataset, seed: int) -> Fitted:
         left = data.error_m - prior_m(source.prior, data) - floating.predict_m(network, data.inputs)
@@ -50,7 +49,7 @@ def candidates(source: Bundle, options: FitOptions) -> list[Candidate]:
         return prior, fit(source.architecture, part.inputs[known], left[known], chosen, start=network)
 
     return [
-        Candidate("as shipped", lambda data, seed: (source.prior, network)),
+        Candidate(AS_SHIPPED, lambda data, seed: (source.prior, network)),
         Candidate("own offset", shifted),
         Candidate(
             choosing.CONSTANT, lambda data, seed: (lad.constant(data.configurations, data.error_m), None)
@@ -68,13 +67,18 @@ def fit_chosen(
     options: FitOptions,
     name: str,
     data: str,
-) -> GradedModel:
-    """The chosen model of all of the dataset, its intervals from the errors on held-out configurations."""
-    assert isinstance(source.architecture, Remnet)
+) -> tuple[GradedModel, CrossValidation]:
+    """The chosen model of all of the dataset, and the errors on held-out configurations that its intervals are from.
+
+    Raises:
+        ModelError: the source's network is no REMNet.
+    """
+    silent = _silent(float_network(source))
+    assert isinstance(silent.architecture, Remnet)
     (candidate,) = (item for item in every if item.name == choice.chosen)
     prior, network = candidate.fit(dataset, choice.seed)
     recipe = Recipe(
-        source.architecture,
+        silent.architecture,
         options,
         line=prior.needs_power,
         per_configuration=PER_CONFIGURATION,
@@ -85,14 +89,18 @@ def fit_chosen(
     )
     card = describe(name, recipe, prior, validation, data)
     started = {"started_from": f"{source.model_id:08x}", "chosen": choice.chosen}
-    return GradedModel(
-        replace(card, training={**card.training, **started}),
-        network if network is not None else _silent(_float_network(source)),
-    )
+    card = replace(card, training={**card.training, **started})
+    return GradedModel(card, silent if network is None else network), validation
 
 
-def _float_network(source: Bundle) -> FloatWeights:
-    """The float network that an int8 bundle stands for; of a float bundle its own."""
+def float_network(source: Bundle) -> FloatWeights:
+    """The float network that an int8 bundle stands for; of a float bundle its own.
+
+    Raises:
+        ModelError: it is no REMNet.
+    """
+    if not isinstance(source.architecture, Remnet):
+        raise ModelError("no REMNet to start from", where=str(source.path), valid="a bundle of `train`")
     if not source.quantised:
         return graph.float_weights(source.model, source.architecture)
     integers = graph.int8_weights(source.model, source.architecture)
