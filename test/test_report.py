@@ -381,6 +381,13 @@ def test_hostile_names_are_text_and_nothing_else(name: str):
     assert not re.search(r"<script|[\x00\u202e]", page)
 
 
+@pytest.mark.usefixtures("without_clouds")
+def test_the_command_names_the_networks_that_were_trained():
+    trainings = results.parse_trainings(protocol(trained("mlp"), trained()), "here")
+    command = report.build(study(), COMMANDS, trainings).tables[1].provenance.command
+    assert "--networks mlp,remnet " in command
+
+
 def test_a_path_with_spaces_can_be_pasted_into_a_shell():
     assert (
         report.Commands("my logs; rm -rf", "out").report

@@ -63,9 +63,13 @@ class Commands:
     @property
     def protocol(self) -> str:
         """Trains every network of the paper."""
+        return self.protocol_of(["remnet", "mlp", "remnet_attention"])
+
+    def protocol_of(self, networks: Sequence[str]) -> str:
+        """Trains these networks."""
         folder = "models" if self.quick or not self.models else self.models
         words = ["uwb-mitigation", "protocol", "--data", self.data, "-o", folder]
-        words += ["--networks", "remnet,mlp,remnet_attention"]
+        words += ["--networks", ",".join(networks)]
         return _shell([*words, *(["--scaling", "preamble"] if self.preamble else [])])
 
     @property
@@ -158,7 +162,7 @@ def _trained_provenance(trainings: Trainings | None, commands: Commands) -> Prov
 def _trained_by(trainings: Trainings, commands: Commands) -> str:
     """The command that trains as these were trained, with the options that are not the protocol's own."""
     seeds = len({model.seed for model in trainings.models})
-    command = commands.protocol
+    command = commands.protocol_of(list(dict.fromkeys(model.network for model in trainings.models)))
     if seeds not in (0, paper.SEEDS):
         command += f" --seeds {seeds}"
     return command if trainings.epochs == paper.EPOCHS else f"{command} --epochs {trainings.epochs}"
