@@ -26,6 +26,7 @@ def test_the_demo_ends_by_itself_with_every_range_equal_to_the_hosts():
     assert done.returncode == 0, done.stdout + done.stderr
     assert "20 corrected by the board, 0 lost" in done.stdout
     assert "20 equal to the host's to the bit, 0 different" in done.stdout
+    assert "gone" not in done.stdout + done.stderr, "the driver's own end is no loss of the board"
 
 
 def test_without_the_tools_the_demo_names_the_line_that_installs_them(

@@ -120,7 +120,8 @@ class BoardFeed:
                 f"connected to board {hello.board_id:x}, model {hello.model_id:08x}, mode {hello.mode.name}"
             )
         elif isinstance(event, Disconnected):
-            self._logger.warning(f"the board is gone: {event.loss.value}; waiting for it")
+            if not self.port.closed:
+                self._logger.warning(f"the board is gone: {event.loss.value}; waiting for it")
         elif isinstance(event, VersionMismatch):
             self._logger.error(
                 f"the board speaks version {event.version} of the protocol, this driver version "
