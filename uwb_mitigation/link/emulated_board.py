@@ -114,7 +114,8 @@ class EmulatedBoard:
         self._source = source
         # Before there is a port: what holds nothing is told to who asks for the board.
         records = _endless(source)
-        self._records = itertools.chain([] if source is None else [next(records)], records)
+        first = [] if source is None else [next(records)]
+        self._records: Iterator[RangeMeasurement] = itertools.chain(first, records)
         self._period_s = 1 / rate_hz
         self._identity = identity
         self._corrector = corrector
