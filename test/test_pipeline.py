@@ -21,7 +21,7 @@ from uwb_mitigation.sources.simulated import SimulatedSource
 pytestmark = pytest.mark.ros
 
 CORRECTED = "/uwb/range_corrected"
-PLAY = ("count:=200", "seed:=1", "simulated_rate:=200.0", "start_delay:=0.5")
+PLAY = ("count:=200", "seed:=1", "simulated_rate:=400.0", "start_delay:=0.5")
 
 
 @pytest.fixture
@@ -32,7 +32,7 @@ def ros(tmp_path: Path):
 
 def test_the_ranges_are_those_of_the_library_to_the_bit(ros: Ros):
     mitigation = Mitigation(load_bundle(default_model_path()))
-    source = SimulatedSource(seed=1, count=200, rate_hz=200.0)
+    source = SimulatedSource(seed=1, count=200, rate_hz=400.0)
     expected = [mitigation.correct(record.measurement) for record in source]
     received = ros.collect(RangeCorrected, CORRECTED)
     pipeline = ros.start("pipeline", *PLAY)

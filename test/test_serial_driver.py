@@ -116,7 +116,7 @@ def test_a_board_that_runs_the_model_gives_what_the_host_gives(ros: Ros, link: P
 def test_the_mode_changes_without_a_restart(ros: Ros, link: Path):
     corrected = ros.collect(RangeCorrected, CORRECTED)
     ros.start("mitigator").wait_for_output("correcting with model")
-    with board(link, model=True):
+    with board(link, model=True, rate_hz=200.0):
         driver = drive(ros, link)
         for mode, origin in (("host", Origin.HOST), ("device", Origin.DEVICE), ("host", Origin.HOST)):
             assert set_mode(ros, mode)
@@ -129,7 +129,7 @@ def test_the_mode_changes_without_a_restart(ros: Ros, link: Path):
 
 def test_in_both_mode_the_diagnostics_tell_that_board_and_host_agree(ros: Ros, link: Path):
     ros.start("mitigator").wait_for_output("correcting with model")
-    with board(link, model=True):
+    with board(link, model=True, rate_hz=200.0):
         drive(ros, link, "mode:=both")
         status = ros.diagnosis("driver", lambda s: int(fact(s, "board and host agree") or 0) > 50)
     assert fact(status, "board and host differ") == "0"
