@@ -77,8 +77,12 @@ def fact(status: DiagnosticStatus, key: str) -> str:
 def test_what_the_board_measures_is_published_with_stamps_of_the_measurement(ros: Ros, link: Path):
     received: list[tuple[int, RangeCir]] = []
     ros.node.create_subscription(RangeCir, RAW, lambda m: received.append((time.time_ns(), m)), 1000)
-    with board(link):
+    with board(link) as device:
+        # Nothing is lost once the driver is there; before, the board drops what nobody reads.
+        device.pause()
         driver = drive(ros, link)
+        ros.diagnosis("driver", lambda s: s.message == "connected")
+        device.resume()
         ros.spin_until(lambda: len(received) >= 100)
     # The board plays them over and over; the simulator leaves out what was too weak to be received.
     played = [
