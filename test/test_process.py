@@ -532,6 +532,20 @@ def test_ctrl_c_ends_cleanly_and_leaves_no_partial_file(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["in.mcap"]
 
 
+def test_of_a_worker_that_was_stopped_anywhere_no_partial_file_stays(tmp_path: Path) -> None:
+    class Left:
+        """A worker that SIGTERM has ended between making the file and entering what removes it."""
+
+        terminate = staticmethod(lambda: None)
+        join = staticmethod(lambda timeout_s: None)
+        is_alive = staticmethod(lambda: False)
+
+    stopped = job(tmp_path / "in.mcap", tmp_path / "out.mcap")
+    (tmp_path / "out.mcap.part").write_bytes(b"begun")
+    running._stop([Left()], [stopped])
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_worker_that_dies_costs_its_own_bag_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     jobs = [
         job(write_bag(tmp_path / f"in{n}.mcap", exchanges(300)), tmp_path / f"out{n}.mcap") for n in range(3)

@@ -157,7 +157,8 @@ def _stop(processes: Sequence[BaseProcess], jobs: Sequence[Job]) -> None:
         if process.is_alive():
             process.kill()
             process.join()
-            _remove_partial(job)
+        # Also of one that left by itself: it may have been about to enter what would have removed it.
+        _remove_partial(job)
 
 
 def _remove_partial(job: Job) -> None:
