@@ -59,9 +59,9 @@ def show_choice(choice: Choice) -> None:
     curve = ", ".join(f"{mae:.3f} m with {count}" for count, mae in choice.curve)
     needed = choice.needed()
     outlook = (
-        "More configurations of this kind are not expected to lower it by 5 %."
+        "More configurations of this kind are not expected to lower it by 5%."
         if needed is None
-        else f"If it goes on like this, some {needed} configurations lower it by 5 %."
+        else f"If it goes on like this, some {needed} configurations lower it by 5%."
     )
     console.out.print(f"MAE of {choice.chosen} by configurations: {curve}. {outlook}", highlight=False)
 
