@@ -217,6 +217,11 @@ def test_arbitrary_cirs_break_no_promise_under_the_sanitizers(scaling: Scaling, 
     assert {0, 4, 5, 6, 7, 9, 12, 14} <= statuses
 
 
+def test_arbitrary_bytes_break_no_promise_of_a_board_under_the_sanitizers(tmp_path: Path):
+    firmware_models.write_model(tmp_path, synthetic.random_remnet(16, 3))
+    run([build_program("fuzz_link", tmp_path, ADDRESS_SANITIZED), "1000", "1"])
+
+
 @pytest.mark.skipif(shutil.which("cmake") is None, reason="no CMake: apt install cmake")
 def test_plain_cmake_builds_the_library_and_passes_its_test(tmp_path: Path):
     firmware_models.write_model(tmp_path, synthetic.random_remnet(16, 3))

@@ -1,8 +1,8 @@
 /* Feeds arbitrary bytes, as from the host and as from the radio's side, to a board, and stops on what breaks its promises.
  *
- *     clang -fsanitize=fuzzer,address,undefined -Isrc -I<export> test/fuzz_link.c src/uwb_*.c
+ *     clang -fsanitize=fuzzer,address,undefined -DUWB_LIBFUZZER -Isrc -I<export> test/fuzz_link.c src/uwb_*.c
  *
- * Half of the stretches are made into intact frames, so that inputs get past the CRC. */
+ * Without a fuzzer it makes its own inputs: fuzz_link <inputs> <seed>. Half of the stretches are made into intact frames, so that inputs get past the CRC. */
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -87,3 +87,23 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
     free(board);
     return 0;
 }
+
+#ifndef UWB_LIBFUZZER
+int main(int argc, char **argv) {
+    static uint8_t data[20000];
+    if (argc != 3) {
+        return 2;
+    }
+    uint64_t state = strtoull(argv[2], NULL, 10) * 2u + 1u;
+    const unsigned long inputs = strtoul(argv[1], NULL, 10);
+    for (unsigned long i = 0; i < inputs; i++) {
+        for (size_t byte = 0; byte < sizeof data; byte++) {
+            /* Knuth's MMIX generator; its high bits are the random ones. */
+            state = state * 6364136223846793005u + 1442695040888963407u;
+            data[byte] = (uint8_t)(state >> 56);
+        }
+        (void)LLVMFuzzerTestOneInput(data, sizeof data);
+    }
+    return 0;
+}
+#endif
