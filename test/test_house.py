@@ -37,6 +37,16 @@ def test_importing_the_package_and_its_command_line_needs_neither_ros_nor_torch(
     subprocess.run([sys.executable, "-c", code], check=True, cwd=REPOSITORY)
 
 
+def test_the_doctor_comes_even_where_numpy_does_not():
+    code = "import sys; sys.modules['numpy'] = None\nfrom uwb_mitigation.cli import main\nmain()"
+    done = subprocess.run(
+        [sys.executable, "-c", code, "doctor"], cwd=REPOSITORY, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 1, done.stderr
+    assert "numpy" in done.stdout
+    assert "Traceback" not in done.stderr
+
+
 @pytest.mark.parametrize("module", ["measurement", "preprocessing", "errors"])
 def test_pure_modules_do_no_input_or_output(module: str):
     text = (PACKAGE / f"{module}.py").read_text(encoding="utf-8")

@@ -342,6 +342,14 @@ def test_sizes_are_in_kilobytes():
     assert [cell["text"] for cell in row[-3:]] == ["27.825", "28.105", "23.888"]
 
 
+def test_a_spread_that_rounds_to_nothing_is_not_shown():
+    models = [
+        trained(seed=seed, bytes_float=27825 + seed // 4, bytes_int8=23888 + 10 * seed) for seed in range(5)
+    ]
+    row = row_of(tabled("table2", *models), "REMNet", "157")
+    assert [cell["text"] for cell in row[-3:]] == ["27.825", "28.105", "23.908 ± 0.016"]
+
+
 def test_rates_and_energy_of_the_emulator_are_called_estimated():
     found = tabled("table3", firmware=(firmware_row(),))
     row = row_of(found, "REMNet", "157", "Cortex-M4")
@@ -442,7 +450,7 @@ def test_quick_training_fills_tables_and_boxes(tmp_path, monkeypatch):
     from uwb_mitigation.commands import report as command
 
     monkeypatch.setattr(command, "QUICK_EPOCHS", 1)
-    monkeypatch.setattr(command, "QUICK_WINDOWS", (16, 8))
+    monkeypatch.setattr("uwb_mitigation.preprocessing.WINDOW_SIZES", (16, 8))
     data, target = deepuwb_pickle(tmp_path), tmp_path / "out.json"
     result = run("--data", data, "-o", tmp_path / "out", "--train", "quick", "--json", target)
     assert result.exit_code == 0, result.output

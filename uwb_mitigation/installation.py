@@ -165,14 +165,12 @@ def _udev_rule() -> Iterator[Finding]:
 
 
 def _tools() -> Iterator[Finding]:
-    from uwb_mitigation.firmware_export import toolchain
-
     # Not imported: that takes seconds.
     torch = _attempt("torch", partial(metadata.version, "torch"), "make setup-training")
     purposes = {
         "cc": ("mitigator with backend:=firmware", "apt install gcc"),
-        "arm-none-eabi-gcc": ("builds the firmware", toolchain.APT),
-        "qemu-system-arm": ("runs the firmware without a board", toolchain.APT),
+        "arm-none-eabi-gcc": ("builds the firmware", "apt install gcc-arm-none-eabi libnewlib-arm-none-eabi"),
+        "qemu-system-arm": ("runs the firmware without a board", "apt install qemu-system-arm"),
     }
     yield replace(torch, state=State.OPTIONAL, detail="for training") if torch.fix else torch
     for tool, (purpose, fix) in purposes.items():

@@ -14,7 +14,6 @@ import typer
 from uwb_mitigation.commands import console
 from uwb_mitigation.commands.console import JsonOption
 from uwb_mitigation.errors import MissingDependencyError, ParameterError, UwbMitigationError
-from uwb_mitigation.preprocessing import WINDOW_SIZES, Preprocessing, Scaling
 
 if TYPE_CHECKING:
     import numpy as np
@@ -30,7 +29,6 @@ MAX_BYTES = 64 * 2**20
 
 QUICK_EPOCHS = 2
 QUICK_MEASUREMENTS = 5000
-QUICK_WINDOWS = WINDOW_SIZES
 
 
 class Training(str, enum.Enum):
@@ -72,6 +70,7 @@ def report(
     # Before the work, not after: a missing library, a wrong file, a place that cannot be written to.
     from uwb_mitigation.evaluation import report as reports
     from uwb_mitigation.evaluation.results import parse_firmware, parse_trainings
+    from uwb_mitigation.preprocessing import Scaling
 
     trainings = None if models is None else parse_trainings(_read(models / PROTOCOL), str(models / PROTOCOL))
     bench = () if firmware is None else parse_firmware(_read(firmware), str(firmware))
@@ -114,6 +113,7 @@ def _study(data: Path, simulated: bool) -> Study:
     """The recording, scaled by the preamble count where its radio reports one, else by the maximum."""
     from uwb_mitigation.dataset import build_dataset
     from uwb_mitigation.evaluation.study import Study
+    from uwb_mitigation.preprocessing import WINDOW_SIZES, Preprocessing, Scaling
     from uwb_mitigation.sources.opening import open_recording
 
     with open_recording(data) as source, console.progress() as bar:
@@ -136,6 +136,7 @@ def _name(name: str, data: Path) -> str:
 def _train_quick(study: Study, folder: Path) -> Trainings:
     """Every network of the paper in short, on the paper's rooms or on a split by configuration."""
     from uwb_mitigation.evaluation.results import parse_trainings
+    from uwb_mitigation.preprocessing import WINDOW_SIZES
 
     try:
         from uwb_mitigation.training import protocol
@@ -149,7 +150,7 @@ def _train_quick(study: Study, folder: Path) -> Trainings:
     if step > 1:
         split = f"{split}; one in {step} of those to train on"
     parts = protocol.Parts(study.title, split, study.dataset.rows(train[::step]), study.dataset.rows(test))
-    wanted = protocol.jobs(["remnet", "mlp"], QUICK_WINDOWS, seeds=1)
+    wanted = protocol.jobs(["remnet", "mlp"], WINDOW_SIZES, seeds=1)
     with console.progress() as bar:
         task = bar.add_task("training, quick", total=1.0)
         protocol.run(
@@ -170,6 +171,7 @@ def _errors(study: Study, trainings: Trainings, folder: Path) -> dict[int, NDArr
     from uwb_mitigation.evaluation.study import agrees
     from uwb_mitigation.model.bundle import load_bundle
     from uwb_mitigation.model.session import Session
+    from uwb_mitigation.preprocessing import WINDOW_SIZES
 
     rows = study.test_rows(trainings.test, trainings.mae_raw)
     if rows is None:
