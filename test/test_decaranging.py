@@ -699,7 +699,7 @@ def test_a_folder_without_logs_is_refused(tmp_path):
 
 
 def naive(data: bytes) -> tuple[Counter[str], list[tuple[float, list[bytes] | None]]]:
-    """An independent reading, line by line: oddities, and the range and the lines of the final's CIR of each exchange."""
+    """An independent reading, line by line: oddities, and of each exchange the range and the final's CIR."""
     counts: Counter[str] = Counter()
     exchanges: list[tuple[float, list[bytes] | None]] = []
     seen = ""

@@ -41,7 +41,11 @@ UDEV_FOLDERS = (Path("/etc/udev/rules.d"), Path("/usr/lib/udev/rules.d"), Path("
 _SETUP = "make setup, or install requirements/runtime.txt"
 _ROS = "make setup, or source ROS's setup.sh and that of the workspace"
 _RCLPY = "from rclpy.utilities import get_rmw_implementation_identifier as middleware; print(middleware())"
-_MESSAGES = "from uwb_mitigation_msgs import msg; msg.RangeCir.__class__.__import_type_support__(); print(msg.__path__[0])"
+_MESSAGES = """\
+from uwb_mitigation_msgs import msg
+msg.RangeCir.__class__.__import_type_support__()
+print(msg.__path__[0])
+"""
 _DIALOUT = "sudo usermod -aG dialout $USER, then log in again"
 
 

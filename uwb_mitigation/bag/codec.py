@@ -1,8 +1,9 @@
 """Measurements to and from the CDR bytes of `RangeCir`, `RangeTruth` and `RangeCorrected`.
 
 The layouts are fixed but for strings and one array, so each is a few packed blocks, and every length
-is checked before it is used. CDR aligns each value to its size, counted from the end of the four-byte encapsulation header (OMG DDSI-RTPS 2.5, section 10.2;
-OMG CDR, section 15.3). Little-endian plain CDR only: all that ROS 2 writes.
+is checked before it is used. CDR aligns each value to its size, counted from the end of the four-byte
+encapsulation header (OMG DDSI-RTPS 2.5, section 10.2; OMG CDR, section 15.3). Little-endian plain CDR only:
+all that ROS 2 writes.
 """
 
 from __future__ import annotations

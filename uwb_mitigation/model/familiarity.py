@@ -3,8 +3,9 @@
 Five features, each with the band that it had in training: the range, the receive power brought to 1 m by the law of
 free space (Friis, "A note on a simple transmission formula", Proc. IRE 1946), its excess over the first-path
 power, and two levels of the CIR less the powers that the radio reports of the same signal.
-At 1 m a weaker or a stronger radio differs from walls that the training data had; as received, it does not. The radio computes both powers from the very accumulator, so the last two hardly vary (DW1000 user
-manual, section 4.7): a CIR that is noise, clipped, or cut at the wrong place contradicts them.
+At 1 m a weaker or a stronger radio differs from walls that the training data had; as received, it does not.
+The radio computes both powers from the very accumulator, so the last two hardly vary (DW1000 user manual,
+section 4.7): a CIR that is noise, clipped, or cut at the wrong place contradicts them.
 """
 
 from __future__ import annotations
@@ -42,8 +43,9 @@ class Widening:
     least: float
 
 
-# A placement farther off is what a model is for, and its error itself lengthens the range. A signal weaker or stronger than distance and the walls of the
-# training data make it, or a first path stronger than the line of sight had, is another radio's.
+# A placement farther off is what a model is for, and its error itself lengthens the range. A signal weaker or
+# stronger than distance and the walls of the training data make it, or a first path stronger than the line of
+# sight had, is another radio's.
 _WIDENINGS = (
     Widening(1.0, 2.0, 1.0),
     Widening(0.0, 0.0, 3.0),
@@ -173,7 +175,7 @@ class Strangeness:
 
 
 def _level_db(power: NDArray[np.float32]) -> NDArray[np.float32]:
-    """10 log10 of a power, within 0.03 dB: the exponent is exact, and a parabola stands for the mantissa's logarithm."""
+    """10 log10 of a power, within 0.03 dB: the exponent is exact, a parabola is the mantissa's logarithm."""
     mantissa, exponent = np.frexp(np.minimum(np.maximum(power, MIN_POWER), MAX_POWER))
     octaves = (_SQUARE * mantissa + _LINEAR) * mantissa - _CONSTANT
     level: NDArray[np.float32] = (exponent.astype(np.float32) + octaves) * _DB_PER_OCTAVE
