@@ -276,6 +276,6 @@ def _seeds(models: Sequence[Trained], values: list[float | None], unit: float, d
     if spread is None:
         return Cell("–", "none") if models else Cell(NOT_MEASURED, "missing")
     text = f"{spread.mean:.{digits}f}"
-    if spread.std:
-        text += f" ± {spread.std:.{digits}f}"
+    if spread.std and float(around := f"{spread.std:.{digits}f}"):
+        text += f" ± {around}"
     return Cell(text, "measured", spread.mean, spread.std, spread.n)
