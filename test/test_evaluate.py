@@ -164,9 +164,6 @@ def test_a_place_that_cannot_be_written_is_refused_before_training(tmp_path, rec
     assert isinstance(result.exception, ParameterError)
 
 
-def test_the_shipped_model_takes_the_error_of_the_real_logs_down(apartment):
-    shipped = load_bundle(default_model_path())
-    with opening.open_recording(apartment) as source:
-        records = [item for _, item in zip(range(400), source, strict=False)]
-    outcome = evaluate(Mitigation(shipped), records)
+def test_the_shipped_model_takes_the_error_of_the_real_logs_down(apartment_reading):
+    outcome = evaluate(Mitigation(load_bundle(default_model_path())), apartment_reading.records[:400])
     assert outcome.corrected.mae < 0.6 * outcome.raw.mae

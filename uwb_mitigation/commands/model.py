@@ -173,8 +173,8 @@ def _choose(dataset: Dataset, candidates: Sequence[Candidate], folds: int, seed:
     model_tables.show_choice(choice)
     if is_cold:
         console.out.print(
-            f"With {cold_start.MOST_CONFIGURATIONS} configurations or fewer, a line averaged with a network "
-            f"trained in the simulator is kept unless another one is {cold_start.MUST_GAIN:.0%} better.",
+            f"With {cold_start.MOST_CONFIGURATIONS} configurations or fewer, {cold_start.NAME} is kept unless "
+            f"another one is {cold_start.MUST_GAIN:.0%} better.",
             highlight=False,
         )
     return choice

@@ -30,12 +30,12 @@ _CANDIDATES = {
     "raw": "as measured",
     "as shipped": "the model that was started from",
     "own offset": "the same with another offset",
-    "line, simulated network": "half of each",
+    "cold start": "mean of a line and a simulator-trained network",
     "constant": "less one offset",
     "line": "less a line in the received power",
     "line+network": "the network on what the line leaves",
     "network": "the network alone",
-    "chosen (nested)": "of the choice, made without what it is tested on",
+    "chosen (nested)": "of choosing, on what no choice has seen",
 }
 
 

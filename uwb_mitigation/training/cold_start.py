@@ -22,7 +22,7 @@ from uwb_mitigation.training import choosing
 from uwb_mitigation.training.choosing import Candidate, Fitted
 from uwb_mitigation.training.site import float_network
 
-NAME = "line, simulated network"
+NAME = "cold start"
 
 MOST_CONFIGURATIONS = 18
 """With more, a line of one's own is as good or better (docs/evaluation.md)."""
