@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
+
+# Before numpy is loaded. Tests run side by side: threads that wait for each other only take time from the next test.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 from pathlib import Path
 
 import pytest
 from real_logs import Reading, read_once
-
-# Tests run side by side: threads of numpy's and torch's that wait for each other only take time from the next test.
-os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 

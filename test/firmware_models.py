@@ -115,14 +115,6 @@ def real_measurements(apartment: Path) -> tuple[RangeMeasurement, ...]:
     return tuple(measured)
 
 
-def real_windows(apartment: Path, samples: int) -> NDArray[np.float32]:
-    """What a network of this length reads of the real measurements, float32 (n, samples)."""
-    preprocessing, measured = Preprocessing(samples, Scaling.PREAMBLE), real_measurements(apartment)
-    windows = np.zeros((len(measured), samples), np.float32)
-    usable = [preprocessing.apply(m.cir, window) is None for m, window in zip(measured, windows, strict=True)]
-    return windows[usable]
-
-
 @dataclass(frozen=True)
 class Exported:
     """A network of one shape, with the folder that it was exported to."""
@@ -137,6 +129,15 @@ class Exported:
         """Windows that press on every rounding; zero, saturating and random ones."""
         samples = self.weights.architecture.samples
         return synthetic.pressing_windows(samples, self.weights.activation_scale["input"], self.inputs)
+
+    def real_windows(self, apartment: Path) -> NDArray[np.float32]:
+        """What the network reads of the real measurements; of every fourth for the unusual first kernel."""
+        samples = self.weights.architecture.samples
+        measured = real_measurements(apartment)[:: 4 if self.subject.first_kernel == 5 else 1]
+        windows = np.zeros((len(measured), samples), np.float32)
+        preprocessing = Preprocessing(samples, Scaling.PREAMBLE)
+        usable = [preprocessing.apply(m.cir, row) is None for m, row in zip(measured, windows, strict=True)]
+        return windows[usable]
 
 
 SHAPES = [*itertools.product((3, 5), WINDOW_SIZES), (0, 157)]
@@ -154,4 +155,4 @@ def exported(shape: tuple[int, int], folder: Path) -> Exported:
     )
     write_model(folder, weights)
     subject = subject_of(weights, identity(), graph.int8_model(weights))
-    return Exported(weights, subject, folder, 1000 if first_kernel == 5 else 5000)
+    return Exported(weights, subject, folder, 500 if first_kernel == 5 else 5000)
