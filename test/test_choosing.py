@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from model_material import bundle, dataset, measurement, record, windows
+from model_material import bundle, dataset, measurement, windows
 from typer.testing import CliRunner
 
 from uwb_mitigation import dataset as datasets
@@ -24,7 +24,7 @@ from uwb_mitigation.sources.source import Record
 from uwb_mitigation.sources.truth_table import load_truth, with_truth
 
 pytest.importorskip("torch", reason="run `make setup-training`")
-from uwb_mitigation.training import choosing, cold_start
+from uwb_mitigation.training import choosing, cold_start, site
 from uwb_mitigation.training.choosing import Candidate, Choice
 from uwb_mitigation.training.fitting import FitOptions
 from uwb_mitigation.training.recipe import Recipe, fit_model
@@ -194,16 +194,36 @@ def run(*arguments: object):
     return CliRunner().invoke(app, [str(value) for value in arguments], catch_exceptions=True)
 
 
-def test_a_bag_of_ones_own_refits_the_offset_and_says_what_it_helped(tmp_path, monkeypatch):
-    started = bundle(tmp_path, Remnet(samples=32), prior=LinePrior(5.0))
-    records = [
-        replace(record(10 * place + number), truth=None, measurement=replace(
-            measurement(3.25, 10 * place + number), tag_id=place))
+EIGHT_PLACES = [f"{place},2,3.0,,,place {place}" for place in range(8)]
+
+
+def ranges_of_eight_places() -> list[Record]:
+    """Ranges that err by 0.25 m."""
+    return [
+        Record(replace(measurement(3.25, 10 * place + number), tag_id=place))
         for place in range(8)
         for number in range(4)
-    ]  # fmt: skip
-    monkeypatch.setattr(opening, "open_recording", lambda path: Recorded(records))
-    table = write(tmp_path, *(f"{place},2,3.0,,,place {place}" for place in range(8)))
+    ]
+
+
+def test_a_bag_of_few_places_starts_from_the_simulator_too(tmp_path, monkeypatch):
+    monkeypatch.setattr(opening, "open_recording", lambda path: Recorded(ranges_of_eight_places()))
+    as_it_is = Candidate(site.AS_SHIPPED, lambda data, seed: (LinePrior(0.0), None))
+    monkeypatch.setattr(site, "candidates", lambda source, options: [as_it_is])
+    output = tmp_path / "own.onnx"
+    done = run(
+        "train", "--from-bag", "bag", "--truth", write(tmp_path, *EIGHT_PLACES), "-o", output, "--folds", 2
+    )
+    assert done.exit_code == 0, done.output
+    start = load_bundle(simulated_model_path())
+    assert load_bundle(output).card.training["chosen"] == cold_start.NAME
+    assert load_bundle(output).card.training["started_from"] == f"{start.model_id:08x}"
+
+
+def test_a_bag_of_ones_own_refits_the_offset_and_says_what_it_helped(tmp_path, monkeypatch):
+    started = bundle(tmp_path, Remnet(samples=32), prior=LinePrior(5.0))
+    monkeypatch.setattr(opening, "open_recording", lambda path: Recorded(ranges_of_eight_places()))
+    table = write(tmp_path, *EIGHT_PLACES)
     output, result = tmp_path / "own.onnx", tmp_path / "own.json"
     done = run(
         "train", "--from-bag", "bag", "--truth", table, "--model", started.path, "-o", output,
