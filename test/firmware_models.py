@@ -50,6 +50,13 @@ def exact_bundle(folder: Path, samples: int = 32, **changes: object) -> Bundle:
     return save_bundle(folder / "exact.onnx", graph.int8_model(weights), card)
 
 
+def mlp_bundle(folder: Path) -> Bundle:
+    """The paper's MLP with random weights."""
+    weights = synthetic.random_mlp()
+    card = model_material.card(weights.architecture, correction_limits_m=(-500.0, 500.0))
+    return save_bundle(folder / "mlp.onnx", graph.int8_model(weights), card)
+
+
 def choosy_bundle(folder: Path, samples: int = 32) -> Bundle:
     """The same with a familiarity that finds random measurements familiar, strange in part, and wholly strange."""
     familiarity = Familiarity(

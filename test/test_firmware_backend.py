@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import firmware_models
@@ -14,15 +15,19 @@ from uwb_mitigation.bag.codec import encode_range
 from uwb_mitigation.errors import MissingDependencyError
 from uwb_mitigation.firmware_export.backend import FirmwareMitigation
 from uwb_mitigation.mitigation import Mitigation
+from uwb_mitigation.model.bundle import Bundle
 
 NO_COMPILER = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc")
 
 
 @NO_COMPILER
-def test_the_firmware_gives_the_corrected_ranges_of_onnx_runtime(tmp_path: Path):
-    bundle = firmware_models.choosy_bundle(tmp_path)
+@pytest.mark.parametrize("bundle_in", [firmware_models.choosy_bundle, firmware_models.mlp_bundle])
+def test_the_firmware_gives_the_corrected_ranges_of_onnx_runtime(
+    bundle_in: Callable[[Path], Bundle], tmp_path: Path
+):
+    bundle = bundle_in(tmp_path)
     random = np.random.default_rng(8)
-    measurements = [firmware_models.random_measurement(random) for _ in range(400)]
+    measurements = [firmware_models.random_measurement(random) for _ in range(300)]
     firmware, host = FirmwareMitigation(bundle), Mitigation(bundle)
     for computed, measurement in zip(firmware.correct_batch(measurements), measurements, strict=True):
         assert repr(computed) == repr(host.correct(measurement))
