@@ -64,7 +64,9 @@ PERTURBED = {
     "noise": noise,
     **{f"shifted by {taps}": shifted(taps) for taps in (-30, -10, -5, 5, 10, 30, 80)},
     **{f"clipped at {level}": clipped(level) for level in (100, 500, 2000)},
-    **{f"{decibels} dB louder": louder(decibels) for decibels in (-25, -20, -15, -10, -5, 5, 10, 20)},
+    **{
+        f"{decibels} dB louder": louder(decibels) for decibels in (-25, -20, -16, -15, -10, -9, -5, 5, 10, 20)
+    },
 }
 
 
@@ -78,14 +80,18 @@ def test_strange_measurements_are_not_made_worse(name, mitigation, records):
     assert outcome.corrected.mae <= 1.02 * outcome.raw.mae
 
 
-def test_a_radio_12_db_weaker_is_the_worst_and_harms_by_less_than_a_tenth(mitigation, records):
+@pytest.mark.parametrize("decibels", [-14, -13, -12, -11])
+def test_a_radio_that_is_weaker_by_a_wall_or_two_is_made_worse_by_an_eighth_at_most(
+    decibels, mitigation, records
+):
     # Of one range alone, a weaker radio in the open and walls that weaken as much cannot be told apart.
     weak = [
-        replace(record, measurement=replace(record.measurement, cir=louder(-12)(record.measurement.cir)))
+        replace(record, measurement=replace(record.measurement, cir=louder(decibels)(record.measurement.cir)))
         for record in records
     ]
     outcome = evaluate(mitigation, weak)
-    assert outcome.corrected.mae <= 1.10 * outcome.raw.mae
+    # Above 1.02 too: a bundle that does better here calls for another table in docs/evaluation.md.
+    assert 1.02 < outcome.corrected.mae / outcome.raw.mae <= 1.12
 
 
 def test_what_cannot_be_familiar_says_so(mitigation, records):
