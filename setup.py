@@ -23,6 +23,8 @@ setup(
         (f"share/{PACKAGE}/params", files("params", "*.yaml")),
         (f"share/{PACKAGE}/udev", files("udev", "*.rules")),
         (f"share/{PACKAGE}/models", files("models", "*.onnx", "*.md")),
+        # What `backend:=firmware` compiles; the boards and the sketch need a checkout.
+        (f"share/{PACKAGE}/firmware/src", files("firmware/src", "*.c", "*.h")),
     ],
     install_requires=["setuptools"],
     # colcon looks here to tell that pytest runs the tests.

@@ -13,6 +13,7 @@ import pytest
 
 from uwb_mitigation.bag.codec import encode_range
 from uwb_mitigation.errors import MissingDependencyError
+from uwb_mitigation.firmware_export import host, toolchain
 from uwb_mitigation.firmware_export.backend import FirmwareMitigation
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import Bundle
@@ -28,9 +29,9 @@ def test_the_firmware_gives_the_corrected_ranges_of_onnx_runtime(
     bundle = bundle_in(tmp_path)
     random = np.random.default_rng(8)
     measurements = [firmware_models.random_measurement(random) for _ in range(300)]
-    firmware, host = FirmwareMitigation(bundle), Mitigation(bundle)
+    firmware, mitigation = FirmwareMitigation(bundle), Mitigation(bundle)
     for computed, measurement in zip(firmware.correct_batch(measurements), measurements, strict=True):
-        assert repr(computed) == repr(host.correct(measurement))
+        assert repr(computed) == repr(mitigation.correct(measurement))
 
 
 def test_without_a_compiler_the_error_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -38,6 +39,23 @@ def test_without_a_compiler_the_error_says_what_to_install(tmp_path: Path, monke
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(MissingDependencyError, match="apt install gcc"):
         FirmwareMitigation(firmware_models.exact_bundle(tmp_path))
+
+
+@pytest.mark.parametrize("words", ["", "  ", "cc", "cc -O2 -g"])
+def test_cc_may_be_empty_and_may_carry_options(words: str, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("CC", words)
+    monkeypatch.setattr(host.shutil, "which", lambda name: {"cc": "/usr/bin/cc"}.get(name))
+    assert host.c_compiler() == tuple(words.split() or ["cc"])
+    monkeypatch.setattr(host.shutil, "which", lambda name: {"gcc": "/usr/bin/gcc"}.get(name))
+    monkeypatch.delenv("CC")
+    assert host.c_compiler() == ("gcc",)
+
+
+def test_what_only_a_checkout_has_is_said_to_need_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(toolchain, "firmware_folder", lambda: tmp_path)
+    monkeypatch.setattr(toolchain, "require_tools", lambda: None)
+    with pytest.raises(MissingDependencyError, match="run from a source checkout"):
+        toolchain.build_image(tmp_path, tmp_path, toolchain.Board.QEMU_MPS2)
 
 
 @NO_COMPILER
@@ -69,9 +87,9 @@ def test_a_mitigator_that_is_told_to_corrects_with_the_firmware(
             publisher.publish(deserialize_message(encode_range(measurement), RangeCir))
         ros.spin_until(lambda: len(corrected) == len(measurements))
     assert traces.exists()
-    host = Mitigation(bundle)
+    mitigation = Mitigation(bundle)
     for message, measurement in zip(corrected, measurements, strict=True):
-        expected = host.correct(measurement)
+        expected = mitigation.correct(measurement)
         values = np.array([expected.range_m, expected.correction_m, expected.variance_m2], np.float32)
         assert (
             np.array([message.range, message.correction, message.variance], np.float32).tobytes()

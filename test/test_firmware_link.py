@@ -295,7 +295,7 @@ def test_fuzzing_for_a_moment_finds_nothing(target: str, bundle: Bundle, tmp_pat
     export_bundle(bundle, tmp_path)
     source, program = firmware_folder() / "src", tmp_path / target
     flags = ("-g", "-O1", "-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=all", f"-I{source}")
-    objects = compile_objects("clang", flags, tuple(sorted(source.glob("*.c"))))
+    objects = compile_objects(("clang",), flags, tuple(sorted(source.glob("*.c"))))
     main = str(firmware_folder() / "test" / f"{target}.c")
     run(["clang", *flags, "-DUWB_LIBFUZZER", f"-I{tmp_path}", main, *objects, "-lm", "-o", str(program)])
     options = ("-runs=1500", "-seed=1", "-max_len=4096", "-len_control=0")

@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import ast
 import os
+import shutil
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -57,9 +59,14 @@ def test_shared_files_are_those_of_the_sources(share: Path, folder: str):
     }
 
 
+def test_the_firmware_that_a_computer_compiles_is_shared(share: Path):
+    library = [*(REPOSITORY / "firmware" / "src").glob("*.[ch]")]
+    assert files_below(share / "firmware") == {f"src/{path.name}": path.read_bytes() for path in library}
+
+
 def test_nothing_else_is_shared(share: Path):
     ours = {path.name for path in share.iterdir() if not path.name.startswith(("package.", "local_setup."))}
-    assert ours - {"hook", "colcon-core"} == {"launch", "params", "models", "udev"}
+    assert ours - {"hook", "colcon-core"} == {"launch", "params", "models", "udev", "firmware"}
     assert (share / "package.xml").read_bytes() == (REPOSITORY / "package.xml").read_bytes()
     for path in (share / "launch").iterdir():
         assert path.name.endswith(".launch.py"), "ros2 launch completes no other names"
@@ -79,27 +86,42 @@ def installed_environment() -> dict[str, str]:
     return os.environ | {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_DOMAIN_ID": "99"}
 
 
-@pytest.mark.parametrize("name", ["driver", "mitigator", "pipeline"])
-def test_a_node_starts_where_it_is_installed_and_ends_on_ctrl_c(prefix: Path, tmp_path: Path, name: str):
-    parameters = ["-p", "simulated_rate:=100.0"] if name != "mitigator" else []
-    node = subprocess.Popen(
-        [prefix / "lib" / NAME / name, "--ros-args", *parameters],
-        env=installed_environment(),
-        cwd=tmp_path,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    try:
-        assert node.stderr is not None
-        said = node.stderr.readline()
-        assert ("correcting with model" if name == "mitigator" else "replaying") in said or (
-            name == "pipeline" and "correcting with model" in said
+def wait_until_said(node: subprocess.Popen[bytes], log: Path, words: str) -> None:
+    deadline = time.monotonic() + 60
+    while words not in log.read_text():
+        assert node.poll() is None, log.read_text()
+        assert time.monotonic() < deadline, f"no {words!r} in:\n{log.read_text()}"
+        time.sleep(0.02)
+
+
+@pytest.mark.parametrize(
+    ("name", "parameter", "words"),
+    [
+        ("driver", "simulated_rate:=100.0", "replaying"),
+        ("mitigator", "backend:=onnxruntime", "correcting with model"),
+        ("mitigator", "backend:=firmware", "correcting with model"),
+        ("pipeline", "simulated_rate:=100.0", "replaying"),
+    ],
+)
+def test_a_node_starts_where_it_is_installed_and_ends_on_ctrl_c(
+    prefix: Path, tmp_path: Path, name: str, parameter: str, words: str
+):
+    log = tmp_path / "said"
+    with log.open("wb") as file:
+        node = subprocess.Popen(
+            [prefix / "lib" / NAME / name, "--ros-args", "-p", parameter],
+            env=installed_environment(),
+            cwd=tmp_path,
+            stdout=file,
+            stderr=subprocess.STDOUT,
         )
+    try:
+        wait_until_said(node, log, words)
         node.send_signal(signal.SIGINT)
-        assert node.wait(20) == 0, node.stderr.read()
+        assert node.wait(20) == 0, log.read_text()
     finally:
         node.kill()
-        node.stderr.close()
+        node.wait()
 
 
 def test_the_command_line_takes_its_model_from_the_installation(prefix: Path, share: Path, tmp_path: Path):
@@ -129,6 +151,35 @@ def test_the_messages_are_installed_as_an_interface_package():
 
 
 # What follows holds of the sources, too, and needs no workspace.
+
+
+CORRECT_WITH_THE_FIRMWARE = """
+import uwb_mitigation
+from uwb_mitigation.firmware_export.backend import FirmwareMitigation
+from uwb_mitigation.firmware_export.host import firmware_folder
+from uwb_mitigation.model.bundle import load_bundle
+from uwb_mitigation.model.shipped import default_model_path
+FirmwareMitigation(load_bundle(default_model_path()))
+print(uwb_mitigation.__file__, default_model_path(), firmware_folder(), sep="\\n")
+"""
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc")
+def test_the_firmware_backend_needs_no_checkout(tmp_path: Path):
+    packages = tmp_path / "lib" / "python3" / "site-packages"
+    steps = [
+        *("build", "-b", tmp_path / "build"),
+        *("build_py", "-d", packages),
+        *("install_data", "-d", tmp_path),
+    ]
+    subprocess.run(
+        [sys.executable, "setup.py", "-q", *steps], cwd=REPOSITORY, check=True, capture_output=True
+    )
+    environment = os.environ | {"PYTHONPATH": str(packages), "AMENT_PREFIX_PATH": ""}
+    command = [sys.executable, "-c", CORRECT_WITH_THE_FIRMWARE]
+    done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert all(Path(place).is_relative_to(tmp_path) for place in done.stdout.split()), done.stdout
 
 
 @pytest.mark.parametrize("folder", ["", "msg_defs"])

@@ -18,7 +18,7 @@ class FirmwareMitigation(Mitigation):
     """`Mitigation` whose single and batched corrections are computed by the firmware, to the same bits.
 
     Raises:
-        MissingDependencyError: there is no C compiler, or no checkout with the firmware's sources.
+        MissingDependencyError: there is no C compiler, or the firmware's sources are not installed.
         ModelError: the firmware cannot run the bundle's network.
         UwbMitigationError: the sources do not compile.
     """

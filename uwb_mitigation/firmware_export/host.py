@@ -8,6 +8,7 @@ import functools
 import math
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import tempfile
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import MissingDependencyError, ModelError, UwbMitigationError
 from uwb_mitigation.measurement import Cir
+from uwb_mitigation.model.shipped import shared_folders
 from uwb_mitigation.preprocessing import CirFault
 
 MODEL_HEADER = "uwb_model.h"
@@ -48,17 +50,20 @@ _FAULTS = {
 
 
 def firmware_folder() -> Path:
-    """The folder `firmware/` of this checkout.
+    """The folder `firmware/`: whole in a checkout, with the library's `src` alone where it is installed.
 
     Raises:
-        MissingDependencyError: the package was installed without it.
+        MissingDependencyError: it is neither here nor there; the message lists where it was looked for.
     """
-    folder = Path(__file__).resolve().parent.parent.parent / "firmware"
-    if not (folder / "src" / "uwb_mitigation.h").is_file():
-        raise MissingDependencyError(
-            "the firmware's sources are not installed", where=str(folder), valid="run from a source checkout"
-        )
-    return folder
+    folders = shared_folders("firmware")
+    for folder in folders:
+        if (folder / "src" / "uwb_mitigation.h").is_file():
+            return folder
+    raise MissingDependencyError(
+        "the firmware's sources are not installed",
+        where=", ".join(map(str, folders)),
+        valid="install the package again",
+    )
 
 
 class _Cir(ctypes.Structure):
@@ -165,11 +170,10 @@ def link(
     program: Path, export: Path, output: Path, flags: Sequence[str] = (), *, shared: bool = False
 ) -> Path:
     """Link one C file, which includes the model in `export`, with the library, for this computer."""
-    compiler = c_compiler()
     objects = library_objects(flags)
     options = (*_OPTIONS, *flags, f"-I{firmware_folder() / 'src'}", f"-I{export}")
     kind = ("-shared",) if shared else ()
-    run([compiler, *options, *kind, str(program), *objects, "-o", str(output), "-lm"])
+    run([*c_compiler(), *options, *kind, str(program), *objects, "-o", str(output), "-lm"])
     return output
 
 
@@ -180,26 +184,28 @@ def library_objects(flags: Sequence[str] = ()) -> tuple[str, ...]:
     return compile_objects(c_compiler(), options, tuple(sorted(sources.glob("*.c"))))
 
 
-def c_compiler() -> str:
-    """The C compiler of this computer.
+def c_compiler() -> tuple[str, ...]:
+    """The words that start the C compiler of this computer: those of CC, as make takes them, or cc, or gcc.
 
     Raises:
         MissingDependencyError: there is none.
     """
-    compiler = os.environ.get("CC") or shutil.which("cc") or shutil.which("gcc")
-    if compiler is None:
-        raise MissingDependencyError("there is no C compiler", valid="apt install gcc, or set CC")
-    return compiler
+    words = tuple(shlex.split(os.environ.get("CC", ""))) or ("cc" if shutil.which("cc") else "gcc",)
+    if shutil.which(words[0]) is None:
+        raise MissingDependencyError(f"there is no C compiler {words[0]}", valid="apt install gcc, or set CC")
+    return words
 
 
 @functools.cache
-def compile_objects(compiler: str, options: tuple[str, ...], sources: tuple[Path, ...]) -> tuple[str, ...]:
+def compile_objects(
+    compiler: tuple[str, ...], options: tuple[str, ...], sources: tuple[Path, ...]
+) -> tuple[str, ...]:
     """Compile sources once a process: many models are linked with the same library."""
     folder = tempfile.mkdtemp(prefix="uwb_firmware_objects_")
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     objects = tuple(f"{folder}/{source.name}.o" for source in sources)
     for source, output in zip(sources, objects, strict=True):
-        run([compiler, *options, "-c", str(source), "-o", output])
+        run([*compiler, *options, "-c", str(source), "-o", output])
     return objects
 
 

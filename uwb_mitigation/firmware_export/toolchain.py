@@ -88,7 +88,7 @@ def build_image(
         MissingDependencyError: a tool is missing.
         UwbMitigationError: it does not compile, or does not fit the board.
     """
-    folder = firmware_folder() / "boards" / board.value
+    folder = _boards_folder() / board.value
     return _link(export, build, board.value, sorted(folder.glob("*.c")), kernels, optimisation)
 
 
@@ -101,6 +101,15 @@ def measure_size(
     return _link(export, build, Board.DWM1001C.value, [stub], kernels, optimisation, "size")
 
 
+def _boards_folder() -> Path:
+    folder = firmware_folder() / "boards"
+    if not folder.is_dir():
+        raise MissingDependencyError(
+            "the firmware's boards are not installed", where=str(folder), valid="run from a source checkout"
+        )
+    return folder
+
+
 def _link(
     export: Path,
     build: Path,
@@ -111,14 +120,13 @@ def _link(
     name: str = "",
 ) -> Image:
     require_tools()
-    firmware = firmware_folder()
-    library, boards = firmware / "src", firmware / "boards"
+    library, boards = firmware_folder() / "src", _boards_folder()
     (script,) = (boards / board).glob("*.ld")
     elf = build / f"{name or board}_{kernels.value}.elf"
     portable = ("-DUWB_PORTABLE",) if kernels is Kernels.PORTABLE else ()
     options = (*_CPU, *_COMMON, optimisation, *_WARNINGS, *portable, f"-I{library}")
     layers = (*library.glob("*.c"), *(library / "cortex_m4").glob("*.S"), boards / "cortex_m4" / "startup.c")
-    objects = compile_objects(f"{_PREFIX}gcc", options, tuple(sorted(layers)))
+    objects = compile_objects((f"{_PREFIX}gcc",), options, tuple(sorted(layers)))
     run(
         [
             f"{_PREFIX}gcc",

@@ -1,4 +1,4 @@
-"""Finds the models that ship with the package, wherever it is installed."""
+"""Finds the models, and other files, that ship with the package, wherever it is installed."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from uwb_mitigation.errors import ModelError
 
 SHIPPED = "evk1000_apartment.onnx"
 SIMULATED = "simulated_flat.onnx"
-_SHARE = Path("share", "uwb_mitigation", "models")
+_SHARE = Path("share", "uwb_mitigation")
 
 
 def default_model_path() -> Path:
@@ -28,7 +28,7 @@ def simulated_model_path() -> Path:
 
 
 def _find(name: str) -> Path:
-    candidates = [folder / name for folder in _folders()]
+    candidates = [folder / name for folder in shared_folders("models")]
     for candidate in candidates:
         if candidate.is_file():
             return candidate
@@ -39,12 +39,13 @@ def _find(name: str) -> Path:
     )
 
 
-def _folders() -> list[Path]:
+def shared_folders(name: str) -> list[Path]:
+    """Where the package's shared folder `name` may be: in a checkout, in this installation, in sourced workspaces."""
     package = Path(__file__).resolve().parent.parent
-    folders = [package.parent / "models"]
+    folders = [package.parent / name]
     # lib/python3.x/site-packages/uwb_mitigation, or Debian's local/lib/python3.x/dist-packages.
-    folders += [prefix / _SHARE for prefix in list(package.parents)[3:5]]
+    folders += [prefix / _SHARE / name for prefix in list(package.parents)[3:5]]
     prefixes = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
-    folders += [Path(prefix) / _SHARE for prefix in prefixes if prefix]
-    folders.append(Path(sys.prefix) / _SHARE)
+    folders += [Path(prefix) / _SHARE / name for prefix in prefixes if prefix]
+    folders.append(Path(sys.prefix) / _SHARE / name)
     return list(dict.fromkeys(folders))
