@@ -129,18 +129,16 @@ class Exported:
     weights: Int8Weights
     subject: Subject
     folder: Path
-    inputs: int
-    """Enough windows for this shape: the usual first kernel and the MLP get the most."""
 
-    def windows(self) -> NDArray[np.float32]:
+    def windows(self, count: int = 5000) -> NDArray[np.float32]:
         """Windows that press on every rounding; zero, saturating and random ones."""
         samples = self.weights.architecture.samples
-        return synthetic.pressing_windows(samples, self.weights.activation_scale["input"], self.inputs)
+        return synthetic.pressing_windows(samples, self.weights.activation_scale["input"], count)
 
-    def real_windows(self, apartment: Path) -> NDArray[np.float32]:
-        """What the network reads of the real measurements; of every fourth for the unusual first kernel."""
+    def real_windows(self, apartment: Path, every: int = 1) -> NDArray[np.float32]:
+        """What the network reads of the real measurements, or of every so many."""
         samples = self.weights.architecture.samples
-        measured = real_measurements(apartment)[:: 4 if self.subject.first_kernel == 5 else 1]
+        measured = real_measurements(apartment)[::every]
         windows = np.zeros((len(measured), samples), np.float32)
         preprocessing = Preprocessing(samples, Scaling.PREAMBLE)
         usable = [preprocessing.apply(m.cir, row) is None for m, row in zip(measured, windows, strict=True)]
@@ -162,4 +160,4 @@ def exported(shape: tuple[int, int], folder: Path) -> Exported:
     )
     write_model(folder, weights)
     subject = subject_of(weights, identity(), graph.int8_model(weights))
-    return Exported(weights, subject, folder, 500 if first_kernel == 5 else 5000)
+    return Exported(weights, subject, folder)

@@ -63,7 +63,8 @@ def test_kernels_equal_onnx_runtime_on_thousands_of_windows_within_the_budgets(
     exported: Exported, image: toolchain.Image
 ):
     subject = exported.subject
-    result = check_windows(exported, image, exported.windows())
+    # An emulated inference costs most: of the unusual first kernel, which the host runs in full, half as many.
+    result = check_windows(exported, image, exported.windows(2500 if subject.first_kernel == 5 else 5000))
     assert result.stack_bytes <= 512
     if subject.network == "mlp":
         assert result.instructions <= 75_000
@@ -75,8 +76,9 @@ def test_kernels_equal_onnx_runtime_on_thousands_of_windows_within_the_budgets(
 
 
 def test_kernels_equal_onnx_runtime_on_real_logs(exported: Exported, image: toolchain.Image, apartment: Path):
-    windows = exported.real_windows(apartment)
-    assert len(windows) > 250
+    every = 4 if exported.subject.first_kernel == 5 else 1
+    windows = exported.real_windows(apartment, every)
+    assert len(windows) > 1000 // every
     check_windows(exported, image, windows)
 
 
