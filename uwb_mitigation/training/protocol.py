@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.dataset import Dataset
 from uwb_mitigation.errors import DatasetError, ParameterError, UwbMitigationError
-from uwb_mitigation.evaluation import baselines, lad
+from uwb_mitigation.evaluation import baselines, lad, splits
+from uwb_mitigation.evaluation.intervals import calibrate
 from uwb_mitigation.model import floating, graph
 from uwb_mitigation.model.architecture import Architecture, Mlp, Remnet
 from uwb_mitigation.model.bundle import Card, save_bundle
@@ -47,6 +48,7 @@ NETWORKS = ("remnet", "remnet_k5", "remnet_attention", "mlp")
 attention of the original, in float alone; and the baseline."""
 
 SEEDS = 5
+VARIANCE_FOLDS = 5
 LOS = "LOS"
 
 
@@ -81,6 +83,10 @@ class Parts:
     split: str
     train: Dataset
     test: Dataset
+
+    def narrowed(self, samples: int) -> Parts:
+        """The same parts with shorter windows; raises as `narrowed`."""
+        return replace(self, train=narrowed(self.train, samples), test=narrowed(self.test, samples))
 
 
 def narrowed(dataset: Dataset, samples: int) -> Dataset:
@@ -182,36 +188,34 @@ class _Worker:
     mark: int
 
     def __call__(self, job: Job, advance: Callable[[float], None]) -> None:
-        train, test = (narrowed(part, job.samples) for part in (self.parts.train, self.parts.test))
+        parts = self.parts.narrowed(job.samples)
         step = _work(job) / self.options.epochs
-        model = train_job(
-            job, train, test, self.folder, replace(self.options, seed=job.seed), lambda: advance(step)
-        )
+        options = replace(self.options, seed=job.seed)
+        model = train_job(job, parts, self.folder, options, lambda: advance(step))
         write_json(self.folder / f"{job.name}.json", {"fingerprint": self.mark, "model": asdict(model)})
 
 
 def train_job(
     job: Job,
-    train: Dataset,
-    test: Dataset,
+    parts: Parts,
     folder: Path,
     options: FitOptions,
     on_epoch: Callable[[], None] = lambda: None,
 ) -> TrainedModel:
-    """One network, from fresh weights to int8; its files go to `folder`.
+    """One network, from fresh weights to int8, on parts with the job's windows; its files go to `folder`.
 
     Raises:
         DatasetError, ModelError: as `fit` and `quantize`.
     """
     start = time.perf_counter()
-    architecture = job.architecture
+    architecture, train = job.architecture, parts.train
     if job.network == "remnet_attention" and isinstance(architecture, Remnet):
-        parameters, predicted = _fit_attention(architecture, train, test, options, on_epoch)
+        parameters, predicted = _fit_attention(architecture, train, parts.test, options, on_epoch)
         seconds = time.perf_counter() - start
-        return _result(job, parameters, train, test, predicted, seconds, options)
+        return _result(job, parameters, parts, predicted, seconds, options)
     weights = fitting.fit(architecture, train.inputs, train.error_m, options, on_epoch)
     seconds = time.perf_counter() - start
-    return _exported(job, weights, train, test, folder, options, seconds)
+    return _exported(job, weights, parts, folder, options, seconds)
 
 
 def _fit_attention(
@@ -234,16 +238,15 @@ def _fit_attention(
 def _exported(
     job: Job,
     weights: FloatWeights,
-    train: Dataset,
-    test: Dataset,
+    parts: Parts,
     folder: Path,
     options: FitOptions,
     seconds: float,
 ) -> TrainedModel:
+    train, test = parts.train, parts.test
     paths = {kind: folder / f"{job.name}_{kind}.onnx" for kind in ("float", "optimised", "int8")}
     compared = calibration.compare(weights, train.inputs, train.error_m, options.seed)
-    left = test.error_m - floating.predict_m(weights, test.inputs)
-    card = _card(job.name, weights.architecture, train, test, left, options)
+    card = describe(job.name, weights.architecture, parts, options)
     save_bundle(paths["float"], graph.float_model(weights), card)
     optimise_file(paths["float"], paths["optimised"])
     save_bundle(paths["int8"], graph.int8_model(compared.network), replace(card, quantised=True))
@@ -252,7 +255,7 @@ def _exported(
     }
     size = {kind: path.stat().st_size for kind, path in paths.items()}
     mae = {kind: float(np.abs(test.error_m - values).mean()) for kind, values in predicted.items()}
-    result = _result(job, weights.architecture.parameters, train, test, predicted["float"], seconds, options)
+    result = _result(job, weights.architecture.parameters, parts, predicted["float"], seconds, options)
     return replace(
         result,
         mae_optimised=mae["optimised"],
@@ -269,13 +272,12 @@ def _exported(
 def _result(
     job: Job,
     parameters: int,
-    train: Dataset,
-    test: Dataset,
+    parts: Parts,
     predicted: NDArray[np.float32],
     seconds: float,
     options: FitOptions,
 ) -> TrainedModel:
-    errors = _by_part(test, predicted)
+    errors = _by_part(parts.test, predicted)
     raw, left = errors["all"].mae_raw, errors["all"].mae
     if raw is None or left is None:
         raise DatasetError("the test part is empty", valid="one measurement or more")
@@ -297,7 +299,7 @@ def _result(
         calibration=None,
         calibration_mae=None,
         seconds=seconds,
-        samples_per_s=len(train) * options.epochs / max(seconds, 1e-9),
+        samples_per_s=len(parts.train) * options.epochs / max(seconds, 1e-9),
     )
 
 
@@ -326,14 +328,25 @@ def _by_part(test: Dataset, predicted: NDArray[np.floating]) -> dict[str, PartEr
     return {name: PartErrors.of(test.error_m[rows], left[rows]) for name, rows in chosen.items()}
 
 
-def _card(
-    name: str,
-    architecture: Architecture,
-    train: Dataset,
-    test: Dataset,
-    left_m: NDArray[np.floating],
-    options: FitOptions,
-) -> Card:
+def describe(name: str, architecture: Architecture, parts: Parts, options: FitOptions) -> Card:
+    """The card of a float network without a prior that was fitted to the training part.
+
+    Nothing of it comes from the errors of the test part. All of the training part is fitted to, so that none of it
+    can tell what is left on other placements: the variance of corrected ranges is that of another such network,
+    fitted to a fifth of the training part's configurations, on the other four. With less to learn from, that
+    network errs more; the variance errs on the safe side.
+
+    Raises:
+        DatasetError: the training part has one configuration alone; see also `fit`.
+    """
+    train = parts.train
+    folds = min(VARIANCE_FOLDS, len(train.names))
+    fold = splits.by_configuration(train.configurations, folds, options.seed)[0]
+    seen, unseen = train.rows(fold.test), train.rows(fold.train)
+    network = fitting.fit(architecture, seen.inputs, seen.error_m, options)
+    predicted = floating.predict_m(network, unseen.inputs)
+    corrected = calibrate(unseen.error_m - predicted, predicted, unseen.configurations)
+    raw = calibrate(train.error_m, np.zeros(len(train)), train.configurations)
     low, high = float(train.error_m.min()), float(train.error_m.max())
     margin = max(high - low, 0.1) / 2
 
@@ -346,10 +359,20 @@ def _card(
         preprocessing=train.preprocessing,
         prior=LinePrior(0.0),
         quantised=False,
-        variance_m2=single(max(float(np.percentile(np.abs(left_m), 68)), 1e-3) ** 2),
-        variance_uncorrected_m2=single(max(float(np.percentile(np.abs(test.error_m), 68)), 1e-3) ** 2),
+        variance_m2=corrected.variance_m2,
+        variance_uncorrected_m2=raw.variance_m2,
         correction_limits_m=(single(low - margin), single(high + margin)),
-        training={"recipe": asdict(options), "measurements": len(train), "tested_on": len(test)},
+        training={
+            "data": parts.data,
+            "split": parts.split,
+            "seed": options.seed,
+            "recipe": asdict(options),
+            "measurements": len(train),
+            "tested_on": len(parts.test),
+            "variance": f"of a network fitted to 1 of {folds} parts of the training configurations, on the others",
+        },
+        variance_per_m2=corrected.variance_per_m2,
+        interval95_sigmas=corrected.sigmas95,
     )
 
 
