@@ -1,0 +1,300 @@
+"""What is tested was not fitted to: nothing of a test part reaches a fit, a calibration or a choice.
+
+Everything that learns from data is watched. What it gets must not hold a row of a configuration that is held out at
+that moment: by a fold that is being gone through, or by the test part of a command.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import wraps
+from typing import Any
+
+import numpy as np
+import pytest
+from model_material import dataset
+from numpy.typing import NDArray
+from typer.testing import CliRunner
+
+from uwb_mitigation.cli import app
+from uwb_mitigation.commands import training as commands
+from uwb_mitigation.dataset import Dataset
+from uwb_mitigation.evaluation import baselines, lad, splits
+from uwb_mitigation.evaluation.splits import Group, Split
+from uwb_mitigation.model.architecture import Remnet
+
+pytest.importorskip("torch", reason="run `make setup-training`")
+pytest.importorskip("sklearn", reason="run `make setup-training`")
+from uwb_mitigation.training import (
+    calibration,
+    choosing,
+    contest,
+    learning_rate,
+    protocol,
+    pruning,
+    recipe,
+    search,
+)
+from uwb_mitigation.training.options import FitOptions
+
+SAMPLES = 8
+QUICK = FitOptions(epochs=1)
+RECIPE = recipe.Recipe(Remnet(SAMPLES, modules=1, filters=4), QUICK)
+
+LEARNERS = {
+    (contest, "fit"),
+    (contest, "calibration_inputs"),
+    (contest, "quantize"),
+    (contest.recipes, "fit_graded"),
+    (recipe, "fit"),
+    (recipe, "calibration_inputs"),
+    (recipe, "quantize"),
+    (recipe, "calibrate"),
+    (recipe, "describe"),
+    (lad, "fit_prior"),
+    (lad, "constant"),
+    (baselines, "los_median"),
+    (baselines, "overall_median"),
+    (baselines, "ridge"),
+    (baselines, "gradient_boosting"),
+    (protocol, "calibrate"),
+    (protocol.fitting, "fit"),
+    (protocol.fitting, "descend"),
+    (calibration, "compare"),
+    (calibration, "quantize"),
+    (search, "fit"),
+    (pruning, "fit"),
+    (learning_rate, "range_test"),
+}
+
+
+class Watch:
+    """Holds what is held out, and what each learner was called with.
+
+    Attributes:
+        calls: how often each learner was called.
+        seen: the configurations that each of them got at its last call.
+        held_out: the configurations of each fold that is being gone through, and of the test part.
+    """
+
+    def __init__(self, data: Dataset) -> None:
+        self.calls: Counter[str] = Counter()
+        self.seen: dict[str, set[str]] = {}
+        self.held_out: list[set[str]] = []
+        rows = zip(data.inputs, data.configurations.tolist(), strict=True)
+        self._of = {row.tobytes(): name for row, name in rows}
+        assert len(self._of) == len(data), "rows that are alike cannot be told apart"
+
+    @contextmanager
+    def without(self, names: Iterable[str]) -> Iterator[None]:
+        self.held_out.append(set(names))
+        yield
+        self.held_out.pop()
+
+    def folds(self, found: list[Split], names: NDArray[np.str_]) -> list[Split]:
+        """The same splits; each is held out while it is gone through."""
+        watch = self
+
+        class Folds(list):  # type: ignore[type-arg]
+            def __iter__(self) -> Iterator[Split]:
+                for split in super().__iter__():
+                    with watch.without(names[split.test].tolist()):
+                        yield split
+
+        return Folds(found)
+
+    def learner(self, name: str, learn: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(learn)
+        def watched(*arguments: Any, **options: Any) -> Any:
+            self.calls[name] += 1
+            seen = set().union(*(self.names_in(value) for value in (*arguments, *options.values())))
+            self.seen[name] = seen
+            assert seen, f"{name} got nothing whose configuration is known"
+            for held_out in self.held_out:
+                assert not seen & held_out, f"{name} got {sorted(seen & held_out)}, which are held out"
+            return learn(*arguments, **options)
+
+        return watched
+
+    def names_in(self, value: Any) -> set[str]:
+        """The configurations that a learner's argument comes from."""
+        if isinstance(value, recipe.CrossValidation):
+            value = value.dataset
+        if isinstance(value, Dataset):
+            return set(value.configurations.tolist())
+        if isinstance(value, np.ndarray) and value.dtype.kind == "U":
+            return set(value.tolist())
+        if isinstance(value, np.ndarray) and value.ndim == 2:
+            return {self._of[row.tobytes()] for row in value}
+        return set()
+
+
+@pytest.fixture(scope="module")
+def data() -> Dataset:
+    """Places in five rooms, with DeepUWB's names: the medium room is what its splits test in."""
+    plain = dataset(15, 6, samples=SAMPLES)
+    rooms = {f"c{n}": f"simulated seed 1/deepuwb/room{n % 5}/clear/placement {n}" for n in range(15)}
+    return replace(plain, configurations=np.array([rooms[name] for name in plain.configurations]))
+
+
+@pytest.fixture
+def watch(data: Dataset, monkeypatch: pytest.MonkeyPatch) -> Watch:
+    watch = Watch(data)
+    for module, name in LEARNERS:
+        watched = watch.learner(f"{module.__name__.split('.')[-1]}.{name}", getattr(module, name))
+        monkeypatch.setattr(module, name, watched)
+    divide = splits.by_configuration
+
+    def by_configuration(names: NDArray[np.str_], folds: int, seed: int) -> list[Split]:
+        return watch.folds(divide(names, folds, seed), names)
+
+    monkeypatch.setattr(splits, "by_configuration", by_configuration)
+    monkeypatch.setattr(choosing, "alone", lambda options: options)
+    return watch
+
+
+def in_room_2(data: Dataset) -> NDArray[np.bool_]:
+    return np.char.find(data.configurations, "room2") >= 0
+
+
+def test_no_row_of_the_contest_has_seen_what_it_is_tested_on(data, watch):
+    contest.run(data, RECIPE, Group.CONFIGURATION, folds=2, seeds=1)
+    for name, calls in {
+        "baselines.los_median": 2,
+        "baselines.overall_median": 2,
+        "baselines.ridge": 4,
+        "baselines.gradient_boosting": 2,
+        "recipe.fit_graded": 2,
+        # The perceptron and the network, for each fold.
+        "contest.fit": 4,
+        "contest.calibration_inputs": 4,
+        "recipe.calibrate": 4,
+        # For the folds' own line, and of the shipped recipe for each inner fold and for the whole.
+        "lad.fit_prior": 2 + 2 * (contest.INNER_FOLDS + 1),
+    }.items():
+        assert watch.calls[name] == calls, name
+
+
+def test_cross_validation_fits_and_calibrates_without_the_fold(data, watch):
+    found = recipe.cross_validate(data, RECIPE, 3, 0)
+    assert {watch.calls[f"recipe.{name}"] for name in ("fit", "calibration_inputs", "quantize")} == {3}
+    assert watch.calls["lad.fit_prior"] == 3
+    for split in splits.by_configuration(data.configurations, 3, 0):
+        expected = data.error_m[split.test] - np.median(data.error_m[split.train])
+        assert np.allclose(found.errors["overall_median"][split.test], expected)
+
+
+def test_a_choice_is_told_by_folds_that_had_no_say_in_it(data, watch, monkeypatch):
+    prefer = choosing.preferred
+    nested = []
+
+    def preferred(errors: dict[str, NDArray[np.float64]], must_gain: float) -> str:
+        if watch.held_out:
+            held_out = set().union(*watch.held_out)
+            nested.append({len(error) for error in errors.values()})
+            assert nested[-1] == {int((~np.isin(data.configurations, list(held_out))).sum())}
+        return prefer(errors, must_gain)
+
+    monkeypatch.setattr(choosing, "preferred", preferred)
+    candidates = choosing.standard(RECIPE)
+    choosing.choose(data, [candidates[0], candidates[2]], 3, 0)
+    assert len(nested) == 3
+    assert watch.calls["lad.constant"] >= 3
+    assert watch.calls["recipe.fit"] >= 3
+
+
+def test_the_learning_curve_is_told_on_configurations_that_it_is_not_fitted_to(data, monkeypatch):
+    fitted: list[set[str]] = []
+    predict = choosing.prior_m
+
+    def fit(part: Dataset, seed: int) -> choosing.Fitted:
+        fitted.append(set(part.names))
+        return lad.constant(part.configurations, part.error_m), None
+
+    def prior_m(prior: Any, part: Dataset) -> NDArray[np.float32]:
+        assert not fitted[-1] & set(part.names)
+        return predict(prior, part)
+
+    monkeypatch.setattr(choosing, "prior_m", prior_m)
+    choosing.choose(data, [choosing.Candidate("constant", fit)], 3, 0)
+    assert len(fitted) == choosing.fits(3, 15, 1)
+
+
+def parts(data: Dataset) -> protocol.Parts:
+    is_test = in_room_2(data)
+    return protocol.Parts("made up", "by room", data.rows(~is_test), data.rows(is_test))
+
+
+def test_the_protocol_fits_and_calibrates_on_its_training_part(data, watch, tmp_path):
+    wanted = protocol.jobs(["remnet", "remnet_attention", "mlp"], [SAMPLES], seeds=1)
+    with watch.without(parts(data).test.names):
+        protocol.run(parts(data), tmp_path, wanted, QUICK)
+    assert watch.calls["calibration.compare"] == 2
+    # Each network, and another for its variance.
+    assert watch.calls["fitting.fit"] == 4
+    for name in ("fitting.descend", "baselines.los_median", "baselines.overall_median", "lad.fit_prior"):
+        assert watch.calls[name] >= 1
+
+
+@pytest.fixture
+def calibrated(monkeypatch: pytest.MonkeyPatch) -> list[set[str]]:
+    """The configurations of each call to `protocol.calibrate`."""
+    calls: list[set[str]] = []
+    calibrate = protocol.calibrate
+
+    def recorded(left: Any, predicted: Any, names: NDArray[np.str_]) -> Any:
+        calls.append(set(names.tolist()))
+        return calibrate(left, predicted, names)
+
+    monkeypatch.setattr(protocol, "calibrate", recorded)
+    return calls
+
+
+def test_the_protocols_variances_are_of_configurations_that_were_not_fitted_to(data, watch, calibrated):
+    card = protocol.describe("made up", RECIPE.architecture, parts(data), QUICK)
+    fitted, (corrected, raw) = watch.seen["fitting.fit"], calibrated
+    assert fitted
+    assert corrected
+    assert not fitted & corrected
+    assert fitted | corrected == raw == set(parts(data).train.names)
+    far_off = replace(parts(data).test, error_m=parts(data).test.error_m + 7)
+    assert (
+        protocol.describe("made up", RECIPE.architecture, replace(parts(data), test=far_off), QUICK) == card
+    )
+
+
+def typed(data: Dataset, monkeypatch: pytest.MonkeyPatch, *words: object) -> None:
+    monkeypatch.setattr(commands, "_labelled", lambda *_: data)
+    monkeypatch.setattr(commands, "_title", lambda path: "made up")
+    result = CliRunner().invoke(app, [str(word) for word in words])
+    if result.exception is not None:
+        raise result.exception
+
+
+def test_a_search_trains_on_neither_its_validation_part_nor_the_test_part(data, watch, monkeypatch, tmp_path):
+    seen = []
+    find = search.search
+
+    def searched(train: Dataset, validation: Dataset, *arguments: Any, **options: Any) -> Any:
+        seen.append(set(train.names) | set(validation.names))
+        with watch.without(validation.names):
+            return find(train, validation, *arguments, **options)
+
+    monkeypatch.setattr(search, "search", searched)
+    test = set(data.rows(in_room_2(data)).names)
+    options = ("--random", 2, "--grid", 1, "--windows", SAMPLES, "--epochs", 1, "--workers", 1)
+    with watch.without(test):
+        typed(data, monkeypatch, "search", "--data", "x", "-o", tmp_path, *options)
+    assert watch.calls["search.fit"] == 3
+    assert seen == [set(data.names) - {n for n in data.names if "room0" in n or "room4" in n} - test]
+
+
+def test_the_range_test_and_the_protocol_train_on_the_training_part(data, watch, monkeypatch, tmp_path):
+    quick = ("--networks", "mlp", "--windows", SAMPLES, "--seeds", 1, "--epochs", 1, "--workers", 1)
+    with watch.without(data.rows(in_room_2(data)).names):
+        typed(data, monkeypatch, "train-lr-range", "--data", "x", "--samples", SAMPLES, "--steps", 20)
+        typed(data, monkeypatch, "protocol", "--data", "x", "-o", tmp_path, *quick)
+    assert watch.calls["learning_rate.range_test"] == watch.calls["calibration.compare"] == 1
