@@ -9,8 +9,9 @@ import typer
 from rich.table import Table
 
 from uwb_mitigation.commands import console
+from uwb_mitigation.commands.checks import needs_torch
 from uwb_mitigation.commands.console import JsonOption
-from uwb_mitigation.commands.training import needs_torch, share_bar
+from uwb_mitigation.commands.training import share_bar
 from uwb_mitigation.errors import ParameterError
 
 

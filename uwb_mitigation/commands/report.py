@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from uwb_mitigation.commands import console
+from uwb_mitigation.commands.checks import needs_torch
 from uwb_mitigation.commands.console import JsonOption
-from uwb_mitigation.errors import MissingDependencyError, ParameterError, UwbMitigationError
+from uwb_mitigation.errors import ParameterError, UwbMitigationError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -138,12 +139,8 @@ def _train_quick(study: Study, folder: Path) -> Trainings:
     from uwb_mitigation.evaluation.results import parse_trainings
     from uwb_mitigation.preprocessing import WINDOW_SIZES
 
-    try:
+    with needs_torch():
         from uwb_mitigation.training import protocol
-    except ModuleNotFoundError as error:
-        if error.name != "torch":
-            raise
-        raise MissingDependencyError("training needs torch", valid="run `make setup-training`") from error
     split, train, test = study.quick_split()
     # Evenly over the data, whose rows are in the order of places.
     step = -(-len(train) // QUICK_MEASUREMENTS)
