@@ -7,12 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from model_material import card, random_weights
 from typer.testing import CliRunner
 
 from uwb_mitigation.cli import app
-from uwb_mitigation.errors import UwbMitigationError
+from uwb_mitigation.errors import ModelError, UwbMitigationError
+from uwb_mitigation.model import graph
 from uwb_mitigation.model.architecture import Remnet
-from uwb_mitigation.model.bundle import load_bundle
+from uwb_mitigation.model.bundle import load_bundle, save_bundle
+from uwb_mitigation.preprocessing import Preprocessing, Scaling
 
 pytest.importorskip("torch", reason="training is not set up: run make setup-training")
 pandas = pytest.importorskip("pandas", reason="test tools are not set up: run make setup-training")
@@ -54,8 +57,43 @@ def test_protocol_then_prune(pickle, tmp_path):
 
     smaller = tmp_path / "smaller.onnx"
     source = folder / "remnet_8_seed0_float.onnx"
-    run("prune", source, "--data", pickle, "-o", smaller, "--filters", 4, "--epochs", 1)
-    assert load_bundle(smaller).architecture == Remnet(8, filters=4)
+    run("prune", source, "--data", pickle, "-o", smaller, "--filters", 4, "--epochs", 1, "--json", summary)
+    pruned, whole = load_bundle(smaller), load_bundle(source)
+    assert pruned.architecture == Remnet(8, filters=4)
+    # What the card tells is of the smaller network.
+    training = pruned.card.training
+    assert training["pruned"]["from"] == f"{whole.model_id:08x}"
+    assert training["pruned"]["architecture"]["filters"] == whole.architecture.filters
+    assert training["metrics_m"]["float"]["mae"] == round(json.loads(summary.read_text())["mae"]["tuned"], 4)
+    assert training["metrics_m"]["raw"]["mae"] == round(result["models"][0]["mae_raw"], 4)
+    assert pruned.card.variance_m2 != whole.card.variance_m2
+    assert (training["split"], training["recipe"]["epochs"]) == ("paper", 1)
+
+    with pytest.raises(ModelError, match="split paper, not all_but_room_2"):
+        run("prune", source, "--data", pickle, "-o", smaller, "--split", "all_but_room_2")
+
+
+@pytest.mark.parametrize(
+    ("training", "message"),
+    [
+        (
+            {"data": "dataset.pkl", "split": "4 folds by configuration", "measurements": 90},
+            "4 folds by config",
+        ),
+        ({"data": "other", "split": "paper", "measurements": 60, "tested_on": 30}, "data other"),
+        ({"data": "dataset.pkl", "split": "paper", "measurements": 61, "tested_on": 30}, "measurements 61"),
+        ({}, "split None"),
+    ],
+)
+def test_a_bundle_that_may_know_the_test_part_is_not_pruned(pickle, tmp_path, training, message):
+    shape = Remnet(8)
+    model = graph.float_model(random_weights(shape))
+    changes = {"quantised": False, "preprocessing": Preprocessing(8, Scaling.MAX), "training": training}
+    save_bundle(tmp_path / "trained.onnx", model, card(shape, **changes))
+    pickled = ("--data", pickle, "--split", "paper")
+    with pytest.raises(ModelError, match=message):
+        run("prune", tmp_path / "trained.onnx", *pickled, "-o", tmp_path / "pruned.onnx")
+    assert not (tmp_path / "pruned.onnx").exists()
 
 
 def test_search_leaves_journal_front_and_figure(pickle, tmp_path):

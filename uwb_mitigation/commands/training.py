@@ -16,11 +16,14 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from uwb_mitigation.commands import console
+from uwb_mitigation.commands.checks import check_output, needs_torch
 from uwb_mitigation.commands.console import JsonOption
-from uwb_mitigation.errors import MissingDependencyError, ModelError, ParameterError, UwbMitigationError
+from uwb_mitigation.errors import ModelError, ParameterError, UwbMitigationError
 
 if TYPE_CHECKING:
     from uwb_mitigation.dataset import Dataset
+    from uwb_mitigation.model.bundle import Bundle
+    from uwb_mitigation.training.protocol import Parts
     from uwb_mitigation.training.results import Protocol
     from uwb_mitigation.training.search import Trial
 
@@ -179,7 +182,9 @@ def train_lr_range(
 
 
 def prune(
-    model: Annotated[Path, typer.Argument(metavar="MODEL_FLOAT", help="Float bundle of a REMNet.")],
+    model: Annotated[
+        Path, typer.Argument(metavar="MODEL_FLOAT", help="Float bundle of a REMNet that `protocol` made.")
+    ],
     data: DataOption,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="Bundle to write.")],
     filters: Annotated[int, typer.Option(help="Filters F to keep.")] = 8,
@@ -191,29 +196,27 @@ def prune(
 ) -> None:
     """Drop the weakest filters of a trained REMNet, and train what is left: a smaller float bundle.
 
-    Trains on the training part of the split, and tells the error on its test part.
+    Trains on the training part of the split, and tells the error on its test part. A bundle that was trained on
+    another split or other data is refused: what is tested would be known to it.
     """
-    import numpy as np
-
     with needs_torch():
+        from uwb_mitigation.training import protocol as protocols
         from uwb_mitigation.training import pruning
-        from uwb_mitigation.training.protocol import PAPER
+    from uwb_mitigation.evaluation.metrics import ErrorStatistics
     from uwb_mitigation.model import floating, graph
     from uwb_mitigation.model.bundle import load_bundle, save_bundle
 
     source = load_bundle(model)
     if source.quantised:
         raise ModelError("already quantised", where=str(model), valid="the float bundle it was made of")
-    if output.suffix != ".onnx" or output.is_dir() or not output.resolve().parent.is_dir():
-        raise ParameterError(
-            "not a place for a bundle", where=str(output), valid="a file .onnx in a folder that exists"
-        )
+    check_output(output)
     weights = graph.float_weights(source.model, source.architecture)
     smaller = pruning.prune(weights, filters)
     dataset = _labelled(data, source.preprocessing.samples, source.preprocessing.scaling.value)
-    known = np.isfinite(_left(dataset, source.prior))
-    train, test, _ = _divide(dataset.rows(known), split)
-    options = replace(PAPER, epochs=epochs, learning_rate=learning_rate, seed=seed)
+    train, test, name = _divide(dataset, split)
+    parts = protocols.Parts(_title(data), name, train, test)
+    _check_trained_on(source, parts)
+    options = replace(protocols.PAPER, epochs=epochs, learning_rate=learning_rate, seed=seed)
     done = 0
     with share_bar("tuning") as update:
 
@@ -222,16 +225,27 @@ def prune(
             done += 1
             update(done / epochs)
 
-        tuned = pruning.prune_and_tune(
-            weights, filters, train.inputs, _left(train, source.prior), options, on_epoch
-        )
-    left = _left(test, source.prior)
-    mae = {
-        name: float(np.abs(left - floating.predict_m(network, test.inputs)).mean())
-        for name, network in (("before", weights), ("pruned", smaller), ("tuned", tuned))
+        tuned = pruning.prune_and_tune(weights, filters, train.inputs, train.error_m, options, on_epoch)
+    networks = {"before": weights, "pruned": smaller, "tuned": tuned}
+    left = {"raw": test.error_m} | {
+        row: test.error_m - floating.predict_m(network, test.inputs) for row, network in networks.items()
     }
-    card = replace(source.card, name=output.stem, architecture=tuned.architecture)
-    bundle = save_bundle(output, graph.float_model(tuned), card)
+    found = {row: ErrorStatistics.of(errors) for row, errors in left.items()}
+    card = protocols.describe(output.stem, tuned.architecture, parts, options)
+    training = {
+        **card.training,
+        "pruned": {
+            "name": source.name,
+            "from": f"{source.model_id:08x}",
+            "architecture": asdict(weights.architecture),
+            "recipe": source.card.training.get("recipe"),
+        },
+        "metrics_m": {
+            row: {key: round(value, 4) for key, value in asdict(found[of]).items()}
+            for row, of in (("raw", "raw"), ("float", "tuned"))
+        },
+    }
+    bundle = save_bundle(output, graph.float_model(tuned), replace(card, training=training))
     cost = {
         "multiply_accumulates": tuned.architecture.multiply_accumulates,
         "multiply_accumulates_before": weights.architecture.multiply_accumulates,
@@ -243,6 +257,7 @@ def prune(
         markup=False,
         highlight=False,
     )
+    mae = {row: found[row].mae for row in networks}
     console.out.print(
         f"test MAE {mae['before']:.4f} m before, {mae['pruned']:.4f} m pruned, {mae['tuned']:.4f} m tuned",
         highlight=False,
@@ -250,15 +265,24 @@ def prune(
     console.write_json(json, {"model_id": bundle.model_id, "mae": mae, **cost})
 
 
-@contextmanager
-def needs_torch() -> Iterator[None]:
-    """Say which command installs torch where it is missing."""
-    try:
-        yield
-    except ModuleNotFoundError as error:
-        if error.name != "torch":
-            raise
-        raise MissingDependencyError("training needs torch", valid="run `make setup-training`") from error
+def _check_trained_on(source: Bundle, parts: Parts) -> None:
+    """Refuse a bundle that may have been fitted to the test part."""
+    here = {
+        "data": parts.data,
+        "split": parts.split,
+        "measurements": len(parts.train),
+        "tested_on": len(parts.test),
+    }
+    trained = {key: source.card.training.get(key) for key in here}
+    if trained != here:
+        differ = "; ".join(
+            f"{key} {trained[key]}, not {here[key]}" for key in here if trained[key] != here[key]
+        )
+        raise ModelError(
+            f"trained on other data than the training part, which leaves nothing to test on: {differ}",
+            where=str(source.path),
+            valid="a bundle of `protocol`, with its --data and --split",
+        )
 
 
 @contextmanager
@@ -309,10 +333,6 @@ def _divide(dataset: Dataset, split: str, folds: int = 4) -> tuple[Dataset, Data
     fold = splits.by_configuration(dataset.configurations, folds, seed=0)[0]
     name = f"configurations: 1 of {folds} parts held out"
     return dataset.rows(fold.train), dataset.rows(fold.test), name
-
-
-def _left(dataset: Dataset, prior: Any) -> Any:
-    return dataset.error_m - prior.predict_batch_m(dataset.rx_power_dbm, dataset.first_path_power_dbm)
 
 
 def _lengths(text: str) -> list[int]:
