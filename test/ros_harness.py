@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import forked_node
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from lifecycle_msgs.srv import ChangeState, GetState
@@ -29,36 +27,33 @@ TIMEOUT_S = 30.0
 # For this process and for all that it starts; read when messages are loaded and when a context is made.
 os.environ |= {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_PYTHON_CHECK_FIELDS": "1"}
 
-FORKS = multiprocessing.get_context("forkserver")
-FORKS.set_forkserver_preload(forked_node.PRELOADED)
-
 
 class Process:
     """A running program whose output is kept."""
 
-    pid: int
-
-    def __init__(self, log: Path) -> None:
+    def __init__(self, command: list[str], domain: int, log: Path) -> None:
         self.log = log
+        environment = os.environ | {"ROS_DOMAIN_ID": str(domain), "PYTHONUNBUFFERED": "1"}
+        with log.open("wb") as file:
+            self._popen = subprocess.Popen(command, env=environment, stdout=file, stderr=subprocess.STDOUT)
+        self.pid = self._popen.pid
 
     def exit_code(self) -> int | None:
         """None while it runs; negative: the signal that ended it."""
-        raise NotImplementedError
+        return self._popen.poll()
 
     @property
     def output(self) -> str:
         return self.log.read_text(errors="replace")
 
     def send(self, number: signal.Signals) -> None:
-        if self.exit_code() is None:
-            os.kill(self.pid, number)
+        self._popen.send_signal(number)
 
     def wait(self, timeout_s: float = TIMEOUT_S) -> int:
-        deadline = time.monotonic() + timeout_s
-        while (code := self.exit_code()) is None:
-            assert time.monotonic() < deadline, f"still running after {timeout_s} s:\n{self.output}"
-            time.sleep(0.01)
-        return code
+        try:
+            return self._popen.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            raise AssertionError(f"still running after {timeout_s} s:\n{self.output}") from None
 
     def signal(self, number: signal.Signals) -> int:
         self.send(number)
@@ -77,35 +72,6 @@ class Process:
         self.wait()
 
 
-class Program(Process):
-    """One that is started from its beginning."""
-
-    def __init__(self, command: list[str], domain: int, log: Path) -> None:
-        super().__init__(log)
-        environment = os.environ | {"ROS_DOMAIN_ID": str(domain), "PYTHONUNBUFFERED": "1"}
-        with log.open("wb") as file:
-            self._popen = subprocess.Popen(command, env=environment, stdout=file, stderr=subprocess.STDOUT)
-        self.pid = self._popen.pid
-
-    def exit_code(self) -> int | None:
-        return self._popen.poll()
-
-
-class ForkedNode(Process):
-    """A node of the package, forked from a process that has loaded most of what it imports."""
-
-    def __init__(self, node: str, words: list[str], domain: int, log: Path) -> None:
-        super().__init__(log)
-        log.touch()
-        self._process = FORKS.Process(target=forked_node.run, args=(node, words, domain, log), daemon=True)
-        self._process.start()
-        assert self._process.pid is not None
-        self.pid = self._process.pid
-
-    def exit_code(self) -> int | None:
-        return self._process.exitcode
-
-
 class Ros:
     """One DDS domain: starts processes in it, and is itself a node in it."""
 
@@ -120,21 +86,13 @@ class Ros:
         self._executor.add_node(self.node)
 
     def start(self, node: str, *parameters: str, arguments: tuple[str, ...] = ()) -> Process:
-        """Start one of the package's nodes: `forked_node` tells in what it differs from `ros2 run`."""
-        return self._keep(ForkedNode(node, _words(parameters, arguments), self.domain, self._next_log()))
-
-    def launch(self, node: str, *parameters: str, arguments: tuple[str, ...] = ()) -> Process:
-        """Start one of the package's nodes as its executable does, which takes a second of loading."""
+        """Start one of the package's nodes as its executable does."""
+        given = [word for parameter in parameters for word in ("-p", parameter)]
         code = f"from uwb_mitigation.nodes.entry import {node}; {node}()"
-        return self.run([sys.executable, "-c", code, *_words(parameters, arguments)])
+        return self.run([sys.executable, "-c", code, "--ros-args", *given, *arguments])
 
     def run(self, command: list[str]) -> Process:
-        return self._keep(Program(command, self.domain, self._next_log()))
-
-    def _next_log(self) -> Path:
-        return self._folder / f"process_{len(self._processes)}.log"
-
-    def _keep(self, process: Process) -> Process:
+        process = Process(command, self.domain, self._folder / f"process_{len(self._processes)}.log")
         self._processes.append(process)
         return process
 
@@ -200,11 +158,6 @@ class Ros:
             process.end()
         self.node.destroy_node()
         rclpy.shutdown(context=self._context)
-
-
-def _words(parameters: Sequence[str], arguments: Sequence[str]) -> list[str]:
-    given = [word for parameter in parameters for word in ("-p", parameter)]
-    return ["--ros-args", *given, *arguments]
 
 
 @contextmanager

@@ -13,7 +13,7 @@ import pytest
 
 from uwb_mitigation.bag.codec import encode_range
 from uwb_mitigation.errors import MissingDependencyError
-from uwb_mitigation.firmware_export import host, toolchain
+from uwb_mitigation.firmware_export import compiling, toolchain
 from uwb_mitigation.firmware_export.backend import FirmwareMitigation
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import Bundle
@@ -44,11 +44,11 @@ def test_without_a_compiler_the_error_says_what_to_install(tmp_path: Path, monke
 @pytest.mark.parametrize("words", ["", "  ", "cc", "cc -O2 -g"])
 def test_cc_may_be_empty_and_may_carry_options(words: str, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("CC", words)
-    monkeypatch.setattr(host.shutil, "which", lambda name: {"cc": "/usr/bin/cc"}.get(name))
-    assert host.c_compiler() == tuple(words.split() or ["cc"])
-    monkeypatch.setattr(host.shutil, "which", lambda name: {"gcc": "/usr/bin/gcc"}.get(name))
+    monkeypatch.setattr(compiling.shutil, "which", lambda name: {"cc": "/usr/bin/cc"}.get(name))
+    assert compiling.c_compiler() == tuple(words.split() or ["cc"])
+    monkeypatch.setattr(compiling.shutil, "which", lambda name: {"gcc": "/usr/bin/gcc"}.get(name))
     monkeypatch.delenv("CC")
-    assert host.c_compiler() == ("gcc",)
+    assert compiling.c_compiler() == ("gcc",)
 
 
 def test_what_only_a_checkout_has_is_said_to_need_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -77,7 +77,7 @@ def test_a_mitigator_that_is_told_to_corrects_with_the_firmware(
     with domain(tmp_path) as ros:
         publisher = ros.node.create_publisher(RangeCir, "/uwb/range_raw", 50)
         corrected = ros.collect(RangeCorrected, "/uwb/range_corrected")
-        ros.launch("mitigator", f"model:={bundle.path}", "backend:=firmware").wait_for_output(
+        ros.start("mitigator", f"model:={bundle.path}", "backend:=firmware").wait_for_output(
             "correcting with"
         )
         ros.spin_until(lambda: publisher.get_subscription_count() == 1)

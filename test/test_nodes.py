@@ -65,9 +65,9 @@ def listen_to_replay(ros: Ros, count: int, *driver: str) -> tuple[list[dict], li
     """Replay through both nodes with a separate subscriber process; its raw and corrected lines."""
     listener = ros.run([sys.executable, str(HERE / "range_listener.py"), str(count)])
     listener.wait_for_output("ready")
-    mitigator = ros.launch("mitigator")
+    mitigator = ros.start("mitigator")
     mitigator.wait_for_output("correcting with model")
-    replay = ros.launch("driver", "wait_for_subscribers:=2", "start_delay:=1.0", *driver)
+    replay = ros.start("driver", "wait_for_subscribers:=2", "start_delay:=1.0", *driver)
     assert listener.wait(60) == 0, listener.output
     assert replay.wait() == 0, replay.output
     assert mitigator.signal(signal.SIGINT) == 0, mitigator.output
@@ -162,7 +162,7 @@ def test_the_simulated_source_runs_until_it_is_told_to_stop(ros: Ros):
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_the_mitigator_cleanly(ros: Ros, number: signal.Signals):
-    mitigator = ros.launch("mitigator")
+    mitigator = ros.start("mitigator")
     mitigator.wait_for_output("correcting with model")
     assert mitigator.signal(number) == 0, mitigator.output
     assert "Traceback" not in mitigator.output
