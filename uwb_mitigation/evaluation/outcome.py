@@ -24,8 +24,8 @@ class Outcome:
     Attributes:
         n: measurements with truth and a valid range.
         raw, corrected: statistics of the error before and after.
-        coverage68, coverage95: shares of corrected errors within 1 and 1.96 of the reported standard
-            deviations; 0.683 and 0.95 were they Gaussian.
+        coverage68, coverage95: shares of corrected errors within the intervals that the bundle promises: 1 and
+            its `interval95_sigmas` of the reported standard deviations.
         by_label, by_configuration: {name: (n, MAE before, MAE after)}.
         statuses: {status: measurements}; on any but OK the raw range counts as corrected.
         model_id: of the model.
@@ -101,7 +101,7 @@ def evaluate(
         raw=ErrorStatistics.of(before),
         corrected=ErrorStatistics.of(after),
         coverage68=coverage(after, spread, 1.0),
-        coverage95=coverage(after, spread, 1.96),
+        coverage95=coverage(after, spread, mitigation.bundle.card.interval95_sigmas),
         by_label=mae_by_group(np.array(labels), before, after),
         by_configuration=mae_by_group(np.array(configurations), before, after),
         statuses=dict(statuses.most_common()),
