@@ -96,6 +96,21 @@ def test_a_range_passed_through_counts_as_it_is(tmp_path):
     assert outcome.statuses == {"BAD_CIR": 1}
 
 
+@pytest.mark.parametrize(("sigmas", "covered"), [(2.0, 0.0), (3.0, 1.0)])
+def test_the_intervals_are_those_that_the_bundle_promises(tmp_path, sigmas, covered):
+    # Every range passes through, and errs by 0.25 m: by 2.8 deviations.
+    promised = {"interval95_sigmas": sigmas, "variance_uncorrected_m2": 1 / 128}
+    mitigation = Mitigation(bundle(tmp_path, Remnet(samples=157), **promised))
+    outcome = evaluate(mitigation, [record(preamble_count=0)])
+    assert (outcome.coverage68, outcome.coverage95) == (0.0, covered)
+
+
+def test_what_only_cross_validation_reads_is_refused_without(recording):
+    for option in (("--seeds", 3), ("--folds", 6), ("--scaling", "max")):
+        with pytest.raises(ParameterError, match=f"^{option[0]} .with --cross-validate"):
+            raise run("evaluate", "--data", "any", *option).exception
+
+
 def test_what_has_no_truth_or_no_range_is_left_out(tmp_path):
     mitigation = Mitigation(bundle(tmp_path, Remnet(samples=157)))
     without_range = replace(record(), measurement=replace(record().measurement, range_m=np.nan))

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from uwb_mitigation.commands import console, model_tables
 from uwb_mitigation.commands.console import JsonOption
-from uwb_mitigation.errors import MissingDependencyError, ModelError, ParameterError
+from uwb_mitigation.errors import DatasetError, MissingDependencyError, ModelError, ParameterError
 
 if TYPE_CHECKING:
     from uwb_mitigation.dataset import Dataset
     from uwb_mitigation.model.bundle import Bundle
-    from uwb_mitigation.preprocessing import Preprocessing
+    from uwb_mitigation.preprocessing import Preprocessing, Scaling
     from uwb_mitigation.sources.source import Record
     from uwb_mitigation.training.choosing import Candidate, Choice
     from uwb_mitigation.training.options import FitOptions
@@ -28,10 +28,21 @@ DataOption = Annotated[
     Path, typer.Option(help="Recording with true ranges: a bag, or a folder of DecaRanging logs.")
 ]
 OutputOption = Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="Bundle to write.")]
+# What only one way of `train` or `evaluate` reads: it is refused, not ignored, with the other.
+_OF_DATA = {
+    "choose": "--recipe",
+    "samples": "--samples",
+    "scaling": "--scaling",
+    "first_kernel": "--first-kernel",
+    "per_configuration": "--per-configuration",
+    "prior": "--prior/--no-prior",
+}
+_OF_CROSS_VALIDATION = {"seeds": "--seeds", "folds": "--folds", "scaling": "--scaling"}
 
 
 @app.command()
 def train(
+    context: typer.Context,
     output: OutputOption,
     data: Annotated[
         Path | None,
@@ -40,7 +51,9 @@ def train(
     from_bag: Annotated[
         Path | None,
         typer.Option(
-            metavar="BAG", help="Instead: start from a model, and fit it to the boards and walls of this bag."
+            metavar="BAG",
+            help="Instead: start from a model, and fit it to the boards and walls of this bag. What is "
+            "marked `with --data` is that model's then, and refused here.",
         ),
     ] = None,
     truth: Annotated[
@@ -53,38 +66,50 @@ def train(
     ] = None,
     model: Annotated[
         Path | None,
-        typer.Option(help="With --from-bag: int8 bundle to start from; without it, the shipped one."),
+        typer.Option(
+            help="With --from-bag: bundle to start from; without it, the shipped one, or where there are few "
+            "configurations the simulator's."
+        ),
     ] = None,
     choose: Annotated[
-        str, typer.Option("--recipe", help="auto, constant, line, line+network, or network.")
+        str, typer.Option("--recipe", help="With --data: auto, constant, line, line+network, or network.")
     ] = "auto",
-    samples: Annotated[int, typer.Option(help="Window length K.")] = 157,
-    scaling: Annotated[str, typer.Option(help="preamble or max.")] = "preamble",
-    first_kernel: Annotated[int, typer.Option(help="Kernel k0 of the first convolution.")] = 3,
+    samples: Annotated[int, typer.Option(help="With --data: window length K.")] = 157,
+    scaling: Annotated[str, typer.Option(help="With --data: preamble or max.")] = "preamble",
+    first_kernel: Annotated[int, typer.Option(help="With --data: kernel k0 of the first convolution.")] = 3,
     epochs: Annotated[int | None, typer.Option(help="Passes over the data.")] = None,
     learning_rate: Annotated[float | None, typer.Option(help="Of Adam.")] = None,
-    per_configuration: Annotated[int, typer.Option(help="Fit to at most so many of a configuration.")] = 20,
+    per_configuration: Annotated[
+        int, typer.Option(help="With --data: fit to at most so many of a configuration.")
+    ] = 20,
     seed: Annotated[int, typer.Option(help="Of the split, the weights and the order.")] = 0,
     folds: Annotated[int, typer.Option(help="Folds of the cross-validation.")] = 6,
-    prior: Annotated[bool, typer.Option("--prior/--no-prior", help="--no-prior is --recipe network.")] = True,
+    prior: Annotated[
+        bool, typer.Option("--prior/--no-prior", help="With --data: --no-prior is --recipe network.")
+    ] = True,
     json: JsonOption = None,
 ) -> None:
     """Choose by cross-validation over configurations what the data can carry, then train it on all of the data:
-    a float bundle."""
+    a float bundle. With 18 configurations or fewer, `cold start` is among what is chosen from, and preferred: half a
+    line of the data's own, half a network that was trained in a simulated flat; not with --recipe or --model."""
     from uwb_mitigation.model.architecture import Remnet
-    from uwb_mitigation.preprocessing import Preprocessing, Scaling
     from uwb_mitigation.training.options import FitOptions
 
     if (data is None) == (from_bag is None):
         raise ParameterError("what to train on", valid="one of --data and --from-bag")
     if from_bag is None and (truth or model):
         raise ParameterError("--truth and --model", valid="with --from-bag")
-    if scaling not in {kind.value for kind in Scaling}:
-        raise ParameterError(f"scaling {scaling!r}", valid=", ".join(kind.value for kind in Scaling))
+    if from_bag is not None and (idle := _given(context, _OF_DATA)):
+        raise ParameterError(
+            f"{idle} with --from-bag",
+            valid="with --data: a bag's fit has these from the model that it starts from",
+        )
+    chosen_scaling = _scaling(scaling)
     if per_configuration < 1:
         raise ParameterError(f"per-configuration = {per_configuration}", valid="1 or more")
-    given = {"epochs": epochs, "learning_rate": learning_rate, "seed": seed}
-    options = FitOptions(**{key: value for key, value in given.items() if value is not None})  # type: ignore[arg-type]
+    asked: dict[str, Any] = {"epochs": epochs, "learning_rate": learning_rate, "seed": seed}
+    asked = {key: value for key, value in asked.items() if value is not None}
+    options = FitOptions(**asked)
     architecture = Remnet(samples=samples, first_kernel=first_kernel)
     _check_output(output)
     _needs_torch()
@@ -102,12 +127,14 @@ def train(
         raise ParameterError(f"recipe {choose!r}", valid=", ".join(("auto", *choosing.STANDARD)))
     choose = choose if prior else choosing.NETWORK
     recipe = recipes.Recipe(architecture, options, per_configuration=per_configuration)
-    dataset, name = _dataset(data, Preprocessing(samples, Scaling(scaling)))
+    alone = replace(choosing.ALONE, **asked)
+    dataset, name = _scaled_dataset(data, samples, chosen_scaling)
+    _check_configurations(dataset, choosing.least_configurations(folds) if choose == "auto" else 2)
     folds = min(folds, len(dataset.names))
     choice = None
     if choose == "auto":
         start = load_bundle(simulated_model_path())
-        candidates = cold_start.offered(choosing.standard(recipe), dataset, start)
+        candidates = cold_start.offered(choosing.standard(recipe, alone), dataset, start)
         choice = _choose(dataset, candidates, folds, seed)
         choose = choice.chosen
     if choice is not None and choose == cold_start.NAME:
@@ -115,10 +142,13 @@ def train(
         bundle = save_bundle(output, graph.float_model(graded.network), graded.card)
         tested = "float"
     else:
-        recipe = choosing.recipe_of(choose, recipe)
+        recipe = choosing.recipe_of(choose, recipe, alone)
         bundle, validation = _train(dataset, name, recipe, output, folds, seed)
         model_tables.show_validation(validation)
         tested = "int8"
+    mae = {row: statistics["mae"] for row, statistics in validation.statistics().items()}
+    after = mae[tested] if choice is None else choice.mae()[choosing.NESTED]
+    model_tables.show_verdict(after, {"raw": mae["raw"]})
     model_tables.show_bundle(bundle)
     console.write_json(
         json,
@@ -126,6 +156,7 @@ def train(
             "model_id": bundle.model_id,
             "n": len(dataset),
             "refused": dict(dataset.refused),
+            "helped": after < mae["raw"],
             "rows": [{"name": row, **statistics} for row, statistics in validation.statistics().items()],
             "by_configuration": {
                 key: {"n": n, "raw_mae": before, "corrected_mae": after}
@@ -195,7 +226,7 @@ def _site(
     from uwb_mitigation.model.bundle import load_bundle, save_bundle
     from uwb_mitigation.model.shipped import default_model_path, simulated_model_path
     from uwb_mitigation.sources.truth_table import load_truth, with_truth
-    from uwb_mitigation.training import cold_start, site
+    from uwb_mitigation.training import choosing, cold_start, site
 
     source = load_bundle(model or default_model_path())
     simulated = load_bundle(simulated_model_path())
@@ -205,20 +236,17 @@ def _site(
     dataset = build_dataset(with_truth(records, stretches) if stretches else records, source.preprocessing)
     for reason, count in dataset.refused.items():
         console.err.print(f"left out: {count} x {reason}", markup=False)
+    _check_configurations(dataset, choosing.least_configurations(folds))
     folds = min(folds, len(dataset.names))
-    candidates = cold_start.offered(candidates, dataset, simulated)
+    if model is None:
+        candidates = cold_start.offered(candidates, dataset, simulated)
     choice = _choose(dataset, candidates, folds, seed)
     start = simulated if choice.chosen == cold_start.NAME else source
     graded, _ = site.fit_chosen(dataset, choice, candidates, start, options, output.stem, bag.resolve().name)
     bundle = save_bundle(output, graph.float_model(graded.network), graded.card)
     mae = choice.mae()
-    for before in ("raw", site.AS_SHIPPED):
-        change = mae[site.NESTED] / mae[before] - 1
-        console.out.print(
-            f"on configurations not seen, {mae[site.NESTED]:.3f} m against {mae[before]:.3f} m {before}: "
-            f"{abs(change):.0%} {'lower' if change < 0 else 'higher: this did not help'}",
-            highlight=False,
-        )
+    before = {name: mae[name] for name in ("raw", site.AS_SHIPPED)}
+    model_tables.show_verdict(mae[site.NESTED], before)
     model_tables.show_bundle(bundle)
     console.write_json(
         json,
@@ -226,7 +254,7 @@ def _site(
             "model_id": bundle.model_id,
             "n": len(dataset),
             "refused": dict(dataset.refused),
-            "helped": mae[site.NESTED] < min(mae["raw"], mae[site.AS_SHIPPED]),
+            "helped": mae[site.NESTED] < min(before.values()),
             "choice": choice.as_json(),
         },
     )
@@ -282,6 +310,7 @@ def quantize(
 
 @app.command()
 def evaluate(
+    context: typer.Context,
     data: DataOption,
     model: Annotated[Path | None, typer.Option(help="Bundle; without it, the shipped one.")] = None,
     cross_validate: Annotated[
@@ -294,6 +323,9 @@ def evaluate(
     ] = None,
     seeds: Annotated[int, typer.Option(help="With --cross-validate: splits and networks.")] = 3,
     folds: Annotated[int, typer.Option(help="With --cross-validate configuration.")] = 6,
+    scaling: Annotated[
+        str, typer.Option(help="With --cross-validate: preamble, or max for data without preamble counts.")
+    ] = "preamble",
     json: JsonOption = None,
 ) -> None:
     """Correct a recording that knows its true ranges, and tell the error before and after."""
@@ -302,8 +334,10 @@ def evaluate(
             raise ParameterError(
                 "--model with --cross-validate", valid="one of them: cross-validation fits models of its own"
             )
-        _contest(data, cross_validate, folds, seeds, json)
+        _contest(data, cross_validate, folds, seeds, _scaling(scaling), json)
         return
+    if idle := _given(context, _OF_CROSS_VALIDATION):
+        raise ParameterError(idle, valid="with --cross-validate")
     from uwb_mitigation.evaluation import outcome
     from uwb_mitigation.mitigation import Mitigation
     from uwb_mitigation.model.bundle import load_bundle
@@ -315,10 +349,9 @@ def evaluate(
     console.write_json(json, result.as_json())
 
 
-def _contest(data: Path, group: str, folds: int, seeds: int, json: Path | None) -> None:
+def _contest(data: Path, group: str, folds: int, seeds: int, scaling: Scaling, json: Path | None) -> None:
     from uwb_mitigation.evaluation import splits
     from uwb_mitigation.model.architecture import Remnet
-    from uwb_mitigation.preprocessing import Preprocessing
     from uwb_mitigation.training.options import FitOptions
 
     if group not in {kind.value for kind in splits.Group}:
@@ -331,7 +364,7 @@ def _contest(data: Path, group: str, folds: int, seeds: int, json: Path | None) 
     from uwb_mitigation.training import contest
     from uwb_mitigation.training.recipe import Recipe
 
-    dataset, _ = _dataset(data, Preprocessing())
+    dataset, _ = _scaled_dataset(data, Remnet().samples, scaling)
     kind = splits.Group(group)
     with console.progress() as bar:
         total = seeds * len(splits.by_group(dataset, kind, folds, 0))
@@ -372,6 +405,41 @@ def _dataset(data: Path, preprocessing: Preprocessing) -> tuple[Dataset, str]:
     for reason, count in dataset.refused.items():
         console.err.print(f"left out: {count} x {reason}", markup=False)
     return dataset, data.resolve().name
+
+
+def _scaled_dataset(data: Path, samples: int, scaling: Scaling) -> tuple[Dataset, str]:
+    """`_dataset` for a network of its own: where it was the scaling that left nothing, the error says so."""
+    from uwb_mitigation.preprocessing import CirFault, Preprocessing
+
+    try:
+        return _dataset(data, Preprocessing(samples, scaling))
+    except DatasetError as error:
+        if CirFault.NO_PREAMBLE_COUNT.value not in error.what:
+            raise
+        raise DatasetError(error.what, valid="--scaling max does without preamble counts") from error
+
+
+def _check_configurations(dataset: Dataset, needed: int) -> None:
+    """Refuse before any fold is drawn what has too few of them."""
+    if (count := len(dataset.names)) < needed:
+        raise DatasetError(
+            f"{count} configuration{'' if count == 1 else 's'}, that is placements of tag and anchor",
+            valid=f"{needed} or more, each under a name of its own in `configuration` of the true ranges",
+        )
+
+
+def _scaling(name: str) -> Scaling:
+    from uwb_mitigation.preprocessing import Scaling
+
+    if name not in {kind.value for kind in Scaling}:
+        raise ParameterError(f"scaling {name!r}", valid=", ".join(kind.value for kind in Scaling))
+    return Scaling(name)
+
+
+def _given(context: typer.Context, flags: Mapping[str, str]) -> str:
+    """Those of `flags`, {parameter: option}, that the command line holds, with commas."""
+    sources = {flag: context.get_parameter_source(name) for name, flag in flags.items()}
+    return ", ".join(flag for flag, source in sources.items() if source and source.name == "COMMANDLINE")
 
 
 def _check_output(output: Path) -> None:

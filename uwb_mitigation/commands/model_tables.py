@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from rich.table import Table
@@ -44,26 +45,40 @@ def show_choice(choice: Choice) -> None:
         title=f"{choice.configurations} configurations, {choice.folds} folds by configuration",
         title_justify="left",
     )
+    table.add_column("")
     table.add_column("candidate")
     table.add_column("MAE, m", justify="right")
     table.add_column("")
     for row, mae in choice.mae().items():
         is_chosen = row == choice.chosen
         table.add_row(
+            "->" if is_chosen else "",
             row,
             f"{mae:.3f}",
-            _CANDIDATES.get(row, "") + (" <- chosen" if is_chosen else ""),
+            _CANDIDATES.get(row, ""),
             style="bold" if is_chosen else None,
         )
     console.out.print(table)
     curve = ", ".join(f"{mae:.3f} m with {count}" for count, mae in choice.curve)
     needed = choice.needed()
-    outlook = (
-        "More configurations of this kind are not expected to lower it by 5%."
-        if needed is None
-        else f"If it goes on like this, some {needed} configurations lower it by 5%."
-    )
+    if not choice.has_outlook:
+        outlook = "Too few configurations to say whether more would lower it."
+    elif needed is None:
+        outlook = "More configurations of this kind are not expected to lower it by 5%."
+    else:
+        outlook = f"If it goes on like this, some {needed} configurations lower it by 5%."
     console.out.print(f"MAE of {choice.chosen} by configurations: {curve}. {outlook}", highlight=False)
+
+
+def show_verdict(after_m: float, before_m: Mapping[str, float]) -> None:
+    """Whether a MAE on configurations not seen is lower than each of those it is to better, by their names."""
+    for name, before in before_m.items():
+        change = after_m / before - 1 if before else 0.0
+        console.out.print(
+            f"on configurations not seen, {after_m:.3f} m against {before:.3f} m {name}: "
+            f"{abs(change):.0%} {'lower' if after_m < before else 'higher: this did not help'}",
+            highlight=False,
+        )
 
 
 def show_validation(validation: CrossValidation) -> None:

@@ -7,7 +7,7 @@ that the error that is told of the chosen model was tuned on nothing that it is 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,13 @@ from uwb_mitigation.training.recipe import Recipe, fit_model, prior_m
 MUST_GAIN = 0.02
 """A richer candidate is chosen where it lowers the error by at least this share: less is the luck of the folds."""
 
+ALONE = FitOptions(epochs=20, learning_rate=1e-3, dropout=0.2)
+"""How a network without a prior is fitted: it needs more of it than one that only refines a line."""
+
 CURVE_DRAWS = 8
+LEAST_POINTS = 3
+"""Of a learning curve, to extrapolate it."""
+
 CURVE_SHARES = (0.3, 0.5, 0.75, 1.0)
 
 CONSTANT, LINE, LINE_NETWORK, NETWORK = STANDARD = ("constant", "line", "line+network", "network")
@@ -77,12 +83,18 @@ class Choice:
             "configurations_needed": self.needed(),
         }
 
+    @property
+    def has_outlook(self) -> bool:
+        """Whether the learning curve has points enough for `needed` to say anything."""
+        return len(self.curve) >= LEAST_POINTS
+
     def needed(self, share: float = 0.95) -> int | None:
-        """How many configurations it would take for `share` of the error of now; None = more of the same would not do.
+        """How many configurations it would take for `share` of the error of now; None = more of the same would not do,
+        or there is no outlook.
 
         From MAE = a + b / n, least squares through the learning curve.
         """
-        if len(self.curve) < 3:
+        if not self.has_outlook:
             return None
         count, mae = np.array(self.curve, float).T
         (floor, slope), *_ = np.linalg.lstsq(
@@ -94,8 +106,8 @@ class Choice:
         return int(np.ceil(slope / (wanted - floor)))
 
 
-def standard(recipe: Recipe) -> list[Candidate]:
-    """A constant, a line, a line and a network on what it leaves, a network alone."""
+def standard(recipe: Recipe, alone: FitOptions = ALONE) -> list[Candidate]:
+    """A constant, a line, a line and a network on what it leaves, a network alone, which is fitted by `alone`."""
 
     def seeded(of: Recipe, seed: int) -> Recipe:
         return replace(of, fit=replace(of.fit, seed=seed))
@@ -106,7 +118,9 @@ def standard(recipe: Recipe) -> list[Candidate]:
         Candidate(
             LINE_NETWORK, lambda data, seed: fit_model(data, seeded(recipe_of(LINE_NETWORK, recipe), seed))
         ),
-        Candidate(NETWORK, lambda data, seed: fit_model(data, seeded(recipe_of(NETWORK, recipe), seed))),
+        Candidate(
+            NETWORK, lambda data, seed: fit_model(data, seeded(recipe_of(NETWORK, recipe, alone), seed))
+        ),
     ]
 
 
@@ -115,23 +129,13 @@ def line(data: Dataset) -> LinePrior:
     return lad.fit_prior(data.configurations, data.rx_power_dbm, data.first_path_power_dbm, data.error_m)
 
 
-def alone(options: FitOptions) -> FitOptions:
-    """How a network without a prior is fitted: it needs more of it than one that only refines a line.
-
-    What differs in `options` from the defaults was asked for, and stays.
-    """
-    defaults = asdict(FitOptions())
-    asked = {name: value for name, value in asdict(options).items() if value != defaults[name]}
-    return replace(FitOptions(epochs=20, learning_rate=1e-3, dropout=0.2), **asked)
-
-
-def recipe_of(name: str, recipe: Recipe) -> Recipe:
-    """The recipe of a standard candidate."""
+def recipe_of(name: str, recipe: Recipe, alone: FitOptions = ALONE) -> Recipe:
+    """The recipe of a standard candidate; a network without a line is fitted by `alone`."""
     return replace(
         recipe,
         line=name in (LINE, LINE_NETWORK),
         network=name in (LINE_NETWORK, NETWORK),
-        fit=alone(recipe.fit) if name == NETWORK else recipe.fit,
+        fit=alone if name == NETWORK else recipe.fit,
     )
 
 
@@ -168,6 +172,11 @@ def choose(
 
 NESTED = "chosen (nested)"
 """Row of what choosing itself leaves on configurations that neither a fit nor a choice has seen."""
+
+
+def least_configurations(folds: int) -> int:
+    """How many configurations `choose` needs, so that each part that a fold leaves fills the inner folds."""
+    return 4 if folds == 2 else 3
 
 
 def fits(folds: int, configurations: int, candidates: int) -> int:

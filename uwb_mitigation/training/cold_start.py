@@ -32,10 +32,14 @@ MUST_GAIN = 0.10
 
 
 def offered(candidates: Sequence[Candidate], dataset: Dataset, source: Bundle) -> list[Candidate]:
-    """The candidates, behind the cold start where the dataset is small and has what `source` reads."""
-    has_powers = np.isfinite(dataset.rx_power_dbm - dataset.first_path_power_dbm).all()
+    """The candidates, behind the cold start where the dataset is small, is preprocessed as for `source`, and has
+    ranges with power levels in as many configurations as a line needs, or in all of fewer.
+    """
+    count = len(dataset.names)
+    known = np.isfinite(dataset.rx_power_dbm - dataset.first_path_power_dbm)
+    has_powers = len(dataset.rows(known).names) >= min(count, lad.MIN_CONFIGURATIONS)
     is_alike = dataset.preprocessing == source.preprocessing
-    if len(dataset.names) > MOST_CONFIGURATIONS or not (has_powers and is_alike):
+    if count > MOST_CONFIGURATIONS or not (has_powers and is_alike):
         return list(candidates)
     return [candidate(source), *candidates]
 
@@ -53,12 +57,8 @@ def candidate(source: Bundle) -> Candidate:
         line = choosing.line(data)
         left = data.error_m - floating.predict_m(network, data.inputs)
         offset = lad.constant(data.configurations, left).offset_m
-        mean = LinePrior(
-            _float32((line.offset_m + offset) / 2),
-            _float32(line.per_rx_power / 2),
-            _float32(line.per_power_gap / 2),
-        )
-        return mean, half
+        total = (line.offset_m + offset, line.per_rx_power, line.per_power_gap)
+        return LinePrior(*(float(np.float32(value / 2)) for value in total)), half
 
     return Candidate(NAME, fit)
 
@@ -68,7 +68,3 @@ def _halved(network: FloatWeights) -> FloatWeights:
     weight = {**network.weight, HEAD: network.weight[HEAD] * np.float32(0.5)}
     bias = {**network.bias, HEAD: network.bias[HEAD] * np.float32(0.5)}
     return replace(network, weight=weight, bias=bias)
-
-
-def _float32(value: float) -> float:
-    return float(np.float32(value))

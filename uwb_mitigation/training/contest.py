@@ -18,7 +18,7 @@ from uwb_mitigation.model.architecture import Mlp, Remnet
 from uwb_mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.training import choosing
 from uwb_mitigation.training import recipe as recipes
-from uwb_mitigation.training.fitting import FitOptions, fit
+from uwb_mitigation.training.fitting import fit
 from uwb_mitigation.training.quantization import calibration_inputs, quantize
 from uwb_mitigation.training.recipe import Recipe
 
@@ -212,7 +212,7 @@ def _baselines(
     line = lad.fit_prior(train.configurations, train.rx_power_dbm, train.first_path_power_dbm, train.error_m)
     yield "l1_line", line.predict_batch_m(test.rx_power_dbm, test.first_path_power_dbm)
     part = train.rows(splits.thinned(train.configurations, recipe.per_configuration, seed))
-    options = choosing.alone(FitOptions(seed=seed))
+    options = replace(choosing.ALONE, seed=seed)
     samples = recipe.architecture.samples
     perceptron = fit(Mlp(samples=samples), part.inputs, part.error_m, options)
     yield "mlp", floating.predict_m(perceptron, test.inputs)

@@ -185,8 +185,10 @@ def describe(name: str, recipe: Recipe, prior: LinePrior, validation: CrossValid
             "measurements": len(dataset),
             "split": f"{validation.folds} folds by configuration",
             "seed": validation.seed,
-            "recipe": asdict(recipe.fit)
-            | {"line": recipe.line, "network": recipe.network, "per_configuration": recipe.per_configuration},
+            "recipe": {"line": recipe.line, "network": recipe.network}
+            | (
+                asdict(recipe.fit) | {"per_configuration": recipe.per_configuration} if recipe.network else {}
+            ),
             "metrics_m": {
                 row: {key: round(value, 4) for key, value in statistics.items()}
                 for row, statistics in validation.statistics().items()

@@ -82,13 +82,15 @@ def fit_chosen(
         options,
         line=prior.needs_power,
         per_configuration=PER_CONFIGURATION,
-        network=network is not None,
+        network=choice.chosen == choosing.LINE_NETWORK,
     )
     validation = CrossValidation(
         dataset, {**choice.errors, "float": choice.errors[choice.chosen]}, choice.folds, choice.seed
     )
     card = describe(name, recipe, prior, validation, data)
-    started = {"started_from": f"{source.model_id:08x}", "chosen": choice.chosen}
+    # A network that is kept as `source` has it is there, but how it was fitted is told by the card of `source`.
+    made = {**card.training["recipe"], "network": network is not None}
+    started = {"started_from": f"{source.model_id:08x}", "chosen": choice.chosen, "recipe": made}
     card = replace(card, training={**card.training, **started})
     return GradedModel(card, silent if network is None else network), validation
 
