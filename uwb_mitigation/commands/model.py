@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from uwb_mitigation.commands import console, model_tables
+from uwb_mitigation.commands.checks import check_output, needs_torch
 from uwb_mitigation.commands.console import JsonOption
-from uwb_mitigation.errors import DatasetError, MissingDependencyError, ModelError, ParameterError
+from uwb_mitigation.errors import DatasetError, ModelError, ParameterError
 
 if TYPE_CHECKING:
     from uwb_mitigation.dataset import Dataset
@@ -111,8 +112,11 @@ def train(
     asked = {key: value for key, value in asked.items() if value is not None}
     options = FitOptions(**asked)
     architecture = Remnet(samples=samples, first_kernel=first_kernel)
-    _check_output(output)
-    _needs_torch()
+    check_output(output)
+    with needs_torch():
+        from uwb_mitigation.training import choosing, cold_start, site
+        from uwb_mitigation.training import recipe as recipes
+
     if from_bag is not None:
         _site(from_bag, truth or [], model, output, options, folds, seed, json)
         return
@@ -120,8 +124,6 @@ def train(
     from uwb_mitigation.model import graph
     from uwb_mitigation.model.bundle import load_bundle, save_bundle
     from uwb_mitigation.model.shipped import simulated_model_path
-    from uwb_mitigation.training import choosing, cold_start, site
-    from uwb_mitigation.training import recipe as recipes
 
     if choose not in ("auto", *choosing.STANDARD):
         raise ParameterError(f"recipe {choose!r}", valid=", ".join(("auto", *choosing.STANDARD)))
@@ -283,7 +285,7 @@ def quantize(
         raise ModelError("already quantised", where=str(model), valid="the float bundle it was made of")
     if not 90 <= percentile <= 100:
         raise ParameterError(f"percentile = {percentile}", valid="90 to 100")
-    _check_output(output)
+    check_output(output)
     dataset, _ = _dataset(data, source.preprocessing)
     inputs = quantization.calibration_inputs(dataset, seed=0)
     network = graph.float_weights(source.model, source.architecture)
@@ -360,9 +362,9 @@ def _contest(data: Path, group: str, folds: int, seeds: int, scaling: Scaling, j
         )
     if not 1 <= seeds <= 100:
         raise ParameterError(f"seeds = {seeds}", valid="1 to 100")
-    _needs_torch()
-    from uwb_mitigation.training import contest
-    from uwb_mitigation.training.recipe import Recipe
+    with needs_torch():
+        from uwb_mitigation.training import contest
+        from uwb_mitigation.training.recipe import Recipe
 
     dataset, _ = _scaled_dataset(data, Remnet().samples, scaling)
     kind = splits.Group(group)
@@ -374,15 +376,6 @@ def _contest(data: Path, group: str, folds: int, seeds: int, scaling: Scaling, j
         )
     model_tables.show_contest(result)
     console.write_json(json, result.as_json())
-
-
-def _needs_torch() -> None:
-    try:
-        import uwb_mitigation.training.learner  # noqa: F401  (brings torch)
-    except ModuleNotFoundError as error:
-        if error.name != "torch":
-            raise
-        raise MissingDependencyError("training needs torch", valid="run `make setup-training`") from error
 
 
 def _records(data: Path) -> Iterator[Record]:
@@ -440,11 +433,3 @@ def _given(context: typer.Context, flags: Mapping[str, str]) -> str:
     """Those of `flags`, {parameter: option}, that the command line holds, with commas."""
     sources = {flag: context.get_parameter_source(name) for name, flag in flags.items()}
     return ", ".join(flag for flag, source in sources.items() if source and source.name == "COMMANDLINE")
-
-
-def _check_output(output: Path) -> None:
-    """Refuse before the work is done, not after."""
-    if output.suffix != ".onnx" or output.is_dir() or not output.resolve().parent.is_dir():
-        raise ParameterError(
-            "not a place for a bundle", where=str(output), valid="a file .onnx in a folder that exists"
-        )
