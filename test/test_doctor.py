@@ -8,6 +8,7 @@ from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 from types import SimpleNamespace
 
+import command_line
 import numpy as np
 import pytest
 from conftest import REPOSITORY
@@ -17,6 +18,7 @@ from typer.testing import CliRunner
 from uwb_mitigation import installation
 from uwb_mitigation.cli import app
 from uwb_mitigation.errors import ModelError
+from uwb_mitigation.firmware_export import compiling
 from uwb_mitigation.installation import Finding, State
 from uwb_mitigation.model import bundle
 from uwb_mitigation.model.session import Session
@@ -62,6 +64,12 @@ def test_a_package_that_cannot_be_imported_is_broken(
     assert found.state is State.BROKEN
     assert module in found.detail
     assert "make setup" in found.fix
+
+
+def test_a_missing_module_is_named_by_what_is_installed_for_it():
+    modules = ["numpy", "serial.tools", "yaml", "lz4", "cobs.cobs", "uwb_mitigation.nothing", ""]
+    known = ["numpy", "pyserial", "pyyaml", "lz4", "cobs", None, None]
+    assert [installation.distribution_of(module) for module in modules] == known
 
 
 @pytest.mark.parametrize("module", ["rclpy", "uwb_mitigation_msgs"])
@@ -134,10 +142,47 @@ def test_optional_tools_that_are_absent_break_nothing(monkeypatch: pytest.Monkey
     monkeypatch.setattr(installation.metadata, "version", absent)
     monkeypatch.setattr(installation, "UDEV_FOLDERS", (tmp_path,))
     found = {f.name: f for f in (*installation._udev_rule(), *installation._tools())}
-    for name in ("torch", "cc", "arm-none-eabi-gcc", "qemu-system-arm", "udev rule"):
+    for name in ("torch", "C compiler", "arm-none-eabi-gcc", "qemu-system-arm", "udev rule"):
         assert found[name].state is State.OPTIONAL
         assert found[name].detail
         assert found[name].fix
+
+
+@pytest.mark.parametrize(("words", "state"), [("", "ok"), ("cc -O2", "ok"), ("nocc -O2", "optional")])
+def test_the_compiler_is_the_one_that_the_backend_runs(
+    monkeypatch: pytest.MonkeyPatch, words: str, state: str
+):
+    monkeypatch.setenv("CC", words)
+    monkeypatch.setattr(compiling.shutil, "which", lambda name: {"cc": "/usr/bin/cc"}.get(name))
+    found = {finding.name: finding for finding in installation._tools()}["C compiler"]
+    assert found.state.value == state
+    assert found.detail == ((words or "cc") if state == "ok" else "mitigator with backend:=firmware")
+
+
+def test_what_does_not_answer_is_broken(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(installation, "CHILD_TIMEOUT_S", 0.2)
+    found = installation._attempt("rclpy", lambda: installation._child("import time; time.sleep(60)"), "")
+    assert (found.state, found.detail) == (State.BROKEN, "did not answer within 0.2 s")
+
+
+@pytest.mark.parametrize(("count", "told"), [(1, "1 thing is broken"), (2, "2 things are broken")])
+def test_how_much_is_broken_is_said_on_standard_error(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, count: int, told: str
+):
+    broken = [Finding("thing", State.BROKEN, "gone", "mend it")] * count
+    monkeypatch.setattr(installation, "examine", lambda: iter([*broken, Finding("other", State.OK, "1.0")]))
+    done = command_line.run("doctor", folder=tmp_path)
+    assert (done.returncode, done.stderr) == (1, f"uwb-mitigation: {told}\n")
+    assert done.stdout.count("thing: mend it") == count
+
+
+def test_a_long_place_is_shown_whole_on_a_narrow_terminal(monkeypatch: pytest.MonkeyPatch):
+    place = "/home/somebody/" + "a_folder_with_a_name/" * 6 + "msg"
+    monkeypatch.setattr(installation, "examine", lambda: iter([Finding("messages", State.OK, place)]))
+    shown = CliRunner().invoke(app, ["doctor"], env={"COLUMNS": "80"}).output
+    assert max(map(len, shown.splitlines())) <= 80
+    cells = [line.split("│")[3].strip() for line in shown.splitlines() if line.startswith("│")]
+    assert "".join(cells) == place
 
 
 def test_the_udev_rule_is_found_where_it_was_copied_to(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):

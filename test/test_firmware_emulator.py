@@ -18,9 +18,9 @@ import pytest
 from firmware_models import Exported
 
 from uwb_mitigation.firmware_export import emulator, measurement, synthetic, toolchain
+from uwb_mitigation.firmware_export.compiling import WARNINGS, firmware_folder, run
 from uwb_mitigation.firmware_export.emulated_board import EmulatedFirmware, window_of
 from uwb_mitigation.firmware_export.export import export_bundle
-from uwb_mitigation.firmware_export.host import WARNINGS, firmware_folder, run
 from uwb_mitigation.firmware_export.toolchain import Board, Kernels
 from uwb_mitigation.link import messages
 from uwb_mitigation.link.framing import FrameDecoder, FrameEncoder

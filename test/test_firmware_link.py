@@ -11,8 +11,9 @@ import firmware_models
 import numpy as np
 import pytest
 
+from uwb_mitigation.firmware_export.compiling import compile_objects, firmware_folder, run
 from uwb_mitigation.firmware_export.export import export_bundle
-from uwb_mitigation.firmware_export.host import compile_objects, firmware_folder, link, run
+from uwb_mitigation.firmware_export.host import link
 from uwb_mitigation.link import messages
 from uwb_mitigation.link.board import Board, Identity
 from uwb_mitigation.link.framing import Frame, FrameDecoder, FrameEncoder, encode_frame

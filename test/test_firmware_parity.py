@@ -15,8 +15,9 @@ from firmware_models import Exported
 
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.firmware_export import synthetic
+from uwb_mitigation.firmware_export.compiling import firmware_folder, run
 from uwb_mitigation.firmware_export.export import export_bundle
-from uwb_mitigation.firmware_export.host import HostFirmware, firmware_folder, link, run
+from uwb_mitigation.firmware_export.host import HostFirmware, link
 from uwb_mitigation.measurement import Status
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model import graph

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from uwb_mitigation.firmware_export.compiling import firmware_folder, run
 from uwb_mitigation.firmware_export.export import export_bundle
-from uwb_mitigation.firmware_export.host import firmware_folder, library_objects, run
+from uwb_mitigation.firmware_export.host import library_objects
 from uwb_mitigation.link import messages
 from uwb_mitigation.link.framing import FrameDecoder, FrameEncoder
 from uwb_mitigation.link.messages import Correction, Hello

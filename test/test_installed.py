@@ -156,7 +156,7 @@ def test_the_messages_are_installed_as_an_interface_package():
 CORRECT_WITH_THE_FIRMWARE = """
 import uwb_mitigation
 from uwb_mitigation.firmware_export.backend import FirmwareMitigation
-from uwb_mitigation.firmware_export.host import firmware_folder
+from uwb_mitigation.firmware_export.compiling import firmware_folder
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.shipped import default_model_path
 FirmwareMitigation(load_bundle(default_model_path()))

@@ -17,6 +17,7 @@ from importlib import import_module, metadata
 from pathlib import Path
 
 from uwb_mitigation.errors import ModelError
+from uwb_mitigation.firmware_export.compiling import c_compiler
 from uwb_mitigation.model.shipped import default_model_path
 
 PYTHONS = ((3, 10), (3, 13))
@@ -46,6 +47,7 @@ from uwb_mitigation_msgs import msg
 msg.RangeCir.__class__.__import_type_support__()
 print(msg.__path__[0])
 """
+CHILD_TIMEOUT_S = 60
 _DIALOUT = "sudo usermod -aG dialout $USER, then log in again"
 
 
@@ -77,14 +79,21 @@ class Finding:
 def examine() -> Iterator[Finding]:
     """Look at everything, one thing after the other."""
     yield _attempt("Python", _python, "make PYTHON=python3.12 setup")
-    for distribution, module in PACKAGES.items():
-        yield _attempt(distribution, partial(_package, distribution, module), _SETUP)
-    yield _attempt("shipped model", _model, "install the package again")
+    packages = [_attempt(name, partial(_package, name, module), _SETUP) for name, module in PACKAGES.items()]
+    yield from packages
+    complete = all(package.state is State.OK for package in packages)
+    yield _attempt("shipped model", _model, "install the package again" if complete else _SETUP)
     yield _attempt("rclpy", partial(_child, _RCLPY), _ROS)
     yield _attempt("messages", partial(_child, _MESSAGES), _ROS)
     yield from _ports()
     yield from _udev_rule()
     yield from _tools()
+
+
+def distribution_of(module: str) -> str | None:
+    """Which of `PACKAGES` a module is of; None: of none."""
+    top = module.partition(".")[0]
+    return next((name for name, imported in PACKAGES.items() if imported.partition(".")[0] == top), None)
 
 
 def _attempt(name: str, look: Callable[[], str], fix: str) -> Finding:
@@ -131,7 +140,11 @@ def _model() -> str:
 
 def _child(code: str) -> str:
     """What Python prints on running `code`. ROS ends the process that cannot load its middleware."""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    command = [sys.executable, "-c", code]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=CHILD_TIMEOUT_S)
+    except subprocess.TimeoutExpired as error:
+        raise RuntimeError(f"did not answer within {CHILD_TIMEOUT_S} s") from error
     if done.returncode:
         lines = done.stderr.strip().splitlines()
         raise RuntimeError(lines[-1] if lines else f"exit code {done.returncode}")
@@ -170,13 +183,24 @@ def _udev_rule() -> Iterator[Finding]:
 
 def _tools() -> Iterator[Finding]:
     # Not imported: that takes seconds.
-    torch = _attempt("torch", partial(metadata.version, "torch"), "make setup-training")
+    yield _optional("torch", partial(metadata.version, "torch"), "for training", "make setup-training")
+    compiler = "mitigator with backend:=firmware"
+    yield _optional("C compiler", lambda: " ".join(c_compiler()), compiler, "apt install gcc, or set CC")
     purposes = {
-        "cc": ("mitigator with backend:=firmware", "apt install gcc"),
         "arm-none-eabi-gcc": ("builds the firmware", "apt install gcc-arm-none-eabi libnewlib-arm-none-eabi"),
         "qemu-system-arm": ("runs the firmware without a board", "apt install qemu-system-arm"),
     }
-    yield replace(torch, state=State.OPTIONAL, detail="for training") if torch.fix else torch
     for tool, (purpose, fix) in purposes.items():
-        place = shutil.which(os.environ.get("CC", tool) if tool == "cc" else tool)
-        yield Finding(tool, State.OK, place) if place else Finding(tool, State.OPTIONAL, purpose, fix)
+        yield _optional(tool, partial(_tool, tool), purpose, fix)
+
+
+def _optional(name: str, look: Callable[[], str], purpose: str, fix: str) -> Finding:
+    found = _attempt(name, look, fix)
+    return found if found.state is State.OK else replace(found, state=State.OPTIONAL, detail=purpose)
+
+
+def _tool(name: str) -> str:
+    place = shutil.which(name)
+    if place is None:
+        raise RuntimeError("not found")
+    return place

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import asdict
 
-import typer
 from rich.markup import escape
-from rich.table import Table
+from rich.table import Column, Table
 
 from uwb_mitigation.commands import console
 from uwb_mitigation.commands.console import JsonOption
+from uwb_mitigation.errors import UwbMitigationError
 
 _STYLES = {"ok": "green", "broken": "red"}
 
@@ -20,7 +20,7 @@ def doctor(json: JsonOption = None) -> None:
 
     findings = list(examine())
     broken = [finding for finding in findings if finding.state is State.BROKEN]
-    table = Table("", "state", "", title_justify="left")
+    table = Table("", "state", Column(overflow="fold"))
     for finding in findings:
         style = _STYLES.get(finding.state.value, "yellow")
         table.add_row(finding.name, f"[{style}]{finding.state.value}[/]", escape(finding.detail))
@@ -30,4 +30,6 @@ def doctor(json: JsonOption = None) -> None:
             console.out.print(f"{finding.name}: {finding.fix}", markup=False, highlight=False, soft_wrap=True)
     console.write_json(json, {"ok": not broken, "findings": [asdict(finding) for finding in findings]})
     if broken:
-        raise typer.Exit(1)
+        raise UwbMitigationError(
+            "1 thing is broken" if len(broken) == 1 else f"{len(broken)} things are broken"
+        )

@@ -12,7 +12,7 @@ import re
 from collections import Counter
 
 from uwb_mitigation.errors import UwbMitigationError
-from uwb_mitigation.firmware_export.host import run
+from uwb_mitigation.firmware_export.compiling import run
 from uwb_mitigation.firmware_export.toolchain import Image
 
 _REFILL = 2

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ParameterError, UwbMitigationError
-from uwb_mitigation.firmware_export.host import run
+from uwb_mitigation.firmware_export.compiling import run
 from uwb_mitigation.firmware_export.toolchain import Image, require_tools
 from uwb_mitigation.measurement import RangeMeasurement
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from uwb_mitigation.errors import MissingDependencyError, UwbMitigationError
-from uwb_mitigation.firmware_export.host import WARNINGS, compile_objects, firmware_folder, run
+from uwb_mitigation.firmware_export.compiling import WARNINGS, compile_objects, firmware_folder, run
 
 APT = "apt install gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm"
 

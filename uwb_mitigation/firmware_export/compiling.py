@@ -1,0 +1,89 @@
+"""Finds the firmware's sources and this computer's C compiler, and runs compilers and other tools."""
+
+from __future__ import annotations
+
+import atexit
+import functools
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from uwb_mitigation.errors import MissingDependencyError, UwbMitigationError
+from uwb_mitigation.model.shipped import shared_folders
+
+WARNINGS = ("-Wall", "-Wextra", "-Wconversion", "-Wpedantic", "-Werror")
+
+
+def firmware_folder() -> Path:
+    """The folder `firmware/`: whole in a checkout, with the library's `src` alone where it is installed.
+
+    Raises:
+        MissingDependencyError: it is neither here nor there; the message lists where it was looked for.
+    """
+    folders = shared_folders("firmware")
+    for folder in folders:
+        if (folder / "src" / "uwb_mitigation.h").is_file():
+            return folder
+    raise MissingDependencyError(
+        "the firmware's sources are not installed",
+        where=", ".join(map(str, folders)),
+        valid="install the package again",
+    )
+
+
+def c_compiler() -> tuple[str, ...]:
+    """The words that start the C compiler of this computer: those of CC, as make takes them, or cc, or gcc.
+
+    Raises:
+        MissingDependencyError: there is none.
+    """
+    words = tuple(shlex.split(os.environ.get("CC", ""))) or ("cc" if shutil.which("cc") else "gcc",)
+    if shutil.which(words[0]) is None:
+        raise MissingDependencyError(f"there is no C compiler {words[0]}", valid="apt install gcc, or set CC")
+    return words
+
+
+@functools.cache
+def compile_objects(
+    compiler: tuple[str, ...], options: tuple[str, ...], sources: tuple[Path, ...]
+) -> tuple[str, ...]:
+    """Compile sources once a process: many models are linked with the same library."""
+    folder = tempfile.mkdtemp(prefix="uwb_firmware_objects_")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    objects = tuple(f"{folder}/{source.name}.o" for source in sources)
+    for source, output in zip(sources, objects, strict=True):
+        run([*compiler, *options, "-c", str(source), "-o", output])
+    return objects
+
+
+def run(command: Sequence[str], timeout_s: float = 300, folder: Path | None = None) -> str:
+    """Run a tool, in `folder`, and return its standard output.
+
+    Raises:
+        UwbMitigationError: it fails or takes too long; carries the first line that says why.
+    """
+    try:
+        done = subprocess.run(
+            command,
+            capture_output=True,
+            text=True,
+            timeout=timeout_s,
+            check=False,
+            stdin=subprocess.DEVNULL,
+            cwd=folder,
+        )
+    except subprocess.TimeoutExpired as error:
+        raise UwbMitigationError(f"took more than {timeout_s} s", where=command[0]) from error
+    except OSError as error:
+        raise MissingDependencyError(f"cannot be run: {error.strerror}", where=command[0]) from error
+    if done.returncode:
+        lines = done.stderr.splitlines()
+        telling = (line for line in lines if re.search("error:|undefined reference", line))
+        reason = next(telling, lines[-1] if lines else "no message")
+        raise UwbMitigationError(f"exit {done.returncode}: {reason}", where=Path(command[0]).name)
+    return done.stdout
