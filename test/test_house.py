@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -37,14 +39,52 @@ def test_importing_the_package_and_its_command_line_needs_neither_ros_nor_torch(
     subprocess.run([sys.executable, "-c", code], check=True, cwd=REPOSITORY)
 
 
+def run_without(package: str, *words: object) -> subprocess.CompletedProcess[str]:
+    """The command line where a package cannot be imported."""
+    code = f"import sys; sys.modules['{package}'] = None\nfrom uwb_mitigation.cli import main\nmain()"
+    command = [sys.executable, "-c", code, *map(str, words)]
+    return subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
+
+
 def test_the_doctor_comes_even_where_numpy_does_not():
-    code = "import sys; sys.modules['numpy'] = None\nfrom uwb_mitigation.cli import main\nmain()"
-    done = subprocess.run(
-        [sys.executable, "-c", code, "doctor"], cwd=REPOSITORY, capture_output=True, text=True, check=False
-    )
+    done = run_without("numpy", "doctor")
     assert done.returncode == 1, done.stderr
-    assert "numpy" in done.stdout
+    assert "\nnumpy: make setup" in done.stdout
+    assert "\nshipped model: make setup" in done.stdout
+    assert re.search(r"│ C compiler +│ ok", done.stdout) or shutil.which("cc") is None
+    # ONNX Runtime says something of its own before.
+    assert re.fullmatch(r"uwb-mitigation: \d+ things are broken", done.stderr.splitlines()[-1])
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("package", "words"),
+    [
+        ("numpy", ("process", "in.mcap", "-o", "out.mcap")),
+        ("onnx", ("export-c", "-o", "/nowhere")),
+        ("cobs", ("bench", "link")),
+    ],
+)
+def test_a_command_that_misses_a_package_says_so_in_one_line(package: str, words: tuple[str, ...]):
+    done = run_without(package, *words)
+    assert done.stderr == f"uwb-mitigation: {package} is not installed (run uwb-mitigation doctor)\n"
+    assert done.returncode == 1
+
+
+def test_a_missing_module_that_no_installation_brings_is_not_explained_away():
+    done = run_without("uwb_mitigation.processing.planning", "process", "in.mcap", "-o", "out.mcap")
+    assert "Traceback" in done.stderr
+
+
+def test_a_reader_that_went_away_ends_a_command_silently_with_1():
+    read, write = os.pipe()
+    os.close(read)
+    try:
+        command = [sys.executable, "-m", "uwb_mitigation.cli", "--help"]
+        done = subprocess.run(command, cwd=REPOSITORY, stdout=write, stderr=subprocess.PIPE, check=False)
+    finally:
+        os.close(write)
+    assert (done.returncode, done.stderr) == (1, b"")
 
 
 @pytest.mark.parametrize("module", ["measurement", "preprocessing", "errors"])

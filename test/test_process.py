@@ -41,7 +41,7 @@ from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.shipped import default_model_path
 from uwb_mitigation.preprocessing import Preprocessing, Scaling
 from uwb_mitigation.processing import running
-from uwb_mitigation.processing.job import Job, Outcome, process_bag
+from uwb_mitigation.processing.job import Job, Outcome, attempt, process_bag
 from uwb_mitigation.processing.planning import plan
 from uwb_mitigation.processing.running import run_here, run_on_dask
 from uwb_mitigation.sources.source import Record
@@ -560,6 +560,17 @@ def test_a_worker_that_dies_costs_its_own_bag_only(tmp_path: Path, monkeypatch: 
     assert "died (SIGKILL" in str(outcomes["in1.mcap"].error)
     assert [outcomes[f"in{n}.mcap"].error for n in (0, 2)] == [None, None]
     assert not list(tmp_path.glob("*.part"))
+
+
+def test_a_package_that_a_worker_misses_is_the_error_of_its_bag(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = write_bag(tmp_path / "in.mcap", exchanges(1))
+    monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
+    monkeypatch.setattr(schemas, "typestore", schemas.typestore.__wrapped__)
+    outcome = attempt(job(source, tmp_path / "out.mcap"))
+    assert str(outcome.error) == "rosbags is not installed (run uwb-mitigation doctor)"
+    assert not outcome.written
 
 
 def test_a_cluster_does_the_same_and_one_bad_bag_does_not_stop_it(tmp_path: Path) -> None:

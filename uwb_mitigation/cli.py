@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from typing import Annotated
+from typing import Annotated, NoReturn
 
 import typer
 
@@ -22,7 +22,7 @@ from uwb_mitigation.commands import (
     report,
     training,
 )
-from uwb_mitigation.errors import UwbMitigationError
+from uwb_mitigation.errors import UwbMitigationError, not_installed
 
 app = typer.Typer(
     name="uwb-mitigation",
@@ -68,17 +68,27 @@ def _root(
     pass
 
 
+def _fail(error: UwbMitigationError) -> NoReturn:
+    console.err.print(f"uwb-mitigation: {error}", style="red", markup=False, soft_wrap=True)
+    sys.exit(1)
+
+
 def main() -> None:
-    """Run the command line; exit 1 with one line on bad input, 130 on Ctrl-C."""
+    """Run the command line; exit 1 with one line on bad input, 130 on Ctrl-C.
+
+    Where the reader of standard output (head, less) goes away, typer and rich end it: silently, with 1.
+    """
     try:
         app()
     except UwbMitigationError as error:
-        console.err.print(f"uwb-mitigation: {error}", style="red", markup=False, soft_wrap=True)
-        sys.exit(1)
-    except BrokenPipeError:
-        # The reader of our output (head, less) went away: nothing is left to say, and to nobody.
-        sys.stdout = None
-        sys.exit(141)
+        _fail(error)
+    except ModuleNotFoundError as error:
+        from uwb_mitigation.installation import distribution_of
+
+        distribution = distribution_of(error.name or "")
+        if distribution is None:
+            raise
+        _fail(not_installed(distribution))
     except KeyboardInterrupt:
         sys.exit(130)
 

@@ -62,3 +62,8 @@ class LinkError(UwbMitigationError):
 
 class MissingDependencyError(UwbMitigationError):
     """An optional part of the installation is not there."""
+
+
+def not_installed(package: str) -> MissingDependencyError:
+    """The error of a needed package that cannot be found."""
+    return MissingDependencyError(f"{package} is not installed", valid="run uwb-mitigation doctor")

@@ -19,7 +19,7 @@ from uwb_mitigation.bag.container import RawMessage
 from uwb_mitigation.bag.reader import BagReader, check_channel
 from uwb_mitigation.bag.topics import RANGE_CIR_TYPE, RANGE_CORRECTED, RANGE_RAW
 from uwb_mitigation.bag.writer import METADATA_RECORD, BagWriter
-from uwb_mitigation.errors import DamagedRecordingError, RecordingError, UwbMitigationError
+from uwb_mitigation.errors import DamagedRecordingError, RecordingError, UwbMitigationError, not_installed
 from uwb_mitigation.measurement import Status
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import load_bundle
@@ -94,6 +94,8 @@ def attempt(job: Job, report: Report | None = None) -> Outcome:
         return process_bag(job, report)
     except UwbMitigationError as error:
         return Outcome(job, error=error)
+    except ModuleNotFoundError as error:
+        return Outcome(job, error=not_installed((error.name or str(error)).partition(".")[0]))
     except MemoryError:
         return Outcome(job, error=RecordingError("not enough memory", where=str(job.source)))
     except OSError as error:
