@@ -7,6 +7,7 @@ import json
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -23,7 +24,7 @@ from uwb_mitigation.errors import DatasetError, UwbMitigationError
 from uwb_mitigation.evaluation import report, results, tables
 from uwb_mitigation.evaluation.projection import principal_components
 from uwb_mitigation.evaluation.study import Study, examples
-from uwb_mitigation.preprocessing import Preprocessing, Scaling
+from uwb_mitigation.preprocessing import WINDOW_SIZES, Preprocessing, Scaling
 
 PARTS = ["data", "table1", "table2", "table3", "fig3", "fig4a", "fig4b", "fig5"]
 HOSTILE = "<script>alert(1)</script>"
@@ -95,6 +96,7 @@ def study(label: str = "LOS", configuration: str = "", **changes: object) -> Stu
     )
 
 
+ROOMS = "simulated seed 1/deepuwb/room2/clear/placement "
 COMMANDS = report.Commands("logs", "out")
 ORIGIN = tables.Provenance("logs", "half", "0", "uwb-mitigation report")
 
@@ -127,10 +129,14 @@ def protocol(*models: dict[str, object], **changes: object) -> dict[str, object]
         "split": "paper",
         "train": 30,
         "test": 10,
-        "options": {"epochs": 30},
+        "options": options(),
         "models": list(models),
         **changes,
     }
+
+
+def options(epochs: int = 30, learning_rate: float = 3e-4) -> dict[str, float]:
+    return {"epochs": epochs, "learning_rate": learning_rate}
 
 
 def baseline(name: str, mae: float | None, reason: str = "") -> dict[str, object]:
@@ -317,7 +323,7 @@ def test_what_needs_no_network_stands_below_the_networks():
     values = protocol(trained(), baselines=[baseline("overall_median", 0.15), baseline("line", 0.125)])
     table = tables.accuracy(results.parse_trainings(values, "here"), ORIGIN, "uwb-mitigation protocol")
     rows = {row[0].text: row[7] for row in table.rows}
-    assert rows["L1 line in received and first-path power"].value == 0.125
+    assert rows["L1 line"].value == 0.125
     assert rows["Median error"].value == 0.15
     assert rows["No correction"].value == 0.2
     assert rows["Median error in LOS"].kind == "missing"
@@ -373,10 +379,62 @@ def test_the_box_plot_shows_the_errors_that_are_given():
 
 @pytest.mark.usefixtures("without_clouds")
 def test_networks_trained_shorter_than_the_papers_are_told():
-    trainings = results.parse_trainings(protocol(trained(), options={"epochs": 2}), "here")
+    trainings = results.parse_trainings(protocol(trained(), options=options(epochs=2)), "here")
     result = report.build(study(), COMMANDS, trainings)
     assert any("2 epochs" in notice for notice in result.notices)
     assert "--seeds 1 --epochs 2" in result.tables[1].provenance.command
+
+
+@pytest.mark.parametrize(
+    ("names", "what"),
+    [
+        (["deepuwb/room2/wall", "deepuwb/room1/clear"], "room and materials"),
+        ([ROOMS + "1", ROOMS + "2"], "placements of both antennas"),
+        (["1", "2"], "placements of both antennas"),
+    ],
+)
+@pytest.mark.usefixtures("without_clouds")
+def test_a_configuration_is_what_the_data_tells_of_it(names: list[str], what: str):
+    data = study().dataset
+    named = replace(data, configurations=np.array([names[row % 2] for row in range(len(data))]))
+    result = report.build(Study.of("made up", False, named), COMMANDS)
+    assert f"2 configurations ({what})" in result.tables[0].note
+
+
+@pytest.mark.usefixtures("without_clouds")
+def test_one_epoch_is_one():
+    trainings = results.parse_trainings(protocol(trained(), options=options(epochs=1)), "here")
+    result = report.build(study(), COMMANDS, trainings)
+    assert result.tables[1].provenance.seeds == "0; 1 epoch each"
+    assert any("for 1 epoch (" in notice for notice in result.notices)
+
+
+@pytest.mark.usefixtures("without_clouds")
+@pytest.mark.parametrize(
+    ("configuration", "values", "words"),
+    [
+        (ROOMS, {"split": "paper"}, ""),
+        (ROOMS, {"split": "all_but_room_2"}, " --split all_but_room_2"),
+        (ROOMS, {"split": "configurations: 1 of 4 parts held out"}, " --split configurations"),
+        ("", {"split": "configurations: 1 of 4 parts held out"}, ""),
+        # A quick one of `report`: no option of the protocol gives it.
+        ("", {"split": "by configuration: 1 of 3 held out"}, ""),
+        (ROOMS, {"options": options(learning_rate=0.001)}, " --learning-rate 0.001"),
+        (ROOMS, {"models": [trained(samples=8, seed=seed) for seed in range(5)]}, " --windows 8"),
+        (ROOMS, {"models": [trained("mlp", 8, seed) for seed in range(5)]}, " --windows 8"),
+        (ROOMS, {"models": [trained("mlp", 157, seed) for seed in range(5)]}, ""),
+    ],
+)
+def test_the_command_names_what_is_not_the_protocols_own(configuration, values, words):
+    every = [trained(samples=samples, seed=seed) for samples in WINDOW_SIZES for seed in range(5)]
+    trainings = results.parse_trainings(protocol(*every) | values, "here")
+    made = study()
+    if configuration:
+        names = np.array([f"{configuration}{row // 10}" for row in range(len(made.dataset))])
+        made = Study.of("made up", True, replace(made.dataset, configurations=names))
+    command = report.build(made, COMMANDS, trainings).tables[1].provenance.command
+    networks = ",".join(dict.fromkeys(model.network for model in trainings.models))
+    assert command == f"uwb-mitigation protocol --data logs -o models --networks {networks}{words}"
 
 
 @pytest.mark.parametrize("name", [HOSTILE + "_$\\frac{$", "_\ud800\x00\n\u202e漢字" + "a" * 500])

@@ -50,6 +50,7 @@ MODELS = {
 
 SEEDS = 5
 EPOCHS = 30
+LEARNING_RATE = 3e-4
 RAW_MAE_M = 0.1242
 RAW_SIGMA_M = 0.1642
 """Of the test room before correction (section III-C)."""

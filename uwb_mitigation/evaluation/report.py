@@ -26,6 +26,9 @@ STEPS = 5
 
 _NO_SEEDS = "none: nothing is drawn or trained"
 _POINTS_SEED = 0
+_CONFIGURATIONS = "configurations"
+"""What a protocol's split of data without rooms is called, and begins with."""
+
 _SPLITS = {
     "paper": f"paper ({PAPER_SPLIT})",
     "all_but_room_2": "all_but_room_2 (trained in all rooms but the medium one, tested there)",
@@ -65,11 +68,11 @@ class Commands:
         """Trains every network of the paper."""
         return self.protocol_of(["remnet", "mlp", "remnet_attention"])
 
-    def protocol_of(self, networks: Sequence[str]) -> str:
-        """Trains these networks."""
+    def protocol_of(self, networks: Sequence[str], options: Sequence[str] = ()) -> str:
+        """Trains these networks, with further options."""
         folder = "models" if self.quick or not self.models else self.models
         words = ["uwb-mitigation", "protocol", "--data", self.data, "-o", folder]
-        words += ["--networks", ",".join(networks)]
+        words += ["--networks", ",".join(networks), *options]
         return _shell([*words, *(["--scaling", "preamble"] if self.preamble else [])])
 
     @property
@@ -92,7 +95,7 @@ def build(
         left_m: {K: errors that REMNet left on the test part, m, of all seeds}, for Fig. 5's boxes.
         on_step: called `STEPS` times.
     """
-    trained = _trained_provenance(trainings, commands)
+    trained = _trained_provenance(study, trainings, commands)
     to_train = f"{commands.protocol}, then {_with(commands, models=True)}"
     to_bench = f"{commands.bench}, then {_with(commands, firmware=True)}"
     nothing = _not_measured(commands.bench)
@@ -146,26 +149,41 @@ def _not_measured(command: str) -> Provenance:
     return Provenance(tables.NOT_MEASURED, tables.NOT_MEASURED, tables.NOT_MEASURED, command)
 
 
-def _trained_provenance(trainings: Trainings | None, commands: Commands) -> Provenance:
+def _trained_provenance(study: Study, trainings: Trainings | None, commands: Commands) -> Provenance:
     if trainings is None:
         return _not_measured(commands.protocol)
     seeds = sorted({model.seed for model in trainings.models})
-    epochs = f"{trainings.epochs} epochs"
     return Provenance(
         trainings.data,
-        f"{_SPLITS.get(trainings.split, trainings.split)}; {trainings.train:,} measurements to train on, {trainings.test:,} to test on",
-        f"{', '.join(map(str, seeds)) or 'none'}; {epochs} each",
-        commands.report if commands.quick else _trained_by(trainings, commands),
+        f"{_SPLITS.get(trainings.split, trainings.split)}; "
+        f"{trainings.train:,} measurements to train on, {trainings.test:,} to test on",
+        f"{', '.join(map(str, seeds)) or 'none'}; {_epochs(trainings)} each",
+        commands.report if commands.quick else _trained_by(study, trainings, commands),
     )
 
 
-def _trained_by(trainings: Trainings, commands: Commands) -> str:
+def _epochs(trainings: Trainings) -> str:
+    return f"{trainings.epochs} epoch{'' if trainings.epochs == 1 else 's'}"
+
+
+def _trained_by(study: Study, trainings: Trainings, commands: Commands) -> str:
     """The command that trains as these were trained, with the options that are not the protocol's own."""
+    networks = list(dict.fromkeys(model.network for model in trainings.models))
     seeds = len({model.seed for model in trainings.models})
-    command = commands.protocol_of(list(dict.fromkeys(model.network for model in trainings.models)))
-    if seeds not in (0, paper.SEEDS):
-        command += f" --seeds {seeds}"
-    return command if trainings.epochs == paper.EPOCHS else f"{command} --epochs {trainings.epochs}"
+    windows = sorted({model.samples for model in trainings.models}, reverse=True)
+    # Only REMNet is trained at every length; the others have the longest alone.
+    every = WINDOW_SIZES if {"remnet", "remnet_k5"} & set(networks) else (max(WINDOW_SIZES),)
+    usual_split = "paper" if study.has_rooms else _CONFIGURATIONS
+    split = _CONFIGURATIONS if trainings.split.startswith(_CONFIGURATIONS) else trainings.split
+    options = {
+        "--split": (split if split in (*_SPLITS, _CONFIGURATIONS) else usual_split, usual_split),
+        "--windows": (",".join(map(str, windows)), ",".join(map(str, every))),
+        "--seeds": (seeds, paper.SEEDS),
+        "--epochs": (trainings.epochs, paper.EPOCHS),
+        "--learning-rate": (trainings.learning_rate, paper.LEARNING_RATE),
+    }
+    said = [(option, str(value)) for option, (value, usual) in options.items() if value != usual]
+    return commands.protocol_of(networks, [word for pair in said for word in pair])
 
 
 def _notices(study: Study, trainings: Trainings | None, commands: Commands) -> tuple[str, ...]:
@@ -186,12 +204,13 @@ def _notices(study: Study, trainings: Trainings | None, commands: Commands) -> t
         )
     elif not study.has_rooms:
         said.append(
-            "The data is not the paper's (DeepUWB): the paper's figures stand beside for orientation, and are not the mark to reach."
+            "The data is not the paper's (DeepUWB): the paper's figures stand beside for orientation, "
+            "and are not the mark to reach."
         )
     if trainings is not None and trainings.epochs < paper.EPOCHS:
         how = "--train quick" if commands.quick else "the models given"
         said.append(
-            f"The networks were trained for {trainings.epochs} epochs ({how}), the paper's for {paper.EPOCHS}: "
+            f"The networks were trained for {_epochs(trainings)} ({how}), the paper's for {paper.EPOCHS}: "
             "their accuracy shows that everything works, not how well it can."
         )
     if refused := study.dataset.refused:
@@ -222,7 +241,8 @@ def _data_table(study: Study, commands: Commands) -> Table:
         "data",
         "The data before any correction",
         "MAE and standard deviation of the range error, measured minus true. "
-        f"{len(study.dataset.names):,} configurations (placements of both antennas)."
+        f"{len(study.dataset.names):,} configurations "
+        f"({'placements of both antennas' if study.has_placements else 'room and materials'})."
         + (" The rows of each room are those that DeepUWB publishes." if study.has_rooms else ""),
         (("Paper and DeepUWB", 3), (_measured(study), 3)),
         ("Part", *(["Measurements", "MAE, m", "σ, m"] * 2)),
@@ -296,8 +316,8 @@ def _projections(study: Study, commands: Commands, on_step: Callable[[], None]) 
                 f"Three-dimensional scatter of {len(chosen)} channel impulse responses along their first three "
                 f"principal components, from two sides, coloured by {kind}: "
                 + (f"{len(names)} of them." if many else f"{', '.join(names.tolist())}."),
-                f"{len(chosen):,} of {len(study.dataset):,} windows of {study.dataset.inputs.shape[1]} amplitudes, seen from two sides. "
-                f"The components carry {share} % of the variance."
+                f"{len(chosen):,} of {len(study.dataset):,} windows of {study.dataset.inputs.shape[1]} amplitudes, "
+                f"seen from two sides. The components carry {share} % of the variance."
                 + (f" {len(names)} {kind}s, a colour each; too many to name." if many else ""),
                 "the three indoor rooms lie close together, apart from outdoor and through-the-wall measurements."
                 if letter == "a"
@@ -363,9 +383,10 @@ def _over_k(
         "Fig. 5. Errors for each length of the CIR",
         "Above, box plot of range errors before correction and after REMNet for each K; below, bars of LOS MAE, "
         f"NLOS MAE and sigma. {described}.",
-        f"REMNet, int8 where it was quantised, all seeds together. Grey: {before} before correction. Black: the paper's int8 MAE (Table 1).{why}",
-        "errors grow as K falls, and K = 8 is the least that is acceptable; its LOS and NLOS MAE and its sigma are given "
-        "in the picture alone, so that no numbers can be put beside.",
+        f"REMNet, int8 where it was quantised, all seeds together. Grey: {before} before correction. "
+        f"Black: the paper's int8 MAE (Table 1).{why}",
+        "errors grow as K falls, and K = 8 is the least that is acceptable; its LOS and NLOS MAE and its sigma "
+        "are given in the picture alone, so that no numbers can be put beside.",
         figures.over_k(raw, boxes, spreads, paper_mae, WINDOW_SIZES),
         {
             "raw": {name: asdict(box) for name, box in raw.items()},

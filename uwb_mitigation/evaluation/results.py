@@ -78,7 +78,7 @@ class Trainings:
     Attributes:
         data, split: names for people.
         train, test: measurements in each part.
-        epochs: of every fit.
+        epochs, learning_rate: of every fit.
         mae_raw: of the test part before correction, m.
         baselines: on the same parts; empty in a file of an earlier version.
     """
@@ -88,6 +88,7 @@ class Trainings:
     train: int
     test: int
     epochs: int
+    learning_rate: float
     mae_raw: float | None
     models: tuple[Trained, ...]
     baselines: tuple[Baseline, ...] = ()
@@ -173,6 +174,7 @@ def parse_trainings(values: object, where: str) -> Trainings:
         train=top.count("train"),
         test=top.count("test"),
         epochs=options.count("epochs"),
+        learning_rate=options.number("learning_rate"),
         mae_raw=_Fields(top.get("models")[0], where).number("mae_raw") if models else None,
         models=models,
         baselines=top.rows("baselines", _baseline) if top.has("baselines") else (),

@@ -66,6 +66,13 @@ class Study:
         return _each(self.dataset.configurations, _material) if self.has_rooms else self.labels
 
     @property
+    def has_placements(self) -> bool:
+        """Whether a configuration is one placement of both antennas; DeepUWB tells only room and materials."""
+        return not self.has_rooms or bool(
+            (np.char.find(self.dataset.configurations, "/placement ") >= 0).all()
+        )
+
+    @property
     def amplitudes(self) -> NDArray[np.float32]:
         """Magnitudes of the windows, float32 (n, K), the largest of each being 1."""
         return _scaled_by_maximum(self.dataset.inputs, self.dataset.preprocessing.scaling)

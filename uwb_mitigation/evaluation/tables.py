@@ -23,7 +23,7 @@ _BASELINES = {
     "raw": "No correction",
     "los_median": "Median error in LOS",
     "overall_median": "Median error",
-    "line": "L1 line in received and first-path power",
+    "line": "L1 line",
 }
 _ROWS = [*(("remnet", samples) for samples in WINDOW_SIZES), ("mlp", max(WINDOW_SIZES))]
 _FORM_NAMES = ("float", "optimised", "int8")
@@ -125,8 +125,8 @@ def accuracy(
         "table1",
         "Table 1. Accuracy for each length of the CIR, before and after optimisation",
         "MAE on the test part, m; mean ± standard deviation over seeds. Optimised: ONNX Runtime's graph. "
-        "Below the networks, what needs none: constants and a line, fitted on the same training part."
-        + "".join(reasons),
+        "Below the networks, what needs none, fitted on the same training part: constants, "
+        "and a line in received and first-path power." + "".join(reasons),
         (("Paper", 4), (measured, 4)),
         ("Model", "CIR", *(["Params", *(f"MAE {form}" for form in _FORM_NAMES)] * 2)),
         2,
@@ -168,7 +168,8 @@ def sizes(trainings: Trainings | None, provenance: Provenance, missing: str) -> 
     return Table(
         "table2",
         "Table 2. Size for each length of the CIR, before and after optimisation",
-        "Files on disk, kB of 1000 bytes; the paper's are TensorFlow Lite's, those measured are ONNX with the model's card.",
+        "Files on disk, kB of 1000 bytes; the paper's are TensorFlow Lite's, those measured are ONNX "
+        "with the model's card.",
         (("", 1), ("Paper", 3), ("Measured", 3)),
         ("Model", "CIR", "Params", *([f"{form}, kB" for form in _FORM_NAMES] * 2)),
         2,
@@ -204,8 +205,8 @@ def firmware(bench: Sequence[FirmwareRow], provenance: Provenance, missing: str)
     return Table(
         "table3",
         "Table 3. Real-time performance on the microcontroller",
-        "Paper: measured on an Arduino Nano 33 BLE Sense. Here: instructions, memory and equality with ONNX Runtime are "
-        "counted in an emulator; rate (64 MHz, no wait states) and energy (at the paper's power) are estimated. "
+        "Paper: measured on an Arduino Nano 33 BLE Sense. Here: instructions, memory and equality with ONNX Runtime "
+        "are counted in an emulator; rate (64 MHz, no wait states) and energy (at the paper's power) are estimated. "
         "Current and power take a board to measure.",
         (("Paper", 5), ("Estimated", 2), ("Counted in the emulator", 4)),
         (
