@@ -5,13 +5,9 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-HERE = Path(__file__).resolve().parent
-sys.path[:0] = [str(HERE), str(HERE.parent)]
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-import generated  # noqa: E402
-from sphinx.application import Sphinx  # noqa: E402
-
-import uwb_mitigation  # noqa: E402
+import uwb_mitigation
 
 project = "uwb_mitigation"
 author = "uwb_mitigation maintainers"
@@ -37,11 +33,3 @@ html_extra_path = ["site"]  # sends the reader of the top folder to docs/index.h
 # External links, for `make docs-links`.
 linkcheck_ignore = [r"http://localhost.*"]
 linkcheck_timeout = 20
-
-
-def _fill(app: Sphinx, page: str, source: list[str]) -> None:
-    source[0] = generated.fill(source[0])
-
-
-def setup(app: Sphinx) -> None:
-    app.connect("source-read", _fill)

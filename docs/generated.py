@@ -1,4 +1,9 @@
-"""What pages take from the code while they are built, in place of `<!-- generated: NAME -->`. No Sphinx here."""
+"""Writes what pages take from the code, between `<!-- generated: NAME -->` and `<!-- end -->`. No Sphinx here.
+
+    python docs/generated.py
+
+A test holds the pages and the code together.
+"""
 
 from __future__ import annotations
 
@@ -11,20 +16,27 @@ from typer.cli import get_docs_for_click
 
 from uwb_mitigation import cli
 
-MESSAGES = Path(__file__).resolve().parent.parent / "msg_defs" / "msg"
+PAGES = Path(__file__).resolve().parent
+MESSAGES = PAGES.parent / "msg_defs" / "msg"
 
-_MARK = re.compile(r"^<!-- generated: (\w+) -->$", re.MULTILINE)
+_MARKED = re.compile(r"^(<!-- generated: (\w+) -->\n).*?^(<!-- end -->)$", re.MULTILINE | re.DOTALL)
 _LISTS = re.compile(r"^\*\*Commands\*\*:\n\n(?:\* .*\n)+\n*", re.MULTILINE)
 _FIELD = re.compile(r"(?P<type>\S+) +(?P<name>\w+)(?: *= *(?P<value>\S+))?(?: +# (?P<meaning>.*))?")
 
 
 def fill(page: str) -> str:
-    """The page with its marks replaced by what they name.
+    """The page with what its marks name between them.
 
     Raises:
         KeyError: nothing has such a name.
     """
-    return _MARK.sub(lambda mark: PARTS[mark[1]](), page)
+    return _MARKED.sub(lambda part: f"{part[1]}\n{PARTS[part[2]]().strip()}\n\n{part[3]}", page)
+
+
+def files() -> dict[Path, str]:
+    """Every page with marks, and its text as it should be."""
+    pages = {path: path.read_text(encoding="utf-8") for path in sorted(PAGES.glob("*.md"))}
+    return {path: fill(page) for path, page in pages.items() if _MARKED.search(page)}
 
 
 def messages() -> str:
@@ -59,3 +71,9 @@ def commands() -> str:
 
 
 PARTS = {"messages": messages, "commands": commands}
+
+
+if __name__ == "__main__":
+    for path, text in files().items():
+        path.write_text(text, encoding="utf-8")
+        print(path)

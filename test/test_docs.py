@@ -201,31 +201,48 @@ def test_the_source_on_the_page_is_read_corrected_and_written_to_a_bag(
         list(JsonLines(tmp_path / "anchor.jsonl"))
 
 
+def test_what_pages_take_from_the_code_is_what_the_code_says():
+    texts = generated.files()
+    assert {path.name for path in texts} == {"commands.md", "messages.md"}
+    stale = [path.name for path, text in texts.items() if path.read_text(encoding="utf-8") != text]
+    assert not stale, "run: python docs/generated.py"
+
+
+def section(page: str, heading: str) -> str:
+    """What stands below a heading, up to the next one."""
+    text = (REPOSITORY / "docs" / page).read_text()
+    begin = text.index(f"# {heading}\n")
+    return text[begin : text.find("\n#", begin)]
+
+
 def test_the_messages_page_holds_every_field():
-    page = generated.fill((REPOSITORY / "docs" / "messages.md").read_text())
     for path in (REPOSITORY / "msg_defs" / "msg").glob("*.msg"):
-        assert f"## {path.stem}\n" in page
+        told = section("messages.md", path.stem)
         for kind, name in re.findall(r"^(\S+) +(\w+)(?= *(?:#|=|$))", path.read_text(), re.M):
             if kind != "#":
-                assert f"| `{name}` |" in page, path.name
+                assert f"| `{name}` |" in told, path.name
 
 
 def test_the_commands_page_holds_every_command_with_its_options():
-    page = generated.fill((REPOSITORY / "docs" / "commands.md").read_text())
     waiting = [("uwb-mitigation", typer.main.get_command(cli.app))]
     while waiting:
         name, command = waiting.pop()
         if hasattr(command, "commands"):
             waiting += [(f"{name} {sub}", of) for sub, of in command.commands.items()]
         elif not command.hidden:
-            section = page[page.index(f"# `{name}`") :]
-            for parameter in command.params:
-                assert parameter.param_type_name == "argument" or parameter.opts[-1] in section, name
+            told = section("commands.md", f"`{name}`")
+            listed = {
+                word for row in re.findall(r"^\* `(-[^`]*)`", told, re.M) for word in re.split("[ ,/]+", row)
+            }
+            options = [parameter for parameter in command.params if parameter.param_type_name == "option"]
+            assert {
+                word for option in options for word in (*option.opts, *option.secondary_opts)
+            } <= listed, name
 
 
 def test_a_page_that_asks_for_what_nothing_makes_is_refused():
     with pytest.raises(KeyError):
-        generated.fill("<!-- generated: nothing -->")
+        generated.fill("<!-- generated: nothing -->\n<!-- end -->\n")
 
 
 def imports() -> set[tuple[str, str]]:
