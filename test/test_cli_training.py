@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from model_material import card, random_weights
 from typer.testing import CliRunner
 
 from uwb_mitigation.cli import app
+from uwb_mitigation.commands import data, report, training
 from uwb_mitigation.errors import ModelError, UwbMitigationError
 from uwb_mitigation.model import graph
 from uwb_mitigation.model.architecture import Remnet
@@ -61,13 +63,13 @@ def test_protocol_then_prune(pickle, tmp_path):
     pruned, whole = load_bundle(smaller), load_bundle(source)
     assert pruned.architecture == Remnet(8, filters=4)
     # What the card tells is of the smaller network.
-    training = pruned.card.training
-    assert training["pruned"]["from"] == f"{whole.model_id:08x}"
-    assert training["pruned"]["architecture"]["filters"] == whole.architecture.filters
-    assert training["metrics_m"]["float"]["mae"] == round(json.loads(summary.read_text())["mae"]["tuned"], 4)
-    assert training["metrics_m"]["raw"]["mae"] == round(result["models"][0]["mae_raw"], 4)
+    told = pruned.card.training
+    assert told["pruned"]["from"] == f"{whole.model_id:08x}"
+    assert told["pruned"]["architecture"]["filters"] == whole.architecture.filters
+    assert told["metrics_m"]["float"]["mae"] == round(json.loads(summary.read_text())["mae"]["tuned"], 4)
+    assert told["metrics_m"]["raw"]["mae"] == round(result["models"][0]["mae_raw"], 4)
     assert pruned.card.variance_m2 != whole.card.variance_m2
-    assert (training["split"], training["recipe"]["epochs"]) == ("paper", 1)
+    assert (told["split"], told["recipe"]["epochs"]) == ("paper", 1)
 
     with pytest.raises(ModelError, match="split paper, not all_but_room_2"):
         run("prune", source, "--data", pickle, "-o", smaller, "--split", "all_but_room_2")
@@ -94,6 +96,23 @@ def test_a_bundle_that_may_know_the_test_part_is_not_pruned(pickle, tmp_path, tr
     with pytest.raises(ModelError, match=message):
         run("prune", tmp_path / "trained.onnx", *pickled, "-o", tmp_path / "pruned.onnx")
     assert not (tmp_path / "pruned.onnx").exists()
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        training.protocol,
+        training.search,
+        training.prune,
+        training.train_lr_range,
+        data.simulate,
+        report.report,
+    ],
+)
+def test_help_breaks_no_sentence(command):
+    # `--help` keeps the breaks of every paragraph but the first.
+    _, *paragraphs = inspect.getdoc(command).split("\n\n")
+    assert not [paragraph for paragraph in paragraphs if "\n" in paragraph]
 
 
 def test_search_leaves_journal_front_and_figure(pickle, tmp_path):

@@ -60,8 +60,9 @@ def protocol(
 ) -> None:
     """The paper's experiment: train every network at every K and seed, optimise, quantise, test.
 
-    Beside them stand the medians and the line in the received power, fitted on the same training part. Run it
-    again to go on with an interrupted run: what is in DIR already is not trained again.
+    Beside them stand the medians and the line in the received power, fitted on the same training part.
+
+    Run it again to go on with an interrupted run: what is in DIR already is not trained again.
     """
     lengths = _lengths(windows)
     with needs_torch():
@@ -98,8 +99,9 @@ def search(
 ) -> None:
     """Random search, then a grid, over N, k0, kn, F and K: MAE against multiply-accumulates.
 
-    Networks are judged on a fifth of the training part's configurations; the test part has no say. Writes
-    journal.jsonl, with which an interrupted search goes on, and front.png.
+    Networks are judged on a fifth of the training part's configurations; the test part has no say.
+
+    Writes journal.jsonl, with which an interrupted search goes on, and front.png.
     """
     lengths = _lengths(windows)
     with needs_torch():
@@ -196,8 +198,9 @@ def prune(
 ) -> None:
     """Drop the weakest filters of a trained REMNet, and train what is left: a smaller float bundle.
 
-    Trains on the training part of the split, and tells the error on its test part. A bundle that was trained on
-    another split or other data is refused: what is tested would be known to it.
+    Trains on the training part of the split, and tells the error on its test part.
+
+    A bundle that was trained on another split or other data is refused: it may know what is tested.
     """
     with needs_torch():
         from uwb_mitigation.training import protocol as protocols
@@ -368,7 +371,7 @@ def _show_protocol(result: Protocol) -> None:
         groups[model.network, model.samples].append(model)
     table = Table(
         title=f"{result.data}, split {result.split}: {result.train} to train on, {result.test} to test, "
-        f"{result.options.epochs} epochs; MAE in m: mean over seeds, and its standard deviation in the last form",
+        f"{result.options.epochs} epoch{'' if result.options.epochs == 1 else 's'}; MAE in m: mean over seeds, and its standard deviation in the last form",
         # Without lines between columns it fits a terminal of 80.
         box=SIMPLE_HEAD,
         padding=(0, 0, 0, 1),
