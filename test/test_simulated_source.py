@@ -5,6 +5,9 @@ from __future__ import annotations
 import itertools
 import json
 import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -276,23 +279,26 @@ def test_every_obstacle_stands_in_the_path_wherever_it_is_put() -> None:
 
 
 @pytest.mark.parametrize(("like", "expected"), [("deepuwb", 55_158), ("survey", 20_000), ("drive", 20_000)])
-def test_how_many_ranges_need_not_be_said(monkeypatch, tmp_path, like: str, expected: int) -> None:  # type: ignore[no-untyped-def]
-    asked: list[int] = []
+def test_how_many_ranges_need_not_be_said(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, like: str, expected: int
+) -> None:
+    totals: list[int] = []
 
-    def few(like: data.Scene, seed: int, ranges: int, exchanges: int) -> Source:
-        asked.append(ranges)
-        whole(like, seed, ranges, exchanges)
-        return SimulatedSource(count=1)
+    def few(*arguments: Any) -> tuple[Source, int]:
+        totals.append(whole(*arguments)[1])
+        return SimulatedSource(count=1), 1
 
     whole = data.simulated_source
     monkeypatch.setattr(data, "simulated_source", few)
     words = ["data", "simulate", "--like", like, "-o", str(tmp_path / "sim.mcap")]
     assert CliRunner().invoke(app, words).exit_code == 0
-    assert asked == [expected]
+    assert totals == [expected]
 
 
 @pytest.mark.parametrize(("like", "ranges"), [("deepuwb", 100), ("survey", 100), ("drive", 100)])
-def test_the_command_line_writes_a_bag_that_says_it_is_simulated(tmp_path, like: str, ranges: int) -> None:  # type: ignore[no-untyped-def]
+def test_the_command_line_writes_a_bag_that_says_it_is_simulated(
+    tmp_path: Path, like: str, ranges: int
+) -> None:
     words = ["data", "simulate", "--like", like, "--ranges", str(ranges), "-o", str(tmp_path / "sim.mcap")]
     done = CliRunner().invoke(app, [*words, "--json", str(tmp_path / "sim.json")])
     assert done.exit_code == 0, done.output
@@ -319,7 +325,9 @@ def test_the_command_line_writes_a_bag_that_says_it_is_simulated(tmp_path, like:
         (["--seed", "-1"], "seed"),
     ],
 )
-def test_a_simulation_that_cannot_be_is_refused_and_leaves_no_file(tmp_path, words, told) -> None:  # type: ignore[no-untyped-def]
+def test_a_simulation_that_cannot_be_is_refused_and_leaves_no_file(
+    tmp_path: Path, words: list[str], told: str
+) -> None:
     done = CliRunner().invoke(app, ["data", "simulate", "-o", str(tmp_path / "sim.mcap"), *words])
     assert isinstance(done.exception, ParameterError)
     assert told in str(done.exception)
@@ -348,7 +356,9 @@ def test_a_simulation_that_cannot_be_is_refused_and_leaves_no_file(tmp_path, wor
         (lambda: SimulatedSurvey(plan=FloorPlan((1.0, 9.0))), "plan size in x", "1.0", "2 to 1000"),
     ],
 )
-def test_a_bad_parameter_is_refused_by_name_value_and_range(make, name, value, valid) -> None:  # type: ignore[no-untyped-def]
+def test_a_bad_parameter_is_refused_by_name_value_and_range(
+    make: Callable[[], object], name: str, value: str, valid: str
+) -> None:
     with pytest.raises(ParameterError) as caught:
         make()
     for part in (name, value, valid):

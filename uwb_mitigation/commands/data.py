@@ -42,6 +42,9 @@ class Scene(str, enum.Enum):
     DEEPUWB = "deepuwb"
 
 
+_RANGES = 20_000
+"""Of a survey or drive where no number is asked for; in the shape of DeepUWB the source has its own."""
+
 CirOption = Annotated[
     CirChoice, typer.Option(help="Of a DecaRanging exchange, take the CIR of this frame: final or poll.")
 ]
@@ -141,8 +144,7 @@ def simulate(
     from uwb_mitigation.bag.writer import BagWriter
     from uwb_mitigation.sources.inventory import Inventory
 
-    total = _RANGES[like] if ranges is None else ranges
-    source = simulated_source(like, seed, total, exchanges)
+    source, total = simulated_source(like, seed, ranges, exchanges)
     inventory = Inventory()
     origin = {"source": source.name, "simulated": "true"}
     with BagWriter(output, origin, force=force) as bag, console.progress() as bar:
@@ -167,11 +169,8 @@ def simulate(
     )
 
 
-_RANGES = {Scene.DEEPUWB: 55_158, Scene.SURVEY: 20_000, Scene.DRIVE: 20_000}
-
-
-def simulated_source(like: Scene, seed: int, ranges: int, exchanges: int) -> Source:
-    """The simulator's source of that many ranges.
+def simulated_source(like: Scene, seed: int, ranges: int | None, exchanges: int) -> tuple[Source, int]:
+    """The simulator's source, and how many ranges it simulates.
 
     Raises:
         ParameterError: a number is out of its range.
@@ -179,16 +178,20 @@ def simulated_source(like: Scene, seed: int, ranges: int, exchanges: int) -> Sou
     from uwb_mitigation.sources import simulated
 
     if like is Scene.DEEPUWB:
-        return simulated.SimulatedDeepUwb(seed=seed, ranges=ranges, exchanges=exchanges)
+        chosen = {} if ranges is None else {"ranges": ranges}
+        rooms = simulated.SimulatedDeepUwb(seed=seed, exchanges=exchanges, **chosen)
+        return rooms, sum(rooms.rows)
+    ranges = _RANGES if ranges is None else ranges
     if like is Scene.SURVEY:
         if exchanges < 1 or ranges % exchanges:
             raise ParameterError(
                 f"{ranges} ranges of {exchanges} exchanges a placement", valid="a multiple of the exchanges"
             )
-        return simulated.SimulatedSurvey(seed=seed, configurations=ranges // exchanges, exchanges=exchanges)
+        placements = ranges // exchanges
+        return simulated.SimulatedSurvey(seed=seed, configurations=placements, exchanges=exchanges), ranges
     if ranges < 1:
         raise ParameterError(f"{ranges} ranges", valid="1 or more: a drive has no end of its own")
-    return simulated.SimulatedSource(seed=seed, count=ranges)
+    return simulated.SimulatedSource(seed=seed, count=ranges), ranges
 
 
 @app.command()

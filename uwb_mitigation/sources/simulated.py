@@ -160,7 +160,18 @@ class _Simulated(ABC):
             yield Record(measurement, Truth(float(distance[i]), label, exchanges.configuration[i]))
 
 
-class SimulatedSource(_Simulated):
+class _OneStream(_Simulated):
+    """A source that simulates a single row of batches, up to its count."""
+
+    @abstractmethod
+    def _batches(self) -> Iterator[tuple[_Exchanges, np.random.Generator]]:
+        """In order of time, each with the generator that the radio is to draw from."""
+
+    def _measurements(self) -> Iterator[Record]:
+        return self._received(self._batches())
+
+
+class SimulatedSource(_OneStream):
     """Tags on a robot's route through a flat, ranging to fixed anchors in turn; a `Source`.
 
     Each metre of the route is a configuration of its own for each pair, "simulated seed 1/tag 101/
@@ -205,9 +216,6 @@ class SimulatedSource(_Simulated):
         closed = np.asarray([*route, route[0]])
         self._spacing_m = float(np.hypot(*np.diff(closed, axis=0).T).sum()) / tags
 
-    def _measurements(self) -> Iterator[Record]:
-        return self._received(self._batches())
-
     def _batches(self) -> Iterator[tuple[_Exchanges, np.random.Generator]]:
         pairs = self._tags * len(self._anchors)
         for segment in counting():
@@ -250,7 +258,7 @@ class SimulatedSource(_Simulated):
         )
 
 
-class SimulatedSurvey(_Simulated):
+class SimulatedSurvey(_OneStream):
     """Independent placements at rest, many exchanges each, like a surveyed data set; a `Source`.
 
     Both antennas lie anywhere in the plan, 0.2 m from its border and at least `CLOSEST_M` apart. A
@@ -287,9 +295,6 @@ class SimulatedSurvey(_Simulated):
         self._plan = plan
         self._seed = seed
         self._exchanges = exchanges
-
-    def _measurements(self) -> Iterator[Record]:
-        return self._received(self._batches())
 
     def _batches(self) -> Iterator[tuple[_Exchanges, np.random.Generator]]:
         placements = -(-BATCH // self._exchanges)
