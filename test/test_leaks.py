@@ -152,7 +152,7 @@ def watch(data: Dataset, monkeypatch: pytest.MonkeyPatch) -> Watch:
         return watch.folds(divide(names, folds, seed), names)
 
     monkeypatch.setattr(splits, "by_configuration", by_configuration)
-    monkeypatch.setattr(choosing, "alone", lambda options: options)
+    monkeypatch.setattr(choosing, "ALONE", QUICK)
     return watch
 
 
@@ -199,7 +199,7 @@ def test_a_choice_is_told_by_folds_that_had_no_say_in_it(data, watch, monkeypatc
         return prefer(errors, must_gain)
 
     monkeypatch.setattr(choosing, "preferred", preferred)
-    candidates = choosing.standard(RECIPE)
+    candidates = choosing.standard(RECIPE, QUICK)
     choosing.choose(data, [candidates[0], candidates[2]], 3, 0)
     assert len(nested) == 3
     assert watch.calls["lad.constant"] >= 3
@@ -292,9 +292,12 @@ def test_a_search_trains_on_neither_its_validation_part_nor_the_test_part(data, 
     assert seen == [set(data.names) - {n for n in data.names if "room0" in n or "room4" in n} - test]
 
 
-def test_the_range_test_and_the_protocol_train_on_the_training_part(data, watch, monkeypatch, tmp_path):
-    quick = ("--networks", "mlp", "--windows", SAMPLES, "--seeds", 1, "--epochs", 1, "--workers", 1)
+def test_every_other_command_trains_on_the_training_part(data, watch, monkeypatch, tmp_path):
+    quick = ("--networks", "remnet", "--windows", SAMPLES, "--seeds", 1, "--epochs", 1, "--workers", 1)
+    smaller = ("-o", tmp_path / "smaller.onnx", "--filters", 4, "--epochs", 1)
     with watch.without(data.rows(in_room_2(data)).names):
         typed(data, monkeypatch, "train-lr-range", "--data", "x", "--samples", SAMPLES, "--steps", 20)
         typed(data, monkeypatch, "protocol", "--data", "x", "-o", tmp_path, *quick)
-    assert watch.calls["learning_rate.range_test"] == watch.calls["calibration.compare"] == 1
+        typed(data, monkeypatch, "prune", tmp_path / "remnet_8_seed0_float.onnx", "--data", "x", *smaller)
+    for name in ("learning_rate.range_test", "calibration.compare", "pruning.fit"):
+        assert watch.calls[name] == 1, name
