@@ -120,8 +120,12 @@ def test_the_command_writes_the_documented_keys(tmp_path, monkeypatch, found):
 
 @pytest.mark.parametrize(
     "arguments",
-    [("--cross-validate", "random"), ("--cross-validate", "tag", "--seeds", 0), ("--cross-validate", "tag", "--model", "x")],
-)  # fmt: skip
+    [
+        ("--cross-validate", "random"),
+        ("--cross-validate", "tag", "--seeds", 0),
+        ("--cross-validate", "tag", "--model", "x"),
+    ],
+)
 def test_requests_that_cannot_be_are_refused(tmp_path, arguments):
     result = run("evaluate", "--data", tmp_path, *arguments)
     assert isinstance(result.exception, ParameterError)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -301,7 +302,9 @@ def test_a_frame_below_the_sensitivity_is_not_received() -> None:
         (lambda: Material("vacuum", 0.5, 0.0), "permittivity", "0.5", "1 to 100"),
     ],
 )
-def test_a_bad_parameter_is_refused_by_name_value_and_range(make, name, value, valid) -> None:  # type: ignore[no-untyped-def]
+def test_a_bad_parameter_is_refused_by_name_value_and_range(
+    make: Callable[[], object], name: str, value: str, valid: str
+) -> None:
     with pytest.raises(ParameterError) as caught:
         make()
     for part in (name, value, valid):

@@ -371,7 +371,8 @@ def _show_protocol(result: Protocol) -> None:
         groups[model.network, model.samples].append(model)
     table = Table(
         title=f"{result.data}, split {result.split}: {result.train} to train on, {result.test} to test, "
-        f"{result.options.epochs} epoch{'' if result.options.epochs == 1 else 's'}; MAE in m: mean over seeds, and its standard deviation in the last form",
+        f"{result.options.epochs} epoch{'' if result.options.epochs == 1 else 's'}; MAE in m: "
+        "mean over seeds, and its standard deviation in the last form",
         # Without lines between columns it fits a terminal of 80.
         box=SIMPLE_HEAD,
         padding=(0, 0, 0, 1),
