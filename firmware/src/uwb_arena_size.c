@@ -1,12 +1,5 @@
 #include "uwb_kernels.h"
 
-enum { LONGEST_KERNEL = 5 };
-
-static size_t blocks(const uwb_model *model) {
-    return ((size_t)model->samples + UWB_BLOCK - 1) / UWB_BLOCK;
-}
-
-/* Dense layers alternate between two halves; the window follows them. */
 static size_t widest_layer(const uwb_model *model) {
     size_t widest = 0;
     for (uint32_t i = 0; i < model->layer_count; i++) {
@@ -21,23 +14,14 @@ size_t uwb_arena_size(const uwb_model *model) {
         return 0;
     }
     if (model->layer_count > 0) {
+        /* two halves, between which the layers alternate | window */
         return 2 * widest_layer(model) * sizeof(uint16_t) + model->samples * sizeof(float);
     }
     if (model->module_count == 0 || model->samples < UWB_BLOCK ||
-        (model->first_kernel != 3 && model->first_kernel != LONGEST_KERNEL)) {
+        (model->first_kernel != 3 && model->first_kernel != UWB_LONGEST_KERNEL)) {
         return 0;
     }
     /* zeros | input | zeros | residual sum | zeros, which only a layer of even length reads */
-    const size_t total = 2 * blocks(model) + 2 + (model->samples % 2 == 0);
+    const size_t total = 2 * UWB_BLOCKS(model->samples) + 2 + (model->samples % 2 == 0);
     return total * UWB_BLOCK_VALUES * sizeof(uint16_t);
-}
-
-float *uwb_arena_window(const uwb_model *model, void *arena) {
-    uint16_t *const values = arena;
-    if (model->layer_count > 0) {
-        return (float *)(void *)(values + 2 * widest_layer(model));
-    }
-    /* The place of the residual sum is free until the first module: quantised samples, then the window. */
-    uint16_t *const sum = values + (blocks(model) + 2) * UWB_BLOCK_VALUES;
-    return (float *)(void *)(sum + blocks(model) * UWB_BLOCK + LONGEST_KERNEL + 1);
 }

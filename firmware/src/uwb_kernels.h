@@ -20,6 +20,8 @@ extern "C" {
 
 #define UWB_BLOCK 8                                 /* positions */
 #define UWB_BLOCK_VALUES (UWB_BLOCK * UWB_FILTERS)  /* uint16 */
+#define UWB_BLOCKS(length) (((length) + UWB_BLOCK - 1u) / UWB_BLOCK)
+#define UWB_LONGEST_KERNEL 5u /* of the first layer */
 
 /* x: uint8 samples, padded in front; 8 blocks + kernel + 1 of them are read. */
 void uwb_conv_first(const uint16_t *x, uint16_t *y, uint32_t blocks, const int16_t *weights,

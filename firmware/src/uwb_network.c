@@ -12,7 +12,7 @@ static void clear_position(uint16_t *values, int32_t position, int split) {
 
 static const uint16_t *run_remnet(const uwb_model *model, const float *window, uint16_t *arena) {
     uint32_t length = model->samples;
-    uint32_t blocks = (length + UWB_BLOCK - 1) / UWB_BLOCK;
+    uint32_t blocks = UWB_BLOCKS(length);
     uint16_t *const x = arena + UWB_BLOCK_VALUES;
     uint16_t *const r = x + (blocks + 1) * UWB_BLOCK_VALUES;
 
@@ -36,7 +36,7 @@ static const uint16_t *run_remnet(const uwb_model *model, const float *window, u
             uwb_conv_reduce_even(r, x, blocks, module);
         }
         length = (length + 1) / 2;
-        blocks = (length + UWB_BLOCK - 1) / UWB_BLOCK;
+        blocks = UWB_BLOCKS(length);
     }
     return x;
 }
