@@ -27,7 +27,8 @@ static uwb_range_status range_status(uwb_status status) {
     }
 }
 
-/* The predicted error of the range, m, and how strange the measurement is. The order of checks is the host's: it decides the status. */
+/* The predicted error of the range, m, and how strange the measurement is. The order of checks is the host's: it
+ * decides the status. */
 static uwb_status predict(const uwb_model *model, float range_m, const uwb_cir *cir, void *arena,
                           size_t arena_bytes, float *error_m, float *score) {
     const size_t needed = uwb_arena_size(model);

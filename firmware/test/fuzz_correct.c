@@ -101,7 +101,8 @@ int main(int argc, char **argv) {
                 data[byte] = 0;
             }
         }
-        seen[LLVMFuzzerTestOneInput(data, FIELD_BYTES + (size_t)(state >> 40) % (sizeof data - FIELD_BYTES + 1)) & 31]++;
+        const size_t bytes = FIELD_BYTES + (size_t)(state >> 40) % (sizeof data - FIELD_BYTES + 1);
+        seen[LLVMFuzzerTestOneInput(data, bytes) & 31]++;
     }
     for (int status = 0; status < 32; status++) {
         if (seen[status] > 0) {

@@ -1,8 +1,10 @@
-/* Feeds arbitrary bytes, as from the host and as from the radio's side, to a board, and stops on what breaks its promises.
+/* Feeds arbitrary bytes, as from the host and as from the radio's side, to a board, and stops on what breaks its
+ * promises.
  *
  *     clang -fsanitize=fuzzer,address,undefined -DUWB_LIBFUZZER -Isrc -I<export> test/fuzz_link.c src/uwb_*.c
  *
- * Without a fuzzer it makes its own inputs: fuzz_link <inputs> <seed>. Half of the stretches are made into intact frames, so that inputs get past the CRC. */
+ * Without a fuzzer it makes its own inputs: fuzz_link <inputs> <seed>. Half of the stretches are
+ * made into intact frames, so that inputs get past the CRC. */
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>

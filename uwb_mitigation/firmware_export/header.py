@@ -151,11 +151,12 @@ def _model(network: PackedNetwork, identity: Identity) -> str:
 def _golden(golden: Golden) -> str:
     count, samples = golden.windows.shape
     rows = "\n".join(f"    {{\n{_wrapped(map(number, row.tolist()))}    }}," for row in golden.windows)
+    outputs = _wrapped(map(number, golden.outputs_m.tolist()))
     return (
         "#ifdef UWB_GOLDEN_VECTORS\n"
         f"enum {{ UWB_GOLDEN_COUNT = {count} }};\n"
         f"static const float uwb_golden_windows[{count}][{samples}] = {{\n{rows}\n}};\n"
-        f"static const float uwb_golden_outputs_m[{count}] = {{\n{_wrapped(map(number, golden.outputs_m.tolist()))}}};\n"
+        f"static const float uwb_golden_outputs_m[{count}] = {{\n{outputs}}};\n"
         "#endif\n"
     )
 

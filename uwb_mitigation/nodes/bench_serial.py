@@ -206,7 +206,11 @@ def unplug(cycles: int, rate_hz: float = 200.0) -> UnplugResult:
             time.sleep(0.1 + 0.37 * (cycle % 7))
             board.plug()
             returned_ns = time.monotonic_ns()
-            _wait(lambda since=returned_ns: listener.last_ns > since, "no range after the port's return")  # type: ignore[misc]
+
+            def resumed(since: int = returned_ns) -> bool:
+                return listener.last_ns > since
+
+            _wait(resumed, "no range after the port's return")
             resumed_ms.append((listener.last_ns - returned_ns) / 1e6)
         after = _descriptors(pid), _threads(pid), _memory_kb(pid)
     resumed_ms.sort()

@@ -1,4 +1,4 @@
-"""`make firmware-demo`: the firmware in an emulated Cortex-M4 corrects, the driver publishes, the host compares each bit.
+"""`make firmware-demo`: the firmware in an emulated Cortex-M4 corrects, the driver publishes, the host compares.
 
 python -m uwb_mitigation.nodes.firmware_demo [--recording PATH] [--count N]
 """
