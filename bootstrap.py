@@ -27,6 +27,7 @@ STAMPS = VENV / "stamps"
 REQUIREMENTS = ROOT / "requirements"
 ROS_PREFIX = Path(os.environ.get("ROS_PREFIX", "/opt/ros/jazzy"))
 SYSTEM_ROS = (ROS_PREFIX / "setup.sh").is_file()
+GOALS = ("run", "develop", "docs")
 PYTHONS = ((3, 10), (3, 13))
 TORCH = "2.13.0"
 TORCH_CPU_INDEX = "https://download.pytorch.org/whl/cpu"
@@ -36,7 +37,10 @@ class SetupError(Exception):
     """A step cannot be done; the text says why and what to do."""
 
 
-def main(goal: str) -> None:
+def main(goals: list[str]) -> None:
+    if len(goals) > 1 or not set(goals) <= set(GOALS):
+        raise SetupError(f"{' '.join(goals)}: no such goal; valid is one of {', '.join(GOALS)}")
+    goal = goals[0] if goals else GOALS[0]
     check_tools()
     STAMPS.mkdir(parents=True, exist_ok=True)
     requirements = [REQUIREMENTS / "runtime.txt"]
@@ -186,7 +190,7 @@ def run(command: list[str], variables: dict[str, str] | None = None) -> None:
 
 if __name__ == "__main__":
     try:
-        main(sys.argv[1] if len(sys.argv) > 1 else "run")
+        main(sys.argv[1:])
     except SetupError as error:
         sys.exit(f"setup: {error}")
     except KeyboardInterrupt:

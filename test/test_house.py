@@ -101,6 +101,16 @@ def test_parameter_files_and_reference_agree_with_the_tables():
     assert not stale, "run: python -m uwb_mitigation.nodes.parameter_files"
 
 
+@pytest.mark.parametrize("goals", [["develp"], ["run", "docs"], [""]])
+def test_the_set_up_refuses_a_goal_that_is_none(goals: list[str], tmp_path: Path):
+    # A copy: what it would set up is its own folder's.
+    program = shutil.copy(REPOSITORY / "bootstrap.py", tmp_path)
+    done = subprocess.run([sys.executable, program, *goals], capture_output=True, text=True, check=False)
+    told = f"setup: {' '.join(goals)}: no such goal; valid is one of run, develop, docs\n"
+    assert (done.returncode, done.stderr) == (1, told)
+    assert [path.name for path in tmp_path.iterdir()] == ["bootstrap.py"]
+
+
 def test_versions_agree():
     import uwb_mitigation
 
