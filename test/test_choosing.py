@@ -27,7 +27,7 @@ from uwb_mitigation.sources.source import Record
 from uwb_mitigation.sources.truth_table import load_truth, with_truth
 
 pytest.importorskip("torch", reason="run `make setup-training`")
-from uwb_mitigation.training import choosing, cold_start, site
+from uwb_mitigation.training import choosing, cold_start, contest, site
 from uwb_mitigation.training.choosing import Candidate, Choice
 from uwb_mitigation.training.fitting import FitOptions
 from uwb_mitigation.training.recipe import Recipe, fit_model
@@ -127,6 +127,21 @@ def test_a_curve_that_is_short_is_not_taken_for_a_flat_one(points, outlook, caps
 def test_a_model_that_harms_is_called_so(after, verdict, capsys):
     model_tables.show_verdict(after, {"raw": 0.5})
     assert verdict in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_recipe_that_harms_is_told_as_one(tmp_path, monkeypatch):
+    # Without one of two places that err by 1 m, the constant is that of the two that err by -1 m, and the reverse.
+    data = dataset(4, 3, samples=8)
+    data = replace(data, error_m=np.where(np.isin(data.configurations, ("c0", "c1")), 1.0, -1.0))
+    monkeypatch.setattr(datasets, "build_dataset", lambda records, preprocessing: data)
+    output, result = tmp_path / "x.onnx", tmp_path / "x.json"
+    told = run_or_raise(
+        "train", "--data", tmp_path, "--recipe", "constant", "--samples", 8, "-o", output, "--json", result
+    )
+    assert "2.000 m against 1.000 m raw: 100% higher: this did not help" in " ".join(told.split())
+    assert json.loads(result.read_text())["helped"] is False
+    # Of a network that was not fitted, the card tells no epochs.
+    assert load_bundle(output).card.training["recipe"] == {"line": False, "network": False}
 
 
 def predicted(fitted, data) -> np.ndarray:
@@ -381,8 +396,15 @@ def test_data_without_preamble_counts_is_told_of_the_other_scaling(tmp_path, mon
     unknown = ranges_of_eight_places()
     for item in unknown:
         object.__setattr__(item.measurement.cir, "preamble_count", 0)
-    unknown = [replace(item, truth=Truth(3.0)) for item in unknown]
+    truths = [Truth(3.0, configuration=f"{item.measurement.tag_id}") for item in unknown]
+    unknown = [replace(item, truth=truth) for item, truth in zip(unknown, truths, strict=True)]
     monkeypatch.setattr(opening, "open_recording", lambda path: Recorded(unknown))
+    tag = ("evaluate", "--data", "bag", "--cross-validate", "tag", "--scaling", "max")
+    monkeypatch.setattr(
+        contest, "run", lambda data, *_: pytest.fail(data.preprocessing.scaling, pytrace=False)
+    )
+    with pytest.raises(pytest.fail.Exception, match="max"):
+        run_or_raise(*tag)
     for command in (("train", "-o", tmp_path / "x.onnx"), ("evaluate", "--cross-validate", "configuration")):
         with pytest.raises(DatasetError, match="--scaling max"):
             run_or_raise(*command, "--data", "bag")
