@@ -25,7 +25,7 @@ def write_bag(path: Path, count: int = 6) -> Path:
             measurement = RangeMeasurement(
                 10**18 + number * 10**8, 5, 2 + number % 2, number, 0, 4.5, Cir(samples)
             )
-            bag.write(Record(measurement, Truth(4.25, "NLOS", "by the door")))
+            bag.write(Record(measurement, Truth(4.0 + 0.25 * (number // 2), "NLOS", "by the door")))
     return path
 
 

@@ -244,7 +244,7 @@ def _show_inventory(inventory: Inventory) -> None:
         f"{inventory.duration_s:.1f} s"
     )
     pairs = Table("anchor", "tag", "label", title="Pairs", title_justify="left")
-    for column in ("ranges", "rate (Hz)", "mean range (m)", "true range (m)"):
+    for column in ("ranges", "rate (Hz)", "mean range (m)", "mean true (m)"):
         pairs.add_column(column, justify="right")
     for pair in inventory.pairs.values():
         pairs.add_row(
@@ -254,7 +254,7 @@ def _show_inventory(inventory: Inventory) -> None:
             str(pair.ranges),
             _number(pair.rate_hz, 1),
             _number(pair.mean_m, 3),
-            _number(pair.true_m, 3),
+            _number(pair.mean_true_m, 3),
         )
     console.out.print(pairs)
     if inventory.skipped:

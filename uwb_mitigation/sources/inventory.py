@@ -23,7 +23,7 @@ class Pair:
         ranges: how many.
         first_ns, last_ns: stamps of the earliest and the latest.
         sum_m, finite: sum and count of the ranges that are finite.
-        true_m: true distance of the last exchange; NaN = unknown.
+        true_sum_m, known: sum and count of the true distances that are known.
     """
 
     anchor_id: int
@@ -34,7 +34,8 @@ class Pair:
     last_ns: int = 0
     sum_m: float = 0.0
     finite: int = 0
-    true_m: float = math.nan
+    true_sum_m: float = 0.0
+    known: int = 0
 
     def add(self, record: Record) -> None:
         """Take in one record."""
@@ -47,12 +48,18 @@ class Pair:
             self.sum_m += measurement.range_m
             self.finite += 1
         if record.truth is not None:
-            self.true_m = record.truth.range_m
+            self.true_sum_m += record.truth.range_m
+            self.known += 1
 
     @property
     def mean_m(self) -> float:
         """Mean of the finite ranges; NaN = there is none."""
         return self.sum_m / self.finite if self.finite else math.nan
+
+    @property
+    def mean_true_m(self) -> float:
+        """Mean of the true distances; NaN = none is known."""
+        return self.true_sum_m / self.known if self.known else math.nan
 
     @property
     def rate_hz(self) -> float:
@@ -115,7 +122,7 @@ class Inventory:
                     "ranges": pair.ranges,
                     "rate_hz": _known(pair.rate_hz),
                     "mean_range_m": _known(pair.mean_m),
-                    "true_range_m": _known(pair.true_m),
+                    "mean_true_range_m": _known(pair.mean_true_m),
                 }
                 for pair in self.pairs.values()
             ],
