@@ -130,6 +130,8 @@ def test_evaluate_writes_the_documented_keys(tmp_path, recording):
     assert set(found["by_label"]) == {"LOS", "NLOS"}
     assert set(found["by_label"]["LOS"]) == {"n", "raw_mae", "corrected_mae"}
     assert found["model_id"] == saved.model_id
+    assert found["trained_on"] == []
+    assert "optimistic" not in result.output
 
 
 def test_train_quantize_evaluate_from_end_to_end(tmp_path, recording):
@@ -145,7 +147,11 @@ def test_train_quantize_evaluate_from_end_to_end(tmp_path, recording):
     assert run("quantize", floats, "--data", "any", "-o", integers).exit_code == 0
     assert load_bundle(integers).quantised
     assert load_bundle(integers).prior == load_bundle(floats).prior
-    assert run("evaluate", "--data", "any", "--model", integers).exit_code == 0
+    result = run("evaluate", "--data", "any", "--model", integers, "--json", tmp_path / "e.json")
+    assert result.exit_code == 0
+    found = json.loads((tmp_path / "e.json").read_text())
+    assert found["trained_on"] == sorted(found["by_configuration"])
+    assert "optimistic" in result.output
 
 
 def test_train_without_a_prior_leaves_all_to_the_network(tmp_path, recording):

@@ -156,3 +156,10 @@ def show_outcome(result: Outcome) -> None:
     for status, count in result.statuses.items():
         if status != "OK":
             console.out.print(f"{status}: {count} ranges passed through as measured", highlight=False)
+    if result.trained_on:
+        console.out.print(
+            f"optimistic: the model was trained on {len(result.trained_on)} of these "
+            f"{len(result.by_configuration)} configurations; --cross-validate tells of unseen ones",
+            highlight=False,
+            soft_wrap=True,
+        )

@@ -29,6 +29,8 @@ class Outcome:
         by_label, by_configuration: {name: (n, MAE before, MAE after)}.
         statuses: {status: measurements}; on any but OK the raw range counts as corrected.
         model_id: of the model.
+        trained_on: configurations that are in the model's training data too, as its card names them: where there
+            are any, the result is optimistic.
     """
 
     n: int
@@ -40,6 +42,7 @@ class Outcome:
     by_configuration: Mapping[str, tuple[int, float, float]]
     statuses: Mapping[str, int]
     model_id: int
+    trained_on: tuple[str, ...]
 
     def as_json(self) -> dict[str, object]:
         """The result of `uwb-mitigation evaluate`."""
@@ -60,6 +63,7 @@ class Outcome:
             "by_configuration": table(self.by_configuration),
             "statuses": dict(self.statuses),
             "model_id": self.model_id,
+            "trained_on": list(self.trained_on),
         }
 
 
@@ -96,14 +100,19 @@ def evaluate(
     if not raw:
         raise DatasetError(f"none of {read} measurements has a valid range and a true one")
     before, after, spread = np.array(raw), np.array(corrected), np.array(variance)
+    card = mitigation.bundle.card
+    # For people, says the card: whatever JSON holds may stand there.
+    learnt = card.training.get("configurations")
+    known = {name for name in set(configurations) if isinstance(learnt, list) and name in learnt}
     return Outcome(
         n=len(raw),
         raw=ErrorStatistics.of(before),
         corrected=ErrorStatistics.of(after),
         coverage68=coverage(after, spread, 1.0),
-        coverage95=coverage(after, spread, mitigation.bundle.card.interval95_sigmas),
+        coverage95=coverage(after, spread, card.interval95_sigmas),
         by_label=mae_by_group(np.array(labels), before, after),
         by_configuration=mae_by_group(np.array(configurations), before, after),
         statuses=dict(statuses.most_common()),
         model_id=mitigation.bundle.model_id,
+        trained_on=tuple(sorted(known)),
     )
