@@ -219,14 +219,12 @@ class _Corrector:
             left.difference_update(numbers)
             self.statuses.update(_NAMES[status] for status in corrected.status.tolist())
         # What is odd in any way is left to the one definition.
-        numbers, measurements = [], []
         for number in sorted(left):
             try:
-                measurements.append(decode_range(messages[number]))
-                numbers.append(number)
-            except RecordingError as error:  # noqa: PERF203 - few
+                measurement = decode_range(messages[number])
+            except RecordingError as error:
                 self.skipped[error.what] += 1
-        for number, measurement in zip(numbers, measurements, strict=True):
+                continue
             result = self._mitigation.correct(measurement)
             answers[number] = encode_corrected(measurement, result)
             self.statuses[result.status.name] += 1
