@@ -1,48 +1,118 @@
 """Build description, as ament_python expects it."""
 
+import os
+import shlex
+import sys
 from pathlib import Path
 
 from setuptools import find_packages, setup
+from setuptools.command.build_py import build_py
+from setuptools.command.develop import develop
 
 PACKAGE = "uwb_mitigation"
+REPOSITORY = "https://github.com/uwb-mitigation/uwb_mitigation"
 
 
 def files(folder: str, *patterns: str) -> list[str]:
     return sorted(str(path) for pattern in patterns for path in Path(folder).glob(pattern))
 
 
+def required(part: str) -> list[str]:
+    """What requirements/PART.in names itself; what it takes from another file is an extra of its own."""
+    lines = Path("requirements", f"{part}.in").read_text(encoding="utf-8").splitlines()
+    return [line for line in lines if line and not line.startswith(("#", "-"))]
+
+
+def check_messages() -> None:
+    """End a `colcon build` that does not know of the messages: colcon looks for no package inside a package."""
+    prefixes = [Path(entry) for entry in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if entry]
+    messages = Path("share", f"{PACKAGE}_msgs", "package.xml")
+    if os.environ.get("COLCON") == "1" and not any((prefix / messages).is_file() for prefix in prefixes):
+        folder = shlex.quote(str(Path("msg_defs").resolve()))
+        sys.exit(f"{PACKAGE}_msgs is missing; run: colcon build --base-paths . {folder}")
+
+
+class Build(build_py):
+    """Of `colcon build`, and of pip."""
+
+    def run(self) -> None:
+        check_messages()
+        super().run()
+
+
+class Develop(develop):
+    """Of `colcon build --symlink-install`."""
+
+    def run(self) -> None:
+        check_messages()
+        super().run()
+
+
+# pip makes a command of its own for the environment's bin; in a workspace it is found below lib alone.
+COMMAND = (
+    []
+    if {"bdist_wheel", "dist_info", "editable_wheel"} & set(sys.argv)
+    else [("bin", ["resource/bin/uwb-mitigation"])]
+)
+
+# A script's first line cannot hold a blank: where Python's path has one, the scripts take the python3 of PATH.
+SCRIPTS = {"build_scripts": {"executable": "/usr/bin/env python3"}} if " " in sys.executable else {}
+
 setup(
     name=PACKAGE,
+    cmdclass={"build_py": Build, "develop": Develop},
+    options=SCRIPTS,
     version="0.1.0",
     packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
-    package_data={PACKAGE: ["py.typed", "interfaces/*.msg", "evaluation/templates/*.j2"]},
+    package_data={
+        PACKAGE: ["py.typed", "interfaces/*.msg", "evaluation/templates/*.j2", "viewer/templates/*.j2"]
+    },
     data_files=[
+        *COMMAND,
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
+        # What the doctor names where something is missing.
+        (f"share/{PACKAGE}/requirements", files("requirements", "ros_*.txt")),
         (f"share/{PACKAGE}/launch", files("launch", "*.launch.py")),
         (f"share/{PACKAGE}/params", files("params", "*.yaml")),
+        (f"share/{PACKAGE}/rviz", files("rviz", "*.rviz")),
+        (f"share/{PACKAGE}/foxglove", files("foxglove", "*.json")),
         (f"share/{PACKAGE}/udev", files("udev", "*.rules")),
         (f"share/{PACKAGE}/models", files("models", "*.onnx", "*.md")),
         # What `backend:=firmware` compiles; the boards and the sketch need a checkout.
         (f"share/{PACKAGE}/firmware/src", files("firmware/src", "*.c", "*.h")),
+        (f"share/{PACKAGE}/firmware/host", files("firmware/host", "*.c")),
+        (f"share/{PACKAGE}/firmware/dw1000_model", files("firmware/dw1000_model", "*.c", "*.h")),
     ],
-    install_requires=["setuptools"],
-    # colcon looks here to tell that pytest runs the tests.
-    extras_require={"test": ["pytest"]},
+    install_requires=required("runtime"),
+    extras_require={
+        "training": [*required("training"), "torch"],
+        "viewer": required("viewer"),
+        "dask": required("dask"),
+        "spi": required("spi"),
+        # colcon looks here to tell that pytest runs the tests.
+        "test": ["pytest"],
+    },
     zip_safe=False,
-    author="uwb_mitigation maintainers",
-    maintainer="uwb_mitigation maintainers",
-    maintainer_email="maintainers@uwb-mitigation.example.org",
+    author="The uwb_mitigation maintainers",
+    maintainer="The uwb_mitigation maintainers",
+    maintainer_email="uwb-mitigation@users.noreply.github.com",
+    url=REPOSITORY,
+    project_urls={"Source": REPOSITORY, "Issues": f"{REPOSITORY}/issues"},
     description="Removes the range error of ultra-wideband ranging with a small int8 network.",
+    long_description=Path("README.md").read_text(encoding="utf-8"),
+    long_description_content_type="text/markdown",
     license="Apache-2.0",
     python_requires=">=3.10",
     entry_points={
         "console_scripts": [
-            "driver = uwb_mitigation.nodes.entry:driver",
-            "mitigator = uwb_mitigation.nodes.entry:mitigator",
-            "pipeline = uwb_mitigation.nodes.entry:pipeline",
-            "monitor = uwb_mitigation.nodes.monitor:main",
-            "uwb-mitigation = uwb_mitigation.cli:main",
+            "driver = uwb_mitigation.entry:driver",
+            "mitigator = uwb_mitigation.entry:mitigator",
+            "locator = uwb_mitigation.entry:locator",
+            "pipeline = uwb_mitigation.entry:pipeline",
+            "monitor = uwb_mitigation.entry:monitor",
+            "viewer = uwb_mitigation.entry:viewer",
+            "uwb-mitigation = uwb_mitigation.entry:command_line",
         ],
     },
 )
