@@ -1,0 +1,84 @@
+/* A model of the DW1000, register by register, in virtual time: several chips share one air, and the program of each
+ * chip's host is a coroutine. Any driver that talks to the chip through SPI runs on it; docs/dw1000_model.md says what
+ * is modelled, and what fails as it does on the chip.
+ *
+ * One air is used by one thread at a time; airs do not know of each other. The same seed and programs give the same run. */
+#ifndef DW1000_MODEL_H
+#define DW1000_MODEL_H
+
+#include <stddef.h>
+#include <stdint.h>
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+typedef struct dw1000_air dw1000_air;
+typedef struct dw1000_chip dw1000_chip;
+
+/* What a frame meets on its way. What is 0 has a default, so that `{.distance_m = 3}` is a clean link. */
+typedef struct {
+    double distance_m;       /* along the straight line, 0 to 100,000 */
+    double excess_m;         /* by how much the detected first path is late */
+    const int16_t *iq;       /* real, imaginary, real, ...: copied. NULL = one path and a little noise */
+    size_t samples;          /* complex ones, at most 1016; the chip's accumulator is filled up with zeros */
+    double first_path_index; /* in samples, 1/64 is kept; 0 = where the accumulator first rises to half of a peak */
+    uint16_t preamble_count; /* RXPACC, where accumulation stopped; 0 = at the end, with the SFD's symbols in it */
+    uint16_t noise_threshold; /* LDE_THRESH; 0 = NTM of LDE_CFG1 times std_noise */
+    uint16_t std_noise;       /* 0 = standard deviation of the magnitudes of samples 64 to 575 */
+    double loss;              /* probability that a frame is not noticed at all */
+    double damage;            /* probability that one is received with an error, of any of the kinds there are */
+} dw1000_link_config;
+
+/* NULL: no memory. Freeing an air frees its chips, and ends programs where they stand. */
+dw1000_air *dw1000_air_new(uint64_t seed);
+void dw1000_air_free(dw1000_air *air);
+
+/* A chip that was powered a while ago and is idle. `ppm`: by how much its crystal is fast. `clock_ticks`: its 40-bit
+ * counter at time 0; a reset does not change it. `tx_delay_ticks`, `rx_delay_ticks`: from counter to antenna and back,
+ * which a driver has to know; the OTP memory holds their sum. */
+dw1000_chip *dw1000_chip_new(dw1000_air *air, double ppm, uint64_t clock_ticks, uint16_t tx_delay_ticks,
+                             uint16_t rx_delay_ticks);
+
+/* Join two chips, both ways; once more = anew; NULL = they no longer hear each other. Frames that are being received
+ * keep what they began with. */
+void dw1000_link(dw1000_air *air, dw1000_chip *a, dw1000_chip *b, const dw1000_link_config *config);
+
+/* Give a chip's host a program, from now on, in place of the one before. */
+void dw1000_program(dw1000_chip *chip, void (*run)(dw1000_chip *chip, void *context), void *context);
+
+/* Let `seconds` pass, or less if all programs end within them; returns the time reached, from the air's beginning. */
+double dw1000_run(dw1000_air *air, double seconds);
+
+/* From within a program. Called from outside of one, they let all programs run on meanwhile. */
+
+/* One chip-select period, full duplex; `in` may be NULL. */
+void dw1000_spi(dw1000_chip *chip, const uint8_t *out, uint8_t *in, size_t n, uint32_t hz);
+/* The level of the IRQ line. To look at it, or at the time, takes a program 100 ns: one may wait by looking. */
+int dw1000_irq(dw1000_chip *chip);
+/* Until the IRQ line is high, or for `at_most_s`. */
+void dw1000_wait(dw1000_chip *chip, double at_most_s);
+void dw1000_delay(dw1000_chip *chip, double s);
+/* Pull RSTn low for 1 ms, and let it float. */
+void dw1000_reset_pin(dw1000_chip *chip);
+/* Seconds since the air's beginning. */
+double dw1000_now(dw1000_chip *chip);
+
+/* Beyond a driver's needs, for tests. */
+
+/* How the host holds RSTn from now on. The chip drives the line too: held high, it is destroyed. */
+typedef enum { DW1000_RESET_LOW, DW1000_RESET_FLOAT, DW1000_RESET_HIGH } dw1000_reset_level;
+void dw1000_reset_drive(dw1000_chip *chip, dw1000_reset_level level);
+/* A pulse on the WAKEUP pin, which ends sleep. */
+void dw1000_wakeup_pin(dw1000_chip *chip);
+/* What the on-chip sensors measure; 25 degrees Celsius and 3.3 V at first. */
+void dw1000_environment(dw1000_chip *chip, double celsius, double volts);
+/* Of the good frames that a chip receives, how many have no leading edge that its detector finds, 0 to 1: LDEERR. */
+void dw1000_lose_edges(dw1000_chip *chip, double probability);
+/* What destroyed the chip, in words; NULL = nothing has. */
+const char *dw1000_fault(const dw1000_chip *chip);
+
+#ifdef __cplusplus
+}
+#endif
+#endif

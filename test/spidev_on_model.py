@@ -1,0 +1,80 @@
+"""PyPI's `dw1000-spi` on modelled chips: a `spidev` that reaches them, and the clock of the program that asks."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from types import ModuleType, SimpleNamespace
+
+import pytest
+
+from uwb_mitigation.dw1000_model.air import ANTENNA_DELAY_TICKS, Host
+
+pytest.importorskip("spidev", reason="spidev is for Linux")
+
+dw1000 = pytest.importorskip("dw1000_spi.dw1000", reason="the develop requirements bring dw1000-spi")
+
+SYSTEM_CALL_S = 60e-6
+"""About what a transaction takes Linux and Python on a Raspberry Pi."""
+
+_program = threading.local()
+
+
+def host() -> Host:
+    """Of the program that asks."""
+    running: Host = _program.host
+    return running
+
+
+CLOCK = SimpleNamespace(
+    sleep=lambda seconds: host().delay(seconds),
+    perf_counter=lambda: host().now(),
+    monotonic_ns=lambda: int(host().now() * 1e9),
+    time_ns=lambda: int(host().now() * 1e9),
+)
+"""Stands in for the module `time`."""
+
+
+class FakeSpiDev:
+    """Stands in for `spidev.SpiDev`; which chip it reaches depends on the program that opens it."""
+
+    max_speed_hz = 0
+    mode = 0
+
+    def open(self, _bus: int, _select: int) -> None:
+        self._host = host()
+
+    def xfer2(self, data: list[int]) -> list[int]:
+        self._host.delay(SYSTEM_CALL_S)
+        return list(self._host.spi(bytes(data), self.max_speed_hz))
+
+    def close(self) -> None:
+        pass
+
+
+def replace_spidev(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the driver meet the model instead of the computer."""
+    module = ModuleType("spidev")
+    module.SpiDev = FakeSpiDev  # type: ignore[attr-defined]
+    monkeypatch.setattr(dw1000, "spidev", module)
+    monkeypatch.setattr(dw1000, "time", CLOCK)
+
+
+def begin(running: Host) -> None:
+    """Say which host the program of this thread has."""
+    _program.host = running
+
+
+def program(
+    run: Callable[[dw1000.DW1000, Host], None], channel: int = 5, prf: int = 64
+) -> Callable[[Host], None]:
+    """A program that opens the driver and hands it to `run`."""
+
+    def started(running: Host) -> None:
+        begin(running)
+        with dw1000.DW1000(0, 0, channel, prf, 6.8, 128, 9 if prf == 64 else 3, False) as driver:
+            driver.write_register([0x98], list(ANTENNA_DELAY_TICKS.to_bytes(2, "little")))
+            driver.write_register([0xEE, 0x84, 0x30], list(ANTENNA_DELAY_TICKS.to_bytes(2, "little")))
+            run(driver, running)
+
+    return started

@@ -1,0 +1,314 @@
+"""The DW1000's model, by the manual: time-outs, errors, double buffering, frame filtering."""
+
+from __future__ import annotations
+
+import shutil
+
+import pytest
+from dw1000_driver import (
+    AAT,
+    AFFREJ,
+    DATA,
+    ERRORS,
+    HRBPT,
+    ICRBP,
+    LDEDONE,
+    RX_GOOD,
+    RXDFR,
+    RXENAB,
+    RXFCG,
+    RXOVRR,
+    RXPHE,
+    RXPRD,
+    RXPTO,
+    RXRFTO,
+    RXSFDTO,
+    TICK_M,
+    TXFRS,
+    WAIT4RESP,
+    Driver,
+    Mode,
+    exchange,
+    flight_ticks,
+    pair,
+)
+
+from uwb_mitigation.dw1000_model.air import Air
+
+pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc")
+
+
+class TestReceiver:
+    def test_status_clears_at_the_next_enable(self, air: Air):
+        a, b, *_ = pair(air)
+        assert exchange(a, b) & RX_GOOD == RX_GOOD
+        b.listen()
+        assert b.status & (RX_GOOD | ERRORS) == 0
+
+    def test_after_a_good_frame_the_receiver_is_off(self, air: Air):
+        a, b, *_ = pair(air)
+        assert exchange(a, b) & RXFCG
+        b.set(0x0F, 0, 0xFFFFFFFF)
+        a.send(DATA)
+        a.host.delay(1e-3)
+        assert not b.status & RXPRD
+
+    def test_the_frame_wait_time_out(self, air: Air):
+        _, b, *_ = pair(air)
+        b.set(0x0C, 0, 1000, 2)
+        b.set(0x04, 0, b.get(0x04) | 1 << 28)
+        b.set(0x0E, 0, RXRFTO)
+        b.listen()
+        began = b.host.now()
+        b.host.wait(1.0)
+        assert b.host.now() - began == pytest.approx(1000 * 512 / 499.2e6 + 16e-6, abs=2e-6)
+        assert b.status & ERRORS == RXRFTO
+
+    def test_a_frame_ends_with_the_time_out_too(self, air: Air):
+        a, b, *_ = pair(air)
+        b.set(0x0C, 0, 200, 2)
+        b.set(0x04, 0, b.get(0x04) | 1 << 28)
+        b.listen()
+        b.host.delay(40e-6)
+        a.send(DATA * 10)
+        a.host.delay(1e-3)
+        assert b.status & (RXPRD | RXFCG | RXRFTO) == RXPRD | RXRFTO
+
+    def test_the_preamble_time_out_counts_chunks_and_one_more(self, air: Air):
+        a, b, *_ = pair(air)
+        b.set(0x27, 0x24, 9, 2)
+        b.set(0x0E, 0, RXPTO)
+        b.listen()
+        began = b.host.now()
+        b.host.wait(1.0)
+        assert b.host.now() - began == pytest.approx(10 * 8 * 1017.63e-9 + 16e-6, abs=2e-6)
+        assert exchange(a, b) & RXFCG, "and not once there is a preamble"
+
+    def test_the_sfd_time_out_may_be_too_short_or_none(self, air: Air):
+        a, b, *_ = pair(air)
+        b.set(0x27, 0x20, 50, 2)
+        assert exchange(a, b) & (RXSFDTO | RXFCG) == RXSFDTO
+        b.configure(Mode(decawave_sfd=True))
+        b.set(0x27, 0x20, 0, 2)
+        status = exchange(a, b)
+        assert status & RXPRD
+        assert not status & ERRORS, "0 waits for ever"
+        assert b.get(0x19, 0, 4) >> 16 & 15 == 5
+
+    def test_a_delayed_reception_begins_at_its_time(self, air: Air):
+        a, b, *_ = pair(air)
+        b.set(0x0A, 0, b.time + 640_000_000, 5)
+        b.set(0x0D, 0, RXENAB | 1 << 9)
+        a.send(DATA)
+        a.host.delay(5e-3)
+        assert not b.status & RXPRD
+        b.host.delay(6e-3)
+        a.send(DATA)
+        a.host.delay(1e-3)
+        assert b.status & RXFCG
+
+    @pytest.mark.parametrize("error", ["header", "time-out"])
+    def test_without_a_receiver_reset_after_an_error_the_next_stamp_is_wrong(self, air: Air, error: str):
+        a, b, *_ = pair(air)
+
+        def fail() -> None:
+            if error == "header":
+                b.configure(Mode(long_frames=True))
+                assert exchange(a, b) & RXPHE
+                b.configure(Mode())
+            else:
+                b.set(0x0C, 0, 100, 2)
+                b.set(0x04, 0, b.get(0x04) | 1 << 28)
+                b.listen()
+                b.host.delay(1e-3)
+                assert b.status & RXRFTO
+                b.set(0x04, 0, b.get(0x04) & ~(1 << 28))
+
+        fail()
+        assert exchange(a, b) & RXFCG
+        assert abs(flight_ticks(a, b) - 3.0 / TICK_M) * TICK_M > 1.0
+        fail()
+        b.reset_receiver()
+        assert exchange(a, b) & RXFCG
+        assert flight_ticks(a, b) == pytest.approx(3.0 / TICK_M, abs=1)
+
+    @pytest.mark.parametrize("error", [RXPTO, RXSFDTO])
+    def test_some_errors_need_no_receiver_reset(self, air: Air, error: int):
+        a, b, *_ = pair(air)
+        if error == RXPTO:
+            b.set(0x27, 0x24, 5, 2)
+            b.listen()
+            b.host.delay(1e-3)
+        else:
+            b.configure(Mode(decawave_sfd=True))
+            exchange(a, b)
+        assert b.status & ERRORS == error
+        b.configure(Mode())
+        b.set(0x27, 0x24, 0, 2)
+        assert exchange(a, b) & RXFCG
+        assert flight_ticks(a, b) == pytest.approx(3.0 / TICK_M, abs=1)
+
+    def test_rxautr_goes_on_after_errors_alone_and_swallows_what_is_sent(self, air: Air):
+        a, b, *_ = pair(air)
+        b.configure(Mode(long_frames=True))
+        b.set(0x04, 0, b.get(0x04) | 1 << 29)
+        assert exchange(a, b) & RXPHE
+        assert b.get(0x19, 0, 4) >> 16 & 15 == 5, "on again by itself"
+        b.send(DATA)
+        b.host.delay(2e-3)
+        assert not b.status & TXFRS, "a driver that takes the receiver for off loses this one"
+        b.off()
+        b.reset_receiver()
+        b.configure(Mode())
+        b.set(0x04, 0, b.get(0x04) | 1 << 29)
+        assert exchange(a, b) & RXFCG
+        assert b.get(0x19, 0, 4) >> 16 & 15 == 1, "off after a good frame"
+
+    def test_turned_off_in_a_frame_it_may_still_tell_of_it(self, air: Air):
+        """The glitch that drivers mask the interrupt for."""
+        a, b, _, two = pair(air)
+        b.set(0x0E, 0, RXPHE | RXFCG)
+        b.listen()
+        b.host.delay(20e-6)
+        a.send(DATA)
+        b.host.delay(100e-6)
+        b.off()
+        two.wait(100e-6)
+        assert two.irq(), "a driver that did not mask it is interrupted by a receiver that is off"
+        b.set(0x0F, 0, 0xFFFFFFFF)
+        b.listen()
+        b.off()
+        two.wait(100e-6)
+        assert not two.irq(), "without a frame there is nothing to tell"
+
+    def test_the_way_round_the_glitch(self, air: Air):
+        a, b, _, two = pair(air)
+        b.set(0x0E, 0, RXPHE | RXFCG)
+        b.listen()
+        b.host.delay(20e-6)
+        a.send(DATA)
+        b.host.delay(100e-6)
+        b.set(0x0E, 0, 0)
+        b.off()
+        b.set(0x0F, 0, 0xFFFFFFFF)
+        b.set(0x0E, 0, RXPHE | RXFCG)
+        two.wait(1e-3)
+        assert not two.irq()
+
+
+class TestDoubleBuffer:
+    def both(self, air: Air) -> tuple[Driver, Driver]:
+        a, b, *_ = pair(air)
+        b.set(0x04, 0, b.get(0x04) & ~(1 << 12) | 1 << 29)
+        b.listen()
+        b.host.delay(20e-6)
+        return a, b
+
+    def send(self, a: Driver, data: bytes) -> None:
+        a.send(data)
+        a.host.delay(1e-3)
+
+    def test_a_second_frame_arrives_while_the_first_is_read(self, air: Air):
+        a, b = self.both(air)
+        self.send(a, b"first")
+        assert b.status & ICRBP
+        self.send(a, b"second")
+        for expected in (b"first", b"second"):
+            assert b.status & (RXFCG | LDEDONE | RXOVRR) == RXFCG | LDEDONE
+            assert b.received() == expected
+            b.set(0x0F, 0, RXFCG | RXDFR | LDEDONE)
+            b.command(HRBPT)
+        assert not b.status & RXFCG
+        self.send(a, b"third")
+        assert b.received() == b"third"
+
+    def test_a_third_one_spoils_them_and_calls_for_a_reset(self, air: Air):
+        a, b = self.both(air)
+        for data in (b"first", b"second"):
+            self.send(a, data)
+        stamp = b.rx_stamp
+        self.send(a, b"third")
+        assert b.status & RXOVRR
+        assert b.rx_stamp != stamp, "of what was not read yet"
+        b.set(0x0F, 0, RXOVRR)
+        assert b.status & RXOVRR, "read-only"
+        b.off()
+        b.listen()
+        b.host.delay(20e-6)
+        self.send(a, b"fourth")
+        b.command(HRBPT)
+        assert abs(flight_ticks(a, b) - 3.0 / TICK_M) * TICK_M > 1.0, "without a receiver reset"
+        b.off()
+        b.reset_receiver()
+        assert not b.status & RXOVRR
+
+
+class TestFilter:
+    OWN = 0x0102
+    PAN = 0xDECA
+
+    def frame(self, kind: int, pan: int | None, to: bytes = b"", *, ack: bool = False) -> bytes:
+        mode = {0: 0, 2: 2, 8: 3}[len(to)]
+        control = kind | ack << 5 | 1 << 6 | mode << 10 | 2 << 14
+        head = control.to_bytes(2, "little") + b"\x2a"
+        if pan is not None:
+            head += pan.to_bytes(2, "little") + to
+        return head + b"\x99\x99data"
+
+    def listener(self, air: Air, bits: int) -> tuple[Driver, Driver]:
+        a, b, *_ = pair(air)
+        b.set(0x03, 0, self.PAN << 16 | self.OWN)
+        b.set(0x04, 0, b.get(0x04) | bits)
+        return a, b
+
+    @pytest.mark.parametrize(
+        ("kind", "pan", "to", "bits", "passes"),
+        [
+            (1, PAN, b"\x02\x01", 0b1001, True),
+            (1, PAN, b"\xff\xff", 0b1001, True),
+            (1, 0xFFFF, b"\x02\x01", 0b1001, True),
+            (1, PAN, b"\x03\x01", 0b1001, False),
+            (1, 0xBEEF, b"\x02\x01", 0b1001, False),
+            (1, PAN, b"\x02\x01", 0b0101, False),
+            (1, PAN, b"EUI", 0b1001, True),
+            (1, PAN, bytes(8), 0b1001, False),
+            (0, PAN, b"", 0b0101, False),
+            (3, PAN, b"\x02\x01", 1 | 1 << 5, True),
+            (4, None, b"", 1 | 1 << 7, True),
+            (4, None, b"", 1 | 1 << 8, False),
+            (1, PAN, b"\x03\x01", 0b1000, True),
+        ],
+    )
+    def test_what_passes(self, air: Air, kind: int, pan: int | None, to: bytes, bits: int, passes: bool):
+        a, b = self.listener(air, bits)
+        if to == b"EUI":
+            to = b.read(0x01, 0, 8)
+        status = exchange(a, b, self.frame(kind, pan, to))
+        assert status & (RXFCG | AFFREJ) == (RXFCG if passes else AFFREJ)
+
+    def test_a_frame_too_short_for_its_addresses_does_not_pass(self, air: Air):
+        a, b = self.listener(air, 0b1001)
+        assert exchange(a, b, self.frame(1, self.PAN, b"\x02\x01")[:6]) & AFFREJ
+        assert exchange(a, b, b"\x41") & AFFREJ
+
+    def test_a_frame_of_a_version_to_come_does_not_pass(self, air: Air):
+        a, b = self.listener(air, 0b1001)
+        frame = bytearray(self.frame(1, self.PAN, b"\x02\x01"))
+        frame[1] |= 0x20
+        assert exchange(a, b, bytes(frame)) & AFFREJ
+
+    def test_a_frame_that_asks_for_it_is_acknowledged(self, air: Air):
+        a, b = self.listener(air, 0b1001 | 1 << 30)
+        b.set(0x1A, 3, 3, 1)
+        b.load(b"")
+        b.listen()
+        b.host.delay(20e-6)
+        a.send(self.frame(1, self.PAN, b"\x02\x01", ack=True), WAIT4RESP)
+        a.host.delay(2e-3)
+        assert b.status & (AAT | TXFRS) == AAT | TXFRS
+        assert a.status & RXFCG
+        assert a.received() == b"\x02\x00\x2a"
+
+    def test_aat_may_be_false(self, air: Air):
+        a, b = self.listener(air, 0)
+        assert exchange(a, b, self.frame(1, self.PAN, b"\x02\x01", ack=True)) & (AAT | TXFRS) == AAT

@@ -1,0 +1,429 @@
+"""The DW1000's model, by the manual: the serial interface, registers, resets, clocks, memories, sleep, sensors."""
+
+from __future__ import annotations
+
+import shutil
+
+import pytest
+from dw1000_driver import (
+    CPLOCK,
+    FAST_HZ,
+    RX_GOOD,
+    RXENAB,
+    RXPTO,
+    SLOW_HZ,
+    SLP2INIT,
+    TICK_S,
+    TRXOFF,
+    TXFRS,
+    TXSTRT,
+    Driver,
+    pair,
+)
+
+from uwb_mitigation.dw1000_model.air import Air, Chip
+
+pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc")
+
+ID = bytes.fromhex("3001cade")
+
+
+@pytest.fixture
+def chip(air: Air) -> Chip:
+    return air.chip()
+
+
+@pytest.fixture
+def driver(chip: Chip) -> Driver:
+    return Driver(chip)
+
+
+def test_a_powered_chip_is_idle_and_locked(driver: Driver):
+    assert driver.status == CPLOCK | SLP2INIT
+    assert driver.get(0x19, 0, 4) >> 16 & 15 == 1
+
+
+@pytest.mark.parametrize("header", [[0x00], [0x40, 0x00], [0x40, 0x80, 0x00]], ids=["1", "2", "3 octets"])
+def test_a_header_has_one_to_three_octets(chip: Chip, header: list[int]):
+    assert chip.spi(bytes([*header, 0, 0, 0, 0]), FAST_HZ)[len(header) :] == ID
+
+
+def test_a_sub_address_has_15_bits(driver: Driver):
+    driver.set(0x2E, 0x2804, 0x3AE0, 2)
+    assert driver.get(0x2E, 0x2804, 2) == 0x3AE0
+    assert driver.get(0x2E, 0x2805, 1) == 0x3A
+    assert driver.get(0x2E, 0x0004, 2) == 0xDEAD, "the 7 low bits alone are another register"
+
+
+@pytest.mark.parametrize("cut", [b"", b"\x40", b"\x6e\x84"])
+def test_a_header_that_is_cut_off_does_nothing(chip: Chip, cut: bytes):
+    assert chip.spi(cut, FAST_HZ) == bytes(len(cut))
+
+
+@pytest.mark.parametrize(
+    ("file", "sub", "octets", "value"),
+    [
+        (0x00, 0x00, 4, 0xDECA0130),
+        (0x03, 0x00, 4, 0xFFFFFFFF),
+        (0x04, 0x00, 4, 0x1200),
+        (0x08, 0x00, 5, 0x15400C),
+        (0x1E, 0x00, 4, 0x1E080222),
+        (0x1F, 0x00, 4, 0x21040055),
+        (0x23, 0x12, 2, 0x0055),
+        (0x27, 0x20, 2, 4161),
+        (0x2B, 0x0E, 1, 0x60),
+        (0x2E, 0x0806, 1, 0x6C),
+        (0x36, 0x00, 4, 0xF0300200),
+        (0x36, 0x04, 4, 0x81020738),
+    ],
+)
+def test_a_reset_leaves_the_manuals_values(driver: Driver, file: int, sub: int, octets: int, value: int):
+    driver.host.reset_pin()
+    driver.host.delay(5e-3)
+    assert driver.get(file, sub, octets) == value
+
+
+def test_reserved_registers_read_0xdeaddead(driver: Driver):
+    assert driver.get(0x02) == 0xDEADDEAD
+    assert driver.get(0x28, 0x0C, 4) >> 24 == 0xDE, "RF_TXCTRL has three octets"
+
+
+def test_a_register_ends_where_it_ends(driver: Driver):
+    driver.set(0x18, 0, 0x44332211)
+    assert driver.get(0x18) == 0xDEAD2211
+
+
+def test_a_write_in_pieces_is_a_write(driver: Driver):
+    driver.set_by_octets(0x27, 0x08, 0x311A002D)
+    assert driver.get(0x27, 0x08) == 0x311A002D
+    driver.set(0x27, 0x0A, 0x371A, 2)
+    assert driver.get(0x27, 0x08) == 0x371A002D
+
+
+def test_what_is_read_only_stays(driver: Driver):
+    driver.set(0x00, 0, 0)
+    driver.set(0x15, 0, 0x1234, 5)
+    driver.set(0x27, 0x28, 0x1234, 3)
+    assert driver.get(0x00) == 0xDECA0130
+    assert (driver.get(0x15, 0, 5), driver.get(0x27, 0x28, 3)) == (0, 0)
+
+
+def test_the_transmit_buffer_is_not_read_back(driver: Driver):
+    driver.write(0x09, 0, b"abcd")
+    assert driver.get(0x09) == 0xDEADDEAD
+
+
+def test_a_command_clears_itself(driver: Driver):
+    driver.command(RXENAB)
+    assert driver.get(0x0D) == 0
+
+
+def test_a_command_may_come_octet_by_octet(air: Air, driver: Driver):
+    driver.set(0x0D, 1, 0x01, 1)
+    assert driver.get(0x19, 0, 4) >> 16 & 15 == 5
+    driver.set(0x0D, 0, 0x40, 1)
+    assert driver.get(0x19, 0, 4) >> 16 & 15 == 1
+
+
+def test_what_starts_something_clears_itself(driver: Driver):
+    """Drivers wait for it."""
+    driver.hz = SLOW_HZ
+    driver.set(0x36, 0, 0x0301, 2)
+    driver.set(0x2D, 6, 0x8000, 2)
+    assert driver.get(0x2D, 6, 2) == 0x8000
+    driver.host.delay(150e-6)
+    assert driver.get(0x2D, 6, 2) == 0
+    driver.set(0x2D, 6, 0x0003, 2)
+    assert driver.get(0x2D, 6, 2) == 0x0001
+    for bits in (2, 1):
+        driver.set(0x2F, 0, bits, 1)
+        assert driver.get(0x2F, 0, 1) == 0
+
+
+def test_ones_clear_status_octet_by_octet_and_zeros_do_not(driver: Driver):
+    driver.set(0x0F, 0, 0x00, 1)
+    driver.set(0x0F, 2, 0x80, 1)
+    assert driver.status == CPLOCK
+    driver.set_by_octets(0x0F, 0, CPLOCK, 5)
+    assert driver.status == 0
+
+
+def test_the_interrupt_line_is_status_and_mask_with_its_polarity(driver: Driver, chip: Chip):
+    assert not chip.irq()
+    driver.set(0x0E, 0, CPLOCK)
+    assert chip.irq()
+    assert driver.status & 1
+    driver.set(0x04, 0, 0x1000)
+    assert not chip.irq(), "active low"
+    driver.set(0x0F, 0, CPLOCK)
+    assert chip.irq()
+
+
+def test_a_wait_ends_with_the_interrupt_or_its_time(air: Air, driver: Driver, chip: Chip):
+    driver.set(0x0E, 0, RXPTO)
+    driver.set(0x27, 0x24, 10, 2)
+    driver.listen()
+    began = chip.now()
+    chip.wait(1.0)
+    assert 50e-6 < chip.now() - began < 200e-6
+    driver.set(0x0F, 0, RXPTO)
+    began = chip.now()
+    chip.wait(0.25)
+    assert chip.now() - began == pytest.approx(0.25)
+
+
+def test_the_counter_runs_on_its_own_crystal_in_steps_of_512(air: Air):
+    chip = air.chip(ppm=20.0, clock_ticks=(1 << 40) - 1000)
+    driver = Driver(chip)
+    began, first = chip.now(), driver.time
+    chip.delay(1.0)
+    ended, second = chip.now(), driver.time
+    assert first % 512 == second % 512 == 0
+    assert (second - first) % (1 << 40) == pytest.approx((ended - began) / TICK_S * (1 + 20e-6), abs=600)
+
+
+def test_a_transaction_takes_its_time(chip: Chip):
+    began = chip.now()
+    chip.spi(bytes(100), 8_000_000)
+    assert chip.now() - began == pytest.approx(100e-6, abs=0.2e-6)
+
+
+class TestClocks:
+    def test_spi_that_is_too_fast_before_the_pll_has_locked_reads_garbage(self, driver: Driver):
+        driver.set(0x36, 0, 0x01, 1)
+        seen = {driver.read(0x00) for _ in range(8)}
+        assert ID not in seen
+        assert len(seen) > 1, "random, not an error"
+        driver.hz = SLOW_HZ
+        assert driver.read(0x00) == ID
+        driver.set(0x36, 0, 0x00, 1)
+        driver.host.delay(10e-6)
+        driver.hz = FAST_HZ
+        assert driver.read(0x00) == ID
+
+    def test_what_is_written_too_fast_is_lost(self, driver: Driver):
+        driver.set(0x36, 0, 0x01, 1)
+        driver.set(0x18, 0, 0x1234, 2)
+        driver.hz = SLOW_HZ
+        assert driver.get(0x18, 0, 2) == 0
+
+    def test_no_spi_is_faster_than_20_mhz(self, driver: Driver):
+        driver.hz = 25_000_000
+        assert driver.read(0x00) != ID
+
+    def test_a_driver_that_does_not_wait_after_a_reset_reads_nothing(self, driver: Driver):
+        driver.hz = SLOW_HZ
+        driver.host.reset_pin()
+        assert driver.read(0x00) != ID
+        driver.host.delay(5e-3)
+        assert driver.read(0x00) == ID
+        assert driver.status == CPLOCK | SLP2INIT
+
+    def test_the_pll_locks_again_after_the_crystal_was_forced(self, driver: Driver):
+        driver.set(0x36, 0, 0x01, 1)
+        driver.hz = SLOW_HZ
+        driver.set(0x0F, 0, CPLOCK)
+        driver.set(0x36, 0, 0x00, 1)
+        driver.host.delay(20e-6)
+        assert driver.status & CPLOCK
+
+    def test_nothing_is_sent_while_the_crystal_is_forced(self, driver: Driver):
+        driver.set(0x36, 0, 0x01, 1)
+        driver.hz = SLOW_HZ
+        driver.command(TXSTRT)
+        driver.host.delay(1e-3)
+        assert not driver.status & TXFRS
+
+
+class TestResets:
+    def test_a_soft_reset_takes_everything_back(self, driver: Driver):
+        driver.set(0x18, 0, 0x1234, 2)
+        driver.hz = SLOW_HZ
+        driver.set(0x36, 0, 0x01, 1)
+        driver.set(0x36, 3, 0x00, 1)
+        driver.host.delay(20e-6)
+        driver.set(0x36, 3, 0xF0, 1)
+        assert driver.get(0x18, 0, 2) == 0
+        assert driver.get(0x36, 0) == 0xF0300200
+        driver.host.delay(20e-6)
+        driver.hz = FAST_HZ
+        assert driver.read(0x00) == ID
+
+    def test_a_chip_held_in_soft_reset_takes_no_writes(self, driver: Driver):
+        driver.hz = SLOW_HZ
+        driver.set(0x36, 3, 0x00, 1)
+        driver.set(0x18, 0, 0x1234, 2)
+        driver.set(0x36, 3, 0xF0, 1)
+        assert driver.get(0x18, 0, 2) == 0
+
+    def test_the_counter_goes_on_over_a_reset(self, air: Air):
+        driver = Driver(air.chip(clock_ticks=1 << 39))
+        driver.host.reset_pin()
+        driver.host.delay(5e-3)
+        assert driver.time > 1 << 39
+
+    def test_rstn_driven_high_destroys_the_chip(self, driver: Driver, chip: Chip):
+        chip.reset_drive(0)
+        chip.delay(1e-3)
+        assert chip.fault is None
+        chip.reset_drive(2)
+        chip.delay(5e-3)
+        driver.hz = SLOW_HZ
+        assert driver.read(0x00) != ID
+        assert "RSTn driven high" in str(chip.fault)
+
+
+class TestMemories:
+    def read_otp(self, driver: Driver, address: int) -> int:
+        driver.set(0x2D, 4, address, 2)
+        driver.set(0x2D, 6, 0x03, 1)
+        driver.set(0x2D, 6, 0x01, 1)
+        value = driver.get(0x2D, 0x0A)
+        driver.set(0x2D, 6, 0x00, 1)
+        return value
+
+    def test_the_otp_memory_holds_what_a_driver_needs(self, air: Air):
+        driver = Driver(air.chip(tx_delay_ticks=16400, rx_delay_ticks=16450))
+        driver.hz = SLOW_HZ
+        driver.set(0x36, 0, 0x01, 1)
+        assert self.read_otp(driver, 0x1C) == 32850 << 16 | 32850
+        assert self.read_otp(driver, 0x1E) & 0x1F == 0x10
+        assert self.read_otp(driver, 0x04) & 0xFF, "an LDO tuning value"
+        eui = self.read_otp(driver, 0) | self.read_otp(driver, 1) << 32
+        assert driver.get(0x01, 0, 8) == eui
+
+    def test_the_otp_memory_is_not_read_from_the_pll(self, driver: Driver):
+        values = {self.read_otp(driver, 0x1E) for _ in range(3)}
+        assert 0x0110 not in values
+
+    def test_each_chip_has_an_identity_of_its_own(self, air: Air):
+        assert len({Driver(air.chip()).get(0x01, 0, 8) for _ in range(4)}) == 4
+
+    @pytest.mark.parametrize("wrong", ["nothing", "no clock", "no time"])
+    def test_without_the_microcode_a_frame_has_no_stamp(self, air: Air, wrong: str):
+        a, b, *_ = pair(air)
+        b.hz = SLOW_HZ
+        b.start(load_lde=False)
+        b.hz = SLOW_HZ
+        if wrong == "no clock":
+            b.set(0x2D, 6, 0x8000, 2)
+            b.host.delay(1e-3)
+        elif wrong == "no time":
+            b.set(0x36, 0, 0x0301, 2)
+            b.set(0x2D, 6, 0x8000, 2)
+            b.host.delay(50e-6)
+            b.set(0x36, 0, 0x0200, 2)
+            b.host.delay(50e-6)
+        b.hz = FAST_HZ
+        stamps = []
+        for _ in range(2):
+            b.listen()
+            b.host.delay(20e-6)
+            a.send(b"hello")
+            a.host.delay(1e-3)
+            assert b.status & RX_GOOD == RX_GOOD & ~(1 << 10), "RXDFR without LDEDONE"
+            stamps.append((b.rx_stamp - b.time) % (1 << 40))
+        # Stamps lie a millisecond in the past where they mean something.
+        assert min((-stamp) % (1 << 40) for stamp in stamps) > 1e9
+
+
+class TestSleep:
+    def asleep(self, driver: Driver, wake: int = 0x07, keep: int = 0x0840) -> None:
+        driver.set(0x2C, 0, keep, 2)
+        driver.set(0x2C, 6, wake, 1)
+        driver.set(0x2C, 2, 0x00, 1)
+        driver.set(0x2C, 2, 0x02, 1)
+
+    def test_a_sleeping_chip_answers_nothing_and_is_woken_by_its_select_line(self, driver: Driver):
+        driver.set(0x04, 0, 0x10001200)
+        self.asleep(driver)
+        driver.hz = SLOW_HZ
+        assert driver.read(0x00) != ID
+        driver.host.spi(bytes(200), SLOW_HZ)
+        driver.host.delay(5e-3)
+        assert driver.read(0x00) == ID
+        assert driver.get(0x04) == 0x10001200, "ONW_LDC brings the configuration back"
+        assert driver.status & SLP2INIT
+
+    def test_sleep_loses_the_antenna_delays(self, driver: Driver, chip: Chip):
+        driver.set(0x18, 0, 16436, 2)
+        driver.set(0x2E, 0x1804, 16436, 2)
+        self.asleep(driver)
+        chip.wakeup_pin()
+        chip.delay(5e-3)
+        assert driver.get(0x18, 0, 2) != 16436
+        assert driver.get(0x2E, 0x1804, 2) == 0
+
+    def test_a_driver_that_does_not_rewrite_the_delays_ranges_wrong(self, air: Air):
+        a, b, *_ = pair(air)
+        self.asleep(b)
+        b.host.wakeup_pin()
+        b.host.delay(5e-3)
+        b.set(0x2E, 0x1804, 16436, 2)
+        a.listen()
+        a.host.delay(20e-6)
+        b.send(b"hello")
+        b.host.delay(1e-3)
+        b.set(0x18, 0, 16436, 2)
+        told = b.tx_stamp
+        assert (told - b.get(0x17, 5, 5)) % (1 << 40) != 16436
+
+    def test_without_a_way_to_wake_there_is_only_a_reset(self, driver: Driver, chip: Chip):
+        self.asleep(driver, wake=0x01)
+        driver.hz = SLOW_HZ
+        driver.host.spi(bytes(200), SLOW_HZ)
+        chip.wakeup_pin()
+        chip.delay(5e-3)
+        assert driver.read(0x00) != ID
+        chip.reset_pin()
+        chip.delay(5e-3)
+        assert driver.read(0x00) == ID
+
+
+def test_temperature_and_voltage_by_the_manuals_formulas(driver: Driver, chip: Chip):
+    chip.environment(41.0, 3.1)
+    driver.set(0x28, 0x11, 0x80, 1)
+    driver.set(0x28, 0x12, 0x0A, 1)
+    driver.set(0x28, 0x12, 0x0F, 1)
+    driver.set(0x2A, 0, 1, 1)
+    driver.set(0x2A, 0, 0, 1)
+    volts, celsius = driver.read(0x2A, 3, 2)
+    driver.set(0x36, 0, 0x01, 1)
+    driver.hz = SLOW_HZ
+    otp = TestMemories().read_otp
+    assert 23 + 1.14 * (celsius - (otp(driver, 9) & 0xFF)) == pytest.approx(41.0, abs=0.6)
+    assert 3.3 + (volts - (otp(driver, 8) & 0xFF)) / 173 == pytest.approx(3.1, abs=0.003)
+
+
+def test_event_counters_count_once_enabled_and_cleared_in_two_writes(driver: Driver):
+    def time_out() -> None:
+        driver.listen()
+        driver.host.delay(1e-3)
+
+    driver.set(0x27, 0x24, 5, 2)
+    time_out()
+    driver.set(0x2F, 0, 3)
+    time_out()
+    assert driver.get(0x2F, 0x12, 2) == 0, "clearing and enabling in one write does not enable"
+    driver.set(0x2F, 0, 1)
+    time_out()
+    time_out()
+    assert driver.get(0x2F, 0x12, 2) == 2
+    driver.set(0x2F, 0, 2)
+    assert driver.get(0x2F, 0x12, 2) == 0
+
+
+def test_the_state_says_what_the_chip_does(driver: Driver):
+    def state() -> int:
+        return driver.get(0x19, 0, 4) >> 16 & 15
+
+    driver.fctrl = 0x15C000
+    driver.listen()
+    assert state() == 5
+    driver.command(TRXOFF)
+    driver.send_at(b"x", driver.time + 64_000_000)
+    assert state() == 2
+    driver.host.delay(0.95e-3)
+    assert state() == 4
+    driver.host.delay(1e-3)
+    assert state() == 1

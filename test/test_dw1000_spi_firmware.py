@@ -1,0 +1,226 @@
+"""PyPI's `dw1000-spi` and the firmware range with each other, on modelled chips: neither knows of the other's code.
+
+The other driver plays the part that the exchange asks for, written here from the layout of the frames.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from types import SimpleNamespace
+
+import pytest
+from dw1000_driver import TICK_M, TXDLYS, TXSTRT, WAIT4RESP, WRAP
+from spidev_on_model import CLOCK, begin, dw1000, program, replace_spidev
+
+from uwb_mitigation.dw1000_model.air import ANTENNA_DELAY_TICKS, Air, Host
+from uwb_mitigation.dw1000_model.links import Link
+from uwb_mitigation.link.layout import Role
+from uwb_mitigation.link.radio import RadioSettings
+from uwb_mitigation.measurement import RangeMeasurement
+from uwb_mitigation.radio import host as firmware
+from uwb_mitigation.radio.host import HostRadio
+
+pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc")
+OTHERS = 0x0123456789ABCDEF
+POLL, ANSWER, FINAL, REPORT = 3, 4, 5, 6
+REPLY_US = 3000
+
+
+class ModelBus:
+    """The firmware's way to the chip of the program that it runs in; see `radio.bus.Bus`."""
+
+    name = "a modelled chip"
+    reply_us = REPLY_US
+    patience_us = 15_000
+    has_reset = True
+
+    def __init__(self, host: Host) -> None:
+        self._host = host
+        self._hz = 2_000_000
+
+    def transfer(self, header: bytes, out: bytes | None, count: int) -> bytes:
+        return self._host.spi(header + (bytes(count) if out is None else out), self._hz)[len(header) :]
+
+    def speed(self, fast: bool) -> None:
+        self._hz = 8_000_000 if fast else 2_000_000
+
+    def reset(self) -> None:
+        self._host.reset_pin()
+
+    def pause(self) -> None:
+        self._host.delay(200e-6)
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.fixture
+def air(monkeypatch: pytest.MonkeyPatch) -> Iterator[Air]:
+    replace_spidev(monkeypatch)
+    monkeypatch.setattr(firmware, "time", CLOCK)
+    with Air(2) as air:
+        yield air
+
+
+def ours(settings: RadioSettings, ranges: list[RangeMeasurement], seconds: float) -> Callable[[Host], None]:
+    """A program that runs the firmware's exchange."""
+
+    def run(host: Host) -> None:
+        begin(host)
+        radio = HostRadio(ModelBus(host), settings, stamp_clock=CLOCK.time_ns)
+        try:
+            while host.now() < seconds:
+                measured = radio.turn(0.02)
+                if measured is not None:
+                    ranges.append(measured)
+        finally:
+            radio.close()
+
+    return run
+
+
+def frame(
+    kind: int, pan: int, to: int, numbers: tuple[int, int], stamps: tuple[int, ...] = (0, 0, 0)
+) -> list[int]:
+    """As `firmware/src/uwb_twr_frame.c` lays it out."""
+    head = b"\x41\xcc" + bytes((numbers[0] & 0xFF,)) + pan.to_bytes(2, "little")
+    body = to.to_bytes(8, "little") + OTHERS.to_bytes(8, "little") + bytes((0x75, kind))
+    body += b"".join(number.to_bytes(4, "little") for number in numbers)
+    return list(head + body + b"".join(stamp.to_bytes(5, "little") for stamp in stamps))
+
+
+def parsed(octets: list[int] | None) -> SimpleNamespace | None:
+    data = bytes(octets or b"")
+    if len(data) != 46 or data[:2] != b"\x41\xcc":
+        return None
+
+    def number(at: int, size: int) -> int:
+        return int.from_bytes(data[at : at + size], "little")
+
+    return SimpleNamespace(
+        pan=number(3, 2),
+        source=number(13, 8),
+        kind=data[22],
+        tag=number(23, 4),
+        anchor=number(27, 4),
+        stamps=tuple(number(31 + 5 * k, 5) for k in range(3)),
+    )
+
+
+def await_kind(driver: dw1000.DW1000, kind: int, seconds: float) -> tuple[SimpleNamespace, int] | None:
+    data, stamp = driver.listen(True, seconds)
+    heard = parsed(data)
+    return None if heard is None or heard.kind != kind else (heard, stamp)
+
+
+@pytest.mark.parametrize("distance_m", [2.0, 40.0])
+def test_our_tag_ranges_with_it_as_anchor(air: Air, distance_m: float):
+    tag, anchor = air.chip(ppm=12.0, clock_ticks=WRAP - 10**9), air.chip(ppm=-9.0)
+    air.link(tag, anchor, Link(distance_m, excess_m=0.5))
+    ranges: list[RangeMeasurement] = []
+
+    def attend(driver: dw1000.DW1000, host: Host) -> None:
+        while host.now() < 0.3:
+            polled = await_kind(driver, POLL, 0.05)
+            if polled is None:
+                continue
+            poll, poll_received = polled
+            numbers = (poll.tag, 0x5EED)
+            _, answered = driver.transmit(frame(ANSWER, poll.pan, poll.source, numbers), ranging=True)
+            final = await_kind(driver, FINAL, 0.02)
+            if final is not None and (final[0].tag, final[0].anchor) == numbers:
+                stamps = (poll_received, answered, final[1])
+                driver.transmit(frame(REPORT, poll.pan, poll.source, numbers, stamps), ranging=False)
+
+    air.program(tag, ours(RadioSettings(anchors=(OTHERS,)), ranges, 0.3))
+    air.program(anchor, program(attend))
+    air.run(1.0)
+    assert len(ranges) > 5
+    assert {measured.anchor_id for measured in ranges} == {OTHERS}
+    found = [measured.range_m for measured in ranges]
+    assert sum(found) / len(found) == pytest.approx(distance_m + 0.5, abs=0.005)
+    assert max(found) - min(found) < 0.02
+    assert all(len(measured.cir) == 157 for measured in ranges)
+
+
+def test_our_anchor_ranges_with_it_as_tag(air: Air):
+    """It has no delayed send, and none that listens at once: SYS_CTRL and DX_TIME are written with its registers."""
+    tag, anchor = air.chip(ppm=-15.0), air.chip(ppm=15.0, clock_ticks=WRAP - 10**9)
+    air.link(tag, anchor, Link(12.5))
+    own = 0xA000000000000001
+    found: list[float] = []
+
+    def ask(
+        driver: dw1000.DW1000, host: Host, data: list[int], command: int
+    ) -> tuple[SimpleNamespace | None, int]:
+        driver.write_register([0x8F], [0xFF] * 4)
+        driver.write_register([0x89], data)
+        driver.write_register([0x88], [len(data) + 2])
+        driver.write_register([0x8D], [command])
+        until = host.now() + 0.02
+        while host.now() < until:
+            if driver.packet_available():
+                heard, stamp = driver.receive_packet()
+                return parsed(heard), stamp
+        driver.disable_rx_tx()
+        return None, 0
+
+    def sent(driver: dw1000.DW1000) -> int:
+        return int.from_bytes(bytes(driver.read_register([0x17], 5, return_ints=True)), "little")
+
+    def range_to(driver: dw1000.DW1000, host: Host) -> None:
+        pan = RadioSettings().pan
+        for turn in range(8):
+            host.delay(20e-3)
+            number = 0x7A600000 + turn
+            answer, answered = ask(
+                driver, host, frame(POLL, pan, own, (number, 0), (REPLY_US, 0, 0)), TXSTRT | WAIT4RESP
+            )
+            if answer is None or answer.kind != ANSWER:
+                continue
+            leaves = (answered + REPLY_US * 63898) % WRAP & ~511
+            stamps = (sent(driver), answered, (leaves + ANTENNA_DELAY_TICKS) % WRAP)
+            driver.write_register([0x8A], list(leaves.to_bytes(5, "little")))
+            final = frame(FINAL, pan, own, (number, answer.anchor), stamps)
+            report, _ = ask(driver, host, final, TXSTRT | TXDLYS | WAIT4RESP)
+            if report is None or report.kind != REPORT:
+                continue
+            assert sent(driver) == stamps[2]
+            their = report.stamps
+            round_1, reply_2 = (stamps[1] - stamps[0]) % WRAP, (stamps[2] - stamps[1]) % WRAP
+            reply_1, round_2 = (their[1] - their[0]) % WRAP, (their[2] - their[1]) % WRAP
+            flight = (round_1 * round_2 - reply_1 * reply_2) / (round_1 + round_2 + reply_1 + reply_2)
+            found.append(flight * TICK_M)
+
+    air.program(anchor, ours(RadioSettings(role=Role.ANCHOR, address=own), [], 0.3))
+    air.program(tag, program(range_to))
+    air.run(1.0)
+    assert len(found) >= 6
+    assert sum(found) / len(found) == pytest.approx(12.5, abs=0.005)
+
+
+def test_frames_without_a_leading_edge_give_our_driver_no_range(air: Air):
+    tag, anchor = air.chip(), air.chip()
+    air.link(tag, anchor, Link(6.0))
+    for chip in (tag, anchor):
+        chip.lose_edges(0.2)
+    ranges: list[RangeMeasurement] = []
+    air.program(tag, ours(RadioSettings(), ranges, 0.3))
+    air.program(anchor, ours(RadioSettings(role=Role.ANCHOR), [], 0.3))
+    air.run(1.0)
+    assert len(ranges) > 5
+    assert all(measured.range_m == pytest.approx(6.0, abs=0.03) for measured in ranges)
+
+
+@pytest.mark.parametrize("preamble", [1024, 4096])
+def test_times_that_are_left_open_grow_with_the_frames(air: Air, preamble: int):
+    slow = {"rate_kbps": 110, "preamble": preamble}
+    tag, anchor = air.chip(ppm=5.0), air.chip(ppm=-5.0)
+    air.link(tag, anchor, Link(6.0))
+    ranges: list[RangeMeasurement] = []
+    air.program(tag, ours(RadioSettings(**slow), ranges, 0.6))
+    air.program(anchor, ours(RadioSettings(role=Role.ANCHOR, **slow), [], 0.6))
+    air.run(1.0)
+    assert len(ranges) >= 3
+    assert all(measured.range_m == pytest.approx(6.0, abs=0.03) for measured in ranges)

@@ -1,0 +1,293 @@
+"""Airs and chips. A chip's host is driven from outside of the air, or by programs that run in virtual time."""
+
+from __future__ import annotations
+
+import ctypes
+import queue
+import threading
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+
+from uwb_mitigation.dw1000_model.library import LinkConfig, NextRequest, Request, load
+from uwb_mitigation.dw1000_model.links import Link
+from uwb_mitigation.errors import UwbMitigationError
+
+ANTENNA_DELAY_TICKS = 16436
+"""Of each direction, as DecaRanging assumes it at PRF 64 MHz."""
+
+_LOOK_S = 1e-6
+_SPI, _DELAY, _WAIT, _RESET_PIN = range(4)
+
+
+class Host(Protocol):
+    """What a driver needs of the computer that it runs on. Times are virtual, s."""
+
+    def spi(self, out: bytes, hz: int) -> bytes:
+        """One chip-select period, full duplex."""
+        ...
+
+    def irq(self) -> bool:
+        """The level of the IRQ line."""
+        ...
+
+    def wait(self, at_most_s: float) -> None:
+        """Wait until the IRQ line is high."""
+        ...
+
+    def delay(self, seconds: float) -> None:
+        """Let time pass."""
+        ...
+
+    def reset_pin(self) -> None:
+        """Pull RSTn low for 1 ms, and let it float."""
+        ...
+
+    def now(self) -> float:
+        """Seconds since the air's beginning."""
+        ...
+
+
+class Air:
+    """Several chips in virtual time. `close`, or leaving the context, ends their programs.
+
+    Not for several threads at once.
+
+    Args:
+        seed: of all chance: the same seed and programs give the same run.
+
+    Raises:
+        MissingDependencyError, UwbMitigationError: the model cannot be compiled.
+    """
+
+    def __init__(self, seed: int = 0) -> None:
+        self._library = load()
+        self._air: int | None = self._library.dw1000_air_new(seed)
+        if self._air is None:
+            raise UwbMitigationError("no memory for the model")
+        self._programs: dict[int, _Program] = {}
+
+    def chip(
+        self,
+        *,
+        ppm: float = 0.0,
+        clock_ticks: int = 0,
+        tx_delay_ticks: int = ANTENNA_DELAY_TICKS,
+        rx_delay_ticks: int = ANTENNA_DELAY_TICKS,
+    ) -> Chip:
+        """A new chip; `dw1000_chip_new` in C."""
+        made = self._library.dw1000_chip_new(self._air, ppm, clock_ticks, tx_delay_ticks, rx_delay_ticks)
+        if made is None:
+            raise UwbMitigationError("no memory for a chip")
+        return Chip(self, self._library, made)
+
+    def link(self, a: Chip, b: Chip, link: Link | None) -> None:
+        """Join two chips, both ways; None parts them."""
+        config = None
+        if link is not None:
+            samples = None if link.samples is None else np.ascontiguousarray(link.samples, np.int16)
+            config = LinkConfig(
+                link.distance_m,
+                link.excess_m,
+                None if samples is None else samples.ctypes.data,
+                0 if samples is None else len(samples) // 2,
+                link.first_path_index,
+                link.preamble_count,
+                link.noise_threshold,
+                link.std_noise,
+                link.loss,
+                link.damage,
+            )
+        self._library.dw1000_link(
+            self._air, a.address, b.address, None if config is None else ctypes.byref(config)
+        )
+
+    def run(self, seconds: float) -> float:
+        """Let time pass, or less if all programs end within it; returns the time reached, s.
+
+        Raises:
+            Exception: what a program raised.
+        """
+        reached: float = self._library.dw1000_run(self._air, seconds)
+        for program in self._programs.values():
+            program.raise_failure()
+        return reached
+
+    def program(self, chip: Chip, run: Callable[[Host], None]) -> None:
+        """Give a chip's host a program, from now on, in place of the one before.
+
+        It runs in a thread of its own, but only while every other one and the air stand still.
+        """
+        old = self._programs.pop(chip.address, None)
+        if old is not None:
+            old.end()
+        program = _Program(run)
+        self._programs[chip.address] = program
+        self._library.dw1000_program_remote(chip.address, program.callback, None)
+
+    def close(self) -> None:
+        """End all programs and free the air; may be called twice."""
+        if self._air is not None:
+            for program in self._programs.values():
+                program.end()
+            self._library.dw1000_air_free(self._air)
+            self._air = None
+
+    def __enter__(self) -> Air:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class Chip:
+    """A chip, with its host driven from outside of the air: while it is, all programs go on. A `Host`."""
+
+    def __init__(self, air: Air, library: ctypes.CDLL, address: int) -> None:
+        self.air = air
+        self.address = address
+        self._library = library
+
+    def spi(self, out: bytes, hz: int) -> bytes:
+        """One chip-select period, full duplex."""
+        buffer = ctypes.create_string_buffer(len(out))
+        self._library.dw1000_spi(self.address, out, buffer, len(out), hz)
+        return buffer.raw
+
+    def irq(self) -> bool:
+        """The level of the IRQ line."""
+        return bool(self._library.dw1000_irq(self.address))
+
+    def wait(self, at_most_s: float) -> None:
+        """Wait until the IRQ line is high."""
+        self._library.dw1000_wait(self.address, at_most_s)
+
+    def delay(self, seconds: float) -> None:
+        """Let time pass."""
+        self._library.dw1000_delay(self.address, seconds)
+
+    def reset_pin(self) -> None:
+        """Pull RSTn low for 1 ms, and let it float."""
+        self._library.dw1000_reset_pin(self.address)
+
+    def reset_drive(self, level: int) -> None:
+        """Hold RSTn from now on: 0 low, 1 floating, 2 high, which destroys the chip."""
+        self._library.dw1000_reset_drive(self.address, level)
+
+    def wakeup_pin(self) -> None:
+        """A pulse on the WAKEUP pin."""
+        self._library.dw1000_wakeup_pin(self.address)
+
+    def environment(self, celsius: float, volts: float) -> None:
+        """Set what the chip's sensors measure."""
+        self._library.dw1000_environment(self.address, celsius, volts)
+
+    def lose_edges(self, probability: float) -> None:
+        """Of the good frames that it receives, how many have no leading edge that its detector finds."""
+        self._library.dw1000_lose_edges(self.address, probability)
+
+    def now(self) -> float:
+        """Seconds since the air's beginning."""
+        now: float = self._library.dw1000_now(self.address)
+        return now
+
+    @property
+    def fault(self) -> str | None:
+        """What destroyed the chip; None = nothing has."""
+        told = self._library.dw1000_fault(self.address)
+        return None if told is None else told.decode()
+
+
+class _Ended(BaseException):
+    """Ends a program's thread where it stands."""
+
+
+class _Program:
+    """A thread that stands still but for the moments in which the model asks for its next request. A `Host`."""
+
+    def __init__(self, run: Callable[[Host], None]) -> None:
+        self._run = run
+        self._requests: queue.SimpleQueue[tuple[int, float, bytes, int] | None] = queue.SimpleQueue()
+        self._answers: queue.SimpleQueue[bool] = queue.SimpleQueue()
+        self._request = Request()
+        self._kept: list[object] = []
+        self._read = ctypes.create_string_buffer(0)
+        self._failure: BaseException | None = None
+        self._over = False
+        self._thread: threading.Thread | None = None
+        self.callback = NextRequest(self._next)
+
+    def spi(self, out: bytes, hz: int) -> bytes:
+        self._ask(_SPI, 0.0, bytes(out), hz)
+        return self._read.raw
+
+    def irq(self) -> bool:
+        # As in C: a program that does nothing but look still gets somewhere.
+        self._ask(_DELAY, _LOOK_S)
+        return bool(self._request.line)
+
+    def wait(self, at_most_s: float) -> None:
+        self._ask(_WAIT, at_most_s)
+
+    def delay(self, seconds: float) -> None:
+        self._ask(_DELAY, seconds)
+
+    def reset_pin(self) -> None:
+        self._ask(_RESET_PIN, 0.0)
+
+    def now(self) -> float:
+        self._ask(_DELAY, _LOOK_S)
+        return float(self._request.now_s)
+
+    def end(self) -> None:
+        """End the thread, wherever the program stands."""
+        self._over = True
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._answers.put(False)
+            self._thread.join()
+            self._thread = None
+
+    def raise_failure(self) -> None:
+        """Raise what the program did, once."""
+        failure, self._failure = self._failure, None
+        if failure is not None:
+            raise failure
+
+    def _ask(self, kind: int, seconds: float, out: bytes = b"", hz: int = 0) -> None:
+        self._requests.put((kind, seconds, out, hz))
+        if not self._answers.get():
+            raise _Ended
+
+    def _body(self) -> None:
+        try:
+            self._run(self)
+        except _Ended:
+            return
+        except BaseException as failure:  # it is raised where the air is run
+            self._failure = failure
+        self._requests.put(None)
+
+    def _next(self, _context: object, request: ctypes._Pointer[Request]) -> int:
+        if self._over:
+            return 0
+        told = request.contents
+        self._request.line, self._request.now_s = told.line, told.now_s
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._body, name="dw1000 host", daemon=True)
+            self._thread.start()
+        else:
+            self._answers.put(True)
+        wanted = self._requests.get()
+        if wanted is None:
+            self._thread.join()
+            self._thread = None
+            self._over = True
+            return 0
+        told.kind, told.seconds, out, told.hz = wanted
+        self._read = ctypes.create_string_buffer(len(out))
+        self._kept = [out]
+        told.out = ctypes.cast(ctypes.c_char_p(out), ctypes.c_void_p)
+        told.in_ = ctypes.cast(self._read, ctypes.c_void_p)
+        told.n = len(out)
+        return 1

@@ -1,0 +1,123 @@
+"""Compiles the model for this computer, and declares its functions to ctypes."""
+
+from __future__ import annotations
+
+import atexit
+import ctypes
+import functools
+import shutil
+import tempfile
+from pathlib import Path
+
+from uwb_mitigation.errors import MissingDependencyError
+from uwb_mitigation.firmware_export.compiling import (
+    WARNINGS,
+    c_compiler,
+    compile_objects,
+    firmware_folder,
+    run,
+)
+
+_OPTIONS = ("-std=c11", "-O2", "-fPIC", *WARNINGS)
+
+
+class LinkConfig(ctypes.Structure):
+    """`dw1000_link_config`."""
+
+    _fields_ = (
+        ("distance_m", ctypes.c_double),
+        ("excess_m", ctypes.c_double),
+        ("iq", ctypes.c_void_p),
+        ("samples", ctypes.c_size_t),
+        ("first_path_index", ctypes.c_double),
+        ("preamble_count", ctypes.c_uint16),
+        ("noise_threshold", ctypes.c_uint16),
+        ("std_noise", ctypes.c_uint16),
+        ("loss", ctypes.c_double),
+        ("damage", ctypes.c_double),
+    )
+
+
+class Request(ctypes.Structure):
+    """`dw1000_request`."""
+
+    _fields_ = (
+        ("kind", ctypes.c_int32),
+        ("line", ctypes.c_int32),
+        ("now_s", ctypes.c_double),
+        ("seconds", ctypes.c_double),
+        ("out", ctypes.c_void_p),
+        ("in_", ctypes.c_void_p),
+        ("n", ctypes.c_size_t),
+        ("hz", ctypes.c_uint32),
+    )
+
+
+NextRequest = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.POINTER(Request))
+
+
+def model_folder() -> Path:
+    """The folder with the model's sources.
+
+    Raises:
+        MissingDependencyError: they are not installed.
+    """
+    folder = firmware_folder() / "dw1000_model"
+    if not (folder / "dw1000_model.h").is_file():
+        raise MissingDependencyError(
+            "the DW1000's model is not installed", where=str(folder), valid="install the package again"
+        )
+    return folder
+
+
+def model_objects(flags: tuple[str, ...] = ()) -> tuple[str, ...]:
+    """Object files of the model for this computer; compiled once a process.
+
+    Raises:
+        MissingDependencyError: there is no C compiler, or the sources are not installed.
+        UwbMitigationError: they do not compile.
+    """
+    folder = model_folder()
+    return compile_objects(
+        c_compiler(), (*_OPTIONS, *flags, f"-I{folder}"), tuple(sorted(folder.glob("*.c")))
+    )
+
+
+@functools.cache
+def load() -> ctypes.CDLL:
+    """The model as a shared library of this process.
+
+    Raises:
+        MissingDependencyError, UwbMitigationError: as `model_objects`.
+    """
+    folder = tempfile.mkdtemp(prefix="uwb_dw1000_model_")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    path = f"{folder}/libdw1000_model.so"
+    run([*c_compiler(), "-shared", *model_objects(), "-o", path, "-lm", "-lpthread"])
+    library = ctypes.CDLL(path)
+    pointer, real, size = ctypes.c_void_p, ctypes.c_double, ctypes.c_size_t
+    declared: dict[str, tuple[object, tuple[object, ...]]] = {
+        "air_new": (pointer, (ctypes.c_uint64,)),
+        "air_free": (None, (pointer,)),
+        "chip_new": (pointer, (pointer, real, ctypes.c_uint64, ctypes.c_uint16, ctypes.c_uint16)),
+        "link": (None, (pointer, pointer, pointer, ctypes.POINTER(LinkConfig))),
+        "program": (None, (pointer, pointer, pointer)),
+        "program_remote": (None, (pointer, NextRequest, pointer)),
+        "run": (real, (pointer, real)),
+        "spi": (None, (pointer, ctypes.c_char_p, ctypes.c_char_p, size, ctypes.c_uint32)),
+        "irq": (ctypes.c_int, (pointer,)),
+        "wait": (None, (pointer, real)),
+        "delay": (None, (pointer, real)),
+        "reset_pin": (None, (pointer,)),
+        "reset_drive": (None, (pointer, ctypes.c_int)),
+        "wakeup_pin": (None, (pointer,)),
+        "environment": (None, (pointer, real, real)),
+        "lose_edges": (None, (pointer, real)),
+        "now": (real, (pointer,)),
+        "fault": (ctypes.c_char_p, (pointer,)),
+    }
+    for name, (result, arguments) in declared.items():
+        function = getattr(library, f"dw1000_{name}")
+        function.restype = result
+        function.argtypes = arguments
+    return library
