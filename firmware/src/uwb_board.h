@@ -28,6 +28,11 @@ typedef struct {
     uint8_t *queue; /* for frames to the host; two of the longest and the reserve are ample */
     size_t queue_bytes;
     uint32_t (*clock_us)(void); /* for compute_us; NULL = it is sent as 0 */
+    /* Take a frame of a type that a board without a radio of its own has not; return whether it was used. May be
+     * NULL. */
+    int (*other)(void *context, const uwb_header_t *header, const uint8_t *payload, size_t payload_bytes,
+                 uint64_t now_us);
+    void *context;
 } uwb_board_config;
 
 typedef struct {
@@ -44,6 +49,9 @@ typedef struct {
     uint32_t radio_faults_told;
     float temperature; /* degrees Celsius, for STATUS; the caller may set it */
     uint8_t mode;
+    float default_offset_m;
+    uint16_t offset_count;
+    uwb_offset_t offsets[UWB_MAX_OFFSETS]; /* as the host has set them; none at the start */
 } uwb_board;
 
 /* Start, and send HELLO. */
@@ -55,6 +63,10 @@ void uwb_board_receive(uwb_board *board, const uint8_t *bytes, size_t count, uin
 /* Take bytes from the radio's side: frames RANGE_CIR. Send them on, corrected or not, as the mode says. */
 void uwb_board_measure(uwb_board *board, const uint8_t *bytes, size_t count, uint64_t now_us);
 
+/* Send a measurement on, a payload of RANGE_CIR aligned to 2 bytes that the board's own radio made at `time_us`; returns
+ * whether it is well formed. */
+int uwb_board_take(uwb_board *board, const uint8_t *payload, size_t payload_bytes, uint64_t time_us);
+
 /* Send what is due: STATUS once a second. */
 void uwb_board_tick(uwb_board *board, uint64_t now_us);
 
@@ -64,6 +76,14 @@ int uwb_board_send(uwb_board *board, uint8_t type, uint16_t flags, uint64_t time
 
 /* Send HELLO, as an answer to the host's frame `*request`, or of its own accord where that is NULL. */
 void uwb_board_hello(uwb_board *board, const uint32_t *request, uint64_t now_us);
+
+/* Take the payload of a SET_OFFSETS, the host's frame `request`, and answer; returns whether it is well formed. */
+int uwb_board_set_offsets(uwb_board *board, const uint8_t *payload, size_t payload_bytes, uint32_t request,
+                          uint64_t now_us);
+
+/* What to take off the ranges of a pair, m: the pair's own offset, else the sum of its tag's and its anchor's, else the
+ * default. */
+float uwb_board_offset_m(const uwb_board *board, uint64_t tag_id, uint64_t anchor_id);
 
 /* Correct a measurement and send the result; returns whether it fitted. */
 int uwb_board_correct(uwb_board *board, const uwb_range_cir_t *fields, const uwb_cir *cir, uint16_t flags,

@@ -7,7 +7,8 @@ int uwb_board_correct(uwb_board *board, const uwb_range_cir_t *fields, const uwb
     const uwb_board_config *const config = &board->config;
     const uint32_t began_us = config->clock_us != NULL ? config->clock_us() : 0;
     uwb_corrected corrected;
-    (void)uwb_correct(config->model, fields->range, cir, config->arena, config->arena_bytes, &corrected);
+    const float offset_m = uwb_board_offset_m(board, fields->tag_id, fields->anchor_id);
+    (void)uwb_correct(config->model, fields->range, offset_m, cir, config->arena, config->arena_bytes, &corrected);
 
     uwb_range_corrected_t message;
     memset(&message, 0, sizeof message);

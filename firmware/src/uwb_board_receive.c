@@ -18,6 +18,8 @@ static int answer(uwb_board *board, const uwb_header_t *header, size_t payload_b
         }
         uwb_board_hello(board, &header->sequence, now_us);
         return 1;
+    case UWB_TYPE_SET_OFFSETS:
+        return uwb_board_set_offsets(board, payload, payload_bytes, header->sequence, now_us);
     case UWB_TYPE_TIME_SYNC: {
         uwb_time_sync_reply_t reply;
         memset(&reply, 0, sizeof reply);
@@ -41,7 +43,8 @@ static int answer(uwb_board *board, const uwb_header_t *header, size_t payload_b
         return 1;
     }
     default:
-        return 0;
+        return board->config.other != NULL &&
+               board->config.other(board->config.context, header, payload, payload_bytes, now_us);
     }
 }
 

@@ -70,38 +70,41 @@ static uwb_status predict(const uwb_model *model, float range_m, const uwb_cir *
 
 /* The stranger a measurement is, the less of its predicted error is believed. As in the host's Grader: every
  * product and every sum is rounded, for which volatile keeps a compiler from fusing them. */
-static void grade(const uwb_model *model, float range_m, float error_m, float score, uwb_corrected *corrected) {
+static void grade(const uwb_model *model, float range_m, float offset_m, float error_m, float score,
+                  uwb_corrected *corrected) {
     const volatile float square = error_m * error_m;
     const volatile float growth = model->variance_per_m2 * square;
     float correction_m = error_m;
     float variance_m2 = model->variance_m2 + growth;
     if (score > 0.0f) {
-        const float offset_m = model->familiarity->known_offset_m;
-        const volatile float shrunk = (1.0f - score) * (error_m - offset_m);
+        const float known_m = model->familiarity->known_offset_m;
+        const volatile float shrunk = (1.0f - score) * (error_m - known_m);
         const volatile float strange = score * model->variance_uncorrected_m2;
-        correction_m = offset_m + shrunk;
+        correction_m = known_m + shrunk;
         variance_m2 += strange;
     }
+    correction_m = offset_m + correction_m;
     corrected->range_m = range_m - correction_m;
     corrected->correction_m = correction_m;
     corrected->variance_m2 = variance_m2;
 }
 
-uwb_status uwb_correct(const uwb_model *model, float range_m, const uwb_cir *cir, void *arena,
+uwb_status uwb_correct(const uwb_model *model, float range_m, float offset_m, const uwb_cir *cir, void *arena,
                        size_t arena_bytes, uwb_corrected *corrected) {
     if (corrected == NULL) {
         return UWB_BAD_ARGUMENT;
     }
     float error_m = 0.0f;
     float score = 0.0f;
-    const uwb_status status = predict(model, range_m, cir, arena, arena_bytes, &error_m, &score);
+    const float less_m = offset_m != 0.0f ? range_m - offset_m : range_m;
+    const uwb_status status = predict(model, less_m, cir, arena, arena_bytes, &error_m, &score);
     corrected->status = range_status(status);
     if (status == UWB_OK) {
-        grade(model, range_m, error_m, score, corrected);
+        grade(model, range_m, offset_m, error_m, score, corrected);
     } else {
-        const int valid = model != NULL && in_limits(range_m, 0.0f, MAX_RANGE_M);
-        corrected->range_m = range_m;
-        corrected->correction_m = 0.0f;
+        const int valid = model != NULL && in_limits(less_m, 0.0f, MAX_RANGE_M);
+        corrected->range_m = less_m;
+        corrected->correction_m = offset_m;
         corrected->variance_m2 = valid ? model->variance_uncorrected_m2 : INFINITY;
     }
     return status;

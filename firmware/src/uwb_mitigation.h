@@ -158,17 +158,17 @@ typedef enum {
     UWB_RANGE_MODEL_ERROR = 4
 } uwb_range_status;
 
-/* On any status but OK the raw range is passed through, and the variance is larger. */
+/* On any status but OK the raw range is passed through, less the radios' offset, and the variance is larger. */
 typedef struct {
     float range_m;
-    float correction_m; /* predicted error, measured - true: prior + network; 0 when passed through */
+    float correction_m; /* offset + predicted error (prior + network); the offset alone when passed through */
     float variance_m2;  /* infinite where the range is not valid */
     uwb_range_status status;
 } uwb_corrected;
 
-/* Correct one range. The result is always usable; what is returned says in more detail why one was
- * passed through. */
-uwb_status uwb_correct(const uwb_model *model, float range_m, const uwb_cir *cir, void *arena,
+/* Correct one range. `offset_m` is what the two radios' antenna delays add to it; 0 = nothing that is known. The result
+ * is always usable; what is returned says in more detail why one was passed through. */
+uwb_status uwb_correct(const uwb_model *model, float range_m, float offset_m, const uwb_cir *cir, void *arena,
                        size_t arena_bytes, uwb_corrected *corrected);
 
 #ifdef __cplusplus

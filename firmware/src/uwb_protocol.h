@@ -21,6 +21,8 @@
 #define UWB_MAX_PAYLOAD_BYTES 4224
 #define UWB_MAX_FRAME_BYTES 4244
 #define UWB_MAX_ENCODED_BYTES 4261
+#define UWB_MAX_ANCHORS 32
+#define UWB_MAX_OFFSETS 64
 
 #define UWB_TYPE_HELLO 1
 #define UWB_TYPE_RANGE_CIR 2
@@ -28,15 +30,34 @@
 #define UWB_TYPE_LOG 4
 #define UWB_TYPE_STATUS 5
 #define UWB_TYPE_TIME_SYNC_REPLY 6
+#define UWB_TYPE_RADIO 7
+#define UWB_TYPE_RADIO_STATUS 8
+#define UWB_TYPE_OFFSETS 9
 #define UWB_TYPE_GET_INFO 64
 #define UWB_TYPE_SET_MODE 65
 #define UWB_TYPE_TIME_SYNC 66
+#define UWB_TYPE_GET_RADIO 67
+#define UWB_TYPE_SET_RADIO 68
+#define UWB_TYPE_SET_OFFSETS 69
 
 #define UWB_FLAG_ANSWER 1
 
 #define UWB_MODE_HOST 0
 #define UWB_MODE_DEVICE 1
 #define UWB_MODE_BOTH 2
+
+#define UWB_ROLE_TAG 0
+#define UWB_ROLE_ANCHOR 1
+
+#define UWB_RADIO_STATE_RUNNING 0
+#define UWB_RADIO_STATE_BUS 1
+#define UWB_RADIO_STATE_ABSENT 2
+#define UWB_RADIO_STATE_NO_CLOCK 3
+#define UWB_RADIO_STATE_RESTARTED 4
+
+#define UWB_OFFSET_OF_ANCHOR 0
+#define UWB_OFFSET_OF_TAG 1
+#define UWB_OFFSET_OF_PAIR 2
 
 #define UWB_LOG_LEVEL_DEBUG 10
 #define UWB_LOG_LEVEL_INFO 20
@@ -56,6 +77,33 @@ UWB_STATIC_ASSERT(offsetof(uwb_header_t, type) == 1);
 UWB_STATIC_ASSERT(offsetof(uwb_header_t, flags) == 2);
 UWB_STATIC_ASSERT(offsetof(uwb_header_t, sequence) == 4);
 UWB_STATIC_ASSERT(offsetof(uwb_header_t, time_us) == 8);
+
+typedef struct {
+    uint64_t address; /* of the anchor */
+    uint32_t tried; /* exchanges that began */
+    uint32_t ranged; /* exchanges that gave a range */
+    float rx_power; /* dBm, of its last frame; NaN = unknown */
+    uint32_t heard_ms; /* since it was last heard; 4294967295 = never */
+} uwb_radio_anchor_t;
+UWB_STATIC_ASSERT(sizeof(uwb_radio_anchor_t) == 24);
+UWB_STATIC_ASSERT(offsetof(uwb_radio_anchor_t, address) == 0);
+UWB_STATIC_ASSERT(offsetof(uwb_radio_anchor_t, tried) == 8);
+UWB_STATIC_ASSERT(offsetof(uwb_radio_anchor_t, ranged) == 12);
+UWB_STATIC_ASSERT(offsetof(uwb_radio_anchor_t, rx_power) == 16);
+UWB_STATIC_ASSERT(offsetof(uwb_radio_anchor_t, heard_ms) == 20);
+
+typedef struct {
+    uint64_t tag_id; /* of no meaning for an anchor's */
+    uint64_t anchor_id; /* of no meaning for a tag's */
+    float offset; /* m, -10 to 10 */
+    uint8_t of; /* OffsetOf */
+    uint8_t reserved[3];
+} uwb_offset_t;
+UWB_STATIC_ASSERT(sizeof(uwb_offset_t) == 24);
+UWB_STATIC_ASSERT(offsetof(uwb_offset_t, tag_id) == 0);
+UWB_STATIC_ASSERT(offsetof(uwb_offset_t, anchor_id) == 8);
+UWB_STATIC_ASSERT(offsetof(uwb_offset_t, offset) == 16);
+UWB_STATIC_ASSERT(offsetof(uwb_offset_t, of) == 20);
 
 typedef struct {
     uint64_t board_id; /* identity of the board */
@@ -134,7 +182,7 @@ typedef struct {
     uint32_t model_id; /* identity of the model that corrected; 0 = none */
     float range; /* m, corrected; NaN = no valid range */
     float range_raw; /* m, as measured */
-    float correction; /* m, predicted error; 0 when passed through */
+    float correction; /* m, offset + predicted error; the offset alone when passed through */
     float variance; /* m^2; infinite where the range is not valid */
     uint32_t compute_us; /* time that the correction took on the board */
     uint8_t status; /* 0 OK, 1 NO_CIR, 2 BAD_CIR, 3 OUT_OF_DISTRIBUTION, 4 MODEL_ERROR */
@@ -188,10 +236,154 @@ UWB_STATIC_ASSERT(offsetof(uwb_time_sync_reply_t, request_sequence) == 0);
 UWB_STATIC_ASSERT(offsetof(uwb_time_sync_reply_t, received_us) == 8);
 
 typedef struct {
+    uint32_t request_sequence; /* with ANSWER: sequence of the host's frame answered */
+    uint8_t accepted; /* 0 = SET_RADIO was refused, and the text says why */
+    uint8_t reserved[3];
+    uint64_t address; /* of the radio; 0 in SET_RADIO = the chip's own */
+    uint32_t antenna_delay; /* ticks, of transmitter and receiver together; 0 = as in the chip's memory */
+    uint32_t tx_power; /* register TX_POWER; 0 = as in the chip's memory, else the manual's */
+    uint32_t reply_us; /* from the reception of ANSWER to FINAL; 0 in SET_RADIO = the firmware's usual */
+    uint32_t patience_us; /* how long a tag waits for an anchor's frames; 0 as above */
+    uint32_t interval_us; /* between the beginnings of two exchanges, at least */
+    uint16_t pan; /* network; radios of others are not heard */
+    uint16_t rate; /* kbit/s: 110, 850, 6800 */
+    uint16_t preamble; /* symbols: 64 to 4096 */
+    uint16_t window; /* complex samples of a measurement; 0 = none, 1016 and more = all */
+    uint8_t channel; /* 1 to 5, 7 */
+    uint8_t prf; /* MHz: 16, 64 */
+    uint8_t preamble_code; /* 0 = the first for channel and PRF */
+    uint8_t decawave_sfd; /* 0 = the standard's start-of-frame delimiter, 1 = Decawave's */
+    uint8_t role; /* Role */
+    uint8_t report; /* 1 = an anchor gives its ranges to its host too */
+    uint8_t bias_correction; /* 1 = ranges are corrected for the power received (APS011) */
+    uint8_t anchor_count; /* anchors that a tag is to poll; 0 = those that it finds */
+    uint8_t reserved_too[4];
+    /* then anchor_count addresses, u64, then text, UTF-8, to the payload's end */
+} uwb_radio_t;
+UWB_STATIC_ASSERT(sizeof(uwb_radio_t) == 56);
+UWB_STATIC_ASSERT(offsetof(uwb_radio_t, request_sequence) == 0);
+UWB_STATIC_ASSERT(offsetof(uwb_radio_t, accepted) == 4);
+UWB_STATIC_ASSERT(offsetof(uwb_radio_t, address) == 8);
+UWB_STATIC_ASSERT(offsetof(uwb_radio_t, antenna_delay) == 16);
+UWB_STATIC_ASSERT(offsetof(uwb_radio_t, tx_power) == 20);
+UWB_STATIC_ASSERT(offsetof(uwb_radio_t, reply_us) == 24);
+UWB_STATIC_ASSERT(offsetof(uwb_radio_t, patience_us) == 28);
+UWB_STATIC_ASSERT(offsetof(uwb_radio_t, interval_us) == 32);
+UWB_STATIC_ASSERT(offsetof(uwb_radio_t, pan) == 36);
+UWB_STATIC_ASSERT(offsetof(uwb_radio_t, rate) == 38);
+UWB_STATIC_ASSERT(offsetof(uwb_radio_t, preamble) == 40);
+UWB_STATIC_ASSERT(offsetof(uwb_radio_t, window) == 42);
+UWB_STATIC_ASSERT(offsetof(uwb_radio_t, channel) == 44);
+UWB_STATIC_ASSERT(offsetof(uwb_radio_t, prf) == 45);
+UWB_STATIC_ASSERT(offsetof(uwb_radio_t, preamble_code) == 46);
+UWB_STATIC_ASSERT(offsetof(uwb_radio_t, decawave_sfd) == 47);
+UWB_STATIC_ASSERT(offsetof(uwb_radio_t, role) == 48);
+UWB_STATIC_ASSERT(offsetof(uwb_radio_t, report) == 49);
+UWB_STATIC_ASSERT(offsetof(uwb_radio_t, bias_correction) == 50);
+UWB_STATIC_ASSERT(offsetof(uwb_radio_t, anchor_count) == 51);
+
+typedef struct {
+    uint32_t tried; /* exchanges that began; the sum of the seven that follow */
+    uint32_t ranged; /* exchanges that gave a range */
+    uint32_t no_answer; /* lost: POLL was not answered */
+    uint32_t late; /* lost: FINAL could not be sent in time */
+    uint32_t time_out; /* lost: FINAL or REPORT did not come */
+    uint32_t damaged; /* lost: what came was no intact frame */
+    uint32_t absurd; /* lost: stamps that no exchange can have */
+    uint32_t broken; /* lost: the chip was reset meanwhile, or its bus failed */
+    uint32_t refused; /* frames that belonged to no exchange of this radio */
+    uint32_t restarts; /* of the chip, but for the first */
+    float temperature; /* of the chip, degrees Celsius; NaN = not measured */
+    float voltage; /* of the chip, V; NaN = not measured */
+    uint8_t state; /* RadioState */
+    uint8_t anchor_count; /* anchors that the tail tells of */
+    uint8_t reserved[6];
+    /* then anchor_count times RADIO_ANCHOR */
+} uwb_radio_status_t;
+UWB_STATIC_ASSERT(sizeof(uwb_radio_status_t) == 56);
+UWB_STATIC_ASSERT(offsetof(uwb_radio_status_t, tried) == 0);
+UWB_STATIC_ASSERT(offsetof(uwb_radio_status_t, ranged) == 4);
+UWB_STATIC_ASSERT(offsetof(uwb_radio_status_t, no_answer) == 8);
+UWB_STATIC_ASSERT(offsetof(uwb_radio_status_t, late) == 12);
+UWB_STATIC_ASSERT(offsetof(uwb_radio_status_t, time_out) == 16);
+UWB_STATIC_ASSERT(offsetof(uwb_radio_status_t, damaged) == 20);
+UWB_STATIC_ASSERT(offsetof(uwb_radio_status_t, absurd) == 24);
+UWB_STATIC_ASSERT(offsetof(uwb_radio_status_t, broken) == 28);
+UWB_STATIC_ASSERT(offsetof(uwb_radio_status_t, refused) == 32);
+UWB_STATIC_ASSERT(offsetof(uwb_radio_status_t, restarts) == 36);
+UWB_STATIC_ASSERT(offsetof(uwb_radio_status_t, temperature) == 40);
+UWB_STATIC_ASSERT(offsetof(uwb_radio_status_t, voltage) == 44);
+UWB_STATIC_ASSERT(offsetof(uwb_radio_status_t, state) == 48);
+UWB_STATIC_ASSERT(offsetof(uwb_radio_status_t, anchor_count) == 49);
+
+typedef struct {
+    uint32_t request_sequence; /* sequence of the SET_OFFSETS answered */
+    uint16_t slots; /* offsets that the board can keep beside the default */
+    uint8_t accepted; /* 0 = they were too many: those before stay in force */
+    uint8_t reserved[1];
+} uwb_offsets_t;
+UWB_STATIC_ASSERT(sizeof(uwb_offsets_t) == 8);
+UWB_STATIC_ASSERT(offsetof(uwb_offsets_t, request_sequence) == 0);
+UWB_STATIC_ASSERT(offsetof(uwb_offsets_t, slots) == 4);
+UWB_STATIC_ASSERT(offsetof(uwb_offsets_t, accepted) == 6);
+
+typedef struct {
     uint8_t mode; /* Mode wanted */
     uint8_t reserved[7];
 } uwb_set_mode_t;
 UWB_STATIC_ASSERT(sizeof(uwb_set_mode_t) == 8);
 UWB_STATIC_ASSERT(offsetof(uwb_set_mode_t, mode) == 0);
+
+typedef struct {
+    uint64_t address; /* of the radio; 0 in SET_RADIO = the chip's own */
+    uint32_t antenna_delay; /* ticks, of transmitter and receiver together; 0 = as in the chip's memory */
+    uint32_t tx_power; /* register TX_POWER; 0 = as in the chip's memory, else the manual's */
+    uint32_t reply_us; /* from the reception of ANSWER to FINAL; 0 in SET_RADIO = the firmware's usual */
+    uint32_t patience_us; /* how long a tag waits for an anchor's frames; 0 as above */
+    uint32_t interval_us; /* between the beginnings of two exchanges, at least */
+    uint16_t pan; /* network; radios of others are not heard */
+    uint16_t rate; /* kbit/s: 110, 850, 6800 */
+    uint16_t preamble; /* symbols: 64 to 4096 */
+    uint16_t window; /* complex samples of a measurement; 0 = none, 1016 and more = all */
+    uint8_t channel; /* 1 to 5, 7 */
+    uint8_t prf; /* MHz: 16, 64 */
+    uint8_t preamble_code; /* 0 = the first for channel and PRF */
+    uint8_t decawave_sfd; /* 0 = the standard's start-of-frame delimiter, 1 = Decawave's */
+    uint8_t role; /* Role */
+    uint8_t report; /* 1 = an anchor gives its ranges to its host too */
+    uint8_t bias_correction; /* 1 = ranges are corrected for the power received (APS011) */
+    uint8_t anchor_count; /* anchors that a tag is to poll; 0 = those that it finds */
+    uint8_t reserved_too[4];
+    /* then anchor_count addresses, u64 */
+} uwb_set_radio_t;
+UWB_STATIC_ASSERT(sizeof(uwb_set_radio_t) == 48);
+UWB_STATIC_ASSERT(offsetof(uwb_set_radio_t, address) == 0);
+UWB_STATIC_ASSERT(offsetof(uwb_set_radio_t, antenna_delay) == 8);
+UWB_STATIC_ASSERT(offsetof(uwb_set_radio_t, tx_power) == 12);
+UWB_STATIC_ASSERT(offsetof(uwb_set_radio_t, reply_us) == 16);
+UWB_STATIC_ASSERT(offsetof(uwb_set_radio_t, patience_us) == 20);
+UWB_STATIC_ASSERT(offsetof(uwb_set_radio_t, interval_us) == 24);
+UWB_STATIC_ASSERT(offsetof(uwb_set_radio_t, pan) == 28);
+UWB_STATIC_ASSERT(offsetof(uwb_set_radio_t, rate) == 30);
+UWB_STATIC_ASSERT(offsetof(uwb_set_radio_t, preamble) == 32);
+UWB_STATIC_ASSERT(offsetof(uwb_set_radio_t, window) == 34);
+UWB_STATIC_ASSERT(offsetof(uwb_set_radio_t, channel) == 36);
+UWB_STATIC_ASSERT(offsetof(uwb_set_radio_t, prf) == 37);
+UWB_STATIC_ASSERT(offsetof(uwb_set_radio_t, preamble_code) == 38);
+UWB_STATIC_ASSERT(offsetof(uwb_set_radio_t, decawave_sfd) == 39);
+UWB_STATIC_ASSERT(offsetof(uwb_set_radio_t, role) == 40);
+UWB_STATIC_ASSERT(offsetof(uwb_set_radio_t, report) == 41);
+UWB_STATIC_ASSERT(offsetof(uwb_set_radio_t, bias_correction) == 42);
+UWB_STATIC_ASSERT(offsetof(uwb_set_radio_t, anchor_count) == 43);
+
+typedef struct {
+    float default_offset; /* m, of pairs that nothing in the tail names, -10 to 10 */
+    uint16_t count; /* offsets in the tail */
+    uint8_t reserved[2];
+    /* then count times OFFSET */
+} uwb_set_offsets_t;
+UWB_STATIC_ASSERT(sizeof(uwb_set_offsets_t) == 8);
+UWB_STATIC_ASSERT(offsetof(uwb_set_offsets_t, default_offset) == 0);
+UWB_STATIC_ASSERT(offsetof(uwb_set_offsets_t, count) == 4);
 
 #endif

@@ -4,23 +4,12 @@
  *
  * Without a fuzzer it makes its own inputs: fuzz_correct <inputs> <seed>. */
 #include <math.h>
-#include <stdio.h>
-#include <stdlib.h>
-#include <string.h>
 
+#include "fuzz.h"
 #include "uwb_model.h"
 
 /* Fields, then samples. Field values come from a few bits where arbitrary ones would seldom get past a check. */
 enum { FIELD_BYTES = 28 };
-
-int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size);
-
-static void check(int promise, const char *what) {
-    if (!promise) {
-        fprintf(stderr, "broken: %s\n", what);
-        abort();
-    }
-}
 
 static float float_at(const uint8_t *data) {
     float value;
@@ -57,17 +46,19 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
         (choice & 32) ? float_at(data + 20) : -85.0f,
     };
     const float range_m = (choice & 64) ? float_at(data + 24) : 3.0f;
+    const float offset_m = (choice & 128) ? 0.25f : 0.0f;
+    const float less_m = offset_m != 0.0f ? range_m - offset_m : range_m;
     uwb_corrected corrected;
-    const uwb_status status = uwb_correct(&uwb_model_data, range_m, &cir, arena, arena_bytes, &corrected);
+    const uwb_status status = uwb_correct(&uwb_model_data, range_m, offset_m, &cir, arena, arena_bytes, &corrected);
     if (status == UWB_OK) {
         check(corrected.status == UWB_RANGE_OK, "status of a corrected range");
-        check(corrected.correction_m >= uwb_model_data.correction_low_m, "lower limit");
-        check(corrected.correction_m <= uwb_model_data.correction_high_m, "upper limit");
-        check(isfinite(corrected.range_m) && range_m >= 0.0f, "range");
+        check(corrected.correction_m >= offset_m + uwb_model_data.correction_low_m, "lower limit");
+        check(corrected.correction_m <= offset_m + uwb_model_data.correction_high_m, "upper limit");
+        check(isfinite(corrected.range_m) && less_m >= 0.0f, "range");
     } else {
         check(corrected.status != UWB_RANGE_OK, "status of a range passed through");
-        check(memcmp(&corrected.range_m, &range_m, sizeof range_m) == 0, "a range passes through unchanged");
-        check(corrected.correction_m == 0.0f, "no correction");
+        check(memcmp(&corrected.range_m, &less_m, sizeof less_m) == 0, "a range passes through, less the offset");
+        check(corrected.correction_m == offset_m, "no correction but the offset");
     }
     check(corrected.variance_m2 > 0.0f, "variance");
     free(arena);
@@ -82,18 +73,10 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
 #ifndef UWB_LIBFUZZER
 int main(int argc, char **argv) {
     static uint8_t data[FIELD_BYTES + 600];
-    if (argc != 3) {
-        return 2;
-    }
-    uint64_t state = strtoull(argv[2], NULL, 10) * 2u + 1u;
     unsigned long seen[32] = {0};
-    const unsigned long inputs = strtoul(argv[1], NULL, 10);
+    const unsigned long inputs = fuzz_inputs(argc, argv);
     for (unsigned long i = 0; i < inputs; i++) {
-        for (size_t byte = 0; byte < sizeof data; byte++) {
-            /* Knuth's MMIX generator; its high bits are the random ones. */
-            state = state * 6364136223846793005u + 1442695040888963407u;
-            data[byte] = (uint8_t)(state >> 56);
-        }
+        fuzz_fill(data, sizeof data);
         /* Every second input has few oddities, and small samples: most of those reach the network. */
         if (i % 2 == 0) {
             data[0] &= (uint8_t)(data[1] & data[3]);
@@ -101,7 +84,7 @@ int main(int argc, char **argv) {
                 data[byte] = 0;
             }
         }
-        const size_t bytes = FIELD_BYTES + (size_t)(state >> 40) % (sizeof data - FIELD_BYTES + 1);
+        const size_t bytes = FIELD_BYTES + (size_t)(fuzz_state >> 40) % (sizeof data - FIELD_BYTES + 1);
         seen[LLVMFuzzerTestOneInput(data, bytes) & 31]++;
     }
     for (int status = 0; status < 32; status++) {

@@ -5,21 +5,9 @@
  *
  * Without a fuzzer it makes its own inputs: fuzz_link <inputs> <seed>. Half of the stretches are
  * made into intact frames, so that inputs get past the CRC. */
-#include <stdio.h>
-#include <stdlib.h>
-#include <string.h>
-
+#include "fuzz.h"
 #include "uwb_board.h"
 #include "uwb_model.h"
-
-int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size);
-
-static void check(int promise, const char *what) {
-    if (!promise) {
-        fprintf(stderr, "broken: %s\n", what);
-        abort();
-    }
-}
 
 /* Read at most `limit` bytes of what the board sends. */
 static void drain(uwb_board *board, uwb_decoder *host, size_t limit) {
@@ -48,7 +36,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
     void *const arena = malloc(arena_bytes);
     check(board != NULL && host != NULL && queue != NULL && wire != NULL && arena != NULL, "memory");
     const uwb_board_config config = {1, 2, {0, 1, 0}, UWB_MODE_BOTH, "fuzzed",   &uwb_model_data,
-                                     arena, arena_bytes, queue, 9000, NULL};
+                                     arena, arena_bytes, queue, 9000, NULL, NULL, NULL};
     uwb_board_start(board, &config, 0);
     uint64_t now_us = 0;
     while (size > 4) {
@@ -93,17 +81,9 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
 #ifndef UWB_LIBFUZZER
 int main(int argc, char **argv) {
     static uint8_t data[20000];
-    if (argc != 3) {
-        return 2;
-    }
-    uint64_t state = strtoull(argv[2], NULL, 10) * 2u + 1u;
-    const unsigned long inputs = strtoul(argv[1], NULL, 10);
+    const unsigned long inputs = fuzz_inputs(argc, argv);
     for (unsigned long i = 0; i < inputs; i++) {
-        for (size_t byte = 0; byte < sizeof data; byte++) {
-            /* Knuth's MMIX generator; its high bits are the random ones. */
-            state = state * 6364136223846793005u + 1442695040888963407u;
-            data[byte] = (uint8_t)(state >> 56);
-        }
+        fuzz_fill(data, sizeof data);
         (void)LLVMFuzzerTestOneInput(data, sizeof data);
     }
     return 0;

@@ -27,7 +27,7 @@ host_board *host_board_new(int mode, int with_model, size_t queue_bytes) {
     if (host == NULL || queue_bytes > sizeof host->queue) {
         abort();
     }
-    uwb_board_config config = {0xE0, 1, {0, 1, 0}, (uint8_t)mode, "emulated", NULL, NULL, 0, NULL, 0, NULL};
+    uwb_board_config config = {0xE0, 1, {0, 1, 0}, (uint8_t)mode, "emulated", NULL, NULL, 0, NULL, 0, NULL, NULL, NULL};
     config.model = with_model ? &uwb_model_data : NULL;
     config.arena = host->arena;
     config.arena_bytes = sizeof host->arena;

@@ -23,6 +23,7 @@ typedef struct {
     float rx_power_dbm;
     float first_path_power_dbm;
     float range_m;
+    float offset_m;
     int16_t samples[2 * MAX_SAMPLES];
 } cir_record;
 
@@ -135,7 +136,8 @@ static int run_cirs(int32_t input, int32_t output, uint32_t count, report *seen)
         uwb_corrected corrected;
         const uint32_t start = SYST_CVR;
         const uint32_t status =
-            (uint32_t)uwb_correct(&uwb_model_data, record.range_m, &cir, arena, arena_bytes, &corrected);
+            (uint32_t)uwb_correct(&uwb_model_data, record.range_m, record.offset_m, &cir, arena, arena_bytes,
+                                  &corrected);
         const uint32_t ticks = ticks_since(start);
         seen->ticks_correct = ticks > seen->ticks_correct ? ticks : seen->ticks_correct;
         if (!semihosting_write(output, &status, sizeof status) ||

@@ -7,7 +7,7 @@
 #include <stdint.h>
 #include <string.h>
 
-enum { LOW = 0, HIGH = 1, OUTPUT = 1, LED_BUILTIN = 13, LED_PWR = 25 };
+enum { LOW = 0, HIGH = 1, INPUT = 0, OUTPUT = 1, INPUT_PULLUP = 2, LED_BUILTIN = 13, LED_PWR = 25 };
 
 /* A port whose two ends are memory. */
 struct StubPort {
@@ -46,6 +46,7 @@ extern StubRandom *NRF_RNG;
 
 void pinMode(int pin, int mode);
 void digitalWrite(int pin, int level);
+int digitalRead(int pin);
 uint32_t micros();
 void setup();
 void loop();

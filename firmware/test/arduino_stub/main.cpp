@@ -25,6 +25,9 @@ size_t StubPort::write(const uint8_t *bytes, size_t count) {
 
 void pinMode(int, int) {}
 void digitalWrite(int, int) {}
+int digitalRead(int) {
+    return LOW;
+}
 uint32_t micros() {
     return now_us += 10;
 }

@@ -1,0 +1,171 @@
+/* Arduino Nano 33 BLE Sense with a DWM1000 module on its SPI: ranges, and corrects ranges if there is a model.
+ *
+ * 3.3 V only. D13 SPICLK, D12 SPIMISO, D11 SPIMOSI, D10 SPICSn, D2 IRQ, D9 RSTn, GND, 3V3 with 10 uF at the module: it
+ * takes 150 mA at times. Serial (USB) is the host, wire protocol of docs/protocol.md.
+ *
+ * It starts as an anchor, so that it can stand alone on a power bank; with D3 at GND at the start, or when its host says
+ * so, it is a tag. For corrections on the board put uwb_model.h beside this file: uwb-mitigation export-c -o UwbRanger.
+ *
+ * SPI is done from loop() only, never from an interrupt, and in whole buffers: a byte at a time costs 20 us each. */
+#include <SPI.h>
+#include <uwb_ranger.h>
+
+#if defined(__has_include)
+#if __has_include("uwb_model.h")
+#include "uwb_model.h"
+#define HAS_MODEL 1
+static uint32_t arena[12288 / 4];
+#endif
+#endif
+
+static const int RADIO_CS = 10, RADIO_IRQ = 2, RADIO_RESET = 9, TAG_SWITCH = 3;
+static const size_t PACKET = 64; /* of USB: one is written whole, when there is room for it, or not at all */
+static const size_t WHOLE = 1016;
+static const uint32_t WATCHDOG_S = 4;
+static const SPISettings SLOW(2000000, MSBFIRST, SPI_MODE0), FAST(8000000, MSBFIRST, SPI_MODE0);
+
+static uwb_ranger ranger;
+static uint8_t queue[16384];
+static uint64_t measurement[UWB_TWR_MEASUREMENT_BYTES(WHOLE) / 8 + 1];
+static uint8_t exchanged[8 + 4 * WHOLE];
+static bool spi_fast;
+
+/* micros() wraps after 71 minutes; loop() asks far more often. */
+static uint64_t uptime_us(void *) {
+    static uint64_t wraps;
+    static uint32_t last;
+    const uint32_t now = micros();
+    if (now < last) {
+        wraps += (uint64_t)1 << 32;
+    }
+    last = now;
+    return wraps + now;
+}
+
+static uint32_t clock_us() {
+    return micros();
+}
+
+static void send_waiting() {
+    const uint8_t *waiting;
+    if (!(bool)Serial) {
+        return;
+    }
+    size_t length = uwb_queue_peek(&ranger.board.queue, uptime_us(nullptr), &waiting);
+    /* One byte less than a packet: a transfer of full packets would have to end with an empty one. */
+    length = length < PACKET - 1 ? length : PACKET - 1;
+    if (length != 0 && Serial.availableForWrite() >= (int)length) {
+        uwb_queue_drop(&ranger.board.queue, Serial.write(waiting, length));
+    }
+}
+
+/* One chip-select period. */
+static int transfer(void *, const uint8_t *header, size_t header_bytes, const uint8_t *out, uint8_t *in, size_t bytes) {
+    const size_t whole = header_bytes + bytes;
+    if (whole > sizeof exchanged) {
+        return -1;
+    }
+    memset(exchanged, 0, whole);
+    memcpy(exchanged, header, header_bytes);
+    if (out != nullptr) {
+        memcpy(exchanged + header_bytes, out, bytes);
+    }
+    SPI.beginTransaction(spi_fast ? FAST : SLOW);
+    digitalWrite(RADIO_CS, LOW);
+    SPI.transfer(exchanged, whole);
+    digitalWrite(RADIO_CS, HIGH);
+    SPI.endTransaction();
+    if (out == nullptr) {
+        memcpy(in, exchanged + header_bytes, bytes);
+    }
+    return 0;
+}
+
+static void speed(void *, int fast) {
+    spi_fast = fast != 0;
+}
+
+static void rest(void *, uint32_t us) {
+    const uint64_t until_us = uptime_us(nullptr) + us;
+    do {
+        send_waiting();
+    } while (uptime_us(nullptr) < until_us);
+}
+
+/* The chip drives the line too: it is pulled low and let go, never driven high. */
+static void reset(void *) {
+    digitalWrite(RADIO_RESET, LOW);
+    pinMode(RADIO_RESET, OUTPUT);
+    rest(nullptr, 1000);
+    pinMode(RADIO_RESET, INPUT);
+}
+
+static void wait(void *, uint64_t until_us) {
+    while (digitalRead(RADIO_IRQ) == LOW && uptime_us(nullptr) < until_us) {
+        send_waiting();
+    }
+}
+
+static uint64_t random_number() {
+    uint64_t value = 0;
+    NRF_RNG->TASKS_START = 1;
+    for (int i = 0; i < 8; i++) {
+        NRF_RNG->EVENTS_VALRDY = 0;
+        for (int patience = 0; patience < 100000 && NRF_RNG->EVENTS_VALRDY == 0; patience++) {
+        }
+        value = value << 8 | (NRF_RNG->VALUE & 0xFFu);
+    }
+    NRF_RNG->TASKS_STOP = 1;
+    return value;
+}
+
+void setup() {
+    pinMode(LED_BUILTIN, OUTPUT);
+    pinMode(LED_PWR, OUTPUT);
+    pinMode(TAG_SWITCH, INPUT_PULLUP);
+    pinMode(RADIO_IRQ, INPUT);
+    pinMode(RADIO_RESET, INPUT);
+    digitalWrite(RADIO_CS, HIGH);
+    pinMode(RADIO_CS, OUTPUT);
+    SPI.begin();
+    Serial.begin(921600);
+
+    const uint64_t random = random_number();
+    uwb_board_config board = {};
+    board.board_id = (uint64_t)NRF_FICR->DEVICEID[1] << 32 | NRF_FICR->DEVICEID[0];
+    board.boot_id = (uint32_t)random;
+    board.firmware_version[1] = 2;
+    board.mode = UWB_MODE_HOST;
+    memcpy(board.firmware_name, "nano33ble-dw1000", 16);
+#ifdef HAS_MODEL
+    board.model = &uwb_model_data;
+    board.arena = arena;
+    board.arena_bytes = sizeof arena;
+#endif
+    board.queue = queue;
+    board.queue_bytes = sizeof queue;
+    board.clock_us = clock_us;
+    const uwb_dw1000_io io = {nullptr, transfer, speed, reset, uptime_us, wait, rest};
+    uwb_twr_config config = uwb_twr_usual;
+    config.role = digitalRead(TAG_SWITCH) == LOW ? UWB_ROLE_TAG : UWB_ROLE_ANCHOR;
+    uwb_ranger_start(&ranger, &board, &io, &config, random, (uint8_t *)measurement, sizeof measurement);
+    NRF_WDT->CONFIG = 1; /* also while asleep; once started it cannot be stopped */
+    NRF_WDT->CRV = 32768u * WATCHDOG_S - 1u;
+    NRF_WDT->RREN = 1;
+    NRF_WDT->TASKS_START = 1;
+}
+
+/* Power LED: the host has the port open. Orange LED: changes with each range. */
+void loop() {
+    uint8_t bytes[PACKET];
+    size_t count = 0;
+    NRF_WDT->RR[0] = 0x6E524635u;
+    while (count < sizeof bytes && Serial.available() > 0) {
+        bytes[count++] = (uint8_t)Serial.read();
+    }
+    uwb_board_receive(&ranger.board, bytes, count, uptime_us(nullptr));
+    (void)uwb_ranger_turn(&ranger);
+    send_waiting();
+    digitalWrite(LED_PWR, (bool)Serial ? HIGH : LOW);
+    digitalWrite(LED_BUILTIN, (ranger.twr.counts.ranged & 1u) ? HIGH : LOW);
+}

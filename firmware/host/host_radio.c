@@ -1,0 +1,92 @@
+/* A radio at a computer, behind functions that are easy to call from another language. */
+#include <stdlib.h>
+
+#include "uwb_twr.h"
+
+enum { WHOLE = 1016 };
+
+typedef struct {
+    uwb_twr twr;
+    uint64_t measurement[UWB_TWR_MEASUREMENT_BYTES(WHOLE) / sizeof(uint64_t) + 1];
+} host_radio;
+
+host_radio *host_radio_new(const uwb_dw1000_io *io, const uwb_twr_config *config, uint64_t random);
+void host_radio_free(host_radio *radio);
+void host_radio_fill_times(uwb_twr_config *config, uint32_t reply_us, uint32_t patience_us);
+const char *host_radio_configure(host_radio *radio, const uwb_twr_config *config);
+int host_radio_turn(host_radio *radio, uint64_t until_us);
+const uint8_t *host_radio_measurement(const host_radio *radio, size_t *bytes, uint64_t *measured_us);
+int host_radio_fault(const host_radio *radio);
+uint64_t host_radio_address(const host_radio *radio);
+const uwb_dw1000_settings *host_radio_settings(const host_radio *radio);
+const uwb_twr_counts *host_radio_counts(const host_radio *radio);
+const uwb_twr_anchor *host_radio_anchors(const host_radio *radio, size_t *count);
+int host_radio_sensors(host_radio *radio, float *temperature, float *voltage);
+
+/* NULL: no memory. */
+host_radio *host_radio_new(const uwb_dw1000_io *io, const uwb_twr_config *config, uint64_t random) {
+    host_radio *const radio = calloc(1, sizeof *radio);
+    if (radio != NULL) {
+        uwb_twr_start(&radio->twr, io, config, random, (uint8_t *)radio->measurement, sizeof radio->measurement);
+    }
+    return radio;
+}
+
+void host_radio_free(host_radio *radio) {
+    free(radio);
+}
+
+void host_radio_fill_times(uwb_twr_config *config, uint32_t reply_us, uint32_t patience_us) {
+    uwb_twr_fill_times(config, reply_us, patience_us);
+}
+
+/* NULL, or why the configuration is refused. */
+const char *host_radio_configure(host_radio *radio, const uwb_twr_config *config) {
+    const char *const refusal = uwb_twr_refusal(&radio->twr, config);
+    (void)uwb_twr_configure(&radio->twr, config);
+    return refusal;
+}
+
+/* A uwb_twr_event. */
+int host_radio_turn(host_radio *radio, uint64_t until_us) {
+    return (int)uwb_twr_turn(&radio->twr, until_us);
+}
+
+/* Of the last turn: a payload of RANGE_CIR. */
+const uint8_t *host_radio_measurement(const host_radio *radio, size_t *bytes, uint64_t *measured_us) {
+    *bytes = uwb_twr_measured_bytes(&radio->twr);
+    *measured_us = radio->twr.measured_us;
+    return radio->twr.measurement;
+}
+
+/* Why the chip does not work, a uwb_dw1000_status; 0 while it does. */
+int host_radio_fault(const host_radio *radio) {
+    return radio->twr.running ? 0 : (int)radio->twr.fault;
+}
+
+/* 0 until the chip has started. */
+uint64_t host_radio_address(const host_radio *radio) {
+    return radio->twr.address;
+}
+
+const uwb_dw1000_settings *host_radio_settings(const host_radio *radio) {
+    return radio->twr.running ? &radio->twr.chip.settings : &radio->twr.config.radio;
+}
+
+const uwb_twr_counts *host_radio_counts(const host_radio *radio) {
+    return &radio->twr.counts;
+}
+
+const uwb_twr_anchor *host_radio_anchors(const host_radio *radio, size_t *count) {
+    *count = radio->twr.known;
+    return radio->twr.anchors;
+}
+
+/* Between two turns; a uwb_dw1000_status. */
+int host_radio_sensors(host_radio *radio, float *temperature, float *voltage) {
+    if (!radio->twr.running) {
+        return UWB_DW1000_ABSENT;
+    }
+    const uwb_dw1000_status idle = uwb_dw1000_idle(&radio->twr.chip);
+    return (int)(idle != UWB_DW1000_OK ? idle : uwb_dw1000_read_sensors(&radio->twr.chip, temperature, voltage));
+}

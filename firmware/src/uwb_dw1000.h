@@ -1,0 +1,183 @@
+/* Driver of the Decawave DW1000, for microcontrollers and for computers: what is wired to the chip is behind callbacks.
+ *
+ * No allocation and no globals; every wait is bounded, and every function says what went wrong. Register names are
+ * those of the DW1000 User Manual. One frame is received at a time (single buffer, no automatic re-enabling): the
+ * accumulator belongs to the frame that was received last until the receiver is enabled again. */
+#ifndef UWB_DW1000_H
+#define UWB_DW1000_H
+
+#include <stddef.h>
+#include <stdint.h>
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+#define UWB_DW1000_TICK_MASK (((uint64_t)1 << 40) - 1) /* stamps count 1 / (128 x 499.2 MHz), modulo 2^40 */
+#define UWB_DW1000_TICKS_PER_US 63897.6
+#define UWB_DW1000_ANTENNA_DELAY 32872u /* of transmitter and receiver together: Decawave's 16436 for each */
+#define UWB_DW1000_MAX_FRAME_BYTES 127u /* with the two octets of the frame check sequence */
+
+typedef enum {
+    UWB_DW1000_OK = 0,
+    UWB_DW1000_BAD_ARGUMENT, /* a setting that the chip has not, or a length beyond its memory */
+    UWB_DW1000_BUS,          /* the transfer callback failed */
+    UWB_DW1000_ABSENT,       /* DEV_ID is not a DW1000's: wiring, supply, or SPI too fast */
+    UWB_DW1000_NO_CLOCK,     /* the clock PLL does not lock */
+    UWB_DW1000_RESTARTED,    /* the chip has lost its settings: it was reset, or its supply failed */
+    UWB_DW1000_TIMEOUT,      /* nothing was received in time */
+    UWB_DW1000_DAMAGED,      /* something was received, and no frame: header, check sequence, decoder, leading edge */
+    UWB_DW1000_LATE,         /* a delayed transmission would have begun in the past */
+    UWB_DW1000_UNSENT        /* a transmission did not end in time */
+} uwb_dw1000_status;
+
+/* What joins the driver and a chip. */
+typedef struct {
+    void *context;
+    /* One chip-select period: `header`, then `bytes` octets out of `out`, or into `in` where `out` is NULL. Returns 0,
+     * or anything else if the bus is gone. */
+    int (*transfer)(void *context, const uint8_t *header, size_t header_bytes, const uint8_t *out, uint8_t *in,
+                    size_t bytes);
+    void (*speed)(void *context, int fast); /* SPI: at most 3 MHz, or if `fast` at most 20 MHz */
+    void (*reset)(void *context); /* pull RSTn low for a while, then let it float: never high. NULL: not wired */
+    uint64_t (*now_us)(void *context);
+    /* Return when the IRQ line is high, at `until_us`, or earlier: the driver then looks at SYS_STATUS. Other work may
+     * be done meanwhile. With no IRQ wired, return at once, or after a pause. */
+    void (*wait)(void *context, uint64_t until_us);
+    void (*sleep)(void *context, uint32_t us); /* at least so long */
+} uwb_dw1000_io;
+
+/* What both ends must agree in, but for the preamble's length and the power. */
+typedef struct {
+    uint8_t channel;         /* 1, 2, 3, 4, 5, 7 */
+    uint8_t prf_mhz;         /* 16, 64 */
+    uint8_t preamble_code;   /* 0 = the first that the standard has for channel and PRF */
+    uint8_t decawave_sfd;    /* 0 = the standard's */
+    uint16_t rate_kbps;      /* 110, 850, 6800 */
+    uint16_t preamble;       /* symbols: 64, 128, 256, 512, 1024, 1536, 2048, 4096 */
+    uint32_t tx_power;       /* TX_POWER; 0 = as calibrated in the OTP memory, else the manual's */
+    uint32_t antenna_delay;  /* ticks of transmitter and receiver together; 0 = as in the OTP memory, else nominal */
+} uwb_dw1000_settings;
+
+/* Channel 5, 64 MHz, 6.8 Mbit/s, preamble of 128. */
+extern const uwb_dw1000_settings uwb_dw1000_usual;
+
+typedef struct {
+    uwb_dw1000_io io;
+    uwb_dw1000_settings settings; /* in force; nothing in it is 0 for unknown any more */
+    uint64_t eui;                 /* of the chip: from the OTP memory, or lot and part if that holds none */
+    uint32_t otp_antenna_delay;   /* OTP memory: 31:16 at 64 MHz, 15:0 at 16 MHz, in all */
+    uint32_t otp_tx_power[12];
+    uint8_t otp_voltage;
+    uint8_t otp_temperature;
+    uint8_t listening;     /* the receiver may be on */
+    uint8_t clock_forced;  /* the transmitter's, for a delayed transmission */
+    uint16_t tx_antenna_delay;
+    uint16_t wait_units; /* RX_FWTO as last written; 0 = never since the start */
+    uint32_t sys_cfg;
+    uint32_t tx_fctrl;   /* but for the length */
+    uint8_t tx_bytes;    /* the length that it has; 0 = none yet */
+} uwb_dw1000;
+
+/* A frame that was received, without its check sequence. */
+typedef struct {
+    uint64_t stamp;       /* RX_STAMP */
+    uint64_t received_us; /* of io.now_us, when it was noticed */
+    uint16_t first_path_index;     /* accumulator index times 64 */
+    uint16_t first_path_amplitude; /* FP_AMPL1 */
+    uint16_t preamble_count;       /* RXPACC */
+    uint8_t bytes;
+    uint8_t octets[UWB_DW1000_MAX_FRAME_BYTES];
+} uwb_dw1000_frame;
+
+/* What the chip knows of the reception beside the frame. */
+typedef struct {
+    uint16_t noise;           /* STD_NOISE */
+    uint16_t first_path_amplitude[3]; /* FP_AMPL1 to FP_AMPL3 */
+    uint16_t preamble_count;          /* RXPACC without the part of the SFD */
+    uint16_t noise_threshold; /* LDE_THRESH */
+    uint16_t power;           /* CIR_PWR */
+    float rx_power_dbm;         /* as in DecaRanging's logs: not corrected for the saturation above -88 dBm */
+    float first_path_power_dbm; /* NaN where an amplitude that it needs is 0 */
+    float clock_offset_ppm;     /* by how much the sender's clock is faster than ours */
+} uwb_dw1000_quality;
+
+/* Reset the chip, set its clocks up, load the leading-edge detector, read the OTP memory, and configure. NULL settings:
+ * the usual ones. */
+uwb_dw1000_status uwb_dw1000_start(uwb_dw1000 *chip, const uwb_dw1000_io *io, const uwb_dw1000_settings *settings);
+
+/* Other settings for a chip that was started. BAD_ARGUMENT leaves it as it was. */
+uwb_dw1000_status uwb_dw1000_configure(uwb_dw1000 *chip, const uwb_dw1000_settings *settings);
+
+/* Whether the settings are ones that a chip has. */
+int uwb_dw1000_valid(const uwb_dw1000_settings *settings);
+
+/* RESTARTED if the chip has lost its settings since. */
+uwb_dw1000_status uwb_dw1000_check(uwb_dw1000 *chip);
+
+/* Duration on the air of a frame of `bytes` octets without check sequence: to the end, and of preamble and SFD alone. */
+uint32_t uwb_dw1000_air_us(const uwb_dw1000_settings *settings, size_t bytes);
+uint32_t uwb_dw1000_lead_us(const uwb_dw1000_settings *settings);
+
+#define UWB_DW1000_NO_LIMIT UINT32_MAX /* of the time that the chip listens: until it is told otherwise */
+
+/* Send now; then, if `answer_us` is not 0, listen for so long: after uwb_dw1000_sent, without which a frame received
+ * before would be taken for the answer. */
+uwb_dw1000_status uwb_dw1000_send(uwb_dw1000 *chip, const uint8_t *octets, size_t bytes, uint32_t answer_us);
+
+/* Get ready for uwb_dw1000_send_at, which otherwise does it itself. */
+uwb_dw1000_status uwb_dw1000_force_clock(uwb_dw1000 *chip);
+
+/* TX_STAMP of a frame that shall leave at about `at`, to be written into the frame. */
+uint64_t uwb_dw1000_stamp_at(const uwb_dw1000 *chip, uint64_t at);
+
+/* Send so that TX_STAMP becomes `stamp`, one that uwb_dw1000_stamp_at gave, then listen as uwb_dw1000_send. */
+uwb_dw1000_status uwb_dw1000_send_at(uwb_dw1000 *chip, const uint8_t *octets, size_t bytes, uint64_t stamp,
+                                     uint32_t answer_us);
+
+/* Leave the clock to the chip again, after uwb_dw1000_sent. */
+uwb_dw1000_status uwb_dw1000_release_clock(uwb_dw1000 *chip);
+
+/* Wait until what was sent has left; `stamp`, which may be NULL, becomes its TX_STAMP. The receiver goes on meanwhile. */
+uwb_dw1000_status uwb_dw1000_sent(uwb_dw1000 *chip, uint64_t until_us, uint64_t *stamp);
+
+/* Listen for `for_us`. */
+uwb_dw1000_status uwb_dw1000_listen(uwb_dw1000 *chip, uint32_t for_us);
+
+/* Wait for a frame until `until_us`, and read it. On anything but OK the receiver is off, or as on DAMAGED and TIMEOUT
+ * ready to be enabled anew. */
+uwb_dw1000_status uwb_dw1000_receive(uwb_dw1000 *chip, uwb_dw1000_frame *frame, uint64_t until_us);
+
+/* As TIMEOUT if nothing has been received by `until_us`, but leaves the receiver on. */
+uwb_dw1000_status uwb_dw1000_receive_or_stay(uwb_dw1000 *chip, uwb_dw1000_frame *frame, uint64_t until_us);
+
+/* Transmitter and receiver off. */
+uwb_dw1000_status uwb_dw1000_idle(uwb_dw1000 *chip);
+
+/* Of the frame received last, before anything enables the receiver again. */
+uwb_dw1000_status uwb_dw1000_read_quality(uwb_dw1000 *chip, const uwb_dw1000_frame *frame,
+                                          uwb_dw1000_quality *quality);
+
+/* The strongest sample of the same frame, and its magnitude (LDE_PPINDX, LDE_PPAMPL). */
+uwb_dw1000_status uwb_dw1000_read_peak(uwb_dw1000 *chip, uint16_t *index, uint16_t *amplitude);
+
+/* Samples of the accumulator at 16 and 64 MHz. */
+#define UWB_DW1000_SAMPLES(prf_mhz) ((prf_mhz) == 16 ? 992u : 1016u)
+
+/* Read complex samples of the same frame: 1 + 4 * count octets, of which the first means nothing, and then real and
+ * imaginary parts, int16, follow. BAD_ARGUMENT beyond the accumulator. */
+uwb_dw1000_status uwb_dw1000_read_cir(uwb_dw1000 *chip, size_t first, size_t count, uint8_t *octets);
+
+/* Degrees Celsius and volts. */
+uwb_dw1000_status uwb_dw1000_read_sensors(uwb_dw1000 *chip, float *temperature, float *voltage);
+
+/* What a true received power is where uwb_dw1000_quality says `rx_power_dbm` (fit of figure 22 of the manual). */
+float uwb_dw1000_true_power_dbm(float rx_power_dbm, uint8_t prf_mhz);
+
+/* By how many metres a range is too long at a true power (application note APS011). */
+float uwb_dw1000_range_bias_m(float true_power_dbm, uint8_t channel, uint8_t prf_mhz);
+
+#ifdef __cplusplus
+}
+#endif
+#endif

@@ -1,0 +1,182 @@
+#include "uwb_dw1000_registers.h"
+
+/* Values of the User Manual, sections 7.2.x; columns of pairs are 16 and 64 MHz. */
+static const struct {
+    uint32_t pll_config;
+    uint32_t tx_control;
+    uint32_t power[2];
+    uint8_t number, pll_tune, pulse_delay, rx_control;
+    uint8_t codes[2], codes_per_prf;
+} channels[] = {
+    {0x09000407, 0x00005C40, {0x75757575, 0x67676767}, 1, 0x1E, 0xC9, 0xD8, {1, 9}, 2},
+    {0x08400508, 0x00045CA0, {0x75757575, 0x67676767}, 2, 0x26, 0xC2, 0xD8, {3, 9}, 2},
+    {0x08401009, 0x00086CC0, {0x6F6F6F6F, 0x8B8B8B8B}, 3, 0x56, 0xC5, 0xD8, {5, 9}, 2},
+    {0x08400508, 0x00045C80, {0x5F5F5F5F, 0x9A9A9A9A}, 4, 0x26, 0x95, 0xBC, {7, 17}, 2},
+    {0x0800041D, 0x001E3FE0, {0x48484848, 0x85858585}, 5, 0xBE, 0xC0, 0xD8, {3, 9}, 2},
+    {0x0800041D, 0x001E7DE0, {0x92929292, 0xD1D1D1D1}, 7, 0xBE, 0x93, 0xBC, {7, 17}, 2},
+};
+
+static const struct {
+    uint16_t symbols;
+    uint8_t pac;
+    uint8_t code; /* TXPSR and PE of TX_FCTRL */
+} preambles[] = {
+    {64, 8, 0x1},    {128, 8, 0x5},   {256, 16, 0x9},  {512, 16, 0xD},
+    {1024, 32, 0x2}, {1536, 64, 0x6}, {2048, 64, 0xA}, {4096, 64, 0x3},
+};
+
+static const uint16_t rates[] = {110, 850, 6800};
+static const uint8_t sfd_symbols[2][3] = {{64, 8, 8}, {64, 16, 8}};
+static const uint16_t sfd_tune[2][3] = {{0x0A, 0x01, 0x01}, {0x16, 0x06, 0x02}};
+
+/* LDE_REPC by preamble code, from 1 on. */
+static const uint16_t replica[24] = {
+    0x5998, 0x5998, 0x51EA, 0x428E, 0x451E, 0x2E14, 0x8000, 0x51EA, 0x28F4, 0x3332, 0x3AE0, 0x3D70,
+    0x3AE0, 0x35C2, 0x2B84, 0x35C2, 0x3332, 0x35C2, 0x35C2, 0x47AE, 0x3AE0, 0x3850, 0x30A2, 0x3850,
+};
+
+const uwb_dw1000_settings uwb_dw1000_usual = {5, 64, 0, 0, 6800, 128, 0, 0};
+
+#define COUNT(array) (sizeof(array) / sizeof(array)[0])
+
+/* Places in the tables above; the number of entries where there is none. */
+static size_t channel_at(const uwb_dw1000_settings *settings) {
+    size_t i = 0;
+    while (i < COUNT(channels) && channels[i].number != settings->channel) {
+        i++;
+    }
+    return i;
+}
+
+static size_t preamble_at(const uwb_dw1000_settings *settings) {
+    size_t i = 0;
+    while (i < COUNT(preambles) && preambles[i].symbols != settings->preamble) {
+        i++;
+    }
+    return i;
+}
+
+static size_t rate_at(const uwb_dw1000_settings *settings) {
+    size_t i = 0;
+    while (i < COUNT(rates) && rates[i] != settings->rate_kbps) {
+        i++;
+    }
+    return i;
+}
+
+/* Two codes for each channel at 16 MHz, four at 64 MHz. */
+static int valid_code(const uwb_dw1000_settings *settings, size_t channel) {
+    const int fast = settings->prf_mhz == 64;
+    const uint8_t first = channels[channel].codes[fast];
+    return settings->preamble_code == 0 ||
+           (settings->preamble_code >= first && settings->preamble_code < first + (fast ? 4 : 2));
+}
+
+int uwb_dw1000_valid(const uwb_dw1000_settings *settings) {
+    const size_t channel = channel_at(settings);
+    return channel < COUNT(channels) && preamble_at(settings) < COUNT(preambles) && rate_at(settings) < COUNT(rates) &&
+           (settings->prf_mhz == 16 || settings->prf_mhz == 64) && settings->decawave_sfd <= 1 &&
+           settings->antenna_delay <= 0x1FFFEu && valid_code(settings, channel);
+}
+
+uint32_t uwb_dw1000_sfd_symbols(const uwb_dw1000_settings *settings) {
+    return sfd_symbols[settings->decawave_sfd][rate_at(settings)];
+}
+
+uint32_t uwb_dw1000_lead_us(const uwb_dw1000_settings *settings) {
+    const double symbol_us = settings->prf_mhz == 16 ? 0.99359 : 1.01763;
+    return (uint32_t)((settings->preamble + uwb_dw1000_sfd_symbols(settings)) * symbol_us) + 1u;
+}
+
+uint32_t uwb_dw1000_air_us(const uwb_dw1000_settings *settings, size_t bytes) {
+    const uint32_t bits = 8u * (uint32_t)(bytes + 2);
+    const uint32_t coded = bits + 48u * ((bits + 329u) / 330u); /* Reed-Solomon */
+    const double header_us = settings->rate_kbps == 110 ? 21 * 8.20513 : 21 * 1.02564;
+    const double bit_us = settings->rate_kbps == 110 ? 8.20513 : settings->rate_kbps == 850 ? 1.02564 : 0.128205;
+    return uwb_dw1000_lead_us(settings) + (uint32_t)(header_us + coded * bit_us) + 1u;
+}
+
+/* The chip's settings with nothing left to the chip. */
+static uwb_dw1000_settings resolve(const uwb_dw1000 *chip, const uwb_dw1000_settings *settings, size_t channel) {
+    uwb_dw1000_settings resolved = *settings;
+    const int fast = settings->prf_mhz == 64;
+    const uint32_t power = chip->otp_tx_power[2 * channel + (size_t)fast];
+    const uint32_t delay = fast ? chip->otp_antenna_delay >> 16 : chip->otp_antenna_delay & 0xFFFFu;
+    if (resolved.preamble_code == 0) {
+        resolved.preamble_code = channels[channel].codes[fast];
+    }
+    if (resolved.tx_power == 0) {
+        resolved.tx_power = power != 0 && power != UINT32_MAX ? power : channels[channel].power[fast];
+    }
+    if (resolved.antenna_delay == 0) {
+        resolved.antenna_delay = delay != 0 && delay != 0xFFFFu ? delay : UWB_DW1000_ANTENNA_DELAY;
+    }
+    return resolved;
+}
+
+static uint32_t drx_tune2(uint8_t pac, int fast) {
+    static const uint32_t values[4][2] = {
+        {0x311A002D, 0x313B006B}, {0x331A0052, 0x333B00BE}, {0x351A009A, 0x353B015E}, {0x371A011D, 0x373B0296}};
+    const size_t row = pac == 8 ? 0 : pac == 16 ? 1 : pac == 32 ? 2 : 3;
+    return values[row][fast];
+}
+
+uwb_dw1000_status uwb_dw1000_configure(uwb_dw1000 *chip, const uwb_dw1000_settings *settings) {
+    if (!uwb_dw1000_valid(settings)) {
+        return UWB_DW1000_BAD_ARGUMENT;
+    }
+    DW1000_TRY(uwb_dw1000_idle(chip));
+    const size_t channel = channel_at(settings), rate = rate_at(settings), preamble = preamble_at(settings);
+    const uwb_dw1000_settings now = resolve(chip, settings, channel);
+    const uint32_t fast = now.prf_mhz == 64, number = now.channel, sfd = now.decawave_sfd, code = now.preamble_code;
+    const uint32_t symbols = sfd_symbols[sfd][rate], pac = preambles[preamble].pac;
+    const uint32_t repeat = replica[code - 1] / (rate == 0 ? 8u : 1u);
+    const uint32_t tx_delay = now.antenna_delay / 2;
+    chip->settings = now;
+    chip->tx_antenna_delay = (uint16_t)tx_delay;
+    chip->sys_cfg = HIRQ_POL | DIS_DRXB | DIS_STXP | (rate == 0 ? RXM110K : 0);
+    chip->wait_units = 0;
+    chip->tx_bytes = 0;
+    /* With the ranging bit. */
+    chip->tx_fctrl = 1u << 15 | (uint32_t)rate << 13 | (fast ? 2u : 1u) << 16 | (uint32_t)preambles[preamble].code << 18;
+    const uwb_dw1000_entry entries[] = {
+        {SYS_CFG, 4, chip->sys_cfg},
+        {PANADR, 4, UWB_DW1000_CANARY},
+        {AGC_TUNE1, 2, fast ? 0x889Bu : 0x8870u},
+        {AGC_TUNE2, 4, 0x2502A907},
+        {AGC_TUNE3, 2, 0x0035},
+        {DRX_TUNE0B, 2, sfd_tune[sfd][rate]},
+        {DRX_TUNE1A, 2, fast ? 0x008Du : 0x0087u},
+        {DRX_TUNE1B, 2, rate == 0 ? 0x0064u : now.preamble == 64 ? 0x0010u : 0x0020u},
+        {DRX_TUNE2, 4, drx_tune2(preambles[preamble].pac, (int)fast)},
+        {DRX_SFDTOC, 2, now.preamble + 1u + symbols - pac},
+        {DRX_TUNE4H, 2, now.preamble == 64 ? 0x0010u : 0x0028u},
+        {LDE_CFG1, 1, 0x6D},
+        {LDE_CFG2, 2, fast ? 0x0607u : 0x1607u},
+        {LDE_REPC, 2, repeat},
+        {LDE_RXANTD, 2, now.antenna_delay - tx_delay},
+        {TX_ANTD, 2, tx_delay},
+        {FS_PLLCFG, 4, channels[channel].pll_config},
+        {FS_PLLTUNE, 1, channels[channel].pll_tune},
+        {RF_RXCTRLH, 1, channels[channel].rx_control},
+        {RF_TXCTRL, 4, channels[channel].tx_control},
+        {TC_PGDELAY, 1, channels[channel].pulse_delay},
+        {USR_SFD, 1, symbols},
+        {CHAN_CTRL, 4,
+         number | number << 4 | sfd << 17 | (fast ? 2u : 1u) << 18 | sfd << 20 | sfd << 21 | code << 22 | code << 27},
+        {TX_POWER, 4, now.tx_power},
+        {ACK_RESP_T, 3, 0},
+        /* Both in one write initialise the SFD's logic, and send nothing (User Manual, 5.3.1.2). */
+        {SYS_CTRL, 4, TXSTRT | TRXOFF},
+        {SYS_STATUS, 4, RX_BITS | TX_BITS},
+        {SYS_MASK, 4, UWB_DW1000_INTERRUPTS},
+        {0, 0, 0},
+    };
+    return uwb_dw1000_set_all(chip, entries);
+}
+
+uwb_dw1000_status uwb_dw1000_check(uwb_dw1000 *chip) {
+    uint64_t canary;
+    DW1000_TRY(uwb_dw1000_get(chip, PANADR, 4, &canary));
+    return canary == UWB_DW1000_CANARY ? UWB_DW1000_OK : UWB_DW1000_RESTARTED;
+}

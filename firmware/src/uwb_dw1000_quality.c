@@ -1,0 +1,120 @@
+#include <math.h>
+
+#include "uwb_dw1000_registers.h"
+
+/* PMSC_CTRL0: FACE with RXCLKS in the first octet, in the second AMCE and what start leaves there. */
+enum { RX_CLOCK_PLL = 0x48, AMCE = 0x80, CTRL0_USUAL = 0x02 };
+
+/* What the SFD adds to RXPACC where the count did not saturate (User Manual, table 18). */
+static uint16_t sfd_part(const uwb_dw1000_settings *settings) {
+    switch (uwb_dw1000_sfd_symbols(settings)) {
+    case 8:
+        return settings->decawave_sfd ? 10 : 5;
+    case 16:
+        return 18;
+    default:
+        return settings->decawave_sfd ? 82 : 64;
+    }
+}
+
+/* Carrier frequency, MHz. */
+static float carrier_mhz(uint8_t channel) {
+    static const float carriers[] = {0, 3494.4f, 3993.6f, 4492.8f, 3993.6f, 6489.6f, 0, 6489.6f};
+    return carriers[channel & 7u];
+}
+
+static float clock_offset_ppm(const uwb_dw1000_settings *settings, uint32_t integrator) {
+    const int32_t value = (int32_t)(integrator << 11) / 2048; /* 21 bits with a sign */
+    const float per_step_hz = 998.4e6f / 2 / (settings->rate_kbps == 110 ? 8192 : 1024) / 131072;
+    return -(float)value * per_step_hz / carrier_mhz(settings->channel);
+}
+
+uwb_dw1000_status uwb_dw1000_read_quality(uwb_dw1000 *chip, const uwb_dw1000_frame *frame,
+                                          uwb_dw1000_quality *quality) {
+    uint8_t fqual[8], receiver[RXPACC_NOSAT + 2 - DRX_CAR_INT];
+    uint64_t threshold;
+    DW1000_TRY(uwb_dw1000_read(chip, RX_FQUAL, fqual, sizeof fqual));
+    DW1000_TRY(uwb_dw1000_get(chip, LDE_THRESH, 2, &threshold));
+    DW1000_TRY(uwb_dw1000_read(chip, DRX_CAR_INT, receiver, sizeof receiver));
+    quality->noise = (uint16_t)uwb_dw1000_number(fqual, 2);
+    quality->first_path_amplitude[0] = frame->first_path_amplitude;
+    quality->first_path_amplitude[1] = (uint16_t)uwb_dw1000_number(fqual + 2, 2);
+    quality->first_path_amplitude[2] = (uint16_t)uwb_dw1000_number(fqual + 4, 2);
+    quality->power = (uint16_t)uwb_dw1000_number(fqual + 6, 2);
+    quality->noise_threshold = (uint16_t)threshold;
+    quality->clock_offset_ppm = clock_offset_ppm(&chip->settings, (uint32_t)uwb_dw1000_number(receiver, 3));
+
+    const uint16_t sfd = sfd_part(&chip->settings);
+    const uint64_t unsaturated = uwb_dw1000_number(receiver + (RXPACC_NOSAT - DRX_CAR_INT), 2);
+    uint16_t count = frame->preamble_count;
+    if (count == unsaturated && count > sfd) {
+        count = (uint16_t)(count - sfd);
+    }
+    quality->preamble_count = count;
+    const float reference_db = chip->settings.prf_mhz == 16 ? 113.77f : 121.74f;
+    const float squared = (float)count * (float)count;
+    float first = 0;
+    for (int i = 0; i < 3; i++) {
+        first += (float)quality->first_path_amplitude[i] * (float)quality->first_path_amplitude[i];
+    }
+    quality->rx_power_dbm =
+        count != 0 && quality->power != 0 ? 10 * log10f((float)quality->power * 131072.0f / squared) - reference_db : NAN;
+    quality->first_path_power_dbm = count != 0 && first > 0 ? 10 * log10f(first / squared) - reference_db : NAN;
+    return UWB_DW1000_OK;
+}
+
+uwb_dw1000_status uwb_dw1000_read_peak(uwb_dw1000 *chip, uint16_t *index, uint16_t *amplitude) {
+    uint8_t peak[4];
+    DW1000_TRY(uwb_dw1000_read(chip, LDE_PPINDX, peak, sizeof peak));
+    *index = (uint16_t)uwb_dw1000_number(peak, 2);
+    *amplitude = (uint16_t)uwb_dw1000_number(peak + 2, 2);
+    return UWB_DW1000_OK;
+}
+
+uwb_dw1000_status uwb_dw1000_read_cir(uwb_dw1000 *chip, size_t first, size_t count, uint8_t *octets) {
+    const size_t samples = UWB_DW1000_SAMPLES(chip->settings.prf_mhz);
+    if (count > samples || first > samples - count) {
+        return UWB_DW1000_BAD_ARGUMENT;
+    }
+    /* Octet by octet: the chip may hang where both change at once. Without these clocks it reads as zeros or noise. */
+    static const uwb_dw1000_entry on[] = {{PMSC_CTRL0, 1, RX_CLOCK_PLL}, {PMSC_CTRL0 + 1, 1, CTRL0_USUAL | AMCE}, {0, 0, 0}};
+    static const uwb_dw1000_entry off[] = {{PMSC_CTRL0, 1, 0}, {PMSC_CTRL0 + 1, 1, CTRL0_USUAL}, {0, 0, 0}};
+    DW1000_TRY(uwb_dw1000_set_all(chip, on));
+    DW1000_TRY(uwb_dw1000_read(chip, ACC_MEM | (uint32_t)(4 * first), octets, 1 + 4 * count));
+    return uwb_dw1000_set_all(chip, off);
+}
+
+uwb_dw1000_status uwb_dw1000_read_sensors(uwb_dw1000 *chip, float *temperature, float *voltage) {
+    static const uwb_dw1000_entry entries[] = {
+        {RF_SENSOR_1, 1, 0x80}, {RF_SENSOR_2, 1, 0x0A}, {RF_SENSOR_2, 1, 0x0F}, {TC_SARC, 1, 1}, {0, 0, 0}};
+    uint8_t raw[2];
+    DW1000_TRY(uwb_dw1000_set_all(chip, entries));
+    chip->io.sleep(chip->io.context, 10);
+    DW1000_TRY(uwb_dw1000_read(chip, TC_SARL, raw, sizeof raw));
+    DW1000_TRY(uwb_dw1000_set(chip, TC_SARC, 1, 0));
+    *voltage = 3.3f + (float)(raw[0] - chip->otp_voltage) / 173.0f;
+    *temperature = 23.0f + 1.14f * (float)(raw[1] - chip->otp_temperature);
+    return UWB_DW1000_OK;
+}
+
+float uwb_dw1000_true_power_dbm(float rx_power_dbm, uint8_t prf_mhz) {
+    const float over = rx_power_dbm + 88;
+    return over <= 0 ? rx_power_dbm : rx_power_dbm + over * (prf_mhz == 16 ? 2.3334f : 1.1667f);
+}
+
+float uwb_dw1000_range_bias_m(float true_power_dbm, uint8_t channel, uint8_t prf_mhz) {
+    /* From -61 dBm in steps of -2 dB; mm for channels 500 MHz wide, 2 mm for those of 900 MHz. */
+    static const int16_t bias[2][2][18] = {
+        {{-198, -187, -179, -163, -143, -127, -109, -84, -59, -31, 0, 36, 65, 84, 97, 106, 110, 112},
+         {-110, -105, -100, -93, -82, -69, -51, -27, 0, 21, 35, 42, 49, 62, 71, 76, 81, 86}},
+        {{-137, -122, -105, -88, -69, -47, -25, 0, 21, 48, 79, 105, 127, 147, 160, 169, 178, 197},
+         {-147, -133, -117, -99, -75, -50, -29, 0, 24, 45, 63, 76, 87, 98, 116, 122, 132, 142}},
+    };
+    const int wide = channel == 4 || channel == 7;
+    const int16_t *const row = bias[wide][prf_mhz == 64];
+    float place = (true_power_dbm + 61) * -0.5f;
+    place = place > 0 ? (place < 17 ? place : 17) : 0; /* NaN too */
+    const int below = place < 16 ? (int)place : 16;
+    const float mm = (float)row[below] + (place - (float)below) * (float)(row[below + 1] - row[below]);
+    return mm * (wide ? 0.002f : 0.001f);
+}

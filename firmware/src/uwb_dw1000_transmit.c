@@ -1,0 +1,139 @@
+#include "uwb_dw1000_registers.h"
+
+enum { TX_CLOCK_PLL = 2 << 4, POLL_US = 100, LONGEST_WAIT_US = 60000, TURNED_ROUND_US = 10 };
+static const double WAIT_UNIT_US = 512 / 499.2;
+
+uwb_dw1000_status uwb_dw1000_idle(uwb_dw1000 *chip) {
+    /* The interrupts are masked, since one may be raised between TRXOFF and the clearing of what it left. */
+    static const uwb_dw1000_entry entries[] = {
+        {SYS_MASK, 4, 0},
+        {SYS_CTRL, 4, TRXOFF},
+        {SYS_STATUS, 4, RX_BITS | TX_BITS},
+        {SYS_MASK, 4, UWB_DW1000_INTERRUPTS},
+        {0, 0, 0},
+    };
+    /* The manual wants it after most errors (4.1.6): stamps would be wrong from then on. One may just have happened. */
+    static const uwb_dw1000_entry reset_receiver[] = {{PMSC_SOFTRESET, 1, 0xE0}, {PMSC_SOFTRESET, 1, 0xF0}, {0, 0, 0}};
+    DW1000_TRY(uwb_dw1000_set_all(chip, entries));
+    if (chip->listening) {
+        DW1000_TRY(uwb_dw1000_set_all(chip, reset_receiver));
+        chip->listening = 0;
+    }
+    return uwb_dw1000_release_clock(chip);
+}
+
+/* Errata TX-1: a time just above the limit of what is too late would pass in silence, with the clock left to the
+ * sequencer. */
+uwb_dw1000_status uwb_dw1000_force_clock(uwb_dw1000 *chip) {
+    if (chip->clock_forced) {
+        return UWB_DW1000_OK;
+    }
+    DW1000_TRY(uwb_dw1000_set(chip, PMSC_CTRL0, 1, TX_CLOCK_PLL));
+    chip->clock_forced = 1;
+    return UWB_DW1000_OK;
+}
+
+uwb_dw1000_status uwb_dw1000_release_clock(uwb_dw1000 *chip) {
+    if (!chip->clock_forced) {
+        return UWB_DW1000_OK;
+    }
+    DW1000_TRY(uwb_dw1000_set(chip, PMSC_CTRL0, 1, 0));
+    chip->clock_forced = 0;
+    return UWB_DW1000_OK;
+}
+
+/* The receiver's own time-out; what it was set to is not written again. */
+static uwb_dw1000_status set_time_out(uwb_dw1000 *chip, uint32_t for_us) {
+    const uint32_t units = for_us < LONGEST_WAIT_US ? (uint32_t)(for_us / WAIT_UNIT_US) + 1u : 0;
+    const uint32_t sys_cfg = units != 0 ? chip->sys_cfg | RXWTOE : chip->sys_cfg & ~RXWTOE;
+    if (units != 0 && units != chip->wait_units) {
+        DW1000_TRY(uwb_dw1000_set(chip, RX_FWTO, 2, units));
+        chip->wait_units = (uint16_t)units;
+    }
+    if (sys_cfg != chip->sys_cfg) {
+        DW1000_TRY(uwb_dw1000_set(chip, SYS_CFG, 4, sys_cfg));
+        chip->sys_cfg = sys_cfg;
+    }
+    return UWB_DW1000_OK;
+}
+
+static uwb_dw1000_status prepare(uwb_dw1000 *chip, const uint8_t *octets, size_t bytes, uint32_t answer_us) {
+    if (bytes + 2 > UWB_DW1000_MAX_FRAME_BYTES) {
+        return UWB_DW1000_BAD_ARGUMENT;
+    }
+    if (chip->listening) {
+        DW1000_TRY(uwb_dw1000_idle(chip)); /* TXSTRT would be ignored */
+    }
+    if (answer_us != 0) {
+        DW1000_TRY(set_time_out(chip, answer_us));
+    }
+    DW1000_TRY(uwb_dw1000_write(chip, TX_BUFFER, octets, bytes));
+    if (chip->tx_bytes != bytes) {
+        DW1000_TRY(uwb_dw1000_set(chip, TX_FCTRL, 4, chip->tx_fctrl | (uint32_t)(bytes + 2)));
+        chip->tx_bytes = (uint8_t)bytes;
+    }
+    return UWB_DW1000_OK;
+}
+
+uwb_dw1000_status uwb_dw1000_send(uwb_dw1000 *chip, const uint8_t *octets, size_t bytes, uint32_t answer_us) {
+    DW1000_TRY(prepare(chip, octets, bytes, answer_us));
+    DW1000_TRY(uwb_dw1000_set(chip, SYS_CTRL, 1, TXSTRT | (answer_us != 0 ? WAIT4RESP : 0)));
+    chip->listening = answer_us != 0;
+    return UWB_DW1000_OK;
+}
+
+uint64_t uwb_dw1000_stamp_at(const uwb_dw1000 *chip, uint64_t at) {
+    return ((at & ~(uint64_t)0x1FF) + chip->tx_antenna_delay) & UWB_DW1000_TICK_MASK;
+}
+
+uwb_dw1000_status uwb_dw1000_send_at(uwb_dw1000 *chip, const uint8_t *octets, size_t bytes, uint64_t stamp,
+                                     uint32_t answer_us) {
+    uint64_t status;
+    DW1000_TRY(prepare(chip, octets, bytes, answer_us));
+    DW1000_TRY(uwb_dw1000_set(chip, DX_TIME, 5, (stamp - chip->tx_antenna_delay) & UWB_DW1000_TICK_MASK));
+    DW1000_TRY(uwb_dw1000_force_clock(chip));
+    DW1000_TRY(uwb_dw1000_set(chip, SYS_CTRL, 1, TXSTRT | TXDLYS | (answer_us != 0 ? WAIT4RESP : 0)));
+    chip->listening = answer_us != 0;
+    DW1000_TRY(uwb_dw1000_get(chip, SYS_STATUS, 5, &status));
+    if (status & (HPDWARN | TXPUTE)) {
+        DW1000_TRY(uwb_dw1000_idle(chip));
+        return UWB_DW1000_LATE;
+    }
+    return UWB_DW1000_OK;
+}
+
+uwb_dw1000_status uwb_dw1000_sent(uwb_dw1000 *chip, uint64_t until_us, uint64_t *stamp) {
+    for (;;) {
+        uint64_t status;
+        DW1000_TRY(uwb_dw1000_get(chip, SYS_STATUS, 4, &status));
+        if (status & SLP2INIT) {
+            return UWB_DW1000_RESTARTED;
+        }
+        if (status & TXFRS) {
+            break;
+        }
+        const uint64_t now_us = chip->io.now_us(chip->io.context);
+        if (now_us >= until_us) {
+            DW1000_TRY(uwb_dw1000_idle(chip));
+            return UWB_DW1000_UNSENT;
+        }
+        chip->io.wait(chip->io.context, until_us - now_us < POLL_US ? until_us : now_us + POLL_US);
+    }
+    /* A delayed frame would leave TXFRS set until it starts, and it would pass for that frame's. */
+    DW1000_TRY(uwb_dw1000_set(chip, SYS_STATUS, 4, TX_BITS));
+    if (chip->listening) {
+        /* Status of the frame received before goes as the receiver is enabled: 6.5 us after the end of this one. */
+        chip->io.sleep(chip->io.context, TURNED_ROUND_US);
+    }
+    return stamp != NULL ? uwb_dw1000_get(chip, TX_TIME, 5, stamp) : UWB_DW1000_OK;
+}
+
+uwb_dw1000_status uwb_dw1000_listen(uwb_dw1000 *chip, uint32_t for_us) {
+    if (chip->listening) {
+        DW1000_TRY(uwb_dw1000_idle(chip));
+    }
+    DW1000_TRY(set_time_out(chip, for_us));
+    DW1000_TRY(uwb_dw1000_set(chip, SYS_CTRL, 2, RXENAB));
+    chip->listening = 1;
+    return UWB_DW1000_OK;
+}

@@ -1,0 +1,180 @@
+#include "uwb_ranger.h"
+
+#include <math.h>
+#include <string.h>
+
+enum { ROOM_WITHIN_US = 20000, ROOM_LOOK_US = 250 };
+
+static uint64_t now_us(const uwb_ranger *ranger) {
+    return ranger->twr.io.now_us(ranger->twr.io.context);
+}
+
+static void tell_radio(uwb_ranger *ranger, const uint32_t *request, const char *refusal) {
+    struct {
+        uwb_radio_t fixed;
+        uint8_t tail[8 * UWB_MAX_ANCHORS + 120];
+    } message;
+    const uwb_twr_config *const config = ranger->change ? &ranger->wanted : &ranger->twr.config;
+    const uwb_dw1000_settings *const radio = ranger->twr.running && !ranger->change ? &ranger->twr.chip.settings
+                                                                                    : &config->radio;
+    uwb_radio_t *const fixed = &message.fixed;
+    memset(&message, 0, sizeof message);
+    fixed->request_sequence = request != NULL ? *request : 0;
+    fixed->accepted = refusal == NULL;
+    fixed->address = ranger->twr.address;
+    fixed->antenna_delay = radio->antenna_delay;
+    fixed->tx_power = radio->tx_power;
+    fixed->reply_us = config->reply_us;
+    fixed->patience_us = config->patience_us;
+    fixed->interval_us = config->interval_us;
+    fixed->pan = config->pan;
+    fixed->rate = radio->rate_kbps;
+    fixed->preamble = radio->preamble;
+    fixed->window = config->window;
+    fixed->channel = radio->channel;
+    fixed->prf = radio->prf_mhz;
+    fixed->preamble_code = radio->preamble_code;
+    fixed->decawave_sfd = radio->decawave_sfd;
+    fixed->role = config->role;
+    fixed->report = config->report;
+    fixed->bias_correction = config->bias_correction;
+    fixed->anchor_count = config->anchor_count;
+    size_t at = 8u * config->anchor_count;
+    memcpy(message.tail, config->anchors, at);
+    for (; refusal != NULL && *refusal != 0 && at < sizeof message.tail; refusal++) {
+        message.tail[at++] = (uint8_t)*refusal;
+    }
+    const uint16_t flags = request != NULL ? UWB_FLAG_ANSWER : 0;
+    (void)uwb_board_send(&ranger->board, UWB_TYPE_RADIO, flags, now_us(ranger), &message, sizeof *fixed + at, 0);
+}
+
+static void tell_status(uwb_ranger *ranger) {
+    struct {
+        uwb_radio_status_t fixed;
+        uwb_radio_anchor_t anchors[UWB_MAX_ANCHORS];
+    } message;
+    const uwb_twr *const twr = &ranger->twr;
+    const uwb_twr_counts *const counts = &twr->counts;
+    const uint64_t at_us = now_us(ranger);
+    const uint8_t known = twr->config.role == UWB_ROLE_TAG ? twr->known : 0;
+    memset(&message, 0, sizeof message);
+    message.fixed = (uwb_radio_status_t){
+        counts->tried, counts->ranged, counts->no_answer, counts->late, counts->time_out, counts->damaged,
+        counts->absurd, counts->broken, counts->refused, counts->restarts, ranger->board.temperature, ranger->voltage,
+        UWB_RADIO_STATE_RUNNING, known, {0}};
+    if (!twr->running) {
+        message.fixed.state = twr->fault == UWB_DW1000_BUS        ? UWB_RADIO_STATE_BUS
+                              : twr->fault == UWB_DW1000_ABSENT   ? UWB_RADIO_STATE_ABSENT
+                              : twr->fault == UWB_DW1000_NO_CLOCK ? UWB_RADIO_STATE_NO_CLOCK
+                                                                  : UWB_RADIO_STATE_RESTARTED;
+    }
+    for (uint8_t i = 0; i < known; i++) {
+        const uwb_twr_anchor *const anchor = &twr->anchors[i];
+        const uint64_t silent_ms = (at_us - anchor->heard_us) / 1000;
+        const uint32_t heard_ms = anchor->heard_us == 0 || silent_ms > UINT32_MAX ? UINT32_MAX : (uint32_t)silent_ms;
+        message.anchors[i] = (uwb_radio_anchor_t){anchor->address, anchor->tried, anchor->ranged, anchor->rx_power_dbm,
+                                                  heard_ms};
+    }
+    const size_t bytes = sizeof message.fixed + known * sizeof message.anchors[0];
+    (void)uwb_board_send(&ranger->board, UWB_TYPE_RADIO_STATUS, 0, at_us, &message, bytes, UWB_ANSWER_RESERVE_BYTES);
+}
+
+/* The host's wish, or what is wrong with it. */
+static const char *understand(const uwb_ranger *ranger, const uint8_t *payload, size_t bytes, uwb_twr_config *config) {
+    uwb_set_radio_t fixed;
+    if (bytes < sizeof fixed) {
+        return "SET_RADIO is too short";
+    }
+    memcpy(&fixed, payload, sizeof fixed);
+    if (fixed.anchor_count > UWB_MAX_ANCHORS || bytes < sizeof fixed + 8u * fixed.anchor_count) {
+        return "more anchors than 32, or than SET_RADIO tells of";
+    }
+    memset(config, 0, sizeof *config);
+    config->radio = (uwb_dw1000_settings){fixed.channel, fixed.prf, fixed.preamble_code, fixed.decawave_sfd, fixed.rate,
+                                          fixed.preamble, fixed.tx_power, fixed.antenna_delay};
+    config->address = fixed.address;
+    config->pan = fixed.pan;
+    config->role = fixed.role;
+    config->report = fixed.report;
+    config->bias_correction = fixed.bias_correction;
+    config->anchor_count = fixed.anchor_count;
+    config->window = fixed.window;
+    config->reply_us = fixed.reply_us;
+    config->patience_us = fixed.patience_us;
+    uwb_twr_fill_times(config, uwb_twr_usual.reply_us, uwb_twr_usual.patience_us);
+    config->interval_us = fixed.interval_us;
+    memcpy(config->anchors, payload + sizeof fixed, 8u * fixed.anchor_count);
+    return uwb_twr_refusal(&ranger->twr, config);
+}
+
+static int take(void *context, const uwb_header_t *header, const uint8_t *payload, size_t bytes, uint64_t at_us) {
+    uwb_ranger *const ranger = context;
+    const char *refusal = NULL;
+    (void)at_us;
+    if (header->type == UWB_TYPE_SET_RADIO) {
+        uwb_twr_config config;
+        refusal = understand(ranger, payload, bytes, &config);
+        if (refusal == NULL) {
+            ranger->wanted = config;
+            ranger->change = 1;
+        }
+    } else if (header->type != UWB_TYPE_GET_RADIO) {
+        return 0;
+    }
+    tell_radio(ranger, &header->sequence, refusal);
+    return 1;
+}
+
+void uwb_ranger_start(uwb_ranger *ranger, const uwb_board_config *board, const uwb_dw1000_io *io,
+                      const uwb_twr_config *config, uint64_t random, uint8_t *measurement, size_t measurement_bytes) {
+    uwb_board_config own = *board;
+    own.other = take;
+    own.context = ranger;
+    memset(ranger, 0, sizeof *ranger);
+    ranger->voltage = NAN;
+    uwb_twr_start(&ranger->twr, io, config, random, measurement, measurement_bytes);
+    uwb_board_start(&ranger->board, &own, now_us(ranger));
+}
+
+static void tell(uwb_ranger *ranger) {
+    const uint64_t at_us = now_us(ranger);
+    uwb_board_tick(&ranger->board, at_us);
+    if (ranger->twr.running && !ranger->address_told) {
+        ranger->address_told = 1;
+        tell_radio(ranger, NULL, NULL);
+    }
+    if (at_us >= ranger->told_us) {
+        ranger->told_us = at_us + UWB_STATUS_INTERVAL_US;
+        tell_status(ranger);
+        if (ranger->twr.running && uwb_dw1000_idle(&ranger->twr.chip) == UWB_DW1000_OK) {
+            (void)uwb_dw1000_read_sensors(&ranger->twr.chip, &ranger->board.temperature, &ranger->voltage);
+        }
+    }
+}
+
+/* A tag that is faster than the line to its host does not range for nothing, nor what has grown old on the way: no more
+ * than a measurement waits behind the one that is being sent. */
+static void await_room(const uwb_ranger *ranger) {
+    const size_t most = UWB_TWR_MEASUREMENT_BYTES(ranger->twr.config.window);
+    const uint64_t until_us = now_us(ranger) + ROOM_WITHIN_US;
+    while (ranger->twr.config.role == UWB_ROLE_TAG && ranger->board.mode != UWB_MODE_DEVICE &&
+           ranger->board.queue.used > most && now_us(ranger) < until_us) {
+        ranger->twr.io.sleep(ranger->twr.io.context, ROOM_LOOK_US);
+    }
+}
+
+uwb_twr_event uwb_ranger_turn(uwb_ranger *ranger) {
+    await_room(ranger);
+    if (ranger->change) {
+        ranger->change = 0;
+        ranger->address_told = 0;
+        (void)uwb_twr_configure(&ranger->twr, &ranger->wanted);
+    }
+    const uwb_twr_event event = uwb_twr_turn(&ranger->twr, now_us(ranger) + UWB_RANGER_TURN_US);
+    if (event == UWB_TWR_RANGED) {
+        (void)uwb_board_take(&ranger->board, ranger->twr.measurement, uwb_twr_measured_bytes(&ranger->twr),
+                             ranger->twr.measured_us);
+    }
+    tell(ranger);
+    return event;
+}

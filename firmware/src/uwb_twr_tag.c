@@ -1,0 +1,224 @@
+#include <math.h>
+
+#include "uwb_twr_exchange.h"
+
+enum {
+    SEEK_WINDOW_US = 8000,     /* in which anchors answer a broadcast */
+    SEEK_INTERVAL_US = 1000000,
+    SEEK_SELDOM = 32,          /* times the window at least, so that seeking takes little of the time on slow buses */
+    SEEK_SOON_US = 50000,      /* after one that found somebody */
+    JITTER_US = 400,           /* so that two tags do not stay in step */
+    SLOWEST_REPLY_US = 50000,
+    MISSES_TO_REST = 3,        /* an anchor that did not answer so often is left alone for as long as it has patience, */
+    LONGEST_REST = 3,          /* and twice as long each time, up to eight times */
+    FORGET_US = 10000000
+};
+
+static uwb_twr_anchor *find(uwb_twr *twr, uint64_t address) {
+    for (uint8_t i = 0; i < twr->known; i++) {
+        if (twr->anchors[i].address == address) {
+            return &twr->anchors[i];
+        }
+    }
+    return NULL;
+}
+
+static void meet(uwb_twr *twr, uint64_t address, uint64_t now_us) {
+    uwb_twr_anchor *anchor = find(twr, address);
+    if (anchor == NULL && twr->known < UWB_TWR_MAX_ANCHORS) {
+        anchor = &twr->anchors[twr->known++];
+        *anchor = (uwb_twr_anchor){address, now_us, 0, 0, 0, 0, 0, NAN};
+    }
+    if (anchor != NULL) {
+        anchor->heard_us = now_us;
+        anchor->due_us = 0;
+    }
+}
+
+/* Found anchors that are gone for long make room; those of a list stay. */
+static void forget(uwb_twr *twr, uint64_t now_us) {
+    for (uint8_t i = twr->known; i-- > 0 && twr->config.anchor_count == 0;) {
+        if (now_us - twr->anchors[i].heard_us > FORGET_US) {
+            twr->anchors[i] = twr->anchors[--twr->known];
+        }
+    }
+}
+
+static uwb_dw1000_status send(uwb_twr *twr, const uwb_twr_frame *frame, uint32_t answer_us) {
+    uint8_t octets[UWB_TWR_MAX_FRAME_BYTES];
+    return uwb_dw1000_send(&twr->chip, octets, uwb_twr_write(frame, octets), answer_us);
+}
+
+/* Ask who is there. */
+static uwb_twr_event seek(uwb_twr *twr) {
+    uwb_twr_frame frame = uwb_twr_frame_to(twr, UWB_TWR_SEEK, UWB_TWR_EVERYBODY, uwb_twr_random(twr), 0);
+    const uint32_t window_us = SEEK_WINDOW_US + twr->config.patience_us;
+    const uint64_t until_us = uwb_twr_now_us(twr) + window_us;
+    uwb_dw1000_status status;
+    const uint8_t known = twr->known;
+    frame.time_us = SEEK_WINDOW_US;
+    for (uint8_t i = 0; i < known; i++) {
+        uwb_twr_mark_known(&frame, twr->anchors[i].address);
+    }
+    status = send(twr, &frame, window_us);
+    if (status == UWB_DW1000_OK) {
+        status = uwb_dw1000_sent(&twr->chip, until_us, NULL);
+    }
+    while (status == UWB_DW1000_OK) {
+        uwb_dw1000_frame received;
+        uwb_twr_frame here;
+        status = uwb_twr_expect(twr, &frame, UWB_TWR_HERE, until_us, &received, &here);
+        if (status == UWB_DW1000_OK) {
+            const uint64_t now_us = uwb_twr_now_us(twr);
+            meet(twr, here.from, now_us);
+            twr->misses = 0;
+            if (now_us >= until_us) {
+                break;
+            }
+            status = uwb_dw1000_listen(&twr->chip, (uint32_t)(until_us - now_us));
+        }
+    }
+    const uint64_t now_us = uwb_twr_now_us(twr);
+    const uint32_t interval_us = SEEK_SELDOM * window_us > SEEK_INTERVAL_US ? SEEK_SELDOM * window_us : SEEK_INTERVAL_US;
+    twr->seek_us = now_us + (twr->known > known    ? SEEK_SOON_US
+                             : twr->known != 0 ? interval_us
+                                               : uwb_twr_random_below(twr, SEEK_SOON_US));
+    forget(twr, now_us);
+    if (status == UWB_DW1000_TIMEOUT || status == UWB_DW1000_DAMAGED) {
+        status = twr->known != 0 ? UWB_DW1000_OK : uwb_dw1000_check(&twr->chip);
+    }
+    return status == UWB_DW1000_OK ? UWB_TWR_NOTHING : uwb_twr_lost(twr, status, NULL);
+}
+
+/* The next anchor in turn that is not left alone, or the one that is due first. */
+static uwb_twr_anchor *next(uwb_twr *twr, uint64_t now_us) {
+    uwb_twr_anchor *first = NULL;
+    for (uint8_t i = 1; i <= twr->known; i++) {
+        uwb_twr_anchor *const anchor = &twr->anchors[(twr->turn + i) % twr->known];
+        if (first == NULL || (first->due_us > now_us && anchor->due_us < first->due_us)) {
+            first = anchor;
+        }
+    }
+    return first;
+}
+
+static uint64_t ticks(uint32_t us) {
+    return (uint64_t)(us * UWB_DW1000_TICKS_PER_US);
+}
+
+/* POLL to ANSWER; FINAL is then complete, with its stamps. */
+static uwb_dw1000_status poll(uwb_twr *twr, uwb_twr_anchor *anchor, uwb_twr_frame *final, uint32_t **lost) {
+    uwb_dw1000_frame received;
+    uwb_twr_frame answer;
+    uwb_twr_frame frame = uwb_twr_frame_to(twr, UWB_TWR_POLL, anchor->address, uwb_twr_random(twr), 0);
+    uint32_t wait_us = 2 * anchor->answer_us + 2000;
+    wait_us = anchor->answer_us != 0 && wait_us < twr->config.patience_us ? wait_us : twr->config.patience_us;
+    const uint64_t until_us = uwb_twr_now_us(twr) + wait_us;
+    frame.time_us = twr->reply_us;
+    *lost = &twr->counts.no_answer;
+    uwb_dw1000_status status = send(twr, &frame, twr->config.patience_us);
+    if (status == UWB_DW1000_OK) {
+        status = uwb_dw1000_sent(&twr->chip, until_us, &final->stamps[0]);
+    }
+    if (status == UWB_DW1000_OK) {
+        status = uwb_dw1000_force_clock(&twr->chip); /* while there is time */
+    }
+    if (status == UWB_DW1000_OK) {
+        status = uwb_twr_expect(twr, &frame, UWB_TWR_ANSWER, until_us, &received, &answer);
+    }
+    if (status != UWB_DW1000_OK) {
+        return status;
+    }
+    const uint64_t polled = final->stamps[0];
+    *final = uwb_twr_frame_to(twr, UWB_TWR_FINAL, anchor->address, frame.tag_number, answer.anchor_number);
+    final->stamps[0] = polled;
+    final->stamps[1] = received.stamp;
+    final->stamps[2] = uwb_dw1000_stamp_at(&twr->chip, received.stamp + ticks(twr->reply_us));
+    anchor->heard_us = received.received_us;
+    anchor->misses = 0;
+    anchor->answer_us = (uint32_t)(((received.stamp - polled) & UWB_DW1000_TICK_MASK) / 63898u);
+    return UWB_DW1000_OK;
+}
+
+static uwb_dw1000_status exchange(uwb_twr *twr, uwb_twr_anchor *anchor, uint32_t **lost) {
+    uint8_t octets[UWB_TWR_MAX_FRAME_BYTES];
+    uwb_dw1000_frame received;
+    uwb_twr_frame final, report;
+    uint64_t sent;
+    double range_m;
+    uwb_dw1000_status status = poll(twr, anchor, &final, lost);
+    if (status != UWB_DW1000_OK) {
+        return status;
+    }
+    *lost = &twr->counts.time_out;
+    const uint64_t until_us = uwb_twr_now_us(twr) + twr->reply_us + twr->config.patience_us;
+    const size_t bytes = uwb_twr_write(&final, octets);
+    status = uwb_dw1000_send_at(&twr->chip, octets, bytes, final.stamps[2], twr->config.patience_us);
+    if (status == UWB_DW1000_OK) {
+        status = uwb_dw1000_sent(&twr->chip, until_us, &sent);
+    }
+    if (status == UWB_DW1000_OK) {
+        status = uwb_dw1000_release_clock(&twr->chip);
+    }
+    if (status == UWB_DW1000_OK) {
+        status = uwb_twr_expect(twr, &final, UWB_TWR_REPORT, until_us, &received, &report);
+    }
+    if (status != UWB_DW1000_OK) {
+        return status;
+    }
+    if (sent != final.stamps[2] || !uwb_twr_range_m(final.stamps, report.stamps, &range_m)) {
+        *lost = &twr->counts.absurd;
+        status = uwb_dw1000_check(&twr->chip);
+        return status == UWB_DW1000_OK ? UWB_DW1000_TIMEOUT : status;
+    }
+    return uwb_twr_measure(twr, &received, twr->address, anchor->address, range_m, &anchor->rx_power_dbm);
+}
+
+uwb_twr_event uwb_twr_tag_turn(uwb_twr *twr, uint64_t until_us) {
+    const uint64_t now_us = uwb_twr_now_us(twr);
+    if (twr->config.anchor_count == 0 && now_us >= twr->seek_us) {
+        return seek(twr);
+    }
+    uwb_twr_anchor *const anchor = next(twr, now_us);
+    const uint64_t due_us = anchor == NULL                     ? twr->seek_us
+                            : anchor->due_us > twr->next_us ? anchor->due_us
+                                                            : twr->next_us;
+    uwb_twr_nap(twr, due_us < until_us ? due_us : until_us);
+    if (anchor == NULL || due_us >= until_us) {
+        return UWB_TWR_NOTHING;
+    }
+    const uint64_t began_us = uwb_twr_now_us(twr);
+    uint32_t *lost = NULL;
+    twr->turn = (uint8_t)(anchor - twr->anchors);
+    twr->counts.tried++;
+    anchor->tried++;
+    const uwb_dw1000_status status = exchange(twr, anchor, &lost);
+    const uint64_t ended_us = uwb_twr_now_us(twr);
+    uint32_t pause_us = JITTER_US;
+    uwb_twr_event event = UWB_TWR_RANGED;
+    if (status == UWB_DW1000_OK) {
+        twr->counts.ranged++;
+        anchor->ranged++;
+        twr->misses = 0;
+        if (twr->reply_us > twr->config.reply_us) {
+            twr->reply_us -= (twr->reply_us - twr->config.reply_us + 255) / 256;
+        }
+    } else {
+        /* Another tag may have been in the way: wait for a random while, longer from miss to miss. */
+        event = uwb_twr_lost(twr, status, lost);
+        if (status == UWB_DW1000_LATE && twr->reply_us < SLOWEST_REPLY_US) {
+            twr->reply_us += twr->reply_us / 4;
+        }
+        pause_us <<= twr->misses < 5 ? twr->misses : 5;
+        if (++anchor->misses >= MISSES_TO_REST) {
+            const uint32_t times = anchor->misses - MISSES_TO_REST;
+            const uint32_t rest_us = twr->config.patience_us << (times < LONGEST_REST ? times : LONGEST_REST);
+            anchor->due_us = ended_us + rest_us + uwb_twr_random_below(twr, rest_us / 4);
+        }
+    }
+    twr->next_us = ended_us + uwb_twr_random_below(twr, pause_us);
+    if (twr->next_us < began_us + twr->config.interval_us) {
+        twr->next_us = began_us + twr->config.interval_us;
+    }
+    return event;
+}

@@ -1,0 +1,147 @@
+/* Runs the sketch with a radio on a modelled chip, with an anchor 7 m away: radio_main <seconds>. What the sketch writes
+ * to Serial goes to standard output. Exit 2: it drove RSTn high, held the chip select wrongly, or wrote more than is safe
+ * on USB. */
+#include "SPI.h"
+
+#include <stdio.h>
+#include <stdlib.h>
+
+extern "C" {
+#include "dw1000_model.h"
+#include "uwb_twr.h"
+}
+
+enum { CS = 10, IRQ = 2, RESET = 9, TAG_SWITCH = 3 };
+
+StubPort Serial, Serial1;
+StubSpi SPI;
+static StubWatchdog watchdog;
+static StubFactory factory = {{0x386, 1}};
+static StubRandom randomness;
+StubWatchdog *NRF_WDT = &watchdog;
+StubFactory *NRF_FICR = &factory;
+StubRandom *NRF_RNG = &randomness;
+
+static dw1000_chip *chip;
+static int modes[64], levels[64], wrong;
+
+size_t StubPort::write(const uint8_t *bytes, size_t count) {
+    longest_write = count > longest_write ? count : longest_write;
+    return fwrite(bytes, 1, count, stdout);
+}
+
+static void drive_reset() {
+    static int held;
+    const int pulled = modes[RESET] == OUTPUT && levels[RESET] == LOW;
+    wrong |= modes[RESET] == OUTPUT && levels[RESET] == HIGH;
+    if (pulled != held) {
+        held = pulled;
+        dw1000_reset_drive(chip, pulled ? DW1000_RESET_LOW : DW1000_RESET_FLOAT);
+    }
+}
+
+void pinMode(int pin, int mode) {
+    modes[pin] = mode;
+    drive_reset();
+}
+
+void digitalWrite(int pin, int level) {
+    levels[pin] = level;
+    drive_reset();
+}
+
+int digitalRead(int pin) {
+    return pin == IRQ ? dw1000_irq(chip) : LOW;
+}
+
+uint32_t micros() {
+    dw1000_delay(chip, 1e-6);
+    return (uint32_t)(dw1000_now(chip) * 1e6);
+}
+
+void StubSpi::transfer(void *bytes, size_t count) {
+    static uint8_t sent[1 << 13];
+    wrong |= levels[CS] != LOW || modes[CS] != OUTPUT;
+    memcpy(sent, bytes, count);
+    dw1000_spi(chip, sent, (uint8_t *)bytes, count, hz);
+}
+
+static void run_sketch(dw1000_chip *, void *) {
+    setup();
+    for (;;) {
+        Serial.room = 64;
+        loop();
+    }
+}
+
+/* The anchor. */
+struct anchor_host {
+    dw1000_chip *chip;
+    uint32_t hz;
+};
+
+static int anchor_transfer(void *context, const uint8_t *header, size_t header_bytes, const uint8_t *out, uint8_t *in,
+                           size_t bytes) {
+    anchor_host *const host = (anchor_host *)context;
+    uint8_t sent[256] = {0}, received[256];
+    memcpy(sent, header, header_bytes);
+    if (out != NULL) {
+        memcpy(sent + header_bytes, out, bytes);
+    }
+    dw1000_spi(host->chip, sent, received, header_bytes + bytes, host->hz);
+    if (out == NULL) {
+        memcpy(in, received + header_bytes, bytes);
+    }
+    return 0;
+}
+
+static void anchor_speed(void *context, int fast) {
+    ((anchor_host *)context)->hz = fast ? 8000000 : 2000000;
+}
+
+static uint64_t anchor_now(void *context) {
+    return (uint64_t)(dw1000_now(((anchor_host *)context)->chip) * 1e6);
+}
+
+static void anchor_wait(void *context, uint64_t until_us) {
+    dw1000_chip *const its = ((anchor_host *)context)->chip;
+    const double left_s = (double)until_us * 1e-6 - dw1000_now(its);
+    dw1000_wait(its, left_s > 1e-6 ? left_s : 1e-6);
+}
+
+static void anchor_sleep(void *context, uint32_t us) {
+    dw1000_delay(((anchor_host *)context)->chip, us * 1e-6);
+}
+
+static void run_anchor(dw1000_chip *its, void *context) {
+    static uwb_twr twr;
+    static uint64_t measurement[1024];
+    anchor_host *const host = (anchor_host *)context;
+    host->chip = its;
+    const uwb_dw1000_io io = {host, anchor_transfer, anchor_speed, NULL, anchor_now, anchor_wait, anchor_sleep};
+    uwb_twr_config config = uwb_twr_usual;
+    config.role = UWB_ROLE_ANCHOR;
+    uwb_twr_start(&twr, &io, &config, 5, (uint8_t *)measurement, sizeof measurement);
+    for (;;) {
+        (void)uwb_twr_turn(&twr, anchor_now(host) + 100000);
+    }
+}
+
+int main(int argc, char **argv) {
+    static anchor_host host;
+    if (argc != 2) {
+        return 2;
+    }
+    randomness.EVENTS_VALRDY = 1;
+    dw1000_air *const air = dw1000_air_new(1);
+    chip = dw1000_chip_new(air, 8, 0, 16436, 16436);
+    dw1000_chip *const anchor = dw1000_chip_new(air, -5, 77, 16436, 16436);
+    const dw1000_link_config link = {7, 0, NULL, 0, 0, 0, 0, 0, 0, 0};
+    dw1000_link(air, chip, anchor, &link);
+    dw1000_program(chip, run_sketch, NULL);
+    dw1000_program(anchor, run_anchor, &host);
+    dw1000_run(air, atof(argv[1]));
+    fflush(stdout);
+    return wrong == 0 && Serial.longest_write < 64 && dw1000_fault(chip) == NULL && watchdog.RR[0] == 0x6E524635u ? 0
+                                                                                                                  : 2;
+}

@@ -1,0 +1,39 @@
+/* What the fuzz targets share: how a broken promise ends one, and inputs of its own where there is no fuzzer. */
+#ifndef UWB_FUZZ_H
+#define UWB_FUZZ_H
+
+#include <stdint.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size);
+
+static void check(int promise, const char *what) {
+    if (!promise) {
+        fprintf(stderr, "broken: %s\n", what);
+        abort();
+    }
+}
+
+#ifndef UWB_LIBFUZZER
+static uint64_t fuzz_state;
+
+/* How many inputs are asked for: PROGRAM <inputs> <seed>. */
+static unsigned long fuzz_inputs(int argc, char **argv) {
+    if (argc != 3) {
+        exit(2);
+    }
+    fuzz_state = strtoull(argv[2], NULL, 10) * 2u + 1u;
+    return strtoul(argv[1], NULL, 10);
+}
+
+static void fuzz_fill(uint8_t *data, size_t size) {
+    for (size_t byte = 0; byte < size; byte++) {
+        /* Knuth's MMIX generator; its high bits are the random ones. */
+        fuzz_state = fuzz_state * 6364136223846793005u + 1442695040888963407u;
+        data[byte] = (uint8_t)(fuzz_state >> 56);
+    }
+}
+#endif
+#endif
