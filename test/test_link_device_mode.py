@@ -11,8 +11,8 @@ import pytest
 
 from uwb_mitigation.link import messages
 from uwb_mitigation.link.board import Board, Identity
-from uwb_mitigation.link.events import Answer
-from uwb_mitigation.link.layout import Mode
+from uwb_mitigation.link.framing import FrameDecoder, FrameEncoder
+from uwb_mitigation.link.layout import Flag, Mode
 from uwb_mitigation.link.messages import Correction
 from uwb_mitigation.link.session import BoardSession
 from uwb_mitigation.measurement import CorrectedRange, RangeMeasurement
@@ -56,15 +56,15 @@ def test_what_the_board_corrects_equals_the_hosts_correction_of_what_the_board_s
         assert bits(corrected.corrected) == bits(mitigation.correct(raw))
 
 
-def test_what_the_board_corrects_for_the_host_equals_the_hosts_correction(mitigation):
-    session, board = connect(mitigation, Mode.HOST)
+def test_what_the_board_corrects_for_a_host_equals_the_hosts_correction(mitigation):
+    _, board = connect(mitigation, Mode.HOST)
+    host, decoder = FrameEncoder(), FrameDecoder()
     for now, measurement in enumerate(recorded(50)):
         kind, payload = messages.encode(measurement)
         held = messages.decode(kind, payload)
-        assert session.correct(held)
-        events = session.receive(board.receive(session.outgoing(), now), 0, 0)
-        (answer,) = (event for event in events if isinstance(event, Answer))
-        assert bits(answer.correction.corrected) == bits(mitigation.correct(held))
+        (frame,) = decoder.feed(board.receive(host.encode(kind, payload), now))
+        assert frame.flags == Flag.ANSWER
+        assert bits(messages.decode(frame.type, frame.payload).corrected) == bits(mitigation.correct(held))
 
 
 def test_a_measurement_the_board_cannot_correct_comes_back_raw_with_its_status(mitigation):

@@ -36,4 +36,4 @@ def test_the_session_target_reaches_a_connection():
     host = link_targets.BoardSession()
     host.receive(link_targets._made_up(kind, script), 0, 0)
 
-    assert host.state is link_targets.State.READY
+    assert host.state is link_targets.LinkState.READY

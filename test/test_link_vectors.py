@@ -14,10 +14,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from uwb_mitigation.link import layout, messages
+from uwb_mitigation.link import layout, messages, radio
 from uwb_mitigation.link.framing import Frame, FrameDecoder, encode_frame
-from uwb_mitigation.link.layout import Flag, LogLevel, MessageType, Mode
+from uwb_mitigation.link.layout import Flag, LogLevel, MessageType, Mode, RadioState, Role
+from uwb_mitigation.link.offsets import OffsetsAnswer, SetOffsets
+from uwb_mitigation.link.radio import RadioSettings
 from uwb_mitigation.measurement import Cir, CorrectedRange, Encoding, Origin, RangeMeasurement, Status
+from uwb_mitigation.offsets import Offsets
 
 FILE = Path(__file__).parent / "data" / "link_vectors.txt"
 
@@ -110,6 +113,67 @@ SENT = {
         Flag.ANSWER,
         9,
         0,
+    ),
+}
+
+
+SETTINGS = RadioSettings(
+    role=Role.ANCHOR,
+    address=0x0102030405060708,
+    pan=0x1234,
+    channel=2,
+    prf_mhz=16,
+    preamble=1024,
+    preamble_code=4,
+    rate_kbps=110,
+    decawave_sfd=True,
+    tx_power=0x15355575,
+    antenna_delay=32872,
+    window=1016,
+    anchors=(1, 2**63 + 1),
+    reply_us=15_000,
+    patience_us=60_000,
+    interval_us=100_000,
+    report=True,
+    bias_correction=True,
+)
+SENT |= {
+    "set_offsets": (
+        SetOffsets(Offsets(0.125, {2: 0.25}, {2**63 + 1: -0.5}, {(7, 3): 10.0})),
+        0,
+        4,
+        0,
+    ),
+    "offsets": (OffsetsAnswer(4, 64, True), Flag.ANSWER, 13, 9_000_000),
+    "get_radio": (radio.GetRadio(), 0, 2, 0),
+    "set_radio": (radio.SetRadio(SETTINGS), 0, 3, 0),
+    "radio": (radio.Radio(SETTINGS, 3), Flag.ANSWER, 10, 8_000_000),
+    "radio_refused": (
+        radio.Radio(RadioSettings(), 3, False, "more anchors than 32"),
+        Flag.ANSWER,
+        11,
+        8_000_000,
+    ),
+    "radio_status": (
+        radio.RadioStatus(
+            28,
+            7,
+            6,
+            5,
+            4,
+            3,
+            2,
+            1,
+            9,
+            10,
+            31.5,
+            3.25,
+            RadioState.BUS,
+            (radio.AnchorInReach(1, 20, 7, -80.5, 12), radio.AnchorInReach(2**64 - 2, 8, 0, math.nan, None)),
+        ),
+        0,
+        12,
+        9_000_000,
     ),
 }
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from uwb_mitigation.link import messages
 from uwb_mitigation.link.board import Board, Identity
-from uwb_mitigation.link.events import State
+from uwb_mitigation.link.events import LinkState
 from uwb_mitigation.link.framing import Frame, FrameDecoder, encode_frame
 from uwb_mitigation.link.layout import MAX_ENCODED_BYTES, MAX_PAYLOAD_BYTES, Mode
 from uwb_mitigation.link.session import BoardSession
@@ -62,7 +62,7 @@ def session(data: bytes) -> None:
         if kind % 16 == 14:
             host.closed(now)
         assert len(host.outgoing()) <= 1 << 17
-        assert (host.hello is not None) == (host.state is State.READY)
+        assert (host.hello is not None) == (host.state is LinkState.READY)
         assert len(host.clock._times) <= 1024
 
 

@@ -13,6 +13,7 @@ from uwb_mitigation.errors import LinkError
 from uwb_mitigation.link import messages
 from uwb_mitigation.link.framing import Frame, FrameDecoder, FrameEncoder
 from uwb_mitigation.link.layout import (
+    MAX_OFFSETS,
     MAX_PAYLOAD_BYTES,
     PROTOCOL_VERSION,
     Flag,
@@ -29,7 +30,9 @@ from uwb_mitigation.link.messages import (
     TimeSync,
     TimeSyncReply,
 )
+from uwb_mitigation.link.offsets import OffsetsAnswer, SetOffsets
 from uwb_mitigation.measurement import CorrectedRange, RangeMeasurement
+from uwb_mitigation.offsets import NO_OFFSETS, Offsets
 
 STATUS_INTERVAL_US = 1_000_000
 
@@ -38,6 +41,8 @@ _UNASKED = Flag(0)
 
 class Corrector(Protocol):
     """What corrects on the board, such as `Mitigation`."""
+
+    offsets: Offsets
 
     def correct(self, measurement: RangeMeasurement) -> CorrectedRange: ...
 
@@ -60,7 +65,8 @@ class Board:
 
     Args:
         identity: what HELLO says.
-        corrector: the board's model; None = it has none and refuses any mode but HOST.
+        corrector: the board's model; None = it has none and refuses any mode but HOST. Its offsets are those that
+            the host sets; none at the start.
         mode: the mode that it starts in.
         boot_id: differs from one start to the next.
         version: protocol version that it speaks; another than the host's shows a mismatch.
@@ -77,6 +83,8 @@ class Board:
     ) -> None:
         self._identity = identity
         self._corrector = corrector
+        if corrector is not None:
+            corrector.offsets = NO_OFFSETS
         self._boot_id = boot_id
         self._decoder = FrameDecoder()
         self._encoder = FrameEncoder(version)
@@ -143,6 +151,11 @@ class Board:
             if self._corrector is not None or message.mode is Mode.HOST:
                 self.mode = message.mode
             return self._hello(now_us, frame.sequence)
+        if isinstance(message, SetOffsets):
+            accepted = len(message.offsets) <= MAX_OFFSETS
+            if accepted and self._corrector is not None:
+                self._corrector.offsets = message.offsets
+            return self._send(OffsetsAnswer(frame.sequence, MAX_OFFSETS, accepted), now_us, Flag.ANSWER)
         if isinstance(message, TimeSync):
             return self._send(TimeSyncReply(frame.sequence, now_us), now_us, Flag.ANSWER)
         if isinstance(message, RangeMeasurement) and self._corrector is not None:

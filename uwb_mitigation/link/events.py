@@ -8,10 +8,11 @@ from dataclasses import dataclass, field
 
 from uwb_mitigation.link.layout import Mode
 from uwb_mitigation.link.messages import BoardStatus, Correction, Hello, Log
+from uwb_mitigation.link.radio import Radio, RadioStatus
 from uwb_mitigation.measurement import RangeMeasurement
 
 
-class State(enum.Enum):
+class LinkState(enum.Enum):
     """Where the session stands."""
 
     CONNECTING = "waiting for the board's HELLO"
@@ -65,10 +66,17 @@ class ModeRefused:
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
-    """The board's correction of a measurement that `correct` sent; it bears that one's stamp."""
+class RadioRefused:
+    """The board does not use the settings of the radio that were asked for; `text` says why."""
 
-    correction: Correction
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class OffsetsRefused:
+    """The board does not use the offsets that were asked for; `text` says why. Its corrections are not delivered."""
+
+    text: str
 
 
 Event = (
@@ -79,9 +87,12 @@ Event = (
     | ModeRefused
     | RangeMeasurement
     | Correction
-    | Answer
     | Log
     | BoardStatus
+    | Radio
+    | RadioStatus
+    | RadioRefused
+    | OffsetsRefused
 )
 
 
@@ -96,6 +107,7 @@ class SessionCounts:
         unknown_types: of types that this version does not know, {type: count}.
         malformed: of a known type, but with impossible contents.
         wrong_model: corrections by another model than the expected one.
+        wrong_offsets: corrections that are not known to hold the offsets asked for.
         unasked: answers to nothing that was asked.
         unsent: requests dropped because what is to be sent piled up.
         connections: HELLOs that began a connection.
@@ -107,6 +119,7 @@ class SessionCounts:
     unknown_types: Counter[int] = field(default_factory=Counter)
     malformed: int = 0
     wrong_model: int = 0
+    wrong_offsets: int = 0
     unasked: int = 0
     unsent: int = 0
     connections: int = 0

@@ -34,9 +34,15 @@ class MessageType(enum.IntEnum):
     LOG = 4
     STATUS = 5
     TIME_SYNC_REPLY = 6
+    RADIO = 7
+    RADIO_STATUS = 8
+    OFFSETS = 9
     GET_INFO = 64
     SET_MODE = 65
     TIME_SYNC = 66
+    GET_RADIO = 67
+    SET_RADIO = 68
+    SET_OFFSETS = 69
 
 
 class Flag(enum.IntFlag):
@@ -55,6 +61,37 @@ class Mode(enum.IntEnum):
     """RANGE_CORRECTED only: the board corrects."""
     BOTH = 2
     """RANGE_CIR, then the RANGE_CORRECTED that belongs to it."""
+
+
+class Role(enum.IntEnum):
+    """What a board's radio does."""
+
+    TAG = 0
+    """Begins exchanges, with one anchor after the other."""
+    ANCHOR = 1
+    """Answers whoever begins one."""
+
+
+class RadioState(enum.IntEnum):
+    """Whether a board's radio works."""
+
+    RUNNING = 0
+    BUS = 1
+    """What joins it and the processor has failed."""
+    ABSENT = 2
+    """No DW1000 answers."""
+    NO_CLOCK = 3
+    """Its clock does not lock."""
+    RESTARTED = 4
+    """It was reset, and is being set up again."""
+
+
+class OffsetOf(enum.IntEnum):
+    """What an offset belongs to."""
+
+    ANCHOR = 0
+    TAG = 1
+    PAIR = 2
 
 
 class LogLevel(enum.IntEnum):
@@ -115,6 +152,59 @@ HEADER = Layout(
     ),
 )
 
+_RADIO_SETTINGS = (
+    Field("address", "Q", "of the radio; 0 in SET_RADIO = the chip's own"),
+    Field("antenna_delay", "I", "ticks, of transmitter and receiver together; 0 = as in the chip's memory"),
+    Field("tx_power", "I", "register TX_POWER; 0 = as in the chip's memory, else the manual's"),
+    Field("reply_us", "I", "from the reception of ANSWER to FINAL; 0 in SET_RADIO = the firmware's usual"),
+    Field("patience_us", "I", "how long a tag waits for an anchor's frames; 0 as above"),
+    Field("interval_us", "I", "between the beginnings of two exchanges, at least"),
+    Field("pan", "H", "network; radios of others are not heard"),
+    Field("rate", "H", "kbit/s: 110, 850, 6800"),
+    Field("preamble", "H", "symbols: 64 to 4096"),
+    Field("window", "H", "complex samples of a measurement; 0 = none, 1016 and more = all"),
+    Field("channel", "B", "1 to 5, 7"),
+    Field("prf", "B", "MHz: 16, 64"),
+    Field("preamble_code", "B", "0 = the first for channel and PRF"),
+    Field("decawave_sfd", "B", "0 = the standard's start-of-frame delimiter, 1 = Decawave's"),
+    Field("role", "B", "Role"),
+    Field("report", "B", "1 = an anchor gives its ranges to its host too"),
+    Field("bias_correction", "B", "1 = ranges are corrected for the power received (APS011)"),
+    Field("anchor_count", "B", "anchors that a tag is to poll; 0 = those that it finds"),
+    Field("reserved_too", "4x", ""),
+)
+"""What RADIO and SET_RADIO have in common."""
+
+RADIO_ANCHOR = Layout(
+    "RADIO_ANCHOR",
+    (
+        Field("address", "Q", "of the anchor"),
+        Field("tried", "I", "exchanges that began"),
+        Field("ranged", "I", "exchanges that gave a range"),
+        Field("rx_power", "f", "dBm, of its last frame; NaN = unknown"),
+        Field("heard_ms", "I", "since it was last heard; 4294967295 = never"),
+    ),
+)
+"""One anchor in the tail of a RADIO_STATUS."""
+
+MAX_ANCHORS = 32
+"""That a tag polls in turn."""
+
+OFFSET = Layout(
+    "OFFSET",
+    (
+        Field("tag_id", "Q", "of no meaning for an anchor's"),
+        Field("anchor_id", "Q", "of no meaning for a tag's"),
+        Field("offset", "f", "m, -10 to 10"),
+        Field("of", "B", "OffsetOf"),
+        Field("reserved", "3x", ""),
+    ),
+)
+"""One offset in the tail of a SET_OFFSETS."""
+
+MAX_OFFSETS = 64
+"""That a board keeps beside its default."""
+
 PAYLOADS = {
     MessageType.HELLO: Layout(
         "HELLO",
@@ -168,7 +258,7 @@ PAYLOADS = {
             Field("model_id", "I", "identity of the model that corrected; 0 = none"),
             Field("range", "f", "m, corrected; NaN = no valid range"),
             Field("range_raw", "f", "m, as measured"),
-            Field("correction", "f", "m, predicted error; 0 when passed through"),
+            Field("correction", "f", "m, offset + predicted error; the offset alone when passed through"),
             Field("variance", "f", "m^2; infinite where the range is not valid"),
             Field("compute_us", "I", "time that the correction took on the board"),
             Field("status", "B", "0 OK, 1 NO_CIR, 2 BAD_CIR, 3 OUT_OF_DISTRIBUTION, 4 MODEL_ERROR"),
@@ -200,11 +290,62 @@ PAYLOADS = {
             Field("received_us", "Q", "board's uptime when the TIME_SYNC's last byte was received"),
         ),
     ),
+    MessageType.RADIO: Layout(
+        "RADIO",
+        (
+            Field("request_sequence", "I", "with ANSWER: sequence of the host's frame answered"),
+            Field("accepted", "B", "0 = SET_RADIO was refused, and the text says why"),
+            Field("reserved", "3x", ""),
+            *_RADIO_SETTINGS,
+        ),
+        tail="anchor_count addresses, u64, then text, UTF-8, to the payload's end",
+    ),
+    MessageType.RADIO_STATUS: Layout(
+        "RADIO_STATUS",
+        (
+            Field("tried", "I", "exchanges that began; the sum of the seven that follow"),
+            Field("ranged", "I", "exchanges that gave a range"),
+            Field("no_answer", "I", "lost: POLL was not answered"),
+            Field("late", "I", "lost: FINAL could not be sent in time"),
+            Field("time_out", "I", "lost: FINAL or REPORT did not come"),
+            Field("damaged", "I", "lost: what came was no intact frame"),
+            Field("absurd", "I", "lost: stamps that no exchange can have"),
+            Field("broken", "I", "lost: the chip was reset meanwhile, or its bus failed"),
+            Field("refused", "I", "frames that belonged to no exchange of this radio"),
+            Field("restarts", "I", "of the chip, but for the first"),
+            Field("temperature", "f", "of the chip, degrees Celsius; NaN = not measured"),
+            Field("voltage", "f", "of the chip, V; NaN = not measured"),
+            Field("state", "B", "RadioState"),
+            Field("anchor_count", "B", "anchors that the tail tells of"),
+            Field("reserved", "6x", ""),
+        ),
+        tail="anchor_count times RADIO_ANCHOR",
+    ),
+    MessageType.OFFSETS: Layout(
+        "OFFSETS",
+        (
+            Field("request_sequence", "I", "sequence of the SET_OFFSETS answered"),
+            Field("slots", "H", "offsets that the board can keep beside the default"),
+            Field("accepted", "B", "0 = they were too many: those before stay in force"),
+            Field("reserved", "1x", ""),
+        ),
+    ),
     MessageType.GET_INFO: Layout("GET_INFO", ()),
     MessageType.SET_MODE: Layout(
         "SET_MODE", (Field("mode", "B", "Mode wanted"), Field("reserved", "7x", ""))
     ),
     MessageType.TIME_SYNC: Layout("TIME_SYNC", ()),
+    MessageType.GET_RADIO: Layout("GET_RADIO", ()),
+    MessageType.SET_RADIO: Layout("SET_RADIO", _RADIO_SETTINGS, tail="anchor_count addresses, u64"),
+    MessageType.SET_OFFSETS: Layout(
+        "SET_OFFSETS",
+        (
+            Field("default_offset", "f", "m, of pairs that nothing in the tail names, -10 to 10"),
+            Field("count", "H", "offsets in the tail"),
+            Field("reserved", "2x", ""),
+        ),
+        tail="count times OFFSET",
+    ),
 }
 """Every message type and its payload. A payload may be longer than its layout, never shorter."""
 
@@ -242,17 +383,22 @@ def c_header() -> str:
         f"#define UWB_MAX_PAYLOAD_BYTES {MAX_PAYLOAD_BYTES}",
         f"#define UWB_MAX_FRAME_BYTES {MAX_FRAME_BYTES}",
         f"#define UWB_MAX_ENCODED_BYTES {MAX_ENCODED_BYTES}",
+        f"#define UWB_MAX_ANCHORS {MAX_ANCHORS}",
+        f"#define UWB_MAX_OFFSETS {MAX_OFFSETS}",
         "",
     ]
     for prefix, members in (
         ("TYPE", MessageType),
         ("FLAG", Flag),
         ("MODE", Mode),
+        ("ROLE", Role),
+        ("RADIO_STATE", RadioState),
+        ("OFFSET_OF", OffsetOf),
         ("LOG_LEVEL", LogLevel),
     ):
         lines += [f"#define UWB_{prefix}_{member.name} {member.value}" for member in members]
         lines.append("")
-    for layout in (HEADER, *PAYLOADS.values()):
+    for layout in (HEADER, RADIO_ANCHOR, OFFSET, *PAYLOADS.values()):
         if layout.fields:
             lines += _c_struct(layout)
     lines += ["#endif", ""]

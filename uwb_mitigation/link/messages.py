@@ -16,6 +16,24 @@ import numpy as np
 
 from uwb_mitigation.errors import LinkError, ParameterError
 from uwb_mitigation.link.layout import MAX_SAMPLES, PAYLOADS, LogLevel, MessageType, Mode
+from uwb_mitigation.link.offsets import (
+    OffsetsAnswer,
+    SetOffsets,
+    decode_offsets,
+    decode_set_offsets,
+    encode_offsets,
+)
+from uwb_mitigation.link.radio import (
+    GetRadio,
+    Radio,
+    RadioStatus,
+    SetRadio,
+    decode_radio,
+    decode_radio_status,
+    decode_set_radio,
+    encode_radio,
+    encode_radio_status,
+)
 from uwb_mitigation.measurement import (
     DEVICE_TIME_WRAP,
     Cir,
@@ -128,7 +146,21 @@ class TimeSync:
 
 
 Message = (
-    Hello | RangeMeasurement | Correction | Log | BoardStatus | TimeSyncReply | SetMode | GetInfo | TimeSync
+    Hello
+    | RangeMeasurement
+    | Correction
+    | Log
+    | BoardStatus
+    | TimeSyncReply
+    | Radio
+    | RadioStatus
+    | SetMode
+    | GetInfo
+    | TimeSync
+    | GetRadio
+    | SetRadio
+    | OffsetsAnswer
+    | SetOffsets
 )
 
 
@@ -194,10 +226,18 @@ def _encode(message: Message) -> tuple[MessageType, bytes]:
         )
     if isinstance(message, TimeSyncReply):
         return _pack(MessageType.TIME_SYNC_REPLY, message.request_sequence, message.received_us)
+    if isinstance(message, Radio | SetRadio):
+        return encode_radio(message)
+    if isinstance(message, RadioStatus):
+        return encode_radio_status(message)
+    if isinstance(message, SetOffsets | OffsetsAnswer):
+        return encode_offsets(message)
     if isinstance(message, SetMode):
         return _pack(MessageType.SET_MODE, message.mode)
     if isinstance(message, GetInfo):
         return _pack(MessageType.GET_INFO)
+    if isinstance(message, GetRadio):
+        return _pack(MessageType.GET_RADIO)
     return _pack(MessageType.TIME_SYNC)
 
 
@@ -376,6 +416,12 @@ _decoders: dict[MessageType, Callable[[bytes, tuple[Any, ...], int], Message]] =
     MessageType.SET_MODE: _decode_set_mode,
     MessageType.GET_INFO: lambda *_: GetInfo(),
     MessageType.TIME_SYNC: lambda *_: TimeSync(),
+    MessageType.RADIO: decode_radio,
+    MessageType.RADIO_STATUS: decode_radio_status,
+    MessageType.GET_RADIO: lambda *_: GetRadio(),
+    MessageType.SET_RADIO: decode_set_radio,
+    MessageType.OFFSETS: decode_offsets,
+    MessageType.SET_OFFSETS: decode_set_offsets,
 }
 
 

@@ -6,6 +6,7 @@ What the bytes mean is for `session`.
 from __future__ import annotations
 
 import contextlib
+import errno
 import math
 import os
 import select
@@ -19,11 +20,12 @@ import serial
 from serial.tools import list_ports
 
 from uwb_mitigation.errors import ParameterError
-from uwb_mitigation.link.events import Event, State
+from uwb_mitigation.link.events import Event, LinkState
 from uwb_mitigation.link.layout import Mode
 from uwb_mitigation.link.messages import Hello
+from uwb_mitigation.link.radio import RadioSettings
 from uwb_mitigation.link.session import BoardSession
-from uwb_mitigation.measurement import RangeMeasurement
+from uwb_mitigation.offsets import Offsets
 
 FIRST_RETRY_S = 0.1
 LAST_RETRY_S = 0.5
@@ -159,36 +161,37 @@ class BoardPort:
         self._thread.start()
 
     def get(self, timeout_s: float) -> Event | None:
-        """The next event, or None if there is none within the time or the port is closed."""
+        """The next event, or None if there is none within the time.
+
+        Once the port is closed it is None at once: events that were still waiting are void.
+        """
         with self._arrived:
             self._arrived.wait_for(lambda: self._events or self._stop.is_set(), timeout_s)
-            return self._events.popleft() if self._events else None
+            return self._events.popleft() if self._events and not self._stop.is_set() else None
 
     def set_mode(self, mode: Mode) -> None:
         """See `BoardSession.set_mode`."""
         with self._arrived:
             self._session.set_mode(mode)
 
-    def correct(self, measurement: RangeMeasurement) -> bool:
-        """See `BoardSession.correct`."""
+    def set_radio(self, settings: RadioSettings) -> None:
+        """See `BoardSession.set_radio`."""
         with self._arrived:
-            return self._session.correct(measurement)
+            self._session.set_radio(settings)
+
+    def set_offsets(self, offsets: Offsets) -> None:
+        """See `BoardSession.set_offsets`."""
+        with self._arrived:
+            self._session.set_offsets(offsets)
 
     def report(self) -> PortReport:
         """How things stand."""
         with self._arrived:
             session = self._session
             decoder, counts = session.decoder_counts, session.counts
-            problem = self._problem
-            if not problem and session.state is State.WRONG_VERSION:
-                problem = f"{session.state.value}: {session.foreign_version}"
-            elif not problem and session.state is not State.READY:
-                problem = session.state.value
-            elif not problem and not session.model_matches:
-                problem = "the board holds another model than the expected one"
             return PortReport(
                 port=self._port,
-                problem=problem,
+                problem=self._problem_now(),
                 hello=session.hello,
                 clock_offset_s=session.clock.offset_ns / 1e9,
                 clock_drift_ppm=session.clock.drift * 1e6,
@@ -205,6 +208,7 @@ class BoardPort:
                     "unknown_type": counts.unknown_types.total(),
                     "malformed": counts.malformed,
                     "wrong_model": counts.wrong_model,
+                    "wrong_offsets": counts.wrong_offsets,
                     "unasked": counts.unasked,
                     "unsent": counts.unsent,
                     "overflowed": self._overflowed,
@@ -212,6 +216,12 @@ class BoardPort:
                     "openings": self._openings,
                 },
             )
+
+    @property
+    def problem(self) -> str:
+        """As `report` has it."""
+        with self._arrived:
+            return self._problem_now()
 
     @property
     def closed(self) -> bool:
@@ -258,7 +268,9 @@ class BoardPort:
             port.open()
         except (OSError, ValueError) as error:
             # SerialException is an OSError; a ValueError is a baud rate that the port refuses.
-            self._say(f"{self._address} cannot be opened: {error}")
+            forbidden = getattr(error, "errno", None) == errno.EACCES
+            fix = " (sudo usermod -aG dialout $USER, then log in again)" if forbidden else ""
+            self._say(f"{self._address} cannot be opened: {error}{fix}")
             return None
         with contextlib.suppress(OSError, ValueError, NotImplementedError):
             # Bridges hold bytes back for 16 ms otherwise. Other ports do not know the flag.
@@ -303,6 +315,16 @@ class BoardPort:
             self._events.popleft()
             self._overflowed += 1
         self._arrived.notify_all()
+
+    def _problem_now(self) -> str:
+        session = self._session
+        if self._problem:
+            return self._problem
+        if session.state is LinkState.WRONG_VERSION:
+            return f"{session.state.value}: {session.foreign_version}"
+        if session.state is not LinkState.READY:
+            return str(session.state.value)
+        return "" if session.model_matches else "the board holds another model than the expected one"
 
     def _say(self, problem: str) -> None:
         with self._arrived:

@@ -6,28 +6,31 @@ owns the port calls `receive` after each read, `tick` at least ten times a secon
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TypeVar
 
 from uwb_mitigation.errors import LinkError
 from uwb_mitigation.link import messages
 from uwb_mitigation.link.clock import DeviceClock
 from uwb_mitigation.link.events import (
-    Answer,
     Connected,
     Disconnected,
     Event,
+    LinkState,
     Loss,
     ModeChanged,
     ModeRefused,
+    OffsetsRefused,
+    RadioRefused,
     SessionCounts,
-    State,
     VersionMismatch,
 )
 from uwb_mitigation.link.framing import DecoderCounts, Frame, FrameDecoder, FrameEncoder
 from uwb_mitigation.link.layout import Flag, MessageType, Mode
 from uwb_mitigation.link.messages import BoardStatus, Correction, Hello, Log, TimeSyncReply
+from uwb_mitigation.link.offsets import OffsetsAnswer, SetOffsets
+from uwb_mitigation.link.radio import GetRadio, Radio, RadioSettings, RadioStatus, SetRadio
 from uwb_mitigation.measurement import RangeMeasurement
+from uwb_mitigation.offsets import Offsets
 
 _MS = 10**6
 REQUEST_INTERVAL_NS = 500 * _MS
@@ -45,6 +48,9 @@ SILENCE_NS = 3000 * _MS
 
 MAX_GAP = 1 << 20
 """More frames missing at once than a link can carry in any silence: the numbers are those of another start."""
+
+RADIO_TRIES = 6
+"""A board that has not answered so many wishes for its radio, or for offsets, does not know them."""
 
 _MAX_STALE = 3
 _MAX_AWAITED = 1024
@@ -71,6 +77,7 @@ class BoardSession:
     Attributes:
         state: where the session stands.
         hello: what the board last said of itself; None while not connected.
+        radio: what it last said of its radio; None while not connected, or where it says nothing.
         foreign_version: with WRONG_VERSION, the version that the board speaks.
         last_malformed: what was wrong with the last frame counted as malformed.
         counts: of frames; those of damaged bytes are in `decoder_counts`.
@@ -78,8 +85,9 @@ class BoardSession:
     """
 
     def __init__(self, *, mode: Mode | None = None, expected_model_id: int | None = None) -> None:
-        self.state = State.CONNECTING
+        self.state = LinkState.CONNECTING
         self.hello: Hello | None = None
+        self.radio: Radio | None = None
         self.foreign_version: int | None = None
         self.last_malformed = ""
         self.counts = SessionCounts()
@@ -91,12 +99,18 @@ class BoardSession:
         self._mode = mode
         self._mode_pending: Mode | None = None
         self._mode_requests: dict[int, None] = {}
+        self._radio_wanted: RadioSettings | None = None
+        self._radio_requests: dict[int, None] = {}
+        self._radio_tries = 0
+        self._offsets_wanted: Offsets | None = None
+        self._offsets_requests: dict[int, None] = {}
+        self._offsets_tries = 0
+        self._offsets_held = False
         self._boot: tuple[int, int] | None = None
         self._next_request_ns = 0
         self._next_sync_ns = 0
         self._syncs = 0
         self._syncs_sent: dict[int, int] = {}
-        self._awaited: dict[tuple[int, int, int, int], int] = {}
         self._next_sequence = 0
         self._stale_run = 0
         self._foreign_frames = 0
@@ -138,27 +152,29 @@ class BoardSession:
         self._mode_requests.clear()
         self._next_request_ns = 0
 
-    def correct(self, measurement: RangeMeasurement) -> bool:
-        """Have the board correct `measurement`; an `Answer` follows if it is lost on neither way.
-
-        Returns False, and sends nothing, while not connected or while too much waits to be sent.
+    def set_radio(self, settings: RadioSettings) -> None:
+        """Ask the board, now and after each of its starts, to use `settings`; a `Radio` or `RadioRefused` follows.
 
         Raises:
-            ParameterError: the measurement does not fit a frame.
-            LinkError: it is longer than the board accepts.
+            ParameterError: no radio has such settings.
         """
-        kind, payload = messages.encode(measurement)
-        if self.hello is None:
-            return False
-        if len(payload) > self.hello.max_payload:
-            raise LinkError(
-                f"a measurement of {len(payload)} bytes for the board {self.hello.board_id:#x}",
-                valid=f"at most {self.hello.max_payload}",
-            )
-        if self._send(kind, payload) is None:
-            return False
-        _remember(self._awaited, _identity(measurement), measurement.stamp_ns)
-        return True
+        settings.check()
+        self._radio_wanted = settings
+        self._radio_tries = 0
+        self._radio_requests.clear()
+        self._next_request_ns = 0
+
+    def set_offsets(self, offsets: Offsets) -> None:
+        """Ask the board, now and after each of its starts, to take these off its ranges.
+
+        Until it says that it does, its corrections are counted and not delivered. A board that cannot is told of by
+        `OffsetsRefused`, but for offsets of 0, which such a board has.
+        """
+        self._offsets_wanted = offsets
+        self._offsets_held = False
+        self._offsets_tries = 0
+        self._offsets_requests.clear()
+        self._next_request_ns = 0
 
     def outgoing(self) -> bytes:
         """Take what is to be sent; to be called, and its bytes sent, right after `receive` and `tick`."""
@@ -180,17 +196,22 @@ class BoardSession:
     def tick(self, now_ns: int, stamp_ns: int) -> list[Event]:
         """Let time pass: repeat requests, keep the clock, notice silence."""
         events: list[Event] = []
-        if self.state is State.READY and self.silent_ns(now_ns) > SILENCE_NS:
+        if self.state is LinkState.READY and self.silent_ns(now_ns) > SILENCE_NS:
             events += self._disconnect(Loss.SILENT, now_ns)
         if now_ns >= self._next_request_ns:
             self._next_request_ns = now_ns + REQUEST_INTERVAL_NS
-            if self.state is not State.READY:
+            if self.state is not LinkState.READY:
                 self._send(*messages.encode(messages.GetInfo()))
-            elif self._mode_pending is not None:
+                return events
+            if self._offsets_wanted is not None and self._offsets_tries <= RADIO_TRIES:
+                events += self._ask_offsets(self._offsets_wanted)
+            if self._mode_pending is not None:
                 request = self._send(*messages.encode(messages.SetMode(self._mode_pending)))
                 if request is not None:
                     _remember(self._mode_requests, request, None)
-        if self.state is State.READY and now_ns >= self._next_sync_ns:
+            elif self._radio_wanted is not None and self._radio_tries <= RADIO_TRIES:
+                events += self._ask_radio(self._radio_wanted)
+        if self.state is LinkState.READY and now_ns >= self._next_sync_ns:
             self._sync(now_ns, stamp_ns)
         return events
 
@@ -205,7 +226,7 @@ class BoardSession:
     def _understand(self, frame: Frame, now_ns: int, stamp_ns: int) -> list[Event]:
         if frame.type == MessageType.HELLO:
             return self._accept_hello(frame, now_ns, stamp_ns)
-        if self.state is not State.READY:
+        if self.state is not LinkState.READY:
             self.counts.withheld += 1
             return []
         if not self._in_step(frame):
@@ -219,7 +240,13 @@ class BoardSession:
         if isinstance(message, TimeSyncReply):
             self._accept_sync(message, frame.time_us, stamp_ns)
             return []
-        if isinstance(message, RangeMeasurement | Log | BoardStatus):
+        if isinstance(message, Radio):
+            return self._accept_radio(message, bool(frame.flags & Flag.ANSWER))
+        if isinstance(message, OffsetsAnswer):
+            return self._accept_offsets(message)
+        if isinstance(message, RadioStatus) and self.radio is None:
+            self._send(*messages.encode(GetRadio()))
+        if isinstance(message, RangeMeasurement | Log | BoardStatus | RadioStatus):
             return [message]
         # The host's own types are as strange from a board as those that nobody knows.
         self.counts.unknown_types[frame.type] += 1
@@ -230,7 +257,7 @@ class BoardSession:
         assert isinstance(hello, Hello)
         boot = (hello.board_id, hello.boot_id)
         events: list[Event] = []
-        if self.state is State.READY:
+        if self.state is LinkState.READY:
             if boot != self._boot:
                 events += self._disconnect(Loss.RESET, now_ns)
             elif not self._in_step(frame):
@@ -240,8 +267,8 @@ class BoardSession:
             self._boot = boot
         self.clock.arrival(frame.time_us, stamp_ns)
         self.hello = hello
-        if self.state is not State.READY:
-            self.state = State.READY
+        if self.state is not LinkState.READY:
+            self.state = LinkState.READY
             self.counts.connections += 1
             self.foreign_version = None
             self._next_sequence = (frame.sequence + 1) % _SEQUENCES
@@ -249,6 +276,8 @@ class BoardSession:
             self._syncs = 0
             self._next_sync_ns = now_ns
             self._mode_pending = None if self._mode == hello.mode else self._mode
+            self._radio_tries = self._offsets_tries = 0
+            self._offsets_held = False
             self._next_request_ns = now_ns
             events.append(Connected(hello))
         elif frame.flags & Flag.ANSWER and hello.request_sequence in self._mode_requests:
@@ -259,17 +288,58 @@ class BoardSession:
                 events.append(ModeChanged(wanted) if changed else ModeRefused(wanted, hello.mode))
         return events
 
+    def _ask_radio(self, wanted: RadioSettings) -> list[Event]:
+        self._radio_tries += 1
+        if self._radio_tries > RADIO_TRIES:
+            return [RadioRefused("its firmware knows no settings of a radio: flash a newer one, or set none")]
+        request = self._send(*messages.encode(SetRadio(wanted)))
+        if request is not None:
+            _remember(self._radio_requests, request, None)
+        return []
+
+    def _ask_offsets(self, wanted: Offsets) -> list[Event]:
+        self._offsets_tries += 1
+        if self._offsets_tries > RADIO_TRIES:
+            text = "its firmware knows no offsets: flash a newer one, or correct on the host"
+            return [OffsetsRefused(text)] if wanted else []
+        request = self._send(*messages.encode(SetOffsets(wanted)))
+        if request is not None:
+            _remember(self._offsets_requests, request, None)
+        return []
+
+    def _accept_offsets(self, answer: OffsetsAnswer) -> list[Event]:
+        if answer.request_sequence not in self._offsets_requests:
+            self.counts.unasked += 1
+            return []
+        self._offsets_requests.clear()
+        self._offsets_tries = RADIO_TRIES + 1
+        self._offsets_held = answer.accepted
+        if answer.accepted or self._offsets_wanted is None:
+            return []
+        text = f"it keeps {answer.slots} offsets, and {len(self._offsets_wanted)} were asked for"
+        return [OffsetsRefused(text)]
+
+    def _accept_radio(self, radio: Radio, answer: bool) -> list[Event]:
+        if answer and radio.request_sequence in self._radio_requests:
+            self._radio_requests.clear()
+            self._radio_tries = RADIO_TRIES + 1
+            if not radio.accepted:
+                return [RadioRefused(radio.text)]
+        self.radio = radio
+        return [radio]
+
     def _accept_correction(self, correction: Correction, answer: bool) -> list[Event]:
         if not self.model_matches:
             self.counts.wrong_model += 1
             return []
-        if not answer:
-            return [correction]
-        stamp_ns = self._awaited.pop(_identity(correction), None)
-        if stamp_ns is None:
+        if self._offsets_wanted and not self._offsets_held:
+            self.counts.wrong_offsets += 1
+            return []
+        if answer:
+            # This host asks no board to correct for it.
             self.counts.unasked += 1
             return []
-        return [Answer(replace(correction, stamp_ns=stamp_ns))]
+        return [correction]
 
     def _accept_sync(self, reply: TimeSyncReply, replied_us: int, stamp_ns: int) -> None:
         sent_ns = self._syncs_sent.pop(reply.request_sequence, None)
@@ -297,21 +367,24 @@ class BoardSession:
         self._foreign_frames = seen
         version = counts.last_foreign_version
         # A connected board of the right version may be preceded in the buffers by what ran before it.
-        if self.state is State.READY or version is None:
+        if self.state is LinkState.READY or version is None:
             return []
         self._heard_ns = now_ns
-        if self.state is State.WRONG_VERSION and version == self.foreign_version:
+        if self.state is LinkState.WRONG_VERSION and version == self.foreign_version:
             return []
-        self.state = State.WRONG_VERSION
+        self.state = LinkState.WRONG_VERSION
         self.foreign_version = version
         return [VersionMismatch(version)]
 
     def _disconnect(self, loss: Loss, now_ns: int) -> list[Event]:
-        was_ready = self.state is State.READY
-        self.state = State.CONNECTING
+        was_ready = self.state is LinkState.READY
+        self.state = LinkState.CONNECTING
         self.hello = None
+        self.radio = None
         self.foreign_version = None
         self._mode_requests.clear()
+        self._radio_requests.clear()
+        self._offsets_requests.clear()
         self._syncs_sent.clear()
         self._next_request_ns = now_ns
         return [Disconnected(loss)] if was_ready else []
@@ -334,10 +407,6 @@ class BoardSession:
         sequence = self._encoder.sequence
         self._outgoing += self._encoder.encode(kind, payload)
         return sequence
-
-
-def _identity(exchange: RangeMeasurement | Correction) -> tuple[int, int, int, int]:
-    return exchange.tag_id, exchange.anchor_id, exchange.sequence, exchange.device_time
 
 
 def _remember(memory: dict[_Key, _Value], key: _Key, value: _Value) -> None:

@@ -1,0 +1,116 @@
+"""`uwb-mitigation antenna-delay`: the delay of emulated boards is found again, and what is no calibration refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import command_line
+import numpy as np
+import pytest
+import yaml
+
+from uwb_mitigation.dw1000_model.evb1000 import EmulatedEvb1000s
+from uwb_mitigation.errors import UwbMitigationError
+from uwb_mitigation.link.layout import Role
+from uwb_mitigation.link.radio import RadioSettings
+from uwb_mitigation.radio.antenna_delay import find
+from uwb_mitigation.radio.opening import opener
+from uwb_mitigation.radio.port import RadioPort
+
+NOMINAL = 2 * 16436
+needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc")
+
+
+def around(middle_m: float, sd_m: float, n: int = 400) -> np.ndarray:
+    return middle_m + sd_m * np.random.default_rng(1).standard_normal(n)
+
+
+@pytest.mark.parametrize("radios", [1, 2])
+def test_the_offset_is_shared_by_the_radios_that_are_calibrated(radios: int):
+    # 1 tick too few in one radio, 2.35 mm too far (APS014).
+    found = find(around(5.01 + 0.235, 0.001), np.full(400, 3.0), 5.01, [NOMINAL] * radios)
+    assert abs(found.antenna_delay - NOMINAL - 100 / radios) <= 1
+    assert abs(found.offset_m - 0.235) < 0.001
+
+
+@pytest.mark.parametrize(
+    ("ranges", "gap_db", "says"),
+    [
+        (around(5.0, 0.3), 3.0, "scatter"),
+        (np.where(np.arange(400) % 3 > 0, 5.0, 6.0), 3.0, "scatter"),
+        (around(5.0, 0.02), 9.0, "line of sight"),
+        (around(5.0, 0.02), float("nan"), "line of sight"),
+        (around(200.0, 0.02), 3.0, "an antenna delay of"),
+    ],
+)
+def test_what_is_no_calibration_is_refused(ranges: np.ndarray, gap_db: float, says: str):
+    with pytest.raises(UwbMitigationError, match=says):
+        find(ranges, np.full(400, gap_db), 5.01, [NOMINAL, NOMINAL])
+
+
+@needs_compiler
+def test_the_delay_of_a_pair_is_found_and_written(tmp_path: Path):
+    # The modelled chips hold it in their memory: the radios are told to pass over that.
+    truth = NOMINAL + 173
+    with EmulatedEvb1000s(boards=2, antenna_delay=truth) as boards:
+        done = command_line.start(
+            "antenna-delay", "--distance", 3.0, "--port", ",".join(boards.ports), "--exchanges", 40, "--start", NOMINAL,
+            "-o", "found.yaml", "--json", "found.json", folder=tmp_path,
+        )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    written = yaml.safe_load((tmp_path / "found.yaml").read_text())["/**"]["ros__parameters"]
+    assert abs(written["radio.antenna_delay"] - truth) <= 2
+    told = json.loads((tmp_path / "found.json").read_text())
+    assert told["before"] == NOMINAL
+    assert told["antenna_delay"] == written["radio.antenna_delay"]
+    assert "--params-file found.yaml" in done.stdout
+
+
+@needs_compiler
+def test_a_tag_alone_takes_all_of_the_offset(tmp_path: Path):
+    with EmulatedEvb1000s(boards=2, antenna_delay=NOMINAL + 60, clean_m=5.01) as boards:
+        anchor = RadioPort(
+            opener("evb1000", boards.ports[1]), RadioSettings(role=Role.ANCHOR, antenna_delay=NOMINAL)
+        )
+        try:
+            done = command_line.run(
+                "antenna-delay", "--distance", 5.01, "--port", boards.ports[0], "--exchanges", 40, "--start", NOMINAL,
+                "--json", "found.json", folder=tmp_path,
+            )  # fmt: skip
+        finally:
+            anchor.close()
+    assert done.returncode == 0, done.stderr
+    told = json.loads((tmp_path / "found.json").read_text())
+    assert abs(told["antenna_delay"] - (NOMINAL + 120)) <= 2
+    assert f"radio.antenna_delay: {told['antenna_delay']}" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (("--distance", "0", "--port", "/dev/a"), "0.3 to 100 m"),
+        (("--distance", "5", "--port", "/dev/a,/dev/a"), "anchor's"),
+        (("--distance", "5", "--port", ","), "anchor's"),
+        (("--distance", "5", "--port", "/dev/a", "--channel", "6"), "channel"),
+        (("--distance", "5", "--port", "/dev/a", "--anchor", "xyz"), "hexadecimal"),
+        (("--distance", "5", "--port", "/dev/a", "-o", "absent/file"), "a folder that is there"),
+    ],
+)
+def test_what_cannot_be_is_refused_at_once(options: tuple[str, ...], says: str, tmp_path: Path):
+    done = command_line.run("antenna-delay", *options, folder=tmp_path)
+    assert done.returncode == 1
+    assert says in done.stderr
+
+
+def test_a_radio_that_is_not_there_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    if shutil.which("cc") is None:
+        pytest.skip("no C compiler: apt install gcc")
+    monkeypatch.setattr("uwb_mitigation.radio.antenna_delay.PATIENCE_S", 0.3)
+    done = command_line.run(
+        "antenna-delay", "--distance", "5", "--port", tmp_path / "absent", folder=tmp_path
+    )
+    assert done.returncode == 1
+    assert "0 ranges of 200" in done.stderr
+    assert str(tmp_path / "absent") in done.stderr

@@ -1,0 +1,167 @@
+"""A board with a radio of its own, on modelled chips, as a host's session sees it: settings, status, ranges."""
+
+from __future__ import annotations
+
+import itertools
+import shutil
+
+import pytest
+
+from uwb_mitigation.dw1000_model.links import Link
+from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.link import messages
+from uwb_mitigation.link.board import Board, Identity
+from uwb_mitigation.link.events import Event, LinkState, RadioRefused
+from uwb_mitigation.link.layout import RadioState, Role
+from uwb_mitigation.link.radio import Radio, RadioSettings, RadioStatus, SetRadio
+from uwb_mitigation.link.session import BoardSession
+from uwb_mitigation.measurement import RangeMeasurement
+from uwb_mitigation.radio.modelled import Line, ModelledAir
+
+pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc")
+
+
+class Host:
+    """A session on the line of a modelled board, whose time is the air's."""
+
+    def __init__(self, air: ModelledAir, board: int, settings: RadioSettings | None = None) -> None:
+        self.air, self.board = air, board
+        self.session = BoardSession()
+        self.events: list[Event] = self.session.opened(0)
+        if settings is not None:
+            self.session.set_radio(settings)
+
+    def run(self, seconds: float) -> None:
+        for _ in range(round(seconds / 0.01)):
+            now_ns = round(self.air.run(0.01) * 1e9)
+            self.events += self.session.receive(self.air.read(self.board), now_ns, now_ns)
+            self.air.write(self.board, self.session.outgoing())
+
+    def seen(self, kind: type) -> list:
+        return [event for event in self.events if isinstance(event, kind)]
+
+
+def test_ranges_reach_the_host_with_stamps_of_their_reception():
+    with ModelledAir() as air:
+        tag = air.add(RadioSettings(), line=Line())
+        anchor = air.add(RadioSettings(role=Role.ANCHOR))
+        air.link(tag, anchor, Link(6))
+        host = Host(air, tag)
+        host.run(2)
+        ranges = host.seen(RangeMeasurement)
+        addresses = air.address(tag), air.address(anchor)
+    assert len(ranges) > 100
+    assert host.session.counts.lost == 0
+    last = ranges[-1]
+    assert (last.tag_id, last.anchor_id) == addresses
+    assert abs(last.range_m - 6) < 0.02
+    assert (len(last.cir), last.cir.channel, last.cir.prf_mhz) == (157, 5, 64)
+    assert all(later.stamp_ns > earlier.stamp_ns for earlier, later in itertools.pairwise(ranges))
+    assert 2e9 - last.stamp_ns < 0.06e9
+
+
+def test_a_board_tells_what_its_radio_is_and_how_it_fares():
+    with ModelledAir() as air:
+        tag = air.add(RadioSettings(window=16), line=Line())
+        anchor = air.add(RadioSettings(role=Role.ANCHOR))
+        air.link(tag, anchor, Link(6, loss=0.05))
+        host = Host(air, tag)
+        host.run(3)
+        addresses = air.address(tag), air.address(anchor)
+    radio = host.session.radio
+    assert radio is not None
+    settings = radio.settings
+    assert (settings.address, settings.antenna_delay, settings.preamble_code) == (addresses[0], 2 * 16436, 9)
+    assert settings.tx_power not in (0, 0xFFFFFFFF)
+    status = host.seen(RadioStatus)[-1]
+    assert status.state is RadioState.RUNNING
+    assert status.tried >= status.ranged > 50
+    assert status.no_answer + status.time_out > 0
+    assert abs(status.temperature_c - 25) < 3
+    assert abs(status.voltage - 3.3) < 0.1
+    (in_reach,) = status.anchors
+    assert in_reach.address == addresses[1]
+    assert -100 < in_reach.rx_power_dbm < -60
+    assert in_reach.heard_ms is not None
+    assert in_reach.heard_ms < 500
+
+
+def test_the_host_configures_the_radio_while_it_ranges():
+    wanted = RadioSettings(channel=2, prf_mhz=16, window=40, pan=7)
+    with ModelledAir() as air:
+        tag = air.add(RadioSettings(), line=Line())
+        anchor = air.add(RadioSettings(role=Role.ANCHOR, channel=2, prf_mhz=16, pan=7))
+        air.link(tag, anchor, Link(6))
+        host = Host(air, tag)
+        host.run(0.5)
+        assert not host.seen(RangeMeasurement)
+        host.session.set_radio(wanted)
+        host.run(1)
+        ranges = host.seen(RangeMeasurement)
+    assert not host.seen(RadioRefused)
+    assert host.session.radio is not None
+    assert host.session.radio.settings.channel == 2
+    assert len(ranges) > 50
+    assert (len(ranges[-1].cir), ranges[-1].cir.prf_mhz) == (40, 16)
+
+
+def test_a_board_takes_the_time_that_slow_frames_need():
+    slow = {"rate_kbps": 110, "preamble": 2048}
+    with ModelledAir() as air:
+        tag = air.add(RadioSettings(), line=Line())
+        anchor = air.add(RadioSettings(role=Role.ANCHOR, **slow, reply_us=15_000, patience_us=40_000))
+        air.link(tag, anchor, Link(6))
+        host = Host(air, tag, RadioSettings(**slow))
+        host.run(1.5)
+    assert not host.seen(RadioRefused)
+    assert len(host.seen(RangeMeasurement)) > 5
+
+
+def test_a_tag_becomes_an_anchor_and_reports():
+    with ModelledAir() as air:
+        tag = air.add(RadioSettings())
+        board = air.add(RadioSettings(), line=Line())
+        air.link(tag, board, Link(4))
+        host = Host(air, board, RadioSettings(role=Role.ANCHOR, report=True))
+        host.run(1.5)
+        assert {measured.anchor_id for measured in host.seen(RangeMeasurement)} == {air.address(board)}
+
+
+def test_settings_that_a_board_cannot_use_are_refused_in_words():
+    with ModelledAir() as air:
+        board = air.add(RadioSettings(), line=Line())
+        host = Host(air, board)
+        host.run(0.5)
+        _, payload = messages.encode(SetRadio(RadioSettings(channel=6)))
+        assert messages.decode(messages.MessageType.SET_RADIO, payload) == SetRadio(RadioSettings(channel=6))
+        host.session._radio_wanted = RadioSettings(channel=6)
+        host.run(1)
+        (refusal,) = host.seen(RadioRefused)
+        assert "channel" in refusal.text
+        assert host.session.radio is not None
+        assert host.session.radio.settings.channel == 5
+
+
+def test_no_radio_has_settings_that_are_refused_before_they_are_sent():
+    for wrong in ({"channel": 6}, {"pan": 0xFFFF}, {"preamble_code": 1}, {"anchors": (0,)}, {"reply_us": 1}):
+        with pytest.raises(ParameterError, match=next(iter(wrong))):
+            BoardSession().set_radio(RadioSettings(**wrong))
+
+
+def test_older_firmware_keeps_ranging_and_the_host_says_that_it_knows_no_radio():
+    board, session, events = Board(Identity()), BoardSession(), []
+    session.set_radio(RadioSettings())
+    for step in range(600):
+        now_ns = step * 10**7
+        events += session.receive(board.receive(session.outgoing(), now_ns // 1000), now_ns, now_ns)
+        board.tick(now_ns // 1000)
+    (refusal,) = [event for event in events if isinstance(event, RadioRefused)]
+    assert "flash" in refusal.text
+    assert session.state is LinkState.READY
+    assert session.radio is None
+
+
+def test_an_older_host_hears_of_a_radio_and_counts_what_it_does_not_know():
+    radio = messages.encode(Radio(RadioSettings()))
+    assert radio[0] not in (1, 2, 3, 4, 5, 6)
+    assert messages.decode(200, radio[1]) is None

@@ -1,0 +1,57 @@
+"""`make radio-demo`, short: emulated EVB1000s in the simulated flat, through driver and mitigator."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
+
+pytestmark = [
+    pytest.mark.ros,
+    pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc"),
+]
+
+COMMAND = [sys.executable, "-m", "uwb_mitigation.entry", "radio-demo", "--seconds"]
+
+
+def test_each_anchor_ranges_and_the_demo_ends_well():
+    done = subprocess.run([*COMMAND, "1"], capture_output=True, text=True, timeout=240, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    rows = [line.strip("│ ").split("│") for line in done.stdout.splitlines() if line.startswith("│")]
+    assert [int(row[0]) for row in rows] == [1, 2, 3, 4]
+    for _, count, raw, corrected, true in rows:
+        assert int(count) > 0
+        assert abs(float(raw) - float(true)) < 4.0
+        assert float(corrected) != float(raw)
+
+
+def test_ctrl_c_ends_it_with_its_nodes():
+    with subprocess.Popen([*COMMAND, "600"], stdout=subprocess.PIPE, text=True) as demo:
+        assert demo.stdout is not None
+        assert "all emulated" in demo.stdout.readline()
+        nodes = children(demo.pid)
+        assert len(nodes) >= 2
+        demo.send_signal(signal.SIGINT)
+        assert demo.wait(60) == 130
+    assert not any(Path(f"/proc/{node}").exists() for node in nodes)
+
+
+def test_without_a_range_it_says_so_and_fails():
+    program = (
+        "from uwb_mitigation.demos import radio_demo as d; d.PATIENCE_S = 0.1; d.typer.run(d.radio_demo)"
+    )
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 1
+    assert "no range within 0.1 s" in " ".join(done.stdout.split())
+
+
+def children(pid: int) -> list[str]:
+    """Processes that this one has started, Linux only."""
+    return Path(f"/proc/{pid}/task/{pid}/children").read_text().split()

@@ -1,0 +1,199 @@
+"""The node `driver` with radios at this computer: emulated EVB1000s behind USB-to-SPI, over real ROS 2."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import threading
+import tty
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import ros_harness
+from diagnostic_msgs.msg import DiagnosticStatus
+from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
+
+from uwb_mitigation.dw1000_model.evb1000 import EmulatedEvb1000s
+from uwb_mitigation.dw1000_model.links import Link
+from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.link.emulated_board import EmulatedBoard
+from uwb_mitigation.link.layout import Role
+from uwb_mitigation.link.radio import RadioSettings
+from uwb_mitigation.nodes.parameter_tables import DRIVER
+from uwb_mitigation.nodes.radio_feed import open_radios, settings_of
+from uwb_mitigation.radio.modelled import Line, ModelledAir
+from uwb_mitigation.sources.simulated import SimulatedSource
+
+pytestmark = [
+    pytest.mark.ros,
+    pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc"),
+]
+
+DEFAULTS = {row.name: row.default for row in DRIVER}
+
+
+@pytest.fixture
+def ros(tmp_path: Path) -> Iterator[ros_harness.Ros]:
+    with ros_harness.domain(tmp_path) as client:
+        yield client
+
+
+@pytest.fixture
+def boards(tmp_path: Path) -> Iterator[EmulatedEvb1000s]:
+    with EmulatedEvb1000s(None, boards=3, port_links=tmp_path / "radio") as emulated:
+        yield emulated
+
+
+def level_of(status: DiagnosticStatus) -> int:
+    return status.level[0] if isinstance(status.level, bytes) else status.level
+
+
+def facts_of(status: DiagnosticStatus) -> dict[str, str]:
+    return {fact.key: fact.value for fact in status.values}
+
+
+def test_a_tag_and_two_anchors_range_through_the_mitigator(
+    ros: ros_harness.Ros, boards: EmulatedEvb1000s, tmp_path: Path
+):
+    raw = ros.collect(RangeCir, "/uwb/range_raw")
+    corrected = ros.collect(RangeCorrected, "/uwb/range_corrected")
+    ros.start("mitigator")
+    ports = ",".join(str(tmp_path / f"radio{number}") for number in range(3))
+    ros.start("driver", "source:=evb1000", f"port:={ports}")
+    ros.spin_until(
+        lambda: len({message.anchor_id for message in corrected}) == 2 and len(corrected) >= 6 and bool(raw),
+        120.0,
+    )
+    message = raw[0]
+    assert len(message.cir.samples) == 2 * 157
+    assert message.cir.preamble_count > 0
+    assert np.isfinite([message.range, message.cir.rx_power, message.cir.first_path_power]).all()
+    status = ros.diagnosis("driver", lambda status: level_of(status) == 0 and "ranging" in status.message)
+    facts = facts_of(status)
+    assert int(facts["radio 0: ranged"]) > 0
+    assert sum(key.startswith("anchor ") and "dBm" in value for key, value in facts.items()) == 2
+
+
+def test_settings_are_applied_and_refused_live(
+    ros: ros_harness.Ros, boards: EmulatedEvb1000s, tmp_path: Path
+):
+    raw = ros.collect(RangeCir, "/uwb/range_raw")
+    ros.start("driver", "source:=evb1000", f"port:={tmp_path / 'radio0'},{tmp_path / 'radio1'}")
+    ros.spin_until(lambda: bool(raw), 120.0)
+    refused = ros.set_parameter("driver", "radio.channel", 6)
+    assert not refused.successful
+    assert "channel" in refused.reason
+    assert ros.set_parameter("driver", "radio.window", 32).successful
+    ros.spin_until(lambda: len(raw[-1].cir.samples) == 64, 120.0)
+
+
+def test_an_absent_board_is_told_and_waited_for(ros: ros_harness.Ros, tmp_path: Path):
+    driver = ros.start("driver", "source:=evb1000", f"port:={tmp_path / 'absent'}")
+    driver.wait_for_output("waiting for the radio")
+    status = ros.diagnosis("driver", lambda status: level_of(status) == 2)
+    assert str(tmp_path / "absent") in status.message
+    assert driver.exit_code() is None
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "named"),
+    [
+        ("radio.channel", 6, "channel"),
+        ("radio.prf", 32, "prf"),
+        ("radio.preamble", 100, "preamble"),
+        ("radio.data_rate", 111, "rate"),
+        ("radio.anchors", "12,xyz", "radio.anchors"),
+        ("radio.address", "0", "radio.address"),
+        ("radio.preamble_code", 3, "preamble_code"),
+    ],
+)
+def test_what_no_radio_has_is_refused_by_name(name: str, value: object, named: str):
+    with pytest.raises(ParameterError, match=named):
+        settings_of(lambda key: value if key == name else DEFAULTS[key])
+
+
+def test_parameters_that_nobody_set_ask_nothing_of_a_boards_radio():
+    assert settings_of(DEFAULTS.__getitem__) == RadioSettings()
+
+
+def test_a_port_is_asked_for():
+    for source, valid in (("evb1000", "/dev/ttyACM0"), ("spi", "/dev/spidev")):
+        values = DEFAULTS | {"source": source}
+        with pytest.raises(ParameterError, match=valid):
+            open_radios(values.__getitem__, lambda: 0)
+
+
+class ModelledBoard:
+    """A board with a radio: the firmware on a modelled chip, an anchor beside it, its UART on a pseudo-terminal."""
+
+    STEP_S = 0.005
+
+    def __init__(self, link: Path) -> None:
+        self._controller, port = os.openpty()
+        tty.setraw(port)
+        os.set_blocking(self._controller, False)
+        link.symlink_to(os.ttyname(port))
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        with ModelledAir() as air:
+            tag = air.add(RadioSettings(), line=Line())
+            near = air.add(RadioSettings(role=Role.ANCHOR))
+            far = air.add(RadioSettings(role=Role.ANCHOR, channel=2, prf_mhz=16))
+            air.link(tag, near, Link(5))
+            air.link(tag, far, Link(9))
+            waiting = b""
+            while not self._stop.wait(self.STEP_S):
+                with contextlib.suppress(BlockingIOError):
+                    air.write(tag, os.read(self._controller, 4096))
+                air.run(self.STEP_S)
+                waiting += air.read(tag)
+                with contextlib.suppress(BlockingIOError):
+                    waiting = waiting[os.write(self._controller, waiting) :]
+
+    def close(self) -> None:
+        self._stop.set()
+        self._thread.join()
+        os.close(self._controller)
+
+
+def test_the_radio_of_a_board_on_a_serial_line_is_configured_and_tells_how_it_fares(
+    ros: ros_harness.Ros, tmp_path: Path
+):
+    raw = ros.collect(RangeCir, "/uwb/range_raw")
+    board = ModelledBoard(tmp_path / "board")
+    try:
+        driver = ros.start("driver", "source:=serial", f"port:={tmp_path / 'board'}", "radio.window:=40")
+        ros.spin_until(lambda: bool(raw) and len(raw[-1].cir.samples) == 80, 120.0)
+        assert abs(raw[-1].range - 5) < 0.1
+        status = ros.diagnosis("driver", lambda status: int(facts_of(status).get("radio: ranged", 0)) > 0)
+        facts = facts_of(status)
+        assert level_of(status) == 0
+        assert (facts["radio: role"], facts["radio: antenna delay"]) == ("tag", str(2 * 16436))
+        assert "radio" in status.hardware_id
+        assert any(key.startswith("anchor ") and "dBm" in value for key, value in facts.items())
+
+        driver.wait_for_output("channel 5, 6800 kbit/s")
+        for name, value in (("radio.prf", 16), ("radio.channel", 2)):
+            assert ros.set_parameter("driver", name, value).successful
+        ros.spin_until(lambda: raw[-1].cir.prf == 16, 120.0)
+        assert abs(raw[-1].range - 9) < 0.1
+        driver.wait_for_output("channel 2, 6800 kbit/s")
+    finally:
+        board.close()
+
+
+def test_a_board_that_knows_no_radio_is_told_so_and_goes_on(ros: ros_harness.Ros, tmp_path: Path):
+    raw = ros.collect(RangeCir, "/uwb/range_raw")
+    with EmulatedBoard(SimulatedSource(seed=4, count=50), link=tmp_path / "board"):
+        driver = ros.start("driver", "source:=serial", f"port:={tmp_path / 'board'}", "radio.pan:=7")
+        status = ros.diagnosis("driver", lambda status: level_of(status) == 2 and "flash" in status.message)
+        assert "the radio's settings are not used" in status.message
+        driver.wait_for_output("the radio's settings are not used")
+        known = len(raw)
+        ros.spin_until(lambda: len(raw) > known)

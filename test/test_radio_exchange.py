@@ -1,0 +1,254 @@
+"""Driver and exchange of the firmware on modelled chips, in virtual time."""
+
+from __future__ import annotations
+
+import math
+import shutil
+
+import numpy as np
+import pytest
+
+from uwb_mitigation.dw1000_model.links import Link
+from uwb_mitigation.link.layout import Mode, Role
+from uwb_mitigation.link.radio import PREAMBLES, RadioSettings
+from uwb_mitigation.radio import modelled, structures
+from uwb_mitigation.radio.modelled import Line, ModelledAir
+
+pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc")
+
+WRAP = 1 << 40
+LOST = ("no_answer", "late", "time_out", "damaged", "absurd", "broken")
+
+
+def accumulator(samples: int = 1016, first_path: int = 745, seed: int = 0) -> np.ndarray:
+    """Noise, and a path of 8,000 with a tail, int16 (2 n,)."""
+    random = np.random.default_rng(seed)
+    iq = random.normal(0, 40, 2 * samples)
+    tail = 8000 * np.exp(-np.arange(60) / 12)
+    iq[2 * first_path : 2 * first_path + 120 : 2] += tail
+    iq[2 * first_path + 1 : 2 * first_path + 121 : 2] += 0.3 * tail
+    return iq.round().astype(np.int16)
+
+
+def pair(
+    air: ModelledAir, path: Link, /, ppm: tuple[float, float] = (20, -20), **settings: object
+) -> tuple[int, int]:
+    tag = air.add(RadioSettings(**settings), ppm=ppm[0], clock_ticks=WRAP - 3 * 10**9)
+    anchor = air.add(RadioSettings(**settings | {"role": Role.ANCHOR}), ppm=ppm[1], clock_ticks=12345)
+    air.link(tag, anchor, path)
+    return tag, anchor
+
+
+def test_the_structures_are_those_of_the_compiler():
+    size = modelled._library().radio_air_size
+    size.restype = structures.c_size_t
+    mirrored = (
+        structures.Io,
+        structures.ChipSettings,
+        structures.Config,
+        structures.TwrCounts,
+        structures.TwrAnchor,
+    )
+    assert [size(i) for i in range(5)] == [structures.ctypes.sizeof(each) for each in mirrored]
+    assert size(5) == modelled.RANGE.itemsize
+
+
+@pytest.mark.parametrize("ppm", [(-20, 20), (0, 0), (20, -20)])
+@pytest.mark.parametrize("distance_m", [0.3, 5.01, 100.0])
+def test_ranges_are_exact_whatever_the_clocks_and_across_their_wrap(ppm, distance_m: float):
+    with ModelledAir() as air:
+        pair(air, Link(distance_m), ppm)
+        air.run(0.5)
+        rows, _ = air.ranges()
+    assert len(rows) > 100
+    assert rows["device_time"].min() < 1e9 < WRAP - 4e9 < rows["device_time"].max(), "the counter has wrapped"
+    errors_m = rows["range_m"] - distance_m
+    assert abs(errors_m.mean()) <= 0.005
+    assert errors_m.std() <= 0.005
+
+
+@pytest.mark.parametrize("window", [0, 157, 1016])
+def test_the_cir_is_that_of_the_link_bit_for_bit(window: int):
+    iq = accumulator()
+    with ModelledAir() as air:
+        pair(air, Link(7, samples=iq, first_path_index=745.25, preamble_count=100), window=window)
+        air.run(0.05)
+        rows, store = air.ranges()
+    assert len(rows) > 2
+    for row in rows:
+        assert row["values"] == 2 * window
+        start = row["start_index"]
+        assert start == (0 if window == 1016 else 740) or window == 0
+        expected = iq[2 * start : 2 * (start + window)]
+        np.testing.assert_array_equal(store[row["at"] : row["at"] + row["values"]], expected)
+        assert abs(row["first_path_index"] - 745.25) <= 1 / 64
+
+
+@pytest.mark.parametrize(("prf", "reference_db", "samples"), [(64, 121.74, 1016), (16, 113.77, 992)])
+def test_powers_are_the_manuals_formulas_of_the_registers(prf: int, reference_db: float, samples: int):
+    iq = accumulator(samples)
+    with ModelledAir() as air:
+        pair(air, Link(7, samples=iq, first_path_index=745.0, preamble_count=100), prf_mhz=prf, window=0)
+        air.run(0.05)
+        rows, _ = air.ranges()
+    magnitude = np.hypot(*iq.reshape(-1, 2).T.astype(float))
+    first = np.sqrt((magnitude[746:749] ** 2).sum())
+    expected = 20 * math.log10(first / 100) - reference_db
+    assert rows["first_path_power_dbm"] == pytest.approx(expected, abs=20 * math.log10(1 + 2 / first))
+    # What is received is what is in the accumulator above its noise; CIR_PWR's step is 2^17 of squared magnitude.
+    energy = (magnitude**2).sum() - (magnitude[64:576] ** 2).mean() * samples
+    low, high = (10 * math.log10((energy + step * 2**17) / 100**2) - reference_db for step in (-1, 1))
+    assert high - low < 0.01
+    assert ((low <= rows["rx_power_dbm"]) & (rows["rx_power_dbm"] <= high)).all()
+    assert (rows["preamble_count"] == 100).all()
+
+
+RADIOS = [{"channel": channel, "prf_mhz": prf} for channel in (1, 2, 3, 4, 5, 7) for prf in (16, 64)] + [
+    {"rate_kbps": 850, "decawave_sfd": True},
+    {"rate_kbps": 110, "preamble": 1024, "decawave_sfd": True},
+]
+
+
+@pytest.mark.parametrize("radio", [*RADIOS, *({"preamble": symbols} for symbols in PREAMBLES)], ids=str)
+def test_every_channel_rate_and_preamble_ranges(radio: dict[str, object]):
+    slow = {"reply_us": 20_000, "patience_us": 60_000}
+    with ModelledAir() as air:
+        tag, _ = pair(air, Link(12), **(slow | radio))
+        air.run(0.3)
+        rows, _ = air.ranges()
+        counts = air.counts(tag)
+    assert counts["ranged"] >= counts["tried"] - 1 >= 2
+    assert abs(rows["range_m"].mean() - 12) < 0.005
+
+
+def test_radios_that_differ_in_the_channel_or_the_network_do_not_range():
+    for other in ({"channel": 2}, {"prf_mhz": 16}, {"pan": 1}, {"preamble_code": 10}):
+        with ModelledAir() as air:
+            tag = air.add(RadioSettings())
+            anchor = air.add(RadioSettings(role=Role.ANCHOR, **other))
+            air.link(tag, anchor, Link(3))
+            air.run(0.3)
+            assert air.counts(tag)["tried"] == 0
+            assert air.counts(tag)["restarts"] <= 1
+
+
+def test_a_tag_finds_its_anchors_and_ranges_with_all_of_them_in_turn():
+    with ModelledAir() as air:
+        tag = air.add(RadioSettings(window=0), ppm=3)
+        anchors = [air.add(RadioSettings(role=Role.ANCHOR), ppm=i - 16) for i in range(32)]
+        for i, anchor in enumerate(anchors):
+            air.link(tag, anchor, Link(1.0 + i))
+        air.run(6)
+        air.ranges()
+        air.run(1)
+        rows, _ = air.ranges()
+        heard = {air.address(anchor): 1.0 + i for i, anchor in enumerate(anchors)}
+    counted = {anchor: (rows["anchor"] == anchor).sum() for anchor in heard}
+    assert len(heard) == 32
+    assert min(counted.values()) >= 3
+    assert max(counted.values()) - min(counted.values()) <= 2, "each in its turn"
+    for row in rows:
+        assert abs(row["range_m"] - heard[row["anchor"]]) < 0.02
+
+
+def test_tags_share_the_air_and_none_takes_anothers_range():
+    with ModelledAir() as air:
+        anchors = [air.add(RadioSettings(role=Role.ANCHOR), ppm=i) for i in range(2)]
+        tags = [air.add(RadioSettings(window=0), ppm=-i) for i in range(4)]
+        for i, tag in enumerate(tags):
+            for j, anchor in enumerate(anchors):
+                air.link(tag, anchor, Link(3.0 + 10 * i + 5 * j))
+            for other in tags[:i]:
+                air.link(tag, other, Link(2))
+        air.link(*anchors, Link(4))
+        air.run(10)
+        rows, _ = air.ranges()
+        truth = {
+            (air.address(tag), air.address(anchor)): 3.0 + 10 * i + 5 * j
+            for i, tag in enumerate(tags)
+            for j, anchor in enumerate(anchors)
+        }
+    assert {(row["tag"], row["anchor"]) for row in rows} == set(truth)
+    for row in rows:
+        assert abs(row["range_m"] - truth[row["tag"], row["anchor"]]) < 0.05
+    for tag in tags:
+        assert (rows["board"] == tag).sum() > 50
+
+
+def test_an_anchor_with_a_host_reports_the_range_with_the_cir_of_final():
+    iq = accumulator(seed=3)
+    with ModelledAir() as air:
+        tag = air.add(RadioSettings(window=0))
+        anchor = air.add(RadioSettings(role=Role.ANCHOR, report=True))
+        air.link(tag, anchor, Link(9, samples=iq, first_path_index=745.0))
+        air.run(0.2)
+        rows, store = air.ranges()
+        addresses = air.address(tag), air.address(anchor)
+    told = rows[rows["board"] == anchor]
+    assert len(told) > 20
+    assert abs(told["range_m"] - 9).max() < 0.02
+    assert {(row["tag"], row["anchor"]) for row in told} == {addresses}
+    np.testing.assert_array_equal(store[told[0]["at"] : told[0]["at"] + 314], iq[2 * 740 : 2 * 897])
+
+
+def test_what_the_antenna_delay_is_short_of_appears_in_the_range():
+    with ModelledAir() as air:
+        tag = air.add(RadioSettings(antenna_delay=2 * 16436 - 400))
+        anchor = air.add(RadioSettings(role=Role.ANCHOR))
+        air.link(tag, anchor, Link(5))
+        air.run(0.1)
+        rows, _ = air.ranges()
+    # Half of what one device lacks, as way: 2.346 mm a tick.
+    assert abs(rows["range_m"].mean() - 5 - 400 * 0.0046917639 / 2) < 0.005
+
+
+def test_the_bias_of_the_power_is_taken_off_when_asked_for():
+    with ModelledAir() as air:
+        pair(air, Link(5, samples=accumulator()), bias_correction=True)
+        air.run(0.1)
+        rows, _ = air.ranges()
+    power_dbm = rows["rx_power_dbm"][0]
+    true_dbm = power_dbm + max(0.0, power_dbm + 88) * 1.1667
+    table = [-110, -105, -100, -93, -82, -69, -51, -27, 0, 21, 35, 42, 49, 62, 71, 76, 81, 86]
+    bias_m = np.interp(-true_dbm, np.arange(61, 97, 2), table) / 1000
+    assert abs(rows["range_m"].mean() - 5 + bias_m) < 0.005
+
+
+@pytest.mark.parametrize(("mode", "at_least_hz"), [(Mode.HOST, 100), (Mode.DEVICE, 80)])
+def test_rates_on_a_serial_line(mode: Mode, at_least_hz: float):
+    """8 MHz SPI, 921600 baud, 157 samples; an inference takes its estimated cycles at 64 MHz."""
+    line = Line(mode=mode, inference_s=458_934 / 64e6, overhead_s=10e-6)
+    with ModelledAir() as air:
+        tag = air.add(RadioSettings(), line=line)
+        air.link(tag, air.add(RadioSettings(role=Role.ANCHOR)), Link(5))
+        air.run(3)
+        rows, _ = air.ranges()
+        lost = air.measurements_lost(tag)
+    assert lost == 0
+    assert len(rows) / 3 >= at_least_hz
+
+
+def test_a_chip_that_is_reset_or_out_of_reach_is_back_within_a_second_and_no_range_is_wrong():
+    random = np.random.default_rng(4)
+    channel = Link(8, loss=0.1, damage=0.01)
+    with ModelledAir(7) as air:
+        tag, anchor = pair(air, channel, window=0)
+        air.run(1)
+        counts = air.counts(tag)
+        for step in range(60):
+            what = step % 3
+            if what == 2:
+                air.link(tag, anchor, None)
+                air.run(random.uniform(0.05, 1))
+                air.link(tag, anchor, channel)
+            else:
+                air.reset((tag, anchor)[what])
+            air.ranges()
+            air.run(1 + random.uniform(0, 0.01))
+            rows, _ = air.ranges()
+            assert len(rows), f"nothing within a second after {('tag', 'anchor', 'link')[what]}"
+            assert abs(rows["range_m"] - 8).max() < 0.1
+        counts = air.counts(tag)
+    assert counts["tried"] - counts["ranged"] - sum(counts[name] for name in LOST) in (0, 1)
+    assert counts["broken"] > 0
+    assert counts["restarts"] >= 20

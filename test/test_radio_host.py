@@ -1,0 +1,305 @@
+"""Radios at this computer: EVB1000s behind their USB-to-SPI protocol, emulated in wall-clock time, and spidev."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import itertools
+import os
+import select
+import shutil
+import sys
+import threading
+import time
+import types
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from uwb_mitigation.dw1000_model.air import Air, Chip
+from uwb_mitigation.dw1000_model.evb1000 import ROUND_TRIP_S, EmulatedEvb1000s
+from uwb_mitigation.errors import LinkError, MissingDependencyError, ParameterError
+from uwb_mitigation.link.layout import RadioState, Role
+from uwb_mitigation.link.port import PortAddress
+from uwb_mitigation.link.radio import Radio, RadioSettings
+from uwb_mitigation.measurement import RangeMeasurement
+from uwb_mitigation.radio import spidev_bus
+from uwb_mitigation.radio.evb1000 import Evb1000Bus
+from uwb_mitigation.radio.host import HostRadio
+from uwb_mitigation.radio.port import RETRY_S, RadioLost, RadioPort
+from uwb_mitigation.radio.spidev_bus import SpidevBus
+
+pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc")
+
+GENEROUS_S = 120.0
+
+
+def bus(path: object) -> Callable[[], Evb1000Bus]:
+    return lambda: Evb1000Bus(PortAddress.parse(str(path)))
+
+
+def wait_for(port: RadioPort, kind: type, count: int = 1) -> list:
+    """So many events of a kind, whatever comes between."""
+    found: list = []
+    until = time.monotonic() + GENEROUS_S
+    while len(found) < count:
+        assert time.monotonic() < until, f"{len(found)} of {count} {kind.__name__}: {port.report()}"
+        event = port.get(0.2)
+        if isinstance(event, kind):
+            found.append(event)
+    return found
+
+
+def wait_until(true: Callable[[], bool]) -> None:
+    until = time.monotonic() + GENEROUS_S
+    while not true():
+        assert time.monotonic() < until
+        time.sleep(0.02)
+
+
+@pytest.fixture(scope="module")
+def boards(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[EmulatedEvb1000s, Path]]:
+    prefix = tmp_path_factory.mktemp("ports with spaces") / "radio"
+    with EmulatedEvb1000s(None, boards=2, port_links=prefix) as emulated:
+        yield emulated, prefix
+
+
+def test_a_tag_and_an_anchor_on_usb_range_are_unplugged_and_come_back(
+    boards: tuple[EmulatedEvb1000s, Path],
+):
+    emulated, prefix = boards
+    anchor = RadioPort(bus(f"{prefix}1"), RadioSettings(role=Role.ANCHOR))
+    tag = RadioPort(bus(f"{prefix}0"), RadioSettings())
+    try:
+        (radio,) = wait_for(tag, Radio)
+        assert radio.settings.address
+        assert radio.settings.antenna_delay == 2 * 16436
+        for measured in wait_for(tag, RangeMeasurement, 10):
+            assert abs(measured.range_m - 3) < 0.05
+            assert (measured.tag_id, measured.anchor_id) == (
+                radio.settings.address,
+                anchor.report().settings.address,
+            )
+            assert len(measured.cir) == 157
+            assert abs(time.time_ns() - measured.stamp_ns) < GENEROUS_S * 1e9
+        assert tag.report().problem == ""
+
+        emulated.unplug(0)
+        (lost,) = wait_for(tag, RadioLost)
+        assert "radio0" in lost.text
+        wait_until(lambda: "is not there" in tag.report().problem)
+        before = emulated.requests[0]
+        emulated.plug(0)
+        wait_for(tag, Radio)
+        # With the pause before a try, all of it takes less than a second of USB: 0.2 s and 0.4 s.
+        assert 50 < emulated.requests[0] - before < 0.4 / ROUND_TRIP_S
+        wait_for(tag, RangeMeasurement, 2)
+
+        emulated.unplug(1)
+        wait_until(lambda: "is not there" in anchor.report().problem)
+        before = tag.report().status
+        wait_until(lambda: tag.report().status.no_answer + tag.report().status.time_out > before.no_answer)
+        assert tag.report().status.state is RadioState.RUNNING
+        emulated.plug(1)
+        wait_for(tag, RangeMeasurement, 2)
+        assert anchor.report().openings == 2
+
+        tag.set_radio(RadioSettings(window=16))
+        wait_for(tag, Radio)
+        assert len(wait_for(tag, RangeMeasurement, 2)[-1].cir) == 16
+    finally:
+        tag.close()
+        anchor.close()
+
+
+def test_a_radio_that_stays_away_is_looked_for_as_often_as_at_first():
+    pauses: list[float | None] = []
+
+    class Impatient(threading.Event):
+        def wait(self, timeout: float | None = None) -> bool:
+            pauses.append(timeout)
+            return super().wait(1e-3)
+
+    port = RadioPort(bus("/nowhere"), RadioSettings())
+    port._stop = Impatient()
+    try:
+        wait_until(lambda: len(pauses) > 50)
+        assert set(pauses) == {RETRY_S}
+        assert RETRY_S < 0.5
+    finally:
+        port.close()
+
+
+def test_a_board_that_ranges_by_itself_is_told_with_the_switch_to_turn():
+    with (
+        EmulatedEvb1000s(None, boards=2, ranging=frozenset({0})) as emulated,
+        pytest.raises(LinkError, match=r"ranges by itself .*S1-3 off"),
+    ):
+        bus(emulated.ports[0])()
+
+
+def test_what_is_no_evb1000_is_told_so(tmp_path: Path):
+    with pytest.raises(LinkError, match=r"nowhere: is not there \(plug"):
+        bus(tmp_path / "nowhere")()
+    (tmp_path / "file").write_text("")
+    with pytest.raises(LinkError, match="cannot be opened"):
+        bus(tmp_path / "file")()
+    controller, port = os.openpty()
+    try:
+        with pytest.raises(LinkError, match="no answer to deca"):
+            bus(os.ttyname(port))()
+        with answering(controller, b"\x02\x05\0"), pytest.raises(LinkError, match="answers deca"):
+            bus(os.ttyname(port))()
+    finally:
+        os.close(controller)
+        os.close(port)
+
+
+@contextlib.contextmanager
+def answering(controller: int, answer: bytes) -> Iterator[None]:
+    """Whatever is written to the port of a terminal is answered so."""
+    stop = threading.Event()
+
+    def run() -> None:
+        while not stop.is_set():
+            if select.select([controller], [], [], 0.05)[0]:
+                os.read(controller, 100)
+                os.write(controller, answer)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+
+
+def test_settings_that_no_radio_has_are_refused_at_once():
+    with pytest.raises(ParameterError, match="channel"):
+        RadioPort(bus("/nowhere"), RadioSettings(channel=6))
+
+
+class FakeSpi:
+    """`spidev.SpiDev` on a modelled chip that keeps up with this computer's clock."""
+
+    air: Air
+    began: float
+
+    def open(self, number: int, select: int) -> None:
+        if number:
+            raise FileNotFoundError(2, "No such file or directory")
+        type(self).air = Air(1)
+        type(self).began = time.monotonic()
+        self.chip = self.air.chip()
+
+    def xfer2(self, octets: list[int]) -> list[int]:
+        late = time.monotonic() - self.began - self.chip.now()
+        if late > 0:
+            self.air.run(late)
+        return list(self.chip.spi(bytes(octets), self.max_speed_hz))
+
+    def close(self) -> None:
+        self.air.close()
+
+
+def test_a_chip_on_spidev_starts_and_looks_for_anchors(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "spidev", types.SimpleNamespace(SpiDev=FakeSpi))
+    spi = SpidevBus("/dev/spidev0.0")
+    radio = HostRadio(spi, RadioSettings())
+    try:
+        until = time.monotonic() + GENEROUS_S
+        while not radio.address:
+            assert time.monotonic() < until
+            assert radio.turn(0.1) is None
+        assert radio.settings.preamble_code == 9
+        assert radio.status().state is RadioState.RUNNING
+        radio.read_sensors()
+        assert abs(radio.status().temperature_c - 25) < 3
+    finally:
+        radio.close()
+        spi.close()
+
+
+class FakeGpio:
+    """The kernel's side of a GPIO line that a modelled chip's RSTn hangs on (linux/gpio.h, the first version)."""
+
+    INPUT, OUTPUT, OPEN_DRAIN = 1, 2, 8
+    GET_LINE = 0xC16CB403
+    O_RDWR, O_CLOEXEC = os.O_RDWR, os.O_CLOEXEC
+
+    def __init__(self) -> None:
+        self.chip: Chip | None = None
+        self.requests: list[tuple[int, int]] = []
+        self._held: dict[int, int] = {}
+        self._free = itertools.count(1000)
+
+    def open(self, path: str, flags: int) -> int:
+        assert path == "/dev/gpiochip0"
+        return next(self._free)
+
+    def ioctl(self, fd: int, request: int, octets: bytearray) -> None:
+        assert request == self.GET_LINE
+        line, flags, value = octets[0], int.from_bytes(octets[256:260], "little"), octets[260]
+        if line == 7 or self._held:
+            raise OSError(errno.EBUSY, "Device or resource busy")
+        self.requests.append((line, flags))
+        handle = next(self._free)
+        self._held[handle] = flags
+        octets[-4:] = handle.to_bytes(4, "little")
+        if self.chip is not None and flags & self.OUTPUT:
+            assert flags & self.OPEN_DRAIN or value == 0, "a level that is driven must not be high"
+            self.chip.reset_drive(0)
+
+    def close(self, fd: int) -> None:
+        flags = self._held.pop(fd, 0)
+        if self.chip is not None and flags & self.OUTPUT:
+            self.chip.reset_drive(1)
+
+
+def test_a_reset_line_is_pulled_low_and_never_driven_high(monkeypatch: pytest.MonkeyPatch):
+    gpio = FakeGpio()
+    monkeypatch.setitem(sys.modules, "spidev", types.SimpleNamespace(SpiDev=FakeSpi))
+    for name in ("os", "fcntl"):
+        monkeypatch.setattr(spidev_bus, name, gpio)
+    spi = SpidevBus("/dev/spidev0.0", "gpiochip0:25")
+    gpio.chip = spi._spi.chip
+    assert spi.has_reset
+    assert gpio.requests == [(25, gpio.INPUT)], "until then it floats"
+    spi.speed(True)
+    spi.transfer(b"\x98", b"\x34\x12", 0)
+    assert spi.transfer(b"\x18", None, 2) == b"\x34\x12"
+    radio = HostRadio(spi, RadioSettings())
+    try:
+        until = time.monotonic() + GENEROUS_S
+        while not radio.address:
+            assert time.monotonic() < until
+            radio.turn(0.1)
+        low = (25, gpio.OUTPUT | gpio.OPEN_DRAIN)
+        assert gpio.requests[:3] == [(25, gpio.INPUT), low, (25, gpio.INPUT)]
+        assert gpio.chip.fault is None
+        spi.reset()
+        spi.speed(False)
+        while spi.transfer(b"\x00", None, 4) != bytes.fromhex("3001cade"):
+            assert time.monotonic() < until
+        assert spi.transfer(b"\x18", None, 2) == bytes(2), "a reset takes what was written"
+    finally:
+        radio.close()
+        gpio.chip = None
+        spi.close()
+        spi.close()
+    with pytest.raises(LinkError, match=r"gpiochip0.*line 7: .*busy.*a GPIO that is free"):
+        SpidevBus("/dev/spidev0.0", "gpiochip0:7")
+
+
+def test_spidev_is_told_what_it_lacks(monkeypatch: pytest.MonkeyPatch):
+    for device, reset in (("/dev/ttyACM0", ""), ("/dev/spidev0.0", "25")):
+        with pytest.raises(ParameterError, match=r"SPI device|reset line"):
+            SpidevBus(device, reset)
+    monkeypatch.setitem(sys.modules, "spidev", types.SimpleNamespace(SpiDev=FakeSpi))
+    with pytest.raises(LinkError, match="enable SPI"):
+        SpidevBus("/dev/spidev1.0")
+    monkeypatch.setitem(sys.modules, "spidev", None)
+    with pytest.raises(MissingDependencyError, match="spidev is not installed"):
+        SpidevBus("/dev/spidev0.0")

@@ -1,0 +1,325 @@
+"""What configures a board's radio and what a radio says of itself: values, and how they travel. No I/O."""
+
+from __future__ import annotations
+
+import math
+import struct
+from dataclasses import dataclass
+from typing import Any
+
+from uwb_mitigation.errors import LinkError, ParameterError
+from uwb_mitigation.link.layout import (
+    MAX_ANCHORS,
+    PAYLOADS,
+    RADIO_ANCHOR,
+    MessageType,
+    RadioState,
+    Role,
+)
+
+CHANNELS = (1, 2, 3, 4, 5, 7)
+PREAMBLES = (64, 128, 256, 512, 1024, 1536, 2048, 4096)
+RATES_KBPS = (110, 850, 6800)
+PRFS_MHZ = (16, 64)
+NEVER_MS = 0xFFFFFFFF
+
+_packing = {kind: PAYLOADS[kind].packing() for kind in PAYLOADS}
+_anchor = RADIO_ANCHOR.packing()
+_RADIO_HEAD = 2
+
+
+@dataclass(frozen=True, slots=True)
+class RadioSettings:
+    """What a radio is to do; both ends of a link must agree in channel, PRF, code, rate, delimiter and PAN.
+
+    Attributes:
+        role: tag or anchor.
+        address: 64 bits; 0 = the chip's own.
+        pan: network; frames of others are refused.
+        channel: 1 to 5, 7.
+        prf_mhz: 16, 64.
+        preamble: symbols; may differ between the ends.
+        preamble_code: 0 = the first that the standard has for channel and PRF.
+        rate_kbps: 110, 850, 6800.
+        decawave_sfd: Decawave's start-of-frame delimiter instead of the standard's.
+        tx_power: register TX_POWER; 0 = as calibrated in the chip's memory, else the manual's.
+        antenna_delay: ticks of transmitter and receiver together; 0 = as in the chip's memory, else 2 x 16436.
+        window: complex samples of the accumulator that come with a range, from 5 before the first path; 0 = none,
+            1016 or more = all.
+        anchors: addresses that a tag polls in turn; empty = those that it finds by broadcast.
+        reply_us: from the reception of ANSWER to FINAL; 0 = what the tag's bus and processor usually need, and more where
+            frames are long.
+        patience_us: how long a tag waits for an anchor's frames; 0 = as long as anchors like itself need, so too.
+        interval_us: between the beginnings of two exchanges, at least.
+        report: an anchor gives its host its ranges too.
+        bias_correction: ranges are corrected for the received power (APS011); the models were trained without.
+    """
+
+    role: Role = Role.TAG
+    address: int = 0
+    pan: int = 0x5542
+    channel: int = 5
+    prf_mhz: int = 64
+    preamble: int = 128
+    preamble_code: int = 0
+    rate_kbps: int = 6800
+    decawave_sfd: bool = False
+    tx_power: int = 0
+    antenna_delay: int = 0
+    window: int = 157
+    anchors: tuple[int, ...] = ()
+    reply_us: int = 0
+    patience_us: int = 0
+    interval_us: int = 0
+    report: bool = False
+    bias_correction: bool = False
+
+    def check(self) -> None:
+        """Raise ParameterError, naming the setting, for what no radio has."""
+        _one_of("channel", self.channel, CHANNELS)
+        _one_of("prf_mhz", self.prf_mhz, PRFS_MHZ)
+        _one_of("preamble", self.preamble, PREAMBLES)
+        _one_of("rate_kbps", self.rate_kbps, RATES_KBPS)
+        if self.preamble_code:
+            _one_of("preamble_code", self.preamble_code, preamble_codes(self.channel, self.prf_mhz))
+        _within("address", self.address, 0, 2**64 - 2)
+        _within("pan", self.pan, 0, 0xFFFE)
+        _within("tx_power", self.tx_power, 0, 0xFFFFFFFF)
+        _within("antenna_delay", self.antenna_delay, 0, 0x1FFFE)
+        _within("window", self.window, 0, 0xFFFF)
+        if self.reply_us:
+            _within("reply_us", self.reply_us, 200, 100_000)
+        if self.patience_us:
+            _within("patience_us", self.patience_us, 400, 500_000)
+        _within("interval_us", self.interval_us, 0, 60_000_000)
+        _within("anchors", len(self.anchors), 0, MAX_ANCHORS)
+        for anchor in self.anchors:
+            _within("anchors", anchor, 1, 2**64 - 2)
+
+
+@dataclass(frozen=True, slots=True)
+class Radio:
+    """What a board says of its radio.
+
+    Attributes:
+        settings: in force, or about to be; what was left to the chip stands there once the chip has started.
+        request_sequence: of the host's frame that this answers.
+        accepted: False if the settings that were asked for are refused.
+        text: why they are.
+    """
+
+    settings: RadioSettings
+    request_sequence: int = 0
+    accepted: bool = True
+    text: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class AnchorInReach:
+    """How a tag fares with one anchor; `heard_ms` since it was last heard, None = never; NaN = power unknown."""
+
+    address: int
+    tried: int
+    ranged: int
+    rx_power_dbm: float
+    heard_ms: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class RadioStatus:
+    """How a radio fares, since its board's start; the counts are those of `layout.PAYLOADS[RADIO_STATUS]`."""
+
+    tried: int = 0
+    ranged: int = 0
+    no_answer: int = 0
+    late: int = 0
+    time_out: int = 0
+    damaged: int = 0
+    absurd: int = 0
+    broken: int = 0
+    refused: int = 0
+    restarts: int = 0
+    temperature_c: float = math.nan
+    voltage: float = math.nan
+    state: RadioState = RadioState.RUNNING
+    anchors: tuple[AnchorInReach, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class GetRadio:
+    """Asks for a RADIO."""
+
+
+@dataclass(frozen=True, slots=True)
+class SetRadio:
+    """Asks for settings; the board answers with a RADIO that accepts or refuses them."""
+
+    settings: RadioSettings
+
+
+def preamble_codes(channel: int, prf_mhz: int) -> range:
+    """The codes that IEEE 802.15.4 has for a channel, at 16 or 64 MHz."""
+    if prf_mhz == 64:
+        return range(17, 21) if channel in (4, 7) else range(9, 13)
+    first = {1: 1, 2: 3, 3: 5, 4: 7, 5: 3, 7: 7}[channel]
+    return range(first, first + 2)
+
+
+def encode_radio(message: Radio | SetRadio) -> tuple[MessageType, bytes]:
+    """Raises struct.error where a value does not fit its field."""
+    settings = message.settings
+    values = (
+        settings.address,
+        settings.antenna_delay,
+        settings.tx_power,
+        settings.reply_us,
+        settings.patience_us,
+        settings.interval_us,
+        settings.pan,
+        settings.rate_kbps,
+        settings.preamble,
+        settings.window,
+        settings.channel,
+        settings.prf_mhz,
+        settings.preamble_code,
+        settings.decawave_sfd,
+        settings.role,
+        settings.report,
+        settings.bias_correction,
+        len(settings.anchors),
+    )
+    anchors = struct.pack(f"<{len(settings.anchors)}Q", *settings.anchors)
+    if isinstance(message, SetRadio):
+        return MessageType.SET_RADIO, _packing[MessageType.SET_RADIO].pack(*values) + anchors
+    fixed = _packing[MessageType.RADIO].pack(message.request_sequence, message.accepted, *values)
+    return MessageType.RADIO, fixed + anchors + message.text.encode("utf-8", "replace")
+
+
+def decode_radio(payload: bytes, values: tuple[Any, ...], _: int = 0) -> Radio:
+    """Raises LinkError where a value is impossible."""
+    settings, end = _settings(payload, values[_RADIO_HEAD:], MessageType.RADIO)
+    return Radio(settings, values[0], bool(values[1]), payload[end:].decode("utf-8", "replace"))
+
+
+def decode_set_radio(payload: bytes, values: tuple[Any, ...], _: int = 0) -> SetRadio:
+    """Raises LinkError where a value is impossible."""
+    return SetRadio(_settings(payload, values, MessageType.SET_RADIO)[0])
+
+
+def encode_radio_status(status: RadioStatus) -> tuple[MessageType, bytes]:
+    """Raises struct.error where a value does not fit its field."""
+    fixed = _packing[MessageType.RADIO_STATUS].pack(
+        status.tried,
+        status.ranged,
+        status.no_answer,
+        status.late,
+        status.time_out,
+        status.damaged,
+        status.absurd,
+        status.broken,
+        status.refused,
+        status.restarts,
+        status.temperature_c,
+        status.voltage,
+        status.state,
+        len(status.anchors),
+    )
+    anchors = b"".join(
+        _anchor.pack(
+            anchor.address,
+            anchor.tried,
+            anchor.ranged,
+            anchor.rx_power_dbm,
+            NEVER_MS if anchor.heard_ms is None else anchor.heard_ms,
+        )
+        for anchor in status.anchors
+    )
+    return MessageType.RADIO_STATUS, fixed + anchors
+
+
+def decode_radio_status(payload: bytes, values: tuple[Any, ...], _: int = 0) -> RadioStatus:
+    """Raises LinkError where a value is impossible."""
+    state, anchor_count = values[-2:]
+    start = _packing[MessageType.RADIO_STATUS].size
+    _check_tail("RADIO_STATUS", payload, start, anchor_count, _anchor.size)
+    rows = _anchor.iter_unpack(payload[start : start + anchor_count * _anchor.size])
+    anchors = tuple(
+        AnchorInReach(address, tried, ranged, power, None if heard == NEVER_MS else heard)
+        for address, tried, ranged, power, heard in rows
+    )
+    made: Any = RadioStatus  # a star of unknown length
+    status: RadioStatus = made(*values[:-2], _enumerated(RadioState, state, "RADIO_STATUS state"), anchors)
+    return status
+
+
+def _settings(payload: bytes, values: tuple[Any, ...], kind: MessageType) -> tuple[RadioSettings, int]:
+    (
+        address,
+        antenna_delay,
+        tx_power,
+        reply_us,
+        patience_us,
+        interval_us,
+        pan,
+        rate,
+        preamble,
+        window,
+        channel,
+        prf,
+        code,
+        decawave_sfd,
+        role,
+        report,
+        bias_correction,
+        count,
+    ) = values
+    start = _packing[kind].size
+    _check_tail(kind.name, payload, start, count, 8)
+    settings = RadioSettings(
+        role=_enumerated(Role, role, f"{kind.name} role"),
+        address=address,
+        pan=pan,
+        channel=channel,
+        prf_mhz=prf,
+        preamble=preamble,
+        preamble_code=code,
+        rate_kbps=rate,
+        decawave_sfd=bool(decawave_sfd),
+        tx_power=tx_power,
+        antenna_delay=antenna_delay,
+        window=window,
+        anchors=struct.unpack_from(f"<{count}Q", payload, start),
+        reply_us=reply_us,
+        patience_us=patience_us,
+        interval_us=interval_us,
+        report=bool(report),
+        bias_correction=bool(bias_correction),
+    )
+    return settings, start + 8 * count
+
+
+def _check_tail(where: str, payload: bytes, start: int, count: int, size: int) -> None:
+    if count > MAX_ANCHORS or start + count * size > len(payload):
+        raise LinkError(
+            f"{count} anchors in a payload of {len(payload)} bytes",
+            where=where,
+            valid=f"at most {MAX_ANCHORS}, of {size} bytes each from byte {start}",
+        )
+
+
+def _enumerated(kind: Any, value: int, where: str) -> Any:
+    try:
+        return kind(value)
+    except ValueError:
+        valid = ", ".join(f"{member.value} {member.name}" for member in kind)
+        raise LinkError(f"the value {value}", where=where, valid=valid) from None
+
+
+def _one_of(name: str, value: int, allowed: tuple[int, ...] | range) -> None:
+    if value not in allowed:
+        raise ParameterError(f"radio setting {name} = {value}", valid=", ".join(map(str, allowed)))
+
+
+def _within(name: str, value: int, low: int, high: int) -> None:
+    if not low <= value <= high:
+        raise ParameterError(f"radio setting {name} = {value}", valid=f"{low} to {high}")

@@ -1,0 +1,160 @@
+"""Finds the antenna delay of a pair of radios from ranges over a known distance, in line of sight."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from uwb_mitigation.errors import UwbMitigationError
+from uwb_mitigation.link.layout import Role
+from uwb_mitigation.link.radio import RadioSettings
+from uwb_mitigation.measurement import DEVICE_TICK_HZ, RangeMeasurement
+from uwb_mitigation.radio.bus import Bus
+from uwb_mitigation.radio.port import RadioPort
+
+M_PER_TICK = 0.5 * 299_792_458.0 / DEVICE_TICK_HZ
+"""By how much ranges come out too long if one radio's delay, transmitter and receiver together, is a tick too small:
+2.35 mm (Decawave APS014)."""
+
+MAX_SD_M = 0.1
+"""DW1000s in line of sight scatter by 2 to 5 cm."""
+
+MAX_POWER_GAP_DB = 6.0
+"""Received over first-path power below which a link is likely in line of sight (DW1000 User Manual 2.09, 4.7)."""
+
+NOMINAL_TICKS = 2 * 16436
+MAX_FROM_NOMINAL_TICKS = 2000
+"""Radios differ by 100; a metre of antenna cable adds 600."""
+
+PATIENCE_S = 30.0
+"""Without a range for so long, it is given up."""
+
+
+@dataclass(frozen=True, slots=True)
+class AntennaDelay:
+    """What was found.
+
+    Attributes:
+        antenna_delay: of each radio that was calibrated, transmitter and receiver together, ticks.
+        before: what it was while it ranged; the mean, where two were calibrated.
+        offset_m: median of the ranges less the distance.
+        sd_m: of one range: half of what the middle 68 % span.
+        power_gap_db: median of received less first-path power.
+        ranges: how many.
+    """
+
+    antenna_delay: int
+    before: float
+    offset_m: float
+    sd_m: float
+    power_gap_db: float
+    ranges: int
+
+
+def find(
+    ranges_m: ArrayLike, power_gap_db: ArrayLike, distance_m: float, before: Sequence[int]
+) -> AntennaDelay:
+    """The delay with which the median range is the distance.
+
+    Args:
+        ranges_m, power_gap_db: (n,), n at least 2; powers that are unknown are NaN.
+        before: delay of each radio whose delay is to be found: of both, which then share the offset, or of one.
+
+    Raises:
+        UwbMitigationError: the ranges scatter, or the link does not look like line of sight, or no radio has such a
+            delay.
+    """
+    ranges = np.asarray(ranges_m, np.float64)
+    low, middle, high = (float(value) for value in np.quantile(ranges, [0.1587, 0.5, 0.8413]))
+    spread = (high - low) / 2
+    if not spread <= MAX_SD_M:
+        raise UwbMitigationError(
+            f"the ranges scatter by {spread:.3f} m",
+            valid=f"at most {MAX_SD_M} m: let nothing move, and nothing stand near the straight line",
+        )
+    gap = float(np.median(np.asarray(power_gap_db, np.float64)))
+    if not gap <= MAX_POWER_GAP_DB:
+        raise UwbMitigationError(
+            f"this is no line of sight: the first path is {gap:.1f} dB below all that is received",
+            valid=f"at most {MAX_POWER_GAP_DB} dB: let the antennas see each other, high above the floor",
+        )
+    offset = middle - distance_m
+    found = round(float(np.mean(before)) + offset / (M_PER_TICK * len(before)))
+    if abs(found - NOMINAL_TICKS) > MAX_FROM_NOMINAL_TICKS:
+        raise UwbMitigationError(
+            f"ranges are off by {offset:.2f} m: an antenna delay of {found} ticks",
+            valid=f"{NOMINAL_TICKS} +- {MAX_FROM_NOMINAL_TICKS}: is it the distance, and are these the radios?",
+        )
+    return AntennaDelay(found, float(np.mean(before)), offset, spread, gap, len(ranges))
+
+
+def measure(
+    openers: Sequence[Callable[[], Bus]],
+    settings: RadioSettings,
+    distance_m: float,
+    exchanges: int,
+    on_range: Callable[[], None],
+) -> AntennaDelay:
+    """Let a tag range with one anchor until it has so many ranges, and `find` the delay.
+
+    Args:
+        openers: of the tag's bus, and of the anchor's where it is at this computer too; without it, the anchor's
+            delay stays and the tag's takes all of the offset.
+        settings: the tag's.
+        on_range: called after each.
+
+    Raises:
+        UwbMitigationError: as `find`; or nothing ranges, or several anchors do.
+        ParameterError, MissingDependencyError: as `RadioPort`.
+    """
+    ports: list[RadioPort] = []
+    try:
+        for number, opener in enumerate(openers):
+            wanted = settings if number == 0 else replace(settings, role=Role.ANCHOR, anchors=())
+            ports.append(RadioPort(opener, wanted))
+        return _measure(ports, distance_m, exchanges, on_range)
+    finally:
+        for port in ports:
+            port.close()
+
+
+def _measure(
+    ports: Sequence[RadioPort], distance_m: float, exchanges: int, on_range: Callable[[], None]
+) -> AntennaDelay:
+    ranges: list[tuple[float, float]] = []
+    heard: set[int] = set()
+    until = time.monotonic() + PATIENCE_S
+    while len(ranges) < exchanges:
+        event = ports[0].get(0.2)
+        if isinstance(event, RangeMeasurement):
+            if len(ports) > 1 and not _is_at(event.anchor_id, ports[1]):
+                continue
+            heard.add(event.anchor_id)
+            if len(heard) > 1:
+                raise UwbMitigationError(
+                    f"anchors {', '.join(f'{anchor:x}' for anchor in sorted(heard))} answer",
+                    valid="one: name it with --anchor",
+                )
+            ranges.append((event.range_m, event.cir.rx_power_dbm - event.cir.first_path_power_dbm))
+            until = time.monotonic() + PATIENCE_S
+            on_range()
+        elif time.monotonic() > until:
+            problems = [report.problem for report in (port.report() for port in ports) if report.problem]
+            raise UwbMitigationError(
+                f"{len(ranges)} ranges of {exchanges}, and none for {PATIENCE_S:g} s",
+                valid="; ".join(problems) or "an anchor in reach, with the same channel, PRF, rate and PAN",
+            )
+    before = [settings.antenna_delay for port in ports if (settings := port.report().settings) is not None]
+    if len(before) < len(ports):
+        raise UwbMitigationError("a radio was lost at the end", valid="try again")
+    measured, gaps = zip(*ranges, strict=True)
+    return find(measured, gaps, distance_m, before)
+
+
+def _is_at(address: int, port: RadioPort) -> bool:
+    settings = port.report().settings
+    return settings is not None and settings.address == address

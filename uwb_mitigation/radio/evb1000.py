@@ -1,0 +1,169 @@
+"""An EVB1000 with the firmware that it was delivered with, as a bridge from USB to its DW1000's SPI.
+
+The firmware of EVK1000 and TREK1000 kits speaks this to Decawave's own PC programs: each request is one chip-select
+period. One request and its answer take a millisecond or two; there is no interrupt, and no reset line.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import struct
+import time
+
+import serial
+
+from uwb_mitigation.errors import LinkError
+from uwb_mitigation.link.port import PortAddress
+
+ANSWER_WITHIN_S = 0.4
+MAX_READ_BYTES = 4093
+
+_START, _END = 0x02, 0x03
+_WRITE, _FAST = 1, 2
+_HEAD = struct.Struct("<BBHH")
+_HOW = "DIP switch S1-3 off (TREK1000: S1-4 to S1-7 on), then power the board up again: it shows USB to SPI"
+
+
+class Evb1000Bus:
+    """A board in USB-to-SPI mode; see `Bus`.
+
+    Args:
+        address: of its port.
+
+    Attributes:
+        version: what the board calls its firmware.
+
+    Raises:
+        LinkError: the port is absent or in use, or the board is in another mode; says what to do.
+    """
+
+    has_reset = False
+    # Seven transactions of 1.5 to 1.8 ms each, and until it is noticed; a slower bus finds its own reply time.
+    reply_us = 14_500
+    patience_us = 60_000
+
+    def __init__(self, address: PortAddress) -> None:
+        self._address = address
+        self._fast = False
+        path = address.find()
+        if path is None:
+            raise LinkError("is not there", where=str(address), valid="plug the board in")
+        try:
+            port = serial.Serial(None, timeout=0, exclusive=True)
+            port.port = path
+            port.open()
+        except (OSError, ValueError) as error:
+            raise LinkError(f"cannot be opened: {error}", where=str(address)) from error
+        self._port: serial.Serial | None = port
+        os.set_blocking(port.fileno(), False)
+        try:
+            self.version = self._greet()
+        except LinkError:
+            self.close()
+            raise
+
+    @property
+    def name(self) -> str:
+        return f"{self.version} at {self._address}"
+
+    def transfer(self, header: bytes, out: bytes | None, count: int) -> bytes:
+        flags = (_WRITE if out is not None else 0) | (_FAST if self._fast else 0)
+        payload = header + (out or b"")
+        data = count if out is None else len(out)
+        if data > MAX_READ_BYTES:
+            raise LinkError(
+                f"{data} octets in one transaction", where=str(self._address), valid=f"{MAX_READ_BYTES}"
+            )
+        request = _HEAD.pack(_START, flags, _HEAD.size + len(payload) + 1, data) + payload + bytes([_END])
+        self._send(request)
+        answer = self._receive(3 + (count if out is None else 0))
+        if answer[0] != _START or answer[-1] != _END or answer[1]:
+            raise LinkError(
+                f"the board answered {answer[:2].hex()}...{answer[-1:].hex()}",
+                where=str(self._address),
+                valid="0200...03",
+            )
+        return answer[2:-1]
+
+    def speed(self, fast: bool) -> None:
+        self._fast = fast
+
+    def reset(self) -> None:
+        """There is no reset line."""
+
+    def pause(self) -> None:
+        """The bus is slow enough."""
+
+    def close(self) -> None:
+        if self._port is not None:
+            with contextlib.suppress(OSError):
+                self._port.close()
+            self._port = None
+
+    def _greet(self) -> str:
+        # What an earlier program left half sent or unread goes first.
+        with contextlib.suppress(LinkError):
+            while self._read_some(0.02):
+                pass
+        self._send(b"deca?")
+        answer = b""
+        until = time.monotonic() + ANSWER_WITHIN_S
+        while not answer.endswith(b"\0") and time.monotonic() < until:
+            answer += self._read_some(until - time.monotonic())
+        text = answer.rstrip(b"\0").decode("ascii", "replace")
+        if text.startswith("y"):
+            return text[1:]
+        if text.startswith("n"):
+            raise LinkError("the board ranges by itself", where=str(self._address), valid=_HOW)
+        told = f"the board answers deca? with {text!r}" if text else "no answer to deca?"
+        raise LinkError(told, where=str(self._address), valid=f"an EVB1000; {_HOW}")
+
+    def _send(self, data: bytes) -> None:
+        fd = self._fd()
+        until = time.monotonic() + ANSWER_WITHIN_S
+        try:
+            while data:
+                _, writable, _ = select.select([], [fd], [], max(0.0, until - time.monotonic()))
+                if not writable:
+                    raise LinkError("the board takes nothing", where=str(self._address), valid=_HOW)
+                data = data[os.write(fd, data) :]
+        except OSError as error:
+            raise self._lost(error.strerror or str(error)) from error
+
+    def _receive(self, count: int) -> bytes:
+        answer = b""
+        until = time.monotonic() + ANSWER_WITHIN_S
+        while len(answer) < count:
+            piece = self._read_some(until - time.monotonic())
+            if not piece:
+                raise LinkError(
+                    f"{len(answer)} octets of {count} within {ANSWER_WITHIN_S} s",
+                    where=str(self._address),
+                    valid=_HOW,
+                )
+            answer += piece
+        return answer[:count]
+
+    def _read_some(self, within_s: float) -> bytes:
+        """At least one octet, or none within the time."""
+        fd = self._fd()
+        try:
+            readable, _, _ = select.select([fd], [], [], max(0.0, within_s))
+            piece = os.read(fd, 1 << 13) if readable else b""
+        except BlockingIOError:
+            return b""
+        except OSError as error:
+            raise self._lost(error.strerror or str(error)) from error
+        if readable and not piece:
+            raise self._lost("unplugged")
+        return piece
+
+    def _fd(self) -> int:
+        if self._port is None:
+            raise self._lost("closed")
+        return int(self._port.fileno())
+
+    def _lost(self, why: str) -> LinkError:
+        return LinkError(f"was lost: {why}", where=str(self._address), valid="plug the board in")

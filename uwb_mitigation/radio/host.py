@@ -1,0 +1,262 @@
+"""One DW1000 at this computer: the firmware's driver and exchange, compiled for it, on a `Bus`."""
+
+from __future__ import annotations
+
+import atexit
+import ctypes
+import functools
+import secrets
+import shutil
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from ctypes import POINTER, c_char_p, c_float, c_int, c_size_t, c_uint32, c_uint64, c_void_p
+from dataclasses import replace
+from pathlib import Path
+
+from uwb_mitigation.errors import LinkError, ParameterError
+from uwb_mitigation.firmware_export.compiling import (
+    WARNINGS,
+    c_compiler,
+    compile_objects,
+    firmware_folder,
+    run,
+)
+from uwb_mitigation.link import messages
+from uwb_mitigation.link.layout import MessageType, RadioState
+from uwb_mitigation.link.radio import NEVER_MS, AnchorInReach, RadioSettings, RadioStatus
+from uwb_mitigation.measurement import RangeMeasurement
+from uwb_mitigation.radio import structures
+from uwb_mitigation.radio.bus import Bus
+
+_OPTIONS = ("-std=c99", "-O2", "-fPIC", *WARNINGS)
+_RANGED, _FAULT = 1, 2
+
+_loading = threading.Lock()
+_FAULTS = {
+    2: (RadioState.BUS, "the bus failed"),
+    3: (RadioState.ABSENT, "no DW1000 answers: look at wiring and supply"),
+    4: (RadioState.NO_CLOCK, "the DW1000's clock does not lock: look at its supply"),
+    5: (RadioState.RESTARTED, "the DW1000 was reset"),
+}
+"""Values of `uwb_dw1000_status` that keep a radio from working."""
+
+
+class HostRadio:
+    """A radio that ranges as its settings say, one exchange a call. Not for several threads at once.
+
+    Args:
+        bus: to its chip; stays the caller's.
+        settings: what it is to do.
+        stamp_clock: the clock that stamps are on, ns.
+
+    Raises:
+        ParameterError: settings that no radio has.
+        MissingDependencyError: there is no C compiler.
+    """
+
+    def __init__(
+        self, bus: Bus, settings: RadioSettings, *, stamp_clock: Callable[[], int] = time.time_ns
+    ) -> None:
+        self._bus = bus
+        self._library = load()
+        config = self._config(settings)
+        self._stamp_clock = stamp_clock
+        self._settings = settings
+        self._failure: BaseException | None = None
+        # The library keeps pointers to these as long as the radio lives.
+        self._io = structures.Io(
+            None,
+            structures.TRANSFER(self._transfer),
+            structures.SPEED(lambda _, fast: self._guard(lambda: self._bus.speed(bool(fast)))),
+            structures.RESET(lambda _: self._guard(lambda: self._bus.reset()))
+            if bus.has_reset
+            else structures.RESET(),
+            structures.NOW(lambda _: time.monotonic_ns() // 1000),
+            structures.WAIT(lambda _, until_us: self._guard(lambda: self._bus.pause())),
+            structures.SLEEP(lambda _, us: time.sleep(us * 1e-6)),
+        )
+        self._radio = self._library.host_radio_new(
+            ctypes.byref(self._io), ctypes.byref(config), secrets.randbits(64)
+        )
+        self._temperature_c = self._voltage = float("nan")
+
+    def turn(self, at_most_s: float) -> RangeMeasurement | None:
+        """One exchange, or none within the time, which it may outlast by its own duration.
+
+        Raises:
+            LinkError: the bus is gone, or no chip answers on it; the next call tries to start the chip again.
+        """
+        self._failure = None
+        until_us = time.monotonic_ns() // 1000 + round(at_most_s * 1e6)
+        event = self._library.host_radio_turn(self._radio, until_us)
+        if self._failure is not None:
+            raise self._failure
+        if event == _FAULT:
+            _, text = self._fault()
+            raise LinkError(text, where=self._bus.name)
+        return self._measurement() if event == _RANGED else None
+
+    def use(self, bus: Bus) -> None:
+        """Go on with another bus of the same kind, after the one before was lost; the chip is started anew."""
+        self._bus = bus
+
+    def configure(self, settings: RadioSettings) -> None:
+        """Use other settings from the next turn on.
+
+        Raises:
+            ParameterError: settings that no radio has, or this one cannot use.
+        """
+        refusal = self._library.host_radio_configure(self._radio, ctypes.byref(self._config(settings)))
+        if refusal is not None:
+            raise ParameterError(f"radio settings: {refusal.decode()}")
+        self._settings = settings
+
+    @property
+    def address(self) -> int:
+        """0 until the chip has started."""
+        address: int = self._library.host_radio_address(self._radio)
+        return address
+
+    @property
+    def settings(self) -> RadioSettings:
+        """In force; what was left to the chip stands here once it has started."""
+        chip: structures.ChipSettings = self._library.host_radio_settings(self._radio)[0]
+        return replace(
+            self._settings,
+            address=self.address or self._settings.address,
+            preamble_code=chip.preamble_code,
+            tx_power=chip.tx_power,
+            antenna_delay=chip.antenna_delay,
+            reply_us=self._times_us[0],
+            patience_us=self._times_us[1],
+        )
+
+    def read_sensors(self) -> None:
+        """Measure the chip's temperature and voltage, for `status`.
+
+        Raises:
+            LinkError: the bus is gone.
+        """
+        temperature, voltage = c_float(), c_float()
+        self._failure = None
+        done = self._library.host_radio_sensors(self._radio, ctypes.byref(temperature), ctypes.byref(voltage))
+        if self._failure is not None:
+            raise self._failure
+        if not done:
+            self._temperature_c, self._voltage = temperature.value, voltage.value
+
+    def status(self) -> RadioStatus:
+        """How it fares."""
+        counts: structures.TwrCounts = self._library.host_radio_counts(self._radio)[0]
+        count = c_size_t()
+        table = self._library.host_radio_anchors(self._radio, ctypes.byref(count))
+        now_us = time.monotonic_ns() // 1000
+        return RadioStatus(
+            **counts.as_dict(),
+            temperature_c=self._temperature_c,
+            voltage=self._voltage,
+            state=self._fault()[0],
+            anchors=tuple(
+                AnchorInReach(
+                    anchor.address,
+                    anchor.tried,
+                    anchor.ranged,
+                    anchor.rx_power_dbm,
+                    min((now_us - anchor.heard_us) // 1000, NEVER_MS - 1) if anchor.heard_us else None,
+                )
+                for anchor in table[: count.value]
+            ),
+        )
+
+    def close(self) -> None:
+        """Free it; the bus stays open. May be called twice."""
+        if self._radio is not None:
+            self._library.host_radio_free(self._radio)
+            self._radio = None
+
+    def _config(self, settings: RadioSettings) -> structures.Config:
+        config = structures.config(settings, 0, 0)
+        self._library.host_radio_fill_times(ctypes.byref(config), self._bus.reply_us, self._bus.patience_us)
+        self._times_us = config.reply_us, config.patience_us
+        return config
+
+    def _fault(self) -> tuple[RadioState, str]:
+        fault = self._library.host_radio_fault(self._radio)
+        return _FAULTS.get(fault, (RadioState.RUNNING, "the radio does not work"))
+
+    def _measurement(self) -> RangeMeasurement:
+        count, measured_us = c_size_t(), c_uint64()
+        place = self._library.host_radio_measurement(
+            self._radio, ctypes.byref(count), ctypes.byref(measured_us)
+        )
+        age_ns = time.monotonic_ns() - 1000 * measured_us.value
+        payload = ctypes.string_at(place, count.value)
+        measured = messages.decode(MessageType.RANGE_CIR, payload, stamp_ns=self._stamp_clock() - age_ns)
+        assert isinstance(measured, RangeMeasurement)
+        return measured
+
+    def _transfer(
+        self, _: int, header: int, header_bytes: int, out: int | None, into: int, count: int
+    ) -> int:
+        try:
+            sent = ctypes.string_at(out, count) if out else None
+            answer = self._bus.transfer(ctypes.string_at(header, header_bytes), sent, count)
+            if sent is None:
+                ctypes.memmove(into, answer, count)
+        except BaseException as error:  # nothing may pass through C
+            self._failure = error
+            return -1
+        return 0
+
+    def _guard(self, act: Callable[[], None]) -> None:
+        try:
+            act()
+        except BaseException as error:  # nothing may pass through C
+            self._failure = error
+
+
+def load() -> ctypes.CDLL:
+    """The firmware's driver and exchange as a shared library of this process; compiled once.
+
+    Raises:
+        MissingDependencyError: there is no C compiler, or the sources are not installed.
+        UwbMitigationError: they do not compile.
+    """
+    with _loading:
+        return _compiled()
+
+
+@functools.cache
+def _compiled() -> ctypes.CDLL:
+    firmware = firmware_folder()
+    sources = tuple(
+        sorted([*(firmware / "src").glob("uwb_dw1000*.c"), *(firmware / "src").glob("uwb_twr*.c")])
+    )
+    options = (*_OPTIONS, f"-I{firmware / 'src'}")
+    objects = compile_objects(c_compiler(), options, (*sources, firmware / "host" / "host_radio.c"))
+    folder = Path(tempfile.mkdtemp(prefix="uwb_host_radio_"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    output = folder / "host_radio.so"
+    run([*c_compiler(), "-shared", *objects, "-o", str(output), "-lm"])
+    library = ctypes.CDLL(str(output))
+    radio = c_void_p
+    signatures: dict[str, tuple[object, tuple[object, ...]]] = {
+        "new": (c_void_p, (POINTER(structures.Io), POINTER(structures.Config), c_uint64)),
+        "free": (None, (radio,)),
+        "fill_times": (None, (POINTER(structures.Config), c_uint32, c_uint32)),
+        "configure": (c_char_p, (radio, POINTER(structures.Config))),
+        "turn": (c_int, (radio, c_uint64)),
+        "measurement": (c_void_p, (radio, POINTER(c_size_t), POINTER(c_uint64))),
+        "fault": (c_int, (radio,)),
+        "address": (c_uint64, (radio,)),
+        "settings": (POINTER(structures.ChipSettings), (radio,)),
+        "counts": (POINTER(structures.TwrCounts), (radio,)),
+        "anchors": (POINTER(structures.TwrAnchor), (radio, POINTER(c_size_t))),
+        "sensors": (c_int, (radio, POINTER(c_float), POINTER(c_float))),
+    }
+    for name, (result, arguments) in signatures.items():
+        function = getattr(library, f"host_radio_{name}")
+        function.restype, function.argtypes = result, arguments
+    return library

@@ -1,0 +1,267 @@
+"""Boards with the firmware's exchange on modelled chips, in virtual time: for the bench and the tests."""
+
+from __future__ import annotations
+
+import atexit
+import ctypes
+import functools
+import shutil
+import tempfile
+from collections.abc import Callable
+from ctypes import POINTER, c_double, c_int, c_size_t, c_uint16, c_uint32, c_uint64, c_void_p
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.dw1000_model.library import NextRequest, Request, model_folder, model_objects
+from uwb_mitigation.dw1000_model.links import Link
+from uwb_mitigation.errors import LinkError, MissingDependencyError
+from uwb_mitigation.firmware_export.compiling import (
+    WARNINGS,
+    c_compiler,
+    compile_objects,
+    firmware_folder,
+    run,
+)
+from uwb_mitigation.link.layout import Mode
+from uwb_mitigation.link.radio import RadioSettings
+from uwb_mitigation.radio import structures
+
+NOMINAL_DELAY_TICKS = 16436
+"""Of a chip's transmitter, and of its receiver."""
+
+RANGE = np.dtype(
+    [
+        ("time_s", "<f8"),
+        ("board", "<i4"),
+        ("values", "<u4"),
+        ("range_m", "<f8"),
+        ("tag", "<u8"),
+        ("anchor", "<u8"),
+        ("device_time", "<u8"),
+        ("rx_power_dbm", "<f4"),
+        ("first_path_power_dbm", "<f4"),
+        ("first_path_index", "<f4"),
+        ("start_index", "<i4"),
+        ("preamble_count", "<u2"),
+        ("noise_threshold", "<u2"),
+        ("at", "<u4"),
+    ]
+)
+"""One range that a board gave, in virtual time; `values` int16 of its CIR stand from `at` on in the store."""
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """A serial line to a host, and the processor of a board that has one.
+
+    Attributes:
+        baud: of the line, ten bits a byte; frames leave it while the board does something else.
+        mode: what the board sends.
+        inference_s: that a correction takes.
+        overhead_s: that the processor adds to each SPI transaction.
+    """
+
+    baud: float = 921_600
+    mode: Mode = Mode.HOST
+    inference_s: float = 0.0
+    overhead_s: float = 0.0
+
+
+class ModelledAir:
+    """Several boards on one air. One thread at a time.
+
+    Args:
+        seed: the same seed and calls give the same run.
+        store_values: int16 values of CIRs that are kept between two calls of `ranges`; beyond it they are not.
+
+    Raises:
+        MissingDependencyError: there is no C compiler, or no checkout.
+    """
+
+    def __init__(self, seed: int = 1, store_values: int = 1 << 16) -> None:
+        self._library = _library()
+        self._air = self._library.radio_air_new(seed, store_values)
+        self._store_values = store_values
+        self._boards = 0
+        self._callbacks: list[object] = []
+
+    def __enter__(self) -> ModelledAir:
+        return self
+
+    def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
+        self._library.radio_air_free(self._air)
+
+    def add(
+        self,
+        settings: RadioSettings,
+        *,
+        ppm: float = 0.0,
+        clock_ticks: int = 0,
+        delay_ticks: int = NOMINAL_DELAY_TICKS,
+        line: Line | None = None,
+    ) -> int:
+        """A board, whose program starts with the next `run`; its number.
+
+        Without a line it ranges and does nothing else.
+        """
+        board: int = self._library.radio_air_board(
+            self._air,
+            ppm,
+            clock_ticks,
+            delay_ticks,
+            delay_ticks,
+            ctypes.byref(structures.config(settings)),
+            0x9E3779B97F4A7C15 * (self._boards + 1) % 2**64,
+        )
+        self._boards += 1
+        if line is not None:
+            self._library.radio_air_line(
+                self._air, board, line.baud, int(line.mode), line.inference_s, line.overhead_s
+            )
+        return board
+
+    def add_remote(
+        self, next_request: Callable[[Request], bool], *, ppm: float = 0.0, clock_ticks: int = 0
+    ) -> int:
+        """A chip whose host's program is elsewhere; its number.
+
+        `next_request` is told of the request before, writes the next one, and returns False when there is none any
+        more. Nothing else happens on the air meanwhile.
+        """
+        callback = NextRequest(lambda _, request: int(next_request(request[0])))
+        self._callbacks.append(callback)
+        delay = NOMINAL_DELAY_TICKS
+        board: int = self._library.radio_air_remote(self._air, ppm, clock_ticks, delay, delay, callback)
+        self._boards += 1
+        return board
+
+    def link(self, a: int, b: int, channel: Link | None) -> None:
+        """Let two boards hear each other, or no longer."""
+        if channel is None:
+            self._library.radio_air_unlink(self._air, a, b)
+            return
+        samples = None if channel.samples is None else np.ascontiguousarray(channel.samples, np.int16)
+        self._library.radio_air_link(
+            self._air,
+            a,
+            b,
+            channel.distance_m,
+            channel.excess_m,
+            None if samples is None else samples.ctypes.data,
+            0 if samples is None else len(samples) // 2,
+            channel.first_path_index,
+            channel.preamble_count,
+            channel.noise_threshold,
+            channel.std_noise,
+            channel.loss,
+            channel.damage,
+        )
+
+    def reset(self, board: int) -> None:
+        """Pull the reset line of a board's chip, whatever it is doing; 1 ms passes."""
+        self._library.radio_air_reset(self._air, board)
+
+    def run(self, seconds: float) -> float:
+        """Let time pass; returns the time reached, s."""
+        reached: float = self._library.radio_air_run(self._air, seconds)
+        return reached
+
+    def ranges(self) -> tuple[NDArray[np.void], NDArray[np.int16]]:
+        """Take what was measured since the last call: rows of `RANGE`, and the store of their CIRs."""
+        rows, store = c_void_p(), c_void_p()
+        count = self._library.radio_air_results(self._air, ctypes.byref(rows), ctypes.byref(store))
+        # RANGE holds no pointers: copies of the bytes will do.
+        taken = np.frombuffer(ctypes.string_at(rows.value or 0, count * RANGE.itemsize), RANGE)
+        values = np.frombuffer(ctypes.string_at(store.value or 0, 2 * self._store_values), "<i2")
+        self._library.radio_air_forget(self._air)
+        return taken, values
+
+    def counts(self, board: int) -> dict[str, int]:
+        """Of exchanges; see `uwb_twr_counts`."""
+        counts: structures.TwrCounts = self._library.radio_air_counts(self._air, board)[0]
+        return counts.as_dict()
+
+    def address(self, board: int) -> int:
+        """In force; 0 before the board's program has started its chip."""
+        address: int = self._library.radio_air_address(self._air, board)
+        return address
+
+    def write(self, board: int, data: bytes) -> None:
+        """Send bytes to a board over its line; it takes them between two turns."""
+        if not self._library.radio_air_write(self._air, board, data, len(data)):
+            raise LinkError(
+                f"{len(data)} bytes for a modelled board that has not run", valid="fewer, or run it"
+            )
+
+    def read(self, board: int) -> bytes:
+        """Take what a board has sent over its line."""
+        buffer = ctypes.create_string_buffer(1 << 18)
+        count = self._library.radio_air_read(self._air, board, buffer)
+        return buffer.raw[:count]
+
+    def measurements_lost(self, board: int) -> int:
+        """Ranges that did not fit into the queue of a board's line."""
+        lost: int = self._library.radio_air_line_lost(self._air, board)
+        return lost
+
+
+@functools.cache
+def _library() -> ctypes.CDLL:
+    folder = Path(tempfile.mkdtemp(prefix="uwb_radio_air_"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    output = folder / "radio_air.so"
+    firmware = firmware_folder()
+    program = firmware / "test" / "radio_air.c"
+    if not program.is_file():
+        raise MissingDependencyError(
+            "modelled boards are not installed", where=str(program), valid="run from a source checkout"
+        )
+    options = ("-std=c99", "-O2", "-fPIC", *WARNINGS, f"-I{model_folder()}", f"-I{firmware / 'src'}")
+    objects = compile_objects(c_compiler(), options, (program, *sorted((firmware / "src").glob("*.c"))))
+    run([*c_compiler(), "-shared", *objects, *model_objects(), "-o", str(output), "-lm", "-lpthread"])
+    library = ctypes.CDLL(str(output))
+    air, board = c_void_p, c_int
+    signatures: dict[str, tuple[object, tuple[object, ...]]] = {
+        "new": (c_void_p, (c_uint64, c_size_t)),
+        "free": (None, (air,)),
+        "board": (
+            c_int,
+            (air, c_double, c_uint64, c_uint16, c_uint16, POINTER(structures.Config), c_uint64),
+        ),
+        "remote": (c_int, (air, c_double, c_uint64, c_uint16, c_uint16, NextRequest)),
+        "line": (None, (air, board, c_double, c_int, c_double, c_double)),
+        "link": (
+            None,
+            (
+                air,
+                board,
+                board,
+                c_double,
+                c_double,
+                c_void_p,
+                c_size_t,
+                c_double,
+                *(c_uint16,) * 3,
+                c_double,
+                c_double,
+            ),
+        ),
+        "unlink": (None, (air, board, board)),
+        "reset": (None, (air, board)),
+        "run": (c_double, (air, c_double)),
+        "results": (c_uint32, (air, POINTER(c_void_p), POINTER(c_void_p))),
+        "forget": (None, (air,)),
+        "counts": (POINTER(structures.TwrCounts), (air, board)),
+        "address": (c_uint64, (air, board)),
+        "write": (c_int, (air, board, ctypes.c_char_p, c_size_t)),
+        "read": (c_size_t, (air, board, c_void_p)),
+        "line_lost": (c_uint64, (air, board)),
+    }
+    for name, (result, arguments) in signatures.items():
+        function = getattr(library, f"radio_air_{name}")
+        function.restype, function.argtypes = result, arguments
+    return library
