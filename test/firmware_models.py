@@ -12,10 +12,11 @@ import model_material
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.firmware_export import synthetic
+from uwb_mitigation.benches import random_networks
+from uwb_mitigation.benches.firmware_cost import Network, network_of
+from uwb_mitigation.evaluation import paper
 from uwb_mitigation.firmware_export.export import golden_windows, write_header
-from uwb_mitigation.firmware_export.header import Golden, Identity
-from uwb_mitigation.firmware_export.measurement import Subject, subject_of
+from uwb_mitigation.firmware_export.header import Golden, ModelConstants
 from uwb_mitigation.firmware_export.packing import pack
 from uwb_mitigation.measurement import Cir, Encoding, RangeMeasurement
 from uwb_mitigation.model import graph
@@ -24,7 +25,7 @@ from uwb_mitigation.model.familiarity import Band, Familiarity
 from uwb_mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.model.prior import LinePrior
 from uwb_mitigation.model.weights import Int8Weights
-from uwb_mitigation.preprocessing import WINDOW_SIZES, Preprocessing, Scaling
+from uwb_mitigation.preprocessing import Preprocessing, Scaling
 from uwb_mitigation.sources.decaranging import open_decaranging
 
 
@@ -32,11 +33,11 @@ def identity(
     scaling: Scaling = Scaling.PREAMBLE,
     prior: LinePrior | None = None,
     limits_m: tuple[float, float] = (-4.0, 4.0),
-) -> Identity:
-    return Identity("random", 0x1234ABCD, scaling, prior or LinePrior(0.25), limits_m, 0.0625, 0.25)
+) -> ModelConstants:
+    return ModelConstants("random", 0x1234ABCD, scaling, prior or LinePrior(0.25), limits_m, 0.0625, 0.25)
 
 
-def write_model(folder: Path, weights: Int8Weights, card: Identity | None = None) -> Path:
+def write_model(folder: Path, weights: Int8Weights, card: ModelConstants | None = None) -> Path:
     network = pack(weights)
     windows = golden_windows(network)
     golden = Golden(windows, IntegerNetwork(weights).predict_m(windows))
@@ -45,14 +46,14 @@ def write_model(folder: Path, weights: Int8Weights, card: Identity | None = None
 
 def exact_bundle(folder: Path, samples: int = 32, **changes: object) -> Bundle:
     """A bundle of random weights, with scales that the firmware can equal, and a prior that needs powers."""
-    weights = synthetic.random_remnet(samples, 3)
+    weights = random_networks.remnet(samples, 3)
     card = model_material.card(weights.architecture, correction_limits_m=(-500.0, 500.0), **changes)
     return save_bundle(folder / "exact.onnx", graph.int8_model(weights), card)
 
 
 def mlp_bundle(folder: Path) -> Bundle:
     """The paper's MLP with random weights."""
-    weights = synthetic.random_mlp()
+    weights = random_networks.mlp()
     card = model_material.card(weights.architecture, correction_limits_m=(-500.0, 500.0))
     return save_bundle(folder / "mlp.onnx", graph.int8_model(weights), card)
 
@@ -127,13 +128,13 @@ class Exported:
     """A network of one shape, with the folder that it was exported to."""
 
     weights: Int8Weights
-    subject: Subject
+    subject: Network
     folder: Path
 
     def windows(self, count: int = 5000) -> NDArray[np.float32]:
         """Windows that press on every rounding; zero, saturating and random ones."""
         samples = self.weights.architecture.samples
-        return synthetic.pressing_windows(samples, self.weights.activation_scale["input"], count)
+        return random_networks.pressing_windows(samples, self.weights.activation_scale["input"], count)
 
     def real_windows(self, apartment: Path, every: int = 1) -> NDArray[np.float32]:
         """What the network reads of the real measurements, or of every so many."""
@@ -145,7 +146,7 @@ class Exported:
         return windows[usable]
 
 
-SHAPES = [*itertools.product((3, 5), WINDOW_SIZES), (0, 157)]
+SHAPES = [*itertools.product((3, 5), paper.WINDOWS), (0, 157)]
 """First kernel and length of every network that must run; 0 is the MLP."""
 
 
@@ -155,9 +156,7 @@ def shape_name(shape: tuple[int, int]) -> str:
 
 def exported(shape: tuple[int, int], folder: Path) -> Exported:
     first_kernel, samples = shape
-    weights = (
-        synthetic.random_remnet(samples, first_kernel) if first_kernel else synthetic.random_mlp(samples)
-    )
+    weights = random_networks.remnet(samples, first_kernel) if first_kernel else random_networks.mlp(samples)
     write_model(folder, weights)
-    subject = subject_of(weights, identity(), graph.int8_model(weights))
+    subject = network_of(weights, identity(), graph.int8_model(weights))
     return Exported(weights, subject, folder)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import firmware_models
@@ -15,8 +16,9 @@ from uwb_mitigation.bag.codec import encode_range
 from uwb_mitigation.errors import MissingDependencyError
 from uwb_mitigation.firmware_export import compiling, toolchain
 from uwb_mitigation.firmware_export.backend import FirmwareMitigation
-from uwb_mitigation.mitigation import Mitigation
+from uwb_mitigation.mitigation import Mitigation, correct_batch
 from uwb_mitigation.model.bundle import Bundle
+from uwb_mitigation.offsets import Offsets
 
 NO_COMPILER = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc")
 
@@ -29,8 +31,10 @@ def test_the_firmware_gives_the_corrected_ranges_of_onnx_runtime(
     bundle = bundle_in(tmp_path)
     random = np.random.default_rng(8)
     measurements = [firmware_models.random_measurement(random) for _ in range(300)]
-    firmware, mitigation = FirmwareMitigation(bundle), Mitigation(bundle)
-    for computed, measurement in zip(firmware.correct_batch(measurements), measurements, strict=True):
+    measurements = [replace(one, tag_id=n % 3, anchor_id=n % 5) for n, one in enumerate(measurements)]
+    offsets = Offsets(0.22, {1: 0.1, 2: 0.3}, {1: -0.05, 2: 0.0}, {(2, 3): 2.5})
+    firmware, mitigation = FirmwareMitigation(bundle, offsets), Mitigation(bundle, offsets)
+    for computed, measurement in zip(correct_batch(firmware, measurements), measurements, strict=True):
         assert repr(computed) == repr(mitigation.correct(measurement))
 
 
@@ -55,7 +59,7 @@ def test_what_only_a_checkout_has_is_said_to_need_one(tmp_path: Path, monkeypatc
     monkeypatch.setattr(toolchain, "firmware_folder", lambda: tmp_path)
     monkeypatch.setattr(toolchain, "require_tools", lambda: None)
     with pytest.raises(MissingDependencyError, match="run from a source checkout"):
-        toolchain.build_image(tmp_path, tmp_path, toolchain.Board.QEMU_MPS2)
+        toolchain.build_image(tmp_path, tmp_path, toolchain.Target.QEMU_MPS2)
 
 
 @NO_COMPILER

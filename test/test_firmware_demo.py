@@ -12,8 +12,8 @@ import typer
 
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
+from uwb_mitigation.demos.firmware_demo import firmware_demo
 from uwb_mitigation.firmware_export import toolchain
-from uwb_mitigation.nodes import firmware_demo
 
 MISSING = toolchain.missing_tools()
 pytestmark = pytest.mark.ros
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.ros
 
 @pytest.mark.skipif(bool(MISSING), reason=f"{', '.join(MISSING)} not found: {toolchain.APT}")
 def test_the_demo_ends_by_itself_with_every_range_equal_to_the_hosts():
-    command = [sys.executable, "-m", "uwb_mitigation.nodes.firmware_demo", "--count", "20"]
+    command = [sys.executable, "-m", "uwb_mitigation.entry", "firmware-demo", "--count", "20"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=150, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "20 corrected by the board, 0 lost" in done.stdout
@@ -36,6 +36,6 @@ def test_without_the_tools_the_demo_names_the_line_that_installs_them(
         monkeypatch.setenv(name, os.environ.get(name, ""))
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(typer.Exit) as end:
-        firmware_demo.firmware_demo(recording=None, count=1)
+        firmware_demo(recording=None, count=1)
     assert end.value.exit_code == 1
     assert "apt install gcc-arm-none-eabi" in " ".join(capsys.readouterr().out.split())

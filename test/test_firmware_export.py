@@ -11,8 +11,9 @@ import model_material
 import numpy as np
 import pytest
 
+from uwb_mitigation.benches import random_networks
 from uwb_mitigation.errors import ModelError, UwbMitigationError
-from uwb_mitigation.firmware_export import header, synthetic
+from uwb_mitigation.firmware_export import header
 from uwb_mitigation.firmware_export.export import export_bundle
 from uwb_mitigation.firmware_export.packing import pack
 from uwb_mitigation.model import graph
@@ -78,7 +79,7 @@ def test_shapes_without_kernels_are_refused(architecture: Remnet, names: str):
 
 
 def test_a_scale_without_exact_integers_is_refused_by_layer_and_channel():
-    weights = synthetic.random_remnet(16, 3)
+    weights = random_networks.remnet(16, 3)
     scales = weights.weight_scale["module2.skip"].copy()
     # A requantisation by 1/64: every 64th accumulator is a tie, and ties go to even.
     unit = weights.activation_scale["module2.skip"] / weights.activation_scale["module2.sum"]
@@ -89,7 +90,7 @@ def test_a_scale_without_exact_integers_is_refused_by_layer_and_channel():
 
 
 def test_a_sum_without_exact_integers_is_refused_by_name():
-    weights = synthetic.random_remnet(16, 3)
+    weights = random_networks.remnet(16, 3)
     scales = {**weights.activation_scale, "module1.sum": weights.activation_scale["first"] / np.float32(3)}
     with pytest.raises(ModelError, match=r"module1\.sum"):
         pack(replace(weights, activation_scale=scales))
@@ -102,7 +103,7 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path):
 
 
 def test_a_hostile_name_cannot_end_the_comment(tmp_path: Path):
-    weights = synthetic.random_remnet(16, 3)
+    weights = random_networks.remnet(16, 3)
     card = replace(firmware_models.identity(), name='*/ #include "/etc/passwd" /*\n')
     text = firmware_models.write_model(tmp_path, weights, card).read_text()
     assert "passwd" in text.splitlines()[0]

@@ -17,11 +17,21 @@ from uwb_mitigation.firmware_export.host import link
 from uwb_mitigation.link import messages
 from uwb_mitigation.link.board import Board, Identity
 from uwb_mitigation.link.framing import Frame, FrameDecoder, FrameEncoder, encode_frame
-from uwb_mitigation.link.layout import HEADER, MAX_PAYLOAD_BYTES, Flag, MessageType, Mode, c_header
+from uwb_mitigation.link.layout import (
+    HEADER,
+    MAX_OFFSETS,
+    MAX_PAYLOAD_BYTES,
+    Flag,
+    MessageType,
+    Mode,
+    c_header,
+)
 from uwb_mitigation.link.messages import GetInfo, SetMode, TimeSync
+from uwb_mitigation.link.offsets import SetOffsets
 from uwb_mitigation.measurement import RangeMeasurement
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import Bundle
+from uwb_mitigation.offsets import Offsets
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc")
 
@@ -182,6 +192,24 @@ def same(sent: bytes, expected: bytes) -> bool:
     return frames(sent) == frames(expected)
 
 
+def some_offsets(random: np.random.Generator) -> Offsets:
+    """As many as a board keeps or a few more, for radios that measurements name and others."""
+    default, *values = random.uniform(-1.0, 1.0, 4)
+    most = {100 + i: 0.5 for i in range(int(random.choice([0, 3, MAX_OFFSETS - 2, MAX_OFFSETS])))}
+    tags, anchors = ({}, {}) if random.random() < 0.5 else ({1: values[0]}, {2: values[1]})
+    pairs = {(1, 2): values[2]} if random.random() < 0.3 else {}
+    return Offsets(default, most | anchors, tags, pairs)
+
+
+def damaged(payload: bytes, random: np.random.Generator) -> bytes:
+    """Cut short, or with a field that holds NaN or what no field may hold."""
+    if random.random() < 0.5:
+        return payload[: int(random.integers(0, len(payload)))]
+    at = int(random.choice([0, *range(8 + 16, len(payload), 24)]))
+    wrong = (b"\0\0\xc0\x7f", b"\0\0\x80\x41\x07")[int(random.integers(0, 2))]
+    return payload[:at] + wrong + payload[at + len(wrong) :]
+
+
 @pytest.mark.parametrize("mode", list(Mode))
 def test_a_board_in_c_sends_what_the_board_in_python_sends(library: ctypes.CDLL, bundle: Bundle, mode: Mode):
     random = np.random.default_rng(5)
@@ -197,10 +225,20 @@ def test_a_board_in_c_sends_what_the_board_in_python_sends(library: ctypes.CDLL,
         measured = firmware_models.random_measurement(random)
         wire = radio.encode(*messages.encode(measured))
         assert same(c.measure(wire, now_us), python.measure(measured, now_us))
-        requests = [GetInfo(), TimeSync(), measured, SetMode(Mode(int(random.integers(0, 3)))), None]
-        request = requests[int(random.choice(5, p=[0.2, 0.2, 0.3, 0.1, 0.2]))]
+        requests = [
+            GetInfo(),
+            TimeSync(),
+            measured,
+            SetMode(Mode(int(random.integers(0, 3)))),
+            SetOffsets(some_offsets(random)),
+            None,
+        ]
+        request = requests[int(random.choice(6, p=[0.1, 0.1, 0.3, 0.1, 0.2, 0.2]))]
         if request is None:
             kind, payload = int(random.integers(0, 256)), random.bytes(int(random.integers(0, 120)))
+            if random.random() < 0.5:
+                kind, payload = messages.encode(SetOffsets(some_offsets(random)))
+                payload = damaged(payload, random)
         else:
             kind, payload = messages.encode(request)
         data = host.encode(kind, payload)

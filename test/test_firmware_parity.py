@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from firmware_models import Exported
 
+from uwb_mitigation.benches import random_networks
 from uwb_mitigation.errors import UwbMitigationError
-from uwb_mitigation.firmware_export import synthetic
 from uwb_mitigation.firmware_export.compiling import firmware_folder, run
 from uwb_mitigation.firmware_export.export import export_bundle
 from uwb_mitigation.firmware_export.host import HostFirmware, link
@@ -25,7 +25,8 @@ from uwb_mitigation.model.architecture import HEAD
 from uwb_mitigation.model.bundle import load_bundle, save_bundle
 from uwb_mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.model.prior import LinePrior
-from uwb_mitigation.model.shipped import default_model_path
+from uwb_mitigation.model.shipped import default_model_path, shipped_model_path
+from uwb_mitigation.offsets import Offsets
 from uwb_mitigation.preprocessing import Preprocessing, Scaling
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc")
@@ -39,8 +40,8 @@ def bits(values: np.ndarray) -> np.ndarray:
 
 
 def test_oracle_windows_are_not_all_alike():
-    weights = synthetic.random_remnet(157, 3)
-    windows = synthetic.pressing_windows(157, weights.activation_scale["input"], 500)
+    weights = random_networks.remnet(157, 3)
+    windows = random_networks.pressing_windows(157, weights.activation_scale["input"], 500)
     assert len(np.unique(IntegerNetwork(weights).predict_m(windows))) > 300
 
 
@@ -74,9 +75,9 @@ def test_c_and_oracle_equal_onnx_runtime_on_real_logs(
 
 @pytest.mark.parametrize(("samples", "modules"), [(9, 1), (12, 2), (23, 3), (40, 2), (81, 3), (156, 1)])
 def test_any_length_and_number_of_modules(samples: int, modules: int, tmp_path: Path):
-    weights = synthetic.random_remnet(samples, 3, modules)
+    weights = random_networks.remnet(samples, 3, modules)
     firmware_models.write_model(tmp_path, weights)
-    windows = synthetic.pressing_windows(samples, weights.activation_scale["input"], 40)
+    windows = random_networks.pressing_windows(samples, weights.activation_scale["input"], 40)
     computed = HostFirmware(tmp_path, tmp_path, SANITIZED).predict_m(windows)
     assert np.array_equal(bits(computed), bits(IntegerNetwork(weights).predict_m(windows)))
 
@@ -88,7 +89,7 @@ def firmware(tmp_path_factory: pytest.TempPathFactory) -> dict[Scaling, HostFirm
     for scaling in Scaling:
         folder = tmp_path_factory.mktemp(scaling.value)
         identity = firmware_models.identity(scaling=scaling)
-        firmware_models.write_model(folder, synthetic.random_remnet(32, 3), identity)
+        firmware_models.write_model(folder, random_networks.remnet(32, 3), identity)
         built[scaling] = HostFirmware(folder, folder, SANITIZED)
     return built
 
@@ -120,8 +121,10 @@ def test_corrected_ranges_equal_the_mitigators(tmp_path: Path):
     seen = set()
     for _ in range(1000):
         measurement = firmware_models.random_measurement(random)
+        offset_m = float(np.float32(random.choice([0.0, 0.22, -0.7, 3.3])))
+        mitigation.offsets = Offsets(offset_m)
         expected = mitigation.correct(measurement)
-        computed = firmware.correct(measurement.range_m, measurement.cir)
+        computed = firmware.correct(measurement.range_m, measurement.cir, offset_m)
         assert computed[3] == int(expected.status)
         values = [expected.range_m, expected.correction_m, expected.variance_m2]
         assert np.array_equal(bits(np.array(computed[:3])), bits(np.array(values)))
@@ -134,7 +137,7 @@ def test_corrected_ranges_equal_the_mitigators(tmp_path: Path):
 def test_a_prediction_that_overflows_is_a_failure_of_the_model_as_for_the_mitigator(
     sign: int, tmp_path: Path
 ):
-    weights = synthetic.random_remnet(16, 3)
+    weights = random_networks.remnet(16, 3)
     scales = {**weights.weight_scale, HEAD: np.array([1e31], np.float32)}
     model = graph.int8_model(replace(weights, weight_scale=scales))
     largest = LinePrior(sign * float(np.finfo(np.float32).max))
@@ -171,8 +174,13 @@ def test_what_is_strange_to_the_model_is_graded_as_by_the_mitigator(samples: int
     assert statuses >= {Status.OK, Status.OUT_OF_DISTRIBUTION}
 
 
-def test_real_logs_are_corrected_as_by_the_mitigator(apartment: Path, tmp_path: Path):
-    bundle = load_bundle(default_model_path())
+@pytest.mark.parametrize(
+    "shipped",
+    [default_model_path(), shipped_model_path("evk1000_apartment"), default_model_path(Scaling.MAX)],
+    ids=lambda path: path.stem,
+)
+def test_real_logs_are_corrected_as_by_the_mitigator(shipped: Path, apartment: Path, tmp_path: Path):
+    bundle = load_bundle(shipped)
     export_bundle(bundle, tmp_path)
     firmware, mitigation = HostFirmware(tmp_path, tmp_path), Mitigation(bundle)
     corrected = 0
@@ -194,13 +202,13 @@ ADDRESS_SANITIZED = ("-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize
 
 
 def test_golden_vectors_pass_under_the_sanitizers(tmp_path: Path):
-    firmware_models.write_model(tmp_path, synthetic.random_remnet(64, 5))
+    firmware_models.write_model(tmp_path, random_networks.remnet(64, 5))
     program = build_program("golden", tmp_path, ADDRESS_SANITIZED)
     assert "0 of 8 golden vectors wrong" in run([program])
 
 
 def test_golden_vectors_notice_a_changed_weight(tmp_path: Path):
-    header = firmware_models.write_model(tmp_path, synthetic.random_remnet(16, 3))
+    header = firmware_models.write_model(tmp_path, random_networks.remnet(16, 3))
     text = header.read_text()
     start = text.index("{\n", text.index("uwb_module1_residual_weights[")) + 2
     first = text[start : text.index(",", start)].strip()
@@ -212,20 +220,20 @@ def test_golden_vectors_notice_a_changed_weight(tmp_path: Path):
 @pytest.mark.parametrize("scaling", list(Scaling))
 def test_arbitrary_cirs_break_no_promise_under_the_sanitizers(scaling: Scaling, tmp_path: Path):
     card = firmware_models.identity(scaling, model_material.LINE, (-1e4, 1e4))
-    firmware_models.write_model(tmp_path, synthetic.random_remnet(16, 3), card)
+    firmware_models.write_model(tmp_path, random_networks.remnet(16, 3), card)
     seen = run([build_program("fuzz_correct", tmp_path, ADDRESS_SANITIZED), "4000", "1"])
     statuses = {int(line.split()[1].rstrip(":")) for line in seen.splitlines()}
     assert {0, 4, 5, 6, 7, 9, 12, 14} <= statuses
 
 
 def test_arbitrary_bytes_break_no_promise_of_a_board_under_the_sanitizers(tmp_path: Path):
-    firmware_models.write_model(tmp_path, synthetic.random_remnet(16, 3))
+    firmware_models.write_model(tmp_path, random_networks.remnet(16, 3))
     run([build_program("fuzz_link", tmp_path, ADDRESS_SANITIZED), "1000", "1"])
 
 
 @pytest.mark.skipif(shutil.which("cmake") is None, reason="no CMake: apt install cmake")
 def test_plain_cmake_builds_the_library_and_passes_its_test(tmp_path: Path):
-    firmware_models.write_model(tmp_path, synthetic.random_remnet(16, 3))
+    firmware_models.write_model(tmp_path, random_networks.remnet(16, 3))
     build = tmp_path / "build"
     run(["cmake", "-S", str(firmware_folder()), "-B", str(build), f"-DUWB_MODEL_DIR={tmp_path}"])
     run(["cmake", "--build", str(build)])
@@ -234,7 +242,7 @@ def test_plain_cmake_builds_the_library_and_passes_its_test(tmp_path: Path):
 
 @pytest.mark.skipif(shutil.which("c++") is None, reason="no C++ compiler: apt install g++")
 def test_a_sketch_in_cpp_can_include_the_model(tmp_path: Path):
-    firmware_models.write_model(tmp_path, synthetic.random_remnet(16, 3))
+    firmware_models.write_model(tmp_path, random_networks.remnet(16, 3))
     sketch = tmp_path / "sketch.cpp"
     sketch.write_text('#include "uwb_model.h"\nuint32_t id() { return uwb_model_data.model_id; }\n')
     warnings = ("-std=gnu++14", "-Wall", "-Wextra", "-Werror")

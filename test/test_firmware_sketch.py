@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from uwb_mitigation.dw1000_model.library import model_folder, model_objects
 from uwb_mitigation.firmware_export.compiling import firmware_folder, run
 from uwb_mitigation.firmware_export.export import export_bundle
 from uwb_mitigation.firmware_export.host import library_objects
@@ -20,7 +21,8 @@ from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.shipped import default_model_path
 from uwb_mitigation.sources.simulated import SimulatedSource
 
-SKETCH = Path(__file__).parent.parent / "firmware" / "examples" / "UwbMitigation"
+EXAMPLES = Path(__file__).parent.parent / "firmware" / "examples"
+SKETCH = EXAMPLES / "UwbMitigation"
 
 
 def test_the_sketchs_model_is_the_shipped_one(tmp_path: Path):
@@ -68,3 +70,49 @@ def test_the_sketch_corrects_what_the_radio_sends_in_writes_that_are_safe_on_usb
             expected, correction.compute_us,
         )  # fmt: skip
         assert messages.encode(correction) == messages.encode(wanted)
+
+
+@pytest.mark.skipif(shutil.which("arm-none-eabi-g++") is None, reason="apt install gcc-arm-none-eabi")
+@pytest.mark.parametrize("name", ["UwbMitigation", "UwbRanger"])
+def test_the_sketches_compile_for_the_boards_processor(tmp_path: Path, name: str):
+    """As the Arduino core for the nRF52840 compiles, but for its headers: sizes of types, warnings, what is inlined."""
+    firmware = firmware_folder()
+    export_bundle(load_bundle(default_model_path()), tmp_path)
+    sketch = tmp_path / f"{name}.cpp"
+    sketch.write_text((EXAMPLES / name / f"{name}.ino").read_text())
+    stub = firmware / "test" / "arduino_stub"
+    cpu = ("-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=softfp", "-mfpu=fpv4-sp-d16")
+    flags = ("-std=gnu++14", "-Os", "-Wall", "-Wextra", "-Werror", "-include", str(stub / "Arduino.h"))
+    includes = (f"-I{stub}", f"-I{firmware / 'src'}", f"-I{tmp_path}")
+    run(["arm-none-eabi-g++", *cpu, *flags, *includes, "-c", str(sketch), "-o", str(tmp_path / "sketch.o")])
+
+
+@pytest.mark.skipif(shutil.which("c++") is None, reason="no C++ compiler: apt install g++")
+@pytest.mark.parametrize("with_model", [False, True], ids=["without a model", "with one"])
+def test_the_sketch_with_a_radio_ranges_on_a_modelled_chip(tmp_path: Path, with_model: bool):
+    firmware = firmware_folder()
+    stub = firmware / "test" / "arduino_stub"
+    if with_model:
+        export_bundle(load_bundle(default_model_path()), tmp_path)
+    sketch = tmp_path / "UwbRanger.cpp"
+    sketch.write_text((EXAMPLES / "UwbRanger" / "UwbRanger.ino").read_text())
+    flags = ("-std=gnu++17", "-O1", "-Wall", "-Wextra", "-Werror", "-include", str(stub / "Arduino.h"))
+    includes = (f"-I{stub}", f"-I{firmware / 'src'}", f"-I{model_folder()}", f"-I{tmp_path}")
+    files = (str(sketch), str(stub / "radio_main.cpp"), *library_objects(), *model_objects())
+    program = tmp_path / "sketch"
+    run(["c++", *flags, *includes, *files, "-lm", "-lpthread", "-o", str(program)])
+
+    done = subprocess.run([program, "0.5"], capture_output=True, timeout=120, check=False)
+
+    assert done.returncode == 0
+    decoder = FrameDecoder()
+    received = [messages.decode(frame.type, frame.payload) for frame in decoder.feed(done.stdout)]
+    assert decoder.counts.corrupt == 0
+    hello = received[0]
+    assert isinstance(hello, Hello)
+    assert (hello.window == 157) is with_model
+    ranges = [message for message in received if isinstance(message, RangeMeasurement)]
+    assert len(ranges) > 50
+    for measured in ranges:
+        assert abs(measured.range_m - 7) < 0.02
+        assert len(measured.cir) == 157

@@ -8,14 +8,13 @@ from fractions import Fraction
 import numpy as np
 import onnxruntime
 import pytest
-from model_material import bundle, card, random_int8, random_weights, windows
+from model_material import bundle, integer_network, random_int8, windows
 
-from uwb_mitigation.errors import ModelError
 from uwb_mitigation.model import graph
 from uwb_mitigation.model.architecture import Remnet
-from uwb_mitigation.model.bundle import load_bundle, save_bundle
+from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.integer import IntegerNetwork
-from uwb_mitigation.model.session import Session, session_options
+from uwb_mitigation.model.runtime import Session, session_options
 from uwb_mitigation.model.shipped import default_model_path
 
 
@@ -51,7 +50,7 @@ def test_it_equals_onnx_runtime(samples, first_kernel):
 
 def test_the_shipped_network_equals_onnx_runtime():
     shipped = load_bundle(default_model_path())
-    session, reference = Session(shipped), IntegerNetwork.from_bundle(shipped)
+    session, reference = Session(shipped), integer_network(shipped)
     inputs = np.concatenate([windows(1500, 157, 4), hostile_inputs(157, 5)])
     expected = reference.predict_m(inputs)
     assert np.array_equal(session.predict_batch_m(inputs), expected)
@@ -91,16 +90,8 @@ def test_padding_is_a_literal_zero():
     assert np.array_equal(first, 7 * kernel[:, 1] + weights.bias["first"])
 
 
-def test_a_float_bundle_has_no_integers(tmp_path):
-    shape = Remnet(samples=8)
-    model = graph.float_model(random_weights(shape))
-    saved = save_bundle(tmp_path / "float.onnx", model, card(shape, quantised=False))
-    with pytest.raises(ModelError, match="an int8 bundle"):
-        IntegerNetwork.from_bundle(saved)
-
-
 def test_it_reads_what_a_bundle_holds(tmp_path):
     saved = bundle(tmp_path, Remnet(samples=8), seed=3)
     inputs = windows(20, 8)
     expected = IntegerNetwork(random_int8(Remnet(samples=8), seed=3)).predict_m(inputs)
-    assert np.array_equal(IntegerNetwork.from_bundle(saved).predict_m(inputs), expected)
+    assert np.array_equal(integer_network(saved).predict_m(inputs), expected)

@@ -37,6 +37,7 @@ _CIR_RECORD = np.dtype(
         ("rx_power_dbm", "<f4"),
         ("first_path_power_dbm", "<f4"),
         ("range_m", "<f4"),
+        ("offset_m", "<f4"),
         ("samples", "<i2", (_MAX_VALUES,)),
     ]
 )
@@ -81,9 +82,13 @@ def run_windows(image: Image, windows: NDArray[np.float32], timeout_s: float = 6
 
 
 def run_measurements(
-    image: Image, measurements: Sequence[RangeMeasurement], samples: int, timeout_s: float = 600
+    image: Image,
+    measurements: Sequence[RangeMeasurement],
+    samples: int,
+    timeout_s: float = 600,
+    offset_m: float = 0.0,
 ) -> Emulation:
-    """Corrected ranges of measurements, and the windows of `samples` values that preprocessing gave.
+    """Corrected ranges of measurements, of radios with this offset, and the windows of `samples` values that preprocessing gave.
 
     Raises:
         ParameterError: a CIR is longer than the board's accumulator.
@@ -98,6 +103,7 @@ def run_measurements(
         row["samples"][: len(cir.samples)] = cir.samples
         row["encoding"] = int(cir.encoding)
         row["range_m"] = measurement.range_m
+        row["offset_m"] = offset_m
         for name in (
             "start_index",
             "first_path_index",

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ModelError, UwbMitigationError
-from uwb_mitigation.firmware_export.header import Golden, Identity, render
+from uwb_mitigation.files import write_whole
+from uwb_mitigation.firmware_export.header import Golden, ModelConstants, render
 from uwb_mitigation.firmware_export.host import MODEL_HEADER
 from uwb_mitigation.firmware_export.packing import PackedNetwork, pack
 from uwb_mitigation.model import graph
@@ -43,23 +44,21 @@ def export_bundle(bundle: Bundle, folder: Path) -> Path:
     return write_header(folder, network, identity(bundle), golden)
 
 
-def write_header(folder: Path, network: PackedNetwork, identity: Identity, golden: Golden) -> Path:
+def write_header(folder: Path, network: PackedNetwork, identity: ModelConstants, golden: Golden) -> Path:
     """Write `uwb_model.h` to `folder`, which is made if need be; whole or not at all."""
     path = folder / MODEL_HEADER
-    partial = path.with_name(path.name + ".part")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        partial.write_text(render(network, identity, golden), encoding="utf-8")
-        partial.replace(path)
     except OSError as error:
         raise UwbMitigationError(f"cannot be written: {error.strerror}", where=str(path)) from error
+    write_whole(path, render(network, identity, golden))
     return path
 
 
-def identity(bundle: Bundle) -> Identity:
+def identity(bundle: Bundle) -> ModelConstants:
     """What the header says of a bundle beside its network."""
     card = bundle.card
-    return Identity(
+    return ModelConstants(
         name=card.name,
         model_id=bundle.model_id,
         scaling=card.preprocessing.scaling,

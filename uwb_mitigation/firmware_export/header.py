@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ModelError
 from uwb_mitigation.firmware_export.packing import Channels, PackedNetwork
-from uwb_mitigation.firmware_export.requantisation import Sum
 from uwb_mitigation.model.familiarity import Familiarity
 from uwb_mitigation.model.prior import LinePrior
+from uwb_mitigation.model.requantisation import Sum
 from uwb_mitigation.preprocessing import Scaling
 
 _COLUMNS = 100
@@ -22,7 +22,7 @@ _SCALINGS = {Scaling.MAX: "UWB_SCALE_MAX", Scaling.PREAMBLE: "UWB_SCALE_PREAMBLE
 
 
 @dataclass(frozen=True, slots=True)
-class Identity:
+class ModelConstants:
     """What a model is beside its network; numbers are float32 values.
 
     Attributes:
@@ -55,7 +55,7 @@ class Golden:
     outputs_m: NDArray[np.float32]
 
 
-def render(network: PackedNetwork, identity: Identity, golden: Golden) -> str:
+def render(network: PackedNetwork, identity: ModelConstants, golden: Golden) -> str:
     """The text of `uwb_model.h`: `uwb_model_data`, and golden vectors under UWB_GOLDEN_VECTORS.
 
     Floats have nine significant digits, which read back to the same bits.
@@ -116,7 +116,7 @@ def _familiarity(familiarity: Familiarity) -> str:
     return f"static const uwb_familiarity uwb_familiar = {{{offset}, {{\n{bands}}}}};\n"
 
 
-def _model(network: PackedNetwork, identity: Identity) -> str:
+def _model(network: PackedNetwork, identity: ModelConstants) -> str:
     remnet = bool(network.modules)
     prior, (low, high) = identity.prior, identity.correction_limits_m
     values = [

@@ -96,6 +96,7 @@ class HostFirmware:
         library.uwb_correct.argtypes = (
             ctypes.c_void_p,
             ctypes.c_float,
+            ctypes.c_float,
             ctypes.POINTER(_Cir),
             ctypes.c_void_p,
             ctypes.c_size_t,
@@ -125,12 +126,13 @@ class HostFirmware:
         status = self._library.uwb_preprocess(self._model, ctypes.byref(_c_cir(cir)), out.ctypes.data)
         return _FAULTS[status] if status else None
 
-    def correct(self, range_m: float, cir: Cir) -> tuple[float, float, float, int]:
+    def correct(self, range_m: float, cir: Cir, offset_m: float = 0.0) -> tuple[float, float, float, int]:
         """Range, correction, variance and status, as `Mitigation.correct` gives them."""
         result = _Corrected()
         self._library.uwb_correct(
             self._model,
             range_m,
+            offset_m,
             ctypes.byref(_c_cir(cir)),
             self._arena,
             self.arena_bytes,

@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ModelError
-from uwb_mitigation.firmware_export.requantisation import (
+from uwb_mitigation.model.architecture import HEAD, Mlp, Remnet
+from uwb_mitigation.model.requantisation import (
     Sum,
     accumulator_range,
     requantisation_scale,
     solve_requantisation,
     solve_sum,
 )
-from uwb_mitigation.model.architecture import HEAD, Mlp, Remnet
 from uwb_mitigation.model.weights import Int8Weights, layer_inputs
 
 FILTERS = 16

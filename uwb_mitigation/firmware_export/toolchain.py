@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import re
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,21 +26,24 @@ _SIZE_STUB = """\
 void board_exit(int code);
 void board_exit(int code) { (void)code; for (;;) { } }
 volatile float uwb_range_m;
+volatile float uwb_offset_m;
 int main(void) {
     static uint32_t arena[4096];
     static uwb_cir cir;
     uwb_corrected corrected;
-    return (int)uwb_correct(&uwb_model_data, uwb_range_m, &cir, arena, sizeof arena, &corrected);
+    return (int)uwb_correct(&uwb_model_data, uwb_range_m, uwb_offset_m, &cir, arena, sizeof arena, &corrected);
 }
 """
 
 
-class Board(str, enum.Enum):
+class Target(str, enum.Enum):
     """The boards that there is a start-up and a linker script for, in `firmware/boards/`."""
 
     QEMU_MPS2 = "qemu_mps2"
     QEMU_MPS2_LINK = "qemu_mps2_link"
+    QEMU_MPS2_RADIO = "qemu_mps2_radio"
     DWM1001C = "dwm1001c"
+    DWM1001_DEV = "dwm1001_dev"
 
 
 class Kernels(str, enum.Enum):
@@ -56,17 +60,20 @@ class Image:
     Attributes:
         elf: its file.
         flash_bytes: code, constants and initial values of variables.
-        static_bytes: variables.
+        static_bytes: variables; what they leave of the RAM is the stack's.
+        flash_room, ram_room: what the board has, bytes.
     """
 
     elf: Path
     flash_bytes: int
     static_bytes: int
+    flash_room: int
+    ram_room: int
 
 
 def missing_tools() -> list[str]:
     """The tools that building and emulating need and that are not installed."""
-    tools = [f"{_PREFIX}{tool}" for tool in ("gcc", "size", "nm", "objdump")] + ["qemu-system-arm"]
+    tools = [f"{_PREFIX}{tool}" for tool in ("gcc", "nm", "objcopy", "objdump")] + ["qemu-system-arm"]
     return [tool for tool in tools if shutil.which(tool) is None]
 
 
@@ -78,7 +85,7 @@ def require_tools() -> None:
 
 
 def build_image(
-    export: Path, build: Path, board: Board, kernels: Kernels = Kernels.CORTEX_M4, optimisation: str = "-Os"
+    export: Path, build: Path, board: Target, kernels: Kernels = Kernels.CORTEX_M4, optimisation: str = "-Os"
 ) -> Image:
     """Build the board's program with the model in `export`, in the folder `build`.
 
@@ -92,13 +99,18 @@ def build_image(
     return _link(export, build, board.value, sorted(folder.glob("*.c")), kernels, optimisation)
 
 
+def write_hex(image: Image, output: Path) -> None:
+    """Write an image as Intel HEX, which a J-Link's drive takes."""
+    run([f"{_PREFIX}objcopy", "-O", "ihex", str(image.elf), str(output)])
+
+
 def measure_size(
     export: Path, build: Path, kernels: Kernels = Kernels.CORTEX_M4, optimisation: str = "-Os"
 ) -> Image:
     """Build a program that does nothing but correct a range: vectors, start-up, library, model."""
     stub = build / "size.c"
     stub.write_text(_SIZE_STUB, encoding="utf-8")
-    return _link(export, build, Board.DWM1001C.value, [stub], kernels, optimisation, "size")
+    return _link(export, build, Target.DWM1001C.value, [stub], kernels, optimisation, "size")
 
 
 def _boards_folder() -> Path:
@@ -135,13 +147,38 @@ def _link(
             f"-L{boards / 'cortex_m4'}",
             *map(str, sources),
             *objects,
-            *("-nostartfiles", "--specs=nano.specs", "-Wl,--gc-sections"),
+            *(
+                "-nostartfiles",
+                "--specs=nano.specs",
+                "-Wl,--gc-sections",
+                f"-Wl,-Map={elf.with_suffix('.map')}",
+            ),
             *("-T", str(script), "-o", str(elf), "-lm"),
         ]
     )
-    lines = run([f"{_PREFIX}size", str(elf)]).splitlines()
+    return _measured(elf)
+
+
+_REGION = re.compile(r"^(FLASH|RAM) +0x([0-9a-f]+) +0x([0-9a-f]+)", re.MULTILINE)
+# A long name stands in a line of its own.
+_SECTION = re.compile(
+    r"^(\.\S+)\s+0x([0-9a-f]+)\s+0x([0-9a-f]+)(?: load address 0x([0-9a-f]+))?$", re.MULTILINE
+)
+
+
+def _measured(elf: Path) -> Image:
+    """What the linker's map says of memory: how far flash and RAM are taken."""
+    text = elf.with_suffix(".map").read_text(encoding="utf-8")
+    regions = {name: (int(origin, 16), int(length, 16)) for name, origin, length in _REGION.findall(text)}
+    sections = {
+        name: (int(address, 16), int(size, 16), int(load or address, 16))
+        for name, address, size, load in _SECTION.findall(text)
+    }
     try:
-        text, data, bss = (int(field) for field in lines[1].split()[:3])
-    except (IndexError, ValueError) as error:
-        raise UwbMitigationError(f"unexpected output of size: {lines!r}", where=str(elf)) from error
-    return Image(elf, text + data, data + bss)
+        (flash, flash_room), (ram, ram_room) = regions["FLASH"], regions["RAM"]
+        _, data_bytes, data_load = sections[".data"]
+        bss, bss_bytes, _ = sections[".bss"]
+    except KeyError as error:
+        raise UwbMitigationError(f"the linker's map lacks {error}", where=str(elf)) from error
+    # Initial values of variables are the last in flash, variables without one the last in RAM.
+    return Image(elf, data_load + data_bytes - flash, bss + bss_bytes - ram, flash_room, ram_room)

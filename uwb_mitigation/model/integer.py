@@ -12,10 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.errors import ModelError
-from uwb_mitigation.model import graph
 from uwb_mitigation.model.architecture import HEAD, Convolution, Mlp, Remnet
-from uwb_mitigation.model.bundle import Bundle
 from uwb_mitigation.model.weights import Int8Weights, activation_tensors, layer_inputs, sum_operands
 
 _BATCH = 256
@@ -31,17 +28,6 @@ class IntegerNetwork:
         if isinstance(weights.architecture, Remnet):
             self._layers = {layer.name: layer for layer in weights.architecture.convolutions}
         self._reads = layer_inputs(weights.architecture)
-
-    @classmethod
-    def from_bundle(cls, bundle: Bundle) -> IntegerNetwork:
-        """The network of an int8 bundle.
-
-        Raises:
-            ModelError: the bundle is not quantised.
-        """
-        if not bundle.quantised:
-            raise ModelError("the network is in float", where=str(bundle.path), valid="an int8 bundle")
-        return cls(graph.int8_weights(bundle.model, bundle.architecture))
 
     def predict_m(self, inputs: NDArray[np.float32]) -> NDArray[np.float32]:
         """The network's outputs, float32 (n,), for inputs of shape (n, K), m."""

@@ -1,7 +1,8 @@
 """As much of the protocol-buffers wire format as it takes to look into an ONNX file before trusting it.
 
 So that a hostile or damaged file is refused by our own bounded reader, with a clear error, and before
-ONNX Runtime sees it; and so that running a model does not need the `onnx` package.
+ONNX Runtime sees it. The `onnx` package would add 0.2 s of processor time, 0.35 s in all, to the start of a node,
+and with `ml-dtypes` a numpy that shadows ROS's.
 """
 
 from __future__ import annotations

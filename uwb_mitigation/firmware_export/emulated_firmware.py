@@ -16,11 +16,10 @@ import time
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from types import TracebackType
 
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.firmware_export.export import export_bundle
-from uwb_mitigation.firmware_export.toolchain import Board, build_image, require_tools
+from uwb_mitigation.firmware_export.toolchain import Target, build_image, require_tools
 from uwb_mitigation.link import messages
 from uwb_mitigation.link.framing import FrameEncoder
 from uwb_mitigation.measurement import Encoding, RangeMeasurement
@@ -68,7 +67,7 @@ class EmulatedFirmware:
         try:
             folder = Path(self._folder.name)
             export_bundle(bundle, folder)
-            self._start(build_image(folder, folder, Board.QEMU_MPS2_LINK).elf, folder / "radio")
+            self._start(build_image(folder, folder, Target.QEMU_MPS2_LINK).elf, folder / "radio")
         except BaseException:
             self.close()
             raise
@@ -107,12 +106,7 @@ class EmulatedFirmware:
     def __enter__(self) -> EmulatedFirmware:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _start(self, elf: Path, radio: Path) -> None:

@@ -1,0 +1,105 @@
+"""Integer constants that equal ONNX Runtime's float requantisation on every reachable value."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from uwb_mitigation.benches import random_networks
+from uwb_mitigation.errors import ModelError
+from uwb_mitigation.firmware_export.packing import pack
+from uwb_mitigation.model import requantisation
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_solved_requantisation_equals_the_float_formula_on_every_accumulator(seed: int):
+    random = np.random.default_rng(seed)
+    scale = np.float32(10 ** random.uniform(-3.4, -1.5))
+    low, high = -int(random.integers(0, 400_000)), int(random.integers(1000, 400_000))
+
+    moved = requantisation.nudge_weight_scale(
+        np.float32(1), np.array([scale]), np.float32(1), np.array([low]), np.array([high])
+    )[0]
+    found = requantisation.solve_requantisation(moved, low, high)
+
+    assert found is not None
+    accumulators = np.arange(low, high + 1)
+    assert np.array_equal(found.apply(accumulators), requantisation.requantise(accumulators, moved))
+
+
+def test_a_multiplier_off_by_a_percent_is_not_exact():
+    scale = np.float32(0.00371)
+    accumulators = np.arange(-1000, 80_000)
+    found = requantisation.solve_requantisation(scale, -1000, 80_000)
+    wrong = requantisation.Requantisation(found.multiplier * 101 // 100, found.offset)
+    assert not np.array_equal(wrong.apply(accumulators), requantisation.requantise(accumulators, scale))
+
+
+def test_a_bias_that_lifts_every_output_is_solved_on_its_reach():
+    accumulators = np.arange(5000, 9000)
+    scale = np.float32(0.0103)
+    found = requantisation.solve_requantisation(scale, 5000, 8999)
+    assert np.array_equal(found.apply(accumulators), requantisation.requantise(accumulators, scale))
+
+
+def test_ties_that_round_half_to_even_have_no_line():
+    # Every second accumulator is a tie, and even and odd levels round opposite ways.
+    assert requantisation.solve_requantisation(np.float32(1 / 64), 0, 20_000) is None
+
+
+@pytest.mark.parametrize("scale", [np.float32(0.07), np.float32(0), np.float32(1e-12), np.float32(np.nan)])
+def test_scales_out_of_range_are_not_solved(scale: np.float32):
+    assert requantisation.solve_requantisation(scale, -100, 100) is None
+
+
+def test_accumulators_that_leave_32_bits_are_not_solved():
+    assert requantisation.solve_requantisation(np.float32(0.00371), 0, 1 << 23) is None
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_solved_sum_equals_fused_and_separate_arithmetic_on_every_pair(seed: int):
+    random = np.random.default_rng(seed)
+    first, second = (np.float32(value) for value in random.uniform(0.01, 0.1, 2))
+    total = requantisation.nudge_sum_scale(first, second, np.float32((first + second) * 0.8))
+    ratios = np.float32(first / total), np.float32(second / total)
+
+    table = requantisation.solve_sum(*ratios).table()
+
+    assert np.array_equal(table, requantisation.sum_table(*ratios))
+    assert np.array_equal(table, requantisation.sum_table(*ratios, fused=False))
+
+
+@pytest.mark.parametrize("ratios", [(1.5, 0.75), (0.0, 0.5), (float("nan"), 0.5)])
+def test_sums_out_of_range_are_not_solved(ratios: tuple[float, float]):
+    assert requantisation.solve_sum(np.float32(ratios[0]), np.float32(ratios[1])) is None
+
+
+def test_nudge_makes_a_network_exportable_and_moves_no_scale_by_more_than_64_ulps():
+    weights = random_networks.remnet(64, 3)
+    halved = {**weights.weight_scale, "first": weights.weight_scale["first"] * np.float32(1.0009)}
+    before = type(weights)(
+        weights.architecture, weights.weight, halved, weights.bias, weights.activation_scale
+    )
+
+    after = requantisation.nudge(before)
+
+    pack(after)
+    for name, scale in before.weight_scale.items():
+        moved = np.abs(after.weight_scale[name].view(np.int32) - scale.view(np.int32))
+        assert moved.max() <= 64
+        assert np.array_equal(after.weight[name], before.weight[name])
+
+
+def test_nudge_leaves_an_exact_network_as_it_is():
+    weights = random_networks.remnet(32, 3)
+    again = requantisation.nudge(weights)
+    assert again.activation_scale == weights.activation_scale
+    for name, scale in weights.weight_scale.items():
+        assert np.array_equal(again.weight_scale[name], scale)
+
+
+def test_an_impossible_scale_is_refused_with_its_channel():
+    with pytest.raises(ModelError, match="channel 0"):
+        requantisation.nudge_weight_scale(
+            np.float32(1), np.array([0.5], np.float32), np.float32(1), np.array([-100]), np.array([100])
+        )
