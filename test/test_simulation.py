@@ -283,7 +283,7 @@ def test_thermal_noise_is_that_of_the_noise_figure() -> None:
     noise = reception.samples[:, 2 * NOISE_TAPS.start : 2 * NOISE_TAPS.stop].astype(float)
     level = 10 * math.log10(2 * noise.var() / radio.preamble_symbols) - POWER_CONSTANT_DB
     # A frame this weak is compressed by little.
-    assert level == pytest.approx(radio.noise_level_dbm(), abs=0.3)
+    assert level == pytest.approx(radio.noise_level_dbm(np.array(radio.noise_figure_db)), abs=0.3)
 
 
 def test_a_frame_below_the_sensitivity_is_not_received() -> None:

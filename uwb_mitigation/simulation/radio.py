@@ -33,6 +33,9 @@ PULSE_WIDTH_TAPS = 2.4
 
 PLACE = (739.0, 751.0)
 """Where the straight line falls in the accumulator: the middle 90 % of the logs' first paths."""
+RAYLEIGH_VARIANCE = 1.0 - math.pi / 4.0
+"""Of the magnitude of complex noise of unit power."""
+
 NOISE_TAPS = slice(64, 576)
 SEARCH_FROM = 640
 """Noise is measured well before the first path can arrive, and the search begins after it."""
@@ -102,6 +105,24 @@ class Reception:
 
 
 @dataclass(frozen=True, slots=True)
+class Boards:
+    """In what the boards at the two ends of n links differ from others with the same chip: float64 (n,) each.
+
+    Attributes:
+        gain_db: of transmit power and both antennas, beyond those of the `Radio`.
+        noise_figure_db, preamble_symbols: as in `Radio`, in place of its own.
+    """
+
+    gain_db: NDArray[np.float64]
+    noise_figure_db: NDArray[np.float64]
+    preamble_symbols: NDArray[np.float64]
+
+    def take(self, index: NDArray[np.intp]) -> Boards:
+        """The links at `index`, in that order."""
+        return Boards(self.gain_db[index], self.noise_figure_db[index], self.preamble_symbols[index])
+
+
+@dataclass(frozen=True, slots=True)
 class Radio:
     """A receiver and the transmitter it hears.
 
@@ -148,40 +169,78 @@ class Radio:
             check_range("radio", name, value, low, high)
         check_range("radio", "preamble_symbols", self.preamble_symbols, 16, 4096, whole=True)
 
-    def noise_level_dbm(self) -> float:
+    def boards(self, n: int) -> Boards:
+        """n links between boards that are all alike."""
+        return Boards(np.zeros(n), np.full(n, self.noise_figure_db), np.full(n, float(self.preamble_symbols)))
+
+    @staticmethod
+    def noise_level_dbm(noise_figure_db: NDArray[np.float64]) -> NDArray[np.float64]:
         """Thermal noise of one tap over one symbol, on the scale of the paths' powers.
 
         A matched filter's peak has a signal-to-noise ratio of P T / (k T0 F); a lone path's peak tap
         holds pulse(0)^2 of its power.
         """
-        matched = BOLTZMANN_290K_DBM_HZ + self.noise_figure_db - 10.0 * math.log10(SYMBOL_S)
-        return matched + 20.0 * math.log10(PULSE_PEAK)
+        per_symbol = BOLTZMANN_290K_DBM_HZ - 10.0 * math.log10(SYMBOL_S) + 20.0 * math.log10(PULSE_PEAK)
+        return per_symbol + noise_figure_db
 
-    def receive(self, multipath: Multipath, rng: np.random.Generator) -> Reception:
+    def least_dbm(self, boards: Boards) -> NDArray[np.float64]:
+        """The weakest frames that are received: as much weaker as a longer preamble and less noise allow."""
+        longer = 10.0 * np.log10(boards.preamble_symbols / self.preamble_symbols)
+        return self.sensitivity_dbm - longer + (boards.noise_figure_db - self.noise_figure_db)
+
+    def compression(self, power: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Gain, as amplitude, of frames with so much power (sum of squares for each symbol squared)."""
+        limit = 10.0 ** ((self.compression_dbm + POWER_CONSTANT_DB) / 20.0)
+        gain: NDArray[np.float64] = (1.0 + (np.sqrt(power) / limit) ** 1.5) ** (-1.0 / 1.5)
+        return gain
+
+    def direct_margin_db(
+        self, direct_db: NDArray[np.float64], diffuse_db: NDArray[np.float64], boards: Boards
+    ) -> NDArray[np.float64]:
+        """About how far a direct path will lie above the threshold: what `receive` finds, before it is run.
+
+        Args:
+            direct_db, diffuse_db: of the direct path and of all others, relative to what was sent, (n,).
+        """
+        sent = self.tx_power_dbm + boards.gain_db + POWER_CONSTANT_DB
+        direct, diffuse = (10.0 ** ((sent + power) / 10.0) for power in (direct_db, diffuse_db))
+        power = direct + diffuse
+        # The strongest of the other paths holds about a tenth of them.
+        peak = PULSE_PEAK * np.sqrt(np.maximum(direct, 0.1 * diffuse)) * self.compression(power)
+        count = np.minimum(self.accumulator_limit / np.maximum(peak, 1e-9), boards.preamble_symbols)
+        thermal = 10.0 ** ((self.noise_level_dbm(boards.noise_figure_db) + POWER_CONSTANT_DB) / 10.0)
+        noise = thermal / np.maximum(count, 1.0) + power * 10.0 ** (self.self_noise_db / 10.0)
+        threshold = self.noise_multiplier**2 * RAYLEIGH_VARIANCE * noise
+        margin: NDArray[np.float64] = 10.0 * np.log10(PULSE_PEAK**2 * direct / threshold)
+        return margin
+
+    def receive(
+        self, multipath: Multipath, rng: np.random.Generator, boards: Boards | None = None
+    ) -> Reception:
         """Receive n frames over n links, each with its own sampling phase and noise.
 
         Amplitudes are scaled so that the sum of squares over the taps, divided by the square of the
         preamble count, is the received power by the manual's formula.
         """
+        boards = boards or self.boards(len(multipath.delay_ns))
         place = rng.uniform(*PLACE, len(multipath.delay_ns))
         symbol = _place_paths(place[:, None] + multipath.delay_ns / TAP_NS, multipath.gain)
-        scale = 10.0 ** ((self.tx_power_dbm + POWER_CONSTANT_DB) / 20.0)
-        symbol *= np.float32(scale)
+        scale = 10.0 ** ((self.tx_power_dbm + boards.gain_db + POWER_CONSTANT_DB) / 20.0)
+        symbol *= scale.astype(np.float32)[:, None]
 
         components = symbol.view(np.float32)
         power = np.einsum("ij,ij->i", components, components).astype(np.float64)
-        audible = power >= 10.0 ** ((self.sensitivity_dbm + POWER_CONSTANT_DB) / 10.0)
-        limit = 10.0 ** ((self.compression_dbm + POWER_CONSTANT_DB) / 20.0)
-        gain = (1.0 + (np.sqrt(power) / limit) ** 1.5) ** (-1.0 / 1.5)
+        audible = power >= 10.0 ** ((self.least_dbm(boards) + POWER_CONSTANT_DB) / 10.0)
+        gain = self.compression(power)
         power *= gain * gain
         symbol *= gain[:, None].astype(np.float32)
 
         peak = np.maximum(components.max(axis=1), -components.min(axis=1)).astype(np.float64)
         # A strong signal fills the accumulator in fewer symbols; at least one is always taken.
-        most = np.minimum(self.accumulator_limit / np.maximum(peak, 1e-9), self.preamble_symbols)
+        most = np.minimum(self.accumulator_limit / np.maximum(peak, 1e-9), boards.preamble_symbols)
         count = np.maximum(most, 1.0).astype(np.int64)
 
-        thermal = 10.0 ** ((self.noise_level_dbm() + POWER_CONSTANT_DB) / 10.0)
+        thermal = 10.0 ** ((self.noise_level_dbm(boards.noise_figure_db) + POWER_CONSTANT_DB) / 10.0)
         # Thermal noise adds up in power over the symbols, the preamble's own residue in amplitude.
         noise = thermal * count * gain * gain + power * count**2.0 * 10.0 ** (self.self_noise_db / 10.0)
         accumulator = rng.standard_normal(components.shape, dtype=np.float32)

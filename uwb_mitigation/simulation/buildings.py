@@ -1,0 +1,269 @@
+"""Random buildings, random boards in them, and placements balanced over what stands between the antennas.
+
+Distributions are assumed unless a source is named; docs/simulator.md tells which of them real ranges had a say in.
+The chip is the same everywhere: pulse, detector and compression are those of `simulation.radio`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.simulation.channel import (
+    INDUSTRIAL_LOS,
+    INDUSTRIAL_NLOS,
+    OFFICE_LOS,
+    OFFICE_NLOS,
+    PATTERN_LOSS_DB,
+    RESIDENTIAL_LOS,
+    RESIDENTIAL_NLOS,
+    Environment,
+    direct_power_db,
+)
+from uwb_mitigation.simulation.links import Environments, Links, draw_fields, place
+from uwb_mitigation.simulation.radio import Boards, Radio
+from uwb_mitigation.simulation.scene import (
+    BRICK,
+    CONCRETE,
+    GLASS,
+    PLASTERBOARD,
+    WOOD,
+    DirectPath,
+    FloorPlan,
+    Screen,
+    Wall,
+)
+
+RESIDENTIAL: Environments = (RESIDENTIAL_LOS, RESIDENTIAL_NLOS)
+OFFICE: Environments = (OFFICE_LOS, OFFICE_NLOS)
+INDUSTRIAL: Environments = (INDUSTRIAL_LOS, INDUSTRIAL_NLOS)
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """Buildings of one use.
+
+    Attributes:
+        name: for people. share: of all buildings.
+        length_m, width_m, room_m: bounds of the plan's sides and of a room's.
+        environments: of the diffuse field, {which: share}.
+        screens_per_m2: of metal furniture and machines, on average.
+    """
+
+    name: str
+    share: float
+    length_m: tuple[float, float]
+    width_m: tuple[float, float]
+    room_m: tuple[float, float]
+    environments: tuple[tuple[Environments, float], ...]
+    screens_per_m2: float
+
+
+KINDS = (
+    Kind("flat", 0.55, (5.0, 14.0), (4.0, 10.0), (2.5, 5.0), ((RESIDENTIAL, 1.0),), 0.12),
+    Kind("office", 0.2, (10.0, 30.0), (8.0, 18.0), (3.0, 7.0), ((RESIDENTIAL, 0.3), (OFFICE, 0.7)), 0.08),
+    Kind("corridor", 0.15, (12.0, 40.0), (6.0, 14.0), (3.0, 6.0), ((RESIDENTIAL, 0.3), (OFFICE, 0.7)), 0.06),
+    Kind("hall", 0.1, (10.0, 40.0), (8.0, 30.0), (10.0, 25.0), ((INDUSTRIAL, 1.0),), 0.06),
+)
+
+HEAVY = ((CONCRETE, (0.15, 0.40)), (BRICK, (0.20, 0.50)))
+LIGHT = ((PLASTERBOARD, (0.02, 0.05)), (WOOD, (0.03, 0.06)), (GLASS, (0.006, 0.02)))
+"""Materials of ITU-R P.2040-1 with bounds of their thickness, m: of load-bearing walls, and of partitions."""
+
+HEAVY_SHARE = 0.85
+"""Of walls that are heavy."""
+
+DOORWAY_SHARE = 0.8
+DOORWAY_M = (0.8, 1.2)
+METAL_M = (0.5, 2.0)
+PERSON_M = 0.45
+PEOPLE = 1.0
+"""On average, in each building."""
+
+RADIO = Radio(range_offset_m=0.0)
+"""The chip, its antenna delays calibrated: the error is the channel's alone."""
+
+GAIN_DB = (-6.0, 6.0)
+"""Transmit power and both antennas, beyond those of the EVB1000: a DW1000's power is set in steps over 30 dB, and
+regulators bound its density; small antennas gain -2 to 3 dB."""
+
+NOISE_FIGURE_DB = (8.0, 12.0)
+PREAMBLES = (128, 256, 512, 1024)
+DETECTION_SYMBOLS = 24
+"""Spent on detecting the preamble, so that they are not accumulated (the logs: 1000 of 1024)."""
+
+PLACEMENTS, BUILDINGS = 256, 4
+"""In one block, which is what one generator draws."""
+
+CANDIDATES = 16
+"""Placements drawn for each one that is kept."""
+
+
+def draw_plan(kind: Kind, rng: np.random.Generator) -> FloorPlan:
+    """A rectangle divided into rooms, most with a doorway, and what metal and people stand in it."""
+    size = (float(rng.uniform(*kind.length_m)), float(rng.uniform(*kind.width_m)))
+    room_m = float(rng.uniform(*kind.room_m))
+    walls: list[Wall] = []
+    if kind.name == "corridor":
+        half = rng.uniform(1.2, 2.5) / 2.0
+        low, high = size[1] / 2.0 - half, size[1] / 2.0 + half
+        for y, bottom, top in ((low, 0.0, low), (high, high, size[1])):
+            doors = np.arange(room_m / 2.0, size[0], room_m)
+            walls += _wall((0.0, y), (size[0], y), rng, doors)
+            _divide((0.0, bottom), (size[0], top), room_m, rng, walls)
+    else:
+        _divide((0.0, 0.0), size, room_m, rng, walls)
+    screens = [
+        _screen("metal", float(rng.uniform(*METAL_M)), size, rng)
+        for _ in range(rng.poisson(kind.screens_per_m2 * size[0] * size[1]))
+    ]
+    screens += [_screen("person", PERSON_M, size, rng) for _ in range(rng.poisson(PEOPLE))]
+    return FloorPlan(size, tuple(walls), tuple(screens))
+
+
+def _divide(
+    low: tuple[float, float],
+    high: tuple[float, float],
+    room_m: float,
+    rng: np.random.Generator,
+    walls: list[Wall],
+) -> None:
+    """Halve a rectangle across its longer side, about in the middle, until rooms are small enough."""
+    sides = high[0] - low[0], high[1] - low[1]
+    axis = 0 if sides[0] >= sides[1] else 1
+    if sides[axis] < 1.6 * room_m:
+        return
+    at = low[axis] + float(rng.uniform(0.35, 0.65)) * sides[axis]
+    start, end = ((at, low[1]), (at, high[1])) if axis == 0 else ((low[0], at), (high[0], at))
+    door = [float(rng.uniform(0.1, 0.9)) * sides[1 - axis]] if rng.random() < DOORWAY_SHARE else []
+    walls += _wall(start, end, rng, np.array(door))
+    _divide(low, (at, high[1]) if axis == 0 else (high[0], at), room_m, rng, walls)
+    _divide((at, low[1]) if axis == 0 else (low[0], at), high, room_m, rng, walls)
+
+
+def _wall(
+    start: tuple[float, float],
+    end: tuple[float, float],
+    rng: np.random.Generator,
+    doors_m: NDArray[np.float64],
+) -> list[Wall]:
+    """One wall, of one material, in the pieces that doorways at `doors_m` from its start leave."""
+    choices = HEAVY if rng.random() < HEAVY_SHARE else LIGHT
+    material, bounds = choices[int(rng.integers(len(choices)))]
+    thickness = float(rng.uniform(*bounds))
+    length = math.dist(start, end)
+    half = float(rng.uniform(*DOORWAY_M)) / 2.0
+    edges = [0.0, *(edge for door in doors_m.tolist() for edge in (door - half, door + half)), length]
+    unit = ((end[0] - start[0]) / length, (end[1] - start[1]) / length)
+    return [
+        Wall(_along(start, unit, first), _along(start, unit, last), material, thickness)
+        for first, last in zip(edges[::2], edges[1::2], strict=True)
+        if last - first > 0.05
+    ]
+
+
+def _along(start: tuple[float, float], unit: tuple[float, float], by: float) -> tuple[float, float]:
+    return start[0] + by * unit[0], start[1] + by * unit[1]
+
+
+def _screen(name: str, length_m: float, size: tuple[float, float], rng: np.random.Generator) -> Screen:
+    x, y, angle = (float(v) for v in rng.uniform((0.0, 0.0, 0.0), (*size, math.pi)))
+    half = (length_m / 2.0 * math.cos(angle), length_m / 2.0 * math.sin(angle))
+    return Screen(name, (x - half[0], y - half[1]), (x + half[0], y + half[1]))
+
+
+def draw_boards(n: int, rng: np.random.Generator) -> Boards:
+    """n pairs of boards: transmit power and antennas, noise, preamble length."""
+    return Boards(
+        rng.uniform(*GAIN_DB, n),
+        rng.uniform(*NOISE_FIGURE_DB, n),
+        rng.choice(np.array(PREAMBLES, np.float64), n) - DETECTION_SYMBOLS,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """Placements of one kind of building; `building`, int (n,), counts from 0."""
+
+    kind: str
+    building: NDArray[np.int64]
+    links: Links
+    boards: Boards
+
+    def configuration(self, seed: int, number: int, placement: int) -> str:
+        """The name of a placement, that counts from 0, of block `number`."""
+        building = number * BUILDINGS + int(self.building[placement])
+        return f"simulated buildings seed {seed}/{self.kind} {building}/placement {number * PLACEMENTS + placement}"
+
+
+def block_of(seed: int, number: int) -> tuple[Block, np.random.Generator]:
+    """A block of `PLACEMENTS` placements of one kind of building, and the generator that fading and noise are to be
+    drawn from: about a third each in line of sight, behind obstacles, and so far behind them that the direct path
+    is lost.
+
+    Sixteen times as many are drawn, and of each condition as many kept as it takes; what would be too weak to be
+    received is kept only where there is nothing else.
+    """
+    rng = np.random.default_rng([seed, number])
+    kind = KINDS[int(rng.choice(len(KINDS), p=[kind.share for kind in KINDS]))]
+    pairs, shares = zip(*kind.environments, strict=True)
+    environments = pairs[int(rng.choice(len(pairs), p=shares))]
+    each = CANDIDATES * PLACEMENTS // BUILDINGS
+    plans = [draw_plan(kind, rng) for _ in range(BUILDINGS)]
+    places = [place(plan.size, each, rng) for plan in plans]
+    path = DirectPath.joined(
+        [plan.direct_path(anchor, tag) for plan, (anchor, tag) in zip(plans, places, strict=True)]
+    )
+    anchor, tag = (np.concatenate(ends) for ends in zip(*places, strict=True))
+    boards = draw_boards(len(anchor), rng)
+    chosen = _balanced(_conditions(environments, anchor, tag, path, boards), PLACEMENTS, rng)
+    fields = draw_fields(environments, PLACEMENTS, rng)
+    links = Links(
+        anchor[chosen],
+        tag[chosen],
+        path.take(chosen),
+        environments,
+        fields,
+        np.arange(PLACEMENTS),
+        at_rest=True,
+    )
+    return Block(kind.name, chosen // each, links, boards.take(chosen)), rng
+
+
+IN_SIGHT, BLOCKED, LOST, WEAK = range(4)
+
+
+def _conditions(
+    environments: tuple[Environment, Environment],
+    anchor: NDArray[np.float64],
+    tag: NDArray[np.float64],
+    path: DirectPath,
+    boards: Boards,
+) -> NDArray[np.int64]:
+    """About which condition each candidate will have, from mean levels."""
+    distance = np.hypot(*(tag - anchor).T)
+    direct = direct_power_db(distance, path.loss_db + math.prod(PATTERN_LOSS_DB))
+    diffuse = -np.where(path.crossings > 0, *(e.path_loss_db(distance) for e in environments[::-1]))
+    is_heard = RADIO.direct_margin_db(direct, diffuse, boards) > 0
+    condition = np.where(path.crossings == 0, IN_SIGHT, np.where(is_heard, BLOCKED, LOST))
+    level = (
+        RADIO.tx_power_dbm
+        + boards.gain_db
+        + 10.0 * np.log10(10.0 ** (direct / 10.0) + 10.0 ** (diffuse / 10.0))
+    )
+    condition[level < RADIO.least_dbm(boards)] = WEAK
+    return condition
+
+
+def _balanced(conditions: NDArray[np.int64], count: int, rng: np.random.Generator) -> NDArray[np.intp]:
+    """`count` rows, ascending, the three conditions in turn as long as there are any; weak ones come last."""
+    order = rng.permutation(len(conditions))
+    turn = np.empty(len(conditions), np.int64)
+    for condition in (IN_SIGHT, BLOCKED, LOST, WEAK):
+        rows = order[conditions[order] == condition]
+        turn[rows] = np.arange(len(rows)) + (len(conditions) if condition == WEAK else 0)
+    chosen: NDArray[np.intp] = np.sort(order[np.argsort(turn[order], kind="stable")][:count])
+    return chosen

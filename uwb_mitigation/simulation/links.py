@@ -1,0 +1,110 @@
+"""Links between antennas at given places: what stands between them, and which diffuse field they share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.simulation.channel import (
+    DiffuseField,
+    Environment,
+    Multipath,
+    draw_diffuse_field,
+    propagate,
+)
+from uwb_mitigation.simulation.scene import DirectPath, Point
+
+BORDER_M = 0.2
+CLOSEST_M = 0.5
+
+Environments = tuple[Environment, Environment]
+"""Diffuse fields in line of sight and out of it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Links:
+    """n links before the radio.
+
+    Attributes:
+        anchor, tag: float64 (n, 2), m.
+        path: what stands between them.
+        environments, fields: the diffuse fields in line of sight and out of it.
+        field_of: int (n,), which of the fields' rows a link has.
+        at_rest: fading is drawn once for a field; in motion, once for a link.
+    """
+
+    anchor: NDArray[np.float64]
+    tag: NDArray[np.float64]
+    path: DirectPath
+    environments: Environments
+    fields: tuple[DiffuseField, DiffuseField]
+    field_of: NDArray[np.intp]
+    at_rest: bool
+
+    @property
+    def distance_m(self) -> NDArray[np.float64]:
+        """Of a straight line, (n,)."""
+        distance: NDArray[np.float64] = np.hypot(*(self.tag - self.anchor).T)
+        return distance
+
+    def take(self, fields: NDArray[np.intp], field_of: NDArray[np.intp]) -> Links:
+        """Links over some of the fields, of which `field_of` counts anew; field k is that of link k here."""
+        links, (in_sight, blocked) = fields[field_of], self.fields
+        return Links(
+            self.anchor[links],
+            self.tag[links],
+            self.path.take(links),
+            self.environments,
+            (in_sight.take(fields), blocked.take(fields)),
+            field_of,
+            self.at_rest,
+        )
+
+    def multipath(self, rng: np.random.Generator) -> Multipath:
+        """What arrives over each link: of the line-of-sight environment where nothing blocks its path."""
+        path, distance = self.path, self.distance_m
+        rays = self.fields[0].delay_ns.shape[1]
+        delay = np.empty((len(distance), 1 + rays))
+        gain = np.empty((len(distance), 1 + rays), np.complex128)
+        for environment, field, blocked in zip(self.environments, self.fields, (False, True), strict=True):
+            (here,) = np.nonzero((path.crossings > 0) == blocked)
+            of = self.field_of[here]
+            fading = field.fade(rng)[of] if self.at_rest else field.take(of).fade(rng)
+            arriving = propagate(
+                distance[here],
+                path.loss_db[here],
+                path.excess_m[here],
+                environment,
+                field.take(of),
+                fading,
+                rng,
+            )
+            delay[here], gain[here] = arriving.delay_ns, arriving.gain
+        return Multipath(delay, gain)
+
+
+def draw_fields(
+    environments: Environments, n: int, rng: np.random.Generator
+) -> tuple[DiffuseField, DiffuseField]:
+    """The diffuse fields of n placements, in line of sight and out of it."""
+    in_sight, blocked = environments
+    return draw_diffuse_field(in_sight, n, rng), draw_diffuse_field(blocked, n, rng)
+
+
+def place(size: Point, n: int, rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Draw n pairs of positions inside a rectangle, float64 (n, 2) each; pairs too close are drawn again."""
+    pair = np.empty((n, 2, 2))
+    again = np.ones(n, np.bool_)
+    while again.any():
+        pair[again] = rng.uniform((BORDER_M, BORDER_M), np.subtract(size, BORDER_M), (int(again.sum()), 2, 2))
+        again = np.hypot(*(pair[:, 0] - pair[:, 1]).T) < CLOSEST_M
+    return pair[:, 0], pair[:, 1]
+
+
+def label(blocked: bool, direct_above_threshold: bool) -> str:
+    """Propagation condition of a link."""
+    if not blocked:
+        return "LOS"
+    return "NLOS" if direct_above_threshold else "NDP NLOS"
