@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from mcap.writer import Writer
 
-from uwb_mitigation.bag import codec, container, schemas
+from uwb_mitigation.bag import codec, index, schemas
 from uwb_mitigation.bag.topics import RANGE_CIR_TYPE, RANGE_RAW, RANGE_TRUTH, RANGE_TRUTH_TYPE
 from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.errors import RecordingError
@@ -19,11 +19,12 @@ from uwb_mitigation.measurement import (
     CorrectedRange,
     Origin,
     RangeMeasurement,
+    Record,
     Status,
     Truth,
 )
 from uwb_mitigation.sources.mcap import McapRecording
-from uwb_mitigation.sources.source import Record
+from uwb_mitigation.sources.source import Source
 
 START_NS = 1_700_000_000_000_000_000
 STEP_NS = 10_000_000
@@ -53,6 +54,12 @@ def corrected(number: int) -> CorrectedRange:
     return CorrectedRange(4.25 + number, 4.5 + number, 0.25, 0.0625, Status.OK, Origin.DEVICE, 77)
 
 
+def write_corrected(bag: BagWriter, measurement: RangeMeasurement, corrected: CorrectedRange) -> None:
+    """Write what was made of a measurement, at the measurement's own time."""
+    data, stamp_ns = codec.encode_corrected(measurement, corrected), measurement.stamp_ns
+    bag.write_serialized(bag.corrected_channel(), data, stamp_ns, stamp_ns, measurement.sequence)
+
+
 def same(one: RangeMeasurement, other: RangeMeasurement) -> bool:
     def flat(measurement: RangeMeasurement) -> list[object]:
         cir = measurement.cir
@@ -66,6 +73,14 @@ def write_bag(path: Path, count: int = 5, simulated: str = "false") -> Path:
     with BagWriter(path, {"source": "a test", "simulated": simulated}) as bag:
         for number in range(count):
             bag.write(record(number))
+    return path
+
+
+def imported(source: Source, path: Path) -> Path:
+    """A bag of what a source yields."""
+    with BagWriter(path, {"source": source.name, "simulated": "false"}) as bag:
+        for item in source:
+            bag.write(item)
     return path
 
 
@@ -140,6 +155,6 @@ def prefix(path: Path) -> tuple[list[int], RecordingError | None]:
     return read, None
 
 
-def spans_of(path: Path) -> list[container.Span]:
+def spans_of(path: Path) -> list[index.Span]:
     with path.open("rb") as stream:
-        return container.survey(stream).spans
+        return index.index_of(stream).spans

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from bag_material import START_NS, corrected, record, same
+from bag_material import START_NS, corrected, record, same, write_corrected
 from mcap.reader import SeekingReader
 from rosbags.interfaces import (
     Qos,
@@ -35,7 +35,7 @@ from uwb_mitigation.bag.topics import (
 )
 from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.sources.source import Record
+from uwb_mitigation.measurement import Record
 
 TYPES = (RANGE_CIR_TYPE, RANGE_TRUTH_TYPE, RANGE_CORRECTED_TYPE)
 
@@ -44,7 +44,7 @@ def write_bag(path: Path, count: int = 5, **options: bool) -> Path:
     with BagWriter(path, {"source": "a test", "simulated": "true"}, **options) as bag:
         for number in range(count):
             bag.write(record(number))
-            bag.write_corrected(record(number).measurement, corrected(number))
+            write_corrected(bag, record(number).measurement, corrected(number))
     return path
 
 

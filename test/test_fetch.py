@@ -7,6 +7,7 @@ import hashlib
 import json
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -17,12 +18,12 @@ from command_line import run, start
 
 from uwb_mitigation.errors import ParameterError, RecordingError
 from uwb_mitigation.sources import deepuwb
-from uwb_mitigation.sources.download import Remote, download
+from uwb_mitigation.sources.download import download
 
 CONTENT = bytes(range(256)) * 1000
 SHA256 = "sha256:" + hashlib.sha256(CONTENT).hexdigest()
 MD5 = "md5:" + hashlib.md5(CONTENT).hexdigest()
-REMOTE = Remote(deepuwb.DOI, deepuwb.FILE_NAME, max_bytes=1_000_000)
+REMOTE = replace(deepuwb.PUBLISHED, max_bytes=1_000_000)
 
 
 class Server(ThreadingHTTPServer):
@@ -87,7 +88,7 @@ def zenodo(server: Server, monkeypatch: pytest.MonkeyPatch) -> Server:
     get = requests.get
 
     def led(url: str, **options: Any) -> requests.Response:
-        if url == f"https://doi.org/{deepuwb.DOI}":
+        if url == f"https://doi.org/{REMOTE.doi}":
             response = requests.Response()
             response.status_code, response.url = 200, "https://zenodo.org/records/4290069"
             return response
@@ -130,7 +131,7 @@ def test_a_mirror_is_checked_against_zenodos_checksum(zenodo: Server, tmp_path: 
 
 def test_a_repository_without_the_file_is_refused(zenodo: Server, tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="checksum cannot be had"):
-        download(Remote(deepuwb.DOI, "other.pkl", 10), tmp_path / "other.pkl")
+        download(replace(REMOTE, name="other.pkl"), tmp_path / "other.pkl")
 
 
 def test_without_a_network_the_error_says_how_to_go_on(
@@ -188,7 +189,7 @@ def test_a_file_beyond_the_ceiling_is_refused_at_once(
     server: Server, tmp_path: Path, state_length: bool
 ) -> None:
     server.state_length = state_length
-    small = Remote(deepuwb.DOI, deepuwb.FILE_NAME, max_bytes=1000)
+    small = replace(REMOTE, max_bytes=1000)
     with pytest.raises(RecordingError, match="at most 1000 bytes"):
         download(small, tmp_path / "a.pkl", url=server.url(), checksum=SHA256)
     assert len(server.asked) == 1

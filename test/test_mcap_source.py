@@ -4,18 +4,23 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from bag_material import START_NS, STEP_NS, Foreign, numbers, record, write_bag
 from mcap.writer import CompressionType
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagWriter
 
-from uwb_mitigation.bag import codec, container, schemas
+from uwb_mitigation.bag import codec, index, schemas
+from uwb_mitigation.bag.poses import encode_odometry
 from uwb_mitigation.bag.reader import BagReader
-from uwb_mitigation.bag.topics import RANGE_CIR_TYPE, RANGE_RAW, RANGE_TRUTH
+from uwb_mitigation.bag.topics import ODOMETRY_TRUTH, ODOMETRY_TYPE, RANGE_CIR_TYPE, RANGE_RAW, RANGE_TRUTH
+from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.errors import RecordingError
+from uwb_mitigation.positioning.tracks import Estimate
 from uwb_mitigation.sources.mcap import McapRecording
 from uwb_mitigation.sources.opening import open_recording
 
@@ -37,11 +42,17 @@ def test_a_recording_can_be_read_again(tmp_path: Path) -> None:
     assert numbers(source) == numbers(source) == [0, 1, 2, 3, 4]
 
 
-@pytest.mark.parametrize(("flag", "simulated"), [("true", True), ("false", False)])
-def test_a_simulated_bag_says_so(tmp_path: Path, flag: str, simulated: bool) -> None:
+@pytest.mark.parametrize(("flag", "simulated"), [("true", True), ("false", False), ("unknown", None)])
+def test_a_simulated_bag_says_so(tmp_path: Path, flag: str, simulated: bool | None) -> None:
     source = McapRecording(write_bag(tmp_path / "bag.mcap", simulated=flag))
     assert source.simulated is simulated
-    assert ("(simulated)" in source.name) is simulated
+    assert ("(simulated)" in source.name) is bool(simulated)
+
+
+def test_a_bag_of_another_recorder_does_not_know_whether_it_was_simulated(tmp_path: Path) -> None:
+    bag = Foreign(tmp_path / "bag.mcap").ours()
+    bag.range(0)
+    assert McapRecording(bag.finish()).simulated is None
 
 
 def test_bounds_on_time_include_the_start_and_not_the_stop(tmp_path: Path) -> None:
@@ -84,6 +95,27 @@ def test_truth_finds_its_range_before_or_after_it(tmp_path: Path, lag: int) -> N
                 bag.add(RANGE_RAW if write == bag.range else RANGE_TRUTH, START_NS, data)
     items = list(McapRecording(bag.finish()))
     assert [item.truth.configuration for item in items if item.truth] == [f"place {i}" for i in range(20)]
+
+
+def test_a_tag_is_where_the_bag_says_that_it_was(tmp_path: Path) -> None:
+    path = tmp_path / "bag.mcap"
+    places = [(1.5, float(number), -0.25) if number != 2 else None for number in range(40)]
+    with BagWriter(path, {}) as out:
+        for number, place in enumerate(places):
+            out.write(replace(record(number), tag_position=place))
+        # Another's frame, and a message that is cut short.
+        estimate = Estimate(record(3).measurement.stamp_ns, np.ones(3), np.ones(3), np.eye(6))
+        whole = encode_odometry(estimate, child_frame_id="base_link")
+        for data in (whole, whole[:50]):
+            out.write_message(ODOMETRY_TRUTH, ODOMETRY_TYPE, data, estimate.stamp_ns)
+    source = McapRecording(path)
+    assert [item.tag_position for item in source] == places
+    assert source.skipped == {"an odometry message that is cut short": 1}
+    again = tmp_path / "again.mcap"
+    with BagWriter(again, {}) as out:
+        for item in source:
+            out.write(item)
+    assert [item.tag_position for item in McapRecording(again)] == places
 
 
 def test_ranges_without_truth_are_read_and_truth_without_range_is_counted(tmp_path: Path) -> None:
@@ -134,13 +166,13 @@ def test_chunks_of_other_topics_are_not_unpacked(tmp_path: Path, monkeypatch: py
     bag.range(1)
     path = bag.finish()
     unpacked = []
-    read_span = container.read_span
+    read_span = index.messages_of
 
-    def counting(*arguments: object) -> Iterator[container.RawMessage]:
+    def counting(*arguments: object) -> Iterator[index.RawMessage]:
         unpacked.append(arguments)
         return read_span(*arguments)
 
-    monkeypatch.setattr("uwb_mitigation.bag.reader.read_span", counting)
+    monkeypatch.setattr("uwb_mitigation.bag.reader.messages_of", counting)
     assert numbers(McapRecording(path)) == [0, 1]
     assert len(unpacked) == 2
 
@@ -224,7 +256,7 @@ def test_a_sqlite_bag_is_refused_with_the_command_that_converts_it(tmp_path: Pat
 
 
 @pytest.mark.parametrize(
-    "text", ["", "[", "a: b", "rosbag2_bagfile_information: 3", "!!python/object:os.system {}", "[" * 2000]
+    "text", [" ", "[", "a: b", "rosbag2_bagfile_information: 3", "!!python/object:os.system {}", "[" * 2000]
 )
 def test_a_malformed_metadata_file_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "metadata.yaml").write_text(text)

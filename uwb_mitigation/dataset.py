@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError
+from uwb_mitigation.measurement import Record
 from uwb_mitigation.preprocessing import Preprocessing
-from uwb_mitigation.sources.source import Record
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,14 +65,33 @@ class Dataset:
             anchors=None if self.anchors is None else self.anchors[chosen],
         )
 
+    @classmethod
+    def joined(cls, parts: Sequence[Dataset]) -> Dataset:
+        """All rows of one or more parts with the same preprocessing, one after the other; without headers and
+        identities."""
+        return cls(
+            parts[0].preprocessing,
+            np.concatenate([part.inputs for part in parts]),
+            np.concatenate([part.rx_power_dbm for part in parts]),
+            np.concatenate([part.first_path_power_dbm for part in parts]),
+            np.concatenate([part.range_m for part in parts]),
+            np.concatenate([part.error_m for part in parts]),
+            np.concatenate([part.configurations for part in parts]),
+            np.concatenate([part.labels for part in parts]),
+        )
+
     @property
     def names(self) -> list[str]:
         """The configurations, sorted."""
         return [str(name) for name in np.unique(self.configurations)]
 
 
-def build_dataset(records: Iterable[Record], preprocessing: Preprocessing) -> Dataset:
+def build_dataset(
+    records: Iterable[Record], preprocessing: Preprocessing, on_record: Callable[[], None] = lambda: None
+) -> Dataset:
     """Preprocess every measurement that has a true range; count by reason what is left out.
+
+    `on_record` is called with each record that was read.
 
     Raises:
         DatasetError: nothing is left.
@@ -80,6 +99,7 @@ def build_dataset(records: Iterable[Record], preprocessing: Preprocessing) -> Da
     refused: Counter[str] = Counter()
     inputs, numbers, headers, identities, configurations, labels = [], [], [], [], [], []
     for record in records:
+        on_record()
         measurement, truth = record.measurement, record.truth
         if truth is None or not math.isfinite(truth.range_m):
             refused["no true range"] += 1

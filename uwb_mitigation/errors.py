@@ -64,6 +64,27 @@ class MissingDependencyError(UwbMitigationError):
     """An optional part of the installation is not there."""
 
 
+_DISTRIBUTIONS = {"serial": "pyserial", "sklearn": "scikit-learn", "yaml": "pyyaml"}
+"""{what is imported: what is installed}, where the two differ."""
+
+
+def not_imported(error: ImportError) -> MissingDependencyError | None:
+    """The error of a library that cannot be imported; None of a module of this package: that is a bug."""
+    module = (error.name or "").partition(".")[0]
+    if module in ("", "uwb_mitigation"):
+        return None
+    if not isinstance(error, ModuleNotFoundError):
+        return MissingDependencyError(f"{module} cannot be used: {error}", valid="run uwb-mitigation doctor")
+    if module.startswith(
+        ("rcl", "rosidl", "builtin_interfaces", "lifecycle_msgs", "ament")
+    ) or module.endswith("_msgs"):
+        return MissingDependencyError(
+            f"ROS 2 is not set up: there is no {module}",
+            valid="source its setup.sh and that of the workspace; uwb-mitigation doctor tells more",
+        )
+    return not_installed(_DISTRIBUTIONS.get(module, module))
+
+
 def not_installed(package: str) -> MissingDependencyError:
-    """The error of a needed package that cannot be found."""
+    """The error of a package that cannot be found."""
     return MissingDependencyError(f"{package} is not installed", valid="run uwb-mitigation doctor")

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import enum
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +25,11 @@ SAMPLE_PERIOD_S = 1.0 / (2 * 499.2e6)
 """Spacing of accumulator samples: half a chip, 1.0016 ns (DW1000 user manual, section 7.2.38)."""
 
 
+LINE_OF_SIGHT_DB = 6.0
+"""A first path less than this below the receive level looks like line of sight; 10 dB below, it is obstructed (Decawave
+APS006, part 3)."""
+
+
 class Encoding(enum.IntEnum):
     """How `Cir.samples` holds the channel impulse response; the values of `Cir.msg`."""
 
@@ -33,7 +40,7 @@ class Encoding(enum.IntEnum):
 class Status(enum.IntEnum):
     """What a corrected range is worth; the values of `RangeCorrected.msg`.
 
-    On anything but OK the raw range is passed through with a larger variance.
+    On anything but OK the raw range is passed through, less the offset of its radios, with a larger variance.
     """
 
     OK = 0
@@ -86,6 +93,11 @@ class Cir:
         """The number of samples in time (a complex sample counts once)."""
         return len(self.samples) // (2 if self.encoding == Encoding.COMPLEX_INT16 else 1)
 
+    @property
+    def power_gap_db(self) -> float:
+        """Receive level less first-path level; NaN = unknown."""
+        return self.rx_power_dbm - self.first_path_power_dbm
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RangeMeasurement:
@@ -128,13 +140,29 @@ class Truth:
 
 
 @dataclass(frozen=True, slots=True)
+class Record:
+    """One measurement, with what a surveyed recording knows of the truth.
+
+    Attributes:
+        measurement: as received.
+        truth: of the range; None = not known.
+        tag_position: where the tag's antenna truly was at the measurement's stamp, x, y, z in m in the
+            anchors' frame; None = not known.
+    """
+
+    measurement: RangeMeasurement
+    truth: Truth | None = None
+    tag_position: tuple[float, float, float] | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class CorrectedRange:
     """A range after mitigation: `range_m = range_raw_m - correction_m`.
 
     Attributes:
-        range_m: corrected range; the raw one on any status but OK.
-        range_raw_m: the range as measured.
-        correction_m: predicted error; 0 when passed through.
+        range_m: corrected range.
+        range_raw_m: the range as measured, with whatever offset its radios have.
+        correction_m: offset of the two radios + predicted error; the offset alone on any status but OK.
         variance_m2: variance of `range_m`; infinite where the range itself is not valid.
         status: what the value is worth.
         origin: who computed it.
@@ -155,23 +183,59 @@ class RangeColumns:
     """n exchanges whose CIRs have one encoding and one length, field by field: what correcting them takes.
 
     Attributes:
-        range_m: float32 (n,), as in `RangeMeasurement`.
+        tag_id, anchor_id: uint64 (n,).
+        range_m: float (n,), as in `RangeMeasurement`: float32 where messages carry it, or float64.
         encoding: of every CIR; the fields below as in `Cir`.
         samples: int16 (n, m).
-        start_index: int32 (n,).
-        first_path_index, scale, rx_power_dbm, first_path_power_dbm: float32 (n,).
-        preamble_count: uint16 (n,).
+        start_index, preamble_count: integer or float64 (n,).
+        first_path_index, scale, rx_power_dbm, first_path_power_dbm: as `range_m`.
     """
 
-    range_m: NDArray[np.float32]
+    tag_id: NDArray[np.uint64]
+    anchor_id: NDArray[np.uint64]
+    range_m: NDArray[Any]
     encoding: Encoding
     samples: NDArray[np.int16]
-    start_index: NDArray[np.int32]
-    first_path_index: NDArray[np.float32]
-    scale: NDArray[np.float32]
-    preamble_count: NDArray[np.uint16]
-    rx_power_dbm: NDArray[np.float32]
-    first_path_power_dbm: NDArray[np.float32]
+    start_index: NDArray[Any]
+    first_path_index: NDArray[Any]
+    scale: NDArray[Any]
+    preamble_count: NDArray[Any]
+    rx_power_dbm: NDArray[Any]
+    first_path_power_dbm: NDArray[Any]
+
+    @staticmethod
+    def of(measurements: Sequence[RangeMeasurement]) -> RangeColumns:
+        """The columns of one measurement or more, whose CIRs have one encoding and one length."""
+        cirs = [measurement.cir for measurement in measurements]
+        numbers = np.array(
+            [
+                (
+                    m.range_m,
+                    m.cir.start_index,
+                    m.cir.first_path_index,
+                    m.cir.scale,
+                    m.cir.preamble_count,
+                    m.cir.rx_power_dbm,
+                    m.cir.first_path_power_dbm,
+                )
+                for m in measurements
+            ],
+            np.float64,
+        )
+        range_m, start, first_path, scale, preamble_count, rx_power, first_path_power = numbers.T
+        return RangeColumns(
+            np.array([measurement.tag_id for measurement in measurements], np.uint64),
+            np.array([measurement.anchor_id for measurement in measurements], np.uint64),
+            range_m,
+            cirs[0].encoding,
+            np.stack([cir.samples for cir in cirs]),
+            start,
+            first_path,
+            scale,
+            preamble_count,
+            rx_power,
+            first_path_power,
+        )
 
     def __len__(self) -> int:
         """The number of exchanges."""

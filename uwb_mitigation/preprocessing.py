@@ -21,8 +21,6 @@ from uwb_mitigation.measurement import Cir, Encoding, RangeColumns, Status
 WINDOW_LEAD = 5
 """Samples of the window before floor(first path): enough to see the noise the path rises from."""
 
-WINDOW_SIZES = (157, 128, 64, 32, 16, 8)
-"""The window lengths K of the paper (section III-B)."""
 
 PREAMBLE_DIVISOR = 60
 """Brings `magnitude / preamble_count` of the DW1000 to order one before the square root."""
@@ -168,7 +166,7 @@ class Preprocessing:
         else:
             inputs = windows.astype(np.float32)
 
-        np.multiply(inputs, ranges.scale[rows, None], out=inputs)
+        np.multiply(inputs, ranges.scale[rows, None].astype(np.float32, copy=False), out=inputs)
         if self.scaling is Scaling.MAX:
             np.divide(inputs, inputs.max(axis=1, keepdims=True), out=inputs)
         else:

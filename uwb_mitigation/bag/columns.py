@@ -58,7 +58,7 @@ _COPIED = ("seconds", "nanoseconds", "tag_id", "anchor_id", "sequence")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Block:
+class MessageBlock:
     """Messages of one layout.
 
     Attributes:
@@ -76,6 +76,8 @@ class Block:
         """What correcting them takes."""
         fields = self.fields
         return RangeColumns(
+            tag_id=fields["tag_id"],
+            anchor_id=fields["anchor_id"],
             range_m=fields["range"],
             encoding=self.first.cir.encoding,
             samples=fields["samples"],
@@ -107,7 +109,7 @@ class Block:
         return [data[start : start + size] for start in range(0, len(data), size)]
 
 
-def blocks(messages: Sequence[bytes]) -> list[Block]:
+def blocks(messages: Sequence[bytes]) -> list[MessageBlock]:
     """The messages that share a layout with several others; those in no block are for `codec.decode_range`."""
     groups: dict[tuple[int, bytes], list[int]] = {}
     for number, message in enumerate(messages):
@@ -123,7 +125,7 @@ def blocks(messages: Sequence[bytes]) -> list[Block]:
     return found
 
 
-def _block(messages: Sequence[bytes], numbers: list[int]) -> Block | None:
+def _block(messages: Sequence[bytes], numbers: list[int]) -> MessageBlock | None:
     model = messages[numbers[0]]
     try:
         first = codec.decode_range(model)
@@ -150,7 +152,7 @@ def _block(messages: Sequence[bytes], numbers: list[int]) -> Block | None:
     rows = np.array(numbers, np.intp)
     if not alike.all():
         rows, fields = rows[alike], fields[alike]
-    return Block(rows, fields, first)
+    return MessageBlock(rows, fields, first)
 
 
 def _structure(at: int, size: int, fields: Mapping[str, tuple[object, int]]) -> np.dtype[np.void]:

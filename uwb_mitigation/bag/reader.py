@@ -1,11 +1,10 @@
 """Reads the messages of a bag, whatever their type: by topic, by time, in the order of their log times.
 
-A bag is one MCAP file or a rosbag2 folder. Nothing but the surveys and a few chunks is in memory.
+A bag is one MCAP file or a rosbag2 folder. Nothing but the indexes and a few chunks is in memory.
 """
 
 from __future__ import annotations
 
-import contextlib
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Collection, Iterator
@@ -16,7 +15,7 @@ from typing import BinaryIO
 from mcap.writer import MCAP0_MAGIC
 
 from uwb_mitigation.bag import schemas
-from uwb_mitigation.bag.container import Channel, RawMessage, Span, Survey, read_span, survey
+from uwb_mitigation.bag.index import Channel, FileIndex, RawMessage, Span, index_of, messages_of
 from uwb_mitigation.bag.rosbag2 import bag_files
 from uwb_mitigation.errors import DamagedRecordingError, RecordingError
 
@@ -43,26 +42,35 @@ class BagReader:
 
     def __init__(self, path: Path) -> None:
         self.files = bag_files(path)
-        self._surveys = [_survey(file) for file in self.files]
+        self._indexes = [_index(file) for file in self.files]
         self.metadata: dict[str, dict[str, str]] = {}
         self.oddities: Counter[str] = Counter()
-        for found in self._surveys:
+        for found in self._indexes:
             self.metadata = found.metadata | self.metadata
             self.oddities += found.oddities
 
     @property
     def message_count(self) -> int:
-        """Messages on all topics, as the files' own indexes say."""
-        return sum(found.messages for found in self._surveys)
+        """Messages on all topics, as the files' indexes say."""
+        return sum(found.messages for found in self._indexes)
+
+    @property
+    def bounds_ns(self) -> tuple[int, int] | None:
+        """First and last log time on all topics, as the files' indexes say; None of an empty bag."""
+        spans = [span for found in self._indexes for span in found.spans]
+        if not spans:
+            return None
+        return min(span.first_ns for span in spans), max(span.last_ns for span in spans)
 
     @property
     def topics(self) -> dict[str, str]:
-        """The topics known so far, {topic: type}; all of them once `messages` has run to its end."""
-        return {
-            channel.topic: channel.schema.name if channel.schema else ""
-            for found in self._surveys
-            for channel in found.channels.values()
-        }
+        """The topics of all files, {topic: type}."""
+        return {channel.topic: channel.schema.name if channel.schema else "" for channel in self.channels}
+
+    @property
+    def channels(self) -> list[Channel]:
+        """Those of all files; a topic has several where it is in several files, or was published by several."""
+        return [channel for found in self._indexes for channel in found.channels.values()]
 
     def messages(
         self,
@@ -77,9 +85,9 @@ class BagReader:
 
         Raises:
             DamagedRecordingError: a file is damaged; every message before the damage has been yielded.
-                A chunk that fails its checksum yields none; one that the file ends in, those before the cut.
+                A chunk that fails its checksum, or that the file ends in, yields none.
         """
-        for path, found in zip(self.files, self._surveys, strict=True):
+        for path, found in zip(self.files, self._indexes, strict=True):
             try:
                 with path.open("rb") as stream:
                     yield from self._ordered(stream, path, found, topics, start_ns, stop_ns)
@@ -90,7 +98,7 @@ class BagReader:
         self,
         stream: BinaryIO,
         path: Path,
-        found: Survey,
+        found: FileIndex,
         topics: Collection[str] | None,
         start_ns: int | None,
         stop_ns: int | None,
@@ -99,8 +107,6 @@ class BagReader:
             (span for span in found.spans if _overlaps(span, start_ns, stop_ns)),
             key=lambda span: (span.first_ns, span.offset),
         )
-        if not found.complete and spans != found.spans:
-            _learn_channels(stream, found)
         damage = found.damage
         pending: list[RawMessage] = []
         for number, span in enumerate(spans):
@@ -108,7 +114,7 @@ class BagReader:
             if (damage and span.offset > damage[0]) or not _may_hold(found, span, topics):
                 continue
             try:
-                for message in read_span(stream, found, span):
+                for message in messages_of(stream, found, span):
                     if (
                         (topics is None or message.channel.topic in topics)
                         and (start_ns is None or message.log_time_ns >= start_ns)
@@ -163,7 +169,7 @@ def check_channel(channel: Channel, type_name: str, path: Path) -> None:
         )
 
 
-def _survey(path: Path) -> Survey:
+def _index(path: Path) -> FileIndex:
     try:
         with path.open("rb") as stream:
             magic = stream.read(len(MCAP0_MAGIC))
@@ -175,7 +181,7 @@ def _survey(path: Path) -> Survey:
                     where=str(path),
                     valid=f"MCAP starts with {MCAP0_MAGIC.hex(' ')}",
                 )
-            return survey(stream)
+            return index_of(stream)
     except OSError as error:
         raise RecordingError(f"cannot be read: {error.strerror}", where=str(path)) from error
 
@@ -184,15 +190,7 @@ def _overlaps(span: Span, start_ns: int | None, stop_ns: int | None) -> bool:
     return (start_ns is None or span.last_ns >= start_ns) and (stop_ns is None or span.first_ns < stop_ns)
 
 
-def _learn_channels(stream: BinaryIO, found: Survey) -> None:
-    """Read what only the chunks define, before chunks are read in another order or left out."""
-    with contextlib.suppress(ValueError):
-        for span in found.spans:
-            for _ in read_span(stream, found, span):
-                pass
-
-
-def _may_hold(found: Survey, span: Span, topics: Collection[str] | None) -> bool:
+def _may_hold(found: FileIndex, span: Span, topics: Collection[str] | None) -> bool:
     """False where the file's index shows that a span holds none of `topics`, so that it need not be unpacked."""
     if topics is None or not span.channel_ids:
         return True

@@ -44,7 +44,10 @@ def typestore() -> Typestore:
 
 @lru_cache(maxsize=8)
 def definition(type_name: str) -> str:
-    """The `ros2msg` schema of one of our types: its text, then that of every type it uses."""
+    """The `ros2msg` schema of one of our types, or of a standard one: its text, then that of every type it uses."""
+    if type_name not in _NESTED:
+        standard, _ = typestore().generate_msgdef(type_name, ros_version=2)
+        return standard
     header, _ = typestore().generate_msgdef("std_msgs/msg/Header", ros_version=2)
     sections = [("std_msgs/Header", header)]
     sections += [(f"{PACKAGE}/{name}", _message_text(name)) for name in _NESTED[type_name]]
@@ -54,7 +57,7 @@ def definition(type_name: str) -> str:
 
 @lru_cache(maxsize=8)
 def type_hash(type_name: str) -> str:
-    """The RIHS01 hash that ROS 2 itself computes for one of our types (REP-2011)."""
+    """The RIHS01 hash that ROS 2 itself computes for a type (REP-2011)."""
     return typestore().hash_rihs01(type_name)
 
 

@@ -7,6 +7,7 @@ the end and removed when the writer is left by an error or Ctrl-C.
 from __future__ import annotations
 
 import contextlib
+import os
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -15,12 +16,13 @@ from types import TracebackType
 from typing import BinaryIO
 
 from mcap.well_known import MessageEncoding, Profile, SchemaEncoding
+from mcap.writer import Writer
 
 import uwb_mitigation
 from uwb_mitigation.bag import schemas
-from uwb_mitigation.bag.chunks import ChunkWriter
-from uwb_mitigation.bag.codec import encode_corrected, encode_range, encode_truth
-from uwb_mitigation.bag.container import Channel
+from uwb_mitigation.bag.codec import encode_range, encode_truth
+from uwb_mitigation.bag.index import Channel
+from uwb_mitigation.bag.poses import encode_place
 from uwb_mitigation.bag.rosbag2 import (
     METADATA_NAME,
     NO_QOS,
@@ -31,6 +33,8 @@ from uwb_mitigation.bag.rosbag2 import (
     recorded_qos,
 )
 from uwb_mitigation.bag.topics import (
+    ODOMETRY_TRUTH,
+    ODOMETRY_TYPE,
     RANGE_CIR_TYPE,
     RANGE_CORRECTED,
     RANGE_CORRECTED_TYPE,
@@ -39,8 +43,8 @@ from uwb_mitigation.bag.topics import (
     RANGE_TRUTH_TYPE,
 )
 from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.measurement import CorrectedRange, RangeMeasurement
-from uwb_mitigation.sources.source import Record
+from uwb_mitigation.files import partial_of, write_whole
+from uwb_mitigation.measurement import RangeMeasurement, Record
 
 METADATA_RECORD = "uwb_mitigation"
 """Name of the MCAP metadata record that holds the bag's origin."""
@@ -52,8 +56,7 @@ _NO_SCHEMA = 0
 
 def partial_file(path: Path) -> Path:
     """Where the data of a bag at `path` is until the bag is whole."""
-    file = _bag_file(path)
-    return file.with_name(file.name + ".part")
+    return partial_of(_bag_file(path))
 
 
 def _bag_file(path: Path) -> Path:
@@ -103,7 +106,10 @@ class BagWriter:
 
         if self._folder is not None and path.exists() and not path.is_dir():
             raise RecordingError("is a file, where a bag folder is wanted", where=str(path))
-        occupied = self.file.exists() or (self._folder is not None and path.is_dir() and any(path.iterdir()))
+        # A link that leads nowhere, too, is replaced only when asked to.
+        occupied = os.path.lexists(self.file) or (
+            self._folder is not None and path.is_dir() and any(path.iterdir())
+        )
         if occupied and not force:
             raise RecordingError("exists already", where=str(path), valid="--force replaces it")
         with self._writing():
@@ -112,11 +118,14 @@ class BagWriter:
                 self._folder.mkdir(parents=True, exist_ok=True)
             self._stream = self._partial.open("wb")
             library = f"uwb_mitigation {uwb_mitigation.__version__}"
-            self._mcap = ChunkWriter(self._stream, Profile.ROS2, library)
+            self._mcap = Writer(self._stream)
+            self._mcap.start(Profile.ROS2, library)
             self._mcap.add_metadata(METADATA_RECORD, self._metadata)
 
     def write(self, record: Record) -> None:
         """Write a measurement to `/uwb/range_raw` and, if known, its truth to `/uwb/range_truth`.
+
+        Where the tag truly was goes to `/uwb/odometry_truth`.
 
         Raises:
             RecordingError: a value does not fit its field, or the bag cannot be written.
@@ -126,19 +135,17 @@ class BagWriter:
         if record.truth is not None:
             truth = encode_truth(measurement, record.truth)
             self._write_ours(RANGE_TRUTH, RANGE_TRUTH_TYPE, measurement, truth)
+        if record.tag_position is not None:
+            odometry = encode_place(record.tag_position, measurement.tag_id, measurement.stamp_ns)
+            self.write_message(ODOMETRY_TRUTH, ODOMETRY_TYPE, odometry, measurement.stamp_ns)
 
-    def write_corrected(
-        self, measurement: RangeMeasurement, corrected: CorrectedRange, log_time_ns: int | None = None
-    ) -> None:
-        """Write what was made of a measurement to `/uwb/range_corrected`.
-
-        The log time is the measurement's own stamp unless given.
+    def write_message(self, topic: str, type_name: str, data: bytes, stamp_ns: int) -> None:
+        """Write a serialised message of a standard type.
 
         Raises:
-            RecordingError: a value does not fit its field, or the bag cannot be written.
+            RecordingError: the time is before the epoch, or the bag cannot be written.
         """
-        data = encode_corrected(measurement, corrected)
-        self._write_ours(RANGE_CORRECTED, RANGE_CORRECTED_TYPE, measurement, data, log_time_ns)
+        self.write_serialized(self._our_channel(topic, type_name), data, stamp_ns, stamp_ns)
 
     def copy_channel(self, channel: Channel, topic: str | None = None) -> int:
         """Register a channel of another bag, under its own name or `topic`; returns its number.
@@ -201,17 +208,11 @@ class BagWriter:
             self._abandon()
             raise
 
-    def _write_ours(
-        self,
-        topic: str,
-        type_name: str,
-        measurement: RangeMeasurement,
-        data: bytes,
-        log_time_ns: int | None = None,
-    ) -> None:
-        channel = self._our_channel(topic, type_name)
-        stamp_ns = measurement.stamp_ns if log_time_ns is None else log_time_ns
-        self.write_serialized(channel, data, stamp_ns, measurement.stamp_ns, measurement.sequence)
+    def _write_ours(self, topic: str, type_name: str, measurement: RangeMeasurement, data: bytes) -> None:
+        stamp_ns = measurement.stamp_ns
+        self.write_serialized(
+            self._our_channel(topic, type_name), data, stamp_ns, stamp_ns, measurement.sequence
+        )
 
     def _our_channel(self, topic: str, type_name: str) -> int:
         channel = self._channels.get(topic)
@@ -255,13 +256,12 @@ class BagWriter:
         document = describe(self.file.name, topics, first_ns, self._last_ns, self._metadata)
         with self._writing():
             self._mcap.add_metadata("rosbag2", {"serialized_metadata": dump(document)})
-            self._mcap.finish()
+            self._mcap.finish()  # type: ignore[no-untyped-call]
             self._close()
             self._partial.replace(self.file)
             if self._may_describe():
-                partial = self.file.with_name(METADATA_NAME + ".part")
-                partial.write_text(dump({"rosbag2_bagfile_information": document}), encoding="utf-8")
-                partial.replace(self.file.with_name(METADATA_NAME))
+                text = dump({"rosbag2_bagfile_information": document})
+                write_whole(self.file.with_name(METADATA_NAME), text, RecordingError)
 
     def _may_describe(self) -> bool:
         """Whether `metadata.yaml` is ours to write; leaves a notice where it is another's."""

@@ -7,22 +7,22 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
 from typing import BinaryIO
 
 from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.measurement import Truth
+from uwb_mitigation.measurement import Record, Truth
+from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.sources.decaranging_format import CirOf, ExchangeReader, Oddity, is_log, stated_start_ns
 from uwb_mitigation.sources.log_lines import LogLines, chunks
-from uwb_mitigation.sources.source import Record
-from uwb_mitigation.sources.survey import Survey
+from uwb_mitigation.sources.source import Source
+from uwb_mitigation.sources.surveyed_positions import Survey
 
 __all__ = ["CirOf", "DecaRangingFolder", "DecaRangingLog", "Oddity", "open_decaranging"]
 
 VALID_LOG = "a log of DecaRanging: lines such as 'File:', 'RX DATA:', 'RX OK', 'Anchor ToF:'"
 
 
-class DecaRangingLog:
+class DecaRangingLog(Source):
     """The exchanges of one log, `.log` or `.log.xz` (told apart by content); a `Source`.
 
     A range is never lost: where the CIR that belongs to it is absent or malformed, the measurement
@@ -37,7 +37,7 @@ class DecaRangingLog:
     Args:
         path: the log.
         cir: which frame's CIR belongs to the range.
-        truth: what was surveyed for this log.
+        truth: what was surveyed for this log. tag_position: where its tag stood, x, y, z in m.
         tag_id, anchor_id: in place of the 64-bit addresses in the frames (0 before the first frame).
     """
 
@@ -49,6 +49,7 @@ class DecaRangingLog:
         *,
         cir: CirOf = CirOf.FINAL,
         truth: Truth | None = None,
+        tag_position: tuple[float, float, float] | None = None,
         tag_id: int | None = None,
         anchor_id: int | None = None,
     ) -> None:
@@ -57,6 +58,7 @@ class DecaRangingLog:
         self.skipped: Counter[str] = Counter()
         self._cir_of = cir
         self._truth = truth
+        self._tag_position = tag_position
         self._tag_id = tag_id
         self._anchor_id = anchor_id
         self._files: set[BinaryIO] = set()
@@ -92,7 +94,7 @@ class DecaRangingLog:
                 for measurement in reader.measurements():
                     if self._closed.is_set():
                         return
-                    yield Record(measurement, self._truth)
+                    yield Record(measurement, self._truth, self._tag_position)
         except RecordingError:
             if not self._closed.is_set():
                 raise
@@ -138,16 +140,8 @@ class DecaRangingLog:
         for file in tuple(self._files):
             file.close()
 
-    def __enter__(self) -> DecaRangingLog:
-        return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-
-class DecaRangingFolder:
+class DecaRangingFolder(Source):
     """The logs of a folder one after the other, with what was surveyed; a `Source`.
 
     The logs are those in the folder, or else in its sub-folder `logs`; the survey's CSV files (see
@@ -164,11 +158,15 @@ class DecaRangingFolder:
         path: the folder.
         cir: which frame's CIR belongs to the range.
 
+    Attributes:
+        anchors: the surveyed locations of anchors, at z = 0; only where there is a survey.
+
     Raises:
         RecordingError: the folder is absent or without logs, or its survey is malformed.
     """
 
     simulated = False
+    anchors: AnchorMap
 
     def __init__(self, path: Path | str, *, cir: CirOf = CirOf.FINAL) -> None:
         self.path = Path(path)
@@ -177,6 +175,8 @@ class DecaRangingFolder:
         paths, self._twice = _logs_of(self.path)
         survey = Survey.find(paths[0].parent)
         self._logs = [_surveyed(log, survey, cir) for log in paths]
+        if survey is not None:
+            self.anchors = survey.anchors
         self.name = f"DecaRanging folder {self.path.resolve().name} ({len(paths)} logs)"
 
     def __iter__(self) -> Iterator[Record]:
@@ -220,14 +220,6 @@ class DecaRangingFolder:
         for log in self._logs:
             log.close()
 
-    def __enter__(self) -> DecaRangingFolder:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
 
 def open_decaranging(path: Path | str, *, cir: CirOf = CirOf.FINAL) -> DecaRangingLog | DecaRangingFolder:
     """The source for a log or a folder of logs, with the truth that a survey beside it gives.
@@ -260,7 +252,12 @@ def _surveyed(path: Path, survey: Survey | None, cir: CirOf) -> DecaRangingLog:
     if placement is None:
         return DecaRangingLog(path, cir=cir)
     return DecaRangingLog(
-        path, cir=cir, truth=placement.truth, tag_id=placement.tag, anchor_id=placement.anchor
+        path,
+        cir=cir,
+        truth=placement.truth,
+        tag_position=placement.tag_position,
+        tag_id=placement.tag,
+        anchor_id=placement.anchor,
     )
 
 

@@ -1,4 +1,4 @@
-"""DeepUWB (doi 10.5281/zenodo.4290069) as a source: `dataset.pkl`, one row a sample, without pandas.
+"""DeepUWB (doi 10.5281/zenodo.4290069) as a source: `dataset.pkl`, one row a sample, a pickled pandas frame.
 
 The data has no distances, times, ids or powers, and its CIRs are cut and normalised. What stands for them
 in a `RangeMeasurement` is fixed here and described in docs/deepuwb.md.
@@ -7,27 +7,33 @@ in a `RangeMeasurement` is fixed here and described in docs/deepuwb.md.
 from __future__ import annotations
 
 import enum
+import io
 import re
 import threading
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from numbers import Real
 from pathlib import Path
-from types import TracebackType
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError, RecordingError
-from uwb_mitigation.measurement import Cir, Encoding, RangeMeasurement, Truth
+from uwb_mitigation.files import read_bounded
+from uwb_mitigation.measurement import Cir, Encoding, RangeMeasurement, Record, Truth
 from uwb_mitigation.preprocessing import WINDOW_LEAD
-from uwb_mitigation.sources.pickle_machine import Name
-from uwb_mitigation.sources.pickled_frame import Column, numbers, read_columns
-from uwb_mitigation.sources.source import Record
+from uwb_mitigation.sources.download import Remote, matches, stated_checksum
+from uwb_mitigation.sources.source import Source
 
-DOI = "10.5281/zenodo.4290069"
-FILE_NAME = "dataset.pkl"
-"""Where the data is published, and under which name."""
+if TYPE_CHECKING:
+    import pandas as pd
+
+PUBLISHED = Remote("10.5281/zenodo.4290069", "dataset.pkl", max_bytes=1 << 29)
+"""Where the data is, and how large at most."""
+
+UNPICKLING = "a pickle is a program: reading it does whatever its author wrote, with all that you may do"
 
 COLUMNS = ("CIR", "Error", "Room", "Obstacles")
 
@@ -181,15 +187,20 @@ def _parsed(configuration: str) -> tuple[int, tuple[str, ...]]:
     return int(match[1]), materials
 
 
-def read_deepuwb(path: Path) -> DeepUwb:
+def read_deepuwb(path: Path, *, trust: bool = False) -> DeepUwb:
     """Read and check the whole of `dataset.pkl`.
 
+    Args:
+        path: the file. It is read only if it has the checksum that the publisher states for the data.
+        trust: read it whatever its checksum; `UNPICKLING` tells what that means.
+
     Raises:
-        RecordingError: the file cannot be read as a frame (see `read_columns`), or a value in it is not
-            as the data's description has it; names the row, counted from 0, and the column.
+        RecordingError: the file is absent, too large, another than the published one, or no frame that
+            pandas reads; or a value in it is not as the data's description has it; names the row, counted
+            from 0, and the column.
     """
-    columns = read_columns(path, COLUMNS)
-    count = len(columns["Error"])
+    columns = _frame(path, trust)
+    count = len(columns)
     if not 0 < count <= MAX_ROWS:
         raise RecordingError(f"{count} rows", where=str(path), valid=f"1 to {MAX_ROWS}")
     check = _Rows(path)
@@ -206,6 +217,45 @@ def read_deepuwb(path: Path) -> DeepUwb:
     return DeepUwb(samples, scale, error_m, rooms.astype(np.uint8), obstacles)
 
 
+def _frame(path: Path, trust: bool) -> pd.DataFrame:
+    data = read_bounded(path, PUBLISHED.max_bytes, RecordingError, "DeepUWB's dataset.pkl")
+    if not trust:
+        _check_published(data, path)
+    import pandas as pd
+
+    try:
+        # The very bytes that were checked, not the file again.
+        frame = pd.read_pickle(io.BytesIO(data), compression=None)
+    except Exception as error:
+        # Whatever the pickle's own calls raise.
+        raise RecordingError(
+            f"not a pickle that pandas {pd.__version__} can read: {type(error).__name__}: {error}",
+            where=str(path),
+        ) from error
+    if not isinstance(frame, pd.DataFrame):
+        raise RecordingError(f"a pickled {type(frame).__name__}", where=str(path), valid="a data frame")
+    for name in COLUMNS:
+        if name not in frame.columns:
+            held = ", ".join(map(str, frame.columns[:12])) or "none"
+            raise RecordingError(f"no column {name!r}", where=str(path), valid=f"the frame holds: {held}")
+    return frame
+
+
+def _check_published(data: bytes, path: Path) -> None:
+    try:
+        if matches(data, stated_checksum(PUBLISHED)):
+            return
+        what = "not the published dataset.pkl"
+    except RecordingError as error:
+        what = f"whether this is the published dataset.pkl cannot be told: {error.what}"
+    raise RecordingError(
+        f"{what}; {UNPICKLING}",
+        where=str(path),
+        valid="`data fetch deepuwb` brings the published one; if you trust who made this one, "
+        "`data import --trust` makes a bag of it, which every command reads",
+    )
+
+
 _VALID_ROOM = "0 (cross-room), 1 (big), 2 (medium), 3 (small) or 4 (outdoor)"
 
 
@@ -218,17 +268,13 @@ class _Rows:
     def _error(self, row: int, column: str, what: str, valid: str) -> RecordingError:
         return RecordingError(f"{column}: {what}", where=f"{self._path}, row {row}", valid=valid)
 
-    def scalars(self, column: Column, name: str, valid: str) -> NDArray[np.float64]:
+    def scalars(self, column: pd.Series, name: str, valid: str) -> NDArray[np.float64]:
         """A column of one number a row, float64 (n,), all finite."""
-        if isinstance(column, np.ndarray):
-            values = column.astype(np.float64)
-        else:
-            values = np.empty(len(column))
-            for row, cell in enumerate(column):
-                parts = numbers(cell)
-                if parts is None or len(parts) != 1:
-                    raise self._error(row, name, _kind(cell), valid)
-                values[row] = parts[0]
+        values = np.empty(len(column))
+        for row, cell in enumerate(column):
+            if not isinstance(cell, Real):
+                raise self._error(row, name, _kind(cell), valid)
+            values[row] = cell
         self.all(np.isfinite(values), values, name, valid)
         return values
 
@@ -239,15 +285,15 @@ class _Rows:
             raise self._error(row, column, f"{values[row]:g}", valid)
 
     def obstacles(self, cell: object, row: int) -> str:
-        if type(cell) is not str or not _OBSTACLES.fullmatch(cell):
-            shown = repr(cell[:20]) if type(cell) is str else _kind(cell)
+        if not isinstance(cell, str) or not _OBSTACLES.fullmatch(cell):
+            shown = repr(cell[:20]) if isinstance(cell, str) else _kind(cell)
             raise self._error(row, "Obstacles", shown, f"{len(MATERIALS)} characters of 0 or 1")
         return cell
 
     def quantise(self, cell: object, row: int, out: NDArray[np.int16]) -> float:
         """Write a CIR's amplitudes as counts, int16 (157,); returns the amplitude per count."""
         valid = f"{CIR_SAMPLES} finite amplitudes"
-        amplitudes = numbers(cell)
+        amplitudes = _numbers(cell)
         if amplitudes is None:
             raise self._error(row, "CIR", _kind(cell), valid)
         if len(amplitudes) != CIR_SAMPLES:
@@ -265,28 +311,46 @@ class _Rows:
         return peak / FULL_SCALE
 
 
+def _numbers(cell: object) -> NDArray[np.float64] | None:
+    """An array, list or tuple of numbers as float64 (n,); None if it is none."""
+    if not isinstance(cell, (np.ndarray, list, tuple)):
+        return None
+    try:
+        values = np.asarray(cell)
+    except ValueError:  # rows of several lengths
+        return None
+    numeric = values.dtype.kind in "biuf" or (
+        values.dtype == object and all(isinstance(value, Real) for value in values.flat)
+    )
+    return values.astype(np.float64) if numeric and values.ndim == 1 else None
+
+
 def _kind(cell: object) -> str:
     """What a cell is that is not what it should be; never its value, which may be huge."""
-    if cell is None or type(cell) is Name:  # pandas.NA
+    import pandas as pd
+
+    if cell is None or cell is pd.NA or (isinstance(cell, float) and np.isnan(cell)):
         return "missing"
-    if type(cell) is str:
+    if isinstance(cell, str):
         return "text"
-    return "a number" if type(cell) in (bool, int, float) else "no array of numbers"
+    return "a number" if isinstance(cell, Real) else "no array of numbers"
 
 
-class DeepUwbRecording:
+class DeepUwbRecording(Source):
     """DeepUWB's `dataset.pkl`; a `Source`.
 
     The file is read and checked whole on the first iteration and then kept, 320 bytes a row.
 
     Args:
         path: the pickle.
+        trust: read it even if it is not the published one, see `read_deepuwb`.
     """
 
     simulated = False
 
-    def __init__(self, path: Path | str) -> None:
+    def __init__(self, path: Path | str, *, trust: bool = False) -> None:
         self.path = Path(path)
+        self._trust = trust
         self.name = f"DeepUWB {self.path.name}"
         self.skipped: Counter[str] = Counter()
         self._data: DeepUwb | None = None
@@ -302,7 +366,7 @@ class DeepUwbRecording:
         if self._closed.is_set():
             raise RecordingError("the source is closed", where=str(self.path), valid="open it anew")
         if self._data is None:
-            self._data = read_deepuwb(self.path)
+            self._data = read_deepuwb(self.path, trust=self._trust)
         data = self._data
         for row in range(len(data)):
             if self._closed.is_set():
@@ -338,11 +402,3 @@ class DeepUwbRecording:
         """End iterations under way and let go of the data; the source cannot be iterated again."""
         self._closed.set()
         self._data = None
-
-    def __enter__(self) -> DeepUwbRecording:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()

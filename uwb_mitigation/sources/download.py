@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -86,7 +87,7 @@ def download(
     if url is not None and not url.startswith(("http://", "https://")):
         raise ParameterError(f"address {url!r}", valid="http:// or https://")
     source = url or remote.url
-    known = _stated_checksum(remote) if checksum is None else checksum.lower()
+    known = stated_checksum(remote) if checksum is None else checksum.lower()
     algorithm, _, digest = known.partition(":")
     if len(digest) != _DIGITS.get(algorithm) or set(digest) - set("0123456789abcdef"):
         raise ParameterError(
@@ -118,8 +119,18 @@ def download(
     return Downloaded(target, source, known, fetched=True)
 
 
-def _stated_checksum(remote: Remote) -> str:
-    """What the repository behind the DOI says the file's checksum is."""
+def matches(data: bytes, checksum: str) -> bool:
+    """Whether `data` has the checksum `md5:...` or `sha256:...`."""
+    algorithm, _, digest = checksum.partition(":")
+    return algorithm in _DIGITS and hashlib.new(algorithm, data).hexdigest() == digest
+
+
+def stated_checksum(remote: Remote) -> str:
+    """What the repository behind the DOI says the file's checksum is: `md5:...`.
+
+    Raises:
+        RecordingError: it does not answer, or knows no such file.
+    """
     pup = pooch.create(Path(), base_url=f"doi:{remote.doi}/", registry=None)
     try:
         pup.load_registry_from_doi()

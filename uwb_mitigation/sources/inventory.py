@@ -8,7 +8,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
-from uwb_mitigation.sources.source import Record, Source
+from uwb_mitigation.measurement import Record
+from uwb_mitigation.sources.source import Source
 
 _SECOND_NS = 1e9
 

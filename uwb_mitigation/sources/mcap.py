@@ -1,4 +1,7 @@
-"""Measurements from an MCAP bag: raw ranges with their CIRs, joined with the truth where the bag holds it."""
+"""Measurements from an MCAP bag: raw ranges with their CIRs, joined with the truth where the bag holds it.
+
+The truth is of the range, and of where the tag was (`/uwb/odometry_truth`, at the stamp of the range).
+"""
 
 from __future__ import annotations
 
@@ -6,20 +9,28 @@ from collections import Counter, deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
+from typing import NamedTuple
 
 from uwb_mitigation.bag.codec import Key, decode_range, decode_truth, key_of
+from uwb_mitigation.bag.poses import decode_place
 from uwb_mitigation.bag.reader import BagReader, check_channel
-from uwb_mitigation.bag.topics import RANGE_CIR_TYPE, RANGE_RAW, RANGE_TRUTH, RANGE_TRUTH_TYPE
+from uwb_mitigation.bag.topics import (
+    ODOMETRY_TRUTH,
+    ODOMETRY_TYPE,
+    RANGE_CIR_TYPE,
+    RANGE_RAW,
+    RANGE_TRUTH,
+    RANGE_TRUTH_TYPE,
+)
 from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.measurement import RangeMeasurement, Truth
-from uwb_mitigation.sources.source import Record
+from uwb_mitigation.measurement import RangeMeasurement, Record, Truth
+from uwb_mitigation.sources.source import Source
 
 JOIN_WINDOW = 32
 """How many exchanges a range and its truth may lie apart; bounds what waits in memory."""
 
 
-class McapRecording:
+class McapRecording(Source):
     """The measurements in an MCAP file or a rosbag2 folder; implements `sources.source.Source`.
 
     Args:
@@ -53,7 +64,8 @@ class McapRecording:
         self._closed = False
         bag = BagReader(path)
         self.message_count = bag.message_count
-        self.simulated = bag.metadata.get("uwb_mitigation", {}).get("simulated") == "true"
+        told = bag.metadata.get("uwb_mitigation", {}).get("simulated", "")
+        self.simulated = {"true": True, "false": False}.get(told)
         self.name = f"MCAP bag {path}" + (" (simulated)" if self.simulated else "")
         self.skipped: Counter[str] = Counter()
 
@@ -77,36 +89,28 @@ class McapRecording:
         """End an iteration at its next message; files are open only while iterating."""
         self._closed = True
 
-    def __enter__(self) -> McapRecording:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
-
     def _join(self, bag: BagReader) -> Iterator[Record]:
         """Pair ranges with their truths, whichever of the two comes first; in the order of the ranges."""
         waiting: deque[_Waiting] = deque()
         by_key: dict[Key, _Waiting] = {}
         early: dict[Key, Truth] = {}
+        places: dict[At, Place] = {}
+        placed = bag.topics.get(ODOMETRY_TRUTH) == ODOMETRY_TYPE
 
         def leave() -> Record:
             entry = waiting.popleft()
             by_key.pop(key_of(entry.measurement), None)
-            return Record(entry.measurement, entry.truth)
+            return Record(entry.measurement, entry.truth, entry.place)
 
         try:
             for item in self._decoded(bag):
                 if isinstance(item, RangeMeasurement):
                     key = key_of(item)
-                    entry = _Waiting(item, early.pop(key, None))
+                    place = places.get(At(item.stamp_ns, item.tag_id))
+                    entry = _Waiting(item, early.pop(key, None), place)
                     waiting.append(entry)
                     by_key[key] = entry
-                else:
+                elif isinstance(item[0], Key):
                     key, truth = item
                     if key in by_key:
                         by_key[key].truth = truth
@@ -115,7 +119,12 @@ class McapRecording:
                         if len(early) > JOIN_WINDOW:
                             del early[next(iter(early))]
                             self.skipped["truth without its range"] += 1
-                while waiting and (waiting[0].truth is not None or len(waiting) > JOIN_WINDOW):
+                else:
+                    _settle(*item, waiting, places)
+                while waiting and (
+                    (waiting[0].truth is not None and (waiting[0].place is not None or not placed))
+                    or len(waiting) > JOIN_WINDOW
+                ):
                     yield leave()
         except RecordingError:
             while waiting:
@@ -126,21 +135,39 @@ class McapRecording:
         if early:
             self.skipped["truth without its range"] += len(early)
 
-    def _decoded(self, bag: BagReader) -> Iterator[RangeMeasurement | tuple[Key, Truth]]:
+    def _decoded(self, bag: BagReader) -> Iterator[RangeMeasurement | tuple[Key, Truth] | tuple[At, Place]]:
         checked: set[int] = set()
-        topics = (self._topic, self._truth_topic)
-        for message in bag.messages(topics, self._start_ns, self._stop_ns):
+        types = {self._topic: RANGE_CIR_TYPE, self._truth_topic: RANGE_TRUTH_TYPE}
+        if bag.topics.get(ODOMETRY_TRUTH) == ODOMETRY_TYPE:
+            types[ODOMETRY_TRUTH] = ODOMETRY_TYPE
+        for message in bag.messages(types, self._start_ns, self._stop_ns):
             if self._closed:
                 return
-            is_range = message.channel.topic == self._topic
+            topic = message.channel.topic
             # The bag keeps its channels, so that an identity stands for one channel of one file.
-            if id(message.channel) not in checked:
-                check_channel(message.channel, RANGE_CIR_TYPE if is_range else RANGE_TRUTH_TYPE, self._path)
+            if id(message.channel) not in checked and topic != ODOMETRY_TRUTH:
+                check_channel(message.channel, types[topic], self._path)
                 checked.add(id(message.channel))
             try:
-                yield decode_range(message.data) if is_range else decode_truth(message.data)
+                if topic == self._topic:
+                    yield decode_range(message.data)
+                elif topic == self._truth_topic:
+                    yield decode_truth(message.data)
+                elif (place := decode_place(message.data)) is not None:
+                    stamp_ns, tag_id, position = place
+                    yield At(stamp_ns, tag_id), position
             except RecordingError as error:
                 self.skipped[error.what] += 1
+
+
+Place = tuple[float, float, float]
+
+
+class At(NamedTuple):
+    """When which tag was at a place."""
+
+    stamp_ns: int
+    tag_id: int
 
 
 @dataclass(slots=True)
@@ -149,3 +176,14 @@ class _Waiting:
 
     measurement: RangeMeasurement
     truth: Truth | None
+    place: Place | None
+
+
+def _settle(at: At, place: Place, waiting: deque[_Waiting], places: dict[At, Place]) -> None:
+    """Give a place to the ranges of its tag and stamp, those that came and those that will."""
+    for entry in waiting:
+        if (entry.measurement.stamp_ns, entry.measurement.tag_id) == at:
+            entry.place = place
+    places[at] = place
+    if len(places) > JOIN_WINDOW:
+        del places[next(iter(places))]

@@ -11,19 +11,22 @@ from uwb_mitigation.sources.source import Source
 
 ACCEPTED = (
     "an MCAP bag (.mcap, or a folder with metadata.yaml), "
-    "DecaRanging logs (.log, .log.xz, or a folder of them), or DeepUWB's pickle (.pkl)"
+    "DecaRanging logs (.log, .log.xz, or a folder of them), a folder of a Hanyang run, or DeepUWB's pickle (.pkl)"
 )
 
 _MCAP_MAGIC = b"\x89MCAP0\r\n"
 _SQLITE_MAGIC = b"SQLite format 3\x00"
 
 
-def open_recording(path: Path, *, cir: Literal["final", "poll"] = "final") -> Source:
+def open_recording(
+    path: Path, *, cir: Literal["final", "poll"] = "final", trust_pickle: bool = False
+) -> Source:
     """The source that reads `path`, picked by what the path holds; the suffix decides only for logs.
 
     Args:
         path: a file or folder.
         cir: of a DecaRanging exchange, which frame's CIR to take: `final` or `poll`.
+        trust_pickle: read a pickle even if it is not the published one, see `deepuwb.read_deepuwb`.
 
     Raises:
         RecordingError: there is nothing at `path`, or no source reads it.
@@ -38,6 +41,11 @@ def open_recording(path: Path, *, cir: Literal["final", "poll"] = "final") -> So
         from uwb_mitigation.sources.mcap import McapRecording
 
         return McapRecording(path)
+    if path.is_dir():
+        from uwb_mitigation.sources.hanyang import HanyangRun, is_run
+
+        if is_run(path):
+            return HanyangRun(path)
     if path.is_dir() or path.name.endswith((".log", ".log.xz")) or _looks_like_log(path):
         from uwb_mitigation.sources.decaranging import CirOf, open_decaranging
 
@@ -45,7 +53,7 @@ def open_recording(path: Path, *, cir: Literal["final", "poll"] = "final") -> So
     if path.suffix == ".pkl" or _looks_like_pickle(path):
         from uwb_mitigation.sources.deepuwb import DeepUwbRecording
 
-        return DeepUwbRecording(path)
+        return DeepUwbRecording(path, trust=trust_pickle)
     raise RecordingError("not a recording that can be read", where=str(path), valid=ACCEPTED)
 
 

@@ -1,5 +1,5 @@
-"""Measurements from the simulator: a robot driving through a flat, a survey of placements at rest, or one in
-DeepUWB's shape.
+"""Measurements from the simulator: what its sources share, a robot driving through a flat, and a survey of
+placements at rest.
 
 All yield the same for the same arguments, however much is consumed: every stretch of the scene draws
 from a generator of its own. Stamps begin at 0 and follow the rate; nothing waits for a clock.
@@ -8,13 +8,11 @@ from a generator of its own. Stamps begin at 0 and follow the rate; nothing wait
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import count as counting
-from itertools import islice
-from types import TracebackType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,33 +22,16 @@ from uwb_mitigation.measurement import (
     DEVICE_TICK_HZ,
     DEVICE_TIME_WRAP,
     Cir,
-    Encoding,
     RangeMeasurement,
+    Record,
     Truth,
 )
-from uwb_mitigation.preprocessing import WINDOW_LEAD
-from uwb_mitigation.simulation.channel import (
-    RESIDENTIAL_LOS,
-    RESIDENTIAL_NLOS,
-    DiffuseField,
-    Environment,
-    Multipath,
-    check_range,
-    draw_diffuse_field,
-    propagate,
-)
-from uwb_mitigation.simulation.radio import Radio, Reception
-from uwb_mitigation.simulation.rooms import OBSTACLES, ROOMS, draw_obstacles, obstruct
-from uwb_mitigation.simulation.scene import ANCHORS, FLAT, ROUTE, DirectPath, FloorPlan, Point, along_route
-from uwb_mitigation.sources.deepuwb import (
-    CIR_SAMPLES,
-    FIRST_ANCHOR_ID,
-    FIRST_PATH_INDEX,
-    FULL_SCALE,
-    ROOM_ROWS,
-    configuration_of,
-)
-from uwb_mitigation.sources.source import Record
+from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
+from uwb_mitigation.simulation.channel import RESIDENTIAL_LOS, RESIDENTIAL_NLOS, DiffuseField, check_range
+from uwb_mitigation.simulation.links import Links, draw_fields, label, place
+from uwb_mitigation.simulation.radio import Boards, Radio, Reception
+from uwb_mitigation.simulation.scene import ANCHORS, FLAT, MORE_ANCHORS, ROUTE, FloorPlan, Point, along_route
+from uwb_mitigation.sources.source import Source
 
 BATCH = 256
 """Exchanges simulated together: enough to vectorise, little enough to stay in cache."""
@@ -59,41 +40,27 @@ SEGMENT_S = 2.0
 SPEED_M_PER_S = 0.5
 """A segment is a metre of the route: clusters keep their places over it, fading does not."""
 
-BORDER_M = 0.2
-CLOSEST_M = 0.5
 FIRST_TAG_ID = 101
 NOT_RECEIVED = "frame too weak to be received"
-LATE = "first path too late for a whole window"
 
 RESIDENTIAL = (RESIDENTIAL_LOS, RESIDENTIAL_NLOS)
-"""Diffuse fields in line of sight and out of it."""
 
 SURVEY_RATE_HZ = 20.0
 
 
 @dataclass(frozen=True, slots=True)
-class _Exchanges:
-    """n exchanges before the radio: who, where, and which diffuse field they share.
-
-    `anchor`, `tag` are float64 (n, 2) positions in m, and `path` is what stands between them;
-    `environments` and `fields` are the diffuse fields in line of sight and out of it, and `field_of`, int
-    (n,), says which of their rows an exchange has.
-    """
+class Exchanges:
+    """n exchanges before the radio: which, between whom, of which configuration, over which links."""
 
     sequence: NDArray[np.int64]
     anchor_id: NDArray[np.int64]
     tag_id: NDArray[np.int64]
-    anchor: NDArray[np.float64]
-    tag: NDArray[np.float64]
-    path: DirectPath
     configuration: list[str]
-    environments: tuple[Environment, Environment]
-    fields: tuple[DiffuseField, DiffuseField]
-    field_of: NDArray[np.intp]
-    at_rest: bool
+    links: Links
+    boards: Boards | None = None
 
 
-class _Simulated(ABC):
+class Simulated(Source):
     """What the sources share: a `sources.source.Source` over batches of exchanges."""
 
     simulated = True
@@ -114,29 +81,15 @@ class _Simulated(ABC):
         self.skipped = Counter()
         yield from self._measurements()
 
-    def close(self) -> None:
-        """Return at once: no file or port is held."""
-        return
-
-    def __enter__(self) -> _Simulated:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
-
-    def _received(self, batches: Iterable[tuple[_Exchanges, np.random.Generator]]) -> Iterator[Record]:
+    def _received(self, batches: Iterable[tuple[Exchanges, np.random.Generator]]) -> Iterator[Record]:
         """What the radio makes of batches, each with the generator that it is to draw from."""
         for exchanges, rng in batches:
             yield from self._records(exchanges, rng)
 
-    def _records(self, exchanges: _Exchanges, rng: np.random.Generator) -> Iterator[Record]:
-        distance = np.hypot(*(exchanges.tag - exchanges.anchor).T)
-        reception = self._radio.receive(_multipath(exchanges, distance, rng), rng)
+    def _records(self, exchanges: Exchanges, rng: np.random.Generator) -> Iterator[Record]:
+        links = exchanges.links
+        distance = links.distance_m
+        reception = self._radio.receive(links.multipath(rng), rng, exchanges.boards)
         for i, sequence in enumerate(exchanges.sequence.tolist()):
             # A batch is always simulated whole: what it draws must not depend on `count`.
             if self._count and sequence >= self._count:
@@ -154,24 +107,26 @@ class _Simulated(ABC):
                 device_time=round(stamp_ns * DEVICE_TICK_HZ / 1e9) % DEVICE_TIME_WRAP,
                 range_m=float(distance[i] + reception.error_m[i]),
                 cir=_cir(reception, i),
-                frame_id=f"anchor_{anchor_id}",
+                frame_id=f"simulated_anchor_{anchor_id}",
             )
-            label = _label(bool(exchanges.path.crossings[i]), bool(reception.direct_above_threshold[i]))
-            yield Record(measurement, Truth(float(distance[i]), label, exchanges.configuration[i]))
+            condition = label(bool(links.path.crossings[i]), bool(reception.direct_above_threshold[i]))
+            truth = Truth(float(distance[i]), condition, exchanges.configuration[i])
+            x, y = links.tag[i].tolist()
+            yield Record(measurement, truth, None if links.at_rest else (x, y, 0.0))
 
 
-class _OneStream(_Simulated):
+class OneStream(Simulated):
     """A source that simulates a single row of batches, up to its count."""
 
     @abstractmethod
-    def _batches(self) -> Iterator[tuple[_Exchanges, np.random.Generator]]:
+    def _batches(self) -> Iterator[tuple[Exchanges, np.random.Generator]]:
         """In order of time, each with the generator that the radio is to draw from."""
 
     def _measurements(self) -> Iterator[Record]:
         return self._received(self._batches())
 
 
-class SimulatedSource(_OneStream):
+class SimulatedSource(OneStream):
     """Tags on a robot's route through a flat, ranging to fixed anchors in turn; a `Source`.
 
     Each metre of the route is a configuration of its own for each pair, "simulated seed 1/tag 101/
@@ -185,6 +140,9 @@ class SimulatedSource(_OneStream):
         tags: 1 to 64, spread evenly along the route.
         anchors: positions in m; their identities are 1, 2, ... in this order.
         plan, radio, route: the scene, the receiver, the closed route (m).
+
+    Attributes:
+        anchors: where they stand; all antennas are level, at z = 0.
 
     Raises:
         ParameterError: an argument is out of its range.
@@ -202,7 +160,7 @@ class SimulatedSource(_OneStream):
         radio: Radio | None = None,
         route: tuple[Point, ...] = ROUTE,
     ) -> None:
-        _check_seed(seed)
+        check_seed(seed)
         check_range("simulated source", "count", count, 0, 2**40, whole=True)
         check_range("simulated source", "tags", tags, 1, 64, whole=True)
         _check_positions("anchors", anchors, 1, 64)
@@ -212,18 +170,32 @@ class SimulatedSource(_OneStream):
         self._seed = seed
         self._tags = tags
         self._anchors = np.asarray(anchors, np.float64)
+        self.anchors = AnchorMap([Anchor(n, (x, y, 0.0)) for n, (x, y) in enumerate(anchors, 1)])
         self._route = route
         closed = np.asarray([*route, route[0]])
         self._spacing_m = float(np.hypot(*np.diff(closed, axis=0).T).sum()) / tags
 
-    def _batches(self) -> Iterator[tuple[_Exchanges, np.random.Generator]]:
+    @classmethod
+    def with_anchors(cls, number: int, *, seed: int, count: int, rate_hz: float = 20.0) -> SimulatedSource:
+        """A drive through the default flat past 4 to 8 anchors.
+
+        Raises:
+            ParameterError: an argument is out of its range.
+        """
+        check_range(
+            "simulated source", "anchors", number, len(ANCHORS), len(ANCHORS + MORE_ANCHORS), whole=True
+        )
+        anchors = (ANCHORS + MORE_ANCHORS)[:number]
+        return cls(seed=seed, count=count, rate_hz=rate_hz, anchors=anchors)
+
+    def _batches(self) -> Iterator[tuple[Exchanges, np.random.Generator]]:
         pairs = self._tags * len(self._anchors)
         for segment in counting():
             first, stop = (math.ceil(s * SEGMENT_S * self._rate_hz) for s in (segment, segment + 1))
             if self._count and first >= self._count:
                 return
             rng = np.random.default_rng([self._seed, segment, 0])
-            fields = _draw_fields(RESIDENTIAL, pairs, rng)
+            fields = draw_fields(RESIDENTIAL, pairs, rng)
             for batch, start in enumerate(range(first, stop, BATCH)):
                 sequence = np.arange(start, min(start + BATCH, stop))
                 rng = np.random.default_rng([self._seed, segment, 1 + batch])
@@ -231,7 +203,7 @@ class SimulatedSource(_OneStream):
 
     def _exchanges(
         self, sequence: NDArray[np.int64], segment: int, fields: tuple[DiffuseField, DiffuseField]
-    ) -> _Exchanges:
+    ) -> Exchanges:
         anchor = sequence % len(self._anchors)
         tag = sequence // len(self._anchors) % self._tags
         travelled = SPEED_M_PER_S * sequence / self._rate_hz + tag * self._spacing_m
@@ -243,22 +215,16 @@ class SimulatedSource(_OneStream):
         pair = tag * len(self._anchors) + anchor
         anchors, positions = self._anchors[anchor], along_route(self._route, travelled)
         path = self._plan.direct_path(anchors, positions)
-        return _Exchanges(
+        return Exchanges(
             sequence,
             anchor_id,
             tag_id,
-            anchors,
-            positions,
-            path,
             names,
-            RESIDENTIAL,
-            fields,
-            pair,
-            at_rest=False,
+            Links(anchors, positions, path, RESIDENTIAL, fields, pair, at_rest=False),
         )
 
 
-class SimulatedSurvey(_OneStream):
+class SimulatedSurvey(OneStream):
     """Independent placements at rest, many exchanges each, like a surveyed data set; a `Source`.
 
     Both antennas lie anywhere in the plan, 0.2 m from its border and at least `CLOSEST_M` apart. A
@@ -284,7 +250,7 @@ class SimulatedSurvey(_OneStream):
         plan: FloorPlan = FLAT,
         radio: Radio | None = None,
     ) -> None:
-        _check_seed(seed)
+        check_seed(seed)
         check_range("simulated survey", "configurations", configurations, 1, 10**7, whole=True)
         check_range("simulated survey", "exchanges", exchanges, 1, 1000, whole=True)
         for axis, extent in zip("xy", plan.size, strict=True):
@@ -296,13 +262,13 @@ class SimulatedSurvey(_OneStream):
         self._seed = seed
         self._exchanges = exchanges
 
-    def _batches(self) -> Iterator[tuple[_Exchanges, np.random.Generator]]:
+    def _batches(self) -> Iterator[tuple[Exchanges, np.random.Generator]]:
         placements = -(-BATCH // self._exchanges)
         size = placements * self._exchanges
         for batch in range(-(-self._count // size)):
             rng = np.random.default_rng([self._seed, batch])
-            fields = _draw_fields(RESIDENTIAL, placements, rng)
-            anchor, tag = _place(self._plan.size, placements, rng)
+            fields = draw_fields(RESIDENTIAL, placements, rng)
+            anchor, tag = place(self._plan.size, placements, rng)
             of = np.repeat(np.arange(placements), self._exchanges)
             names = [
                 f"simulated survey seed {self._seed}/placement {batch * placements + k}" for k in of.tolist()
@@ -311,168 +277,15 @@ class SimulatedSurvey(_OneStream):
             ids = np.ones(size, np.int64)
             path = self._plan.direct_path(anchor, tag).take(of)
             yield (
-                _Exchanges(
+                Exchanges(
                     sequence,
                     ids,
                     FIRST_TAG_ID * ids,
-                    anchor[of],
-                    tag[of],
-                    path,
                     names,
-                    RESIDENTIAL,
-                    fields,
-                    of,
-                    at_rest=True,
+                    Links(anchor[of], tag[of], path, RESIDENTIAL, fields, of, at_rest=True),
                 ),
                 rng,
             )
-
-
-class SimulatedDeepUwb(_Simulated):
-    """Placements at rest in five environments, in DeepUWB's shape; a `Source`.
-
-    Rooms in DeepUWB's order, each with its share of the rows, obstacles among the ten materials between the
-    antennas, and CIRs as DeepUWB has them: 157 amplitudes from five samples before the first path, the largest
-    being 1, without a preamble count. Beyond DeepUWB, distances are true and the radio's levels known, and a
-    configuration is one placement: "simulated seed 1/deepuwb/room2/wall/placement 7", with 7 counted in its room.
-
-    Args:
-        seed: 0 to 2^32 - 1.
-        ranges: rows, 100 to 1,000,000; by default as many as in DeepUWB, with its number in each room.
-        exchanges: 1 to 1000 for each placement.
-
-    Attributes:
-        rows: of each room.
-
-    Raises:
-        ParameterError: an argument is out of its range.
-    """
-
-    def __init__(self, *, seed: int = 1, ranges: int = sum(ROOM_ROWS), exchanges: int = 20) -> None:
-        _check_seed(seed)
-        check_range("simulated DeepUWB", "ranges", ranges, 100, 1_000_000, whole=True)
-        check_range("simulated DeepUWB", "exchanges", exchanges, 1, 1000, whole=True)
-        # Their raw error leaves no room for delays that were not calibrated.
-        radio = Radio(range_offset_m=0.0)
-        super().__init__(f"simulated in the shape of DeepUWB, seed {seed}", SURVEY_RATE_HZ, radio, 0)
-        self._seed = seed
-        self._exchanges = exchanges
-        ends = np.rint(np.cumsum(ROOM_ROWS) * (ranges / sum(ROOM_ROWS))).astype(int)
-        self.rows: tuple[int, ...] = tuple(np.diff(ends, prepend=0).tolist())
-
-    def _measurements(self) -> Iterator[Record]:
-        for room, rows in enumerate(self.rows):
-            # Without end: how many frames are lost is known only as they are.
-            batches = (self._batch(room, batch) for batch in counting())
-            yield from islice(self._shaped(self._received(batches)), rows)
-
-    def _shaped(self, records: Iterable[Record]) -> Iterator[Record]:
-        for record in records:
-            cir, truth = _cut(record.measurement.cir), record.truth
-            if cir is None or truth is None:
-                self.skipped[LATE] += 1
-                continue
-            # DeepUWB tells what stands in the path, not what was received over it.
-            label = "LOS" if truth.label == "LOS" else "NLOS"
-            yield Record(replace(record.measurement, cir=cir), replace(truth, label=label))
-
-    def _batch(self, number: int, batch: int) -> tuple[_Exchanges, np.random.Generator]:
-        room = ROOMS[number]
-        placements = -(-BATCH // self._exchanges)
-        size = placements * self._exchanges
-        rng = np.random.default_rng([self._seed, number, batch])
-        environments = (room.in_sight, room.blocked)
-        fields = _draw_fields(environments, placements, rng)
-        anchor, tag = _place(room.size, placements, rng)
-        chosen = [draw_obstacles(room, rng) for _ in range(placements)]
-        path = DirectPath.joined(
-            [obstruct(a, b, between, rng) for a, b, between in zip(anchor, tag, chosen, strict=True)]
-        )
-        of = np.repeat(np.arange(placements), self._exchanges)
-        names = [
-            f"simulated seed {self._seed}/{configuration_of(number, _digits(between))}"
-            f"/placement {batch * placements + k}"
-            for k, between in enumerate(chosen)
-        ]
-        # Each room on a day of its own.
-        sequence = round(number * 86_400 * SURVEY_RATE_HZ) + batch * size + np.arange(size)
-        ids = np.ones(size, np.int64)
-        return (
-            _Exchanges(
-                sequence,
-                (FIRST_ANCHOR_ID + number) * ids,
-                FIRST_TAG_ID * ids,
-                anchor[of],
-                tag[of],
-                path.take(of),
-                [names[k] for k in of.tolist()],
-                environments,
-                fields,
-                of,
-                at_rest=True,
-            ),
-            rng,
-        )
-
-
-def _digits(chosen: tuple[int, ...]) -> str:
-    return "".join("1" if number in chosen else "0" for number in range(len(OBSTACLES)))
-
-
-def _cut(cir: Cir) -> Cir | None:
-    """A CIR as DeepUWB has it, and the levels that it does not have; None where it ends before the window."""
-    start = math.floor(cir.first_path_index) - WINDOW_LEAD
-    if start < 0 or start + CIR_SAMPLES > len(cir):
-        return None
-    taps = cir.samples[2 * start : 2 * (start + CIR_SAMPLES)].astype(np.float64).reshape(-1, 2)
-    magnitude = np.hypot(*taps.T)
-    samples = np.rint(magnitude * (FULL_SCALE / magnitude.max())).astype(np.int16)
-    return replace(
-        cir,
-        samples=samples,
-        encoding=Encoding.MAGNITUDE,
-        first_path_index=FIRST_PATH_INDEX,
-        scale=1.0 / FULL_SCALE,
-        preamble_count=0,
-        noise_threshold=0,
-    )
-
-
-def _draw_fields(
-    environments: tuple[Environment, Environment], n: int, rng: np.random.Generator
-) -> tuple[DiffuseField, DiffuseField]:
-    in_sight, blocked = environments
-    return draw_diffuse_field(in_sight, n, rng), draw_diffuse_field(blocked, n, rng)
-
-
-def _place(size: Point, n: int, rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Draw n pairs of positions, float64 (n, 2) each; pairs too close are drawn again."""
-    pair = np.empty((n, 2, 2))
-    again = np.ones(n, np.bool_)
-    while again.any():
-        pair[again] = rng.uniform((BORDER_M, BORDER_M), np.subtract(size, BORDER_M), (int(again.sum()), 2, 2))
-        again = np.hypot(*(pair[:, 0] - pair[:, 1]).T) < CLOSEST_M
-    return pair[:, 0], pair[:, 1]
-
-
-def _multipath(exchanges: _Exchanges, distance: NDArray[np.float64], rng: np.random.Generator) -> Multipath:
-    """Each exchange's multipath: of the line-of-sight environment where nothing blocks its path."""
-    path = exchanges.path
-    rays = exchanges.fields[0].delay_ns.shape[1]
-    delay = np.empty((len(distance), 1 + rays))
-    gain = np.empty((len(distance), 1 + rays), np.complex128)
-    for environment, field, blocked in zip(
-        exchanges.environments, exchanges.fields, (False, True), strict=True
-    ):
-        # At rest the fading is drawn once for a field, in motion once for an exchange.
-        (here,) = np.nonzero((path.crossings > 0) == blocked)
-        of = exchanges.field_of[here]
-        fading = field.fade(rng)[of] if exchanges.at_rest else field.take(of).fade(rng)
-        arriving = propagate(
-            distance[here], path.loss_db[here], path.excess_m[here], environment, field.take(of), fading, rng
-        )
-        delay[here], gain[here] = arriving.delay_ns, arriving.gain
-    return Multipath(delay, gain)
 
 
 def _cir(reception: Reception, i: int) -> Cir:
@@ -488,12 +301,6 @@ def _cir(reception: Reception, i: int) -> Cir:
     )
 
 
-def _label(blocked: bool, direct_above_threshold: bool) -> str:
-    if not blocked:
-        return "LOS"
-    return "NLOS" if direct_above_threshold else "NDP NLOS"
-
-
 def _check_positions(name: str, points: tuple[Point, ...], low: int, high: int) -> None:
     try:
         array = np.asarray(points, np.float64)
@@ -504,5 +311,5 @@ def _check_positions(name: str, points: tuple[Point, ...], low: int, high: int) 
     check_range("simulated source", f"number of {name}", len(array), low, high)
 
 
-def _check_seed(seed: int) -> None:
+def check_seed(seed: int) -> None:
     check_range("simulated source", "seed", seed, 0, 2**32 - 1, whole=True)

@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
-from types import TracebackType
-from typing import Protocol
+from typing import TypeVar
 
-from uwb_mitigation.measurement import RangeMeasurement, Truth
+from uwb_mitigation.measurement import Record
 
-
-@dataclass(frozen=True, slots=True)
-class Record:
-    """One measurement, with what a surveyed recording knows of the truth."""
-
-    measurement: RangeMeasurement
-    truth: Truth | None = None
+Self = TypeVar("Self", bound="Source")
 
 
-class Source(Protocol):
+class Source(ABC):
     """Yields measurements in the order of their times; a consumer may stop at any point.
 
     A recording can be iterated again and then yields the same. What a source leaves out, repairs or
@@ -30,25 +23,23 @@ class Source(Protocol):
 
     Attributes:
         name: what a person sees: kind and place, and the word "simulated" where it is.
-        simulated: True where no radio was involved.
+        simulated: True where no radio was involved; None = not known.
         skipped: oddities of the current or last iteration, {kind: count}.
     """
 
     name: str
-    simulated: bool
+    simulated: bool | None
     skipped: Counter[str]
 
+    @abstractmethod
     def __iter__(self) -> Iterator[Record]: ...
 
     def close(self) -> None:
-        """Release files and ports; may be called twice, and from another thread than iterates."""
-        ...
+        """Release files and ports, where any are held; may be called twice, and from another thread than iterates."""
+        return
 
-    def __enter__(self) -> Source: ...
+    def __enter__(self: Self) -> Self:
+        return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None: ...
+    def __exit__(self, *_: object) -> None:
+        self.close()

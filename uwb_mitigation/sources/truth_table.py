@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.measurement import Truth
-from uwb_mitigation.sources.source import Record
+from uwb_mitigation.files import read_bounded
+from uwb_mitigation.measurement import Record, Truth
 
 MAX_CSV_BYTES = 1 << 20
 MAX_RANGE_M = 1e6
@@ -41,15 +41,7 @@ def load_truth(path: Path) -> list[Stretch]:
     Raises:
         RecordingError: the file is absent, too large, or malformed; names the line.
     """
-    try:
-        with path.open("rb") as file:
-            data = file.read(MAX_CSV_BYTES + 1)
-    except OSError as error:
-        raise RecordingError(
-            f"cannot read the truth: {error.strerror}", where=str(path), valid="a CSV file"
-        ) from error
-    if len(data) > MAX_CSV_BYTES:
-        raise RecordingError("the file is too large", where=str(path), valid=f"{MAX_CSV_BYTES} bytes at most")
+    data = read_bounded(path, MAX_CSV_BYTES, RecordingError, f"a CSV file with {', '.join(_NEEDED)}")
     try:
         reader = csv.DictReader(io.StringIO(data.decode("utf-8-sig"), newline=""), strict=True)
         absent = [name for name in _NEEDED if name not in (reader.fieldnames or ())]

@@ -15,7 +15,9 @@ from pathlib import Path
 from typing import TypeVar
 
 from uwb_mitigation.errors import RecordingError
+from uwb_mitigation.files import read_bounded
 from uwb_mitigation.measurement import Truth
+from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
 
 MAX_CSV_BYTES = 1 << 20
 MAX_LOCATION = (1 << 64) - 1
@@ -26,19 +28,21 @@ _Value = TypeVar("_Value")
 
 @dataclass(frozen=True, slots=True)
 class Placement:
-    """Where one log was made: location numbers of anchor and tag, and the truth that follows."""
+    """Where one log was made: location numbers of anchor and tag, where the tag stood, and the truth that follows."""
 
     anchor: int
     tag: int
+    tag_position: tuple[float, float, float]
     truth: Truth
 
 
 @dataclass(frozen=True, slots=True)
 class Survey:
-    """The surveyed placements of a folder's logs, by log number."""
+    """The surveyed placements of a folder's logs, by log number; and all anchors, by location number, at z = 0."""
 
     folder: Path
     placements: dict[int, Placement]
+    anchors: AnchorMap
 
     @classmethod
     def find(cls, folder: Path) -> Survey | None:
@@ -83,8 +87,9 @@ class Survey:
                 label=labels.get(number, ""),
                 configuration=f"{folder.name}/{number}",
             )
-            _put(placements, number, Placement(anchor, tag, truth), where)
-        return cls(folder, placements)
+            _put(placements, number, Placement(anchor, tag, (*tags[tag], 0.0), truth), where)
+        known = [Anchor(number, (*place, 0.0)) for number, place in anchors.items()]
+        return cls(folder, placements, AnchorMap(known, str(folder / "anchors.csv")))
 
 
 def _positions(path: Path) -> dict[int, tuple[float, float]]:
@@ -105,17 +110,7 @@ def _labels(path: Path) -> dict[int, str]:
 
 def _rows(path: Path, columns: tuple[str, ...]) -> list[tuple[int, list[str]]]:
     """Line number and the values of `columns` of each row; blank rows are passed over."""
-    try:
-        with path.open("rb") as file:
-            data = file.read(MAX_CSV_BYTES + 1)
-    except OSError as error:
-        raise RecordingError(
-            f"cannot read the survey: {error.strerror}",
-            where=str(path),
-            valid=f"a CSV file with the columns {', '.join(columns)}",
-        ) from error
-    if len(data) > MAX_CSV_BYTES:
-        raise RecordingError("the file is too large", where=str(path), valid=f"{MAX_CSV_BYTES} bytes at most")
+    data = read_bounded(path, MAX_CSV_BYTES, RecordingError, f"a CSV file with {', '.join(columns)}")
     rows: list[tuple[int, list[str]]] = []
     try:
         reader = csv.DictReader(io.StringIO(data.decode("utf-8-sig"), newline=""), strict=True)

@@ -1,0 +1,80 @@
+"""Files are read up to a ceiling, and written whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import threading
+from pathlib import Path
+
+import pytest
+
+from uwb_mitigation.errors import ModelError, RecordingError
+from uwb_mitigation.files import partial_of, read_bounded, write_whole
+
+
+def test_a_file_up_to_the_ceiling_is_read_and_no_more(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    path.write_bytes(bytes(10))
+    assert read_bounded(path, 10, RecordingError) == bytes(10)
+    with pytest.raises(RecordingError, match="more than 9 bytes"):
+        read_bounded(path, 9, RecordingError)
+
+
+@pytest.mark.parametrize(
+    ("name", "told"), [("absent", "no such file"), (".", "no such file"), ("empty", "empty")]
+)
+def test_what_holds_nothing_is_refused_by_name_and_with_what_would_be_valid(
+    tmp_path: Path, name: str, told: str
+) -> None:
+    (tmp_path / "empty").touch()
+    with pytest.raises(ModelError, match=rf"{told}.*\(a model\)") as caught:
+        read_bounded(tmp_path / name, 10, ModelError, "a model")
+    assert caught.value.where == str(tmp_path / name)
+
+
+def test_what_was_there_is_replaced_and_nothing_stays_beside_it(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    path.write_text("old")
+    write_whole(path, "new")
+    assert path.read_text() == "new"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_link_is_followed_and_stays(tmp_path: Path) -> None:
+    link, target = tmp_path / "link", tmp_path / "target"
+    link.symlink_to(target)
+    write_whole(link, b"new")
+    assert link.is_symlink()
+    assert target.read_bytes() == b"new"
+
+
+def test_a_pipe_is_written_to_and_stays(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    read: list[str] = []
+    reader = threading.Thread(target=lambda: read.append(pipe.read_text()))
+    reader.start()
+    write_whole(pipe, "new")
+    reader.join(10)
+    assert read == ["new"]
+    assert pipe.is_fifo()
+
+
+def test_a_disk_that_fills_leaves_what_was_there_and_nothing_beside_it(tmp_path: Path) -> None:
+    if not Path("/dev/full").exists():
+        pytest.skip("no /dev/full on this system")
+    path = tmp_path / "file"
+    path.write_text("old")
+    partial_of(tmp_path / f"file.{os.getpid()}").symlink_to("/dev/full")
+    with pytest.raises(ModelError, match="No space left"):
+        write_whole(path, "new", ModelError)
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("place", ["absent/file", "link"])
+def test_a_place_that_cannot_be_written_is_named(tmp_path: Path, place: str) -> None:
+    (tmp_path / "link").symlink_to(tmp_path / "link")
+    with pytest.raises(ModelError, match="cannot be written") as caught:
+        write_whole(tmp_path / place, "new", ModelError)
+    assert caught.value.where == str(tmp_path / place)

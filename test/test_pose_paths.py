@@ -1,0 +1,98 @@
+"""Where a robot's own localisation says that it was: poses of bags that others recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from uwb_mitigation.bag.pose_paths import read_poses
+from uwb_mitigation.errors import RecordingError
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+SECONDS = 10
+
+
+def of(name: str, *values: Any) -> Any:
+    return STORE.types[name](*values)
+
+
+def header(second: int, frame: str = "map") -> Any:
+    return of("std_msgs/msg/Header", of("builtin_interfaces/msg/Time", second, 0), frame)
+
+
+def pose(second: int) -> Any:
+    """A metre a second along x."""
+    return of(
+        "geometry_msgs/msg/Pose",
+        of("geometry_msgs/msg/Point", float(second), 2.0, 0.5),
+        of("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0),
+    )
+
+
+def step(second: int, parent: str, child: str, x: float) -> Any:
+    return of(
+        "geometry_msgs/msg/TransformStamped",
+        header(second, parent),
+        child,
+        of(
+            "geometry_msgs/msg/Transform",
+            of("geometry_msgs/msg/Vector3", x, 1.0, 0.25),
+            of("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0),
+        ),
+    )
+
+
+def posed(second: int) -> Any:
+    return of("geometry_msgs/msg/PoseStamped", header(second), pose(second))
+
+
+def posed_with_covariance(second: int) -> Any:
+    sure = of("geometry_msgs/msg/PoseWithCovariance", pose(second), np.zeros(36))
+    return of("geometry_msgs/msg/PoseWithCovarianceStamped", header(second), sure)
+
+
+def transformed(second: int) -> Any:
+    """Through a frame between, and beside more links than an arm has."""
+    links = [step(second, "base_link", f"link_{n}", 0.0) for n in range(70)]
+    chain = [step(second, "map", "odom", float(second)), step(second, "odom", "base_link", 0.0)]
+    return of("tf2_msgs/msg/TFMessage", [*chain, *links])
+
+
+def write(folder: Path, topic: str, make: Callable[[int], Any]) -> Path:
+    kind = make(0).__msgtype__
+    with Writer(folder / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connection = writer.add_connection(topic, kind, typestore=STORE)
+        for second in range(SECONDS):
+            writer.write(connection, second * 10**9, STORE.serialize_cdr(make(second), kind))
+    return folder / "bag"
+
+
+@pytest.mark.parametrize(
+    ("topic", "make", "frames"),
+    [
+        ("/pose", posed, None),
+        ("/amcl_pose", posed_with_covariance, None),
+        ("/tf", transformed, ("map", "base_link")),
+    ],
+)
+def test_poses_are_read_whatever_tells_them(tmp_path, topic, make, frames):
+    path = read_poses(write(tmp_path, topic, make), topic, frames)
+    assert path.stamp_ns.tolist() == [second * 10**9 for second in range(SECONDS)]
+    assert np.allclose(path.position, [[second, 2.0, 0.5] for second in range(SECONDS)])
+    assert np.allclose(np.abs(path.orientation), [0.0, 0.0, 0.0, 1.0])
+
+
+def test_frames_that_are_not_there_and_none_at_all_are_told(tmp_path):
+    bag = write(tmp_path, "/tf", transformed)
+    with pytest.raises(RecordingError, match="--frames"):
+        read_poses(bag, "/tf", None)
+    with pytest.raises(RecordingError, match="lidar"):
+        read_poses(bag, "/tf", ("map", "lidar"))
+    with pytest.raises(RecordingError, match="no topic /odom"):
+        read_poses(bag, "/odom", None)

@@ -1,0 +1,203 @@
+"""Where a robot's own localisation says that the robot was: positions and orientations from a topic of a bag.
+
+Messages are decoded by the types that the bag itself declares, so that no interface package need be installed.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.bag.poses import POSITION_TYPES
+from uwb_mitigation.bag.topics import TF_STATIC, TF_TYPE
+from uwb_mitigation.errors import RecordingError
+from uwb_mitigation.positioning.localised import PosePath
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
+
+    from uwb_mitigation.bag.index import Channel, RawMessage
+
+MOST_POSES = 2_000_000
+_MOST_FRAMES = 64
+_NANOSECONDS = 1_000_000_000
+_Row = tuple[int, float, float, float, float, float, float, float]
+
+
+def read_poses(path: Path, topic: str, frames: tuple[str, str] | None = None) -> PosePath:
+    """The poses of a robot's frame in the anchors' frame.
+
+    Args:
+        topic: of `POSITION_TYPES`, or /tf.
+        frames: of /tf: the anchors' frame and the robot's, such as map and base_link.
+
+    Raises:
+        RecordingError: the bag cannot be read, has no such topic, or its messages cannot be used.
+    """
+    from uwb_mitigation.bag.reader import BagReader
+
+    bag = BagReader(path)
+    where = f"{path}, topic {topic}"
+    if topic not in bag.topics:
+        known = ", ".join(
+            f"{name} ({kind})"
+            for name, kind in sorted(bag.topics.items())
+            if kind in (*POSITION_TYPES, TF_TYPE)
+        )
+        raise RecordingError(
+            f"no topic {topic}", where=str(path), valid=f"one with poses: {known or 'there is none'}"
+        )
+    decode = _Decoder(where)
+    if bag.topics[topic] == TF_TYPE:
+        if frames is None:
+            raise RecordingError(
+                "transforms between many frames", where=where, valid="--frames MAP BASE_LINK"
+            )
+        edges: dict[str, dict[str, list[_Row]]] = {}
+        for message in bag.messages([topic, TF_STATIC]):
+            for one in decode(message).transforms:
+                row = _row(one.header.stamp, one.transform.translation, one.transform.rotation)
+                child = _frame(one.child_frame_id)
+                if row is not None and (child in edges or len(edges) < _MOST_FRAMES):
+                    parents = edges.setdefault(child, {})
+                    parents.setdefault(_frame(one.header.frame_id), []).append(row)
+        return _chained(edges, _frame(frames[0]), _frame(frames[1]), where)
+    rows = []
+    for message in bag.messages([topic]):
+        decoded = decode(message)
+        pose = decoded.pose if hasattr(decoded.pose, "position") else decoded.pose.pose
+        row = _row(decoded.header.stamp, pose.position, pose.orientation)
+        if row is not None:
+            rows.append(row)
+    return _path(rows, where)
+
+
+class _Decoder:
+    """Decodes messages by the schemas of their channels."""
+
+    def __init__(self, where: str) -> None:
+        self._where = where
+        self._stores: dict[int, tuple[Typestore, str]] = {}
+        self._count = 0
+
+    def __call__(self, message: RawMessage) -> Any:
+        self._count += 1
+        if self._count > MOST_POSES:
+            raise RecordingError(
+                f"more than {MOST_POSES} messages", where=self._where, valid="a shorter recording"
+            )
+        key = id(message.channel)
+        if key not in self._stores:
+            self._stores[key] = self._store(message.channel)
+        store, name = self._stores[key]
+        try:
+            return store.deserialize_cdr(message.data, name)
+        except Exception as error:  # Of no common type.
+            raise RecordingError(f"a message is damaged: {error}", where=self._where) from error
+
+    def _store(self, channel: Channel) -> tuple[Typestore, str]:
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+        name = channel.schema.name if channel.schema is not None else ""
+        if channel.schema is None or name not in (*POSITION_TYPES, TF_TYPE):
+            raise RecordingError(
+                f"messages of type {name!r}", where=self._where, valid=", ".join((*POSITION_TYPES, TF_TYPE))
+            )
+        store = get_typestore(Stores.EMPTY)
+        try:
+            store.register(get_types_from_msg(channel.schema.data.decode(), name))
+        except Exception as error:  # Of no common type.
+            raise RecordingError(f"the type {name} cannot be read: {error}", where=self._where) from error
+        return store, name
+
+
+def _frame(name: str) -> str:
+    """Without the leading slash that ROS 1 wrote."""
+    return name.removeprefix("/")
+
+
+def _row(stamp: Any, position: Any, orientation: Any) -> _Row | None:
+    """None where it is no pose."""
+    turn = (orientation.x, orientation.y, orientation.z, orientation.w)
+    row = (stamp.sec * _NANOSECONDS + stamp.nanosec, position.x, position.y, position.z, *turn)
+    length = math.sqrt(sum(value * value for value in turn))
+    if not all(map(math.isfinite, row)) or not 0.5 < length < 2.0:
+        return None
+    x, y, z, w = (value / length for value in turn)
+    return row[0], row[1], row[2], row[3], x, y, z, w
+
+
+def _path(rows: list[_Row], where: str) -> PosePath:
+    rows = sorted(set(rows))
+    stamps = np.array([row[0] for row in rows], np.int64)
+    first = np.flatnonzero(np.diff(stamps, prepend=np.iinfo(np.int64).min // 2))
+    if len(first) < 2:
+        raise RecordingError(
+            f"{len(first)} poses", where=where, valid="two or more with a position and orientation"
+        )
+    values = np.array([row[1:] for row in rows], np.float64)[first]
+    return PosePath(stamps[first], values[:, :3], values[:, 3:])
+
+
+def _chained(edges: dict[str, dict[str, list[_Row]]], root: str, leaf: str, where: str) -> PosePath:
+    """The transforms from the root's frame to the leaf's, one after the other, at the times of the most frequent."""
+    chain: list[list[_Row]] = []
+    frame = leaf
+    while frame != root:
+        if frame not in edges or len(chain) > len(edges):
+            known = ", ".join(sorted({*edges, *(parent for own in edges.values() for parent in own)}))
+            raise RecordingError(
+                f"no transforms from {root} to {leaf}",
+                where=where,
+                valid=f"--frames of: {known or 'there are none'}",
+            )
+        parent = max(edges[frame], key=lambda one, own=edges[frame]: len(own[one]))  # type: ignore[misc]
+        chain.append(sorted(set(edges[frame][parent])))
+        frame = parent
+    if not chain:
+        raise RecordingError(f"--frames {root} {leaf}", where=where, valid="two different frames")
+    chain.reverse()
+    busiest = max(chain, key=len)
+    stamps = np.unique(np.array([row[0] for row in busiest], np.int64))
+    position, turn = np.zeros((len(stamps), 3)), np.tile([0.0, 0.0, 0.0, 1.0], (len(stamps), 1))
+    for rows in chain:
+        step, by = _held(rows, stamps)
+        position = position + _turned(turn, step)
+        turn = _times(turn, by)
+    found = [(int(s), *p, *q) for s, p, q in zip(stamps, position.tolist(), turn.tolist(), strict=True)]
+    return _path(found, where)
+
+
+def _held(rows: list[_Row], stamps: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Interpolated between two; before the first and after the last as those are: a transform holds until the next."""
+    own = np.array([row[0] for row in rows], np.int64)
+    values = np.array([row[1:] for row in rows], np.float64)
+    if len(own) == 1:
+        return np.tile(values[0, :3], (len(stamps), 1)), np.tile(values[0, 3:], (len(stamps), 1))
+    after = np.clip(np.searchsorted(own, stamps), 1, len(own) - 1)
+    before = after - 1
+    part = ((stamps - own[before]) / np.maximum(own[after] - own[before], 1)).clip(0.0, 1.0)[:, None]
+    first, second = values[before, 3:], values[after, 3:]
+    second = np.where(np.einsum("ni,ni->n", first, second)[:, None] < 0.0, -second, second)
+    turn = (1.0 - part) * first + part * second
+    position = (1.0 - part) * values[before, :3] + part * values[after, :3]
+    return position, turn / np.linalg.norm(turn, axis=1, keepdims=True)
+
+
+def _turned(q: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Vectors (n, 3) turned by unit quaternions (n, 4)."""
+    axis, w = q[:, :3], q[:, 3:]
+    twice = 2.0 * np.cross(axis, v)
+    turned: NDArray[np.float64] = v + w * twice + np.cross(axis, twice)
+    return turned
+
+
+def _times(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Products of quaternions (n, 4), x, y, z, w: first b, then a."""
+    axis = a[:, 3:] * b[:, :3] + b[:, 3:] * a[:, :3] + np.cross(a[:, :3], b[:, :3])
+    real = a[:, 3:] * b[:, 3:] - np.einsum("ni,ni->n", a[:, :3], b[:, :3])[:, None]
+    return np.concatenate([axis, real], axis=1)

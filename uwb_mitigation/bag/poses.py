@@ -1,0 +1,178 @@
+"""Estimates to and from the CDR bytes of standard messages: poses and odometry, in the frame of the anchors.
+
+Orientation is not observed by ranges: it is sent as none, with a variance that says so. What others recorded of
+a robot's position is read by the types that the bag itself declares.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.bag import schemas
+from uwb_mitigation.bag.codec import LITTLE_ENDIAN
+from uwb_mitigation.bag.topics import ODOMETRY_TYPE
+from uwb_mitigation.errors import RecordingError
+from uwb_mitigation.positioning.tracks import Estimate, TruePath
+
+MAP = "map"
+"""The anchors' frame (REP-105)."""
+
+UNOBSERVED = 1e6
+"""Variance of what ranges do not tell, rad^2 and rad^2/s^2."""
+
+POSITION_TYPES = (
+    ODOMETRY_TYPE,
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+)
+"""Types that a position can be read from."""
+
+_NANOSECONDS = 1_000_000_000
+_PREFIX = struct.Struct("<4siII")
+_LENGTH = struct.Struct("<I")
+_POSE = struct.Struct("<43d")
+_POINT = struct.Struct("<3d")
+_TWIST = struct.Struct("<42d")
+_TAG_FRAME = "tag_"
+
+
+def tag_frame(tag_id: int) -> str:
+    """The frame of a tag's antenna."""
+    return f"{_TAG_FRAME}{tag_id}"
+
+
+def tag_topic(topic: str, tag_id: int | None) -> str:
+    """The topic of one tag: the plain one of the only tag (None), `/uwb/tag_7/pose` of others."""
+    if tag_id is None:
+        return topic
+    head, _, tail = topic.rpartition("/")
+    return f"{head}/{tag_frame(tag_id)}/{tail}"
+
+
+def encode_pose(estimate: Estimate, frame_id: str = MAP) -> bytes:
+    """`geometry_msgs/PoseWithCovarianceStamped` in CDR."""
+    data = _header(estimate.stamp_ns, frame_id)
+    data += bytes((4 - len(data)) % 8)
+    return data + _pose(estimate)
+
+
+def encode_odometry(estimate: Estimate, frame_id: str = MAP, child_frame_id: str = "base_link") -> bytes:
+    """`nav_msgs/Odometry` in CDR. The velocity is in the child frame, which stands as the pose says: unturned."""
+    data = _header(estimate.stamp_ns, frame_id)
+    child = child_frame_id.encode() + b"\0"
+    data += bytes(-len(data) % 4) + _LENGTH.pack(len(child)) + child
+    data += bytes((4 - len(data)) % 8)
+    covariance = np.zeros((6, 6))
+    covariance[:3, :3] = estimate.covariance[3:, 3:]
+    covariance[[3, 4, 5], [3, 4, 5]] = UNOBSERVED
+    twist = _TWIST.pack(*estimate.velocity, 0.0, 0.0, 0.0, *covariance.reshape(-1))
+    return data + _pose(estimate) + twist
+
+
+def encode_place(position: tuple[float, float, float], tag_id: int, stamp_ns: int) -> bytes:
+    """`nav_msgs/Odometry` in CDR of where a tag truly was: without velocity, exact."""
+    place = Estimate(stamp_ns, np.array(position), np.zeros(3), np.zeros((6, 6)))
+    return encode_odometry(place, child_frame_id=tag_frame(tag_id))
+
+
+def decode_place(data: bytes) -> tuple[int, int, tuple[float, float, float]] | None:
+    """Stamp, tag and position in the CDR of an Odometry such as `encode_place` makes; None = of another frame.
+
+    Raises:
+        RecordingError: the bytes are not an Odometry.
+    """
+    try:
+        encapsulation, seconds, nanoseconds, length = _PREFIX.unpack_from(data)
+        at = _PREFIX.size + length
+        at += -at % 4
+        (length,) = _LENGTH.unpack_from(data, at)
+        at += _LENGTH.size
+        child = bytes(data[at : at + length])
+        at += length
+        at += (4 - at) % 8
+        x, y, z = _POINT.unpack_from(data, at)
+    except struct.error as error:
+        raise RecordingError("an odometry message that is cut short") from error
+    if encapsulation[:2] != LITTLE_ENDIAN:
+        raise RecordingError("an odometry message in another encoding")
+    frame, digits = _TAG_FRAME.encode(), child.rstrip(b"\0").removeprefix(_TAG_FRAME.encode())
+    if not (child.startswith(frame) and digits.isdigit() and all(map(math.isfinite, (x, y, z)))):
+        return None
+    return seconds * _NANOSECONDS + nanoseconds, int(digits), (x, y, z)
+
+
+@dataclass(frozen=True, slots=True)
+class Positions:
+    """Where one frame was, as recorded.
+
+    Attributes:
+        child_frame: of an odometry; empty where the type has none.
+        path: stamps and positions, in order.
+    """
+
+    child_frame: str
+    path: TruePath
+
+    @property
+    def tag_id(self) -> int | None:
+        """The tag whose frame it is, as `tag_frame` names it; None = another frame."""
+        digits = self.child_frame.removeprefix(_TAG_FRAME)
+        return int(digits) if self.child_frame.startswith(_TAG_FRAME) and digits.isdigit() else None
+
+
+def read_positions(path: Path, topic: str) -> list[Positions]:
+    """The positions of every frame on a topic of a bag; of a topic that is not there, none.
+
+    Raises:
+        RecordingError: the bag cannot be read, or the topic is of another type.
+    """
+    from uwb_mitigation.bag.reader import BagReader  # needs mcap, which a node on a robot does without
+
+    bag = BagReader(path)
+    store = schemas.typestore()
+    found: dict[str, list[tuple[int, float, float, float]]] = {}
+    for message in bag.messages([topic]):
+        schema = message.channel.schema
+        name = schema.name if schema is not None else ""
+        if name not in POSITION_TYPES:
+            raise RecordingError(
+                f"messages of type {name!r}", where=f"{path}, topic {topic}", valid=", ".join(POSITION_TYPES)
+            )
+        try:
+            decoded: Any = store.deserialize_cdr(message.data, name)
+        except Exception as error:  # Of no common type.
+            raise RecordingError(f"a message is damaged: {error}", where=f"{path}, topic {topic}") from error
+        pose = decoded.pose if name.endswith("PoseStamped") else decoded.pose.pose
+        stamp = decoded.header.stamp
+        row = (stamp.sec * _NANOSECONDS + stamp.nanosec, pose.position.x, pose.position.y, pose.position.z)
+        if all(map(math.isfinite, row)):
+            found.setdefault(getattr(decoded, "child_frame_id", ""), []).append(row)
+    return [Positions(frame, _path(rows)) for frame, rows in found.items()]
+
+
+def _path(rows: list[tuple[int, float, float, float]]) -> TruePath:
+    rows = sorted(set(rows))
+    stamps = np.array([row[0] for row in rows], np.int64)
+    positions: NDArray[np.float64] = np.array([row[1:] for row in rows], np.float64)
+    first = np.flatnonzero(np.diff(stamps, prepend=-1))
+    return TruePath(stamps[first], positions[first])
+
+
+def _header(stamp_ns: int, frame_id: str) -> bytes:
+    seconds, nanoseconds = divmod(stamp_ns, _NANOSECONDS)
+    frame = frame_id.encode() + b"\0"
+    return _PREFIX.pack(LITTLE_ENDIAN + b"\0\0", seconds, nanoseconds, len(frame)) + frame
+
+
+def _pose(estimate: Estimate) -> bytes:
+    covariance = np.zeros((6, 6))
+    covariance[:3, :3] = estimate.covariance[:3, :3]
+    covariance[[3, 4, 5], [3, 4, 5]] = UNOBSERVED
+    return _POSE.pack(*estimate.position, 0.0, 0.0, 0.0, 1.0, *covariance.reshape(-1))

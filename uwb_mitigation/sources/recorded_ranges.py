@@ -1,0 +1,150 @@
+"""The ranges of a bag by tag, in columns, as positioning takes them; and where the tags truly were."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from uwb_mitigation.bag.codec import decode_corrected, decode_range
+from uwb_mitigation.bag.poses import read_positions
+from uwb_mitigation.bag.reader import BagReader, check_channel
+from uwb_mitigation.bag.topics import (
+    ODOMETRY_TRUTH,
+    RANGE_CIR_TYPE,
+    RANGE_CORRECTED,
+    RANGE_CORRECTED_TYPE,
+    RANGE_RAW,
+)
+from uwb_mitigation.errors import RecordingError
+from uwb_mitigation.positioning.anchors import AnchorMap
+from uwb_mitigation.positioning.tracks import Ranges, TruePath
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TagRecording:
+    """What a bag holds of one tag.
+
+    Attributes:
+        tag_id: of all of it.
+        raw: ranges as measured, of unknown variance.
+        ranges: the corrected ones where the bag has such, with their variances; else the raw ones.
+        corrected: whether `ranges` are.
+        truth: where the tag was; empty = not known.
+    """
+
+    tag_id: int
+    raw: Ranges
+    ranges: Ranges
+    corrected: bool
+    truth: TruePath
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecordedRanges:
+    """Attributes:
+    tags: by their numbers.
+    strangers: ranges of anchors that are not in the map, {anchor id: count}.
+    skipped: other ranges that were left out, {why: count}.
+    """
+
+    tags: list[TagRecording]
+    strangers: Counter[int]
+    skipped: Counter[str]
+
+
+_Row = tuple[int, int, float, float, float]
+
+
+def read_ranges(path: Path, anchors: AnchorMap, stamp_offset_s: float = 0.0) -> RecordedRanges:
+    """Read all ranges of a bag.
+
+    Args:
+        path: the bag.
+        anchors: those that ranges may come from.
+        stamp_offset_s: what to add to the stamps of the ranges (not of the truth): -0.2 where they lag by 0.2 s.
+
+    Raises:
+        RecordingError: the bag cannot be read, or has no range of an anchor in the map.
+    """
+    bag = BagReader(path)
+    raw: dict[int, list[_Row]] = {}
+    corrected: dict[int, list[_Row]] = {}
+    strangers: Counter[int] = Counter()
+    skipped: Counter[str] = Counter()
+    checked: set[int] = set()
+    powers: dict[tuple[int, int, int, int], float] = {}
+    offset_ns = round(stamp_offset_s * 1e9)
+    for message in bag.messages((RANGE_RAW, RANGE_CORRECTED)):
+        is_raw = message.channel.topic == RANGE_RAW
+        if id(message.channel) not in checked:
+            check_channel(message.channel, RANGE_CIR_TYPE if is_raw else RANGE_CORRECTED_TYPE, path)
+            checked.add(id(message.channel))
+        try:
+            if is_raw:
+                measured = decode_range(message.data)
+                key = (measured.stamp_ns, measured.tag_id, measured.anchor_id, measured.sequence)
+                value, variance, table = measured.range_m, math.nan, raw
+                powers[key] = power = measured.cir.rx_power_dbm
+            else:
+                found, made = decode_corrected(message.data)
+                key = (found.stamp_ns, found.tag_id, found.anchor_id, found.sequence)
+                value, variance, table = made.range_m, made.variance_m2, corrected
+                power = powers.get(key, math.nan)
+                if key not in powers:
+                    # A bag of corrected ranges alone: what was measured is in them.
+                    _add(raw, key, made.range_raw_m, math.nan, math.nan, anchors, offset_ns)
+        except RecordingError as error:
+            skipped[error.what] += 1
+            continue
+        if key[2] not in anchors.index:
+            strangers[key[2]] += is_raw or not raw
+        elif not (math.isfinite(value) and value >= 0.0) or variance == math.inf:
+            skipped["range that is not valid"] += is_raw or not raw
+        else:
+            _add(table, key, value, variance, power, anchors, offset_ns)
+    if not raw and not corrected:
+        place = ", ".join(map(str, sorted(anchors.index)))
+        seen = ", ".join(map(str, sorted(strangers))) or "none"
+        raise RecordingError(
+            f"no range of the anchors {place}",
+            where=str(path),
+            valid=f"the bag's ranges come from anchors: {seen}",
+        )
+    truths = {one.tag_id: one.path for one in read_positions(path, ODOMETRY_TRUTH)}
+    nowhere = TruePath(np.zeros(0, np.int64), np.zeros((0, 3)))
+    tags = []
+    for tag in sorted(raw.keys() | corrected.keys()):
+        measured_ranges = _columns(tag, raw.get(tag, []))
+        usable = _columns(tag, corrected[tag]) if tag in corrected else measured_ranges
+        tags.append(TagRecording(tag, measured_ranges, usable, tag in corrected, truths.get(tag, nowhere)))
+    return RecordedRanges(tags, strangers, skipped + bag.oddities)
+
+
+def _add(
+    table: dict[int, list[_Row]],
+    key: tuple[int, int, int, int],
+    value: float,
+    variance: float,
+    power: float,
+    anchors: AnchorMap,
+    offset_ns: int,
+) -> None:
+    row = anchors.index.get(key[2])
+    if row is not None and math.isfinite(value) and value >= 0.0:
+        table.setdefault(key[1], []).append((key[0] + offset_ns, row, value, variance, power))
+
+
+def _columns(tag_id: int, rows: list[_Row]) -> Ranges:
+    rows = sorted(rows, key=lambda row: row[0])
+    return Ranges(
+        np.array([row[0] for row in rows], np.int64),
+        np.array([row[1] for row in rows], np.intp),
+        np.array([row[2] for row in rows], np.float64),
+        np.array([row[3] for row in rows], np.float64),
+        np.array([row[4] for row in rows], np.float64),
+        tag_id,
+    )

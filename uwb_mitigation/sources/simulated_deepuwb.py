@@ -1,0 +1,141 @@
+"""Simulated measurements in DeepUWB's shape."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from itertools import count as counting
+from itertools import islice
+
+import numpy as np
+
+from uwb_mitigation.measurement import Cir, Encoding, Record
+from uwb_mitigation.preprocessing import WINDOW_LEAD
+from uwb_mitigation.simulation.channel import check_range
+from uwb_mitigation.simulation.links import Links, draw_fields, place
+from uwb_mitigation.simulation.radio import Radio
+from uwb_mitigation.simulation.rooms import OBSTACLES, ROOMS, draw_obstacles, obstruct
+from uwb_mitigation.simulation.scene import DirectPath
+from uwb_mitigation.sources.deepuwb import (
+    CIR_SAMPLES,
+    FIRST_ANCHOR_ID,
+    FIRST_PATH_INDEX,
+    FULL_SCALE,
+    ROOM_ROWS,
+    configuration_of,
+)
+from uwb_mitigation.sources.simulated import (
+    BATCH,
+    FIRST_TAG_ID,
+    SURVEY_RATE_HZ,
+    Exchanges,
+    Simulated,
+    check_seed,
+)
+
+LATE = "first path too late for a whole window"
+
+
+class SimulatedDeepUwb(Simulated):
+    """Placements at rest in five environments, in DeepUWB's shape; a `Source`.
+
+    Rooms in DeepUWB's order, each with its share of the rows, obstacles among the ten materials between the
+    antennas, and CIRs as DeepUWB has them: 157 amplitudes from five samples before the first path, the largest
+    being 1, without a preamble count. Beyond DeepUWB, distances are true and the radio's levels known, and a
+    configuration is one placement: "simulated seed 1/deepuwb/room2/wall/placement 7", with 7 counted in its room.
+
+    Args:
+        seed: 0 to 2^32 - 1.
+        ranges: rows, 100 to 1,000,000; by default as many as in DeepUWB, with its number in each room.
+        exchanges: 1 to 1000 for each placement.
+
+    Attributes:
+        rows: of each room.
+
+    Raises:
+        ParameterError: an argument is out of its range.
+    """
+
+    def __init__(self, *, seed: int = 1, ranges: int = sum(ROOM_ROWS), exchanges: int = 20) -> None:
+        check_seed(seed)
+        check_range("simulated DeepUWB", "ranges", ranges, 100, 1_000_000, whole=True)
+        check_range("simulated DeepUWB", "exchanges", exchanges, 1, 1000, whole=True)
+        # Their raw error leaves no room for delays that were not calibrated.
+        radio = Radio(range_offset_m=0.0)
+        super().__init__(f"simulated in the shape of DeepUWB, seed {seed}", SURVEY_RATE_HZ, radio, 0)
+        self._seed = seed
+        self._exchanges = exchanges
+        ends = np.rint(np.cumsum(ROOM_ROWS) * (ranges / sum(ROOM_ROWS))).astype(int)
+        self.rows: tuple[int, ...] = tuple(np.diff(ends, prepend=0).tolist())
+
+    def _measurements(self) -> Iterator[Record]:
+        for room, rows in enumerate(self.rows):
+            # Without end: how many frames are lost is known only as they are.
+            batches = (self._batch(room, batch) for batch in counting())
+            yield from islice(self._shaped(self._received(batches)), rows)
+
+    def _shaped(self, records: Iterable[Record]) -> Iterator[Record]:
+        for record in records:
+            cir, truth = _cut(record.measurement.cir), record.truth
+            if cir is None or truth is None:
+                self.skipped[LATE] += 1
+                continue
+            # DeepUWB tells what stands in the path, not what was received over it.
+            label = "LOS" if truth.label == "LOS" else "NLOS"
+            yield Record(replace(record.measurement, cir=cir), replace(truth, label=label))
+
+    def _batch(self, number: int, batch: int) -> tuple[Exchanges, np.random.Generator]:
+        room = ROOMS[number]
+        placements = -(-BATCH // self._exchanges)
+        size = placements * self._exchanges
+        rng = np.random.default_rng([self._seed, number, batch])
+        environments = (room.in_sight, room.blocked)
+        fields = draw_fields(environments, placements, rng)
+        anchor, tag = place(room.size, placements, rng)
+        chosen = [draw_obstacles(room, rng) for _ in range(placements)]
+        path = DirectPath.joined(
+            [obstruct(a, b, between, rng) for a, b, between in zip(anchor, tag, chosen, strict=True)]
+        )
+        of = np.repeat(np.arange(placements), self._exchanges)
+        names = [
+            f"simulated seed {self._seed}/{configuration_of(number, _digits(between))}"
+            f"/placement {batch * placements + k}"
+            for k, between in enumerate(chosen)
+        ]
+        # Each room on a day of its own.
+        sequence = round(number * 86_400 * SURVEY_RATE_HZ) + batch * size + np.arange(size)
+        ids = np.ones(size, np.int64)
+        return (
+            Exchanges(
+                sequence,
+                (FIRST_ANCHOR_ID + number) * ids,
+                FIRST_TAG_ID * ids,
+                [names[k] for k in of.tolist()],
+                Links(anchor[of], tag[of], path.take(of), environments, fields, of, at_rest=True),
+            ),
+            rng,
+        )
+
+
+def _digits(chosen: tuple[int, ...]) -> str:
+    return "".join("1" if number in chosen else "0" for number in range(len(OBSTACLES)))
+
+
+def _cut(cir: Cir) -> Cir | None:
+    """A CIR as DeepUWB has it, and the levels that it does not have; None where it ends before the window."""
+    start = math.floor(cir.first_path_index) - WINDOW_LEAD
+    if start < 0 or start + CIR_SAMPLES > len(cir):
+        return None
+    taps = cir.samples[2 * start : 2 * (start + CIR_SAMPLES)].astype(np.float64).reshape(-1, 2)
+    magnitude = np.hypot(*taps.T)
+    samples = np.rint(magnitude * (FULL_SCALE / magnitude.max())).astype(np.int16)
+    return replace(
+        cir,
+        samples=samples,
+        encoding=Encoding.MAGNITUDE,
+        first_path_index=FIRST_PATH_INDEX,
+        scale=1.0 / FULL_SCALE,
+        preamble_count=0,
+        noise_threshold=0,
+    )
