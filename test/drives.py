@@ -1,0 +1,59 @@
+"""Simulated drives past anchors, for the tests of positioning: ranges as its model says that they err."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
+from uwb_mitigation.positioning.model import Model
+from uwb_mitigation.positioning.tracks import Ranges, TruePath
+
+HALL = AnchorMap(
+    [
+        Anchor(number, place, 0.01)
+        for number, place in enumerate(
+            [(0.0, 0.0, 2.5), (12.0, 0.0, 0.5), (12.0, 9.0, 2.5), (0.0, 9.0, 0.5), (6.0, 0.0, 1.5)], 1
+        )
+    ]
+)
+NANOSECONDS = 1_000_000_000
+
+
+def circuit(time_s: NDArray[np.float64], height_m: float = 1.0) -> NDArray[np.float64]:
+    """Positions (n, 3) on an ellipse through the hall, at about 0.8 m/s."""
+    phase = 0.2 * time_s
+    return np.stack([6 + 4 * np.cos(phase), 4.5 + 3 * np.sin(phase), np.full_like(phase, height_m)], axis=1)
+
+
+def drive(
+    anchors: AnchorMap = HALL,
+    *,
+    seconds: float = 60.0,
+    rate_hz: float = 40.0,
+    seed: int = 1,
+    offset_m: float = 0.1,
+    model: Model | None = None,
+    path=circuit,
+) -> tuple[Ranges, TruePath]:
+    """Ranges to the anchors in turn: white noise, what persists of each pair's error, and one offset."""
+    model = model or Model()
+    rng = np.random.default_rng(seed)
+    n = round(seconds * rate_hz)
+    time_s = np.arange(n) / rate_hz
+    anchor = np.arange(n) % len(anchors)
+    position = path(time_s)
+    kept = np.exp(-len(anchors) / rate_hz / model.persistence_s)
+    error = np.empty(n)
+    persisting = rng.normal(0, 1, len(anchors))
+    for i in range(n):
+        row = anchor[i]
+        persisting[row] = kept * persisting[row] + np.sqrt(1 - kept**2) * rng.normal()
+        error[i] = persisting[row]
+    error *= model.range_sd * np.sqrt(1 - model.white)
+    error += rng.normal(0, model.range_sd * np.sqrt(model.white), n) + offset_m
+    distance = np.linalg.norm(position - anchors.position[anchor], axis=1)
+    stamp_ns = np.rint(time_s * NANOSECONDS).astype(np.int64)
+    nothing = np.full(n, np.nan)
+    ranges = Ranges(stamp_ns, anchor, distance + error, np.full(n, model.range_sd**2), nothing, 7)
+    return ranges, TruePath(stamp_ns, position)

@@ -1,0 +1,59 @@
+"""The anchors file: what is in it, and what it is refused for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.positioning.anchors import Anchor, AnchorMap, dump_anchors, parse_anchors
+
+GOOD = """
+anchors:
+  - {id: 1, x: 0, y: 0.5, z: 2.1}
+  - {id: 0x1f, x: 7.6, y: 0, z: 2.1, sd: 0.02, name: door}
+"""
+
+
+def test_ids_places_deviations_and_names_are_read():
+    anchors = parse_anchors(GOOD, "a.yaml")
+    assert [anchor.id for anchor in anchors.anchors] == [1, 31]
+    np.testing.assert_array_equal(anchors.position, [[0, 0.5, 2.1], [7.6, 0, 2.1]])
+    np.testing.assert_array_equal(anchors.sd, [0.05, 0.02])
+    assert [str(anchor) for anchor in anchors.anchors] == ["1", "31 (door)"]
+
+
+def test_what_is_written_is_read_again():
+    anchors = AnchorMap(
+        [Anchor(2**64 - 1, (1.5, -2.0, 0.0), 0.1, "no: 1, 'east'"), Anchor(3, (0.0, 0.0, 1.0))]
+    )
+    text = dump_anchors(anchors, "two lines\nof comment")
+    assert text.startswith("# two lines\n# of comment\n")
+    assert parse_anchors(text, "x").anchors == anchors.anchors
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("", "not a list of anchors"),
+        ("anchors: []", "0 anchors"),
+        ("anchors: [", "not YAML"),
+        ("- 1", "not a list of anchors"),
+        ("anchors: [3]", "entry 1: 3 is no anchor"),
+        ("anchors: [{id: 1, x: 0, y: 0}]", "entry 1: the field z is missing"),
+        ("anchors: [{id: 1, x: 0, y: 0, z: 0, colour: red}]", "the field 'colour' is unknown"),
+        ("anchors: [{id: -1, x: 0, y: 0, z: 0}]", "id = -1"),
+        ("anchors: [{id: '1', x: 0, y: 0, z: 0}]", "id = '1'"),
+        ("anchors: [{id: 1, x: .nan, y: 0, z: 0}]", "x = nan"),
+        ("anchors: [{id: 1, x: 1 m, y: 0, z: 0}]", "x = '1 m'"),
+        ("anchors: [{id: 1, x: 0, y: 0, z: 0, sd: -1}]", "sd = -1"),
+        ("anchors: [{id: 1, x: 0, y: 0, z: 0}, {id: 1, x: 1, y: 0, z: 0}]", "anchor 1 is there twice"),
+        ("anchors: [{id: 1, x: 0, y: 0, z: 2100}, {id: 2, x: 7600, y: 0, z: 2100}]", "look like millimetres"),
+        ("anchors: [{id: 1, x: 3000000, y: 0, z: 0}]", "millimetres?"),
+    ],
+)
+def test_a_file_of_another_form_is_refused_in_words(text: str, told: str):
+    with pytest.raises(ParameterError) as caught:
+        parse_anchors(text, "a.yaml")
+    assert told in str(caught.value)
+    assert str(caught.value).startswith("a.yaml")

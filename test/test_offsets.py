@@ -1,0 +1,255 @@
+"""Offsets of radios: the file, which counts for a pair, what they do to a range, and a board that is told them."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from model_material import bundle, measurement
+
+from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.link import messages
+from uwb_mitigation.link.board import Board, Identity
+from uwb_mitigation.link.events import OffsetsRefused
+from uwb_mitigation.link.layout import MAX_OFFSETS, MessageType, Mode
+from uwb_mitigation.link.messages import Correction
+from uwb_mitigation.link.session import RADIO_TRIES, REQUEST_INTERVAL_NS, BoardSession
+from uwb_mitigation.measurement import CorrectedRange, RangeMeasurement, Status
+from uwb_mitigation.mitigation import Mitigation, correct_batch
+from uwb_mitigation.model.architecture import Remnet
+from uwb_mitigation.offsets import NO_OFFSETS, Offsets, dump_offsets, parse_offsets, read_offsets
+
+TEXT = """\
+default: 0.5
+anchors: {1: 0.25, 0x1f: 0.125}
+tags: {7: -0.0625}
+pairs:
+  - {anchor: 1, tag: 7, offset: 1.5}
+"""
+
+
+def test_the_most_specific_offset_counts_and_those_of_two_radios_add():
+    offsets = parse_offsets(TEXT, "x")
+    assert offsets.of(7, 1) == 1.5
+    assert offsets.of(7, 31) == 0.0625
+    assert offsets.of(8, 1) == 0.25
+    assert offsets.of(7, 9) == -0.0625
+    assert offsets.of(8, 9) == 0.5
+    pairs = np.array(list(itertools.product((7, 8, 2**64 - 1), (1, 31, 9))), np.uint64)
+    expected = [offsets.of(int(tag), int(anchor)) for tag, anchor in pairs]
+    assert offsets.of_columns(*pairs.T).tolist() == expected
+
+
+def test_a_file_that_is_written_is_read_as_it_was():
+    offsets = parse_offsets(TEXT, "x")
+    assert parse_offsets(dump_offsets(offsets, "found\nso"), "y") == offsets
+    assert not parse_offsets(dump_offsets(NO_OFFSETS), "y")
+    assert offsets
+
+
+def test_a_parameter_is_a_number_or_a_file(tmp_path: Path):
+    assert read_offsets("") is NO_OFFSETS
+    assert read_offsets(" 0.22 ").of(1, 2) == float(np.float32(0.22))
+    path = tmp_path / "offsets.yaml"
+    path.write_text(TEXT, encoding="utf-8")
+    assert read_offsets(str(path)) == parse_offsets(TEXT, "x")
+    with pytest.raises(ParameterError, match=r"none\.yaml: no such file.*metres"):
+        read_offsets(str(tmp_path / "none.yaml"))
+    path.write_bytes(b"\xff\xfe\xff")
+    with pytest.raises(ParameterError, match="not text"):
+        read_offsets(str(path))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "no offsets"),
+        ("[0.2]", "no offsets"),
+        ("{", "not YAML"),
+        ("default: yes", "default = True.*metres"),
+        ("default: .nan", "default = nan"),
+        ("default: 220", "default = 220 m: are these millimetres"),
+        ("default: 1.0e+9", "-10 to 10 m"),
+        ("default: '0.2'", "a number of metres"),
+        ("offset: 0.2", "'offset' is unknown.*default, anchors, tags, pairs"),
+        ("anchors: [1, 2]", "identity: metres"),
+        ("anchors: {a: 0.2}", "identity 'a'.*64 bits"),
+        ("anchors: {-1: 0.2}", "identity -1"),
+        ("anchors: {18446744073709551616: 0.2}", "identity 18446744073709551616"),
+        ("tags: {1: .inf}", "tags: 1 = inf"),
+        ("anchors: {1: 0.1, 0x1: 0.2}", "1 is there twice"),
+        ("default: 0.1\ndefault: 0.2", "twice, in line 2"),
+        ("pairs: {1: 2}", "pairs = "),
+        ("pairs: [{anchor: 1, tag: 2}]", "entry 1.*no pair.*anchor, tag, offset"),
+        ("pairs: [{anchor: 1, tag: 2, offset: 0.1}, {anchor: 1, tag: 2, offset: 0.2}]", "entry 2.*twice"),
+    ],
+)
+def test_what_is_no_file_of_offsets_is_refused_in_words(text: str, said: str):
+    with pytest.raises(ParameterError, match=said) as caught:
+        parse_offsets(text, "site.yaml")
+    assert "site.yaml" in str(caught.value)
+
+
+def test_noise_of_identities_does_not_fill_the_memory():
+    offsets = parse_offsets(TEXT, "x")
+    for tag in range(10_000):
+        offsets.of(tag, tag)
+    assert len(offsets._known) < 5_000
+
+
+@pytest.fixture(scope="module")
+def subject(tmp_path_factory) -> Mitigation:
+    return Mitigation(bundle(tmp_path_factory.mktemp("bundle"), Remnet(samples=157)))
+
+
+def with_offsets(subject: Mitigation, offsets: Offsets) -> Mitigation:
+    return Mitigation(subject.bundle, offsets)
+
+
+def test_the_offset_comes_off_beside_the_predicted_error(subject: Mitigation):
+    offset = 0.25
+    plain, moved = subject.correct(measurement(3.0)), measurement(3.25)
+    result = with_offsets(subject, Offsets(offset)).correct(moved)
+    assert result.status is Status.OK
+    assert result.range_raw_m == 3.25
+    assert result.correction_m == pytest.approx(plain.correction_m + offset, abs=1e-6)
+    assert result.range_m == np.float32(3.25) - np.float32(result.correction_m)
+    assert result.range_m == pytest.approx(plain.range_m, abs=1e-6)
+    assert result.variance_m2 == plain.variance_m2
+
+
+@pytest.mark.parametrize(
+    ("range_m", "offset", "expected", "valid"),
+    [
+        (3.0, 0.5, 2.5, True),
+        (0.25, 0.5, -0.25, False),
+        (-0.25, -0.5, 0.25, True),
+        (math.nan, 0.5, math.nan, False),
+    ],
+)
+def test_a_range_passes_through_less_the_offset(
+    subject: Mitigation, range_m: float, offset: float, expected: float, valid: bool
+):
+    bad = measurement(range_m)
+    bad = replace(bad, cir=replace(bad.cir, preamble_count=0))
+    result = with_offsets(subject, Offsets(offset)).correct(bad)
+    assert result.status is Status.BAD_CIR
+    assert str(result.range_m) == str(expected)
+    assert result.correction_m == offset
+    assert str(result.range_raw_m) == str(range_m)
+    assert math.isfinite(result.variance_m2) is valid
+
+
+def test_many_at_once_give_the_same_bits_as_one_by_one(subject: Mitigation):
+    offsets = Offsets(0.1, {1: 0.2, 2: -0.3}, {3: 0.05}, {(4, 2): 5.0})
+    several = with_offsets(subject, offsets)
+    ranges = (3.0, 0.05, math.nan, 1e300, -0.2, 20.0)
+    asked = [
+        replace(measurement(range_m, seed), tag_id=tag, anchor_id=anchor)
+        for seed, (range_m, tag, anchor) in enumerate(itertools.product(ranges, (3, 4, 5), (1, 2, 6)))
+    ]
+    answers = correct_batch(several, asked)
+    assert [repr(answer) for answer in answers] == [repr(several.correct(one)) for one in asked]
+    assert {answer.status for answer in answers} == {Status.OK, Status.OUT_OF_DISTRIBUTION}
+
+
+class Echo:
+    """Corrects by the offset alone."""
+
+    def __init__(self) -> None:
+        self.offsets = Offsets(9.0)
+
+    def correct(self, asked: RangeMeasurement) -> CorrectedRange:
+        offset_m = self.offsets.of(asked.tag_id, asked.anchor_id)
+        plain = messages.decode(*messages.encode(CORRECTION))
+        assert isinstance(plain, Correction)
+        return replace(plain.corrected, range_m=asked.range_m - offset_m, correction_m=offset_m)
+
+
+CORRECTION = Correction(0, 1, 2, 3, 4, CorrectedRange(1.0, 1.0, 0.0, 1.0, Status.OK, 1, 5))  # type: ignore[arg-type]
+
+
+class Pair:
+    """A session and a board on one wire; a board of an older firmware does not hear of offsets."""
+
+    def __init__(self, wanted: Offsets | None, *, older: bool = False) -> None:
+        self.session = BoardSession()
+        self.older = older
+        self.now = 0
+        self.events: list[object] = []
+        self.start()
+        if wanted is not None:
+            self.session.set_offsets(wanted)
+
+    def start(self, boot: int = 1) -> None:
+        self.board = Board(Identity(model_id=5), Echo(), mode=Mode.DEVICE, boot_id=boot)
+        self.deliver(self.board.hello(self.now))
+
+    def deliver(self, data: bytes) -> None:
+        self.events += self.session.receive(data, self.now, self.now)
+
+    def turn(self) -> None:
+        self.now += REQUEST_INTERVAL_NS
+        self.deliver(b"")
+        asked = self.session.outgoing()
+        if self.older:
+            decoder = messages_in(asked)
+            asked = b"".join(wire for kind, wire in decoder if kind != MessageType.SET_OFFSETS)
+        self.deliver(self.board.receive(asked, self.now // 1000))
+
+    def range(self) -> list[float]:
+        before = len(self.events)
+        self.deliver(self.board.measure(measurement(3.0), self.now // 1000))
+        return [event.corrected.range_m for event in self.events[before:] if isinstance(event, Correction)]
+
+
+def messages_in(data: bytes) -> list[tuple[int, bytes]]:
+    from uwb_mitigation.link.framing import FrameDecoder, encode_frame
+
+    return [(frame.type, encode_frame(frame)) for frame in FrameDecoder().feed(data)]
+
+
+def test_a_board_takes_off_what_the_host_sets_and_again_after_a_restart():
+    pair = Pair(Offsets(0.25))
+    assert pair.range() == []
+    assert pair.session.counts.wrong_offsets == 1
+    pair.turn()
+    assert pair.range() == [2.75]
+    pair.start(boot=2)
+    assert pair.range() == []
+    pair.turn()
+    assert pair.range() == [2.75]
+    pair.session.set_offsets(NO_OFFSETS)
+    pair.turn()
+    assert pair.range() == [3.0]
+    assert not [event for event in pair.events if isinstance(event, OffsetsRefused)]
+
+
+def test_an_older_board_is_told_of_in_words_and_its_corrections_do_not_count():
+    pair = Pair(Offsets(0.25), older=True)
+    for _ in range(RADIO_TRIES + 3):
+        pair.turn()
+    (refused,) = [event for event in pair.events if isinstance(event, OffsetsRefused)]
+    assert "flash a newer one" in refused.text
+    assert pair.range() == []
+
+
+def test_an_older_board_is_good_enough_where_there_are_no_offsets():
+    pair = Pair(NO_OFFSETS, older=True)
+    assert pair.range() == [3.0]
+    for _ in range(RADIO_TRIES + 3):
+        pair.turn()
+    assert not [event for event in pair.events if isinstance(event, OffsetsRefused)]
+    assert pair.range() == [3.0]
+
+
+def test_more_offsets_than_a_board_keeps_are_refused_with_both_numbers():
+    pair = Pair(Offsets(anchors=dict.fromkeys(range(MAX_OFFSETS + 1), 0.1)))
+    pair.turn()
+    (refused,) = [event for event in pair.events if isinstance(event, OffsetsRefused)]
+    assert f"keeps {MAX_OFFSETS} offsets, and {MAX_OFFSETS + 1}" in refused.text
+    assert pair.range() == []

@@ -1,0 +1,263 @@
+"""The filter, how it starts, and how it finds a lost tag again."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from drives import HALL, NANOSECONDS, circuit, drive
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
+from uwb_mitigation.positioning.filter import FIRST_ERROR, OFFSET, RangeFilter
+from uwb_mitigation.positioning.geometry import Shape, geometry, shape
+from uwb_mitigation.positioning.locator import SILENCE_S, TagLocator, run_live
+from uwb_mitigation.positioning.model import Model
+from uwb_mitigation.positioning.start import Area, Height, places
+from uwb_mitigation.positioning.track_errors import errors_of, track_errors
+from uwb_mitigation.positioning.tracks import TruePath
+
+PLAIN = Model(long=100.0, short=100.0)
+"""No range is doubted."""
+
+
+def test_the_filter_agrees_with_filterpy():
+    kalman = pytest.importorskip("filterpy.kalman")
+    mine = RangeFilter(HALL, PLAIN, 0.0, np.array([6.0, 4.0, 1.0]), np.eye(3))
+    mine.learns = True
+    n = len(mine.x)
+    theirs = kalman.ExtendedKalmanFilter(dim_x=n, dim_z=1)
+    theirs.x, theirs.P = mine.x.copy()[:, None], mine.p.copy()
+    ranges, _ = drive(seconds=3)
+    variance = PLAIN.range_sd**2
+    claimed = np.diag(theirs.P)[FIRST_ERROR:].copy()
+    previous = 0.0
+    for stamp, row, range_m in zip(ranges.stamp_ns / 1e9, ranges.anchor, ranges.range_m, strict=True):
+        dt, previous = stamp - previous, stamp
+        kept = math.exp(-dt / PLAIN.persistence_s)
+        f, q = np.eye(n), np.zeros((n, n))
+        f[range(FIRST_ERROR, n), range(FIRST_ERROR, n)] = kept
+        q[range(FIRST_ERROR, n), range(FIRST_ERROR, n)] = (1 - kept**2) * claimed
+        for axis in range(3):
+            f[axis, axis + 3] = dt
+            block = np.ix_([axis, axis + 3], [axis, axis + 3])
+            q[block] = PLAIN.acceleration**2 * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
+        theirs.F, theirs.Q = f, q
+        theirs.predict()
+
+        def slope(x, row=row):
+            away = x[:3, 0] - HALL.position[row]
+            h = np.zeros((1, n))
+            h[0, :3], h[0, OFFSET], h[0, FIRST_ERROR + row] = away / np.linalg.norm(away), 1, 1
+            return h
+
+        def expected(x, row=row):
+            return np.linalg.norm(x[:3, 0] - HALL.position[row]) + x[OFFSET] + x[FIRST_ERROR + row]
+
+        white = max(PLAIN.white * variance, variance - claimed[row])
+        theirs.update(np.array([[range_m]]), slope, expected, R=np.array([[white]]))
+        claimed[row] += 0.1 * ((1 - PLAIN.white) * variance - claimed[row])
+        mine.predict(stamp)
+        mine.update(row, range_m, variance)
+        np.testing.assert_allclose(mine.x, theirs.x[:, 0], atol=1e-8)
+        np.testing.assert_allclose(mine.p, theirs.P, atol=1e-8)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    steps=st.lists(
+        st.tuples(st.floats(0, 2), st.integers(0, 4), st.floats(0, 60), st.floats(1e-4, 10)),
+        min_size=1,
+        max_size=60,
+    ),
+    learns=st.booleans(),
+)
+def test_the_covariance_stays_one_and_the_state_finite(steps, learns: bool):
+    one = RangeFilter(HALL, Model(), 0.0, np.array([6.0, 4.0, 1.0]), np.eye(3))
+    one.learns = learns
+    now = 0.0
+    for dt, row, range_m, variance in steps:
+        now += dt
+        one.predict(now)
+        one.update(row, range_m, variance)
+    np.testing.assert_allclose(one.p, one.p.T, atol=1e-9 * np.abs(one.p).max())
+    assert np.linalg.eigvalsh((one.p + one.p.T) / 2).min() > -1e-9 * np.abs(one.p).max()
+    assert np.isfinite(one.x).all()
+
+
+def test_a_range_that_is_too_long_is_doubted_more_than_one_too_short_and_never_wholly():
+    moved = []
+    for error in (-5.0, 5.0, 50.0):
+        one = RangeFilter(HALL, Model(), 0.0, np.array([6.0, 4.5, 1.0]), 0.01 * np.eye(3))
+        one.update(0, float(np.linalg.norm(one.position - HALL.position[0])) + error, 0.01)
+        moved.append(float(np.linalg.norm(one.position - (6.0, 4.5, 1.0))))
+    short, long, far = moved
+    assert short > long > far > 0
+
+
+def test_what_is_considered_is_not_moved_but_keeps_its_correlation():
+    one = RangeFilter(HALL, Model(), 0.0, np.array([6.0, 4.0, 1.0]), np.eye(3))
+    one.update(0, 8.0, 0.01)
+    assert (one.x[OFFSET:] == 0).all()
+    assert one.p[OFFSET, OFFSET] == pytest.approx(Model().offset_sd ** 2)
+    assert np.abs(one.p[:3, OFFSET]).max() > 0
+
+
+def test_live_estimates_of_many_drives_are_honest():
+    found = []
+    for seed in range(6):
+        offset = np.random.default_rng(seed).normal(0, Model().offset_sd)
+        ranges, truth = drive(seconds=25, seed=seed, offset_m=offset)
+        errors = track_errors(run_live(ranges, TagLocator(HALL)).track, truth)
+        assert errors.rmse < 0.25
+        found.append(errors)
+    assert 0.5 < np.mean([e.nees_per_dof for e in found]) < 1.5
+    assert np.mean([e.coverage95 for e in found]) > 0.88
+    assert np.mean([e.exceeded for e in found]) < 0.01
+
+
+def test_outliers_do_not_carry_the_filter_away():
+    ranges, truth = drive(seconds=40)
+    wrong = np.random.default_rng(3).random(len(ranges)) < 0.1
+    ranges.range_m[wrong] += 8.0
+    ranges.range_m[::97] = 0.5
+    assert track_errors(run_live(ranges, TagLocator(HALL)).track, truth).rmse < 0.35
+
+
+def test_of_two_mirror_images_nothing_is_told_until_an_area_excludes_one():
+    wall = AnchorMap([Anchor(1, (0, 0, 1)), Anchor(2, (10, 0, 1)), Anchor(3, (5, 0, 1.0))])
+    ranges, truth = drive(wall, seconds=8)
+    locator = TagLocator(wall, height=Height(1.0))
+    assert len(run_live(ranges, locator).track) == 0
+    assert locator.candidates == 2
+    inside = TagLocator(wall, height=Height(1.0), area=Area((-50, 0.1, 0), (50, 50, 3)))
+    assert track_errors(run_live(ranges, inside).track, truth).rmse < 0.4
+
+
+def test_two_anchors_alone_tell_nothing():
+    ranges, _ = drive(AnchorMap(HALL.anchors[:2]), seconds=5)
+    assert len(run_live(ranges, TagLocator(AnchorMap(HALL.anchors[:2]))).track) == 0
+
+
+def test_the_covariance_grows_through_a_silence_and_the_tag_is_found_within_two_seconds_after():
+    ranges, truth = drive(seconds=40)
+    before = ranges.take(ranges.stamp_ns < 15 * NANOSECONDS)
+    locator = TagLocator(HALL)
+    run_live(before, locator)
+    spread = [locator.at((15 + s) * NANOSECONDS).covariance[0, 0] for s in range(10)]
+    assert (np.diff(spread) > 0).all()
+    assert spread[-1] > 10
+    assert SILENCE_S < 10
+    after = run_live(ranges.take(ranges.stamp_ns >= 25 * NANOSECONDS), locator).track
+    late = after.take(after.stamp_ns >= 27 * NANOSECONDS)
+    assert late.stamp_ns[0] < 27.1 * NANOSECONDS
+    errors = track_errors(late, truth)
+    assert errors.nees_per_dof < 2
+    assert errors.rmse < 0.3
+
+
+def test_a_tag_that_was_carried_away_is_found_within_two_seconds():
+    def carried(time_s):
+        position = circuit(time_s)
+        position[time_s >= 20] += (-5.5, 3.0, 0.0)
+        return position
+
+    ranges, truth = drive(seconds=40, path=carried)
+    locator = TagLocator(HALL)
+    track = run_live(ranges, locator).track
+    late = track.take(track.stamp_ns >= 22 * NANOSECONDS)
+    assert len(late) > 600
+    assert locator.counts.lost >= 1
+    assert track_errors(late, truth).nees_per_dof < 2
+
+
+def test_bad_input_is_skipped_and_a_replay_that_starts_again_starts_the_tag_again():
+    ranges, truth = drive(seconds=10)
+    locator = TagLocator(HALL)
+    for value in (math.nan, math.inf, -1.0):
+        assert locator.add(0, 0, value) is None
+    assert locator.add(0, 0, 5.0, math.inf) is None
+    run_live(ranges, locator)
+    stamp = int(ranges.stamp_ns[-1])
+    assert locator.add(stamp - 1000, 0, float(ranges.range_m[-1])) is not None
+    assert locator.counts.backwards == 1
+    again = run_live(ranges, locator).track
+    assert track_errors(again, truth).rmse < 0.3
+    assert locator.counts.found == 2
+
+
+def test_an_anchor_that_disagrees_with_all_others_is_named():
+    ranges, _ = drive(seconds=30)
+    ranges.range_m[ranges.anchor == 2] += 1.5
+    locator = TagLocator(HALL)
+    run_live(ranges, locator)
+    assert locator.disagreeing() == [2]
+
+
+def test_heights_and_speeds_that_are_told_help():
+    ranges, truth = drive(seconds=20)
+    spreads = []
+    for told in (False, True):
+        locator = TagLocator(HALL)
+        for i in range(len(ranges)):
+            estimate = locator.add(int(ranges.stamp_ns[i]), int(ranges.anchor[i]), float(ranges.range_m[i]))
+            if told and i % 4 == 0:
+                locator.add_height(1.0, 0.01)
+                locator.add_speed(0.7, 0.01)
+        spreads.append(estimate.covariance.diagonal())
+    assert spreads[1][2] < 0.5 * spreads[0][2]
+    assert spreads[1][3:5].sum() < spreads[0][3:5].sum()
+    assert np.abs(estimate.position - truth.position[-1]).max() < 0.4
+
+
+def test_all_places_that_explain_ranges_are_found():
+    rng = np.random.default_rng(2)
+    for _ in range(20):
+        anchors = rng.uniform((0, 0, 0), (20, 20, 3), (4, 3))
+        tag = np.append(rng.uniform(-5, 25, 2), 1.0)
+        found = places(
+            anchors, np.linalg.norm(anchors - tag, axis=1), np.full(4, 0.1), Model(), height=Height(1.0)
+        )
+        assert min(np.linalg.norm(place.position - tag) for place in found) < 0.05
+    collinear = np.array([[0.0, 0, 1], [4, 0, 1], [9, 0, 1]])
+    found = places(
+        collinear, np.linalg.norm(collinear - (3, 2, 1), axis=1), np.full(3, 0.1), Model(), height=Height(1.0)
+    )
+    assert sorted(round(float(place.position[1])) for place in found) == [-2, 2]
+
+
+def test_shapes_of_anchors_and_dilution():
+    square = np.array([[0.0, 0, 2], [4, 0, 2], [4, 4, 2], [0, 4, 2]])
+    assert shape(square) is Shape.PLANE
+    assert shape(square[:2]) is Shape.LINE
+    assert shape(square[:1]) is Shape.POINT
+    assert shape(HALL.position) is Shape.SPACE
+    middle = geometry(square, np.array([2.0, 2, 2]), level=True)
+    assert middle.hdop == pytest.approx(1.0)
+    assert math.isinf(geometry(square[:2], np.array([2.0, 0, 2]), level=True).hdop)
+
+
+def test_errors_of_known_size():
+    rng = np.random.default_rng(1)
+    covariance = np.broadcast_to(np.diag([0.04, 0.01, 1.0]), (4000, 3, 3))
+    error = rng.normal(0, 1, (4000, 3)) * (0.2, 0.1, 1.0)
+    found = errors_of(error, covariance, np.zeros((4000, 3)))
+    assert found.nees_per_dof == pytest.approx(1, abs=0.05)
+    assert found.coverage95 == pytest.approx(0.95, abs=0.01)
+    assert found.rmse == pytest.approx(math.hypot(0.2, 0.1), rel=0.03)
+    assert found.exceeded < 0.006
+
+
+def test_truth_is_not_made_up_in_gaps():
+    path = TruePath(np.array([0, 1, 5]) * NANOSECONDS, np.array([[0.0, 0, 0], [1, 0, 0], [5, 0, 0]]))
+    at = path.at(np.array([-1, 0, NANOSECONDS // 2, 3 * NANOSECONDS, 6 * NANOSECONDS]))
+    np.testing.assert_array_equal(at[:, 0], [np.nan, 0, 0.5, np.nan, np.nan])
+
+
+@pytest.mark.parametrize("name", ["acceleration", "range_sd", "white", "long"])
+def test_a_model_out_of_range_is_refused(name: str):
+    with pytest.raises(ParameterError, match=name):
+        Model(**{name: math.nan})

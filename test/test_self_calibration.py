@@ -1,0 +1,210 @@
+"""Offsets, lines and places found from ranges alone; synthetic geometry, whose truth is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from drives import HALL, circuit, drive
+
+from uwb_mitigation.errors import DatasetError
+from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
+from uwb_mitigation.positioning.localised import PosePath, solve_localised
+from uwb_mitigation.positioning.model import Model
+from uwb_mitigation.positioning.rests import stretches
+from uwb_mitigation.positioning.self_calibration import SLOPE_SD, Regressors, calibrate
+from uwb_mitigation.positioning.start import Height
+from uwb_mitigation.positioning.tracks import Ranges
+
+LEVEL = Height(1.0)
+OWN = np.array([0.2, -0.1, 0.05, -0.2, 0.05])
+
+
+def with_own(ranges: Ranges, own=OWN) -> Ranges:
+    return Ranges(
+        ranges.stamp_ns,
+        ranges.anchor,
+        ranges.range_m + own[ranges.anchor],
+        ranges.variance_m2,
+        ranges.rx_power_dbm,
+        ranges.tag_id,
+    )
+
+
+@pytest.fixture(scope="module")
+def minute():
+    return drive(seconds=60, rate_hz=25.0, offset_m=0.25)
+
+
+@pytest.fixture(scope="module")
+def solved(minute):
+    return calibrate(HALL, [with_own(minute[0])], height=LEVEL)
+
+
+def places_at_rest(count=12, seed=3, slope=-0.02):
+    """Tags at rest, each anchor heard once from each; ranges err by a line in the received power."""
+    rng = np.random.default_rng(seed)
+    where = np.column_stack([rng.uniform(0, 20, 10), rng.uniform(0, 14, 10), rng.uniform(1, 4, 10)])
+    anchors = AnchorMap([Anchor(n, tuple(place), 0.01) for n, place in enumerate(where.tolist(), 1)])
+    tags, truth = [], []
+    for number in range(count):
+        place = np.array([rng.uniform(2, 18), rng.uniform(2, 12), 1.0])
+        distance = np.linalg.norm(where - place, axis=1)
+        power = -85 - 20 * np.log10(distance / 5) + rng.normal(0, 4, 10)
+        error = 0.1 + slope * (power + 88) + rng.normal(0, 0.08, 10)
+        tags.append(
+            Ranges(np.arange(10) * 10**8, np.arange(10), distance + error, np.full(10, np.nan), power, number)
+        )
+        truth.append(place)
+    return anchors, tags, np.array(truth)
+
+
+def test_offsets_of_pairs_are_found_from_a_drive_as_well_as_is_said(solved):
+    found = np.array([solved.pair(0, row) for row in range(5)])
+    error = found[:, 0] - 0.25 - OWN
+    assert solved.level == "pair"
+    assert np.abs(error).max() < 0.12
+    assert np.abs(error / found[:, 1]).max() < 3.0
+
+
+def test_pseudo_truth_comes_from_the_other_anchors_and_says_how_sure_it_is(solved, minute):
+    ranges, path = minute
+    truth = np.linalg.norm(path.position - HALL.position[ranges.anchor], axis=1)
+    error = solved.pseudo_m - truth
+    assert np.isfinite(error).all()
+    assert np.abs(error).mean() < 0.1
+    assert 0.3 < np.sqrt(np.mean((error / solved.pseudo_sd_m) ** 2)) < 2.0
+    # An anchor's own ranges have no say: spoilt, they leave the tag where the others see it.
+    spoilt = with_own(ranges, np.array([0.0, 0.0, 0.9, 0.0, 0.0]))
+    again = calibrate(HALL, [spoilt], height=LEVEL)
+    own = ranges.anchor == 2
+    assert np.abs(again.pseudo_m - truth)[own].mean() < 0.15
+
+
+def test_one_offset_is_found_where_none_differs(minute):
+    found = calibrate(HALL, [minute[0]], height=LEVEL)
+    assert found.level == "one"
+    assert found.pair(0, 0)[0] == pytest.approx(0.25, abs=0.05)
+    assert any("share one" in note for note in found.not_told)
+
+
+def test_tags_at_a_dozen_unknown_places_tell_offset_and_line():
+    anchors, tags, truth = places_at_rest()
+    power = np.concatenate([one.rx_power_dbm for one in tags])
+    level = Regressors(("level",), (power + 88)[:, None], np.zeros(1), np.array([SLOPE_SD]))
+    found = calibrate(anchors, tags, level, height=LEVEL)
+    assert found.stretches.at_rest.all()
+    assert found.value("offset")[0] == pytest.approx(0.1, abs=0.06)
+    assert found.value("level")[0] == pytest.approx(-0.02, abs=0.006)
+    assert len(found.fit.position) == 12
+    assert np.median(np.linalg.norm((found.fit.position - truth)[:, :2], axis=1)) < 0.08
+
+
+@pytest.mark.parametrize("heard", [1, 2])
+def test_one_tag_carried_from_place_to_place_rests_at_each(heard):
+    _, tags, _ = places_at_rest()
+    order = np.repeat(np.arange(len(tags)), heard)
+    carried = Ranges(
+        np.concatenate([tags[n].stamp_ns + k * 60 * 10**9 for k, n in enumerate(order)])
+        if heard == 1
+        else np.concatenate([tags[n].stamp_ns + (60 * n + 2 * (k % 2)) * 10**9 for k, n in enumerate(order)]),
+        *(
+            np.concatenate([getattr(tags[n], name) for n in order])
+            for name in ("anchor", "range_m", "variance_m2", "rx_power_dbm")
+        ),
+        7,
+    )
+    found = stretches([carried])
+    assert found.at_rest.tolist() == [True] * len(tags)
+
+
+def test_poses_of_recordings_that_overlap_are_in_the_order_of_time():
+    def path(begin_s):
+        stamp = (np.arange(100) + 10 * begin_s) * 10**8
+        position = np.column_stack([stamp / 1e9, np.zeros((100, 2))])
+        return PosePath(stamp, position, np.tile([0.0, 0.0, 0.0, 1.0], (100, 1)))
+
+    both = PosePath.joined([path(0), path(5)])
+    wanted = np.arange(1, 14) * 10**9 + 5 * 10**7
+    assert np.allclose(both.at(wanted, 0.0)[0][:, 0], wanted / 1e9)
+
+
+def test_a_rest_within_a_drive_is_one_place():
+    def path(time_s):
+        return circuit(np.minimum(time_s, 20.0) + np.maximum(time_s - 40.0, 0.0))
+
+    ranges, _ = drive(seconds=60, rate_hz=25.0, path=path, model=Model(range_sd=0.02))
+    found = stretches([ranges])
+    assert found.at_rest.tolist() == [False, True, False]
+    resting = found.ranges.stamp_ns[found.of == 1] / 1e9
+    assert resting[0] == pytest.approx(20.0, abs=2.0)
+    assert resting[-1] == pytest.approx(40.0, abs=2.0)
+
+
+def refused(match, anchors, tags, **options):
+    with pytest.raises(DatasetError, match=match):
+        calibrate(anchors, tags, **options)
+
+
+def test_too_few_anchors_are_refused(minute):
+    ranges = minute[0]
+    refused("3 anchors were heard", HALL, [ranges.take(ranges.anchor < 3)], height=LEVEL)
+    refused("4 anchors were heard", HALL, [ranges.take(ranges.anchor < 4)])
+
+
+def test_anchors_on_a_line_or_in_a_plane_are_refused(minute):
+    line = HALL.moved(HALL.position * (1, 0, 0), HALL.sd)
+    refused("on a line", line, [minute[0]], height=LEVEL)
+    refused("in a plane", HALL.moved(HALL.position * (1, 1, 0), HALL.sd), [minute[0]])
+
+
+def test_a_tag_that_hardly_moves_is_refused():
+    still, _ = drive(seconds=30, rate_hz=25.0, path=lambda t: circuit(0 * t))
+    refused("moves by", HALL, [still], height=LEVEL)
+
+
+def test_too_few_ranges_are_refused():
+    short, _ = drive(seconds=6, rate_hz=25.0)
+    refused("too few", HALL, [short], height=LEVEL)
+
+
+def test_a_track_with_two_mirror_images_is_refused():
+    # Anchors all but in a plane, the tag half a metre below it: as good half a metre above.
+    flat = HALL.position.copy()
+    flat[:, 2] = (1.1, 1.9, 1.1, 1.9, 1.5)
+    ranges, _ = drive(HALL.moved(flat, HALL.sd), seconds=40, rate_hz=25.0, model=Model(range_sd=0.3))
+    refused("mirror images", HALL.moved(flat, HALL.sd), [ranges])
+
+
+def test_an_anchor_that_contradicts_the_others_is_named(minute):
+    wrong = HALL.position.copy()
+    wrong[3] += (3.0, -2.5, 0.0)
+    refused("anchor 4 contradicts", HALL.moved(wrong, HALL.sd), [minute[0]], height=LEVEL)
+
+
+def test_lag_and_lever_arm_are_found_beside_a_localisation(minute):
+    ranges, path = minute
+    time_s = ranges.stamp_ns / 1e9
+    # It turns as it likes: were it to look along its way, a lag would be an arm.
+    heading = 0.7 * time_s
+    zero = np.zeros_like(heading)
+    lever = np.array([0.3, -0.25, 0.0])
+    turned = np.stack(
+        [
+            np.cos(heading) * lever[0] - np.sin(heading) * lever[1],
+            np.sin(heading) * lever[0] + np.cos(heading) * lever[1],
+            zero,
+        ],
+        axis=1,
+    )
+    quaternion = np.stack([zero, zero, np.sin(heading / 2), np.cos(heading / 2)], axis=1)
+    late = PosePath(ranges.stamp_ns + 300_000_000, path.position - turned, quaternion)
+    found = solve_localised(HALL, [with_own(ranges)], late, np.zeros(len(ranges)))
+    assert found.time_offset_s == pytest.approx(0.3, abs=0.03)
+    assert np.abs(found.lever_arm_m - lever)[:2].max() < 0.05
+    assert np.abs(found.offset_m - 0.25 - OWN).max() < 0.08
+    given = solve_localised(
+        HALL, [ranges], late, np.zeros(len(ranges)), time_offset_s=0.3, lever_arm_m=(0.3, -0.25, 0.0)
+    )
+    assert (given.time_offset_s, given.time_offset_sd_s) == (pytest.approx(0.3, abs=1e-6), 0.0)
+    with pytest.raises(DatasetError, match="localisation's times"):
+        solve_localised(HALL, [ranges], late.shifted(10**13), np.zeros(len(ranges)))

@@ -1,0 +1,157 @@
+"""The batch smoother: its linear algebra, gtsam as an oracle, and honesty."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from drives import HALL, drive
+
+from uwb_mitigation.errors import DatasetError
+from uwb_mitigation.positioning.chain import Chain
+from uwb_mitigation.positioning.locator import TagLocator, run_live
+from uwb_mitigation.positioning.model import Model
+from uwb_mitigation.positioning.smoother import Parameters, Smoother, knots_of
+from uwb_mitigation.positioning.start import Height
+from uwb_mitigation.positioning.track_errors import track_errors
+from uwb_mitigation.positioning.tracks import Ranges, Track
+
+
+def test_a_chain_solves_as_a_dense_matrix_does():
+    rng = np.random.default_rng(1)
+    knots, b, q = 6, 3, 2
+    size = knots * b + q
+    rows = rng.normal(0, 1, (200, size))
+    for k in range(knots):  # each row touches two neighbouring knots and the border
+        rows[k::knots, : k * b] = 0
+        rows[k::knots, min(k + 2, knots) * b : knots * b] = 0
+    full, right = rows.T @ rows, rows.T @ rng.normal(0, 1, 200)
+    chain = Chain.empty(knots, b, q)
+    for k in range(knots):
+        here = slice(k * b, (k + 1) * b)
+        chain.diagonal[k], chain.border[k], chain.right[k] = full[here, here], full[here, -q:], right[here]
+        if k + 1 < knots:
+            chain.beside[k] = full[here, (k + 1) * b : (k + 2) * b]
+    chain.shared[:], chain.right_shared[:] = full[-q:, -q:], right[-q:]
+    solution = chain.solve()
+    wanted, inverse = np.linalg.solve(full, right), np.linalg.inv(full)
+    np.testing.assert_allclose(solution.x.reshape(-1), wanted[:-q], atol=1e-9)
+    np.testing.assert_allclose(solution.shared, wanted[-q:], atol=1e-9)
+    np.testing.assert_allclose(solution.shared_covariance, inverse[-q:, -q:], atol=1e-9)
+    for k, found in enumerate(solution.covariances()):
+        np.testing.assert_allclose(found, inverse[k * b : (k + 1) * b, k * b : (k + 1) * b], atol=1e-9)
+    np.testing.assert_allclose(solution.covariances(2), solution.covariances()[:, :2, :2], atol=1e-12)
+
+
+def test_the_smoother_agrees_with_gtsam():
+    gtsam = pytest.importorskip("gtsam")
+    # Persisting errors so small, and robustness so far, that ranges err independently, as gtsam's factors do.
+    model = Model(long=100.0, short=100.0, white=1.0, offset_sd=1e-6, pair_sd=1e-6)
+    ranges, truth = drive(seconds=6, model=Model(white=1.0), offset_m=0.0)
+    knots_ns, of = knots_of(ranges.stamp_ns)
+    # gtsam has ranges at the knots: as many of the drive's.
+    at = np.flatnonzero(ranges.stamp_ns == knots_ns[of])
+    ranges = ranges.take(at)
+    mine = Smoother(HALL, model, ranges).fit(Track(truth.stamp_ns, truth.position, *_nothing(len(truth))), 30)
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    knots_ns, of = knots_of(ranges.stamp_ns)
+    variance = model.range_sd**2 + HALL.sd**2
+    key = [gtsam.symbol("x", k) for k in range(len(knots_ns))]
+    for row, place in enumerate(HALL.position):
+        anchor = gtsam.symbol("a", row)
+        values.insert(anchor, gtsam.Point3(*place))
+        graph.add(gtsam.NonlinearEqualityPoint3(anchor, gtsam.Point3(*place)))
+    speeds = [gtsam.symbol("v", k) for k in range(len(knots_ns))]
+    dt = np.diff(knots_ns / 1e9)
+    for k in range(len(knots_ns)):
+        values.insert(key[k], gtsam.Point3(*truth.position[at[k]]))
+        values.insert(speeds[k], np.zeros(3))
+    graph.add(
+        gtsam.PriorFactorVector(speeds[0], np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, model.speed))
+    )
+    for k, step in enumerate(dt):
+        q = model.acceleration**2 * np.array([[step**3 / 3, step**2 / 2], [step**2 / 2, step]])
+        root = np.linalg.cholesky(np.linalg.inv(q)).T
+        _motion(gtsam, graph, key, speeds, k, step, root)
+    for i in range(len(ranges)):
+        noise = gtsam.noiseModel.Isotropic.Sigma(1, float(np.sqrt(variance[ranges.anchor[i]])))
+        factor = gtsam.RangeFactor3(
+            key[of[i]], gtsam.symbol("a", int(ranges.anchor[i])), ranges.range_m[i], noise
+        )
+        graph.add(factor)
+    solved = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+    theirs = np.array([solved.atPoint3(one) for one in key])
+    np.testing.assert_allclose(mine.track.position, theirs, atol=2e-3)
+    marginals = gtsam.Marginals(graph, solved)
+    for k in (0, len(key) // 2, len(key) - 1):
+        np.testing.assert_allclose(
+            mine.track.covariance[k, :3, :3], marginals.marginalCovariance(key[k]), rtol=0.02, atol=1e-4
+        )
+
+
+def _nothing(n: int):
+    return np.zeros((n, 3)), np.zeros((n, 6, 6))
+
+
+def _motion(gtsam, graph, key, speeds, k: int, step: float, root) -> None:
+    def error(factor, values, jacobians):
+        p0, p1 = values.atPoint3(key[k]), values.atPoint3(key[k + 1])
+        v0, v1 = values.atVector(speeds[k]), values.atVector(speeds[k + 1])
+        eye = np.eye(3)
+        if jacobians is not None:
+            jacobians[0] = np.asfortranarray(np.kron(root, eye) @ np.vstack([-eye, 0 * eye]))
+            jacobians[1] = np.asfortranarray(np.kron(root, eye) @ np.vstack([eye, 0 * eye]))
+            jacobians[2] = np.asfortranarray(np.kron(root, eye) @ np.vstack([-step * eye, -eye]))
+            jacobians[3] = np.asfortranarray(np.kron(root, eye) @ np.vstack([0 * eye, eye]))
+        return np.kron(root, eye) @ np.concatenate([p1 - p0 - step * v0, v1 - v0])
+
+    keys = [key[k], key[k + 1], speeds[k], speeds[k + 1]]
+    graph.add(gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(6), keys, error))
+
+
+def test_smoothed_tracks_of_many_drives_are_honest_and_better_than_live_ones():
+    live, smooth = [], []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        ranges, truth = drive(seconds=25, seed=seed, offset_m=rng.normal(0, Model().offset_sd))
+        ranges = Ranges(
+            ranges.stamp_ns,
+            ranges.anchor,
+            ranges.range_m + rng.normal(0, Model().pair_sd, len(HALL))[ranges.anchor],
+            ranges.variance_m2,
+            ranges.rx_power_dbm,
+        )
+        first = run_live(ranges, TagLocator(HALL)).track
+        live.append(track_errors(first, truth).rmse)
+        smooth.append(track_errors(Smoother(HALL, Model(), ranges).fit(first).track, truth))
+    assert np.mean([e.rmse for e in smooth]) < 0.95 * np.mean(live)
+    assert 0.5 < np.mean([e.nees_per_dof for e in smooth]) < 1.6
+
+
+def test_outliers_do_not_bend_the_track():
+    ranges, truth = drive(seconds=30)
+    ranges.range_m[5::11] += 6.0
+    ranges.range_m[3::29] *= 0.2
+    first = run_live(ranges, TagLocator(HALL, height=Height(1.0))).track
+    smooth = Smoother(HALL, Model(), ranges, height=Height(1.0)).fit(first)
+    assert track_errors(smooth.track, truth).rmse < 0.25
+    assert smooth.weight[5::11].max() < 0.01 < np.median(smooth.weight)
+
+
+def test_parameters_that_ranges_share_are_found_with_the_track():
+    ranges, truth = drive(seconds=60, offset_m=0.0)
+    power = np.random.default_rng(4).normal(0, 1, len(ranges))
+    ranges.range_m[:] += 0.3 * power + 0.5 * (ranges.anchor == 3)
+    rows = np.stack([power, ranges.anchor == 3], axis=1).astype(float)
+    wanted = Parameters(rows, np.zeros(2), np.array([1.0, 1.0]))
+    found = Smoother(HALL, Model(), ranges, parameters=wanted).fit(
+        Track(truth.stamp_ns, truth.position, *_nothing(len(truth)))
+    )
+    sd = np.sqrt(np.diag(found.parameter_covariance))
+    assert np.abs(found.parameters - (0.3, 0.5)).max() < 3 * sd.max()
+    assert np.abs(found.parameters[0] - 0.3) < 0.01
+
+
+def test_one_range_makes_no_track():
+    ranges, _ = drive(seconds=1)
+    with pytest.raises(DatasetError, match="1 ranges"):
+        Smoother(HALL, Model(), ranges.take(slice(0, 1)))

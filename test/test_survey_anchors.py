@@ -1,0 +1,73 @@
+"""Anchors found by driving past them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from drives import HALL, circuit, drive
+
+from uwb_mitigation.errors import DatasetError
+from uwb_mitigation.positioning.anchors import AnchorMap
+from uwb_mitigation.positioning.start import Height
+from uwb_mitigation.positioning.survey import displacements, survey
+
+LEVEL = Height(1.0)
+
+
+@pytest.fixture(scope="module")
+def minute():
+    return drive(seconds=60)[0]
+
+
+def test_anchors_are_found_from_guesses_that_are_off_by_a_metre_and_a_half(minute):
+    rng = np.random.default_rng(5)
+    away = np.zeros((5, 3))
+    away[:, :2] = rng.normal(0, 1, (5, 2))
+    away *= 1.5 / np.linalg.norm(away, axis=1, keepdims=True)
+    found = survey(HALL.moved(HALL.position + away, HALL.sd), minute, off_m=1.5, height=LEVEL)
+    off = displacements(found.anchors.position, HALL.position)
+    assert np.sqrt((off**2).sum(axis=1).mean()) < 0.15
+    assert found.swapped == []
+    assert found.explained
+
+
+def test_anchors_that_do_not_explain_the_ranges_say_so(minute):
+    nonsense = minute.take(slice(0, 300))
+    nonsense = replace(nonsense, range_m=np.random.default_rng(1).permutation(nonsense.range_m))
+    assert not survey(HALL, nonsense, height=LEVEL).explained
+
+
+def test_an_anchor_half_a_metre_off_is_named_and_no_other(minute):
+    wrong = HALL.position.copy()
+    wrong[2] += (0.4, 0.3, 0.0)
+    found = survey(HALL.moved(wrong, HALL.sd), minute, height=LEVEL)
+    assert (found.misplaced, found.swapped) == ([2], [])
+    assert survey(HALL, minute, height=LEVEL).misplaced == []
+
+
+def test_a_swapped_pair_is_named(minute):
+    wrong = HALL.position.copy()
+    wrong[[1, 3]] = wrong[[3, 1]]
+    found = survey(HALL.moved(wrong, HALL.sd), minute, height=LEVEL)
+    assert found.swapped == [(1, 3)]
+    assert sorted(found.misplaced) == [1, 3]
+
+
+def test_the_whole_may_lie_and_turn_as_it_likes():
+    angle = 0.3
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    off = displacements(HALL.position @ turn.T + (2.0, -1.0, 0.5), HALL.position)
+    np.testing.assert_allclose(off, 0.0, atol=1e-9)
+
+
+def test_what_cannot_be_surveyed_is_refused_in_words(minute):
+    with pytest.raises(DatasetError, match="2 anchors were heard"):
+        survey(HALL, minute.take(minute.anchor < 2), height=LEVEL)
+    line = HALL.moved(HALL.position * (1, 0, 0), HALL.sd)
+    with pytest.raises(DatasetError, match="on a line"):
+        survey(line, minute, height=LEVEL)
+    still, _ = drive(seconds=10, path=lambda t: circuit(0 * t))
+    with pytest.raises(DatasetError, match="the tag moves by"):
+        survey(AnchorMap(HALL.anchors), still, height=LEVEL)

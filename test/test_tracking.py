@@ -1,0 +1,189 @@
+"""`uwb-mitigation track` and `survey` on bags; real recordings, where they are at hand."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bag_material import write_corrected
+from command_line import run
+from conftest import REPOSITORY
+from drives import HALL, drive
+
+from uwb_mitigation.bag.poses import read_positions, tag_topic
+from uwb_mitigation.bag.topics import ODOMETRY, ODOMETRY_TRUTH
+from uwb_mitigation.bag.writer import BagWriter
+from uwb_mitigation.measurement import Cir, CorrectedRange, Origin, RangeMeasurement, Record, Status
+from uwb_mitigation.positioning.anchors import dump_anchors, parse_anchors
+from uwb_mitigation.sources.hanyang import HanyangRun
+from uwb_mitigation.sources.opening import open_recording
+
+
+@pytest.fixture(scope="module")
+def hall(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bag of a drive of 40 s past five anchors, raw ranges 0.6 m too long; its anchors beside it."""
+    bag = tmp_path_factory.mktemp("hall") / "hall.mcap"
+    ranges, truth = drive(seconds=40)
+    empty = Cir(np.zeros(0, np.int16))
+    with BagWriter(bag, {"simulated": "true"}) as writer:
+        for i in range(len(ranges)):
+            good = float(ranges.range_m[i])
+            anchor = HALL.anchors[ranges.anchor[i]].id
+            measured = RangeMeasurement(int(ranges.stamp_ns[i]), 7, anchor, i, 0, good + 0.6, empty)
+            x, y, z = truth.position[i].tolist()
+            writer.write(Record(measured, tag_position=(x, y, z)))
+            corrected = CorrectedRange(good, good + 0.6, 0.6, 0.01, Status.OK, Origin.HOST, 1)
+            write_corrected(writer, measured, corrected)
+        stranger = RangeMeasurement(int(ranges.stamp_ns[-1]), 7, 99, len(ranges), 0, 1.0, empty)
+        writer.write(Record(stranger))
+    (bag.parent / "hall.anchors.yaml").write_text(dump_anchors(HALL))
+    return bag
+
+
+def test_a_track_is_written_judged_and_read_by_evo(hall: Path, tmp_path: Path):
+    out, tum, result = tmp_path / "track.mcap", tmp_path / "track.tum", tmp_path / "track.json"
+    done = run("track", hall, "-o", out, "--tum", tum, "--height", "1.0", "--json", result, folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    told = json.loads(result.read_text())
+    assert told["unknown_anchors"] == {"99": 1}
+    assert told["corrected"] is True
+    assert told["tags"][0]["tag_id"] == 7
+    for kind in ("live", "smoothed"):
+        assert told[kind]["horizontal_rmse_m"] < 0.2
+        assert 0.3 < told[kind]["nees_per_dof"] < 2
+    assert told["snapshot"]["horizontal_rmse_m"] > 1.5 * told["live"]["horizontal_rmse_m"]
+    assert told["hdop_median"] < 3
+    (live,) = read_positions(out, ODOMETRY)
+    (truth,) = read_positions(out, ODOMETRY_TRUTH)
+    assert (live.tag_id, truth.tag_id) == (7, 7)
+    off = live.path.position - truth.path.at(live.path.stamp_ns)
+    assert np.nanmean(np.hypot(*off[:, :2].T)) < 0.2
+    evo = pytest.importorskip("evo.tools.file_interface")
+    read = evo.read_tum_trajectory_file(tum)
+    assert read.num_poses >= 400
+    np.testing.assert_allclose(read.timestamps[0], live.path.stamp_ns[0] / 1e9, atol=2.0)
+
+
+def test_what_cannot_be_tracked_is_said_in_a_line(hall: Path, tmp_path: Path):
+    out = tmp_path / "track.mcap"
+    absent = run("track", hall, "-o", out, "--anchors", tmp_path / "no.yaml", folder=tmp_path)
+    assert "no.yaml: no such file" in absent.stderr
+    assert "area 'here'" in str(run("track", hall, "-o", out, "--area", "here", folder=tmp_path).stderr)
+    line = tmp_path / "line.yaml"
+    line.write_text(dump_anchors(HALL.moved(HALL.position * (1, 0, 0) + (0, 0, 1), HALL.sd)))
+    told = str(run("track", hall, "-o", out, "--anchors", line, "--height", "1.0", folder=tmp_path).stderr)
+    assert "no place can be told" in told
+    assert "all on a line" in told
+    others = tmp_path / "others.yaml"
+    others.write_text("anchors: [{id: 50, x: 0, y: 0, z: 0}]")
+    assert "ranges come from anchors: 1, 2" in str(
+        run("track", hall, "-o", out, "--anchors", others, folder=tmp_path).stderr
+    )
+    assert not out.exists()
+
+
+def test_a_survey_writes_anchors_that_are_nearer(hall: Path, tmp_path: Path):
+    guesses, found, result = tmp_path / "guesses.yaml", tmp_path / "found.yaml", tmp_path / "found.json"
+    off = HALL.position.copy()
+    off[1] += (0.5, -0.4, 0.0)
+    guesses.write_text(dump_anchors(HALL.moved(off, HALL.sd)))
+    done = run(
+        "survey",
+        hall,
+        "-o",
+        found,
+        "--anchors",
+        guesses,
+        "--height",
+        "1.0",
+        "--json",
+        result,
+        folder=tmp_path,
+    )
+    assert done.returncode == 0, done.stderr
+    assert json.loads(result.read_text())["misplaced"] == [2]
+    told = parse_anchors(found.read_text(), "found")
+    assert np.linalg.norm(told.position[1] - HALL.position[1]) < 0.5
+    assert "exists already" in str(
+        run("survey", hall, "-o", found, "--anchors", guesses, folder=tmp_path).stderr
+    )
+
+
+def test_topics_of_several_tags():
+    assert tag_topic("/uwb/pose", None) == "/uwb/pose"
+    assert tag_topic("/uwb/pose", 7) == "/uwb/tag_7/pose"
+
+
+@pytest.fixture(scope="module")
+def hanyang() -> Path:
+    folder = (
+        Path(os.environ.get("UWB_MITIGATION_DATA", REPOSITORY.parent / "shared" / "data")) / "hanyang_outdoor"
+    )
+    if not folder.is_dir():
+        pytest.skip(f"Hanyang's runs are not at {folder}: set UWB_MITIGATION_DATA to run this test")
+    return folder
+
+
+def test_a_real_run_is_read_with_its_anchors_and_places(hanyang: Path):
+    source = open_recording(hanyang / "LOS_A2")
+    assert isinstance(source, HanyangRun)
+    records = list(source)
+    assert len(records) == 8219
+    assert [anchor.id for anchor in source.anchors.anchors] == [3, 5, 9, 12]
+    stamps = [record.measurement.stamp_ns for record in records]
+    assert stamps == sorted(stamps)
+    assert source.skipped["place without GNSS"] > 100
+    heights = [record.tag_position[2] for record in records if record.tag_position is not None]
+    assert 0.7 < min(heights) < max(heights) < 1.7
+
+
+def test_a_bag_of_a_real_run_keeps_its_stamps_and_anchors(hanyang: Path, tmp_path: Path):
+    done = run("data", "import", hanyang / "LOS_A2", "-o", tmp_path / "a2.mcap", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    wanted = [record.measurement.stamp_ns for record in open_recording(hanyang / "LOS_A2")]
+    assert [record.measurement.stamp_ns for record in open_recording(tmp_path / "a2.mcap")] == wanted
+    anchors = parse_anchors((tmp_path / "a2.anchors.yaml").read_text(), "a2")
+    assert anchors.anchors == HanyangRun(hanyang / "LOS_A2").anchors.anchors
+
+
+@pytest.mark.slow
+def test_real_drives_meet_what_the_documentation_says(hanyang: Path):
+    from uwb_mitigation.benches import positions
+
+    runs = [positions.hanyang(folder) for folder in sorted(hanyang.glob("*_*"))]
+    assert len(runs) == 6
+
+    def mean(kind: str, name: str) -> float:
+        return float(np.mean([getattr(getattr(run, kind), name) for run in runs]))
+
+    assert mean("live", "rmse") < 0.55
+    assert mean("live", "coverage95") > 0.95
+    assert 0.5 < mean("live", "nees_per_dof") < 2
+    assert mean("live", "exceeded") < 0.01
+    assert mean("smoothed", "rmse") < 0.40
+    assert mean("smoothed", "coverage95") > 0.9
+    assert mean("snapshot", "rmse") > 2
+
+
+def test_real_tags_at_rest_are_placed_by_the_line_of_the_others(apartment: Path):
+    from uwb_mitigation.benches import positions
+
+    found = positions.apartment(apartment)
+    assert found.tags == 5
+    assert found.corrected_m < 0.32
+    assert found.raw_m > 2 * found.corrected_m
+    assert 0.5 < found.nees_per_dof < 2
+
+
+def test_corrected_ranges_halve_the_error_in_the_simulated_flat():
+    from uwb_mitigation.benches import positions
+
+    found = positions.flat(6, ranges=2000)
+    assert found.corrected.live.rmse < 0.5 * found.raw.snapshot.rmse
+    assert found.corrected.snapshot.rmse < 0.5 * found.raw.snapshot.rmse
+    assert found.corrected.live.coverage95 > 0.95
+    assert found.universal.live.rmse < 0.6 * found.raw.live.rmse
+    assert found.universal.live.coverage95 > 0.95

@@ -1,0 +1,279 @@
+"""The offsets of radios: what antenna delays that nobody calibrated add to every range, whatever the channel does.
+
+    default: 0.15                # m, of pairs that nothing below names
+    anchors: {1: 0.21, 0x1f: 0.19}
+    tags: {7: -0.02}
+    pairs:
+      - {anchor: 1, tag: 7, offset: 0.22, sd: 0.03}
+
+`sd`, how sure that is in m, may be absent. A pair's own offset counts where there is one; else the sum of its anchor's and its tag's, as the delays of two radios
+add (0 for the one that is not named); else the default. One number stands for a default alone.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.files import read_bounded
+
+MAX_OFFSET_M = 10.0
+"""A DW1000 whose antenna delay was never set is 154 m off: that belongs into the radio, as `antenna_delay`."""
+
+MAX_ENTRIES = 10_000
+MAX_TEXT = 1 << 20
+_MAX_ID = (1 << 64) - 1
+_CACHED_PAIRS = 4096
+_SECTIONS = ("default", "anchors", "tags", "pairs")
+_PAIR = ("anchor", "tag", "offset")
+SCHEMA = (
+    "default: m; anchors: {id: m}; tags: {id: m}; pairs: a list of {anchor, tag, offset, and optionally sd}"
+)
+VALID = f"a number of metres, {-MAX_OFFSET_M:g} to {MAX_OFFSET_M:g}, or a YAML file of offsets by anchor, tag or pair"
+_NONE: Mapping[Any, float] = MappingProxyType({})
+
+
+class Offsets:
+    """Offsets of pairs of radios, m, rounded to float32 as messages and boards have them; immutable.
+
+    Args:
+        default: of pairs that nothing else names.
+        anchors, tags: {identity: m}.
+        pairs: {(tag, anchor): m}.
+        pair_sd: the standard deviations of some of these, m.
+
+    Raises:
+        ParameterError: an offset is not finite or beyond `MAX_OFFSET_M`, or there are too many.
+    """
+
+    def __init__(
+        self,
+        default: float = 0.0,
+        anchors: Mapping[int, float] = _NONE,
+        tags: Mapping[int, float] = _NONE,
+        pairs: Mapping[tuple[int, int], float] = _NONE,
+        where: str = "offsets",
+        pair_sd: Mapping[tuple[int, int], float] = _NONE,
+    ) -> None:
+        entries = len(anchors) + len(tags) + len(pairs)
+        if entries > MAX_ENTRIES:
+            raise ParameterError(f"{entries} offsets", where=where, valid=f"{MAX_ENTRIES} at most")
+        self.default = _checked(default, "default", where)
+        self.anchors = {i: _checked(value, f"anchor {i}", where) for i, value in anchors.items()}
+        self.tags = {i: _checked(value, f"tag {i}", where) for i, value in tags.items()}
+        self.pairs = {
+            (tag, anchor): _checked(value, f"anchor {anchor}, tag {tag}", where)
+            for (tag, anchor), value in pairs.items()
+        }
+        self.pair_sd = {
+            pair: _deviation(pair_sd[pair], pair, where) for pair in self.pairs if pair in pair_sd
+        }
+        self._known: dict[tuple[int, int], float] = {}
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Offsets):
+            return NotImplemented
+        mine, others = ((o.default, o.anchors, o.tags, o.pairs) for o in (self, other))
+        return mine == others
+
+    def __hash__(self) -> int:
+        return hash((self.default, *(frozenset(o.items()) for o in (self.anchors, self.tags, self.pairs))))
+
+    def __bool__(self) -> bool:
+        """Whether any is not 0."""
+        return any((self.default, *self.anchors.values(), *self.tags.values(), *self.pairs.values()))
+
+    def __len__(self) -> int:
+        """The number of anchors, tags and pairs named."""
+        return len(self.anchors) + len(self.tags) + len(self.pairs)
+
+    def __str__(self) -> str:
+        return f"{self.default:g} m" + (f", and {len(self)} of anchors, tags and pairs" if len(self) else "")
+
+    def of(self, tag_id: int, anchor_id: int) -> float:
+        """The offset of a pair, m."""
+        pair = tag_id, anchor_id
+        found = self._known.get(pair)
+        if found is None:
+            found = self._find(pair)
+            # Identities may be noise: no more are kept than a site has.
+            if len(self._known) < _CACHED_PAIRS:
+                self._known[pair] = found
+        return found
+
+    def of_columns(self, tag_ids: NDArray[Any], anchor_ids: NDArray[Any]) -> NDArray[np.float32]:
+        """The offsets of pairs, m: uint64 (n,) and (n,) to float32 (n,)."""
+        if not len(self):
+            return np.full(len(tag_ids), self.default, np.float32)
+        pairs = zip(tag_ids.tolist(), anchor_ids.tolist(), strict=True)
+        return np.array([self.of(tag, anchor) for tag, anchor in pairs], np.float32)
+
+    def _find(self, pair: tuple[int, int]) -> float:
+        if pair in self.pairs:
+            return self.pairs[pair]
+        tag, anchor = pair
+        if tag in self.tags or anchor in self.anchors:
+            return float(np.float32(self.anchors.get(anchor, 0.0)) + np.float32(self.tags.get(tag, 0.0)))
+        return self.default
+
+
+def read_offsets(value: str) -> Offsets:
+    """The offsets that a parameter or option names: a number of metres, the path of a file, or nothing for 0.
+
+    Raises:
+        ParameterError: it is neither, or the file holds something else.
+    """
+    text = value.strip()
+    if not text:
+        return NO_OFFSETS
+    try:
+        number = float(text)
+    except ValueError:
+        path = Path(text).expanduser()
+        data = read_bounded(path, MAX_TEXT, ParameterError, VALID)
+        try:
+            return parse_offsets(data.decode(), str(path))
+        except UnicodeDecodeError as error:
+            raise ParameterError("not text", where=str(path), valid=SCHEMA) from error
+    return Offsets(number)
+
+
+def parse_offsets(text: str, where: str) -> Offsets:
+    """The offsets of a file's text.
+
+    Args:
+        text: YAML (so JSON too) as the module's text shows, or one number.
+        where: what to call the file in errors.
+
+    Raises:
+        ParameterError: it is no YAML, or not of that form; names the entry.
+    """
+    try:
+        document = yaml.load(text, _Loader)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        first = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ParameterError(f"not YAML: {first}", where=where, valid=SCHEMA) from error
+    if isinstance(document, int | float) and not isinstance(document, bool):
+        return Offsets(document, where=where)
+    if not isinstance(document, dict):
+        raise ParameterError("no offsets", where=where, valid=SCHEMA)
+    for name in document:
+        if name not in _SECTIONS:
+            raise ParameterError(f"the key {name!r:.60} is unknown", where=where, valid=", ".join(_SECTIONS))
+    pairs, deviations = _by_pair(document.get("pairs") or [], where)
+    return Offsets(
+        _number(document.get("default", 0.0), "default", where),
+        _by_identity(document.get("anchors") or {}, "anchors", where),
+        _by_identity(document.get("tags") or {}, "tags", where),
+        pairs,
+        where,
+        deviations,
+    )
+
+
+def dump_offsets(offsets: Offsets, comment: str = "") -> str:
+    """The text of a file of offsets, which `parse_offsets` reads; `comment` goes ahead, a line a line."""
+    out = io.StringIO()
+    for line in comment.splitlines():
+        out.write(f"# {line}\n")
+    out.write(f"default: {round(offsets.default, 6)}\n")
+    for name, entries in (("anchors", offsets.anchors), ("tags", offsets.tags)):
+        if entries:
+            out.write(f"{name}:\n" + "".join(f"  {i}: {round(m, 6)}\n" for i, m in sorted(entries.items())))
+    if offsets.pairs:
+        out.write("pairs:\n")
+        for (tag, anchor), value in sorted(offsets.pairs.items()):
+            sd = offsets.pair_sd.get((tag, anchor))
+            sure = "" if sd is None else f", sd: {round(sd, 6)}"
+            out.write(f"  - {{anchor: {anchor}, tag: {tag}, offset: {round(value, 6)}{sure}}}\n")
+    return out.getvalue()
+
+
+class _Loader(yaml.SafeLoader):
+    """Refuses a key that is there twice, of which YAML would keep the last."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen = set()
+        for key_node, _ in node.value:
+            key = self.construct_object(key_node, deep=True)
+            if isinstance(key, int | float | str) and key in seen:
+                raise yaml.YAMLError(f"{key!r} is there twice, in line {key_node.start_mark.line + 1}")
+            if isinstance(key, int | float | str):
+                seen.add(key)
+        return super().construct_mapping(node, deep)
+
+
+def _by_identity(entries: object, name: str, where: str) -> dict[int, float]:
+    if not isinstance(entries, dict):
+        raise ParameterError(f"{name} = {entries!r:.60}", where=where, valid=f"{name}: {{identity: metres}}")
+    return {
+        _identity(identity, name, where): _number(value, f"{name}: {identity!r:.60}", where)
+        for identity, value in entries.items()
+    }
+
+
+def _by_pair(
+    entries: object, where: str
+) -> tuple[dict[tuple[int, int], float], dict[tuple[int, int], float]]:
+    """Offsets and deviations."""
+    if not isinstance(entries, list):
+        raise ParameterError(f"pairs = {entries!r:.60}", where=where, valid=SCHEMA)
+    found: dict[tuple[int, int], float] = {}
+    deviations: dict[tuple[int, int], float] = {}
+    for number, entry in enumerate(entries, 1):
+        place = f"{where}: pairs, entry {number}"
+        if not isinstance(entry, dict) or set(entry) - {"sd"} != set(_PAIR):
+            raise ParameterError(f"{entry!r:.80} is no pair", where=place, valid=f"{{{', '.join(_PAIR)}}}")
+        pair = _identity(entry["tag"], "tag", place), _identity(entry["anchor"], "anchor", place)
+        if pair in found:
+            raise ParameterError("the pair is there twice", where=place, valid="one entry for each")
+        found[pair] = _number(entry["offset"], "offset", place)
+        if "sd" in entry:
+            deviations[pair] = _deviation(_number(entry["sd"], "sd", place), pair, place)
+    return found, deviations
+
+
+def _identity(value: object, name: str, where: str) -> int:
+    if isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= _MAX_ID:
+        return value
+    raise ParameterError(
+        f"{name}: identity {value!r:.60}", where=where, valid="a whole number of 64 bits, such as 3 or 0x1f"
+    )
+
+
+def _number(value: object, name: str, where: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ParameterError(f"{name} = {value!r:.60}", where=where, valid="a number of metres")
+    return _checked(value, name, where)
+
+
+def _deviation(value: float, pair: tuple[int, int], where: str) -> float:
+    if not 0.0 < value <= MAX_OFFSET_M:
+        tag, anchor = pair
+        raise ParameterError(
+            f"sd = {value!r:.60} m of anchor {anchor}, tag {tag}",
+            where=where,
+            valid=f"more than 0, {MAX_OFFSET_M:g} m at most",
+        )
+    return float(value)
+
+
+def _checked(value: float, name: str, where: str) -> float:
+    if math.isfinite(value) and abs(value) <= MAX_OFFSET_M:
+        return float(np.float32(value))
+    hint = ": are these millimetres?" if MAX_OFFSET_M < abs(value) <= 1000.0 * MAX_OFFSET_M else ""
+    raise ParameterError(
+        f"{name} = {value!r:.60} m{hint}", where=where, valid=f"{-MAX_OFFSET_M:g} to {MAX_OFFSET_M:g} m"
+    )
+
+
+NO_OFFSETS = Offsets()

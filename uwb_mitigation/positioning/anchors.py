@@ -1,0 +1,186 @@
+"""Where the anchors are: the anchors file, checked in words, and the arrays that estimation takes.
+
+    anchors:
+      - {id: 1, x: 0.0, y: 0.0, z: 2.1}
+      - {id: 2, x: 7.6, y: 0.0, z: 2.1, sd: 0.05, name: door}
+
+Metres in the frame `map`; `sd` is the standard deviation of each coordinate, 0.05 m unless said; `id` is the
+64-bit identity that ranges carry, decimal or 0x... . Nothing else may stand in it.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from uwb_mitigation.errors import ParameterError
+
+SD_M = 0.05
+"""How well a tape measure places an anchor."""
+
+MAX_ANCHORS = 256
+MAX_TEXT = 1 << 20
+MAX_COORDINATE_M = 1e5
+MILLIMETRES = 200.0
+"""Anchors that far apart are out of each other's reach: such coordinates are millimetres."""
+
+_MAX_ID = (1 << 64) - 1
+_NEEDED = ("id", "x", "y", "z")
+_FIELDS = (*_NEEDED, "sd", "name")
+SCHEMA = "anchors: a list of {id, x, y, z, and optionally sd, name}, in metres"
+
+
+@dataclass(frozen=True, slots=True)
+class Anchor:
+    """Attributes:
+    id: 64-bit identity.
+    position: x, y, z in m.
+    sd: standard deviation of each coordinate, m.
+    name: what people call it; may be empty.
+    """
+
+    id: int
+    position: tuple[float, float, float]
+    sd: float = SD_M
+    name: str = ""
+
+    def __str__(self) -> str:
+        identity = str(self.id) if self.id < 1 << 16 else f"{self.id:016x}"
+        return f"{identity} ({self.name})" if self.name else identity
+
+
+class AnchorMap:
+    """The anchors of a site; immutable.
+
+    Args:
+        anchors: one or more, of different identities.
+
+    Attributes:
+        anchors: as given.
+        position: float64 (m, 3), m.
+        sd: float64 (m,), m.
+        index: where an identity is among them.
+
+    Raises:
+        ParameterError: there is none, too many, or one identity twice.
+    """
+
+    def __init__(self, anchors: Sequence[Anchor], where: str = "anchors") -> None:
+        if not 1 <= len(anchors) <= MAX_ANCHORS:
+            raise ParameterError(f"{len(anchors)} anchors", where=where, valid=f"1 to {MAX_ANCHORS}")
+        self.anchors = tuple(anchors)
+        self.index: dict[int, int] = {}
+        for number, anchor in enumerate(self.anchors):
+            if anchor.id in self.index:
+                raise ParameterError(
+                    f"anchor {anchor.id} is there twice", where=where, valid="one entry for each"
+                )
+            self.index[anchor.id] = number
+        self.position: NDArray[np.float64] = np.array(
+            [anchor.position for anchor in self.anchors], np.float64
+        )
+        self.sd: NDArray[np.float64] = np.array([anchor.sd for anchor in self.anchors], np.float64)
+        self.position.setflags(write=False)
+        self.sd.setflags(write=False)
+
+    def __len__(self) -> int:
+        return len(self.anchors)
+
+    def moved(self, position: NDArray[np.float64], sd: NDArray[np.float64]) -> AnchorMap:
+        """The same anchors at other places: float64 (m, 3) and (m,)."""
+        return AnchorMap(
+            [
+                Anchor(anchor.id, (float(p[0]), float(p[1]), float(p[2])), float(s), anchor.name)
+                for anchor, p, s in zip(self.anchors, position, sd, strict=True)
+            ]
+        )
+
+
+def parse_anchors(text: str, where: str) -> AnchorMap:
+    """The anchors of a file's text.
+
+    Args:
+        text: YAML (so JSON too) as the module's text shows.
+        where: what to call the file in errors.
+
+    Raises:
+        ParameterError: it is no YAML, or not of that form; names entry and field.
+    """
+    if len(text) > MAX_TEXT:
+        raise ParameterError(f"{len(text)} characters", where=where, valid=f"{MAX_TEXT} at most")
+    try:
+        document = yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        first = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ParameterError(f"not YAML: {first}", where=where, valid=SCHEMA) from error
+    entries = document.get("anchors") if isinstance(document, dict) else None
+    if not isinstance(entries, list) or not isinstance(document, dict) or len(document) != 1:
+        raise ParameterError("not a list of anchors", where=where, valid=SCHEMA)
+    found = AnchorMap([_anchor(entry, f"{where}: entry {n}") for n, entry in enumerate(entries, 1)], where)
+    spread = np.ptp(found.position, axis=0).max() if len(found) > 1 else 0.0
+    if spread > MILLIMETRES and np.all(found.position == np.rint(found.position)):
+        raise ParameterError(
+            f"anchors {spread:g} m apart, all at whole numbers: these look like millimetres",
+            where=where,
+            valid="metres",
+        )
+    return found
+
+
+def dump_anchors(anchors: AnchorMap, comment: str = "") -> str:
+    """The text of an anchors file, which `parse_anchors` reads; `comment` goes ahead, a line a line."""
+    out = io.StringIO()
+    for line in comment.splitlines():
+        out.write(f"# {line}\n")
+    out.write("anchors:\n")
+    for anchor in anchors.anchors:
+        x, y, z = (round(value, 6) for value in anchor.position)
+        entry: dict[str, object] = {"id": anchor.id, "x": x, "y": y, "z": z, "sd": round(anchor.sd, 6)}
+        if anchor.name:
+            entry["name"] = anchor.name
+        out.write("  - " + yaml.safe_dump(entry, default_flow_style=True, sort_keys=False, width=1 << 16))
+    return out.getvalue()
+
+
+def _anchor(entry: Any, where: str) -> Anchor:
+    if not isinstance(entry, dict):
+        raise ParameterError(f"{entry!r:.60} is no anchor", where=where, valid=SCHEMA)
+    absent = [name for name in _NEEDED if name not in entry]
+    if absent:
+        raise ParameterError(f"the field {absent[0]} is missing", where=where, valid=", ".join(_FIELDS))
+    strange = [name for name in entry if name not in _FIELDS]
+    if strange:
+        raise ParameterError(
+            f"the field {strange[0]!r:.60} is unknown", where=where, valid=", ".join(_FIELDS)
+        )
+    x, y, z = (_number(entry, name, where, -MAX_COORDINATE_M, MAX_COORDINATE_M) for name in "xyz")
+    sd = _number(entry, "sd", where, 0.0, 100.0) if "sd" in entry else SD_M
+    name = entry.get("name", "")
+    if not isinstance(name, str) or len(name) > 100:
+        raise ParameterError(f"name = {name!r:.60}", where=where, valid="text of at most 100 characters")
+    return Anchor(_identity(entry["id"], where), (x, y, z), sd, name)
+
+
+def _identity(value: object, where: str) -> int:
+    if isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= _MAX_ID:
+        return value
+    raise ParameterError(
+        f"id = {value!r:.60}", where=where, valid="a whole number of 64 bits, such as 3 or 0x1f"
+    )
+
+
+def _number(entry: dict[str, Any], name: str, where: str, low: float, high: float) -> float:
+    value = entry[name]
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ParameterError(f"{name} = {value!r:.60}", where=where, valid="a number of metres")
+    if not (math.isfinite(value) and low <= value <= high):
+        hint = " (millimetres?)" if math.isfinite(value) and abs(value) > high else ""
+        raise ParameterError(f"{name} = {value!r:.60}{hint}", where=where, valid=f"{low:g} to {high:g} m")
+    return float(value)

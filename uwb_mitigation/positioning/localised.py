@@ -1,0 +1,296 @@
+"""Ranges beside a robot's own localisation: how far clocks and antenna are from it, and how long ranges truly were.
+
+A pose tells where the robot's frame is, not the antenna: that sits off it by a lever arm, in the robot's frame. And
+radio and localisation stamp by clocks and delays of their own. Both, and the offset of each pair, by robust least squares
+(Gauss-Newton) on the ranges themselves.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.errors import DatasetError
+from uwb_mitigation.positioning.anchors import AnchorMap
+from uwb_mitigation.positioning.model import Model
+from uwb_mitigation.positioning.tracks import Ranges
+
+GAP_S = 0.5
+"""In longer gaps of the localisation nothing is known of the pose."""
+
+MOST_LAG_S = 2.0
+LAGS_S = np.arange(-MOST_LAG_S, MOST_LAG_S + 0.01, 0.1)
+LAG_SD_S, LEVER_SD_M, OFFSET_SD_M = 2.0, 1.0, 2.0
+LEAST_RANGES = 40
+MOST_RANGES = 20_000
+"""Of more, so many are fitted to, spread evenly: none of these unknowns needs more."""
+
+SMALLEST_TURN_RAD = 0.5
+_STEPS = 40
+_MAD_TO_SD = 1.4826
+_PERSISTENCE_S = 1.0
+_SECOND_NS = 1_000_000_000
+_MODEL = Model(long=1.5, short=1.5)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PosePath:
+    """Where a robot's frame was: int64 (n,) stamps in order, float64 (n, 3) positions in m, and (n, 4) unit quaternions
+    x, y, z, w that turn the robot's axes into the map's."""
+
+    stamp_ns: NDArray[np.int64]
+    position: NDArray[np.float64]
+    orientation: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.stamp_ns)
+
+    def shifted(self, by_ns: int) -> PosePath:
+        """At stamps that much later."""
+        return PosePath(self.stamp_ns + by_ns, self.position, self.orientation)
+
+    @classmethod
+    def joined(cls, paths: Sequence[PosePath]) -> PosePath:
+        """All in the order of time."""
+        stamp_ns = np.concatenate([path.stamp_ns for path in paths])
+        order = np.argsort(stamp_ns, kind="stable")
+        return cls(
+            stamp_ns[order],
+            np.concatenate([path.position for path in paths])[order],
+            np.concatenate([path.orientation for path in paths])[order],
+        )
+
+    def at(
+        self, stamp_ns: NDArray[np.int64], later_s: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Positions (k, 3) and rotation matrices (k, 3, 3) at stamps + `later_s`; NaN outside, and in gaps over `GAP_S`.
+
+        Between two poses the quaternion is interpolated linearly and scaled to length 1: turns are small there.
+        """
+        own = (self.stamp_ns - self.stamp_ns[0]) / _SECOND_NS
+        wanted = (stamp_ns - self.stamp_ns[0]) / _SECOND_NS + later_s
+        after = np.clip(np.searchsorted(own, wanted), 1, len(own) - 1)
+        before = after - 1
+        span = own[after] - own[before]
+        part = (wanted - own[before]) / np.maximum(span, 1e-9)
+        outside = (part < -1e-9) | (part > 1.0 + 1e-9) | (span > GAP_S)
+        part = np.where(outside, np.nan, part)[:, None]
+        position = (1.0 - part) * self.position[before] + part * self.position[after]
+        first, second = self.orientation[before], self.orientation[after]
+        second = np.where(np.einsum("ni,ni->n", first, second)[:, None] < 0.0, -second, second)
+        turn = (1.0 - part) * first + part * second
+        return position, _matrices(turn / np.linalg.norm(turn, axis=1, keepdims=True))
+
+
+def _matrices(q: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rotation matrices (k, 3, 3) of unit quaternions (k, 4), x, y, z, w."""
+    x, y, z, w = q.T
+    return np.stack(
+        [
+            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], axis=1),
+            np.stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], axis=1),
+            np.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], axis=1),
+        ],
+        axis=1,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Localised:
+    """What was found.
+
+    Attributes:
+        time_offset_s, time_offset_sd_s: what to add to a range's stamp to have the localisation's; an sd of 0 = given.
+        lever_arm_m, lever_arm_sd_m: (3,), of the antenna in the robot's frame; sd 0 = given, NaN = not told.
+        pairs: (tag number, anchor row), and `offset_m`, `offset_sd_m` of each.
+        position: float64 (r, 3), of the antenna at each of all ranges; NaN = not known. distance_m: (r,), to the anchor.
+        scale_m: of what is left of ranges that are no outliers.
+    """
+
+    time_offset_s: float
+    time_offset_sd_s: float
+    lever_arm_m: NDArray[np.float64]
+    lever_arm_sd_m: NDArray[np.float64]
+    pairs: tuple[tuple[int, int], ...]
+    offset_m: NDArray[np.float64]
+    offset_sd_m: NDArray[np.float64]
+    position: NDArray[np.float64]
+    distance_m: NDArray[np.float64]
+    scale_m: float
+
+    def pair(self, tag: int, row: int, anchor_sd_m: float) -> tuple[float, float]:
+        """The offset of a pair, m, and its deviation, which an anchor that is misplaced adds to."""
+        at = self.pairs.index((tag, row))
+        return float(self.offset_m[at]), math.hypot(float(self.offset_sd_m[at]), anchor_sd_m / math.sqrt(2.0))
+
+    def as_json(self) -> dict[str, object]:
+        """Numbers; null = not told."""
+        sds = [None if math.isnan(sd) else sd for sd in self.lever_arm_sd_m.tolist()]
+        return {
+            "time_offset_s": self.time_offset_s,
+            "time_offset_sd_s": self.time_offset_sd_s,
+            "lever_arm_m": self.lever_arm_m.tolist(),
+            "lever_arm_sd_m": sds,
+        }
+
+
+def solve_localised(
+    anchors: AnchorMap,
+    tags: Sequence[Ranges],
+    path: PosePath,
+    expected_m: NDArray[np.float64],
+    *,
+    time_offset_s: float | None = None,
+    lever_arm_m: tuple[float, float, float] | None = None,
+) -> Localised:
+    """Time offset, lever arm and offsets.
+
+    Args:
+        path: of the robot that carries all the tags.
+        expected_m: float64 (r,), what is to be taken off the ranges, one tag after the other.
+        time_offset_s, lever_arm_m: where known.
+
+    Raises:
+        DatasetError: too few ranges lie within the localisation's times, or it does not move.
+    """
+    stamp = np.concatenate([one.stamp_ns for one in tags])
+    row = np.concatenate([one.anchor for one in tags])
+    value = np.concatenate([one.range_m for one in tags]) - expected_m
+    tag = np.repeat(np.arange(len(tags)), list(map(len, tags)))
+    if len(path) < 2:
+        raise DatasetError(f"{len(path)} poses of the localisation", valid="two or more")
+    pairs, of_pair = np.unique(np.stack([tag, row]), axis=1, return_inverse=True)
+    of_pair = of_pair.reshape(-1)
+    chosen = np.arange(len(stamp))
+    if len(chosen) > MOST_RANGES:
+        chosen = np.sort(np.random.default_rng(1).choice(chosen, MOST_RANGES, replace=False))
+    fitted = _Fit(
+        anchors.position[row[chosen]], stamp[chosen], value[chosen], of_pair[chosen], pairs.shape[1], path
+    )
+    lever = np.zeros(3) if lever_arm_m is None else np.array(lever_arm_m, float)
+    lag = fitted.likely_lag(lever) if time_offset_s is None else time_offset_s
+    unknown = fitted.solve(lag, lever, time_offset_s is None, lever_arm_m is None)
+    position, turn = path.at(stamp, unknown.lag)
+    antenna = position + turn @ unknown.lever
+    distance = np.linalg.norm(antenna - anchors.position[row], axis=1)
+    if int(np.isfinite(distance).sum()) < LEAST_RANGES:
+        raise DatasetError(
+            f"{int(np.isfinite(distance).sum())} ranges lie within the localisation's times",
+            valid=f"{LEAST_RANGES} or more: do their clocks agree to {MOST_LAG_S:g} s?",
+        )
+    sd = np.sqrt(np.diag(unknown.covariance))
+    return Localised(
+        unknown.lag,
+        float(sd[0]) if time_offset_s is None else 0.0,
+        unknown.lever,
+        np.where(unknown.told, sd[1:4], np.nan) if lever_arm_m is None else np.zeros(3),
+        tuple((int(a), int(b)) for a, b in pairs.T),
+        unknown.offset,
+        sd[4:],
+        antenna,
+        distance,
+        unknown.scale,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Unknowns:
+    lag: float
+    lever: NDArray[np.float64]
+    offset: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    told: NDArray[np.bool_]
+    scale: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fit:
+    """n ranges (n,) to anchors (n, 3), of `count` pairs."""
+
+    anchor: NDArray[np.float64]
+    stamp_ns: NDArray[np.int64]
+    range_m: NDArray[np.float64]
+    pair: NDArray[np.intp]
+    count: int
+    path: PosePath
+
+    def likely_lag(self, lever: NDArray[np.float64]) -> float:
+        """The one of `LAGS_S` with which ranges agree best, each pair's median error taken off."""
+        spread = []
+        for lag in LAGS_S.tolist():
+            error = self._errors(lag, lever)[0]
+            left = np.abs(error - self._medians(error)[self.pair])
+            spread.append(float(np.nanmedian(left)) if np.isfinite(left).sum() >= LEAST_RANGES else np.inf)
+        if not np.isfinite(min(spread)):
+            raise DatasetError(
+                "hardly any range lies within the localisation's times",
+                valid=f"clocks that agree to {MOST_LAG_S:g} s, or --time-offset",
+            )
+        return float(LAGS_S[int(np.argmin(spread))])
+
+    def _medians(self, error: NDArray[np.float64]) -> NDArray[np.float64]:
+        found = np.zeros(self.count)
+        for pair in range(self.count):
+            own = error[self.pair == pair]
+            found[pair] = np.nanmedian(own) if np.isfinite(own).any() else 0.0
+        return found
+
+    def _errors(
+        self, lag: float, lever: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Range less distance (n,), unit vectors (n, 3) from anchor to antenna, rotations (n, 3, 3)."""
+        position, turn = self.path.at(self.stamp_ns, lag)
+        away = position + turn @ lever - self.anchor
+        distance = np.maximum(np.linalg.norm(away, axis=1), 0.05)
+        return self.range_m - distance, away / distance[:, None], turn
+
+    def solve(self, lag: float, lever: NDArray[np.float64], free_lag: bool, free_lever: bool) -> _Unknowns:
+        size = 4 + self.count
+        certainty = 1.0 / np.array(
+            [
+                LAG_SD_S**2 if free_lag else 1e-18,
+                *[LEVER_SD_M**2 if free_lever else 1e-18] * 3,
+                *[OFFSET_SD_M**2] * self.count,
+            ]
+        )
+        mean = np.array([lag, *lever, *np.zeros(self.count)])
+        if free_lag:
+            mean[0] = 0.0
+        x = np.array([lag, *lever, *self._medians(self._errors(lag, lever)[0])])
+        # Ranges of a pair err alike for a second: so many are new (see `joint`).
+        seconds = max(float(self.stamp_ns.max() - self.stamp_ns.min()) / _SECOND_NS, 1.0)
+        count = np.maximum(np.bincount(self.pair, minlength=self.count), 1)
+        share = np.minimum(1.0, seconds / (2.0 * _PERSISTENCE_S) / count)[self.pair]
+        scale, covariance = 0.1, np.eye(size)
+        for step_number in range(_STEPS):
+            error, unit, turn = self._errors(x[0], x[1:4])
+            step_s = 0.05
+            beside = self._errors(x[0] + step_s, x[1:4])[0]
+            before = self._errors(x[0] - step_s, x[1:4])[0]
+            rows = np.zeros((len(error), size))
+            rows[:, 0] = (before - beside) / (2.0 * step_s)
+            rows[:, 1:4] = np.einsum("ni,nij->nj", unit, turn)
+            rows[np.arange(len(error)), 4 + self.pair] = 1.0
+            left = error - x[4:][self.pair]
+            known = np.isfinite(left) & np.isfinite(rows).all(axis=1)
+            if int(known.sum()) < LEAST_RANGES:
+                raise DatasetError(
+                    f"{int(known.sum())} ranges lie within the localisation's times",
+                    valid=f"{LEAST_RANGES} or more: do their clocks agree to {MOST_LAG_S:g} s?",
+                )
+            rows, left = rows[known], left[known]
+            scale = max(_MAD_TO_SD * float(np.median(np.abs(left))), 0.01)
+            weight = _MODEL.weight(left / scale) * share[known] / scale**2
+            normal = rows.T @ (weight[:, None] * rows) + np.diag(certainty)
+            covariance = np.linalg.inv(normal)
+            move = covariance @ (rows.T @ (weight * left) + certainty * (mean - x))
+            move[0] = np.clip(move[0], -0.3, 0.3)
+            x = x + move
+            if float(np.abs(move).max()) < 1e-5 and step_number > 3:
+                break
+        told = np.sqrt(np.diag(covariance)[1:4]) < 0.3 * LEVER_SD_M
+        return _Unknowns(float(x[0]), x[1:4].copy(), x[4:].copy(), covariance, told, scale)

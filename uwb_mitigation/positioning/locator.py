@@ -1,0 +1,440 @@
+"""One tag from its first range on: finds its place, follows it, notices when it is lost, and finds it again.
+
+While more than one place explains the ranges, each is followed by a filter of its own, and nothing is told.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.positioning.anchors import AnchorMap
+from uwb_mitigation.positioning.filter import FIRST_ERROR, RangeFilter
+from uwb_mitigation.positioning.geometry import Geometry, geometry
+from uwb_mitigation.positioning.model import Model
+from uwb_mitigation.positioning.start import IMPLAUSIBLE, Area, Height, Place, places
+from uwb_mitigation.positioning.tracks import Estimate, Ranges, Track
+
+WINDOW_S = 1.0
+"""A place is sought from the ranges of so long: every anchor has had its turn, and a robot is a metre on."""
+
+SILENCE_S = 3.0
+"""After a longer silence of all anchors the place is sought anew: a line through the old one may mislead."""
+
+STRANGE = 3.0
+"""A range with a larger normalised innovation disagrees with the filter."""
+
+DISAGREES = 1.5
+"""An anchor whose normalised innovations have such a mean disagrees: what persists for a second averages out."""
+
+_KEPT_RANGES = 400
+_MOST_PLACES = 12
+_RETRY_S = 0.25
+_LEARN_SPARE = 2
+_NANOSECONDS = 1_000_000_000
+
+
+@dataclass(slots=True)
+class AnchorState:
+    """What the latest ranges of one anchor said.
+
+    Attributes:
+        ranges: how many in all.
+        heard_s: time of the latest; -inf = never.
+        z: its normalised innovation.
+        strange: share of the latest ranges (some twenty) that disagreed.
+        mean_z: running mean of the normalised innovation over some fifty ranges, each at most 5.
+    """
+
+    ranges: int = 0
+    heard_s: float = -math.inf
+    z: float = 0.0
+    strange: float = 0.0
+    mean_z: float = 0.0
+
+
+@dataclass(slots=True)
+class _Candidate:
+    filter: RangeFilter
+    loss: float
+
+
+@dataclass(slots=True)
+class TagCounts:
+    """What befell a tag: ranges that were skipped since they ran backwards, times it was found, lost, silent."""
+
+    backwards: int = 0
+    found: int = 0
+    lost: int = 0
+    silent: int = 0
+
+
+@dataclass(slots=True)
+class InnovationMeans:
+    """Running means over some hundred ranges: of the normalised innovation, and of its square (1 is ideal)."""
+
+    mean: float = 0.0
+    square: float = 1.0
+
+    def add(self, z: float) -> None:
+        z = max(-10.0, min(10.0, z))
+        self.mean += 0.01 * (z - self.mean)
+        self.square += 0.01 * (z * z - self.square)
+
+
+@dataclass(slots=True)
+class _Heard:
+    time_s: float
+    anchor: int
+    range_m: float
+    variance_m2: float
+
+
+class TagLocator:
+    """Args:
+        anchors, model: as of the filter.
+        height: of the tag, where it stays the same.
+        area: where the tag can be; None = wherever the ranges reach.
+
+    Attributes:
+        anchors: as given.
+        states: of each anchor.
+        counts, health: what happened so far.
+        candidates: how many places are plausible; 1 = the tag is followed, 0 = too little is known.
+    """
+
+    def __init__(
+        self,
+        anchors: AnchorMap,
+        model: Model | None = None,
+        *,
+        height: Height | None = None,
+        area: Area | None = None,
+    ) -> None:
+        self.anchors = anchors
+        self.states = [AnchorState() for _ in range(len(anchors))]
+        self.counts = TagCounts()
+        self.health = InnovationMeans()
+        self._model = model or Model()
+        self._height = height
+        self._area = area
+        self._filter: RangeFilter | None = None
+        self._last_known: RangeFilter | None = None
+        self._candidates: list[_Candidate] = []
+        self._recent: deque[_Heard] = deque(maxlen=_KEPT_RANGES)
+        self._origin_ns: int | None = None
+        self._time_s = -math.inf
+        self._next_try_s = -math.inf
+        self._checked_s = -math.inf
+        self._sought_since_s = -math.inf
+
+    @property
+    def candidates(self) -> int:
+        return 1 if self._filter is not None else len(self._candidates)
+
+    @property
+    def following(self) -> bool:
+        """Whether the tag has one place."""
+        return self._filter is not None
+
+    @property
+    def filter(self) -> RangeFilter | None:
+        """The filter that follows the tag; None while its place is sought."""
+        return self._filter
+
+    def add(
+        self, stamp_ns: int, anchor: int, range_m: float, variance_m2: float = math.nan
+    ) -> Estimate | None:
+        """Take in a range.
+
+        Args:
+            stamp_ns: of the range; one up to `WINDOW_S` older than the latest is taken as if it came with that.
+            anchor: a row of the anchors.
+            range_m: m; one that is not finite or negative is skipped.
+            variance_m2: m^2; NaN = unknown. An infinite one is skipped.
+
+        Returns:
+            Where the tag is now; None while that is not known.
+        """
+        if not (math.isfinite(range_m) and range_m >= 0.0) or variance_m2 == math.inf:
+            return None
+        time_s = self._seconds(stamp_ns)
+        if time_s < self._time_s:
+            if time_s < self._time_s - WINDOW_S:
+                # A replay that starts again: what was known belongs to another time.
+                self.restart(stamp_ns)
+                time_s = 0.0
+            else:
+                self.counts.backwards += 1
+                time_s = self._time_s
+        if self._filter is not None and time_s - self._time_s > SILENCE_S:
+            self.counts.silent += 1
+            self._seek(time_s)
+        self._time_s = time_s
+        self._recent.append(_Heard(time_s, anchor, range_m, variance_m2))
+        state = self.states[anchor]
+        state.ranges += 1
+        state.heard_s = time_s
+        if self._filter is None:
+            self._search(time_s, anchor, range_m, variance_m2)
+        else:
+            self._follow(self._filter, time_s, anchor, range_m, variance_m2)
+        return self._estimate(stamp_ns) if self._filter is not None else None
+
+    def add_height(self, height_m: float, variance_m2: float) -> None:
+        """Take in the tag's height, at the time of the latest range."""
+        for one in self._filters():
+            one.update_height(height_m, variance_m2)
+
+    def add_speed(self, speed_m_per_s: float, variance_m2: float) -> None:
+        """Take in the tag's horizontal speed, at the time of the latest range."""
+        for one in self._filters():
+            one.update_speed(speed_m_per_s, variance_m2)
+
+    def at(self, stamp_ns: int) -> Estimate | None:
+        """Where the tag is at a time from the latest range on, without another range; None = not known.
+
+        While its place is sought after a silence, that is where the last known motion leads.
+        """
+        known = self._filter
+        if known is None:
+            return None
+        ahead = known.copy()
+        ahead.predict(self._seconds(stamp_ns))
+        return _as_estimate(ahead, stamp_ns)
+
+    def restart(self, stamp_ns: int | None = None) -> None:
+        """Forget the place, not the counts."""
+        self._origin_ns = stamp_ns
+        self._filter = self._last_known = None
+        self._candidates = []
+        self._recent.clear()
+        self._time_s = self._next_try_s = self._checked_s = self._sought_since_s = -math.inf
+        for state in self.states:
+            state.heard_s, state.strange = -math.inf, 0.0
+
+    def heard(self, within_s: float = WINDOW_S) -> list[int]:
+        """Rows of the anchors that were heard within so long before the latest range."""
+        return [i for i, s in enumerate(self.states) if s.heard_s >= self._time_s - within_s]
+
+    def disagreeing(self) -> list[int]:
+        """Rows of anchors whose ranges disagree with those of most others."""
+        heard = self.heard(5.0)
+        odd = [i for i in heard if abs(self.states[i].mean_z) > DISAGREES]
+        return odd if 2 * len(odd) < len(heard) else []
+
+    def geometry(self) -> Geometry | None:
+        """How the anchors heard now lie as seen from the tag; None while its place is not known."""
+        if self._filter is None:
+            return None
+        rows = self.heard()
+        return geometry(self.anchors.position[rows], self._filter.position, level=self._height is not None)
+
+    def _seconds(self, stamp_ns: int) -> float:
+        if self._origin_ns is None:
+            self._origin_ns = stamp_ns
+        return (stamp_ns - self._origin_ns) / _NANOSECONDS
+
+    def _filters(self) -> list[RangeFilter]:
+        return [self._filter] if self._filter is not None else [c.filter for c in self._candidates]
+
+    def _estimate(self, stamp_ns: int) -> Estimate | None:
+        return _as_estimate(self._filter, stamp_ns) if self._filter is not None else None
+
+    def _follow(
+        self, known: RangeFilter, time_s: float, anchor: int, range_m: float, variance_m2: float
+    ) -> None:
+        known.predict(time_s)
+        z, _ = known.update(anchor, range_m, variance_m2)
+        self.health.add(z)
+        state = self.states[anchor]
+        state.z = z
+        state.strange += 0.1 * ((abs(z) > STRANGE) - state.strange)
+        state.mean_z += 0.02 * (max(-5.0, min(5.0, z)) - state.mean_z)
+        if time_s - self._checked_s >= _RETRY_S:
+            self._checked_s = time_s
+            heard = self.heard()
+            known.learns = len(heard) >= self._dims + _LEARN_SPARE
+            odd = sum(self.states[i].strange > 0.5 for i in heard)
+            if 2 * odd >= len(heard) > 0 and odd:
+                self._doubt(known)
+
+    @property
+    def _dims(self) -> int:
+        return 2 if self._height is not None else 3
+
+    def _doubt(self, known: RangeFilter) -> None:
+        """Most anchors disagree: is there a place that explains their ranges much better?"""
+        found = self._places()
+        if not found:
+            return
+        anchors, range_m, sd_m = self._window()
+        here = np.linalg.norm(anchors - known.position, axis=1)
+        loss = float(self._model.loss((range_m - here) / sd_m).sum())
+        best = found[0]
+        apart = best.position[:2] - known.position[:2]
+        if loss > best.loss + IMPLAUSIBLE and apart @ apart > 9.0 * known.horizontal_sd**2:
+            self.counts.lost += 1
+            self._last_known = None
+            self._filter = None
+            self._start(found, self._time_s)
+            self._settle()
+
+    def _seek(self, time_s: float) -> None:
+        """Give up the place, but remember it."""
+        self._last_known = self._filter
+        self._filter = None
+        self._candidates = []
+        self._recent.clear()
+        self._sought_since_s = time_s
+        self._next_try_s = -math.inf
+
+    def _search(self, time_s: float, anchor: int, range_m: float, variance_m2: float) -> None:
+        if self._sought_since_s == -math.inf:
+            self._sought_since_s = time_s
+        if self._candidates:
+            for candidate in self._candidates:
+                candidate.filter.predict(time_s)
+                z, sd = candidate.filter.update(anchor, range_m, variance_m2)
+                candidate.loss += float(self._model.loss(np.float64(z))) + math.log(sd)
+            self._settle()
+            return
+        if time_s < self._next_try_s:
+            return
+        self._next_try_s = time_s + _RETRY_S
+        # Every anchor in reach has its turn first, unless enough have spoken.
+        if time_s - self._sought_since_s < WINDOW_S / 2 and len(self.heard()) < self._dims + _LEARN_SPARE:
+            return
+        found = self._places()
+        if found and len(found) <= _MOST_PLACES:
+            self._start(found, time_s)
+            self._settle()
+
+    def _settle(self) -> None:
+        """Drop places that became implausible or fell together; follow the one that is left."""
+        best = min(candidate.loss for candidate in self._candidates)
+        kept: list[_Candidate] = []
+        for candidate in sorted(self._candidates, key=lambda c: c.loss):
+            if candidate.loss > best + IMPLAUSIBLE or not self._possible(candidate.filter):
+                continue
+            if all(np.linalg.norm(candidate.filter.position - other.filter.position) > 0.3 for other in kept):
+                kept.append(candidate)
+        self._candidates = kept
+        if not kept:
+            self._sought_since_s = self._time_s
+        elif len(kept) == 1:
+            self._filter = kept[0].filter
+            self._last_known = None
+            self._candidates = []
+            self.counts.found += 1
+            self._checked_s = self._time_s + WINDOW_S
+            for state in self.states:
+                state.strange = 0.0
+        elif self._time_s - self._sought_since_s > 10.0 * WINDOW_S:
+            # What seemed a place from one second's ranges may have been none: look again with new ones.
+            self._sought_since_s = self._time_s
+            self._candidates = []
+
+    def _possible(self, one: RangeFilter) -> bool:
+        return self._area is None or bool(self._area.holds(one.position))
+
+    def _window(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Anchors' positions (k, 3), median ranges (k,) and their deviations (k,) of the last second."""
+        by_anchor: dict[int, list[_Heard]] = {}
+        for heard in self._recent:
+            if heard.time_s >= self._time_s - WINDOW_S:
+                by_anchor.setdefault(heard.anchor, []).append(heard)
+        self._rows = list(by_anchor)
+        ranges, sds = [], []
+        for row, group in by_anchor.items():
+            ranges.append(float(np.median([heard.range_m for heard in group])))
+            variance = float(np.median([self._model.variance(heard.variance_m2) for heard in group]))
+            age = self._time_s - float(np.mean([heard.time_s for heard in group]))
+            spread = variance + self.anchors.sd[row] ** 2 + (self._model.speed * age) ** 2 / 3.0
+            sds.append(math.sqrt(spread))
+        return self.anchors.position[self._rows], np.array(ranges), np.array(sds)
+
+    def _places(self) -> list[Place]:
+        anchors, range_m, sd_m = self._window()
+        if len(range_m) < self._dims:
+            return []
+        return places(anchors, range_m, sd_m, self._model, height=self._height, area=self._area)
+
+    def _start(self, found: list[Place], time_s: float) -> None:
+        """A filter at each place; what the pairs' errors did to the place is kept as their correlation."""
+        self._candidates = []
+        model = self._model
+        for place in found:
+            covariance = place.covariance.copy()
+            offset = place.gain.sum(axis=1)
+            covariance += np.multiply.outer(offset, offset) * model.offset_sd**2
+            # The tag has moved on since the middle of the window.
+            covariance[[0, 1, 2], [0, 1, 2]] += (model.speed * WINDOW_S / 2.0) ** 2
+            position = place.position.copy()
+            if self._height is not None:
+                position[2] = self._height.value
+                covariance[2] = covariance[:, 2] = 0.0
+                covariance[2, 2] = self._height.sd**2
+            one = RangeFilter(
+                self.anchors, model, time_s, position, covariance, level=self._height is not None
+            )
+            for row, effect in zip(self._rows, place.gain.T, strict=True):
+                cross = effect * one.p[FIRST_ERROR + row, FIRST_ERROR + row]
+                one.p[:3, FIRST_ERROR + row] = cross
+                one.p[FIRST_ERROR + row, :3] = cross
+            one.p[:3, FIRST_ERROR - 1] = offset * model.offset_sd**2
+            one.p[FIRST_ERROR - 1, :3] = one.p[:3, FIRST_ERROR - 1]
+            if self._height is not None:
+                one.p[2, 3:] = 0.0
+                one.p[3:, 2] = 0.0
+            self._candidates.append(_Candidate(one, place.loss + self._surprise(place, time_s)))
+
+    def _surprise(self, place: Place, time_s: float) -> float:
+        """How unlikely a place is after where the tag was last known to be."""
+        if self._last_known is None:
+            return 0.0
+        before = self._last_known.copy()
+        before.predict(time_s)
+        apart = place.position[:2] - before.position[:2]
+        spread = before.p[:2, :2] + place.covariance[:2, :2]
+        # Bounded: a tag that was carried away is found all the same.
+        return min(IMPLAUSIBLE, 0.5 * float(apart @ np.linalg.solve(spread, apart)))
+
+
+def _as_estimate(known: RangeFilter, stamp_ns: int) -> Estimate:
+    return Estimate(stamp_ns, known.x[:3].copy(), known.x[3:6].copy(), known.p[:6, :6].copy())
+
+
+@dataclass(slots=True)
+class LiveRun:
+    """A recording as the live locator would have told it.
+
+    Attributes:
+        track: an estimate for each range from which one came.
+        locator: as it was at the end.
+    """
+
+    track: Track
+    locator: TagLocator
+    estimates: list[Estimate] = field(default_factory=list)
+
+
+def run_live(ranges: Ranges, locator: TagLocator) -> LiveRun:
+    """Feed recorded ranges to a locator."""
+    estimates: list[Estimate] = []
+    columns = zip(
+        ranges.stamp_ns.tolist(),
+        ranges.anchor.tolist(),
+        ranges.range_m.tolist(),
+        ranges.variance_m2.tolist(),
+        strict=True,
+    )
+    for stamp_ns, anchor, range_m, variance_m2 in columns:
+        estimate = locator.add(stamp_ns, anchor, range_m, variance_m2)
+        if estimate is not None:
+            estimates.append(estimate)
+    return LiveRun(Track.of(estimates), locator)

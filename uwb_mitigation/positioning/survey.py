@@ -1,0 +1,231 @@
+"""Where the anchors are, from the ranges of a tag that moves among them and rough guesses.
+
+Track and anchors are found together. Ranges alone say nothing of where the whole lies or how it is turned: that
+comes from the guesses, or from anchors that are held. Swapped anchors are tried first: a swap is further than a
+descent from the guesses can go.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.errors import DatasetError
+from uwb_mitigation.positioning.anchors import AnchorMap
+from uwb_mitigation.positioning.geometry import Shape, shape
+from uwb_mitigation.positioning.locator import TagLocator, run_live
+from uwb_mitigation.positioning.model import Model
+from uwb_mitigation.positioning.smoother import Smoother
+from uwb_mitigation.positioning.start import Area, Height
+from uwb_mitigation.positioning.tracks import Ranges, Track
+
+MISPLACED_M = 0.3
+"""An anchor that far from where it should be is misplaced, if that is also `_UNLIKELY` of its deviations."""
+
+_UNLIKELY = 2.2
+"""In a plane an error exceeds so many root mean squares once in 126 times: exp(-2.2^2)."""
+
+TAPE_M = 0.1
+"""How well a height that was measured is known."""
+
+_STEPS_M = (1.0, 0.5, 0.25, 0.0)
+"""Ranges are trusted in steps: at first a metre off is nothing strange."""
+
+UNEXPLAINED = 0.6
+"""In real drives it was 0.7 and more wherever anchors were not found, and wherever a pair was called swapped that was not."""
+
+_TRIAL_NS = 60_000_000_000
+_TRIAL_RANGES = 800
+_SWAP_GAIN = 0.15
+"""A swap that is right lowers the mean loss by far more, one that is wrong raises it."""
+
+_MOVES_M = 1.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SurveyResult:
+    """Attributes:
+    anchors: where they were found, with deviations.
+    moved_m: float64 (m,), how far from the guesses, the whole laid onto them as well as it fits.
+    misplaced: rows of anchors too far from their guesses.
+    swapped: pairs of rows that stand in each other's places.
+    track: of the tag.
+    loss: mean robust loss of a range; below about 0.5 the anchors explain the ranges.
+    explained: whether it is below `UNEXPLAINED`: else the anchors may be anywhere.
+    """
+
+    anchors: AnchorMap
+    moved_m: NDArray[np.float64]
+    misplaced: list[int]
+    swapped: list[tuple[int, int]]
+    track: Track
+    loss: float
+
+    @property
+    def explained(self) -> bool:
+        return self.loss < UNEXPLAINED
+
+
+def survey(
+    guesses: AnchorMap,
+    ranges: Ranges,
+    *,
+    off_m: float = 1.0,
+    fixed: frozenset[int] = frozenset(),
+    height: Height | None = None,
+    area: Area | None = None,
+    model: Model | None = None,
+) -> SurveyResult:
+    """Find the anchors.
+
+    Args:
+        guesses: where they may be.
+        ranges: of one tag that moves.
+        off_m: how far guesses may be off (standard deviation of each coordinate). With a `height`, that of
+            anchors is taken as off by no more than `TAPE_M`: a level drive hardly tells it, a tape does.
+        fixed: rows of anchors that are known as well as their own deviations say.
+        height, area, model: as of `TagLocator`.
+
+    Raises:
+        DatasetError: too few anchors, all on a line, or a tag that hardly moves; says which.
+    """
+    model = model or Model()
+    used = np.unique(ranges.anchor)
+    needed = 3 if height is not None else 4
+    if len(used) < needed:
+        raise DatasetError(f"{len(used)} anchors were heard", valid=f"{needed} or more for a survey")
+    if shape(guesses.position[used]) is Shape.LINE:
+        raise DatasetError("the anchors are all on a line", valid="one or more beside it")
+    order, swapped = _unswap(guesses, ranges, off_m, height, area, model)
+    start = guesses.moved(guesses.position[order], _deviations(guesses, off_m, fixed))
+    track = _first_track(start, ranges, height, area, model)
+    spread = np.ptp(track.position[:, :2], axis=0)
+    if float(np.hypot(*spread)) < _MOVES_M:
+        raise DatasetError(
+            f"the tag moves by {np.hypot(*spread):.1f} m only", valid=f"{_MOVES_M:g} m or more"
+        )
+    known = start
+    around = np.repeat(start.sd[:, None], 3, axis=1)
+    if height is not None:
+        around[:, 2] = np.minimum(around[:, 2], TAPE_M)
+    fit = None
+    for step in _STEPS_M:
+        variance = np.where(np.isfinite(ranges.variance_m2), ranges.variance_m2, model.range_sd**2)
+        trusted = Ranges(
+            ranges.stamp_ns,
+            ranges.anchor,
+            ranges.range_m,
+            np.maximum(variance, step**2),
+            ranges.rx_power_dbm,
+            ranges.tag_id,
+        )
+        fit = Smoother(
+            known, model, trusted, height=height, find_anchors=True, around=(start.position, around)
+        ).fit(track)
+        track = fit.track
+        known = known.moved(fit.anchors, start.sd)
+    assert fit is not None
+    sd = np.sqrt(np.einsum("ijij->i", fit.anchor_covariance) / 3.0)
+    found = guesses.moved(fit.anchors, np.maximum(sd, 1e-3))
+    moved = displacements(fit.anchors[used], guesses.position[used])
+    distance = np.zeros(len(guesses))
+    # A level drive tells heights badly, and they were taken as measured.
+    axes = slice(0, 2) if height is not None else slice(0, 3)
+    distance[used] = np.linalg.norm(moved[:, axes], axis=1)
+    relative = np.linalg.norm(_relative_sd(fit.anchors, fit.anchor_covariance)[:, axes], axis=1)
+    odd = [int(row) for row in used if distance[row] > max(MISPLACED_M, _UNLIKELY * relative[row])]
+    expected = np.where(np.isfinite(ranges.variance_m2), ranges.variance_m2, model.range_sd**2)
+    loss = float(model.loss(fit.residual_m / np.sqrt(expected)).mean())
+    return SurveyResult(found, distance, odd, swapped, track, loss)
+
+
+def displacements(found: NDArray[np.float64], guessed: NDArray[np.float64]) -> NDArray[np.float64]:
+    """By how much each anchor (m, 3) is off its guess once the whole was laid onto the guesses.
+
+    Shifted, and turned about the vertical, by robust least squares: one anchor that is off does not carry the
+    others with it.
+    """
+    weight = np.ones(len(found))
+    off = found - guessed
+    for _ in range(30):
+        total = weight.sum()
+        a, b = (weight @ found) / total, (weight @ guessed) / total
+        p, q = found - a, guessed - b
+        cross = weight @ (p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0])
+        along = weight @ (p[:, 0] * q[:, 0] + p[:, 1] * q[:, 1])
+        angle = np.arctan2(cross, along)
+        c, s = np.cos(angle), np.sin(angle)
+        turned = p @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        off = turned - q
+        weight = 1.0 / np.maximum(np.linalg.norm(off, axis=1), 0.02)
+    return off
+
+
+def _relative_sd(position: NDArray[np.float64], covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Deviations (m, 3) of anchors (m, 3) with a covariance (m, 3, m, 3), where a shift or turn of the whole is none."""
+    m = len(position)
+    whole = np.zeros((m, 3, 4))
+    whole[:, [0, 1, 2], [0, 1, 2]] = 1.0
+    centred = position - position.mean(axis=0)
+    whole[:, 0, 3], whole[:, 1, 3] = -centred[:, 1], centred[:, 0]
+    basis, _ = np.linalg.qr(whole.reshape(3 * m, 4))
+    left = np.eye(3 * m) - basis @ basis.T
+    spread = np.diag(left @ covariance.reshape(3 * m, 3 * m) @ left).reshape(m, 3)
+    sd: NDArray[np.float64] = np.sqrt(spread)
+    return sd
+
+
+def _deviations(guesses: AnchorMap, off_m: float, fixed: frozenset[int]) -> NDArray[np.float64]:
+    return np.array([sd if row in fixed else max(off_m, sd) for row, sd in enumerate(guesses.sd.tolist())])
+
+
+def _first_track(
+    anchors: AnchorMap, ranges: Ranges, height: Height | None, area: Area | None, model: Model
+) -> Track:
+    track = run_live(ranges, TagLocator(anchors, model, height=height, area=area)).track
+    if len(track) < 2:
+        raise DatasetError(
+            "no place of the tag can be told",
+            valid="better guesses, an area, or a height; four anchors or more",
+        )
+    return track
+
+
+def _unswap(
+    guesses: AnchorMap,
+    ranges: Ranges,
+    off_m: float,
+    height: Height | None,
+    area: Area | None,
+    model: Model,
+) -> tuple[list[int], list[tuple[int, int]]]:
+    """The order of guesses that explains the first minute best, of all with one pair swapped; and that pair."""
+    trial = ranges.take(ranges.stamp_ns < ranges.stamp_ns[0] + _TRIAL_NS)
+    if len(trial) > _TRIAL_RANGES:
+        # Chosen by chance: every so-manieth might always be of the same anchor.
+        chosen = np.random.default_rng(1).choice(len(trial), _TRIAL_RANGES, replace=False)
+        trial = trial.take(np.sort(chosen))
+    rows = [int(row) for row in np.unique(trial.anchor)]
+    identity = list(range(len(guesses)))
+
+    def loss(order: list[int]) -> float:
+        anchors = guesses.moved(guesses.position[order], np.full(len(guesses), off_m))
+        track = run_live(trial, TagLocator(anchors, model, height=height, area=area)).track
+        if len(track) < 2:
+            return np.inf
+        fit = Smoother(anchors, model, trial, height=height).fit(track, iterations=4)
+        return float(model.loss(fit.residual_m / np.sqrt(off_m**2 / 4.0 + model.range_sd**2)).mean())
+
+    best, order, swapped = loss(identity), identity, list[tuple[int, int]]()
+    if best < _SWAP_GAIN:
+        return order, swapped
+    for a, b in itertools.combinations(rows, 2):
+        trial_order = identity.copy()
+        trial_order[a], trial_order[b] = b, a
+        found = loss(trial_order)
+        if found < best - _SWAP_GAIN:
+            best, order, swapped = found, trial_order, [(a, b)]
+    return order, swapped

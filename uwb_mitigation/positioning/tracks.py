@@ -1,0 +1,115 @@
+"""What goes into estimation and what comes out: ranges in columns, single fixes, and whole tracks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ranges:
+    """n ranges of one tag, in the order of their times.
+
+    Attributes:
+        stamp_ns: int64 (n,).
+        anchor: int (n,), rows of an `AnchorMap`.
+        range_m: float64 (n,), finite.
+        variance_m2: float64 (n,); NaN = unknown.
+        rx_power_dbm: float64 (n,); NaN = unknown.
+        tag_id: of all of them.
+    """
+
+    stamp_ns: NDArray[np.int64]
+    anchor: NDArray[np.intp]
+    range_m: NDArray[np.float64]
+    variance_m2: NDArray[np.float64]
+    rx_power_dbm: NDArray[np.float64]
+    tag_id: int = 0
+
+    def __len__(self) -> int:
+        return len(self.stamp_ns)
+
+    def take(self, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> Ranges:
+        """The ranges at `index`."""
+        return Ranges(
+            self.stamp_ns[index],
+            self.anchor[index],
+            self.range_m[index],
+            self.variance_m2[index],
+            self.rx_power_dbm[index],
+            self.tag_id,
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """Where a tag is at one time.
+
+    Attributes:
+        stamp_ns: of the estimate.
+        position, velocity: float64 (3,), m and m/s, in the anchors' frame.
+        covariance: float64 (6, 6), of position and velocity.
+    """
+
+    stamp_ns: int
+    position: NDArray[np.float64]
+    velocity: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Track:
+    """n estimates in the order of their times.
+
+    Attributes:
+        stamp_ns: int64 (n,).
+        position, velocity: float64 (n, 3).
+        covariance: float64 (n, 6, 6), of position and velocity.
+    """
+
+    stamp_ns: NDArray[np.int64]
+    position: NDArray[np.float64]
+    velocity: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.stamp_ns)
+
+    @classmethod
+    def of(cls, estimates: list[Estimate]) -> Track:
+        """Estimates as a track; of none, an empty one."""
+        return cls(
+            np.array([e.stamp_ns for e in estimates], np.int64),
+            np.array([e.position for e in estimates], np.float64).reshape(-1, 3),
+            np.array([e.velocity for e in estimates], np.float64).reshape(-1, 3),
+            np.array([e.covariance for e in estimates], np.float64).reshape(-1, 6, 6),
+        )
+
+    def take(self, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> Track:
+        """The estimates at `index`."""
+        return Track(self.stamp_ns[index], self.position[index], self.velocity[index], self.covariance[index])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TruePath:
+    """Where a tag truly was: int64 (n,) stamps in order, float64 (n, 3) positions in m."""
+
+    stamp_ns: NDArray[np.int64]
+    position: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.stamp_ns)
+
+    def at(self, stamp_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Positions float64 (k, 3) at other times, by interpolation; NaN outside, and in gaps of over 1 s."""
+        if len(self) == 0:
+            return np.full((len(stamp_ns), 3), np.nan)
+        # Relative: seconds since the epoch leave a float64 no more than a fraction of a microsecond.
+        own, wanted = (stamps - self.stamp_ns[0] for stamps in (self.stamp_ns, stamp_ns))
+        found = np.stack([np.interp(wanted, own, axis, np.nan, np.nan) for axis in self.position.T], axis=1)
+        after = np.clip(np.searchsorted(own, wanted), 1, max(len(own) - 1, 1))
+        if len(own) > 1:
+            found[own[after] - own[after - 1] > 1_000_000_000] = np.nan
+        return found
