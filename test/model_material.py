@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from uwb_mitigation.dataset import Dataset
-from uwb_mitigation.measurement import Cir, RangeMeasurement, Truth
+from uwb_mitigation.measurement import Cir, RangeMeasurement, Record, Truth
 from uwb_mitigation.model import graph
 from uwb_mitigation.model.architecture import HEAD, Remnet
 from uwb_mitigation.model.bundle import Bundle, Card, save_bundle
+from uwb_mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.model.prior import LinePrior
 from uwb_mitigation.model.weights import FloatWeights, Int8Weights
 from uwb_mitigation.preprocessing import Preprocessing, Scaling
-from uwb_mitigation.sources.source import Record
 from uwb_mitigation.training.quantization import quantize
 
 LINE = LinePrior(*(float(np.float32(value)) for value in (-5.0, -0.0691, -0.0126)))
@@ -33,6 +33,11 @@ def random_weights(architecture: Remnet, seed: int = 0) -> FloatWeights:
     weight[HEAD] = generator.normal(0, 0.02, (architecture.features, 1)).astype(np.float32)
     bias[HEAD] = generator.normal(0, 0.1, 1).astype(np.float32)
     return FloatWeights(architecture, weight, bias)
+
+
+def integer_network(bundle: Bundle) -> IntegerNetwork:
+    """The oracle of what an int8 bundle computes."""
+    return IntegerNetwork(graph.int8_weights(bundle.model, bundle.architecture))
 
 
 def windows(count: int, samples: int, seed: int = 0) -> np.ndarray:

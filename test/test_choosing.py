@@ -10,28 +10,26 @@ import pytest
 from model_material import bundle, dataset, measurement, windows
 from typer.testing import CliRunner
 
-from uwb_mitigation import dataset as datasets
 from uwb_mitigation.cli import app
-from uwb_mitigation.commands import model as commands
 from uwb_mitigation.commands import model_tables
 from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError
 from uwb_mitigation.evaluation.lad import constant as fit_constant
-from uwb_mitigation.measurement import Truth
+from uwb_mitigation.measurement import Record, Truth
 from uwb_mitigation.model import floating
 from uwb_mitigation.model.architecture import Remnet
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.prior import LinePrior
-from uwb_mitigation.model.shipped import simulated_model_path
+from uwb_mitigation.model.shipped import default_model_path
 from uwb_mitigation.sources import opening
-from uwb_mitigation.sources.source import Record
 from uwb_mitigation.sources.truth_table import load_truth, with_truth
 
 pytest.importorskip("torch", reason="run `make setup-training`")
-from uwb_mitigation.training import choosing, cold_start, contest, site
+from uwb_mitigation.model.float_networks import float_network
+from uwb_mitigation.training import adaptation, choosing, cold_start, comparison, parts
+from uwb_mitigation.training import recipe as recipes
 from uwb_mitigation.training.choosing import Candidate, Choice
 from uwb_mitigation.training.fitting import FitOptions
 from uwb_mitigation.training.recipe import Recipe, fit_model
-from uwb_mitigation.training.site import float_network
 
 SHAPE = Remnet(samples=8)
 CONSTANTS = [
@@ -101,9 +99,9 @@ def test_a_curve_that_is_flat_promises_nothing(points):
     ],
 )
 def test_a_network_alone_is_trained_longer_unless_asked_otherwise(tmp_path, monkeypatch, asked, expected):
-    monkeypatch.setattr(datasets, "build_dataset", lambda records, preprocessing: dataset(4, 3, samples=8))
+    monkeypatch.setattr(parts, "load", lambda *_: ("made up", dataset(4, 3, samples=8)))
     monkeypatch.setattr(
-        commands, "_train", lambda data, name, recipe, *_: pytest.fail(f"{recipe.fit}", pytrace=False)
+        recipes, "cross_validate", lambda data, recipe, *_: pytest.fail(f"{recipe.fit}", pytrace=False)
     )
     with pytest.raises(pytest.fail.Exception) as caught:
         run_or_raise("train", "--data", tmp_path, "--recipe", "network", "-o", tmp_path / "x.onnx", *asked)
@@ -133,7 +131,7 @@ def test_a_recipe_that_harms_is_told_as_one(tmp_path, monkeypatch):
     # Without one of two places that err by 1 m, the constant is that of the two that err by -1 m, and the reverse.
     data = dataset(4, 3, samples=8)
     data = replace(data, error_m=np.where(np.isin(data.configurations, ("c0", "c1")), 1.0, -1.0))
-    monkeypatch.setattr(datasets, "build_dataset", lambda records, preprocessing: data)
+    monkeypatch.setattr(parts, "load", lambda *_: ("made up", data))
     output, result = tmp_path / "x.onnx", tmp_path / "x.json"
     told = run_or_raise(
         "train", "--data", tmp_path, "--recipe", "constant", "--samples", 8, "-o", output, "--json", result
@@ -150,43 +148,42 @@ def predicted(fitted, data) -> np.ndarray:
     return prior.predict_batch_m(data.rx_power_dbm, data.first_path_power_dbm) + of_network
 
 
-def test_the_cold_start_is_the_mean_of_a_line_and_of_a_network_with_an_offset(tmp_path):
-    data, source = dataset(10, 5, samples=32), bundle(tmp_path)
+def test_the_cold_start_fits_an_offset_alone_and_the_mean_a_line_too(tmp_path):
+    data, source = dataset(20, 3, samples=32), bundle(tmp_path)
+    offered = cold_start.offered(choosing.standard(Recipe(SHAPE, FitOptions())), data, source)
+    found = {
+        item.name: predicted(item.fit(data, 0), data) for item in offered if item.name in cold_start.NAMES
+    }
     line = predicted((choosing.line(data), None), data)
     network = floating.predict_m(float_network(source), data.inputs)
     shift = fit_constant(data.configurations, data.error_m - network).offset_m
-    found = predicted(cold_start.candidate(source).fit(data, 0), data)
     assert np.std(network) > 0.01
-    assert found == pytest.approx((line + network + shift) / 2, abs=1e-5)
+    assert found[cold_start.NAME] == pytest.approx(network + shift, abs=1e-5)
+    assert found[cold_start.MEAN] == pytest.approx((line + network + shift) / 2, abs=1e-5)
 
 
-def test_the_cold_start_is_offered_first_and_to_small_data_alone(tmp_path):
-    source = bundle(tmp_path)
+def test_the_cold_start_comes_first_where_placements_are_few_and_the_mean_where_they_are_not(tmp_path):
+    source, usual = bundle(tmp_path), choosing.standard(Recipe(SHAPE, FitOptions()))
+    plain = ["constant", "line", "line+network", "network"]
 
     def names(data) -> list[str]:
-        return [item.name for item in cold_start.offered(CONSTANTS, data, source)]
+        return [item.name for item in cold_start.offered(usual, data, source)]
 
-    usual = [item.name for item in CONSTANTS]
-    assert names(dataset(18, 2)) == [cold_start.NAME, *usual]
-    assert names(dataset(19, 2)) == usual
-    assert names(dataset(18, 2, samples=8)) == usual
+    assert names(dataset(19, 2)) == [cold_start.NAME, *plain]
+    many = dataset(20, 2)
+    assert names(many) == ["constant", cold_start.NAME, "line", cold_start.MEAN, "line+network", "network"]
+    assert names(dataset(20, 2, samples=8)) == plain
+    many.rx_power_dbm[:2] = np.nan  # One placement of the twenty without power levels.
+    assert names(many) == ["constant", cold_start.NAME, "line", "line+network", "network"]
 
 
-@pytest.mark.parametrize(
-    ("configurations", "without", "is_offered"),
-    [(18, 0, True), (18, 12, True), (18, 13, False), (4, 0, True), (4, 1, False)],
-)
-def test_the_cold_start_needs_power_levels_in_as_many_places_as_a_line(
-    configurations, without, is_offered, tmp_path
-):
-    data = dataset(configurations, 2)
-    data.rx_power_dbm[0] = np.nan  # Where `without` is 0, one range alone.
-    data.rx_power_dbm[: 2 * without] = np.nan
-    candidates = cold_start.offered(CONSTANTS, data, bundle(tmp_path))
-    assert (candidates[0].name == cold_start.NAME) == is_offered
-    if is_offered:
-        prior, _ = candidates[0].fit(data, 0)
-        assert prior.needs_power == (configurations >= 6)
+def test_a_trained_network_must_show_its_gain_where_no_choice_has_seen(monkeypatch):
+    data = numbered(lambda number: 0.3)
+    none, half, quarter = (replace(item, trains=item.name == "quarter") for item in CONSTANTS)
+    assert choosing.choose(data, [none, half, quarter], 3, 0).chosen == "quarter"
+    # The folds within prefer another, so that choosing leaves more than the candidate would.
+    monkeypatch.setattr(choosing, "_held_out", lambda *_: {"none": np.zeros(1), "half": np.ones(1)})
+    assert choosing.choose(data, [none, half, quarter], 3, 0).chosen == "half"
 
 
 @pytest.mark.parametrize("name", [choosing.CONSTANT, choosing.LINE])
@@ -247,6 +244,8 @@ def test_a_table_that_is_none_is_refused(tmp_path):
 
 
 class Recorded(list):
+    simulated = False
+
     def __enter__(self):
         return self
 
@@ -279,14 +278,14 @@ def ranges_of_eight_places() -> list[Record]:
 
 def test_a_bag_of_few_places_starts_from_the_simulator_too(tmp_path, monkeypatch):
     monkeypatch.setattr(opening, "open_recording", lambda path: Recorded(ranges_of_eight_places()))
-    as_it_is = Candidate(site.AS_SHIPPED, lambda data, seed: (LinePrior(0.0), None))
-    monkeypatch.setattr(site, "candidates", lambda source, options: [as_it_is])
+    as_it_is = Candidate(adaptation.AS_SHIPPED, lambda data, seed: (LinePrior(0.0), None))
+    monkeypatch.setattr(adaptation, "candidates", lambda source, options: [as_it_is])
     output = tmp_path / "own.onnx"
     done = run(
         "train", "--from-bag", "bag", "--truth", write(tmp_path, *EIGHT_PLACES), "-o", output, "--folds", 2
     )
     assert done.exit_code == 0, done.output
-    start = load_bundle(simulated_model_path())
+    start = load_bundle(default_model_path())
     assert load_bundle(output).card.training["chosen"] == cold_start.NAME
     assert load_bundle(output).card.training["started_from"] == f"{start.model_id:08x}"
     # No network was fitted, so that the card tells of no epochs.
@@ -295,9 +294,13 @@ def test_a_bag_of_few_places_starts_from_the_simulator_too(tmp_path, monkeypatch
 
 def test_the_card_tells_how_a_network_was_fitted_that_was(tmp_path):
     data, source = dataset(8, 3), bundle(tmp_path)
-    choice = Choice(choosing.LINE_NETWORK, {"raw": data.error_m, "line+network": data.error_m}, (), 2, 0, 8)
+    choice = Choice(
+        adaptation.TRAINED_FURTHER, {"raw": data.error_m, "trained further": data.error_m}, (), 2, 0, 8
+    )
     options = FitOptions(epochs=1)
-    graded, _ = site.fit_chosen(data, choice, site.candidates(source, options), source, options, "own", "bag")
+    graded, _ = adaptation.fit_chosen(
+        data, choice, adaptation.candidates(source, options), source, options, "own", "bag"
+    )
     assert graded.card.training["recipe"]["epochs"] == 1
     assert graded.card.training["recipe"]["network"]
 
@@ -321,8 +324,9 @@ def test_a_bag_of_ones_own_refits_the_offset_and_says_what_it_helped(tmp_path, m
 
 
 def test_few_configurations_start_from_the_simulator(tmp_path, monkeypatch):
-    monkeypatch.setattr(datasets, "build_dataset", lambda records, preprocessing: dataset(6, 3, samples=157))
-    monkeypatch.setattr(choosing, "standard", lambda recipe, alone: CONSTANTS[:1])
+    monkeypatch.setattr(parts, "load", lambda *_: ("made up", dataset(6, 3, samples=157)))
+    far_off = Candidate("far off", lambda data, seed: (LinePrior(9.0), None))
+    monkeypatch.setattr(choosing, "standard", lambda recipe, alone: [far_off])
     output, result = tmp_path / "cold.onnx", tmp_path / "cold.json"
     done = run("train", "--data", tmp_path, "-o", output, "--folds", 2, "--json", result)
     assert done.exit_code == 0, done.output
@@ -332,17 +336,17 @@ def test_few_configurations_start_from_the_simulator(tmp_path, monkeypatch):
     found, made, start = (
         json.loads(result.read_text()),
         load_bundle(output),
-        load_bundle(simulated_model_path()),
+        load_bundle(default_model_path()),
     )
     assert found["choice"]["chosen"] == made.card.training["chosen"] == cold_start.NAME
     mae = {row["name"]: row["mae"] for row in found["choice"]["rows"]}
     assert found["helped"] == (mae[choosing.NESTED] < mae["raw"])
-    assert ("this did not help" in done.output) != found["helped"]
+    assert ("this did not help" in " ".join(done.output.split())) != found["helped"]
     assert set(found) == {"model_id", "n", "refused", "rows", "helped", "by_configuration", "choice"}
     assert made.card.training["started_from"] == f"{start.model_id:08x}"
     inputs = windows(5, 157)
-    half = floating.predict_m(float_network(start), inputs) / 2
-    assert floating.predict_m(float_network(made), inputs) == pytest.approx(half, abs=1e-6)
+    whole = floating.predict_m(float_network(start), inputs)
+    assert floating.predict_m(float_network(made), inputs) == pytest.approx(whole, abs=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -381,7 +385,7 @@ def test_what_does_not_go_with_a_bag_is_named(tmp_path):
     ],
 )
 def test_too_few_configurations_are_counted(tmp_path, monkeypatch, configurations, arguments, message):
-    monkeypatch.setattr(datasets, "build_dataset", lambda records, preprocessing: dataset(configurations, 3))
+    monkeypatch.setattr(parts, "load", lambda *_: ("made up", dataset(configurations, 3)))
     with pytest.raises(DatasetError, match=message):
         run_or_raise("train", "--data", tmp_path, "-o", tmp_path / "x.onnx", *arguments)
 
@@ -401,7 +405,7 @@ def test_data_without_preamble_counts_is_told_of_the_other_scaling(tmp_path, mon
     monkeypatch.setattr(opening, "open_recording", lambda path: Recorded(unknown))
     tag = ("evaluate", "--data", "bag", "--cross-validate", "tag", "--scaling", "max")
     monkeypatch.setattr(
-        contest, "run", lambda data, *_: pytest.fail(data.preprocessing.scaling, pytrace=False)
+        comparison, "run", lambda data, *_: pytest.fail(data.preprocessing.scaling, pytrace=False)
     )
     with pytest.raises(pytest.fail.Exception, match="max"):
         run_or_raise(*tag)

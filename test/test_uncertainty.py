@@ -12,7 +12,7 @@ from model_material import bundle, measurement
 
 from uwb_mitigation.errors import ModelError
 from uwb_mitigation.measurement import Status
-from uwb_mitigation.mitigation import Mitigation
+from uwb_mitigation.mitigation import Mitigation, correct_batch
 from uwb_mitigation.model.architecture import Remnet
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.familiarity import Band, Familiarity, Strangeness, features
@@ -112,7 +112,7 @@ def test_batches_grade_to_the_bit_as_single_measurements(tmp_path):
     subjects.append(measurement(rx_power_dbm=1e300))
     single = [subject.correct(item) for item in subjects]
     assert {result.status for result in single} >= {Status.OK, Status.OUT_OF_DISTRIBUTION}
-    assert [repr(result) for result in subject.correct_batch(subjects)] == [repr(r) for r in single]
+    assert [repr(result) for result in correct_batch(subject, subjects)] == [repr(r) for r in single]
 
 
 def test_a_bundle_keeps_its_familiarity(tmp_path):

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from uwb_mitigation.errors import ModelError, UwbMitigationError
+from uwb_mitigation.files import read_bounded, write_whole
 from uwb_mitigation.model import onnx_file
 from uwb_mitigation.model.architecture import Architecture, Mlp, Remnet
 from uwb_mitigation.model.familiarity import Band, Familiarity
@@ -54,6 +55,7 @@ class Card:
         variance_per_m2: the variance grows by so much times the square of the predicted error, without unit.
         interval95_sigmas: standard deviations that cover 95 % of the errors on unseen configurations.
         familiarity: bands outside of which a measurement is unlike the training data; None = not known.
+        needs_cir: False = the network predicts nothing, so that a range without a CIR is corrected, too, by the prior.
     """
 
     name: str
@@ -68,6 +70,15 @@ class Card:
     variance_per_m2: float = 0.0
     interval95_sigmas: float = 1.96
     familiarity: Familiarity | None = None
+    needs_cir: bool = True
+
+    @property
+    def origin(self) -> str:
+        """The boards and the site that the bundle was trained on, for people."""
+        data, boards = (self.training.get(key) for key in ("data", "boards"))
+        learnt = self.training.get("configurations")
+        extent = f" ({len(learnt)} configurations)" if isinstance(learnt, list) else ""
+        return f"trained on {data or 'what it does not tell'}{extent}, boards {boards or 'as there'}"
 
     def __post_init__(self) -> None:
         if self.architecture.samples != self.preprocessing.samples:
@@ -142,18 +153,7 @@ def load_bundle(path: Path | str) -> Bundle:
             metadata and its graph contradict each other.
     """
     path = Path(path)
-    try:
-        if not path.is_file():
-            raise ModelError("no such model file", where=str(path), valid=_REMEDY)
-        with path.open("rb") as file:
-            data = file.read(MAX_BYTES + 1)
-    except OSError as error:
-        raise ModelError(f"cannot be read: {error.strerror}", where=str(path)) from error
-    if not data:
-        raise ModelError("the model file is empty", where=str(path), valid=_REMEDY)
-    if len(data) > MAX_BYTES:
-        raise ModelError(f"more than {MAX_BYTES} bytes", where=str(path), valid="a model of ours")
-    return parse_bundle(data, path)
+    return parse_bundle(read_bounded(path, MAX_BYTES, ModelError, _REMEDY), path)
 
 
 def parse_bundle(data: bytes, path: Path) -> Bundle:
@@ -203,18 +203,17 @@ def save_bundle(path: Path, graph: bytes, card: Card) -> Bundle:
     """
     data = assemble_bundle(graph, card)
     bundle = parse_bundle(data, path)
-    partial = path.with_name(path.name + ".part")
-    try:
-        partial.write_bytes(data)
-        partial.replace(path)
-    except OSError as error:
-        raise ModelError(f"cannot be written: {error.strerror}", where=str(path)) from error
+    write_whole(path, data, ModelError)
     return bundle
 
 
 def assemble_bundle(graph: bytes, card: Card) -> bytes:
     """The bytes of a bundle."""
-    metadata = asdict(card) | {
+    said = asdict(card)
+    if card.needs_cir:
+        # As bundles had it before there were others.
+        del said["needs_cir"]
+    metadata = said | {
         "format": FORMAT,
         "model_id": _BLANK.decode(),
         "architecture": _architecture_metadata(card.architecture),
@@ -261,6 +260,7 @@ def _card(metadata: dict[str, Any]) -> Card:
         variance_per_m2=float(metadata.get("variance_per_m2", 0.0)),
         interval95_sigmas=float(metadata.get("interval95_sigmas", 1.96)),
         familiarity=_familiarity(metadata.get("familiarity")),
+        needs_cir=metadata.get("needs_cir", True) is not False,
     )
 
 

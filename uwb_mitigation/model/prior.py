@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,15 +49,18 @@ class LinePrior:
         return predicted
 
     def predict_batch_m(
-        self, rx_power_dbm: NDArray[np.float32], first_path_power_dbm: NDArray[np.float32]
+        self, rx_power_dbm: NDArray[Any], first_path_power_dbm: NDArray[Any]
     ) -> NDArray[np.float32]:
-        """`predict_m` of arrays of shape (n,), to the bit."""
+        """`predict_m` of arrays of floats, shape (n,), to the bit."""
         if not self.needs_power:
             return np.full(len(rx_power_dbm), self.offset_m, np.float32)
         known = np.abs(rx_power_dbm) <= MAX_POWER_DBM
         known &= np.abs(first_path_power_dbm) <= MAX_POWER_DBM
-        rx = np.where(known, rx_power_dbm, np.float32(np.nan))
-        gap = rx - first_path_power_dbm
+        rx, first_path = (
+            np.where(known, power, np.nan).astype(np.float32)
+            for power in (rx_power_dbm, first_path_power_dbm)
+        )
+        gap = rx - first_path
         level = np.float32(self.offset_m) + np.float32(self.per_rx_power) * rx
         predicted: NDArray[np.float32] = level + np.float32(self.per_power_gap) * gap
         return predicted

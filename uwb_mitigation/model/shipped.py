@@ -5,30 +5,43 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from uwb_mitigation.errors import ModelError
 
-SHIPPED = "evk1000_apartment.onnx"
-SIMULATED = "simulated_flat.onnx"
+if TYPE_CHECKING:
+    # The doctor comes even where numpy does not.
+    from uwb_mitigation.preprocessing import Scaling
+
+DEFAULT, AMPLITUDE, SITE = SHIPPED = ("universal", "universal_amplitude", "evk1000_apartment")
+"""For places and boards that they never saw, with preamble counts and without; and an example of a surveyed site."""
+
 _SHARE = Path("share", "uwb_mitigation")
 
 
-def default_model_path() -> Path:
-    """The shipped model: of a source checkout, of this installation, or of a sourced ROS workspace.
+def default_model_path(scaling: Scaling | None = None) -> Path:
+    """The model where none is named, for inputs of that scaling (preamble by default): see `shipped_model_path`."""
+    return shipped_model_path(AMPLITUDE if scaling is not None and scaling.value == "max" else DEFAULT)
+
+
+def model_path(named: str | Path | None) -> Path:
+    """The bundle that a person names: a file, or one of `SHIPPED`; nothing names the default.
+
+    Raises:
+        ModelError: see `shipped_model_path`.
+    """
+    if not named or str(named) == ".":
+        return default_model_path()
+    return shipped_model_path(str(named)) if str(named) in SHIPPED else Path(named).expanduser()
+
+
+def shipped_model_path(name: str) -> Path:
+    """One of `SHIPPED`: of a source checkout, of this installation, or of a sourced ROS workspace.
 
     Raises:
         ModelError: it is in none of these; the message lists them.
     """
-    return _find(SHIPPED)
-
-
-def simulated_model_path() -> Path:
-    """The model that was trained in the simulator alone, to start from with few configurations: as above."""
-    return _find(SIMULATED)
-
-
-def _find(name: str) -> Path:
-    candidates = [folder / name for folder in shared_folders("models")]
+    candidates = [folder / f"{name}.onnx" for folder in shared_folders("models")]
     for candidate in candidates:
         if candidate.is_file():
             return candidate

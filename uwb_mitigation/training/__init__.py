@@ -1,1 +1,1 @@
-"""Fitting and quantising the model. Of the whole package only `networks` and `fitting` here import torch."""
+"""Fitting and quantising the model. Of the whole package only `networks`, `augmentation` and `fitting` here import torch."""

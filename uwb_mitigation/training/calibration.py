@@ -27,7 +27,7 @@ CHECKED_INPUTS = 1024
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Comparison:
+class Calibration:
     """Attributes:
     mae_m: {choice: MAE of the int8 network on training inputs that it was not calibrated on, m}.
     best: the choice with the least; the first of equals.
@@ -41,7 +41,7 @@ class Comparison:
 
 def compare(
     weights: FloatWeights, inputs: NDArray[np.float32], targets: NDArray[np.floating], seed: int
-) -> Comparison:
+) -> Calibration:
     """Quantise with every choice and keep the best, from inputs (n, K) and targets (n,) of the training part.
 
     Raises:
@@ -59,4 +59,4 @@ def compare(
         left = targets[checked] - network.predict_m(inputs[checked])
         errors[name] = float(np.abs(left).mean())
     best = min(errors, key=lambda name: errors[name])
-    return Comparison(errors, best, quantize(weights, seen, CHOICES[best]))
+    return Calibration(errors, best, quantize(weights, seen, CHOICES[best]))

@@ -15,14 +15,12 @@ from numpy.typing import NDArray
 from uwb_mitigation.dataset import Dataset
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.evaluation import lad, splits
+from uwb_mitigation.evaluation.preference import MUST_GAIN, preferred
 from uwb_mitigation.model import floating
 from uwb_mitigation.model.prior import LinePrior
 from uwb_mitigation.model.weights import FloatWeights
 from uwb_mitigation.training.options import FitOptions
 from uwb_mitigation.training.recipe import Recipe, fit_model, prior_m
-
-MUST_GAIN = 0.02
-"""A richer candidate is chosen where it lowers the error by at least this share: less is the luck of the folds."""
 
 ALONE = FitOptions(epochs=20, learning_rate=1e-3, dropout=0.2)
 """How a network without a prior is fitted: it needs more of it than one that only refines a line."""
@@ -45,10 +43,12 @@ class Candidate:
     Attributes:
         name: in tables.
         fit: from a dataset and a seed.
+        trains: it fits a network, which is kept only where choosing it shows a gain on what no choice has seen.
     """
 
     name: str
     fit: Callable[[Dataset, int], Fitted]
+    trains: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,10 +116,14 @@ def standard(recipe: Recipe, alone: FitOptions = ALONE) -> list[Candidate]:
         Candidate(CONSTANT, lambda data, seed: (lad.constant(data.configurations, data.error_m), None)),
         Candidate(LINE, lambda data, seed: (line(data), None)),
         Candidate(
-            LINE_NETWORK, lambda data, seed: fit_model(data, seeded(recipe_of(LINE_NETWORK, recipe), seed))
+            LINE_NETWORK,
+            lambda data, seed: fit_model(data, seeded(recipe_of(LINE_NETWORK, recipe), seed)),
+            trains=True,
         ),
         Candidate(
-            NETWORK, lambda data, seed: fit_model(data, seeded(recipe_of(NETWORK, recipe, alone), seed))
+            NETWORK,
+            lambda data, seed: fit_model(data, seeded(recipe_of(NETWORK, recipe, alone), seed)),
+            trains=True,
         ),
     ]
 
@@ -165,6 +169,11 @@ def choose(
             errors[name][split.test] = left[name]
         errors[NESTED][split.test] = left[preferred(inner, must_gain)]
     chosen = preferred({name: errors[name] for name in names}, must_gain)
+    if untrained := [item.name for item in candidates if not item.trains]:
+        fallback = preferred({name: errors[name] for name in untrained}, must_gain)
+        # Of many candidates one always looks good on the folds it was picked by: the nested error tells.
+        if preferred({fallback: errors[fallback], chosen: errors[NESTED]}, must_gain) == fallback:
+            chosen = fallback
     (candidate,) = (item for item in candidates if item.name == chosen)
     curve = _curve(dataset, candidate, seed, on_fit)
     return Choice(chosen, errors, curve, folds, seed, len(dataset.names))
@@ -183,16 +192,6 @@ def fits(folds: int, configurations: int, candidates: int) -> int:
     """How often `choose` reports a fit, for a progress bar."""
     inner = max(2, folds - 2)
     return folds * candidates * (1 + inner) + len(_sizes(configurations)) * CURVE_DRAWS
-
-
-def preferred(errors: Mapping[str, NDArray[np.float64]], must_gain: float) -> str:
-    """The first of candidates, in order of preference, that no later one betters by the share `must_gain`."""
-    best, best_mae = "", np.inf
-    for name, error in errors.items():
-        mae = float(np.abs(error).mean())
-        if not best or mae < (1 - must_gain) * best_mae:
-            best, best_mae = name, mae
-    return best
 
 
 def _held_out(

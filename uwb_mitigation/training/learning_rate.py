@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError, ParameterError
 from uwb_mitigation.model.architecture import Architecture
-from uwb_mitigation.training.fitting import single_thread
-from uwb_mitigation.training.learner import learner
+from uwb_mitigation.training import networks
+from uwb_mitigation.training.fitting import adam, as_tensors, single_thread
+from uwb_mitigation.training.fitting import step as train_step
 from uwb_mitigation.training.options import FitOptions
 
 SMOOTHING = 0.95
@@ -61,18 +61,17 @@ def range_test(
         raise ParameterError(
             f"rates {low} to {high} in {steps} steps", valid="0 < low < high <= 10, 20 to 100000 steps"
         )
-    if len(inputs) == 0 or not (np.isfinite(inputs).all() and np.isfinite(targets).all()):
-        raise DatasetError(f"cannot fit to {len(inputs)} inputs", valid="one or more, all finite")
+    source, wanted = as_tensors(inputs, targets)
     rates, losses = [], []
     mean, least, diverged = 0.0, math.inf, False
-    source = torch.from_numpy(np.ascontiguousarray(inputs))
-    wanted = torch.from_numpy(targets.astype(np.float32))
+    generator = np.random.default_rng(options.seed)
     with single_thread(options.seed):
-        network = learner(architecture, replace(options, learning_rate=1e-3))
+        network = networks.build(architecture, options.dropout)
+        optimizer = adam(network, options)
         for step, rate in enumerate(np.geomspace(low, high, steps).tolist()):
-            network.optimizer.learning_rate = rate
-            rows = torch.randint(len(source), (options.batch,))
-            loss = network.step(source[rows], wanted[rows])
+            optimizer.param_groups[0]["lr"] = rate
+            rows = generator.integers(len(source), size=options.batch)
+            loss = train_step(network, optimizer, source[rows], wanted[rows])
             on_step()
             mean = SMOOTHING * mean + (1 - SMOOTHING) * loss
             smooth = mean / (1 - SMOOTHING ** (step + 1))

@@ -20,7 +20,7 @@ _counter: Any = None
 class Work(Protocol[J]):
     """Does one job, and calls `advance` with the amounts of work that are done."""
 
-    def __call__(self, job: J, advance: Callable[[float], None]) -> None: ...
+    def __call__(self, job: J, advance: Callable[[float], None], /) -> None: ...
 
 
 def each(work: Work[J], jobs: Sequence[J], workers: int, on_progress: Callable[[float], None]) -> None:

@@ -7,17 +7,23 @@ set, so that the result is a `Remnet` with fewer filters, which everything else 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ModelError, ParameterError
+from uwb_mitigation.evaluation.metrics import ErrorStatistics
+from uwb_mitigation.model import floating, graph
 from uwb_mitigation.model.architecture import HEAD, Remnet
+from uwb_mitigation.model.bundle import Bundle, save_bundle
 from uwb_mitigation.model.weights import FloatWeights
+from uwb_mitigation.training import experiment
 from uwb_mitigation.training.fitting import fit
 from uwb_mitigation.training.options import FitOptions
+from uwb_mitigation.training.parts import Parts
 
 
 def prune(weights: FloatWeights, filters: int) -> FloatWeights:
@@ -46,21 +52,82 @@ def prune(weights: FloatWeights, filters: int) -> FloatWeights:
     return FloatWeights(replace(shape, filters=filters), weight, bias)
 
 
-def prune_and_tune(
-    weights: FloatWeights,
+@dataclass(frozen=True, slots=True, eq=False)
+class Pruned:
+    """Attributes:
+    bundle: as it was written.
+    mae_m: on the test part, {`before`, `pruned`, `tuned`: MAE}.
+    before: the architecture that was pruned.
+    """
+
+    bundle: Bundle
+    mae_m: Mapping[str, float]
+    before: Remnet
+
+
+def prune_bundle(
+    source: Bundle,
+    parts: Parts,
     filters: int,
-    inputs: NDArray[np.float32],
-    targets: NDArray[np.floating],
     options: FitOptions,
+    output: Path,
     on_epoch: Callable[[], None] = lambda: None,
-) -> FloatWeights:
-    """Prune, then train what is left on inputs (n, K) and targets (n,), m.
+) -> Pruned:
+    """Prune a float bundle, train what is left on the training part, tell its error on the test part, and write it.
 
     Raises:
-        ModelError, ParameterError: see `prune`. DatasetError: see `fit`.
+        ModelError: the source is quantised, no REMNet, or may have been fitted to the test part.
+        ParameterError: see `prune`. DatasetError: see `fit`.
     """
+    if source.quantised:
+        raise ModelError("already quantised", where=str(source.path), valid="the float bundle it was made of")
+    weights = graph.float_weights(source.model, source.architecture)
     smaller = prune(weights, filters)
-    return fit(smaller.architecture, inputs, targets, options, on_epoch, start=smaller)
+    _check_trained_on(source, parts)
+    train, test = parts.train, parts.test
+    tuned = fit(smaller.architecture, train.inputs, train.error_m, options, on_epoch, start=smaller)
+    networks = {"before": weights, "pruned": smaller, "tuned": tuned}
+    found = {"raw": ErrorStatistics.of(test.error_m)} | {
+        row: ErrorStatistics.of(test.error_m - floating.predict_m(network, test.inputs))
+        for row, network in networks.items()
+    }
+    card = experiment.describe(output.stem, tuned.architecture, parts, options)
+    training = {
+        **card.training,
+        "pruned": {
+            "name": source.name,
+            "from": f"{source.model_id:08x}",
+            "architecture": asdict(weights.architecture),
+            "recipe": source.card.training.get("recipe"),
+        },
+        "metrics_m": {
+            row: {key: round(value, 4) for key, value in asdict(found[of]).items()}
+            for row, of in (("raw", "raw"), ("float", "tuned"))
+        },
+    }
+    bundle = save_bundle(output, graph.float_model(tuned), replace(card, training=training))
+    assert isinstance(weights.architecture, Remnet)
+    return Pruned(bundle, {row: found[row].mae for row in networks}, weights.architecture)
+
+
+def _check_trained_on(source: Bundle, parts: Parts) -> None:
+    """Refuse a bundle that may have been fitted to the test part."""
+    here = {
+        "data": parts.data,
+        "split": parts.split,
+        "measurements": len(parts.train),
+        "tested_on": len(parts.test),
+    }
+    trained = {key: source.card.training.get(key) for key in here}
+    if trained != here:
+        differ = "; ".join(
+            f"{key} {trained[key]}, not {here[key]}" for key in here if trained[key] != here[key]
+        )
+        raise ModelError(
+            f"trained on other data than the training part, which leaves nothing to test on: {differ}",
+            where=str(source.path),
+            valid="a bundle of `protocol`, with its --data and --split",
+        )
 
 
 def _sets(shape: Remnet) -> list[tuple[int | None, int]]:

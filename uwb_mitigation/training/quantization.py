@@ -7,16 +7,20 @@ signed byte then fit the 16-bit sums of processors without VNNI, so that every p
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.dataset import Dataset
-from uwb_mitigation.errors import DatasetError
+from uwb_mitigation.errors import DatasetError, ModelError, ParameterError
 from uwb_mitigation.evaluation import splits
-from uwb_mitigation.firmware_export.requantisation import nudge
-from uwb_mitigation.model import floating
+from uwb_mitigation.model import floating, graph
 from uwb_mitigation.model.architecture import HEAD
+from uwb_mitigation.model.bundle import Bundle, save_bundle
+from uwb_mitigation.model.integer import IntegerNetwork
+from uwb_mitigation.model.requantisation import nudge
 from uwb_mitigation.model.weights import FloatWeights, Int8Weights, layer_inputs, sum_operands
 
 WEIGHT_LIMIT = 63
@@ -75,6 +79,37 @@ def quantize(
         biases[name] = np.clip(bias, limits.min, limits.max).astype(np.int32)
     quantized = Int8Weights(architecture, integers, weight_scale, biases, scale)
     return nudge(quantized) if exact else quantized
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Quantised:
+    """A bundle that was written; `difference_m` (n,) is how far it is from float on the calibration inputs."""
+
+    bundle: Bundle
+    difference_m: NDArray[np.float32]
+
+
+def check(source: Bundle, percentile: float) -> None:
+    """Refuse what `quantize_bundle` does; before data is read for it."""
+    if source.quantised:
+        raise ModelError("already quantised", where=str(source.path), valid="the float bundle it was made of")
+    if not 90 <= percentile <= 100:
+        raise ParameterError(f"percentile = {percentile}", valid="90 to 100")
+
+
+def quantize_bundle(source: Bundle, dataset: Dataset, percentile: float, output: Path) -> Quantised:
+    """Quantise a float bundle with the data that it was trained on, and write it.
+
+    Raises:
+        ModelError: it is quantised already; see also `quantize`. ParameterError: `percentile` is below 90.
+    """
+    check(source, percentile)
+    inputs = calibration_inputs(dataset, seed=0)
+    network = graph.float_weights(source.model, source.architecture)
+    integers = quantize(network, inputs, percentile)
+    difference = np.abs(IntegerNetwork(integers).predict_m(inputs) - floating.predict_m(network, inputs))
+    card = replace(source.card, name=output.stem, quantised=True)
+    return Quantised(save_bundle(output, graph.int8_model(integers), card), difference)
 
 
 def _weight_scale(name: str, weight: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -12,18 +12,16 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.dataset import Dataset
 from uwb_mitigation.evaluation import lad, splits
-from uwb_mitigation.evaluation.intervals import calibrate
 from uwb_mitigation.evaluation.metrics import ErrorStatistics, mae_by_group
 from uwb_mitigation.model import floating
 from uwb_mitigation.model.architecture import Remnet
 from uwb_mitigation.model.bundle import Card
-from uwb_mitigation.model.familiarity import Familiarity, features
 from uwb_mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.model.prior import LinePrior
 from uwb_mitigation.model.weights import FloatWeights
-from uwb_mitigation.preprocessing import Scaling
+from uwb_mitigation.training import networks
+from uwb_mitigation.training.cards import card_of, familiarity_of
 from uwb_mitigation.training.fitting import FitOptions, fit, single_thread
-from uwb_mitigation.training.networks import RemnetModule
 from uwb_mitigation.training.quantization import calibration_inputs, quantize
 
 MOST_NAMED = 100
@@ -127,7 +125,7 @@ def fit_model(
         )
     if not recipe.network:
         with single_thread(recipe.fit.seed):
-            return prior, RemnetModule(recipe.architecture, 0).weights()
+            return prior, networks.weights_of(networks.build(recipe.architecture, 0))
     part = dataset.rows(splits.thinned(dataset.configurations, recipe.per_configuration, recipe.fit.seed))
     left = part.error_m - prior_m(prior, part)
     # Measurements whose power is unknown have no prior, and are passed through where it is needed.
@@ -159,67 +157,26 @@ def fit_graded(
 
 
 def describe(name: str, recipe: Recipe, prior: LinePrior, validation: CrossValidation, data: str) -> Card:
-    """The card of the float model that `recipe` makes of the whole dataset.
-
-    Variances are conformal (see `intervals`): of corrected ranges from the errors left on held-out configurations;
-    of ranges passed through from the raw errors.
-    """
+    """The card of the float model that `recipe` makes of the whole dataset (see `cards`)."""
     dataset = validation.dataset
-    low, high = float(dataset.error_m.min()), float(dataset.error_m.max())
-    margin = max(high - low, 0.1) / 2
-    left = validation.errors["float"]
-    corrected = calibrate(left, dataset.error_m - left, dataset.configurations)
-    raw = calibrate(dataset.error_m, np.zeros(len(dataset)), dataset.configurations)
-    return Card(
-        name=name,
-        architecture=recipe.architecture,
-        preprocessing=dataset.preprocessing,
-        prior=prior,
-        quantised=False,
-        variance_m2=corrected.variance_m2,
-        variance_uncorrected_m2=raw.variance_m2,
-        correction_limits_m=(_float32(low - margin), _float32(high + margin)),
-        training={
-            "data": data,
-            "configurations": names if len(names := dataset.names) <= MOST_NAMED else len(names),
-            "measurements": len(dataset),
-            "split": f"{validation.folds} folds by configuration",
-            "seed": validation.seed,
-            "recipe": {"line": recipe.line, "network": recipe.network}
-            | (
-                asdict(recipe.fit) | {"per_configuration": recipe.per_configuration} if recipe.network else {}
-            ),
-            "metrics_m": {
-                row: {key: round(value, 4) for key, value in statistics.items()}
-                for row, statistics in validation.statistics().items()
-            },
+    training = {
+        "data": data,
+        "configurations": names if len(names := dataset.names) <= MOST_NAMED else len(names),
+        "measurements": len(dataset),
+        "split": f"{validation.folds} folds by configuration",
+        "seed": validation.seed,
+        "recipe": {"line": recipe.line, "network": recipe.network}
+        | (asdict(recipe.fit) | {"per_configuration": recipe.per_configuration} if recipe.network else {}),
+        "metrics_m": {
+            row: {key: round(value, 4) for key, value in statistics.items()}
+            for row, statistics in validation.statistics().items()
         },
-        variance_per_m2=corrected.variance_per_m2,
-        interval95_sigmas=corrected.sigmas95,
-        familiarity=_familiarity(dataset),
-    )
-
-
-def _familiarity(dataset: Dataset) -> Familiarity | None:
-    """None where the inputs have no level, or no measurement has both powers."""
-    if dataset.preprocessing.scaling is not Scaling.PREAMBLE:
-        return None
-    values = features(
-        dataset.inputs,
-        dataset.range_m.astype(np.float32),
-        dataset.rx_power_dbm,
-        dataset.first_path_power_dbm,
-    )
-    if not np.isfinite(values).all(axis=1).any():
-        return None
-    means = [dataset.error_m[dataset.configurations == name].mean() for name in dataset.names]
-    return Familiarity.of(float(np.median(means)), values)
+    }
+    left = validation.errors["float"]
+    familiarity = familiarity_of(dataset)
+    return card_of(name, recipe.architecture, dataset, prior, dataset, left, training, familiarity)
 
 
 def prior_m(prior: LinePrior, dataset: Dataset) -> NDArray[np.float32]:
     """What the prior predicts of each measurement, m; NaN where it needs a power that is unknown."""
     return prior.predict_batch_m(dataset.rx_power_dbm, dataset.first_path_power_dbm)
-
-
-def _float32(value: float) -> float:
-    return float(np.float32(value))

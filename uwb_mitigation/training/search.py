@@ -18,12 +18,13 @@ import numpy as np
 
 from uwb_mitigation.dataset import Dataset
 from uwb_mitigation.errors import DatasetError, ParameterError, UwbMitigationError
+from uwb_mitigation.evaluation.splits import by_configuration
 from uwb_mitigation.model import floating
 from uwb_mitigation.model.architecture import Remnet
 from uwb_mitigation.training import parallel
 from uwb_mitigation.training.fitting import fit
 from uwb_mitigation.training.options import FitOptions
-from uwb_mitigation.training.protocol import narrowed
+from uwb_mitigation.training.parts import narrowed
 
 SPACE: Mapping[str, tuple[int, ...]] = {
     "modules": (1, 2, 3, 4),
@@ -32,6 +33,10 @@ SPACE: Mapping[str, tuple[int, ...]] = {
     "filters": (4, 8, 12, 16, 24),
 }
 """N, k0, kn and F; the window length K is searched over what is asked for."""
+
+
+VALIDATION_FOLDS = 5
+"""Of the training part's configurations; on one of them networks are judged."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,8 +67,7 @@ def front(trials: Sequence[Trial]) -> list[Trial]:
 
 
 def search(
-    train: Dataset,
-    validation: Dataset,
+    known: Dataset,
     journal: Path,
     options: FitOptions,
     *,
@@ -76,6 +80,7 @@ def search(
     """Try `random` networks drawn from `SPACE`, then up to `grid` neighbours of the best of them.
 
     Args:
+        known: a training part; one of `VALIDATION_FOLDS` of its configurations judges, the others are fitted to.
         journal: a file of one JSON object a line; its trials on the same data and options are not repeated.
         options: of every fit; its seed also draws the networks.
         windows: lengths K; without any, that of the data.
@@ -83,15 +88,18 @@ def search(
 
     Raises:
         ParameterError: nothing to try, or a window longer than the data's.
-        DatasetError: every network diverged.
+        DatasetError: every network diverged, or there are too few configurations.
         UwbMitigationError: the journal cannot be read or written.
     """
-    windows = tuple(windows) or (train.preprocessing.samples,)
-    if random < 1 or grid < 0 or max(windows) > train.preprocessing.samples or min(windows) < 1:
+    longest = known.preprocessing.samples
+    windows = tuple(windows) or (longest,)
+    if random < 1 or grid < 0 or max(windows) > longest or min(windows) < 1:
         raise ParameterError(
             f"{random} random trials, {grid} of a grid, windows {windows}",
-            valid=f"at least 1, at least 0, 1 to {train.preprocessing.samples}",
+            valid=f"at least 1, at least 0, 1 to {longest}",
         )
+    fold = by_configuration(known.configurations, VALIDATION_FOLDS, seed=0)[0]
+    train, validation = known.rows(fold.train), known.rows(fold.test)
     mark = _fingerprint(train, validation, options)
     worker = _Worker(train, validation, journal, options, mark)
     drawn = _draw(random, windows, options.seed)

@@ -9,12 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.dataset import Dataset
-from uwb_mitigation.evaluation import baselines, lad, splits
+from uwb_mitigation.evaluation import baselines, lad, splits, zero_shot
 from uwb_mitigation.evaluation.metrics import bootstrap_interval, coverage, kept_mae
 from uwb_mitigation.evaluation.splits import Group
 from uwb_mitigation.mitigation import Grader
 from uwb_mitigation.model import floating
 from uwb_mitigation.model.architecture import Mlp, Remnet
+from uwb_mitigation.model.bundle import Bundle
 from uwb_mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.training import choosing
 from uwb_mitigation.training import recipe as recipes
@@ -41,11 +42,11 @@ NAMES = (
     "shipped_float",
     "shipped_int8",
 )
-"""The rows of the table, in its order."""
+"""The rows of the table, in its order; those of `zero_shot.NAMES` stand behind them."""
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class ErrorRow:
     """One row of the table: {label: MAE}, m, mean over seeds; the interval is of the first seed's errors."""
 
     name: str
@@ -56,7 +57,7 @@ class Row:
 
 
 @dataclass(frozen=True, slots=True)
-class Contest:
+class Comparison:
     """Attributes:
     rows: of the table.
     coverage68, coverage95: shares of the shipped recipe's errors within the intervals it promised, over seeds.
@@ -64,9 +65,11 @@ class Contest:
     rejection: (share rejected, MAE of the rest), the ranges with the largest variance first.
     passed_through: share of held-out ranges that the shipped recipe does not correct.
     group, folds, seeds, configurations: of the splits.
+    universal_coverage: {label, or "" for all: shares of the errors of `universal_los_offset` within the intervals that
+        were promised (68 %, 95 %)}; None without a universal model.
     """
 
-    rows: tuple[Row, ...]
+    rows: tuple[ErrorRow, ...]
     coverage68: float
     coverage95: float
     coverage_by_label: Mapping[str, tuple[float, float]]
@@ -76,6 +79,7 @@ class Contest:
     folds: int
     seeds: int
     configurations: int
+    universal_coverage: Mapping[str, tuple[float, float]] | None = None
 
     def as_json(self) -> dict[str, object]:
         """The result of `uwb-mitigation evaluate --cross-validate`."""
@@ -101,6 +105,12 @@ class Contest:
             },
             "rejection": [{"rejected": share, "mae": mae} for share, mae in self.rejection],
             "passed_through": self.passed_through,
+            "universal_coverage": None
+            if self.universal_coverage is None
+            else {
+                label or "all": {"coverage68": narrow, "coverage95": wide}
+                for label, (narrow, wide) in self.universal_coverage.items()
+            },
         }
 
 
@@ -121,8 +131,10 @@ def run(
     folds: int,
     seeds: int,
     on_fold: Callable[[], None] = lambda: None,
-) -> Contest:
-    """Fit every row anew for each fold and each seed, and test it on configurations that it has not seen.
+    universal: Bundle | None = None,
+) -> Comparison:
+    """Fit every row anew for each fold and each seed, and test it on configurations that it has not seen; beside
+    them, a model that is not fitted to any of the data, where it reads such inputs.
 
     Raises:
         DatasetError, ParameterError: see `splits.by_group` and `fit`.
@@ -132,12 +144,16 @@ def run(
     dataset = dataset.rows(known) if known.any() else dataset
     held = [_hold_out(dataset, recipe, group, folds, seed, on_fold) for seed in range(seeds)]
     labels = list(dict.fromkeys(dataset.labels.tolist()))
+    found = {name: np.array([part.errors[name] for part in held]) for name in NAMES}
+    unfitted = None
+    if universal is not None and universal.preprocessing == dataset.preprocessing:
+        unfitted = zero_shot.run(dataset, universal)
+        found |= {name: error[None] for name, error in unfitted.errors.items()}
     rows = []
-    for name in NAMES:
-        errors = np.array([part.errors[name] for part in held])
+    for name, errors in found.items():
         maes = np.abs(errors).mean(axis=1)
         rows.append(
-            Row(
+            ErrorRow(
                 name,
                 float(maes.mean()),
                 float(maes.std()),
@@ -154,7 +170,7 @@ def run(
         return coverage(left, variance[:, chosen], 1.0), coverage(left, wide[:, chosen], 1.0)
 
     every = covered(np.ones(len(dataset), np.bool_))
-    return Contest(
+    return Comparison(
         tuple(rows),
         *every,
         {label: covered(dataset.labels == label) for label in labels},
@@ -164,7 +180,19 @@ def run(
         len(splits.by_group(dataset, group, folds, 0)),
         seeds,
         len(dataset.names),
+        None if unfitted is None else _unfitted_coverage(unfitted, dataset),
     )
+
+
+def _unfitted_coverage(unfitted: zero_shot.ZeroShot, dataset: Dataset) -> dict[str, tuple[float, float]]:
+    left, covered = unfitted.errors["universal_los_offset"], {}
+    for label in ("", *dict.fromkeys(dataset.labels.tolist())):
+        rows = (dataset.labels == label) | (label == "")
+        covered[label] = (
+            coverage(left[rows], unfitted.variance_m2[rows], 1.0),
+            coverage(left[rows], unfitted.variance_m2[rows], unfitted.sigmas95),
+        )
+    return covered
 
 
 def _hold_out(

@@ -8,26 +8,27 @@ from dataclasses import replace
 import numpy as np
 
 from uwb_mitigation.dataset import Dataset
-from uwb_mitigation.errors import ModelError
 from uwb_mitigation.evaluation import lad, splits
-from uwb_mitigation.model import floating, graph
-from uwb_mitigation.model.architecture import HEAD, Remnet
+from uwb_mitigation.model import floating
+from uwb_mitigation.model.architecture import Remnet
 from uwb_mitigation.model.bundle import Bundle
-from uwb_mitigation.model.weights import FloatWeights, layer_inputs
+from uwb_mitigation.model.float_networks import float_network, scaled
 from uwb_mitigation.training import choosing
 from uwb_mitigation.training.choosing import NESTED, Candidate, Choice, Fitted
 from uwb_mitigation.training.fitting import FitOptions, fit
 from uwb_mitigation.training.recipe import CrossValidation, GradedModel, Recipe, describe, prior_m
 
-__all__ = ["NESTED", "candidates", "fit_chosen", "float_network"]
+__all__ = ["NESTED", "candidates", "fit_chosen"]
 
 PER_CONFIGURATION = 20
 AS_SHIPPED = "as shipped"
+OWN_OFFSET = "own offset"
+TRAINED_FURTHER = "trained further"
 
 
 def candidates(source: Bundle, options: FitOptions) -> list[Candidate]:
-    """The source's model as it is, with another offset, a constant, a line, and a line with the source's network
-    trained further.
+    """The source's model as it is, with another offset, a constant, a line, and the source's network trained further on
+    what a prior of the site's own leaves: a line if the source has one, else an offset.
 
     Raises:
         ModelError: the source's network is no REMNet.
@@ -41,7 +42,11 @@ def candidates(source: Bundle, options: FitOptions) -> list[Candidate]:
         return replace(source.prior, offset_m=float(np.float32(source.prior.offset_m + shift))), network
 
     def trained(data: Dataset, seed: int) -> Fitted:
-        prior = choosing.line(data)
+        if source.prior.needs_power:
+            prior = choosing.line(data)
+        else:
+            left = data.error_m - floating.predict_m(network, data.inputs)
+            prior = lad.constant(data.configurations, left)
         part = data.rows(splits.thinned(data.configurations, PER_CONFIGURATION, seed))
         left = part.error_m - prior_m(prior, part)
         known = np.isfinite(left)
@@ -50,12 +55,12 @@ def candidates(source: Bundle, options: FitOptions) -> list[Candidate]:
 
     return [
         Candidate(AS_SHIPPED, lambda data, seed: (source.prior, network)),
-        Candidate("own offset", shifted),
+        Candidate(OWN_OFFSET, shifted),
         Candidate(
             choosing.CONSTANT, lambda data, seed: (lad.constant(data.configurations, data.error_m), None)
         ),
         Candidate(choosing.LINE, lambda data, seed: (choosing.line(data), None)),
-        Candidate(choosing.LINE_NETWORK, trained),
+        Candidate(TRAINED_FURTHER, trained, trains=True),
     ]
 
 
@@ -73,7 +78,7 @@ def fit_chosen(
     Raises:
         ModelError: the source's network is no REMNet.
     """
-    silent = _silent(float_network(source))
+    silent = scaled(float_network(source), 0.0)
     assert isinstance(silent.architecture, Remnet)
     (candidate,) = (item for item in every if item.name == choice.chosen)
     prior, network = candidate.fit(dataset, choice.seed)
@@ -82,7 +87,7 @@ def fit_chosen(
         options,
         line=prior.needs_power,
         per_configuration=PER_CONFIGURATION,
-        network=choice.chosen == choosing.LINE_NETWORK,
+        network=choice.chosen == TRAINED_FURTHER,
     )
     validation = CrossValidation(
         dataset, {**choice.errors, "float": choice.errors[choice.chosen]}, choice.folds, choice.seed
@@ -93,32 +98,3 @@ def fit_chosen(
     started = {"started_from": f"{source.model_id:08x}", "chosen": choice.chosen, "recipe": made}
     card = replace(card, training={**card.training, **started})
     return GradedModel(card, silent if network is None else network), validation
-
-
-def float_network(source: Bundle) -> FloatWeights:
-    """The float network that an int8 bundle stands for; of a float bundle its own.
-
-    Raises:
-        ModelError: it is no REMNet.
-    """
-    if not isinstance(source.architecture, Remnet):
-        raise ModelError("no REMNet to start from", where=str(source.path), valid="a bundle of `train`")
-    if not source.quantised:
-        return graph.float_weights(source.model, source.architecture)
-    integers = graph.int8_weights(source.model, source.architecture)
-    reads = layer_inputs(source.architecture)
-    weight, bias = {}, {}
-    for layer, values in integers.weight.items():
-        scale = integers.weight_scale[layer]
-        shaped = scale if layer == HEAD else scale[:, None, None]
-        weight[layer] = (values * shaped).astype(np.float32)
-        unit = integers.activation_scale[reads[layer]] * scale
-        bias[layer] = (integers.bias[layer] * unit).astype(np.float32)
-    return FloatWeights(source.architecture, weight, bias)
-
-
-def _silent(network: FloatWeights) -> FloatWeights:
-    """The same network with a head that predicts 0."""
-    weight = {**network.weight, HEAD: np.zeros_like(network.weight[HEAD])}
-    bias = {**network.bias, HEAD: np.zeros_like(network.bias[HEAD])}
-    return FloatWeights(network.architecture, weight, bias)

@@ -10,7 +10,6 @@ import pytest
 from model_material import dataset
 from typer.testing import CliRunner
 
-from uwb_mitigation import dataset as datasets
 from uwb_mitigation.cli import app
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.evaluation.splits import Group
@@ -18,7 +17,7 @@ from uwb_mitigation.model.architecture import Remnet
 
 pytest.importorskip("torch", reason="run `make setup-training`")
 pytest.importorskip("sklearn", reason="run `make setup-training`")
-from uwb_mitigation.training import contest
+from uwb_mitigation.training import comparison, parts
 from uwb_mitigation.training.fitting import FitOptions
 from uwb_mitigation.training.recipe import Recipe
 
@@ -29,22 +28,22 @@ RECIPE = Recipe(Remnet(samples=8), FitOptions(epochs=1))
 def _short():
     """The network alone is trained for as long as it needs; here nothing is learnt from that."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(contest.choosing, "ALONE", FitOptions(epochs=1))
+        patch.setattr(comparison.choosing, "ALONE", FitOptions(epochs=1))
         yield
 
 
 @pytest.fixture(scope="module")
-def found() -> contest.Contest:
+def found() -> comparison.Comparison:
     data = dataset(12, 6, samples=8)
-    return contest.run(data, RECIPE, Group.CONFIGURATION, folds=3, seeds=2)
+    return comparison.run(data, RECIPE, Group.CONFIGURATION, folds=3, seeds=2)
 
 
-def mae(result: contest.Contest) -> dict[str, float]:
+def mae(result: comparison.Comparison) -> dict[str, float]:
     return {row.name: row.mae_mean for row in result.rows}
 
 
 def test_every_row_is_there_in_order(found):
-    assert tuple(row.name for row in found.rows) == contest.NAMES
+    assert tuple(row.name for row in found.rows) == comparison.NAMES
     assert (found.folds, found.seeds, found.configurations) == (3, 2, 12)
     for row in found.rows:
         assert set(row.by_label) == {"LOS", "NLOS"}
@@ -72,7 +71,7 @@ def test_what_is_tested_was_not_fitted_to():
     is_seen = data.configurations == "c0"
     error = np.where(is_seen, 5.0, 0.0)
     data = replace(data, error_m=error, range_m=5.0 + error, labels=np.where(is_seen, "LOS", "NLOS"))
-    found = contest.run(data, RECIPE, Group.CONFIGURATION, folds=2, seeds=1)
+    found = comparison.run(data, RECIPE, Group.CONFIGURATION, folds=2, seeds=1)
     (row,) = (row for row in found.rows if row.name == "los_median")
     assert row.by_label["LOS"] == 5.0
 
@@ -94,7 +93,7 @@ def test_rejecting_nothing_leaves_the_error_as_it_is(found):
 def test_measurements_without_powers_are_left_out():
     data = dataset(8, 4, samples=8)
     data.rx_power_dbm[data.configurations == "c0"] = np.nan
-    found = contest.run(data, RECIPE, Group.CONFIGURATION, folds=2, seeds=1)
+    found = comparison.run(data, RECIPE, Group.CONFIGURATION, folds=2, seeds=1)
     assert found.configurations == 7
     assert np.isfinite([row.mae_mean for row in found.rows]).all()
 
@@ -104,14 +103,14 @@ def run(*arguments: object):
 
 
 def test_the_command_writes_the_documented_keys(tmp_path, monkeypatch, found):
-    monkeypatch.setattr(datasets, "build_dataset", lambda records, preprocessing: dataset(12, 6, samples=8))
-    monkeypatch.setattr(contest, "run", lambda *_: found)
+    monkeypatch.setattr(parts, "load", lambda *_: ("made up", dataset(12, 6, samples=8)))
+    monkeypatch.setattr(comparison, "run", lambda *_: found)
     result = run(
         "evaluate", "--data", tmp_path, "--cross-validate", "configuration", "--json", tmp_path / "c.json"
     )
     assert result.exit_code == 0, result.output
     written = json.loads((tmp_path / "c.json").read_text())
-    assert [row["name"] for row in written["rows"]] == list(contest.NAMES)
+    assert [row["name"] for row in written["rows"]] == list(comparison.NAMES)
     assert all(set(row) == {"name", "mae_mean", "mae_std", "by_label", "ci95"} for row in written["rows"])
     assert (written["coverage68"], written["coverage95"]) == (found.coverage68, found.coverage95)
     for name in ("shipped_int8", "68 %", "passed through"):

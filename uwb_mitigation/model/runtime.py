@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-import onnxruntime
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ModelError
 from uwb_mitigation.model.bundle import Bundle
+
+if TYPE_CHECKING:
+    import onnxruntime
 
 
 class Session:
@@ -18,6 +22,9 @@ class Session:
     """
 
     def __init__(self, bundle: Bundle) -> None:
+        # Only here: a node joins the graph while ONNX Runtime loads.
+        import onnxruntime
+
         self.bundle = bundle
         try:
             self._session = onnxruntime.InferenceSession(
@@ -59,6 +66,8 @@ def session_options() -> onnxruntime.SessionOptions:
 
     One thread: the network takes tens of microseconds, less than waking a second one.
     """
+    import onnxruntime
+
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1

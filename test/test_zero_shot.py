@@ -1,0 +1,63 @@
+"""The rows of a model that is not fitted to the data: what each takes off, and what it must not see."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from model_material import bundle, dataset
+
+from uwb_mitigation.dataset import Dataset
+from uwb_mitigation.evaluation import zero_shot
+from uwb_mitigation.evaluation.zero_shot import NAMES, ZeroShot
+from uwb_mitigation.model.bundle import Bundle
+from uwb_mitigation.model.prior import LinePrior
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory) -> Bundle:
+    return bundle(tmp_path_factory.mktemp("zero"), prior=LinePrior(0.0))
+
+
+@pytest.fixture(scope="module")
+def data() -> Dataset:
+    return dataset(8, 6)
+
+
+def maes(found: ZeroShot) -> list[float]:
+    return [float(np.abs(found.errors[name]).mean()) for name in NAMES]
+
+
+def test_without_an_offset_nothing_but_the_models_correction_is_taken_off(model, data):
+    doubled = zero_shot.run(replace(data, error_m=2 * data.error_m), model).errors["universal"]
+    once = zero_shot.run(data, model).errors["universal"]
+    np.testing.assert_allclose(doubled - once, data.error_m, atol=1e-9)
+
+
+def test_offsets_take_a_constant_of_the_boards_off(model, data):
+    moved = zero_shot.run(replace(data, error_m=data.error_m + 3.0), model)
+    still = zero_shot.run(data, model)
+    assert moved.los_offset_m == pytest.approx(still.los_offset_m + 3.0)
+    assert maes(moved)[1:] == pytest.approx(maes(still)[1:])
+    assert maes(moved)[0] > maes(still)[0] + 1.0
+
+
+def test_the_offset_of_a_placement_is_that_of_the_others(model, data):
+    odd = data.configurations == data.names[0]
+    moved = zero_shot.run(replace(data, error_m=data.error_m + np.where(odd, 50.0, 0.0)), model)
+    assert np.abs(moved.errors["universal_offset"][odd]).min() > 45.0
+
+
+def test_without_a_placement_in_line_of_sight_there_is_no_offset(model, data):
+    blind = zero_shot.run(replace(data, labels=np.full(len(data), "NLOS")), model)
+    assert blind.los_offset_m == 0.0
+    assert (blind.errors["universal_los_offset"] == blind.errors["universal"]).all()
+
+
+def test_what_the_model_refuses_stays_as_measured(tmp_path, data):
+    timid = bundle(tmp_path, prior=LinePrior(0.0), correction_limits_m=(-(2.0**-20), 2.0**-20))
+    found = zero_shot.run(data, timid)
+    assert found.passed.all()
+    assert (found.errors["universal"] == data.error_m).all()
+    assert (found.variance_m2 == np.float32(timid.card.variance_uncorrected_m2)).all()

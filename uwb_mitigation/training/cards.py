@@ -1,0 +1,76 @@
+"""What a bundle's card tells: variances, limits, where it comes from. All cards that training writes are made here."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.dataset import Dataset
+from uwb_mitigation.evaluation.intervals import calibrate
+from uwb_mitigation.model.architecture import Architecture
+from uwb_mitigation.model.bundle import Card
+from uwb_mitigation.model.familiarity import Familiarity, features
+from uwb_mitigation.model.prior import LinePrior
+from uwb_mitigation.preprocessing import Scaling
+
+
+def card_of(
+    name: str,
+    architecture: Architecture,
+    dataset: Dataset,
+    prior: LinePrior,
+    unseen: Dataset,
+    left_m: NDArray[np.floating],
+    training: Mapping[str, Any],
+    familiarity: Familiarity | None = None,
+) -> Card:
+    """The card of a float model.
+
+    Variances are conformal (see `evaluation.intervals`): of corrected ranges from the errors left on configurations
+    that were held out; of ranges passed through from the raw errors.
+
+    Args:
+        dataset: what the model was fitted to.
+        unseen: measurements that what left `left_m` (n,), m, was not fitted to.
+        training: where the model comes from, for people.
+
+    Raises:
+        DatasetError: no error is finite.
+    """
+    low, high = float(dataset.error_m.min()), float(dataset.error_m.max())
+    margin = max(high - low, 0.1) / 2
+    corrected = calibrate(left_m, unseen.error_m - left_m, unseen.configurations)
+    raw = calibrate(dataset.error_m, np.zeros(len(dataset)), dataset.configurations)
+    return Card(
+        name=name,
+        architecture=architecture,
+        preprocessing=dataset.preprocessing,
+        prior=prior,
+        quantised=False,
+        variance_m2=corrected.variance_m2,
+        variance_uncorrected_m2=raw.variance_m2,
+        correction_limits_m=(float(np.float32(low - margin)), float(np.float32(high + margin))),
+        training=training,
+        variance_per_m2=corrected.variance_per_m2,
+        interval95_sigmas=corrected.sigmas95,
+        familiarity=familiarity,
+    )
+
+
+def familiarity_of(dataset: Dataset) -> Familiarity | None:
+    """What is familiar to who was fitted to it; None where the inputs have no level, or no measurement has both powers."""
+    if dataset.preprocessing.scaling is not Scaling.PREAMBLE:
+        return None
+    values = features(
+        dataset.inputs,
+        dataset.range_m.astype(np.float32),
+        dataset.rx_power_dbm,
+        dataset.first_path_power_dbm,
+    )
+    if not np.isfinite(values).all(axis=1).any():
+        return None
+    means = [dataset.error_m[dataset.configurations == name].mean() for name in dataset.names]
+    return Familiarity.of(float(np.median(means)), values)

@@ -1,0 +1,77 @@
+"""Simulated placements as arrays, without a recording between the simulator and the trainer."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.dataset import Dataset
+from uwb_mitigation.measurement import Encoding, RangeColumns
+from uwb_mitigation.preprocessing import Preprocessing
+from uwb_mitigation.simulation.buildings import RADIO, block_of
+from uwb_mitigation.simulation.links import label
+from uwb_mitigation.simulation.radio import Reception
+
+
+def building_dataset(
+    seed: int,
+    blocks: int,
+    preprocessing: Preprocessing,
+    workers: int,
+    on_block: Callable[[], None] = lambda: None,
+) -> Dataset:
+    """One range of each of the first `blocks` x 256 placements of `sources.simulated_buildings`, in its order.
+
+    Those that are not received, or whose window cannot be used, are left out. The same for every number of
+    `workers` (processes); `on_block` is called after each block.
+    """
+    simulate = partial(_block, seed, preprocessing)
+    parts = []
+    # Not forked: a caller may hold threads (torch, a progress bar).
+    with multiprocessing.get_context("spawn").Pool(workers) as pool:
+        for part in pool.imap(simulate, range(blocks)):
+            parts.append(part)
+            on_block()
+    return Dataset.joined(parts)
+
+
+def _block(seed: int, preprocessing: Preprocessing, number: int) -> Dataset:
+    block, rng = block_of(seed, number)
+    reception = RADIO.receive(block.links.multipath(rng), rng, block.boards)
+    distance = block.links.distance_m
+    heard = np.flatnonzero(np.isfinite(reception.first_path_index))
+    usable, inputs = preprocessing.apply_batch(_columns(reception, distance, heard))
+    rows = heard[usable]
+    is_blocked, is_direct = block.links.path.crossings > 0, reception.direct_above_threshold
+    return Dataset(
+        preprocessing,
+        inputs,
+        reception.rx_power_dbm[rows].astype(np.float32),
+        reception.first_path_power_dbm[rows].astype(np.float32),
+        distance[rows] + reception.error_m[rows],
+        reception.error_m[rows],
+        np.array([block.configuration(seed, number, int(row)) for row in rows]),
+        np.array([label(bool(is_blocked[row]), bool(is_direct[row])) for row in rows]),
+    )
+
+
+def _columns(reception: Reception, distance: NDArray[np.float64], rows: NDArray[np.intp]) -> RangeColumns:
+    n = len(rows)
+    unknown = np.zeros(n, np.uint64)
+    return RangeColumns(
+        unknown,
+        unknown,
+        (distance + reception.error_m)[rows].astype(np.float32),
+        Encoding.COMPLEX_INT16,
+        reception.samples[rows],
+        np.zeros(n, np.int32),
+        reception.first_path_index[rows].astype(np.float32),
+        np.ones(n, np.float32),
+        reception.preamble_count[rows].astype(np.uint16),
+        reception.rx_power_dbm[rows].astype(np.float32),
+        reception.first_path_power_dbm[rows].astype(np.float32),
+    )
