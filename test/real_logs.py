@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import pytest
 
+from uwb_mitigation.measurement import Record
 from uwb_mitigation.sources.opening import open_recording
-from uwb_mitigation.sources.source import Record
 
 
 class Reading(NamedTuple):

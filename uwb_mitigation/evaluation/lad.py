@@ -37,23 +37,42 @@ def fit_prior(
     names = np.unique(configurations[known])
     if len(names) < MIN_CONFIGURATIONS:
         return constant(configurations, error_m)
-    rows = [known & (configurations == name) for name in names]
-    design = np.array(
-        [(1.0, rx_power_dbm[row].mean(dtype=float), gap[row].mean(dtype=float)) for row in rows]
+    design = np.column_stack(
+        [
+            np.ones(len(names)),
+            means(configurations[known], rx_power_dbm[known]),
+            means(configurations[known], gap[known]),
+        ]
     )
     if np.linalg.matrix_rank(design, tol=1e-3) < design.shape[1]:
         return constant(configurations, error_m)
-    target = np.array([error_m[row].mean(dtype=float) for row in rows])
+    target = means(configurations[known], error_m[known])
     offset, per_rx_power, per_power_gap = (
         float(np.float32(value)) for value in least_absolute_deviations(design, target)
     )
     return LinePrior(offset, per_rx_power, per_power_gap)
 
 
+def fit_level(
+    configurations: NDArray[np.str_], rx_power_dbm: NDArray[np.floating], error_m: NDArray[np.floating]
+) -> LinePrior:
+    """A line in the received power alone, as `fit_prior`: for radios that tell no other. Arguments of shape (n,)."""
+    known = np.isfinite(rx_power_dbm)
+    names = np.unique(configurations[known])
+    if len(names) < MIN_CONFIGURATIONS:
+        return constant(configurations, error_m)
+    level, target = (means(configurations[known], values[known]) for values in (rx_power_dbm, error_m))
+    if float(np.ptp(level)) < 1.0:
+        return constant(configurations, error_m)
+    design = np.column_stack([np.ones(len(names)), level])
+    offset, slope = least_absolute_deviations(design, target)
+    return LinePrior(float(np.float32(offset)), float(np.float32(slope)))
+
+
 def least_absolute_deviations(
     design: NDArray[np.floating], target: NDArray[np.floating]
 ) -> NDArray[np.floating]:
-    """Coefficients (p,) that minimise sum |target - design @ coefficients|; design (n, p), target (n,).
+    """Coefficients (p,) that minimise `sum(abs(target - design @ coefficients))`; design (n, p), target (n,).
 
     Iteratively reweighted least squares, its floor on the residuals lowered step by step (Schlossmacher,
     "An iterative technique for absolute deviations curve fitting", JASA 1973), then a step onto the
@@ -81,5 +100,11 @@ def least_absolute_deviations(
 
 def constant(configurations: NDArray[np.str_], error_m: NDArray[np.floating]) -> LinePrior:
     """The median over configurations of their mean errors; arguments of shape (n,), n > 0."""
-    means = [error_m[configurations == name].mean(dtype=float) for name in np.unique(configurations)]
-    return LinePrior(float(np.float32(np.median(means))))
+    return LinePrior(float(np.float32(np.median(means(configurations, error_m)))))
+
+
+def means(configurations: NDArray[np.str_], values: NDArray[np.floating]) -> NDArray[np.float64]:
+    """The mean of each configuration, in the order of their names."""
+    _, of = np.unique(configurations, return_inverse=True)
+    means: NDArray[np.float64] = np.bincount(of, values.astype(np.float64)) / np.bincount(of)
+    return means

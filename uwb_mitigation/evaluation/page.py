@@ -42,12 +42,19 @@ class Picture:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """A page: what it says above, its tables and its figures."""
+    """A page: what it says above, its tables and its figures.
+
+    Attributes:
+        lacking: what is left out for want of results, and `to_fill`, the command that makes them; empty where all is
+            there.
+    """
 
     title: str
     data: str
     simulated: bool
     command: str
+    lacking: str
+    to_fill: str
     notices: tuple[str, ...]
     tables: tuple[Table, ...]
     pictures: tuple[Picture, ...]
@@ -59,6 +66,8 @@ class Report:
             "data": self.data,
             "simulated": self.simulated,
             "command": self.command,
+            "lacking": self.lacking,
+            "to_fill": self.to_fill,
             "notices": list(self.notices),
             "tables": [table.as_json() for table in self.tables],
             "figures": [picture.as_json() for picture in self.pictures],
@@ -70,17 +79,26 @@ class Report:
         Raises:
             MissingDependencyError: jinja2 is not installed.
         """
-        try:
-            import jinja2
-        except ModuleNotFoundError as error:
-            raise MissingDependencyError(
-                "a report's page needs jinja2", valid="run `make setup-training`"
-            ) from error
-        environment = jinja2.Environment(
-            loader=jinja2.FileSystemLoader(_TEMPLATES),
-            autoescape=True,
-            undefined=jinja2.StrictUndefined,
-            trim_blocks=True,
-            lstrip_blocks=True,
-        )
-        return environment.get_template("report.html.j2").render(report=self) + "\n"
+        return rendered("report.html.j2", report=self)
+
+
+def rendered(template: str, **values: object) -> str:
+    """A page of `templates/`.
+
+    Raises:
+        MissingDependencyError: jinja2 is not installed.
+    """
+    try:
+        import jinja2
+    except ModuleNotFoundError as error:
+        raise MissingDependencyError(
+            "a report's page needs jinja2", valid="run `make setup-training`"
+        ) from error
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(_TEMPLATES),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(template).render(**values) + "\n"

@@ -48,9 +48,15 @@ MODELS = {
 }
 """By network and window length K."""
 
+WINDOWS = (157, 128, 64, 32, 16, 8)
+"""Lengths K of the CIR that the paper compares."""
+
 SEEDS = 5
 EPOCHS = 30
 LEARNING_RATE = 3e-4
+BATCH = 32
+"""Of every fit, by Adam (section III-B)."""
+
 RAW_MAE_M = 0.1242
 RAW_SIGMA_M = 0.1642
 """Of the test room before correction (section III-C)."""

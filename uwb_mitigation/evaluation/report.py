@@ -15,22 +15,22 @@ from numpy.typing import NDArray
 from uwb_mitigation.evaluation import figures, paper, tables
 from uwb_mitigation.evaluation.page import Picture, Report
 from uwb_mitigation.evaluation.projection import Projection, principal_components
-from uwb_mitigation.evaluation.results import FirmwareRow, Spread, Trainings, clean
-from uwb_mitigation.evaluation.study import LOS, PAPER_SPLIT, Box, Study, examples
+from uwb_mitigation.evaluation.results import ExperimentResults, FirmwareRow, Spread, clean
+from uwb_mitigation.evaluation.splits import CONFIGURATIONS
+from uwb_mitigation.evaluation.study import LOS, Box, Study, examples
 from uwb_mitigation.evaluation.tables import Cell, Provenance, Table
-from uwb_mitigation.preprocessing import WINDOW_SIZES
 from uwb_mitigation.sources.deepuwb import ROOM_ROWS, ROOMS
 
 STEPS = 5
 """How often `build` tells of its progress."""
 
+BENCH_INPUTS = 5000
+"""Windows that `bench firmware` compares unless told otherwise."""
+
 _NO_SEEDS = "none: nothing is drawn or trained"
 _POINTS_SEED = 0
-_CONFIGURATIONS = "configurations"
-"""What a protocol's split of data without rooms is called, and begins with."""
-
 _SPLITS = {
-    "paper": f"paper ({PAPER_SPLIT})",
+    "paper": "paper (trained in the big and the small room, tested in the medium room)",
     "all_but_room_2": "all_but_room_2 (trained in all rooms but the medium one, tested there)",
 }
 
@@ -63,10 +63,20 @@ class Commands:
         words += ["--train", "quick"] if self.quick else []
         return _shell([*words, *(["--simulated"] if self.simulated else [])])
 
+    def filled(self, *, models: bool = False, firmware: bool = False) -> str:
+        """This report with the protocol's results, or the bench's, where it has none."""
+        given = None if self.quick else self.models
+        return replace(
+            self,
+            models=given or ("models" if models else None),
+            firmware=self.firmware or ("firmware.json" if firmware else None),
+            quick=self.quick and not models,
+        ).report
+
     @property
     def protocol(self) -> str:
         """Trains every network of the paper."""
-        return self.protocol_of(["remnet", "mlp", "remnet_attention"])
+        return self.protocol_of(["remnet", "mlp"])
 
     def protocol_of(self, networks: Sequence[str], options: Sequence[str] = ()) -> str:
         """Trains these networks, with further options."""
@@ -78,52 +88,68 @@ class Commands:
     @property
     def bench(self) -> str:
         """Measures the firmware."""
-        return _shell(["uwb-mitigation", "bench", "firmware", "--json", self.firmware or "firmware.json"])
+        return self.bench_of(())
+
+    def bench_of(self, rows: Sequence[FirmwareRow]) -> str:
+        """Measures the firmware as these rows were, with the options that are not the bench's own."""
+        words = ["uwb-mitigation", "bench", "firmware"]
+        inputs = max((row.inputs for row in rows), default=BENCH_INPUTS)
+        words += [] if inputs == BENCH_INPUTS else ["--inputs", str(inputs)]
+        words += ["--no-portable"] if rows and all(row.kernels != "portable" for row in rows) else []
+        return _shell([*words, "--json", self.firmware or "firmware.json"])
 
 
 def build(
     study: Study,
     commands: Commands,
-    trainings: Trainings | None = None,
+    trainings: ExperimentResults | None = None,
     left_m: Mapping[int, NDArray[np.floating]] | None = None,
     firmware: Sequence[FirmwareRow] = (),
     on_step: Callable[[], None] = lambda: None,
 ) -> Report:
-    """Every table and figure that the data, the trainings and the bench allow.
+    """Every table and figure that the data, the trainings and the bench allow; the others are named as lacking.
 
     Args:
         left_m: {K: errors that REMNet left on the test part, m, of all seeds}, for Fig. 5's boxes.
         on_step: called `STEPS` times.
     """
-    trained = _trained_provenance(study, trainings, commands)
-    to_train = f"{commands.protocol}, then {_with(commands, models=True)}"
-    to_bench = f"{commands.bench}, then {_with(commands, firmware=True)}"
-    nothing = _not_measured(commands.bench)
-    emulated = Provenance(
-        "windows drawn to press on every rounding",
-        "none: no accuracy is measured here",
-        "fixed, of the windows and of random weights; the cost depends on neither",
-        commands.bench,
-    )
-    shown = (
-        _data_table(study, commands),
-        tables.accuracy(trainings, trained, to_train, _measured(study)),
-        tables.sizes(trainings, trained, to_train),
-        tables.firmware(firmware, emulated if firmware else nothing, to_bench),
-    )
+    shown = [_data_table(study, commands)]
+    lacking = {}
+    to_train = f"{commands.protocol} && {commands.filled(models=True)}"
+    if trainings is None:
+        lacking["Tables 1 and 2, Fig. 5"] = commands.protocol
+    else:
+        trained = _trained_provenance(study, trainings, commands)
+        shown.append(tables.accuracy(trainings, trained, to_train, _measured(study)))
+        shown.append(tables.sizes(trainings, trained, to_train))
+    if firmware:
+        emulated = Provenance(
+            "windows drawn to press on every rounding",
+            "none: no accuracy is measured here",
+            "fixed, of the windows and of random weights; the cost depends on neither",
+            commands.bench_of(firmware),
+        )
+        to_bench = f"{commands.bench} && {commands.filled(firmware=True)}"
+        shown.append(tables.firmware(firmware, emulated, to_bench))
+    else:
+        lacking["Table 3"] = commands.bench
     on_step()
     pictures = [_samples(study, commands)]
     on_step()
     pictures += _projections(study, commands, on_step)
-    pictures.append(_over_k(study, trainings, left_m or {}, trained, to_train))
+    if trainings is not None:
+        pictures.append(_over_k(study, trainings, left_m or {}, trained, to_train))
     on_step()
+    filled = commands.filled(models=trainings is None, firmware=not firmware)
     return Report(
         "Range error mitigation: the paper's tables and figures",
         study.title,
         study.simulated,
         commands.report,
+        "; ".join(lacking),
+        " && ".join([*lacking.values(), filled]) if lacking else "",
         _notices(study, trainings, commands),
-        shown,
+        tuple(shown),
         tuple(pictures),
     )
 
@@ -133,25 +159,7 @@ def _shell(words: Sequence[str]) -> str:
     return clean(shlex.join(words), 2000)
 
 
-def _with(commands: Commands, *, models: bool = False, firmware: bool = False) -> str:
-    chosen = Commands(
-        commands.data,
-        commands.output,
-        (commands.models if not commands.quick else None) or ("models" if models else None),
-        commands.firmware or ("firmware.json" if firmware else None),
-        simulated=commands.simulated,
-        preamble=commands.preamble,
-    )
-    return chosen.report
-
-
-def _not_measured(command: str) -> Provenance:
-    return Provenance(tables.NOT_MEASURED, tables.NOT_MEASURED, tables.NOT_MEASURED, command)
-
-
-def _trained_provenance(study: Study, trainings: Trainings | None, commands: Commands) -> Provenance:
-    if trainings is None:
-        return _not_measured(commands.protocol)
+def _trained_provenance(study: Study, trainings: ExperimentResults, commands: Commands) -> Provenance:
     seeds = sorted({model.seed for model in trainings.models})
     return Provenance(
         trainings.data,
@@ -162,31 +170,31 @@ def _trained_provenance(study: Study, trainings: Trainings | None, commands: Com
     )
 
 
-def _epochs(trainings: Trainings) -> str:
-    return f"{trainings.epochs} epoch{'' if trainings.epochs == 1 else 's'}"
+def _epochs(trainings: ExperimentResults) -> str:
+    return f"{trainings.options.epochs} epoch{'' if trainings.options.epochs == 1 else 's'}"
 
 
-def _trained_by(study: Study, trainings: Trainings, commands: Commands) -> str:
+def _trained_by(study: Study, trainings: ExperimentResults, commands: Commands) -> str:
     """The command that trains as these were trained, with the options that are not the protocol's own."""
     networks = list(dict.fromkeys(model.network for model in trainings.models))
     seeds = len({model.seed for model in trainings.models})
     windows = sorted({model.samples for model in trainings.models}, reverse=True)
     # Only REMNet is trained at every length; the others have the longest alone.
-    every = WINDOW_SIZES if {"remnet", "remnet_k5"} & set(networks) else (max(WINDOW_SIZES),)
-    usual_split = "paper" if study.has_rooms else _CONFIGURATIONS
-    split = _CONFIGURATIONS if trainings.split.startswith(_CONFIGURATIONS) else trainings.split
+    every = paper.WINDOWS if {"remnet", "remnet_k5"} & set(networks) else (max(paper.WINDOWS),)
+    usual_split = "paper" if study.has_rooms else CONFIGURATIONS
+    split = CONFIGURATIONS if trainings.split.startswith(CONFIGURATIONS) else trainings.split
     options = {
-        "--split": (split if split in (*_SPLITS, _CONFIGURATIONS) else usual_split, usual_split),
+        "--split": (split if split in (*_SPLITS, CONFIGURATIONS) else usual_split, usual_split),
         "--windows": (",".join(map(str, windows)), ",".join(map(str, every))),
         "--seeds": (seeds, paper.SEEDS),
-        "--epochs": (trainings.epochs, paper.EPOCHS),
-        "--learning-rate": (trainings.learning_rate, paper.LEARNING_RATE),
+        "--epochs": (trainings.options.epochs, paper.EPOCHS),
+        "--learning-rate": (trainings.options.learning_rate, paper.LEARNING_RATE),
     }
     said = [(option, str(value)) for option, (value, usual) in options.items() if value != usual]
     return commands.protocol_of(networks, [word for pair in said for word in pair])
 
 
-def _notices(study: Study, trainings: Trainings | None, commands: Commands) -> tuple[str, ...]:
+def _notices(study: Study, trainings: ExperimentResults | None, commands: Commands) -> tuple[str, ...]:
     said = []
     if study.simulated:
         said.append(
@@ -207,16 +215,31 @@ def _notices(study: Study, trainings: Trainings | None, commands: Commands) -> t
             "The data is not the paper's (DeepUWB): the paper's figures stand beside for orientation, "
             "and are not the mark to reach."
         )
-    if trainings is not None and trainings.epochs < paper.EPOCHS:
+    if trainings is not None and trainings.options.epochs < paper.EPOCHS:
         how = "--train quick" if commands.quick else "the models given"
         said.append(
             f"The networks were trained for {_epochs(trainings)} ({how}), the paper's for {paper.EPOCHS}: "
             "their accuracy shows that everything works, not how well it can."
         )
+    if trainings is not None:
+        said += _quick(trainings)
     if refused := study.dataset.refused:
         reasons = ", ".join(f"{count:,} × {why}" for why, count in sorted(refused.items()))
         said.append(f"Measurements left out: {reasons}.")
     return tuple(said)
+
+
+def _quick(trainings: ExperimentResults) -> list[str]:
+    """That fewer networks were trained than the paper's tables have, if they were."""
+    seeds = len({model.seed for model in trainings.models})
+    lengths = len({model.samples for model in trainings.models} & set(paper.WINDOWS))
+    if seeds >= paper.SEEDS and lengths == len(paper.WINDOWS):
+        return []
+    return [
+        f"A quick look: {seeds} seed{'' if seeds == 1 else 's'} of {paper.SEEDS} and {lengths} of {len(paper.WINDOWS)} "
+        "lengths of the CIR were trained. The other rows of Tables 1 and 2 are not measured, and no spread over seeds is "
+        "told where there is but one."
+    ]
 
 
 def _own(study: Study, commands: Commands, split: str, seeds: str = _NO_SEEDS) -> Provenance:
@@ -342,28 +365,28 @@ def _at(projection: Projection, rows: NDArray[np.intp]) -> Projection:
 
 def _over_k(
     study: Study,
-    trainings: Trainings | None,
+    trainings: ExperimentResults,
     left_m: Mapping[int, NDArray[np.floating]],
     provenance: Provenance,
     missing: str,
 ) -> Picture:
-    rows = study.test_rows(trainings.test, trainings.mae_raw) if trainings else None
+    rows = study.test_rows(trainings.test, trainings.mae_raw)
     chosen = np.arange(len(study.dataset)) if rows is None else rows
     errors, is_los = study.dataset.error_m[chosen], study.labels[chosen] == LOS
     parts = {"all": errors, "LOS": errors[is_los], "NLOS": errors[~is_los]}
     raw = {name: Box.of(part) for name, part in parts.items() if len(part)}
     boxes = {samples: Box.of(left) for samples, left in left_m.items() if len(left)}
     spreads: dict[int, dict[str, Spread]] = {}
-    for samples in WINDOW_SIZES:
-        models = trainings.of("remnet", samples) if trainings else ()
+    for samples in paper.WINDOWS:
+        models = trainings.of("remnet", samples)
         values = {
-            "los": Spread.of([model.left["los"].mae for model in models]),
-            "nlos": Spread.of([model.left["nlos"].mae for model in models]),
-            "sigma": Spread.of([model.left["all"].sigma for model in models]),
+            "los": Spread.of([model.left.los.mae for model in models]),
+            "nlos": Spread.of([model.left.nlos.mae for model in models]),
+            "sigma": Spread.of([model.left.all.sigma for model in models]),
         }
         if models:
             spreads[samples] = {name: spread for name, spread in values.items() if spread is not None}
-    gaps = [samples for samples in WINDOW_SIZES if samples not in spreads or samples not in boxes]
+    gaps = [samples for samples in paper.WINDOWS if samples not in spreads or samples not in boxes]
     paper_mae = {
         samples: row.mae_m[2] for (network, samples), row in paper.MODELS.items() if network == "remnet"
     }
@@ -372,11 +395,11 @@ def _over_k(
         + ", ".join(f"{name} {spread.mean:.3f} m" for name, spread in spreads[samples].items())
         if samples in spreads
         else f"K = {samples}: not measured"
-        for samples in WINDOW_SIZES
+        for samples in paper.WINDOWS
     )
     before = "the test part" if rows is not None else "all measurements"
     why = ""
-    if trainings and any(samples in spreads and samples not in boxes for samples in WINDOW_SIZES):
+    if any(samples in spreads and samples not in boxes for samples in paper.WINDOWS):
         why = " A box is missing where the trained files, or the measurements they were tested on, are not at hand."
     return Picture(
         "fig5",
@@ -387,7 +410,7 @@ def _over_k(
         f"Black: the paper's int8 MAE (Table 1).{why}",
         "errors grow as K falls, and K = 8 is the least that is acceptable; its LOS and NLOS MAE and its sigma "
         "are given in the picture alone, so that no numbers can be put beside.",
-        figures.over_k(raw, boxes, spreads, paper_mae, WINDOW_SIZES),
+        figures.over_k(raw, boxes, spreads, paper_mae, paper.WINDOWS),
         {
             "raw": {name: asdict(box) for name, box in raw.items()},
             "errors": {str(samples): asdict(box) for samples, box in boxes.items()},

@@ -1,55 +1,116 @@
-"""What the protocol and the firmware bench wrote, checked: the numbers that a report shows. No files are read here.
+"""Files of results: `protocol.json` of the paper's experiment, and the firmware bench's JSON; one schema writes and reads.
 
-The training package defines what the protocol measures, but needs torch to be imported; a report does not.
+No torch here: a report needs none.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from pathlib import Path
+from typing import Annotated, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from uwb_mitigation.errors import DatasetError
+from uwb_mitigation.errors import DatasetError, UwbMitigationError
+from uwb_mitigation.files import read_bounded
+
+RESULTS = "protocol.json"
+MAX_BYTES = 64 * 2**20
+"""Of a file; the largest of ours are far smaller."""
 
 MAX_MODELS = 10_000
 FORMS = ("float", "optimised", "int8")
 """Of a trained network, in the order of the paper's columns."""
 
-PARTS = ("all", "los", "nlos")
 
-_Row = TypeVar("_Row")
-
-
-@dataclass(frozen=True, slots=True)
-class Left:
-    """Errors that a network leaves on a part of the test data, m; None where the part is empty."""
-
-    n: int
-    mae: float | None
-    sigma: float | None
+def clean(text: str, most: int = 120) -> str:
+    """Text from outside, fit for a page: printable, of valid Unicode, and not longer than `most`."""
+    valid = text.encode("utf-8", "replace").decode("utf-8")
+    shown = "".join(
+        character if character.isprintable() else "\N{REPLACEMENT CHARACTER}" for character in valid
+    )
+    return shown if len(shown) <= most else f"{shown[: most - 1]}…"
 
 
-@dataclass(frozen=True, slots=True)
-class Trained:
-    """One network, trained with one seed.
+Text = Annotated[str, AfterValidator(clean)]
+Count = Annotated[int, Field(ge=0, le=10**15)]
+Number = Annotated[float, Field(ge=0, le=1e15, allow_inf_nan=False)]
+
+
+class _Entry(BaseModel):
+    model_config = ConfigDict(frozen=True, strict=True)
+
+
+class PartErrors(_Entry):
+    """Errors left on a part of the test data, m. `n` may be 0; all else is then None.
+
+    Attributes:
+        mae: mean absolute error; `mae_raw` before any correction.
+        sigma: standard deviation of the signed error; `sigma_raw` before.
+    """
+
+    n: Count
+    mae_raw: Number | None
+    sigma_raw: Number | None
+    mae: Number | None
+    sigma: Number | None
+
+    @classmethod
+    def of(cls, raw_m: NDArray[np.floating], left_m: NDArray[np.floating]) -> PartErrors:
+        """Of errors of shape (n,), before and after."""
+        if len(raw_m) == 0:
+            return cls(n=0, mae_raw=None, sigma_raw=None, mae=None, sigma=None)
+        return cls(
+            n=len(raw_m),
+            mae_raw=float(np.abs(raw_m).mean()),
+            sigma_raw=float(np.std(raw_m)),
+            mae=float(np.abs(left_m).mean()),
+            sigma=float(np.std(left_m)),
+        )
+
+
+class ErrorsByCondition(_Entry):
+    """Errors left on the test part, on those of it that are in line of sight, and on those that are not."""
+
+    all: PartErrors
+    los: PartErrors
+    nlos: PartErrors
+
+
+class TrainedModel(_Entry):
+    """One network, trained with one seed. `None` where a network has no such form.
 
     Attributes:
         network, samples, seed: which; `samples` is the window length K.
-        parameters: trainable.
-        mae_m, size_bytes: of each of `FORMS`; None where the network has no such form.
-        left: {`all`, `los`, `nlos`: errors}, of int8 where there is one, else of float.
+        parameters, multiply_accumulates: of one inference.
+        mae_float, mae_optimised, mae_int8: on the test part, m (Table 1).
+        bytes_float, bytes_optimised, bytes_int8: of the files on disk (Table 2).
+        float_errors, int8_errors: on the test part (Fig. 5).
+        calibration_mae: {choice: MAE} of int8 on the training part, and `calibration`, the choice.
+        seconds: of training, wall clock; `samples_per_s` of it.
     """
 
-    network: str
-    samples: int
-    seed: int
-    parameters: int
-    mae_m: tuple[float | None, ...]
-    size_bytes: tuple[float | None, ...]
-    left: Mapping[str, Left]
+    network: Text
+    samples: Count
+    seed: Count
+    parameters: Count
+    multiply_accumulates: Count
+    mae_raw: Number
+    mae_float: Number
+    mae_optimised: Number | None
+    mae_int8: Number | None
+    bytes_float: Count | None
+    bytes_optimised: Count | None
+    bytes_int8: Count | None
+    float_errors: ErrorsByCondition
+    int8_errors: ErrorsByCondition | None
+    calibration: Text | None
+    calibration_mae: Mapping[str, Number] | None
+    seconds: Number
+    samples_per_s: Number
 
     @property
     def name(self) -> str:
@@ -57,50 +118,83 @@ class Trained:
         return f"{self.network}_{self.samples}_seed{self.seed}"
 
     @property
-    def is_int8(self) -> bool:
-        """Whether `left` is of the int8 form."""
-        return self.mae_m[FORMS.index("int8")] is not None
+    def mae_m(self) -> tuple[float | None, ...]:
+        """Of each of `FORMS`."""
+        return self.mae_float, self.mae_optimised, self.mae_int8
+
+    @property
+    def size_bytes(self) -> tuple[int | None, ...]:
+        """Of each of `FORMS`."""
+        return self.bytes_float, self.bytes_optimised, self.bytes_int8
+
+    @property
+    def left(self) -> ErrorsByCondition:
+        """Of int8 where there is one, else of float."""
+        return self.int8_errors or self.float_errors
 
 
-@dataclass(frozen=True, slots=True)
-class Baseline:
-    """What needs no network: the errors left on the test part; None, and why, where the data does not allow it."""
+class Baseline(_Entry):
+    """What needs no network, on the same split.
 
-    name: str
-    left: Left | None
-    reason: str
+    Attributes:
+        name: `los_median`, `overall_median` (of the training part's errors), or `line` (`evaluation.lad`).
+        errors: on the test part; None where the data does not allow it.
+        reason: why not; empty where there are errors.
+    """
+
+    name: Text
+    errors: ErrorsByCondition | None
+    reason: Text = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Trainings:
-    """The results of a protocol, and what they were measured on.
+class Settings(_Entry):
+    """Of every fit (see `training.options.FitOptions`)."""
+
+    epochs: Count
+    learning_rate: Number
+    batch: Count
+    dropout: Number
+    weight_decay: Number
+    seed: Count
+
+
+class ExperimentResults(_Entry):
+    """What the paper's experiment came to, and what it was measured on: what a table has to name beside its numbers.
 
     Attributes:
         data, split: names for people.
         train, test: measurements in each part.
-        epochs, learning_rate: of every fit.
-        mae_raw: of the test part before correction, m.
-        baselines: on the same parts; empty in a file of an earlier version.
+        options: of every fit, but for the seed.
+        baselines: empty in a file of an earlier version.
     """
 
-    data: str
-    split: str
-    train: int
-    test: int
-    epochs: int
-    learning_rate: float
-    mae_raw: float | None
-    models: tuple[Trained, ...]
-    baselines: tuple[Baseline, ...] = ()
+    data: Text
+    split: Text
+    train: Count
+    test: Count
+    options: Settings
+    models: Annotated[tuple[TrainedModel, ...], Field(max_length=MAX_MODELS)]
+    baselines: Annotated[tuple[Baseline, ...], Field(max_length=MAX_MODELS)] = ()
 
-    def of(self, network: str, samples: int) -> tuple[Trained, ...]:
+    @model_validator(mode="after")
+    def _each_once(self) -> ExperimentResults:
+        names = [model.name for model in self.models]
+        if twice := next((name for name in names if names.count(name) > 1), None):
+            raise ValueError(f"{twice} is there twice")
+        return self
+
+    @property
+    def mae_raw(self) -> float | None:
+        """Of the test part before correction, m."""
+        return self.models[0].mae_raw if self.models else None
+
+    def of(self, network: str, samples: int) -> tuple[TrainedModel, ...]:
         """Every seed of a network, in the order of seeds."""
         found = [model for model in self.models if (model.network, model.samples) == (network, samples)]
         return tuple(sorted(found, key=lambda model: model.seed))
 
 
-@dataclass(frozen=True, slots=True)
-class FirmwareRow:
+class FirmwareRow(_Entry):
     """One network on an emulated Cortex-M4; cycles, rate and energy are estimates, the rest is measured.
 
     Attributes:
@@ -112,18 +206,65 @@ class FirmwareRow:
         mismatches, inputs: outputs that differ from ONNX Runtime's, of how many.
     """
 
-    network: str
-    samples: int
-    first_kernel: int
-    kernels: str
-    instructions: float
-    cycles: float
-    ram_bytes: float
-    flash_bytes: float
-    rate_hz: float
-    energy_mj: float | None
-    mismatches: int
-    inputs: int
+    network: Text = Field(validation_alias="model")
+    samples: Count = Field(validation_alias="k")
+    first_kernel: Count = Field(validation_alias="k0")
+    kernels: Text
+    instructions: Number
+    cycles: Number = Field(validation_alias="cycles_estimated")
+    ram_bytes: Number
+    flash_bytes: Number
+    rate_hz: Number = Field(validation_alias="hz")
+    energy_mj: Number | None
+    mismatches: Count
+    inputs: Count
+
+
+class _FirmwareResults(_Entry):
+    rows: Annotated[tuple[FirmwareRow, ...], Field(max_length=MAX_MODELS)]
+
+
+Entry = TypeVar("Entry", bound=BaseModel)
+
+
+def parse(kind: type[Entry], text: str | bytes, where: str) -> Entry:
+    """The content of a JSON file.
+
+    Raises:
+        DatasetError: it is no such file; names the entry.
+    """
+    try:
+        return kind.model_validate_json(text)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        entry = ".".join(map(str, first["loc"])) or "the whole"
+        raise DatasetError(
+            f"{entry}: {first['msg']}", where=where, valid="a result file of this program"
+        ) from error
+
+
+def parse_firmware(text: str | bytes, where: str) -> tuple[FirmwareRow, ...]:
+    """The content of the JSON result of `uwb-mitigation bench firmware`; raises as `parse`."""
+    return parse(_FirmwareResults, text, where).rows
+
+
+def read_experiment(folder: Path) -> ExperimentResults:
+    """The results of a finished run.
+
+    Raises:
+        UwbMitigationError: there are none. DatasetError: the file is damaged.
+    """
+    return parse(ExperimentResults, read(folder / RESULTS), str(folder / RESULTS))
+
+
+def read(path: Path) -> bytes:
+    """The content of a file of results.
+
+    Raises:
+        UwbMitigationError: it cannot be read, is empty, or is too large.
+    """
+    valid = "what `uwb-mitigation protocol` or `bench firmware` wrote"
+    return read_bounded(path, MAX_BYTES, UwbMitigationError, valid)
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,140 +284,4 @@ class Spread:
         # Seeds are a sample of all seeds, hence n - 1.
         return cls(
             float(np.mean(known)), float(np.std(known, ddof=1)) if len(known) > 1 else None, len(known)
-        )
-
-
-def clean(text: str, most: int = 120) -> str:
-    """Text from outside, fit for a page: printable, of valid Unicode, and not longer than `most`."""
-    valid = text.encode("utf-8", "replace").decode("utf-8")
-    shown = "".join(
-        character if character.isprintable() else "\N{REPLACEMENT CHARACTER}" for character in valid
-    )
-    return shown if len(shown) <= most else f"{shown[: most - 1]}…"
-
-
-def parse_trainings(values: object, where: str) -> Trainings:
-    """The content of a `protocol.json`.
-
-    Raises:
-        DatasetError: it is not one; names the entry.
-    """
-    top = _Fields(values, where)
-    options = _Fields(top.get("options"), f"{where}: options")
-    models = top.rows("models", _trained)
-    names = [model.name for model in models]
-    if len(set(names)) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise DatasetError(f"{twice} is there twice", where=where, valid="each network, K and seed once")
-    return Trainings(
-        data=top.text("data"),
-        split=top.text("split"),
-        train=top.count("train"),
-        test=top.count("test"),
-        epochs=options.count("epochs"),
-        learning_rate=options.number("learning_rate"),
-        mae_raw=_Fields(top.get("models")[0], where).number("mae_raw") if models else None,
-        models=models,
-        baselines=top.rows("baselines", _baseline) if top.has("baselines") else (),
-    )
-
-
-def parse_firmware(values: object, where: str) -> tuple[FirmwareRow, ...]:
-    """The content of the JSON result of `uwb-mitigation bench firmware`.
-
-    Raises:
-        DatasetError: it is not one; names the entry.
-    """
-    return _Fields(values, where).rows("rows", _firmware_row)
-
-
-def _trained(fields: _Fields) -> Trained:
-    is_int8 = fields.get("int8_errors") is not None
-    errors = _Fields(fields.get("int8_errors" if is_int8 else "float_errors"), f"{fields.where}: errors")
-    return Trained(
-        network=fields.text("network"),
-        samples=fields.count("samples"),
-        seed=fields.count("seed"),
-        parameters=fields.count("parameters"),
-        mae_m=tuple(fields.optional(f"mae_{form}") for form in FORMS),
-        size_bytes=tuple(fields.optional(f"bytes_{form}") for form in FORMS),
-        left={part: _left(_Fields(errors.get(part), f"{errors.where}: {part}")) for part in PARTS},
-    )
-
-
-def _baseline(fields: _Fields) -> Baseline:
-    errors = fields.get("errors")
-    left = None if errors is None else _left(_Fields(_Fields(errors, fields.where).get("all"), fields.where))
-    return Baseline(fields.text("name"), left, fields.text("reason"))
-
-
-def _left(fields: _Fields) -> Left:
-    return Left(fields.count("n"), fields.optional("mae"), fields.optional("sigma"))
-
-
-def _firmware_row(fields: _Fields) -> FirmwareRow:
-    return FirmwareRow(
-        network=fields.text("model"),
-        samples=fields.count("k"),
-        first_kernel=fields.count("k0"),
-        kernels=fields.text("kernels"),
-        instructions=fields.number("instructions"),
-        cycles=fields.number("cycles_estimated"),
-        ram_bytes=fields.number("ram_bytes"),
-        flash_bytes=fields.number("flash_bytes"),
-        rate_hz=fields.number("hz"),
-        energy_mj=fields.optional("energy_mj"),
-        mismatches=fields.count("mismatches"),
-        inputs=fields.count("inputs"),
-    )
-
-
-class _Fields:
-    """The entries of a JSON object, each checked when it is asked for."""
-
-    def __init__(self, values: object, where: str) -> None:
-        self.where = where
-        if not isinstance(values, dict):
-            raise DatasetError("not an object", where=where, valid="a result file of this program")
-        self._values: dict[str, Any] = values
-
-    def _refused(self, key: str, valid: str) -> DatasetError:
-        return DatasetError(f"entry {key!r} is missing or wrong", where=self.where, valid=valid)
-
-    def has(self, key: str) -> bool:
-        return key in self._values
-
-    def get(self, key: str) -> Any:
-        if key not in self._values:
-            raise self._refused(key, "a result file of this program")
-        return self._values[key]
-
-    def text(self, key: str) -> str:
-        value = self.get(key)
-        if not isinstance(value, str):
-            raise self._refused(key, "text")
-        return clean(value)
-
-    def number(self, key: str) -> float:
-        value = self.get(key)
-        # A whole number may be too large for a float, and JSON's reader accepts NaN.
-        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= 1e15:
-            raise self._refused(key, "a number from 0 to 1e15")
-        return float(value)
-
-    def optional(self, key: str) -> float | None:
-        return None if self.get(key) is None else self.number(key)
-
-    def count(self, key: str) -> int:
-        value = self.number(key)
-        if not math.floor(value) == value:
-            raise self._refused(key, "a whole number")
-        return int(value)
-
-    def rows(self, key: str, parse: Callable[[_Fields], _Row]) -> tuple[_Row, ...]:
-        values = self.get(key)
-        if not isinstance(values, list) or len(values) > MAX_MODELS:
-            raise self._refused(key, f"a list of at most {MAX_MODELS}")
-        return tuple(
-            parse(_Fields(value, f"{self.where}: {key}[{number}]")) for number, value in enumerate(values)
         )

@@ -14,9 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError, ParameterError
+from uwb_mitigation.sources.deepuwb import RoomSplit, has_rooms, split_rows
 
 if TYPE_CHECKING:
     from uwb_mitigation.dataset import Dataset
+
+
+AUTO, CONFIGURATIONS = "auto", "configurations"
+SPLITS = (AUTO, CONFIGURATIONS, *(room.value for room in RoomSplit))
+FOLDS = 4
+"""Of data without rooms; one of them is the test part."""
 
 
 class Group(str, enum.Enum):
@@ -33,6 +40,23 @@ class Split:
 
     train: NDArray[np.intp]
     test: NDArray[np.intp]
+
+
+def by_name(configurations: NDArray[np.str_], name: str, folds: int = FOLDS) -> tuple[str, Split]:
+    """One of `SPLITS` and what to tell people of it; AUTO is the paper's for DeepUWB, else CONFIGURATIONS.
+
+    Raises:
+        ParameterError: there is no such split. DatasetError: the data cannot be split.
+    """
+    if name not in SPLITS:
+        raise ParameterError(f"split {name!r}", valid=", ".join(SPLITS))
+    if name == AUTO:
+        name = RoomSplit.PAPER.value if has_rooms(configurations) else CONFIGURATIONS
+    if name == CONFIGURATIONS:
+        fold = by_configuration(configurations, folds, seed=0)[0]
+        return f"{CONFIGURATIONS}: 1 of {folds} parts held out", fold
+    train, test = split_rows(configurations, RoomSplit(name))
+    return name, Split(np.flatnonzero(train), np.flatnonzero(test))
 
 
 def by_configuration(configurations: NDArray[np.str_], folds: int, seed: int) -> list[Split]:
@@ -92,8 +116,9 @@ def thinned(configurations: NDArray[np.str_], most: int, seed: int) -> NDArray[n
     """Rows in order, at most `most` of each configuration, drawn without replacement."""
     generator = np.random.default_rng(seed)
     chosen = []
-    for name in np.unique(configurations):
-        rows = np.flatnonzero(configurations == name)
+    _, of = np.unique(configurations, return_inverse=True)
+    order = np.argsort(of, kind="stable")
+    for rows in np.split(order, np.flatnonzero(np.diff(of[order])) + 1):
         if len(rows) > most:
             rows = generator.choice(rows, most, replace=False)
         chosen.append(rows)

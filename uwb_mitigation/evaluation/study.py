@@ -10,13 +10,11 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.dataset import Dataset
 from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.evaluation.results import Trained, clean
-from uwb_mitigation.evaluation.splits import by_configuration
+from uwb_mitigation.evaluation.results import TrainedModel, clean
+from uwb_mitigation.evaluation.splits import AUTO, by_name
 from uwb_mitigation.preprocessing import Preprocessing, Scaling
 from uwb_mitigation.sources import deepuwb
 
-QUICK_FOLDS = 4
-PAPER_SPLIT = "trained in the big and the small room, tested in the medium room"
 LOS = "LOS"
 NO_LABEL = "no label"
 
@@ -85,33 +83,13 @@ class Study:
         counts = {name: int((self.places == name).sum()) for name in deepuwb.ROOMS}
         return tuple(counts.values()) == deepuwb.ROOM_ROWS
 
-    def quick_split(self) -> tuple[str, NDArray[np.intp], NDArray[np.intp]]:
-        """What `--train quick` trains and tests on: name, rows to train on, rows to test on.
-
-        The paper's rooms; without rooms, one fold by configuration.
-
-        Raises:
-            DatasetError: the data cannot be split.
-        """
-        names = self.dataset.configurations
-        if self.has_rooms:
-            train, test = deepuwb.split_rows(names, deepuwb.RoomSplit.PAPER)
-            return PAPER_SPLIT, np.flatnonzero(train), np.flatnonzero(test)
-        split = by_configuration(names, QUICK_FOLDS, seed=0)[0]
-        count = len(np.unique(names[split.test]))
-        return (
-            f"by configuration: {count} of {len(self.dataset.names)} held out (fold 1 of {QUICK_FOLDS}, seed 0)",
-            split.train,
-            split.test,
-        )
-
     def test_rows(self, n: int, mae_raw: float | None) -> NDArray[np.intp] | None:
         """The rows that a training was tested on, recognised by their number and their raw MAE.
 
         None where they cannot be told: no errors are then shown rather than those of other rows.
         """
         try:
-            _, _, rows = self.quick_split()
+            rows = by_name(self.dataset.configurations, AUTO)[1].test
         except DatasetError:
             return None
         raw = float(np.abs(self.dataset.error_m[rows]).mean())
@@ -176,9 +154,9 @@ def examples(study: Study, most: int = 3) -> list[Example]:
     return found
 
 
-def agrees(model: Trained, left_m: NDArray[np.floating]) -> bool:
+def agrees(model: TrainedModel, left_m: NDArray[np.floating]) -> bool:
     """Whether errors left on the test rows are those that the training wrote down."""
-    mae = model.left["all"].mae
+    mae = model.left.all.mae
     return mae is not None and abs(float(np.abs(left_m).mean()) - mae) < 1e-4
 
 

@@ -7,9 +7,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 from uwb_mitigation.evaluation import paper
-from uwb_mitigation.evaluation.results import FORMS, Baseline, FirmwareRow, Left, Spread, Trained, Trainings
+from uwb_mitigation.evaluation.results import FORMS, ExperimentResults, FirmwareRow, Spread, TrainedModel
 from uwb_mitigation.model.architecture import Mlp, Remnet
-from uwb_mitigation.preprocessing import WINDOW_SIZES
 
 NOT_MEASURED = "not measured"
 
@@ -25,7 +24,7 @@ _BASELINES = {
     "overall_median": "Median error",
     "line": "L1 line",
 }
-_ROWS = [*(("remnet", samples) for samples in WINDOW_SIZES), ("mlp", max(WINDOW_SIZES))]
+_ROWS = [*(("remnet", samples) for samples in paper.WINDOWS), ("mlp", max(paper.WINDOWS))]
 _FORM_NAMES = ("float", "optimised", "int8")
 
 
@@ -96,12 +95,12 @@ def number(value: float | None, form: str, kind: str) -> Cell:
 
 
 def accuracy(
-    trainings: Trainings | None, provenance: Provenance, missing: str, measured: str = "Measured"
+    trainings: ExperimentResults, provenance: Provenance, missing: str, measured: str = "Measured"
 ) -> Table:
     """Table 1: MAE before and after graph optimisation and quantisation; `measured` heads our own columns."""
     rows = []
     for network, samples in _networks(trainings):
-        models = trainings.of(network, samples) if trainings else ()
+        models = trainings.of(network, samples)
         printed = paper.MODELS.get((network, samples))
         rows.append(
             (
@@ -115,11 +114,11 @@ def accuracy(
                 *(_seeds(models, [m.mae_m[form] for m in models], 1, 4) for form in range(len(FORMS))),
             )
         )
-    known = {baseline.name: baseline for baseline in trainings.baselines} if trainings else {}
-    if trainings is not None:
-        known["raw"] = Baseline("raw", Left(trainings.test, trainings.mae_raw, None), "")
+    known = {baseline.name: baseline for baseline in trainings.baselines}
     names = dict.fromkeys([*_BASELINES, *known])
-    rows += [_baseline_row(_BASELINES.get(name, name), known.get(name)) for name in names]
+    left = {name: None if b.errors is None else b.errors.all.mae for name, b in known.items()}
+    left["raw"] = trainings.mae_raw
+    rows += [_baseline_row(_BASELINES.get(name, name), name in left, left.get(name)) for name in names]
     reasons = [f" {_BASELINES.get(name, name)}: {b.reason}." for name, b in known.items() if b.reason]
     return Table(
         "table1",
@@ -136,20 +135,18 @@ def accuracy(
     )
 
 
-def _baseline_row(name: str, baseline: Baseline | None) -> tuple[Cell, ...]:
+def _baseline_row(name: str, measured: bool, mae_m: float | None) -> tuple[Cell, ...]:
     """A row of Table 1: neither CIR nor parameters, and one form alone."""
     none = Cell("–", "none")
-    left = Cell(NOT_MEASURED, "missing")
-    if baseline is not None:
-        left = number(None if baseline.left is None else baseline.left.mae, "{:.4f}", "measured")
+    left = number(mae_m, "{:.4f}", "measured") if measured else Cell(NOT_MEASURED, "missing")
     return (Cell(name, "head"), Cell("–", "head"), none, none, none, none, none, left, none, none)
 
 
-def sizes(trainings: Trainings | None, provenance: Provenance, missing: str) -> Table:
+def sizes(trainings: ExperimentResults, provenance: Provenance, missing: str) -> Table:
     """Table 2: sizes of the files."""
     rows = []
     for network, samples in _networks(trainings):
-        models = trainings.of(network, samples) if trainings else ()
+        models = trainings.of(network, samples)
         printed = paper.MODELS.get((network, samples))
         rows.append(
             (
@@ -248,31 +245,23 @@ def _firmware_cells(row: FirmwareRow | None, has_power: bool) -> list[Cell]:
     ]
 
 
-def _networks(trainings: Trainings | None) -> list[tuple[str, int]]:
-    """The paper's networks, the attention that it left out, and what else was trained."""
-    wanted = [*_ROWS, ("remnet_attention", max(WINDOW_SIZES))]
-    trained = [(model.network, model.samples) for model in trainings.models] if trainings else []
-    return list(dict.fromkeys([*wanted, *trained]))
+def _networks(trainings: ExperimentResults) -> list[tuple[str, int]]:
+    """The paper's networks, and what else was trained."""
+    return list(dict.fromkeys([*_ROWS, *((model.network, model.samples) for model in trainings.models)]))
 
 
 def _heads(network: str, samples: int) -> tuple[Cell, Cell]:
     return Cell(network_name(network), "head"), Cell(str(samples), "head")
 
 
-def _parameters(network: str, samples: int, models: Sequence[Trained]) -> Cell:
+def _parameters(network: str, samples: int, models: Sequence[TrainedModel]) -> Cell:
     """Of the trained network, else of its architecture: a count needs no training."""
-    if models:
-        count = models[0].parameters
-    elif network == "remnet":
-        count = Remnet(samples).parameters
-    elif network == "mlp":
-        count = Mlp(samples).parameters
-    else:
-        return Cell(NOT_MEASURED, "missing")
+    shape = Mlp if network == "mlp" else Remnet
+    count = models[0].parameters if models else shape(samples).parameters
     return Cell(str(count), "measured", count)
 
 
-def _seeds(models: Sequence[Trained], values: list[float | None], unit: float, digits: int) -> Cell:
+def _seeds(models: Sequence[TrainedModel], values: list[float | None], unit: float, digits: int) -> Cell:
     spread = Spread.of([None if value is None else value / unit for value in values])
     if spread is None:
         return Cell("–", "none") if models else Cell(NOT_MEASURED, "missing")

@@ -11,14 +11,14 @@ import numpy as np
 
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.evaluation.metrics import ErrorStatistics, coverage, mae_by_group
-from uwb_mitigation.mitigation import Mitigation
-from uwb_mitigation.sources.source import Record
+from uwb_mitigation.measurement import Record
+from uwb_mitigation.mitigation import Mitigation, correct_batch
 
 _BATCH = 256
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class Accuracy:
     """What one model does to one recording.
 
     Attributes:
@@ -70,11 +70,11 @@ class Outcome:
 def evaluate(
     mitigation: Mitigation,
     records: Iterable[Record],
-    on_progress: Callable[[int], None] = lambda count: None,
-) -> Outcome:
+    on_record: Callable[[], None] = lambda: None,
+) -> Accuracy:
     """Correct every measurement and compare with its truth; those without a true or a valid range are left out.
 
-    `on_progress` is told how many records have been read.
+    `on_record` is called for each record that was read.
 
     Raises:
         DatasetError: nothing is left to compare.
@@ -84,7 +84,7 @@ def evaluate(
     stream = iter(records)
     read = 0
     while batch := list(islice(stream, _BATCH)):
-        results = mitigation.correct_batch([record.measurement for record in batch])
+        results = correct_batch(mitigation, [record.measurement for record in batch])
         for record, result in zip(batch, results, strict=True):
             # An infinite variance marks a range that is none.
             if record.truth is None or not np.isfinite(record.truth.range_m + result.variance_m2):
@@ -96,7 +96,8 @@ def evaluate(
             configurations.append(record.truth.configuration)
             statuses[result.status.name] += 1
         read += len(batch)
-        on_progress(read)
+        for _ in batch:
+            on_record()
     if not raw:
         raise DatasetError(f"none of {read} measurements has a valid range and a true one")
     before, after, spread = np.array(raw), np.array(corrected), np.array(variance)
@@ -104,7 +105,7 @@ def evaluate(
     # For people, says the card: whatever JSON holds may stand there.
     learnt = card.training.get("configurations")
     known = {name for name in set(configurations) if isinstance(learnt, list) and name in learnt}
-    return Outcome(
+    return Accuracy(
         n=len(raw),
         raw=ErrorStatistics.of(before),
         corrected=ErrorStatistics.of(after),

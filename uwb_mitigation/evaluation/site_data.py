@@ -1,0 +1,199 @@
+"""What was recorded at a site, in columns, and as a `Dataset` once it is known how long its ranges truly were."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.dataset import Dataset
+from uwb_mitigation.errors import DatasetError
+from uwb_mitigation.measurement import Record
+from uwb_mitigation.mitigation import MAX_RANGE_M
+from uwb_mitigation.positioning.anchors import AnchorMap
+from uwb_mitigation.positioning.tracks import Ranges
+from uwb_mitigation.preprocessing import Preprocessing
+
+WITH_CIR = 0.5
+"""Where fewer of the ranges have a CIR that can be used, none counts."""
+
+CHUNK_S = 2.0
+"""Ranges of a pair in motion err alike for about so long: a configuration."""
+
+FOLD_S = 10.0
+"""Stretches of motion that are held out as a whole."""
+
+BETWEEN_NS = 3_600_000_000_000
+_SECOND_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SiteData:
+    """Ranges of all tags of all recordings, one tag after the other.
+
+    Attributes:
+        anchors: of the site.
+        tags: of each, in the order of time.
+        preprocessing, inputs: float32 (r, K), zeros where there is no CIR.
+        rx_power_dbm, first_path_power_dbm: float32 (r,), NaN = unknown.
+        has_cirs: whether the inputs say anything.
+        left_out: {why: count}.
+        shift_ns: what was added to the stamps of each recording, so that none overlap.
+    """
+
+    anchors: AnchorMap
+    tags: tuple[Ranges, ...]
+    preprocessing: Preprocessing
+    inputs: NDArray[np.float32]
+    rx_power_dbm: NDArray[np.float32]
+    first_path_power_dbm: NDArray[np.float32]
+    has_cirs: bool
+    left_out: Counter[str]
+    shift_ns: tuple[int, ...]
+
+    @property
+    def begins(self) -> NDArray[np.intp]:
+        """Where each tag's ranges begin among all."""
+        return np.cumsum([0, *map(len, self.tags)])[:-1].astype(np.intp)
+
+    def labelled(
+        self,
+        rows: NDArray[np.intp],
+        true_m: NDArray[np.float64],
+        offset_m: NDArray[np.float64],
+        stretch: NDArray[np.intp],
+        at_rest: NDArray[np.bool_],
+    ) -> Dataset:
+        """A dataset whose errors are those of ranges less their radios' offset, float64 (k,) each.
+
+        Args:
+            rows: which of all ranges.
+            stretch: int (k,), of motion or rest; `at_rest`: bool (k,). A configuration is a pair at rest, or a pair for
+                `CHUNK_S` of motion; its name begins with what is held out together, "stretch 3.1/".
+        """
+        every = {
+            name: np.concatenate([getattr(one, name) for one in self.tags])[rows]
+            for name in ("stamp_ns", "anchor", "range_m")
+        }
+        tag = np.repeat([one.tag_id for one in self.tags], list(map(len, self.tags))).astype(np.uint64)[rows]
+        first = np.full(int(stretch.max()) + 1, np.iinfo(np.int64).max)
+        np.minimum.at(first, stretch, every["stamp_ns"])
+        since = (every["stamp_ns"] - first[stretch]) / _SECOND_NS
+        chunk = np.where(at_rest, 0, since // CHUNK_S).astype(int)
+        fold = np.where(at_rest, 0, since // FOLD_S).astype(int)
+        names = [
+            f"stretch {s}.{f}/{c}/tag {t}/anchor {a}"
+            for s, f, c, t, a in zip(stretch, fold, chunk, tag, every["anchor"], strict=True)
+        ]
+        identities = np.array([anchor.id for anchor in self.anchors.anchors], np.uint64)
+        less = every["range_m"] - offset_m
+        return Dataset(
+            self.preprocessing,
+            self.inputs[rows],
+            self.rx_power_dbm[rows],
+            self.first_path_power_dbm[rows],
+            less,
+            less - true_m,
+            np.array(names),
+            np.full(len(rows), ""),
+            tags=tag,
+            anchors=identities[every["anchor"]],
+        )
+
+
+def gather(
+    recordings: Iterable[Iterable[Record]],
+    anchors: AnchorMap,
+    preprocessing: Preprocessing,
+    on_record: Callable[[], None] = lambda: None,
+) -> SiteData:
+    """Read recordings; what they know of the truth is not looked at.
+
+    Raises:
+        DatasetError: no range is of an anchor in the map.
+    """
+    left_out: Counter[str] = Counter()
+    rows: dict[int, list[tuple[int, int, float, float, float, bool]]] = {}
+    windows: dict[int, list[NDArray[np.float32]]] = {}
+    strangers: Counter[int] = Counter()
+    shifts: list[int] = []
+    latest: int | None = None
+    for recording in recordings:
+        shift: int | None = None
+        here = latest
+        for record in recording:
+            on_record()
+            measured = record.measurement
+            if shift is None:
+                shift = (
+                    0 if here is None or measured.stamp_ns > here else here - measured.stamp_ns + BETWEEN_NS
+                )
+            row = anchors.index.get(measured.anchor_id)
+            if row is None:
+                strangers[measured.anchor_id] += 1
+                continue
+            if not (math.isfinite(measured.range_m) and 0 <= measured.range_m <= MAX_RANGE_M):
+                left_out["no valid range"] += 1
+                continue
+            window = np.zeros(preprocessing.samples, np.float32)
+            fault = preprocessing.apply(measured.cir, window)
+            if fault is not None:
+                window[:] = 0.0
+            stamp_ns = measured.stamp_ns + shift
+            latest = stamp_ns if latest is None else max(latest, stamp_ns)
+            cir = measured.cir
+            power = cir.rx_power_dbm, cir.first_path_power_dbm
+            rows.setdefault(measured.tag_id, []).append(
+                (stamp_ns, row, measured.range_m, *power, fault is None)
+            )
+            windows.setdefault(measured.tag_id, []).append(window)
+        shifts.append(shift or 0)
+    for identity, count in strangers.items():
+        left_out[f"anchor {identity} is not in the anchors file"] += count
+    if not rows:
+        seen = ", ".join(map(str, sorted(strangers))) or "none"
+        raise DatasetError(
+            f"no range of the anchors {', '.join(map(str, sorted(anchors.index)))}",
+            valid=f"the recording's ranges come from anchors: {seen}",
+        )
+    with_cir = np.array([row[5] for tag in sorted(rows) for row in rows[tag]])
+    has_cirs = bool(with_cir.mean() >= WITH_CIR)
+    if has_cirs and not with_cir.all():
+        left_out["no CIR that can be used"] += int((~with_cir).sum())
+    tags, inputs, powers = [], [], []
+    for tag in sorted(rows):
+        order = sorted(range(len(rows[tag])), key=lambda i, own=rows[tag]: own[i][0])  # type: ignore[misc]
+        kept = [i for i in order if rows[tag][i][5] or not has_cirs]
+        if not kept:
+            continue
+        part = [rows[tag][i] for i in kept]
+        rx = np.array([row[3] for row in part], np.float64)
+        tags.append(
+            Ranges(
+                np.array([row[0] for row in part], np.int64),
+                np.array([row[1] for row in part], np.intp),
+                np.array([row[2] for row in part], np.float64),
+                np.full(len(part), np.nan),
+                np.where(np.isfinite(rx), rx, np.nan),
+                tag,
+            )
+        )
+        inputs.append(np.stack([windows[tag][i] for i in kept]))
+        powers.append(np.array([row[3:5] for row in part], np.float64))
+    reported = np.concatenate(powers)
+    level = np.where(np.isfinite(reported), reported, np.nan).astype(np.float32)
+    return SiteData(
+        anchors,
+        tuple(tags),
+        preprocessing,
+        np.concatenate(inputs),
+        level[:, 0],
+        level[:, 1],
+        has_cirs,
+        left_out,
+        tuple(shifts),
+    )
