@@ -32,19 +32,20 @@ from uwb_mitigation.measurement import (
     Encoding,
     Origin,
     RangeMeasurement,
+    Record,
     Status,
     Truth,
 )
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.architecture import Remnet
 from uwb_mitigation.model.bundle import load_bundle
-from uwb_mitigation.model.shipped import default_model_path
+from uwb_mitigation.model.shipped import shipped_model_path
+from uwb_mitigation.offsets import NO_OFFSETS, Offsets
 from uwb_mitigation.preprocessing import Preprocessing, Scaling
-from uwb_mitigation.processing import running
+from uwb_mitigation.processing import pool
 from uwb_mitigation.processing.job import Job, Outcome, attempt, process_bag
 from uwb_mitigation.processing.planning import plan
-from uwb_mitigation.processing.running import run_here, run_on_dask
-from uwb_mitigation.sources.source import Record
+from uwb_mitigation.processing.pool import run_here, run_on_dask
 
 REPOSITORY = Path(__file__).parent.parent
 START_NS = 1_700_000_000_000_000_000
@@ -130,15 +131,15 @@ def exchanges(count: int) -> list[RangeMeasurement]:
 
 
 def job(source: Path, output: Path, **options: object) -> Job:
-    return Job(source, output, default_model_path(), **options)  # type: ignore[arg-type]
+    return Job(source, output, shipped_model_path("evk1000_apartment"), **options)  # type: ignore[arg-type]
 
 
 def corrected_of(path: Path) -> list[bytes]:
     return [message.data for message in BagReader(path).messages([RANGE_CORRECTED])]
 
 
-def one_by_one(measurements: list[RangeMeasurement]) -> list[bytes]:
-    mitigation = Mitigation(load_bundle(default_model_path()))
+def one_by_one(measurements: list[RangeMeasurement], offsets: Offsets = NO_OFFSETS) -> list[bytes]:
+    mitigation = Mitigation(load_bundle(shipped_model_path("evk1000_apartment")), offsets)
     return [codec.encode_corrected(m, mitigation.correct(m)) for m in measurements]
 
 
@@ -419,8 +420,9 @@ def test_a_damaged_bag_is_processed_as_far_as_it_goes(tmp_path: Path) -> None:
 def test_the_command_writes_a_bag_and_its_result(tmp_path: Path) -> None:
     write_bag(tmp_path / "in.mcap", exchanges(40))
     done = start(
-        "process", "in.mcap", "-o", "out.mcap", "--compare-copy", "--json", "out.json", folder=tmp_path
-    )
+        "process", "in.mcap", "-o", "out.mcap", "--model", "evk1000_apartment", "--compare-copy", "--json", "out.json",
+        folder=tmp_path,
+    )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "40 ranges" in done.stdout
     result = json.loads((tmp_path / "out.json").read_text())
@@ -436,6 +438,39 @@ def test_the_command_writes_a_bag_and_its_result(tmp_path: Path) -> None:
     assert corrected_of(tmp_path / "out.mcap") == one_by_one(exchanges(40))
 
 
+def test_offsets_of_a_file_are_taken_off_each_pair(tmp_path: Path) -> None:
+    write_bag(tmp_path / "in.mcap", exchanges(30))
+    # Of the three anchors one has its own offset, one its own with this tag.
+    offsets = "default: 0.2\nanchors: {2: 0.35}\npairs: [{anchor: 3, tag: 7, offset: -0.1}]\n"
+    (tmp_path / "offsets.yaml").write_text(offsets)
+    done = run(
+        "process",
+        "in.mcap",
+        "-o",
+        "out.mcap",
+        "--offsets",
+        "offsets.yaml",
+        "--model",
+        "evk1000_apartment",
+        folder=tmp_path,
+    )
+    assert done.returncode == 0, done.stderr
+    expected = one_by_one(exchanges(30), Offsets(0.2, {2: 0.35}, pairs={(7, 3): -0.1}))
+    assert corrected_of(tmp_path / "out.mcap") == expected
+    without = [codec.decode_corrected(data)[1].correction_m for data in one_by_one(exchanges(30))]
+    more = [codec.decode_corrected(data)[1].correction_m for data in expected]
+    assert np.subtract(more, without)[:3] == pytest.approx([0.2, 0.35, -0.1], abs=1e-6)
+
+
+def test_cirs_without_a_preamble_count_get_the_model_that_needs_none(tmp_path: Path) -> None:
+    write_bag(tmp_path / "in.mcap", [exchange(n, {"preamble_count": 0}) for n in range(4)])
+    done = start("process", "in.mcap", "-o", "out.mcap", "--json", "out.json", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "universal_amplitude" in done.stderr
+    amplitude = load_bundle(shipped_model_path("universal_amplitude"))
+    assert json.loads((tmp_path / "out.json").read_text())["model_id"] == amplitude.model_id
+
+
 def test_an_output_that_is_there_is_kept_unless_forced(tmp_path: Path) -> None:
     source = write_bag(tmp_path / "in.mcap", exchanges(4))
     output = write_bag(tmp_path / "out.mcap", exchanges(1))
@@ -446,6 +481,16 @@ def test_an_output_that_is_there_is_kept_unless_forced(tmp_path: Path) -> None:
     assert corrected_of(output) == []
     assert run("process", source, "-o", output, "--force", folder=tmp_path).returncode == 0
     assert len(corrected_of(output)) == 4
+
+
+def test_a_link_that_leads_nowhere_is_replaced_only_when_forced(tmp_path: Path) -> None:
+    source = write_bag(tmp_path / "in.mcap", exchanges(4))
+    (tmp_path / "out.mcap").symlink_to(tmp_path / "nowhere.mcap")
+    with pytest.raises(RecordingError, match="--force"):
+        process_bag(job(source, tmp_path / "out.mcap"))
+    process_bag(job(source, tmp_path / "out.mcap", force=True))
+    assert len(corrected_of(tmp_path / "out.mcap")) == 4
+    assert not (tmp_path / "nowhere.mcap").exists()
 
 
 def test_one_bad_bag_is_reported_and_does_not_stop_the_rest(tmp_path: Path) -> None:
@@ -478,6 +523,7 @@ def test_one_bad_bag_is_reported_and_does_not_stop_the_rest(tmp_path: Path) -> N
         (["empty", "-o", "out"], "holds no MCAP bag"),
         (["in.mcap", "-o", "out.mcap", "--jobs", "0"], "jobs = 0"),
         (["in.mcap", "-o", "out.mcap", "--model", "absent.onnx"], "absent.onnx"),
+        (["in.mcap", "-o", "out.mcap", "--offsets", "absent.yaml"], "absent.yaml"),
         (["in.mcap", "-o", "no/such/folder.mcap"], "cannot be written"),
     ],
 )
@@ -542,7 +588,7 @@ def test_of_a_worker_that_was_stopped_anywhere_no_partial_file_stays(tmp_path: P
 
     stopped = job(tmp_path / "in.mcap", tmp_path / "out.mcap")
     (tmp_path / "out.mcap.part").write_bytes(b"begun")
-    running._stop([Left()], [stopped])
+    pool._stop([Left()], [stopped])
     assert list(tmp_path.iterdir()) == []
 
 
@@ -608,7 +654,3 @@ def test_without_dask_the_error_says_how_to_get_it(monkeypatch: pytest.MonkeyPat
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(MissingDependencyError, match="pip install distributed"):
         list(run_on_dask([job(tmp_path / "a", tmp_path / "b")], "tcp://127.0.0.1:8786"))
-
-
-def test_every_core_that_may_be_used_is_used() -> None:
-    assert running.cores() == len(os.sched_getaffinity(0))

@@ -15,14 +15,15 @@ from pathlib import Path
 
 from uwb_mitigation.bag import columns, schemas
 from uwb_mitigation.bag.codec import decode_range, encode_corrected
-from uwb_mitigation.bag.container import RawMessage
+from uwb_mitigation.bag.index import RawMessage
 from uwb_mitigation.bag.reader import BagReader, check_channel
 from uwb_mitigation.bag.topics import RANGE_CIR_TYPE, RANGE_CORRECTED, RANGE_RAW
 from uwb_mitigation.bag.writer import METADATA_RECORD, BagWriter
-from uwb_mitigation.errors import DamagedRecordingError, RecordingError, UwbMitigationError, not_installed
+from uwb_mitigation.errors import DamagedRecordingError, RecordingError, UwbMitigationError, not_imported
 from uwb_mitigation.measurement import Status
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import load_bundle
+from uwb_mitigation.offsets import NO_OFFSETS, Offsets
 from uwb_mitigation.processing import copying
 
 BATCH = 256
@@ -44,7 +45,8 @@ class Job:
         model: the bundle to correct with.
         force: replace `output` if it is there.
         described: write `metadata.yaml` beside a one-file output.
-        compare_copy: also time loops that only read and rewrite the bag.
+        compare_copy: also time a loop that only reads and rewrites the bag.
+        offsets: of the radios.
     """
 
     source: Path
@@ -53,6 +55,7 @@ class Job:
     force: bool = False
     described: bool = True
     compare_copy: bool = False
+    offsets: Offsets = NO_OFFSETS
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +71,6 @@ class Outcome:
         skipped: oddities, {kind: count}.
         seconds: wall time of reading, correcting and writing.
         copy_seconds: wall time of reading and rewriting alone, with the `mcap` library; None = not asked for.
-        own_copy_seconds: the same with this package's reader and writer.
         notice: what the user should know; may be empty.
         error: why there is no output or, after damage, why it is not the whole bag; None = success.
         written: whether there is an output.
@@ -82,7 +84,6 @@ class Outcome:
     skipped: Counter[str] = field(default_factory=Counter)
     seconds: float = 0.0
     copy_seconds: float | None = None
-    own_copy_seconds: float | None = None
     notice: str = ""
     error: UwbMitigationError | None = None
     written: bool = False
@@ -94,8 +95,10 @@ def attempt(job: Job, report: Report | None = None) -> Outcome:
         return process_bag(job, report)
     except UwbMitigationError as error:
         return Outcome(job, error=error)
-    except ModuleNotFoundError as error:
-        return Outcome(job, error=not_installed((error.name or str(error)).partition(".")[0]))
+    except ImportError as error:
+        if (absent := not_imported(error)) is None:
+            raise
+        return Outcome(job, error=absent)
     except MemoryError:
         return Outcome(job, error=RecordingError("not enough memory", where=str(job.source)))
     except OSError as error:
@@ -111,7 +114,7 @@ def process_bag(job: Job, report: Report | None = None) -> Outcome:
             or cannot be written. Nothing is left of an output then.
         ModelError: the model cannot be used.
     """
-    mitigation = Mitigation(load_bundle(job.model))
+    mitigation = Mitigation(load_bundle(job.model), job.offsets)
     # Once a process, and as long as thousands of ranges take: no part of a bag's own time.
     schemas.typestore()
     started = time.perf_counter()
@@ -119,7 +122,7 @@ def process_bag(job: Job, report: Report | None = None) -> Outcome:
     known = bag.metadata.get(METADATA_RECORD, {})
     origin = {
         "source": f"{job.source.name}, corrected by model {mitigation.bundle.model_id:08x}",
-        "simulated": known.get("simulated", "false"),
+        "simulated": known.get("simulated", "unknown"),
     }
     with BagWriter(job.output, origin, force=job.force, described=job.described) as out:
         corrector = _Corrector(job.source, mitigation, out)
@@ -150,10 +153,7 @@ def process_bag(job: Job, report: Report | None = None) -> Outcome:
                 f"no topic {RANGE_RAW}", where=str(job.source), valid=f"the bag holds: {held}"
             )
     seconds = time.perf_counter() - started
-    copy_seconds = own_copy_seconds = None
-    if job.compare_copy:
-        copy_seconds = copying.time_library_copy(job.source, job.output)
-        own_copy_seconds = copying.time_own_copy(job.source, job.output)
+    copy_seconds = copying.time_copy(job.source, job.output) if job.compare_copy else None
     return Outcome(
         job,
         messages=done,
@@ -163,7 +163,6 @@ def process_bag(job: Job, report: Report | None = None) -> Outcome:
         skipped=corrector.skipped + bag.oddities,
         seconds=seconds,
         copy_seconds=copy_seconds,
-        own_copy_seconds=own_copy_seconds,
         notice=out.notice,
         error=damage,
         written=True,

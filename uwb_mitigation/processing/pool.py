@@ -1,6 +1,7 @@
 """Many jobs at once: a process for each bag on this machine, or an existing Dask cluster.
 
-A process of its own keeps a bag that exhausts memory or crashes a library from taking others with it.
+A process of its own keeps a bag that exhausts memory or crashes a library from taking others with it. Dask beside
+the processes: they need nothing but Python and have one machine's cores, a fleet's recordings need many machines.
 """
 
 from __future__ import annotations

@@ -1,0 +1,64 @@
+"""Nodes that a bench or a demo starts end with it, however it ends."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
+
+TIMEOUT_S = 60.0
+RUNS = {
+    "bench": ["-c", "from uwb_mitigation.entry import command_line; command_line()", "bench", "nodes"],
+    "demo": ["-m", "uwb_mitigation.entry", "demo"],
+}
+
+
+def nodes_of(pid: int) -> list[psutil.Process]:
+    """The nodes that a process has started."""
+    return [
+        child
+        for child in psutil.Process(pid).children(recursive=True)
+        if {"uwb_mitigation.entry", "-m"} <= set(child.cmdline())
+    ]
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize(
+    ("run", "number", "code"),
+    [
+        ("bench", signal.SIGTERM, 143),
+        ("bench", signal.SIGKILL, -9),
+        ("demo", signal.SIGTERM, 143),
+        ("demo", signal.SIGINT, 130),
+    ],
+)
+def test_nodes_end_with_who_started_them(run: str, number: signal.Signals, code: int, tmp_path: Path):
+    # Each isolates itself.
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("ROS_")}
+    with (tmp_path / "said").open("wb") as said:
+        running = subprocess.Popen(
+            [sys.executable, *RUNS[run]], env=environment, stdout=said, stderr=subprocess.STDOUT
+        )
+    try:
+        deadline = time.monotonic() + TIMEOUT_S
+        while len(nodes := nodes_of(running.pid)) < 2:
+            assert running.poll() is None, (tmp_path / "said").read_text()
+            assert time.monotonic() < deadline, "it starts no nodes"
+            time.sleep(0.05)
+        running.send_signal(number)
+        assert running.wait(TIMEOUT_S) == code, (tmp_path / "said").read_text()
+        _, left = psutil.wait_procs(nodes, TIMEOUT_S)
+        for node in left:
+            node.kill()
+        assert not left
+    finally:
+        running.kill()
+        running.wait()
