@@ -1,0 +1,125 @@
+"""The system's Chromium, driven through Selenium, for tests of pages."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+SCREENS = Path(__file__).resolve().parents[1] / "build" / "screens"
+TIMEOUT_S = 120.0
+
+_OPTIONS = (
+    "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-dev-shm-usage",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync", "--hide-scrollbars",
+)  # fmt: skip
+
+
+class Browser:
+    """One window."""
+
+    def __init__(self, driver: Any) -> None:
+        self.driver = driver
+
+    def open(self, url: str, width: int = 1280, height: int = 1000) -> None:
+        self.resize(width, height)
+        # What an earlier page still complains of is none of this one's.
+        self.driver.get("about:blank")
+        self.driver.get_log("browser")
+        self.driver.get(url)
+
+    def resize(self, width: int, height: int) -> None:
+        self.driver.execute_cdp_cmd(
+            "Emulation.setDeviceMetricsOverride",
+            {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False},
+        )
+
+    def run(self, script: str, *arguments: object) -> Any:
+        return self.driver.execute_script(script, *arguments)
+
+    def wait(self, what: str, condition: Callable[[], Any]) -> Any:
+        """What `condition` returns once it is true."""
+        end_s = time.monotonic() + TIMEOUT_S
+        while not (found := condition()):
+            assert time.monotonic() < end_s, f"not within {TIMEOUT_S} s: {what}"
+            time.sleep(0.05)
+        return found
+
+    def ready(self) -> bool:
+        """Whether a page of Bokeh's is there and has drawn."""
+        return bool(self.run("return !!(window.Bokeh && Bokeh.documents[0]?.is_idle)"))
+
+    def cell(self, text: str) -> Any:
+        """The element with a text, in whatever shadow tree; None where there is none."""
+        return self.run(
+            "const wanted = arguments[0], find = (root) => { for (const e of root.querySelectorAll('*')) {"
+            " if (e.children.length == 0 && e.textContent == wanted) return e;"
+            " if (e.shadowRoot) { const f = find(e.shadowRoot); if (f) return f; } } return null; };"
+            "return find(document)",
+            text,
+        )
+
+    def click_figure(self, name: str, x: float, y: float) -> None:
+        """Click where a named figure of Bokeh's shows a place, as a mouse does."""
+        from selenium.webdriver.common.action_chains import ActionChains
+
+        left, top = self.run(
+            "const view = Bokeh.index.find_one(Bokeh.documents[0].get_model_by_name(arguments[0]));"
+            "view.el.scrollIntoView({block: 'center'});"
+            "const at = view.canvas_view.el.getBoundingClientRect();"
+            "return [at.x + view.frame.x_scale.compute(arguments[1]), at.y + view.frame.y_scale.compute(arguments[2])]",
+            name,
+            x,
+            y,
+        )
+        actions = ActionChains(self.driver)
+        actions.w3c_actions.pointer_action.move_to_location(round(left), round(top))
+        actions.w3c_actions.pointer_action.click()
+        actions.perform()
+
+    def complaints(self) -> list[str]:
+        """What the page wrote to the console beyond information."""
+        return [line["message"] for line in self.driver.get_log("browser") if line["level"] != "INFO"]
+
+    def cut_off(self, width: int) -> list[str]:
+        """What reaches beyond the right edge of a page that is `width` wide, without a bar to move it by."""
+        self.resize(width, 1100)
+        if self.run("return document.documentElement.scrollWidth") <= width:
+            return []
+        return self.run(
+            "return [...document.querySelectorAll('body *')].filter((e) => e.getBoundingClientRect().right > arguments[0])"
+            ".map((e) => e.outerHTML.slice(0, 100)).slice(0, 5).concat(['the page'])",
+            width,
+        )
+
+    def screenshot(self, name: str) -> Path:
+        SCREENS.mkdir(parents=True, exist_ok=True)
+        path = SCREENS / f"{name}.png"
+        self.driver.save_screenshot(str(path))
+        return path
+
+
+@contextmanager
+def chromium() -> Iterator[Browser]:
+    """A new browser; skips the test where the system has none."""
+    binary, driver = shutil.which("chromium"), shutil.which("chromedriver")
+    if binary is None or driver is None:
+        pytest.skip("no Chromium: sudo apt-get install chromium chromium-driver")
+    from selenium import webdriver
+    from selenium.webdriver.chrome.service import Service
+
+    options = webdriver.ChromeOptions()
+    options.binary_location = binary
+    for option in _OPTIONS:
+        options.add_argument(option)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    window = webdriver.Chrome(options=options, service=Service(driver))
+    try:
+        yield Browser(window)
+    finally:
+        window.quit()

@@ -1,0 +1,100 @@
+"""The node `viewer` beside a real driver, mitigator and locator: what the page shows is what they publish."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+import ros_harness
+from browser import Browser
+from uwb_mitigation_msgs.msg import RangeCorrected
+from visualization_msgs.msg import MarkerArray
+
+from uwb_mitigation.nodes import topics
+
+pytestmark = pytest.mark.ros
+
+
+@pytest.fixture
+def ros(tmp_path: Path) -> Iterator[ros_harness.Ros]:
+    with ros_harness.domain(tmp_path) as client:
+        yield client
+
+
+def test_the_page_shows_what_is_published(ros: ros_harness.Ros, browser: Browser, tmp_path: Path):
+    published = ros.collect(RangeCorrected, "/uwb/range_corrected")
+    ros.start("mitigator")
+    ros.start("driver", "source:=simulated", "simulated_rate:=40.0")
+    ros.spin_until(lambda: len({message.anchor_id for message in published}) >= 2)
+    ids = sorted({message.anchor_id for message in published})
+    anchors = tmp_path / "anchors.yaml"
+    anchors.write_text(
+        "anchors:\n" + "".join(f"  - {{id: {i}, x: {n}.0, y: 0.5, z: 2.0}}\n" for n, i in enumerate(ids))
+    )
+    ros.start("locator", f"anchors:={anchors}")
+    viewer = ros.start("viewer", "port:=0")
+    viewer.wait_for_output("the page is at")
+    found = re.search(r"the page is at (\S+)", viewer.output)
+    assert found is not None
+    assert ros.node.count_subscribers("/uwb/range_raw") == 1, (
+        "CIRs are for the mitigator, while no page is open"
+    )
+    browser.open(found[1])
+
+    def column(model: str, name: str) -> list:
+        script = """
+            const model = window.Bokeh && Bokeh.documents[0] && Bokeh.documents[0].get_model_by_name(arguments[0]);
+            if (!model) return [];
+            const sources = model.source ? [model.source] : model.renderers.map((r) => r.data_source);
+            const source = sources.find((s) => arguments[1] in s.data);
+            return source ? Array.from(source.data[arguments[1]]) : [];"""
+        return browser.run(script, model, name)
+
+    def seen() -> bool:
+        ros.spin_for(0.05)
+        shown = column("pairs", "range")
+        values = {round(message.range, 6) for message in published}
+        return bool(shown) and all(round(value, 6) in values for value in shown)
+
+    browser.wait("ranges as published", seen)
+    browser.wait("the locator's anchors by their ids", lambda: sorted(map(int, column("map", "id"))) == ids)
+    browser.wait("a CIR", lambda: len(column("cir", "magnitude")) > 100)
+    browser.wait("diagnostics", lambda: browser.cell("mitigator: ranges"))
+    assert browser.run("return document.title").startswith("UWB ranges")
+    browser.open(found[1] + "parameters")
+    browser.wait(
+        "their parameters", lambda: "simulated_rate" in browser.run("return document.body.innerText")
+    )
+    browser.open(found[1])
+    browser.wait("ranges again", lambda: len(column("pairs", "range")) >= 2)
+    browser.run("window.before = true")
+    viewer.end()
+    ros.start("viewer", f"port:={found[1].rsplit(':')[-1].strip('/')}")
+    browser.wait("the page to come back by itself", lambda: not browser.run("return window.before ?? false"))
+    browser.wait("ranges of the new one", lambda: len(column("pairs", "range")) >= 2)
+
+
+def test_it_shows_anchors_to_others_where_there_is_no_locator(ros: ros_harness.Ros, tmp_path: Path):
+    anchors = tmp_path / "anchors.yaml"
+    anchors.write_text("anchors:\n  - {id: 5, x: 1.0, y: 2.0, z: 3.0, name: door}\n")
+    shown: list[MarkerArray] = []
+    ros.node.create_subscription(MarkerArray, "/uwb/anchors", shown.append, topics.LATCHED)
+    viewer = ros.start("viewer", "port:=0", f"anchors:={anchors}", "map_frame:=site")
+    ros.spin_until(lambda: bool(shown))
+    ball, name = shown[0].markers
+    assert (ball.ns, ball.text, ball.header.frame_id) == ("anchors", "5", "site")
+    assert (ball.pose.position.x, ball.pose.position.y, ball.pose.position.z) == (1.0, 2.0, 3.0)
+    assert name.text == "5 (door)"
+    assert psutil.Process(viewer.pid).nice() == min(os.nice(0) + 10, 19), (
+        "ranges are corrected before they are drawn"
+    )
+
+
+def test_an_anchors_file_that_is_none_is_named(ros: ros_harness.Ros, tmp_path: Path):
+    viewer = ros.start("viewer", "port:=0", f"anchors:={tmp_path / 'absent.yaml'}")
+    assert viewer.wait() == 1
+    assert "absent.yaml" in viewer.output

@@ -1,0 +1,236 @@
+"""The viewer's page in a real browser, on a scene that the test fills."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from functools import partial
+from threading import Lock
+
+import numpy as np
+import pytest
+from browser import Browser
+
+from uwb_mitigation.benches.visitors import Visitors
+from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.measurement import Cir, Encoding, Status
+from uwb_mitigation.viewer.scene import AnchorPlace, Pose, Report, Sample, Scene, Trace
+from uwb_mitigation.viewer.server import ViewerServer
+from uwb_mitigation.viewer.view import Drawing, View
+
+HOSTILE = "<img src=x onerror=window.pwned=1><script>window.pwned=1</script>$$x$$"
+
+
+@pytest.fixture
+def view() -> View:
+    return View(Scene(), Lock(), "UWB ranges")
+
+
+@pytest.fixture
+def server(view: View) -> Iterator[ViewerServer]:
+    with ViewerServer(view, port=0, parameters=lambda: {HOSTILE: {"model": HOSTILE}}) as server:
+        yield server
+
+
+def fill(view: View, upto_s: float = 5.0) -> None:
+    """Two pairs of tag 7, ten ranges a second each; anchor 2's are unfamiliar and 0.5 m too long."""
+    scene = view.scene
+    with view.lock:
+        scene.set_anchors({1: AnchorPlace(0, 0, 2, HOSTILE), 2: AnchorPlace(8, 0, 2)})
+        scene.add_report(HOSTILE, Report(1, HOSTILE))
+        for step in range(int(upto_s * 10)):
+            time_s = 1000.0 + step / 10
+            for anchor in (1, 2):
+                magnitude = np.full(200, 10, np.int16)
+                magnitude[20:40] = 1000 * anchor
+                cir = Cir(magnitude, Encoding.MAGNITUDE, 730, 750.4, noise_threshold=120)
+                scene.add_trace((anchor, 7), Trace(cir, time_s))
+                status = Status.OK if anchor == 1 else Status.OUT_OF_DISTRIBUTION
+                sample = Sample(
+                    time_s, 5.3, 5.1 if anchor == 1 else 5.3, 0.1, status, 4.8 if anchor == 2 else 5.1
+                )
+                scene.add_sample((anchor, 7), sample)
+                scene.add_error(sample)
+            scene.add_true_position(HOSTILE, 4.0, 3.0)
+            scene.add_pose("tag", Pose(time_s, 4 + math.sin(step / 20), 3, 1, (0.4, 0.2, 0.3)))
+
+
+def data(browser: Browser, model: str, column: str) -> list[object]:
+    """A column of the source behind a named table or figure."""
+    return browser.run(
+        "const m = Bokeh.documents[0].get_model_by_name(arguments[0]);"
+        "const s = m.source ?? m.renderers.map((r) => r.data_source).find((d) => arguments[1] in d.data);"
+        "return Array.from(s.data[arguments[1]])",
+        model,
+        column,
+    )
+
+
+def selected(browser: Browser, model: str) -> list[int]:
+    """The rows chosen in a named table, or among a map's anchors."""
+    return browser.run(
+        "const m = Bokeh.documents[0].get_model_by_name(arguments[0]);"
+        "return (m.source ?? m.renderers.map((r) => r.data_source).find((d) => 'id' in d.data)).selected.indices",
+        model,
+    )
+
+
+def opened(browser: Browser, server: ViewerServer, width: int = 1280, height: int = 1150) -> None:
+    browser.open(server.url, width, height)
+    browser.wait("the page", browser.ready)
+
+
+def test_it_shows_what_the_scene_holds(browser: Browser, view: View, server: ViewerServer) -> None:
+    fill(view)
+    opened(browser, server)
+    assert data(browser, "pairs", "anchor") == ["1", "2"]
+    assert data(browser, "pairs", "range") == pytest.approx([5.1, 5.3])
+    assert data(browser, "pairs", "rate") == pytest.approx([10.0, 10.0])
+    assert data(browser, "pairs", "status") == ["OK", "OUT_OF_DISTRIBUTION"]
+    assert max(data(browser, "cir", "magnitude")) == 1000.0
+    assert sum(data(browser, "errors", "raw")) == 100
+    assert len(data(browser, "strip", "raw")) == 50
+    assert data(browser, "map", "range") == pytest.approx([math.sqrt(5.1**2 - 1), math.sqrt(5.3**2 - 1)])
+    summary = browser.run("return Bokeh.documents[0].get_model_by_name('summary').text")
+    assert "mean absolute error 0.350 m raw, 0.250 m corrected" in summary
+    assert browser.complaints() == []
+    browser.screenshot("viewer_1280")
+
+
+def test_it_follows_the_scene(browser: Browser, view: View, server: ViewerServer) -> None:
+    fill(view)
+    opened(browser, server)
+    with view.lock:
+        view.scene.add_sample((1, 7), Sample(1010.0, 9.9, 9.5, 0.1, Status.OK))
+    browser.wait("the new range", lambda: data(browser, "pairs", "range")[0] == pytest.approx(9.5))
+
+
+def test_a_paused_page_stands_still_and_goes_on(browser: Browser, view: View, server: ViewerServer) -> None:
+    fill(view)
+    opened(browser, server)
+    pause = "Bokeh.documents[0].get_model_by_name('pause').active = arguments[0]"
+    browser.run(pause, True)
+    # The server's word: it knows.
+    browser.wait("the button", lambda: browser.cell("Resume"))
+    still = browser.driver.current_window_handle
+    browser.driver.switch_to.new_window("tab")
+    opened(browser, server)
+
+    def shown(value: float) -> bool:
+        return data(browser, "pairs", "range")[0] == pytest.approx(value)
+
+    for value in (9.5, 9.6):
+        with view.lock:
+            view.scene.add_sample((1, 7), Sample(1010.0, 9.9, value, 0.1, Status.OK))
+        browser.wait("the other page", partial(shown, value))
+    browser.driver.close()
+    browser.driver.switch_to.window(still)
+    assert shown(5.1)
+    browser.run(pause, False)
+    browser.wait("the new range", partial(shown, 9.6))
+
+
+def test_a_click_shows_another_pair(browser: Browser, view: View, server: ViewerServer) -> None:
+    fill(view)
+    opened(browser, server)
+    browser.wait("the table", lambda: browser.cell("OUT_OF_DISTRIBUTION")).click()
+    browser.wait("the other CIR", lambda: max(data(browser, "cir", "magnitude")) == 2000.0)
+    assert browser.complaints() == []
+
+
+def test_a_click_on_an_anchor_shows_its_pair(browser: Browser, view: View, server: ViewerServer) -> None:
+    fill(view)
+    opened(browser, server)
+    assert selected(browser, "pairs") == selected(browser, "map") == [0]
+    browser.click_figure("map", 8.0, 0.0)
+    browser.wait("the other CIR", lambda: max(data(browser, "cir", "magnitude")) == 2000.0)
+    browser.wait("its row", lambda: selected(browser, "pairs") == selected(browser, "map") == [1])
+    browser.click_figure("map", 4.0, 1.5)
+    browser.wait("the anchor to stay chosen", lambda: selected(browser, "map") == [1])
+    assert browser.complaints() == []
+
+
+def test_tags_are_told_apart_by_their_names(browser: Browser, view: View, server: ViewerServer) -> None:
+    with view.lock:
+        scene = view.scene
+        scene.set_anchors({1: AnchorPlace(0, 0, 0)})
+        for tag, name, x in ((7, "tag", 1.0), (8, "tag_8", 6.0)):
+            scene.add_sample((1, tag), Sample(1000.0, 5.3, 5.1, 0.1, Status.OK))
+            scene.add_pose(name, Pose(1000.0, x, 3, 0))
+    opened(browser, server)
+    assert data(browser, "map", "x1") == [1.0]
+    browser.wait("the table", lambda: browser.cell("8")).click()
+    browser.wait("the ray to the other tag", lambda: data(browser, "map", "x1") == [6.0])
+    with view.lock:
+        scene.add_sample((1, 9), Sample(1000.0, 5.3, 5.1, 0.1, Status.OK))
+        assert scene.tag_of(8) is scene.tags["tag_8"]
+        assert scene.tag_of(7) is None, "the plain pose may be of either"
+
+
+def test_a_page_of_nothing_complains_of_nothing(browser: Browser, server: ViewerServer) -> None:
+    opened(browser, server)
+    assert data(browser, "pairs", "anchor") == []
+    assert browser.complaints() == []
+
+
+def test_nothing_from_a_message_is_run(browser: Browser, view: View, server: ViewerServer) -> None:
+    fill(view)
+    opened(browser, server)
+    browser.wait("the diagnostics as they are", lambda: browser.cell(HOSTILE))
+    assert browser.run("return window.pwned ?? null") is None
+    browser.open(server.url + "parameters")
+    assert HOSTILE in browser.run("return document.body.innerText")
+    assert browser.run("return window.pwned ?? null") is None
+
+
+def test_nothing_is_cut_off_on_a_narrow_screen(browser: Browser, view: View, server: ViewerServer) -> None:
+    fill(view)
+    opened(browser, server, 400, 2000)
+    assert browser.run("return document.documentElement.scrollWidth") <= 400
+    browser.screenshot("viewer_400")
+
+
+def test_a_screenshot_is_an_image(browser: Browser, view: View, server: ViewerServer) -> None:
+    fill(view)
+    opened(browser, server)
+    browser.run("window.saveScreenshot()")
+    assert browser.run("return window.lastScreenshot").startswith("data:image/png;base64,")
+    assert browser.complaints() == []
+
+
+def test_the_page_comes_back_with_the_server(browser: Browser, view: View) -> None:
+    fill(view)
+    with ViewerServer(view, port=0) as first:
+        opened(browser, first)
+    browser.wait(
+        "the notice",
+        lambda: browser.run("return getComputedStyle(document.getElementById('lost')).display") == "block",
+    )
+    browser.screenshot("viewer_lost")
+    fresh = View(Scene(), Lock(), "UWB ranges again")
+    fill(fresh)
+    with ViewerServer(fresh, port=first.port):
+        browser.wait("the page", lambda: browser.run("return document.title") == "UWB ranges again")
+
+
+def test_ten_pages_at_once(browser: Browser, view: View, server: ViewerServer) -> None:
+    fill(view)
+    opened(browser, server)
+    with Visitors(server.url, 9) as others:
+        browser.wait("ten pages", lambda: view.drawing.pages == 10)
+        with view.lock:
+            view.scene.add_sample((1, 7), Sample(1010.0, 9.9, 9.5, 0.1, Status.OK))
+        browser.wait("the new range", lambda: data(browser, "pairs", "range")[0] == pytest.approx(9.5))
+        browser.wait("it to reach the others", lambda: all(others.received))
+    browser.wait("the closed ones to be forgotten", lambda: view.drawing.pages == 1)
+
+
+def test_many_pages_are_drawn_less_often() -> None:
+    drawing = Drawing(pages=10, cost_s=0.03)
+    assert drawing.pause_s() == pytest.approx(1.0)
+    assert Drawing(pages=1, cost_s=0.002).pause_s() == pytest.approx(0.1)
+
+
+def test_a_taken_port_is_named(server: ViewerServer, view: View) -> None:
+    with pytest.raises(ParameterError, match=str(server.port)):
+        ViewerServer(view, port=server.port)

@@ -1,0 +1,238 @@
+"""A recording on the viewer's page: its player over real bags, and the command in a real browser."""
+
+from __future__ import annotations
+
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bag_material import START_NS, STEP_NS, corrected, record, write_bag, write_corrected
+from browser import Browser
+
+from uwb_mitigation.bag.codec import encode_range
+from uwb_mitigation.bag.poses import encode_place, encode_pose, tag_topic
+from uwb_mitigation.bag.topics import ODOMETRY_TRUTH, ODOMETRY_TYPE, POSE, POSE_TYPE, RANGE_CIR_TYPE
+from uwb_mitigation.bag.writer import BagWriter
+from uwb_mitigation.errors import RecordingError, UwbMitigationError
+from uwb_mitigation.mitigation import Mitigation
+from uwb_mitigation.model.bundle import load_bundle
+from uwb_mitigation.model.shipped import default_model_path
+from uwb_mitigation.positioning.tracks import Estimate
+from uwb_mitigation.viewer import playback
+from uwb_mitigation.viewer.feed import Feed
+from uwb_mitigation.viewer.playback import BagPlayer
+from uwb_mitigation.viewer.scene import Scene, Trace
+
+COUNT = 400
+"""Ranges of the bag, 10 ms apart, of two anchors by turns."""
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Corrected ranges with their truth, poses of two tags, and where one truly was."""
+    path = tmp_path_factory.mktemp("view") / "site.mcap"
+    with BagWriter(path, {"source": "a test", "simulated": "true"}) as out:
+        for number in range(COUNT):
+            item = record(number)
+            out.write(item)
+            write_corrected(out, item.measurement, corrected(number))
+            if number % 10 == 0:
+                stamp_ns = item.measurement.stamp_ns
+                place = Estimate(stamp_ns, np.array([number / 100, 1.0, 0.0]), np.zeros(3), np.eye(6) * 0.01)
+                out.write_message(POSE, POSE_TYPE, encode_pose(place), stamp_ns)
+                out.write_message(tag_topic(POSE, 9), POSE_TYPE, encode_pose(place), stamp_ns)
+                true = encode_place((number / 100, 1.5, 0.0), 7, stamp_ns)
+                out.write_message(ODOMETRY_TRUTH, ODOMETRY_TYPE, true, stamp_ns)
+    anchors = "anchors:\n  - {id: 1, x: 0, y: 0, z: 2}\n  - {id: 2, x: 5, y: 0, z: 2}\n"
+    path.with_name("site.anchors.yaml").write_text(anchors)
+    return path
+
+
+def opened(path: Path, namespace: str | None = None) -> tuple[BagPlayer, Scene]:
+    scene = Scene()
+    feed = Feed(scene, threading.Lock())
+    return BagPlayer(path, feed, lambda: Mitigation(load_bundle(default_model_path())), namespace), scene
+
+
+def latest(scene: Scene) -> dict[tuple[int, int], float]:
+    return {pair: sample.range_m for pair, _, sample in scene.latest()}
+
+
+def test_any_place_shows_what_came_until_then(bag: Path):
+    player, scene = opened(bag)
+    assert player.seconds == pytest.approx((COUNT - 1) * STEP_NS / 1e9)
+    for last in (399, 100, 250, 0):
+        player.seek(last * STEP_NS / 1e9)
+        before = last - 1
+        expected = {(1 + number % 2, 7): 4.25 + number for number in (before, last) if number >= 0}
+        assert latest(scene) == expected
+        assert scene.now_s == pytest.approx((START_NS + last * STEP_NS) / 1e9)
+        assert scene.errors == last + 1, "the truth is joined, and nothing is counted twice"
+        assert len(scene.tags["tag"].trail) == len(scene.tags["tag_9"].trail) == last // 10 + 1
+        assert len(scene.true_trails["tag_7"]) == last // 10 + 1
+    assert len(scene.pairs[1, 7].traces) == 1
+
+
+def test_it_plays_at_the_recordings_own_pace(bag: Path, monkeypatch: pytest.MonkeyPatch):
+    now_s = [100.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now_s[0])
+    player, scene = opened(bag)
+    player.play(True)
+    now_s[0] += 0.5
+    player.advance()
+    assert player.position_s == pytest.approx(0.5)
+    assert latest(scene) == {(2, 7): 4.25 + 49, (1, 7): 4.25 + 50}
+    player.play(False)
+    now_s[0] += 0.5
+    player.advance()
+    assert player.position_s == pytest.approx(0.5)
+    player.play(True)
+    for _ in range(8):
+        now_s[0] += 0.5
+        player.advance()
+    assert (player.position_s, player.playing) == (player.seconds, False)
+    assert latest(scene)[2, 7] == 4.25 + COUNT - 1
+    player.play(True)
+    assert player.position_s == 0.0
+
+
+def test_raw_ranges_are_corrected_as_they_are_shown(tmp_path: Path):
+    player, scene = opened(write_bag(tmp_path / "raw.mcap", 30))
+    assert player.corrects
+    player.seek(player.seconds)
+    mitigation = Mitigation(load_bundle(default_model_path()))
+    expected = mitigation.correct(record(29).measurement).range_m
+    assert latest(scene)[2, 7] == pytest.approx(expected)
+
+
+def test_of_a_crowded_minute_its_end_is_shown(bag: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(playback, "MAX_MESSAGES", 150)
+    player, scene = opened(bag)
+    player.seek(player.seconds)
+    for _ in range(5):
+        player.advance()
+    assert latest(scene)[2, 7] == 4.25 + COUNT - 1
+    assert sum(history.ranges for history in scene.pairs.values()) < COUNT / 2
+
+
+def test_a_bag_that_was_cut_shows_what_is_left_and_says_so(bag: Path, tmp_path: Path):
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(write_bag(tmp_path / "whole.mcap", 3000).read_bytes()[:-20_000])
+    player, scene = opened(cut)
+    player.seek(player.seconds)
+    assert scene.reports["recording"].level == 2
+    assert "nothing beyond" in scene.reports["recording"].message
+    player.seek(0.0)
+    assert latest(scene)
+
+
+def test_a_cir_that_nobody_looks_at_is_not_computed(monkeypatch: pytest.MonkeyPatch):
+    scene = Scene()
+    feed = Feed(scene, threading.Lock())
+    with monkeypatch.context() as patched:
+        patched.setattr(Trace, "magnitude", property(lambda trace: pytest.fail("nobody looks")))
+        feed.range_raw(encode_range(record(1).measurement))
+    (trace,) = scene.pairs[2, 7].traces
+    samples = record(1).measurement.cir.samples.astype(float)
+    assert trace.magnitude == pytest.approx(np.hypot(samples[::2], samples[1::2]))
+
+
+def without_ranges(path: Path) -> Path:
+    with BagWriter(path, {}) as out:
+        out.write_message(ODOMETRY_TRUTH, ODOMETRY_TYPE, encode_place((0.0, 0.0, 0.0), 1, START_NS), START_NS)
+    return path
+
+
+def of_another_kind(path: Path) -> Path:
+    path.write_bytes(b"no bag at all, but some bytes")
+    return path
+
+
+def empty(path: Path) -> Path:
+    path.touch()
+    return path
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda path: path, "no such file"),
+        (empty, "the file is empty"),
+        (of_another_kind, "not an MCAP file"),
+        (without_ranges, "no ranges"),
+    ],
+)
+def test_what_cannot_be_shown_is_named(make: Callable[[Path], Path], words: str, tmp_path: Path):
+    with pytest.raises(RecordingError, match=words):
+        opened(make(tmp_path / "one.mcap"))
+
+
+def test_of_several_namespaces_one_is_to_be_named(tmp_path: Path):
+    path = tmp_path / "two.mcap"
+    with BagWriter(path, {}) as out:
+        for number in range(4):
+            data = encode_range(record(number).measurement)
+            for board in ("left", "right"):
+                out.write_message(f"/{board}/uwb/range_raw", RANGE_CIR_TYPE, data, START_NS + number)
+    with pytest.raises(UwbMitigationError, match="--namespace with one of: '/left', '/right'"):
+        opened(path)
+    player, scene = opened(path, "/left")
+    player.seek(1.0)
+    assert sum(history.ranges for history in scene.pairs.values()) == 4
+
+
+@pytest.fixture
+def page(bag: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """`uwb-mitigation view` on the bag, and its address."""
+    command = [sys.executable, "-c", "from uwb_mitigation.entry import command_line; command_line()", "view"]
+    running = subprocess.Popen(
+        [*command, str(bag), "--port", "0"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    try:
+        assert running.stdout is not None
+        said = running.stdout.readline()
+        found = re.search(r"http://\S+", said)
+        assert found is not None, said + running.stdout.read()
+        yield running, found[0]
+    finally:
+        running.kill()
+        running.wait()
+
+
+def test_the_page_has_a_slider_and_plays(browser: Browser, page: tuple[subprocess.Popen[str], str]):
+    running, url = page
+
+    def model(name: str, attribute: str) -> object:
+        return browser.run(
+            "return Bokeh.documents[0].get_model_by_name(arguments[0])[arguments[1]]", name, attribute
+        )
+
+    def ranges() -> list[float]:
+        return browser.run(
+            "return Array.from(Bokeh.documents[0].get_model_by_name('pairs').source.data['range'])"
+        )
+
+    browser.open(url)
+    browser.wait("the page", browser.ready)
+    browser.wait("it to play to its end", lambda: model("pause", "label") == "Play")
+    assert model("slider", "value") == model("slider", "end") == 4.0
+    assert sorted(ranges()) == [4.25 + 398, 4.25 + 399]
+    browser.run(
+        "const s = Bokeh.documents[0].get_model_by_name('slider'); s.value = 1.0; s.value_throttled = 1.0"
+    )
+    browser.wait("that place", lambda: sorted(ranges()) == [4.25 + 99, 4.25 + 100])
+    browser.screenshot("view_1280")
+    browser.wait("the button", lambda: browser.cell("Play")).click()
+    browser.wait("it to play on", lambda: sorted(ranges())[-1] > 4.25 + 100)
+    assert browser.complaints() == []
+    browser.resize(400, 2000)
+    assert browser.run("return document.documentElement.scrollWidth") <= 400
+    running.send_signal(signal.SIGINT)
+    assert running.wait(20) == 130

@@ -1,0 +1,352 @@
+"""How a scene is drawn into the models of one page, and what clicks on it do.
+
+A page is one browser tab. It draws at most ten times a second, only what has changed, and slower where drawing all open
+pages would take more than its share of a core.
+"""
+
+from __future__ import annotations
+
+import html
+import math
+import time
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import numpy as np
+from bokeh.document import Document
+from bokeh.models import ColumnDataSource
+
+from uwb_mitigation.measurement import Status
+from uwb_mitigation.preprocessing import WINDOW_LEAD
+from uwb_mitigation.viewer.models import TRACE_AFTER, TRACE_BEFORE, Models, blank_waterfall
+from uwb_mitigation.viewer.scene import ERROR_EDGES_M, History, Pair, Scene, Trace, short_id
+from uwb_mitigation.viewer.view import REFRESH_S, View
+
+COLOURS = {
+    Status.OK: "#15803d",
+    Status.NO_CIR: "#6b7280",
+    Status.BAD_CIR: "#b45309",
+    Status.OUT_OF_DISTRIBUTION: "#c2410c",
+    Status.MODEL_ERROR: "#b91c1c",
+}
+LEVELS = ("OK", "WARN", "ERROR", "STALE")
+LEVEL_COLOURS = ("#15803d", "#b45309", "#b91c1c", "#6b7280")
+
+_REPORTS_STYLE = (
+    "<style>td{padding:2px 10px 2px 4px;vertical-align:top;overflow-wrap:anywhere}"
+    "td:first-child{min-width:90px}</style>"
+)
+
+_TEMPLATES = jinja2.Environment(loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"))
+
+
+class Page:
+    """One open page.
+
+    Args:
+        document: the session's, into which the page is laid out.
+        view: what it looks at.
+    """
+
+    def __init__(self, document: Document, view: View) -> None:
+        self._view = view
+        self._selected: Pair | None = None
+        self._rows: list[Pair] = []
+        self._due_s = 0.0
+        self._drawn: dict[str, object] = {}
+        self._models = models = Models(None if view.player is None else view.player.seconds)
+        # As one, or Bokeh looks for new models after each: half of what opening a page takes.
+        with document.models.freeze():
+            for model in models.roots.values():
+                document.add_root(model)
+        document.title = view.title
+        document.template = _TEMPLATES.get_template("page.html.j2")
+        document.template_variables.update(
+            page_title=view.title, recording=view.player is not None, parameters=view.parameters
+        )
+        document.config.update(reconnect_session=False, notify_connection_status=False, notifications=None)
+        models.pairs.selected.on_change("indices", self._on_row)
+        models.anchors.selected.on_change("indices", self._on_anchor)
+        models.pause.on_change("active", self._on_pause)
+        if models.slider is not None:
+            models.slider.on_change("value_throttled", self._on_slider)
+        view.drawing.pages += 1
+        document.on_session_destroyed(self._gone)
+        document.add_periodic_callback(self.tick, int(1000 * REFRESH_S))
+        self.draw()
+
+    def tick(self) -> None:
+        """Draw if it is time and nobody has paused the page."""
+        now_s, player = time.monotonic(), self._view.player
+        if player is not None:
+            player.advance()
+        elif self._models.pause.active:
+            return
+        if now_s < self._due_s:
+            return
+        before_s = time.thread_time()
+        self.draw()
+        self._view.drawing.drawn(time.thread_time() - before_s)
+        self._due_s = now_s + self._view.drawing.pause_s() - 0.5 * REFRESH_S
+
+    def draw(self) -> None:
+        """Bring every model up to the scene."""
+        self._draw_player()
+        with self._view.lock:
+            scene = self._view.scene
+            if not self._changed("scene", (scene.revision, self._selected)):
+                return
+            self._draw_pairs(scene)
+            self._draw_summary(scene)
+            self._draw_map(scene)
+            history = None if self._selected is None else scene.pairs.get(self._selected)
+            self._draw_strip(scene.now_s, history)
+            self._draw_trace(() if history is None else tuple(history.traces))
+            self._draw_errors(scene)
+            self._draw_reports(scene)
+
+    def select(self, pair: Pair) -> None:
+        """Show another pair's CIR and strip."""
+        self._selected = pair
+        self.draw()
+
+    # What is shown --------------------------------------------------------------------------------------------
+
+    def _draw_player(self) -> None:
+        player, slider = self._view.player, self._models.slider
+        if player is None or slider is None:
+            return
+        if self._changed("position", round(player.position_s, 1)):
+            slider.value = min(round(player.position_s, 1), slider.end)
+        if self._changed("playing", player.playing):
+            self._models.pause.active = not player.playing
+            self._models.pause.label = "Pause" if player.playing else "Play"
+
+    def _draw_pairs(self, scene: Scene) -> None:
+        latest = list(scene.latest())
+        rows = [pair for pair, _, _ in latest]
+        if self._selected is None and rows:
+            self._selected = rows[0]
+        self._models.pairs.data = {
+            "anchor": [short_id(anchor) for anchor, _ in rows],
+            "tag": [short_id(tag) for _, tag in rows],
+            "rate": [history.rate_hz() for _, history, _ in latest],
+            "raw": [sample.raw_m for _, _, sample in latest],
+            "range": [sample.range_m for _, _, sample in latest],
+            "sigma": [sample.sigma_m for _, _, sample in latest],
+            "status": [sample.status.name for _, _, sample in latest],
+            "colour": [COLOURS[sample.status] for _, _, sample in latest],
+            "correction": [_finite(sample.raw_m - sample.range_m) for _, _, sample in latest],
+        }
+        self._rows = rows
+        _choose(self._models.pairs, rows, self._selected)
+
+    def _draw_summary(self, scene: Scene) -> None:
+        ranges = sum(history.ranges for history in scene.pairs.values())
+        parts = [f"{len(self._rows)} pairs", f"{ranges} ranges"]
+        if math.isfinite(scene.now_s):
+            parts.insert(0, f"{_utc(scene.now_s)}")
+        raw_m, corrected_m = scene.mean_errors_m()
+        if scene.errors:
+            parts.append(f"mean absolute error {raw_m:.3f} m raw, {corrected_m:.3f} m corrected")
+        text = html.escape(" · ".join(parts))
+        if self._models.summary.text != text:
+            self._models.summary.text = text
+
+    def _draw_map(self, scene: Scene) -> None:
+        models = self._models
+        if self._changed("anchors", scene.anchors):
+            places = list(scene.anchors.items())
+            models.anchors.data = {
+                "x": [place.x for _, place in places],
+                "y": [place.y for _, place in places],
+                "name": [place.name or short_id(identity) for identity, place in places],
+                "id": [str(identity) for identity, _ in places],
+            }
+        _choose(models.anchors, list(scene.anchors), None if self._selected is None else self._selected[0])
+        posed = [(name, tag.pose) for name, tag in scene.tags.items() if tag.pose is not None]
+        ellipses = [pose.ellipse for _, pose in posed]
+        models.tags.data = {
+            "x": [pose.x for _, pose in posed],
+            "y": [pose.y for _, pose in posed],
+            "name": [name for name, _ in posed],
+            "width": [_finite(2 * larger) for larger, _, _ in ellipses],
+            "height": [_finite(2 * smaller) for _, smaller, _ in ellipses],
+            "angle": [_finite(angle) for _, _, angle in ellipses],
+        }
+        models.trails.data = _lines([tag.trail for tag in scene.tags.values()])
+        models.true_trails.data = _lines(list(scene.true_trails.values()))
+        models.show_empty("map", not (scene.anchors or scene.tags or scene.true_trails))
+        self._draw_ranges(scene)
+
+    def _draw_ranges(self, scene: Scene) -> None:
+        """Circles and rays of the chosen pair's tag: a map of all tags' would show nothing."""
+        columns: dict[str, list[object]] = {name: [] for name in self._models.circles.data}
+        tag_id = None if self._selected is None else self._selected[1]
+        tag = None if tag_id is None else scene.tag_of(tag_id)
+        pose = None if tag is None else tag.pose
+        for (anchor, other), _, sample in scene.latest():
+            place = scene.anchors.get(anchor)
+            if other != tag_id or place is None or not math.isfinite(sample.range_m):
+                continue
+            height_m = 0.0 if pose is None else _finite(pose.z - place.z)
+            raw_m, range_m = (
+                math.sqrt(max(_finite(value) ** 2 - height_m * height_m, 0.0))
+                for value in (sample.raw_m, sample.range_m)
+            )
+            end = (place.x, place.y) if pose is None else (pose.x, pose.y)
+            values = (place.x, place.y, raw_m, range_m, COLOURS[sample.status], *end)
+            for column, value in zip(columns.values(), values, strict=True):
+                column.append(value)
+        self._models.circles.data = columns
+
+    def _draw_strip(self, now_s: float, history: History | None) -> None:
+        samples = () if history is None else tuple(history.samples)
+        newest = samples[-1].time_s if samples else math.nan
+        if not self._changed("strip", (self._selected, newest, len(samples))):
+            return
+        self._models.show_empty("strip", not any(math.isfinite(sample.raw_m) for sample in samples))
+        self._models.strip.data = {
+            "age": np.array([sample.time_s - now_s for sample in samples], np.float32),
+            "raw": np.array([sample.raw_m for sample in samples], np.float32),
+            "range": np.array([sample.range_m for sample in samples], np.float32),
+            "true": np.array([sample.true_m for sample in samples], np.float32),
+        }
+        title = "no pair chosen"
+        if self._selected is not None:
+            title = f"anchor {short_id(self._selected[0])}, tag {short_id(self._selected[1])}"
+        self._models.strip_figure.title.text = f"Range: {title}"
+        self._models.cir_figure.title.text = f"CIR: {title}"
+
+    def _draw_trace(self, traces: tuple[Trace, ...]) -> None:
+        models = self._models
+        if not self._changed("traces", (self._selected, traces[-1].time_s if traces else None, len(traces))):
+            return
+        models.show_empty("cir", not traces)
+        models.waterfall.data = {"image": [_waterfall_image(traces)]}
+        if not traces:
+            models.trace.data = {name: [] for name in models.trace.data}
+            models.marks.data = {name: [] for name in models.marks.data}
+            return
+        trace = traces[-1]
+        cir, magnitude = trace.cir, trace.magnitude
+        sample = np.arange(len(magnitude)) + (cir.start_index - trace.origin)
+        shown = (sample >= -TRACE_BEFORE) & (sample < TRACE_AFTER)
+        models.trace.data = {"sample": sample[shown].astype(np.float32), "magnitude": magnitude[shown]}
+        models.marks.data = {
+            "noise": [float(cir.noise_threshold)],
+            "first": [_finite(cir.first_path_index - trace.origin)],
+            "top": [1.05 * float(magnitude[shown].max()) if shown.any() else 1.0],
+            "from": [-float(WINDOW_LEAD)],
+            "to": [float(self._view.window - WINDOW_LEAD)],
+        }
+
+    def _draw_errors(self, scene: Scene) -> None:
+        if self._changed("errors", scene.errors):
+            self._models.errors.data = {
+                "left": ERROR_EDGES_M[:-1],
+                "right": ERROR_EDGES_M[1:],
+                "raw": scene.raw_errors.astype(float),
+                "corrected": scene.corrected_errors.astype(float),
+            }
+
+    def _draw_reports(self, scene: Scene) -> None:
+        rows = sorted(scene.reports.items())
+        if self._changed("reports", rows):
+            # Words of messages, which may hold anything: nothing else on the page is made of such.
+            cells = [
+                f"<tr><td>{html.escape(name)}</td><td>{_level(report.level)}</td><td>{html.escape(report.message)}</td></tr>"
+                for name, report in rows
+            ]
+            self._models.reports.text = (
+                f"{_REPORTS_STYLE}<table>{''.join(cells)}</table>" if cells else "none yet"
+            )
+
+    def _changed(self, name: str, value: object) -> bool:
+        if name in self._drawn and self._drawn[name] == value:
+            return False
+        self._drawn[name] = value
+        return True
+
+    # What is clicked ------------------------------------------------------------------------------------------
+
+    def _on_row(self, _attribute: str, _old: object, new: list[int]) -> None:
+        if new and new[0] < len(self._rows) and self._rows[new[0]] != self._selected:
+            self.select(self._rows[new[0]])
+
+    def _on_anchor(self, _attribute: str, _old: object, new: list[int]) -> None:
+        """A click on an anchor chooses its pair with the tag that is shown, else its first."""
+        source, selected = self._models.anchors, self._selected
+        places = [int(identity) for identity in source.data["id"]]
+        anchor = places[new[0]] if new and new[0] < len(places) else None
+        pairs = [pair for pair in self._rows if pair[0] == anchor]
+        if pairs and selected not in pairs:
+            self.select(next((pair for pair in pairs if selected and pair[1] == selected[1]), pairs[0]))
+        else:
+            _choose(source, places, None if selected is None else selected[0])
+
+    def _on_pause(self, _attribute: str, _old: object, new: bool) -> None:
+        player = self._view.player
+        if player is None:
+            self._models.pause.label = "Resume" if new else "Pause"
+        elif player.playing is new:
+            player.play(not new)
+            self.draw()
+
+    def _on_slider(self, _attribute: str, _old: object, new: float) -> None:
+        if self._view.player is not None:
+            self._view.player.seek(new)
+            self.draw()
+
+    def _gone(self, _context: Any) -> None:
+        self._view.drawing.pages -= 1
+
+
+def _choose(source: ColumnDataSource, rows: list[Any], chosen: object) -> None:
+    """Mark a row of a source, or none."""
+    indices = [rows.index(chosen)] if chosen in rows else []
+    if source.selected.indices != indices:
+        source.selected.indices = indices
+
+
+def _waterfall_image(traces: tuple[Trace, ...]) -> np.ndarray[Any, np.dtype[np.uint8]]:
+    """Each exchange a row, the newest on top, its levels over 40 dB below its own peak; uint8 (WATERFALL, width)."""
+    image = blank_waterfall()
+    for row, trace in enumerate(reversed(traces)):
+        begin = trace.origin - TRACE_BEFORE - trace.cir.start_index
+        low, high = max(begin, 0), min(begin + image.shape[1], len(trace.magnitude))
+        if low >= high:
+            continue
+        part = trace.magnitude[low:high]
+        peak = float(part.max())
+        if peak > 0.0:
+            level = 1.0 + np.log10(np.maximum(part / peak, 1e-2)) / 2.0
+            image[row, low - begin : high - begin] = (255.0 * level).astype(np.uint8)
+    return image
+
+
+def _level(level: int) -> str:
+    """The level of a diagnostic, coloured."""
+    if not 0 <= level < len(LEVELS):
+        return "?"
+    return f'<span style="color:{LEVEL_COLOURS[level]};font-weight:600;white-space:nowrap">{LEVELS[level]}</span>'
+
+
+def _lines(trails: list[Any]) -> dict[str, list[list[float]]]:
+    return {
+        "xs": [[x for x, _ in trail] for trail in trails],
+        "ys": [[y for _, y in trail] for trail in trails],
+    }
+
+
+def _utc(time_s: float) -> str:
+    try:
+        return f"{datetime.fromtimestamp(time_s, timezone.utc):%Y-%m-%d %H:%M:%S} UTC"
+    except (OverflowError, ValueError, OSError):
+        return f"{time_s:.0f} s"
+
+
+def _finite(value: float) -> float:
+    return value if math.isfinite(value) else 0.0

@@ -1,0 +1,229 @@
+"""Plays a bag into a scene, as its topics would have come live, from any place and at its own pace.
+
+Nothing is read but what is shown: a seek reads the minute before, playing reads on from there. So a bag of any size
+opens at once and takes no memory.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from uwb_mitigation.bag import schemas
+from uwb_mitigation.bag.codec import decode_range, key_of
+from uwb_mitigation.bag.index import RawMessage
+from uwb_mitigation.bag.reader import BagReader, check_channel
+from uwb_mitigation.bag.topics import (
+    ANCHORS,
+    MARKERS_TYPE,
+    ODOMETRY_TRUTH,
+    ODOMETRY_TYPE,
+    POSE,
+    POSE_TYPE,
+    RANGE_CIR_TYPE,
+    RANGE_CORRECTED,
+    RANGE_CORRECTED_TYPE,
+    RANGE_RAW,
+    RANGE_TRUTH,
+    RANGE_TRUTH_TYPE,
+)
+from uwb_mitigation.errors import ParameterError, RecordingError
+from uwb_mitigation.measurement import RangeMeasurement
+from uwb_mitigation.mitigation import Backend, correct_batch
+from uwb_mitigation.viewer.feed import Feed
+from uwb_mitigation.viewer.scene import PLAIN, STRIP_S, Report
+
+DIAGNOSTICS = "/diagnostics"
+DIAGNOSTICS_TYPE = "diagnostic_msgs/msg/DiagnosticArray"
+
+MAX_MESSAGES = 40_000
+"""Read at a seek: where a minute holds more, only its end is."""
+
+LONGEST_STEP_S = 1.0
+"""A page that was not looked at for longer goes on from where it was."""
+
+_BATCH = 256
+_OURS = {
+    RANGE_RAW: RANGE_CIR_TYPE,
+    RANGE_TRUTH: RANGE_TRUTH_TYPE,
+    RANGE_CORRECTED: RANGE_CORRECTED_TYPE,
+}
+_TAG_POSE = re.compile(r"/uwb/(tag_\d+)/pose")
+
+
+class BagPlayer:
+    """The ranges of a bag; implements `view.Player`.
+
+    Ranges that the bag holds only raw are corrected as they are shown.
+
+    Args:
+        path: an MCAP file or a rosbag2 folder.
+        feed: puts messages into the scene.
+        backend: makes what corrects raw ranges; called only where the bag holds no corrected ones.
+        namespace: of the topics, as `/board1`; None = that of the only ranges in the bag.
+
+    Attributes:
+        corrects: whether the bag holds raw ranges alone.
+
+    Raises:
+        RecordingError: the path is absent or no MCAP bag, holds no ranges, or ranges of another version.
+        ParameterError: ranges of several namespaces, and none was named.
+    """
+
+    def __init__(
+        self, path: Path, feed: Feed, backend: Callable[[], Backend], namespace: str | None = None
+    ) -> None:
+        self._feed = feed
+        self._bag = BagReader(path)
+        topics, bounds = self._bag.topics, self._bag.bounds_ns
+        prefix = _namespace(path, topics) if namespace is None else namespace.rstrip("/")
+        if bounds is None or not {prefix + RANGE_RAW, prefix + RANGE_CORRECTED} & topics.keys():
+            raise _no_ranges(path, topics)
+        for channel in self._bag.channels:
+            if kind := _OURS.get(channel.topic.removeprefix(prefix)):
+                check_channel(channel, kind, path)
+        self._start_ns, end_ns = bounds
+        self.seconds = (end_ns - self._start_ns) / 1e9
+        self.position_s = 0.0
+        self.playing = False
+        self.corrects = prefix + RANGE_CORRECTED not in topics
+        self._backend = backend() if self.corrects else None
+        self._takers = self._takers_of(prefix, topics)
+        self._uncorrected: list[RangeMeasurement] = []
+        self._ahead: RawMessage | None = None
+        self._messages: Iterator[RawMessage] = iter(())
+        self._looked_s = time.monotonic()
+        per_s = self._bag.message_count / max(self.seconds, 1e-9)
+        self._window_s = min(STRIP_S, MAX_MESSAGES / max(per_s, 1e-9))
+        self._take_first(prefix + ANCHORS)
+        self.seek(0.0)
+
+    def play(self, on: bool) -> None:
+        """Go on, or stand still; at its end the recording begins anew."""
+        if on and self.position_s >= self.seconds:
+            self.seek(0.0)
+        self.playing = on
+        self._looked_s = time.monotonic()
+
+    def seek(self, position_s: float) -> None:
+        """Bring the scene to a place, with the minute before it."""
+        self.position_s = min(max(position_s, 0.0), self.seconds)
+        self._feed.clear()
+        start_ns = self._start_ns + int((self.position_s - self._window_s) * 1e9)
+        self._ahead = None
+        self._messages = self._bag.messages(self._takers, max(start_ns, 0))
+        self._read()
+        self._looked_s = time.monotonic()
+
+    def advance(self) -> None:
+        """Move on by the time that has passed since the last call."""
+        now_s = time.monotonic()
+        passed_s, self._looked_s = min(now_s - self._looked_s, LONGEST_STEP_S), now_s
+        if self.playing:
+            self.position_s = min(self.position_s + passed_s, self.seconds)
+            self.playing = self.position_s < self.seconds
+        self._read()
+
+    def _read(self) -> None:
+        """Take what was recorded up to here; of more than `MAX_MESSAGES` the rest comes with the next call."""
+        stop_ns = self._start_ns + round(self.position_s * 1e9)
+        try:
+            for _ in range(MAX_MESSAGES):
+                message = self._ahead or next(self._messages, None)
+                self._ahead = None
+                if message is None:
+                    break
+                if message.log_time_ns > stop_ns:
+                    self._ahead = message
+                    break
+                self._takers[message.channel.topic](message.data)
+        except RecordingError as error:
+            self._messages = iter(())
+            self._feed.report("recording", Report(2, f"{error.what}: nothing beyond can be shown"))
+        self._correct()
+
+    def _take_first(self, topic: str) -> None:
+        """Of what is said once at the beginning, wherever the recording is looked at."""
+        if topic in self._takers:
+            with contextlib.suppress(RecordingError):
+                for message in islice(self._bag.messages([topic]), 1):
+                    self._takers[topic](message.data)
+
+    def _takers_of(self, prefix: str, topics: dict[str, str]) -> dict[str, Callable[[bytes], None]]:
+        """What takes the messages of each topic that is shown."""
+        feed = self._feed
+        takers: dict[str, Callable[[bytes], None]] = {
+            prefix + RANGE_RAW: self._raw if self.corrects else feed.range_raw,
+            prefix + RANGE_TRUTH: feed.range_truth,
+            prefix + RANGE_CORRECTED: feed.range_corrected,
+        }
+        standard: dict[str, tuple[str, Callable[[Any], None]]] = {
+            prefix + ODOMETRY_TRUTH: (ODOMETRY_TYPE, feed.true_position),
+            prefix + ANCHORS: (MARKERS_TYPE, feed.markers),
+            DIAGNOSTICS: (DIAGNOSTICS_TYPE, feed.diagnostics),
+        }
+        for topic in topics:
+            own = _TAG_POSE.fullmatch(topic.removeprefix(prefix))
+            if own or topic == prefix + POSE:
+                standard[topic] = POSE_TYPE, partial(feed.pose, own[1] if own else PLAIN)
+        for topic, (kind, take) in standard.items():
+            if topics.get(topic, "").replace("/msg/", "/") == kind.replace("/msg/", "/"):
+                takers[topic] = partial(self._take_standard, kind, take)
+        return {topic: take for topic, take in takers.items() if topic in topics}
+
+    def _take_standard(self, kind: str, take: Callable[[Any], None], data: bytes) -> None:
+        """A standard message, by the types that ROS 2 Jazzy has."""
+        try:
+            message = schemas.typestore().deserialize_cdr(data, kind)
+        except Exception:  # Of no common type.
+            self._feed.malformed += 1
+            return
+        take(message)
+
+    def _raw(self, data: bytes) -> None:
+        try:
+            measurement = decode_range(data)
+        except RecordingError:
+            self._feed.malformed += 1
+            return
+        self._feed.measurement(measurement)
+        self._uncorrected.append(measurement)
+        if len(self._uncorrected) == _BATCH:
+            self._correct()
+
+    def _correct(self) -> None:
+        if self._backend is None:
+            return
+        batch, self._uncorrected = self._uncorrected, []
+        for measurement, corrected in zip(batch, correct_batch(self._backend, batch), strict=True):
+            self._feed.corrected(key_of(measurement), corrected)
+
+
+def _namespace(path: Path, topics: dict[str, str]) -> str:
+    """The namespace of the only ranges in a bag."""
+    found = {
+        topic.removesuffix(name)
+        for topic in topics
+        for name in (RANGE_RAW, RANGE_CORRECTED)
+        if topic.endswith(name)
+    }
+    if len(found) > 1:
+        raise ParameterError(
+            "ranges of several namespaces",
+            where=str(path),
+            valid="--namespace with one of: " + ", ".join(repr(name) for name in sorted(found)),
+        )
+    if not found:
+        raise _no_ranges(path, topics)
+    return found.pop()
+
+
+def _no_ranges(path: Path, topics: dict[str, str]) -> RecordingError:
+    known = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items()))
+    return RecordingError("no ranges", where=str(path), valid=f"the bag holds: {known or 'no topic'}")
