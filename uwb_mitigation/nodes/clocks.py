@@ -7,6 +7,9 @@ from collections.abc import Callable
 
 from rclpy.clock import Clock, ClockType
 
+STEP_NS = 1_000_000
+"""A clock that has moved so much against the steady one was set, or has drifted: stamps go along."""
+
 
 def reader(clock: Clock) -> Callable[[], int]:
     """A function that returns the clock's time, ns: from rclpy only while it is simulated."""
@@ -20,3 +23,33 @@ def reader(clock: Clock) -> Callable[[], int]:
         return int(clock.now().nanoseconds) if clock.ros_time_is_active else time.time_ns()
 
     return now_ns
+
+
+class Pace:
+    """Time to keep pace by, and its stamps on a node's clock.
+
+    The pace is kept by a steady clock: one that is set must not stop a replay, or hurry it. Only simulated
+    time is followed as it goes.
+    """
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._stamp_now_ns = reader(clock)
+        self._offset_ns: int | None = None
+
+    def now_ns(self) -> int:
+        """The time to keep pace by."""
+        return self._stamp_now_ns() if self._simulated else time.monotonic_ns()
+
+    def stamp_ns(self, pace_ns: int) -> int:
+        """The time on the node's clock of a moment of the pace; moments are as far apart on both."""
+        if self._simulated:
+            return pace_ns
+        offset_ns = self._stamp_now_ns() - time.monotonic_ns()
+        if self._offset_ns is None or abs(offset_ns - self._offset_ns) > STEP_NS:
+            self._offset_ns = offset_ns
+        return pace_ns + self._offset_ns
+
+    @property
+    def _simulated(self) -> bool:
+        return self._clock.clock_type == ClockType.ROS_TIME and bool(self._clock.ros_time_is_active)

@@ -39,6 +39,11 @@ def percentiles(name: str, values_ns: list[int]) -> dict[str, object]:
     return {f"{name} p50 ms": f"{p50:.3f}", f"{name} p99 ms": f"{p99:.3f}"}
 
 
+def model_id(identity: int) -> str:
+    """As the tools print it, in hexadecimal, and as `ros2 topic echo` does."""
+    return f"{identity:08x} ({identity})"
+
+
 class Meter:
     """Rate and latency of what passes, over the time since it was last asked.
 

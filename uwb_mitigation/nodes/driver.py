@@ -7,15 +7,17 @@ model itself is also heard on `/uwb/range_corrected`.
 from __future__ import annotations
 
 import contextlib
-import sys
 import threading
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
+from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
+from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 from rclpy.time import Time
@@ -23,60 +25,25 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
 
 from uwb_mitigation.bag.codec import encode_range
+from uwb_mitigation.bag.poses import encode_place
 from uwb_mitigation.errors import ParameterError, UwbMitigationError
 from uwb_mitigation.link.layout import Mode
 from uwb_mitigation.link.messages import Correction
 from uwb_mitigation.link.port import BoardPort, PortAddress
-from uwb_mitigation.measurement import Origin, RangeMeasurement
-from uwb_mitigation.nodes import clocks, diagnostics, messages, topics
+from uwb_mitigation.link.radio import RadioSettings
+from uwb_mitigation.measurement import Origin, RangeMeasurement, Record
+from uwb_mitigation.nodes import clocks, conversions, diagnostics, topics
 from uwb_mitigation.nodes.agreement import Agreement
 from uwb_mitigation.nodes.board_feed import BoardFeed
 from uwb_mitigation.nodes.lifecycle import ManagedNode
-from uwb_mitigation.nodes.parameters import Parameter
+from uwb_mitigation.nodes.parameter_tables import DRIVER
+from uwb_mitigation.nodes.radio_feed import PREFIX, RADIOS, RadioFeed, open_radios, settings_of
 from uwb_mitigation.nodes.replay_feed import ReplayFeed
-from uwb_mitigation.nodes.running import run
-from uwb_mitigation.sources.source import Record, Source
+from uwb_mitigation.offsets import NO_OFFSETS, read_offsets
+from uwb_mitigation.sources.source import Source
 
-PARAMETERS = (
-    Parameter("source", "simulated", "Where measurements come from.",
-              choices=("mcap", "decaranging", "simulated", "serial")),
-    Parameter("path", "", "Recording to replay: a bag (mcap), a log or a folder of logs (decaranging)."),
-    Parameter("topic", "/uwb/range_raw", "Topic of the ranges inside the bag (mcap)."),
-    Parameter("cir", "final", "Which frame's CIR belongs to a range (decaranging).",
-              choices=("final", "poll")),
-    Parameter("seed", 1, "Seed of the simulated measurements.", low=0, high=2**31 - 1),
-    Parameter("count", 0, "Simulated measurements before the end; 0 = endless.", low=0, high=2**31 - 1),
-    Parameter("simulated_rate", 40.0, "Simulated exchanges a second, over all pairs.",
-              low=0.1, high=10_000.0, unit="Hz"),
-    Parameter("rate", 1.0, "Speed of a replay relative to the recording.",
-              low=0.001, high=10_000.0, live=True),
-    Parameter("paused", False, "A replay stands still while this is set.", live=True),
-    Parameter("seek_to", 0.0, "Where a replay starts, from the beginning of the recording; set while it runs, "
-              "it goes on from there.", low=0.0, high=1e9, live=True, unit="s"),
-    Parameter("loop", False, "Start a replay over when it ends; otherwise the node exits then."),
-    Parameter("longest_pause", 5.0, "Pauses of a recording longer than this are cut to it, in recorded time.",
-              low=0.0, high=1e6, unit="s"),
-    Parameter("publish_clock", False, "Publish the recording's time on /clock, and stamp with it. "
-              "Run the other nodes with use_sim_time."),
-    Parameter("wait_for_subscribers", 1, "A replay waits until so many subscribe to its ranges.",
-              low=0, high=1000),
-    Parameter("longest_wait", 10.0, "A replay starts all the same after this long without them.",
-              low=0.0, high=3600.0, unit="s"),
-    Parameter("start_delay", 3.0, "Pause before the first range of a replay once they are there: time for the "
-              "rest of the graph to start and connect.", low=0.0, high=3600.0, unit="s"),
-    Parameter("port", "", "Serial port of the board: a path such as /dev/ttyACM0, or "
-              "usb:VENDOR:PRODUCT[:SERIAL] with ids in hexadecimal, wherever it is plugged in (serial)."),
-    Parameter("baud", 921_600, "Of a serial line; native USB ignores it (serial).",
-              low=1200, high=12_000_000, unit="bit/s"),
-    Parameter("dtr", True, "Level of DTR: boards with native USB send only while it is set; through a bridge, "
-              "its change resets the board (serial)."),
-    Parameter("mode", "host", "Who runs the model: the host, the device, or both, to compare them (serial).",
-              choices=("host", "device", "both"), live=True),
-    Parameter("board_model", "", "Model id that the board must hold, eight hexadecimal digits; its corrections "
-              "by another model are withheld. Empty = any (serial)."),
-    Parameter("frame_id", "uwb_antenna", "Frame of the receiving antenna, where the source names none."),
-    Parameter("autostart", True, "Configure and activate without a lifecycle manager."),
-)  # fmt: skip
+if TYPE_CHECKING:
+    from uwb_mitigation.nodes.sensor_ranges import SensorRanges
 
 
 def _recording_path(path: str) -> Path:
@@ -145,20 +112,25 @@ class Driver(ManagedNode):
     def __init__(
         self, ended: threading.Event, consumer: Consumer | None = None, foreign: Collection[str] = ()
     ) -> None:
-        super().__init__("driver", PARAMETERS, foreign)
+        super().__init__("driver", DRIVER, foreign)
         self._ended = ended
         self._consumer = consumer
         self.exit_code = 0
         self._source: Source | None = None
         self._address: PortAddress | None = None
-        self._feed: ReplayFeed | BoardFeed | None = None
+        self._feed: ReplayFeed | BoardFeed | RadioFeed | None = None
         self._agreement = Agreement()
         self._ranges: Publisher | None = None
         self._corrected: Publisher | None = None
         self._truths: Publisher | None = None
+        self._places: Publisher | None = None
         self._clock_publisher: Publisher | None = None
+        self._sensor_ranges: SensorRanges | None = None
         self._host_ranges: Subscription | None = None
         self._frame_id: str = self.value("frame_id")
+        self.add_on_set_parameters_callback(self._check)
+        self._offsets = self._prepared_offsets = NO_OFFSETS
+        self.add_on_set_parameters_callback(self._read_offsets)
         self.add_post_set_parameters_callback(self._apply)
         self.autostart()
 
@@ -166,21 +138,34 @@ class Driver(ManagedNode):
         if self.value("source") == "serial":
             self._address = PortAddress.parse(self.value("port"))
             self._board_model = _model_id(self.value("board_model"))
+            self._offsets = read_offsets(str(self.value("offsets")))
+        elif self.value("source") in RADIOS:
+            settings_of(self.value)
         else:
             self._source = open_source(self.value)
         self._ranges = topics.create_publisher(self, RangeCir, topics.RANGE_RAW)
         if self._address is not None:
             self._corrected = topics.create_publisher(self, RangeCorrected, topics.RANGE_CORRECTED)
+            if self.value("sensor_ranges"):
+                self._sensor_ranges = self._make_sensor_ranges()
             self._host_ranges = topics.create_subscription(
                 self, RangeCorrected, topics.RANGE_CORRECTED, self._compare
             )
             return
+        if self._source is None:
+            return
         self._truths = topics.create_publisher(self, RangeTruth, topics.RANGE_TRUTH)
+        self._places = topics.create_publisher(self, Odometry, topics.ODOMETRY_TRUTH)
         if self.value("publish_clock"):
             self._clock_publisher = self.create_publisher(ClockMessage, topics.CLOCK, 10)
 
     def begin(self) -> None:
-        self._feed = self._make_board_feed() if self._address is not None else self._make_replay_feed()
+        if self._address is not None:
+            self._feed = self._make_board_feed()
+        elif self._source is not None:
+            self._feed = self._make_replay_feed()
+        else:
+            self._feed = self._make_radio_feed()
         self._feed.start()
 
     def end(self) -> None:
@@ -193,16 +178,25 @@ class Driver(ManagedNode):
         if self._source is not None:
             self._source.close()
             self._source = None
-        for publisher in (self._ranges, self._corrected, self._truths):
+        for publisher in (self._ranges, self._corrected, self._truths, self._places):
             if publisher is not None:
                 self.destroy_lifecycle_publisher(publisher)
-        self._ranges = self._corrected = self._truths = None
+        self._ranges = self._corrected = self._truths = self._places = None
         if self._clock_publisher is not None:
             self.destroy_publisher(self._clock_publisher)
             self._clock_publisher = None
+        if self._sensor_ranges is not None:
+            self._sensor_ranges.close()
+            self._sensor_ranges = None
         if self._host_ranges is not None:
             self.destroy_subscription(self._host_ranges)
             self._host_ranges = None
+
+    def _make_sensor_ranges(self) -> SensorRanges:
+        # Only here, where it is asked for: sensor_msgs takes a twelfth of the time that a node takes to start.
+        from uwb_mitigation.nodes.sensor_ranges import SensorRanges
+
+        return SensorRanges(self)
 
     def _make_replay_feed(self) -> ReplayFeed:
         assert self._source is not None
@@ -241,18 +235,66 @@ class Driver(ManagedNode):
             expected_model_id=self._board_model,
             stamp_clock=now_ns,
         )
-        return BoardFeed(
+        feed = BoardFeed(
             port,
             on_range=self._publish_range,
             on_correction=self._publish_correction,
             now_ns=now_ns,
             logger=self.get_logger(),
         )
+        if self.value("mode") != "host":
+            feed.set_offsets(self._offsets)
+        settings = settings_of(self.value)
+        # A board whose radio nobody configures here keeps the settings that it has.
+        if settings != RadioSettings():
+            feed.set_radio(settings)
+        return feed
+
+    def _read_offsets(self, changes: list[Any]) -> SetParametersResult:
+        """Read offsets that are to be set, or refuse them."""
+        for change in changes:
+            if change.name == "offsets":
+                try:
+                    self._prepared_offsets = read_offsets(str(change.value))
+                except UwbMitigationError as error:
+                    reason = f"parameter offsets = {change.value!r}: {error}"
+                    return SetParametersResult(successful=False, reason=reason)
+        return SetParametersResult(successful=True)
+
+    def _make_radio_feed(self) -> RadioFeed:
+        now_ns = clocks.reader(self.get_clock())
+        return RadioFeed(
+            open_radios(self.value, now_ns),
+            on_range=self._publish_range,
+            now_ns=now_ns,
+            logger=self.get_logger(),
+        )
+
+    def _check(self, changes: list[Any]) -> SetParametersResult:
+        """Refuse settings of a radio that do not go together."""
+        wanted = {change.name: change.value for change in changes if change.name.startswith(PREFIX)}
+        if wanted:
+            try:
+                settings_of(lambda name: wanted.get(name, self.value(name)))
+            except ParameterError as error:
+                return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
 
     def _apply(self, changes: list[Any]) -> None:
         """Pass live parameters, accepted by now, to what they govern."""
+        if any(change.name.startswith(PREFIX) for change in changes):
+            if isinstance(self._feed, RadioFeed):
+                self._feed.configure(settings_of(self.value))
+            elif isinstance(self._feed, BoardFeed):
+                self._feed.set_radio(settings_of(self.value))
         for change in changes:
-            if isinstance(self._feed, BoardFeed) and change.name == "mode":
+            if change.name == "offsets":
+                self._offsets = self._prepared_offsets
+                if isinstance(self._feed, BoardFeed) and self.value("mode") != "host":
+                    self._feed.set_offsets(self._offsets)
+            elif isinstance(self._feed, BoardFeed) and change.name == "mode":
+                if change.value != "host":
+                    self._feed.set_offsets(self._offsets)
                 self._feed.port.set_mode(Mode[change.value.upper()])
             elif isinstance(self._feed, ReplayFeed):
                 playback = self._feed.playback
@@ -274,8 +316,10 @@ class Driver(ManagedNode):
         ]
         for (record, stamp_ns), measurement in zip(records, measurements, strict=True):
             if record.truth is not None and self._truths is not None:
-                header = messages.to_header(stamp_ns, measurement.frame_id)
-                self._truths.publish(messages.to_range_truth(record.truth, measurement, header))
+                header = conversions.to_header(stamp_ns, measurement.frame_id)
+                self._truths.publish(conversions.to_range_truth(record.truth, measurement, header))
+            if record.tag_position is not None and self._places is not None:
+                self._places.publish(encode_place(record.tag_position, measurement.tag_id, stamp_ns))
         self._publish_measurements(measurements)
 
     def _publish_clock(self, recorded_ns: int) -> None:
@@ -296,19 +340,26 @@ class Driver(ManagedNode):
             self._ranges.publish(encode_range(measurement))
 
     def _publish_correction(self, correction: Correction) -> None:
-        header = messages.to_header(correction.stamp_ns, self._frame_id)
-        message = messages.to_range_corrected(correction, header)
+        header = conversions.to_header(correction.stamp_ns, self._frame_id)
+        message = conversions.to_range_corrected(correction, header)
         assert self._corrected is not None
         self._corrected.publish(message)
+        if self._sensor_ranges is not None and self.value("mode") == "device":
+            # In mode both it is the mitigator that does.
+            self._sensor_ranges.publish(
+                correction.anchor_id, correction.stamp_ns, self._frame_id, correction.corrected
+            )
         if self.value("mode") == "both":
-            self._agreement.add_device(messages.key_of(message), correction.corrected)
+            self._agreement.add_device(conversions.key_of(message), correction.corrected)
 
     def _compare(self, message: RangeCorrected) -> None:
         """The mitigator's result for a range that the board has corrected too."""
         if message.source == Origin.HOST and self.value("mode") == "both":
             # Anybody may publish there; a status of no known meaning is not the mitigator's.
             with contextlib.suppress(ValueError):
-                self._agreement.add_host(messages.key_of(message), messages.from_range_corrected(message))
+                self._agreement.add_host(
+                    conversions.key_of(message), conversions.from_range_corrected(message)
+                )
 
     def _finish(self, error: UwbMitigationError | None) -> None:
         """The recording has ended: see that everything arrived, and leave."""
@@ -334,5 +385,5 @@ class Driver(ManagedNode):
         return hardware, level, text, facts
 
 
-def main() -> None:
-    sys.exit(run(lambda ended: [Driver(ended)]))
+def make_nodes(ended: threading.Event) -> list[Node]:
+    return [Driver(ended)]

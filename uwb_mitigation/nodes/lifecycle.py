@@ -15,9 +15,10 @@ from lifecycle_msgs.msg import State
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
-from uwb_mitigation.errors import UwbMitigationError
+from uwb_mitigation.errors import UwbMitigationError, not_imported
 from uwb_mitigation.nodes import diagnostics, topics
-from uwb_mitigation.nodes.parameters import Parameter, declare, warn_of_unknown
+from uwb_mitigation.nodes.parameter_tables import Parameter
+from uwb_mitigation.nodes.parameters import declare, warn_of_unknown_qos
 
 
 class ManagedNode(LifecycleNode):
@@ -84,7 +85,7 @@ class ManagedNode(LifecycleNode):
         result = self._attempt(self.open, self.close)
         if result == TransitionCallbackReturn.SUCCESS:
             # Those of quality of service are declared with the publishers and subscriptions.
-            warn_of_unknown(self, qos=True)
+            warn_of_unknown_qos(self)
         return result
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -120,8 +121,12 @@ class ManagedNode(LifecycleNode):
         except UwbMitigationError as error:
             self.error = error
         except Exception as error:
-            self.get_logger().error(traceback.format_exc())
-            self.error = UwbMitigationError(f"{type(error).__name__}: {error}", valid="see the log: a bug")
+            self.error = not_imported(error) if isinstance(error, ImportError) else None
+            if self.error is None:
+                self.get_logger().error(traceback.format_exc())
+                self.error = UwbMitigationError(
+                    f"{type(error).__name__}: {error}", valid="see the log: a bug"
+                )
         else:
             self.error = None
             return TransitionCallbackReturn.SUCCESS

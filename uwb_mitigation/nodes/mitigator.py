@@ -2,52 +2,54 @@
 
 from __future__ import annotations
 
-import sys
+import importlib.util
 import threading
 import time
 from collections.abc import Collection, Sequence
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.duration import Duration
+from rclpy.node import Node
 from rclpy.publisher import Publisher
+from rclpy.qos import ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
 from uwb_mitigation.bag.codec import decode_range, encode_corrected
 from uwb_mitigation.errors import RecordingError, UwbMitigationError
-from uwb_mitigation.measurement import RangeMeasurement, Status
-from uwb_mitigation.mitigation import Mitigation
+from uwb_mitigation.measurement import LINE_OF_SIGHT_DB, RangeMeasurement, Status
+from uwb_mitigation.mitigation import Backend, Mitigation, correct_batch
 from uwb_mitigation.model.bundle import load_bundle
-from uwb_mitigation.model.shipped import default_model_path
-from uwb_mitigation.nodes import clocks, diagnostics, messages, topics
-from uwb_mitigation.nodes.health import Health
+from uwb_mitigation.model.prior import LinePrior
+from uwb_mitigation.model.shipped import model_path
+from uwb_mitigation.nodes import clocks, conversions, diagnostics, topics
+from uwb_mitigation.nodes.health import MitigatorHealth
 from uwb_mitigation.nodes.lifecycle import ManagedNode
-from uwb_mitigation.nodes.parameters import Parameter
-from uwb_mitigation.nodes.running import run
+from uwb_mitigation.nodes.parameter_tables import MITIGATOR
+from uwb_mitigation.offsets import NO_OFFSETS, Offsets, read_offsets
+from uwb_mitigation.preprocessing import Scaling
 
-PARAMETERS = (
-    Parameter("model", "", "Model bundle to correct with; empty = the shipped one. A bundle that cannot be "
-              "used is refused, and the one before stays.", live=True),
-    Parameter("backend", "onnxruntime", "What computes: ONNX Runtime, or the firmware's C compiled for this "
-              "computer at activation, to the same bits.", choices=("onnxruntime", "firmware")),
-    Parameter("autostart", True, "Configure and activate without a lifecycle manager."),
-)  # fmt: skip
+if TYPE_CHECKING:
+    from uwb_mitigation.nodes.sensor_ranges import SensorRanges
+
+# ONNX Runtime is loaded while the node joins the graph; that it is absent is told before.
+if importlib.util.find_spec("onnxruntime") is None:
+    raise ModuleNotFoundError("No module named 'onnxruntime'", name="onnxruntime")
 
 BATCH = 16
 """Ranges that have queued up are corrected so many at once: a batch costs half of its ranges one by one."""
 
 
-def load(model: str, backend: str = "onnxruntime") -> Mitigation:
+def load(model: str, backend: str = "onnxruntime") -> Backend:
     """The bundle that the parameter `model` names, ready to correct by `backend`.
 
     Raises:
         ModelError: it is absent, corrupt, or refused by the backend.
         MissingDependencyError: the firmware is asked for where there is no C compiler.
     """
-    bundle = load_bundle(Path(model).expanduser() if model else default_model_path())
+    bundle = load_bundle(model_path(model))
     if backend == "firmware":
         # Only here: it compiles.
         from uwb_mitigation.firmware_export.backend import FirmwareMitigation
@@ -70,13 +72,16 @@ class Mitigator(ManagedNode):
     """
 
     def __init__(self, *, subscribe: bool = True, foreign: Collection[str] = ()) -> None:
-        super().__init__("mitigator", PARAMETERS, foreign)
-        self.health = Health()
+        super().__init__("mitigator", MITIGATOR, foreign)
+        self.health = MitigatorHealth(self._publisher_count)
         self._subscribe = subscribe
         self._raw: Subscription | None = None
         self._corrected: Publisher | None = None
-        self._mitigation: Mitigation | None = None
-        self._prepared: tuple[str, Mitigation] | None = None
+        self._sensor_ranges: SensorRanges | None = None
+        self._mitigation: Backend | None = None
+        self._prepared: tuple[str, Backend] | None = None
+        self._offsets = NO_OFFSETS
+        self._prepared_offsets: Offsets | None = None
         # A driver in the same process corrects from its own thread, while transitions run in the executor's.
         self._lock = threading.Lock()
         self._now_ns = clocks.reader(self.get_clock())
@@ -87,13 +92,16 @@ class Mitigator(ManagedNode):
 
     def open(self) -> None:
         self._corrected = topics.create_publisher(self, RangeCorrected, topics.RANGE_CORRECTED)
+        if self.value("sensor_ranges"):
+            self._sensor_ranges = self._make_sensor_ranges()
         if self._subscribe:
             # Serialised messages: decoding them here takes a third of what rclpy takes for its objects.
-            self._raw = topics.create_subscription(
-                self, RangeCir, topics.RANGE_RAW, self._on_raw, raw=True, on_lost=self._on_lost
+            self._raw = topics.create_raw_subscription(
+                self, RangeCir, topics.RANGE_RAW, self._on_raw, self._on_lost
             )
 
     def begin(self) -> None:
+        self._offsets = read_offsets(str(self.value("offsets")))
         self._use(load(self.value("model"), self.value("backend")))
 
     def end(self) -> None:
@@ -104,6 +112,9 @@ class Mitigator(ManagedNode):
         if self._raw is not None:
             self.destroy_subscription(self._raw)
             self._raw = None
+        if self._sensor_ranges is not None:
+            self._sensor_ranges.close()
+            self._sensor_ranges = None
         if self._corrected is not None:
             self.destroy_lifecycle_publisher(self._corrected)
             self._corrected = None
@@ -115,17 +126,30 @@ class Mitigator(ManagedNode):
             mitigation, publisher = self._mitigation, self._corrected
             if mitigation is None or publisher is None:
                 return
-            if len(measurements) == 1:
-                results = [mitigation.correct(measurements[0])]
-            else:
-                results = mitigation.correct_batch(measurements)
+            results = correct_batch(mitigation, measurements)
             for measurement, corrected in zip(measurements, results, strict=True):
                 publisher.publish(encode_corrected(measurement, corrected))
+                if self._sensor_ranges is not None:
+                    m = measurement
+                    self._sensor_ranges.publish(m.anchor_id, m.stamp_ns, m.frame_id, corrected)
         now_ns = self._now_ns()
         self.health.add_time(time.perf_counter_ns() - began_ns)
+        offsets = mitigation.offsets
+        needs_count = mitigation.bundle.preprocessing.scaling is Scaling.PREAMBLE
         for measurement, corrected in zip(measurements, results, strict=True):
             self.health.statuses[corrected.status] += 1
+            if needs_count and corrected.status is Status.BAD_CIR and measurement.cir.preamble_count <= 0:
+                self.health.uncounted += 1
+            if corrected.status is Status.OK and measurement.cir.power_gap_db < LINE_OF_SIGHT_DB:
+                offset_m = offsets.of(measurement.tag_id, measurement.anchor_id)
+                self.health.direct_m.append(corrected.correction_m - offset_m)
             self._meter.add(now_ns - measurement.stamp_ns)
+
+    def _make_sensor_ranges(self) -> SensorRanges:
+        # Only here, where it is asked for: sensor_msgs takes a twelfth of the time that a node takes to start.
+        from uwb_mitigation.nodes.sensor_ranges import SensorRanges
+
+        return SensorRanges(self)
 
     def subscription_count(self) -> int:
         """How many listen to the corrected ranges."""
@@ -137,11 +161,9 @@ class Mitigator(ManagedNode):
             self._corrected.wait_for_all_acked(timeout)
 
     def describe(self) -> tuple[str, bytes, str, dict[str, object]]:
-        if self._raw is not None and self._raw.get_publisher_count() != 1:
-            self.health.numbering.restart()
         period = self.health.period()
         level, text = diagnostics.OK, "correcting"
-        if warnings := period.warnings():
+        if warnings := [*self._mismatches(), *period.warnings()]:
             level, text = diagnostics.WARN, "; ".join(warnings)
         if period.statuses[Status.MODEL_ERROR]:
             level, text = diagnostics.ERROR, "the model fails on some ranges"
@@ -150,22 +172,42 @@ class Mitigator(ManagedNode):
         }
         facts |= {
             "out of distribution": f"{period.share(Status.OUT_OF_DISTRIBUTION):.3f}",
-            "dropped by a queue": self.health.dropped,
+            "dropped by a queue": self.health.dropped_text,
             "malformed": self.health.malformed,
         }
         facts |= self._meter.facts()
         facts |= diagnostics.percentiles("processing", period.processing_ns)
         if (mitigation := self._mitigation) is not None:
             bundle = mitigation.bundle
-            facts |= {"model": bundle.name, "model id": f"{bundle.model_id:08x}"}
+            facts |= {
+                "model": bundle.name,
+                "model id": diagnostics.model_id(bundle.model_id),
+                "offsets": str(mitigation.offsets),
+                "line of sight: ranges": period.direct_ranges,
+            }
+            if period.direct_ranges:
+                facts["line of sight: median predicted error m"] = f"{period.direct_m:.3f}"
         return "host", level, text, facts
 
-    def _on_raw(self, data: bytes) -> None:
+    def _mismatches(self) -> list[str]:
+        """Who publishes ranges that this node does not hear."""
+        if self._raw is None or self._raw.qos_profile.reliability != ReliabilityPolicy.RELIABLE:
+            return []
+        return [
+            f"{name} publishes by best effort and is not heard: set qos_overrides.{self._raw.topic_name}"
+            ".subscription.reliability:=best_effort"
+            for name in topics.unheard(self, self._raw.topic_name)
+        ]
+
+    def _publisher_count(self) -> int:
+        return self._raw.get_publisher_count() if self._raw is not None else 0
+
+    def _on_raw(self, data: bytes, number: int) -> None:
         # Subscriptions go on firing while a lifecycle node is inactive.
         if self._mitigation is None or self._raw is None:
             return
         batch = []
-        self.health.numbering.add()
+        self.health.numbering.add(number)
         take = self._raw.handle.take_message
         while True:
             measurement = self._decode(data)
@@ -175,7 +217,7 @@ class Mitigator(ManagedNode):
             if len(batch) == BATCH or (taken := take(RangeCir, True)) is None:
                 break
             data, info = taken
-            self.health.numbering.add_number(info["publication_sequence_number"])
+            self.health.numbering.add(topics.number_of(info))
         if batch:
             self.correct(batch)
 
@@ -186,7 +228,7 @@ class Mitigator(ManagedNode):
             pass
         # Of another byte order, or with an encoding of a later version: rclpy may still read it.
         try:
-            return messages.from_range_cir(deserialize_message(data, RangeCir))
+            return conversions.from_range_cir(deserialize_message(data, RangeCir))
         except Exception as error:  # Of no common type, and no message may end the node.
             self.health.malformed += 1
             self.get_logger().warning(f"a message cannot be read: {error}", throttle_duration_sec=10.0)
@@ -195,16 +237,35 @@ class Mitigator(ManagedNode):
     def _on_lost(self, info: Any) -> None:
         self.health.lost += info.total_count_change
 
-    def _use(self, mitigation: Mitigation) -> None:
+    def _use(self, mitigation: Backend) -> None:
         # Between two ranges, never within one: none is lost, none is corrected by half a model.
+        mitigation.offsets = self._offsets
         with self._lock:
             self._mitigation = mitigation
         bundle = mitigation.bundle
-        self.get_logger().info(f"correcting with model {bundle.name}, id {bundle.model_id:08x}")
+        self._judge_anew(mitigation)
+        limits = ": on other boards or behind other walls it may harm"
+        if bundle.prior == LinePrior(0.0):
+            limits = f"; offsets of these radios: {self._offsets}"
+        self.get_logger().info(
+            f"correcting with model {bundle.name}, id {diagnostics.model_id(bundle.model_id)}; "
+            f"{bundle.card.origin}{limits}"
+        )
+
+    def _judge_anew(self, mitigation: Backend) -> None:
+        # A prior has the offset of the boards that it was fitted to, unless another is set beside it.
+        self.health.predicts_excess_alone = bool(self._offsets) or mitigation.bundle.prior == LinePrior(0.0)
+        self.health.direct_m.clear()
 
     def _prepare(self, changes: list[Any]) -> SetParametersResult:
-        """Load a model that is to be set, or refuse it; ranges wait in the queue meanwhile."""
+        """Load a model or offsets that are to be set, or refuse them; ranges wait in the queue meanwhile."""
         for change in changes:
+            if change.name == "offsets":
+                try:
+                    self._prepared_offsets = read_offsets(str(change.value))
+                except UwbMitigationError as error:
+                    reason = f"parameter offsets = {change.value!r}: {error}"
+                    return SetParametersResult(successful=False, reason=reason)
             if change.name == "model" and isinstance(change.value, str):
                 try:
                     self._prepared = change.value, load(change.value, self.value("backend"))
@@ -216,12 +277,20 @@ class Mitigator(ManagedNode):
     def _swap(self, changes: list[Any]) -> None:
         # Called once the whole set was accepted; another callback may have refused what was prepared before.
         prepared, self._prepared = self._prepared, None
+        offsets, self._prepared_offsets = self._prepared_offsets, None
         for change in changes:
+            if change.name == "offsets" and offsets is not None:
+                with self._lock:
+                    self._offsets = offsets
+                    if self._mitigation is not None:
+                        self._mitigation.offsets = offsets
+                        self._judge_anew(self._mitigation)
+                self.get_logger().info(f"offsets: {offsets}")
             if change.name == "model" and prepared is not None and prepared[0] == change.value:
                 self.error = None
                 if self._mitigation is not None:
                     self._use(prepared[1])
 
 
-def main() -> None:
-    sys.exit(run(lambda stop: [Mitigator()]))
+def make_nodes(stop: threading.Event) -> list[Node]:
+    return [Mitigator()]

@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
-import threading
-import time
+import sys
 
-import rclpy
+from rclpy.context import Context
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 from rich.console import Console, Group
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
 
+from uwb_mitigation.bag.codec import decode_corrected, decode_truth
+from uwb_mitigation.errors import RecordingError, UwbMitigationError
 from uwb_mitigation.measurement import Status
 from uwb_mitigation.nodes import topics
-from uwb_mitigation.nodes.messages import NANOSECONDS, key_of
-from uwb_mitigation.nodes.running import spin
+from uwb_mitigation.nodes.probe import watching
+from uwb_mitigation.nodes.signals import stop_event
 from uwb_mitigation.nodes.tally import Tally
+from uwb_mitigation.viewer.scene import short_id
 
 REFRESH_HZ = 5
 
@@ -27,41 +29,34 @@ REFRESH_HZ = 5
 class Monitor(Node):
     """Feeds a tally from the three range topics."""
 
-    def __init__(self) -> None:
-        super().__init__("monitor")
+    def __init__(self, context: Context | None = None) -> None:
+        super().__init__("monitor", context=context)
         self.tally = Tally()
-        self.create_subscription(RangeTruth, topics.RANGE_TRUTH, self._on_truth, topics.RANGES)
-        self.create_subscription(RangeCir, topics.RANGE_RAW, self._on_raw, topics.RANGES)
-        self.create_subscription(RangeCorrected, topics.RANGE_CORRECTED, self._on_corrected, topics.RANGES)
+        for kind, topic, callback in (
+            (RangeTruth, topics.RANGE_TRUTH, self._on_truth),
+            (RangeCir, topics.RANGE_RAW, self._on_raw),
+            (RangeCorrected, topics.RANGE_CORRECTED, self._on_corrected),
+        ):
+            self.create_subscription(kind, topic, callback, topics.RANGES, raw=True)
 
-    def _on_raw(self, message: RangeCir) -> None:
+    def _on_raw(self, data: bytes) -> None:
         self.tally.add_raw()
 
-    def _on_truth(self, message: RangeTruth) -> None:
-        self.tally.add_truth(key_of(message), message.range, message.label)
+    def _on_truth(self, data: bytes) -> None:
+        with contextlib.suppress(RecordingError):
+            self.tally.add_truth(*decode_truth(data))
 
-    def _on_corrected(self, message: RangeCorrected) -> None:
+    def _on_corrected(self, data: bytes) -> None:
         now_ns = self.get_clock().now().nanoseconds
-        stamp = message.header.stamp
-        self.tally.add_corrected(
-            key_of(message),
-            (message.anchor_id, message.tag_id),
-            arrival_s=now_ns / NANOSECONDS,
-            latency_s=(now_ns - stamp.sec * NANOSECONDS - stamp.nanosec) / NANOSECONDS,
-            range_raw_m=message.range_raw,
-            range_m=message.range,
-            variance_m2=message.variance,
-            status=Status(message.status),
-        )
+        # What cannot be read is missing, and is counted as such.
+        with contextlib.suppress(RecordingError):
+            key, corrected = decode_corrected(data)
+            pair = (key.anchor_id, key.tag_id)
+            self.tally.add_corrected(key, pair, corrected, now_ns / 1e9, (now_ns - key.stamp_ns) / 1e9)
 
 
 def metres(value: float) -> str:
     return f"{value:.3f}" if math.isfinite(value) else "-"
-
-
-def short_id(identity: int) -> str:
-    """Small ids as they are; EUI-64 addresses by their last four digits."""
-    return str(identity) if identity < 1_000_000 else f"...{identity & 0xFFFF:04x}"
 
 
 def live_table(tally: Tally, title: str) -> Table:
@@ -79,18 +74,18 @@ def live_table(tally: Tally, title: str) -> Table:
         "label",
     ):
         table.add_column(column, justify="left" if column in ("status", "label") else "right")
-    for (anchor, tag), pair in sorted(tally.pairs.copy().items()):
-        style = "green" if pair.status is Status.OK else "yellow"
+    for (anchor, tag), history in sorted(tally.pairs.copy().items()):
+        sample, rate_hz = history.samples[-1], history.rate_hz()
         table.add_row(
             short_id(anchor),
             short_id(tag),
-            f"{pair.rate_hz:.1f}" if math.isfinite(pair.rate_hz) else "-",
-            metres(pair.range_raw_m),
-            metres(pair.range_m),
-            metres(pair.sigma_m),
-            metres(pair.true_m),
-            Text(pair.status.name, style=style),
-            pair.label,
+            f"{rate_hz:.1f}" if math.isfinite(rate_hz) else "-",
+            metres(sample.raw_m),
+            metres(sample.range_m),
+            metres(sample.sigma_m),
+            metres(sample.true_m),
+            Text(sample.status.name, style="green" if sample.status is Status.OK else "yellow"),
+            sample.label,
         )
     return table
 
@@ -103,11 +98,10 @@ def summary(tally: Tally) -> Group:
     lines: list[Text | Table] = [
         Text(),
         Text(f"{tally.raw} ranges received, {tally.corrected} corrected ({statuses}), {tally.missing} lost"),
-        Text(
-            "latency from stamp to corrected range: "
-            f"p50 {tally.latency_ms(50):.2f} ms, p99 {tally.latency_ms(99):.2f} ms"
-        ),
     ]
+    if tally.corrected:
+        p50, p99 = tally.latency_ms(50), tally.latency_ms(99)
+        lines.append(Text(f"latency from stamp to corrected range: p50 {p50:.2f} ms, p99 {p99:.2f} ms"))
     if tally.errors:
         table = Table(title="mean absolute error, m", title_justify="left")
         for column in ("label", "ranges", "raw MAE", "corrected MAE", "ratio"):
@@ -129,22 +123,13 @@ def summary(tally: Tally) -> Group:
 
 def main() -> None:
     """Show what passes on the topics until Ctrl-C."""
-    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    node = Monitor()
-    stop = threading.Event()
-    # The screen is drawn by this thread, messages are counted by another.
-    thread = threading.Thread(target=spin, args=(node, stop), daemon=True)
-    thread.start()
+    stop = stop_event()
     console = Console()
     try:
-        with Live(console=console, refresh_per_second=REFRESH_HZ) as live:
-            while True:
-                live.update(live_table(node.tally, "UWB ranges"))
-                time.sleep(1 / REFRESH_HZ)
-    except KeyboardInterrupt:
-        pass
-    stop.set()
-    thread.join()
-    console.print(summary(node.tally))
-    node.destroy_node()
-    rclpy.try_shutdown()
+        with watching(Monitor) as monitor:
+            with Live(console=console, refresh_per_second=REFRESH_HZ) as live:
+                while not stop.wait(1 / REFRESH_HZ):
+                    live.update(live_table(monitor.tally, "UWB ranges"))
+            console.print(summary(monitor.tally))
+    except UwbMitigationError as error:
+        sys.exit(f"error: {error}")

@@ -13,8 +13,9 @@ from collections.abc import Callable, Sequence
 from rclpy.clock import Clock
 
 from uwb_mitigation.errors import UwbMitigationError
+from uwb_mitigation.measurement import Record
 from uwb_mitigation.nodes import clocks
-from uwb_mitigation.sources.source import Record, Source
+from uwb_mitigation.sources.source import Source
 
 # How often the pace is checked against a clock that may be simulated, and /clock is published.
 TICK_S = 0.02
@@ -26,10 +27,10 @@ BATCH = 16
 class Playback:
     """Calls `publish([(record, stamp_ns), ...])` for the records of a source when their time has come.
 
-    A record's time is its offset from the first record, divided by `rate`, counted on `clock` from
-    the moment that playing starts; pauses longer than `longest_pause_s` of recorded time are cut to it.
+    A record's time is its offset from the first record, divided by `rate`, counted by a steady clock (by
+    `clock` where that is simulated) from the moment that playing starts; pauses longer than `longest_pause_s` of recorded time are cut to it.
     It is one record a call as long as playing keeps up; late ones may come several at once. Stamps are
-    on that clock; with `recorded_stamps` they are the recording's own and `on_time(recorded_ns)` is
+    on `clock`; with `recorded_stamps` they are the recording's own and `on_time(recorded_ns)` is
     called all along, to drive `/clock`. `on_end(error)` is called once, from the playing thread, unless
     `stop()` came first.
 
@@ -37,6 +38,7 @@ class Playback:
 
     Attributes:
         played: records published.
+        late_ns: how late the latest record was.
         rate: speed relative to the recording.
         paused: while True no record is published, and its time stands still.
     """
@@ -60,8 +62,10 @@ class Playback:
         self.rate = rate
         self.paused = paused
         self.played = 0
+        self.late_ns = 0
         self._source = source
-        self._now_ns = clocks.reader(clock)
+        self._clock = clocks.Pace(clock)
+        self._now_ns = self._clock.now_ns
         self._loop = loop
         self._longest_pause_ns = int(longest_pause_s * 1e9)
         self._recorded_stamps = recorded_stamps
@@ -142,7 +146,10 @@ class Playback:
                 late_ns = self._wait_until(due_ns, recorded_ns)
                 if late_ns is None:
                     return True, min(due_ns, self._position_ns(self._now_ns()))
-                stamp_ns = recorded_ns if self._recorded_stamps else self._clock_ns(due_ns)
+                self.late_ns = late_ns
+                stamp_ns = (
+                    recorded_ns if self._recorded_stamps else self._clock.stamp_ns(self._clock_ns(due_ns))
+                )
                 self._late.append((record, stamp_ns))
                 if late_ns < LATE_NS or len(self._late) == BATCH:
                     self._flush()
@@ -159,7 +166,7 @@ class Playback:
             self._late = []
 
     def _clock_ns(self, due_ns: int) -> int:
-        """When a moment of played time is due on the clock."""
+        """When a moment of played time is due, by the clock of the pace."""
         return self._place_clock_ns + int((due_ns - self._place_ns) / self._pace)
 
     def _wait_until(self, due_ns: int, recorded_ns: int) -> int | None:

@@ -6,13 +6,12 @@ that looks at a message can do.
 
 from __future__ import annotations
 
-import sys
+import threading
 
 from rclpy.node import Node
 from uwb_mitigation_msgs.msg import RangeCir
 
 from uwb_mitigation.nodes import topics
-from uwb_mitigation.nodes.running import run
 
 RELAYED = "uwb/range_relayed"
 
@@ -25,5 +24,5 @@ class Relay(Node):
         self.create_subscription(RangeCir, topics.RANGE_RAW, publisher.publish, topics.RANGES, raw=serialised)
 
 
-def main() -> None:
-    sys.exit(run(lambda stop: [Relay()]))
+def make_nodes(stop: threading.Event) -> list[Node]:
+    return [Relay()]

@@ -9,9 +9,14 @@ from typing import Any
 from rclpy.clock import Clock
 
 from uwb_mitigation.errors import UwbMitigationError
+from uwb_mitigation.measurement import Record
 from uwb_mitigation.nodes import diagnostics
 from uwb_mitigation.nodes.playback import Playback
-from uwb_mitigation.sources.source import Record, Source
+from uwb_mitigation.sources.source import Source
+
+ANNOUNCED_AFTER_S = 3.0
+FALLEN_BEHIND_S = 0.5
+"""A replay that is later than this is said to fall behind."""
 
 
 class ReplayFeed:
@@ -23,7 +28,8 @@ class ReplayFeed:
         logger: with `info` and `warning`, as rclpy's.
         subscribers: how many listen now.
         wanted_subscribers: playing waits for so many, but no longer than `longest_wait_s`.
-        start_delay_s: then it waits so long again, for the rest of the graph to start and connect.
+        start_delay_s: then it waits so long again, for the rest of the graph to start and connect; negative =
+            not at all where several are wanted, and have come.
 
     Attributes:
         playback: what plays; its rate and pause may be changed.
@@ -55,6 +61,9 @@ class ReplayFeed:
         self._wanted_subscribers = wanted_subscribers
         self._longest_wait_s = longest_wait_s
         self._start_delay_s = start_delay_s
+        if start_delay_s < 0.0:
+            # The middleware announces what is new every 3 s, should its first announcements be missed.
+            self._start_delay_s = 0.0 if wanted_subscribers > 1 else ANNOUNCED_AFTER_S
         self._on_end = on_end
         self._started_s = 0.0
         self._heard_s: float | None = None
@@ -74,7 +83,10 @@ class ReplayFeed:
         )
 
     def start(self) -> None:
-        self._logger.info(f"replaying {self._source.name}")
+        if self._source.simulated:
+            self._logger.warning(f"replaying simulated ranges, which no radio measured: {self._source.name}")
+        else:
+            self._logger.info(f"replaying {self._source.name}")
         self._started_s = time.monotonic()
         self.playback.start()
 
@@ -86,12 +98,22 @@ class ReplayFeed:
         """Hardware id, level, message and facts for the diagnostics."""
         facts: dict[str, object] = {
             "source": self._source.name,
-            "simulated": self._source.simulated,
+            "simulated": "unknown" if self._source.simulated is None else self._source.simulated,
             "ranges published": self.playback.played,
         }
         facts |= {f"oddity: {kind}": count for kind, count in self._source.skipped.copy().items()}
-        text = "paused" if self.playback.paused else "replaying"
-        return "simulated" if self._source.simulated else "recording", diagnostics.OK, text, facts
+        level, text = diagnostics.OK, "paused" if self.playback.paused else "replaying"
+        if self._source.simulated:
+            level, text = diagnostics.WARN, f"{text} simulated ranges: no radio measured them"
+        late_s = self.playback.late_ns / 1e9
+        if late_s > FALLEN_BEHIND_S:
+            level, text = (
+                diagnostics.WARN,
+                f"{text}; {late_s:.1f} s behind: the rate is too high for this machine",
+            )
+            self._logger.warning(text, throttle_duration_sec=10.0)
+        facts["behind s"] = f"{max(late_s, 0.0):.3f}"
+        return "simulated" if self._source.simulated else "recording", level, text, facts
 
     def _is_ready(self) -> bool:
         """True once enough others listen and the graph had time to settle, or they did not come."""

@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM as an event, from the first moment of a node on. Standard library only: see `entry`."""
+"""SIGINT and SIGTERM as an event, from the moment that a node is loaded; before that, see `entry`."""
 
 from __future__ import annotations
 

@@ -7,6 +7,7 @@ History, depth and reliability can be overridden by the standard parameters
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -24,6 +25,12 @@ from uwb_mitigation.errors import ParameterError
 RANGE_RAW = "uwb/range_raw"
 RANGE_CORRECTED = "uwb/range_corrected"
 RANGE_TRUTH = "uwb/range_truth"
+POSE = "uwb/pose"
+ODOMETRY = "uwb/odometry"
+POSE_SMOOTHED = "uwb/pose_smoothed"
+ANCHORS = "uwb/anchors"
+ODOMETRY_TRUTH = "uwb/odometry_truth"
+TF = "/tf"
 DIAGNOSTICS = "/diagnostics"
 CLOCK = "/clock"
 
@@ -43,6 +50,15 @@ def _ranges() -> QoSProfile:
 RANGES = _ranges()
 
 
+LATCHED = QoSProfile(
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+    history=HistoryPolicy.KEEP_LAST,
+    depth=1,
+)
+"""Of what a late subscriber wants too."""
+
+
 def create_publisher(node: LifecycleNode, kind: type, topic: str) -> Publisher:
     """A lifecycle publisher of ranges.
 
@@ -57,15 +73,9 @@ def create_publisher(node: LifecycleNode, kind: type, topic: str) -> Publisher:
 
 
 def create_subscription(
-    node: LifecycleNode,
-    kind: type,
-    topic: str,
-    callback: Callable[[Any], None],
-    *,
-    raw: bool = False,
-    on_lost: Callable[[Any], None] | None = None,
+    node: LifecycleNode, kind: type, topic: str, callback: Callable[[Any], None]
 ) -> Subscription:
-    """A subscription of ranges; `raw` hands the callback serialised bytes.
+    """A subscription of ranges.
 
     Raises:
         ParameterError: an overridden quality of service is none.
@@ -76,10 +86,54 @@ def create_subscription(
             topic,
             callback,
             _ranges(),
-            raw=raw,
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+        )
+
+
+def create_raw_subscription(
+    node: LifecycleNode,
+    kind: type,
+    topic: str,
+    callback: Callable[[bytes, int], None],
+    on_lost: Callable[[Any], None],
+) -> Subscription:
+    """A subscription of ranges that hands over serialised bytes, and the number that their publisher gave them.
+
+    Raises:
+        ParameterError: an overridden quality of service is none.
+    """
+
+    def taken(*message: Any) -> None:
+        # rclpy's executors pass message and info; its events executor passes both as one tuple.
+        data, info = message if len(message) == 2 else message[0]
+        callback(data, number_of(info))
+
+    # By its signature rclpy tells that the info is wanted.
+    vars(taken)["__signature__"] = inspect.signature(lambda data, info: None)
+    with _checked(node, topic):
+        return node.create_subscription(
+            kind,
+            topic,
+            taken,
+            _ranges(),
+            raw=True,
             event_callbacks=SubscriptionEventCallbacks(message_lost=on_lost),
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )
+
+
+def number_of(info: dict[str, int]) -> int:
+    """The number of a message from its publisher, as rclpy's `take_message` has it."""
+    return info["publication_sequence_number"]
+
+
+def unheard(node: LifecycleNode, topic: str) -> list[str]:
+    """The nodes that publish on a topic by best effort, which a reliable subscription does not hear."""
+    return [
+        f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"
+        for endpoint in node.get_publishers_info_by_topic(topic)
+        if endpoint.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
+    ]
 
 
 @contextmanager

@@ -6,13 +6,17 @@ here converts explicitly. Raw and corrected ranges of the host are serialised by
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from builtin_interfaces.msg import Time
 from std_msgs.msg import Header
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
 
-from uwb_mitigation.link.messages import Correction
 from uwb_mitigation.measurement import Cir, CorrectedRange, Encoding, Origin, RangeMeasurement, Status, Truth
+
+if TYPE_CHECKING:
+    from uwb_mitigation.link.messages import Correction
 
 NANOSECONDS = 1_000_000_000
 _COMPLEX = Encoding.COMPLEX_INT16

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import gc
+import importlib
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 import rclpy
 from rclpy.context import Context
@@ -16,7 +18,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
-from uwb_mitigation.errors import ParameterError, UwbMitigationError
+from uwb_mitigation.errors import ParameterError, UwbMitigationError, not_imported
 from uwb_mitigation.nodes.signals import stop_event
 
 PATIENCE_S = 0.2
@@ -24,8 +26,9 @@ PATIENCE_S = 0.2
 
 def spin(nodes: Node | Sequence[Node], stop: threading.Event) -> None:
     """Serve the callbacks of one node, or of several, until `stop` is set."""
-    executor = make_executor()
-    for node in nodes if isinstance(nodes, Sequence) else [nodes]:
+    all_nodes = nodes if isinstance(nodes, Sequence) else [nodes]
+    executor = make_executor(all_nodes[0].context if all_nodes else None)
+    for node in all_nodes:
         executor.add_node(node)
     # What was imported stays for good: a full collection would walk all of it, and delay a range by
     # tens of milliseconds.
@@ -47,26 +50,34 @@ def make_executor(context: Context | None = None) -> Executor:
     return EventsExecutor(context=context)
 
 
-def run(
-    make_nodes: Callable[[threading.Event], Sequence[Node]], arguments: Sequence[str] | None = None
-) -> int:
-    """Initialise ROS, make nodes, spin them, and end cleanly. Returns the process's exit code.
+def main(module: str) -> None:
+    """Be the process of a module of `nodes`, whose `make_nodes` is called once it is loaded."""
+    sys.exit(_run(f"uwb_mitigation.nodes.{module}"))
+
+
+def _run(module: str) -> int:
+    """Initialise ROS, load a module, make its nodes, spin them, and end cleanly. Returns the process's exit code.
 
     SIGINT and SIGTERM set the event that `make_nodes` is given; so may a node, with its `exit_code`
     set before. Nodes are destroyed in their order. ROS's own handlers would tear the context down
     under callbacks that still publish.
     """
-    stop = stop_event()
     nodes: Sequence[Node] = ()
     try:
-        if stop.is_set():
-            return 0
-        _initialise(arguments)
+        _initialise()
         try:
-            nodes = make_nodes(stop)
+            with _participant():
+                make_nodes = importlib.import_module(module).make_nodes
+                stop = stop_event()
+                nodes = make_nodes(stop)
         except (rclpy_implementation.RCLError, NameValidationException) as error:
             raise ParameterError(_first_line(error), valid="check the names given to --ros-args") from error
         spin(nodes, stop)
+    except ImportError as error:
+        if (absent := not_imported(error)) is None:
+            raise
+        print(f"error: {absent}", file=sys.stderr)
+        return 1
     except UwbMitigationError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
@@ -77,13 +88,31 @@ def run(
     return max((int(getattr(node, "exit_code", 0)) for node in nodes), default=0)
 
 
-def _initialise(arguments: Sequence[str] | None) -> None:
+@contextmanager
+def _participant() -> Iterator[None]:
+    """Join the graph by a hidden node, until there are others: the middleware's participant is the process's.
+
+    Finding each other takes the middleware longer than loading takes Python, and goes on meanwhile.
+    """
+    node = Node(
+        "_loading",
+        use_global_arguments=False,
+        enable_rosout=False,
+        start_parameter_services=False,
+    )
+    try:
+        yield
+    finally:
+        node.destroy_node()
+
+
+def _initialise() -> None:
     """Initialise ROS without its signal handlers.
 
     Raises:
         ParameterError: an argument that ROS cannot read, or that is none of ROS's.
     """
-    words = list(sys.argv if arguments is None else arguments)
+    words = list(sys.argv)
     try:
         rclpy.init(args=words, signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:

@@ -1,0 +1,96 @@
+"""The executables, and how they end while they still load. Standard library only: loading the rest takes a second.
+
+python -m uwb_mitigation.entry NODE --ros-args ..., or DEMO ...
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import signal
+import sys
+from collections.abc import Callable
+from typing import Any
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_DEMOS = {"demo": "replay", "firmware-demo": "firmware_demo", "radio-demo": "radio_demo"}
+
+
+def driver() -> None:
+    _node("driver")
+
+
+def mitigator() -> None:
+    _node("mitigator")
+
+
+def locator() -> None:
+    _node("locator")
+
+
+def pipeline() -> None:
+    _node("pipeline")
+
+
+def monitor() -> None:
+    _node("monitor")
+
+
+def viewer() -> None:
+    _node("viewer")
+
+
+def command_line() -> None:
+    """`uwb-mitigation`."""
+    _program("uwb_mitigation.cli")
+
+
+def _program(module: str) -> None:
+    """Run a module that leaves signals to Python, and is told of Ctrl-C by an exception."""
+    run = _load(module)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    run()
+
+
+def _node(name: str) -> None:
+    if {"-h", "--help"} & set(sys.argv[1:]):
+        from uwb_mitigation.nodes.help import text_for
+
+        print(text_for(name))
+    elif name == "monitor":
+        # It draws in this thread, and is spun by another.
+        _load("uwb_mitigation.nodes.monitor")()
+    else:
+        # Which catches signals itself once the node is loaded.
+        _load("uwb_mitigation.nodes.spinning")(name)
+
+
+def _load(module: str) -> Callable[..., Any]:
+    """The `main` of a module. Until it is loaded a signal ends the process at once, with 128 + its number.
+
+    A library that is not there ends it with one line.
+    """
+    for number in _SIGNALS:
+        signal.signal(number, _end)
+    try:
+        main: Callable[..., Any] = importlib.import_module(module).main
+    except ImportError as error:
+        from uwb_mitigation.errors import not_imported
+
+        if (absent := not_imported(error)) is None:
+            raise
+        sys.exit(f"error: {absent}")
+    return main
+
+
+def _end(number: int, frame: Any) -> None:
+    os._exit(128 + number)
+
+
+if __name__ == "__main__":
+    name = sys.argv.pop(1)
+    if name in _DEMOS:
+        _program(f"uwb_mitigation.demos.{_DEMOS[name]}")
+    else:
+        _node(name)

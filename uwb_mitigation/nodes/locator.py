@@ -1,0 +1,353 @@
+"""The node `locator`: subscribes to `/uwb/range_corrected`, publishes where the tags are."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Callable, Collection
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import PoseWithCovarianceStamped, Quaternion, Transform, TransformStamped, Vector3
+from nav_msgs.msg import Odometry
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.subscription import Subscription
+from rclpy.timer import Timer
+from uwb_mitigation_msgs.msg import RangeCorrected
+from visualization_msgs.msg import MarkerArray
+
+from uwb_mitigation.bag.codec import decode_corrected
+from uwb_mitigation.bag.poses import encode_odometry, encode_pose, tag_frame
+from uwb_mitigation.errors import MissingDependencyError, ParameterError, RecordingError
+from uwb_mitigation.nodes import clocks, diagnostics, markers, topics
+from uwb_mitigation.nodes.conversions import to_header
+from uwb_mitigation.nodes.lifecycle import ManagedNode
+from uwb_mitigation.nodes.parameter_tables import LOCATOR
+from uwb_mitigation.offsets import NO_OFFSETS
+from uwb_mitigation.positioning.fleet import Fleet, Tag
+from uwb_mitigation.positioning.model import Model
+from uwb_mitigation.positioning.start import Area, Height
+from uwb_mitigation.positioning.tracks import Estimate
+from uwb_mitigation.sources.site import load_anchors, load_learnt, save_learnt
+
+BATCH = 64
+"""Ranges that have queued up are taken so many at a time."""
+
+SLOW_S = 0.2
+"""Smoothed poses, markers, and predictions through a silence come so often."""
+
+SILENT_S = 0.3
+KEEP_S = 60.0
+"""Learnt offsets are written so often, and at the end."""
+
+COAST_S = 30.0
+"""A tag that fell silent is predicted for so long: by then its covariance has outgrown most halls."""
+
+_NANOSECONDS = 1_000_000_000
+
+
+class _Outputs:
+    """The publishers of one tag, and what it said last."""
+
+    def __init__(self, node: Locator, prefix: str) -> None:
+        def publisher(kind: type, topic: str) -> Publisher:
+            head, _, tail = topic.rpartition("/")
+            return topics.create_publisher(node, kind, f"{head}/{prefix}{tail}")
+
+        self.pose = publisher(PoseWithCovarianceStamped, topics.POSE)
+        self.odometry = publisher(Odometry, topics.ODOMETRY)
+        self.smoothed = publisher(PoseWithCovarianceStamped, topics.POSE_SMOOTHED)
+        self.plain = not prefix
+        self.picture = markers.TagPicture()
+        self.told_ns = self.smoothed_ns = -(1 << 62)
+
+    def all(self) -> tuple[Publisher, ...]:
+        return self.pose, self.odometry, self.smoothed
+
+
+class Locator(ManagedNode):
+    """Lifecycle: configure reads the anchors and makes the topics, activate begins to follow tags.
+
+    An anchors file that is absent or wrong leaves the node unconfigured, and log and diagnostics say why; it may be
+    configured again once the file is mended.
+
+    Args:
+        foreign: see `ManagedNode`.
+    """
+
+    def __init__(self, *, foreign: Collection[str] = ()) -> None:
+        super().__init__("locator", LOCATOR, foreign)
+        self._fleet: Fleet | None = None
+        self._subscriptions_made: list[Subscription] = []
+        self._ranges: Subscription | None = None
+        self._anchors_out: Publisher | None = None
+        self._tf: Publisher | None = None
+        self._make_tf: Callable[[list[Any]], Any] = list
+        self._outputs: dict[int, _Outputs] = {}
+        self._timer: Timer | None = None
+        self._malformed = self._lost = 0
+        self._told: set[int] = set()
+        self._offsets_file: Path | None = None
+        self._kept = 0
+        self._keep_at_s = time.monotonic() + KEEP_S
+        self._processing_ns: list[int] = []
+        self._now_ns = clocks.reader(self.get_clock())
+        self._meter = diagnostics.Meter(self._now_ns)
+        # Without its anchors it stays, for the log and the diagnostics to say so.
+        with contextlib.suppress(ParameterError, MissingDependencyError):
+            self.autostart()
+
+    def open(self) -> None:
+        path = self.value("anchors")
+        if not path:
+            raise ParameterError(
+                "parameter anchors is empty", valid="anchors:=FILE, as docs/positioning.md shows"
+            )
+        anchors = load_anchors(Path(path).expanduser())
+        model = Model(acceleration=self.value("acceleration"), range_sd=self.value("range_sd"))
+        height = Height(self.value("height"), self.value("height_sd")) if self.value("level") else None
+        self._offsets_file = (
+            Path(self.value("offsets_file")).expanduser() if self.value("offsets_file") else None
+        )
+        known = load_learnt(self._offsets_file, model) if self._offsets_file else NO_OFFSETS
+        self._fleet = Fleet(
+            anchors,
+            model,
+            height=height,
+            area=_area(self.value("area")),
+            known=known,
+            learn_offsets=self.value("learn_offsets"),
+        )
+        self._kept = 0
+        self._period_ns = round(_NANOSECONDS / self.value("rate")) if self.value("rate") > 0 else 0
+        self._offset_ns = round(self.value("stamp_offset") * _NANOSECONDS)
+        self._map, self._base = self.value("map_frame"), self.value("base_frame")
+        self._lever = np.array([self.value(f"lever_arm_{axis}") for axis in "xyz"])
+        if self.value("publish_tf"):
+            self._open_tf()
+        self._anchors_out = self.create_lifecycle_publisher(MarkerArray, topics.ANCHORS, topics.LATCHED)
+        self._ranges = topics.create_raw_subscription(
+            self, RangeCorrected, topics.RANGE_CORRECTED, self._on_range, self._on_lost
+        )
+        for kind, name, callback in (
+            (PoseWithCovarianceStamped, "height_topic", self._on_height),
+            (Odometry, "odometry_topic", self._on_odometry),
+        ):
+            if topic := self.value(name):
+                self._subscriptions_made.append(topics.create_subscription(self, kind, topic, callback))
+        self.get_logger().info(f"{len(anchors)} anchors from {path}")
+        if len(known):
+            self.get_logger().info(f"offsets of {len(known)} pairs from {self._offsets_file}")
+
+    def begin(self) -> None:
+        self._show_anchors()
+        self._timer = self.create_timer(SLOW_S, self._on_timer, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.get_logger().info("locating")
+
+    def end(self) -> None:
+        if self._timer is not None:
+            self.destroy_timer(self._timer)
+            self._timer = None
+            self._keep_offsets()
+
+    def close(self) -> None:
+        for subscription in (*self._subscriptions_made, self._ranges):
+            if subscription is not None:
+                self.destroy_subscription(subscription)
+        self._subscriptions_made, self._ranges = [], None
+        for outputs in self._outputs.values():
+            for publisher in outputs.all():
+                self.destroy_lifecycle_publisher(publisher)
+        for publisher in (self._anchors_out, self._tf):
+            if publisher is not None:
+                self.destroy_lifecycle_publisher(publisher)
+        self._outputs, self._anchors_out, self._tf, self._fleet = {}, None, None, None
+
+    def describe(self) -> tuple[str, bytes, str, dict[str, object]]:
+        fleet = self._fleet
+        if fleet is None:
+            return "host", diagnostics.WARN, "no anchors", {}
+        warnings = fleet.warnings()
+        level, text = diagnostics.OK, "locating" if fleet.tags else "no ranges yet"
+        if warnings:
+            level, text = diagnostics.WARN, "; ".join(warnings[:5])
+        facts = fleet.facts() | {"dropped by a queue": self._lost, "malformed": self._malformed}
+        facts |= self._meter.facts()
+        taken, self._processing_ns = self._processing_ns, []
+        facts |= diagnostics.percentiles("processing", taken)
+        return "host", level, text, facts
+
+    def _keep_offsets(self) -> None:
+        """Write what was learnt since the last time, if anything."""
+        self._keep_at_s = time.monotonic() + KEEP_S
+        fleet, path = self._fleet, self._offsets_file
+        if fleet is None or path is None or fleet.learnt == self._kept:
+            return
+        try:
+            save_learnt(path, fleet.offsets())
+        except ParameterError as error:
+            self.get_logger().warning(f"learnt offsets are not kept: {error}", throttle_duration_sec=600.0)
+        else:
+            self._kept = fleet.learnt
+
+    def _open_tf(self) -> None:
+        try:
+            from tf2_msgs.msg import TFMessage
+        except ImportError as error:
+            raise MissingDependencyError(
+                "publish_tf needs tf2_msgs, which is not installed",
+                valid="apt install ros-jazzy-tf2-msgs, or publish_tf:=false",
+            ) from error
+        self._tf = self.create_lifecycle_publisher(TFMessage, topics.TF, 100)
+        self._make_tf = lambda transforms: TFMessage(transforms=transforms)
+
+    def _on_lost(self, info: Any) -> None:
+        self._lost += info.total_count_change
+
+    def _on_range(self, data: bytes, number: int) -> None:
+        # Subscriptions go on firing while a lifecycle node is inactive.
+        if self._fleet is None or self._ranges is None or not self.is_active:
+            return
+        take = self._ranges.handle.take_message
+        for _ in range(BATCH):
+            self._take(self._fleet, data)
+            # What else has queued up comes with it; the executor then finds its own turn empty.
+            taken = take(RangeCorrected, True)
+            if taken is None:
+                return
+            data, _ = taken
+        self._take(self._fleet, data)
+
+    def _take(self, fleet: Fleet, data: bytes) -> None:
+        began_ns = time.perf_counter_ns()
+        try:
+            key, corrected = decode_corrected(data)
+        except RecordingError as error:
+            self._malformed += 1
+            self.get_logger().warning(f"a message cannot be read: {error}", throttle_duration_sec=10.0)
+            return
+        stamp_ns = key.stamp_ns + self._offset_ns
+        found = fleet.add(key.tag_id, key.anchor_id, stamp_ns, corrected.range_m, corrected.variance_m2)
+        if found is None:
+            if key.anchor_id in fleet.strangers and key.anchor_id not in self._told:
+                self._told.add(key.anchor_id)
+                self.get_logger().warning(
+                    f"ranges of anchor {key.anchor_id} are left out: it is not in the anchors file"
+                )
+            return
+        tag, estimate = found
+        outputs = self._outputs_of(tag)
+        outputs.picture.statuses[fleet.anchors.index[key.anchor_id]] = corrected.status
+        if estimate is not None and not 0 <= stamp_ns - outputs.told_ns < self._period_ns:
+            outputs.told_ns = stamp_ns
+            self._tell(outputs, estimate)
+        now_ns = time.perf_counter_ns()
+        if len(self._processing_ns) < 20_000:
+            self._processing_ns.append(now_ns - began_ns)
+        self._meter.add(self._now_ns() - key.stamp_ns)
+
+    def _outputs_of(self, tag: Tag) -> _Outputs:
+        outputs = self._outputs.get(tag.tag_id)
+        if outputs is None:
+            chosen = self.value("tag")
+            plain = tag.tag_id == chosen if chosen else not self._outputs
+            outputs = _Outputs(self, "" if plain else f"{tag_frame(tag.tag_id)}/")
+            for publisher in outputs.all():
+                publisher.on_activate(None)
+            self._outputs[tag.tag_id] = outputs
+            self.get_logger().info(f"tag {tag.tag_id} on {outputs.pose.topic_name}")
+        return outputs
+
+    def _tell(self, outputs: _Outputs, estimate: Estimate) -> None:
+        outputs.picture.add(estimate)
+        estimate = self._at_base(estimate)
+        outputs.pose.publish(encode_pose(estimate, self._map))
+        outputs.odometry.publish(encode_odometry(estimate, self._map, self._base))
+        if self._tf is not None and outputs.plain:
+            x, y, z = estimate.position.tolist()
+            transform = TransformStamped(
+                header=to_header(estimate.stamp_ns, self._map),
+                child_frame_id=self._base,
+                transform=Transform(translation=Vector3(x=x, y=y, z=z), rotation=Quaternion(w=1.0)),
+            )
+            self._tf.publish(self._make_tf([transform]))
+
+    def _at_base(self, estimate: Estimate) -> Estimate:
+        """The estimate of the base frame. How the base is turned is not known: a horizontal arm points anywhere."""
+        x, y, z = self._lever.tolist()
+        if not (x or y or z):
+            return estimate
+        covariance = estimate.covariance.copy()
+        covariance[[0, 1], [0, 1]] += (x * x + y * y) / 2.0
+        return replace(estimate, position=estimate.position - (0.0, 0.0, z), covariance=covariance)
+
+    def _on_timer(self) -> None:
+        fleet, now_ns = self._fleet, self._now_ns()
+        if fleet is None or not self.is_active:
+            return
+        for tag in list(fleet.tags.values()):
+            outputs = self._outputs_of(tag)
+            silent_s = (now_ns + self._offset_ns - tag.latest_ns) / _NANOSECONDS
+            if SILENT_S < silent_s < COAST_S:
+                ahead = tag.locator.at(now_ns + self._offset_ns)
+                if ahead is not None:
+                    self._tell(outputs, ahead)
+            elif outputs.smoothed_ns != tag.latest_ns and outputs.smoothed.get_subscription_count():
+                outputs.smoothed_ns = tag.latest_ns
+                smoothed = tag.smoother.estimate()
+                if smoothed is not None:
+                    outputs.smoothed.publish(encode_pose(self._at_base(smoothed), self._map))
+        if time.monotonic() >= self._keep_at_s:
+            self._keep_offsets()
+        if self._anchors_out is not None and fleet.tags and self._anchors_out.get_subscription_count():
+            self._show_anchors()
+
+    def _show_anchors(self) -> None:
+        fleet, publisher = self._fleet, self._anchors_out
+        if fleet is None or publisher is None:
+            return
+        now_ns = self._now_ns()
+        shown = markers.anchor_markers(fleet.anchors, self._map, now_ns)
+        for number, tag in enumerate(fleet.tags.values()):
+            picture = self._outputs_of(tag).picture
+            heard = tag.locator.heard()
+            shown += markers.tag_markers(picture, heard, fleet.anchors, self._map, number, now_ns)
+        publisher.publish(markers.array(shown))
+
+    def _on_height(self, message: PoseWithCovarianceStamped) -> None:
+        variance = float(message.pose.covariance[14])
+        self._tell_all(
+            lambda tag: tag.locator.add_height(float(message.pose.pose.position.z), variance), variance
+        )
+
+    def _on_odometry(self, message: Odometry) -> None:
+        velocity, variance = message.twist.twist.linear, float(message.twist.covariance[0])
+        speed = float(np.hypot(velocity.x, velocity.y))
+        self._tell_all(lambda tag: tag.locator.add_speed(speed, max(variance, 1e-4)), speed + variance)
+
+    def _tell_all(self, tell: Callable[[Tag], None], finite: float) -> None:
+        if self._fleet is None or not np.isfinite(finite):
+            return
+        # One robot, one tag: of several, nobody could say whose height or speed it is.
+        if len(self._fleet.tags) == 1:
+            for tag in self._fleet.tags.values():
+                tell(tag)
+
+
+def _area(text: str) -> Area | None:
+    if not text:
+        return None
+    try:
+        x, y, z, x1, y1, z1 = (float(word) for word in text.split(","))
+    except ValueError as error:
+        raise ParameterError(f"parameter area = {text!r}", valid="six numbers: X,Y,Z,X,Y,Z") from error
+    return Area((x, y, z), (x1, y1, z1))
+
+
+def make_nodes(stop: threading.Event) -> list[Node]:
+    return [Locator()]

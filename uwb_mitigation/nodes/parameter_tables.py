@@ -1,0 +1,230 @@
+"""The parameter tables of the nodes: name, type, default, range and meaning in one place. No ROS here.
+
+Ours, since generate_parameter_library makes its own code at build time and is not on PyPI. From them come the declarations (`parameters`), `--help`, the files in `params/` and the parameter reference.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from uwb_mitigation.errors import ParameterError
+
+Value = bool | int | float | str
+
+_TYPE_NAMES = {
+    bool: "true or false",
+    int: "a whole number",
+    float: "a number",
+    str: "a text",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """One row of a table.
+
+    Attributes:
+        name, default: as declared; the default's type is the parameter's type.
+        description: what it does.
+        unit: of a number; empty = none.
+        or_number: a text that may be given as a number too.
+        low, high: inclusive range of a number.
+        choices: the values a string may take; empty = any.
+        filed: stands in the parameter file; otherwise it is what the user has to say.
+        live: may be set while the node runs; otherwise it is read-only after start-up.
+    """
+
+    name: str
+    default: Value
+    description: str
+    low: float | None = None
+    high: float | None = None
+    choices: tuple[str, ...] = ()
+    live: bool = False
+    filed: bool = True
+    unit: str = ""
+    or_number: bool = False
+
+    @property
+    def valid(self) -> str:
+        """The range of valid values in words."""
+        if self.choices:
+            return "one of " + ", ".join(self.choices)
+        if self.low is not None and self.high is not None:
+            low, high = (f"{bound:.10g}" for bound in (self.low, self.high))
+            return f"{_TYPE_NAMES[type(self.default)]}, {low} to {high} {self.unit}".rstrip()
+        return "a number or a text" if self.or_number else _TYPE_NAMES[type(self.default)]
+
+    @property
+    def default_text(self) -> str:
+        """The default as YAML has it."""
+        if isinstance(self.default, bool):
+            return str(self.default).lower()
+        return str(self.default) or "''"
+
+    def check(self, value: Any) -> None:
+        """Raise ParameterError unless `value` has the right type and lies in the range."""
+        numeric = isinstance(self.default, float) and type(value) is int
+        numeric |= self.or_number and type(value) in (int, float)
+        if type(value) is not type(self.default) and not numeric:
+            raise ParameterError(f"parameter {self.name} = {value!r}", valid=self.valid)
+        inside = True
+        if self.choices:
+            inside = value in self.choices
+        elif self.low is not None and self.high is not None:
+            inside = self.low <= value <= self.high
+        if not inside:
+            raise ParameterError(f"parameter {self.name} = {value!r}", valid=self.valid)
+
+
+_SENSOR_RANGES = Parameter(
+    "sensor_ranges", False, "Publish corrected ranges as sensor_msgs/Range as well, on uwb/range_corrected/anchor_ID; "
+    "a range that is none as +Inf. The driver does so with what the board has corrected.",
+)  # fmt: skip
+
+DRIVER = (
+    Parameter("source", "simulated", "Where measurements come from.",
+              choices=("mcap", "decaranging", "simulated", "serial", "evb1000", "spi"), filed=False),
+    Parameter("path", "", "Recording to replay: a bag (mcap), a log or a folder of logs (decaranging)."),
+    Parameter("topic", "/uwb/range_raw", "Topic of the ranges inside the bag (mcap)."),
+    Parameter("cir", "final", "Which frame's CIR belongs to a range (decaranging).",
+              choices=("final", "poll")),
+    Parameter("seed", 1, "Seed of the simulated measurements.", low=0, high=2**31 - 1),
+    Parameter("count", 0, "Simulated measurements before the end; 0 = endless.", low=0, high=2**31 - 1),
+    Parameter("simulated_rate", 40.0, "Simulated exchanges a second, over all pairs.",
+              low=0.1, high=10_000.0, unit="Hz"),
+    Parameter("rate", 1.0, "Speed of a replay relative to the recording.",
+              low=0.001, high=10_000.0, live=True),
+    Parameter("paused", False, "A replay stands still while this is set.", live=True),
+    Parameter("seek_to", 0.0, "Where a replay starts, from the beginning of the recording; set while it runs, "
+              "it goes on from there.", low=0.0, high=1e9, live=True, unit="s"),
+    Parameter("loop", False, "Start a replay over when it ends; otherwise the node exits then."),
+    Parameter("longest_pause", 5.0, "Pauses of a recording longer than this are cut to it, in recorded time.",
+              low=0.0, high=1e6, unit="s"),
+    Parameter("publish_clock", False, "Publish the recording's time on /clock, and stamp with it. "
+              "Run the other nodes with use_sim_time."),
+    Parameter("wait_for_subscribers", 1, "A replay waits until so many subscribe to its ranges.",
+              low=0, high=1000),
+    Parameter("longest_wait", 10.0, "A replay starts all the same after this long without them.",
+              low=0.0, high=3600.0, unit="s"),
+    Parameter("start_delay", -1.0, "Pause before the first range of a replay once they are there: time for the "
+              "rest of the graph to connect. -1 = none where wait_for_subscribers counts two or more, and all have "
+              "come; 3 s elsewhere, since one subscriber tells nothing of others.",
+              low=-1.0, high=3600.0, unit="s"),
+    Parameter("port", "", "Serial port of the board: a path such as /dev/ttyACM0, or "
+              "usb:VENDOR:PRODUCT[:SERIAL] with ids in hexadecimal, wherever it is plugged in (serial, evb1000); or "
+              "/dev/spidev0.0 (spi). Of radios several, with commas between: the first has radio.role, the others "
+              "are anchors."),
+    Parameter("baud", 921_600, "Of a serial line; native USB ignores it (serial).",
+              low=1200, high=12_000_000, unit="bit/s"),
+    Parameter("dtr", True, "Level of DTR: boards with native USB send only while it is set; through a bridge, "
+              "its change resets the board (serial)."),
+    Parameter("mode", "host", "Who runs the model: the host, the device, or both, to compare them (serial).",
+              choices=("host", "device", "both"), live=True),
+    Parameter("offsets", "", "As the mitigator's, of a board that corrects by itself: modes device and both (serial).",
+              live=True, or_number=True),
+    Parameter("board_model", "", "Model id that the board must hold, eight hexadecimal digits; its corrections "
+              "by another model are withheld. Empty = any (serial)."),
+    Parameter("radio.role", "tag", "What the first radio is: a tag, which ranges with anchors, or an anchor, which "
+              "answers (serial, evb1000, spi).", choices=("tag", "anchor"), live=True),
+    Parameter("radio.address", "", "Its address, up to sixteen hexadecimal digits; empty = the chip's own "
+              "(serial, evb1000, spi).", live=True),
+    Parameter("radio.pan", 0x5542, "Network; frames of others are refused (serial, evb1000, spi).",
+              low=0, high=0xFFFE, live=True),
+    Parameter("radio.channel", 5, "UWB channel: 1 to 5, or 7 (serial, evb1000, spi).", low=1, high=7, live=True),
+    Parameter("radio.prf", 64, "Pulse repetition frequency: 16 or 64 (serial, evb1000, spi).",
+              low=16, high=64, live=True, unit="MHz"),
+    Parameter("radio.preamble", 128, "Preamble: 64, 128, 256, 512, 1024, 1536, 2048 or 4096 symbols; the longer, the "
+              "farther and the slower (serial, evb1000, spi).", low=64, high=4096, live=True, unit="symbols"),
+    Parameter("radio.preamble_code", 0, "0 = the first that the standard has for channel and PRF "
+              "(serial, evb1000, spi).",
+              low=0, high=24, live=True),
+    Parameter("radio.data_rate", 6800, "110, 850 or 6800 (serial, evb1000, spi).",
+              low=110, high=6800, live=True, unit="kbit/s"),
+    Parameter("radio.decawave_sfd", False, "Decawave's start-of-frame delimiter instead of the standard's "
+              "(serial, evb1000, spi).", live=True),
+    Parameter("radio.tx_power", 0, "Register TX_POWER; 0 = as calibrated in the chip's memory, else the manual's "
+              "(serial, evb1000, spi).", low=0, high=0xFFFFFFFF, live=True),
+    Parameter("radio.antenna_delay", 0, "Of transmitter and receiver together; 0 = as in the chip's memory, else "
+              "2 x 16436 (serial, evb1000, spi).", low=0, high=0x1FFFE, live=True, unit="ticks"),
+    Parameter("radio.window", 157, "Samples of the CIR that come with a range; 1016 = all (serial, evb1000, spi).",
+              low=0, high=1016, live=True),
+    Parameter("radio.anchors", "", "Addresses that a tag polls in turn, with commas between; empty = those that it "
+              "finds (serial, evb1000, spi).", live=True),
+    Parameter("radio.rate", 0.0, "Exchanges a second at most; 0 = as fast as they go (serial, evb1000, spi).",
+              low=0.0, high=1000.0, live=True, unit="Hz"),
+    Parameter("radio.report", False, "An anchor gives its ranges here too (serial, evb1000, spi).", live=True),
+    Parameter("radio.bias_correction", False, "Correct ranges for the received power (APS011); the models were "
+              "trained without (serial, evb1000, spi).", live=True),
+    Parameter("radio.reset", "", "The chip's reset line, as gpiochip0:25; empty = not wired (spi)."),
+    Parameter("frame_id", "uwb_antenna", "Frame of the receiving antenna, where the source names none."),
+    _SENSOR_RANGES,
+    Parameter("autostart", True, "Configure and activate without a lifecycle manager."),
+)  # fmt: skip
+
+MITIGATOR = (
+    Parameter("model", "", "Model bundle to correct with: a file, or the name of a shipped one (universal, universal_amplitude, "
+              "evk1000_apartment); empty = universal. A bundle that cannot be "
+              "used is refused, and the one before stays.", live=True),
+    Parameter("offsets", "", "What the radios' antenna delays add to ranges, taken off before the model: a number of "
+              "metres, or a file by anchor, tag or pair (docs/tuning.md); empty = 0. What is no offset is refused, and "
+              "those before stay.", live=True, or_number=True),
+    Parameter("backend", "onnxruntime", "What computes: ONNX Runtime, or the firmware's C compiled for this "
+              "computer at activation, to the same bits.", choices=("onnxruntime", "firmware")),
+    _SENSOR_RANGES,
+    Parameter("autostart", True, "Configure and activate without a lifecycle manager."),
+)  # fmt: skip
+
+LOCATOR = (
+    Parameter("anchors", "", "File that says where the anchors are, as docs/positioning.md shows; needed."),
+    Parameter("tag", 0, "Number of the tag whose topics have the plain names; others have uwb/tag_N/pose and so "
+              "on. 0 = the one that is heard first.", low=0, high=2**63 - 1),
+    Parameter("level", False, "The tag's antenna stays at one height, that of `height`."),
+    Parameter("height", 0.0, "Of the tag's antenna, in the anchors' frame, where it stays the same.",
+              low=-1e4, high=1e4, unit="m"),
+    Parameter("height_sd", 0.1, "How well that height is known.", low=0.001, high=100.0, unit="m"),
+    Parameter("area", "", "Where tags can be, X,Y,Z,X,Y,Z: two corners of a box, m. Empty = wherever ranges reach."),
+    Parameter("acceleration", 1.0, "How briskly tags change their speed: 1 of a robot or a person, 3 of a drone.",
+              low=0.001, high=1000.0, unit="m/s^1.5"),
+    Parameter("range_sd", 0.1, "Standard deviation of a range that comes without a variance.",
+              low=0.001, high=100.0, unit="m"),
+    Parameter("stamp_offset", 0.0, "Added to the stamps of ranges: -0.2 where they lag by 0.2 s.",
+              low=-10.0, high=10.0, unit="s"),
+    Parameter("rate", 50.0, "Most estimates of a tag a second; 0 = one with each range.",
+              low=0.0, high=10_000.0, unit="Hz"),
+    Parameter("height_topic", "", "Topic of the only tag's height, a PoseWithCovarianceStamped; its z counts. "
+              "Empty = none."),
+    Parameter("odometry_topic", "", "Topic of the only tag's odometry, a nav_msgs/Odometry; its speed counts. "
+              "Empty = none."),
+    Parameter("learn_offsets", False, "Take off ranges what was learnt of each pair's constant offset; it is learnt and "
+              "shown in the diagnostics either way."),
+    Parameter("offsets_file", "", "Where learnt offsets are kept through a restart; made if it is not there. Empty = "
+              "they are forgotten."),
+    Parameter("map_frame", "map", "Frame of the anchors."),
+    Parameter("base_frame", "base_link", "Frame of what carries the tag."),
+    Parameter("lever_arm_x", 0.0, "Of the tag's antenna in the base frame. Ranges do not tell how it is turned: a "
+              "horizontal arm widens the covariance.", low=-100.0, high=100.0, unit="m"),
+    Parameter("lever_arm_y", 0.0, "The same in y.", low=-100.0, high=100.0, unit="m"),
+    Parameter("lever_arm_z", 0.0, "The same in z; taken off the height.", low=-100.0, high=100.0, unit="m"),
+    Parameter("publish_tf", False, "Publish map_frame to base_frame on /tf; needs tf2_msgs."),
+    Parameter("autostart", True, "Configure and activate without a lifecycle manager."),
+)  # fmt: skip
+
+VIEWER = (
+    Parameter("host", "localhost", "Address to serve the page at; 0.0.0.0 = every address of this machine."),
+    Parameter("port", 5006, "Port of the page; 0 = a free one, named in the log.", low=0, high=65535),
+    Parameter("origins", "", "Further HOST:PORT that a browser may name to reach the page, with commas between."),
+    Parameter("anchors", "", "Anchors file, for a map without a locator: shown, and published as markers for RViz and "
+              "Foxglove. Empty = those of a locator's markers."),
+    Parameter("map_frame", "map", "Frame of the anchors."),
+    Parameter("window", 157, "Samples that the network reads, to be marked in the CIR.", low=1, high=1016),
+    Parameter("autostart", True, "Configure and activate without a lifecycle manager."),
+)  # fmt: skip
+
+TABLES: dict[str, tuple[Parameter, ...]] = {
+    "driver": DRIVER,
+    "mitigator": MITIGATOR,
+    "locator": LOCATOR,
+    "viewer": VIEWER,
+}

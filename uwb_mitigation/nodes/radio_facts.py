@@ -1,0 +1,64 @@
+"""What a radio is and how it fares, in words: of radios at this computer and of those on boards."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+from uwb_mitigation.link.layout import RadioState, Role
+from uwb_mitigation.link.radio import RadioSettings, RadioStatus
+
+COUNTS = tuple(row.name for row in fields(RadioStatus) if row.type == "int")
+"""Of the exchanges of a radio, by how they ended."""
+
+NO_ANCHOR = "no anchor in reach: are they on, with the same channel, rate and PAN?"
+
+_STATES = {
+    RadioState.ABSENT: "no DW1000 answers the board: look at wiring and supply",
+    RadioState.NO_CLOCK: "the DW1000's clock does not lock: look at its supply",
+    RadioState.BUS: "the board's SPI fails",
+}
+
+
+def told(settings: RadioSettings) -> str:
+    """In a line of the log."""
+    return (
+        f"{settings.role.name.lower()}, channel {settings.channel}, {settings.rate_kbps} kbit/s, preamble "
+        f"{settings.preamble}, PAN {settings.pan:04x}"
+    )
+
+
+def problem(status: RadioStatus) -> str:
+    """What keeps a board's radio from ranging; empty while nothing does."""
+    return _STATES.get(status.state, "")
+
+
+def lonely(settings: RadioSettings | None, status: RadioStatus) -> bool:
+    """Whether a tag has nobody to range with."""
+    return settings is not None and settings.role is Role.TAG and not status.anchors
+
+
+def facts(settings: RadioSettings | None, status: RadioStatus, prefix: str = "") -> dict[str, object]:
+    """For diagnostics, but for the anchors in reach."""
+    said: dict[str, object] = {}
+    if settings is not None:
+        said |= {
+            f"{prefix}address": f"{settings.address:016x}",
+            f"{prefix}role": settings.role.name.lower(),
+            f"{prefix}antenna delay": settings.antenna_delay,
+        }
+    said |= {f"{prefix}{name.replace('_', ' ')}": getattr(status, name) for name in COUNTS}
+    return said | {
+        f"{prefix}temperature C": f"{status.temperature_c:.1f}",
+        f"{prefix}voltage V": f"{status.voltage:.2f}",
+    }
+
+
+def anchors(status: RadioStatus) -> dict[str, object]:
+    """Those in reach, for diagnostics."""
+    said: dict[str, object] = {}
+    for anchor in status.anchors:
+        heard = "never" if anchor.heard_ms is None else f"{anchor.heard_ms / 1000:.1f} s ago"
+        said[f"anchor {anchor.address:016x}"] = (
+            f"{anchor.ranged} of {anchor.tried} ranged, {anchor.rx_power_dbm:.1f} dBm, heard {heard}"
+        )
+    return said

@@ -1,0 +1,199 @@
+"""Hands what radios at this computer range to the driver's publishers, and keeps their diagnosis.
+
+The radios are `radio`'s; topics and messages are the driver's.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.link.layout import Role
+from uwb_mitigation.link.radio import Radio, RadioSettings
+from uwb_mitigation.measurement import RangeMeasurement
+from uwb_mitigation.nodes import diagnostics, radio_facts
+from uwb_mitigation.radio.opening import opener
+from uwb_mitigation.radio.port import RadioEvent, RadioLost, RadioPort
+
+RADIOS = ("evb1000", "spi")
+"""Sources that are radios at this computer."""
+
+PREFIX = "radio."
+"""Of the parameters that are a radio's."""
+
+PATIENCE_S = 0.5
+
+
+def settings_of(value: Callable[[str], Any]) -> RadioSettings:
+    """What the parameters `radio.*` ask of a radio; `value(name)` gives a parameter's value.
+
+    Raises:
+        ParameterError: no radio has such settings; names the parameter.
+    """
+
+    def of(name: str) -> Any:
+        return value(PREFIX + name)
+
+    settings = RadioSettings(
+        role=Role[of("role").upper()],
+        address=_address(of("address"), PREFIX + "address") if of("address") else 0,
+        pan=of("pan"),
+        channel=of("channel"),
+        prf_mhz=int(of("prf")),
+        preamble=of("preamble"),
+        preamble_code=of("preamble_code"),
+        rate_kbps=of("data_rate"),
+        decawave_sfd=of("decawave_sfd"),
+        tx_power=of("tx_power"),
+        antenna_delay=of("antenna_delay"),
+        window=of("window"),
+        anchors=tuple(
+            _address(part.strip(), PREFIX + "anchors") for part in of("anchors").split(",") if part.strip()
+        ),
+        interval_us=round(1e6 / of("rate")) if of("rate") else 0,
+        report=of("report"),
+        bias_correction=of("bias_correction"),
+    )
+    try:
+        settings.check()
+    except ParameterError as error:
+        raise ParameterError(f"parameters {PREFIX}*: {error.what}", valid=error.valid) from error
+    return settings
+
+
+def open_radios(value: Callable[[str], Any], now_ns: Callable[[], int]) -> list[RadioPort]:
+    """The radios that `source`, `port` and `radio.*` name, ranging. The first takes the role asked for, the others are anchors.
+
+    Raises:
+        ParameterError: a port or a setting is none.
+        MissingDependencyError: there is no C compiler.
+    """
+    settings = settings_of(value)
+    places = [part.strip() for part in value("port").split(",") if part.strip()]
+    if not places:
+        valid = (
+            "/dev/spidevBUS.SELECT"
+            if value("source") == "spi"
+            else "/dev/ttyACM0 or usb:0483:5740, or several with commas"
+        )
+        raise ParameterError("parameter port is empty", valid=valid)
+    if settings.address and len(places) > 1:
+        raise ParameterError(
+            f"parameter {PREFIX}address with {len(places)} ports", valid="empty: each has its chip's own"
+        )
+    openers = [opener(value("source"), place, value(PREFIX + "reset")) for place in places]
+    ports: list[RadioPort] = []
+    try:
+        for number, open_bus in enumerate(openers):
+            wanted = settings if number == 0 else replace(settings, role=Role.ANCHOR, anchors=())
+            ports.append(RadioPort(open_bus, wanted, stamp_clock=now_ns))
+    except Exception:
+        for port in ports:
+            port.close()
+        raise
+    return ports
+
+
+class RadioFeed:
+    """Calls `on_range` for what the radios measure, and logs what happens to them.
+
+    Args:
+        ports: of one or several radios, the tag first; closed by `stop`.
+        now_ns: the clock that stamps are on.
+        logger: with `info`, `warning`, as rclpy's.
+
+    Attributes:
+        ranges: how many were handed on.
+    """
+
+    def __init__(
+        self,
+        ports: Sequence[RadioPort],
+        *,
+        on_range: Callable[[RangeMeasurement], None],
+        now_ns: Callable[[], int],
+        logger: Any,
+    ) -> None:
+        self.ranges = 0
+        self.meter = diagnostics.Meter(now_ns)
+        self._ports = list(ports)
+        self._on_range = on_range
+        self._now_ns = now_ns
+        self._logger = logger
+        # Ranges of several radios are published one after the other.
+        self._publishing = threading.Lock()
+        self._threads = [
+            threading.Thread(target=self._run, args=(port,), name="radio feed", daemon=True)
+            for port in self._ports
+        ]
+
+    def start(self) -> None:
+        for thread in self._threads:
+            thread.start()
+
+    def stop(self) -> None:
+        """Close the ports and wait for the threads; may be called twice."""
+        for port in self._ports:
+            port.close()
+        for thread in self._threads:
+            if thread.is_alive():
+                thread.join()
+
+    def configure(self, settings: RadioSettings) -> None:
+        """Use other settings from the next exchange on; the ports after the first stay anchors."""
+        for number, port in enumerate(self._ports):
+            port.set_radio(settings if number == 0 else replace(settings, role=Role.ANCHOR, anchors=()))
+
+    def describe(self) -> tuple[str, bytes, str, dict[str, object]]:
+        """Hardware id, level, message and facts for the diagnostics."""
+        reports = [port.report() for port in self._ports]
+        first = reports[0]
+        facts: dict[str, object] = {"ranges published": self.ranges}
+        facts |= self.meter.facts()
+        for number, report in enumerate(reports):
+            prefix = f"radio {number}: " if len(reports) > 1 else ""
+            facts[f"{prefix}port"] = report.name or "none"
+            facts |= radio_facts.facts(report.settings, report.status, prefix)
+        facts |= radio_facts.anchors(first.status)
+        hardware = "no radio" if first.settings is None else f"radio {first.settings.address:016x}"
+        problems = [report.problem for report in reports if report.problem]
+        if problems:
+            return hardware, diagnostics.ERROR, "; ".join(problems), facts
+        if radio_facts.lonely(first.settings, first.status):
+            return hardware, diagnostics.WARN, radio_facts.NO_ANCHOR, facts
+        tag = first.settings is not None and first.settings.role is Role.TAG
+        return hardware, diagnostics.OK, "ranging" if tag else "answering", facts
+
+    def _run(self, port: RadioPort) -> None:
+        while not port.closed:
+            event = port.get(PATIENCE_S)
+            if event is not None:
+                self._handle(event, port)
+
+    def _handle(self, event: RadioEvent, port: RadioPort) -> None:
+        if isinstance(event, RangeMeasurement):
+            with self._publishing:
+                self.ranges += 1
+                self._on_range(event)
+                self.meter.add(self._now_ns() - event.stamp_ns)
+        elif isinstance(event, Radio):
+            settings = event.settings
+            self._logger.info(
+                f"radio {settings.address:016x} at {port.report().name}: {radio_facts.told(settings)}"
+            )
+        elif isinstance(event, RadioLost) and not port.closed:
+            self._logger.warning(f"{event.text}; waiting for the radio")
+
+
+def _address(text: str, name: str) -> int:
+    """Raise ParameterError unless `text` is an address of up to sixteen hexadecimal digits, other than 0."""
+    try:
+        address = int(text, 16)
+    except ValueError:
+        address = 0
+    if not 0 < address < 2**64 - 1:
+        raise ParameterError(f"parameter {name} = {text!r:.40}", valid="up to sixteen hexadecimal digits")
+    return address

@@ -1,0 +1,181 @@
+"""The node `viewer`: a page in the browser on what passes on the topics.
+
+It subscribes, and publishes but diagnostics and, of an anchors file that it was given, the anchors' markers.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import threading
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from rclpy.parameter import parameter_value_to_python
+from rclpy.parameter_client import AsyncParameterClient
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
+from rclpy.task import Future
+from rclpy.timer import Timer
+from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
+from visualization_msgs.msg import MarkerArray
+
+from uwb_mitigation.nodes import clocks, diagnostics, markers, topics
+from uwb_mitigation.nodes.lifecycle import ManagedNode
+from uwb_mitigation.nodes.parameter_tables import VIEWER
+from uwb_mitigation.positioning.anchors import AnchorMap
+from uwb_mitigation.sources.site import load_anchors
+from uwb_mitigation.viewer.feed import Feed
+from uwb_mitigation.viewer.scene import MAX_TAGS, PLAIN, Scene
+from uwb_mitigation.viewer.server import ViewerServer
+from uwb_mitigation.viewer.view import View
+
+OURS = ("driver", "mitigator", "locator", "viewer")
+"""Nodes whose parameters are shown."""
+
+ANSWER_S = 1.0
+"""How long their answers are waited for."""
+
+# Never reliable: a publisher must not wait for somebody who only looks.
+_LOOK = QoSProfile(
+    reliability=ReliabilityPolicy.BEST_EFFORT,
+    durability=DurabilityPolicy.VOLATILE,
+    history=HistoryPolicy.KEEP_LAST,
+    depth=200,
+)
+LOOK_AROUND_S = 0.5
+YIELD = 10
+"""Nice value: where a processor is short, ranges are corrected before they are drawn."""
+
+
+class Viewer(ManagedNode):
+    """Lifecycle: configure subscribes, activate serves the page, deactivate ends it."""
+
+    def __init__(self) -> None:
+        super().__init__("viewer", VIEWER)
+        self._looking: dict[str, Subscription] = {}
+        self._anchors: AnchorMap | None = None
+        self._anchors_out: Publisher | None = None
+        self._timer: Timer | None = None
+        self._server: ViewerServer | None = None
+        self._scene = Scene()
+        self._lock = threading.Lock()
+        self._feed = Feed(self._scene, self._lock)
+        self._view: View | None = None
+        self.autostart()
+
+    def open(self) -> None:
+        if path := self.value("anchors"):
+            self._anchors = load_anchors(Path(path).expanduser())
+            self._feed.anchors(self._anchors)
+            self._anchors_out = self.create_lifecycle_publisher(MarkerArray, topics.ANCHORS, topics.LATCHED)
+        else:
+            self._look(MarkerArray, topics.ANCHORS, self._feed.markers, qos=topics.LATCHED)
+        feed = self._feed
+        self._look(RangeTruth, topics.RANGE_TRUTH, feed.range_truth, raw=True)
+        self._look(RangeCorrected, topics.RANGE_CORRECTED, feed.range_corrected, raw=True)
+        self._look(DiagnosticArray, topics.DIAGNOSTICS, feed.diagnostics)
+        self._look(PoseWithCovarianceStamped, topics.POSE, partial(feed.pose, PLAIN))
+        self._look(Odometry, topics.ODOMETRY_TRUTH, feed.true_position)
+        self._timer = self.create_timer(
+            LOOK_AROUND_S, self._look_around, clock=Clock(clock_type=ClockType.STEADY_TIME)
+        )
+
+    def _look(
+        self,
+        kind: type,
+        topic: str,
+        take: Callable[[Any], None],
+        *,
+        qos: QoSProfile = _LOOK,
+        raw: bool = False,
+    ) -> None:
+        if topic not in self._looking:
+            self._looking[topic] = self.create_subscription(kind, topic, take, qos, raw=raw)
+
+    def _look_around(self) -> None:
+        """Subscribe to what is wanted, or there, only by now."""
+        # CIRs are most of what is sent: a pipeline sends none where nobody looks.
+        if self._view is not None and self._view.drawing.pages:
+            self._look(RangeCir, topics.RANGE_RAW, self._feed.range_raw, raw=True)
+        # The locator gives every tag but one topics of its own, once it is heard.
+        own = re.compile(re.escape(self.resolve_topic_name(topics.POSE)).replace("/uwb/", r"/uwb/(tag_\d+)/"))
+        for topic, _ in self.get_topic_names_and_types():
+            if (found := own.fullmatch(topic)) and len(self._looking) < MAX_TAGS:
+                self._look(PoseWithCovarianceStamped, topic, partial(self._feed.pose, found[1]))
+
+    def begin(self) -> None:
+        self._view = View(
+            self._scene,
+            self._lock,
+            title=f"UWB ranges {self.get_namespace().strip('/')}".strip(),
+            window=self.value("window"),
+        )
+        origins = tuple(origin.strip() for origin in self.value("origins").split(",") if origin.strip())
+        self._server = ViewerServer(
+            self._view, self.value("host"), self.value("port"), origins, self._parameters_of_nodes
+        )
+        if self._anchors is not None and self._anchors_out is not None:
+            now_ns = clocks.reader(self.get_clock())()
+            shown = markers.anchor_markers(self._anchors, self.value("map_frame"), now_ns)
+            self._anchors_out.publish(markers.array(shown))
+        self.get_logger().info(f"the page is at {self._server.url}")
+
+    def end(self) -> None:
+        server, self._server = self._server, None
+        if server is not None:
+            server.close()
+
+    def close(self) -> None:
+        if self._timer is not None:
+            self.destroy_timer(self._timer)
+        for subscription in self._looking.values():
+            self.destroy_subscription(subscription)
+        if self._anchors_out is not None:
+            self.destroy_lifecycle_publisher(self._anchors_out)
+        self._looking, self._timer, self._anchors_out = {}, None, None
+
+    def describe(self) -> tuple[str, bytes, str, dict[str, object]]:
+        pages = 0 if self._view is None else self._view.drawing.pages
+        url = "" if self._server is None else self._server.url
+        facts: dict[str, object] = {"url": url, "pages": pages, "malformed": self._feed.malformed}
+        return url, diagnostics.OK, f"serving {pages} pages", facts
+
+    def _parameters_of_nodes(self) -> dict[str, dict[str, object]]:
+        """What our nodes in this namespace say of themselves; called from the page's thread, answered by the executor's."""
+        found: dict[str, dict[str, object]] = {}
+        for name, namespace in self.get_node_names_and_namespaces():
+            if namespace != self.get_namespace() or name not in OURS:
+                continue
+            if name == self.get_name():
+                found[name] = {row.name: self.value(row.name) for row in VIEWER}
+                continue
+            client = AsyncParameterClient(self, f"{namespace.rstrip('/')}/{name}")
+            listed = _wait(client.list_parameters())
+            if listed is None:
+                continue
+            names = sorted(listed.result.names)
+            values = _wait(client.get_parameters(names))
+            if values is not None:
+                found[name] = dict(zip(names, map(parameter_value_to_python, values.values), strict=True))
+        return found
+
+
+def _wait(future: Future) -> Any:
+    """The result of a call, or None where none comes; the executor of another thread completes it."""
+    done = threading.Event()
+    future.add_done_callback(lambda _: done.set())
+    return future.result() if done.wait(ANSWER_S) else None
+
+
+def make_nodes(stop: threading.Event) -> list[Node]:
+    os.nice(YIELD)
+    return [Viewer()]
