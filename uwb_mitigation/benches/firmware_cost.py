@@ -1,0 +1,173 @@
+"""Measures exported models in the emulator: instructions, estimated cycles, memory, and equality with
+ONNX Runtime."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+from numpy.typing import NDArray
+
+from uwb_mitigation.benches.random_networks import mlp, pressing_windows, remnet
+from uwb_mitigation.evaluation import paper
+from uwb_mitigation.firmware_export import emulator
+from uwb_mitigation.firmware_export.cycles import estimate_cycles
+from uwb_mitigation.firmware_export.export import golden_windows, identity, write_header
+from uwb_mitigation.firmware_export.header import Golden, ModelConstants
+from uwb_mitigation.firmware_export.packing import PackedNetwork, pack
+from uwb_mitigation.firmware_export.toolchain import Kernels, Target, build_image, measure_size
+from uwb_mitigation.model import graph
+from uwb_mitigation.model.architecture import Mlp
+from uwb_mitigation.model.bundle import Bundle
+from uwb_mitigation.model.prior import LinePrior
+from uwb_mitigation.model.runtime import session_options
+from uwb_mitigation.model.weights import Int8Weights
+from uwb_mitigation.preprocessing import Scaling
+
+CLOCK_HZ = 64e6
+"""Of the paper's board, an Arduino Nano 33 BLE Sense."""
+
+DEFAULT_INPUTS = 5000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Network:
+    """A network to measure.
+
+    Attributes:
+        network: `remnet` or `mlp`, as in `evaluation.paper`.
+        first_kernel: k0; 0 for an MLP.
+        packed: what the firmware is given.
+        card: what the header says beside it.
+        onnx: the serialised ONNX model.
+    """
+
+    network: str
+    first_kernel: int
+    packed: PackedNetwork
+    card: ModelConstants
+    onnx: bytes
+
+    def expect(self, windows: NDArray[np.float32]) -> NDArray[np.float32]:
+        """ONNX Runtime's outputs for windows (n, K)."""
+        session = onnxruntime.InferenceSession(
+            self.onnx, session_options(), providers=["CPUExecutionProvider"]
+        )
+        outputs: NDArray[np.float32] = session.run(None, {graph.INPUT: windows[:, None, :]})[0][:, 0]
+        return outputs
+
+
+@dataclass(frozen=True, slots=True)
+class NetworkCost:
+    """One measurement; the keys of `bench firmware`.
+
+    Attributes:
+        model: `remnet` or `mlp`.
+        k, k0: window length and first kernel; k0 is 0 for an MLP.
+        kernels: `cortex_m4` (assembly) or `portable` (C, -O3).
+        instructions: of one inference from a window of floats, the most over all inputs.
+        cycles_estimated: at zero wait states, see `cycles`.
+        ram_bytes: the arena; `stack_bytes` come on top.
+        flash_bytes: an image that does nothing but correct ranges.
+        mismatches, inputs: outputs that differ from ONNX Runtime's in any bit, of how many.
+        hz: at 64 MHz; `energy_mj` at the paper's power; `paper_hz`; None where the paper has none.
+    """
+
+    model: str
+    k: int
+    k0: int
+    kernels: str
+    instructions: int
+    cycles_estimated: int
+    ram_bytes: int
+    stack_bytes: int
+    flash_bytes: int
+    mismatches: int
+    inputs: int
+    hz: float
+    energy_mj: float | None
+    paper_hz: float | None
+
+
+def random_shapes(
+    windows: Sequence[int] = paper.WINDOWS, first_kernels: Sequence[int] = (3, 5), dense: bool = True
+) -> Iterator[Network]:
+    """A random network of every shape asked for."""
+    for first_kernel in first_kernels:
+        for samples in windows:
+            weights = remnet(samples, first_kernel)
+            yield network_of(weights, _nameless(), graph.int8_model(weights))
+    if dense:
+        weights = mlp()
+        yield network_of(weights, _nameless(), graph.int8_model(weights))
+
+
+def trained(bundle: Bundle) -> Network:
+    """A trained model.
+
+    Raises:
+        ModelError: as `export_bundle`.
+    """
+    return network_of(graph.int8_weights(bundle.model, bundle.architecture), identity(bundle), bundle.model)
+
+
+def network_of(weights: Int8Weights, card: ModelConstants, onnx: bytes) -> Network:
+    shape = weights.architecture
+    network, first_kernel = ("mlp", 0) if isinstance(shape, Mlp) else ("remnet", shape.first_kernel)
+    return Network(network, first_kernel, pack(weights), card, onnx)
+
+
+def measure(
+    network: Network,
+    windows: NDArray[np.float32] | None = None,
+    kernels: Kernels = Kernels.CORTEX_M4,
+    inputs: int = DEFAULT_INPUTS,
+) -> NetworkCost:
+    """Measure one network on `windows`, float32 (n, K), or on `inputs` windows that press on every rounding.
+
+    Raises:
+        MissingDependencyError: compiler or emulator are missing; names the line that installs them.
+        UwbMitigationError: building or running fails.
+    """
+    packed = network.packed
+    if windows is None:
+        windows = pressing_windows(packed.samples, packed.input_scale, inputs)
+    expected = network.expect(windows)
+    examples = golden_windows(packed)
+    with tempfile.TemporaryDirectory(prefix="uwb_firmware_") as name:
+        folder = Path(name)
+        write_header(folder, packed, network.card, Golden(examples, network.expect(examples)))
+        optimisation = "-O3" if kernels is Kernels.PORTABLE else "-Os"
+        image = build_image(folder, folder, Target.QEMU_MPS2, kernels, optimisation)
+        result = emulator.run_windows(image, windows)
+        cycles = estimate_cycles(image, emulator.count_executed(image, windows[len(windows) // 2]))
+        flash = measure_size(folder, folder, kernels, optimisation).flash_bytes
+    printed = paper.MODELS.get((network.network, packed.samples))
+    hz = CLOCK_HZ / cycles
+    wrong = (result.records["output_m"].view(np.uint32) != expected.view(np.uint32)) | (
+        result.records["status"] != 0
+    )
+    return NetworkCost(
+        model=network.network,
+        k=packed.samples,
+        k0=network.first_kernel,
+        kernels=kernels.value,
+        instructions=result.instructions,
+        cycles_estimated=cycles,
+        ram_bytes=result.arena_bytes,
+        stack_bytes=result.stack_bytes,
+        flash_bytes=flash,
+        mismatches=int(np.count_nonzero(wrong)),
+        inputs=len(windows),
+        hz=hz,
+        energy_mj=None if printed is None else printed.power_mw / hz,
+        paper_hz=None if printed is None else printed.rate_hz,
+    )
+
+
+def _nameless() -> ModelConstants:
+    return ModelConstants("random weights", 0, Scaling.PREAMBLE, LinePrior(0.0), (-1e3, 1e3), 1.0, 1.0)

@@ -1,0 +1,125 @@
+"""What the locator costs: processor time of the filter, and latency and loss of the node at a thousand ranges a second."""
+
+from __future__ import annotations
+
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from numpy.typing import NDArray
+from uwb_mitigation_msgs.msg import RangeCorrected
+
+from uwb_mitigation.bag.codec import encode_corrected
+from uwb_mitigation.measurement import Cir, CorrectedRange, Origin, RangeMeasurement, Status
+from uwb_mitigation.nodes import processes, topics
+from uwb_mitigation.nodes.probe import Probe, wait, watching
+from uwb_mitigation.positioning.anchors import Anchor, AnchorMap, dump_anchors
+from uwb_mitigation.positioning.filter import RangeFilter
+from uwb_mitigation.positioning.model import Model
+
+ANCHORS = AnchorMap(
+    [
+        Anchor(n, place)
+        for n, place in enumerate([(0.0, 0.0, 2.0), (9.0, 0.0, 1.0), (9.0, 7.0, 2.0), (0.0, 7.0, 1.0)], 1)
+    ]
+)
+_NOISE_M = 0.03
+_WARM_S = 2.0
+_SECOND_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class NodeFigures:
+    """Ranges sent, poses that came back, ranges lost between; percentiles of the latency from publishing a range
+    to having its pose, ms."""
+
+    sent: int
+    received: int
+    lost: int
+    p50_ms: float
+    p99_ms: float
+
+
+def _drive(n: int, rate_hz: float) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    time_s = np.arange(n) / rate_hz
+    place = np.stack([4.5 + 3 * np.cos(0.3 * time_s), 3.5 + 2 * np.sin(0.3 * time_s), np.ones(n)], axis=1)
+    row = np.arange(n) % len(ANCHORS)
+    noise = np.random.default_rng(1).normal(0.0, _NOISE_M, n)
+    return row, np.linalg.norm(place - ANCHORS.position[row], axis=1) + noise
+
+
+def filter_us(ranges: int = 5000, rounds: int = 5) -> float:
+    """Processor time of a prediction and an update, us: the best of some rounds, four anchors."""
+    row, range_m = _drive(ranges, 40.0)
+    rows, values = row.tolist(), range_m.tolist()
+    best = float("inf")
+    for _ in range(rounds):
+        one = RangeFilter(ANCHORS, Model(), 0.0, np.array([7.5, 3.5, 1.0]), np.eye(3))
+        began = time.process_time()
+        for i in range(ranges):
+            one.predict(i / 40.0)
+            one.update(rows[i], values[i], 0.01)
+        best = min(best, (time.process_time() - began) / ranges * 1e6)
+    return best
+
+
+def node(rate_hz: float, seconds: float, show: Callable[[str], None]) -> NodeFigures:
+    """A locator process beside this one, which sends ranges on time and gets a pose for each.
+
+    Raises:
+        UwbMitigationError: it does not come up.
+    """
+    processes.isolate()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "anchors.yaml"
+        path.write_text(dump_anchors(ANCHORS))
+        locator = processes.start("locator", f"anchors:={path}", "rate:=0.0")
+        try:
+            with watching(Probe) as probe:
+                return _measure(probe, locator, rate_hz, seconds, show)
+        finally:
+            processes.stop(locator)
+
+
+def _measure(
+    probe: Probe,
+    locator: subprocess.Popen[bytes],
+    rate_hz: float,
+    seconds: float,
+    show: Callable[[str], None],
+) -> NodeFigures:
+    n = round((seconds + _WARM_S) * rate_hz)
+    row, range_m = _drive(n, rate_hz)
+    arrived: dict[int, int] = {}
+
+    def take(message: PoseWithCovarianceStamped) -> None:
+        stamp = message.header.stamp
+        arrived.setdefault(stamp.sec * _SECOND_NS + stamp.nanosec, time.time_ns())
+
+    probe.subscribe(PoseWithCovarianceStamped, topics.POSE, take)
+    publisher = probe.publisher(RangeCorrected, topics.RANGE_CORRECTED)
+    wait(lambda: publisher.get_subscription_count() > 0, "the locator did not come up", [locator])
+    show(f"{rate_hz:.0f} ranges a second for {seconds:.0f} s")
+    empty = Cir(np.zeros(0, np.int16))
+    sent: list[int] = []
+    start_s = time.perf_counter() + 0.1
+    for i in range(n):
+        while (left := start_s + i / rate_hz - time.perf_counter()) > 0:
+            time.sleep(min(left, 0.001))
+        stamp_ns = time.time_ns()
+        measured = RangeMeasurement(stamp_ns, 1, ANCHORS.anchors[row[i]].id, i, 0, float(range_m[i]), empty)
+        corrected = CorrectedRange(float(range_m[i]), float(range_m[i]), 0.0, 0.01, Status.OK, Origin.HOST, 1)
+        publisher.publish(encode_corrected(measured, corrected))
+        sent.append(stamp_ns)
+    counted = sent[round(_WARM_S * rate_hz) :]
+    deadline = time.monotonic() + 5.0
+    while time.monotonic() < deadline and any(stamp not in arrived for stamp in counted):
+        time.sleep(0.05)
+    latency = np.array([arrived[stamp] - stamp for stamp in counted if stamp in arrived]) / 1e6
+    p50, p99 = np.percentile(latency, (50, 99)) if len(latency) else (np.inf, np.inf)
+    return NodeFigures(len(counted), len(latency), len(counted) - len(latency), float(p50), float(p99))

@@ -1,0 +1,342 @@
+"""Measures what the nodes add to what rclpy takes anyway: latency, highest rate, processor time, memory.
+
+Four subjects take the same recorded ranges, in one run and by turns, so that they share whatever else the
+machine is doing: a relay that only republishes, one that does so without looking, the mitigator, and the
+one-process pipeline. The first three have a driver process before them; all drivers loop over one bag, and
+their live parameters set the rate.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import partial
+from itertools import islice
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
+
+from uwb_mitigation.bag.codec import after_frame
+from uwb_mitigation.bag.writer import BagWriter
+from uwb_mitigation.benches import vitals
+from uwb_mitigation.errors import UwbMitigationError
+from uwb_mitigation.measurement import Record
+from uwb_mitigation.nodes import processes, relay, topics
+from uwb_mitigation.nodes.probe import Probe, wait, watching
+from uwb_mitigation.preprocessing import WINDOW_LEAD
+from uwb_mitigation.sources.simulated import SimulatedSource
+
+WINDOW = 157
+"""Complex samples of each range: what the network reads."""
+RANGES = 5000
+RECORDED_HZ = 1000.0
+RATES_HZ = (100, 500, 1000)
+
+_DISTINCT = 500
+_SETTLE_S = 0.3
+_TRIAL_S = 1.0
+_LATE_NS = 100_000_000
+_LOWEST_HZ, _STEP, _HALVINGS, _HIGHEST_HZ = 1000.0, 1.5, 3, 50_000.0
+_SEARCH_S = 12.0
+_STAMP = struct.Struct("<4xiII")
+_SEQUENCE = struct.Struct("<16xI")
+
+
+@dataclass(frozen=True, slots=True)
+class Latency:
+    """From a range's stamp, when it was due, to its arrival at the subscriber, us."""
+
+    p50: float
+    p99: float
+    max: float
+
+
+@dataclass(slots=True)
+class Figures:
+    """Of one subject.
+
+    Attributes:
+        rates_hz: the highest rate without loss, of each search.
+        latency_us: at each rate, the median over the slices; `max` the highest of all.
+        cpu_us_per_message: of the subject's process, at the highest of the rates for latency.
+        chain_cpu_us_per_message: the same with its driver's process.
+        memory_mb: resident, of the subject's process at the end.
+    """
+
+    rates_hz: list[float] = field(default_factory=list)
+    latency_us: dict[int, Latency] = field(default_factory=dict)
+    cpu_us_per_message: float = math.nan
+    chain_cpu_us_per_message: float = math.nan
+    memory_mb: float = math.nan
+
+    @property
+    def max_lossless_rate_hz(self) -> float:
+        return median(self.rates_hz) if self.rates_hz else math.nan
+
+
+@dataclass(frozen=True, slots=True)
+class RateTrial:
+    """What arrived at one rate.
+
+    Attributes:
+        received, lost: ranges that arrived, and that are missing between them.
+        late_ns: of each that arrived.
+        kept_up: none was lost, they came at the rate asked for, and the last ones were not late.
+    """
+
+    received: int
+    lost: int
+    late_ns: list[int]
+    kept_up: bool
+
+
+class Subject:
+    """Processes in a namespace of their own, and what comes out of them."""
+
+    def __init__(self, bench: Bench, name: str, kind: type, topic: str, *nodes: str) -> None:
+        self.name = name
+        self.figures = Figures()
+        self._bench = bench
+        self._arrivals: list[tuple[int, bytes]] = []
+        self._carried = 0
+        self._cpu_s = self._chain_cpu_s = 0.0
+        self._counted = self._counted_hz = 0
+        arrived, now_ns = self._arrivals.append, time.time_ns
+        bench.probe.subscribe(kind, f"/{name}/{topic}", lambda data: arrived((now_ns(), data)), raw=True)
+        # The node that is measured comes first.
+        self.processes = [bench.start(node, name) for node in nodes]
+        self.play(50.0)
+        wait(lambda: len(self._arrivals) > 5, f"{name}: nothing arrives", self.processes)
+        self.pause()
+
+    def play(self, rate_hz: float) -> None:
+        self._set(rate=rate_hz / RECORDED_HZ, paused=False)
+
+    def pause(self) -> None:
+        """Stop, and let everything that is queued arrive."""
+        self._set(paused=True)
+        before = -1
+        while before != len(self._arrivals):
+            before = len(self._arrivals)
+            time.sleep(0.1)
+
+    def forget(self) -> None:
+        """Begin to count anew."""
+        self._arrivals.clear()
+        self._carried = 0
+
+    def count(self) -> tuple[int, int]:
+        """How many arrived since the last call, and how many are missing between them."""
+        # The last one stays, for what comes between it and the next.
+        sequences = [read_head(data)[1] for _, data in self._arrivals]
+        fresh = len(sequences) - self._carried
+        self._carried = min(len(sequences), 1)
+        del self._arrivals[:-1]
+        return fresh, missing_between(sequences)
+
+    def trial(self, rate_hz: float, seconds: float) -> RateTrial:
+        self.play(rate_hz)
+        time.sleep(_SETTLE_S)
+        self._arrivals.clear()
+        began_ns = time.time_ns()
+        time.sleep(seconds)
+        passed_s = (time.time_ns() - began_ns) / 1e9
+        arrivals = self._arrivals.copy()
+        self.pause()
+        late_ns, sequences = [], []
+        for arrived_ns, data in arrivals:
+            stamp_ns, sequence = read_head(data)
+            late_ns.append(arrived_ns - stamp_ns)
+            sequences.append(sequence)
+        lost = missing_between(sequences)
+        kept_up = lost == 0 and len(arrivals) >= 0.97 * rate_hz * passed_s and max(late_ns[-20:]) < _LATE_NS
+        return RateTrial(len(arrivals), lost, late_ns, kept_up)
+
+    def warm_up(self) -> None:
+        self.trial(RECORDED_HZ, _TRIAL_S)
+
+    def measure_latency(self, rate_hz: int, seconds: float) -> Latency:
+        before = [vitals.look(process.pid).cpu_s for process in self.processes]
+        trial = self.trial(rate_hz, seconds)
+        after = [vitals.look(process.pid).cpu_s for process in self.processes]
+        if not trial.received:
+            raise UwbMitigationError(f"{self.name}: nothing arrives at {rate_hz} Hz")
+        # Added up over slices: the system counts in hundredths of a second. The settling before, and the
+        # pause after, play at the same rate and are counted along.
+        share = seconds / (seconds + _SETTLE_S)
+        spent_s = [(b - a) * share for a, b in zip(before, after, strict=True)]
+        if rate_hz != self._counted_hz:
+            self._counted_hz, self._counted, self._cpu_s, self._chain_cpu_s = rate_hz, 0, 0.0, 0.0
+        self._cpu_s, self._chain_cpu_s = self._cpu_s + spent_s[0], self._chain_cpu_s + sum(spent_s)
+        self._counted += trial.received
+        self.figures.cpu_us_per_message = 1e6 * self._cpu_s / self._counted
+        self.figures.chain_cpu_us_per_message = 1e6 * self._chain_cpu_s / self._counted
+        p50, p99 = np.percentile(trial.late_ns, (50, 99)) / 1e3
+        return Latency(float(p50), float(p99), max(trial.late_ns) / 1e3)
+
+    def search_rate(self) -> None:
+        """Find the highest rate that is kept up with, to within a few per cent; 0 if not even the lowest."""
+
+        def holds(rate_hz: float) -> bool:
+            # Twice: something else on the machine may have been in the way.
+            return self.trial(rate_hz, _TRIAL_S).kept_up or self.trial(rate_hz, _TRIAL_S).kept_up
+
+        low, high = 0.0, _LOWEST_HZ
+        # Another search begins below what the ones before found.
+        if self.figures.rates_hz and holds(below := self.figures.max_lossless_rate_hz / _STEP):
+            low, high = below, below * _STEP
+        while high < _HIGHEST_HZ and holds(high):
+            low, high = high, high * _STEP
+        for _ in range(_HALVINGS if low else 0):
+            middle = math.sqrt(low * high)
+            low, high = (middle, high) if holds(middle) else (low, middle)
+        self.figures.rates_hz.append(low)
+
+    def _set(self, **values: object) -> None:
+        self._bench.probe.set_parameters_of(f"/{self.name}/driver", self.processes, **values)
+
+
+class Bench:
+    """A subscriber in this process, and the subjects in theirs."""
+
+    def __init__(self, probe: Probe, bag: Path) -> None:
+        self.probe = probe
+        self.processes: list[subprocess.Popen[bytes]] = []
+        self._bag = bag
+
+    def start(self, node: str, namespace: str) -> subprocess.Popen[bytes]:
+        """Start a node; a driver, or a pipeline, waits to be told to play."""
+        node, _, parameter = node.partition(" ")
+        words = [parameter] if parameter else []
+        if node in ("driver", "pipeline"):
+            words = ["source:=mcap", f"path:={self._bag}", "loop:=true", "paused:=true"]
+            words += ["wait_for_subscribers:=0", "start_delay:=0.0"]
+        process = processes.start(node, *words, namespace=namespace, log_level="error")
+        self.processes.append(process)
+        return process
+
+
+@contextmanager
+def open_bench() -> Iterator[Bench]:
+    """A bench on a domain of its own, with a bag to play."""
+    processes.isolate()
+    with tempfile.TemporaryDirectory() as folder, watching(Probe) as probe:
+        bag = Path(folder, "ranges.mcap")
+        write_bag(bag)
+        bench = Bench(probe, bag)
+        try:
+            yield bench
+        finally:
+            processes.stop(*bench.processes)
+
+
+def read_head(data: bytes) -> tuple[int, int]:
+    """Stamp, ns, and sequence of a serialised RangeCir or RangeCorrected: their beginnings are the same."""
+    seconds, nanoseconds, length = _STAMP.unpack_from(data)
+    (sequence,) = _SEQUENCE.unpack_from(data, after_frame(_STAMP.size + length))
+    return seconds * 10**9 + nanoseconds, sequence
+
+
+def missing_between(sequences: Sequence[int]) -> int:
+    """How many of the bag's ranges are missing between those that arrived in order."""
+    return int(((np.diff(sequences) - 1) % RANGES).sum()) if len(sequences) > 1 else 0
+
+
+def write_bag(path: Path) -> None:
+    """A bag of windows of simulated CIRs, `RANGES` of them, numbered from 0, `RECORDED_HZ` a second."""
+    records = [_cut(record) for record in islice(SimulatedSource(seed=1), _DISTINCT)]
+    with BagWriter(path, {"source": "simulated windows", "simulated": "true"}) as writer:
+        for sequence in range(RANGES):
+            measurement = records[sequence % _DISTINCT].measurement
+            stamp_ns = int(sequence * 1e9 / RECORDED_HZ)
+            writer.write(Record(replace(measurement, stamp_ns=stamp_ns, sequence=sequence)))
+
+
+def _cut(record: Record) -> Record:
+    cir = record.measurement.cir
+    start = int(cir.first_path_index) - WINDOW_LEAD
+    samples = cir.samples[2 * start : 2 * (start + WINDOW)]
+    return Record(replace(record.measurement, cir=replace(cir, samples=samples, start_index=start)))
+
+
+Advance = Callable[[str, float], None]
+"""Told what is measured next, and the share that is done."""
+
+
+def measure(repeats: int, slices: int, seconds: float, advance: Advance) -> dict[str, Figures]:
+    """All figures, by subject.
+
+    Percentiles are medians over slices of time in which the subjects take turns: what else happens on
+    the machine for a moment meets one slice of one subject, not its result.
+
+    Args:
+        repeats: how often each highest rate is searched.
+        slices: in how many each latency is measured.
+        seconds: of each slice.
+        advance: told how far it is.
+
+    Raises:
+        UwbMitigationError: a node did not start, or nothing arrives.
+    """
+    with open_bench() as bench:
+        subjects = [
+            Subject(bench, "relay", RangeCir, relay.RELAYED, "relay", "driver"),
+            Subject(bench, "relay_serialised", RangeCir, relay.RELAYED, "relay serialised:=true", "driver"),
+            Subject(bench, "mitigator", RangeCorrected, topics.RANGE_CORRECTED, "mitigator", "driver"),
+            Subject(bench, "pipeline", RangeCorrected, topics.RANGE_CORRECTED, "pipeline"),
+        ]
+        for subject in subjects:
+            subject.warm_up()
+        latencies: dict[tuple[str, int], list[Latency]] = {}
+
+        def take_slice(subject: Subject, rate_hz: int) -> None:
+            latency = subject.measure_latency(rate_hz, seconds)
+            latencies.setdefault((subject.name, rate_hz), []).append(latency)
+
+        steps: list[Step] = [
+            (f"latency of {subject.name} at {rate_hz} Hz", seconds, partial(take_slice, subject, rate_hz))
+            for rate_hz in RATES_HZ
+            for _ in range(slices)
+            for subject in subjects
+        ]
+        take_steps([*steps, *searches(subjects, repeats)], advance)
+        for subject in subjects:
+            for rate_hz in RATES_HZ:
+                of_rate = latencies[subject.name, rate_hz]
+                subject.figures.latency_us[rate_hz] = Latency(
+                    median(latency.p50 for latency in of_rate),
+                    median(latency.p99 for latency in of_rate),
+                    max(latency.max for latency in of_rate),
+                )
+            subject.figures.memory_mb = vitals.look(subject.processes[0].pid).memory_mb
+        return {subject.name: subject.figures for subject in subjects}
+
+
+Step = tuple[str, float, Callable[[], None]]
+"""What is measured, about how long that takes, s, and what measures it."""
+
+
+def searches(subjects: Sequence[Subject], repeats: int) -> list[Step]:
+    """Of the highest rates, by turns."""
+    return [
+        (f"highest rate of {subject.name}", _SEARCH_S, subject.search_rate)
+        for _ in range(repeats)
+        for subject in subjects
+    ]
+
+
+def take_steps(steps: Sequence[Step], advance: Advance) -> None:
+    """One after the other."""
+    whole_s, done_s = sum(length_s for _, length_s, _ in steps), 0.0
+    for name, length_s, take in steps:
+        advance(name, done_s / whole_s)
+        take()
+        done_s += length_s

@@ -1,0 +1,227 @@
+"""How well positions are told on real recordings and in the simulated flat. Needs neither ROS nor torch.
+
+The real ones are not part of the repository; see `sources/hanyang.py` and `sources/decaranging.py`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.evaluation.lad import fit_prior
+from uwb_mitigation.mitigation import Mitigation, correct_batch
+from uwb_mitigation.model.bundle import load_bundle
+from uwb_mitigation.model.prior import LinePrior
+from uwb_mitigation.model.shipped import default_model_path
+from uwb_mitigation.positioning.anchors import AnchorMap
+from uwb_mitigation.positioning.locator import TagLocator, run_live
+from uwb_mitigation.positioning.model import Model
+from uwb_mitigation.positioning.smoother import Smoother
+from uwb_mitigation.positioning.snapshot import snapshot
+from uwb_mitigation.positioning.start import Area, Height, places
+from uwb_mitigation.positioning.track_errors import TrackErrors, errors_of, track_errors
+from uwb_mitigation.positioning.tracks import Ranges, Track, TruePath
+from uwb_mitigation.sources.decaranging import DecaRangingFolder
+from uwb_mitigation.sources.hanyang import ANTENNA_M, HanyangRun
+from uwb_mitigation.sources.simulated import SimulatedSource, SimulatedSurvey
+from uwb_mitigation.sources.source import Source
+
+LAG_S = 0.2
+"""By how much Hanyang's ranges lag the truth, in every run."""
+
+HEIGHT = Height(ANTENNA_M, 0.2)
+"""Of the tag in Hanyang's runs."""
+
+_SECOND_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Errors:
+    """Of one recording: live, smoothed, and by snapshots of raw ranges."""
+
+    name: str
+    live: TrackErrors
+    smoothed: TrackErrors
+    snapshot: TrackErrors
+
+
+def columns(source: Source, anchors: AnchorMap, variance_m2: float = math.nan) -> tuple[Ranges, TruePath]:
+    """The ranges of a source of one tag, and where that truly was."""
+    records = list(source)
+    stamps = np.array([record.measurement.stamp_ns for record in records], np.int64)
+    known = [i for i, record in enumerate(records) if record.tag_position is not None]
+    truth = TruePath(stamps[known], np.array([records[i].tag_position for i in known], float).reshape(-1, 3))
+    ranges = Ranges(
+        stamps,
+        np.array([anchors.index[record.measurement.anchor_id] for record in records], np.intp),
+        np.array([record.measurement.range_m for record in records], float),
+        np.full(len(records), variance_m2),
+        np.array([record.measurement.cir.rx_power_dbm for record in records], float),
+        records[0].measurement.tag_id,
+    )
+    return ranges, truth
+
+
+def hanyang_run(folder: Path) -> tuple[AnchorMap, Ranges, TruePath, TruePath]:
+    """Anchors, ranges with their lag taken off, and the truth of a run: all of it, and in its authors' window.
+
+    The window of trajectory A is from the first x > 49.3 and y > -5 to the next x <= 12 and y > 3.4; that of B from
+    the first x < 8.6 and y < -7 to the next x > 8.6 and y < -7.
+    """
+    run = HanyangRun(folder)
+    ranges, _ = columns(run, run.anchors)
+    shifted = Ranges(
+        ranges.stamp_ns - round(LAG_S * _SECOND_NS),
+        ranges.anchor,
+        ranges.range_m,
+        ranges.variance_m2,
+        ranges.rx_power_dbm,
+        ranges.tag_id,
+    )
+    kind_a = folder.name.rpartition("_")[2].startswith("A")
+    return run.anchors, shifted, run.truth, _window(run.truth, kind_a)
+
+
+def hanyang(folder: Path, model: Model | None = None) -> Errors:
+    """One run in its authors' window, the height known."""
+    model = model or Model()
+    anchors, ranges, _, truth = hanyang_run(folder)
+    live = run_live(ranges, TagLocator(anchors, model, height=HEIGHT)).track
+    smoothed = Smoother(anchors, model, ranges, height=HEIGHT).fit(live).track
+    tracks = (live, smoothed, snapshot(anchors, ranges, HEIGHT))
+    return Errors(folder.name, *(at_truths(track, truth) for track in tracks))
+
+
+def _window(path: TruePath, kind_a: bool) -> TruePath:
+    x, y, _ = path.position.T
+    enters = (x > 49.3) & (y > -5.0) if kind_a else (x < 8.6) & (y < -7.0)
+    leaves = (x <= 12.0) & (y > 3.4) if kind_a else (x > 8.6) & (y < -7.0)
+    first = int(np.flatnonzero(enters)[0])
+    last = first + int(np.flatnonzero(leaves[first:])[0])
+    return TruePath(path.stamp_ns[first:last], path.position[first:last])
+
+
+def at_truths(track: Track, truth: TruePath) -> TrackErrors:
+    """Errors at the truth's times: each beside the latest estimate then."""
+    latest = np.searchsorted(track.stamp_ns, truth.stamp_ns, side="right") - 1
+    some = latest >= 0
+    return errors_of(track.position[latest[some]], track.covariance[latest[some]], truth.position[some])
+
+
+@dataclass(frozen=True, slots=True)
+class StaticErrors:
+    """Of tags at rest that three or more anchors saw: tags, mean horizontal errors in m of raw and corrected
+    ranges, and the mean NEES per degree of freedom of the latter."""
+
+    tags: int
+    raw_m: float
+    corrected_m: float
+    nees_per_dof: float
+
+
+def apartment(folder: Path) -> StaticErrors:
+    """The EVK1000 logs: each tag's place by the line in received power that the *other* tags' logs give.
+
+    A tag is in the flat, in the box of all anchors, half a metre wider: that decides between mirror images.
+    """
+    with DecaRangingFolder(folder) as source:
+        records = [
+            record for record in source if record.truth is not None and record.tag_position is not None
+        ]
+        anchors = source.anchors
+    tag = np.array([record.measurement.tag_id for record in records])
+    row = np.array([anchors.index[record.measurement.anchor_id] for record in records])
+    configuration = np.array([record.truth.configuration for record in records if record.truth is not None])
+    range_m = np.array([record.measurement.range_m for record in records])
+    error = range_m - np.array([record.truth.range_m for record in records if record.truth is not None])
+    power = np.array([record.measurement.cir.rx_power_dbm for record in records], np.float32)
+    first = np.array([record.measurement.cir.first_path_power_dbm for record in records], np.float32)
+    low, high = anchors.position.min(axis=0) - 0.5, anchors.position.max(axis=0) + 0.5
+    area = Area((low[0], low[1], -1.0), (high[0], high[1], 1.0))
+    raw: list[float] = []
+    corrected: list[float] = []
+    nees: list[float] = []
+    for one in np.unique(tag):
+        own, model = tag == one, Model()
+        used = np.unique(row[own])
+        if len(used) < 3:
+            continue
+        prior = fit_prior(configuration[~own], power[~own], first[~own], error[~own])
+        better = range_m - prior.predict_batch_m(power, first)
+        left = [
+            np.nanmean((better - range_m + error)[~own & (configuration == c)])
+            for c in np.unique(configuration[~own])
+        ]
+        # Mean absolute errors, as the line is fitted by; 1.25 times that is a normal deviation.
+        sd = 1.2533 * float(np.nanmean(np.abs(left)))
+        true = np.array(next(r.tag_position for r, mine in zip(records, own, strict=True) if mine))
+        for values, spread, errors in ((range_m, model.range_sd, raw), (better, sd, corrected)):
+            means = np.array([np.nanmedian(values[own & (row == a)]) for a in used])
+            told = anchors.position[used], means, np.full(len(used), spread), model
+            inside = places(*told, height=Height(0.0), area=area)
+            place = (inside or places(*told, height=Height(0.0)))[0]
+            off = place.position[:2] - true[:2]
+            errors.append(float(np.hypot(*off)))
+        nees.append(float(off @ np.linalg.solve(place.covariance[:2, :2], off)) / 2.0)
+    return StaticErrors(len(raw), float(np.mean(raw)), float(np.mean(corrected)), float(np.mean(nees)))
+
+
+@dataclass(frozen=True, slots=True)
+class FlatErrors:
+    """Of a drive through the simulated flat: from raw ranges, from those that a line in received power corrects, and
+    from those that the universal model does, which never saw that flat and leaves its radios' offset in."""
+
+    anchors: int
+    raw: Errors
+    corrected: Errors
+    universal: Errors
+
+
+def flat(anchor_count: int, seed: int = 1, ranges: int = 3000) -> FlatErrors:
+    """Drive past 4 to 8 anchors; the line was fitted to a survey of another 150 places in the same flat."""
+    prior, variance = _flat_line()
+    drive = SimulatedSource.with_anchors(anchor_count, seed=seed, count=ranges, rate_hz=40.0)
+    records = list(drive)
+    raw, truth = columns(drive, drive.anchors)
+    first = np.array([record.measurement.cir.first_path_power_dbm for record in records], np.float32)
+    predicted = prior.predict_batch_m(raw.rx_power_dbm.astype(np.float32), first)
+    told = correct_batch(
+        Mitigation(load_bundle(default_model_path())), [record.measurement for record in records]
+    )
+    by_line = raw.range_m - predicted, np.full(len(raw), variance)
+    by_network = np.array([one.range_m for one in told]), np.array([one.variance_m2 for one in told])
+    lines, networks = (
+        replace(raw, range_m=np.maximum(range_m, 0.0), variance_m2=variance_m2)
+        for range_m, variance_m2 in (by_line, by_network)
+    )
+    found = [
+        _flat_errors(name, drive.anchors, some, truth)
+        for name, some in (("raw", raw), ("line", lines), ("universal", networks))
+    ]
+    return FlatErrors(anchor_count, *found)
+
+
+def _flat_errors(name: str, anchors: AnchorMap, ranges: Ranges, truth: TruePath) -> Errors:
+    model, height = Model(), Height(0.0, 0.05)
+    live = run_live(ranges, TagLocator(anchors, model, height=height)).track
+    smoothed = Smoother(anchors, model, ranges, height=height).fit(live).track
+    tracks = (live, smoothed, snapshot(anchors, ranges, height))
+    return Errors(name, *(track_errors(track, truth) for track in tracks))
+
+
+def _flat_line() -> tuple[LinePrior, float]:
+    """The line, and the variance of what it leaves: of its mean absolute error, since it is fitted by that."""
+    survey = list(SimulatedSurvey(seed=11, configurations=150, exchanges=6))
+    truths = [record.truth for record in survey if record.truth is not None]
+    error: NDArray[np.float64] = np.array([record.measurement.range_m for record in survey]) - [
+        truth.range_m for truth in truths
+    ]
+    power = np.array([record.measurement.cir.rx_power_dbm for record in survey], np.float32)
+    first = np.array([record.measurement.cir.first_path_power_dbm for record in survey], np.float32)
+    prior = fit_prior(np.array([truth.configuration for truth in truths]), power, first, error)
+    left = np.abs(error - prior.predict_batch_m(power, first))
+    return prior, (1.2533 * float(left.mean())) ** 2

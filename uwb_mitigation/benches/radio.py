@@ -1,0 +1,259 @@
+"""What the firmware's ranging does on modelled chips: error, rates, and what it stands. Virtual time but for EVB1000s."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import psutil
+from numpy.typing import NDArray
+
+from uwb_mitigation.dw1000_model.evb1000 import ROUND_TRIP_S
+from uwb_mitigation.dw1000_model.links import Link
+from uwb_mitigation.errors import UwbMitigationError
+from uwb_mitigation.link.layout import Mode, Role
+from uwb_mitigation.link.port import PortAddress
+from uwb_mitigation.link.radio import RadioSettings
+from uwb_mitigation.measurement import DEVICE_TIME_WRAP, RangeMeasurement
+from uwb_mitigation.radio.evb1000 import Evb1000Bus
+from uwb_mitigation.radio.modelled import Line, ModelledAir
+from uwb_mitigation.radio.port import RadioPort
+
+PPM_PAIRS = ((-20.0, 20.0), (-10.0, 10.0), (0.0, 0.0), (10.0, -10.0), (20.0, -20.0))
+DISTANCES_M = (0.3, 1.0, 5.01, 20.0, 100.0)
+
+INFERENCE_CYCLES = 458_934
+"""Estimated, of the shipped network with K = 157 (`bench firmware`)."""
+
+PROCESSOR_HZ = 64e6
+SPI_OVERHEAD_S = 10e-6
+"""Assumed, of a microcontroller for each SPI transaction."""
+
+WRONG_M = 0.1
+
+_BEFORE_WRAP_TICKS = 3 * 10**9
+_LOSS, _DAMAGE = 0.1, 0.01
+_ANCHORS_M = (2.0, 5.5, 9.0, 14.0)
+_LONGEST_CALM_S = 0.25
+_PATIENCE_S = 20.0
+_STATIONARY_S = 3.0
+_STARTS_WITHIN_S = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class Ranging:
+    """Errors of one pair of clocks at one distance; the tag's counter wraps meanwhile."""
+
+    ppm_a: float
+    ppm_b: float
+    distance_m: float
+    exchanges: int
+    mean_error_m: float
+    sd_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Soaked:
+    """Of a soak.
+
+    Attributes:
+        exchanges: that began.
+        delivered: ranges.
+        wrong: of them, those off by more than `WRONG_M`.
+        disturbances: chips reset, and anchors that vanished and returned.
+        longest_recovery_s: from a reset, or from an anchor's return, to its next range; virtual time.
+        lost: {cause: exchanges}.
+        memory_growth_mb: of this process, from a tenth of the exchanges to the end.
+    """
+
+    exchanges: int
+    delivered: int
+    wrong: int
+    disturbances: int
+    longest_recovery_s: float
+    lost: dict[str, int]
+    memory_growth_mb: float
+
+
+def ranging(seconds: float, advance: Callable[[], None]) -> list[Ranging]:
+    """A pair for each of `PPM_PAIRS` at each of `DISTANCES_M`, for so many seconds of virtual time."""
+    rows = []
+    for (ppm_a, ppm_b), distance_m in itertools.product(PPM_PAIRS, DISTANCES_M):
+        with ModelledAir() as air:
+            tag = air.add(RadioSettings(), ppm=ppm_a, clock_ticks=DEVICE_TIME_WRAP - _BEFORE_WRAP_TICKS)
+            anchor = air.add(RadioSettings(role=Role.ANCHOR), ppm=ppm_b)
+            air.link(tag, anchor, Link(distance_m))
+            air.run(seconds)
+            measured, _ = air.ranges()
+        errors = measured["range_m"] - distance_m
+        rows.append(Ranging(ppm_a, ppm_b, distance_m, len(errors), float(errors.mean()), float(errors.std())))
+        advance()
+    return rows
+
+
+def line_rate_hz(mode: Mode, seconds: float = 5.0) -> float:
+    """Ranges a second over a serial line of 921600 baud, with 157 samples each in mode HOST, virtual time."""
+    line = Line(mode=mode, inference_s=INFERENCE_CYCLES / PROCESSOR_HZ, overhead_s=SPI_OVERHEAD_S)
+    with ModelledAir() as air:
+        tag = air.add(RadioSettings(), line=line)
+        air.link(tag, air.add(RadioSettings(role=Role.ANCHOR)), Link(5))
+        air.run(seconds)
+        rows, _ = air.ranges()
+        return (len(rows) - air.measurements_lost(tag)) / seconds
+
+
+def evb1000_rate_hz(seconds: float, round_trip_s: float = ROUND_TRIP_S) -> float:
+    """Ranges a second with 157 samples each of two emulated EVB1000s on this computer, wall-clock time.
+
+    Raises:
+        UwbMitigationError: they do not range.
+    """
+    with tempfile.TemporaryDirectory() as folder, _emulated(Path(folder) / "board", round_trip_s) as paths:
+        ports = [
+            RadioPort(_opening(path), RadioSettings(role=role))
+            for path, role in zip(paths, (Role.TAG, Role.ANCHOR), strict=True)
+        ]
+        try:
+            _await_range(ports[0])
+            time.sleep(_STATIONARY_S)
+            before, began = ports[0].report().status.ranged, time.monotonic()
+            time.sleep(seconds)
+            return (ports[0].report().status.ranged - before) / (time.monotonic() - began)
+        finally:
+            for port in ports:
+                port.close()
+
+
+@contextlib.contextmanager
+def _emulated(prefix: Path, round_trip_s: float) -> Iterator[tuple[Path, Path]]:
+    """Two EVB1000s in a process of their own, as boards would not take of this one's time."""
+    paths = (Path(f"{prefix}0"), Path(f"{prefix}1"))
+    program = "from uwb_mitigation.entry import command_line; command_line()"
+    # On a clean link: a simulator in that process would hold up the boards now and then.
+    options = ("emulate-evb1000", "--link", str(prefix), "--round-trip", str(round_trip_s), "--distance", "5")
+    process = subprocess.Popen([sys.executable, "-c", program, *options], stdout=subprocess.DEVNULL)
+    try:
+        until = time.monotonic() + _STARTS_WITHIN_S
+        while not all(path.exists() for path in paths):
+            if process.poll() is not None or time.monotonic() > until:
+                raise UwbMitigationError("emulated EVB1000s do not start")
+            time.sleep(0.05)
+        yield paths
+    finally:
+        process.terminate()
+        process.wait()
+
+
+def soak(exchanges: int, seed: int, advance: Callable[[int], None]) -> Soaked:
+    """A tag and four anchors, 10 % of frames lost, 1 % damaged, chips reset and anchors gone for a while."""
+    random = np.random.default_rng(seed)
+    process = psutil.Process()
+    with ModelledAir(seed) as air:
+        tag = air.add(RadioSettings(window=0), ppm=11)
+        anchors = {
+            air.add(RadioSettings(role=Role.ANCHOR), ppm=ppm): Link(distance_m, loss=_LOSS, damage=_DAMAGE)
+            for distance_m, ppm in zip(_ANCHORS_M, (-20, -7, 5, 19), strict=True)
+        }
+        for anchor, path in anchors.items():
+            air.link(tag, anchor, path)
+        now_s = air.run(1.0)
+        watch = _Watch(air, anchors)
+        watch.take(now_s)
+        memory_mb: float | None = None
+        disturbances = 0
+        while (tried := air.counts(tag)["tried"]) < exchanges:
+            advance(tried)
+            if memory_mb is None and tried > exchanges / 10:
+                memory_mb = process.memory_info().rss / 1e6
+            disturbances += 1
+            what = random.integers(0, 3)
+            anchor = int(random.choice(list(anchors)))
+            if what == 0:
+                air.link(tag, anchor, None)
+                watch.take(air.run(float(random.uniform(0.05, 1.0))))
+                air.link(tag, anchor, anchors[anchor])
+                expected = {anchor}
+            else:
+                air.reset(tag if what == 1 else anchor)
+                expected = set(anchors) if what == 1 else {anchor}
+            now_s = watch.await_all(expected)
+            now_s = watch.take(air.run(float(random.uniform(0, _LONGEST_CALM_S))))
+        counts = air.counts(tag)
+    end_mb = process.memory_info().rss / 1e6
+    lost = {name: counts[name] for name in ("no_answer", "late", "time_out", "damaged", "absurd", "broken")}
+    return Soaked(
+        exchanges=counts["tried"],
+        delivered=watch.delivered,
+        wrong=watch.wrong,
+        disturbances=disturbances,
+        longest_recovery_s=watch.longest_s,
+        lost=lost,
+        memory_growth_mb=end_mb - (memory_mb if memory_mb is not None else end_mb),
+    )
+
+
+class _Watch:
+    """Takes a soak's ranges, and looks how long it takes from now on until an anchor is heard again."""
+
+    _SLICE_S = 0.01
+
+    def __init__(self, air: ModelledAir, anchors: dict[int, Link]) -> None:
+        self._air = air
+        self._by_address = {air.address(anchor): anchor for anchor in anchors}
+        self._distances_m = {anchor: path.distance_m for anchor, path in anchors.items()}
+        self.delivered = 0
+        self.wrong = 0
+        self.longest_s = 0.0
+
+    def take(self, now_s: float) -> float:
+        """Count what has been measured; returns the time."""
+        self._rows()
+        return now_s
+
+    def await_all(self, expected: set[int]) -> float:
+        """Run until each of these anchors gave a range; returns the time.
+
+        Raises:
+            UwbMitigationError: one gives none any more.
+        """
+        now_s = began_s = self._air.run(0.0)
+        # What was measured before counts for nothing here.
+        self._rows()
+        missing = set(expected)
+        while missing:
+            if now_s - began_s > _PATIENCE_S:
+                raise UwbMitigationError(f"no range within {_PATIENCE_S} s of virtual time")
+            now_s = self._air.run(self._SLICE_S)
+            for row in self._rows():
+                missing.discard(self._by_address[int(row["anchor"])])
+        self.longest_s = max(self.longest_s, now_s - began_s)
+        return now_s
+
+    def _rows(self) -> NDArray[np.void]:
+        rows, _ = self._air.ranges()
+        self.delivered += len(rows)
+        for row in rows:
+            distance_m = self._distances_m[self._by_address[int(row["anchor"])]]
+            self.wrong += bool(abs(row["range_m"] - distance_m) > WRONG_M)
+        return rows
+
+
+def _opening(path: Path) -> Callable[[], Evb1000Bus]:
+    return lambda: Evb1000Bus(PortAddress.parse(str(path)))
+
+
+def _await_range(port: RadioPort) -> None:
+    until = time.monotonic() + _STARTS_WITHIN_S
+    while not isinstance(port.get(0.2), RangeMeasurement):
+        if time.monotonic() > until:
+            raise UwbMitigationError(
+                f"emulated EVB1000s do not range: {port.report().problem or 'no answer'}"
+            )

@@ -1,0 +1,120 @@
+"""What the viewer costs: processor time with and without open pages, and what the mitigator loses to it."""
+
+from __future__ import annotations
+
+import socket
+import time
+from dataclasses import dataclass
+from functools import partial
+from statistics import median
+
+from uwb_mitigation_msgs.msg import RangeCorrected
+
+from uwb_mitigation.benches import vitals
+from uwb_mitigation.benches.nodes import Advance, Bench, Step, Subject, open_bench, searches, take_steps
+from uwb_mitigation.benches.visitors import Visitors
+from uwb_mitigation.nodes import topics
+from uwb_mitigation.nodes.probe import wait
+
+RATE_HZ = 100.0
+SENT_HZ = 500
+_SLICES = 5
+PAGES = (0, 1, 10)
+_SETTLE_S = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class ViewerCosts:
+    """Of a viewer beside a driver and a mitigator.
+
+    Attributes:
+        core_share: processor time of the viewer at `RATE_HZ` by seconds passed, {open pages: share of a core}.
+        alone_us: processor time of driver and mitigator for a range at `SENT_HZ`, without a viewer.
+        viewed_us: the same with a viewer and one open page, measured by turns with it.
+        alone_hz, viewed_hz: likewise the mitigator's highest rate without loss, of each search.
+    """
+
+    core_share: dict[int, float]
+    alone_us: float
+    viewed_us: float
+    alone_hz: list[float]
+    viewed_hz: list[float]
+
+    @property
+    def rate_ratio(self) -> float:
+        """The mitigator's rate with a viewer, by that without."""
+        return median(self.viewed_hz) / (median(self.alone_hz) or 1.0)
+
+
+def measure(repeats: int, seconds: float, advance: Advance) -> ViewerCosts:
+    """Measure a viewer.
+
+    Args:
+        repeats: how often each highest rate is searched.
+        seconds: for how long each share of a core is measured.
+        advance: told how far it is.
+
+    Raises:
+        UwbMitigationError: a node did not start, or nothing arrives.
+    """
+    with open_bench() as bench:
+        alone, viewed = (
+            Subject(bench, name, RangeCorrected, topics.RANGE_CORRECTED, "mitigator", "driver")
+            for name in ("mitigator", "mitigator_viewed")
+        )
+        url, pid = _start_viewer(bench, viewed.name)
+        core_share: dict[int, float] = {}
+
+        def look(pages: int) -> None:
+            with Visitors(url, pages):
+                time.sleep(_SETTLE_S)
+                before_s, began_s = vitals.look(pid).cpu_s, time.monotonic()
+                time.sleep(seconds)
+                passed_s = time.monotonic() - began_s
+                core_share[pages] = (vitals.look(pid).cpu_s - before_s) / passed_s
+
+        viewed.play(RATE_HZ)
+        looks: list[Step] = [
+            (f"the viewer with {pages} open pages", _SETTLE_S + seconds, partial(look, pages))
+            for pages in PAGES
+        ]
+        take_steps([*looks, ("resting", 0.1, viewed.pause)], lambda text, share: advance(text, 0.3 * share))
+        with Visitors(url, 1):
+            for subject in (alone, viewed):
+                subject.warm_up()
+            slices: list[Step] = [
+                (f"processor time of {subject.name}", 2.0, partial(_measure_slice, subject))
+                for _ in range(_SLICES)
+                for subject in (alone, viewed)
+            ]
+            steps = [*slices, *searches((alone, viewed), repeats)]
+            take_steps(steps, lambda text, share: advance(text, 0.3 + 0.7 * share))
+    return ViewerCosts(
+        core_share,
+        alone.figures.chain_cpu_us_per_message,
+        viewed.figures.chain_cpu_us_per_message,
+        alone.figures.rates_hz,
+        viewed.figures.rates_hz,
+    )
+
+
+def _measure_slice(subject: Subject) -> None:
+    subject.measure_latency(SENT_HZ, 2.0)
+
+
+def _start_viewer(bench: Bench, namespace: str) -> tuple[str, int]:
+    """A viewer's page and process."""
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        port = free.getsockname()[1]
+    process = bench.start(f"viewer port:={port}", namespace)
+
+    def serves() -> bool:
+        try:
+            socket.create_connection(("localhost", port), 0.1).close()
+        except OSError:
+            return False
+        return True
+
+    wait(serves, "the viewer does not serve its page", [process])
+    return f"http://localhost:{port}/", process.pid

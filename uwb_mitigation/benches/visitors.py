@@ -1,0 +1,74 @@
+"""Open pages of a viewer without a browser: what a page is sent is counted and dropped. No ROS here."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from concurrent.futures import Future
+from urllib.parse import urlsplit
+
+from bokeh.util.token import generate_jwt_token, generate_session_id
+from tornado.httpclient import HTTPRequest
+from tornado.websocket import WebSocketClientConnection, websocket_connect
+
+_PATIENCE_S = 30.0
+
+
+class Visitors:
+    """Pages that stay open until the block ends.
+
+    Args:
+        url: of the viewer's page.
+        count: how many.
+
+    Attributes:
+        received: messages that each page was sent; not the first of a connection.
+
+    Raises:
+        OSError: nobody serves there.
+    """
+
+    def __init__(self, url: str, count: int) -> None:
+        self.received = [0] * count
+        self._host = urlsplit(url).netloc
+        self._pages: list[WebSocketClientConnection] = []
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, name="visitors", daemon=True)
+
+    def __enter__(self) -> Visitors:
+        self._thread.start()
+        try:
+            for number in range(len(self.received)):
+                opening: Future[None] = asyncio.run_coroutine_threadsafe(self._open(number), self._loop)
+                opening.result(_PATIENCE_S)
+        except BaseException:
+            self._end()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._end()
+
+    async def _open(self, number: int) -> None:
+        # As Bokeh's own script connects: the token names the session.
+        token = generate_jwt_token(generate_session_id())
+        request = HTTPRequest(f"ws://{self._host}/ws", headers={"Origin": f"http://{self._host}"})
+        page = await websocket_connect(request, subprotocols=["bokeh", token])
+        await page.read_message()
+        self._pages.append(page)
+        self._loop.create_task(self._read(page, number))
+
+    async def _read(self, page: WebSocketClientConnection, number: int) -> None:
+        while await page.read_message() is not None:
+            self.received[number] += 1
+
+    def _end(self) -> None:
+        self._loop.call_soon_threadsafe(self._close)
+        self._thread.join()
+        self._loop.close()
+
+    def _close(self) -> None:
+        for page in self._pages:
+            page.close()
+        # A turn later, so that the server hears of it.
+        self._loop.call_later(0.2, self._loop.stop)

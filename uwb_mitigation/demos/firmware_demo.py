@@ -1,0 +1,167 @@
+"""`make firmware-demo`: the firmware in an emulated Cortex-M4 corrects, the driver publishes, the host compares.
+
+python -m uwb_mitigation.entry firmware-demo [--recording PATH] [--count N]
+"""
+
+from __future__ import annotations
+
+import itertools
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from diagnostic_msgs.msg import DiagnosticArray
+from rich.console import Console
+from uwb_mitigation_msgs.msg import RangeCorrected
+
+from uwb_mitigation.errors import UwbMitigationError
+from uwb_mitigation.firmware_export.emulated_firmware import EmulatedFirmware
+from uwb_mitigation.link import messages as wire
+from uwb_mitigation.measurement import CorrectedRange, Origin, RangeMeasurement, Status
+from uwb_mitigation.mitigation import Mitigation
+from uwb_mitigation.model.bundle import load_bundle
+from uwb_mitigation.model.shipped import default_model_path
+from uwb_mitigation.nodes import processes, topics
+from uwb_mitigation.nodes.probe import Probe, watching
+from uwb_mitigation.sources.opening import open_recording
+from uwb_mitigation.sources.simulated import SimulatedSource
+
+READY_TIMEOUT_S = 60.0
+PATIENCE_S = 20.0
+"""Without a corrected range for so long, the rest counts as lost."""
+
+
+class Listener:
+    """Keeps what the board corrected, and whether the driver has it in mode DEVICE."""
+
+    def __init__(self, probe: Probe) -> None:
+        self.ready = threading.Event()
+        self.corrected: list[RangeCorrected] = []
+        probe.subscribe(RangeCorrected, topics.RANGE_CORRECTED, self.corrected.append)
+        probe.subscribe(DiagnosticArray, topics.DIAGNOSTICS, self._on_diagnostics)
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        facts = {value.key: value.value for status in message.status for value in status.values}
+        if facts.get("mode") == "device":
+            self.ready.set()
+
+
+def numbered(recording: Path | None, count: int) -> list[RangeMeasurement]:
+    """At most `count` measurements as a board holds them, in binary32, with sequences that tell them apart."""
+    source = SimulatedSource(seed=1, count=count) if recording is None else open_recording(recording)
+    with source:
+        measured = [record.measurement for record in itertools.islice(source, count)]
+    if not measured:
+        raise UwbMitigationError("the recording holds no range", where=str(recording))
+    held = []
+    for sequence, measurement in enumerate(measured):
+        kind, payload = wire.encode(measurement)
+        decoded = wire.decode(kind, payload)
+        assert isinstance(decoded, RangeMeasurement)
+        held.append(replace(decoded, sequence=sequence))
+    return held
+
+
+def differences(expected: CorrectedRange, message: RangeCorrected) -> bool:
+    """Whether board and host differ in any bit, or the message does not say that the board corrected."""
+    values = [expected.range_m, expected.correction_m, expected.variance_m2]
+    computed = [message.range, message.correction, message.variance]
+    first, second = (np.array(row, np.float32).tobytes() for row in (values, computed))
+    same = first == second and message.status == int(expected.status)
+    return not (same and message.source == Origin.DEVICE and message.model_id == expected.model_id)
+
+
+def play(
+    board: EmulatedFirmware, listener: Listener, measured: Sequence[RangeMeasurement], console: Console
+) -> None:
+    """Measure with the board's radio, and wait until all has come back or nothing more does."""
+    with console.status("waiting for the driver to bring the board into mode DEVICE") as status:
+
+        def show() -> None:
+            status.update(f"{len(listener.corrected)} of {len(measured)} ranges corrected")
+
+        if not listener.ready.wait(READY_TIMEOUT_S):
+            raise UwbMitigationError("the driver has not brought the board into mode DEVICE")
+        for measurement in measured:
+            board.measure(measurement)
+            show()
+        seen, since = -1, time.monotonic()
+        while len(listener.corrected) < len(measured) and time.monotonic() - since < PATIENCE_S:
+            if len(listener.corrected) != seen:
+                seen, since = len(listener.corrected), time.monotonic()
+                show()
+            time.sleep(0.05)
+
+
+def summarise(
+    console: Console,
+    host: Mitigation,
+    measured: Sequence[RangeMeasurement],
+    received: Sequence[RangeCorrected],
+) -> int:
+    """Say what came back. Returns the exit code: 0 if everything did, equal to the bit."""
+    expected = [host.correct(measurement) for measurement in measured]
+    arrived = {message.sequence: message for message in received}
+    different = sum(
+        differences(result, arrived[sequence])
+        for sequence, result in enumerate(expected)
+        if sequence in arrived
+    )
+    lost = len(measured) - len(arrived)
+    statuses = ", ".join(
+        f"{count} {status.name}"
+        for status in Status
+        if (count := sum(result.status is status for result in expected))
+    )
+    console.print(f"{len(measured)} ranges measured, {len(arrived)} corrected by the board, {lost} lost")
+    console.print(
+        f"{len(arrived) - different} equal to the host's to the bit, {different} different ({statuses})"
+    )
+    return 1 if lost or different or len(received) != len(arrived) else 0
+
+
+def run(console: Console, measured: Sequence[RangeMeasurement]) -> int:
+    """Start board and driver, play, compare. Returns the exit code."""
+    bundle = load_bundle(default_model_path())
+    console.print(f"building the firmware with model {bundle.name}, id {bundle.model_id:08x}")
+    with EmulatedFirmware(bundle) as board, watching(Probe) as probe:
+        console.print(f"emulated Cortex-M4 on {board.port}")
+        listener = Listener(probe)
+        driver = processes.start("driver", "source:=serial", f"port:={board.port}", "mode:=device")
+        try:
+            play(board, listener, measured, console)
+        finally:
+            (code,) = processes.stop(driver)
+    failed = summarise(console, Mitigation(bundle), measured, listener.corrected)
+    if code:
+        console.print(f"driver ended with exit code {code}", style="red")
+    return failed or int(bool(code))
+
+
+def firmware_demo(
+    recording: Annotated[
+        Path | None,
+        typer.Option(help="DecaRanging log, folder of logs, or MCAP bag. Default: a simulated recording."),
+    ] = None,
+    count: Annotated[int, typer.Option(min=1, max=100_000, help="Ranges to measure, at most.")] = 200,
+) -> None:
+    """Run the firmware in an emulator as a board of the driver, and compare its ranges with the host's."""
+    processes.isolate()
+    console = Console()
+    try:
+        code = run(console, numbered(recording, count))
+    except UwbMitigationError as error:
+        console.print(f"firmware-demo: {error}", style="red", markup=False)
+        code = 1
+    except KeyboardInterrupt:
+        code = 130
+    raise typer.Exit(code)
+
+
+def main() -> None:
+    typer.run(firmware_demo)

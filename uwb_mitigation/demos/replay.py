@@ -1,0 +1,187 @@
+"""`make demo`: a recording through `driver` and `mitigator`, two processes over real DDS, watched live.
+
+python -m uwb_mitigation.entry demo [--recording PATH] [--rate FACTOR]
+"""
+
+from __future__ import annotations
+
+import subprocess
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.live import Live
+
+from uwb_mitigation.demos.positions import Positions
+from uwb_mitigation.errors import DatasetError, UwbMitigationError
+from uwb_mitigation.nodes import processes, topics
+from uwb_mitigation.nodes.monitor import REFRESH_HZ, Monitor, live_table, summary
+from uwb_mitigation.nodes.probe import wait, watching
+from uwb_mitigation.positioning.anchors import AnchorMap, dump_anchors
+from uwb_mitigation.sources.simulated import SimulatedSource
+from uwb_mitigation.sources.source import Source
+
+SIMULATED_EXCHANGES = 600
+SIMULATED_RATE_HZ = 40.0
+LONGEST_PAUSE_S = 5.0
+TARGET_S = 15.0
+SETTLE_S = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class Programme:
+    """What is to be played: the driver's parameters, what a person should know of it, its anchors and the boards'
+    offset if known."""
+
+    title: str
+    parameters: tuple[str, ...]
+    anchors: AnchorMap | None = None
+    offset_m: float | None = None
+
+
+def simulated(rate: float) -> Programme:
+    """The simulator's default scene; what is too weak to be received gives no range, as on the air."""
+    source = SimulatedSource(count=SIMULATED_EXCHANGES, rate_hz=SIMULATED_RATE_HZ)
+    offset_m, told = offset_of(source)
+    return Programme(
+        f"simulated recording, {len(list(source))} ranges{told}",
+        (
+            "source:=simulated",
+            f"count:={SIMULATED_EXCHANGES}",
+            f"simulated_rate:={SIMULATED_RATE_HZ}",
+            f"rate:={rate or 1.0}",
+        ),
+        source.anchors,
+        offset_m,
+    )
+
+
+def offset_of(source: Source) -> tuple[float | None, str]:
+    """What the boards' antenna delays add, from the true distances in line of sight, as `uwb-mitigation offset` has it,
+    and a word of it; None where nothing tells."""
+    from uwb_mitigation.evaluation.radio_offsets import find_offset
+    from uwb_mitigation.mitigation import Mitigation
+    from uwb_mitigation.model.bundle import load_bundle
+    from uwb_mitigation.model.shipped import default_model_path
+
+    try:
+        found = find_offset(Mitigation(load_bundle(default_model_path())), source)
+    except DatasetError:
+        return None, ""
+    return found.offset_m, f", {found.offset_m:.2f} m of antenna delays taken off"
+
+
+def recorded(path: Path, rate: float) -> Programme:
+    """Read the recording once, so that it fits into about a quarter of a minute unless told otherwise."""
+    from uwb_mitigation.sources.mcap import McapRecording
+    from uwb_mitigation.sources.opening import open_recording
+
+    count, length_s, last_ns = 0, 0.0, None
+    with open_recording(path) as source:
+        for record in source:
+            stamp_ns = record.measurement.stamp_ns
+            if last_ns is not None:
+                length_s += min((stamp_ns - last_ns) / 1e9, LONGEST_PAUSE_S)
+            count, last_ns = count + 1, stamp_ns
+        offset_m, told = offset_of(source) if count else (None, "")
+        name = source.name
+        kind = "mcap" if isinstance(source, McapRecording) else "decaranging"
+    if not count:
+        raise UwbMitigationError("the recording holds no range", where=str(path))
+    rate = rate or max(1.0, length_s / TARGET_S)
+    return Programme(
+        f"{name}, {count} ranges, {rate:.1f} x recorded speed{told}",
+        (f"source:={kind}", f"path:={path.resolve()}", f"rate:={rate}", f"longest_pause:={LONGEST_PAUSE_S}"),
+        offset_m=offset_m,
+    )
+
+
+def watch(programme: Programme, console: Console) -> int:
+    """Run the nodes and show what they say. Returns the exit code."""
+    with watching(Monitor) as monitor, tempfile.TemporaryDirectory() as folder:
+        offsets = () if programme.offset_m is None else (f"offsets:={programme.offset_m:.4f}",)
+        nodes = {"mitigator": processes.start("mitigator", *offsets)}
+        positions: Positions | None = None
+        try:
+            if programme.anchors is not None:
+                positions = Positions(monitor, programme.anchors)
+                file = Path(folder) / "anchors.yaml"
+                file.write_text(dump_anchors(programme.anchors), encoding="utf-8")
+                nodes["locator"] = processes.start("locator", f"anchors:={file}", "level:=true", "rate:=0.0")
+                pose = monitor.resolve_topic_name(topics.ANCHORS)
+                wait(
+                    lambda: monitor.count_publishers(pose) > 0,
+                    "the locator did not come up",
+                    [nodes["locator"]],
+                )
+            wait_for_mitigator(monitor, nodes["mitigator"])
+            # Both the mitigator and this process are to receive the first range too.
+            nodes["driver"] = processes.start("driver", *programme.parameters, "wait_for_subscribers:=2")
+            with Live(console=console, refresh_per_second=REFRESH_HZ) as live:
+                while all(node.poll() is None for node in nodes.values()):
+                    live.update(live_table(monitor.tally, programme.title))
+                    time.sleep(1 / REFRESH_HZ)
+                # What the mitigator has in hand still arrives after the driver is gone.
+                settled = time.monotonic() + SETTLE_S
+                while monitor.tally.missing and time.monotonic() < settled:
+                    time.sleep(0.05)
+                live.update(live_table(monitor.tally, programme.title))
+        finally:
+            codes = processes.stop(*nodes.values())
+        console.print(summary(monitor.tally))
+        table = positions.table() if positions is not None else None
+        if table is not None:
+            console.print(table)
+        failed = [
+            f"{name} ended with exit code {code}" for name, code in zip(nodes, codes, strict=True) if code
+        ]
+        if monitor.tally.missing or not monitor.tally.corrected:
+            failed.append(f"{monitor.tally.corrected} of {monitor.tally.raw} ranges came back corrected")
+    for failure in failed:
+        console.print(failure, style="red")
+    return 1 if failed else 0
+
+
+def wait_for_mitigator(monitor: Monitor, mitigator: subprocess.Popen[bytes]) -> None:
+    """Wait until the mitigator is connected both ways.
+
+    Raises:
+        UwbMitigationError: it ended, or did not come up in time.
+    """
+    raw, corrected = (monitor.resolve_topic_name(name) for name in (topics.RANGE_RAW, topics.RANGE_CORRECTED))
+    wait(
+        lambda: monitor.count_publishers(corrected) > 0 and monitor.count_subscribers(raw) > 1,
+        "the mitigator did not come up: see its message above",
+        [mitigator],
+    )
+
+
+def demo(
+    recording: Annotated[
+        Path | None,
+        typer.Option(help="DecaRanging log, folder of logs, or MCAP bag. Default: a simulated recording."),
+    ] = None,
+    rate: Annotated[
+        float, typer.Option(min=0.0, max=10_000.0, help="Speed of the replay; 0 = about 15 s in all.")
+    ] = 0.0,
+) -> None:
+    """Replay a recording through driver and mitigator, show it live, and sum it up."""
+    processes.isolate()
+    console = Console()
+    try:
+        programme = simulated(rate) if recording is None else recorded(recording, rate)
+        code = watch(programme, console)
+    except UwbMitigationError as error:
+        console.print(f"demo: {error}", style="red", markup=False)
+        code = 1
+    except KeyboardInterrupt:
+        code = 130
+    raise typer.Exit(code)
+
+
+def main() -> None:
+    typer.run(demo)
