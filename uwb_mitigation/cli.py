@@ -3,53 +3,108 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from typing import Annotated, NoReturn
 
 import typer
+from typer.core import TyperGroup
 
 import uwb_mitigation
 from uwb_mitigation.commands import (
+    antenna_delay,
+    bench_locator,
     bench_nodes,
+    bench_radio,
     bench_serial,
-    bench_training,
+    calibrate,
     console,
     data,
     doctor,
+    evb1000,
     firmware,
     link,
     model,
+    offset,
+    positioning,
     process,
     report,
     training,
+    universal,
+    view,
 )
-from uwb_mitigation.errors import UwbMitigationError, not_installed
+from uwb_mitigation.errors import UwbMitigationError, not_imported
+
+bench = typer.Typer(help="Measure what the parts of the system can do.", no_args_is_help=True)
+bench.command("nodes")(bench_nodes.bench_nodes)
+bench.command("locator")(bench_locator.bench_locator)
+bench.command("soak")(bench_nodes.bench_soak)
+bench.command("serial")(bench_serial.bench_serial)
+bench.command("link")(link.bench_link)
+bench.command("radio")(bench_radio.bench_radio)
+bench.command("firmware")(firmware.bench_firmware)
+
+PANELS: dict[str, dict[str, typer.Typer | Callable[..., None]]] = {
+    "Recordings": {
+        "data": data.app,
+        "process": process.process,
+        "view": view.view,
+    },
+    "Positions": {
+        "track": positioning.track,
+        "survey": positioning.survey,
+        "calibrate": calibrate.calibrate,
+    },
+    "Models": {
+        "train": model.train,
+        "train-universal": universal.train_universal,
+        "quantize": model.quantize,
+        "evaluate": model.evaluate,
+        "offset": offset.offset,
+    },
+    "Boards": {
+        "antenna-delay": antenna_delay.antenna_delay,
+        "emulate-board": link.emulate_board,
+        "emulate-evb1000": evb1000.emulate_evb1000,
+        "export-c": firmware.export_c,
+        "build-image": firmware.build_image,
+    },
+    "The paper": {
+        "protocol": training.protocol,
+        "search": training.search,
+        "train-lr-range": training.train_lr_range,
+        "prune": training.prune,
+        "report": report.report,
+    },
+    "Installation and speed": {
+        "doctor": doctor.doctor,
+        "bench": bench,
+    },
+}
+"""Every command where `--help` and docs/commands.md show it: a new one is a line here, and what it says there
+is the first line of its docstring."""
+
+
+class _InOrder(TyperGroup):
+    """Shows commands in the order of `PANELS`: typer would put groups behind all others."""
+
+    def list_commands(self, ctx: object) -> list[str]:
+        return [name for commands in PANELS.values() for name in commands]
+
 
 app = typer.Typer(
     name="uwb-mitigation",
-    help="Remove the range error of ultra-wideband ranging: import recordings, train and evaluate models.",
+    cls=_InOrder,
+    help="Remove the range error of ultra-wideband ranging.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     add_completion=False,
 )
-app.add_typer(data.app, name="data")
-app.add_typer(model.app)
-bench = typer.Typer(help="Measure what the parts of the system can do.", no_args_is_help=True)
-app.add_typer(bench, name="bench")
-bench.command("link")(link.bench_link)
-bench.command("serial")(bench_serial.bench_serial)
-bench.command("nodes")(bench_nodes.bench_nodes)
-bench.command("soak")(bench_nodes.bench_soak)
-bench.command("firmware")(firmware.bench_firmware)
-app.command("process")(process.process)
-app.command("protocol")(training.protocol)
-app.command("search")(training.search)
-app.command("train-lr-range")(training.train_lr_range)
-app.command("prune")(training.prune)
-bench.command("training")(bench_training.bench_training)
-app.command("report")(report.report)
-app.command("emulate-board")(link.emulate_board)
-app.command("export-c")(firmware.export_c)
-app.command("doctor")(doctor.doctor)
+for _panel, _commands in PANELS.items():
+    for _name, _command in _commands.items():
+        if isinstance(_command, typer.Typer):
+            app.add_typer(_command, name=_name, rich_help_panel=_panel)
+        else:
+            app.command(_name, rich_help_panel=_panel)(_command)
 
 
 def _print_version(wanted: bool) -> None:
@@ -82,13 +137,10 @@ def main() -> None:
         app()
     except UwbMitigationError as error:
         _fail(error)
-    except ModuleNotFoundError as error:
-        from uwb_mitigation.installation import distribution_of
-
-        distribution = distribution_of(error.name or "")
-        if distribution is None:
+    except ImportError as error:
+        if (absent := not_imported(error)) is None:
             raise
-        _fail(not_installed(distribution))
+        _fail(absent)
     except KeyboardInterrupt:
         sys.exit(130)
 

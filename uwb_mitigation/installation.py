@@ -7,48 +7,67 @@ from __future__ import annotations
 
 import enum
 import os
+import shlex
 import shutil
 import subprocess
 import sys
+import sysconfig
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib import import_module, metadata
+from importlib.util import find_spec
 from pathlib import Path
+from typing import NamedTuple
 
 from uwb_mitigation.errors import ModelError
 from uwb_mitigation.firmware_export.compiling import c_compiler
-from uwb_mitigation.model.shipped import default_model_path
+from uwb_mitigation.model.shipped import default_model_path, shared_folders
 
 PYTHONS = ((3, 10), (3, 13))
-PACKAGES = {
-    "numpy": "numpy",
-    "onnxruntime": "onnxruntime",
-    "onnx": "onnx",
-    "mcap": "mcap",
-    "zstandard": "zstandard",
-    "lz4": "lz4.frame",
-    "rosbags": "rosbags",
-    "pyyaml": "yaml",
-    "pooch": "pooch",
-    "cobs": "cobs.cobs",
-    "pyserial": "serial",
+
+
+class Library(NamedTuple):
+    """A library of Python: what is imported of it, and what it is for; empty = nothing works without it."""
+
+    module: str
+    purpose: str = ""
+
+
+LIBRARIES = {
+    "numpy": Library("numpy"),
+    "onnxruntime": Library("onnxruntime"),
+    "pyyaml": Library("yaml"),
+    "cobs": Library("cobs.cobs", "boards on a serial link"),
+    "pyserial": Library("serial", "boards on a serial link"),
+    "mcap": Library("mcap", "bags"),
+    "rosbags": Library("rosbags", "bags"),
+    "zstandard": Library("zstandard", "compressed bags"),
+    "lz4": Library("lz4.frame", "compressed bags"),
+    "onnx": Library("onnx", "training and exporting models"),
+    "scipy": Library("scipy", "positions and calibration"),
+    "pandas": Library("pandas", "the DeepUWB data set"),
+    "pooch": Library("pooch", "fetching data sets"),
+    "pydantic": Library("pydantic", "reports"),
+    "psutil": Library("psutil", "benches of the nodes"),
+    "bokeh": Library("bokeh", "the viewer"),
+    "typer": Library("typer", "the command line"),
+    "rich": Library("rich", "the command line and the monitor"),
 }
-"""Distributions that the command line and the nodes need, and what is imported of each."""
+"""{distribution: library} of what the package can use and every installation by `make setup` has."""
 
 UDEV_RULE = "60-uwb-mitigation.rules"
 UDEV_FOLDERS = (Path("/etc/udev/rules.d"), Path("/usr/lib/udev/rules.d"), Path("/lib/udev/rules.d"))
+ROS_PREFIX = Path(os.environ.get("ROS_PREFIX", "/opt/ros/jazzy"))
 
-_SETUP = "make setup, or install requirements/runtime.txt"
-_ROS = "make setup, or source ROS's setup.sh and that of the workspace"
-_RCLPY = "from rclpy.utilities import get_rmw_implementation_identifier as middleware; print(middleware())"
-_MESSAGES = """\
+ASK_RCLPY = "from rclpy.utilities import get_rmw_implementation_identifier as middleware; print(middleware())"
+ASK_MESSAGES = """\
 from uwb_mitigation_msgs import msg
 msg.RangeCir.__class__.__import_type_support__()
 print(msg.__path__[0])
 """
 CHILD_TIMEOUT_S = 60
-_DIALOUT = "sudo usermod -aG dialout $USER, then log in again"
+_DIALOUT = 'sudo usermod -aG dialout "$USER"'
 
 
 class State(str, enum.Enum):
@@ -67,7 +86,7 @@ class Finding:
         name: of the thing.
         state: BROKEN is what has to be mended; OPTIONAL what is absent and need not be there.
         detail: version or place, what is wrong, or what an optional thing is for.
-        fix: what to do; empty where there is nothing to do.
+        fix: a line for a shell that mends it; empty where there is none.
     """
 
     name: str
@@ -78,25 +97,68 @@ class Finding:
 
 def examine() -> Iterator[Finding]:
     """Look at everything, one thing after the other."""
-    yield _attempt("Python", _python, "make PYTHON=python3.12 setup")
-    packages = [_attempt(name, partial(_package, name, module), _SETUP) for name, module in PACKAGES.items()]
-    yield from packages
-    complete = all(package.state is State.OK for package in packages)
-    yield _attempt("shipped model", _model, "install the package again" if complete else _SETUP)
-    yield _attempt("rclpy", partial(_child, _RCLPY), _ROS)
-    yield _attempt("messages", partial(_child, _MESSAGES), _ROS)
-    yield from _ports()
-    yield from _udev_rule()
-    yield from _tools()
+    yield attempt("Python", python_version, "make PYTHON=python3.12 setup")
+    yield from (examine_library(name, library) for name, library in LIBRARIES.items())
+    yield attempt("shipped model", compare_model, _restored_models())
+    yield examine_ros("rclpy", ASK_RCLPY)
+    yield examine_ros("messages", ASK_MESSAGES)
+    yield from examine_ports()
+    yield from examine_udev_rule()
+    yield from examine_tools()
 
 
-def distribution_of(module: str) -> str | None:
-    """Which of `PACKAGES` a module is of; None: of none."""
-    top = module.partition(".")[0]
-    return next((name for name, imported in PACKAGES.items() if imported.partition(".")[0] == top), None)
+def own_environment() -> Path | None:
+    """The environment of a checkout that `make setup` made, where this Python is of it."""
+    environment = Path(sys.prefix)
+    return environment if (environment / "environment.sh").is_file() else None
 
 
-def _attempt(name: str, look: Callable[[], str], fix: str) -> Finding:
+def examine_library(name: str, library: Library) -> Finding:
+    """Broken where it is installed and cannot be imported, or nothing works without it."""
+    found = attempt(name, partial(library_version, name, library.module), _installing(name))
+    if found.state is State.BROKEN and library.purpose and not _is_installed(name):
+        return replace(found, state=State.OPTIONAL, detail=f"for {library.purpose}")
+    return found
+
+
+def library_version(distribution: str, module: str) -> str:
+    """The version of a distribution whose module can be imported."""
+    import_module(module)
+    return metadata.version(distribution)
+
+
+def _is_installed(distribution: str) -> bool:
+    try:
+        metadata.version(distribution)
+    except metadata.PackageNotFoundError:
+        return False
+    return True
+
+
+def _installing(distribution: str) -> str:
+    """The line that installs a library here, without a change of what the system brings."""
+    if environment := own_environment():
+        return shlex.join(["make", "-C", str(environment.parent), "setup"])
+    words = [sys.executable, "-m", "pip", "install"]
+    if sys.prefix == sys.base_prefix:
+        words.append("--user")
+        if Path(sysconfig.get_path("stdlib"), "EXTERNALLY-MANAGED").is_file():
+            words.append("--break-system-packages")
+        constraints = [folder / "ros_constraints.txt" for folder in shared_folders("requirements")]
+        words += [word for file in constraints if file.is_file() for word in ("-c", str(file))][:2]
+    return shlex.join([*words, distribution])
+
+
+def _restored_models() -> str:
+    """The line that brings the models of a checkout back; those of an installation come with the package."""
+    checkout = Path(__file__).resolve().parent.parent
+    return (
+        shlex.join(["git", "-C", str(checkout), "restore", "models"]) if (checkout / ".git").exists() else ""
+    )
+
+
+def attempt(name: str, look: Callable[[], str], fix: str) -> Finding:
+    """What a look finds; BROKEN with the first line of whatever it raises."""
     try:
         return Finding(name, State.OK, look())
     except Exception as error:  # A broken library raises anything, and what it says is what is wanted.
@@ -104,7 +166,8 @@ def _attempt(name: str, look: Callable[[], str], fix: str) -> Finding:
         return Finding(name, State.BROKEN, lines[0] if lines else type(error).__name__, fix)
 
 
-def _python() -> str:
+def python_version() -> str:
+    """This Python's version; raises RuntimeError where it is not supported."""
     version = ".".join(map(str, sys.version_info[:3]))
     low, high = PYTHONS
     if not low <= sys.version_info[:2] <= high:
@@ -112,35 +175,69 @@ def _python() -> str:
     return version
 
 
-def _package(distribution: str, module: str) -> str:
-    import_module(module)
-    return metadata.version(distribution)
-
-
-def _model() -> str:
-    """Load the shipped model and compare ONNX Runtime with the integer reference, bit by bit."""
+def compare_model() -> str:
+    """Load the shipped model, and compare ONNX Runtime with the integer reference bit by bit where onnx can read it."""
     import numpy as np
 
+    from uwb_mitigation.model.bundle import load_bundle
+    from uwb_mitigation.model.runtime import Session
+
+    bundle = load_bundle(default_model_path())
+    name = f"{bundle.card.name}, id {bundle.model_id:08x}"
+    session = Session(bundle)
+    if not _is_installed("onnx"):
+        return f"{name}: loaded, not compared with the integer reference"
     from uwb_mitigation.firmware_export.export import golden_windows
     from uwb_mitigation.firmware_export.packing import pack
     from uwb_mitigation.model import graph
-    from uwb_mitigation.model.bundle import load_bundle
     from uwb_mitigation.model.integer import IntegerNetwork
-    from uwb_mitigation.model.session import Session
 
-    bundle = load_bundle(default_model_path())
     weights = graph.int8_weights(bundle.model, bundle.architecture)
     windows = golden_windows(pack(weights))
-    given, golden = Session(bundle).predict_batch_m(windows), IntegerNetwork(weights).predict_m(windows)
+    given, golden = session.predict_batch_m(windows), IntegerNetwork(weights).predict_m(windows)
     wrong = int(np.sum(given.view(np.uint32) != golden.view(np.uint32)))
     if wrong:
         raise RuntimeError(f"ONNX Runtime computes {wrong} of {len(windows)} golden vectors differently")
-    return f"{bundle.card.name}, id {bundle.model_id:08x}: {len(windows)} golden vectors equal to the bit"
+    return f"{name}: {len(windows)} golden vectors equal to the bit"
 
 
-def _child(code: str) -> str:
-    """What Python prints on running `code`. ROS ends the process that cannot load its middleware."""
+def examine_ros(name: str, code: str) -> Finding:
+    """Run `code`, which needs ROS: as things are, or else after a script that sets ROS up has been sourced."""
+    scripts = _setup_scripts()
+    found = attempt(name, partial(ask_child, code), "")
+    for script in scripts:
+        if found.state is State.OK:
+            break
+        found = attempt(name, partial(ask_child, code, script), "")
+        if found.state is State.OK:
+            told = f"{found.detail}, once its script is sourced"
+            return replace(found, detail=told, fix=f". {shlex.quote(str(script))}")
+    if found.state is State.OK:
+        return found
+    if environment := own_environment():
+        return replace(found, fix=shlex.join(["make", "-C", str(environment.parent), "setup"]))
+    if scripts or os.environ.get("AMENT_PREFIX_PATH") or find_spec("rclpy"):
+        build = "colcon build --base-paths src src/uwb_mitigation/msg_defs && . install/setup.sh"  # in the workspace
+        return replace(found, fix=build if name == "messages" else "")
+    return replace(found, state=State.OPTIONAL, detail="for the nodes: there is no ROS 2 Jazzy here")
+
+
+def _setup_scripts() -> list[Path]:
+    """Scripts that set ROS up: of this environment, of the workspace that holds this package, and ROS's own."""
+    # install/uwb_mitigation/lib/python3.x/site-packages/uwb_mitigation, or install/lib/... where it is merged.
+    prefixes = list(Path(__file__).resolve().parents[3:7])
+    scripts = [Path(sys.prefix) / "environment.sh"]
+    scripts += [prefix / "setup.sh" for prefix in prefixes if (prefix / "_local_setup_util_sh.py").is_file()]
+    scripts.append(ROS_PREFIX / "setup.sh")
+    return [script for script in scripts if script.is_file()]
+
+
+def ask_child(code: str, script: Path | None = None) -> str:
+    """What Python prints on running `code`, after `script` where given. ROS ends the process that cannot load
+    its middleware."""
     command = [sys.executable, "-c", code]
+    if script is not None:
+        command = ["sh", "-c", '. "$0" && exec "$@"', str(script), *command]
     try:
         done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=CHILD_TIMEOUT_S)
     except subprocess.TimeoutExpired as error:
@@ -151,7 +248,8 @@ def _child(code: str) -> str:
     return done.stdout.strip()
 
 
-def _ports() -> Iterator[Finding]:
+def examine_ports() -> Iterator[Finding]:
+    """The serial ports, and whether they may be opened."""
     try:
         from serial.tools import list_ports
     except ImportError:
@@ -165,10 +263,11 @@ def _ports() -> Iterator[Finding]:
         else:
             # Without USB it is the computer's own port, where there is rarely a board.
             state = State.OPTIONAL if port.vid is None else State.BROKEN
-            yield Finding(port.device, state, "permission denied", _DIALOUT)
+            yield Finding(port.device, state, "permission denied; after the fix, log in again", _DIALOUT)
 
 
-def _udev_rule() -> Iterator[Finding]:
+def examine_udev_rule() -> Iterator[Finding]:
+    """The rule that names boards, where it was copied to, or how to copy it."""
     for folder in UDEV_FOLDERS:
         if (folder / UDEV_RULE).is_file():
             yield Finding("udev rule", State.OK, str(folder / UDEV_RULE))
@@ -177,29 +276,43 @@ def _udev_rule() -> Iterator[Finding]:
         source = default_model_path().parent.parent / "udev" / UDEV_RULE
     except ModelError:
         return  # nothing of the package's shared files is there, as told above
-    fix = f"sudo cp {source} {UDEV_FOLDERS[0]} && sudo udevadm control --reload && sudo udevadm trigger"
+    copy = shlex.join(["sudo", "cp", str(source), str(UDEV_FOLDERS[0])])
+    fix = f"{copy} && sudo udevadm control --reload && sudo udevadm trigger"
     yield Finding("udev rule", State.OPTIONAL, "names boards /dev/uwb/SERIAL", fix)
 
 
-def _tools() -> Iterator[Finding]:
+def examine_tools() -> Iterator[Finding]:
+    """What is optional: torch, compilers, the emulator."""
+    environment = own_environment()
+    torch = [
+        sys.executable,
+        "-m",
+        "pip",
+        "install",
+        "torch",
+        "--index-url",
+        "https://download.pytorch.org/whl/cpu",
+    ]
+    training = ["make", "-C", str(environment.parent), "setup-training"] if environment else torch
     # Not imported: that takes seconds.
-    yield _optional("torch", partial(metadata.version, "torch"), "for training", "make setup-training")
+    yield _optional("torch", partial(metadata.version, "torch"), "for training", shlex.join(training))
     compiler = "mitigator with backend:=firmware"
-    yield _optional("C compiler", lambda: " ".join(c_compiler()), compiler, "apt install gcc, or set CC")
+    yield _optional("C compiler", lambda: " ".join(c_compiler()), compiler, "sudo apt-get install gcc")
     purposes = {
-        "arm-none-eabi-gcc": ("builds the firmware", "apt install gcc-arm-none-eabi libnewlib-arm-none-eabi"),
-        "qemu-system-arm": ("runs the firmware without a board", "apt install qemu-system-arm"),
+        "arm-none-eabi-gcc": ("builds the firmware", "gcc-arm-none-eabi libnewlib-arm-none-eabi"),
+        "qemu-system-arm": ("runs the firmware without a board", "qemu-system-arm"),
     }
-    for tool, (purpose, fix) in purposes.items():
-        yield _optional(tool, partial(_tool, tool), purpose, fix)
+    for tool, (purpose, packages) in purposes.items():
+        yield _optional(tool, partial(find_tool, tool), purpose, f"sudo apt-get install {packages}")
 
 
 def _optional(name: str, look: Callable[[], str], purpose: str, fix: str) -> Finding:
-    found = _attempt(name, look, fix)
+    found = attempt(name, look, fix)
     return found if found.state is State.OK else replace(found, state=State.OPTIONAL, detail=purpose)
 
 
-def _tool(name: str) -> str:
+def find_tool(name: str) -> str:
+    """Where a program is; raises RuntimeError where it is not."""
     place = shutil.which(name)
     if place is None:
         raise RuntimeError("not found")

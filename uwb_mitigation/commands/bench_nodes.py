@@ -3,39 +3,75 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from types import ModuleType
+from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.table import Table
 
 from uwb_mitigation.commands import console
+from uwb_mitigation.commands.checks import import_bench
 from uwb_mitigation.commands.console import JsonOption
-from uwb_mitigation.errors import MissingDependencyError
 
 if TYPE_CHECKING:
-    from uwb_mitigation.nodes.bench_nodes import Figures
+    from uwb_mitigation.benches.nodes import Figures
+    from uwb_mitigation.benches.viewer import ViewerCosts
 
 
 def bench_nodes(
     repeats: Annotated[
         int, typer.Option(min=1, help="Searches of the highest rate; their median counts.")
     ] = 3,
-    slices: Annotated[int, typer.Option(min=1, help="Of each latency; their medians count.")] = 7,
+    slices: Annotated[int, typer.Option(min=1, help="Of each latency; their medians count.")] = 5,
     seconds: Annotated[float, typer.Option(min=0.5, help="Length of a slice.")] = 2.0,
+    viewer: Annotated[
+        bool,
+        typer.Option(
+            "--viewer",
+            help="Instead: what the viewer takes with 0, 1 and 10 open pages, and from the mitigator.",
+        ),
+    ] = False,
     json: JsonOption = None,
 ) -> None:
-    """Put the same ranges through a relay, the mitigator and the one-process pipeline, by turns."""
-    bench = _nodes("bench_nodes")
+    """Rate and latency: relay, mitigator, one-process pipeline.
+
+    The same ranges go through each by turns; that takes about five minutes.
+    """
+    if viewer:
+        _bench_viewer(repeats, seconds, json)
+        return
+    bench = import_bench("nodes")
     with console.progress() as bar:
-        task = bar.add_task("starting the nodes", total=None)
+        task = bar.add_task("starting the nodes", total=1.0)
         figures: dict[str, Figures] = bench.measure(
-            repeats, slices, seconds, lambda text: bar.update(task, description=text)
+            repeats, slices, seconds, lambda text, share: bar.update(task, description=text, completed=share)
         )
     ratios = ratios_of(figures)
     console.out.print(_table(figures))
     console.out.print(_ratio_table(ratios))
     console.write_json(json, {name: _as_json(f) for name, f in figures.items()} | {"ratios": ratios})
+
+
+def _bench_viewer(repeats: int, seconds: float, json: Path | None) -> None:
+    bench = import_bench("viewer")
+    with console.progress() as bar:
+        task = bar.add_task("starting the nodes", total=1.0)
+        costs: ViewerCosts = bench.measure(
+            repeats, 5.0 * seconds, lambda text, share: bar.update(task, description=text, completed=share)
+        )
+    table = Table("the viewer at 100 ranges a second", "", title_justify="left")
+    for pages, share in costs.core_share.items():
+        table.add_row(f"share of a core, {pages} open page{'s' if pages != 1 else ''}", f"{share:.1%}")
+    table.add_section()
+    table.add_row("driver and mitigator, us a range, no viewer", f"{costs.alone_us:.0f}")
+    table.add_row("with a viewer and an open page, us", f"{costs.viewed_us:.0f}")
+    table.add_section()
+    table.add_row("mitigator's highest rate, no viewer, Hz", f"{median(costs.alone_hz):.0f}")
+    table.add_row("with a viewer and an open page, Hz", f"{median(costs.viewed_hz):.0f}")
+    table.add_row("ratio", f"{costs.rate_ratio:.2f}")
+    console.out.print(table)
+    console.write_json(json, asdict(costs) | {"rate_ratio": costs.rate_ratio})
 
 
 def bench_soak(
@@ -48,8 +84,8 @@ def bench_soak(
     ] = False,
     json: JsonOption = None,
 ) -> None:
-    """Run many ranges through the nodes, and watch their memory, descriptors and threads."""
-    soak = _nodes("soak")
+    """Many ranges through the nodes: memory, descriptors, threads."""
+    soak = import_bench("soak")
     with console.progress() as bar:
         task = bar.add_task("ranges corrected", total=messages)
         outcome = soak.soak(
@@ -73,22 +109,6 @@ def ratios_of(figures: dict[str, Figures]) -> dict[str, float]:
         / (mitigator.max_lossless_rate_hz or 1.0),
         "added_p99_us_at_500_hz": mitigator.latency_us[500].p99 - relay.latency_us[500].p99,
     }
-
-
-def _nodes(name: str) -> ModuleType:
-    """A module of the nodes, imported only where ROS is wanted.
-
-    Raises:
-        MissingDependencyError: there is no ROS.
-    """
-    from importlib import import_module
-
-    try:
-        return import_module(f"uwb_mitigation.nodes.{name}")
-    except ModuleNotFoundError as error:
-        raise MissingDependencyError(
-            f"this needs ROS 2: {error}", valid="run `make setup`, or source ROS's setup.sh"
-        ) from error
 
 
 def _as_json(figures: Figures) -> dict[str, Any]:

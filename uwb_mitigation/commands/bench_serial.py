@@ -9,8 +9,8 @@ import typer
 from rich.table import Table
 
 from uwb_mitigation.commands import console
+from uwb_mitigation.commands.checks import import_bench
 from uwb_mitigation.commands.console import JsonOption
-from uwb_mitigation.errors import MissingDependencyError
 
 
 def bench_serial(
@@ -21,14 +21,11 @@ def bench_serial(
     unplugs: Annotated[int, typer.Option(min=1, max=1_000_000, help="How often the cable is pulled.")] = 50,
     json: JsonOption = None,
 ) -> None:
-    """Stream ranges of an emulated board through the driver; then pull its cable again and again."""
-    try:
-        from uwb_mitigation.nodes import bench_serial as bench
-    except ModuleNotFoundError as error:
-        raise MissingDependencyError(
-            f"this needs ROS 2: {error}", valid="run `make setup`, or source ROS's setup.sh"
-        ) from error
+    """Stream a board through the driver; pull its cable often.
 
+    The board is emulated.
+    """
+    bench = import_bench("serial_link")
     with console.progress() as bar:
         task = bar.add_task("streaming", total=None)
         steady = bench.steady(rate, seconds)
@@ -45,8 +42,10 @@ def bench_serial(
         "port's return to range, ms, p50 / max",
         f"{unplug.resumed_ms_p50:.0f} / {unplug.resumed_ms_max:.0f}",
     )
-    for name in ("descriptors", "threads", "memory_kb"):
+    for name in ("descriptors", "threads"):
         before, after = getattr(unplug, name)
-        table.add_row(f"{name.replace('_', ', ')}, before / after", f"{before} / {after}")
+        table.add_row(f"{name}, before / after", f"{before} / {after}")
+    before, after = unplug.memory_mb
+    table.add_row("memory, MB, before / after", f"{before:.1f} / {after:.1f}")
     console.out.print(table)
     console.write_json(json, {"steady": asdict(steady), "unplug": asdict(unplug)})

@@ -4,9 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Annotated
+
+import typer
 
 from uwb_mitigation.errors import MissingDependencyError, ParameterError
+
+if TYPE_CHECKING:
+    from uwb_mitigation.preprocessing import Scaling
+
+
+OffsetsOption = Annotated[
+    str | None,
+    typer.Option(
+        "--offsets",
+        metavar="M|FILE",
+        help="What the radios' antenna delays add: metres, or a file as `uwb-mitigation offset` writes.",
+    ),
+]
 
 
 @contextmanager
@@ -20,6 +38,20 @@ def needs_torch() -> Iterator[None]:
         raise MissingDependencyError("training needs torch", valid="run `make setup-training`") from error
 
 
+def import_bench(name: str) -> ModuleType:
+    """A module of `benches` that runs nodes.
+
+    Raises:
+        MissingDependencyError: there is no ROS.
+    """
+    try:
+        return import_module(f"uwb_mitigation.benches.{name}")
+    except ModuleNotFoundError as error:
+        raise MissingDependencyError(
+            f"this needs ROS 2: {error}", valid="run `make setup`, or source ROS's setup.sh"
+        ) from error
+
+
 def check_output(output: Path) -> None:
     """Refuse a place that no bundle can be written to.
 
@@ -30,3 +62,16 @@ def check_output(output: Path) -> None:
         raise ParameterError(
             "not a place for a bundle", where=str(output), valid="a file .onnx in a folder that exists"
         )
+
+
+def scaling_of(name: str) -> Scaling:
+    """The scaling of that name.
+
+    Raises:
+        ParameterError: there is none.
+    """
+    from uwb_mitigation.preprocessing import Scaling
+
+    if name not in {kind.value for kind in Scaling}:
+        raise ParameterError(f"scaling {name!r}", valid=", ".join(kind.value for kind in Scaling))
+    return Scaling(name)

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from uwb_mitigation.errors import UwbMitigationError
+from uwb_mitigation.files import write_whole
 
 # Results go to standard output, progress to standard error, so that a pipe carries results alone.
 # rich leaves colours and cursor movement out where a stream is not a terminal.
@@ -34,32 +36,68 @@ def progress() -> Progress:
     )
 
 
+@contextlib.contextmanager
+def share_bar(name: str) -> Iterator[Callable[[float], None]]:
+    """A progress bar with remaining time; yields what takes the share that is done."""
+    with progress() as bar:
+        task = bar.add_task(name, total=1.0)
+        yield lambda share: bar.update(task, completed=share)
+
+
+@contextlib.contextmanager
+def step_bar(name: str, steps: int) -> Iterator[Callable[[], None]]:
+    """A progress bar with remaining time; yields what is called after each step."""
+    with progress() as bar:
+        task = bar.add_task(name, total=steps)
+        yield lambda: bar.advance(task)
+
+
+@contextlib.contextmanager
+def stage_bars() -> Iterator[Callable[[str, float], None]]:
+    """A progress bar for each thing that is done, one after the other; yields what takes its name and share."""
+    with progress() as bar:
+        tasks: dict[str, TaskID] = {}
+
+        def on_progress(stage: str, share: float) -> None:
+            if stage not in tasks:
+                tasks[stage] = bar.add_task(stage, total=1.0)
+            bar.update(tasks[stage], completed=share)
+
+        yield on_progress
+
+
+@contextlib.contextmanager
+def reading() -> Iterator[Callable[[], None]]:
+    """A progress bar of no known end; yields what is called after each range."""
+    with progress() as bar:
+        task, ranges = bar.add_task("reading", total=None), itertools.count(1)
+
+        def on_record() -> None:
+            if (count := next(ranges)) % 100 == 0:
+                bar.update(task, description=f"reading: {count} ranges")
+
+        yield on_record
+
+
+def show_refused(refused: Mapping[str, int]) -> None:
+    """What was left out, {why: count}."""
+    for reason, count in refused.items():
+        err.print(f"left out: {count} x {reason}", markup=False)
+
+
 def write_json(path: Path | None, result: Mapping[str, Any]) -> None:
     """Write `result` to `path`, whole or not at all; do nothing without a path.
-
-    A link is followed, and a device or pipe written to rather than replaced.
 
     Raises:
         UwbMitigationError: the file cannot be written.
     """
     if path is None:
         return
-    text = json.dumps(result, indent=2, allow_nan=False) + "\n"
-    partial: Path | None = None
     try:
-        target = path.resolve()
-        if target.exists() and not target.is_file():
-            target.write_text(text, encoding="utf-8")
-            return
-        partial = target.with_name(target.name + ".part")
-        partial.write_text(text, encoding="utf-8")
-        partial.replace(target)
-    except (OSError, RuntimeError, ValueError) as error:
-        if partial is not None:
-            with contextlib.suppress(OSError):
-                partial.unlink(missing_ok=True)
-        reason = getattr(error, "strerror", None) or error
-        raise UwbMitigationError(f"cannot write the result: {reason}", where=str(path)) from error
+        text = json.dumps(result, indent=2, allow_nan=False) + "\n"
+    except ValueError as error:
+        raise UwbMitigationError(f"cannot write the result: {error}", where=str(path)) from error
+    write_whole(path, text)
 
 
 def _check_json_target(path: Path | None) -> Path | None:

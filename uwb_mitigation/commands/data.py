@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import enum
 import math
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,11 +17,10 @@ from uwb_mitigation.errors import DamagedRecordingError, ParameterError, Recordi
 
 if TYPE_CHECKING:
     from uwb_mitigation.sources.inventory import Inventory
+    from uwb_mitigation.sources.pauses import Pauses
     from uwb_mitigation.sources.source import Source
 
-app = typer.Typer(
-    help="Bring recordings into bags or simulate them, and show what a recording holds.", no_args_is_help=True
-)
+app = typer.Typer(help="Bring recordings into bags, simulate them, look at them.", no_args_is_help=True)
 app.command()(fetch)
 
 _STRIDE = 100
@@ -40,10 +40,19 @@ class Scene(str, enum.Enum):
     DRIVE = "drive"
     SURVEY = "survey"
     DEEPUWB = "deepuwb"
+    BUILDINGS = "buildings"
 
 
 _RANGES = 20_000
-"""Of a survey or drive where no number is asked for; in the shape of DeepUWB the source has its own."""
+"""Where no number is asked for; in the shape of DeepUWB the source has its own."""
+
+LongestPauseOption = Annotated[
+    float,
+    typer.Option(
+        metavar="SECONDS", help="Pauses are cut to this, so that the bag can be played; inf cuts none."
+    ),
+]
+_LONGEST_PAUSE_S = 5.0
 
 CirOption = Annotated[
     CirChoice, typer.Option(help="Of a DecaRanging exchange, take the CIR of this frame: final or poll.")
@@ -60,20 +69,33 @@ def import_recordings(
         ),
     ],
     cir: CirOption = CirChoice.FINAL,
+    trust: Annotated[
+        bool,
+        typer.Option(
+            "--trust",
+            help="Also read a pickle that is not the published one. A pickle is a program: reading it does "
+            "whatever its author wrote, with all that you may do.",
+        ),
+    ] = False,
+    longest_pause: LongestPauseOption = _LONGEST_PAUSE_S,
     force: Annotated[bool, typer.Option("--force", help="Replace OUT if it exists.")] = False,
     json: JsonOption = None,
 ) -> None:
-    """Write recordings into one MCAP bag, with their truth where it is known."""
+    """Write recordings into one MCAP bag, with truth where known."""
     from uwb_mitigation.bag.writer import BagWriter
     from uwb_mitigation.sources.inventory import Inventory
     from uwb_mitigation.sources.opening import open_recording
+    from uwb_mitigation.sources.pauses import Pauses
 
-    opened = [open_recording(path, cir=cir.value) for path in sources]
+    opened = [open_recording(path, cir=cir.value, trust_pickle=trust) for path in sources]
     inventory = Inventory()
     origin = {
         "source": "; ".join(source.name for source in opened),
-        "simulated": "true" if any(source.simulated for source in opened) else "false",
+        "simulated": _simulated(opened),
     }
+    # A tag that is known to move goes on through a pause: its time is not to be cut.
+    in_motion = any(getattr(source, "in_motion", False) for source in opened)
+    pauses = Pauses(math.inf if in_motion else longest_pause, _today_ns())
     damage: list[DamagedRecordingError] = []
     with BagWriter(output, origin, force=force) as bag, console.progress() as bar:
         task = bar.add_task("importing", total=None)
@@ -81,7 +103,7 @@ def import_recordings(
             try:
                 with source:
                     for record in inventory.watch(source):
-                        bag.write(record)
+                        bag.write(pauses.without(record))
                         if inventory.ranges % _STRIDE == 0:
                             bar.update(task, description=f"importing: {inventory.ranges} ranges")
             except DamagedRecordingError as error:  # noqa: PERF203 - once a source
@@ -92,9 +114,12 @@ def import_recordings(
             )
     for source in opened:
         _show(source, inventory if len(opened) == 1 else None)
+    if len(opened) == 1:
+        _save_anchors(opened[0], output)
     if len(opened) > 1:
         _show_inventory(inventory)
     messages = bag.counts.total()
+    _show_pauses(pauses)
     console.out.print(f"Wrote {messages} messages to {bag.file}.", markup=False, soft_wrap=True)
     if bag.notice:
         console.err.print(bag.notice, style="yellow", markup=False, soft_wrap=True)
@@ -115,23 +140,29 @@ def simulate(
     like: Annotated[
         Scene,
         typer.Option(
-            help="deepuwb: five rooms with obstacles, in DeepUWB's shape and size; survey: placements at rest "
-            "in a flat; drive: a robot through that flat."
+            help="deepuwb: five rooms with obstacles, in DeepUWB's shape and size; buildings: placements in random "
+            "buildings, with boards that differ; survey: placements at rest in a flat; drive: a robot through that flat."
         ),
     ] = Scene.DEEPUWB,
-    seed: Annotated[int, typer.Option(help="The same seed gives the same bag.")] = 1,
+    seed: Annotated[
+        int, typer.Option(help="The same seed gives the same ranges, from today 0:00 UTC on.")
+    ] = 1,
     ranges: Annotated[
         int | None,
         typer.Option(
-            help="How many; without it, 55158 as DeepUWB has, or 20000 of a survey or drive, less those "
+            help="How many; without it, 55158 as DeepUWB has, or 20000 of the others, less those "
             "that are too weak to be received."
         ),
     ] = None,
     exchanges: Annotated[int, typer.Option(help="For each placement at rest; a drive has none.")] = 20,
+    anchors: Annotated[int, typer.Option(help="That a drive goes past, 4 to 8.")] = 4,
+    longest_pause: LongestPauseOption = _LONGEST_PAUSE_S,
     force: Annotated[bool, typer.Option("--force", help="Replace OUT if it exists.")] = False,
     json: JsonOption = None,
 ) -> None:
-    """Simulate ranges with their truth, and write them to an MCAP bag that says it is simulated.
+    """Simulate ranges with their truth, and write them to a bag.
+
+    The bag says that it is simulated.
 
     Try the protocol and the report without hardware or a download:
 
@@ -140,20 +171,26 @@ def simulate(
         uwb-mitigation protocol --data sim.mcap -o models
 
         uwb-mitigation report --data sim.mcap --models models -o report
+
+    In a checkout, `make paper` does all of it.
     """
     from uwb_mitigation.bag.writer import BagWriter
     from uwb_mitigation.sources.inventory import Inventory
+    from uwb_mitigation.sources.pauses import Pauses
 
-    source, total = simulated_source(like, seed, ranges, exchanges)
+    source, total = simulated_source(like, seed, ranges, exchanges, anchors)
     inventory = Inventory()
     origin = {"source": source.name, "simulated": "true"}
+    pauses = Pauses(longest_pause, _today_ns())
     with BagWriter(output, origin, force=force) as bag, console.progress() as bar:
         task = bar.add_task("simulating", total=total)
         for record in inventory.watch(source):
-            bag.write(record)
+            bag.write(pauses.without(record))
             if inventory.ranges % _STRIDE == 0:
                 bar.update(task, completed=inventory.ranges)
     _show(source, None)
+    _show_pauses(pauses)
+    _save_anchors(source, output)
     lost = ", ".join(f"{count} x {why}" for why, count in inventory.skipped.items())
     console.out.print(
         f"Wrote {inventory.ranges} ranges of {inventory.pair_count} pairs to {bag.file}"
@@ -169,29 +206,35 @@ def simulate(
     )
 
 
-def simulated_source(like: Scene, seed: int, ranges: int | None, exchanges: int) -> tuple[Source, int]:
+def simulated_source(
+    like: Scene, seed: int, ranges: int | None, exchanges: int, anchors: int = 4
+) -> tuple[Source, int]:
     """The simulator's source, and how many ranges it simulates.
 
     Raises:
         ParameterError: a number is out of its range.
     """
     from uwb_mitigation.sources import simulated
+    from uwb_mitigation.sources.simulated_buildings import SimulatedBuildings
+    from uwb_mitigation.sources.simulated_deepuwb import SimulatedDeepUwb
 
     if like is Scene.DEEPUWB:
         chosen = {} if ranges is None else {"ranges": ranges}
-        rooms = simulated.SimulatedDeepUwb(seed=seed, exchanges=exchanges, **chosen)
+        rooms = SimulatedDeepUwb(seed=seed, exchanges=exchanges, **chosen)
         return rooms, sum(rooms.rows)
     ranges = _RANGES if ranges is None else ranges
-    if like is Scene.SURVEY:
+    if like in (Scene.SURVEY, Scene.BUILDINGS):
         if exchanges < 1 or ranges % exchanges:
             raise ParameterError(
                 f"{ranges} ranges of {exchanges} exchanges a placement", valid="a multiple of the exchanges"
             )
         placements = ranges // exchanges
+        if like is Scene.BUILDINGS:
+            return SimulatedBuildings(seed=seed, placements=placements, exchanges=exchanges), ranges
         return simulated.SimulatedSurvey(seed=seed, configurations=placements, exchanges=exchanges), ranges
     if ranges < 1:
         raise ParameterError(f"{ranges} ranges", valid="1 or more: a drive has no end of its own")
-    return simulated.SimulatedSource(seed=seed, count=ranges), ranges
+    return simulated.SimulatedSource.with_anchors(anchors, seed=seed, count=ranges), ranges
 
 
 @app.command()
@@ -200,7 +243,7 @@ def info(
     cir: CirOption = CirChoice.FINAL,
     json: JsonOption = None,
 ) -> None:
-    """Show what a recording holds: pairs, counts, times and oddities."""
+    """Show what a recording holds: pairs, counts, oddities."""
     from uwb_mitigation.sources.inventory import Inventory
     from uwb_mitigation.sources.mcap import McapRecording
     from uwb_mitigation.sources.opening import open_recording
@@ -229,11 +272,47 @@ def info(
     )
 
 
+def _save_anchors(source: Source, bag: Path) -> None:
+    from uwb_mitigation.sources.site import KnowsAnchors, anchors_file, save_anchors
+
+    if isinstance(source, KnowsAnchors):
+        path = anchors_file(bag)
+        # The bag itself was refused, or `--force` given, before.
+        save_anchors(path, source.anchors, f"anchors of {source.name}", force=True)
+        console.out.print(f"Wrote {len(source.anchors)} anchors to {path}.", markup=False, soft_wrap=True)
+
+
 def _show(source: Source, inventory: Inventory | None) -> None:
     console.out.print(source.name, style="bold", markup=False, soft_wrap=True)
-    console.out.print("simulated: no radio was involved" if source.simulated else "measured by radios")
+    told = {
+        True: "simulated: no radio was involved",
+        False: "measured by radios",
+        None: "unknown whether radios measured it or a simulator made it",
+    }
+    console.out.print(told[source.simulated])
     if inventory is not None:
         _show_inventory(inventory)
+
+
+def _simulated(sources: list[Source]) -> str:
+    """Of all together, as a bag's metadata says it."""
+    kinds = {source.simulated for source in sources}
+    return "true" if True in kinds else "unknown" if None in kinds else "false"
+
+
+def _show_pauses(pauses: Pauses) -> None:
+    if pauses.cut:
+        console.out.print(
+            f"Cut {pauses.cut} pauses to {pauses.longest_s:g} s each, {pauses.cut_s:.0f} s in all; "
+            "--longest-pause inf keeps them.",
+            highlight=False,
+            soft_wrap=True,
+        )
+
+
+def _today_ns() -> int:
+    """Today at 0:00 UTC, where recordings begin that bear no date."""
+    return int(time.time() // 86_400) * 86_400 * 10**9
 
 
 def _show_inventory(inventory: Inventory) -> None:

@@ -33,16 +33,15 @@ def fetch(
     force: Annotated[bool, typer.Option("--force", help="Replace FILE if it is another file.")] = False,
     json: JsonOption = None,
 ) -> None:
-    """Download a published data set, check it, and leave it in a file that `data import` reads."""
+    """Download and check a data set that `data import` reads."""
     from uwb_mitigation.sources import deepuwb
-    from uwb_mitigation.sources.download import Remote, download
-    from uwb_mitigation.sources.pickled_frame import MAX_FILE_BYTES
+    from uwb_mitigation.sources.download import download
 
     target = output or Path(f"{name.value}.pkl")
     with console.progress() as bar:
         task = bar.add_task(f"fetching {name.value}", total=None)
         result = download(
-            Remote(deepuwb.DOI, deepuwb.FILE_NAME, MAX_FILE_BYTES),
+            deepuwb.PUBLISHED,
             target,
             lambda done, total: bar.update(task, completed=done, total=total),
             url=url,

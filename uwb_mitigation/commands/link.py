@@ -44,7 +44,10 @@ def emulate_board(
     seed: Annotated[int, typer.Option(help="Of all faults, and of simulated measurements.")] = 1,
     json: JsonOption = None,
 ) -> None:
-    """Be a board on a pseudo-terminal: open the port it prints as if it were /dev/ttyACM0."""
+    """Be a board without hardware, on a pseudo-terminal.
+
+    Open the port it prints as if it were /dev/ttyACM0.
+    """
     from uwb_mitigation.link.emulated_board import BoardFaults, EmulatedBoard
     from uwb_mitigation.link.faults import ByteFaults
     from uwb_mitigation.link.layout import Mode
@@ -87,7 +90,7 @@ def bench_link(
     seed: Annotated[int, typer.Option(help="Of payloads and damage.")] = 0,
     json: JsonOption = None,
 ) -> None:
-    """Send frames through a channel that damages them: what arrives, and how fast it is decoded."""
+    """Frames through a damaging channel: losses, decoder speed."""
     from uwb_mitigation.link.faults import ByteFaults, loopback
 
     if frames < 1:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -10,20 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from uwb_mitigation.commands import console, model_tables
-from uwb_mitigation.commands.checks import check_output, needs_torch
+from uwb_mitigation.commands.bundles import ModelOption, bundle_for
+from uwb_mitigation.commands.checks import OffsetsOption, check_output, needs_torch, scaling_of
 from uwb_mitigation.commands.console import JsonOption
-from uwb_mitigation.errors import DatasetError, ModelError, ParameterError
+from uwb_mitigation.errors import ParameterError
 
 if TYPE_CHECKING:
     from uwb_mitigation.dataset import Dataset
-    from uwb_mitigation.model.bundle import Bundle
     from uwb_mitigation.preprocessing import Preprocessing, Scaling
-    from uwb_mitigation.sources.source import Record
-    from uwb_mitigation.training.choosing import Candidate, Choice
-    from uwb_mitigation.training.options import FitOptions
-    from uwb_mitigation.training.recipe import CrossValidation, Recipe
-
-app = typer.Typer()
 
 DataOption = Annotated[
     Path, typer.Option(help="Recording with true ranges: a bag, or a folder of DecaRanging logs.")
@@ -41,7 +35,6 @@ _OF_DATA = {
 _OF_CROSS_VALIDATION = {"seeds": "--seeds", "folds": "--folds", "scaling": "--scaling"}
 
 
-@app.command()
 def train(
     context: typer.Context,
     output: OutputOption,
@@ -68,8 +61,9 @@ def train(
     model: Annotated[
         Path | None,
         typer.Option(
-            help="With --from-bag: bundle to start from; without it, the shipped one, or where there are few "
-            "configurations the simulator's."
+            metavar="FILE|NAME",
+            help="With --from-bag: bundle to start from, or the name of a shipped one; without it `universal`, or "
+            "`universal_amplitude` for CIRs without preamble counts.",
         ),
     ] = None,
     choose: Annotated[
@@ -90,10 +84,17 @@ def train(
     ] = True,
     json: JsonOption = None,
 ) -> None:
-    """Choose by cross-validation over configurations what the data can carry, then train it on all of the data:
-    a float bundle. With 18 configurations or fewer, `cold start` is among what is chosen from, and preferred: half a
-    line of the data's own, half a network that was trained in a simulated flat; not with --recipe or --model."""
+    """Train what the data can carry: a float bundle.
+
+    What that is, is chosen by cross-validation over configurations, and then trained on all of the data.
+
+    Among the candidates is `cold start`, a network that was trained in simulated buildings with an offset of these
+    data; with fewer than 20 configurations it is preferred, with more its mean with the line is offered too. Not
+    with --recipe or --model. A network that is trained on the data is kept only where choosing it gains on what no choice
+    has seen.
+    """
     from uwb_mitigation.model.architecture import Remnet
+    from uwb_mitigation.preprocessing import Preprocessing
     from uwb_mitigation.training.options import FitOptions
 
     if (data is None) == (from_bag is None):
@@ -105,7 +106,7 @@ def train(
             f"{idle} with --from-bag",
             valid="with --data: a bag's fit has these from the model that it starts from",
         )
-    chosen_scaling = _scaling(scaling)
+    chosen_scaling = scaling_of(scaling)
     if per_configuration < 1:
         raise ParameterError(f"per-configuration = {per_configuration}", valid="1 or more")
     asked: dict[str, Any] = {"epochs": epochs, "learning_rate": learning_rate, "seed": seed}
@@ -114,155 +115,30 @@ def train(
     architecture = Remnet(samples=samples, first_kernel=first_kernel)
     check_output(output)
     with needs_torch():
-        from uwb_mitigation.training import choosing, cold_start, site
-        from uwb_mitigation.training import recipe as recipes
+        from uwb_mitigation.training import choosing, making
+        from uwb_mitigation.training.recipe import Recipe
 
     if from_bag is not None:
-        _site(from_bag, truth or [], model, output, options, folds, seed, json)
-        return
-    assert data is not None
-    from uwb_mitigation.model import graph
-    from uwb_mitigation.model.bundle import load_bundle, save_bundle
-    from uwb_mitigation.model.shipped import simulated_model_path
-
-    if choose not in ("auto", *choosing.STANDARD):
-        raise ParameterError(f"recipe {choose!r}", valid=", ".join(("auto", *choosing.STANDARD)))
-    choose = choose if prior else choosing.NETWORK
-    recipe = recipes.Recipe(architecture, options, per_configuration=per_configuration)
-    alone = replace(choosing.ALONE, **asked)
-    dataset, name = _scaled_dataset(data, samples, chosen_scaling)
-    _check_configurations(dataset, choosing.least_configurations(folds) if choose == "auto" else 2)
-    folds = min(folds, len(dataset.names))
-    choice = None
-    if choose == "auto":
-        start = load_bundle(simulated_model_path())
-        candidates = cold_start.offered(choosing.standard(recipe, alone), dataset, start)
-        choice = _choose(dataset, candidates, folds, seed)
-        choose = choice.chosen
-    if choice is not None and choose == cold_start.NAME:
-        graded, validation = site.fit_chosen(dataset, choice, candidates, start, options, output.stem, name)
-        bundle = save_bundle(output, graph.float_model(graded.network), graded.card)
-        tested = "float"
+        source = bundle_for(model, from_bag)
+        name, dataset = _dataset(from_bag, source.preprocessing, truth or ())
+        with console.stage_bars() as on_progress:
+            made = making.of_another(
+                dataset, name, source, options, output, folds, on_progress, offer_cold_start=model is None
+            )
     else:
-        recipe = choosing.recipe_of(choose, recipe, alone)
-        bundle, validation = _train(dataset, name, recipe, output, folds, seed)
-        model_tables.show_validation(validation)
-        tested = "int8"
-    mae = {row: statistics["mae"] for row, statistics in validation.statistics().items()}
-    after = mae[tested] if choice is None else choice.mae()[choosing.NESTED]
-    model_tables.show_verdict(after, {"raw": mae["raw"]})
-    model_tables.show_bundle(bundle)
-    console.write_json(
-        json,
-        {
-            "model_id": bundle.model_id,
-            "n": len(dataset),
-            "refused": dict(dataset.refused),
-            "helped": after < mae["raw"],
-            "rows": [{"name": row, **statistics} for row, statistics in validation.statistics().items()],
-            "by_configuration": {
-                key: {"n": n, "raw_mae": before, "corrected_mae": after}
-                for key, (n, before, after) in validation.by_configuration(tested).items()
-            },
-            **({} if choice is None else {"choice": choice.as_json()}),
-        },
-    )
+        assert data is not None
+        if choose not in (making.AUTO, *choosing.STANDARD):
+            raise ParameterError(f"recipe {choose!r}", valid=", ".join((making.AUTO, *choosing.STANDARD)))
+        choose = choose if prior else choosing.NETWORK
+        recipe = Recipe(architecture, options, per_configuration=per_configuration)
+        alone = replace(choosing.ALONE, **asked)
+        name, dataset = _dataset(data, Preprocessing(samples, chosen_scaling))
+        with console.stage_bars() as on_progress:
+            made = making.of_recipe(dataset, name, recipe, alone, choose, output, folds, on_progress)
+    model_tables.show_made(made)
+    console.write_json(json, made.as_json())
 
 
-def _train(
-    dataset: Dataset, name: str, recipe: Recipe, output: Path, folds: int, seed: int
-) -> tuple[Bundle, CrossValidation]:
-    from uwb_mitigation.model import graph
-    from uwb_mitigation.model.bundle import save_bundle
-    from uwb_mitigation.training import recipe as recipes
-
-    with console.progress() as bar:
-        task = bar.add_task("training", total=recipe.fit.epochs * (folds + 1))
-
-        def advance() -> None:
-            bar.advance(task)
-
-        validation = recipes.cross_validate(dataset, recipe, folds, seed, advance)
-        line, network = recipes.fit_model(dataset, recipe, advance)
-    card = recipes.describe(output.stem, recipe, line, validation, name)
-    return save_bundle(output, graph.float_model(network), card), validation
-
-
-def _choose(dataset: Dataset, candidates: Sequence[Candidate], folds: int, seed: int) -> Choice:
-    from uwb_mitigation.training import choosing, cold_start
-
-    is_cold = candidates[0].name == cold_start.NAME
-    with console.progress() as bar:
-        total = choosing.fits(folds, len(dataset.names), len(candidates))
-        task = bar.add_task("choosing", total=total)
-        choice = choosing.choose(
-            dataset,
-            candidates,
-            folds,
-            seed,
-            lambda: bar.advance(task),
-            must_gain=cold_start.MUST_GAIN if is_cold else choosing.MUST_GAIN,
-        )
-    model_tables.show_choice(choice)
-    if is_cold:
-        console.out.print(
-            f"With {cold_start.MOST_CONFIGURATIONS} configurations or fewer, {cold_start.NAME} is kept unless "
-            f"another one is {cold_start.MUST_GAIN:.0%} better.",
-            highlight=False,
-        )
-    return choice
-
-
-def _site(
-    bag: Path,
-    truth: list[Path],
-    model: Path | None,
-    output: Path,
-    options: FitOptions,
-    folds: int,
-    seed: int,
-    json: Path | None,
-) -> None:
-    from uwb_mitigation.dataset import build_dataset
-    from uwb_mitigation.model import graph
-    from uwb_mitigation.model.bundle import load_bundle, save_bundle
-    from uwb_mitigation.model.shipped import default_model_path, simulated_model_path
-    from uwb_mitigation.sources.truth_table import load_truth, with_truth
-    from uwb_mitigation.training import choosing, cold_start, site
-
-    source = load_bundle(model or default_model_path())
-    simulated = load_bundle(simulated_model_path())
-    candidates = site.candidates(source, options)
-    stretches = [row for path in truth for row in load_truth(path)]
-    records = _records(bag)
-    dataset = build_dataset(with_truth(records, stretches) if stretches else records, source.preprocessing)
-    for reason, count in dataset.refused.items():
-        console.err.print(f"left out: {count} x {reason}", markup=False)
-    _check_configurations(dataset, choosing.least_configurations(folds))
-    folds = min(folds, len(dataset.names))
-    if model is None:
-        candidates = cold_start.offered(candidates, dataset, simulated)
-    choice = _choose(dataset, candidates, folds, seed)
-    start = simulated if choice.chosen == cold_start.NAME else source
-    graded, _ = site.fit_chosen(dataset, choice, candidates, start, options, output.stem, bag.resolve().name)
-    bundle = save_bundle(output, graph.float_model(graded.network), graded.card)
-    mae = choice.mae()
-    before = {name: mae[name] for name in ("raw", site.AS_SHIPPED)}
-    model_tables.show_verdict(mae[site.NESTED], before)
-    model_tables.show_bundle(bundle)
-    console.write_json(
-        json,
-        {
-            "model_id": bundle.model_id,
-            "n": len(dataset),
-            "refused": dict(dataset.refused),
-            "helped": mae[site.NESTED] < min(before.values()),
-            "choice": choice.as_json(),
-        },
-    )
-
-
-@app.command()
 def quantize(
     model: Annotated[Path, typer.Argument(metavar="MODEL_FLOAT", help="Float bundle, of `train`.")],
     data: DataOption,
@@ -272,27 +148,19 @@ def quantize(
     ] = 100.0,
     json: JsonOption = None,
 ) -> None:
-    """Quantise a float bundle to int8, with the scales of its activations from the data it was trained on."""
-    import numpy as np
+    """Quantise a float bundle to int8.
 
-    from uwb_mitigation.model import floating, graph
-    from uwb_mitigation.model.bundle import load_bundle, save_bundle
-    from uwb_mitigation.model.integer import IntegerNetwork
+    The scales of its activations come from the data it was trained on.
+    """
+    from uwb_mitigation.model.bundle import load_bundle
     from uwb_mitigation.training import quantization
 
     source = load_bundle(model)
-    if source.quantised:
-        raise ModelError("already quantised", where=str(model), valid="the float bundle it was made of")
-    if not 90 <= percentile <= 100:
-        raise ParameterError(f"percentile = {percentile}", valid="90 to 100")
+    quantization.check(source, percentile)
     check_output(output)
-    dataset, _ = _dataset(data, source.preprocessing)
-    inputs = quantization.calibration_inputs(dataset, seed=0)
-    network = graph.float_weights(source.model, source.architecture)
-    integers = quantization.quantize(network, inputs, percentile)
-    difference = np.abs(IntegerNetwork(integers).predict_m(inputs) - floating.predict_m(network, inputs))
-    card = replace(source.card, name=output.stem, quantised=True)
-    bundle = save_bundle(output, graph.int8_model(integers), card)
+    _, dataset = _dataset(data, source.preprocessing)
+    made = quantization.quantize_bundle(source, dataset, percentile, output)
+    bundle, difference = made.bundle, made.difference_m
     model_tables.show_bundle(bundle)
     console.out.print(
         f"int8 differs from float by {difference.mean():.4f} m on average, {difference.max():.4f} m at most"
@@ -302,7 +170,7 @@ def quantize(
         {
             "model_id": bundle.model_id,
             "float_model_id": source.model_id,
-            "calibration_inputs": len(inputs),
+            "calibration_inputs": len(difference),
             "mean_difference": float(difference.mean()),
             "max_difference": float(difference.max()),
             "bytes": len(bundle.model),
@@ -310,11 +178,11 @@ def quantize(
     )
 
 
-@app.command()
 def evaluate(
     context: typer.Context,
     data: DataOption,
-    model: Annotated[Path | None, typer.Option(help="Bundle; without it, the shipped one.")] = None,
+    model: ModelOption = None,
+    offsets: OffsetsOption = None,
     cross_validate: Annotated[
         str | None,
         typer.Option(
@@ -330,30 +198,36 @@ def evaluate(
     ] = "preamble",
     json: JsonOption = None,
 ) -> None:
-    """Correct a recording that knows its true ranges, and tell the error before and after."""
+    """Tell the error of a recording with truth, raw and corrected."""
     if cross_validate is not None:
+        if offsets is not None:
+            raise ParameterError(
+                "--offsets with --cross-validate", valid="with --model, or the shipped model"
+            )
         if model is not None:
             raise ParameterError(
                 "--model with --cross-validate", valid="one of them: cross-validation fits models of its own"
             )
-        _contest(data, cross_validate, folds, seeds, _scaling(scaling), json)
+        _compare(data, cross_validate, folds, seeds, scaling_of(scaling), json)
         return
     if idle := _given(context, _OF_CROSS_VALIDATION):
         raise ParameterError(idle, valid="with --cross-validate")
-    from uwb_mitigation.evaluation import outcome
+    from uwb_mitigation.evaluation import accuracy
     from uwb_mitigation.mitigation import Mitigation
-    from uwb_mitigation.model.bundle import load_bundle
-    from uwb_mitigation.model.shipped import default_model_path
+    from uwb_mitigation.offsets import read_offsets
+    from uwb_mitigation.sources.opening import open_recording
 
-    mitigation = Mitigation(load_bundle(model or default_model_path()))
-    result = outcome.evaluate(mitigation, _records(data))
+    mitigation = Mitigation(bundle_for(model, data), read_offsets(offsets or ""))
+    with open_recording(data) as source, console.reading() as on_record:
+        result = accuracy.evaluate(mitigation, source, on_record)
     model_tables.show_outcome(result)
     console.write_json(json, result.as_json())
 
 
-def _contest(data: Path, group: str, folds: int, seeds: int, scaling: Scaling, json: Path | None) -> None:
+def _compare(data: Path, group: str, folds: int, seeds: int, scaling: Scaling, json: Path | None) -> None:
     from uwb_mitigation.evaluation import splits
     from uwb_mitigation.model.architecture import Remnet
+    from uwb_mitigation.preprocessing import Preprocessing
     from uwb_mitigation.training.options import FitOptions
 
     if group not in {kind.value for kind in splits.Group}:
@@ -362,71 +236,31 @@ def _contest(data: Path, group: str, folds: int, seeds: int, scaling: Scaling, j
         )
     if not 1 <= seeds <= 100:
         raise ParameterError(f"seeds = {seeds}", valid="1 to 100")
+    from uwb_mitigation.model.bundle import load_bundle
+    from uwb_mitigation.model.shipped import default_model_path
+
     with needs_torch():
-        from uwb_mitigation.training import contest
+        from uwb_mitigation.training import comparison
         from uwb_mitigation.training.recipe import Recipe
 
-    dataset, _ = _scaled_dataset(data, Remnet().samples, scaling)
-    kind = splits.Group(group)
-    with console.progress() as bar:
-        total = seeds * len(splits.by_group(dataset, kind, folds, 0))
-        task = bar.add_task("cross-validating", total=total)
-        result = contest.run(
-            dataset, Recipe(Remnet(), FitOptions()), kind, folds, seeds, lambda: bar.advance(task)
-        )
-    model_tables.show_contest(result)
+    _, dataset = _dataset(data, Preprocessing(Remnet().samples, scaling))
+    universal = load_bundle(default_model_path(scaling))
+    kind, recipe = splits.Group(group), Recipe(Remnet(), FitOptions())
+    total = seeds * len(splits.by_group(dataset, kind, folds, 0))
+    with console.step_bar("cross-validating", total) as on_fold:
+        result = comparison.run(dataset, recipe, kind, folds, seeds, on_fold, universal)
+    model_tables.show_comparison(result)
     console.write_json(json, result.as_json())
 
 
-def _records(data: Path) -> Iterator[Record]:
-    """The records of a recording, behind a progress bar."""
-    from uwb_mitigation.sources.opening import open_recording
+def _dataset(data: Path, preprocessing: Preprocessing, truth: Sequence[Path] = ()) -> tuple[str, Dataset]:
+    """The recording's name, and its measurements; tells what is left out."""
+    from uwb_mitigation.training import parts
 
-    with open_recording(data) as source, console.progress() as bar:
-        task = bar.add_task("reading", total=None)
-        for count, record in enumerate(source, start=1):
-            if count % 100 == 0:
-                bar.update(task, description=f"reading: {count} ranges")
-            yield record
-
-
-def _dataset(data: Path, preprocessing: Preprocessing) -> tuple[Dataset, str]:
-    """The recording as arrays, and its name."""
-    from uwb_mitigation.dataset import build_dataset
-
-    dataset = build_dataset(_records(data), preprocessing)
-    for reason, count in dataset.refused.items():
-        console.err.print(f"left out: {count} x {reason}", markup=False)
-    return dataset, data.resolve().name
-
-
-def _scaled_dataset(data: Path, samples: int, scaling: Scaling) -> tuple[Dataset, str]:
-    """`_dataset` for a network of its own: where it was the scaling that left nothing, the error says so."""
-    from uwb_mitigation.preprocessing import CirFault, Preprocessing
-
-    try:
-        return _dataset(data, Preprocessing(samples, scaling))
-    except DatasetError as error:
-        if CirFault.NO_PREAMBLE_COUNT.value not in error.what:
-            raise
-        raise DatasetError(error.what, valid="--scaling max does without preamble counts") from error
-
-
-def _check_configurations(dataset: Dataset, needed: int) -> None:
-    """Refuse before any fold is drawn what has too few of them."""
-    if (count := len(dataset.names)) < needed:
-        raise DatasetError(
-            f"{count} configuration{'' if count == 1 else 's'}, that is placements of tag and anchor",
-            valid=f"{needed} or more, each under a name of its own in `configuration` of the true ranges",
-        )
-
-
-def _scaling(name: str) -> Scaling:
-    from uwb_mitigation.preprocessing import Scaling
-
-    if name not in {kind.value for kind in Scaling}:
-        raise ParameterError(f"scaling {name!r}", valid=", ".join(kind.value for kind in Scaling))
-    return Scaling(name)
+    with console.reading() as on_record:
+        name, dataset = parts.load(data, preprocessing, truth, on_record)
+    console.show_refused(dataset.refused)
+    return name, dataset
 
 
 def _given(context: typer.Context, flags: Mapping[str, str]) -> str:

@@ -10,10 +10,11 @@ from rich.table import Table
 from uwb_mitigation.commands import console
 
 if TYPE_CHECKING:
-    from uwb_mitigation.evaluation.outcome import Outcome
+    from uwb_mitigation.evaluation.accuracy import Accuracy
     from uwb_mitigation.model.bundle import Bundle
     from uwb_mitigation.training.choosing import Choice
-    from uwb_mitigation.training.contest import Contest
+    from uwb_mitigation.training.comparison import Comparison
+    from uwb_mitigation.training.making import Made
     from uwb_mitigation.training.recipe import CrossValidation
 
 # Seen in rows of the cross-validation table, in this order.
@@ -31,13 +32,32 @@ _CANDIDATES = {
     "raw": "as measured",
     "as shipped": "the model that was started from",
     "own offset": "the same with another offset",
-    "cold start": "mean of a line and a simulator-trained network",
+    "cold start": "a simulator-trained network with an offset of these",
+    "line and cold start": "mean of the line and that",
+    "trained further": "the network that was started from, trained on these",
     "constant": "less one offset",
     "line": "less a line in the received power",
     "line+network": "the network on what the line leaves",
     "network": "the network alone",
     "chosen (nested)": "of choosing, on what no choice has seen",
 }
+
+
+def show_made(made: Made) -> None:
+    from uwb_mitigation.training import cold_start
+
+    if made.choice is not None:
+        show_choice(made.choice)
+    if made.is_cold:
+        console.out.print(
+            f"With fewer than {cold_start.ENOUGH_FOR_MEAN} configurations, cold start is kept unless another one is "
+            f"{cold_start.MUST_GAIN:.0%} better.",
+            highlight=False,
+        )
+    if "int8" in made.validation.errors:
+        show_validation(made.validation)
+    show_verdict(made.after_m, made.before_m)
+    show_bundle(made.bundle)
 
 
 def show_choice(choice: Choice) -> None:
@@ -92,7 +112,7 @@ def show_validation(validation: CrossValidation) -> None:
     console.out.print(table)
 
 
-def show_contest(result: Contest) -> None:
+def show_comparison(result: Comparison) -> None:
     labels = list(result.rows[0].by_label)
     table = Table(
         title=f"{result.configurations} configurations, {result.folds} splits by {result.group.value}, "
@@ -124,6 +144,16 @@ def show_contest(result: Contest) -> None:
         highlight=False,
         soft_wrap=True,
     )
+    if result.universal_coverage is not None:
+        covered = ", ".join(
+            f"{label or 'all'} {narrow:.1%} and {wide:.1%}"
+            for label, (narrow, wide) in result.universal_coverage.items()
+        )
+        console.out.print(
+            f"universal_los_offset: its 68 and 95 % intervals cover {covered}",
+            highlight=False,
+            soft_wrap=True,
+        )
 
 
 def show_bundle(bundle: Bundle) -> None:
@@ -136,7 +166,7 @@ def show_bundle(bundle: Bundle) -> None:
     )
 
 
-def show_outcome(result: Outcome) -> None:
+def show_outcome(result: Accuracy) -> None:
     table = Table(title=f"{result.n} ranges, model {result.model_id:08x}, m")
     table.add_column("")
     for column in ("n", "raw MAE", "corrected MAE", "std", "p95"):

@@ -12,12 +12,14 @@ from rich.markup import escape
 from rich.table import Table
 
 from uwb_mitigation.commands import console
+from uwb_mitigation.commands.bundles import ModelOption, bundle_for
+from uwb_mitigation.commands.checks import OffsetsOption
 from uwb_mitigation.commands.console import JsonOption
 from uwb_mitigation.errors import ParameterError, RecordingError, UwbMitigationError
 
 if TYPE_CHECKING:
     from uwb_mitigation.processing.job import Job, Outcome
-    from uwb_mitigation.processing.running import Event
+    from uwb_mitigation.processing.pool import Event
 
 
 def process(
@@ -33,7 +35,8 @@ def process(
             help="Of one bag: OUT.mcap for one file, any other name for a bag folder. Of several: a folder.",
         ),
     ],
-    model: Annotated[Path | None, typer.Option(help="Bundle; without it, the shipped one.")] = None,
+    model: ModelOption = None,
+    offsets: OffsetsOption = None,
     workers: Annotated[
         int | None, typer.Option("-j", "--jobs", help="Bags at a time; without it, one for each core.")
     ] = None,
@@ -45,34 +48,41 @@ def process(
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace outputs that exist.")] = False,
     compare_copy: Annotated[
-        bool, typer.Option("--compare-copy", help="Also time loops that only read and rewrite the bags.")
+        bool,
+        typer.Option(
+            "--compare-copy", help="Also time a loop that only reads and rewrites the bags, for comparison."
+        ),
     ] = False,
     json: JsonOption = None,
 ) -> None:
-    """Copy bags with a corrected range behind each raw one; all other messages stay as they are."""
-    from uwb_mitigation.model.bundle import load_bundle
-    from uwb_mitigation.model.shipped import default_model_path
-    from uwb_mitigation.processing import planning, running
+    """Copy bags with a corrected range behind each raw one.
+
+    All other messages stay as they are.
+    """
+    from uwb_mitigation.offsets import read_offsets
+    from uwb_mitigation.processing import planning, pool
     from uwb_mitigation.processing.job import Job
 
     if workers is not None and workers < 1:
         raise ParameterError(f"jobs = {workers}", valid="1 or more")
+    bags = planning.plan(sources, output)
     # A model that does not load would fail every bag in the same way.
-    bundle = load_bundle(model or default_model_path())
+    bundle = bundle_for(model, bags[0].source)
+    known = read_offsets(offsets or "")
     jobs = []
-    for planned in planning.plan(sources, output):
+    for planned in bags:
         described = planned.alone or planned.output.suffix != ".mcap"
         # Absolute, since a worker of a cluster has a working directory of its own.
         source, place, path = planned.source.absolute(), planned.output.absolute(), bundle.path.absolute()
-        jobs.append(Job(source, place, path, force, described, compare_copy))
+        jobs.append(Job(source, place, path, force, described, compare_copy, known))
         if not planned.alone:
             _make_folder(place.parent)
 
     started = time.perf_counter()
     if scheduler is None:
-        events = running.run_here(jobs, min(workers or running.cores(), len(jobs)))
+        events = pool.run_here(jobs, min(workers or pool.cores(), len(jobs)))
     else:
-        events = running.run_on_dask(jobs, scheduler)
+        events = pool.run_on_dask(jobs, scheduler)
     outcomes = _follow(jobs, events)
     seconds = outcomes[0].seconds if len(jobs) == 1 else time.perf_counter() - started
     result = _result(outcomes, seconds, bundle.model_id)
@@ -93,7 +103,7 @@ def _make_folder(path: Path) -> None:
 
 def _follow(jobs: list[Job], events: Iterable[Event]) -> list[Outcome]:
     """Show the progress; return the outcomes in the order of the jobs."""
-    from uwb_mitigation.processing.running import Progress
+    from uwb_mitigation.processing.pool import Progress
 
     outcomes: dict[Job, Outcome] = {}
     with console.progress() as bar:
@@ -125,13 +135,10 @@ def _result(outcomes: list[Outcome], seconds: float, model_id: int) -> dict[str,
         "bags": [_bag(outcome) for outcome in outcomes],
     }
     # Bags that run side by side share the cores: rates of the copies are means over the bags' own times.
-    timed = [outcome for outcome in outcomes if outcome.copy_seconds and outcome.own_copy_seconds]
+    timed = [outcome for outcome in outcomes if outcome.copy_seconds]
     if timed:
         copied = sum(outcome.ranges for outcome in timed)
         result["copy_only_ranges_per_s"] = copied / sum(outcome.copy_seconds or 0.0 for outcome in timed)
-        result["own_copy_only_ranges_per_s"] = copied / sum(
-            outcome.own_copy_seconds or 0.0 for outcome in timed
-        )
     return result
 
 
@@ -165,8 +172,7 @@ def _show(outcomes: list[Outcome], result: dict[str, Any]) -> None:
     console.out.print(f"{result['ranges']} ranges, {result['ranges_per_s']:.0f} ranges/s", highlight=False)
     if "copy_only_ranges_per_s" in result:
         console.out.print(
-            f"only copied: {result['copy_only_ranges_per_s']:.0f} ranges/s by the mcap library, "
-            f"{result['own_copy_only_ranges_per_s']:.0f} by this package",
+            f"only copied by the mcap library: {result['copy_only_ranges_per_s']:.0f} ranges/s",
             highlight=False,
         )
     for outcome in outcomes:

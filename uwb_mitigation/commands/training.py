@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 import statistics
 from collections import defaultdict
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -16,15 +14,14 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from uwb_mitigation.commands import console
-from uwb_mitigation.commands.checks import check_output, needs_torch
+from uwb_mitigation.commands.checks import check_output, needs_torch, scaling_of
 from uwb_mitigation.commands.console import JsonOption
-from uwb_mitigation.errors import ModelError, ParameterError, UwbMitigationError
+from uwb_mitigation.errors import ParameterError, UwbMitigationError
+from uwb_mitigation.evaluation import paper
 
 if TYPE_CHECKING:
-    from uwb_mitigation.dataset import Dataset
-    from uwb_mitigation.model.bundle import Bundle
-    from uwb_mitigation.training.protocol import Parts
-    from uwb_mitigation.training.results import Protocol
+    from uwb_mitigation.evaluation.results import ExperimentResults
+    from uwb_mitigation.training.parts import Parts
     from uwb_mitigation.training.search import Trial
 
 DataOption = Annotated[
@@ -49,16 +46,20 @@ def protocol(
     networks: Annotated[
         str, typer.Option(help="Of remnet, remnet_k5, remnet_attention, mlp; with commas.")
     ] = "remnet,mlp",
-    windows: Annotated[str, typer.Option(help="Window lengths K, with commas.")] = "157,128,64,32,16,8",
-    seeds: Annotated[int, typer.Option(help="Networks of each kind.")] = 5,
-    epochs: Annotated[int, typer.Option(help="Passes over the data.")] = 30,
-    learning_rate: Annotated[float, typer.Option(help="Of Adam.")] = 3e-4,
+    windows: Annotated[str, typer.Option(help="Window lengths K, with commas.")] = ",".join(
+        map(str, paper.WINDOWS)
+    ),
+    seeds: Annotated[int, typer.Option(help="Networks of each kind.")] = paper.SEEDS,
+    epochs: Annotated[int, typer.Option(help="Passes over the data.")] = paper.EPOCHS,
+    learning_rate: Annotated[float, typer.Option(help="Of Adam.")] = paper.LEARNING_RATE,
     split: SplitOption = "auto",
     scaling: ScalingOption = "max",
     workers: WorkersOption = None,
     json: JsonOption = None,
 ) -> None:
-    """The paper's experiment: train every network at every K and seed, optimise, quantise, test.
+    """The paper's experiment: every network, K and seed, tested.
+
+    Each is trained, optimised, quantised and tested.
 
     Beside them stand the medians and the line in the received power, fitted on the same training part.
 
@@ -66,19 +67,17 @@ def protocol(
     """
     lengths = _lengths(windows)
     with needs_torch():
-        from uwb_mitigation.training import protocol as protocols
+        from uwb_mitigation.training import experiment
 
-    wanted = protocols.jobs([name.strip() for name in networks.split(",")], lengths, seeds)
-    options = replace(protocols.PAPER, epochs=epochs, learning_rate=learning_rate)
+    wanted = experiment.tasks([name.strip() for name in networks.split(",")], lengths, seeds)
+    options = replace(experiment.PAPER, epochs=epochs, learning_rate=learning_rate)
     if output.exists() and not output.is_dir():
         raise ParameterError("not a folder", where=str(output), valid="a folder, or a name for one")
-    dataset = _labelled(data, max(lengths), scaling)
-    train, test, name = _divide(dataset, split)
-    parts = protocols.Parts(_title(data), name, train, test)
-    with share_bar(f"{len(wanted)} networks") as update:
-        result = protocols.run(parts, output, wanted, options, _workers(workers), update)
-    _show_protocol(result)
-    console.write_json(json, asdict(result))
+    parts = _parts(data, max(lengths), scaling, split)
+    with console.share_bar(f"{len(wanted)} networks") as update:
+        result = experiment.run(parts, output, wanted, options, _workers(workers), update)
+    _show_experiment(result)
+    console.write_json(json, result.model_dump(mode="json"))
 
 
 def search(
@@ -90,14 +89,16 @@ def search(
     grid: Annotated[int, typer.Option(help="At most so many neighbours of the best of them.")] = 16,
     windows: Annotated[str, typer.Option(help="Window lengths K to draw from, with commas.")] = "157,64,32",
     epochs: Annotated[int, typer.Option(help="Passes over the data, each network.")] = 8,
-    learning_rate: Annotated[float, typer.Option(help="Of Adam.")] = 3e-4,
+    learning_rate: Annotated[float, typer.Option(help="Of Adam.")] = paper.LEARNING_RATE,
     seed: Annotated[int, typer.Option(help="Of the draw and of every network.")] = 0,
     split: SplitOption = "auto",
     scaling: ScalingOption = "max",
     workers: WorkersOption = None,
     json: JsonOption = None,
 ) -> None:
-    """Random search, then a grid, over N, k0, kn, F and K: MAE against multiply-accumulates.
+    """Search shapes of REMNet: error against operations.
+
+    Random search, then a grid, over N, k0, kn, F and K: MAE against multiply-accumulates.
 
     Networks are judged on a fifth of the training part's configurations; the test part has no say.
 
@@ -105,18 +106,16 @@ def search(
     """
     lengths = _lengths(windows)
     with needs_torch():
-        from uwb_mitigation.training import figures
+        from uwb_mitigation.training import plots
         from uwb_mitigation.training import search as searches
-        from uwb_mitigation.training.protocol import PAPER
+        from uwb_mitigation.training.experiment import PAPER
 
     options = replace(PAPER, epochs=epochs, learning_rate=learning_rate, seed=seed)
     _make_folder(output)
-    train, _, _ = _divide(_labelled(data, max(lengths), scaling), split)
-    train, validation, _ = _divide(train, "configurations", folds=5)
-    with share_bar("searching") as update:
+    train = _parts(data, max(lengths), scaling, split).train
+    with console.share_bar("searching") as update:
         trials = searches.search(
             train,
-            validation,
             output / "journal.jsonl",
             options,
             random=random,
@@ -127,7 +126,7 @@ def search(
         )
     best = searches.front(trials)
     _show_front(best, len(trials))
-    figures.draw_front(trials, output / "front.png")
+    plots.draw_front(trials, output / "front.png")
     console.write_json(
         json,
         {"trials": [_trial_json(trial) for trial in trials], "front": [_trial_json(trial) for trial in best]},
@@ -146,23 +145,19 @@ def train_lr_range(
     plot: Annotated[Path | None, typer.Option(metavar="PNG", help="Draw the loss against the rate.")] = None,
     json: JsonOption = None,
 ) -> None:
-    """The learning-rate range test of Smith (2017), on the training part."""
+    """The learning-rate range test of Smith (2017).
+
+    Runs on the training part of the split.
+    """
     with needs_torch():
-        from uwb_mitigation.training import figures
+        from uwb_mitigation.training import plots
+        from uwb_mitigation.training.experiment import PAPER
         from uwb_mitigation.training.learning_rate import range_test
-        from uwb_mitigation.training.protocol import PAPER
     from uwb_mitigation.model.architecture import Remnet
 
     shape = Remnet(samples)
-    train, _, _ = _divide(_labelled(data, samples, scaling), split)
-    done = 0
-    with share_bar("range test") as update:
-
-        def on_step() -> None:
-            nonlocal done
-            done += 1
-            update(done / steps)
-
+    train = _parts(data, samples, scaling, split).train
+    with console.step_bar("range test", steps) as on_step:
         result = range_test(
             shape,
             train.inputs,
@@ -179,7 +174,7 @@ def train_lr_range(
         highlight=False,
     )
     if plot is not None:
-        figures.draw_range_test(result, plot)
+        plots.draw_range_test(result, plot)
     console.write_json(json, asdict(result))
 
 
@@ -191,68 +186,36 @@ def prune(
     output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="Bundle to write.")],
     filters: Annotated[int, typer.Option(help="Filters F to keep.")] = 8,
     epochs: Annotated[int, typer.Option(help="Passes over the data to tune what is left.")] = 10,
-    learning_rate: Annotated[float, typer.Option(help="Of Adam.")] = 3e-4,
+    learning_rate: Annotated[float, typer.Option(help="Of Adam.")] = paper.LEARNING_RATE,
     seed: Annotated[int, typer.Option(help="Of the order and the dropout.")] = 0,
     split: SplitOption = "auto",
     json: JsonOption = None,
 ) -> None:
-    """Drop the weakest filters of a trained REMNet, and train what is left: a smaller float bundle.
+    """Drop the weakest filters of a REMNet, and train the rest.
+
+    Writes a smaller float bundle.
 
     Trains on the training part of the split, and tells the error on its test part.
 
     A bundle that was trained on another split or other data is refused: it may know what is tested.
     """
     with needs_torch():
-        from uwb_mitigation.training import protocol as protocols
-        from uwb_mitigation.training import pruning
-    from uwb_mitigation.evaluation.metrics import ErrorStatistics
-    from uwb_mitigation.model import floating, graph
-    from uwb_mitigation.model.bundle import load_bundle, save_bundle
+        from uwb_mitigation.training.experiment import PAPER
+        from uwb_mitigation.training.pruning import prune_bundle
+    from uwb_mitigation.model.bundle import load_bundle
 
     source = load_bundle(model)
-    if source.quantised:
-        raise ModelError("already quantised", where=str(model), valid="the float bundle it was made of")
     check_output(output)
-    weights = graph.float_weights(source.model, source.architecture)
-    smaller = pruning.prune(weights, filters)
-    dataset = _labelled(data, source.preprocessing.samples, source.preprocessing.scaling.value)
-    train, test, name = _divide(dataset, split)
-    parts = protocols.Parts(_title(data), name, train, test)
-    _check_trained_on(source, parts)
-    options = replace(protocols.PAPER, epochs=epochs, learning_rate=learning_rate, seed=seed)
-    done = 0
-    with share_bar("tuning") as update:
-
-        def on_epoch() -> None:
-            nonlocal done
-            done += 1
-            update(done / epochs)
-
-        tuned = pruning.prune_and_tune(weights, filters, train.inputs, train.error_m, options, on_epoch)
-    networks = {"before": weights, "pruned": smaller, "tuned": tuned}
-    left = {"raw": test.error_m} | {
-        row: test.error_m - floating.predict_m(network, test.inputs) for row, network in networks.items()
-    }
-    found = {row: ErrorStatistics.of(errors) for row, errors in left.items()}
-    card = protocols.describe(output.stem, tuned.architecture, parts, options)
-    training = {
-        **card.training,
-        "pruned": {
-            "name": source.name,
-            "from": f"{source.model_id:08x}",
-            "architecture": asdict(weights.architecture),
-            "recipe": source.card.training.get("recipe"),
-        },
-        "metrics_m": {
-            row: {key: round(value, 4) for key, value in asdict(found[of]).items()}
-            for row, of in (("raw", "raw"), ("float", "tuned"))
-        },
-    }
-    bundle = save_bundle(output, graph.float_model(tuned), replace(card, training=training))
+    preprocessing = source.preprocessing
+    parts = _parts(data, preprocessing.samples, preprocessing.scaling.value, split)
+    options = replace(PAPER, epochs=epochs, learning_rate=learning_rate, seed=seed)
+    with console.step_bar("tuning", epochs) as on_epoch:
+        pruned = prune_bundle(source, parts, filters, options, output, on_epoch)
+    after, mae = pruned.bundle.architecture, pruned.mae_m
     cost = {
-        "multiply_accumulates": tuned.architecture.multiply_accumulates,
-        "multiply_accumulates_before": weights.architecture.multiply_accumulates,
-        "parameters": tuned.architecture.parameters,
+        "multiply_accumulates": after.multiply_accumulates,
+        "multiply_accumulates_before": pruned.before.multiply_accumulates,
+        "parameters": after.parameters,
     }
     console.out.print(
         f"{output}: {filters} filters, {cost['parameters']} parameters, "
@@ -260,82 +223,23 @@ def prune(
         markup=False,
         highlight=False,
     )
-    mae = {row: found[row].mae for row in networks}
     console.out.print(
         f"test MAE {mae['before']:.4f} m before, {mae['pruned']:.4f} m pruned, {mae['tuned']:.4f} m tuned",
         highlight=False,
     )
-    console.write_json(json, {"model_id": bundle.model_id, "mae": mae, **cost})
+    console.write_json(json, {"model_id": pruned.bundle.model_id, "mae": dict(mae), **cost})
 
 
-def _check_trained_on(source: Bundle, parts: Parts) -> None:
-    """Refuse a bundle that may have been fitted to the test part."""
-    here = {
-        "data": parts.data,
-        "split": parts.split,
-        "measurements": len(parts.train),
-        "tested_on": len(parts.test),
-    }
-    trained = {key: source.card.training.get(key) for key in here}
-    if trained != here:
-        differ = "; ".join(
-            f"{key} {trained[key]}, not {here[key]}" for key in here if trained[key] != here[key]
-        )
-        raise ModelError(
-            f"trained on other data than the training part, which leaves nothing to test on: {differ}",
-            where=str(source.path),
-            valid="a bundle of `protocol`, with its --data and --split",
-        )
+def _parts(data: Path, samples: int, scaling: str, split: str) -> Parts:
+    """The recording's parts; tells what is left out."""
+    from uwb_mitigation.preprocessing import Preprocessing
+    from uwb_mitigation.training import parts
 
-
-@contextmanager
-def share_bar(name: str) -> Iterator[Callable[[float], None]]:
-    """A progress bar with remaining time; yields what takes the share that is done."""
-    with console.progress() as bar:
-        task = bar.add_task(name, total=1.0)
-        yield lambda share: bar.update(task, completed=share)
-
-
-def _labelled(data: Path, samples: int, scaling: str) -> Dataset:
-    """The recording as arrays; tells what is left out."""
-    from uwb_mitigation.dataset import build_dataset
-    from uwb_mitigation.preprocessing import Preprocessing, Scaling
-    from uwb_mitigation.sources.opening import open_recording
-
-    if scaling not in {kind.value for kind in Scaling}:
-        raise ParameterError(f"scaling {scaling!r}", valid=", ".join(kind.value for kind in Scaling))
-    with open_recording(data) as source:
-        dataset = build_dataset(source, Preprocessing(samples, Scaling(scaling)))
-    for reason, count in dataset.refused.items():
-        console.err.print(f"left out: {count} x {reason}", markup=False)
-    return dataset
-
-
-def _title(data: Path) -> str:
-    """The recording's name, with the word "simulated" where it is."""
-    from uwb_mitigation.sources.opening import open_recording
-
-    with open_recording(data) as source:
-        name = data.resolve().name
-        return f"{name} (simulated)" if source.simulated and "simulated" not in name else name
-
-
-def _divide(dataset: Dataset, split: str, folds: int = 4) -> tuple[Dataset, Dataset, str]:
-    """Training part, test part, and the split's name."""
-    from uwb_mitigation.evaluation import splits
-    from uwb_mitigation.sources.deepuwb import RoomSplit, has_rooms, split_rows
-
-    rooms = [room.value for room in RoomSplit]
-    if split == "auto":
-        split = RoomSplit.PAPER.value if has_rooms(dataset.configurations) else "configurations"
-    if split in rooms:
-        train, test = split_rows(dataset.configurations, RoomSplit(split))
-        return dataset.rows(train), dataset.rows(test), split
-    if split != "configurations":
-        raise ParameterError(f"split {split!r}", valid=", ".join(["auto", "configurations", *rooms]))
-    fold = splits.by_configuration(dataset.configurations, folds, seed=0)[0]
-    name = f"configurations: 1 of {folds} parts held out"
-    return dataset.rows(fold.train), dataset.rows(fold.test), name
+    preprocessing = Preprocessing(samples, scaling_of(scaling))
+    with console.reading() as on_record:
+        name, dataset = parts.load(data, preprocessing, on_record=on_record)
+    console.show_refused(dataset.refused)
+    return parts.divided(name, dataset, split)
 
 
 def _lengths(text: str) -> list[int]:
@@ -365,7 +269,7 @@ def _make_folder(folder: Path) -> None:
         raise UwbMitigationError(f"cannot be made: {error.strerror}", where=str(folder)) from error
 
 
-def _show_protocol(result: Protocol) -> None:
+def _show_experiment(result: ExperimentResults) -> None:
     groups = defaultdict(list)
     for model in result.models:
         groups[model.network, model.samples].append(model)
@@ -382,7 +286,7 @@ def _show_protocol(result: Protocol) -> None:
     if result.models:
         table.add_row("none", "", "", "", f"{result.models[0].mae_raw:.4f}")
     for baseline in result.baselines:
-        left = None if baseline.errors is None else baseline.errors["all"].mae
+        left = None if baseline.errors is None else baseline.errors.all.mae
         table.add_row(_BASELINES.get(baseline.name, baseline.name), "", "", "", _mean([left], ".4f"))
     for (network, samples), models in groups.items():
         forms = [

@@ -1,0 +1,131 @@
+"""`uwb-mitigation offset`: what two radios' antenna delays add to every range, from one known distance."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.table import Table
+
+from uwb_mitigation.commands import console
+from uwb_mitigation.commands.bundles import ModelOption, bundle_for
+from uwb_mitigation.commands.console import JsonOption
+from uwb_mitigation.errors import ParameterError
+
+if TYPE_CHECKING:
+    from uwb_mitigation.evaluation.radio_offsets import FoundOffset
+
+FARTHEST_M = 1000.0
+MOST_SHOWN = 40
+
+
+def offset(
+    bag: Annotated[Path, typer.Argument(metavar="BAG", help="Ranges in line of sight: a bag or logs.")],
+    distance: Annotated[
+        float | None, typer.Option(metavar="M", help="True distance between the antennas, m.")
+    ] = None,
+    truth: Annotated[
+        bool, typer.Option("--truth", help="Instead: take the true distances that the recording holds.")
+    ] = False,
+    anchor: Annotated[str | None, typer.Option(metavar="ID", help="Only ranges of this anchor.")] = None,
+    tag: Annotated[str | None, typer.Option(metavar="ID", help="Only ranges of this tag.")] = None,
+    model: ModelOption = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "-o", "--output", metavar="FILE", help="Write what --offsets and the nodes' `offsets` read."
+        ),
+    ] = None,
+    together: Annotated[
+        bool,
+        typer.Option(
+            "--together", help="Write one offset for all: where the same boards stood at several places."
+        ),
+    ] = False,
+    json: JsonOption = None,
+) -> None:
+    """Find what the radios' antenna delays add to every range.
+
+    Place tag and anchor at a known distance, two metres or more, with nothing between or beside them, and record some
+    hundred ranges. What does not look like line of sight is refused. More placements make the answer surer,
+    more ranges of one hardly.
+
+        uwb-mitigation offset los.mcap --distance 5.00 -o offsets.yaml
+        ros2 param set /mitigator offsets offsets.yaml
+    """
+    from uwb_mitigation.evaluation import radio_offsets
+    from uwb_mitigation.files import write_whole
+    from uwb_mitigation.mitigation import Mitigation
+    from uwb_mitigation.offsets import dump_offsets
+    from uwb_mitigation.sources.opening import open_recording
+
+    if (distance is None) == (not truth):
+        raise ParameterError("which distance", valid="one of --distance and --truth")
+    if distance is not None and not 0.0 < distance <= FARTHEST_M:
+        raise ParameterError(f"distance = {distance}", valid=f"above 0, at most {FARTHEST_M:g} m")
+    if output is not None and (output.is_dir() or not output.absolute().parent.is_dir()):
+        raise ParameterError(
+            "not a place for a file", where=str(output), valid="a file in a folder that exists"
+        )
+    anchor_id, tag_id = (
+        _identity(name, text) if text is not None else None
+        for name, text in (("anchor", anchor), ("tag", tag))
+    )
+    mitigation = Mitigation(bundle_for(model, bag))
+    with open_recording(bag) as source, console.reading() as on_record:
+        found = radio_offsets.find_offset(
+            mitigation, source, distance, tag_id=tag_id, anchor_id=anchor_id, on_record=on_record
+        )
+    _show(found)
+    if output is not None:
+        comment = (
+            f"Antenna delays, m, beside model {found.model_id:08x}, found by uwb-mitigation offset in {bag.name}.\n"
+            f"Standard deviation {found.sd_m:.3f} m."
+        )
+        write_whole(output, dump_offsets(found.offsets(together=together), comment), ParameterError)
+    console.write_json(json, found.as_json())
+
+
+def _identity(name: str, text: str) -> int:
+    try:
+        value = int(text, 0)
+    except ValueError:
+        value = -1
+    if not 0 <= value < 1 << 64:
+        raise ParameterError(
+            f"{name} = {text!r}", valid="a whole number of 64 bits, such as 3 or 0x1f"
+        ) from None
+    return value
+
+
+def _show(found: FoundOffset) -> None:
+    table = Table("anchor", "tag", "placement", "ranges", "offset m", "sd m", "gap dB", "predicted m")
+    for column in table.columns[3:]:
+        column.justify = "right"
+    for one in found.placements[:MOST_SHOWN]:
+        values = (one.offset_m, one.sd_m) if not one.refused else ()
+        table.add_row(
+            str(one.anchor_id),
+            str(one.tag_id),
+            one.placement,
+            str(one.ranges),
+            *(f"{value:.3f}" for value in values),
+            *("" for _ in range(2 - len(values))),
+            f"{one.power_gap_db:.1f}",
+            f"{one.predicted_m:.3f}",
+        )
+    console.out.print(table)
+    if len(found.placements) > MOST_SHOWN:
+        console.out.print(f"and {len(found.placements) - MOST_SHOWN} placements more")
+    refused = [one for one in found.placements if one.refused]
+    for one in refused[:MOST_SHOWN]:
+        console.err.print(
+            f"left out: anchor {one.anchor_id}, tag {one.tag_id} {one.placement}: {one.refused}", markup=False
+        )
+    if len(refused) > MOST_SHOWN:
+        console.err.print(f"left out: {len(refused) - MOST_SHOWN} placements more")
+    console.out.print(
+        f"offset {found.offset_m:.3f} m, standard deviation {found.sd_m:.3f} m, of {found.ranges} ranges, "
+        f"beside model {found.model_id:08x}"
+    )

@@ -1,0 +1,329 @@
+"""`uwb-mitigation track` and `survey`: where a recording's tags were, and where its anchors are."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from uwb_mitigation.commands import console
+from uwb_mitigation.commands.console import JsonOption
+from uwb_mitigation.errors import ParameterError, RecordingError
+
+if TYPE_CHECKING:
+    from uwb_mitigation.positioning.anchors import AnchorMap
+    from uwb_mitigation.positioning.start import Area, Height
+    from uwb_mitigation.positioning.survey import SurveyResult
+    from uwb_mitigation.positioning.track_errors import TrackErrors
+    from uwb_mitigation.processing.tracking import TagTracks
+    from uwb_mitigation.sources.recorded_ranges import RecordedRanges
+
+BagArgument = Annotated[
+    Path, typer.Argument(metavar="BAG", help="An MCAP bag with ranges, corrected or raw.")
+]
+AnchorsOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--anchors",
+        metavar="FILE",
+        help="Where the anchors are (docs/positioning.md shows how it looks); without it, BAG's own X.anchors.yaml.",
+    ),
+]
+HeightOption = Annotated[
+    float | None,
+    typer.Option(help="Height of the tag's antenna in the anchors' frame, m, where it stays the same."),
+]
+HeightSdOption = Annotated[float, typer.Option("--height-sd", help="How well that is known, m.")]
+AreaOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="X,Y,Z,X,Y,Z", help="Where tags can be: the lower and the upper corner of a box, m."
+    ),
+]
+OffsetOption = Annotated[
+    float,
+    typer.Option(
+        "--stamp-offset", help="What to add to the ranges' stamps, s: -0.2 where ranges lag by 0.2 s."
+    ),
+]
+AccelerationOption = Annotated[
+    float,
+    typer.Option(
+        help="How briskly tags change their speed, m/s^1.5: 1 of a robot or a person, 3 of a drone."
+    ),
+]
+
+
+def track(
+    bag: BagArgument,
+    output: Annotated[
+        Path,
+        typer.Option(
+            "-o", "--output", metavar="OUT", help="OUT.mcap for one file, any other name for a folder."
+        ),
+    ],
+    anchors: AnchorsOption = None,
+    tum: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Also write the smoothed track in TUM's format, as evo reads it."),
+    ] = None,
+    height: HeightOption = None,
+    height_sd: HeightSdOption = 0.1,
+    area: AreaOption = None,
+    stamp_offset: OffsetOption = 0.0,
+    acceleration: AccelerationOption = 1.0,
+    force: Annotated[bool, typer.Option("--force", help="Replace what exists.")] = False,
+    json: JsonOption = None,
+) -> None:
+    """Tell where the tags of a recording were: live, and smoothed looking ahead.
+
+    Corrected ranges are taken where the bag has them (`uwb-mitigation process`), raw ones otherwise. Where the
+    bag knows the truth, a table shows the errors of both, beside least squares on raw ranges.
+
+        uwb-mitigation data import LOS_A1 -o a1.mcap
+
+        uwb-mitigation track a1.mcap -o track.mcap --height 1.0 --stamp-offset=-0.2
+    """
+    from uwb_mitigation.bag.writer import BagWriter
+    from uwb_mitigation.files import write_whole
+    from uwb_mitigation.positioning.model import Model
+    from uwb_mitigation.processing.tracking import track_tag, tum_file, write_tracks
+    from uwb_mitigation.processing.tracking import tum as tum_text
+
+    model = Model(acceleration=acceleration)
+    place, box = height_of(height, height_sd), area_of(area)
+    known, recorded = _read(bag, anchors, stamp_offset)
+    if tum is not None and tum.exists() and not force:
+        raise ParameterError("exists already", where=str(tum), valid="--force replaces it")
+    tracks = []
+    origin = {"source": f"track of {bag.name}", "simulated": "false"}
+    with BagWriter(output, origin, force=force) as out, console.progress() as bar:
+        task = bar.add_task("tracking", total=len(recorded.tags))
+        for tag in recorded.tags:
+            bar.update(task, description=f"tracking tag {tag.tag_id}: {len(tag.ranges)} ranges")
+            tracks.append(track_tag(tag, known, model, place, box))
+            bar.advance(task)
+        write_tracks(out, tracks)
+    _show_tracks(tracks, known)
+    console.out.print(f"Wrote {out.counts.total()} messages to {out.file}.", markup=False, soft_wrap=True)
+    if tum is not None:
+        for one in tracks:
+            write_whole(tum_file(tum, one.recording.tag_id, len(tracks) > 1), tum_text(one.smoothed))
+    console.write_json(json, _result(tracks, recorded))
+
+
+def survey(
+    bag: BagArgument,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="FILE", help="The anchors file to write.")
+    ],
+    anchors: AnchorsOption = None,
+    off: Annotated[
+        float, typer.Option(help="How far the guesses in FILE may be off, m in each direction.")
+    ] = 1.0,
+    fixed: Annotated[
+        list[int] | None,
+        typer.Option("--fixed", metavar="ID", help="An anchor that stands where FILE says; may be repeated."),
+    ] = None,
+    height: HeightOption = None,
+    height_sd: HeightSdOption = 0.1,
+    area: AreaOption = None,
+    stamp_offset: OffsetOption = 0.0,
+    acceleration: AccelerationOption = 1.0,
+    force: Annotated[bool, typer.Option("--force", help="Replace FILE if it exists.")] = False,
+    json: JsonOption = None,
+) -> None:
+    """Find the anchors from rough guesses and the ranges of a tag driven past them.
+
+    Drive a loop of a minute or more that passes every anchor on more than one side. Anchors that are not where the
+    file says, and pairs that were swapped, are named. Ranges do not tell where the whole lies and how it is turned:
+    the guesses do, or anchors that are `--fixed`.
+    """
+    from uwb_mitigation.positioning.model import Model
+    from uwb_mitigation.positioning.survey import survey as find
+    from uwb_mitigation.sources.site import save_anchors
+
+    if not 0.0 < off <= 100.0:
+        raise ParameterError(f"off = {off}", valid="more than 0, 100 at most")
+    if output.exists() and not force:
+        raise ParameterError("exists already", where=str(output), valid="--force replaces it")
+    place, box = height_of(height, height_sd), area_of(area)
+    known, recorded = _read(bag, anchors, stamp_offset)
+    rows = []
+    for identity in fixed or []:
+        if identity not in known.index:
+            raise ParameterError(f"--fixed {identity}", valid=f"one of {', '.join(map(str, known.index))}")
+        rows.append(known.index[identity])
+    tag = max(recorded.tags, key=lambda one: len(one.ranges))
+    with console.progress() as bar:
+        bar.add_task(f"surveying from {len(tag.ranges)} ranges of tag {tag.tag_id}", total=None)
+        result = find(
+            known,
+            tag.ranges,
+            off_m=off,
+            fixed=frozenset(rows),
+            height=place,
+            area=box,
+            model=Model(acceleration=acceleration),
+        )
+    save_anchors(output, result.anchors, f"surveyed from {bag.name}, tag {tag.tag_id}", force=force)
+    _show_survey(result, known)
+    console.out.print(f"Wrote {len(known)} anchors to {output}.", markup=False, soft_wrap=True)
+    console.write_json(
+        json,
+        {
+            "output": str(output),
+            "anchors": [
+                {
+                    "id": anchor.id,
+                    "x": x,
+                    "y": y,
+                    "z": z,
+                    "sd": anchor.sd,
+                    "moved_m": float(result.moved_m[row]),
+                }
+                for row, anchor in enumerate(result.anchors.anchors)
+                for x, y, z in [anchor.position]
+            ],
+            "misplaced": [known.anchors[row].id for row in result.misplaced],
+            "swapped": [[known.anchors[row].id for row in pair] for pair in result.swapped],
+            "mean_loss": result.loss,
+            "explained": result.explained,
+        },
+    )
+
+
+def _read(bag: Path, anchors: Path | None, stamp_offset: float) -> tuple[AnchorMap, RecordedRanges]:
+    from uwb_mitigation.sources.recorded_ranges import read_ranges
+    from uwb_mitigation.sources.site import anchors_file, load_anchors
+
+    if not abs(stamp_offset) <= 3600.0:
+        raise ParameterError(f"stamp offset {stamp_offset}", valid="-3600 to 3600 s")
+    if not bag.exists():
+        raise RecordingError("no such bag", where=str(bag), valid="an MCAP bag")
+    known = load_anchors(anchors or anchors_file(bag))
+    with console.progress() as bar:
+        bar.add_task("reading", total=None)
+        recorded = read_ranges(bag, known, stamp_offset)
+    for identity, count in recorded.strangers.items():
+        _warn(f"{count} ranges of anchor {identity} left out: it is not in the anchors file")
+    for why, count in recorded.skipped.items():
+        _warn(f"left out: {count} x {why}")
+    return known, recorded
+
+
+def height_of(height: float | None, sd: float) -> Height | None:
+    """What --height and --height-sd say."""
+    from uwb_mitigation.positioning.start import Height
+
+    return None if height is None else Height(height, sd)
+
+
+def area_of(text: str | None) -> Area | None:
+    """What --area says."""
+    from uwb_mitigation.positioning.start import Area
+
+    if text is None:
+        return None
+    try:
+        x, y, z, x1, y1, z1 = (float(word) for word in text.split(","))
+    except ValueError as error:
+        raise ParameterError(f"area {text!r}", valid="six numbers: X,Y,Z,X,Y,Z") from error
+    return Area((x, y, z), (x1, y1, z1))
+
+
+def _show_tracks(tracks: list[TagTracks], anchors: AnchorMap) -> None:
+    from rich.table import Table
+
+    table = Table("tag", "track", title="Horizontal errors, m", title_justify="left")
+    for column in ("epochs", "RMSE", "median", "p95", "in ellipse", "NEES", "beyond"):
+        table.add_column(column, justify="right")
+    for one in tracks:
+        kind = "corrected" if one.recording.corrected else "raw"
+        rows = (
+            ("snapshots, raw", len(one.snapshot), one.snapshot_errors),
+            (f"live, {kind}", len(one.live), one.live_errors),
+            (f"smoothed, {kind}", len(one.smoothed), one.smoothed_errors),
+        )
+        for name, epochs, errors in rows:
+            table.add_row(str(one.recording.tag_id), name, *_cells(epochs, errors))
+    console.out.print(table)
+    console.out.print(
+        "In ellipse: truths inside the 95 % ellipses. NEES: 1 is honest, more overconfident. Beyond: errors beyond "
+        "the protection levels.",
+        style="dim",
+    )
+    for one in tracks:
+        if not one.live_errors.epochs:
+            console.out.print(f"tag {one.recording.tag_id}: no truth in the bag, so no errors")
+        for row in one.disagreeing:
+            _warn(f"anchor {anchors.anchors[row]} disagrees with the others: is it where the file says?")
+
+
+def _cells(epochs: int, errors: TrackErrors) -> tuple[str, ...]:
+    return (
+        str(errors.epochs or epochs),
+        _number(errors.rmse, "{:.3f}"),
+        _number(errors.median, "{:.3f}"),
+        _number(errors.p95, "{:.3f}"),
+        _number(errors.coverage95, "{:.1%}"),
+        _number(errors.nees_per_dof, "{:.2f}"),
+        _number(errors.exceeded, "{:.2%}"),
+    )
+
+
+def _show_survey(result: SurveyResult, guesses: AnchorMap) -> None:
+    from rich.table import Table
+
+    table = Table("anchor", title="Anchors, m", title_justify="left")
+    for column in ("x", "y", "z", "deviation", "off its guess"):
+        table.add_column(column, justify="right")
+    for row, anchor in enumerate(result.anchors.anchors):
+        cells = (*anchor.position, anchor.sd, float(result.moved_m[row]))
+        table.add_row(str(anchor), *(f"{value:.2f}" for value in cells))
+    console.out.print(table)
+    if not result.explained:
+        _warn(
+            f"these anchors do not explain the ranges (mean loss {result.loss:.1f}; 0.5 or less where they do): do not "
+            "trust them; begin with better guesses, and drive past every anchor on more than one side"
+        )
+    for a, b in result.swapped:
+        _warn(f"anchors {guesses.anchors[a]} and {guesses.anchors[b]} are swapped in the file")
+    for row in result.misplaced:
+        if not any(row in pair for pair in result.swapped):
+            _warn(f"anchor {guesses.anchors[row]} is {result.moved_m[row]:.2f} m from where the file says")
+
+
+def _result(tracks: list[TagTracks], recorded: RecordedRanges) -> dict[str, Any]:
+    from uwb_mitigation.processing.tracking import pooled
+
+    known = any(one.live_errors.epochs for one in tracks)
+    kinds = ("live", "smoothed", "snapshot")
+    hdops = [one.hdop for one in tracks if math.isfinite(one.hdop)]
+    return {
+        "tags": [
+            {"tag_id": one.recording.tag_id, "ranges": len(one.recording.ranges)}
+            | one.smoothed_errors.as_json()
+            | {"epochs": one.smoothed_errors.epochs or len(one.smoothed)}
+            | {kind: getattr(one, f"{kind}_errors").as_json() for kind in kinds if known}
+            for one in tracks
+        ],
+        **{
+            kind: pooled([getattr(one, f"{kind}_errors") for one in tracks]).as_json() if known else None
+            for kind in kinds
+        },
+        "hdop_median": max(hdops) if hdops else None,
+        "corrected": all(one.recording.corrected for one in tracks),
+        "unknown_anchors": {str(identity): count for identity, count in recorded.strangers.items()},
+        "skipped": dict(recorded.skipped),
+    }
+
+
+def _number(value: float, form: str) -> str:
+    return form.format(value) if math.isfinite(value) else "-"
+
+
+def _warn(text: str) -> None:
+    console.err.print(text, style="yellow", markup=False, highlight=False, soft_wrap=True)

@@ -1,0 +1,106 @@
+"""`uwb-mitigation train-universal`: the model for places and boards that it never saw."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from uwb_mitigation.commands import console, model_tables
+from uwb_mitigation.commands.checks import check_output, needs_torch, scaling_of
+from uwb_mitigation.commands.console import JsonOption
+from uwb_mitigation.errors import ParameterError
+
+if TYPE_CHECKING:
+    from uwb_mitigation.evaluation.metrics import ErrorStatistics
+
+MOST_BLOCKS = 10_000
+
+
+def train_universal(
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="int8 bundle to write.")],
+    seed: Annotated[int, typer.Option(help="Of the worlds and of the network.")] = 0,
+    samples: Annotated[int, typer.Option(help="Window length K.")] = 157,
+    scaling: Annotated[
+        str, typer.Option(help="preamble, or max for windows without preamble counts.")
+    ] = "preamble",
+    blocks: Annotated[int | None, typer.Option(help="Of 256 placements, to train on.")] = None,
+    float_output: Annotated[
+        Path | None, typer.Option("--float", metavar="FILE", help="Write the float bundle too.")
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(help="Processes that simulate; without it, one a processor.")
+    ] = None,
+    json: JsonOption = None,
+) -> None:
+    """Train a model for places that it never saw, in simulated buildings.
+
+    Simulates, trains, quantises, and grades the int8 network in a world that it was not trained on.
+
+    The same seed gives the same bundle on the same machine.
+
+        uwb-mitigation train-universal --seed 0 -o universal.onnx
+
+        uwb-mitigation train-universal --seed 0 --scaling max -o universal_amplitude.onnx
+    """
+    from uwb_mitigation.model import graph
+    from uwb_mitigation.model.bundle import save_bundle
+    from uwb_mitigation.preprocessing import Preprocessing
+
+    preprocessing = Preprocessing(samples, scaling_of(scaling))
+    for name, value, least, most in (
+        ("seed", seed, 0, 2**31),
+        ("blocks", blocks, 1, MOST_BLOCKS),
+        ("workers", workers, 1, 256),
+    ):
+        if value is not None and not least <= value <= most:
+            raise ParameterError(f"{name} = {value}", valid=f"{least} to {most}")
+    for path in (output, *([float_output] if float_output else [])):
+        check_output(path)
+    with needs_torch():
+        from uwb_mitigation.training import universal
+
+    plan = universal.Plan(seed=seed, samples=samples, scaling=preprocessing.scaling)
+    if blocks is not None:
+        plan = replace(plan, blocks=blocks)
+    with console.progress() as bar:
+        task = bar.add_task("simulating", total=1.0)
+        made = universal.train(
+            plan,
+            output.stem,
+            workers or os.cpu_count() or 1,
+            lambda share, what: bar.update(task, completed=share, description=what),
+        )
+    if float_output is not None:
+        save_bundle(float_output, graph.float_model(made.network), replace(made.card, name=float_output.stem))
+    bundle = save_bundle(output, graph.int8_model(made.integers), replace(made.card, quantised=True))
+    _show(made.held_out)
+    model_tables.show_bundle(bundle)
+    console.write_json(
+        json,
+        {
+            "model_id": bundle.model_id,
+            "seed": seed,
+            "simulated": True,
+            "held_out": {
+                row: {label: asdict(statistics) for label, statistics in by.items()}
+                for row, by in made.held_out.items()
+            },
+        },
+    )
+
+
+def _show(held_out: Mapping[str, Mapping[str, ErrorStatistics]]) -> None:
+    from rich.table import Table
+
+    table = Table(title="MAE in a simulated world that was held out, m", title_justify="left")
+    table.add_column("")
+    for label in held_out["raw"]:
+        table.add_column(label, justify="right")
+    for row, by in held_out.items():
+        table.add_row(row, *(f"{statistics.mae:.3f}" for statistics in by.values()))
+    console.out.print(table)

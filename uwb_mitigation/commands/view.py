@@ -1,0 +1,80 @@
+"""`uwb-mitigation view`: a recording on the viewer's page."""
+
+from __future__ import annotations
+
+import time
+import webbrowser
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from uwb_mitigation.commands import console
+from uwb_mitigation.commands.bundles import ModelOption, bundle_for
+
+if TYPE_CHECKING:
+    from uwb_mitigation.mitigation import Backend
+
+
+def view(
+    bag: Annotated[
+        Path,
+        typer.Argument(metavar="BAG", help="An MCAP bag or a rosbag2 folder with ranges, corrected or raw."),
+    ],
+    anchors: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Where the anchors are; without it, BAG's own X.anchors.yaml, else what BAG says of them.",
+        ),
+    ] = None,
+    model: ModelOption = None,
+    namespace: Annotated[
+        str | None, typer.Option(help="Of the ranges, as /board1; needed only where BAG has several.")
+    ] = None,
+    host: Annotated[str, typer.Option(help="Address to serve at; 0.0.0.0 = every one.")] = "localhost",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 = a free one.")] = 5006,
+    browser: Annotated[bool, typer.Option("--browser", help="Open the page in the browser.")] = False,
+) -> None:
+    """Look at a recording in the browser: map, ranges, CIRs.
+
+    The page of the node `viewer`, with a slider for the time; no ROS is needed. It plays at the recording's own pace,
+    until Ctrl-C here.
+
+        uwb-mitigation data simulate -o flat.mcap
+
+        uwb-mitigation view flat.mcap --browser
+    """
+    from threading import Lock
+
+    from uwb_mitigation.sources.site import anchors_file, load_anchors
+    from uwb_mitigation.viewer.feed import Feed
+    from uwb_mitigation.viewer.playback import BagPlayer
+    from uwb_mitigation.viewer.scene import Scene
+    from uwb_mitigation.viewer.server import ViewerServer
+    from uwb_mitigation.viewer.view import View
+
+    scene, lock = Scene(), Lock()
+    feed = Feed(scene, lock)
+    player = BagPlayer(bag, feed, lambda: _backend(model, bag), namespace)
+    own = anchors_file(bag)
+    if anchors is not None or own.is_file():
+        feed.anchors(load_anchors(anchors or own))
+    if player.corrects:
+        console.err.print(
+            "The bag holds raw ranges alone: they are corrected as they are shown.", style="yellow"
+        )
+    shown = View(scene, lock, title=bag.resolve().name, player=player)
+    with ViewerServer(shown, host, port) as server:
+        console.out.print(f"{server.url} shows {bag}; Ctrl-C ends it.", markup=False, soft_wrap=True)
+        player.play(True)
+        if browser:
+            webbrowser.open(server.url)
+        while True:
+            time.sleep(3600.0)
+
+
+def _backend(model: Path | None, bag: Path) -> Backend:
+    from uwb_mitigation.mitigation import Mitigation
+
+    return Mitigation(bundle_for(model, bag))
