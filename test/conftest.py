@@ -7,12 +7,27 @@ import os
 # Before numpy is loaded. Tests run side by side: threads that wait for each other only take time from the next test.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from browser import Browser, chromium
 from real_logs import Reading, read_once
 
+from uwb_mitigation.dw1000_model.air import Air
+
+# A suite that a script starts in the background ignores SIGINT, and so would all that tests start and interrupt.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
 REPOSITORY = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Browser]:
+    """One for all tests of a worker: it takes seconds to come up."""
+    with chromium() as window:
+        yield window
 
 
 @pytest.fixture(scope="session")
@@ -29,3 +44,10 @@ def apartment() -> Path:
 def apartment_reading(apartment: Path, tmp_path_factory: pytest.TempPathFactory) -> Reading:
     """All exchanges of the real logs, and what was odd."""
     return read_once(apartment, tmp_path_factory)
+
+
+@pytest.fixture
+def air() -> Iterator[Air]:
+    """Where a test puts modelled chips; it needs a C compiler."""
+    with Air(1) as air:
+        yield air

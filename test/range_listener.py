@@ -1,6 +1,6 @@
 """A subscriber that knows only the ROS API: prints the corrected ranges it receives as JSON lines.
 
-range_listener.py COUNT    ends after COUNT corrected ranges
+range_listener.py COUNT    ends after COUNT raw and as many corrected ranges; those of tag 0 only show that it is connected
 """
 
 import json
@@ -18,7 +18,7 @@ def main() -> None:
     seen = {"raw": 0, "corrected": 0}
 
     def note(kind, message):
-        seen[kind] += 1
+        seen[kind] += message.tag_id != 0
         stamp = message.header.stamp
         line = {
             "kind": kind,

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import fcntl
+import itertools
 import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import rclpy
@@ -22,7 +25,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 
-TIMEOUT_S = 30.0
+TIMEOUT_S = 90.0
 
 # For this process and for all that it starts; read when messages are loaded and when a context is made.
 os.environ |= {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_PYTHON_CHECK_FIELDS": "1"}
@@ -88,8 +91,8 @@ class Ros:
     def start(self, node: str, *parameters: str, arguments: tuple[str, ...] = ()) -> Process:
         """Start one of the package's nodes as its executable does."""
         given = [word for parameter in parameters for word in ("-p", parameter)]
-        code = f"from uwb_mitigation.nodes.entry import {node}; {node}()"
-        return self.run([sys.executable, "-c", code, "--ros-args", *given, *arguments])
+        command = [sys.executable, "-m", "uwb_mitigation.entry", node]
+        return self.run([*command, "--ros-args", *given, *arguments])
 
     def run(self, command: list[str]) -> Process:
         process = Process(command, self.domain, self._folder / f"process_{len(self._processes)}.log")
@@ -162,11 +165,28 @@ class Ros:
 
 @contextmanager
 def domain(folder: Path) -> Iterator[Ros]:
-    """A domain that no other test of this run, and hopefully nobody else, uses."""
-    worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
-    domain.used = getattr(domain, "used", os.getpid()) + 1  # type: ignore[attr-defined]
-    ros = Ros(101 + (domain.used * 8 + worker) % 130, folder)  # type: ignore[attr-defined]
-    try:
-        yield ros
-    finally:
-        ros.close()
+    """A domain that no other test on this machine uses meanwhile."""
+    with _reserved() as number:
+        ros = Ros(number, folder)
+        try:
+            yield ros
+        finally:
+            ros.close()
+
+
+_counter = itertools.count(os.getpid())
+
+
+@contextmanager
+def _reserved() -> Iterator[int]:
+    """The number of a domain, held by a lock: neither another worker of this run has it, nor another run."""
+    for count in _counter:
+        number = 101 + count % 130
+        with ExitStack() as stack:
+            try:
+                place = Path(tempfile.gettempdir(), f"uwb_mitigation_domain_{number}")
+                fcntl.flock(stack.enter_context(place.open("a")), fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:  # taken, or another user's
+                continue
+            yield number
+            return

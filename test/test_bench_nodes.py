@@ -14,14 +14,15 @@ pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 from ros_harness import domain
 from uwb_mitigation_msgs.msg import RangeCorrected
 
+from uwb_mitigation.benches import nodes, viewer, vitals
+from uwb_mitigation.benches.nodes import RANGES, RATES_HZ, Figures, Latency, Subject, missing_between
 from uwb_mitigation.commands.bench_nodes import _as_json, ratios_of
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.measurement import Status
-from uwb_mitigation.mitigation import Mitigation
+from uwb_mitigation.mitigation import Mitigation, correct_batch
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.shipped import default_model_path
-from uwb_mitigation.nodes import bench_nodes, topics, vitals
-from uwb_mitigation.nodes.bench_nodes import RANGES, RATES_HZ, Figures, Latency, Subject, missing_between
+from uwb_mitigation.nodes import topics
 from uwb_mitigation.sources.opening import open_recording
 
 pytestmark = pytest.mark.ros
@@ -43,13 +44,13 @@ def test_ranges_that_are_missing_are_counted_across_the_bags_end():
 
 
 def test_the_benchs_ranges_are_ones_that_the_model_corrects(tmp_path: Path):
-    bench_nodes.write_bag(tmp_path / "ranges.mcap")
+    nodes.write_bag(tmp_path / "ranges.mcap")
     mitigation = Mitigation(load_bundle(default_model_path()))
     with open_recording(tmp_path / "ranges.mcap") as source:
         measurements = [record.measurement for record in source]
     assert [m.sequence for m in measurements] == list(range(RANGES))
     assert {len(m.cir) for m in measurements} == {157}
-    statuses = [result.status for result in mitigation.correct_batch(measurements[:500])]
+    statuses = [result.status for result in correct_batch(mitigation, measurements[:500])]
     assert statuses.count(Status.OK) > 450
 
 
@@ -76,7 +77,7 @@ def test_the_result_has_the_documented_keys():
 
 
 def test_a_subject_is_measured_at_a_rate_it_can_keep(own_domain: None):
-    with bench_nodes.open_bench() as bench:
+    with nodes.open_bench() as bench:
         subject = Subject(bench, "pipeline", RangeCorrected, topics.RANGE_CORRECTED, "pipeline")
         trial = subject.trial(200.0, 1.0)
         assert trial.lost == 0
@@ -89,9 +90,25 @@ def test_a_subject_is_measured_at_a_rate_it_can_keep(own_domain: None):
         subject.processes[0].kill()
         subject.processes[0].wait()
         with pytest.raises(UwbMitigationError, match="has ended"):
-            vitals.memory_kb(pid)
+            vitals.look(pid)
         with pytest.raises(UwbMitigationError, match="driver does not answer"):
             subject.play(100.0)
+
+
+def test_the_viewers_costs_are_measured(own_domain: None, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(viewer, "PAGES", (0, 1))
+    monkeypatch.setattr(viewer, "_SETTLE_S", 1.0)
+    monkeypatch.setattr(viewer, "_SLICES", 1)
+    monkeypatch.setattr(Subject, "search_rate", lambda self: self.figures.rates_hz.append(1000.0))
+    told: list[float] = []
+    costs = viewer.measure(2, 2.0, lambda text, share: told.append(share))
+    assert list(costs.core_share) == [0, 1]
+    assert 0.0 <= costs.core_share[0] < costs.core_share[1], "an open page is drawn"
+    assert (costs.alone_hz, costs.viewed_hz, costs.rate_ratio) == ([1000.0] * 2, [1000.0] * 2, 1.0)
+    assert costs.alone_us > 0.0
+    assert costs.viewed_us > 0.0
+    assert told == sorted(told)
+    assert told[-1] < 1.0
 
 
 def test_a_soak_tells_what_the_processes_took(own_domain: None, tmp_path: Path):

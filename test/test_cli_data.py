@@ -10,12 +10,11 @@ import pytest
 from command_line import run, start
 from real_logs import Reading
 
-from uwb_mitigation.bag.container import survey
+from uwb_mitigation.bag.index import index_of
 from uwb_mitigation.bag.reader import BagReader
 from uwb_mitigation.bag.topics import RANGE_RAW, RANGE_TRUTH
 from uwb_mitigation.bag.writer import BagWriter
-from uwb_mitigation.measurement import Cir, RangeMeasurement, Truth
-from uwb_mitigation.sources.source import Record
+from uwb_mitigation.measurement import Cir, RangeMeasurement, Record, Truth
 
 
 def write_bag(path: Path, count: int = 6) -> Path:
@@ -73,7 +72,7 @@ def test_a_bag_can_be_replaced_by_an_import_of_itself(tmp_path: Path) -> None:
 def test_a_damaged_bag_is_shown_as_far_as_it_goes_and_exits_1(tmp_path: Path) -> None:
     path = write_bag(tmp_path / "bag.mcap")
     with path.open("rb") as stream:
-        end = survey(stream).spans[0].end
+        end = index_of(stream).spans[0].end
     path.write_bytes(path.read_bytes()[:end] + b"\x06\xff\xff\xff")
     done = run("data", "info", "bag.mcap", "--json", "info.json", folder=tmp_path)
     assert done.returncode == 1
@@ -114,7 +113,18 @@ def test_all_apartment_logs_become_one_bag_that_rosbags_agrees_with(
 
     from uwb_mitigation.bag import schemas
 
-    done = run("data", "import", apartment, "-o", "apartment.mcap", "--json", "import.json", folder=tmp_path)
+    done = run(
+        "data",
+        "import",
+        apartment,
+        "-o",
+        "apartment.mcap",
+        "--longest-pause",
+        "inf",
+        "--json",
+        "import.json",
+        folder=tmp_path,
+    )
     assert done.returncode == 0, done.stderr
     result = json.loads((tmp_path / "import.json").read_text())
     assert result["pairs"] == 28
@@ -134,3 +144,29 @@ def test_all_apartment_logs_become_one_bag_that_rosbags_agrees_with(
             assert (message.sequence, stamp_ns) == (measurement.sequence, measurement.stamp_ns)
             assert message.range == np.float32(measurement.range_m)
             assert np.array_equal(message.cir.samples, measurement.cir.samples)
+
+
+def test_import_cuts_pauses_unless_told_not_to_and_says_so(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "in.mcap", {"source": "a test"}) as bag:
+        for stamp_ns in (10**18, 10**18 + 10**12):
+            bag.write(Record(RangeMeasurement(stamp_ns, 5, 2, 0, 0, 4.5, Cir(np.zeros(2, np.int16)))))
+
+    def span_s(*options: str) -> float:
+        done = run("data", "import", "in.mcap", "-o", "out.mcap", "--force", *options, folder=tmp_path)
+        assert done.returncode == 0, done.stderr
+        assert ("Cut 1 pauses to 5 s each, 995 s in all" in done.stdout) is not bool(options)
+        first, last = BagReader(tmp_path / "out.mcap").messages()
+        assert BagReader(tmp_path / "out.mcap").metadata["uwb_mitigation"]["simulated"] == "unknown"
+        return (last.log_time_ns - first.log_time_ns) / 1e9
+
+    assert span_s() == 5.0
+    assert span_s("--longest-pause", "inf") == 1000.0
+    assert "unknown whether" in run("data", "info", "out.mcap", folder=tmp_path).stdout
+
+
+def test_a_simulated_bag_bears_a_date_and_can_be_played(tmp_path: Path) -> None:
+    done = run("data", "simulate", "--like", "deepuwb", "--ranges", "100", "-o", "sim.mcap", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    times = [message.log_time_ns for message in BagReader(tmp_path / "sim.mcap").messages([RANGE_RAW])]
+    assert times[0] > 1_700_000_000 * 10**9
+    assert max(np.diff(times)) <= 5 * 10**9

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import ast
 import os
+import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -19,10 +21,12 @@ import pytest
 import yaml
 from conftest import REPOSITORY
 
+from uwb_mitigation import installation
+
 NAME = "uwb_mitigation"
 MESSAGES = "uwb_mitigation_msgs"
-EXECUTABLES = {"driver", "mitigator", "pipeline", "monitor", "uwb-mitigation"}
-NOT_ON_PYPI = {"launch", "launch_ros"}
+EXECUTABLES = set(re.findall(r'"([\w-]+) = uwb_mitigation\.entry:', (REPOSITORY / "setup.py").read_text()))
+NOT_ON_PYPI = {"launch", "launch_ros", "tf2_msgs"}
 """ROS packages that no index of a machine without ROS lists."""
 
 
@@ -52,7 +56,7 @@ def files_below(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-@pytest.mark.parametrize("folder", ["launch", "params", "models", "udev"])
+@pytest.mark.parametrize("folder", ["launch", "params", "models", "udev", "rviz", "foxglove"])
 def test_shared_files_are_those_of_the_sources(share: Path, folder: str):
     assert files_below(share / folder) == {
         name: data for name, data in files_below(REPOSITORY / folder).items() if "__pycache__" not in name
@@ -60,13 +64,27 @@ def test_shared_files_are_those_of_the_sources(share: Path, folder: str):
 
 
 def test_the_firmware_that_a_computer_compiles_is_shared(share: Path):
-    library = [*(REPOSITORY / "firmware" / "src").glob("*.[ch]")]
-    assert files_below(share / "firmware") == {f"src/{path.name}": path.read_bytes() for path in library}
+    library = [
+        path
+        for part in ("src", "host", "dw1000_model")
+        for path in (REPOSITORY / "firmware" / part).glob("*.[ch]")
+    ]
+    expected = {f"{path.parent.name}/{path.name}": path.read_bytes() for path in library}
+    assert files_below(share / "firmware") == expected
 
 
 def test_nothing_else_is_shared(share: Path):
     ours = {path.name for path in share.iterdir() if not path.name.startswith(("package.", "local_setup."))}
-    assert ours - {"hook", "colcon-core"} == {"launch", "params", "models", "udev", "firmware"}
+    assert ours - {"hook", "colcon-core"} == {
+        "launch",
+        "params",
+        "models",
+        "udev",
+        "rviz",
+        "foxglove",
+        "firmware",
+        "requirements",
+    }
     assert (share / "package.xml").read_bytes() == (REPOSITORY / "package.xml").read_bytes()
     for path in (share / "launch").iterdir():
         assert path.name.endswith(".launch.py"), "ros2 launch completes no other names"
@@ -80,6 +98,13 @@ def test_the_executables_are_where_ros2_run_looks(prefix: Path):
     for path in found.values():
         assert os.access(path, os.X_OK)
         assert path.read_text().startswith("#!")
+
+
+def test_the_command_is_in_the_path_of_a_sourced_workspace(prefix: Path):
+    place = shutil.which("uwb-mitigation", path=f"{prefix / 'bin'}")
+    assert place is not None
+    done = subprocess.run([place, "--version"], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def installed_environment() -> dict[str, str]:
@@ -106,14 +131,15 @@ def wait_until_said(node: subprocess.Popen[bytes], log: Path, words: str) -> Non
 def test_a_node_starts_where_it_is_installed_and_ends_on_ctrl_c(
     prefix: Path, tmp_path: Path, name: str, parameter: str, words: str
 ):
-    log = tmp_path / "said"
+    start_and_end([prefix / "lib" / NAME / name, "--ros-args", "-p", parameter], words, tmp_path)
+
+
+def start_and_end(command: list[str | Path], words: str, folder: Path) -> None:
+    """Start a node in `folder`, wait until it says `words`, and end it by Ctrl-C."""
+    log = folder / "said"
     with log.open("wb") as file:
         node = subprocess.Popen(
-            [prefix / "lib" / NAME / name, "--ros-args", "-p", parameter],
-            env=installed_environment(),
-            cwd=tmp_path,
-            stdout=file,
-            stderr=subprocess.STDOUT,
+            command, env=installed_environment(), cwd=folder, stdout=file, stderr=subprocess.STDOUT
         )
     try:
         wait_until_said(node, log, words)
@@ -151,6 +177,94 @@ def test_the_messages_are_installed_as_an_interface_package():
 
 
 # What follows holds of the sources, too, and needs no workspace.
+
+
+def test_a_colcon_build_that_does_not_know_of_the_messages_names_the_command_that_does(tmp_path: Path):
+    environment = os.environ | {"COLCON": "1", "AMENT_PREFIX_PATH": str(tmp_path)}
+    command = [sys.executable, "setup.py", "-q", "build", "-b", str(tmp_path / "build")]
+    refused = subprocess.run(
+        command, cwd=REPOSITORY, env=environment, capture_output=True, text=True, check=False
+    )
+    assert refused.returncode == 1
+    (line,) = refused.stderr.splitlines()[-1:]
+    told, _, build = line.partition("; run: ")
+    assert told == "uwb_mitigation_msgs is missing"
+    assert shlex.split(build) == ["colcon", "build", "--base-paths", ".", str(REPOSITORY / "msg_defs")]
+    manifest = tmp_path / "share" / MESSAGES / "package.xml"
+    manifest.parent.mkdir(parents=True)
+    manifest.touch()
+    subprocess.run(command, cwd=REPOSITORY, env=environment, check=True, capture_output=True)
+
+
+@pytest.mark.skipif(shutil.which("cmake") is None, reason="no CMake: apt install cmake")
+@pytest.mark.parametrize("name", ["jürgen", "it's"])
+def test_a_path_that_the_macros_of_ros_cannot_take_is_refused_in_words(tmp_path: Path, name: str):
+    command = ["cmake", "-S", str(REPOSITORY / "msg_defs"), "-B", str(tmp_path / name)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode != 0
+    assert "colcon build --build-base /tmp/build --install-base /tmp/install" in " ".join(done.stderr.split())
+
+
+def without(absent: Iterable[str], name: str) -> list[str]:
+    """The command that runs an executable where some libraries are not installed."""
+    code = (
+        f"import sys; sys.path.insert(0, {str(REPOSITORY)!r})\n"
+        f"sys.modules.update(dict.fromkeys({sorted(absent)!r}))\n"
+        f"from uwb_mitigation import entry; entry.{name}()"
+    )
+    return [sys.executable, "-c", code]
+
+
+@pytest.mark.parametrize(
+    ("name", "needed", "words"),
+    [
+        ("driver", {"pyyaml", "cobs", "pyserial"}, "replaying"),
+        ("mitigator", {"pyyaml", "onnxruntime"}, "correcting with model"),
+    ],
+)
+def test_a_node_needs_little_to_run(tmp_path: Path, name: str, needed: set[str], words: str):
+    pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
+    needless = installation.LIBRARIES.keys() - needed - {"numpy"}
+    absent = {installation.LIBRARIES[library].module.partition(".")[0] for library in needless}
+    options = ["--ros-args", "-p", "source:=simulated"] if name == "driver" else []
+    start_and_end([*without(absent, name), *options], words, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "absent", "told"),
+    [
+        ("mitigator", "onnxruntime", "error: onnxruntime is not installed (run uwb-mitigation doctor)"),
+        ("mitigator", "yaml", "error: pyyaml is not installed (run uwb-mitigation doctor)"),
+        ("driver", "serial", "error: pyserial is not installed (run uwb-mitigation doctor)"),
+        ("monitor", "rich", "error: rich is not installed (run uwb-mitigation doctor)"),
+        ("mitigator", "rclpy", "error: ROS 2 is not set up: there is no rclpy"),
+        ("mitigator", "uwb_mitigation_msgs", "error: ROS 2 is not set up: there is no uwb_mitigation_msgs"),
+    ],
+)
+def test_what_an_executable_misses_is_one_line(tmp_path: Path, name: str, absent: str, told: str):
+    command = without([absent], name)
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 1
+    (line,) = done.stderr.splitlines()
+    assert line.startswith(told)
+
+
+def test_a_driver_that_misses_what_its_source_needs_says_so_in_one_line(tmp_path: Path):
+    pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
+    options = ["--ros-args", "-p", "source:=mcap", "-p", "path:=absent.mcap"]
+    command = [*without(["mcap"], "driver"), *options]
+    done = subprocess.run(
+        command,
+        env=installed_environment(),
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    assert done.returncode == 1
+    assert "mcap is not installed (run uwb-mitigation doctor)" in done.stderr
+    assert "Traceback" not in done.stderr
 
 
 CORRECT_WITH_THE_FIRMWARE = """
@@ -197,10 +311,11 @@ def test_the_manifest_is_valid(folder: str):
     )
 
 
-def imported(paths: Iterable[Path]) -> Iterator[str]:
-    """First names of the modules that files import."""
+def imported(paths: Iterable[Path], at_start: bool = False) -> Iterator[str]:
+    """First names of the modules that files import; `at_start`: without a condition, and not in a function."""
     for path in paths:
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        for node in tree.body if at_start else ast.walk(tree):
             if isinstance(node, ast.Import):
                 yield from (alias.name.partition(".")[0] for alias in node.names)
             elif isinstance(node, ast.ImportFrom) and node.module:
@@ -217,9 +332,51 @@ def test_every_ros_package_that_is_imported_is_declared_and_no_other():
     ros = {*indexed, MESSAGES, *NOT_ON_PYPI} - {NAME}
     sources = [*(REPOSITORY / NAME).rglob("*.py"), *(REPOSITORY / "launch").glob("*.py")]
     used = set(imported(sources)) & ros
-    assert used == {name for name in declared if not name.startswith("python3-")}
+    assert used == {name for name in declared if not name.startswith(("python-", "python3-"))}
     tested = set(imported((REPOSITORY / "test").glob("*.py"))) & ros
     assert tested <= declared | {entry.name for entry in manifest.test_depends}
+
+
+# Where a rosdep key is not `python3-` and the name of the distribution; None: there is none, or it is too old.
+KEYS = {
+    "bokeh": "python3-bokeh-pip",
+    "cobs": "python-cobs-pip",
+    "onnxruntime": "python3-onnxruntime-pip",
+    "pyserial": "python3-serial",
+    "pyyaml": "python3-yaml",
+    "rosbags": "python3-rosbags-pip",
+    "lz4": None,
+    "mcap": None,
+    "onnx": None,
+    "pooch": None,
+    "zstandard": None,
+}
+
+
+def machine_requirements() -> set[str]:
+    lines = (REPOSITORY / "requirements" / "ros_machine.txt").read_text().splitlines()
+    return {line.partition(">")[0] for line in lines if line and not line.startswith(("#", "-"))}
+
+
+@pytest.mark.parametrize("library", installation.LIBRARIES)
+def test_every_library_has_a_rosdep_key_in_the_manifest_or_stands_in_the_requirements_of_a_ros_machine(
+    library: str,
+):
+    package = pytest.importorskip("catkin_pkg.package", reason="run make setup-training")
+    declared = {entry.name for entry in package.parse_package(str(REPOSITORY)).exec_depends}
+    key = KEYS.get(library, f"python3-{library}")
+    assert key in declared or library in machine_requirements()
+
+
+def test_every_library_that_tests_import_is_declared():
+    package = pytest.importorskip("catkin_pkg.package", reason="run make setup-training")
+    manifest = package.parse_package(str(REPOSITORY))
+    declared = {entry.name for entry in (*manifest.exec_depends, *manifest.test_depends)}
+    tests = [*(REPOSITORY / "test").glob("*.py")]
+    ours = {*(path.stem for path in tests), NAME, "generated"}
+    used = set(imported(tests, at_start=True)) - ours - set(sys.stdlib_module_names)
+    keys = {KEYS.get(name, f"python3-{name}") for name in used - declared - machine_requirements()}
+    assert keys <= declared | {"python3-serial", "python3-yaml"}
 
 
 def test_every_interface_that_the_messages_use_is_declared():

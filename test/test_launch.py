@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import runpy
 import sys
+from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
 import pytest
-import yaml
 from conftest import REPOSITORY
 
 LAUNCH = REPOSITORY / "launch"
@@ -36,10 +36,6 @@ def generate(monkeypatch: pytest.MonkeyPatch):
             "DeclareLaunchArgument": record("argument"),
             "OpaqueFunction": record("function"),
         },
-        "launch.conditions": {
-            "IfCondition": lambda value: ("if", value.name),
-            "UnlessCondition": lambda value: ("unless", value.name),
-        },
         "launch.substitutions": {
             "LaunchConfiguration": Configuration,
             "PathJoinSubstitution": lambda parts: parts,
@@ -55,48 +51,128 @@ def generate(monkeypatch: pytest.MonkeyPatch):
     return lambda file: runpy.run_path(str(LAUNCH / file))["generate_launch_description"]()
 
 
-def test_the_launch_file_starts_both_nodes_with_their_parameter_files(generate):
-    entities = generate("uwb.launch.py")
-    nodes = [entity for entity in entities if entity.kind == "node"]
-    assert [(node.executable, node.condition) for node in nodes] == [
-        ("driver", ("unless", "one_process")),
-        ("mitigator", ("unless", "one_process")),
-        ("pipeline", ("if", "one_process")),
-    ]
+def described(generate, file: str) -> tuple[dict, object]:
+    """The arguments that a launch file declares, and what makes its nodes of them."""
+    entities = generate(file)
+    (function,) = [entity for entity in entities if entity.kind == "function"]
     arguments = {entity.values[0]: entity for entity in entities if entity.kind == "argument"}
-    assert set(arguments) == {"namespace", "one_process", "driver_params", "mitigator_params"}
-    for name in ("driver", "mitigator"):
-        assert arguments[f"{name}_params"].default_value == [
-            ["share/uwb_mitigation", "params"],
-            f"{name}.yaml",
-        ]
-        assert "/**" in yaml.safe_load((REPOSITORY / "params" / f"{name}.yaml").read_text())
+    assert all(argument.description.endswith(".") for argument in arguments.values()), "for --show-args"
+    return arguments, function.function
 
 
-def boards(generate, text: str, mode: str = "host"):
-    (function,) = [entity for entity in generate("boards.launch.py") if entity.kind == "function"]
-    return function.function({"boards": text, "mode": mode})
+def launch(generate, file: str, **said: str) -> list:
+    """The nodes that a launch file starts when it is told so."""
+    arguments, nodes_of = described(generate, file)
+    assert set(said) <= set(arguments)
+    context = {
+        name: str(REPOSITORY / "params" / f"{name.removesuffix('_params')}.yaml") for name in arguments
+    }
+    context |= {
+        name: argument.default_value
+        for name, argument in arguments.items()
+        if isinstance(getattr(argument, "default_value", None), str)
+    }
+    return nodes_of(context | said)
+
+
+def settings(node) -> dict[str, object]:
+    """What a node is given beside its file."""
+    return {
+        name: value for group in node.parameters if isinstance(group, dict) for name, value in group.items()
+    }
+
+
+def test_both_nodes_start_with_what_is_said_and_come_back(generate):
+    said = {"source": "serial", "port": "/dev/ttyACM0", "model": "mine.onnx", "namespace": "left"}
+    driver, mitigator = launch(generate, "uwb.launch.py", **said, log_level="debug", use_sim_time="True")
+    assert (driver.executable, mitigator.executable) == ("driver", "mitigator")
+    assert settings(driver) == {"source": "serial", "port": "/dev/ttyACM0", "use_sim_time": True}
+    assert settings(mitigator) == {"model": "mine.onnx", "use_sim_time": True}
+    for node in (driver, mitigator):
+        assert (node.namespace, node.respawn, node.ros_arguments) == ("left", True, ["--log-level", "debug"])
+        assert node.parameters[0] == str(REPOSITORY / "params" / f"{node.executable}.yaml")
+    assert not any(node.respawn for node in launch(generate, "uwb.launch.py", **said, respawn="false"))
+
+
+def test_one_process_takes_what_both_take(generate):
+    (pipeline,) = launch(
+        generate, "uwb.launch.py", source="serial", port="/dev/x", model="m.onnx", one_process="true"
+    )
+    assert (pipeline.executable, pipeline.name, pipeline.respawn) == ("pipeline", None, True)
+    assert settings(pipeline) == {
+        "source": "serial",
+        "port": "/dev/x",
+        "model": "m.onnx",
+        "use_sim_time": False,
+    }
+    assert [Path(file).name for file in pipeline.parameters[:2]] == ["driver.yaml", "mitigator.yaml"]
+
+
+def test_a_locator_starts_where_it_is_asked_for(generate):
+    *_, locator = launch(generate, "uwb.launch.py", source="simulated", locate="true", anchors="a.yaml")
+    assert (locator.executable, locator.respawn) == ("locator", True)
+    assert settings(locator) == {"anchors": "a.yaml", "use_sim_time": False}
+
+
+def test_a_viewer_starts_where_it_is_asked_for(generate):
+    said = {"source": "simulated", "anchors": "a.yaml", "viewer": "true"}
+    *_, viewer = launch(generate, "uwb.launch.py", **said, one_process="true")
+    assert (viewer.executable, viewer.name, viewer.respawn) == ("viewer", "viewer", True)
+    assert settings(viewer) == {"anchors": "a.yaml", "use_sim_time": False}
+    *_, locator, viewer = launch(generate, "uwb.launch.py", **said, locate="true")
+    assert settings(locator)["anchors"] == "a.yaml"
+    assert settings(viewer) == {"use_sim_time": False}, "the locator tells it"
+    nodes = launch(generate, "uwb.launch.py", source="simulated")
+    assert "viewer" not in [node.executable for node in nodes]
+
+
+@pytest.mark.parametrize("one_process", ["false", "true"])
+def test_a_recording_that_has_ended_is_not_played_again(generate, one_process: str):
+    said = {"source": "mcap", "path": "a.mcap", "one_process": one_process}
+    respawning = {node.executable: node.respawn for node in launch(generate, "uwb.launch.py", **said)}
+    assert respawning == (
+        {"pipeline": False} if one_process == "true" else {"driver": False, "mitigator": True}
+    )
+
+
+def test_nothing_is_simulated_that_was_not_asked_for(generate, tmp_path: Path):
+    with pytest.raises(RuntimeError, match=r"source:=serial.*source:=simulated"):
+        launch(generate, "uwb.launch.py")
+    mine = tmp_path / "mine.yaml"
+    mine.write_text("driver:\n  ros__parameters:\n    source: mcap\n    path: a.mcap\n")
+    driver, _ = launch(generate, "uwb.launch.py", driver_params=str(mine))
+    assert settings(driver) == {"use_sim_time": False}
+    assert not driver.respawn
+
+
+@pytest.mark.parametrize("file", ["uwb.launch.py", "boards.launch.py"])
+@pytest.mark.parametrize("argument", ["driver_params", "mitigator_params"])
+def test_a_parameter_file_that_is_not_there_ends_the_launch(generate, file: str, argument: str):
+    source = {"source": "serial"} if file == "uwb.launch.py" else {"boards": "left=/dev/x"}
+    with pytest.raises(RuntimeError, match=r"absent\.yaml: no such file"):
+        launch(generate, file, **source, **{argument: "absent.yaml"})
 
 
 def test_every_board_gets_a_driver_and_a_mitigator_in_its_own_namespace(generate):
-    nodes = boards(generate, "left=/dev/uwb/1A2B right=usb:2341:805a:3C4D", "device")
+    boards = "left=/dev/uwb/1A2B right=usb:2341:805a:3C4D"
+    nodes = launch(generate, "boards.launch.py", boards=boards, mode="device")
     assert [(node.namespace, node.executable) for node in nodes] == [
         ("left", "driver"),
         ("left", "mitigator"),
         ("right", "driver"),
         ("right", "mitigator"),
     ]
-    assert nodes[2].parameters == [
-        {
-            "source": "serial",
-            "port": "usb:2341:805a:3C4D",
-            "mode": "device",
-            "frame_id": "right_uwb_antenna",
-        }
-    ]
+    assert settings(nodes[2]) == {
+        "source": "serial",
+        "port": "usb:2341:805a:3C4D",
+        "mode": "device",
+        "frame_id": "right_uwb_antenna",
+        "use_sim_time": False,
+    }
+    assert all(node.respawn for node in nodes)
 
 
 @pytest.mark.parametrize("text", ["/dev/ttyACM0", "left=", "1=/dev/ttyACM0", "=/dev/ttyACM0"])
 def test_a_board_that_cannot_be_meant_is_refused(generate, text: str):
     with pytest.raises(ValueError, match="NAME=PORT"):
-        boards(generate, text)
+        launch(generate, "boards.launch.py", boards=text)

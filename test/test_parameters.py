@@ -16,10 +16,9 @@ from uwb_mitigation_msgs.msg import RangeCir
 
 from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.errors import ParameterError
-from uwb_mitigation.nodes.parameter_files import TABLES
-from uwb_mitigation.nodes.parameters import Parameter
+from uwb_mitigation.measurement import Record
+from uwb_mitigation.nodes.parameter_tables import TABLES, Parameter
 from uwb_mitigation.sources.simulated import SimulatedSource
-from uwb_mitigation.sources.source import Record
 
 pytestmark = pytest.mark.ros
 
@@ -61,14 +60,29 @@ def test_a_whole_number_is_good_enough_for_a_number(replaying: Ros):
     assert replaying.set_parameter("driver", "rate", 3).successful
 
 
-def test_a_parameter_that_no_node_knows_is_reported_with_what_was_meant(ros: Ros, tmp_path: Path):
+def test_a_parameter_that_no_node_knows_is_refused_with_what_was_meant(ros: Ros, tmp_path: Path):
     file = tmp_path / "parameters.yaml"
-    file.write_text("/**:\n  ros__parameters:\n    simulatd_rate: 10.0\n    wholly_else: 1\n")
-    driver = ros.start("driver", "raet:=2.0", arguments=("--params-file", str(file)))
-    driver.wait_for_output("parameter raet is unknown and has no effect: meant is perhaps rate")
-    driver.wait_for_output("parameter simulatd_rate is unknown")
-    driver.wait_for_output("simulated_rate")
-    driver.wait_for_output("parameter wholly_else is unknown")
+    file.write_text("/**:\n  ros__parameters:\n    sorce: mcap\n")
+    for node, words, told in (
+        (
+            "driver",
+            ("--params-file", str(file)),
+            "parameter sorce is unknown (meant is perhaps source)",
+        ),
+        ("pipeline", ("-p", "raet:=2.0"), "parameter raet is unknown (meant is perhaps rate"),
+        ("mitigator", ("-p", "wholly_else:=1"), "parameter wholly_else is unknown"),
+    ):
+        process = ros.start(node, arguments=words)
+        assert process.wait() == 1
+        assert told in process.output
+        assert "Traceback" not in process.output
+
+
+def test_another_nodes_parameter_in_a_file_for_all_has_no_effect_and_is_told(ros: Ros, tmp_path: Path):
+    file = tmp_path / "parameters.yaml"
+    file.write_text("/**:\n  ros__parameters:\n    model: ''\n    rate: 2.0\n")
+    driver = ros.start("driver", arguments=("--params-file", str(file)))
+    driver.wait_for_output("parameter model is another node's and has no effect here")
 
 
 def test_known_parameters_are_not_reported(ros: Ros):

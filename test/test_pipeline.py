@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import signal
+import threading
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,16 +12,21 @@ import pytest
 
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
+import rclpy
 from ros_harness import Ros, domain
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
+from uwb_mitigation.bag.codec import encode_range
+from uwb_mitigation.measurement import RangeMeasurement
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.shipped import default_model_path
+from uwb_mitigation.nodes import driver
 from uwb_mitigation.sources.simulated import SimulatedSource
 
 pytestmark = pytest.mark.ros
 
+RAW = "/uwb/range_raw"
 CORRECTED = "/uwb/range_corrected"
 PLAY = ("count:=200", "seed:=1", "simulated_rate:=400.0", "start_delay:=0.5")
 
@@ -54,27 +61,45 @@ def test_the_raw_ranges_are_there_for_who_subscribes(ros: Ros):
     assert all(len(m.cir.samples) for m in raw)
 
 
-def test_no_raw_range_is_built_while_nobody_subscribes(ros: Ros, monkeypatch: pytest.MonkeyPatch):
-    from uwb_mitigation.nodes.driver import Driver
+class Consumer:
+    """Takes the driver's measurements, in the mitigator's place."""
 
-    built, handed = [], []
-    driver = Driver.__new__(Driver)
-    driver._consumer = type("Consumer", (), {"correct": lambda self, items: handed.extend(items)})()
-    subscribers = 0
-    driver._ranges = type(
-        "Publisher",
-        (),
-        {
-            "get_subscription_count": lambda self: subscribers,
-            "publish": lambda self, data: built.append(data),
-        },
-    )()
-    measurement = next(iter(SimulatedSource(seed=1))).measurement
-    driver._publish_measurements([measurement])
-    assert (len(handed), len(built)) == (1, 0)
-    subscribers = 1
-    driver._publish_measurements([measurement])
-    assert (len(handed), len(built)) == (2, 1)
+    def __init__(self) -> None:
+        self.taken: list[RangeMeasurement] = []
+
+    def correct(self, measurements: Sequence[RangeMeasurement]) -> None:
+        self.taken += measurements
+
+    def subscription_count(self) -> int:
+        return 1
+
+    def wait_for_all_acked(self, timeout: object) -> None:
+        """Nothing is on its way."""
+
+
+def test_no_raw_range_is_built_while_nobody_subscribes(ros: Ros, monkeypatch: pytest.MonkeyPatch):
+    built: list[RangeMeasurement] = []
+
+    def encode(measurement: RangeMeasurement) -> bytes:
+        built.append(measurement)
+        return encode_range(measurement)
+
+    monkeypatch.setattr(driver, "encode_range", encode)
+    words = ["-p", "simulated_rate:=400.0", "-p", "start_delay:=0.0"]
+    rclpy.init(args=["driver", "--ros-args", *words], domain_id=ros.domain)
+    playing = None
+    try:
+        consumer = Consumer()
+        playing = driver.Driver(threading.Event(), consumer)
+        ros.spin_until(lambda: len(consumer.taken) > 200)
+        assert built == []
+        raw = ros.collect(RangeCir, RAW)
+        ros.spin_until(lambda: len(raw) > 0)
+        assert len(built) > 0
+    finally:
+        if playing is not None:
+            playing.destroy_node()
+        rclpy.try_shutdown()
 
 
 def test_several_pipelines_side_by_side_keep_to_themselves(ros: Ros):

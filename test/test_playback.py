@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections import Counter
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -13,9 +15,9 @@ pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 from rclpy.clock import Clock, ClockType
 
 from uwb_mitigation.errors import DamagedRecordingError, UwbMitigationError
-from uwb_mitigation.measurement import Cir, RangeMeasurement
+from uwb_mitigation.measurement import Cir, RangeMeasurement, Record
+from uwb_mitigation.nodes import clocks
 from uwb_mitigation.nodes.playback import Playback
-from uwb_mitigation.sources.source import Record
 
 NO_CIR = Cir(np.zeros(0, np.int16))
 
@@ -163,3 +165,31 @@ def test_a_source_that_fails_in_no_foreseen_way_ends_the_playing_with_an_error(c
     (error,) = player.ends
     assert "a bug" in str(error)
     assert "ZeroDivisionError" in capsys.readouterr().err
+
+
+def test_a_wall_clock_that_is_set_neither_stops_nor_hurries_a_replay(monkeypatch: pytest.MonkeyPatch):
+    step_ns = [0]
+    wall_ns = time.time_ns
+    monkeypatch.setattr(time, "time_ns", lambda: wall_ns() + step_ns[0])
+    pace = clocks.Pace(Clock(clock_type=ClockType.SYSTEM_TIME))
+    began_ns = pace.now_ns()
+    due_ns = [began_ns + each * 1_000_000 for each in range(4)]
+    stamps = []
+    for due, step_s in zip(due_ns, (0, 0, -3600, 10_800), strict=True):
+        step_ns[0] = step_s * 10**9
+        stamps.append(pace.stamp_ns(due))
+    assert 0 < pace.now_ns() - began_ns < 60 * 10**9, "the pace is another clock's"
+    assert stamps[1] - stamps[0] == 1_000_000, "stamps are as far apart as what they are of"
+    steps_s = [round((b - a) / 1e9) for a, b in pairwise(stamps)]
+    assert steps_s == [0, -3600, 14_400], "stamps are on the clock as it is set"
+
+
+def test_how_late_a_source_is_that_cannot_keep_its_rate_is_known():
+    class Slow(ListSource):
+        def __iter__(self):
+            for record in super().__iter__():
+                time.sleep(0.005)
+                yield record
+
+    player = Player(Slow([each * 1000 for each in range(60)])).play()
+    assert player.playback.late_ns > 100_000_000

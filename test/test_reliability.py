@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
+import re
 import signal
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +17,10 @@ pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from model_material import bundle
+from rclpy.qos import qos_profile_sensor_data
 from ros_harness import Ros, domain
 from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import Range
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
 from uwb_mitigation.bag.codec import encode_range
@@ -27,12 +32,14 @@ from uwb_mitigation.model.shipped import default_model_path
 from uwb_mitigation.nodes.diagnostics import Meter
 from uwb_mitigation.nodes.health import (
     DROPPED,
+    NOT_NUMBERED,
     OUT_OF_DISTRIBUTION,
     SILENT,
     SLOW,
     THRESHOLDS,
+    UNCOUNTED,
     UNUSABLE,
-    Health,
+    MitigatorHealth,
     Numbering,
 )
 from uwb_mitigation.sources.simulated import SimulatedSource
@@ -221,8 +228,8 @@ def test_a_rate_is_counted_on_the_nodes_clock():
     assert meter.facts() == {"rate Hz": "unknown"}
 
 
-def health(statuses: dict[Status, int] | None = None, processing_ms: float = 0.1) -> Health:
-    health = Health()
+def health(statuses: dict[Status, int] | None = None, processing_ms: float = 0.1, **clock) -> MitigatorHealth:
+    health = MitigatorHealth(**clock)
     for status, count in (statuses or {Status.OK: 100}).items():
         health.statuses[status] += count
         health.add_time(int(processing_ms * 1e6))
@@ -246,6 +253,13 @@ def test_many_ranges_of_a_bad_status_are_warned_of(statuses: dict[Status, int], 
     assert health(statuses).period().warnings() == []
 
 
+def test_ranges_that_lack_a_preamble_count_are_told_of_as_such():
+    lacking = health({Status.OK: 79, Status.BAD_CIR: 21})
+    lacking.uncounted = 21
+    assert lacking.period().warnings() == [UNCOUNTED.text]
+    assert lacking.uncounted == 0
+
+
 def test_the_documented_thresholds_are_those_in_force():
     document = (Path(__file__).parent.parent / "docs" / "diagnostics.md").read_text()
     for threshold in THRESHOLDS:
@@ -254,8 +268,9 @@ def test_the_documented_thresholds_are_those_in_force():
 
 def test_slow_correcting_and_silence_are_warned_of():
     assert health(processing_ms=25.0).period().warnings() == [SLOW.text]
-    silent = health()
-    silent._last_s -= 6.0
+    now_s = [100.0]
+    silent = health(now_s=lambda: now_s[0])
+    now_s[0] = 106.0
     assert silent.period().warnings() == [SILENT.text]
 
 
@@ -268,19 +283,148 @@ def test_a_drop_is_warned_of_once():
 
 
 def test_drops_are_found_by_the_publishers_numbers():
-    numbering = Numbering()
-    numbering.add()
-    for number in (2, 3):
-        numbering.add_number(number)
-    numbering.add()
-    numbering.add_number(5)
+    numbering = Numbering(lambda: 1)
+    for number in (1, 2, 3):
+        numbering.add(number)
     assert numbering.missing == 0
-    numbering.add()
-    numbering.add_number(17)
+    numbering.add(14)
     assert numbering.missing == 10
-    numbering.add_number(1)
-    numbering.add_number(2)
+    for number in (1, 2):  # Started anew.
+        numbering.add(number)
     assert numbering.missing == 10
-    numbering.restart()
-    numbering.add_number(500)
-    assert numbering.missing == 10
+
+
+@pytest.mark.parametrize("count", [2, 3, 5])
+def test_drops_of_several_publishers_add_up_whoever_they_are_of(count: int):
+    random = np.random.default_rng(count)
+    numbering = Numbering(lambda: count)
+    last = [int(start) for start in random.integers(0, 100_000, count)]
+    lost = 0
+    for step in range(3000):
+        publisher = int(random.integers(count)) if step >= count else step
+        gap = int(random.integers(50)) if step >= count and random.random() < 0.02 else 0
+        last[publisher] += gap + 1
+        lost += gap
+        numbering.add(last[publisher])
+    for publisher in range(count):
+        last[publisher] += 1
+        numbering.add(last[publisher])
+    assert numbering.missing == lost > 0
+
+
+def test_a_publisher_that_starts_anew_beside_another_loses_nothing():
+    known = [2]
+    numbering = Numbering(lambda: known[0])
+    for number in range(1, 100):
+        numbering.add(number)
+        numbering.add(1000 + number)
+    known[0] = 3  # The middleware counts the one that was killed until its lease ends.
+    for number in range(1, 50):
+        numbering.add(number)
+        numbering.add(1099 + number)
+    known[0] = 2
+    for number in range(50, 200):
+        numbering.add(number)
+        numbering.add(1099 + number)
+    assert numbering.missing == 0
+
+
+def test_a_middleware_that_numbers_nothing_is_said_to_hide_what_it_drops():
+    silent = health()
+    silent.numbering.add(NOT_NUMBERED)
+    silent.lost += 7
+    assert silent.dropped_text == "7 told by the middleware; the rest cannot be told here"
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize("count", [2, 3])
+def test_several_drivers_into_one_mitigator_lose_nothing_also_when_one_starts_anew(ros: Ros, count: int):
+    corrected = ros.collect(RangeCorrected, CORRECTED)
+    ros.start("mitigator").wait_for_output("correcting with model")
+    ros.wait_for_publishers(CORRECTED, 1)
+    drivers = [
+        ros.start("driver", "simulated_rate:=150.0", arguments=("-r", f"__node:=driver{number}"))
+        for number in range(count)
+    ]
+    ros.spin_until(lambda: len(corrected) > 300)
+    drivers[0].send(signal.SIGKILL)
+    drivers[0].wait()
+    ros.start("driver", "simulated_rate:=150.0", arguments=("-r", "__node:=driver0"))
+    ros.wait_for_publishers(RAW, count)
+    before = len(corrected)
+    ros.spin_until(lambda: len(corrected) > before + 500)
+    status = ros.diagnosis("mitigator", lambda status: status.message != SILENT.text)
+    facts = {value.key: value.value for value in status.values}
+    assert facts["dropped by a queue"] == "0"
+    assert DROPPED.text not in status.message
+
+
+@pytest.mark.ros
+def test_a_publisher_by_best_effort_is_named_and_heard_where_it_is_asked_for(ros: Ros):
+    data = encode_range(next(iter(SimulatedSource(seed=2))).measurement)
+    publisher = ros.node.create_publisher(RangeCir, RAW, qos_profile_sensor_data)
+    mitigator = ros.start("mitigator")
+    status = ros.diagnosis("mitigator", lambda status: "best effort" in status.message)
+    assert status.level == DiagnosticStatus.WARN
+    assert "/test_client publishes by best effort and is not heard" in status.message
+    (parameter,) = re.findall(r"qos_overrides\S+", status.message)
+    mitigator.wait_for_output("incompatible QoS")
+    assert mitigator.signal(signal.SIGINT) == 0
+    corrected = ros.collect(RangeCorrected, CORRECTED)
+    ros.start("mitigator", parameter)
+
+    def heard() -> bool:
+        publisher.publish(data)
+        return len(corrected) > 0
+
+    ros.spin_until(heard)
+
+
+@pytest.mark.ros
+def test_corrected_ranges_come_as_sensor_msgs_too_where_they_are_asked_for(ros: Ros):
+    measurement = next(iter(SimulatedSource(seed=2))).measurement
+    corrected = ros.collect(RangeCorrected, CORRECTED)
+    plain = ros.collect(Range, f"{CORRECTED}/anchor_{measurement.anchor_id}")
+    ros.start("mitigator", "sensor_ranges:=true").wait_for_output("correcting with model")
+    publisher = ros.node.create_publisher(RangeCir, RAW, 10)
+    ros.spin_until(lambda: publisher.get_subscription_count() == 1)
+
+    def heard() -> bool:
+        publisher.publish(encode_range(measurement))
+        return len(plain) > 0 and len(corrected) > 0
+
+    ros.spin_until(heard)
+    assert (plain[-1].range, plain[-1].variance) == (corrected[-1].range, corrected[-1].variance)
+    assert plain[-1].header == corrected[-1].header
+    plain.clear()
+    publisher.publish(encode_range(replace(measurement, range_m=math.nan)))
+    ros.spin_until(lambda: bool(plain) and plain[-1].range == math.inf)
+    assert plain[-1].variance == math.inf
+
+
+@pytest.mark.ros
+def test_the_log_says_what_the_model_was_trained_on_and_its_id_both_ways(ros: Ros):
+    mitigator = ros.start("mitigator")
+    mitigator.wait_for_output("correcting with model")
+    model = load_bundle(default_model_path())
+    assert f"id {model.model_id:08x} ({model.model_id})" in mitigator.output
+    assert f"trained on {model.card.training['data']}" in mitigator.output
+    assert mitigator.output.count("trained on") == 1
+
+
+@pytest.mark.ros
+def test_simulated_ranges_are_called_so(ros: Ros):
+    raw = ros.collect(RangeCir, RAW)
+    driver = ros.start("driver", *ENDLESS)
+    driver.wait_for_output("simulated ranges, which no radio measured")
+    status = ros.diagnosis("driver", lambda status: "simulated" in status.message)
+    assert status.level == DiagnosticStatus.WARN
+    ros.spin_until(lambda: len(raw) > 0)
+    assert raw[0].header.frame_id.startswith("simulated_")
+
+
+@pytest.mark.ros
+def test_all_subscribers_that_are_counted_hear_the_first_range_without_a_delay(ros: Ros):
+    received = [ros.collect(RangeCir, RAW) for _ in range(3)]
+    ros.start("driver", "count:=50", "simulated_rate:=500.0", "wait_for_subscribers:=3")
+    ros.spin_until(lambda: all(len(messages) == 50 for messages in received))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from pathlib import Path
 
 import numpy as np
 import onnx
@@ -14,8 +15,9 @@ from uwb_mitigation.errors import ModelError
 from uwb_mitigation.model import floating, graph
 from uwb_mitigation.model.architecture import Remnet
 from uwb_mitigation.model.bundle import save_bundle
-from uwb_mitigation.model.session import Session, session_options
-from uwb_mitigation.model.shipped import SHIPPED, default_model_path
+from uwb_mitigation.model.runtime import Session, session_options
+from uwb_mitigation.model.shipped import default_model_path, model_path, shipped_model_path
+from uwb_mitigation.preprocessing import Scaling
 
 
 def test_the_int8_graph_fuses_to_integer_operators(tmp_path):
@@ -79,26 +81,33 @@ def test_a_graph_that_onnx_runtime_refuses_is_a_model_error(tmp_path):
 
 
 def test_the_shipped_model_is_found_in_a_checkout():
-    assert default_model_path().name == SHIPPED
+    assert default_model_path().name == "universal.onnx"
+    assert default_model_path(Scaling.MAX).name == "universal_amplitude.onnx"
+
+
+def test_a_model_is_named_by_its_file_or_as_it_ships():
+    assert model_path("") == model_path(None) == default_model_path()
+    assert model_path(Path("evk1000_apartment")) == shipped_model_path("evk1000_apartment")
+    assert model_path("folder/own.onnx") == Path("folder/own.onnx")
 
 
 def test_the_shipped_model_is_found_in_a_sourced_workspace(tmp_path, monkeypatch):
     folder = tmp_path / "share" / "uwb_mitigation" / "models"
     folder.mkdir(parents=True)
-    (folder / SHIPPED).touch()
+    (folder / "universal.onnx").touch()
     monkeypatch.setattr("uwb_mitigation.model.shipped.__file__", "/nowhere/else/at/all/m/shipped.py")
     monkeypatch.setenv("AMENT_PREFIX_PATH", f"/none:{tmp_path}")
-    assert default_model_path() == folder / SHIPPED
+    assert default_model_path() == folder / "universal.onnx"
 
 
 def test_the_shipped_model_is_found_beside_an_installation(tmp_path, monkeypatch):
     folder = tmp_path / "share" / "uwb_mitigation" / "models"
     folder.mkdir(parents=True)
-    (folder / SHIPPED).touch()
+    (folder / "universal.onnx").touch()
     module = tmp_path / "lib/python3.12/site-packages/uwb_mitigation/model/shipped.py"
     monkeypatch.setattr("uwb_mitigation.model.shipped.__file__", str(module))
     monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
-    assert default_model_path() == folder / SHIPPED
+    assert default_model_path() == folder / "universal.onnx"
 
 
 def test_a_model_that_is_nowhere_lists_where_it_was_sought(monkeypatch):

@@ -1,0 +1,52 @@
+"""`uwb-mitigation bench radio`: the soak, and its results for machines."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+from command_line import run
+
+from uwb_mitigation.benches import radio
+
+pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc")
+
+
+def test_no_range_of_a_soak_is_wrong_and_every_chip_is_back_within_a_second():
+    soaked = radio.soak(2000, seed=3, advance=lambda _: None)
+    assert soaked.exchanges >= 2000
+    assert soaked.delivered > 800
+    assert soaked.disturbances > 10
+    assert soaked.wrong == 0
+    assert soaked.longest_recovery_s <= 1.0
+    assert soaked.lost["no_answer"] > 0
+    assert soaked.lost["damaged"] > 0
+    assert sum(soaked.lost.values()) + soaked.delivered >= soaked.exchanges - 1
+
+
+def test_the_bench_writes_what_it_measured(tmp_path: Path):
+    output = tmp_path / "radio.json"
+    run(
+        "bench",
+        "radio",
+        "--seconds",
+        "0.5",
+        "--exchanges",
+        "300",
+        "--evb1000",
+        "0",
+        "--json",
+        output,
+        folder=tmp_path,
+    )
+    result = json.loads(output.read_text())
+    assert len(result["ranging"]) == 25
+    for row in result["ranging"]:
+        assert abs(row["mean_error_m"]) <= 0.005
+        assert row["sd_m"] <= 0.005
+    assert result["host_rate_hz"] >= 100
+    assert result["device_rate_hz"] >= 80
+    assert result["evb1000_rate_hz"] is None
+    assert result["soak"]["wrong"] == 0

@@ -1,0 +1,170 @@
+"""`uwb-mitigation calibrate`: a bundle and offsets from a simulated drive, and from a localisation beside it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from command_line import run
+from drives import drive
+
+from uwb_mitigation.bag.poses import encode_odometry
+from uwb_mitigation.bag.writer import BagWriter
+from uwb_mitigation.measurement import Cir, RangeMeasurement, Record
+from uwb_mitigation.mitigation import Mitigation
+from uwb_mitigation.model.bundle import load_bundle
+from uwb_mitigation.offsets import read_offsets
+from uwb_mitigation.positioning.tracks import Estimate
+from uwb_mitigation.sources.simulated import SimulatedSource
+from uwb_mitigation.sources.site import save_anchors
+
+OWN = np.array([0.3, 0.1, 0.25, 0.05, 0.2])
+LEVER = np.array([0.4, 0.1, 0.0])
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """A folder with a drive past five anchors, without CIRs, and a localisation 0.3 s late; and a short one."""
+    from drives import HALL
+
+    folder = tmp_path_factory.mktemp("a site")
+    save_anchors(folder / "anchors.yaml", HALL)
+    ranges, path = drive(seconds=80, rate_hz=20.0, offset_m=0.0)
+    power = -80 - 0.5 * np.random.default_rng(2).normal(0, 8, len(ranges))
+    value = ranges.range_m + OWN[ranges.anchor] - 0.02 * (power + 80)
+    turn = 0.6 * ranges.stamp_ns / 1e9
+    with (
+        BagWriter(folder / "drive.mcap", {"simulated": "true"}) as bag,
+        BagWriter(folder / "short.mcap", {}) as short,
+    ):
+        for i, stamp in enumerate(ranges.stamp_ns.tolist()):
+            cir = Cir(np.zeros(0, np.int16), rx_power_dbm=float(power[i]))
+            anchor = HALL.anchors[int(ranges.anchor[i])].id
+            record = Record(RangeMeasurement(stamp, 7, anchor, i, 0, float(value[i]), cir))
+            bag.write(record)
+            if i < 100:
+                short.write(record)
+            if i % 2 == 0:
+                c, s = np.cos(turn[i]), np.sin(turn[i])
+                frame = path.position[i] - (c * LEVER[0] - s * LEVER[1], s * LEVER[0] + c * LEVER[1], 0.0)
+                late = stamp + 300_000_000
+                data = bytearray(encode_odometry(Estimate(late, frame, np.zeros(3), np.zeros((6, 6)))))
+                # The orientation stands after the position in the pose, which is encoded as none.
+                none = np.array([0.0, 0.0, 0.0, 1.0]).tobytes()
+                at = data.index(none, data.index(frame.tobytes()))
+                data[at : at + 32] = np.array([0.0, 0.0, np.sin(turn[i] / 2), np.cos(turn[i] / 2)]).tobytes()
+                bag.write_message("/odom", "nav_msgs/msg/Odometry", bytes(data), late)
+    return folder
+
+
+LEVEL = ("--anchors", "anchors.yaml", "--height", 1.0)
+
+
+def test_a_drive_becomes_a_bundle_and_offsets_that_better_other_ranges(site):
+    done = run(
+        "calibrate",
+        "drive.mcap",
+        *LEVEL,
+        "-o",
+        "site.onnx",
+        "--json",
+        "r.json",
+        "--report",
+        "r.html",
+        folder=site,
+    )
+    assert done.returncode == 0, done.stderr
+    result = json.loads((site / "r.json").read_text())
+    assert result["truth"] == "none"
+    assert result["refused"] is None
+    assert result["chosen"] == "offsets + line"
+    assert result["calibrated_mae_m"] < result["raw_mae_m"]
+    assert set(result["offsets_m"]) == {f"7-{anchor}" for anchor in range(1, 6)}
+    bundle, offsets = load_bundle(site / "site.onnx"), read_offsets(str(site / "site.offsets.yaml"))
+    assert bundle.card.training["calibrated"] == "without truth"
+    assert bundle.prior.per_rx_power == pytest.approx(-0.02, abs=0.006)
+    assert "without truth" in bundle.card.origin
+    # Without a CIR: the line and the offset count, since the network has nothing to say.
+    cir = Cir(np.zeros(0, np.int16), rx_power_dbm=-85.0)
+    corrected = Mitigation(bundle, offsets).correct(RangeMeasurement(0, 7, 1, 0, 0, 5.4, cir))
+    assert corrected.status == 0
+    assert corrected.range_m == pytest.approx(5.0, abs=0.12)
+    page = (site / "r.html").read_text()
+    assert "polyline" in page
+    assert result["chosen"] in page
+    again = run("calibrate", "drive.mcap", *LEVEL, "-o", "site.onnx", folder=site)
+    assert (again.returncode, "--force" in again.stderr) == (1, True)
+
+
+def test_a_localisation_that_lags_tells_the_truth(site):
+    done = run(
+        "calibrate",
+        "drive.mcap",
+        *LEVEL,
+        "-o",
+        "odom.onnx",
+        "--json",
+        "o.json",
+        "--truth-topic",
+        "/odom",
+        folder=site,
+    )
+    assert done.returncode == 0, done.stderr
+    result = json.loads((site / "o.json").read_text())
+    assert result["truth"] == "/odom"
+    assert result["localisation"]["time_offset_s"] == pytest.approx(0.3, abs=0.03)
+    assert np.abs(np.array(result["localisation"]["lever_arm_m"]) - LEVER)[:2].max() < 0.05
+    assert "with truth from /odom" in load_bundle(site / "odom.onnx").card.origin
+    wrong = run("calibrate", "drive.mcap", *LEVEL, "-o", "x.onnx", "--truth-topic", "/amcl_pose", folder=site)
+    assert (wrong.returncode, "/odom (nav_msgs/msg/Odometry)" in wrong.stderr) == (1, True)
+
+
+def test_what_is_refused_is_said_in_the_json_and_writes_nothing(site):
+    done = run("calibrate", "short.mcap", *LEVEL, "-o", "short.onnx", "--json", "s.json", folder=site)
+    assert done.returncode == 1
+    result = json.loads((site / "s.json").read_text())
+    assert "too few" in result["refused"]
+    assert result["offsets_m"] == {}
+    assert not (site / "short.onnx").exists()
+    assert not (site / "short.offsets.yaml").exists()
+
+
+def test_a_calibration_that_would_harm_is_written_by_force_only(site, monkeypatch):
+    from uwb_mitigation.training.calibrating import Calibrated
+
+    monkeypatch.setattr(Calibrated, "calibrated_mae_m", property(lambda self: self.raw_mae_m + 0.01))
+    options = ("drive.mcap", *LEVEL, "-o", "harm.onnx", "--json", "h.json")
+    done = run("calibrate", *options, folder=site)
+    assert done.returncode == 1
+    assert "not written" in json.loads((site / "h.json").read_text())["refused"]
+    assert not (site / "harm.onnx").exists()
+    assert run("calibrate", *options, "--force", folder=site).returncode == 0
+    assert (site / "harm.onnx").exists()
+
+
+def test_cirs_bring_the_universal_network_in(tmp_path, monkeypatch):
+    """Without torch, whose candidate takes long: then it is said."""
+    import importlib.util
+
+    from uwb_mitigation.training import site_model
+
+    monkeypatch.setattr(site_model.importlib.util, "find_spec", lambda name: None)
+    assert importlib.util is site_model.importlib.util
+    source = SimulatedSource.with_anchors(5, seed=4, count=1600, rate_hz=20.0)
+    save_anchors(tmp_path / "anchors.yaml", source.anchors)
+    with BagWriter(tmp_path / "drive.mcap", {"simulated": "true"}) as bag:
+        for record in source:
+            measured = replace(record.measurement, range_m=record.measurement.range_m + 0.2)
+            bag.write(replace(record, measurement=measured))
+    done = run(
+        "calibrate", "drive.mcap", "--anchors", "anchors.yaml", "--height", 0.0, "-o", "site.onnx", "--json", "r.json",
+        folder=tmp_path,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "torch is not installed" in done.stderr
+    result = json.loads((tmp_path / "r.json").read_text())
+    assert result["chosen"].startswith("offsets + universal network")
+    assert result["calibrated_mae_m"] < 0.7 * result["raw_mae_m"]
+    assert load_bundle(tmp_path / "site.onnx").card.needs_cir

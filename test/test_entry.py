@@ -1,0 +1,75 @@
+"""The executables: what they answer before they load, and how a signal ends them while they do. No ROS needed."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from conftest import REPOSITORY
+
+from uwb_mitigation.nodes.help import USAGES
+
+NODES = ("driver", "mitigator", "pipeline", "monitor")
+
+
+def run(executable: str, *words: str, path: Path | None = None) -> subprocess.Popen[str]:
+    """Start an executable, or a demo; `path` holds modules that come before those installed."""
+    start = ["-c", f"from uwb_mitigation.entry import {executable}; {executable}()"]
+    if "demo" in executable:
+        start = ["-m", "uwb_mitigation.entry", executable]
+    modules = os.pathsep.join(str(entry) for entry in (path, REPOSITORY) if entry is not None)
+    return subprocess.Popen(
+        [sys.executable, *start, *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=os.environ | {"PYTHONPATH": modules},
+    )
+
+
+@pytest.mark.parametrize("node", NODES)
+def test_help_tells_every_parameter_where_there_is_no_ros(node: str, tmp_path: Path):
+    (tmp_path / "rclpy.py").write_text("raise ModuleNotFoundError('no rclpy here', name='rclpy')\n")
+    process = run(node, "--help", path=tmp_path)
+    told, _ = process.communicate(timeout=60)
+    assert process.returncode == 0, told
+    assert f"    {node}" in told
+    assert all(f"\n  {row.name}:=" in told for row in USAGES[node].parameters)
+
+
+@pytest.mark.parametrize(
+    ("executable", "number"),
+    [
+        ("driver", signal.SIGINT),
+        ("driver", signal.SIGTERM),
+        ("monitor", signal.SIGINT),
+        ("command_line", signal.SIGINT),
+        ("radio-demo", signal.SIGINT),
+    ],
+)
+def test_a_signal_while_an_executable_still_loads_ends_it_at_once(
+    executable: str, number: signal.Signals, tmp_path: Path
+):
+    for package in ("rclpy", "typer"):
+        (tmp_path / f"{package}.py").write_text(
+            "import time\nprint('loading', flush=True)\ntime.sleep(600)\n"
+        )
+    process = run(executable, path=tmp_path)
+    assert process.stdout.readline() == "loading\n"
+    process.send_signal(number)
+    told, _ = process.communicate(timeout=60)
+    assert (process.returncode, told) == (128 + number, "")
+
+
+def test_a_signal_while_a_node_loads_beside_the_graph_ends_it_at_once(tmp_path: Path):
+    pytest.importorskip("rclpy")
+    (tmp_path / "cobs.py").write_text("import time\nprint('loading', flush=True)\ntime.sleep(600)\n")
+    process = run("driver", path=tmp_path)
+    assert process.stdout.readline() == "loading\n"
+    process.send_signal(signal.SIGINT)
+    told, _ = process.communicate(timeout=60)
+    assert (process.returncode, told) == (130, "")

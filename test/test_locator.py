@@ -1,0 +1,248 @@
+"""The node `locator` as a real process over real DDS."""
+
+from __future__ import annotations
+
+import math
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
+
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray
+from drives import HALL, drive
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from ros_harness import Ros, domain
+from std_msgs.msg import Header
+from uwb_mitigation_msgs.msg import RangeCorrected
+from visualization_msgs.msg import MarkerArray
+
+from uwb_mitigation.positioning.anchors import dump_anchors
+from uwb_mitigation.positioning.model import Model
+from uwb_mitigation.sources.site import load_learnt
+
+pytestmark = pytest.mark.ros
+
+CORRECTED = "/uwb/range_corrected"
+NANOSECONDS = 1_000_000_000
+
+
+@pytest.fixture
+def ros(tmp_path: Path):
+    with domain(tmp_path) as ros:
+        yield ros
+
+
+@pytest.fixture
+def anchors(tmp_path: Path) -> Path:
+    path = tmp_path / "hall anchors.yaml"
+    path.write_text(dump_anchors(HALL))
+    return path
+
+
+class Drive:
+    """Publishes a drive, stamped from now on, as fast as it is asked to."""
+
+    def __init__(self, ros: Ros, **options) -> None:
+        self.ranges, self.truth = drive(**options)
+        self.start_ns = ros.node.get_clock().now().nanoseconds - int(self.ranges.stamp_ns[-1])
+        self._ros = ros
+        self._publisher = ros.node.create_publisher(RangeCorrected, CORRECTED, QoSProfile(depth=10_000))
+
+    def send(self, rows: range, tag: int = 7, **changes) -> None:
+        for i in rows:
+            stamp = self.start_ns + int(self.ranges.stamp_ns[i])
+            message = RangeCorrected(
+                header=Header(stamp=Time(sec=stamp // NANOSECONDS, nanosec=stamp % NANOSECONDS)),
+                tag_id=tag,
+                anchor_id=HALL.anchors[self.ranges.anchor[i]].id,
+                sequence=i,
+                range=float(self.ranges.range_m[i]),
+                range_raw=float(self.ranges.range_m[i]),
+                variance=0.01,
+            )
+            for name, value in changes.items():
+                setattr(message, name, value)
+            self._publisher.publish(message)
+            if i % 50 == 0:
+                self._ros.spin_for(0.01)
+
+    def errors(self, poses: list) -> np.ndarray:
+        """Horizontal distances of poses to the truth at their stamps."""
+        stamps = [pose.header.stamp.sec * NANOSECONDS + pose.header.stamp.nanosec for pose in poses]
+        at = self.truth.at(np.array(stamps) - self.start_ns)
+        places = np.array([(pose.pose.pose.position.x, pose.pose.pose.position.y) for pose in poses])
+        return np.hypot(*(places - at[:, :2]).T)
+
+
+def stamp_ns(pose: PoseWithCovarianceStamped) -> int:
+    return pose.header.stamp.sec * NANOSECONDS + pose.header.stamp.nanosec
+
+
+def facts(received: list[DiagnosticArray]) -> dict[str, str]:
+    """Those of the locator's latest status, and its message."""
+    for array in reversed(received):
+        for status in array.status:
+            if status.name.startswith("locator"):
+                return {value.key: value.value for value in status.values} | {"": status.message}
+    return {}
+
+
+def test_poses_odometry_smoothed_poses_and_markers_come_of_ranges(ros: Ros, anchors: Path):
+    locator = ros.start("locator", f"anchors:={anchors}", "rate:=0.0")
+    locator.wait_for_output("locating")
+    poses = ros.collect(PoseWithCovarianceStamped, "/uwb/pose")
+    odometry = ros.collect(Odometry, "/uwb/odometry")
+    smoothed = ros.collect(PoseWithCovarianceStamped, "/uwb/pose_smoothed")
+    diagnostics = ros.collect(DiagnosticArray, "/diagnostics")
+    second = ros.collect(PoseWithCovarianceStamped, "/uwb/tag_9/pose")
+    run = Drive(ros, seconds=20)
+    ros.wait_for_subscribers(CORRECTED, 1)
+    half = len(run.ranges) // 2
+    run.send(range(half))
+    ros.spin_until(lambda: len(smoothed) > 0)
+    # What is not right is counted, and said; it ends nothing.
+    run.send(range(half, half + 3), range=math.nan)
+    run.send(range(half, half + 3), anchor_id=4711)
+    run.send(range(half, len(run.ranges)))
+    run.send(range(half), tag=9)
+    ros.spin_until(lambda: len(second) > 20 and "4711" in facts(diagnostics).get("", ""))
+    moving = [pose for pose in poses if pose.header.stamp.sec * NANOSECONDS < run.start_ns + 19 * NANOSECONDS]
+    errors = run.errors(moving)
+    known = np.isfinite(errors)
+    assert known.sum() > 500
+    assert np.sqrt(np.mean(errors[known] ** 2)) < 0.3
+    assert np.nanmax(run.errors(smoothed)) < 0.5
+    assert {pose.header.frame_id for pose in poses} == {"map"}
+    assert {message.child_frame_id for message in odometry} == {"base_link"}
+    assert poses[-1].pose.covariance[35] >= 1e5
+    assert poses[-1].pose.pose.orientation.w == 1.0
+    told = facts(diagnostics)
+    assert told["ranges not valid"] == "3"
+    assert told["ranges of unknown anchors"] == "3"
+    assert float(told["tag 7 HDOP"]) < 3
+    assert "anchor 4711 are left out" in locator.output
+    late = ros.node.create_subscription(
+        MarkerArray,
+        "/uwb/anchors",
+        (shown := []).append,
+        QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL),
+    )
+    ros.spin_until(lambda: bool(shown))
+    names = {(marker.ns, marker.id) for marker in shown[0].markers}
+    assert {("anchors", row) for row in range(len(HALL))} <= names
+    assert late is not None
+    assert locator.signal(signal.SIGINT) == 0, locator.output
+
+
+def test_a_silence_is_bridged_by_predictions_whose_covariance_grows(ros: Ros, anchors: Path):
+    locator = ros.start("locator", f"anchors:={anchors}")
+    locator.wait_for_output("locating")
+    poses = ros.collect(PoseWithCovarianceStamped, "/uwb/pose")
+    run = Drive(ros, seconds=5)
+    ros.wait_for_subscribers(CORRECTED, 1)
+    run.send(range(len(run.ranges)))
+    end_ns = run.start_ns + int(run.ranges.stamp_ns[-1])
+
+    def after() -> list[float]:
+        stamped = [(p.header.stamp.sec * NANOSECONDS + p.header.stamp.nanosec, p) for p in poses]
+        return [pose.pose.covariance[0] for stamp, pose in stamped if stamp > end_ns]
+
+    ros.spin_until(lambda: len(after()) > 6)
+    spread = after()
+    assert spread == sorted(spread)
+    assert spread[-1] > 2 * spread[0]
+
+
+def test_offsets_are_learnt_shown_taken_off_and_kept_through_a_restart(
+    ros: Ros, anchors: Path, tmp_path: Path
+):
+    kept = tmp_path / "learnt offsets.yaml"
+    given = (f"anchors:={anchors}", "rate:=0.0", "level:=true", "height:=1.0", f"offsets_file:={kept}")
+    pairs = np.array([0.3, 0.0, -0.05, 0.25, 0.0])
+
+    def told(received: list[DiagnosticArray]) -> list[tuple[float, float]]:
+        found = facts(received)
+        texts = [found.get(f"tag 7 anchor {anchor.id} offset m", "0 +- 1") for anchor in HALL.anchors]
+        return [(float(text.split(" +- ")[0]), float(text.split(" +- ")[1])) for text in texts]
+
+    def driven(seconds: float, *parameters: str) -> tuple[float, np.ndarray]:
+        locator = ros.start("locator", *given, *parameters)
+        locator.wait_for_output("locating")
+        poses = ros.collect(PoseWithCovarianceStamped, "/uwb/pose")
+        diagnostics = ros.collect(DiagnosticArray, "/diagnostics")
+        run = Drive(ros, seconds=seconds, offset_m=0.0)
+        run.ranges.range_m[:] += pairs[run.ranges.anchor]
+        ros.wait_for_subscribers(CORRECTED, 1)
+        run.send(range(len(run.ranges)))
+        last_ns = run.start_ns + int(run.ranges.stamp_ns[-1])
+        ros.spin_until(lambda: any(stamp_ns(pose) >= last_ns for pose in poses))
+        seen = len(diagnostics)
+        ros.spin_until(lambda: "tag 7 places" in facts(diagnostics[seen:]))
+        assert locator.signal(signal.SIGINT) == 0, locator.output
+        errors = run.errors([pose for pose in poses if stamp_ns(pose) <= last_ns])
+        return float(np.sqrt(np.nanmean(errors**2))), np.array(told(diagnostics))
+
+    before, learnt = driven(60)
+    assert (np.abs(learnt[:, 0] - pairs) < 4 * learnt[:, 1]).all()
+    assert (learnt[:, 1] < 0.06).all()
+    found = load_learnt(kept, Model())
+    assert [found.pairs[7, anchor.id] for anchor in HALL.anchors] == pytest.approx(learnt[:, 0], abs=2e-3)
+    # Short: what it takes off it has from the file.
+    after, again = driven(8, "learn_offsets:=true")
+    assert after < 0.8 * before
+    assert np.abs(again[:, 0] - learnt[:, 0]).max() < 0.1
+    kept.write_text("pairs: nonsense")
+    broken = ros.start("locator", *given)
+    broken.wait_for_output("pairs = 'nonsense'")
+    assert broken.exit_code() is None
+    assert kept.read_text() == "pairs: nonsense"
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [(None, "no such file"), ("anchors: [{id: 1, x: 0, y: 0}]", "the field z is missing")],
+)
+def test_an_anchors_file_that_cannot_be_used_is_said_and_the_node_stays(
+    ros: Ros, tmp_path: Path, text: str | None, told: str
+):
+    path = tmp_path / "anchors.yaml"
+    if text is not None:
+        path.write_text(text)
+    locator = ros.start("locator", f"anchors:={path}")
+    locator.wait_for_output(told)
+    diagnostics = ros.collect(DiagnosticArray, "/diagnostics")
+    ros.spin_until(lambda: told in facts(diagnostics).get("", ""))
+    assert locator.exit_code() is None
+    assert locator.signal(signal.SIGINT) == 0
+
+
+def test_tf_is_refused_where_its_messages_are_not_installed(ros: Ros, anchors: Path):
+    try:
+        import tf2_msgs  # noqa: F401
+    except ImportError:
+        locator = ros.start("locator", f"anchors:={anchors}", "publish_tf:=true")
+        locator.wait_for_output("tf2_msgs, which is not installed")
+        assert locator.exit_code() is None
+    else:
+        pytest.skip("tf2_msgs is installed")
+
+
+def test_the_pipeline_has_a_locator_where_anchors_are_given(ros: Ros, tmp_path: Path):
+    from uwb_mitigation.sources.simulated import SimulatedSource
+
+    path = tmp_path / "flat.yaml"
+    path.write_text(dump_anchors(SimulatedSource().anchors))
+    poses = ros.collect(PoseWithCovarianceStamped, "/uwb/pose")
+    truth = ros.collect(Odometry, "/uwb/odometry_truth")
+    pipeline = ros.start(
+        "pipeline", f"anchors:={path}", "level:=true", "start_delay:=0.2", "wait_for_subscribers:=0"
+    )
+    ros.spin_until(lambda: len(poses) > 20 and len(truth) > 20)
+    assert truth[0].child_frame_id == "tag_101"
+    assert pipeline.signal(signal.SIGINT) == 0, pipeline.output

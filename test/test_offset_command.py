@@ -1,0 +1,171 @@
+"""`uwb-mitigation offset`: the radios' offset from a known distance, and what of a recording is refused."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import command_line
+import numpy as np
+import pytest
+
+from uwb_mitigation.bag.writer import BagWriter
+from uwb_mitigation.errors import DatasetError, ParameterError
+from uwb_mitigation.evaluation.radio_offsets import FoundOffset, find_offset
+from uwb_mitigation.measurement import Record
+from uwb_mitigation.mitigation import Mitigation
+from uwb_mitigation.model.bundle import load_bundle
+from uwb_mitigation.model.shipped import default_model_path
+from uwb_mitigation.offsets import Offsets, parse_offsets
+from uwb_mitigation.sources.simulated import SimulatedSource
+
+
+@pytest.fixture(scope="module")
+def universal() -> Mitigation:
+    return Mitigation(load_bundle(default_model_path()))
+
+
+@pytest.fixture(scope="module")
+def direct() -> list[Record]:
+    """Simulated ranges of one pair, in line of sight, with their truth."""
+    seen = [
+        record
+        for record in SimulatedSource(seed=11, count=1500)
+        if record.truth is not None and record.truth.label == "LOS"
+    ]
+    return [
+        replace(record, measurement=replace(record.measurement, tag_id=1, anchor_id=2)) for record in seen
+    ]
+
+
+def longer(records: list[Record], by_m: float) -> Iterator[Record]:
+    for record in records:
+        measurement = record.measurement
+        yield replace(record, measurement=replace(measurement, range_m=measurement.range_m + by_m))
+
+
+def weaker_first_path(records: list[Record], by_db: float) -> Iterator[Record]:
+    for record in records:
+        cir = record.measurement.cir
+        cir = replace(cir, first_path_power_dbm=cir.first_path_power_dbm - by_db)
+        yield replace(record, measurement=replace(record.measurement, cir=cir))
+
+
+def at_one_place(found: FoundOffset) -> set[str]:
+    return {one.placement for one in found.placements if not one.refused}
+
+
+def test_an_offset_that_was_added_is_found(universal: Mitigation, direct: list[Record]):
+    before, after = find_offset(universal, direct), find_offset(universal, longer(direct, 0.625))
+    assert after.offset_m - before.offset_m == pytest.approx(0.625, abs=0.02)
+    assert after.sd_m == pytest.approx(before.sd_m, abs=0.02)
+    assert before.ranges >= 20
+    assert len(at_one_place(before)) > 1
+    # What the simulator adds for the boards: docs/simulator.md.
+    assert before.offset_m == pytest.approx(0.22, abs=3.0 * before.sd_m)
+    # What the mitigator has been told already does not count twice.
+    told = Mitigation(universal.bundle, Offsets(0.625))
+    assert find_offset(told, longer(direct, 0.625)).offset_m == pytest.approx(after.offset_m, abs=0.02)
+
+
+def test_ranges_of_one_place_leave_what_the_place_does(universal: Mitigation, direct: list[Record]):
+    one = direct[0]
+    found = find_offset(universal, [one] * 50, one.truth.range_m if one.truth else None)
+    assert found.placements[0].noise_sd_m < 0.01
+    assert found.sd_m >= 0.15
+
+
+def test_what_is_not_line_of_sight_is_refused_with_what_shows_it(universal: Mitigation, direct: list[Record]):
+    with pytest.raises(DatasetError, match=r"not line of sight: the first path is \d+\.\d dB below"):
+        find_offset(universal, weaker_first_path(direct, 9.0), 3.0)
+    with pytest.raises(DatasetError, match="tells no power of the first path"):
+        find_offset(universal, weaker_first_path(direct, float("nan")), 3.0)
+    with pytest.raises(DatasetError, match="m off: is the distance in metres"):
+        find_offset(universal, longer(direct, 20.0), 3.0)
+    with pytest.raises(DatasetError, match="5 ranges look like line of sight"):
+        find_offset(universal, [direct[0]] * 5, 3.0)
+    with pytest.raises(DatasetError, match="none of 20 ranges has a true distance"):
+        find_offset(universal, [replace(record, truth=None) for record in direct[:20]])
+
+
+def test_one_distance_is_that_of_one_pair(universal: Mitigation, direct: list[Record]):
+    two = [
+        replace(record, measurement=replace(record.measurement, anchor_id=2 + n % 2))
+        for n, record in enumerate(direct)
+    ]
+    with pytest.raises(ParameterError, match=r"2 pairs.*--anchor and --tag"):
+        find_offset(universal, two, 3.0)
+    found = find_offset(universal, two, anchor_id=3)
+    assert {one.anchor_id for one in found.placements} == {3}
+    with pytest.raises(DatasetError, match="no range of that anchor"):
+        find_offset(universal, two, anchor_id=9)
+
+
+def test_line_of_sight_of_the_real_logs_tells_the_boards_delay(apartment: Path, tmp_path: Path):
+    outcome = command_line.run(
+        "offset", apartment, "--truth", "--together", "-o", "o.yaml", "--json", "o.json",
+        "--model", default_model_path(), folder=tmp_path,
+    )  # fmt: skip
+    assert outcome.returncode == 0, outcome.stderr
+    result = json.loads((tmp_path / "o.json").read_text())
+    assert result["offset_m"] == pytest.approx(0.22, abs=2.0 * result["sd_m"])
+    assert 0.02 < result["sd_m"] < 0.1
+    refused = {pair["placement"].rpartition("/")[2] for pair in result["pairs"] if pair["refused"]}
+    # Behind a wall and a cabinet; in the open.
+    assert {"27", "51", "18"} <= refused
+    assert not {"12", "14", "5"} & refused
+    assert result["ranges"] == sum(pair["ranges"] for pair in result["pairs"])
+    offsets = parse_offsets((tmp_path / "o.yaml").read_text(), "o.yaml")
+    assert offsets.of(5, 6) == pytest.approx(result["offset_m"], abs=1e-6)
+    assert not offsets.pairs
+
+
+def test_what_is_written_is_what_the_other_commands_read(direct: list[Record], tmp_path: Path):
+    with BagWriter(tmp_path / "los.mcap", {"source": "test", "simulated": "true"}) as bag:
+        for record in longer(direct[:300], 0.5):
+            bag.write(record)
+    asked = ("offset", "los.mcap", "--truth", "-o", "o.yaml")
+    assert command_line.run(*asked, folder=tmp_path).returncode == 0
+    errors = {}
+    for name, options in {
+        "without": (),
+        "with": ("--offsets", "o.yaml"),
+        "number": ("--offsets", "0.5"),
+    }.items():
+        done = command_line.run(
+            "evaluate", "--data", "los.mcap", *options, "--json", "e.json", folder=tmp_path
+        )
+        assert done.returncode == 0, done.stderr
+        errors[name] = json.loads((tmp_path / "e.json").read_text())["corrected"]["mae"]
+    assert errors["with"] < 0.5 * errors["without"]
+    assert errors["number"] < errors["without"]
+    wrong = command_line.run("evaluate", "--data", "los.mcap", "--offsets", "220", folder=tmp_path)
+    assert wrong.returncode != 0
+    assert "millimetres" in wrong.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ((), "one of --distance and --truth"),
+        (("--distance", "5", "--truth"), "one of --distance and --truth"),
+        (("--distance", "-5"), "distance = -5.0"),
+        (("--distance", "nan"), "distance = nan"),
+        (("--truth", "-o", "none/o.yaml"), "a file in a folder that exists"),
+        (("--truth", "--anchor", "door"), "anchor = 'door'"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_before_the_work(options: tuple[str, ...], said: str, tmp_path: Path):
+    outcome = command_line.run("offset", "none.mcap", *options, folder=tmp_path)
+    assert outcome.returncode != 0
+    assert said in outcome.stderr
+
+
+def test_the_spread_of_a_few_wild_ranges_moves_nothing(universal: Mitigation, direct: list[Record]):
+    one = direct[0]
+    wild = [*[one] * 40, *longer([one] * 5, 8.0)]
+    distance = one.truth.range_m if one.truth else 1.0
+    calm = find_offset(universal, [one] * 40, distance)
+    assert np.isclose(find_offset(universal, wild, distance).offset_m, calm.offset_m, atol=1e-6)

@@ -1,0 +1,155 @@
+"""docs/site.md as its reader goes through it: every command, in order, with emulated boards.
+
+A block of `bash` on the page is typed as it stands. Its first line may name a terminal (`# terminal: driver`): what
+is typed there stays, until the next block for that terminal interrupts it.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from conftest import REPOSITORY
+
+pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
+
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from ros_harness import Ros, domain
+
+from uwb_mitigation.sources.recorded_ranges import read_ranges
+from uwb_mitigation.sources.site import load_anchors
+
+pytestmark = [
+    pytest.mark.ros,
+    pytest.mark.slow,
+    pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc"),
+]
+
+PAGE = REPOSITORY / "docs" / "site.md"
+FENCED = re.compile(r"^```(\w+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+TERMINAL = re.compile(r"# terminal: (\w+)\n")
+TIMEOUT_S = 240.0
+
+
+class Terminals:
+    """One shell for what ends, and one of its own for each name of what stays."""
+
+    def __init__(self, folder: Path, environment: dict[str, str]) -> None:
+        self.folder = folder
+        self._environment = environment
+        self._open: dict[str, subprocess.Popen[bytes]] = {}
+
+    def type(self, text: str) -> None:
+        """Wait for its end, unless it names a terminal."""
+        named = TERMINAL.match(text)
+        name = named.group(1) if named else "first"
+        self._interrupt(name)
+        if named and not text[named.end() :].strip():
+            return
+        with (self.folder / f"{name}.log").open("ab") as out:
+            shell = subprocess.Popen(
+                ["bash", "-e", "-c", text],
+                cwd=self.folder,
+                env=self._environment,
+                stdout=out,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+        if named:
+            self._open[name] = shell
+            # As a reader waits for the ports.
+            deadline = time.monotonic() + TIMEOUT_S
+            while "--link board" in text and not (self.folder / "board1").exists():
+                assert shell.poll() is None, self._printed()
+                assert time.monotonic() < deadline, self._printed()
+                time.sleep(0.1)
+            return
+        try:
+            code = shell.wait(TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            os.killpg(shell.pid, signal.SIGKILL)
+            code = None
+        assert code == 0, f"{code} of:\n{text}\n{self._printed()}"
+
+    def _interrupt(self, name: str) -> None:
+        """Ctrl-C, and wait for the end of what was typed there."""
+        shell = self._open.pop(name, None)
+        if shell is not None:
+            assert shell.poll() is None, f"{name} has ended by itself\n{self._printed()}"
+            os.killpg(shell.pid, signal.SIGINT)
+            shell.wait(60.0)
+
+    def close(self) -> None:
+        for shell in self._open.values():
+            os.killpg(shell.pid, signal.SIGKILL)
+            shell.wait(60.0)
+
+    def _printed(self) -> str:
+        return "\n".join(f"--- {log.name}\n{log.read_text()[-3000:]}" for log in self.folder.glob("*.log"))
+
+
+@pytest.fixture
+def ros(tmp_path: Path) -> Iterator[Ros]:
+    with domain(tmp_path) as ros:
+        yield ros
+
+
+@pytest.fixture
+def terminals(tmp_path: Path, ros: Ros) -> Iterator[Terminals]:
+    tools, folder = tmp_path / "tools", tmp_path / "a site"
+    tools.mkdir()
+    folder.mkdir()
+    stand_in = Path(__file__).with_name("ros2_stand_in.py")
+    for name, what in (("uwb-mitigation", "-m uwb_mitigation.cli"), ("ros2", f'"{stand_in}"')):
+        (tools / name).write_text(f'#!/bin/sh\nexec "{sys.executable}" {what} "$@"\n')
+        (tools / name).chmod(0o755)
+    environment = os.environ | {
+        "PATH": f"{tools}:{os.environ['PATH']}",
+        "PYTHONPATH": f"{REPOSITORY}:{os.environ.get('PYTHONPATH', '')}",
+        "ROS_DOMAIN_ID": str(ros.domain),
+        "PYTHONUNBUFFERED": "1",
+        "COLUMNS": "160",
+        "RECORDED_RANGES": "look 20 first 300 second 50 los 30",
+    }
+    opened = Terminals(folder, environment)
+    yield opened
+    opened.close()
+
+
+def test_every_command_of_the_page_is_in_a_block_that_is_run():
+    """None is typed in prose or in an indented block, where the test below would pass it by."""
+    rest = FENCED.sub("", PAGE.read_text(encoding="utf-8"))
+    assert not re.findall(r"^ {4,}(?:uwb-mitigation|ros2) .*", rest, re.MULTILINE)
+
+
+def test_the_page_leads_from_boards_to_a_robot_that_knows_where_it_is(terminals: Terminals, ros: Ros):
+    folder = terminals.folder
+    poses = ros.collect(PoseWithCovarianceStamped, "/uwb/pose")
+    for kind, text in FENCED.findall(PAGE.read_text(encoding="utf-8")):
+        if kind == "text":
+            (folder / "anchors.yaml").write_text(text)
+            continue
+        assert kind == "bash", f"who types {kind}? {text}"
+        terminals.type(text)
+        if "pipeline" in text:
+            ros.spin_until(lambda: len(poses) > 5, TIMEOUT_S)
+    anchors = load_anchors(folder / "anchors.yaml")
+    # The page's anchors are those that its boards find.
+    recorded = read_ranges(folder / "first", anchors)
+    assert not recorded.strangers
+    assert {int(row) for tag in recorded.tags for row in tag.raw.anchor} == set(range(len(anchors)))
+    shown = "".join(log.read_text() for log in folder.glob("*.log"))
+    for anchor in anchors.anchors:
+        assert f"{anchor.id:016x}" in shown
+    # In the flat, not beyond its walls.
+    at = poses[-1].pose.pose.position
+    assert -1.0 < at.x < 10.0
+    assert -1.0 < at.y < 8.0
