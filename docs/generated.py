@@ -1,4 +1,5 @@
-"""Writes what pages take from the code, between `<!-- generated: NAME -->` and `<!-- end -->`. No Sphinx here.
+"""Writes what pages take from the code, between `<!-- generated: NAME -->` and `<!-- end -->`, and the parameter
+files in `params/`. No Sphinx here, and no ROS.
 
     python docs/generated.py
 
@@ -7,17 +8,27 @@ A test holds the pages and the code together.
 
 from __future__ import annotations
 
+import ast
+import enum
 import re
+import textwrap
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import typer
 from typer.cli import get_docs_for_click
 
 from uwb_mitigation import cli
+from uwb_mitigation.link import layout
+from uwb_mitigation.link.layout import Layout, MessageType
+from uwb_mitigation.nodes.parameter_tables import TABLES
 
 PAGES = Path(__file__).resolve().parent
-MESSAGES = PAGES.parent / "msg_defs" / "msg"
+REPOSITORY = PAGES.parent
+PACKAGE = REPOSITORY / "uwb_mitigation"
+MESSAGES = REPOSITORY / "msg_defs" / "msg"
+PARAMETERS = REPOSITORY / "params"
 
 _MARKED = re.compile(r"^(<!-- generated: (\w+) -->\n).*?^(<!-- end -->)$", re.MULTILINE | re.DOTALL)
 _LISTS = re.compile(r"^\*\*Commands\*\*:\n\n(?:\* .*\n)+\n*", re.MULTILINE)
@@ -34,9 +45,41 @@ def fill(page: str) -> str:
 
 
 def files() -> dict[Path, str]:
-    """Every page with marks, and its text as it should be."""
+    """Every page with marks and every parameter file, and its text as it should be."""
     pages = {path: path.read_text(encoding="utf-8") for path in sorted(PAGES.glob("*.md"))}
-    return {path: fill(page) for path, page in pages.items() if _MARKED.search(page)}
+    texts = {path: fill(page) for path, page in pages.items() if _MARKED.search(page)}
+    return texts | {PARAMETERS / f"{node}.yaml": parameter_file(node) for node in TABLES}
+
+
+def parameter_file(node: str) -> str:
+    """A ROS parameter file that holds every parameter at its default, with its meaning."""
+    lines = [f"# Parameters of the {node} node, at their defaults.", "/**:", "  ros__parameters:"]
+    for row in TABLES[node]:
+        lines += [f"    # {line}" for line in textwrap.wrap(f"{row.description} ({row.valid})", 100)]
+        # What the user has to say is shown, and left out.
+        lines.append(
+            f"    {'' if row.filed else '# '}{row.name}: {row.default_text if row.filed else ''}".rstrip()
+        )
+    return "\n".join(lines) + "\n"
+
+
+def parameters() -> str:
+    """The parameters of every node: a table each."""
+    lines: list[str] = []
+    for node, table in TABLES.items():
+        lines += [
+            f"## `{node}`",
+            "",
+            "| name | default | unit | valid | changes live | meaning |",
+            "|---|---|---|---|---|---|",
+        ]
+        lines += [
+            f"| `{row.name}` | `{row.default_text}` | {row.unit or '-'} | {row.valid} "
+            f"| {'yes' if row.live else 'no'} | {row.description} |"
+            for row in table
+        ]
+        lines.append("")
+    return "\n".join(lines)
 
 
 def messages() -> str:
@@ -70,7 +113,89 @@ def commands() -> str:
     return sections[sections.index("\n## ") :]
 
 
-PARTS = {"messages": messages, "commands": commands}
+_WIRE_TYPES = {"B": "u8", "H": "u16", "I": "u32", "Q": "u64", "i": "i32", "f": "f32"}
+
+
+def wire_layout(table: Layout) -> str:
+    """One header or payload of the wire protocol: its type, its length and its fields."""
+    number = f"Type {MessageType[table.name].value}; " if table.name in MessageType.__members__ else ""
+    if not table.fields:
+        return f"{number}no payload."
+    tail = f", then {table.tail}" if table.tail else ""
+    lines = [
+        f"{number}{table.packing().size} bytes{tail}.",
+        "",
+        "| byte | type | field | meaning |",
+        "|---|---|---|---|",
+    ]
+    for field in table.fields:
+        if field.name in table.offsets():
+            kind = _WIRE_TYPES.get(field.code) or f"{field.code[:-1]} bytes"
+            lines.append(f"| {table.offsets()[field.name]} | {kind} | `{field.name}` | {field.meaning} |")
+    return "\n".join(lines)
+
+
+def wire_values(*kinds: type[enum.IntEnum]) -> str:
+    """What the values of enumerations mean."""
+    lines = ["| value | name |", "|---|---|"]
+    return "\n".join(lines + [f"| {member.value} | {member.name} |" for kind in kinds for member in kind])
+
+
+def wire_limits() -> str:
+    """How long the parts of a frame may be."""
+    return f"""\
+| limit | bytes |
+|---|---|
+| payload | {layout.MAX_PAYLOAD_BYTES} |
+| header, payload and CRC | {layout.MAX_FRAME_BYTES} |
+| the same after COBS, without delimiters | {layout.MAX_ENCODED_BYTES} |
+
+| limit | int16 values |
+|---|---|
+| samples of a RANGE_CIR ({layout.MAX_SAMPLES // 2} complex ones) | {layout.MAX_SAMPLES} |"""
+
+
+def layers() -> str:
+    """The package's parts, each layer above what it may import, as the contract in pyproject.toml has them."""
+    return "\n".join(["```text", *(layer.replace(" |", ",") for layer in _layers()), "```"])
+
+
+def parts() -> str:
+    """What lives in each part, as its own docstring says."""
+    lines = ["| part | what lives there |", "|---|---|"]
+    for name in (name for layer in _layers() for name in re.findall(r"\w+", layer)):
+        folder = (PACKAGE / name).is_dir()
+        module = PACKAGE / name / "__init__.py" if folder else PACKAGE / f"{name}.py"
+        told = ast.get_docstring(ast.parse(module.read_text(encoding="utf-8"))) or ""
+        about = " ".join(told.partition("\n\n")[0].split()).replace("|", "\\|")
+        lines.append(f"| `{name}{'/' if folder else '.py'}` | {about} |")
+    return "\n".join(lines)
+
+
+def _layers() -> list[str]:
+    from importlinter.api import read_configuration  # no need of what else is here
+
+    contracts = read_configuration(str(REPOSITORY / "pyproject.toml"))["contracts_options"]
+    (found,) = (contract["layers"] for contract in contracts if contract["type"] == "layers")
+    return [str(layer) for layer in found]
+
+
+PARTS = {
+    "messages": messages,
+    "parameters": parameters,
+    "commands": commands,
+    "layers": layers,
+    "parts": parts,
+    "wire_limits": wire_limits,
+    "wire_modes": partial(wire_values, layout.Mode),
+    "wire_roles": partial(wire_values, layout.Role),
+    "wire_radio_states": partial(wire_values, layout.RadioState),
+    "wire_offset_of": partial(wire_values, layout.OffsetOf),
+    "wire_log_levels": partial(wire_values, layout.LogLevel),
+} | {
+    f"wire_{each.name}": partial(wire_layout, each)
+    for each in (layout.HEADER, layout.RADIO_ANCHOR, layout.OFFSET, *layout.PAYLOADS.values())
+}
 
 
 if __name__ == "__main__":

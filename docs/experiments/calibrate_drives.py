@@ -1,0 +1,273 @@
+"""How well a site calibrates from a drive whose truth nobody knows. Simulated: no radio was involved.
+
+For each seed the simulator's flat, which the universal model was not trained on (or with --building a random building that
+it did not see), 4 to 8 anchors, radios with offsets of their own, a drive to calibrate from, and another drive of the same building to test on. Beside it stands what `train`
+makes of the true ranges of the same drive.
+
+    python docs/experiments/calibrate_drives.py --seeds 10 -o drives.json
+    python docs/experiments/calibrate_drives.py --seeds 3 --truth-topic      # a localisation that lags, a lever arm
+    python docs/experiments/calibrate_drives.py --minutes 30                 # time and memory alone
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import resource
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from uwb_mitigation.dataset import build_dataset
+from uwb_mitigation.evaluation.site_data import gather
+from uwb_mitigation.measurement import Record
+from uwb_mitigation.mitigation import Mitigation, correct_batch
+from uwb_mitigation.model.bundle import Bundle, load_bundle
+from uwb_mitigation.model.shipped import default_model_path
+from uwb_mitigation.offsets import NO_OFFSETS, Offsets
+from uwb_mitigation.positioning.anchors import AnchorMap
+from uwb_mitigation.positioning.localised import PosePath
+from uwb_mitigation.positioning.locator import TagLocator, run_live
+from uwb_mitigation.positioning.model import Model
+from uwb_mitigation.positioning.start import Height
+from uwb_mitigation.positioning.track_errors import track_errors
+from uwb_mitigation.positioning.tracks import Ranges, TruePath
+from uwb_mitigation.simulation.buildings import KINDS, RADIO, draw_plan
+from uwb_mitigation.simulation.radio import Radio
+from uwb_mitigation.simulation.scene import ANCHORS, FLAT, MORE_ANCHORS, ROUTE
+from uwb_mitigation.sources.simulated import SimulatedSource
+from uwb_mitigation.training import calibrating, making
+
+UNSEEN = 7_000_000
+"""Added to the seed of a building: the universal model's begin at 0 and at 1 000 003."""
+
+RATE_HZ = 40.0
+LAG_S, LEVER_M = 0.3, (0.4, 0.0, 0.0)
+
+
+class Drive:
+    """A drive through a simulated building; a `Source` whose pairs have offsets."""
+
+    simulated = True
+
+    def __init__(
+        self, seed: int, drive: int, anchors: int, seconds: float, building: str | None = None
+    ) -> None:
+        rng = np.random.default_rng(UNSEEN + seed)
+        if building is None:
+            plan, radio, route, places = (
+                FLAT,
+                Radio(range_offset_m=0.0),
+                ROUTE,
+                (ANCHORS + MORE_ANCHORS)[:anchors],
+            )
+            route = route[drive * 5 :] + route[: drive * 5]
+        else:
+            plan, radio = draw_plan(next(kind for kind in KINDS if kind.name == building), rng), RADIO
+            x, y = plan.size
+            # Along the walls, evenly, 0.3 m before them.
+            turn = (np.arange(anchors) / anchors + rng.uniform(0.0, 1.0 / anchors)) % 1.0
+            places = tuple(_on_wall(part, x - 0.6, y - 0.6) for part in turn.tolist())
+            inset = 0.18 + 0.08 * drive
+            route = (
+                (inset * x, inset * y),
+                ((1 - inset) * x, inset * y),
+                ((1 - inset) * x, (1 - inset) * y),
+                (0.5 * x, (0.5 + 0.1 * drive) * y),
+                (inset * x, (1 - inset) * y),
+            )
+        self.offset_m = 0.2 + rng.normal(0.0, 0.12, anchors)
+        self._inner = SimulatedSource(
+            seed=seed * 1000 + drive, count=round(seconds * RATE_HZ), rate_hz=RATE_HZ,
+            anchors=places, plan=plan, radio=radio, route=route,
+        )  # fmt: skip
+        self.anchors: AnchorMap = self._inner.anchors
+        self.name = self._inner.name
+
+    def __iter__(self) -> Iterator[Record]:
+        for record in self._inner:
+            measured = record.measurement
+            off = float(self.offset_m[measured.anchor_id - 1])
+            yield replace(record, measurement=replace(measured, range_m=measured.range_m + off))
+
+
+def _on_wall(part: float, x: float, y: float) -> tuple[float, float]:
+    along = part * 2.0 * (x + y)
+    if along < x:
+        return 0.3 + along, 0.3
+    if along < x + y:
+        return 0.3 + x, 0.3 + along - x
+    if along < 2.0 * x + y:
+        return 0.3 + 2.0 * x + y - along, 0.3 + y
+    return 0.3, 0.3 + 2.0 * (x + y) - along
+
+
+def error_of(records: list[Record], bundle: Bundle | None, offsets: Offsets) -> float:
+    """MAE of the corrected ranges, m; without a bundle, of the raw ones."""
+    truth = np.array([record.truth.range_m for record in records if record.truth is not None])
+    if bundle is None:
+        return float(np.abs(np.array([record.measurement.range_m for record in records]) - truth).mean())
+    corrected = correct_batch(Mitigation(bundle, offsets), [record.measurement for record in records])
+    return float(np.abs(np.array([one.range_m for one in corrected]) - truth).mean())
+
+
+def position_rmse(
+    records: list[Record], anchors: AnchorMap, bundle: Bundle | None, offsets: Offsets
+) -> float:
+    """Of the live track, m."""
+    stamps = np.array([record.measurement.stamp_ns for record in records], np.int64)
+    truth = TruePath(stamps, np.array([record.tag_position for record in records], float))
+    row = np.array([anchors.index[record.measurement.anchor_id] for record in records])
+    value = np.array([record.measurement.range_m for record in records])
+    variance = np.full(len(value), np.nan)
+    if bundle is not None:
+        corrected = correct_batch(Mitigation(bundle, offsets), [record.measurement for record in records])
+        value = np.array([one.range_m for one in corrected])
+        variance = np.array([one.variance_m2 for one in corrected])
+    ranges = Ranges(stamps, row, np.maximum(value, 0.0), variance, np.full(len(value), np.nan), 101)
+    track = run_live(ranges, TagLocator(anchors, Model(), height=Height(0.0, 0.05))).track
+    return track_errors(track, truth).rmse
+
+
+def trained(records: list[Record], universal: Bundle, folder: Path) -> Bundle:
+    """What `train --data` makes of the drive's true ranges, a configuration a metre and pair as the simulator names."""
+    dataset = build_dataset(records, universal.preprocessing)
+    from uwb_mitigation.model.architecture import Remnet
+    from uwb_mitigation.training.choosing import ALONE
+    from uwb_mitigation.training.options import FitOptions
+    from uwb_mitigation.training.recipe import Recipe
+
+    recipe = Recipe(Remnet(samples=universal.preprocessing.samples), FitOptions())
+    return making.of_recipe(
+        dataset, "drive", recipe, ALONE, "auto", folder / "trained.onnx", 4, lambda what, share: None
+    ).bundle
+
+
+def one(
+    seed: int, seconds: float, truth_topic: bool, with_train: bool, building: str | None
+) -> dict[str, object]:
+    """A building."""
+    universal = load_bundle(default_model_path())
+    anchors = 4 + seed % 5
+    drive, other = (Drive(seed, which, anchors, seconds, building) for which in (0, 1))
+    records = list(drive)
+    site = gather([records], drive.anchors, universal.preprocessing)
+    began = time.perf_counter()
+    height = Height(0.0, 0.05)
+    if truth_topic:
+        # The robot looks along its way; its antenna is ahead of its frame, and its localisation is late.
+        stamps = np.array([record.measurement.stamp_ns for record in records], np.int64)
+        antenna = np.array([record.tag_position for record in records], float)
+        heading = _headings(antenna)
+        frame = antenna - np.stack(
+            [LEVER_M[0] * np.cos(heading), LEVER_M[0] * np.sin(heading), np.zeros_like(heading)], axis=1
+        )
+        noise = np.random.default_rng(seed).normal(0.0, 0.02, frame.shape) * (1.0, 1.0, 0.0)
+        quaternion = np.stack(
+            [np.zeros_like(heading), np.zeros_like(heading), np.sin(heading / 2), np.cos(heading / 2)], axis=1
+        )
+        path = PosePath(stamps + round(LAG_S * 1e9), frame + noise, quaternion)
+        found = calibrating.with_truth(
+            site, universal, [path], "/odom", time_offset_s=None, lever_arm_m=None, seed=0
+        )
+    else:
+        found = calibrating.without_truth(site, universal, height=height, area=None, seed=0)
+    took = time.perf_counter() - began
+    test = list(other)
+    off = np.array([found.pair_m[101, k + 1][0] for k in range(anchors) if (101, k + 1) in found.pair_m])
+    sd = np.array([found.pair_m[101, k + 1][1] for k in range(anchors) if (101, k + 1) in found.pair_m])
+    true = np.array([drive.offset_m[k] for k in range(anchors) if (101, k + 1) in found.pair_m])
+    with tempfile.TemporaryDirectory() as folder:
+        bundle, _ = calibrating.write(Path(folder) / "site.onnx", found, universal, "drive")
+        row: dict[str, object] = {
+            "seed": seed,
+            "anchors": anchors,
+            "building": building or "the flat",
+            "chosen": found.choice.chosen,
+            "level": found.level,
+            "seconds": took,
+            "raw_mae": error_of(test, None, NO_OFFSETS),
+            "calibrated_mae": error_of(test, bundle, found.offsets),
+            "raw_rmse": position_rmse(test, drive.anchors, None, NO_OFFSETS),
+            "calibrated_rmse": position_rmse(test, drive.anchors, bundle, found.offsets),
+            "offset_mae": float(np.abs(off - true).mean()),
+            "offset_worst": float(np.abs(off - true).max()),
+            "in_two_sd": float((np.abs(off - true) <= 2.0 * sd).mean()),
+            "sd": float(sd.mean()),
+        }
+        if found.localised is not None:
+            row["time_offset_error"] = found.localised.time_offset_s - LAG_S
+            row["lever_error"] = (found.localised.lever_arm_m - LEVER_M).tolist()
+        if with_train:
+            bundle = trained(records, universal, Path(folder))
+            row["trained_mae"] = error_of(test, bundle, NO_OFFSETS)
+    return row
+
+
+def _headings(position: np.ndarray) -> np.ndarray:
+    ahead = np.minimum(np.arange(len(position)) + 20, len(position) - 1)
+    before = np.maximum(np.arange(len(position)) - 20, 0)
+    away = position[ahead] - position[before]
+    return np.arctan2(away[:, 1], away[:, 0])
+
+
+def speed(minutes: float) -> dict[str, object]:
+    """Time and memory of one long drive."""
+    universal = load_bundle(default_model_path())
+    drive = Drive(1, 0, 6, 60.0 * minutes)
+    site = gather([drive], drive.anchors, universal.preprocessing)
+    began, cpu = time.perf_counter(), time.process_time()
+    found = calibrating.without_truth(site, universal, height=Height(0.0, 0.05), area=None, seed=0)
+    return {
+        "minutes": minutes,
+        "ranges": sum(map(len, site.tags)),
+        "seconds": time.perf_counter() - began,
+        "cpu_seconds": time.process_time() - cpu,
+        "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "chosen": found.choice.chosen,
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--seconds", type=float, default=240.0)
+    parser.add_argument("--minutes", type=float, help="one drive of so many, for time and memory")
+    parser.add_argument(
+        "--building", choices=[kind.name for kind in KINDS], help="a random one, not the flat"
+    )
+    parser.add_argument("--truth-topic", action="store_true")
+    parser.add_argument("--no-train", action="store_true")
+    parser.add_argument("-o", "--output", type=Path)
+    arguments = parser.parse_args()
+    rows = []
+    if arguments.minutes:
+        rows.append(speed(arguments.minutes))
+        print(json.dumps(rows[0]))
+    else:
+        for seed in range(arguments.first, arguments.first + arguments.seeds):
+            row = one(
+                seed, arguments.seconds, arguments.truth_topic, not arguments.no_train, arguments.building
+            )
+            rows.append(row)
+            print(
+                json.dumps({k: round(v, 4) if isinstance(v, float) else v for k, v in row.items()}),
+                flush=True,
+            )
+        numbers = [key for key, value in rows[0].items() if isinstance(value, float)]
+        mean = {key: round(math.fsum(float(row[key]) for row in rows) / len(rows), 4) for key in numbers}  # type: ignore[arg-type]
+        print(json.dumps({"mean": mean}))
+    if arguments.output:
+        arguments.output.write_text(json.dumps(rows, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,100 @@
+"""Calibration without truth on real recordings, whose truth then tells what it brought.
+
+    python docs/experiments/calibrate_logs.py hanyang ../shared/data/hanyang_outdoor LOS_A1
+    python docs/experiments/calibrate_logs.py apartment ../shared/data/evk1000_apartment
+
+Of Hanyang's runs one is calibrated from, and the others tracked with and without its offsets and line (no CIRs). Of the
+EVK1000 logs, of tags at rest, all are calibrated from, and the ranges' errors told before and after: the surveyed
+distances are used for nothing else.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from uwb_mitigation.benches.positions import at_truths, hanyang_run
+from uwb_mitigation.evaluation.site_data import gather
+from uwb_mitigation.model.bundle import load_bundle
+from uwb_mitigation.model.shipped import default_model_path
+from uwb_mitigation.positioning.locator import TagLocator, run_live
+from uwb_mitigation.positioning.model import Model
+from uwb_mitigation.positioning.smoother import Smoother
+from uwb_mitigation.positioning.start import Height
+from uwb_mitigation.positioning.tracks import Ranges
+from uwb_mitigation.sources.decaranging import DecaRangingFolder
+from uwb_mitigation.sources.hanyang import ANTENNA_M, HanyangRun
+from uwb_mitigation.training.calibrating import Calibrated, without_truth
+
+HEIGHT = Height(ANTENNA_M, 0.2)
+
+
+def told(found: Calibrated) -> None:
+    print(found.sentence())
+    print({f"{tag}-{anchor}": f"{v:.3f}+-{sd:.3f}" for (tag, anchor), (v, sd) in found.pair_m.items()})
+    print(found.choice.prior, found.notes)
+
+
+def hanyang(folder: Path, name: str) -> None:
+    source = load_bundle(default_model_path())
+    run = HanyangRun(folder / name)
+    found = without_truth(
+        gather([run], run.anchors, source.preprocessing), source, height=HEIGHT, area=None, seed=0
+    )
+    told(found)
+    for other in sorted(path for path in folder.iterdir() if path.is_dir() and path.name != name):
+        test = HanyangRun(other)
+        anchors, ranges, _, truth = hanyang_run(other)
+        ids = np.array([anchor.id for anchor in anchors.anchors], np.uint64)
+        off = found.offsets.of_columns(np.full(len(ranges), ranges.tag_id), ids[ranges.anchor]).astype(float)
+        first = np.array([record.measurement.cir.first_path_power_dbm for record in test])
+        line = found.choice.prior.predict_batch_m(ranges.rx_power_dbm, first).astype(float)
+        less = off + np.where(np.isfinite(line), line, 0.0)
+        for kind, value in (("raw", ranges.range_m), ("calibrated", np.maximum(ranges.range_m - less, 0.0))):
+            shifted = Ranges(ranges.stamp_ns, ranges.anchor, value, ranges.variance_m2, ranges.rx_power_dbm)
+            live = run_live(shifted, TagLocator(anchors, Model(), height=HEIGHT)).track
+            smoothed = Smoother(anchors, Model(), shifted, height=HEIGHT).fit(live).track
+            one, two = (at_truths(track, truth) for track in (live, smoothed))
+            print(
+                f"{other.name} {kind}: live {one.rmse:.3f} m, in ellipse {one.coverage95:.1%}; "
+                f"smoothed {two.rmse:.3f} m, {two.coverage95:.1%}",
+                flush=True,
+            )
+
+
+def apartment(folder: Path) -> None:
+    source = load_bundle(default_model_path())
+    with DecaRangingFolder(folder) as logs:
+        records = list(logs)
+        anchors = logs.anchors
+    found = without_truth(
+        gather([records], anchors, source.preprocessing), source, height=Height(0.0, 0.05), area=None, seed=0
+    )
+    told(found)
+    true = {}
+    for record in records:
+        if record.truth is not None:
+            true[record.measurement.tag_id, record.measurement.anchor_id] = record.truth.range_m
+    data = found.data
+    assert data.tags is not None
+    assert data.anchors is not None
+    pairs = list(zip(data.tags.tolist(), data.anchors.tolist(), strict=True))
+    distance = np.array([true.get(pair, np.nan) for pair in pairs])
+    off = found.offsets.of_columns(data.tags, data.anchors).astype(float)
+    # What is held out is told against the track: so much further is the truth.
+    pseudo = data.range_m - data.error_m
+    left = found.choice.held_out[found.choice.chosen] + pseudo - distance
+    known = np.isfinite(distance)
+    raw = (data.range_m + off - distance)[known]
+    print(
+        f"{known.sum()} ranges: MAE {np.abs(raw).mean():.3f} m raw, {np.abs(left[known]).mean():.3f} m calibrated"
+    )
+
+
+if __name__ == "__main__":
+    if sys.argv[1] == "hanyang":
+        hanyang(Path(sys.argv[2]), sys.argv[3])
+    else:
+        apartment(Path(sys.argv[2]))

@@ -1,0 +1,48 @@
+"""A line, the simulated network, and their mean on few configurations: docs/evaluation.md, *Few configurations*.
+
+Arguments: the folder of the logs, and how many draws (60).
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from uwb_mitigation.dataset import build_dataset
+from uwb_mitigation.evaluation import lad
+from uwb_mitigation.model.architecture import Remnet
+from uwb_mitigation.model.bundle import load_bundle
+from uwb_mitigation.model.runtime import Session
+from uwb_mitigation.model.shipped import default_model_path
+from uwb_mitigation.preprocessing import Preprocessing
+from uwb_mitigation.sources.decaranging import DecaRangingFolder
+from uwb_mitigation.training import choosing, cold_start
+from uwb_mitigation.training.choosing import line
+from uwb_mitigation.training.options import FitOptions
+from uwb_mitigation.training.recipe import Recipe, prior_m
+
+data = build_dataset(DecaRangingFolder(Path(sys.argv[1])), Preprocessing())
+data = data.rows(np.isfinite(data.rx_power_dbm - data.first_path_power_dbm))
+network_m = Session(load_bundle(default_model_path())).predict_batch_m(data.inputs)
+draws = int(sys.argv[2]) if len(sys.argv) > 2 else 60
+for count in (6, 9, 12, 15, 18, 21):
+    generator, maes = np.random.default_rng(count), []
+    for _ in range(draws):
+        seen = np.isin(data.configurations, generator.permutation(data.names)[:count])
+        train, test, names = data.rows(seen), data.rows(~seen), data.configurations[seen]
+        constant = lad.constant(names, train.error_m).offset_m
+        own_line = prior_m(line(train), test)
+        network = network_m[~seen] + lad.constant(names, train.error_m - network_m[seen]).offset_m
+        predicted = (constant, own_line, network, (own_line + network) / 2)
+        maes.append([np.abs(test.error_m - values).mean() for values in predicted])
+    table = np.array(maes)
+    print(count, *table.mean(axis=0).round(3), f"{np.mean(table[:, 3] < table[:, 1]):.0%}")
+
+# Of all of them, by 6 folds of placements, what `train` chooses from; networks that are trained on them are left out.
+plain = [item for item in choosing.standard(Recipe(Remnet(), FitOptions())) if not item.trains]
+choice = choosing.choose(data, cold_start.offered(plain, data, load_bundle(default_model_path())), 6, 0)
+print({name: round(mae, 3) for name, mae in choice.mae().items()})
+is_27 = data.configurations == "evk1000_apartment/27"
+print(
+    {name: round(float(np.abs(left[~is_27]).mean()), 3) for name, left in choice.errors.items()}, "without 27"
+)

@@ -1,0 +1,65 @@
+"""How far the NEES of a single run may be from 1 where the model is exactly right: docs/positioning.md.
+
+Each of Hanyang's runs is driven again with its own times, anchors and true path, and with ranges that err just as the
+model says; 20 times. Arguments: the folder of the runs, and how often.
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from uwb_mitigation.benches.positions import HEIGHT, at_truths, hanyang_run
+from uwb_mitigation.positioning.anchors import AnchorMap
+from uwb_mitigation.positioning.locator import TagLocator, run_live
+from uwb_mitigation.positioning.model import Model
+from uwb_mitigation.positioning.smoother import Smoother
+from uwb_mitigation.positioning.tracks import Ranges, TruePath
+
+
+def erring(
+    ranges: Ranges, path: TruePath, anchors: AnchorMap, model: Model, rng: np.random.Generator
+) -> Ranges:
+    """The same ranges with errors by the model: white, persisting, of each pair, of all, and misplaced anchors."""
+    true = path.at(ranges.stamp_ns)
+    known = np.isfinite(true).all(axis=1)
+    ranges, true = ranges.take(known), true[known]
+    place = anchors.position + rng.normal(0.0, anchors.sd[:, None], anchors.position.shape)
+    error = rng.normal(0.0, np.sqrt(model.white) * model.range_sd, len(ranges)) + rng.normal(
+        0.0, model.offset_sd
+    )
+    for row in range(len(anchors)):
+        own = np.flatnonzero(ranges.anchor == row)
+        kept = np.exp(-np.diff(ranges.stamp_ns[own], prepend=0) / 1e9 / model.persistence_s)
+        new = rng.normal(0.0, np.sqrt(1.0 - model.white) * model.range_sd, len(own))
+        persisting = 0.0
+        for i, k in zip(own, range(len(own)), strict=True):
+            persisting = kept[k] * persisting + np.sqrt(1.0 - kept[k] ** 2) * new[k]
+            error[i] += persisting
+    distance = np.linalg.norm(true - place[ranges.anchor], axis=1)
+    return Ranges(
+        ranges.stamp_ns,
+        ranges.anchor,
+        np.maximum(distance + error, 0.0),
+        ranges.variance_m2,
+        ranges.rx_power_dbm,
+        ranges.tag_id,
+    )
+
+
+again = int(sys.argv[2]) if len(sys.argv) > 2 else 20
+model = Model()
+for folder in sorted(Path(sys.argv[1]).glob("*_*")):
+    anchors, ranges, path, window = hanyang_run(folder)
+    found = []
+    for seed in range(again):
+        drawn = erring(ranges, path, anchors, model, np.random.default_rng(seed))
+        live = run_live(drawn, TagLocator(anchors, model, height=HEIGHT)).track
+        smoothed = Smoother(anchors, model, drawn, height=HEIGHT).fit(live).track
+        found.append([at_truths(track, window).nees_per_dof for track in (live, smoothed)])
+    low, middle, high = np.percentile(found, (5, 50, 95), axis=0)
+    print(
+        f"{folder.name:8} NEES/dof of {again}: live {low[0]:.2f} to {high[0]:.2f}, median {middle[0]:.2f};"
+        f" smoothed {low[1]:.2f} to {high[1]:.2f}, median {middle[1]:.2f}",
+        flush=True,
+    )

@@ -1,0 +1,17 @@
+"""How fast the simulator makes buildings as arrays: docs/simulator.md, *Speed*.
+
+Arguments: how many placements, in hundreds of thousands or less.
+"""
+
+import sys
+import time
+
+from uwb_mitigation.preprocessing import Preprocessing
+from uwb_mitigation.simulation.buildings import PLACEMENTS
+from uwb_mitigation.training.simulated import building_dataset
+
+if __name__ == "__main__":
+    blocks = -(-int(sys.argv[1]) // PLACEMENTS)
+    wall = time.monotonic()
+    made = len(building_dataset(1, blocks, Preprocessing(), workers=2))
+    print(f"{made} ranges of {blocks * PLACEMENTS} placements in {time.monotonic() - wall:.0f} s")

@@ -1,0 +1,39 @@
+"""Anchors of Hanyang's runs found by `survey` from guesses that are 1.5 m off in plan: docs/positioning.md.
+
+Arguments: the folder of the runs, and how many guesses a run.
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from uwb_mitigation.benches.positions import HEIGHT, hanyang_run
+from uwb_mitigation.errors import DatasetError
+from uwb_mitigation.positioning.survey import displacements, survey
+
+OFF_M = 1.5
+
+again = int(sys.argv[2]) if len(sys.argv) > 2 else 2
+for folder in sorted(Path(sys.argv[1]).glob("*_*")):
+    anchors, ranges, _, _ = hanyang_run(folder)
+    for seed in range(again):
+        away = np.zeros((len(anchors), 3))
+        away[:, :2] = np.random.default_rng(seed).normal(0.0, 1.0, (len(anchors), 2))
+        away *= OFF_M / np.linalg.norm(away, axis=1, keepdims=True)
+        guesses = anchors.moved(anchors.position + away, anchors.sd)
+        before = np.sqrt((displacements(guesses.position, anchors.position)[:, :2] ** 2).sum(axis=1).mean())
+        try:
+            found = survey(guesses, ranges, off_m=OFF_M, height=HEIGHT)
+        except DatasetError as error:
+            print(f"{folder.name:8} guess {seed}: {error}", flush=True)
+            continue
+        off = displacements(found.anchors.position, anchors.position)
+        plan = np.sqrt((off[:, :2] ** 2).sum(axis=1).mean())
+        said = float(np.mean(found.anchors.sd))
+        names = [(anchors.anchors[a].id, anchors.anchors[b].id) for a, b in found.swapped]
+        print(
+            f"{folder.name:8} guess {seed}: {before:.2f} m off in plan, found {plan:.2f} m, loss {found.loss:.2f},"
+            f" says {said:.2f}; swapped {names or 'none'}",
+            flush=True,
+        )

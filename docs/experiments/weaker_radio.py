@@ -1,0 +1,48 @@
+"""What models do to a radio that is weaker or stronger: docs/evaluation.md, *Unlike the training data*.
+
+Arguments: the folder of the logs, to take one range in how many, and bundles or names of shipped ones. For a model that
+holds no offset of boards, that of the line-of-sight placements is taken off first.
+"""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from uwb_mitigation.evaluation.accuracy import evaluate
+from uwb_mitigation.mitigation import Mitigation
+from uwb_mitigation.model.bundle import load_bundle
+from uwb_mitigation.model.prior import LinePrior
+from uwb_mitigation.model.shipped import model_path
+from uwb_mitigation.sources.opening import open_recording
+
+with open_recording(Path(sys.argv[1])) as source:
+    records = list(source)[:: int(sys.argv[2])]
+errors = {}
+for record in records:
+    if record.truth.label == "LOS":
+        error = record.measurement.range_m - record.truth.range_m
+        errors.setdefault(record.truth.configuration, []).append(error)
+offset_m = np.median([np.mean(values) for values in errors.values()])
+
+
+def heard(record, level, less_m):
+    """The record of a radio that hears so many dB more, its range less an offset."""
+    cir = record.measurement.cir
+    powers = {
+        "rx_power_dbm": cir.rx_power_dbm + level,
+        "first_path_power_dbm": cir.first_path_power_dbm + level,
+    }
+    louder = replace(cir, scale=10 ** (level / 20), **powers)
+    range_m = record.measurement.range_m - less_m
+    return replace(record, measurement=replace(record.measurement, cir=louder, range_m=range_m))
+
+
+for name in sys.argv[3:]:
+    mitigation = Mitigation(load_bundle(model_path(name)))
+    less_m = offset_m if mitigation.bundle.prior == LinePrior(0.0) else 0.0
+    print(name)
+    for level in (-25, -20, *range(-16, -8), -7, -5, 0, 3, 5, 8, 10, 15, 20):
+        found = evaluate(mitigation, (heard(record, level, less_m) for record in records))
+        print(f"{level:5} {found.corrected.mae / found.raw.mae:.3f}", found.statuses)
