@@ -23,7 +23,9 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
+from uwb_mitigation_msgs.msg import RangeCir
 
 TIMEOUT_S = 90.0
 
@@ -60,7 +62,7 @@ class Process:
 
     def signal(self, number: signal.Signals) -> int:
         self.send(number)
-        return self.wait(10)
+        return self.wait()
 
     def wait_for_output(self, text: str) -> None:
         deadline = time.monotonic() + TIMEOUT_S
@@ -121,6 +123,19 @@ class Ros:
 
     def wait_for_publishers(self, topic: str, count: int) -> None:
         self.spin_until(lambda: self.node.count_publishers(topic) >= count)
+
+    def find_each_other(self, publisher: Publisher, question: RangeCir, answers: list) -> None:
+        """Ask until a node has answered and owes no answer any more: it is found, and finds us, one after the other."""
+        numbers = itertools.count(1)
+
+        def asked() -> bool:
+            question.sequence = next(numbers)
+            publisher.publish(question)
+            return len(answers) > 0
+
+        self.spin_until(asked)
+        self.spin_until(lambda: answers[-1].sequence == question.sequence)
+        answers.clear()
 
     def call(self, kind: type, name: str, request: object) -> object:
         client = self.node.create_client(kind, name)

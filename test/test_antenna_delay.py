@@ -10,6 +10,7 @@ import command_line
 import numpy as np
 import pytest
 import yaml
+from compilers import NEEDS_CC
 
 from uwb_mitigation.dw1000_model.evb1000 import EmulatedEvb1000s
 from uwb_mitigation.errors import UwbMitigationError
@@ -20,7 +21,6 @@ from uwb_mitigation.radio.opening import opener
 from uwb_mitigation.radio.port import RadioPort
 
 NOMINAL = 2 * 16436
-needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc")
 
 
 def around(middle_m: float, sd_m: float, n: int = 400) -> np.ndarray:
@@ -50,7 +50,7 @@ def test_what_is_no_calibration_is_refused(ranges: np.ndarray, gap_db: float, sa
         find(ranges, np.full(400, gap_db), 5.01, [NOMINAL, NOMINAL])
 
 
-@needs_compiler
+@NEEDS_CC
 def test_the_delay_of_a_pair_is_found_and_written(tmp_path: Path):
     # The modelled chips hold it in their memory: the radios are told to pass over that.
     truth = NOMINAL + 173
@@ -68,7 +68,7 @@ def test_the_delay_of_a_pair_is_found_and_written(tmp_path: Path):
     assert "--params-file found.yaml" in done.stdout
 
 
-@needs_compiler
+@NEEDS_CC
 def test_a_tag_alone_takes_all_of_the_offset(tmp_path: Path):
     with EmulatedEvb1000s(boards=2, antenna_delay=NOMINAL + 60, clean_m=5.01) as boards:
         anchor = RadioPort(

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
-import pytest
 from command_line import run
+from compilers import NEEDS_CC
 
 from uwb_mitigation.benches import radio
 
-pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc")
+pytestmark = NEEDS_CC
 
 
 def test_no_range_of_a_soak_is_wrong_and_every_chip_is_back_within_a_second():

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import math
-import shutil
 from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from compilers import NEEDS_CC
 from dw1000_driver import DATA, RXFCG, TXSTRT, WAIT4RESP, Mode, exchange, pair
 
 from uwb_mitigation.dw1000_model.air import Air
 from uwb_mitigation.dw1000_model.links import Link, link_of
 from uwb_mitigation.sources.simulated import SimulatedSurvey
 
-pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc")
+pytestmark = NEEDS_CC
 
 
 class TestChannel:

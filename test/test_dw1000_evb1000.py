@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import signal
 import statistics
 import subprocess
@@ -14,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import serial
+from compilers import NEEDS_CC
 from dw1000_driver import DATA, HPDWARN, RXFCG, TICK_M, TICK_S, TXFRS, TXPUTE, WRAP, Driver
 
 from uwb_mitigation.dw1000_model.evb1000 import EmulatedEvb1000s
@@ -21,7 +21,7 @@ from uwb_mitigation.dw1000_model.usb2spi import FAST_HZ, SLOW_HZ, Bridge
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.sources.simulated import SimulatedSource
 
-pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc")
+pytestmark = NEEDS_CC
 
 PATIENCE_S = 60.0
 

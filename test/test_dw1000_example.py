@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import re
-import shutil
 import subprocess
 from pathlib import Path
 
 import pytest
+from compilers import NEEDS_CC
 from conftest import REPOSITORY
 
 from uwb_mitigation.dw1000_model.library import model_folder
 from uwb_mitigation.firmware_export.compiling import WARNINGS, c_compiler, run
 
-pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc")
+pytestmark = NEEDS_CC
 
 
 def compiled(source: Path, program: Path) -> Path:

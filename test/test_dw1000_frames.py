@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-import shutil
 
 import numpy as np
 import pytest
+from compilers import NEEDS_CC
 from dw1000_driver import (
     DATA,
     ERRORS,
@@ -41,7 +41,7 @@ from dw1000_driver import (
 from uwb_mitigation.dw1000_model.air import Air
 from uwb_mitigation.dw1000_model.links import Link
 
-pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc")
+pytestmark = NEEDS_CC
 
 
 class TestFrames:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 
 import pytest
+from compilers import NEEDS_CC
 from dw1000_driver import (
     DATA,
     ERRORS,
@@ -40,7 +40,7 @@ from dw1000_driver import (
 
 from uwb_mitigation.dw1000_model.air import Air
 
-pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc")
+pytestmark = NEEDS_CC
 
 TX_GOOD = TXFRB | TXPRS | TXPHS | TXFRS
 SWINGING = RXDFR | RXFCG | LDEDONE

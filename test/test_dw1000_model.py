@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import shutil
 import subprocess
 import threading
 from dataclasses import replace
@@ -13,6 +12,7 @@ from pathlib import Path
 import model_material
 import numpy as np
 import pytest
+from compilers import NEEDS_CC
 from dw1000_driver import DATA, RX_GOOD, RXFCG, RXRFTO, Driver, exchange, pair
 
 from uwb_mitigation.dw1000_model.air import Air, Host
@@ -22,7 +22,7 @@ from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.firmware_export.compiling import WARNINGS, c_compiler, firmware_folder, run
 from uwb_mitigation.measurement import Cir, Encoding, RangeMeasurement, Truth
 
-pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc")
+pytestmark = NEEDS_CC
 
 SANITIZED = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import shutil
-
 import pytest
+from compilers import NEEDS_CC
 from dw1000_driver import (
     AAT,
     AFFREJ,
@@ -35,7 +34,7 @@ from dw1000_driver import (
 
 from uwb_mitigation.dw1000_model.air import Air
 
-pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc")
+pytestmark = NEEDS_CC
 
 
 class TestReceiver:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import shutil
-
 import pytest
+from compilers import NEEDS_CC
 from dw1000_driver import (
     CPLOCK,
     FAST_HZ,
@@ -23,7 +22,7 @@ from dw1000_driver import (
 
 from uwb_mitigation.dw1000_model.air import Air, Chip
 
-pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc")
+pytestmark = NEEDS_CC
 
 ID = bytes.fromhex("3001cade")
 

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 
 import pytest
+from compilers import NEEDS_CC
 from dw1000_driver import TICK_M, WRAP
 from spidev_on_model import dw1000, program, replace_spidev
 
 from uwb_mitigation.dw1000_model.air import Air, Host
 from uwb_mitigation.dw1000_model.links import Link
 
-pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc")
+pytestmark = NEEDS_CC
 
 
 @pytest.fixture

@@ -5,11 +5,11 @@ The other driver plays the part that the exchange asks for, written here from th
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 
 import pytest
+from compilers import NEEDS_CC
 from dw1000_driver import TICK_M, TXDLYS, TXSTRT, WAIT4RESP, WRAP
 from spidev_on_model import CLOCK, begin, dw1000, program, replace_spidev
 
@@ -21,7 +21,7 @@ from uwb_mitigation.measurement import RangeMeasurement
 from uwb_mitigation.radio import host as firmware
 from uwb_mitigation.radio.host import HostRadio
 
-pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc")
+pytestmark = NEEDS_CC
 OTHERS = 0x0123456789ABCDEF
 POLL, ANSWER, FINAL, REPORT = 3, 4, 5, 6
 REPLY_US = 3000

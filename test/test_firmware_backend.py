@@ -11,6 +11,7 @@ import firmware_models
 import model_material
 import numpy as np
 import pytest
+from compilers import NEEDS_CC
 
 from uwb_mitigation.bag.codec import encode_range
 from uwb_mitigation.errors import MissingDependencyError
@@ -20,10 +21,8 @@ from uwb_mitigation.mitigation import Mitigation, correct_batch
 from uwb_mitigation.model.bundle import Bundle
 from uwb_mitigation.offsets import Offsets
 
-NO_COMPILER = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc")
 
-
-@NO_COMPILER
+@NEEDS_CC
 @pytest.mark.parametrize("bundle_in", [firmware_models.choosy_bundle, firmware_models.mlp_bundle])
 def test_the_firmware_gives_the_corrected_ranges_of_onnx_runtime(
     bundle_in: Callable[[Path], Bundle], tmp_path: Path
@@ -62,7 +61,7 @@ def test_what_only_a_checkout_has_is_said_to_need_one(tmp_path: Path, monkeypatc
         toolchain.build_image(tmp_path, tmp_path, toolchain.Target.QEMU_MPS2)
 
 
-@NO_COMPILER
+@NEEDS_CC
 @pytest.mark.ros
 def test_a_mitigator_that_is_told_to_corrects_with_the_firmware(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -84,11 +83,10 @@ def test_a_mitigator_that_is_told_to_corrects_with_the_firmware(
         ros.start("mitigator", f"model:={bundle.path}", "backend:=firmware").wait_for_output(
             "correcting with"
         )
-        ros.spin_until(lambda: publisher.get_subscription_count() == 1)
-        ros.wait_for_publishers("/uwb/range_corrected", 1)
-        ros.spin_for(0.5)
-        for measurement in measurements:
-            publisher.publish(deserialize_message(encode_range(measurement), RangeCir))
+        questions = [deserialize_message(encode_range(each), RangeCir) for each in measurements]
+        ros.find_each_other(publisher, questions[0], corrected)
+        for question in questions:
+            publisher.publish(question)
         ros.spin_until(lambda: len(corrected) == len(measurements))
     assert traces.exists()
     mitigation = Mitigation(bundle)

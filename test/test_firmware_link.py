@@ -10,6 +10,7 @@ from pathlib import Path
 import firmware_models
 import numpy as np
 import pytest
+from compilers import NEEDS_CC
 
 from uwb_mitigation.firmware_export.compiling import compile_objects, firmware_folder, run
 from uwb_mitigation.firmware_export.export import export_bundle
@@ -33,7 +34,7 @@ from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import Bundle
 from uwb_mitigation.offsets import Offsets
 
-pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc")
+pytestmark = NEEDS_CC
 
 VECTORS = Path(__file__).parent / "data" / "link_vectors.txt"
 SANITIZED = ("-O1", "-fsanitize=undefined", "-fno-sanitize-recover=all")

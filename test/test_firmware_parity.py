@@ -11,6 +11,7 @@ import firmware_models
 import model_material
 import numpy as np
 import pytest
+from compilers import NEEDS_CC, NEEDS_CXX
 from firmware_models import Exported
 
 from uwb_mitigation.benches import random_networks
@@ -29,7 +30,7 @@ from uwb_mitigation.model.shipped import default_model_path, shipped_model_path
 from uwb_mitigation.offsets import Offsets
 from uwb_mitigation.preprocessing import Preprocessing, Scaling
 
-pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc")
+pytestmark = NEEDS_CC
 
 # Undefined behaviour ends the process, so that a finding cannot pass unseen.
 SANITIZED = ("-O1", "-fsanitize=undefined", "-fno-sanitize-recover=all")
@@ -240,7 +241,7 @@ def test_plain_cmake_builds_the_library_and_passes_its_test(tmp_path: Path):
     run(["ctest", "--test-dir", str(build)])
 
 
-@pytest.mark.skipif(shutil.which("c++") is None, reason="no C++ compiler: apt install g++")
+@NEEDS_CXX
 def test_a_sketch_in_cpp_can_include_the_model(tmp_path: Path):
     firmware_models.write_model(tmp_path, random_networks.remnet(16, 3))
     sketch = tmp_path / "sketch.cpp"

@@ -7,6 +7,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from compilers import NEEDS_CXX
 
 from uwb_mitigation.dw1000_model.library import model_folder, model_objects
 from uwb_mitigation.firmware_export.compiling import firmware_folder, run
@@ -31,7 +32,7 @@ def test_the_sketchs_model_is_the_shipped_one(tmp_path: Path):
     assert (SKETCH / "uwb_model.h").read_text() == expected, f"uwb-mitigation export-c -o {SKETCH}"
 
 
-@pytest.mark.skipif(shutil.which("c++") is None, reason="no C++ compiler: apt install g++")
+@NEEDS_CXX
 def test_the_sketch_corrects_what_the_radio_sends_in_writes_that_are_safe_on_usb(tmp_path: Path):
     firmware = firmware_folder()
     stub, library = firmware / "test" / "arduino_stub", firmware / "src"
@@ -87,7 +88,7 @@ def test_the_sketches_compile_for_the_boards_processor(tmp_path: Path, name: str
     run(["arm-none-eabi-g++", *cpu, *flags, *includes, "-c", str(sketch), "-o", str(tmp_path / "sketch.o")])
 
 
-@pytest.mark.skipif(shutil.which("c++") is None, reason="no C++ compiler: apt install g++")
+@NEEDS_CXX
 @pytest.mark.parametrize("with_model", [False, True], ids=["without a model", "with one"])
 def test_the_sketch_with_a_radio_ranges_on_a_modelled_chip(tmp_path: Path, with_model: bool):
     firmware = firmware_folder()

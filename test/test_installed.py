@@ -13,12 +13,12 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
 import yaml
+from compilers import NEEDS_CC
 from conftest import REPOSITORY
 
 from uwb_mitigation import installation
@@ -53,14 +53,14 @@ def share(prefix: Path) -> Path:
 
 
 def files_below(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    # Launching leaves bytecode beside a launch file.
+    found = [path for path in folder.rglob("*") if path.is_file() and path.suffix != ".pyc"]
+    return {str(path.relative_to(folder)): path.read_bytes() for path in found}
 
 
 @pytest.mark.parametrize("folder", ["launch", "params", "models", "udev", "rviz", "foxglove"])
 def test_shared_files_are_those_of_the_sources(share: Path, folder: str):
-    assert files_below(share / folder) == {
-        name: data for name, data in files_below(REPOSITORY / folder).items() if "__pycache__" not in name
-    }
+    assert files_below(share / folder) == files_below(REPOSITORY / folder)
 
 
 def test_the_firmware_that_a_computer_compiles_is_shared(share: Path):
@@ -86,8 +86,8 @@ def test_nothing_else_is_shared(share: Path):
         "requirements",
     }
     assert (share / "package.xml").read_bytes() == (REPOSITORY / "package.xml").read_bytes()
-    for path in (share / "launch").iterdir():
-        assert path.name.endswith(".launch.py"), "ros2 launch completes no other names"
+    for name in files_below(share / "launch"):
+        assert name.endswith(".launch.py"), "ros2 launch completes no other names"
     for path in (share / "params").iterdir():
         assert set(yaml.safe_load(path.read_text())["/**"]) == {"ros__parameters"}
 
@@ -107,18 +107,6 @@ def test_the_command_is_in_the_path_of_a_sourced_workspace(prefix: Path):
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def installed_environment() -> dict[str, str]:
-    return os.environ | {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_DOMAIN_ID": "99"}
-
-
-def wait_until_said(node: subprocess.Popen[bytes], log: Path, words: str) -> None:
-    deadline = time.monotonic() + 60
-    while words not in log.read_text():
-        assert node.poll() is None, log.read_text()
-        assert time.monotonic() < deadline, f"no {words!r} in:\n{log.read_text()}"
-        time.sleep(0.02)
-
-
 @pytest.mark.parametrize(
     ("name", "parameter", "words"),
     [
@@ -135,19 +123,13 @@ def test_a_node_starts_where_it_is_installed_and_ends_on_ctrl_c(
 
 
 def start_and_end(command: list[str | Path], words: str, folder: Path) -> None:
-    """Start a node in `folder`, wait until it says `words`, and end it by Ctrl-C."""
-    log = folder / "said"
-    with log.open("wb") as file:
-        node = subprocess.Popen(
-            command, env=installed_environment(), cwd=folder, stdout=file, stderr=subprocess.STDOUT
-        )
-    try:
-        wait_until_said(node, log, words)
-        node.send_signal(signal.SIGINT)
-        assert node.wait(20) == 0, log.read_text()
-    finally:
-        node.kill()
-        node.wait()
+    """Start a node, wait until it says `words`, and end it by Ctrl-C."""
+    from ros_harness import domain
+
+    with domain(folder) as ros:
+        node = ros.run([*map(str, command)])
+        node.wait_for_output(words)
+        assert node.signal(signal.SIGINT) == 0, node.output
 
 
 def test_the_command_line_takes_its_model_from_the_installation(prefix: Path, share: Path, tmp_path: Path):
@@ -251,20 +233,15 @@ def test_what_an_executable_misses_is_one_line(tmp_path: Path, name: str, absent
 
 def test_a_driver_that_misses_what_its_source_needs_says_so_in_one_line(tmp_path: Path):
     pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
+    from ros_harness import domain
+
     options = ["--ros-args", "-p", "source:=mcap", "-p", "path:=absent.mcap"]
     command = [*without(["mcap"], "driver"), *options]
-    done = subprocess.run(
-        command,
-        env=installed_environment(),
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=60,
-    )
-    assert done.returncode == 1
-    assert "mcap is not installed (run uwb-mitigation doctor)" in done.stderr
-    assert "Traceback" not in done.stderr
+    with domain(tmp_path) as ros:
+        driver = ros.run(command)
+        assert driver.wait() == 1
+    assert "mcap is not installed (run uwb-mitigation doctor)" in driver.output
+    assert "Traceback" not in driver.output
 
 
 CORRECT_WITH_THE_FIRMWARE = """
@@ -278,7 +255,7 @@ print(uwb_mitigation.__file__, default_model_path(), firmware_folder(), sep="\\n
 """
 
 
-@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc")
+@NEEDS_CC
 def test_the_firmware_backend_needs_no_checkout(tmp_path: Path):
     packages = tmp_path / "lib" / "python3" / "site-packages"
     steps = [

@@ -34,9 +34,7 @@ def test_offsets_are_set_while_it_runs_and_nonsense_leaves_those_before(tmp_path
         publisher = ros.node.create_publisher(RangeCir, "/uwb/range_raw", 10)
         corrected = ros.collect(RangeCorrected, "/uwb/range_corrected")
         ros.start("mitigator", "offsets:=0.25").wait_for_output("correcting with")
-        ros.spin_until(lambda: publisher.get_subscription_count() == 1)
-        ros.wait_for_publishers("/uwb/range_corrected", 1)
-        ros.spin_for(0.5)
+        ros.find_each_other(publisher, deserialize_message(encode_range(asked), RangeCir), corrected)
 
         def answer() -> RangeCorrected:
             corrected.clear()

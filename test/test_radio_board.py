@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import itertools
-import shutil
 
 import pytest
+from compilers import NEEDS_CC
 
 from uwb_mitigation.dw1000_model.links import Link
 from uwb_mitigation.errors import ParameterError
@@ -18,7 +18,7 @@ from uwb_mitigation.link.session import BoardSession
 from uwb_mitigation.measurement import RangeMeasurement
 from uwb_mitigation.radio.modelled import Line, ModelledAir
 
-pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc")
+pytestmark = NEEDS_CC
 
 
 class Host:

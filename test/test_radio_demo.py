@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import shutil
 import signal
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from compilers import NEEDS_CC
 
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
 pytestmark = [
     pytest.mark.ros,
-    pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc"),
+    NEEDS_CC,
 ]
 
 COMMAND = [sys.executable, "-m", "uwb_mitigation.entry", "radio-demo", "--seconds"]

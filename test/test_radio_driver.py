@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import shutil
 import threading
 import tty
 from collections.abc import Iterator
@@ -13,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import ros_harness
+from compilers import NEEDS_CC
 from diagnostic_msgs.msg import DiagnosticStatus
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
@@ -29,7 +29,7 @@ from uwb_mitigation.sources.simulated import SimulatedSource
 
 pytestmark = [
     pytest.mark.ros,
-    pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc"),
+    NEEDS_CC,
 ]
 
 DEFAULTS = {row.name: row.default for row in DRIVER}

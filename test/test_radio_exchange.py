@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-import shutil
 
 import numpy as np
 import pytest
+from compilers import NEEDS_CC
 
 from uwb_mitigation.dw1000_model.links import Link
 from uwb_mitigation.link.layout import Mode, Role
@@ -14,7 +14,7 @@ from uwb_mitigation.link.radio import PREAMBLES, RadioSettings
 from uwb_mitigation.radio import modelled, structures
 from uwb_mitigation.radio.modelled import Line, ModelledAir
 
-pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc")
+pytestmark = NEEDS_CC
 
 WRAP = 1 << 40
 LOST = ("no_answer", "late", "time_out", "damaged", "absurd", "broken")

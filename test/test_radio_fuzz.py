@@ -7,13 +7,14 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from compilers import NEEDS_CC
 
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.firmware_export.compiling import c_compiler, compile_objects, firmware_folder, run
 
 SANITIZED = ("-std=c99", "-g", "-O1", "-fno-sanitize-recover=all")
 
-pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc")
+pytestmark = NEEDS_CC
 
 
 def build(

@@ -7,7 +7,6 @@ import errno
 import itertools
 import os
 import select
-import shutil
 import sys
 import threading
 import time
@@ -16,6 +15,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from compilers import NEEDS_CC
 
 from uwb_mitigation.dw1000_model.air import Air, Chip
 from uwb_mitigation.dw1000_model.evb1000 import ROUND_TRIP_S, EmulatedEvb1000s
@@ -30,7 +30,7 @@ from uwb_mitigation.radio.host import HostRadio
 from uwb_mitigation.radio.port import RETRY_S, RadioLost, RadioPort
 from uwb_mitigation.radio.spidev_bus import SpidevBus
 
-pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc")
+pytestmark = NEEDS_CC
 
 GENEROUS_S = 120.0
 

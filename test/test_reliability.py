@@ -18,6 +18,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from model_material import bundle
 from rclpy.qos import qos_profile_sensor_data
+from rclpy.serialization import deserialize_message
 from ros_harness import Ros, domain
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Range
@@ -103,9 +104,7 @@ def test_ranges_that_queue_up_are_all_corrected_in_order_and_to_the_bit(ros: Ros
     corrected = ros.collect(RangeCorrected, CORRECTED)
     mitigator = ros.start("mitigator")
     publisher = ros.node.create_publisher(RangeCir, RAW, 1000)
-    ros.wait_for_publishers(CORRECTED, 1)
-    ros.spin_until(lambda: publisher.get_subscription_count() == 1)
-    ros.spin_for(0.5)
+    ros.find_each_other(publisher, deserialize_message(encode_range(measurements[0]), RangeCir), corrected)
     # Stopped meanwhile, it finds all of them in its queue.
     mitigator.send(signal.SIGSTOP)
     for measurement in measurements:
@@ -125,8 +124,6 @@ def test_what_a_queue_has_dropped_is_told(ros: Ros):
         "correcting"
     )
     publisher = ros.node.create_publisher(RangeCir, RAW, 10)
-    ros.spin_until(lambda: publisher.get_subscription_count() == 1)
-    ros.spin_for(0.5)
 
     def told(status: DiagnosticStatus) -> bool:
         # More at once than the queue holds.

@@ -63,7 +63,7 @@ class Player:
             **(settings | options),
             ready=lambda: True,
             publish=self.publish,
-            on_time=self.clock_times.append,
+            on_time=self.tell_time,
             on_end=lambda error: self.ended.set(),
         )
 
@@ -74,25 +74,28 @@ class Player:
             self.stamps.append(stamp_ns)
             self.on_record(self, record.measurement.sequence)
 
+    def tell_time(self, time_ns: int) -> None:
+        self.clock_times.append(time_ns)
+
     def published_with(self, sequence: int) -> int:
         """How many records had come when the call with this one ended: what is late comes together."""
         return next(end for end in itertools.accumulate(self.batches) if end > self.sequences.index(sequence))
 
     def play(self) -> Player:
         self.playback.start()
-        assert self.ended.wait(20)
+        assert self.ended.wait(60)
         self.playback.stop()
         return self
 
 
 def test_a_seek_forwards_leaves_records_out_and_stamps_go_on():
     player = Player(
-        100, 10 * MS, lambda player, sequence: player.playback.seek(0.9) if sequence == 3 else None
+        100, 100 * MS, lambda player, sequence: player.playback.seek(9.0) if sequence == 3 else None
     ).play()
     before = player.published_with(3)
     assert player.sequences == [*range(before), *range(90, 100)]
     assert player.stamps == sorted(player.stamps)
-    assert player.stamps[-1] - player.stamps[0] < 500 * MS
+    assert player.stamps[-1] - player.stamps[0] < 5000 * MS
 
 
 def test_a_seek_backwards_plays_again():
@@ -151,22 +154,30 @@ def test_a_seek_does_not_wait_for_the_record_that_was_next():
         if sequence == 0:
             player.playback.seek(120.0)
 
-    player = Player(4, 60_000 * MS, skip, loop=False, longest_pause_s=0.3).play()
-    assert player.sequences == [0, 2, 3]
-    first, second, _ = player.stamps
-    assert second - first < 100 * MS
+        if sequence == 2:
+            player.playback.stop()
+            player.ended.set()
+
+    player = Player(4, 60_000 * MS, skip, longest_pause_s=30.0).play()
+    assert player.sequences == [0, 2]
+    first, second = player.stamps
+    assert second - first < 10_000 * MS
 
 
 def test_the_clock_stands_still_in_a_pause():
+    class Watched(Player):
+        def tell_time(self, time_ns: int) -> None:
+            super().tell_time(time_ns)
+            if self.clock_times.count(time_ns) == 5:
+                self.playback.paused = False
+
     def pause(player: Player, sequence: int) -> None:
         if sequence == 1:
             player.playback.paused = True
-            threading.Timer(0.2, lambda: setattr(player.playback, "paused", False)).start()
 
-    player = Player(3, 100 * MS, pause, recorded_stamps=True).play()
+    player = Watched(3, 100 * MS, pause, recorded_stamps=True).play()
+    assert player.sequences == [0, 1, 2], "a clock that goes on ends no pause here"
     assert player.clock_times == sorted(player.clock_times)
-    (_, most), *_ = Counter(player.clock_times).most_common()
-    assert most >= 5
 
 
 def test_another_rate_changes_the_distances_from_there_on():

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -17,6 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from compilers import NEEDS_CC
 from conftest import REPOSITORY
 
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
@@ -30,7 +30,7 @@ from uwb_mitigation.sources.site import load_anchors
 pytestmark = [
     pytest.mark.ros,
     pytest.mark.slow,
-    pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc"),
+    NEEDS_CC,
 ]
 
 PAGE = REPOSITORY / "docs" / "site.md"
