@@ -244,18 +244,39 @@ def _conditions(
     boards: Boards,
 ) -> NDArray[np.int64]:
     """About which condition each candidate will have, from mean levels."""
+    direct, diffuse = _mean_powers_db(environments, anchor, tag, path)
+    is_heard = RADIO.direct_margin_db(direct, diffuse, boards) > 0
+    condition = np.where(path.crossings == 0, IN_SIGHT, np.where(is_heard, BLOCKED, LOST))
+    level = mean_level_dbm(environments, anchor, tag, path, boards)
+    condition[level < RADIO.least_dbm(boards)] = WEAK
+    return condition
+
+
+def mean_level_dbm(
+    environments: Environments,
+    anchor: NDArray[np.float64],
+    tag: NDArray[np.float64],
+    path: DirectPath,
+    boards: Boards,
+) -> NDArray[np.float64]:
+    """The mean receive level of links between antennas at float64 (n, 2) in m, over what meets `path`, dBm (n,)."""
+    powers = _mean_powers_db(environments, anchor, tag, path)
+    level: NDArray[np.float64] = (
+        RADIO.tx_power_dbm
+        + boards.gain_db
+        + 10.0 * np.log10(10.0 ** (powers[0] / 10.0) + 10.0 ** (powers[1] / 10.0))
+    )
+    return level
+
+
+def _mean_powers_db(
+    environments: Environments, anchor: NDArray[np.float64], tag: NDArray[np.float64], path: DirectPath
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Of the direct path and of all others, relative to what was sent."""
     distance = np.hypot(*(tag - anchor).T)
     direct = direct_power_db(distance, path.loss_db + math.prod(PATTERN_LOSS_DB))
     diffuse = -np.where(path.crossings > 0, *(e.path_loss_db(distance) for e in environments[::-1]))
-    is_heard = RADIO.direct_margin_db(direct, diffuse, boards) > 0
-    condition = np.where(path.crossings == 0, IN_SIGHT, np.where(is_heard, BLOCKED, LOST))
-    level = (
-        RADIO.tx_power_dbm
-        + boards.gain_db
-        + 10.0 * np.log10(10.0 ** (direct / 10.0) + 10.0 ** (diffuse / 10.0))
-    )
-    condition[level < RADIO.least_dbm(boards)] = WEAK
-    return condition
+    return direct, diffuse
 
 
 def _balanced(conditions: NDArray[np.int64], count: int, rng: np.random.Generator) -> NDArray[np.intp]:

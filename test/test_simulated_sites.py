@@ -1,0 +1,43 @@
+"""Random sites: seeded, small enough to be heard in, and driven through their doorways."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from uwb_mitigation.simulation.scene import along_route
+from uwb_mitigation.simulation.sites import SIDE_M, draw_site
+from uwb_mitigation.sources.simulated import SimulatedSource
+
+
+def drawn(seed: int):
+    rng = np.random.default_rng(seed)
+    site = draw_site(4 + seed % 5, rng)
+    return site, site.route(rng)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_tag_goes_through_doorways_and_not_through_walls(seed):
+    site, route = drawn(seed)
+    assert len(site.anchors) == 4 + seed % 5
+    assert all(SIDE_M[0] <= side <= SIDE_M[1] for side in site.plan.size)
+    places = along_route(route, np.arange(0.0, 40.0, 0.05))
+    assert site.plan.direct_path(places[:-1], places[1:]).crossings.sum() == 0
+    assert np.hypot(*np.diff(places, axis=0).T).max() < 0.06
+
+
+def test_the_same_seed_is_the_same_site_and_another_route_is_another():
+    (one, route), (again, same) = drawn(3), drawn(3)
+    assert one.plan == again.plan
+    assert one.anchors == again.anchors
+    assert route == same
+    assert one.route(np.random.default_rng(9)) != route
+
+
+def test_every_anchor_is_heard():
+    site, route = drawn(5)
+    source = SimulatedSource(
+        seed=1, count=1200, rate_hz=20.0, anchors=site.anchors, plan=site.plan, route=route
+    )
+    heard = np.bincount([record.measurement.anchor_id for record in source])[1:]
+    assert heard.min() > 0.5 * 1200 / len(site.anchors)

@@ -1,0 +1,147 @@
+"""Random sites: buildings small enough that every anchor hears a tag nearly everywhere, and drives through their doorways.
+
+Beyond what `buildings` says nothing is from a source: sizes, clearances and where anchors hang are assumed.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components, dijkstra
+
+from uwb_mitigation.simulation.buildings import KINDS, RADIO, RESIDENTIAL, draw_plan, mean_level_dbm
+from uwb_mitigation.simulation.radio import Boards
+from uwb_mitigation.simulation.scene import FloorPlan, Point
+
+SITES = ("flat", "office")
+"""The kinds of buildings, equally often."""
+
+SIDE_M = (6.0, 20.0)
+HEARD = 0.75
+"""Each anchor hears a tag at such a share, or more, of the places where it can go."""
+
+GOES = 0.5
+"""A tag can go to such a share of the plan, or more, through doorways."""
+
+BEFORE_WALL_M = 0.3
+CLEARANCE_M = 0.3
+"""Of the tag from walls and whatever stands."""
+
+CELL_M = 0.15
+WAYPOINTS = 12
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Site:
+    """A building with anchors along its outer walls.
+
+    Attributes:
+        plan: the building.
+        anchors: m.
+        cells: float64 (c, 2), places where a tag can go, each from each other; `ways`: float64 (c, c) sparse, m,
+            between neighbours.
+    """
+
+    plan: FloorPlan
+    anchors: tuple[Point, ...]
+    cells: NDArray[np.float64]
+    ways: coo_array
+
+    def route(self, rng: np.random.Generator) -> tuple[Point, ...]:
+        """A closed route by the shortest ways past `WAYPOINTS` random places."""
+        stops = rng.choice(len(self.cells), WAYPOINTS, replace=False)
+        _, before = dijkstra(self.ways, directed=False, indices=stops, return_predecessors=True)
+        found: list[int] = []
+        for number in range(WAYPOINTS):
+            # From each stop's own tree: the way back from the next one.
+            here, leg = int(stops[(number + 1) % WAYPOINTS]), list[int]()
+            while here != stops[number]:
+                here = int(before[number, here])
+                leg.append(here)
+            found += leg[::-1]
+        return tuple((float(x), float(y)) for x, y in self.cells[found])
+
+
+def draw_site(anchors: int, rng: np.random.Generator) -> Site:
+    """A random site; drawn again until it has walls, its anchors hear, and its doorways lead somewhere.
+
+    Args:
+        anchors: how many, evenly along the outer walls.
+    """
+    name = SITES[int(rng.integers(len(SITES)))]
+    kind = next(one for one in KINDS if one.name == name)
+    while True:
+        plan = draw_plan(kind, rng)
+        places = _along_walls(plan.size, anchors, rng)
+        if not plan.walls or not all(SIDE_M[0] <= side <= SIDE_M[1] for side in plan.size):
+            continue
+        cells, ways = _free(plan)
+        if len(cells) * CELL_M**2 < GOES * math.prod(plan.size):
+            continue
+        if all(_heard(plan, place, cells) >= HEARD for place in places):
+            return Site(plan, places, cells, ways)
+
+
+def _along_walls(size: Point, count: int, rng: np.random.Generator) -> tuple[Point, ...]:
+    """Evenly, `BEFORE_WALL_M` before the outer walls."""
+    x, y = (side - 2.0 * BEFORE_WALL_M for side in size)
+    corners = np.array([[0.0, 0.0], [x, 0.0], [x, y], [0.0, y], [0.0, 0.0]]) + BEFORE_WALL_M
+    reached = np.array([0.0, x, x + y, 2.0 * x + y, 2.0 * (x + y)])
+    along = (np.arange(count) + rng.uniform()) / count * reached[-1]
+    places = np.stack([np.interp(along, reached, axis) for axis in corners.T], axis=1)
+    return tuple((float(a), float(b)) for a, b in places)
+
+
+def _free(plan: FloorPlan) -> tuple[NDArray[np.float64], coo_array]:
+    """The largest part of a grid whose cells lead to each other, and the ways between neighbours."""
+    columns, rows = (np.arange(CELL_M, side, CELL_M) for side in plan.size)
+    grid = np.stack(np.meshgrid(columns, rows, indexing="ij"), axis=-1)
+    free = np.all((grid > CLEARANCE_M) & (grid < np.subtract(plan.size, CLEARANCE_M)), axis=-1)
+    lines = [(wall.start, wall.end) for wall in plan.walls]
+    for start, end in lines + [(screen.start, screen.end) for screen in plan.screens]:
+        free &= _away(grid, np.array(start), np.array(end)) > CLEARANCE_M
+    number = np.arange(free.size).reshape(free.shape)
+    starts, ends, lengths = [], [], []
+    for step in ((1, 0), (0, 1), (1, 1), (1, -1)):
+        here, there = _shifted(number, step)
+        both = free.ravel()[here] & free.ravel()[there]
+        starts.append(here[both])
+        ends.append(there[both])
+        lengths.append(np.full(int(both.sum()), CELL_M * math.hypot(*step)))
+    links = (np.concatenate(starts), np.concatenate(ends))
+    ways = coo_array((np.concatenate(lengths), links), shape=(free.size, free.size)).tocsr()
+    _, part = connected_components(ways, directed=False)
+    sizes = np.bincount(part[free.ravel()], minlength=1)
+    kept = np.flatnonzero(free.ravel() & (part == int(np.argmax(sizes))))
+    return grid.reshape(-1, 2)[kept], ways[kept][:, kept]
+
+
+def _shifted(number: NDArray[np.intp], step: tuple[int, int]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Cells that have a neighbour a step away, and that neighbour."""
+    along, up = step
+    here = number[: len(number) - along, max(-up, 0) : number.shape[1] - max(up, 0)]
+    there = number[along:, max(up, 0) : number.shape[1] + min(up, 0)]
+    return here.ravel(), there.ravel()
+
+
+def _away(
+    grid: NDArray[np.float64], start: NDArray[np.float64], end: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Distances of points (..., 2) from a line between two."""
+    along = end - start
+    part = np.clip((grid - start) @ along / (along @ along), 0.0, 1.0)
+    away: NDArray[np.float64] = np.linalg.norm(grid - start - part[..., None] * along, axis=-1)
+    return away
+
+
+def _heard(plan: FloorPlan, anchor: Point, cells: NDArray[np.float64]) -> float:
+    """The share of places from which, by its mean level, a frame is received."""
+    n = len(cells)
+    boards = Boards(np.zeros(n), np.full(n, RADIO.noise_figure_db), np.full(n, float(RADIO.preamble_symbols)))
+    here = np.tile(anchor, (n, 1))
+    level = mean_level_dbm(RESIDENTIAL, here, cells, plan.direct_path(here, cells), boards)
+    return float((level >= RADIO.least_dbm(boards)).mean())
