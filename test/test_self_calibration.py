@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from drives import HALL, circuit, drive
@@ -87,10 +89,26 @@ def test_one_offset_is_found_where_none_differs(minute):
     assert any("share one" in note for note in found.not_told)
 
 
+def test_ranges_that_err_more_than_others_weigh_less(minute):
+    ranges, _ = minute
+    # Behind walls half of what is predicted is left: of the anchors at one side, more often.
+    rng = np.random.default_rng(8)
+    blocked = rng.random(len(ranges)) < np.array([0.8, 0.1, 0.1, 0.8, 0.4])[ranges.anchor]
+    late = with_own(ranges, OWN).range_m + np.where(blocked, np.abs(rng.normal(0.0, 0.4, len(ranges))), 0.0)
+    spoilt = replace(ranges, range_m=late)
+    nothing = Regressors.none(len(ranges))
+
+    def worst(alike):
+        found = calibrate(HALL, [spoilt], replace(nothing, alike=alike), height=LEVEL)
+        return np.abs([found.pair(0, row)[0] - 0.25 - OWN[row] for row in range(5)]).max()
+
+    assert worst(blocked.astype(int)) < 0.07 < worst(nothing.alike)
+
+
 def test_tags_at_a_dozen_unknown_places_tell_offset_and_line():
     anchors, tags, truth = places_at_rest()
     power = np.concatenate([one.rx_power_dbm for one in tags])
-    level = Regressors(("level",), (power + 88)[:, None], np.zeros(1), np.array([SLOPE_SD]))
+    level = Regressors.one("level", power + 88, 0.0, SLOPE_SD)
     found = calibrate(anchors, tags, level, height=LEVEL)
     assert found.stretches.at_rest.all()
     assert found.value("offset")[0] == pytest.approx(0.1, abs=0.06)

@@ -22,6 +22,10 @@ from uwb_mitigation.positioning.start import Height
 
 KNOT_S = 0.15
 LEAST_SCALE_M = 0.02
+LEAST_ALIKE = 20
+"""Links that tell by how much such links err."""
+
+_FIRST_SCALE_M = 0.3
 UNDERSTATED = 1.5
 """By how much deviations are multiplied: errors of one place come again with each lap, and a track bends to what persists,
 which counting new ranges does not know. Of simulated drives, with it 9 of 10 offsets lie within two deviations."""
@@ -50,6 +54,7 @@ class Links:
         ahead_s: float64 (n,), its time after the knot's.
         range_m, share: float64 (n,), and how much of a new range each is.
         rows: float64 (n, q), of the parameters.
+        alike: int (n,), links that err about as much have the same number, from 0.
         of: int (n,), the link of each of the original ranges (r,).
         knot_stretch: int (K,). time_s: float64 (K,), of each knot in its stretch. at_rest: bool (s,).
     """
@@ -60,6 +65,7 @@ class Links:
     range_m: NDArray[np.float64]
     share: NDArray[np.float64]
     rows: NDArray[np.float64]
+    alike: NDArray[np.intp]
     of: NDArray[np.intp]
     knot_stretch: NDArray[np.intp]
     time_s: NDArray[np.float64]
@@ -76,12 +82,12 @@ class Links:
     def without(self, left_out: NDArray[np.bool_]) -> Links:
         """The same knots, without those links (n,); `of` says nothing any more."""
         kept = ~left_out
-        columns = ("knot", "anchor", "ahead_s", "range_m", "share", "rows")
+        columns = ("knot", "anchor", "ahead_s", "range_m", "share", "rows", "alike")
         return replace(self, **{name: getattr(self, name)[kept] for name in columns})
 
 
-def links_of(stretches: Stretches, rows: NDArray[np.float64], model: Model) -> Links:
-    """Links of ranges whose parameters' rows are float64 (r, q)."""
+def links_of(stretches: Stretches, rows: NDArray[np.float64], alike: NDArray[np.intp], model: Model) -> Links:
+    """Links of ranges whose parameters' rows are float64 (r, q), and which err as much as others `alike`, int (r,)."""
     ranges = stretches.ranges
     knot, ahead, share = np.zeros(len(ranges), np.intp), np.zeros(len(ranges)), np.ones(len(ranges))
     knot_stretch: list[NDArray[np.intp]] = []
@@ -110,13 +116,14 @@ def links_of(stretches: Stretches, rows: NDArray[np.float64], model: Model) -> L
         len(stretches) * 1024 + np.arange(len(ranges)),
     )
     _, first, of = np.unique(key, return_index=True, return_inverse=True)
-    value, shared = ranges.range_m[first].copy(), rows[first].copy()
+    value, shared, kind = ranges.range_m[first].copy(), rows[first].copy(), alike[first].copy()
     order = np.argsort(of, kind="stable")
     groups = np.split(order, np.searchsorted(of[order], np.arange(1, len(first))))
     for link, group in enumerate(groups):
         if len(group) > 1:
             value[link] = np.median(ranges.range_m[group])
             shared[link] = np.median(rows[group], axis=0)
+            kind[link] = int(np.median(alike[group]))
     return Links(
         knot[first],
         ranges.anchor[first],
@@ -124,6 +131,7 @@ def links_of(stretches: Stretches, rows: NDArray[np.float64], model: Model) -> L
         value,
         share[first],
         shared,
+        kind,
         of,
         np.concatenate(knot_stretch),
         np.concatenate(times),
@@ -147,7 +155,7 @@ class JointFit:
         position, velocity: float64 (K, 3), at the knots.
         parameters: float64 (q,), and their covariance (q, q).
         residual_m: float64 (n,), of each link. weight: float64 (n,), what robustness left of it.
-        scale_m: standard deviation of residuals that are no outliers.
+        scale_m: float64 (g,), standard deviation of residuals that are no outliers, of links that err alike.
         stretch_loss: float64 (s,), robust loss of each stretch, in units of `scale_m`.
     """
 
@@ -157,7 +165,7 @@ class JointFit:
     covariance: NDArray[np.float64]
     residual_m: NDArray[np.float64]
     weight: NDArray[np.float64]
-    scale_m: float
+    scale_m: NDArray[np.float64]
     stretch_loss: NDArray[np.float64]
     _solution: Solution
     _height: Height | None
@@ -185,7 +193,7 @@ class JointSolver:
         links: of which each knot has one or more.
         parameters: their means and deviations; the rows are the links'.
         height: of all tags, where it stays the same.
-        scale_m: of the residuals; None = estimated.
+        scale_m: float64 (g,), of the residuals; None = estimated.
         around: float64 (K, 3), where the knots are known to be, to `AROUND_M`; None = nothing is known.
 
     Raises:
@@ -199,7 +207,7 @@ class JointSolver:
         parameters: Parameters,
         model: Model,
         height: Height | None = None,
-        scale_m: float | None = None,
+        scale_m: NDArray[np.float64] | None = None,
         around: NDArray[np.float64] | None = None,
     ) -> None:
         self._anchors, self._links, self._model, self._height = anchors, links, model, height
@@ -227,19 +235,23 @@ class JointSolver:
         x = np.zeros((len(links.time_s), 2 * d))
         x[:, :d] = position[:, :d]
         shared = self._mean.copy() if parameters is None else parameters
-        scale = self._scale or 0.3
+        scale = (
+            np.full(int(links.alike.max(initial=0)) + 1, _FIRST_SCALE_M)
+            if self._scale is None
+            else self._scale
+        )
         solution: Solution | None = None
         try:
             for iteration in range(_ITERATIONS):
                 direction, _, error = self._errors(x, shared)
                 if self._scale is None and (iteration or parameters is not None):
-                    found = _MAD_TO_SD * float(np.median(np.abs(error)))
-                    scale = max(found, LEAST_SCALE_M) if near else max(found, 0.5 * scale, LEAST_SCALE_M)
-                z = error / scale
+                    found = np.maximum(self._scales(error, len(scale)), LEAST_SCALE_M)
+                    scale = found if near else np.maximum(found, 0.5 * scale)
+                z = error / scale[links.alike]
                 robust = self._model.weight(z)
                 if iteration < _HUBER_ITERATIONS and not near:
                     robust = np.minimum(1.0, 1.0 / np.maximum(np.abs(z), 1e-9))
-                weight = robust * links.share / scale**2
+                weight = robust * links.share / scale[links.alike] ** 2
                 solution = self._linearised(x, shared, direction, error, weight).solve()
                 step = float(np.abs(solution.x[:, :d] - x[:, :d]).max())
                 x, shared = solution.x, solution.shared
@@ -253,7 +265,7 @@ class JointSolver:
             ) from error_
         assert solution is not None
         _, _, error = self._errors(x, shared)
-        z = error / scale
+        z = error / scale[links.alike]
         loss = np.bincount(links.stretch, self._model.loss(z) * links.share, minlength=len(links.at_rest))
         place, velocity = np.full((len(x), 3), self._level), np.zeros((len(x), 3))
         place[:, :d], velocity[:, :d] = x[:, :d], x[:, d:]
@@ -269,6 +281,16 @@ class JointSolver:
             solution,
             self._height,
         )
+
+    def _scales(self, error: NDArray[np.float64], kinds: int) -> NDArray[np.float64]:
+        """Of each kind the deviation of errors (n,) by their median; of one with few links, that of all."""
+        every = _MAD_TO_SD * float(np.median(np.abs(error)))
+        found = np.full(kinds, every)
+        for kind in range(kinds):
+            own = error[self._links.alike == kind]
+            if len(own) >= LEAST_ALIKE:
+                found[kind] = _MAD_TO_SD * float(np.median(np.abs(own)))
+        return found
 
     @property
     def _level(self) -> float:

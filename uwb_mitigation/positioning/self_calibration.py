@@ -72,17 +72,24 @@ class Regressors:
         names: of the columns.
         rows: float64 (r, k); 0 where not known.
         mean, sd: float64 (k,), what is known before.
+        alike: int (r,), ranges that should err about as much have the same number, from 0.
     """
 
     names: tuple[str, ...]
     rows: NDArray[np.float64]
     mean: NDArray[np.float64]
     sd: NDArray[np.float64]
+    alike: NDArray[np.intp]
+
+    @classmethod
+    def one(cls, name: str, row: NDArray[np.float64], mean: float, sd: float) -> Regressors:
+        """A single one, float64 (r,), of ranges that all err alike."""
+        return cls((name,), row[:, None], np.array([mean]), np.array([sd]), np.zeros(len(row), np.intp))
 
     @classmethod
     def none(cls, ranges: int) -> Regressors:
         """No such thing."""
-        return cls((), np.zeros((ranges, 0)), np.zeros(0), np.zeros(0))
+        return cls((), np.zeros((ranges, 0)), np.zeros(0), np.zeros(0), np.zeros(ranges, np.intp))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -165,7 +172,8 @@ def calibrate(
     told: list[str] = []
     found = stretches(tags)
     begins = np.cumsum([0, *map(len, tags)])
-    rows = known.rows[begins[found.tag] + found.row]
+    of_range = begins[found.tag] + found.row
+    rows, alike = known.rows[of_range], known.alike[of_range]
     expected = rows @ known.mean
     offset = likely_offset(anchors, found, expected, height, area, model)
     position, placed = first_positions(anchors, tags, found, expected + offset, height, area, model)
@@ -179,9 +187,9 @@ def calibrate(
             valid="four anchors or more that hear a tag at once, --height or --area",
         )
     kept = placed[found.of]
-    found, rows = found.keep(placed), rows[kept]
-    solved = _Columns.shared(rows, known, offset)
-    links = links_of(found, solved.rows, model)
+    found, rows, alike = found.keep(placed), rows[kept], alike[kept]
+    solved = _Columns.shared(rows, alike, known, offset)
+    links = links_of(found, solved.rows, solved.alike, model)
     # Knots of stretches that were left out are gone from the positions, too.
     fit = JointSolver(anchors, links, solved.parameters(links), model, height).fit(position)
     ambiguous = _mirrored(anchors, links, fit, height, area, model)
@@ -196,7 +204,7 @@ def calibrate(
             )
         kept, knots = ~ambiguous[found.of], ~ambiguous[links.knot_stretch]
         found, solved, position = found.keep(~ambiguous), solved.take(kept), fit.position[knots]
-        links = links_of(found, solved.rows, model)
+        links = links_of(found, solved.rows, solved.alike, model)
         fit = JointSolver(anchors, links, solved.parameters(links), model, height).fit(position)
     _check_motion(links, fit, height)
     level = "one"
@@ -208,21 +216,21 @@ def calibrate(
         # Without it nothing says how long any range truly is: offsets of their own would be its errors.
         tried = []
         solved = replace(solved, mean=np.array([0.0, *solved.mean[1:]]), sd=np.array([1e-4, *solved.sd[1:]]))
-        links = links_of(found, solved.rows, model)
+        links = links_of(found, solved.rows, solved.alike, model)
         start = np.array([0.0, *fit.parameters[1:]])
         fit = JointSolver(anchors, links, solved.parameters(links), model, height).fit(fit.position, start)
     for group, columns in tried:
-        richer, better, alike = _with_own(anchors, found, solved, columns, fit, height, model)
+        richer, better, shared = _with_own(anchors, found, solved, columns, fit, height, model)
         if richer is None or better is None:
             told.append(f"offsets of {group}s of their own: not told from chance, so that all share one")
             break
         solved, fit, level = richer, better, "pair" if group != "anchor" else "anchor"
-        if alike:
-            told.append(f"{', '.join(alike)}: not told apart from the others, whose offset counts")
+        if shared:
+            told.append(f"{', '.join(shared)}: not told apart from the others, whose offset counts")
     if level == "anchor" and len(np.unique(found.tag)) == 1:
         # Of one tag an anchor's offset is the pair's.
         level = "pair"
-    links = links_of(found, solved.rows, model)
+    links = links_of(found, solved.rows, solved.alike, model)
     fit = JointSolver(anchors, links, solved.parameters(links), model, height).fit(
         fit.position, fit.parameters
     )
@@ -273,18 +281,22 @@ def check_anchors(anchors: AnchorMap, used: NDArray[np.intp], height: Height | N
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Columns:
-    """Parameters, with their rows for every range."""
+    """Parameters, with their rows for every range, and which ranges err alike."""
 
     names: tuple[str, ...]
     rows: NDArray[np.float64]
+    alike: NDArray[np.intp]
     mean: NDArray[np.float64]
     sd: NDArray[np.float64]
 
     @classmethod
-    def shared(cls, rows: NDArray[np.float64], known: Regressors, offset: float) -> _Columns:
+    def shared(
+        cls, rows: NDArray[np.float64], alike: NDArray[np.intp], known: Regressors, offset: float
+    ) -> _Columns:
         return cls(
             ("offset", *known.names),
             np.column_stack([np.ones(len(rows)), rows]),
+            alike,
             np.array([offset, *known.mean]),
             np.array([COMMON_SD_M, *known.sd]),
         )
@@ -297,12 +309,13 @@ class _Columns:
         return _Columns(
             (*self.names, *columns),
             np.concatenate([self.rows, more], axis=1),
+            self.alike,
             np.concatenate([self.mean, np.zeros(len(columns))]),
             np.concatenate([self.sd, np.full(len(columns), sd)]),
         )
 
     def take(self, kept: NDArray[np.bool_]) -> _Columns:
-        return replace(self, rows=self.rows[kept])
+        return replace(self, rows=self.rows[kept], alike=self.alike[kept])
 
 
 def _own_offsets(found: Stretches) -> list[tuple[str, dict[str, NDArray[np.bool_]]]]:
@@ -340,7 +353,7 @@ def _with_own(
     count = len(columns)
 
     def fitted(some: _Columns) -> JointFit:
-        links = links_of(found, some.rows, model)
+        links = links_of(found, some.rows, some.alike, model)
         start = np.concatenate([fit.parameters, np.zeros(len(some.names) - len(fit.parameters))])
         return JointSolver(anchors, links, some.parameters(links), model, height).fit(
             fit.position, start, near=True

@@ -35,6 +35,9 @@ UNSURE_M = 0.25
 """Ranges whose pseudo-truth has a larger deviation are left out."""
 
 LEAST_LABELLED = 40
+KINDS = 8
+"""Of ranges, by how much the network corrects them: as many of each."""
+
 NETWORK, LEVEL = "network", "level"
 
 Progress = Callable[[str, float], None]
@@ -274,13 +277,15 @@ def regressors(site: SiteData, source: Bundle) -> Regressors:
     if site.has_cirs:
         predicted = site_model.network_m(float_network(source), site.inputs)
         rows = np.where(np.isfinite(predicted), predicted, 0.0)[:, None]
-        return Regressors((NETWORK,), rows, np.ones(1), np.array([NETWORK_SD]))
+        # What it takes for undisturbed errs by centimetres, what it corrects by decimetres.
+        size = np.abs(rows[:, 0])
+        edges = np.quantile(size, np.linspace(0.0, 1.0, KINDS + 1)[1:-1])
+        return Regressors((NETWORK,), rows, np.ones(1), np.array([NETWORK_SD]), np.searchsorted(edges, size))
     power = site.rx_power_dbm.astype(np.float64)
     known = np.isfinite(power)
     if known.mean() < 0.5 or np.ptp(power[known]) < 1.0:
         return Regressors.none(len(power))
-    level = np.where(known, power - np.median(power[known]), 0.0)[:, None]
-    return Regressors((LEVEL,), level, np.zeros(1), np.array([SLOPE_SD]))
+    return Regressors.one(LEVEL, np.where(known, power - np.median(power[known]), 0.0), 0.0, SLOPE_SD)
 
 
 def write(output: Path, result: Calibrated, source: Bundle, name: str) -> tuple[Bundle, Path]:
