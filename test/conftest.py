@@ -10,12 +10,16 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import signal
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from browser import Browser, chromium
 from real_logs import Reading, read_once
 
 from uwb_mitigation.dw1000_model.air import Air
+
+if TYPE_CHECKING:
+    from ros_harness import Ros
 
 # A suite that a script starts in the background ignores SIGINT, and so would all that tests start and interrupt.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -51,3 +55,13 @@ def air() -> Iterator[Air]:
     """Where a test puts modelled chips; it needs a C compiler."""
     with Air(1) as air:
         yield air
+
+
+@pytest.fixture
+def ros(tmp_path: Path) -> Iterator[Ros]:
+    """A DDS domain of the test's own, with a client in it."""
+    pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
+    from ros_harness import domain
+
+    with domain(tmp_path) as ros:
+        yield ros

@@ -11,7 +11,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
-from ros_harness import domain
+from ros_harness import Ros
 from uwb_mitigation_msgs.msg import RangeCorrected
 
 from uwb_mitigation.benches import nodes, viewer, vitals
@@ -29,10 +29,8 @@ pytestmark = pytest.mark.ros
 
 
 @pytest.fixture
-def own_domain(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    with domain(tmp_path) as ros:
-        monkeypatch.setenv("ROS_DOMAIN_ID", str(ros.domain))
-        yield
+def own_domain(ros: Ros, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(ros.domain))
 
 
 def test_ranges_that_are_missing_are_counted_across_the_bags_end():

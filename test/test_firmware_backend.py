@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import firmware_models
 import model_material
@@ -20,6 +21,9 @@ from uwb_mitigation.firmware_export.backend import FirmwareMitigation
 from uwb_mitigation.mitigation import Mitigation, correct_batch
 from uwb_mitigation.model.bundle import Bundle
 from uwb_mitigation.offsets import Offsets
+
+if TYPE_CHECKING:
+    from ros_harness import Ros
 
 
 @NEEDS_CC
@@ -64,11 +68,9 @@ def test_what_only_a_checkout_has_is_said_to_need_one(tmp_path: Path, monkeypatc
 @NEEDS_CC
 @pytest.mark.ros
 def test_a_mitigator_that_is_told_to_corrects_with_the_firmware(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ros: Ros, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
     from rclpy.serialization import deserialize_message
-    from ros_harness import domain
     from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
     bundle = firmware_models.choosy_bundle(tmp_path)
@@ -77,17 +79,14 @@ def test_a_mitigator_that_is_told_to_corrects_with_the_firmware(
     compiler.chmod(0o755)
     monkeypatch.setenv("CC", str(compiler))
     measurements = [model_material.measurement(1.0 + seed / 4, seed) for seed in range(20)]
-    with domain(tmp_path) as ros:
-        publisher = ros.node.create_publisher(RangeCir, "/uwb/range_raw", 50)
-        corrected = ros.collect(RangeCorrected, "/uwb/range_corrected")
-        ros.start("mitigator", f"model:={bundle.path}", "backend:=firmware").wait_for_output(
-            "correcting with"
-        )
-        questions = [deserialize_message(encode_range(each), RangeCir) for each in measurements]
-        ros.find_each_other(publisher, questions[0], corrected)
-        for question in questions:
-            publisher.publish(question)
-        ros.spin_until(lambda: len(corrected) == len(measurements))
+    publisher = ros.node.create_publisher(RangeCir, "/uwb/range_raw", 50)
+    corrected = ros.collect(RangeCorrected, "/uwb/range_corrected")
+    ros.start("mitigator", f"model:={bundle.path}", "backend:=firmware").wait_for_output("correcting with")
+    questions = [deserialize_message(encode_range(each), RangeCir) for each in measurements]
+    ros.find_each_other(publisher, questions[0], corrected)
+    for question in questions:
+        publisher.publish(question)
+    ros.spin_until(lambda: len(corrected) == len(measurements))
     assert traces.exists()
     mitigation = Mitigation(bundle)
     for message, measurement in zip(corrected, measurements, strict=True):

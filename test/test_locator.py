@@ -17,7 +17,7 @@ from drives import HALL, drive
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from ros_harness import Ros, domain
+from ros_harness import Ros
 from std_msgs.msg import Header
 from uwb_mitigation_msgs.msg import RangeCorrected
 from visualization_msgs.msg import MarkerArray
@@ -30,12 +30,6 @@ pytestmark = pytest.mark.ros
 
 CORRECTED = "/uwb/range_corrected"
 NANOSECONDS = 1_000_000_000
-
-
-@pytest.fixture
-def ros(tmp_path: Path):
-    with domain(tmp_path) as ros:
-        yield ros
 
 
 @pytest.fixture

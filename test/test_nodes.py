@@ -42,12 +42,6 @@ RAW = "/uwb/range_raw"
 CORRECTED = "/uwb/range_corrected"
 
 
-@pytest.fixture
-def ros(tmp_path: Path):
-    with domain(tmp_path) as ros:
-        yield ros
-
-
 @pytest.fixture(scope="session")
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """300 simulated ranges in a bag, 40 a second."""

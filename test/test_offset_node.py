@@ -11,7 +11,7 @@ pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
 from model_material import measurement
 from rclpy.serialization import deserialize_message
-from ros_harness import domain
+from ros_harness import Ros
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
 from uwb_mitigation.bag.codec import encode_range
@@ -25,43 +25,42 @@ from uwb_mitigation.offsets import Offsets, read_offsets
 pytestmark = pytest.mark.ros
 
 
-def test_offsets_are_set_while_it_runs_and_nonsense_leaves_those_before(tmp_path: Path):
+def test_offsets_are_set_while_it_runs_and_nonsense_leaves_those_before(ros: Ros, tmp_path: Path):
     path = tmp_path / "offsets.yaml"
     path.write_text("pairs: [{anchor: 2, tag: 1, offset: 1.5}]")
     asked = measurement(5.0)
     host = Mitigation(load_bundle(default_model_path()))
-    with domain(tmp_path) as ros:
-        publisher = ros.node.create_publisher(RangeCir, "/uwb/range_raw", 10)
-        corrected = ros.collect(RangeCorrected, "/uwb/range_corrected")
-        ros.start("mitigator", "offsets:=0.25").wait_for_output("correcting with")
-        ros.find_each_other(publisher, deserialize_message(encode_range(asked), RangeCir), corrected)
+    publisher = ros.node.create_publisher(RangeCir, "/uwb/range_raw", 10)
+    corrected = ros.collect(RangeCorrected, "/uwb/range_corrected")
+    ros.start("mitigator", "offsets:=0.25").wait_for_output("correcting with")
+    ros.find_each_other(publisher, deserialize_message(encode_range(asked), RangeCir), corrected)
 
-        def answer() -> RangeCorrected:
-            corrected.clear()
-            publisher.publish(deserialize_message(encode_range(asked), RangeCir))
-            ros.spin_until(lambda: len(corrected) == 1)
-            return corrected[0]
+    def answer() -> RangeCorrected:
+        corrected.clear()
+        publisher.publish(deserialize_message(encode_range(asked), RangeCir))
+        ros.spin_until(lambda: len(corrected) == 1)
+        return corrected[0]
 
-        def expected(offsets: Offsets) -> np.float32:
-            host.offsets = offsets
-            return np.float32(host.correct(asked).range_m)
+    def expected(offsets: Offsets) -> np.float32:
+        host.offsets = offsets
+        return np.float32(host.correct(asked).range_m)
 
-        assert answer().range == expected(Offsets(0.25))
-        assert ros.set_parameter("mitigator", "offsets", str(path)).successful
-        assert answer().range == expected(read_offsets(str(path)))
-        for nonsense, said in (
-            ("220", "millimetres"),
-            (str(tmp_path / "no.yaml"), "no such file"),
-            (True, "number of metres"),
-        ):
-            refused = ros.set_parameter("mitigator", "offsets", nonsense)
-            assert not refused.successful
-            assert said in refused.reason
-        assert answer().range == expected(read_offsets(str(path)))
-        assert ros.set_parameter("mitigator", "offsets", 0.5).successful
-        last = answer()
-        assert last.range == expected(Offsets(0.5))
-        assert last.range_raw == np.float32(asked.range_m)
+    assert answer().range == expected(Offsets(0.25))
+    assert ros.set_parameter("mitigator", "offsets", str(path)).successful
+    assert answer().range == expected(read_offsets(str(path)))
+    for nonsense, said in (
+        ("220", "millimetres"),
+        (str(tmp_path / "no.yaml"), "no such file"),
+        (True, "number of metres"),
+    ):
+        refused = ros.set_parameter("mitigator", "offsets", nonsense)
+        assert not refused.successful
+        assert said in refused.reason
+    assert answer().range == expected(read_offsets(str(path)))
+    assert ros.set_parameter("mitigator", "offsets", 0.5).successful
+    last = answer()
+    assert last.range == expected(Offsets(0.5))
+    assert last.range_raw == np.float32(asked.range_m)
 
 
 def test_a_model_that_holds_an_offset_is_warned_of_once_enough_ranges_show_it():

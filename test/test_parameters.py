@@ -23,12 +23,6 @@ from uwb_mitigation.sources.simulated import SimulatedSource
 pytestmark = pytest.mark.ros
 
 
-@pytest.fixture
-def ros(tmp_path: Path):
-    with domain(tmp_path) as ros:
-        yield ros
-
-
 @pytest.fixture(scope="module")
 def replaying(tmp_path_factory: pytest.TempPathFactory):
     """A domain with a driver that waits to be told to play."""

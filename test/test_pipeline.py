@@ -5,7 +5,6 @@ from __future__ import annotations
 import signal
 import threading
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
 import rclpy
-from ros_harness import Ros, domain
+from ros_harness import Ros
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
 from uwb_mitigation.bag.codec import encode_range
@@ -29,12 +28,6 @@ pytestmark = pytest.mark.ros
 RAW = "/uwb/range_raw"
 CORRECTED = "/uwb/range_corrected"
 PLAY = ("count:=200", "seed:=1", "simulated_rate:=400.0", "start_delay:=0.5")
-
-
-@pytest.fixture
-def ros(tmp_path: Path):
-    with domain(tmp_path) as ros:
-        yield ros
 
 
 def test_the_ranges_are_those_of_the_library_to_the_bit(ros: Ros):

@@ -36,12 +36,6 @@ DEFAULTS = {row.name: row.default for row in DRIVER}
 
 
 @pytest.fixture
-def ros(tmp_path: Path) -> Iterator[ros_harness.Ros]:
-    with ros_harness.domain(tmp_path) as client:
-        yield client
-
-
-@pytest.fixture
 def boards(tmp_path: Path) -> Iterator[EmulatedEvb1000s]:
     with EmulatedEvb1000s(None, boards=3, port_links=tmp_path / "radio") as emulated:
         yield emulated

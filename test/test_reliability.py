@@ -19,7 +19,7 @@ from lifecycle_msgs.msg import Transition
 from model_material import bundle
 from rclpy.qos import qos_profile_sensor_data
 from rclpy.serialization import deserialize_message
-from ros_harness import Ros, domain
+from ros_harness import Ros
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Range
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
@@ -48,12 +48,6 @@ from uwb_mitigation.sources.simulated import SimulatedSource
 RAW = "/uwb/range_raw"
 CORRECTED = "/uwb/range_corrected"
 ENDLESS = ("simulated_rate:=100.0", "start_delay:=0.2")
-
-
-@pytest.fixture
-def ros(tmp_path: Path):
-    with domain(tmp_path) as ros:
-        yield ros
 
 
 @pytest.mark.ros

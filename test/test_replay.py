@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import threading
 import time
-from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -13,86 +12,33 @@ import pytest
 
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
-from rclpy.clock import Clock, ClockType
-from ros_harness import Ros, domain
+from players import ListSource, Player, stop_after
+from ros_harness import Ros
 from rosgraph_msgs.msg import Clock as ClockMessage
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
 from uwb_mitigation.bag.writer import BagWriter
-from uwb_mitigation.measurement import Cir, RangeMeasurement, Record
-from uwb_mitigation.nodes.playback import Playback
 from uwb_mitigation.sources.simulated import SimulatedSource
 
 MS = 1_000_000
 COUNT = 400
 
 
-class Steps:
-    """Records `step_ns` apart, numbered from 0."""
-
-    name = "steps"
-    simulated = True
-
-    def __init__(self, count: int, step_ns: int) -> None:
-        self.count, self.step_ns = count, step_ns
-        self.skipped: Counter[str] = Counter()
-
-    def __iter__(self):
-        cir = Cir(np.zeros(0, np.int16))
-        for index in range(self.count):
-            yield Record(RangeMeasurement(10**18 + index * self.step_ns, 1, 2, index, 0, 1.0, cir))
-
-    def close(self) -> None:
-        pass
+def steps(count: int, step_ns: int) -> ListSource:
+    return ListSource(range(10**18, 10**18 + count * step_ns, step_ns))
 
 
-class Player:
-    """Plays steps; `on_record(player, sequence)` is called for each from the playing thread."""
-
-    def __init__(self, count: int, step_ns: int, on_record=lambda player, sequence: None, **options) -> None:
-        self.sequences: list[int] = []
-        self.stamps: list[int] = []
-        self.clock_times: list[int] = []
-        self.batches: list[int] = []
-        self.ended = threading.Event()
-        self.on_record = on_record
-        settings = {"rate": 1.0, "loop": False, "longest_pause_s": 100.0, "recorded_stamps": False}
-        self.playback = Playback(
-            Steps(count, step_ns),
-            Clock(clock_type=ClockType.STEADY_TIME),
-            **(settings | options),
-            ready=lambda: True,
-            publish=self.publish,
-            on_time=self.tell_time,
-            on_end=lambda error: self.ended.set(),
-        )
-
-    def publish(self, records) -> None:
-        self.batches.append(len(records))
-        for record, stamp_ns in records:
-            self.sequences.append(record.measurement.sequence)
-            self.stamps.append(stamp_ns)
-            self.on_record(self, record.measurement.sequence)
-
-    def tell_time(self, time_ns: int) -> None:
-        self.clock_times.append(time_ns)
-
-    def published_with(self, sequence: int) -> int:
-        """How many records had come when the call with this one ended: what is late comes together."""
-        return next(end for end in itertools.accumulate(self.batches) if end > self.sequences.index(sequence))
-
-    def play(self) -> Player:
-        self.playback.start()
-        assert self.ended.wait(60)
-        self.playback.stop()
-        return self
+def published_with(player: Player, sequence: int) -> int:
+    """How many records had come when the call with this one ended: what is late comes together."""
+    ends = itertools.accumulate(player.batches)
+    return next(end for end in ends if end > player.sequences.index(sequence))
 
 
 def test_a_seek_forwards_leaves_records_out_and_stamps_go_on():
     player = Player(
-        100, 100 * MS, lambda player, sequence: player.playback.seek(9.0) if sequence == 3 else None
+        steps(100, 100 * MS), lambda player, sequence: player.playback.seek(9.0) if sequence == 3 else None
     ).play()
-    before = player.published_with(3)
+    before = published_with(player, 3)
     assert player.sequences == [*range(before), *range(90, 100)]
     assert player.stamps == sorted(player.stamps)
     assert player.stamps[-1] - player.stamps[0] < 5000 * MS
@@ -105,24 +51,19 @@ def test_a_seek_backwards_plays_again():
         if sequence == 5 and next(seeks, False):
             player.playback.seek(0.02)
 
-    player = Player(8, 10 * MS, back).play()
-    before = player.published_with(5)
+    player = Player(steps(8, 10 * MS), back).play()
+    before = published_with(player, 5)
     assert player.sequences == [*range(before), *range(2, 8)]
     assert player.stamps == sorted(player.stamps)
 
 
 def test_a_replay_can_start_anywhere_and_ends_at_once_beyond_the_end():
-    assert Player(20, 10 * MS, from_s=0.15).play().sequences == [15, 16, 17, 18, 19]
-    assert Player(20, 10 * MS, from_s=5.0).play().sequences == []
+    assert Player(steps(20, 10 * MS), from_s=0.15).play().sequences == [15, 16, 17, 18, 19]
+    assert Player(steps(20, 10 * MS), from_s=5.0).play().sequences == []
 
 
 def test_a_loop_plays_from_the_start_after_a_seek():
-    def stop(player: Player, sequence: int) -> None:
-        if len(player.sequences) == 7:
-            player.playback.stop()
-            player.ended.set()
-
-    player = Player(10, 5 * MS, stop, from_s=0.04, loop=True).play()
+    player = Player(steps(10, 5 * MS), stop_after(7), from_s=0.04, loop=True).play()
     # A record that was late already came in one call with the seventh.
     assert player.sequences[:7] == [8, 9, 0, 1, 2, 3, 4]
 
@@ -141,7 +82,7 @@ def test_a_pause_holds_the_records_and_their_time():
         if sequence == 2:
             assert resumed.is_set()
 
-    player = Player(5, 200 * MS, pause).play()
+    player = Player(steps(5, 200 * MS), pause).play()
     assert player.sequences == [0, 1, 2, 3, 4]
     gaps = np.diff(player.stamps)
     # The rest of the wait for the next record comes after the pause.
@@ -155,10 +96,9 @@ def test_a_seek_does_not_wait_for_the_record_that_was_next():
             player.playback.seek(120.0)
 
         if sequence == 2:
-            player.playback.stop()
-            player.ended.set()
+            player.stop()
 
-    player = Player(4, 60_000 * MS, skip, longest_pause_s=30.0).play()
+    player = Player(steps(4, 60_000 * MS), skip, longest_pause_s=30.0).play()
     assert player.sequences == [0, 2]
     first, second = player.stamps
     assert second - first < 10_000 * MS
@@ -175,7 +115,7 @@ def test_the_clock_stands_still_in_a_pause():
         if sequence == 1:
             player.playback.paused = True
 
-    player = Watched(3, 100 * MS, pause, recorded_stamps=True).play()
+    player = Watched(steps(3, 100 * MS), pause, recorded_stamps=True).play()
     assert player.sequences == [0, 1, 2], "a clock that goes on ends no pause here"
     assert player.clock_times == sorted(player.clock_times)
 
@@ -185,7 +125,7 @@ def test_another_rate_changes_the_distances_from_there_on():
         if sequence == 2:
             player.playback.rate = 10.0
 
-    player = Player(12, 50 * MS, faster).play()
+    player = Player(steps(12, 50 * MS), faster).play()
     gaps = np.diff(player.stamps)
     assert list(gaps[:2]) == [50 * MS] * 2
     assert list(gaps[4:]) == [5 * MS] * 7
@@ -196,7 +136,7 @@ def test_late_records_come_several_at_once_and_in_order():
         if sequence == 0:
             time.sleep(0.02)
 
-    player = Player(500, 1000, delay).play()
+    player = Player(steps(500, 1000), delay).play()
     assert player.sequences == list(range(500))
     assert max(player.batches) > 1
     assert player.batches[0] == 1
@@ -210,12 +150,6 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for record in source:
             writer.write(record)
     return path
-
-
-@pytest.fixture
-def ros(tmp_path: Path):
-    with domain(tmp_path) as ros:
-        yield ros
 
 
 @pytest.mark.ros

@@ -19,7 +19,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
-from ros_harness import Process, Ros, domain
+from ros_harness import Process, Ros
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
 from uwb_mitigation.link.board import Identity
@@ -39,12 +39,6 @@ pytestmark = pytest.mark.ros
 LOST = "board: measurements_lost"
 RAW = "/uwb/range_raw"
 CORRECTED = "/uwb/range_corrected"
-
-
-@pytest.fixture
-def ros(tmp_path: Path):
-    with domain(tmp_path) as ros:
-        yield ros
 
 
 @pytest.fixture

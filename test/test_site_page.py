@@ -22,7 +22,7 @@ from conftest import REPOSITORY
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from ros_harness import Ros, domain
+from ros_harness import Ros
 
 from uwb_mitigation.sources.recorded_ranges import read_ranges
 from uwb_mitigation.sources.site import load_anchors
@@ -94,12 +94,6 @@ class Terminals:
 
     def _printed(self) -> str:
         return "\n".join(f"--- {log.name}\n{log.read_text()[-3000:]}" for log in self.folder.glob("*.log"))
-
-
-@pytest.fixture
-def ros(tmp_path: Path) -> Iterator[Ros]:
-    with domain(tmp_path) as ros:
-        yield ros
 
 
 @pytest.fixture
