@@ -73,8 +73,12 @@ class Process:
             time.sleep(0.02)
 
     def end(self) -> None:
-        self.send(signal.SIGKILL)
-        self.wait()
+        """Kill it if it does not end by itself."""
+        try:
+            self._popen.wait(10.0)
+        except subprocess.TimeoutExpired:
+            self.send(signal.SIGKILL)
+            self.wait()
 
 
 class Ros:
@@ -172,10 +176,17 @@ class Ros:
         return found[0]
 
     def close(self) -> None:
-        for process in self._processes:
-            process.end()
+        """The client leaves first, and the nodes by Ctrl-C.
+
+        Killed, they leave shared memory half written: Fast DDS of who writes to them then, or opens that memory in
+        a later test of this domain, can crash (eProsima/Fast-DDS issue 6501).
+        """
         self.node.destroy_node()
         rclpy.shutdown(context=self._context)
+        for process in self._processes:
+            process.send(signal.SIGINT)
+        for process in self._processes:
+            process.end()
 
 
 @contextmanager

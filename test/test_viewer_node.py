@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -72,7 +73,7 @@ def test_the_page_shows_what_is_published(ros: ros_harness.Ros, browser: Browser
     browser.open(found[1])
     browser.wait("ranges again", lambda: len(column("pairs", "range")) >= 2)
     browser.run("window.before = true")
-    viewer.end()
+    viewer.signal(signal.SIGKILL)
     ros.start("viewer", f"port:={found[1].rsplit(':')[-1].strip('/')}")
     browser.wait("the page to come back by itself", lambda: not browser.run("return window.before ?? false"))
     browser.wait("ranges of the new one", lambda: len(column("pairs", "range")) >= 2)
