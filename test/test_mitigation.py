@@ -13,6 +13,7 @@ from uwb_mitigation.measurement import Encoding, Origin, Status
 from uwb_mitigation.mitigation import Mitigation, correct_batch
 from uwb_mitigation.model.architecture import Remnet
 from uwb_mitigation.model.prior import LinePrior
+from uwb_mitigation.offsets import Offsets
 from uwb_mitigation.preprocessing import Preprocessing
 
 
@@ -111,10 +112,20 @@ def test_a_prediction_beyond_the_limits_is_out_of_distribution(tmp_path):
     assert (result.status, result.range_m) == (Status.OUT_OF_DISTRIBUTION, 3.0)
 
 
-def test_a_batch_has_the_bits_of_single_measurements(mitigation):
+@pytest.mark.parametrize(
+    "prior", [None, LinePrior(0.25), LinePrior(-1.0, -0.015625), LinePrior(0.125, 0.0, 0.03125)]
+)
+def test_a_batch_has_the_bits_of_single_measurements(mitigation, tmp_path, prior):
+    if prior is not None:
+        made = bundle(tmp_path, Remnet(samples=157), prior=prior, needs_cir=False)
+        mitigation = Mitigation(made, Offsets(0.125))
     subjects = [measurement(2 + 0.01 * seed, seed) for seed in range(60)]
     subjects[5:5] = [measurement(range_m, **changes) for changes, range_m, _ in BAD]
+    subjects += [measurement(2.0, samples=np.zeros(0, np.int16), rx_power_dbm=-60.0 - n) for n in range(9)]
+    subjects += [measurement(2.0, first_path_power_dbm=math.nan), measurement(2.0, rx_power_dbm=math.nan)] * 4
     single = [mitigation.correct(subject) for subject in subjects]
+    if prior is not None:
+        assert sum(result.status is Status.OK for result in single) > 70
     assert [repr(result) for result in correct_batch(mitigation, subjects)] == [repr(r) for r in single]
 
 

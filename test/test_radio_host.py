@@ -184,14 +184,13 @@ def test_settings_that_no_radio_has_are_refused_at_once():
 class FakeSpi:
     """`spidev.SpiDev` on a modelled chip that keeps up with this computer's clock."""
 
-    air: Air
-    began: float
+    air: Air | None = None
 
     def open(self, number: int, select: int) -> None:
         if number:
             raise FileNotFoundError(2, "No such file or directory")
-        type(self).air = Air(1)
-        type(self).began = time.monotonic()
+        self.air = Air(1)
+        self.began = time.monotonic()
         self.chip = self.air.chip()
 
     def xfer2(self, octets: list[int]) -> list[int]:
@@ -201,7 +200,8 @@ class FakeSpi:
         return list(self.chip.spi(bytes(octets), self.max_speed_hz))
 
     def close(self) -> None:
-        self.air.close()
+        if self.air is not None:
+            self.air.close()
 
 
 def test_a_chip_on_spidev_starts_and_looks_for_anchors(monkeypatch: pytest.MonkeyPatch):

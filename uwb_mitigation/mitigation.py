@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -198,7 +198,7 @@ class Mitigation:
         prior, status = self._prepare(range_m, measurement.cir)
         unread = status in (Status.NO_CIR, Status.BAD_CIR)
         if unread and not self.bundle.card.needs_cir and _valid(range_m):
-            prior = self._prior_alone(measurement.cir)
+            prior = self._prior.predict_m(*self._powers_alone(measurement.cir))
             if math.isfinite(prior):
                 return self._corrected(measurement, np.float32(offset_m), prior, np.float32(0.0))
         if status is not Status.OK:
@@ -212,34 +212,39 @@ class Mitigation:
 
     def correct_columns(self, ranges: RangeColumns) -> tuple[NDArray[np.intp], CorrectedColumns]:
         """As `Backend` says; the rows are those whose error could be predicted."""
-        rows, windows = self._preprocessing.apply_batch(ranges)
-        prior = self._prior.predict_batch_m(ranges.rx_power_dbm[rows], ranges.first_path_power_dbm[rows])
-        offset = self.offsets.of_columns(ranges.tag_id[rows], ranges.anchor_id[rows])
-        raw = ranges.range_m[rows]
+        offset = self.offsets.of_columns(ranges.tag_id, ranges.anchor_id)
+        raw = ranges.range_m
+        powers = (ranges.rx_power_dbm, ranges.first_path_power_dbm)
         with np.errstate(over="ignore"):  # As in `_less`.
             range_m = np.where(offset == 0.0, raw, raw.astype(np.float32, copy=False) - offset)
-        wanted = np.isfinite(prior) & (range_m >= 0.0) & (range_m <= MAX_RANGE_M)
+        predicted = self._prior.predict_batch_m(*powers)
+        score = np.zeros(len(raw), np.float32)
+        read, windows = self._preprocessing.apply_batch(ranges)
+        with_powers = np.isfinite(predicted[read])
+        if not with_powers.all():
+            read, windows = read[with_powers], windows[with_powers]
+        unread = np.ones(len(raw), np.bool_)
+        unread[read] = False
+        predicted[unread] = np.nan
+        if not self.bundle.card.needs_cir:
+            predicted[unread] = self._prior.predict_batch_m(*self._powers_alone(ranges))[unread]
         try:
-            predicted = prior + self._session.predict_batch_m(windows)
+            predicted[read] += self._session.predict_batch_m(windows)
         except Exception:  # As in `correct`.
-            wanted[:] = False
-            predicted = prior
-        wanted &= np.isfinite(predicted)
-        if not wanted.all():
-            rows, windows, predicted = rows[wanted], windows[wanted], predicted[wanted]
-            range_m, raw, offset = range_m[wanted], raw[wanted], offset[wanted]
-        powers = (ranges.rx_power_dbm[rows], ranges.first_path_power_dbm[rows])
-        with np.errstate(over="ignore"):  # As in `correct`.
-            score = self._grader.score(
-                windows, *(numbers.astype(np.float32, copy=False) for numbers in (range_m, *powers))
-            )
+            predicted[read] = np.nan
+        with np.errstate(over="ignore"):  # As in `_score`.
+            judged = (values[read].astype(np.float32, copy=False) for values in (range_m, *powers))
+            score[read] = self._grader.score(windows, *judged)
+
+        rows = np.flatnonzero(np.isfinite(predicted) & (range_m >= 0.0) & (range_m <= MAX_RANGE_M))
+        predicted, score = predicted[rows], score[rows]
         inside = self._grader.passes(predicted, score)
         correction = np.zeros(len(rows), np.float32)
         variance = np.full(len(rows), self._variance_uncorrected, np.float32)
         correction[inside], variance[inside] = self._grader.grade(predicted[inside], score[inside])
-        correction += offset
+        correction += offset[rows]
         return rows, CorrectedColumns(
-            raw.astype(np.float32, copy=False) - correction,
+            raw[rows].astype(np.float32, copy=False) - correction,
             correction,
             variance,
             np.where(inside, np.uint8(Status.OK), np.uint8(Status.OUT_OF_DISTRIBUTION)),
@@ -260,10 +265,10 @@ class Mitigation:
         score: np.float32 = self._grader.score(self._window[None], *numbers)[0]
         return score
 
-    def _prior_alone(self, cir: Cir) -> np.float32:
-        """What the prior predicts of a range without CIR; a level that it gives no weight need not be known."""
-        first_path = cir.first_path_power_dbm if self._prior.per_power_gap != 0.0 else cir.rx_power_dbm
-        return self._prior.predict_m(cir.rx_power_dbm, first_path)
+    def _powers_alone(self, of: Cir | RangeColumns) -> tuple[Any, Any]:
+        """The powers that the prior reads where it is alone; a level that it gives no weight need not be known."""
+        first_path = of.first_path_power_dbm if self._prior.per_power_gap != 0.0 else of.rx_power_dbm
+        return of.rx_power_dbm, first_path
 
     def _prepare(self, range_m: float, cir: Cir) -> tuple[np.float32, Status]:
         """Fill the network's input; return the prior's prediction and whether to go on."""
