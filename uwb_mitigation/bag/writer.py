@@ -276,8 +276,8 @@ class BagWriter:
         if described is None or described == [self.file.name]:
             return True
         self.notice = (
-            f"{self.file.with_name(METADATA_NAME)} describes another bag and was left as it is; "
-            f"open {self.file} by its own name"
+            f"{self.file.with_name(METADATA_NAME)} describes another bag and was left as it is: "
+            f"open {self.file.name} itself, not its folder"
         )
         return False
 

@@ -193,7 +193,7 @@ def simulate(
     _save_anchors(source, output)
     lost = ", ".join(f"{count} x {why}" for why, count in inventory.skipped.items())
     console.out.print(
-        f"Wrote {inventory.ranges} ranges of {inventory.pair_count} pairs to {bag.file}"
+        f"Wrote {inventory.ranges} ranges of {_pairs(inventory)} to {bag.file}"
         + (f"; left out: {lost}." if lost else "."),
         markup=False,
         highlight=False,
@@ -319,8 +319,8 @@ def _show_inventory(inventory: Inventory) -> None:
     from rich.table import Table
 
     console.out.print(
-        f"{inventory.ranges} ranges, {inventory.with_truth} with truth, {inventory.pair_count} pairs, "
-        f"{inventory.duration_s:.1f} s"
+        f"{inventory.ranges} ranges, {inventory.with_truth} with truth, "
+        f"{_pairs(inventory)}, {inventory.duration_s:.1f} s"
     )
     pairs = Table("anchor", "tag", "label", title="Pairs", title_justify="left")
     for column in ("ranges", "rate (Hz)", "mean range (m)", "mean true (m)"):
@@ -342,6 +342,10 @@ def _show_inventory(inventory: Inventory) -> None:
         for kind, count in inventory.skipped.most_common():
             oddities.add_row(kind, str(count))
         console.out.print(oddities)
+
+
+def _pairs(inventory: Inventory) -> str:
+    return f"{inventory.pair_count} pair{'' if inventory.pair_count == 1 else 's'}"
 
 
 def _identity(number: int) -> str:

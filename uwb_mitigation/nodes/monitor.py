@@ -95,9 +95,10 @@ def summary(tally: Tally) -> Group:
     statuses = ", ".join(
         f"{tally.statuses[status]} {status.name}" for status in Status if tally.statuses[status]
     )
+    corrected = f"{tally.corrected} corrected" + (f" ({statuses})" if statuses else "")
     lines: list[Text | Table] = [
         Text(),
-        Text(f"{tally.raw} ranges received, {tally.corrected} corrected ({statuses}), {tally.missing} lost"),
+        Text(f"{tally.raw} ranges received, {corrected}, {tally.missing} lost"),
     ]
     if tally.corrected:
         p50, p99 = tally.latency_ms(50), tally.latency_ms(99)

@@ -184,7 +184,7 @@ class HostRadio:
 
     def _fault(self) -> tuple[RadioState, str]:
         fault = self._library.host_radio_fault(self._radio)
-        return _FAULTS.get(fault, (RadioState.RUNNING, "the radio does not work"))
+        return _FAULTS.get(fault, (RadioState.RUNNING, "the DW1000 did not do in time what it was told"))
 
     def _measurement(self) -> RangeMeasurement:
         count, measured_us = c_size_t(), c_uint64()

@@ -6,9 +6,6 @@ each may be compressed with xz. The tag's antenna is 1.0 m above the trajectory'
 
 from __future__ import annotations
 
-import csv
-import io
-import lzma
 import math
 import re
 from collections import Counter
@@ -19,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.files import read_bounded
 from uwb_mitigation.measurement import Cir, RangeMeasurement, Record
 from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
 from uwb_mitigation.positioning.tracks import TruePath
+from uwb_mitigation.sources.csv_rows import read_rows
 from uwb_mitigation.sources.source import Source
 
 TAG_ID = 1
@@ -96,7 +93,7 @@ class HanyangRun(Source):
         anchors: dict[int, Anchor],
         rows: list[tuple[int, int, float, float, float]],
     ) -> None:
-        for line, row in _rows(path, _RANGE_COLUMNS):
+        for line, row in read_rows(path, _RANGE_COLUMNS, MAX_BYTES):
             where = f"{path}: line {line}"
             stamp_ns, key = (_whole(row[name], where) for name in ("field.stamp", "field.id"))
             x, y, z = (_number(row[f"field.{axis}"], where) for axis in "xyz")
@@ -119,7 +116,7 @@ class HanyangRun(Source):
         # The stamps were written as floats, and have lost some 256 ns.
         rows = [
             [_number(row[name], f"{path}: line {line}") for name in _PATH_COLUMNS]
-            for line, row in _rows(path, _PATH_COLUMNS)
+            for line, row in read_rows(path, _PATH_COLUMNS, MAX_BYTES)
         ]
         table: NDArray[np.float64] = np.array(rows, np.float64).reshape(-1, 4)
         table = table[np.isfinite(table).all(axis=1)]
@@ -133,34 +130,6 @@ class HanyangRun(Source):
         table = table[~lost]
         table = table[np.argsort(table[:, 0], kind="stable")]
         return TruePath(table[:, 0].astype(np.int64), table[:, 1:] + (0.0, 0.0, ANTENNA_M))
-
-
-def _rows(path: Path, columns: tuple[str, ...]) -> Iterator[tuple[int, dict[str, str]]]:
-    valid = ", ".join(columns)
-    data = read_bounded(path, MAX_BYTES, RecordingError, valid)
-    if path.suffix == ".xz":
-        try:
-            with lzma.open(io.BytesIO(data)) as stream:
-                data = stream.read(MAX_BYTES + 1)
-        except (EOFError, lzma.LZMAError) as error:
-            raise RecordingError(f"not whole: {error}", where=str(path), valid=valid) from error
-        if len(data) > MAX_BYTES:
-            raise RecordingError(f"more than {MAX_BYTES} bytes", where=str(path), valid=valid)
-    try:
-        reader = csv.DictReader(io.StringIO(data.decode("utf-8-sig"), newline=""), strict=True)
-        absent = [name for name in columns if name not in (reader.fieldnames or ())]
-        if absent:
-            raise RecordingError(
-                f"the column {absent[0]} is absent", where=str(path), valid=", ".join(columns)
-            )
-        for row in reader:
-            if any(row[name] is None for name in columns):
-                raise RecordingError(
-                    "the row is too short", where=f"{path}: line {reader.line_num}", valid=valid
-                )
-            yield reader.line_num, row
-    except (csv.Error, UnicodeDecodeError) as error:
-        raise RecordingError(f"not a CSV file: {error}", where=str(path), valid=valid) from error
 
 
 def _whole(text: str, where: str) -> int:

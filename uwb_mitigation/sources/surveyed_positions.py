@@ -7,17 +7,15 @@ tag_location), `anchors.csv` and `tags.csv` (location, x, y in metres), and opti
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
 from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.files import read_bounded
 from uwb_mitigation.measurement import Truth
 from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
+from uwb_mitigation.sources.csv_rows import read_rows
 
 MAX_CSV_BYTES = 1 << 20
 MAX_LOCATION = (1 << 64) - 1
@@ -70,11 +68,10 @@ class Survey:
         labels = _labels(folder / "labels.csv") if (folder / "labels.csv").is_file() else {}
         placements: dict[int, Placement] = {}
         path = folder / "pairs.csv"
-        for line, (number_text, anchor_text, tag_text) in _rows(
-            path, ("file_number", "anchor_location", "tag_location")
-        ):
+        columns = ("file_number", "anchor_location", "tag_location")
+        for line, row in read_rows(path, columns, MAX_CSV_BYTES):
             where = f"{path}: line {line}"
-            number, anchor, tag = (_count(text, where) for text in (number_text, anchor_text, tag_text))
+            number, anchor, tag = (_count(row[name], where) for name in columns)
             for kind, location, surveyed in (("anchor", anchor, anchors), ("tag", tag, tags)):
                 if location not in surveyed:
                     raise RecordingError(
@@ -94,43 +91,19 @@ class Survey:
 
 def _positions(path: Path) -> dict[int, tuple[float, float]]:
     positions: dict[int, tuple[float, float]] = {}
-    for line, (location, x, y) in _rows(path, ("location", "x", "y")):
+    for line, row in read_rows(path, ("location", "x", "y"), MAX_CSV_BYTES):
         where = f"{path}: line {line}"
-        _put(positions, _count(location, where), (_metres(x, where), _metres(y, where)), where)
+        place = (_metres(row["x"], where), _metres(row["y"], where))
+        _put(positions, _count(row["location"], where), place, where)
     return positions
 
 
 def _labels(path: Path) -> dict[int, str]:
     labels: dict[int, str] = {}
-    for line, (number, label) in _rows(path, ("file_id", "label")):
+    for line, row in read_rows(path, ("file_id", "label"), MAX_CSV_BYTES):
         where = f"{path}: line {line}"
-        _put(labels, _count(number, where), label.strip(), where)
+        _put(labels, _count(row["file_id"], where), row["label"].strip(), where)
     return labels
-
-
-def _rows(path: Path, columns: tuple[str, ...]) -> list[tuple[int, list[str]]]:
-    """Line number and the values of `columns` of each row; blank rows are passed over."""
-    data = read_bounded(path, MAX_CSV_BYTES, RecordingError, f"a CSV file with {', '.join(columns)}")
-    rows: list[tuple[int, list[str]]] = []
-    try:
-        reader = csv.DictReader(io.StringIO(data.decode("utf-8-sig"), newline=""), strict=True)
-        absent = [name for name in columns if name not in (reader.fieldnames or ())]
-        if absent:
-            raise RecordingError(
-                f"the column {absent[0]} is absent", where=str(path), valid=", ".join(columns)
-            )
-        for row in reader:
-            values = [row[name] for name in columns]
-            if None in values:
-                raise RecordingError(
-                    "the row is too short",
-                    where=f"{path}: line {reader.line_num}",
-                    valid=", ".join(columns),
-                )
-            rows.append((reader.line_num, values))
-    except (csv.Error, UnicodeDecodeError) as error:
-        raise RecordingError(f"not a CSV file: {error}", where=str(path), valid=", ".join(columns)) from error
-    return rows
 
 
 def _put(table: dict[int, _Value], key: int, value: _Value, where: str) -> None:

@@ -6,16 +6,14 @@ recording's first measurement (empty = from its start, to its end), `configurati
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.files import read_bounded
 from uwb_mitigation.measurement import Record, Truth
+from uwb_mitigation.sources.csv_rows import read_rows
 
 MAX_CSV_BYTES = 1 << 20
 MAX_RANGE_M = 1e6
@@ -41,17 +39,7 @@ def load_truth(path: Path) -> list[Stretch]:
     Raises:
         RecordingError: the file is absent, too large, or malformed; names the line.
     """
-    data = read_bounded(path, MAX_CSV_BYTES, RecordingError, f"a CSV file with {', '.join(_NEEDED)}")
-    try:
-        reader = csv.DictReader(io.StringIO(data.decode("utf-8-sig"), newline=""), strict=True)
-        absent = [name for name in _NEEDED if name not in (reader.fieldnames or ())]
-        if absent:
-            raise RecordingError(
-                f"the column {absent[0]} is absent", where=str(path), valid=", ".join(_NEEDED)
-            )
-        found = [_stretch(row, path, reader.line_num) for row in reader]
-    except (csv.Error, UnicodeDecodeError) as error:
-        raise RecordingError(f"not a CSV file: {error}", where=str(path), valid=", ".join(_NEEDED)) from error
+    found = [_stretch(row, path, line) for line, row in read_rows(path, _NEEDED, MAX_CSV_BYTES)]
     if not found:
         raise RecordingError("the truth holds no rows", where=str(path), valid="one for each configuration")
     return found
@@ -74,7 +62,7 @@ def with_truth(records: Iterable[Record], stretches: Sequence[Stretch]) -> Itera
         )
 
 
-def _stretch(row: dict[str, str | None], path: Path, line: int) -> Stretch:
+def _stretch(row: dict[str, str], path: Path, line: int) -> Stretch:
     where = f"{path}: line {line}"
 
     def number(name: str, otherwise: float | None = None) -> float:
