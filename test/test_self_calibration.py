@@ -12,8 +12,9 @@ from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
 from uwb_mitigation.positioning.localised import PosePath, solve_localised
 from uwb_mitigation.positioning.model import Model
+from uwb_mitigation.positioning.regressors import Regressors
 from uwb_mitigation.positioning.rests import stretches
-from uwb_mitigation.positioning.self_calibration import SLOPE_SD, Regressors, calibrate
+from uwb_mitigation.positioning.self_calibration import SLOPE_SD, calibrate
 from uwb_mitigation.positioning.start import Height
 from uwb_mitigation.positioning.tracks import Ranges
 
@@ -146,6 +147,19 @@ def test_poses_of_recordings_that_overlap_are_in_the_order_of_time():
     assert np.allclose(both.at(wanted, 0.0)[0][:, 0], wanted / 1e9)
 
 
+def test_a_localisation_that_jitters_is_smoothed_and_keeps_its_turns():
+    rng = np.random.default_rng(3)
+    stamp = np.arange(1200) * 25_000_000 + rng.integers(0, 10_000_000, 1200)
+    true = circuit(stamp / 1e9 * 3.0)
+    rough = PosePath(stamp, true + rng.normal(0, 0.02, true.shape), np.tile([0.0, 0.0, 0.0, 1.0], (1200, 1)))
+    left = rough.smoothed().position - true
+    assert np.abs(left.mean(axis=0)).max() < 0.002
+    assert left.std() < 0.012
+    # Poses that are too few for a parabola stay as they are.
+    few = PosePath(rough.stamp_ns[::10], rough.position[::10], rough.orientation[::10])
+    assert (few.smoothed().position == few.position).all()
+
+
 def test_a_rest_within_a_drive_is_one_place():
     def path(time_s):
         return circuit(np.minimum(time_s, 20.0) + np.maximum(time_s - 40.0, 0.0))
@@ -216,13 +230,12 @@ def test_lag_and_lever_arm_are_found_beside_a_localisation(minute):
     )
     quaternion = np.stack([zero, zero, np.sin(heading / 2), np.cos(heading / 2)], axis=1)
     late = PosePath(ranges.stamp_ns + 300_000_000, path.position - turned, quaternion)
-    found = solve_localised(HALL, [with_own(ranges)], late, np.zeros(len(ranges)))
-    assert found.time_offset_s == pytest.approx(0.3, abs=0.03)
+    nothing = Regressors.none(len(ranges))
+    found = solve_localised(HALL, [with_own(ranges)], late, nothing)
+    assert found.time_offset_s == pytest.approx(0.3, abs=0.02)
     assert np.abs(found.lever_arm_m - lever)[:2].max() < 0.05
     assert np.abs(found.offset_m - 0.25 - OWN).max() < 0.08
-    given = solve_localised(
-        HALL, [ranges], late, np.zeros(len(ranges)), time_offset_s=0.3, lever_arm_m=(0.3, -0.25, 0.0)
-    )
+    given = solve_localised(HALL, [ranges], late, nothing, time_offset_s=0.3, lever_arm_m=(0.3, -0.25, 0.0))
     assert (given.time_offset_s, given.time_offset_sd_s) == (pytest.approx(0.3, abs=1e-6), 0.0)
     with pytest.raises(DatasetError, match="localisation's times"):
-        solve_localised(HALL, [ranges], late.shifted(10**13), np.zeros(len(ranges)))
+        solve_localised(HALL, [ranges], late.shifted(10**13), nothing)

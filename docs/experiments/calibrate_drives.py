@@ -191,10 +191,14 @@ def one(seed: int, seconds: float, truth_topic: bool, with_train: bool, flat: bo
 
 
 def _headings(position: np.ndarray) -> np.ndarray:
+    """Along the way, turned towards over two seconds: no robot turns at once."""
     ahead = np.minimum(np.arange(len(position)) + 20, len(position) - 1)
     before = np.maximum(np.arange(len(position)) - 20, 0)
     away = position[ahead] - position[before]
-    return np.arctan2(away[:, 1], away[:, 0])
+    heading = np.unwrap(np.arctan2(away[:, 1], away[:, 0]))
+    window = round(2.0 * RATE_HZ)
+    padded = np.pad(heading, (window // 2, window - window // 2 - 1), mode="edge")
+    return np.convolve(padded, np.full(window, 1.0 / window), mode="valid")
 
 
 def speed(minutes: float) -> dict[str, object]:

@@ -17,14 +17,12 @@ from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.chain import Chain, Solution
 from uwb_mitigation.positioning.model import Model
 from uwb_mitigation.positioning.rests import Stretches
+from uwb_mitigation.positioning.scatter import scatter_of
 from uwb_mitigation.positioning.smoother import Parameters
 from uwb_mitigation.positioning.start import Height
 
 KNOT_S = 0.15
 LEAST_SCALE_M = 0.02
-LEAST_ALIKE = 20
-"""Links that tell by how much such links err."""
-
 _FIRST_SCALE_M = 0.3
 UNDERSTATED = 1.5
 """By how much deviations are multiplied: errors of one place come again with each lap, and a track bends to what persists,
@@ -40,7 +38,6 @@ _SECOND_NS = 1_000_000_000
 _ITERATIONS = 25
 _HUBER_ITERATIONS = 4
 _SETTLED_M = 1e-3
-_MAD_TO_SD = 1.4826
 _NOWHERE = 1e-8
 _STILL = 1e-6
 
@@ -245,7 +242,7 @@ class JointSolver:
             for iteration in range(_ITERATIONS):
                 direction, _, error = self._errors(x, shared)
                 if self._scale is None and (iteration or parameters is not None):
-                    found = np.maximum(self._scales(error, len(scale)), LEAST_SCALE_M)
+                    found = np.maximum(scatter_of(error, links.alike, len(scale)), LEAST_SCALE_M)
                     scale = found if near else np.maximum(found, 0.5 * scale)
                 z = error / scale[links.alike]
                 robust = self._model.weight(z)
@@ -281,16 +278,6 @@ class JointSolver:
             solution,
             self._height,
         )
-
-    def _scales(self, error: NDArray[np.float64], kinds: int) -> NDArray[np.float64]:
-        """Of each kind the deviation of errors (n,) by their median; of one with few links, that of all."""
-        every = _MAD_TO_SD * float(np.median(np.abs(error)))
-        found = np.full(kinds, every)
-        for kind in range(kinds):
-            own = error[self._links.alike == kind]
-            if len(own) >= LEAST_ALIKE:
-                found[kind] = _MAD_TO_SD * float(np.median(np.abs(own)))
-        return found
 
     @property
     def _level(self) -> float:

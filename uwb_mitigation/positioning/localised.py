@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.model import Model
+from uwb_mitigation.positioning.persisting import normal_equations
+from uwb_mitigation.positioning.regressors import Regressors
 from uwb_mitigation.positioning.tracks import Ranges
 
 GAP_S = 0.5
@@ -29,10 +31,21 @@ LEAST_RANGES = 40
 MOST_RANGES = 20_000
 """Of more, so many are fitted to, spread evenly: none of these unknowns needs more."""
 
-SMALLEST_TURN_RAD = 0.5
+SMOOTHED_S = 0.2
+"""Where poses jitter, times halfway between two of them would look best, since there the jitter is less."""
+
+SLOPE_S = 0.1
+"""The velocity of a pose is from so long before and after it."""
+
+FINE_LAG_S = 0.02
+LEVER_STEPS = 5
+SEARCHED = 4000
+"""Of more ranges, so many tell about which lag it is."""
+
 _STEPS = 40
-_MAD_TO_SD = 1.4826
 _PERSISTENCE_S = 1.0
+_SMALL_M = 0.02
+_MOST_NEIGHBOURS = 20
 _SECOND_NS = 1_000_000_000
 _MODEL = Model(long=1.5, short=1.5)
 
@@ -52,6 +65,27 @@ class PosePath:
     def shifted(self, by_ns: int) -> PosePath:
         """At stamps that much later."""
         return PosePath(self.stamp_ns + by_ns, self.position, self.orientation)
+
+    def smoothed(self) -> PosePath:
+        """Positions from a parabola through those of `SMOOTHED_S` before and after each (Savitzky and Golay, 1964)."""
+        time_s = (self.stamp_ns - self.stamp_ns[0]) / _SECOND_NS
+        # Sums over neighbours of 1, t, t^2, t^3, t^4, and of the positions times the first three.
+        moments, right = np.zeros((len(self), 5)), np.zeros((len(self), 3, 3))
+        reach = (
+            int(np.max(np.searchsorted(time_s, time_s + SMOOTHED_S, side="right") - np.arange(len(self)))) - 1
+        )
+        stride = max(1, reach // _MOST_NEIGHBOURS)
+        for step in range(-(reach // stride) * stride, reach + 1, stride):
+            here = np.arange(max(-step, 0), len(self) - max(step, 0))
+            since = (time_s[here + step] - time_s[here]) / SMOOTHED_S
+            powers = np.where(np.abs(since)[:, None] <= 1.0, since[:, None] ** np.arange(5), 0.0)
+            moments[here] += powers
+            right[here] += powers[:, :3, None] * self.position[here + step][:, None]
+        told = moments[:, 0] >= 5.0
+        normal = moments[:, np.add.outer(np.arange(3), np.arange(3))][told]
+        position = self.position.copy()
+        position[told] = np.linalg.solve(normal, right[told])[:, 0]
+        return PosePath(self.stamp_ns, position, self.orientation)
 
     @classmethod
     def joined(cls, paths: Sequence[PosePath]) -> PosePath:
@@ -108,7 +142,6 @@ class Localised:
         lever_arm_m, lever_arm_sd_m: (3,), of the antenna in the robot's frame; sd 0 = given, NaN = not told.
         pairs: (tag number, anchor row), and `offset_m`, `offset_sd_m` of each.
         position: float64 (r, 3), of the antenna at each of all ranges; NaN = not known. distance_m: (r,), to the anchor.
-        scale_m: of what is left of ranges that are no outliers.
     """
 
     time_offset_s: float
@@ -120,7 +153,6 @@ class Localised:
     offset_sd_m: NDArray[np.float64]
     position: NDArray[np.float64]
     distance_m: NDArray[np.float64]
-    scale_m: float
 
     def pair(self, tag: int, row: int, anchor_sd_m: float) -> tuple[float, float]:
         """The offset of a pair, m, and its deviation, which an anchor that is misplaced adds to."""
@@ -142,7 +174,7 @@ def solve_localised(
     anchors: AnchorMap,
     tags: Sequence[Ranges],
     path: PosePath,
-    expected_m: NDArray[np.float64],
+    known: Regressors,
     *,
     time_offset_s: float | None = None,
     lever_arm_m: tuple[float, float, float] | None = None,
@@ -151,7 +183,7 @@ def solve_localised(
 
     Args:
         path: of the robot that carries all the tags.
-        expected_m: float64 (r,), what is to be taken off the ranges, one tag after the other.
+        known: as many rows as there are ranges, one tag after the other.
         time_offset_s, lever_arm_m: where known.
 
     Raises:
@@ -159,7 +191,7 @@ def solve_localised(
     """
     stamp = np.concatenate([one.stamp_ns for one in tags])
     row = np.concatenate([one.anchor for one in tags])
-    value = np.concatenate([one.range_m for one in tags]) - expected_m
+    value = np.concatenate([one.range_m for one in tags])
     tag = np.repeat(np.arange(len(tags)), list(map(len, tags)))
     if len(path) < 2:
         raise DatasetError(f"{len(path)} poses of the localisation", valid="two or more")
@@ -169,10 +201,18 @@ def solve_localised(
     if len(chosen) > MOST_RANGES:
         chosen = np.sort(np.random.default_rng(1).choice(chosen, MOST_RANGES, replace=False))
     fitted = _Fit(
-        anchors.position[row[chosen]], stamp[chosen], value[chosen], of_pair[chosen], pairs.shape[1], path
+        anchors.position[row[chosen]],
+        stamp[chosen],
+        value[chosen],
+        of_pair[chosen],
+        pairs.shape[1],
+        known.take(chosen),
+        path.smoothed(),
     )
     lever = np.zeros(3) if lever_arm_m is None else np.array(lever_arm_m, float)
-    lag = fitted.likely_lag(lever) if time_offset_s is None else time_offset_s
+    lag = time_offset_s
+    if lag is None:
+        lag, lever = fitted.likely(lever, lever_arm_m is None)
     unknown = fitted.solve(lag, lever, time_offset_s is None, lever_arm_m is None)
     position, turn = path.at(stamp, unknown.lag)
     antenna = position + turn @ unknown.lever
@@ -182,7 +222,7 @@ def solve_localised(
             f"{int(np.isfinite(distance).sum())} ranges lie within the localisation's times",
             valid=f"{LEAST_RANGES} or more: do their clocks agree to {MOST_LAG_S:g} s?",
         )
-    sd = np.sqrt(np.diag(unknown.covariance))
+    sd = np.sqrt(np.diag(unknown.covariance))[: 4 + pairs.shape[1]]
     return Localised(
         unknown.lag,
         float(sd[0]) if time_offset_s is None else 0.0,
@@ -193,7 +233,6 @@ def solve_localised(
         sd[4:],
         antenna,
         distance,
-        unknown.scale,
     )
 
 
@@ -204,33 +243,71 @@ class _Unknowns:
     offset: NDArray[np.float64]
     covariance: NDArray[np.float64]
     told: NDArray[np.bool_]
-    scale: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Fit:
-    """n ranges (n,) to anchors (n, 3), of `count` pairs."""
+    """n ranges (n,) to anchors (n, 3), of `count` pairs; `known` of them."""
 
     anchor: NDArray[np.float64]
     stamp_ns: NDArray[np.int64]
     range_m: NDArray[np.float64]
     pair: NDArray[np.intp]
     count: int
+    known: Regressors
     path: PosePath
 
-    def likely_lag(self, lever: NDArray[np.float64]) -> float:
-        """The one of `LAGS_S` with which ranges agree best, each pair's median error taken off."""
-        spread = []
-        for lag in LAGS_S.tolist():
-            error = self._errors(lag, lever)[0]
-            left = np.abs(error - self._medians(error)[self.pair])
-            spread.append(float(np.nanmedian(left)) if np.isfinite(left).sum() >= LEAST_RANGES else np.inf)
-        if not np.isfinite(min(spread)):
+    def likely(self, lever: NDArray[np.float64], free_lever: bool) -> tuple[float, NDArray[np.float64]]:
+        """The lag with which ranges agree best, and the lever arm beside it: from each lag anew, since a wrong one has
+        turns look like outliers.
+
+        Raises:
+            DatasetError: hardly any range lies within the localisation's times.
+        """
+        few = self if len(self.range_m) <= SEARCHED else self._some(SEARCHED)
+        best = (math.inf, 0.0, lever)
+        for around, lags in ((0.0, LAGS_S), (None, np.arange(-0.1, 0.101, FINE_LAG_S))):
+            middle = best[1] if around is None else around
+            for lag in (middle + lags).tolist():
+                arm = few._lever(lag, lever) if free_lever else lever
+                best = min(best, (few._spread(lag, arm), lag, arm), key=lambda one: one[0])
+        if not math.isfinite(best[0]):
             raise DatasetError(
                 "hardly any range lies within the localisation's times",
                 valid=f"clocks that agree to {MOST_LAG_S:g} s, or --time-offset",
             )
-        return float(LAGS_S[int(np.argmin(spread))])
+        return best[1], best[2]
+
+    def _some(self, count: int) -> _Fit:
+        part = np.linspace(0, len(self.range_m) - 1, count).astype(int)
+        columns = ("anchor", "stamp_ns", "range_m", "pair")
+        some = {name: getattr(self, name)[part] for name in columns}
+        return replace(self, known=self.known.take(part), **some)
+
+    def _left(self, lag: float, lever: NDArray[np.float64]) -> NDArray[np.float64]:
+        error = self._errors(lag, lever)[0]
+        left: NDArray[np.float64] = error - self._medians(error)[self.pair]
+        return left
+
+    def _spread(self, lag: float, lever: NDArray[np.float64]) -> float:
+        left = np.abs(self._left(lag, lever))
+        return float(np.nanmedian(left)) if np.isfinite(left).sum() >= LEAST_RANGES else math.inf
+
+    def _lever(self, lag: float, lever: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The lever arm that goes best with a lag: least absolute deviations, by reweighting."""
+        for _ in range(LEVER_STEPS):
+            left = self._left(lag, lever)
+            _, unit, turn = self._errors(lag, lever)
+            rows = np.einsum("ni,nij->nj", unit, turn)
+            known = np.isfinite(left) & np.isfinite(rows).all(axis=1)
+            if int(known.sum()) < LEAST_RANGES:
+                return lever
+            rows, left = rows[known], left[known]
+            weight = 1.0 / np.maximum(np.abs(left), _SMALL_M)
+            certainty = float(weight.sum()) * _SMALL_M**2 / LEVER_SD_M**2
+            normal = rows.T @ (weight[:, None] * rows) + certainty * np.eye(3)
+            lever = lever + np.linalg.solve(normal, rows.T @ (weight * left) - certainty * lever)
+        return lever
 
     def _medians(self, error: NDArray[np.float64]) -> NDArray[np.float64]:
         found = np.zeros(self.count)
@@ -242,55 +319,55 @@ class _Fit:
     def _errors(
         self, lag: float, lever: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Range less distance (n,), unit vectors (n, 3) from anchor to antenna, rotations (n, 3, 3)."""
+        """Range less distance and what is expected beside it (n,), unit vectors (n, 3) from anchor to antenna, rotations (n, 3, 3)."""
         position, turn = self.path.at(self.stamp_ns, lag)
         away = position + turn @ lever - self.anchor
         distance = np.maximum(np.linalg.norm(away, axis=1), 0.05)
-        return self.range_m - distance, away / distance[:, None], turn
+        return self.range_m - self.known.rows @ self.known.mean - distance, away / distance[:, None], turn
 
     def solve(self, lag: float, lever: NDArray[np.float64], free_lag: bool, free_lever: bool) -> _Unknowns:
-        size = 4 + self.count
-        certainty = 1.0 / np.array(
+        first = 4 + self.count
+        size = first + len(self.known.mean)
+        certainty: NDArray[np.float64] = 1.0 / np.array(
             [
                 LAG_SD_S**2 if free_lag else 1e-18,
                 *[LEVER_SD_M**2 if free_lever else 1e-18] * 3,
                 *[OFFSET_SD_M**2] * self.count,
+                *(self.known.sd**2).tolist(),
             ]
         )
-        mean = np.array([lag, *lever, *np.zeros(self.count)])
+        # What is known of regressors' factors is taken off with their means.
+        mean = np.array([lag, *lever, *np.zeros(size - 4)])
         if free_lag:
             mean[0] = 0.0
-        x = np.array([lag, *lever, *self._medians(self._errors(lag, lever)[0])])
-        # Ranges of a pair err alike for a second: so many are new (see `joint`).
-        seconds = max(float(self.stamp_ns.max() - self.stamp_ns.min()) / _SECOND_NS, 1.0)
-        count = np.maximum(np.bincount(self.pair, minlength=self.count), 1)
-        share = np.minimum(1.0, seconds / (2.0 * _PERSISTENCE_S) / count)[self.pair]
-        scale, covariance = 0.1, np.eye(size)
+        x = np.array([lag, *lever, *self._medians(self._errors(lag, lever)[0]), *np.zeros(size - first)])
+        # Ranges of a pair err alike for about so long (see `model`).
+        chunk = (self.stamp_ns - self.stamp_ns.min()) // round(2.0 * _PERSISTENCE_S * _SECOND_NS)
+        group = chunk * self.count + self.pair
+        covariance: NDArray[np.float64] = np.eye(size)
         for step_number in range(_STEPS):
             error, unit, turn = self._errors(x[0], x[1:4])
-            step_s = 0.05
-            beside = self._errors(x[0] + step_s, x[1:4])[0]
-            before = self._errors(x[0] - step_s, x[1:4])[0]
+            beside, before = (self._errors(x[0] + by, x[1:4])[0] for by in (SLOPE_S, -SLOPE_S))
             rows = np.zeros((len(error), size))
-            rows[:, 0] = (before - beside) / (2.0 * step_s)
+            rows[:, 0] = (before - beside) / (2.0 * SLOPE_S)
             rows[:, 1:4] = np.einsum("ni,nij->nj", unit, turn)
             rows[np.arange(len(error)), 4 + self.pair] = 1.0
-            left = error - x[4:][self.pair]
+            rows[:, first:] = self.known.rows
+            left = error - x[4:first][self.pair] - self.known.rows @ x[first:]
             known = np.isfinite(left) & np.isfinite(rows).all(axis=1)
             if int(known.sum()) < LEAST_RANGES:
                 raise DatasetError(
                     f"{int(known.sum())} ranges lie within the localisation's times",
                     valid=f"{LEAST_RANGES} or more: do their clocks agree to {MOST_LAG_S:g} s?",
                 )
-            rows, left = rows[known], left[known]
-            scale = max(_MAD_TO_SD * float(np.median(np.abs(left))), 0.01)
-            weight = _MODEL.weight(left / scale) * share[known] / scale**2
-            normal = rows.T @ (weight[:, None] * rows) + np.diag(certainty)
-            covariance = np.linalg.inv(normal)
-            move = covariance @ (rows.T @ (weight * left) + certainty * (mean - x))
+            normal, right = normal_equations(
+                rows[known], left[known], group[known], self.known.alike[known], _MODEL
+            )
+            covariance = np.linalg.inv(normal + np.diag(certainty))
+            move = covariance @ (right + certainty * (mean - x))
             move[0] = np.clip(move[0], -0.3, 0.3)
             x = x + move
             if float(np.abs(move).max()) < 1e-5 and step_number > 3:
                 break
         told = np.sqrt(np.diag(covariance)[1:4]) < 0.3 * LEVER_SD_M
-        return _Unknowns(float(x[0]), x[1:4].copy(), x[4:].copy(), covariance, told, scale)
+        return _Unknowns(float(x[0]), x[1:4].copy(), x[4:first].copy(), covariance, told)

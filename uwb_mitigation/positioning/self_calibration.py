@@ -18,6 +18,7 @@ from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.geometry import Shape, shape
 from uwb_mitigation.positioning.joint import FAR_S, JointFit, JointSolver, Links, links_of
 from uwb_mitigation.positioning.model import Model
+from uwb_mitigation.positioning.regressors import Regressors
 from uwb_mitigation.positioning.rests import Stretches, stretches
 from uwb_mitigation.positioning.smoother import Parameters
 from uwb_mitigation.positioning.start import Area, Height
@@ -62,34 +63,6 @@ MOST_REFITS = 8
 MODEL = Model(long=1.5, short=1.5)
 """Of errors about as often too long as too short, once offsets and predictions are taken off: what is doubted sooner on
 one side than on the other would pull an offset to that other."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Regressors:
-    """What beside offsets may make a range long, of all ranges of all tags, one tag after the other.
-
-    Attributes:
-        names: of the columns.
-        rows: float64 (r, k); 0 where not known.
-        mean, sd: float64 (k,), what is known before.
-        alike: int (r,), ranges that should err about as much have the same number, from 0.
-    """
-
-    names: tuple[str, ...]
-    rows: NDArray[np.float64]
-    mean: NDArray[np.float64]
-    sd: NDArray[np.float64]
-    alike: NDArray[np.intp]
-
-    @classmethod
-    def one(cls, name: str, row: NDArray[np.float64], mean: float, sd: float) -> Regressors:
-        """A single one, float64 (r,), of ranges that all err alike."""
-        return cls((name,), row[:, None], np.array([mean]), np.array([sd]), np.zeros(len(row), np.intp))
-
-    @classmethod
-    def none(cls, ranges: int) -> Regressors:
-        """No such thing."""
-        return cls((), np.zeros((ranges, 0)), np.zeros(0), np.zeros(0), np.zeros(ranges, np.intp))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

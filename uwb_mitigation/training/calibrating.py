@@ -20,10 +20,10 @@ from uwb_mitigation.model.bundle import Bundle
 from uwb_mitigation.model.float_networks import float_network
 from uwb_mitigation.offsets import MAX_OFFSET_M, Offsets, dump_offsets
 from uwb_mitigation.positioning.localised import Localised, PosePath, solve_localised
+from uwb_mitigation.positioning.regressors import Regressors
 from uwb_mitigation.positioning.self_calibration import (
     NETWORK_SD,
     SLOPE_SD,
-    Regressors,
     SelfCalibration,
     calibrate,
 )
@@ -230,7 +230,7 @@ def with_truth(
         site.anchors,
         site.tags,
         path,
-        known.rows @ known.mean,
+        known,
         time_offset_s=time_offset_s,
         lever_arm_m=lever_arm_m,
     )
