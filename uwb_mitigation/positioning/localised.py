@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -241,7 +242,7 @@ class _Unknowns:
     lag: float
     lever: NDArray[np.float64]
     offset: NDArray[np.float64]
-    covariance: NDArray[np.float64]
+    covariance: NDArray[np.floating[Any]]
     told: NDArray[np.bool_]
 
 
@@ -328,7 +329,7 @@ class _Fit:
     def solve(self, lag: float, lever: NDArray[np.float64], free_lag: bool, free_lever: bool) -> _Unknowns:
         first = 4 + self.count
         size = first + len(self.known.mean)
-        certainty: NDArray[np.float64] = 1.0 / np.array(
+        certainty = 1.0 / np.array(
             [
                 LAG_SD_S**2 if free_lag else 1e-18,
                 *[LEVER_SD_M**2 if free_lever else 1e-18] * 3,
@@ -344,7 +345,7 @@ class _Fit:
         # Ranges of a pair err alike for about so long (see `model`).
         chunk = (self.stamp_ns - self.stamp_ns.min()) // round(2.0 * _PERSISTENCE_S * _SECOND_NS)
         group = chunk * self.count + self.pair
-        covariance: NDArray[np.float64] = np.eye(size)
+        covariance: NDArray[np.floating[Any]] = np.eye(size)
         for step_number in range(_STEPS):
             error, unit, turn = self._errors(x[0], x[1:4])
             beside, before = (self._errors(x[0] + by, x[1:4])[0] for by in (SLOPE_S, -SLOPE_S))
