@@ -4,39 +4,11 @@ from __future__ import annotations
 
 import math
 
+import dw1000_driver as dw
 import numpy as np
 import pytest
 from compilers import NEEDS_CC
-from dw1000_driver import (
-    DATA,
-    ERRORS,
-    HPDWARN,
-    RX_GOOD,
-    RXDFR,
-    RXFCE,
-    RXFCG,
-    RXPHE,
-    RXPRD,
-    RXRFSL,
-    RXSFDTO,
-    TICK_M,
-    TICK_S,
-    TRXOFF,
-    TXDLYS,
-    TXFRB,
-    TXFRS,
-    TXPHS,
-    TXPRS,
-    TXPUTE,
-    TXSTRT,
-    WAIT4RESP,
-    WRAP,
-    Driver,
-    Mode,
-    exchange,
-    flight_ticks,
-    pair,
-)
+from dw1000_driver import Driver, Mode, exchange, flight_ticks, pair
 
 from uwb_mitigation.dw1000_model.air import Air
 from uwb_mitigation.dw1000_model.links import Link
@@ -55,11 +27,14 @@ class TestFrames:
     )
     def test_in_every_mode_a_frame_arrives_whole_and_in_time(self, air: Air, mode: Mode):
         a, b, *_ = pair(air, Link(30.0), mode)
-        data = DATA * (80 if mode.long_frames else 5)
-        assert exchange(a, b, data) & (RX_GOOD | ERRORS) == RX_GOOD
+        data = dw.DATA * (80 if mode.long_frames else 5)
+        assert exchange(a, b, data) & (dw.RX_GOOD | dw.ERRORS) == dw.RX_GOOD
         assert b.received() == data
-        assert flight_ticks(a, b) == pytest.approx(30.0 / TICK_M, abs=1)
-        assert a.status & (TXFRB | TXPRS | TXPHS | TXFRS) == TXFRB | TXPRS | TXPHS | TXFRS
+        assert flight_ticks(a, b) == pytest.approx(30.0 / dw.TICK_M, abs=1)
+        assert (
+            a.status & (dw.TXFRB | dw.TXPRS | dw.TXPHS | dw.TXFRS)
+            == dw.TXFRB | dw.TXPRS | dw.TXPHS | dw.TXFRS
+        )
 
     @pytest.mark.parametrize(
         ("other", "told"),
@@ -68,24 +43,24 @@ class TestFrames:
             (Mode(prf=16), 0),
             (Mode(code=10), 0),
             (Mode(prf=16, code=9), 0),
-            (Mode(decawave_sfd=True), RXSFDTO),
-            (Mode(rate=0), RXSFDTO),
-            (Mode(long_frames=True), RXPHE),
+            (Mode(decawave_sfd=True), dw.RXSFDTO),
+            (Mode(rate=0), dw.RXSFDTO),
+            (Mode(long_frames=True), dw.RXPHE),
         ],
         ids=str,
     )
     def test_both_ends_must_agree(self, air: Air, other: Mode, told: int):
         a, b, *_ = pair(air, receiver=other)
-        assert exchange(a, b) & (RXFCG | ERRORS) == told
+        assert exchange(a, b) & (dw.RXFCG | dw.ERRORS) == told
         b.off()
         b.reset_receiver()
         b.configure(Mode())
-        assert exchange(a, b) & RXFCG
+        assert exchange(a, b) & dw.RXFCG
 
     def test_the_synthesiser_must_be_tuned_to_the_channel(self, air: Air):
         a, b, *_ = pair(air, mode=Mode(channel=2))
         a.set(0x2B, 7, 0x0800041D)
-        assert exchange(a, b) & (RXPRD | RXFCG) == 0
+        assert exchange(a, b) & (dw.RXPRD | dw.RXFCG) == 0
 
     @pytest.mark.parametrize(
         ("mode", "octets", "air_time_us"),
@@ -99,9 +74,9 @@ class TestFrames:
     )
     def test_a_frame_takes_its_air_time(self, air: Air, mode: Mode, octets: int, air_time_us: float):
         a, *_ = pair(air, mode=mode)
-        a.set(0x0E, 0, TXFRS)
+        a.set(0x0E, 0, dw.TXFRS)
         a.load(bytes(octets - 2))
-        a.command(TXSTRT)
+        a.command(dw.TXSTRT)
         began = a.host.now()
         a.host.wait(10e-3)
         # The transmitter takes 10 us to start, and waits for the grid.
@@ -112,11 +87,11 @@ class TestFrames:
         a, b, *_ = pair(air)
         heard = []
         for late_us in (60, 80, 90, 95, 115, 130):
-            a.send(DATA)
+            a.send(dw.DATA)
             a.host.delay(10e-6 + late_us * 1e-6)
             b.listen()
             b.host.delay(1e-3)
-            heard.append(bool(b.status & RXFCG))
+            heard.append(bool(b.status & dw.RXFCG))
             b.off()
             b.reset_receiver()
         assert heard == [True, True, True, True, False, False]
@@ -126,34 +101,34 @@ class TestFrames:
         lost = 0
         for _ in range(100):
             status = exchange(a, b)
-            lost += not status & RXPRD
-            assert status & RXPRD == 0 or status & RXFCG
+            lost += not status & dw.RXPRD
+            assert status & dw.RXPRD == 0 or status & dw.RXFCG
             b.off()
         assert 15 < lost < 45
         air.link(one, two, Link(3.0, damage=1.0))
         kinds = set()
         for _ in range(40):
             status = exchange(a, b)
-            assert not status & RXFCG
-            kinds.add(status & ERRORS)
+            assert not status & dw.RXFCG
+            kinds.add(status & dw.ERRORS)
             b.off()
-        assert kinds == {RXPHE, RXRFSL, RXFCE, RXSFDTO}
+        assert kinds == {dw.RXPHE, dw.RXRFSL, dw.RXFCE, dw.RXSFDTO}
 
     def test_a_damaged_frame_that_is_read_differs(self, air: Air):
         a, b, *_ = pair(air, Link(3.0, damage=1.0))
         for _ in range(20):
-            if exchange(a, b) & RXFCE:
-                assert b.status & RXDFR
-                assert b.get(0x10, 0, 2) & 0x7F == len(DATA) + 2
-                whole = b.read(0x11, 0, len(DATA) + 2)
-                assert whole[: len(DATA)] != DATA or whole[len(DATA) :] != bytes(2)
+            if exchange(a, b) & dw.RXFCE:
+                assert b.status & dw.RXDFR
+                assert b.get(0x10, 0, 2) & 0x7F == len(dw.DATA) + 2
+                whole = b.read(0x11, 0, len(dw.DATA) + 2)
+                assert whole[: len(dw.DATA)] != dw.DATA or whole[len(dw.DATA) :] != bytes(2)
                 return
         pytest.fail("no damage to the check sum in 20 frames")
 
     def test_who_is_not_linked_hears_nothing(self, air: Air):
         a, b, one, two = pair(air)
         air.link(one, two, None)
-        assert exchange(a, b) & RXPRD == 0
+        assert exchange(a, b) & dw.RXPRD == 0
 
     @pytest.mark.parametrize("apart_us", [0.0, 30.0, 140.0, 165.0])
     def test_two_at_once_spoil_each_other(self, air: Air, apart_us: float):
@@ -164,11 +139,11 @@ class TestFrames:
         b.listen()
         now = a.time
         for sender, late_us in ((a, 0.0), (c, apart_us)):
-            sender.send_at(DATA, now + round((400e-6 + late_us * 1e-6) / TICK_S))
+            sender.send_at(dw.DATA, now + round((400e-6 + late_us * 1e-6) / dw.TICK_S))
         a.host.delay(6e-3)
-        assert b.status & RXPRD
-        assert not b.status & RXFCG
-        assert b.status & ERRORS
+        assert b.status & dw.RXPRD
+        assert not b.status & dw.RXFCG
+        assert b.status & dw.ERRORS
 
     def test_another_code_does_not_disturb(self, air: Air):
         a, b, _, two = pair(air)
@@ -178,9 +153,9 @@ class TestFrames:
         b.listen()
         now = a.time
         for sender in (a, c):
-            sender.send_at(DATA, now + round(400e-6 / TICK_S))
+            sender.send_at(dw.DATA, now + round(400e-6 / dw.TICK_S))
         a.host.delay(2e-3)
-        assert b.status & RXFCG
+        assert b.status & dw.RXFCG
 
     def test_a_much_stronger_frame_survives(self, air: Air):
         a, b, _, two = pair(air)
@@ -191,58 +166,58 @@ class TestFrames:
         air.link(c.host, two, Link(3.0, samples=faint))
         b.listen()
         now = a.time
-        a.send_at(DATA, now + round(400e-6 / TICK_S))
-        c.send_at(DATA, now + round(450e-6 / TICK_S))
+        a.send_at(dw.DATA, now + round(400e-6 / dw.TICK_S))
+        c.send_at(dw.DATA, now + round(450e-6 / dw.TICK_S))
         a.host.delay(2e-3)
-        assert b.status & RXFCG
+        assert b.status & dw.RXFCG
 
     def test_a_buffer_written_while_it_is_sent_is_what_is_sent(self, air: Air):
         """Errata TX-2, as a driver would meet it."""
         a, b, *_ = pair(air)
         b.listen()
         b.host.delay(20e-6)
-        a.send(DATA)
+        a.send(dw.DATA)
         a.write(0x09, 3, b"P")
         a.host.delay(1e-3)
-        assert b.received() == DATA[:3] + b"P" + DATA[4:]
+        assert b.received() == dw.DATA[:3] + b"P" + dw.DATA[4:]
 
 
 class TestStamps:
     @pytest.mark.parametrize("ppm", [(-20.0, 20.0), (0.0, 0.0), (20.0, -20.0)])
     def test_a_stamp_is_the_marker_at_the_antenna_on_the_grid(self, air: Air, ppm: tuple[float, float]):
-        a, b, *_ = pair(air, Link(10.0, excess_m=1.5), ppm=ppm, clocks=(WRAP - 10**9, 0))
+        a, b, *_ = pair(air, Link(10.0, excess_m=1.5), ppm=ppm, clocks=(dw.WRAP - 10**9, 0))
         flights = []
         for _ in range(3):
-            assert exchange(a, b) & RXFCG
+            assert exchange(a, b) & dw.RXFCG
             assert a.get(0x17, 5, 5) % 512 == 0
-            assert (a.tx_stamp - a.get(0x17, 5, 5)) % WRAP == 16436
+            assert (a.tx_stamp - a.get(0x17, 5, 5)) % dw.WRAP == 16436
             flights.append(flight_ticks(a, b))
         # Between clocks that differ a flight means little, but its change over 6 ms is their difference.
         if ppm == (0.0, 0.0):
-            expected = (11.5 / TICK_M - (WRAP - 10**9) + WRAP // 2) % WRAP - WRAP // 2
+            expected = (11.5 / dw.TICK_M - (dw.WRAP - 10**9) + dw.WRAP // 2) % dw.WRAP - dw.WRAP // 2
             assert flights == pytest.approx([expected] * 3, abs=1)
 
     def test_a_delayed_frame_leaves_at_its_time_on_the_grid(self, air: Air):
         a, b, *_ = pair(air, Link(10.0), clocks=(12345, 12345))
         b.listen()
         wanted = a.time + 64_000_000 + 333
-        a.send_at(DATA, wanted)
+        a.send_at(dw.DATA, wanted)
         a.host.delay(2e-3)
         assert a.tx_stamp == wanted - wanted % 512 + 16436
-        assert b.rx_stamp == pytest.approx(a.tx_stamp + 10.0 / TICK_M, abs=1)
+        assert b.rx_stamp == pytest.approx(a.tx_stamp + 10.0 / dw.TICK_M, abs=1)
 
     def test_an_antenna_delay_that_is_not_set_is_in_the_stamps(self, air: Air):
         a, b, *_ = pair(air, Link(10.0))
         b.set(0x2E, 0x1804, 0, 2)
-        assert exchange(a, b) & RXFCG
-        assert flight_ticks(a, b) == pytest.approx(10.0 / TICK_M + 16436, abs=1)
+        assert exchange(a, b) & dw.RXFCG
+        assert flight_ticks(a, b) == pytest.approx(10.0 / dw.TICK_M + 16436, abs=1)
 
     @pytest.mark.parametrize("offset", [-40.0, -3.5, 0.0, 12.0, 40.0])
     @pytest.mark.parametrize("mode", [Mode(), Mode(channel=2, prf=16, rate=0, preamble=1024)], ids=str)
     def test_the_offset_of_the_other_clock_is_told_twice(self, air: Air, offset: float, mode: Mode):
         """Positive: the other's runs faster."""
         a, b, *_ = pair(air, mode=mode, ppm=(offset / 2, -offset / 2))
-        assert exchange(a, b) & RXFCG
+        assert exchange(a, b) & dw.RXFCG
         interval, raw = b.get(0x13), b.get(0x14, 0, 5) & 0x7FFFF
         assert interval == (0x01FC0000 if mode.prf == 64 else 0x01F00000)
         assert (raw ^ 0x40000) - 0x40000 == pytest.approx(offset * 1e-6 * interval, abs=1)
@@ -254,53 +229,53 @@ class TestStamps:
 class TestTransmitter:
     def test_status_clears_at_the_next_start(self, air: Air):
         a, *_ = pair(air)
-        a.send(DATA)
+        a.send(dw.DATA)
         a.host.delay(1e-3)
-        assert a.status & TXFRS
-        a.command(TXSTRT)
-        assert a.status & (TXFRB | TXPRS | TXPHS | TXFRS) == 0
+        assert a.status & dw.TXFRS
+        a.command(dw.TXSTRT)
+        assert a.status & (dw.TXFRB | dw.TXPRS | dw.TXPHS | dw.TXFRS) == 0
 
     def test_a_start_while_the_receiver_is_on_is_dropped_without_a_word(self, air: Air):
         a, b, *_ = pair(air)
         a.listen()
         before = a.status
-        a.send(DATA)
+        a.send(dw.DATA)
         a.host.delay(2e-3)
         assert a.status == before
         a.off()
-        assert exchange(a, b) & RXFCG
+        assert exchange(a, b) & dw.RXFCG
 
     def test_a_start_with_trxoff_in_one_write_sends_nothing(self, air: Air):
         a, b, *_ = pair(air)
         b.listen()
-        a.load(DATA)
-        a.command(TXSTRT | TRXOFF)
+        a.load(dw.DATA)
+        a.command(dw.TXSTRT | dw.TRXOFF)
         a.host.delay(2e-3)
-        assert not a.status & (TXFRB | TXFRS)
-        assert not b.status & RXPRD
+        assert not a.status & (dw.TXFRB | dw.TXFRS)
+        assert not b.status & dw.RXPRD
 
     def test_trxoff_ends_a_frame_that_is_being_sent(self, air: Air):
         a, b, *_ = pair(air)
         b.listen()
         b.host.delay(20e-6)
-        a.send(DATA * 10)
+        a.send(dw.DATA * 10)
         a.host.delay(250e-6)
         a.off()
         a.host.delay(2e-3)
-        assert not a.status & TXFRS
-        assert b.status & RXRFSL
+        assert not a.status & dw.TXFRS
+        assert b.status & dw.RXRFSL
 
     def send_with_lead(self, a: Driver, lead_us: float, *, held_clock: bool = False) -> int:
         """A delayed send with so much time from the command to the start of the preamble; the status after it."""
         header = (128 + 8) * 65024
-        a.load(DATA)
+        a.load(dw.DATA)
         a.set(0x36, 0, 0x20 if held_clock else 0x00, 1)
         write_s = (5 + 1) * 8 / a.hz + (4 + 1) * 8 / a.hz + 2 * 96e-9
         now = a.host.now() + write_s
         # The counter began at 0, with the air.
-        wanted = math.ceil((now + lead_us * 1e-6) / TICK_S + header)
-        a.set(0x0A, 0, -(-wanted // 512) * 512 % WRAP, 5)
-        a.command(TXSTRT | TXDLYS)
+        wanted = math.ceil((now + lead_us * 1e-6) / dw.TICK_S + header)
+        a.set(0x0A, 0, -(-wanted // 512) * 512 % dw.WRAP, 5)
+        a.command(dw.TXSTRT | dw.TXDLYS)
         a.host.delay(5e-3)
         status = a.status
         a.off()
@@ -309,64 +284,64 @@ class TestTransmitter:
     @pytest.mark.parametrize(
         ("lead_us", "told"),
         [
-            (-400.0, HPDWARN),
-            (-0.1, HPDWARN),
-            (0.5, TXPUTE),
-            (9.8, TXPUTE),
+            (-400.0, dw.HPDWARN),
+            (-0.1, dw.HPDWARN),
+            (0.5, dw.TXPUTE),
+            (9.8, dw.TXPUTE),
             (10.1, 0),
             (10.3, 0),
-            (10.5, TXFRS),
+            (10.5, dw.TXFRS),
         ],
     )
     def test_a_late_frame_is_told_or_lost(self, air: Air, lead_us: float, told: int):
         a, *_ = pair(air)
-        assert self.send_with_lead(a, lead_us) & (HPDWARN | TXPUTE | TXFRS) == told
+        assert self.send_with_lead(a, lead_us) & (dw.HPDWARN | dw.TXPUTE | dw.TXFRS) == told
 
     def test_the_window_of_errata_tx_1_closes_with_the_clock_held(self, air: Air):
         a, *_ = pair(air)
-        assert self.send_with_lead(a, 10.2) & TXFRS == 0, (
+        assert self.send_with_lead(a, 10.2) & dw.TXFRS == 0, (
             "a driver without the work-around and a time-out hangs"
         )
-        assert self.send_with_lead(a, 10.2, held_clock=True) & TXFRS
+        assert self.send_with_lead(a, 10.2, held_clock=True) & dw.TXFRS
 
     def test_a_late_frame_leaves_a_turn_of_the_counter_later(self, air: Air):
         a, *_ = pair(air)
-        a.send_at(DATA, a.time)
-        assert a.status & HPDWARN
-        a.set(0x0E, 0, TXFRS)
+        a.send_at(dw.DATA, a.time)
+        assert a.status & dw.HPDWARN
+        a.set(0x0E, 0, dw.TXFRS)
         a.host.wait(20.0)
-        assert a.host.now() == pytest.approx(WRAP * TICK_S, abs=0.05)
+        assert a.host.now() == pytest.approx(dw.WRAP * dw.TICK_S, abs=0.05)
 
     def test_hpdwarn_goes_with_trxoff_and_not_by_writing(self, air: Air):
         a, *_ = pair(air)
-        a.send_at(DATA, a.time)
-        a.set(0x0F, 0, HPDWARN)
-        assert a.status & HPDWARN
+        a.send_at(dw.DATA, a.time)
+        a.set(0x0F, 0, dw.HPDWARN)
+        assert a.status & dw.HPDWARN
         a.off()
-        assert not a.status & HPDWARN
+        assert not a.status & dw.HPDWARN
 
     def test_an_enable_while_it_sends_comes_after_the_frame(self, air: Air):
         a, b, *_ = pair(air)
         b.listen()
         b.host.delay(20e-6)
-        a.send(DATA)
+        a.send(dw.DATA)
         a.listen()
         a.host.delay(300e-6)
-        assert b.status & RXFCG
+        assert b.status & dw.RXFCG
         b.send(b"answer")
         b.host.delay(1e-3)
-        assert a.status & TXFRS
-        assert a.status & RXFCG
+        assert a.status & dw.TXFRS
+        assert a.status & dw.RXFCG
 
     def test_wait_for_response_turns_the_receiver_on(self, air: Air):
         a, b, *_ = pair(air)
         a.set(0x1A, 0, 100)
         b.listen()
         b.host.delay(20e-6)
-        a.send(DATA, WAIT4RESP)
+        a.send(dw.DATA, dw.WAIT4RESP)
         a.host.delay(300e-6)
         b.off()
         b.send(b"answer")
         b.host.delay(1e-3)
-        assert a.status & RXFCG
+        assert a.status & dw.RXFCG
         assert a.received() == b"answer"

@@ -4,46 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import dw1000_driver as dw
 import pytest
 from compilers import NEEDS_CC
-from dw1000_driver import (
-    DATA,
-    ERRORS,
-    FAST_HZ,
-    HPDWARN,
-    ICRBP,
-    LDEDONE,
-    LDEERR,
-    RX_GOOD,
-    RXDFR,
-    RXENAB,
-    RXFCG,
-    RXPRD,
-    SLOW_HZ,
-    TICK_M,
-    TRXOFF,
-    TXBERR,
-    TXDLYS,
-    TXFRB,
-    TXFRS,
-    TXPHS,
-    TXPRS,
-    TXPUTE,
-    TXSTRT,
-    WAIT4RESP,
-    Driver,
-    Mode,
-    exchange,
-    flight_ticks,
-    pair,
-)
+from dw1000_driver import Driver, Mode, exchange, flight_ticks, pair
 
 from uwb_mitigation.dw1000_model.air import Air
 
 pytestmark = NEEDS_CC
 
-TX_GOOD = TXFRB | TXPRS | TXPHS | TXFRS
-SWINGING = RXDFR | RXFCG | LDEDONE
+TX_GOOD = dw.TXFRB | dw.TXPRS | dw.TXPHS | dw.TXFRS
+SWINGING = dw.RXDFR | dw.RXFCG | dw.LDEDONE
 MS_TICKS = 63_897_600
 
 
@@ -76,45 +47,45 @@ class TestStart:
     @pytest.mark.parametrize("wait_us", [100, 120])
     def test_microcode_takes_as_long_as_decawaves_drivers_wait(self, air: Air, wait_us: int):
         a, b, *_ = pair(air)
-        b.hz = SLOW_HZ
+        b.hz = dw.SLOW_HZ
         b.start(load_lde=False)
-        b.hz = SLOW_HZ
+        b.hz = dw.SLOW_HZ
         b.set(0x36, 0, 0xF0300301)
         b.set(0x2D, 6, 0x8000, 2)
         b.host.delay(wait_us * 1e-6)
         b.set(0x36, 0, 0x00, 1)  # the second octet stays 0x03
         b.host.delay(10e-6)
-        b.hz = FAST_HZ
-        assert bool(exchange(a, b) & LDEDONE) == (wait_us == 120)
+        b.hz = dw.FAST_HZ
+        assert bool(exchange(a, b) & dw.LDEDONE) == (wait_us == 120)
 
     def test_a_clock_that_is_forced_to_the_pll_serves_everything(self, air: Air):
         a, b, *_ = pair(air)
         for driver in (a, b):
             driver.set(0x36, 0, 0x02, 1)
-        assert exchange(a, b) & RX_GOOD == RX_GOOD
+        assert exchange(a, b) & dw.RX_GOOD == dw.RX_GOOD
 
     def test_whole_register_files_read_as_their_parts(self, air: Air):
         a, b, *_ = pair(air)
         exchange(a, b)
         for file, length, sub, octets in ((0x15, 14, 9, 5), (0x0F, 5, 1, 2), (0x27, 46, 0x28, 3)):
             assert b.read(file, 0, length)[sub : sub + octets] == b.read(file, sub, octets)
-        assert b.read(0x11, 0, 1024)[: len(DATA)] == DATA
-        assert b.read(0x11, 3, 4) == DATA[3:7]
+        assert b.read(0x11, 0, 1024)[: len(dw.DATA)] == dw.DATA
+        assert b.read(0x11, 3, 4) == dw.DATA[3:7]
 
 
 class TestSending:
     def test_flags_of_the_frame_before_stand_until_a_delayed_one_starts(self, air: Air):
         a, *_ = pair(air)
-        a.send(DATA)
+        a.send(dw.DATA)
         a.host.delay(1e-3)
-        a.send_at(DATA, a.time + 5 * MS_TICKS)
+        a.send_at(dw.DATA, a.time + 5 * MS_TICKS)
         a.host.delay(1e-3)
         assert a.status & TX_GOOD == TX_GOOD, "a driver that waits for TXFRS now takes it for the new frame's"
         a.host.delay(3.95e-3)
-        assert a.status & (TXFRB | TXFRS) == TXFRB
+        assert a.status & (dw.TXFRB | dw.TXFRS) == dw.TXFRB
         a.host.delay(1e-3)
         a.set(0x0F, 0, TX_GOOD)
-        a.send_at(DATA, a.time + 5 * MS_TICKS)
+        a.send_at(dw.DATA, a.time + 5 * MS_TICKS)
         assert not a.status & TX_GOOD
         assert status_when_read_by(a) & TX_GOOD == 0
         a.host.delay(5e-3)
@@ -122,43 +93,43 @@ class TestSending:
 
     def test_flags_go_at_once_where_nothing_is_delayed(self, air: Air):
         a, *_ = pair(air)
-        a.send(DATA)
+        a.send(dw.DATA)
         a.host.delay(1e-3)
-        a.command(TXSTRT)
-        assert not a.status & TXFRS
+        a.command(dw.TXSTRT)
+        assert not a.status & dw.TXFRS
 
     def test_a_command_may_be_told_in_steps_and_its_warnings_read_from_the_middle(self, air: Air):
         a, b, *_ = pair(air)
-        a.load(DATA)
-        a.set(0x0D, 0, WAIT4RESP, 1)
+        a.load(dw.DATA)
+        a.set(0x0D, 0, dw.WAIT4RESP, 1)
         a.set(0x0A, 0, a.time + 2 * MS_TICKS, 5)
-        a.set(0x0D, 0, WAIT4RESP | TXSTRT | TXDLYS, 1)
-        assert not a.get(0x0F, 3, 2) << 24 & (HPDWARN | TXPUTE)
+        a.set(0x0D, 0, dw.WAIT4RESP | dw.TXSTRT | dw.TXDLYS, 1)
+        assert not a.get(0x0F, 3, 2) << 24 & (dw.HPDWARN | dw.TXPUTE)
         b.listen()
         a.host.delay(3e-3)
-        assert b.status & RXFCG
-        b.send(DATA)
-        assert status_when_read_by(a) & RXFCG, "the receiver came on after the frame"
+        assert b.status & dw.RXFCG
+        b.send(dw.DATA)
+        assert status_when_read_by(a) & dw.RXFCG, "the receiver came on after the frame"
         a.set(0x0A, 0, a.time, 5)
-        a.set(0x0D, 0, TXSTRT | TXDLYS, 1)
-        assert a.get(0x0F, 3, 2) << 24 & (HPDWARN | TXPUTE)
+        a.set(0x0D, 0, dw.TXSTRT | dw.TXDLYS, 1)
+        assert a.get(0x0F, 3, 2) << 24 & (dw.HPDWARN | dw.TXPUTE)
 
     @pytest.mark.parametrize("checked", [True, False])
     def test_a_buffer_written_while_its_frame_goes_out_unchecked_is_an_error(self, air: Air, checked: bool):
         a, *_ = pair(air)
-        a.send(DATA, 0 if checked else 1)
+        a.send(dw.DATA, 0 if checked else 1)
         a.host.delay(60e-6)
         a.write(0x09, 0, b"late")
-        assert bool(a.status & TXBERR) == (not checked)
+        assert bool(a.status & dw.TXBERR) == (not checked)
 
 
 class TestReceiving:
     def test_each_status_bit_is_cleared_by_its_own_one(self, air: Air):
         a, b, *_ = pair(air)
-        b.send(DATA)
+        b.send(dw.DATA)
         b.host.delay(1e-3)
         left = exchange(a, b)
-        assert left & (RX_GOOD | TX_GOOD) == RX_GOOD | TX_GOOD
+        assert left & (dw.RX_GOOD | TX_GOOD) == dw.RX_GOOD | TX_GOOD
         for bit in (1 << number for number in range(1, 35)):
             if left & bit:
                 b.set(0x0F, 0, bit, 5)
@@ -171,21 +142,21 @@ class TestReceiving:
         a, b, _, two = pair(air)
         two.lose_edges(lost)
         status = exchange(a, b)
-        off_m = abs(flight_ticks(a, b) - 3.0 / TICK_M) * TICK_M
-        assert b.received() == DATA
+        off_m = abs(flight_ticks(a, b) - 3.0 / dw.TICK_M) * dw.TICK_M
+        assert b.received() == dw.DATA
         if not lost:
-            assert status & (RXFCG | LDEDONE | LDEERR) == RXFCG | LDEDONE
+            assert status & (dw.RXFCG | dw.LDEDONE | dw.LDEERR) == dw.RXFCG | dw.LDEDONE
             assert off_m < 0.01
             return
-        assert status & (RXFCG | LDEDONE | LDEERR) == RXFCG | LDEERR
+        assert status & (dw.RXFCG | dw.LDEDONE | dw.LDEERR) == dw.RXFCG | dw.LDEERR
         assert off_m > 100
         two.lose_edges(0.0)
-        assert exchange(a, b) & LDEDONE
-        assert abs(flight_ticks(a, b) - 3.0 / TICK_M) * TICK_M > 1.0, "without a receiver reset"
-        b.set(0x0F, 0, LDEERR)
+        assert exchange(a, b) & dw.LDEDONE
+        assert abs(flight_ticks(a, b) - 3.0 / dw.TICK_M) * dw.TICK_M > 1.0, "without a receiver reset"
+        b.set(0x0F, 0, dw.LDEERR)
         b.reset_receiver()
-        assert exchange(a, b) & (LDEDONE | LDEERR) == LDEDONE
-        assert flight_ticks(a, b) == pytest.approx(3.0 / TICK_M, abs=1)
+        assert exchange(a, b) & (dw.LDEDONE | dw.LDEERR) == dw.LDEDONE
+        assert flight_ticks(a, b) == pytest.approx(3.0 / dw.TICK_M, abs=1)
 
     @pytest.mark.parametrize(
         ("preamble", "off", "heard"), [(1024, 24, True), (1024, 255, True), (64, 255, False)]
@@ -202,13 +173,13 @@ class TestReceiving:
         for late_us in range(0, 300, 37):
             b.listen()
             b.host.delay(50e-6 + late_us * 1e-6)
-            a.send(DATA)
+            a.send(dw.DATA)
             a.host.delay(3e-3)
-            statuses.append(b.status & (RXFCG | ERRORS))
+            statuses.append(b.status & (dw.RXFCG | dw.ERRORS))
             b.off()
-        assert all(status == RXFCG for status in statuses) == heard
+        assert all(status == dw.RXFCG for status in statuses) == heard
         b.set(0x1D, 0, 0)
-        assert exchange(a, b) & RXFCG
+        assert exchange(a, b) & dw.RXFCG
 
 
 class TestDoubleBuffer:
@@ -225,7 +196,7 @@ class TestDoubleBuffer:
 
     def test_pointers_are_aligned_by_their_octet_alone(self, air: Air):
         a, b = self.listening(air)
-        self.send(a, DATA)
+        self.send(a, dw.DATA)
         side = b.get(0x0F, 3, 1)
         assert (side >> 7 & 1) != (side >> 6 & 1)
         b.set(0x0D, 3, 1, 1)
@@ -239,10 +210,10 @@ class TestDoubleBuffer:
         b.off()
         b.listen()
         b.host.delay(20e-6)
-        self.send(a, DATA)
-        b.command(RXENAB)
+        self.send(a, dw.DATA)
+        b.command(dw.RXENAB)
         assert b.status & SWINGING == SWINGING
-        assert b.received() == DATA
+        assert b.received() == dw.DATA
 
     def test_an_overrun_ends_with_the_hosts_pointer_and_the_receiver_goes_on(self, air: Air):
         a, b = self.listening(air)
@@ -260,22 +231,22 @@ class TestDoubleBuffer:
     def test_clearing_what_swings_makes_a_pulse_unless_it_is_masked(self, air: Air, masked: bool):
         """Errata IRQ-1: an interrupt that tells of nothing."""
         a, b = self.listening(air)
-        b.set(0x0E, 0, RXFCG)
-        self.send(a, DATA)
+        b.set(0x0E, 0, dw.RXFCG)
+        self.send(a, dw.DATA)
         assert b.host.irq()
         if masked:
             b.set(0x0E, 0, 0)
-        b.set(0x0F, 0, SWINGING | RXPRD)
+        b.set(0x0F, 0, SWINGING | dw.RXPRD)
         assert b.host.irq() == (not masked)
         assert not b.status & SWINGING
         if masked:
-            b.set(0x0E, 0, RXFCG)
+            b.set(0x0E, 0, dw.RXFCG)
         b.host.delay(2e-6)
         assert not b.host.irq()
 
     def test_with_one_buffer_there_is_no_pulse(self, air: Air):
         a, b, *_ = pair(air)
-        b.set(0x0E, 0, RXFCG)
+        b.set(0x0E, 0, dw.RXFCG)
         exchange(a, b)
         b.set(0x0F, 0, SWINGING)
         assert not b.host.irq()
@@ -290,7 +261,7 @@ class TestDoubleBuffer:
         self.send(a, long)
         self.send(a, long)
         b.command(1 << 24)
-        assert not b.status & ICRBP
+        assert not b.status & dw.ICRBP
         b.write(0x09, 0, bytes(written))
         data = b.received()
         assert (data == long) == (not spoilt)
@@ -309,7 +280,7 @@ class TestSleep:
     def test_a_counter_wakes_where_it_may(self, air: Air, wake: int, wakes: bool):
         driver = Driver(air.chip())
         self.sleep(driver, wake=wake, counter=2)
-        driver.hz = SLOW_HZ
+        driver.hz = dw.SLOW_HZ
         driver.host.delay(0.7)
         assert driver.get(0x00) != 0xDECA0130
         driver.host.delay(0.2)
@@ -321,8 +292,8 @@ class TestSleep:
         self.sleep(b, keep=0x0842 if listens else 0x0840)
         two.wakeup_pin()
         two.delay(5e-3)
-        a.send(DATA)
-        assert bool(status_when_read_by(b) & RXFCG) == listens
+        a.send(dw.DATA)
+        assert bool(status_when_read_by(b) & dw.RXFCG) == listens
 
     @pytest.mark.parametrize("measures", [True, False])
     def test_it_may_measure_as_it_wakes(self, air: Air, measures: bool):
@@ -340,8 +311,8 @@ def test_a_receiver_that_is_turned_off_sends_no_more_than_it_was_told(air: Air):
     a, b, *_ = pair(air)
     b.listen()
     b.host.delay(20e-6)
-    a.load(DATA)
-    a.set(0x0D, 0, TXSTRT | TRXOFF, 1)
+    a.load(dw.DATA)
+    a.set(0x0D, 0, dw.TXSTRT | dw.TRXOFF, 1)
     a.host.delay(1e-3)
-    assert not b.status & RXPRD
-    assert not a.status & TXFRB
+    assert not b.status & dw.RXPRD
+    assert not a.status & dw.TXFRB

@@ -2,35 +2,10 @@
 
 from __future__ import annotations
 
+import dw1000_driver as dw
 import pytest
 from compilers import NEEDS_CC
-from dw1000_driver import (
-    AAT,
-    AFFREJ,
-    DATA,
-    ERRORS,
-    HRBPT,
-    ICRBP,
-    LDEDONE,
-    RX_GOOD,
-    RXDFR,
-    RXENAB,
-    RXFCG,
-    RXOVRR,
-    RXPHE,
-    RXPRD,
-    RXPTO,
-    RXRFTO,
-    RXSFDTO,
-    TICK_M,
-    TXFRS,
-    WAIT4RESP,
-    Driver,
-    Mode,
-    exchange,
-    flight_ticks,
-    pair,
-)
+from dw1000_driver import Driver, Mode, exchange, flight_ticks, pair
 
 from uwb_mitigation.dw1000_model.air import Air
 
@@ -40,28 +15,28 @@ pytestmark = NEEDS_CC
 class TestReceiver:
     def test_status_clears_at_the_next_enable(self, air: Air):
         a, b, *_ = pair(air)
-        assert exchange(a, b) & RX_GOOD == RX_GOOD
+        assert exchange(a, b) & dw.RX_GOOD == dw.RX_GOOD
         b.listen()
-        assert b.status & (RX_GOOD | ERRORS) == 0
+        assert b.status & (dw.RX_GOOD | dw.ERRORS) == 0
 
     def test_after_a_good_frame_the_receiver_is_off(self, air: Air):
         a, b, *_ = pair(air)
-        assert exchange(a, b) & RXFCG
+        assert exchange(a, b) & dw.RXFCG
         b.set(0x0F, 0, 0xFFFFFFFF)
-        a.send(DATA)
+        a.send(dw.DATA)
         a.host.delay(1e-3)
-        assert not b.status & RXPRD
+        assert not b.status & dw.RXPRD
 
     def test_the_frame_wait_time_out(self, air: Air):
         _, b, *_ = pair(air)
         b.set(0x0C, 0, 1000, 2)
         b.set(0x04, 0, b.get(0x04) | 1 << 28)
-        b.set(0x0E, 0, RXRFTO)
+        b.set(0x0E, 0, dw.RXRFTO)
         b.listen()
         began = b.host.now()
         b.host.wait(1.0)
         assert b.host.now() - began == pytest.approx(1000 * 512 / 499.2e6 + 16e-6, abs=2e-6)
-        assert b.status & ERRORS == RXRFTO
+        assert b.status & dw.ERRORS == dw.RXRFTO
 
     def test_a_frame_ends_with_the_time_out_too(self, air: Air):
         a, b, *_ = pair(air)
@@ -69,42 +44,42 @@ class TestReceiver:
         b.set(0x04, 0, b.get(0x04) | 1 << 28)
         b.listen()
         b.host.delay(40e-6)
-        a.send(DATA * 10)
+        a.send(dw.DATA * 10)
         a.host.delay(1e-3)
-        assert b.status & (RXPRD | RXFCG | RXRFTO) == RXPRD | RXRFTO
+        assert b.status & (dw.RXPRD | dw.RXFCG | dw.RXRFTO) == dw.RXPRD | dw.RXRFTO
 
     def test_the_preamble_time_out_counts_chunks_and_one_more(self, air: Air):
         a, b, *_ = pair(air)
         b.set(0x27, 0x24, 9, 2)
-        b.set(0x0E, 0, RXPTO)
+        b.set(0x0E, 0, dw.RXPTO)
         b.listen()
         began = b.host.now()
         b.host.wait(1.0)
         assert b.host.now() - began == pytest.approx(10 * 8 * 1017.63e-9 + 16e-6, abs=2e-6)
-        assert exchange(a, b) & RXFCG, "and not once there is a preamble"
+        assert exchange(a, b) & dw.RXFCG, "and not once there is a preamble"
 
     def test_the_sfd_time_out_may_be_too_short_or_none(self, air: Air):
         a, b, *_ = pair(air)
         b.set(0x27, 0x20, 50, 2)
-        assert exchange(a, b) & (RXSFDTO | RXFCG) == RXSFDTO
+        assert exchange(a, b) & (dw.RXSFDTO | dw.RXFCG) == dw.RXSFDTO
         b.configure(Mode(decawave_sfd=True))
         b.set(0x27, 0x20, 0, 2)
         status = exchange(a, b)
-        assert status & RXPRD
-        assert not status & ERRORS, "0 waits for ever"
+        assert status & dw.RXPRD
+        assert not status & dw.ERRORS, "0 waits for ever"
         assert b.get(0x19, 0, 4) >> 16 & 15 == 5
 
     def test_a_delayed_reception_begins_at_its_time(self, air: Air):
         a, b, *_ = pair(air)
         b.set(0x0A, 0, b.time + 640_000_000, 5)
-        b.set(0x0D, 0, RXENAB | 1 << 9)
-        a.send(DATA)
+        b.set(0x0D, 0, dw.RXENAB | 1 << 9)
+        a.send(dw.DATA)
         a.host.delay(5e-3)
-        assert not b.status & RXPRD
+        assert not b.status & dw.RXPRD
         b.host.delay(6e-3)
-        a.send(DATA)
+        a.send(dw.DATA)
         a.host.delay(1e-3)
-        assert b.status & RXFCG
+        assert b.status & dw.RXFCG
 
     @pytest.mark.parametrize("error", ["header", "time-out"])
     def test_without_a_receiver_reset_after_an_error_the_next_stamp_is_wrong(self, air: Air, error: str):
@@ -113,63 +88,63 @@ class TestReceiver:
         def fail() -> None:
             if error == "header":
                 b.configure(Mode(long_frames=True))
-                assert exchange(a, b) & RXPHE
+                assert exchange(a, b) & dw.RXPHE
                 b.configure(Mode())
             else:
                 b.set(0x0C, 0, 100, 2)
                 b.set(0x04, 0, b.get(0x04) | 1 << 28)
                 b.listen()
                 b.host.delay(1e-3)
-                assert b.status & RXRFTO
+                assert b.status & dw.RXRFTO
                 b.set(0x04, 0, b.get(0x04) & ~(1 << 28))
 
         fail()
-        assert exchange(a, b) & RXFCG
-        assert abs(flight_ticks(a, b) - 3.0 / TICK_M) * TICK_M > 1.0
+        assert exchange(a, b) & dw.RXFCG
+        assert abs(flight_ticks(a, b) - 3.0 / dw.TICK_M) * dw.TICK_M > 1.0
         fail()
         b.reset_receiver()
-        assert exchange(a, b) & RXFCG
-        assert flight_ticks(a, b) == pytest.approx(3.0 / TICK_M, abs=1)
+        assert exchange(a, b) & dw.RXFCG
+        assert flight_ticks(a, b) == pytest.approx(3.0 / dw.TICK_M, abs=1)
 
-    @pytest.mark.parametrize("error", [RXPTO, RXSFDTO])
+    @pytest.mark.parametrize("error", [dw.RXPTO, dw.RXSFDTO])
     def test_some_errors_need_no_receiver_reset(self, air: Air, error: int):
         a, b, *_ = pair(air)
-        if error == RXPTO:
+        if error == dw.RXPTO:
             b.set(0x27, 0x24, 5, 2)
             b.listen()
             b.host.delay(1e-3)
         else:
             b.configure(Mode(decawave_sfd=True))
             exchange(a, b)
-        assert b.status & ERRORS == error
+        assert b.status & dw.ERRORS == error
         b.configure(Mode())
         b.set(0x27, 0x24, 0, 2)
-        assert exchange(a, b) & RXFCG
-        assert flight_ticks(a, b) == pytest.approx(3.0 / TICK_M, abs=1)
+        assert exchange(a, b) & dw.RXFCG
+        assert flight_ticks(a, b) == pytest.approx(3.0 / dw.TICK_M, abs=1)
 
     def test_rxautr_goes_on_after_errors_alone_and_swallows_what_is_sent(self, air: Air):
         a, b, *_ = pair(air)
         b.configure(Mode(long_frames=True))
         b.set(0x04, 0, b.get(0x04) | 1 << 29)
-        assert exchange(a, b) & RXPHE
+        assert exchange(a, b) & dw.RXPHE
         assert b.get(0x19, 0, 4) >> 16 & 15 == 5, "on again by itself"
-        b.send(DATA)
+        b.send(dw.DATA)
         b.host.delay(2e-3)
-        assert not b.status & TXFRS, "a driver that takes the receiver for off loses this one"
+        assert not b.status & dw.TXFRS, "a driver that takes the receiver for off loses this one"
         b.off()
         b.reset_receiver()
         b.configure(Mode())
         b.set(0x04, 0, b.get(0x04) | 1 << 29)
-        assert exchange(a, b) & RXFCG
+        assert exchange(a, b) & dw.RXFCG
         assert b.get(0x19, 0, 4) >> 16 & 15 == 1, "off after a good frame"
 
     def test_turned_off_in_a_frame_it_may_still_tell_of_it(self, air: Air):
         """The glitch that drivers mask the interrupt for."""
         a, b, _, two = pair(air)
-        b.set(0x0E, 0, RXPHE | RXFCG)
+        b.set(0x0E, 0, dw.RXPHE | dw.RXFCG)
         b.listen()
         b.host.delay(20e-6)
-        a.send(DATA)
+        a.send(dw.DATA)
         b.host.delay(100e-6)
         b.off()
         two.wait(100e-6)
@@ -182,15 +157,15 @@ class TestReceiver:
 
     def test_the_way_round_the_glitch(self, air: Air):
         a, b, _, two = pair(air)
-        b.set(0x0E, 0, RXPHE | RXFCG)
+        b.set(0x0E, 0, dw.RXPHE | dw.RXFCG)
         b.listen()
         b.host.delay(20e-6)
-        a.send(DATA)
+        a.send(dw.DATA)
         b.host.delay(100e-6)
         b.set(0x0E, 0, 0)
         b.off()
         b.set(0x0F, 0, 0xFFFFFFFF)
-        b.set(0x0E, 0, RXPHE | RXFCG)
+        b.set(0x0E, 0, dw.RXPHE | dw.RXFCG)
         two.wait(1e-3)
         assert not two.irq()
 
@@ -210,14 +185,14 @@ class TestDoubleBuffer:
     def test_a_second_frame_arrives_while_the_first_is_read(self, air: Air):
         a, b = self.both(air)
         self.send(a, b"first")
-        assert b.status & ICRBP
+        assert b.status & dw.ICRBP
         self.send(a, b"second")
         for expected in (b"first", b"second"):
-            assert b.status & (RXFCG | LDEDONE | RXOVRR) == RXFCG | LDEDONE
+            assert b.status & (dw.RXFCG | dw.LDEDONE | dw.RXOVRR) == dw.RXFCG | dw.LDEDONE
             assert b.received() == expected
-            b.set(0x0F, 0, RXFCG | RXDFR | LDEDONE)
-            b.command(HRBPT)
-        assert not b.status & RXFCG
+            b.set(0x0F, 0, dw.RXFCG | dw.RXDFR | dw.LDEDONE)
+            b.command(dw.HRBPT)
+        assert not b.status & dw.RXFCG
         self.send(a, b"third")
         assert b.received() == b"third"
 
@@ -227,19 +202,19 @@ class TestDoubleBuffer:
             self.send(a, data)
         stamp = b.rx_stamp
         self.send(a, b"third")
-        assert b.status & RXOVRR
+        assert b.status & dw.RXOVRR
         assert b.rx_stamp != stamp, "of what was not read yet"
-        b.set(0x0F, 0, RXOVRR)
-        assert b.status & RXOVRR, "read-only"
+        b.set(0x0F, 0, dw.RXOVRR)
+        assert b.status & dw.RXOVRR, "read-only"
         b.off()
         b.listen()
         b.host.delay(20e-6)
         self.send(a, b"fourth")
-        b.command(HRBPT)
-        assert abs(flight_ticks(a, b) - 3.0 / TICK_M) * TICK_M > 1.0, "without a receiver reset"
+        b.command(dw.HRBPT)
+        assert abs(flight_ticks(a, b) - 3.0 / dw.TICK_M) * dw.TICK_M > 1.0, "without a receiver reset"
         b.off()
         b.reset_receiver()
-        assert not b.status & RXOVRR
+        assert not b.status & dw.RXOVRR
 
 
 class TestFilter:
@@ -283,18 +258,18 @@ class TestFilter:
         if to == b"EUI":
             to = b.read(0x01, 0, 8)
         status = exchange(a, b, self.frame(kind, pan, to))
-        assert status & (RXFCG | AFFREJ) == (RXFCG if passes else AFFREJ)
+        assert status & (dw.RXFCG | dw.AFFREJ) == (dw.RXFCG if passes else dw.AFFREJ)
 
     def test_a_frame_too_short_for_its_addresses_does_not_pass(self, air: Air):
         a, b = self.listener(air, 0b1001)
-        assert exchange(a, b, self.frame(1, self.PAN, b"\x02\x01")[:6]) & AFFREJ
-        assert exchange(a, b, b"\x41") & AFFREJ
+        assert exchange(a, b, self.frame(1, self.PAN, b"\x02\x01")[:6]) & dw.AFFREJ
+        assert exchange(a, b, b"\x41") & dw.AFFREJ
 
     def test_a_frame_of_a_version_to_come_does_not_pass(self, air: Air):
         a, b = self.listener(air, 0b1001)
         frame = bytearray(self.frame(1, self.PAN, b"\x02\x01"))
         frame[1] |= 0x20
-        assert exchange(a, b, bytes(frame)) & AFFREJ
+        assert exchange(a, b, bytes(frame)) & dw.AFFREJ
 
     def test_a_frame_that_asks_for_it_is_acknowledged(self, air: Air):
         a, b = self.listener(air, 0b1001 | 1 << 30)
@@ -302,12 +277,12 @@ class TestFilter:
         b.load(b"")
         b.listen()
         b.host.delay(20e-6)
-        a.send(self.frame(1, self.PAN, b"\x02\x01", ack=True), WAIT4RESP)
+        a.send(self.frame(1, self.PAN, b"\x02\x01", ack=True), dw.WAIT4RESP)
         a.host.delay(2e-3)
-        assert b.status & (AAT | TXFRS) == AAT | TXFRS
-        assert a.status & RXFCG
+        assert b.status & (dw.AAT | dw.TXFRS) == dw.AAT | dw.TXFRS
+        assert a.status & dw.RXFCG
         assert a.received() == b"\x02\x00\x2a"
 
     def test_aat_may_be_false(self, air: Air):
         a, b = self.listener(air, 0)
-        assert exchange(a, b, self.frame(1, self.PAN, b"\x02\x01", ack=True)) & (AAT | TXFRS) == AAT
+        assert exchange(a, b, self.frame(1, self.PAN, b"\x02\x01", ack=True)) & (dw.AAT | dw.TXFRS) == dw.AAT

@@ -2,23 +2,10 @@
 
 from __future__ import annotations
 
+import dw1000_driver as dw
 import pytest
 from compilers import NEEDS_CC
-from dw1000_driver import (
-    CPLOCK,
-    FAST_HZ,
-    RX_GOOD,
-    RXENAB,
-    RXPTO,
-    SLOW_HZ,
-    SLP2INIT,
-    TICK_S,
-    TRXOFF,
-    TXFRS,
-    TXSTRT,
-    Driver,
-    pair,
-)
+from dw1000_driver import Driver, pair
 
 from uwb_mitigation.dw1000_model.air import Air, Chip
 
@@ -38,13 +25,13 @@ def driver(chip: Chip) -> Driver:
 
 
 def test_a_powered_chip_is_idle_and_locked(driver: Driver):
-    assert driver.status == CPLOCK | SLP2INIT
+    assert driver.status == dw.CPLOCK | dw.SLP2INIT
     assert driver.get(0x19, 0, 4) >> 16 & 15 == 1
 
 
 @pytest.mark.parametrize("header", [[0x00], [0x40, 0x00], [0x40, 0x80, 0x00]], ids=["1", "2", "3 octets"])
 def test_a_header_has_one_to_three_octets(chip: Chip, header: list[int]):
-    assert chip.spi(bytes([*header, 0, 0, 0, 0]), FAST_HZ)[len(header) :] == ID
+    assert chip.spi(bytes([*header, 0, 0, 0, 0]), dw.FAST_HZ)[len(header) :] == ID
 
 
 def test_a_sub_address_has_15_bits(driver: Driver):
@@ -56,7 +43,7 @@ def test_a_sub_address_has_15_bits(driver: Driver):
 
 @pytest.mark.parametrize("cut", [b"", b"\x40", b"\x6e\x84"])
 def test_a_header_that_is_cut_off_does_nothing(chip: Chip, cut: bytes):
-    assert chip.spi(cut, FAST_HZ) == bytes(len(cut))
+    assert chip.spi(cut, dw.FAST_HZ) == bytes(len(cut))
 
 
 @pytest.mark.parametrize(
@@ -113,7 +100,7 @@ def test_the_transmit_buffer_is_not_read_back(driver: Driver):
 
 
 def test_a_command_clears_itself(driver: Driver):
-    driver.command(RXENAB)
+    driver.command(dw.RXENAB)
     assert driver.get(0x0D) == 0
 
 
@@ -126,7 +113,7 @@ def test_a_command_may_come_octet_by_octet(air: Air, driver: Driver):
 
 def test_what_starts_something_clears_itself(driver: Driver):
     """Drivers wait for it."""
-    driver.hz = SLOW_HZ
+    driver.hz = dw.SLOW_HZ
     driver.set(0x36, 0, 0x0301, 2)
     driver.set(0x2D, 6, 0x8000, 2)
     assert driver.get(0x2D, 6, 2) == 0x8000
@@ -142,30 +129,30 @@ def test_what_starts_something_clears_itself(driver: Driver):
 def test_ones_clear_status_octet_by_octet_and_zeros_do_not(driver: Driver):
     driver.set(0x0F, 0, 0x00, 1)
     driver.set(0x0F, 2, 0x80, 1)
-    assert driver.status == CPLOCK
-    driver.set_by_octets(0x0F, 0, CPLOCK, 5)
+    assert driver.status == dw.CPLOCK
+    driver.set_by_octets(0x0F, 0, dw.CPLOCK, 5)
     assert driver.status == 0
 
 
 def test_the_interrupt_line_is_status_and_mask_with_its_polarity(driver: Driver, chip: Chip):
     assert not chip.irq()
-    driver.set(0x0E, 0, CPLOCK)
+    driver.set(0x0E, 0, dw.CPLOCK)
     assert chip.irq()
     assert driver.status & 1
     driver.set(0x04, 0, 0x1000)
     assert not chip.irq(), "active low"
-    driver.set(0x0F, 0, CPLOCK)
+    driver.set(0x0F, 0, dw.CPLOCK)
     assert chip.irq()
 
 
 def test_a_wait_ends_with_the_interrupt_or_its_time(air: Air, driver: Driver, chip: Chip):
-    driver.set(0x0E, 0, RXPTO)
+    driver.set(0x0E, 0, dw.RXPTO)
     driver.set(0x27, 0x24, 10, 2)
     driver.listen()
     began = chip.now()
     chip.wait(1.0)
     assert 50e-6 < chip.now() - began < 200e-6
-    driver.set(0x0F, 0, RXPTO)
+    driver.set(0x0F, 0, dw.RXPTO)
     began = chip.now()
     chip.wait(0.25)
     assert chip.now() - began == pytest.approx(0.25)
@@ -178,7 +165,7 @@ def test_the_counter_runs_on_its_own_crystal_in_steps_of_512(air: Air):
     chip.delay(1.0)
     ended, second = chip.now(), driver.time
     assert first % 512 == second % 512 == 0
-    assert (second - first) % (1 << 40) == pytest.approx((ended - began) / TICK_S * (1 + 20e-6), abs=600)
+    assert (second - first) % (1 << 40) == pytest.approx((ended - began) / dw.TICK_S * (1 + 20e-6), abs=600)
 
 
 def test_a_transaction_takes_its_time(chip: Chip):
@@ -193,17 +180,17 @@ class TestClocks:
         seen = {driver.read(0x00) for _ in range(8)}
         assert ID not in seen
         assert len(seen) > 1, "random, not an error"
-        driver.hz = SLOW_HZ
+        driver.hz = dw.SLOW_HZ
         assert driver.read(0x00) == ID
         driver.set(0x36, 0, 0x00, 1)
         driver.host.delay(10e-6)
-        driver.hz = FAST_HZ
+        driver.hz = dw.FAST_HZ
         assert driver.read(0x00) == ID
 
     def test_what_is_written_too_fast_is_lost(self, driver: Driver):
         driver.set(0x36, 0, 0x01, 1)
         driver.set(0x18, 0, 0x1234, 2)
-        driver.hz = SLOW_HZ
+        driver.hz = dw.SLOW_HZ
         assert driver.get(0x18, 0, 2) == 0
 
     def test_no_spi_is_faster_than_20_mhz(self, driver: Driver):
@@ -211,33 +198,33 @@ class TestClocks:
         assert driver.read(0x00) != ID
 
     def test_a_driver_that_does_not_wait_after_a_reset_reads_nothing(self, driver: Driver):
-        driver.hz = SLOW_HZ
+        driver.hz = dw.SLOW_HZ
         driver.host.reset_pin()
         assert driver.read(0x00) != ID
         driver.host.delay(5e-3)
         assert driver.read(0x00) == ID
-        assert driver.status == CPLOCK | SLP2INIT
+        assert driver.status == dw.CPLOCK | dw.SLP2INIT
 
     def test_the_pll_locks_again_after_the_crystal_was_forced(self, driver: Driver):
         driver.set(0x36, 0, 0x01, 1)
-        driver.hz = SLOW_HZ
-        driver.set(0x0F, 0, CPLOCK)
+        driver.hz = dw.SLOW_HZ
+        driver.set(0x0F, 0, dw.CPLOCK)
         driver.set(0x36, 0, 0x00, 1)
         driver.host.delay(20e-6)
-        assert driver.status & CPLOCK
+        assert driver.status & dw.CPLOCK
 
     def test_nothing_is_sent_while_the_crystal_is_forced(self, driver: Driver):
         driver.set(0x36, 0, 0x01, 1)
-        driver.hz = SLOW_HZ
-        driver.command(TXSTRT)
+        driver.hz = dw.SLOW_HZ
+        driver.command(dw.TXSTRT)
         driver.host.delay(1e-3)
-        assert not driver.status & TXFRS
+        assert not driver.status & dw.TXFRS
 
 
 class TestResets:
     def test_a_soft_reset_takes_everything_back(self, driver: Driver):
         driver.set(0x18, 0, 0x1234, 2)
-        driver.hz = SLOW_HZ
+        driver.hz = dw.SLOW_HZ
         driver.set(0x36, 0, 0x01, 1)
         driver.set(0x36, 3, 0x00, 1)
         driver.host.delay(20e-6)
@@ -245,11 +232,11 @@ class TestResets:
         assert driver.get(0x18, 0, 2) == 0
         assert driver.get(0x36, 0) == 0xF0300200
         driver.host.delay(20e-6)
-        driver.hz = FAST_HZ
+        driver.hz = dw.FAST_HZ
         assert driver.read(0x00) == ID
 
     def test_a_chip_held_in_soft_reset_takes_no_writes(self, driver: Driver):
-        driver.hz = SLOW_HZ
+        driver.hz = dw.SLOW_HZ
         driver.set(0x36, 3, 0x00, 1)
         driver.set(0x18, 0, 0x1234, 2)
         driver.set(0x36, 3, 0xF0, 1)
@@ -267,7 +254,7 @@ class TestResets:
         assert chip.fault is None
         chip.reset_drive(2)
         chip.delay(5e-3)
-        driver.hz = SLOW_HZ
+        driver.hz = dw.SLOW_HZ
         assert driver.read(0x00) != ID
         assert "RSTn driven high" in str(chip.fault)
 
@@ -283,7 +270,7 @@ class TestMemories:
 
     def test_the_otp_memory_holds_what_a_driver_needs(self, air: Air):
         driver = Driver(air.chip(tx_delay_ticks=16400, rx_delay_ticks=16450))
-        driver.hz = SLOW_HZ
+        driver.hz = dw.SLOW_HZ
         driver.set(0x36, 0, 0x01, 1)
         assert self.read_otp(driver, 0x1C) == 32850 << 16 | 32850
         assert self.read_otp(driver, 0x1E) & 0x1F == 0x10
@@ -301,9 +288,9 @@ class TestMemories:
     @pytest.mark.parametrize("wrong", ["nothing", "no clock", "no time"])
     def test_without_the_microcode_a_frame_has_no_stamp(self, air: Air, wrong: str):
         a, b, *_ = pair(air)
-        b.hz = SLOW_HZ
+        b.hz = dw.SLOW_HZ
         b.start(load_lde=False)
-        b.hz = SLOW_HZ
+        b.hz = dw.SLOW_HZ
         if wrong == "no clock":
             b.set(0x2D, 6, 0x8000, 2)
             b.host.delay(1e-3)
@@ -313,14 +300,14 @@ class TestMemories:
             b.host.delay(50e-6)
             b.set(0x36, 0, 0x0200, 2)
             b.host.delay(50e-6)
-        b.hz = FAST_HZ
+        b.hz = dw.FAST_HZ
         stamps = []
         for _ in range(2):
             b.listen()
             b.host.delay(20e-6)
             a.send(b"hello")
             a.host.delay(1e-3)
-            assert b.status & RX_GOOD == RX_GOOD & ~(1 << 10), "RXDFR without LDEDONE"
+            assert b.status & dw.RX_GOOD == dw.RX_GOOD & ~(1 << 10), "RXDFR without LDEDONE"
             stamps.append((b.rx_stamp - b.time) % (1 << 40))
         # Stamps lie a millisecond in the past where they mean something.
         assert min((-stamp) % (1 << 40) for stamp in stamps) > 1e9
@@ -336,13 +323,13 @@ class TestSleep:
     def test_a_sleeping_chip_answers_nothing_and_is_woken_by_its_select_line(self, driver: Driver):
         driver.set(0x04, 0, 0x10001200)
         self.asleep(driver)
-        driver.hz = SLOW_HZ
+        driver.hz = dw.SLOW_HZ
         assert driver.read(0x00) != ID
-        driver.host.spi(bytes(200), SLOW_HZ)
+        driver.host.spi(bytes(200), dw.SLOW_HZ)
         driver.host.delay(5e-3)
         assert driver.read(0x00) == ID
         assert driver.get(0x04) == 0x10001200, "ONW_LDC brings the configuration back"
-        assert driver.status & SLP2INIT
+        assert driver.status & dw.SLP2INIT
 
     def test_sleep_loses_the_antenna_delays(self, driver: Driver, chip: Chip):
         driver.set(0x18, 0, 16436, 2)
@@ -369,8 +356,8 @@ class TestSleep:
 
     def test_without_a_way_to_wake_there_is_only_a_reset(self, driver: Driver, chip: Chip):
         self.asleep(driver, wake=0x01)
-        driver.hz = SLOW_HZ
-        driver.host.spi(bytes(200), SLOW_HZ)
+        driver.hz = dw.SLOW_HZ
+        driver.host.spi(bytes(200), dw.SLOW_HZ)
         chip.wakeup_pin()
         chip.delay(5e-3)
         assert driver.read(0x00) != ID
@@ -388,7 +375,7 @@ def test_temperature_and_voltage_by_the_manuals_formulas(driver: Driver, chip: C
     driver.set(0x2A, 0, 0, 1)
     volts, celsius = driver.read(0x2A, 3, 2)
     driver.set(0x36, 0, 0x01, 1)
-    driver.hz = SLOW_HZ
+    driver.hz = dw.SLOW_HZ
     otp = TestMemories().read_otp
     assert 23 + 1.14 * (celsius - (otp(driver, 9) & 0xFF)) == pytest.approx(41.0, abs=0.6)
     assert 3.3 + (volts - (otp(driver, 8) & 0xFF)) / 173 == pytest.approx(3.1, abs=0.003)
@@ -419,7 +406,7 @@ def test_the_state_says_what_the_chip_does(driver: Driver):
     driver.fctrl = 0x15C000
     driver.listen()
     assert state() == 5
-    driver.command(TRXOFF)
+    driver.command(dw.TRXOFF)
     driver.send_at(b"x", driver.time + 64_000_000)
     assert state() == 2
     driver.host.delay(0.95e-3)
