@@ -109,7 +109,7 @@ def decode_place(data: bytes) -> tuple[int, int, tuple[float, float, float]] | N
 
 
 @dataclass(frozen=True, slots=True)
-class Positions:
+class FramePath:
     """Where one frame was, as recorded.
 
     Attributes:
@@ -127,7 +127,7 @@ class Positions:
         return int(digits) if self.child_frame.startswith(_TAG_FRAME) and digits.isdigit() else None
 
 
-def read_positions(path: Path, topic: str) -> list[Positions]:
+def read_positions(path: Path, topic: str) -> list[FramePath]:
     """The positions of every frame on a topic of a bag; of a topic that is not there, none.
 
     Raises:
@@ -154,7 +154,7 @@ def read_positions(path: Path, topic: str) -> list[Positions]:
         row = (stamp.sec * _NANOSECONDS + stamp.nanosec, pose.position.x, pose.position.y, pose.position.z)
         if all(map(math.isfinite, row)):
             found.setdefault(getattr(decoded, "child_frame_id", ""), []).append(row)
-    return [Positions(frame, _path(rows)) for frame, rows in found.items()]
+    return [FramePath(frame, _path(rows)) for frame, rows in found.items()]
 
 
 def _path(rows: list[tuple[int, float, float, float]]) -> TruePath:

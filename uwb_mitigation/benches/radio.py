@@ -61,7 +61,7 @@ class Ranging:
 
 
 @dataclass(frozen=True, slots=True)
-class Soaked:
+class RadioSoak:
     """Of a soak.
 
     Attributes:
@@ -152,7 +152,7 @@ def _emulated(prefix: Path, round_trip_s: float) -> Iterator[tuple[Path, Path]]:
         process.wait()
 
 
-def soak(exchanges: int, seed: int, advance: Callable[[int], None]) -> Soaked:
+def soak(exchanges: int, seed: int, advance: Callable[[int], None]) -> RadioSoak:
     """A tag and four anchors, 10 % of frames lost, 1 % damaged, chips reset and anchors gone for a while."""
     random = np.random.default_rng(seed)
     process = psutil.Process()
@@ -189,7 +189,7 @@ def soak(exchanges: int, seed: int, advance: Callable[[int], None]) -> Soaked:
         counts = air.counts(tag)
     end_mb = process.memory_info().rss / 1e6
     lost = {name: counts[name] for name in ("no_answer", "late", "time_out", "damaged", "absurd", "broken")}
-    return Soaked(
+    return RadioSoak(
         exchanges=counts["tried"],
         delivered=watch.delivered,
         wrong=watch.wrong,

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from uwb_mitigation.radio.antenna_delay import AntennaDelay
 
 
-class Source(str, Enum):
+class RadioSource(str, Enum):
     """What hangs between this computer and the chip."""
 
     EVB1000 = "evb1000"
@@ -37,7 +37,7 @@ def antenna_delay(
             "/dev/spidev0.0.",
         ),
     ],
-    source: Annotated[Source, typer.Option(help="As the driver's.")] = Source.EVB1000,
+    source: Annotated[RadioSource, typer.Option(help="As the driver's.")] = RadioSource.EVB1000,
     reset: Annotated[str, typer.Option(help="The chip's reset line, as gpiochip0:25 (spi).")] = "",
     anchor: Annotated[
         str | None,

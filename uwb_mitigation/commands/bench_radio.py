@@ -13,7 +13,7 @@ from uwb_mitigation.commands.console import JsonOption
 from uwb_mitigation.errors import ParameterError
 
 if TYPE_CHECKING:
-    from uwb_mitigation.benches.radio import Ranging, Soaked
+    from uwb_mitigation.benches.radio import RadioSoak, Ranging
 
 
 def bench_radio(
@@ -85,7 +85,7 @@ def _ranging_table(rows: list[Ranging]) -> Table:
     return table
 
 
-def _table(host_hz: float, device_hz: float, evb1000_hz: float | None, soaked: Soaked | None) -> Table:
+def _table(host_hz: float, device_hz: float, evb1000_hz: float | None, soaked: RadioSoak | None) -> Table:
     table = Table("ranges a second, 157 samples", "")
     table.add_row("921600 baud, host corrects (virtual time)", f"{host_hz:.0f}")
     table.add_row("921600 baud, board corrects (virtual time, estimated cycles)", f"{device_hz:.0f}")

@@ -34,7 +34,7 @@ class CirChoice(str, enum.Enum):
     POLL = "poll"
 
 
-class Scene(str, enum.Enum):
+class Like(str, enum.Enum):
     """What is simulated."""
 
     DRIVE = "drive"
@@ -138,12 +138,12 @@ def simulate(
         ),
     ],
     like: Annotated[
-        Scene,
+        Like,
         typer.Option(
             help="deepuwb: five rooms with obstacles, in DeepUWB's shape and size; buildings: placements in random "
             "buildings, with boards that differ; survey: placements at rest in a flat; drive: a robot through that flat."
         ),
-    ] = Scene.DEEPUWB,
+    ] = Like.DEEPUWB,
     seed: Annotated[
         int, typer.Option(help="The same seed gives the same ranges, from today 0:00 UTC on.")
     ] = 1,
@@ -207,7 +207,7 @@ def simulate(
 
 
 def simulated_source(
-    like: Scene, seed: int, ranges: int | None, exchanges: int, anchors: int = 4
+    like: Like, seed: int, ranges: int | None, exchanges: int, anchors: int = 4
 ) -> tuple[Source, int]:
     """The simulator's source, and how many ranges it simulates.
 
@@ -218,18 +218,18 @@ def simulated_source(
     from uwb_mitigation.sources.simulated_buildings import SimulatedBuildings
     from uwb_mitigation.sources.simulated_deepuwb import SimulatedDeepUwb
 
-    if like is Scene.DEEPUWB:
+    if like is Like.DEEPUWB:
         chosen = {} if ranges is None else {"ranges": ranges}
         rooms = SimulatedDeepUwb(seed=seed, exchanges=exchanges, **chosen)
         return rooms, sum(rooms.rows)
     ranges = _RANGES if ranges is None else ranges
-    if like in (Scene.SURVEY, Scene.BUILDINGS):
+    if like in (Like.SURVEY, Like.BUILDINGS):
         if exchanges < 1 or ranges % exchanges:
             raise ParameterError(
                 f"{ranges} ranges of {exchanges} exchanges a placement", valid="a multiple of the exchanges"
             )
         placements = ranges // exchanges
-        if like is Scene.BUILDINGS:
+        if like is Like.BUILDINGS:
             return SimulatedBuildings(seed=seed, placements=placements, exchanges=exchanges), ranges
         return simulated.SimulatedSurvey(seed=seed, configurations=placements, exchanges=exchanges), ranges
     if ranges < 1:

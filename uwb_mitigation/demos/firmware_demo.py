@@ -36,7 +36,7 @@ PATIENCE_S = 20.0
 """Without a corrected range for so long, the rest counts as lost."""
 
 
-class Listener:
+class BoardListener:
     """Keeps what the board corrected, and whether the driver has it in mode DEVICE."""
 
     def __init__(self, probe: Probe) -> None:
@@ -77,7 +77,7 @@ def differences(expected: CorrectedRange, message: RangeCorrected) -> bool:
 
 
 def play(
-    board: EmulatedFirmware, listener: Listener, measured: Sequence[RangeMeasurement], console: Console
+    board: EmulatedFirmware, listener: BoardListener, measured: Sequence[RangeMeasurement], console: Console
 ) -> None:
     """Measure with the board's radio, and wait until all has come back or nothing more does."""
     with console.status("waiting for the driver to bring the board into mode DEVICE") as status:
@@ -131,7 +131,7 @@ def run(console: Console, measured: Sequence[RangeMeasurement]) -> int:
     console.print(f"building the firmware with model {bundle.name}, id {bundle.model_id:08x}")
     with EmulatedFirmware(bundle) as board, watching(Probe) as probe:
         console.print(f"emulated Cortex-M4 on {board.port}")
-        listener = Listener(probe)
+        listener = BoardListener(probe)
         driver = processes.start("driver", "source:=serial", f"port:={board.port}", "mode:=device")
         try:
             play(board, listener, measured, console)

@@ -40,7 +40,7 @@ PATIENCE_S = 60.0
 """Until each anchor has ranged once, on a computer that has other work."""
 
 
-class Listener:
+class RadioListener:
     """Keeps corrected ranges by anchor, and what the driver says of its radios."""
 
     def __init__(self, probe: Probe) -> None:
@@ -97,7 +97,7 @@ def run(console: Console, seconds: float) -> int:
         EmulatedEvb1000s(source, boards=1 + len(ANCHORS)) as boards,
         watching(Probe) as probe,
     ):
-        listener = Listener(probe)
+        listener = RadioListener(probe)
         nodes = {"mitigator": processes.start("mitigator")}
         try:
             corrected = probe.resolve_topic_name(topics.RANGE_CORRECTED)
