@@ -12,7 +12,6 @@ import os
 import select
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -20,6 +19,7 @@ import serial
 from serial.tools import list_ports
 
 from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.link.event_queue import EventQueue
 from uwb_mitigation.link.events import Event, LinkState
 from uwb_mitigation.link.layout import Mode
 from uwb_mitigation.link.messages import Hello
@@ -146,15 +146,13 @@ class BoardPort:
         self._baud = baud
         self._dtr = dtr
         self._stamp_clock = stamp_clock
-        self._capacity = capacity
         self._session = BoardSession(mode=mode, expected_model_id=expected_model_id)
-        self._events: deque[Event] = deque()
-        self._overflowed = 0
+        self._events: EventQueue[Event] = EventQueue(capacity)
         self._openings = 0
         self._port = ""
         self._problem = f"{address} is not there"
-        # Guards the session and all of the above; `_arrived` wakes who waits for events.
-        self._arrived = threading.Condition()
+        # Guards the session, and what is told of it.
+        self._lock = threading.Lock()
         self._stop = threading.Event()
         self._wake_read, self._wake_write = os.pipe()
         self._thread = threading.Thread(target=self._run, name=f"board at {address}", daemon=True)
@@ -165,28 +163,26 @@ class BoardPort:
 
         Once the port is closed it is None at once: events that were still waiting are void.
         """
-        with self._arrived:
-            self._arrived.wait_for(lambda: self._events or self._stop.is_set(), timeout_s)
-            return self._events.popleft() if self._events and not self._stop.is_set() else None
+        return self._events.get(timeout_s)
 
     def set_mode(self, mode: Mode) -> None:
         """See `BoardSession.set_mode`."""
-        with self._arrived:
+        with self._lock:
             self._session.set_mode(mode)
 
     def set_radio(self, settings: RadioSettings) -> None:
         """See `BoardSession.set_radio`."""
-        with self._arrived:
+        with self._lock:
             self._session.set_radio(settings)
 
     def set_offsets(self, offsets: Offsets) -> None:
         """See `BoardSession.set_offsets`."""
-        with self._arrived:
+        with self._lock:
             self._session.set_offsets(offsets)
 
     def report(self) -> PortReport:
         """How things stand."""
-        with self._arrived:
+        with self._lock:
             session = self._session
             decoder, counts = session.decoder_counts, session.counts
             return PortReport(
@@ -211,7 +207,7 @@ class BoardPort:
                     "wrong_offsets": counts.wrong_offsets,
                     "unasked": counts.unasked,
                     "unsent": counts.unsent,
-                    "overflowed": self._overflowed,
+                    "overflowed": self._events.overflowed,
                     "connections": counts.connections,
                     "openings": self._openings,
                 },
@@ -220,7 +216,7 @@ class BoardPort:
     @property
     def problem(self) -> str:
         """As `report` has it."""
-        with self._arrived:
+        with self._lock:
             return self._problem_now()
 
     @property
@@ -230,11 +226,11 @@ class BoardPort:
 
     def close(self) -> None:
         """End the thread and close the port; may be called twice, and from any thread."""
-        with self._arrived:
+        with self._lock:
             if self._stop.is_set():
                 return
             self._stop.set()
-            self._arrived.notify_all()
+        self._events.close()
         os.write(self._wake_write, b"\0")
         self._thread.join()
         os.close(self._wake_read)
@@ -247,9 +243,9 @@ class BoardPort:
             port = self._open()
             if port is not None:
                 problem = self._serve(port)
-                with self._arrived:
+                with self._lock:
                     self._port, self._problem = "", problem
-                    self._publish(self._session.closed(time.monotonic_ns()))
+                    self._events.put(self._session.closed(time.monotonic_ns()))
                 port.close()
             if self._session.counts.connections > connections:
                 retry_s = FIRST_RETRY_S
@@ -275,10 +271,10 @@ class BoardPort:
         with contextlib.suppress(OSError, ValueError, NotImplementedError):
             # Bridges hold bytes back for 16 ms otherwise. Other ports do not know the flag.
             port.set_low_latency_mode(True)
-        with self._arrived:
+        with self._lock:
             self._port, self._problem = path, ""
             self._openings += 1
-            self._publish(self._session.opened(time.monotonic_ns()))
+            self._events.put(self._session.opened(time.monotonic_ns()))
         return port
 
     def _serve(self, port: serial.Serial) -> str:
@@ -293,8 +289,8 @@ class BoardPort:
                 if fd in readable and not data:
                     return f"{self._address} was unplugged"
                 now_ns, stamp_ns = time.monotonic_ns(), self._stamp_clock()
-                with self._arrived:
-                    self._publish(self._session.receive(data, now_ns, stamp_ns))
+                with self._lock:
+                    self._events.put(self._session.receive(data, now_ns, stamp_ns))
                     if self._session.silent_ns(now_ns) > REOPEN_AFTER_SILENCE_NS:
                         return f"{self._address} is silent"
                     # While the port takes nothing, requests wait in the session, which bounds them.
@@ -307,15 +303,6 @@ class BoardPort:
             return f"{self._address} was lost: {error.strerror}"
         return "closed"
 
-    def _publish(self, events: list[Event]) -> None:
-        if not events:
-            return
-        self._events.extend(events)
-        while len(self._events) > self._capacity:
-            self._events.popleft()
-            self._overflowed += 1
-        self._arrived.notify_all()
-
     def _problem_now(self) -> str:
         session = self._session
         if self._problem:
@@ -327,5 +314,5 @@ class BoardPort:
         return "" if session.model_matches else "the board holds another model than the expected one"
 
     def _say(self, problem: str) -> None:
-        with self._arrived:
+        with self._lock:
             self._problem = problem

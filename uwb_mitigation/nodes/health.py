@@ -44,7 +44,6 @@ OFFSET = Threshold(
     0.15,
     "the model takes much off ranges that look like line of sight: it holds other boards' offset",
 )
-THRESHOLDS = (OUT_OF_DISTRIBUTION, UNUSABLE, UNCOUNTED, DROPPED, SLOW, SILENT, OFFSET)
 
 MOST_DIRECT = 1000
 FEWEST_DIRECT = 200

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from uwb_mitigation.errors import UwbMitigationError
+from uwb_mitigation.link.event_queue import EventQueue
 from uwb_mitigation.link.layout import RadioState
 from uwb_mitigation.link.radio import Radio, RadioSettings, RadioStatus
 from uwb_mitigation.measurement import RangeMeasurement
@@ -23,6 +23,8 @@ SENSORS_INTERVAL_S = 10.0
 """Between two readings of temperature and voltage, for which the receiver is off: over USB for 20 ms."""
 
 _TURN_S = 0.1
+_CAPACITY = 1024
+"""Events that wait at most; beyond it the oldest are dropped, and counted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +68,6 @@ class RadioPort:
         open_bus: opens the bus; called again after it was lost.
         settings: what the radio is to do.
         stamp_clock: the clock that stamps are on, ns.
-        capacity: events that wait at most; beyond it the oldest are dropped, and counted.
 
     Raises:
         ParameterError: settings that no radio has.
@@ -79,33 +80,28 @@ class RadioPort:
         settings: RadioSettings,
         *,
         stamp_clock: Callable[[], int] = time.time_ns,
-        capacity: int = 1024,
     ) -> None:
         settings.check()
         load()
         self._open_bus = open_bus
         self._stamp_clock = stamp_clock
-        self._capacity = capacity
         self._wanted = settings
         self._changed = False
-        self._events: deque[RadioEvent] = deque()
-        self._overflowed = 0
+        self._events: EventQueue[RadioEvent] = EventQueue(_CAPACITY)
         self._openings = 0
         self._name = ""
         self._problem = "it has not been reached yet"
         self._settings: RadioSettings | None = None
         self._status = RadioStatus(state=RadioState.BUS)
-        # Guards all of the above; wakes who waits for events.
-        self._arrived = threading.Condition()
+        # Guards what is told of the radio, and what is wanted of it.
+        self._lock = threading.Lock()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="radio", daemon=True)
         self._thread.start()
 
     def get(self, timeout_s: float) -> RadioEvent | None:
         """The next event, or None if there is none within the time or the port is closed."""
-        with self._arrived:
-            self._arrived.wait_for(lambda: self._events or self._stop.is_set(), timeout_s)
-            return self._events.popleft() if self._events and not self._stop.is_set() else None
+        return self._events.get(timeout_s)
 
     def set_radio(self, settings: RadioSettings) -> None:
         """Use other settings from the next exchange on; a `Radio` follows.
@@ -114,14 +110,19 @@ class RadioPort:
             ParameterError: settings that no radio has.
         """
         settings.check()
-        with self._arrived:
+        with self._lock:
             self._wanted, self._changed = settings, True
 
     def report(self) -> RadioReport:
         """How things stand."""
-        with self._arrived:
+        with self._lock:
             return RadioReport(
-                self._name, self._problem, self._settings, self._status, self._openings, self._overflowed
+                self._name,
+                self._problem,
+                self._settings,
+                self._status,
+                self._openings,
+                self._events.overflowed,
             )
 
     @property
@@ -131,9 +132,8 @@ class RadioPort:
 
     def close(self) -> None:
         """End the thread and close the bus; may be called twice, and from any thread."""
-        with self._arrived:
-            self._stop.set()
-            self._arrived.notify_all()
+        self._stop.set()
+        self._events.close()
         self._thread.join()
 
     def _run(self) -> None:
@@ -145,7 +145,7 @@ class RadioPort:
                 if radio is None:
                     radio = HostRadio(bus, self._wanted, stamp_clock=self._stamp_clock)
                 radio.use(bus)
-                with self._arrived:
+                with self._lock:
                     self._name = bus.name
                     self._openings += 1
                 self._serve(radio)
@@ -163,7 +163,7 @@ class RadioPort:
         started = False
         status_due = sensors_due = 0.0
         while not self._stop.is_set():
-            with self._arrived:
+            with self._lock:
                 changed, self._changed = self._changed, False
                 wanted = self._wanted
             if changed:
@@ -184,24 +184,15 @@ class RadioPort:
                     radio.read_sensors()
                     status = radio.status()
                 events.append(status)
-            with self._arrived:
+            with self._lock:
                 self._problem = ""
                 self._settings = radio.settings if started else None
                 self._status = status
-                self._publish(events)
+                self._events.put(events)
 
     def _lose(self, text: str) -> None:
-        with self._arrived:
+        with self._lock:
             known = self._problem == text
             self._name, self._problem = "", text
             if not known:
-                self._publish([RadioLost(text)])
-
-    def _publish(self, events: list[RadioEvent]) -> None:
-        if not events:
-            return
-        self._events.extend(events)
-        while len(self._events) > self._capacity:
-            self._events.popleft()
-            self._overflowed += 1
-        self._arrived.notify_all()
+                self._events.put([RadioLost(text)])
