@@ -6,12 +6,17 @@ which each anchor was heard once has no motion to be followed by.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
+from uwb_mitigation.positioning.anchors import AnchorMap
+from uwb_mitigation.positioning.carried import rests_between_jumps
+from uwb_mitigation.positioning.model import Model
+from uwb_mitigation.positioning.start import Height
 from uwb_mitigation.positioning.tracks import Ranges
 
 STILL_M = 0.06
@@ -26,11 +31,17 @@ BIN_S = 1.0
 LEAST_S = 4.0
 """A rest among motion is as long at least; what is shorter a track follows."""
 
+HEARD_AT_ONCE = 3
+"""Between silences so many anchors are heard, or more, else these are no pauses."""
+
 GAP_S = 10.0
 """After a longer silence a tag may be anywhere."""
 
 _SECOND_NS = 1_000_000_000
 _MAD_TO_SD = 1.4826
+
+
+_Carried = Callable[[Ranges, NDArray[np.intp]], list[NDArray[np.intp]] | None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,11 +79,15 @@ class Stretches:
         )
 
 
-def stretches(tags: Sequence[Ranges]) -> Stretches:
-    """Divide what tags recorded into places at rest and stretches of motion."""
+def stretches(tags: Sequence[Ranges], anchors: AnchorMap, height: Height | None, model: Model) -> Stretches:
+    """Divide what tags recorded into places at rest and stretches of motion.
+
+    Args:
+        height: of all tags, where it stays the same.
+    """
     tag, row, of, at_rest = [], [], [], list[bool]()
     for number, ranges in enumerate(tags):
-        part = _one(ranges)
+        part = _one(ranges, partial(rests_between_jumps, anchors=anchors, height=height, model=model))
         for piece, is_still in part:
             tag.append(np.full(len(piece), number))
             row.append(piece)
@@ -90,7 +105,7 @@ def stretches(tags: Sequence[Ranges]) -> Stretches:
     return Stretches(columns, tag_of, row_of, np.concatenate(of), np.array(at_rest))
 
 
-def _one(ranges: Ranges) -> list[tuple[NDArray[np.intp], bool]]:
+def _one(ranges: Ranges, carried: _Carried) -> list[tuple[NDArray[np.intp], bool]]:
     """Rows of each stretch of one tag, and whether it rests."""
     rows = np.arange(len(ranges))
     # However long the silences between: pairs that were recorded one after the other, too.
@@ -98,8 +113,15 @@ def _one(ranges: Ranges) -> list[tuple[NDArray[np.intp], bool]]:
         return [(rows, True)]
     found: list[tuple[NDArray[np.intp], bool]] = []
     edges = np.flatnonzero(np.diff(ranges.stamp_ns) > GAP_S * _SECOND_NS) + 1
-    for part in np.split(rows, edges):
-        found += _parts(ranges, part)
+    parts = np.split(rows, edges)
+    if np.median([len(np.unique(ranges.anchor[part])) for part in parts]) < HEARD_AT_ONCE:
+        # So slow that silences say nothing.
+        at_places = carried(ranges, rows)
+        if at_places is not None:
+            return [(piece, True) for piece in at_places]
+    for part in parts:
+        at_places = None if _is_sparse(ranges, part) or _is_still(ranges, part) else carried(ranges, part)
+        found += _parts(ranges, part) if at_places is None else [(piece, True) for piece in at_places]
     return found
 
 

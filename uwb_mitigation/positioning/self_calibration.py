@@ -143,7 +143,7 @@ def calibrate(
     known = regressors or Regressors.none(sum(map(len, tags)))
     check_anchors(anchors, np.unique(np.concatenate([one.anchor for one in tags])), height)
     told: list[str] = []
-    found = stretches(tags)
+    found = stretches(tags, anchors, height, model)
     begins = np.cumsum([0, *map(len, tags)])
     of_range = begins[found.tag] + found.row
     rows, alike = known.rows[of_range], known.alike[of_range]
