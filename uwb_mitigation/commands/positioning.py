@@ -225,13 +225,7 @@ def area_of(text: str | None) -> Area | None:
     """What --area says."""
     from uwb_mitigation.positioning.start import Area
 
-    if text is None:
-        return None
-    try:
-        x, y, z, x1, y1, z1 = (float(word) for word in text.split(","))
-    except ValueError as error:
-        raise ParameterError(f"area {text!r}", valid="six numbers: X,Y,Z,X,Y,Z") from error
-    return Area((x, y, z), (x1, y1, z1))
+    return Area.parse(text or "")
 
 
 def _show_tracks(tracks: list[TagTracks], anchors: AnchorMap) -> None:

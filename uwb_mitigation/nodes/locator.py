@@ -119,7 +119,7 @@ class Locator(ManagedNode):
             anchors,
             model,
             height=height,
-            area=_area(self.value("area")),
+            area=Area.parse(self.value("area")),
             known=known,
             learn_offsets=self.value("learn_offsets"),
         )
@@ -337,16 +337,6 @@ class Locator(ManagedNode):
         if len(self._fleet.tags) == 1:
             for tag in self._fleet.tags.values():
                 tell(tag)
-
-
-def _area(text: str) -> Area | None:
-    if not text:
-        return None
-    try:
-        x, y, z, x1, y1, z1 = (float(word) for word in text.split(","))
-    except ValueError as error:
-        raise ParameterError(f"parameter area = {text!r}", valid="six numbers: X,Y,Z,X,Y,Z") from error
-    return Area((x, y, z), (x1, y1, z1))
 
 
 def make_nodes(stop: threading.Event) -> list[Node]:

@@ -46,6 +46,21 @@ class Area:
                 f"area from {self.low} to {self.high}", valid="three smaller, then three larger"
             )
 
+    @classmethod
+    def parse(cls, text: str) -> Area | None:
+        """The box that `X,Y,Z,X,Y,Z` says, m; None where it is empty.
+
+        Raises:
+            ParameterError: it says no box.
+        """
+        if not text:
+            return None
+        try:
+            x, y, z, x1, y1, z1 = (float(word) for word in text.split(","))
+        except ValueError as error:
+            raise ParameterError(f"area {text!r}", valid="six numbers: X,Y,Z,X,Y,Z") from error
+        return cls((x, y, z), (x1, y1, z1))
+
     def holds(self, position: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Which of the places float64 (n, 3) lie in it."""
         inside: NDArray[np.bool_] = np.all((position >= self.low) & (position <= self.high), axis=-1)
