@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import re
 import shlex
@@ -112,6 +113,15 @@ def test_a_command_that_is_typed_exists_with_its_options(words: list[str]):
 def test_a_make_target_that_is_typed_exists(words: list[str]):
     targets = re.findall(r"^([a-z-]+):", (REPOSITORY / "Makefile").read_text(), re.M)
     assert [word for word in words if "=" not in word and word not in targets] == []
+
+
+def test_what_python_is_told_to_run_exists():
+    text = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
+    scripts = set(re.findall(r"\bpython3? ([\w/]+/\w+\.py)", text))
+    assert len(scripts) > 5
+    assert [script for script in sorted(scripts) if not (REPOSITORY / script).is_file()] == []
+    modules = set(re.findall(r"\bpython3? -m ([\w.]+)", text))
+    assert [module for module in sorted(modules) if importlib.util.find_spec(module) is None] == []
 
 
 def check_parameters(node: str, values: dict[str, object]) -> None:
