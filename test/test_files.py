@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from uwb_mitigation.errors import ModelError, RecordingError
-from uwb_mitigation.files import partial_of, read_bounded, write_whole
+from uwb_mitigation.files import partial_of, read_bounded, write_together, write_whole
 
 
 def test_a_file_up_to_the_ceiling_is_read_and_no_more(tmp_path: Path) -> None:
@@ -70,6 +70,20 @@ def test_a_disk_that_fills_leaves_what_was_there_and_nothing_beside_it(tmp_path:
         write_whole(path, "new", ModelError)
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_of_files_that_belong_together_all_are_written_or_none(tmp_path: Path, order: int) -> None:
+    path = tmp_path / "file"
+    path.write_text("old")
+    pair = {path: "new", tmp_path / "absent/file": b"new"}
+    with pytest.raises(ModelError, match="cannot be written") as caught:
+        write_together(dict(list(pair.items())[::order]), ModelError)
+    assert caught.value.where == str(tmp_path / "absent/file")
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+    write_together({path: "new", tmp_path / "other": b"new"})
+    assert [one.read_text() for one in (path, tmp_path / "other")] == ["new", "new"]
 
 
 @pytest.mark.parametrize("place", ["absent/file", "link"])

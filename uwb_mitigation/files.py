@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+from collections.abc import Mapping
 from pathlib import Path
 
 from uwb_mitigation.errors import UwbMitigationError
@@ -48,20 +49,34 @@ def write_whole(
     Raises:
         UwbMitigationError: as `error`: the file cannot be written.
     """
-    data = content.encode() if isinstance(content, str) else content
-    partial: Path | None = None
+    write_together({path: content}, error)
+
+
+def write_together(
+    contents: Mapping[Path, str | bytes], error: type[UwbMitigationError] = UwbMitigationError
+) -> None:
+    """Write files that belong together, each as `write_whole` does; none takes its place before all are written.
+
+    Raises:
+        UwbMitigationError: as `error`: one of them cannot be written, and all are as they were.
+    """
+    partials: dict[Path, Path] = {}
+    path = Path()
     try:
-        target = path.resolve()
-        if target.exists() and not target.is_file():
-            target.write_bytes(data)
-            return
-        partial = partial_of(target.with_name(f"{target.name}.{os.getpid()}"))
-        partial.write_bytes(data)
-        partial.replace(target)
+        for path, content in contents.items():
+            data = content.encode() if isinstance(content, str) else content
+            target = path.resolve()
+            if target.exists() and not target.is_file():
+                target.write_bytes(data)
+                continue
+            partials[target] = partial_of(target.with_name(f"{target.name}.{os.getpid()}"))
+            partials[target].write_bytes(data)
+        for path, partial in partials.items():
+            partial.replace(path)
     except (OSError, RuntimeError) as problem:  # a circle of links is a RuntimeError before Python 3.13
         reason = getattr(problem, "strerror", None) or problem
         raise error(f"cannot be written: {reason}", where=str(path)) from problem
     finally:
-        if partial is not None:
+        for partial in partials.values():
             with contextlib.suppress(OSError):
                 partial.unlink(missing_ok=True)

@@ -201,10 +201,19 @@ def save_bundle(path: Path, graph: bytes, card: Card) -> Bundle:
     Raises:
         ModelError: the card does not fit the graph, or the file cannot be written.
     """
-    data = assemble_bundle(graph, card)
-    bundle = parse_bundle(data, path)
+    bundle, data = made_bundle(path, graph, card)
     write_whole(path, data, ModelError)
     return bundle
+
+
+def made_bundle(path: Path, graph: bytes, card: Card) -> tuple[Bundle, bytes]:
+    """A bundle as `save_bundle` returns it, and the bytes that are still to be written to `path`.
+
+    Raises:
+        ModelError: the card does not fit the graph.
+    """
+    data = assemble_bundle(graph, card)
+    return parse_bundle(data, path), data
 
 
 def assemble_bundle(graph: bytes, card: Card) -> bytes:

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.dataset import Dataset
-from uwb_mitigation.errors import DatasetError, ParameterError
+from uwb_mitigation.errors import DatasetError, ModelError
 from uwb_mitigation.evaluation.site_data import SiteData
 from uwb_mitigation.evaluation.site_page import AnchorRow, OffsetRow, SitePage
-from uwb_mitigation.files import write_whole
+from uwb_mitigation.files import write_together
 from uwb_mitigation.model.bundle import Bundle
 from uwb_mitigation.model.float_networks import float_network
 from uwb_mitigation.offsets import MAX_OFFSET_M, Offsets, dump_offsets
@@ -289,13 +289,13 @@ def regressors(site: SiteData, source: Bundle) -> Regressors:
 
 
 def write(output: Path, result: Calibrated, source: Bundle, name: str) -> tuple[Bundle, Path]:
-    """The bundle, and the offsets beside it as `X.offsets.yaml`.
+    """The bundle, and the offsets beside it as `X.offsets.yaml`: both, or neither.
 
     Args:
         name: of the recordings, for people.
 
     Raises:
-        ModelError, ParameterError: they cannot be written.
+        ModelError: they cannot be written.
     """
     how = "without truth" if result.truth is None else f"with truth from {result.truth}"
     mae = result.choice.mae()
@@ -312,13 +312,13 @@ def write(output: Path, result: Calibrated, source: Bundle, name: str) -> tuple[
             row: {"mae": round(value, 4)} for row, value in {"raw": result.raw_mae_m, **mae}.items()
         },
     }
-    bundle = site_model.write(output, result.data, result.choice, source, result.raw_m, told)
+    bundle, data = site_model.bundle_of(output, result.data, result.choice, source, result.raw_m, told)
     beside = offsets_file(output)
     comment = (
         f"Offsets of the radios, m, beside model {bundle.model_id:08x} ({output.name}): use both together.\n"
         f"Found by uwb-mitigation calibrate in {name}, {how}."
     )
-    write_whole(beside, dump_offsets(result.offsets, comment), ParameterError)
+    write_together({output: data, beside: dump_offsets(result.offsets, comment)}, ModelError)
     return bundle, beside
 
 

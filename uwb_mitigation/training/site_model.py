@@ -1,4 +1,4 @@
-"""The model of a site from ranges whose truth a track or a localisation tells: chosen, graded, and written.
+"""The model of a site from ranges whose truth a track or a localisation tells: chosen, and graded.
 
 Candidates stand in order, simple before rich; a richer one must better the simpler by `MUST_GAIN` on stretches of the
 track, and on anchors, that it was not fitted to. Only the last one needs torch, which is imported for it alone.
@@ -21,7 +21,7 @@ from uwb_mitigation.evaluation import lad, splits
 from uwb_mitigation.evaluation.preference import MUST_GAIN, preferred
 from uwb_mitigation.model import graph
 from uwb_mitigation.model.architecture import Architecture
-from uwb_mitigation.model.bundle import Bundle, Card, save_bundle
+from uwb_mitigation.model.bundle import Bundle, Card, made_bundle
 from uwb_mitigation.model.float_networks import float_network, scaled
 from uwb_mitigation.model.prior import LinePrior
 from uwb_mitigation.model.runtime import session_options
@@ -162,15 +162,16 @@ def choose(
     )
 
 
-def write(
+def bundle_of(
     path: Path,
     data: Dataset,
     choice: SiteChoice,
     source: Bundle,
     raw_m: NDArray[np.float64],
     training: Mapping[str, Any],
-) -> Bundle:
-    """Write the chosen model as a float bundle, whose intervals are from the errors on stretches held out.
+) -> tuple[Bundle, bytes]:
+    """The chosen model as a float bundle to be written to `path`, and its bytes; its intervals are from the errors on
+    stretches held out.
 
     Args:
         raw_m: float64 (n,), errors of the ranges as measured.
@@ -193,7 +194,7 @@ def write(
             ),
             familiarity=familiarity,
         )
-    return save_bundle(path, graph.float_model(network), replace(card, needs_cir=not silent))
+    return made_bundle(path, graph.float_model(network), replace(card, needs_cir=not silent))
 
 
 def _candidates(
