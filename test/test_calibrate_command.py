@@ -91,6 +91,8 @@ def test_a_drive_becomes_a_bundle_and_offsets_that_better_other_ranges(site):
     corrected = Mitigation(bundle, offsets).correct(RangeMeasurement(0, 7, 1, 0, 0, 5.4, cir))
     assert corrected.status == 0
     assert corrected.range_m == pytest.approx(5.0, abs=0.12)
+    none = run("quantize", "site.onnx", "--data", "drive.mcap", "-o", "int8.onnx", folder=site)
+    assert (none.returncode, "no network to quantise" in none.stderr) == (1, True)
     page = (site / "r.html").read_text()
     assert "polyline" in page
     assert result["chosen"] in page
@@ -157,7 +159,7 @@ def test_cirs_bring_the_universal_network_in(tmp_path, monkeypatch):
     with BagWriter(tmp_path / "drive.mcap", {"simulated": "true"}) as bag:
         for record in source:
             measured = replace(record.measurement, range_m=record.measurement.range_m + 0.2)
-            bag.write(replace(record, measurement=measured))
+            bag.write(replace(record, measurement=measured, truth=None))
     done = run(
         "calibrate", "drive.mcap", "--anchors", "anchors.yaml", "--height", 0.0, "-o", "site.onnx", "--json", "r.json",
         folder=tmp_path,
@@ -168,3 +170,7 @@ def test_cirs_bring_the_universal_network_in(tmp_path, monkeypatch):
     assert result["chosen"].startswith("offsets + universal network")
     assert result["calibrated_mae_m"] < 0.7 * result["raw_mae_m"]
     assert load_bundle(tmp_path / "site.onnx").card.needs_cir
+    # The drive alone, without true ranges, does for int8, too.
+    done = run("quantize", "site.onnx", "--data", "drive.mcap", "-o", "int8.onnx", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert load_bundle(tmp_path / "int8.onnx").quantised

@@ -140,8 +140,13 @@ def train(
 
 
 def quantize(
-    model: Annotated[Path, typer.Argument(metavar="MODEL_FLOAT", help="Float bundle, of `train`.")],
-    data: DataOption,
+    model: Annotated[
+        Path, typer.Argument(metavar="MODEL_FLOAT", help="Float bundle, of `train` or `calibrate`.")
+    ],
+    data: Annotated[
+        Path,
+        typer.Option(help="Recording with CIRs, with true ranges or without: what the bundle was made of."),
+    ],
     output: OutputOption,
     percentile: Annotated[
         float, typer.Option(help="Of each activation, what 255 stands for; 100 = the largest seen.")
@@ -150,15 +155,17 @@ def quantize(
 ) -> None:
     """Quantise a float bundle to int8.
 
-    The scales of its activations come from the data it was trained on.
+    The scales of its activations come from the data it was trained on, or calibrated with.
     """
     from uwb_mitigation.model.bundle import load_bundle
-    from uwb_mitigation.training import quantization
+    from uwb_mitigation.training import parts, quantization
 
     source = load_bundle(model)
     quantization.check(source, percentile)
     check_output(output)
-    _, dataset = _dataset(data, source.preprocessing)
+    with console.reading() as on_record:
+        dataset = parts.load_inputs(data, source.preprocessing, on_record)
+    console.show_refused(dataset.refused)
     made = quantization.quantize_bundle(source, dataset, percentile, output)
     bundle, difference = made.bundle, made.difference_m
     model_tables.show_bundle(bundle)

@@ -12,6 +12,7 @@ from uwb_mitigation import dataset as datasets
 from uwb_mitigation.dataset import Dataset
 from uwb_mitigation.errors import DatasetError, ParameterError
 from uwb_mitigation.evaluation import splits
+from uwb_mitigation.measurement import Record, Truth
 from uwb_mitigation.preprocessing import CirFault, Preprocessing, Scaling
 from uwb_mitigation.sources import opening
 from uwb_mitigation.sources.truth_table import load_truth, with_truth
@@ -61,6 +62,29 @@ def load(
         name = path.resolve().name
         is_said = "simulated" in name or not source.simulated
     return (name if is_said else f"{name} (simulated)"), dataset
+
+
+def load_inputs(
+    path: Path, preprocessing: Preprocessing, on_record: Callable[[], None] = lambda: None
+) -> Dataset:
+    """A recording's measurements, with true ranges or without: their errors say nothing.
+
+    Without a truth, and so without a name for it, a minute of a pair is a configuration.
+
+    Raises:
+        RecordingError, DatasetError: it cannot be read, or holds no CIR that can be used.
+    """
+    with opening.open_recording(path) as source:
+        return datasets.build_dataset(map(_named, source), preprocessing, on_record)
+
+
+def _named(record: Record) -> Record:
+    if record.truth is not None:
+        return record
+    measured = record.measurement
+    minute = measured.stamp_ns // 60_000_000_000
+    name = f"tag {measured.tag_id}/anchor {measured.anchor_id}/minute {minute}"
+    return replace(record, truth=Truth(measured.range_m, configuration=name))
 
 
 def divided(name: str, dataset: Dataset, split: str) -> Parts:

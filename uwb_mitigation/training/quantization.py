@@ -93,6 +93,10 @@ def check(source: Bundle, percentile: float) -> None:
     """Refuse what `quantize_bundle` does; before data is read for it."""
     if source.quantised:
         raise ModelError("already quantised", where=str(source.path), valid="the float bundle it was made of")
+    if not source.card.needs_cir:
+        raise ModelError(
+            "there is no network to quantise", where=str(source.path), valid="the bundle as it is"
+        )
     if not 90 <= percentile <= 100:
         raise ParameterError(f"percentile = {percentile}", valid="90 to 100")
 
