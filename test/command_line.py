@@ -57,7 +57,7 @@ def start(*arguments: object, folder: Path) -> Finished:
         env=ENVIRONMENT,
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=240,
         check=False,
     )
     return Finished(done.returncode, done.stdout, done.stderr)

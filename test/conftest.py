@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 from browser import Browser, chromium
+from hypothesis import HealthCheck, settings
 from real_logs import Reading, read_once
 
 from uwb_mitigation.dw1000_model.air import Air
@@ -23,6 +24,12 @@ if TYPE_CHECKING:
 
 # A suite that a script starts in the background ignores SIGINT, and so would all that tests start and interrupt.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# The same examples every time, however slow the computer is.
+settings.register_profile(
+    "suite", deadline=None, derandomize=True, database=None, suppress_health_check=[HealthCheck.too_slow]
+)
+settings.load_profile("suite")
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 

@@ -88,7 +88,7 @@ class Player:
 
     def play(self) -> Player:
         self.playback.start()
-        assert self.ended.wait(60)
+        assert self.ended.wait(240)
         self.playback.stop()
         return self
 

@@ -27,7 +27,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from uwb_mitigation_msgs.msg import RangeCir
 
-TIMEOUT_S = 90.0
+TIMEOUT_S = 240.0
 
 # For this process and for all that it starts; read when messages are loaded and when a context is made.
 os.environ |= {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_PYTHON_CHECK_FIELDS": "1"}

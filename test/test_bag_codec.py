@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from bag_material import record, same
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from uwb_mitigation.bag import codec, schemas
@@ -30,9 +30,6 @@ from uwb_mitigation.measurement import (
 )
 
 TYPES = (RANGE_CIR_TYPE, RANGE_TRUTH_TYPE, RANGE_CORRECTED_TYPE)
-
-# The machine may be busy, and a failure must come again.
-examples = settings(deadline=None, derandomize=True)
 
 float32 = st.floats(width=32)
 uint64 = st.integers(0, 2**64 - 1)
@@ -77,13 +74,11 @@ corrections = st.builds(
 )
 
 
-@examples
 @given(measurements)
 def test_a_measurement_survives_its_message(measurement: RangeMeasurement) -> None:
     assert same(codec.decode_range(codec.encode_range(measurement)), measurement)
 
 
-@examples
 @given(measurements, truths)
 def test_truth_survives_its_message(measurement: RangeMeasurement, truth: Truth) -> None:
     key, decoded = codec.decode_truth(codec.encode_truth(measurement, truth))
@@ -91,7 +86,6 @@ def test_truth_survives_its_message(measurement: RangeMeasurement, truth: Truth)
     assert repr(decoded) == repr(truth)
 
 
-@examples
 @given(measurements, corrections)
 def test_a_corrected_range_survives_its_message(
     measurement: RangeMeasurement, correction: CorrectedRange
@@ -101,7 +95,6 @@ def test_a_corrected_range_survives_its_message(
     assert repr(decoded) == repr(correction)
 
 
-@examples
 @given(measurements, truths, corrections)
 def test_messages_equal_those_of_the_rosbags_library(
     measurement: RangeMeasurement, truth: Truth, correction: CorrectedRange
@@ -117,7 +110,6 @@ def test_messages_equal_those_of_the_rosbags_library(
         assert bytes(theirs) == data
 
 
-@examples
 @given(measurements, st.data())
 def test_a_message_cut_anywhere_is_refused(measurement: RangeMeasurement, data: st.DataObject) -> None:
     whole = codec.encode_range(measurement)
@@ -127,7 +119,6 @@ def test_a_message_cut_anywhere_is_refused(measurement: RangeMeasurement, data: 
 
 
 @pytest.mark.parametrize("decode", [codec.decode_range, codec.decode_truth, codec.decode_corrected])
-@examples
 @given(noise=st.binary(max_size=200), start=st.sampled_from([b"", b"\0\1\0\0"]))
 def test_arbitrary_bytes_decode_or_are_refused(
     decode: Callable[[bytes], object], noise: bytes, start: bytes

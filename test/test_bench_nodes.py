@@ -113,7 +113,7 @@ def test_a_soak_tells_what_the_processes_took(own_domain: None, tmp_path: Path):
     result = tmp_path / "soak.json"
     command = [sys.executable, "-m", "uwb_mitigation.cli", "bench", "soak", "--one-process"]
     command += ["--messages", "1500", "--rate", "1000", "--json", str(result)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=240, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     outcome = json.loads(result.read_text())
     assert outcome["received"] >= 1500
@@ -131,7 +131,7 @@ def test_without_ros_the_bench_says_what_is_missing(tmp_path: Path):
         env={"PYTHONPATH": f"{tmp_path}:{Path(__file__).parent.parent}", "COLUMNS": "160"},
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=240,
         check=False,
     )
     assert done.returncode == 1

@@ -68,7 +68,7 @@ def test_rows_picks_from_every_array():
     assert len(part) == 2
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     names=st.lists(st.sampled_from("abcdefgh"), min_size=4, max_size=80),
     folds=st.integers(2, 8),

@@ -407,7 +407,7 @@ def test_a_log_without_truth_is_counted(write):
 int16 = st.integers(-32768, 32767)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(st.lists(st.tuples(int16, int16), min_size=1, max_size=40), st.sampled_from(["\n", "\r\n"]))
 def test_bulk_parsing_equals_int(pairs, end):
     text = "".join(f"{re}, {im}{end}" for re, im in pairs).encode()
@@ -417,7 +417,7 @@ def test_bulk_parsing_equals_int(pairs, end):
     assert parsed[1] == len(text)
 
 
-@settings(deadline=None, max_examples=300)
+@settings(max_examples=300)
 @given(
     st.lists(
         st.sampled_from([b"1", b"-", b",", b" ", b"\n", b"\r", b", ", b"\r\n", b"x", b"99999"]), max_size=24

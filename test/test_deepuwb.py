@@ -244,7 +244,7 @@ def test_the_command_line_imports_it_into_a_bag(tmp_path: Path) -> None:
         capture_output=True,
         text=True,
         check=False,
-        timeout=120,
+        timeout=240,
     )
     assert done.returncode == 0, done.stderr
     assert BagReader(tmp_path / "deepuwb.mcap").message_count == 24

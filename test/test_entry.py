@@ -35,7 +35,7 @@ def run(executable: str, *words: str, path: Path | None = None) -> subprocess.Po
 def test_help_tells_every_parameter_where_there_is_no_ros(node: str, tmp_path: Path):
     (tmp_path / "rclpy.py").write_text("raise ModuleNotFoundError('no rclpy here', name='rclpy')\n")
     process = run(node, "--help", path=tmp_path)
-    told, _ = process.communicate(timeout=60)
+    told, _ = process.communicate(timeout=240)
     assert process.returncode == 0, told
     assert f"    {node}" in told
     assert all(f"\n  {row.name}:=" in told for row in USAGES[node].parameters)
@@ -61,7 +61,7 @@ def test_a_signal_while_an_executable_still_loads_ends_it_at_once(
     process = run(executable, path=tmp_path)
     assert process.stdout.readline() == "loading\n"
     process.send_signal(number)
-    told, _ = process.communicate(timeout=60)
+    told, _ = process.communicate(timeout=240)
     assert (process.returncode, told) == (128 + number, "")
 
 
@@ -71,5 +71,5 @@ def test_a_signal_while_a_node_loads_beside_the_graph_ends_it_at_once(tmp_path: 
     process = run("driver", path=tmp_path)
     assert process.stdout.readline() == "loading\n"
     process.send_signal(signal.SIGINT)
-    told, _ = process.communicate(timeout=60)
+    told, _ = process.communicate(timeout=240)
     assert (process.returncode, told) == (130, "")

@@ -55,7 +55,7 @@ def test_a_pipe_is_written_to_and_stays(tmp_path: Path) -> None:
     reader = threading.Thread(target=lambda: read.append(pipe.read_text()))
     reader.start()
     write_whole(pipe, "new")
-    reader.join(60)
+    reader.join(240)
     assert read == ["new"]
     assert pipe.is_fifo()
 

@@ -180,7 +180,7 @@ def test_a_burst_into_the_boards_port_is_answered_whole(tmp_path: Path):
     with EmulatedFirmware(bundle) as board:
         port = os.open(board.port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
         # The emulated UART takes a byte when the board has read the one before: a pseudo-terminal's buffer fills.
-        deadline = time.monotonic() + 60
+        deadline = time.monotonic() + 240
         while len(answers) < 50 and time.monotonic() < deadline:
             readable, writable, _ = select.select([port], [port] if waiting else [], [], 0.1)
             waiting = waiting[os.write(port, waiting) :] if writable else waiting

@@ -49,7 +49,7 @@ def test_the_sketch_corrects_what_the_radio_sends_in_writes_that_are_safe_on_usb
     encoder = FrameEncoder()
     wires = [encoder.encode(*messages.encode(r.measurement)) for r in SimulatedSource(seed=2, count=25)]
     done = subprocess.run(
-        [program], input=b"".join(wires)[:60_000], capture_output=True, timeout=60, check=False
+        [program], input=b"".join(wires)[:60_000], capture_output=True, timeout=240, check=False
     )
     assert done.returncode == 0
 
@@ -103,7 +103,7 @@ def test_the_sketch_with_a_radio_ranges_on_a_modelled_chip(tmp_path: Path, with_
     program = tmp_path / "sketch"
     run(["c++", *flags, *includes, *files, "-lm", "-lpthread", "-o", str(program)])
 
-    done = subprocess.run([program, "0.5"], capture_output=True, timeout=120, check=False)
+    done = subprocess.run([program, "0.5"], capture_output=True, timeout=240, check=False)
 
     assert done.returncode == 0
     decoder = FrameDecoder()

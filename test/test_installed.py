@@ -225,7 +225,7 @@ def test_a_node_needs_little_to_run(tmp_path: Path, name: str, needed: set[str],
 )
 def test_what_an_executable_misses_is_one_line(tmp_path: Path, name: str, absent: str, told: str):
     command = without([absent], name)
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=60)
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=240)
     assert done.returncode == 1
     (line,) = done.stderr.splitlines()
     assert line.startswith(told)

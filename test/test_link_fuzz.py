@@ -20,7 +20,7 @@ _spec.loader.exec_module(link_targets)
 def test_no_bytes_make_the_target_fail(name):
     target = link_targets.TARGETS[name]
 
-    @settings(max_examples=300, derandomize=True, deadline=None)
+    @settings(max_examples=300)
     @given(st.binary(max_size=400))
     def run(data: bytes) -> None:
         target(data)

@@ -22,7 +22,7 @@ from uwb_mitigation.link.messages import Correction
 from uwb_mitigation.link.port import BoardPort, PortAddress
 from uwb_mitigation.measurement import Cir, CorrectedRange, Origin, RangeMeasurement, Record, Status
 
-PATIENCE_S = 60
+PATIENCE_S = 240
 """How long a test waits for what must come; nothing is asserted about how soon it does."""
 
 IDENTITY = Identity(board_id=0xB0, model_id=0xCAFE, window=157)

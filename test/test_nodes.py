@@ -313,7 +313,7 @@ def test_nodes_of_a_namespace_keep_to_themselves(ros: Ros):
 def run_demo(*arguments: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "uwb_mitigation.entry", "demo", *arguments]
     environment = {k: v for k, v in os.environ.items() if k != "ROS_DOMAIN_ID"}
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment, check=False)
+    return subprocess.run(command, capture_output=True, text=True, timeout=240, env=environment, check=False)
 
 
 def test_the_demo_replays_a_log_and_sums_it_up(apartment: Path):

@@ -66,7 +66,7 @@ def test_the_filter_agrees_with_filterpy():
         np.testing.assert_allclose(mine.p, theirs.P, atol=1e-8)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     steps=st.lists(
         st.tuples(st.floats(0, 2), st.integers(0, 4), st.floats(0, 60), st.floats(1e-4, 10)),

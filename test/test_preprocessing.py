@@ -51,7 +51,7 @@ def fault(cir: Cir, samples: int = 157, scaling: Scaling = Scaling.PREAMBLE):
 
 @pytest.mark.parametrize("scaling", list(Scaling))
 @pytest.mark.parametrize("encoding", list(Encoding))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(data=st.data())
 def test_inputs_are_the_contract_to_the_bit(scaling, encoding, data):
     seed = data.draw(st.integers(0, 2**32 - 1))

@@ -14,7 +14,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
-TIMEOUT_S = 60.0
+TIMEOUT_S = 240.0
 RUNS = {
     "bench": ["-c", "from uwb_mitigation.entry import command_line; command_line()", "bench", "nodes"],
     "demo": ["-m", "uwb_mitigation.entry", "demo"],

@@ -29,7 +29,7 @@ pytestmark = pytest.mark.skipif(bool(toolchain.missing_tools()), reason=toolchai
 SPI_SLOW, SPI_FAST, DELAY, WAIT, RESET = range(5)
 KINDS = {SPI_SLOW: 0, SPI_FAST: 0, DELAY: 1, WAIT: 2, RESET: 3}
 SECONDS = 0.1
-PATIENCE_S = 120
+PATIENCE_S = 240
 
 
 class Bridge:

@@ -85,12 +85,12 @@ class Terminals:
         if shell is not None:
             assert shell.poll() is None, f"{name} has ended by itself\n{self._printed()}"
             os.killpg(shell.pid, signal.SIGINT)
-            shell.wait(60.0)
+            shell.wait(240)
 
     def close(self) -> None:
         for shell in self._open.values():
             os.killpg(shell.pid, signal.SIGKILL)
-            shell.wait(60.0)
+            shell.wait(240)
 
     def _printed(self) -> str:
         return "\n".join(f"--- {log.name}\n{log.read_text()[-3000:]}" for log in self.folder.glob("*.log"))

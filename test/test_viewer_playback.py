@@ -235,4 +235,4 @@ def test_the_page_has_a_slider_and_plays(browser: Browser, page: tuple[subproces
     browser.resize(400, 2000)
     assert browser.run("return document.documentElement.scrollWidth") <= 400
     running.send_signal(signal.SIGINT)
-    assert running.wait(60) == 130
+    assert running.wait(240) == 130

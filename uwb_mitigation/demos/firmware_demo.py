@@ -32,7 +32,7 @@ from uwb_mitigation.sources.opening import open_recording
 from uwb_mitigation.sources.simulated import SimulatedSource
 
 READY_TIMEOUT_S = 60.0
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 """Without a corrected range for so long, the rest counts as lost."""
 
 

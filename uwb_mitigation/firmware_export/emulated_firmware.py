@@ -26,7 +26,7 @@ from uwb_mitigation.measurement import Encoding, RangeMeasurement
 from uwb_mitigation.model.bundle import Bundle
 from uwb_mitigation.preprocessing import WINDOW_LEAD
 
-_START_TIMEOUT_S = 20.0
+_START_TIMEOUT_S = 60.0
 _PORT = re.compile(rb"char device redirected to (\S+)")
 
 

@@ -13,7 +13,7 @@ import sys
 import threading
 from typing import NoReturn
 
-_PATIENCE_S = 10.0
+_PATIENCE_S = 30.0
 
 
 def isolate() -> None:
