@@ -12,9 +12,9 @@ from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
 from uwb_mitigation.positioning.localised import PosePath, solve_localised
 from uwb_mitigation.positioning.model import Model
-from uwb_mitigation.positioning.regressors import Regressors
+from uwb_mitigation.positioning.regressors import SLOPE_SD, Regressors
 from uwb_mitigation.positioning.rests import stretches
-from uwb_mitigation.positioning.self_calibration import SLOPE_SD, calibrate
+from uwb_mitigation.positioning.self_calibration import calibrate
 from uwb_mitigation.positioning.start import Height
 from uwb_mitigation.positioning.tracks import Ranges
 

@@ -7,6 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+NETWORK_SD = 0.03
+"""How far the universal network's predictions may be from what the site's errors are, as a factor around 1. Little: a
+predictor that errs itself draws a free factor below 1, and what it then leaves goes into the offsets."""
+
+SLOPE_SD = 0.1
+"""m/dB."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Regressors:

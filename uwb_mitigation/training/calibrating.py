@@ -20,10 +20,8 @@ from uwb_mitigation.model.bundle import Bundle
 from uwb_mitigation.model.float_networks import float_network
 from uwb_mitigation.offsets import MAX_OFFSET_M, Offsets, dump_offsets
 from uwb_mitigation.positioning.localised import Localised, PosePath, solve_localised
-from uwb_mitigation.positioning.regressors import Regressors
+from uwb_mitigation.positioning.regressors import NETWORK_SD, SLOPE_SD, Regressors
 from uwb_mitigation.positioning.self_calibration import (
-    NETWORK_SD,
-    SLOPE_SD,
     SelfCalibration,
     calibrate,
 )
