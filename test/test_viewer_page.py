@@ -55,6 +55,14 @@ def fill(view: View, upto_s: float = 5.0) -> None:
             scene.add_pose("tag", Pose(time_s, 4 + math.sin(step / 20), 3, 1, (0.4, 0.2, 0.3)))
 
 
+IN_TABLE = (
+    "const table = Bokeh.index.find_one(Bokeh.documents[0].get_model_by_name('pairs')).shadow_el;"
+    "const view = table.querySelector('.slick-viewport-top.slick-viewport-left');"
+    "const cells = [...table.querySelectorAll('.slick-column-name, .slick-cell')];"
+)
+"""For a script: the table's own box, and its cells and headers."""
+
+
 def data(browser: Browser, model: str, column: str) -> list[object]:
     """A column of the source behind a named table or figure."""
     return browser.run(
@@ -94,7 +102,6 @@ def test_it_shows_what_the_scene_holds(browser: Browser, view: View, server: Vie
     summary = browser.run("return Bokeh.documents[0].get_model_by_name('summary').text")
     assert "mean absolute error 0.350 m raw, 0.250 m corrected" in summary
     assert browser.complaints() == []
-    browser.screenshot("viewer_1280")
 
 
 def test_it_follows_the_scene(browser: Browser, view: View, server: ViewerServer) -> None:
@@ -103,6 +110,7 @@ def test_it_follows_the_scene(browser: Browser, view: View, server: ViewerServer
     with view.lock:
         view.scene.add_sample((1, 7), Sample(1010.0, 9.9, 9.5, 0.1, Status.OK))
     browser.wait("the new range", lambda: data(browser, "pairs", "range")[0] == pytest.approx(9.5))
+    browser.wait("it in the table", lambda: browser.cell("9.500"))
 
 
 def test_a_paused_page_stands_still_and_goes_on(browser: Browser, view: View, server: ViewerServer) -> None:
@@ -136,6 +144,23 @@ def test_a_click_shows_another_pair(browser: Browser, view: View, server: Viewer
     browser.wait("the table", lambda: browser.cell("OUT_OF_DISTRIBUTION")).click()
     browser.wait("the other CIR", lambda: max(data(browser, "cir", "magnitude")) == 2000.0)
     assert browser.complaints() == []
+
+
+def test_a_row_that_is_drawn_anew_within_a_click_is_chosen(
+    browser: Browser, view: View, server: ViewerServer
+) -> None:
+    from selenium.webdriver.common.action_chains import ActionChains
+
+    fill(view)
+    opened(browser, server)
+    row = browser.wait("the table", lambda: browser.cell("OUT_OF_DISTRIBUTION"))
+    ActionChains(browser.driver).click_and_hold(row).perform()
+    with view.lock:
+        view.scene.add_sample((2, 7), Sample(1005.0, 9.9, 9.5, 0.1, Status.OUT_OF_DISTRIBUTION))
+    browser.wait("the new range", lambda: data(browser, "pairs", "range")[1] == pytest.approx(9.5))
+    ActionChains(browser.driver).release().perform()
+    browser.wait("the other CIR", lambda: max(data(browser, "cir", "magnitude")) == 2000.0)
+    browser.wait("it in the table", lambda: browser.cell("9.500"))
 
 
 def test_a_click_on_an_anchor_shows_its_pair(browser: Browser, view: View, server: ViewerServer) -> None:
@@ -183,11 +208,36 @@ def test_nothing_from_a_message_is_run(browser: Browser, view: View, server: Vie
     assert browser.run("return window.pwned ?? null") is None
 
 
-def test_nothing_is_cut_off_on_a_narrow_screen(browser: Browser, view: View, server: ViewerServer) -> None:
+@pytest.mark.parametrize("width", [1280, 1024, 400])
+def test_nothing_is_cut_off_on_a_narrow_screen(
+    browser: Browser, view: View, server: ViewerServer, width: int
+) -> None:
     fill(view)
-    opened(browser, server, 400, 2000)
-    assert browser.run("return document.documentElement.scrollWidth") <= 400
-    browser.screenshot("viewer_400")
+    with view.lock:
+        view.scene.add_sample(
+            (0xDECA010203040506, 0xDECA0102030407F8), Sample(1005.0, -9.9, 123.456, 12.345, Status.OK)
+        )
+    opened(browser, server, width, 2000)
+    browser.wait("the table", lambda: browser.run(f"{IN_TABLE} return cells.length") > 9)
+    assert browser.run("return document.documentElement.scrollWidth") <= width
+    assert browser.run(IN_TABLE + "return view.scrollWidth - view.clientWidth") == 0
+    cut = "return cells.filter((e) => e.scrollWidth > e.clientWidth).map((e) => e.textContent)"
+    assert browser.run(IN_TABLE + cut) == []
+    browser.screenshot(f"viewer_{width}")
+
+
+def test_a_table_stays_where_it_was_scrolled_to(browser: Browser, view: View, server: ViewerServer) -> None:
+    with view.lock:
+        for anchor in range(100):
+            view.scene.add_sample((anchor, 7), Sample(1000.0, 5.3, 5.1, 0.1, Status.OK))
+    opened(browser, server)
+    browser.wait("the table", lambda: browser.cell("1"))
+    browser.run(IN_TABLE + "view.scrollTop = 1500")
+    browser.wait("its end", lambda: browser.cell("70"))
+    with view.lock:
+        view.scene.add_sample((70, 7), Sample(1010.0, 9.9, 9.5, 0.1, Status.OK))
+    browser.wait("the new range", lambda: browser.cell("9.500"))
+    assert browser.run(IN_TABLE + "return view.scrollTop") == 1500
 
 
 def test_a_screenshot_is_an_image(browser: Browser, view: View, server: ViewerServer) -> None:
@@ -223,6 +273,16 @@ def test_ten_pages_at_once(browser: Browser, view: View, server: ViewerServer) -
         browser.wait("the new range", lambda: data(browser, "pairs", "range")[0] == pytest.approx(9.5))
         browser.wait("it to reach the others", lambda: all(others.received))
     browser.wait("the closed ones to be forgotten", lambda: view.drawing.pages == 1)
+
+
+def test_a_page_that_is_left_is_forgotten(browser: Browser, view: View, server: ViewerServer) -> None:
+    fill(view)
+    opened(browser, server)
+    assert view.drawing.pages == 1
+    browser.open("about:blank")
+    browser.wait("it to be forgotten", lambda: view.drawing.pages == 0)
+    browser.driver.back()
+    browser.wait("it to be there again", lambda: view.drawing.pages == 1 and browser.ready())
 
 
 def test_many_pages_are_drawn_less_often() -> None:

@@ -7,11 +7,15 @@ from typing import Any
 import numpy as np
 from bokeh.models import (
     Button,
+    CellFormatter,
+    ColorBar,
     ColumnDataSource,
     CustomJS,
     DataTable,
     Div,
+    FixedTicker,
     HTMLTemplateFormatter,
+    LinearColorMapper,
     NumberFormatter,
     Range1d,
     Slider,
@@ -32,11 +36,17 @@ _MARK, _WINDOW = "#b91c1c", "#fde68a"
 
 _BAR = (
     '<div style="position:relative;text-align:right"><div style="position:absolute;left:0;top:3px;bottom:3px;'
-    'background:#bfdbfe;width:<%= Math.min(100, Math.abs(value) * 50) %>%"></div>'
-    '<span style="position:relative"><%= value.toFixed(3) %></span></div>'
+    'background:#bfdbfe;width:<%= Math.min(100, Math.abs(value) * 50) || 0 %>%"></div>'
+    "<span style=\"position:relative\"><%= isNaN(value) ? '-' : value.toFixed(3) %></span></div>"
 )
-_COLOURED = '<span style="color:<%= colour %>;font-weight:600"><%- value %></span>'
+_COLOURED = (
+    '<span style="color:<%= colour %>;font-size:11px;font-weight:600;white-space:normal"><%- value %></span>'
+)
+_BROKEN = _COLOURED.replace("<%- value %>", '<%= value.replaceAll("_", "_<wbr>") %>')
 """Only numbers and names of ours reach these."""
+
+STACKED = "stacked"
+"""Name of the columns for a narrow box: the page shows these or the others."""
 
 
 class Models:
@@ -145,9 +155,18 @@ class Models:
         plot = _figure(title, 220, "samples (1 ns) from the first path", "exchanges ago")
         plot.x_range = Range1d(-TRACE_BEFORE, TRACE_AFTER)
         plot.y_range = Range1d(WATERFALL, 0)
+        levels = LinearColorMapper("Viridis256", low=0, high=255)
         plot.image(
             "image", x=-TRACE_BEFORE, y=WATERFALL, dw=TRACE_BEFORE + TRACE_AFTER, dh=WATERFALL,
-            source=self.waterfall, palette="Viridis256", origin="top_left", anchor="top_left",
+            source=self.waterfall, color_mapper=levels, origin="top_left", anchor="top_left",
+        )  # fmt: skip
+        scale = {0: "-40", 127.5: "-20", 255: "0"}
+        plot.add_layout(
+            ColorBar(
+                color_mapper=levels, ticker=FixedTicker(ticks=list(scale)), major_label_overrides=scale,
+                title="dB of peak", width=8, padding=4, major_tick_line_color=None,
+            ),
+            "right",
         )  # fmt: skip
         return plot
 
@@ -175,16 +194,39 @@ class Models:
         def metres() -> NumberFormatter:
             return NumberFormatter(format="0.000", nan_format="-", text_align="right")
 
-        return _table(
-            self.pairs,
-            ("anchor", "anchor", StringFormatter(), 56),
-            ("tag", "tag", StringFormatter(), 56),
-            ("rate", "Hz", NumberFormatter(format="0.0", nan_format="-"), 46),
-            ("raw", "raw, m", metres(), 62),
-            ("range", "corrected, m", metres(), 100),
-            ("sigma", "sigma, m", metres(), 78),
-            ("correction", "correction, m", HTMLTemplateFormatter(template=_BAR), 110),
-            ("status", "status", HTMLTemplateFormatter(template=_COLOURED), 170),
+        return DataTable(
+            source=self.pairs,
+            columns=[
+                _column("anchor", "anchor", 54, StringFormatter()),
+                _column("tag", "tag", 54, StringFormatter()),
+                _column("rate", "Hz", 46, NumberFormatter(format="0.0", nan_format="-")),
+                _column("raw", "raw", 54, metres()),
+                _column("range", "corrected", 66, metres()),
+                _column("sigma", "sigma", 50, metres()),
+                _column("correction", "correction", 76, HTMLTemplateFormatter(template=_BAR)),
+                _column("status", "status", 166, HTMLTemplateFormatter(template=_COLOURED)),
+                # The same for a narrow box.
+                _stacked(
+                    "anchor", "pair", 70, "<b><%= value %></b>", "tag <%= tag %>", f"{_digits('rate', 1)} Hz"
+                ),
+                _stacked("range", "corrected, raw", 98, f"<b>{_digits('value', 3)}</b>", _digits("raw", 3)),
+                _stacked("correction", "correction, \u03c3", 90, _BAR, _digits("sigma", 3)),
+                _stacked(
+                    "status",
+                    "status",
+                    98,
+                    f'<div style="text-align:left">{_BROKEN}</div>',
+                ),
+            ],
+            index_position=None,
+            sortable=False,
+            reorderable=False,
+            editable=False,
+            # Ten times a second it would scroll back from where somebody reads.
+            scroll_to_selection=False,
+            height=290,
+            sizing_mode="stretch_width",
+            autosize_mode="force_fit",
         )
 
 
@@ -208,21 +250,23 @@ def _slider(seconds: float) -> Slider:
     )
 
 
-def _table(source: ColumnDataSource, *columns: tuple[str, str, Any, int]) -> DataTable:
-    return DataTable(
-        source=source,
-        columns=[
-            TableColumn(field=name, title=title, formatter=formatter, width=width)
-            for name, title, formatter, width in columns
-        ],
-        index_position=None,
-        sortable=False,
-        reorderable=False,
-        editable=False,
-        height=290,
-        sizing_mode="stretch_width",
-        autosize_mode="force_fit",
+def _column(
+    field: str, title: str, width: int, formatter: CellFormatter, name: str | None = None
+) -> TableColumn:
+    return TableColumn(
+        field=field, title=title, width=width, formatter=formatter, name=name, visible=name is None
     )
+
+
+def _stacked(field: str, title: str, width: int, *lines: str) -> TableColumn:
+    template = '<div style="line-height:16px;text-align:right">' + "".join(
+        f"<div>{line}</div>" for line in lines
+    )
+    return _column(field, title, width, HTMLTemplateFormatter(template=template + "</div>"), STACKED)
+
+
+def _digits(value: str, digits: int) -> str:
+    return f"<%= isNaN({value}) ? '-' : {value}.toFixed({digits}) %>"
 
 
 def _figure(title: str, height: int, x: str, y: str, **options: Any) -> figure:
@@ -237,8 +281,10 @@ def _figure(title: str, height: int, x: str, y: str, **options: Any) -> figure:
 
 
 def _with_legend(plot: figure) -> figure:
-    plot.legend.location = "top_right"
-    plot.legend.background_fill_alpha = 0.6
+    """Its legend beside the title's line, where it covers no data."""
+    plot.add_layout(plot.legend[0], "above")
+    plot.legend.orientation = "horizontal"
     plot.legend.label_text_font_size = "11px"
-    plot.legend.padding = 4
+    plot.legend.padding = plot.legend.margin = 0
+    plot.legend.border_line_color = None
     return plot

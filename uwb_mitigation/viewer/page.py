@@ -138,7 +138,7 @@ class Page:
             "sigma": [sample.sigma_m for _, _, sample in latest],
             "status": [sample.status.name for _, _, sample in latest],
             "colour": [COLOURS[sample.status] for _, _, sample in latest],
-            "correction": [_finite(sample.raw_m - sample.range_m) for _, _, sample in latest],
+            "correction": [sample.raw_m - sample.range_m for _, _, sample in latest],
         }
         self._rows = rows
         _choose(self._models.pairs, rows, self._selected)
