@@ -62,6 +62,9 @@ def _node(name: str) -> None:
         # It draws in this thread, and is spun by another.
         _load("uwb_mitigation.nodes.monitor")()
     else:
+        if name == "viewer":
+            # Where a processor is short, ranges are corrected before they are drawn. Here, before the middleware has threads.
+            os.nice(10)
         # Which catches signals itself once the node is loaded.
         _load("uwb_mitigation.nodes.spinning")(name)
 

@@ -23,27 +23,29 @@ PAGES = (0, 1, 10)
 _SETTLE_S = 3.0
 
 
+NO_VIEWER, NO_PAGE, ONE_PAGE = SUBJECTS = ("no viewer", "no open page", "an open page")
+"""A driver and a mitigator each, with what looks on."""
+
+
 @dataclass(frozen=True, slots=True)
 class ViewerCosts:
-    """Of a viewer beside a driver and a mitigator.
+    """Of a viewer beside a driver and a mitigator, all in one session as a launch has them.
 
     Attributes:
         core_share: processor time of the viewer at `RATE_HZ` by seconds passed, {open pages: share of a core}.
-        alone_us: processor time of driver and mitigator for a range at `SENT_HZ`, without a viewer.
-        viewed_us: the same with a viewer and one open page, measured by turns with it.
-        alone_hz, viewed_hz: likewise the mitigator's highest rate without loss, of each search.
+        range_us: processor time of driver and mitigator for a range at `SENT_HZ`, {of `SUBJECTS`: us}, by turns.
+        rates_hz: likewise the mitigator's highest rate without loss, of each search.
     """
 
     core_share: dict[int, float]
-    alone_us: float
-    viewed_us: float
-    alone_hz: list[float]
-    viewed_hz: list[float]
+    range_us: dict[str, float]
+    rates_hz: dict[str, list[float]]
 
     @property
-    def rate_ratio(self) -> float:
-        """The mitigator's rate with a viewer, by that without."""
-        return median(self.viewed_hz) / (median(self.alone_hz) or 1.0)
+    def rate_ratios(self) -> dict[str, float]:
+        """The mitigator's rates, by that without a viewer."""
+        medians_hz = {name: median(rates_hz) for name, rates_hz in self.rates_hz.items()}
+        return {name: rate_hz / (medians_hz[NO_VIEWER] or 1.0) for name, rate_hz in medians_hz.items()}
 
 
 def measure(repeats: int, seconds: float, advance: Advance) -> ViewerCosts:
@@ -58,11 +60,15 @@ def measure(repeats: int, seconds: float, advance: Advance) -> ViewerCosts:
         UwbMitigationError: a node did not start, or nothing arrives.
     """
     with open_bench() as bench:
-        alone, viewed = (
-            Subject(bench, name, RangeCorrected, topics.RANGE_CORRECTED, "mitigator", "driver")
-            for name in ("mitigator", "mitigator_viewed")
-        )
-        url, pid = _start_viewer(bench, viewed.name)
+        subjects = [
+            Subject(
+                bench, name.replace(" ", "_"), RangeCorrected, topics.RANGE_CORRECTED, "mitigator", "driver"
+            )
+            for name in SUBJECTS
+        ]
+        _, unwatched, watched = subjects
+        url, pid = _start_viewer(bench, unwatched.name)
+        watched_url, _ = _start_viewer(bench, watched.name)
         core_share: dict[int, float] = {}
 
         def look(pages: int) -> None:
@@ -73,28 +79,29 @@ def measure(repeats: int, seconds: float, advance: Advance) -> ViewerCosts:
                 passed_s = time.monotonic() - began_s
                 core_share[pages] = (vitals.look(pid).cpu_s - before_s) / passed_s
 
-        viewed.play(RATE_HZ)
+        unwatched.play(RATE_HZ)
         looks: list[Step] = [
             (f"the viewer with {pages} open pages", _SETTLE_S + seconds, partial(look, pages))
             for pages in PAGES
         ]
-        take_steps([*looks, ("resting", 0.1, viewed.pause)], lambda text, share: advance(text, 0.3 * share))
-        with Visitors(url, 1):
-            for subject in (alone, viewed):
+        take_steps(
+            [*looks, ("resting", 0.1, unwatched.pause)], lambda text, share: advance(text, 0.3 * share)
+        )
+        with Visitors(watched_url, 1):
+            for subject in subjects:
                 subject.warm_up()
             slices: list[Step] = [
-                (f"processor time of {subject.name}", 2.0, partial(_measure_slice, subject))
+                (f"processor time, {name}", 2.0, partial(_measure_slice, subject))
                 for _ in range(_SLICES)
-                for subject in (alone, viewed)
+                for name, subject in zip(SUBJECTS, subjects, strict=True)
             ]
-            steps = [*slices, *searches((alone, viewed), repeats)]
+            steps = [*slices, *searches(subjects, repeats)]
             take_steps(steps, lambda text, share: advance(text, 0.3 + 0.7 * share))
+    figures = {name: subject.figures for name, subject in zip(SUBJECTS, subjects, strict=True)}
     return ViewerCosts(
         core_share,
-        alone.figures.chain_cpu_us_per_message,
-        viewed.figures.chain_cpu_us_per_message,
-        alone.figures.rates_hz,
-        viewed.figures.rates_hz,
+        {name: of.chain_cpu_us_per_message for name, of in figures.items()},
+        {name: of.rates_hz for name, of in figures.items()},
     )
 
 

@@ -5,11 +5,11 @@ It subscribes, and publishes but diagnostics and, of an anchors file that it was
 
 from __future__ import annotations
 
-import os
 import re
 import threading
 from collections.abc import Callable
 from functools import partial
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
 from visualization_msgs.msg import MarkerArray
 
 from uwb_mitigation.nodes import clocks, diagnostics, markers, topics
+from uwb_mitigation.nodes.health import Numbering
 from uwb_mitigation.nodes.lifecycle import ManagedNode
 from uwb_mitigation.nodes.parameter_tables import VIEWER
 from uwb_mitigation.positioning.anchors import AnchorMap
@@ -52,8 +53,8 @@ _LOOK = QoSProfile(
     depth=200,
 )
 LOOK_AROUND_S = 0.5
-YIELD = 10
-"""Nice value: where a processor is short, ranges are corrected before they are drawn."""
+HEAR_S = 0.1
+"""From one look into the queues of ranges to the next: no page is drawn more often. Of more than `_LOOK.depth`, the last count."""
 
 
 class Viewer(ManagedNode):
@@ -62,9 +63,12 @@ class Viewer(ManagedNode):
     def __init__(self) -> None:
         super().__init__("viewer", VIEWER)
         self._looking: dict[str, Subscription] = {}
+        self._ears: Node | None = None
+        self._ranges: dict[str, Subscription] = {}
+        self._numbering = Numbering(self._publisher_count)
         self._anchors: AnchorMap | None = None
         self._anchors_out: Publisher | None = None
-        self._timer: Timer | None = None
+        self._ticking: list[Timer] = []
         self._server: ViewerServer | None = None
         self._scene = Scene()
         self._lock = threading.Lock()
@@ -80,14 +84,25 @@ class Viewer(ManagedNode):
         else:
             self._look(MarkerArray, topics.ANCHORS, self._feed.markers, qos=topics.LATCHED)
         feed = self._feed
-        self._look(RangeTruth, topics.RANGE_TRUTH, feed.range_truth, raw=True)
-        self._look(RangeCorrected, topics.RANGE_CORRECTED, feed.range_corrected, raw=True)
         self._look(DiagnosticArray, topics.DIAGNOSTICS, feed.diagnostics)
         self._look(PoseWithCovarianceStamped, topics.POSE, partial(feed.pose, PLAIN))
         self._look(Odometry, topics.ODOMETRY_TRUTH, feed.true_position)
-        self._timer = self.create_timer(
-            LOOK_AROUND_S, self._look_around, clock=Clock(clock_type=ClockType.STEADY_TIME)
+        # Of a node that no executor spins: nobody is woken by a range, which would take time from whoever corrects it.
+        self._ears = Node(
+            f"_{self.get_name()}_ranges",
+            namespace=self.get_namespace(),
+            context=self.context,
+            use_global_arguments=False,
+            enable_rosout=False,
+            start_parameter_services=False,
         )
+        self._listen(RangeTruth, topics.RANGE_TRUTH)
+        self._listen(RangeCorrected, topics.RANGE_CORRECTED)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._ticking = [
+            self.create_timer(LOOK_AROUND_S, self._look_around, clock=steady),
+            self.create_timer(HEAR_S, self._hear, clock=steady),
+        ]
 
     def _look(
         self,
@@ -96,16 +111,49 @@ class Viewer(ManagedNode):
         take: Callable[[Any], None],
         *,
         qos: QoSProfile = _LOOK,
-        raw: bool = False,
     ) -> None:
         if topic not in self._looking:
-            self._looking[topic] = self.create_subscription(kind, topic, take, qos, raw=raw)
+            self._looking[topic] = self.create_subscription(kind, topic, take, qos)
+
+    def _listen(self, kind: type, topic: str) -> None:
+        """Let ranges queue up until `_hear`."""
+        if self._ears is not None and topic not in self._ranges:
+            # By the name that arguments may have given it: they are this node's.
+            name = self.resolve_topic_name(topic)
+            self._ranges[topic] = self._ears.create_subscription(kind, name, _hear_nothing, _LOOK, raw=True)
+
+    def _hear(self) -> None:
+        """Take what has queued up."""
+        # A truth is sent before its corrected range: taken after it and used before, none is missed.
+        corrected, truths, raw = map(
+            self._queued, (topics.RANGE_CORRECTED, topics.RANGE_TRUTH, topics.RANGE_RAW)
+        )
+        for _, number in corrected:
+            self._numbering.add(number)
+        for feed, queued in (
+            (self._feed.range_truth, truths),
+            (self._feed.range_raw, raw),
+            (self._feed.range_corrected, corrected),
+        ):
+            for data, _ in queued:
+                feed(data)
+
+    def _queued(self, topic: str) -> list[tuple[bytes, int]]:
+        """The messages in the queue of a topic, and their publishers' numbers of them."""
+        if (subscription := self._ranges.get(topic)) is None:
+            return []
+        take, kind = subscription.handle.take_message, subscription.msg_type
+        # Never more than it holds: more may come as fast as they are taken.
+        found = (take(kind, True) for _ in range(_LOOK.depth))
+        return [(data, topics.number_of(info)) for data, info in takewhile(bool, found)]
 
     def _look_around(self) -> None:
         """Subscribe to what is wanted, or there, only by now."""
         # CIRs are most of what is sent: a pipeline sends none where nobody looks.
         if self._view is not None and self._view.drawing.pages:
-            self._look(RangeCir, topics.RANGE_RAW, self._feed.range_raw, raw=True)
+            self._listen(RangeCir, topics.RANGE_RAW)
+        elif self._ears is not None and topics.RANGE_RAW in self._ranges:
+            self._ears.destroy_subscription(self._ranges.pop(topics.RANGE_RAW))
         # The locator gives every tag but one topics of its own, once it is heard.
         own = re.compile(re.escape(self.resolve_topic_name(topics.POSE)).replace("/uwb/", r"/uwb/(tag_\d+)/"))
         for topic, _ in self.get_topic_names_and_types():
@@ -135,19 +183,34 @@ class Viewer(ManagedNode):
             server.close()
 
     def close(self) -> None:
-        if self._timer is not None:
-            self.destroy_timer(self._timer)
+        for timer in self._ticking:
+            self.destroy_timer(timer)
+        if self._ears is not None:
+            self._ears.destroy_node()
         for subscription in self._looking.values():
             self.destroy_subscription(subscription)
         if self._anchors_out is not None:
             self.destroy_lifecycle_publisher(self._anchors_out)
-        self._looking, self._timer, self._anchors_out = {}, None, None
+        self._looking, self._ranges, self._ticking, self._anchors_out, self._ears = {}, {}, [], None, None
 
     def describe(self) -> tuple[str, bytes, str, dict[str, object]]:
         pages = 0 if self._view is None else self._view.drawing.pages
         url = "" if self._server is None else self._server.url
-        facts: dict[str, object] = {"url": url, "pages": pages, "malformed": self._feed.malformed}
-        return url, diagnostics.OK, f"serving {pages} pages", facts
+        passed_over = self._numbering.missing
+        facts: dict[str, object] = {
+            "url": url,
+            "pages": pages,
+            "malformed": self._feed.malformed,
+            "passed over": passed_over,
+        }
+        text = f"serving {pages} page{'' if pages == 1 else 's'}"
+        if passed_over:
+            text += f"; {passed_over} ranges passed over, for they came too fast to be shown"
+        return url, diagnostics.OK, text, facts
+
+    def _publisher_count(self) -> int:
+        corrected = self._ranges.get(topics.RANGE_CORRECTED)
+        return 0 if corrected is None else int(corrected.get_publisher_count())
 
     def _parameters_of_nodes(self) -> dict[str, dict[str, object]]:
         """What our nodes in this namespace say of themselves; called from the page's thread, answered by the executor's."""
@@ -169,6 +232,10 @@ class Viewer(ManagedNode):
         return found
 
 
+def _hear_nothing(_message: object) -> None:
+    """Ranges are taken, not given."""
+
+
 def _wait(future: Future) -> Any:
     """The result of a call, or None where none comes; the executor of another thread completes it."""
     done = threading.Event()
@@ -177,5 +244,4 @@ def _wait(future: Future) -> Any:
 
 
 def make_nodes(stop: threading.Event) -> list[Node]:
-    os.nice(YIELD)
     return [Viewer()]
