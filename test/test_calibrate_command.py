@@ -123,6 +123,29 @@ def test_a_localisation_that_lags_tells_the_truth(site):
     assert (wrong.returncode, "/odom (nav_msgs/msg/Odometry)" in wrong.stderr) == (1, True)
 
 
+@pytest.mark.parametrize("truth", [None, "/odom"])
+def test_offsets_are_found_without_the_stretches_that_are_held_out(site, truth, monkeypatch):
+    from uwb_mitigation.training import calibrating, site_model
+
+    told = []
+
+    def look(data, has_cirs, source, seed, on_share, *, offsets_without):
+        rows = np.arange(len(data))
+        own = data.anchors == 2
+        told.append([offsets_without(rows[:0]), offsets_without(rows[own & (rows > len(rows) // 4)]), own])
+        return choose(data, has_cirs, source, seed, on_share, offsets_without=offsets_without)
+
+    choose = site_model.choose
+    monkeypatch.setattr(calibrating.site_model, "choose", look)
+    options = ("--truth-topic", truth) if truth else ()
+    done = run("calibrate", "drive.mcap", *LEVEL, "-o", "w.onnx", "--force", *options, folder=site)
+    assert done.returncode == 0, done.stderr
+    ((nothing, without, own),) = told
+    assert np.abs(nothing).max() < 2e-3
+    assert np.abs(without[own]).max() > 3.0 * np.abs(nothing).max()
+    assert np.abs(without).max() < 0.15
+
+
 def test_what_is_refused_is_said_in_the_json_and_writes_nothing(site):
     done = run("calibrate", "short.mcap", *LEVEL, "-o", "short.onnx", "--json", "s.json", folder=site)
     assert done.returncode == 1

@@ -83,6 +83,21 @@ def test_pseudo_truth_comes_from_the_other_anchors_and_says_how_sure_it_is(solve
     assert np.abs(again.pseudo_m - truth)[own].mean() < 0.15
 
 
+def test_what_is_held_out_has_no_say_in_the_offsets(solved, minute):
+    ranges = with_own(minute[0])
+    late = ranges.stamp_ns > 30 * 10**9
+    spoilt = replace(ranges, range_m=ranges.range_m + np.where(late & (ranges.anchor == 2), 0.5, 0.0))
+    found = calibrate(HALL, [spoilt], height=LEVEL)
+    again = found.found_without(found.stretches.ranges.stamp_ns > 30 * 10**9)
+    before, after = (np.array([one.pair(0, row)[0] for row in range(5)]) for one in (found, again))
+    assert after[2] < before[2] - 0.05
+    assert np.abs(after - 0.25 - OWN).max() < 0.15
+    assert (again.pseudo_m == found.pseudo_m).all()
+    # Of nothing left out, as before.
+    same = solved.found_without(np.zeros(len(ranges), bool))
+    assert np.abs(same.fit.parameters - solved.fit.parameters).max() < 2e-3
+
+
 def test_one_offset_is_found_where_none_differs(minute):
     found = calibrate(HALL, [minute[0]], height=LEVEL)
     assert found.level == "one"

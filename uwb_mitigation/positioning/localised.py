@@ -160,6 +160,12 @@ class Localised:
         at = self.pairs.index((tag, row))
         return float(self.offset_m[at]), math.hypot(float(self.offset_sd_m[at]), anchor_sd_m / math.sqrt(2.0))
 
+    @property
+    def lever_arm(self) -> tuple[float, float, float]:
+        """The same as numbers."""
+        x, y, z = self.lever_arm_m.tolist()
+        return x, y, z
+
     def as_json(self) -> dict[str, object]:
         """Numbers; null = not told."""
         sds = [None if math.isnan(sd) else sd for sd in self.lever_arm_sd_m.tolist()]

@@ -44,7 +44,7 @@ class SelfCalibration:
 
     Attributes:
         stretches, links, fit: as in `rests` and `joint`.
-        names: of the parameters: `offset`, `anchor ROW`, `tag NUMBER`, `pair NUMBER ROW`, and the regressors'.
+        solved: the parameters: `offset`, `anchor ROW`, `tag NUMBER`, `pair NUMBER ROW`, and the regressors'.
         level: `pair`, `anchor` or `one`: what has an offset of its own.
         not_told: what geometry cannot tell apart, and what was left out, in words.
         tag_ids: of the tags.
@@ -55,14 +55,40 @@ class SelfCalibration:
     stretches: Stretches
     links: Links
     fit: JointFit
-    names: tuple[str, ...]
+    solved: Columns
     level: str
     not_told: tuple[str, ...]
     tag_ids: tuple[int, ...]
     anchors: AnchorMap
     pseudo_m: NDArray[np.float64]
     pseudo_sd_m: NDArray[np.float64]
-    untold_m: float = 0.0
+    untold_m: float
+    height: Height | None
+    model: Model
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the parameters."""
+        return self.solved.names
+
+    def found_without(self, left_out: NDArray[np.bool_]) -> SelfCalibration:
+        """The same parameters and tracks from all but those of `stretches.ranges`, bool (r,); the pseudo-truth stays.
+
+        Raises:
+            DatasetError: the other ranges do not determine them.
+        """
+        gone = np.ones(len(self.links), np.bool_)
+        gone[self.links.of[~left_out]] = False
+        links = self.links.without(gone)
+        solver = JointSolver(
+            self.anchors,
+            links,
+            self.solved.parameters(links),
+            self.model,
+            self.height,
+            around=self.fit.position,
+        )
+        return replace(self, fit=solver.fit(self.fit.position, self.fit.parameters, near=True))
 
     def value(self, name: str) -> tuple[float, float]:
         """A parameter and its standard deviation; (0, 0) where it was not solved for."""
@@ -186,7 +212,7 @@ def calibrate(
         found,
         links,
         fit,
-        solved.names,
+        solved,
         level,
         tuple(told),
         tuple(one.tag_id for one in tags),
@@ -194,4 +220,6 @@ def calibrate(
         pseudo,
         sd,
         untold,
+        height,
+        model,
     )

@@ -170,12 +170,25 @@ def without_truth(
         found.stretches.at_rest,
     )
     network = found.value(NETWORK)
+    used = np.flatnonzero(known)
+
+    def offsets_without(held_out: NDArray[np.intp]) -> NDArray[np.float64]:
+        left_out = np.zeros(len(known), np.bool_)
+        left_out[used[held_out]] = True
+        again = found.found_without(left_out)
+        grown = {
+            (found.tag_ids[tag], ids[row]): again.pair(tag, row)[0] - found.pair(tag, row)[0]
+            for tag, row in found.pairs()
+        }
+        return _of_rows(data, grown)
+
     choice = site_model.choose(
         data,
         site.has_cirs,
         source,
         seed,
         lambda share: on_progress("choosing", 0.4 + 0.6 * share),
+        offsets_without=offsets_without,
     )
     resting = found.links.at_rest
     first_tag = {
@@ -247,8 +260,33 @@ def with_truth(
     data, raw = _labelled(
         site, offsets, rows, found.distance_m[rows], tag[rows], np.zeros(len(site.tags), np.bool_)
     )
+    begins = np.cumsum([0, *map(len, site.tags)])
+
+    def offsets_without(held_out: NDArray[np.intp]) -> NDArray[np.float64]:
+        kept = np.setdiff1d(rows, rows[held_out])
+        own = [kept[tag[kept] == number] for number in range(len(site.tags))]
+        again = solve_localised(
+            site.anchors,
+            [one.take(part - begin) for one, part, begin in zip(site.tags, own, begins, strict=False)],
+            path,
+            known.take(kept),
+            time_offset_s=found.time_offset_s,
+            lever_arm_m=found.lever_arm,
+        )
+        grown = {
+            (site.tags[number].tag_id, ids[row]): again.pair(number, row, 0.0)[0]
+            - found.pair(number, row, 0.0)[0]
+            for number, row in again.pairs
+        }
+        return _of_rows(data, grown)
+
     choice = site_model.choose(
-        data, site.has_cirs, source, seed, lambda share: on_progress("choosing", 0.3 + 0.7 * share)
+        data,
+        site.has_cirs,
+        source,
+        seed,
+        lambda share: on_progress("choosing", 0.3 + 0.7 * share),
+        offsets_without=offsets_without,
     )
     track = found.position[rows]
     return Calibrated(
@@ -397,6 +435,14 @@ def _labelled(
     assert nothing.anchors is not None
     off = offsets.of_columns(nothing.tags, nothing.anchors).astype(np.float64)
     return replace(nothing, range_m=nothing.range_m - off, error_m=nothing.error_m - off), nothing.error_m
+
+
+def _of_rows(data: Dataset, of_pair: dict[tuple[int, int], float]) -> NDArray[np.float64]:
+    """What holds of each range's pair; 0 where nothing is known of it."""
+    assert data.tags is not None
+    assert data.anchors is not None
+    pairs = zip(data.tags.tolist(), data.anchors.tolist(), strict=True)
+    return np.array([of_pair.get(pair, 0.0) for pair in pairs])
 
 
 def _check_labelled(count: int) -> None:

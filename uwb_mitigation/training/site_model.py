@@ -45,6 +45,9 @@ FACTORS, LEAST_SPREAD_M = (0.0, 1.5), 0.05
 """Of the universal network's predictions: noise in what predicts pulls the best factor below 1, which only offsets that
 are sought with it would suffer from."""
 
+OffsetsWithout = Callable[[NDArray[np.intp]], NDArray[np.float64]]
+"""Of rows that are held out, float64 (n,): by how much the offset of each range grows when it is found without them, m."""
+
 _BATCH = 1024
 TUNING = FitOptions(epochs=2, learning_rate=3e-4, dropout=0.2)
 STRETCH_FOLDS, ANCHOR_FOLDS = 4, 2
@@ -118,11 +121,16 @@ def choose(
     source: Bundle,
     seed: int = 0,
     on_share: Callable[[float], None] = lambda share: None,
+    *,
+    offsets_without: OffsetsWithout,
 ) -> SiteChoice:
     """Choose among the candidates, and fit the chosen one to all of the data.
 
+    Of a stretch that is held out the radios' offsets, too, are found without it. Not of an anchor: its own offset is told
+    by its own ranges alone.
+
     Args:
-        data: as `SiteData.labelled` makes it.
+        data: as `SiteData.labelled` makes it, less the offsets.
         source: the universal model.
 
     Raises:
@@ -143,7 +151,8 @@ def choose(
         )
     errors = {name: np.tile(data.error_m, 2) for name in every}
     for number, (kind, split) in enumerate(parts):
-        train, test = data.rows(split.train), data.rows(split.test)
+        fold = _less(data, offsets_without(split.test)) if kind == 0 else data
+        train, test = fold.rows(split.train), fold.rows(split.test)
         for name, fit in every.items():
             errors[name][split.test + kind * len(data)] = test.error_m - fit(train).predicted_m(test)
         on_share((number + 1) / (len(parts) + 1))
@@ -160,6 +169,10 @@ def choose(
         fitted.network,
         tuple(notes),
     )
+
+
+def _less(data: Dataset, offset_m: NDArray[np.float64]) -> Dataset:
+    return replace(data, range_m=data.range_m - offset_m, error_m=data.error_m - offset_m)
 
 
 def bundle_of(
