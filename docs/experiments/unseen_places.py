@@ -34,7 +34,7 @@ for path in map(Path, sys.argv[2:]):
     rows = {"raw": data.error_m, "raw less LOS offset": data.error_m - offset, **found.errors}
     rows["less raw LOS offset"] = found.errors["universal"] - offset
     for name, left in rows.items():
-        low, high = bootstrap_interval(left, data.configurations, seed=0)
+        low, high = bootstrap_interval(left, data.configurations)
         labels = np.unique(data.labels)
         told = ", ".join(f"{label} {np.abs(left[data.labels == label]).mean():.3f}" for label in labels)
         print(f"  {name:22}{np.abs(left).mean():.3f} ({low:.3f} to {high:.3f}); {told}")

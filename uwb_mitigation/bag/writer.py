@@ -147,19 +147,18 @@ class BagWriter:
         """
         self.write_serialized(self._our_channel(topic, type_name), data, stamp_ns, stamp_ns)
 
-    def copy_channel(self, channel: Channel, topic: str | None = None) -> int:
-        """Register a channel of another bag, under its own name or `topic`; returns its number.
+    def copy_channel(self, channel: Channel) -> int:
+        """Register a channel of another bag; returns its number.
 
         A channel that is the same in all but its id gets the same number: files of one bag share it.
         Its recorded quality of service comes with it, spelt as by the current rosbag2.
         """
-        topic = topic or channel.topic
         metadata = channel.metadata | {_QOS_KEY: dump(recorded_qos(channel.metadata.get(_QOS_KEY, "")))}
-        key = (topic, channel.encoding, channel.schema, *sorted(metadata.items()))
+        key = (channel.topic, channel.encoding, channel.schema, *sorted(metadata.items()))
         if key not in self._copied:
             schema = channel.schema
             self._copied[key] = self._add_channel(
-                topic,
+                channel.topic,
                 schema.name if schema else "",
                 schema.encoding if schema else "",
                 schema.data if schema else None,

@@ -53,12 +53,13 @@ def _drive(n: int, rate_hz: float) -> tuple[NDArray[np.intp], NDArray[np.float64
     return row, np.linalg.norm(place - ANCHORS.position[row], axis=1) + noise
 
 
-def filter_us(ranges: int = 5000, rounds: int = 5) -> float:
-    """Processor time of a prediction and an update, us: the best of some rounds, four anchors."""
+def filter_us() -> float:
+    """Processor time of a prediction and an update, us: the best of five rounds, four anchors."""
+    ranges = 5000
     row, range_m = _drive(ranges, 40.0)
     rows, values = row.tolist(), range_m.tolist()
     best = float("inf")
-    for _ in range(rounds):
+    for _ in range(5):
         one = RangeFilter(ANCHORS, Model(), 0.0, np.array([7.5, 3.5, 1.0]), np.eye(3))
         began = time.process_time()
         for i in range(ranges):

@@ -16,7 +16,6 @@ import numpy as np
 import psutil
 from numpy.typing import NDArray
 
-from uwb_mitigation.dw1000_model.evb1000 import ROUND_TRIP_S
 from uwb_mitigation.dw1000_model.links import Link
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.link.layout import Mode, Role
@@ -99,8 +98,9 @@ def ranging(seconds: float, advance: Callable[[], None]) -> list[Ranging]:
     return rows
 
 
-def line_rate_hz(mode: Mode, seconds: float = 5.0) -> float:
+def line_rate_hz(mode: Mode) -> float:
     """Ranges a second over a serial line of 921600 baud, with 157 samples each in mode HOST, virtual time."""
+    seconds = 5.0
     line = Line(mode=mode, inference_s=INFERENCE_CYCLES / PROCESSOR_HZ, overhead_s=SPI_OVERHEAD_S)
     with ModelledAir() as air:
         tag = air.add(RadioSettings(), line=line)
@@ -110,13 +110,13 @@ def line_rate_hz(mode: Mode, seconds: float = 5.0) -> float:
         return (len(rows) - air.measurements_lost(tag)) / seconds
 
 
-def evb1000_rate_hz(seconds: float, round_trip_s: float = ROUND_TRIP_S) -> float:
+def evb1000_rate_hz(seconds: float) -> float:
     """Ranges a second with 157 samples each of two emulated EVB1000s on this computer, wall-clock time.
 
     Raises:
         UwbMitigationError: they do not range.
     """
-    with tempfile.TemporaryDirectory() as folder, _emulated(Path(folder) / "board", round_trip_s) as paths:
+    with tempfile.TemporaryDirectory() as folder, _emulated(Path(folder) / "board") as paths:
         ports = [
             RadioPort(_opening(path), RadioSettings(role=role))
             for path, role in zip(paths, (Role.TAG, Role.ANCHOR), strict=True)
@@ -133,12 +133,12 @@ def evb1000_rate_hz(seconds: float, round_trip_s: float = ROUND_TRIP_S) -> float
 
 
 @contextlib.contextmanager
-def _emulated(prefix: Path, round_trip_s: float) -> Iterator[tuple[Path, Path]]:
+def _emulated(prefix: Path) -> Iterator[tuple[Path, Path]]:
     """Two EVB1000s in a process of their own, as boards would not take of this one's time."""
     paths = (Path(f"{prefix}0"), Path(f"{prefix}1"))
     program = "from uwb_mitigation.entry import command_line; command_line()"
     # On a clean link: a simulator in that process would hold up the boards now and then.
-    options = ("emulate-evb1000", "--link", str(prefix), "--round-trip", str(round_trip_s), "--distance", "5")
+    options = ("emulate-evb1000", "--link", str(prefix), "--distance", "5")
     process = subprocess.Popen([sys.executable, "-c", program, *options], stdout=subprocess.DEVNULL)
     try:
         until = time.monotonic() + _STARTS_WITHIN_S

@@ -70,7 +70,7 @@ def model_folder() -> Path:
     return folder
 
 
-def model_objects(flags: tuple[str, ...] = ()) -> tuple[str, ...]:
+def model_objects() -> tuple[str, ...]:
     """Object files of the model for this computer; compiled once a process.
 
     Raises:
@@ -78,9 +78,7 @@ def model_objects(flags: tuple[str, ...] = ()) -> tuple[str, ...]:
         UwbMitigationError: they do not compile.
     """
     folder = model_folder()
-    return compile_objects(
-        c_compiler(), (*_OPTIONS, *flags, f"-I{folder}"), tuple(sorted(folder.glob("*.c")))
-    )
+    return compile_objects(c_compiler(), (*_OPTIONS, f"-I{folder}"), tuple(sorted(folder.glob("*.c"))))
 
 
 @functools.cache

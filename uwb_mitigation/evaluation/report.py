@@ -242,8 +242,8 @@ def _quick(trainings: ExperimentResults) -> list[str]:
     ]
 
 
-def _own(study: Study, commands: Commands, split: str, seeds: str = _NO_SEEDS) -> Provenance:
-    return Provenance(study.title, split, seeds, commands.report)
+def _own(study: Study, commands: Commands, seeds: str = _NO_SEEDS) -> Provenance:
+    return Provenance(study.title, "none: all measurements", seeds, commands.report)
 
 
 def _data_table(study: Study, commands: Commands) -> Table:
@@ -271,7 +271,7 @@ def _data_table(study: Study, commands: Commands) -> Table:
         ("Part", *(["Measurements", "MAE, m", "σ, m"] * 2)),
         1,
         tuple(rows),
-        _own(study, commands, "none: all measurements"),
+        _own(study, commands),
         "",
     )
 
@@ -315,7 +315,7 @@ def _samples(study: Study, commands: Commands) -> Picture:
         "and the range is biased upward.",
         figures.samples(chosen),
         {"samples": [{"label": one.label, "error_m": one.error_m} for one in chosen]},
-        _own(study, commands, "none: all measurements"),
+        _own(study, commands),
     )
 
 
@@ -352,7 +352,7 @@ def _projections(study: Study, commands: Commands, on_step: Callable[[], None]) 
                     "groups": dict(zip(names.tolist(), counts.tolist(), strict=True)),
                     "points": len(chosen),
                 },
-                _own(study, commands, "none: all measurements", seeds),
+                _own(study, commands, seeds),
             )
         )
         on_step()

@@ -42,7 +42,7 @@ class Split:
     test: NDArray[np.intp]
 
 
-def by_name(configurations: NDArray[np.str_], name: str, folds: int = FOLDS) -> tuple[str, Split]:
+def by_name(configurations: NDArray[np.str_], name: str) -> tuple[str, Split]:
     """One of `SPLITS` and what to tell people of it; AUTO is the paper's for DeepUWB, else CONFIGURATIONS.
 
     Raises:
@@ -53,8 +53,8 @@ def by_name(configurations: NDArray[np.str_], name: str, folds: int = FOLDS) -> 
     if name == AUTO:
         name = RoomSplit.PAPER.value if has_rooms(configurations) else CONFIGURATIONS
     if name == CONFIGURATIONS:
-        fold = by_configuration(configurations, folds, seed=0)[0]
-        return f"{CONFIGURATIONS}: 1 of {folds} parts held out", fold
+        fold = by_configuration(configurations, FOLDS, seed=0)[0]
+        return f"{CONFIGURATIONS}: 1 of {FOLDS} parts held out", fold
     train, test = split_rows(configurations, RoomSplit(name))
     return name, Split(np.flatnonzero(train), np.flatnonzero(test))
 

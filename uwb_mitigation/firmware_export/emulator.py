@@ -24,6 +24,7 @@ from uwb_mitigation.measurement import RangeMeasurement
 _MACHINE = ("qemu-system-arm", "-M", "mps2-an386", "-display", "none", "-monitor", "none", "-serial", "none")
 _TICKS_PER_INSTRUCTION = 64 / 40
 _MAX_VALUES = 2 * 1016
+_TIMEOUT_S = 600.0
 _WINDOWS, _CIRS = 0, 1
 
 _CIR_RECORD = np.dtype(
@@ -70,7 +71,7 @@ class Emulation:
     stack_bytes: int
 
 
-def run_windows(image: Image, windows: NDArray[np.float32], timeout_s: float = 600) -> Emulation:
+def run_windows(image: Image, windows: NDArray[np.float32]) -> Emulation:
     """The network's outputs for windows, float32 (n, K).
 
     Raises:
@@ -78,15 +79,11 @@ def run_windows(image: Image, windows: NDArray[np.float32], timeout_s: float = 6
         UwbMitigationError: the program fails, hangs or writes less than it should.
     """
     record = np.dtype([("status", "<u4"), ("output_m", "<f4")])
-    return _run(image, _WINDOWS, np.ascontiguousarray(windows, np.float32), record, timeout_s)
+    return _run(image, _WINDOWS, np.ascontiguousarray(windows, np.float32), record)
 
 
 def run_measurements(
-    image: Image,
-    measurements: Sequence[RangeMeasurement],
-    samples: int,
-    timeout_s: float = 600,
-    offset_m: float = 0.0,
+    image: Image, measurements: Sequence[RangeMeasurement], samples: int, offset_m: float = 0.0
 ) -> Emulation:
     """Corrected ranges of measurements, of radios with this offset, and the windows of `samples` values that preprocessing gave.
 
@@ -124,7 +121,7 @@ def run_measurements(
             ("window", "<f4", (samples,)),
         ]
     )
-    return _run(image, _CIRS, rows, record, timeout_s)
+    return _run(image, _CIRS, rows, record)
 
 
 def count_executed(image: Image, window: NDArray[np.float32]) -> Counter[tuple[int, bool]]:
@@ -189,15 +186,13 @@ def _write_input(folder: Path, kind: int, rows: NDArray[np.generic]) -> None:
     (folder / "input.bin").write_bytes(header.tobytes() + rows.tobytes())
 
 
-def _run(
-    image: Image, kind: int, rows: NDArray[np.generic], record: np.dtype[np.void], timeout_s: float
-) -> Emulation:
+def _run(image: Image, kind: int, rows: NDArray[np.generic], record: np.dtype[np.void]) -> Emulation:
     require_tools()
     folder = image.elf.parent
     _write_input(folder, kind, rows)
     output = folder / "output.bin"
     output.unlink(missing_ok=True)
-    run(_command(image), timeout_s, folder)
+    run(_command(image), _TIMEOUT_S, folder)
     data = output.read_bytes() if output.is_file() else b""
     expected = len(rows) * record.itemsize + _REPORT.itemsize
     if len(data) != expected:

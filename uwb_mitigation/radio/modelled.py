@@ -33,6 +33,9 @@ from uwb_mitigation.radio import structures
 NOMINAL_DELAY_TICKS = 16436
 """Of a chip's transmitter, and of its receiver."""
 
+_STORE_VALUES = 1 << 16
+"""int16 values of CIRs that are kept between two calls of `ranges`; beyond it they are not."""
+
 RANGE = np.dtype(
     [
         ("time_s", "<f8"),
@@ -76,16 +79,14 @@ class ModelledAir:
 
     Args:
         seed: the same seed and calls give the same run.
-        store_values: int16 values of CIRs that are kept between two calls of `ranges`; beyond it they are not.
 
     Raises:
         MissingDependencyError: there is no C compiler, or no checkout.
     """
 
-    def __init__(self, seed: int = 1, store_values: int = 1 << 16) -> None:
+    def __init__(self, seed: int = 1) -> None:
         self._library = _library()
-        self._air = self._library.radio_air_new(seed, store_values)
-        self._store_values = store_values
+        self._air = self._library.radio_air_new(seed, _STORE_VALUES)
         self._boards = 0
         self._callbacks: list[object] = []
 
@@ -124,9 +125,7 @@ class ModelledAir:
             )
         return board
 
-    def add_remote(
-        self, next_request: Callable[[Request], bool], *, ppm: float = 0.0, clock_ticks: int = 0
-    ) -> int:
+    def add_remote(self, next_request: Callable[[Request], bool], *, ppm: float = 0.0) -> int:
         """A chip whose host's program is elsewhere; its number.
 
         `next_request` is told of the request before, writes the next one, and returns False when there is none any
@@ -135,7 +134,7 @@ class ModelledAir:
         callback = NextRequest(lambda _, request: int(next_request(request[0])))
         self._callbacks.append(callback)
         delay = NOMINAL_DELAY_TICKS
-        board: int = self._library.radio_air_remote(self._air, ppm, clock_ticks, delay, delay, callback)
+        board: int = self._library.radio_air_remote(self._air, ppm, 0, delay, delay, callback)
         self._boards += 1
         return board
 
@@ -176,7 +175,7 @@ class ModelledAir:
         count = self._library.radio_air_results(self._air, ctypes.byref(rows), ctypes.byref(store))
         # RANGE holds no pointers: copies of the bytes will do.
         taken = np.frombuffer(ctypes.string_at(rows.value or 0, count * RANGE.itemsize), RANGE)
-        values = np.frombuffer(ctypes.string_at(store.value or 0, 2 * self._store_values), "<i2")
+        values = np.frombuffer(ctypes.string_at(store.value or 0, 2 * _STORE_VALUES), "<i2")
         self._library.radio_air_forget(self._air)
         return taken, values
 

@@ -158,7 +158,7 @@ def run(
                 float(maes.mean()),
                 float(maes.std()),
                 {label: float(np.abs(errors[:, dataset.labels == label]).mean()) for label in labels},
-                bootstrap_interval(errors[0], dataset.configurations, seed=0),
+                bootstrap_interval(errors[0], dataset.configurations),
             )
         )
     final = np.array([part.errors["shipped_int8"] for part in held])
