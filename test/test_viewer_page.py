@@ -14,7 +14,7 @@ from browser import Browser
 from uwb_mitigation.benches.visitors import Visitors
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.measurement import Cir, Encoding, Status
-from uwb_mitigation.viewer.scene import AnchorPlace, Pose, Report, Sample, Scene, Trace
+from uwb_mitigation.viewer.scene import MAX_PAIRS, SILENT_S, AnchorPlace, Pose, Report, Sample, Scene, Trace
 from uwb_mitigation.viewer.server import ViewerServer
 from uwb_mitigation.viewer.view import Drawing, View
 
@@ -190,6 +190,60 @@ def test_tags_are_told_apart_by_their_names(browser: Browser, view: View, server
         scene.add_sample((1, 9), Sample(1000.0, 5.3, 5.1, 0.1, Status.OK))
         assert scene.tag_of(8) is scene.tags["tag_8"]
         assert scene.tag_of(7) is None, "the plain pose may be of either"
+
+
+def test_what_no_radio_measured_spoils_nothing(browser: Browser, view: View, server: ViewerServer) -> None:
+    fill(view)
+    nan, inf = math.nan, math.inf
+    with view.lock:
+        view.scene.set_anchors({1: AnchorPlace(0, 0, 2), 2: AnchorPlace(8, 0, nan)})
+        for pair, values in (
+            ((1, 7), (3e38, -3e38, inf)),
+            ((2, 7), (nan, nan, nan)),
+            ((3, 7), (inf, -inf, 0.1)),
+        ):
+            view.scene.add_sample(pair, Sample(1005.0, *values, Status.BAD_CIR, 3e38))
+            view.scene.add_error(Sample(1005.0, *values, Status.BAD_CIR, 5.0))
+            for scale in (3e38, nan):
+                cir = Cir(np.full(200, 30_000, np.int16), Encoding.MAGNITUDE, 730, nan, scale=scale)
+                assert Trace.of(cir, 1005.0) is None
+        view.scene.add_pose("tag", Pose(1005.0, 4, 3, nan, (nan, nan, nan)))
+    opened(browser, server)
+    assert browser.complaints() == []
+    shown = [
+        cell for cell in browser.run(IN_TABLE + "return cells.map((e) => e.textContent)") if "e+" in cell
+    ]
+    assert shown == ["3.0e+38", "-3.0e+38", "6.0e+38"]
+    assert data(browser, "map", "range") == []
+    ends = browser.run(
+        "return ['strip', 'map'].map((name) => Bokeh.documents[0].get_model_by_name(name).y_range.end)"
+    )
+    assert max(ends) < 20
+
+
+def test_of_too_many_pairs_some_are_shown_for_good_and_the_others_are_counted() -> None:
+    scene = Scene()
+    for step in range(20):
+        for anchor in range(MAX_PAIRS + 100):
+            scene.add_sample((anchor, 7), Sample(1000.0 + step / 10, 5.3, 5.1, 0.1, Status.OK))
+    assert len(scene.pairs) == MAX_PAIRS
+    assert all(history.rate_hz() == pytest.approx(10.0) for _, history, _ in scene.latest())
+    assert (scene.ranges, scene.not_shown) == (20 * (MAX_PAIRS + 100), 20 * 100)
+    scene.add_sample((5000, 7), Sample(1000.0 + 2 * SILENT_S, 5.3, 5.1, 0.1, Status.OK))
+    assert (5000, 7) in scene.pairs, "the others are silent"
+
+
+def test_clocks_may_differ_and_jump() -> None:
+    scene = Scene()
+    for step in range(50):
+        for anchor, late_s in ((1, 0.0), (2, 5.0)):
+            scene.add_sample((anchor, 7), Sample(1000.0 + step / 10 - late_s, 5.3, 5.1, 0.1, Status.OK))
+    assert [history.rate_hz() for _, history, _ in scene.latest()] == pytest.approx([10.0, 10.0])
+    scene.add_sample((3, 7), Sample(9e8, 5.3, 5.1, 0.1, Status.OK))
+    scene.add_sample((1, 7), Sample(1005.0, 5.3, 5.1, 0.1, Status.OK))
+    assert [pair for pair, _, _ in scene.latest()] == [(1, 7)], "a stamp of the future hides nothing for long"
+    scene.add_sample((1, 7), Sample(1001.0, 5.3, 5.1, 0.1, Status.OK))
+    assert len(scene.pairs[1, 7].samples) == 1, "a replay began anew"
 
 
 def test_a_page_of_nothing_complains_of_nothing(browser: Browser, server: ViewerServer) -> None:

@@ -16,7 +16,6 @@ from bokeh.models import (
     FixedTicker,
     HTMLTemplateFormatter,
     LinearColorMapper,
-    NumberFormatter,
     Range1d,
     Slider,
     StringFormatter,
@@ -34,10 +33,17 @@ TRACE_BEFORE, TRACE_AFTER = 20, 180
 RAW, CORRECTED, TRUE = "#94a3b8", "#2563eb", "#111827"
 _MARK, _WINDOW = "#b91c1c", "#fde68a"
 
+
+def _digits(value: str, digits: int) -> str:
+    """A number in a template; of what is too long for a column the magnitude."""
+    near = f"Math.abs({value}) < 1e5 ? {value}.toFixed({digits})"
+    return f"<%= {near} : isNaN({value}) ? '-' : {value}.toExponential(1) %>"
+
+
 _BAR = (
     '<div style="position:relative;text-align:right"><div style="position:absolute;left:0;top:3px;bottom:3px;'
     'background:#bfdbfe;width:<%= Math.min(100, Math.abs(value) * 50) || 0 %>%"></div>'
-    "<span style=\"position:relative\"><%= isNaN(value) ? '-' : value.toFixed(3) %></span></div>"
+    f'<span style="position:relative">{_digits("value", 3)}</span></div>'
 )
 _COLOURED = (
     '<span style="color:<%= colour %>;font-size:11px;font-weight:600;white-space:normal"><%- value %></span>'
@@ -191,18 +197,20 @@ class Models:
         return _with_legend(plot)
 
     def _pairs_table(self) -> DataTable:
-        def metres() -> NumberFormatter:
-            return NumberFormatter(format="0.000", nan_format="-", text_align="right")
+        def number(digits: int) -> HTMLTemplateFormatter:
+            return HTMLTemplateFormatter(
+                template=f'<div style="text-align:right">{_digits("value", digits)}</div>'
+            )
 
         return DataTable(
             source=self.pairs,
             columns=[
                 _column("anchor", "anchor", 54, StringFormatter()),
                 _column("tag", "tag", 54, StringFormatter()),
-                _column("rate", "Hz", 46, NumberFormatter(format="0.0", nan_format="-")),
-                _column("raw", "raw", 54, metres()),
-                _column("range", "corrected", 66, metres()),
-                _column("sigma", "sigma", 50, metres()),
+                _column("rate", "Hz", 46, number(1)),
+                _column("raw", "raw", 54, number(3)),
+                _column("range", "corrected", 66, number(3)),
+                _column("sigma", "sigma", 50, number(3)),
                 _column("correction", "correction", 76, HTMLTemplateFormatter(template=_BAR)),
                 _column("status", "status", 166, HTMLTemplateFormatter(template=_COLOURED)),
                 # The same for a narrow box.
@@ -263,10 +271,6 @@ def _stacked(field: str, title: str, width: int, *lines: str) -> TableColumn:
         f"<div>{line}</div>" for line in lines
     )
     return _column(field, title, width, HTMLTemplateFormatter(template=template + "</div>"), STACKED)
-
-
-def _digits(value: str, digits: int) -> str:
-    return f"<%= isNaN({value}) ? '-' : {value}.toFixed({digits}) %>"
 
 
 def _figure(title: str, height: int, x: str, y: str, **options: Any) -> figure:

@@ -34,6 +34,9 @@ COLOURS = {
 LEVELS = ("OK", "WARN", "ERROR", "STALE")
 LEVEL_COLOURS = ("#15803d", "#b45309", "#b91c1c", "#6b7280")
 
+FARTHEST_M = 10_000.0
+"""A range of more is in the table alone: no radio has measured it."""
+
 _REPORTS_STYLE = (
     "<style>td{padding:2px 10px 2px 4px;vertical-align:top;overflow-wrap:anywhere}"
     "td:first-child{min-width:90px}</style>"
@@ -144,8 +147,10 @@ class Page:
         _choose(self._models.pairs, rows, self._selected)
 
     def _draw_summary(self, scene: Scene) -> None:
-        ranges = sum(history.ranges for history in scene.pairs.values())
-        parts = [f"{len(self._rows)} pairs", f"{ranges} ranges"]
+        count = len(self._rows)
+        parts = [f"{count} pair{'' if count == 1 else 's'}", f"{scene.ranges} ranges"]
+        if scene.not_shown:
+            parts[1] += f", {scene.not_shown} of them of further pairs, which are not shown"
         if math.isfinite(scene.now_s):
             parts.insert(0, f"{_utc(scene.now_s)}")
         raw_m, corrected_m = scene.mean_errors_m()
@@ -189,11 +194,11 @@ class Page:
         pose = None if tag is None else tag.pose
         for (anchor, other), _, sample in scene.latest():
             place = scene.anchors.get(anchor)
-            if other != tag_id or place is None or not math.isfinite(sample.range_m):
+            if other != tag_id or place is None or math.isnan(_drawable(sample.range_m)):
                 continue
             height_m = 0.0 if pose is None else _finite(pose.z - place.z)
             raw_m, range_m = (
-                math.sqrt(max(_finite(value) ** 2 - height_m * height_m, 0.0))
+                math.sqrt(max(_finite(_drawable(value)) ** 2 - height_m * height_m, 0.0))
                 for value in (sample.raw_m, sample.range_m)
             )
             end = (place.x, place.y) if pose is None else (pose.x, pose.y)
@@ -207,12 +212,12 @@ class Page:
         newest = samples[-1].time_s if samples else math.nan
         if not self._changed("strip", (self._selected, newest, len(samples))):
             return
-        self._models.show_empty("strip", not any(math.isfinite(sample.raw_m) for sample in samples))
+        self._models.show_empty("strip", all(math.isnan(_drawable(sample.raw_m)) for sample in samples))
         self._models.strip.data = {
             "age": np.array([sample.time_s - now_s for sample in samples], np.float32),
-            "raw": np.array([sample.raw_m for sample in samples], np.float32),
-            "range": np.array([sample.range_m for sample in samples], np.float32),
-            "true": np.array([sample.true_m for sample in samples], np.float32),
+            "raw": np.array([_drawable(sample.raw_m) for sample in samples], np.float32),
+            "range": np.array([_drawable(sample.range_m) for sample in samples], np.float32),
+            "true": np.array([_drawable(sample.true_m) for sample in samples], np.float32),
         }
         title = "no pair chosen"
         if self._selected is not None:
@@ -346,6 +351,11 @@ def _utc(time_s: float) -> str:
         return f"{datetime.fromtimestamp(time_s, timezone.utc):%Y-%m-%d %H:%M:%S} UTC"
     except (OverflowError, ValueError, OSError):
         return f"{time_s:.0f} s"
+
+
+def _drawable(value_m: float) -> float:
+    """NaN where a length would leave no room for any other."""
+    return value_m if abs(value_m) < FARTHEST_M else math.nan
 
 
 def _finite(value: float) -> float:

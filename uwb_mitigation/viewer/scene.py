@@ -26,7 +26,10 @@ WATERFALL = 50
 """Exchanges whose CIRs are kept for each pair."""
 
 MAX_PAIRS, MAX_TAGS, MAX_REPORTS, MAX_ANCHORS = 256, 64, 64, 256
-"""Ids come from the air: of more than these, those unheard the longest are forgotten."""
+"""Ids come from the air: of more than these, those unheard the longest are forgotten, pairs once they are silent."""
+
+SILENT_S = 10.0
+"""A pair unheard for as long makes room for another: of too many, some are shown rather than each for a moment."""
 
 MAX_STRIP, MAX_TRAIL = 6000, 1200
 """Points of a strip (100 ranges a second for a minute) and of a tag's trail."""
@@ -118,9 +121,10 @@ class Trace:
 
     @classmethod
     def of(cls, cir: Cir, time_s: float) -> Trace | None:
-        """None where the CIR holds no samples or its samples are not what its encoding says."""
+        """None where the CIR holds no samples, or they are not what its encoding says, or out of all proportion."""
         odd = cir.encoding is Encoding.COMPLEX_INT16 and len(cir.samples) % 2
-        return None if odd or not len(cir.samples) or not math.isfinite(cir.scale) else cls(cir, time_s)
+        # The largest sample times the scale must be a float32 still.
+        return None if odd or not len(cir.samples) or not abs(cir.scale) < 1e30 else cls(cir, time_s)
 
     @property
     def magnitude(self) -> NDArray[np.float32]:
@@ -145,11 +149,9 @@ class History:
 
     samples: deque[Sample] = field(default_factory=lambda: deque(maxlen=MAX_STRIP))
     traces: deque[Trace] = field(default_factory=lambda: deque(maxlen=WATERFALL))
-    ranges: int = 0
 
     def add(self, sample: Sample, now_s: float) -> None:
         """A range; what is older than a minute is forgotten."""
-        self.ranges += 1
         self.samples.append(sample)
         while self.samples[0].time_s < now_s - STRIP_S:
             self.samples.popleft()
@@ -212,6 +214,7 @@ class Scene:
 
     Attributes:
         now_s: the latest stamp seen; NaN before any.
+        ranges, not_shown: how many came, and how many of them are of pairs beyond `MAX_PAIRS`.
         pairs: {(anchor, tag): its last minute}, those heard last at the end.
         tags, true_trails, anchors, reports: {id or name: ...}.
         revision: grows with every change, so that a page may leave alone what has not changed.
@@ -219,6 +222,7 @@ class Scene:
 
     def __init__(self) -> None:
         self.now_s = math.nan
+        self.ranges = self.not_shown = 0
         self.pairs: OrderedDict[Pair, History] = OrderedDict()
         self.tags: OrderedDict[str, Tag] = OrderedDict()
         self.true_trails: OrderedDict[str, deque[tuple[float, float]]] = OrderedDict()
@@ -230,23 +234,32 @@ class Scene:
         self.errors = 0
         self.revision = 0
 
-    def history(self, pair: Pair) -> History:
-        """The history of a pair, made anew for a new one; the pair counts as heard."""
+    def history(self, pair: Pair) -> History | None:
+        """The history of a pair, made anew for a new one; the pair counts as heard. None: there are too many."""
         history = self.pairs.get(pair)
         if history is None:
+            if len(self.pairs) == MAX_PAIRS and not self._forget_silent():
+                return None
             history = self.pairs[pair] = History()
-            if len(self.pairs) > MAX_PAIRS:
-                self.pairs.popitem(last=False)
         self.pairs.move_to_end(pair)
         self.revision += 1
         return history
 
     def add_sample(self, pair: Pair, sample: Sample) -> None:
-        """A corrected range. Time that jumps back by more than a second (a replay's loop) starts the strips anew."""
-        if sample.time_s < self.now_s - 1.0:
+        """A corrected range. Time that jumps back by more than a second (a replay's loop) starts the strips anew.
+
+        The clocks of two pairs may differ by less than a strip: only a pair's own time tells of a jump sooner.
+        """
+        known = self.pairs.get(pair)
+        latest = None if known is None else known.latest
+        if sample.time_s < self.now_s - STRIP_S or (latest and sample.time_s < latest.time_s - 1.0):
             self.rewind()
         self.now_s = max(sample.time_s, self.now_s) if math.isfinite(self.now_s) else sample.time_s
-        self.history(pair).add(sample, self.now_s)
+        self.ranges += 1
+        if (history := self.history(pair)) is None:
+            self.not_shown += 1
+        else:
+            history.add(sample, self.now_s)
 
     def add_error(self, sample: Sample) -> None:
         """Count a range in the histogram, where its truth is known."""
@@ -261,7 +274,8 @@ class Scene:
         self.errors += 1
 
     def add_trace(self, pair: Pair, trace: Trace) -> None:
-        self.history(pair).traces.append(trace)
+        if (history := self.history(pair)) is not None:
+            history.traces.append(trace)
 
     def add_pose(self, tag: str, pose: Pose) -> None:
         entry = self._tag(tag)
@@ -300,6 +314,7 @@ class Scene:
         """Forget everything but the anchors."""
         self.rewind()
         self.pairs.clear()
+        self.ranges = self.not_shown = 0
         self.reports.clear()
         for errors in (self.raw_errors, self.corrected_errors):
             errors[:] = 0
@@ -324,6 +339,14 @@ class Scene:
         own = self.tags.get(tag_frame(tag_id))
         nameless = {tag for _, tag in self.pairs if tag_frame(tag) not in self.tags}
         return self.tags.get(PLAIN) if own is None and nameless == {tag_id} else own
+
+    def _forget_silent(self) -> bool:
+        """Forget the pair unheard the longest, if that is long enough."""
+        pair, history = next(iter(self.pairs.items()))
+        if history.latest is not None and history.latest.time_s > self.now_s - SILENT_S:
+            return False
+        del self.pairs[pair]
+        return True
 
     def _tag(self, tag: str) -> Tag:
         self.revision += 1
