@@ -241,8 +241,10 @@ class DiffuseField:
         return gains
 
 
-def draw_diffuse_field(environment: Environment, n: int, rng: np.random.Generator) -> DiffuseField:
-    """Draw the diffuse fields of `n` independent placements.
+def draw_diffuse_field(
+    environment: Environment, n: int, rng: np.random.Generator, later: NDArray[np.float64] | float = 1.0
+) -> DiffuseField:
+    """Draw the diffuse fields of `n` independent placements; `later`, (n,): factor of the delay of their first clusters.
 
     Clusters: a Poisson number (at least one), exponential gaps, exponential decay, log-normal power.
     Rays: gaps from a mixture of two exponentials, exponential decay, log-normal Nakagami m
@@ -264,7 +266,7 @@ def draw_diffuse_field(environment: Environment, n: int, rng: np.random.Generato
     ray_decay_ns = e.ray_decay_ns + e.ray_decay_growth * start[..., None]
     power = (cluster_power[..., None] * np.exp(-offset / ray_decay_ns)).reshape(n, -1)
     delay = (start[..., None] + offset).reshape(n, -1)
-    delay += rng.exponential(1.0, (n, 1)) * e.first_cluster_delay_ns
+    delay += (rng.exponential(1.0, n) * e.first_cluster_delay_ns * later)[:, None]
     m = np.maximum(np.exp(rng.normal(e.nakagami_log_mean, e.nakagami_log_std, power.shape)), 0.5)
     shadowing = rng.normal(0.0, e.shadowing_db, n)
     pattern_loss = rng.gamma(*PATTERN_LOSS_DB, n)

@@ -86,11 +86,11 @@ class Links:
 
 
 def draw_fields(
-    environments: Environments, n: int, rng: np.random.Generator
+    environments: Environments, n: int, rng: np.random.Generator, later: NDArray[np.float64] | float = 1.0
 ) -> tuple[DiffuseField, DiffuseField]:
-    """The diffuse fields of n placements, in line of sight and out of it."""
+    """The diffuse fields of n placements, in line of sight and out of it; see `draw_diffuse_field` for `later`."""
     in_sight, blocked = environments
-    return draw_diffuse_field(in_sight, n, rng), draw_diffuse_field(blocked, n, rng)
+    return draw_diffuse_field(in_sight, n, rng, later), draw_diffuse_field(blocked, n, rng, later)
 
 
 def place(size: Point, n: int, rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
