@@ -191,6 +191,21 @@ def pair(
     return (*drivers, *chips)
 
 
+def double_buffered(air: Air, mode: Mode = Mode()) -> tuple[Driver, Driver]:
+    """A pair whose second listens with both buffers."""
+    a, b, *_ = pair(air, mode=mode)
+    b.set(0x04, 0, b.get(0x04) & ~(1 << 12) | 1 << 29)
+    b.listen()
+    b.host.delay(20e-6)
+    return a, b
+
+
+def send_whole(sender: Driver, data: bytes) -> None:
+    """Send, and let it arrive."""
+    sender.send(data)
+    sender.host.delay(2e-3)
+
+
 DATA = bytes.fromhex("4188") + b"\x07payload"
 
 

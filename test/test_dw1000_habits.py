@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import dw1000_driver as dw
 import pytest
 from compilers import NEEDS_CC
-from dw1000_driver import Driver, Mode, exchange, flight_ticks, pair
+from dw1000_driver import Driver, Mode, double_buffered, exchange, flight_ticks, pair, send_whole
 
 from uwb_mitigation.dw1000_model.air import Air
 
@@ -183,20 +183,9 @@ class TestReceiving:
 
 
 class TestDoubleBuffer:
-    def listening(self, air: Air, mode: Mode | None = None) -> tuple[Driver, Driver]:
-        a, b, *_ = pair(air, mode=mode or Mode())
-        b.set(0x04, 0, b.get(0x04) & ~(1 << 12) | 1 << 29)
-        b.listen()
-        b.host.delay(20e-6)
-        return a, b
-
-    def send(self, a: Driver, data: bytes) -> None:
-        a.send(data)
-        a.host.delay(2e-3)
-
     def test_pointers_are_aligned_by_their_octet_alone(self, air: Air):
-        a, b = self.listening(air)
-        self.send(a, dw.DATA)
+        a, b = double_buffered(air)
+        send_whole(a, dw.DATA)
         side = b.get(0x0F, 3, 1)
         assert (side >> 7 & 1) != (side >> 6 & 1)
         b.set(0x0D, 3, 1, 1)
@@ -205,22 +194,22 @@ class TestDoubleBuffer:
 
     def test_an_enable_leaves_the_flags_of_a_frame_that_waits(self, air: Air):
         """Drivers turn the receiver on again before they read."""
-        a, b = self.listening(air)
+        a, b = double_buffered(air)
         b.set(0x04, 0, b.get(0x04) & ~(1 << 29))
         b.off()
         b.listen()
         b.host.delay(20e-6)
-        self.send(a, dw.DATA)
+        send_whole(a, dw.DATA)
         b.command(dw.RXENAB)
         assert b.status & SWINGING == SWINGING
         assert b.received() == dw.DATA
 
     def test_an_overrun_ends_with_the_hosts_pointer_and_the_receiver_goes_on(self, air: Air):
-        a, b = self.listening(air)
+        a, b = double_buffered(air)
         for data in (b"first", b"second"):
-            self.send(a, data)
+            send_whole(a, data)
         stamp = b.rx_stamp
-        self.send(a, b"third")
+        send_whole(a, b"third")
         assert b.status & (1 << 20)
         assert b.rx_stamp != stamp, "what was known of the first frame"
         assert b.get(0x19, 0, 4) >> 16 & 15 == 5, "RXAUTR"
@@ -230,9 +219,9 @@ class TestDoubleBuffer:
     @pytest.mark.parametrize("masked", [True, False])
     def test_clearing_what_swings_makes_a_pulse_unless_it_is_masked(self, air: Air, masked: bool):
         """Errata IRQ-1: an interrupt that tells of nothing."""
-        a, b = self.listening(air)
+        a, b = double_buffered(air)
         b.set(0x0E, 0, dw.RXFCG)
-        self.send(a, dw.DATA)
+        send_whole(a, dw.DATA)
         assert b.host.irq()
         if masked:
             b.set(0x0E, 0, 0)
@@ -256,10 +245,10 @@ class TestDoubleBuffer:
         self, air: Air, written: int, spoilt: bool
     ):
         """Errata RX-1: octet 128 of the second buffer."""
-        a, b = self.listening(air, Mode(long_frames=True))
+        a, b = double_buffered(air, Mode(long_frames=True))
         long = bytes(range(200))
-        self.send(a, long)
-        self.send(a, long)
+        send_whole(a, long)
+        send_whole(a, long)
         b.command(1 << 24)
         assert not b.status & dw.ICRBP
         b.write(0x09, 0, bytes(written))

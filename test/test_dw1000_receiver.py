@@ -5,7 +5,7 @@ from __future__ import annotations
 import dw1000_driver as dw
 import pytest
 from compilers import NEEDS_CC
-from dw1000_driver import Driver, Mode, exchange, flight_ticks, pair
+from dw1000_driver import Driver, Mode, double_buffered, exchange, flight_ticks, pair, send_whole
 
 from uwb_mitigation.dw1000_model.air import Air
 
@@ -171,37 +171,26 @@ class TestReceiver:
 
 
 class TestDoubleBuffer:
-    def both(self, air: Air) -> tuple[Driver, Driver]:
-        a, b, *_ = pair(air)
-        b.set(0x04, 0, b.get(0x04) & ~(1 << 12) | 1 << 29)
-        b.listen()
-        b.host.delay(20e-6)
-        return a, b
-
-    def send(self, a: Driver, data: bytes) -> None:
-        a.send(data)
-        a.host.delay(1e-3)
-
     def test_a_second_frame_arrives_while_the_first_is_read(self, air: Air):
-        a, b = self.both(air)
-        self.send(a, b"first")
+        a, b = double_buffered(air)
+        send_whole(a, b"first")
         assert b.status & dw.ICRBP
-        self.send(a, b"second")
+        send_whole(a, b"second")
         for expected in (b"first", b"second"):
             assert b.status & (dw.RXFCG | dw.LDEDONE | dw.RXOVRR) == dw.RXFCG | dw.LDEDONE
             assert b.received() == expected
             b.set(0x0F, 0, dw.RXFCG | dw.RXDFR | dw.LDEDONE)
             b.command(dw.HRBPT)
         assert not b.status & dw.RXFCG
-        self.send(a, b"third")
+        send_whole(a, b"third")
         assert b.received() == b"third"
 
     def test_a_third_one_spoils_them_and_calls_for_a_reset(self, air: Air):
-        a, b = self.both(air)
+        a, b = double_buffered(air)
         for data in (b"first", b"second"):
-            self.send(a, data)
+            send_whole(a, data)
         stamp = b.rx_stamp
-        self.send(a, b"third")
+        send_whole(a, b"third")
         assert b.status & dw.RXOVRR
         assert b.rx_stamp != stamp, "of what was not read yet"
         b.set(0x0F, 0, dw.RXOVRR)
@@ -209,7 +198,7 @@ class TestDoubleBuffer:
         b.off()
         b.listen()
         b.host.delay(20e-6)
-        self.send(a, b"fourth")
+        send_whole(a, b"fourth")
         b.command(dw.HRBPT)
         assert abs(flight_ticks(a, b) - 3.0 / dw.TICK_M) * dw.TICK_M > 1.0, "without a receiver reset"
         b.off()

@@ -35,5 +35,17 @@ static void fuzz_fill(uint8_t *data, size_t size) {
         data[byte] = (uint8_t)(fuzz_state >> 56);
     }
 }
+
+/* Give the target all inputs that are asked for, `size` bytes each. */
+static inline void fuzz_run(int argc, char **argv, size_t size) {
+    const unsigned long inputs = fuzz_inputs(argc, argv);
+    uint8_t *data = malloc(size);
+    check(data != NULL, "memory");
+    for (unsigned long i = 0; i < inputs; i++) {
+        fuzz_fill(data, size);
+        (void)LLVMFuzzerTestOneInput(data, size);
+    }
+    free(data);
+}
 #endif
 #endif

@@ -114,12 +114,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
 
 #ifndef UWB_LIBFUZZER
 int main(int argc, char **argv) {
-    static uint8_t data[6000];
-    const unsigned long inputs = fuzz_inputs(argc, argv);
-    for (unsigned long i = 0; i < inputs; i++) {
-        fuzz_fill(data, sizeof data);
-        (void)LLVMFuzzerTestOneInput(data, sizeof data);
-    }
+    fuzz_run(argc, argv, 6000);
     return 0;
 }
 #endif
