@@ -78,13 +78,36 @@ def test_ranges_that_are_doubted_teach_nothing():
     others = others.take(others.stamp_ns > ranges.stamp_ns[-1])
     run(fleet, others.take(others.anchor != 2))
     locator, own = fleet.tags[TAG].locator, others.take(others.anchor == 2)
-    range_m, variance = float(own.range_m[-1]), float(own.variance_m2[-1])
-    locator.add(int(own.stamp_ns[-1]), 2, range_m, variance)
-    for z, too_long_m, learns in ((1.2, 0.0, False), (-1.2, 0.0, False), (0.0, 1.5, False), (0.0, 0.0, True)):
+    variance = float(own.variance_m2[-1])
+    for k, (z, too_long_m, learns) in enumerate(
+        [(0.0, 0.0, True), (1.2, 0.0, False), (-1.2, 0.0, False), (0.0, 1.5, False)]
+    ):
+        # Later each time: a pair is asked five times a second at most.
+        stamp_ns = int(own.stamp_ns[-1]) + 3 * k * NANOSECONDS // 10
+        away = circuit(np.array([stamp_ns / NANOSECONDS]))[0] - HALL.position[2]
+        range_m = float(np.linalg.norm(away)) + PAIRS[2]
+        locator.add(stamp_ns, 2, range_m, variance)
         locator.states[2].z = z
-        before = learner.offset_m.copy()
+        before, sure = learner.offset_m.copy(), learner.sd_m[2]
         assert learner.add(locator, 2, range_m + too_long_m, variance) is learns
         assert (learner.offset_m == before).all() is np.bool_(not learns)
+        # That a range was left out says that less is known; a reflection, which it is when far out, says nothing.
+        assert (learner.sd_m[2] > sure + 2e-5) is np.bool_(not learns and not too_long_m)
+
+
+def test_deviations_are_honest_though_only_ranges_that_agree_teach():
+    z = []
+    for seed in range(8):
+        rng = np.random.default_rng(100 + seed)
+        offset_m = rng.normal(0.0, 0.15) + rng.normal(0.0, 0.1, 5)
+        ranges, _ = drive(seconds=60, seed=50 + seed, offset_m=0.0)
+        ranges.range_m[:] += offset_m[ranges.anchor]
+        fleet = Fleet(HALL, Model(), height=HEIGHT)
+        run(fleet, ranges)
+        learner = fleet.tags[TAG].learner
+        z.append((learner.offset_m - offset_m) / learner.sd_m)
+    # 1.35 where what was left out does not count.
+    assert 0.7 < math.sqrt(np.mean(np.square(z))) < 1.2
 
 
 @pytest.mark.parametrize("kind", ["aside", "few", "at rest", "height unknown"])
