@@ -80,7 +80,7 @@ def test_ranges_that_are_doubted_teach_nothing():
     locator, own = fleet.tags[TAG].locator, others.take(others.anchor == 2)
     variance = float(own.variance_m2[-1])
     for k, (z, too_long_m, learns) in enumerate(
-        [(0.0, 0.0, True), (1.2, 0.0, False), (-1.2, 0.0, False), (0.0, 1.5, False)]
+        [(0.0, 0.0, True), (1.2, 0.0, False), (-1.2, 0.0, False), (0.0, 6.0, False)]
     ):
         # Later each time: a pair is asked five times a second at most.
         stamp_ns = int(own.stamp_ns[-1]) + 3 * k * NANOSECONDS // 10
