@@ -25,7 +25,9 @@ from uwb_mitigation.sources.simulated import SimulatedSource  # noqa: E402
 PICTURES = REPOSITORY / "docs" / "pictures"
 SIMULATED_HZ = 40.0
 WATCHED_S = 40.0
-"""Before the pictures are taken: a trail, and most of a strip."""
+"""Before the page is opened: a trail, and most of a strip."""
+FILLED_S = 7.0
+"""Before the pictures are taken: a waterfall."""
 
 
 def save(browser: Browser, name: str) -> None:
@@ -58,7 +60,8 @@ def main() -> None:
             time.sleep(WATCHED_S)
             browser.open(f"http://localhost:{port}/", 1280, 1170)
             browser.wait("the page", browser.ready)
-            time.sleep(2.0)
+            # CIRs come only while a page is open.
+            time.sleep(FILLED_S)
             save(browser, "viewer")
             browser.resize(400, 800)
             time.sleep(2.0)

@@ -175,6 +175,18 @@ def test_a_click_on_an_anchor_shows_its_pair(browser: Browser, view: View, serve
     assert browser.complaints() == []
 
 
+def test_the_newest_exchange_is_on_top(browser: Browser, view: View, server: ViewerServer) -> None:
+    fill(view, upto_s=0.5)
+    opened(browser, server)
+    colours = browser.run(
+        "const plot = Bokeh.index.find_one(Bokeh.documents[0].get_model_by_name('waterfall'));"
+        "const drawn = plot.export('png', false).canvas.getContext('2d'), {x_scale, y_scale} = plot.frame;"
+        "return [2, 40].map((ago) => Array.from(drawn.getImageData(x_scale.compute(10), y_scale.compute(ago), 1, 1).data))"
+    )
+    none, peak = [68, 1, 84, 255], [253, 231, 36, 255]
+    assert colours == [peak, none]
+
+
 def test_tags_are_told_apart_by_their_names(browser: Browser, view: View, server: ViewerServer) -> None:
     with view.lock:
         scene = view.scene

@@ -162,9 +162,10 @@ class Models:
         plot.x_range = Range1d(-TRACE_BEFORE, TRACE_AFTER)
         plot.y_range = Range1d(WATERFALL, 0)
         levels = LinearColorMapper("Viridis256", low=0, high=255)
+        # By its first row, which is the newest; the axis runs downwards.
         plot.image(
-            "image", x=-TRACE_BEFORE, y=WATERFALL, dw=TRACE_BEFORE + TRACE_AFTER, dh=WATERFALL,
-            source=self.waterfall, color_mapper=levels, origin="top_left", anchor="top_left",
+            "image", x=-TRACE_BEFORE, y=0, dw=TRACE_BEFORE + TRACE_AFTER, dh=WATERFALL,
+            source=self.waterfall, color_mapper=levels,
         )  # fmt: skip
         scale = {0: "-40", 127.5: "-20", 255: "0"}
         plot.add_layout(
