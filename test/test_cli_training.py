@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 from pathlib import Path
 
@@ -13,7 +12,6 @@ from model_material import card, random_weights
 from typer.testing import CliRunner
 
 from uwb_mitigation.cli import app
-from uwb_mitigation.commands import data, report, training
 from uwb_mitigation.errors import ModelError, UwbMitigationError
 from uwb_mitigation.model import graph
 from uwb_mitigation.model.architecture import Remnet
@@ -98,23 +96,6 @@ def test_a_bundle_that_may_know_the_test_part_is_not_pruned(bag, tmp_path, train
     with pytest.raises(ModelError, match=message):
         run("prune", tmp_path / "trained.onnx", *pickled, "-o", tmp_path / "pruned.onnx")
     assert not (tmp_path / "pruned.onnx").exists()
-
-
-@pytest.mark.parametrize(
-    "command",
-    [
-        training.protocol,
-        training.search,
-        training.prune,
-        training.train_lr_range,
-        data.simulate,
-        report.report,
-    ],
-)
-def test_help_breaks_no_sentence(command):
-    # `--help` keeps the breaks of every paragraph but the first.
-    _, *paragraphs = inspect.getdoc(command).split("\n\n")
-    assert not [paragraph for paragraph in paragraphs if "\n" in paragraph]
 
 
 def test_search_leaves_journal_front_and_figure(bag, tmp_path):

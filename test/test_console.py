@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import typer
+from command_line import run
 
 from uwb_mitigation.commands import console
 from uwb_mitigation.errors import UwbMitigationError
@@ -27,3 +28,9 @@ def test_a_result_that_json_cannot_hold_is_refused(tmp_path: Path):
 def test_a_place_that_can_hold_no_result_is_refused_before_the_work(place: str):
     with pytest.raises(typer.BadParameter):
         console._check_json_target(Path(place))
+
+
+def test_help_takes_the_width_of_the_terminal_and_keeps_commands_on_lines_of_their_own(tmp_path: Path):
+    text = run("offset", "--help", folder=tmp_path).stdout
+    assert "and record some hundred ranges." in text
+    assert [line.split()[0] for line in text.splitlines() if "offsets offsets.yaml" in line] == ["ros2"]

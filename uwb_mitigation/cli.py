@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import inspect
 import sys
 from collections.abc import Callable
-from typing import Annotated, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import typer
+import typer.main
 from typer.core import TyperGroup
 
 import uwb_mitigation
@@ -123,6 +125,16 @@ def _root(
     pass
 
 
+def _fill(command: Any) -> None:
+    """Let the help of a command and of those below it take the terminal's width: typer keeps a docstring's lines."""
+    paragraphs = inspect.cleandoc(command.help or "").split("\n\n")
+    command.help = "\n\n".join(
+        text if text.startswith(" ") else text.replace("\n", " ") for text in paragraphs
+    )
+    for below in getattr(command, "commands", {}).values():
+        _fill(below)
+
+
 def _fail(error: UwbMitigationError) -> NoReturn:
     console.err.print(f"uwb-mitigation: {error}", style="red", markup=False, soft_wrap=True)
     sys.exit(1)
@@ -133,8 +145,10 @@ def main() -> None:
 
     Where the reader of standard output (head, less) goes away, typer and rich end it: silently, with 1.
     """
+    command = typer.main.get_command(app)
+    _fill(command)
     try:
-        app()
+        command()
     except UwbMitigationError as error:
         _fail(error)
     except ImportError as error:
