@@ -57,6 +57,8 @@ def _node(name: str) -> None:
     if {"-h", "--help"} & set(sys.argv[1:]):
         from uwb_mitigation.nodes.help import text_for
 
+        # Whoever reads it, such as `head`, may have enough of it.
+        signal.signal(signal.SIGPIPE, signal.SIG_DFL)
         print(text_for(name))
     elif name == "monitor":
         # It draws in this thread, and is spun by another.
