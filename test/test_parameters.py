@@ -119,7 +119,7 @@ def test_topics_can_be_remapped_and_the_frame_is_a_parameter(ros: Ros, tmp_path:
         "source:=mcap",
         f"path:={bag}",
         "frame_id:=mast",
-        "start_delay:=0.5",
+        "start_delay:=3.0",
         arguments=("-r", "uwb/range_raw:=/elsewhere"),
     )
     ros.spin_until(lambda: len(received) == 5)

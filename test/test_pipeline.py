@@ -27,7 +27,7 @@ pytestmark = pytest.mark.ros
 
 RAW = "/uwb/range_raw"
 CORRECTED = "/uwb/range_corrected"
-PLAY = ("count:=200", "seed:=1", "simulated_rate:=400.0", "start_delay:=0.5")
+PLAY = ("count:=200", "seed:=1", "simulated_rate:=400.0", "start_delay:=3.0")
 
 
 def test_the_ranges_are_those_of_the_library_to_the_bit(ros: Ros):

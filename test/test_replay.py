@@ -162,7 +162,7 @@ def test_the_same_bag_gives_the_same_corrected_ranges_twice(ros: Ros, bag: Path)
             f"path:={bag}",
             f"rate:={rate}",
             "publish_clock:=true",
-            "start_delay:=0.5",
+            "start_delay:=3.0",
         )
         assert pipeline.wait() == 0, pipeline.output
         ros.spin_until(lambda: len(received) == COUNT)
