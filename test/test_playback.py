@@ -118,6 +118,24 @@ def test_a_wall_clock_that_is_set_neither_stops_nor_hurries_a_replay(monkeypatch
     assert steps_s == [0, -3600, 14_400], "stamps are on the clock as it is set"
 
 
+def test_a_process_held_up_between_two_clocks_does_not_take_one_for_set(monkeypatch: pytest.MonkeyPatch):
+    steady_ns, held_up_ns = [0], [0]
+
+    def wall_ns() -> int:
+        steady_ns[0] += held_up_ns[0]
+        wall = 10**18 + steady_ns[0]
+        steady_ns[0] += held_up_ns[0]
+        return wall
+
+    monkeypatch.setattr(time, "monotonic_ns", lambda: steady_ns[0])
+    monkeypatch.setattr(time, "time_ns", wall_ns)
+    pace = clocks.Pace(Clock(clock_type=ClockType.SYSTEM_TIME))
+    stamps = []
+    for due_ns, held_up_ns[0] in ((0, 0), (25_000_000, 5_000_000), (50_000_000, 0)):
+        stamps.append(pace.stamp_ns(due_ns))
+    assert [b - a for a, b in pairwise(stamps)] == [25_000_000, 25_000_000]
+
+
 def test_how_late_a_source_is_that_cannot_keep_its_rate_is_known():
     class Slow(ListSource):
         def __iter__(self):

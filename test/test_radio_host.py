@@ -10,6 +10,7 @@ import select
 import sys
 import threading
 import time
+import tty
 import types
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -56,6 +57,30 @@ def wait_until(true: Callable[[], bool]) -> None:
     while not true():
         assert time.monotonic() < until
         time.sleep(0.02)
+
+
+def test_an_answer_that_comes_late_is_not_taken_for_the_boards_greeting():
+    board, port = os.openpty()
+    tty.setraw(port)
+    late = [b"\x02\x00\x03", b""]
+
+    def answer() -> None:
+        while late:
+            assert os.read(board, 100) == b"deca?"
+            os.write(board, late.pop(0) + b"yEVB1000 USB2SPI 1.0\0")
+
+    answering = threading.Thread(target=answer)
+    answering.start()
+    try:
+        found = Evb1000Bus(PortAddress.parse(os.ttyname(port)))
+        assert found.version == "EVB1000 USB2SPI 1.0"
+        found.close()
+    finally:
+        late.clear()
+        os.write(port, b"deca?")
+        answering.join()
+        os.close(board)
+        os.close(port)
 
 
 @pytest.fixture(scope="module")

@@ -45,10 +45,21 @@ class Pace:
         """The time on the node's clock of a moment of the pace; moments are as far apart on both."""
         if self._simulated:
             return pace_ns
-        offset_ns = self._stamp_now_ns() - time.monotonic_ns()
-        if self._offset_ns is None or abs(offset_ns - self._offset_ns) > STEP_NS:
+        offset_ns, unsure_ns = self._read_both()
+        while self._offset_ns is None and unsure_ns > STEP_NS:
+            offset_ns, unsure_ns = self._read_both()
+        if self._offset_ns is None or abs(offset_ns - self._offset_ns) > STEP_NS + unsure_ns:
             self._offset_ns = offset_ns
         return pace_ns + self._offset_ns
+
+    def _read_both(self) -> tuple[int, int]:
+        """How far the node's clock is ahead of the steady one, and how far off that may be, ns.
+
+        A process that was held up between the two readings must not take it for a clock that was set.
+        """
+        before_ns = time.monotonic_ns()
+        offset_ns = self._stamp_now_ns() - before_ns
+        return offset_ns, time.monotonic_ns() - before_ns
 
     @property
     def _simulated(self) -> bool:

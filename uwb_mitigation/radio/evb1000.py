@@ -103,6 +103,19 @@ class Evb1000Bus:
             self._port = None
 
     def _greet(self) -> str:
+        text = self._ask()
+        # An answer to an earlier program, or to a request that was given up, may have come only now, before ours.
+        if text and not text.startswith(("y", "n")):
+            text = self._ask()
+        if text.startswith("y"):
+            return text[1:]
+        if text.startswith("n"):
+            raise LinkError("the board ranges by itself", where=str(self._address), valid=_HOW)
+        told = f"the board answers deca? with {text!r}" if text else "no answer to deca?"
+        raise LinkError(told, where=str(self._address), valid=f"an EVB1000; {_HOW}")
+
+    def _ask(self) -> str:
+        """What it says to `deca?`."""
         # What an earlier program left half sent or unread goes first.
         with contextlib.suppress(LinkError):
             while self._read_some(0.02):
@@ -112,13 +125,7 @@ class Evb1000Bus:
         until = time.monotonic() + ANSWER_WITHIN_S
         while not answer.endswith(b"\0") and time.monotonic() < until:
             answer += self._read_some(until - time.monotonic())
-        text = answer.rstrip(b"\0").decode("ascii", "replace")
-        if text.startswith("y"):
-            return text[1:]
-        if text.startswith("n"):
-            raise LinkError("the board ranges by itself", where=str(self._address), valid=_HOW)
-        told = f"the board answers deca? with {text!r}" if text else "no answer to deca?"
-        raise LinkError(told, where=str(self._address), valid=f"an EVB1000; {_HOW}")
+        return answer.rstrip(b"\0").decode("ascii", "replace")
 
     def _send(self, data: bytes) -> None:
         fd = self._fd()
