@@ -43,6 +43,6 @@ for name in sys.argv[3:]:
     mitigation = Mitigation(load_bundle(model_path(name)))
     less_m = offset_m if mitigation.bundle.prior == LinePrior(0.0) else 0.0
     print(name)
-    for level in (-25, -20, *range(-16, -8), -7, -5, 0, 3, 5, 8, 10, 15, 20):
+    for level in (-25, *range(-20, -8), -7, -5, 0, 3, 5, 8, 10, 15, 20):
         found = evaluate(mitigation, (heard(record, level, less_m) for record in records))
         print(f"{level:5} {found.corrected.mae / found.raw.mae:.3f}", found.statuses)

@@ -98,8 +98,8 @@ DETECTION_SYMBOLS = 24
 DETOUR_M = 4.0
 DETOUR_MOST = 3.0
 """Behind obstacles the first cluster comes later in proportion to the distance, since all detours of a shape grow with
-it: as late as the environment has it at so many m, which is about the mean distance of the logs that this was fitted
-to, and at most so many times later, 8.1 ns (the report's own program: 8.3)."""
+it: as late as the environment has it at so many m, and at most so many times later, 8.1 ns (the report's own program:
+8.3). Assumed, and kept because it helped on the real logs (docs/simulator.md)."""
 
 PLACEMENTS, BUILDINGS = 256, 4
 """In one block, which is what one generator draws."""
