@@ -28,13 +28,13 @@ class Finished(NamedTuple):
     stderr: str
 
 
-def run(*arguments: object, folder: Path) -> Finished:
-    """Run the command in `folder`."""
+def run(*arguments: object, folder: Path, columns: int = 160) -> Finished:
+    """Run the command in `folder`, on a terminal of so many columns."""
     out, err = io.StringIO(), io.StringIO()
     before = Path.cwd()
     with (
         mock.patch.object(sys, "argv", ["uwb-mitigation", *map(str, arguments)]),
-        mock.patch.dict(os.environ, COLUMNS="160"),
+        mock.patch.dict(os.environ, COLUMNS=str(columns)),
         contextlib.redirect_stdout(out),
         contextlib.redirect_stderr(err),
     ):

@@ -128,8 +128,9 @@ def _root(
 def _fill(command: Any) -> None:
     """Let the help of a command and of those below it take the terminal's width: typer keeps a docstring's lines."""
     paragraphs = inspect.cleandoc(command.help or "").split("\n\n")
+    # An example in a style, even in none, keeps its indent: typer takes off what all lines but the first begin with.
     command.help = "\n\n".join(
-        text if text.startswith(" ") else text.replace("\n", " ") for text in paragraphs
+        f"[none]{text}[/none]" if text.startswith(" ") else text.replace("\n", " ") for text in paragraphs
     )
     for below in getattr(command, "commands", {}).values():
         _fill(below)
