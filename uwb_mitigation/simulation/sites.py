@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
+from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
 from uwb_mitigation.simulation.buildings import KINDS, RADIO, RESIDENTIAL, draw_plan, mean_level_dbm
@@ -49,7 +49,7 @@ class Site:
     plan: FloorPlan
     anchors: tuple[Point, ...]
     cells: NDArray[np.float64]
-    ways: coo_array
+    ways: csr_array
 
     def route(self, rng: np.random.Generator) -> tuple[Point, ...]:
         """A closed route by the shortest ways past `WAYPOINTS` random places."""
@@ -96,7 +96,7 @@ def _along_walls(size: Point, count: int, rng: np.random.Generator) -> tuple[Poi
     return tuple((float(a), float(b)) for a, b in places)
 
 
-def _free(plan: FloorPlan) -> tuple[NDArray[np.float64], coo_array]:
+def _free(plan: FloorPlan) -> tuple[NDArray[np.float64], csr_array]:
     """The largest part of a grid whose cells lead to each other, and the ways between neighbours."""
     columns, rows = (np.arange(CELL_M, side, CELL_M) for side in plan.size)
     grid = np.stack(np.meshgrid(columns, rows, indexing="ij"), axis=-1)
