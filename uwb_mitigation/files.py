@@ -58,7 +58,8 @@ def write_together(
     """Write files that belong together, each as `write_whole` does; none takes its place before all are written.
 
     Raises:
-        UwbMitigationError: as `error`: one of them cannot be written, and all are as they were.
+        UwbMitigationError: as `error`: one of them cannot be written, and all are as they were; or it was written whole
+            but may not take its place (another user's file in a folder like /tmp), and only those before it are new.
     """
     partials: dict[Path, Path] = {}
     path = Path()

@@ -325,7 +325,7 @@ def regressors(site: SiteData, source: Bundle) -> Regressors:
 
 
 def write(output: Path, result: Calibrated, source: Bundle, name: str) -> tuple[Bundle, Path]:
-    """The bundle, and the offsets beside it as `X.offsets.yaml`: both, or neither.
+    """The bundle, and the offsets beside it as `X.offsets.yaml`, together (`write_together`).
 
     Args:
         name: of the recordings, for people.
