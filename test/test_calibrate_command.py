@@ -26,7 +26,7 @@ LEVER = np.array([0.4, 0.1, 0.0])
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
-    """A folder with a drive past five anchors, without CIRs, and a localisation 0.3 s late; and a short one."""
+    """A folder with a drive past five anchors, without CIRs, and a localisation 0.3 s late; a short one, and one of few ranges."""
     from drives import HALL
 
     folder = tmp_path_factory.mktemp("a site")
@@ -38,6 +38,7 @@ def site(tmp_path_factory):
     with (
         BagWriter(folder / "drive.mcap", {"simulated": "true"}) as bag,
         BagWriter(folder / "short.mcap", {}) as short,
+        BagWriter(folder / "few.mcap", {}) as few,
     ):
         for i, stamp in enumerate(ranges.stamp_ns.tolist()):
             cir = Cir(np.zeros(0, np.int16), rx_power_dbm=float(power[i]))
@@ -46,6 +47,8 @@ def site(tmp_path_factory):
             bag.write(record)
             if i < 100:
                 short.write(record)
+            if i % 31 == 0:
+                few.write(record)
             if i % 2 == 0:
                 c, s = np.cos(turn[i]), np.sin(turn[i])
                 frame = path.position[i] - (c * LEVER[0] - s * LEVER[1], s * LEVER[0] + c * LEVER[1], 0.0)
@@ -55,7 +58,8 @@ def site(tmp_path_factory):
                 none = np.array([0.0, 0.0, 0.0, 1.0]).tobytes()
                 at = data.index(none, data.index(frame.tobytes()))
                 data[at : at + 32] = np.array([0.0, 0.0, np.sin(turn[i] / 2), np.cos(turn[i] / 2)]).tobytes()
-                bag.write_message("/odom", "nav_msgs/msg/Odometry", bytes(data), late)
+                for one in (bag, few):
+                    one.write_message("/odom", "nav_msgs/msg/Odometry", bytes(data), late)
     return folder
 
 
@@ -144,6 +148,16 @@ def test_offsets_are_found_without_the_stretches_that_are_held_out(site, truth, 
     assert np.abs(nothing).max() < 2e-3
     assert np.abs(without[own]).max() > 3.0 * np.abs(nothing).max()
     assert np.abs(without).max() < 0.15
+
+
+def test_a_localisation_needs_few_ranges_beside_it(site):
+    done = run(
+        "calibrate", "few.mcap", *LEVEL, "-o", "few.onnx", "--json", "f.json", "--truth-topic", "/odom", "--force",
+        folder=site,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    # Less a quarter, which is held out in turn, it is fewer than tell a lag and a lever arm.
+    assert 40 <= json.loads((site / "f.json").read_text())["labelled"] < 53
 
 
 def test_what_is_refused_is_said_in_the_json_and_writes_nothing(site):

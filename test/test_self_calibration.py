@@ -291,3 +291,20 @@ def test_lag_and_lever_arm_are_found_beside_a_localisation(minute):
     assert (given.time_offset_s, given.time_offset_sd_s) == (pytest.approx(0.3, abs=1e-6), 0.0)
     with pytest.raises(DatasetError, match="localisation's times"):
         solve_localised(HALL, [ranges], late.shifted(10**13), nothing)
+    # As they are left when stretches of a short recording are held out.
+    part = np.arange(20, 620, 20)
+    few = [ranges.take(part)], late, Regressors.none(len(part))
+    alone = solve_localised(HALL, *few, time_offset_s=0.3, lever_arm_m=(0.3, -0.25, 0.0))
+    assert np.abs(alone.offset_m - 0.25).max() < 0.15
+    with pytest.raises(DatasetError, match=r"30 ranges .*40 or more"):
+        solve_localised(HALL, *few, time_offset_s=0.3)
+
+
+@pytest.mark.parametrize("told", [1, 6])
+def test_poses_that_bags_tell_twice_are_as_good_as_told_once(told):
+    stamp_ns = np.arange(200) * 250_000_000
+    position = np.random.default_rng(1).normal(size=(200, 3))
+    once = PosePath(stamp_ns, position, np.tile([0.0, 0.0, 0.0, 1.0], (200, 1)))
+    # A nanosecond apart: bags round as they like.
+    path = PosePath.joined([once.shifted(number % 2) for number in range(told)]).smoothed()
+    assert np.abs(path.position - np.repeat(position, told, axis=0)).max() < 1e-12

@@ -47,6 +47,7 @@ _STEPS = 40
 _PERSISTENCE_S = 1.0
 _SMALL_M = 0.02
 _MOST_NEIGHBOURS = 20
+_WORST_CONDITION = 1e6
 _SECOND_NS = 1_000_000_000
 _MODEL = Model(long=1.5, short=1.5)
 
@@ -82,10 +83,11 @@ class PosePath:
             powers = np.where(np.abs(since)[:, None] <= 1.0, since[:, None] ** np.arange(5), 0.0)
             moments[here] += powers
             right[here] += powers[:, :3, None] * self.position[here + step][:, None]
-        told = moments[:, 0] >= 5.0
-        normal = moments[:, np.add.outer(np.arange(3), np.arange(3))][told]
+        normal = moments[:, np.add.outer(np.arange(3), np.arange(3))]
+        # Poses that bags tell twice are at too few times for a parabola.
+        told = (moments[:, 0] >= 5.0) & (np.linalg.cond(normal) < _WORST_CONDITION)
         position = self.position.copy()
-        position[told] = np.linalg.solve(normal, right[told])[:, 0]
+        position[told] = np.linalg.solve(normal[told], right[told])[:, 0]
         return PosePath(self.stamp_ns, position, self.orientation)
 
     @classmethod
@@ -224,11 +226,7 @@ def solve_localised(
     position, turn = path.at(stamp, unknown.lag)
     antenna = position + turn @ unknown.lever
     distance = np.linalg.norm(antenna - anchors.position[row], axis=1)
-    if int(np.isfinite(distance).sum()) < LEAST_RANGES:
-        raise DatasetError(
-            f"{int(np.isfinite(distance).sum())} ranges lie within the localisation's times",
-            valid=f"{LEAST_RANGES} or more: do their clocks agree to {MOST_LAG_S:g} s?",
-        )
+    _check_enough(int(np.isfinite(distance).sum()), time_offset_s is None or lever_arm_m is None)
     sd = np.sqrt(np.diag(unknown.covariance))[: 4 + pairs.shape[1]]
     return Localised(
         unknown.lag,
@@ -241,6 +239,16 @@ def solve_localised(
         antenna,
         distance,
     )
+
+
+def _check_enough(count: int, alignment_unknown: bool) -> None:
+    """Of the offsets alone, whose deviations are known beforehand, any range tells."""
+    least = LEAST_RANGES if alignment_unknown else 1
+    if count < least:
+        raise DatasetError(
+            f"{count} ranges lie within the localisation's times",
+            valid=f"{least} or more: do their clocks agree to {MOST_LAG_S:g} s?",
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -362,11 +370,7 @@ class _Fit:
             rows[:, first:] = self.known.rows
             left = error - x[4:first][self.pair] - self.known.rows @ x[first:]
             known = np.isfinite(left) & np.isfinite(rows).all(axis=1)
-            if int(known.sum()) < LEAST_RANGES:
-                raise DatasetError(
-                    f"{int(known.sum())} ranges lie within the localisation's times",
-                    valid=f"{LEAST_RANGES} or more: do their clocks agree to {MOST_LAG_S:g} s?",
-                )
+            _check_enough(int(known.sum()), free_lag or free_lever)
             normal, right = normal_equations(
                 rows[known], left[known], group[known], self.known.alike[known], _MODEL
             )
