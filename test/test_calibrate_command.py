@@ -150,6 +150,16 @@ def test_offsets_are_found_without_the_stretches_that_are_held_out(site, truth, 
     assert np.abs(without).max() < 0.15
 
 
+def test_of_a_stretch_that_is_held_out_ranges_of_unknown_truth_are_too():
+    from uwb_mitigation.training.calibrating import _whole_stretch
+
+    stretch = np.array([0, 0, 0, 0, 0, 0, 1, 1, 1, 2, 2])
+    labelled = np.array([1, 2, 4, 7, 8])
+    for held_out, gone in (([1, 2], [0, 1, 2, 3]), ([4], [4, 5]), ([7, 8], [6, 7, 8]), ([], [])):
+        found = _whole_stretch(np.array(held_out, int), labelled, stretch)
+        assert np.flatnonzero(found).tolist() == gone
+
+
 def test_a_localisation_needs_few_ranges_beside_it(site):
     done = run(
         "calibrate", "few.mcap", *LEVEL, "-o", "few.onnx", "--json", "f.json", "--truth-topic", "/odom", "--force",

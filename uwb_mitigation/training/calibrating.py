@@ -173,9 +173,7 @@ def without_truth(
     used = np.flatnonzero(known)
 
     def offsets_without(held_out: NDArray[np.intp]) -> NDArray[np.float64]:
-        left_out = np.zeros(len(known), np.bool_)
-        left_out[used[held_out]] = True
-        again = found.found_without(left_out)
+        again = found.found_without(_whole_stretch(used[held_out], used, found.stretches.of))
         grown = {
             (found.tag_ids[tag], ids[row]): again.pair(tag, row)[0] - found.pair(tag, row)[0]
             for tag, row in found.pairs()
@@ -435,6 +433,23 @@ def _labelled(
     assert nothing.anchors is not None
     off = offsets.of_columns(nothing.tags, nothing.anchors).astype(np.float64)
     return replace(nothing, range_m=nothing.range_m - off, error_m=nothing.error_m - off), nothing.error_m
+
+
+def _whole_stretch(
+    held_out: NDArray[np.intp], labelled: NDArray[np.intp], stretch: NDArray[np.intp]
+) -> NDArray[np.bool_]:
+    """Which ranges are held out when those of a part of a stretch are: also those of unknown truth among them.
+
+    Args:
+        held_out: rows, some of `labelled`, which ascend.
+        stretch: int (r,), of all ranges, each stretch in the order of time.
+    """
+    every = np.arange(len(stretch))
+    before = np.maximum(np.searchsorted(labelled, every, side="right") - 1, 0)
+    after = np.minimum(before + 1, len(labelled) - 1)
+    beside = np.where(stretch[labelled[before]] == stretch, labelled[before], labelled[after])
+    found: NDArray[np.bool_] = np.isin(beside, held_out) & (stretch[beside] == stretch)
+    return found
 
 
 def _of_rows(data: Dataset, of_pair: dict[tuple[int, int], float]) -> NDArray[np.float64]:
