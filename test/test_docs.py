@@ -61,6 +61,13 @@ def test_no_page_holds_a_placeholder():
     assert [page.name for page in PAGES if bare.search(page.read_text(encoding="utf-8"))] == []
 
 
+def test_the_page_of_nodes_names_each_executable_and_each_lifecycle():
+    text = (REPOSITORY / "docs" / "nodes.md").read_text(encoding="utf-8")
+    executables, lifecycle = (text[text.index(head) :].partition("\n\n")[0] for head in ("| exec", "| trans"))
+    assert sorted(re.findall(r"^\| `(\w+)`", executables, re.MULTILINE)) == sorted(NODES)
+    assert re.findall(r"`(\w+)`", lifecycle.splitlines()[0]) == list(TABLES)
+
+
 # What a page tells the reader to type.
 
 
