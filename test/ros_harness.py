@@ -29,6 +29,9 @@ from uwb_mitigation_msgs.msg import RangeCir
 
 TIMEOUT_S = 240.0
 
+PAUSED = ("paused:=true", "start_delay:=0.0", "longest_wait:=3600.0")
+"""Of a driver that plays nothing until somebody subscribes to its ranges and `Ros.play` is called."""
+
 # For this process and for all that it starts; read when messages are loaded and when a context is made.
 os.environ |= {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_PYTHON_CHECK_FIELDS": "1"}
 
@@ -140,6 +143,16 @@ class Ros:
         self.spin_until(asked)
         self.spin_until(lambda: answers[-1].sequence == question.sequence)
         answers.clear()
+
+    def play(self, driver: str = "driver") -> None:
+        """Let a driver that was started `PAUSED` play, once whatever this client collects is connected to its publisher.
+
+        The nodes of the driver's process have found the client when the driver has answered it: a client announces
+        what it makes in turn, and what hears the answer is made last.
+        """
+        self.spin_until(lambda: all(made.get_publisher_count() for made in self.node.subscriptions))
+        self.spin_until(lambda: self.state_of(driver) == "active")
+        assert self.set_parameter(driver, "paused", False).successful
 
     def call(self, kind: type, name: str, request: object) -> object:
         client = self.node.create_client(kind, name)

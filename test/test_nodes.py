@@ -22,7 +22,7 @@ pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from rclpy.serialization import deserialize_message
-from ros_harness import Ros, domain
+from ros_harness import PAUSED, Ros, domain
 from rosgraph_msgs.msg import Clock
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
 
@@ -103,7 +103,8 @@ def played(
     with domain(tmp_path_factory.mktemp("played")) as ros:
         truths = ros.collect(RangeTruth, "/uwb/range_truth")
         received = ros.collect(RangeCir, RAW)
-        ros.start("driver", "source:=mcap", f"path:={bag}", "rate:=10.0", "start_delay:=3.0")
+        ros.start("driver", "source:=mcap", f"path:={bag}", "rate:=10.0", *PAUSED)
+        ros.play()
         ros.spin_until(lambda: len(received) == 300 and len(truths) == 300)
         return received, truths, time.time_ns()
 
@@ -129,9 +130,8 @@ def test_recorded_stamps_and_clock_on_request(ros: Ros, bag: Path):
         recorded = [record.measurement.stamp_ns for record in source]
     received = ros.collect(RangeCir, RAW)
     clock = ros.collect(Clock, "/clock")
-    ros.start(
-        "driver", "source:=mcap", f"path:={bag}", "rate:=10.0", "start_delay:=3.0", "publish_clock:=true"
-    )
+    ros.start("driver", "source:=mcap", f"path:={bag}", "rate:=10.0", "publish_clock:=true", *PAUSED)
+    ros.play()
     ros.spin_until(lambda: len(received) == 300)
     assert [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in received] == recorded
     times = [m.clock.sec * 10**9 + m.clock.nanosec for m in clock]
@@ -197,7 +197,7 @@ def test_a_damaged_bag_is_played_up_to_the_damage(ros: Ros, bag: Path, tmp_path:
 
 def test_without_autostart_nothing_happens_until_asked(ros: Ros, bag: Path):
     received = ros.collect(RangeCir, RAW)
-    ros.start("driver", "source:=mcap", f"path:={bag}", "rate:=20.0", "start_delay:=3.0", "autostart:=false")
+    ros.start("driver", "source:=mcap", f"path:={bag}", "rate:=20.0", "start_delay:=0.0", "autostart:=false")
     assert ros.state_of("driver") == "unconfigured"
     assert ros.change_state("driver", Transition.TRANSITION_CONFIGURE)
     assert ros.state_of("driver") == "inactive"

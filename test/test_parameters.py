@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
 from rclpy.qos import ReliabilityPolicy
-from ros_harness import Ros, domain
+from ros_harness import PAUSED, Ros, domain
 from uwb_mitigation_msgs.msg import RangeCir
 
 from uwb_mitigation.bag.writer import BagWriter
@@ -119,9 +119,10 @@ def test_topics_can_be_remapped_and_the_frame_is_a_parameter(ros: Ros, tmp_path:
         "source:=mcap",
         f"path:={bag}",
         "frame_id:=mast",
-        "start_delay:=3.0",
+        *PAUSED,
         arguments=("-r", "uwb/range_raw:=/elsewhere"),
     )
+    ros.play()
     ros.spin_until(lambda: len(received) == 5)
     assert {message.header.frame_id for message in received} == {"mast"}
 

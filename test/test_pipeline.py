@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
 import rclpy
-from ros_harness import Ros
+from ros_harness import PAUSED, Ros
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
 from uwb_mitigation.bag.codec import encode_range
@@ -27,7 +27,7 @@ pytestmark = pytest.mark.ros
 
 RAW = "/uwb/range_raw"
 CORRECTED = "/uwb/range_corrected"
-PLAY = ("count:=200", "seed:=1", "simulated_rate:=400.0", "start_delay:=3.0")
+PLAY = ("count:=200", "seed:=1", "simulated_rate:=400.0", *PAUSED)
 
 
 def test_the_ranges_are_those_of_the_library_to_the_bit(ros: Ros):
@@ -36,6 +36,7 @@ def test_the_ranges_are_those_of_the_library_to_the_bit(ros: Ros):
     expected = [mitigation.correct(record.measurement) for record in source]
     received = ros.collect(RangeCorrected, CORRECTED)
     pipeline = ros.start("pipeline", *PLAY)
+    ros.play()
     assert pipeline.wait() == 0, pipeline.output
     ros.spin_until(lambda: len(received) == 200)
     assert [m.sequence for m in received] == list(range(200))
@@ -48,6 +49,7 @@ def test_the_raw_ranges_are_there_for_who_subscribes(ros: Ros):
     raw = ros.collect(RangeCir, "/uwb/range_raw")
     corrected = ros.collect(RangeCorrected, CORRECTED)
     ros.start("pipeline", *PLAY)
+    ros.play()
     ros.spin_until(lambda: len(raw) == 200 and len(corrected) == 200)
     assert [m.header for m in raw] == [m.header for m in corrected]
     assert [m.range for m in raw] == [m.range_raw for m in corrected]
@@ -98,6 +100,8 @@ def test_no_raw_range_is_built_while_nobody_subscribes(ros: Ros, monkeypatch: py
 def test_several_pipelines_side_by_side_keep_to_themselves(ros: Ros):
     received = {name: ros.collect(RangeCorrected, f"/{name}{CORRECTED}") for name in ("left", "right")}
     pipelines = [ros.start("pipeline", *PLAY, arguments=("-r", f"__ns:=/{name}")) for name in received]
+    for name in received:
+        ros.play(f"{name}/driver")
     for pipeline in pipelines:
         assert pipeline.wait() == 0, pipeline.output
     ros.spin_until(lambda: all(len(messages) == 200 for messages in received.values()))

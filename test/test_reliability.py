@@ -19,7 +19,7 @@ from lifecycle_msgs.msg import Transition
 from model_material import bundle
 from rclpy.qos import qos_profile_sensor_data
 from rclpy.serialization import deserialize_message
-from ros_harness import Ros
+from ros_harness import PAUSED, Ros
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Range
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
@@ -139,7 +139,10 @@ def test_a_model_is_swapped_live_without_losing_a_range_and_a_bad_one_is_refused
     corrected = ros.collect(RangeCorrected, CORRECTED)
     mitigator = ros.start("mitigator")
     mitigator.wait_for_output("correcting with model")
-    ros.start("driver", "simulated_rate:=200.0", "start_delay:=3.0")
+    # It answers once it has found who collects; the driver counts the mitigator itself.
+    assert ros.state_of("mitigator") == "active"
+    ros.start("driver", "simulated_rate:=200.0", *PAUSED)
+    ros.play()
     ros.spin_until(lambda: len(corrected) > 50)
     refused = ros.set_parameter("mitigator", "model", str(torn))
     assert not refused.successful
@@ -160,8 +163,7 @@ def test_a_model_is_swapped_live_without_losing_a_range_and_a_bad_one_is_refused
 @pytest.mark.ros
 def test_every_transition_of_the_driver_can_be_repeated_and_a_replay_starts_over(ros: Ros):
     received = ros.collect(RangeCir, RAW)
-    # Long enough for the two to find each other: what is sent before is lost, and the first record is looked for.
-    ros.start("driver", "simulated_rate:=100.0", "start_delay:=3.0", "autostart:=false")
+    ros.start("driver", "simulated_rate:=100.0", "start_delay:=0.0", "autostart:=false")
     for _ in range(2):
         for transition in (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE):
             assert ros.change_state("driver", transition)
@@ -182,7 +184,7 @@ def test_every_transition_of_the_driver_can_be_repeated_and_a_replay_starts_over
 def test_a_driver_that_cannot_be_configured_says_why_and_can_be_mended(ros: Ros, tmp_path: Path):
     path = tmp_path / "late.mcap"
     received = ros.collect(RangeCir, RAW)
-    ros.start("driver", "source:=mcap", f"path:={path}", "start_delay:=3.0", "autostart:=false")
+    ros.start("driver", "source:=mcap", f"path:={path}", "start_delay:=0.0", "autostart:=false")
     assert not ros.change_state("driver", Transition.TRANSITION_CONFIGURE)
     assert ros.state_of("driver") == "unconfigured"
     status = ros.diagnosis("driver", lambda status: status.level == DiagnosticStatus.ERROR)

@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
 from players import ListSource, Player, stop_after
-from ros_harness import Ros
+from ros_harness import PAUSED, Ros
 from rosgraph_msgs.msg import Clock as ClockMessage
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
@@ -162,10 +162,13 @@ def test_the_same_bag_gives_the_same_corrected_ranges_twice(ros: Ros, bag: Path)
             f"path:={bag}",
             f"rate:={rate}",
             "publish_clock:=true",
-            "start_delay:=3.0",
+            *PAUSED,
         )
+        ros.play()
         assert pipeline.wait() == 0, pipeline.output
         ros.spin_until(lambda: len(received) == COUNT)
+        # The next one must not be taken for this one.
+        ros.spin_until(lambda: ros.node.count_publishers("/uwb/range_corrected") == 0)
         return [
             (m.header.stamp.sec, m.header.stamp.nanosec, m.sequence, m.range, m.variance, m.status)
             for m in received
