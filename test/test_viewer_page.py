@@ -9,11 +9,13 @@ from threading import Lock
 
 import numpy as np
 import pytest
+from bokeh.document import Document
 from browser import Browser
 
 from uwb_mitigation.benches.visitors import Visitors
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.measurement import Cir, Encoding, Status
+from uwb_mitigation.viewer.page import Page
 from uwb_mitigation.viewer.scene import MAX_PAIRS, SILENT_S, AnchorPlace, Pose, Report, Sample, Scene, Trace
 from uwb_mitigation.viewer.server import ViewerServer
 from uwb_mitigation.viewer.view import Drawing, View
@@ -208,7 +210,7 @@ def test_what_no_radio_measured_spoils_nothing(browser: Browser, view: View, ser
     fill(view)
     nan, inf = math.nan, math.inf
     with view.lock:
-        view.scene.set_anchors({1: AnchorPlace(0, 0, 2), 2: AnchorPlace(8, 0, nan)})
+        view.scene.set_anchors({1: AnchorPlace(0, 0, 2), 2: AnchorPlace(8, 0, nan), 3: AnchorPlace(0, 1e300)})
         for pair, values in (
             ((1, 7), (3e38, -3e38, inf)),
             ((2, 7), (nan, nan, nan)),
@@ -216,10 +218,18 @@ def test_what_no_radio_measured_spoils_nothing(browser: Browser, view: View, ser
         ):
             view.scene.add_sample(pair, Sample(1005.0, *values, Status.BAD_CIR, 3e38))
             view.scene.add_error(Sample(1005.0, *values, Status.BAD_CIR, 5.0))
-            for scale in (3e38, nan):
-                cir = Cir(np.full(200, 30_000, np.int16), Encoding.MAGNITUDE, 730, nan, scale=scale)
+            for scale, first_path, count in (
+                (3e38, nan, 200),
+                (nan, nan, 200),
+                (1.0, 1e30, 200),
+                (1.0, -3.4e38, 200),
+                (1.0, nan, 2033),
+            ):
+                cir = Cir(np.full(count, 30_000, np.int16), Encoding.MAGNITUDE, 730, first_path, scale=scale)
                 assert Trace.of(cir, 1005.0) is None
-        view.scene.add_pose("tag", Pose(1005.0, 4, 3, nan, (nan, nan, nan)))
+        view.scene.add_pose("tag", Pose(1005.0, 4, 3, nan, (1e300, nan, nan)))
+        view.scene.add_pose("tag", Pose(1005.0, 1e300, 3, 0))
+        view.scene.add_true_position("tag", 4.0, -1e300)
     opened(browser, server)
     assert browser.complaints() == []
     shown = [
@@ -228,9 +238,62 @@ def test_what_no_radio_measured_spoils_nothing(browser: Browser, view: View, ser
     assert shown == ["3.0e+38", "-3.0e+38", "6.0e+38"]
     assert data(browser, "map", "range") == []
     ends = browser.run(
-        "return ['strip', 'map'].map((name) => Bokeh.documents[0].get_model_by_name(name).y_range.end)"
+        "return ['strip', 'map'].flatMap((name) => ['x_range', 'y_range'].flatMap((range) => {"
+        "  const {start, end} = Bokeh.documents[0].get_model_by_name(name)[range]; return [start, end]}))"
     )
-    assert max(ends) < 20
+    assert max(map(abs, ends)) < 100
+    summary = browser.run("return Bokeh.documents[0].get_model_by_name('summary').text")
+    assert "mean absolute error 0.350 m raw, 0.250 m corrected" in summary
+
+
+def test_a_cir_keeps_no_message_in_memory() -> None:
+    samples = np.ones(1_000_000, np.int16)[:2032]
+    trace = Trace.of(Cir(samples, Encoding.COMPLEX_INT16, 730, 750.4), 1005.0)
+    assert trace is not None
+    assert trace.cir.samples.base is None
+    assert len(trace.magnitude) == 1016
+
+
+def drawn(document: Document, figure: str, column: str) -> np.ndarray:
+    """A column of the source behind a named figure of a page that no browser shows."""
+    sources = [renderer.data_source for renderer in document.get_model_by_name(figure).renderers]
+    return next(source.data[column] for source in sources if column in source.data)
+
+
+def test_ranges_of_a_silent_pair_grow_older_and_are_left_out(view: View) -> None:
+    def heard(anchor: int, time_s: float) -> None:
+        view.scene.add_sample((anchor, 7), Sample(time_s, 5.3, 5.1, 0.1, Status.OK))
+
+    heard(1, 1000.0)
+    heard(1, 1020.0)
+    document = Document()
+    page = Page(document, view)
+    assert drawn(document, "strip", "age").tolist() == [-20.0, 0.0]
+    heard(2, 1050.0)
+    page.draw()
+    assert drawn(document, "strip", "age").tolist() == [-50.0, -30.0]
+    heard(2, 1070.0)
+    page.draw()
+    assert drawn(document, "strip", "age").tolist() == [-50.0]
+
+
+def test_a_newer_cir_of_the_same_stamp_is_drawn(view: View) -> None:
+    view.scene.add_sample((1, 7), Sample(0.0, 5.3, 5.1, 0.1, Status.OK))
+    document = Document()
+    page = Page(document, view)
+    for level in range(1, 100):
+        view.scene.add_trace(
+            (1, 7), Trace(Cir(np.full(200, level, np.int16), Encoding.MAGNITUDE, 730, 750.4), 0.0)
+        )
+        page.draw()
+        assert drawn(document, "cir", "magnitude").max() == level
+
+
+def test_a_page_that_cannot_be_opened_is_not_counted(view: View, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Page, "draw", lambda page: 1 // 0)
+    with pytest.raises(ZeroDivisionError):
+        Page(Document(), view)
+    assert view.drawing.pages == 0
 
 
 def test_of_too_many_pairs_some_are_shown_for_good_and_the_others_are_counted() -> None:

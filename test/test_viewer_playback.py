@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -142,6 +143,27 @@ def test_a_cir_that_nobody_looks_at_is_not_computed(monkeypatch: pytest.MonkeyPa
     (trace,) = scene.pairs[2, 7].traces
     samples = record(1).measurement.cir.samples.astype(float)
     assert trace.magnitude == pytest.approx(np.hypot(samples[::2], samples[1::2]))
+
+
+def test_an_anchor_of_no_64_bits_is_passed_over() -> None:
+    scene = Scene()
+    feed = Feed(scene, threading.Lock())
+    pose = SimpleNamespace(position=SimpleNamespace(x=1.0, y=2.0, z=3.0))
+    texts = "1" * 5000, str(2**64 - 1)
+    feed.markers(
+        SimpleNamespace(markers=[SimpleNamespace(ns="anchors", text=text, pose=pose) for text in texts])
+    )
+    assert list(scene.anchors) == [2**64 - 1]
+
+
+def test_what_cannot_be_taken_is_counted(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = Scene()
+    feed = Feed(scene, threading.Lock())
+    monkeypatch.setattr(feed, "true_position", lambda message: int("1" * 5000))
+    player = BagPlayer(bag, feed, lambda: pytest.fail("the bag holds corrected ranges"))
+    player.seek(player.seconds)
+    assert feed.malformed >= COUNT // 10
+    assert latest(scene)[2, 7] == 4.25 + COUNT - 1
 
 
 def without_ranges(path: Path) -> Path:

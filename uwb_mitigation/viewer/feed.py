@@ -23,6 +23,9 @@ CHI2_95 = 5.991
 ANCHORS_NAMESPACE = "anchors"
 """Of the markers that are anchors, among those of `/uwb/anchors`; their texts are the anchors' ids."""
 
+LONGEST_ID = 20
+"""Digits of the largest of 64 bits."""
+
 
 class Feed:
     """Puts messages into a scene, under the lock that its pages hold while they draw.
@@ -108,7 +111,7 @@ class Feed:
             place = marker.pose.position
             if marker.ns != ANCHORS_NAMESPACE or not math.isfinite(place.x + place.y):
                 continue
-            if marker.text.isascii() and marker.text.isdigit():
+            if marker.text.isascii() and marker.text.isdigit() and len(marker.text) <= LONGEST_ID:
                 found[int(marker.text)] = AnchorPlace(place.x, place.y, place.z)
         if found:
             with self._lock:

@@ -21,7 +21,16 @@ from bokeh.models import ColumnDataSource
 from uwb_mitigation.measurement import Status
 from uwb_mitigation.preprocessing import WINDOW_LEAD
 from uwb_mitigation.viewer.models import TRACE_AFTER, TRACE_BEFORE, Models, blank_waterfall
-from uwb_mitigation.viewer.scene import ERROR_EDGES_M, History, Pair, Scene, Trace, short_id
+from uwb_mitigation.viewer.scene import (
+    ERROR_EDGES_M,
+    FARTHEST_M,
+    STRIP_S,
+    History,
+    Pair,
+    Scene,
+    Trace,
+    short_id,
+)
 from uwb_mitigation.viewer.view import REFRESH_S, View
 
 COLOURS = {
@@ -33,9 +42,6 @@ COLOURS = {
 }
 LEVELS = ("OK", "WARN", "ERROR", "STALE")
 LEVEL_COLOURS = ("#15803d", "#b45309", "#b91c1c", "#6b7280")
-
-FARTHEST_M = 10_000.0
-"""A range of more is in the table alone: no radio has measured it."""
 
 _REPORTS_STYLE = (
     "<style>td{padding:2px 10px 2px 4px;vertical-align:top;overflow-wrap:anywhere}"
@@ -75,10 +81,11 @@ class Page:
         models.pause.on_change("active", self._on_pause)
         if models.slider is not None:
             models.slider.on_change("value_throttled", self._on_slider)
-        view.drawing.pages += 1
-        document.on_session_destroyed(self._gone)
         document.add_periodic_callback(self.tick, int(1000 * REFRESH_S))
         self.draw()
+        # Last: of a page that could not be opened no session tells that it is gone.
+        document.on_session_destroyed(self._gone)
+        view.drawing.pages += 1
 
     def tick(self) -> None:
         """Draw if it is time and nobody has paused the page."""
@@ -105,7 +112,7 @@ class Page:
             self._draw_summary(scene)
             self._draw_map(scene)
             history = None if self._selected is None else scene.pairs.get(self._selected)
-            self._draw_strip(scene.now_s, history)
+            self._draw_strip(scene, history)
             self._draw_trace(() if history is None else tuple(history.traces))
             self._draw_errors(scene)
             self._draw_reports(scene)
@@ -177,8 +184,8 @@ class Page:
             "x": [pose.x for _, pose in posed],
             "y": [pose.y for _, pose in posed],
             "name": [name for name, _ in posed],
-            "width": [_finite(2 * larger) for larger, _, _ in ellipses],
-            "height": [_finite(2 * smaller) for _, smaller, _ in ellipses],
+            "width": [_finite(_drawable(2 * larger)) for larger, _, _ in ellipses],
+            "height": [_finite(_drawable(2 * smaller)) for _, smaller, _ in ellipses],
             "angle": [_finite(angle) for _, _, angle in ellipses],
         }
         models.trails.data = _lines([tag.trail for tag in scene.tags.values()])
@@ -207,11 +214,13 @@ class Page:
                 column.append(value)
         self._models.circles.data = columns
 
-    def _draw_strip(self, now_s: float, history: History | None) -> None:
-        samples = () if history is None else tuple(history.samples)
-        newest = samples[-1].time_s if samples else math.nan
-        if not self._changed("strip", (self._selected, newest, len(samples))):
+    def _draw_strip(self, scene: Scene, history: History | None) -> None:
+        # Of a silent pair too: its ranges grow older.
+        if not self._changed("strip", (self._selected, scene.now_s, scene.ranges)):
             return
+        now_s = scene.now_s
+        kept = () if history is None else tuple(history.samples)
+        samples = [sample for sample in kept if sample.time_s >= now_s - STRIP_S]
         self._models.show_empty("strip", all(math.isnan(_drawable(sample.raw_m)) for sample in samples))
         self._models.strip.data = {
             "age": np.array([sample.time_s - now_s for sample in samples], np.float32),
@@ -227,7 +236,8 @@ class Page:
 
     def _draw_trace(self, traces: tuple[Trace, ...]) -> None:
         models = self._models
-        if not self._changed("traces", (self._selected, traces[-1].time_s if traces else None, len(traces))):
+        # By which is the newest: stamps may be alike.
+        if not self._changed("traces", (self._selected, traces[-1] if traces else None)):
             return
         models.show_empty("cir", not traces)
         models.waterfall.data = {"image": [_waterfall_image(traces)]}

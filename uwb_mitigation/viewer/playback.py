@@ -180,11 +180,9 @@ class BagPlayer:
     def _take_standard(self, kind: str, take: Callable[[Any], None], data: bytes) -> None:
         """A standard message, by the types that ROS 2 Jazzy has."""
         try:
-            message = schemas.typestore().deserialize_cdr(data, kind)
-        except Exception:  # Of no common type.
+            take(schemas.typestore().deserialize_cdr(data, kind))
+        except Exception:  # Of no common type, or what it says is out of all proportion.
             self._feed.malformed += 1
-            return
-        take(message)
 
     def _raw(self, data: bytes) -> None:
         try:

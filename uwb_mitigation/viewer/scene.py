@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections import OrderedDict, deque
 from collections.abc import Hashable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from typing import NamedTuple
 
@@ -37,8 +37,17 @@ MAX_STRIP, MAX_TRAIL = 6000, 1200
 MAX_TRUTHS = 10_000
 """Truths that wait for their corrected ranges."""
 
+MAX_VALUES = 2 * 1016
+"""Of a CIR's samples: the DW1000's whole accumulator, real and imaginary."""
+
 MAX_TEXT = 400
 """Letters kept of a name or a message."""
+
+FARTHEST_M = 10_000.0
+"""A range of more is in the table alone, and no error of more is counted: no radio has measured it."""
+
+FARTHEST_PLACE_M = 2e7
+"""From the origin of any coordinates of a place on Earth: one of more is left out."""
 
 ERROR_EDGES_M = np.linspace(-1.0, 2.0, 61)
 """Bins of the error histogram; what lies beyond counts in the outermost."""
@@ -123,8 +132,15 @@ class Trace:
     def of(cls, cir: Cir, time_s: float) -> Trace | None:
         """None where the CIR holds no samples, or they are not what its encoding says, or out of all proportion."""
         odd = cir.encoding is Encoding.COMPLEX_INT16 and len(cir.samples) % 2
-        # The largest sample times the scale must be a float32 still.
-        return None if odd or not len(cir.samples) or not abs(cir.scale) < 1e30 else cls(cir, time_s)
+        if odd or not 0 < len(cir.samples) <= MAX_VALUES:
+            return None
+        # The largest sample times the scale must be a float32 still, and the first path's index an int32, as the others'.
+        if not abs(cir.scale) < 1e30 or (
+            math.isfinite(cir.first_path_index) and abs(cir.first_path_index) >= 2**31
+        ):
+            return None
+        # They may be a view into a message of any size.
+        return cls(replace(cir, samples=cir.samples.copy()), time_s)
 
     @property
     def magnitude(self) -> NDArray[np.float32]:
@@ -264,7 +280,7 @@ class Scene:
     def add_error(self, sample: Sample) -> None:
         """Count a range in the histogram, where its truth is known."""
         raw_m, corrected_m = sample.raw_m - sample.true_m, sample.range_m - sample.true_m
-        if not (math.isfinite(raw_m) and math.isfinite(corrected_m)):
+        if not (abs(raw_m) <= FARTHEST_M and abs(corrected_m) <= FARTHEST_M):
             return
         for errors, value in ((self.raw_errors, raw_m), (self.corrected_errors, corrected_m)):
             place = int(np.searchsorted(ERROR_EDGES_M, value, side="right")) - 1
@@ -278,12 +294,16 @@ class Scene:
             history.traces.append(trace)
 
     def add_pose(self, tag: str, pose: Pose) -> None:
+        if not _on_earth(pose.x, pose.y):
+            return
         entry = self._tag(tag)
         entry.pose = pose
         entry.trail.append((pose.x, pose.y))
 
     def add_true_position(self, tag: str, x: float, y: float) -> None:
         """Where a tag truly was, by the name that the truth has for it."""
+        if not _on_earth(x, y):
+            return
         trail = self.true_trails.setdefault(tag[:MAX_TEXT], deque(maxlen=MAX_TRAIL))
         trail.append((x, y))
         if len(self.true_trails) > MAX_TAGS:
@@ -291,7 +311,8 @@ class Scene:
         self.revision += 1
 
     def set_anchors(self, anchors: dict[int, AnchorPlace]) -> None:
-        self.anchors = dict(list(anchors.items())[:MAX_ANCHORS])
+        placed = ((identity, place) for identity, place in anchors.items() if _on_earth(place.x, place.y))
+        self.anchors = dict(islice(placed, MAX_ANCHORS))
         self.revision += 1
 
     def add_report(self, name: str, report: Report) -> None:
@@ -355,3 +376,7 @@ class Scene:
         if len(self.tags) > MAX_TAGS:
             self.tags.popitem(last=False)
         return entry
+
+
+def _on_earth(x: float, y: float) -> bool:
+    return abs(x) <= FARTHEST_PLACE_M and abs(y) <= FARTHEST_PLACE_M
