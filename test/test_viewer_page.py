@@ -420,6 +420,17 @@ def test_many_pages_are_drawn_less_often() -> None:
     assert Drawing(pages=1, cost_s=0.002).pause_s() == pytest.approx(0.1)
 
 
+def test_the_address_that_is_told_opens_a_page(view: View) -> None:
+    with ViewerServer(view, "0.0.0.0", 0) as server, Visitors(server.url, 1):
+        assert server.url == f"http://localhost:{server.port}/"
+        assert view.drawing.pages == 1
+
+
+def test_an_address_that_bokeh_does_not_know_is_named(view: View) -> None:
+    with pytest.raises(ParameterError, match="an IPv4 address of this machine"):
+        ViewerServer(view, "::1", 0)
+
+
 def test_a_taken_port_is_named(server: ViewerServer, view: View) -> None:
     with pytest.raises(ParameterError, match=str(server.port)):
         ViewerServer(view, port=server.port)

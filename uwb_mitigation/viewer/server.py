@@ -25,8 +25,12 @@ Parameters = Callable[[], Mapping[str, Mapping[str, object]]]
 """{node: {parameter: value}}; called from the server's thread."""
 
 
+EVERY = ("0.0.0.0", "*")
+"""Hosts that mean every address of this machine."""
+
+
 class ViewerServer:
-    """A page at `http://host:port/` until `close`.
+    """A page at `url` until `close`.
 
     Args:
         view: what the pages show.
@@ -62,10 +66,11 @@ class ViewerServer:
                 raise found
             raise ParameterError(
                 f"the page cannot be served at {host}:{port}: {found}",
-                valid="a free port and an address of this machine",
+                valid="a free port, and a name or an IPv4 address of this machine",
             ) from found
         self.port = found
-        self.url = f"http://{host}:{self.port}/"
+        # Every address is none that a browser could name.
+        self.url = f"http://{'localhost' if host in EVERY else host}:{self.port}/"
 
     def close(self) -> None:
         """Stop serving; may be called twice."""
@@ -106,7 +111,7 @@ class ViewerServer:
             server = Server(
                 {"/": Application(FunctionHandler(open_page))},
                 io_loop=loop,
-                address="" if host in ("0.0.0.0", "*") else host,
+                address="" if host in EVERY else host,
                 port=port,
                 allow_websocket_origin=_origins(host, port, origins),
                 extra_patterns=patterns,
@@ -155,7 +160,7 @@ class _ParametersPage(RequestHandler):  # type: ignore[misc]
 
 def _origins(host: str, port: int, more: tuple[str, ...]) -> list[str]:
     """Who may open the page's websocket: pages of other sites in the same browser may not."""
-    names = {"localhost", "127.0.0.1"} | ({host} if host not in ("0.0.0.0", "*") else set())
+    names = {"localhost", "127.0.0.1"} | ({host} if host not in EVERY else set())
     return [*(f"{name}:{port}" for name in sorted(names)), *more]
 
 
