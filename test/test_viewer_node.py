@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 import signal
-from collections.abc import Iterator
 from pathlib import Path
 
 import psutil
@@ -13,18 +12,15 @@ import pytest
 import ros_harness
 from browser import Browser
 from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from lifecycle_msgs.msg import Transition
 from uwb_mitigation_msgs.msg import RangeCorrected
 from visualization_msgs.msg import MarkerArray
 
+from uwb_mitigation.benches.visitors import Visitors
 from uwb_mitigation.nodes import topics
 
 pytestmark = pytest.mark.ros
-
-
-@pytest.fixture
-def ros(tmp_path: Path) -> Iterator[ros_harness.Ros]:
-    with ros_harness.domain(tmp_path) as client:
-        yield client
 
 
 def test_the_page_shows_what_is_published(ros: ros_harness.Ros, browser: Browser, tmp_path: Path):
@@ -71,6 +67,10 @@ def test_the_page_shows_what_is_published(ros: ros_harness.Ros, browser: Browser
     browser.wait(
         "their parameters", lambda: "simulated_rate" in browser.run("return document.body.innerText")
     )
+    for _ in range(3):
+        browser.open(found[1] + "parameters")
+    ros.spin_for(0.5)
+    assert ros.node.count_clients("/mitigator/get_parameters") == 1, "looking again takes nothing more"
     ros.spin_until(lambda: ros.node.count_subscribers("/uwb/range_raw") == 1)
     browser.open(found[1])
     browser.wait("ranges again", lambda: len(column("pairs", "range")) >= 2)
@@ -124,6 +124,46 @@ def test_ranges_that_come_too_fast_are_passed_over_and_counted(ros: ros_harness.
     found = told() or told() or told()
     assert found is not None, said
     assert int(found[1]) >= 100
+
+
+def test_tags_of_their_own_are_found_whatever_the_names_around_are(ros: ros_harness.Ros):
+    viewer = ros.start(
+        "viewer", "port:=0", arguments=("-r", "__ns:=/uwb", "-r", "/uwb/uwb/pose:=/robot/pose")
+    )
+    own = ros.node.create_publisher(PoseWithCovarianceStamped, "/uwb/uwb/tag_3/pose", 10)
+    ros.spin_until(lambda: own.get_subscription_count() == 1 or viewer.exit_code() is not None)
+    assert viewer.exit_code() is None, viewer.output
+    assert ros.node.count_subscribers("/robot/pose") == 1
+
+
+def test_a_viewer_that_is_put_away_looks_at_nothing_and_begins_anew(ros: ros_harness.Ros):
+    corrected = ros.node.create_publisher(RangeCorrected, "/uwb/range_corrected", 10)
+
+    def publish(count: int) -> None:
+        for _ in range(count):
+            corrected.publish(RangeCorrected(anchor_id=1, tag_id=2))
+            ros.spin_for(0.02)
+
+    viewer = ros.start("viewer", "port:=0")
+    viewer.wait_for_output("the page is at")
+    found = re.search(r"the page is at (\S+)", viewer.output)
+    assert found is not None
+    with Visitors(found[1], 1):
+        ros.spin_until(lambda: ros.node.count_subscribers("/uwb/range_raw") == 1)
+        ros.spin_until(lambda: corrected.get_subscription_count() == 1)
+        publish(20)
+        assert ros.change_state("viewer", Transition.TRANSITION_DEACTIVATE)
+        ros.spin_until(lambda: ros.node.count_subscribers("/uwb/range_raw") == 0)
+    assert ros.change_state("viewer", Transition.TRANSITION_CLEANUP)
+    ros.spin_until(lambda: corrected.get_subscription_count() == 0)
+    publish(50)
+    assert ros.change_state("viewer", Transition.TRANSITION_CONFIGURE)
+    assert ros.change_state("viewer", Transition.TRANSITION_ACTIVATE)
+    ros.spin_until(lambda: corrected.get_subscription_count() == 1)
+    publish(20)
+    ros.spin_for(0.5)
+    said = ros.diagnosis("viewer", lambda status: status.message.startswith("serving"))
+    assert said.message == "serving 0 pages", "what came while it was put away was not passed over"
 
 
 def test_an_anchors_file_that_is_none_is_named(ros: ros_harness.Ros, tmp_path: Path):

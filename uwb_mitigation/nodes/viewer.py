@@ -74,9 +74,11 @@ class Viewer(ManagedNode):
         self._lock = threading.Lock()
         self._feed = Feed(self._scene, self._lock)
         self._view: View | None = None
+        self._asked: dict[str, AsyncParameterClient] = {}
         self.autostart()
 
     def open(self) -> None:
+        self._numbering = Numbering(self._publisher_count)
         if path := self.value("anchors"):
             self._anchors = load_anchors(Path(path).expanduser())
             self._feed.anchors(self._anchors)
@@ -155,7 +157,10 @@ class Viewer(ManagedNode):
         elif self._ears is not None and topics.RANGE_RAW in self._ranges:
             self._ears.destroy_subscription(self._ranges.pop(topics.RANGE_RAW))
         # The locator gives every tag but one topics of its own, once it is heard.
-        own = re.compile(re.escape(self.resolve_topic_name(topics.POSE)).replace("/uwb/", r"/uwb/(tag_\d+)/"))
+        # What names the plain topic anew does not name theirs.
+        plain = self.resolve_topic_name(topics.POSE, only_expand=True)
+        head, _, tail = plain.rpartition("/")
+        own = re.compile(rf"{re.escape(head)}/(tag_\d+)/{re.escape(tail)}")
         for topic, _ in self.get_topic_names_and_types():
             if (found := own.fullmatch(topic)) and len(self._looking) < MAX_TAGS:
                 self._look(PoseWithCovarianceStamped, topic, partial(self._feed.pose, found[1]))
@@ -181,6 +186,8 @@ class Viewer(ManagedNode):
         server, self._server = self._server, None
         if server is not None:
             server.close()
+        # Its pages are gone.
+        self._view = None
 
     def close(self) -> None:
         for timer in self._ticking:
@@ -221,7 +228,10 @@ class Viewer(ManagedNode):
             if name == self.get_name():
                 found[name] = {row.name: self.value(row.name) for row in VIEWER}
                 continue
-            client = AsyncParameterClient(self, f"{namespace.rstrip('/')}/{name}")
+            # One for each name, for good: another is not destroyed by itself.
+            if name not in self._asked:
+                self._asked[name] = AsyncParameterClient(self, f"{namespace.rstrip('/')}/{name}")
+            client = self._asked[name]
             listed = _wait(client.list_parameters())
             if listed is None:
                 continue
