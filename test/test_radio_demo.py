@@ -23,6 +23,7 @@ COMMAND = [sys.executable, "-m", "uwb_mitigation.entry", "radio-demo", "--second
 def test_each_anchor_ranges_and_the_demo_ends_well():
     done = subprocess.run([*COMMAND, "1"], capture_output=True, text=True, timeout=240, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.endswith("┘\n")
     rows = [line.strip("│ ").split("│") for line in done.stdout.splitlines() if line.startswith("│")]
     assert [int(row[0]) for row in rows] == [1, 2, 3, 4]
     for _, count, raw, corrected, true in rows:

@@ -119,6 +119,9 @@ def run(console: Console, seconds: float) -> int:
                         started, ended = True, time.monotonic() + seconds
                     live.update(listener.table(dict(enumerate(boards.distances_m))))
                     time.sleep(1 / REFRESH_HZ)
+            # A live table ends its last line on a terminal only.
+            if not console.is_terminal:
+                console.line()
         finally:
             codes = processes.stop(*nodes.values())
         failed = [
