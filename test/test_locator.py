@@ -18,6 +18,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from ros_harness import Ros
+from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Header
 from uwb_mitigation_msgs.msg import RangeCorrected
 from visualization_msgs.msg import MarkerArray
@@ -135,20 +136,31 @@ def test_poses_odometry_smoothed_poses_and_markers_come_of_ranges(ros: Ros, anch
 
 
 def test_a_silence_is_bridged_by_predictions_whose_covariance_grows(ros: Ros, anchors: Path):
-    locator = ros.start("locator", f"anchors:={anchors}")
+    locator = ros.start("locator", f"anchors:={anchors}", "rate:=0.0", "use_sim_time:=true")
     locator.wait_for_output("locating")
     poses = ros.collect(PoseWithCovarianceStamped, "/uwb/pose")
-    run = Drive(ros, seconds=5)
+    clock = ros.node.create_publisher(Clock, "/clock", 10)
+    run = Drive(ros, seconds=10)
     ros.wait_for_subscribers(CORRECTED, 1)
-    run.send(range(len(run.ranges)))
-    end_ns = run.start_ns + int(run.ranges.stamp_ns[-1])
 
-    def after() -> list[float]:
-        stamped = [(p.header.stamp.sec * NANOSECONDS + p.header.stamp.nanosec, p) for p in poses]
-        return [pose.pose.covariance[0] for stamp, pose in stamped if stamp > end_ns]
+    def spread_at(row: int, silent_s: float) -> float:
+        """The variance that is told so long after a range."""
+        now_ns = run.start_ns + int(run.ranges.stamp_ns[row]) + round(silent_s * NANOSECONDS)
+        now = Clock(clock=Time(sec=now_ns // NANOSECONDS, nanosec=now_ns % NANOSECONDS))
 
-    ros.spin_until(lambda: len(after()) > 6)
-    spread = after()
+        def told() -> list[float]:
+            return [pose.pose.covariance[0] for pose in poses if stamp_ns(pose) == now_ns]
+
+        ros.spin_until(lambda: clock.publish(now) or bool(told()))
+        return told()[-1]
+
+    half = len(run.ranges) // 2
+    run.send(range(half))
+    # Who is told of half a drive is told of the last of all ranges.
+    spread_at(half - 1, 0.4)
+    run.send(range(half, len(run.ranges)))
+    ros.spin_until(lambda: stamp_ns(poses[-1]) == run.start_ns + int(run.ranges.stamp_ns[-1]))
+    spread = [spread_at(-1, silent_s) for silent_s in (0.4, 0.8, 1.2, 1.6, 2.0)]
     assert spread == sorted(spread)
     assert spread[-1] > 2 * spread[0]
 
