@@ -10,7 +10,6 @@ Schmidt-Kalman Filter", 2017). Covariances by Joseph's form, which holds for any
 from __future__ import annotations
 
 import math
-from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,17 +21,6 @@ OFFSET = 6
 FIRST_ERROR = 7
 _SHORTEST_M = 0.05
 """Closer to an anchor a range has no direction to speak of."""
-
-OUTLIER = 3.0
-"""Deviations beyond which an innovation is none of a Gaussian (0.3 %)."""
-
-
-@cache
-def _excess(limit: float) -> float:
-    """By how much the mean square of a standard Gaussian between `limit` and `OUTLIER` exceeds 1."""
-    low, high = (x * math.exp(-0.5 * x * x) / math.sqrt(2.0 * math.pi) for x in (limit, OUTLIER))
-    share = 0.5 * (math.erf(OUTLIER / math.sqrt(2.0)) - math.erf(limit / math.sqrt(2.0)))
-    return (low - high) / share
 
 
 class RangeFilter:
@@ -169,20 +157,6 @@ class RangeFilter:
         white = max(self._model.white * variance, variance - self._claimed[anchor])
         error, _, _, expected = self._observe(anchor, range_m)
         return error / math.sqrt(expected + white)
-
-    def leave_out(self, anchor: int, range_m: float, variance_m2: float, limit: float) -> None:
-        """Know of a range that it was left out since its normalised innovation is beyond `limit`, or another filter's is.
-
-        What takes only ranges that agree with it believes itself too much. That one did not agree tells that the state is
-        less sure, by what the square of a Gaussian exceeds 1 where it lies between `limit` and `OUTLIER` deviations
-        (Johnson, Kotz, Balakrishnan, Continuous Univariate Distributions 1, 13.10.1). Beyond `OUTLIER` it is a reflection's.
-        """
-        variance = self._model.variance(variance_m2)
-        white = max(self._model.white * variance, variance - self._claimed[anchor])
-        error, _, ph, expected = self._observe(anchor, range_m)
-        s = expected + white
-        if error * error <= OUTLIER**2 * s:
-            self.p += _excess(limit) / s * np.outer(ph, ph)
 
     def take_off(self, change_m: NDArray[np.float64]) -> None:
         """From here on, ranges come with so much more taken off, float64 (m,): what they share, and each one's."""
