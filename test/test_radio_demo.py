@@ -29,7 +29,9 @@ def test_each_anchor_ranges_and_the_demo_ends_well():
     for _, count, raw, corrected, true in rows:
         assert int(count) > 0
         assert abs(float(raw) - float(true)) < 4.0
-        assert float(corrected) != float(raw)
+        assert abs(float(corrected) - float(true)) < 4.0
+    # In line of sight there may be nothing to correct.
+    assert any(float(corrected) != float(raw) for *_, raw, corrected, _ in rows)
 
 
 def test_ctrl_c_ends_it_with_its_nodes():
