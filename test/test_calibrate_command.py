@@ -181,7 +181,7 @@ def test_what_is_refused_is_said_in_the_json_and_writes_nothing(site):
 
 
 def test_a_calibration_that_would_harm_is_written_by_force_only(site, monkeypatch):
-    from uwb_mitigation.training.calibrating import Calibrated
+    from uwb_mitigation.training.calibrated import Calibrated
 
     monkeypatch.setattr(Calibrated, "calibrated_mae_m", property(lambda self: self.raw_mae_m + 0.01))
     options = ("drive.mcap", *LEVEL, "-o", "harm.onnx", "--json", "h.json")

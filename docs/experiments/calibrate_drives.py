@@ -42,7 +42,7 @@ from uwb_mitigation.simulation.buildings import RADIO
 from uwb_mitigation.simulation.scene import ANCHORS, FLAT, MORE_ANCHORS, ROUTE
 from uwb_mitigation.simulation.sites import draw_site
 from uwb_mitigation.sources.simulated import SimulatedSource
-from uwb_mitigation.training import calibrating, making
+from uwb_mitigation.training import calibrated, calibrating, making
 
 UNSEEN = 7_000_000
 """Added to the seed of a building: the universal model's begin at 0 and at 1 000 003."""
@@ -160,7 +160,7 @@ def one(seed: int, seconds: float, truth_topic: bool, with_train: bool, flat: bo
     true = np.array([drive.offset_m[k] for k in range(anchors) if (101, k + 1) in found.pair_m])
     known = Offsets(pairs={(101, k + 1): off for k, off in enumerate(drive.offset_m.tolist())})
     with tempfile.TemporaryDirectory() as folder:
-        bundle, _ = calibrating.write(Path(folder) / "site.onnx", found, universal, "drive")
+        bundle, _ = calibrated.write(Path(folder) / "site.onnx", found, universal, "drive")
         row: dict[str, object] = {
             "seed": seed,
             "anchors": anchors,

@@ -26,7 +26,8 @@ from uwb_mitigation.positioning.start import Height
 from uwb_mitigation.positioning.tracks import Ranges
 from uwb_mitigation.sources.decaranging import DecaRangingFolder
 from uwb_mitigation.sources.hanyang import ANTENNA_M, HanyangRun
-from uwb_mitigation.training.calibrating import Calibrated, without_truth
+from uwb_mitigation.training.calibrated import Calibrated
+from uwb_mitigation.training.calibrating import without_truth
 
 HEIGHT = Height(ANTENNA_M, 0.2)
 

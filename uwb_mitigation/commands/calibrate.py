@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from uwb_mitigation.model.bundle import Bundle
     from uwb_mitigation.positioning.anchors import AnchorMap
     from uwb_mitigation.positioning.localised import PosePath
-    from uwb_mitigation.training.calibrating import Calibrated
+    from uwb_mitigation.training.calibrated import Calibrated
 
 MOST_SHOWN = 40
 
@@ -93,10 +93,10 @@ def calibrate(
     """
     from uwb_mitigation.commands.bundles import bundle_for
     from uwb_mitigation.sources.site import anchors_file, load_anchors
-    from uwb_mitigation.training import calibrating
+    from uwb_mitigation.training import calibrated, calibrating
 
     check_output(output)
-    beside = calibrating.offsets_file(output)
+    beside = calibrated.offsets_file(output)
     for file in (output, beside, *([report] if report else [])):
         if file.exists() and not force:
             raise ParameterError("exists already", where=str(file), valid="--force replaces it")
@@ -142,7 +142,7 @@ def calibrate(
     name = ", ".join(bag.resolve().name for bag in bags)
     if report is not None:
         _write_report(report, found, name)
-    bundle, beside = calibrating.write(output, found, source, name)
+    bundle, beside = calibrated.write(output, found, source, name)
     console.out.print(
         f"Wrote {output} (model {bundle.model_id:08x}) and {beside}.", markup=False, soft_wrap=True
     )
@@ -224,7 +224,7 @@ def _show(found: Calibrated) -> None:
 def _write_report(path: Path, found: Calibrated, name: str) -> None:
     from uwb_mitigation.evaluation.site_page import site_page
     from uwb_mitigation.files import write_whole
-    from uwb_mitigation.training.calibrating import shown
+    from uwb_mitigation.training.calibrated import shown
 
     write_whole(path, site_page(shown(found, name)))
     console.out.print(f"Wrote {path}.", markup=False, soft_wrap=True)

@@ -5,29 +5,23 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.dataset import Dataset
-from uwb_mitigation.errors import DatasetError, ModelError
+from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.evaluation.site_data import SiteData
-from uwb_mitigation.evaluation.site_page import AnchorRow, OffsetRow, SitePage
-from uwb_mitigation.files import write_together
 from uwb_mitigation.model.bundle import Bundle
 from uwb_mitigation.model.float_networks import float_network
-from uwb_mitigation.offsets import MAX_OFFSET_M, Offsets, dump_offsets
-from uwb_mitigation.positioning.localised import Localised, PosePath, solve_localised
+from uwb_mitigation.offsets import MAX_OFFSET_M, Offsets
+from uwb_mitigation.positioning.localised import PosePath, solve_localised
 from uwb_mitigation.positioning.regressors import NETWORK_SD, SLOPE_SD, Regressors
-from uwb_mitigation.positioning.self_calibration import (
-    SelfCalibration,
-    calibrate,
-)
+from uwb_mitigation.positioning.self_calibration import SelfCalibration, calibrate
 from uwb_mitigation.positioning.start import Area, Height
 from uwb_mitigation.training import site_model
-from uwb_mitigation.training.site_model import SiteChoice
+from uwb_mitigation.training.calibrated import Calibrated
 
 UNSURE_M = 0.25
 """Ranges whose pseudo-truth has a larger deviation are left out."""
@@ -40,93 +34,6 @@ NETWORK, LEVEL = "network", "level"
 
 Progress = Callable[[str, float], None]
 """Is told what is being done, and the share of it that is, 0 to 1."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Calibrated:
-    """A site's calibration, before it is written.
-
-    Attributes:
-        site: what was recorded.
-        truth: the topic of the localisation; None = the ranges alone.
-        offsets: of the radios, and `pair_m`: {(tag id, anchor id): (offset, standard deviation)}, m.
-        level: `pair`, `anchor` or `one`: what has an offset of its own.
-        data: the ranges that truth is known of, less the offsets.
-        raw_m: float64 (n,), errors of these as measured, against that truth.
-        choice: the model.
-        notes: what was not told apart, or left out, in words.
-        track: float64 (k, 3), where the tags were at `track_of` (k,), the stretches; for a picture.
-        network: the factor of the universal network's predictions and its deviation; (0, 0) = not solved for.
-        line: the same of the received power, m/dB.
-        localised: what `truth` needed.
-        places: {tag id: position} of tags at rest; {`tag id #number`: position} of each place of one that was at several.
-    """
-
-    site: SiteData
-    truth: str | None
-    offsets: Offsets
-    pair_m: dict[tuple[int, int], tuple[float, float]]
-    level: str
-    data: Dataset
-    raw_m: NDArray[np.float64]
-    choice: SiteChoice
-    notes: tuple[str, ...]
-    track: NDArray[np.float64]
-    track_of: NDArray[np.intp]
-    network: tuple[float, float]
-    line: tuple[float, float]
-    localised: Localised | None
-    places: dict[str, tuple[float, float, float]]
-
-    @property
-    def raw_mae_m(self) -> float:
-        """MAE of the ranges as measured."""
-        return float(np.abs(self.raw_m).mean())
-
-    @property
-    def calibrated_mae_m(self) -> float:
-        """MAE that the chosen model leaves on stretches and anchors that it was not fitted to."""
-        return self.choice.mae()[self.choice.chosen]
-
-    @property
-    def harms(self) -> bool:
-        return self.calibrated_mae_m >= self.raw_mae_m
-
-    def sentence(self) -> str:
-        """What it should bring, for people."""
-        less = 1.0 - self.calibrated_mae_m / self.raw_mae_m
-        truth = "where the other anchors see the tag" if self.truth is None else "the localisation"
-        how = f"Ranges here err by {self.raw_mae_m:.3f} m on the mean against {truth}"
-        if self.harms:
-            return f"{how}; the model makes that no better ({self.calibrated_mae_m:.3f} m)."
-        return f"{how}; with this model it should be {self.calibrated_mae_m:.3f} m, {less:.0%} less ({self.choice.chosen})."
-
-    def as_json(self) -> dict[str, object]:
-        """The result of `uwb-mitigation calibrate`."""
-        prior = self.choice.prior
-        return {
-            "offsets_m": {f"{tag}-{anchor}": value for (tag, anchor), (value, _) in self.pair_m.items()},
-            "offset_sd_m": {f"{tag}-{anchor}": sd for (tag, anchor), (_, sd) in self.pair_m.items()},
-            "offsets_of": self.level,
-            "raw_mae_m": self.raw_mae_m,
-            "calibrated_mae_m": self.calibrated_mae_m,
-            "truth": self.truth or "none",
-            "refused": None,
-            "chosen": self.choice.chosen,
-            "candidates": self.choice.mae(),
-            "ranges": sum(map(len, self.site.tags)),
-            "labelled": len(self.data),
-            "network_factor": list(self.network),
-            "line": {
-                "offset_m": prior.offset_m,
-                "per_rx_power": prior.per_rx_power,
-                "per_power_gap": prior.per_power_gap,
-            },
-            "places": {name: list(place) for name, place in self.places.items()},
-            "notes": list(self.notes),
-            "left_out": dict(self.site.left_out),
-            "localisation": None if self.localised is None else self.localised.as_json(),
-        }
 
 
 def without_truth(
@@ -188,19 +95,6 @@ def without_truth(
         lambda share: on_progress("choosing", 0.4 + 0.6 * share),
         offsets_without=offsets_without,
     )
-    resting = found.links.at_rest
-    first_tag = {
-        int(s): int(t) for s, t in zip(found.stretches.of[::-1], found.stretches.tag[::-1], strict=True)
-    }
-    stood = Counter(first_tag[s] for s in np.flatnonzero(resting).tolist())
-    number: Counter[int] = Counter()
-    places = {}
-    for s in np.flatnonzero(resting).tolist():
-        tag = first_tag[s]
-        number[tag] += 1
-        several = f" #{number[tag]}" if stood[tag] > 1 else ""
-        x, y, z = found.fit.position[found.links.knot_stretch == s][0].tolist()
-        places[f"{found.tag_ids[tag]}{several}"] = (x, y, z)
     return Calibrated(
         site,
         None,
@@ -216,7 +110,7 @@ def without_truth(
         network,
         found.value(LEVEL),
         None,
-        places,
+        _places(found),
     )
 
 
@@ -258,14 +152,13 @@ def with_truth(
     data, raw = _labelled(
         site, offsets, rows, found.distance_m[rows], tag[rows], np.zeros(len(site.tags), np.bool_)
     )
-    begins = np.cumsum([0, *map(len, site.tags)])
 
     def offsets_without(held_out: NDArray[np.intp]) -> NDArray[np.float64]:
         kept = np.setdiff1d(rows, rows[held_out])
         own = [kept[tag[kept] == number] for number in range(len(site.tags))]
         again = solve_localised(
             site.anchors,
-            [one.take(part - begin) for one, part, begin in zip(site.tags, own, begins, strict=False)],
+            [one.take(part - begin) for one, part, begin in zip(site.tags, own, site.begins, strict=True)],
             path,
             known.take(kept),
             time_offset_s=found.time_offset_s,
@@ -322,86 +215,6 @@ def regressors(site: SiteData, source: Bundle) -> Regressors:
     return Regressors.one(LEVEL, np.where(known, power - np.median(power[known]), 0.0), 0.0, SLOPE_SD)
 
 
-def write(output: Path, result: Calibrated, source: Bundle, name: str) -> tuple[Bundle, Path]:
-    """The bundle, and the offsets beside it as `X.offsets.yaml`, together (`write_together`).
-
-    Args:
-        name: of the recordings, for people.
-
-    Raises:
-        ModelError: they cannot be written.
-    """
-    how = "without truth" if result.truth is None else f"with truth from {result.truth}"
-    mae = result.choice.mae()
-    told = {
-        "data": f"{name}, calibrated {how}",
-        "calibrated": how,
-        "chosen": result.choice.chosen,
-        "measurements": len(result.data),
-        "configurations": len(result.data.names),
-        "split": "held out: stretches of the track, and anchors",
-        "started_from": f"{source.model_id:08x}",
-        "recipe": {"line": result.choice.prior.needs_power, "network": result.choice.network is not None},
-        "metrics_m": {
-            row: {"mae": round(value, 4)} for row, value in {"raw": result.raw_mae_m, **mae}.items()
-        },
-    }
-    bundle, data = site_model.bundle_of(output, result.data, result.choice, source, result.raw_m, told)
-    beside = offsets_file(output)
-    comment = (
-        f"Offsets of the radios, m, beside model {bundle.model_id:08x} ({output.name}): use both together.\n"
-        f"Found by uwb-mitigation calibrate in {name}, {how}."
-    )
-    write_together({output: data, beside: dump_offsets(result.offsets, comment)}, ModelError)
-    return bundle, beside
-
-
-def shown(result: Calibrated, name: str) -> SitePage:
-    """What the page of a calibration shows."""
-    left = result.choice.held_out[result.choice.chosen]
-    assert result.data.anchors is not None
-    rows = []
-    for anchor in result.site.anchors.anchors:
-        own = result.data.anchors == anchor.id
-        if own.any():
-            before, after = (np.abs(error[own]) for error in (result.raw_m, left))
-            rows.append(AnchorRow(str(anchor), int(own.sum()), *map(float, (before.mean(), after.mean()))))
-    offsets = [OffsetRow(str(tag), str(anchor), *pair) for (tag, anchor), pair in result.pair_m.items()]
-    facts = []
-    if result.localised is not None:
-        told = result.localised
-        arm = ", ".join(f"{value:.3f}" for value in told.lever_arm_m)
-        facts.append(
-            f"Localisation {result.truth}: time offset {told.time_offset_s:.3f} s, lever arm {arm} m."
-        )
-    if result.network[0] and result.network[1]:
-        facts.append(
-            f"The universal network's predictions count {result.network[0]:.2f} +- {result.network[1]:.2f} times."
-        )
-    if result.line[1]:
-        facts.append(
-            f"A dB more received power: {result.line[0] * 100:.2f} +- {result.line[1] * 100:.2f} cm of range."
-        )
-    tracks = [result.track[result.track_of == one][:, :2] for one in np.unique(result.track_of)]
-    return SitePage(
-        name,
-        result.sentence(),
-        tuple(facts),
-        result.notes,
-        tuple((str(one), one.position[0], one.position[1]) for one in result.site.anchors.anchors),
-        tuple(tracks),
-        tuple(rows),
-        tuple(offsets),
-        tuple({"raw": result.raw_mae_m, **result.choice.mae()}.items()),
-        result.choice.chosen,
-    )
-
-
-def offsets_file(bundle: Path) -> Path:
-    """Where the offsets of a site's bundle lie."""
-    return bundle.with_suffix(".offsets.yaml")
-
-
 def _offsets(
     found: SelfCalibration, ids: list[int], pair_m: dict[tuple[int, int], tuple[float, float]]
 ) -> Offsets:
@@ -412,6 +225,23 @@ def _offsets(
         own = {ids[row]: common + found.value(f"anchor {row}")[0] for _, row in found.pairs()}
         return Offsets(common, anchors=own)
     return Offsets(common)
+
+
+def _places(found: SelfCalibration) -> dict[str, tuple[float, float, float]]:
+    """Where tags stood, as `Calibrated.places`."""
+    resting = np.flatnonzero(found.links.at_rest).tolist()
+    # Of a stretch all ranges are of one tag.
+    tag_of = dict(zip(found.stretches.of.tolist(), found.stretches.tag.tolist(), strict=True))
+    stood = Counter(tag_of[stretch] for stretch in resting)
+    number: Counter[int] = Counter()
+    places = {}
+    for stretch in resting:
+        tag = tag_of[stretch]
+        number[tag] += 1
+        several = f" #{number[tag]}" if stood[tag] > 1 else ""
+        x, y, z = found.fit.position[found.links.knot_stretch == stretch][0].tolist()
+        places[f"{found.tag_ids[tag]}{several}"] = (x, y, z)
+    return places
 
 
 def _of_pairs(common: float, pair_m: dict[tuple[int, int], tuple[float, float]]) -> Offsets:
