@@ -38,7 +38,7 @@ templates_path = [str(Path(__file__).resolve().parent / "templates")]
 default_role = "code"
 autodoc_member_order = "bysource"
 # Absent where pages alone are built. What is there is not mocked: scipy asks classes whether they are torch's.
-autodoc_mock_imports = [name for name in ("torch", "distributed") if find_spec(name) is None]
+autodoc_mock_imports = [name for name in ("torch", "distributed", "matplotlib") if find_spec(name) is None]
 napoleon_use_ivar = True  # else an attribute that has a docstring of its own is described twice
 napoleon_attr_annotations = False  # a class shows them in its signature
 # Annotations name types of libraries, whose pages are elsewhere.
