@@ -47,8 +47,8 @@ def windows(count: int, samples: int, seed: int = 0) -> np.ndarray:
     return (generator.gamma(2.0, 0.3, (count, samples)) * decay).astype(np.float32)
 
 
-def random_int8(architecture: Remnet, seed: int = 0, *, exact: bool = False) -> Int8Weights:
-    """Return a quantised network. With `exact`, its scales are nudged as those of an exported network."""
+def random_int8(architecture: Remnet, seed: int = 0, *, exact: bool = True) -> Int8Weights:
+    """Return a quantised network. Without `exact`, its scales suit neither the firmware nor all processors."""
     weights = random_weights(architecture, seed)
     return quantize(weights, windows(64, architecture.samples, seed), exact=exact)
 
