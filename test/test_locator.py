@@ -274,12 +274,11 @@ def test_tf_of_the_tags_leaves_the_transforms_of_the_robot_alone(ros: Ros, ancho
         run.send(rows, tag=0x1122334455667788)
     ros.spin_until(lambda: len(poses) > 100 and len(second) > 20 and len(odometry["left/"]) > 20)
 
-    def received(frame: str) -> set[int]:
-        return {
-            stamp_ns(one) for array in transforms for one in array.transforms if one.child_frame_id == frame
-        }
+    def received(parent: str) -> set[int]:
+        sent_by = [one for array in transforms for one in array.transforms if one.header.frame_id == parent]
+        return {stamp_ns(one) for one in sent_by}
 
-    ros.spin_until(lambda: received("base_link") >= set(sent) and stamp_ns(poses[-1]) in received("uwb_tag"))
+    ros.spin_until(lambda: received("odom") >= set(sent) and stamp_ns(poses[-1]) in received("map"))
     buffer = Buffer()
     for message in [one for array in transforms for one in array.transforms]:
         buffer.add(

@@ -16,6 +16,7 @@ from nav_msgs.msg import Odometry
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.publisher import Publisher
+from rclpy.qos import ReliabilityPolicy
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from uwb_mitigation_msgs.msg import RangeCorrected
@@ -144,7 +145,9 @@ class Locator(ManagedNode):
             (Odometry, "odometry_topic", self._on_odometry),
         ):
             if topic := self.value(name):
-                self._subscriptions_made.append(topics.create_subscription(self, kind, topic, callback))
+                self._subscriptions_made.append(
+                    topics.create_subscription(self, kind, topic, callback, ReliabilityPolicy.BEST_EFFORT)
+                )
         self.get_logger().info(f"{len(anchors)} anchors from {path}")
         if len(known):
             self.get_logger().info(f"offsets of {len(known)} pairs from {self._offsets_file}")

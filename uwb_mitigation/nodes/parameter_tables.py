@@ -227,6 +227,13 @@ VIEWER = (
     Parameter("autostart", True, "Configure and activate without a lifecycle manager."),
 )  # fmt: skip
 
+KEPT_PARAMETERS = "UWB_MITIGATION_KEPT_PARAMETERS"
+"""Environment variable of a folder where nodes keep the parameters that were set while they ran. A launch file makes
+the folder, for as long as it runs: a node that it respawns gets them back."""
+
+STANDARD = ("qos_overrides.", "use_sim_time", "start_type_description_service")
+"""Beginnings of the names of parameters that rclpy declares for every node."""
+
 TABLES: dict[str, tuple[Parameter, ...]] = {
     "driver": DRIVER,
     "mitigator": MITIGATOR,
