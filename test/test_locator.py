@@ -16,7 +16,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from drives import HALL, drive
 from geometry_msgs.msg import PoseWithCovarianceStamped, Quaternion, Transform, TransformStamped, Vector3
 from nav_msgs.msg import Odometry
-from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
 from ros_harness import Ros
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Header
@@ -229,6 +229,16 @@ def test_an_anchors_file_that_cannot_be_used_is_said_and_the_node_stays(
     ros.spin_until(lambda: told in facts(diagnostics).get("", ""))
     assert locator.exit_code() is None
     assert locator.signal(signal.SIGINT) == 0
+
+
+def test_a_best_effort_height_is_received_and_best_effort_ranges_are_reported(ros: Ros, anchors: Path):
+    heights = ros.node.create_publisher(PoseWithCovarianceStamped, "/height", qos_profile_sensor_data)
+    ros.node.create_publisher(RangeCorrected, CORRECTED, qos_profile_sensor_data)
+    locator = ros.start("locator", f"anchors:={anchors}", "height_topic:=/height", "rate:=0.0")
+    locator.wait_for_output(f"publishes by best effort and is not received: set qos_overrides.{CORRECTED}")
+    ros.spin_until(lambda: heights.get_subscription_count() == 1)
+    (subscription,) = ros.node.get_subscriptions_info_by_topic("/height")
+    assert subscription.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
 
 
 def transform_matrix(message) -> np.ndarray:

@@ -184,15 +184,14 @@ class ManagedNode(LifecycleNode):
             level, text = diagnostics.ERROR, f"{label}: {self.error}"
         elif not self.is_active:
             level, text = diagnostics.WARN, f"not active: {label}"
-        if problems := [*topics.not_received(self), *self._namesakes.problems()]:
-            for problem in problems:
-                if problem not in self._reported:
-                    self.get_logger().warning(problem)
-            level = max(level, diagnostics.WARN)
-            text = "; ".join(
-                [*problems, *([text] if level == diagnostics.ERROR or not self.is_active else [])]
-            )
+        problems = [*topics.not_received(self), *self._namesakes.problems()]
+        for problem in problems:
+            if problem not in self._reported:
+                self.get_logger().warning(problem)
         self._reported = set(problems)
+        if problems:
+            text = "; ".join([*problems, text] if level > diagnostics.OK else problems)
+            level = max(level, diagnostics.WARN)
         report = diagnostics.report(self, hardware, level, text, facts)
         self._namesakes.sent(report)
         self._diagnostics.publish(report)
