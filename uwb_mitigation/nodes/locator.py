@@ -25,6 +25,7 @@ from visualization_msgs.msg import MarkerArray
 from uwb_mitigation.bag.codec import decode_corrected
 from uwb_mitigation.bag.poses import encode_odometry, encode_pose, tag_frame, tag_of_frame
 from uwb_mitigation.errors import MissingDependencyError, ParameterError, RecordingError
+from uwb_mitigation.measurement import format_id
 from uwb_mitigation.nodes import clocks, diagnostics, markers, topics
 from uwb_mitigation.nodes.conversions import to_header
 from uwb_mitigation.nodes.lifecycle import ManagedNode
@@ -245,7 +246,7 @@ class Locator(ManagedNode):
             if key.anchor_id in fleet.strangers and key.anchor_id not in self._told:
                 self._told.add(key.anchor_id)
                 self.get_logger().warning(
-                    f"ranges of anchor {key.anchor_id} are left out: it is not in the anchors file"
+                    f"ranges of anchor {format_id(key.anchor_id)} are left out: it is not in the anchors file"
                 )
             return
         tag, estimate = found
@@ -271,7 +272,7 @@ class Locator(ManagedNode):
             for publisher in outputs.all():
                 publisher.on_activate(None)
             self._outputs[tag.tag_id] = outputs
-            self.get_logger().info(f"tag {tag.tag_id} on {outputs.pose.topic_name}")
+            self.get_logger().info(f"tag {format_id(tag.tag_id)} on {outputs.pose.topic_name}")
         return outputs
 
     def _tell(self, outputs: _Outputs, estimate: Estimate) -> None:
