@@ -99,10 +99,7 @@ def value_of(row: Parameter, text: str) -> Value:
     """
     value: Any = text
     if row.or_number or not isinstance(row.default, str):
-        try:
-            value = yaml.safe_load(text)
-        except yaml.YAMLError:
-            value = text
+        value = _read(text)
     if row.or_number and not isinstance(value, (int, float)):
         value = text
     row.check(value)
@@ -111,7 +108,15 @@ def value_of(row: Parameter, text: str) -> Value:
 
 def for_launch(value: Value) -> Value:
     """Return the value as launch_ros has to get it: it reads a text as YAML, so a text such as 1234 needs quotes."""
-    return json.dumps(value) if isinstance(value, str) and yaml.safe_load(value) != value else value
+    return json.dumps(value) if isinstance(value, str) and _read(value) != value else value
+
+
+def _read(text: str) -> Any:
+    """Return the value of a text in YAML; None where it is not YAML."""
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError:
+        return None
 
 
 def boolean(name: str, text: str) -> bool:
