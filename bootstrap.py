@@ -188,25 +188,37 @@ def install(requirements: list[Path]) -> None:
 
 
 def build_messages() -> None:
-    """Build and install `uwb_mitigation_msgs` into the environment with CMake."""
+    """Build the message packages with CMake and install them into the environment."""
     # ROS's macros take neither an apostrophe nor a letter beyond ASCII in a path: the checkout is given one without.
     with tempfile.TemporaryDirectory(prefix="uwb_messages_") as folder:
         checkout = Path(folder, "checkout")
         checkout.symlink_to(ROOT)
-        build_messages_of(checkout, Path(folder, "build"))
+        environment = checkout / VENV.name
+        variables = dict(os.environ)
+        variables["PATH"] = f"{environment / 'bin'}{os.pathsep}{variables.get('PATH', '')}"
+        prefixes = [str(environment)]
+        if SYSTEM_ROS:
+            variables = sourced_environment(variables)
+            prefixes += variables.get("AMENT_PREFIX_PATH", str(ROS_PREFIX)).split(os.pathsep)
+        variables["AMENT_PREFIX_PATH"] = os.pathsep.join(prefixes)
+        packages = [checkout / "msg_defs"]
+        if not has_tf2_messages(prefixes):
+            packages.append(checkout / "cmake" / "tf2_msgs")
+        for package in packages:
+            build_messages_of(package, checkout, Path(folder, package.name), variables)
 
 
-def build_messages_of(checkout: Path, build: Path) -> None:
+def has_tf2_messages(prefixes: Iterable[str]) -> bool:
+    """Whether tf2_msgs is installed, other than the copy that this script installs."""
+    own = (ROOT / "cmake" / "tf2_msgs" / "package.xml").read_bytes()
+    found = [Path(prefix, "share", "tf2_msgs", "package.xml") for prefix in prefixes]
+    return any(file.is_file() and file.read_bytes() != own for file in found)
+
+
+def build_messages_of(package: Path, checkout: Path, build: Path, variables: dict[str, str]) -> None:
     environment = checkout / VENV.name
-    variables = dict(os.environ)
-    variables["PATH"] = f"{environment / 'bin'}{os.pathsep}{variables.get('PATH', '')}"
-    prefixes = [str(environment)]
-    if SYSTEM_ROS:
-        variables = sourced_environment(variables)
-        prefixes.append(variables.get("AMENT_PREFIX_PATH", str(ROS_PREFIX)))
-    variables["AMENT_PREFIX_PATH"] = os.pathsep.join(prefixes)
     configure = [
-        "cmake", "-S", str(checkout / "msg_defs"), "-B", str(build),
+        "cmake", "-S", str(package), "-B", str(build),
         f"-DCMAKE_INSTALL_PREFIX={environment}", "-DBUILD_TESTING=OFF", "-DCMAKE_BUILD_TYPE=Release",
         f"-DPython3_EXECUTABLE={environment / 'bin' / 'python'}",
         f"-DCMAKE_PROJECT_INCLUDE={checkout / 'cmake' / 'ros_wheels.cmake'}",

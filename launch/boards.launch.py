@@ -3,10 +3,8 @@
     ros2 launch uwb_mitigation boards.launch.py boards:='left=/dev/uwb/1A2B right=usb:2341:805a:3C4D'
 
 `left` then publishes on /left/uwb/range_raw and /left/uwb/range_corrected, in the frame `left_uwb_antenna`.
-Each node comes back if it dies.
+A node that crashes is respawned. Every other parameter of driver and mitigator is an argument, for all boards.
 """
-
-from pathlib import Path
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
@@ -14,35 +12,56 @@ from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
+from uwb_mitigation.nodes import launching
 
+NODES = ("driver", "mitigator")
+PARAMETERS = {
+    name: rows
+    for name, rows in launching.arguments(NODES).items()
+    if name not in ("source", "port", "path", "frame_id")
+}
+OWN = {
+    "params": ("", "Parameter file of all nodes; it overrides the files of single nodes."),
+    "use_sim_time": ("false", "Take the time from /clock: true or false."),
+    "log_level": ("info", f"Log level of every node: {', '.join(launching.LOG_LEVELS)}."),
+    "respawn": ("true", "Restart a node that crashes: true or false."),
+}
+FILES = tuple(f"{node}_params" for node in NODES)
+
+
+@launching.plain_errors
 def nodes_of(context):
-    def said(name):
-        return LaunchConfiguration(name).perform(context)
-
-    files = {name: said(f"{name}_params") for name in ("driver", "mitigator")}
-    for path in files.values():
-        if not Path(path).is_file():
-            raise RuntimeError(f"parameter file {path}: no such file")
-    common = {"use_sim_time": said("use_sim_time").lower() == "true"}
-    model = {"model": said("model")} if said("model") else {}
+    names = (*PARAMETERS, *OWN, *FILES, "boards")
+    launching.check_names(getattr(context, "argv", ()), names)
+    said = {name: LaunchConfiguration(name).perform(context) for name in names}
+    flag = {name: launching.boolean(name, said[name]) for name in ("use_sim_time", "respawn")}
+    level = launching.log_level(said["log_level"])
+    files = {node: [said[f"{node}_params"], *filter(None, [said["params"]])] for node in NODES}
+    for node in NODES:
+        launching.from_files(node, *files[node])
+    values = launching.parameters({name: said[name] for name in PARAMETERS}, NODES, NODES)
+    common = {"use_sim_time": flag["use_sim_time"]}
+    kept = launching.kept_parameters()
     nodes = []
-    for entry in said("boards").split():
+    for entry in said["boards"].split():
         name, separator, port = entry.partition("=")
         if not (separator and name.isidentifier() and port):
             raise ValueError(f"boards: {entry!r} is not NAME=PORT, such as left=/dev/ttyACM0")
-        board = {"source": "serial", "port": port, "mode": said("mode"), "frame_id": f"{name}_uwb_antenna"}
-        for executable, own in (("driver", board), ("mitigator", model)):
+        board = {"source": "serial", "port": port, "frame_id": f"{name}_uwb_antenna"}
+        for node in NODES:
+            own = values[node] | board if node == "driver" else values[node]
             nodes.append(
                 Node(
                     package="uwb_mitigation",
-                    executable=executable,
-                    name=executable,
+                    executable=node,
+                    name=node,
                     namespace=name,
-                    parameters=[files[executable], own, common],
+                    parameters=[*files[node], own, common],
                     output="screen",
-                    respawn=said("respawn").lower() == "true",
+                    respawn=flag["respawn"],
                     respawn_delay=0.5,
-                    ros_arguments=["--log-level", said("log_level")],
+                    additional_env=kept,
+                    ros_arguments=["--log-level", level],
                 )
             )
     return nodes
@@ -50,28 +69,18 @@ def nodes_of(context):
 
 def generate_launch_description():
     params = PathJoinSubstitution([FindPackageShare("uwb_mitigation"), "params"])
-    arguments = [
-        ("mode", "host", "Who runs the model: host, device or both."),
-        (
-            "model",
-            "",
-            "Model bundle to correct with. Empty = as mitigator_params says, else universal.",
-        ),
-        ("use_sim_time", "false", "Take the time from /clock: true or false."),
-        ("log_level", "info", "Of every node: debug, info, warn, error or fatal."),
-        ("respawn", "true", "Start a node again when it dies: true or false."),
-    ]
+    texts = {name: ("", launching.description(rows)) for name, rows in PARAMETERS.items()} | OWN
     return LaunchDescription(
         [
             DeclareLaunchArgument("boards", description="NAME=PORT of each board, separated by spaces."),
-            *(DeclareLaunchArgument(n, default_value=v, description=d) for n, v, d in arguments),
+            *(DeclareLaunchArgument(n, default_value=v, description=d) for n, (v, d) in texts.items()),
             *(
                 DeclareLaunchArgument(
                     f"{name}_params",
                     default_value=PathJoinSubstitution([params, f"{name}.yaml"]),
                     description=f"Parameter file of every {name}.",
                 )
-                for name in ("driver", "mitigator")
+                for name in NODES
             ),
             OpaqueFunction(function=nodes_of),
         ]

@@ -1,84 +1,89 @@
-"""Starts a driver and a mitigator, each of which comes back if it dies.
+"""Starts driver and mitigator, and respawns them when they crash.
 
     ros2 launch uwb_mitigation uwb.launch.py source:=serial port:=/dev/ttyACM0
     ros2 launch uwb_mitigation uwb.launch.py source:=mcap path:=recording.mcap
-    ros2 launch uwb_mitigation uwb.launch.py driver_params:=mine.yaml       # which names the source
+    ros2 launch uwb_mitigation uwb.launch.py params:=robot.yaml             # which names the source
 
-`locate:=true anchors:=anchors.yaml` starts a locator too, `viewer:=true` a page at http://localhost:5006. Several boards: give each a namespace, such as `namespace:=board1`, or see `boards.launch.py`.
-`one_process:=true` runs both in one process, which takes less of the processor and sends no CIR unless
-somebody subscribes to it.
+`locate:=true anchors:=anchors.yaml` also starts a locator, `viewer:=true` a page at http://localhost:5006; without a
+source they are started alone. Every parameter of these nodes is an argument; `--show-args` lists them. For several
+boards give each a namespace, such as `namespace:=board1`, or see `boards.launch.py`. `one_process:=true` runs driver
+and mitigator in one process, which needs less CPU and publishes no CIR unless there is a subscriber.
 """
 
-from pathlib import Path
-
-import yaml
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
-FILED = ("driver", "mitigator", "locator", "viewer")
-SOURCES = ("mcap", "decaranging", "simulated", "serial", "evb1000", "spi")
+from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.nodes import launching
+
+NODES = ("driver", "mitigator", "locator", "viewer")
+PARAMETERS = launching.arguments(NODES)
+OWN = {
+    "params": ("", "Parameter file of all nodes; it overrides the files of single nodes."),
+    "namespace": ("", "Namespace of the nodes."),
+    "one_process": ("false", "Run driver and mitigator in one process: true or false."),
+    "locate": ("false", "Start a locator too: true or false."),
+    "viewer": ("false", "Start a viewer too, which serves a page: true or false."),
+    "use_sim_time": ("false", "Take the time from /clock: true or false."),
+    "log_level": ("info", f"Log level of every node: {', '.join(launching.LOG_LEVELS)}."),
+    "respawn": ("true", "Restart a node that crashes, but not after the end of a recording: true or false."),
+}
+FILES = tuple(f"{node}_params" for node in NODES)
 
 
-def parameters_in(path):
-    """The parameters that a file sets, by name, whatever node it sets them for."""
-    if not Path(path).is_file():
-        raise RuntimeError(f"parameter file {path}: no such file")
-    return dict(parameters_below(yaml.safe_load(Path(path).read_text(encoding="utf-8"))))
-
-
-def parameters_below(tree):
-    for name, branch in tree.items() if isinstance(tree, dict) else ():
-        if name == "ros__parameters":
-            yield from (branch or {}).items()
-        else:
-            yield from parameters_below(branch)
-
-
+@launching.plain_errors
 def nodes_of(context):
-    def said(name):
-        return LaunchConfiguration(name).perform(context)
-
-    files = {name: said(f"{name}_params") for name in FILED}
-    given = {name: parameters_in(path) for name, path in files.items()}
-    if not (said("source") or given["driver"].get("source")):
-        raise RuntimeError(
-            "where do ranges come from? Say source:=serial port:=/dev/ttyACM0, source:=mcap path:=FILE, "
-            "source:=decaranging path:=FILE, or source:=simulated for ranges that no radio measured"
+    launching.check_names(getattr(context, "argv", ()), {*PARAMETERS, *OWN, *FILES})
+    said = {name: LaunchConfiguration(name).perform(context) for name in (*PARAMETERS, *OWN, *FILES)}
+    flags = ("one_process", "locate", "viewer", "use_sim_time", "respawn")
+    flag = {name: launching.boolean(name, said[name]) for name in flags}
+    level = launching.log_level(said["log_level"])
+    files = {node: [said[f"{node}_params"], *filter(None, [said["params"]])] for node in NODES}
+    given = {node: launching.from_files(node, *files[node]) for node in NODES}
+    wanted = {"locator": flag["locate"], "viewer": flag["viewer"]}
+    started = [node for node in wanted if wanted[node]]
+    source = said["source"] or given["driver"].get("source")
+    if source:
+        started = ["driver", "mitigator", *started]
+    elif not started:
+        raise ParameterError(
+            "no source of ranges",
+            valid="source:=serial port:=/dev/ttyACM0, source:=mcap path:=FILE, source:=decaranging path:=FILE, or "
+            "source:=simulated for ranges that no radio measured",
         )
-    # What is not said is left to the parameter files.
-    driver = {name: said(name) for name in ("source", "port", "path") if said(name)}
-    mitigator = {"model": said("model")} if said("model") else {}
-    common = {"use_sim_time": said("use_sim_time").lower() == "true"}
-    settings = {
-        "driver": [files["driver"], driver, common],
-        "mitigator": [files["mitigator"], mitigator, common],
-    }
-    if said("one_process").lower() == "true":
+    values = launching.parameters(said, started, NODES)
+    if source:
+        launching.check_driver(given["driver"] | values["driver"])
+    for node in started if said["params"] else ():
+        own = {n: given[node].get(n, default) for n, default in launching.others_meaning(node).items()}
+        values[node] = own | values[node]
+    common = {"use_sim_time": flag["use_sim_time"]}
+    if flag["locate"] and "viewer" in values:
+        # The locator publishes the anchors for the viewer.
+        values["viewer"].pop("anchors", None)
+    settings = {node: [*files[node], values[node], common] for node in started}
+    if flag["one_process"] and source:
         # Without a name: it would be given to both nodes of the process.
-        settings = {"pipeline": [files["driver"], files["mitigator"], driver | mitigator, common]}
-    anchors = {"anchors": said("anchors")} if said("anchors") else {}
-    locate = said("locate").lower() == "true"
-    if locate:
-        settings["locator"] = [files["locator"], anchors, common]
-    if said("viewer").lower() == "true":
-        # A locator tells the viewer where the anchors are.
-        settings["viewer"] = [files["viewer"], {} if locate else anchors, common]
-    ends = (driver.get("source") or given["driver"]["source"]) in ("mcap", "decaranging")
+        both = [said["driver_params"], *files["mitigator"], values["driver"] | values["mitigator"], common]
+        settings = {"pipeline": both} | {node: settings[node] for node in started if node in wanted}
+    ends = source in ("mcap", "decaranging")
+    kept = launching.kept_parameters()
     return [
         Node(
             package="uwb_mitigation",
             executable=name,
             name=None if name == "pipeline" else name,
-            namespace=said("namespace"),
+            namespace=said["namespace"],
             parameters=parameters,
             output="screen",
-            # A recording ends its driver, which is then to stay away.
-            respawn=said("respawn").lower() == "true" and not (name in ("driver", "pipeline") and ends),
+            # The end of a recording ends its driver, which must not start again.
+            respawn=flag["respawn"] and not (name in ("driver", "pipeline") and ends),
             respawn_delay=0.5,
-            ros_arguments=["--log-level", said("log_level")],
+            additional_env=kept,
+            ros_arguments=["--log-level", level],
         )
         for name, parameters in settings.items()
     ]
@@ -86,43 +91,17 @@ def nodes_of(context):
 
 def generate_launch_description():
     params = PathJoinSubstitution([FindPackageShare("uwb_mitigation"), "params"])
-    arguments = [
-        ("source", "", f"Where ranges come from: {', '.join(SOURCES)}. Empty = as driver_params says."),
-        (
-            "port",
-            "",
-            "Port of the board or radio: /dev/ttyACM0, or usb:VENDOR:PRODUCT[:SERIAL] (source:=serial, source:=evb1000); "
-            "/dev/spidev0.0 (source:=spi).",
-        ),
-        ("path", "", "Recording to replay (source:=mcap, source:=decaranging)."),
-        (
-            "model",
-            "",
-            "Model bundle to correct with. Empty = as mitigator_params says, else universal.",
-        ),
-        ("namespace", "", "Namespace of the nodes."),
-        ("one_process", "false", "Run driver and mitigator in one process: true or false."),
-        ("locate", "false", "Start a locator too: true or false."),
-        ("viewer", "false", "Start a viewer too, which serves a page: true or false."),
-        (
-            "anchors",
-            "",
-            "Anchors file of the locator, or of a viewer without one. Empty = as their files say.",
-        ),
-        ("use_sim_time", "false", "Take the time from /clock: true or false."),
-        ("log_level", "info", "Of every node: debug, info, warn, error or fatal."),
-        ("respawn", "true", "Start a node again when it dies, unless a recording has ended: true or false."),
-    ]
+    texts = {name: ("", launching.description(rows)) for name, rows in PARAMETERS.items()} | OWN
     return LaunchDescription(
         [
-            *(DeclareLaunchArgument(n, default_value=v, description=d) for n, v, d in arguments),
+            *(DeclareLaunchArgument(n, default_value=v, description=d) for n, (v, d) in texts.items()),
             *(
                 DeclareLaunchArgument(
                     f"{name}_params",
                     default_value=PathJoinSubstitution([params, f"{name}.yaml"]),
                     description=f"Parameter file of the {name}.",
                 )
-                for name in FILED
+                for name in NODES
             ),
             OpaqueFunction(function=nodes_of),
         ]

@@ -20,7 +20,7 @@ from uwb_mitigation.model import graph
 from uwb_mitigation.model.architecture import Remnet
 from uwb_mitigation.model.bundle import METADATA_KEY, assemble_bundle, load_bundle, parse_bundle, save_bundle
 from uwb_mitigation.model.prior import LinePrior
-from uwb_mitigation.model.shipped import default_model_path, shipped_model_path
+from uwb_mitigation.model.shipped import SHIPPED, default_model_path, model_path, shipped_model_path
 from uwb_mitigation.preprocessing import Preprocessing, Scaling
 
 SHAPE = Remnet(samples=16, filters=4)
@@ -113,6 +113,13 @@ def test_random_bytes_are_refused():
     generator = random.Random(2)
     for length in (1, 10, 1000):
         refusal(generator.randbytes(length))
+
+
+def test_a_wrong_name_of_a_model_gets_those_of_the_shipped_ones():
+    with pytest.raises(ModelError) as caught:
+        model_path("univresal")
+    assert "did you mean universal" in caught.value.valid
+    assert all(name in caught.value.valid for name in SHIPPED)
 
 
 def test_an_absent_file_is_named(tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import runpy
 import shutil
 import subprocess
 import sys
@@ -150,6 +151,17 @@ def test_the_set_up_goes_on_with_the_python_that_was_chosen_before(tmp_path: Pat
     command = [sys.executable, program, "--keep-python", "develop"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert done.stdout == f"{program} develop\n"
+
+
+def test_tf2_messages_are_built_unless_the_real_ones_are_installed(tmp_path: Path):
+    bootstrap = runpy.run_path(str(REPOSITORY / "bootstrap.py"))
+    manifest = tmp_path / "share" / "tf2_msgs" / "package.xml"
+    assert not bootstrap["has_tf2_messages"]([str(tmp_path)])
+    manifest.parent.mkdir(parents=True)
+    shutil.copy(REPOSITORY / "cmake" / "tf2_msgs" / "package.xml", manifest)
+    assert not bootstrap["has_tf2_messages"]([str(tmp_path)]), "the copy of the set-up itself"
+    manifest.write_text("<package><name>tf2_msgs</name><version>0.36.0</version></package>")
+    assert bootstrap["has_tf2_messages"](["/absent", str(tmp_path)])
 
 
 def test_an_environment_that_cannot_be_made_anew_stays_as_it_was(tmp_path: Path):

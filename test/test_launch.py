@@ -8,7 +8,10 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
 import pytest
+import yaml
 from conftest import REPOSITORY
+
+from uwb_mitigation.nodes.parameter_tables import TABLES
 
 LAUNCH = REPOSITORY / "launch"
 
@@ -64,15 +67,17 @@ def launch(generate, file: str, **said: str) -> list:
     """The nodes that a launch file starts when it is told so."""
     arguments, nodes_of = described(generate, file)
     assert set(said) <= set(arguments)
-    context = {
-        name: str(REPOSITORY / "params" / f"{name.removesuffix('_params')}.yaml") for name in arguments
-    }
-    context |= {
+    return nodes_of(values_of(arguments) | said)
+
+
+def values_of(arguments: dict) -> dict[str, str]:
+    """The value of each argument that is not given."""
+    values = {name: str(REPOSITORY / "params" / f"{name.removesuffix('_params')}.yaml") for name in arguments}
+    return values | {
         name: argument.default_value
         for name, argument in arguments.items()
         if isinstance(getattr(argument, "default_value", None), str)
     }
-    return nodes_of(context | said)
 
 
 def settings(node) -> dict[str, object]:
@@ -133,6 +138,110 @@ def test_a_recording_that_has_ended_is_not_played_again(generate, one_process: s
     assert respawning == (
         {"pipeline": False} if one_process == "true" else {"driver": False, "mitigator": True}
     )
+
+
+def test_every_parameter_is_an_argument_and_reaches_its_node_with_its_type(generate):
+    said = {"source": "serial", "port": "usb:2341:805a", "locate": "true", "viewer": "true"}
+    arguments, _ = described(generate, "uwb.launch.py")
+    examples = {"radio.address": "1234", "offsets": "0.25", "level": "true", "height": "1", "publish_tf": "True",
+                "viewer_port": "8080", "locator_rate": "20", "rate": "2", "radio.pan": "7", "area": "0,0,0,9,9,3"}  # fmt: skip
+    assert set(examples) <= set(arguments)
+    for node, table in TABLES.items():
+        for row in table:
+            assert {row.name, f"{node}_{row.name}"} & set(arguments), row
+    nodes = {
+        node.executable: settings(node) for node in launch(generate, "uwb.launch.py", **said, **examples)
+    }
+    # launch_ros reads a text as YAML: an address of digits alone has to stay a text.
+    assert yaml.safe_load(nodes["driver"]["radio.address"]) == "1234"
+    expected = {
+        "driver": {"offsets": 0.25, "rate": 2.0, "radio.pan": 7, "port": "usb:2341:805a"},
+        "mitigator": {"offsets": 0.25},
+        "locator": {"level": True, "height": 1.0, "publish_tf": True, "rate": 20.0, "area": "0,0,0,9,9,3"},
+        "viewer": {"port": 8080},
+    }
+    for node, values in expected.items():
+        assert {name: nodes[node][name] for name in values} == values
+        assert all(type(nodes[node][name]) is type(value) for name, value in values.items())
+    assert not {"level", "rate"} & set(nodes["mitigator"])
+
+
+@pytest.mark.parametrize(
+    ("said", "told"),
+    [
+        ({"source": "mcpa", "path": "a.mcap"}, "source = 'mcpa'"),
+        ({"source": "simulated", "locate": "yess"}, "locate:=yess"),
+        ({"source": "simulated", "use_sim_time": "1.0"}, "use_sim_time:=1.0"),
+        ({"source": "simulated", "respawn": ""}, "respawn:="),
+        ({"source": "simulated", "log_level": "loud"}, "log_level:=loud"),
+        ({"source": "simulated", "sensor_ranges": "maybe"}, "sensor_ranges = 'maybe'"),
+        ({"source": "simulated", "simulated_rate": "-1"}, "simulated_rate = -1"),
+        ({"source": "simulated", "height": "1.0"}, "height:=1.0.*locate:=true"),
+        ({"source": "serial"}, "serial without a port"),
+        ({"source": "decaranging"}, "decaranging without a path"),
+    ],
+)
+def test_an_argument_that_is_wrong_stops_the_launch(generate, said: dict[str, str], told: str):
+    with pytest.raises(RuntimeError, match=told):
+        launch(generate, "uwb.launch.py", **said)
+
+
+class Context(dict):
+    """Launch's context: the values of arguments, and the words after the file on the command line."""
+
+    argv = ("log_level:=info", "hieght:=0.4")
+
+
+@pytest.mark.parametrize("file", ["uwb.launch.py", "boards.launch.py"])
+def test_an_argument_that_is_unknown_stops_the_launch_but_those_of_another_file_do_not(
+    generate, file: str, monkeypatch: pytest.MonkeyPatch
+):
+    arguments, nodes_of = described(generate, file)
+    context = Context(values_of(arguments) | {"source": "simulated", "boards": "left=/dev/x"})
+    with pytest.raises(RuntimeError, match="hieght"):
+        nodes_of(context)
+    monkeypatch.setattr(sys, "argv", ["ros2", "launch", "robot_bringup", "robot.launch.xml", *Context.argv])
+    assert nodes_of(context)
+
+
+def test_one_file_configures_all_nodes(generate, tmp_path: Path):
+    robot = tmp_path / "robot.yaml"
+    robot.write_text(
+        "/**:\n  ros__parameters: {source: serial, port: /dev/x, offsets: 0.2, use_sim_time: true}\n"
+        "driver: {ros__parameters: {radio: {channel: 2}, rate: 3}}\n"
+        "/left/locator: {ros__parameters: {anchors: a.yaml}}\n"
+        "controller_server: {ros__parameters: {frequency: 20.0}}\n"
+    )
+    nodes = launch(generate, "uwb.launch.py", params=str(robot), locate="true", viewer="true")
+    assert [node.executable for node in nodes] == ["driver", "mitigator", "locator", "viewer"]
+    assert all(node.parameters[1] == str(robot) for node in nodes)
+    # `port` for all nodes is the driver's.
+    assert "port" not in settings(nodes[0])
+    assert settings(nodes[3])["port"] == 5006
+    (pipeline,) = launch(generate, "uwb.launch.py", params=str(robot), one_process="true")
+    assert pipeline.parameters[2] == str(robot)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("/**: {ros__parameters: {sorce: mcap}}", "sorce is unknown.*source"),
+        ("/**: {ros__parameters: {source: mcpa}}", "source = 'mcpa'"),
+        ("driver: {ros__parameters: {radio: {chanel: 5}}}", r"radio\.chanel is unknown.*radio\.channel"),
+        ("mitigator: [", "robot.yaml"),
+    ],
+)
+def test_a_parameter_file_with_a_mistake_stops_the_launch(generate, tmp_path: Path, text: str, told: str):
+    robot = tmp_path / "robot.yaml"
+    robot.write_text(text)
+    with pytest.raises(RuntimeError, match=told):
+        launch(generate, "uwb.launch.py", source="simulated", params=str(robot))
+
+
+def test_a_locator_is_started_alone_where_there_is_no_source(generate):
+    (locator,) = launch(generate, "uwb.launch.py", locate="true", anchors="anchors.yaml")
+    assert locator.executable == "locator"
+    assert settings(locator)["anchors"] == "anchors.yaml"
 
 
 def test_nothing_is_simulated_that_was_not_asked_for(generate, tmp_path: Path):

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import threading
 import time
 from collections import Counter
@@ -10,9 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import serial
 
-from uwb_mitigation.errors import ParameterError, RecordingError
+from uwb_mitigation.errors import LinkError, ParameterError, RecordingError
 from uwb_mitigation.link.board import Identity
 from uwb_mitigation.link.emulated_board import BoardFaults, EmulatedBoard
 from uwb_mitigation.link.events import Connected, Disconnected, Event, Loss
@@ -21,6 +23,7 @@ from uwb_mitigation.link.layout import Mode
 from uwb_mitigation.link.messages import Correction
 from uwb_mitigation.link.port import BoardPort, PortAddress
 from uwb_mitigation.measurement import Cir, CorrectedRange, Origin, RangeMeasurement, Record, Status
+from uwb_mitigation.radio.evb1000 import Evb1000Bus
 
 PATIENCE_S = 240
 """How long a test waits for what must come; nothing is asserted about how soon it does."""
@@ -221,11 +224,28 @@ def test_a_file_that_is_no_port_is_reported(tmp_path):
     port.close()
 
 
-def test_a_port_that_another_program_holds_is_reported(board, link):
-    with serial.Serial(str(link), exclusive=True):
-        port = BoardPort(PortAddress(str(link)))
-        wait_until(lambda: "cannot be opened" in port.report().problem)
+@pytest.mark.parametrize("exclusive", [True, False])
+def test_a_port_that_another_program_has_open_is_reported_with_its_name(exclusive: bool):
+    controller, device = os.openpty()
+    name = os.ttyname(device)
+    program = (
+        f"import serial; port = serial.Serial({name!r}, exclusive={exclusive}); print(1, flush=True); input()"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as other:
+        other.stdout.readline()
+        port = BoardPort(PortAddress(name))
+        place = "in use by" if exclusive else "also open in"
+        wait_until(lambda: place in port.report().problem)
+        assert f"(process {other.pid})" in port.report().problem
         port.close()
+        if exclusive:
+            with pytest.raises(LinkError, match=rf"in use by .*\(process {other.pid}\)"):
+                Evb1000Bus(PortAddress(name))
+        other.stdin.close()
+    os.close(controller)
+    os.close(device)
 
 
 def test_closing_ends_a_wait_for_events_in_another_thread(link):

@@ -14,12 +14,14 @@ pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 from drives import HALL, drive
-from geometry_msgs.msg import PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped, Quaternion, Transform, TransformStamped, Vector3
 from nav_msgs.msg import Odometry
-from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
 from ros_harness import Ros
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Header
+from tf2_msgs.msg import TFMessage
+from tf_buffer import Buffer
 from uwb_mitigation_msgs.msg import RangeCorrected
 from visualization_msgs.msg import MarkerArray
 
@@ -30,6 +32,7 @@ from uwb_mitigation.sources.site import load_learnt
 pytestmark = pytest.mark.ros
 
 CORRECTED = "/uwb/range_corrected"
+SHARED = ("-r", f"uwb/range_corrected:={CORRECTED}")
 NANOSECONDS = 1_000_000_000
 
 
@@ -114,7 +117,7 @@ def test_poses_odometry_smoothed_poses_and_markers_come_of_ranges(ros: Ros, anch
     assert np.sqrt(np.mean(errors[known] ** 2)) < 0.3
     assert np.nanmax(run.errors(smoothed)) < 0.5
     assert {pose.header.frame_id for pose in poses} == {"map"}
-    assert {message.child_frame_id for message in odometry} == {"base_link"}
+    assert {message.child_frame_id for message in odometry} == {"uwb_tag"}
     assert poses[-1].pose.covariance[35] >= 1e5
     assert poses[-1].pose.pose.orientation.w == 1.0
     told = facts(diagnostics)
@@ -228,15 +231,101 @@ def test_an_anchors_file_that_cannot_be_used_is_said_and_the_node_stays(
     assert locator.signal(signal.SIGINT) == 0
 
 
-def test_tf_is_refused_where_its_messages_are_not_installed(ros: Ros, anchors: Path):
-    try:
-        import tf2_msgs  # noqa: F401
-    except ImportError:
-        locator = ros.start("locator", f"anchors:={anchors}", "publish_tf:=true")
-        locator.wait_for_output("tf2_msgs, which is not installed")
-        assert locator.exit_code() is None
-    else:
-        pytest.skip("tf2_msgs is installed")
+def test_a_best_effort_height_is_received_and_best_effort_ranges_are_reported(ros: Ros, anchors: Path):
+    heights = ros.node.create_publisher(PoseWithCovarianceStamped, "/height", qos_profile_sensor_data)
+    ros.node.create_publisher(RangeCorrected, CORRECTED, qos_profile_sensor_data)
+    locator = ros.start("locator", f"anchors:={anchors}", "height_topic:=/height", "rate:=0.0")
+    locator.wait_for_output(f"publishes by best effort and is not received: set qos_overrides.{CORRECTED}")
+    ros.spin_until(lambda: heights.get_subscription_count() == 1)
+    (subscription,) = ros.node.get_subscriptions_info_by_topic("/height")
+    assert subscription.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
+
+
+def transform_matrix(message) -> np.ndarray:
+    """The 4 x 4 matrix of a transform that turns about z only."""
+    at, turn = message.transform.translation, message.transform.rotation
+    yaw = 2 * math.atan2(turn.z, turn.w)
+    matrix = np.eye(4)
+    matrix[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
+    matrix[:3, 3] = at.x, at.y, at.z
+    return matrix
+
+
+@pytest.mark.parametrize("localized", [False, True], ids=["odom to base_link", "and map to odom"])
+def test_tf_of_the_tags_leaves_the_transforms_of_the_robot_alone(ros: Ros, anchors: Path, localized: bool):
+    # One robot in a namespace, one without: their tags share the map.
+    locator = ros.start("locator", f"anchors:={anchors}", "rate:=0.0", "publish_tf:=true", "tag:=7")
+    other = ros.start(
+        "locator", f"anchors:={anchors}", "publish_tf:=true", arguments=("-r", "__ns:=/left", *SHARED)
+    )
+    for process in (locator, other):
+        process.wait_for_output("locating")
+    transforms = ros.collect(TFMessage, "/tf")
+    poses = ros.collect(PoseWithCovarianceStamped, "/uwb/pose")
+    odometry = {name: ros.collect(Odometry, f"/{name}uwb/odometry") for name in ("", "left/")}
+    second = ros.collect(Odometry, "/uwb/tag_0x1122334455667788/odometry")
+    wheels = ros.node.create_publisher(TFMessage, "/tf", QoSProfile(depth=10_000))
+    run = Drive(ros, seconds=10)
+    ros.wait_for_subscribers(CORRECTED, 2)
+    sent = {}
+    for step in range(0, len(run.ranges), 20):
+        stamp = run.start_ns + int(run.ranges.stamp_ns[step])
+        links = [link("odom", "base_link", stamp, step / 100, 1.0)]
+        if localized:
+            links.append(link("map", "odom", stamp, 2.0, -1.0))
+        sent[stamp] = (
+            transform_matrix(links[-1]) @ transform_matrix(links[0])
+            if localized
+            else transform_matrix(links[0])
+        )
+        wheels.publish(TFMessage(transforms=links))
+        rows = range(step, min(step + 20, len(run.ranges)))
+        run.send(rows)
+        run.send(rows, tag=0x1122334455667788)
+    ros.spin_until(lambda: len(poses) > 100 and len(second) > 20 and len(odometry["left/"]) > 20)
+
+    def received(parent: str) -> set[int]:
+        links = [one for array in transforms for one in array.transforms if one.child_frame_id != "odom"]
+        return {stamp_ns(one) for one in links if one.header.frame_id == parent}
+
+    ros.spin_until(lambda: received("odom") >= set(sent) and stamp_ns(poses[-1]) in received("map"))
+    buffer = Buffer()
+    for message in [one for array in transforms for one in array.transforms]:
+        buffer.add(
+            message.header.frame_id, message.child_frame_id, stamp_ns(message), transform_matrix(message)
+        )
+    root = "map" if localized else "odom"
+    for stamp, matrix in sent.items():
+        assert buffer.lookup(root, "base_link", stamp) == pytest.approx(matrix)
+    pose = poses[-1].pose.pose.position
+    assert buffer.lookup("map", "uwb_tag", stamp_ns(poses[-1]))[:3, 3] == pytest.approx(
+        (pose.x, pose.y, pose.z)
+    )
+    tags = {"uwb_tag", "left/uwb_tag", "tag_0x1122334455667788", "left/tag_0x1122334455667788"}
+    robot = {"base_link", "odom"} if localized else {"base_link"}
+    assert buffer.frames() - robot <= tags
+    assert {"uwb_tag", "left/uwb_tag", "tag_0x1122334455667788"} <= buffer.frames()
+    assert all(buffer.parents(frame) == {"map"} for frame in buffer.frames() & tags)
+    assert {message.child_frame_id for message in odometry[""]} == {"uwb_tag"}
+    assert {message.child_frame_id for message in odometry["left/"]} == {"left/uwb_tag"}
+    assert {message.child_frame_id for message in second} == {"tag_0x1122334455667788"}
+
+
+def link(parent: str, child: str, stamp: int, x: float, yaw: float) -> TransformStamped:
+    return TransformStamped(
+        header=Header(frame_id=parent, stamp=Time(sec=stamp // NANOSECONDS, nanosec=stamp % NANOSECONDS)),
+        child_frame_id=child,
+        transform=Transform(
+            translation=Vector3(x=x), rotation=Quaternion(z=math.sin(yaw / 2), w=math.cos(yaw / 2))
+        ),
+    )
+
+
+@pytest.mark.parametrize("frame", ["tag_9", "map"])
+def test_a_tag_frame_that_is_taken_is_refused(ros: Ros, anchors: Path, frame: str):
+    locator = ros.start("locator", f"anchors:={anchors}", f"tag_frame:={frame}", "tag:=7")
+    locator.wait_for_output(f"tag_frame = '{frame}'")
+    assert locator.exit_code() is None
 
 
 def test_the_pipeline_has_a_locator_where_anchors_are_given(ros: Ros, tmp_path: Path):

@@ -7,7 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from uwb_mitigation.measurement import Cir, Encoding, Origin, Status
+from uwb_mitigation.bag.poses import tag_frame, tag_of_frame
+from uwb_mitigation.measurement import Cir, Encoding, Origin, Status, format_id
 
 
 def test_a_complex_sample_counts_once():
@@ -27,3 +28,14 @@ def test_the_values_are_those_of_the_messages():
     assert [status.value for status in Status] == [0, 1, 2, 3, 4]
     assert (Origin.HOST, Origin.DEVICE) == (0, 1)
     assert (Encoding.COMPLEX_INT16, Encoding.MAGNITUDE) == (0, 1)
+
+
+@pytest.mark.parametrize("number", [0, 7, 65535, 65536, 2**64 - 1])
+def test_the_text_of_an_id_is_complete_and_can_be_read_again(number: int):
+    assert int(format_id(number), 0) == number
+    assert len(format_id(number)) == (18 if number > 65535 else len(str(number)))
+    assert tag_of_frame(f"left/{tag_frame(number)}") == number
+
+
+def test_a_frame_of_no_tag_is_none():
+    assert [tag_of_frame(frame) for frame in ("uwb_tag", "tag_", "tag_x", "base_link")] == [None] * 4

@@ -19,7 +19,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
-from diagnostic_msgs.msg import DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from rclpy.serialization import deserialize_message
 from ros_harness import PAUSED, Ros, domain
@@ -171,6 +171,7 @@ def test_a_signal_ends_the_mitigator_cleanly(ros: Ros, number: signal.Signals):
     [
         (("source:=mcap", "path:=/nonexistent/bag.mcap"), "/nonexistent/bag.mcap"),
         (("source:=mcap",), "path"),
+        (("source:=serial",), "no port is given"),
         (("source:=carrier_pigeon",), "one of mcap, decaranging, simulated, serial"),
         (("rate:=-1.0",), "rate"),
         (("rate:=.nan",), "rate"),
@@ -296,6 +297,24 @@ def quiet_mitigator(tmp_path_factory: pytest.TempPathFactory):
             return corrected[0]
 
         yield ask
+
+
+def test_two_nodes_with_one_name_are_reported_and_a_killed_one_is_not(ros: Ros):
+    killed = ros.start("mitigator")
+    killed.wait_for_output("correcting")
+    killed.signal(signal.SIGKILL)
+    first = ros.start("mitigator")
+    first.wait_for_output("correcting")
+    own = ("mitigator", "/")
+    # The killed one is still in the graph.
+    ros.spin_until(lambda: ros.node.get_node_names_and_namespaces().count(own) > 1)
+    reports = ros.collect(DiagnosticArray, "/diagnostics")
+    ros.spin_until(lambda: len(reports) > 3)
+    assert "another node has the name" not in first.output
+    second = ros.start("mitigator")
+    for process in (first, second):
+        process.wait_for_output("another node has the name /mitigator")
+    ros.diagnosis("mitigator", lambda status: "another node has the name" in status.message)
 
 
 def test_nodes_of_a_namespace_keep_to_themselves(ros: Ros):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import signal
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from uwb_mitigation_msgs.msg import RangeCir
 from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.measurement import Record
-from uwb_mitigation.nodes.parameter_tables import TABLES, Parameter
+from uwb_mitigation.nodes.parameter_tables import KEPT_PARAMETERS, TABLES, Parameter
 from uwb_mitigation.sources.simulated import SimulatedSource
 
 pytestmark = pytest.mark.ros
@@ -61,9 +62,9 @@ def test_a_parameter_that_no_node_knows_is_refused_with_what_was_meant(ros: Ros,
         (
             "driver",
             ("--params-file", str(file)),
-            "parameter sorce is unknown (meant is perhaps source)",
+            "parameter sorce is unknown (did you mean source?)",
         ),
-        ("pipeline", ("-p", "raet:=2.0"), "parameter raet is unknown (meant is perhaps rate"),
+        ("pipeline", ("-p", "raet:=2.0"), "parameter raet is unknown (did you mean rate"),
         ("mitigator", ("-p", "wholly_else:=1"), "parameter wholly_else is unknown"),
     ):
         process = ros.start(node, arguments=words)
@@ -72,11 +73,35 @@ def test_a_parameter_that_no_node_knows_is_refused_with_what_was_meant(ros: Ros,
         assert "Traceback" not in process.output
 
 
-def test_another_nodes_parameter_in_a_file_for_all_has_no_effect_and_is_told(ros: Ros, tmp_path: Path):
+def test_other_nodes_parameters_in_a_file_for_all_are_named_in_one_line_and_no_warning(
+    ros: Ros, tmp_path: Path
+):
     file = tmp_path / "parameters.yaml"
-    file.write_text("/**:\n  ros__parameters:\n    model: ''\n    rate: 2.0\n")
+    file.write_text("/**:\n  ros__parameters: {model: '', rate: 2.0, height: 1.0, anchors: a.yaml}\n")
     driver = ros.start("driver", arguments=("--params-file", str(file)))
-    driver.wait_for_output("parameter model is another node's and has no effect here")
+    driver.wait_for_output("replaying")
+    (line,) = [line for line in driver.output.splitlines() if "parameters of other nodes" in line]
+    assert "[INFO]" in line
+    assert line.endswith("anchors, height, model")
+
+
+def test_parameters_that_were_set_survive_a_respawn(
+    ros: Ros, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv(KEPT_PARAMETERS, str(tmp_path))
+    mitigator = ros.start("mitigator", "offsets:=0.1")
+    mitigator.wait_for_output("correcting with")
+    assert ros.set_parameter("mitigator", "offsets", 0.22).successful
+    assert ros.set_parameter("mitigator", "model", "evk1000_apartment").successful
+    assert ros.set_parameter("mitigator", "model", "absent.onnx").successful is False
+    mitigator.signal(signal.SIGKILL)
+    respawned = ros.start("mitigator", "offsets:=0.1")
+    respawned.wait_for_output("correcting with model evk1000_apartment")
+    assert "restored after a restart" in respawned.output
+    status = ros.diagnosis(
+        "mitigator", lambda one: any(v.key == "offsets" and "0.22" in v.value for v in one.values)
+    )
+    assert status
 
 
 def test_known_parameters_are_not_reported(ros: Ros):

@@ -363,7 +363,7 @@ def test_a_publisher_by_best_effort_is_named_and_heard_where_it_is_asked_for(ros
     mitigator = ros.start("mitigator")
     status = ros.diagnosis("mitigator", lambda status: "best effort" in status.message)
     assert status.level == DiagnosticStatus.WARN
-    assert "/test_client publishes by best effort and is not heard" in status.message
+    assert "/test_client publishes by best effort and is not received" in status.message
     (parameter,) = re.findall(r"qos_overrides\S+", status.message)
     mitigator.wait_for_output("incompatible QoS")
     assert mitigator.signal(signal.SIGINT) == 0

@@ -6,6 +6,9 @@ that a caller can act on them. No other module defines exceptions.
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
+
 
 class UwbMitigationError(Exception):
     """Base of every error raised on purpose.
@@ -62,6 +65,12 @@ class LinkError(UwbMitigationError):
 
 class MissingDependencyError(UwbMitigationError):
     """An optional part of the installation is not there."""
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Return the question which of the known names was meant; empty if none is similar."""
+    close = difflib.get_close_matches(name, list(known), n=2)
+    return f"did you mean {' or '.join(close)}?" if close else ""
 
 
 _DISTRIBUTIONS = {"serial": "pyserial", "sklearn": "scikit-learn", "yaml": "pyyaml"}

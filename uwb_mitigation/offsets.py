@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.files import read_bounded
+from uwb_mitigation.measurement import format_id
 
 MAX_OFFSET_M = 10.0
 """A DW1000 whose antenna delay was never set is 154 m off: that belongs into the radio, as `antenna_delay`."""
@@ -68,10 +69,10 @@ class Offsets:
         if entries > MAX_ENTRIES:
             raise ParameterError(f"{entries} offsets", where=where, valid=f"{MAX_ENTRIES} at most")
         self.default = _checked(default, "default", where)
-        self.anchors = {i: _checked(value, f"anchor {i}", where) for i, value in anchors.items()}
-        self.tags = {i: _checked(value, f"tag {i}", where) for i, value in tags.items()}
+        self.anchors = {i: _checked(value, f"anchor {format_id(i)}", where) for i, value in anchors.items()}
+        self.tags = {i: _checked(value, f"tag {format_id(i)}", where) for i, value in tags.items()}
         self.pairs = {
-            (tag, anchor): _checked(value, f"anchor {anchor}, tag {tag}", where)
+            (tag, anchor): _checked(value, f"anchor {format_id(anchor)}, tag {format_id(tag)}", where)
             for (tag, anchor), value in pairs.items()
         }
         self.pair_sd = {
@@ -188,13 +189,18 @@ def dump_offsets(offsets: Offsets, comment: str = "") -> str:
     out.write(f"default: {round(offsets.default, 6)}\n")
     for name, entries in (("anchors", offsets.anchors), ("tags", offsets.tags)):
         if entries:
-            out.write(f"{name}:\n" + "".join(f"  {i}: {round(m, 6)}\n" for i, m in sorted(entries.items())))
+            out.write(
+                f"{name}:\n"
+                + "".join(f"  {format_id(i)}: {round(m, 6)}\n" for i, m in sorted(entries.items()))
+            )
     if offsets.pairs:
         out.write("pairs:\n")
         for (tag, anchor), value in sorted(offsets.pairs.items()):
             sd = offsets.pair_sd.get((tag, anchor))
             sure = "" if sd is None else f", sd: {round(sd, 6)}"
-            out.write(f"  - {{anchor: {anchor}, tag: {tag}, offset: {round(value, 6)}{sure}}}\n")
+            out.write(
+                f"  - {{anchor: {format_id(anchor)}, tag: {format_id(tag)}, offset: {round(value, 6)}{sure}}}\n"
+            )
     return out.getvalue()
 
 
@@ -260,7 +266,7 @@ def _deviation(value: float, pair: tuple[int, int], where: str) -> float:
     if not 0.0 < value <= MAX_OFFSET_M:
         tag, anchor = pair
         raise ParameterError(
-            f"sd = {value!r:.60} m of anchor {anchor}, tag {tag}",
+            f"sd = {value!r:.60} m of anchor {format_id(anchor)}, tag {format_id(tag)}",
             where=where,
             valid=f"more than 0, {MAX_OFFSET_M:g} m at most",
         )

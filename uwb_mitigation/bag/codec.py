@@ -15,7 +15,16 @@ from typing import NamedTuple
 import numpy as np
 
 from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.measurement import Cir, CorrectedRange, Encoding, Origin, RangeMeasurement, Status, Truth
+from uwb_mitigation.measurement import (
+    Cir,
+    CorrectedRange,
+    Encoding,
+    Origin,
+    RangeMeasurement,
+    Status,
+    Truth,
+    format_id,
+)
 
 LITTLE_ENDIAN = b"\x00\x01"
 """The encapsulation that is read and written (OMG DDSI-RTPS 2.5, section 10.2)."""
@@ -271,5 +280,5 @@ def _require_end(data: bytes, size: int) -> None:
 def _misfit(type_name: str, measurement: RangeMeasurement, error: Exception) -> RecordingError:
     return RecordingError(
         f"a value does not fit {type_name}: {error}",
-        where=f"exchange {measurement.sequence} of anchor {measurement.anchor_id}, tag {measurement.tag_id}",
+        where=f"exchange {measurement.sequence} of anchor {format_id(measurement.anchor_id)}, tag {format_id(measurement.tag_id)}",
     )

@@ -19,10 +19,14 @@ from uwb_mitigation.bag import schemas
 from uwb_mitigation.bag.codec import LITTLE_ENDIAN
 from uwb_mitigation.bag.topics import ODOMETRY_TYPE
 from uwb_mitigation.errors import RecordingError
+from uwb_mitigation.measurement import format_id
 from uwb_mitigation.positioning.tracks import Estimate, TruePath
 
 MAP = "map"
 """The anchors' frame (REP-105)."""
+
+UWB_TAG = "uwb_tag"
+"""The frame of the only tag: at its antenna, with the axes of `MAP`."""
 
 UNOBSERVED = 1e6
 """Variance of what ranges do not tell, rad^2 and rad^2/s^2."""
@@ -45,7 +49,16 @@ _TAG_FRAME = "tag_"
 
 def tag_frame(tag_id: int) -> str:
     """The frame of a tag's antenna."""
-    return f"{_TAG_FRAME}{tag_id}"
+    return f"{_TAG_FRAME}{format_id(tag_id)}"
+
+
+def tag_of_frame(frame: str) -> int | None:
+    """The tag of a frame that `tag_frame` names, in any namespace; None for another frame."""
+    name = frame.rpartition("/")[2]
+    try:
+        return int(name.removeprefix(_TAG_FRAME), 0) if name.startswith(_TAG_FRAME) else None
+    except ValueError:
+        return None
 
 
 def tag_topic(topic: str, tag_id: int | None) -> str:
@@ -63,8 +76,8 @@ def encode_pose(estimate: Estimate, frame_id: str = MAP) -> bytes:
     return data + _pose(estimate)
 
 
-def encode_odometry(estimate: Estimate, frame_id: str = MAP, child_frame_id: str = "base_link") -> bytes:
-    """`nav_msgs/Odometry` in CDR. The velocity is in the child frame, which stands as the pose says: unturned."""
+def encode_odometry(estimate: Estimate, frame_id: str = MAP, child_frame_id: str = UWB_TAG) -> bytes:
+    """Return `nav_msgs/Odometry` in CDR. The child frame has the axes of `frame_id`, and so has the velocity."""
     data = _header(estimate.stamp_ns, frame_id)
     child = child_frame_id.encode() + b"\0"
     data += bytes(-len(data) % 4) + _LENGTH.pack(len(child)) + child
@@ -102,10 +115,10 @@ def decode_place(data: bytes) -> tuple[int, int, tuple[float, float, float]] | N
         raise RecordingError("an odometry message that is cut short") from error
     if encapsulation[:2] != LITTLE_ENDIAN:
         raise RecordingError("an odometry message in another encoding")
-    frame, digits = _TAG_FRAME.encode(), child.rstrip(b"\0").removeprefix(_TAG_FRAME.encode())
-    if not (child.startswith(frame) and digits.isdigit() and all(map(math.isfinite, (x, y, z)))):
+    tag_id = tag_of_frame(child.rstrip(b"\0").decode(errors="replace"))
+    if tag_id is None or not all(map(math.isfinite, (x, y, z))):
         return None
-    return seconds * _NANOSECONDS + nanoseconds, int(digits), (x, y, z)
+    return seconds * _NANOSECONDS + nanoseconds, tag_id, (x, y, z)
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,8 +136,7 @@ class FramePath:
     @property
     def tag_id(self) -> int | None:
         """The tag whose frame it is, as `tag_frame` names it; None = another frame."""
-        digits = self.child_frame.removeprefix(_TAG_FRAME)
-        return int(digits) if self.child_frame.startswith(_TAG_FRAME) and digits.isdigit() else None
+        return tag_of_frame(self.child_frame)
 
 
 def read_positions(path: Path, topic: str) -> list[FramePath]:

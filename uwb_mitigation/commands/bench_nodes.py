@@ -8,11 +8,10 @@ from statistics import median
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.table import Table
 
 from uwb_mitigation.commands import console
 from uwb_mitigation.commands.checks import import_bench
-from uwb_mitigation.commands.console import JsonOption
+from uwb_mitigation.commands.console import JsonOption, Table
 
 if TYPE_CHECKING:
     from uwb_mitigation.benches.nodes import Figures

@@ -6,10 +6,9 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.table import Table
 
 from uwb_mitigation.commands import console
-from uwb_mitigation.commands.console import JsonOption
+from uwb_mitigation.commands.console import JsonOption, Table
 from uwb_mitigation.errors import ParameterError
 
 if TYPE_CHECKING:

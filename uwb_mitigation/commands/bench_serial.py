@@ -6,11 +6,10 @@ from dataclasses import asdict
 from typing import Annotated
 
 import typer
-from rich.table import Table
 
 from uwb_mitigation.commands import console
 from uwb_mitigation.commands.checks import import_bench
-from uwb_mitigation.commands.console import JsonOption
+from uwb_mitigation.commands.console import JsonOption, Table
 
 
 def bench_serial(

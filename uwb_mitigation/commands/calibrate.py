@@ -189,7 +189,7 @@ def _lever_arm(text: str | None) -> tuple[float, float, float] | None:
 
 
 def _show(found: Calibrated) -> None:
-    from rich.table import Table
+    from uwb_mitigation.commands.console import Table
 
     if found.localised is not None:
         one = found.localised

@@ -12,9 +12,18 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table as RichTable
 
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.files import write_whole
+
+
+class Table(RichTable):
+    """A table that breaks a long word over two lines: rich would cut it off where the terminal is narrow."""
+
+    def add_column(self, *arguments: Any, **options: Any) -> None:
+        super().add_column(*arguments, **{"overflow": "fold", **options})
+
 
 # Results go to standard output, progress to standard error, so that a pipe carries results alone.
 # rich leaves colours and cursor movement out where a stream is not a terminal.

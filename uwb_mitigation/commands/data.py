@@ -14,6 +14,7 @@ from uwb_mitigation.commands import console
 from uwb_mitigation.commands.console import JsonOption
 from uwb_mitigation.commands.fetch import fetch
 from uwb_mitigation.errors import DamagedRecordingError, ParameterError, RecordingError
+from uwb_mitigation.measurement import format_id
 
 if TYPE_CHECKING:
     from uwb_mitigation.sources.inventory import Inventory
@@ -316,7 +317,7 @@ def _today_ns() -> int:
 
 
 def _show_inventory(inventory: Inventory) -> None:
-    from rich.table import Table
+    from uwb_mitigation.commands.console import Table
 
     console.out.print(
         f"{inventory.ranges} ranges, {inventory.with_truth} with truth, "
@@ -327,8 +328,8 @@ def _show_inventory(inventory: Inventory) -> None:
         pairs.add_column(column, justify="right")
     for pair in inventory.pairs.values():
         pairs.add_row(
-            _identity(pair.anchor_id),
-            _identity(pair.tag_id),
+            format_id(pair.anchor_id),
+            format_id(pair.tag_id),
             pair.label,
             str(pair.ranges),
             _number(pair.rate_hz, 1),
@@ -346,11 +347,6 @@ def _show_inventory(inventory: Inventory) -> None:
 
 def _pairs(inventory: Inventory) -> str:
     return f"{inventory.pair_count} pair{'' if inventory.pair_count == 1 else 's'}"
-
-
-def _identity(number: int) -> str:
-    """Small numbers as they are; long addresses as the radio's tools print them."""
-    return str(number) if number < 1 << 16 else f"{number:016x}"
 
 
 def _number(value: float, digits: int) -> str:

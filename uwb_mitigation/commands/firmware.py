@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.box import SIMPLE_HEAD
-from rich.table import Table
 
 from uwb_mitigation.commands import console
-from uwb_mitigation.commands.console import JsonOption
+from uwb_mitigation.commands.console import JsonOption, Table
 from uwb_mitigation.errors import ParameterError
 
 if TYPE_CHECKING:

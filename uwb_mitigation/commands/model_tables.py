@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from rich.table import Table
-
 from uwb_mitigation.commands import console
+from uwb_mitigation.commands.console import Table
 
 if TYPE_CHECKING:
     from uwb_mitigation.evaluation.accuracy import Accuracy

@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.table import Table
 
 from uwb_mitigation.commands import console
 from uwb_mitigation.commands.bundles import ModelOption, bundle_for
-from uwb_mitigation.commands.console import JsonOption
+from uwb_mitigation.commands.console import JsonOption, Table
 from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.measurement import format_id
 
 if TYPE_CHECKING:
     from uwb_mitigation.evaluation.radio_offsets import FoundOffset
@@ -106,8 +106,8 @@ def _show(found: FoundOffset) -> None:
     for one in found.placements[:MOST_SHOWN]:
         values = (one.offset_m, one.sd_m) if not one.refused else ()
         table.add_row(
-            str(one.anchor_id),
-            str(one.tag_id),
+            format_id(one.anchor_id),
+            format_id(one.tag_id),
             one.placement,
             str(one.ranges),
             *(f"{value:.3f}" for value in values),
@@ -121,7 +121,8 @@ def _show(found: FoundOffset) -> None:
     refused = [one for one in found.placements if one.refused]
     for one in refused[:MOST_SHOWN]:
         console.err.print(
-            f"left out: anchor {one.anchor_id}, tag {one.tag_id} {one.placement}: {one.refused}", markup=False
+            f"left out: anchor {format_id(one.anchor_id)}, tag {format_id(one.tag_id)} {one.placement}: {one.refused}",
+            markup=False,
         )
     if len(refused) > MOST_SHOWN:
         console.err.print(f"left out: {len(refused) - MOST_SHOWN} placements more")

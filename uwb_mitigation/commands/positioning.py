@@ -11,6 +11,7 @@ import typer
 from uwb_mitigation.commands import console
 from uwb_mitigation.commands.console import JsonOption
 from uwb_mitigation.errors import ParameterError, RecordingError
+from uwb_mitigation.measurement import format_id
 
 if TYPE_CHECKING:
     from uwb_mitigation.positioning.anchors import AnchorMap
@@ -102,7 +103,7 @@ def track(
     with BagWriter(output, origin, force=force) as out, console.progress() as bar:
         task = bar.add_task("tracking", total=len(recorded.tags))
         for tag in recorded.tags:
-            bar.update(task, description=f"tracking tag {tag.tag_id}: {len(tag.ranges)} ranges")
+            bar.update(task, description=f"tracking tag {format_id(tag.tag_id)}: {len(tag.ranges)} ranges")
             tracks.append(track_tag(tag, known, model, place, box))
             bar.advance(task)
         write_tracks(out, tracks)
@@ -154,11 +155,13 @@ def survey(
     rows = []
     for identity in fixed or []:
         if identity not in known.index:
-            raise ParameterError(f"--fixed {identity}", valid=f"one of {', '.join(map(str, known.index))}")
+            raise ParameterError(
+                f"--fixed {format_id(identity)}", valid=f"one of {', '.join(map(format_id, known.index))}"
+            )
         rows.append(known.index[identity])
     tag = max(recorded.tags, key=lambda one: len(one.ranges))
     with console.progress() as bar:
-        bar.add_task(f"surveying from {len(tag.ranges)} ranges of tag {tag.tag_id}", total=None)
+        bar.add_task(f"surveying from {len(tag.ranges)} ranges of tag {format_id(tag.tag_id)}", total=None)
         result = find(
             known,
             tag.ranges,
@@ -168,7 +171,9 @@ def survey(
             area=box,
             model=Model(acceleration=acceleration),
         )
-    save_anchors(output, result.anchors, f"surveyed from {bag.name}, tag {tag.tag_id}", force=force)
+    save_anchors(
+        output, result.anchors, f"surveyed from {bag.name}, tag {format_id(tag.tag_id)}", force=force
+    )
     _show_survey(result, known)
     console.out.print(f"Wrote {len(known)} anchors to {output}.", markup=False, soft_wrap=True)
     console.write_json(
@@ -208,7 +213,7 @@ def _read(bag: Path, anchors: Path | None, stamp_offset: float) -> tuple[AnchorM
         bar.add_task("reading", total=None)
         recorded = read_ranges(bag, known, stamp_offset)
     for identity, count in recorded.strangers.items():
-        _warn(f"{count} ranges of anchor {identity} left out: it is not in the anchors file")
+        _warn(f"{count} ranges of anchor {format_id(identity)} left out: it is not in the anchors file")
     for why, count in recorded.skipped.items():
         _warn(f"left out: {count} x {why}")
     return known, recorded
@@ -229,7 +234,7 @@ def area_of(text: str | None) -> Area | None:
 
 
 def _show_tracks(tracks: list[TagTracks], anchors: AnchorMap) -> None:
-    from rich.table import Table
+    from uwb_mitigation.commands.console import Table
 
     table = Table("tag", "track", title="Horizontal errors, m", title_justify="left")
     for column in ("epochs", "RMSE", "median", "p95", "in ellipse", "NEES", "beyond"):
@@ -242,7 +247,7 @@ def _show_tracks(tracks: list[TagTracks], anchors: AnchorMap) -> None:
             (f"smoothed, {kind}", len(one.smoothed), one.smoothed_errors),
         )
         for name, epochs, errors in rows:
-            table.add_row(str(one.recording.tag_id), name, *_cells(epochs, errors))
+            table.add_row(format_id(one.recording.tag_id), name, *_cells(epochs, errors))
     console.out.print(table)
     console.out.print(
         "In ellipse: truths inside the 95 % ellipses. NEES: 1 is honest, more overconfident. Beyond: errors beyond "
@@ -251,7 +256,7 @@ def _show_tracks(tracks: list[TagTracks], anchors: AnchorMap) -> None:
     )
     for one in tracks:
         if not one.live_errors.epochs:
-            console.out.print(f"tag {one.recording.tag_id}: no truth in the bag, so no errors")
+            console.out.print(f"tag {format_id(one.recording.tag_id)}: no truth in the bag, so no errors")
         for row in one.disagreeing:
             _warn(f"anchor {anchors.anchors[row]} disagrees with the others: is it where the file says?")
 
@@ -269,7 +274,7 @@ def _cells(epochs: int, errors: TrackErrors) -> tuple[str, ...]:
 
 
 def _show_survey(result: SurveyResult, guesses: AnchorMap) -> None:
-    from rich.table import Table
+    from uwb_mitigation.commands.console import Table
 
     table = Table("anchor", title="Anchors, m", title_justify="left")
     for column in ("x", "y", "z", "deviation", "off its guess"):

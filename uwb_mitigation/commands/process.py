@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
-from rich.table import Table
 
 from uwb_mitigation.commands import console
 from uwb_mitigation.commands.bundles import ModelOption, bundle_for
 from uwb_mitigation.commands.checks import OffsetsOption
-from uwb_mitigation.commands.console import JsonOption
+from uwb_mitigation.commands.console import JsonOption, Table
 from uwb_mitigation.errors import ParameterError, RecordingError, UwbMitigationError
 
 if TYPE_CHECKING:

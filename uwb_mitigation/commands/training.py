@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.box import SIMPLE_HEAD
-from rich.table import Table
 
 from uwb_mitigation.commands import console
 from uwb_mitigation.commands.checks import check_output, needs_torch, scaling_of
-from uwb_mitigation.commands.console import JsonOption
+from uwb_mitigation.commands.console import JsonOption, Table
 from uwb_mitigation.errors import ParameterError, UwbMitigationError
 from uwb_mitigation.evaluation import paper
 

@@ -95,7 +95,7 @@ def train_universal(
 
 
 def _show(held_out: Mapping[str, Mapping[str, ErrorStatistics]]) -> None:
-    from rich.table import Table
+    from uwb_mitigation.commands.console import Table
 
     table = Table(title="MAE in a simulated world that was held out, m", title_justify="left")
     table.add_column("")

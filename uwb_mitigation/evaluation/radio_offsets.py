@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError, ParameterError
-from uwb_mitigation.measurement import LINE_OF_SIGHT_DB, Record, Status
+from uwb_mitigation.measurement import LINE_OF_SIGHT_DB, Record, Status, format_id
 from uwb_mitigation.mitigation import Mitigation, correct_batch
 from uwb_mitigation.model.prior import LinePrior
 from uwb_mitigation.offsets import MAX_OFFSET_M, Offsets
@@ -183,7 +183,7 @@ def find_offset(
         raise DatasetError("no range of that anchor and tag")
     pairs = sorted({(tag, anchor) for tag, anchor, _ in groups})
     if distance_m is not None and len(pairs) > 1:
-        some = ", ".join(f"anchor {anchor} tag {tag}" for tag, anchor in pairs[:5])
+        some = ", ".join(f"anchor {format_id(anchor)} tag {format_id(tag)}" for tag, anchor in pairs[:5])
         raise ParameterError(
             f"one distance for {len(pairs)} pairs ({some}{', ...' if len(pairs) > 5 else ''})",
             valid="choose one with --anchor and --tag",
@@ -246,7 +246,7 @@ def _together(placements: tuple[PlacementOffset, ...], model_id: int) -> FoundOf
         first = placements[0]
         more = f", and so on for {len(placements)} placements" if len(placements) > 1 else ""
         raise DatasetError(
-            f"anchor {first.anchor_id}, tag {first.tag_id}: {first.refused}{more}",
+            f"anchor {format_id(first.anchor_id)}, tag {format_id(first.tag_id)}: {first.refused}{more}",
             valid="range with nothing between or beside the antennas",
         )
     if (ranges := sum(one.ranges for one in good)) < FEWEST_RANGES:

@@ -60,6 +60,10 @@ class PortAddress:
         Raises:
             ParameterError: the text is none of these.
         """
+        if not text:
+            raise ParameterError(
+                "no port is given", valid="port:=/dev/ttyACM0 or port:=usb:VENDOR:PRODUCT[:SERIAL]"
+            )
         if text.startswith("/"):
             return cls(device=text)
         kind, *parts = text.split(":", 3)
@@ -91,6 +95,33 @@ class PortAddress:
             ):
                 return str(port.device)
         return None
+
+
+def users_of(path: str) -> list[str]:
+    """Return the other programs that have a device file open, such as `minicom (process 123)`; only those of this user
+    unless it is root.
+    """
+    device, found = os.path.realpath(path), []
+    for process in os.listdir("/proc"):
+        if not process.isdigit() or int(process) == os.getpid():
+            continue
+        with contextlib.suppress(OSError):
+            folder = f"/proc/{process}/fd"
+            if any(os.path.realpath(f"{folder}/{fd}") == device for fd in os.listdir(folder)):
+                with open(f"/proc/{process}/comm", encoding="utf-8") as name:
+                    found.append(f"{name.read().strip()} (process {process})")
+    return found
+
+
+def why_not_opened(address: PortAddress, error: Exception) -> str:
+    """Return why a port could not be opened, and what to do."""
+    code = getattr(error, "errno", None)
+    if code in (errno.EAGAIN, errno.EBUSY):
+        users = ", ".join(users_of(address.find() or "")) or "another program"
+        return f"in use by {users} (close it; sudo fuser -v {address.find()} lists the users)"
+    return (
+        f"{error} (sudo usermod -aG dialout $USER, then log in again)" if code == errno.EACCES else str(error)
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +180,7 @@ class BoardPort:
         self._session = BoardSession(mode=mode, expected_model_id=expected_model_id)
         self._events: EventQueue[Event] = EventQueue(capacity)
         self._openings = 0
-        self._port = ""
+        self._port = self._others = ""
         self._problem = f"{address} is not there"
         # Guards the session, and what is told of it.
         self._lock = threading.Lock()
@@ -264,15 +295,14 @@ class BoardPort:
             port.open()
         except (OSError, ValueError) as error:
             # SerialException is an OSError; a ValueError is a baud rate that the port refuses.
-            forbidden = getattr(error, "errno", None) == errno.EACCES
-            fix = " (sudo usermod -aG dialout $USER, then log in again)" if forbidden else ""
-            self._say(f"{self._address} cannot be opened: {error}{fix}")
+            self._say(f"{self._address} cannot be opened: {why_not_opened(self._address, error)}")
             return None
         with contextlib.suppress(OSError, ValueError, NotImplementedError):
             # Bridges hold bytes back for 16 ms otherwise. Other ports do not know the flag.
             port.set_low_latency_mode(True)
         with self._lock:
             self._port, self._problem = path, ""
+            self._others = ", ".join(users_of(path))
             self._openings += 1
             self._events.put(self._session.opened(time.monotonic_ns()))
         return port
@@ -310,7 +340,8 @@ class BoardPort:
         if session.state is LinkState.WRONG_VERSION:
             return f"{session.state.value}: {session.foreign_version}"
         if session.state is not LinkState.READY:
-            return str(session.state.value)
+            others = f"; the port is also open in {self._others}" if self._others else ""
+            return f"{session.state.value}{others}"
         return "" if session.model_matches else "the board holds another model than the expected one"
 
     def _say(self, problem: str) -> None:

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from uwb_mitigation.errors import ModelError
+from uwb_mitigation.errors import ModelError, did_you_mean
 
 if TYPE_CHECKING:
     # The doctor comes even where numpy does not.
@@ -28,11 +28,21 @@ def model_path(named: str | Path | None) -> Path:
     """The bundle that a person names: a file, or one of `SHIPPED`; nothing names the default.
 
     Raises:
-        ModelError: see `shipped_model_path`.
+        ModelError: there is no such file or shipped model; names the shipped ones.
     """
     if not named or str(named) == ".":
         return default_model_path()
-    return shipped_model_path(str(named)) if str(named) in SHIPPED else Path(named).expanduser()
+    if str(named) in SHIPPED:
+        return shipped_model_path(str(named))
+    path = Path(named).expanduser()
+    if not path.exists():
+        hint = did_you_mean(path.stem, SHIPPED)
+        raise ModelError(
+            "no such file, and no shipped model",
+            where=str(named),
+            valid=f"{f'{hint} ' if hint else ''}shipped models: {', '.join(SHIPPED)}",
+        )
+    return path
 
 
 def shipped_model_path(name: str) -> Path:

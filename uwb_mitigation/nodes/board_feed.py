@@ -25,7 +25,7 @@ from uwb_mitigation.link.layout import PROTOCOL_VERSION, LogLevel
 from uwb_mitigation.link.messages import BoardStatus, Correction, Log
 from uwb_mitigation.link.port import BoardPort
 from uwb_mitigation.link.radio import Radio, RadioSettings, RadioStatus
-from uwb_mitigation.measurement import RangeMeasurement
+from uwb_mitigation.measurement import RangeMeasurement, format_id
 from uwb_mitigation.nodes import diagnostics, radio_facts
 from uwb_mitigation.offsets import Offsets
 
@@ -88,7 +88,7 @@ class BoardFeed:
         }
         hardware = "no board"
         if report.hello is not None:
-            hardware = f"board {report.hello.board_id:x}"
+            hardware = f"board {format_id(report.hello.board_id)}"
             facts |= {
                 "firmware": f"{report.hello.firmware_name} {'.'.join(map(str, report.hello.firmware_version))}",
                 "model id": diagnostics.model_id(report.hello.model_id),
@@ -105,7 +105,7 @@ class BoardFeed:
             facts |= {f"board: {name}": value for name, value in asdict(self.status).items()}
         radio, status = self._radio, self._radio_status
         if radio is not None:
-            hardware += f", radio {radio.address:016x}"
+            hardware += f", radio {format_id(radio.address)}"
         if status is not None:
             facts |= radio_facts.facts(radio, status, "radio: ") | radio_facts.anchors(status)
         problem = report.problem
@@ -165,7 +165,7 @@ class BoardFeed:
             # A board tells it anew at times.
             if event.settings != self._radio:
                 self._logger.info(
-                    f"the board's radio {event.settings.address:016x}: {radio_facts.told(event.settings)}"
+                    f"the board's radio {format_id(event.settings.address)}: {radio_facts.told(event.settings)}"
                 )
             self._radio = event.settings
         elif isinstance(event, RadioRefused):
@@ -177,7 +177,7 @@ class BoardFeed:
             self._told = ""
             hello = event.hello
             self._logger.info(
-                f"connected to board {hello.board_id:x}, model {diagnostics.model_id(hello.model_id)}, "
+                f"connected to board {format_id(hello.board_id)}, model {diagnostics.model_id(hello.model_id)}, "
                 f"mode {hello.mode.name}"
             )
         elif isinstance(event, Disconnected):

@@ -21,7 +21,7 @@ def report(
     """The message of one status, stamped on the node's clock and named after the node."""
     status = DiagnosticStatus(
         level=level,
-        name=f"{node.get_fully_qualified_name().lstrip('/')}: ranges",
+        name=name_of(node),
         message=message,
         hardware_id=hardware_id,
         values=[KeyValue(key=key, value=str(value)) for key, value in facts.items()],
@@ -29,6 +29,11 @@ def report(
     array = DiagnosticArray(status=[status])
     array.header.stamp = node.get_clock().now().to_msg()
     return array
+
+
+def name_of(node: Node) -> str:
+    """Return the name of the node's status."""
+    return f"{node.get_fully_qualified_name().lstrip('/')}: ranges"
 
 
 def percentiles(name: str, values_ns: list[int]) -> dict[str, object]:

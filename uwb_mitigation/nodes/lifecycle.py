@@ -7,6 +7,7 @@ transition had opened is closed again, so that the same transition may be asked 
 from __future__ import annotations
 
 import traceback
+from collections import deque
 from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
@@ -14,11 +15,50 @@ from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import State
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.subscription import Subscription
 
 from uwb_mitigation.errors import UwbMitigationError, not_imported
 from uwb_mitigation.nodes import diagnostics, topics
 from uwb_mitigation.nodes.parameter_tables import Parameter
 from uwb_mitigation.nodes.parameters import declare, warn_of_unknown_qos
+
+
+class Namesakes:
+    """Finds out whether another node has the name of this one: ROS then mixes up their parameters and transitions.
+
+    A node that was killed stays in the graph for some seconds. So the graph is only a hint, and diagnostics under the
+    node's name that this node has not sent are the proof.
+    """
+
+    def __init__(self, node: LifecycleNode) -> None:
+        self._node = node
+        self._subscription: Subscription | None = None
+        self._sent: deque[tuple[int, int]] = deque(maxlen=10)
+        self._found = False
+
+    def sent(self, report: DiagnosticArray) -> None:
+        self._sent.append((report.header.stamp.sec, report.header.stamp.nanosec))
+
+    def problems(self) -> list[str]:
+        """Return what is wrong in a line; empty if the name is unique."""
+        node = self._node
+        own = (node.get_name(), node.get_namespace())
+        shared = node.get_node_names_and_namespaces().count(own) > 1
+        if shared and self._subscription is None:
+            self._subscription = node.create_subscription(
+                DiagnosticArray, topics.DIAGNOSTICS, self._on_report, 10
+            )
+        elif not shared and self._subscription is not None:
+            node.destroy_subscription(self._subscription)
+            self._subscription, self._found = None, False
+        name = node.get_fully_qualified_name()
+        remedy = "give it a namespace (-r __ns:=/left) or a name (-r __node:=left)"
+        return [f"another node has the name {name}: {remedy}"] if self._found else []
+
+    def _on_report(self, message: DiagnosticArray) -> None:
+        name = diagnostics.name_of(self._node)
+        stamp = (message.header.stamp.sec, message.header.stamp.nanosec)
+        self._found |= stamp not in self._sent and any(status.name == name for status in message.status)
 
 
 class ManagedNode(LifecycleNode):
@@ -40,6 +80,8 @@ class ManagedNode(LifecycleNode):
         super().__init__(name)
         declare(self, table, foreign)
         self.error: UwbMitigationError | None = None
+        self._namesakes = Namesakes(self)
+        self._reported: set[str] = set()
         self._diagnostics = self.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, 10)
         # By a steady clock: diagnostics are wanted most when the node's own clock stands still.
         self.create_timer(1.0, self._publish_diagnostics, clock=Clock(clock_type=ClockType.STEADY_TIME))
@@ -142,4 +184,14 @@ class ManagedNode(LifecycleNode):
             level, text = diagnostics.ERROR, f"{label}: {self.error}"
         elif not self.is_active:
             level, text = diagnostics.WARN, f"not active: {label}"
-        self._diagnostics.publish(diagnostics.report(self, hardware, level, text, facts))
+        problems = [*topics.not_received(self), *self._namesakes.problems()]
+        for problem in problems:
+            if problem not in self._reported:
+                self.get_logger().warning(problem)
+        self._reported = set(problems)
+        if problems:
+            text = "; ".join([*problems, text] if level > diagnostics.OK else problems)
+            level = max(level, diagnostics.WARN)
+        report = diagnostics.report(self, hardware, level, text, facts)
+        self._namesakes.sent(report)
+        self._diagnostics.publish(report)

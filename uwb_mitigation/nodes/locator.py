@@ -16,14 +16,16 @@ from nav_msgs.msg import Odometry
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.publisher import Publisher
+from rclpy.qos import ReliabilityPolicy
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from uwb_mitigation_msgs.msg import RangeCorrected
 from visualization_msgs.msg import MarkerArray
 
 from uwb_mitigation.bag.codec import decode_corrected
-from uwb_mitigation.bag.poses import encode_odometry, encode_pose, tag_frame
+from uwb_mitigation.bag.poses import encode_odometry, encode_pose, tag_frame, tag_of_frame
 from uwb_mitigation.errors import MissingDependencyError, ParameterError, RecordingError
+from uwb_mitigation.measurement import format_id
 from uwb_mitigation.nodes import clocks, diagnostics, markers, topics
 from uwb_mitigation.nodes.conversions import to_header
 from uwb_mitigation.nodes.lifecycle import ManagedNode
@@ -52,9 +54,9 @@ _NANOSECONDS = 1_000_000_000
 
 
 class _Outputs:
-    """The publishers of one tag, and what it said last."""
+    """The publishers of one tag, its frame, and what it said last."""
 
-    def __init__(self, node: Locator, prefix: str) -> None:
+    def __init__(self, node: Locator, prefix: str, frame: str) -> None:
         def publisher(kind: type, topic: str) -> Publisher:
             head, _, tail = topic.rpartition("/")
             return topics.create_publisher(node, kind, f"{head}/{prefix}{tail}")
@@ -62,9 +64,9 @@ class _Outputs:
         self.pose = publisher(PoseWithCovarianceStamped, topics.POSE)
         self.odometry = publisher(Odometry, topics.ODOMETRY)
         self.smoothed = publisher(PoseWithCovarianceStamped, topics.POSE_SMOOTHED)
-        self.plain = not prefix
+        self.frame = frame
         self.picture = markers.TagPicture()
-        self.told_ns = self.smoothed_ns = -(1 << 62)
+        self.told_ns = self.smoothed_ns = self.transform_ns = -(1 << 62)
 
     def all(self) -> tuple[Publisher, ...]:
         return self.pose, self.odometry, self.smoothed
@@ -126,7 +128,12 @@ class Locator(ManagedNode):
         self._kept = 0
         self._period_ns = round(_NANOSECONDS / self.value("rate")) if self.value("rate") > 0 else 0
         self._offset_ns = round(self.value("stamp_offset") * _NANOSECONDS)
-        self._map, self._base = self.value("map_frame"), self.value("base_frame")
+        self._map, self._plain_frame = self.value("map_frame"), self.value("tag_frame")
+        if tag_of_frame(self._plain_frame) not in (None, self.value("tag")) or self._plain_frame == self._map:
+            raise ParameterError(
+                f"parameter tag_frame = {self._plain_frame!r} is the frame of another tag or of the map",
+                valid="a name of its own, such as uwb_tag",
+            )
         self._lever = np.array([self.value(f"lever_arm_{axis}") for axis in "xyz"])
         if self.value("publish_tf"):
             self._open_tf()
@@ -139,7 +146,9 @@ class Locator(ManagedNode):
             (Odometry, "odometry_topic", self._on_odometry),
         ):
             if topic := self.value(name):
-                self._subscriptions_made.append(topics.create_subscription(self, kind, topic, callback))
+                self._subscriptions_made.append(
+                    topics.create_subscription(self, kind, topic, callback, ReliabilityPolicy.BEST_EFFORT)
+                )
         self.get_logger().info(f"{len(anchors)} anchors from {path}")
         if len(known):
             self.get_logger().info(f"offsets of {len(known)} pairs from {self._offsets_file}")
@@ -237,7 +246,7 @@ class Locator(ManagedNode):
             if key.anchor_id in fleet.strangers and key.anchor_id not in self._told:
                 self._told.add(key.anchor_id)
                 self.get_logger().warning(
-                    f"ranges of anchor {key.anchor_id} are left out: it is not in the anchors file"
+                    f"ranges of anchor {format_id(key.anchor_id)} are left out: it is not in the anchors file"
                 )
             return
         tag, estimate = found
@@ -256,29 +265,33 @@ class Locator(ManagedNode):
         if outputs is None:
             chosen = self.value("tag")
             plain = tag.tag_id == chosen if chosen else not self._outputs
-            outputs = _Outputs(self, "" if plain else f"{tag_frame(tag.tag_id)}/")
+            name = tag_frame(tag.tag_id)
+            # Tags of several robots share the map, so the namespace keeps their frames apart.
+            frame = f"{self.get_namespace()}/{self._plain_frame if plain else name}".lstrip("/")
+            outputs = _Outputs(self, "" if plain else f"{name}/", frame)
             for publisher in outputs.all():
                 publisher.on_activate(None)
             self._outputs[tag.tag_id] = outputs
-            self.get_logger().info(f"tag {tag.tag_id} on {outputs.pose.topic_name}")
+            self.get_logger().info(f"tag {format_id(tag.tag_id)} on {outputs.pose.topic_name}")
         return outputs
 
     def _tell(self, outputs: _Outputs, estimate: Estimate) -> None:
         outputs.picture.add(estimate)
-        estimate = self._at_base(estimate)
-        outputs.pose.publish(encode_pose(estimate, self._map))
-        outputs.odometry.publish(encode_odometry(estimate, self._map, self._base))
-        if self._tf is not None and outputs.plain:
+        outputs.pose.publish(encode_pose(self._at_base(estimate), self._map))
+        outputs.odometry.publish(encode_odometry(estimate, self._map, outputs.frame))
+        # Listeners of tf warn of a stamp that they have already.
+        if self._tf is not None and estimate.stamp_ns > outputs.transform_ns:
+            outputs.transform_ns = estimate.stamp_ns
             x, y, z = estimate.position.tolist()
             transform = TransformStamped(
                 header=to_header(estimate.stamp_ns, self._map),
-                child_frame_id=self._base,
+                child_frame_id=outputs.frame,
                 transform=Transform(translation=Vector3(x=x, y=y, z=z), rotation=Quaternion(w=1.0)),
             )
             self._tf.publish(self._make_tf([transform]))
 
     def _at_base(self, estimate: Estimate) -> Estimate:
-        """The estimate of the base frame. How the base is turned is not known: a horizontal arm points anywhere."""
+        """Return the estimate of the robot's origin. Its heading is unknown: a horizontal arm points anywhere."""
         x, y, z = self._lever.tolist()
         if not (x or y or z):
             return estimate

@@ -12,7 +12,6 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
@@ -163,7 +162,7 @@ class Mitigator(ManagedNode):
     def describe(self) -> tuple[str, bytes, str, dict[str, object]]:
         period = self.health.period()
         level, text = diagnostics.OK, "correcting"
-        if warnings := [*self._mismatches(), *period.warnings()]:
+        if warnings := period.warnings():
             level, text = diagnostics.WARN, "; ".join(warnings)
         if period.statuses[Status.MODEL_ERROR]:
             level, text = diagnostics.ERROR, "the model fails on some ranges"
@@ -188,16 +187,6 @@ class Mitigator(ManagedNode):
             if period.direct_ranges:
                 facts["line of sight: median predicted error m"] = f"{period.direct_m:.3f}"
         return "host", level, text, facts
-
-    def _mismatches(self) -> list[str]:
-        """Who publishes ranges that this node does not hear."""
-        if self._raw is None or self._raw.qos_profile.reliability != ReliabilityPolicy.RELIABLE:
-            return []
-        return [
-            f"{name} publishes by best effort and is not heard: set qos_overrides.{self._raw.topic_name}"
-            ".subscription.reliability:=best_effort"
-            for name in topics.unheard(self, self._raw.topic_name)
-        ]
 
     def _publisher_count(self) -> int:
         return self._raw.get_publisher_count() if self._raw is not None else 0

@@ -16,12 +16,11 @@ from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
 
 from uwb_mitigation.bag.codec import decode_corrected, decode_truth
 from uwb_mitigation.errors import RecordingError, UwbMitigationError
-from uwb_mitigation.measurement import Status
+from uwb_mitigation.measurement import Status, format_id
 from uwb_mitigation.nodes import topics
 from uwb_mitigation.nodes.probe import watching
 from uwb_mitigation.nodes.signals import stop_event
 from uwb_mitigation.nodes.tally import Tally
-from uwb_mitigation.viewer.scene import short_id
 
 REFRESH_HZ = 5
 
@@ -73,12 +72,14 @@ def live_table(tally: Tally, title: str) -> Table:
         "status",
         "label",
     ):
-        table.add_column(column, justify="left" if column in ("status", "label") else "right")
+        table.add_column(
+            column, justify="left" if column in ("status", "label") else "right", overflow="fold"
+        )
     for (anchor, tag), history in sorted(tally.pairs.copy().items()):
         sample, rate_hz = history.samples[-1], history.rate_hz()
         table.add_row(
-            short_id(anchor),
-            short_id(tag),
+            format_id(anchor),
+            format_id(tag),
             f"{rate_hz:.1f}" if math.isfinite(rate_hz) else "-",
             metres(sample.raw_m),
             metres(sample.range_m),

@@ -202,12 +202,17 @@ LOCATOR = (
     Parameter("offsets_file", "", "Where learnt offsets are kept through a restart; made if it is not there. Empty = "
               "they are forgotten."),
     Parameter("map_frame", "map", "Frame of the anchors."),
-    Parameter("base_frame", "base_link", "Frame of what carries the tag."),
-    Parameter("lever_arm_x", 0.0, "Of the tag's antenna in the base frame. Ranges do not tell how it is turned: a "
-              "horizontal arm widens the covariance.", low=-100.0, high=100.0, unit="m"),
+    Parameter("tag_frame", "uwb_tag", "Frame of the tag with the plain topic names: child frame of uwb/odometry and "
+              "/tf. It is at the antenna and has the axes of map_frame. Other tags use tag_N. The namespace of the node "
+              "is put before it. Do not use a frame of the robot such as base_link: its heading is unknown here, and a "
+              "frame has only one parent in tf."),
+    Parameter("lever_arm_x", 0.0, "Position of the antenna in the robot's frame, x. With a lever arm, uwb/pose and "
+              "uwb/pose_smoothed are the position of the robot's origin. The heading is unknown: a horizontal arm only "
+              "widens the covariance.", low=-100.0, high=100.0, unit="m"),
     Parameter("lever_arm_y", 0.0, "The same in y.", low=-100.0, high=100.0, unit="m"),
-    Parameter("lever_arm_z", 0.0, "The same in z; taken off the height.", low=-100.0, high=100.0, unit="m"),
-    Parameter("publish_tf", False, "Publish map_frame to base_frame on /tf; needs tf2_msgs."),
+    Parameter("lever_arm_z", 0.0, "The same in z; subtracted from the height.", low=-100.0, high=100.0, unit="m"),
+    Parameter("publish_tf", False, "Publish map_frame to the frame of each tag on /tf, for display and lookups. The "
+              "frame is a leaf without heading: it never replaces odom to base_link or map to odom of the robot."),
     Parameter("autostart", True, "Configure and activate without a lifecycle manager."),
 )  # fmt: skip
 
@@ -221,6 +226,13 @@ VIEWER = (
     Parameter("window", 157, "Samples that the network reads, to be marked in the CIR.", low=1, high=1016),
     Parameter("autostart", True, "Configure and activate without a lifecycle manager."),
 )  # fmt: skip
+
+KEPT_PARAMETERS = "UWB_MITIGATION_KEPT_PARAMETERS"
+"""Environment variable of a folder where nodes keep the parameters that were set while they ran. A launch file makes
+the folder, for as long as it runs: a node that it respawns gets them back."""
+
+STANDARD = ("qos_overrides.", "use_sim_time", "start_type_description_service")
+"""Beginnings of the names of parameters that rclpy declares for every node."""
 
 TABLES: dict[str, tuple[Parameter, ...]] = {
     "driver": DRIVER,

@@ -6,6 +6,7 @@ from dataclasses import fields
 
 from uwb_mitigation.link.layout import RadioState, Role
 from uwb_mitigation.link.radio import RadioSettings, RadioStatus
+from uwb_mitigation.measurement import format_id
 
 COUNTS = tuple(row.name for row in fields(RadioStatus) if row.type == "int")
 """Of the exchanges of a radio, by how they ended."""
@@ -42,7 +43,7 @@ def facts(settings: RadioSettings | None, status: RadioStatus, prefix: str = "")
     said: dict[str, object] = {}
     if settings is not None:
         said |= {
-            f"{prefix}address": f"{settings.address:016x}",
+            f"{prefix}address": format_id(settings.address),
             f"{prefix}role": settings.role.name.lower(),
             f"{prefix}antenna delay": settings.antenna_delay,
         }
@@ -58,7 +59,7 @@ def anchors(status: RadioStatus) -> dict[str, object]:
     said: dict[str, object] = {}
     for anchor in status.anchors:
         heard = "never" if anchor.heard_ms is None else f"{anchor.heard_ms / 1000:.1f} s ago"
-        said[f"anchor {anchor.address:016x}"] = (
+        said[f"anchor {format_id(anchor.address)}"] = (
             f"{anchor.ranged} of {anchor.tried} ranged, {anchor.rx_power_dbm:.1f} dBm, heard {heard}"
         )
     return said

@@ -13,7 +13,7 @@ from typing import Any
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.link.layout import Role
 from uwb_mitigation.link.radio import Radio, RadioSettings
-from uwb_mitigation.measurement import RangeMeasurement
+from uwb_mitigation.measurement import RangeMeasurement, format_id
 from uwb_mitigation.nodes import diagnostics, radio_facts
 from uwb_mitigation.radio.opening import opener
 from uwb_mitigation.radio.port import RadioEvent, RadioLost, RadioPort
@@ -158,7 +158,7 @@ class RadioFeed:
             facts[f"{prefix}port"] = report.name or "none"
             facts |= radio_facts.facts(report.settings, report.status, prefix)
         facts |= radio_facts.anchors(first.status)
-        hardware = "no radio" if first.settings is None else f"radio {first.settings.address:016x}"
+        hardware = "no radio" if first.settings is None else f"radio {format_id(first.settings.address)}"
         problems = [report.problem for report in reports if report.problem]
         if problems:
             return hardware, diagnostics.ERROR, "; ".join(problems), facts
@@ -182,7 +182,7 @@ class RadioFeed:
         elif isinstance(event, Radio):
             settings = event.settings
             self._logger.info(
-                f"radio {settings.address:016x} at {port.report().name}: {radio_facts.told(settings)}"
+                f"radio {format_id(settings.address)} at {port.report().name}: {radio_facts.told(settings)}"
             )
         elif isinstance(event, RadioLost) and not port.closed:
             self._logger.warning(f"{event.text}; waiting for the radio")

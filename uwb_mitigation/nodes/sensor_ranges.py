@@ -8,7 +8,7 @@ from rclpy.lifecycle import LifecycleNode
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import Range
 
-from uwb_mitigation.measurement import CorrectedRange
+from uwb_mitigation.measurement import CorrectedRange, format_id
 from uwb_mitigation.nodes import conversions, topics
 
 LONGEST_M = 300.0
@@ -34,7 +34,7 @@ class SensorRanges:
         if publisher is None:
             if len(self._publishers) == MOST_ANCHORS:
                 self._node.get_logger().warning(
-                    f"more than {MOST_ANCHORS} anchors: no topic for anchor {anchor_id}",
+                    f"more than {MOST_ANCHORS} anchors: no topic for anchor {format_id(anchor_id)}",
                     throttle_duration_sec=60.0,
                 )
                 return
@@ -58,6 +58,8 @@ class SensorRanges:
         self._publishers.clear()
 
     def _make(self, anchor_id: int) -> Publisher:
-        publisher = topics.create_publisher(self._node, Range, f"{topics.RANGE_CORRECTED}/anchor_{anchor_id}")
+        publisher = topics.create_publisher(
+            self._node, Range, f"{topics.RANGE_CORRECTED}/anchor_{format_id(anchor_id)}"
+        )
         publisher.on_activate(None)
         return publisher

@@ -38,9 +38,9 @@ CLOCK = "/clock"
 DEPTH = 1000
 
 
-def _ranges() -> QoSProfile:
+def _ranges(reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE) -> QoSProfile:
     return QoSProfile(
-        reliability=ReliabilityPolicy.RELIABLE,
+        reliability=reliability,
         durability=DurabilityPolicy.VOLATILE,
         history=HistoryPolicy.KEEP_LAST,
         depth=DEPTH,
@@ -73,9 +73,13 @@ def create_publisher(node: LifecycleNode, kind: type, topic: str) -> Publisher:
 
 
 def create_subscription(
-    node: LifecycleNode, kind: type, topic: str, callback: Callable[[Any], None]
+    node: LifecycleNode,
+    kind: type,
+    topic: str,
+    callback: Callable[[Any], None],
+    reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE,
 ) -> Subscription:
-    """A subscription of ranges.
+    """Return a subscription; a best-effort one also receives from best-effort publishers, such as odometry.
 
     Raises:
         ParameterError: an overridden quality of service is none.
@@ -85,7 +89,7 @@ def create_subscription(
             kind,
             topic,
             callback,
-            _ranges(),
+            _ranges(reliability),
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )
 
@@ -127,11 +131,14 @@ def number_of(info: dict[str, int]) -> int:
     return info["publication_sequence_number"]
 
 
-def unheard(node: LifecycleNode, topic: str) -> list[str]:
-    """The nodes that publish on a topic by best effort, which a reliable subscription does not hear."""
+def not_received(node: LifecycleNode) -> list[str]:
+    """Return a line for each best-effort publisher from which a reliable subscription of the node receives nothing."""
     return [
-        f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"
-        for endpoint in node.get_publishers_info_by_topic(topic)
+        f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name} publishes by best effort and is not received: set "
+        f"qos_overrides.{subscription.topic_name}.subscription.reliability:=best_effort"
+        for subscription in node.subscriptions
+        if subscription.qos_profile.reliability == ReliabilityPolicy.RELIABLE
+        for endpoint in node.get_publishers_info_by_topic(subscription.topic_name)
         if endpoint.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
     ]
 

@@ -21,6 +21,7 @@ import yaml
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.measurement import format_id
 
 SD_M = 0.05
 """How well a tape measure places an anchor."""
@@ -52,7 +53,7 @@ class Anchor:
     name: str = ""
 
     def __str__(self) -> str:
-        identity = str(self.id) if self.id < 1 << 16 else f"{self.id:016x}"
+        identity = format_id(self.id)
         return f"{identity} ({self.name})" if self.name else identity
 
 
@@ -80,7 +81,7 @@ class AnchorMap:
         for number, anchor in enumerate(self.anchors):
             if anchor.id in self.index:
                 raise ParameterError(
-                    f"anchor {anchor.id} is there twice", where=where, valid="one entry for each"
+                    f"anchor {format_id(anchor.id)} is there twice", where=where, valid="one entry for each"
                 )
             self.index[anchor.id] = number
         self.position: NDArray[np.float64] = np.array(
@@ -142,10 +143,11 @@ def dump_anchors(anchors: AnchorMap, comment: str = "") -> str:
     out.write("anchors:\n")
     for anchor in anchors.anchors:
         x, y, z = (round(value, 6) for value in anchor.position)
-        entry: dict[str, object] = {"id": anchor.id, "x": x, "y": y, "z": z, "sd": round(anchor.sd, 6)}
+        entry: dict[str, object] = {"x": x, "y": y, "z": z, "sd": round(anchor.sd, 6)}
         if anchor.name:
             entry["name"] = anchor.name
-        out.write("  - " + yaml.safe_dump(entry, default_flow_style=True, sort_keys=False, width=1 << 16))
+        fields = yaml.safe_dump(entry, default_flow_style=True, sort_keys=False, width=1 << 16)
+        out.write(f"  - {{id: {format_id(anchor.id)}, {fields.removeprefix('{')}")
     return out.getvalue()
 
 

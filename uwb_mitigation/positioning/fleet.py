@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from uwb_mitigation.measurement import format_id
 from uwb_mitigation.offsets import NO_OFFSETS, Offsets
 from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.fixed_lag import FixedLag
@@ -142,10 +143,10 @@ class Fleet:
         """What a person should know, in words; empty = all is well."""
         found = []
         if self.strangers:
-            names = ", ".join(str(identity) for identity in sorted(self.strangers)[:5])
+            names = ", ".join(format_id(identity) for identity in sorted(self.strangers)[:5])
             found.append(f"ranges of anchors that are not in the anchors file: {names}")
         for tag in self.tags.values():
-            locator, name = tag.locator, f"tag {tag.tag_id}"
+            locator, name = tag.locator, f"tag {format_id(tag.tag_id)}"
             if not locator.following:
                 found.append(f"{name}: {self._why(locator)}")
             odd = [self.anchors.anchors[row] for row in locator.disagreeing()]
@@ -175,7 +176,7 @@ class Fleet:
             "ranges of unknown anchors": self.strangers.total(),
         }
         for tag in self.tags.values():
-            locator, name = tag.locator, f"tag {tag.tag_id}"
+            locator, name = tag.locator, f"tag {format_id(tag.tag_id)}"
             counts, health, known = locator.counts, locator.health, locator.filter
             found |= {
                 f"{name} places": locator.candidates,
@@ -187,7 +188,7 @@ class Fleet:
             }
             sd = tag.learner.sd_m
             found |= {
-                f"{name} anchor {anchor.id} offset m": f"{tag.learner.offset_m[row]:.3f} +- {sd[row]:.3f}"
+                f"{name} anchor {format_id(anchor.id)} offset m": f"{tag.learner.offset_m[row]:.3f} +- {sd[row]:.3f}"
                 for row, anchor in enumerate(self.anchors.anchors)
                 if locator.states[row].ranges
             }

@@ -18,6 +18,7 @@ from uwb_mitigation.bag.topics import (
 )
 from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.errors import DatasetError
+from uwb_mitigation.measurement import format_id
 from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.geometry import Shape, geometry, shape
 from uwb_mitigation.positioning.locator import TagLocator, run_live
@@ -90,7 +91,7 @@ def _nowhere(
     recording: TagRecording, anchors: AnchorMap, locator: TagLocator, height: Height | None
 ) -> tuple[str]:
     used = anchors.position[np.unique(recording.ranges.anchor)]
-    what = f"tag {recording.tag_id}: no place can be told from {len(recording.ranges)} ranges"
+    what = f"tag {format_id(recording.tag_id)}: no place can be told from {len(recording.ranges)} ranges"
     if locator.candidates > 1:
         what += f": {locator.candidates} places are as good"
     needed = 3 if height is not None else 4

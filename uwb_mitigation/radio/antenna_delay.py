@@ -136,7 +136,7 @@ def _measure(
             heard.add(event.anchor_id)
             if len(heard) > 1:
                 raise UwbMitigationError(
-                    f"anchors {', '.join(f'{anchor:x}' for anchor in sorted(heard))} answer",
+                    f"anchors {', '.join(f'0x{anchor:016x}' for anchor in sorted(heard))} answer",
                     valid="one: name it with --anchor",
                 )
             ranges.append((event.range_m, event.cir.rx_power_dbm - event.cir.first_path_power_dbm))

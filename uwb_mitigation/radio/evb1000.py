@@ -15,7 +15,7 @@ import time
 import serial
 
 from uwb_mitigation.errors import LinkError
-from uwb_mitigation.link.port import PortAddress
+from uwb_mitigation.link.port import PortAddress, why_not_opened
 
 ANSWER_WITHIN_S = 0.4
 MAX_READ_BYTES = 4093
@@ -55,7 +55,9 @@ class Evb1000Bus:
             port.port = path
             port.open()
         except (OSError, ValueError) as error:
-            raise LinkError(f"cannot be opened: {error}", where=str(address)) from error
+            raise LinkError(
+                f"cannot be opened: {why_not_opened(address, error)}", where=str(address)
+            ) from error
         self._port: serial.Serial | None = port
         os.set_blocking(port.fileno(), False)
         try:

@@ -18,7 +18,7 @@ import numpy as np
 from bokeh.document import Document
 from bokeh.models import ColumnDataSource
 
-from uwb_mitigation.measurement import Status
+from uwb_mitigation.measurement import Status, format_id
 from uwb_mitigation.preprocessing import WINDOW_LEAD
 from uwb_mitigation.viewer.models import TRACE_AFTER, TRACE_BEFORE, Models, blank_waterfall
 from uwb_mitigation.viewer.scene import (
@@ -29,7 +29,6 @@ from uwb_mitigation.viewer.scene import (
     Pair,
     Scene,
     Trace,
-    short_id,
 )
 from uwb_mitigation.viewer.view import REFRESH_S, View
 
@@ -140,8 +139,8 @@ class Page:
         if self._selected is None and rows:
             self._selected = rows[0]
         self._models.pairs.data = {
-            "anchor": [short_id(anchor) for anchor, _ in rows],
-            "tag": [short_id(tag) for _, tag in rows],
+            "anchor": [format_id(anchor) for anchor, _ in rows],
+            "tag": [format_id(tag) for _, tag in rows],
             "rate": [history.rate_hz() for _, history, _ in latest],
             "raw": [sample.raw_m for _, _, sample in latest],
             "range": [sample.range_m for _, _, sample in latest],
@@ -174,7 +173,7 @@ class Page:
             models.anchors.data = {
                 "x": [place.x for _, place in places],
                 "y": [place.y for _, place in places],
-                "name": [place.name or short_id(identity) for identity, place in places],
+                "name": [place.name or format_id(identity) for identity, place in places],
                 "id": [str(identity) for identity, _ in places],
             }
         _choose(models.anchors, list(scene.anchors), None if self._selected is None else self._selected[0])
@@ -230,7 +229,7 @@ class Page:
         }
         title = "no pair chosen"
         if self._selected is not None:
-            title = f"anchor {short_id(self._selected[0])}, tag {short_id(self._selected[1])}"
+            title = f"anchor {format_id(self._selected[0])}, tag {format_id(self._selected[1])}"
         self._models.strip_figure.title.text = f"Range: {title}"
         self._models.cir_figure.title.text = f"CIR: {title}"
 

@@ -59,11 +59,6 @@ PLAIN = "tag"
 """The tag whose topics have the plain names, whatever its number is; others are called as `tag_frame` has it."""
 
 
-def short_id(identity: int) -> str:
-    """Small ids as they are; EUI-64 addresses by their last four digits."""
-    return str(identity) if identity < 1_000_000 else f"...{identity & 0xFFFF:04x}"
-
-
 class Sample(NamedTuple):
     """One corrected range of a pair.
 

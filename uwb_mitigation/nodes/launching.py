@@ -1,0 +1,256 @@
+"""The arguments of the launch files: one for each parameter of the nodes, checked before a node starts. No ROS here."""
+
+from __future__ import annotations
+
+import atexit
+import functools
+import json
+import shutil
+import sys
+import tempfile
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from uwb_mitigation.errors import ParameterError, UwbMitigationError, did_you_mean
+from uwb_mitigation.nodes.parameter_tables import KEPT_PARAMETERS, STANDARD, TABLES, Parameter, Value
+
+LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
+
+_WILDCARDS = ("*", "**", "/*", "/**")
+"""Sections of a parameter file that are for every node."""
+
+_LAUNCH_FILES = (".launch.py", ".launch.xml", ".launch.yaml", ".launch.yml")
+_OWN = ("uwb.launch.py", "boards.launch.py")
+
+
+def plain_errors(function: Callable[[Any], list[Any]]) -> Callable[[Any], list[Any]]:
+    """Make a launch function raise RuntimeError, which `ros2 launch` reports in one line, and then stops."""
+
+    @functools.wraps(function)
+    def wrapped(context: Any) -> list[Any]:
+        try:
+            return function(context)
+        except UwbMitigationError as error:
+            raise RuntimeError(str(error)) from None
+
+    return wrapped
+
+
+def arguments(nodes: Iterable[str]) -> dict[str, dict[str, Parameter]]:
+    """Return the arguments of a launch file, {argument: {node: parameter}}.
+
+    An argument has the name of its parameter and is for every node with that parameter. Where parameters of one name
+    differ in their defaults, they are different things: the later node's argument is NODE_PARAMETER.
+    """
+    found: dict[str, dict[str, Parameter]] = {}
+    for node in nodes:
+        for row in TABLES[node]:
+            same = found.setdefault(row.name, {})
+            if any(other.default != row.default for other in same.values()):
+                same = found.setdefault(f"{node}_{row.name}", {})
+            same[node] = row
+    return found
+
+
+def description(rows: Mapping[str, Parameter]) -> str:
+    """Return the line of an argument for `--show-args`."""
+    row = next(iter(rows.values()))
+    default = "" if not row.filed else f" Default: {row.default_text}."
+    return f"{row.description.rstrip('.')} ({row.valid}; {', '.join(rows)}).{default}"
+
+
+def parameters(
+    said: Mapping[str, str], nodes: Collection[str], known: Iterable[str]
+) -> dict[str, dict[str, Any]]:
+    """Return the parameters that arguments set, {node: {parameter: value}}.
+
+    Args:
+        said: {argument: text}; an empty text leaves the parameter to the files.
+        nodes: the nodes that are started.
+        known: the nodes whose parameters are arguments.
+
+    Raises:
+        ParameterError: a value is invalid, or for a node that is not started.
+    """
+    found: dict[str, dict[str, Any]] = {node: {} for node in nodes}
+    for name, rows in arguments(known).items():
+        text = said.get(name, "")
+        if not text:
+            continue
+        started = [node for node in rows if node in nodes]
+        if not started:
+            raise ParameterError(
+                f"argument {name}:={text} is for the {' or '.join(rows)}, which is not started",
+                valid="locate:=true starts the locator, viewer:=true the viewer, source:=... the driver",
+            )
+        for node in started:
+            found[node][rows[node].name] = for_launch(value_of(rows[node], text))
+    return found
+
+
+def value_of(row: Parameter, text: str) -> Value:
+    """Return the value of a parameter from the text of an argument.
+
+    Raises:
+        ParameterError: the text is no valid value.
+    """
+    value: Any = text
+    if row.or_number or not isinstance(row.default, str):
+        value = _read(text)
+    if row.or_number and not isinstance(value, (int, float)):
+        value = text
+    row.check(value)
+    return float(value) if isinstance(row.default, float) else value
+
+
+def for_launch(value: Value) -> Value:
+    """Return the value as launch_ros has to get it: it reads a text as YAML, so a text such as 1234 needs quotes."""
+    return json.dumps(value) if isinstance(value, str) and _read(value) != value else value
+
+
+def _read(text: str) -> Any:
+    """Return the value of a text in YAML; None where it is not YAML."""
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError:
+        return None
+
+
+def boolean(name: str, text: str) -> bool:
+    """Return the value of an argument that is true or false.
+
+    Raises:
+        ParameterError: it is neither.
+    """
+    return _choice(name, text.lower(), ("true", "false")) == "true"
+
+
+def log_level(text: str) -> str:
+    """Return the log level.
+
+    Raises:
+        ParameterError: there is no such level.
+    """
+    return _choice("log_level", text.lower(), LOG_LEVELS)
+
+
+def check_names(words: Sequence[str], known: Collection[str]) -> None:
+    """Raise ParameterError for an argument of `ros2 launch` that the launch file does not declare.
+
+    Args:
+        words: what follows the name of the launch file on the command line.
+        known: the declared arguments.
+    """
+    # The arguments of a launch file that includes this one are its own.
+    if any(word.endswith(_LAUNCH_FILES) and Path(word).name not in _OWN for word in sys.argv):
+        return
+    for word in words:
+        name, separator, _ = word.partition(":=")
+        if separator and name not in known:
+            raise ParameterError(
+                f"unknown argument {name}", valid=did_you_mean(name, known) or "--show-args lists them"
+            )
+
+
+def check_driver(values: Mapping[str, Any]) -> None:
+    """Raise ParameterError where the source needs a port or a recording, and none is given."""
+    source = values.get("source")
+    name = (
+        "port"
+        if source in ("serial", "evb1000", "spi")
+        else "path"
+        if source in ("mcap", "decaranging")
+        else ""
+    )
+    if name and not values.get(name):
+        example = {"port": "/dev/spidev0.0" if source == "spi" else "/dev/ttyACM0", "path": "FILE"}[name]
+        raise ParameterError(f"source {source} without a {name}", valid=f"{name}:={example}")
+
+
+def from_files(node: str, own: str, shared: str = "") -> dict[str, Any]:
+    """Return the parameters that the files of a node set.
+
+    Args:
+        own: path of the file for this node.
+        shared: path of a file for all nodes, which overrides the other; may be empty.
+
+    Raises:
+        ParameterError: a file cannot be read, or a parameter in it is unknown or invalid.
+    """
+    given = _parameters_in(Path(own), node, ())
+    return given | _parameters_in(Path(shared), node, others_meaning(node)) if shared else given
+
+
+def others_meaning(node: str) -> dict[str, Value]:
+    """Return the parameters whose names mean something else for an earlier node, such as the viewer's port.
+
+    In the section for all nodes of a shared file they belong to that earlier node, as arguments do.
+
+    Returns:
+        {parameter: default}
+    """
+    found = [(name, rows[node]) for name, rows in arguments(TABLES).items() if node in rows]
+    return {row.name: row.default for name, row in found if row.name != name}
+
+
+def _parameters_in(path: Path, node: str, not_shared: Collection[str]) -> dict[str, Any]:
+    try:
+        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        reason = "no such file" if isinstance(error, FileNotFoundError) else " ".join(str(error).split())
+        raise ParameterError(f"parameter file {path}: {reason}") from error
+    found: dict[str, Any] = {}
+    everyones = {row.name for table in TABLES.values() for row in table}
+    rows = {row.name: row for row in TABLES[node]}
+    for section, name, value in _entries(tree, ""):
+        if section in _WILDCARDS:
+            if name in not_shared:
+                continue
+        elif section.rpartition("/")[2] != node:
+            continue
+        if name in rows:
+            try:
+                rows[name].check(value)
+            except ParameterError as error:
+                raise ParameterError(error.what, where=str(path), valid=error.valid) from None
+            found[name] = value
+        elif name not in everyones and not name.startswith(STANDARD):
+            raise ParameterError(
+                f"parameter {name} is unknown", where=str(path), valid=did_you_mean(name, everyones)
+            )
+    return found
+
+
+def kept_parameters() -> dict[str, str]:
+    """Return the environment by which a respawned node gets back the parameters that were set while it ran."""
+    folder = tempfile.mkdtemp(prefix="uwb_mitigation_")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return {KEPT_PARAMETERS: folder}
+
+
+def _choice(name: str, text: str, choices: Sequence[str]) -> str:
+    if text not in choices:
+        raise ParameterError(f"argument {name}:={text}", valid=f"one of {', '.join(choices)}")
+    return text
+
+
+def _entries(tree: Any, section: str) -> Iterator[tuple[str, str, Any]]:
+    """Section, name and value of every parameter in a file."""
+    for key, branch in tree.items() if isinstance(tree, dict) else ():
+        if key == "ros__parameters":
+            yield from ((section, name, value) for name, value in _flat(branch, ""))
+        else:
+            yield from _entries(
+                branch, str(key) if str(key) in _WILDCARDS else f"{section}/{key}".lstrip("/")
+            )
+
+
+def _flat(branch: Any, prefix: str) -> Iterator[tuple[str, Any]]:
+    for name, value in branch.items() if isinstance(branch, dict) else ():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
