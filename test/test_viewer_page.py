@@ -23,9 +23,23 @@ from uwb_mitigation.viewer.view import Drawing, View
 HOSTILE = "<img src=x onerror=window.pwned=1><script>window.pwned=1</script>$$x$$"
 
 
+class Clock:
+    """A clock that stands still until a test sets it."""
+
+    now_s = 0.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
 @pytest.fixture
-def view() -> View:
-    return View(Scene(), Lock(), "UWB ranges")
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def view(clock: Clock) -> View:
+    return View(Scene(clock), Lock(), "UWB ranges")
 
 
 @pytest.fixture
@@ -260,8 +274,9 @@ def drawn(document: Document, figure: str, column: str) -> np.ndarray:
     return next(source.data[column] for source in sources if column in source.data)
 
 
-def test_ranges_of_a_silent_pair_grow_older_and_are_left_out(view: View) -> None:
+def test_ranges_of_a_silent_pair_grow_older_and_are_left_out(view: View, clock: Clock) -> None:
     def heard(anchor: int, time_s: float) -> None:
+        clock.now_s = time_s
         view.scene.add_sample((anchor, 7), Sample(time_s, 5.3, 5.1, 0.1, Status.OK))
 
     heard(1, 1000.0)
@@ -296,14 +311,15 @@ def test_a_page_that_cannot_be_opened_is_not_counted(view: View, monkeypatch: py
     assert view.drawing.pages == 0
 
 
-def test_of_too_many_pairs_some_are_shown_for_good_and_the_others_are_counted() -> None:
-    scene = Scene()
+def test_of_too_many_pairs_some_are_shown_for_good_and_the_others_are_counted(clock: Clock) -> None:
+    scene = Scene(clock)
     for step in range(20):
         for anchor in range(MAX_PAIRS + 100):
             scene.add_sample((anchor, 7), Sample(1000.0 + step / 10, 5.3, 5.1, 0.1, Status.OK))
     assert len(scene.pairs) == MAX_PAIRS
     assert all(history.rate_hz() == pytest.approx(10.0) for _, history, _ in scene.latest())
     assert (scene.ranges, scene.not_shown) == (20 * (MAX_PAIRS + 100), 20 * 100)
+    clock.now_s = 2 * SILENT_S
     scene.add_sample((5000, 7), Sample(1000.0 + 2 * SILENT_S, 5.3, 5.1, 0.1, Status.OK))
     assert (5000, 7) in scene.pairs, "the others are silent"
 
@@ -372,7 +388,7 @@ def test_a_table_stays_where_it_was_scrolled_to(browser: Browser, view: View, se
 def test_a_screenshot_is_an_image(browser: Browser, view: View, server: ViewerServer) -> None:
     fill(view)
     opened(browser, server)
-    browser.run("window.saveScreenshot()")
+    browser.run("document.getElementById('screenshot').click()")
     assert browser.run("return window.lastScreenshot").startswith("data:image/png;base64,")
     assert browser.complaints() == []
 
