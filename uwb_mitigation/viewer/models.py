@@ -91,6 +91,8 @@ class Models:
 
     def _map(self) -> figure:
         plot = _figure("Map", 480, "x, m", "y, m", match_aspect=True, tools="pan,wheel_zoom,reset,save")
+        # Tick labels of another width must not resize the frame, which would change the view.
+        plot.min_border_left, plot.min_border_right = 70, 20
         unfilled = {"source": self.circles, "fill_color": None}
         extent = plot.scatter("x", "y", source=self.extent, size=0, alpha=0)
         plot.x_range, plot.y_range = DataRange1d(renderers=[extent]), DataRange1d(renderers=[extent])

@@ -84,6 +84,8 @@ class Page:
         self._due_s = 0.0
         self._drawn: dict[str, object] = {}
         self._models = models = Models(None if view.player is None else view.player.seconds)
+        # Before the model is in the document: later it is not subscribed.
+        models.map_figure.on_event(Reset, self._on_reset)
         # As one, or Bokeh looks for new models after each: half of what opening a page takes.
         with document.models.freeze():
             for model in models.roots.values():
@@ -96,7 +98,6 @@ class Page:
         document.config.update(reconnect_session=False, notify_connection_status=False, notifications=None)
         models.pairs.selected.on_change("indices", self._on_row)
         models.anchors.selected.on_change("indices", self._on_anchor)
-        models.map_figure.on_event(Reset, self._on_reset)
         models.pause.on_change("active", self._on_pause)
         if models.slider is not None:
             models.slider.on_change("value_throttled", self._on_slider)
