@@ -91,6 +91,7 @@ def track(
     from uwb_mitigation.positioning.model import Model
     from uwb_mitigation.processing.tracking import track_tag, tum_file, write_tracks
     from uwb_mitigation.processing.tracking import tum as tum_text
+    from uwb_mitigation.sources.site import anchors_file, save_anchors
 
     model = Model(acceleration=acceleration)
     place, box = height_of(height, height_sd), area_of(area)
@@ -106,6 +107,8 @@ def track(
             tracks.append(track_tag(tag, known, model, place, box))
             bar.advance(task)
         write_tracks(out, tracks)
+    if force or not anchors_file(output).exists():
+        save_anchors(anchors_file(output), known, f"anchors of the track of {bag.name}", force=True)
     _show_tracks(tracks, known)
     console.out.print(f"Wrote {out.counts.total()} messages to {out.file}.", markup=False, soft_wrap=True)
     if tum is not None:
