@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 SCREENS = Path(__file__).resolve().parents[1] / "build" / "screens"
-TIMEOUT_S = 60.0
+TIMEOUT_S = 240.0
 
 _OPTIONS = (
     "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-dev-shm-usage",

@@ -267,7 +267,7 @@ def _show_tracks(tracks: list[TagTracks], anchors: AnchorMap) -> None:
 def _show_residuals(residuals: list[HeldOut], anchors: AnchorMap) -> None:
     from rich.table import Table
 
-    table = Table("anchor", title="Median absolute residuals of held-out ranges, m", title_justify="left")
+    table = Table("anchor", title="Residuals of held-out ranges, m", title_justify="left")
     for column in ("ranges", "raw", "corrected"):
         table.add_column(column, justify="right")
     for one in residuals:
@@ -276,7 +276,7 @@ def _show_residuals(residuals: list[HeldOut], anchors: AnchorMap) -> None:
         table.add_row(name, str(one.ranges), *cells, end_section=one is residuals[-2:][0])
     console.out.print(table)
     console.out.print(
-        "The ranges of each anchor are compared with a track of the other anchors' ranges.", style="dim"
+        "Median absolute residuals. The ranges of each anchor are compared with a track of the other anchors' ranges.", style="dim"
     )
 
 
