@@ -184,7 +184,7 @@ class Viewer(ManagedNode):
         return Missing(
             ranges=ranges,
             anchors=f"No anchor positions: nothing received on {anchors}. Start the locator, or set the parameter anchors.",
-            positions=""
+            positions="No tag positions yet: see the diagnostics of the locator."
             if self.count_publishers(poses)
             else f"No tag positions: {poses} has no publisher. Start the locator.",
         )
