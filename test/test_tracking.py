@@ -84,12 +84,14 @@ def test_a_track_is_written_judged_and_read_by_evo(hall: Path, tmp_path: Path):
 
 def test_held_out_residuals_show_the_offset_of_one_anchor():
     ranges, truth = drive(seconds=40, offset_m=0.0)
-    wrong = replace(ranges, range_m=ranges.range_m + 0.5 * (ranges.anchor == 2))
-    one = track_tag(TagRecording(7, wrong, ranges, True, truth), HALL, Model(), Height(1.0, 0.1))
+    one = track_tag(TagRecording(7, ranges, ranges, False, truth), HALL, Model(), Height(1.0, 0.1))
+    wrong, worse = (replace(ranges, range_m=ranges.range_m + m * (ranges.anchor == 2)) for m in (1.0, 1.5))
+    one = replace(one, recording=TagRecording(7, wrong, worse, True, truth))
     found = held_out([one], HALL, Model(), Height(1.0, 0.1))
-    assert found[2].raw_m > 0.4
-    assert found[2].raw_m > 1.5 * max(other.raw_m for row, other in enumerate(found) if row != 2)
-    assert found[2].corrected_m < 0.2
+    assert found[2].raw_m == pytest.approx(1.0, abs=0.1)
+    assert found[2].corrected_m - found[2].raw_m == pytest.approx(0.5, abs=1e-6), (
+        "its ranges do not move the track"
+    )
     few = replace(one, recording=replace(one.recording, raw=wrong.take(wrong.anchor < 3), corrected=False))
     assert [(other.ranges, math.isnan(other.raw_m)) for other in held_out([few], HALL, Model())] == [
         (0, True)
