@@ -276,7 +276,8 @@ def _show_residuals(residuals: list[HeldOut], anchors: AnchorMap) -> None:
         table.add_row(name, str(one.ranges), *cells, end_section=one is residuals[-2:][0])
     console.out.print(table)
     console.out.print(
-        "Median absolute residuals. The ranges of each anchor are compared with a track of the other anchors' ranges.", style="dim"
+        "Median absolute residuals. The ranges of each anchor are compared with a track of the other anchors' ranges.",
+        style="dim",
     )
 
 

@@ -50,21 +50,19 @@ def held_out(
     """Return the held-out residuals of each anchor, and of all anchors last."""
     raw = [(one.live, one.recording.raw) for one in tracks]
     corrected = [(one.live, one.recording.ranges) for one in tracks if one.recording.corrected]
-    found = [
-        (
-            anchor.id,
-            *(
-                np.concatenate(
-                    [np.zeros(0), *(_residuals(*one, row, anchors, model, height) for one in kind)]
-                )
-                for kind in (raw, corrected)
-            ),
+
+    def of(row: int, kind: list[tuple[Track, Ranges]]) -> NDArray[np.float64]:
+        parts = [_residuals(live, ranges, row, anchors, model, height) for live, ranges in kind]
+        return np.concatenate([np.zeros(0), *parts])
+
+    by_anchor = [(of(row, raw), of(row, corrected)) for row in range(len(anchors))]
+    every = [np.concatenate(kind) for kind in zip(*by_anchor, strict=True)]
+    return [
+        HeldOut(identity, len(before), _median(before), _median(after))
+        for identity, (before, after) in zip(
+            [*(anchor.id for anchor in anchors.anchors), None], [*by_anchor, every], strict=True
         )
-        for row, anchor in enumerate(anchors.anchors)
     ]
-    _, *every = (list(column) for column in zip(*found, strict=True))
-    rows = [*found, (None, *map(np.concatenate, every))]
-    return [HeldOut(anchor, len(raw), _median(raw), _median(corrected)) for anchor, raw, corrected in rows]
 
 
 def _residuals(
@@ -76,8 +74,11 @@ def _residuals(
         return np.zeros(0)
     track = Smoother(anchors, model, ranges.take(~own), height=height).fit(initial).track
     position = TruePath(track.stamp_ns, track.position).at(ranges.stamp_ns[own])
-    residual = ranges.range_m[own] - np.linalg.norm(position - anchors.position[row], axis=1)
-    return residual[np.isfinite(residual)]
+    residual: NDArray[np.float64] = ranges.range_m[own] - np.linalg.norm(
+        position - anchors.position[row], axis=1
+    )
+    known: NDArray[np.float64] = residual[np.isfinite(residual)]
+    return known
 
 
 def _median(residual: NDArray[np.float64]) -> float:
