@@ -79,6 +79,14 @@ class Terminals:
             code = None
         assert code == 0, f"{code} of:\n{text}\n{self._printed()}"
 
+    def wait_for(self, name: str, text: str) -> None:
+        """Wait until a terminal has printed a text."""
+        deadline = time.monotonic() + TIMEOUT_S
+        while text not in (self.folder / f"{name}.log").read_text():
+            assert self._open[name].poll() is None, self._printed()
+            assert time.monotonic() < deadline, self._printed()
+            time.sleep(0.1)
+
     def _interrupt(self, name: str) -> None:
         """Ctrl-C, and wait for the end of what was typed there."""
         shell = self._open.pop(name, None)
@@ -133,6 +141,8 @@ def test_the_page_leads_from_boards_to_a_robot_that_knows_where_it_is(terminals:
             continue
         assert kind == "bash", f"who types {kind}? {text}"
         terminals.type(text)
+        if "view track" in text:
+            terminals.wait_for("viewer", "shows track")
         if "pipeline" in text:
             ros.spin_until(lambda: len(poses) > 5, TIMEOUT_S)
     anchors = load_anchors(folder / "anchors.yaml")
@@ -140,6 +150,7 @@ def test_the_page_leads_from_boards_to_a_robot_that_knows_where_it_is(terminals:
     recorded = read_ranges(folder / "first", anchors)
     assert not recorded.strangers
     assert {int(row) for tag in recorded.tags for row in tag.raw.anchor} == set(range(len(anchors)))
+    assert "residuals of held-out ranges" in (folder / "first.log").read_text()
     shown = "".join(log.read_text() for log in folder.glob("*.log"))
     for anchor in anchors.anchors:
         assert f"{anchor.id:016x}" in shown

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +20,14 @@ from uwb_mitigation.bag.topics import ODOMETRY, ODOMETRY_TRUTH
 from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.measurement import Cir, CorrectedRange, Origin, RangeMeasurement, Record, Status
 from uwb_mitigation.positioning.anchors import dump_anchors, parse_anchors
+from uwb_mitigation.positioning.model import Model
+from uwb_mitigation.positioning.start import Height
+from uwb_mitigation.processing.residuals import held_out
+from uwb_mitigation.processing.tracking import track_tag
 from uwb_mitigation.sources.hanyang import HanyangRun
 from uwb_mitigation.sources.opening import open_recording
+from uwb_mitigation.sources.recorded_ranges import TagRecording
+from uwb_mitigation.sources.site import anchors_file
 
 
 @pytest.fixture(scope="module")
@@ -56,6 +64,13 @@ def test_a_track_is_written_judged_and_read_by_evo(hall: Path, tmp_path: Path):
         assert 0.3 < told[kind]["nees_per_dof"] < 2
     assert told["snapshot"]["horizontal_rmse_m"] > 1.5 * told["live"]["horizontal_rmse_m"]
     assert told["hdop_median"] < 3
+    *anchors, every = told["held_out"]
+    assert [one["anchor_id"] for one in anchors] == [1, 2, 3, 4, 5]
+    assert every["anchor_id"] is None
+    for one in told["held_out"]:
+        assert one["corrected_m"] < 0.3
+        assert one["raw_m"] > 0.4, "they are 0.6 m too long"
+    assert anchors_file(out).read_text() == dump_anchors(HALL, "anchors of the track of hall.mcap")
     (live,) = read_positions(out, ODOMETRY)
     (truth,) = read_positions(out, ODOMETRY_TRUTH)
     assert (live.tag_id, truth.tag_id) == (7, 7)
@@ -65,6 +80,22 @@ def test_a_track_is_written_judged_and_read_by_evo(hall: Path, tmp_path: Path):
     read = evo.read_tum_trajectory_file(tum)
     assert read.num_poses >= 400
     np.testing.assert_allclose(read.timestamps[0], live.path.stamp_ns[0] / 1e9, atol=2.0)
+
+
+def test_held_out_residuals_show_the_offset_of_one_anchor():
+    ranges, truth = drive(seconds=40, offset_m=0.0)
+    one = track_tag(TagRecording(7, ranges, ranges, False, truth), HALL, Model(), Height(1.0, 0.1))
+    wrong, worse = (replace(ranges, range_m=ranges.range_m + m * (ranges.anchor == 2)) for m in (1.0, 1.5))
+    one = replace(one, recording=TagRecording(7, wrong, worse, True, truth))
+    found = held_out([one], HALL, Model(), Height(1.0, 0.1))
+    assert found[2].raw_m == pytest.approx(1.0, abs=0.1)
+    assert found[2].corrected_m - found[2].raw_m == pytest.approx(0.5, abs=1e-6), (
+        "its ranges do not move the track"
+    )
+    few = replace(one, recording=replace(one.recording, raw=wrong.take(wrong.anchor < 3), corrected=False))
+    assert [(other.ranges, math.isnan(other.raw_m)) for other in held_out([few], HALL, Model())] == [
+        (0, True)
+    ] * 6
 
 
 def test_what_cannot_be_tracked_is_said_in_a_line(hall: Path, tmp_path: Path):

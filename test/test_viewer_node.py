@@ -81,6 +81,32 @@ def test_the_page_shows_what_is_published(ros: ros_harness.Ros, browser: Browser
     browser.wait("ranges of the new one", lambda: len(column("pairs", "range")) >= 2)
 
 
+def test_nodes_that_are_killed_turn_stale_and_a_missing_node_is_named(ros: ros_harness.Ros, browser: Browser):
+    viewer = ros.start("viewer", "port:=0")
+    viewer.wait_for_output("the page is at")
+    found = re.search(r"the page is at (\S+)", viewer.output)
+    assert found is not None
+    browser.open(found[1])
+    browser.wait("the page", browser.ready)
+
+    def shown(text: str) -> bool:
+        return text in browser.run("return Bokeh.documents[0].roots().map((m) => m.text ?? '').join(' ')")
+
+    browser.wait("what to start", lambda: shown("Start the driver and the mitigator"))
+    # The driver waits for a first subscriber.
+    driver = ros.start("driver", "source:=simulated", "simulated_rate:=40.0")
+    browser.wait("what else to start", lambda: shown("Start the mitigator"))
+    mitigator = ros.start("mitigator")
+    statuses = "return Array.from(Bokeh.documents[0].get_model_by_name('pairs').source.data['status'])"
+    browser.wait("ranges", lambda: len(browser.run(statuses)) >= 2)
+    browser.wait("diagnostics", lambda: shown("mitigator: ranges"))
+    for node in (driver, mitigator):
+        node.signal(signal.SIGKILL)
+    browser.wait("no data", lambda: all("no data for" in status for status in browser.run(statuses)))
+    browser.wait("STALE", lambda: shown("no diagnostics for"))
+    assert set(browser.run(statuses.replace("status", "rate"))) == {0}
+
+
 def test_it_shows_anchors_to_others_where_there_is_no_locator(ros: ros_harness.Ros, tmp_path: Path):
     anchors = tmp_path / "anchors.yaml"
     anchors.write_text("anchors:\n  - {id: 5, x: 1.0, y: 2.0, z: 3.0, name: door}\n")

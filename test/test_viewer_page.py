@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Iterator
 from functools import partial
+from http.client import HTTPConnection, HTTPResponse
 from threading import Lock
 
 import numpy as np
@@ -18,14 +20,28 @@ from uwb_mitigation.measurement import Cir, Encoding, Status
 from uwb_mitigation.viewer.page import Page
 from uwb_mitigation.viewer.scene import MAX_PAIRS, SILENT_S, AnchorPlace, Pose, Report, Sample, Scene, Trace
 from uwb_mitigation.viewer.server import ViewerServer
-from uwb_mitigation.viewer.view import Drawing, View
+from uwb_mitigation.viewer.view import Drawing, Missing, View
 
 HOSTILE = "<img src=x onerror=window.pwned=1><script>window.pwned=1</script>$$x$$"
 
 
+class Clock:
+    """A clock that stands still until a test sets it."""
+
+    now_s = 0.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
 @pytest.fixture
-def view() -> View:
-    return View(Scene(), Lock(), "UWB ranges")
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def view(clock: Clock) -> View:
+    return View(Scene(clock), Lock(), "UWB ranges")
 
 
 @pytest.fixture
@@ -113,6 +129,93 @@ def test_it_follows_the_scene(browser: Browser, view: View, server: ViewerServer
         view.scene.add_sample((1, 7), Sample(1010.0, 9.9, 9.5, 0.1, Status.OK))
     browser.wait("the new range", lambda: data(browser, "pairs", "range")[0] == pytest.approx(9.5))
     browser.wait("it in the table", lambda: browser.cell("9.500"))
+
+
+def test_pairs_tags_and_nodes_without_data_turn_grey(
+    browser: Browser, view: View, server: ViewerServer, clock: Clock
+) -> None:
+    fill(view)
+    with view.lock:
+        view.scene.add_report("driver", Report(0, "10.0 Hz", clock()))
+        view.scene.add_report("recording", Report(2, "damaged"))
+    opened(browser, server)
+    assert browser.cell("10.0 Hz")
+    assert not browser.cell("STALE")
+    assert set(data(browser, "pairs", "row_colour")) == {""}
+    clock.now_s = 1.0
+    browser.wait("a lower rate", lambda: 0 < data(browser, "pairs", "rate")[0] < 9)
+    clock.now_s = 12.0
+    browser.wait("no data", lambda: data(browser, "pairs", "status") == ["no data for 12 s"] * 2)
+    assert data(browser, "pairs", "rate") == [0.0, 0.0]
+    cell = browser.wait("the row", lambda: browser.cell("5.100"))
+    assert browser.run("return getComputedStyle(arguments[0]).color", cell) == "rgb(156, 163, 175)"
+    assert data(browser, "map", "name")[-1] == "tag: no data for 12 s"
+    assert data(browser, "map", "range") == []
+    assert browser.cell("STALE")
+    assert browser.cell("no diagnostics for 12 s; last: 10.0 Hz")
+    assert browser.cell("damaged"), "it is not of a node"
+    assert browser.cell("No ranges for 12 s.")
+    browser.screenshot("viewer_no_data")
+    with view.lock:
+        view.scene.add_sample((1, 7), Sample(1017.0, 5.3, 5.1, 0.1, Status.OK))
+    browser.wait("data", lambda: data(browser, "pairs", "status")[0] == "OK")
+    assert not browser.cell("No ranges for 12 s.")
+
+
+def test_a_slow_pair_has_data_between_its_ranges(view: View, clock: Clock) -> None:
+    for clock.now_s in range(0, 100, 5):
+        view.scene.add_sample((1, 7), Sample(clock.now_s, 5.3, 5.1, 0.1, Status.OK))
+    clock.now_s += 9.0
+    document = Document()
+    Page(document, view)
+    source = document.get_model_by_name("pairs").source
+    assert source.data["status"] == ["OK"]
+    assert source.data["rate"] == pytest.approx([0.2])
+
+
+def test_the_map_keeps_its_view_until_the_user_changes_it(
+    browser: Browser, view: View, server: ViewerServer
+) -> None:
+    fill(view)
+    opened(browser, server)
+
+    def view_of_map() -> list[float]:
+        return browser.run(
+            "const {x_range: x, y_range: y} = Bokeh.documents[0].get_model_by_name('map');"
+            "return [x.start, x.end, y.start, y.end]"
+        )
+
+    def settled() -> list[float] | None:
+        """The view, once the page has its final layout."""
+        seen = view_of_map()
+        time.sleep(0.5)
+        return seen if view_of_map() == seen else None
+
+    first = browser.wait("a view", settled)
+    assert first[0] < 0 < 8 < first[1], "both anchors"
+
+    def moved(x: float) -> None:
+        with view.lock:
+            view.scene.add_pose("tag", Pose(1005.0, x, 3, 0))
+            view.scene.add_sample((1, 7), Sample(1005.0, x, x, 0.1, Status.OK))
+        browser.wait("the tag", lambda: data(browser, "map", "name") and x in data(browser, "map", "x1"))
+
+    moved(50.0)
+    assert view_of_map() == first
+    browser.run("Bokeh.index.find_one(Bokeh.documents[0].get_model_by_name('map')).reset()")
+    browser.wait("everything", lambda: view_of_map()[1] > 50)
+    zoomed = [1.0, 2.0, 3.0, 4.0]
+    browser.run(
+        "const [a, b, c, d] = arguments[0], plot = Bokeh.index.find_one(Bokeh.documents[0].get_model_by_name('map'));"
+        "plot.update_range({xrs: new Map([[plot.model.x_range, {start: a, end: b}]]),"
+        " yrs: new Map([[plot.model.y_range, {start: c, end: d}]])}, {panning: true})",
+        zoomed,
+    )
+    moved(90.0)
+    with view.lock:
+        view.scene.set_anchors({5: AnchorPlace(-70, 0, 2)})
+    browser.wait("the new anchor", lambda: "5" in data(browser, "map", "id"))
+    assert view_of_map() == zoomed
 
 
 def test_a_paused_page_stands_still_and_goes_on(browser: Browser, view: View, server: ViewerServer) -> None:
@@ -260,8 +363,9 @@ def drawn(document: Document, figure: str, column: str) -> np.ndarray:
     return next(source.data[column] for source in sources if column in source.data)
 
 
-def test_ranges_of_a_silent_pair_grow_older_and_are_left_out(view: View) -> None:
+def test_ranges_of_a_silent_pair_grow_older_and_are_left_out(view: View, clock: Clock) -> None:
     def heard(anchor: int, time_s: float) -> None:
+        clock.now_s = time_s
         view.scene.add_sample((anchor, 7), Sample(time_s, 5.3, 5.1, 0.1, Status.OK))
 
     heard(1, 1000.0)
@@ -296,14 +400,15 @@ def test_a_page_that_cannot_be_opened_is_not_counted(view: View, monkeypatch: py
     assert view.drawing.pages == 0
 
 
-def test_of_too_many_pairs_some_are_shown_for_good_and_the_others_are_counted() -> None:
-    scene = Scene()
+def test_of_too_many_pairs_some_are_shown_for_good_and_the_others_are_counted(clock: Clock) -> None:
+    scene = Scene(clock)
     for step in range(20):
         for anchor in range(MAX_PAIRS + 100):
             scene.add_sample((anchor, 7), Sample(1000.0 + step / 10, 5.3, 5.1, 0.1, Status.OK))
     assert len(scene.pairs) == MAX_PAIRS
     assert all(history.rate_hz() == pytest.approx(10.0) for _, history, _ in scene.latest())
     assert (scene.ranges, scene.not_shown) == (20 * (MAX_PAIRS + 100), 20 * 100)
+    clock.now_s = 2 * SILENT_S
     scene.add_sample((5000, 7), Sample(1000.0 + 2 * SILENT_S, 5.3, 5.1, 0.1, Status.OK))
     assert (5000, 7) in scene.pairs, "the others are silent"
 
@@ -321,9 +426,13 @@ def test_clocks_may_differ_and_jump() -> None:
     assert len(scene.pairs[1, 7].samples) == 1, "a replay began anew"
 
 
-def test_a_page_of_nothing_complains_of_nothing(browser: Browser, server: ViewerServer) -> None:
+def test_an_empty_page_states_what_is_missing(browser: Browser, view: View, server: ViewerServer) -> None:
+    view.missing = Missing("no driver", "no anchors", "no locator")
     opened(browser, server)
     assert data(browser, "pairs", "anchor") == []
+    for reason in ("no driver", "no anchors", "no locator"):
+        browser.wait(reason, partial(browser.cell, reason))
+    browser.screenshot("viewer_empty")
     assert browser.complaints() == []
 
 
@@ -335,6 +444,69 @@ def test_nothing_from_a_message_is_run(browser: Browser, view: View, server: Vie
     browser.open(server.url + "parameters")
     assert HOSTILE in browser.run("return document.body.innerText")
     assert browser.run("return window.pwned ?? null") is None
+
+
+def fetch(server: ViewerServer, path: str = "", **headers: str) -> HTTPResponse:
+    client = HTTPConnection("127.0.0.1", server.port, timeout=60)
+    client.request("GET", f"/{path}", headers=headers)
+    response = client.getresponse()
+    response.read()
+    client.close()
+    return response
+
+
+@pytest.mark.parametrize("path", ["", "parameters", "ws", "static/js/bokeh.min.js"])
+def test_another_host_name_is_refused(view: View, server: ViewerServer, path: str) -> None:
+    own = f"localhost:{server.port}"
+    assert fetch(server, path, Host=own).status != 403
+    for name in ("evil.example", f"evil.example:{server.port}", "localhost", f"localhost:{server.port + 1}"):
+        assert fetch(server, path, Host=name).status == 403
+    assert view.drawing.pages == 0 or path == ""
+    with ViewerServer(view, port=0, origins=("robot.local:5006",)) as other:
+        assert fetch(other, Host="robot.local:5006").status == 200
+
+
+def test_only_scripts_of_the_page_run(browser: Browser, view: View, server: ViewerServer) -> None:
+    fill(view)
+    policies = [
+        fetch(server, path, Host=f"localhost:{server.port}", **{"X-Nonce": "mine"}).headers[
+            "Content-Security-Policy"
+        ]
+        for path in ("", "", "parameters", "absent")
+    ]
+    assert len(set(policies)) == 4, "a nonce is used once"
+    for policy in policies:
+        (scripts,) = [part for part in policy.split("; ") if part.startswith("script-src")]
+        assert "unsafe" not in scripts
+        assert "mine" not in scripts
+        assert policy.startswith("default-src 'none'")
+        assert "frame-ancestors 'none'" in policy
+    opened(browser, server)
+    assert browser.complaints() == []
+    browser.run(
+        "const script = document.createElement('script');"
+        "script.textContent = 'window.pwned = 1'; document.body.append(script);"
+        "const image = document.createElement('div'); document.body.append(image);"
+        "image.innerHTML = '<img src=x: onerror=\"window.pwned = 2\">'"
+    )
+    browser.wait("the refusal", lambda: "Content Security Policy" in "".join(browser.complaints()))
+    assert browser.run("return window.pwned ?? null") is None
+
+
+def test_a_swipe_over_a_figure_scrolls_the_page_of_a_phone(
+    browser: Browser, view: View, server: ViewerServer
+) -> None:
+    fill(view)
+    with browser.touch_screen():
+        opened(browser, server, 400, 800)
+        for name in ("map", "cir", "strip", "waterfall", "errors"):
+            before = browser.scroll_to(name)
+            browser.swipe(200, 400, 250 if before < 500 else -250)
+            browser.wait(
+                f"the page to scroll by {name}",
+                lambda before=before: abs(browser.run("return scrollY") - before) > 100,
+            )
+        assert browser.complaints() == []
 
 
 @pytest.mark.parametrize("width", [1280, 1024, 400])
@@ -372,7 +544,7 @@ def test_a_table_stays_where_it_was_scrolled_to(browser: Browser, view: View, se
 def test_a_screenshot_is_an_image(browser: Browser, view: View, server: ViewerServer) -> None:
     fill(view)
     opened(browser, server)
-    browser.run("window.saveScreenshot()")
+    browser.run("document.getElementById('screenshot').click()")
     assert browser.run("return window.lastScreenshot").startswith("data:image/png;base64,")
     assert browser.complaints() == []
 

@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -16,16 +17,22 @@ import numpy as np
 import pytest
 from bag_material import START_NS, STEP_NS, corrected, record, write_bag, write_corrected
 from browser import Browser
+from command_line import run
+from drives import HALL, drive
 
 from uwb_mitigation.bag.codec import encode_range
 from uwb_mitigation.bag.poses import encode_place, encode_pose, tag_topic
 from uwb_mitigation.bag.topics import ODOMETRY_TRUTH, ODOMETRY_TYPE, POSE, POSE_TYPE, RANGE_CIR_TYPE
 from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.errors import RecordingError, UwbMitigationError
+from uwb_mitigation.measurement import Cir, RangeMeasurement, Record
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.shipped import default_model_path
+from uwb_mitigation.positioning.anchors import dump_anchors
 from uwb_mitigation.positioning.tracks import Estimate
+from uwb_mitigation.processing.job import Job, process_bag
+from uwb_mitigation.sources.site import anchors_file, load_anchors
 from uwb_mitigation.viewer import playback
 from uwb_mitigation.viewer.feed import Feed
 from uwb_mitigation.viewer.playback import BagPlayer
@@ -113,6 +120,61 @@ def test_raw_ranges_are_corrected_as_they_are_shown(tmp_path: Path):
     assert latest(scene)[2, 7] == pytest.approx(expected)
 
 
+def test_a_processed_bag_keeps_its_truth(bag: Path, tmp_path: Path):
+    """Its truths follow the corrected ranges."""
+    raw = write_bag(tmp_path / "raw.mcap", 30)
+    process_bag(Job(raw, tmp_path / "out.mcap", default_model_path()))
+    player, scene = opened(tmp_path / "out.mcap")
+    assert not player.corrects
+    player.seek(player.seconds)
+    assert scene.errors == 30
+    assert [sample.true_m for sample in scene.pairs[1, 7].samples] == [4.0 + n for n in range(0, 30, 2)]
+    assert scene.pairs[1, 7].samples[-1].label == "NDP NLOS"
+    raw_player, raw_scene = opened(raw)
+    raw_player.seek(raw_player.seconds)
+    assert scene.mean_errors_m() == pytest.approx(raw_scene.mean_errors_m())
+
+
+def test_the_output_of_track_is_shown(tmp_path: Path):
+    ranges, truth = drive(seconds=20)
+    bag = tmp_path / "hall.mcap"
+    with BagWriter(bag, {}) as out:
+        for i in range(len(ranges)):
+            anchor = HALL.anchors[ranges.anchor[i]].id
+            stamp_ns, range_m = int(ranges.stamp_ns[i]), float(ranges.range_m[i])
+            out.write(
+                Record(RangeMeasurement(stamp_ns, 7, anchor, i, 0, range_m, Cir(np.zeros(0, np.int16))))
+            )
+    anchors_file(bag).write_text(dump_anchors(HALL))
+    track = tmp_path / "track.mcap"
+    done = run("track", bag, "-o", track, "--height", "1.0", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    player, scene = opened(track)
+    player.seek(player.seconds)
+    assert {"tag", "tag smoothed"} <= scene.tags.keys()
+    for tag in ("tag", "tag smoothed"):
+        assert scene.tags[tag].trail[-1] == pytest.approx(truth.position[-1, :2], abs=0.5)
+    assert "without ranges" in player.missing.ranges
+    assert load_anchors(anchors_file(track)).anchors == HALL.anchors
+
+
+def test_ages_are_of_the_recording(tmp_path: Path):
+    path = tmp_path / "one.mcap"
+    with BagWriter(path, {}) as out:
+        for number in (*range(100), 2100):
+            item = record(number)
+            out.write(item)
+            if number != 99:
+                write_corrected(out, item.measurement, corrected(number))
+    player, scene = opened(path)
+    player.seek(20.0)
+    ages = {pair: scene.age_s(history) for pair, history, _ in scene.latest()}
+    assert ages == pytest.approx({(1, 7): 20.0 - 0.98, (2, 7): 20.0 - 0.97})
+    assert scene.now_s == pytest.approx(START_NS / 1e9 + 20.0)
+    player.seek(0.5)
+    assert max(scene.age_s(history) for _, history, _ in scene.latest()) < 0.02
+
+
 def test_of_a_crowded_minute_its_end_is_shown(bag: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(playback, "MAX_MESSAGES", 150)
     player, scene = opened(bag)
@@ -188,7 +250,7 @@ def empty(path: Path) -> Path:
         (lambda path: path, "no such file"),
         (empty, "the file is empty"),
         (of_another_kind, "not an MCAP file"),
-        (without_ranges, "no ranges"),
+        (without_ranges, "no ranges and no tracks"),
     ],
 )
 def test_what_cannot_be_shown_is_named(make: Callable[[Path], Path], words: str, tmp_path: Path):
@@ -210,9 +272,9 @@ def test_of_several_namespaces_one_is_to_be_named(tmp_path: Path):
     assert scene.ranges == 4
 
 
-@pytest.fixture
-def page(bag: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """`uwb-mitigation view` on the bag, and its address."""
+@contextmanager
+def viewing(bag: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """`uwb-mitigation view` on a bag, and its address."""
     command = [sys.executable, "-c", "from uwb_mitigation.entry import command_line; command_line()", "view"]
     running = subprocess.Popen(
         [*command, str(bag), "--port", "0"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
@@ -228,8 +290,44 @@ def page(bag: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
         running.wait()
 
 
-def test_the_page_has_a_slider_and_plays(browser: Browser, page: tuple[subprocess.Popen[str], str]):
-    running, url = page
+def test_the_slider_can_be_dragged_while_the_recording_plays(browser: Browser, tmp_path: Path):
+    from selenium.webdriver.common.action_chains import ActionChains
+
+    long = tmp_path / "long.mcap"
+    with BagWriter(long, {}) as out:
+        for number in range(0, 30_000, 100):
+            write_corrected(out, record(number).measurement, corrected(number))
+
+    def slider(attribute: str) -> float:
+        return browser.run("return Bokeh.documents[0].get_model_by_name('slider')[arguments[0]]", attribute)
+
+    with viewing(long) as (_, url):
+        browser.open(url)
+        browser.wait("the page", browser.ready)
+        browser.wait("it to play", lambda: slider("value") > 0)
+        left, right, y = browser.run(
+            "const view = Bokeh.index.find_one(Bokeh.documents[0].get_model_by_name('slider'));"
+            "const box = view.slider_el.getBoundingClientRect();"
+            "return [box.left, box.right, (box.top + box.bottom) / 2]"
+        )
+
+        def at(value: float) -> tuple[int, int]:
+            return round(left + (right - left) * value / slider("end")), round(y)
+
+        actions = ActionChains(browser.driver, duration=100)
+        mouse = actions.w3c_actions.pointer_action
+        mouse.move_to_location(*at(slider("value"))).pointer_down()
+        mouse.move_to_location(*at(250.0)).pause(1.0).move_to_location(*at(200.0)).pause(1.0)
+        actions.perform()
+        assert slider("value") == pytest.approx(200.0, abs=1.0), "it stays where it is held"
+        actions = ActionChains(browser.driver)
+        actions.w3c_actions.pointer_action.pointer_up()
+        actions.perform()
+        browser.wait("it to play from there", lambda: slider("value") > 202.0)
+        assert slider("value") < 250.0
+
+
+def test_the_page_has_a_slider_and_plays(browser: Browser, bag: Path):
 
     def model(name: str, attribute: str) -> object:
         return browser.run(
@@ -241,21 +339,22 @@ def test_the_page_has_a_slider_and_plays(browser: Browser, page: tuple[subproces
             "return Array.from(Bokeh.documents[0].get_model_by_name('pairs').source.data['range'])"
         )
 
-    browser.open(url)
-    browser.wait("the page", browser.ready)
-    browser.wait("it to play to its end", lambda: model("pause", "label") == "Play")
-    assert model("slider", "value") == model("slider", "end") == 4.0
-    assert sorted(ranges()) == [4.25 + 398, 4.25 + 399]
-    browser.run(
-        "const s = Bokeh.documents[0].get_model_by_name('slider'); s.value = 1.0; s.value_throttled = 1.0"
-    )
-    browser.wait("that place", lambda: sorted(ranges()) == [4.25 + 99, 4.25 + 100])
-    browser.screenshot("view_1280")
-    browser.wait("the button", lambda: browser.cell("Play")).click()
-    browser.wait("it to play on", lambda: sorted(ranges())[-1] > 4.25 + 100)
-    assert browser.complaints() == []
-    browser.resize(400, 2000)
-    # Figures take their new width a moment later.
-    browser.wait("it to fit", lambda: browser.run("return document.documentElement.scrollWidth") <= 400)
-    running.send_signal(signal.SIGINT)
-    assert running.wait(240) == 130
+    with viewing(bag) as (running, url):
+        browser.open(url)
+        browser.wait("the page", browser.ready)
+        browser.wait("it to play to its end", lambda: model("pause", "label") == "Play")
+        assert model("slider", "value") == model("slider", "end") == 4.0
+        assert sorted(ranges()) == [4.25 + 398, 4.25 + 399]
+        browser.run(
+            "const s = Bokeh.documents[0].get_model_by_name('slider'); s.value = 1.0; s.value_throttled = 1.0"
+        )
+        browser.wait("that place", lambda: sorted(ranges()) == [4.25 + 99, 4.25 + 100])
+        browser.screenshot("view_1280")
+        browser.wait("the button", lambda: browser.cell("Play")).click()
+        browser.wait("it to play on", lambda: sorted(ranges())[-1] > 4.25 + 100)
+        assert browser.complaints() == []
+        browser.resize(400, 2000)
+        # Figures take their new width a moment later.
+        browser.wait("it to fit", lambda: browser.run("return document.documentElement.scrollWidth") <= 400)
+        running.send_signal(signal.SIGINT)
+        assert running.wait(240) == 130

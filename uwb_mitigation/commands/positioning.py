@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from uwb_mitigation.positioning.start import Area, Height
     from uwb_mitigation.positioning.survey import SurveyResult
     from uwb_mitigation.positioning.track_errors import TrackErrors
+    from uwb_mitigation.processing.residuals import HeldOut
     from uwb_mitigation.processing.tracking import TagTracks
     from uwb_mitigation.sources.recorded_ranges import RecordedRanges
 
@@ -81,7 +82,8 @@ def track(
     """Tell where the tags of a recording were: live, and smoothed looking ahead.
 
     Corrected ranges are taken where the bag has them (`uwb-mitigation process`), raw ones otherwise. Where the
-    bag knows the truth, a table shows the errors of both, beside least squares on raw ranges.
+    bag knows the truth, a table shows the errors of both, beside least squares on raw ranges. A second table needs no
+    truth: residuals of raw and of corrected ranges. Positions of anchors are written to OUT.anchors.yaml.
 
         uwb-mitigation data import LOS_A1 -o a1.mcap
 
@@ -90,8 +92,10 @@ def track(
     from uwb_mitigation.bag.writer import BagWriter
     from uwb_mitigation.files import write_whole
     from uwb_mitigation.positioning.model import Model
+    from uwb_mitigation.processing.residuals import held_out
     from uwb_mitigation.processing.tracking import track_tag, tum_file, write_tracks
     from uwb_mitigation.processing.tracking import tum as tum_text
+    from uwb_mitigation.sources.site import anchors_file, save_anchors
 
     model = Model(acceleration=acceleration)
     place, box = height_of(height, height_sd), area_of(area)
@@ -107,12 +111,16 @@ def track(
             tracks.append(track_tag(tag, known, model, place, box))
             bar.advance(task)
         write_tracks(out, tracks)
+    if force or not anchors_file(output).exists():
+        save_anchors(anchors_file(output), known, f"anchors of the track of {bag.name}", force=True)
     _show_tracks(tracks, known)
+    residuals = held_out(tracks, known, model, place)
+    _show_residuals(residuals, known)
     console.out.print(f"Wrote {out.counts.total()} messages to {out.file}.", markup=False, soft_wrap=True)
     if tum is not None:
         for one in tracks:
             write_whole(tum_file(tum, one.recording.tag_id, len(tracks) > 1), tum_text(one.smoothed))
-    console.write_json(json, _result(tracks, recorded))
+    console.write_json(json, _result(tracks, recorded) | {"held_out": [one.as_json() for one in residuals]})
 
 
 def survey(
@@ -259,6 +267,23 @@ def _show_tracks(tracks: list[TagTracks], anchors: AnchorMap) -> None:
             console.out.print(f"tag {format_id(one.recording.tag_id)}: no truth in the bag, so no errors")
         for row in one.disagreeing:
             _warn(f"anchor {anchors.anchors[row]} disagrees with the others: is it where the file says?")
+
+
+def _show_residuals(residuals: list[HeldOut], anchors: AnchorMap) -> None:
+    from rich.table import Table
+
+    table = Table("anchor", title="Residuals of held-out ranges, m", title_justify="left")
+    for column in ("ranges", "raw", "corrected"):
+        table.add_column(column, justify="right")
+    for one in residuals:
+        name = "all" if one.anchor_id is None else str(anchors.anchors[anchors.index[one.anchor_id]])
+        cells = (_number(one.raw_m, "{:.3f}"), _number(one.corrected_m, "{:.3f}"))
+        table.add_row(name, str(one.ranges), *cells, end_section=one is residuals[-2:][0])
+    console.out.print(table)
+    console.out.print(
+        "Median absolute residuals. The ranges of each anchor are compared with a track of the other anchors' ranges.",
+        style="dim",
+    )
 
 
 def _cells(epochs: int, errors: TrackErrors) -> tuple[str, ...]:

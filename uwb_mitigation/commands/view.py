@@ -19,7 +19,10 @@ if TYPE_CHECKING:
 def view(
     bag: Annotated[
         Path,
-        typer.Argument(metavar="BAG", help="An MCAP bag or a rosbag2 folder with ranges, corrected or raw."),
+        typer.Argument(
+            metavar="BAG",
+            help="An MCAP bag or rosbag2 folder with ranges (raw or corrected), or the output of `track`.",
+        ),
     ],
     anchors: Annotated[
         Path | None,
@@ -64,7 +67,7 @@ def view(
         console.err.print(
             "The bag holds raw ranges alone: they are corrected as they are shown.", style="yellow"
         )
-    shown = View(scene, lock, title=bag.resolve().name, player=player)
+    shown = View(scene, lock, title=bag.resolve().name, player=player, missing=player.missing)
     with ViewerServer(shown, host, port) as server:
         console.out.print(f"{server.url} shows {bag}; Ctrl-C ends it.", markup=False, soft_wrap=True)
         player.play(True)

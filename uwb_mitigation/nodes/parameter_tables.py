@@ -219,7 +219,7 @@ LOCATOR = (
 VIEWER = (
     Parameter("host", "localhost", "Address to serve the page at; 0.0.0.0 = every address of this machine."),
     Parameter("port", 5006, "Port of the page; 0 = a free one, named in the log.", low=0, high=65535),
-    Parameter("origins", "", "Further HOST:PORT that a browser may name to reach the page, with commas between."),
+    Parameter("origins", "", "Further HOST:PORT that are accepted in the HTTP headers Host and Origin, separated by commas."),
     Parameter("anchors", "", "Anchors file, for a map without a locator: shown, and published as markers for RViz and "
               "Foxglove. Empty = those of a locator's markers."),
     Parameter("map_frame", "map", "Frame of the anchors."),

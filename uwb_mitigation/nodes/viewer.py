@@ -37,7 +37,7 @@ from uwb_mitigation.sources.site import load_anchors
 from uwb_mitigation.viewer.feed import Feed
 from uwb_mitigation.viewer.scene import MAX_TAGS, PLAIN, Scene
 from uwb_mitigation.viewer.server import ViewerServer
-from uwb_mitigation.viewer.view import View
+from uwb_mitigation.viewer.view import Missing, View
 
 OURS = ("driver", "mitigator", "locator", "viewer")
 """Nodes whose parameters are shown."""
@@ -73,6 +73,8 @@ class Viewer(ManagedNode):
         self._scene = Scene()
         self._lock = threading.Lock()
         self._feed = Feed(self._scene, self._lock)
+        pace = clocks.Pace(self.get_clock())
+        self._feed.set_clock(lambda: pace.now_ns() / 1e9)
         self._view: View | None = None
         self._asked: dict[str, AsyncParameterClient] = {}
         self.autostart()
@@ -151,6 +153,8 @@ class Viewer(ManagedNode):
 
     def _look_around(self) -> None:
         """Subscribe to what is wanted, or there, only by now."""
+        if self._view is not None:
+            self._view.missing = self._missing()
         # CIRs are most of what is sent: a pipeline sends none where nobody looks.
         if self._view is not None and self._view.drawing.pages:
             self._listen(RangeCir, topics.RANGE_RAW)
@@ -164,6 +168,26 @@ class Viewer(ManagedNode):
         for topic, _ in self.get_topic_names_and_types():
             if (found := own.fullmatch(topic)) and len(self._looking) < MAX_TAGS:
                 self._look(PoseWithCovarianceStamped, topic, partial(self._feed.pose, found[1]))
+
+    def _missing(self) -> Missing:
+        """Return why the page is empty: which node is not running."""
+        raw, corrected, anchors, poses = (
+            self.resolve_topic_name(topic)
+            for topic in (topics.RANGE_RAW, topics.RANGE_CORRECTED, topics.ANCHORS, topics.POSE)
+        )
+        if self.count_publishers(corrected):
+            ranges = f"No ranges received: {corrected} has a publisher but no messages."
+        elif self.count_publishers(raw):
+            ranges = f"No ranges received: {raw} has a publisher, {corrected} has none. Start the mitigator."
+        else:
+            ranges = f"No ranges received: {raw} and {corrected} have no publisher. Start the driver and the mitigator."
+        return Missing(
+            ranges=ranges,
+            anchors=f"No anchor positions: nothing received on {anchors}. Start the locator, or set the parameter anchors.",
+            positions="No tag positions yet: see the diagnostics of the locator."
+            if self.count_publishers(poses)
+            else f"No tag positions: {poses} has no publisher. Start the locator.",
+        )
 
     def begin(self) -> None:
         self._view = View(

@@ -6,6 +6,8 @@ Ranges come as CDR bytes, the rest as message objects; those of rclpy and of ros
 from __future__ import annotations
 
 import math
+from collections import OrderedDict
+from collections.abc import Callable
 from threading import Lock
 from typing import Any
 
@@ -23,6 +25,9 @@ CHI2_95 = 5.991
 ANCHORS_NAMESPACE = "anchors"
 """Of the markers that are anchors, among those of `/uwb/anchors`; their texts are the anchors' ids."""
 
+MAX_WITHOUT_TRUTH = 1000
+"""Corrected ranges that a later truth can still be joined with."""
+
 LONGEST_ID = 20
 """Digits of the largest of 64 bits."""
 
@@ -39,10 +44,16 @@ class Feed:
         self._scene = scene
         self._lock = lock
         self._truths = Truths()
+        self._without_truth: OrderedDict[Key, Sample] = OrderedDict()
+
+    def set_clock(self, clock: Callable[[], float]) -> None:
+        """Measure ages with another clock, s."""
+        self._scene.clock = clock
 
     def clear(self) -> None:
         """Forget what came, but for the anchors."""
         self._truths = Truths()
+        self._without_truth.clear()
         with self._lock:
             self._scene.clear()
 
@@ -70,7 +81,12 @@ class Feed:
         except RecordingError:
             self.malformed += 1
             return
-        self._truths.add(key, truth)
+        sample = self._without_truth.pop(key, None)
+        if sample is None:
+            self._truths.add(key, truth)
+            return
+        with self._lock:
+            self._scene.set_truth(sample, truth)
 
     def range_corrected(self, data: bytes) -> None:
         try:
@@ -81,13 +97,18 @@ class Feed:
         self.corrected(key, corrected)
 
     def corrected(self, key: Key, corrected: CorrectedRange) -> None:
-        sample = Sample.of(key.stamp_ns / 1e9, corrected, self._truths.take(key))
+        truth = self._truths.take(key)
+        sample = Sample.of(key.stamp_ns / 1e9, corrected, truth)
         with self._lock:
             self._scene.add_sample((key.anchor_id, key.tag_id), sample)
             self._scene.add_error(sample)
+        if truth is None:
+            self._without_truth[key] = sample
+            if len(self._without_truth) > MAX_WITHOUT_TRUTH:
+                self._without_truth.popitem(last=False)
 
     def pose(self, tag: str, message: Any) -> None:
-        """A geometry_msgs/PoseWithCovarianceStamped."""
+        """A geometry_msgs/PoseWithCovarianceStamped or a nav_msgs/Odometry."""
         position = message.pose.pose.position
         if not all(math.isfinite(value) for value in (position.x, position.y)):
             self.malformed += 1
@@ -129,7 +150,8 @@ class Feed:
             for status in message.status:
                 # rclpy gives an octet as bytes, rosbags as a number.
                 level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
-                self._scene.add_report(str(status.name), Report(level, str(status.message)))
+                report = Report(level, str(status.message), self._scene.clock())
+                self._scene.add_report(str(status.name), report)
 
 
 def _ellipse(covariance: np.ndarray[Any, Any]) -> tuple[float, float, float]:

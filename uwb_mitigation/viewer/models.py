@@ -6,11 +6,9 @@ from typing import Any
 
 import numpy as np
 from bokeh.models import (
-    Button,
-    CellFormatter,
     ColorBar,
     ColumnDataSource,
-    CustomJS,
+    DataRange1d,
     DataTable,
     Div,
     FixedTicker,
@@ -18,7 +16,6 @@ from bokeh.models import (
     LinearColorMapper,
     Range1d,
     Slider,
-    StringFormatter,
     TableColumn,
     TapTool,
     Toggle,
@@ -30,26 +27,9 @@ from uwb_mitigation.viewer.scene import STRIP_S, WATERFALL
 TRACE_BEFORE, TRACE_AFTER = 20, 180
 """Samples before and after the first path that are shown."""
 
-RAW, CORRECTED, TRUE = "#94a3b8", "#2563eb", "#111827"
+RAW, CORRECTED, TRUE, SMOOTHED = "#94a3b8", "#2563eb", "#111827", "#0f766e"
 _MARK, _WINDOW = "#b91c1c", "#fde68a"
 
-
-def _digits(value: str, digits: int) -> str:
-    """A number in a template; of what is too long for a column the magnitude."""
-    near = f"Math.abs({value}) < 1e5 ? {value}.toFixed({digits})"
-    return f"<%= {near} : isNaN({value}) ? '-' : {value}.toExponential(1) %>"
-
-
-_BAR = (
-    '<div style="position:relative;text-align:right"><div style="position:absolute;left:0;top:3px;bottom:3px;'
-    'background:#bfdbfe;width:<%= Math.min(100, Math.abs(value) * 50) || 0 %>%"></div>'
-    f'<span style="position:relative">{_digits("value", 3)}</span></div>'
-)
-_COLOURED = (
-    '<span style="color:<%= colour %>;font-size:11px;font-weight:600;white-space:normal"><%- value %></span>'
-)
-_BROKEN = _COLOURED.replace("<%- value %>", '<%= value.replaceAll("_", "_<wbr>") %>')
-"""Only numbers and names of ours reach these."""
 
 STACKED = "stacked"
 """Name of the columns for a narrow box: the page shows these or the others."""
@@ -64,11 +44,13 @@ class Models:
 
     def __init__(self, seconds: float | None) -> None:
         self.pairs = _source(
-            "anchor", "tag", "rate", "raw", "range", "sigma", "status", "colour", "correction"
+            "anchor", "tag", "rate", "raw", "range", "sigma", "status", "colour", "row_colour", "correction"
         )
         self.anchors = _source("x", "y", "name", "id")
-        self.tags = _source("x", "y", "name", "width", "height", "angle")
-        self.trails, self.true_trails = _source("xs", "ys"), _source("xs", "ys")
+        self.tags = _source("x", "y", "name", "width", "height", "angle", "colour")
+        self.trails, self.true_trails = _source("xs", "ys", "colour"), _source("xs", "ys")
+        # The map shows these corners until the user changes its view: it must not follow the data.
+        self.extent = _source("x", "y")
         self.circles = _source("x", "y", "raw", "range", "colour", "x1", "y1")
         self.strip = _source("age", "raw", "range", "true")
         self.trace = _source("sample", "magnitude")
@@ -76,20 +58,19 @@ class Models:
         self.waterfall = ColumnDataSource({"image": [blank_waterfall()]})
         self.errors = _source("left", "right", "raw", "corrected")
         # A figure without data would have no ranges: unseen corners stand in until some comes.
-        self.corners = {name: _source("corner_x", "corner_y") for name in ("map", "cir", "strip")}
-        self.summary, self.reports = (
-            Div(text="", sizing_mode="stretch_width", disable_math=True) for _ in range(2)
+        self.corners = {name: _source("corner_x", "corner_y") for name in ("cir", "strip")}
+        self.summary, self.notice, self.reports = (
+            Div(text="", sizing_mode="stretch_width", disable_math=True) for _ in range(3)
         )
         self.pause = Toggle(label="Pause", width=90)
-        self.screenshot = Button(label="Screenshot", width=110)
-        self.screenshot.js_on_click(CustomJS(code="window.saveScreenshot()"))
         self.slider = None if seconds is None else _slider(seconds)
+        self.map_figure = self._map()
         self.strip_figure, self.cir_figure = self._strip(), self._cir()
         self.roots = {
             "summary": self.summary,
+            "notice": self.notice,
             "pause": self.pause,
-            "screenshot": self.screenshot,
-            "map": self._map(),
+            "map": self.map_figure,
             "pairs": self._pairs_table(),
             "reports": self.reports,
             "cir": self.cir_figure,
@@ -110,21 +91,25 @@ class Models:
 
     def _map(self) -> figure:
         plot = _figure("Map", 480, "x, m", "y, m", match_aspect=True, tools="pan,wheel_zoom,reset,save")
+        # Tick labels of another width must not resize the frame, which would change the view.
+        plot.min_border_left, plot.min_border_right = 70, 20
         unfilled = {"source": self.circles, "fill_color": None}
+        extent = plot.scatter("x", "y", source=self.extent, size=0, alpha=0)
+        plot.x_range, plot.y_range = DataRange1d(renderers=[extent]), DataRange1d(renderers=[extent])
         plot.circle("x", "y", radius="raw", line_color=RAW, line_width=1, **unfilled)
         plot.circle("x", "y", radius="range", line_color="colour", line_width=2.5, **unfilled)
         plot.segment(
             "x", "y", "x1", "y1", source=self.circles, line_color="colour", line_width=1, line_dash="dotted"
         )
-        plot.multi_line("xs", "ys", source=self.trails, line_color=CORRECTED, line_width=1.5)
+        plot.multi_line("xs", "ys", source=self.trails, line_color="colour", line_width=1.5)
         plot.multi_line(
             "xs", "ys", source=self.true_trails, line_color=TRUE, line_width=1, line_dash="dashed"
         )
         plot.ellipse(
             "x", "y", width="width", height="height", angle="angle", source=self.tags,
-            fill_color=CORRECTED, fill_alpha=0.15, line_color=CORRECTED,
+            fill_color="colour", fill_alpha=0.15, line_color="colour",
         )  # fmt: skip
-        plot.scatter("x", "y", source=self.tags, size=8, color=CORRECTED)
+        plot.scatter("x", "y", source=self.tags, size=8, color="colour")
         anchors = plot.scatter(
             "x", "y", source=self.anchors, marker="triangle", size=12, color=TRUE, nonselection_alpha=0.8,
             selection_line_color=CORRECTED, selection_line_width=3,
@@ -198,34 +183,22 @@ class Models:
         return _with_legend(plot)
 
     def _pairs_table(self) -> DataTable:
-        def number(digits: int) -> HTMLTemplateFormatter:
-            return HTMLTemplateFormatter(
-                template=f'<div style="text-align:right">{_digits("value", digits)}</div>'
-            )
-
         return DataTable(
             source=self.pairs,
             columns=[
-                _column("anchor", "anchor", 54, StringFormatter()),
-                _column("tag", "tag", 54, StringFormatter()),
-                _column("rate", "Hz", 46, number(1)),
-                _column("raw", "raw", 54, number(3)),
-                _column("range", "corrected", 66, number(3)),
-                _column("sigma", "sigma", 50, number(3)),
-                _column("correction", "correction", 76, HTMLTemplateFormatter(template=_BAR)),
-                _column("status", "status", 166, HTMLTemplateFormatter(template=_COLOURED)),
-                # The same for a narrow box.
-                _stacked(
-                    "anchor", "pair", 70, "<b><%= value %></b>", "tag <%= tag %>", f"{_digits('rate', 1)} Hz"
-                ),
-                _stacked("range", "corrected, raw", 98, f"<b>{_digits('value', 3)}</b>", _digits("raw", 3)),
-                _stacked("correction", "correction, \u03c3", 90, _BAR, _digits("sigma", 3)),
-                _stacked(
-                    "status",
-                    "status",
-                    98,
-                    f'<div style="text-align:left">{_BROKEN}</div>',
-                ),
+                _column("anchor", "anchor", 54, "text"),
+                _column("tag", "tag", 54, "text"),
+                _column("rate", "Hz", 46, "1"),
+                _column("raw", "raw", 54, "3"),
+                _column("range", "corrected", 66, "3"),
+                _column("sigma", "sigma", 50, "3"),
+                _column("correction", "correction", 76, "bar"),
+                _column("status", "status", 166, "status"),
+                # The same columns for a narrow page.
+                _column("anchor", "pair", 70, "pair", STACKED),
+                _column("range", "corrected, raw", 98, "ranges", STACKED),
+                _column("correction", "correction, \u03c3", 90, "corrections", STACKED),
+                _column("status", "status", 98, "broken", STACKED),
             ],
             index_position=None,
             sortable=False,
@@ -259,19 +232,12 @@ def _slider(seconds: float) -> Slider:
     )
 
 
-def _column(
-    field: str, title: str, width: int, formatter: CellFormatter, name: str | None = None
-) -> TableColumn:
+def _column(field: str, title: str, width: int, cell: str, name: str | None = None) -> TableColumn:
+    """A column; `cell` names the function of the page's script that renders its cells."""
+    formatter = HTMLTemplateFormatter(template=cell)
     return TableColumn(
         field=field, title=title, width=width, formatter=formatter, name=name, visible=name is None
     )
-
-
-def _stacked(field: str, title: str, width: int, *lines: str) -> TableColumn:
-    template = '<div style="line-height:16px;text-align:right">' + "".join(
-        f"<div>{line}</div>" for line in lines
-    )
-    return _column(field, title, width, HTMLTemplateFormatter(template=template + "</div>"), STACKED)
 
 
 def _figure(title: str, height: int, x: str, y: str, **options: Any) -> figure:

@@ -16,14 +16,23 @@ from typing import Any
 import jinja2
 import numpy as np
 from bokeh.document import Document
+from bokeh.events import Reset
 from bokeh.models import ColumnDataSource
 
 from uwb_mitigation.measurement import Status, format_id
 from uwb_mitigation.preprocessing import WINDOW_LEAD
-from uwb_mitigation.viewer.models import TRACE_AFTER, TRACE_BEFORE, Models, blank_waterfall
+from uwb_mitigation.viewer.models import (
+    CORRECTED,
+    SMOOTHED,
+    TRACE_AFTER,
+    TRACE_BEFORE,
+    Models,
+    blank_waterfall,
+)
 from uwb_mitigation.viewer.scene import (
     ERROR_EDGES_M,
     FARTHEST_M,
+    NO_DATA_S,
     STRIP_S,
     History,
     Pair,
@@ -42,6 +51,13 @@ COLOURS = {
 LEVELS = ("OK", "WARN", "ERROR", "STALE")
 LEVEL_COLOURS = ("#15803d", "#b45309", "#b91c1c", "#6b7280")
 
+SILENT = "#9ca3af"
+"""Colour of pairs and tags without recent data."""
+
+ROOM_M = 5.0
+"""Room around a tag on a map without anchors."""
+
+_NOTICE_STYLE = "background:#fef3c7;color:#78350f;padding:4px 10px;border-radius:4px;margin-bottom:4px"
 _REPORTS_STYLE = (
     "<style>td{padding:2px 10px 2px 4px;vertical-align:top;overflow-wrap:anywhere}"
     "td:first-child{min-width:90px}</style>"
@@ -56,15 +72,19 @@ class Page:
     Args:
         document: the session's, into which the page is laid out.
         view: what it looks at.
+        nonce: of the scripts in the page, for its Content-Security-Policy.
     """
 
-    def __init__(self, document: Document, view: View) -> None:
+    def __init__(self, document: Document, view: View, nonce: str = "") -> None:
         self._view = view
+        self._fitted: tuple[bool, bool] = False, False
         self._selected: Pair | None = None
         self._rows: list[Pair] = []
         self._due_s = 0.0
         self._drawn: dict[str, object] = {}
         self._models = models = Models(None if view.player is None else view.player.seconds)
+        # Before the model is in the document: later it is not subscribed.
+        models.map_figure.on_event(Reset, self._on_reset)
         # As one, or Bokeh looks for new models after each: half of what opening a page takes.
         with document.models.freeze():
             for model in models.roots.values():
@@ -72,7 +92,7 @@ class Page:
         document.title = view.title
         document.template = _TEMPLATES.get_template("page.html.j2")
         document.template_variables.update(
-            page_title=view.title, recording=view.player is not None, parameters=view.parameters
+            page_title=view.title, recording=view.player is not None, parameters=view.parameters, nonce=nonce
         )
         document.config.update(reconnect_session=False, notify_connection_status=False, notifications=None)
         models.pairs.selected.on_change("indices", self._on_row)
@@ -105,10 +125,12 @@ class Page:
         self._draw_player()
         with self._view.lock:
             scene = self._view.scene
-            if not self._changed("scene", (scene.revision, self._selected)):
+            # Ages change without data: once a second is enough.
+            if not self._changed("scene", (scene.revision, self._selected, math.floor(scene.clock()))):
                 return
             self._draw_pairs(scene)
             self._draw_summary(scene)
+            self._draw_notice(scene)
             self._draw_map(scene)
             history = None if self._selected is None else scene.pairs.get(self._selected)
             self._draw_strip(scene, history)
@@ -127,8 +149,9 @@ class Page:
         player, slider = self._view.player, self._models.slider
         if player is None or slider is None:
             return
-        if self._changed("position", round(player.position_s, 1)):
-            slider.value = min(round(player.position_s, 1), slider.end)
+        if self._changed("position", position_s := min(round(player.position_s, 1), slider.end)):
+            # The page's script moves the handle to it, unless the user is dragging it.
+            slider.tags = [position_s]
         if self._changed("playing", player.playing):
             self._models.pause.active = not player.playing
             self._models.pause.label = "Pause" if player.playing else "Play"
@@ -138,15 +161,19 @@ class Page:
         rows = [pair for pair, _, _ in latest]
         if self._selected is None and rows:
             self._selected = rows[0]
+        live = [(_no_data(scene, entry[1]), entry) for entry in latest]
         self._models.pairs.data = {
             "anchor": [format_id(anchor) for anchor, _ in rows],
             "tag": [format_id(tag) for _, tag in rows],
-            "rate": [history.rate_hz() for _, history, _ in latest],
+            "rate": [
+                0.0 if silent else history.rate_hz(scene.age_s(history)) for silent, (_, history, _) in live
+            ],
             "raw": [sample.raw_m for _, _, sample in latest],
             "range": [sample.range_m for _, _, sample in latest],
             "sigma": [sample.sigma_m for _, _, sample in latest],
-            "status": [sample.status.name for _, _, sample in latest],
-            "colour": [COLOURS[sample.status] for _, _, sample in latest],
+            "status": [silent or sample.status.name for silent, (_, _, sample) in live],
+            "colour": [SILENT if silent else COLOURS[sample.status] for silent, (_, _, sample) in live],
+            "row_colour": [SILENT if silent else "" for silent, _ in live],
             "correction": [sample.raw_m - sample.range_m for _, _, sample in latest],
         }
         self._rows = rows
@@ -166,6 +193,22 @@ class Page:
         if self._models.summary.text != text:
             self._models.summary.text = text
 
+    def _draw_notice(self, scene: Scene) -> None:
+        """State why the page is empty, and what has stopped."""
+        missing, lines = self._view.missing, []
+        histories = [history for _, history, _ in scene.latest()]
+        if not histories:
+            lines.append(missing.ranges)
+        elif all(_no_data(scene, history) for history in histories):
+            lines.append(f"No ranges for {min(map(scene.age_s, histories)):.0f} s.")
+        if not scene.anchors:
+            lines.append(missing.anchors)
+        if not scene.tags:
+            lines.append(missing.positions)
+        text = "".join(f'<div style="{_NOTICE_STYLE}">{html.escape(line)}</div>' for line in lines if line)
+        if self._models.notice.text != text:
+            self._models.notice.text = text
+
     def _draw_map(self, scene: Scene) -> None:
         models = self._models
         if self._changed("anchors", scene.anchors):
@@ -177,20 +220,44 @@ class Page:
                 "id": [str(identity) for identity, _ in places],
             }
         _choose(models.anchors, list(scene.anchors), None if self._selected is None else self._selected[0])
-        posed = [(name, tag.pose) for name, tag in scene.tags.items() if tag.pose is not None]
-        ellipses = [pose.ellipse for _, pose in posed]
+        posed = [(name, tag, tag.pose) for name, tag in scene.tags.items() if tag.pose is not None]
+        ellipses = [pose.ellipse for _, _, pose in posed]
+        silent = {
+            name: f"no data for {age_s:.0f} s"
+            for name, tag, _ in posed
+            if (age_s := scene.age_s(tag)) > NO_DATA_S
+        }
+        colours = {name: SMOOTHED if name.endswith(" smoothed") else CORRECTED for name in scene.tags}
         models.tags.data = {
-            "x": [pose.x for _, pose in posed],
-            "y": [pose.y for _, pose in posed],
-            "name": [name for name, _ in posed],
+            "x": [pose.x for _, _, pose in posed],
+            "y": [pose.y for _, _, pose in posed],
+            "name": [f"{name}: {silent[name]}" if name in silent else name for name, _, _ in posed],
+            "colour": [SILENT if name in silent else colours[name] for name, _, _ in posed],
             "width": [_finite(_drawable(2 * larger)) for larger, _, _ in ellipses],
             "height": [_finite(_drawable(2 * smaller)) for _, smaller, _ in ellipses],
             "angle": [_finite(angle) for _, _, angle in ellipses],
         }
-        models.trails.data = _lines([tag.trail for tag in scene.tags.values()])
+        models.trails.data = _lines([tag.trail for tag in scene.tags.values()]) | {
+            "colour": list(colours.values())
+        }
         models.true_trails.data = _lines(list(scene.true_trails.values()))
-        models.show_empty("map", not (scene.anchors or scene.tags or scene.true_trails))
+        fitted = bool(scene.anchors), bool(scene.anchors or scene.tags or scene.true_trails)
+        # The view is chosen for the first content and for the first anchors, and then only by the user.
+        if fitted > self._fitted or not models.extent.data["x"]:
+            self._fitted = fitted
+            self._fit(scene)
         self._draw_ranges(scene)
+
+    def _fit(self, scene: Scene) -> None:
+        """Let the map show everything that is on it now."""
+        places = [(place.x, place.y) for place in scene.anchors.values()]
+        for trail in (*(tag.trail for tag in scene.tags.values()), *scene.true_trails.values()):
+            places += trail
+        x, y = np.array(places or [(0.0, 0.0), (10.0, 10.0)]).T
+        # A single tag needs room to move.
+        room = 0.0 if scene.anchors or not places else ROOM_M
+        corners = {"x": [x.min() - room, x.max() + room], "y": [y.min() - room, y.max() + room]}
+        self._models.extent.data = {name: [float(value) for value in ends] for name, ends in corners.items()}
 
     def _draw_ranges(self, scene: Scene) -> None:
         """Circles and rays of the chosen pair's tag: a map of all tags' would show nothing."""
@@ -198,9 +265,11 @@ class Page:
         tag_id = None if self._selected is None else self._selected[1]
         tag = None if tag_id is None else scene.tag_of(tag_id)
         pose = None if tag is None else tag.pose
-        for (anchor, other), _, sample in scene.latest():
+        for (anchor, other), history, sample in scene.latest():
             place = scene.anchors.get(anchor)
             if other != tag_id or place is None or math.isnan(_drawable(sample.range_m)):
+                continue
+            if _no_data(scene, history):
                 continue
             height_m = 0.0 if pose is None else _finite(pose.z - place.z)
             raw_m, range_m = (
@@ -267,11 +336,12 @@ class Page:
             }
 
     def _draw_reports(self, scene: Scene) -> None:
-        rows = sorted(scene.reports.items())
+        rows = [(name, report.at(scene.clock())) for name, report in sorted(scene.reports.items())]
         if self._changed("reports", rows):
             # Words of messages, which may hold anything: nothing else on the page is made of such.
             cells = [
-                f"<tr><td>{html.escape(name)}</td><td>{_level(report.level)}</td><td>{html.escape(report.message)}</td></tr>"
+                f"<tr><td>{html.escape(name)}</td>"
+                f"<td>{_level(report.level)}</td><td>{html.escape(report.message)}</td></tr>"
                 for name, report in rows
             ]
             self._models.reports.text = (
@@ -301,6 +371,10 @@ class Page:
         else:
             _choose(source, places, None if selected is None else selected[0])
 
+    def _on_reset(self, _event: Reset) -> None:
+        with self._view.lock:
+            self._fit(self._view.scene)
+
     def _on_pause(self, _attribute: str, _old: object, new: bool) -> None:
         player = self._view.player
         if player is None:
@@ -316,6 +390,12 @@ class Page:
 
     def _gone(self, _context: Any) -> None:
         self._view.drawing.pages -= 1
+
+
+def _no_data(scene: Scene, history: History) -> str:
+    """Return "no data for 12 s" for a pair that has stopped, else an empty string."""
+    age_s = scene.age_s(history)
+    return "" if history.has_data(age_s) else f"no data for {age_s:.0f} s"
 
 
 def _choose(source: ColumnDataSource, rows: list[Any], chosen: object) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import re
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -22,9 +22,11 @@ from uwb_mitigation.bag.reader import BagReader, check_channel
 from uwb_mitigation.bag.topics import (
     ANCHORS,
     MARKERS_TYPE,
+    ODOMETRY,
     ODOMETRY_TRUTH,
     ODOMETRY_TYPE,
     POSE,
+    POSE_SMOOTHED,
     POSE_TYPE,
     RANGE_CIR_TYPE,
     RANGE_CORRECTED,
@@ -38,6 +40,7 @@ from uwb_mitigation.measurement import RangeMeasurement
 from uwb_mitigation.mitigation import Backend, correct_batch
 from uwb_mitigation.viewer.feed import Feed
 from uwb_mitigation.viewer.scene import PLAIN, STRIP_S, Report
+from uwb_mitigation.viewer.view import Missing
 
 DIAGNOSTICS = "/diagnostics"
 DIAGNOSTICS_TYPE = "diagnostic_msgs/msg/DiagnosticArray"
@@ -54,25 +57,28 @@ _OURS = {
     RANGE_TRUTH: RANGE_TRUTH_TYPE,
     RANGE_CORRECTED: RANGE_CORRECTED_TYPE,
 }
-_TAG_POSE = re.compile(r"/uwb/(tag_\d+)/pose")
+_POSITIONS = {POSE: POSE_TYPE, ODOMETRY: ODOMETRY_TYPE, POSE_SMOOTHED: POSE_TYPE}
+_POSITION_TOPIC = re.compile(r"(.*)/uwb/(?:(tag_\d+)/)?(pose|odometry|pose_smoothed)")
 
 
 class BagPlayer:
-    """The ranges of a bag; implements `view.Player`.
+    """The ranges or the tracks of a bag; implements `view.Player`.
 
-    Ranges that the bag holds only raw are corrected as they are shown.
+    If the bag contains raw ranges only, they are corrected for display.
 
     Args:
         path: an MCAP file or a rosbag2 folder.
         feed: puts messages into the scene.
         backend: makes what corrects raw ranges; called only where the bag holds no corrected ones.
-        namespace: of the topics, as `/board1`; None = that of the only ranges in the bag.
+        namespace: of the topics, as `/board1`; None = the only namespace with ranges (or tracks) in the bag.
 
     Attributes:
-        corrects: whether the bag holds raw ranges alone.
+        corrects: whether the bag contains raw ranges only.
+        missing: what the bag does not contain; for the page.
 
     Raises:
-        RecordingError: the path is absent or no MCAP bag, holds no ranges, or ranges of another version.
+        RecordingError: the path is absent or no MCAP bag, contains neither ranges nor tracks, or ranges of another
+            version.
         ParameterError: ranges of several namespaces, and none was named.
     """
 
@@ -83,7 +89,8 @@ class BagPlayer:
         self._bag = BagReader(path)
         topics, bounds = self._bag.topics, self._bag.bounds_ns
         prefix = _namespace(path, topics) if namespace is None else namespace.rstrip("/")
-        if bounds is None or not {prefix + RANGE_RAW, prefix + RANGE_CORRECTED} & topics.keys():
+        has_ranges = bool({prefix + RANGE_RAW, prefix + RANGE_CORRECTED} & topics.keys())
+        if bounds is None or not (has_ranges or _positions(prefix, topics)):
             raise _no_ranges(path, topics)
         for channel in self._bag.channels:
             if kind := _OURS.get(channel.topic.removeprefix(prefix)):
@@ -92,13 +99,24 @@ class BagPlayer:
         self.seconds = (end_ns - self._start_ns) / 1e9
         self.position_s = 0.0
         self.playing = False
-        self.corrects = prefix + RANGE_CORRECTED not in topics
+        self.corrects = has_ranges and prefix + RANGE_CORRECTED not in topics
+        self.missing = Missing(
+            ranges="No ranges up to this time."
+            if has_ranges
+            else "The recording contains tracks without ranges.",
+            anchors="No anchor positions: set --anchors FILE.",
+            positions=""
+            if _positions(prefix, topics)
+            else "No tag positions: `uwb-mitigation track` estimates them.",
+        )
         self._backend = backend() if self.corrects else None
         self._takers = self._takers_of(prefix, topics)
-        self._uncorrected: list[RangeMeasurement] = []
+        self._uncorrected: list[tuple[float, RangeMeasurement]] = []
         self._ahead: RawMessage | None = None
         self._messages: Iterator[RawMessage] = iter(())
         self._looked_s = time.monotonic()
+        self._clock_s = 0.0
+        feed.set_clock(lambda: self._clock_s)
         per_s = self._bag.message_count / max(self.seconds, 1e-9)
         self._window_s = min(STRIP_S, MAX_MESSAGES / max(per_s, 1e-9))
         self._take_first(prefix + ANCHORS)
@@ -142,11 +160,13 @@ class BagPlayer:
                 if message.log_time_ns > stop_ns:
                     self._ahead = message
                     break
+                self._clock_s = (message.log_time_ns - self._start_ns) / 1e9
                 self._takers[message.channel.topic](message.data)
         except RecordingError as error:
             self._messages = iter(())
             self._feed.report("recording", Report(2, f"{error.what}: nothing beyond can be shown"))
         self._correct()
+        self._clock_s = self.position_s
 
     def _take_first(self, topic: str) -> None:
         """Of what is said once at the beginning, wherever the recording is looked at."""
@@ -168,10 +188,9 @@ class BagPlayer:
             prefix + ANCHORS: (MARKERS_TYPE, feed.markers),
             DIAGNOSTICS: (DIAGNOSTICS_TYPE, feed.diagnostics),
         }
-        for topic in topics:
-            own = _TAG_POSE.fullmatch(topic.removeprefix(prefix))
-            if own or topic == prefix + POSE:
-                standard[topic] = POSE_TYPE, partial(feed.pose, own[1] if own else PLAIN)
+        for topic, (tag, plain) in _positions(prefix, topics).items():
+            name = f"{tag} smoothed" if plain == POSE_SMOOTHED else tag
+            standard[topic] = _POSITIONS[plain], partial(feed.pose, name)
         for topic, (kind, take) in standard.items():
             if topics.get(topic, "").replace("/msg/", "/") == kind.replace("/msg/", "/"):
                 takers[topic] = partial(self._take_standard, kind, take)
@@ -191,7 +210,7 @@ class BagPlayer:
             self._feed.malformed += 1
             return
         self._feed.measurement(measurement)
-        self._uncorrected.append(measurement)
+        self._uncorrected.append((self._clock_s, measurement))
         if len(self._uncorrected) == _BATCH:
             self._correct()
 
@@ -199,21 +218,37 @@ class BagPlayer:
         if self._backend is None:
             return
         batch, self._uncorrected = self._uncorrected, []
-        for measurement, corrected in zip(batch, correct_batch(self._backend, batch), strict=True):
+        measurements = [measurement for _, measurement in batch]
+        results = correct_batch(self._backend, measurements)
+        for (self._clock_s, measurement), corrected in zip(batch, results, strict=True):
             self._feed.corrected(key_of(measurement), corrected)
 
 
+def _positions(prefix: str, topics: Iterable[str]) -> dict[str, tuple[str, str]]:
+    """Return the topics with estimated positions, {topic: (tag, its plain topic)}.
+
+    Tracks (the output of `track`) are used only if there are no poses.
+    """
+    found = {
+        topic: (match[2] or PLAIN, f"/uwb/{match[3]}")
+        for topic in topics
+        if (match := _POSITION_TOPIC.fullmatch(topic)) and match[1] == prefix
+    }
+    poses = {topic: entry for topic, entry in found.items() if entry[1] == POSE}
+    return poses or found
+
+
 def _namespace(path: Path, topics: dict[str, str]) -> str:
-    """The namespace of the only ranges in a bag."""
+    """Return the only namespace with ranges, or with tracks if there are no ranges."""
     found = {
         topic.removesuffix(name)
         for topic in topics
         for name in (RANGE_RAW, RANGE_CORRECTED)
         if topic.endswith(name)
-    }
+    } or {match[1] for topic in topics if (match := _POSITION_TOPIC.fullmatch(topic))}
     if len(found) > 1:
         raise ParameterError(
-            "ranges of several namespaces",
+            "several namespaces",
             where=str(path),
             valid="--namespace with one of: " + ", ".join(repr(name) for name in sorted(found)),
         )
@@ -224,4 +259,6 @@ def _namespace(path: Path, topics: dict[str, str]) -> str:
 
 def _no_ranges(path: Path, topics: dict[str, str]) -> RecordingError:
     known = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items()))
-    return RecordingError("no ranges", where=str(path), valid=f"the bag holds: {known or 'no topic'}")
+    return RecordingError(
+        "no ranges and no tracks", where=str(path), valid=f"the bag holds: {known or 'no topic'}"
+    )

@@ -7,11 +7,11 @@ from topics or by a recording; no ROS, no page, no I/O here.
 from __future__ import annotations
 
 import math
+import time
 from collections import OrderedDict, deque
-from collections.abc import Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import islice
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,12 @@ MAX_PAIRS, MAX_TAGS, MAX_REPORTS, MAX_ANCHORS = 256, 64, 64, 256
 
 SILENT_S = 10.0
 """A pair unheard for as long makes room for another: of too many, some are shown rather than each for a moment."""
+
+NO_DATA_S, NO_DATA_INTERVALS = 3.0, 3.0
+"""A pair or a tag has no data after this time, or after this many of its mean intervals if that is longer."""
+
+STALE_S = 5.0
+"""A node is STALE if its last diagnostics are older than this, as in rqt_robot_monitor."""
 
 MAX_STRIP, MAX_TRAIL = 6000, 1200
 """Points of a strip (100 ranges a second for a minute) and of a tag's trail."""
@@ -59,8 +65,9 @@ PLAIN = "tag"
 """The tag whose topics have the plain names, whatever its number is; others are called as `tag_frame` has it."""
 
 
-class Sample(NamedTuple):
-    """One corrected range of a pair.
+@dataclass(slots=True)
+class Sample:
+    """One corrected range of a pair; its truth may arrive later.
 
     Attributes:
         time_s: its stamp.
@@ -156,8 +163,13 @@ class Trace:
 
 @dataclass(slots=True)
 class History:
-    """The last minute of one pair."""
+    """The last minute of one pair.
 
+    Attributes:
+        received_s: time of the last range on the scene's clock.
+    """
+
+    received_s: float = math.nan
     samples: deque[Sample] = field(default_factory=lambda: deque(maxlen=MAX_STRIP))
     traces: deque[Trace] = field(default_factory=lambda: deque(maxlen=WATERFALL))
 
@@ -171,12 +183,24 @@ class History:
     def latest(self) -> Sample | None:
         return self.samples[-1] if self.samples else None
 
-    def rate_hz(self) -> float:
-        """Ranges a second over the last twenty; NaN before the second one."""
+    def rate_hz(self, age_s: float = 0.0) -> float:
+        """Ranges a second over the last twenty; NaN before the second one.
+
+        Args:
+            age_s: time since the last range; the rate decreases if this is several mean intervals.
+        """
         # At once: the monitor's table looks from another thread than the one that adds.
         recent = [sample.time_s for sample in list(islice(reversed(self.samples), 20))]
         span = recent[0] - recent[-1] if recent else 0.0
-        return (len(recent) - 1) / span if span > 0 else math.nan
+        if not span > 0:
+            return math.nan
+        rate_hz = (len(recent) - 1) / span
+        return rate_hz if age_s * rate_hz <= NO_DATA_INTERVALS else len(recent) / (span + age_s)
+
+    def has_data(self, age_s: float) -> bool:
+        """Return whether the last range is recent enough, relative to the mean interval of this pair."""
+        rate_hz = self.rate_hz()
+        return age_s <= max(NO_DATA_S, NO_DATA_INTERVALS / rate_hz if rate_hz > 0 else 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,9 +220,10 @@ class Pose:
 
 @dataclass(slots=True)
 class Tag:
-    """A tag's latest pose, and where it came from."""
+    """A tag's latest pose, when it was received on the scene's clock, and where it came from."""
 
     pose: Pose | None = None
+    received_s: float = math.nan
     trail: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=MAX_TRAIL))
 
 
@@ -214,25 +239,43 @@ class AnchorPlace:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """The latest diagnostics of one node: level 0 OK, 1 WARN, 2 ERROR, 3 STALE."""
+    """The latest diagnostics of one node: level 0 OK, 1 WARN, 2 ERROR, 3 STALE.
+
+    Attributes:
+        received_s: time of reception on the scene's clock; NaN: the report never becomes stale.
+    """
 
     level: int
     message: str
+    received_s: float = math.nan
+
+    def at(self, now_s: float) -> Report:
+        """Return what to show at a time: STALE with the age if the node has stopped reporting."""
+        age_s = now_s - self.received_s
+        if not age_s > STALE_S:
+            return self
+        return replace(self, level=STALE, message=f"no diagnostics for {age_s:.0f} s; last: {self.message}")
+
+
+STALE = 3
 
 
 class Scene:
     """Everything that the page shows.
 
     Attributes:
-        now_s: the latest stamp seen; NaN before any.
+        clock: returns the time that ages are measured with, s: a steady clock live, the recording's time in a replay.
+            Stamps are not compared with it: they may come from another computer.
+        now_s: the latest stamp seen plus the time since then; NaN before any.
         ranges, not_shown: how many came, and how many of them are of pairs beyond `MAX_PAIRS`.
         pairs: {(anchor, tag): its last minute}, those heard last at the end.
         tags, true_trails, anchors, reports: {id or name: ...}.
         revision: grows with every change, so that a page may leave alone what has not changed.
     """
 
-    def __init__(self) -> None:
-        self.now_s = math.nan
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self.clock = clock
+        self._latest_s = self._received_s = math.nan
         self.ranges = self.not_shown = 0
         self.pairs: OrderedDict[Pair, History] = OrderedDict()
         self.tags: OrderedDict[str, Tag] = OrderedDict()
@@ -244,6 +287,14 @@ class Scene:
         self.raw_error_sum_m = self.corrected_error_sum_m = 0.0
         self.errors = 0
         self.revision = 0
+
+    @property
+    def now_s(self) -> float:
+        return self._latest_s + max(self.clock() - self._received_s, 0.0)
+
+    def age_s(self, entry: History | Tag) -> float:
+        """Return the time since the last data of a pair or tag."""
+        return max(self.clock() - entry.received_s, 0.0)
 
     def history(self, pair: Pair) -> History | None:
         """The history of a pair, made anew for a new one; the pair counts as heard. None: there are too many."""
@@ -263,14 +314,16 @@ class Scene:
         """
         known = self.pairs.get(pair)
         latest = None if known is None else known.latest
-        if sample.time_s < self.now_s - STRIP_S or (latest and sample.time_s < latest.time_s - 1.0):
+        if sample.time_s < self._latest_s - STRIP_S or (latest and sample.time_s < latest.time_s - 1.0):
             self.rewind()
-        self.now_s = max(sample.time_s, self.now_s) if math.isfinite(self.now_s) else sample.time_s
+        if not sample.time_s < self._latest_s:
+            self._latest_s, self._received_s = sample.time_s, self.clock()
         self.ranges += 1
         if (history := self.history(pair)) is None:
             self.not_shown += 1
         else:
-            history.add(sample, self.now_s)
+            history.add(sample, self._latest_s)
+            history.received_s = self.clock()
 
     def add_error(self, sample: Sample) -> None:
         """Count a range in the histogram, where its truth is known."""
@@ -284,6 +337,12 @@ class Scene:
         self.corrected_error_sum_m += abs(corrected_m)
         self.errors += 1
 
+    def set_truth(self, sample: Sample, truth: Truth) -> None:
+        """Add the truth of a range that was added without it."""
+        sample.true_m, sample.label = truth.range_m, truth.label
+        self.add_error(sample)
+        self.revision += 1
+
     def add_trace(self, pair: Pair, trace: Trace) -> None:
         if (history := self.history(pair)) is not None:
             history.traces.append(trace)
@@ -292,7 +351,7 @@ class Scene:
         if not _on_earth(pose.x, pose.y):
             return
         entry = self._tag(tag)
-        entry.pose = pose
+        entry.pose, entry.received_s = pose, self.clock()
         entry.trail.append((pose.x, pose.y))
 
     def add_true_position(self, tag: str, x: float, y: float) -> None:
@@ -311,7 +370,7 @@ class Scene:
         self.revision += 1
 
     def add_report(self, name: str, report: Report) -> None:
-        self.reports[name[:MAX_TEXT]] = Report(report.level, report.message[:MAX_TEXT])
+        self.reports[name[:MAX_TEXT]] = replace(report, message=report.message[:MAX_TEXT])
         self.reports.move_to_end(name[:MAX_TEXT])
         if len(self.reports) > MAX_REPORTS:
             self.reports.popitem(last=False)
@@ -319,7 +378,7 @@ class Scene:
 
     def rewind(self) -> None:
         """Forget the last minute, but not what was counted, the anchors and the diagnostics."""
-        self.now_s = math.nan
+        self._latest_s = self._received_s = math.nan
         for history in self.pairs.values():
             history.samples.clear()
             history.traces.clear()
@@ -345,9 +404,9 @@ class Scene:
         return self.raw_error_sum_m / self.errors, self.corrected_error_sum_m / self.errors
 
     def latest(self) -> Iterator[tuple[Pair, History, Sample]]:
-        """Every pair that has been heard within the last minute, by anchor and tag."""
+        """Every pair with its last range, by anchor and tag; also those that have stopped."""
         for pair, history in sorted(self.pairs.items()):
-            if history.latest is not None and history.latest.time_s >= self.now_s - STRIP_S:
+            if history.latest is not None:
                 yield pair, history, history.latest
 
     def tag_of(self, tag_id: int) -> Tag | None:
@@ -359,7 +418,7 @@ class Scene:
     def _forget_silent(self) -> bool:
         """Forget the pair unheard the longest, if that is long enough."""
         pair, history = next(iter(self.pairs.items()))
-        if history.latest is not None and history.latest.time_s > self.now_s - SILENT_S:
+        if history.latest is not None and self.age_s(history) < SILENT_S:
             return False
         del self.pairs[pair]
         return True

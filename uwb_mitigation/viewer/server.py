@@ -6,16 +6,20 @@ import asyncio
 import html
 import logging
 import queue
-import socket
+import secrets
 import threading
 from collections.abc import Callable, Mapping
 from typing import Any
 
 from bokeh.application import Application
 from bokeh.application.handlers.function import FunctionHandler
-from bokeh.server.server import Server
+from bokeh.server.server import BaseServer
+from bokeh.server.tornado import BokehTornado
+from bokeh.server.util import bind_sockets, check_allowlist, create_hosts_allowlist
+from tornado.httpserver import HTTPServer
+from tornado.httputil import HTTPHeaders, HTTPServerRequest
 from tornado.ioloop import IOLoop
-from tornado.web import RequestHandler
+from tornado.web import OutputTransform, RequestHandler
 
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.viewer.page import Page
@@ -35,7 +39,7 @@ class ViewerServer:
     Args:
         view: what the pages show.
         host, port: where to listen; port 0 takes a free one, which `port` then tells.
-        origins: further `host:port` that a browser may name, for a page behind a proxy or a host name.
+        origins: further `host:port` that are accepted in the headers Host and Origin, for a proxy or a host name.
         parameters: what `/parameters` shows.
 
     Raises:
@@ -94,37 +98,25 @@ class ViewerServer:
         origins: tuple[str, ...],
         parameters: Parameters | None,
     ) -> None:
-        # Bokeh wants to know the port beforehand, to tell who may open a websocket.
-        port = port or _free_port()
         asyncio.set_event_loop(asyncio.new_event_loop())
-        # That a tab was closed while something was on its way to it is nothing to warn of.
+        # A tab that is closed while data is sent to it is not worth a warning.
         logging.getLogger("bokeh.server.views.ws").setLevel(logging.ERROR)
         loop = IOLoop.current()
-        patterns = (
-            [] if parameters is None else [(r"/parameters", _ParametersPage, {"parameters": parameters})]
-        )
-
-        def open_page(document: Any) -> None:
-            Page(document, view)
-
+        sockets = []
         try:
-            server = Server(
-                {"/": Application(FunctionHandler(open_page))},
-                io_loop=loop,
-                address="" if host in EVERY else host,
-                port=port,
-                allow_websocket_origin=_origins(host, port, origins),
-                extra_patterns=patterns,
-                # A closed tab is forgotten soon, so that it costs nothing.
-                check_unused_sessions_milliseconds=1000,
-                unused_session_lifetime_milliseconds=2000,
-            )
+            sockets, port = bind_sockets("" if host in EVERY else host, port)
+            application = _Application(view, _hosts(host, port, origins), parameters)
+            http = HTTPServer(application)
+            http.add_sockets(sockets)
+            server = BaseServer(loop, application, http)
         except Exception as error:
+            for listening in sockets:
+                listening.close()
             outcome.put(error)
             return
         self._loop = loop
         server.start()
-        loop.add_callback(outcome.put, int(server.port))
+        loop.add_callback(outcome.put, port)
         try:
             loop.start()
         finally:
@@ -132,6 +124,75 @@ class ViewerServer:
             server.stop()
             # Its connections too, so that pages learn of it at once.
             loop.close(all_fds=True)
+
+
+class _Application(BokehTornado):  # type: ignore[misc]
+    """Serves only requests that name an accepted host, each with a Content-Security-Policy.
+
+    Without the check of Host, another site could reach the page through a name that it resolves to this computer
+    (DNS rebinding).
+    """
+
+    def __init__(self, view: View, hosts: list[str], parameters: Parameters | None) -> None:
+        self._hosts = create_hosts_allowlist(hosts, None)
+        patterns = (
+            [] if parameters is None else [(r"/parameters", _ParametersPage, {"parameters": parameters})]
+        )
+
+        def open_page(document: Any) -> None:
+            Page(document, view, document.session_context.request.headers.get(_NONCE, ""))
+
+        super().__init__(
+            {"/": Application(FunctionHandler(open_page))},
+            extra_websocket_origins=self._hosts,
+            extra_patterns=patterns,
+            # A closed tab is forgotten soon, so that it costs nothing.
+            check_unused_sessions_milliseconds=1000,
+            unused_session_lifetime_milliseconds=2000,
+        )
+        self.add_transform(_SecurityPolicy)
+
+    def find_handler(self, request: HTTPServerRequest, **kwargs: Any) -> Any:
+        request.headers[_NONCE] = secrets.token_urlsafe(16)
+        if check_allowlist(request.host, self._hosts):
+            return super().find_handler(request, **kwargs)
+        return self.get_handler_delegate(request, _UnknownHost)
+
+
+_NONCE = "X-Nonce"
+"""Header that hands the nonce of a response to the page; one from the client is replaced."""
+
+
+class _SecurityPolicy(OutputTransform):  # type: ignore[misc]
+    """Adds the Content-Security-Policy to every response.
+
+    Only scripts of this server and inline scripts with the nonce run. Bokeh needs inline styles, and `data:` for its icons.
+    """
+
+    def __init__(self, request: HTTPServerRequest) -> None:
+        # Some browsers do not count a websocket as 'self'.
+        self._policy = (
+            f"default-src 'none'; script-src 'self' 'nonce-{request.headers[_NONCE]}'; style-src 'self' 'unsafe-inline'; "
+            f"img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self' ws://{request.host} "
+            f"wss://{request.host}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+        )
+
+    def transform_first_chunk(
+        self, status_code: int, headers: HTTPHeaders, chunk: bytes, finishing: bool
+    ) -> tuple[int, HTTPHeaders, bytes]:
+        headers["Content-Security-Policy"] = self._policy
+        headers["X-Content-Type-Options"] = "nosniff"
+        return status_code, headers, chunk
+
+
+class _UnknownHost(RequestHandler):  # type: ignore[misc]
+    """Answers requests whose header Host is not accepted."""
+
+    def prepare(self) -> None:
+        self.set_status(403)
+        self.finish(
+            "The viewer does not accept this host name. Add HOST:PORT to the viewer's parameter origins.\n"
+        )
 
 
 class _ParametersPage(RequestHandler):  # type: ignore[misc]
@@ -158,13 +219,7 @@ class _ParametersPage(RequestHandler):  # type: ignore[misc]
         )
 
 
-def _origins(host: str, port: int, more: tuple[str, ...]) -> list[str]:
-    """Who may open the page's websocket: pages of other sites in the same browser may not."""
+def _hosts(host: str, port: int, more: tuple[str, ...]) -> list[str]:
+    """Return the `host:port` that requests may name as Host and as Origin."""
     names = {"localhost", "127.0.0.1"} | ({host} if host not in EVERY else set())
     return [*(f"{name}:{port}" for name in sorted(names)), *more]
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("localhost", 0))
-        return int(probe.getsockname()[1])

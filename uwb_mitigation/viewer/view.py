@@ -57,6 +57,15 @@ class Player(Protocol):
 
 
 @dataclass(slots=True)
+class Missing:
+    """What the page says if it has no ranges, anchors or positions to show; empty = nothing."""
+
+    ranges: str = "No ranges received."
+    anchors: str = "No anchor positions."
+    positions: str = ""
+
+
+@dataclass(slots=True)
 class View:
     """What pages look at: a scene and the lock that its feed holds while it changes it.
 
@@ -65,6 +74,7 @@ class View:
         window: samples that the network reads.
         player: of a recording; None = live.
         parameters: shows whether there is a page of parameters to link to.
+        missing: the reasons for an empty page.
     """
 
     scene: Scene
@@ -73,4 +83,5 @@ class View:
     window: int = 157
     player: Player | None = None
     parameters: bool = False
+    missing: Missing = field(default_factory=Missing)
     drawing: Drawing = field(default_factory=Drawing)
