@@ -133,8 +133,8 @@ def calibrate(
     _show(found)
     if found.harms and not force:
         harm = DatasetError(
-            f"not written: on what was held out the model leaves {found.calibrated_mae_m:.3f} m, raw ranges "
-            f"{found.raw_mae_m:.3f} m",
+            f"not written: held-out ranges err by {found.calibrated_mae_m:.3f} m after calibration, by "
+            f"{found.raw_mae_m:.3f} m before" + "".join(f"; {note}" for note in found.notes[:1]),
             valid="a longer drive, or --force",
         )
         console.write_json(json, found.as_json() | {"refused": str(harm)})
@@ -218,6 +218,8 @@ def _show(found: Calibrated) -> None:
     console.out.print(table)
     for note in found.notes:
         _warn(note)
+    if found.outliers:
+        _warn(f"{found.outliers} outliers left out of all figures")
     console.out.print(found.sentence(), markup=False, highlight=False, soft_wrap=True)
 
 

@@ -28,6 +28,11 @@ UNDERSTATED = 1.5
 """By how much deviations are multiplied: errors of one place come again with each lap, and a track bends to what persists,
 which counting new ranges does not know. Of simulated drives, with it 9 of 10 offsets lie within two deviations."""
 
+SLOW_SD_M, SLOW_S = 0.05, 20.0
+"""Errors of a pair that stay the same for many seconds: reflections at one place, and the range bias of a DW1000, which
+changes by 0.1 m with the received power (Decawave APS011). Averaging does not reduce them. Where the geometry is weak, as
+outside of the anchors, they contribute most of the error of the common offset."""
+
 AROUND_M = 5.0
 """Keeps a place of which too few anchors are left from running away, and no other."""
 
@@ -270,7 +275,7 @@ class JointSolver:
             place,
             velocity,
             shared,
-            UNDERSTATED**2 * solution.shared_covariance,
+            self._covariance(solution, x, shared, scale),
             error,
             self._model.weight(z),
             scale,
@@ -278,6 +283,29 @@ class JointSolver:
             solution,
             self._height,
         )
+
+    def _covariance(
+        self,
+        solution: Solution,
+        x: NDArray[np.float64],
+        shared: NDArray[np.float64],
+        scale: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """The covariance of the parameters: of noise, and of errors that stay the same for `SLOW_S`."""
+        links = self._links
+        direction, _, error = self._errors(x, shared)
+        weight = self._model.weight(error / scale[links.alike]) * links.share / scale[links.alike] ** 2
+        rows = solution.reduced(links.knot, self._own(direction), links.rows)
+        gain = weight[:, None] * rows @ solution.shared_covariance
+        chunk = (links.time_s[links.knot] // SLOW_S).astype(np.intp)
+        group = np.stack([links.stretch, chunk, links.anchor])
+        _, of = np.unique(group, axis=1, return_inverse=True)
+        summed = np.zeros((int(of.max(initial=0)) + 1, len(shared)))
+        np.add.at(summed, of.reshape(-1), gain)
+        found: NDArray[np.float64] = (
+            UNDERSTATED**2 * solution.shared_covariance + SLOW_SD_M**2 * summed.T @ summed
+        )
+        return found
 
     @property
     def _level(self) -> float:
@@ -295,6 +323,11 @@ class JointSolver:
         distance = np.maximum(np.sqrt(np.einsum("ni,ni->n", away, away)), 0.05)
         return away / distance[:, None], distance, links.range_m - distance - links.rows @ shared
 
+    def _own(self, direction: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The derivative of each range with respect to the position and velocity of its knot, float64 (n, 2 d)."""
+        level = direction[:, : self._d]
+        return np.concatenate([level, self._links.ahead_s[:, None] * level], axis=1)
+
     def _linearised(
         self,
         x: NDArray[np.float64],
@@ -304,7 +337,7 @@ class JointSolver:
         weight: NDArray[np.float64],
     ) -> Chain:
         d, links = self._d, self._links
-        own = np.concatenate([direction[:, :d], links.ahead_s[:, None] * direction[:, :d]], axis=1)
+        own = self._own(direction)
         # The unknowns themselves are solved for, not their changes: motion and priors are linear in them.
         target = error + links.rows @ shared + np.einsum("nb,nb->n", own, x[links.knot])
         chain = Chain.empty(len(x), 2 * d, len(shared))

@@ -33,6 +33,9 @@ from uwb_mitigation.positioning.tracks import Ranges
 UNTOLD_M = 0.2
 """An offset that is known no better is as good as unknown: antenna delays that nobody calibrated differ by as much."""
 
+SEVERAL = 3.0
+"""An offset is subtracted only if it is at least this number of standard deviations away from zero."""
+
 MODEL = Model(long=1.5, short=1.5)
 """Of errors about as often too long as too short, once offsets and predictions are taken off: what is doubted sooner on
 one side than on the other would pull an offset to that other."""
@@ -99,8 +102,7 @@ class SelfCalibration:
 
     def pair(self, tag: int, row: int) -> tuple[float, float]:
         """The offset of a tag (its number) and an anchor (its row), m, and its standard deviation."""
-        wanted = {"offset", f"anchor {row}", f"tag {tag}", f"pair {tag} {row}"}
-        at = [i for i, name in enumerate(self.names) if name in wanted]
+        at = self._columns(tag, row)
         # How well anchors were measured bounds it: an anchor's misplacement looks like an offset, its mean over all
         # directions from which the tag saw it being about half of it in variance.
         placed = (
@@ -110,6 +112,39 @@ class SelfCalibration:
         )
         variance = self.fit.covariance[np.ix_(at, at)].sum() + placed + self.untold_m**2
         return float(self.fit.parameters[at].sum()), float(np.sqrt(variance))
+
+    def applied(self, tag: int, row: int) -> tuple[float, float]:
+        """The offset to subtract from the ranges of a tag and an anchor, m, and its standard deviation.
+
+        If the mean of all offsets is significant, it is the estimate. Otherwise only an offset that is significant by
+        itself is subtracted, and the others are 0.
+        """
+        value, sd = self.pair(tag, row)
+        if self.mean_is_significant or abs(value) >= SEVERAL * sd:
+            return value, sd
+        return 0.0, float(np.hypot(value, sd))
+
+    @property
+    def mean_is_significant(self) -> bool:
+        """Whether the mean offset of all pairs is `SEVERAL` standard deviations away from zero."""
+        value, sd = self.mean()
+        return abs(value) >= SEVERAL * sd
+
+    def mean(self) -> tuple[float, float]:
+        """The mean offset of all pairs, m, and its standard deviation."""
+        pairs = self.pairs()
+        rows = np.zeros((len(pairs), len(self.names)))
+        for number, (tag, row) in enumerate(pairs):
+            rows[number, self._columns(tag, row)] = 1.0
+        of_mean = rows.mean(axis=0)
+        placed = float(np.mean(self.anchors.sd**2)) / 2.0 / len(self.anchors)
+        variance = of_mean @ self.fit.covariance @ of_mean + placed + self.untold_m**2
+        return float(of_mean @ self.fit.parameters), float(np.sqrt(variance))
+
+    def _columns(self, tag: int, row: int) -> list[int]:
+        """The parameters that are added to the ranges of a tag and an anchor."""
+        wanted = {"offset", f"anchor {row}", f"tag {tag}", f"pair {tag} {row}"}
+        return [i for i, name in enumerate(self.names) if name in wanted]
 
     def pairs(self) -> list[tuple[int, int]]:
         """(tag number, anchor row) of all pairs that there are ranges of."""
@@ -180,17 +215,18 @@ def calibrate(
         fit = JointSolver(anchors, links, solved.parameters(links), model, height).fit(position)
     check_motion(links, fit, height)
     level = "one"
-    tried = candidates(found)
-    untold = 0.0
-    if float(np.sqrt(fit.covariance[0, 0])) > UNTOLD_M:
-        untold = float(np.sqrt(fit.covariance[0, 0]))
-        told.append("an offset of all: not told apart from where the tags were, and taken as 0")
-        # Without it nothing says how long any range truly is: offsets of their own would be its errors.
-        tried = []
-        solved = replace(solved, mean=np.array([0.0, *solved.mean[1:]]), sd=np.array([1e-4, *solved.sd[1:]]))
-        links = links_of(found, solved.rows, solved.alike, model)
-        start = np.array([0.0, *fit.parameters[1:]])
-        fit = JointSolver(anchors, links, solved.parameters(links), model, height).fit(fit.position, start)
+    tag_ids = tuple(one.tag_id for one in tags)
+
+    def result(untold_m: float) -> SelfCalibration:
+        no_truth = np.zeros(0)
+        return SelfCalibration(
+            found, links, fit, solved, level, tuple(told), tag_ids, anchors, no_truth, no_truth, untold_m, height, model
+        )  # fmt: skip
+
+    # Without the common offset the true ranges are unknown: own offsets would contain its error.
+    common_sd = float(np.sqrt(fit.covariance[0, 0]))
+    tried = candidates(found) if common_sd <= UNTOLD_M else []
+    shared_only = solved
     for group, columns in tried:
         richer, better, shared = with_own_offsets(anchors, found, solved, columns, fit, height, model)
         if richer is None or better is None:
@@ -206,20 +242,23 @@ def calibrate(
     fit = JointSolver(anchors, links, solved.parameters(links), model, height).fit(
         fit.position, fit.parameters
     )
+    untold = 0.0
+    trial = result(0.0)
+    if common_sd > UNTOLD_M or not any(trial.applied(*pair)[0] for pair in trial.pairs()):
+        value, sd = trial.mean()
+        untold, level = float(np.hypot(value, sd)), "one"
+        told.append(
+            f"the offset is not significant, so that no offset is subtracted: {value:.2f} m with a standard deviation of "
+            f"{sd:.2f} m. Drive between the anchors, not only past them"
+        )
+        solved = replace(
+            shared_only,
+            mean=np.array([0.0, *shared_only.mean[1:]]),
+            sd=np.array([1e-4, *shared_only.sd[1:]]),
+        )
+        links = links_of(found, solved.rows, solved.alike, model)
+        start = np.array([0.0, *fit.parameters[1 : len(solved.names)]])
+        fit = JointSolver(anchors, links, solved.parameters(links), model, height).fit(fit.position, start)
     check_contradiction(anchors, links, fit, height, model)
-    pseudo, sd = seen_by_others(anchors, found, links, fit, height, model)
-    return SelfCalibration(
-        found,
-        links,
-        fit,
-        solved,
-        level,
-        tuple(told),
-        tuple(one.tag_id for one in tags),
-        anchors,
-        pseudo,
-        sd,
-        untold,
-        height,
-        model,
-    )
+    pseudo, pseudo_sd = seen_by_others(anchors, found, links, fit, height, model)
+    return replace(result(untold), pseudo_m=pseudo, pseudo_sd_m=pseudo_sd)

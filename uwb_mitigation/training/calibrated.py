@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.dataset import Dataset
 from uwb_mitigation.errors import ModelError
+from uwb_mitigation.evaluation.preference import MUST_GAIN
 from uwb_mitigation.evaluation.site_data import SiteData
 from uwb_mitigation.evaluation.site_page import AnchorRow, OffsetRow, SitePage
 from uwb_mitigation.files import write_together
@@ -38,6 +39,9 @@ class Calibrated:
         line: the same of the received power, m/dB.
         localised: what `truth` needed.
         places: {tag id: position} of tags at rest; {`tag id #number`: position} of each place of one that was at several.
+        outliers: the number of ranges that were left out of all figures because their errors are implausible.
+        common_sd_m: the standard deviation of the mean offset, which the evaluation has in common with the offsets; 0 with
+            ground truth.
     """
 
     site: SiteData
@@ -55,6 +59,8 @@ class Calibrated:
     line: tuple[float, float]
     localised: Localised | None
     places: dict[str, tuple[float, float, float]]
+    outliers: int
+    common_sd_m: float
 
     @property
     def raw_mae_m(self) -> float:
@@ -68,16 +74,36 @@ class Calibrated:
 
     @property
     def harms(self) -> bool:
-        return self.calibrated_mae_m >= self.raw_mae_m
+        """Whether the held-out error is not lower than the raw one by `MUST_GAIN`."""
+        return self.calibrated_mae_m > (1.0 - MUST_GAIN) * self.raw_mae_m
+
+    @property
+    def sure_gain(self) -> float:
+        """The share by which the held-out error is lower at least, if the mean offset is wrong by two standard deviations.
+
+        Without ground truth the held-out ranges are compared with a track that contains the error of the mean offset.
+        """
+        left = self.choice.held_out[self.choice.chosen]
+        by = (-2.0 * self.common_sd_m, 0.0, 2.0 * self.common_sd_m)
+        return min(
+            1.0 - float(np.abs(left + wrong).mean() / max(np.abs(self.raw_m + wrong).mean(), 1e-9))
+            for wrong in by
+        )
 
     def sentence(self) -> str:
-        """What it should bring, for people."""
-        less = 1.0 - self.calibrated_mae_m / self.raw_mae_m
-        truth = "where the other anchors see the tag" if self.truth is None else "the localisation"
-        how = f"Ranges here err by {self.raw_mae_m:.3f} m on the mean against {truth}"
+        """The result in one sentence."""
+        errors = (
+            f"{self.raw_mae_m:.3f} m raw, {self.calibrated_mae_m:.3f} m calibrated ({self.choice.chosen})"
+        )
+        if self.truth is not None:
+            what = f"Held-out range errors against {self.truth}: {errors}"
+        else:
+            what = f"Held-out range residuals against the other anchors (not ground truth): {errors}"
         if self.harms:
-            return f"{how}; the model makes that no better ({self.calibrated_mae_m:.3f} m)."
-        return f"{how}; with this model it should be {self.calibrated_mae_m:.3f} m, {less:.0%} less ({self.choice.chosen})."
+            return f"{what}: no gain."
+        if (gain := self.sure_gain) <= 0.0:
+            return f"{what}. The gain is smaller than its uncertainty."
+        return f"{what}: at least {gain:.0%} less."
 
     def as_json(self) -> dict[str, object]:
         """The result of `uwb-mitigation calibrate`."""
@@ -94,6 +120,7 @@ class Calibrated:
             "candidates": self.choice.mae(),
             "ranges": sum(map(len, self.site.tags)),
             "labelled": len(self.data),
+            "outliers": self.outliers,
             "network_factor": list(self.network),
             "line": {
                 "offset_m": prior.offset_m,

@@ -18,6 +18,7 @@ from uwb_mitigation.model.float_networks import float_network
 from uwb_mitigation.offsets import MAX_OFFSET_M, Offsets
 from uwb_mitigation.positioning.localised import PosePath, solve_localised
 from uwb_mitigation.positioning.regressors import NETWORK_SD, SLOPE_SD, Regressors
+from uwb_mitigation.positioning.scatter import MAD_TO_SD
 from uwb_mitigation.positioning.self_calibration import SelfCalibration, calibrate
 from uwb_mitigation.positioning.start import Area, Height
 from uwb_mitigation.training import site_model
@@ -27,6 +28,9 @@ UNSURE_M = 0.25
 """Ranges whose pseudo-truth has a larger deviation are left out."""
 
 LEAST_LABELLED = 40
+OUTLIER_M, OUTLIER_SDS = 3.0, 10.0
+"""A range is an outlier if its error is further than both from the median error."""
+
 KINDS = 8
 """Of ranges, by how much the network corrects them: as many of each."""
 
@@ -58,14 +62,15 @@ def without_truth(
     on_progress("solving for track and offsets", 0.4)
     of_range = site.begins[found.stretches.tag] + found.stretches.row
     known = np.isfinite(found.pseudo_m) & (found.pseudo_sd_m <= UNSURE_M)
+    known, outliers = _without_outliers(found.stretches.ranges.range_m - found.pseudo_m, known)
     notes = list(found.not_told)
-    if (unsure := int((~known).sum())) > 0:
+    if (unsure := int((~known).sum()) - outliers) > 0:
         notes.append(
             f"{unsure} of {len(known)} ranges left out of the fit: the other anchors tell too little of where the tag was"
         )
     _check_labelled(int(known.sum()))
     ids = [anchor.id for anchor in site.anchors.anchors]
-    pair_m = {(found.tag_ids[tag], ids[row]): found.pair(tag, row) for tag, row in found.pairs()}
+    pair_m = {(found.tag_ids[tag], ids[row]): found.applied(tag, row) for tag, row in found.pairs()}
     _check_offsets(pair_m)
     offsets = _offsets(found, ids, pair_m)
     data, raw = _labelled(
@@ -84,6 +89,7 @@ def without_truth(
         grown = {
             (found.tag_ids[tag], ids[row]): again.pair(tag, row)[0] - found.pair(tag, row)[0]
             for tag, row in found.pairs()
+            if found.applied(tag, row)[0] != 0.0
         }
         return _of_rows(data, grown)
 
@@ -111,6 +117,8 @@ def without_truth(
         found.value(LEVEL),
         None,
         _places(found),
+        outliers,
+        found.mean()[1],
     )
 
 
@@ -138,7 +146,10 @@ def with_truth(
         lever_arm_m=lever_arm_m,
     )
     on_progress("time offset and lever arm", 0.3)
-    rows = np.flatnonzero(np.isfinite(found.distance_m))
+    value = np.concatenate([one.range_m for one in site.tags])
+    error = value - found.distance_m
+    kept, outliers = _without_outliers(error, np.isfinite(error))
+    rows = np.flatnonzero(kept)
     _check_labelled(len(rows))
     ids = [anchor.id for anchor in site.anchors.anchors]
     pair_m = {
@@ -196,6 +207,8 @@ def with_truth(
         (0.0, 0.0),
         found,
         {},
+        outliers,
+        0.0,
     )
 
 
@@ -218,12 +231,11 @@ def regressors(site: SiteData, source: Bundle) -> Regressors:
 def _offsets(
     found: SelfCalibration, ids: list[int], pair_m: dict[tuple[int, int], tuple[float, float]]
 ) -> Offsets:
-    common = found.value("offset")[0]
+    common = found.mean()[0] if found.mean_is_significant else 0.0
     if found.level == "pair":
         return _of_pairs(common, pair_m)
     if found.level == "anchor":
-        own = {ids[row]: common + found.value(f"anchor {row}")[0] for _, row in found.pairs()}
-        return Offsets(common, anchors=own)
+        return Offsets(common, anchors={ids[row]: found.applied(tag, row)[0] for tag, row in found.pairs()})
     return Offsets(common)
 
 
@@ -263,6 +275,18 @@ def _labelled(
     assert nothing.anchors is not None
     off = offsets.of_columns(nothing.tags, nothing.anchors).astype(np.float64)
     return replace(nothing, range_m=nothing.range_m - off, error_m=nothing.error_m - off), nothing.error_m
+
+
+def _without_outliers(
+    error_m: NDArray[np.float64], known: NDArray[np.bool_]
+) -> tuple[NDArray[np.bool_], int]:
+    """Which of the `known` errors are no outliers, bool (n,), and the number of outliers."""
+    if not known.any():
+        return known, 0
+    away = np.abs(error_m - np.median(error_m[known]))
+    limit = max(OUTLIER_M, OUTLIER_SDS * MAD_TO_SD * float(np.median(away[known])))
+    kept = known & (away <= limit)
+    return kept, int(known.sum() - kept.sum())
 
 
 def _whole_stretch(
