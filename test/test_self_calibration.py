@@ -259,10 +259,48 @@ def test_a_track_with_two_mirror_images_is_refused():
     refused("mirror images", HALL.moved(flat, HALL.sd), [ranges])
 
 
-def test_an_anchor_that_contradicts_the_others_is_named(minute):
+@pytest.mark.parametrize(("row", "by"), [(3, (3.0, -2.5, 0.0)), (3, (1.5, 0.0, 0.0)), (4, (1.5, 0.0, 0.0))])
+def test_an_anchor_that_was_moved_is_named_by_its_id(minute, row, by):
     wrong = HALL.position.copy()
-    wrong[3] += (3.0, -2.5, 0.0)
-    refused("anchor 4 contradicts", HALL.moved(wrong, HALL.sd), [minute[0]], height=LEVEL)
+    wrong[row] += by
+    refused(f"anchor {row + 1} contradicts", HALL.moved(wrong, HALL.sd), [minute[0]], height=LEVEL)
+
+
+def test_two_swapped_opposite_anchors_are_named(minute):
+    order = [2, 1, 0, 3, 4]
+    refused(
+        "anchors 1 and 3 contradict", HALL.moved(HALL.position[order], HALL.sd), [minute[0]], height=LEVEL
+    )
+
+
+def test_a_long_tail_accuses_no_anchor(minute):
+    """A body between tag and anchor makes 40 % of the ranges of two anchors long."""
+    ranges, _ = minute
+    rng = np.random.default_rng(4)
+    blocked = np.isin(ranges.anchor, (1, 3)) & (rng.random(len(ranges)) < 0.4)
+    tail = np.where(blocked, rng.exponential(0.6, len(ranges)), 0.0)
+    calibrate(HALL, [replace(ranges, range_m=ranges.range_m + tail)], height=LEVEL)
+
+
+def outside(seed):
+    """A drive around five anchors that are close together; errors change slowly, as reflections do."""
+    near = HALL.moved(HALL.position * (0.25, 0.25, 1.0) + (4.5, 3.5, 0.0), HALL.sd)
+    ranges, _ = drive(
+        near, seconds=90, rate_hz=25.0, seed=seed, offset_m=0.0, path=lambda t: circuit(t) * (2.0, 2.0, 1.0)
+    )
+    phase = np.random.default_rng(seed).uniform(0, 2 * np.pi, 5)
+    slow = 0.05 * np.sin(2 * np.pi * ranges.stamp_ns / 30e9 + phase[ranges.anchor])
+    return near, replace(ranges, range_m=ranges.range_m + slow)
+
+
+def test_an_offset_that_slow_errors_can_explain_is_not_subtracted():
+    """Outside of the anchors, 0.05 m of slow error moves the estimate of the offset by decimetres."""
+    for seed in (2, 3):
+        near, ranges = outside(seed)
+        found = calibrate(near, [ranges], height=LEVEL)
+        assert [found.applied(0, row)[0] for row in range(5)] == [0.0] * 5
+        assert found.applied(0, 0)[1] > 0.05
+        assert any("not significant" in note for note in found.not_told)
 
 
 def test_lag_and_lever_arm_are_found_beside_a_localisation(minute):

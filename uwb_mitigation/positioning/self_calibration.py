@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError
+from uwb_mitigation.positioning.anchor_errors import check_anchor_positions
 from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.joint import JointFit, JointSolver, Links, links_of
 from uwb_mitigation.positioning.model import Model
 from uwb_mitigation.positioning.observability import (
     check_anchors,
-    check_contradiction,
     check_motion,
     mirrored,
 )
@@ -234,7 +234,8 @@ def calibrate(
             break
         solved, fit, level = richer, better, "pair" if group != "anchor" else "anchor"
         if shared:
-            told.append(f"{', '.join(shared)}: not told apart from the others, whose offset counts")
+            names = ", ".join(_with_ids(name, anchors, tags) for name in shared)
+            told.append(f"{names}: their own offsets are not significant, so that they get the common offset")
     if level == "anchor" and len(np.unique(found.tag)) == 1:
         # Of one tag an anchor's offset is the pair's.
         level = "pair"
@@ -242,6 +243,7 @@ def calibrate(
     fit = JointSolver(anchors, links, solved.parameters(links), model, height).fit(
         fit.position, fit.parameters
     )
+    check_anchor_positions(anchors, tags, found, solved, links, fit, height, area, model)
     untold = 0.0
     trial = result(0.0)
     if common_sd > UNTOLD_M or not any(trial.applied(*pair)[0] for pair in trial.pairs()):
@@ -259,6 +261,15 @@ def calibrate(
         links = links_of(found, solved.rows, solved.alike, model)
         start = np.array([0.0, *fit.parameters[1 : len(solved.names)]])
         fit = JointSolver(anchors, links, solved.parameters(links), model, height).fit(fit.position, start)
-    check_contradiction(anchors, links, fit, height, model)
     pseudo, pseudo_sd = seen_by_others(anchors, found, links, fit, height, model)
     return replace(result(untold), pseudo_m=pseudo, pseudo_sd_m=pseudo_sd)
+
+
+def _with_ids(name: str, anchors: AnchorMap, tags: Sequence[Ranges]) -> str:
+    """The name of an own offset, with the ids of tag and anchor in place of their numbers."""
+    kind, *numbers = name.split()
+    if kind == "anchor":
+        return f"anchor {anchors.anchors[int(numbers[0])]}"
+    if kind == "tag":
+        return f"tag {tags[int(numbers[0])].tag_id}"
+    return f"tag {tags[int(numbers[0])].tag_id} and anchor {anchors.anchors[int(numbers[1])]}"

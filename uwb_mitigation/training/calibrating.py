@@ -15,7 +15,7 @@ from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.evaluation.site_data import SiteData
 from uwb_mitigation.model.bundle import Bundle
 from uwb_mitigation.model.float_networks import float_network
-from uwb_mitigation.offsets import MAX_OFFSET_M, Offsets
+from uwb_mitigation.offsets import Offsets
 from uwb_mitigation.positioning.localised import PosePath, solve_localised
 from uwb_mitigation.positioning.regressors import NETWORK_SD, SLOPE_SD, Regressors
 from uwb_mitigation.positioning.scatter import MAD_TO_SD
@@ -28,6 +28,9 @@ UNSURE_M = 0.25
 """Ranges whose pseudo-truth has a larger deviation are left out."""
 
 LEAST_LABELLED = 40
+MOST_OFFSET_M = 1.0
+"""Radios of one kind without individual antenna delays differ by 0.3 m at three sigma (Decawave APS014)."""
+
 OUTLIER_M, OUTLIER_SDS = 3.0, 10.0
 """A range is an outlier if its error is further than both from the median error."""
 
@@ -322,9 +325,17 @@ def _check_labelled(count: int) -> None:
 
 
 def _check_offsets(pair_m: dict[tuple[int, int], tuple[float, float]]) -> None:
+    median = float(np.median([value for value, _ in pair_m.values()]))
     for (tag, anchor), (value, _) in pair_m.items():
-        if not abs(value) <= MAX_OFFSET_M:
+        what = f"an offset of {value:.2f} m of tag {tag} and anchor {anchor}"
+        if abs(value - median) > MOST_OFFSET_M:
             raise DatasetError(
-                f"an offset of {value:.1f} m, of tag {tag} and anchor {anchor}",
-                valid=f"at most {MAX_OFFSET_M:g} m: is the antenna delay set (`uwb-mitigation antenna-delay`)?",
+                f"{what}; the median of all pairs is {median:.2f} m",
+                valid=f"the true position of anchor {anchor} in the anchors file; radios of one kind differ by less than "
+                f"{MOST_OFFSET_M:g} m",
+            )
+        if abs(value) > MOST_OFFSET_M:
+            raise DatasetError(
+                what,
+                valid=f"{MOST_OFFSET_M:g} m at most: set the antenna delay first (`uwb-mitigation antenna-delay`)",
             )
