@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.bag.poses import POSITION_TYPES
-from uwb_mitigation.bag.topics import TF_STATIC, TF_TYPE
+from uwb_mitigation.bag.topics import ODOMETRY_TYPE, POSE_TYPE, RANGE_SENSOR_TYPE, TF_STATIC, TF_TYPE
 from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.positioning.localised import PosePath
+from uwb_mitigation.positioning.tracks import Heights
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
     from uwb_mitigation.bag.index import Channel, RawMessage
 
 MOST_POSES = 2_000_000
+HEIGHT_TYPES = (RANGE_SENSOR_TYPE, ODOMETRY_TYPE, POSE_TYPE)
+_READABLE_TYPES = tuple(dict.fromkeys((*POSITION_TYPES, TF_TYPE, *HEIGHT_TYPES)))
 _MOST_FRAMES = 64
 _NANOSECONDS = 1_000_000_000
 _Row = tuple[int, float, float, float, float, float, float, float]
@@ -42,15 +45,7 @@ def read_poses(path: Path, topic: str, frames: tuple[str, str] | None = None) ->
 
     bag = BagReader(path)
     where = f"{path}, topic {topic}"
-    if topic not in bag.topics:
-        known = ", ".join(
-            f"{name} ({kind})"
-            for name, kind in sorted(bag.topics.items())
-            if kind in (*POSITION_TYPES, TF_TYPE)
-        )
-        raise RecordingError(
-            f"no topic {topic}", where=str(path), valid=f"one with poses: {known or 'there is none'}"
-        )
+    _check_topic(path, bag.topics, topic, (*POSITION_TYPES, TF_TYPE))
     decode = _Decoder(where)
     if bag.topics[topic] == TF_TYPE:
         if frames is None:
@@ -74,6 +69,55 @@ def read_poses(path: Path, topic: str, frames: tuple[str, str] | None = None) ->
         if row is not None:
             rows.append(row)
     return _path(rows, where)
+
+
+def read_heights(path: Path, topic: str, sd_m: float = 0.1) -> Heights:
+    """Read a tag's height from a topic of one of the `HEIGHT_TYPES`.
+
+    A `sensor_msgs/Range` is the height above z = 0; of the other types the z coordinate counts.
+
+    Args:
+        path: The bag.
+        topic: The topic.
+        sd_m: Standard deviation where the message has no variance.
+
+    Raises:
+        RecordingError: The bag cannot be read, has no such topic, or the topic contains no valid height.
+    """
+    from uwb_mitigation.bag.reader import BagReader
+
+    bag = BagReader(path)
+    where = f"{path}, topic {topic}"
+    _check_topic(path, bag.topics, topic, HEIGHT_TYPES)
+    decode = _Decoder(where)
+    rows: dict[int, tuple[float, float]] = {}
+    for message in bag.messages([topic]):
+        decoded = decode(message)
+        if bag.topics[topic] == RANGE_SENSOR_TYPE:
+            height, variance = float(decoded.range), float(getattr(decoded, "variance", 0.0))
+            valid = decoded.min_range <= height <= decoded.max_range
+        else:
+            height, variance = float(decoded.pose.pose.position.z), float(decoded.pose.covariance[14])
+            valid = True
+        if valid and math.isfinite(height):
+            stamp = decoded.header.stamp
+            known = math.isfinite(variance) and variance > 0.0
+            rows[stamp.sec * _NANOSECONDS + stamp.nanosec] = height, variance if known else sd_m**2
+    if not rows:
+        raise RecordingError("no valid height", where=where, valid="finite heights within the sensor's range")
+    stamps = sorted(rows)
+    values = np.array([rows[stamp] for stamp in stamps])
+    return Heights(np.array(stamps, np.int64), values[:, 0], values[:, 1])
+
+
+def _check_topic(path: Path, topics: dict[str, str], topic: str, types: tuple[str, ...]) -> None:
+    """Raise RecordingError unless the topic exists and has one of the types."""
+    if topics.get(topic) in types:
+        return
+    usable = [f"{name} ({kind})" for name, kind in sorted(topics.items()) if kind in types]
+    what = f"topic {topic} has the type {topics[topic]}" if topic in topics else f"no topic {topic}"
+    valid = ", ".join(usable) or f"a topic of type {', '.join(types)}; the bag has none"
+    raise RecordingError(what, where=str(path), valid=valid)
 
 
 class _Decoder:
@@ -103,9 +147,9 @@ class _Decoder:
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
         name = channel.schema.name if channel.schema is not None else ""
-        if channel.schema is None or name not in (*POSITION_TYPES, TF_TYPE):
+        if channel.schema is None or name not in _READABLE_TYPES:
             raise RecordingError(
-                f"messages of type {name!r}", where=self._where, valid=", ".join((*POSITION_TYPES, TF_TYPE))
+                f"messages of type {name!r}", where=self._where, valid=", ".join(_READABLE_TYPES)
             )
         store = get_typestore(Stores.EMPTY)
         try:
