@@ -115,6 +115,7 @@ def test_a_localisation_that_lags_tells_the_truth(site):
         "o.json",
         "--truth-topic",
         "/odom",
+        "--estimate-lever-arm",
         folder=site,
     )
     assert done.returncode == 0, done.stderr
@@ -141,7 +142,7 @@ def test_offsets_are_found_without_the_stretches_that_are_held_out(site, truth, 
 
     choose = site_model.choose
     monkeypatch.setattr(calibrating.site_model, "choose", look)
-    options = ("--truth-topic", truth) if truth else ()
+    options = ("--truth-topic", truth, "--estimate-lever-arm") if truth else ()
     done = run("calibrate", "drive.mcap", *LEVEL, "-o", "w.onnx", "--force", *options, folder=site)
     assert done.returncode == 0, done.stderr
     ((nothing, without, own),) = told
@@ -162,7 +163,7 @@ def test_of_a_stretch_that_is_held_out_ranges_of_unknown_truth_are_too():
 
 def test_a_localisation_needs_few_ranges_beside_it(site):
     done = run(
-        "calibrate", "few.mcap", *LEVEL, "-o", "few.onnx", "--json", "f.json", "--truth-topic", "/odom", "--force",
+        "calibrate", "few.mcap", *LEVEL, "-o", "few.onnx", "--json", "f.json", "--truth-topic", "/odom", "--estimate-lever-arm", "--force",
         folder=site,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr

@@ -321,21 +321,21 @@ def test_lag_and_lever_arm_are_found_beside_a_localisation(minute):
     quaternion = np.stack([zero, zero, np.sin(heading / 2), np.cos(heading / 2)], axis=1)
     late = PosePath(ranges.stamp_ns + 300_000_000, path.position - turned, quaternion)
     nothing = Regressors.none(len(ranges))
-    found = solve_localised(HALL, [with_own(ranges)], late, nothing)
+    found = solve_localised(HALL, [with_own(ranges)], [late], nothing, estimate_lever_arm=True)
     assert found.time_offset_s == pytest.approx(0.3, abs=0.02)
-    assert np.abs(found.lever_arm_m - lever)[:2].max() < 0.05
+    assert np.abs(found.lever_arm_m[0] - lever)[:2].max() < 0.05
     assert np.abs(found.offset_m - 0.25 - OWN).max() < 0.08
-    given = solve_localised(HALL, [ranges], late, nothing, time_offset_s=0.3, lever_arm_m=(0.3, -0.25, 0.0))
+    given = solve_localised(HALL, [ranges], [late], nothing, time_offset_s=0.3, lever_arms_m=lever[None])
     assert (given.time_offset_s, given.time_offset_sd_s) == (pytest.approx(0.3, abs=1e-6), 0.0)
     with pytest.raises(DatasetError, match="localisation's times"):
-        solve_localised(HALL, [ranges], late.shifted(10**13), nothing)
+        solve_localised(HALL, [ranges], [late.shifted(10**13)], nothing)
     # As they are left when stretches of a short recording are held out.
     part = np.arange(20, 620, 20)
-    few = [ranges.take(part)], late, Regressors.none(len(part))
-    alone = solve_localised(HALL, *few, time_offset_s=0.3, lever_arm_m=(0.3, -0.25, 0.0))
+    few = [ranges.take(part)], [late], Regressors.none(len(part))
+    alone = solve_localised(HALL, *few, time_offset_s=0.3, lever_arms_m=lever[None])
     assert np.abs(alone.offset_m - 0.25).max() < 0.15
     with pytest.raises(DatasetError, match=r"30 ranges .*40 or more"):
-        solve_localised(HALL, *few, time_offset_s=0.3)
+        solve_localised(HALL, *few, time_offset_s=0.3, estimate_lever_arm=True)
 
 
 @pytest.mark.parametrize("told", [1, 6])

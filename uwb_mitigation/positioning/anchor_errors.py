@@ -124,6 +124,7 @@ def _displaced(
     try:
         for _ in range(_STEPS):
             away = position[links.knot] - moved.position[links.anchor]
+            away[:, 2] += links.rise
             unit = away / np.maximum(np.linalg.norm(away, axis=1), 0.05)[:, None]
             rows = np.concatenate([parameters.rows, -unit[:, axes] * own[:, None]], axis=1)
             shift = moved.position[row, axes] - anchors.position[row, axes]
@@ -160,7 +161,14 @@ def _swapped(
 ) -> tuple[int, int] | None:
     """The pair of anchors that explains the ranges best if swapped; None: no pair does so much better."""
     part = np.arange(min(len(found.ranges), _MOST_RANGES))
-    few = Stretches(found.ranges.take(part), found.tag[part], found.row[part], found.of[part], found.at_rest)
+    few = Stretches(
+        found.ranges.take(part),
+        found.tag[part],
+        found.row[part],
+        found.of[part],
+        found.at_rest,
+        found.rise[part],
+    )
     few = few.keep(np.isin(np.arange(len(found)), few.of))
     columns = solved.take(np.isin(np.arange(len(found.ranges)), part))
     expected = columns.rows @ solved.mean

@@ -55,6 +55,7 @@ class Links:
         knot, anchor: int (n,), where each belongs; knots of one stretch stand together.
         ahead_s: float64 (n,), its time after the knot's.
         range_m, share: float64 (n,), and how much of a new range each is.
+        rise: float64 (n,), the height of the tag above the common one.
         rows: float64 (n, q), of the parameters.
         alike: int (n,), links that err about as much have the same number, from 0.
         of: int (n,), the link of each of the original ranges (r,).
@@ -66,6 +67,7 @@ class Links:
     ahead_s: NDArray[np.float64]
     range_m: NDArray[np.float64]
     share: NDArray[np.float64]
+    rise: NDArray[np.float64]
     rows: NDArray[np.float64]
     alike: NDArray[np.intp]
     of: NDArray[np.intp]
@@ -84,7 +86,7 @@ class Links:
     def without(self, left_out: NDArray[np.bool_]) -> Links:
         """The same knots, without those links (n,); `of` says nothing any more."""
         kept = ~left_out
-        columns = ("knot", "anchor", "ahead_s", "range_m", "share", "rows", "alike")
+        columns = ("knot", "anchor", "ahead_s", "range_m", "share", "rise", "rows", "alike")
         return replace(self, **{name: getattr(self, name)[kept] for name in columns})
 
 
@@ -119,11 +121,13 @@ def links_of(stretches: Stretches, rows: NDArray[np.float64], alike: NDArray[np.
     )
     _, first, of = np.unique(key, return_index=True, return_inverse=True)
     value, shared, kind = ranges.range_m[first].copy(), rows[first].copy(), alike[first].copy()
+    rise = stretches.rise[first].copy()
     order = np.argsort(of, kind="stable")
     groups = np.split(order, np.searchsorted(of[order], np.arange(1, len(first))))
     for link, group in enumerate(groups):
         if len(group) > 1:
             value[link] = np.median(ranges.range_m[group])
+            rise[link] = np.median(stretches.rise[group])
             shared[link] = np.median(rows[group], axis=0)
             kind[link] = int(np.median(alike[group]))
     return Links(
@@ -132,6 +136,7 @@ def links_of(stretches: Stretches, rows: NDArray[np.float64], alike: NDArray[np.
         ahead[first],
         value,
         share[first],
+        rise,
         shared,
         kind,
         of,
@@ -319,6 +324,7 @@ class JointSolver:
         at = x[links.knot]
         tag = np.full((len(at), 3), self._level)
         tag[:, :d] = at[:, :d] + links.ahead_s[:, None] * at[:, d:]
+        tag[:, 2] += links.rise
         away = tag - self._anchors.position[links.anchor]
         distance = np.maximum(np.sqrt(np.einsum("ni,ni->n", away, away)), 0.05)
         return away / distance[:, None], distance, links.range_m - distance - links.rows @ shared

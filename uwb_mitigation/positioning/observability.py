@@ -22,11 +22,14 @@ MIRRORED = 4.5
 """Mirror images are as good where one is not less likely than the other by e^-4.5."""
 
 
-def check_anchors(anchors: AnchorMap, used: NDArray[np.intp], height: Height | None) -> None:
+def check_anchors(
+    anchors: AnchorMap, used: NDArray[np.intp], height: Height | None, area: Area | None = None
+) -> None:
     """Refuse anchors that cannot tell.
 
     Args:
         used: rows of those that were heard.
+        area: where tags can be; it can exclude the mirror image of a track at a plane of anchors.
 
     Raises:
         DatasetError: too few, or all on a line (without a height: in a plane).
@@ -43,10 +46,10 @@ def check_anchors(anchors: AnchorMap, used: NDArray[np.intp], height: Height | N
     kind = shape(position)
     if kind in (Shape.POINT, Shape.LINE):
         raise DatasetError("the anchors are all on a line", valid="one or more beside it")
-    if height is None and kind is Shape.PLANE:
+    if height is None and area is None and kind is Shape.PLANE:
         raise DatasetError(
             "the anchors are all in a plane: mirrored at it, the track explains the ranges as well",
-            valid="--height of the tag, or an anchor above or below that plane",
+            valid="--height of the tag, --area on one side of the plane, or an anchor above or below that plane",
         )
 
 

@@ -60,6 +60,7 @@ def seen_by_others(
         away = (
             seen.position[knot] + ahead[:, None] * seen.velocity[knot] - anchors.position[links.anchor[own]]
         )
+        away[:, 2] += links.rise[own]
         length = np.maximum(np.linalg.norm(away, axis=1), 0.05)
         unit = away / length[:, None]
         known = np.sqrt(np.einsum("ni,nij,nj->n", unit, covariance[knot], unit))

@@ -36,6 +36,9 @@ UNTOLD_M = 0.2
 SEVERAL = 3.0
 """An offset is subtracted only if it is at least this number of standard deviations away from zero."""
 
+HEIGHT_SD_M = 0.1
+"""Of a measured height."""
+
 MODEL = Model(long=1.5, short=1.5)
 """Of errors about as often too long as too short, once offsets and predictions are taken off: what is doubted sooner on
 one side than on the other would pull an offset to that other."""
@@ -159,6 +162,7 @@ def calibrate(
     *,
     height: Height | None = None,
     area: Area | None = None,
+    heights_m: NDArray[np.float64] | None = None,
     model: Model | None = None,
 ) -> SelfCalibration:
     """Solve for all of it.
@@ -168,19 +172,25 @@ def calibrate(
         tags: what was recorded of each, of unknown places; each in the order of time.
         regressors: as many rows as there are ranges.
         height: of all tags, where it stays the same. area: where tags can be.
+        heights_m: float64 (r,), the measured height at each range, in place of `height`.
 
     Raises:
         DatasetError: geometry does not tell; says what is missing.
     """
     model = model or MODEL
     tags = list(tags)
+    if heights_m is not None:
+        # Positions to start from are found with the median height, and only these.
+        height = Height(float(np.median(heights_m)), max(float(np.std(heights_m)), HEIGHT_SD_M))
     known = regressors or Regressors.none(sum(map(len, tags)))
-    check_anchors(anchors, np.unique(np.concatenate([one.anchor for one in tags])), height)
+    check_anchors(anchors, np.unique(np.concatenate([one.anchor for one in tags])), height, area)
     told: list[str] = []
     found = stretches(tags, anchors, height, model)
     begins = np.cumsum([0, *map(len, tags)])
     of_range = begins[found.tag] + found.row
     rows, alike = known.rows[of_range], known.alike[of_range]
+    if heights_m is not None and height is not None:
+        found = replace(found, rise=heights_m[of_range] - height.value)
     expected = rows @ known.mean
     offset = likely_offset(anchors, found, expected, height, area, model)
     position, placed = first_positions(anchors, tags, found, expected + offset, height, area, model)

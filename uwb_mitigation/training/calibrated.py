@@ -35,7 +35,8 @@ class Calibrated:
         choice: the model.
         notes: what was not told apart, or left out, in words.
         track: float64 (k, 3), where the tags were at `track_of` (k,), the stretches; for a picture.
-        network: the factor of the universal network's predictions and its deviation; (0, 0) = not solved for.
+        network: the factor by which the bundle multiplies the universal network's predictions (0: no network; 1: of a
+            fine-tuned network), and the standard deviation of the factor in the joint solution (0: given).
         line: the same of the received power, m/dB.
         localised: what `truth` needed.
         places: {tag id: position} of tags at rest; {`tag id #number`: position} of each place of one that was at several.
@@ -182,7 +183,7 @@ def shown(result: Calibrated, name: str) -> SitePage:
     facts = []
     if result.localised is not None:
         told = result.localised
-        arm = ", ".join(f"{value:.3f}" for value in told.lever_arm_m)
+        arm = "; ".join(", ".join(f"{value:.3f}" for value in own) for own in told.lever_arm_m)
         facts.append(
             f"Localisation {result.truth}: time offset {told.time_offset_s:.3f} s, lever arm {arm} m."
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -61,16 +61,19 @@ def without_truth(
         DatasetError: geometry does not tell; says what is missing.
     """
     on_progress("solving for track and offsets", 0.05)
-    found = calibrate(site.anchors, site.tags, regressors(site, source), height=height, area=area)
+    found = calibrate(
+        site.anchors, site.tags, regressors(site, source), height=height, area=area, heights_m=site.height_m
+    )
     on_progress("solving for track and offsets", 0.4)
     of_range = site.begins[found.stretches.tag] + found.stretches.row
     known = np.isfinite(found.pseudo_m) & (found.pseudo_sd_m <= UNSURE_M)
     known, outliers = _without_outliers(found.stretches.ranges.range_m - found.pseudo_m, known)
-    notes = list(found.not_told)
+    notes = [*found.not_told, *_without_cir(site)]
     if (unsure := int((~known).sum()) - outliers) > 0:
         notes.append(
             f"{unsure} of {len(known)} ranges left out of the fit: the other anchors tell too little of where the tag was"
         )
+    known &= _fits_model(site)[of_range]
     _check_labelled(int(known.sum()))
     ids = [anchor.id for anchor in site.anchors.anchors]
     pair_m = {(found.tag_ids[tag], ids[row]): found.applied(tag, row) for tag, row in found.pairs()}
@@ -84,7 +87,6 @@ def without_truth(
         found.stretches.of[known],
         found.stretches.at_rest,
     )
-    network = found.value(NETWORK)
     used = np.flatnonzero(known)
 
     def offsets_without(held_out: NDArray[np.intp]) -> NDArray[np.float64]:
@@ -116,7 +118,7 @@ def without_truth(
         (*notes, *choice.notes),
         found.fit.position,
         found.links.knot_stretch,
-        network,
+        (choice.factor, found.value(NETWORK)[1]),
         found.value(LEVEL),
         None,
         _places(found),
@@ -128,39 +130,55 @@ def without_truth(
 def with_truth(
     site: SiteData,
     source: Bundle,
-    paths: list[PosePath],
+    paths: Sequence[Sequence[PosePath]],
     topic: str,
     *,
     time_offset_s: float | None,
-    lever_arm_m: tuple[float, float, float] | None,
+    lever_arms_m: NDArray[np.float64] | None = None,
+    estimate_lever_arm: bool = False,
     seed: int,
     on_progress: Progress = lambda what, share: None,
 ) -> Calibrated:
-    """Calibrate against a localisation's poses, of which `paths` are one a recording; the rest as `without_truth`."""
+    """Calibrate against the poses of a localisation.
+
+    Args:
+        paths: for each tag, the poses of the robot that carries it, for each recording.
+        time_offset_s, lever_arms_m, estimate_lever_arm: as of `solve_localised`. The others as of `without_truth`.
+    """
     on_progress("time offset and lever arm", 0.05)
-    path = PosePath.joined([one.shifted(by) for one, by in zip(paths, site.shift_ns, strict=True)])
+    joined = [
+        PosePath.joined([one.shifted(by) for one, by in zip(own, site.shift_ns, strict=True)])
+        for own in paths
+    ]
     known = regressors(site, source)
     found = solve_localised(
         site.anchors,
         site.tags,
-        path,
+        joined,
         known,
         time_offset_s=time_offset_s,
-        lever_arm_m=lever_arm_m,
+        lever_arms_m=lever_arms_m,
+        estimate_lever_arm=estimate_lever_arm,
     )
     on_progress("time offset and lever arm", 0.3)
     value = np.concatenate([one.range_m for one in site.tags])
     error = value - found.distance_m
     kept, outliers = _without_outliers(error, np.isfinite(error))
-    rows = np.flatnonzero(kept)
+    rows = np.flatnonzero(kept & _fits_model(site))
     _check_labelled(len(rows))
     ids = [anchor.id for anchor in site.anchors.anchors]
     pair_m = {
         (site.tags[tag].tag_id, ids[row]): found.pair(tag, row, float(site.anchors.sd[row]))
         for tag, row in found.pairs
     }
+    common = float(np.median([value for value, sd in pair_m.values() if sd <= UNSURE_M] or [0.0]))
+    spread = MAD_TO_SD * float(np.median([abs(value - common) for value, _ in pair_m.values()]))
+    # Few ranges say less about the offset of a pair than the other pairs do.
+    unsure = math.hypot(UNSURE_M, spread)
+    pair_m = {
+        pair: (common, unsure) if sd > UNSURE_M else (value, sd) for pair, (value, sd) in pair_m.items()
+    }
     _check_offsets(pair_m)
-    common = float(np.median([value for value, _ in pair_m.values()]))
     offsets = _of_pairs(common, pair_m)
     tag = np.repeat(np.arange(len(site.tags)), list(map(len, site.tags)))
     data, raw = _labelled(
@@ -173,10 +191,10 @@ def with_truth(
         again = solve_localised(
             site.anchors,
             [one.take(part - begin) for one, part, begin in zip(site.tags, own, site.begins, strict=True)],
-            path,
+            joined,
             known.take(kept),
             time_offset_s=found.time_offset_s,
-            lever_arm_m=found.lever_arm,
+            lever_arms_m=found.lever_arm_m,
         )
         grown = {
             (site.tags[number].tag_id, ids[row]): again.pair(number, row, 0.0)[0]
@@ -203,10 +221,10 @@ def with_truth(
         data,
         raw,
         choice,
-        choice.notes,
+        (*_without_cir(site), *choice.notes),
         track,
         tag[rows],
-        (1.0, 0.0) if site.has_cirs else (0.0, 0.0),
+        (choice.factor, 0.0),
         (0.0, 0.0),
         found,
         {},
@@ -219,11 +237,13 @@ def regressors(site: SiteData, source: Bundle) -> Regressors:
     """What may make ranges long: the universal network's prediction where there are CIRs, else the received power."""
     if site.has_cirs:
         predicted = site_model.network_m(float_network(source), site.inputs)
-        rows = np.where(np.isfinite(predicted), predicted, 0.0)[:, None]
+        rows = np.where(np.isfinite(predicted) & site.with_cir, predicted, 0.0)[:, None]
         # What it takes for undisturbed errs by centimetres, what it corrects by decimetres.
         size = np.abs(rows[:, 0])
-        edges = np.quantile(size, np.linspace(0.0, 1.0, KINDS + 1)[1:-1])
-        return Regressors((NETWORK,), rows, np.ones(1), np.array([NETWORK_SD]), np.searchsorted(edges, size))
+        edges = np.quantile(size[site.with_cir], np.linspace(0.0, 1.0, KINDS + 1)[1:-1])
+        # Ranges without a CIR are not corrected, so that they have a standard deviation of their own.
+        alike = np.where(site.with_cir, np.searchsorted(edges, size), KINDS)
+        return Regressors((NETWORK,), rows, np.ones(1), np.array([NETWORK_SD]), alike)
     power = site.rx_power_dbm.astype(np.float64)
     known = np.isfinite(power)
     if known.mean() < 0.5 or np.ptp(power[known]) < 1.0:
@@ -315,6 +335,16 @@ def _of_rows(data: Dataset, of_pair: dict[tuple[int, int], float]) -> NDArray[np
     assert data.anchors is not None
     pairs = zip(data.tags.tolist(), data.anchors.tolist(), strict=True)
     return np.array([of_pair.get(pair, 0.0) for pair in pairs])
+
+
+def _fits_model(site: SiteData) -> NDArray[np.bool_]:
+    """Which ranges the model is fitted to, bool (r,): the others contribute to track and offsets only."""
+    return site.with_cir if site.has_cirs else np.ones(len(site.with_cir), np.bool_)
+
+
+def _without_cir(site: SiteData) -> tuple[str, ...]:
+    count = int((~_fits_model(site)).sum())
+    return (f"{count} ranges without a usable CIR: used for track and offsets only",) if count else ()
 
 
 def _check_labelled(count: int) -> None:
