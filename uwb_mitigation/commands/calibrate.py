@@ -172,7 +172,8 @@ def calibrate(
     if found.harms and not force:
         harm = DatasetError(
             f"not written: held-out ranges err by {found.calibrated_mae_m:.3f} m after calibration, by "
-            f"{found.raw_mae_m:.3f} m before" + "".join(f"; {note}" for note in found.notes[:1]),
+            f"{found.raw_mae_m:.3f} m before; positions scatter by {found.position_scatter_m[1]:.3f} m and "
+            f"{found.position_scatter_m[0]:.3f} m" + "".join(f"; {note}" for note in found.notes[:1]),
             valid="a longer drive, or --force",
         )
         console.write_json(json, found.as_json() | {"refused": str(harm)})

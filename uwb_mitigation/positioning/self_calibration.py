@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.anchor_errors import check_anchor_positions
 from uwb_mitigation.positioning.anchors import AnchorMap
-from uwb_mitigation.positioning.joint import JointFit, JointSolver, Links, links_of
+from uwb_mitigation.positioning.joint import SLOW_S, JointFit, JointSolver, Links, links_of
 from uwb_mitigation.positioning.model import Model
 from uwb_mitigation.positioning.observability import (
     check_anchors,
     check_motion,
     mirrored,
 )
-from uwb_mitigation.positioning.other_anchors import seen_by_others
+from uwb_mitigation.positioning.other_anchors import position_scatter, seen_by_others
 from uwb_mitigation.positioning.own_offsets import Columns, candidates, with_own_offsets
 from uwb_mitigation.positioning.regressors import Regressors
 from uwb_mitigation.positioning.rests import Stretches, stretches
@@ -56,6 +56,7 @@ class SelfCalibration:
         tag_ids: of the tags.
         pseudo_m, pseudo_sd_m: float64 (r,), in the order of `stretches.ranges`: how far each range's anchor is from where
             the *other* anchors see the tag, and how well that is known; NaN = not at all.
+        position_scatter_m: `position_scatter` of raw ranges, and of calibrated ones on held-out parts; NaN = unknown.
     """
 
     stretches: Stretches
@@ -71,6 +72,7 @@ class SelfCalibration:
     untold_m: float
     height: Height | None
     model: Model
+    position_scatter_m: tuple[float, float] = (float("nan"), float("nan"))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -233,6 +235,24 @@ def calibrate(
             found, links, fit, solved, level, tuple(told), tag_ids, anchors, no_truth, no_truth, untold_m, height, model
         )  # fmt: skip
 
+    def held_out_scatter(some: Columns, fitted: JointFit) -> float:
+        """Of positions, with parameters from the other half of the drive."""
+        of_some = links_of(found, some.rows, some.alike, model)
+        block = (of_some.time_s[of_some.knot] // SLOW_S).astype(int) + of_some.stretch
+        correction = np.zeros(len(of_some))
+        for half in range(2):
+            held_out = block % 2 == half
+            if held_out.any() and not held_out.all():
+                rest = of_some.without(held_out)
+                solver = JointSolver(
+                    anchors, rest, some.parameters(rest), model, height, around=fitted.position
+                )
+                parameters = solver.fit(fitted.position, fitted.parameters, near=True).parameters
+            else:
+                parameters = fitted.parameters
+            correction[held_out] = of_some.rows[held_out] @ parameters
+        return position_scatter(anchors, of_some, fitted, correction, height, model)
+
     # Without the common offset the true ranges are unknown: own offsets would contain its error.
     common_sd = float(np.sqrt(fit.covariance[0, 0]))
     tried = candidates(found) if common_sd <= UNTOLD_M else []
@@ -241,6 +261,13 @@ def calibrate(
         richer, better, shared = with_own_offsets(anchors, found, solved, columns, fit, height, model)
         if richer is None or better is None:
             told.append(f"offsets of {group}s of their own: not told from chance, so that all share one")
+            break
+        before, after = (held_out_scatter(one, result) for one, result in ((solved, fit), (richer, better)))
+        if after > before:
+            told.append(
+                f"offsets of {group}s of their own: positions without one anchor scatter by {after:.3f} m with them, by "
+                f"{before:.3f} m without them, so that all share one"
+            )
             break
         solved, fit, level = richer, better, "pair" if group != "anchor" else "anchor"
         if shared:
@@ -271,8 +298,12 @@ def calibrate(
         links = links_of(found, solved.rows, solved.alike, model)
         start = np.array([0.0, *fit.parameters[1 : len(solved.names)]])
         fit = JointSolver(anchors, links, solved.parameters(links), model, height).fit(fit.position, start)
+    scatter = (
+        position_scatter(anchors, links, fit, np.zeros(len(links)), height, model),
+        held_out_scatter(solved, fit),
+    )
     pseudo, pseudo_sd = seen_by_others(anchors, found, links, fit, height, model)
-    return replace(result(untold), pseudo_m=pseudo, pseudo_sd_m=pseudo_sd)
+    return replace(result(untold), pseudo_m=pseudo, pseudo_sd_m=pseudo_sd, position_scatter_m=scatter)
 
 
 def _with_ids(name: str, anchors: AnchorMap, tags: Sequence[Ranges]) -> str:

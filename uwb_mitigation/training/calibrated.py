@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -43,6 +44,7 @@ class Calibrated:
         outliers: the number of ranges that were left out of all figures because their errors are implausible.
         common_sd_m: the standard deviation of the mean offset, which the evaluation has in common with the offsets; 0 with
             ground truth.
+        position_scatter_m: the scatter of positions between tracks without one anchor, raw and calibrated; NaN = unknown.
     """
 
     site: SiteData
@@ -62,6 +64,7 @@ class Calibrated:
     places: dict[str, tuple[float, float, float]]
     outliers: int
     common_sd_m: float
+    position_scatter_m: tuple[float, float]
 
     @property
     def raw_mae_m(self) -> float:
@@ -75,8 +78,9 @@ class Calibrated:
 
     @property
     def harms(self) -> bool:
-        """Whether the held-out error is not lower than the raw one by `MUST_GAIN`."""
-        return self.calibrated_mae_m > (1.0 - MUST_GAIN) * self.raw_mae_m
+        """Whether the held-out error is not lower than the raw one by `MUST_GAIN`, or positions scatter more."""
+        raw, calibrated = self.position_scatter_m
+        return self.calibrated_mae_m > (1.0 - MUST_GAIN) * self.raw_mae_m or calibrated > raw
 
     @property
     def sure_gain(self) -> float:
@@ -100,6 +104,9 @@ class Calibrated:
             what = f"Held-out range errors against {self.truth}: {errors}"
         else:
             what = f"Held-out range residuals against the other anchors (not ground truth): {errors}"
+            if not math.isnan(self.position_scatter_m[0]):
+                raw, calibrated = self.position_scatter_m
+                what += f"; positions without one anchor scatter by {raw:.3f} m raw, {calibrated:.3f} m calibrated"
         if self.harms:
             return f"{what}: no gain."
         if (gain := self.sure_gain) <= 0.0:
@@ -122,6 +129,7 @@ class Calibrated:
             "ranges": sum(map(len, self.site.tags)),
             "labelled": len(self.data),
             "outliers": self.outliers,
+            "position_scatter_m": [None if math.isnan(value) else value for value in self.position_scatter_m],
             "network_factor": list(self.network),
             "line": {
                 "offset_m": prior.offset_m,

@@ -124,6 +124,7 @@ def without_truth(
         _places(found),
         outliers,
         found.mean()[1],
+        found.position_scatter_m,
     )
 
 
@@ -230,6 +231,7 @@ def with_truth(
         {},
         outliers,
         0.0,
+        (math.nan, math.nan),
     )
 
 
