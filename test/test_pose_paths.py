@@ -11,7 +11,7 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from uwb_mitigation.bag.pose_paths import read_heights, read_poses
+from uwb_mitigation.bag.pose_paths import read_bodies, read_heights, read_lever_arm, read_poses
 from uwb_mitigation.errors import RecordingError
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -86,6 +86,39 @@ def test_poses_are_read_whatever_tells_them(tmp_path, topic, make, frames):
     assert path.stamp_ns.tolist() == [second * 10**9 for second in range(SECONDS)]
     assert np.allclose(path.position, [[second, 2.0, 0.5] for second in range(SECONDS)])
     assert np.allclose(np.abs(path.orientation), [0.0, 0.0, 0.0, 1.0])
+
+
+def of_two_tags(second: int) -> Any:
+    """An odometry of tag 7 in even seconds and of tag 8 in odd ones."""
+    sure = of("geometry_msgs/msg/PoseWithCovariance", pose(second), np.zeros(36))
+    zero = of("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)
+    twist = of(
+        "geometry_msgs/msg/TwistWithCovariance", of("geometry_msgs/msg/Twist", zero, zero), np.zeros(36)
+    )
+    return of("nav_msgs/msg/Odometry", header(second), f"tag_{7 + second % 2}", sure, twist)
+
+
+def test_each_child_frame_is_a_body_of_its_own(tmp_path):
+    bag = write(tmp_path, "/odom", of_two_tags)
+    bodies = read_bodies(bag, "/odom")
+    assert {frame: path.position[:, 0].tolist() for frame, path in bodies.items()} == {
+        "tag_7": [0.0, 2.0, 4.0, 6.0, 8.0],
+        "tag_8": [1.0, 3.0, 5.0, 7.0, 9.0],
+    }
+    assert list(read_bodies(bag, "/odom", ("map", "tag_8"))) == ["tag_8"]
+    with pytest.raises(RecordingError, match="tag_7, tag_8"):
+        read_poses(bag, "/odom")
+    with pytest.raises(RecordingError, match="base_link"):
+        read_bodies(bag, "/odom", ("map", "base_link"))
+
+
+def test_the_lever_arm_is_the_transform_from_robot_to_antenna(tmp_path):
+    bag = write(tmp_path, "/tf", transformed)
+    assert read_lever_arm(bag, "base_link", "link_3") == (0.0, 1.0, 0.25)
+    assert read_lever_arm(bag, "base_link", "uwb") is None
+    assert read_lever_arm(bag, "base_link", "base_link") is None
+    with pytest.raises(RecordingError, match="moves relative to"):
+        read_lever_arm(bag, "map", "base_link")
 
 
 def test_frames_that_are_not_there_and_none_at_all_are_told(tmp_path):
