@@ -88,7 +88,11 @@ def harm(folder: Path) -> None:
             row = f"{path.name} {name}: raw MAE {raw_mae:.3f} m, live RMSE {raw_rmse:.3f} m; "
             try:
                 found = without_truth(
-                    gather([part], run.anchors, source.preprocessing), source, height=height, area=None, seed=0
+                    gather([part], run.anchors, source.preprocessing),
+                    source,
+                    height=height,
+                    area=None,
+                    seed=0,
                 )
             except DatasetError as error:
                 print(row + f"refused: {error}", flush=True)
@@ -101,7 +105,8 @@ def harm(folder: Path) -> None:
                 for (_, anchor), (value, sd) in found.pair_m.items()
             ]
             print(
-                row + f"calibrated MAE {mae:.3f} m, live RMSE {rmse:.3f} m; {'refused' if found.harms else 'written'}; offsets "
+                row
+                + f"calibrated MAE {mae:.3f} m, live RMSE {rmse:.3f} m; {'refused' if found.harms else 'written'}; offsets "
                 f"{[f'{value:.2f} +- {sd:.2f}' for value, sd in found.pair_m.values()]}, median errors "
                 f"{[f'{value:.2f}' for value in true]}, {sum(covered)} of {len(covered)} within two standard deviations",
                 flush=True,

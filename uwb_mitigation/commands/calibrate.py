@@ -291,12 +291,12 @@ def _show(found: Calibrated) -> None:
         console.out.print(
             f"time offset {one.time_offset_s:.3f} +- {one.time_offset_sd_s:.3f} s", highlight=False
         )
-        for tag, arm, arm_sd in zip(found.site.tags, one.lever_arm_m, one.lever_arm_sd_m, strict=True):
+        for ranges, arm, arm_sd in zip(found.site.tags, one.lever_arm_m, one.lever_arm_sd_m, strict=True):
             known = ", ".join(
                 f"{value:.3f}" + ("" if sd == 0.0 or math.isnan(sd) else f" +- {sd:.3f}")
                 for value, sd in zip(arm.tolist(), arm_sd.tolist(), strict=True)
             )
-            console.out.print(f"tag {tag.tag_id}: lever arm {known} m", highlight=False)
+            console.out.print(f"tag {ranges.tag_id}: lever arm {known} m", highlight=False)
     table = Table("tag", "anchor", "offset m", "deviation m", title="Offsets", title_justify="left")
     for column in table.columns[2:]:
         column.justify = "right"
