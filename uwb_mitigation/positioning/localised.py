@@ -442,7 +442,8 @@ class _Fit:
         blocks = max(len(scores), 2)
         robust = covariance @ (scores.T @ scores) @ covariance * (blocks / (blocks - 1))
         sd = UNDERSTATED * np.sqrt(np.diag(covariance) + np.diag(robust))
-        return _Unknowns(float(x[0]), x[arms].reshape(lever.shape).copy(), x[pairs].copy(), sd)
+        arm = np.where(free_lever, x[arms].reshape(lever.shape), expected)
+        return _Unknowns(float(x[0]), arm, x[pairs].copy(), sd)
 
     def _normal(
         self,
