@@ -39,12 +39,15 @@ def site(tmp_path_factory):
         BagWriter(folder / "drive.mcap", {"simulated": "true"}) as bag,
         BagWriter(folder / "short.mcap", {}) as short,
         BagWriter(folder / "few.mcap", {}) as few,
+        BagWriter(folder / "gross.mcap", {}) as gross,
     ):
         for i, stamp in enumerate(ranges.stamp_ns.tolist()):
             cir = Cir(np.zeros(0, np.int16), rx_power_dbm=float(power[i]))
             anchor = HALL.anchors[int(ranges.anchor[i])].id
             record = Record(RangeMeasurement(stamp, 7, anchor, i, 0, float(value[i]), cir))
             bag.write(record)
+            wrong = replace(record.measurement, range_m=float(value[i]) + 150.0 * (i % 178 == 5))
+            gross.write(replace(record, measurement=wrong))
             if i < 100:
                 short.write(record)
             if i % 31 == 0:
@@ -115,6 +118,7 @@ def test_a_localisation_that_lags_tells_the_truth(site):
         "o.json",
         "--truth-topic",
         "/odom",
+        "--estimate-lever-arm",
         folder=site,
     )
     assert done.returncode == 0, done.stderr
@@ -141,7 +145,7 @@ def test_offsets_are_found_without_the_stretches_that_are_held_out(site, truth, 
 
     choose = site_model.choose
     monkeypatch.setattr(calibrating.site_model, "choose", look)
-    options = ("--truth-topic", truth) if truth else ()
+    options = ("--truth-topic", truth, "--estimate-lever-arm") if truth else ()
     done = run("calibrate", "drive.mcap", *LEVEL, "-o", "w.onnx", "--force", *options, folder=site)
     assert done.returncode == 0, done.stderr
     ((nothing, without, own),) = told
@@ -162,12 +166,62 @@ def test_of_a_stretch_that_is_held_out_ranges_of_unknown_truth_are_too():
 
 def test_a_localisation_needs_few_ranges_beside_it(site):
     done = run(
-        "calibrate", "few.mcap", *LEVEL, "-o", "few.onnx", "--json", "f.json", "--truth-topic", "/odom", "--force",
+        "calibrate", "few.mcap", *LEVEL, "-o", "few.onnx", "--json", "f.json", "--truth-topic", "/odom", "--estimate-lever-arm", "--force",
         folder=site,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     # Less a quarter, which is held out in turn, it is fewer than tell a lag and a lever arm.
     assert 40 <= json.loads((site / "f.json").read_text())["labelled"] < 53
+
+
+def figures(site, bag, *options):
+    done = run("calibrate", bag, "--anchors", "anchors.yaml", *options, "-o", "f.onnx", "--json", "f.json", "--force",
+               folder=site)  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return json.loads((site / "f.json").read_text()), done
+
+
+def test_nine_gross_outliers_change_no_figure(site):
+    clean, _ = figures(site, "drive.mcap", "--height", 1.0)
+    spoilt, done = figures(site, "gross.mcap", "--height", 1.0)
+    assert (clean["outliers"], spoilt["outliers"]) == (0, 9)
+    assert "9 outliers" in done.stderr
+    for key in ("raw_mae_m", "calibrated_mae_m"):
+        assert spoilt[key] == pytest.approx(clean[key], rel=0.05)
+
+
+def test_heights_come_from_a_topic_and_stamps_are_shifted(site):
+    late, _ = figures(site, "drive.mcap", "--height-topic", "/odom")
+    # The localisation is 0.3 s late, so that it does not cover the first ranges.
+    assert late["left_out"] == {"no height at that time": 6}
+    shifted, _ = figures(site, "drive.mcap", "--height-topic", "/odom", "--stamp-offset", 0.3)
+    # Now it ends one range early.
+    assert shifted["left_out"] == {"no height at that time": 1}
+    given, _ = figures(site, "drive.mcap", "--height", 1.0)
+    for pair, value in given["offsets_m"].items():
+        assert shifted["offsets_m"][pair] == pytest.approx(value, abs=0.02)
+    both = run("calibrate", "drive.mcap", *LEVEL, "--height-topic", "/odom", "-o", "x.onnx", folder=site)
+    assert (both.returncode, "one of them" in both.stderr) == (1, True)
+
+
+def test_without_a_transform_the_lever_arm_is_zero(site):
+    result, done = figures(site, "drive.mcap", "--height", 1.0, "--truth-topic", "/odom")
+    assert result["localisation"]["lever_arm_m"] == [0.0, 0.0, 0.0]
+    assert "no transform from base_link" in done.stderr
+
+
+def test_what_makes_positions_worse_is_refused(site, monkeypatch):
+    from uwb_mitigation.training.calibrated import Calibrated
+
+    before = Calibrated.__init__
+
+    def worse(self, *fields):
+        before(self, *fields[:-1], (0.2, 0.21))
+
+    monkeypatch.setattr(Calibrated, "__init__", worse)
+    done = run("calibrate", "drive.mcap", *LEVEL, "-o", "p.onnx", "--json", "p.json", folder=site)
+    assert done.returncode == 1
+    assert "not written" in json.loads((site / "p.json").read_text())["refused"]
 
 
 def test_what_is_refused_is_said_in_the_json_and_writes_nothing(site):
@@ -197,15 +251,20 @@ def test_cirs_bring_the_universal_network_in(tmp_path, monkeypatch):
     """Without torch, whose candidate takes long: then it is said."""
     import importlib.util
 
+    from uwb_mitigation.model.float_networks import float_network
+    from uwb_mitigation.model.shipped import default_model_path
     from uwb_mitigation.training import site_model
+    from uwb_mitigation.training.site_model import network_m
 
     monkeypatch.setattr(site_model.importlib.util, "find_spec", lambda name: None)
     assert importlib.util is site_model.importlib.util
     source = SimulatedSource.with_anchors(5, seed=4, count=1600, rate_hz=20.0)
     save_anchors(tmp_path / "anchors.yaml", source.anchors)
     with BagWriter(tmp_path / "drive.mcap", {"simulated": "true"}) as bag:
-        for record in source:
+        for number, record in enumerate(source):
             measured = replace(record.measurement, range_m=record.measurement.range_m + 0.2)
+            if number % 7 == 0:
+                measured = replace(measured, cir=replace(measured.cir, samples=np.zeros(0, np.int16)))
             bag.write(replace(record, measurement=measured, truth=None))
     done = run(
         "calibrate", "drive.mcap", "--anchors", "anchors.yaml", "--height", 0.0, "-o", "site.onnx", "--json", "r.json",
@@ -215,6 +274,13 @@ def test_cirs_bring_the_universal_network_in(tmp_path, monkeypatch):
     assert "torch is not installed" in done.stderr
     result = json.loads((tmp_path / "r.json").read_text())
     assert result["chosen"].startswith("offsets + universal network")
+    # Ranges without a CIR contribute to the track; the model is fitted to the others.
+    assert (result["ranges"], result["left_out"]) == (1600, {})
+    assert "229 ranges without a usable CIR" in done.stderr
+    assert result["labelled"] <= 1600 - 229
+    weights = [float_network(load_bundle(path)) for path in (tmp_path / "site.onnx", default_model_path())]
+    predicted = [network_m(one, np.random.default_rng(1).random((50, 157), np.float32)) for one in weights]
+    assert predicted[0] == pytest.approx(result["network_factor"][0] * predicted[1], abs=1e-4)
     assert result["calibrated_mae_m"] < 0.7 * result["raw_mae_m"]
     assert load_bundle(tmp_path / "site.onnx").card.needs_cir
     # The drive alone, without true ranges, does for int8, too.

@@ -11,7 +11,7 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from uwb_mitigation.bag.pose_paths import read_poses
+from uwb_mitigation.bag.pose_paths import read_bodies, read_heights, read_lever_arm, read_poses
 from uwb_mitigation.errors import RecordingError
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -88,6 +88,39 @@ def test_poses_are_read_whatever_tells_them(tmp_path, topic, make, frames):
     assert np.allclose(np.abs(path.orientation), [0.0, 0.0, 0.0, 1.0])
 
 
+def of_two_tags(second: int) -> Any:
+    """An odometry of tag 7 in even seconds and of tag 8 in odd ones."""
+    sure = of("geometry_msgs/msg/PoseWithCovariance", pose(second), np.zeros(36))
+    zero = of("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)
+    twist = of(
+        "geometry_msgs/msg/TwistWithCovariance", of("geometry_msgs/msg/Twist", zero, zero), np.zeros(36)
+    )
+    return of("nav_msgs/msg/Odometry", header(second), f"tag_{7 + second % 2}", sure, twist)
+
+
+def test_each_child_frame_is_a_body_of_its_own(tmp_path):
+    bag = write(tmp_path, "/odom", of_two_tags)
+    bodies = read_bodies(bag, "/odom")
+    assert {frame: path.position[:, 0].tolist() for frame, path in bodies.items()} == {
+        "tag_7": [0.0, 2.0, 4.0, 6.0, 8.0],
+        "tag_8": [1.0, 3.0, 5.0, 7.0, 9.0],
+    }
+    assert list(read_bodies(bag, "/odom", ("map", "tag_8"))) == ["tag_8"]
+    with pytest.raises(RecordingError, match="tag_7, tag_8"):
+        read_poses(bag, "/odom")
+    with pytest.raises(RecordingError, match="base_link"):
+        read_bodies(bag, "/odom", ("map", "base_link"))
+
+
+def test_the_lever_arm_is_the_transform_from_robot_to_antenna(tmp_path):
+    bag = write(tmp_path, "/tf", transformed)
+    assert read_lever_arm(bag, "base_link", "link_3") == (0.0, 1.0, 0.25)
+    assert read_lever_arm(bag, "base_link", "uwb") is None
+    assert read_lever_arm(bag, "base_link", "base_link") is None
+    with pytest.raises(RecordingError, match="moves relative to"):
+        read_lever_arm(bag, "map", "base_link")
+
+
 def test_frames_that_are_not_there_and_none_at_all_are_told(tmp_path):
     bag = write(tmp_path, "/tf", transformed)
     with pytest.raises(RecordingError, match="--frames"):
@@ -96,3 +129,45 @@ def test_frames_that_are_not_there_and_none_at_all_are_told(tmp_path):
         read_poses(bag, "/tf", ("map", "lidar"))
     with pytest.raises(RecordingError, match="no topic /odom"):
         read_poses(bag, "/odom", None)
+
+
+def measured_range(second: int) -> Any:
+    """0.1 m higher each second; the sensor sees nothing in second 3."""
+    value = float("inf") if second == 3 else 0.5 + 0.1 * second
+    return of("sensor_msgs/msg/Range", header(second), 1, 0.1, 0.0, 4.0, value, 0.0004)
+
+
+def odometry(second: int) -> Any:
+    sure = of(
+        "geometry_msgs/msg/PoseWithCovariance", pose(second), np.diag([1.0, 1, 0.04, 1, 1, 1]).reshape(-1)
+    )
+    zero = of("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)
+    twist = of(
+        "geometry_msgs/msg/TwistWithCovariance", of("geometry_msgs/msg/Twist", zero, zero), np.zeros(36)
+    )
+    return of("nav_msgs/msg/Odometry", header(second), "base_link", sure, twist)
+
+
+@pytest.mark.parametrize(
+    ("make", "seconds", "height_m", "variance_m2"),
+    [
+        (measured_range, 9, 1.4, 0.0004),
+        (odometry, 10, 0.5, 0.04),
+        (posed_with_covariance, 10, 0.5, 0.01),  # no variance in the message
+    ],
+)
+def test_heights_are_read_from_each_type(tmp_path, make, seconds, height_m, variance_m2):
+    heights = read_heights(write(tmp_path, "/height", make), "/height")
+    assert len(heights) == seconds
+    assert heights.height_m[-1] == pytest.approx(height_m)
+    assert heights.variance_m2[-1] == pytest.approx(variance_m2)
+    value, _ = heights.at(np.array([500_000_000, 3_000_000_000, 60_000_000_000]))
+    assert np.isfinite(value).tolist() == [True, make is not measured_range, False]
+
+
+def test_a_topic_without_heights_is_refused(tmp_path):
+    bag = write(tmp_path, "/pose", posed)
+    with pytest.raises(RecordingError, match="no topic /height"):
+        read_heights(bag, "/height")
+    with pytest.raises(RecordingError, match="PoseStamped"):
+        read_heights(bag, "/pose")

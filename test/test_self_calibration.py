@@ -12,6 +12,7 @@ from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
 from uwb_mitigation.positioning.localised import PosePath, solve_localised
 from uwb_mitigation.positioning.model import Model
+from uwb_mitigation.positioning.other_anchors import position_scatter
 from uwb_mitigation.positioning.regressors import SLOPE_SD, Regressors
 from uwb_mitigation.positioning.rests import stretches
 from uwb_mitigation.positioning.self_calibration import calibrate
@@ -259,10 +260,48 @@ def test_a_track_with_two_mirror_images_is_refused():
     refused("mirror images", HALL.moved(flat, HALL.sd), [ranges])
 
 
-def test_an_anchor_that_contradicts_the_others_is_named(minute):
+@pytest.mark.parametrize(("row", "by"), [(3, (3.0, -2.5, 0.0)), (3, (1.5, 0.0, 0.0)), (4, (1.5, 0.0, 0.0))])
+def test_an_anchor_that_was_moved_is_named_by_its_id(minute, row, by):
     wrong = HALL.position.copy()
-    wrong[3] += (3.0, -2.5, 0.0)
-    refused("anchor 4 contradicts", HALL.moved(wrong, HALL.sd), [minute[0]], height=LEVEL)
+    wrong[row] += by
+    refused(f"anchor {row + 1} contradicts", HALL.moved(wrong, HALL.sd), [minute[0]], height=LEVEL)
+
+
+def test_two_swapped_opposite_anchors_are_named(minute):
+    order = [2, 1, 0, 3, 4]
+    refused(
+        "anchors 1 and 3 contradict", HALL.moved(HALL.position[order], HALL.sd), [minute[0]], height=LEVEL
+    )
+
+
+def test_a_long_tail_accuses_no_anchor(minute):
+    """A body between tag and anchor makes 40 % of the ranges of two anchors long."""
+    ranges, _ = minute
+    rng = np.random.default_rng(4)
+    blocked = np.isin(ranges.anchor, (1, 3)) & (rng.random(len(ranges)) < 0.4)
+    tail = np.where(blocked, rng.exponential(0.6, len(ranges)), 0.0)
+    calibrate(HALL, [replace(ranges, range_m=ranges.range_m + tail)], height=LEVEL)
+
+
+def outside(seed):
+    """A drive around five anchors that are close together; errors change slowly, as reflections do."""
+    near = HALL.moved(HALL.position * (0.25, 0.25, 1.0) + (4.5, 3.5, 0.0), HALL.sd)
+    ranges, _ = drive(
+        near, seconds=90, rate_hz=25.0, seed=seed, offset_m=0.0, path=lambda t: circuit(t) * (2.0, 2.0, 1.0)
+    )
+    phase = np.random.default_rng(seed).uniform(0, 2 * np.pi, 5)
+    slow = 0.05 * np.sin(2 * np.pi * ranges.stamp_ns / 30e9 + phase[ranges.anchor])
+    return near, replace(ranges, range_m=ranges.range_m + slow)
+
+
+def test_an_offset_that_slow_errors_can_explain_is_not_subtracted():
+    """Outside of the anchors, 0.05 m of slow error moves the estimate of the offset by decimetres."""
+    for seed in (2, 3):
+        near, ranges = outside(seed)
+        found = calibrate(near, [ranges], height=LEVEL)
+        assert [found.applied(0, row)[0] for row in range(5)] == [0.0] * 5
+        assert found.applied(0, 0)[1] > 0.05
+        assert any("not significant" in note for note in found.not_told)
 
 
 def test_lag_and_lever_arm_are_found_beside_a_localisation(minute):
@@ -283,21 +322,89 @@ def test_lag_and_lever_arm_are_found_beside_a_localisation(minute):
     quaternion = np.stack([zero, zero, np.sin(heading / 2), np.cos(heading / 2)], axis=1)
     late = PosePath(ranges.stamp_ns + 300_000_000, path.position - turned, quaternion)
     nothing = Regressors.none(len(ranges))
-    found = solve_localised(HALL, [with_own(ranges)], late, nothing)
+    found = solve_localised(HALL, [with_own(ranges)], [late], nothing, estimate_lever_arm=True)
     assert found.time_offset_s == pytest.approx(0.3, abs=0.02)
-    assert np.abs(found.lever_arm_m - lever)[:2].max() < 0.05
+    assert np.abs(found.lever_arm_m[0] - lever)[:2].max() < 0.05
     assert np.abs(found.offset_m - 0.25 - OWN).max() < 0.08
-    given = solve_localised(HALL, [ranges], late, nothing, time_offset_s=0.3, lever_arm_m=(0.3, -0.25, 0.0))
+    given = solve_localised(HALL, [ranges], [late], nothing, time_offset_s=0.3, lever_arms_m=lever[None])
     assert (given.time_offset_s, given.time_offset_sd_s) == (pytest.approx(0.3, abs=1e-6), 0.0)
     with pytest.raises(DatasetError, match="localisation's times"):
-        solve_localised(HALL, [ranges], late.shifted(10**13), nothing)
+        solve_localised(HALL, [ranges], [late.shifted(10**13)], nothing)
     # As they are left when stretches of a short recording are held out.
     part = np.arange(20, 620, 20)
-    few = [ranges.take(part)], late, Regressors.none(len(part))
-    alone = solve_localised(HALL, *few, time_offset_s=0.3, lever_arm_m=(0.3, -0.25, 0.0))
+    few = [ranges.take(part)], [late], Regressors.none(len(part))
+    alone = solve_localised(HALL, *few, time_offset_s=0.3, lever_arms_m=lever[None])
     assert np.abs(alone.offset_m - 0.25).max() < 0.15
     with pytest.raises(DatasetError, match=r"30 ranges .*40 or more"):
-        solve_localised(HALL, *few, time_offset_s=0.3)
+        solve_localised(HALL, *few, time_offset_s=0.3, estimate_lever_arm=True)
+
+
+def turning(path, lever, late_ns=0):
+    """Poses of a robot that turns and carries an antenna at `lever`."""
+    heading = 0.7 * path.stamp_ns / 1e9
+    c, s, zero = np.cos(heading), np.sin(heading), np.zeros(len(path))
+    off = np.stack([c * lever[0] - s * lever[1], s * lever[0] + c * lever[1], zero + lever[2]], axis=1)
+    quaternion = np.stack([zero, zero, np.sin(heading / 2), np.cos(heading / 2)], axis=1)
+    return PosePath(path.stamp_ns + late_ns, path.position - off, quaternion)
+
+
+def test_each_tag_has_its_own_lever_arm_and_its_own_body(minute):
+    ranges, path = minute
+    arms = np.array([[0.4, 0.0, 0.0], [-0.3, 0.2, 0.0]])
+    other, _ = drive(seconds=60, rate_hz=25.0, offset_m=0.25, seed=5)
+    bodies = [turning(path, arms[0]), turning(path, arms[1])]
+    tags = [ranges, replace(other, tag_id=8)]
+    nothing = Regressors.none(sum(map(len, tags)))
+    found = solve_localised(HALL, tags, bodies, nothing, time_offset_s=0.0, estimate_lever_arm=True)
+    assert np.abs(found.lever_arm_m - arms)[:, :2].max() < 0.05
+    assert np.abs(found.offset_m - 0.25).max() < 0.08
+    given = solve_localised(HALL, tags, bodies, nothing, time_offset_s=0.0, lever_arms_m=arms)
+    assert (given.lever_arm_m == arms).all()
+    assert np.abs(given.offset_m - 0.25).max() < 0.08
+
+
+def test_a_lever_arm_that_offsets_can_explain_is_refused(minute):
+    ranges, path = minute
+    still = PosePath(path.stamp_ns, path.position, np.tile([0.0, 0.0, 0.0, 1.0], (len(path), 1)))
+    short = ranges.take(ranges.stamp_ns < 4 * 10**9)
+    nothing = Regressors.none(len(short))
+    with pytest.raises(DatasetError, match="cannot be separated"):
+        solve_localised(HALL, [short], [still], nothing, time_offset_s=0.0, estimate_lever_arm=True)
+
+
+def test_two_standard_deviations_of_lag_and_arm_cover_their_errors():
+    lever, error, sd = np.array([0.3, -0.2, 0.0]), [], []
+    for seed in range(5):
+        ranges, path = drive(seconds=60, rate_hz=20.0, seed=seed, offset_m=0.2)
+        # The localisation drifts by 4 cm within ten seconds or so.
+        phase = np.random.default_rng(seed).uniform(0, 2 * np.pi, 2)
+        time_s = path.stamp_ns[:, None] / 1e9
+        drift = np.column_stack([0.04 * np.sin(0.6 * time_s + phase), np.zeros(len(path))])
+        pose = turning(replace(path, position=path.position + drift), lever, 300_000_000)
+        found = solve_localised(HALL, [ranges], [pose], Regressors.none(len(ranges)), estimate_lever_arm=True)
+        error += [found.time_offset_s - 0.3, *(found.lever_arm_m[0] - lever)[:2]]
+        sd += [found.time_offset_sd_s, *found.lever_arm_sd_m[0, :2]]
+    assert (np.abs(error) <= 2.0 * np.array(sd)).mean() >= 0.9
+
+
+def test_measured_heights_replace_a_constant_one():
+    def up_and_down(time_s):
+        return circuit(time_s) + np.stack([0 * time_s, 0 * time_s, np.sin(0.5 * time_s)], axis=1)
+
+    ranges, path = drive(seconds=60, rate_hz=20.0, offset_m=0.25, path=up_and_down)
+    found = calibrate(HALL, [ranges], heights_m=path.position[:, 2])
+    assert found.pair(0, 0)[0] == pytest.approx(0.25, abs=0.06)
+    assert found.fit.scale_m[0] < 0.7 * calibrate(HALL, [ranges], height=LEVEL).fit.scale_m[0]
+
+
+def test_positions_scatter_less_if_anchors_agree(solved):
+    def scatter(offset_m):
+        correction = np.asarray(offset_m)[solved.links.anchor]
+        return position_scatter(HALL, solved.links, solved.fit, correction, LEVEL, Model())
+
+    assert scatter(OWN + 0.25) < 0.6 * scatter(np.full(5, 0.25)) < scatter(0.25 - OWN)
+    raw, calibrated = solved.position_scatter_m
+    assert calibrated < 0.6 * raw
 
 
 @pytest.mark.parametrize("told", [1, 6])

@@ -149,7 +149,7 @@ def one(seed: int, seconds: float, truth_topic: bool, with_train: bool, flat: bo
         )
         path = PosePath(stamps + round(LAG_S * 1e9), frame + noise, quaternion)
         found = calibrating.with_truth(
-            site, universal, [path], "/odom", time_offset_s=None, lever_arm_m=None, seed=0
+            site, universal, [[path]], "/odom", time_offset_s=None, estimate_lever_arm=True, seed=0
         )
     else:
         found = calibrating.without_truth(site, universal, height=height, area=None, seed=0)
@@ -182,7 +182,9 @@ def one(seed: int, seconds: float, truth_topic: bool, with_train: bool, flat: bo
         }
         if found.localised is not None:
             row["time_offset_error"] = found.localised.time_offset_s - LAG_S
-            row["lever_error"] = (found.localised.lever_arm_m - LEVER_M).tolist()
+            row["lever_error"] = (found.localised.lever_arm_m[0] - LEVER_M).tolist()
+            row["time_offset_sd"] = found.localised.time_offset_sd_s
+            row["lever_sd"] = found.localised.lever_arm_sd_m[0].tolist()
         if with_train:
             bundle = trained(records, universal, Path(folder))
             row["trained_mae"] = error_of(test, bundle, NO_OFFSETS)

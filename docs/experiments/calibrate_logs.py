@@ -2,6 +2,10 @@
 
     python docs/experiments/calibrate_logs.py hanyang ../shared/data/hanyang_outdoor LOS_A1
     python docs/experiments/calibrate_logs.py apartment ../shared/data/evk1000_apartment
+    python docs/experiments/calibrate_logs.py harm ../shared/data/hanyang_outdoor
+
+`harm` calibrates each run and both halves of it without ground truth, and compares the ranges and the live track of the same
+ranges with ground truth: raw, and corrected with the written bundle and offsets.
 
 Of Hanyang's runs one is calibrated from, and the others tracked with and without its offsets and line (no CIRs). Of the
 EVK1000 logs, of tags at rest, all are calibrated from, and the ranges' errors told before and after: the surveyed
@@ -11,21 +15,28 @@ distances are used for nothing else.
 from __future__ import annotations
 
 import sys
+import tempfile
 from pathlib import Path
 
 import numpy as np
 
-from uwb_mitigation.benches.positions import at_truths, hanyang_run
+from uwb_mitigation.benches.positions import LAG_S, at_truths, hanyang_run
+from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.evaluation.site_data import gather
-from uwb_mitigation.model.bundle import load_bundle
+from uwb_mitigation.measurement import Record
+from uwb_mitigation.mitigation import Mitigation, correct_batch
+from uwb_mitigation.model.bundle import Bundle, load_bundle
 from uwb_mitigation.model.shipped import default_model_path
+from uwb_mitigation.offsets import NO_OFFSETS, Offsets
 from uwb_mitigation.positioning.locator import TagLocator, run_live
 from uwb_mitigation.positioning.model import Model
 from uwb_mitigation.positioning.smoother import Smoother
 from uwb_mitigation.positioning.start import Height
+from uwb_mitigation.positioning.track_errors import track_errors
 from uwb_mitigation.positioning.tracks import Ranges
 from uwb_mitigation.sources.decaranging import DecaRangingFolder
 from uwb_mitigation.sources.hanyang import ANTENNA_M, HanyangRun
+from uwb_mitigation.training import calibrated
 from uwb_mitigation.training.calibrated import Calibrated
 from uwb_mitigation.training.calibrating import without_truth
 
@@ -65,6 +76,64 @@ def hanyang(folder: Path, name: str) -> None:
             )
 
 
+def harm(folder: Path) -> None:
+    source = load_bundle(default_model_path())
+    height = Height(ANTENNA_M, 0.1)
+    for path in sorted(path for path in folder.iterdir() if path.is_dir()):
+        run = HanyangRun(path)
+        records = list(run)
+        half = len(records) // 2
+        for name, part in (("all", records), ("first half", records[:half]), ("second half", records[half:])):
+            raw_mae, raw_rmse, true = _against_truth(run, part, None, NO_OFFSETS, height)
+            row = f"{path.name} {name}: raw MAE {raw_mae:.3f} m, live RMSE {raw_rmse:.3f} m; "
+            try:
+                found = without_truth(
+                    gather([part], run.anchors, source.preprocessing),
+                    source,
+                    height=height,
+                    area=None,
+                    seed=0,
+                )
+            except DatasetError as error:
+                print(row + f"refused: {error}", flush=True)
+                continue
+            with tempfile.TemporaryDirectory() as temporary:
+                bundle, _ = calibrated.write(Path(temporary) / "site.onnx", found, source, path.name)
+            mae, rmse, _ = _against_truth(run, part, bundle, found.offsets, height)
+            covered = [
+                abs(value - true[run.anchors.index[anchor]]) <= 2.0 * sd
+                for (_, anchor), (value, sd) in found.pair_m.items()
+            ]
+            print(
+                row
+                + f"calibrated MAE {mae:.3f} m, live RMSE {rmse:.3f} m; {'refused' if found.harms else 'written'}; offsets "
+                f"{[f'{value:.2f} +- {sd:.2f}' for value, sd in found.pair_m.values()]}, median errors "
+                f"{[f'{value:.2f}' for value in true]}, {sum(covered)} of {len(covered)} within two standard deviations",
+                flush=True,
+            )
+
+
+def _against_truth(
+    run: HanyangRun, records: list[Record], bundle: Bundle | None, offsets: Offsets, height: Height
+) -> tuple[float, float, np.ndarray]:
+    """MAE of ranges, RMSE of the live track, and the median error of each anchor's ranges, m; the lag removed."""
+    measured = [record.measurement for record in records]
+    stamp = np.array([one.stamp_ns for one in measured], np.int64) - round(LAG_S * 1e9)
+    row = np.array([run.anchors.index[one.anchor_id] for one in measured])
+    value, variance = np.array([one.range_m for one in measured]), np.full(len(measured), np.nan)
+    if bundle is not None:
+        corrected = correct_batch(Mitigation(bundle, offsets), measured)
+        value = np.array([one.range_m for one in corrected])
+        variance = np.array([one.variance_m2 for one in corrected])
+    unknown = np.full(len(value), np.nan)
+    ranges = Ranges(stamp, row, np.maximum(value, 0.0), variance, unknown, measured[0].tag_id)
+    track = run_live(ranges, TagLocator(run.anchors, Model(), height=height)).track
+    distance = np.linalg.norm(run.truth.at(stamp) - run.anchors.position[row], axis=1)
+    error = value - distance
+    true = np.array([np.nanmedian(error[row == one]) for one in range(len(run.anchors))])
+    return float(np.nanmean(np.abs(error))), track_errors(track, run.truth).rmse, true
+
+
 def apartment(folder: Path) -> None:
     source = load_bundle(default_model_path())
     with DecaRangingFolder(folder) as logs:
@@ -97,5 +166,7 @@ def apartment(folder: Path) -> None:
 if __name__ == "__main__":
     if sys.argv[1] == "hanyang":
         hanyang(Path(sys.argv[2]), sys.argv[3])
+    elif sys.argv[1] == "harm":
+        harm(Path(sys.argv[2]))
     else:
         apartment(Path(sys.argv[2]))

@@ -13,67 +13,172 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.bag.poses import POSITION_TYPES
-from uwb_mitigation.bag.topics import TF_STATIC, TF_TYPE
+from uwb_mitigation.bag.topics import ODOMETRY_TYPE, POSE_TYPE, RANGE_SENSOR_TYPE, TF, TF_STATIC, TF_TYPE
 from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.positioning.localised import PosePath
+from uwb_mitigation.positioning.tracks import Heights
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
     from uwb_mitigation.bag.index import Channel, RawMessage
+    from uwb_mitigation.bag.reader import BagReader
 
 MOST_POSES = 2_000_000
+MOVES_M = 0.05
+"""An antenna whose position in the robot's frame changes more has no lever arm."""
+
+HEIGHT_TYPES = (RANGE_SENSOR_TYPE, ODOMETRY_TYPE, POSE_TYPE)
+_READABLE_TYPES = tuple(dict.fromkeys((*POSITION_TYPES, TF_TYPE, *HEIGHT_TYPES)))
 _MOST_FRAMES = 64
 _NANOSECONDS = 1_000_000_000
 _Row = tuple[int, float, float, float, float, float, float, float]
 
 
 def read_poses(path: Path, topic: str, frames: tuple[str, str] | None = None) -> PosePath:
-    """The poses of a robot's frame in the anchors' frame.
+    """The poses of one frame in the anchors' frame; arguments and errors as of `read_bodies`.
+
+    Raises:
+        RecordingError: also if the topic contains several child frames and `frames` does not choose one.
+    """
+    bodies = read_bodies(path, topic, frames)
+    if len(bodies) > 1:
+        raise RecordingError(
+            f"poses of several frames: {', '.join(sorted(bodies))}",
+            where=f"{path}, topic {topic}",
+            valid="--frames MAP CHILD to choose one",
+        )
+    return next(iter(bodies.values()))
+
+
+def read_bodies(path: Path, topic: str, frames: tuple[str, str] | None = None) -> dict[str, PosePath]:
+    """The poses of each child frame on a topic, in the anchors' frame.
 
     Args:
         topic: of `POSITION_TYPES`, or /tf.
-        frames: of /tf: the anchors' frame and the robot's, such as map and base_link.
+        frames: the anchors' frame and the robot's, such as map and base_link. Needed for /tf.
+
+    Returns:
+        {child frame: poses}; of a type without a child frame, the key is empty.
 
     Raises:
-        RecordingError: the bag cannot be read, has no such topic, or its messages cannot be used.
+        RecordingError: the bag cannot be read, has no such topic or frame, or its messages cannot be used.
     """
     from uwb_mitigation.bag.reader import BagReader
 
     bag = BagReader(path)
     where = f"{path}, topic {topic}"
-    if topic not in bag.topics:
-        known = ", ".join(
-            f"{name} ({kind})"
-            for name, kind in sorted(bag.topics.items())
-            if kind in (*POSITION_TYPES, TF_TYPE)
-        )
-        raise RecordingError(
-            f"no topic {topic}", where=str(path), valid=f"one with poses: {known or 'there is none'}"
-        )
-    decode = _Decoder(where)
+    _check_topic(path, bag.topics, topic, (*POSITION_TYPES, TF_TYPE))
     if bag.topics[topic] == TF_TYPE:
         if frames is None:
             raise RecordingError(
                 "transforms between many frames", where=where, valid="--frames MAP BASE_LINK"
             )
-        edges: dict[str, dict[str, list[_Row]]] = {}
-        for message in bag.messages([topic, TF_STATIC]):
-            for one in decode(message).transforms:
-                row = _row(one.header.stamp, one.transform.translation, one.transform.rotation)
-                child = _frame(one.child_frame_id)
-                if row is not None and (child in edges or len(edges) < _MOST_FRAMES):
-                    parents = edges.setdefault(child, {})
-                    parents.setdefault(_frame(one.header.frame_id), []).append(row)
-        return _chained(edges, _frame(frames[0]), _frame(frames[1]), where)
-    rows = []
+        edges = _edges(bag, [topic, TF_STATIC], where)
+        return {_frame(frames[1]): _chained(edges, _frame(frames[0]), _frame(frames[1]), where)}
+    decode = _Decoder(where)
+    rows: dict[str, list[_Row]] = {}
     for message in bag.messages([topic]):
         decoded = decode(message)
         pose = decoded.pose if hasattr(decoded.pose, "position") else decoded.pose.pose
         row = _row(decoded.header.stamp, pose.position, pose.orientation)
-        if row is not None:
-            rows.append(row)
-    return _path(rows, where)
+        child = _frame(getattr(decoded, "child_frame_id", ""))
+        if row is not None and (child in rows or len(rows) < _MOST_FRAMES):
+            rows.setdefault(child, []).append(row)
+    if frames is not None and set(rows) - {""}:
+        wanted = _frame(frames[1])
+        if wanted not in rows:
+            raise RecordingError(
+                f"no poses of {wanted}", where=where, valid=f"--frames of: {', '.join(sorted(rows))}"
+            )
+        rows = {wanted: rows[wanted]}
+    return {child: _path(own, where) for child, own in rows.items()} or {"": _path([], where)}
+
+
+def read_lever_arm(path: Path, base: str, frame: str) -> tuple[float, float, float] | None:
+    """Where a frame is in the robot's frame, from /tf_static and /tf; None: no such transforms.
+
+    Raises:
+        RecordingError: the frame moves relative to the robot.
+    """
+    from uwb_mitigation.bag.reader import BagReader
+
+    bag = BagReader(path)
+    topics = [name for name in (TF, TF_STATIC) if bag.topics.get(name) == TF_TYPE]
+    where = f"{path}, {' and '.join(topics)}"
+    if not topics or not frame or _frame(frame) == _frame(base):
+        return None
+    try:
+        rows = _composed(_edges(bag, topics, where), _frame(base), _frame(frame), where)
+    except RecordingError:
+        return None
+    position = np.array([row[1:4] for row in rows])
+    if float(np.ptp(position, axis=0).max()) > MOVES_M:
+        raise RecordingError(f"{frame} moves relative to {base}", where=where, valid="--lever-arm X,Y,Z")
+    x, y, z = np.median(position, axis=0).tolist()
+    return x, y, z
+
+
+def _edges(bag: BagReader, topics: list[str], where: str) -> dict[str, dict[str, list[_Row]]]:
+    """{child frame: {parent frame: transforms}}."""
+    decode = _Decoder(where)
+    edges: dict[str, dict[str, list[_Row]]] = {}
+    for message in bag.messages(topics):
+        for one in decode(message).transforms:
+            row = _row(one.header.stamp, one.transform.translation, one.transform.rotation)
+            child = _frame(one.child_frame_id)
+            if row is not None and (child in edges or len(edges) < _MOST_FRAMES):
+                edges.setdefault(child, {}).setdefault(_frame(one.header.frame_id), []).append(row)
+    return edges
+
+
+def read_heights(path: Path, topic: str, sd_m: float = 0.1) -> Heights:
+    """Read a tag's height from a topic of one of the `HEIGHT_TYPES`.
+
+    A `sensor_msgs/Range` is the height above z = 0; of the other types the z coordinate counts.
+
+    Args:
+        path: The bag.
+        topic: The topic.
+        sd_m: Standard deviation where the message has no variance.
+
+    Raises:
+        RecordingError: The bag cannot be read, has no such topic, or the topic contains no valid height.
+    """
+    from uwb_mitigation.bag.reader import BagReader
+
+    bag = BagReader(path)
+    where = f"{path}, topic {topic}"
+    _check_topic(path, bag.topics, topic, HEIGHT_TYPES)
+    decode = _Decoder(where)
+    rows: dict[int, tuple[float, float]] = {}
+    for message in bag.messages([topic]):
+        decoded = decode(message)
+        if bag.topics[topic] == RANGE_SENSOR_TYPE:
+            height, variance = float(decoded.range), float(getattr(decoded, "variance", 0.0))
+            valid = decoded.min_range <= height <= decoded.max_range
+        else:
+            height, variance = float(decoded.pose.pose.position.z), float(decoded.pose.covariance[14])
+            valid = True
+        if valid and math.isfinite(height):
+            stamp = decoded.header.stamp
+            known = math.isfinite(variance) and variance > 0.0
+            rows[stamp.sec * _NANOSECONDS + stamp.nanosec] = height, variance if known else sd_m**2
+    if not rows:
+        raise RecordingError("no valid height", where=where, valid="finite heights within the sensor's range")
+    stamps = sorted(rows)
+    values = np.array([rows[stamp] for stamp in stamps])
+    return Heights(np.array(stamps, np.int64), values[:, 0], values[:, 1])
+
+
+def _check_topic(path: Path, topics: dict[str, str], topic: str, types: tuple[str, ...]) -> None:
+    """Raise RecordingError unless the topic exists and has one of the types."""
+    if topics.get(topic) in types:
+        return
+    usable = [f"{name} ({kind})" for name, kind in sorted(topics.items()) if kind in types]
+    what = f"topic {topic} has the type {topics[topic]}" if topic in topics else f"no topic {topic}"
+    valid = ", ".join(usable) or f"a topic of type {', '.join(types)}; the bag has none"
+    raise RecordingError(what, where=str(path), valid=valid)
 
 
 class _Decoder:
@@ -103,9 +208,9 @@ class _Decoder:
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
         name = channel.schema.name if channel.schema is not None else ""
-        if channel.schema is None or name not in (*POSITION_TYPES, TF_TYPE):
+        if channel.schema is None or name not in _READABLE_TYPES:
             raise RecordingError(
-                f"messages of type {name!r}", where=self._where, valid=", ".join((*POSITION_TYPES, TF_TYPE))
+                f"messages of type {name!r}", where=self._where, valid=", ".join(_READABLE_TYPES)
             )
         store = get_typestore(Stores.EMPTY)
         try:
@@ -144,6 +249,10 @@ def _path(rows: list[_Row], where: str) -> PosePath:
 
 
 def _chained(edges: dict[str, dict[str, list[_Row]]], root: str, leaf: str, where: str) -> PosePath:
+    return _path(_composed(edges, root, leaf, where), where)
+
+
+def _composed(edges: dict[str, dict[str, list[_Row]]], root: str, leaf: str, where: str) -> list[_Row]:
     """The transforms from the root's frame to the leaf's, one after the other, at the times of the most frequent."""
     chain: list[list[_Row]] = []
     frame = leaf
@@ -168,8 +277,7 @@ def _chained(edges: dict[str, dict[str, list[_Row]]], root: str, leaf: str, wher
         step, by = _held(rows, stamps)
         position = position + _turned(turn, step)
         turn = _times(turn, by)
-    found = [(int(s), *p, *q) for s, p, q in zip(stamps, position.tolist(), turn.tolist(), strict=True)]
-    return _path(found, where)
+    return [(int(s), *p, *q) for s, p, q in zip(stamps, position.tolist(), turn.tolist(), strict=True)]
 
 
 def _held(rows: list[_Row], stamps: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -11,10 +11,20 @@ import typer
 from uwb_mitigation.commands import console
 from uwb_mitigation.commands.checks import check_output
 from uwb_mitigation.commands.console import JsonOption
-from uwb_mitigation.commands.positioning import AreaOption, HeightOption, HeightSdOption, area_of, height_of
-from uwb_mitigation.errors import DatasetError, ParameterError
+from uwb_mitigation.commands.positioning import (
+    AreaOption,
+    HeightOption,
+    HeightSdOption,
+    OffsetOption,
+    area_of,
+    height_of,
+)
+from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from uwb_mitigation.evaluation.site_data import SiteData
     from uwb_mitigation.model.bundle import Bundle
     from uwb_mitigation.positioning.anchors import AnchorMap
@@ -22,6 +32,8 @@ if TYPE_CHECKING:
     from uwb_mitigation.training.calibrated import Calibrated
 
 MOST_SHOWN = 40
+BASE_FRAME = "base_link"
+"""The robot's frame if the poses do not name it."""
 
 
 def calibrate(
@@ -69,9 +81,26 @@ def calibrate(
         str | None,
         typer.Option(
             metavar="X,Y,Z",
-            help="With --truth-topic: where the antenna is in the robot's frame, m; without it, it is estimated.",
+            help="With --truth-topic: position of the antenna in the robot's frame, m. Default: the transform in the bag "
+            "to the frame_id of the ranges, otherwise 0.",
         ),
     ] = None,
+    estimate_lever_arm: Annotated[
+        bool,
+        typer.Option(
+            "--estimate-lever-arm",
+            help="With --truth-topic: estimate the lever arm, starting from that value. Needs a drive with turns.",
+        ),
+    ] = False,
+    height_topic: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TOPIC",
+            help="Measured height of the tag, in place of --height: sensor_msgs/Range, nav_msgs/Odometry or "
+            "geometry_msgs/PoseWithCovarianceStamped.",
+        ),
+    ] = None,
+    stamp_offset: OffsetOption = 0.0,
     report: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Also write a page that shows what was found: FILE.html."),
@@ -100,15 +129,22 @@ def calibrate(
     for file in (output, beside, *([report] if report else [])):
         if file.exists() and not force:
             raise ParameterError("exists already", where=str(file), valid="--force replaces it")
-    if truth_topic is None and (frames is not None or time_offset is not None or lever_arm is not None):
-        raise ParameterError("--frames, --time-offset and --lever-arm", valid="with --truth-topic")
+    with_poses = (frames, time_offset, lever_arm, estimate_lever_arm or None)
+    if truth_topic is None and any(option is not None for option in with_poses):
+        raise ParameterError(
+            "--frames, --time-offset, --lever-arm and --estimate-lever-arm", valid="with --truth-topic"
+        )
+    if height is not None and height_topic is not None:
+        raise ParameterError("--height and --height-topic", valid="one of them")
+    if not abs(stamp_offset) <= 3600.0:
+        raise ParameterError(f"stamp offset {stamp_offset}", valid="-3600 to 3600 s")
     place, box, arm = height_of(height, height_sd), area_of(area), _lever_arm(lever_arm)
     if time_offset is not None and not abs(time_offset) <= 3600.0:
         raise ParameterError(f"time offset {time_offset}", valid="-3600 to 3600 s")
     known = load_anchors(anchors or anchors_file(bags[0]))
     source = bundle_for(None, bags[0])
     try:
-        site = _gather(bags, known, source)
+        site = _gather(bags, known, source, stamp_offset, height_topic)
         for why, count in site.left_out.items():
             _warn(f"left out: {count} x {why}")
         with console.stage_bars() as on_progress:
@@ -117,13 +153,15 @@ def calibrate(
                     site, source, height=place, area=box, seed=seed, on_progress=on_progress
                 )
             else:
+                paths, arms = _poses(bags, site, truth_topic, frames, arm)
                 found = calibrating.with_truth(
                     site,
                     source,
-                    _paths(bags, truth_topic, frames),
+                    paths,
                     truth_topic,
                     time_offset_s=time_offset,
-                    lever_arm_m=arm,
+                    lever_arms_m=arms,
+                    estimate_lever_arm=estimate_lever_arm,
                     seed=seed,
                     on_progress=on_progress,
                 )
@@ -133,8 +171,9 @@ def calibrate(
     _show(found)
     if found.harms and not force:
         harm = DatasetError(
-            f"not written: on what was held out the model leaves {found.calibrated_mae_m:.3f} m, raw ranges "
-            f"{found.raw_mae_m:.3f} m",
+            f"not written: held-out ranges err by {found.calibrated_mae_m:.3f} m after calibration, by "
+            f"{found.raw_mae_m:.3f} m before; positions scatter by {found.position_scatter_m[1]:.3f} m and "
+            f"{found.position_scatter_m[0]:.3f} m" + "".join(f"; {note}" for note in found.notes[:1]),
             valid="a longer drive, or --force",
         )
         console.write_json(json, found.as_json() | {"refused": str(harm)})
@@ -149,21 +188,77 @@ def calibrate(
     console.write_json(json, found.as_json() | {"model_id": bundle.model_id, "offsets_file": str(beside)})
 
 
-def _gather(bags: list[Path], anchors: AnchorMap, source: Bundle) -> SiteData:
+def _gather(
+    bags: list[Path], anchors: AnchorMap, source: Bundle, stamp_offset: float, height_topic: str | None
+) -> SiteData:
     from contextlib import ExitStack
 
+    from uwb_mitigation.bag.pose_paths import read_heights
     from uwb_mitigation.evaluation.site_data import gather
     from uwb_mitigation.sources.opening import open_recording
 
+    heights = None if height_topic is None else [read_heights(bag, height_topic) for bag in bags]
     with ExitStack() as stack, console.reading() as on_record:
         recordings = [stack.enter_context(open_recording(bag)) for bag in bags]
-        return gather(recordings, anchors, source.preprocessing, on_record)
+        return gather(
+            recordings,
+            anchors,
+            source.preprocessing,
+            on_record,
+            stamp_offset_s=stamp_offset,
+            heights=heights,
+        )
 
 
-def _paths(bags: list[Path], topic: str, frames: tuple[str, str] | None) -> list[PosePath]:
-    from uwb_mitigation.bag.pose_paths import read_poses
+def _poses(
+    bags: list[Path],
+    site: SiteData,
+    topic: str,
+    frames: tuple[str, str] | None,
+    arm: tuple[float, float, float] | None,
+) -> tuple[list[list[PosePath]], NDArray[np.float64]]:
+    """The poses of the body that carries each tag, for each bag; and the lever arms (T, 3)."""
+    import numpy as np
 
-    return [read_poses(bag, topic, frames) for bag in bags]
+    from uwb_mitigation.bag.pose_paths import read_bodies, read_lever_arm
+    from uwb_mitigation.bag.poses import tag_frame
+
+    if arm is not None and len(site.tags) > 1:
+        raise ParameterError(
+            f"one --lever-arm for {len(site.tags)} tags",
+            valid="transforms to the frames of the tags in the bag",
+        )
+    bodies = [read_bodies(bag, topic, frames) for bag in bags]
+    paths, arms = [], np.zeros((len(site.tags), 3))
+    for number, tag in enumerate(site.tags):
+        own, body = [], ""
+        for bag, known in zip(bags, bodies, strict=True):
+            body = tag_frame(tag.tag_id)
+            if body not in known:
+                # Poses of another tag's own frame are no poses of a robot that carries this tag.
+                others = list(known)
+                if len(others) != 1 or others[0].startswith(tag_frame(0)[:-1]):
+                    raise RecordingError(
+                        f"no body for tag {tag.tag_id}: poses of {', '.join(sorted(known))}",
+                        where=f"{bag}, topic {topic}",
+                        valid=f"--frames MAP CHILD, or poses of {body}",
+                    )
+                body = others[0]
+            own.append(known[body])
+        paths.append(own)
+        if arm is not None:
+            arms[number] = arm
+        elif body != tag_frame(tag.tag_id):
+            found = [read_lever_arm(bags[0], body or BASE_FRAME, frame) for frame in site.frames[tag.tag_id]]
+            known_arms = [one for one in found if one is not None]
+            if known_arms:
+                arms[number] = known_arms[0]
+            else:
+                _warn(
+                    f"tag {tag.tag_id}: no transform from {body or BASE_FRAME} to its antenna in the bag, so that the lever "
+                    "arm is 0; set --lever-arm"
+                )
+    return paths, arms
 
 
 def _refused(why: str, truth: str | None) -> dict[str, object]:
@@ -193,14 +288,15 @@ def _show(found: Calibrated) -> None:
 
     if found.localised is not None:
         one = found.localised
-        told = ", ".join(
-            f"{value:.3f}" + ("" if sd == 0.0 else " (not told)" if math.isnan(sd) else f" +- {sd:.3f}")
-            for value, sd in zip(one.lever_arm_m, one.lever_arm_sd_m, strict=True)
-        )
         console.out.print(
-            f"time offset {one.time_offset_s:.3f} +- {one.time_offset_sd_s:.3f} s, lever arm {told} m",
-            highlight=False,
+            f"time offset {one.time_offset_s:.3f} +- {one.time_offset_sd_s:.3f} s", highlight=False
         )
+        for ranges, arm, arm_sd in zip(found.site.tags, one.lever_arm_m, one.lever_arm_sd_m, strict=True):
+            known = ", ".join(
+                f"{value:.3f}" + ("" if sd == 0.0 or math.isnan(sd) else f" +- {sd:.3f}")
+                for value, sd in zip(arm.tolist(), arm_sd.tolist(), strict=True)
+            )
+            console.out.print(f"tag {ranges.tag_id}: lever arm {known} m", highlight=False)
     table = Table("tag", "anchor", "offset m", "deviation m", title="Offsets", title_justify="left")
     for column in table.columns[2:]:
         column.justify = "right"
@@ -218,6 +314,8 @@ def _show(found: Calibrated) -> None:
     console.out.print(table)
     for note in found.notes:
         _warn(note)
+    if found.outliers:
+        _warn(f"{found.outliers} outliers left out of all figures")
     console.out.print(found.sentence(), markup=False, highlight=False, soft_wrap=True)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,11 +15,11 @@ from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.measurement import Record
 from uwb_mitigation.mitigation import MAX_RANGE_M
 from uwb_mitigation.positioning.anchors import AnchorMap
-from uwb_mitigation.positioning.tracks import Ranges
+from uwb_mitigation.positioning.tracks import Heights, Ranges
 from uwb_mitigation.preprocessing import Preprocessing
 
 WITH_CIR = 0.5
-"""Where fewer of the ranges have a CIR that can be used, none counts."""
+"""If a smaller share of the ranges has a CIR that can be used, no CIR is used."""
 
 CHUNK_S = 2.0
 """Ranges of a pair in motion err alike for about so long: a configuration."""
@@ -41,6 +41,9 @@ class SiteData:
         preprocessing, inputs: float32 (r, K), zeros where there is no CIR.
         rx_power_dbm, first_path_power_dbm: float32 (r,), NaN = unknown.
         has_cirs: whether the inputs say anything.
+        with_cir: bool (r,), which ranges have a CIR that can be used.
+        height_m: float64 (r,), measured heights of the tags; None: not measured.
+        frames: {tag id: the frame ids of its ranges}.
         left_out: {why: count}.
         shift_ns: what was added to the stamps of each recording, so that none overlap.
     """
@@ -52,6 +55,9 @@ class SiteData:
     rx_power_dbm: NDArray[np.float32]
     first_path_power_dbm: NDArray[np.float32]
     has_cirs: bool
+    with_cir: NDArray[np.bool_]
+    height_m: NDArray[np.float64] | None
+    frames: dict[int, tuple[str, ...]]
     left_out: Counter[str]
     shift_ns: tuple[int, ...]
 
@@ -110,28 +116,36 @@ def gather(
     anchors: AnchorMap,
     preprocessing: Preprocessing,
     on_record: Callable[[], None] = lambda: None,
+    *,
+    stamp_offset_s: float = 0.0,
+    heights: Sequence[Heights] | None = None,
 ) -> SiteData:
-    """Read recordings; what they know of the truth is not looked at.
+    """Read recordings, without their ground truth.
+
+    Args:
+        stamp_offset_s: what to add to the stamps of ranges: -0.2 if they lag by 0.2 s.
+        heights: of the tags, for each recording. Ranges without a height are left out.
 
     Raises:
         DatasetError: no range is of an anchor in the map.
     """
     left_out: Counter[str] = Counter()
-    rows: dict[int, list[tuple[int, int, float, float, float, bool]]] = {}
+    rows: dict[int, list[tuple[int, int, float, float, float, bool, float]]] = {}
+    frames: dict[int, dict[str, None]] = {}
+    offset_ns = round(stamp_offset_s * _SECOND_NS)
     windows: dict[int, list[NDArray[np.float32]]] = {}
     strangers: Counter[int] = Counter()
     shifts: list[int] = []
     latest: int | None = None
-    for recording in recordings:
+    for number, recording in enumerate(recordings):
         shift: int | None = None
         here = latest
         for record in recording:
             on_record()
             measured = record.measurement
+            stamp_ns = measured.stamp_ns + offset_ns
             if shift is None:
-                shift = (
-                    0 if here is None or measured.stamp_ns > here else here - measured.stamp_ns + BETWEEN_NS
-                )
+                shift = 0 if here is None or stamp_ns > here else here - stamp_ns + BETWEEN_NS
             row = anchors.index.get(measured.anchor_id)
             if row is None:
                 strangers[measured.anchor_id] += 1
@@ -139,16 +153,21 @@ def gather(
             if not (math.isfinite(measured.range_m) and 0 <= measured.range_m <= MAX_RANGE_M):
                 left_out["no valid range"] += 1
                 continue
+            height = math.nan if heights is None else float(heights[number].at(np.array([stamp_ns]))[0][0])
+            if heights is not None and math.isnan(height):
+                left_out["no height at that time"] += 1
+                continue
+            frames.setdefault(measured.tag_id, {}).setdefault(measured.frame_id)
             window = np.zeros(preprocessing.samples, np.float32)
             fault = preprocessing.apply(measured.cir, window)
             if fault is not None:
                 window[:] = 0.0
-            stamp_ns = measured.stamp_ns + shift
+            stamp_ns += shift
             latest = stamp_ns if latest is None else max(latest, stamp_ns)
             cir = measured.cir
             power = cir.rx_power_dbm, cir.first_path_power_dbm
             rows.setdefault(measured.tag_id, []).append(
-                (stamp_ns, row, measured.range_m, *power, fault is None)
+                (stamp_ns, row, measured.range_m, *power, fault is None, height)
             )
             windows.setdefault(measured.tag_id, []).append(window)
         shifts.append(shift or 0)
@@ -162,15 +181,12 @@ def gather(
         )
     with_cir = np.array([row[5] for tag in sorted(rows) for row in rows[tag]])
     has_cirs = bool(with_cir.mean() >= WITH_CIR)
-    if has_cirs and not with_cir.all():
-        left_out["no CIR that can be used"] += int((~with_cir).sum())
-    tags, inputs, powers = [], [], []
+    tags, inputs, powers, usable, level_m = [], [], [], list[bool](), list[float]()
     for tag in sorted(rows):
         order = sorted(range(len(rows[tag])), key=lambda i, own=rows[tag]: own[i][0])  # type: ignore[misc]
-        kept = [i for i in order if rows[tag][i][5] or not has_cirs]
-        if not kept:
-            continue
-        part = [rows[tag][i] for i in kept]
+        part = [rows[tag][i] for i in order]
+        usable += [row[5] for row in part]
+        level_m += [row[6] for row in part]
         rx = np.array([row[3] for row in part], np.float64)
         tags.append(
             Ranges(
@@ -182,7 +198,7 @@ def gather(
                 tag,
             )
         )
-        inputs.append(np.stack([windows[tag][i] for i in kept]))
+        inputs.append(np.stack([windows[tag][i] for i in order]))
         powers.append(np.array([row[3:5] for row in part], np.float64))
     reported = np.concatenate(powers)
     level = np.where(np.isfinite(reported), reported, np.nan).astype(np.float32)
@@ -194,6 +210,9 @@ def gather(
         level[:, 0],
         level[:, 1],
         has_cirs,
+        np.array(usable),
+        None if heights is None else np.array(level_m),
+        {tag: tuple(own) for tag, own in frames.items()},
         left_out,
         tuple(shifts),
     )

@@ -157,6 +157,16 @@ class Solution:
     _y: NDArray[np.float64]
     _chain: Chain
 
+    def reduced(
+        self, of: NDArray[np.intp], own: NDArray[np.float64], rows: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Rows of the shared unknowns (n, q) of measurements, after the knots have adapted to those unknowns.
+
+        Args: as in `Chain.add_rows`.
+        """
+        found: NDArray[np.float64] = rows - np.einsum("nb,nbq->nq", own, self._y[of])
+        return found
+
     def covariances(self, first: int | None = None) -> NDArray[np.float64]:
         """The marginal covariance of every knot, float64 (K, f, f), of its `first` unknowns (None = all).
 

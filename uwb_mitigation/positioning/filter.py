@@ -10,6 +10,7 @@ Schmidt-Kalman Filter", 2017). Covariances by Joseph's form, which holds for any
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -182,6 +183,29 @@ class RangeFilter:
     def update_height(self, height_m: float, variance_m2: float) -> float:
         """Take in the height of the tag; returns the normalised innovation."""
         return self._direct(2, height_m, variance_m2)
+
+    def confine(self, low: Sequence[float], high: Sequence[float]) -> bool:
+        """Project the position onto a box; return whether it was outside.
+
+        This is estimate projection (Simon, "Kalman filtering with state constraints", 2010): the covariance stays, so
+        that repeated projections do not count as new information.
+        """
+        x = self.x
+        outside = False
+        for axis in range(3):
+            excess = x[axis] - min(max(x[axis], low[axis]), high[axis])
+            if excess == 0.0:
+                continue
+            outside = True
+            gain = self.p[:, axis] / max(self.p[axis, axis], 1e-12)
+            # Where the correlation with another coordinate is steep, the linear model does not hold.
+            gain[:3] = np.clip(gain[:3], -1.0, 1.0)
+            if not self.learns:
+                gain[OFFSET:] = 0.0
+            x -= gain * excess
+        if outside:
+            x[:3] = np.clip(x[:3], low, high)
+        return outside
 
     def update_speed(self, speed_m_per_s: float, variance_m2: float) -> float:
         """Take in the horizontal speed that wheels tell; returns the normalised innovation.

@@ -28,6 +28,11 @@ UNDERSTATED = 1.5
 """By how much deviations are multiplied: errors of one place come again with each lap, and a track bends to what persists,
 which counting new ranges does not know. Of simulated drives, with it 9 of 10 offsets lie within two deviations."""
 
+SLOW_SD_M, SLOW_S = 0.05, 20.0
+"""Errors of a pair that stay the same for many seconds: reflections at one place, and the range bias of a DW1000, which
+changes by 0.1 m with the received power (Decawave APS011). Averaging does not reduce them. Where the geometry is weak, as
+outside of the anchors, they contribute most of the error of the common offset."""
+
 AROUND_M = 5.0
 """Keeps a place of which too few anchors are left from running away, and no other."""
 
@@ -50,6 +55,7 @@ class Links:
         knot, anchor: int (n,), where each belongs; knots of one stretch stand together.
         ahead_s: float64 (n,), its time after the knot's.
         range_m, share: float64 (n,), and how much of a new range each is.
+        rise: float64 (n,), the height of the tag above the common one.
         rows: float64 (n, q), of the parameters.
         alike: int (n,), links that err about as much have the same number, from 0.
         of: int (n,), the link of each of the original ranges (r,).
@@ -61,6 +67,7 @@ class Links:
     ahead_s: NDArray[np.float64]
     range_m: NDArray[np.float64]
     share: NDArray[np.float64]
+    rise: NDArray[np.float64]
     rows: NDArray[np.float64]
     alike: NDArray[np.intp]
     of: NDArray[np.intp]
@@ -79,7 +86,7 @@ class Links:
     def without(self, left_out: NDArray[np.bool_]) -> Links:
         """The same knots, without those links (n,); `of` says nothing any more."""
         kept = ~left_out
-        columns = ("knot", "anchor", "ahead_s", "range_m", "share", "rows", "alike")
+        columns = ("knot", "anchor", "ahead_s", "range_m", "share", "rise", "rows", "alike")
         return replace(self, **{name: getattr(self, name)[kept] for name in columns})
 
 
@@ -114,11 +121,13 @@ def links_of(stretches: Stretches, rows: NDArray[np.float64], alike: NDArray[np.
     )
     _, first, of = np.unique(key, return_index=True, return_inverse=True)
     value, shared, kind = ranges.range_m[first].copy(), rows[first].copy(), alike[first].copy()
+    rise = stretches.rise[first].copy()
     order = np.argsort(of, kind="stable")
     groups = np.split(order, np.searchsorted(of[order], np.arange(1, len(first))))
     for link, group in enumerate(groups):
         if len(group) > 1:
             value[link] = np.median(ranges.range_m[group])
+            rise[link] = np.median(stretches.rise[group])
             shared[link] = np.median(rows[group], axis=0)
             kind[link] = int(np.median(alike[group]))
     return Links(
@@ -127,6 +136,7 @@ def links_of(stretches: Stretches, rows: NDArray[np.float64], alike: NDArray[np.
         ahead[first],
         value,
         share[first],
+        rise,
         shared,
         kind,
         of,
@@ -270,7 +280,7 @@ class JointSolver:
             place,
             velocity,
             shared,
-            UNDERSTATED**2 * solution.shared_covariance,
+            self._covariance(solution, x, shared, scale),
             error,
             self._model.weight(z),
             scale,
@@ -278,6 +288,29 @@ class JointSolver:
             solution,
             self._height,
         )
+
+    def _covariance(
+        self,
+        solution: Solution,
+        x: NDArray[np.float64],
+        shared: NDArray[np.float64],
+        scale: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """The covariance of the parameters: of noise, and of errors that stay the same for `SLOW_S`."""
+        links = self._links
+        direction, _, error = self._errors(x, shared)
+        weight = self._model.weight(error / scale[links.alike]) * links.share / scale[links.alike] ** 2
+        rows = solution.reduced(links.knot, self._own(direction), links.rows)
+        gain = weight[:, None] * rows @ solution.shared_covariance
+        chunk = (links.time_s[links.knot] // SLOW_S).astype(np.intp)
+        group = np.stack([links.stretch, chunk, links.anchor])
+        _, of = np.unique(group, axis=1, return_inverse=True)
+        summed = np.zeros((int(of.max(initial=0)) + 1, len(shared)))
+        np.add.at(summed, of.reshape(-1), gain)
+        found: NDArray[np.float64] = (
+            UNDERSTATED**2 * solution.shared_covariance + SLOW_SD_M**2 * summed.T @ summed
+        )
+        return found
 
     @property
     def _level(self) -> float:
@@ -291,9 +324,15 @@ class JointSolver:
         at = x[links.knot]
         tag = np.full((len(at), 3), self._level)
         tag[:, :d] = at[:, :d] + links.ahead_s[:, None] * at[:, d:]
+        tag[:, 2] += links.rise
         away = tag - self._anchors.position[links.anchor]
         distance = np.maximum(np.sqrt(np.einsum("ni,ni->n", away, away)), 0.05)
         return away / distance[:, None], distance, links.range_m - distance - links.rows @ shared
+
+    def _own(self, direction: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The derivative of each range with respect to the position and velocity of its knot, float64 (n, 2 d)."""
+        level = direction[:, : self._d]
+        return np.concatenate([level, self._links.ahead_s[:, None] * level], axis=1)
 
     def _linearised(
         self,
@@ -304,7 +343,7 @@ class JointSolver:
         weight: NDArray[np.float64],
     ) -> Chain:
         d, links = self._d, self._links
-        own = np.concatenate([direction[:, :d], links.ahead_s[:, None] * direction[:, :d]], axis=1)
+        own = self._own(direction)
         # The unknowns themselves are solved for, not their changes: motion and priors are linear in them.
         target = error + links.rows @ shared + np.einsum("nb,nb->n", own, x[links.knot])
         chain = Chain.empty(len(x), 2 * d, len(shared))

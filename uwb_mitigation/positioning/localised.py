@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +36,13 @@ SMOOTHED_S = 0.2
 
 SLOPE_S = 0.1
 """The velocity of a pose is from so long before and after it."""
+
+SEPARATED_M = 0.1
+"""A lever arm that is known less well cannot be separated from the offsets."""
+
+BLOCK_S, UNDERSTATED = 10.0, 1.5
+"""Errors of blocks of that duration count as independent. Errors that come again with each lap are not in their scatter:
+hence the factor."""
 
 FINE_LAG_S = 0.02
 LEVER_STEPS = 5
@@ -142,7 +148,8 @@ class Localised:
 
     Attributes:
         time_offset_s, time_offset_sd_s: what to add to a range's stamp to have the localisation's; an sd of 0 = given.
-        lever_arm_m, lever_arm_sd_m: (3,), of the antenna in the robot's frame; sd 0 = given, NaN = not told.
+        lever_arm_m, lever_arm_sd_m: (T, 3), of each tag's antenna in the robot's frame; sd 0 = given, NaN = not observable,
+            so that the start value holds.
         pairs: (tag number, anchor row), and `offset_m`, `offset_sd_m` of each.
         position: float64 (r, 3), of the antenna at each of all ranges; NaN = not known. distance_m: (r,), to the anchor.
     """
@@ -162,48 +169,48 @@ class Localised:
         at = self.pairs.index((tag, row))
         return float(self.offset_m[at]), math.hypot(float(self.offset_sd_m[at]), anchor_sd_m / math.sqrt(2.0))
 
-    @property
-    def lever_arm(self) -> tuple[float, float, float]:
-        """The same as numbers."""
-        x, y, z = self.lever_arm_m.tolist()
-        return x, y, z
-
     def as_json(self) -> dict[str, object]:
-        """Numbers; null = not told."""
-        sds = [None if math.isnan(sd) else sd for sd in self.lever_arm_sd_m.tolist()]
+        """Numbers; null = not observable. The arm of the first tag, and of all in the order of their ids."""
+        arms = self.lever_arm_m.tolist()
+        sds = [[None if math.isnan(sd) else sd for sd in own] for own in self.lever_arm_sd_m.tolist()]
         return {
             "time_offset_s": self.time_offset_s,
             "time_offset_sd_s": self.time_offset_sd_s,
-            "lever_arm_m": self.lever_arm_m.tolist(),
-            "lever_arm_sd_m": sds,
+            "lever_arm_m": arms[0],
+            "lever_arm_sd_m": sds[0],
+            "lever_arms_m": arms,
+            "lever_arms_sd_m": sds,
         }
 
 
 def solve_localised(
     anchors: AnchorMap,
     tags: Sequence[Ranges],
-    path: PosePath,
+    paths: Sequence[PosePath],
     known: Regressors,
     *,
     time_offset_s: float | None = None,
-    lever_arm_m: tuple[float, float, float] | None = None,
+    lever_arms_m: NDArray[np.float64] | None = None,
+    estimate_lever_arm: bool = False,
 ) -> Localised:
-    """Time offset, lever arm and offsets.
+    """Estimate time offset and offsets, and on request the lever arms.
 
     Args:
-        path: of the robot that carries all the tags.
+        paths: of the robot that carries the tag, for each tag.
         known: as many rows as there are ranges, one tag after the other.
-        time_offset_s, lever_arm_m: where known.
+        time_offset_s: if known.
+        lever_arms_m: float64 (T, 3), of each tag; None: zero.
+        estimate_lever_arm: start from these arms and estimate them.
 
     Raises:
-        DatasetError: too few ranges lie within the localisation's times, or it does not move.
+        DatasetError: too few ranges lie within the localisation's times, or arms and offsets cannot be separated.
     """
     stamp = np.concatenate([one.stamp_ns for one in tags])
     row = np.concatenate([one.anchor for one in tags])
     value = np.concatenate([one.range_m for one in tags])
     tag = np.repeat(np.arange(len(tags)), list(map(len, tags)))
-    if len(path) < 2:
-        raise DatasetError(f"{len(path)} poses of the localisation", valid="two or more")
+    if (fewest := min(map(len, paths))) < 2:
+        raise DatasetError(f"{fewest} poses of the localisation", valid="two or more")
     pairs, of_pair = np.unique(np.stack([tag, row]), axis=1, return_inverse=True)
     of_pair = of_pair.reshape(-1)
     chosen = np.arange(len(stamp))
@@ -214,31 +221,57 @@ def solve_localised(
         stamp[chosen],
         value[chosen],
         of_pair[chosen],
+        tag[chosen],
         pairs.shape[1],
         known.take(chosen),
-        path.smoothed(),
+        [path.smoothed() for path in paths],
     )
-    lever = np.zeros(3) if lever_arm_m is None else np.array(lever_arm_m, float)
+    levers = np.zeros((len(tags), 3)) if lever_arms_m is None else lever_arms_m
+    start, free = levers, np.full(levers.shape, estimate_lever_arm)
     lag = time_offset_s
     if lag is None:
-        lag, lever = fitted.likely(lever, lever_arm_m is None)
-    unknown = fitted.solve(lag, lever, time_offset_s is None, lever_arm_m is None)
-    position, turn = path.at(stamp, unknown.lag)
-    antenna = position + turn @ unknown.lever
+        lag, start = fitted.likely(levers, estimate_lever_arm)
+    unknown = fitted.solve(lag, start, levers, time_offset_s is None, free)
+    if estimate_lever_arm:
+        free = unknown.lever_sd < SEPARATED_M
+        if not free[:, :2].all():
+            raise DatasetError(
+                "lever arm and offsets cannot be separated: the standard deviation of the arm is "
+                f"{unknown.lever_sd[:, :2].max():.2f} m",
+                valid="--lever-arm or a transform in the bag instead of --estimate-lever-arm, or a drive with more turns",
+            )
+        if not free.all():
+            # A level drive does not observe the height of the arm: it would trade off against the offsets.
+            unknown = fitted.solve(
+                unknown.lag, np.where(free, unknown.lever, levers), levers, time_offset_s is None, free
+            )
+    position, turn = _at(paths, tag, stamp, unknown.lag)
+    antenna = position + np.einsum("nij,nj->ni", turn, unknown.lever[tag])
     distance = np.linalg.norm(antenna - anchors.position[row], axis=1)
-    _check_enough(int(np.isfinite(distance).sum()), time_offset_s is None or lever_arm_m is None)
-    sd = np.sqrt(np.diag(unknown.covariance))[: 4 + pairs.shape[1]]
+    _check_enough(int(np.isfinite(distance).sum()), time_offset_s is None or estimate_lever_arm)
+    arm_sd = np.where(free, unknown.lever_sd, np.nan) if estimate_lever_arm else np.zeros(levers.shape)
     return Localised(
         unknown.lag,
-        float(sd[0]) if time_offset_s is None else 0.0,
+        float(unknown.sd[0]) if time_offset_s is None else 0.0,
         unknown.lever,
-        np.where(unknown.told, sd[1:4], np.nan) if lever_arm_m is None else np.zeros(3),
+        arm_sd,
         tuple((int(a), int(b)) for a, b in pairs.T),
         unknown.offset,
-        sd[4:],
+        unknown.sd[1 + levers.size :][: pairs.shape[1]],
         antenna,
         distance,
     )
+
+
+def _at(
+    paths: Sequence[PosePath], tag: NDArray[np.intp], stamp_ns: NDArray[np.int64], later_s: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """As `PosePath.at`, of the path of each tag (n,)."""
+    position, turn = np.zeros((len(tag), 3)), np.zeros((len(tag), 3, 3))
+    for number, path in enumerate(paths):
+        own = tag == number
+        position[own], turn[own] = path.at(stamp_ns[own], later_s)
+    return position, turn
 
 
 def _check_enough(count: int, alignment_unknown: bool) -> None:
@@ -253,24 +286,30 @@ def _check_enough(count: int, alignment_unknown: bool) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Unknowns:
+    """Of T tags and their pairs; sd: float64 (1 + 3 T + pairs + regressors,), in this order."""
+
     lag: float
     lever: NDArray[np.float64]
     offset: NDArray[np.float64]
-    covariance: NDArray[np.floating[Any]]
-    told: NDArray[np.bool_]
+    sd: NDArray[np.float64]
+
+    @property
+    def lever_sd(self) -> NDArray[np.float64]:
+        return self.sd[1 : 1 + self.lever.size].reshape(self.lever.shape)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Fit:
-    """n ranges (n,) to anchors (n, 3), of `count` pairs; `known` of them."""
+    """n ranges (n,) of tags (n,) to anchors (n, 3), of `count` pairs; `known` of them. Lever arms are float64 (T, 3)."""
 
     anchor: NDArray[np.float64]
     stamp_ns: NDArray[np.int64]
     range_m: NDArray[np.float64]
     pair: NDArray[np.intp]
+    tag: NDArray[np.intp]
     count: int
     known: Regressors
-    path: PosePath
+    paths: Sequence[PosePath]
 
     def likely(self, lever: NDArray[np.float64], free_lever: bool) -> tuple[float, NDArray[np.float64]]:
         """The lag with which ranges agree best, and the lever arm beside it: from each lag anew, since a wrong one has
@@ -295,7 +334,7 @@ class _Fit:
 
     def _some(self, count: int) -> _Fit:
         part = np.linspace(0, len(self.range_m) - 1, count).astype(int)
-        columns = ("anchor", "stamp_ns", "range_m", "pair")
+        columns = ("anchor", "stamp_ns", "range_m", "pair", "tag")
         some = {name: getattr(self, name)[part] for name in columns}
         return replace(self, known=self.known.take(part), **some)
 
@@ -317,11 +356,16 @@ class _Fit:
             known = np.isfinite(left) & np.isfinite(rows).all(axis=1)
             if int(known.sum()) < LEAST_RANGES:
                 return lever
-            rows, left = rows[known], left[known]
-            weight = 1.0 / np.maximum(np.abs(left), _SMALL_M)
-            certainty = float(weight.sum()) * _SMALL_M**2 / LEVER_SD_M**2
-            normal = rows.T @ (weight[:, None] * rows) + certainty * np.eye(3)
-            lever = lever + np.linalg.solve(normal, rows.T @ (weight * left) - certainty * lever)
+            lever = lever.copy()
+            for tag in range(len(lever)):
+                own = known & (self.tag == tag)
+                if not own.any():
+                    continue
+                weight = 1.0 / np.maximum(np.abs(left[own]), _SMALL_M)
+                certainty = float(weight.sum()) * _SMALL_M**2 / LEVER_SD_M**2
+                normal = rows[own].T @ (weight[:, None] * rows[own]) + certainty * np.eye(3)
+                right = rows[own].T @ (weight * left[own]) - certainty * lever[tag]
+                lever[tag] += np.linalg.solve(normal, right)
         return lever
 
     def _medians(self, error: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -335,50 +379,77 @@ class _Fit:
         self, lag: float, lever: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Range less distance and what is expected beside it (n,), unit vectors (n, 3) from anchor to antenna, rotations (n, 3, 3)."""
-        position, turn = self.path.at(self.stamp_ns, lag)
-        away = position + turn @ lever - self.anchor
+        position, turn = _at(self.paths, self.tag, self.stamp_ns, lag)
+        away = position + np.einsum("nij,nj->ni", turn, lever[self.tag]) - self.anchor
         distance = np.maximum(np.linalg.norm(away, axis=1), 0.05)
         return self.range_m - self.known.rows @ self.known.mean - distance, away / distance[:, None], turn
 
-    def solve(self, lag: float, lever: NDArray[np.float64], free_lag: bool, free_lever: bool) -> _Unknowns:
-        first = 4 + self.count
-        size = first + len(self.known.mean)
+    def solve(
+        self,
+        lag: float,
+        lever: NDArray[np.float64],
+        expected: NDArray[np.float64],
+        free_lag: bool,
+        free_lever: NDArray[np.bool_],
+    ) -> _Unknowns:
+        """From a lag and lever arms; `expected`: the arms as known before, bool (T, 3): which coordinates are estimated."""
+        arms = slice(1, 1 + lever.size)
+        pairs = slice(arms.stop, arms.stop + self.count)
+        size = pairs.stop + len(self.known.mean)
         certainty = 1.0 / np.array(
             [
                 LAG_SD_S**2 if free_lag else 1e-18,
-                *[LEVER_SD_M**2 if free_lever else 1e-18] * 3,
+                *np.where(free_lever.reshape(-1), LEVER_SD_M**2, 1e-18).tolist(),
                 *[OFFSET_SD_M**2] * self.count,
                 *(self.known.sd**2).tolist(),
             ]
         )
         # What is known of regressors' factors is taken off with their means.
-        mean = np.array([lag, *lever, *np.zeros(size - 4)])
-        if free_lag:
-            mean[0] = 0.0
-        x = np.array([lag, *lever, *self._medians(self._errors(lag, lever)[0]), *np.zeros(size - first)])
+        mean = np.array([0.0 if free_lag else lag, *expected.reshape(-1), *np.zeros(size - arms.stop)])
+        offsets = self._medians(self._errors(lag, lever)[0])
+        x = np.array([lag, *lever.reshape(-1), *offsets, *np.zeros(size - pairs.stop)])
         # Ranges of a pair err alike for about so long (see `model`).
-        chunk = (self.stamp_ns - self.stamp_ns.min()) // round(2.0 * _PERSISTENCE_S * _SECOND_NS)
+        since = self.stamp_ns - self.stamp_ns.min()
+        chunk = since // round(2.0 * _PERSISTENCE_S * _SECOND_NS)
         group = chunk * self.count + self.pair
-        covariance: NDArray[np.floating[Any]] = np.eye(size)
+        every = np.arange(len(self.pair))
         for step_number in range(_STEPS):
-            error, unit, turn = self._errors(x[0], x[1:4])
-            beside, before = (self._errors(x[0] + by, x[1:4])[0] for by in (SLOPE_S, -SLOPE_S))
+            arm = x[arms].reshape(lever.shape)
+            error, unit, turn = self._errors(x[0], arm)
+            beside, before = (self._errors(x[0] + by, arm)[0] for by in (SLOPE_S, -SLOPE_S))
             rows = np.zeros((len(error), size))
             rows[:, 0] = (before - beside) / (2.0 * SLOPE_S)
-            rows[:, 1:4] = np.einsum("ni,nij->nj", unit, turn)
-            rows[np.arange(len(error)), 4 + self.pair] = 1.0
-            rows[:, first:] = self.known.rows
-            left = error - x[4:first][self.pair] - self.known.rows @ x[first:]
+            for axis in range(3):
+                rows[every, 1 + 3 * self.tag + axis] = np.einsum("ni,ni->n", unit, turn[:, :, axis])
+            rows[every, pairs.start + self.pair] = 1.0
+            rows[:, pairs.stop :] = self.known.rows
+            left = error - x[pairs][self.pair] - self.known.rows @ x[pairs.stop :]
             known = np.isfinite(left) & np.isfinite(rows).all(axis=1)
-            _check_enough(int(known.sum()), free_lag or free_lever)
-            normal, right = normal_equations(
-                rows[known], left[known], group[known], self.known.alike[known], _MODEL
-            )
+            _check_enough(int(known.sum()), free_lag or bool(free_lever.any()))
+            normal, right = self._normal(rows, left, group, known)
             covariance = np.linalg.inv(normal + np.diag(certainty))
             move = covariance @ (right + certainty * (mean - x))
             move[0] = np.clip(move[0], -0.3, 0.3)
             x = x + move
             if float(np.abs(move).max()) < 1e-5 and step_number > 3:
                 break
-        told = np.sqrt(np.diag(covariance)[1:4]) < 0.3 * LEVER_SD_M
-        return _Unknowns(float(x[0]), x[1:4].copy(), x[4:first].copy(), covariance, told)
+        # Errors persist for longer than a group, and those of the localisation are in all pairs: the scatter of the
+        # scores of long blocks shows it (Liang and Zeger, Biometrika 1986).
+        block = since // round(BLOCK_S * _SECOND_NS)
+        scores = np.array(
+            [self._normal(rows, left, group, known & (block == one))[1] for one in np.unique(block[known])]
+        )
+        blocks = max(len(scores), 2)
+        robust = covariance @ (scores.T @ scores) @ covariance * (blocks / (blocks - 1))
+        sd = UNDERSTATED * np.sqrt(np.diag(covariance) + np.diag(robust))
+        arm = np.where(free_lever, x[arms].reshape(lever.shape), expected)
+        return _Unknowns(float(x[0]), arm, x[pairs].copy(), sd)
+
+    def _normal(
+        self,
+        rows: NDArray[np.float64],
+        left: NDArray[np.float64],
+        group: NDArray[np.intp],
+        some: NDArray[np.bool_],
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        return normal_equations(rows[some], left[some], group[some], self.known.alike[some], _MODEL)

@@ -17,7 +17,7 @@ from uwb_mitigation.positioning.filter import FIRST_ERROR, RangeFilter
 from uwb_mitigation.positioning.geometry import Geometry, geometry
 from uwb_mitigation.positioning.model import Model
 from uwb_mitigation.positioning.start import IMPLAUSIBLE, Area, Height, Place, places
-from uwb_mitigation.positioning.tracks import Estimate, Ranges, Track
+from uwb_mitigation.positioning.tracks import Estimate, Heights, Ranges, Track
 
 WINDOW_S = 1.0
 """A place is sought from the ranges of so long: every anchor has had its turn, and a robot is a metre on."""
@@ -30,6 +30,20 @@ STRANGE = 3.0
 
 DISAGREES = 1.5
 """An anchor whose normalised innovations have such a mean disagrees: what persists for a second averages out."""
+
+_UNCERTAIN_HEIGHT_M = 0.5
+"""With a larger standard deviation in z, a height is not a linear measurement: the position is searched again."""
+
+_SEPARABLE = 9.0
+"""Squared distance of two positions in their ranges, in standard deviations, from which the ranges separate them."""
+
+_UNDETERMINED_M = 5.0
+"""A position with a larger horizontal standard deviation is not determined by the ranges."""
+
+UNKNOWN_HEIGHT_SD_M = 0.1
+"""Standard deviation of a measured height without a variance."""
+
+HEIGHT_AGE_NS = 200_000_000
 
 _KEPT_RANGES = 400
 _MOST_PLACES = 12
@@ -105,6 +119,7 @@ class TagLocator:
         states: of each anchor.
         counts, health: what happened so far.
         candidates: how many places are plausible; 1 = the tag is followed, 0 = too little is known.
+        undetermined: the ranges do not determine the horizontal position at all.
     """
 
     def __init__(
@@ -125,6 +140,10 @@ class TagLocator:
         self._filter: RangeFilter | None = None
         self._last_known: RangeFilter | None = None
         self._candidates: list[_Candidate] = []
+        self._ambiguous_with: list[NDArray[np.float64]] = []
+        self.undetermined = False
+        self._pressed = False
+        self._heights: deque[tuple[float, float, float]] = deque(maxlen=_KEPT_RANGES)
         self._recent: deque[_Heard] = deque(maxlen=_KEPT_RANGES)
         self._origin_ns: int | None = None
         self._time_s = -math.inf
@@ -134,7 +153,9 @@ class TagLocator:
 
     @property
     def candidates(self) -> int:
-        return 1 if self._filter is not None else len(self._candidates)
+        if self._filter is not None:
+            return 1
+        return len(self._candidates) + len(self._ambiguous_with)
 
     @property
     def following(self) -> bool:
@@ -186,14 +207,30 @@ class TagLocator:
         return self._estimate(stamp_ns) if self._filter is not None else None
 
     def add_height(self, height_m: float, variance_m2: float) -> None:
-        """Take in the tag's height, at the time of the latest range."""
+        """Take in the tag's height, at the time of the latest range; one that is not finite is skipped."""
+        if not (math.isfinite(height_m) and math.isfinite(variance_m2)):
+            return
+        # A variance of 0 means unknown in ROS.
+        variance_m2 = variance_m2 if variance_m2 > 0.0 else UNKNOWN_HEIGHT_SD_M**2
+        self._heights.append((self._time_s, height_m, variance_m2))
+        limit = max(_UNCERTAIN_HEIGHT_M**2, 4.0 * variance_m2)
+        if self._height is None and any(one.p[2, 2] > limit for one in self._filters()):
+            found = self._places()
+            if found and len(found) <= _MOST_PLACES:
+                self._last_known = self._filter or self._last_known
+                self._filter = None
+                self._start(found, self._time_s)
+                self._settle()
+                return
         for one in self._filters():
             one.update_height(height_m, variance_m2)
+            self._confine(one)
 
     def add_speed(self, speed_m_per_s: float, variance_m2: float) -> None:
         """Take in the tag's horizontal speed, at the time of the latest range."""
         for one in self._filters():
             one.update_speed(speed_m_per_s, variance_m2)
+            self._confine(one)
 
     def at(self, stamp_ns: int) -> Estimate | None:
         """Where the tag is at a time from the latest range on, without another range; None = not known.
@@ -205,14 +242,16 @@ class TagLocator:
             return None
         ahead = known.copy()
         ahead.predict(self._seconds(stamp_ns))
+        self._confine(ahead)
         return _as_estimate(ahead, stamp_ns)
 
     def restart(self, stamp_ns: int | None = None) -> None:
         """Forget the place, not the counts."""
         self._origin_ns = stamp_ns
         self._filter = self._last_known = None
-        self._candidates = []
+        self._candidates, self._ambiguous_with = [], []
         self._recent.clear()
+        self._heights.clear()
         self._time_s = self._next_try_s = self._checked_s = self._sought_since_s = -math.inf
         for state in self.states:
             state.heard_s, state.strange = -math.inf, 0.0
@@ -232,7 +271,7 @@ class TagLocator:
         if self._filter is None:
             return None
         rows = self.heard()
-        return geometry(self.anchors.position[rows], self._filter.position, level=self._height is not None)
+        return geometry(self.anchors.position[rows], self._filter.position, level=self._dims == 2)
 
     def _seconds(self, stamp_ns: int) -> float:
         if self._origin_ns is None:
@@ -250,6 +289,7 @@ class TagLocator:
     ) -> None:
         known.predict(time_s)
         z, _ = known.update(anchor, range_m, variance_m2)
+        self._pressed |= self._confine(known)
         self.health.add(z)
         state = self.states[anchor]
         state.z = z
@@ -260,12 +300,27 @@ class TagLocator:
             heard = self.heard()
             known.learns = len(heard) >= self._dims + _LEARN_SPARE
             odd = sum(self.states[i].strange > 0.5 for i in heard)
-            if 2 * odd >= len(heard) > 0 and odd:
+            # At the edge of the area the filter may follow a solution that is outside of it.
+            if self._pressed or (2 * odd >= len(heard) > 0 and odd):
+                self._pressed = False
                 self._doubt(known)
+
+    def _confine(self, one: RangeFilter) -> bool:
+        """Keep a filter inside the area; return whether it was outside."""
+        return self._area is not None and one.confine(self._area.low, self._area.high)
+
+    def _known_height(self) -> Height | None:
+        """The constant height, or that of the last second's measurements; None: unknown."""
+        while self._heights and self._heights[0][0] < self._time_s - WINDOW_S:
+            self._heights.popleft()
+        if self._height is not None or not self._heights:
+            return self._height
+        _, heights, variances = zip(*self._heights, strict=True)
+        return Height(float(np.median(heights)), max(math.sqrt(float(np.median(variances))), 0.02))
 
     @property
     def _dims(self) -> int:
-        return 2 if self._height is not None else 3
+        return 2 if self._known_height() is not None else 3
 
     def _doubt(self, known: RangeFilter) -> None:
         """Most anchors disagree: is there a place that explains their ranges much better?"""
@@ -300,6 +355,7 @@ class TagLocator:
             for candidate in self._candidates:
                 candidate.filter.predict(time_s)
                 z, sd = candidate.filter.update(anchor, range_m, variance_m2)
+                self._confine(candidate.filter)
                 candidate.loss += float(self._model.loss(np.float64(z))) + math.log(sd)
             self._settle()
             return
@@ -319,14 +375,12 @@ class TagLocator:
         best = min(candidate.loss for candidate in self._candidates)
         kept: list[_Candidate] = []
         for candidate in sorted(self._candidates, key=lambda c: c.loss):
-            if candidate.loss > best + IMPLAUSIBLE or not self._possible(candidate.filter):
+            if candidate.loss > best + IMPLAUSIBLE:
                 continue
             if all(np.linalg.norm(candidate.filter.position - other.filter.position) > 0.3 for other in kept):
                 kept.append(candidate)
         self._candidates = kept
-        if not kept:
-            self._sought_since_s = self._time_s
-        elif len(kept) == 1:
+        if len(kept) == 1 and self._is_unique(kept[0].filter):
             self._filter = kept[0].filter
             self._last_known = None
             self._candidates = []
@@ -339,8 +393,35 @@ class TagLocator:
             self._sought_since_s = self._time_s
             self._candidates = []
 
-    def _possible(self, one: RangeFilter) -> bool:
-        return self._area is None or bool(self._area.holds(one.position))
+    def _is_unique(self, one: RangeFilter) -> bool:
+        """Whether the latest ranges distinguish the filter's position from every other possible one.
+
+        The likelihood of recorded ranges can prefer one of two mirror images by chance, because errors persist. So exact
+        ranges from the filter's position are compared with those from the other solutions.
+        """
+        if self._time_s < self._next_try_s:
+            return not (self._ambiguous_with or self.undetermined)
+        self._next_try_s = self._time_s + _RETRY_S
+        rows = self.heard()
+        anchors, model = self.anchors.position[rows], self._model
+        range_m = np.linalg.norm(anchors - one.position, axis=1)
+        sd_m = np.sqrt(model.range_sd**2 + model.offset_sd**2 + self.anchors.sd[rows] ** 2)
+        height = self._known_height()
+        found = places(anchors, range_m, sd_m, model, height=height, area=self._area)
+        self._ambiguous_with, self.undetermined = [], False
+        if not found:
+            return True
+        nearest = min(found, key=lambda place: float(np.linalg.norm(place.position - one.position)))
+        here = self._surprise(nearest, self._time_s)
+        for place in found:
+            z = (np.linalg.norm(anchors - place.position, axis=1) - range_m) / sd_m
+            apart = 2.0 * (self._surprise(place, self._time_s) - here) + float(z @ z)
+            if place is nearest:
+                largest = float(np.linalg.eigvalsh(place.covariance[:2, :2])[-1])
+                self.undetermined = self._last_known is None and largest > _UNDETERMINED_M**2
+            elif apart < _SEPARABLE and np.linalg.norm((place.position - one.position)[:2]) > 0.5:
+                self._ambiguous_with.append(place.position)
+        return not (self._ambiguous_with or self.undetermined)
 
     def _window(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Anchors' positions (k, 3), median ranges (k,) and their deviations (k,) of the last second."""
@@ -362,11 +443,13 @@ class TagLocator:
         anchors, range_m, sd_m = self._window()
         if len(range_m) < self._dims:
             return []
-        return places(anchors, range_m, sd_m, self._model, height=self._height, area=self._area)
+        return places(anchors, range_m, sd_m, self._model, height=self._known_height(), area=self._area)
 
     def _start(self, found: list[Place], time_s: float) -> None:
         """A filter at each place; what the pairs' errors did to the place is kept as their correlation."""
-        self._candidates = []
+        self._candidates, self._ambiguous_with = [], []
+        # The next check whether the position is unique must not wait.
+        self._next_try_s = -math.inf
         model = self._model
         for place in found:
             covariance = place.covariance.copy()
@@ -423,8 +506,8 @@ class LiveRun:
     estimates: list[Estimate] = field(default_factory=list)
 
 
-def run_live(ranges: Ranges, locator: TagLocator) -> LiveRun:
-    """Feed recorded ranges to a locator."""
+def run_live(ranges: Ranges, locator: TagLocator, heights: Heights | None = None) -> LiveRun:
+    """Feed recorded ranges, and heights where there are any, to a locator."""
     estimates: list[Estimate] = []
     columns = zip(
         ranges.stamp_ns.tolist(),
@@ -433,7 +516,19 @@ def run_live(ranges: Ranges, locator: TagLocator) -> LiveRun:
         ranges.variance_m2.tolist(),
         strict=True,
     )
+    measured: list[tuple[int, float, float]] = []
+    if heights is not None:
+        of_heights = (heights.stamp_ns, heights.height_m, heights.variance_m2)
+        measured = list(zip(*(column.tolist() for column in of_heights), strict=True))
+    next_height, latest_ns = 0, None
     for stamp_ns, anchor, range_m, variance_m2 in columns:
+        while next_height < len(measured) and measured[next_height][0] <= stamp_ns:
+            height_ns, *height = measured[next_height]
+            next_height += 1
+            # The locator takes a height as of the latest range: skip those in a gap of the ranges.
+            if latest_ns is not None and height_ns - latest_ns <= HEIGHT_AGE_NS:
+                locator.add_height(*height)
+        latest_ns = stamp_ns
         estimate = locator.add(stamp_ns, anchor, range_m, variance_m2)
         if estimate is not None:
             estimates.append(estimate)

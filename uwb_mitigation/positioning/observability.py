@@ -10,7 +10,7 @@ from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.geometry import Shape, shape
 from uwb_mitigation.positioning.joint import JointFit, JointSolver, Links
 from uwb_mitigation.positioning.model import Model
-from uwb_mitigation.positioning.other_anchors import less_parameters, without
+from uwb_mitigation.positioning.other_anchors import less_parameters
 from uwb_mitigation.positioning.smoother import Parameters
 from uwb_mitigation.positioning.start import Area, Height
 
@@ -21,16 +21,15 @@ LEAST_NEW = 20
 MIRRORED = 4.5
 """Mirror images are as good where one is not less likely than the other by e^-4.5."""
 
-CONTRADICTS_M, CONTRADICTS = 0.12, 2.0
-"""Anchors contradict each other where ranges scatter so much; the one without which they scatter less by such a factor,
-and by as much less than without any other, is to blame."""
 
-
-def check_anchors(anchors: AnchorMap, used: NDArray[np.intp], height: Height | None) -> None:
+def check_anchors(
+    anchors: AnchorMap, used: NDArray[np.intp], height: Height | None, area: Area | None = None
+) -> None:
     """Refuse anchors that cannot tell.
 
     Args:
         used: rows of those that were heard.
+        area: where tags can be; it can exclude the mirror image of a track at a plane of anchors.
 
     Raises:
         DatasetError: too few, or all on a line (without a height: in a plane).
@@ -47,10 +46,10 @@ def check_anchors(anchors: AnchorMap, used: NDArray[np.intp], height: Height | N
     kind = shape(position)
     if kind in (Shape.POINT, Shape.LINE):
         raise DatasetError("the anchors are all on a line", valid="one or more beside it")
-    if height is None and kind is Shape.PLANE:
+    if height is None and area is None and kind is Shape.PLANE:
         raise DatasetError(
             "the anchors are all in a plane: mirrored at it, the track explains the ranges as well",
-            valid="--height of the tag, or an anchor above or below that plane",
+            valid="--height of the tag, --area on one side of the plane, or an anchor above or below that plane",
         )
 
 
@@ -91,28 +90,4 @@ def check_motion(links: Links, fit: JointFit, height: Height | None) -> None:
         raise DatasetError(
             f"{len(links.of)} ranges that say {new:.0f} things: too few",
             valid=f"{needed:.0f} or more: a longer drive, or more anchors at each place",
-        )
-
-
-def check_contradiction(
-    anchors: AnchorMap, links: Links, fit: JointFit, height: Height | None, model: Model
-) -> None:
-    """Raises `DatasetError` where anchors contradict each other; names the one without which they would not."""
-
-    def scatter(one: JointFit) -> float:
-        return float(np.sqrt(np.mean(np.minimum(np.abs(one.residual_m), 5.0) ** 2)))
-
-    used = np.unique(links.anchor)
-    if scatter(fit) < CONTRADICTS_M or len(used) < 4:
-        return
-    left = np.array(
-        [scatter(without(anchors, links, fit, used[k : k + 1], height, model)) for k in range(len(used))]
-    )
-    order = np.argsort(left)
-    best, next_best = left[order[0]], left[order[1]]
-    name = anchors.anchors[used[order[0]]]
-    if best * CONTRADICTS < min(scatter(fit), next_best):
-        raise DatasetError(
-            f"anchor {name} contradicts the others: with it ranges scatter by {scatter(fit):.2f} m, without it by {best:.2f} m",
-            valid="its true place in the anchors file (`uwb-mitigation survey` finds it)",
         )

@@ -16,6 +16,7 @@ from uwb_mitigation.positioning.smoother import Parameters
 from uwb_mitigation.positioning.start import Height
 
 MOST_REFITS = 8
+MOST_GROUPS = 5
 
 
 def less_parameters(links: Links, fit: JointFit) -> Links:
@@ -39,6 +40,39 @@ def without(
     )
 
 
+def position_scatter(
+    anchors: AnchorMap,
+    links: Links,
+    fit: JointFit,
+    correction_m: NDArray[np.float64],
+    height: Height | None,
+    model: Model,
+) -> float:
+    """The error of the horizontal positions without ground truth, RMSE in m: the jackknife over the anchors.
+
+    Errors of ranges that contradict each other move the track when an anchor is left out. An error that all anchors have in
+    common is not seen.
+
+    Args:
+        correction_m: float64 (n,), what is subtracted from each range.
+
+    Returns:
+        NaN if too few anchors remain.
+    """
+    used = np.unique(links.anchor)
+    groups = min(MOST_GROUPS, len(used))
+    parts = [used[k::groups] for k in range(groups)]
+    if len(used) - max(map(len, parts)) < (3 if height is not None else 4):
+        return float("nan")
+    corrected = replace(links, range_m=links.range_m - correction_m, rows=np.zeros((len(links), 0)))
+    nothing = replace(fit, parameters=np.zeros(0))
+    tracks = np.array(
+        [without(anchors, corrected, nothing, part, height, model).position[:, :2] for part in parts]
+    )
+    squared = np.sum((tracks - tracks.mean(axis=0)) ** 2, axis=(0, 2))
+    return float(np.sqrt(squared.mean() * (groups - 1) / groups))
+
+
 def seen_by_others(
     anchors: AnchorMap, found: Stretches, links: Links, fit: JointFit, height: Height | None, model: Model
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -60,6 +94,7 @@ def seen_by_others(
         away = (
             seen.position[knot] + ahead[:, None] * seen.velocity[knot] - anchors.position[links.anchor[own]]
         )
+        away[:, 2] += links.rise[own]
         length = np.maximum(np.linalg.norm(away, axis=1), 0.05)
         unit = away / length[:, None]
         known = np.sqrt(np.einsum("ni,nij,nj->n", unit, covariance[knot], unit))

@@ -54,6 +54,7 @@ class Stretches:
         row: int (n,), and which of that tag's ranges.
         of: int (n,), the stretch of each, from 0.
         at_rest: bool (s,), of each stretch.
+        rise: float64 (n,), the height of the tag above the common one at each range.
     """
 
     ranges: Ranges
@@ -61,6 +62,7 @@ class Stretches:
     row: NDArray[np.intp]
     of: NDArray[np.intp]
     at_rest: NDArray[np.bool_]
+    rise: NDArray[np.float64]
 
     def __len__(self) -> int:
         """The number of stretches."""
@@ -76,6 +78,7 @@ class Stretches:
             self.row[rows],
             number[self.of[rows]],
             self.at_rest[wanted],
+            self.rise[rows],
         )
 
 
@@ -102,7 +105,7 @@ def stretches(tags: Sequence[Ranges], anchors: AnchorMap, height: Height | None,
         np.concatenate([one.variance_m2 for one in taken]),
         np.concatenate([one.rx_power_dbm for one in taken]),
     )
-    return Stretches(columns, tag_of, row_of, np.concatenate(of), np.array(at_rest))
+    return Stretches(columns, tag_of, row_of, np.concatenate(of), np.array(at_rest), np.zeros(len(columns)))
 
 
 def _one(ranges: Ranges, carried: _Carried) -> list[tuple[NDArray[np.intp], bool]]:

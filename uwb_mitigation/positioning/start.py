@@ -15,6 +15,10 @@ IMPLAUSIBLE = 9.0
 
 _STEPS = 40
 _STUCK = 0.01
+_WALL_SD_M = 0.02
+"""Standard deviation of the pseudo-measurement that holds a position at the wall of the area."""
+
+_NEAR_WALL_M = 0.5
 _AROUND = 24
 _SPHERE = 96
 
@@ -66,6 +70,11 @@ class Area:
         inside: NDArray[np.bool_] = np.all((position >= self.low) & (position <= self.high), axis=-1)
         return inside
 
+    def clip(self, position: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the nearest point of the box to each position float64 (..., 3)."""
+        nearest: NDArray[np.float64] = np.clip(position, self.low, self.high)
+        return nearest
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Place:
@@ -108,19 +117,8 @@ def places(
     if len(range_m) < dims:
         return []
     x = _starts(anchors, range_m, height)
-    damping = np.full(len(x), 1e-2)
-    cost, gradient, hessian, _ = _linearised(x, anchors, range_m, sd_m, model, height)
-    for _ in range(_STEPS):
-        diagonal = np.einsum("nii->ni", hessian)
-        damped = hessian + (damping[:, None] * diagonal + 1e-9)[:, :, None] * np.eye(3)
-        trial = x - np.linalg.solve(damped, gradient[..., None])[..., 0]
-        found = _linearised(trial, anchors, range_m, sd_m, model, height)
-        better = found[0] <= cost
-        x = np.where(better[:, None], trial, x)
-        cost = np.where(better, found[0], cost)
-        gradient = np.where(better[:, None], found[1], gradient)
-        hessian = np.where(better[:, None, None], found[2], hessian)
-        damping = np.clip(np.where(better, damping / 4.0, damping * 8.0), 1e-8, 1e8)
+    prior = _Prior.of(len(x), height)
+    x, cost, gradient, hessian = _descend(x, anchors, range_m, sd_m, model, prior)
     # A start that got stuck on its way is no place, unless all did.
     step = np.linalg.solve(hessian + 1e-9 * np.eye(3), gradient[..., None])[..., 0]
     arrived = np.einsum("ni,ni->n", step, gradient) < _STUCK
@@ -128,20 +126,79 @@ def places(
         cost = np.where(arrived, cost, np.inf)
     keep = cost <= cost.min() + IMPLAUSIBLE
     if area is not None:
-        keep = area.holds(x) & np.isfinite(cost)
+        keep = np.isfinite(cost)
+        excess = x - area.clip(x)
+        squared = np.einsum("ni,ni->n", excess, np.einsum("nij,nj->ni", hessian, excess))
+        near = (np.linalg.norm(excess, axis=1) < _NEAR_WALL_M) | (squared < IMPLAUSIBLE)
+        keep &= near
         if not keep.any():
             return []
+        outside = np.flatnonzero(keep & (excess != 0.0).any(axis=1))
+        if len(outside):
+            # Optima just outside, because of range errors: find the best positions on the wall.
+            walls = prior.take(outside).with_walls(area.clip(x[outside]), excess[outside] != 0.0)
+            x[outside], cost[outside], *_ = _descend(
+                area.clip(x[outside]), anchors, range_m, sd_m, model, walls
+            )
+            x = area.clip(x)
         keep &= cost <= cost[keep].min() + IMPLAUSIBLE
     result: list[Place] = []
     for i in np.flatnonzero(keep)[np.argsort(cost[keep])]:
         if any(_same(x[i], place) for place in result):
             continue
-        _, _, h, rows = _linearised(x[i : i + 1], anchors, range_m, sd_m, model, height)
+        _, _, h, rows = _linearised(x[i : i + 1], anchors, range_m, sd_m, model, _Prior.of(1, height))
         covariance = np.linalg.inv(h[0] + 1e-6 * np.eye(3))
         # Of the damped normal equations, ranges only: their errors move the position by this much.
         gain = covariance @ (rows[0] / sd_m[:, None]).T
         result.append(Place(x[i].copy(), covariance, gain, float(cost[i])))
     return result
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Prior:
+    """Independent priors of n positions: mean float64 (n, 3) and inverse variance (n, 3), 0 = none."""
+
+    mean: NDArray[np.float64]
+    information: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, count: int, height: Height | None) -> _Prior:
+        prior = cls(np.zeros((count, 3)), np.zeros((count, 3)))
+        if height is not None:
+            prior.mean[:, 2], prior.information[:, 2] = height.value, 1.0 / height.sd**2
+        return prior
+
+    def take(self, rows: NDArray[np.intp]) -> _Prior:
+        return _Prior(self.mean[rows], self.information[rows])
+
+    def with_walls(self, wall: NDArray[np.float64], held: NDArray[np.bool_]) -> _Prior:
+        """The same, with the coordinates `held` bool (n, 3) at the walls."""
+        return _Prior(np.where(held, wall, self.mean), np.where(held, 1.0 / _WALL_SD_M**2, self.information))
+
+
+def _descend(
+    x: NDArray[np.float64],
+    anchors: NDArray[np.float64],
+    range_m: NDArray[np.float64],
+    sd_m: NDArray[np.float64],
+    model: Model,
+    prior: _Prior,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Levenberg-Marquardt from n starts: positions, loss, gradient and Hessian."""
+    damping = np.full(len(x), 1e-2)
+    cost, gradient, hessian, _ = _linearised(x, anchors, range_m, sd_m, model, prior)
+    for _ in range(_STEPS):
+        diagonal = np.einsum("nii->ni", hessian)
+        damped = hessian + (damping[:, None] * diagonal + 1e-9)[:, :, None] * np.eye(3)
+        trial = x - np.linalg.solve(damped, gradient[..., None])[..., 0]
+        found = _linearised(trial, anchors, range_m, sd_m, model, prior)
+        better = found[0] <= cost
+        x = np.where(better[:, None], trial, x)
+        cost = np.where(better, found[0], cost)
+        gradient = np.where(better[:, None], found[1], gradient)
+        hessian = np.where(better[:, None, None], found[2], hessian)
+        damping = np.clip(np.where(better, damping / 4.0, damping * 8.0), 1e-8, 1e8)
+    return x, cost, gradient, hessian
 
 
 def _same(position: NDArray[np.float64], place: Place) -> bool:
@@ -178,7 +235,7 @@ def _linearised(
     range_m: NDArray[np.float64],
     sd_m: NDArray[np.float64],
     model: Model,
-    height: Height | None,
+    prior: _Prior,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Loss (n,), its gradient (n, 3), a Gauss-Newton Hessian (n, 3, 3), and weighted rows (n, k, 3) at places x."""
     away = x[:, None] - anchors
@@ -190,9 +247,8 @@ def _linearised(
     cost = model.loss(z).sum(axis=1)
     gradient = -np.einsum("nki,nk->ni", rows, z)
     hessian = np.einsum("nki,nkj->nij", rows, slope)
-    if height is not None:
-        above = (x[:, 2] - height.value) / height.sd
-        cost = cost + 0.5 * above * above
-        gradient[:, 2] += above / height.sd
-        hessian[:, 2, 2] += 1.0 / height.sd**2
-    return cost, gradient, hessian, rows
+    apart = x - prior.mean
+    pull = prior.information * apart
+    cost = cost + 0.5 * np.einsum("ni,ni->n", pull, apart)
+    hessian[:, [0, 1, 2], [0, 1, 2]] += prior.information
+    return cost, gradient + pull, hessian, rows

@@ -113,3 +113,27 @@ class TruePath:
         if len(own) > 1:
             found[own[after] - own[after - 1] > 1_000_000_000] = np.nan
         return found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Heights:
+    """Measured heights of a tag in the anchors' frame.
+
+    Attributes:
+        stamp_ns: int64 (n,), ascending.
+        height_m: float64 (n,), finite.
+        variance_m2: float64 (n,), positive.
+    """
+
+    stamp_ns: NDArray[np.int64]
+    height_m: NDArray[np.float64]
+    variance_m2: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.stamp_ns)
+
+    def at(self, stamp_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return height and variance at each stamp, linearly interpolated; NaN outside and in gaps of over 1 s."""
+        columns = np.stack([self.height_m, self.variance_m2, np.zeros(len(self))], axis=1)
+        found = TruePath(self.stamp_ns, columns).at(stamp_ns)
+        return found[:, 0], found[:, 1]

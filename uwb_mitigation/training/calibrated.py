@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.dataset import Dataset
 from uwb_mitigation.errors import ModelError
+from uwb_mitigation.evaluation.preference import MUST_GAIN
 from uwb_mitigation.evaluation.site_data import SiteData
 from uwb_mitigation.evaluation.site_page import AnchorRow, OffsetRow, SitePage
 from uwb_mitigation.files import write_together
@@ -34,10 +36,15 @@ class Calibrated:
         choice: the model.
         notes: what was not told apart, or left out, in words.
         track: float64 (k, 3), where the tags were at `track_of` (k,), the stretches; for a picture.
-        network: the factor of the universal network's predictions and its deviation; (0, 0) = not solved for.
+        network: the factor by which the bundle multiplies the universal network's predictions (0: no network; 1: of a
+            fine-tuned network), and the standard deviation of the factor in the joint solution (0: given).
         line: the same of the received power, m/dB.
         localised: what `truth` needed.
         places: {tag id: position} of tags at rest; {`tag id #number`: position} of each place of one that was at several.
+        outliers: the number of ranges that were left out of all figures because their errors are implausible.
+        common_sd_m: the standard deviation of the mean offset, which the evaluation has in common with the offsets; 0 with
+            ground truth.
+        position_scatter_m: the scatter of positions between tracks without one anchor, raw and calibrated; NaN = unknown.
     """
 
     site: SiteData
@@ -55,6 +62,9 @@ class Calibrated:
     line: tuple[float, float]
     localised: Localised | None
     places: dict[str, tuple[float, float, float]]
+    outliers: int
+    common_sd_m: float
+    position_scatter_m: tuple[float, float]
 
     @property
     def raw_mae_m(self) -> float:
@@ -68,16 +78,40 @@ class Calibrated:
 
     @property
     def harms(self) -> bool:
-        return self.calibrated_mae_m >= self.raw_mae_m
+        """Whether the held-out error is not lower than the raw one by `MUST_GAIN`, or positions scatter more."""
+        raw, calibrated = self.position_scatter_m
+        return self.calibrated_mae_m > (1.0 - MUST_GAIN) * self.raw_mae_m or calibrated > raw
+
+    @property
+    def sure_gain(self) -> float:
+        """The share by which the held-out error is lower at least, if the mean offset is wrong by two standard deviations.
+
+        Without ground truth the held-out ranges are compared with a track that contains the error of the mean offset.
+        """
+        left = self.choice.held_out[self.choice.chosen]
+        by = (-2.0 * self.common_sd_m, 0.0, 2.0 * self.common_sd_m)
+        return min(
+            1.0 - float(np.abs(left + wrong).mean() / max(np.abs(self.raw_m + wrong).mean(), 1e-9))
+            for wrong in by
+        )
 
     def sentence(self) -> str:
-        """What it should bring, for people."""
-        less = 1.0 - self.calibrated_mae_m / self.raw_mae_m
-        truth = "where the other anchors see the tag" if self.truth is None else "the localisation"
-        how = f"Ranges here err by {self.raw_mae_m:.3f} m on the mean against {truth}"
+        """The result in one sentence."""
+        errors = (
+            f"{self.raw_mae_m:.3f} m raw, {self.calibrated_mae_m:.3f} m calibrated ({self.choice.chosen})"
+        )
+        if self.truth is not None:
+            what = f"Held-out range errors against {self.truth}: {errors}"
+        else:
+            what = f"Held-out range residuals against the other anchors (not ground truth): {errors}"
+            if not math.isnan(self.position_scatter_m[0]):
+                raw, calibrated = self.position_scatter_m
+                what += f"; positions without one anchor scatter by {raw:.3f} m raw, {calibrated:.3f} m calibrated"
         if self.harms:
-            return f"{how}; the model makes that no better ({self.calibrated_mae_m:.3f} m)."
-        return f"{how}; with this model it should be {self.calibrated_mae_m:.3f} m, {less:.0%} less ({self.choice.chosen})."
+            return f"{what}: no gain."
+        if (gain := self.sure_gain) <= 0.0:
+            return f"{what}. The gain is smaller than its uncertainty."
+        return f"{what}: at least {gain:.0%} less."
 
     def as_json(self) -> dict[str, object]:
         """The result of `uwb-mitigation calibrate`."""
@@ -94,6 +128,8 @@ class Calibrated:
             "candidates": self.choice.mae(),
             "ranges": sum(map(len, self.site.tags)),
             "labelled": len(self.data),
+            "outliers": self.outliers,
+            "position_scatter_m": [None if math.isnan(value) else value for value in self.position_scatter_m],
             "network_factor": list(self.network),
             "line": {
                 "offset_m": prior.offset_m,
@@ -155,7 +191,7 @@ def shown(result: Calibrated, name: str) -> SitePage:
     facts = []
     if result.localised is not None:
         told = result.localised
-        arm = ", ".join(f"{value:.3f}" for value in told.lever_arm_m)
+        arm = "; ".join(", ".join(f"{value:.3f}" for value in own) for own in told.lever_arm_m)
         facts.append(
             f"Localisation {result.truth}: time offset {told.time_offset_s:.3f} s, lever arm {arm} m."
         )

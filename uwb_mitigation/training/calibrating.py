@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,9 +15,10 @@ from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.evaluation.site_data import SiteData
 from uwb_mitigation.model.bundle import Bundle
 from uwb_mitigation.model.float_networks import float_network
-from uwb_mitigation.offsets import MAX_OFFSET_M, Offsets
+from uwb_mitigation.offsets import Offsets
 from uwb_mitigation.positioning.localised import PosePath, solve_localised
 from uwb_mitigation.positioning.regressors import NETWORK_SD, SLOPE_SD, Regressors
+from uwb_mitigation.positioning.scatter import MAD_TO_SD
 from uwb_mitigation.positioning.self_calibration import SelfCalibration, calibrate
 from uwb_mitigation.positioning.start import Area, Height
 from uwb_mitigation.training import site_model
@@ -27,6 +28,12 @@ UNSURE_M = 0.25
 """Ranges whose pseudo-truth has a larger deviation are left out."""
 
 LEAST_LABELLED = 40
+MOST_OFFSET_M = 1.0
+"""Radios of one kind without individual antenna delays differ by 0.3 m at three sigma (Decawave APS014)."""
+
+OUTLIER_M, OUTLIER_SDS = 3.0, 10.0
+"""A range is an outlier if its error is further than both from the median error."""
+
 KINDS = 8
 """Of ranges, by how much the network corrects them: as many of each."""
 
@@ -54,18 +61,22 @@ def without_truth(
         DatasetError: geometry does not tell; says what is missing.
     """
     on_progress("solving for track and offsets", 0.05)
-    found = calibrate(site.anchors, site.tags, regressors(site, source), height=height, area=area)
+    found = calibrate(
+        site.anchors, site.tags, regressors(site, source), height=height, area=area, heights_m=site.height_m
+    )
     on_progress("solving for track and offsets", 0.4)
     of_range = site.begins[found.stretches.tag] + found.stretches.row
     known = np.isfinite(found.pseudo_m) & (found.pseudo_sd_m <= UNSURE_M)
-    notes = list(found.not_told)
-    if (unsure := int((~known).sum())) > 0:
+    known, outliers = _without_outliers(found.stretches.ranges.range_m - found.pseudo_m, known)
+    notes = [*found.not_told, *_without_cir(site)]
+    if (unsure := int((~known).sum()) - outliers) > 0:
         notes.append(
             f"{unsure} of {len(known)} ranges left out of the fit: the other anchors tell too little of where the tag was"
         )
+    known &= _fits_model(site)[of_range]
     _check_labelled(int(known.sum()))
     ids = [anchor.id for anchor in site.anchors.anchors]
-    pair_m = {(found.tag_ids[tag], ids[row]): found.pair(tag, row) for tag, row in found.pairs()}
+    pair_m = {(found.tag_ids[tag], ids[row]): found.applied(tag, row) for tag, row in found.pairs()}
     _check_offsets(pair_m)
     offsets = _offsets(found, ids, pair_m)
     data, raw = _labelled(
@@ -76,7 +87,6 @@ def without_truth(
         found.stretches.of[known],
         found.stretches.at_rest,
     )
-    network = found.value(NETWORK)
     used = np.flatnonzero(known)
 
     def offsets_without(held_out: NDArray[np.intp]) -> NDArray[np.float64]:
@@ -84,6 +94,7 @@ def without_truth(
         grown = {
             (found.tag_ids[tag], ids[row]): again.pair(tag, row)[0] - found.pair(tag, row)[0]
             for tag, row in found.pairs()
+            if found.applied(tag, row)[0] != 0.0
         }
         return _of_rows(data, grown)
 
@@ -107,46 +118,68 @@ def without_truth(
         (*notes, *choice.notes),
         found.fit.position,
         found.links.knot_stretch,
-        network,
+        (choice.factor, found.value(NETWORK)[1]),
         found.value(LEVEL),
         None,
         _places(found),
+        outliers,
+        found.mean()[1],
+        found.position_scatter_m,
     )
 
 
 def with_truth(
     site: SiteData,
     source: Bundle,
-    paths: list[PosePath],
+    paths: Sequence[Sequence[PosePath]],
     topic: str,
     *,
     time_offset_s: float | None,
-    lever_arm_m: tuple[float, float, float] | None,
+    lever_arms_m: NDArray[np.float64] | None = None,
+    estimate_lever_arm: bool = False,
     seed: int,
     on_progress: Progress = lambda what, share: None,
 ) -> Calibrated:
-    """Calibrate against a localisation's poses, of which `paths` are one a recording; the rest as `without_truth`."""
+    """Calibrate against the poses of a localisation.
+
+    Args:
+        paths: for each tag, the poses of the robot that carries it, for each recording.
+        time_offset_s, lever_arms_m, estimate_lever_arm: as of `solve_localised`. The others as of `without_truth`.
+    """
     on_progress("time offset and lever arm", 0.05)
-    path = PosePath.joined([one.shifted(by) for one, by in zip(paths, site.shift_ns, strict=True)])
+    joined = [
+        PosePath.joined([one.shifted(by) for one, by in zip(own, site.shift_ns, strict=True)])
+        for own in paths
+    ]
     known = regressors(site, source)
     found = solve_localised(
         site.anchors,
         site.tags,
-        path,
+        joined,
         known,
         time_offset_s=time_offset_s,
-        lever_arm_m=lever_arm_m,
+        lever_arms_m=lever_arms_m,
+        estimate_lever_arm=estimate_lever_arm,
     )
     on_progress("time offset and lever arm", 0.3)
-    rows = np.flatnonzero(np.isfinite(found.distance_m))
+    value = np.concatenate([one.range_m for one in site.tags])
+    error = value - found.distance_m
+    kept, outliers = _without_outliers(error, np.isfinite(error))
+    rows = np.flatnonzero(kept & _fits_model(site))
     _check_labelled(len(rows))
     ids = [anchor.id for anchor in site.anchors.anchors]
     pair_m = {
         (site.tags[tag].tag_id, ids[row]): found.pair(tag, row, float(site.anchors.sd[row]))
         for tag, row in found.pairs
     }
+    common = float(np.median([value for value, sd in pair_m.values() if sd <= UNSURE_M] or [0.0]))
+    spread = MAD_TO_SD * float(np.median([abs(value - common) for value, _ in pair_m.values()]))
+    # Few ranges say less about the offset of a pair than the other pairs do.
+    unsure = math.hypot(UNSURE_M, spread)
+    pair_m = {
+        pair: (common, unsure) if sd > UNSURE_M else (value, sd) for pair, (value, sd) in pair_m.items()
+    }
     _check_offsets(pair_m)
-    common = float(np.median([value for value, _ in pair_m.values()]))
     offsets = _of_pairs(common, pair_m)
     tag = np.repeat(np.arange(len(site.tags)), list(map(len, site.tags)))
     data, raw = _labelled(
@@ -159,10 +192,10 @@ def with_truth(
         again = solve_localised(
             site.anchors,
             [one.take(part - begin) for one, part, begin in zip(site.tags, own, site.begins, strict=True)],
-            path,
+            joined,
             known.take(kept),
             time_offset_s=found.time_offset_s,
-            lever_arm_m=found.lever_arm,
+            lever_arms_m=found.lever_arm_m,
         )
         grown = {
             (site.tags[number].tag_id, ids[row]): again.pair(number, row, 0.0)[0]
@@ -189,13 +222,16 @@ def with_truth(
         data,
         raw,
         choice,
-        choice.notes,
+        (*_without_cir(site), *choice.notes),
         track,
         tag[rows],
-        (1.0, 0.0) if site.has_cirs else (0.0, 0.0),
+        (choice.factor, 0.0),
         (0.0, 0.0),
         found,
         {},
+        outliers,
+        0.0,
+        (math.nan, math.nan),
     )
 
 
@@ -203,11 +239,13 @@ def regressors(site: SiteData, source: Bundle) -> Regressors:
     """What may make ranges long: the universal network's prediction where there are CIRs, else the received power."""
     if site.has_cirs:
         predicted = site_model.network_m(float_network(source), site.inputs)
-        rows = np.where(np.isfinite(predicted), predicted, 0.0)[:, None]
+        rows = np.where(np.isfinite(predicted) & site.with_cir, predicted, 0.0)[:, None]
         # What it takes for undisturbed errs by centimetres, what it corrects by decimetres.
         size = np.abs(rows[:, 0])
-        edges = np.quantile(size, np.linspace(0.0, 1.0, KINDS + 1)[1:-1])
-        return Regressors((NETWORK,), rows, np.ones(1), np.array([NETWORK_SD]), np.searchsorted(edges, size))
+        edges = np.quantile(size[site.with_cir], np.linspace(0.0, 1.0, KINDS + 1)[1:-1])
+        # Ranges without a CIR are not corrected, so that they have a standard deviation of their own.
+        alike = np.where(site.with_cir, np.searchsorted(edges, size), KINDS)
+        return Regressors((NETWORK,), rows, np.ones(1), np.array([NETWORK_SD]), alike)
     power = site.rx_power_dbm.astype(np.float64)
     known = np.isfinite(power)
     if known.mean() < 0.5 or np.ptp(power[known]) < 1.0:
@@ -218,12 +256,11 @@ def regressors(site: SiteData, source: Bundle) -> Regressors:
 def _offsets(
     found: SelfCalibration, ids: list[int], pair_m: dict[tuple[int, int], tuple[float, float]]
 ) -> Offsets:
-    common = found.value("offset")[0]
+    common = found.mean()[0] if found.mean_is_significant else 0.0
     if found.level == "pair":
         return _of_pairs(common, pair_m)
     if found.level == "anchor":
-        own = {ids[row]: common + found.value(f"anchor {row}")[0] for _, row in found.pairs()}
-        return Offsets(common, anchors=own)
+        return Offsets(common, anchors={ids[row]: found.applied(tag, row)[0] for tag, row in found.pairs()})
     return Offsets(common)
 
 
@@ -265,6 +302,18 @@ def _labelled(
     return replace(nothing, range_m=nothing.range_m - off, error_m=nothing.error_m - off), nothing.error_m
 
 
+def _without_outliers(
+    error_m: NDArray[np.float64], known: NDArray[np.bool_]
+) -> tuple[NDArray[np.bool_], int]:
+    """Which of the `known` errors are no outliers, bool (n,), and the number of outliers."""
+    if not known.any():
+        return known, 0
+    away = np.abs(error_m - np.median(error_m[known]))
+    limit = max(OUTLIER_M, OUTLIER_SDS * MAD_TO_SD * float(np.median(away[known])))
+    kept = known & (away <= limit)
+    return kept, int(known.sum() - kept.sum())
+
+
 def _whole_stretch(
     held_out: NDArray[np.intp], labelled: NDArray[np.intp], stretch: NDArray[np.intp]
 ) -> NDArray[np.bool_]:
@@ -290,6 +339,16 @@ def _of_rows(data: Dataset, of_pair: dict[tuple[int, int], float]) -> NDArray[np
     return np.array([of_pair.get(pair, 0.0) for pair in pairs])
 
 
+def _fits_model(site: SiteData) -> NDArray[np.bool_]:
+    """Which ranges the model is fitted to, bool (r,): the others contribute to track and offsets only."""
+    return site.with_cir if site.has_cirs else np.ones(len(site.with_cir), np.bool_)
+
+
+def _without_cir(site: SiteData) -> tuple[str, ...]:
+    count = int((~_fits_model(site)).sum())
+    return (f"{count} ranges without a usable CIR: used for track and offsets only",) if count else ()
+
+
 def _check_labelled(count: int) -> None:
     if count < LEAST_LABELLED:
         raise DatasetError(
@@ -298,9 +357,17 @@ def _check_labelled(count: int) -> None:
 
 
 def _check_offsets(pair_m: dict[tuple[int, int], tuple[float, float]]) -> None:
+    median = float(np.median([value for value, _ in pair_m.values()]))
     for (tag, anchor), (value, _) in pair_m.items():
-        if not abs(value) <= MAX_OFFSET_M:
+        what = f"an offset of {value:.2f} m of tag {tag} and anchor {anchor}"
+        if abs(value - median) > MOST_OFFSET_M:
             raise DatasetError(
-                f"an offset of {value:.1f} m, of tag {tag} and anchor {anchor}",
-                valid=f"at most {MAX_OFFSET_M:g} m: is the antenna delay set (`uwb-mitigation antenna-delay`)?",
+                f"{what}; the median of all pairs is {median:.2f} m",
+                valid=f"the true position of anchor {anchor} in the anchors file; radios of one kind differ by less than "
+                f"{MOST_OFFSET_M:g} m",
+            )
+        if abs(value) > MOST_OFFSET_M:
+            raise DatasetError(
+                what,
+                valid=f"{MOST_OFFSET_M:g} m at most: set the antenna delay first (`uwb-mitigation antenna-delay`)",
             )

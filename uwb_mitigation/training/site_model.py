@@ -99,7 +99,8 @@ class SiteChoice:
     chosen: one of `CANDIDATES`.
     errors: {`raw`, candidate: float64 (n + n,) or (n,)}, m, on stretches held out, then on anchors held out.
     held_out: {the same: float64 (n,)}, on stretches held out alone: one error of each range.
-    prior, network: of all of the data.
+    prior, network: of all of the data. factor: by which the network multiplies the universal one's predictions; 0 = no
+        network, 1 = a fine-tuned one.
     notes: what was not tried, and why.
     """
 
@@ -108,6 +109,7 @@ class SiteChoice:
     held_out: Mapping[str, NDArray[np.float64]]
     prior: LinePrior
     network: FloatWeights | None
+    factor: float
     notes: tuple[str, ...]
 
     def mae(self) -> dict[str, float]:
@@ -167,6 +169,7 @@ def choose(
         {name: error[: len(data)] for name, error in errors.items()},
         fitted.prior,
         fitted.network,
+        0.0 if fitted.network is None else 1.0 if fitted.factor is None else fitted.factor,
         tuple(notes),
     )
 
