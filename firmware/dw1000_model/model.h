@@ -54,6 +54,7 @@ enum {
 #define CFG_DIS_RSDE (1u << 14)
 #define CFG_FCS_INIT2F (1u << 15)
 #define CFG_PHR_MODE (3u << 16)
+#define CFG_DIS_STXP (1u << 18)
 #define CFG_RXM110K (1u << 22)
 #define CFG_RXWTOE (1u << 28)
 #define CFG_RXAUTR (1u << 29)
@@ -117,7 +118,7 @@ typedef enum {
 } counter;
 
 /* What belongs together is cancelled together. */
-typedef enum { GROUP_POWER, GROUP_LOAD, GROUP_TX, GROUP_RX, GROUP_FRAME, GROUP_LATE, GROUPS } event_group;
+typedef enum { GROUP_POWER, GROUP_LOAD, GROUP_SENSORS, GROUP_TX, GROUP_RX, GROUP_FRAME, GROUP_LATE, GROUPS } event_group;
 
 typedef struct coroutine coroutine;
 typedef struct transmission transmission;
@@ -199,6 +200,7 @@ struct dw1000_chip {
     tx_state tx;
     transmission *sending;
     bool suppress_fcs, wait_for_response, acknowledging;
+    uint8_t data_power, header_power; /* of the frame sent last: octets of TX_POWER */
 
     rx_state rx;
     bool rx_in_reset, stale; /* stale: an error was not followed by a receiver reset */

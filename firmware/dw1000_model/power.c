@@ -11,6 +11,8 @@
 #define RESET_PULSE_S 1e-3
 #define CRYSTAL_RUNS_US 1000.0 /* after RSTn, while the crystal swings */
 #define WAKE_UP_US 4000.0
+#define SENSORS_XTI_US 2.5
+#define SENSORS_PLL_US 1000.0
 #define SELECT_TO_WAKE_US 500.0
 #define SLEEP_UNIT_US (4096 / 10e3 * 1e6) /* of SLEEP_TIM: the low-power oscillator runs at 7 to 13 kHz */
 
@@ -79,6 +81,7 @@ static void silence(dw1000_chip *chip) {
     cancel(chip, GROUP_LATE);
     cancel(chip, GROUP_POWER);
     cancel(chip, GROUP_LOAD);
+    cancel(chip, GROUP_SENSORS);
     chip->glitch = false;
 }
 
@@ -202,8 +205,8 @@ static void awake(dw1000_chip *chip, transmission *none) {
     cancel(chip, GROUP_POWER);
     if (keep & ONW_LDC) {
         memcpy(chip->octets, chip->retained, sizeof chip->octets);
-        /* Errata: the antenna delays do not survive. */
-        put(chip, TX_ANTD, 0, 2, (get(chip, TX_ANTD, 0, 2) ^ dice(chip->air->seed, (uint64_t)chip->air->now)) | 1);
+        /* The antenna delays do not survive (manual 2.12, p. 103). */
+        put(chip, TX_ANTD, 0, 1, get(chip, LDE_IF, LDE_RXANTD + 1, 1));
         put(chip, LDE_IF, LDE_RXANTD, 2, 0);
     } else {
         put(chip, AON, AON_WCFG, 2, keep);
@@ -264,10 +267,17 @@ void dw1000_environment(dw1000_chip *chip, double celsius, double volts) {
     chip->volts = volts;
 }
 
+static void sensors_ready(dw1000_chip *chip, transmission *none) {
+    (void)none;
+    measure_to(chip, TC_SARL);
+}
+
+/* The manual's 2.5 us are not enough while the PLL clocks the chip: Decawave's driver waits for 1 ms. */
 static void sensors_written(dw1000_chip *chip) {
     const bool on = get(chip, RF_CONF, RF_SAR_BIAS, 1) == 0x80 && get(chip, RF_CONF, RF_SAR_SWITCH, 1) == 0x0F;
     if (on && (get(chip, TX_CAL, TC_SARC, 1) & 1)) {
-        measure_to(chip, TC_SARL);
+        const double takes_us = chip->power == POWER_IDLE ? SENSORS_PLL_US : SENSORS_XTI_US;
+        schedule(chip, GROUP_SENSORS, chip->air->now + MICROSECONDS(takes_us), sensors_ready, NULL);
     }
 }
 
@@ -295,6 +305,12 @@ void power_written(dw1000_chip *chip, unsigned file, unsigned sub, size_t count)
         }
         chip->counting = command == 1; /* EN together with CLR is not taken */
         put(chip, DIG_DIAG, EVC_CTRL, 1, 0);
+    }
+}
+
+void dw1000_program_otp(dw1000_chip *chip, unsigned address, uint32_t word) {
+    if (address < sizeof chip->otp / sizeof *chip->otp) {
+        chip->otp[address] = word;
     }
 }
 

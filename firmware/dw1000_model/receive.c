@@ -52,7 +52,7 @@ void stop_receiver(dw1000_chip *chip) {
     chip->rx = RX_OFF;
 }
 
-static void listen(dw1000_chip *chip, transmission *none);
+static void search(dw1000_chip *chip);
 
 /* The receiver ends, or begins anew by itself. */
 static void ended(dw1000_chip *chip, bool again) {
@@ -134,7 +134,12 @@ static void frame_over(dw1000_chip *chip, transmission *frame) {
     }
     count_event(chip, COUNT_FCG);
     if ((setting & CFG_FFEN) && !accepted(chip, octets, length - 2)) {
-        failed(chip, ST_AFFREJ, COUNT_FFR);
+        /* The receiver and its time-out just continue (manual 2.12, p. 79). */
+        raise_status(chip, ST_AFFREJ);
+        count_event(chip, COUNT_FFR);
+        memset(chip->accumulator, 0, sizeof chip->accumulator);
+        let_go(chip);
+        search(chip);
         return;
     }
     const bool asks = length > 4 && (octets[0] & 0x20) && ((octets[0] & 7) == 1 || (octets[0] & 7) == 3);
@@ -252,19 +257,23 @@ void disturb(dw1000_chip *chip, const transmission *frame) {
 }
 
 /* Search for preambles: those that are on the air already, too. */
-static void listen(dw1000_chip *chip, transmission *none) {
-    (void)none;
+static void search(dw1000_chip *chip) {
     chip->rx = RX_SEARCH;
     chip->searching = chip->air->now;
+    for (transmission *frame = chip->air->flying; frame != NULL; frame = frame->next) {
+        consider(chip, frame);
+    }
+}
+
+static void listen(dw1000_chip *chip, transmission *none) {
+    (void)none;
     const unsigned chunks = (unsigned)get(chip, DRX_CONF, DRX_PRETOC, 2);
     if (chunks != 0) {
         const instant symbol = symbol_units(receive_mode(chip).prf);
         const instant wait = (instant)(chunks + 1) * (instant)acquisition_chunk(chip) * symbol;
         schedule(chip, GROUP_RX, chip->air->now + wait, preamble_wait_over, NULL);
     }
-    for (transmission *frame = chip->air->flying; frame != NULL; frame = frame->next) {
-        consider(chip, frame);
-    }
+    search(chip);
 }
 
 static void turn_on(dw1000_chip *chip, transmission *none) {
@@ -273,9 +282,9 @@ static void turn_on(dw1000_chip *chip, transmission *none) {
     memset(chip->accumulator, 0, sizeof chip->accumulator);
     chip->rx = RX_WARMUP;
     schedule(chip, GROUP_RX, chip->air->now + MICROSECONDS(WARM_UP_US), listen, NULL);
-    if (setting & CFG_RXWTOE) {
+    if (setting & CFG_RXWTOE) { /* it counts from the enable on, not from the end of the warm-up */
         const instant wait = (instant)get(chip, RX_FWTO, 0, 2) * TIMEOUT_TICKS * UNITS_PER_TICK;
-        schedule(chip, GROUP_RX, chip->air->now + MICROSECONDS(WARM_UP_US) + wait, frame_wait_over, NULL);
+        schedule(chip, GROUP_RX, chip->air->now + wait, frame_wait_over, NULL);
     }
 }
 

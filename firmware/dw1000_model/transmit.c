@@ -1,4 +1,5 @@
 /* The transmitter. */
+#include <math.h>
 #include <stdlib.h>
 #include <string.h>
 
@@ -83,8 +84,32 @@ static void preamble_sent(dw1000_chip *chip, transmission *frame) {
     schedule(chip, GROUP_TX, frame->data, take_payload, frame);
 }
 
+/* TX_POWER by its two formats: smart power has an octet for each duration of a frame, at 6.8 Mbit/s alone; without it
+ * the third octet is for preamble and data, the second one for the PHR. */
+static void choose_power(dw1000_chip *chip, const transmission *frame) {
+    static const double BOOST_US[] = {500, 250, 125};
+    unsigned data = 0;
+    while (frame->rate == 2 && data < 3 && frame->end - frame->start <= MICROSECONDS(BOOST_US[data])) {
+        data++;
+    }
+    const bool smart = (get(chip, SYS_CFG, 0, 4) & CFG_DIS_STXP) == 0;
+    chip->data_power = (uint8_t)get(chip, TX_POWER, smart ? data : 2, 1);
+    chip->header_power = (uint8_t)get(chip, TX_POWER, smart ? data : 1, 1);
+}
+
+/* Bits 7:5: 18 dB in steps of -3, or nothing; bits 4:0: steps of 0.5 dB. */
+static double decibels(unsigned octet) {
+    return octet >> 5 == 7 ? -INFINITY : 18 - 3.0 * (octet >> 5) + 0.5 * (octet & 31u);
+}
+
+void dw1000_sent_power(const dw1000_chip *chip, double *data_db, double *header_db) {
+    *data_db = decibels(chip->data_power);
+    *header_db = decibels(chip->header_power);
+}
+
 static void on_air(dw1000_chip *chip, transmission *frame) {
     dw1000_air *const air = chip->air;
+    choose_power(chip, frame);
     chip->tx = TX_ON;
     chip->status &= ~(ST_TX & ~ST_AAT); /* of a delayed frame only now: while it waits, those of the frame before stand */
     raise_status(chip, ST_TXFRB);
