@@ -40,8 +40,8 @@ class Evb1000Bus:
     """
 
     has_reset = False
-    # Seven transactions of 1.5 to 1.8 ms each, and until it is noticed; a slower bus finds its own reply time.
-    reply_us = 14_500
+    # Eight transactions of 1.5 to 1.8 ms each, and the time until the answer is noticed; a slower bus finds its own.
+    reply_us = 16_500
     patience_us = 60_000
 
     def __init__(self, address: PortAddress) -> None:
