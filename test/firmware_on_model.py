@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 import threading
 from collections.abc import Callable
 from types import SimpleNamespace
@@ -76,8 +77,9 @@ class ModelBus:
 
 
 def use_virtual_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the firmware take its time from the program in which it runs."""
+    """Let the firmware take its time from the program in which it runs, and the same random numbers in each run."""
     monkeypatch.setattr(firmware, "time", CLOCK)
+    monkeypatch.setattr(firmware, "secrets", SimpleNamespace(randbits=random.Random(1).getrandbits))
 
 
 def ranging(

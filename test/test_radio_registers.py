@@ -195,7 +195,7 @@ def test_no_frame_exceeds_the_calibrated_power(air: Air, settings: RadioSettings
 
 def test_smart_power_sends_one_frame_per_millisecond(air: Air):
     run = Run(air, tags=3, seconds=0.25)
-    assert len(run.ranges) > 30
+    assert len(run.ranges) > 10
     starts = [at for at, file, _, data in run.buses[0].writes if file == SYS_CTRL and data[0] & 0x42 == 2]
     assert min(later - earlier for earlier, later in itertools.pairwise(starts)) >= 1e-3
 
