@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 
 import pytest
+from firmware_on_model import CLOCK, begin, host
 
 from uwb_mitigation.dw1000_model.air import ANTENNA_DELAY_TICKS, Host
 
@@ -16,23 +16,6 @@ dw1000 = pytest.importorskip("dw1000_spi.dw1000", reason="the develop requiremen
 
 SYSTEM_CALL_S = 60e-6
 """About what a transaction takes Linux and Python on a Raspberry Pi."""
-
-_program = threading.local()
-
-
-def host() -> Host:
-    """Of the program that asks."""
-    running: Host = _program.host
-    return running
-
-
-CLOCK = SimpleNamespace(
-    sleep=lambda seconds: host().delay(seconds),
-    perf_counter=lambda: host().now(),
-    monotonic_ns=lambda: int(host().now() * 1e9),
-    time_ns=lambda: int(host().now() * 1e9),
-)
-"""Stands in for the module `time`."""
 
 
 class FakeSpiDev:
@@ -58,11 +41,6 @@ def replace_spidev(monkeypatch: pytest.MonkeyPatch) -> None:
     module.SpiDev = FakeSpiDev  # type: ignore[attr-defined]
     monkeypatch.setattr(dw1000, "spidev", module)
     monkeypatch.setattr(dw1000, "time", CLOCK)
-
-
-def begin(running: Host) -> None:
-    """Say which host the program of this thread has."""
-    _program.host = running
 
 
 def program(

@@ -17,13 +17,14 @@ from compilers import NEEDS_CC
 from dw1000_driver import DATA, HPDWARN, RXFCG, TICK_M, TICK_S, TXFRS, TXPUTE, WRAP, Driver
 
 from uwb_mitigation.dw1000_model.evb1000 import EmulatedEvb1000s
-from uwb_mitigation.dw1000_model.usb2spi import FAST_HZ, SLOW_HZ, Bridge
+from uwb_mitigation.dw1000_model.usb2spi import FAST_HZ, SLOW_HZ, STALE, Bridge
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.sources.simulated import SimulatedSource
 
 pytestmark = NEEDS_CC
 
 PATIENCE_S = 240
+ANSWER = b"yEVB1000 USB2SPI 2.0\0" + STALE
 
 
 def request(header: bytes, *, write: bytes = b"", read: int = 0, fast: bool = True, end: int = 3) -> bytes:
@@ -55,40 +56,60 @@ class TestBridge:
         assert seen == [(b"\x84ab", SLOW_HZ)]
 
     def test_the_question_is_answered(self, bridge: Bridge):
-        assert bridge.receive(b"deca?") == [b"yEVB1000 USB2SPI 1.0\0"]
+        assert bridge.receive(b"deca?") == [ANSWER]
+        assert bridge.receive(b"de") + bridge.receive(b"ca?") == [ANSWER]
+
+    @pytest.mark.parametrize(
+        "stray", [b"AT", b"AT\r\n", b"ATZ\rATE1\r", request(b"\x00", read=4)[:-1], bytes(200)]
+    )
+    def test_after_stray_octets_the_first_question_is_ignored(self, bridge: Bridge, stray: bytes):
+        assert bridge.receive(stray) == []
+        assert bridge.receive(request(b"\x00", read=1)) == [], "they stay in the buffer"
+        assert bridge.receive(b"deca?") == []
+        assert bridge.receive(b"deca?") == [ANSWER]
+        assert bridge.receive(request(b"\x00", read=1)) == [b"\x02\x00\x01\x03"]
 
     def test_in_ranging_mode_it_says_so_and_no_more(self):
         bridge = Bridge(lambda out, _: out, ranging=True)
-        assert bridge.receive(b"deca?" + request(b"\x00", read=4)) == [b"nEVB1000 USB2SPI 1.0\0"]
+        assert bridge.receive(b"deca?") == [b"n" + ANSWER[1:]]
+        assert bridge.receive(request(b"\x00", read=4)) == []
 
     def test_a_wrong_end_is_refused_and_nothing_is_done(self, bridge: Bridge, seen: list[tuple[bytes, int]]):
-        assert bridge.receive(request(b"\x00", read=4, end=4)) == [b"\x02\x01\x03"]
+        # A read that fails has the length of one that succeeds.
+        assert bridge.receive(request(b"\x00", read=4, end=4)) == [b"\x02\x01" + bytes(4) + b"\x03"]
+        assert bridge.receive(request(b"\x84", write=b"ab", end=4)) == [b"\x02\x01\x03"]
         assert not seen
 
     @pytest.mark.parametrize("length", [0, 5, 6, 7, 300, 65535])
-    def test_lengths_that_do_not_fit_are_refused(self, bridge: Bridge, seen: list[object], length: int):
+    def test_a_request_of_another_length_than_it_says_is_waited_for(
+        self, bridge: Bridge, seen: list[object], length: int
+    ):
         bad = b"\x02\x02" + length.to_bytes(2, "little") + b"\x04\x00" + b"\x00\x03"
-        assert bridge.receive(bad) == [b"\x02\x01\x03"]
+        assert bridge.receive(bad) == []
         assert not seen
-        assert bridge.receive(request(b"\x00", read=1)) == [b"\x02\x00\x01\x03"]
 
     def test_more_than_4093_octets_are_not_read(self, bridge: Bridge):
         (whole,) = bridge.receive(request(b"\x25", read=4065))
         assert len(whole) == 4068
-        assert bridge.receive(request(b"\x25", read=4094)) == [b"\x02\x01\x03"]
+        (refused,) = bridge.receive(request(b"\x25", read=4094))
+        assert (refused[:2], len(refused)) == (b"\x02\x01", 4097)
 
-    def test_requests_may_come_in_any_pieces_with_noise_between(self, bridge: Bridge):
-        stream = b"xyr" + request(b"\x00", read=2) + b"de" + request(b"\x84", write=b"a") + b"deca?"
-        answers = [a for octet in stream for a in bridge.receive(bytes((octet,)))]
-        assert answers == [b"\x02\x00\x01\x02\x03", b"\x02\x00\x03", b"yEVB1000 USB2SPI 1.0\0"]
+    @pytest.mark.parametrize("size", [1, 7, 64, 1000])
+    def test_requests_may_come_in_any_pieces(self, bridge: Bridge, size: int):
+        for sent, answer in (
+            (request(b"\x00", read=2), b"\x02\x00\x01\x02\x03"),
+            (request(b"\x89", write=bytes(120)), b"\x02\x00\x03"),
+        ):
+            pieces = (sent[at : at + size] for at in range(0, len(sent), size))
+            assert [a for piece in pieces for a in bridge.receive(piece)] == [answer]
 
     def test_any_octets_in_any_order_do_no_harm(self, bridge: Bridge):
         random = np.random.default_rng(5)
         for _ in range(300):
             data = random.choice([0, 2, 3, 7, 8, 100, 255], int(random.integers(1, 60))).astype(np.uint8)
             bridge.receive(data.tobytes())
-        bridge.reset()
-        assert bridge.receive(b"deca?")
+        bridge.receive(b"deca?")
+        assert bridge.receive(b"deca?") == [ANSWER]
 
 
 class UsbHost:
@@ -239,7 +260,7 @@ def test_a_board_that_is_unplugged_is_gone_and_comes_back_anew(boards: EmulatedE
     boards.plug(1)
     host = UsbHost(boards.ports[1])
     host.port.write(b"deca?")
-    assert host.port.read(21) == b"yEVB1000 USB2SPI 1.0\0"
+    assert host.port.read(22) == ANSWER
     time.sleep(5e-3)
     assert Driver(host).get(0x18, 0, 2) == 0
     host.close()

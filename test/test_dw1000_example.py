@@ -10,10 +10,28 @@ import pytest
 from compilers import NEEDS_CC
 from conftest import REPOSITORY
 
-from uwb_mitigation.dw1000_model.library import model_folder
+from uwb_mitigation.dw1000_model.library import model_folder, model_objects
 from uwb_mitigation.firmware_export.compiling import WARNINGS, c_compiler, run
 
 pytestmark = NEEDS_CC
+
+
+def test_a_driver_may_define_any_name_without_the_models_prefix(tmp_path: Path):
+    objects = model_objects()
+    defined = run(["nm", "-g", "--defined-only", "-P", *objects]).splitlines()
+    names = [line.split()[0] for line in defined if not line.endswith(":")]
+    assert len(names) > 50
+    assert [name for name in names if not name.startswith("dw1000_")] == []
+    short = sorted({"get", "put", "wake", "control", *(name.removeprefix("dw1000_") for name in names)})
+    driver = tmp_path / "driver.c"
+    driver.write_text(
+        "".join(f"int {name}(void);\nint {name}(void) {{ return 0; }}\n" for name in short)
+        + '#include "dw1000_model.h"\nint main(void) { dw1000_air_free(dw1000_air_new(1)); return 0; }\n'
+    )
+    program = tmp_path / "driver"
+    options = ("-fno-builtin", f"-I{model_folder()}")
+    run([*c_compiler(), *options, str(driver), *objects, "-lm", "-lpthread", "-o", str(program)])
+    run([str(program)])
 
 
 def compiled(source: Path, program: Path) -> Path:

@@ -345,3 +345,25 @@ class TestTransmitter:
         b.host.delay(1e-3)
         assert a.status & dw.RXFCG
         assert a.received() == b"answer"
+
+
+@pytest.mark.parametrize(
+    ("smart", "rate", "preamble", "octet"),
+    [
+        (True, 2, 64, 3),
+        (True, 2, 128, 2),
+        (True, 2, 256, 1),
+        (True, 2, 1024, 0),
+        (True, 0, 128, 0),
+        (False, 2, 64, 2),
+    ],
+)
+def test_transmit_power_has_two_formats(air: Air, smart: bool, rate: int, preamble: int, octet: int):
+    a, _, sender, _ = pair(air, mode=Mode(rate=rate, preamble=preamble))
+    a.set(0x04, 0, a.get(0x04) | (not smart) << 18)
+    word = 0x25456585
+    a.set(0x1E, 0, word)
+    a.send(dw.DATA)
+    a.host.delay(20e-3)
+    level_db = [8.5, 11.5, 14.5, 17.5]
+    assert sender.sent_power_db == (level_db[octet], level_db[octet if smart else 1])

@@ -35,7 +35,7 @@ class TestReceiver:
         b.listen()
         began = b.host.now()
         b.host.wait(1.0)
-        assert b.host.now() - began == pytest.approx(1000 * 512 / 499.2e6 + 16e-6, abs=2e-6)
+        assert b.host.now() - began == pytest.approx(1000 * 512 / 499.2e6, abs=2e-6)
         assert b.status & dw.ERRORS == dw.RXRFTO
 
     def test_a_frame_ends_with_the_time_out_too(self, air: Air):
@@ -252,7 +252,26 @@ class TestFilter:
     def test_a_frame_too_short_for_its_addresses_does_not_pass(self, air: Air):
         a, b = self.listener(air, 0b1001)
         assert exchange(a, b, self.frame(1, self.PAN, b"\x02\x01")[:6]) & dw.AFFREJ
+        b.off()
         assert exchange(a, b, b"\x41") & dw.AFFREJ
+
+    def test_after_a_rejected_frame_the_receiver_and_its_time_out_continue(self, air: Air):
+        a, b = self.listener(air, 0b1001)
+        b.set(0x0C, 0, 10_000, 2)
+        b.set(0x04, 0, b.get(0x04) | 1 << 28)
+        rejected = self.frame(1, self.PAN, b"\x03\x01")
+        assert exchange(a, b, rejected) & (dw.AFFREJ | dw.RXRFTO) == dw.AFFREJ
+        assert b.accumulator(740, 16) == bytes(64), "a receiver that is on owns the accumulator"
+        a.send(self.frame(1, self.PAN, b"\x02\x01"))
+        a.host.delay(1e-3)
+        assert b.status & (dw.RXFCG | dw.LDEDONE) == dw.RXFCG | dw.LDEDONE, "without another enable"
+        assert flight_ticks(a, b) == pytest.approx(3.0 / dw.TICK_M, abs=1), "and without a receiver reset"
+        b.set(0x0F, 0, 0xFFFFFFFF)
+        b.set(0x0E, 0, dw.RXRFTO)
+        began = b.host.now()
+        assert exchange(a, b, rejected) & dw.AFFREJ
+        b.host.wait(1.0)
+        assert b.host.now() - began == pytest.approx(10_000 * 512 / 499.2e6, abs=20e-6)
 
     def test_a_frame_of_a_version_to_come_does_not_pass(self, air: Air):
         a, b = self.listener(air, 0b1001)

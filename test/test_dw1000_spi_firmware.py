@@ -5,79 +5,32 @@ The other driver plays the part that the exchange asks for, written here from th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from types import SimpleNamespace
 
 import pytest
 from compilers import NEEDS_CC
 from dw1000_driver import TICK_M, TXDLYS, TXSTRT, WAIT4RESP, WRAP
-from spidev_on_model import CLOCK, begin, dw1000, program, replace_spidev
+from firmware_on_model import REPLY_US, ranging, use_virtual_time
+from spidev_on_model import dw1000, program, replace_spidev
 
 from uwb_mitigation.dw1000_model.air import ANTENNA_DELAY_TICKS, Air, Host
 from uwb_mitigation.dw1000_model.links import Link
 from uwb_mitigation.link.layout import Role
 from uwb_mitigation.link.radio import RadioSettings
 from uwb_mitigation.measurement import RangeMeasurement
-from uwb_mitigation.radio import host as firmware
-from uwb_mitigation.radio.host import HostRadio
 
 pytestmark = NEEDS_CC
 OTHERS = 0x0123456789ABCDEF
 POLL, ANSWER, FINAL, REPORT = 3, 4, 5, 6
-REPLY_US = 3000
-
-
-class ModelBus:
-    """The firmware's way to the chip of the program that it runs in; see `radio.bus.Bus`."""
-
-    name = "a modelled chip"
-    reply_us = REPLY_US
-    patience_us = 15_000
-    has_reset = True
-
-    def __init__(self, host: Host) -> None:
-        self._host = host
-        self._hz = 2_000_000
-
-    def transfer(self, header: bytes, out: bytes | None, count: int) -> bytes:
-        return self._host.spi(header + (bytes(count) if out is None else out), self._hz)[len(header) :]
-
-    def speed(self, fast: bool) -> None:
-        self._hz = 8_000_000 if fast else 2_000_000
-
-    def reset(self) -> None:
-        self._host.reset_pin()
-
-    def pause(self) -> None:
-        self._host.delay(200e-6)
-
-    def close(self) -> None:
-        pass
 
 
 @pytest.fixture
 def air(monkeypatch: pytest.MonkeyPatch) -> Iterator[Air]:
     replace_spidev(monkeypatch)
-    monkeypatch.setattr(firmware, "time", CLOCK)
+    use_virtual_time(monkeypatch)
     with Air(2) as air:
         yield air
-
-
-def ours(settings: RadioSettings, ranges: list[RangeMeasurement], seconds: float) -> Callable[[Host], None]:
-    """A program that runs the firmware's exchange."""
-
-    def run(host: Host) -> None:
-        begin(host)
-        radio = HostRadio(ModelBus(host), settings, stamp_clock=CLOCK.time_ns)
-        try:
-            while host.now() < seconds:
-                measured = radio.turn(0.02)
-                if measured is not None:
-                    ranges.append(measured)
-        finally:
-            radio.close()
-
-    return run
 
 
 def frame(
@@ -133,7 +86,7 @@ def test_our_tag_ranges_with_it_as_anchor(air: Air, distance_m: float):
                 stamps = (poll_received, answered, final[1])
                 driver.transmit(frame(REPORT, poll.pan, poll.source, numbers, stamps), ranging=False)
 
-    air.program(tag, ours(RadioSettings(anchors=(OTHERS,)), ranges, 0.3))
+    air.program(tag, ranging(RadioSettings(anchors=(OTHERS,)), ranges, 0.3))
     air.program(anchor, program(attend))
     air.run(1.0)
     assert len(ranges) > 5
@@ -193,7 +146,7 @@ def test_our_anchor_ranges_with_it_as_tag(air: Air):
             flight = (round_1 * round_2 - reply_1 * reply_2) / (round_1 + round_2 + reply_1 + reply_2)
             found.append(flight * TICK_M)
 
-    air.program(anchor, ours(RadioSettings(role=Role.ANCHOR, address=own), [], 0.3))
+    air.program(anchor, ranging(RadioSettings(role=Role.ANCHOR, address=own), [], 0.3))
     air.program(tag, program(range_to))
     air.run(1.0)
     assert len(found) >= 6
@@ -206,8 +159,8 @@ def test_frames_without_a_leading_edge_give_our_driver_no_range(air: Air):
     for chip in (tag, anchor):
         chip.lose_edges(0.2)
     ranges: list[RangeMeasurement] = []
-    air.program(tag, ours(RadioSettings(), ranges, 0.3))
-    air.program(anchor, ours(RadioSettings(role=Role.ANCHOR), [], 0.3))
+    air.program(tag, ranging(RadioSettings(), ranges, 0.3))
+    air.program(anchor, ranging(RadioSettings(role=Role.ANCHOR), [], 0.3))
     air.run(1.0)
     assert len(ranges) > 5
     assert all(measured.range_m == pytest.approx(6.0, abs=0.03) for measured in ranges)
@@ -219,8 +172,8 @@ def test_times_that_are_left_open_grow_with_the_frames(air: Air, preamble: int):
     tag, anchor = air.chip(ppm=5.0), air.chip(ppm=-5.0)
     air.link(tag, anchor, Link(6.0))
     ranges: list[RangeMeasurement] = []
-    air.program(tag, ours(RadioSettings(**slow), ranges, 0.6))
-    air.program(anchor, ours(RadioSettings(role=Role.ANCHOR, **slow), [], 0.6))
+    air.program(tag, ranging(RadioSettings(**slow), ranges, 0.6))
+    air.program(anchor, ranging(RadioSettings(role=Role.ANCHOR, **slow), [], 0.6))
     air.run(1.0)
     assert len(ranges) >= 3
     assert all(measured.range_m == pytest.approx(6.0, abs=0.03) for measured in ranges)

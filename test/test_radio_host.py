@@ -16,7 +16,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+import serial
 from compilers import NEEDS_CC
+from conftest import REPOSITORY
 
 from uwb_mitigation.dw1000_model.air import Air, Chip
 from uwb_mitigation.dw1000_model.evb1000 import ROUND_TRIP_S, EmulatedEvb1000s
@@ -59,21 +61,33 @@ def wait_until(true: Callable[[], bool]) -> None:
         time.sleep(0.02)
 
 
-def test_an_answer_that_comes_late_is_not_taken_for_the_boards_greeting():
+@pytest.mark.parametrize(
+    "answers",
+    [
+        [b"\x02\x00\x03yEVB1000 USB2SPI 1.0\0", b"yEVB1000 USB2SPI 1.0\0"],
+        [b"", b"yEVB1000 USB2SPI 1.0\0\x03"],
+        [b"", b"\x02", b"yEVB1000 USB2SPI 1.0\0y"],
+    ],
+    ids=["a late answer first", "a question that is ignored", "both"],
+)
+def test_a_board_is_asked_again_and_its_answer_ends_at_the_nul(answers: list[bytes]):
     board, port = os.openpty()
     tty.setraw(port)
-    late = [b"\x02\x00\x03", b""]
+    late = list(answers)
 
     def answer() -> None:
         while late:
             assert os.read(board, 100) == b"deca?"
-            os.write(board, late.pop(0) + b"yEVB1000 USB2SPI 1.0\0")
+            os.write(board, late.pop(0))
 
     answering = threading.Thread(target=answer)
     answering.start()
     try:
         found = Evb1000Bus(PortAddress.parse(os.ttyname(port)))
         assert found.version == "EVB1000 USB2SPI 1.0"
+        assert not select.select([port], [], [], 0)[0], (
+            "the octet after the NUL is no part of the next answer"
+        )
         found.close()
     finally:
         late.clear()
@@ -158,6 +172,23 @@ def test_a_radio_that_stays_away_is_looked_for_as_often_as_at_first():
         assert RETRY_S < 0.5
     finally:
         port.close()
+
+
+def test_a_board_that_modem_manager_has_written_to_is_opened(boards: tuple[EmulatedEvb1000s, Path]):
+    _, prefix = boards
+    with serial.Serial(f"{prefix}1") as port:
+        port.write(b"AT+GCAP\r")
+    with contextlib.closing(bus(f"{prefix}1")()) as found:
+        assert found.version == "EVB1000 USB2SPI 2.0"
+        assert found.transfer(b"\x00", None, 4) == bytes.fromhex("3001cade")
+
+
+def test_modem_manager_ignores_the_boards():
+    rules = (REPOSITORY / "udev" / "60-uwb-mitigation.rules").read_text(encoding="utf-8")
+    ignored = [line for line in rules.splitlines() if 'ENV{ID_MM_DEVICE_IGNORE}="1"' in line]
+    for vendor, product in (("0483", "5740"), ("2341", "805a")):
+        wanted = (f'ATTRS{{idVendor}}=="{vendor}"', f'ATTRS{{idProduct}}=="{product}"')
+        assert any(all(match in line for match in wanted) for line in ignored), vendor
 
 
 def test_a_board_that_ranges_by_itself_is_told_with_the_switch_to_turn():

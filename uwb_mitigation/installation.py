@@ -278,7 +278,7 @@ def examine_udev_rule() -> Iterator[Finding]:
         return  # nothing of the package's shared files is there, as told above
     copy = shlex.join(["sudo", "cp", str(source), str(UDEV_FOLDERS[0])])
     fix = f"{copy} && sudo udevadm control --reload && sudo udevadm trigger"
-    yield Finding("udev rule", State.OPTIONAL, "names boards /dev/uwb/SERIAL", fix)
+    yield Finding("udev rule", State.OPTIONAL, "names boards /dev/uwb/SERIAL, keeps ModemManager away", fix)
 
 
 def examine_tools() -> Iterator[Finding]:

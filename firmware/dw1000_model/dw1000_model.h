@@ -75,6 +75,10 @@ void dw1000_wakeup_pin(dw1000_chip *chip);
 void dw1000_environment(dw1000_chip *chip, double celsius, double volts);
 /* Of the good frames that a chip receives, how many have no leading edge that its detector finds, 0 to 1: LDEERR. */
 void dw1000_lose_edges(dw1000_chip *chip, double probability);
+/* Set a word of the OTP memory, 0x00 to 0x7F; registers that are loaded from it change with the next reset. */
+void dw1000_program_otp(dw1000_chip *chip, unsigned address, uint32_t word);
+/* Transmit power of the last frame for preamble and data, and for the PHR: dB above the lowest that TX_POWER can set. */
+void dw1000_sent_power(const dw1000_chip *chip, double *data_db, double *header_db);
 /* What destroyed the chip, in words; NULL = nothing has. */
 const char *dw1000_fault(const dw1000_chip *chip);
 

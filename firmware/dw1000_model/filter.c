@@ -35,9 +35,10 @@ static bool type_allowed(uint32_t setting, unsigned type) {
     return setting & (type == 4 ? CFG_FFA4 : type == 5 ? CFG_FFA5 : 1u << 6);
 }
 
-bool accepted(const dw1000_chip *chip, const uint8_t *octets, size_t count) {
-    const uint32_t setting = (uint32_t)get(chip, SYS_CFG, 0, 4);
-    const unsigned own_pan = (unsigned)get(chip, PANADR, 2, 2), own_short = (unsigned)get(chip, PANADR, 0, 2);
+bool dw1000_accepted(const dw1000_chip *chip, const uint8_t *octets, size_t count) {
+    const uint32_t setting = (uint32_t)dw1000_get(chip, SYS_CFG, 0, 4);
+    const unsigned own_pan = (unsigned)dw1000_get(chip, PANADR, 2, 2);
+    const unsigned own_short = (unsigned)dw1000_get(chip, PANADR, 0, 2);
     cursor at = {octets, count, false};
     const unsigned control = (unsigned)take(&at, 2), type = control & 7;
     if (at.short_of || !type_allowed(setting, type) || (control >> 12 & 3) > 1) {
@@ -73,6 +74,6 @@ bool accepted(const dw1000_chip *chip, const uint8_t *octets, size_t count) {
         }
         return (setting & CFG_FFBC) && from_pan == own_pan;
     }
-    const bool ours = to == LONG ? address == get(chip, EUI, 0, 8) : address == own_short || address == BROADCAST;
+    const bool ours = to == LONG ? address == dw1000_get(chip, EUI, 0, 8) : address == own_short || address == BROADCAST;
     return ours && (to_pan == BROADCAST || to_pan == own_pan);
 }

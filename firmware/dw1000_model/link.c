@@ -16,10 +16,10 @@
 
 dw1000_air *dw1000_air_new(uint64_t seed) {
     dw1000_air *const air = calloc(1, sizeof *air);
-    prepare_map();
+    dw1000_prepare_map();
     if (air != NULL) {
         air->seed = seed;
-        if (!start_outside(air)) {
+        if (!dw1000_start_outside(air)) {
             free(air);
             return NULL;
         }
@@ -27,7 +27,7 @@ dw1000_air *dw1000_air_new(uint64_t seed) {
     return air;
 }
 
-void drop_link(link *path) {
+void dw1000_drop_link(link *path) {
     if (path != NULL && --path->users == 0) {
         free(path);
     }
@@ -39,10 +39,10 @@ void dw1000_air_free(dw1000_air *air) {
     }
     for (size_t i = 0; i < air->chip_count; i++) {
         dw1000_chip *const chip = air->chips[i];
-        stop_transmitter(chip);
-        stop_receiver(chip);
+        dw1000_stop_transmitter(chip);
+        dw1000_stop_receiver(chip);
         for (size_t j = 0; j < air->chip_count; j++) {
-            drop_link(chip->links[j]);
+            dw1000_drop_link(chip->links[j]);
         }
         free(chip->links);
         free(chip);
@@ -52,7 +52,7 @@ void dw1000_air_free(dw1000_air *air) {
         air->flying = frame->next;
         free(frame);
     }
-    free_programs(air);
+    dw1000_free_programs(air);
     free(air->chips);
     free(air);
 }
@@ -68,7 +68,7 @@ dw1000_chip *dw1000_chip_new(dw1000_air *air, double ppm, uint64_t clock_ticks, 
         return NULL;
     }
     for (size_t i = 0; i < count; i++) {
-        link **const links = memory(count * sizeof(link *));
+        link **const links = dw1000_memory(count * sizeof(link *));
         dw1000_chip *const other = i + 1 < count ? air->chips[i] : chip;
         if (other->links != NULL) {
             memcpy(links, other->links, (count - 1) * sizeof(link *));
@@ -89,8 +89,8 @@ dw1000_chip *dw1000_chip_new(dw1000_air *air, double ppm, uint64_t clock_ticks, 
     chip->clock_rate = llround((1 + ppm * 1e-6) * 0x1p44);
     chip->tx_delay = tx_delay_ticks;
     chip->rx_delay = rx_delay_ticks;
-    fill_otp(chip);
-    reset_registers(chip);
+    dw1000_fill_otp(chip);
+    dw1000_reset_registers(chip);
     chip->power = POWER_IDLE;
     chip->status = ST_CPLOCK | ST_SLP2INIT;
     return chip;
@@ -117,7 +117,7 @@ static void synthesise(link *path, double place) {
             /* The sum of three uniform numbers is normal enough. */
             double noise = -1.5;
             for (uint64_t k = 0; k < 3; k++) {
-                noise += chance(dice(path->key + k, 2 * i + part));
+                noise += dw1000_chance(dw1000_dice(path->key + k, 2 * i + part));
             }
             path->iq[2 * i + part] = (int16_t)rint(height * (part == 0 ? 0.8 : 0.6) + noise * 2 * DEFAULT_NOISE);
         }
@@ -191,7 +191,7 @@ static double within(double value, double low, double high) {
 }
 
 static link *new_link(const dw1000_link_config *config, uint64_t key) {
-    link *const path = memory(sizeof *path);
+    link *const path = dw1000_memory(sizeof *path);
     const double per_metre = (double)UNITS_PER_SECOND / SPEED_OF_LIGHT;
     path->key = key;
     path->flight = llround(within(config->distance_m, 0, LONGEST_LINK_M) * per_metre);
@@ -213,12 +213,12 @@ void dw1000_link(dw1000_air *air, dw1000_chip *a, dw1000_chip *b, const dw1000_l
         return;
     }
     link **const there = &b->links[a->index], **const back = &a->links[b->index];
-    drop_link(*there);
-    drop_link(*back);
+    dw1000_drop_link(*there);
+    dw1000_drop_link(*back);
     *there = *back = NULL;
     if (config != NULL) {
         const uint64_t low = a->index < b->index ? a->index : b->index, high = a->index + b->index - low;
-        *there = *back = new_link(config, dice(air->seed, low << 32 | high));
+        *there = *back = new_link(config, dw1000_dice(air->seed, low << 32 | high));
         (*there)->users = 2;
     }
 }

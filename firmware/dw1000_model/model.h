@@ -1,4 +1,5 @@
-/* What the model's files share. None of it is for users of the library. */
+/* What the model's files share. None of it is for users of the library; symbols have its prefix all the same, so that
+ * a driver can define `get` or `control`. */
 #ifndef DW1000_MODEL_INTERNAL_H
 #define DW1000_MODEL_INTERNAL_H
 
@@ -54,6 +55,7 @@ enum {
 #define CFG_DIS_RSDE (1u << 14)
 #define CFG_FCS_INIT2F (1u << 15)
 #define CFG_PHR_MODE (3u << 16)
+#define CFG_DIS_STXP (1u << 18)
 #define CFG_RXM110K (1u << 22)
 #define CFG_RXWTOE (1u << 28)
 #define CFG_RXAUTR (1u << 29)
@@ -117,7 +119,7 @@ typedef enum {
 } counter;
 
 /* What belongs together is cancelled together. */
-typedef enum { GROUP_POWER, GROUP_LOAD, GROUP_TX, GROUP_RX, GROUP_FRAME, GROUP_LATE, GROUPS } event_group;
+typedef enum { GROUP_POWER, GROUP_LOAD, GROUP_SENSORS, GROUP_TX, GROUP_RX, GROUP_FRAME, GROUP_LATE, GROUPS } event_group;
 
 typedef struct coroutine coroutine;
 typedef struct transmission transmission;
@@ -199,6 +201,7 @@ struct dw1000_chip {
     tx_state tx;
     transmission *sending;
     bool suppress_fcs, wait_for_response, acknowledging;
+    uint8_t data_power, header_power; /* of the frame sent last: octets of TX_POWER */
 
     rx_state rx;
     bool rx_in_reset, stale; /* stale: an error was not followed by a receiver reset */
@@ -234,81 +237,81 @@ struct dw1000_air {
 };
 
 /* schedule.c */
-void *memory(size_t bytes); /* zeroed; ends the process where there is none */
-void schedule(dw1000_chip *chip, event_group group, instant at, handler *fire, transmission *frame);
-void cancel(dw1000_chip *chip, event_group group);
-void pass(dw1000_air *air, instant until);
-void wake(dw1000_chip *chip);
-double seconds_now(const dw1000_air *air);
-void free_programs(dw1000_air *air);
-bool start_outside(dw1000_air *air);
+void *dw1000_memory(size_t bytes); /* zeroed; ends the process where there is none */
+void dw1000_schedule(dw1000_chip *chip, event_group group, instant at, handler *fire, transmission *frame);
+void dw1000_cancel(dw1000_chip *chip, event_group group);
+void dw1000_pass(dw1000_air *air, instant until);
+void dw1000_wake(dw1000_chip *chip);
+double dw1000_seconds_now(const dw1000_air *air);
+void dw1000_free_programs(dw1000_air *air);
+bool dw1000_start_outside(dw1000_air *air);
 
 /* clock.c */
-uint64_t local_units(const dw1000_chip *chip, instant at); /* of the chip's counter, not wrapped */
-instant air_time(const dw1000_chip *chip, uint64_t units);
-uint64_t counter_now(const dw1000_chip *chip);
-uint64_t dice(uint64_t a, uint64_t b); /* 64 random bits that depend on nothing else */
-double chance(uint64_t bits);          /* in 0 to 1 */
+uint64_t dw1000_local_units(const dw1000_chip *chip, instant at); /* of the chip's counter, not wrapped */
+instant dw1000_air_time(const dw1000_chip *chip, uint64_t units);
+uint64_t dw1000_counter_now(const dw1000_chip *chip);
+uint64_t dw1000_dice(uint64_t a, uint64_t b); /* 64 random bits that depend on nothing else */
+double dw1000_chance(uint64_t bits);          /* in 0 to 1 */
 
 /* registers.c */
-void prepare_map(void);
-void reset_registers(dw1000_chip *chip);
-uint64_t get(const dw1000_chip *chip, unsigned file, unsigned sub, unsigned octets);
-void put(dw1000_chip *chip, unsigned file, unsigned sub, unsigned octets, uint64_t value);
-uint8_t *place(dw1000_chip *chip, unsigned file, unsigned sub); /* of an octet; NULL = reserved */
-void read_octets(dw1000_chip *chip, unsigned file, unsigned sub, uint8_t *to, size_t count);
-void write_octets(dw1000_chip *chip, unsigned file, unsigned sub, const uint8_t *from, size_t count);
+void dw1000_prepare_map(void);
+void dw1000_reset_registers(dw1000_chip *chip);
+uint64_t dw1000_get(const dw1000_chip *chip, unsigned file, unsigned sub, unsigned octets);
+void dw1000_put(dw1000_chip *chip, unsigned file, unsigned sub, unsigned octets, uint64_t value);
+uint8_t *dw1000_place(dw1000_chip *chip, unsigned file, unsigned sub); /* of an octet; NULL = reserved */
+void dw1000_read_octets(dw1000_chip *chip, unsigned file, unsigned sub, uint8_t *to, size_t count);
+void dw1000_write_octets(dw1000_chip *chip, unsigned file, unsigned sub, const uint8_t *from, size_t count);
 
 /* control.c */
-uint64_t status_of(const dw1000_chip *chip);
-void raise_status(dw1000_chip *chip, uint64_t bits);
-void clear_status(dw1000_chip *chip, uint64_t bits);
-void update_line(dw1000_chip *chip);
-void count_event(dw1000_chip *chip, counter which);
-void control(dw1000_chip *chip, uint32_t command);
-void acknowledge_status(dw1000_chip *chip, uint64_t bits); /* the host writes ones */
-uint32_t system_state(const dw1000_chip *chip);
+uint64_t dw1000_status_of(const dw1000_chip *chip);
+void dw1000_raise_status(dw1000_chip *chip, uint64_t bits);
+void dw1000_clear_status(dw1000_chip *chip, uint64_t bits);
+void dw1000_update_line(dw1000_chip *chip);
+void dw1000_count_event(dw1000_chip *chip, counter which);
+void dw1000_control(dw1000_chip *chip, uint32_t command);
+void dw1000_acknowledge_status(dw1000_chip *chip, uint64_t bits); /* the host writes ones */
+uint32_t dw1000_system_state(const dw1000_chip *chip);
 
 /* power.c */
-void power_written(dw1000_chip *chip, unsigned file, unsigned sub, size_t count);
-void reset_chip(dw1000_chip *chip, instant until_init);
-void fill_otp(dw1000_chip *chip);
-bool spi_works(dw1000_chip *chip, uint32_t hz);
-bool clocks_listen(const dw1000_chip *chip, uint32_t hz);
-void wake_by_select(dw1000_chip *chip, instant held);
-void sleep_after(dw1000_chip *chip, unsigned enabling_bit);
+void dw1000_power_written(dw1000_chip *chip, unsigned file, unsigned sub, size_t count);
+void dw1000_reset_chip(dw1000_chip *chip, instant until_init);
+void dw1000_fill_otp(dw1000_chip *chip);
+bool dw1000_spi_works(dw1000_chip *chip, uint32_t hz);
+bool dw1000_clocks_listen(const dw1000_chip *chip, uint32_t hz);
+void dw1000_wake_by_select(dw1000_chip *chip, instant held);
+void dw1000_sleep_after(dw1000_chip *chip, unsigned enabling_bit);
 
 /* transmit.c */
-void start_transmission(dw1000_chip *chip, uint32_t command);
-void start_acknowledgement(dw1000_chip *chip, uint8_t sequence);
-void stop_transmitter(dw1000_chip *chip);
+void dw1000_start_transmission(dw1000_chip *chip, uint32_t command);
+void dw1000_start_acknowledgement(dw1000_chip *chip, uint8_t sequence);
+void dw1000_stop_transmitter(dw1000_chip *chip);
 
 /* receive.c */
-void enable_receiver(dw1000_chip *chip, instant at, bool by_itself);
-void delay_receiver(dw1000_chip *chip);
-void stop_receiver(dw1000_chip *chip);
-void consider(dw1000_chip *chip, transmission *frame); /* whether the receiver will notice it */
-void disturb(dw1000_chip *chip, const transmission *frame); /* what another one does to the frame being received */
-void late_event(dw1000_chip *chip);
-bool doubly_buffered(const dw1000_chip *chip);
+void dw1000_enable_receiver(dw1000_chip *chip, instant at, bool by_itself);
+void dw1000_delay_receiver(dw1000_chip *chip);
+void dw1000_stop_receiver(dw1000_chip *chip);
+void dw1000_consider(dw1000_chip *chip, transmission *frame); /* whether the receiver will notice it */
+void dw1000_disturb(dw1000_chip *chip, const transmission *frame); /* by another frame than the one being received */
+void dw1000_late_event(dw1000_chip *chip);
+bool dw1000_doubly_buffered(const dw1000_chip *chip);
 
 /* reception.c */
-void report_header(dw1000_chip *chip);
-void report_frame(dw1000_chip *chip, const uint8_t *octets, bool timed);
-void report_overrun(dw1000_chip *chip);
-uint16_t frame_check(const uint8_t *octets, size_t count, uint16_t start);
+void dw1000_report_header(dw1000_chip *chip);
+void dw1000_report_frame(dw1000_chip *chip, const uint8_t *octets, bool timed);
+void dw1000_report_overrun(dw1000_chip *chip);
+uint16_t dw1000_frame_check(const uint8_t *octets, size_t count, uint16_t start);
 
 /* filter.c */
-bool accepted(const dw1000_chip *chip, const uint8_t *octets, size_t count);
+bool dw1000_accepted(const dw1000_chip *chip, const uint8_t *octets, size_t count);
 
 /* link.c */
-void drop_link(link *path);
+void dw1000_drop_link(link *path);
 
 /* mode.c */
-air_interface transmit_mode(const dw1000_chip *chip);
-air_interface receive_mode(const dw1000_chip *chip);
-instant symbol_units(unsigned prf);
-unsigned acquisition_chunk(const dw1000_chip *chip);
-double carrier_hz(unsigned channel);
+air_interface dw1000_transmit_mode(const dw1000_chip *chip);
+air_interface dw1000_receive_mode(const dw1000_chip *chip);
+instant dw1000_symbol_units(unsigned prf);
+unsigned dw1000_acquisition_chunk(const dw1000_chip *chip);
+double dw1000_carrier_hz(unsigned channel);
 
 #endif

@@ -11,6 +11,8 @@
 #define RESET_PULSE_S 1e-3
 #define CRYSTAL_RUNS_US 1000.0 /* after RSTn, while the crystal swings */
 #define WAKE_UP_US 4000.0
+#define SENSORS_XTI_US 2.5
+#define SENSORS_PLL_US 1000.0
 #define SELECT_TO_WAKE_US 500.0
 #define SLEEP_UNIT_US (4096 / 10e3 * 1e6) /* of SLEEP_TIM: the low-power oscillator runs at 7 to 13 kHz */
 
@@ -27,10 +29,10 @@ enum { AON_SAVE = 0x02, SLEEP_EN = 0x01, WAKE_PIN = 0x02, WAKE_SPI = 0x04, WAKE_
 #define LDE_LOAD 0x8000u
 
 static unsigned system_clock(const dw1000_chip *chip) {
-    return (unsigned)get(chip, PMSC, PMSC_CTRL0, 1) & 3u;
+    return (unsigned)dw1000_get(chip, PMSC, PMSC_CTRL0, 1) & 3u;
 }
 
-bool spi_works(dw1000_chip *chip, uint32_t hz) {
+bool dw1000_spi_works(dw1000_chip *chip, uint32_t hz) {
     if (chip->fault != NULL || chip->power < POWER_INIT) {
         return false;
     }
@@ -39,17 +41,17 @@ bool spi_works(dw1000_chip *chip, uint32_t hz) {
 
 /* Drivers reset chips in the field by writing PMSC as fast as ever while the crystal is the clock, and it works:
  * what they read then is garbage all the same, and other registers lose what is written. */
-bool clocks_listen(const dw1000_chip *chip, uint32_t hz) {
+bool dw1000_clocks_listen(const dw1000_chip *chip, uint32_t hz) {
     return chip->fault == NULL && chip->power == POWER_INIT && hz <= FAST_SPI_HZ;
 }
 
 static void lock(dw1000_chip *chip, transmission *none) {
     (void)none;
     chip->power = POWER_IDLE;
-    raise_status(chip, ST_CPLOCK);
+    dw1000_raise_status(chip, ST_CPLOCK);
     if (chip->listens_on_wake) {
         chip->listens_on_wake = false;
-        enable_receiver(chip, chip->air->now, false);
+        dw1000_enable_receiver(chip, chip->air->now, false);
     }
 }
 
@@ -58,41 +60,42 @@ static void choose_clock(dw1000_chip *chip) {
         return;
     }
     if (system_clock(chip) == SYSCLKS_XTI) {
-        cancel(chip, GROUP_POWER);
+        dw1000_cancel(chip, GROUP_POWER);
         chip->power = POWER_INIT;
     } else if (chip->power == POWER_INIT) {
-        cancel(chip, GROUP_POWER);
-        schedule(chip, GROUP_POWER, chip->air->now + MICROSECONDS(LOCK_US), lock, NULL);
+        dw1000_cancel(chip, GROUP_POWER);
+        dw1000_schedule(chip, GROUP_POWER, chip->air->now + MICROSECONDS(LOCK_US), lock, NULL);
     }
 }
 
 static void initialise(dw1000_chip *chip, transmission *none) {
     (void)none;
     chip->power = POWER_INIT;
-    raise_status(chip, ST_SLP2INIT);
+    dw1000_raise_status(chip, ST_SLP2INIT);
     choose_clock(chip);
 }
 
 static void silence(dw1000_chip *chip) {
-    stop_transmitter(chip);
-    stop_receiver(chip);
-    cancel(chip, GROUP_LATE);
-    cancel(chip, GROUP_POWER);
-    cancel(chip, GROUP_LOAD);
+    dw1000_stop_transmitter(chip);
+    dw1000_stop_receiver(chip);
+    dw1000_cancel(chip, GROUP_LATE);
+    dw1000_cancel(chip, GROUP_POWER);
+    dw1000_cancel(chip, GROUP_LOAD);
+    dw1000_cancel(chip, GROUP_SENSORS);
     chip->glitch = false;
 }
 
-void reset_chip(dw1000_chip *chip, instant until_init) {
+void dw1000_reset_chip(dw1000_chip *chip, instant until_init) {
     silence(chip);
-    reset_registers(chip);
+    dw1000_reset_registers(chip);
     chip->status = 0;
     chip->chip_side = chip->host_side = 0;
     chip->lde_loaded = chip->in_reset = chip->rx_in_reset = chip->stale = chip->listens_on_wake = false;
     chip->counting = false;
-    update_line(chip);
+    dw1000_update_line(chip);
     chip->power = POWER_WAKEUP;
     if (until_init > 0) {
-        schedule(chip, GROUP_POWER, chip->air->now + until_init, initialise, NULL);
+        dw1000_schedule(chip, GROUP_POWER, chip->air->now + until_init, initialise, NULL);
     } else {
         initialise(chip, NULL);
     }
@@ -102,16 +105,16 @@ void dw1000_reset_drive(dw1000_chip *chip, dw1000_reset_level level) {
     if (level == DW1000_RESET_HIGH) {
         chip->fault = "RSTn driven high against the chip's own output: pull it low, then let it float";
         silence(chip);
-        reset_registers(chip);
+        dw1000_reset_registers(chip);
         chip->status = 0;
         chip->power = POWER_WAKEUP;
-        update_line(chip);
+        dw1000_update_line(chip);
     } else if (level == DW1000_RESET_LOW) {
-        reset_chip(chip, MICROSECONDS(CRYSTAL_RUNS_US));
-        cancel(chip, GROUP_POWER);
+        dw1000_reset_chip(chip, MICROSECONDS(CRYSTAL_RUNS_US));
+        dw1000_cancel(chip, GROUP_POWER);
     } else if (chip->power == POWER_WAKEUP && chip->fault == NULL) {
-        cancel(chip, GROUP_POWER);
-        schedule(chip, GROUP_POWER, chip->air->now + MICROSECONDS(CRYSTAL_RUNS_US), initialise, NULL);
+        dw1000_cancel(chip, GROUP_POWER);
+        dw1000_schedule(chip, GROUP_POWER, chip->air->now + MICROSECONDS(CRYSTAL_RUNS_US), initialise, NULL);
     }
 }
 
@@ -127,15 +130,15 @@ const char *dw1000_fault(const dw1000_chip *chip) {
 
 /* What a write of PMSC_CTRL0's octets asks of resets and clocks. */
 static void clocks_written(dw1000_chip *chip, bool whole_reset_octet) {
-    const uint32_t clocks = (uint32_t)get(chip, PMSC, PMSC_CTRL0, 4);
+    const uint32_t clocks = (uint32_t)dw1000_get(chip, PMSC, PMSC_CTRL0, 4);
     if (whole_reset_octet) {
         const unsigned lines = clocks >> 28;
         if (lines == 0 && !chip->in_reset) {
-            reset_chip(chip, 0);
-            cancel(chip, GROUP_POWER);
+            dw1000_reset_chip(chip, 0);
+            dw1000_cancel(chip, GROUP_POWER);
             chip->power = POWER_INIT;
             chip->in_reset = true;
-            put(chip, PMSC, PMSC_CTRL0 + 3, 1, clocks >> 24);
+            dw1000_put(chip, PMSC, PMSC_CTRL0 + 3, 1, clocks >> 24);
             return;
         }
         if (chip->in_reset && lines == 0xF) {
@@ -143,15 +146,15 @@ static void clocks_written(dw1000_chip *chip, bool whole_reset_octet) {
         }
         const bool held = (lines & 1) == 0;
         if (held) {
-            stop_receiver(chip);
-            clear_status(chip, ST_RXOVRR);
+            dw1000_stop_receiver(chip);
+            dw1000_clear_status(chip, ST_RXOVRR);
             chip->set[0].full = chip->set[1].full = false;
             chip->stale = false;
         }
         chip->rx_in_reset = held;
     }
     if ((clocks & OF_LDE_CLOCKS) != LDE_CLOCKS) {
-        cancel(chip, GROUP_LOAD); /* too early: what was loaded so far is worth nothing */
+        dw1000_cancel(chip, GROUP_LOAD); /* too early: what was loaded so far is worth nothing */
     }
     choose_clock(chip);
 }
@@ -159,27 +162,27 @@ static void clocks_written(dw1000_chip *chip, bool whole_reset_octet) {
 static void microcode_loaded(dw1000_chip *chip, transmission *none) {
     (void)none;
     chip->lde_loaded = true;
-    put(chip, OTP_IF, OTP_CTRL, 2, get(chip, OTP_IF, OTP_CTRL, 2) & ~LDE_LOAD);
+    dw1000_put(chip, OTP_IF, OTP_CTRL, 2, dw1000_get(chip, OTP_IF, OTP_CTRL, 2) & ~LDE_LOAD);
 }
 
 static void otp_written(dw1000_chip *chip) {
-    const unsigned command = (unsigned)get(chip, OTP_IF, OTP_CTRL, 2);
-    const unsigned clocks = (unsigned)get(chip, PMSC, PMSC_CTRL0, 2);
+    const unsigned command = (unsigned)dw1000_get(chip, OTP_IF, OTP_CTRL, 2);
+    const unsigned clocks = (unsigned)dw1000_get(chip, PMSC, PMSC_CTRL0, 2);
     if (command & LDE_LOAD) {
         chip->lde_loaded = false;
-        cancel(chip, GROUP_LOAD);
+        dw1000_cancel(chip, GROUP_LOAD);
         if ((clocks & OF_LDE_CLOCKS) == LDE_CLOCKS) {
-            schedule(chip, GROUP_LOAD, chip->air->now + MICROSECONDS(LDE_LOAD_US), microcode_loaded, NULL);
+            dw1000_schedule(chip, GROUP_LOAD, chip->air->now + MICROSECONDS(LDE_LOAD_US), microcode_loaded, NULL);
         }
     }
     if ((command & ACCESS_OTP) == ACCESS_OTP) {
-        const unsigned at = (unsigned)get(chip, OTP_IF, OTP_ADDR, 2) & 0x7FF;
+        const unsigned at = (unsigned)dw1000_get(chip, OTP_IF, OTP_ADDR, 2) & 0x7FF;
         uint32_t value = at < sizeof chip->otp / sizeof *chip->otp ? chip->otp[at] : 0;
         if (system_clock(chip) != SYSCLKS_XTI) {
-            value = (uint32_t)dice(chip->air->seed ^ (uint64_t)chip->air->now, at);
+            value = (uint32_t)dw1000_dice(chip->air->seed ^ (uint64_t)chip->air->now, at);
         }
-        put(chip, OTP_IF, OTP_RDAT, 4, value);
-        put(chip, OTP_IF, OTP_CTRL, 2, command & ~READ_OTP); /* it clears itself */
+        dw1000_put(chip, OTP_IF, OTP_RDAT, 4, value);
+        dw1000_put(chip, OTP_IF, OTP_CTRL, 2, command & ~READ_OTP); /* it clears itself */
     }
 }
 
@@ -190,25 +193,25 @@ static uint64_t converted(double value) {
 /* Voltage and temperature, an octet each. */
 static void measure_to(dw1000_chip *chip, unsigned sub) {
     const double at_3v3 = chip->otp[8] & 0xFF, at_23c = chip->otp[9] & 0xFF;
-    put(chip, TX_CAL, sub, 1, converted(at_3v3 + (chip->volts - 3.3) * 173.0));
-    put(chip, TX_CAL, sub + 1, 1, converted(at_23c + (chip->celsius - 23.0) / 1.14));
+    dw1000_put(chip, TX_CAL, sub, 1, converted(at_3v3 + (chip->volts - 3.3) * 173.0));
+    dw1000_put(chip, TX_CAL, sub + 1, 1, converted(at_23c + (chip->celsius - 23.0) / 1.14));
 }
 
 static void awake(dw1000_chip *chip, transmission *none) {
     (void)none;
-    const unsigned keep = (unsigned)get(chip, AON, AON_WCFG, 2);
+    const unsigned keep = (unsigned)dw1000_get(chip, AON, AON_WCFG, 2);
     const bool microcode = (keep & ONW_LLDE) != 0;
-    reset_chip(chip, 0);
-    cancel(chip, GROUP_POWER);
+    dw1000_reset_chip(chip, 0);
+    dw1000_cancel(chip, GROUP_POWER);
     if (keep & ONW_LDC) {
         memcpy(chip->octets, chip->retained, sizeof chip->octets);
-        /* Errata: the antenna delays do not survive. */
-        put(chip, TX_ANTD, 0, 2, (get(chip, TX_ANTD, 0, 2) ^ dice(chip->air->seed, (uint64_t)chip->air->now)) | 1);
-        put(chip, LDE_IF, LDE_RXANTD, 2, 0);
+        /* The antenna delays do not survive (manual 2.12, p. 103). */
+        dw1000_put(chip, TX_ANTD, 0, 1, dw1000_get(chip, LDE_IF, LDE_RXANTD + 1, 1));
+        dw1000_put(chip, LDE_IF, LDE_RXANTD, 2, 0);
     } else {
-        put(chip, AON, AON_WCFG, 2, keep);
+        dw1000_put(chip, AON, AON_WCFG, 2, keep);
     }
-    put(chip, AON, AON_CTRL, 1, 0);
+    dw1000_put(chip, AON, AON_CTRL, 1, 0);
     chip->lde_loaded = microcode;
     initialise(chip, NULL);
     if (keep & ONW_RADC) {
@@ -218,10 +221,10 @@ static void awake(dw1000_chip *chip, transmission *none) {
 }
 
 static void begin_to_wake(dw1000_chip *chip, unsigned by) {
-    if (chip->power == POWER_SLEEP && (get(chip, AON, AON_CFG0, 1) & by)) {
-        cancel(chip, GROUP_POWER);
+    if (chip->power == POWER_SLEEP && (dw1000_get(chip, AON, AON_CFG0, 1) & by)) {
+        dw1000_cancel(chip, GROUP_POWER);
         chip->power = POWER_WAKEUP;
-        schedule(chip, GROUP_POWER, chip->air->now + MICROSECONDS(WAKE_UP_US), awake, NULL);
+        dw1000_schedule(chip, GROUP_POWER, chip->air->now + MICROSECONDS(WAKE_UP_US), awake, NULL);
     }
 }
 
@@ -235,15 +238,15 @@ static void fall_asleep(dw1000_chip *chip) {
     silence(chip);
     chip->status = 0;
     chip->set[0].status = chip->set[1].status = 0;
-    update_line(chip);
+    dw1000_update_line(chip);
     chip->power = POWER_SLEEP;
-    const double units = (double)get(chip, AON, AON_SLEEP_TIM, 2);
-    if (units > 0 && (get(chip, AON, AON_CFG1, 1) & COUNTER_ON)) {
-        schedule(chip, GROUP_POWER, chip->air->now + MICROSECONDS(units * SLEEP_UNIT_US), slept_enough, NULL);
+    const double units = (double)dw1000_get(chip, AON, AON_SLEEP_TIM, 2);
+    if (units > 0 && (dw1000_get(chip, AON, AON_CFG1, 1) & COUNTER_ON)) {
+        dw1000_schedule(chip, GROUP_POWER, chip->air->now + MICROSECONDS(units * SLEEP_UNIT_US), slept_enough, NULL);
     }
 }
 
-void wake_by_select(dw1000_chip *chip, instant held) {
+void dw1000_wake_by_select(dw1000_chip *chip, instant held) {
     if (held >= MICROSECONDS(SELECT_TO_WAKE_US)) {
         begin_to_wake(chip, WAKE_SPI);
     }
@@ -253,8 +256,8 @@ void dw1000_wakeup_pin(dw1000_chip *chip) {
     begin_to_wake(chip, WAKE_PIN);
 }
 
-void sleep_after(dw1000_chip *chip, unsigned enabling_bit) {
-    if (get(chip, PMSC, PMSC_CTRL1, 4) & (1u << enabling_bit)) {
+void dw1000_sleep_after(dw1000_chip *chip, unsigned enabling_bit) {
+    if (dw1000_get(chip, PMSC, PMSC_CTRL1, 4) & (1u << enabling_bit)) {
         fall_asleep(chip);
     }
 }
@@ -264,10 +267,18 @@ void dw1000_environment(dw1000_chip *chip, double celsius, double volts) {
     chip->volts = volts;
 }
 
+static void sensors_ready(dw1000_chip *chip, transmission *none) {
+    (void)none;
+    measure_to(chip, TC_SARL);
+}
+
+/* The manual's 2.5 us are not enough while the PLL clocks the chip: Decawave's driver waits for 1 ms. */
 static void sensors_written(dw1000_chip *chip) {
-    const bool on = get(chip, RF_CONF, RF_SAR_BIAS, 1) == 0x80 && get(chip, RF_CONF, RF_SAR_SWITCH, 1) == 0x0F;
-    if (on && (get(chip, TX_CAL, TC_SARC, 1) & 1)) {
-        measure_to(chip, TC_SARL);
+    const bool on = dw1000_get(chip, RF_CONF, RF_SAR_BIAS, 1) == 0x80 &&
+                    dw1000_get(chip, RF_CONF, RF_SAR_SWITCH, 1) == 0x0F;
+    if (on && (dw1000_get(chip, TX_CAL, TC_SARC, 1) & 1)) {
+        const double takes_us = chip->power == POWER_IDLE ? SENSORS_PLL_US : SENSORS_XTI_US;
+        dw1000_schedule(chip, GROUP_SENSORS, chip->air->now + MICROSECONDS(takes_us), sensors_ready, NULL);
     }
 }
 
@@ -275,7 +286,7 @@ static bool touched(unsigned sub, size_t count, unsigned at, unsigned octets) {
     return sub < at + octets && at < sub + count;
 }
 
-void power_written(dw1000_chip *chip, unsigned file, unsigned sub, size_t count) {
+void dw1000_power_written(dw1000_chip *chip, unsigned file, unsigned sub, size_t count) {
     if (file == PMSC && touched(sub, count, PMSC_CTRL0, 4)) {
         clocks_written(chip, touched(sub, count, PMSC_CTRL0 + 3, 1));
     } else if (file == OTP_IF && touched(sub, count, OTP_CTRL, 2)) {
@@ -283,28 +294,34 @@ void power_written(dw1000_chip *chip, unsigned file, unsigned sub, size_t count)
     } else if (file == TX_CAL && touched(sub, count, TC_SARC, 1)) {
         sensors_written(chip);
     } else if (file == AON && touched(sub, count, AON_CTRL, 1)) {
-        if ((get(chip, AON, AON_CTRL, 1) & AON_SAVE) && (get(chip, AON, AON_CFG0, 1) & SLEEP_EN)) {
+        if ((dw1000_get(chip, AON, AON_CTRL, 1) & AON_SAVE) && (dw1000_get(chip, AON, AON_CFG0, 1) & SLEEP_EN)) {
             fall_asleep(chip);
         }
     } else if (file == DIG_DIAG && touched(sub, count, EVC_CTRL, 1)) {
-        const unsigned command = (unsigned)get(chip, DIG_DIAG, EVC_CTRL, 1);
+        const unsigned command = (unsigned)dw1000_get(chip, DIG_DIAG, EVC_CTRL, 1);
         if (command & 2) {
             for (unsigned i = 0; i < COUNTERS; i++) {
-                put(chip, DIG_DIAG, 4 + 2 * i, 2, 0);
+                dw1000_put(chip, DIG_DIAG, 4 + 2 * i, 2, 0);
             }
         }
         chip->counting = command == 1; /* EN together with CLR is not taken */
-        put(chip, DIG_DIAG, EVC_CTRL, 1, 0);
+        dw1000_put(chip, DIG_DIAG, EVC_CTRL, 1, 0);
     }
 }
 
-void fill_otp(dw1000_chip *chip) {
+void dw1000_program_otp(dw1000_chip *chip, unsigned address, uint32_t word) {
+    if (address < sizeof chip->otp / sizeof *chip->otp) {
+        chip->otp[address] = word;
+    }
+}
+
+void dw1000_fill_otp(dw1000_chip *chip) {
     static const uint32_t POWERS[] = {0x15355575, 0x07274767, 0x15355575, 0x07274767, 0x0F2F4F6F, 0x2B4B6B8B,
                                       0x1F1F3F5F, 0x3A5A7A9A, 0x0E082848, 0x25456585, 0x32527292, 0x5171B1D1};
     const uint32_t delay = (uint32_t)chip->tx_delay + chip->rx_delay;
     const uint32_t number = (uint32_t)chip->index + 1;
     chip->otp[0x00] = 0x00000000u | number;
-    chip->otp[0x01] = 0xDECA0100u | (uint32_t)(dice(chip->air->seed, number) & 0xFF);
+    chip->otp[0x01] = 0xDECA0100u | (uint32_t)(dw1000_dice(chip->air->seed, number) & 0xFF);
     chip->otp[0x04] = 0x88888828;
     chip->otp[0x05] = 0x00000088;
     chip->otp[0x06] = 0x10000000u | number;

@@ -134,7 +134,7 @@ static void lay_out(void) {
     }
 }
 
-void prepare_map(void) {
+void dw1000_prepare_map(void) {
     static pthread_once_t once = PTHREAD_ONCE_INIT;
     (void)pthread_once(&once, lay_out);
 }
@@ -148,7 +148,7 @@ static location locate(unsigned file, unsigned sub) {
     return (location){NULL, 0};
 }
 
-uint8_t *place(dw1000_chip *chip, unsigned file, unsigned sub) {
+uint8_t *dw1000_place(dw1000_chip *chip, unsigned file, unsigned sub) {
     const location at = locate(file, sub);
     if (at.found == NULL) {
         return NULL;
@@ -157,7 +157,7 @@ uint8_t *place(dw1000_chip *chip, unsigned file, unsigned sub) {
 }
 
 /* Values of registers as the chip itself sees them: of the swinging set the side that it writes to. */
-uint64_t get(const dw1000_chip *chip, unsigned file, unsigned sub, unsigned octets) {
+uint64_t dw1000_get(const dw1000_chip *chip, unsigned file, unsigned sub, unsigned octets) {
     const location at = locate(file, sub);
     const uint8_t *const from =
         at.found->type == SWINGING ? &chip->set[chip->chip_side].octets[at.base] : &chip->octets[at.base];
@@ -168,23 +168,23 @@ uint64_t get(const dw1000_chip *chip, unsigned file, unsigned sub, unsigned octe
     return value;
 }
 
-void put(dw1000_chip *chip, unsigned file, unsigned sub, unsigned octets, uint64_t value) {
-    uint8_t *const to = place(chip, file, sub);
+void dw1000_put(dw1000_chip *chip, unsigned file, unsigned sub, unsigned octets, uint64_t value) {
+    uint8_t *const to = dw1000_place(chip, file, sub);
     for (unsigned i = 0; i < octets; i++) {
         to[i] = (uint8_t)(value >> (8 * i));
     }
 }
 
-void reset_registers(dw1000_chip *chip) {
+void dw1000_reset_registers(dw1000_chip *chip) {
     for (size_t i = 0; i < ENTRIES; i++) {
         if (MAP[i].octets <= 8) {
-            put(chip, MAP[i].file, MAP[i].sub, MAP[i].octets, MAP[i].reset);
+            dw1000_put(chip, MAP[i].file, MAP[i].sub, MAP[i].octets, MAP[i].reset);
         } else {
-            memset(place(chip, MAP[i].file, MAP[i].sub), 0, MAP[i].octets);
+            memset(dw1000_place(chip, MAP[i].file, MAP[i].sub), 0, MAP[i].octets);
         }
     }
-    put(chip, EUI, 0, 4, chip->otp[0]);
-    put(chip, EUI, 4, 4, chip->otp[1]);
+    dw1000_put(chip, EUI, 0, 4, chip->otp[0]);
+    dw1000_put(chip, EUI, 4, 4, chip->otp[1]);
     memset(chip->set, 0, sizeof chip->set);
 }
 
@@ -201,7 +201,7 @@ static uint8_t octet_of(uint64_t value, unsigned sub, unsigned octets) {
 }
 
 static uint8_t accumulator_octet(const dw1000_chip *chip, unsigned sub) {
-    const uint32_t clocks = (uint32_t)get(chip, PMSC, PMSC_CTRL0, 4);
+    const uint32_t clocks = (uint32_t)dw1000_get(chip, PMSC, PMSC_CTRL0, 4);
     const bool on = (clocks & (1u << 6)) && (clocks & (1u << 15));
     if (!on || sub >= sizeof chip->accumulator) {
         return 0;
@@ -210,20 +210,20 @@ static uint8_t accumulator_octet(const dw1000_chip *chip, unsigned sub) {
     return (uint8_t)(sub & 1 ? value >> 8 : value);
 }
 
-void read_octets(dw1000_chip *chip, unsigned file, unsigned sub, uint8_t *to, size_t count) {
+void dw1000_read_octets(dw1000_chip *chip, unsigned file, unsigned sub, uint8_t *to, size_t count) {
     uint64_t value = 0;
     unsigned octets = 0;
     switch (file) {
     case SYS_TIME:
-        value = counter_now(chip) & ~(uint64_t)(COUNTER_GRID - 1);
+        value = dw1000_counter_now(chip) & ~(uint64_t)(COUNTER_GRID - 1);
         octets = 5;
         break;
     case SYS_STATUS:
-        value = status_of(chip);
+        value = dw1000_status_of(chip);
         octets = 5;
         break;
     case SYS_STATE:
-        value = system_state(chip);
+        value = dw1000_system_state(chip);
         octets = 5;
         break;
     case SYS_CTRL:
@@ -252,16 +252,16 @@ void read_octets(dw1000_chip *chip, unsigned file, unsigned sub, uint8_t *to, si
     }
 }
 
-void write_octets(dw1000_chip *chip, unsigned file, unsigned sub, const uint8_t *from, size_t count) {
+void dw1000_write_octets(dw1000_chip *chip, unsigned file, unsigned sub, const uint8_t *from, size_t count) {
     if (file == SYS_STATUS || file == SYS_CTRL) {
         uint64_t value = 0;
         for (size_t i = 0; i < count && sub + i < 5; i++) {
             value |= (uint64_t)from[i] << (8 * (sub + i));
         }
         if (file == SYS_STATUS) {
-            acknowledge_status(chip, value & ~ST_READ_ONLY);
+            dw1000_acknowledge_status(chip, value & ~ST_READ_ONLY);
         } else {
-            control(chip, (uint32_t)value);
+            dw1000_control(chip, (uint32_t)value);
         }
         return;
     }
@@ -271,7 +271,7 @@ void write_octets(dw1000_chip *chip, unsigned file, unsigned sub, const uint8_t 
             if (at < FRAME_OCTETS) {
                 chip->tx_buffer[at] = from[i];
             }
-            if (at > LAST_HARMLESS && chip->set[1].full && doubly_buffered(chip)) {
+            if (at > LAST_HARMLESS && chip->set[1].full && dw1000_doubly_buffered(chip)) {
                 chip->set[1].buffer[LAST_HARMLESS + 1] ^= 0xFF; /* errata RX-1 */
             }
             continue;
@@ -282,10 +282,10 @@ void write_octets(dw1000_chip *chip, unsigned file, unsigned sub, const uint8_t 
         }
     }
     if (file == SYS_CFG || file == SYS_MASK) {
-        update_line(chip);
+        dw1000_update_line(chip);
     }
     if (file == TX_BUFFER && chip->tx == TX_ON && chip->suppress_fcs) {
-        raise_status(chip, ST_TXBERR);
+        dw1000_raise_status(chip, ST_TXBERR);
     }
-    power_written(chip, file, sub, count);
+    dw1000_power_written(chip, file, sub, count);
 }

@@ -5,7 +5,7 @@ static void run(dw1000_chip *chip, void *context) {
     dw1000_request request = {DW1000_DELAY, 0, 0, 0, NULL, NULL, 0, 0};
     for (;;) {
         request.line = chip->line;
-        request.now_s = seconds_now(chip->air);
+        request.now_s = dw1000_seconds_now(chip->air);
         if (!chip->next(context, &request)) {
             return;
         }

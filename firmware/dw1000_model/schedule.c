@@ -41,7 +41,7 @@ static void *or_end(void *fresh) {
     return fresh;
 }
 
-void *memory(size_t bytes) {
+void *dw1000_memory(size_t bytes) {
     return or_end(calloc(1, bytes));
 }
 
@@ -84,13 +84,13 @@ static event pop(dw1000_air *air) {
     return first;
 }
 
-void schedule(dw1000_chip *chip, event_group group, instant at, handler *fire, transmission *frame) {
+void dw1000_schedule(dw1000_chip *chip, event_group group, instant at, handler *fire, transmission *frame) {
     dw1000_air *const air = chip->air;
     const event added = {at > air->now ? at : air->now, 0, fire, chip, frame, NULL, chip->epoch[group], group};
     push(air, added);
 }
 
-void cancel(dw1000_chip *chip, event_group group) {
+void dw1000_cancel(dw1000_chip *chip, event_group group) {
     chip->epoch[group]++;
 }
 
@@ -132,7 +132,7 @@ static void dispatch(dw1000_air *air) {
     }
 }
 
-void pass(dw1000_air *air, instant until) {
+void dw1000_pass(dw1000_air *air, instant until) {
     if (until < air->now) {
         until = air->now;
     }
@@ -175,7 +175,7 @@ static void enter(unsigned high, unsigned low) {
     finish(self);
 }
 
-bool start_outside(dw1000_air *air) {
+bool dw1000_start_outside(dw1000_air *air) {
     air->outside = calloc(1, sizeof *air->outside);
     if (air->outside == NULL) {
         return false;
@@ -207,7 +207,7 @@ static void sweep(dw1000_air *air, bool all) {
     }
 }
 
-void free_programs(dw1000_air *air) {
+void dw1000_free_programs(dw1000_air *air) {
     sweep(air, true);
     free(air->outside);
     free(air->events);
@@ -221,7 +221,7 @@ void dw1000_program(dw1000_chip *chip, void (*run)(dw1000_chip *, void *), void 
         air->alive--;
     }
     sweep(air, false);
-    coroutine *const program = memory(sizeof *program);
+    coroutine *const program = dw1000_memory(sizeof *program);
     program->air = air;
     program->chip = chip;
     program->run = run;
@@ -253,31 +253,31 @@ static instant duration(double seconds) {
     return (instant)llround(fmin(seconds, LONGEST_S) * (double)UNITS_PER_SECOND);
 }
 
-double seconds_now(const dw1000_air *air) {
+double dw1000_seconds_now(const dw1000_air *air) {
     return (double)air->now / (double)UNITS_PER_SECOND;
 }
 
 double dw1000_run(dw1000_air *air, double seconds) {
     air->running = air->alive != 0;
-    pass(air, air->now + duration(seconds));
+    dw1000_pass(air, air->now + duration(seconds));
     air->running = false;
-    return seconds_now(air);
+    return dw1000_seconds_now(air);
 }
 
 void dw1000_delay(dw1000_chip *chip, double s) {
-    pass(chip->air, chip->air->now + duration(s));
+    dw1000_pass(chip->air, chip->air->now + duration(s));
 }
 
 /* Looking takes a program a moment: one that does nothing but look still gets somewhere. */
 static void look(dw1000_air *air) {
     if (air->current != air->outside) {
-        pass(air, air->now + duration(LOOK_S));
+        dw1000_pass(air, air->now + duration(LOOK_S));
     }
 }
 
 double dw1000_now(dw1000_chip *chip) {
     look(chip->air);
-    return seconds_now(chip->air);
+    return dw1000_seconds_now(chip->air);
 }
 
 int dw1000_irq(dw1000_chip *chip) {
@@ -290,11 +290,11 @@ void dw1000_wait(dw1000_chip *chip, double at_most_s) {
         return;
     }
     chip->waiter = chip->air->current;
-    pass(chip->air, chip->air->now + duration(at_most_s));
+    dw1000_pass(chip->air, chip->air->now + duration(at_most_s));
     chip->waiter = NULL;
 }
 
-void wake(dw1000_chip *chip) {
+void dw1000_wake(dw1000_chip *chip) {
     if (chip->waiter != NULL) {
         resume_at(chip->waiter, chip->air->now);
         chip->waiter = NULL;

@@ -35,34 +35,34 @@ void dw1000_spi(dw1000_chip *chip, const uint8_t *out, uint8_t *in, size_t n, ui
     const double octet = 8.0 / hz * (double)UNITS_PER_SECOND;
     const instant began = air->now, ends = began + (instant)(octet * (double)n + FRAMING_NS * UNITS_PER_NS);
     const header to = decode(out, n);
-    if (!spi_works(chip, hz)) {
+    if (!dw1000_spi_works(chip, hz)) {
         if (in != NULL) {
             for (size_t i = 0; i < n; i++) {
                 in[i] = chip->power == POWER_SLEEP || chip->power == POWER_WAKEUP
                             ? 0
-                            : (uint8_t)dice(air->seed ^ (uint64_t)began, i);
+                            : (uint8_t)dw1000_dice(air->seed ^ (uint64_t)began, i);
             }
         }
-        pass(air, ends);
-        wake_by_select(chip, ends - began);
-        if (to.write && to.file == PMSC && n > to.octets && to.octets != 0 && clocks_listen(chip, hz)) {
-            write_octets(chip, to.file, to.sub, out + to.octets, n - to.octets);
+        dw1000_pass(air, ends);
+        dw1000_wake_by_select(chip, ends - began);
+        if (to.write && to.file == PMSC && n > to.octets && to.octets != 0 && dw1000_clocks_listen(chip, hz)) {
+            dw1000_write_octets(chip, to.file, to.sub, out + to.octets, n - to.octets);
         }
         return;
     }
     if (to.octets == 0) {
-        pass(air, ends);
+        dw1000_pass(air, ends);
         return;
     }
     if (to.write) {
         if (in != NULL) {
             memset(in, 0, n);
         }
-        pass(air, ends);
+        dw1000_pass(air, ends);
         if (n > to.octets && !chip->in_reset) {
-            write_octets(chip, to.file, to.sub, out + to.octets, n - to.octets);
+            dw1000_write_octets(chip, to.file, to.sub, out + to.octets, n - to.octets);
         } else if (n > to.octets && to.file == PMSC) {
-            write_octets(chip, to.file, to.sub, out + to.octets, n - to.octets);
+            dw1000_write_octets(chip, to.file, to.sub, out + to.octets, n - to.octets);
         }
         return;
     }
@@ -82,12 +82,12 @@ void dw1000_spi(dw1000_chip *chip, const uint8_t *out, uint8_t *in, size_t n, ui
     }
     while (done < n) {
         const size_t piece = n - done < PIECE ? n - done : PIECE;
-        read_octets(chip, to.file, sub, in != NULL ? in + done : unwanted, piece);
+        dw1000_read_octets(chip, to.file, sub, in != NULL ? in + done : unwanted, piece);
         done += piece;
         sub += (unsigned)piece;
         if (done < n) {
-            pass(air, began + (instant)(octet * (double)done));
+            dw1000_pass(air, began + (instant)(octet * (double)done));
         }
     }
-    pass(air, ends);
+    dw1000_pass(air, ends);
 }

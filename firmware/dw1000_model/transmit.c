@@ -1,4 +1,5 @@
 /* The transmitter. */
+#include <math.h>
 #include <stdlib.h>
 #include <string.h>
 
@@ -46,20 +47,20 @@ static void finished(dw1000_chip *chip, transmission *frame) {
     (void)frame;
     chip->tx = TX_OFF;
     chip->sending = NULL;
-    raise_status(chip, ST_TXFRS);
-    count_event(chip, COUNT_TXFS);
+    dw1000_raise_status(chip, ST_TXFRS);
+    dw1000_count_event(chip, COUNT_TXFS);
     chip->acknowledging = false;
     if (chip->wait_for_response) {
-        const double wait_us = (double)(get(chip, ACK_RESP_T, 0, 4) & 0xFFFFF);
-        enable_receiver(chip, chip->air->now + MICROSECONDS(wait_us + TURNAROUND_US), false);
+        const double wait_us = (double)(dw1000_get(chip, ACK_RESP_T, 0, 4) & 0xFFFFF);
+        dw1000_enable_receiver(chip, chip->air->now + MICROSECONDS(wait_us + TURNAROUND_US), false);
     } else {
-        sleep_after(chip, ATXSLP);
+        dw1000_sleep_after(chip, ATXSLP);
     }
 }
 
 /* Only now are octets taken from the buffer: what is written while a frame is being sent ends up in it (errata TX-2). */
 static void take_payload(dw1000_chip *chip, transmission *frame) {
-    const uint32_t control = (uint32_t)get(chip, TX_FCTRL, 0, 4);
+    const uint32_t control = (uint32_t)dw1000_get(chip, TX_FCTRL, 0, 4);
     const size_t offset = control >> 22;
     if (!chip->acknowledging) {
         for (size_t i = 0; i < frame->length; i++) {
@@ -67,52 +68,76 @@ static void take_payload(dw1000_chip *chip, transmission *frame) {
         }
     }
     if (!chip->suppress_fcs && frame->length >= 2) {
-        const bool ones = (get(chip, SYS_CFG, 0, 4) & CFG_FCS_INIT2F) != 0;
-        const uint16_t check = frame_check(frame->payload, frame->length - 2, ones ? 0xFFFF : 0);
+        const bool ones = (dw1000_get(chip, SYS_CFG, 0, 4) & CFG_FCS_INIT2F) != 0;
+        const uint16_t check = dw1000_frame_check(frame->payload, frame->length - 2, ones ? 0xFFFF : 0);
         frame->payload[frame->length - 2] = (uint8_t)check;
         frame->payload[frame->length - 1] = (uint8_t)(check >> 8);
     }
-    put(chip, TX_TIME, TX_RAWST, 5, frame->counter);
-    put(chip, TX_TIME, 0, 5, (frame->counter + get(chip, TX_ANTD, 0, 2)) & COUNTER_MASK);
-    raise_status(chip, ST_TXPHS);
-    schedule(chip, GROUP_TX, frame->end, finished, frame);
+    dw1000_put(chip, TX_TIME, TX_RAWST, 5, frame->counter);
+    dw1000_put(chip, TX_TIME, 0, 5, (frame->counter + dw1000_get(chip, TX_ANTD, 0, 2)) & COUNTER_MASK);
+    dw1000_raise_status(chip, ST_TXPHS);
+    dw1000_schedule(chip, GROUP_TX, frame->end, finished, frame);
 }
 
 static void preamble_sent(dw1000_chip *chip, transmission *frame) {
-    raise_status(chip, ST_TXPRS);
-    schedule(chip, GROUP_TX, frame->data, take_payload, frame);
+    dw1000_raise_status(chip, ST_TXPRS);
+    dw1000_schedule(chip, GROUP_TX, frame->data, take_payload, frame);
+}
+
+/* TX_POWER by its two formats: smart power has an octet for each duration of a frame, at 6.8 Mbit/s alone; without it
+ * the third octet is for preamble and data, the second one for the PHR. */
+static void choose_power(dw1000_chip *chip, const transmission *frame) {
+    static const double BOOST_US[] = {500, 250, 125};
+    unsigned data = 0;
+    while (frame->rate == 2 && data < 3 && frame->end - frame->start <= MICROSECONDS(BOOST_US[data])) {
+        data++;
+    }
+    const bool smart = (dw1000_get(chip, SYS_CFG, 0, 4) & CFG_DIS_STXP) == 0;
+    chip->data_power = (uint8_t)dw1000_get(chip, TX_POWER, smart ? data : 2, 1);
+    chip->header_power = (uint8_t)dw1000_get(chip, TX_POWER, smart ? data : 1, 1);
+}
+
+/* Bits 7:5: 18 dB in steps of -3, or nothing; bits 4:0: steps of 0.5 dB. */
+static double decibels(unsigned octet) {
+    return octet >> 5 == 7 ? -INFINITY : 18 - 3.0 * (octet >> 5) + 0.5 * (octet & 31u);
+}
+
+void dw1000_sent_power(const dw1000_chip *chip, double *data_db, double *header_db) {
+    *data_db = decibels(chip->data_power);
+    *header_db = decibels(chip->header_power);
 }
 
 static void on_air(dw1000_chip *chip, transmission *frame) {
     dw1000_air *const air = chip->air;
+    choose_power(chip, frame);
     chip->tx = TX_ON;
     chip->status &= ~(ST_TX & ~ST_AAT); /* of a delayed frame only now: while it waits, those of the frame before stand */
-    raise_status(chip, ST_TXFRB);
+    dw1000_raise_status(chip, ST_TXFRB);
     frame->next = air->flying;
     air->flying = frame;
     for (size_t i = 0; i < air->chip_count; i++) {
         if (chip->links[i] != NULL) {
-            consider(air->chips[i], frame);
-            disturb(air->chips[i], frame);
+            dw1000_consider(air->chips[i], frame);
+            dw1000_disturb(air->chips[i], frame);
         }
     }
-    schedule(chip, GROUP_TX, frame->sfd, preamble_sent, frame);
+    dw1000_schedule(chip, GROUP_TX, frame->sfd, preamble_sent, frame);
 }
 
 /* A frame as TX_FCTRL describes it, but for its times. */
 static transmission *describe(dw1000_chip *chip) {
-    const uint32_t control = (uint32_t)get(chip, TX_FCTRL, 0, 4);
-    transmission *const frame = memory(sizeof *frame);
+    const uint32_t control = (uint32_t)dw1000_get(chip, TX_FCTRL, 0, 4);
+    transmission *const frame = dw1000_memory(sizeof *frame);
     frame->serial = chip->air->serial++;
     frame->sender = chip;
-    frame->mode = transmit_mode(chip);
+    frame->mode = dw1000_transmit_mode(chip);
     frame->rate = control >> 13 & 3;
     frame->preamble_code = control >> 18 & 15;
     frame->preamble_symbols = preamble_symbols(frame->preamble_code);
-    frame->phr_mode = (unsigned)(get(chip, SYS_CFG, 0, 4) & CFG_PHR_MODE) >> 16;
+    frame->phr_mode = (unsigned)(dw1000_get(chip, SYS_CFG, 0, 4) & CFG_PHR_MODE) >> 16;
     frame->ranging = control >> 15 & 1;
     frame->length = control & (frame->phr_mode == 3 ? 0x3FF : 0x7F);
-    frame->symbol = symbol_units(frame->mode.prf);
+    frame->symbol = dw1000_symbol_units(frame->mode.prf);
     return frame;
 }
 
@@ -124,7 +149,7 @@ static instant header_units(const transmission *frame) {
 static void send_at(dw1000_chip *chip, transmission *frame, uint64_t marker) {
     const instant bit = bit_units(frame->rate), coded = frame->rate == 0 ? bit : bit_units(1);
     const size_t bits = 8 * frame->length;
-    frame->marker = air_time(chip, marker + (uint64_t)chip->tx_delay * UNITS_PER_TICK);
+    frame->marker = dw1000_air_time(chip, marker + (uint64_t)chip->tx_delay * UNITS_PER_TICK);
     frame->sfd = frame->marker - (instant)frame->mode.sfd_symbols * frame->symbol;
     frame->start = frame->marker - header_units(frame);
     frame->data = frame->marker + PHR_SYMBOLS * coded;
@@ -133,7 +158,7 @@ static void send_at(dw1000_chip *chip, transmission *frame, uint64_t marker) {
     frame->counter = (marker / UNITS_PER_TICK) & COUNTER_MASK;
     chip->sending = frame;
     chip->tx = TX_WAIT;
-    schedule(chip, GROUP_TX, frame->start, on_air, frame);
+    dw1000_schedule(chip, GROUP_TX, frame->start, on_air, frame);
 }
 
 static uint64_t next_grid(uint64_t units) {
@@ -146,31 +171,31 @@ static void give_up(dw1000_chip *chip, transmission *frame) {
     free(frame);
 }
 
-void start_transmission(dw1000_chip *chip, uint32_t command) {
+void dw1000_start_transmission(dw1000_chip *chip, uint32_t command) {
     forget_old(chip->air);
-    cancel(chip, GROUP_TX);
+    dw1000_cancel(chip, GROUP_TX);
     chip->status &= ~(ST_HPDWARN | ST_TXPUTE | (command & CTRL_TXDLYS ? 0 : ST_TX));
-    update_line(chip);
+    dw1000_update_line(chip);
     chip->suppress_fcs = (command & CTRL_SFCST) != 0;
     chip->wait_for_response = (command & CTRL_WAIT4RESP) != 0;
     chip->acknowledging = false;
     transmission *const frame = describe(chip);
-    const uint64_t now = local_units(chip, chip->air->now), power_up = (uint64_t)MICROSECONDS(POWER_UP_US);
+    const uint64_t now = dw1000_local_units(chip, chip->air->now), power_up = (uint64_t)MICROSECONDS(POWER_UP_US);
     if (!(command & CTRL_TXDLYS)) {
         send_at(chip, frame, next_grid(now + power_up + (uint64_t)header_units(frame)));
         return;
     }
-    const uint64_t wanted = get(chip, DX_TIME, 0, 5) & ~(uint64_t)(COUNTER_GRID - 1);
+    const uint64_t wanted = dw1000_get(chip, DX_TIME, 0, 5) & ~(uint64_t)(COUNTER_GRID - 1);
     const uint64_t header = (uint64_t)header_units(frame) / UNITS_PER_TICK, ticks = now / UNITS_PER_TICK;
     const uint64_t lead = (wanted - header - ticks) & COUNTER_MASK; /* to the start of the preamble */
     const uint64_t lead_units = lead * UNITS_PER_TICK;
-    const bool clock_held = (get(chip, PMSC, PMSC_CTRL0, 1) >> 4 & 3) == TXCLKS_PLL;
+    const bool clock_held = (dw1000_get(chip, PMSC, PMSC_CTRL0, 1) >> 4 & 3) == TXCLKS_PLL;
     if (lead > COUNTER_MASK / 2) {
-        raise_status(chip, ST_HPDWARN); /* and it waits for a whole turn of the counter */
-        count_event(chip, COUNT_HPW);
+        dw1000_raise_status(chip, ST_HPDWARN); /* and it waits for a whole turn of the counter */
+        dw1000_count_event(chip, COUNT_HPW);
     } else if (lead_units < power_up) {
-        raise_status(chip, ST_TXPUTE);
-        count_event(chip, COUNT_TPW);
+        dw1000_raise_status(chip, ST_TXPUTE);
+        dw1000_count_event(chip, COUNT_TPW);
         give_up(chip, frame);
         return;
     } else if (lead_units < power_up + (uint64_t)MICROSECONDS(LOST_US) && !clock_held) {
@@ -181,25 +206,25 @@ void start_transmission(dw1000_chip *chip, uint32_t command) {
     send_at(chip, frame, (ticks + lead + header) * UNITS_PER_TICK);
 }
 
-void start_acknowledgement(dw1000_chip *chip, uint8_t sequence) {
+void dw1000_start_acknowledgement(dw1000_chip *chip, uint8_t sequence) {
     forget_old(chip->air);
-    cancel(chip, GROUP_TX);
+    dw1000_cancel(chip, GROUP_TX);
     transmission *const frame = describe(chip);
-    const bool pending = (get(chip, SYS_CFG, 0, 4) & CFG_AACKPEND) != 0;
-    const uint64_t wait = (get(chip, ACK_RESP_T, 3, 1)) * (uint64_t)frame->symbol;
+    const bool pending = (dw1000_get(chip, SYS_CFG, 0, 4) & CFG_AACKPEND) != 0;
+    const uint64_t wait = (dw1000_get(chip, ACK_RESP_T, 3, 1)) * (uint64_t)frame->symbol;
     frame->ranging = false;
     frame->length = 5;
     frame->payload[0] = pending ? 0x12 : 0x02;
     frame->payload[2] = sequence;
     chip->acknowledging = true;
     chip->suppress_fcs = chip->wait_for_response = false;
-    const uint64_t ready = local_units(chip, chip->air->now) + (uint64_t)MICROSECONDS(POWER_UP_US) + wait;
+    const uint64_t ready = dw1000_local_units(chip, chip->air->now) + (uint64_t)MICROSECONDS(POWER_UP_US) + wait;
     send_at(chip, frame, next_grid(ready + (uint64_t)header_units(frame)));
 }
 
-void stop_transmitter(dw1000_chip *chip) {
+void dw1000_stop_transmitter(dw1000_chip *chip) {
     transmission *const frame = chip->sending;
-    cancel(chip, GROUP_TX);
+    dw1000_cancel(chip, GROUP_TX);
     if (frame != NULL && chip->tx == TX_ON) {
         frame->aborted = chip->air->now;
     } else {

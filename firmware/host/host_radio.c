@@ -59,9 +59,12 @@ const uint8_t *host_radio_measurement(const host_radio *radio, size_t *bytes, ui
     return radio->twr.measurement;
 }
 
-/* Why the chip does not work, a uwb_dw1000_status; 0 while it does. */
+/* Why the chip does not work, a uwb_dw1000_status. 0 while it works, or NO_CLOCK if it has not reported its lock. */
 int host_radio_fault(const host_radio *radio) {
-    return radio->twr.running ? 0 : (int)radio->twr.fault;
+    if (radio->twr.running) {
+        return radio->twr.chip.lock_unconfirmed ? UWB_DW1000_NO_CLOCK : UWB_DW1000_OK;
+    }
+    return (int)radio->twr.fault;
 }
 
 /* 0 until the chip has started. */

@@ -23,7 +23,7 @@ typedef enum {
     UWB_DW1000_BAD_ARGUMENT, /* a setting that the chip has not, or a length beyond its memory */
     UWB_DW1000_BUS,          /* the transfer callback failed */
     UWB_DW1000_ABSENT,       /* DEV_ID is not a DW1000's: wiring, supply, or SPI too fast */
-    UWB_DW1000_NO_CLOCK,     /* the clock PLL does not lock */
+    UWB_DW1000_NO_CLOCK,     /* the clock PLL did not report its lock, and the chip ignores SPI at full speed */
     UWB_DW1000_RESTARTED,    /* the chip has lost its settings: it was reset, or its supply failed */
     UWB_DW1000_TIMEOUT,      /* nothing was received in time */
     UWB_DW1000_DAMAGED,      /* something was received, and no frame: header, check sequence, decoder, leading edge */
@@ -55,8 +55,11 @@ typedef struct {
     uint8_t decawave_sfd;    /* 0 = the standard's */
     uint16_t rate_kbps;      /* 110, 850, 6800 */
     uint16_t preamble;       /* symbols: 64, 128, 256, 512, 1024, 1536, 2048, 4096 */
-    uint32_t tx_power;       /* TX_POWER; 0 = as calibrated in the OTP memory, else the manual's */
+    uint32_t tx_power;       /* TX_POWER in smart-power format, as in the OTP memory: from the lowest octet on for frames
+                              * of any length, up to 500, 250 and 125 us; below 6.8 Mbit/s the lowest octet is used for
+                              * all. 0 = the OTP memory's value, or the manual's if there is none */
     uint32_t antenna_delay;  /* ticks of transmitter and receiver together; 0 = as in the OTP memory, else nominal */
+    uint8_t anchor;          /* take a TREK1000 board's antenna delay as an anchor, not as a tag */
 } uwb_dw1000_settings;
 
 /* Channel 5, 64 MHz, 6.8 Mbit/s, preamble of 128. */
@@ -66,17 +69,21 @@ typedef struct {
     uwb_dw1000_io io;
     uwb_dw1000_settings settings; /* in force; nothing in it is 0 for unknown any more */
     uint64_t eui;                 /* of the chip: from the OTP memory, or lot and part if that holds none */
-    uint32_t otp_antenna_delay;   /* OTP memory: 31:16 at 64 MHz, 15:0 at 16 MHz, in all */
+    uint32_t otp_antenna_delay;   /* OTP memory: TX + RX, 31:16 at 64 MHz, 15:0 at 16 MHz */
+    uint32_t otp_trek_delay[4];   /* per direction, 31:16 anchor, 15:0 tag: channel 2 at 6.8M and 110k, channel 5 */
     uint32_t otp_tx_power[12];
     uint8_t otp_voltage;
     uint8_t otp_temperature;
-    uint8_t listening;     /* the receiver may be on */
+    uint8_t otp_trek;         /* the OTP memory has the layout of the TREK1000 kit */
+    uint8_t lock_unconfirmed; /* CPLOCK has not appeared (errata: not reliable): a warning, not an error */
+    uint8_t listening;        /* the receiver may be on */
     uint8_t clock_forced;  /* the transmitter's, for a delayed transmission */
     uint16_t tx_antenna_delay;
     uint16_t wait_units; /* RX_FWTO as last written; 0 = never since the start */
     uint32_t sys_cfg;
     uint32_t tx_fctrl;   /* but for the length */
     uint8_t tx_bytes;    /* the length that it has; 0 = none yet */
+    uint64_t quiet_until_us; /* smart power is legal for one frame per millisecond */
 } uwb_dw1000;
 
 /* A frame that was received, without its check sequence. */
@@ -121,8 +128,7 @@ uint32_t uwb_dw1000_lead_us(const uwb_dw1000_settings *settings);
 
 #define UWB_DW1000_NO_LIMIT UINT32_MAX /* of the time that the chip listens: until it is told otherwise */
 
-/* Send now; then, if `answer_us` is not 0, listen for so long: after uwb_dw1000_sent, without which a frame received
- * before would be taken for the answer. */
+/* Send now, or with smart power 1 ms after the frame before; then, if `answer_us` is not 0, listen for that time. */
 uwb_dw1000_status uwb_dw1000_send(uwb_dw1000 *chip, const uint8_t *octets, size_t bytes, uint32_t answer_us);
 
 /* Get ready for uwb_dw1000_send_at, which otherwise does it itself. */

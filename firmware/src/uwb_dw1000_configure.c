@@ -1,6 +1,7 @@
 #include "uwb_dw1000_registers.h"
 
-/* Values of the User Manual, sections 7.2.x; columns of pairs are 16 and 64 MHz. */
+/* Values of the User Manual, sections 7.2.x; pairs are for PRF 16 and 64 MHz. RF_TXCTRL and TC_PGDELAY of channel 5 are
+ * those of manual 2.16 and later; they change together, and ranges with them. Power is in smart-power format. */
 static const struct {
     uint32_t pll_config;
     uint32_t tx_control;
@@ -8,12 +9,12 @@ static const struct {
     uint8_t number, pll_tune, pulse_delay, rx_control;
     uint8_t codes[2], codes_per_prf;
 } channels[] = {
-    {0x09000407, 0x00005C40, {0x75757575, 0x67676767}, 1, 0x1E, 0xC9, 0xD8, {1, 9}, 2},
-    {0x08400508, 0x00045CA0, {0x75757575, 0x67676767}, 2, 0x26, 0xC2, 0xD8, {3, 9}, 2},
-    {0x08401009, 0x00086CC0, {0x6F6F6F6F, 0x8B8B8B8B}, 3, 0x56, 0xC5, 0xD8, {5, 9}, 2},
-    {0x08400508, 0x00045C80, {0x5F5F5F5F, 0x9A9A9A9A}, 4, 0x26, 0x95, 0xBC, {7, 17}, 2},
-    {0x0800041D, 0x001E3FE0, {0x48484848, 0x85858585}, 5, 0xBE, 0xC0, 0xD8, {3, 9}, 2},
-    {0x0800041D, 0x001E7DE0, {0x92929292, 0xD1D1D1D1}, 7, 0xBE, 0x93, 0xBC, {7, 17}, 2},
+    {0x09000407, 0x00005C40, {0x15355575, 0x07274767}, 1, 0x1E, 0xC9, 0xD8, {1, 9}, 2},
+    {0x08400508, 0x00045CA0, {0x15355575, 0x07274767}, 2, 0x26, 0xC2, 0xD8, {3, 9}, 2},
+    {0x08401009, 0x00086CC0, {0x0F2F4F6F, 0x2B4B6B8B}, 3, 0x56, 0xC5, 0xD8, {5, 9}, 2},
+    {0x08400508, 0x00045C80, {0x1F1F3F5F, 0x3A5A7A9A}, 4, 0x26, 0x95, 0xBC, {7, 17}, 2},
+    {0x0800041D, 0x001E3FE3, {0x0E082848, 0x25456585}, 5, 0xBE, 0xB5, 0xD8, {3, 9}, 2},
+    {0x0800041D, 0x001E7DE0, {0x32527292, 0x5171B1D1}, 7, 0xBE, 0x93, 0xBC, {7, 17}, 2},
 };
 
 static const struct {
@@ -35,7 +36,7 @@ static const uint16_t replica[24] = {
     0x3AE0, 0x35C2, 0x2B84, 0x35C2, 0x3332, 0x35C2, 0x35C2, 0x47AE, 0x3AE0, 0x3850, 0x30A2, 0x3850,
 };
 
-const uwb_dw1000_settings uwb_dw1000_usual = {5, 64, 0, 0, 6800, 128, 0, 0};
+const uwb_dw1000_settings uwb_dw1000_usual = {5, 64, 0, 0, 6800, 128, 0, 0, 0};
 
 #define COUNT(array) (sizeof(array) / sizeof(array)[0])
 
@@ -96,12 +97,27 @@ uint32_t uwb_dw1000_air_us(const uwb_dw1000_settings *settings, size_t bytes) {
     return uwb_dw1000_lead_us(settings) + (uint32_t)(header_us + coded * bit_us) + 1u;
 }
 
+/* TX plus RX antenna delay in the OTP memory; 0 = not programmed. A TREK1000 kit (OTP revision 2 or 3) has a delay per
+ * direction for each of its use cases, all others one total delay for each PRF. */
+static uint32_t otp_antenna_delay(const uwb_dw1000 *chip, const uwb_dw1000_settings *settings) {
+    const int fast = settings->prf_mhz == 64, slow_rate = settings->rate_kbps == 110;
+    if (chip->otp_trek && settings->rate_kbps != 850 && (settings->channel == 2 || settings->channel == 5)) {
+        const uint32_t word = chip->otp_trek_delay[(settings->channel == 5 ? 2 : 0) + slow_rate];
+        const uint32_t delay = settings->anchor ? word >> 16 : word & 0xFFFFu;
+        if (delay != 0 && delay != 0xFFFFu) {
+            return 2 * delay;
+        }
+    }
+    const uint32_t total = fast ? chip->otp_antenna_delay >> 16 : chip->otp_antenna_delay & 0xFFFFu;
+    return total != 0xFFFFu ? total : 0;
+}
+
 /* The chip's settings with nothing left to the chip. */
 static uwb_dw1000_settings resolve(const uwb_dw1000 *chip, const uwb_dw1000_settings *settings, size_t channel) {
     uwb_dw1000_settings resolved = *settings;
     const int fast = settings->prf_mhz == 64;
     const uint32_t power = chip->otp_tx_power[2 * channel + (size_t)fast];
-    const uint32_t delay = fast ? chip->otp_antenna_delay >> 16 : chip->otp_antenna_delay & 0xFFFFu;
+    const uint32_t delay = otp_antenna_delay(chip, settings);
     if (resolved.preamble_code == 0) {
         resolved.preamble_code = channels[channel].codes[fast];
     }
@@ -109,7 +125,7 @@ static uwb_dw1000_settings resolve(const uwb_dw1000 *chip, const uwb_dw1000_sett
         resolved.tx_power = power != 0 && power != UINT32_MAX ? power : channels[channel].power[fast];
     }
     if (resolved.antenna_delay == 0) {
-        resolved.antenna_delay = delay != 0 && delay != 0xFFFFu ? delay : UWB_DW1000_ANTENNA_DELAY;
+        resolved.antenna_delay = delay != 0 ? delay : UWB_DW1000_ANTENNA_DELAY;
     }
     return resolved;
 }
@@ -134,7 +150,11 @@ uwb_dw1000_status uwb_dw1000_configure(uwb_dw1000 *chip, const uwb_dw1000_settin
     const uint32_t tx_delay = now.antenna_delay / 2;
     chip->settings = now;
     chip->tx_antenna_delay = (uint16_t)tx_delay;
-    chip->sys_cfg = HIRQ_POL | DIS_DRXB | DIS_STXP | (rate == 0 ? RXM110K : 0);
+    /* Smart power exists at 6.8 Mbit/s only: the chip boosts short frames, by the upper octets of the word. Without it,
+     * octets 1 and 2 drive PHR and data whatever the length, so that all octets get the level of long frames. */
+    const int smart = now.rate_kbps == 6800;
+    const uint32_t power = smart ? now.tx_power : (now.tx_power & 0xFFu) * 0x01010101u;
+    chip->sys_cfg = HIRQ_POL | DIS_DRXB | (smart ? 0 : DIS_STXP) | (rate == 0 ? RXM110K : 0);
     chip->wait_units = 0;
     chip->tx_bytes = 0;
     /* With the ranging bit. */
@@ -164,7 +184,7 @@ uwb_dw1000_status uwb_dw1000_configure(uwb_dw1000 *chip, const uwb_dw1000_settin
         {USR_SFD, 1, symbols},
         {CHAN_CTRL, 4,
          number | number << 4 | sfd << 17 | (fast ? 2u : 1u) << 18 | sfd << 20 | sfd << 21 | code << 22 | code << 27},
-        {TX_POWER, 4, now.tx_power},
+        {TX_POWER, 4, power},
         {ACK_RESP_T, 3, 0},
         /* Both in one write initialise the SFD's logic, and send nothing (User Manual, 5.3.1.2). */
         {SYS_CTRL, 4, TXSTRT | TRXOFF},

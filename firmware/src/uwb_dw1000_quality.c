@@ -5,6 +5,9 @@
 /* PMSC_CTRL0: FACE with RXCLKS in the first octet, in the second AMCE and what start leaves there. */
 enum { RX_CLOCK_PLL = 0x48, AMCE = 0x80, CTRL0_USUAL = 0x02 };
 
+/* The manual says 2.5 us, but that is too short while the PLL clocks the chip. */
+enum { SENSORS_US = 1000 };
+
 /* What the SFD adds to RXPACC where the count did not saturate (User Manual, table 18). */
 static uint16_t sfd_part(const uwb_dw1000_settings *settings) {
     switch (uwb_dw1000_sfd_symbols(settings)) {
@@ -89,7 +92,7 @@ uwb_dw1000_status uwb_dw1000_read_sensors(uwb_dw1000 *chip, float *temperature, 
         {RF_SENSOR_1, 1, 0x80}, {RF_SENSOR_2, 1, 0x0A}, {RF_SENSOR_2, 1, 0x0F}, {TC_SARC, 1, 1}, {0, 0, 0}};
     uint8_t raw[2];
     DW1000_TRY(uwb_dw1000_set_all(chip, entries));
-    chip->io.sleep(chip->io.context, 10);
+    chip->io.sleep(chip->io.context, SENSORS_US);
     DW1000_TRY(uwb_dw1000_read(chip, TC_SARL, raw, sizeof raw));
     DW1000_TRY(uwb_dw1000_set(chip, TC_SARC, 1, 0));
     *voltage = 3.3f + (float)(raw[0] - chip->otp_voltage) / 173.0f;

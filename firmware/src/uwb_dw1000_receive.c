@@ -18,8 +18,8 @@ static uwb_dw1000_status read_frame(uwb_dw1000 *chip, uwb_dw1000_frame *frame) {
     frame->stamp = uwb_dw1000_number(time, 5);
     frame->first_path_index = (uint16_t)uwb_dw1000_number(time + 5, 2);
     frame->first_path_amplitude = (uint16_t)uwb_dw1000_number(time + 7, 2);
-    /* The status is cleared by the chip as the receiver is enabled again, and by uwb_dw1000_idle. */
-    return UWB_DW1000_OK;
+    /* The chip clears these bits at the next receiver enable; the write makes the driver independent of that. */
+    return uwb_dw1000_set(chip, SYS_STATUS, 4, RX_BITS);
 }
 
 /* TIMEOUT with the receiver still on if nothing happens by `until_us`. */

@@ -14,7 +14,8 @@ static const uint32_t DEVICE = 0xDECA0130u;
 
 /* OTP memory, addresses of words. */
 enum { OTP_EUI = 0, OTP_LDOTUNE = 4, OTP_PART = 6, OTP_VOLTAGE = 8, OTP_TEMPERATURE = 9, OTP_POWER = 0x10,
-       OTP_ANTENNA_DELAY = 0x1C, OTP_XTAL_TRIM = 0x1E };
+       OTP_ANTENNA_DELAY = 0x1C, OTP_XTAL_TRIM = 0x1E, TREK_REVISION_FIRST = 2, TREK_REVISION_LAST = 3 };
+static const uint8_t otp_trek_delay[4] = {0x0D, 0x0E, 0x0F, 0x1D};
 
 static uwb_dw1000_status soft_reset(uwb_dw1000 *chip) {
     /* User Manual, 7.2.50.1: on the crystal, with the sequencing and what would survive in the AON block switched off. */
@@ -79,19 +80,31 @@ static uwb_dw1000_status read_memory(uwb_dw1000 *chip) {
         DW1000_TRY(uwb_dw1000_set(chip, OTP_SF, 1, 2)); /* load it */
     }
     DW1000_TRY(read_otp(chip, OTP_XTAL_TRIM, &word));
+    const uint32_t revision = word >> 8 & 0xFFu;
+    chip->otp_trek = revision >= TREK_REVISION_FIRST && revision <= TREK_REVISION_LAST;
+    for (uint32_t i = 0; i < 4 && chip->otp_trek; i++) {
+        DW1000_TRY(read_otp(chip, otp_trek_delay[i], &chip->otp_trek_delay[i]));
+    }
     const uint32_t trim = (word & 0x1Fu) != 0 ? word & 0x1Fu : 0x10u; /* the middle */
     return uwb_dw1000_set(chip, FS_XTALT, 1, 0x60u | trim);
 }
 
 /* Without its microcode the leading-edge detector gives no stamps (User Manual, 2.5.5.10). */
 static uwb_dw1000_status load_leading_edge_detector(uwb_dw1000 *chip) {
-    static const uwb_dw1000_entry begin[] = {{PMSC_CTRL0, 2, 0x0301}, {OTP_CTRL, 2, 0x8000}, {0, 0, 0}};
+    static const uwb_dw1000_entry begin[] = {
+        {PMSC_CTRL0, 1, 0x01}, {PMSC_CTRL0 + 1, 1, 0x03}, {OTP_CTRL, 2, 0x8000}, {0, 0, 0}};
     DW1000_TRY(uwb_dw1000_set_all(chip, begin));
     chip->io.sleep(chip->io.context, LDE_LOAD_US);
-    return uwb_dw1000_set(chip, PMSC_CTRL0, 2, 0x0200); /* and the clock back to automatic */
+    return UWB_DW1000_OK;
 }
 
-static uwb_dw1000_status await_clock(uwb_dw1000 *chip) {
+/* Give the clock back to the chip and wait until the PLL has locked. CPLOCK is not reliable (errata): without it the
+ * start goes on, with a warning. */
+static uwb_dw1000_status start_clock(uwb_dw1000 *chip) {
+    static const uwb_dw1000_entry automatic[] = {
+        {SYS_STATUS, 4, (uint32_t)CPLOCK}, {PMSC_CTRL0, 1, 0x00}, {PMSC_CTRL0 + 1, 1, 0x02}, {AON_CFG1, 2, 0},
+        {0, 0, 0}};
+    DW1000_TRY(uwb_dw1000_set_all(chip, automatic));
     const uint64_t until_us = chip->io.now_us(chip->io.context) + CLOCK_LOCK_US;
     for (;;) {
         uint64_t status;
@@ -100,7 +113,8 @@ static uwb_dw1000_status await_clock(uwb_dw1000 *chip) {
             return UWB_DW1000_OK;
         }
         if (chip->io.now_us(chip->io.context) > until_us) {
-            return UWB_DW1000_NO_CLOCK;
+            chip->lock_unconfirmed = 1;
+            return UWB_DW1000_OK;
         }
         chip->io.sleep(chip->io.context, 100);
     }
@@ -122,10 +136,11 @@ uwb_dw1000_status uwb_dw1000_start(uwb_dw1000 *chip, const uwb_dw1000_io *io, co
     DW1000_TRY(uwb_dw1000_set(chip, EC_CTRL, 1, 4)); /* PLLLDT: makes CPLOCK valid */
     DW1000_TRY(read_memory(chip));
     DW1000_TRY(load_leading_edge_detector(chip));
-    DW1000_TRY(uwb_dw1000_set(chip, AON_CFG1, 2, 0));
-    DW1000_TRY(await_clock(chip));
+    DW1000_TRY(start_clock(chip));
     io->speed(io->context, 1);
     /* The chip's own mark of a start: seen again, it was reset behind our back. */
     DW1000_TRY(uwb_dw1000_set(chip, SYS_STATUS, 4, SLP2INIT));
-    return uwb_dw1000_configure(chip, settings != NULL ? settings : &uwb_dw1000_usual);
+    DW1000_TRY(uwb_dw1000_configure(chip, settings != NULL ? settings : &uwb_dw1000_usual));
+    const uwb_dw1000_status status = uwb_dw1000_check(chip);
+    return status == UWB_DW1000_RESTARTED && chip->lock_unconfirmed ? UWB_DW1000_NO_CLOCK : status;
 }

@@ -1,6 +1,6 @@
 #include "uwb_dw1000_registers.h"
 
-enum { TX_CLOCK_PLL = 2 << 4, POLL_US = 100, LONGEST_WAIT_US = 60000, TURNED_ROUND_US = 10 };
+enum { TX_CLOCK_PLL = 2 << 4, POLL_US = 100, LONGEST_WAIT_US = 60000, SMART_POWER_US = 1000 };
 static const double WAIT_UNIT_US = 512 / 499.2;
 
 uwb_dw1000_status uwb_dw1000_idle(uwb_dw1000 *chip) {
@@ -77,6 +77,10 @@ static uwb_dw1000_status prepare(uwb_dw1000 *chip, const uint8_t *octets, size_t
 
 uwb_dw1000_status uwb_dw1000_send(uwb_dw1000 *chip, const uint8_t *octets, size_t bytes, uint32_t answer_us) {
     DW1000_TRY(prepare(chip, octets, bytes, answer_us));
+    const uint64_t now_us = chip->io.now_us(chip->io.context);
+    if (now_us < chip->quiet_until_us) {
+        chip->io.sleep(chip->io.context, (uint32_t)(chip->quiet_until_us - now_us));
+    }
     DW1000_TRY(uwb_dw1000_set(chip, SYS_CTRL, 1, TXSTRT | (answer_us != 0 ? WAIT4RESP : 0)));
     chip->listening = answer_us != 0;
     return UWB_DW1000_OK;
@@ -119,12 +123,11 @@ uwb_dw1000_status uwb_dw1000_sent(uwb_dw1000 *chip, uint64_t until_us, uint64_t 
         }
         chip->io.wait(chip->io.context, until_us - now_us < POLL_US ? until_us : now_us + POLL_US);
     }
+    if ((chip->sys_cfg & DIS_STXP) == 0) {
+        chip->quiet_until_us = chip->io.now_us(chip->io.context) + SMART_POWER_US;
+    }
     /* A delayed frame would leave TXFRS set until it starts, and it would pass for that frame's. */
     DW1000_TRY(uwb_dw1000_set(chip, SYS_STATUS, 4, TX_BITS));
-    if (chip->listening) {
-        /* Status of the frame received before goes as the receiver is enabled: 6.5 us after the end of this one. */
-        chip->io.sleep(chip->io.context, TURNED_ROUND_US);
-    }
     return stamp != NULL ? uwb_dw1000_get(chip, TX_TIME, 5, stamp) : UWB_DW1000_OK;
 }
 

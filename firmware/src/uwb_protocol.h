@@ -241,7 +241,7 @@ typedef struct {
     uint8_t reserved[3];
     uint64_t address; /* of the radio; 0 in SET_RADIO = the chip's own */
     uint32_t antenna_delay; /* ticks, of transmitter and receiver together; 0 = as in the chip's memory */
-    uint32_t tx_power; /* register TX_POWER; 0 = as in the chip's memory, else the manual's */
+    uint32_t tx_power; /* register TX_POWER in smart-power format; 0 = OTP value or the manual's */
     uint32_t reply_us; /* from the reception of ANSWER to FINAL; 0 in SET_RADIO = the firmware's usual */
     uint32_t patience_us; /* how long a tag waits for an anchor's frames; 0 as above */
     uint32_t interval_us; /* between the beginnings of two exchanges, at least */
@@ -337,7 +337,7 @@ UWB_STATIC_ASSERT(offsetof(uwb_set_mode_t, mode) == 0);
 typedef struct {
     uint64_t address; /* of the radio; 0 in SET_RADIO = the chip's own */
     uint32_t antenna_delay; /* ticks, of transmitter and receiver together; 0 = as in the chip's memory */
-    uint32_t tx_power; /* register TX_POWER; 0 = as in the chip's memory, else the manual's */
+    uint32_t tx_power; /* register TX_POWER in smart-power format; 0 = OTP value or the manual's */
     uint32_t reply_us; /* from the reception of ANSWER to FINAL; 0 in SET_RADIO = the firmware's usual */
     uint32_t patience_us; /* how long a tag waits for an anchor's frames; 0 as above */
     uint32_t interval_us; /* between the beginnings of two exchanges, at least */

@@ -67,6 +67,8 @@ static void tell_status(uwb_ranger *ranger) {
                               : twr->fault == UWB_DW1000_ABSENT   ? UWB_RADIO_STATE_ABSENT
                               : twr->fault == UWB_DW1000_NO_CLOCK ? UWB_RADIO_STATE_NO_CLOCK
                                                                   : UWB_RADIO_STATE_RESTARTED;
+    } else if (twr->chip.lock_unconfirmed) {
+        message.fixed.state = UWB_RADIO_STATE_NO_CLOCK;
     }
     for (uint8_t i = 0; i < known; i++) {
         const uwb_twr_anchor *const anchor = &twr->anchors[i];
@@ -91,7 +93,7 @@ static const char *understand(const uwb_ranger *ranger, const uint8_t *payload, 
     }
     memset(config, 0, sizeof *config);
     config->radio = (uwb_dw1000_settings){fixed.channel, fixed.prf, fixed.preamble_code, fixed.decawave_sfd, fixed.rate,
-                                          fixed.preamble, fixed.tx_power, fixed.antenna_delay};
+                                          fixed.preamble, fixed.tx_power, fixed.antenna_delay, 0};
     config->address = fixed.address;
     config->pan = fixed.pan;
     config->role = fixed.role;

@@ -7,7 +7,7 @@
 enum { START_AGAIN_US = 100000, NAP_US = 1000, MISSES_TO_RESTART = 100 };
 
 const uwb_twr_config uwb_twr_usual = {
-    {5, 64, 0, 0, 6800, 128, 0, 0}, 0, 0x5542, UWB_ROLE_TAG, 0, 0, 0, 157, 1500, 6000, 0, {0},
+    {5, 64, 0, 0, 6800, 128, 0, 0, 0}, 0, 0x5542, UWB_ROLE_TAG, 0, 0, 0, 157, 1500, 6000, 0, {0},
 };
 
 uint64_t uwb_twr_now_us(const uwb_twr *twr) {
@@ -213,6 +213,7 @@ int uwb_twr_configure(uwb_twr *twr, const uwb_twr_config *config) {
         return 0;
     }
     twr->config = *config;
+    twr->config.radio.anchor = config->role == UWB_ROLE_ANCHOR;
     twr->reply_us = config->reply_us;
     twr->running = 0;
     twr->known = config->anchor_count;

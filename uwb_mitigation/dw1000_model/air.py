@@ -187,6 +187,17 @@ class Chip:
         """Of the good frames that it receives, how many have no leading edge that its detector finds."""
         self._library.dw1000_lose_edges(self.address, probability)
 
+    def program_otp(self, address: int, word: int) -> None:
+        """Set a word of the OTP memory; registers that are loaded from it change with the next reset."""
+        self._library.dw1000_program_otp(self.address, address, word)
+
+    @property
+    def sent_power_db(self) -> tuple[float, float]:
+        """Transmit power of the last frame, (preamble and data, PHR), dB above the lowest setting of TX_POWER."""
+        data, header = ctypes.c_double(), ctypes.c_double()
+        self._library.dw1000_sent_power(self.address, ctypes.byref(data), ctypes.byref(header))
+        return data.value, header.value
+
     def now(self) -> float:
         """Seconds since the air's beginning."""
         now: float = self._library.dw1000_now(self.address)

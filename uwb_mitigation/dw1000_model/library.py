@@ -111,6 +111,8 @@ def load() -> ctypes.CDLL:
         "wakeup_pin": (None, (pointer,)),
         "environment": (None, (pointer, real, real)),
         "lose_edges": (None, (pointer, real)),
+        "program_otp": (None, (pointer, ctypes.c_uint, ctypes.c_uint32)),
+        "sent_power": (None, (pointer, ctypes.POINTER(real), ctypes.POINTER(real))),
         "now": (real, (pointer,)),
         "fault": (ctypes.c_char_p, (pointer,)),
     }

@@ -15,17 +15,24 @@ FAST_HZ, SLOW_HZ = 18_000_000, 2_250_000
 """An STM32F105's SPI clock for the two speeds: 36 MHz divided by 2 and by 16."""
 
 MAX_READ = 4093
-MAX_REQUEST = 4096 + 16
+BUFFER = 10_000
 
 QUESTION = b"deca?"
-VERSION = "EVB1000 USB2SPI 1.0"
+VERSION = "EVB1000 USB2SPI 2.0"
+STALE = b"\x5a"
+"""Last octet of the answer to the question, after the NUL: the firmware sends one octet more than it has written."""
 
+_PACKET = 64
 _FIXED = 6
 """Octets before the SPI header."""
 
 
 class Bridge:
-    """Takes what the host sends, in pieces of any size, and tells what to answer.
+    """Receives USB packets from the host and returns the answers.
+
+    The firmware collects packets in a buffer until its length is the one that octets 2 and 3 contain. Stray octets
+    therefore stay in the buffer until a packet that is a question on its own; that question clears the buffer, but
+    only the next one is answered.
 
     Args:
         spi: one chip-select period: octets out, frequency in Hz; returns as many octets.
@@ -35,52 +42,36 @@ class Bridge:
     def __init__(self, spi: Callable[[bytes, int], bytes], *, ranging: bool = False) -> None:
         self._spi = spi
         self._ranging = ranging
-        self._waiting = bytearray()
+        self._waiting = b""
 
     def reset(self) -> None:
-        """Forget an unfinished request."""
-        self._waiting.clear()
+        """Clear the buffer."""
+        self._waiting = b""
 
     def receive(self, data: bytes) -> list[bytes]:
-        """The answers to all requests that are complete now, in order."""
-        self._waiting += data
-        answers = []
-        while self._waiting:
-            taken, answer = self._take()
-            if not taken:
-                break
-            del self._waiting[:taken]
-            if answer:
-                answers.append(answer)
-        return answers
+        """Return the answers to `data`, which arrives in packets of at most 64 octets."""
+        packets = (data[at : at + _PACKET] for at in range(0, len(data), _PACKET))
+        return [answer for packet in packets if (answer := self._receive(packet))]
 
-    def _take(self) -> tuple[int, bytes]:
-        """How many octets are dealt with, 0 = more must come; and the answer."""
-        data = self._waiting
-        if data[0] == QUESTION[0]:
-            heard = bytes(data[: len(QUESTION)])
-            if heard == QUESTION:
-                word = "n" if self._ranging else "y"
-                return len(QUESTION), f"{word}{VERSION}\0".encode()
-            return (0, b"") if QUESTION.startswith(heard) else (1, b"")
-        if data[0] != START or self._ranging:
-            return 1, b""
-        if len(data) < _FIXED:
-            return 0, b""
-        total, count = int.from_bytes(data[2:4], "little"), int.from_bytes(data[4:6], "little")
-        written = count if data[1] & WRITE else 0
-        header = total - _FIXED - 1 - written
-        if not 1 <= header <= 3 or total > MAX_REQUEST or (not written and count > MAX_READ):
-            # No length to go by: what came is dropped, up to the next request.
-            return len(data), bytes((START, BAD, END))
-        if len(data) < total:
-            return 0, b""
-        if data[total - 1] != END:
-            return total, bytes((START, BAD, END))
-        out = bytes(data[_FIXED : total - 1])
-        hz = FAST_HZ if data[1] & FAST else SLOW_HZ
-        if data[1] & WRITE:
-            self._spi(out, hz)
-            return total, bytes((START, GOOD, END))
-        read = self._spi(out + bytes(count), hz)[header:]
-        return total, bytes((START, GOOD)) + read + bytes((END,))
+    def _receive(self, packet: bytes) -> bytes:
+        request = (self._waiting + packet)[:BUFFER]
+        self._waiting = b""
+        if request == QUESTION:
+            return f"{'n' if self._ranging else 'y'}{VERSION}\0".encode() + STALE
+        if packet == QUESTION:
+            return b""
+        if len(request) < 4 or int.from_bytes(request[2:4], "little") != len(request):
+            self._waiting = request
+            return b""
+        return self._transfer(request) if request[0] == START and not self._ranging else b""
+
+    def _transfer(self, request: bytes) -> bytes:
+        count = int.from_bytes(request[4:6], "little")
+        write = bool(request[1] & WRITE)
+        out = request[_FIXED:-1]
+        header = len(out) - (count if write else 0)
+        read = 0 if write else count
+        if request[-1] != END or read > MAX_READ or not 1 <= header <= 3:
+            return bytes((START, BAD)) + bytes(read) + bytes((END,))
+        answer = self._spi(out + bytes(read), FAST_HZ if request[1] & FAST else SLOW_HZ)
+        return bytes((START, GOOD)) + (answer[header:] if read else b"") + bytes((END,))

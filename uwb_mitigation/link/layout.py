@@ -81,7 +81,7 @@ class RadioState(enum.IntEnum):
     ABSENT = 2
     """No DW1000 answers."""
     NO_CLOCK = 3
-    """Its clock does not lock."""
+    """Its clock PLL did not report its lock. The radio may range all the same."""
     RESTARTED = 4
     """It was reset, and is being set up again."""
 
@@ -155,7 +155,7 @@ HEADER = Layout(
 _RADIO_SETTINGS = (
     Field("address", "Q", "of the radio; 0 in SET_RADIO = the chip's own"),
     Field("antenna_delay", "I", "ticks, of transmitter and receiver together; 0 = as in the chip's memory"),
-    Field("tx_power", "I", "register TX_POWER; 0 = as in the chip's memory, else the manual's"),
+    Field("tx_power", "I", "register TX_POWER in smart-power format; 0 = OTP value or the manual's"),
     Field("reply_us", "I", "from the reception of ANSWER to FINAL; 0 in SET_RADIO = the firmware's usual"),
     Field("patience_us", "I", "how long a tag waits for an anchor's frames; 0 as above"),
     Field("interval_us", "I", "between the beginnings of two exchanges, at least"),

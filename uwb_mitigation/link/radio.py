@@ -42,8 +42,11 @@ class RadioSettings:
         preamble_code: 0 = the first that the standard has for channel and PRF.
         rate_kbps: 110, 850, 6800.
         decawave_sfd: Decawave's start-of-frame delimiter instead of the standard's.
-        tx_power: register TX_POWER; 0 = as calibrated in the chip's memory, else the manual's.
-        antenna_delay: ticks of transmitter and receiver together; 0 = as in the chip's memory, else 2 x 16436.
+        tx_power: register TX_POWER in smart-power format, as in the OTP memory: octets, from the lowest, for frames of
+            any length, up to 500, 250 and 125 us. Below 6.8 Mbit/s the lowest octet is used for all frames. 0: the
+            calibrated value of the OTP memory, or the manual's if there is none.
+        antenna_delay: total TX + RX antenna delay in ticks; 0: the value of the OTP memory (of a TREK1000 board the one
+            for this role, channel and rate), or 2 x 16436 if there is none.
         window: complex samples of the accumulator that come with a range, from 5 before the first path; 0 = none,
             1016 or more = all.
         anchors: addresses that a tag polls in turn; empty = those that it finds by broadcast.

@@ -117,8 +117,9 @@ class BoardFeed:
             problem = radio_facts.problem(status)
         if problem:
             return hardware, diagnostics.ERROR, problem, facts
-        if status is not None and radio_facts.lonely(radio, status):
-            return hardware, diagnostics.WARN, radio_facts.NO_ANCHOR, facts
+        warning = radio_facts.warning(radio, status) if status is not None else ""
+        if warning:
+            return hardware, diagnostics.WARN, warning, facts
         return hardware, diagnostics.OK, "connected", facts
 
     def set_offsets(self, offsets: Offsets) -> None:

@@ -144,10 +144,10 @@ DRIVER = (
               low=110, high=6800, live=True, unit="kbit/s"),
     Parameter("radio.decawave_sfd", False, "Decawave's start-of-frame delimiter instead of the standard's "
               "(serial, evb1000, spi).", live=True),
-    Parameter("radio.tx_power", 0, "Register TX_POWER; 0 = as calibrated in the chip's memory, else the manual's "
-              "(serial, evb1000, spi).", low=0, high=0xFFFFFFFF, live=True),
-    Parameter("radio.antenna_delay", 0, "Of transmitter and receiver together; 0 = as in the chip's memory, else "
-              "2 x 16436 (serial, evb1000, spi).", low=0, high=0x1FFFE, live=True, unit="ticks"),
+    Parameter("radio.tx_power", 0, "Register TX_POWER in smart-power format (lowest octet: frames of any length; "
+              "below 6.8 Mbit/s it is used for all). 0: value from OTP, or the manual's (serial, evb1000, spi).", low=0, high=0xFFFFFFFF, live=True),
+    Parameter("radio.antenna_delay", 0, "Total TX + RX antenna delay. 0: value from OTP, or 2 x 16436 "
+              "(serial, evb1000, spi).", low=0, high=0x1FFFE, live=True, unit="ticks"),
     Parameter("radio.window", 157, "Samples of the CIR that come with a range; 1016 = all (serial, evb1000, spi).",
               low=0, high=1016, live=True),
     Parameter("radio.anchors", "", "Addresses that a tag polls in turn, with commas between; empty = those that it "

@@ -11,11 +11,8 @@ from uwb_mitigation.measurement import format_id
 COUNTS = tuple(row.name for row in fields(RadioStatus) if row.type == "int")
 """Of the exchanges of a radio, by how they ended."""
 
-NO_ANCHOR = "no anchor in reach: are they on, with the same channel, rate and PAN?"
-
 _STATES = {
     RadioState.ABSENT: "no DW1000 answers the board: look at wiring and supply",
-    RadioState.NO_CLOCK: "the DW1000's clock does not lock: look at its supply",
     RadioState.BUS: "the board's SPI fails",
 }
 
@@ -33,9 +30,13 @@ def problem(status: RadioStatus) -> str:
     return _STATES.get(status.state, "")
 
 
-def lonely(settings: RadioSettings | None, status: RadioStatus) -> bool:
-    """Whether a tag has nobody to range with."""
-    return settings is not None and settings.role is Role.TAG and not status.anchors
+def warning(settings: RadioSettings | None, status: RadioStatus) -> str:
+    """Return what may keep a radio without a problem from ranging; empty if there is nothing."""
+    if status.state is RadioState.NO_CLOCK:
+        return "the DW1000 has not reported that its clock PLL locked; if it does not range, check its supply"
+    if settings is not None and settings.role is Role.TAG and not status.anchors:
+        return "no anchor in reach: are they on, with the same channel, rate and PAN?"
+    return ""
 
 
 def facts(settings: RadioSettings | None, status: RadioStatus, prefix: str = "") -> dict[str, object]:

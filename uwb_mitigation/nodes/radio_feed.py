@@ -162,8 +162,11 @@ class RadioFeed:
         problems = [report.problem for report in reports if report.problem]
         if problems:
             return hardware, diagnostics.ERROR, "; ".join(problems), facts
-        if radio_facts.lonely(first.settings, first.status):
-            return hardware, diagnostics.WARN, radio_facts.NO_ANCHOR, facts
+        warnings = [
+            text for report in reports if (text := radio_facts.warning(report.settings, report.status))
+        ]
+        if warnings:
+            return hardware, diagnostics.WARN, warnings[0], facts
         tag = first.settings is not None and first.settings.role is Role.TAG
         return hardware, diagnostics.OK, "ranging" if tag else "answering", facts
 

@@ -18,6 +18,9 @@ from uwb_mitigation.errors import LinkError
 from uwb_mitigation.link.port import PortAddress, why_not_opened
 
 ANSWER_WITHIN_S = 0.4
+ASK_AT_MOST = 3
+"""After stray octets, of another program or of ModemManager, the firmware ignores the first question."""
+
 MAX_READ_BYTES = 4093
 
 _START, _END = 0x02, 0x03
@@ -40,8 +43,8 @@ class Evb1000Bus:
     """
 
     has_reset = False
-    # Seven transactions of 1.5 to 1.8 ms each, and until it is noticed; a slower bus finds its own reply time.
-    reply_us = 14_500
+    # Eight transactions of 1.5 to 1.8 ms each, and the time until the answer is noticed; a slower bus finds its own.
+    reply_us = 16_500
     patience_us = 60_000
 
     def __init__(self, address: PortAddress) -> None:
@@ -105,10 +108,12 @@ class Evb1000Bus:
             self._port = None
 
     def _greet(self) -> str:
-        text = self._ask()
-        # An answer to an earlier program, or to a request that was given up, may have come only now, before ours.
-        if text and not text.startswith(("y", "n")):
-            text = self._ask()
+        text = ""
+        for _ in range(ASK_AT_MOST):
+            # A late answer to an earlier program or request may arrive first.
+            text = self._ask() or text
+            if text.startswith(("y", "n")):
+                break
         if text.startswith("y"):
             return text[1:]
         if text.startswith("n"):
@@ -117,17 +122,21 @@ class Evb1000Bus:
         raise LinkError(told, where=str(self._address), valid=f"an EVB1000; {_HOW}")
 
     def _ask(self) -> str:
-        """What it says to `deca?`."""
-        # What an earlier program left half sent or unread goes first.
-        with contextlib.suppress(LinkError):
-            while self._read_some(0.02):
-                pass
+        """Return the answer to `deca?`, up to its first NUL; a stale octet follows that."""
+        self._drain()
         self._send(b"deca?")
         answer = b""
         until = time.monotonic() + ANSWER_WITHIN_S
-        while not answer.endswith(b"\0") and time.monotonic() < until:
+        while b"\0" not in answer and time.monotonic() < until:
             answer += self._read_some(until - time.monotonic())
-        return answer.rstrip(b"\0").decode("ascii", "replace")
+        self._drain()
+        return answer.partition(b"\0")[0].decode("ascii", "replace")
+
+    def _drain(self) -> None:
+        """Discard what is left of earlier answers."""
+        with contextlib.suppress(LinkError):
+            while self._read_some(0.02):
+                pass
 
     def _send(self, data: bytes) -> None:
         fd = self._fd()

@@ -37,7 +37,7 @@ _loading = threading.Lock()
 _FAULTS = {
     2: (RadioState.BUS, "the bus failed"),
     3: (RadioState.ABSENT, "no DW1000 answers: look at wiring and supply"),
-    4: (RadioState.NO_CLOCK, "the DW1000's clock does not lock: look at its supply"),
+    4: (RadioState.NO_CLOCK, "the DW1000's clock PLL does not lock: check its supply"),
     5: (RadioState.RESTARTED, "the DW1000 was reset"),
 }
 """Values of `uwb_dw1000_status` that keep a radio from working."""

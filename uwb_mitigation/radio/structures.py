@@ -42,6 +42,7 @@ class ChipSettings(ctypes.Structure):
         ("preamble", c_uint16),
         ("tx_power", c_uint32),
         ("antenna_delay", c_uint32),
+        ("anchor", c_uint8),
     )
 
 

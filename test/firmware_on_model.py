@@ -1,0 +1,107 @@
+"""The firmware's driver and exchange on modelled chips, compiled for this computer, in virtual time."""
+
+from __future__ import annotations
+
+import random
+import threading
+from collections.abc import Callable
+from types import SimpleNamespace
+
+import pytest
+
+from uwb_mitigation.dw1000_model.air import Host
+from uwb_mitigation.link.radio import RadioSettings
+from uwb_mitigation.measurement import RangeMeasurement
+from uwb_mitigation.radio import host as firmware
+from uwb_mitigation.radio.host import HostRadio
+
+REPLY_US = 3000
+
+_program = threading.local()
+
+
+def host() -> Host:
+    """Return the host of the program that asks."""
+    running: Host = _program.host
+    return running
+
+
+CLOCK = SimpleNamespace(
+    sleep=lambda seconds: host().delay(seconds),
+    perf_counter=lambda: host().now(),
+    monotonic_ns=lambda: int(host().now() * 1e9),
+    time_ns=lambda: int(host().now() * 1e9),
+)
+"""Stands in for the module `time`."""
+
+
+def begin(running: Host) -> None:
+    """Set the host of the program in this thread."""
+    _program.host = running
+
+
+class ModelBus:
+    """Connects the firmware to the chip of the program in which it runs; see `radio.bus.Bus`.
+
+    Attributes:
+        writes: every register write: (time in s, register file, sub-address, data).
+    """
+
+    name = "a modelled chip"
+    reply_us = REPLY_US
+    patience_us = 15_000
+    has_reset = True
+
+    def __init__(self, host: Host) -> None:
+        self._host = host
+        self._hz = 2_000_000
+        self.writes: list[tuple[float, int, int, bytes]] = []
+
+    def transfer(self, header: bytes, out: bytes | None, count: int) -> bytes:
+        if out is not None:
+            low, high = (*header[1:], 0, 0)[:2]
+            self.writes.append((self._host.now(), header[0] & 0x3F, low & 0x7F | high << 7, out))
+        return self._host.spi(header + (bytes(count) if out is None else out), self._hz)[len(header) :]
+
+    def speed(self, fast: bool) -> None:
+        self._hz = 8_000_000 if fast else 2_000_000
+
+    def reset(self) -> None:
+        self._host.reset_pin()
+
+    def pause(self) -> None:
+        self._host.delay(200e-6)
+
+    def close(self) -> None:
+        pass
+
+
+def use_virtual_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the firmware take its time from the program in which it runs, and the same random numbers in each run."""
+    monkeypatch.setattr(firmware, "time", CLOCK)
+    monkeypatch.setattr(firmware, "secrets", SimpleNamespace(randbits=random.Random(1).getrandbits))
+
+
+def ranging(
+    settings: RadioSettings,
+    ranges: list[RangeMeasurement],
+    seconds: float,
+    *,
+    bus: Callable[[Host], ModelBus] = ModelBus,
+    at_end: Callable[[HostRadio], None] = lambda _: None,
+) -> Callable[[Host], None]:
+    """Return a program that runs the exchange for `seconds` and collects the ranges."""
+
+    def run(host: Host) -> None:
+        begin(host)
+        radio = HostRadio(bus(host), settings, stamp_clock=CLOCK.time_ns)
+        try:
+            while host.now() < seconds:
+                measured = radio.turn(0.02)
+                if measured is not None:
+                    ranges.append(measured)
+            at_end(radio)
+        finally:
+            radio.close()
+
+    return run

@@ -1,0 +1,317 @@
+"""What the firmware's driver writes to the chip, and what it must not depend on: compared with Decawave's own driver."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import pytest
+from compilers import NEEDS_CC
+from firmware_on_model import ModelBus, ranging, use_virtual_time
+
+from uwb_mitigation.dw1000_model.air import Air, Chip, Host
+from uwb_mitigation.dw1000_model.links import Link
+from uwb_mitigation.errors import LinkError
+from uwb_mitigation.link.layout import RadioState, Role
+from uwb_mitigation.link.radio import RadioSettings, RadioStatus
+from uwb_mitigation.measurement import RangeMeasurement
+from uwb_mitigation.nodes import radio_facts
+from uwb_mitigation.radio.host import HostRadio
+
+pytestmark = NEEDS_CC
+
+ANCHOR_ADDRESS = 0xA000000000000001
+SYS_CFG, SYS_CTRL, SYS_STATUS, TX_POWER = 0x04, 0x0D, 0x0F, 0x1E
+CPLOCK = 0x02
+DEFAULT = RadioSettings()
+
+
+@pytest.fixture
+def air(monkeypatch: pytest.MonkeyPatch) -> Iterator[Air]:
+    use_virtual_time(monkeypatch)
+    with Air(3) as air:
+        yield air
+
+
+class Run:
+    """A tag, or several, and an anchor that range over a link of 6 m, and what they wrote to their chips."""
+
+    def __init__(
+        self,
+        air: Air,
+        settings: RadioSettings = DEFAULT,
+        *,
+        seconds: float = 0.12,
+        tags: int = 1,
+        bus: Callable[[Host], ModelBus] = ModelBus,
+        prepare: Callable[[Chip], None] = lambda _: None,
+    ) -> None:
+        self.ranges: list[RangeMeasurement] = []
+        self.radios: list[RadioSettings] = []
+        self.statuses: list[RadioStatus] = []
+        self.buses: list[ModelBus] = []
+        anchor = replace(settings, role=Role.ANCHOR, address=ANCHOR_ADDRESS)
+        tag = replace(settings, anchors=(ANCHOR_ADDRESS,))
+        self.chips = [air.chip(ppm=4.0 * number) for number in range(1 + tags)]
+        for number, chip in enumerate(self.chips):
+            prepare(chip)
+            for other in self.chips[:number]:
+                air.link(chip, other, Link(6.0))
+            wanted = tag if number else anchor
+            air.program(chip, ranging(wanted, self.ranges, seconds, bus=self._bus(bus), at_end=self._at_end))
+        air.run(2 * seconds)
+
+    def _bus(self, bus: Callable[[Host], ModelBus]) -> Callable[[Host], ModelBus]:
+        def opened(host: Host) -> ModelBus:
+            self.buses.append(bus(host))
+            return self.buses[-1]
+
+        return opened
+
+    def _at_end(self, radio: HostRadio) -> None:
+        self.radios.append(radio.settings)
+        radio.read_sensors()
+        self.statuses.append(radio.status())
+
+    def start_up(self) -> list[tuple[int, int, bytes]]:
+        """What the anchor wrote until its configuration was complete: SYS_MASK is not 0 from then on."""
+        writes = [write[1:] for write in self.buses[0].writes]
+        end = next(at for at, (file, _, data) in enumerate(writes) if file == 0x0E and any(data))
+        return writes[: next(at for at in range(end + 1, len(writes)) if writes[at][0] == 0x0E)]
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """Registers of a configuration: name, register file, sub-address, octets and value of each.
+
+    The values are those of Decawave's tables and of its driver's register log, as listed in the facts about the chip;
+    the OTP memory is the modelled chip's, whose TX power words are in smart-power format.
+    """
+
+    settings: RadioSettings
+    registers: str
+
+
+COMMON = """
+PANADR 03 0 4 5542A55A          AGC_TUNE2 23 0C 4 2502A907      AGC_TUNE3 23 12 2 0035
+DRX_TUNE4H 27 26 2 0028         LDE_CFG1 2E 0806 1 6D           ACK_RESP_T 1A 0 3 000000
+TX_ANTD 18 0 2 4034             LDE_RXANTD 2E 1804 2 4034       FS_XTALT 2B 0E 1 70
+EC_CTRL 24 0 1 04               OTP_SF 2D 12 1 02               AON_CFG1 2C 0A 2 0000
+"""
+CONFIGURATIONS = {
+    "channel 5, 64 MHz, 6.8 Mbit/s": Configuration(
+        RadioSettings(),
+        """
+SYS_CFG 04 0 4 00001200         TX_POWER 1E 0 4 25456585        CHAN_CTRL 1F 0 4 4A480055
+RF_TXCTRL 28 0C 4 001E3FE3      TC_PGDELAY 2A 0B 1 B5           RF_RXCTRLH 28 0B 1 D8
+FS_PLLCFG 2B 07 4 0800041D      FS_PLLTUNE 2B 0B 1 BE           AGC_TUNE1 23 04 2 889B
+DRX_TUNE0b 27 02 2 0001         DRX_TUNE1a 27 04 2 008D         DRX_TUNE1b 27 06 2 0020
+DRX_TUNE2 27 08 4 313B006B      DRX_SFDTOC 27 20 2 0081         LDE_CFG2 2E 1806 2 0607
+LDE_REPC 2E 2804 2 28F4         USR_SFD 21 0 1 08
+""",
+    ),
+    "channel 2, 16 MHz, 110 kbit/s": Configuration(
+        RadioSettings(channel=2, prf_mhz=16, rate_kbps=110, preamble=1024),
+        """
+SYS_CFG 04 0 4 00441200         TX_POWER 1E 0 4 75757575        CHAN_CTRL 1F 0 4 18C40022
+RF_TXCTRL 28 0C 4 00045CA0      TC_PGDELAY 2A 0B 1 C2           RF_RXCTRLH 28 0B 1 D8
+FS_PLLCFG 2B 07 4 08400508      FS_PLLTUNE 2B 0B 1 26           AGC_TUNE1 23 04 2 8870
+DRX_TUNE0b 27 02 2 000A         DRX_TUNE1a 27 04 2 0087         DRX_TUNE1b 27 06 2 0064
+DRX_TUNE2 27 08 4 351A009A      DRX_SFDTOC 27 20 2 0421         LDE_CFG2 2E 1806 2 1607
+LDE_REPC 2E 2804 2 0A3D         USR_SFD 21 0 1 40
+""",
+    ),
+    "channel 7, 64 MHz, 6.8 Mbit/s, long preamble": Configuration(
+        RadioSettings(channel=7, preamble=1024),
+        """
+SYS_CFG 04 0 4 00001200         TX_POWER 1E 0 4 5171B1D1        CHAN_CTRL 1F 0 4 8C480077
+RF_TXCTRL 28 0C 4 001E7DE0      TC_PGDELAY 2A 0B 1 93           RF_RXCTRLH 28 0B 1 BC
+FS_PLLCFG 2B 07 4 0800041D      FS_PLLTUNE 2B 0B 1 BE           AGC_TUNE1 23 04 2 889B
+DRX_TUNE0b 27 02 2 0001         DRX_TUNE1a 27 04 2 008D         DRX_TUNE1b 27 06 2 0020
+DRX_TUNE2 27 08 4 353B015E      DRX_SFDTOC 27 20 2 03E9         LDE_CFG2 2E 1806 2 0607
+LDE_REPC 2E 2804 2 3332         USR_SFD 21 0 1 08
+""",
+    ),
+}
+
+
+def expected(registers: str) -> dict[tuple[int, int], bytes]:
+    """Return {(register file, sub-address): octets} of a table."""
+    words = registers.split()
+    rows = [words[at : at + 5] for at in range(0, len(words), 5)]
+    return {
+        (int(file, 16), int(sub, 16)): int(value, 16).to_bytes(int(octets), "little")
+        for _, file, sub, octets, value in rows
+    }
+
+
+@pytest.mark.parametrize("name", CONFIGURATIONS)
+def test_every_register_write_at_the_start_is_that_of_the_table(air: Air, name: str):
+    configuration = CONFIGURATIONS[name]
+    writes = Run(air, configuration.settings).start_up()
+    commands = {0x0D, 0x0E, SYS_STATUS, 0x36}
+    configured = {
+        (file, sub): data
+        for file, sub, data in writes
+        if file not in commands and (file, sub) not in {(0x2D, 0x04), (0x2D, 0x06)}
+    }
+    assert configured == expected(COMMON + configuration.registers)
+    # The clocks change octet by octet, and CPLOCK is cleared before the PLL starts.
+    clocks = [(file, sub, data) for file, sub, data in writes if file == 0x36 or data == b"\x02\0\0\0"]
+    assert clocks == [
+        (0x36, 0, b"\x01"),
+        (0x36, 0, b"\x01"),
+        (0x36, 1, b"\x03"),
+        (SYS_STATUS, 0, b"\x02\0\0\0"),
+        (0x36, 0, b"\x00"),
+        (0x36, 1, b"\x02"),
+    ]
+    # TXSTRT with TRXOFF initialises the SFD logic and sends nothing.
+    assert [data for file, _, data in writes if file == SYS_CTRL][-1] == b"\x42\0\0\0"
+
+
+@pytest.mark.parametrize(
+    ("settings", "boost_db"),
+    [
+        (RadioSettings(), 6.0),  # up to 250 us
+        (RadioSettings(preamble=64), 6.0),
+        (RadioSettings(preamble=256), 3.0),
+        (RadioSettings(preamble=1024), 0.0),
+        (RadioSettings(channel=2, prf_mhz=16, preamble=2048), 0.0),
+        (RadioSettings(rate_kbps=850), 0.0),
+        (RadioSettings(rate_kbps=110, preamble=1024), 0.0),
+        (RadioSettings(rate_kbps=110, preamble=1024, tx_power=0x25456585), 0.0),
+    ],
+    ids=lambda value: f"{value.rate_kbps}-{value.preamble}" if isinstance(value, RadioSettings) else None,
+)
+def test_no_frame_exceeds_the_calibrated_power(air: Air, settings: RadioSettings, boost_db: float):
+    run = Run(air, settings)
+    assert run.ranges
+    calibrated_db = 19.5 if settings.channel == 2 else 8.5  # OTP, octet for frames of any length: 0x75, 0x85
+    for chip in run.chips:
+        assert chip.sent_power_db == (calibrated_db + boost_db,) * 2
+
+
+class FastBus(ModelBus):
+    """A bus that notices the end of a frame at once."""
+
+    def pause(self) -> None:
+        self._host.delay(5e-6)
+
+
+def test_smart_power_sends_one_frame_per_millisecond(air: Air):
+    run = Run(air, RadioSettings(preamble=64, window=0), tags=3, seconds=0.15, bus=FastBus)
+    assert len(run.ranges) > 5
+    starts = [at for at, file, _, data in run.buses[0].writes if file == SYS_CTRL and data[0] & 0x42 == 2]
+    assert min(later - earlier for earlier, later in itertools.pairwise(starts)) >= 1e-3
+
+
+@pytest.mark.parametrize(
+    ("settings", "tag", "anchor"),
+    [
+        (RadioSettings(channel=2), 2 * 0x4011, 2 * 0x4111),
+        (RadioSettings(channel=2, rate_kbps=110, preamble=1024), 2 * 0x4022, 2 * 0x4122),
+        (RadioSettings(channel=5), 2 * 0x4033, 2 * 0x4133),
+        (RadioSettings(channel=5, rate_kbps=110, preamble=1024), 2 * 0x4044, 2 * 0x4144),
+        (RadioSettings(channel=5, rate_kbps=850), 0x8050, 0x8050),
+        (RadioSettings(channel=3), 0x8050, 0x8050),
+        (RadioSettings(channel=3, prf_mhz=16), 0x8060, 0x8060),
+        (RadioSettings(channel=2, antenna_delay=32_700), 32_700, 32_700),
+    ],
+)
+def test_the_antenna_delay_of_a_trek1000_board_is_that_of_its_use_case(
+    air: Air, settings: RadioSettings, tag: int, anchor: int
+):
+    assert antenna_delays(air, settings, revision=2) == (anchor, tag)
+
+
+@pytest.mark.parametrize(("revision", "delays"), [(1, 0x8050), (3, 2 * 0x4033), (4, 0x8050)])
+def test_only_otp_revisions_2_and_3_are_those_of_a_trek1000(air: Air, revision: int, delays: int):
+    assert antenna_delays(air, RadioSettings(), revision)[1] == delays
+
+
+def antenna_delays(air: Air, settings: RadioSettings, revision: int) -> tuple[int, int]:
+    """Return the antenna delays, TX + RX, that (anchor, tag) take from this OTP memory."""
+
+    def prepare(chip: Chip) -> None:
+        chip.program_otp(0x1E, revision << 8 | 0x10)
+        chip.program_otp(0x1C, 0x8050_8060)
+        for address, word in (
+            (0x0D, 0x4111_4011),
+            (0x0E, 0x4122_4022),
+            (0x0F, 0x4133_4033),
+            (0x1D, 0x4144_4044),
+        ):
+            chip.program_otp(address, word)
+
+    run = Run(air, settings, seconds=0.03, prepare=prepare)
+    of = {radio.role: radio.antenna_delay for radio in run.radios}
+    return of[Role.ANCHOR], of[Role.TAG]
+
+
+class StickyStatusBus(ModelBus):
+    """To a chip whose receiver enable and transmitter start leave the status bits: only a write clears them."""
+
+    def __init__(self, host: Host) -> None:
+        super().__init__(host)
+        self._status = 0
+
+    def transfer(self, header: bytes, out: bytes | None, count: int) -> bytes:
+        answer = super().transfer(header, out, count)
+        if header[0] & 0x3F != SYS_STATUS:
+            return answer
+        if out is None:
+            self._status |= int.from_bytes(answer, "little")
+            return self._status.to_bytes(5, "little")[:count]
+        self._status &= ~int.from_bytes(out, "little")
+        return answer
+
+
+def test_it_clears_the_status_of_a_reception_itself(air: Air):
+    run = Run(air, bus=StickyStatusBus)
+    assert len(run.ranges) > 10
+    assert all(measured.range_m == pytest.approx(6.0, abs=0.03) for measured in run.ranges)
+
+
+class NoLockBus(ModelBus):
+    """To a chip that never reports CPLOCK."""
+
+    def transfer(self, header: bytes, out: bytes | None, count: int) -> bytes:
+        answer = super().transfer(header, out, count)
+        if out is None and header[0] & 0x3F == SYS_STATUS:
+            return bytes((answer[0] & ~CPLOCK,)) + answer[1:]
+        return answer
+
+
+class NoClockBus(NoLockBus):
+    """To a chip whose PLL does not lock: it ignores SPI at full speed."""
+
+    def transfer(self, header: bytes, out: bytes | None, count: int) -> bytes:
+        return (
+            super().transfer(header, out, count)
+            if self._hz < 3e6
+            else bytes(count if out is None else len(out))
+        )
+
+
+def test_a_lock_that_is_not_reported_is_a_warning(air: Air):
+    run = Run(air, bus=NoLockBus)
+    assert len(run.ranges) > 10
+    for status in run.statuses:
+        assert status.state is RadioState.NO_CLOCK
+        assert radio_facts.problem(status) == ""
+        assert "PLL" in radio_facts.warning(None, status)
+
+
+def test_a_clock_that_does_not_lock_is_an_error(air: Air):
+    with pytest.raises(LinkError, match="clock"):
+        Run(air, bus=NoClockBus)
+
+
+def test_temperature_and_voltage_are_read_when_they_are_ready(air: Air):
+    run = Run(air, seconds=0.05, prepare=lambda chip: chip.environment(41.0, 3.1))
+    assert len(run.statuses) == 2
+    for status in run.statuses:
+        assert status.temperature_c == pytest.approx(41.0, abs=0.6)
+        assert status.voltage == pytest.approx(3.1, abs=0.003)
