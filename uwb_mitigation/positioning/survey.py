@@ -123,8 +123,12 @@ def survey(
     if swapped:
         # In a square, swapped opposite anchors are the mirror image of the right ones: ranges do not tell the two apart.
         exchanged, lower = fit(order)
-        mirror = _misfit(exchanged.anchors[used], guesses.position[used], mirrored=True)
-        if lower < loss - _SWAP_GAIN and mirror > _AS_WELL * off_m:
+        here, mirror = (
+            _misfit(fitted.anchors[used], guesses.position[used], mirrored=side)
+            for fitted, side in ((found, False), (exchanged, True))
+        )
+        limit = _AS_WELL * off_m
+        if (lower < loss - _SWAP_GAIN or here > limit) and mirror > limit:
             found, loss = exchanged, lower
         else:
             swapped = []
