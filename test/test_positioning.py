@@ -193,6 +193,19 @@ def test_anchors_almost_on_a_line_never_decide_by_chance(seed: int, height: Heig
     assert "all on a line" in warning
 
 
+def test_the_default_acceleration_suits_simulated_drones():
+    def rmse(acceleration: float) -> float:
+        found = []
+        for seed in range(3):
+            ranges, truth = drive(HALL, path=lambda t: flight(t) + (6, 4.5, 0), seed=seed, seconds=40)
+            block(ranges, seed)
+            live = run_live(ranges, TagLocator(HALL, Model(acceleration=acceleration))).track
+            found.append(track_errors(live, truth).rmse)
+        return float(np.mean(found))
+
+    assert rmse(Model().acceleration) < rmse(3.0)
+
+
 def test_two_anchors_alone_tell_nothing():
     ranges, _ = drive(AnchorMap(HALL.anchors[:2]), seconds=5)
     assert len(run_live(ranges, TagLocator(AnchorMap(HALL.anchors[:2]))).track) == 0

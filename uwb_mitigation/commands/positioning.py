@@ -208,6 +208,7 @@ def survey(
             "alternatives": {
                 str(known.anchors[row].id): position.tolist() for row, position in result.alternatives.items()
             },
+            "undetermined": [known.anchors[row].id for row in result.undetermined],
             "mirrored": result.mirrored,
             "mean_loss": result.loss,
             "explained": result.explained,
@@ -329,6 +330,12 @@ def _show_survey(result: SurveyResult, guesses: AnchorMap) -> None:
         _warn(
             f"anchor {guesses.anchors[row]}: the ranges explain ({x:.2f}, {y:.2f}, {z:.2f}) as well; only the guess "
             "decides. Drive a route that leaves its line or plane, or measure this anchor"
+        )
+    if result.undetermined:
+        names = ", ".join(str(guesses.anchors[row]) for row in result.undetermined)
+        _warn(
+            f"the ranges do not determine the positions of the anchors {names}, only the guesses do. Without --height, "
+            "ranges do not determine how the whole is tilted: set --fixed for three measured anchors, or a smaller --off"
         )
     if result.mirrored:
         _warn(

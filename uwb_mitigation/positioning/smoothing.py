@@ -63,7 +63,7 @@ def smooth(
     later = _at(run_live(mirrored, locator, mirrored_heights).track, (end_ns - stamp_ns)[backwards])
     flip = np.diag([1.0, 1.0, 1.0, -1.0, -1.0, -1.0])
     later = later[0][backwards] @ flip, flip @ later[1][backwards] @ flip
-    state, covariance = _fused(_at(live, stamp_ns), later)
+    state, covariance, spread = _fused(_at(live, stamp_ns), later)
     # Without a position of either filter the batch smoother's choice among several optima is arbitrary.
     found = np.isfinite(state).all(axis=1)
     try:
@@ -77,13 +77,14 @@ def smooth(
             batch.covariance + bias,
         )
         apart = (own - state)[:, :3]
-        spread = (covariance + own_covariance)[:, :3, :3]
-        squared = np.einsum("ni,ni->n", apart, np.linalg.solve(_regular(spread), apart[..., None])[..., 0])
+        expected = _regular((covariance + own_covariance)[:, :3, :3])
+        squared = np.einsum("ni,ni->n", apart, np.linalg.solve(expected, apart[..., None])[..., 0])
         # Where it contradicts the filters, it is in another optimum.
         own_covariance = own_covariance * np.fmax(squared / 3.0, 1.0)[:, None, None]
-        state, covariance = _fused((state, covariance), (own, own_covariance))
+        state, covariance, more = _fused((state, covariance), (own, own_covariance))
+        spread += more
     position = state[:, :3] if area is None else area.clip(state[:, :3])
-    return Track(stamp_ns, position, state[:, 3:], covariance).take(found)
+    return Track(stamp_ns, position, state[:, 3:], covariance + spread).take(found)
 
 
 def _at(track: Track, stamp_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -105,10 +106,15 @@ def _at(track: Track, stamp_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64],
 def _fused(
     one: tuple[NDArray[np.float64], NDArray[np.float64]],
     other: tuple[NDArray[np.float64], NDArray[np.float64]],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Fuse states (k, 6) with covariances (k, 6, 6) by covariance intersection; where one is NaN, take the other."""
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Fuse states (k, 6) with covariances (k, 6, 6) by covariance intersection; where one is NaN, take the other.
+
+    Returns:
+        States, covariances, and the spread of the two means (k, 6, 6), as in a mixture: where they differ, one is wrong.
+    """
     (a, p), (b, q) = one, other
     state, covariance = np.where(np.isfinite(a), a, b), np.where(np.isfinite(p), p, q)
+    spread = np.zeros_like(covariance)
     both = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
     p, q = _regular(p[both]), _regular(q[both])
     trace = [np.einsum("nii->n", c[:, :3, :3]) for c in (p, q)]
@@ -116,9 +122,11 @@ def _fused(
     of_p, of_q = weight * np.linalg.inv(p), (1.0 - weight) * np.linalg.inv(q)
     found = np.linalg.inv(of_p + of_q)
     covariance[both] = found
+    apart = a[both] - b[both]
+    spread[both] = weight * (1.0 - weight) * np.einsum("ni,nj->nij", apart, apart)
     weighted = of_p @ a[both][..., None] + of_q @ b[both][..., None]
     state[both] = (found @ weighted)[..., 0]
-    return state, covariance
+    return state, covariance, spread
 
 
 def _regular(covariance: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -59,6 +59,7 @@ class SurveyResult:
     track: of the tag.
     loss: mean robust loss of a range; below about 0.5 the anchors explain the ranges.
     alternatives: {row: float64 (3,)}, other positions of single anchors that explain the ranges as well.
+    undetermined: rows of anchors that the ranges place, relative to the others, to no better than `MISPLACED_M`.
     mirrored: the mirror image of all anchors fits the guesses about as well; ranges never decide between the two.
     explained: whether it is below `UNEXPLAINED`: else the anchors may be anywhere.
     """
@@ -70,6 +71,7 @@ class SurveyResult:
     track: Track
     loss: float
     alternatives: dict[int, NDArray[np.float64]]
+    undetermined: list[int]
     mirrored: bool
 
     @property
@@ -159,6 +161,7 @@ def survey(
         found.track,
         loss,
         alternatives,
+        [row for row in used.tolist() if row not in fixed and relative[row] > MISPLACED_M],
         not fixed and mirror < _AS_WELL * max(plain, TAPE_M),
     )
 
