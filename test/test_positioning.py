@@ -197,7 +197,7 @@ def test_the_default_acceleration_suits_simulated_drones():
     def rmse(acceleration: float) -> float:
         found = []
         for seed in range(3):
-            ranges, truth = drive(HALL, path=lambda t: flight(t) + (6, 4.5, 0), seed=seed, seconds=40)
+            ranges, truth = drive(HALL, path=lambda t: np.add(flight(t), (6, 4.5, 0)), seed=seed, seconds=40)
             block(ranges, seed)
             live = run_live(ranges, TagLocator(HALL, Model(acceleration=acceleration))).track
             found.append(track_errors(live, truth).rmse)

@@ -178,7 +178,7 @@ def test_a_bad_geometry_and_failed_smoothing_are_reported(monkeypatch: pytest.Mo
     area = Area((-50, 0, 0), (50, 50, 3))
     found = track_tag(recording_of(ranges, truth), near_line, Model(range_sd=0.02), Height(1.0), area)
     assert not found.warnings
-    ranges, far = drive(near_line, seconds=10, path=lambda t: circuit(t) + (80, 0, 0))
+    ranges, far = drive(near_line, seconds=10, path=lambda t: np.add(circuit(t), (80, 0, 0)))
     found = track_tag(
         recording_of(ranges, far),
         near_line,
