@@ -57,3 +57,32 @@ def drive(
     nothing = np.full(n, np.nan)
     ranges = Ranges(stamp_ns, anchor, distance + error, np.full(n, model.range_sd**2), nothing, 7)
     return ranges, TruePath(stamp_ns, position)
+
+
+WALL = AnchorMap(
+    [
+        Anchor(number, place, 0.03)
+        for number, place in enumerate(
+            [(1, -3, 0.2), (1, 3, 0.2), (1, -3, 2.5), (1, 3, 2.5), (1.1, 0, 1.3)], 1
+        )
+    ]
+)
+"""Anchors on one wall: beyond it is a mirror image of every position."""
+
+
+def flight(time_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Positions (n, 3) of a drone that takes off from 0.08 m in front of `WALL`, and lands again."""
+    height = 0.08 + 1.2 * np.sin(np.pi * np.clip(time_s / 60.0, 0.0, 1.0))
+    return np.stack([-1.2 + 1.4 * np.sin(0.3 * time_s), 2.5 * np.sin(0.21 * time_s + 1.0), height], axis=1)
+
+
+def block(ranges: Ranges, seed: int = 1, share: float = 0.25, mean_m: float = 0.5, anchors=None) -> Ranges:
+    """Lengthen the ranges of each anchor (or of `anchors`) in a share of all intervals of 2 s, as a body does."""
+    rng = np.random.default_rng(seed)
+    interval = (ranges.stamp_ns - ranges.stamp_ns[0]) // (2 * NANOSECONDS)
+    for row in np.unique(ranges.anchor) if anchors is None else anchors:
+        size = int(interval.max()) + 1
+        longer = (rng.random(size) < share) * rng.exponential(mean_m, size)
+        own = ranges.anchor == row
+        ranges.range_m[own] += longer[interval[own]]
+    return ranges

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -64,6 +65,20 @@ def test_the_correction_is_prior_plus_network_in_float32(mitigation):
     assert result.variance_m2 == 0.0625
     assert result.origin is Origin.HOST
     assert result.model_id == mitigation.bundle.model_id
+
+
+def test_a_range_without_a_cir_gets_the_variance_of_its_offset(tmp_path):
+    one = Mitigation(bundle(tmp_path), Offsets(pairs={(7, 1): 0.2}, pair_sd={(7, 1): 0.03}))
+    card = one.bundle.card
+    without = replace(measurement(samples=np.zeros(0, np.int16)), tag_id=7, anchor_id=1)
+    calibrated = one.correct(without)
+    assert calibrated.status is Status.NO_CIR
+    assert calibrated.variance_m2 == pytest.approx(
+        min(card.variance_uncorrected_m2, card.variance_m2 + 0.03**2)
+    )
+    assert calibrated.variance_m2 < card.variance_uncorrected_m2
+    one.offsets = Offsets()
+    assert one.correct(without).variance_m2 == pytest.approx(card.variance_uncorrected_m2)
 
 
 @pytest.mark.parametrize(("changes", "range_m", "status"), BAD)

@@ -6,19 +6,21 @@ import math
 
 import numpy as np
 import pytest
-from drives import HALL, NANOSECONDS, circuit, drive
+from drives import HALL, NANOSECONDS, WALL, block, circuit, drive, flight
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
 from uwb_mitigation.positioning.filter import FIRST_ERROR, OFFSET, RangeFilter
+from uwb_mitigation.positioning.fleet import Fleet
 from uwb_mitigation.positioning.geometry import Shape, geometry, shape
 from uwb_mitigation.positioning.locator import SILENCE_S, TagLocator, run_live
 from uwb_mitigation.positioning.model import Model
+from uwb_mitigation.positioning.smoothing import smooth
 from uwb_mitigation.positioning.start import Area, Height, places
 from uwb_mitigation.positioning.track_errors import errors_of, track_errors
-from uwb_mitigation.positioning.tracks import TruePath
+from uwb_mitigation.positioning.tracks import Heights, TruePath
 
 PLAIN = Model(long=100.0, short=100.0)
 """No range is doubted."""
@@ -135,6 +137,73 @@ def test_of_two_mirror_images_nothing_is_told_until_an_area_excludes_one():
     assert locator.candidates == 2
     inside = TagLocator(wall, height=Height(1.0), area=Area((-50, 0.1, 0), (50, 50, 3)))
     assert track_errors(run_live(ranges, inside).track, truth).rmse < 0.4
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+def test_every_position_lies_inside_the_area(seed: int):
+    area = Area((-4, -4, 0), (0.9, 4, 3))
+    ranges, truth = drive(WALL, path=flight, seed=seed)
+    locator = TagLocator(WALL, area=area)
+    track = run_live(block(ranges, seed), locator).track
+    assert len(track) > 0.9 * len(ranges)
+    assert area.holds(track.position).all()
+    assert area.holds(locator.at(int(ranges.stamp_ns[-1]) + 5 * NANOSECONDS).position).all()
+    errors = track_errors(track, truth)
+    assert errors.rmse < 0.6
+    assert errors.height_rmse < 0.6
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_measured_heights_near_the_floor_keep_the_right_solution(seed: int):
+    """The anchors are in one plane, so that every position has a mirror image without a height."""
+    flat = WALL.moved(WALL.position * (1, 1, 0) + (0, 0, 2.0), WALL.sd)
+    flat = flat.moved(flat.position + np.outer([0, 0, -3, -3, 0], (1, 0, 0)), WALL.sd)
+    ranges, truth = drive(flat, path=flight, seed=seed, seconds=30)
+    rng = np.random.default_rng(seed)
+    stamps = np.arange(0, 30 * NANOSECONDS, NANOSECONDS // 10)
+    height = truth.at(stamps)[:, 2] + rng.normal(0, 0.02, len(stamps))
+    known = np.isfinite(height)
+    heights = Heights(stamps[known], height[known], np.full(known.sum(), 0.0004))
+    area = Area((-4, -4, 0), (30, 4, 3))
+    live = run_live(ranges, TagLocator(flat, area=area), heights).track
+    smoothed = smooth(flat, Model(), ranges, live, area=area, heights=heights)
+    for track in (live, smoothed):
+        assert len(track) > 250
+        assert area.holds(track.position).all()
+        errors = track_errors(track, truth)
+        assert errors.rmse < 0.3
+        assert errors.height_rmse < 0.06
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+@pytest.mark.parametrize("height", [None, Height(1.0)])
+def test_anchors_almost_on_a_line_never_decide_by_chance(seed: int, height: Height | None):
+    rng = np.random.default_rng(seed)
+    line = AnchorMap([Anchor(i, (2.5 * i, *rng.normal((0, 1), 0.03)), 0.03) for i in range(1, 6)])
+    ranges, _ = drive(line, seconds=30, seed=seed)
+    block(ranges, seed)
+    fleet = Fleet(line, Model(), height=height)
+    for i in range(len(ranges)):
+        found = fleet.add(
+            7, int(ranges.anchor[i]) + 1, int(ranges.stamp_ns[i]), float(ranges.range_m[i]), 0.01
+        )
+        assert found is not None
+        assert found[1] is None
+    (warning,) = fleet.warnings()
+    assert "all on a line" in warning
+
+
+def test_the_default_acceleration_suits_simulated_drones():
+    def rmse(acceleration: float) -> float:
+        found = []
+        for seed in range(3):
+            ranges, truth = drive(HALL, path=lambda t: np.add(flight(t), (6, 4.5, 0)), seed=seed, seconds=40)
+            block(ranges, seed)
+            live = run_live(ranges, TagLocator(HALL, Model(acceleration=acceleration))).track
+            found.append(track_errors(live, truth).rmse)
+        return float(np.mean(found))
+
+    assert rmse(Model().acceleration) < rmse(3.0)
 
 
 def test_two_anchors_alone_tell_nothing():

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from drives import HALL, drive
+from drives import HALL, block, drive
 
 from uwb_mitigation.errors import DatasetError
+from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
 from uwb_mitigation.positioning.chain import Chain
 from uwb_mitigation.positioning.locator import TagLocator, run_live
 from uwb_mitigation.positioning.model import Model
 from uwb_mitigation.positioning.smoother import Parameters, Smoother, knots_of
+from uwb_mitigation.positioning.smoothing import smooth
 from uwb_mitigation.positioning.start import Height
 from uwb_mitigation.positioning.track_errors import track_errors
 from uwb_mitigation.positioning.tracks import Ranges, Track
@@ -155,3 +157,18 @@ def test_one_range_makes_no_track():
     ranges, _ = drive(seconds=1)
     with pytest.raises(DatasetError, match="1 ranges"):
         Smoother(HALL, Model(), ranges.take(slice(0, 1)))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_track_smoothed_among_obstacles_is_not_worse_than_live(seed: int):
+    box = np.array([(x, y, z) for x in (0.0, 12.0) for y in (0.0, 9.0) for z in (0.2, 2.8)])
+    anchors = AnchorMap([Anchor(i, tuple(p), 0.03) for i, p in enumerate(box.tolist(), 1)])
+    ranges, truth = drive(anchors, seconds=40, seed=seed)
+    block(ranges, seed)
+    live = run_live(ranges, TagLocator(anchors)).track
+    of_live = track_errors(live, truth)
+    errors = track_errors(smooth(anchors, Model(), ranges, live), truth)
+    assert errors.epochs > 380
+    assert errors.rmse < 1.1 * of_live.rmse
+    assert errors.height_rmse < 1.2 * of_live.height_rmse
+    assert errors.coverage95 > 0.85

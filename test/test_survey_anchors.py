@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from drives import HALL, circuit, drive
+from drives import HALL, NANOSECONDS, circuit, drive
 
 from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.positioning.anchors import AnchorMap
+from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
 from uwb_mitigation.positioning.start import Height
 from uwb_mitigation.positioning.survey import displacements, survey
 
@@ -53,6 +53,27 @@ def test_a_swapped_pair_is_named(minute):
     found = survey(HALL.moved(wrong, HALL.sd), minute, height=LEVEL)
     assert found.swapped == [(1, 3)]
     assert sorted(found.misplaced) == [1, 3]
+
+
+def test_the_mirror_image_of_a_square_is_not_a_swapped_pair():
+    """Swapped opposite anchors of a square are its mirror image, which explains the ranges as well as the truth."""
+    square = AnchorMap(
+        [Anchor(i, (x, y, 2.0)) for i, (x, y) in enumerate([(2, 0), (10, 0), (10, 8), (2, 8)], 1)]
+    )
+    ranges, _ = drive(square, seconds=40, seed=2)
+    wrong = square.position + np.random.default_rng(4).normal(0, (0.4, 0.4, 0), (4, 3))
+    wrong[[1, 3]] = wrong[[3, 1]]
+    found = survey(square.moved(wrong, square.sd), ranges, height=LEVEL)
+    assert found.explained
+    assert found.swapped == []
+
+
+def test_what_ranges_do_not_determine_is_reported(minute):
+    guesses = HALL.moved(HALL.position, np.full(5, 0.5))
+    level_drive = minute.take(minute.stamp_ns < 30 * NANOSECONDS)
+    found = survey(guesses, level_drive, off_m=0.5)
+    assert set(found.undetermined) | set(found.alternatives)
+    assert not survey(HALL, level_drive, off_m=0.05).undetermined
 
 
 def test_the_whole_may_lie_and_turn_as_it_likes():

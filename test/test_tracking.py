@@ -13,15 +13,18 @@ import pytest
 from bag_material import write_corrected
 from command_line import run
 from conftest import REPOSITORY
-from drives import HALL, drive
+from drives import HALL, NANOSECONDS, circuit, drive
 
-from uwb_mitigation.bag.poses import read_positions, tag_topic
-from uwb_mitigation.bag.topics import ODOMETRY, ODOMETRY_TRUTH
+from uwb_mitigation.bag.poses import encode_pose, read_positions, tag_topic
+from uwb_mitigation.bag.topics import ODOMETRY, ODOMETRY_TRUTH, POSE_TYPE
 from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.measurement import Cir, CorrectedRange, Origin, RangeMeasurement, Record, Status
 from uwb_mitigation.positioning.anchors import dump_anchors, parse_anchors
+from uwb_mitigation.positioning.locator import TagLocator, run_live
 from uwb_mitigation.positioning.model import Model
-from uwb_mitigation.positioning.start import Height
+from uwb_mitigation.positioning.start import Area, Height
+from uwb_mitigation.positioning.tracks import Estimate, Ranges, TruePath
+from uwb_mitigation.processing import tracking
 from uwb_mitigation.processing.residuals import held_out
 from uwb_mitigation.processing.tracking import track_tag
 from uwb_mitigation.sources.hanyang import HanyangRun
@@ -141,6 +144,81 @@ def test_a_survey_writes_anchors_that_are_nearer(hall: Path, tmp_path: Path):
     assert "exists already" in str(
         run("survey", hall, "-o", found, "--anchors", guesses, folder=tmp_path).stderr
     )
+
+
+def test_a_height_topic_is_used_and_excludes_a_constant_height(hall: Path, tmp_path: Path):
+    bag, result = tmp_path / "flight.mcap", tmp_path / "track.json"
+    ranges, truth = drive(
+        seconds=20, path=lambda t: circuit(t, 1.0) + np.outer(0.5 * np.sin(0.4 * t), (0, 0, 1))
+    )
+    with BagWriter(bag, {"simulated": "true"}) as writer:
+        for i in range(len(ranges)):
+            stamp, at = int(ranges.stamp_ns[i]), truth.position[i]
+            measured = RangeMeasurement(
+                stamp,
+                7,
+                HALL.anchors[ranges.anchor[i]].id,
+                i,
+                0,
+                float(ranges.range_m[i]),
+                Cir(np.zeros(0, np.int16)),
+            )
+            writer.write(Record(measured, tag_position=tuple(at.tolist())))
+            if i % 4 == 0:
+                height = Estimate(stamp, at * (0, 0, 1), np.zeros(3), np.eye(6) * 0.0004)
+                writer.write_message("/height", POSE_TYPE, encode_pose(height), stamp)
+    (tmp_path / "flight.anchors.yaml").write_text(dump_anchors(HALL))
+    arguments = ("track", bag, "-o", tmp_path / "track.mcap", "--height-topic")
+    done = run(*arguments, "/height", "--json", result, folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    told = json.loads(result.read_text())
+    for kind in ("live", "smoothed"):
+        assert told[kind]["horizontal_rmse_m"] < 0.2
+        assert told[kind]["height_rmse_m"] < 0.05
+    assert told["tags"][0]["warnings"] == []
+    for more in (("/height", "--height", "1.0"), ("/nothing",)):
+        assert run(*arguments, *more, "--force", folder=tmp_path).returncode != 0
+
+
+def recording_of(ranges: Ranges, truth: TruePath) -> TagRecording:
+    return TagRecording(7, ranges, ranges, False, truth)
+
+
+def test_only_anchors_that_contradict_the_others_are_accused():
+    height = Height(1.0)
+    blocked, truth = drive(seconds=60, seed=1)
+    late = (blocked.anchor == 2) & (blocked.stamp_ns > 30 * NANOSECONDS)
+    blocked.range_m[late] += np.random.default_rng(1).exponential(1.5, int(late.sum()))
+    locator = TagLocator(HALL, height=height)
+    run_live(blocked, locator)
+    assert locator.disagreeing() == [2]  # by its last ranges alone
+    assert track_tag(recording_of(blocked, truth), HALL, Model(), height).disagreeing == []
+    wrong, truth = drive(seconds=60, seed=1)
+    wrong.range_m[wrong.anchor == 2] += 1.5
+    assert track_tag(recording_of(wrong, truth), HALL, Model(), height).disagreeing == [2]
+
+
+def test_a_bad_geometry_and_failed_smoothing_are_reported(monkeypatch: pytest.MonkeyPatch):
+    near_line = HALL.moved(HALL.position * (1, 0.02, 0) + (0, -6, 1), HALL.sd)
+    ranges, truth = drive(near_line, seconds=10)
+    area = Area((-50, 0, 0), (50, 50, 3))
+    found = track_tag(recording_of(ranges, truth), near_line, Model(range_sd=0.02), Height(1.0), area)
+    assert not found.warnings
+    ranges, far = drive(near_line, seconds=10, path=lambda t: np.add(circuit(t), (80, 0, 0)))
+    found = track_tag(
+        recording_of(ranges, far),
+        near_line,
+        Model(range_sd=0.02),
+        Height(1.0),
+        area=Area((0, -5, 0), (200, 50, 3)),
+    )
+    assert "poor geometry" in found.warnings[0]
+    monkeypatch.setattr(
+        tracking, "smooth", lambda *given, **_: replace(given[3], position=given[3].position + 1.0)
+    )
+    ranges, truth = drive(seconds=10)
+    (warning,) = track_tag(recording_of(ranges, truth), HALL, Model(), Height(1.0)).warnings
+    assert "smoothing failed" in warning
 
 
 def test_topics_of_several_tags():

@@ -20,7 +20,7 @@ from uwb_mitigation.model.shipped import default_model_path
 from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.locator import TagLocator, run_live
 from uwb_mitigation.positioning.model import Model
-from uwb_mitigation.positioning.smoother import Smoother
+from uwb_mitigation.positioning.smoothing import smooth
 from uwb_mitigation.positioning.snapshot import snapshot
 from uwb_mitigation.positioning.start import Area, Height, places
 from uwb_mitigation.positioning.track_errors import TrackErrors, errors_of, track_errors
@@ -91,7 +91,7 @@ def hanyang(folder: Path, model: Model | None = None) -> Errors:
     model = model or Model()
     anchors, ranges, _, truth = hanyang_run(folder)
     live = run_live(ranges, TagLocator(anchors, model, height=HEIGHT)).track
-    smoothed = Smoother(anchors, model, ranges, height=HEIGHT).fit(live).track
+    smoothed = smooth(anchors, model, ranges, live, height=HEIGHT)
     tracks = (live, smoothed, snapshot(anchors, ranges, HEIGHT))
     return Errors(folder.name, *(at_truths(track, truth) for track in tracks))
 
@@ -208,7 +208,7 @@ def flat(anchor_count: int, seed: int = 1, ranges: int = 3000) -> FlatErrors:
 def _flat_errors(name: str, anchors: AnchorMap, ranges: Ranges, truth: TruePath) -> Errors:
     model, height = Model(), Height(0.0, 0.05)
     live = run_live(ranges, TagLocator(anchors, model, height=height)).track
-    smoothed = Smoother(anchors, model, ranges, height=height).fit(live).track
+    smoothed = smooth(anchors, model, ranges, live, height=height)
     tracks = (live, smoothed, snapshot(anchors, ranges, height))
     return Errors(name, *(track_errors(track, truth) for track in tracks))
 

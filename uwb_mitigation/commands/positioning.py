@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from uwb_mitigation.positioning.start import Area, Height
     from uwb_mitigation.positioning.survey import SurveyResult
     from uwb_mitigation.positioning.track_errors import TrackErrors
+    from uwb_mitigation.positioning.tracks import Heights
     from uwb_mitigation.processing.residuals import HeldOut
     from uwb_mitigation.processing.tracking import TagTracks
     from uwb_mitigation.sources.recorded_ranges import RecordedRanges
@@ -38,6 +39,16 @@ HeightOption = Annotated[
     typer.Option(help="Height of the tag's antenna in the anchors' frame, m, where it stays the same."),
 ]
 HeightSdOption = Annotated[float, typer.Option("--height-sd", help="How well that is known, m.")]
+HeightTopicOption = Annotated[
+    str | None,
+    typer.Option(
+        "--height-topic",
+        metavar="TOPIC",
+        help="Topic of BAG with the measured height of the tag's antenna: sensor_msgs/Range (height above z = 0), "
+        "nav_msgs/Odometry or geometry_msgs/PoseWithCovarianceStamped. --height-sd is used where a message has no "
+        "variance.",
+    ),
+]
 AreaOption = Annotated[
     str | None,
     typer.Option(
@@ -53,7 +64,7 @@ OffsetOption = Annotated[
 AccelerationOption = Annotated[
     float,
     typer.Option(
-        help="How briskly tags change their speed, m/s^1.5: 1 of a robot or a person, 3 of a drone."
+        help="How fast tags change their velocity, m/s^1.5 (root of the spectral density of white acceleration)."
     ),
 ]
 
@@ -73,6 +84,7 @@ def track(
     ] = None,
     height: HeightOption = None,
     height_sd: HeightSdOption = 0.1,
+    height_topic: HeightTopicOption = None,
     area: AreaOption = None,
     stamp_offset: OffsetOption = 0.0,
     acceleration: AccelerationOption = 1.0,
@@ -100,6 +112,7 @@ def track(
     model = Model(acceleration=acceleration)
     place, box = height_of(height, height_sd), area_of(area)
     known, recorded = _read(bag, anchors, stamp_offset)
+    measured = heights_of(bag, height_topic, height_sd, height, recorded)
     if tum is not None and tum.exists() and not force:
         raise ParameterError("exists already", where=str(tum), valid="--force replaces it")
     tracks = []
@@ -108,19 +121,21 @@ def track(
         task = bar.add_task("tracking", total=len(recorded.tags))
         for tag in recorded.tags:
             bar.update(task, description=f"tracking tag {format_id(tag.tag_id)}: {len(tag.ranges)} ranges")
-            tracks.append(track_tag(tag, known, model, place, box))
+            tracks.append(track_tag(tag, known, model, place, box, measured))
             bar.advance(task)
         write_tracks(out, tracks)
     if force or not anchors_file(output).exists():
         save_anchors(anchors_file(output), known, f"anchors of the track of {bag.name}", force=True)
     _show_tracks(tracks, known)
-    residuals = held_out(tracks, known, model, place)
+    residuals = held_out(tracks, known, model, place, measured)
     _show_residuals(residuals, known)
     console.out.print(f"Wrote {out.counts.total()} messages to {out.file}.", markup=False, soft_wrap=True)
     if tum is not None:
         for one in tracks:
             write_whole(tum_file(tum, one.recording.tag_id, len(tracks) > 1), tum_text(one.smoothed))
-    console.write_json(json, _result(tracks, recorded) | {"held_out": [one.as_json() for one in residuals]})
+    console.write_json(
+        json, _result(tracks, recorded, known) | {"held_out": [one.as_json() for one in residuals]}
+    )
 
 
 def survey(
@@ -138,6 +153,7 @@ def survey(
     ] = None,
     height: HeightOption = None,
     height_sd: HeightSdOption = 0.1,
+    height_topic: HeightTopicOption = None,
     area: AreaOption = None,
     stamp_offset: OffsetOption = 0.0,
     acceleration: AccelerationOption = 1.0,
@@ -160,6 +176,7 @@ def survey(
         raise ParameterError("exists already", where=str(output), valid="--force replaces it")
     place, box = height_of(height, height_sd), area_of(area)
     known, recorded = _read(bag, anchors, stamp_offset)
+    measured = heights_of(bag, height_topic, height_sd, height, recorded)
     rows = []
     for identity in fixed or []:
         if identity not in known.index:
@@ -177,6 +194,7 @@ def survey(
             fixed=frozenset(rows),
             height=place,
             area=box,
+            heights=measured,
             model=Model(acceleration=acceleration),
         )
     save_anchors(
@@ -202,6 +220,11 @@ def survey(
             ],
             "misplaced": [known.anchors[row].id for row in result.misplaced],
             "swapped": [[known.anchors[row].id for row in pair] for pair in result.swapped],
+            "alternatives": {
+                str(known.anchors[row].id): position.tolist() for row, position in result.alternatives.items()
+            },
+            "undetermined": [known.anchors[row].id for row in result.undetermined],
+            "mirrored": result.mirrored,
             "mean_loss": result.loss,
             "explained": result.explained,
         },
@@ -234,6 +257,22 @@ def height_of(height: float | None, sd: float) -> Height | None:
     return None if height is None else Height(height, sd)
 
 
+def heights_of(
+    bag: Path, topic: str | None, sd: float, height: float | None, recorded: RecordedRanges
+) -> Heights | None:
+    """Read the heights of --height-topic."""
+    from uwb_mitigation.bag.pose_paths import read_heights
+
+    if topic is None:
+        return None
+    if height is not None:
+        raise ParameterError("--height and --height-topic", valid="one of the two")
+    if len(recorded.tags) > 1:
+        tags = ", ".join(str(tag.tag_id) for tag in recorded.tags)
+        raise ParameterError(f"--height-topic with the tags {tags}", valid="a bag with one tag")
+    return read_heights(bag, topic, sd)
+
+
 def area_of(text: str | None) -> Area | None:
     """What --area says."""
     from uwb_mitigation.positioning.start import Area
@@ -245,7 +284,7 @@ def _show_tracks(tracks: list[TagTracks], anchors: AnchorMap) -> None:
     from uwb_mitigation.commands.console import Table
 
     table = Table("tag", "track", title="Horizontal errors, m", title_justify="left")
-    for column in ("epochs", "RMSE", "median", "p95", "in ellipse", "NEES", "beyond"):
+    for column in ("epochs", "RMSE", "median", "p95", "in ellipse", "NEES", "beyond", "height"):
         table.add_column(column, justify="right")
     for one in tracks:
         kind = "corrected" if one.recording.corrected else "raw"
@@ -258,19 +297,24 @@ def _show_tracks(tracks: list[TagTracks], anchors: AnchorMap) -> None:
             table.add_row(format_id(one.recording.tag_id), name, *_cells(epochs, errors))
     console.out.print(table)
     console.out.print(
-        "In ellipse: truths inside the 95 % ellipses. NEES: 1 is honest, more overconfident. Beyond: errors beyond "
-        "the protection levels.",
+        "In ellipse: true positions inside the 95 % ellipses. NEES: 1 is consistent, more is overconfident. "
+        "Beyond: errors beyond the protection levels. Height: RMSE of z.",
         style="dim",
     )
     for one in tracks:
         if not one.live_errors.epochs:
             console.out.print(f"tag {format_id(one.recording.tag_id)}: no truth in the bag, so no errors")
+        for warning in one.warnings:
+            _warn(f"tag {format_id(one.recording.tag_id)}: {warning}.")
         for row in one.disagreeing:
-            _warn(f"anchor {anchors.anchors[row]} disagrees with the others: is it where the file says?")
+            _warn(
+                f"anchor {anchors.anchors[row]}: its ranges contradict those of the other anchors. Check its position in "
+                "the anchors file."
+            )
 
 
 def _show_residuals(residuals: list[HeldOut], anchors: AnchorMap) -> None:
-    from rich.table import Table
+    from uwb_mitigation.commands.console import Table
 
     table = Table("anchor", title="Residuals of held-out ranges, m", title_justify="left")
     for column in ("ranges", "raw", "corrected"):
@@ -295,6 +339,7 @@ def _cells(epochs: int, errors: TrackErrors) -> tuple[str, ...]:
         _number(errors.coverage95, "{:.1%}"),
         _number(errors.nees_per_dof, "{:.2f}"),
         _number(errors.exceeded, "{:.2%}"),
+        _number(errors.height_rmse, "{:.3f}"),
     )
 
 
@@ -313,6 +358,22 @@ def _show_survey(result: SurveyResult, guesses: AnchorMap) -> None:
             f"these anchors do not explain the ranges (mean loss {result.loss:.1f}; 0.5 or less where they do): do not "
             "trust them; begin with better guesses, and drive past every anchor on more than one side"
         )
+    for row, (x, y, z) in result.alternatives.items():
+        _warn(
+            f"anchor {guesses.anchors[row]}: the ranges explain ({x:.2f}, {y:.2f}, {z:.2f}) as well; only the guess "
+            "decides. Drive a route that leaves its line or plane, or measure this anchor"
+        )
+    if result.undetermined:
+        names = ", ".join(str(guesses.anchors[row]) for row in result.undetermined)
+        _warn(
+            f"the ranges do not determine the positions of the anchors {names}, only the guesses do. Without --height, "
+            "ranges do not determine how the whole is tilted: set --fixed for three measured anchors, or a smaller --off"
+        )
+    if result.mirrored:
+        _warn(
+            "the mirror image of all anchors fits the guesses about as well, and ranges cannot distinguish the two. "
+            "Measure one anchor beside the line of the others, and set --fixed"
+        )
     for a, b in result.swapped:
         _warn(f"anchors {guesses.anchors[a]} and {guesses.anchors[b]} are swapped in the file")
     for row in result.misplaced:
@@ -320,7 +381,7 @@ def _show_survey(result: SurveyResult, guesses: AnchorMap) -> None:
             _warn(f"anchor {guesses.anchors[row]} is {result.moved_m[row]:.2f} m from where the file says")
 
 
-def _result(tracks: list[TagTracks], recorded: RecordedRanges) -> dict[str, Any]:
+def _result(tracks: list[TagTracks], recorded: RecordedRanges, anchors: AnchorMap) -> dict[str, Any]:
     from uwb_mitigation.processing.tracking import pooled
 
     known = any(one.live_errors.epochs for one in tracks)
@@ -331,6 +392,10 @@ def _result(tracks: list[TagTracks], recorded: RecordedRanges) -> dict[str, Any]
             {"tag_id": one.recording.tag_id, "ranges": len(one.recording.ranges)}
             | one.smoothed_errors.as_json()
             | {"epochs": one.smoothed_errors.epochs or len(one.smoothed)}
+            | {
+                "warnings": one.warnings,
+                "disagreeing": [anchors.anchors[row].id for row in one.disagreeing],
+            }
             | {kind: getattr(one, f"{kind}_errors").as_json() for kind in kinds if known}
             for one in tracks
         ],

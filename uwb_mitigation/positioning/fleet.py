@@ -150,7 +150,10 @@ class Fleet:
             if not locator.following:
                 found.append(f"{name}: {self._why(locator)}")
             odd = [self.anchors.anchors[row] for row in locator.disagreeing()]
-            found += [f"{name}: anchor {anchor} disagrees with the others" for anchor in odd]
+            found += [
+                f"{name}: ranges of anchor {anchor} do not fit: blocked, or wrong in the anchors file"
+                for anchor in odd
+            ]
             geometry = locator.geometry()
             if geometry is not None and geometry.hdop > 10.0:
                 found.append(f"{name}: poor geometry, HDOP {geometry.hdop:.0f}")

@@ -289,7 +289,8 @@ class TagLocator:
     ) -> None:
         known.predict(time_s)
         z, _ = known.update(anchor, range_m, variance_m2)
-        self._pressed |= self._confine(known)
+        if self._area is not None and self._confine(known):
+            self._pressed = True
         self.health.add(z)
         state = self.states[anchor]
         state.z = z

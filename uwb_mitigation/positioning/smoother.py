@@ -18,7 +18,7 @@ from uwb_mitigation.positioning.chain import Chain, Solution
 from uwb_mitigation.positioning.filter import FIRST_ERROR, OFFSET, RangeFilter
 from uwb_mitigation.positioning.model import Model
 from uwb_mitigation.positioning.start import Height
-from uwb_mitigation.positioning.tracks import Ranges, Track
+from uwb_mitigation.positioning.tracks import Heights, Ranges, Track
 
 KNOT_S = 0.1
 _ITERATIONS = 12
@@ -83,6 +83,7 @@ class Smoother:
         around: where anchors that are sought are known to be, and to which deviation in each axis, float64
             (m, 3) both; None = as `anchors` says.
         after: the filter at the first range's time, whose state and covariance are where the track begins.
+        heights: measured heights of the tag; not together with `height`.
 
     Raises:
         DatasetError: fewer than two ranges.
@@ -99,6 +100,7 @@ class Smoother:
         find_anchors: bool = False,
         around: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
         after: RangeFilter | None = None,
+        heights: Heights | None = None,
     ) -> None:
         if len(ranges) < 2:
             raise DatasetError(f"{len(ranges)} ranges", valid="two or more for a track")
@@ -129,6 +131,11 @@ class Smoother:
             parameters = Parameters(np.concatenate([np.ones((n, 1)), own], axis=1), np.zeros(len(sd)), sd)
         self._rows, self._mean = parameters.rows, parameters.mean
         self._certainty = 1.0 / np.maximum(parameters.sd, 1e-6) ** 2
+        self._height_m = self._height_information = np.zeros(len(self._knots_ns))
+        if heights is not None and height is None:
+            value, variance = heights.at(self._origin_ns + self._knots_ns)
+            self._height_m = np.nan_to_num(value)
+            self._height_information = np.nan_to_num(1.0 / variance)
 
     def fit(self, initial: Track, iterations: int = _ITERATIONS) -> Smoothed:
         """The track, starting from one that is roughly right.
@@ -249,6 +256,9 @@ class Smoother:
                     certainty = 1.0 / max(self._spread[row, axis], 1e-6) ** 2
                     chain.shared[i, i] += certainty
                     chain.right_shared[i] += certainty * self._expected[row, axis]
+        if d == 3:
+            chain.diagonal[:, 2, 2] += self._height_information
+            chain.right[:, 2] += self._height_information * self._height_m
         if self._after is None:
             for axis in range(d):
                 chain.diagonal[0, d + axis, d + axis] += 1.0 / self._model.speed**2

@@ -8,7 +8,7 @@ descent from the guesses can go.
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +18,9 @@ from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.geometry import Shape, shape
 from uwb_mitigation.positioning.locator import TagLocator, run_live
 from uwb_mitigation.positioning.model import Model
-from uwb_mitigation.positioning.smoother import Smoother
+from uwb_mitigation.positioning.smoother import Smoothed, Smoother
 from uwb_mitigation.positioning.start import Area, Height
-from uwb_mitigation.positioning.tracks import Ranges, Track
+from uwb_mitigation.positioning.tracks import Heights, Ranges, Track
 
 MISPLACED_M = 0.3
 """An anchor that far from where it should be is misplaced, if that is also `_UNLIKELY` of its deviations."""
@@ -44,6 +44,10 @@ _SWAP_GAIN = 0.15
 
 _MOVES_M = 1.0
 
+_AS_WELL = 1.5
+_SAME_LOSS = 0.2
+"""Mean losses of two positions of an anchor that differ by less do not decide between them."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurveyResult:
@@ -54,6 +58,9 @@ class SurveyResult:
     swapped: pairs of rows that stand in each other's places.
     track: of the tag.
     loss: mean robust loss of a range; below about 0.5 the anchors explain the ranges.
+    alternatives: {row: float64 (3,)}, other positions of single anchors that explain the ranges as well.
+    undetermined: rows of anchors that the ranges place, relative to the others, to no better than `MISPLACED_M`.
+    mirrored: the mirror image of all anchors fits the guesses about as well; ranges never decide between the two.
     explained: whether it is below `UNEXPLAINED`: else the anchors may be anywhere.
     """
 
@@ -63,6 +70,9 @@ class SurveyResult:
     swapped: list[tuple[int, int]]
     track: Track
     loss: float
+    alternatives: dict[int, NDArray[np.float64]]
+    undetermined: list[int]
+    mirrored: bool
 
     @property
     def explained(self) -> bool:
@@ -77,6 +87,7 @@ def survey(
     fixed: frozenset[int] = frozenset(),
     height: Height | None = None,
     area: Area | None = None,
+    heights: Heights | None = None,
     model: Model | None = None,
 ) -> SurveyResult:
     """Find the anchors.
@@ -88,6 +99,7 @@ def survey(
             anchors is taken as off by no more than `TAPE_M`: a level drive hardly tells it, a tape does.
         fixed: rows of anchors that are known as well as their own deviations say.
         height, area, model: as of `TagLocator`.
+        heights: measured heights of the tag.
 
     Raises:
         DatasetError: too few anchors, all on a line, or a tag that hardly moves; says which.
@@ -99,9 +111,70 @@ def survey(
         raise DatasetError(f"{len(used)} anchors were heard", valid=f"{needed} or more for a survey")
     if shape(guesses.position[used]) is Shape.LINE:
         raise DatasetError("the anchors are all on a line", valid="one or more beside it")
-    order, swapped = _unswap(guesses, ranges, off_m, height, area, model)
-    start = guesses.moved(guesses.position[order], _deviations(guesses, off_m, fixed))
-    track = _first_track(start, ranges, height, area, model)
+    deviations = _deviations(guesses, off_m, fixed)
+
+    def fit(order: list[int]) -> tuple[Smoothed, float]:
+        start = guesses.moved(guesses.position[order], deviations)
+        found = _fit(start, ranges, height, area, heights, model)
+        expected = np.where(np.isfinite(ranges.variance_m2), ranges.variance_m2, model.range_sd**2)
+        return found, float(model.loss(found.residual_m / np.sqrt(expected)).mean())
+
+    order, swapped = _unswap(guesses, ranges, off_m, height, area, heights, model)
+    identity = list(range(len(guesses)))
+    found, loss = fit(identity)
+    if swapped:
+        # In a square, swapped opposite anchors are the mirror image of the right ones: ranges do not tell the two apart.
+        exchanged, lower = fit(order)
+        here, mirror = (
+            _misfit(fitted.anchors[used], guesses.position[used], mirrored=side)
+            for fitted, side in ((found, False), (exchanged, True))
+        )
+        limit = _AS_WELL * off_m
+        if (lower < loss - _SWAP_GAIN or here > limit) and mirror > limit:
+            found, loss = exchanged, lower
+        else:
+            swapped = []
+    sd = np.sqrt(np.einsum("ijij->i", found.anchor_covariance) / 3.0)
+    moved = displacements(found.anchors[used], guesses.position[used])
+    distance = np.zeros(len(guesses))
+    # A level drive tells heights badly, and they were taken as measured.
+    axes = slice(0, 2) if height is not None else slice(0, 3)
+    distance[used] = np.linalg.norm(moved[:, axes], axis=1)
+    relative = np.linalg.norm(_relative_sd(found.anchors, found.anchor_covariance)[:, axes], axis=1)
+    odd = [int(row) for row in used if distance[row] > max(MISPLACED_M, _UNLIKELY * relative[row])]
+    alternatives = {
+        row: other
+        for row in used.tolist()
+        if row not in fixed
+        for other in [_alternative(found, ranges, row, model, level=height is not None)]
+        if other is not None
+    }
+    plain, mirror = (
+        _misfit(found.anchors[used], guesses.position[order if swapped else identity][used], mirrored=side)
+        for side in (False, True)
+    )
+    return SurveyResult(
+        guesses.moved(found.anchors, np.maximum(sd, 1e-3)),
+        distance,
+        odd,
+        swapped,
+        found.track,
+        loss,
+        alternatives,
+        [row for row in used.tolist() if row not in fixed and relative[row] > MISPLACED_M],
+        not fixed and mirror < _AS_WELL * max(plain, TAPE_M),
+    )
+
+
+def _fit(
+    start: AnchorMap,
+    ranges: Ranges,
+    height: Height | None,
+    area: Area | None,
+    heights: Heights | None,
+    model: Model,
+) -> Smoothed:
+    track = _first_track(start, ranges, height, area, heights, model)
     spread = np.ptp(track.position[:, :2], axis=0)
     if float(np.hypot(*spread)) < _MOVES_M:
         raise DatasetError(
@@ -114,32 +187,60 @@ def survey(
     fit = None
     for step in _STEPS_M:
         variance = np.where(np.isfinite(ranges.variance_m2), ranges.variance_m2, model.range_sd**2)
-        trusted = Ranges(
-            ranges.stamp_ns,
-            ranges.anchor,
-            ranges.range_m,
-            np.maximum(variance, step**2),
-            ranges.rx_power_dbm,
-            ranges.tag_id,
+        trusted = replace(ranges, variance_m2=np.maximum(variance, step**2))
+        smoother = Smoother(
+            known,
+            model,
+            trusted,
+            height=height,
+            heights=heights,
+            find_anchors=True,
+            around=(start.position, around),
         )
-        fit = Smoother(
-            known, model, trusted, height=height, find_anchors=True, around=(start.position, around)
-        ).fit(track)
+        fit = smoother.fit(track)
         track = fit.track
         known = known.moved(fit.anchors, start.sd)
     assert fit is not None
-    sd = np.sqrt(np.einsum("ijij->i", fit.anchor_covariance) / 3.0)
-    found = guesses.moved(fit.anchors, np.maximum(sd, 1e-3))
-    moved = displacements(fit.anchors[used], guesses.position[used])
-    distance = np.zeros(len(guesses))
-    # A level drive tells heights badly, and they were taken as measured.
-    axes = slice(0, 2) if height is not None else slice(0, 3)
-    distance[used] = np.linalg.norm(moved[:, axes], axis=1)
-    relative = np.linalg.norm(_relative_sd(fit.anchors, fit.anchor_covariance)[:, axes], axis=1)
-    odd = [int(row) for row in used if distance[row] > max(MISPLACED_M, _UNLIKELY * relative[row])]
-    expected = np.where(np.isfinite(ranges.variance_m2), ranges.variance_m2, model.range_sd**2)
-    loss = float(model.loss(fit.residual_m / np.sqrt(expected)).mean())
-    return SurveyResult(found, distance, odd, swapped, track, loss)
+    return fit
+
+
+def _misfit(found: NDArray[np.float64], guessed: NDArray[np.float64], *, mirrored: bool) -> float:
+    """RMS distance in plan between found anchors (m, 3), or their mirror image, and the guesses."""
+    side = -1.0 if mirrored else 1.0
+    return float(np.sqrt(np.mean(displacements(found * (side, 1.0, 1.0), guessed)[:, :2] ** 2)))
+
+
+def _alternative(
+    fit: Smoothed, ranges: Ranges, row: int, model: Model, *, level: bool
+) -> NDArray[np.float64] | None:
+    """Another position of an anchor from which its ranges to the track are explained as well, or None.
+
+    Candidate: the mirror image beyond the track's plane (its line in plan, of a level drive), refined with the track held.
+    """
+    own = ranges.anchor == row
+    track, axes = fit.track, 2 if level else 3
+    tag = np.stack(
+        [np.interp(ranges.stamp_ns[own], track.stamp_ns, axis) for axis in track.position.T], axis=1
+    )
+    centre = tag.mean(axis=0)
+    normal = np.zeros(3)
+    normal[:axes] = np.linalg.svd((tag - centre)[:, :axes], full_matrices=False)[2][-1]
+    anchor = fit.anchors[row]
+    other = anchor - 2.0 * float((anchor - centre) @ normal) * normal
+    found_m = np.linalg.norm(tag - anchor, axis=1)
+    sd = np.sqrt(np.where(np.isfinite(ranges.variance_m2[own]), ranges.variance_m2[own], model.range_sd**2))
+    # Residuals of the fit, with what it attributes to offsets: the other position has to explain the same ranges.
+    range_m = found_m + fit.residual_m[own]
+    for _ in range(10):
+        away = other - tag
+        expected = np.maximum(np.linalg.norm(away, axis=1), 1e-6)
+        z = (range_m - expected) / sd
+        slope = (away / expected[:, None] / sd[:, None])[:, :axes]
+        weighted = slope * model.weight(z)[:, None]
+        other[:axes] += np.linalg.solve(weighted.T @ slope + np.eye(axes), weighted.T @ z)
+    worse = float(model.loss((range_m - np.linalg.norm(other - tag, axis=1)) / sd).mean())
+    here = float(model.loss(fit.residual_m[own] / sd).mean())
+    return other if worse < here + _SAME_LOSS and np.linalg.norm(other - anchor) > MISPLACED_M else None
 
 
 def displacements(found: NDArray[np.float64], guessed: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -183,9 +284,14 @@ def _deviations(guesses: AnchorMap, off_m: float, fixed: frozenset[int]) -> NDAr
 
 
 def _first_track(
-    anchors: AnchorMap, ranges: Ranges, height: Height | None, area: Area | None, model: Model
+    anchors: AnchorMap,
+    ranges: Ranges,
+    height: Height | None,
+    area: Area | None,
+    heights: Heights | None,
+    model: Model,
 ) -> Track:
-    track = run_live(ranges, TagLocator(anchors, model, height=height, area=area)).track
+    track = run_live(ranges, TagLocator(anchors, model, height=height, area=area), heights).track
     if len(track) < 2:
         raise DatasetError(
             "no place of the tag can be told",
@@ -200,6 +306,7 @@ def _unswap(
     off_m: float,
     height: Height | None,
     area: Area | None,
+    heights: Heights | None,
     model: Model,
 ) -> tuple[list[int], list[tuple[int, int]]]:
     """The order of guesses that explains the first minute best, of all with one pair swapped; and that pair."""
@@ -213,10 +320,10 @@ def _unswap(
 
     def loss(order: list[int]) -> float:
         anchors = guesses.moved(guesses.position[order], np.full(len(guesses), off_m))
-        track = run_live(trial, TagLocator(anchors, model, height=height, area=area)).track
+        track = run_live(trial, TagLocator(anchors, model, height=height, area=area), heights).track
         if len(track) < 2:
             return np.inf
-        fit = Smoother(anchors, model, trial, height=height).fit(track, iterations=4)
+        fit = Smoother(anchors, model, trial, height=height, heights=heights).fit(track, iterations=4)
         return float(model.loss(fit.residual_m / np.sqrt(off_m**2 / 4.0 + model.range_sd**2)).mean())
 
     best, order, swapped = loss(identity), identity, list[tuple[int, int]]()

@@ -26,6 +26,7 @@ class TrackErrors:
         nees_per_dof: mean normalised estimation error squared, over its two degrees of freedom: 1 is honest,
             more is overconfident (Bar-Shalom et al., section 5.4); NaN without covariances.
         exceeded: share of epochs where the error in x or y was beyond its protection level; NaN likewise.
+        height_rmse: RMSE of z.
     """
 
     epochs: int
@@ -35,6 +36,7 @@ class TrackErrors:
     coverage95: float
     nees_per_dof: float
     exceeded: float
+    height_rmse: float
 
     def as_json(self) -> dict[str, float | int | None]:
         """The keys of `track --json`; what is not known is null."""
@@ -45,13 +47,14 @@ class TrackErrors:
             "coverage95": self.coverage95,
             "nees_per_dof": self.nees_per_dof,
             "protection_exceeded": self.exceeded,
+            "height_rmse_m": self.height_rmse,
         }
         return {"epochs": self.epochs} | {
             name: value if math.isfinite(value) else None for name, value in values.items()
         }
 
 
-NO_ERRORS = TrackErrors(0, *(math.nan,) * 6)
+NO_ERRORS = TrackErrors(0, *(math.nan,) * 7)
 
 
 def track_errors(track: Track, truth: TruePath, offset_ns: int = 0) -> TrackErrors:
@@ -90,4 +93,5 @@ def errors_of(
         coverage,
         nees,
         exceeded,
+        float(np.sqrt(np.mean((position[:, 2] - true[:, 2]) ** 2))),
     )

@@ -15,7 +15,7 @@ from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.model import Model
 from uwb_mitigation.positioning.smoother import Smoother
 from uwb_mitigation.positioning.start import Height
-from uwb_mitigation.positioning.tracks import Ranges, Track, TruePath
+from uwb_mitigation.positioning.tracks import Heights, Ranges, Track, TruePath
 from uwb_mitigation.processing.tracking import TagTracks
 
 MIN_OTHERS = 3
@@ -45,14 +45,18 @@ class HeldOut:
 
 
 def held_out(
-    tracks: Sequence[TagTracks], anchors: AnchorMap, model: Model, height: Height | None = None
+    tracks: Sequence[TagTracks],
+    anchors: AnchorMap,
+    model: Model,
+    height: Height | None = None,
+    heights: Heights | None = None,
 ) -> list[HeldOut]:
     """Return the held-out residuals of each anchor, and of all anchors last."""
     raw = [(one.live, one.recording.raw) for one in tracks]
     corrected = [(one.live, one.recording.ranges) for one in tracks if one.recording.corrected]
 
     def of(row: int, kind: list[tuple[Track, Ranges]]) -> NDArray[np.float64]:
-        parts = [_residuals(live, ranges, row, anchors, model, height) for live, ranges in kind]
+        parts = [_residuals(live, ranges, row, anchors, model, height, heights) for live, ranges in kind]
         return np.concatenate([np.zeros(0), *parts])
 
     by_anchor = [(of(row, raw), of(row, corrected)) for row in range(len(anchors))]
@@ -66,13 +70,19 @@ def held_out(
 
 
 def _residuals(
-    initial: Track, ranges: Ranges, row: int, anchors: AnchorMap, model: Model, height: Height | None
+    initial: Track,
+    ranges: Ranges,
+    row: int,
+    anchors: AnchorMap,
+    model: Model,
+    height: Height | None,
+    heights: Heights | None,
 ) -> NDArray[np.float64]:
     """Return range minus distance of an anchor's ranges, where the track of the others is known."""
     own = ranges.anchor == row
     if len(np.unique(ranges.anchor[~own])) < MIN_OTHERS or not own.any():
         return np.zeros(0)
-    track = Smoother(anchors, model, ranges.take(~own), height=height).fit(initial).track
+    track = Smoother(anchors, model, ranges.take(~own), height=height, heights=heights).fit(initial).track
     position = TruePath(track.stamp_ns, track.position).at(ranges.stamp_ns[own])
     residual: NDArray[np.float64] = ranges.range_m[own] - np.linalg.norm(
         position - anchors.position[row], axis=1

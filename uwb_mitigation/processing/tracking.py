@@ -23,12 +23,21 @@ from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.geometry import Shape, geometry, shape
 from uwb_mitigation.positioning.locator import TagLocator, run_live
 from uwb_mitigation.positioning.model import Model
-from uwb_mitigation.positioning.smoother import Smoother
+from uwb_mitigation.positioning.smoothing import smooth
 from uwb_mitigation.positioning.snapshot import snapshot
 from uwb_mitigation.positioning.start import Area, Height
 from uwb_mitigation.positioning.track_errors import NO_ERRORS, TrackErrors, track_errors
-from uwb_mitigation.positioning.tracks import Estimate, Track
+from uwb_mitigation.positioning.tracks import Estimate, Heights, Ranges, Track
 from uwb_mitigation.sources.recorded_ranges import TagRecording
+
+POOR_HDOP = 10.0
+CONTRADICTION_M = 0.4
+"""NLOS errors of the other anchors move their track by up to about this much."""
+
+WORSE = 1.1
+LEAST_COVERAGE = 0.85
+"""Where the truth is known, smoothing has failed if its RMSE exceeds `WORSE` times the live one, or its 95 % ellipses
+contain a smaller share of the true positions than this."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,7 +50,8 @@ class TagTracks:
         snapshot: least squares on raw ranges.
         live_errors, smoothed_errors, snapshot_errors: beside the truth.
         hdop: median horizontal dilution of precision along the track.
-        disagreeing: rows of anchors that disagree with most others.
+        disagreeing: rows of anchors whose ranges contradict the track of the other anchors.
+        warnings: What makes the tracks unreliable; empty = nothing found.
     """
 
     recording: TagRecording
@@ -53,6 +63,7 @@ class TagTracks:
     snapshot_errors: TrackErrors
     hdop: float
     disagreeing: list[int]
+    warnings: list[str]
 
 
 def track_tag(
@@ -61,6 +72,7 @@ def track_tag(
     model: Model,
     height: Height | None = None,
     area: Area | None = None,
+    heights: Heights | None = None,
 ) -> TagTracks:
     """The tracks of one tag.
 
@@ -69,11 +81,10 @@ def track_tag(
     """
     ranges = recording.ranges
     locator = TagLocator(anchors, model, height=height, area=area)
-    live = run_live(ranges, locator).track
+    live = run_live(ranges, locator, heights).track
     if len(live) < 2:
-        raise DatasetError(*_nowhere(recording, anchors, locator, height))
-    # What came before the first place was found is smoothed too, from there.
-    smoothed = Smoother(anchors, model, ranges, height=height).fit(live).track
+        raise DatasetError(*_nowhere(recording, anchors, locator, height or heights))
+    smoothed = smooth(anchors, model, ranges, live, height=height, area=area, heights=heights)
     snapshots = snapshot(anchors, recording.raw, height)
     truth = recording.truth
     of_live, of_smoothed, of_snapshots = (
@@ -81,14 +92,56 @@ def track_tag(
     )
     sample = smoothed.position[:: max(len(smoothed) // 200, 1)]
     used = anchors.position[np.unique(ranges.anchor)]
-    hdop = float(np.median([geometry(used, place, level=height is not None).hdop for place in sample]))
+    level = height is not None or heights is not None
+    hdop = float(np.median([geometry(used, place, level=level).hdop for place in sample]))
+    warnings = []
+    if not hdop <= POOR_HDOP:
+        warnings.append(
+            f"poor geometry: median HDOP {hdop:.0f}. The anchors are {shape(used).value}. "
+            "Place anchors on more sides of the tag"
+        )
+    share = len(live) / len(ranges)
+    if share < 0.9:
+        warnings.append(
+            f"no position for {1.0 - share:.0%} of the ranges, because several positions explain them or too few anchors "
+            "were received. Give a height or an area"
+        )
+    if of_smoothed.rmse > WORSE * of_live.rmse or of_smoothed.coverage95 < LEAST_COVERAGE:
+        warnings.append(
+            f"smoothing failed: RMSE {of_smoothed.rmse:.3f} m (live {of_live.rmse:.3f} m), "
+            f"{of_smoothed.coverage95:.0%} of the true positions in the 95 % ellipses. Use the live track"
+        )
+
+    def live_without(row: int) -> Track:
+        others = ranges.take(ranges.anchor != row)
+        return run_live(others, TagLocator(anchors, model, height=height, area=area), heights).track
+
+    # A locator accuses by its last ranges only: evidence comes from the whole recording.
+    odd = [row for row in locator.disagreeing() if contradicts(anchors, ranges, row, live_without(row))]
     return TagTracks(
-        recording, live, smoothed, snapshots, of_live, of_smoothed, of_snapshots, hdop, locator.disagreeing()
+        recording, live, smoothed, snapshots, of_live, of_smoothed, of_snapshots, hdop, odd, warnings
     )
 
 
+def contradicts(anchors: AnchorMap, ranges: Ranges, row: int, others: Track) -> bool:
+    """Whether an anchor's ranges contradict the track that was estimated without them.
+
+    A blocked line of sight makes some ranges too long, which is a long tail: the shortest residuals still fit. A wrong
+    anchor position or offset shifts all residuals, or makes many ranges too short, which no obstacle does.
+    """
+    own = ranges.anchor == row
+    if len(others) < 2 or not own.any() or own.all():
+        return False
+    position = np.stack(
+        [np.interp(ranges.stamp_ns, others.stamp_ns, axis) for axis in others.position.T], axis=1
+    )
+    residual = ranges.range_m - np.linalg.norm(position - anchors.position[ranges.anchor], axis=1)
+    low = float(np.percentile(residual[own], 20.0) - np.median(residual[~own]))
+    return abs(low) > CONTRADICTION_M
+
+
 def _nowhere(
-    recording: TagRecording, anchors: AnchorMap, locator: TagLocator, height: Height | None
+    recording: TagRecording, anchors: AnchorMap, locator: TagLocator, height: Height | Heights | None
 ) -> tuple[str]:
     used = anchors.position[np.unique(recording.ranges.anchor)]
     what = f"tag {format_id(recording.tag_id)}: no place can be told from {len(recording.ranges)} ranges"
@@ -96,6 +149,8 @@ def _nowhere(
         what += f": {locator.candidates} places are as good"
     needed = 3 if height is not None else 4
     kind = shape(used)
+    if locator.undetermined:
+        what += ": the ranges do not determine it"
     if len(used) < needed:
         what += f"; {len(used)} anchors were heard, {needed} are needed"
     if kind in (Shape.LINE, Shape.POINT) or (kind is Shape.PLANE and height is None):
@@ -118,7 +173,7 @@ def pooled(errors: list[TrackErrors]) -> TrackErrors:
     return TrackErrors(
         sum(one.epochs for one in known),
         rmse,
-        *(mean(name) for name in ("median", "p95", "coverage95", "nees_per_dof", "exceeded")),
+        *(mean(name) for name in ("median", "p95", "coverage95", "nees_per_dof", "exceeded", "height_rmse")),
     )
 
 
