@@ -60,7 +60,7 @@ def mlp_bundle(folder: Path) -> Bundle:
 
 def choosy_bundle(folder: Path, samples: int = 32, scaling: Scaling = Scaling.PREAMBLE) -> Bundle:
     """The same with a familiarity that finds random measurements familiar, strange in part, and wholly strange."""
-    lead = Band(-40.0, -1.0, 10.0)
+    lead = Band(-40.0, -12.0, 10.0)
     if scaling is Scaling.MAX:
         return exact_bundle(
             folder,

@@ -83,7 +83,7 @@ def test_plans_hold_what_their_kind_says(kind: buildings.Kind) -> None:
             ends = np.array([wall.start, wall.end])
             assert (ends >= -1e-9).all()
             assert (ends <= np.add(plan.size, 1e-9)).all()
-    if kind.name != "hall":
+    if kind.name not in ("hall", "open"):
         assert np.mean([len(plan.walls) for plan in plans]) > 3
     assert any(plan.screens for plan in plans)
 

@@ -64,20 +64,22 @@ def test_the_features_are_levels_in_decibels():
 
 @pytest.mark.parametrize("scaling", Scaling)
 def test_energy_before_the_first_path_needs_no_level(scaling):
-    amplitude = np.full((1, 157), 0.25, np.float32)
-    amplitude[0, :3] = 0.125
+    amplitude = np.zeros((1, 157), np.float32)
+    amplitude[0, :3], amplitude[0, 6:9] = 0.125, 0.25
     window = np.sqrt(amplitude) if scaling is Scaling.PREAMBLE else amplitude
     unknown = np.float32([math.nan])
     found = features(window, scaling, np.float32([3.0]), unknown, unknown)
-    assert found[0, 5] == pytest.approx(-6.02, abs=0.06)
-    only = Familiarity(0.0, None, lead_level_db=Band(-50.0, -10.0, 8.0))
-    assert Strangeness(only.bands).score(found) == pytest.approx([0.5], abs=0.01)
+    assert found[0, 5] == pytest.approx(10 * math.log10(0.2), abs=0.06)
+    only = Familiarity(0.0, None, lead_level_db=Band(-50.0, -10.0, 6.0))
+    assert Strangeness(only.bands).score(found) == pytest.approx([0.5], abs=0.02)
 
 
 @pytest.mark.parametrize("level", [0.0, 1e-20, 1e16])
 def test_a_level_is_finite_whatever_the_window_holds(level):
     window = np.full((1, 157), level, np.float32)
-    assert np.isfinite(features(window, Scaling.PREAMBLE, *(np.float32([value]) for value in (3.0, -80.0, -85.0)))).all()
+    assert np.isfinite(
+        features(window, Scaling.PREAMBLE, *(np.float32([value]) for value in (3.0, -80.0, -85.0)))
+    ).all()
 
 
 def test_distance_alone_is_not_strange_and_a_weaker_radio_is(tmp_path):

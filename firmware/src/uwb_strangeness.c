@@ -45,7 +45,7 @@ float uwb_strangeness(const uwb_model *model, const float *window, float range_m
         rx_power_dbm - first_path_power_dbm,
         level - rx_power_dbm,
         first_path_level - first_path_power_dbm,
-        lead_level - first_path_level,
+        lead_level - level,
     };
     float score = -INFINITY;
     for (size_t i = 0; i < UWB_FEATURES; i++) {

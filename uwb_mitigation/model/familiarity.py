@@ -3,11 +3,11 @@
 Six features, each with a band of values that are in distribution: the range, the receive power normalised to 1 m by
 free-space propagation (Friis, "A note on a simple transmission formula", Proc. IRE 1946), its excess over the
 first-path power, two levels of the CIR less the powers that the radio reports of the same signal, and the energy
-before the first path relative to the first path. A model for CIRs without levels has bands for the first and the last.
+before the first path relative to the whole window. A model for CIRs without levels has bands for the first and the last.
 At 1 m a weaker or a stronger radio differs from walls that the training data had; as received, it does not.
 The radio computes both powers from the very accumulator, so the last two hardly vary (DW1000 user manual,
 section 4.7): a CIR that is noise, clipped, or cut at the wrong place contradicts them. The energy before the first
-path needs no level: where it exceeds the first path, the window is noise or starts at the wrong tap.
+path needs no level: where it is much of the window's energy, the window is noise or starts too late.
 """
 
 from __future__ import annotations
@@ -85,8 +85,9 @@ class Band:
         return cls(*(float(np.float32(value)) for value in bounds))
 
 
-LEAD = Band(-1000.0, -5.0, 5.0)
-"""Band of `lead_level_db`. It is fixed: a detector reports the first energy above its noise threshold."""
+LEAD = Band(-1000.0, -20.0, 5.0)
+"""Band of `lead_level_db`. It is fixed, because a detector reports the first energy above its noise threshold: in the
+simulated buildings 99 % of the values are below -24 dB, and 95 % are above -17 dB if windows start 5 taps too late."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +101,7 @@ class Familiarity:
         power_gap_db: of the receive power less the first-path power.
         cir_level_db: of the window's energy less the receive power.
         first_path_level_db: of the energy at the first path less the first-path power.
-        lead_level_db: energy before the first path relative to the first path.
+        lead_level_db: energy before the first path relative to the energy of the window.
 
     A feature without a band (None) is not checked.
     """
@@ -182,7 +183,7 @@ def features(
         np.subtract(rx_power_dbm, first_path_power_dbm, out=out[:, 2])
         np.subtract(level[:, 0], rx_power_dbm, out=out[:, 3])
         np.subtract(level[:, 1], first_path_power_dbm, out=out[:, 4])
-        np.subtract(level[:, 3], level[:, 1], out=out[:, 5])
+        np.subtract(level[:, 3], level[:, 0], out=out[:, 5])
     return out
 
 

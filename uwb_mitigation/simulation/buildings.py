@@ -7,7 +7,7 @@ The chip is the same everywhere: pulse, detector and compression are those of `s
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from uwb_mitigation.simulation.channel import (
     INDUSTRIAL_NLOS,
     OFFICE_LOS,
     OFFICE_NLOS,
+    OUTDOOR_LOS,
     PATTERN_LOSS_DB,
     RESIDENTIAL_LOS,
     RESIDENTIAL_NLOS,
@@ -40,6 +41,7 @@ from uwb_mitigation.simulation.scene import (
 RESIDENTIAL: Environments = (RESIDENTIAL_LOS, RESIDENTIAL_NLOS)
 OFFICE: Environments = (OFFICE_LOS, OFFICE_NLOS)
 INDUSTRIAL: Environments = (INDUSTRIAL_LOS, INDUSTRIAL_NLOS)
+OUTDOOR: Environments = (OUTDOOR_LOS, RESIDENTIAL_NLOS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,11 +65,21 @@ class Kind:
 
 
 KINDS = (
-    Kind("flat", 0.55, (5.0, 14.0), (4.0, 10.0), (2.5, 5.0), ((RESIDENTIAL, 1.0),), 0.12),
+    Kind("flat", 0.5, (5.0, 14.0), (4.0, 10.0), (2.5, 5.0), ((RESIDENTIAL, 1.0),), 0.12),
     Kind("office", 0.2, (10.0, 30.0), (8.0, 18.0), (3.0, 7.0), ((RESIDENTIAL, 0.3), (OFFICE, 0.7)), 0.08),
-    Kind("corridor", 0.15, (12.0, 40.0), (6.0, 14.0), (3.0, 6.0), ((RESIDENTIAL, 0.3), (OFFICE, 0.7)), 0.06),
+    Kind("corridor", 0.1, (12.0, 40.0), (6.0, 14.0), (3.0, 6.0), ((RESIDENTIAL, 0.3), (OFFICE, 0.7)), 0.06),
     Kind("hall", 0.1, (10.0, 40.0), (8.0, 30.0), (10.0, 25.0), ((INDUSTRIAL, 1.0),), 0.06),
+    Kind(
+        "open",
+        0.1,
+        (5.0, 40.0),
+        (4.0, 30.0),
+        (60.0, 60.0),
+        ((RESIDENTIAL, 0.35), (OFFICE, 0.25), (INDUSTRIAL, 0.2), (OUTDOOR, 0.2)),
+        0.02,
+    ),
 )
+"""The open kind has no inner walls: laboratories, arenas, halls, and places outdoors. Nearly all of it is LOS."""
 
 HEAVY = ((CONCRETE, (0.15, 0.40)), (BRICK, (0.20, 0.50)))
 LIGHT = ((PLASTERBOARD, (0.02, 0.05)), (WOOD, (0.03, 0.06)), (GLASS, (0.006, 0.02)))
@@ -90,7 +102,14 @@ GAIN_DB = (-6.0, 6.0)
 """Transmit power and both antennas, beyond those of the EVB1000: a DW1000's power is set in steps over 30 dB, and
 regulators bound its density; small antennas gain -2 to 3 dB."""
 
-NOISE_FIGURE_DB = (8.0, 12.0)
+WIDE_GAIN_SHARE, WIDE_GAIN_DB = 0.1, (-15.0, 15.0)
+"""Share of blocks with a power amplifier, an external antenna or attenuation."""
+
+TILTED_SHARE, TILTED_LOSS_DB = 0.3, (2.0, 6.0)
+"""Share of blocks whose antennas move or are tilted, as on drones: the direct path loses an exponentially distributed
+number of dB, with a mean between these bounds; reflections do not."""
+
+NOISE_FIGURE_DB = (7.0, 14.0)
 PREAMBLES = (128, 256, 512, 1024)
 DETECTION_SYMBOLS = 24
 """Spent on detecting the preamble, so that they are not accumulated (the logs: 1000 of 1024)."""
@@ -183,8 +202,9 @@ def _screen(name: str, length_m: float, size: tuple[float, float], rng: np.rando
 
 def draw_boards(n: int, rng: np.random.Generator) -> Boards:
     """n pairs of boards: transmit power and antennas, noise, preamble length."""
+    is_wide = rng.random() < WIDE_GAIN_SHARE
     return Boards(
-        rng.uniform(*GAIN_DB, n),
+        rng.uniform(*(WIDE_GAIN_DB if is_wide else GAIN_DB), n),
         rng.uniform(*NOISE_FIGURE_DB, n),
         rng.choice(np.array(PREAMBLES, np.float64), n) - DETECTION_SYMBOLS,
     )
@@ -225,6 +245,9 @@ def block_of(seed: int, number: int) -> tuple[Block, np.random.Generator]:
     )
     anchor, tag = (np.concatenate(ends) for ends in zip(*places, strict=True))
     boards = draw_boards(len(anchor), rng)
+    if rng.random() < TILTED_SHARE:
+        loss_db = rng.exponential(rng.uniform(*TILTED_LOSS_DB), len(anchor))
+        path = replace(path, loss_db=path.loss_db + loss_db)
     chosen = _balanced(_conditions(environments, anchor, tag, path, boards), PLACEMENTS, rng)
     anchor, tag = anchor[chosen], tag[chosen]
     later = np.minimum(np.hypot(*(tag - anchor).T) / DETOUR_M, DETOUR_MOST)
