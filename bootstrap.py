@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import platform
 import shlex
 import shutil
 import subprocess
@@ -128,7 +129,13 @@ def step(name: str, inputs: Iterable[Path | str], action: Callable[[], None]) ->
 
 
 def check_tools() -> None:
-    """Name every missing tool at once, with the line that installs it."""
+    """Refuse a processor without ROS wheels; name every missing tool at once, with the line that installs it."""
+    machine = platform.machine()
+    if not SYSTEM_ROS and machine not in ("x86_64", "AMD64"):
+        raise SetupError(
+            f"the ROS 2 wheels exist for x86-64 only, and this is {machine}. "
+            f"Install ROS 2 Jazzy, so that {ROS_PREFIX}/setup.sh exists, or set ROS_PREFIX"
+        )
     low, high = PYTHONS
     if not low <= sys.version_info[:2] <= high:
         raise SetupError(

@@ -8,6 +8,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
+import scipy.stats  # noqa: F401 - Before autodoc mocks torch: on import, scipy tests whether classes are torch's.
 from sphinx.application import Sphinx
 
 import uwb_mitigation
@@ -37,8 +38,8 @@ html_extra_path = ["site"]  # sends the reader of the top folder to docs/index.h
 templates_path = [str(Path(__file__).resolve().parent / "templates")]
 default_role = "code"
 autodoc_member_order = "bysource"
-# Absent where pages alone are built. What is there is not mocked: scipy asks classes whether they are torch's.
-autodoc_mock_imports = [name for name in ("torch", "distributed") if find_spec(name) is None]
+# The goal `docs` does not install these. What is installed is not mocked: scipy tests whether classes are torch's.
+autodoc_mock_imports = [name for name in ("torch", "distributed", "matplotlib") if find_spec(name) is None]
 napoleon_use_ivar = True  # else an attribute that has a docstring of its own is described twice
 napoleon_attr_annotations = False  # a class shows them in its signature
 # Annotations name types of libraries, whose pages are elsewhere.

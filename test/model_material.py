@@ -47,10 +47,10 @@ def windows(count: int, samples: int, seed: int = 0) -> np.ndarray:
     return (generator.gamma(2.0, 0.3, (count, samples)) * decay).astype(np.float32)
 
 
-def random_int8(architecture: Remnet, seed: int = 0) -> Int8Weights:
-    """A quantised network; its scales are not those that the firmware needs."""
+def random_int8(architecture: Remnet, seed: int = 0, *, exact: bool = True) -> Int8Weights:
+    """Return a quantised network. Without `exact`, its scales suit neither the firmware nor all processors."""
     weights = random_weights(architecture, seed)
-    return quantize(weights, windows(64, architecture.samples, seed), exact=False)
+    return quantize(weights, windows(64, architecture.samples, seed), exact=exact)
 
 
 def card(architecture: Remnet, *, quantised: bool = True, **changes: object) -> Card:

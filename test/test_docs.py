@@ -5,10 +5,14 @@
 
 from __future__ import annotations
 
+import ast
+import importlib.metadata
 import importlib.util
 import json
 import re
 import shlex
+import sys
+from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 
@@ -18,17 +22,23 @@ import typer
 import yaml
 from browser import Browser
 from conftest import REPOSITORY
+from typer.testing import CliRunner
 
 from uwb_mitigation import cli
+from uwb_mitigation.commands import view as view_command
 from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.nodes.parameter_tables import TABLES
 from uwb_mitigation.sources.opening import open_recording
+from uwb_mitigation.sources.site import anchors_file, load_anchors
 
 PAGES = sorted(
     path
     for pattern in ("*.md", "docs/*.md", "models/*.md", "firmware/**/*.md")
     for path in REPOSITORY.glob(pattern)
 )
+
+
+SEEING = REPOSITORY / "docs" / "seeing.md"
 
 
 def links(page: Path) -> list[str]:
@@ -114,6 +124,20 @@ def test_a_command_that_is_typed_exists_with_its_options(words: list[str]):
         command, words = command.commands[words[0]], words[1:]
     known = {name for parameter in command.params for name in (*parameter.opts, *parameter.secondary_opts)}
     assert {word.partition("=")[0] for word in words if word.startswith("-")} <= known | {"--help"}
+
+
+def test_the_recording_of_the_view_example_shows_anchors_and_ranges(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    example = re.findall(r"^ +uwb-mitigation (.*)$", view_command.view.__doc__, re.M)
+    assert all(f"    uwb-mitigation {line}\n" in SEEING.read_text() for line in example)
+    simulate, view = map(shlex.split, example)
+    bag = Path(view[1])
+    assert CliRunner().invoke(cli.app, [*simulate, "--ranges", "100"]).exit_code == 0
+    assert load_anchors(anchors_file(bag))
+    with open_recording(bag) as source:
+        measurement = next(iter(source)).measurement
+    assert measurement.cir is not None
+    assert measurement.cir.rx_power_dbm is not None
 
 
 @pytest.mark.parametrize("words", lines_of("make"))
@@ -240,6 +264,44 @@ def test_every_experiment_is_named_by_a_page():
     scripts = list((REPOSITORY / "docs" / "experiments").glob("*.py"))
     assert scripts
     assert not [script.name for script in scripts if f"docs/experiments/{script.name}" not in pages]
+
+
+def imported_on_import(body: list[ast.stmt]) -> Iterator[str]:
+    """The top-level packages that a module imports when it is imported itself."""
+    for node in body:
+        if isinstance(node, ast.Import):
+            yield from (alias.name.partition(".")[0] for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield str(node.module).partition(".")[0]
+        elif isinstance(node, ast.Try):
+            yield from imported_on_import(node.body)
+
+
+def test_make_docs_installs_or_mocks_all_that_the_modules_import():
+    """Autodoc imports every module, and in a fresh clone there is nothing but what the goal `docs` installs."""
+    locks = [REPOSITORY / "requirements" / f"{part}.txt" for part in ("ros", "runtime", "docs")]
+    locked = {re.split(r"[ =]", line)[0] for lock in locks for line in lock.read_text().splitlines()}
+    conf = (REPOSITORY / "docs" / "conf.py").read_text()
+    mocked = re.search(r"^autodoc_mock_imports = \[name for name in (\(.*?\)) if", conf, re.M)
+    assert mocked
+    distributions = importlib.metadata.packages_distributions()
+    available = {
+        *ast.literal_eval(mocked[1]),
+        *sys.stdlib_module_names,
+        "uwb_mitigation",
+        "uwb_mitigation_msgs",
+    }
+    for name, sources in distributions.items():
+        if any(re.sub(r"[-_.]+", "-", source).lower() in locked for source in sources):
+            available.add(name)
+    modules = (REPOSITORY / "uwb_mitigation").rglob("*.py")
+    missing = {
+        (path.name, name)
+        for path in modules
+        for name in imported_on_import(ast.parse(path.read_text(encoding="utf-8")).body)
+        if name not in available
+    }
+    assert missing == set()
 
 
 # What a reader sees.

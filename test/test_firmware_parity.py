@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import platform
 import shutil
 from collections.abc import Sequence
 from dataclasses import replace
@@ -242,6 +243,32 @@ def test_plain_cmake_builds_the_library_and_passes_its_test(tmp_path: Path):
     run(["cmake", "-S", str(firmware_folder()), "-B", str(build), f"-DUWB_MODEL_DIR={tmp_path}"])
     run(["cmake", "--build", str(build)])
     run(["ctest", "--test-dir", str(build)])
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        ("-ffast-math",),
+        ("-O2", "-Ofast"),
+        ("-U__FLT_EVAL_METHOD__", "-D__FLT_EVAL_METHOD__=1"),
+        ("-U__FLT_EVAL_METHOD__", "-D__FLT_EVAL_METHOD__=2"),
+        pytest.param(
+            ("-m32", "-mno-sse", "-mfpmath=387"),
+            marks=pytest.mark.skipif(platform.machine() != "x86_64", reason="an option of gcc for x86"),
+        ),
+    ],
+)
+def test_flags_that_change_float_results_are_refused(flags: tuple[str, ...]):
+    compile_ = ["cc", "-fsyntax-only", "-x", "c", str(firmware_folder() / "src" / "uwb_target.h")]
+    run(compile_)
+    with pytest.raises(UwbMitigationError, match=r"wider type|-ffast-math"):
+        run([*compile_, *flags])
+
+
+@pytest.mark.parametrize("name", ["preprocess", "prior_m", "strangeness", "correct", "quantise", "network"])
+def test_every_source_with_float_arithmetic_refuses_fast_math(name: str):
+    with pytest.raises(UwbMitigationError, match=r"wider type|-ffast-math"):
+        run(["cc", "-fsyntax-only", "-ffast-math", str(firmware_folder() / "src" / f"uwb_{name}.c")])
 
 
 @NEEDS_CXX

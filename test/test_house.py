@@ -120,6 +120,26 @@ def test_the_set_up_refuses_a_goal_that_is_none(goals: list[str], tmp_path: Path
     assert [path.name for path in tmp_path.iterdir()] == ["bootstrap.py"]
 
 
+@pytest.mark.parametrize("machine", ["aarch64", "x86_64"])
+@pytest.mark.parametrize("system_ros", [False, True])
+def test_the_setup_stops_where_there_are_no_ros_wheels(machine: str, system_ros: bool, tmp_path: Path):
+    program = shutil.copy(REPOSITORY / "bootstrap.py", tmp_path)
+    prefix = tmp_path / "ros"
+    prefix.mkdir()
+    if system_ros:
+        (prefix / "setup.sh").touch()
+    fake = f"import platform, runpy; platform.machine = lambda: {machine!r}; "
+    code = fake + f"runpy.run_path({str(program)!r}, run_name='__main__')"
+    # Without tools nothing can be installed: the next check stops the setup where this one does not.
+    environment = os.environ | {"ROS_PREFIX": str(prefix), "PATH": str(tmp_path)}
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    (line,) = done.stderr.splitlines()
+    assert ("x86-64 only" in line) == (machine == "aarch64" and not system_ros)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["bootstrap.py", "ros"]
+
+
 def test_the_set_up_goes_on_with_the_python_that_was_chosen_before(tmp_path: Path):
     program = shutil.copy(REPOSITORY / "bootstrap.py", tmp_path)
     chosen = tmp_path / "chosen python"

@@ -14,8 +14,10 @@ from uwb_mitigation.model import graph
 from uwb_mitigation.model.architecture import Remnet
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.integer import IntegerNetwork
+from uwb_mitigation.model.requantisation import neon_sum_table, sum_table
 from uwb_mitigation.model.runtime import Session, session_options
-from uwb_mitigation.model.shipped import default_model_path
+from uwb_mitigation.model.shipped import SHIPPED, default_model_path, shipped_model_path
+from uwb_mitigation.model.weights import Int8Weights, layer_inputs, sum_operands
 
 
 def hostile_inputs(samples: int, seed: int) -> np.ndarray:
@@ -56,6 +58,27 @@ def test_the_shipped_network_equals_onnx_runtime():
     assert np.array_equal(session.predict_batch_m(inputs), expected)
     single = np.array([session.predict_m(row) for row in inputs[-500:]], np.float32)
     assert np.array_equal(single, expected[-500:])
+
+
+def check_sums_on_every_processor(weights: Int8Weights) -> None:
+    scale = weights.activation_scale
+    names = [name for name in scale if name not in layer_inputs(weights.architecture)]
+    for name in names[1:]:  # The first one is the input.
+        ratios = [np.float32(scale[operand] / scale[name]) for operand in sum_operands(name)]
+        with_fma, arm = sum_table(*ratios), neon_sum_table(*ratios)
+        assert np.array_equal(arm, with_fma), (name, np.argwhere(arm != with_fma).tolist())
+        assert np.array_equal(sum_table(*ratios, fused=False), with_fma), name
+    assert len(names) == 1 + 2 * weights.architecture.modules
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_every_sum_of_a_shipped_model_is_equal_on_x86_and_arm(name):
+    check_sums_on_every_processor(integer_network(load_bundle(shipped_model_path(name))).weights)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_every_sum_of_a_nudged_network_is_equal_on_x86_and_arm(seed):
+    check_sums_on_every_processor(random_int8(Remnet(samples=16), seed))
 
 
 def test_a_sum_is_rounded_as_by_a_fused_multiply_add():

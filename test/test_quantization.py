@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from model_material import random_weights, windows
+from model_material import card, integer_network, random_int8, random_weights, windows
 
-from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.model import floating
+from uwb_mitigation.errors import DatasetError, ModelError
+from uwb_mitigation.model import floating, graph
 from uwb_mitigation.model.architecture import HEAD, Remnet
+from uwb_mitigation.model.bundle import load_bundle, save_bundle
 from uwb_mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.model.requantisation import nudge
+from uwb_mitigation.model.shipped import SHIPPED, shipped_model_path
 from uwb_mitigation.model.weights import FloatWeights, sum_operands
-from uwb_mitigation.training.quantization import calibration_inputs, quantize
+from uwb_mitigation.training.quantization import calibration_inputs, nudge_bundle, quantize
 
 SHAPE = Remnet(samples=32)
 
@@ -46,6 +48,33 @@ def test_the_integers_are_exact_for_the_firmware_already():
     assert dict(again.activation_scale) == dict(integers.activation_scale)
     for name in integers.weight:
         assert np.array_equal(again.weight_scale[name], integers.weight_scale[name])
+
+
+def test_a_bundle_is_written_again_with_nudged_scales_only(tmp_path):
+    shape = Remnet(samples=8)
+    model = graph.int8_model(random_int8(shape, seed=1, exact=False))
+    before = save_bundle(tmp_path / "before.onnx", model, card(shape))
+    after = nudge_bundle(before, tmp_path / "nudged.onnx")
+    assert after.card == before.card
+    assert after.model_id != before.model_id
+    old, new = integer_network(before).weights, integer_network(after).weights
+    expected = random_int8(shape, seed=1)
+    assert new.activation_scale == expected.activation_scale != old.activation_scale
+    assert all(np.array_equal(new.weight[name], old.weight[name]) for name in old.weight)
+
+
+def test_a_float_bundle_has_no_scales_to_nudge(tmp_path):
+    model = graph.float_model(random_weights(SHAPE))
+    source = save_bundle(tmp_path / "float.onnx", model, card(SHAPE, quantised=False))
+    with pytest.raises(ModelError):
+        nudge_bundle(source, tmp_path / "nudged.onnx")
+    assert not (tmp_path / "nudged.onnx").exists()
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_shipped_model_is_what_the_nudge_makes_of_it(name, tmp_path):
+    shipped = load_bundle(shipped_model_path(name))
+    assert nudge_bundle(shipped, tmp_path / "again.onnx").model == shipped.model
 
 
 def test_a_network_with_dead_filters_can_be_quantised():

@@ -2,6 +2,7 @@
 #include <math.h>
 
 #include "uwb_mitigation.h"
+#include "uwb_target.h"
 
 /* Every step is one IEEE-754 operation, as in uwb_mitigation/preprocessing.py; checks are in its order. */
 

@@ -1,6 +1,7 @@
 #include <math.h>
 
 #include "uwb_mitigation.h"
+#include "uwb_target.h"
 
 static const float MAX_POWER_DBM = 1000.0f;
 

@@ -1,6 +1,7 @@
 #include <math.h>
 
 #include "uwb_mitigation.h"
+#include "uwb_target.h"
 
 /* Every step is one IEEE-754 operation, as in uwb_mitigation/model/familiarity.py; volatile keeps a compiler from
  * fusing two. */

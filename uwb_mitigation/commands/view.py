@@ -41,7 +41,7 @@ def view(
     The page of the node `viewer`, with a slider for the time; no ROS is needed. It plays at the recording's own pace,
     until Ctrl-C here.
 
-        uwb-mitigation data simulate -o flat.mcap
+        uwb-mitigation data simulate --like drive -o flat.mcap
 
         uwb-mitigation view flat.mcap --browser
     """

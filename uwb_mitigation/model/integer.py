@@ -3,8 +3,8 @@
 It computes with integers and rounds where, and as, ONNX Runtime rounds (its MLAS kernels):
 a convolution requantises its int32 accumulator with `rint(float32(acc) * s)`, `s = fl(fl(sx sw) / sy)`;
 a sum is `rint(fma(a, ra, fl(b rb)))` with `ra = fl(sa / sy)`; all to uint8, half to even, saturating; the
-head's output is `float32(acc) * fl(sx sw)`. The quantiser leaves only sums that are the same without
-a fused multiply-add, so that old processors agree too.
+head's output is `float32(acc) * fl(sx sw)`. ONNX Runtime computes sums differently on ARM and on processors
+without a fused multiply-add. The quantiser chooses scales for which all three sums are equal (see `nudge`).
 """
 
 from __future__ import annotations

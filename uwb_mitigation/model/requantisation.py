@@ -5,6 +5,7 @@ ONNX Runtime (MLAS) computes, in float32:
 - after a convolution or a dense layer: `clip(rint(acc * s), 0, 255)`, `s = fl(fl(x * w) / y)` of the
   scales of input, weight and output;
 - a sum of two uint8 tensors: `clip(rint(fma(a, ra, fl(rb * b))), 0, 255)`, `ra = fl(sa / sy)`, `rb = fl(sb / sy)`.
+  Its NEON kernel for ARM computes the sum in integers instead: see `neon_sum_table`.
 
 `rint` rounds half to even. As a function of integers each is a staircase of at most 255 steps, so a
 line through the right integer gaps is the same function:
@@ -90,6 +91,24 @@ def sum_table(first: np.float32, second: np.float32, *, fused: bool = True) -> N
     else:
         total = (values * np.float32(first))[:, None] + products
     return _saturate(np.rint(total))
+
+
+def neon_sum_table(first: np.float32, second: np.float32) -> NDArray[np.uint8] | None:
+    """Return the sum of ONNX Runtime's NEON kernel (ARM) for every a (rows) and b (columns).
+
+    The kernel scales both ratios by `2^(21 - e)`, where e is the exponent of the larger ratio, rounds them to
+    integers of at most 22 bits, and rounds halves of the shifted sum up. It uses another formula, and the
+    result is None, if a ratio is outside of 2^-14 to 2^8, or if the larger ratio rounds to 23 bits.
+    """
+    ratios = np.array([first, second], np.float32)
+    if not np.all((ratios >= 2.0**-14) & (ratios < 2.0**8)):
+        return None
+    shift = 22 - int(np.frexp(ratios.max())[1])
+    scaled = np.rint(np.ldexp(ratios, shift)).astype(np.int64)
+    if scaled.max() >= 1 << 22:
+        return None
+    values = np.arange(256, dtype=np.int64)
+    return _saturate((scaled[0] * values[:, None] + scaled[1] * values + (1 << (shift - 1))) >> shift)
 
 
 def requantisation_scale(
@@ -238,17 +257,21 @@ def nudge_weight_scale(
 
 
 def nudge_sum_scale(first: np.float32, second: np.float32, total: np.float32) -> np.float32:
-    """The scale nearest to `total` for which the sum of tensors of the other two scales is solvable.
+    """Return the scale nearest to `total` at which the sum is solvable and equal on x86 and ARM.
+
+    `first` and `second` are the scales of the operands. "Equal" means for all 65,536 pairs of operands.
 
     Raises:
-        ModelError: none within 64 ulps is; the operands' scales then exceed the result's too far.
+        ModelError: no scale within 64 ulps meets this; the scales of the operands are then too large.
     """
     for candidate in _neighbours(total):
-        if solve_sum(np.float32(first / candidate), np.float32(second / candidate)):
+        ratios = np.float32(first / candidate), np.float32(second / candidate)
+        neon = neon_sum_table(*ratios)
+        if neon is not None and np.array_equal(neon, sum_table(*ratios)) and solve_sum(*ratios):
             return candidate
     raise ModelError(
         f"no exact integer sum near scale {total!r} of operands {first!r} and {second!r}",
-        valid="operands' scales that add up to at most twice the result's",
+        valid="scales of the operands above 1/16384 of the result's, and a sum of at most twice the result's",
     )
 
 

@@ -1,4 +1,4 @@
-/* universal, model 0305796b, written by `uwb-mitigation export-c`. */
+/* universal, model 982c95fd, written by `uwb-mitigation export-c`. */
 #ifndef UWB_MODEL_H
 #define UWB_MODEL_H
 
@@ -222,17 +222,17 @@ static const int8_t uwb_module2_reduce_weights[1024] __attribute__((aligned(4)))
 };
 
 static const uwb_channel uwb_module2_reduce[16] = {
-    {-112559, 263013376}, {-210070, 299208992}, {76233, 442968704}, {7370, 207512144},
-    {134494, 304785952}, {195585, 306732160}, {40983, 372699776}, {22572, 194850000},
-    {-109069, 232313392}, {55342, 449968064}, {-73580, 230216560}, {-87537, 211941808},
-    {30620, 236615728}, {-83219, 232391424}, {-162174, 243666368}, {-94320, 215926528},
+    {-112558, 263013440}, {-210069, 299209024}, {76233, 442968800}, {7370, 207512176},
+    {134493, 304786016}, {195587, 306732224}, {40985, 372699837}, {22571, 194850032},
+    {-109070, 232313440}, {55342, 449968128}, {-73581, 230216592}, {-87537, 211941856},
+    {30618, 236615776}, {-83218, 232391456}, {-162174, 243666400}, {-94319, 215926592},
 };
 
 static const uwb_channel uwb_module2_skip[16] = {
-    {-32720, 656001664}, {10354, 424743104}, {-221202, 491814944}, {-150290, 441326368},
-    {70902, 477733024}, {10096, 435433216}, {-134037, 499186624}, {59174, 462456096},
-    {64866, 405364640}, {118665, 562620544}, {129053, 450790400}, {27898, 636857928},
-    {108344, 502078400}, {265617, 368924928}, {-37732, 433731456}, {-140671, 386032448},
+    {-32719, 656001792}, {10353, 424743200}, {-221202, 491815147}, {-150291, 441326464},
+    {70902, 477733120}, {10095, 435433312}, {-134037, 499186720}, {59174, 462456128},
+    {64866, 405364639}, {118664, 562620672}, {129052, 450790496}, {27898, 636858304},
+    {108343, 502078496}, {265616, 368925160}, {-37732, 433731552}, {-140671, 386032544},
 };
 
 static const int8_t uwb_module3_residual_weights[768] __attribute__((aligned(4))) = {
@@ -347,10 +347,10 @@ static const uwb_channel uwb_module3_skip[16] = {
 static const uwb_module uwb_modules[] = {
     {uwb_module1_residual_weights, uwb_module1_residual, {3512472, 4194304, 2097152},
      uwb_module1_reduce_weights, uwb_module1_reduce, uwb_module1_skip, {2954513, 2739508, 2097152}},
-    {uwb_module2_residual_weights, uwb_module2_residual, {2703901, 2624736, 2097153},
+    {uwb_module2_residual_weights, uwb_module2_residual, {2703900, 2624736, 2097152},
      uwb_module2_reduce_weights, uwb_module2_reduce, uwb_module2_skip, {4194304, 3255140, 2097152}},
     {uwb_module3_residual_weights, uwb_module3_residual, {2599103, 3200656, 2097152},
-     uwb_module3_reduce_weights, uwb_module3_reduce, uwb_module3_skip, {2857131, 3428619, 2097141}},
+     uwb_module3_reduce_weights, uwb_module3_reduce, uwb_module3_skip, {2857130, 3428619, 2097152}},
 };
 
 static const int8_t uwb_head_weights[384] __attribute__((aligned(4))) = {
@@ -379,8 +379,8 @@ static const uwb_familiarity uwb_familiar = {0.0f, {
 }};
 
 static const uwb_model uwb_model_data = {
-    0x0305796bu, 157u, UWB_SCALE_PREAMBLE, 0.0100363968f, 3u, 3u, uwb_first_weights, uwb_first,
-    uwb_modules, 0u, NULL, uwb_head_weights, 384u, 166912, 6.12721415e-05f, 0.0f, 0.0f, 0.0f,
+    0x982c95fdu, 157u, UWB_SCALE_PREAMBLE, 0.0100363968f, 3u, 3u, uwb_first_weights, uwb_first,
+    uwb_modules, 0u, NULL, uwb_head_weights, 384u, 166912, 6.12721487e-05f, 0.0f, 0.0f, 0.0f,
     -8.72018242f, 25.2730923f, 0.0237812009f, 0.199585781f, 0.13643989f, &uwb_familiar,
 };
 
@@ -589,8 +589,8 @@ static const float uwb_golden_windows[8][157] = {
     },
 };
 static const float uwb_golden_outputs_m[8] = {
-    0.961237371f, 2.84486556f, 1.07998276f, 1.92045271f, 2.62177372f, 1.7198478f, 2.54414177f,
-    2.99528861f,
+    0.96123749f, 2.8448658f, 1.07998288f, 1.92045295f, 2.62177396f, 1.71984792f, 2.54414225f,
+    2.99528909f,
 };
 #endif
 

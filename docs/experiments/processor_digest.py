@@ -1,0 +1,39 @@
+"""Print a digest of every corrected range of the shipped models: equal on two processors if all bits are equal.
+
+    python docs/experiments/processor_digest.py RECORDING...
+
+Run it on both processors with the same recordings, and compare the lines. Nothing but the packages in
+`requirements/runtime.txt` is needed. A recording is any that `evaluate` reads; simulate it once and copy it, because
+the simulator itself uses functions (exp, log) that differ between processors.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from uwb_mitigation.mitigation import Mitigation, correct_batch
+from uwb_mitigation.model.bundle import load_bundle
+from uwb_mitigation.model.shipped import SHIPPED, shipped_model_path
+from uwb_mitigation.sources.opening import open_recording
+
+
+def main(recordings: list[Path]) -> None:
+    print(platform.machine(), file=sys.stderr)
+    for recording in recordings:
+        with open_recording(recording) as source:
+            measurements = [record.measurement for record in source]
+        for name in SHIPPED:
+            bundle = load_bundle(shipped_model_path(name))
+            corrected = correct_batch(Mitigation(bundle), measurements)
+            rows = np.array([(row.range_m, row.variance_m2, row.status.value) for row in corrected], float)
+            digest = hashlib.sha256(rows.astype("<f8").tobytes()).hexdigest()[:16]
+            print(f"{recording.name}: {name} {bundle.model_id:08x}: {len(rows)} ranges, {digest}")
+
+
+if __name__ == "__main__":
+    main([Path(word) for word in sys.argv[1:]])
