@@ -84,7 +84,10 @@ def test_the_command_writes_both_bundles(tmp_path: Path) -> None:
     assert made.quantised
     assert not floating.quantised
     assert made.preprocessing.scaling is Scaling.MAX
-    assert made.card.familiarity is None
+    familiarity = made.card.familiarity
+    assert familiarity is not None
+    assert not familiarity.needs_levels
+    assert familiarity.lead_level_db is not None
     result = json.loads((tmp_path / "a.json").read_text())
     assert result["model_id"] == made.model_id
     assert result["simulated"]
