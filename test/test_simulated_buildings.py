@@ -97,6 +97,19 @@ def test_a_block_holds_placements_of_its_buildings() -> None:
     )
 
 
+def test_open_sites_are_in_line_of_sight_and_some_antennas_are_tilted() -> None:
+    blocks = [block_of(7, number)[0] for number in range(60)]
+    crossings = {
+        kind: np.concatenate([block.links.path.crossings for block in blocks if block.kind == kind])
+        for kind in ("open", "flat")
+    }
+    assert np.mean(crossings["open"] == 0) > 0.5 > np.mean(crossings["flat"] == 0)
+    # In line of sight nothing but a tilted antenna weakens the direct path.
+    loss = [block.links.path.loss_db[block.links.path.crossings == 0] for block in blocks]
+    tilted = [values.max() > 0.0 for values in loss if len(values)]
+    assert 0.0 < np.mean(tilted) < 0.3
+
+
 @pytest.mark.parametrize("distance_m", [(0.0, 3.0), (3.0, 8.0), (12.0, 50.0)])
 def test_behind_obstacles_what_goes_around_comes_later_the_longer_the_way(
     distance_m: tuple[float, float],

@@ -85,9 +85,10 @@ class Band:
         return cls(*(float(np.float32(value)) for value in bounds))
 
 
-LEAD = Band(-1000.0, -16.0, 4.0)
-"""Band of `lead_level_db`. It is fixed, because a detector reports the first energy above its noise threshold: in the
-simulated buildings 99 % of the values are below -24 dB. Of windows that start 5 taps too late, 75 % are above -10 dB."""
+LEAD, LEAD_WITHOUT_LEVELS = Band(-1000.0, -16.0, 4.0), Band(-1000.0, -20.0, 4.0)
+"""Bands of `lead_level_db`. They are fixed, because a detector reports the first energy above its noise threshold: in
+the simulated buildings 99 % of the values are below -24 dB. Of windows that start 5 taps too late, 75 % are above
+-10 dB. Without levels no other feature detects them, so the band ends earlier."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +148,8 @@ class Familiarity:
             Band.of(column, widening) if is_known else None
             for column, is_known, widening in zip(values[rows].T[:-1], known[:-1], _WIDENINGS, strict=True)
         )
-        return cls(float(np.float32(known_offset_m)), *bands, lead_level_db=LEAD)
+        lead = LEAD if known[1:-1].any() else LEAD_WITHOUT_LEVELS
+        return cls(float(np.float32(known_offset_m)), *bands, lead_level_db=lead)
 
 
 def features(

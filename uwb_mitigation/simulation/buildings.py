@@ -65,13 +65,13 @@ class Kind:
 
 
 KINDS = (
-    Kind("flat", 0.5, (5.0, 14.0), (4.0, 10.0), (2.5, 5.0), ((RESIDENTIAL, 1.0),), 0.12),
+    Kind("flat", 0.55, (5.0, 14.0), (4.0, 10.0), (2.5, 5.0), ((RESIDENTIAL, 1.0),), 0.12),
     Kind("office", 0.2, (10.0, 30.0), (8.0, 18.0), (3.0, 7.0), ((RESIDENTIAL, 0.3), (OFFICE, 0.7)), 0.08),
     Kind("corridor", 0.1, (12.0, 40.0), (6.0, 14.0), (3.0, 6.0), ((RESIDENTIAL, 0.3), (OFFICE, 0.7)), 0.06),
     Kind("hall", 0.1, (10.0, 40.0), (8.0, 30.0), (10.0, 25.0), ((INDUSTRIAL, 1.0),), 0.06),
     Kind(
         "open",
-        0.1,
+        0.05,
         (5.0, 40.0),
         (4.0, 30.0),
         (60.0, 60.0),
@@ -102,14 +102,14 @@ GAIN_DB = (-6.0, 6.0)
 """Transmit power and both antennas, beyond those of the EVB1000: a DW1000's power is set in steps over 30 dB, and
 regulators bound its density; small antennas gain -2 to 3 dB."""
 
-WIDE_GAIN_SHARE, WIDE_GAIN_DB = 0.1, (-15.0, 15.0)
+WIDE_GAIN_SHARE, WIDE_GAIN_DB = 0.05, (-15.0, 15.0)
 """Share of blocks with a power amplifier, an external antenna or attenuation."""
 
-TILTED_SHARE, TILTED_LOSS_DB = 0.3, (2.0, 6.0)
+TILTED_SHARE, TILTED_LOSS_DB = 0.1, (2.0, 6.0)
 """Share of blocks whose antennas move or are tilted, as on drones: the direct path loses an exponentially distributed
 number of dB, with a mean between these bounds; reflections do not."""
 
-NOISE_FIGURE_DB = (7.0, 14.0)
+NOISE_FIGURE_DB = (8.0, 12.0)
 PREAMBLES = (128, 256, 512, 1024)
 DETECTION_SYMBOLS = 24
 """Spent on detecting the preamble, so that they are not accumulated (the logs: 1000 of 1024)."""

@@ -31,6 +31,11 @@ DAMAGED_SHARE = 0.05
 
 
 def vary(inputs: Tensor, generator: torch.Generator) -> Tensor:
+    """Inputs (n, K), scaled by the preamble count, with another channel and another receiver each."""
+    return vary_receiver(vary_channel(inputs, generator), generator)
+
+
+def vary_channel(inputs: Tensor, generator: torch.Generator) -> Tensor:
     """Inputs (n, K), scaled by the preamble count, each with a decay of its own, some louder."""
     n, samples = inputs.shape
     # The scaling is a square root of amplitudes.
@@ -39,10 +44,10 @@ def vary(inputs: Tensor, generator: torch.Generator) -> Tensor:
     is_louder = torch.rand(n, 1, generator=generator) < LOUDER_SHARE
     level_db = torch.where(is_louder, torch.rand(n, 1, generator=generator) * LOUDER_DB, torch.zeros(n, 1))
     louder: Tensor = varied * 10 ** (level_db / 40)
-    return _other_receiver(louder, generator)
+    return louder
 
 
-def _other_receiver(inputs: Tensor, generator: torch.Generator) -> Tensor:
+def vary_receiver(inputs: Tensor, generator: torch.Generator) -> Tensor:
     """Inputs (n, K) as receivers with another pulse, another detector, clipping or short windows report them."""
     n, samples = inputs.shape
 
