@@ -30,11 +30,6 @@ DAMAGED_SHARE = 0.05
 """Share of the inputs that are clipped at 40 % of their maximum or more, and share of those that end early."""
 
 
-def vary(inputs: Tensor, generator: torch.Generator) -> Tensor:
-    """Inputs (n, K), scaled by the preamble count, with another channel and another receiver each."""
-    return vary_receiver(vary_channel(inputs, generator), generator)
-
-
 def vary_channel(inputs: Tensor, generator: torch.Generator) -> Tensor:
     """Inputs (n, K), scaled by the preamble count, each with a decay of its own, some louder."""
     n, samples = inputs.shape

@@ -22,7 +22,7 @@ from uwb_mitigation.model.prior import LinePrior
 from uwb_mitigation.model.weights import FloatWeights, Int8Weights
 from uwb_mitigation.preprocessing import Preprocessing, Scaling
 from uwb_mitigation.simulation.buildings import PLACEMENTS
-from uwb_mitigation.training.augmentation import calibration_inputs, normalised, vary
+from uwb_mitigation.training.augmentation import calibration_inputs, normalised, vary_channel, vary_receiver
 from uwb_mitigation.training.cards import card_of, familiarity_of
 from uwb_mitigation.training.fitting import FitOptions, fit_varied
 from uwb_mitigation.training.quantization import quantize
@@ -83,9 +83,16 @@ def train(
 
     # Augmentation needs the levels, whatever of them the scaling leaves.
     leveled = Preprocessing(plan.samples)
-    world = building_dataset(plan.seed, plan.blocks, leveled, workers, count_block)
+    # Levels show which receivers and sites are out of distribution. Without levels, training has to contain them.
+    is_leveled = plan.scaling is Scaling.PREAMBLE
+    world = building_dataset(plan.seed, plan.blocks, leveled, workers, count_block, wide=not is_leveled)
     held_out = building_dataset(
-        plan.seed + HELD_OUT_SEED, plan.held_out_blocks, preprocessing, workers, count_block
+        plan.seed + HELD_OUT_SEED,
+        plan.held_out_blocks,
+        preprocessing,
+        workers,
+        count_block,
+        wide=not is_leveled,
     )
     epochs = 0
 
@@ -94,13 +101,14 @@ def train(
         epochs += 1
         on_share(0.2 + 0.75 * epochs / plan.fit.epochs, "training")
 
-    is_leveled = plan.scaling is Scaling.PREAMBLE
     options = replace(plan.fit, seed=plan.seed)
     network = fit_varied(
         Remnet(samples=plan.samples),
         world.inputs,
         world.error_m,
-        vary if is_leveled else lambda inputs, generator: normalised(vary(inputs, generator)),
+        vary_channel
+        if is_leveled
+        else lambda inputs, generator: normalised(vary_receiver(vary_channel(inputs, generator), generator)),
         options,
         count_epoch,
     )
