@@ -36,8 +36,8 @@ MOST = {
     (Scaling.PREAMBLE, "open hall"): (1.9, 1.65, 2.6),
     (Scaling.PREAMBLE, "drone room"): (1.4, 1.15, 1.25),
     (Scaling.PREAMBLE, "offices"): (1.1, 1.15, 1.1),
-    (Scaling.MAX, "open hall"): (1.25, 1.3, 5.0),
-    (Scaling.MAX, "drone room"): (1.1, 1.1, 1.35),
+    (Scaling.MAX, "open hall"): (1.3, 1.3, 5.0),
+    (Scaling.MAX, "drone room"): (1.15, 1.1, 1.35),
     (Scaling.MAX, "offices"): (1.02, 1.15, 1.1),
 }
 

@@ -139,9 +139,9 @@ class Familiarity:
         Raises:
             ModelError: no row has them all.
         """
-        finite = np.isfinite(values)
-        known = finite.any(axis=0)
-        rows = finite[:, known].all(axis=1)
+        finite: NDArray[np.bool_] = np.isfinite(values)
+        known: NDArray[np.bool_] = np.any(finite, axis=0)
+        rows: NDArray[np.bool_] = np.all(finite[:, known], axis=1)
         if not known.any() or not rows.any():
             raise ModelError("no measurement has all the features of familiarity")
         bands = (
@@ -149,7 +149,7 @@ class Familiarity:
             for column, is_known, widening in zip(values[rows].T[:-1], known[:-1], _WIDENINGS, strict=True)
         )
         lead = LEAD if known[1:-1].any() else LEAD_WITHOUT_LEVELS
-        return cls(float(np.float32(known_offset_m)), *bands, lead_level_db=lead)
+        return cls(float(np.float32(known_offset_m)), *(*bands, lead))
 
 
 def features(

@@ -20,6 +20,9 @@ LOUDER_SHARE, LOUDER_DB = 0.15, 22.0
 """So many of the inputs are made louder by up to so much, which no DW1000 could be: its gain control compresses. A
 model that never met such levels predicts errors of metres for them."""
 
+OTHER_RECEIVERS = 0.5
+"""Share of the inputs that are changed to those of another receiver."""
+
 PULSE = (-0.08, 0.15)
 """Bounds of the share of a tap's amplitude that each neighbour receives: receivers differ in bandwidth."""
 
@@ -27,7 +30,7 @@ EARLY_TAPS = 0.7
 """First-path detectors differ by up to so many taps in either direction."""
 
 DAMAGED_SHARE = 0.05
-"""Share of the inputs that are clipped at 40 % of their maximum or more, and share of those that end early."""
+"""Share of these inputs that are clipped at 40 % of their maximum or more, and share of those that end early."""
 
 
 def vary_channel(inputs: Tensor, generator: torch.Generator) -> Tensor:
@@ -61,8 +64,9 @@ def vary_receiver(inputs: Tensor, generator: torch.Generator) -> Tensor:
     limit = torch.where(uniform(0, 1) < DAMAGED_SHARE, uniform(0.4, 1.0), torch.ones(n, 1))
     clipped = torch.minimum(spread.clamp(min=0), limit * spread.amax(1, keepdim=True))
     end = torch.where(uniform(0, 1) < DAMAGED_SHARE, uniform(0.2, 1.0) * samples, torch.full((n, 1), samples))
-    received: Tensor = torch.where(torch.arange(samples) < end, clipped, torch.zeros(())).sqrt()
-    return received
+    received = torch.where(torch.arange(samples) < end, clipped, torch.zeros(())).sqrt()
+    either: Tensor = torch.where(uniform(0, 1) < OTHER_RECEIVERS, received, inputs)
+    return either
 
 
 def normalised(inputs: Tensor) -> Tensor:
