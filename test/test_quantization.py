@@ -89,6 +89,17 @@ def test_a_network_with_dead_filters_can_be_quantised():
     assert np.allclose(IntegerNetwork(integers).predict_m(inputs), expected, atol=1e-3)
 
 
+@pytest.mark.parametrize("layer", ["module1.residual", "module2.reduce"])
+def test_a_layer_with_tiny_weights_can_be_quantised_for_all_processors(layer):
+    weights = random_weights(Remnet(samples=8))
+    weights.weight[layer][:] *= np.float32(1e-7)
+    weights.bias[layer][:] *= np.float32(1e-7)
+    inputs = windows(50, 8)
+    computed = IntegerNetwork(quantize(weights, inputs)).predict_m(inputs)
+    expected = floating.predict_m(weights, inputs)
+    assert np.abs(computed - expected).mean() < 0.25 * expected.std()
+
+
 def test_operands_never_outweigh_their_sum():
     integers = quantize(random_weights(SHAPE), windows(30, 32), exact=False)
     for total in ("module1.sum", "module1", "module3"):

@@ -29,6 +29,9 @@ WEIGHT_LIMIT = 63
 MSE = None
 """In place of a percentile: of each activation, the scale with the least mean squared rounding error."""
 
+LEAST_RATIO = 2.0**-12
+"""Of the scales of a sum's operands: below 2^-14 of the result's scale, ONNX Runtime uses another formula on ARM."""
+
 CALIBRATION_PER_CONFIGURATION = 40
 """Inputs of each configuration that the scales of the activations are found from."""
 
@@ -176,8 +179,8 @@ def _activation_scales(
 ) -> dict[str, np.float32]:
     """Scales at which 255 stands for the peaks, or for more where integer arithmetic asks for it.
 
-    It asks that a convolution's output has steps of at least 16 of its accumulator's, and that the scales of a
-    sum's operands add up to at most twice its own. Only a tensor that is hardly ever active, or operands
+    It asks that a convolution's output has steps of at least 16 of its accumulator's, that the scales of a
+    sum's operands add up to at most twice its own, and that their ratio is at least `LEAST_RATIO`. Only a tensor that is hardly ever active, or operands
     that never peak together, are touched by it.
     """
     scale: dict[str, np.float32] = {}
@@ -187,6 +190,8 @@ def _activation_scales(
             wanted = max(wanted, 17 * float(scale[reads[tensor]]) * float(weight_scale[tensor].max()))
         elif tensor != "input":
             first, second = sum_operands(tensor)
+            least = LEAST_RATIO * float(max(scale[first], scale[second]))
+            scale |= {name: np.float32(max(float(scale[name]), least)) for name in (first, second)}
             wanted = max(wanted, 0.501 * (float(scale[first]) + float(scale[second])))
         scale[tensor] = np.float32(wanted)
     return scale
