@@ -175,7 +175,7 @@ def test_what_is_strange_to_the_model_is_graded_as_by_the_mitigator(
         assert np.array_equal(bits(np.array(computed[:3])), bits(np.array(values)))
         variances.add(expected.variance_m2)
         statuses.add(expected.status)
-    assert len(variances) > 100
+    assert len(variances) > (100 if scaling is Scaling.PREAMBLE else 50)
     assert statuses >= {Status.OK, Status.OUT_OF_DISTRIBUTION}
 
 
