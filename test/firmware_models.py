@@ -58,8 +58,17 @@ def mlp_bundle(folder: Path) -> Bundle:
     return save_bundle(folder / "mlp.onnx", graph.int8_model(weights), card)
 
 
-def choosy_bundle(folder: Path, samples: int = 32) -> Bundle:
+def choosy_bundle(folder: Path, samples: int = 32, scaling: Scaling = Scaling.PREAMBLE) -> Bundle:
     """The same with a familiarity that finds random measurements familiar, strange in part, and wholly strange."""
+    lead = Band(-40.0, -12.0, 10.0)
+    if scaling is Scaling.MAX:
+        return exact_bundle(
+            folder,
+            samples,
+            variance_per_m2=0.0078125,
+            familiarity=Familiarity(0.125, Band(0.5, 3.0, 2.0), lead_level_db=lead),
+            preprocessing=Preprocessing(samples, scaling),
+        )
     familiarity = Familiarity(
         0.125,
         Band(0.5, 3.0, 2.0),
@@ -67,6 +76,7 @@ def choosy_bundle(folder: Path, samples: int = 32) -> Bundle:
         Band(-5.0, 8.0, 20.0),
         Band(-10.0, 200.0, 50.0),
         Band(20.0, 101.0, 70.0),
+        lead,
     )
     return exact_bundle(folder, samples, variance_per_m2=0.0078125, familiarity=familiarity)
 

@@ -14,12 +14,15 @@ import pytest
 from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.errors import DatasetError, ParameterError
 from uwb_mitigation.evaluation.radio_offsets import FoundOffset, find_offset
-from uwb_mitigation.measurement import Record
+from uwb_mitigation.measurement import Encoding, Record
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.shipped import default_model_path
 from uwb_mitigation.offsets import Offsets, parse_offsets
+from uwb_mitigation.preprocessing import Scaling
 from uwb_mitigation.sources.simulated import SimulatedSource
+
+NO_SAMPLES = np.empty(0, np.int16)
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +56,22 @@ def weaker_first_path(records: list[Record], by_db: float) -> Iterator[Record]:
         yield replace(record, measurement=replace(record.measurement, cir=cir))
 
 
+def without_levels(records: list[Record]) -> Iterator[Record]:
+    """What boards report that send amplitudes only."""
+    for record in records:
+        cir = record.measurement.cir
+        magnitude = np.hypot(*cir.samples.reshape(-1, 2).astype(float).T).clip(max=32000).astype(np.int16)
+        cir = replace(
+            cir,
+            samples=magnitude,
+            encoding=Encoding.MAGNITUDE,
+            preamble_count=0,
+            rx_power_dbm=float("nan"),
+            first_path_power_dbm=float("nan"),
+        )
+        yield replace(record, measurement=replace(record.measurement, cir=cir))
+
+
 def at_one_place(found: FoundOffset) -> set[str]:
     return {one.placement for one in found.placements if not one.refused}
 
@@ -70,6 +89,24 @@ def test_an_offset_that_was_added_is_found(universal: Mitigation, direct: list[R
     assert find_offset(told, longer(direct, 0.625)).offset_m == pytest.approx(after.offset_m, abs=0.02)
 
 
+def test_without_receive_levels_line_of_sight_is_seen_in_the_cir(direct: list[Record]):
+    amplitude = Mitigation(load_bundle(default_model_path(Scaling.MAX)))
+    found = find_offset(amplitude, without_levels(direct))
+    assert found.offset_m == pytest.approx(0.22, abs=3.0 * found.sd_m)
+    assert len(at_one_place(found)) > 1
+    reported = find_offset(amplitude, direct)
+    gaps = {one.placement: one.power_gap_db for one in reported.placements}
+    for one in found.placements:
+        assert one.power_gap_db == pytest.approx(gaps[one.placement], abs=1.0)
+    blocked = [
+        record
+        for record in SimulatedSource(seed=11, count=1500)
+        if record.truth is not None and record.truth.label == "NDP NLOS"
+    ]
+    with pytest.raises(DatasetError, match="not line of sight"):
+        find_offset(amplitude, without_levels(blocked[:1] * 20))
+
+
 def test_ranges_of_one_place_leave_what_the_place_does(universal: Mitigation, direct: list[Record]):
     one = direct[0]
     found = find_offset(universal, [one] * 50, one.truth.range_m if one.truth else None)
@@ -80,8 +117,15 @@ def test_ranges_of_one_place_leave_what_the_place_does(universal: Mitigation, di
 def test_what_is_not_line_of_sight_is_refused_with_what_shows_it(universal: Mitigation, direct: list[Record]):
     with pytest.raises(DatasetError, match=r"not line of sight: the first path is \d+\.\d dB below"):
         find_offset(universal, weaker_first_path(direct, 9.0), 3.0)
-    with pytest.raises(DatasetError, match="tells no power of the first path"):
-        find_offset(universal, weaker_first_path(direct, float("nan")), 3.0)
+    without_cir = [
+        replace(
+            record,
+            measurement=replace(record.measurement, cir=replace(record.measurement.cir, samples=NO_SAMPLES)),
+        )
+        for record in weaker_first_path(direct, float("nan"))
+    ]
+    with pytest.raises(DatasetError, match="has the power of the first path"):
+        find_offset(universal, without_cir, 3.0)
     with pytest.raises(DatasetError, match="m off: is the distance in metres"):
         find_offset(universal, longer(direct, 20.0), 3.0)
     with pytest.raises(DatasetError, match="5 ranges look like line of sight"):

@@ -9,7 +9,7 @@ from uwb_mitigation.dataset import Dataset, build_dataset
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.preprocessing import Preprocessing
 from uwb_mitigation.simulation import buildings
-from uwb_mitigation.simulation.buildings import BUILDINGS, KINDS, PLACEMENTS, RADIO, block_of, draw_plan
+from uwb_mitigation.simulation.buildings import BUILDINGS, PLACEMENTS, RADIO, WIDE_KINDS, block_of, draw_plan
 from uwb_mitigation.simulation.channel import Multipath
 from uwb_mitigation.simulation.radio import Boards, Reception
 from uwb_mitigation.sources.simulated_buildings import SimulatedBuildings
@@ -71,7 +71,7 @@ def test_within_a_placement_the_error_is_nearly_constant_and_placements_differ()
     assert np.std([group.mean() for group in groups]) > 0.2
 
 
-@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
+@pytest.mark.parametrize("kind", WIDE_KINDS, ids=lambda kind: kind.name)
 def test_plans_hold_what_their_kind_says(kind: buildings.Kind) -> None:
     rng = np.random.default_rng(0)
     plans = [draw_plan(kind, rng) for _ in range(30)]
@@ -83,7 +83,7 @@ def test_plans_hold_what_their_kind_says(kind: buildings.Kind) -> None:
             ends = np.array([wall.start, wall.end])
             assert (ends >= -1e-9).all()
             assert (ends <= np.add(plan.size, 1e-9)).all()
-    if kind.name != "hall":
+    if kind.name not in ("hall", "open"):
         assert np.mean([len(plan.walls) for plan in plans]) > 3
     assert any(plan.screens for plan in plans)
 
@@ -95,6 +95,19 @@ def test_a_block_holds_placements_of_its_buildings() -> None:
     assert set(np.unique(block.boards.preamble_symbols + buildings.DETECTION_SYMBOLS)) == set(
         buildings.PREAMBLES
     )
+
+
+def test_open_sites_are_in_line_of_sight_and_some_antennas_are_tilted() -> None:
+    blocks = [block_of(7, number, wide=True)[0] for number in range(40)]
+    crossings = {
+        kind: np.concatenate([block.links.path.crossings for block in blocks if block.kind == kind])
+        for kind in ("open", "flat")
+    }
+    assert np.mean(crossings["open"] == 0) >= 0.5 > 0.4 > np.mean(crossings["flat"] == 0)
+    # In line of sight nothing but a tilted antenna weakens the direct path.
+    loss = [block.links.path.loss_db[block.links.path.crossings == 0] for block in blocks]
+    tilted = [values.max() > 0.0 for values in loss if len(values)]
+    assert 0.1 < np.mean(tilted) < 0.5
 
 
 @pytest.mark.parametrize("distance_m", [(0.0, 3.0), (3.0, 8.0), (12.0, 50.0)])

@@ -16,7 +16,7 @@ from uwb_mitigation.mitigation import Mitigation, correct_batch
 from uwb_mitigation.model.architecture import Remnet
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.familiarity import Band, Familiarity, Strangeness, features
-from uwb_mitigation.preprocessing import Preprocessing
+from uwb_mitigation.preprocessing import Preprocessing, Scaling
 
 WIDE = Band(-1000.0, 1000.0, 1.0)
 SHAPE = Remnet(samples=157)
@@ -24,7 +24,15 @@ SHAPE = Remnet(samples=157)
 
 def bands(**changes: Band) -> Familiarity:
     every = dict.fromkeys(
-        ("range_m", "power_at_1m_dbm", "power_gap_db", "cir_level_db", "first_path_level_db"), WIDE
+        (
+            "range_m",
+            "power_at_1m_dbm",
+            "power_gap_db",
+            "cir_level_db",
+            "first_path_level_db",
+            "lead_level_db",
+        ),
+        WIDE,
     )
     return Familiarity(0.25, **(every | changes))
 
@@ -44,19 +52,34 @@ def test_the_features_are_levels_in_decibels():
     window = np.zeros((1, 157), np.float32)
     window[0, 6:9] = (0.5, 1.0, 0.75)
     window[0, 50] = 0.9
-    found = features(window, *(np.float32([value]) for value in (3.0, -80.0, -85.0)))
+    found = features(window, Scaling.PREAMBLE, *(np.float32([value]) for value in (3.0, -80.0, -85.0)))
     fourth = window.astype(float) ** 4
     assert found[0, 0] == 3.0
     assert found[0, 1] == pytest.approx(-80.0 + 20 * math.log10(3.0), abs=0.05)
     assert found[0, 2] == 5.0
     assert found[0, 3] == pytest.approx(10 * math.log10(fourth.sum()) + 80, abs=0.05)
     assert found[0, 4] == pytest.approx(10 * math.log10(fourth[0, 6:9].sum()) + 85, abs=0.05)
+    assert found[0, 5] < -200.0
+
+
+@pytest.mark.parametrize("scaling", Scaling)
+def test_energy_before_the_first_path_needs_no_level(scaling):
+    amplitude = np.zeros((1, 157), np.float32)
+    amplitude[0, :3], amplitude[0, 6:9] = 0.125, 0.25
+    window = np.sqrt(amplitude) if scaling is Scaling.PREAMBLE else amplitude
+    unknown = np.float32([math.nan])
+    found = features(window, scaling, np.float32([3.0]), unknown, unknown)
+    assert found[0, 5] == pytest.approx(10 * math.log10(0.2), abs=0.06)
+    only = Familiarity(0.0, None, lead_level_db=Band(-50.0, -10.0, 6.0))
+    assert Strangeness(only.bands).score(found) == pytest.approx([0.5], abs=0.02)
 
 
 @pytest.mark.parametrize("level", [0.0, 1e-20, 1e16])
 def test_a_level_is_finite_whatever_the_window_holds(level):
     window = np.full((1, 157), level, np.float32)
-    assert np.isfinite(features(window, *(np.float32([value]) for value in (3.0, -80.0, -85.0)))).all()
+    assert np.isfinite(
+        features(window, Scaling.PREAMBLE, *(np.float32([value]) for value in (3.0, -80.0, -85.0)))
+    ).all()
 
 
 def test_distance_alone_is_not_strange_and_a_weaker_radio_is(tmp_path):
@@ -71,7 +94,7 @@ def test_distance_alone_is_not_strange_and_a_weaker_radio_is(tmp_path):
 def test_the_score_is_the_largest_excess_in_margins():
     scale = Strangeness(bands(range_m=Band(1.0, 6.0, 2.0), power_at_1m_dbm=Band(-90.0, -80.0, 4.0)).bands)
     rows = [(3.0, -85.0), (7.0, -85.0), (7.0, -77.0), (3.0, -96.0), (math.nan, -85.0)]
-    values = np.array([(range_m, power, 0.0, 0.0, 0.0) for range_m, power in rows], np.float32)
+    values = np.array([(range_m, power, 0.0, 0.0, 0.0, 0.0) for range_m, power in rows], np.float32)
     assert scale.score(values).tolist()[1:4] == [0.5, 0.75, 1.5]
     assert scale.score(values)[0] <= 0
     assert np.isnan(scale.score(values)[4])
@@ -136,7 +159,9 @@ def test_a_card_with_an_impossible_variance_is_refused(tmp_path, change):
 def test_familiarity_of_measurements_covers_them():
     windows = np.random.default_rng(0).uniform(0.1, 1, (50, 157)).astype(np.float32)
     power = np.linspace(-95, -80, 50, dtype=np.float32)
-    values = features(windows, np.linspace(1, 6, 50, dtype=np.float32), power, power - np.float32(5))
+    range_m = np.linspace(1, 6, 50, dtype=np.float32)
+    windows[:, :3] /= 16
+    values = features(windows, Scaling.PREAMBLE, range_m, power, power - np.float32(5))
     found = Familiarity.of(0.3, values)
     assert (Strangeness(found.bands).score(values) <= 0).all()
     assert replace(found, known_offset_m=0.0).bands == found.bands
@@ -146,7 +171,7 @@ def test_the_window_that_is_scored_is_the_networks_input(tmp_path):
     subject = measurement()
     window = np.empty(157, np.float32)
     assert Preprocessing(157).apply(subject.cir, window) is None
-    (row,) = features(window[None], *(np.float32([v]) for v in (3.0, -82.0, -88.0)))
+    (row,) = features(window[None], Scaling.PREAMBLE, *(np.float32([v]) for v in (3.0, -82.0, -88.0)))
     level = float(row[3])
     edge = Band(float(np.float32(level + 1)), 500.0, 2.0)
     result = mitigation(tmp_path, cir_level_db=edge).correct(subject)

@@ -52,7 +52,7 @@ def test_it_is_graded_by_condition_in_another_world(small: Universal) -> None:
 
 def test_decays_vary_behind_the_first_path_alone_and_some_inputs_are_louder() -> None:
     inputs = torch.ones(4000, 157) * torch.linspace(1.0, 0.1, 157)
-    varied = augmentation.vary(inputs, torch.Generator().manual_seed(0)).numpy()
+    varied = augmentation.vary_channel(inputs, torch.Generator().manual_seed(0)).numpy()
     gain = varied[:, 0]
     assert gain.min() == 1.0
     assert np.mean(gain > 1.0) == pytest.approx(augmentation.LOUDER_SHARE, abs=0.03)
@@ -65,6 +65,22 @@ def test_decays_vary_behind_the_first_path_alone_and_some_inputs_are_louder() ->
     decay = 2.0 * np.log(varied[:, first + 100] / gain / inputs[0, first + 100].item())
     assert np.mean(decay) == pytest.approx(0.0, abs=0.05)
     assert np.std(decay) == pytest.approx(augmentation.DECAY_NEPERS, rel=0.05)
+
+
+def test_receivers_vary_in_pulse_first_path_clipping_and_length() -> None:
+    inputs = torch.zeros(4000, 157)
+    inputs[:, 7], inputs[:, 100] = 1.0, 0.5
+    varied = augmentation.vary_receiver(inputs, torch.Generator().manual_seed(0)).numpy()
+    assert np.isfinite(varied).all()
+    assert varied.min() == 0.0
+    ends_early = varied[:, 98:103].max(axis=1) == 0.0
+    share = augmentation.OTHER_RECEIVERS
+    assert 0.4 < ends_early.mean() / (share * augmentation.DAMAGED_SHARE) < 1.3
+    amplitude = varied[:, 5:10] ** 2
+    place = (amplitude @ np.arange(5, 10)) / amplitude.sum(axis=1)
+    assert np.abs(place - 7.0).max() <= augmentation.EARLY_TAPS + 0.1
+    assert np.mean(np.abs(place - 7.0) > 1e-6) == pytest.approx(share, abs=0.05)
+    assert np.std(place) == pytest.approx(augmentation.EARLY_TAPS * np.sqrt(share / 3.0), rel=0.15)
 
 
 def test_int8_is_calibrated_on_louder_inputs_too_unless_levels_are_left_out() -> None:
@@ -84,7 +100,10 @@ def test_the_command_writes_both_bundles(tmp_path: Path) -> None:
     assert made.quantised
     assert not floating.quantised
     assert made.preprocessing.scaling is Scaling.MAX
-    assert made.card.familiarity is None
+    familiarity = made.card.familiarity
+    assert familiarity is not None
+    assert not familiarity.needs_levels
+    assert familiarity.lead_level_db is not None
     result = json.loads((tmp_path / "a.json").read_text())
     assert result["model_id"] == made.model_id
     assert result["simulated"]

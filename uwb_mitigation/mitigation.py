@@ -43,6 +43,7 @@ class Grader:
         self._variance_uncorrected = np.float32(card.variance_uncorrected_m2)
         familiarity = card.familiarity
         self._strangeness = None if familiarity is None else Strangeness(familiarity.bands)
+        self._scaling = card.preprocessing.scaling
         self._known_offset = np.float32(0.0 if familiarity is None else familiarity.known_offset_m)
 
     @property
@@ -65,7 +66,8 @@ class Grader:
         """How strange n measurements are to the bundle, float32 (n,); 0 where it does not say what is familiar."""
         if self._strangeness is None:
             return np.zeros(len(windows), np.float32)
-        return self._strangeness.score(features(windows, range_m, rx_power_dbm, first_path_power_dbm))
+        values = features(windows, self._scaling, range_m, rx_power_dbm, first_path_power_dbm)
+        return self._strangeness.score(values)
 
     def grade(
         self, predicted: NDArray[np.float32], score: NDArray[np.float32]

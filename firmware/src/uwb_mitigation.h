@@ -83,9 +83,9 @@ typedef struct {
     uint16_t outputs;
 } uwb_dense_layer;
 
-enum { UWB_FEATURES = 5 };
+enum { UWB_FEATURES = 6 };
 
-/* Values from low to high are familiar; 1 / per_unit beyond them they are wholly strange. */
+/* Values from low to high are in distribution; 1 / per_unit beyond them the score is 1. per_unit 0: not checked. */
 typedef struct {
     float low;
     float high;

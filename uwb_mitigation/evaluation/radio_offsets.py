@@ -17,10 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError, ParameterError
-from uwb_mitigation.measurement import LINE_OF_SIGHT_DB, Record, Status, format_id
+from uwb_mitigation.measurement import LINE_OF_SIGHT_DB, Cir, Record, Status, format_id
 from uwb_mitigation.mitigation import Mitigation, correct_batch
+from uwb_mitigation.model.familiarity import FIRST_PATH_TAPS
 from uwb_mitigation.model.prior import LinePrior
 from uwb_mitigation.offsets import MAX_OFFSET_M, Offsets
+from uwb_mitigation.preprocessing import Preprocessing, Scaling
 
 PLACEMENT_SD_M = 0.15
 """Of the offset found at one placement, beside noise. The spread (1.48 x median absolute deviation) between the seven
@@ -54,7 +56,7 @@ class PlacementOffset:
         ranges: that it counts on.
         offset_m, sd_m: of its ranges, by medians; NaN where refused.
         noise_sd_m: the part of `sd_m` that more ranges make smaller.
-        power_gap_db: receive level less first-path level, median; NaN = unknown.
+        power_gap_db: receive level less first-path level, median, as reported or from the CIR; NaN = unknown.
         predicted_m: the model's predicted error, median; NaN without any.
         refused: why it does not count; empty = it does.
     """
@@ -147,6 +149,7 @@ def find_offset(
         DatasetError: nothing looks like line of sight, or there is no truth.
     """
     groups: dict[tuple[int, int, str], _Gathered] = {}
+    preprocessing = Preprocessing(mitigation.bundle.preprocessing.samples, Scaling.MAX)
     without_truth = 0
     stream = iter(records)
     while batch := list(islice(stream, _BATCH)):
@@ -167,7 +170,7 @@ def find_offset(
                 continue
             placement = truth.configuration if truth is not None and distance_m is None else ""
             found = groups.setdefault((measurement.tag_id, measurement.anchor_id, placement), _Gathered())
-            found.gap_db.append(measurement.cir.power_gap_db)
+            found.gap_db.append(_power_gap_db(measurement.cir, preprocessing))
             predicted = math.nan
             if result.status is Status.OK:
                 predicted = result.correction_m - mitigation.offsets.of(
@@ -193,6 +196,16 @@ def find_offset(
     return _together(placements, mitigation.bundle.model_id)
 
 
+def _power_gap_db(cir: Cir, preprocessing: Preprocessing) -> float:
+    """Receive level less first-path level, dB; from the CIR if the radio does not report them; NaN if neither has them."""
+    window = np.empty(preprocessing.samples, np.float32)
+    if math.isfinite(cir.power_gap_db) or preprocessing.apply(cir, window) is not None:
+        return cir.power_gap_db
+    energy = window * window
+    first_path = max(float(energy[FIRST_PATH_TAPS].sum()), 1e-12)
+    return 10.0 * math.log10(float(energy.sum()) / first_path)
+
+
 def _judge(
     tag_id: int, anchor_id: int, placement: str, found: _Gathered, largest_m: float
 ) -> PlacementOffset:
@@ -207,7 +220,7 @@ def _judge(
     median_predicted = float(np.median(predicted[judged])) if judged.any() else math.nan
     refused = ""
     if 2 * known.sum() < n:
-        refused = "the radio tells no power of the first path: nothing shows line of sight"
+        refused = "neither the radio nor the CIR has the power of the first path: nothing shows line of sight"
     elif 2 * direct.sum() < known.sum():
         refused = (
             f"not line of sight: the first path is {median_gap:.1f} dB below the receive level "

@@ -110,6 +110,8 @@ def _mlp(network: PackedNetwork) -> Iterable[str]:
 def _familiarity(familiarity: Familiarity) -> str:
     bands = "".join(
         f"    {{{number(band.low)}, {number(band.high)}, {number(np.float32(1) / np.float32(band.margin))}}},\n"
+        if band
+        else "    {0.0f, 0.0f, 0.0f},\n"
         for band in familiarity.bands
     )
     offset = number(familiarity.known_offset_m)

@@ -109,7 +109,11 @@ class Card:
             raise ModelError(f"variance_per_m2 = {self.variance_per_m2}", valid="0 or more")
         if not 1.0 <= self.interval95_sigmas <= 1e3:
             raise ModelError(f"interval95_sigmas = {self.interval95_sigmas}", valid="1 to 1000")
-        if self.familiarity is not None and self.preprocessing.scaling is not Scaling.PREAMBLE:
+        if (
+            self.familiarity is not None
+            and self.familiarity.needs_levels
+            and self.preprocessing.scaling is not Scaling.PREAMBLE
+        ):
             raise ModelError("familiarity of windows without level", valid="the scaling preamble")
         if self.correction_limits_m[0] >= self.correction_limits_m[1]:
             raise ModelError(f"correction_limits_m = {self.correction_limits_m}", valid="low, high")
@@ -278,7 +282,7 @@ def _familiarity(metadata: dict[str, Any] | None) -> Familiarity | None:
         return None
     bands = dict(metadata)
     offset = float(bands.pop("known_offset_m"))
-    return Familiarity(offset, **{name: Band(**band) for name, band in bands.items()})
+    return Familiarity(offset, **{name: Band(**band) if band else None for name, band in bands.items()})
 
 
 def _architecture_metadata(architecture: Architecture) -> dict[str, Any]:

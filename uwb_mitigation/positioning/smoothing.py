@@ -65,7 +65,7 @@ def smooth(
     later = later[0][backwards] @ flip, flip @ later[1][backwards] @ flip
     state, covariance, spread = _fused(_at(live, stamp_ns), later)
     # Without a position of either filter the batch smoother's choice among several optima is arbitrary.
-    found: NDArray[np.bool_] = np.isfinite(state).all(axis=1)
+    found = np.asarray(np.isfinite(state).all(axis=1), np.bool_)
     try:
         batch = Smoother(anchors, model, ranges, height=height, heights=heights).fit(live).track
     except DatasetError:

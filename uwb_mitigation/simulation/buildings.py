@@ -7,7 +7,7 @@ The chip is the same everywhere: pulse, detector and compression are those of `s
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from uwb_mitigation.simulation.channel import (
     INDUSTRIAL_NLOS,
     OFFICE_LOS,
     OFFICE_NLOS,
+    OUTDOOR_LOS,
     PATTERN_LOSS_DB,
     RESIDENTIAL_LOS,
     RESIDENTIAL_NLOS,
@@ -40,6 +41,7 @@ from uwb_mitigation.simulation.scene import (
 RESIDENTIAL: Environments = (RESIDENTIAL_LOS, RESIDENTIAL_NLOS)
 OFFICE: Environments = (OFFICE_LOS, OFFICE_NLOS)
 INDUSTRIAL: Environments = (INDUSTRIAL_LOS, INDUSTRIAL_NLOS)
+OUTDOOR: Environments = (OUTDOOR_LOS, RESIDENTIAL_NLOS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +71,20 @@ KINDS = (
     Kind("hall", 0.1, (10.0, 40.0), (8.0, 30.0), (10.0, 25.0), ((INDUSTRIAL, 1.0),), 0.06),
 )
 
+WIDE_KINDS = (
+    *(replace(kind, share=share) for kind, share in zip(KINDS, (0.5, 0.2, 0.1, 0.1), strict=True)),
+    Kind(
+        "open",
+        0.1,
+        (5.0, 40.0),
+        (4.0, 30.0),
+        (60.0, 60.0),
+        ((RESIDENTIAL, 0.35), (OFFICE, 0.25), (INDUSTRIAL, 0.2), (OUTDOOR, 0.2)),
+        0.02,
+    ),
+)
+"""Open sites have no inner walls: laboratories, arenas, halls, and places outdoors. Half of the placements or more are LOS."""
+
 HEAVY = ((CONCRETE, (0.15, 0.40)), (BRICK, (0.20, 0.50)))
 LIGHT = ((PLASTERBOARD, (0.02, 0.05)), (WOOD, (0.03, 0.06)), (GLASS, (0.006, 0.02)))
 """Materials of ITU-R P.2040-1 with bounds of their thickness, m: of load-bearing walls, and of partitions."""
@@ -90,7 +106,14 @@ GAIN_DB = (-6.0, 6.0)
 """Transmit power and both antennas, beyond those of the EVB1000: a DW1000's power is set in steps over 30 dB, and
 regulators bound its density; small antennas gain -2 to 3 dB."""
 
-NOISE_FIGURE_DB = (8.0, 12.0)
+WIDE_GAIN_SHARE, WIDE_GAIN_DB = 0.1, (-15.0, 15.0)
+"""Share of blocks with a power amplifier, an external antenna or attenuation."""
+
+TILTED_SHARE, TILTED_LOSS_DB = 0.3, (2.0, 6.0)
+"""Share of blocks whose antennas move or are tilted, as on drones: the direct path loses an exponentially distributed
+number of dB, with a mean between these bounds; reflections do not."""
+
+NOISE_FIGURE_DB, WIDE_NOISE_FIGURE_DB = (8.0, 12.0), (7.0, 14.0)
 PREAMBLES = (128, 256, 512, 1024)
 DETECTION_SYMBOLS = 24
 """Spent on detecting the preamble, so that they are not accumulated (the logs: 1000 of 1024)."""
@@ -181,11 +204,12 @@ def _screen(name: str, length_m: float, size: tuple[float, float], rng: np.rando
     return Screen(name, (x - half[0], y - half[1]), (x + half[0], y + half[1]))
 
 
-def draw_boards(n: int, rng: np.random.Generator) -> Boards:
+def draw_boards(n: int, rng: np.random.Generator, *, wide: bool = False) -> Boards:
     """n pairs of boards: transmit power and antennas, noise, preamble length."""
+    gain_db = WIDE_GAIN_DB if wide and rng.random() < WIDE_GAIN_SHARE else GAIN_DB
     return Boards(
-        rng.uniform(*GAIN_DB, n),
-        rng.uniform(*NOISE_FIGURE_DB, n),
+        rng.uniform(*gain_db, n),
+        rng.uniform(*(WIDE_NOISE_FIGURE_DB if wide else NOISE_FIGURE_DB), n),
         rng.choice(np.array(PREAMBLES, np.float64), n) - DETECTION_SYMBOLS,
     )
 
@@ -205,16 +229,20 @@ class Block:
         return f"simulated buildings seed {seed}/{self.kind} {building}/placement {number * PLACEMENTS + placement}"
 
 
-def block_of(seed: int, number: int) -> tuple[Block, np.random.Generator]:
+def block_of(seed: int, number: int, *, wide: bool = False) -> tuple[Block, np.random.Generator]:
     """A block of `PLACEMENTS` placements of one kind of building, and the generator that fading and noise are to be
     drawn from: about a third each in line of sight, behind obstacles, and so far behind them that the direct path
     is lost.
 
     Sixteen times as many are drawn, and of each condition as many kept as it takes; what would be too weak to be
     received is kept only where there is nothing else.
+
+    Args:
+        wide: also open sites, tilted antennas, and wider gains and noise figures.
     """
     rng = np.random.default_rng([seed, number])
-    kind = KINDS[int(rng.choice(len(KINDS), p=[kind.share for kind in KINDS]))]
+    kinds = WIDE_KINDS if wide else KINDS
+    kind = kinds[int(rng.choice(len(kinds), p=[kind.share for kind in kinds]))]
     pairs, shares = zip(*kind.environments, strict=True)
     environments = pairs[int(rng.choice(len(pairs), p=shares))]
     each = CANDIDATES * PLACEMENTS // BUILDINGS
@@ -224,7 +252,10 @@ def block_of(seed: int, number: int) -> tuple[Block, np.random.Generator]:
         [plan.direct_path(anchor, tag) for plan, (anchor, tag) in zip(plans, places, strict=True)]
     )
     anchor, tag = (np.concatenate(ends) for ends in zip(*places, strict=True))
-    boards = draw_boards(len(anchor), rng)
+    boards = draw_boards(len(anchor), rng, wide=wide)
+    if wide and rng.random() < TILTED_SHARE:
+        loss_db = rng.exponential(rng.uniform(*TILTED_LOSS_DB), len(anchor))
+        path = replace(path, loss_db=path.loss_db + loss_db)
     chosen = _balanced(_conditions(environments, anchor, tag, path, boards), PLACEMENTS, rng)
     anchor, tag = anchor[chosen], tag[chosen]
     later = np.minimum(np.hypot(*(tag - anchor).T) / DETOUR_M, DETOUR_MOST)

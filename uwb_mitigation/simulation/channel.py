@@ -197,6 +197,12 @@ INDUSTRIAL_NLOS = Environment(
 )
 
 
+# The same report's outdoor environment (CM5), with fewer clusters than its 13.6, because `MAX_CLUSTERS` limits them.
+OUTDOOR_LOS = Environment(
+    "outdoor LOS", 45.6, 1.76, 0.83, 0.12, 6.0, 0.0048, (0.27, 2.41), 0.0078, 31.7, 3.7, 3.0, 0.77, 0.78, 0.0
+)
+
+
 @dataclass(frozen=True, slots=True)
 class DiffuseField:
     """Where the rays of n placements lie and what they carry on average: it changes over metres.

@@ -20,8 +20,20 @@ LOUDER_SHARE, LOUDER_DB = 0.15, 22.0
 """So many of the inputs are made louder by up to so much, which no DW1000 could be: its gain control compresses. A
 model that never met such levels predicts errors of metres for them."""
 
+OTHER_RECEIVERS = 0.5
+"""Share of the inputs that are changed to those of another receiver."""
 
-def vary(inputs: Tensor, generator: torch.Generator) -> Tensor:
+PULSE = (-0.08, 0.15)
+"""Bounds of the share of a tap's amplitude that each neighbour receives: receivers differ in bandwidth."""
+
+EARLY_TAPS = 0.7
+"""First-path detectors differ by up to so many taps in either direction."""
+
+DAMAGED_SHARE = 0.05
+"""Share of these inputs that are clipped at 40 % of their maximum or more, and share of those that end early."""
+
+
+def vary_channel(inputs: Tensor, generator: torch.Generator) -> Tensor:
     """Inputs (n, K), scaled by the preamble count, each with a decay of its own, some louder."""
     n, samples = inputs.shape
     # The scaling is a square root of amplitudes.
@@ -31,6 +43,30 @@ def vary(inputs: Tensor, generator: torch.Generator) -> Tensor:
     level_db = torch.where(is_louder, torch.rand(n, 1, generator=generator) * LOUDER_DB, torch.zeros(n, 1))
     louder: Tensor = varied * 10 ** (level_db / 40)
     return louder
+
+
+def vary_receiver(inputs: Tensor, generator: torch.Generator) -> Tensor:
+    """Inputs (n, K) as receivers with another pulse, another detector, clipping or short windows report them."""
+    n, samples = inputs.shape
+
+    def uniform(low: float, high: float) -> Tensor:
+        return low + (high - low) * torch.rand(n, 1, generator=generator)
+
+    place = torch.arange(samples) + uniform(-EARLY_TAPS, EARLY_TAPS)
+    before = place.floor()
+    part = place - before
+    taps = [(before.long() + step).clamp(0, samples - 1) for step in (0, 1)]
+    amplitude = inputs * inputs
+    shifted = (1 - part) * amplitude.gather(1, taps[0]) + part * amplitude.gather(1, taps[1])
+    share = uniform(*PULSE)
+    padded = torch.nn.functional.pad(shifted, (1, 1), mode="replicate")
+    spread = (1 - 2 * share) * shifted + share * (padded[:, :-2] + padded[:, 2:])
+    limit = torch.where(uniform(0, 1) < DAMAGED_SHARE, uniform(0.4, 1.0), torch.ones(n, 1))
+    clipped = torch.minimum(spread.clamp(min=0), limit * spread.amax(1, keepdim=True))
+    end = torch.where(uniform(0, 1) < DAMAGED_SHARE, uniform(0.2, 1.0) * samples, torch.full((n, 1), samples))
+    received = torch.where(torch.arange(samples) < end, clipped, torch.zeros(())).sqrt()
+    either: Tensor = torch.where(uniform(0, 1) < OTHER_RECEIVERS, received, inputs)
+    return either
 
 
 def normalised(inputs: Tensor) -> Tensor:

@@ -60,17 +60,25 @@ def card_of(
     )
 
 
-def familiarity_of(dataset: Dataset) -> Familiarity | None:
-    """What is familiar to who was fitted to it; None where the inputs have no level, or no measurement has both powers."""
-    if dataset.preprocessing.scaling is not Scaling.PREAMBLE:
-        return None
+def familiarity_of(dataset: Dataset, known_offset_m: float | None = None) -> Familiarity | None:
+    """The bands of familiarity of a model that was fitted to `dataset`.
+
+    Without levels (scaling MAX), the bands are those of the features that need none; None if a model needs levels and
+    no measurement has both powers.
+    """
+    scaling = dataset.preprocessing.scaling
+    with_levels = scaling is Scaling.PREAMBLE
+    unknown = np.full(len(dataset), np.nan, np.float32)
     values = features(
         dataset.inputs,
+        scaling,
         dataset.range_m.astype(np.float32),
-        dataset.rx_power_dbm,
-        dataset.first_path_power_dbm,
+        dataset.rx_power_dbm if with_levels else unknown,
+        dataset.first_path_power_dbm if with_levels else unknown,
     )
-    if not np.isfinite(values).all(axis=1).any():
+    if with_levels and not np.isfinite(values).all(axis=1).any():
         return None
+    if known_offset_m is not None:
+        return Familiarity.of(known_offset_m, values)
     means = [dataset.error_m[dataset.configurations == name].mean() for name in dataset.names]
     return Familiarity.of(float(np.median(means)), values)

@@ -23,13 +23,15 @@ def building_dataset(
     preprocessing: Preprocessing,
     workers: int,
     on_block: Callable[[], None] = lambda: None,
+    *,
+    wide: bool = False,
 ) -> Dataset:
     """One range of each of the first `blocks` x 256 placements of `sources.simulated_buildings`, in its order.
 
     Those that are not received, or whose window cannot be used, are left out. The same for every number of
-    `workers` (processes); `on_block` is called after each block.
+    `workers` (processes); `on_block` is called after each block. `wide`: see `block_of`.
     """
-    simulate = partial(_block, seed, preprocessing)
+    simulate = partial(_block, seed, preprocessing, wide)
     parts = []
     # Not forked: a caller may hold threads (torch, a progress bar).
     with multiprocessing.get_context("spawn").Pool(workers) as pool:
@@ -39,8 +41,8 @@ def building_dataset(
     return Dataset.joined(parts)
 
 
-def _block(seed: int, preprocessing: Preprocessing, number: int) -> Dataset:
-    block, rng = block_of(seed, number)
+def _block(seed: int, preprocessing: Preprocessing, wide: bool, number: int) -> Dataset:
+    block, rng = block_of(seed, number, wide=wide)
     reception = RADIO.receive(block.links.multipath(rng), rng, block.boards)
     distance = block.links.distance_m
     heard = np.flatnonzero(np.isfinite(reception.first_path_index))

@@ -17,14 +17,13 @@ from uwb_mitigation.evaluation.metrics import ErrorStatistics
 from uwb_mitigation.model import floating
 from uwb_mitigation.model.architecture import Remnet
 from uwb_mitigation.model.bundle import Card
-from uwb_mitigation.model.familiarity import Familiarity, features
 from uwb_mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.model.prior import LinePrior
 from uwb_mitigation.model.weights import FloatWeights, Int8Weights
 from uwb_mitigation.preprocessing import Preprocessing, Scaling
 from uwb_mitigation.simulation.buildings import PLACEMENTS
-from uwb_mitigation.training.augmentation import calibration_inputs, normalised, vary
-from uwb_mitigation.training.cards import card_of
+from uwb_mitigation.training.augmentation import calibration_inputs, normalised, vary_channel, vary_receiver
+from uwb_mitigation.training.cards import card_of, familiarity_of
 from uwb_mitigation.training.fitting import FitOptions, fit_varied
 from uwb_mitigation.training.quantization import quantize
 from uwb_mitigation.training.simulated import building_dataset
@@ -84,9 +83,16 @@ def train(
 
     # Augmentation needs the levels, whatever of them the scaling leaves.
     leveled = Preprocessing(plan.samples)
-    world = building_dataset(plan.seed, plan.blocks, leveled, workers, count_block)
+    # Levels show which receivers and sites are out of distribution. Without levels, training has to contain them.
+    is_leveled = plan.scaling is Scaling.PREAMBLE
+    world = building_dataset(plan.seed, plan.blocks, leveled, workers, count_block, wide=not is_leveled)
     held_out = building_dataset(
-        plan.seed + HELD_OUT_SEED, plan.held_out_blocks, preprocessing, workers, count_block
+        plan.seed + HELD_OUT_SEED,
+        plan.held_out_blocks,
+        preprocessing,
+        workers,
+        count_block,
+        wide=not is_leveled,
     )
     epochs = 0
 
@@ -95,13 +101,14 @@ def train(
         epochs += 1
         on_share(0.2 + 0.75 * epochs / plan.fit.epochs, "training")
 
-    is_leveled = plan.scaling is Scaling.PREAMBLE
     options = replace(plan.fit, seed=plan.seed)
     network = fit_varied(
         Remnet(samples=plan.samples),
         world.inputs,
         world.error_m,
-        vary if is_leveled else lambda inputs, generator: normalised(vary(inputs, generator)),
+        vary_channel
+        if is_leveled
+        else lambda inputs, generator: normalised(vary_receiver(vary_channel(inputs, generator), generator)),
         options,
         count_epoch,
     )
@@ -146,7 +153,8 @@ def _graded(plan: Plan, name: str, network: FloatWeights, integers: Int8Weights,
                 for row, by in statistics.items()
             },
         },
-        _familiarity(test),
+        # The correction shrinks to zero out of distribution: an offset belongs to the radio, not to the channel.
+        familiarity_of(test, known_offset_m=0.0),
     )
     return Universal(card, network, integers, statistics)
 
@@ -155,16 +163,3 @@ def _alike(labels: NDArray[np.str_]) -> NDArray[np.intp]:
     """Rows, as many of each condition: how often each occurs at a site is not known, and intervals are to hold in all."""
     conditions = [np.flatnonzero(labels == label) for label in np.unique(labels)]
     return np.concatenate([part[: min(map(len, conditions))] for part in conditions])
-
-
-def _familiarity(dataset: Dataset) -> Familiarity | None:
-    """Where a correction shrinks, it shrinks to none: an offset is the radio's, not the channel's."""
-    if dataset.preprocessing.scaling is not Scaling.PREAMBLE:
-        return None
-    values = features(
-        dataset.inputs,
-        dataset.range_m.astype(np.float32),
-        dataset.rx_power_dbm,
-        dataset.first_path_power_dbm,
-    )
-    return Familiarity.of(0.0, values)

@@ -1,4 +1,4 @@
-/* universal, model 982c95fd, written by `uwb-mitigation export-c`. */
+/* universal, model 7b0469c5, written by `uwb-mitigation export-c`. */
 #ifndef UWB_MODEL_H
 #define UWB_MODEL_H
 
@@ -376,10 +376,11 @@ static const uwb_familiarity uwb_familiar = {0.0f, {
     {0.0581130981f, 41.6133842f, 0.0721930042f},
     {84.6467056f, 87.9652328f, 0.666666687f},
     {84.6437225f, 87.6972046f, 0.666666687f},
+    {-1000.0f, -16.0f, 0.25f},
 }};
 
 static const uwb_model uwb_model_data = {
-    0x982c95fdu, 157u, UWB_SCALE_PREAMBLE, 0.0100363968f, 3u, 3u, uwb_first_weights, uwb_first,
+    0x7b0469c5u, 157u, UWB_SCALE_PREAMBLE, 0.0100363968f, 3u, 3u, uwb_first_weights, uwb_first,
     uwb_modules, 0u, NULL, uwb_head_weights, 384u, 166912, 6.12721487e-05f, 0.0f, 0.0f, 0.0f,
     -8.72018242f, 25.2730923f, 0.0237812009f, 0.199585781f, 0.13643989f, &uwb_familiar,
 };
