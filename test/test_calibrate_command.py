@@ -40,6 +40,8 @@ def site(tmp_path_factory):
         BagWriter(folder / "short.mcap", {}) as short,
         BagWriter(folder / "few.mcap", {}) as few,
         BagWriter(folder / "gross.mcap", {}) as gross,
+        BagWriter(folder / "far.mcap", {}) as far,
+        BagWriter(folder / "rare.mcap", {}) as rare,
     ):
         for i, stamp in enumerate(ranges.stamp_ns.tolist()):
             cir = Cir(np.zeros(0, np.int16), rx_power_dbm=float(power[i]))
@@ -48,6 +50,9 @@ def site(tmp_path_factory):
             bag.write(record)
             wrong = replace(record.measurement, range_m=float(value[i]) + 150.0 * (i % 178 == 5))
             gross.write(replace(record, measurement=wrong))
+            far.write(replace(record, measurement=replace(record.measurement, range_m=float(value[i]) + 1.2)))
+            if anchor != 5 or i == 204:
+                rare.write(record)
             if i < 100:
                 short.write(record)
             if i % 31 == 0:
@@ -56,12 +61,13 @@ def site(tmp_path_factory):
                 c, s = np.cos(turn[i]), np.sin(turn[i])
                 frame = path.position[i] - (c * LEVER[0] - s * LEVER[1], s * LEVER[0] + c * LEVER[1], 0.0)
                 late = stamp + 300_000_000
-                data = bytearray(encode_odometry(Estimate(late, frame, np.zeros(3), np.zeros((6, 6)))))
+                pose = Estimate(late, frame, np.zeros(3), np.zeros((6, 6)))
+                data = bytearray(encode_odometry(pose, child_frame_id="base_link"))
                 # The orientation stands after the position in the pose, which is encoded as none.
                 none = np.array([0.0, 0.0, 0.0, 1.0]).tobytes()
                 at = data.index(none, data.index(frame.tobytes()))
                 data[at : at + 32] = np.array([0.0, 0.0, np.sin(turn[i] / 2), np.cos(turn[i] / 2)]).tobytes()
-                for one in (bag, few):
+                for one in (bag, few, rare):
                     one.write_message("/odom", "nav_msgs/msg/Odometry", bytes(data), late)
     return folder
 
@@ -210,6 +216,27 @@ def test_without_a_transform_the_lever_arm_is_zero(site):
     assert "no transform from base_link" in done.stderr
 
 
+def test_a_pair_with_few_ranges_gets_the_common_offset(site):
+    with_truth = ("--truth-topic", "/odom", "--time-offset", 0.3, "--lever-arm", "0.4,0.1,0")
+    for options in ((), with_truth):
+        result, _ = figures(site, "rare.mcap", "--height", 1.0, *options)
+        others = [result["offsets_m"][f"7-{anchor}"] for anchor in range(1, 5)]
+        assert min(others) < result["offsets_m"]["7-5"] < max(others)
+        assert 0.05 < result["offset_sd_m"]["7-5"] < 0.5
+
+
+def test_offsets_above_a_metre_are_refused(site):
+    done = run("calibrate", "far.mcap", *LEVEL, "-o", "far.onnx", "--json", "far.json", folder=site)
+    assert done.returncode == 1
+    assert "antenna-delay" in json.loads((site / "far.json").read_text())["refused"]
+    assert not (site / "far.onnx").exists()
+
+
+def test_the_area_is_where_tags_are_sought(site):
+    done = run("calibrate", "drive.mcap", *LEVEL, "--area=30,30,0,40,40,2", "-o", "x.onnx", folder=site)
+    assert (done.returncode, "--area" in done.stderr) == (1, True)
+
+
 def test_what_makes_positions_worse_is_refused(site, monkeypatch):
     from uwb_mitigation.training.calibrated import Calibrated
 
@@ -261,7 +288,8 @@ def test_cirs_bring_the_universal_network_in(tmp_path, monkeypatch):
     source = SimulatedSource.with_anchors(5, seed=4, count=1600, rate_hz=20.0)
     save_anchors(tmp_path / "anchors.yaml", source.anchors)
     with BagWriter(tmp_path / "drive.mcap", {"simulated": "true"}) as bag:
-        for number, record in enumerate(source):
+        records = list(source)
+        for number, record in enumerate(records):
             measured = replace(record.measurement, range_m=record.measurement.range_m + 0.2)
             if number % 7 == 0:
                 measured = replace(measured, cir=replace(measured.cir, samples=np.zeros(0, np.int16)))
@@ -275,9 +303,10 @@ def test_cirs_bring_the_universal_network_in(tmp_path, monkeypatch):
     result = json.loads((tmp_path / "r.json").read_text())
     assert result["chosen"].startswith("offsets + universal network")
     # Ranges without a CIR contribute to the track; the model is fitted to the others.
-    assert (result["ranges"], result["left_out"]) == (1600, {})
-    assert "229 ranges without a usable CIR" in done.stderr
-    assert result["labelled"] <= 1600 - 229
+    without = len(range(0, len(records), 7))
+    assert (result["ranges"], result["left_out"]) == (len(records), {})
+    assert f"{without} ranges without a usable CIR" in done.stderr
+    assert result["labelled"] <= len(records) - without
     weights = [float_network(load_bundle(path)) for path in (tmp_path / "site.onnx", default_model_path())]
     predicted = [network_m(one, np.random.default_rng(1).random((50, 157), np.float32)) for one in weights]
     assert predicted[0] == pytest.approx(result["network_factor"][0] * predicted[1], abs=1e-4)

@@ -221,7 +221,7 @@ def _poses(
     import numpy as np
 
     from uwb_mitigation.bag.pose_paths import read_bodies, read_lever_arm
-    from uwb_mitigation.bag.poses import tag_frame
+    from uwb_mitigation.bag.poses import UWB_TAG, tag_frame, tag_of_frame
 
     if arm is not None and len(site.tags) > 1:
         raise ParameterError(
@@ -237,7 +237,7 @@ def _poses(
             if body not in known:
                 # Poses of another tag's own frame are no poses of a robot that carries this tag.
                 others = list(known)
-                if len(others) != 1 or others[0].startswith(tag_frame(0)[:-1]):
+                if len(others) != 1 or tag_of_frame(others[0]) is not None:
                     raise RecordingError(
                         f"no body for tag {tag.tag_id}: poses of {', '.join(sorted(known))}",
                         where=f"{bag}, topic {topic}",
@@ -248,7 +248,7 @@ def _poses(
         paths.append(own)
         if arm is not None:
             arms[number] = arm
-        elif body != tag_frame(tag.tag_id):
+        elif body not in (tag_frame(tag.tag_id), UWB_TAG):
             found = [read_lever_arm(bags[0], body or BASE_FRAME, frame) for frame in site.frames[tag.tag_id]]
             known_arms = [one for one in found if one is not None]
             if known_arms:

@@ -106,10 +106,11 @@ def with_own_offsets(
     fit: JointFit,
     height: Height | None,
     model: Model,
-) -> tuple[Columns | None, JointFit | None, list[str]]:
+) -> tuple[Columns | None, JointFit | None, list[str], float]:
     """The parameters with offsets of those columns, where ranges tell them from chance; and whose they do not tell.
 
-    Empirical Bayes: by how much offsets scatter beyond their own uncertainty says how well they are known before.
+    Empirical Bayes: by how much offsets scatter beyond their own uncertainty says how well they are known before. This
+    standard deviation, m, is also the error of the common offset where it replaces an own one.
     """
     count = len(columns)
 
@@ -132,13 +133,13 @@ def with_own_offsets(
     free = own * alone / variance
     excess = float(np.sum(free**2 / alone))
     scatter = float(np.sum((free**2 - alone) / alone**2) / np.sum(1.0 / alone**2))
+    sd = float(np.sqrt(max(scatter, 0.0)))
     if excess < chi2.ppf(LEAST_CONFIDENCE, max(count - 1, 1)) or scatter < LEAST_OWN_SD_M**2:
-        return None, None, []
-    sd = float(np.sqrt(scatter))
+        return None, None, [], sd
     # An offset of which the ranges say less than what is known before is not solved for.
     told = np.sqrt(1.0 / (1.0 / alone + 1.0 / scatter)) < TOLD * sd
     untold = [name for name, is_told in zip(columns, told, strict=True) if not is_told]
     if told.mean() < MOST:
-        return None, None, []
+        return None, None, [], sd
     better = solved.with_own({name: mask for name, mask in columns.items() if name not in untold}, sd)
-    return better, fitted(better), untold
+    return better, fitted(better), untold, sd

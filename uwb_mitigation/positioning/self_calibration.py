@@ -56,6 +56,7 @@ class SelfCalibration:
         tag_ids: of the tags.
         pseudo_m, pseudo_sd_m: float64 (r,), in the order of `stretches.ranges`: how far each range's anchor is from where
             the *other* anchors see the tag, and how well that is known; NaN = not at all.
+        own_sd_m: standard deviation of own offsets about the common one, for pairs that get the common one.
         position_scatter_m: `position_scatter` of raw ranges, and of calibrated ones on held-out parts; NaN = unknown.
     """
 
@@ -70,6 +71,7 @@ class SelfCalibration:
     pseudo_m: NDArray[np.float64]
     pseudo_sd_m: NDArray[np.float64]
     untold_m: float
+    own_sd_m: float
     height: Height | None
     model: Model
     position_scatter_m: tuple[float, float] = (float("nan"), float("nan"))
@@ -113,7 +115,7 @@ class SelfCalibration:
         placed = (
             self.anchors.sd[row] ** 2 / 2.0
             if len(at) > 1
-            else np.mean(self.anchors.sd**2) / len(self.anchors)
+            else np.mean(self.anchors.sd**2) / len(self.anchors) + self.own_sd_m**2
         )
         variance = self.fit.covariance[np.ix_(at, at)].sum() + placed + self.untold_m**2
         return float(self.fit.parameters[at].sum()), float(np.sqrt(variance))
@@ -226,13 +228,13 @@ def calibrate(
         links = links_of(found, solved.rows, solved.alike, model)
         fit = JointSolver(anchors, links, solved.parameters(links), model, height).fit(position)
     check_motion(links, fit, height)
-    level = "one"
+    level, own_sd = "one", 0.0
     tag_ids = tuple(one.tag_id for one in tags)
 
     def result(untold_m: float) -> SelfCalibration:
         no_truth = np.zeros(0)
         return SelfCalibration(
-            found, links, fit, solved, level, tuple(told), tag_ids, anchors, no_truth, no_truth, untold_m, height, model
+            found, links, fit, solved, level, tuple(told), tag_ids, anchors, no_truth, no_truth, untold_m, own_sd, height, model
         )  # fmt: skip
 
     def held_out_scatter(some: Columns, fitted: JointFit) -> float:
@@ -258,7 +260,11 @@ def calibrate(
     tried = candidates(found) if common_sd <= UNTOLD_M else []
     shared_only = solved
     for group, columns in tried:
-        richer, better, shared = with_own_offsets(anchors, found, solved, columns, fit, height, model)
+        richer, better, shared, sd_of_group = with_own_offsets(
+            anchors, found, solved, columns, fit, height, model
+        )
+        if group == "anchor":
+            own_sd = sd_of_group
         if richer is None or better is None:
             told.append(f"offsets of {group}s of their own: not told from chance, so that all share one")
             break
