@@ -305,7 +305,7 @@ def test_an_anchor_with_few_ranges_gets_the_common_offset(minute):
     assert found.level == "pair"
     assert found.pair(0, 4)[0] == found.value("offset")[0]
     # The others scatter by 0.16 m, and so may this one.
-    assert 0.1 < found.pair(0, 4)[1] < 0.3
+    assert 0.15 < found.pair(0, 4)[1] < 0.3
     assert found.pair(0, 3)[0] != found.value("offset")[0]
     assert any("anchor 5" in note for note in found.not_told)
 
@@ -372,6 +372,9 @@ def test_each_tag_has_its_own_lever_arm_and_its_own_body(minute):
     found = solve_localised(HALL, tags, bodies, nothing, time_offset_s=0.0, estimate_lever_arm=True)
     assert np.abs(found.lever_arm_m - arms)[:, :2].max() < 0.05
     assert np.abs(found.offset_m - 0.25).max() < 0.08
+    truth = np.linalg.norm(path.position - HALL.position[ranges.anchor], axis=1)
+    known = np.isfinite(found.distance_m)
+    assert np.abs(found.distance_m - np.tile(truth, 2))[known].max() < 0.1
     given = solve_localised(HALL, tags, bodies, nothing, time_offset_s=0.0, lever_arms_m=arms)
     assert (given.lever_arm_m == arms).all()
     assert np.abs(given.offset_m - 0.25).max() < 0.08

@@ -108,7 +108,8 @@ def harm(folder: Path) -> None:
                 row
                 + f"calibrated MAE {mae:.3f} m, live RMSE {rmse:.3f} m; {'refused' if found.harms else 'written'}; offsets "
                 f"{[f'{value:.2f} +- {sd:.2f}' for value, sd in found.pair_m.values()]}, median errors "
-                f"{[f'{value:.2f}' for value in true]}, {sum(covered)} of {len(covered)} within two standard deviations",
+                f"{[f'{value:.2f}' for value in true]}, {sum(covered)} of {len(covered)} within two standard deviations"
+                + "".join(f"; {note}" for note in found.notes),
                 flush=True,
             )
 
