@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from command_line import run
 from drives import drive
+from rosbags.typesys import Stores, get_typestore
 
 from uwb_mitigation.bag.poses import encode_odometry
+from uwb_mitigation.bag.topics import TF_TYPE
 from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.measurement import Cir, RangeMeasurement, Record
 from uwb_mitigation.mitigation import Mitigation
@@ -20,8 +22,18 @@ from uwb_mitigation.positioning.tracks import Estimate
 from uwb_mitigation.sources.simulated import SimulatedSource
 from uwb_mitigation.sources.site import save_anchors
 
+STORE = get_typestore(Stores.ROS2_JAZZY)
 OWN = np.array([0.3, 0.1, 0.25, 0.05, 0.2])
 LEVER = np.array([0.4, 0.1, 0.0])
+
+
+def arm_to(frame):
+    """A TFMessage in CDR: a frame at `LEVER` in base_link."""
+    of = STORE.types
+    header = of["std_msgs/msg/Header"](of["builtin_interfaces/msg/Time"](0, 0), "base_link")
+    at = of["geometry_msgs/msg/Vector3"](*LEVER), of["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
+    step = of["geometry_msgs/msg/TransformStamped"](header, frame, of["geometry_msgs/msg/Transform"](*at))
+    return bytes(STORE.serialize_cdr(of[TF_TYPE]([step]), TF_TYPE))
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +67,7 @@ def site(tmp_path_factory):
             wrong = replace(record.measurement, range_m=float(value[i]) + 1.2 * (anchor == 2))
             odd.write(replace(record, measurement=wrong))
             if anchor != 5 or i == len(ranges) - 1:
-                rare.write(record)
+                rare.write(replace(record, measurement=replace(record.measurement, frame_id="antenna")))
             if i < 100:
                 short.write(record)
             if i % 31 == 0:
@@ -75,6 +87,7 @@ def site(tmp_path_factory):
                 )
                 for one, data in ((bag, of_robot), (few, of_tag), (odd, of_robot), (rare, of_robot)):
                     one.write_message("/odom", "nav_msgs/msg/Odometry", data, late)
+        rare.write_message("/tf_static", TF_TYPE, arm_to("antenna"), int(ranges.stamp_ns[0]))
     return folder
 
 
@@ -247,6 +260,13 @@ def test_offsets_above_a_metre_are_refused(site):
 def test_the_area_is_where_tags_are_sought(site):
     done = run("calibrate", "drive.mcap", *LEVEL, "--area=30,30,0,40,40,2", "-o", "x.onnx", folder=site)
     assert (done.returncode, "--area" in done.stderr) == (1, True)
+
+
+def test_the_lever_arm_is_the_transform_to_the_frame_of_the_ranges(site):
+    result, done = figures(site, "rare.mcap", "--height", 1.0, "--truth-topic", "/odom")
+    assert result["localisation"]["lever_arm_m"] == LEVER.tolist()
+    assert result["localisation"]["lever_arm_sd_m"] == [0.0] * 3
+    assert "no transform" not in done.stderr
 
 
 def test_what_makes_positions_worse_is_refused(site, monkeypatch):
