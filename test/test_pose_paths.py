@@ -132,8 +132,8 @@ def test_frames_that_are_not_there_and_none_at_all_are_told(tmp_path):
 
 
 def measured_range(second: int) -> Any:
-    """0.1 m higher each second; the sensor sees nothing in second 3."""
-    value = float("inf") if second == 3 else 0.5 + 0.1 * second
+    """0.1 m higher each second; the sensor reports more than its maximum in second 3."""
+    value = 9.0 if second == 3 else 0.5 + 0.1 * second
     return of("sensor_msgs/msg/Range", header(second), 1, 0.1, 0.0, 4.0, value, 0.0004)
 
 
