@@ -85,10 +85,11 @@ def test_the_shipped_model_is_found_in_a_checkout():
     assert default_model_path(Scaling.MAX).name == "universal_amplitude.onnx"
 
 
-def test_a_model_is_named_by_its_file_or_as_it_ships():
+def test_a_model_is_named_by_its_file_or_as_it_ships(tmp_path):
     assert model_path("") == model_path(None) == default_model_path()
     assert model_path(Path("evk1000_apartment")) == shipped_model_path("evk1000_apartment")
-    assert model_path("folder/own.onnx") == Path("folder/own.onnx")
+    (tmp_path / "own.onnx").touch()
+    assert model_path(str(tmp_path / "own.onnx")) == tmp_path / "own.onnx"
 
 
 def test_the_shipped_model_is_found_in_a_sourced_workspace(tmp_path, monkeypatch):

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
 
+from uwb_mitigation.errors import format_id
 from uwb_mitigation.link.events import (
     Connected,
     Disconnected,
@@ -25,7 +26,7 @@ from uwb_mitigation.link.layout import PROTOCOL_VERSION, LogLevel
 from uwb_mitigation.link.messages import BoardStatus, Correction, Log
 from uwb_mitigation.link.port import BoardPort
 from uwb_mitigation.link.radio import Radio, RadioSettings, RadioStatus
-from uwb_mitigation.measurement import RangeMeasurement, format_id
+from uwb_mitigation.measurement import RangeMeasurement
 from uwb_mitigation.nodes import diagnostics, radio_facts
 from uwb_mitigation.offsets import Offsets
 

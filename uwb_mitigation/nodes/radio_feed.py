@@ -10,10 +10,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
-from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.errors import ParameterError, format_id
 from uwb_mitigation.link.layout import Role
 from uwb_mitigation.link.radio import Radio, RadioSettings
-from uwb_mitigation.measurement import RangeMeasurement, format_id
+from uwb_mitigation.measurement import RangeMeasurement
 from uwb_mitigation.nodes import diagnostics, radio_facts
 from uwb_mitigation.radio.opening import opener
 from uwb_mitigation.radio.port import RadioEvent, RadioLost, RadioPort
