@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Literal
 
 from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.sources.log_lines import XZ_MAGIC
 from uwb_mitigation.sources.source import Source
 
 ACCEPTED = (
@@ -15,6 +14,7 @@ ACCEPTED = (
 )
 
 _MCAP_MAGIC = b"\x89MCAP0\r\n"
+_XZ_MAGIC = b"\xfd7zXZ\x00"
 _SQLITE_MAGIC = b"SQLite format 3\x00"
 
 
@@ -62,7 +62,7 @@ def _is_bag(path: Path) -> bool:
 
 def _looks_like_log(path: Path) -> bool:
     head = _head(path)
-    return head.startswith(XZ_MAGIC) or b"DecaRanging" in head
+    return head.startswith(_XZ_MAGIC) or b"DecaRanging" in head
 
 
 def _head(path: Path) -> bytes:
