@@ -311,7 +311,7 @@ def report(
     _make_folder(output)
     with console.reading() as on_record:
         longest = Preprocessing(max(published.WINDOWS), Scaling.MAX)
-        study = reports.Study(*load(data, longest, on_record), _command())
+        study = reports.Study(data, *load(data, longest, on_record), _command())
     with console.step_bar("drawing", reports.STEPS) as on_step:
         result = reports.build(study, trainings, bench, on_step)
     page = output / "report.html"

@@ -105,6 +105,8 @@ def scatter(points: NDArray[np.floating], groups: NDArray[np.str_], title: str) 
                     label=f" {names[group]}",
                 )
             place.set(xlabel="component 1", ylabel="component 2", zlabel="component 3")
+            for axis in (place.xaxis, place.yaxis, place.zaxis):
+                axis.labelpad = -7
             place.tick_params(labelsize=7, pad=-3)
             place.locator_params(nbins=5)
         figure.suptitle(title, fontsize=11, y=0.985)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -81,8 +82,9 @@ class Report:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Study:
-    """Labelled data with windows of the longest K, scaled by their maximum; `command` made the report."""
+    """Labelled data with windows of the longest K, scaled by their maximum; `command` made the report from `path`."""
 
+    path: Path
     name: str
     simulated: bool
     dataset: Dataset
@@ -129,7 +131,7 @@ def build(
     on_step: Callable[[], None] = lambda: None,
 ) -> Report:
     """Return every table and figure that the data, the trainings and the firmware results allow."""
-    train = f"uwb-mitigation paper protocol --data {study.name.split(' ')[0]} -o models"
+    train = f"uwb-mitigation paper protocol --data {shlex.quote(str(study.path))} -o models"
     bench = "uwb-mitigation bench firmware --json firmware.json"
     lacking: dict[str, str] = {}
     shown, pictures = [_data_table(study)], [_samples(study)]
