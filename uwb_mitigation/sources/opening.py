@@ -10,7 +10,7 @@ from uwb_mitigation.sources.source import Source
 
 ACCEPTED = (
     "an MCAP bag (.mcap, or a folder with metadata.yaml), "
-    "DecaRanging logs (.log, .log.xz, or a folder of them), or a folder of a Hanyang run"
+    "DecaRanging logs (.log, .log.xz, or a folder of them), or a folder of a Hanyang run; `data import` makes a bag of DeepUWB's pickle"
 )
 
 _MCAP_MAGIC = b"\x89MCAP0\r\n"
