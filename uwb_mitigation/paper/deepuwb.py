@@ -28,18 +28,11 @@ from uwb_mitigation.sources.source import Source
 MAX_BYTES, MAX_ERROR_M = 1 << 29, 1000.0
 CIR_SAMPLES = 157
 NOMINAL_RANGE_M = 10.0
-"""True range of every record. Binary32 represents 10 m + error to within 1e-6 m for errors below 22 m."""
-
 FIRST_PATH_INDEX = float(WINDOW_LEAD)
 """With this index the window of the preprocessing is the whole CIR, which the authors cut at the first path."""
 
-FIRST_STAMP_NS, STAMP_STEP_NS = 1_577_836_800 * 10**9, 10_000_000
-"""Row i has the stamp 2020-01-01T00:00:00Z + i x 10 ms."""
-
-TAG_ID = 1
-FIRST_ANCHOR_ID = 1000
-"""The anchor of room r is 1000 + r."""
-
+FIRST_STAMP_NS, STAMP_STEP_NS = 1_577_836_800 * 10**9, 10_000_000  # 2020-01-01T00:00:00Z, 10 ms
+TAG_ID, FIRST_ANCHOR_ID = 1, 1000
 FULL_SCALE = np.iinfo(np.int16).max - 1  # the maximum itself means a saturated sample
 
 _PANDAS = re.compile(

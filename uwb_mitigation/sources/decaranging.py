@@ -129,7 +129,7 @@ class DecaRangingLog(Source):
         for sequence, measured in enumerate(self._measurements(text, not_before_ns), first_sequence):
             tag, anchor = (placed.tag, placed.anchor) if placed else (measured.tag_id, measured.anchor_id)
             numbered = replace(measured, sequence=sequence & 0xFFFFFFFF, tag_id=tag, anchor_id=anchor)
-            yield Record(numbered, placed and placed.truth, placed and placed.tag_position)
+            yield Record(numbered, placed.truth, placed.tag_position) if placed else Record(numbered)
         if fault:
             raise DamagedRecordingError(fault, where=self._after(text))
 
