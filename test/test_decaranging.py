@@ -204,6 +204,7 @@ def test_exponents_of_three_digits_are_read(write):
         (poll(0) + ranged(5.0), 0, [Oddity.NO_CIR]),
         (poll(0) + poll(SECOND) + TRANSMIT + final(2 * SECOND) + ranged(5.0), 6, [Oddity.NO_RANGE]),
         (poll(0) + final(1) + final(SECOND) + ranged(5.0), 6, [Oddity.NO_RANGE]),
+        (poll(0) + final(1) + poll(SECOND) + ranged(5.0), 0, [Oddity.NO_RANGE, Oddity.NO_CIR]),
         (poll(0) + final(SECOND) + TRANSMIT + ranged(5.0), 6, []),
         (poll(0) + received(0x2A, 1, dump(ramp(5))) + final(2) + ranged(5.0), 6, []),
         (poll(0) + final(1, rsl="-001.#INF") + ranged(5.0), 6, [Oddity.NOT_A_NUMBER]),
