@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import lzma
+import math
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -41,20 +42,23 @@ def read_rows(path: Path, columns: tuple[str, ...], most_bytes: int) -> Iterator
         raise RecordingError(f"cannot be read: {error}", where=where, valid=valid) from error
 
 
-def identity(text: str | None, where: str) -> int:
+def identity(row: dict[str, str], column: str, where: str) -> int:
     """Return the 64-bit number in a cell; raises RecordingError."""
-    stripped = (text or "").strip()
-    if stripped.isascii() and stripped.isdigit() and len(stripped) <= 20 and int(stripped) < 1 << 64:
-        return int(stripped)
-    raise RecordingError(f"{stripped!r:.40} is not an id", where=where, valid="a whole number below 2^64")
+    text = (row.get(column) or "").strip()
+    if text.isascii() and text.isdigit() and len(text) <= 20 and int(text) < 1 << 64:
+        return int(text)
+    raise RecordingError(f"{column} = {text!r:.40}", where=where, valid="a whole number below 2^64")
 
 
-def number(text: str | None, where: str, low: float, high: float) -> float:
-    """Return the number in a cell; raises RecordingError."""
+def number(
+    row: dict[str, str], column: str, where: str, low: float, high: float, empty: float = math.nan
+) -> float:
+    """Return the number in a cell, or `empty`; raises RecordingError."""
+    text = (row.get(column) or "").strip()
     try:
-        value = float(text or "")
+        value = float(text) if text else empty
     except ValueError:
-        value = low - 1.0
+        value = math.nan
     if not low <= value <= high:
-        raise RecordingError(f"{text!r:.40} is out of range", where=where, valid=f"{low:g} to {high:g}")
+        raise RecordingError(f"{column} = {text!r:.40}", where=where, valid=f"{low:g} to {high:g}")
     return value

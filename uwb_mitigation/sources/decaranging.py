@@ -352,7 +352,7 @@ def find_survey(folder: Path) -> Survey | None:
         seen: set[int] = set()
         for line, row in read_rows(folder / name, columns, MAX_CSV_BYTES):
             where = f"{folder / name}: line {line}"
-            key = identity(row[columns[0]], where)
+            key = identity(row, columns[0], where)
             if key in seen:
                 raise RecordingError(f"{columns[0]} {key} is repeated", where=where)
             seen.add(key)
@@ -361,7 +361,7 @@ def find_survey(folder: Path) -> Survey | None:
     def positions(name: str) -> dict[int, tuple[float, ...]]:
         limits = -1e6, 1e6
         rows = table(name, "location", "x", "y")
-        return {key: tuple(number(row[axis], where, *limits) for axis in "xy") for where, key, row in rows}
+        return {key: tuple(number(row, axis, where, *limits) for axis in "xy") for where, key, row in rows}
 
     labels = {}
     if (folder / "labels.csv").is_file():
@@ -369,7 +369,7 @@ def find_survey(folder: Path) -> Survey | None:
     surveyed = {kind: positions(f"{kind}s.csv") for kind in ("anchor", "tag")}
     placements = {}
     for where, log, row in table("pairs.csv", "file_number", "anchor_location", "tag_location"):
-        ids = {kind: identity(row[f"{kind}_location"], where) for kind in surveyed}
+        ids = {kind: identity(row, f"{kind}_location", where) for kind in surveyed}
         for kind, location in ids.items():
             if location not in surveyed[kind]:
                 raise RecordingError(f"{kind} location {location} is unknown", where=where)

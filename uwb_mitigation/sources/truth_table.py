@@ -63,14 +63,14 @@ def with_truth(records: Iterable[Record], stretches: Sequence[Stretch]) -> Itera
 
 def _stretch(row: dict[str, str], path: Path, line: int) -> Stretch:
     where = f"{path}: line {line}"
-    start_s = number(row.get("start_s") or "0", where, 0.0, MAX_RANGE_M)
-    stop_s = number(row.get("stop_s") or "inf", where, 0.0, math.inf)
+    start_s = number(row, "start_s", where, 0.0, MAX_RANGE_M, 0.0)
+    stop_s = number(row, "stop_s", where, 0.0, math.inf, math.inf)
     if start_s >= stop_s:
         raise RecordingError(f"start_s = {start_s} is not before stop_s = {stop_s}", where=where)
     truth = Truth(
-        number(row["range_m"], where, 0.0, MAX_RANGE_M),
+        number(row, "range_m", where, 0.0, MAX_RANGE_M),
         (row.get("label") or "").strip(),
         (row.get("configuration") or "").strip() or f"{path.name} line {line}",
     )
-    tag_id, anchor_id = (identity(row[name], where) for name in ("tag_id", "anchor_id"))
+    tag_id, anchor_id = (identity(row, name, where) for name in ("tag_id", "anchor_id"))
     return Stretch(tag_id, anchor_id, start_s, stop_s, truth)
