@@ -20,7 +20,7 @@ from uwb_mitigation.positioning.localised import PosePath
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
-    from uwb_mitigation.bag.index import Channel, RawMessage
+    from uwb_mitigation.bag.reader import Channel, RawMessage
 
 MOST_POSES = 2_000_000
 _MOST_FRAMES = 64

@@ -21,8 +21,8 @@ from mcap.writer import Writer
 import uwb_mitigation
 from uwb_mitigation.bag import schemas
 from uwb_mitigation.bag.codec import encode_range, encode_truth
-from uwb_mitigation.bag.index import Channel
 from uwb_mitigation.bag.poses import encode_place
+from uwb_mitigation.bag.reader import Channel
 from uwb_mitigation.bag.rosbag2 import (
     METADATA_NAME,
     NO_QOS,

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from uwb_mitigation.bag import columns, schemas
 from uwb_mitigation.bag.codec import decode_range, encode_corrected
-from uwb_mitigation.bag.index import RawMessage
+from uwb_mitigation.bag.reader import RawMessage
 from uwb_mitigation.bag.reader import BagReader, check_channel
 from uwb_mitigation.bag.topics import RANGE_CIR_TYPE, RANGE_CORRECTED, RANGE_RAW
 from uwb_mitigation.bag.writer import METADATA_RECORD, BagWriter
