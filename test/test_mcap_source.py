@@ -285,6 +285,5 @@ def test_a_folder_is_no_bag_for_a_folder_in_it_that_has_a_bags_name(tmp_path: Pa
 
 def test_a_bags_folder_may_hold_a_folder_with_a_bags_name(tmp_path: Path) -> None:
     write_bag(tmp_path / "bag.mcap")
-    (tmp_path / "metadata.yaml").unlink()
     (tmp_path / "another.mcap").mkdir()
     assert len(numbers(open_recording(tmp_path))) == 5
