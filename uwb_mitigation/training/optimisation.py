@@ -9,7 +9,7 @@ import onnxruntime
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ModelError
-from uwb_mitigation.model.runtime import session_options
+from uwb_mitigation.model.bundle import session_options
 
 _CHUNK = 1024
 
