@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bag_material import chunk_offsets
 from command_line import run, start
 from real_logs import Reading
 
-from uwb_mitigation.bag.index import index_of
 from uwb_mitigation.bag.reader import BagReader
 from uwb_mitigation.bag.topics import RANGE_RAW, RANGE_TRUTH
 from uwb_mitigation.bag.writer import BagWriter
@@ -83,8 +83,7 @@ def test_a_bag_can_be_replaced_by_an_import_of_itself(tmp_path: Path) -> None:
 
 def test_a_damaged_bag_is_shown_as_far_as_it_goes_and_exits_1(tmp_path: Path) -> None:
     path = write_bag(tmp_path / "bag.mcap")
-    with path.open("rb") as stream:
-        end = index_of(stream).spans[0].end
+    ((_, end),) = chunk_offsets(path)
     path.write_bytes(path.read_bytes()[:end] + b"\x06\xff\xff\xff")
     done = run("data", "info", "bag.mcap", "--json", "info.json", folder=tmp_path)
     assert done.returncode == 1

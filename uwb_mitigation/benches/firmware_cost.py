@@ -21,9 +21,8 @@ from uwb_mitigation.firmware_export.packing import PackedNetwork, pack
 from uwb_mitigation.firmware_export.toolchain import Kernels, Target, build_image, measure_size
 from uwb_mitigation.model import graph
 from uwb_mitigation.model.architecture import Mlp
-from uwb_mitigation.model.bundle import Bundle
+from uwb_mitigation.model.bundle import Bundle, session_options
 from uwb_mitigation.model.prior import LinePrior
-from uwb_mitigation.model.runtime import session_options
 from uwb_mitigation.model.weights import Int8Weights
 from uwb_mitigation.paper import published
 from uwb_mitigation.preprocessing import Scaling

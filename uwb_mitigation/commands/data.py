@@ -106,8 +106,6 @@ def import_recordings(
     messages = bag.counts.total()
     _show_pauses(pauses)
     console.out.print(f"Wrote {messages} messages to {bag.file}.", markup=False, soft_wrap=True)
-    if bag.notice:
-        console.err.print(bag.notice, style="yellow", markup=False, soft_wrap=True)
     console.write_json(json, {"messages": messages, "output": str(bag.file), **inventory.as_json()})
     # What was readable is kept; that it is not everything must not pass unnoticed.
     if damage:
@@ -177,8 +175,6 @@ def write_simulated(
         highlight=False,
         soft_wrap=True,
     )
-    if bag.notice:
-        console.err.print(bag.notice, style="yellow", markup=False, soft_wrap=True)
     console.write_json(
         json, {"output": str(bag.file), "seed": seed, "simulated": True, **inventory.as_json()}
     )

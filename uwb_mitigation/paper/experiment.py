@@ -19,10 +19,9 @@ from uwb_mitigation.evaluation import baselines, lad, splits
 from uwb_mitigation.files import write_whole
 from uwb_mitigation.model import floating, graph
 from uwb_mitigation.model.architecture import Architecture, Mlp, Remnet
-from uwb_mitigation.model.bundle import Card, save_bundle
+from uwb_mitigation.model.bundle import Card, save_bundle, session_options
 from uwb_mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.model.prior import LinePrior
-from uwb_mitigation.model.runtime import session_options
 from uwb_mitigation.model.weights import FloatWeights, Int8Weights
 from uwb_mitigation.paper import published
 from uwb_mitigation.paper.jobs import run_jobs
