@@ -79,7 +79,7 @@ paper: setup-training  ## the paper's experiment, the firmware's bench and their
 
 build/paper/deepuwb.mcap:
 	@echo "1 of 4: simulated rooms in DeepUWB's shape"; mkdir -p $(@D)
-	@$(VENV)/bin/uwb-mitigation data simulate --like deepuwb --force -o $@
+	@$(VENV)/bin/uwb-mitigation paper simulate --force -o $@
 
 $(PAPER)/firmware.json: $(wildcard firmware/src/*.[ch] firmware/src/cortex_m4/* uwb_mitigation/firmware_export/*.py)
 	@echo "2 of 4: the firmware in an emulator"; mkdir -p $(@D)
@@ -88,11 +88,11 @@ $(PAPER)/firmware.json: $(wildcard firmware/src/*.[ch] firmware/src/cortex_m4/* 
 # After the bench, which says at once if its tools are not there.
 $(PAPER)/models/protocol.json: $(subst $(space),\ ,$(PAPER_DATA)) | $(PAPER)/firmware.json
 	@echo "3 of 4: the networks, about $(if $(QUICK),4,48) minutes on two cores"
-	@$(VENV)/bin/uwb-mitigation protocol --data '$(PAPER_DATA)' -o $(@D) $(if $(QUICK),$(PAPER_QUICK))
+	@$(VENV)/bin/uwb-mitigation paper protocol --data '$(PAPER_DATA)' -o $(@D) $(if $(QUICK),$(PAPER_QUICK))
 
-$(PAPER)/report.html: $(PAPER)/models/protocol.json $(PAPER)/firmware.json $(wildcard uwb_mitigation/evaluation/*)
+$(PAPER)/report.html: $(PAPER)/models/protocol.json $(PAPER)/firmware.json $(wildcard uwb_mitigation/paper/* uwb_mitigation/paper/templates/*)
 	@echo "4 of 4: the page"
-	@$(VENV)/bin/uwb-mitigation report --data '$(PAPER_DATA)' -o $(@D) \
+	@$(VENV)/bin/uwb-mitigation paper report --data '$(PAPER_DATA)' -o $(@D) \
 	  --models $(PAPER)/models --firmware $(PAPER)/firmware.json
 
 setup-docs:

@@ -65,7 +65,13 @@ setup(
     version="0.1.0",
     packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
     package_data={
-        PACKAGE: ["py.typed", "interfaces/*.msg", "evaluation/templates/*.j2", "viewer/templates/*.j2"]
+        PACKAGE: [
+            "py.typed",
+            "interfaces/*.msg",
+            "evaluation/templates/*.j2",
+            "paper/templates/*.j2",
+            "viewer/templates/*.j2",
+        ]
     },
     data_files=[
         *COMMAND,

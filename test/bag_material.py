@@ -7,9 +7,10 @@ from dataclasses import astuple, replace
 from pathlib import Path
 
 import numpy as np
+from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from uwb_mitigation.bag import codec, index, schemas
+from uwb_mitigation.bag import codec, schemas
 from uwb_mitigation.bag.topics import RANGE_CIR_TYPE, RANGE_RAW, RANGE_TRUTH, RANGE_TRUTH_TYPE
 from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.errors import RecordingError
@@ -155,6 +156,8 @@ def prefix(path: Path) -> tuple[list[int], RecordingError | None]:
     return read, None
 
 
-def spans_of(path: Path) -> list[index.Span]:
+def chunk_offsets(path: Path) -> list[tuple[int, int]]:
+    """First and last byte of the chunks of a complete file."""
     with path.open("rb") as stream:
-        return index.index_of(stream).spans
+        indexes = make_reader(stream).get_summary().chunk_indexes
+    return [(one.chunk_start_offset, one.chunk_start_offset + one.chunk_length) for one in indexes]

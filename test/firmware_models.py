@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.benches import random_networks
 from uwb_mitigation.benches.firmware_cost import Network, network_of
-from uwb_mitigation.evaluation import paper
 from uwb_mitigation.firmware_export.export import golden_windows, write_header
 from uwb_mitigation.firmware_export.header import Golden, ModelConstants
 from uwb_mitigation.firmware_export.packing import pack
@@ -25,6 +24,7 @@ from uwb_mitigation.model.familiarity import Band, Familiarity
 from uwb_mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.model.prior import LinePrior
 from uwb_mitigation.model.weights import Int8Weights
+from uwb_mitigation.paper import published
 from uwb_mitigation.preprocessing import Preprocessing, Scaling
 from uwb_mitigation.sources.decaranging import open_decaranging
 
@@ -156,7 +156,7 @@ class Exported:
         return windows[usable]
 
 
-SHAPES = [*itertools.product((3, 5), paper.WINDOWS), (0, 157)]
+SHAPES = [*itertools.product((3, 5), published.WINDOWS), (0, 157)]
 """First kernel and length of every network that must run; 0 is the MLP."""
 
 

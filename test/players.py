@@ -11,7 +11,7 @@ from rclpy.clock import Clock, ClockType
 
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.measurement import Cir, RangeMeasurement, Record
-from uwb_mitigation.nodes.playback import Playback
+from uwb_mitigation.nodes.playback import Playback, ReplayOptions
 
 _NO_CIR = Cir(np.zeros(0, np.int16))
 
@@ -55,11 +55,10 @@ class Player:
         self.ends: list[UwbMitigationError | None] = []
         self.ended = threading.Event()
         self.on_record = on_record
-        settings = {"rate": 1.0, "loop": False, "longest_pause_s": 100.0, "recorded_stamps": False}
         self.playback = Playback(
             source,
             self.clock,
-            **(settings | options),
+            ReplayOptions(**({"longest_pause_s": 100.0} | options)),
             ready=lambda: True,
             publish=self.publish,
             on_time=self.tell_time,

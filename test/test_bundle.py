@@ -12,13 +12,12 @@ import numpy as np
 import onnx
 import pytest
 from model_material import LINE, bundle, card, random_int8, random_weights
-from onnx import TensorProto, helper
 
 from uwb_mitigation.errors import ModelError
 from uwb_mitigation.model import bundle as bundles
 from uwb_mitigation.model import graph
 from uwb_mitigation.model.architecture import Remnet
-from uwb_mitigation.model.bundle import METADATA_KEY, assemble_bundle, load_bundle, parse_bundle, save_bundle
+from uwb_mitigation.model.bundle import assemble_bundle, load_bundle, parse_bundle, save_bundle
 from uwb_mitigation.model.prior import LinePrior
 from uwb_mitigation.model.shipped import SHIPPED, default_model_path, model_path, shipped_model_path
 from uwb_mitigation.preprocessing import Preprocessing, Scaling
@@ -31,11 +30,11 @@ def saved(tmp_path_factory) -> bundles.Bundle:
     return bundle(tmp_path_factory.mktemp("bundle"), SHAPE)
 
 
-def refusal(data: bytes) -> str:
+def refused(data: bytes) -> bool:
+    """Whether `parse_bundle` raises ModelError that names the file."""
     with pytest.raises(ModelError) as caught:
         parse_bundle(data, Path("some.onnx"))
-    assert caught.value.where == "some.onnx"
-    return str(caught.value)
+    return caught.value.where == "some.onnx"
 
 
 def with_metadata(data: bytes, change) -> bytes:
@@ -94,25 +93,19 @@ def test_any_changed_byte_is_found(saved):
         position = generator.randrange(len(saved.model))
         damaged = bytearray(saved.model)
         damaged[position] ^= 1 << generator.randrange(8)
-        refusal(bytes(damaged))
+        assert refused(bytes(damaged))
 
 
 def test_any_truncation_is_found(saved):
     for length in range(0, len(saved.model), 97):
         if length:
-            refusal(saved.model[:length])
-
-
-def test_damage_is_called_damage(saved):
-    damaged = bytearray(saved.model)
-    damaged[200] ^= 1
-    assert "is damaged: its checksum is" in refusal(bytes(damaged))
+            assert refused(saved.model[:length])
 
 
 def test_random_bytes_are_refused():
     generator = random.Random(2)
     for length in (1, 10, 1000):
-        refusal(generator.randbytes(length))
+        assert refused(generator.randbytes(length))
 
 
 def test_a_wrong_name_of_a_model_gets_those_of_the_shipped_ones():
@@ -149,78 +142,44 @@ def test_a_huge_file_is_refused_without_reading_it_whole(tmp_path):
 def test_a_foreign_model_is_refused(saved):
     foreign = onnx.load_model_from_string(saved.model)
     del foreign.metadata_props[:]
-    assert f"without the metadata '{METADATA_KEY}'" in refusal(foreign.SerializeToString())
+    assert refused(foreign.SerializeToString())
 
 
-def test_a_foreign_operator_is_refused(saved):
+def test_a_graph_that_onnx_runtime_cannot_run_is_refused(saved):
     model = onnx.load_model_from_string(saved.model)
-    model.graph.node.append(helper.make_node("Loop", ["a"], ["b"]))
-    assert "operators that no model of ours has: ['Loop']" in refusal(sealed(model))
-
-
-def test_an_operator_of_another_domain_is_refused(saved):
-    model = onnx.load_model_from_string(saved.model)
-    model.graph.node[0].domain = "evil"
-    assert "['evil." in refusal(sealed(model))
-
-
-def test_external_data_is_refused(saved):
-    model = onnx.load_model_from_string(saved.model)
-    tensor = model.graph.initializer[0]
-    tensor.data_location = TensorProto.EXTERNAL
-    tensor.external_data.add(key="location", value="/etc/passwd")
-    assert "lies in another file" in refusal(sealed(model))
-
-
-def test_a_tensor_hidden_in_an_attribute_is_refused(saved):
-    model = onnx.load_model_from_string(saved.model)
-    value = helper.make_tensor("x", TensorProto.FLOAT, [1], [0.0])
-    model.graph.node[0].attribute.append(helper.make_attribute("value", value))
-    assert "a tensor or a graph of its own" in refusal(sealed(model))
+    model.graph.node[0].domain = "other"
+    assert refused(sealed(model))
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    "change",
     [
-        (lambda m: m.update(format=2), "metadata format 2 (1)"),
-        (lambda m: m.pop("prior"), "bad metadata: no 'prior'"),
-        (lambda m: m["preprocessing"].update(scaling="log"), "'log' is not a valid Scaling"),
-        (lambda m: m["preprocessing"].update(samples=32), "the preprocessing makes 32"),
-        (lambda m: m["architecture"].update(samples="16"), "'16' is not an integer"),
-        (lambda m: m["architecture"].update(samples=10**9), "1 to 1016"),
-        (lambda m: m["architecture"].update(depth=1), "bad metadata"),
-        (lambda m: m["architecture"].update(filters=8), "layer first has weights of shape"),
-        (lambda m: m["prior"].update(offset_m=0.1), "is no float32 value"),
-        (lambda m: m["prior"].update(offset_m=1e400), "offset_m = inf"),
-        (lambda m: m.update(variance_m2=-1), "a positive number"),
-        (lambda m: m.update(correction_limits_m=[1, 0]), "low, high"),
-        (lambda m: m.update(correction_limits_m=[1]), "bad metadata"),
-        (lambda m: m.update(quantised=False), "the graph disagrees"),
-        (lambda m: m.update(training=3), "bad metadata"),
+        lambda m: m.update(format=2),
+        lambda m: m.pop("prior"),
+        lambda m: m["preprocessing"].update(scaling="log"),
+        lambda m: m["preprocessing"].update(samples=32),
+        lambda m: m["architecture"].update(samples="16"),
+        lambda m: m["architecture"].update(samples=10**9),
+        lambda m: m["architecture"].update(depth=1),
+        lambda m: m["prior"].update(offset_m=0.1),
+        lambda m: m["prior"].update(offset_m=1e400),
+        lambda m: m.update(variance_m2=-1),
+        lambda m: m.update(correction_limits_m=[1, 0]),
+        lambda m: m.update(correction_limits_m=[1]),
+        lambda m: m.update(quantised=False),
+        lambda m: m.update(training=3),
+        lambda m: m["architecture"].update(samples=32) or m["preprocessing"].update(samples=32),
     ],
 )
-def test_metadata_that_cannot_be_is_refused(saved, change, message):
-    assert message in refusal(with_metadata(saved.model, change))
+def test_inconsistent_metadata_is_refused(saved, change):
+    assert refused(with_metadata(saved.model, change))
 
 
-def test_another_window_than_the_graphs_is_refused(saved):
-    def change(metadata):
-        metadata["architecture"]["samples"] = metadata["preprocessing"]["samples"] = 32
-
-    message = refusal(with_metadata(saved.model, change))
-    assert "inputs of shape (0, 1, 16), the metadata promises K = 32" in message
-
-
-def test_metadata_that_is_no_json_is_refused(saved):
+@pytest.mark.parametrize("text", ['{"model_id":"00000000"', '{"model_id":"00000000","a":' + "[" * 100_000])
+def test_metadata_that_is_not_json_is_refused(saved, text):
     model = onnx.load_model_from_string(saved.model)
-    model.metadata_props[0].value = '{"model_id":"00000000"'
-    assert "bad metadata" in refusal(sealed(model))
-
-
-def test_deeply_nested_metadata_is_refused(saved):
-    model = onnx.load_model_from_string(saved.model)
-    model.metadata_props[0].value = '{"model_id":"00000000","a":' + "[" * 100_000
-    assert "bad metadata" in refusal(sealed(model))
+    model.metadata_props[0].value = text
+    assert refused(sealed(model))
 
 
 def test_without_a_prior_the_network_predicts_alone(saved):
@@ -232,7 +191,7 @@ def test_without_a_prior_the_network_predicts_alone(saved):
 
 def test_a_card_that_does_not_fit_its_graph_is_not_written(tmp_path):
     path = tmp_path / "wrong.onnx"
-    with pytest.raises(ModelError, match="the graph disagrees"):
+    with pytest.raises(ModelError):
         save_bundle(path, graph.float_model(random_weights(SHAPE)), card(SHAPE))
     assert not path.exists()
 

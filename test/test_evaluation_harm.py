@@ -15,9 +15,9 @@ from uwb_mitigation.measurement import Cir, Encoding, Record
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.shipped import default_model_path, shipped_model_path
+from uwb_mitigation.paper.simulated import SimulatedDeepUwb
 from uwb_mitigation.preprocessing import Scaling
 from uwb_mitigation.sources.simulated import SimulatedSource
-from uwb_mitigation.sources.simulated_deepuwb import SimulatedDeepUwb
 
 EVERY = 15
 

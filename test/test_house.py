@@ -50,10 +50,9 @@ def test_the_doctor_comes_even_where_numpy_does_not():
     assert done.returncode == 1, done.stderr
     assert re.search(r"│ numpy +│ broken", done.stdout)
     assert re.search(r"│ shipped model +│ broken", done.stdout)
-    assert re.search(r"\nnumpy\b.*:\n    \S", done.stdout)
-    assert re.search(r"│ C compiler +│ ok", done.stdout) or shutil.which("cc") is None
+    assert re.search(r"broken: numpy.*make setup", done.stderr)
+    assert re.search(r"│ gcc +│ ok", done.stdout) or shutil.which("gcc") is None
     # ONNX Runtime says something of its own before.
-    assert re.fullmatch(r"uwb-mitigation: \d+ things are broken", done.stderr.splitlines()[-1])
     assert "Traceback" not in done.stderr
 
 

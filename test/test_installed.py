@@ -21,7 +21,7 @@ import yaml
 from compilers import NEEDS_CC
 from conftest import REPOSITORY
 
-from uwb_mitigation import installation
+from uwb_mitigation.commands.doctor import LIBRARIES, MODULES
 
 NAME = "uwb_mitigation"
 MESSAGES = "uwb_mitigation_msgs"
@@ -206,8 +206,8 @@ def without(absent: Iterable[str], name: str) -> list[str]:
 )
 def test_a_node_needs_little_to_run(tmp_path: Path, name: str, needed: set[str], words: str):
     pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
-    needless = installation.LIBRARIES.keys() - needed - {"numpy"}
-    absent = {installation.LIBRARIES[library].module.partition(".")[0] for library in needless}
+    needless = {library for libraries in LIBRARIES.values() for library in libraries} - needed - {"numpy"}
+    absent = {MODULES.get(library, library) for library in needless}
     options = ["--ros-args", "-p", "source:=simulated"] if name == "driver" else []
     start_and_end([*without(absent, name), *options], words, tmp_path)
 
@@ -335,7 +335,7 @@ def machine_requirements() -> set[str]:
     return {line.partition(">")[0] for line in lines if line and not line.startswith(("#", "-"))}
 
 
-@pytest.mark.parametrize("library", installation.LIBRARIES)
+@pytest.mark.parametrize("library", [library for libraries in LIBRARIES.values() for library in libraries])
 def test_every_library_has_a_rosdep_key_in_the_manifest_or_stands_in_the_requirements_of_a_ros_machine(
     library: str,
 ):

@@ -26,20 +26,11 @@ from uwb_mitigation.model.architecture import Remnet
 
 pytest.importorskip("torch", reason="run `make setup-training`")
 pytest.importorskip("sklearn", reason="run `make setup-training`")
-from uwb_mitigation.training import (
-    calibration,
-    cards,
-    choosing,
-    comparison,
-    experiment,
-    learning_rate,
-    pruning,
-    recipe,
-    search,
-)
-from uwb_mitigation.training import parts as recordings
+from uwb_mitigation.paper import experiment, learning_rate, pruning, search
+from uwb_mitigation.paper import parts as recordings
+from uwb_mitigation.paper.parts import Parts
+from uwb_mitigation.training import cards, choosing, comparison, recipe
 from uwb_mitigation.training.options import FitOptions
-from uwb_mitigation.training.parts import Parts
 
 SAMPLES = 8
 QUICK = FitOptions(epochs=1)
@@ -63,8 +54,8 @@ LEARNERS = {
     (cards, "calibrate"),
     (experiment.fitting, "fit"),
     (experiment.fitting, "descend"),
-    (calibration, "compare"),
-    (calibration, "quantize"),
+    (experiment, "calibrate"),
+    (experiment, "quantize"),
     (search, "fit"),
     (pruning, "fit"),
     (learning_rate, "range_test"),
@@ -220,7 +211,7 @@ def test_the_protocol_fits_and_calibrates_on_its_training_part(data, watch, tmp_
     wanted = experiment.tasks(["remnet", "remnet_attention", "mlp"], [SAMPLES], seeds=1)
     with watch.without(parts(data).test.names):
         experiment.run(parts(data), tmp_path, wanted, QUICK)
-    watch.called("calibration.compare", "fitting.fit", "fitting.descend")
+    watch.called("experiment.calibrate", "fitting.fit", "fitting.descend")
     watch.called("baselines.los_median", "baselines.overall_median", "lad.fit_prior")
 
 
@@ -252,7 +243,7 @@ def test_the_protocols_variances_are_of_configurations_that_were_not_fitted_to(d
 
 
 def typed(data: Dataset, monkeypatch: pytest.MonkeyPatch, *words: object) -> None:
-    monkeypatch.setattr(recordings, "load", lambda *_, **__: ("made up", data))
+    monkeypatch.setattr(recordings, "load", lambda *_, **__: ("made up", True, data))
     result = CliRunner().invoke(app, [str(word) for word in words])
     if result.exception is not None:
         raise result.exception
@@ -272,7 +263,7 @@ def test_a_search_trains_on_neither_its_validation_part_nor_the_test_part(data, 
     test = set(data.rows(in_room_2(data)).names)
     options = ("--random", 2, "--grid", 1, "--windows", SAMPLES, "--epochs", 1, "--workers", 1)
     with watch.without(test):
-        typed(data, monkeypatch, "search", "--data", "x", "-o", tmp_path, *options)
+        typed(data, monkeypatch, "paper", "search", "--data", "x", "-o", tmp_path, *options)
     watch.called("search.fit")
     assert seen == [set(data.names) - {n for n in data.names if "room0" in n or "room4" in n} - test]
 
@@ -281,7 +272,16 @@ def test_every_other_command_trains_on_the_training_part(data, watch, monkeypatc
     quick = ("--networks", "remnet", "--windows", SAMPLES, "--seeds", 1, "--epochs", 1, "--workers", 1)
     smaller = ("-o", tmp_path / "smaller.onnx", "--filters", 4, "--epochs", 1)
     with watch.without(data.rows(in_room_2(data)).names):
-        typed(data, monkeypatch, "train-lr-range", "--data", "x", "--samples", SAMPLES, "--steps", 20)
-        typed(data, monkeypatch, "protocol", "--data", "x", "-o", tmp_path, *quick)
-        typed(data, monkeypatch, "prune", tmp_path / "remnet_8_seed0_float.onnx", "--data", "x", *smaller)
-    watch.called("learning_rate.range_test", "calibration.compare", "pruning.fit")
+        typed(data, monkeypatch, "paper", "lr-range", "--data", "x", "--samples", SAMPLES, "--steps", 20)
+        typed(data, monkeypatch, "paper", "protocol", "--data", "x", "-o", tmp_path, *quick)
+        typed(
+            data,
+            monkeypatch,
+            "paper",
+            "prune",
+            tmp_path / "remnet_8_seed0_float.onnx",
+            "--data",
+            "x",
+            *smaller,
+        )
+    watch.called("learning_rate.range_test", "experiment.calibrate", "pruning.fit")

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from uwb_mitigation.bag.poses import tag_frame, tag_of_frame
-from uwb_mitigation.measurement import Cir, Encoding, Origin, Status, format_id
+from uwb_mitigation.errors import format_id
+from uwb_mitigation.measurement import Cir, Encoding, Origin, Status
 
 
 def test_a_complex_sample_counts_once():

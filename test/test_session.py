@@ -14,8 +14,8 @@ from model_material import bundle, card, random_weights, windows
 from uwb_mitigation.errors import ModelError
 from uwb_mitigation.model import floating, graph
 from uwb_mitigation.model.architecture import Remnet
-from uwb_mitigation.model.bundle import save_bundle
-from uwb_mitigation.model.runtime import Session, session_options
+from uwb_mitigation.model.bundle import save_bundle, session_options
+from uwb_mitigation.model.runtime import Session
 from uwb_mitigation.model.shipped import default_model_path, model_path, shipped_model_path
 from uwb_mitigation.preprocessing import Scaling
 
@@ -75,9 +75,9 @@ def test_a_graph_that_onnx_runtime_refuses_is_a_model_error(tmp_path):
     broken = onnx.load_model_from_string(good.model)
     del broken.metadata_props[:]
     broken.graph.node[0].input[0] = "nowhere"
-    model = save_bundle(tmp_path / "broken.onnx", broken.SerializeToString(), good.card)
-    with pytest.raises(ModelError, match=r"broken\.onnx: ONNX Runtime .* refuses the model"):
-        Session(model)
+    with pytest.raises(ModelError) as caught:
+        save_bundle(tmp_path / "broken.onnx", broken.SerializeToString(), good.card)
+    assert caught.value.where.endswith("broken.onnx")
 
 
 def test_the_shipped_model_is_found_in_a_checkout():
@@ -85,10 +85,11 @@ def test_the_shipped_model_is_found_in_a_checkout():
     assert default_model_path(Scaling.MAX).name == "universal_amplitude.onnx"
 
 
-def test_a_model_is_named_by_its_file_or_as_it_ships():
+def test_a_model_is_named_by_its_file_or_as_it_ships(tmp_path):
     assert model_path("") == model_path(None) == default_model_path()
     assert model_path(Path("evk1000_apartment")) == shipped_model_path("evk1000_apartment")
-    assert model_path("folder/own.onnx") == Path("folder/own.onnx")
+    (tmp_path / "own.onnx").touch()
+    assert model_path(str(tmp_path / "own.onnx")) == tmp_path / "own.onnx"
 
 
 def test_the_shipped_model_is_found_in_a_sourced_workspace(tmp_path, monkeypatch):

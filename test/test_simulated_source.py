@@ -7,21 +7,18 @@ import json
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from uwb_mitigation.cli import app
-from uwb_mitigation.commands import data
 from uwb_mitigation.errors import ParameterError
-from uwb_mitigation.measurement import DEVICE_TICK_HZ, Encoding, Record
-from uwb_mitigation.preprocessing import WINDOW_LEAD, Preprocessing, Scaling
+from uwb_mitigation.measurement import DEVICE_TICK_HZ, Record
+from uwb_mitigation.preprocessing import Preprocessing
 from uwb_mitigation.simulation.radio import TAPS, Radio
-from uwb_mitigation.simulation.rooms import OBSTACLES, ROOMS, obstruct
+from uwb_mitigation.simulation.rooms import OBSTACLES, obstruct
 from uwb_mitigation.simulation.scene import ROUTE, FloorPlan, along_route
-from uwb_mitigation.sources import deepuwb
 from uwb_mitigation.sources.mcap import McapRecording
 from uwb_mitigation.sources.simulated import (
     FIRST_TAG_ID,
@@ -29,8 +26,6 @@ from uwb_mitigation.sources.simulated import (
     SimulatedSource,
     SimulatedSurvey,
 )
-from uwb_mitigation.sources.simulated_deepuwb import SimulatedDeepUwb
-from uwb_mitigation.sources.source import Source
 
 
 def values(record: Record) -> tuple[object, ...]:
@@ -187,85 +182,7 @@ def test_levels_are_of_the_order_of_real_logs(survey: list[Record]) -> None:
     assert 0.2 < np.min(peaks) < np.max(peaks) < 1.6
 
 
-# --- in the shape of DeepUWB ------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def rooms() -> list[Record]:
-    return list(SimulatedDeepUwb(seed=3, ranges=900, exchanges=4))
-
-
-def room(record: Record) -> int:
-    assert record.truth is not None
-    return deepuwb.room_of(record.truth.configuration)
-
-
-def test_rooms_and_obstacles_are_those_of_deepuwb() -> None:
-    assert tuple(one.name for one in ROOMS) == deepuwb.ROOMS
-    assert tuple(one.name for one in OBSTACLES) == deepuwb.MATERIALS
-
-
-def test_each_room_has_the_published_number_of_rows_or_its_share(rooms: list[Record]) -> None:
-    assert SimulatedDeepUwb().rows == (954, 18_422, 13_210, 17_601, 4_971)
-    counted = np.bincount([room(record) for record in rooms])
-    assert counted.tolist() == list(SimulatedDeepUwb(ranges=900).rows)
-    assert np.abs(counted / 900 - np.array(SimulatedDeepUwb().rows) / 55_158).max() < 0.002
-
-
-def test_the_splits_by_room_apply(rooms: list[Record]) -> None:
-    names = [record.truth.configuration for record in rooms if record.truth]
-    train, test = deepuwb.split_rows(names, deepuwb.RoomSplit.PAPER)
-    assert {room(record) for record, chosen in zip(rooms, train, strict=True) if chosen} == {1, 3}
-    assert {room(record) for record, chosen in zip(rooms, test, strict=True) if chosen} == {2}
-    assert deepuwb.has_rooms(names)
-    assert not deepuwb.has_rooms([*names, "simulated survey seed 1/placement 3"])
-
-
-def test_a_row_says_that_it_is_simulated(rooms: list[Record]) -> None:
-    source = SimulatedDeepUwb()
-    assert source.simulated
-    assert "simulated" in source.name
-    assert all("simulated" in record.truth.configuration for record in rooms if record.truth)
-
-
-def test_a_configuration_is_one_placement(rooms: list[Record]) -> None:
-    distance: dict[str, list[float]] = {}
-    for record in rooms:
-        assert record.truth is not None
-        distance.setdefault(record.truth.configuration, []).append(record.truth.range_m)
-    assert all(len(set(values)) == 1 and len(values) <= 4 for values in distance.values())
-    assert len({values[0] for values in distance.values()}) == len(distance) >= 150
-
-
-def test_cirs_are_cut_and_normalised_and_levels_known(rooms: list[Record]) -> None:
-    preprocessing, out = Preprocessing(157, Scaling.MAX), np.empty(157, np.float32)
-    for record in rooms:
-        cir = record.measurement.cir
-        assert (len(cir), cir.encoding, cir.preamble_count) == (157, Encoding.MAGNITUDE, 0)
-        assert cir.samples.max() * cir.scale == pytest.approx(1.0)
-        assert math.isfinite(cir.rx_power_dbm - cir.first_path_power_dbm)
-        assert preprocessing.apply(cir, out) is None
-
-
-def test_the_cut_begins_five_samples_before_the_first_path(rooms: list[Record]) -> None:
-    clear = [r.measurement.cir.samples for r in rooms if r.truth and r.truth.label == "LOS"]
-    rise = np.median([np.argmax(samples > 0.3 * deepuwb.FULL_SCALE) for samples in clear])
-    assert abs(rise - WINDOW_LEAD) <= 1
-
-
-def test_labels_are_of_what_stands_in_the_path(rooms: list[Record]) -> None:
-    for record in rooms:
-        assert record.truth is not None
-        materials = deepuwb.materials_of(record.truth.configuration)
-        assert record.truth.label == ("NLOS" if materials else "LOS")
-        if room(record) == 0:
-            assert "wall" in materials
-    assert errors_of(rooms, "LOS").mean() + 0.05 < errors_of(rooms, "NLOS").mean()
-
-
-def test_a_room_is_the_same_however_many_ranges_are_asked_for(rooms: list[Record]) -> None:
-    few = [values(r) for r in SimulatedDeepUwb(seed=3, ranges=100, exchanges=4) if room(r) == 1]
-    assert few == [values(record) for record in rooms if room(record) == 1][: len(few)]
+# --- the commands ---
 
 
 def test_every_obstacle_stands_in_the_path_wherever_it_is_put() -> None:
@@ -278,27 +195,7 @@ def test_every_obstacle_stands_in_the_path_wherever_it_is_put() -> None:
             assert (path.loss_db[0] > 6.0) >= (obstacle.material is None)
 
 
-@pytest.mark.parametrize(
-    ("like", "expected"),
-    [("deepuwb", 55_158), ("buildings", 20_000), ("survey", 20_000), ("drive", 20_000)],
-)
-def test_how_many_ranges_need_not_be_said(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, like: str, expected: int
-) -> None:
-    totals: list[int] = []
-
-    def few(*arguments: Any) -> tuple[Source, int]:
-        totals.append(whole(*arguments)[1])
-        return SimulatedSource(count=1), 1
-
-    whole = data.simulated_source
-    monkeypatch.setattr(data, "simulated_source", few)
-    words = ["data", "simulate", "--like", like, "-o", str(tmp_path / "sim.mcap")]
-    assert CliRunner().invoke(app, words).exit_code == 0
-    assert totals == [expected]
-
-
-@pytest.mark.parametrize("like", ["deepuwb", "buildings", "survey", "drive"])
+@pytest.mark.parametrize("like", ["buildings", "survey", "drive"])
 def test_the_command_line_writes_a_bag_that_says_it_is_simulated(tmp_path: Path, like: str) -> None:
     ranges = 100
     words = ["data", "simulate", "--like", like, "--ranges", str(ranges), "-o", str(tmp_path / "sim.mcap")]
@@ -308,7 +205,7 @@ def test_the_command_line_writes_a_bag_that_says_it_is_simulated(tmp_path: Path,
     result = json.loads((tmp_path / "sim.json").read_text())
     lost = result["skipped"].get(NOT_RECEIVED, 0)
     assert result["simulated"]
-    assert result["ranges"] == (ranges if like == "deepuwb" else ranges - lost)
+    assert result["ranges"] == ranges - lost
     read = McapRecording(tmp_path / "sim.mcap")
     assert read.simulated
     assert sum(1 for _ in read) == result["ranges"]
@@ -319,8 +216,6 @@ def test_the_command_line_writes_a_bag_that_says_it_is_simulated(tmp_path: Path,
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (["--ranges", "7"], "100 to"),
-        (["--ranges", "0"], "100 to"),
         (["--like", "survey", "--ranges", "30"], "a multiple of"),
         (["--like", "survey", "--exchanges", "0"], "a multiple of"),
         (["--like", "drive", "--ranges", "0"], "1 or more"),
@@ -352,9 +247,6 @@ def test_a_simulation_that_cannot_be_is_refused_and_leaves_no_file(
         (lambda: SimulatedSource(route=((0.0, 0.0), (1.0, 1.0))), "route", "2", "3 to 10000"),
         (lambda: SimulatedSurvey(configurations=0), "configurations", "0", "1 to"),
         (lambda: SimulatedSurvey(exchanges=1001), "exchanges", "1001", "1 to 1000"),
-        (lambda: SimulatedDeepUwb(ranges=99), "ranges", "99", "100 to"),
-        (lambda: SimulatedDeepUwb(exchanges=0), "exchanges", "0", "1 to 1000"),
-        (lambda: SimulatedDeepUwb(seed=-1), "seed", "-1", "0 to"),
         (lambda: SimulatedSurvey(plan=FloorPlan((1.0, 9.0))), "plan size in x", "1.0", "2 to 1000"),
     ],
 )

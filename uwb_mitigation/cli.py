@@ -27,10 +27,9 @@ from uwb_mitigation.commands import (
     link,
     model,
     offset,
+    paper,
     positioning,
     process,
-    report,
-    training,
     universal,
     view,
 )
@@ -71,11 +70,7 @@ PANELS: dict[str, dict[str, typer.Typer | Callable[..., None]]] = {
         "build-image": firmware.build_image,
     },
     "The paper": {
-        "protocol": training.protocol,
-        "search": training.search,
-        "train-lr-range": training.train_lr_range,
-        "prune": training.prune,
-        "report": report.report,
+        "paper": paper.app,
     },
     "Installation and speed": {
         "doctor": doctor.doctor,

@@ -97,3 +97,8 @@ def not_imported(error: ImportError) -> MissingDependencyError | None:
 def not_installed(package: str) -> MissingDependencyError:
     """The error of a package that cannot be found."""
     return MissingDependencyError(f"{package} is not installed", valid="run uwb-mitigation doctor")
+
+
+def format_id(number: int) -> str:
+    """Return an id of a tag, anchor or board as text: small numbers in decimal, others as `0x` and 16 hex digits."""
+    return str(number) if number < 1 << 16 else f"0x{number:016x}"

@@ -30,11 +30,6 @@ LINE_OF_SIGHT_DB = 6.0
 APS006, part 3)."""
 
 
-def format_id(number: int) -> str:
-    """Return an id of a tag, anchor or board as text: small numbers in decimal, others as `0x` and 16 hex digits."""
-    return str(number) if number < 1 << 16 else f"0x{number:016x}"
-
-
 class Encoding(enum.IntEnum):
     """How `Cir.samples` holds the channel impulse response; the values of `Cir.msg`."""
 

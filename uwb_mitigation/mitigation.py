@@ -26,9 +26,6 @@ from uwb_mitigation.offsets import NO_OFFSETS, Offsets
 MAX_RANGE_M = 1e6
 """What lies beyond is no range: the radio reaches a few hundred metres."""
 
-UNCERTAIN_OFFSET_M = 0.1
-"""Standard deviation of an offset that comes without one."""
-
 MIN_COLUMNS = 4
 """Fewer measurements with CIRs alike are faster one by one."""
 
@@ -145,20 +142,19 @@ def passed_through(
 ) -> CorrectedRange:
     """The raw range of a measurement whose error was not predicted, less its radios' offset, with the variance of one.
 
-    The offset is known, whatever the CIR holds. Ranges without a CIR get a smaller variance if offsets are set: then the
-    variance of uncorrected ranges, which contains the offsets of the training boards, is far too large.
+    The offset is known, whatever the CIR holds. A range without a CIR from which an offset was subtracted gets the
+    variance of corrected ranges: that of uncorrected ranges contains the offsets of the training boards.
     """
     offset_m = offsets.of(measurement.tag_id, measurement.anchor_id)
     range_m = _less(measurement.range_m, offset_m)
-    variance_m2 = bundle.card.variance_uncorrected_m2
-    if status is Status.NO_CIR and offsets:
-        sd_m = offsets.pair_sd.get((measurement.tag_id, measurement.anchor_id), UNCERTAIN_OFFSET_M)
-        variance_m2 = min(variance_m2, bundle.card.variance_m2 + sd_m**2)
+    card = bundle.card
+    is_calibrated = status is Status.NO_CIR and offset_m != 0.0
+    variance_m2 = card.variance_m2 if is_calibrated else card.variance_uncorrected_m2
     return CorrectedRange(
         range_m=range_m,
         range_raw_m=measurement.range_m,
         correction_m=offset_m,
-        variance_m2=float(np.float32(variance_m2)) if _valid(range_m) else math.inf,
+        variance_m2=variance_m2 if _valid(range_m) else math.inf,
         status=status,
         origin=Origin.HOST,
         model_id=bundle.model_id,

@@ -23,9 +23,8 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.errors import ParameterError, format_id
 from uwb_mitigation.files import read_bounded
-from uwb_mitigation.measurement import format_id
 
 MAX_OFFSET_M = 10.0
 """A DW1000 whose antenna delay was never set is 154 m off: that belongs into the radio, as `antenna_delay`."""

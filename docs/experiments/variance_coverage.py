@@ -10,14 +10,14 @@ from uwb_mitigation.dataset import build_dataset
 from uwb_mitigation.evaluation.metrics import coverage
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.runtime import Session
-from uwb_mitigation.sources.deepuwb import RoomSplit, split_rows
+from uwb_mitigation.paper.rooms import split_by_name
 from uwb_mitigation.sources.opening import open_recording
 
 bundle = load_bundle(Path(sys.argv[2]))
 card = bundle.card
 with open_recording(Path(sys.argv[1])) as source:
     data = build_dataset(source, card.preprocessing)
-test = data.rows(split_rows(data.configurations, RoomSplit.PAPER)[1])
+test = data.rows(split_by_name(data.configurations, "paper")[1].test)
 predicted_m = Session(bundle).predict_batch_m(test.inputs)
 variance_m2 = card.variance_m2 + card.variance_per_m2 * predicted_m**2
 for sigmas in (1, card.interval95_sigmas):

@@ -105,7 +105,11 @@ uwb_status uwb_correct(const uwb_model *model, float range_m, float offset_m, co
         const int valid = model != NULL && in_limits(less_m, 0.0f, MAX_RANGE_M);
         corrected->range_m = less_m;
         corrected->correction_m = offset_m;
-        corrected->variance_m2 = valid ? model->variance_uncorrected_m2 : INFINITY;
+        /* Without an offset the variance contains the offsets of the training boards. */
+        const int calibrated = status == UWB_EMPTY && offset_m != 0.0f;
+        corrected->variance_m2 = !valid       ? INFINITY
+                                 : calibrated ? model->variance_m2
+                                              : model->variance_uncorrected_m2;
     }
     return status;
 }

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from uwb_mitigation.errors import RecordingError
+from uwb_mitigation.errors import RecordingError, format_id
 from uwb_mitigation.measurement import (
     Cir,
     CorrectedRange,
@@ -23,7 +23,6 @@ from uwb_mitigation.measurement import (
     RangeMeasurement,
     Status,
     Truth,
-    format_id,
 )
 
 LITTLE_ENDIAN = b"\x00\x01"

@@ -21,8 +21,7 @@ from uwb_mitigation.positioning.tracks import Heights
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
-    from uwb_mitigation.bag.index import Channel, RawMessage
-    from uwb_mitigation.bag.reader import BagReader
+    from uwb_mitigation.bag.reader import BagReader, Channel, RawMessage
 
 MOST_POSES = 2_000_000
 MOVES_M = 0.05

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from uwb_mitigation.bag import schemas
 from uwb_mitigation.bag.codec import LITTLE_ENDIAN
 from uwb_mitigation.bag.topics import ODOMETRY_TYPE
-from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.measurement import format_id
+from uwb_mitigation.errors import RecordingError, format_id
 from uwb_mitigation.positioning.tracks import Estimate, TruePath
 
 MAP = "map"

@@ -1,28 +1,141 @@
-"""Reads the messages of a bag, whatever their type: by topic, by time, in the order of their log times.
+"""Reads the messages of a bag by topic and time, in the order of their log times.
 
-A bag is one MCAP file or a rosbag2 folder. Nothing but the indexes and a few chunks is in memory.
+A bag is one MCAP file or a rosbag2 folder. The `mcap` library parses the records; lengths that a file claims are
+checked before memory is allocated for them. A file without a valid index is scanned once, so that a truncated
+recording is read up to the damage. Only the indexes and a few chunks are in memory.
 """
 
 from __future__ import annotations
 
+import struct
+import zlib
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass, field, replace
+from io import BytesIO
 from operator import attrgetter
 from pathlib import Path
-from typing import BinaryIO
+from typing import NamedTuple
 
+import lz4.frame  # type: ignore[import-untyped]
+import zstandard
+from mcap import records
+from mcap.exceptions import EndOfFile, McapError
+from mcap.reader import FOOTER_SIZE
+from mcap.stream_reader import MAGIC_SIZE, StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 
 from uwb_mitigation.bag import schemas
-from uwb_mitigation.bag.index import Channel, FileIndex, RawMessage, Span, index_of, messages_of
 from uwb_mitigation.bag.rosbag2 import bag_files
 from uwb_mitigation.errors import DamagedRecordingError, RecordingError
 
-MAX_PENDING = 256 << 20
-"""Bytes of messages held back to bring them into order; beyond, they leave as they are, and are counted."""
+MAX_RECORD = 256 << 20
+"""Maximum size of a record, and of an uncompressed chunk, in bytes: 300 times what rosbag2 writes."""
 
+MAX_PENDING = 256 << 20
+"""Maximum size of the messages that are held back to sort them, in bytes."""
+
+BAD_INDEX = "index at the end missing or damaged"
+"""Kind of warning in `BagReader.oddities`; the messages are complete."""
+
+_LIBRARY_ERRORS = (ValueError, McapError, struct.error)
 _log_time = attrgetter("log_time_ns")
+
+
+@dataclass(frozen=True, slots=True)
+class Schema:
+    """A message type as the file defines it."""
+
+    name: str
+    encoding: str
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """A topic in the file; `schema` is None if the file contains none for it."""
+
+    id: int
+    topic: str
+    encoding: str
+    metadata: dict[str, str]
+    schema: Schema | None
+
+
+class RawMessage(NamedTuple):
+    """A serialised message."""
+
+    channel: Channel
+    sequence: int
+    log_time_ns: int
+    publish_time_ns: int
+    data: bytes
+
+
+class _Chunk(NamedTuple):
+    """Where a chunk is, the times of its messages, and their channels (empty: unknown)."""
+
+    offset: int
+    first_ns: int
+    last_ns: int
+    channel_ids: frozenset[int]
+
+
+@dataclass(slots=True)
+class _FileIndex:
+    """What one file contains.
+
+    Attributes:
+        chunks: empty if the messages are not in chunks.
+        schemas, channels: by id.
+        metadata: metadata records by name.
+        messages: number of messages.
+        bounds_ns: first and last log time of messages that are not in chunks; None if there are none.
+        damage: (byte offset, description) of the first damage; None if none is known.
+        warnings: {kind: count}.
+    """
+
+    chunks: list[_Chunk] = field(default_factory=list)
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+    messages: int = 0
+    bounds_ns: tuple[int, int] | None = None
+    damage: tuple[int, str] | None = None
+    warnings: Counter[str] = field(default_factory=Counter)
+
+    def define(self, record: records.McapRecord) -> None:
+        """Add a schema, channel or metadata record; the first of an id or name is kept."""
+        if isinstance(record, records.Schema):
+            self.schemas.setdefault(record.id, Schema(record.name, record.encoding, record.data))
+        elif isinstance(record, records.Channel) and record.id not in self.channels:
+            schema = self.schemas.get(record.schema_id)
+            self.channels[record.id] = Channel(
+                record.id, record.topic, record.message_encoding, record.metadata, schema
+            )
+        elif isinstance(record, records.Metadata):
+            self.metadata.setdefault(record.name, record.metadata)
+
+    def message(self, record: records.Message) -> RawMessage:
+        """Resolve the channel of a message.
+
+        Raises:
+            ValueError: the channel is not defined.
+        """
+        channel = self.channels.get(record.channel_id)
+        if channel is None:
+            raise ValueError(f"a message on channel {record.channel_id}, which is not defined")
+        return RawMessage(channel, record.sequence, record.log_time, record.publish_time, record.data)
+
+    def may_contain(self, chunk: _Chunk, topics: Collection[str] | None) -> bool:
+        """Whether a chunk may contain messages of `topics`, so that it must be decompressed."""
+        channels = [self.channels.get(number) for number in chunk.channel_ids]
+        return (
+            topics is None
+            or not channels
+            or any(channel is None or channel.topic in topics for channel in channels)
+        )
 
 
 class BagReader:
@@ -34,7 +147,7 @@ class BagReader:
     Attributes:
         files: the files of the bag, in order.
         metadata: the MCAP metadata records, {name: {key: value}}; of several files, the first wins.
-        oddities: what was found beside the messages, {kind: count}.
+        oddities: warnings, {kind: count}.
 
     Raises:
         RecordingError: the path is absent, unreadable, or no MCAP bag; the message says which.
@@ -47,20 +160,19 @@ class BagReader:
         self.oddities: Counter[str] = Counter()
         for found in self._indexes:
             self.metadata = found.metadata | self.metadata
-            self.oddities += found.oddities
+            self.oddities += found.warnings
 
     @property
     def message_count(self) -> int:
-        """Messages on all topics, as the files' indexes say."""
+        """Number of messages on all topics, from the indexes of the files."""
         return sum(found.messages for found in self._indexes)
 
     @property
     def bounds_ns(self) -> tuple[int, int] | None:
-        """First and last log time on all topics, as the files' indexes say; None of an empty bag."""
-        spans = [span for found in self._indexes for span in found.spans]
-        if not spans:
-            return None
-        return min(span.first_ns for span in spans), max(span.last_ns for span in spans)
+        """First and last log time on all topics, from the indexes of the files; None if the bag is empty."""
+        bounds = [found.bounds_ns for found in self._indexes if found.bounds_ns is not None]
+        bounds += [(chunk.first_ns, chunk.last_ns) for found in self._indexes for chunk in found.chunks]
+        return (min(first for first, _ in bounds), max(last for _, last in bounds)) if bounds else None
 
     @property
     def topics(self) -> dict[str, str]:
@@ -69,7 +181,7 @@ class BagReader:
 
     @property
     def channels(self) -> list[Channel]:
-        """Those of all files; a topic has several where it is in several files, or was published by several."""
+        """Channels of all files; a topic has one for each file and publisher."""
         return [channel for found in self._indexes for channel in found.channels.values()]
 
     def messages(
@@ -78,56 +190,57 @@ class BagReader:
         start_ns: int | None = None,
         stop_ns: int | None = None,
     ) -> Iterator[RawMessage]:
-        """Messages of `topics` (None = all) with start_ns <= log time < stop_ns.
+        """Yield the messages of `topics` (None: all) with start_ns <= log time < stop_ns.
 
-        They come in the order of their log times within a file; files follow one another. What cannot
-        be brought into order within `MAX_PENDING` is counted in `oddities`.
+        They are in the order of their log times within a file; files follow one another. A file with
+        messages outside chunks is read in its own order.
 
         Raises:
-            DamagedRecordingError: a file is damaged; every message before the damage has been yielded.
-                A chunk that fails its checksum, or that the file ends in, yields none.
+            DamagedRecordingError: a file is damaged; every message before the damage has been yielded. A chunk
+                that is truncated or fails its checksum yields none.
         """
+        start = -1 if start_ns is None else start_ns
+        stop = 1 << 64 if stop_ns is None else stop_ns
         for path, found in zip(self.files, self._indexes, strict=True):
             try:
-                with path.open("rb") as stream:
-                    yield from self._ordered(stream, path, found, topics, start_ns, stop_ns)
+                with _BoundedFile(path) as file:
+                    read = _in_file_order if found.bounds_ns else self._in_time_order
+                    for message in read(file, found, topics, start, stop):
+                        if start <= message.log_time_ns < stop:
+                            yield message
             except OSError as error:  # noqa: PERF203 - once a file
                 raise RecordingError(f"cannot be read: {error.strerror}", where=str(path)) from error
 
-    def _ordered(
-        self,
-        stream: BinaryIO,
-        path: Path,
-        found: FileIndex,
-        topics: Collection[str] | None,
-        start_ns: int | None,
-        stop_ns: int | None,
+    def _in_time_order(
+        self, file: _BoundedFile, found: _FileIndex, topics: Collection[str] | None, start: int, stop: int
     ) -> Iterator[RawMessage]:
-        spans = sorted(
-            (span for span in found.spans if _overlaps(span, start_ns, stop_ns)),
-            key=lambda span: (span.first_ns, span.offset),
+        chunks = sorted(
+            (
+                chunk
+                for chunk in found.chunks
+                if chunk.last_ns >= start and chunk.first_ns < stop and found.may_contain(chunk, topics)
+            ),
+            key=lambda chunk: (chunk.first_ns, chunk.offset),
         )
         damage = found.damage
         pending: list[RawMessage] = []
-        for number, span in enumerate(spans):
-            # A damaged chunk may claim any time; those before it in the file are read all the same.
-            if (damage and span.offset > damage[0]) or not _may_hold(found, span, topics):
+        for number, chunk in enumerate(chunks):
+            # The header of a damaged chunk may claim any time: chunks before it in the file are still read.
+            if damage and chunk.offset > damage[0]:
                 continue
             try:
-                for message in messages_of(stream, found, span):
-                    if (
-                        (topics is None or message.channel.topic in topics)
-                        and (start_ns is None or message.log_time_ns >= start_ns)
-                        and (stop_ns is None or message.log_time_ns < stop_ns)
-                    ):
-                        # Not extend(): what was read before damage inside a run must stay.
-                        pending.append(message)  # noqa: PERF401
-            except ValueError as error:
-                damage = (span.offset, str(error))
+                inside = [
+                    found.message(each)
+                    for each in file.chunk(chunk.offset)
+                    if isinstance(each, records.Message)
+                ]
+            except _LIBRARY_ERRORS as error:
+                damage, inside = (chunk.offset, _description(error)), []
+            pending += (each for each in inside if topics is None or each.channel.topic in topics)
             pending.sort(key=_log_time)
-            if number + 1 == len(spans):
+            if number + 1 == len(chunks):
                 break
-            ready = bisect_right(pending, spans[number + 1].first_ns, key=_log_time)
+            ready = bisect_right(pending, chunks[number + 1].first_ns, key=_log_time)
             if sum(len(message.data) for message in pending[ready:]) > MAX_PENDING:
                 self.oddities["chunks too far out of order to sort"] += 1
                 ready = len(pending)
@@ -135,19 +248,14 @@ class BagReader:
             del pending[:ready]
         yield from pending
         if damage:
-            offset, what = damage
-            raise DamagedRecordingError(
-                f"damaged: {what}",
-                where=f"{path}, byte {offset}",
-                valid="everything before that byte was read",
-            )
+            raise _damaged(file.path, *damage)
 
 
 def check_channel(channel: Channel, type_name: str, path: Path) -> None:
-    """Refuse a channel of the bag at `path` whose messages this package would misread as `type_name`.
+    """Check that the messages of a channel of the bag at `path` can be decoded as `type_name`.
 
     Raises:
-        RecordingError: it has no schema, or its type, encoding or fields are others.
+        RecordingError: its schema is missing, or its type, encoding or fields differ.
     """
     place = f"{path}, topic {channel.topic}"
     if channel.schema is None:
@@ -169,10 +277,84 @@ def check_channel(channel: Channel, type_name: str, path: Path) -> None:
         )
 
 
-def _index(path: Path) -> FileIndex:
+class _BoundedFile:
+    """An MCAP file as the stream that the library reads from.
+
+    A read beyond the end of the file or `MAX_RECORD` is an error instead of a short read or a large allocation.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._file = path.open("rb")
+        self.size = self._file.seek(0, 2)
+        self.seek(0)
+
+    def __enter__(self) -> _BoundedFile:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def seek(self, offset: int) -> None:
+        self.position = offset
+        self._file.seek(min(offset, self.size))
+
+    def read(self, length: int) -> bytes:
+        if not 0 <= length <= min(self.size - self.position, MAX_RECORD):
+            raise McapError(f"{length} bytes are expected where {max(self.size - self.position, 0)} are left")
+        self.position += length
+        return self._file.read(length)
+
+    def record(self, offset: int) -> records.McapRecord:
+        """Read the record at a byte offset, or the first one after it of a known kind.
+
+        Raises:
+            ValueError, McapError, struct.error: it is damaged, or larger than `MAX_RECORD`.
+        """
+        self.seek(offset)
+        reader = StreamReader(self, skip_magic=True, emit_chunks=True, record_size_limit=MAX_RECORD)  # type: ignore[arg-type]
+        return next(reader.records)
+
+    def chunk(self, offset: int) -> list[records.McapRecord]:
+        """Read and decompress the chunk at a byte offset.
+
+        Raises:
+            ValueError, McapError, struct.error: it is damaged, or larger than `MAX_RECORD`.
+        """
+        chunk = self.record(offset)
+        if not isinstance(chunk, records.Chunk):
+            raise McapError("no chunk where the index has one")
+        return _chunk_records(chunk)
+
+
+def _chunk_records(chunk: records.Chunk) -> list[records.McapRecord]:
+    """Decompress a chunk. The library alone would allocate any size that a compressed frame claims."""
+    size = chunk.uncompressed_size
+    if size > MAX_RECORD:
+        raise McapError(f"a chunk of {size} bytes uncompressed, more than the maximum of {MAX_RECORD}")
+    if chunk.compression not in _DECOMPRESSORS:
+        raise McapError(f"a chunk of unknown compression {chunk.compression[:32]!r}, not zstd, lz4 or none")
     try:
-        with path.open("rb") as stream:
-            magic = stream.read(len(MCAP0_MAGIC))
+        # One byte more than claimed, so that a chunk that contains more is detected.
+        data = _DECOMPRESSORS[chunk.compression](chunk.data, size + 1)
+    except (zstandard.ZstdError, RuntimeError, EOFError) as error:
+        raise McapError(f"a chunk that cannot be decompressed: {error}") from error
+    if len(data) != size:
+        raise McapError(f"a chunk that does not have the {size} bytes that it claims")
+    return breakup_chunk(replace(chunk, compression="", data=data), validate_crc=True)
+
+
+_DECOMPRESSORS: dict[str, Callable[[bytes, int], bytes]] = {
+    "": lambda data, limit: data[:limit],
+    "zstd": lambda data, limit: zstandard.ZstdDecompressor().stream_reader(data).read(limit),
+    "lz4": lambda data, limit: lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=limit),
+}
+
+
+def _index(path: Path) -> _FileIndex:
+    try:
+        with _BoundedFile(path) as file:
+            magic = file.read(min(file.size, MAGIC_SIZE))
             if not magic:
                 raise RecordingError("the file is empty", where=str(path), valid="an MCAP file")
             if magic != MCAP0_MAGIC:
@@ -181,18 +363,102 @@ def _index(path: Path) -> FileIndex:
                     where=str(path),
                     valid=f"MCAP starts with {MCAP0_MAGIC.hex(' ')}",
                 )
-            return index_of(stream)
+            try:
+                return _summary(file) or _scan(file)
+            except _LIBRARY_ERRORS:
+                found = _scan(file)
+                found.warnings[BAD_INDEX] += found.damage is None
+                return found
     except OSError as error:
         raise RecordingError(f"cannot be read: {error.strerror}", where=str(path)) from error
 
 
-def _overlaps(span: Span, start_ns: int | None, stop_ns: int | None) -> bool:
-    return (start_ns is None or span.last_ns >= start_ns) and (stop_ns is None or span.first_ns < stop_ns)
+def _summary(file: _BoundedFile) -> _FileIndex | None:
+    """Read the index at the end of a file; None if the file has none, or none of all of its messages.
+
+    Raises:
+        ValueError, McapError, struct.error: the index is damaged.
+    """
+    footer = file.record(max(file.size - FOOTER_SIZE - MAGIC_SIZE, 0))
+    if not isinstance(footer, records.Footer) or file.read(MAGIC_SIZE) != MCAP0_MAGIC:
+        raise McapError("no footer")
+    if footer.summary_start == 0:
+        return None
+    file.seek(footer.summary_start)
+    data = file.read(file.size - footer.summary_start)
+    # The checksum covers the footer up to itself; 0: there is none.
+    if footer.summary_crc not in (0, zlib.crc32(data[: -MAGIC_SIZE - 4])):
+        raise McapError("the index fails its checksum")
+    found = _FileIndex()
+    statistics: records.Statistics | None = None
+    for record in StreamReader(BytesIO(data), skip_magic=True).records:
+        if isinstance(record, records.ChunkIndex):
+            times, ids = (record.message_start_time, record.message_end_time), record.message_index_offsets
+            found.chunks.append(_Chunk(record.chunk_start_offset, *times, frozenset(ids)))
+        elif isinstance(record, records.MetadataIndex):
+            found.define(file.record(record.offset))
+        elif isinstance(record, records.Statistics):
+            statistics = record
+        else:
+            found.define(record)
+    if statistics is None:
+        return None
+    found.messages = statistics.message_count
+    counted = statistics.chunk_count, statistics.channel_count, statistics.schema_count
+    complete = counted == (len(found.chunks), len(found.channels), len(found.schemas))
+    return found if complete and (found.chunks or not found.messages) else None
 
 
-def _may_hold(found: FileIndex, span: Span, topics: Collection[str] | None) -> bool:
-    """False where the file's index shows that a span holds none of `topics`, so that it need not be unpacked."""
-    if topics is None or not span.channel_ids:
-        return True
-    channels = [found.channels.get(number) for number in span.channel_ids]
-    return any(channel is None or channel.topic in topics for channel in channels)
+def _scan(file: _BoundedFile) -> _FileIndex:
+    """Build the index from the records themselves; every chunk is decompressed once."""
+    found = _FileIndex()
+    offset = MAGIC_SIZE
+    try:
+        while not isinstance(record := file.record(offset), records.DataEnd):
+            if isinstance(record, records.Footer):
+                raise McapError("the data ends without its end record")
+            inside = _chunk_records(record) if isinstance(record, records.Chunk) else [record]
+            for each in inside:
+                found.define(each)
+            messages = [found.message(each) for each in inside if isinstance(each, records.Message)]
+            if messages:
+                found.messages += len(messages)
+                times = [message.log_time_ns for message in messages]
+                bounds = min(times), max(times)
+                if isinstance(record, records.Chunk):
+                    ids = frozenset(message.channel.id for message in messages)
+                    found.chunks.append(_Chunk(offset, *bounds, ids))
+                else:
+                    known = found.bounds_ns or bounds
+                    found.bounds_ns = min(known[0], bounds[0]), max(known[1], bounds[1])
+            offset = file.position
+    except _LIBRARY_ERRORS as error:
+        found.damage = (offset, _description(error))
+    return found
+
+
+def _in_file_order(
+    file: _BoundedFile, found: _FileIndex, topics: Collection[str] | None, start: int, stop: int
+) -> Iterator[RawMessage]:
+    """Yield the messages of a file in which some are not in chunks."""
+    offset, end = MAGIC_SIZE, found.damage[0] if found.damage else file.size
+    while offset < end and not isinstance(record := file.record(offset), records.DataEnd):
+        offset = file.position
+        for each in _chunk_records(record) if isinstance(record, records.Chunk) else [record]:
+            if isinstance(each, records.Message):
+                message = found.message(each)
+                if topics is None or message.channel.topic in topics:
+                    yield message
+    if found.damage:
+        raise _damaged(file.path, *found.damage)
+
+
+def _damaged(path: Path, offset: int, what: str) -> DamagedRecordingError:
+    return DamagedRecordingError(
+        f"damaged: {what}", where=f"{path}, byte {offset}", valid="everything before that byte was read"
+    )
+
+
+def _description(error: Exception) -> str:
+    """The library gives no reason for a record that is shorter than its fields."""
+    return "a field ends beyond its record" if isinstance(error, (EndOfFile, struct.error)) else str(error)

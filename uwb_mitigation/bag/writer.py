@@ -1,7 +1,7 @@
 """Writes a bag that `ros2 bag`, Foxglove and the `rosbags` library open: MCAP, profile ros2, zstd chunks.
 
-Nothing stands under the bag's name until it is whole: data goes to a `.part` file, which is renamed at
-the end and removed when the writer is left by an error or Ctrl-C.
+The `mcap` library writes the records. The output is atomic: data goes to a `.part` file, which is renamed at the end
+and removed if an error or Ctrl-C ends the writer.
 """
 
 from __future__ import annotations
@@ -21,14 +21,13 @@ from mcap.writer import Writer
 import uwb_mitigation
 from uwb_mitigation.bag import schemas
 from uwb_mitigation.bag.codec import encode_range, encode_truth
-from uwb_mitigation.bag.index import Channel
 from uwb_mitigation.bag.poses import encode_place
+from uwb_mitigation.bag.reader import Channel
 from uwb_mitigation.bag.rosbag2 import (
     METADATA_NAME,
     NO_QOS,
     TopicCount,
     describe,
-    described_files,
     dump,
     recorded_qos,
 )
@@ -66,35 +65,26 @@ def _bag_file(path: Path) -> Path:
 class BagWriter:
     """Writes one bag; a context manager, which finishes the bag or, on any exception, removes it.
 
-    A path that ends in `.mcap` becomes that one file, with a `metadata.yaml` beside it unless one that
-    describes another bag is there. Any other path becomes a rosbag2 folder.
-
     Args:
-        path: where the bag goes.
-        metadata: what to say of its origin, beside the package's version; `source` and `simulated`
-            (`true` or `false`) are what a reader of this package looks for.
-        force: replace a bag that is there.
-        described: write `metadata.yaml`; False where several one-file bags share a folder.
+        path: one file if it ends in `.mcap`, otherwise a rosbag2 folder.
+        metadata: origin of the bag; the version of the package is added. Readers of this package use `source` and
+            `simulated` (`true` or `false`).
+        force: replace an existing bag.
 
     Attributes:
         file: the MCAP file.
         counts: messages written, {topic: count}.
-        notice: what the user should know once the bag is finished; empty = nothing.
 
     Raises:
-        RecordingError: a bag is there and `force` is not given, or the path cannot be written.
+        RecordingError: the bag exists and `force` is not given, or the path cannot be written.
     """
 
-    def __init__(
-        self, path: Path, metadata: Mapping[str, str], *, force: bool = False, described: bool = True
-    ) -> None:
+    def __init__(self, path: Path, metadata: Mapping[str, str], *, force: bool = False) -> None:
         self._folder = None if path.suffix == ".mcap" else path
         self.file = _bag_file(path)
         self._partial = partial_file(path)
-        self._described = described
         self._metadata = {"version": uwb_mitigation.__version__, **metadata}
         self.counts: Counter[str] = Counter()
-        self.notice = ""
         self._channels: dict[str, int] = {}
         self._copied: dict[tuple[object, ...], int] = {}
         self._names: dict[int, str] = {}
@@ -258,27 +248,9 @@ class BagWriter:
             self._mcap.finish()  # type: ignore[no-untyped-call]
             self._close()
             self._partial.replace(self.file)
-            if self._may_describe():
+            if self._folder is not None:
                 text = dump({"rosbag2_bagfile_information": document})
                 write_whole(self.file.with_name(METADATA_NAME), text, RecordingError)
-
-    def _may_describe(self) -> bool:
-        """Whether `metadata.yaml` is ours to write; leaves a notice where it is another's."""
-        if not self._described:
-            return False
-        if self._folder is not None:
-            return True
-        try:
-            described = described_files(self.file.parent)
-        except RecordingError:
-            described = []
-        if described is None or described == [self.file.name]:
-            return True
-        self.notice = (
-            f"{self.file.with_name(METADATA_NAME)} describes another bag and was left as it is: "
-            f"open {self.file.name} itself, not its folder"
-        )
-        return False
 
     def _close(self) -> None:
         stream, self._stream = self._stream, None

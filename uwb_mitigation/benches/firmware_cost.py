@@ -13,7 +13,6 @@ import onnxruntime
 from numpy.typing import NDArray
 
 from uwb_mitigation.benches.random_networks import mlp, pressing_windows, remnet
-from uwb_mitigation.evaluation import paper
 from uwb_mitigation.firmware_export import emulator
 from uwb_mitigation.firmware_export.cycles import estimate_cycles
 from uwb_mitigation.firmware_export.export import golden_windows, identity, write_header
@@ -22,10 +21,10 @@ from uwb_mitigation.firmware_export.packing import PackedNetwork, pack
 from uwb_mitigation.firmware_export.toolchain import Kernels, Target, build_image, measure_size
 from uwb_mitigation.model import graph
 from uwb_mitigation.model.architecture import Mlp
-from uwb_mitigation.model.bundle import Bundle
+from uwb_mitigation.model.bundle import Bundle, session_options
 from uwb_mitigation.model.prior import LinePrior
-from uwb_mitigation.model.runtime import session_options
 from uwb_mitigation.model.weights import Int8Weights
+from uwb_mitigation.paper import published
 from uwb_mitigation.preprocessing import Scaling
 
 CLOCK_HZ = 64e6
@@ -39,7 +38,7 @@ class Network:
     """A network to measure.
 
     Attributes:
-        network: `remnet` or `mlp`, as in `evaluation.paper`.
+        network: `remnet` or `mlp`, as in `paper.published`.
         first_kernel: k0; 0 for an MLP.
         packed: what the firmware is given.
         card: what the header says beside it.
@@ -94,7 +93,7 @@ class NetworkCost:
 
 
 def random_shapes(
-    windows: Sequence[int] = paper.WINDOWS, first_kernels: Sequence[int] = (3, 5), dense: bool = True
+    windows: Sequence[int] = published.WINDOWS, first_kernels: Sequence[int] = (3, 5), dense: bool = True
 ) -> Iterator[Network]:
     """A random network of every shape asked for."""
     for first_kernel in first_kernels:
@@ -146,7 +145,7 @@ def measure(
         result = emulator.run_windows(image, windows)
         cycles = estimate_cycles(image, emulator.count_executed(image, windows[len(windows) // 2]))
         flash = measure_size(folder, folder, kernels, optimisation).flash_bytes
-    printed = paper.MODELS.get((network.network, packed.samples))
+    printed = published.MODELS.get((network.network, packed.samples))
     hz = CLOCK_HZ / cycles
     wrong = (result.records["output_m"].view(np.uint32) != expected.view(np.uint32)) | (
         result.records["status"] != 0

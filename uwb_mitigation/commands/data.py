@@ -12,9 +12,7 @@ import typer
 
 from uwb_mitigation.commands import console
 from uwb_mitigation.commands.console import JsonOption
-from uwb_mitigation.commands.fetch import fetch
-from uwb_mitigation.errors import DamagedRecordingError, ParameterError, RecordingError
-from uwb_mitigation.measurement import format_id
+from uwb_mitigation.errors import DamagedRecordingError, ParameterError, RecordingError, format_id
 
 if TYPE_CHECKING:
     from uwb_mitigation.sources.inventory import Inventory
@@ -22,7 +20,6 @@ if TYPE_CHECKING:
     from uwb_mitigation.sources.source import Source
 
 app = typer.Typer(help="Bring recordings into bags, simulate them, look at them.", no_args_is_help=True)
-app.command()(fetch)
 
 _STRIDE = 100
 """Ranges between two updates of a progress bar."""
@@ -40,12 +37,8 @@ class Like(str, enum.Enum):
 
     DRIVE = "drive"
     SURVEY = "survey"
-    DEEPUWB = "deepuwb"
     BUILDINGS = "buildings"
 
-
-_RANGES = 20_000
-"""Where no number is asked for; in the shape of DeepUWB the source has its own."""
 
 LongestPauseOption = Annotated[
     float,
@@ -70,14 +63,6 @@ def import_recordings(
         ),
     ],
     cir: CirOption = CirChoice.FINAL,
-    trust: Annotated[
-        bool,
-        typer.Option(
-            "--trust",
-            help="Also read a pickle that is not the published one. A pickle is a program: reading it does "
-            "whatever its author wrote, with all that you may do.",
-        ),
-    ] = False,
     longest_pause: LongestPauseOption = _LONGEST_PAUSE_S,
     force: Annotated[bool, typer.Option("--force", help="Replace OUT if it exists.")] = False,
     json: JsonOption = None,
@@ -85,10 +70,9 @@ def import_recordings(
     """Write recordings into one MCAP bag, with truth where known."""
     from uwb_mitigation.bag.writer import BagWriter
     from uwb_mitigation.sources.inventory import Inventory
-    from uwb_mitigation.sources.opening import open_recording
     from uwb_mitigation.sources.pauses import Pauses
 
-    opened = [open_recording(path, cir=cir.value, trust_pickle=trust) for path in sources]
+    opened = [_opened(path, cir) for path in sources]
     inventory = Inventory()
     origin = {
         "source": "; ".join(source.name for source in opened),
@@ -122,8 +106,6 @@ def import_recordings(
     messages = bag.counts.total()
     _show_pauses(pauses)
     console.out.print(f"Wrote {messages} messages to {bag.file}.", markup=False, soft_wrap=True)
-    if bag.notice:
-        console.err.print(bag.notice, style="yellow", markup=False, soft_wrap=True)
     console.write_json(json, {"messages": messages, "output": str(bag.file), **inventory.as_json()})
     # What was readable is kept; that it is not everything must not pass unnoticed.
     if damage:
@@ -141,20 +123,16 @@ def simulate(
     like: Annotated[
         Like,
         typer.Option(
-            help="deepuwb: five rooms with obstacles, in DeepUWB's shape and size; buildings: placements in random "
-            "buildings, with boards that differ; survey: placements at rest in a flat; drive: a robot through that flat."
+            help="drive: a robot that drives through a flat; survey: static placements in that flat; buildings: placements "
+            "in random buildings, with different boards. `paper simulate`: DeepUWB's rooms."
         ),
-    ] = Like.DEEPUWB,
+    ] = Like.DRIVE,
     seed: Annotated[
         int, typer.Option(help="The same seed gives the same ranges, from today 0:00 UTC on.")
     ] = 1,
     ranges: Annotated[
-        int | None,
-        typer.Option(
-            help="How many; without it, 55158 as DeepUWB has, or 20000 of the others, less those "
-            "that are too weak to be received."
-        ),
-    ] = None,
+        int, typer.Option(help="Number of ranges, including those that are too weak to be received.")
+    ] = 20_000,
     exchanges: Annotated[int, typer.Option(help="For each placement at rest; a drive has none.")] = 20,
     anchors: Annotated[int, typer.Option(help="That a drive goes past, 4 to 8.")] = 4,
     longest_pause: LongestPauseOption = _LONGEST_PAUSE_S,
@@ -163,23 +141,20 @@ def simulate(
 ) -> None:
     """Simulate ranges with their truth, and write them to a bag.
 
-    The bag says that it is simulated.
-
-    Try the protocol and the report without hardware or a download:
-
-        uwb-mitigation data simulate --like deepuwb -o sim.mcap
-
-        uwb-mitigation protocol --data sim.mcap -o models
-
-        uwb-mitigation report --data sim.mcap --models models -o report
-
-    In a checkout, `make paper` does all of it.
+    The bag is marked as simulated.
     """
+    source = simulated_source(like, seed, ranges, exchanges, anchors)
+    write_simulated(source, ranges, seed, output, longest_pause, force, json)
+
+
+def write_simulated(
+    source: Source, total: int, seed: int, output: Path, longest_pause: float, force: bool, json: Path | None
+) -> None:
+    """Write a simulated source to a bag; `total` is the number of ranges for the progress bar."""
     from uwb_mitigation.bag.writer import BagWriter
     from uwb_mitigation.sources.inventory import Inventory
     from uwb_mitigation.sources.pauses import Pauses
 
-    source, total = simulated_source(like, seed, ranges, exchanges, anchors)
     inventory = Inventory()
     origin = {"source": source.name, "simulated": "true"}
     pauses = Pauses(longest_pause, _today_ns())
@@ -200,30 +175,20 @@ def simulate(
         highlight=False,
         soft_wrap=True,
     )
-    if bag.notice:
-        console.err.print(bag.notice, style="yellow", markup=False, soft_wrap=True)
     console.write_json(
         json, {"output": str(bag.file), "seed": seed, "simulated": True, **inventory.as_json()}
     )
 
 
-def simulated_source(
-    like: Like, seed: int, ranges: int | None, exchanges: int, anchors: int = 4
-) -> tuple[Source, int]:
-    """The simulator's source, and how many ranges it simulates.
+def simulated_source(like: Like, seed: int, ranges: int, exchanges: int, anchors: int = 4) -> Source:
+    """Return the simulator's source.
 
     Raises:
         ParameterError: a number is out of its range.
     """
     from uwb_mitigation.sources import simulated
     from uwb_mitigation.sources.simulated_buildings import SimulatedBuildings
-    from uwb_mitigation.sources.simulated_deepuwb import SimulatedDeepUwb
 
-    if like is Like.DEEPUWB:
-        chosen = {} if ranges is None else {"ranges": ranges}
-        rooms = SimulatedDeepUwb(seed=seed, exchanges=exchanges, **chosen)
-        return rooms, sum(rooms.rows)
-    ranges = _RANGES if ranges is None else ranges
     if like in (Like.SURVEY, Like.BUILDINGS):
         if exchanges < 1 or ranges % exchanges:
             raise ParameterError(
@@ -231,11 +196,22 @@ def simulated_source(
             )
         placements = ranges // exchanges
         if like is Like.BUILDINGS:
-            return SimulatedBuildings(seed=seed, placements=placements, exchanges=exchanges), ranges
-        return simulated.SimulatedSurvey(seed=seed, configurations=placements, exchanges=exchanges), ranges
+            return SimulatedBuildings(seed=seed, placements=placements, exchanges=exchanges)
+        return simulated.SimulatedSurvey(seed=seed, configurations=placements, exchanges=exchanges)
     if ranges < 1:
         raise ParameterError(f"{ranges} ranges", valid="1 or more: a drive has no end of its own")
-    return simulated.SimulatedSource.with_anchors(anchors, seed=seed, count=ranges), ranges
+    return simulated.SimulatedSource.with_anchors(anchors, seed=seed, count=ranges)
+
+
+def _opened(path: Path, cir: CirChoice) -> Source:
+    """Open any recording, DeepUWB's pickle included; raises as `open_recording`."""
+    from uwb_mitigation.sources.opening import open_recording
+
+    if path.suffix == ".pkl":
+        from uwb_mitigation.paper.deepuwb import DeepUwbRecording
+
+        return DeepUwbRecording(path)
+    return open_recording(path, cir=cir.value)
 
 
 @app.command()
@@ -247,9 +223,8 @@ def info(
     """Show what a recording holds: pairs, counts, oddities."""
     from uwb_mitigation.sources.inventory import Inventory
     from uwb_mitigation.sources.mcap import McapRecording
-    from uwb_mitigation.sources.opening import open_recording
 
-    source = open_recording(path, cir=cir.value)
+    source = _opened(path, cir)
     inventory = Inventory()
     try:
         with source, console.progress() as bar:

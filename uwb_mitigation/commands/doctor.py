@@ -1,8 +1,15 @@
-"""`uwb-mitigation doctor`."""
+"""`uwb-mitigation doctor`: checks the installation by using each part of it; serial ports are not opened."""
 
 from __future__ import annotations
 
-from dataclasses import asdict
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from functools import partial
+from importlib import import_module, metadata
+from typing import NamedTuple
 
 from rich.markup import escape
 from rich.table import Column, Table
@@ -11,30 +18,103 @@ from uwb_mitigation.commands import console
 from uwb_mitigation.commands.console import JsonOption
 from uwb_mitigation.errors import UwbMitigationError
 
-_STYLES = {"ok": "green", "broken": "red"}
+LIBRARIES = {
+    "": ("numpy", "onnxruntime", "pyyaml"),
+    "boards on a serial link": ("cobs", "pyserial"),
+    "bags": ("mcap", "rosbags", "zstandard", "lz4"),
+    "models, positions, reports and data sets": ("onnx", "scipy", "pydantic", "pandas", "pooch"),
+    "the command line, the viewer and benchmarks": ("typer", "rich", "bokeh", "psutil"),
+}
+"""{purpose: libraries that it needs}; nothing works without the first ones."""
+
+MODULES = {"pyyaml": "yaml", "pyserial": "serial"}
+_TOOLS = {
+    "gcc": "mitigator with backend:=firmware",
+    "arm-none-eabi-gcc": "building the firmware",
+    "qemu-system-arm": "running the firmware without a board",
+}
+_ROS = """
+from rclpy.utilities import get_rmw_implementation_identifier as middleware
+from uwb_mitigation_msgs import msg
+print(middleware(), msg.RangeCir.__class__.__import_type_support__() or "")
+"""
+
+
+class Finding(NamedTuple):
+    """Result of one check; `state` is ok, broken or optional (missing, and not required)."""
+
+    name: str
+    state: str
+    detail: str
 
 
 def doctor(json: JsonOption = None) -> None:
-    """Look at what is installed, and say how to mend it.
-
-    The exit code is 1 where something is broken; what is optional never is.
-    """
-    from uwb_mitigation.installation import State, examine
-
+    """Check the installation. The exit code is 1 if something is broken."""
     findings = list(examine())
-    broken = [finding for finding in findings if finding.state is State.BROKEN]
     table = Table("", "state", Column(overflow="fold"))
-    for finding in findings:
-        style = _STYLES.get(finding.state.value, "yellow")
-        table.add_row(finding.name, f"[{style}]{finding.state.value}[/]", escape(finding.detail))
+    for name, state, detail in findings:
+        table.add_row(name, {"ok": "[green]ok", "broken": "[red]broken"}.get(state, state), escape(detail))
     console.out.print(table)
-    for fix in dict.fromkeys(finding.fix for finding in findings if finding.fix):
-        names = ", ".join(finding.name for finding in findings if finding.fix == fix)
-        # A line of its own, whole: it is to be copied.
-        console.out.print(f"{names}:\n    {fix}", markup=False, highlight=False, soft_wrap=True)
-    console.write_json(json, {"ok": not broken, "findings": [asdict(finding) for finding in findings]})
+    broken = [name for name, state, _ in findings if state == "broken"]
+    console.write_json(json, {"ok": not broken, "findings": [finding._asdict() for finding in findings]})
     if broken:
-        raise UwbMitigationError(
-            "1 thing is broken" if len(broken) == 1 else f"{len(broken)} things are broken"
-        )
-    console.out.print("all is well")
+        raise UwbMitigationError(f"broken: {', '.join(broken)}", valid="run make setup, or see docs/robot.md")
+    console.out.print("No problems found.")
+
+
+def examine() -> Iterator[Finding]:
+    for purpose, names in LIBRARIES.items():
+        yield from (_check(name, partial(_version, name), name, purpose) for name in names)
+    yield _check("shipped model", _compare_model)
+    yield _check("ROS 2", _load_ros, "rclpy", "the nodes: source ROS and the workspace, or run make setup")
+    yield from _ports()
+    yield _check("torch", partial(metadata.version, "torch"), "torch", "training: make setup-training")
+    for tool, use in _TOOLS.items():
+        found = shutil.which(tool)
+        yield Finding(tool, "ok" if found else "optional", found or f"for {use}")
+
+
+def _check(name: str, look: Callable[[], str], distribution: str = "", purpose: str = "") -> Finding:
+    """Run one check. A distribution with a purpose is optional: it may be missing, but not broken."""
+    try:
+        return Finding(name, "ok", look())
+    except Exception as error:  # A broken library raises anything.
+        if purpose and not list(metadata.distributions(name=distribution)):
+            return Finding(name, "optional", f"not installed; for {purpose}")
+        return Finding(name, "broken", (str(error).strip().splitlines() or [type(error).__name__])[-1])
+
+
+def _version(distribution: str) -> str:
+    import_module(MODULES.get(distribution, distribution))
+    return metadata.version(distribution)
+
+
+def _load_ros() -> str:
+    """Load ROS in a process of its own, since it ends a process that cannot load its middleware."""
+    done = subprocess.run([sys.executable, "-c", _ROS], capture_output=True, text=True, timeout=60)
+    if done.returncode:
+        raise RuntimeError(done.stderr or f"exit code {done.returncode}")
+    return done.stdout.strip()
+
+
+def _compare_model() -> str:
+    from uwb_mitigation.firmware_export.export import compare_with_reference
+    from uwb_mitigation.model.bundle import load_bundle
+    from uwb_mitigation.model.shipped import default_model_path
+
+    bundle = load_bundle(default_model_path())
+    if wrong := compare_with_reference(bundle):
+        raise RuntimeError(f"{wrong} test vectors differ from the integer reference")
+    return f"{bundle.card.name}, bit-identical with the integer reference"
+
+
+def _ports() -> Iterator[Finding]:
+    try:
+        from serial.tools import list_ports
+    except ImportError:
+        return  # reported above
+    for port in sorted(list_ports.comports()):
+        if os.access(port.device, os.R_OK | os.W_OK):
+            yield Finding(port.device, "ok", port.description)
+        elif port.vid is not None:  # One without USB belongs to the computer, and rarely has a board.
+            yield Finding(port.device, "broken", "permission denied: join the group dialout, log in again")

@@ -10,8 +10,7 @@ import typer
 from uwb_mitigation.commands import console
 from uwb_mitigation.commands.bundles import ModelOption, bundle_for
 from uwb_mitigation.commands.console import JsonOption, Table
-from uwb_mitigation.errors import ParameterError
-from uwb_mitigation.measurement import format_id
+from uwb_mitigation.errors import ParameterError, format_id
 
 if TYPE_CHECKING:
     from uwb_mitigation.evaluation.radio_offsets import FoundOffset

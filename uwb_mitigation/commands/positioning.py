@@ -10,8 +10,7 @@ import typer
 
 from uwb_mitigation.commands import console
 from uwb_mitigation.commands.console import JsonOption
-from uwb_mitigation.errors import ParameterError, RecordingError
-from uwb_mitigation.measurement import format_id
+from uwb_mitigation.errors import ParameterError, RecordingError, format_id
 
 if TYPE_CHECKING:
     from uwb_mitigation.positioning.anchors import AnchorMap

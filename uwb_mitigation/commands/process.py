@@ -18,7 +18,6 @@ from uwb_mitigation.errors import ParameterError, RecordingError, UwbMitigationE
 
 if TYPE_CHECKING:
     from uwb_mitigation.processing.job import Job, Outcome
-    from uwb_mitigation.processing.pool import Event
 
 
 def process(
@@ -46,12 +45,6 @@ def process(
         ),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace outputs that exist.")] = False,
-    compare_copy: Annotated[
-        bool,
-        typer.Option(
-            "--compare-copy", help="Also time a loop that only reads and rewrites the bags, for comparison."
-        ),
-    ] = False,
     json: JsonOption = None,
 ) -> None:
     """Copy bags with a corrected range behind each raw one.
@@ -59,7 +52,7 @@ def process(
     All other messages stay as they are.
     """
     from uwb_mitigation.offsets import read_offsets
-    from uwb_mitigation.processing import planning, pool
+    from uwb_mitigation.processing import parallel, planning
     from uwb_mitigation.processing.job import Job
 
     if workers is not None and workers < 1:
@@ -70,19 +63,19 @@ def process(
     known = read_offsets(offsets or "")
     jobs = []
     for planned in bags:
-        described = planned.alone or planned.output.suffix != ".mcap"
         # Absolute, since a worker of a cluster has a working directory of its own.
         source, place, path = planned.source.absolute(), planned.output.absolute(), bundle.path.absolute()
-        jobs.append(Job(source, place, path, force, described, compare_copy, known))
+        jobs.append(Job(source, place, path, force, known))
         if not planned.alone:
             _make_folder(place.parent)
 
     started = time.perf_counter()
-    if scheduler is None:
-        events = pool.run_here(jobs, min(workers or pool.cores(), len(jobs)))
+    if scheduler is not None:
+        outcomes = _follow(jobs, parallel.run_on_dask(jobs, scheduler))
+    elif len(jobs) == 1:
+        outcomes = [_process_one(jobs[0])]
     else:
-        events = pool.run_on_dask(jobs, scheduler)
-    outcomes = _follow(jobs, events)
+        outcomes = _follow(jobs, parallel.run_here(jobs, workers or parallel.num_cores()))
     seconds = outcomes[0].seconds if len(jobs) == 1 else time.perf_counter() - started
     result = _result(outcomes, seconds, bundle.model_id)
     if any(outcome.written for outcome in outcomes):
@@ -100,31 +93,28 @@ def _make_folder(path: Path) -> None:
         ) from error
 
 
-def _follow(jobs: list[Job], events: Iterable[Event]) -> list[Outcome]:
-    """Show the progress; return the outcomes in the order of the jobs."""
-    from uwb_mitigation.processing.pool import Progress
+def _process_one(job: Job) -> Outcome:
+    from uwb_mitigation.processing.job import attempt
 
-    outcomes: dict[Job, Outcome] = {}
     with console.progress() as bar:
-        whole = bar.add_task(f"0 of {len(jobs)} bags", total=len(jobs), visible=len(jobs) > 1)
-        tasks = {}
-        for event in events:
-            if isinstance(event, Progress):
-                if event.job not in tasks:
-                    tasks[event.job] = bar.add_task(escape(event.job.source.name), total=None)
-                if event.total:
-                    bar.update(tasks[event.job], completed=event.done, total=event.total)
-                continue
-            outcomes[event.job] = event
-            if event.job in tasks:
-                bar.remove_task(tasks.pop(event.job))
-            bar.update(whole, completed=len(outcomes), description=f"{len(outcomes)} of {len(jobs)} bags")
-    return [outcomes[job] for job in jobs]
+        task = bar.add_task(escape(job.source.name), total=None)
+        return attempt(job, lambda done, total: bar.update(task, completed=done, total=total))
+
+
+def _follow(jobs: list[Job], outcomes: Iterable[Outcome]) -> list[Outcome]:
+    """Show the progress; return the outcomes in the order of the jobs."""
+    found: dict[Job, Outcome] = {}
+    with console.progress() as bar:
+        task = bar.add_task(f"0 of {len(jobs)} bags", total=len(jobs))
+        for outcome in outcomes:
+            found[outcome.job] = outcome
+            bar.update(task, completed=len(found), description=f"{len(found)} of {len(jobs)} bags")
+    return [found[job] for job in jobs]
 
 
 def _result(outcomes: list[Outcome], seconds: float, model_id: int) -> dict[str, Any]:
     ranges = sum(outcome.ranges for outcome in outcomes)
-    result: dict[str, Any] = {
+    return {
         "ranges": ranges,
         "ranges_per_s": ranges / seconds if seconds else 0.0,
         "messages": sum(outcome.messages for outcome in outcomes),
@@ -133,12 +123,6 @@ def _result(outcomes: list[Outcome], seconds: float, model_id: int) -> dict[str,
         "failed": sum(outcome.error is not None for outcome in outcomes),
         "bags": [_bag(outcome) for outcome in outcomes],
     }
-    # Bags that run side by side share the cores: rates of the copies are means over the bags' own times.
-    timed = [outcome for outcome in outcomes if outcome.copy_seconds]
-    if timed:
-        copied = sum(outcome.ranges for outcome in timed)
-        result["copy_only_ranges_per_s"] = copied / sum(outcome.copy_seconds or 0.0 for outcome in timed)
-    return result
 
 
 def _bag(outcome: Outcome) -> dict[str, Any]:
@@ -170,18 +154,11 @@ def _show(outcomes: list[Outcome], result: dict[str, Any]) -> None:
         )
     console.out.print(table)
     console.out.print(f"{result['ranges']} ranges, {result['ranges_per_s']:.0f} ranges/s", highlight=False)
-    if "copy_only_ranges_per_s" in result:
-        console.out.print(
-            f"only copied by the mcap library: {result['copy_only_ranges_per_s']:.0f} ranges/s",
-            highlight=False,
-        )
     for outcome in outcomes:
         if outcome.replaced:
             _note(outcome.job.source, f"{outcome.replaced} corrected ranges that it held were replaced")
         for kind, count in outcome.skipped.items():
             _note(outcome.job.source, f"{count} x {kind}")
-        if outcome.notice:
-            _note(outcome.job.output, outcome.notice)
 
 
 def _note(path: Path, text: str) -> None:

@@ -16,8 +16,8 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.errors import DatasetError, ParameterError
-from uwb_mitigation.measurement import LINE_OF_SIGHT_DB, Cir, Record, Status, format_id
+from uwb_mitigation.errors import DatasetError, ParameterError, format_id
+from uwb_mitigation.measurement import LINE_OF_SIGHT_DB, Cir, Record, Status
 from uwb_mitigation.mitigation import Mitigation, correct_batch
 from uwb_mitigation.model.familiarity import FIRST_PATH_TAPS
 from uwb_mitigation.model.prior import LinePrior

@@ -14,16 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError, ParameterError
-from uwb_mitigation.sources.deepuwb import RoomSplit, has_rooms, split_rows
 
 if TYPE_CHECKING:
     from uwb_mitigation.dataset import Dataset
-
-
-AUTO, CONFIGURATIONS = "auto", "configurations"
-SPLITS = (AUTO, CONFIGURATIONS, *(room.value for room in RoomSplit))
-FOLDS = 4
-"""Of data without rooms; one of them is the test part."""
 
 
 class Group(str, enum.Enum):
@@ -40,23 +33,6 @@ class Split:
 
     train: NDArray[np.intp]
     test: NDArray[np.intp]
-
-
-def by_name(configurations: NDArray[np.str_], name: str) -> tuple[str, Split]:
-    """One of `SPLITS` and what to tell people of it; AUTO is the paper's for DeepUWB, else CONFIGURATIONS.
-
-    Raises:
-        ParameterError: there is no such split. DatasetError: the data cannot be split.
-    """
-    if name not in SPLITS:
-        raise ParameterError(f"split {name!r}", valid=", ".join(SPLITS))
-    if name == AUTO:
-        name = RoomSplit.PAPER.value if has_rooms(configurations) else CONFIGURATIONS
-    if name == CONFIGURATIONS:
-        fold = by_configuration(configurations, FOLDS, seed=0)[0]
-        return f"{CONFIGURATIONS}: 1 of {FOLDS} parts held out", fold
-    train, test = split_rows(configurations, RoomSplit(name))
-    return name, Split(np.flatnonzero(train), np.flatnonzero(test))
 
 
 def by_configuration(configurations: NDArray[np.str_], folds: int, seed: int) -> list[Split]:

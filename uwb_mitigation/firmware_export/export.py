@@ -15,6 +15,7 @@ from uwb_mitigation.firmware_export.packing import PackedNetwork, pack
 from uwb_mitigation.model import graph
 from uwb_mitigation.model.bundle import Bundle
 from uwb_mitigation.model.integer import IntegerNetwork
+from uwb_mitigation.model.runtime import Session
 
 GOLDEN_VECTORS = 8
 
@@ -78,3 +79,11 @@ def golden_windows(network: PackedNetwork) -> NDArray[np.float32]:
     noise = random.uniform(0, 1, (GOLDEN_VECTORS - 2, network.samples)) * levels[:, None]
     rows = np.concatenate([np.zeros((1, network.samples)), np.full((1, network.samples), 1e4), noise])
     return (rows * float(network.input_scale)).astype(np.float32)
+
+
+def compare_with_reference(bundle: Bundle) -> int:
+    """Return the number of golden vectors for which ONNX Runtime and the integer reference are not bit-identical."""
+    weights = graph.int8_weights(bundle.model, bundle.architecture)
+    windows = golden_windows(pack(weights))
+    given, expected = Session(bundle).predict_batch_m(windows), IntegerNetwork(weights).predict_m(windows)
+    return int(np.sum(given.view(np.uint32) != expected.view(np.uint32)))

@@ -2,40 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.errors import ModelError
 from uwb_mitigation.model.bundle import Bundle
-
-if TYPE_CHECKING:
-    import onnxruntime
 
 
 class Session:
-    """A loaded network. Not for use by two threads at once: it owns its input and output buffers.
-
-    Raises:
-        ModelError: ONNX Runtime refuses the model.
-    """
+    """Runs the network of a bundle. Not for use by two threads at once: it owns its input and output buffers."""
 
     def __init__(self, bundle: Bundle) -> None:
-        # Only here: a node joins the graph while ONNX Runtime loads.
-        import onnxruntime
+        import onnxruntime  # loaded by the bundle already
 
         self.bundle = bundle
-        try:
-            self._session = onnxruntime.InferenceSession(
-                bundle.model, session_options(), providers=["CPUExecutionProvider"]
-            )
-        except Exception as error:  # ONNX Runtime's errors share no narrower base.
-            raise ModelError(
-                f"ONNX Runtime {onnxruntime.__version__} refuses the model: {error}",
-                where=str(bundle.path),
-                valid="build it anew with `uwb-mitigation train` and `quantize`",
-            ) from error
+        self._session = bundle.session
         self._input = np.zeros((1, 1, bundle.architecture.samples), np.float32)
         self._output = np.zeros((1, 1), np.float32)
         binding = self._session.io_binding()
@@ -59,18 +39,3 @@ class Session:
         outputs, name = self._names
         result: NDArray[np.float32] = self._session.run(outputs, {name: windows[:, None, :]})[0][:, 0]
         return result
-
-
-def session_options() -> onnxruntime.SessionOptions:
-    """How every session of this package runs.
-
-    One thread: the network takes tens of microseconds, less than waking a second one.
-    """
-    import onnxruntime
-
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1
-    options.inter_op_num_threads = 1
-    options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
-    options.log_severity_level = 4
-    return options

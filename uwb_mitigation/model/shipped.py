@@ -25,10 +25,10 @@ def default_model_path(scaling: Scaling | None = None) -> Path:
 
 
 def model_path(named: str | Path | None) -> Path:
-    """The bundle that a person names: a file, or one of `SHIPPED`; nothing names the default.
+    """Return the path of a bundle: a file, or one of `SHIPPED`; the default if none is named.
 
     Raises:
-        ModelError: there is no such file or shipped model; names the shipped ones.
+        ModelError: there is no such shipped model or file; names the shipped ones.
     """
     if not named or str(named) == ".":
         return default_model_path()

@@ -1,16 +1,13 @@
-"""Hands what a board sends to the driver's publishers, from a thread of its own, and keeps its diagnosis.
-
-The port and the protocol are `link`'s; topics and messages are the driver's.
-"""
+"""Publishes the ranges and corrections of a board on a serial link, and keeps its diagnosis."""
 
 from __future__ import annotations
 
-import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import asdict
 from typing import Any
 
+from uwb_mitigation.errors import format_id
 from uwb_mitigation.link.events import (
     Connected,
     Disconnected,
@@ -21,28 +18,28 @@ from uwb_mitigation.link.events import (
     RadioRefused,
     VersionMismatch,
 )
-from uwb_mitigation.link.layout import PROTOCOL_VERSION, LogLevel
+from uwb_mitigation.link.layout import PROTOCOL_VERSION, LogLevel, Mode
 from uwb_mitigation.link.messages import BoardStatus, Correction, Log
 from uwb_mitigation.link.port import BoardPort
 from uwb_mitigation.link.radio import Radio, RadioSettings, RadioStatus
-from uwb_mitigation.measurement import RangeMeasurement, format_id
+from uwb_mitigation.measurement import RangeMeasurement
 from uwb_mitigation.nodes import diagnostics, radio_facts
+from uwb_mitigation.nodes.feed import EVENT_TIMEOUT_S, Description, LiveFeed, Value
+from uwb_mitigation.nodes.radio_feed import PREFIX, settings_of
 from uwb_mitigation.offsets import Offsets
 
-PATIENCE_S = 0.5
 
-
-class BoardFeed:
-    """Calls `on_range` and `on_correction` for what arrives, and logs what happens to the board.
+class BoardFeed(LiveFeed):
+    """Publishes what a board sends, and logs what happens to it.
 
     Args:
         port: closed by `stop`.
-        now_ns: the clock that stamps are on.
-        logger: with `info`, `warning`, `error`, as rclpy's.
+        on_correction: publishes a range that the board has corrected.
+        on_range, now_ns, logger: see `LiveFeed`.
 
     Attributes:
-        ranges, corrections: how many were handed on.
-        status: the board's latest STATUS; None before the first.
+        corrections: number of corrections that were published.
+        status: the latest STATUS of the board; None before the first.
     """
 
     def __init__(
@@ -54,32 +51,29 @@ class BoardFeed:
         now_ns: Callable[[], int],
         logger: Any,
     ) -> None:
+        super().__init__([port], on_range=on_range, now_ns=now_ns, logger=logger)
         self.port = port
-        self.ranges = 0
         self.corrections = 0
-        self.meter = diagnostics.Meter(now_ns)
         self.status: BoardStatus | None = None
-        self._problem = self._told = ""
-        self._on_range = on_range
+        self._problem = self._logged = ""
+        self._checked_s = 0.0
         self._on_correction = on_correction
-        self._now_ns = now_ns
-        self._logger = logger
         self._refused_offsets = self._refused_radio = ""
         self._radio: RadioSettings | None = None
         self._radio_status: RadioStatus | None = None
-        self._thread = threading.Thread(target=self._run, name="board feed", daemon=True)
 
-    def start(self) -> None:
-        self._thread.start()
+    def apply(self, changed: Collection[str], value: Value, offsets: Offsets) -> None:
+        """Send new settings to the board."""
+        if any(name.startswith(PREFIX) for name in changed):
+            self._refused_radio = ""
+            self.port.set_radio(settings_of(value))
+        if {"mode", "offsets"} & set(changed) and value("mode") != "host":
+            self._refused_offsets = ""
+            self.port.set_offsets(offsets)
+        if "mode" in changed:
+            self.port.set_mode(Mode[value("mode").upper()])
 
-    def stop(self) -> None:
-        """Close the port and wait for the thread; may be called twice."""
-        self.port.close()
-        if self._thread.is_alive():
-            self._thread.join()
-
-    def describe(self) -> tuple[str, bytes, str, dict[str, object]]:
-        """Hardware id, level, message and facts for the diagnostics."""
+    def describe(self) -> Description:
         report = self.port.report()
         facts: dict[str, object] = {
             "port": report.port or "none",
@@ -122,39 +116,19 @@ class BoardFeed:
             return hardware, diagnostics.WARN, warning, facts
         return hardware, diagnostics.OK, "connected", facts
 
-    def set_offsets(self, offsets: Offsets) -> None:
-        """See `BoardSession.set_offsets`."""
-        self._refused_offsets = ""
-        self.port.set_offsets(offsets)
-
-    def set_radio(self, settings: RadioSettings) -> None:
-        """See `BoardSession.set_radio`."""
-        self._refused_radio = ""
-        self.port.set_radio(settings)
-
-    def _run(self) -> None:
-        looked_s = 0.0
-        while not self.port.closed:
-            event = self.port.get(PATIENCE_S)
-            if event is not None:
-                self._handle(event)
-            if (now_s := time.monotonic()) - looked_s >= PATIENCE_S:
-                looked_s = now_s
-                self._look()
-
-    def _look(self) -> None:
-        """Tell once what keeps the board away, if it has lasted since the last look: a handshake does not."""
-        before, self._problem = self._problem, self.port.problem
-        if self._problem and self._problem == before != self._told and not self.port.closed:
+    def check(self, port: BoardPort) -> None:
+        """Log a problem once if it has lasted since the last check; a handshake does not last."""
+        now_s = time.monotonic()
+        if now_s - self._checked_s < EVENT_TIMEOUT_S:
+            return
+        self._checked_s = now_s
+        before, self._problem = self._problem, port.problem
+        if self._problem and self._problem == before != self._logged and not port.closed:
             self._logger.warning(f"{self._problem}; waiting for the board")
-            self._told = self._problem
+            self._logged = self._problem
 
-    def _handle(self, event: Event) -> None:
-        if isinstance(event, RangeMeasurement):
-            self.ranges += 1
-            self._on_range(event)
-            self.meter.add(self._now_ns() - event.stamp_ns)
-        elif isinstance(event, Correction):
+    def handle(self, event: Event, port: BoardPort) -> None:
+        if isinstance(event, Correction):
             self.corrections += 1
             self._on_correction(event)
             self.meter.add(self._now_ns() - event.stamp_ns)
@@ -163,7 +137,7 @@ class BoardFeed:
         elif isinstance(event, RadioStatus):
             self._radio_status = event
         elif isinstance(event, Radio):
-            # A board tells it anew at times.
+            # A board repeats it at times.
             if event.settings != self._radio:
                 self._logger.info(
                     f"the board's radio {format_id(event.settings.address)}: {radio_facts.told(event.settings)}"
@@ -175,14 +149,14 @@ class BoardFeed:
         elif isinstance(event, Connected):
             self._refused_offsets = self._refused_radio = ""
             self._radio = self._radio_status = None
-            self._told = ""
+            self._logged = ""
             hello = event.hello
             self._logger.info(
                 f"connected to board {format_id(hello.board_id)}, model {diagnostics.model_id(hello.model_id)}, "
                 f"mode {hello.mode.name}"
             )
         elif isinstance(event, Disconnected):
-            if not self.port.closed:
+            if not port.closed:
                 self._logger.warning(f"the board is gone: {event.loss.value}; waiting for it")
         elif isinstance(event, VersionMismatch):
             self._logger.error(

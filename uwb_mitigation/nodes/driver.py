@@ -1,12 +1,11 @@
-"""The node `driver`: publishes measurements on `/uwb/range_raw`, from a recording, the simulator or a board.
+"""The node `driver`: publishes measurements on `/uwb/range_raw`, from a recording, the simulator, a board or radios.
 
-Reading, parsing and simulating live in `sources`, the board's protocol in `link`. A board that runs the
-model itself is also heard on `/uwb/range_corrected`.
+Reading and simulating is in `sources`, the protocol of boards in `link`, radios at this computer in `radio`. A board
+that runs the model itself also publishes on `/uwb/range_corrected`.
 """
 
 from __future__ import annotations
 
-import contextlib
 import threading
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
@@ -19,7 +18,6 @@ from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.subscription import Subscription
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock as ClockMessage
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
@@ -31,12 +29,13 @@ from uwb_mitigation.link.layout import Mode
 from uwb_mitigation.link.messages import Correction
 from uwb_mitigation.link.port import BoardPort, PortAddress
 from uwb_mitigation.link.radio import RadioSettings
-from uwb_mitigation.measurement import Origin, RangeMeasurement, Record
+from uwb_mitigation.measurement import RangeMeasurement, Record
 from uwb_mitigation.nodes import clocks, conversions, diagnostics, topics
-from uwb_mitigation.nodes.agreement import Agreement
 from uwb_mitigation.nodes.board_feed import BoardFeed
+from uwb_mitigation.nodes.feed import Description, Feed
 from uwb_mitigation.nodes.lifecycle import ManagedNode
 from uwb_mitigation.nodes.parameter_tables import DRIVER
+from uwb_mitigation.nodes.playback import ReplayOptions
 from uwb_mitigation.nodes.radio_feed import PREFIX, RADIOS, RadioFeed, open_radios, settings_of
 from uwb_mitigation.nodes.replay_feed import ReplayFeed
 from uwb_mitigation.offsets import NO_OFFSETS, read_offsets
@@ -86,7 +85,7 @@ def _model_id(digits: str) -> int | None:
 
 
 class Consumer(Protocol):
-    """Who takes measurements in the same process: the mitigator of a pipeline."""
+    """What takes measurements in the same process: the mitigator of a pipeline."""
 
     def correct(self, measurements: Sequence[RangeMeasurement]) -> None: ...
 
@@ -96,13 +95,13 @@ class Consumer(Protocol):
 
 
 class Driver(ManagedNode):
-    """Lifecycle: configure opens the source, activate feeds from it (a recording from its start).
+    """Lifecycle: configure opens the source, activate starts its feed (a recording from its start).
 
-    A port is opened at activate; that it is absent is no error, it is waited for.
+    A port is opened at activate. If it is missing, that is no error: the feed waits for it.
 
     Args:
-        ended: set when a replay has come to its end.
-        consumer: takes the measurements; `/uwb/range_raw` is then published only if someone subscribes.
+        ended: set when a replay has ended.
+        consumer: takes the measurements; `/uwb/range_raw` is then published only if it has subscribers.
         foreign: see `ManagedNode`.
 
     Attributes:
@@ -117,55 +116,29 @@ class Driver(ManagedNode):
         self._consumer = consumer
         self.exit_code = 0
         self._source: Source | None = None
-        self._address: PortAddress | None = None
-        self._feed: ReplayFeed | BoardFeed | RadioFeed | None = None
-        self._agreement = Agreement()
+        self._make_feed: Callable[[], Feed] | None = None
+        self._feed: Feed | None = None
         self._ranges: Publisher | None = None
         self._corrected: Publisher | None = None
         self._truths: Publisher | None = None
         self._places: Publisher | None = None
         self._clock_publisher: Publisher | None = None
         self._sensor_ranges: SensorRanges | None = None
-        self._host_ranges: Subscription | None = None
         self._frame_id: str = self.value("frame_id")
         self.add_on_set_parameters_callback(self._check)
         self._offsets = self._prepared_offsets = NO_OFFSETS
-        self.add_on_set_parameters_callback(self._read_offsets)
         self.add_post_set_parameters_callback(self._apply)
         self.autostart()
 
     def open(self) -> None:
-        if self.value("source") == "serial":
-            self._address = PortAddress.parse(self.value("port"))
-            self._board_model = _model_id(self.value("board_model"))
-            self._offsets = read_offsets(str(self.value("offsets")))
-        elif self.value("source") in RADIOS:
-            settings_of(self.value)
-        else:
-            self._source = open_source(self.value)
+        kind = self.value("source")
+        prepare = {"serial": self._prepare_board} | dict.fromkeys(RADIOS, self._prepare_radios)
+        self._make_feed = prepare.get(kind, self._prepare_replay)()
         self._ranges = topics.create_publisher(self, RangeCir, topics.RANGE_RAW)
-        if self._address is not None:
-            self._corrected = topics.create_publisher(self, RangeCorrected, topics.RANGE_CORRECTED)
-            if self.value("sensor_ranges"):
-                self._sensor_ranges = self._make_sensor_ranges()
-            self._host_ranges = topics.create_subscription(
-                self, RangeCorrected, topics.RANGE_CORRECTED, self._compare
-            )
-            return
-        if self._source is None:
-            return
-        self._truths = topics.create_publisher(self, RangeTruth, topics.RANGE_TRUTH)
-        self._places = topics.create_publisher(self, Odometry, topics.ODOMETRY_TRUTH)
-        if self.value("publish_clock"):
-            self._clock_publisher = self.create_publisher(ClockMessage, topics.CLOCK, 10)
 
     def begin(self) -> None:
-        if self._address is not None:
-            self._feed = self._make_board_feed()
-        elif self._source is not None:
-            self._feed = self._make_replay_feed()
-        else:
-            self._feed = self._make_radio_feed()
+        assert self._make_feed is not None
+        self._feed = self._make_feed()
         self._feed.start()
 
     def end(self) -> None:
@@ -173,8 +146,7 @@ class Driver(ManagedNode):
             self._feed.stop()
 
     def close(self) -> None:
-        self._feed = None
-        self._address = None
+        self._feed = self._make_feed = None
         if self._source is not None:
             self._source.close()
             self._source = None
@@ -188,122 +160,115 @@ class Driver(ManagedNode):
         if self._sensor_ranges is not None:
             self._sensor_ranges.close()
             self._sensor_ranges = None
-        if self._host_ranges is not None:
-            self.destroy_subscription(self._host_ranges)
-            self._host_ranges = None
 
-    def _make_sensor_ranges(self) -> SensorRanges:
-        # Only here, where it is asked for: sensor_msgs takes a twelfth of the time that a node takes to start.
-        from uwb_mitigation.nodes.sensor_ranges import SensorRanges
+    def describe(self) -> Description:
+        return ("none", diagnostics.OK, "", {}) if self._feed is None else self._feed.describe()
 
-        return SensorRanges(self)
+    def _prepare_board(self) -> Callable[[], Feed]:
+        address = PortAddress.parse(self.value("port"))
+        board_model = _model_id(self.value("board_model"))
+        self._offsets = read_offsets(str(self.value("offsets")))
+        self._corrected = topics.create_publisher(self, RangeCorrected, topics.RANGE_CORRECTED)
+        if self.value("sensor_ranges"):
+            # sensor_msgs takes a twelfth of the time that a node takes to start.
+            from uwb_mitigation.nodes.sensor_ranges import SensorRanges
 
-    def _make_replay_feed(self) -> ReplayFeed:
-        assert self._source is not None
-        assert self._ranges is not None
+            self._sensor_ranges = SensorRanges(self)
+
+        def make() -> BoardFeed:
+            now_ns = clocks.reader(self.get_clock())
+            port = BoardPort(
+                address,
+                baud=self.value("baud"),
+                dtr=self.value("dtr"),
+                mode=Mode[self.value("mode").upper()],
+                expected_model_id=board_model,
+                stamp_clock=now_ns,
+            )
+            feed = BoardFeed(
+                port,
+                on_range=self._publish_range,
+                on_correction=self._publish_correction,
+                now_ns=now_ns,
+                logger=self.get_logger(),
+            )
+            feed.apply(["offsets"], self.value, self._offsets)
+            # A board whose radio is not configured here keeps its own settings.
+            if settings_of(self.value) != RadioSettings():
+                feed.apply([PREFIX], self.value, self._offsets)
+            return feed
+
+        return make
+
+    def _prepare_radios(self) -> Callable[[], Feed]:
+        settings_of(self.value)
+
+        def make() -> RadioFeed:
+            now_ns = clocks.reader(self.get_clock())
+            radios = open_radios(self.value, now_ns)
+            return RadioFeed(radios, on_range=self._publish_range, now_ns=now_ns, logger=self.get_logger())
+
+        return make
+
+    def _prepare_replay(self) -> Callable[[], Feed]:
+        source = self._source = open_source(self.value)
+        self._truths = topics.create_publisher(self, RangeTruth, topics.RANGE_TRUTH)
+        self._places = topics.create_publisher(self, Odometry, topics.ODOMETRY_TRUTH)
         own_clock = self.value("publish_clock")
-        return ReplayFeed(
-            self._source,
-            # A node that drives /clock must not wait for /clock.
-            Clock(clock_type=ClockType.STEADY_TIME) if own_clock else self.get_clock(),
-            self.get_logger(),
-            rate=self.value("rate"),
-            loop=self.value("loop"),
-            longest_pause_s=self.value("longest_pause"),
-            recorded_stamps=own_clock,
-            subscribers=self._ranges.get_subscription_count
-            if self._consumer is None
-            else self._consumer.subscription_count,
-            wanted_subscribers=self.value("wait_for_subscribers"),
-            longest_wait_s=self.value("longest_wait"),
-            start_delay_s=self.value("start_delay"),
-            paused=self.value("paused"),
-            from_s=self.value("seek_to"),
-            publish=self._publish_records,
-            on_time=self._publish_clock,
-            on_end=self._finish,
-        )
+        if own_clock:
+            self._clock_publisher = self.create_publisher(ClockMessage, topics.CLOCK, 10)
 
-    def _make_board_feed(self) -> BoardFeed:
-        assert self._address is not None
-        now_ns = clocks.reader(self.get_clock())
-        port = BoardPort(
-            self._address,
-            baud=self.value("baud"),
-            dtr=self.value("dtr"),
-            mode=Mode[self.value("mode").upper()],
-            expected_model_id=self._board_model,
-            stamp_clock=now_ns,
-        )
-        feed = BoardFeed(
-            port,
-            on_range=self._publish_range,
-            on_correction=self._publish_correction,
-            now_ns=now_ns,
-            logger=self.get_logger(),
-        )
-        if self.value("mode") != "host":
-            feed.set_offsets(self._offsets)
-        settings = settings_of(self.value)
-        # A board whose radio nobody configures here keeps the settings that it has.
-        if settings != RadioSettings():
-            feed.set_radio(settings)
-        return feed
+        def make() -> ReplayFeed:
+            assert self._ranges is not None
+            return ReplayFeed(
+                source,
+                # A node that drives /clock must not wait for /clock.
+                Clock(clock_type=ClockType.STEADY_TIME) if own_clock else self.get_clock(),
+                ReplayOptions(
+                    rate=self.value("rate"),
+                    loop=self.value("loop"),
+                    longest_pause_s=self.value("longest_pause"),
+                    recorded_stamps=own_clock,
+                    wanted_subscribers=self.value("wait_for_subscribers"),
+                    longest_wait_s=self.value("longest_wait"),
+                    start_delay_s=self.value("start_delay"),
+                    paused=self.value("paused"),
+                    from_s=self.value("seek_to"),
+                ),
+                self.get_logger(),
+                subscribers=self._ranges.get_subscription_count
+                if self._consumer is None
+                else self._consumer.subscription_count,
+                publish=self._publish_records,
+                on_time=self._publish_clock,
+                on_end=self._finish,
+            )
 
-    def _read_offsets(self, changes: list[Any]) -> SetParametersResult:
-        """Read offsets that are to be set, or refuse them."""
-        for change in changes:
-            if change.name == "offsets":
-                try:
-                    self._prepared_offsets = read_offsets(str(change.value))
-                except UwbMitigationError as error:
-                    reason = f"parameter offsets = {change.value!r}: {error}"
-                    return SetParametersResult(successful=False, reason=reason)
-        return SetParametersResult(successful=True)
-
-    def _make_radio_feed(self) -> RadioFeed:
-        now_ns = clocks.reader(self.get_clock())
-        return RadioFeed(
-            open_radios(self.value, now_ns),
-            on_range=self._publish_range,
-            now_ns=now_ns,
-            logger=self.get_logger(),
-        )
+        return make
 
     def _check(self, changes: list[Any]) -> SetParametersResult:
-        """Refuse settings of a radio that do not go together."""
-        wanted = {change.name: change.value for change in changes if change.name.startswith(PREFIX)}
-        if wanted:
-            try:
+        """Refuse radio settings that contradict each other, and offsets that cannot be read."""
+        wanted = {change.name: change.value for change in changes}
+        try:
+            if any(name.startswith(PREFIX) for name in wanted):
                 settings_of(lambda name: wanted.get(name, self.value(name)))
-            except ParameterError as error:
-                return SetParametersResult(successful=False, reason=str(error))
+        except ParameterError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        try:
+            if "offsets" in wanted:
+                self._prepared_offsets = read_offsets(str(wanted["offsets"]))
+        except UwbMitigationError as error:
+            reason = f"parameter offsets = {wanted['offsets']!r}: {error}"
+            return SetParametersResult(successful=False, reason=reason)
         return SetParametersResult(successful=True)
 
     def _apply(self, changes: list[Any]) -> None:
-        """Pass live parameters, accepted by now, to what they govern."""
-        if any(change.name.startswith(PREFIX) for change in changes):
-            if isinstance(self._feed, RadioFeed):
-                self._feed.configure(settings_of(self.value))
-            elif isinstance(self._feed, BoardFeed):
-                self._feed.set_radio(settings_of(self.value))
-        for change in changes:
-            if change.name == "offsets":
-                self._offsets = self._prepared_offsets
-                if isinstance(self._feed, BoardFeed) and self.value("mode") != "host":
-                    self._feed.set_offsets(self._offsets)
-            elif isinstance(self._feed, BoardFeed) and change.name == "mode":
-                if change.value != "host":
-                    self._feed.set_offsets(self._offsets)
-                self._feed.port.set_mode(Mode[change.value.upper()])
-            elif isinstance(self._feed, ReplayFeed):
-                playback = self._feed.playback
-                if change.name == "rate":
-                    playback.rate = float(change.value)
-                elif change.name == "paused":
-                    playback.paused = change.value
-                elif change.name == "seek_to":
-                    playback.seek(float(change.value))
+        """Pass live parameters, which were checked, to the feed."""
+        changed = {change.name for change in changes}
+        if "offsets" in changed:
+            self._offsets = self._prepared_offsets
+        if self._feed is not None:
+            self._feed.apply(changed, self.value, self._offsets)
 
     def _publish_records(self, records: Sequence[tuple[Record, int]]) -> None:
         measurements = [
@@ -341,28 +306,15 @@ class Driver(ManagedNode):
 
     def _publish_correction(self, correction: Correction) -> None:
         header = conversions.to_header(correction.stamp_ns, self._frame_id)
-        message = conversions.to_range_corrected(correction, header)
         assert self._corrected is not None
-        self._corrected.publish(message)
-        if self._sensor_ranges is not None and self.value("mode") == "device":
-            # In mode both it is the mitigator that does.
+        self._corrected.publish(conversions.to_range_corrected(correction, header))
+        if self._sensor_ranges is not None:
             self._sensor_ranges.publish(
                 correction.anchor_id, correction.stamp_ns, self._frame_id, correction.corrected
             )
-        if self.value("mode") == "both":
-            self._agreement.add_device(conversions.key_of(message), correction.corrected)
-
-    def _compare(self, message: RangeCorrected) -> None:
-        """The mitigator's result for a range that the board has corrected too."""
-        if message.source == Origin.HOST and self.value("mode") == "both":
-            # Anybody may publish there; a status of no known meaning is not the mitigator's.
-            with contextlib.suppress(ValueError):
-                self._agreement.add_host(
-                    conversions.key_of(message), conversions.from_range_corrected(message)
-                )
 
     def _finish(self, error: UwbMitigationError | None) -> None:
-        """The recording has ended: see that everything arrived, and leave."""
+        """End the node after everything was acknowledged."""
         assert self._ranges is not None
         self._ranges.wait_for_all_acked(Duration(seconds=5))
         if self._consumer is not None:
@@ -372,17 +324,6 @@ class Driver(ManagedNode):
             self.get_logger().error(str(error))
             self.exit_code = 1
         self._ended.set()
-
-    def describe(self) -> tuple[str, bytes, str, dict[str, object]]:
-        level, text, hardware = diagnostics.OK, "", "none"
-        facts: dict[str, object] = {}
-        if self._feed is not None:
-            hardware, level, text, facts = self._feed.describe()
-        if self._address is not None and self.value("mode") == "both":
-            facts |= self._agreement.facts()
-            if self._agreement.different:
-                level, text = diagnostics.ERROR, "board and host disagree"
-        return hardware, level, text, facts
 
 
 def make_nodes(ended: threading.Event) -> list[Node]:

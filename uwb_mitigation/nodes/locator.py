@@ -24,8 +24,7 @@ from visualization_msgs.msg import MarkerArray
 
 from uwb_mitigation.bag.codec import decode_corrected
 from uwb_mitigation.bag.poses import encode_odometry, encode_pose, tag_frame, tag_of_frame
-from uwb_mitigation.errors import MissingDependencyError, ParameterError, RecordingError
-from uwb_mitigation.measurement import format_id
+from uwb_mitigation.errors import MissingDependencyError, ParameterError, RecordingError, format_id
 from uwb_mitigation.nodes import clocks, diagnostics, markers, topics
 from uwb_mitigation.nodes.conversions import to_header
 from uwb_mitigation.nodes.lifecycle import ManagedNode

@@ -15,8 +15,8 @@ from rich.text import Text
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
 
 from uwb_mitigation.bag.codec import decode_corrected, decode_truth
-from uwb_mitigation.errors import RecordingError, UwbMitigationError
-from uwb_mitigation.measurement import Status, format_id
+from uwb_mitigation.errors import RecordingError, UwbMitigationError, format_id
+from uwb_mitigation.measurement import Status
 from uwb_mitigation.nodes import topics
 from uwb_mitigation.nodes.probe import watching
 from uwb_mitigation.nodes.signals import stop_event

@@ -120,9 +120,9 @@ DRIVER = (
               low=1200, high=12_000_000, unit="bit/s"),
     Parameter("dtr", True, "Level of DTR: boards with native USB send only while it is set; through a bridge, "
               "its change resets the board (serial)."),
-    Parameter("mode", "host", "Who runs the model: the host, the device, or both, to compare them (serial).",
-              choices=("host", "device", "both"), live=True),
-    Parameter("offsets", "", "As the mitigator's, of a board that corrects by itself: modes device and both (serial).",
+    Parameter("mode", "host", "Where the model runs: on the host or on the device (serial).",
+              choices=("host", "device"), live=True),
+    Parameter("offsets", "", "As the mitigator's, for a board in mode device (serial).",
               live=True, or_number=True),
     Parameter("board_model", "", "Model id that the board must hold, eight hexadecimal digits; its corrections "
               "by another model are withheld. Empty = any (serial)."),

@@ -5,10 +5,12 @@ Knows time, pausing, seeking and the end of a recording; knows nothing of messag
 
 from __future__ import annotations
 
+import math
 import threading
 import traceback
 from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 from rclpy.clock import Clock
 
@@ -22,6 +24,33 @@ TICK_S = 0.02
 # A record so late is published together with those behind it, at most BATCH at once.
 LATE_NS = 1_000_000
 BATCH = 16
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayOptions:
+    """How a recording is replayed.
+
+    Attributes:
+        rate: speed relative to the recording.
+        loop: start again at the end.
+        longest_pause_s: longer pauses of the recording are shortened to this.
+        recorded_stamps: keep the recorded stamps and drive `/clock`, instead of stamps on the node's clock.
+        wanted_subscribers: wait for this number of subscribers, but not longer than `longest_wait_s`.
+        start_delay_s: wait this long after that, until the rest of the graph is connected; negative: 3 s, or 0 if
+            several subscribers are wanted.
+        paused: start paused.
+        from_s: start this long after the first record.
+    """
+
+    rate: float = 1.0
+    loop: bool = False
+    longest_pause_s: float = math.inf
+    recorded_stamps: bool = False
+    wanted_subscribers: int = 0
+    longest_wait_s: float = 0.0
+    start_delay_s: float = 0.0
+    paused: bool = False
+    from_s: float = 0.0
 
 
 class Playback:
@@ -47,39 +76,34 @@ class Playback:
         self,
         source: Source,
         clock: Clock,
+        options: ReplayOptions,
         *,
-        rate: float,
-        loop: bool,
-        longest_pause_s: float,
-        recorded_stamps: bool,
         ready: Callable[[], bool],
         publish: Callable[[Sequence[tuple[Record, int]]], None],
         on_time: Callable[[int], None],
         on_end: Callable[[UwbMitigationError | None], None],
-        paused: bool = False,
-        from_s: float = 0.0,
     ) -> None:
-        self.rate = rate
-        self.paused = paused
+        self.rate = options.rate
+        self.paused = options.paused
         self.played = 0
         self.late_ns = 0
         self._source = source
         self._clock = clocks.Pace(clock)
         self._now_ns = self._clock.now_ns
-        self._loop = loop
-        self._longest_pause_ns = int(longest_pause_s * 1e9)
-        self._recorded_stamps = recorded_stamps
+        self._loop = options.loop
+        self._longest_pause_ns = int(min(options.longest_pause_s, 1e9) * 1e9)
+        self._recorded_stamps = options.recorded_stamps
         self._ready = ready
         self._publish = publish
         self._on_time = on_time
         self._on_end = on_end
         self._seeks: deque[int] = deque()
-        if from_s:
-            self.seek(from_s)
+        if options.from_s:
+            self.seek(options.from_s)
         self._late: list[tuple[Record, int]] = []
         # The pace: `_place_ns` of played time is due at `_place_clock_ns`.
         self._place_ns = self._place_clock_ns = 0
-        self._pace = rate
+        self._pace = options.rate
         self._standing = False
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="playback", daemon=True)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import fields
 
+from uwb_mitigation.errors import format_id
 from uwb_mitigation.link.layout import RadioState, Role
 from uwb_mitigation.link.radio import RadioSettings, RadioStatus
-from uwb_mitigation.measurement import format_id
 
 COUNTS = tuple(row.name for row in fields(RadioStatus) if row.type == "int")
 """Of the exchanges of a radio, by how they ended."""

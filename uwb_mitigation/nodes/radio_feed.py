@@ -1,20 +1,18 @@
-"""Hands what radios at this computer range to the driver's publishers, and keeps their diagnosis.
-
-The radios are `radio`'s; topics and messages are the driver's.
-"""
+"""Publishes the ranges of radios at this computer, and keeps their diagnosis."""
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from typing import Any
 
-from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.errors import ParameterError, format_id
 from uwb_mitigation.link.layout import Role
 from uwb_mitigation.link.radio import Radio, RadioSettings
-from uwb_mitigation.measurement import RangeMeasurement, format_id
+from uwb_mitigation.measurement import RangeMeasurement
 from uwb_mitigation.nodes import diagnostics, radio_facts
+from uwb_mitigation.nodes.feed import Description, LiveFeed, Value
+from uwb_mitigation.offsets import Offsets
 from uwb_mitigation.radio.opening import opener
 from uwb_mitigation.radio.port import RadioEvent, RadioLost, RadioPort
 
@@ -23,8 +21,6 @@ RADIOS = ("evb1000", "spi")
 
 PREFIX = "radio."
 """Of the parameters that are a radio's."""
-
-PATIENCE_S = 0.5
 
 
 def settings_of(value: Callable[[str], Any]) -> RadioSettings:
@@ -97,16 +93,12 @@ def open_radios(value: Callable[[str], Any], now_ns: Callable[[], int]) -> list[
     return ports
 
 
-class RadioFeed:
-    """Calls `on_range` for what the radios measure, and logs what happens to them.
+class RadioFeed(LiveFeed):
+    """Publishes what the radios measure, and logs what happens to them.
 
     Args:
         ports: of one or several radios, the tag first; closed by `stop`.
-        now_ns: the clock that stamps are on.
-        logger: with `info`, `warning`, as rclpy's.
-
-    Attributes:
-        ranges: how many were handed on.
+        on_range, now_ns, logger: see `LiveFeed`.
     """
 
     def __init__(
@@ -117,39 +109,18 @@ class RadioFeed:
         now_ns: Callable[[], int],
         logger: Any,
     ) -> None:
-        self.ranges = 0
-        self.meter = diagnostics.Meter(now_ns)
-        self._ports = list(ports)
-        self._on_range = on_range
-        self._now_ns = now_ns
-        self._logger = logger
-        # Ranges of several radios are published one after the other.
-        self._publishing = threading.Lock()
-        self._threads = [
-            threading.Thread(target=self._run, args=(port,), name="radio feed", daemon=True)
-            for port in self._ports
-        ]
+        super().__init__(ports, on_range=on_range, now_ns=now_ns, logger=logger)
+        self._radios = list(ports)
 
-    def start(self) -> None:
-        for thread in self._threads:
-            thread.start()
+    def apply(self, changed: Collection[str], value: Value, offsets: Offsets) -> None:
+        """Use other radio settings from the next exchange on; the ports after the first stay anchors."""
+        if any(name.startswith(PREFIX) for name in changed):
+            settings = settings_of(value)
+            for number, port in enumerate(self._radios):
+                port.set_radio(settings if number == 0 else replace(settings, role=Role.ANCHOR, anchors=()))
 
-    def stop(self) -> None:
-        """Close the ports and wait for the threads; may be called twice."""
-        for port in self._ports:
-            port.close()
-        for thread in self._threads:
-            if thread.is_alive():
-                thread.join()
-
-    def configure(self, settings: RadioSettings) -> None:
-        """Use other settings from the next exchange on; the ports after the first stay anchors."""
-        for number, port in enumerate(self._ports):
-            port.set_radio(settings if number == 0 else replace(settings, role=Role.ANCHOR, anchors=()))
-
-    def describe(self) -> tuple[str, bytes, str, dict[str, object]]:
-        """Hardware id, level, message and facts for the diagnostics."""
-        reports = [port.report() for port in self._ports]
+    def describe(self) -> Description:
+        reports = [port.report() for port in self._radios]
         first = reports[0]
         facts: dict[str, object] = {"ranges published": self.ranges}
         facts |= self.meter.facts()
@@ -170,19 +141,8 @@ class RadioFeed:
         tag = first.settings is not None and first.settings.role is Role.TAG
         return hardware, diagnostics.OK, "ranging" if tag else "answering", facts
 
-    def _run(self, port: RadioPort) -> None:
-        while not port.closed:
-            event = port.get(PATIENCE_S)
-            if event is not None:
-                self._handle(event, port)
-
-    def _handle(self, event: RadioEvent, port: RadioPort) -> None:
-        if isinstance(event, RangeMeasurement):
-            with self._publishing:
-                self.ranges += 1
-                self._on_range(event)
-                self.meter.add(self._now_ns() - event.stamp_ns)
-        elif isinstance(event, Radio):
+    def handle(self, event: RadioEvent, port: RadioPort) -> None:
+        if isinstance(event, Radio):
             settings = event.settings
             self._logger.info(
                 f"radio {format_id(settings.address)} at {port.report().name}: {radio_facts.told(settings)}"

@@ -1,9 +1,9 @@
-"""Plays a recording or the simulator for the driver: waits for listeners, plays, and tells how it went."""
+"""Replays a recording or the simulator for the driver: waits for subscribers, plays, and reports."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
 from rclpy.clock import Clock
@@ -11,7 +11,9 @@ from rclpy.clock import Clock
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.measurement import Record
 from uwb_mitigation.nodes import diagnostics
-from uwb_mitigation.nodes.playback import Playback
+from uwb_mitigation.nodes.feed import Description, Value
+from uwb_mitigation.nodes.playback import Playback, ReplayOptions
+from uwb_mitigation.offsets import Offsets
 from uwb_mitigation.sources.source import Source
 
 ANNOUNCED_AFTER_S = 3.0
@@ -20,37 +22,23 @@ FALLEN_BEHIND_S = 0.5
 
 
 class ReplayFeed:
-    """A playback that starts when enough others listen, and logs what it left out at its end.
+    """A playback that starts when enough subscribers are there, and logs what it skipped at its end.
 
     Args:
         source: closed by who opened it.
-        clock, rate, loop, longest_pause_s, recorded_stamps, paused, from_s, publish, on_time, on_end: see `Playback`.
+        clock, options, publish, on_time, on_end: see `Playback`.
         logger: with `info` and `warning`, as rclpy's.
-        subscribers: how many listen now.
-        wanted_subscribers: playing waits for so many, but no longer than `longest_wait_s`.
-        start_delay_s: then it waits so long again, for the rest of the graph to start and connect; negative =
-            not at all where several are wanted, and have come.
-
-    Attributes:
-        playback: what plays; its rate and pause may be changed.
+        subscribers: returns the number of subscribers.
     """
 
     def __init__(
         self,
         source: Source,
         clock: Clock,
+        options: ReplayOptions,
         logger: Any,
         *,
-        rate: float,
-        loop: bool,
-        longest_pause_s: float,
-        recorded_stamps: bool,
         subscribers: Callable[[], int],
-        wanted_subscribers: int,
-        longest_wait_s: float,
-        start_delay_s: float,
-        paused: bool,
-        from_s: float,
         publish: Callable[[Sequence[tuple[Record, int]]], None],
         on_time: Callable[[int], None],
         on_end: Callable[[UwbMitigationError | None], None],
@@ -58,24 +46,18 @@ class ReplayFeed:
         self._source = source
         self._logger = logger
         self._subscribers = subscribers
-        self._wanted_subscribers = wanted_subscribers
-        self._longest_wait_s = longest_wait_s
-        self._start_delay_s = start_delay_s
-        if start_delay_s < 0.0:
-            # The middleware announces what is new every 3 s, should its first announcements be missed.
-            self._start_delay_s = 0.0 if wanted_subscribers > 1 else ANNOUNCED_AFTER_S
+        self._options = options
+        self._start_delay_s = options.start_delay_s
+        if options.start_delay_s < 0.0:
+            # The middleware repeats announcements every 3 s, in case that the first ones are lost.
+            self._start_delay_s = 0.0 if options.wanted_subscribers > 1 else ANNOUNCED_AFTER_S
         self._on_end = on_end
         self._started_s = 0.0
-        self._heard_s: float | None = None
-        self.playback = Playback(
+        self._connected_s: float | None = None
+        self._playback = Playback(
             source,
             clock,
-            rate=rate,
-            loop=loop,
-            longest_pause_s=longest_pause_s,
-            recorded_stamps=recorded_stamps,
-            paused=paused,
-            from_s=from_s,
+            options,
             ready=self._is_ready,
             publish=publish,
             on_time=on_time,
@@ -88,24 +70,32 @@ class ReplayFeed:
         else:
             self._logger.info(f"replaying {self._source.name}")
         self._started_s = time.monotonic()
-        self.playback.start()
+        self._playback.start()
 
     def stop(self) -> None:
         """End playing; may be called twice."""
-        self.playback.stop()
+        self._playback.stop()
 
-    def describe(self) -> tuple[str, bytes, str, dict[str, object]]:
-        """Hardware id, level, message and facts for the diagnostics."""
+    def apply(self, changed: Collection[str], value: Value, offsets: Offsets) -> None:
+        """Change rate, pause and position of the playback."""
+        if "rate" in changed:
+            self._playback.rate = float(value("rate"))
+        if "paused" in changed:
+            self._playback.paused = value("paused")
+        if "seek_to" in changed:
+            self._playback.seek(float(value("seek_to")))
+
+    def describe(self) -> Description:
         facts: dict[str, object] = {
             "source": self._source.name,
             "simulated": "unknown" if self._source.simulated is None else self._source.simulated,
-            "ranges published": self.playback.played,
+            "ranges published": self._playback.played,
         }
         facts |= {f"oddity: {kind}": count for kind, count in self._source.skipped.copy().items()}
-        level, text = diagnostics.OK, "paused" if self.playback.paused else "replaying"
+        level, text = diagnostics.OK, "paused" if self._playback.paused else "replaying"
         if self._source.simulated:
             level, text = diagnostics.WARN, f"{text} simulated ranges: no radio measured them"
-        late_s = self.playback.late_ns / 1e9
+        late_s = self._playback.late_ns / 1e9
         if late_s > FALLEN_BEHIND_S:
             level, text = (
                 diagnostics.WARN,
@@ -116,23 +106,21 @@ class ReplayFeed:
         return "simulated" if self._source.simulated else "recording", level, text, facts
 
     def _is_ready(self) -> bool:
-        """True once enough others listen and the graph had time to settle, or they did not come."""
+        """Whether enough subscribers are there and the graph had time to connect, or the wait is over."""
         now_s = time.monotonic()
-        if self._heard_s is None:
-            subscribers = self._subscribers()
-            if subscribers >= self._wanted_subscribers:
-                self._heard_s = now_s
-            elif now_s - self._started_s >= self._longest_wait_s:
-                self._logger.warning(
-                    f"{subscribers} of {self._wanted_subscribers} subscribers have come; playing all the same"
-                )
+        if self._connected_s is None:
+            subscribers, wanted = self._subscribers(), self._options.wanted_subscribers
+            if subscribers >= wanted:
+                self._connected_s = now_s
+            elif now_s - self._started_s >= self._options.longest_wait_s:
+                self._logger.warning(f"{subscribers} of {wanted} subscribers have come; playing all the same")
                 return True
             return False
-        return now_s - self._heard_s >= self._start_delay_s
+        return now_s - self._connected_s >= self._start_delay_s
 
     def _finish(self, error: UwbMitigationError | None) -> None:
         skipped = ", ".join(f"{count} x {kind}" for kind, count in sorted(self._source.skipped.items()))
         self._logger.info(
-            f"played {self.playback.played} ranges" + (f"; oddities: {skipped}" if skipped else "")
+            f"played {self._playback.played} ranges" + (f"; oddities: {skipped}" if skipped else "")
         )
         self._on_end(error)

@@ -8,7 +8,8 @@ from rclpy.lifecycle import LifecycleNode
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import Range
 
-from uwb_mitigation.measurement import CorrectedRange, format_id
+from uwb_mitigation.errors import format_id
+from uwb_mitigation.measurement import CorrectedRange
 from uwb_mitigation.nodes import conversions, topics
 
 LONGEST_M = 300.0

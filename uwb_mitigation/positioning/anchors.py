@@ -20,8 +20,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from uwb_mitigation.errors import ParameterError
-from uwb_mitigation.measurement import format_id
+from uwb_mitigation.errors import ParameterError, format_id
 
 SD_M = 0.05
 """How well a tape measure places an anchor."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.measurement import format_id
+from uwb_mitigation.errors import format_id
 from uwb_mitigation.offsets import NO_OFFSETS, Offsets
 from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.fixed_lag import FixedLag

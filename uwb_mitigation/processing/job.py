@@ -15,8 +15,7 @@ from pathlib import Path
 
 from uwb_mitigation.bag import columns, schemas
 from uwb_mitigation.bag.codec import decode_range, encode_corrected
-from uwb_mitigation.bag.index import RawMessage
-from uwb_mitigation.bag.reader import BagReader, check_channel
+from uwb_mitigation.bag.reader import BagReader, RawMessage, check_channel
 from uwb_mitigation.bag.topics import RANGE_CIR_TYPE, RANGE_CORRECTED, RANGE_RAW
 from uwb_mitigation.bag.writer import METADATA_RECORD, BagWriter
 from uwb_mitigation.errors import DamagedRecordingError, RecordingError, UwbMitigationError, not_imported
@@ -24,7 +23,6 @@ from uwb_mitigation.measurement import Status
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.offsets import NO_OFFSETS, Offsets
-from uwb_mitigation.processing import copying
 
 BATCH = 256
 """Messages taken together: enough to vectorise, little enough that the network's inputs stay in cache."""
@@ -44,8 +42,6 @@ class Job:
         output: an MCAP file or, without `.mcap`, a rosbag2 folder.
         model: the bundle to correct with.
         force: replace `output` if it is there.
-        described: write `metadata.yaml` beside a one-file output.
-        compare_copy: also time a loop that only reads and rewrites the bag.
         offsets: of the radios.
     """
 
@@ -53,8 +49,6 @@ class Job:
     output: Path
     model: Path
     force: bool = False
-    described: bool = True
-    compare_copy: bool = False
     offsets: Offsets = NO_OFFSETS
 
 
@@ -70,8 +64,6 @@ class Outcome:
         replaced: corrected ranges of the input, left out for the new ones.
         skipped: oddities, {kind: count}.
         seconds: wall time of reading, correcting and writing.
-        copy_seconds: wall time of reading and rewriting alone, with the `mcap` library; None = not asked for.
-        notice: what the user should know; may be empty.
         error: why there is no output or, after damage, why it is not the whole bag; None = success.
         written: whether there is an output.
     """
@@ -83,8 +75,6 @@ class Outcome:
     replaced: int = 0
     skipped: Counter[str] = field(default_factory=Counter)
     seconds: float = 0.0
-    copy_seconds: float | None = None
-    notice: str = ""
     error: UwbMitigationError | None = None
     written: bool = False
 
@@ -124,7 +114,7 @@ def process_bag(job: Job, report: Report | None = None) -> Outcome:
         "source": f"{job.source.name}, corrected by model {mitigation.bundle.model_id:08x}",
         "simulated": known.get("simulated", "unknown"),
     }
-    with BagWriter(job.output, origin, force=job.force, described=job.described) as out:
+    with BagWriter(job.output, origin, force=job.force) as out:
         corrector = _Corrector(job.source, mitigation, out)
         damage = None
         total, done = bag.message_count, 0
@@ -153,7 +143,6 @@ def process_bag(job: Job, report: Report | None = None) -> Outcome:
                 f"no topic {RANGE_RAW}", where=str(job.source), valid=f"the bag holds: {held}"
             )
     seconds = time.perf_counter() - started
-    copy_seconds = copying.time_copy(job.source, job.output) if job.compare_copy else None
     return Outcome(
         job,
         messages=done,
@@ -162,8 +151,6 @@ def process_bag(job: Job, report: Report | None = None) -> Outcome:
         replaced=corrector.replaced,
         skipped=corrector.skipped + bag.oddities,
         seconds=seconds,
-        copy_seconds=copy_seconds,
-        notice=out.notice,
         error=damage,
         written=True,
     )

@@ -13,7 +13,7 @@ from uwb_mitigation.errors import ParameterError, RecordingError
 
 @dataclass(frozen=True, slots=True)
 class Planned:
-    """One bag and its place; `alone` = it is all that was asked for."""
+    """A bag and its output; `alone`: it is the only one."""
 
     source: Path
     output: Path

@@ -17,8 +17,7 @@ from uwb_mitigation.bag.topics import (
     POSE_TYPE,
 )
 from uwb_mitigation.bag.writer import BagWriter
-from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.measurement import format_id
+from uwb_mitigation.errors import DatasetError, format_id
 from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.geometry import Shape, geometry, shape
 from uwb_mitigation.positioning.locator import TagLocator, run_live

@@ -1,48 +1,64 @@
-"""CSV files with a header row that people make by hand or publish, read with typed errors."""
+"""CSV files with a header row, read with typed errors."""
 
 from __future__ import annotations
 
 import csv
 import io
 import lzma
+import math
 from collections.abc import Iterator
 from pathlib import Path
 
 from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.files import read_bounded
 
 
 def read_rows(path: Path, columns: tuple[str, ...], most_bytes: int) -> Iterator[tuple[int, dict[str, str]]]:
-    """Line number and values by column of each row; blank rows are passed over.
+    """Yield line number and {column: value} of each row; blank rows are skipped.
 
     Args:
-        path: of the file; `.xz` is unpacked.
-        columns: that must be there; the values of others are given, too, and may be absent from a short row.
-        most_bytes: that are read, and unpacked.
+        path: the file; `.xz` is decompressed.
+        columns: required columns; other columns may be missing in a short row.
+        most_bytes: maximum size after decompression.
 
     Raises:
-        RecordingError: the file is absent, too large, no CSV file, or lacks a column or a value; names the line.
+        RecordingError: the file is absent, too large, not CSV, or a column or a value is missing; `where` gives the line.
     """
-    valid = f"a CSV file with {', '.join(columns)}"
-    data = read_bounded(path, most_bytes, RecordingError, valid)
-    if path.suffix == ".xz":
-        try:
-            with lzma.open(io.BytesIO(data)) as stream:
-                data = stream.read(most_bytes + 1)
-        except (EOFError, lzma.LZMAError) as error:
-            raise RecordingError(f"not whole: {error}", where=str(path), valid=valid) from error
-        if len(data) > most_bytes:
-            raise RecordingError(f"more than {most_bytes} bytes", where=str(path), valid=valid)
+    valid = f"a CSV file of at most {most_bytes} bytes with {', '.join(columns)}"
+    where = str(path)
     try:
+        with lzma.open(path) if path.suffix == ".xz" else path.open("rb") as stream:
+            data = stream.read(most_bytes + 1)
+        if len(data) > most_bytes:
+            raise RecordingError("too large", where=where, valid=valid)
         reader = csv.DictReader(io.StringIO(data.decode("utf-8-sig"), newline=""), strict=True)
-        absent = [name for name in columns if name not in (reader.fieldnames or ())]
-        if absent:
-            raise RecordingError(f"the column {absent[0]} is absent", where=str(path), valid=valid)
+        if missing := [name for name in columns if name not in (reader.fieldnames or ())]:
+            raise RecordingError(f"no column {missing[0]}", where=where, valid=valid)
         for row in reader:
+            where = f"{path}: line {reader.line_num}"
             if any(row[name] is None for name in columns):
-                raise RecordingError(
-                    "the row is too short", where=f"{path}: line {reader.line_num}", valid=valid
-                )
+                raise RecordingError("a value is missing", where=where, valid=valid)
             yield reader.line_num, row
-    except (csv.Error, UnicodeDecodeError) as error:
-        raise RecordingError(f"not a CSV file: {error}", where=str(path), valid=valid) from error
+    except (OSError, EOFError, lzma.LZMAError, csv.Error, UnicodeDecodeError) as error:
+        raise RecordingError(f"cannot be read: {error}", where=where, valid=valid) from error
+
+
+def identity(row: dict[str, str], column: str, where: str) -> int:
+    """Return the 64-bit number in a cell; raises RecordingError."""
+    text = (row.get(column) or "").strip()
+    if text.isascii() and text.isdigit() and len(text) <= 20 and int(text) < 1 << 64:
+        return int(text)
+    raise RecordingError(f"{column} = {text!r:.40}", where=where, valid="a whole number below 2^64")
+
+
+def number(
+    row: dict[str, str], column: str, where: str, low: float, high: float, empty: float = math.nan
+) -> float:
+    """Return the number in a cell, or `empty`; raises RecordingError."""
+    text = (row.get(column) or "").strip()
+    try:
+        value = float(text) if text else empty
+    except ValueError:
+        value = math.nan
+    if not low <= value <= high:
+        raise RecordingError(f"{column} = {text!r:.40}", where=where, valid=f"{low:g} to {high:g}")
+    return value

@@ -1,199 +1,313 @@
-"""Logs of Decawave's DecaRanging PC program (EVK1000) as sources: one file, or a folder of them."""
+"""Logs of Decawave's DecaRanging PC program (EVK1000) as sources: one file, or a folder with surveyed positions.
+
+The format is known from recordings alone (doi 10.5281/zenodo.4742391, DecaRanging 3.05). From the anchor's view, one
+exchange consists of a received poll, a sent response, a received final frame, and the range. Each received frame
+appears as `RX DATA` (the frame), `RX OK` (diagnostics) and `Accum Len` (the CIR); a reception error is `RX E`.
+"""
 
 from __future__ import annotations
 
-import threading
+import contextlib
+import enum
+import lzma
+import math
+import re
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from datetime import datetime, timezone
 from pathlib import Path
-from typing import BinaryIO
 
-from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.measurement import Record, Truth
-from uwb_mitigation.positioning.anchors import AnchorMap
-from uwb_mitigation.sources.decaranging_format import CirOf, ExchangeReader, Oddity, is_log, stated_start_ns
-from uwb_mitigation.sources.log_lines import LogLines, chunks
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.errors import DamagedRecordingError, RecordingError
+from uwb_mitigation.measurement import DEVICE_TICK_HZ, DEVICE_TIME_WRAP, Cir, RangeMeasurement, Record, Truth
+from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
+from uwb_mitigation.sources.csv_rows import identity, number, read_rows
 from uwb_mitigation.sources.source import Source
-from uwb_mitigation.sources.surveyed_positions import Survey
 
-__all__ = ["CirOf", "DecaRangingFolder", "DecaRangingLog", "Oddity", "open_decaranging"]
+MAX_ACCUMULATOR = 1016
+"""Samples of the accumulator at 64 MHz PRF; 992 at 16 MHz (DW1000 user manual, section 7.2.38)."""
 
-VALID_LOG = "a log of DecaRanging: lines such as 'File:', 'RX DATA:', 'RX OK', 'Anchor ToF:'"
+MAX_BYTES, MAX_CSV_BYTES = 1 << 30, 1 << 20
+"""Of a decompressed log (one hour has 80 MB), and of a file of the survey."""
+
+_TOKEN = re.compile(
+    rb"(?m)^(?:"
+    rb"File:(?P<start>\d{8}-\d{6})"
+    rb"|Mode: .*?Chan (?P<channel>[1-7]), .*?PRF (?P<prf>16|64),"
+    rb"|RX DATA: ?(?P<frame>(?:[0-9A-Fa-f]{2}){22,1024})$"
+    rb"|RX OK .*?HLP\((?P<path>[^()\n]*)\), PSC\((?P<preamble>\d{1,4})\), .*?RC\((?P<high>[0-9A-F]{1,4}) "
+    rb"(?P<low>[0-9A-F]{8})\), .*?NTH\((?P<noise>[0-9A-F]{1,4})\), "
+    rb".*?RSL\((?P<power>[^()\n]*)\), FSL\((?P<first>[^()\n]*)\)"
+    rb"|Accum Len (?P<length>\d{1,9})\n(?P<pairs>(?:-?\d{1,5}, -?\d{1,5}\n)*)"
+    rb"|Anchor ToF: .*?Dist: (?P<range>\S+) m "
+    rb"|(?P<error>RX E)"
+    rb"|(?P<malformed>Mode: |RX |Accum Len|Anchor ToF))"
+)
+"""Everything that is used of a log; the last group that matches tells its kind."""
+
+_NUMBER = re.compile(rb"[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?")
+_NO_SAMPLES: NDArray[np.int16] = np.zeros(0, np.int16)
+
+
+class CirOf(str, enum.Enum):
+    """The frame whose CIR and time belong to the range."""
+
+    POLL = "poll"
+    FINAL = "final"
+
+
+_CODES = {0x21: CirOf.POLL, 0x29: CirOf.FINAL}
+
+
+class Oddity(str, enum.Enum):
+    """Keys of `skipped`."""
+
+    RECEPTION_ERROR = "reception error"
+    NO_RANGE = "exchange without a range"
+    NO_CIR = "range without a CIR"
+    NOT_A_NUMBER = "value that is not a number or out of range"
+    MALFORMED = "malformed line"
+    NO_START_TIME = "log without a start time"
+    NO_TRUTH = "log without surveyed truth"
+    MOVED = "log moved later, not to overlap the one before"
+    UNREADABLE = "log that could not be read to its end"
+
+
+@dataclass(frozen=True, slots=True)
+class Placement:
+    """Surveyed location of one log: numbers of anchor and tag location, position of the tag, and truth."""
+
+    anchor: int
+    tag: int
+    tag_position: tuple[float, float, float]
+    truth: Truth
+
+
+Survey = tuple[dict[int, Placement], AnchorMap]
 
 
 class DecaRangingLog(Source):
-    """The exchanges of one log, `.log` or `.log.xz` (told apart by content); a `Source`.
+    """The exchanges of one log, `.log` or `.log.xz`; a `Source`.
 
-    A range is never lost: where the CIR that belongs to it is absent or malformed, the measurement
-    has a CIR without samples. What in the middle of a log is malformed is counted in `skipped` (see
-    `Oddity`) and reading goes on; a log that ends in the middle of a line or of an accumulator is damaged.
-
-    `stamp_ns` is the start time in the log's first line, taken as UTC (0 where there is none), plus
-    the time by the radio's counter from the first frame received to the exchange's last. The counter
-    is unwrapped from frame to frame: a silence of more than 17.2 s cannot be seen in it.
-    `device_time` is that of the frame that the CIR comes from, 0 where no frame was received.
+    No range is lost: if its CIR is missing or malformed, the measurement has a CIR without samples. Malformed parts are
+    counted in `skipped`. `stamp_ns` is the start time in the first line (as UTC; 0 if there is none) plus the time by the
+    radio's 40-bit counter since the first received frame; gaps above 17.2 s are invisible in this counter.
 
     Args:
-        path: the log.
         cir: which frame's CIR belongs to the range.
-        truth: what was surveyed for this log. tag_position: where its tag stood, x, y, z in m.
-        tag_id, anchor_id: in place of the 64-bit addresses in the frames (0 before the first frame).
+        placement: surveyed location; its numbers replace the 64-bit addresses in the frames.
     """
 
     simulated = False
 
-    def __init__(
-        self,
-        path: Path | str,
-        *,
-        cir: CirOf = CirOf.FINAL,
-        truth: Truth | None = None,
-        tag_position: tuple[float, float, float] | None = None,
-        tag_id: int | None = None,
-        anchor_id: int | None = None,
-    ) -> None:
-        self.path = Path(path)
-        self.name = f"DecaRanging log {self.path.name}"
+    def __init__(self, path: Path, cir: CirOf = CirOf.FINAL, placement: Placement | None = None) -> None:
+        self.path = path
+        self.name = f"DecaRanging log {path.name}"
         self.skipped: Counter[str] = Counter()
         self._cir_of = cir
-        self._truth = truth
-        self._tag_position = tag_position
-        self._tag_id = tag_id
-        self._anchor_id = anchor_id
-        self._files: set[BinaryIO] = set()
-        self._closed = threading.Event()
+        self._placement = placement
 
     def __iter__(self) -> Iterator[Record]:
         """Yield the exchanges that have a range.
 
         Raises:
-            RecordingError: the file is absent, empty, or no DecaRanging log.
-            DamagedRecordingError: the log is cut short or corrupt; names the line before.
+            RecordingError: the file is absent, empty, too large, or not a DecaRanging log.
+            DamagedRecordingError: the log is truncated or corrupt; `where` gives the last line.
         """
         return self.records()
 
     def records(self, first_sequence: int = 0, not_before_ns: int = 0) -> Iterator[Record]:
-        """As iteration, for a log that follows others: counts on from there, and starts no earlier."""
-        self.skipped = Counter()
-        if self._closed.is_set():
-            raise _closed_error(self.path)
-        try:
-            with self._opened() as lines:
-                if self._truth is None:
-                    self.skipped[Oddity.NO_TRUTH.value] += 1
-                reader = ExchangeReader(
-                    lines,
-                    self.skipped,
-                    self._cir_of,
-                    self._tag_id,
-                    self._anchor_id,
-                    first_sequence,
-                    not_before_ns,
-                )
-                for measurement in reader.measurements():
-                    if self._closed.is_set():
-                        return
-                    yield Record(measurement, self._truth, self._tag_position)
-        except RecordingError:
-            if not self._closed.is_set():
-                raise
+        """Iterate as part of a series: continue its sequence numbers and begin no earlier than `not_before_ns`."""
+        self.skipped = Counter() if self._placement else Counter({Oddity.NO_TRUTH.value: 1})
+        placed = self._placement
+        text, fault = _read(self.path)
+        if not (_TOKEN.search(text) or fault):
+            raise RecordingError("not a DecaRanging log", where=str(self.path), valid="'RX DATA:' and so on")
+        for sequence, measured in enumerate(self._measurements(text, not_before_ns), first_sequence):
+            tag, anchor = (placed.tag, placed.anchor) if placed else (measured.tag_id, measured.anchor_id)
+            numbered = replace(measured, sequence=sequence & 0xFFFFFFFF, tag_id=tag, anchor_id=anchor)
+            yield Record(numbered, placed.truth, placed.tag_position) if placed else Record(numbered)
+        if fault:
+            raise DamagedRecordingError(fault, where=self._after(text))
 
     def start_ns(self) -> int:
-        """The start time in the log's first line, ns since the epoch; 0 where it states none.
+        """Return the start time in the first line, ns since the epoch; 0 if there is none or it cannot be read."""
+        with contextlib.suppress(OSError, EOFError, lzma.LZMAError), _opened(self.path) as stream:
+            return _start_ns(stream.readline(4096))
+        return 0
 
-        Raises:
-            RecordingError: see `__iter__`.
-        """
-        with self._opened() as lines:
-            return stated_start_ns(lines.head())
+    def _after(self, text: bytes) -> str:
+        lines = text.count(b"\n")
+        return f"{self.path}: after line {lines}"
 
-    @contextmanager
-    def _opened(self) -> Iterator[LogLines]:
-        """The lines of the log, while it is open."""
-        if not self.path.is_file():
-            raise RecordingError("no such file", where=str(self.path), valid=VALID_LOG)
-        try:
-            file = self.path.open("rb")
-        except OSError as error:
-            raise RecordingError(f"cannot open: {error.strerror}", where=str(self.path)) from error
-        self._files.add(file)
-        try:
-            lines = LogLines(chunks(file, self.path), self.path)
-            head = lines.head()
-            if not is_log(head):
-                what = "not a DecaRanging log" if head else "the log is empty"
-                raise RecordingError(what, where=str(self.path), valid=VALID_LOG)
-            yield lines
-        except ValueError as error:
-            # What a file says that another thread has closed.
-            if self._closed.is_set():
-                raise _closed_error(self.path) from error
-            raise
-        finally:
-            self._files.discard(file)
-            file.close()
+    def _count(self, oddity: Oddity) -> None:
+        self.skipped[oddity.value] += 1
 
-    def close(self) -> None:
-        """End iterations under way and release their files; the source cannot be iterated again."""
-        self._closed.set()
-        for file in tuple(self._files):
-            file.close()
+    def _measurements(self, text: bytes, not_before_ns: int) -> Iterator[RangeMeasurement]:
+        start_ns = _start_ns(text)
+        if not start_ns:
+            self._count(Oddity.NO_START_TIME)
+        base_ns, ticks = max(start_ns, not_before_ns), 0
+        latest: int | None = None  # device time of the latest frame
+        announced: CirOf | None = None  # kind of the frame in RX DATA
+        owner: CirOf | None = None  # kind of the frame that a CIR would belong to
+        frames: dict[CirOf, tuple[int, Cir]] = {}
+        channel = prf = tag = anchor = 0
+        for match in _TOKEN.finditer(text):
+            kind = match.lastgroup
+            if kind == "prf":
+                channel, prf = int(match["channel"]), int(match["prf"])
+            elif kind == "frame":
+                # IEEE 802.15.4 with 64-bit addresses, then the function code
+                frame = bytes.fromhex(match["frame"].decode())
+                announced, owner = _CODES.get(frame[21]), None
+                tag, anchor = (int.from_bytes(frame[at : at + 8], "little") for at in (13, 5))
+            elif kind == "first":
+                owner, announced = announced, None
+                time = (int(match["high"], 16) << 32 | int(match["low"], 16)) % DEVICE_TIME_WRAP
+                ticks += 0 if latest is None else (time - latest) % DEVICE_TIME_WRAP
+                latest = time
+                if owner is not None:
+                    if owner in frames or (owner is CirOf.POLL and frames):
+                        self._count(Oddity.NO_RANGE)
+                    if owner is CirOf.POLL:
+                        frames.clear()
+                    frames[owner] = time, self._diagnostics(match, channel, prf)
+            elif kind == "pairs":
+                length, lines = int(match["length"]), match["pairs"].count(b"\n")
+                if match.end() == len(text) and lines < length:
+                    what = f"ends after {lines} of {length} lines of a CIR"
+                    raise DamagedRecordingError(what, where=self._after(text))
+                if lines != length or length > MAX_ACCUMULATOR:
+                    self._count(Oddity.MALFORMED)
+                elif owner is self._cir_of:
+                    frames[owner] = frames[owner][0], self._with_samples(frames[owner][1], match["pairs"])
+                owner = None
+            elif kind == "range":
+                empty = Cir(_NO_SAMPLES, channel=channel, prf_mhz=prf)
+                time, cir = frames.get(self._cir_of, (latest or 0, empty))
+                if len(cir) == 0:
+                    self._count(Oddity.NO_CIR)
+                stamp_ns = base_ns + ticks * 1_000_000_000 // int(DEVICE_TICK_HZ)
+                range_m = self._number(match["range"], -3e38, 3e38)
+                yield RangeMeasurement(stamp_ns, tag, anchor, 0, time, range_m, cir)
+                frames.clear()
+                announced = owner = None
+            elif kind != "start":
+                self._count(Oddity.RECEPTION_ERROR if kind == "error" else Oddity.MALFORMED)
+                announced = owner = None
+        if frames:
+            self._count(Oddity.NO_RANGE)
+
+    def _diagnostics(self, match: re.Match[bytes], channel: int, prf: int) -> Cir:
+        power, first = (self._number(match[name], -1000.0, 1000.0) for name in ("power", "first"))
+        return Cir(
+            _NO_SAMPLES,
+            # ten bits, and six after the point
+            first_path_index=self._number(match["path"], 0.0, 1024 - 2**-6),
+            preamble_count=int(match["preamble"]),
+            noise_threshold=int(match["noise"], 16),
+            rx_power_dbm=power,
+            first_path_power_dbm=first,
+            channel=channel,
+            prf_mhz=prf,
+        )
+
+    def _with_samples(self, cir: Cir, pairs: bytes) -> Cir:
+        values = np.fromstring(pairs.replace(b",", b" "), np.int32, sep=" ")
+        if values.size == 0 or values.min() < -32768 or values.max() > 32767:
+            self._count(Oddity.MALFORMED)
+            return cir
+        return replace(cir, samples=values.astype(np.int16))
+
+    def _number(self, text: bytes, low: float, high: float) -> float:
+        value = float(text) if _NUMBER.fullmatch(text) else math.nan
+        if low <= value <= high:
+            return value
+        self._count(Oddity.NOT_A_NUMBER)  # such as -001.#INF
+        return math.nan
+
+
+def _opened(path: Path) -> lzma.LZMAFile:
+    return lzma.open(path) if path.suffix == ".xz" else path.open("rb")  # type: ignore[return-value]
+
+
+def _read(path: Path) -> tuple[bytes, str]:
+    """Return the complete lines of a log, with line feeds only, and what is damaged (empty: nothing)."""
+    pieces: list[bytes] = []
+    fault = ""
+    try:
+        with _opened(path) as stream:
+            # Small pieces, so that everything before a damage is kept.
+            while piece := stream.read(1 << 13):
+                pieces.append(piece)
+                if len(pieces) << 13 > MAX_BYTES:
+                    raise RecordingError(f"more than {MAX_BYTES} bytes", where=str(path))
+    except (OSError, EOFError, lzma.LZMAError) as error:
+        if not pieces:
+            raise RecordingError(f"cannot be read: {error}", where=str(path)) from error
+        fault = str(error)
+    text = b"".join(pieces).replace(b"\r\n", b"\n")
+    whole = text[: text.rfind(b"\n") + 1]
+    return whole, fault or ("ends in the middle of a line" if len(whole) < len(text) else "")
+
+
+def _start_ns(head: bytes) -> int:
+    """The start time of a first line, as UTC; 0 if there is none."""
+    match = _TOKEN.match(head)
+    try:
+        stated = match["start"].decode() if match is not None and match["start"] else ""
+        start = datetime.strptime(stated, "%Y%m%d-%H%M%S").replace(tzinfo=timezone.utc)
+    except ValueError:
+        return 0
+    # The 64-bit nanoseconds of ROS and NumPy end in 2262.
+    return int(start.timestamp()) * 1_000_000_000 if 1970 <= start.year < 2262 else 0
 
 
 class DecaRangingFolder(Source):
-    """The logs of a folder one after the other, with what was surveyed; a `Source`.
+    """The logs of a folder (or of its sub-folder `logs`) in the order of time, with surveyed positions; a `Source`.
 
-    The logs are those in the folder, or else in its sub-folder `logs`; the survey's CSV files (see
-    `survey`) are there or in the folder above. All logs of a survey are made with the same two boards,
-    moved about: their tag and anchor therefore bear the numbers of the surveyed locations, not the
-    boards' addresses, so that a pair is one pair of locations. Anchor 2 and tag 2 are two locations.
-    Logs without a row in the survey keep the addresses and have no truth.
-
-    Order is that of start times, then of log numbers. Where a log would begin before the one
-    before it ends, it is moved later, so that time never runs backwards. A log that is damaged or
-    is none does not keep those after it from being read: the first such error is raised at the end.
-
-    Args:
-        path: the folder.
-        cir: which frame's CIR belongs to the range.
+    The survey is in the folder or its parent: `pairs.csv` (file_number, anchor_location, tag_location), `anchors.csv` and
+    `tags.csv` (location, x, y in m) and optionally `labels.csv` (file_id, label). True ranges are distances in the plane.
+    Location numbers replace the boards' addresses as ids. Logs without a row in `pairs.csv` keep the addresses and have no
+    truth. A log that would begin before the previous one ends is moved later. If a log cannot be read, the others are;
+    the first error is raised at the end.
 
     Attributes:
-        anchors: the surveyed locations of anchors, at z = 0; only where there is a survey.
+        anchors: surveyed anchor locations, at z = 0; only if there is a survey.
 
     Raises:
-        RecordingError: the folder is absent or without logs, or its survey is malformed.
+        RecordingError: the folder is absent or contains no logs, or the survey is malformed.
     """
 
     simulated = False
     anchors: AnchorMap
 
-    def __init__(self, path: Path | str, *, cir: CirOf = CirOf.FINAL) -> None:
-        self.path = Path(path)
+    def __init__(self, path: Path, cir: CirOf = CirOf.FINAL) -> None:
         self.skipped: Counter[str] = Counter()
-        self._closed = threading.Event()
-        paths, self._twice = _logs_of(self.path)
-        survey = Survey.find(paths[0].parent)
-        self._logs = [_surveyed(log, survey, cir) for log in paths]
+        folder = next((one for one in (path, path / "logs") if any(one.glob("*.log*"))), path)
+        plain, packed = (
+            {log.name.removesuffix(".xz"): log for log in folder.glob(f"*.log{end}")} for end in ("", ".xz")
+        )
+        if not plain | packed:
+            raise RecordingError("no logs", where=str(path), valid="*.log or *.log.xz, or logs/")
+        survey = find_survey(folder)
         if survey is not None:
-            self.anchors = survey.anchors
-        self.name = f"DecaRanging folder {self.path.resolve().name} ({len(paths)} logs)"
+            self.anchors = survey[1]
+        logs = [_surveyed(log, survey, cir) for log in sorted({**packed, **plain}.values())]
+        self._logs = sorted(logs, key=lambda log: (log.start_ns(), _number_of(log.path) or 0, log.path.name))
+        self.name = f"DecaRanging folder {path.resolve().name} ({len(logs)} logs)"
 
     def __iter__(self) -> Iterator[Record]:
-        """Yield the exchanges that have a range.
-
-        Raises:
-            RecordingError, DamagedRecordingError: a log could not be read to its end; all others were.
-        """
+        """Yield the exchanges that have a range; raises as `DecaRangingLog`, after all logs were read."""
         self.skipped = Counter()
-        if self._closed.is_set():
-            raise _closed_error(self.path)
-        if self._twice:
-            self.skipped[Oddity.TWICE.value] = self._twice
         first_error: RecordingError | None = None
         sequence = last_ns = 0
-        for start_ns, log in self._in_order():
-            if start_ns < last_ns:
+        for log in self._logs:
+            if log.start_ns() < last_ns:
                 self.skipped[Oddity.MOVED.value] += 1
             try:
                 for record in log.records(sequence, last_ns):
@@ -201,8 +315,6 @@ class DecaRangingFolder(Source):
                     sequence += 1
                     yield record
             except RecordingError as error:
-                if self._closed.is_set():
-                    return
                 self.skipped[Oddity.UNREADABLE.value] += 1
                 first_error = first_error or error
             finally:
@@ -210,67 +322,68 @@ class DecaRangingFolder(Source):
         if first_error is not None:
             raise first_error
 
-    def _in_order(self) -> list[tuple[int, DecaRangingLog]]:
-        started = [(_start_or_zero_ns(log), log) for log in self._logs]
-        return sorted(started, key=lambda pair: (pair[0], _number_of(pair[1].path) or 0, pair[1].path.name))
-
-    def close(self) -> None:
-        """End iterations under way and release their files; the source cannot be iterated again."""
-        self._closed.set()
-        for log in self._logs:
-            log.close()
-
 
 def open_decaranging(path: Path | str, *, cir: CirOf = CirOf.FINAL) -> DecaRangingLog | DecaRangingFolder:
-    """The source for a log or a folder of logs, with the truth that a survey beside it gives.
+    """Return the source for a log or a folder of logs, with surveyed truth if there is a survey.
 
     Raises:
-        RecordingError: nothing is there, the folder holds no logs, or the survey is malformed.
+        RecordingError: nothing is there, the folder contains no logs, or the survey is malformed.
     """
     path = Path(path)
     if path.is_dir():
-        return DecaRangingFolder(path, cir=cir)
+        return DecaRangingFolder(path, cir)
     if not path.is_file():
-        raise RecordingError("no such file or folder", where=str(path), valid=VALID_LOG)
-    return _surveyed(path, Survey.find(path.parent), cir)
+        raise RecordingError("no such file or folder", where=str(path), valid="a log, or a folder of logs")
+    return _surveyed(path, find_survey(path.parent), cir)
 
 
-def _closed_error(path: Path) -> RecordingError:
-    return RecordingError("the source is closed", where=str(path), valid="open it anew")
+def find_survey(folder: Path) -> Survey | None:
+    """Return {log number: placement} and all anchors of the survey in `folder` or its parent; None without `pairs.csv`.
 
+    Raises:
+        RecordingError: a file is absent or malformed, names an unknown location, or repeats a number.
+    """
+    folder = folder.resolve()
+    folder = folder if (folder / "pairs.csv").is_file() else folder.parent
+    if not (folder / "pairs.csv").is_file():
+        return None
 
-def _start_or_zero_ns(log: DecaRangingLog) -> int:
-    try:
-        return log.start_ns()
-    except RecordingError:
-        return 0  # reading the log raises it again, where it is reported
+    def table(name: str, *columns: str) -> Iterator[tuple[str, int, dict[str, str]]]:
+        seen: set[int] = set()
+        for line, row in read_rows(folder / name, columns, MAX_CSV_BYTES):
+            where = f"{folder / name}: line {line}"
+            key = identity(row, columns[0], where)
+            if key in seen:
+                raise RecordingError(f"{columns[0]} {key} is repeated", where=where)
+            seen.add(key)
+            yield where, key, row
+
+    def positions(name: str) -> dict[int, tuple[float, ...]]:
+        limits = -1e6, 1e6
+        rows = table(name, "location", "x", "y")
+        return {key: tuple(number(row, axis, where, *limits) for axis in "xy") for where, key, row in rows}
+
+    labels = {}
+    if (folder / "labels.csv").is_file():
+        labels = {key: row["label"].strip() for _, key, row in table("labels.csv", "file_id", "label")}
+    surveyed = {kind: positions(f"{kind}s.csv") for kind in ("anchor", "tag")}
+    placements = {}
+    for where, log, row in table("pairs.csv", "file_number", "anchor_location", "tag_location"):
+        ids = {kind: identity(row, f"{kind}_location", where) for kind in surveyed}
+        for kind, location in ids.items():
+            if location not in surveyed[kind]:
+                raise RecordingError(f"{kind} location {location} is unknown", where=where)
+        tag = surveyed["tag"][ids["tag"]]
+        range_m = math.dist(surveyed["anchor"][ids["anchor"]], tag)
+        truth = Truth(range_m, labels.get(log, ""), f"{folder.name}/{log}")
+        placements[log] = Placement(ids["anchor"], ids["tag"], (*tag, 0.0), truth)  # type: ignore[arg-type]
+    anchors = [Anchor(key, (x, y, 0.0)) for key, (x, y) in surveyed["anchor"].items()]
+    return placements, AnchorMap(anchors, str(folder / "anchors.csv"))
 
 
 def _surveyed(path: Path, survey: Survey | None, cir: CirOf) -> DecaRangingLog:
-    number = _number_of(path)
-    placement = survey.placements.get(number) if survey is not None and number is not None else None
-    if placement is None:
-        return DecaRangingLog(path, cir=cir)
-    return DecaRangingLog(
-        path,
-        cir=cir,
-        truth=placement.truth,
-        tag_position=placement.tag_position,
-        tag_id=placement.tag,
-        anchor_id=placement.anchor,
-    )
-
-
-def _logs_of(folder: Path) -> tuple[list[Path], int]:
-    """The logs of a folder, each once (the plain one of two), and how many were there twice."""
-    if not folder.is_dir():
-        raise RecordingError("no such folder", where=str(folder), valid="a folder of DecaRanging logs")
-    for place in (folder, folder / "logs"):
-        compressed = {path.name[: -len(".xz")]: path for path in place.glob("*.log.xz") if path.is_file()}
-        plain = {path.name: path for path in place.glob("*.log") if path.is_file()}
-        if compressed or plain:
-            return sorted({**compressed, **plain}.values()), len(compressed.keys() & plain.keys())
-    raise RecordingError("the folder holds no logs", where=str(folder), valid="*.log or *.log.xz, or logs/")
+    log = _number_of(path)
+    return DecaRangingLog(path, cir, survey[0].get(log) if survey and log is not None else None)
 
 
 def _number_of(path: Path) -> int | None:

@@ -6,27 +6,24 @@ from pathlib import Path
 from typing import Literal
 
 from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.sources.log_lines import XZ_MAGIC
 from uwb_mitigation.sources.source import Source
 
 ACCEPTED = (
     "an MCAP bag (.mcap, or a folder with metadata.yaml), "
-    "DecaRanging logs (.log, .log.xz, or a folder of them), a folder of a Hanyang run, or DeepUWB's pickle (.pkl)"
+    "DecaRanging logs (.log, .log.xz, or a folder of them), or a folder of a Hanyang run; `data import` makes a bag of DeepUWB's pickle"
 )
 
 _MCAP_MAGIC = b"\x89MCAP0\r\n"
+_XZ_MAGIC = b"\xfd7zXZ\x00"
 _SQLITE_MAGIC = b"SQLite format 3\x00"
 
 
-def open_recording(
-    path: Path, *, cir: Literal["final", "poll"] = "final", trust_pickle: bool = False
-) -> Source:
+def open_recording(path: Path, *, cir: Literal["final", "poll"] = "final") -> Source:
     """The source that reads `path`, picked by what the path holds; the suffix decides only for logs.
 
     Args:
         path: a file or folder.
         cir: of a DecaRanging exchange, which frame's CIR to take: `final` or `poll`.
-        trust_pickle: read a pickle even if it is not the published one, see `deepuwb.read_deepuwb`.
 
     Raises:
         RecordingError: there is nothing at `path`, or no source reads it.
@@ -50,10 +47,6 @@ def open_recording(
         from uwb_mitigation.sources.decaranging import CirOf, open_decaranging
 
         return open_decaranging(path, cir=CirOf[cir.upper()])
-    if path.suffix == ".pkl" or _looks_like_pickle(path):
-        from uwb_mitigation.sources.deepuwb import DeepUwbRecording
-
-        return DeepUwbRecording(path, trust=trust_pickle)
     raise RecordingError("not a recording that can be read", where=str(path), valid=ACCEPTED)
 
 
@@ -69,12 +62,7 @@ def _is_bag(path: Path) -> bool:
 
 def _looks_like_log(path: Path) -> bool:
     head = _head(path)
-    return head.startswith(XZ_MAGIC) or b"DecaRanging" in head
-
-
-def _looks_like_pickle(path: Path) -> bool:
-    head = _head(path)
-    return len(head) > 1 and head[0] == 0x80 and head[1] in range(2, 6)  # the opcode PROTO and its number
+    return head.startswith(_XZ_MAGIC) or b"DecaRanging" in head
 
 
 def _head(path: Path) -> bytes:

@@ -13,13 +13,12 @@ from pathlib import Path
 
 from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.measurement import Record, Truth
-from uwb_mitigation.sources.csv_rows import read_rows
+from uwb_mitigation.sources.csv_rows import identity, number, read_rows
 
 MAX_CSV_BYTES = 1 << 20
 MAX_RANGE_M = 1e6
 
 _NEEDED = ("tag_id", "anchor_id", "range_m")
-_MAX_ID = (1 << 64) - 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,31 +63,14 @@ def with_truth(records: Iterable[Record], stretches: Sequence[Stretch]) -> Itera
 
 def _stretch(row: dict[str, str], path: Path, line: int) -> Stretch:
     where = f"{path}: line {line}"
-
-    def number(name: str, otherwise: float | None = None) -> float:
-        text = (row.get(name) or "").strip()
-        if not text and otherwise is not None:
-            return otherwise
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
-        if not 0 <= value <= MAX_RANGE_M:
-            raise RecordingError(f"{name} = {text!r}", where=where, valid=f"0 to {MAX_RANGE_M:g}")
-        return value
-
-    def identity(name: str) -> int:
-        text = (row.get(name) or "").strip()
-        if text.isascii() and text.isdigit() and len(text) <= 20 and int(text) <= _MAX_ID:
-            return int(text)
-        raise RecordingError(f"{name} = {text!r}", where=where, valid="a whole number of 64 bits")
-
-    start_s, stop_s = number("start_s", 0.0), number("stop_s", math.inf)
+    start_s = number(row, "start_s", where, 0.0, MAX_RANGE_M, 0.0)
+    stop_s = number(row, "stop_s", where, 0.0, math.inf, math.inf)
     if start_s >= stop_s:
         raise RecordingError(f"start_s = {start_s} is not before stop_s = {stop_s}", where=where)
     truth = Truth(
-        number("range_m"),
+        number(row, "range_m", where, 0.0, MAX_RANGE_M),
         (row.get("label") or "").strip(),
         (row.get("configuration") or "").strip() or f"{path.name} line {line}",
     )
-    return Stretch(identity("tag_id"), identity("anchor_id"), start_s, stop_s, truth)
+    tag_id, anchor_id = (identity(row, name, where) for name in ("tag_id", "anchor_id"))
+    return Stretch(tag_id, anchor_id, start_s, stop_s, truth)

@@ -1,39 +1,18 @@
-"""A recording as the parts that a network is trained and tested on."""
+"""Read a recording as a data set to train, calibrate or evaluate on."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-
-import numpy as np
 
 from uwb_mitigation import dataset as datasets
 from uwb_mitigation.dataset import Dataset
-from uwb_mitigation.errors import DatasetError, ParameterError
-from uwb_mitigation.evaluation import splits
+from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.measurement import Record, Truth
 from uwb_mitigation.preprocessing import CirFault, Preprocessing, Scaling
 from uwb_mitigation.sources import opening
 from uwb_mitigation.sources.truth_table import load_truth, with_truth
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Parts:
-    """The data of a run; windows of other lengths are cut from these.
-
-    Attributes:
-        data, split: names for people.
-    """
-
-    data: str
-    split: str
-    train: Dataset
-    test: Dataset
-
-    def narrowed(self, samples: int) -> Parts:
-        """The same parts with shorter windows; raises as `narrowed`."""
-        return replace(self, train=narrowed(self.train, samples), test=narrowed(self.test, samples))
 
 
 def load(
@@ -85,30 +64,3 @@ def _named(record: Record) -> Record:
     minute = measured.stamp_ns // 60_000_000_000
     name = f"tag {measured.tag_id}/anchor {measured.anchor_id}/minute {minute}"
     return replace(record, truth=Truth(measured.range_m, configuration=name))
-
-
-def divided(name: str, dataset: Dataset, split: str) -> Parts:
-    """The training and the test part by one of `evaluation.splits.SPLITS`; raises as `by_name` there."""
-    told, rows = splits.by_name(dataset.configurations, split)
-    return Parts(name, told, dataset.rows(rows.train), dataset.rows(rows.test))
-
-
-def narrowed(dataset: Dataset, samples: int) -> Dataset:
-    """The same measurements with shorter windows.
-
-    Windows start at the same sample whatever their length; scaling by the maximum is done anew.
-
-    Raises:
-        ParameterError: longer than the windows that there are.
-    """
-    if not 1 <= samples <= dataset.preprocessing.samples:
-        raise ParameterError(f"window of {samples} samples", valid=f"1 to {dataset.preprocessing.samples}")
-    inputs = dataset.inputs[:, :samples]
-    if dataset.preprocessing.scaling is Scaling.MAX:
-        peak = inputs.max(axis=1, keepdims=True)
-        inputs = inputs / np.where(peak > 0, peak, np.float32(1))
-    return replace(
-        dataset,
-        preprocessing=Preprocessing(samples, dataset.preprocessing.scaling),
-        inputs=np.ascontiguousarray(inputs),
-    )

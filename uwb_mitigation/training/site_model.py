@@ -21,10 +21,9 @@ from uwb_mitigation.evaluation import lad, splits
 from uwb_mitigation.evaluation.preference import MUST_GAIN, preferred
 from uwb_mitigation.model import graph
 from uwb_mitigation.model.architecture import Architecture
-from uwb_mitigation.model.bundle import Bundle, Card, made_bundle
+from uwb_mitigation.model.bundle import Bundle, Card, made_bundle, session_options
 from uwb_mitigation.model.float_networks import float_network, scaled
 from uwb_mitigation.model.prior import LinePrior
-from uwb_mitigation.model.runtime import session_options
 from uwb_mitigation.model.weights import FloatWeights
 from uwb_mitigation.training.cards import card_of, familiarity_of
 from uwb_mitigation.training.options import FitOptions

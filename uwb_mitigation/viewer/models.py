@@ -186,17 +186,17 @@ class Models:
         return DataTable(
             source=self.pairs,
             columns=[
-                _column("anchor", "anchor", 54, "text"),
-                _column("tag", "tag", 54, "text"),
+                _column("anchor", "anchor", 64, "text"),
+                _column("tag", "tag", 64, "text"),
                 _column("rate", "Hz", 46, "1"),
                 _column("raw", "raw", 54, "3"),
                 _column("range", "corrected", 66, "3"),
                 _column("sigma", "sigma", 50, "3"),
-                _column("correction", "correction", 76, "bar"),
-                _column("status", "status", 166, "status"),
+                _column("correction", "correction", 70, "bar"),
+                _column("status", "status", 160, "status"),
                 # The same columns for a narrow page.
-                _column("anchor", "pair", 70, "pair", STACKED),
-                _column("range", "corrected, raw", 98, "ranges", STACKED),
+                _column("anchor", "pair", 76, "pair", STACKED),
+                _column("range", "corrected, raw", 92, "ranges", STACKED),
                 _column("correction", "correction, \u03c3", 90, "corrections", STACKED),
                 _column("status", "status", 98, "broken", STACKED),
             ],

@@ -19,7 +19,8 @@ from bokeh.document import Document
 from bokeh.events import Reset
 from bokeh.models import ColumnDataSource
 
-from uwb_mitigation.measurement import Status, format_id
+from uwb_mitigation.errors import format_id
+from uwb_mitigation.measurement import Status
 from uwb_mitigation.preprocessing import WINDOW_LEAD
 from uwb_mitigation.viewer.models import (
     CORRECTED,

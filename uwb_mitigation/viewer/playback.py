@@ -17,8 +17,7 @@ from typing import Any
 
 from uwb_mitigation.bag import schemas
 from uwb_mitigation.bag.codec import decode_range, key_of
-from uwb_mitigation.bag.index import RawMessage
-from uwb_mitigation.bag.reader import BagReader, check_channel
+from uwb_mitigation.bag.reader import BagReader, RawMessage, check_channel
 from uwb_mitigation.bag.topics import (
     ANCHORS,
     MARKERS_TYPE,

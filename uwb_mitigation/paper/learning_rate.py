@@ -1,4 +1,4 @@
-"""The learning-rate range test (Smith 2017): the rate rises with every batch, and the loss is watched."""
+"""The learning-rate range test (Smith 2017): increase the rate with every batch and record the loss."""
 
 from __future__ import annotations
 
@@ -11,26 +11,28 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError, ParameterError
 from uwb_mitigation.model.architecture import Architecture
-from uwb_mitigation.training import networks
-from uwb_mitigation.training.fitting import adam, as_tensors, single_thread
-from uwb_mitigation.training.fitting import step as train_step
+from uwb_mitigation.training import fitting, networks
 from uwb_mitigation.training.options import FitOptions
 
 SMOOTHING = 0.95
 """Weight of the past in the running mean of the losses."""
 
 DIVERGED = 4.0
-"""The test ends where the smoothed loss is so many times its least."""
+"""The test ends when the smoothed loss exceeds this multiple of its minimum."""
+
+SETTLING = 20
+"""Steps before the running mean is reliable."""
 
 
 @dataclass(frozen=True, slots=True)
 class RangeTest:
-    """Attributes:
-    rates: of each step.
-    losses_m: smoothed mean absolute error at each step, m; as many as rates.
-    suggested: the rate at which the loss falls steepest, per factor of the rate.
-    highest: the rate at which the loss is least; beyond it training becomes unstable.
-    diverged: whether the loss exploded before the last rate.
+    """Result of a range test.
+
+    Attributes:
+        rates, losses_m: of each step; losses are smoothed mean absolute errors.
+        suggested: the rate at which the loss falls steepest over the logarithm of the rate.
+        highest: the rate with the smallest loss.
+        diverged: the loss exploded before the last rate.
     """
 
     rates: tuple[float, ...]
@@ -55,41 +57,39 @@ def range_test(
 
     Raises:
         ParameterError: the rates or the steps are out of range.
-        DatasetError: there are no inputs, or no step had a finite loss.
+        DatasetError: no inputs, or no step has a finite loss.
     """
-    if not 0 < low < high <= 10 or not 20 <= steps <= 100_000:
+    if not 0 < low < high <= 10 or not SETTLING <= steps <= 100_000:
         raise ParameterError(
             f"rates {low} to {high} in {steps} steps", valid="0 < low < high <= 10, 20 to 100000 steps"
         )
-    source, wanted = as_tensors(inputs, targets)
-    rates, losses = [], []
+    source, wanted = fitting.as_tensors(inputs, targets)
+    rates: list[float] = []
+    losses: list[float] = []
     mean, least, diverged = 0.0, math.inf, False
     generator = np.random.default_rng(options.seed)
-    with single_thread(options.seed):
+    with fitting.single_thread(options.seed):
         network = networks.build(architecture, options.dropout)
-        optimizer = adam(network, options)
+        optimizer = fitting.adam(network, options)
         for step, rate in enumerate(np.geomspace(low, high, steps).tolist()):
             optimizer.param_groups[0]["lr"] = rate
             rows = generator.integers(len(source), size=options.batch)
-            loss = train_step(network, optimizer, source[rows], wanted[rows])
+            loss = fitting.step(network, optimizer, source[rows], wanted[rows])
             on_step()
             mean = SMOOTHING * mean + (1 - SMOOTHING) * loss
             smooth = mean / (1 - SMOOTHING ** (step + 1))
-            if not math.isfinite(smooth):
-                diverged = True
-                break
-            rates.append(rate)
-            losses.append(smooth)
-            # The first batches' mean is too noisy to compare with.
-            least = min(least, smooth) if step >= 20 else least
-            if smooth > DIVERGED * least:
+            if math.isfinite(smooth):
+                rates.append(rate)
+                losses.append(smooth)
+                least = min(least, smooth) if step >= SETTLING else least
+            if not math.isfinite(smooth) or smooth > DIVERGED * least:
                 diverged = True
                 break
     if len(losses) < 3:
         raise DatasetError("the loss diverges at the lowest rates", valid="a lower rate, smaller targets")
-    settled = min(20, len(losses) // 4)
+    settled = min(SETTLING, len(losses) // 4)
     best = settled + int(np.argmin(losses[settled:]))
-    # Before the least: after it the loss may fall again from a height that it jumped to.
+    # Search before the minimum: after it the loss may fall again from a peak.
     slope = np.gradient(np.array(losses), np.log(np.array(rates)))
     steepest = settled + int(np.argmin(slope[settled : best + 1]))
     return RangeTest(tuple(rates), tuple(losses), rates[steepest], rates[best], diverged)

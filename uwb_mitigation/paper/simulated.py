@@ -1,4 +1,4 @@
-"""Simulated measurements in DeepUWB's shape."""
+"""Simulated measurements with the format, rooms and size of DeepUWB."""
 
 from __future__ import annotations
 
@@ -11,20 +11,14 @@ from itertools import islice
 import numpy as np
 
 from uwb_mitigation.measurement import Cir, Encoding, Record
+from uwb_mitigation.paper.deepuwb import CIR_SAMPLES, FIRST_ANCHOR_ID, FIRST_PATH_INDEX, FULL_SCALE
+from uwb_mitigation.paper.rooms import ROOM_ROWS, configuration_of
 from uwb_mitigation.preprocessing import WINDOW_LEAD
 from uwb_mitigation.simulation.channel import check_range
 from uwb_mitigation.simulation.links import Links, draw_fields, place
 from uwb_mitigation.simulation.radio import Radio
 from uwb_mitigation.simulation.rooms import OBSTACLES, ROOMS, draw_obstacles, obstruct
 from uwb_mitigation.simulation.scene import DirectPath
-from uwb_mitigation.sources.deepuwb import (
-    CIR_SAMPLES,
-    FIRST_ANCHOR_ID,
-    FIRST_PATH_INDEX,
-    FULL_SCALE,
-    ROOM_ROWS,
-    configuration_of,
-)
 from uwb_mitigation.sources.simulated import (
     BATCH,
     FIRST_TAG_ID,
@@ -38,16 +32,16 @@ LATE = "first path too late for a whole window"
 
 
 class SimulatedDeepUwb(Simulated):
-    """Placements at rest in five environments, in DeepUWB's shape; a `Source`.
+    """Static placements in five environments, in the format of DeepUWB; a `Source`.
 
-    Rooms in DeepUWB's order, each with its share of the rows, obstacles among the ten materials between the
-    antennas, and CIRs as DeepUWB has them: 157 amplitudes from five samples before the first path, the largest
-    being 1, without a preamble count. Beyond DeepUWB, distances are true and the radio's levels known, and a
-    configuration is one placement: "simulated seed 1/deepuwb/room2/wall/placement 7", with 7 counted in its room.
+    The rooms are in DeepUWB's order, each with its share of the rows, with obstacles of the ten materials between the
+    antennas. The CIRs are cut and normalised like DeepUWB's: 157 amplitudes from five samples before the first path,
+    the largest is 1, no preamble count. In addition to DeepUWB, true ranges and received powers are known, and a
+    configuration is one placement: "simulated seed 1/deepuwb/room2/wall/placement 7" (numbered within the room).
 
     Args:
         seed: 0 to 2^32 - 1.
-        ranges: rows, 100 to 1,000,000; by default as many as in DeepUWB, with its number in each room.
+        ranges: number of rows, 100 to 1,000,000; by default that of DeepUWB in each room.
         exchanges: 1 to 1000 for each placement.
 
     Attributes:
@@ -61,9 +55,9 @@ class SimulatedDeepUwb(Simulated):
         check_seed(seed)
         check_range("simulated DeepUWB", "ranges", ranges, 100, 1_000_000, whole=True)
         check_range("simulated DeepUWB", "exchanges", exchanges, 1, 1000, whole=True)
-        # Their raw error leaves no room for delays that were not calibrated.
+        # The published raw errors leave no room for uncalibrated antenna delays.
         radio = Radio(range_offset_m=0.0)
-        super().__init__(f"simulated in the shape of DeepUWB, seed {seed}", SURVEY_RATE_HZ, radio, 0)
+        super().__init__(f"simulated like DeepUWB, seed {seed}", SURVEY_RATE_HZ, radio, 0)
         self._seed = seed
         self._exchanges = exchanges
         ends = np.rint(np.cumsum(ROOM_ROWS) * (ranges / sum(ROOM_ROWS))).astype(int)
@@ -71,7 +65,7 @@ class SimulatedDeepUwb(Simulated):
 
     def _measurements(self) -> Iterator[Record]:
         for room, rows in enumerate(self.rows):
-            # Without end: how many frames are lost is known only as they are.
+            # Endless: the number of lost frames is not known in advance.
             batches = (self._batch(room, batch) for batch in counting())
             yield from islice(self._shaped(self._received(batches)), rows)
 
@@ -81,7 +75,7 @@ class SimulatedDeepUwb(Simulated):
             if cir is None or truth is None:
                 self.skipped[LATE] += 1
                 continue
-            # DeepUWB tells what stands in the path, not what was received over it.
+            # DeepUWB labels the obstacles, not the received path.
             label = "LOS" if truth.label == "LOS" else "NLOS"
             yield Record(replace(record.measurement, cir=cir), replace(truth, label=label))
 
@@ -103,7 +97,7 @@ class SimulatedDeepUwb(Simulated):
             f"/placement {batch * placements + k}"
             for k, between in enumerate(chosen)
         ]
-        # Each room on a day of its own.
+        # One day per room.
         sequence = round(number * 86_400 * SURVEY_RATE_HZ) + batch * size + np.arange(size)
         ids = np.ones(size, np.int64)
         return (
@@ -123,7 +117,7 @@ def _digits(chosen: tuple[int, ...]) -> str:
 
 
 def _cut(cir: Cir) -> Cir | None:
-    """A CIR as DeepUWB has it, and the levels that it does not have; None where it ends before the window."""
+    """Return the CIR cut and normalised like DeepUWB's, with the received powers; None if it ends before the window."""
     start = math.floor(cir.first_path_index) - WINDOW_LEAD
     if start < 0 or start + CIR_SAMPLES > len(cir):
         return None

@@ -1,0 +1,435 @@
+"""DeepUWB: download, reader and simulated stand-in."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import pickle
+import threading
+from collections.abc import Callable, Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import requests
+from command_line import run, start
+
+from uwb_mitigation.dataset import build_dataset
+from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError
+from uwb_mitigation.measurement import Encoding, Record
+from uwb_mitigation.paper import rooms
+from uwb_mitigation.paper.deepuwb import FULL_SCALE, NOMINAL_RANGE_M, STAMP_STEP_NS, DeepUwbRecording
+from uwb_mitigation.paper.download import DOI, fetch_deepuwb
+from uwb_mitigation.paper.simulated import SimulatedDeepUwb
+from uwb_mitigation.preprocessing import WINDOW_LEAD, Preprocessing, Scaling
+from uwb_mitigation.simulation.rooms import OBSTACLES as SIMULATED_OBSTACLES
+from uwb_mitigation.simulation.rooms import ROOMS as SIMULATED_ROOMS
+from uwb_mitigation.sources.mcap import McapRecording
+
+OBSTACLES = ("0000000000", "1000000000", "0000001001", "0000000001")
+
+
+def frame(count: int = 12) -> pd.DataFrame:
+    """A frame with the published columns and random values."""
+    generator = np.random.default_rng(5)
+    amplitudes = generator.random((count, 157))
+    amplitudes /= amplitudes.max(axis=1, keepdims=True)
+    return pd.DataFrame(
+        {
+            "CIR": [row.copy() for row in amplitudes],
+            "Error": generator.normal(0.1, 0.5, count),
+            "Room": np.arange(count) % 5,
+            "Obstacles": [OBSTACLES[row % 4] for row in range(count)],
+        }
+    )
+
+
+def written(folder: Path, data: pd.DataFrame) -> Path:
+    data.to_pickle(folder / "dataset.pkl", protocol=4)
+    return folder / "dataset.pkl"
+
+
+def amplitudes_of(records: list[Record]) -> np.ndarray:
+    return np.array([record.measurement.cir.samples * record.measurement.cir.scale for record in records])
+
+
+# --- reading ---
+
+
+@pytest.mark.parametrize(
+    "writing",
+    [
+        lambda data: data,
+        lambda data: data.assign(CIR=[row.astype(np.float32) for row in data["CIR"]]),
+        lambda data: data.assign(CIR=[np.repeat(row, 2)[::2] for row in data["CIR"]]),
+        lambda data: data.assign(CIR=[row.tolist() for row in data["CIR"]]),
+        lambda data: data.assign(CIR=[tuple(row) for row in data["CIR"]]),
+        lambda data: data.assign(CIR=[row.astype(object) for row in data["CIR"]]),
+        lambda data: data.astype(object),
+        lambda data: data.astype({"Room": "category", "Obstacles": "category"}),
+        lambda data: data.astype({"Obstacles": pd.StringDtype("python"), "Room": float}),
+        lambda data: data[["Obstacles", "Room", "Error", "CIR"]].assign(Note="x", When=3.5),
+        lambda data: data.set_index(pd.Index([f"r{i}" for i in range(len(data))])),
+    ],
+)
+def test_a_frame_is_read_in_every_representation(
+    tmp_path: Path, writing: Callable[[pd.DataFrame], pd.DataFrame]
+) -> None:
+    data = frame()
+    records = list(DeepUwbRecording(written(tmp_path, writing(data))))
+    assert np.allclose(amplitudes_of(records), np.stack(list(data["CIR"])), atol=2e-5)
+    errors = [record.measurement.range_m - NOMINAL_RANGE_M for record in records]
+    assert np.allclose(errors, data["Error"], rtol=1e-6)
+    names = [rooms.configuration_of(*row) for row in zip(data["Room"], data["Obstacles"], strict=True)]
+    assert [record.truth.configuration for record in records if record.truth] == names
+
+
+@pytest.mark.parametrize("version", ["0.25.3", "1.1.5", "1.5.3", "2.2.3"])
+def test_frames_of_older_pandas_are_read(version: str) -> None:
+    records = list(DeepUwbRecording(Path(__file__).parent / "data" / f"deepuwb_pandas_{version}.pkl"))
+    expected = [np.arange(157) * (row + 1) % 157 / 156 for row in range(4)]
+    assert np.allclose(amplitudes_of(records), expected, atol=2e-5)
+    assert [record.measurement.range_m - 10.0 for record in records] == [0.25, -0.125, 1.5, 0.0]
+    assert [rooms.room_of(record.truth.configuration) for record in records if record.truth] == [0, 2, 4, 2]
+
+
+def test_missing_columns_have_documented_values(tmp_path: Path) -> None:
+    records = list(DeepUwbRecording(written(tmp_path, frame())))
+    first, third = records[0].measurement, records[2].measurement
+    assert (first.cir.encoding, first.cir.preamble_count) == (Encoding.MAGNITUDE, 0)
+    assert np.isnan([first.cir.rx_power_dbm, first.cir.first_path_power_dbm]).all()
+    assert [record.measurement.sequence for record in records] == list(range(12))
+    assert third.stamp_ns - first.stamp_ns == 2 * STAMP_STEP_NS
+    assert {record.measurement.anchor_id for record in records} == {1000, 1001, 1002, 1003, 1004}
+    assert [record.truth.label for record in records if record.truth][:3] == ["LOS", "NLOS", "NLOS"]
+
+
+def test_the_window_of_the_preprocessing_is_the_whole_cir(tmp_path: Path) -> None:
+    data = frame()
+    dataset = build_dataset(DeepUwbRecording(written(tmp_path, data)), Preprocessing(157, Scaling.MAX))
+    assert not dataset.refused
+    # Each amplitude is within half a count.
+    assert np.abs(dataset.inputs - np.stack(list(data["CIR"]))).max() < 0.51 / 32766
+
+
+@pytest.mark.parametrize("error", [-9.9, -1.234567, 1e-4, 5.999999, 21.9])
+def test_errors_survive_import_into_a_bag_to_a_micrometre(tmp_path: Path, error: float) -> None:
+    written(tmp_path, frame(1).assign(Error=[error]))
+    assert run("data", "import", "dataset.pkl", "-o", "bag.mcap", folder=tmp_path).returncode == 0
+    (record,) = McapRecording(tmp_path / "bag.mcap")
+    assert record.truth is not None
+    assert abs(record.measurement.range_m - record.truth.range_m - error) < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("column", "value"),
+    [
+        ("CIR", np.zeros(156)),
+        ("CIR", np.zeros((157, 1))),
+        ("CIR", ["0.5"] * 157),
+        ("CIR", None),
+        ("CIR", np.array([0.5] * 100 + [np.nan] * 57)),
+        ("CIR", np.full(157, 1e300)),
+        ("Error", float("nan")),
+        ("Error", 1e6),
+        ("Error", "0.3"),
+        ("Room", 5),
+        ("Room", 1.5),
+        ("Room", "big"),
+        ("Obstacles", "000000000"),
+        ("Obstacles", "0000000002"),
+        ("Obstacles", "000000000\n"),
+        ("Obstacles", "٠٠٠٠٠٠٠٠٠٠"),
+        ("Obstacles", 1000000000),
+    ],
+)
+def test_an_invalid_cell_is_rejected_with_row_and_column(tmp_path: Path, column: str, value: object) -> None:
+    data = frame()
+    cells = list(data[column])
+    cells[7] = value
+    data[column] = pd.Series(cells, dtype=object)
+    path = written(tmp_path, data)
+    with pytest.raises(RecordingError) as caught:
+        DeepUwbRecording(path)
+    assert caught.value.where == f"{path}, row 7"
+    assert caught.value.what.startswith(column)
+
+
+class Calls:
+    """A hostile pickle: unpickling calls a function."""
+
+    def __init__(self, function: Callable[..., object], *arguments: object) -> None:
+        self.call = (function, arguments)
+
+    def __reduce__(self) -> tuple[Callable[..., object], tuple[object, ...]]:
+        return self.call
+
+
+@pytest.mark.parametrize("protocol", [0, 2, 4])
+def test_a_hostile_pickle_runs_nothing(tmp_path: Path, protocol: int) -> None:
+    mark, path = tmp_path / "ran", tmp_path / "dataset.pkl"
+    data = frame().astype(object)
+    for hostile in (Calls(os.system, f"touch '{mark}'"), Calls(eval, f"open({str(mark)!r}, 'w')")):
+        data.at[2, "CIR"] = hostile
+        path.write_bytes(pickle.dumps(data, protocol=protocol))
+        with pytest.raises(RecordingError):
+            DeepUwbRecording(path)
+    assert not mark.exists()
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        pickle.dumps(frame())[:500],
+        b"\x80\x04nonsense",
+        b"",
+        pickle.dumps(frame()["CIR"]),
+        pickle.dumps({"CIR": [1]}),
+        pickle.dumps(frame().drop(columns="Room")),
+        pickle.dumps(frame().iloc[:0]),
+    ],
+)
+def test_other_files_are_rejected_by_name(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "dataset.pkl"
+    path.write_bytes(content)
+    with pytest.raises(RecordingError) as caught:
+        DeepUwbRecording(path)
+    assert caught.value.where == str(path)
+
+
+# --- rooms and splits ---
+
+
+def test_names_of_configurations_contain_room_and_materials() -> None:
+    for number, material in enumerate(rooms.MATERIALS):
+        name = rooms.configuration_of(3, "".join("1" if at == number else "0" for at in range(10)))
+        assert rooms.parse_configuration(name) == (3, (material,))
+    assert rooms.parse_configuration("deepuwb/room1/clear") == (1, ())
+    for name in ("", "deepuwb", "deepuwb/room5/wall", "deepuwb/room1/gold", "by the door"):
+        with pytest.raises(DatasetError):
+            rooms.room_of(name)
+
+
+def test_the_splits_have_the_published_sizes() -> None:
+    names = np.repeat([rooms.configuration_of(room, OBSTACLES[0]) for room in range(5)], rooms.ROOM_ROWS)
+    for split, sizes in (("paper", (36_023, 13_210)), ("all_but_room_2", (41_948, 13_210))):
+        name, rows = rooms.split_by_name(names, split)
+        assert (name, len(rows.train), len(rows.test)) == (split, *sizes)
+        assert not np.isin(rows.train, rows.test).any()
+    assert rooms.split_by_name(names, "auto")[0] == "paper"
+
+
+def test_other_data_is_split_by_configuration() -> None:
+    names = np.repeat([f"place {n}" for n in range(8)], 3)
+    name, rows = rooms.split_by_name(names, "auto")
+    assert name.startswith("configurations")
+    assert len(rows.test) == 6
+    assert not set(names[rows.train]) & set(names[rows.test])
+    with pytest.raises(DatasetError):
+        rooms.split_by_name(names, "paper")
+    with pytest.raises(DatasetError):
+        rooms.split_by_name(np.array(["deepuwb/room1/clear"] * 3), "paper")
+    with pytest.raises(ParameterError):
+        rooms.split_by_name(names, "random")
+
+
+# --- simulated ---
+
+
+@pytest.fixture(scope="module")
+def simulated() -> list[Record]:
+    return list(SimulatedDeepUwb(seed=3, ranges=900, exchanges=4))
+
+
+def room(record: Record) -> int:
+    assert record.truth is not None
+    return rooms.room_of(record.truth.configuration)
+
+
+def test_simulated_rooms_and_obstacles_are_those_of_deepuwb(simulated: list[Record]) -> None:
+    assert tuple(one.name for one in SIMULATED_ROOMS) == rooms.ROOMS
+    assert tuple(one.name for one in SIMULATED_OBSTACLES) == rooms.MATERIALS
+    assert SimulatedDeepUwb().rows == rooms.ROOM_ROWS
+    counted = np.bincount([room(record) for record in simulated])
+    assert counted.tolist() == list(SimulatedDeepUwb(ranges=900).rows)
+    names = np.array([record.truth.configuration for record in simulated if record.truth])
+    assert all("simulated" in name for name in names)
+    assert rooms.has_rooms(names)
+    assert not rooms.has_rooms([*names, "simulated survey seed 1/placement 3"])
+    assert SimulatedDeepUwb().simulated
+
+
+def test_a_simulated_configuration_is_one_placement(simulated: list[Record]) -> None:
+    distance: dict[str, list[float]] = {}
+    for record in simulated:
+        assert record.truth is not None
+        distance.setdefault(record.truth.configuration, []).append(record.truth.range_m)
+    assert all(len(set(values)) == 1 and len(values) <= 4 for values in distance.values())
+    assert len({values[0] for values in distance.values()}) == len(distance) >= 150
+
+
+def test_simulated_cirs_are_cut_and_normalised_and_powers_known(simulated: list[Record]) -> None:
+    preprocessing, out = Preprocessing(157, Scaling.MAX), np.empty(157, np.float32)
+    for record in simulated:
+        cir = record.measurement.cir
+        assert (len(cir), cir.encoding, cir.preamble_count) == (157, Encoding.MAGNITUDE, 0)
+        assert cir.samples.max() * cir.scale == pytest.approx(1.0)
+        assert math.isfinite(cir.rx_power_dbm - cir.first_path_power_dbm)
+        assert preprocessing.apply(cir, out) is None
+    clear = [r.measurement.cir.samples for r in simulated if r.truth and r.truth.label == "LOS"]
+    rise = np.median([np.argmax(samples > 0.3 * FULL_SCALE) for samples in clear])
+    assert abs(rise - WINDOW_LEAD) <= 1
+
+
+def test_simulated_labels_follow_the_obstacles(simulated: list[Record]) -> None:
+    errors: dict[str, list[float]] = {"LOS": [], "NLOS": []}
+    for record in simulated:
+        assert record.truth is not None
+        materials = rooms.parse_configuration(record.truth.configuration)[1]
+        assert record.truth.label == ("NLOS" if materials else "LOS")
+        assert room(record) != 0 or "wall" in materials
+        errors[record.truth.label].append(record.measurement.range_m - record.truth.range_m)
+    assert np.mean(errors["LOS"]) + 0.05 < np.mean(errors["NLOS"])
+
+
+def test_a_room_does_not_depend_on_the_number_of_ranges(simulated: list[Record]) -> None:
+    def ranges(records: list[Record]) -> list[float]:
+        return [record.measurement.range_m for record in records if room(record) == 1]
+
+    few = ranges(list(SimulatedDeepUwb(seed=3, ranges=100, exchanges=4)))
+    assert few == ranges(simulated)[: len(few)]
+
+
+def test_the_command_simulates_a_bag_that_can_be_played(tmp_path: Path) -> None:
+    words = ("paper", "simulate", "--ranges", "100", "-o", "sim.mcap", "--json", "sim.json")
+    assert run(*words, folder=tmp_path).returncode == 0
+    assert json.loads((tmp_path / "sim.json").read_text())["ranges"] == 100
+    recording = McapRecording(tmp_path / "sim.mcap")
+    stamps = [record.measurement.stamp_ns for record in recording]
+    assert recording.simulated
+    assert stamps[0] > 1_700_000_000 * 10**9
+    assert max(np.diff(stamps)) <= 5 * 10**9
+    assert run(*words, folder=tmp_path).returncode == 1  # without --force
+    assert run("paper", "simulate", "--ranges", "7", "-o", "x.mcap", folder=tmp_path).returncode == 1
+    assert not (tmp_path / "x.mcap").exists()
+
+
+# --- download, against a server on this machine ---
+
+CONTENT = bytes(range(256)) * 1000
+SHA256, MD5 = hashlib.sha256(CONTENT).hexdigest(), hashlib.md5(CONTENT).hexdigest()
+
+
+class Server(ThreadingHTTPServer):
+    daemon_threads = True
+
+    def __init__(self) -> None:
+        super().__init__(("127.0.0.1", 0), _Handler)
+        self.requests: list[str] = []
+        self.truncated = 0
+        self.checksum = f"md5:{MD5}"
+
+    def url(self, path: str = "/dataset.pkl") -> str:
+        return f"http://127.0.0.1:{self.server_address[1]}{path}"
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: Server
+
+    def do_GET(self) -> None:
+        self.server.requests.append(self.path)
+        body = CONTENT
+        if self.path == "/absent":
+            self.send_error(404)
+            return
+        if self.path == "/api/records/4290069":
+            item = {
+                "key": "dataset.pkl",
+                "checksum": self.server.checksum,
+                "links": {"self": self.server.url()},
+            }
+            body = json.dumps({"id": 4290069, "files": [item]}).encode()
+        self.send_response(200)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        if self.server.truncated > 0:
+            self.server.truncated -= 1
+            body = body[: len(body) // 2]
+        self.wfile.write(body)
+
+    def log_message(self, format: str, *args: Any) -> None:
+        pass
+
+
+@pytest.fixture
+def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
+    """A server that takes the place of doi.org and Zenodo."""
+    monkeypatch.setattr("time.sleep", lambda seconds: None)
+    get = requests.get
+
+    def redirected(url: str, **options: Any) -> requests.Response:
+        if url == f"https://doi.org/{DOI.partition(':')[2]}":
+            response = requests.Response()
+            response.status_code, response.url = 200, "https://zenodo.org/records/4290069"
+            return response
+        return get(url.replace("https://zenodo.org", running.url("")), **options)
+
+    with Server() as running:
+        thread = threading.Thread(target=running.serve_forever, args=(0.01,))
+        thread.start()
+        monkeypatch.setattr(requests, "get", redirected)
+        yield running
+        running.shutdown()
+        thread.join()
+
+
+def test_the_doi_leads_to_file_and_checksum(server: Server, tmp_path: Path) -> None:
+    assert fetch_deepuwb(tmp_path / "deepuwb.pkl") == f"md5:{MD5}"
+    assert (tmp_path / "deepuwb.pkl").read_bytes() == CONTENT
+    assert (server.requests[0], server.requests[-1]) == ("/api/records/4290069", "/dataset.pkl")
+    server.requests.clear()
+    fetch_deepuwb(tmp_path / "deepuwb.pkl")  # the file is kept
+    assert "/dataset.pkl" not in server.requests
+
+
+def test_a_wrong_checksum_leaves_no_file(server: Server, tmp_path: Path) -> None:
+    server.checksum = "md5:" + "0" * 32
+    with pytest.raises(RecordingError):
+        fetch_deepuwb(tmp_path / "deepuwb.pkl")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_truncated_download_is_repeated(server: Server, tmp_path: Path) -> None:
+    server.truncated = 2
+    fetch_deepuwb(tmp_path / "a.pkl", server.url(), SHA256.upper())
+    assert (tmp_path / "a.pkl").read_bytes() == CONTENT
+    assert server.requests == ["/dataset.pkl"] * 3
+    server.truncated = 9
+    with pytest.raises(RecordingError):
+        fetch_deepuwb(tmp_path / "b.pkl", server.url(), SHA256)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.pkl"]
+
+
+def test_another_file_is_not_replaced(server: Server, tmp_path: Path) -> None:
+    (tmp_path / "a.pkl").write_bytes(b"mine")
+    with pytest.raises(RecordingError):
+        fetch_deepuwb(tmp_path / "a.pkl", server.url(), SHA256)
+    assert (tmp_path / "a.pkl").read_bytes() == b"mine"
+
+
+def test_the_command_downloads_or_fails_with_one_line(server: Server, tmp_path: Path) -> None:
+    mirror = ("--url", server.url(), "--sha256", SHA256)
+    done = start("paper", "fetch", *mirror, "--json", "fetch.json", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "deepuwb.pkl").read_bytes() == CONTENT
+    assert json.loads((tmp_path / "fetch.json").read_text())["bytes"] == len(CONTENT)
+    for url in (server.url("/absent"), "file:///etc/passwd", "nonsense"):
+        done = run("paper", "fetch", "-o", "x.pkl", "--url", url, "--sha256", SHA256, folder=tmp_path)
+        assert done.returncode == 1
+        assert len(done.stderr.strip().splitlines()) == 1
+        assert not (tmp_path / "x.pkl").exists()

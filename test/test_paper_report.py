@@ -1,0 +1,356 @@
+"""The report: tables and figures of the paper for any labelled data, with missing measurements marked."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from browser import Browser
+from command_line import run
+from conftest import REPOSITORY
+from model_material import dataset
+
+from uwb_mitigation.paper import report, tables
+from uwb_mitigation.paper.report import Report, Study, build, principal_components
+from uwb_mitigation.paper.results import ExperimentResults, FirmwareRow
+from uwb_mitigation.preprocessing import Preprocessing, Scaling
+
+PARTS = ["data", "table1", "table2", "table3", "fig3", "fig4a", "fig4b", "fig5"]
+HOSTILE = "<script>alert(1)</script>_$\\frac{$"
+
+
+class Page(HTMLParser):
+    """Elements of a page and the text of its sections; checks that every element is closed."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.elements: list[tuple[str, dict[str, str | None]]] = []
+        self.text: dict[str, list[str]] = {"": []}
+        self._open: list[str] = []
+        self._section = ""
+        self.feed(html)
+        assert not self._open
+
+    def handle_starttag(self, tag, attributes):
+        self.elements.append((tag, dict(attributes)))
+        if tag == "section":
+            self._section = dict(attributes)["id"]
+            self.text[self._section] = []
+        if tag not in ("meta", "img", "br", "link"):
+            self._open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self._open.pop() == tag
+        if tag == "section":
+            self._section = ""
+
+    def handle_data(self, data):
+        if data.strip():
+            self.text[self._section].append(data.strip())
+
+    def all(self, tag: str) -> list[dict[str, str | None]]:
+        return [values for name, values in self.elements if name == tag]
+
+
+def study(name: str = "logs", label: str = "LOS", configuration: str = "", simulated: bool = False) -> Study:
+    data = dataset(3, 10)
+    labels = np.array([label if row % 2 else "NLOS" for row in range(len(data))])
+    names = np.array([f"{configuration}{one}" for one in data.configurations])
+    scaled = (data.inputs / data.inputs.max(axis=1, keepdims=True)).astype(np.float32)
+    data = replace(data, labels=labels, configurations=names, inputs=scaled)
+    data = replace(data, preprocessing=Preprocessing(data.inputs.shape[1], Scaling.MAX))
+    return Study(Path(name), name, simulated, data, "uwb-mitigation paper report")
+
+
+def trained(network: str = "remnet", samples: int = 157, seed: int = 0, **changes: object) -> dict:
+    box = [-0.1, 0.0, 0.0625, 0.1, 0.2]
+    part = {
+        "n": 10,
+        "mae_raw": 0.2,
+        "sigma_raw": 0.1,
+        "mae": 0.0625,
+        "sigma": 0.05,
+        "box": box,
+        "box_raw": box,
+    }
+    return {
+        "network": network,
+        "samples": samples,
+        "seed": seed,
+        "parameters": 5905,
+        "multiply_accumulates": 362_160,
+        "mae_raw": 0.2,
+        "mae_float": 0.0625 + 0.002 * seed,
+        "mae_optimised": 0.0625,
+        "mae_int8": 0.0635,
+        "bytes_float": 27825,
+        "bytes_optimised": 28105,
+        "bytes_int8": 23888 + 10 * seed,
+        "float_errors": dict.fromkeys(("all", "los", "nlos"), part),
+        "int8_errors": dict.fromkeys(("all", "los", "nlos"), part),
+        "seconds": 60.0,
+        "samples_per_s": 6000.0,
+    } | changes
+
+
+def results(*models: dict, epochs: int = 30, **changes: object) -> ExperimentResults:
+    options = {
+        "epochs": epochs,
+        "learning_rate": 3e-4,
+        "batch": 32,
+        "dropout": 0.5,
+        "weight_decay": 0,
+        "seed": 0,
+    }
+    values = {"data": "logs", "split": "paper", "train": 30, "test": 10, "options": options, "models": models}
+    return ExperimentResults.model_validate(values | changes)
+
+
+def firmware_row(**changes: object) -> FirmwareRow:
+    values = {
+        "model": "remnet",
+        "k": 157,
+        "k0": 3,
+        "kernels": "cortex_m4",
+        "instructions": 389_000,
+        "ram_bytes": 10_700,
+        "flash_bytes": 17_600,
+        "mismatches": 0,
+        "inputs": 5000,
+        "hz": 142.2,
+        "energy_mj": 0.375,
+    }
+    return FirmwareRow.model_validate(values | changes)
+
+
+def row_of(made: Report, table: str, *heads: str) -> tuple[tables.Cell, ...]:
+    (found,) = (one for one in made.tables if one.id == table)
+    return next(row for row in found.rows if [cell.text for cell in row[: len(heads)]] == list(heads))
+
+
+DRAW_CLOUD = report.figures.scatter
+
+
+@pytest.fixture(scope="module", autouse=True)
+def clouds():
+    """Leave out Fig. 4 in all reports but `full`: it takes most of the time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(report.figures, "scatter", lambda *_: "data:image/png;base64,")
+        yield patch
+
+
+@pytest.fixture(scope="module")
+def full(clouds) -> Report:
+    """The report of one network and one firmware measurement."""
+    with clouds.context() as patch:
+        patch.setattr(report.figures, "scatter", DRAW_CLOUD)
+        return build(study(simulated=True), results(trained()), [firmware_row()])
+
+
+def test_every_table_and_figure_is_there_and_names_its_origin(full):
+    page = Page(full.html())
+    assert sorted(values["id"] for values in page.all("section")) == sorted(PARTS)
+    assert full.lacking == {}
+    for part in PARTS:
+        assert {"Data", "Split", "Seeds", "Command"} <= set(page.text[part])
+        assert any(text.startswith("uwb-mitigation ") for text in page.text[part])
+
+
+def test_parts_without_results_are_left_out_with_the_command_that_makes_them():
+    made = build(study("my logs"))
+    assert list(made.lacking) == ["Tables 1 and 2, Fig. 5", "Table 3"]
+    assert "--data 'my logs' " in made.lacking["Tables 1 and 2, Fig. 5"]
+    page = Page(made.html())
+    assert [values["id"] for values in page.all("section")] == ["data", "fig3", "fig4a", "fig4b"]
+    for command in made.lacking.values():
+        assert command in page.text[""]
+
+
+def test_the_page_refers_to_nothing_outside_itself(full):
+    page = Page(full.html())
+    assert not {"script", "link", "iframe", "object", "base"} & {tag for tag, _ in page.elements}
+    for _, values in page.elements:
+        for name in ("src", "href"):
+            assert values.get(name, "#").startswith(("data:image/", "#"))
+    assert not re.search(r"url\(|@import|https?:", full.html())
+    for image in page.all("img"):
+        kind, content = image["src"].split(";base64,")
+        data = base64.b64decode(content, validate=True)
+        if kind == "data:image/png":
+            assert data.startswith(b"\x89PNG")
+            continue
+        text = re.sub(r'xmlns(:\w+)?="[^"]*"|<!DOCTYPE.*?>', "", data.decode(), flags=re.DOTALL)
+        assert not re.search(r'href="(?!#)|url\((?!#)|<script', text)
+
+
+def test_the_page_is_accessible(full):
+    page = Page(full.html())
+    assert page.all("html")[0]["lang"] == "en"
+    assert all(values.get("scope") for values in page.all("th"))
+    assert len(page.all("caption")) == 4
+    assert all(len(image["alt"]) > 40 for image in page.all("img"))
+
+
+@pytest.mark.parametrize("width", [1280, 400])
+def test_nothing_is_cut_off(browser: Browser, full, tmp_path: Path, width: int):
+    (tmp_path / "report.html").write_text(full.html(), encoding="utf-8")
+    browser.open((tmp_path / "report.html").as_uri(), width)
+    assert browser.cut_off(width) == []
+    assert browser.complaints() == []
+    browser.screenshot(f"report_{width}")
+
+
+def test_simulated_data_is_marked_and_radio_data_is_not(full):
+    page = Page(full.html())
+    assert "simulated data" in page.text[""]
+    for part in ("data", "table1"):
+        assert "Measured on simulated data" in page.text[part]
+    plain = build(study()).html().split("</style>")[1]
+    assert "simulated" not in plain.lower()
+    assert build(study()).html().split("</style>")[1] == plain  # the same data gives the same page
+
+
+def test_shortened_training_is_reported(full):
+    def shortened(trainings: ExperimentResults) -> bool:
+        return any(notice.startswith("Shortened") for notice in build(study(), trainings).notices)
+
+    every = [trained(samples=k, seed=seed) for k in (157, 128, 64, 32, 16, 8) for seed in range(5)]
+    assert not shortened(results(*every))
+    assert shortened(results(*every, epochs=2))
+    assert shortened(results(*every[:-5]))
+
+
+def test_missing_measurements_are_marked(full):
+    for table in full.tables[1:]:
+        assert table.has_gaps
+        assert table.missing.startswith("uwb-mitigation ")
+    assert "not measured" in Page(full.html()).text["table3"]
+    attention = trained("remnet_attention", mae_int8=None, bytes_int8=None, int8_errors=None)
+    made = build(study(), results(attention))
+    # A form that does not exist is not missing.
+    assert [cell.kind for cell in row_of(made, "table1", "REMNet with attention", "157")[-2:]] == [
+        "measured",
+        "none",
+    ]
+
+
+def test_published_numbers_are_in_their_own_columns(full):
+    row = row_of(full, "table1", "MLP", "157")
+    assert [cell.value for cell in row if cell.kind == "paper"] == [54401, 0.0769, 0.0777, 0.0775]
+    row = row_of(full, "table3", "REMNet", "16", "Cortex-M4")
+    assert [cell.value for cell in row if cell.kind == "paper"] == [140.0, 3.3, 15.6, 51.6, 0.37]
+
+
+def test_measured_numbers_are_means_over_seeds():
+    made = build(study(), results(*(trained(seed=seed) for seed in range(3))))
+    cell = row_of(made, "table1", "REMNet", "157")[7]
+    assert (cell.kind, cell.n, cell.text) == ("measured", 3, "0.0645 ± 0.0020")
+    assert (cell.value, cell.std) == (pytest.approx(0.0645), pytest.approx(0.002))
+    row = row_of(made, "table2", "REMNet", "157")
+    assert [cell.text for cell in row[-3:]] == ["27.825", "28.105", "23.898 ± 0.010"]  # kB; no spread of zero
+    picture = made.figures[-1]
+    assert picture.numbers["boxes"]["K = 157"] == pytest.approx([-0.1, 0.0, 0.0625, 0.1, 0.2])
+    assert picture.numbers["boxes"]["K = 64"] is None
+
+
+def test_baselines_are_below_the_networks():
+    part = {"n": 10, "mae_raw": 0.2, "sigma_raw": 0.1, "mae": 0.15, "sigma": 0.05}
+    baselines = [
+        {"name": "overall_median", "errors": dict.fromkeys(("all", "los", "nlos"), part)},
+        {"name": "line", "errors": None, "reason": "the data has no received power"},
+    ]
+    made = build(study(), results(trained(), baselines=baselines))
+    assert row_of(made, "table1", "Median error")[7].value == 0.15
+    assert row_of(made, "table1", "No correction")[7].value == 0.2
+    assert row_of(made, "table1", "Median error in LOS")[7].kind == "missing"
+    assert row_of(made, "table1", "L1 line")[7].kind == "none"
+    assert "no received power" in made.tables[1].note
+
+
+def test_rates_and_energy_of_the_emulator_are_marked_as_estimates(full):
+    row = row_of(full, "table3", "REMNet", "157", "Cortex-M4")
+    assert [cell.kind for cell in row[8:11]] == ["estimated", "estimated", "measured"]
+
+
+def test_rooms_and_materials_group_deepuwb():
+    made = study()
+    names = np.array(
+        [f"deepuwb/room{row % 5}/{('clear', 'wall')[row % 2]}" for row in range(len(made.dataset))]
+    )
+    made = replace(made, dataset=replace(made.dataset, configurations=names))
+    built = build(made)
+    assert set(built.figures[1].numbers["groups"]) == {row[0].text for row in built.tables[0].rows[:5]}
+    assert set(built.figures[2].numbers["groups"]) == {"none (LOS)", "wall"}
+    medium = row_of(built, "data", "medium room")
+    assert [cell.value for cell in medium if cell.kind == "paper"] == [13_210, 0.1242, 0.1642]
+
+
+def test_the_sample_of_each_condition_has_the_median_error(full):
+    made = study()
+    shown = full.figures[0].numbers["samples"]
+    assert [one["label"] for one in shown] == ["LOS", "NLOS"]
+    errors = np.sort(made.dataset.error_m[made.labels == "LOS"])
+    assert shown[0]["error_m"] == errors[(len(errors) - 1) // 2]
+
+
+def test_hostile_names_are_only_text():
+    made = study(HOSTILE, HOSTILE, HOSTILE)
+    page = build(made, results(trained(network=HOSTILE), data=HOSTILE, split=HOSTILE)).html()
+    assert not Page(page).all("script")
+    assert "<script" not in page
+
+
+def test_components_are_those_of_the_covariance():
+    inputs = np.random.default_rng(0).normal(size=(200, 6)) * (5, 3, 2, 1, 1, 1) + 7
+    points, explained = principal_components(inputs)
+    values = np.sort(np.linalg.eigvalsh(np.cov(inputs.T)))[::-1]
+    assert points.var(axis=0, ddof=1) == pytest.approx(values[:3])
+    assert explained == pytest.approx(values[:3] / values.sum())
+    for shape in ((1, 157), (2, 157), (5, 1)):
+        points, explained = principal_components(np.ones(shape, np.float32))
+        assert points.shape == (shape[0], 3)
+        assert not points.any()
+        assert not explained.any()
+
+
+def test_the_command_writes_the_page_and_rejects_wrong_files(apartment, tmp_path):
+    log = sorted((apartment / "logs").glob("*.log*"))[0]
+    words = ("paper", "report", "--data", log, "-o", "out", "--json", "out.json")
+    done = run(*words, folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "paper protocol" in done.stdout
+    assert Page((tmp_path / "out" / "report.html").read_text()).all("img")
+    values = json.loads((tmp_path / "out.json").read_text())
+    assert [one["id"] for one in (*values["tables"], *values["figures"])] == [
+        "data",
+        "fig3",
+        "fig4a",
+        "fig4b",
+    ]
+    (tmp_path / "bench.json").write_text("{}")
+    for option in (("--firmware", "bench.json"), ("--models", "nowhere")):
+        refused = run("paper", "report", "--data", log, "-o", "other", *option, folder=tmp_path)
+        assert refused.returncode == 1
+        assert option[1] in refused.stderr
+        assert not (tmp_path / "other").exists()
+
+
+def test_a_missing_matplotlib_is_named_with_its_remedy():
+    code = (
+        "import sys; sys.modules['matplotlib'] = None\n"
+        "from uwb_mitigation.errors import MissingDependencyError\n"
+        "try:\n    import uwb_mitigation.paper.figures\n"
+        "except MissingDependencyError as error:\n    print(error)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], check=True, cwd=REPOSITORY, capture_output=True, text=True
+    )
+    assert "make setup-training" in done.stdout

@@ -1,0 +1,320 @@
+"""The paper's experiment (section III): every network and window length, several seeds, from float to int8."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime
+from numpy.typing import NDArray
+
+from uwb_mitigation.dataset import Dataset
+from uwb_mitigation.errors import DatasetError, ModelError, ParameterError, UwbMitigationError
+from uwb_mitigation.evaluation import baselines, lad, splits
+from uwb_mitigation.files import write_whole
+from uwb_mitigation.model import floating, graph
+from uwb_mitigation.model.architecture import Architecture, Mlp, Remnet
+from uwb_mitigation.model.bundle import Card, save_bundle, session_options
+from uwb_mitigation.model.integer import IntegerNetwork
+from uwb_mitigation.model.prior import LinePrior
+from uwb_mitigation.model.weights import FloatWeights, Int8Weights
+from uwb_mitigation.paper import published
+from uwb_mitigation.paper.jobs import run_jobs
+from uwb_mitigation.paper.parts import Parts, fingerprint
+from uwb_mitigation.paper.results import (
+    FORMS,
+    RESULTS,
+    Baseline,
+    ErrorsByCondition,
+    ExperimentResults,
+    Settings,
+    TrainedModel,
+)
+from uwb_mitigation.training import fitting, networks
+from uwb_mitigation.training.cards import card_of
+from uwb_mitigation.training.options import FitOptions
+from uwb_mitigation.training.quantization import MSE, quantize
+
+PAPER = FitOptions(published.EPOCHS, published.LEARNING_RATE, published.BATCH, dropout=0.5, weight_decay=0.0)
+"""The paper does not report its dropout rate."""
+
+NETWORKS = ("remnet", "remnet_k5", "remnet_attention", "mlp")
+"""REMNet with k0 = 3 (which the paper's parameter counts require), with k0 = 5 (as its text says), with the attention of
+the original network (float only), and the baseline."""
+
+JOURNAL = "journal.jsonl"
+VARIANCE_FOLDS = 5
+
+CALIBRATIONS: Mapping[str, float | None] = {
+    "max": 100.0,
+    "p99.99": 99.99,
+    "p99.9": 99.9,
+    "p99": 99.0,
+    "mse": MSE,
+}
+"""{name: percentile of `quantize`} to choose activation scales by."""
+
+CALIBRATION_INPUTS, CHECKED_INPUTS = 512, 1024
+_BATCH = 1024
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """One network to train."""
+
+    network: str
+    samples: int
+    seed: int
+
+    def __post_init__(self) -> None:
+        if self.network not in NETWORKS:
+            raise ParameterError(f"network {self.network!r}", valid=", ".join(NETWORKS))
+
+    @property
+    def name(self) -> str:
+        return f"{self.network}_{self.samples}_seed{self.seed}"
+
+    @property
+    def architecture(self) -> Architecture:
+        if self.network == "mlp":
+            return Mlp(self.samples)
+        return Remnet(self.samples, first_kernel=5 if self.network == "remnet_k5" else 3)
+
+
+def tasks(networks_: Sequence[str], windows: Sequence[int], seeds: int) -> list[Task]:
+    """Return every window length and seed; for the MLP and the attention network only the longest window.
+
+    Raises:
+        ParameterError: unknown network, or no seeds or windows.
+    """
+    if seeds < 1 or not windows:
+        raise ParameterError(f"{seeds} seeds, {len(windows)} windows", valid="1 or more of each")
+    return [
+        Task(network, samples, seed)
+        for network in networks_
+        for samples in (windows if network in ("remnet", "remnet_k5") else [max(windows)])
+        for seed in range(seeds)
+    ]
+
+
+def run(
+    parts: Parts,
+    folder: Path,
+    wanted: Sequence[Task],
+    options: FitOptions = PAPER,
+    workers: int = 1,
+    on_progress: Callable[[float], None] = lambda share: None,
+    command: str = "",
+) -> ExperimentResults:
+    """Train, optimise, quantise and test every task, and write `protocol.json`.
+
+    Tasks that an earlier run on the same data and options finished are not repeated. Each network becomes three files:
+    `NAME_float.onnx`, `NAME_optimised.onnx`, `NAME_int8.onnx`.
+
+    Raises:
+        DatasetError: a loss diverges, or the data is not usable.
+        UwbMitigationError: a file cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UwbMitigationError(f"cannot be created: {error.strerror}", where=str(folder)) from error
+    settings = asdict(replace(options, seed=0))
+    mark = fingerprint(json.dumps(settings, sort_keys=True), parts.train, parts.test)
+    trained = run_jobs(
+        _Worker(parts, folder, options),
+        {task.name: task for task in wanted},
+        folder / JOURNAL,
+        mark,
+        cost=lambda task: task.architecture.multiply_accumulates,
+        workers=workers,
+        on_progress=on_progress,
+    )
+    result = ExperimentResults(
+        data=parts.data,
+        split=parts.split,
+        command=command,
+        train=len(parts.train),
+        test=len(parts.test),
+        options=Settings(**settings),
+        models=tuple(TrainedModel.model_validate(model) for model in trained.values()),
+        baselines=baselines_of(parts.train, parts.test),
+    )
+    write_whole(folder / RESULTS, result.model_dump_json(indent=1) + "\n")
+    return result
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Worker:
+    parts: Parts
+    folder: Path
+    options: FitOptions
+
+    def __call__(self, task: Task) -> dict[str, Any]:
+        options = replace(self.options, seed=task.seed)
+        return train_task(task, self.parts.narrowed(task.samples), self.folder, options).model_dump(
+            mode="json"
+        )
+
+
+def train_task(task: Task, parts: Parts, folder: Path, options: FitOptions) -> TrainedModel:
+    """Train one network from random weights to int8, on parts with the task's windows; raises as `fit` and `quantize`."""
+    train, test, architecture = parts.train, parts.test, task.architecture
+    start = time.perf_counter()
+    found: dict[str, Any] = {"parameters": architecture.parameters}
+    predicted: dict[str, NDArray[np.float32]]
+    if task.network == "remnet_attention" and isinstance(architecture, Remnet):
+        with fitting.single_thread(options.seed):
+            module = networks.RemnetModule(architecture, options.dropout, attention=True)
+            fitting.descend(module, train.inputs, train.error_m, options)
+            predicted = {"float": fitting.predict_m(module, test.inputs)}
+        seconds = time.perf_counter() - start
+        found["parameters"] = sum(values.numel() for values in module.parameters())
+    else:
+        weights = fitting.fit(architecture, train.inputs, train.error_m, options)
+        seconds = time.perf_counter() - start
+        files, maes, network = _export(task.name, weights, parts, folder, options)
+        predicted = {form: _predict_m(files[form], test.inputs, fuse=form == "int8") for form in FORMS}
+        found |= {f"bytes_{form}": path.stat().st_size for form, path in files.items()}
+        found |= {"calibration": network, "calibration_mae": maes}
+    errors = {
+        form: ErrorsByCondition.of(test.error_m, test.error_m - outputs, test.labels)
+        for form, outputs in predicted.items()
+    }
+    found |= {f"mae_{form}": one.all.mae for form, one in errors.items()}
+    if errors["float"].all.mae_raw is None:
+        raise DatasetError("the test part is empty", valid="at least one measurement")
+    return TrainedModel(
+        network=task.network,
+        samples=task.samples,
+        seed=task.seed,
+        multiply_accumulates=architecture.multiply_accumulates,
+        mae_raw=errors["float"].all.mae_raw,
+        float_errors=errors["float"],
+        int8_errors=errors.get("int8"),
+        seconds=seconds,
+        samples_per_s=len(train) * options.epochs / max(seconds, 1e-9),
+        **found,
+    )
+
+
+def _export(
+    name: str, weights: FloatWeights, parts: Parts, folder: Path, options: FitOptions
+) -> tuple[dict[str, Path], dict[str, float], str]:
+    """Write the three files; return them, the MAE of each calibration, and the chosen calibration."""
+    files = {form: folder / f"{name}_{form}.onnx" for form in FORMS}
+    card = describe(name, weights.architecture, parts, options)
+    maes, best, network = calibrate(weights, parts.train.inputs, parts.train.error_m, options.seed)
+    save_bundle(files["float"], graph.float_model(weights), card)
+    # Optimisations that do not depend on the processor, so that the file runs on another one.
+    settings = session_options()
+    settings.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_EXTENDED
+    settings.optimized_model_filepath = str(files["optimised"])
+    _session(files["float"], settings)
+    save_bundle(files["int8"], graph.int8_model(network), replace(card, quantised=True))
+    return files, maes, best
+
+
+def calibrate(
+    weights: FloatWeights, inputs: NDArray[np.float32], targets: NDArray[np.floating], seed: int
+) -> tuple[dict[str, float], str, Int8Weights]:
+    """Quantise with every one of `CALIBRATIONS` on inputs (n, K) of the training part, and keep the best.
+
+    Returns:
+        MAE of each on training inputs that it was not calibrated on, m; the best; its network.
+
+    Raises:
+        DatasetError: fewer than two inputs. ModelError: see `quantize`.
+    """
+    if len(inputs) < 2:
+        raise DatasetError(f"{len(inputs)} inputs to calibrate and to check on", valid="at least 2")
+    order = np.random.default_rng(seed).permutation(len(inputs))
+    count = min(CALIBRATION_INPUTS, len(inputs) // 2)
+    seen, checked = inputs[order[:count]], order[count : count + CHECKED_INPUTS]
+    maes = {}
+    for name, percentile in CALIBRATIONS.items():
+        network = IntegerNetwork(quantize(weights, seen, percentile, exact=False))
+        maes[name] = float(np.abs(targets[checked] - network.predict_m(inputs[checked])).mean())
+    best = min(maes, key=lambda name: maes[name])
+    return maes, best, quantize(weights, seen, CALIBRATIONS[best])
+
+
+def _session(path: Path, settings: onnxruntime.SessionOptions) -> onnxruntime.InferenceSession:
+    try:
+        return onnxruntime.InferenceSession(str(path), settings, providers=["CPUExecutionProvider"])
+    except Exception as error:  # ONNX Runtime's errors have no narrower base class.
+        raise ModelError(f"ONNX Runtime rejects the model: {error}", where=str(path)) from error
+
+
+def _predict_m(path: Path, inputs: NDArray[np.float32], *, fuse: bool) -> NDArray[np.float32]:
+    """Return outputs (n,) of an ONNX file; int8 networks need ONNX Runtime's fusion of nodes."""
+    settings = session_options()
+    if not fuse:
+        settings.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
+    session = _session(path, settings)
+    name = session.get_inputs()[0].name
+    parts = [
+        session.run(None, {name: inputs[start : start + _BATCH, None, :]})[0][:, 0]
+        for start in range(0, len(inputs), _BATCH)
+    ]
+    return np.concatenate([np.zeros(0, np.float32), *parts])
+
+
+def baselines_of(train: Dataset, test: Dataset) -> tuple[Baseline, ...]:
+    """Return the constants and the line in the received power, fitted on `train`, tested on `test`.
+
+    The line does not change a range whose power is unknown.
+
+    Raises:
+        DatasetError: no training data.
+    """
+
+    def row(name: str, predicted: NDArray[np.floating]) -> Baseline:
+        return Baseline(
+            name=name, errors=ErrorsByCondition.of(test.error_m, test.error_m - predicted, test.labels)
+        )
+
+    rows = [
+        row("los_median", baselines.los_median(train)(test)),
+        row("overall_median", baselines.overall_median(train)(test)),
+    ]
+    if not all(np.isfinite(part.rx_power_dbm - part.first_path_power_dbm).any() for part in (train, test)):
+        return (*rows, Baseline(name="line", errors=None, reason="the data has no received power"))
+    line = lad.fit_prior(train.configurations, train.rx_power_dbm, train.first_path_power_dbm, train.error_m)
+    if not line.needs_power:
+        reason = "too few configurations, or powers that are all alike"
+        return (*rows, Baseline(name="line", errors=None, reason=reason))
+    predicted = line.predict_batch_m(test.rx_power_dbm, test.first_path_power_dbm)
+    return (*rows, row("line", np.nan_to_num(predicted)))
+
+
+def describe(name: str, architecture: Architecture, parts: Parts, options: FitOptions) -> Card:
+    """Return the card of a float network without a prior that was fitted to the whole training part.
+
+    Its variance comes from a second network, fitted to a fifth of the training configurations and tested on the others.
+    That network has less to learn from, so the variance errs on the safe side. The test part is not used.
+
+    Raises:
+        DatasetError: the training part has only one configuration; see also `fit`.
+    """
+    train = parts.train
+    folds = min(VARIANCE_FOLDS, len(train.names))
+    fold = splits.by_configuration(train.configurations, folds, options.seed)[0]
+    seen, unseen = train.rows(fold.test), train.rows(fold.train)
+    network = fitting.fit(architecture, seen.inputs, seen.error_m, options)
+    left = unseen.error_m - floating.predict_m(network, unseen.inputs)
+    training = {
+        "data": parts.data,
+        "split": parts.split,
+        "seed": options.seed,
+        "recipe": asdict(options),
+        "measurements": len(train),
+        "tested_on": len(parts.test),
+        "variance": f"of a network fitted to 1 of {folds} parts of the training configurations, on the others",
+    }
+    return card_of(name, architecture, train, LinePrior(0.0), unseen, left, training)

@@ -1,0 +1,96 @@
+"""Run jobs in several processes, with a journal: jobs that an earlier run finished are not repeated."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import multiprocessing
+from collections.abc import Callable, Mapping
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from typing import Any, TypeVar
+
+from uwb_mitigation.errors import ParameterError, UwbMitigationError
+
+Job = TypeVar("Job")
+
+
+def run_jobs(
+    work: Callable[[Job], dict[str, Any]],
+    jobs: Mapping[str, Job],
+    journal: Path,
+    mark: int,
+    *,
+    cost: Callable[[Job], float],
+    workers: int = 1,
+    on_progress: Callable[[float], None] = lambda share: None,
+) -> dict[str, dict[str, Any]]:
+    """Return {name: result} of all jobs, in the order of `jobs`.
+
+    Args:
+        work: called with each job; its result can be written as JSON. Picklable if there are several workers.
+        journal: file with one JSON object per line; lines with another `mark` (other data or options) are ignored.
+        cost: computing time of a job, in any unit; the most expensive jobs start first.
+        workers: processes; 1 runs everything in this process.
+        on_progress: called with the finished share of the work, 0 to 1.
+
+    Raises:
+        ParameterError: `workers` is less than 1.
+        UwbMitigationError: a process was killed, or the journal cannot be read or written; any error of `work`.
+    """
+    if workers < 1:
+        raise ParameterError(f"{workers} workers", valid="1 or more")
+    results = _read(journal, mark)
+    missing = sorted((name for name in jobs if name not in results), key=lambda name: -cost(jobs[name]))
+    total = sum(map(cost, jobs.values())) or 1.0
+
+    def finish(name: str, result: dict[str, Any]) -> None:
+        results[name] = result
+        _append(journal, {"mark": mark, "name": name, "result": result})
+        on_progress(sum(cost(job) for name, job in jobs.items() if name in results) / total)
+
+    if workers == 1 or len(missing) < 2:
+        for name in missing:
+            finish(name, work(jobs[name]))
+    else:
+        # Not forked: a forked child would inherit torch's thread pools in an undefined state.
+        context = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(min(workers, len(missing)), context) as pool:
+            pending = {pool.submit(work, jobs[name]): name for name in missing}
+            try:
+                for future in as_completed(pending):
+                    finish(pending[future], future.result())
+            except BrokenProcessPool as error:
+                raise UwbMitigationError(
+                    "a training process was killed", valid="fewer workers, or more memory"
+                ) from error
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)
+                for process in multiprocessing.active_children():
+                    process.terminate()
+                raise
+    return {name: results[name] for name in jobs}
+
+
+def _append(journal: Path, entry: dict[str, Any]) -> None:
+    try:
+        with journal.open("a", encoding="utf-8") as stream:
+            # The line before may be incomplete, if its process was killed.
+            stream.write(f"\n{json.dumps(entry)}\n")
+    except OSError as error:
+        raise UwbMitigationError(f"cannot be written: {error.strerror}", where=str(journal)) from error
+
+
+def _read(journal: Path, mark: int) -> dict[str, dict[str, Any]]:
+    try:
+        lines = journal.read_text(encoding="utf-8", errors="replace").splitlines() if journal.exists() else []
+    except OSError as error:
+        raise UwbMitigationError(f"cannot be read: {error.strerror}", where=str(journal)) from error
+    found = {}
+    for line in lines:
+        with contextlib.suppress(ValueError, TypeError, KeyError):  # empty or incomplete line
+            entry = json.loads(line)
+            if entry["mark"] == mark:
+                found[str(entry["name"])] = dict(entry["result"])
+    return found

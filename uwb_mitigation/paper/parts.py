@@ -1,0 +1,82 @@
+"""A recording as the training and the test part of an experiment."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from uwb_mitigation.dataset import Dataset, build_dataset
+from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.paper import rooms
+from uwb_mitigation.paper.deepuwb import DeepUwbRecording
+from uwb_mitigation.preprocessing import Preprocessing, Scaling
+from uwb_mitigation.sources.opening import open_recording
+from uwb_mitigation.sources.source import Source
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Parts:
+    """The data of an experiment; `data` and `split` are descriptions for people."""
+
+    data: str
+    split: str
+    train: Dataset
+    test: Dataset
+
+    def narrowed(self, samples: int) -> Parts:
+        """Return the same parts with shorter windows; raises as `narrowed`."""
+        return replace(self, train=narrowed(self.train, samples), test=narrowed(self.test, samples))
+
+
+def open_data(path: Path) -> Source:
+    """Open DeepUWB's pickle (`.pkl`) or any recording; raises as `open_recording`."""
+    return DeepUwbRecording(path) if path.suffix == ".pkl" else open_recording(path)
+
+
+def load(
+    path: Path, preprocessing: Preprocessing, on_record: Callable[[], None] = lambda: None
+) -> tuple[str, bool, Dataset]:
+    """Return the recording's name, whether it is simulated, and its labelled measurements.
+
+    Raises:
+        RecordingError, DatasetError: it cannot be read, or no measurement is usable.
+    """
+    with open_data(path) as source:
+        dataset = build_dataset(source, preprocessing, on_record)
+        name, simulated = path.resolve().name, bool(source.simulated)
+    return (f"{name} (simulated)" if simulated and "simulated" not in name else name), simulated, dataset
+
+
+def divided(name: str, dataset: Dataset, split: str) -> Parts:
+    """Return training and test part by one of `rooms.SPLITS`; raises as `split_by_name`."""
+    described, rows = rooms.split_by_name(dataset.configurations, split)
+    return Parts(name, described, dataset.rows(rows.train), dataset.rows(rows.test))
+
+
+def narrowed(dataset: Dataset, samples: int) -> Dataset:
+    """Return the same measurements with shorter windows, scaled again where scaling is by the maximum.
+
+    Raises:
+        ParameterError: longer than the existing windows.
+    """
+    if not 1 <= samples <= dataset.preprocessing.samples:
+        raise ParameterError(f"window of {samples} samples", valid=f"1 to {dataset.preprocessing.samples}")
+    inputs = dataset.inputs[:, :samples]
+    if dataset.preprocessing.scaling is Scaling.MAX:
+        peak = inputs.max(axis=1, keepdims=True)
+        inputs = inputs / np.where(peak > 0, peak, np.float32(1))
+    preprocessing = Preprocessing(samples, dataset.preprocessing.scaling)
+    return replace(dataset, preprocessing=preprocessing, inputs=np.ascontiguousarray(inputs))
+
+
+def fingerprint(text: str, *datasets: Dataset) -> int:
+    """Return a checksum of options and data, to recognise the results of an earlier run."""
+    mark = zlib.crc32(text.encode())
+    for dataset in datasets:
+        for array in (dataset.inputs, dataset.error_m):
+            mark = zlib.crc32(array.tobytes(), mark)
+    return mark

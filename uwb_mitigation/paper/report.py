@@ -1,0 +1,342 @@
+"""The report: the paper's tables and figures for one recording, next to the published numbers."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.dataset import Dataset
+from uwb_mitigation.evaluation.page import rendered
+from uwb_mitigation.paper import figures, published, tables
+from uwb_mitigation.paper.results import Box, ExperimentResults, FirmwareRow, PartErrors, Spread
+from uwb_mitigation.paper.rooms import ROOM_ROWS, ROOMS, has_rooms, parse_configuration
+from uwb_mitigation.paper.tables import Cell, Provenance, Table
+
+STEPS = 4
+"""Number of calls of `on_step`."""
+
+_ALL = "none: all measurements"
+_TEST_ROOM = "medium room"
+LOS = "LOS"
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """One figure.
+
+    Attributes:
+        alt: description for readers who do not see it.
+        note: how to read it; `paper_note`: what the paper's figure shows.
+        uri: the image, as `data:`.
+        numbers: what is drawn, for programs.
+    """
+
+    id: str
+    title: str
+    alt: str
+    note: str
+    paper_note: str
+    uri: str
+    numbers: dict[str, Any]
+    provenance: Provenance
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """The page.
+
+    Attributes:
+        command: made this report.
+        lacking: {parts that are left out: command that makes their results}.
+    """
+
+    data: str
+    simulated: bool
+    command: str
+    lacking: dict[str, str]
+    notices: tuple[str, ...]
+    tables: tuple[Table, ...]
+    figures: tuple[Picture, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the content without images."""
+        content = asdict(self)
+        for picture in content["figures"]:
+            del picture["uri"]
+        return content
+
+    def html(self) -> str:
+        """Return one page without external resources.
+
+        Raises:
+            MissingDependencyError: jinja2 is not installed.
+        """
+        return rendered("report.html.j2", Path(__file__).parent / "templates", report=self)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Study:
+    """Labelled data with windows of the longest K, scaled by their maximum; `command` made the report from `path`."""
+
+    path: Path
+    name: str
+    simulated: bool
+    dataset: Dataset
+    command: str
+
+    @property
+    def has_rooms(self) -> bool:
+        return has_rooms(self.dataset.configurations)
+
+    @property
+    def labels(self) -> NDArray[np.str_]:
+        """Propagation condition of each row."""
+        return np.where(self.dataset.labels == "", "no label", self.dataset.labels)
+
+    @property
+    def places(self) -> NDArray[np.str_]:
+        """Room of each row, or the configuration if the data has no rooms."""
+        names = self.dataset.configurations
+        return _map(names, lambda name: ROOMS[parse_configuration(name)[0]]) if self.has_rooms else names
+
+    @property
+    def materials(self) -> NDArray[np.str_]:
+        """Material between the antennas of each row, or the label if the data does not contain it."""
+        return _map(self.dataset.configurations, _material) if self.has_rooms else self.labels
+
+    def provenance(self, seeds: str = "none") -> Provenance:
+        return Provenance(self.name, _ALL, seeds, self.command)
+
+
+def _map(names: NDArray[np.str_], shown: Callable[[str], str]) -> NDArray[np.str_]:
+    unique, inverse = np.unique(names, return_inverse=True)
+    return np.array([shown(str(name)) for name in unique])[inverse]
+
+
+def _material(configuration: str) -> str:
+    materials = parse_configuration(configuration)[1]
+    return "none (LOS)" if not materials else materials[0] if len(materials) == 1 else "several"
+
+
+def build(
+    study: Study,
+    trainings: ExperimentResults | None = None,
+    firmware: Sequence[FirmwareRow] = (),
+    on_step: Callable[[], None] = lambda: None,
+) -> Report:
+    """Return every table and figure that the data, the trainings and the firmware results allow."""
+    train = f"uwb-mitigation paper protocol --data {shlex.quote(str(study.path))} -o models"
+    bench = "uwb-mitigation bench firmware --json firmware.json"
+    lacking: dict[str, str] = {}
+    shown, pictures = [_data_table(study)], [_samples(study)]
+    on_step()
+    for letter in "ab":
+        pictures.append(_components(study, letter))
+        on_step()
+    if trainings is None:
+        lacking["Tables 1 and 2, Fig. 5"] = train
+    else:
+        seeds = sorted({model.seed for model in trainings.models})
+        trained = Provenance(
+            trainings.data,
+            f"{trainings.split}; {trainings.train:,} measurements to train on, {trainings.test:,} to test on",
+            f"{', '.join(map(str, seeds)) or 'none'}; {trainings.options.epochs} epochs each",
+            trainings.command or train,
+        )
+        shown.append(tables.accuracy(trainings, trained, train, _measured(study)))
+        shown.append(tables.sizes(trainings, trained, train))
+        pictures.append(_over_k(trainings, trained))
+    if firmware:
+        random = "fixed, of the windows and of random weights; the cost depends on neither"
+        emulated = Provenance(
+            "windows that test every rounding", "none: no accuracy is measured", random, bench
+        )
+        shown.append(tables.firmware(firmware, emulated, bench))
+    else:
+        lacking["Table 3"] = bench
+    on_step()
+    notices = _notices(study, trainings)
+    return Report(study.name, study.simulated, study.command, lacking, notices, tuple(shown), tuple(pictures))
+
+
+def _measured(study: Study) -> str:
+    return "Measured on simulated data" if study.simulated else "Measured"
+
+
+def _notices(study: Study, trainings: ExperimentResults | None) -> tuple[str, ...]:
+    found = []
+    rows = tuple(int((study.places == room).sum()) for room in ROOMS)
+    if study.simulated:
+        found.append(
+            "The data is simulated: no radio was involved. It does not show the accuracy at a real site."
+        )
+    if study.simulated or not study.has_rooms or rows != ROOM_ROWS:
+        found.append("The data is not the published DeepUWB: the paper's numbers are not a target for it.")
+    if trainings is not None:
+        seeds = len({model.seed for model in trainings.models})
+        lengths = len({model.samples for model in trainings.models} & set(published.WINDOWS))
+        epochs = trainings.options.epochs
+        if epochs < published.EPOCHS or seeds < published.SEEDS or lengths < len(published.WINDOWS):
+            found.append(
+                f"Shortened training: {epochs} epochs (paper: {published.EPOCHS}), {seeds} of {published.SEEDS} seeds, "
+                f"{lengths} of {len(published.WINDOWS)} lengths of the CIR. Accuracies are not comparable with the paper's."
+            )
+    if study.dataset.refused:
+        reasons = ", ".join(f"{count:,} x {why}" for why, count in sorted(study.dataset.refused.items()))
+        found.append(f"Measurements left out: {reasons}.")
+    return tuple(found)
+
+
+def _data_table(study: Study) -> Table:
+    labels = study.labels
+
+    def row(name: str, chosen: NDArray[np.bool_], published_rows: int | None = None) -> tuple[Cell, ...]:
+        part = PartErrors.of(study.dataset.error_m[chosen], study.dataset.error_m[chosen])
+        paper = (published.RAW_MAE_M, published.RAW_SIGMA_M) if name == _TEST_ROOM else (None, None)
+        return (
+            Cell(name, "head"),
+            tables.number(published_rows, "{:,}", "paper"),
+            *(tables.number(value, "{:.4f}", "paper") for value in paper),
+            tables.number(part.n, "{:,}", "measured"),
+            *(tables.number(value, "{:.4f}", "measured") for value in (part.mae_raw, part.sigma_raw)),
+        )
+
+    rows = []
+    if study.has_rooms:
+        rows = [row(room, study.places == room, count) for room, count in zip(ROOMS, ROOM_ROWS, strict=True)]
+    names = sorted(np.unique(labels).tolist(), key=lambda name: (name != LOS, name))
+    rows += [row(f"label {name}", labels == name) for name in names]
+    rows.append(row("all", np.ones(len(labels), np.bool_), sum(ROOM_ROWS) if study.has_rooms else None))
+    return Table(
+        "data",
+        "The data before any correction",
+        "MAE and standard deviation of the range error, measured minus true. "
+        f"{len(study.dataset.names):,} configurations. Rows of DeepUWB: as published.",
+        (("Paper and DeepUWB", 3), (_measured(study), 3)),
+        ("Part", *(["Measurements", "MAE, m", "σ, m"] * 2)),
+        1,
+        tuple(rows),
+        study.provenance(),
+    )
+
+
+def _samples(study: Study, most: int = 3) -> Picture:
+    labels, errors = study.labels, study.dataset.error_m
+    names, counts = np.unique(labels, return_counts=True)
+    order = sorted(
+        zip(names.tolist(), counts.tolist(), strict=True), key=lambda pair: (pair[0] != LOS, -pair[1])
+    )
+    chosen = []
+    for name, _ in order[:most]:
+        rows = np.flatnonzero(labels == name)
+        median = rows[np.argsort(errors[rows], kind="stable")[(len(rows) - 1) // 2]]
+        chosen.append((name, float(errors[median]), study.dataset.inputs[median]))
+    described = "; ".join(f"{name}, range error {error:+.3f} m" for name, error, _ in chosen)
+    return Picture(
+        "fig3",
+        "Fig. 3. LOS and NLOS samples",
+        f"Channel impulse responses over time, one panel each: {described}.",
+        "The measurement with the median range error of each condition; amplitude relative to the maximum of the window. "
+        "Dashed: first path reported by the radio.",
+        "one LOS and one NLOS sample with normalised amplitude; in NLOS the signal arrives over many paths, "
+        "and the range is biased upward.",
+        figures.samples(chosen),
+        {"samples": [{"label": name, "error_m": error} for name, error, _ in chosen]},
+        study.provenance(),
+    )
+
+
+def principal_components(
+    inputs: NDArray[np.floating], dimensions: int = 3
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Project inputs (n, k) onto the directions of their largest variance.
+
+    Returns:
+        Coordinates (n, d) and the share of the variance along each, (d,). Components that the data does not have are 0.
+        The largest weight of a component is positive, so that the same data gives the same picture.
+    """
+    centred = inputs.astype(np.float64) - inputs.mean(axis=0, dtype=np.float64)
+    _, singular, components = np.linalg.svd(centred, full_matrices=False)
+    components, power = components[:dimensions], singular**2
+    found = len(components)
+    largest = np.abs(components).argmax(axis=1)
+    components = components * np.sign(components[np.arange(found), largest])[:, None]
+    points, explained = np.zeros((len(inputs), dimensions)), np.zeros(dimensions)
+    points[:, :found] = centred @ components.T
+    if power.sum() > 0:
+        explained[:found] = power[:found] / power.sum()
+    return points, explained
+
+
+def _components(study: Study, letter: str) -> Picture:
+    points, explained = principal_components(study.dataset.inputs)
+    share = " + ".join(f"{100 * part:.0f}" for part in explained)
+    chosen = np.arange(len(points))
+    if len(chosen) > figures.MAX_POINTS:
+        chosen = np.sort(np.random.default_rng(0).choice(len(chosen), figures.MAX_POINTS, replace=False))
+    kinds = ("room", "material") if study.has_rooms else ("configuration", "label")
+    kind, groups = kinds["ab".index(letter)], study.places if letter == "a" else study.materials
+    names, counts = np.unique(groups, return_counts=True)
+    numbers = dict(zip(names.tolist(), counts.tolist(), strict=True))
+    return Picture(
+        f"fig4{letter}",
+        f"Fig. 4{letter}. Principal components, by {kind}",
+        f"Three-dimensional scatter plot of {len(chosen)} channel impulse responses along their first three principal "
+        f"components, from two sides, coloured by {kind}: {len(names)} of them.",
+        f"{len(chosen):,} of {len(points):,} windows of {study.dataset.inputs.shape[1]} amplitudes. "
+        f"The components contain {share} % of the variance.",
+        "the three indoor rooms lie close together, apart from outdoor and through-the-wall measurements."
+        if letter == "a"
+        else "materials lie in different regions; heavier ones, such as metal, are concentrated and distant "
+        "from plastic and wood.",
+        figures.scatter(points[chosen], groups[chosen], f"By {kind}"),
+        {"explained": explained.tolist(), "groups": numbers, "points": len(chosen)},
+        study.provenance("0, of the points drawn" if len(chosen) < len(points) else "none"),
+    )
+
+
+def _over_k(trainings: ExperimentResults, provenance: Provenance) -> Picture:
+    spreads: dict[int, dict[str, Spread]] = {}
+    boxes: dict[str, Box | None] = {}
+    if trainings.models:
+        first = trainings.models[0].left
+        boxes = {f"raw\n{name}": getattr(first, name.lower()).box_raw for name in ("all", LOS, "NLOS")}
+    for samples in published.WINDOWS:
+        models = trainings.of("remnet", samples)
+        values = {
+            "los": Spread.of([model.left.los.mae for model in models]),
+            "nlos": Spread.of([model.left.nlos.mae for model in models]),
+            "sigma": Spread.of([model.left.all.sigma for model in models]),
+        }
+        if models:
+            spreads[samples] = {name: spread for name, spread in values.items() if spread is not None}
+        found = [model.left.all.box for model in models if model.left.all.box is not None]
+        box = tuple(np.mean(found, axis=0).tolist()) if found else None
+        boxes[f"K = {samples}"] = box
+    paper_mae = {k: row.mae_m[2] for (network, k), row in published.MODELS.items() if network == "remnet"}
+    described = "; ".join(
+        f"K = {samples}: " + ", ".join(f"{name} {spread.mean:.3f} m" for name, spread in spread_of.items())
+        for samples, spread_of in spreads.items()
+    )
+    return Picture(
+        "fig5",
+        "Fig. 5. Errors for each length of the CIR",
+        "Above, box plot of range errors before correction and after REMNet for each K; below, bars of LOS MAE, "
+        f"NLOS MAE and sigma. {described or 'No REMNet was trained'}.",
+        "REMNet on the test part, int8 if it was quantised; quantiles are means over seeds. Grey: before correction. "
+        "Black: the paper's int8 MAE (Table 1).",
+        "errors grow as K falls, and K = 8 is the smallest acceptable length; the paper prints no numbers for it.",
+        figures.over_k(boxes, spreads, paper_mae, published.WINDOWS),
+        {
+            "boxes": {name.replace("\n", " "): box for name, box in boxes.items()},
+            "left": {str(k): {name: asdict(one) for name, one in of.items()} for k, of in spreads.items()},
+            "paper_mae": {str(k): mae for k, mae in paper_mae.items()},
+        },
+        provenance,
+    )

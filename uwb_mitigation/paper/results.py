@@ -1,0 +1,250 @@
+"""Result files: `protocol.json` of the experiment and the JSON result of `bench firmware`. One schema writes and reads them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from uwb_mitigation.errors import DatasetError, UwbMitigationError
+from uwb_mitigation.files import read_bounded
+
+RESULTS = "protocol.json"
+MAX_BYTES = 64 * 2**20
+FORMS = ("float", "optimised", "int8")
+"""Of a trained network, in the order of the paper's columns."""
+
+Count = Annotated[int, Field(ge=0)]
+Number = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Box = tuple[float, float, float, float, float]
+"""Quantiles of signed errors, m: 5 %, 25 %, 50 %, 75 %, 95 %."""
+
+
+class _Entry(BaseModel):
+    model_config = ConfigDict(frozen=True)
+
+
+class PartErrors(_Entry):
+    """Errors on a part of the test data, m. If `n` is 0, everything else is None.
+
+    Attributes:
+        mae_raw, sigma_raw, box_raw: mean absolute error, standard deviation and quantiles before correction.
+        mae, sigma, box: after correction.
+    """
+
+    n: Count
+    mae_raw: Number | None = None
+    sigma_raw: Number | None = None
+    mae: Number | None = None
+    sigma: Number | None = None
+    box_raw: Box | None = None
+    box: Box | None = None
+
+    @classmethod
+    def of(cls, raw_m: NDArray[np.floating], left_m: NDArray[np.floating]) -> PartErrors:
+        """Return the statistics of errors (n,) before and after correction."""
+        if len(raw_m) == 0:
+            return cls(n=0)
+        mae, sigma, box = zip(
+            *((np.abs(e).mean(), np.std(e), quantiles(e)) for e in (raw_m, left_m)), strict=True
+        )
+        return cls(
+            n=len(raw_m),
+            mae_raw=mae[0],
+            sigma_raw=sigma[0],
+            box_raw=box[0],
+            mae=mae[1],
+            sigma=sigma[1],
+            box=box[1],
+        )
+
+
+def quantiles(error_m: NDArray[np.floating]) -> Box:
+    """Return the `Box` of errors (n,), n at least 1."""
+    low, first, median, third, high = (float(v) for v in np.percentile(error_m, (5, 25, 50, 75, 95)))
+    return low, first, median, third, high
+
+
+class ErrorsByCondition(_Entry):
+    """Errors on the test part, on its LOS part and on its NLOS part."""
+
+    all: PartErrors
+    los: PartErrors
+    nlos: PartErrors
+
+    @classmethod
+    def of(
+        cls, error_m: NDArray[np.floating], left_m: NDArray[np.floating], labels: NDArray[np.str_]
+    ) -> ErrorsByCondition:
+        """Return the statistics of errors (n,) before and after correction; rows without a label count in `all` only."""
+        los = labels == "LOS"
+        parts = {"all": np.ones(len(labels), np.bool_), "los": los, "nlos": ~los & (labels != "")}
+        return cls(**{name: PartErrors.of(error_m[rows], left_m[rows]) for name, rows in parts.items()})
+
+
+class TrainedModel(_Entry):
+    """One network, trained with one seed. None where a network has no such form.
+
+    Attributes:
+        network, samples, seed: which; `samples` is the window length K.
+        parameters, multiply_accumulates: of one inference.
+        mae_float, mae_optimised, mae_int8: on the test part, m (Table 1).
+        bytes_float, bytes_optimised, bytes_int8: file sizes (Table 2).
+        float_errors, int8_errors: on the test part (Fig. 5).
+        calibration_mae: {calibration: MAE of int8 on the training part, m}; `calibration` is the chosen one.
+        seconds: training time; `samples_per_s` during it.
+    """
+
+    network: str
+    samples: Count
+    seed: Count
+    parameters: Count
+    multiply_accumulates: Count
+    mae_raw: Number
+    mae_float: Number
+    mae_optimised: Number | None = None
+    mae_int8: Number | None = None
+    bytes_float: Count | None = None
+    bytes_optimised: Count | None = None
+    bytes_int8: Count | None = None
+    float_errors: ErrorsByCondition
+    int8_errors: ErrorsByCondition | None = None
+    calibration: str | None = None
+    calibration_mae: Mapping[str, Number] | None = None
+    seconds: Number
+    samples_per_s: Number
+
+    @property
+    def mae_m(self) -> tuple[float | None, ...]:
+        """Of each of `FORMS`."""
+        return self.mae_float, self.mae_optimised, self.mae_int8
+
+    @property
+    def size_bytes(self) -> tuple[int | None, ...]:
+        """Of each of `FORMS`."""
+        return self.bytes_float, self.bytes_optimised, self.bytes_int8
+
+    @property
+    def left(self) -> ErrorsByCondition:
+        """Of int8 if the network has this form, otherwise of float."""
+        return self.int8_errors or self.float_errors
+
+
+class Baseline(_Entry):
+    """A correction without a network, on the same split.
+
+    Attributes:
+        name: `los_median`, `overall_median` (of the training errors) or `line` (`evaluation.lad`).
+        errors: on the test part; None if the data does not allow this baseline, for this `reason`.
+    """
+
+    name: str
+    errors: ErrorsByCondition | None
+    reason: str = ""
+
+
+class Settings(_Entry):
+    """Options of every fit (`training.options.FitOptions`)."""
+
+    epochs: Count
+    learning_rate: Number
+    batch: Count
+    dropout: Number
+    weight_decay: Number
+    seed: Count
+
+
+class ExperimentResults(_Entry):
+    """Results of the paper's experiment, with the description of data, split and command.
+
+    Attributes:
+        train, test: number of measurements in each part.
+        options: of every fit, except for the seed.
+    """
+
+    data: str
+    split: str
+    command: str = ""
+    train: Count
+    test: Count
+    options: Settings
+    models: tuple[TrainedModel, ...]
+    baselines: tuple[Baseline, ...] = ()
+
+    def of(self, network: str, samples: int) -> tuple[TrainedModel, ...]:
+        """Return every seed of a network, in the order of seeds."""
+        found = [model for model in self.models if (model.network, model.samples) == (network, samples)]
+        return tuple(sorted(found, key=lambda model: model.seed))
+
+
+class FirmwareRow(_Entry):
+    """One network on an emulated Cortex-M4; cycles, rate and energy are estimates, the rest is measured.
+
+    Attributes:
+        network, samples, first_kernel, kernels: which; `first_kernel` is 0 for an MLP.
+        instructions: of one inference.
+        rate_hz: at 64 MHz without wait states.
+        energy_mj: at the paper's power; None if the paper has no such network.
+        mismatches, inputs: number of outputs that differ from ONNX Runtime's, and of inputs.
+    """
+
+    network: str = Field(validation_alias="model")
+    samples: Count = Field(validation_alias="k")
+    first_kernel: Count = Field(validation_alias="k0")
+    kernels: str
+    instructions: Number
+    ram_bytes: Number
+    flash_bytes: Number
+    rate_hz: Number = Field(validation_alias="hz")
+    energy_mj: Number | None
+    mismatches: Count
+    inputs: Count
+
+
+class FirmwareResults(_Entry):
+    """The JSON result of `bench firmware`."""
+
+    rows: tuple[FirmwareRow, ...]
+
+
+Entry = TypeVar("Entry", bound=BaseModel)
+
+
+def read(kind: type[Entry], path: Path) -> Entry:
+    """Return the content of a result file.
+
+    Raises:
+        UwbMitigationError: it cannot be read, is empty or too large.
+        DatasetError: it is not such a file; `what` contains the entry.
+    """
+    data = read_bounded(path, MAX_BYTES, UwbMitigationError, "output of `paper protocol` or `bench firmware`")
+    try:
+        return kind.model_validate_json(data)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        entry = ".".join(map(str, first["loc"])) or "the file"
+        raise DatasetError(f"{entry}: {first['msg']}", where=str(path)) from error
+
+
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """Mean and standard deviation over seeds; the latter is None for a single seed."""
+
+    mean: float
+    std: float | None
+    n: int
+
+    @classmethod
+    def of(cls, values: list[float | None]) -> Spread | None:
+        """Return the spread of the values that are not None; None if there are none."""
+        known = [value for value in values if value is not None]
+        if not known:
+            return None
+        # Seeds are a sample of all seeds, hence n - 1.
+        std = float(np.std(known, ddof=1)) if len(known) > 1 else None
+        return cls(float(np.mean(known)), std, len(known))

@@ -1,0 +1,231 @@
+"""The paper's tables, with measured numbers next to the published ones. A missing measurement is marked as such."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from uwb_mitigation.model.architecture import Mlp, Remnet
+from uwb_mitigation.paper import published
+from uwb_mitigation.paper.results import FORMS, ExperimentResults, FirmwareRow, Spread, TrainedModel
+
+NAMES = {
+    "remnet": "REMNet",
+    "remnet_k5": "REMNet, k0 = 5",
+    "remnet_attention": "REMNet with attention",
+    "mlp": "MLP",
+    "raw": "No correction",
+    "los_median": "Median error in LOS",
+    "overall_median": "Median error",
+    "line": "L1 line",
+    "cortex_m4": "Cortex-M4",
+    "portable": "portable C",
+}
+"""{name in result files: name for people}."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One cell of a table.
+
+    Attributes:
+        kind: `head`, `paper`, `measured`, `estimated`, `missing` (measurable, but not measured) or `none` (no such value).
+        value: the number; `std` over `n` seeds.
+    """
+
+    text: str
+    kind: str
+    value: float | None = None
+    std: float | None = None
+    n: int | None = None
+
+
+NONE, MISSING = Cell("–", "none"), Cell("not measured", "missing")
+
+
+@dataclass(frozen=True, slots=True)
+class Provenance:
+    """Origin of the measured numbers of a table or a figure."""
+
+    data: str
+    split: str
+    seeds: str
+    command: str
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """One table.
+
+    Attributes:
+        note: how to read it.
+        groups: (text, number of columns) above the column heads, without the columns that name a row.
+        columns: heads of all columns; the first `heads` name a row.
+        rows: one cell per column.
+        missing: command that measures missing values.
+    """
+
+    id: str
+    title: str
+    note: str
+    groups: tuple[tuple[str, int], ...]
+    columns: tuple[str, ...]
+    heads: int
+    rows: tuple[tuple[Cell, ...], ...]
+    provenance: Provenance
+    missing: str = ""
+
+    @property
+    def has_gaps(self) -> bool:
+        """Whether a measurable value is missing."""
+        return any(cell.kind == "missing" for row in self.rows for cell in row)
+
+
+def number(value: float | None, form: str, kind: str, otherwise: Cell = NONE) -> Cell:
+    """Return a formatted number, or `otherwise` without a value."""
+    return otherwise if value is None else Cell(form.format(value), kind, value)
+
+
+def accuracy(trainings: ExperimentResults, provenance: Provenance, missing: str, measured: str) -> Table:
+    """Return Table 1, MAE before and after graph optimisation and quantisation; `measured` heads our columns."""
+    rows = []
+    for network, samples, models, printed in _networks(trainings):
+        paper = [printed.parameters, *printed.mae_m] if printed else [None] * 4
+        rows.append(
+            (
+                *_heads(network, samples),
+                number(paper[0], "{:.0f}", "paper"),
+                *(number(mae, "{:.4f}", "paper") for mae in paper[1:]),
+                _parameters(network, samples, models),
+                *(_seeds(models, [model.mae_m[form] for model in models], 4) for form in range(len(FORMS))),
+            )
+        )
+    known = {baseline.name: baseline for baseline in trainings.baselines}
+    left = {name: b.errors.all.mae if b.errors else None for name, b in known.items()}
+    left["raw"] = trainings.models[0].mae_raw if trainings.models else None
+    for name in dict.fromkeys(["raw", "los_median", "overall_median", "line", *known]):
+        cell = number(left[name], "{:.4f}", "measured") if name in left else MISSING
+        head = Cell(NAMES.get(name, name), "head"), Cell("–", "head")
+        rows.append((*head, NONE, NONE, NONE, NONE, NONE, cell, NONE, NONE))
+    reasons = [f" {NAMES.get(name, name)}: {b.reason}." for name, b in known.items() if b.reason]
+    return Table(
+        "table1",
+        "Table 1. Accuracy for each length of the CIR, before and after optimisation",
+        "MAE on the test part, m; mean ± standard deviation over seeds. Optimised: ONNX Runtime's graph. "
+        "Below the networks: baselines that were fitted on the same training part (constants, and a line in received "
+        "and first-path power)." + "".join(reasons),
+        (("Paper", 4), (measured, 4)),
+        ("Model", "CIR", *(["Params", *(f"MAE {form}" for form in FORMS)] * 2)),
+        2,
+        tuple(rows),
+        provenance,
+        missing,
+    )
+
+
+def sizes(trainings: ExperimentResults, provenance: Provenance, missing: str) -> Table:
+    """Return Table 2, file sizes."""
+    rows = []
+    for network, samples, models, printed in _networks(trainings):
+        kilobytes = [[size and size / 1000 for size in model.size_bytes] for model in models]
+        rows.append(
+            (
+                *_heads(network, samples),
+                _parameters(network, samples, models),
+                *(number(size, "{:.3f}", "paper") for size in (printed.size_kb if printed else [None] * 3)),
+                *(_seeds(models, [sizes[form] for sizes in kilobytes], 3) for form in range(len(FORMS))),
+            )
+        )
+    return Table(
+        "table2",
+        "Table 2. Size for each length of the CIR, before and after optimisation",
+        "Files on disk, kB of 1000 bytes. Paper: TensorFlow Lite. Measured: ONNX with the model's card.",
+        (("", 1), ("Paper", 3), ("Measured", 3)),
+        ("Model", "CIR", "Params", *([f"{form}, kB" for form in FORMS] * 2)),
+        2,
+        tuple(rows),
+        provenance,
+        missing,
+    )
+
+
+def firmware(bench: Sequence[FirmwareRow], provenance: Provenance, missing: str) -> Table:
+    """Return Table 3, rate and energy on the microcontroller."""
+    found = {(row.network, row.samples, row.first_kernel, row.kernels): row for row in bench}
+    wanted = [(network, samples, 3 if network == "remnet" else 0, "cortex_m4") for network, samples in _ROWS]
+    rows = []
+    for key in dict.fromkeys([*wanted, *found]):
+        network, samples, first_kernel, kernels = key
+        printed, row = published.MODELS.get((network, samples)), found.get(key)
+        name = NAMES.get(network, network) + (f", k0 = {first_kernel}" if first_kernel not in (0, 3) else "")
+        paper = (
+            (printed.rate_hz, printed.supply_v, printed.current_ma, printed.power_mw, printed.energy_mj)
+            if printed
+            else [None] * 5
+        )
+        own = [MISSING, MISSING if printed else NONE, *[MISSING] * 4]
+        if row is not None:
+            own = [
+                number(row.rate_hz, "≈ {:.1f}", "estimated"),
+                number(row.energy_mj, "≈ {:.3f}", "estimated"),
+                number(row.instructions, "{:,.0f}", "measured"),
+                number(row.ram_bytes / 1000, "{:.1f}", "measured"),
+                number(row.flash_bytes / 1000, "{:.1f}", "measured"),
+                Cell(f"{row.mismatches} of {row.inputs:,}", "measured", row.mismatches, n=row.inputs),
+            ]
+        forms = ("{:.1f}", "{:.1f}", "{:.1f}", "{:.1f}", "{:g}")
+        rows.append(
+            (
+                Cell(name, "head"),
+                Cell(str(samples), "head"),
+                Cell(NAMES.get(kernels, kernels), "head"),
+                *(number(value, form, "paper") for value, form in zip(paper, forms, strict=True)),
+                *own,
+            )
+        )
+    return Table(
+        "table3",
+        "Table 3. Real-time performance on the microcontroller",
+        "Paper: measured on an Arduino Nano 33 BLE Sense. Here: instructions, memory and equality with ONNX Runtime "
+        "are counted in an emulator; rate (64 MHz, no wait states) and energy (at the paper's power) are estimated. "
+        "Current and power require a board.",
+        (("Paper", 5), ("Estimated", 2), ("Counted in the emulator", 4)),
+        (
+            *("Model", "CIR", "Kernels", "f, Hz", "Vcc, V", "I, mA", "P, mW", "E, mJ"),
+            *("f, Hz (est.)", "E, mJ (est.)", "Instructions", "RAM, kB", "Flash, kB", "Unequal outputs"),
+        ),
+        3,
+        tuple(rows),
+        provenance,
+        missing,
+    )
+
+
+_ROWS = [*(("remnet", samples) for samples in published.WINDOWS), ("mlp", max(published.WINDOWS))]
+_Row = tuple[str, int, tuple[TrainedModel, ...], "published.PaperModel | None"]
+
+
+def _networks(trainings: ExperimentResults) -> list[_Row]:
+    """The paper's networks, and all others that were trained."""
+    keys = dict.fromkeys([*_ROWS, *((model.network, model.samples) for model in trainings.models)])
+    return [(*key, trainings.of(*key), published.MODELS.get(key)) for key in keys]
+
+
+def _heads(network: str, samples: int) -> tuple[Cell, Cell]:
+    return Cell(NAMES.get(network, network), "head"), Cell(str(samples), "head")
+
+
+def _parameters(network: str, samples: int, models: Sequence[TrainedModel]) -> Cell:
+    """Of the trained network, otherwise of the architecture: counting needs no training."""
+    shape = Mlp if network == "mlp" else Remnet
+    return number(models[0].parameters if models else shape(samples).parameters, "{}", "measured")
+
+
+def _seeds(models: Sequence[TrainedModel], values: list[float | None], digits: int) -> Cell:
+    spread = Spread.of(values)
+    if spread is None:
+        return NONE if models else MISSING
+    text = f"{spread.mean:.{digits}f}"
+    if spread.std and float(around := f"{spread.std:.{digits}f}"):
+        text += f" ± {around}"
+    return Cell(text, "measured", spread.mean, spread.std, spread.n)

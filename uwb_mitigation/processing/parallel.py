@@ -1,0 +1,116 @@
+"""Processes several bags at once: in processes on this machine, or on an existing Dask cluster."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+
+from uwb_mitigation.bag.writer import partial_file
+from uwb_mitigation.errors import MissingDependencyError, ParameterError, RecordingError
+from uwb_mitigation.processing.job import Job, Outcome, attempt
+
+
+def num_cores() -> int:
+    """Return the number of processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def run_here(jobs: Sequence[Job], workers: int) -> Iterator[Outcome]:
+    """Process the bags in at most `workers` processes; yield outcomes as they are ready.
+
+    If a process dies, for example because memory runs out, the remaining bags are processed one at a time, so that
+    only the bag that causes it fails.
+    """
+    unfinished = []
+    with _processes(min(workers, len(jobs))) as executor:
+        for job, outcome in _run(executor, _in_worker, jobs):
+            if outcome is None:
+                unfinished.append(job)
+            else:
+                yield outcome
+    for job in unfinished:
+        with _processes(1) as executor:
+            for _, outcome in _run(executor, _in_worker, [job]):
+                yield outcome or Outcome(
+                    job, error=RecordingError("the process died, perhaps of no memory", where=str(job.source))
+                )
+        partial_file(job.output).unlink(missing_ok=True)
+
+
+def run_on_dask(jobs: Sequence[Job], address: str) -> Iterator[Outcome]:
+    """Process the bags on the Dask cluster with the scheduler at `address`; yield outcomes as they are ready.
+
+    The workers need this package, and the same paths as here. A bag that has started is finished even if the
+    iterator is closed, since Dask cannot interrupt it.
+
+    Raises:
+        MissingDependencyError: `distributed` is not installed.
+        ParameterError: no scheduler answers.
+    """
+    try:
+        from distributed import Client
+        from distributed.comm import get_address_host
+    except ModuleNotFoundError as error:
+        raise MissingDependencyError(
+            "a scheduler needs Dask", valid="python -m pip install distributed"
+        ) from error
+    try:
+        # A client that fails on the address itself takes a minute to close.
+        get_address_host(address)
+        client = Client(address, set_as_default=False)
+    except (OSError, ValueError, TypeError) as error:
+        raise ParameterError(
+            f"no Dask scheduler: {str(error) or type(error).__name__}",
+            where=address,
+            valid="tcp://HOST:8786, as `dask scheduler` prints",
+        ) from error
+    with client, client.get_executor(pure=False) as executor:
+        for _, outcome in _run(executor, attempt, jobs):
+            assert outcome is not None
+            yield outcome
+
+
+def _processes(workers: int) -> ProcessPoolExecutor:
+    # Forking a process with threads (ONNX Runtime, rich) may deadlock.
+    server = "forkserver" in multiprocessing.get_all_start_methods()
+    context = multiprocessing.get_context("forkserver" if server else "spawn")
+    return ProcessPoolExecutor(workers, context, initializer=_ignore_interrupts)
+
+
+def _run(
+    executor: Executor, work: Callable[[Job], Outcome], jobs: Sequence[Job]
+) -> Iterator[tuple[Job, Outcome | None]]:
+    """Yield jobs with their outcomes as they are ready; None: a worker process died before."""
+    futures = {executor.submit(work, job): job for job in jobs}
+    try:
+        for future in as_completed(futures):
+            job = futures[future]
+            try:
+                yield job, future.result()
+            except BrokenProcessPool:
+                yield job, None
+            except Exception as error:  # Of the cluster or of pickling, of no common type.
+                reason = f"cannot be processed: {type(error).__name__}: {error}"
+                yield job, Outcome(job, error=RecordingError(reason, where=str(job.source)))
+    finally:
+        for future in futures:
+            future.cancel()
+
+
+def _ignore_interrupts() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _in_worker(job: Job) -> Outcome:
+    """Process a bag. Ctrl-C, which a terminal sends to all processes, removes its unfinished output."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        return attempt(job)
+    except KeyboardInterrupt:
+        return Outcome(job, error=RecordingError("interrupted", where=str(job.source)))
+    finally:
+        _ignore_interrupts()
