@@ -20,7 +20,7 @@ from uwb_mitigation.positioning.model import Model
 from uwb_mitigation.positioning.smoothing import smooth
 from uwb_mitigation.positioning.start import Area, Height, places
 from uwb_mitigation.positioning.track_errors import errors_of, track_errors
-from uwb_mitigation.positioning.tracks import Heights, TruePath
+from uwb_mitigation.positioning.tracks import Estimate, Heights, Track, TruePath
 
 PLAIN = Model(long=100.0, short=100.0)
 """No range is doubted."""
@@ -173,6 +173,28 @@ def test_measured_heights_near_the_floor_keep_the_right_solution(seed: int):
         errors = track_errors(track, truth)
         assert errors.rmse < 0.3
         assert errors.height_rmse < 0.06
+
+
+def test_poses_smoothed_with_a_lag_obey_area_and_measured_heights():
+    area, variance = Area((-4, -4, 0), (0.25, 4, 3)), 0.0004
+    ranges, truth = drive(WALL, path=flight, seconds=10, seed=2)
+    block(ranges, 2)
+    fleets = [Fleet(WALL, Model(), area=area) for _ in range(2)]
+    tracks: list[list[Estimate]] = [[], []]
+    for i, row in enumerate(ranges.anchor.tolist()):
+        for measured, (fleet, track) in enumerate(zip(fleets, tracks, strict=True)):
+            found = fleet.add(7, row + 1, int(ranges.stamp_ns[i]), float(ranges.range_m[i]), 0.01)
+            assert found is not None
+            if measured:
+                found[0].add_height(math.nan, variance)
+                found[0].add_height(float(truth.position[i, 2]), variance)
+            if i % 10 == 0 and (estimate := found[0].smoother.estimate()) is not None:
+                track.append(estimate)
+    without, with_heights = map(Track.of, tracks)
+    for track in (without, with_heights):
+        assert len(track) > 30
+        assert area.holds(track.position).all()
+    assert track_errors(with_heights, truth).height_rmse < 0.03 < track_errors(without, truth).height_rmse
 
 
 @pytest.mark.parametrize("seed", [0, 3])

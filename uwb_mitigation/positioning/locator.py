@@ -40,9 +40,6 @@ _SEPARABLE = 9.0
 _UNDETERMINED_M = 5.0
 """A position with a larger horizontal standard deviation is not determined by the ranges."""
 
-UNKNOWN_HEIGHT_SD_M = 0.1
-"""Standard deviation of a measured height without a variance."""
-
 HEIGHT_AGE_NS = 200_000_000
 
 _KEPT_RANGES = 400
@@ -207,11 +204,7 @@ class TagLocator:
         return self._estimate(stamp_ns) if self._filter is not None else None
 
     def add_height(self, height_m: float, variance_m2: float) -> None:
-        """Take in the tag's height, at the time of the latest range; one that is not finite is skipped."""
-        if not (math.isfinite(height_m) and math.isfinite(variance_m2)):
-            return
-        # A variance of 0 means unknown in ROS.
-        variance_m2 = variance_m2 if variance_m2 > 0.0 else UNKNOWN_HEIGHT_SD_M**2
+        """Take in the tag's height (finite) with its variance (positive), at the time of the latest range."""
         self._heights.append((self._time_s, height_m, variance_m2))
         limit = max(_UNCERTAIN_HEIGHT_M**2, 4.0 * variance_m2)
         if self._height is None and any(one.p[2, 2] > limit for one in self._filters()):
