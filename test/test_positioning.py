@@ -25,6 +25,9 @@ from uwb_mitigation.positioning.tracks import Estimate, Heights, Track, TruePath
 PLAIN = Model(long=100.0, short=100.0)
 """No range is doubted."""
 
+FLAT = WALL.moved(WALL.position * (1, 1, 0) + np.outer([0, 0, -3, -3, 0], (1, 0, 0)) + (0, 0, 2), WALL.sd)
+"""Anchors in one plane: without a height, every position has a mirror image."""
+
 
 def test_the_filter_agrees_with_filterpy():
     kalman = pytest.importorskip("filterpy.kalman")
@@ -155,24 +158,31 @@ def test_every_position_lies_inside_the_area(seed: int):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_measured_heights_near_the_floor_keep_the_right_solution(seed: int):
-    """The anchors are in one plane, so that every position has a mirror image without a height."""
-    flat = WALL.moved(WALL.position * (1, 1, 0) + (0, 0, 2.0), WALL.sd)
-    flat = flat.moved(flat.position + np.outer([0, 0, -3, -3, 0], (1, 0, 0)), WALL.sd)
-    ranges, truth = drive(flat, path=flight, seed=seed, seconds=30)
+    ranges, truth = drive(FLAT, path=flight, seed=seed, seconds=30)
     rng = np.random.default_rng(seed)
     stamps = np.arange(0, 30 * NANOSECONDS, NANOSECONDS // 10)
     height = truth.at(stamps)[:, 2] + rng.normal(0, 0.02, len(stamps))
     known = np.isfinite(height)
     heights = Heights(stamps[known], height[known], np.full(known.sum(), 0.0004))
     area = Area((-4, -4, 0), (30, 4, 3))
-    live = run_live(ranges, TagLocator(flat, area=area), heights).track
-    smoothed = smooth(flat, Model(), ranges, live, area=area, heights=heights)
+    live = run_live(ranges, TagLocator(FLAT, area=area), heights).track
+    smoothed = smooth(FLAT, Model(), ranges, live, area=area, heights=heights)
     for track in (live, smoothed):
         assert len(track) > 250
         assert area.holds(track.position).all()
         errors = track_errors(track, truth)
         assert errors.rmse < 0.3
         assert errors.height_rmse < 0.06
+
+
+def test_late_heights_decide_between_mirror_images_at_once():
+    ranges, truth = drive(FLAT, path=flight, seconds=6, seed=1)
+    late = truth.stamp_ns > 4 * NANOSECONDS
+    heights = Heights(truth.stamp_ns[late], truth.position[late, 2], np.full(late.sum(), 0.0004))
+    track = run_live(ranges, TagLocator(FLAT), heights).track
+    track = track.take(track.stamp_ns > 4.5 * NANOSECONDS)
+    assert len(track) == 59
+    assert track_errors(track, truth).height_rmse < 0.05
 
 
 def test_poses_smoothed_with_a_lag_obey_area_and_measured_heights():

@@ -216,8 +216,11 @@ class TagLocator:
                 self._settle()
                 return
         for one in self._filters():
-            one.update_height(height_m, variance_m2)
+            z = one.update_height(height_m, variance_m2)
             self._confine(one)
+            for candidate in self._candidates:
+                if candidate.filter is one:
+                    candidate.loss += float(self._model.loss(np.float64(z)))
 
     def add_speed(self, speed_m_per_s: float, variance_m2: float) -> None:
         """Take in the tag's horizontal speed, at the time of the latest range."""
