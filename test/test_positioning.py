@@ -20,10 +20,22 @@ from uwb_mitigation.positioning.model import Model
 from uwb_mitigation.positioning.smoothing import smooth
 from uwb_mitigation.positioning.start import Area, Height, places
 from uwb_mitigation.positioning.track_errors import errors_of, track_errors
-from uwb_mitigation.positioning.tracks import Heights, TruePath
+from uwb_mitigation.positioning.tracks import Estimate, Heights, Track, TruePath
 
 PLAIN = Model(long=100.0, short=100.0)
 """No range is doubted."""
+
+FLAT = WALL.moved(WALL.position * (1, 1, 0) + np.outer([0, 0, -3, -3, 0], (1, 0, 0)) + (0, 0, 2), WALL.sd)
+"""Anchors in one plane: without a height, every position has a mirror image."""
+FLAT_HALL = HALL.moved(HALL.position * (1, 1, 0) + (-6, -4.5, 2), HALL.sd)
+
+SLOPE = AnchorMap(
+    [
+        Anchor(number, place, 0.03)
+        for number, place in enumerate([(8, -3, 6), (8, 3, 6), (9, -3, 6.5), (9, 3, 6.5), (8.5, 0, 6.2)], 1)
+    ]
+)
+"""Anchors high on one side: errors of the height and in plan are strongly correlated."""
 
 
 def test_the_filter_agrees_with_filterpy():
@@ -155,24 +167,58 @@ def test_every_position_lies_inside_the_area(seed: int):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_measured_heights_near_the_floor_keep_the_right_solution(seed: int):
-    """The anchors are in one plane, so that every position has a mirror image without a height."""
-    flat = WALL.moved(WALL.position * (1, 1, 0) + (0, 0, 2.0), WALL.sd)
-    flat = flat.moved(flat.position + np.outer([0, 0, -3, -3, 0], (1, 0, 0)), WALL.sd)
-    ranges, truth = drive(flat, path=flight, seed=seed, seconds=30)
+    ranges, truth = drive(FLAT, path=flight, seed=seed, seconds=30)
     rng = np.random.default_rng(seed)
     stamps = np.arange(0, 30 * NANOSECONDS, NANOSECONDS // 10)
     height = truth.at(stamps)[:, 2] + rng.normal(0, 0.02, len(stamps))
     known = np.isfinite(height)
     heights = Heights(stamps[known], height[known], np.full(known.sum(), 0.0004))
     area = Area((-4, -4, 0), (30, 4, 3))
-    live = run_live(ranges, TagLocator(flat, area=area), heights).track
-    smoothed = smooth(flat, Model(), ranges, live, area=area, heights=heights)
+    live = run_live(ranges, TagLocator(FLAT, area=area), heights).track
+    smoothed = smooth(FLAT, Model(), ranges, live, area=area, heights=heights)
     for track in (live, smoothed):
         assert len(track) > 250
         assert area.holds(track.position).all()
         errors = track_errors(track, truth)
         assert errors.rmse < 0.3
         assert errors.height_rmse < 0.06
+
+
+@pytest.mark.parametrize(
+    ("anchors", "area"), [(FLAT, None), (FLAT_HALL, None), (SLOPE, Area((-30, -30, 0), (30, 30, 7)))]
+)
+def test_late_heights_correct_a_wrong_height_at_once(anchors: AnchorMap, area: Area | None):
+    ranges, truth = drive(anchors, path=flight, seconds=8, seed=2)
+    late = truth.stamp_ns > 4 * NANOSECONDS
+    heights = Heights(truth.stamp_ns[late], truth.position[late, 2], np.full(late.sum(), 0.0004))
+    track = run_live(ranges, TagLocator(anchors, area=area), heights).track
+    track = track.take(track.stamp_ns > 4.1 * NANOSECONDS)
+    assert len(track) > 150
+    errors = track_errors(track, truth)
+    assert errors.rmse < 0.4
+    assert errors.height_rmse < 0.05
+
+
+def test_poses_smoothed_with_a_lag_obey_area_and_measured_heights():
+    area, variance = Area((-4, -4, 0), (0.25, 4, 3)), 0.0004
+    ranges, truth = drive(WALL, path=flight, seconds=10, seed=2)
+    block(ranges, 2)
+    fleets = [Fleet(WALL, Model(), area=area) for _ in range(2)]
+    tracks: list[list[Estimate]] = [[], []]
+    for i, row in enumerate(ranges.anchor.tolist()):
+        for measured, (fleet, track) in enumerate(zip(fleets, tracks, strict=True)):
+            found = fleet.add(7, row + 1, int(ranges.stamp_ns[i]), float(ranges.range_m[i]), 0.01)
+            assert found is not None
+            if measured:
+                found[0].add_height(math.nan, variance)
+                found[0].add_height(float(truth.position[i, 2]), variance)
+            if i % 10 == 0 and (estimate := found[0].smoother.estimate()) is not None:
+                track.append(estimate)
+    without, with_heights = map(Track.of, tracks)
+    for track in (without, with_heights):
+        assert len(track) > 30
+        assert area.holds(track.position).all()
+    assert track_errors(with_heights, truth).height_rmse < 0.03 < track_errors(without, truth).height_rmse
 
 
 @pytest.mark.parametrize("seed", [0, 3])

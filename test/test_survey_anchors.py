@@ -10,7 +10,7 @@ from drives import HALL, NANOSECONDS, circuit, drive
 
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
-from uwb_mitigation.positioning.start import Height
+from uwb_mitigation.positioning.start import Area, Height
 from uwb_mitigation.positioning.survey import displacements, survey
 
 LEVEL = Height(1.0)
@@ -61,18 +61,29 @@ def test_the_mirror_image_of_a_square_is_not_a_swapped_pair():
         [Anchor(i, (x, y, 2.0)) for i, (x, y) in enumerate([(2, 0), (10, 0), (10, 8), (2, 8)], 1)]
     )
     ranges, _ = drive(square, seconds=40, seed=2)
-    wrong = square.position + np.random.default_rng(4).normal(0, (0.4, 0.4, 0), (4, 3))
-    wrong[[1, 3]] = wrong[[3, 1]]
-    found = survey(square.moved(wrong, square.sd), ranges, height=LEVEL)
+    guesses = square.position + np.random.default_rng(3).normal(0, (0.4, 0.4, 0), (4, 3))
+    found = survey(square.moved(guesses, square.sd), ranges, off_m=0.4, height=LEVEL)
     assert found.explained
     assert found.swapped == []
+
+
+@pytest.mark.parametrize(("guess_sd_m", "mirrored"), [(0.1, False), (0.7, True)])
+def test_a_mirror_image_that_fits_the_guesses_as_well_is_reported(guess_sd_m: float, mirrored: bool):
+    narrow = AnchorMap([Anchor(i, (4.0 * i - 4.0, 0.4 * (-1) ** i, 2.0)) for i in range(1, 5)])
+    ranges, _ = drive(narrow, seconds=20, seed=2)
+    wrong = narrow.position + np.random.default_rng(4).normal(0, (guess_sd_m, guess_sd_m, 0), (4, 3))
+    area = Area((-5, 1, 0), (20, 20, 3))
+    found = survey(narrow.moved(wrong, narrow.sd), ranges, height=LEVEL, area=area)
+    assert found.explained
+    assert found.mirrored is mirrored
 
 
 def test_what_ranges_do_not_determine_is_reported(minute):
     guesses = HALL.moved(HALL.position, np.full(5, 0.5))
     level_drive = minute.take(minute.stamp_ns < 30 * NANOSECONDS)
     found = survey(guesses, level_drive, off_m=0.5)
-    assert set(found.undetermined) | set(found.alternatives)
+    assert found.undetermined == [0, 1, 2, 3, 4]
+    assert {0, 2} <= set(found.alternatives)
     assert not survey(HALL, level_drive, off_m=0.05).undetermined
 
 

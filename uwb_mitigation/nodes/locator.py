@@ -333,9 +333,7 @@ class Locator(ManagedNode):
 
     def _on_height(self, message: PoseWithCovarianceStamped) -> None:
         variance = float(message.pose.covariance[14])
-        self._tell_all(
-            lambda tag: tag.locator.add_height(float(message.pose.pose.position.z), variance), variance
-        )
+        self._tell_all(lambda tag: tag.add_height(float(message.pose.pose.position.z), variance), variance)
 
     def _on_odometry(self, message: Odometry) -> None:
         velocity, variance = message.twist.twist.linear, float(message.twist.covariance[0])

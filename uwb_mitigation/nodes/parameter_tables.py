@@ -185,7 +185,7 @@ LOCATOR = (
               low=-1e4, high=1e4, unit="m"),
     Parameter("height_sd", 0.1, "How well that height is known.", low=0.001, high=100.0, unit="m"),
     Parameter("area", "", "Where tags can be, X,Y,Z,X,Y,Z: two corners of a box, m. Empty = wherever ranges reach."),
-    Parameter("acceleration", 1.0, "How briskly tags change their speed: 1 of a robot or a person, 3 of a drone.",
+    Parameter("acceleration", 1.0, "How fast tags change their speed: 1 for robots, people and drones.",
               low=0.001, high=1000.0, unit="m/s^1.5"),
     Parameter("range_sd", 0.1, "Standard deviation of a range that comes without a variance.",
               low=0.001, high=100.0, unit="m"),

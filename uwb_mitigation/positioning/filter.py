@@ -191,21 +191,22 @@ class RangeFilter:
         that repeated projections do not count as new information.
         """
         x = self.x
-        outside = False
+        # This runs after each update, where numbers of NumPy are slow.
+        x0, x1, x2 = x[:3].tolist()
+        if low[0] <= x0 <= high[0] and low[1] <= x1 <= high[1] and low[2] <= x2 <= high[2]:
+            return False
         for axis in range(3):
-            excess = x[axis] - min(max(x[axis], low[axis]), high[axis])
-            if excess == 0.0:
+            beyond = x[axis] - min(max(x[axis], low[axis]), high[axis])
+            if beyond == 0.0:
                 continue
-            outside = True
             gain = self.p[:, axis] / max(self.p[axis, axis], 1e-12)
             # Where the correlation with another coordinate is steep, the linear model does not hold.
             gain[:3] = np.clip(gain[:3], -1.0, 1.0)
             if not self.learns:
                 gain[OFFSET:] = 0.0
-            x -= gain * excess
-        if outside:
-            x[:3] = np.clip(x[:3], low, high)
-        return outside
+            x -= gain * beyond
+        x[:3] = np.clip(x[:3], low, high)
+        return True
 
     def update_speed(self, speed_m_per_s: float, variance_m2: float) -> float:
         """Take in the horizontal speed that wheels tell; returns the normalised innovation.

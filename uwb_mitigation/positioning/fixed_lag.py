@@ -12,8 +12,8 @@ from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.filter import RangeFilter
 from uwb_mitigation.positioning.model import Model
 from uwb_mitigation.positioning.smoother import Parameters, Smoother
-from uwb_mitigation.positioning.start import Height
-from uwb_mitigation.positioning.tracks import Estimate, Ranges, Track
+from uwb_mitigation.positioning.start import Area, Height
+from uwb_mitigation.positioning.tracks import Estimate, Heights, Ranges, Track
 
 LAG_S = 1.0
 """What a robot does next tells where it is now, for about so long."""
@@ -31,13 +31,21 @@ class FixedLag:
     """Keeps the filter's states and the ranges of the last moments, and smooths over them when asked.
 
     Args:
-        anchors, model, height: as of the filter.
+        anchors, model, height, area: As of `TagLocator`.
     """
 
-    def __init__(self, anchors: AnchorMap, model: Model, height: Height | None) -> None:
-        self._anchors, self._model, self._height = anchors, model, height
+    def __init__(
+        self, anchors: AnchorMap, model: Model, height: Height | None, area: Area | None = None
+    ) -> None:
+        self._anchors, self._model, self._height, self._area = anchors, model, height, area
         self._states: deque[tuple[int, RangeFilter]] = deque()
         self._ranges: deque[_Range] = deque()
+        self._heights: deque[tuple[int, float, float]] = deque(maxlen=_MOST_RANGES)
+
+    def add_height(self, height_m: float, variance_m2: float) -> None:
+        """Take in the tag's height at the time of the latest range; the variance is positive."""
+        if self._ranges:
+            self._heights.append((self._ranges[-1][0], height_m, variance_m2))
 
     def add(self, known: RangeFilter, stamp_ns: int, anchor: int, range_m: float, variance_m2: float) -> None:
         """Take in a range, and the filter after it."""
@@ -51,11 +59,14 @@ class FixedLag:
             self._states.popleft()
         while self._ranges[0][0] < oldest:
             self._ranges.popleft()
+        while self._heights and self._heights[0][0] < oldest:
+            self._heights.popleft()
 
     def clear(self) -> None:
         """Forget all: the tag was lost."""
         self._states.clear()
         self._ranges.clear()
+        self._heights.clear()
 
     def estimate(self) -> Estimate | None:
         """Where the tag was `LAG_S` before the latest range; None = not known for as long."""
@@ -91,17 +102,26 @@ class FixedLag:
             np.array([one.x[3:6] for one in guess]),
             np.zeros((len(guess), 6, 6)),
         )
+        heights = None
+        if self._heights:
+            columns = [np.array(column) for column in zip(*self._heights, strict=True)]
+            heights = Heights(columns[0], columns[1], columns[2])
+        smoother = Smoother(
+            self._anchors,
+            self._model,
+            ranges,
+            height=self._height,
+            parameters=offset,
+            after=first,
+            heights=heights,
+        )
         try:
-            track = (
-                Smoother(
-                    self._anchors, self._model, ranges, height=self._height, parameters=offset, after=first
-                )
-                .fit(initial, _ITERATIONS)
-                .track
-            )
+            track = smoother.fit(initial, _ITERATIONS).track
         except DatasetError:
             return None
         at = int(np.abs(track.stamp_ns - wanted_ns).argmin())
         ahead = (wanted_ns - int(track.stamp_ns[at])) / _SECOND_NS
         position = track.position[at] + ahead * track.velocity[at]
+        if self._area is not None:
+            position = self._area.clip(position)
         return Estimate(wanted_ns, position, track.velocity[at], track.covariance[at])

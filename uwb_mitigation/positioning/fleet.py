@@ -23,6 +23,9 @@ from uwb_mitigation.positioning.tracks import Estimate
 MAX_TAGS = 256
 """More tags than that are no tags: damaged numbers, rather."""
 
+UNKNOWN_HEIGHT_SD_M = 0.1
+"""Standard deviation of a measured height without a variance."""
+
 
 @dataclass(slots=True)
 class Tag:
@@ -39,6 +42,15 @@ class Tag:
     learner: OffsetLearner
     taken_off: NDArray[np.float64]
     latest_ns: int = 0
+
+    def add_height(self, height_m: float, variance_m2: float) -> None:
+        """Take in the tag's height at the time of its latest range; one that is not finite is skipped."""
+        if not (math.isfinite(height_m) and math.isfinite(variance_m2)):
+            return
+        # A variance of 0 means unknown in ROS.
+        variance_m2 = variance_m2 if variance_m2 > 0.0 else UNKNOWN_HEIGHT_SD_M**2
+        self.locator.add_height(height_m, variance_m2)
+        self.smoother.add_height(height_m, variance_m2)
 
 
 class Fleet:
@@ -116,7 +128,7 @@ class Fleet:
         return Tag(
             tag_id,
             TagLocator(self.anchors, self._model, height=self._height, area=self._area),
-            FixedLag(self.anchors, self._model, self._height),
+            FixedLag(self.anchors, self._model, self._height, self._area),
             learner,
             learner.offset_m.copy() if self._applies else np.zeros(len(self.anchors)),
         )

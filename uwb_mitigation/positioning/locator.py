@@ -31,17 +31,14 @@ STRANGE = 3.0
 DISAGREES = 1.5
 """An anchor whose normalised innovations have such a mean disagrees: what persists for a second averages out."""
 
-_UNCERTAIN_HEIGHT_M = 0.5
-"""With a larger standard deviation in z, a height is not a linear measurement: the position is searched again."""
+_BENDS_M = 0.5
+"""A height that moves an estimate by more in plan is not a linear measurement: the position is searched again."""
 
 _SEPARABLE = 9.0
 """Squared distance of two positions in their ranges, in standard deviations, from which the ranges separate them."""
 
 _UNDETERMINED_M = 5.0
 """A position with a larger horizontal standard deviation is not determined by the ranges."""
-
-UNKNOWN_HEIGHT_SD_M = 0.1
-"""Standard deviation of a measured height without a variance."""
 
 HEIGHT_AGE_NS = 200_000_000
 
@@ -207,14 +204,9 @@ class TagLocator:
         return self._estimate(stamp_ns) if self._filter is not None else None
 
     def add_height(self, height_m: float, variance_m2: float) -> None:
-        """Take in the tag's height, at the time of the latest range; one that is not finite is skipped."""
-        if not (math.isfinite(height_m) and math.isfinite(variance_m2)):
-            return
-        # A variance of 0 means unknown in ROS.
-        variance_m2 = variance_m2 if variance_m2 > 0.0 else UNKNOWN_HEIGHT_SD_M**2
+        """Take in the tag's height (finite) with its variance (positive), at the time of the latest range."""
         self._heights.append((self._time_s, height_m, variance_m2))
-        limit = max(_UNCERTAIN_HEIGHT_M**2, 4.0 * variance_m2)
-        if self._height is None and any(one.p[2, 2] > limit for one in self._filters()):
+        if self._height is None and any(_bends(one, height_m, variance_m2) for one in self._filters()):
             found = self._places()
             if found and len(found) <= _MOST_PLACES:
                 self._last_known = self._filter or self._last_known
@@ -223,8 +215,11 @@ class TagLocator:
                 self._settle()
                 return
         for one in self._filters():
-            one.update_height(height_m, variance_m2)
+            z = one.update_height(height_m, variance_m2)
             self._confine(one)
+            for candidate in self._candidates:
+                if candidate.filter is one:
+                    candidate.loss += float(self._model.loss(np.float64(z)))
 
     def add_speed(self, speed_m_per_s: float, variance_m2: float) -> None:
         """Take in the tag's horizontal speed, at the time of the latest range."""
@@ -487,6 +482,12 @@ class TagLocator:
         spread = before.p[:2, :2] + place.covariance[:2, :2]
         # Bounded: a tag that was carried away is found all the same.
         return min(IMPLAUSIBLE, 0.5 * float(apart @ np.linalg.solve(spread, apart)))
+
+
+def _bends(one: RangeFilter, height_m: float, variance_m2: float) -> bool:
+    """Whether a height would move an estimate so far in plan that the filter's linear model does not hold."""
+    share = math.hypot(one.p[0, 2], one.p[1, 2]) / (one.p[2, 2] + variance_m2)
+    return bool(share * abs(height_m - float(one.x[2])) > _BENDS_M)
 
 
 def _as_estimate(known: RangeFilter, stamp_ns: int) -> Estimate:

@@ -22,8 +22,8 @@ class Model:
     """How a tag moves and how its ranges err.
 
     Attributes:
-        acceleration: root of the spectral density of white acceleration, m/s^1.5: 1 of a walking robot, 3 of a
-            drone (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 6.2.2).
+        acceleration: root of the spectral density of white acceleration, m/s^1.5: 1 for robots, people and
+            drones (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 6.2.2).
         speed: standard deviation of an unknown velocity, m/s in each axis.
         range_sd: of a range that comes without a variance, m: 0.10 is what the DW1000's data sheet promises.
         white: part of a range's variance that is new with each range.

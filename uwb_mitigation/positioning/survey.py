@@ -129,8 +129,10 @@ def survey(
             _misfit(fitted.anchors[used], guesses.position[used], mirrored=side)
             for fitted, side in ((found, False), (exchanged, True))
         )
+        there = _misfit(exchanged.anchors[used], guesses.position[order][used], mirrored=False)
         limit = _AS_WELL * off_m
-        if (lower < loss - _SWAP_GAIN or here > limit) and mirror > limit:
+        better = lower < loss - _SWAP_GAIN or here > max(limit, _AS_WELL * there)
+        if better and mirror > limit:
             found, loss = exchanged, lower
         else:
             swapped = []
