@@ -277,7 +277,7 @@ def test_what_no_source_reads_is_refused_with_what_is_accepted(tmp_path: Path) -
 
 def test_a_folder_is_no_bag_for_a_folder_in_it_that_has_a_bags_name(tmp_path: Path) -> None:
     (tmp_path / "empty.mcap").mkdir()
-    with pytest.raises(RecordingError, match="holds no logs"):
+    with pytest.raises(RecordingError):
         open_recording(tmp_path)
     (tmp_path / "7.log").write_text("File:7.log, created by DecaRanging\n")
     assert open_recording(tmp_path).name.startswith("DecaRanging")

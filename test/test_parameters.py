@@ -40,7 +40,7 @@ def replaying(tmp_path_factory: pytest.TempPathFactory):
         ("rate", math.nan, ("rate", "nan", "0.001", "10000")),
         ("rate", "fast", ("rate", "fast", "0.001", "10000")),
         ("paused", 1, ("paused", "1", "true or false")),
-        ("mode", "cloud", ("mode", "cloud", "host, device, both")),
+        ("mode", "cloud", ("mode", "cloud", "host, device")),
         ("seek_to", -5.0, ("seek_to", "-5.0", "1000000000")),
         ("seed", 7, ("seed", "read-only")),
     ],

@@ -51,7 +51,7 @@ def rows(page: str, heading: str) -> list[list[str]]:
 
 @pytest.fixture(scope="module")
 def ros(tmp_path_factory: pytest.TempPathFactory):
-    """A replay, a board in mode `both`, and a mitigator for the two."""
+    """A replay, a board in mode `device`, and a mitigator for the two."""
     folder = tmp_path_factory.mktemp("reference")
     port = folder / "port"
     with domain(folder) as ros:
@@ -60,7 +60,7 @@ def ros(tmp_path_factory: pytest.TempPathFactory):
         ros.run([sys.executable, "-c", code, "emulate-board", "--link", str(port), "--model", model])
         ros.start("mitigator")
         ros.start("driver", "publish_clock:=true", "start_delay:=0.0")
-        serial = ("source:=serial", f"port:={port}", "mode:=both")
+        serial = ("source:=serial", f"port:={port}", "mode:=device")
         ros.start("driver", *serial, arguments=("-r", "__node:=board"))
         ros.spin_until(lambda: set(NODES) <= set(ros.node.get_node_names()))
         yield ros

@@ -137,38 +137,6 @@ def test_the_mode_changes_without_a_restart(ros: Ros, link: Path):
     assert max(keys.values()) == 1
 
 
-def test_in_both_mode_the_diagnostics_tell_that_board_and_host_agree(ros: Ros, link: Path):
-    ros.start("mitigator").wait_for_output("correcting with model")
-    with board(link, model=True, rate_hz=200.0):
-        drive(ros, link, "mode:=both")
-        status = ros.diagnosis("driver", lambda s: int(fact(s, "board and host agree") or 0) > 50)
-    assert fact(status, "board and host differ") == "0"
-    assert status.level == DiagnosticStatus.OK
-
-
-def test_a_board_that_corrects_otherwise_is_found_out(ros: Ros, link: Path):
-    class Careless:
-        """Rounds its corrections to millimetres."""
-
-        def __init__(self) -> None:
-            self.mitigation = Mitigation(load_bundle(default_model_path()))
-
-        def correct(self, measurement):
-            from dataclasses import replace
-
-            result = self.mitigation.correct(measurement)
-            return replace(result, range_m=round(result.range_m, 3))
-
-    careless = Careless()
-    ros.start("mitigator").wait_for_output("correcting with model")
-    identity = Identity(0xBAD, careless.mitigation.bundle.model_id, 157)
-    with EmulatedBoard(SimulatedSource(count=100), corrector=careless, identity=identity, link=link):
-        drive(ros, link, "mode:=both")
-        status = ros.diagnosis("driver", lambda s: int(fact(s, "board and host differ") or 0) > 0)
-    assert status.level == DiagnosticStatus.ERROR
-    assert "disagree" in status.message
-
-
 def test_corrections_by_another_model_than_the_expected_one_are_withheld(ros: Ros, link: Path):
     corrected = ros.collect(RangeCorrected, CORRECTED)
     with board(link, model=True):

@@ -103,7 +103,8 @@ def test_open_sites_are_in_line_of_sight_and_some_antennas_are_tilted() -> None:
         kind: np.concatenate([block.links.path.crossings for block in blocks if block.kind == kind])
         for kind in ("open", "flat")
     }
-    assert np.mean(crossings["open"] == 0) >= 0.5 > 0.4 > np.mean(crossings["flat"] == 0)
+    # A block takes a third of each condition as far as a site has them.
+    assert np.mean(crossings["open"] == 0) > 0.45 > 0.4 > np.mean(crossings["flat"] == 0)
     # In line of sight nothing but a tilted antenna weakens the direct path.
     loss = [block.links.path.loss_db[block.links.path.crossings == 0] for block in blocks]
     tilted = [values.max() > 0.0 for values in loss if len(values)]

@@ -254,6 +254,8 @@ def assemble_bundle(graph: bytes, card: Card) -> bytes:
     if card.needs_cir:
         # Bundles did not have this field at first.
         del fields["needs_cir"]
+    if card.familiarity is not None and card.familiarity.lead_level_db is None:
+        del fields["familiarity"]["lead_level_db"]
     metadata = fields | {
         "format": FORMAT,
         "model_id": _BLANK.decode(),

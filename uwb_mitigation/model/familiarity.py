@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import astuple, dataclass, fields
+from dataclasses import astuple, dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,7 +86,7 @@ class Band:
 
 
 LEAD, LEAD_WITHOUT_LEVELS = Band(-1000.0, -16.0, 4.0), Band(-1000.0, -20.0, 4.0)
-"""Bands of `lead_level_db`. They are fixed, because a detector reports the first energy above its noise threshold: in
+"""Least bands of `lead_level_db`. They do not follow the training data downwards, because a detector reports the first energy above its noise threshold: in
 the simulated buildings 99 % of the values are below -24 dB. Of windows that start 5 taps too late, 75 % are above
 -10 dB. Without levels no other feature detects them, so the band ends earlier."""
 
@@ -149,6 +149,9 @@ class Familiarity:
             for column, is_known, widening in zip(values[rows].T[:-1], known[:-1], _WIDENINGS, strict=True)
         )
         lead = LEAD if known[1:-1].any() else LEAD_WITHOUT_LEVELS
+        # What the training data contains is in distribution, whatever its first-path index means.
+        highest = max(lead.high, float(np.float32(np.percentile(values[rows, -1], 99))))
+        lead = replace(lead, high=highest)
         return cls(float(np.float32(known_offset_m)), *(*bands, lead))
 
 

@@ -83,7 +83,7 @@ WIDE_KINDS = (
         0.02,
     ),
 )
-"""Open sites have no inner walls: laboratories, arenas, halls, and places outdoors. Half of the placements or more are LOS."""
+"""Open sites have no inner walls: laboratories, arenas, halls, and places outdoors. About half of the placements are LOS."""
 
 HEAVY = ((CONCRETE, (0.15, 0.40)), (BRICK, (0.20, 0.50)))
 LIGHT = ((PLASTERBOARD, (0.02, 0.05)), (WOOD, (0.03, 0.06)), (GLASS, (0.006, 0.02)))
