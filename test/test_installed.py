@@ -138,7 +138,7 @@ def test_the_command_line_takes_its_model_from_the_installation(prefix: Path, sh
         "print(uwb_mitigation.__file__); print(default_model_path())"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
-    package, model = map(Path, done.stdout.split())
+    package, model = map(Path, done.stdout.splitlines())
     assert package.is_relative_to(prefix), done.stderr
     assert model.parent == share / "models"
     command = [prefix / "lib" / NAME / "uwb-mitigation", "--version"]
