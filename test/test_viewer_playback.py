@@ -358,3 +358,21 @@ def test_the_page_has_a_slider_and_plays(browser: Browser, bag: Path):
         browser.wait("it to fit", lambda: browser.run("return document.documentElement.scrollWidth") <= 400)
         running.send_signal(signal.SIGINT)
         assert running.wait(240) == 130
+
+
+def test_the_tracks_of_tags_with_long_ids_are_shown(tmp_path: Path):
+    ranges, _ = drive(seconds=5)
+    bag, track = tmp_path / "hall.mcap", tmp_path / "track.mcap"
+    with BagWriter(bag, {}) as out:
+        for i in range(len(ranges)):
+            anchor = HALL.anchors[ranges.anchor[i]].id
+            stamp_ns, range_m = int(ranges.stamp_ns[i]), float(ranges.range_m[i])
+            for tag in (7, 0x1122334455667788):
+                cir = Cir(np.zeros(0, np.int16))
+                out.write(Record(RangeMeasurement(stamp_ns, tag, anchor, i, 0, range_m, cir)))
+    anchors_file(bag).write_text(dump_anchors(HALL))
+    done = run("track", bag, "-o", track, "--height", "1.0", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    player, scene = opened(track)
+    player.seek(player.seconds)
+    assert any("0x1122334455667788" in name for name in scene.tags)

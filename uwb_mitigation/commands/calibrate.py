@@ -19,7 +19,7 @@ from uwb_mitigation.commands.positioning import (
     area_of,
     height_of,
 )
-from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError
+from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError, format_id
 
 if TYPE_CHECKING:
     import numpy as np
@@ -145,6 +145,8 @@ def calibrate(
     source = bundle_for(None, bags[0])
     try:
         site = _gather(bags, known, source, stamp_offset, height_topic)
+        if height_topic is not None and len(site.tags) > 1:
+            raise ParameterError(f"--height-topic with {len(site.tags)} tags", valid="bags with one tag")
         for why, count in site.left_out.items():
             _warn(f"left out: {count} x {why}")
         with console.stage_bars() as on_progress:
@@ -239,7 +241,7 @@ def _poses(
                 others = list(known)
                 if len(others) != 1 or tag_of_frame(others[0]) is not None:
                     raise RecordingError(
-                        f"no body for tag {tag.tag_id}: poses of {', '.join(sorted(known))}",
+                        f"no body for tag {format_id(tag.tag_id)}: poses of {', '.join(sorted(known))}",
                         where=f"{bag}, topic {topic}",
                         valid=f"--frames MAP CHILD, or poses of {body}",
                     )
@@ -255,7 +257,7 @@ def _poses(
                 arms[number] = known_arms[0]
             else:
                 _warn(
-                    f"tag {tag.tag_id}: no transform from {body or BASE_FRAME} to its antenna in the bag, so that the lever "
+                    f"tag {format_id(tag.tag_id)}: no transform from {body or BASE_FRAME} to its antenna in the bag, so that the lever "
                     "arm is 0; set --lever-arm"
                 )
     return paths, arms
@@ -296,7 +298,7 @@ def _show(found: Calibrated) -> None:
                 f"{value:.3f}" + ("" if sd == 0.0 or math.isnan(sd) else f" +- {sd:.3f}")
                 for value, sd in zip(arm.tolist(), arm_sd.tolist(), strict=True)
             )
-            console.out.print(f"tag {ranges.tag_id}: lever arm {known} m", highlight=False)
+            console.out.print(f"tag {format_id(ranges.tag_id)}: lever arm {known} m", highlight=False)
     table = Table("tag", "anchor", "offset m", "deviation m", title="Offsets", title_justify="left")
     for column in table.columns[2:]:
         column.justify = "right"

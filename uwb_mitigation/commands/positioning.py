@@ -147,8 +147,8 @@ def survey(
         float, typer.Option(help="How far the guesses in FILE may be off, m in each direction.")
     ] = 1.0,
     fixed: Annotated[
-        list[int] | None,
-        typer.Option("--fixed", metavar="ID", help="An anchor that stands where FILE says; may be repeated."),
+        list[str] | None,
+        typer.Option("--fixed", metavar="ID", help="An anchor that is where FILE says; may be repeated."),
     ] = None,
     height: HeightOption = None,
     height_sd: HeightSdOption = 0.1,
@@ -177,12 +177,15 @@ def survey(
     known, recorded = _read(bag, anchors, stamp_offset)
     measured = heights_of(bag, height_topic, height_sd, height, recorded)
     rows = []
-    for identity in fixed or []:
-        if identity not in known.index:
+    by_text = {
+        text: row for identity, row in known.index.items() for text in (str(identity), format_id(identity))
+    }
+    for text in fixed or []:
+        if text.lower() not in by_text:
             raise ParameterError(
-                f"--fixed {format_id(identity)}", valid=f"one of {', '.join(map(format_id, known.index))}"
+                f"--fixed {text:.40}", valid=f"one of {', '.join(map(format_id, known.index))}"
             )
-        rows.append(known.index[identity])
+        rows.append(by_text[text.lower()])
     tag = max(recorded.tags, key=lambda one: len(one.ranges))
     with console.progress() as bar:
         bar.add_task(f"surveying from {len(tag.ranges)} ranges of tag {format_id(tag.tag_id)}", total=None)
@@ -267,7 +270,7 @@ def heights_of(
     if height is not None:
         raise ParameterError("--height and --height-topic", valid="one of the two")
     if len(recorded.tags) > 1:
-        tags = ", ".join(str(tag.tag_id) for tag in recorded.tags)
+        tags = ", ".join(format_id(tag.tag_id) for tag in recorded.tags)
         raise ParameterError(f"--height-topic with the tags {tags}", valid="a bag with one tag")
     return read_heights(bag, topic, sd)
 

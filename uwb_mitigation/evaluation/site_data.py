@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.dataset import Dataset
-from uwb_mitigation.errors import DatasetError
+from uwb_mitigation.errors import DatasetError, format_id
 from uwb_mitigation.measurement import Record
 from uwb_mitigation.mitigation import MAX_RANGE_M
 from uwb_mitigation.positioning.anchors import AnchorMap
@@ -172,11 +172,11 @@ def gather(
             windows.setdefault(measured.tag_id, []).append(window)
         shifts.append(shift or 0)
     for identity, count in strangers.items():
-        left_out[f"anchor {identity} is not in the anchors file"] += count
+        left_out[f"anchor {format_id(identity)} is not in the anchors file"] += count
     if not rows:
-        seen = ", ".join(map(str, sorted(strangers))) or "none"
+        seen = ", ".join(map(format_id, sorted(strangers))) or "none"
         raise DatasetError(
-            f"no range of the anchors {', '.join(map(str, sorted(anchors.index)))}",
+            f"no range of the anchors {', '.join(map(format_id, sorted(anchors.index)))}",
             valid=f"the recording's ranges come from anchors: {seen}",
         )
     with_cir = np.array([row[5] for tag in sorted(rows) for row in rows[tag]])

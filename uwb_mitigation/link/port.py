@@ -107,7 +107,7 @@ def users_of(path: str) -> list[str]:
             continue
         with contextlib.suppress(OSError):
             folder = f"/proc/{process}/fd"
-            if any(os.path.realpath(f"{folder}/{fd}") == device for fd in os.listdir(folder)):
+            if any(os.readlink(f"{folder}/{fd}") == device for fd in os.listdir(folder)):
                 with open(f"/proc/{process}/comm", encoding="utf-8") as name:
                     found.append(f"{name.read().strip()} (process {process})")
     return found
@@ -300,9 +300,10 @@ class BoardPort:
         with contextlib.suppress(OSError, ValueError, NotImplementedError):
             # Bridges hold bytes back for 16 ms otherwise. Other ports do not know the flag.
             port.set_low_latency_mode(True)
+        others = ", ".join(users_of(path))
         with self._lock:
             self._port, self._problem = path, ""
-            self._others = ", ".join(users_of(path))
+            self._others = others
             self._openings += 1
             self._events.put(self._session.opened(time.monotonic_ns()))
         return port

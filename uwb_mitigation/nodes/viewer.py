@@ -164,7 +164,7 @@ class Viewer(ManagedNode):
         # What names the plain topic anew does not name theirs.
         plain = self.resolve_topic_name(topics.POSE, only_expand=True)
         head, _, tail = plain.rpartition("/")
-        own = re.compile(rf"{re.escape(head)}/(tag_\d+)/{re.escape(tail)}")
+        own = re.compile(rf"{re.escape(head)}/(tag_(?:\d+|0x[0-9a-f]+))/{re.escape(tail)}")
         for topic, _ in self.get_topic_names_and_types():
             if (found := own.fullmatch(topic)) and len(self._looking) < MAX_TAGS:
                 self._look(PoseWithCovarianceStamped, topic, partial(self._feed.pose, found[1]))

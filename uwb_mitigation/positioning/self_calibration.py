@@ -198,6 +198,9 @@ def calibrate(
     expected = rows @ known.mean
     offset = likely_offset(anchors, found, expected, height, area, model)
     position, placed = first_positions(anchors, tags, found, expected + offset, height, area, model)
+    if heights_m is not None and height is not None:
+        # The spread of the heights was for the start: each height is known as well as it was measured.
+        height = Height(height.value, HEIGHT_SD_M)
     if not placed.all():
         told.append(
             f"{int((~placed).sum())} of {len(placed)} stretches left out: no place of the tag can be told"

@@ -135,7 +135,8 @@ class Evb1000Bus:
     def _drain(self) -> None:
         """Discard what is left of earlier answers."""
         with contextlib.suppress(LinkError):
-            while self._read_some(0.02):
+            until = time.monotonic() + ANSWER_WITHIN_S
+            while time.monotonic() < until and self._read_some(0.02):
                 pass
 
     def _send(self, data: bytes) -> None:

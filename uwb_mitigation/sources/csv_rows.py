@@ -6,6 +6,7 @@ import csv
 import io
 import lzma
 import math
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -47,7 +48,11 @@ def identity(row: dict[str, str], column: str, where: str) -> int:
     text = (row.get(column) or "").strip()
     if text.isascii() and text.isdigit() and len(text) <= 20 and int(text) < 1 << 64:
         return int(text)
-    raise RecordingError(f"{column} = {text!r:.40}", where=where, valid="a whole number below 2^64")
+    if re.fullmatch(r"0x[0-9a-fA-F]{1,16}", text):
+        return int(text, 16)
+    raise RecordingError(
+        f"{column} = {text!r:.40}", where=where, valid="a whole number below 2^64, such as 3 or 0x1f"
+    )
 
 
 def number(

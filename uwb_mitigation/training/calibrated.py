@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.dataset import Dataset
-from uwb_mitigation.errors import ModelError
+from uwb_mitigation.errors import ModelError, format_id
 from uwb_mitigation.evaluation.preference import MUST_GAIN
 from uwb_mitigation.evaluation.site_data import SiteData
 from uwb_mitigation.evaluation.site_page import AnchorRow, OffsetRow, SitePage
@@ -187,7 +187,9 @@ def shown(result: Calibrated, name: str) -> SitePage:
         if own.any():
             before, after = (np.abs(error[own]) for error in (result.raw_m, left))
             rows.append(AnchorRow(str(anchor), int(own.sum()), *map(float, (before.mean(), after.mean()))))
-    offsets = [OffsetRow(str(tag), str(anchor), *pair) for (tag, anchor), pair in result.pair_m.items()]
+    offsets = [
+        OffsetRow(format_id(tag), format_id(anchor), *pair) for (tag, anchor), pair in result.pair_m.items()
+    ]
     facts = []
     if result.localised is not None:
         told = result.localised

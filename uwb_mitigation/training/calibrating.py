@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.dataset import Dataset
-from uwb_mitigation.errors import DatasetError
+from uwb_mitigation.errors import DatasetError, format_id
 from uwb_mitigation.evaluation.site_data import SiteData
 from uwb_mitigation.model.bundle import Bundle
 from uwb_mitigation.model.float_networks import float_network
@@ -359,11 +359,11 @@ def _check_labelled(count: int) -> None:
 def _check_offsets(pair_m: dict[tuple[int, int], tuple[float, float]]) -> None:
     median = float(np.median([value for value, _ in pair_m.values()]))
     for (tag, anchor), (value, _) in pair_m.items():
-        what = f"an offset of {value:.2f} m of tag {tag} and anchor {anchor}"
+        what = f"an offset of {value:.2f} m of tag {format_id(tag)} and anchor {format_id(anchor)}"
         if abs(value - median) > MOST_OFFSET_M:
             raise DatasetError(
                 f"{what}; the median of all pairs is {median:.2f} m",
-                valid=f"the true position of anchor {anchor} in the anchors file; radios of one kind differ by less than "
+                valid=f"the true position of anchor {format_id(anchor)} in the anchors file; radios of one kind differ by less than "
                 f"{MOST_OFFSET_M:g} m",
             )
         if abs(value) > MOST_OFFSET_M:

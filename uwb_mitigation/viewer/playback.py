@@ -57,7 +57,7 @@ _OURS = {
     RANGE_CORRECTED: RANGE_CORRECTED_TYPE,
 }
 _POSITIONS = {POSE: POSE_TYPE, ODOMETRY: ODOMETRY_TYPE, POSE_SMOOTHED: POSE_TYPE}
-_POSITION_TOPIC = re.compile(r"(.*)/uwb/(?:(tag_\d+)/)?(pose|odometry|pose_smoothed)")
+_POSITION_TOPIC = re.compile(r"(.*)/uwb/(?:(tag_(?:\d+|0x[0-9a-f]+))/)?(pose|odometry|pose_smoothed)")
 
 
 class BagPlayer:
