@@ -19,7 +19,7 @@ from pathlib import Path
 import typer
 from typer.cli import get_docs_for_click
 
-from uwb_mitigation import cli
+from uwb_mitigation.commands import cli
 from uwb_mitigation.link import layout
 from uwb_mitigation.link.layout import Layout, MessageType
 from uwb_mitigation.nodes.parameter_tables import TABLES

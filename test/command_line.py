@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 from unittest import mock
 
-from uwb_mitigation import cli
+from uwb_mitigation.commands import cli
 
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parent.parent), "COLUMNS": "160"}
 """Of a command in a process of its own: the package of this repository, and columns to print on."""
@@ -65,4 +65,4 @@ def start(*arguments: object, folder: Path) -> Finished:
 
 def command(*arguments: object) -> list[str]:
     """The words that start the command."""
-    return [sys.executable, "-m", "uwb_mitigation.cli", *map(str, arguments)]
+    return [sys.executable, "-m", "uwb_mitigation.commands.cli", *map(str, arguments)]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from uwb_mitigation.dataset import Dataset
+from uwb_mitigation.evaluation.dataset import Dataset
 from uwb_mitigation.measurement import Cir, RangeMeasurement, Record, Truth
 from uwb_mitigation.model import graph
 from uwb_mitigation.model.architecture import HEAD, Remnet

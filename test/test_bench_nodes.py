@@ -112,7 +112,7 @@ def test_the_viewers_costs_are_measured(own_domain: None, monkeypatch: pytest.Mo
 
 def test_a_soak_tells_what_the_processes_took(own_domain: None, tmp_path: Path):
     result = tmp_path / "soak.json"
-    command = [sys.executable, "-m", "uwb_mitigation.cli", "bench", "soak", "--one-process"]
+    command = [sys.executable, "-m", "uwb_mitigation.commands.cli", "bench", "soak", "--one-process"]
     command += ["--messages", "1500", "--rate", "1000", "--json", str(result)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=240, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -128,7 +128,7 @@ def test_a_soak_tells_what_the_processes_took(own_domain: None, tmp_path: Path):
 def test_without_ros_the_bench_says_what_is_missing(tmp_path: Path):
     (tmp_path / "rclpy.py").write_text("raise ModuleNotFoundError('no rclpy here', name='rclpy')\n")
     done = subprocess.run(
-        [sys.executable, "-m", "uwb_mitigation.cli", "bench", "nodes"],
+        [sys.executable, "-m", "uwb_mitigation.commands.cli", "bench", "nodes"],
         env={"PYTHONPATH": f"{tmp_path}:{Path(__file__).parent.parent}", "COLUMNS": "160"},
         capture_output=True,
         text=True,

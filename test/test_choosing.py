@@ -10,8 +10,8 @@ import pytest
 from model_material import bundle, dataset, measurement, windows
 from typer.testing import CliRunner
 
-from uwb_mitigation.cli import app
 from uwb_mitigation.commands import model_tables
+from uwb_mitigation.commands.cli import app
 from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError
 from uwb_mitigation.evaluation.lad import constant as fit_constant
 from uwb_mitigation.measurement import Record, Truth

@@ -10,7 +10,7 @@ import pytest
 from model_material import dataset
 from typer.testing import CliRunner
 
-from uwb_mitigation.cli import app
+from uwb_mitigation.commands.cli import app
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.evaluation.splits import Group
 from uwb_mitigation.model.architecture import Remnet

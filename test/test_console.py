@@ -13,8 +13,7 @@ import pytest
 import typer
 from command_line import run
 
-from uwb_mitigation import cli
-from uwb_mitigation.commands import console
+from uwb_mitigation.commands import cli, console
 from uwb_mitigation.errors import UwbMitigationError
 
 

@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from model_material import dataset, record
 
-from uwb_mitigation.dataset import build_dataset
 from uwb_mitigation.errors import DatasetError, ParameterError
 from uwb_mitigation.evaluation import splits
+from uwb_mitigation.evaluation.dataset import build_dataset
 from uwb_mitigation.measurement import Truth
 from uwb_mitigation.preprocessing import CirFault, Preprocessing
 

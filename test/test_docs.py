@@ -26,7 +26,7 @@ from test_launch import generate as generate
 from test_launch import launch
 from typer.testing import CliRunner
 
-from uwb_mitigation import cli
+from uwb_mitigation.commands import cli
 from uwb_mitigation.commands import view as view_command
 from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.nodes.parameter_tables import TABLES

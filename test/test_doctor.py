@@ -14,8 +14,8 @@ from conftest import REPOSITORY
 from serial.tools import list_ports
 from typer.testing import CliRunner
 
-from uwb_mitigation.cli import app
 from uwb_mitigation.commands import doctor
+from uwb_mitigation.commands.cli import app
 from uwb_mitigation.errors import not_imported
 from uwb_mitigation.model.runtime import Session
 

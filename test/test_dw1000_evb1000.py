@@ -288,7 +288,7 @@ def test_the_command_prints_its_ports_unplugs_on_a_signal_and_ends(tmp_path: Pat
     command = [
         sys.executable,
         "-m",
-        "uwb_mitigation.cli",
+        "uwb_mitigation.commands.cli",
         "emulate-evb1000",
         "--boards",
         "3",
@@ -320,7 +320,7 @@ def test_the_command_prints_its_ports_unplugs_on_a_signal_and_ends(tmp_path: Pat
     ],
 )
 def test_the_command_refuses_in_one_line(options: list[str], told: str):
-    command = [sys.executable, "-m", "uwb_mitigation.cli", "emulate-evb1000", *options]
+    command = [sys.executable, "-m", "uwb_mitigation.commands.cli", "emulate-evb1000", *options]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=240)
     assert done.returncode == 1
     assert told in done.stderr

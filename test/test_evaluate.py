@@ -10,7 +10,7 @@ import pytest
 from model_material import bundle, record
 from typer.testing import CliRunner
 
-from uwb_mitigation.cli import app
+from uwb_mitigation.commands.cli import app
 from uwb_mitigation.errors import DatasetError, ModelError, ParameterError
 from uwb_mitigation.evaluation.accuracy import evaluate
 from uwb_mitigation.evaluation.metrics import ErrorStatistics, coverage, mae_by_group

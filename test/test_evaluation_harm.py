@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from uwb_mitigation.dataset import build_dataset
 from uwb_mitigation.evaluation import zero_shot
 from uwb_mitigation.evaluation.accuracy import evaluate
+from uwb_mitigation.evaluation.dataset import build_dataset
 from uwb_mitigation.measurement import Cir, Encoding, Record
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import load_bundle

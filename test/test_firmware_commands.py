@@ -10,7 +10,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from uwb_mitigation import cli
+from uwb_mitigation.commands import cli
 from uwb_mitigation.errors import MissingDependencyError, ModelError, ParameterError
 from uwb_mitigation.firmware_export import toolchain
 

@@ -16,7 +16,7 @@ import pytest
 from conftest import REPOSITORY
 from typer.main import get_command
 
-from uwb_mitigation import cli
+from uwb_mitigation.commands import cli
 
 PACKAGE = REPOSITORY / "uwb_mitigation"
 
@@ -32,7 +32,7 @@ def test_layers_hold_and_only_nodes_import_rclpy_and_only_training_torch():
 def test_importing_the_package_and_its_command_line_needs_neither_ros_nor_torch():
     code = (
         "import sys; sys.modules.update(dict.fromkeys(['rclpy', 'torch', 'uwb_mitigation_msgs']))\n"
-        "import uwb_mitigation.cli, uwb_mitigation.mitigation, uwb_mitigation.sources.opening\n"
+        "import uwb_mitigation.commands.cli, uwb_mitigation.mitigation, uwb_mitigation.sources.opening\n"
         "import uwb_mitigation.sources.mcap, uwb_mitigation.sources.decaranging"
     )
     subprocess.run([sys.executable, "-c", code], check=True, cwd=REPOSITORY)
@@ -40,7 +40,9 @@ def test_importing_the_package_and_its_command_line_needs_neither_ros_nor_torch(
 
 def run_without(package: str, *words: object) -> subprocess.CompletedProcess[str]:
     """The command line where a package cannot be imported."""
-    code = f"import sys; sys.modules['{package}'] = None\nfrom uwb_mitigation.cli import main\nmain()"
+    code = (
+        f"import sys; sys.modules['{package}'] = None\nfrom uwb_mitigation.commands.cli import main\nmain()"
+    )
     command = [sys.executable, "-c", code, *map(str, words)]
     return subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
 
@@ -97,7 +99,7 @@ def test_a_reader_that_went_away_ends_a_command_silently_with_1():
     read, write = os.pipe()
     os.close(read)
     try:
-        command = [sys.executable, "-m", "uwb_mitigation.cli", "--help"]
+        command = [sys.executable, "-m", "uwb_mitigation.commands.cli", "--help"]
         done = subprocess.run(command, cwd=REPOSITORY, stdout=write, stderr=subprocess.PIPE, check=False)
     finally:
         os.close(write)

@@ -18,9 +18,9 @@ from model_material import dataset
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
-from uwb_mitigation.cli import app
-from uwb_mitigation.dataset import Dataset
+from uwb_mitigation.commands.cli import app
 from uwb_mitigation.evaluation import baselines, lad, splits
+from uwb_mitigation.evaluation.dataset import Dataset
 from uwb_mitigation.evaluation.splits import Group, Split
 from uwb_mitigation.model.architecture import Remnet
 

@@ -9,7 +9,7 @@ import pytest
 from bag_material import Foreign
 from typer.testing import CliRunner
 
-from uwb_mitigation.cli import app
+from uwb_mitigation.commands.cli import app
 from uwb_mitigation.errors import ParameterError, RecordingError, UwbMitigationError
 
 

@@ -19,17 +19,17 @@ import pytest
 import requests
 from command_line import run, start
 
-from uwb_mitigation.dataset import build_dataset
 from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError
+from uwb_mitigation.evaluation.dataset import build_dataset
 from uwb_mitigation.measurement import Encoding, Record
 from uwb_mitigation.paper import rooms
 from uwb_mitigation.paper.deepuwb import FULL_SCALE, NOMINAL_RANGE_M, STAMP_STEP_NS, DeepUwbRecording
 from uwb_mitigation.paper.download import DOI, fetch_deepuwb
 from uwb_mitigation.paper.simulated import SimulatedDeepUwb
 from uwb_mitigation.preprocessing import WINDOW_LEAD, Preprocessing, Scaling
-from uwb_mitigation.simulation.rooms import OBSTACLES as SIMULATED_OBSTACLES
-from uwb_mitigation.simulation.rooms import ROOMS as SIMULATED_ROOMS
 from uwb_mitigation.sources.mcap import McapRecording
+from uwb_mitigation.sources.simulation.rooms import OBSTACLES as SIMULATED_OBSTACLES
+from uwb_mitigation.sources.simulation.rooms import ROOMS as SIMULATED_ROOMS
 
 OBSTACLES = ("0000000000", "1000000000", "0000001001", "0000000001")
 

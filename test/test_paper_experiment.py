@@ -14,8 +14,8 @@ from model_material import card, dataset, integer_network, random_weights, windo
 
 pytest.importorskip("torch", reason="training is not set up: run make setup-training")
 
-from uwb_mitigation.dataset import Dataset
 from uwb_mitigation.errors import DatasetError, ModelError, ParameterError, UwbMitigationError
+from uwb_mitigation.evaluation.dataset import Dataset
 from uwb_mitigation.model import floating, graph
 from uwb_mitigation.model.architecture import HEAD, Mlp, Remnet
 from uwb_mitigation.model.bundle import load_bundle, save_bundle

@@ -55,7 +55,7 @@ def ros(tmp_path_factory: pytest.TempPathFactory):
     folder = tmp_path_factory.mktemp("reference")
     port = folder / "port"
     with domain(folder) as ros:
-        code = "from uwb_mitigation.cli import main; main()"
+        code = "from uwb_mitigation.commands.cli import main; main()"
         model = str(default_model_path())
         ros.run([sys.executable, "-c", code, "emulate-board", "--link", str(port), "--model", model])
         ros.start("mitigator")

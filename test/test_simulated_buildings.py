@@ -5,14 +5,21 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from uwb_mitigation.dataset import Dataset, build_dataset
 from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.evaluation.dataset import Dataset, build_dataset
 from uwb_mitigation.preprocessing import Preprocessing
-from uwb_mitigation.simulation import buildings
-from uwb_mitigation.simulation.buildings import BUILDINGS, PLACEMENTS, RADIO, WIDE_KINDS, block_of, draw_plan
-from uwb_mitigation.simulation.channel import Multipath
-from uwb_mitigation.simulation.radio import Boards, Reception
 from uwb_mitigation.sources.simulated_buildings import SimulatedBuildings
+from uwb_mitigation.sources.simulation import buildings
+from uwb_mitigation.sources.simulation.buildings import (
+    BUILDINGS,
+    PLACEMENTS,
+    RADIO,
+    WIDE_KINDS,
+    block_of,
+    draw_plan,
+)
+from uwb_mitigation.sources.simulation.channel import Multipath
+from uwb_mitigation.sources.simulation.radio import Boards, Reception
 from uwb_mitigation.training.simulated import building_dataset
 
 BLOCKS = 8

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from uwb_mitigation.simulation.scene import along_route
-from uwb_mitigation.simulation.sites import SIDE_M, draw_site
 from uwb_mitigation.sources.simulated import SimulatedSource
+from uwb_mitigation.sources.simulation.scene import along_route
+from uwb_mitigation.sources.simulation.sites import SIDE_M, draw_site
 
 
 def drawn(seed: int):

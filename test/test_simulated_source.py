@@ -12,13 +12,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from uwb_mitigation.cli import app
+from uwb_mitigation.commands.cli import app
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.measurement import DEVICE_TICK_HZ, Record
 from uwb_mitigation.preprocessing import Preprocessing
-from uwb_mitigation.simulation.radio import TAPS, Radio
-from uwb_mitigation.simulation.rooms import OBSTACLES, obstruct
-from uwb_mitigation.simulation.scene import ROUTE, FloorPlan, along_route
 from uwb_mitigation.sources.mcap import McapRecording
 from uwb_mitigation.sources.simulated import (
     FIRST_TAG_ID,
@@ -26,6 +23,9 @@ from uwb_mitigation.sources.simulated import (
     SimulatedSource,
     SimulatedSurvey,
 )
+from uwb_mitigation.sources.simulation.radio import TAPS, Radio
+from uwb_mitigation.sources.simulation.rooms import OBSTACLES, obstruct
+from uwb_mitigation.sources.simulation.scene import ROUTE, FloorPlan, along_route
 
 
 def values(record: Record) -> tuple[object, ...]:

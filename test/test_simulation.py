@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from uwb_mitigation.errors import ParameterError
-from uwb_mitigation.simulation.channel import (
+from uwb_mitigation.sources.simulation.channel import (
     FREE_SPACE_LOSS_1M_DB,
     RAYS_PER_CLUSTER,
     RESIDENTIAL_LOS,
@@ -21,7 +21,7 @@ from uwb_mitigation.simulation.channel import (
     draw_diffuse_field,
     propagate,
 )
-from uwb_mitigation.simulation.radio import (
+from uwb_mitigation.sources.simulation.radio import (
     EDGE_LEAD_TAPS,
     NOISE_TAPS,
     POWER_CONSTANT_DB,
@@ -31,7 +31,7 @@ from uwb_mitigation.simulation.radio import (
     Radio,
     pulse,
 )
-from uwb_mitigation.simulation.scene import (
+from uwb_mitigation.sources.simulation.scene import (
     BRICK,
     CONCRETE,
     FLAT,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from uwb_mitigation.cli import app
+from uwb_mitigation.commands.cli import app
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.preprocessing import Scaling

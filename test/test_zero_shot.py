@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from model_material import bundle, dataset
 
-from uwb_mitigation.dataset import Dataset
 from uwb_mitigation.evaluation import zero_shot
+from uwb_mitigation.evaluation.dataset import Dataset
 from uwb_mitigation.evaluation.zero_shot import NAMES, ZeroShot
 from uwb_mitigation.model.bundle import Bundle
 from uwb_mitigation.model.prior import LinePrior

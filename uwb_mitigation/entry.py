@@ -42,7 +42,7 @@ def viewer() -> None:
 
 def command_line() -> None:
     """`uwb-mitigation`."""
-    _program("uwb_mitigation.cli")
+    _program("uwb_mitigation.commands.cli")
 
 
 def _program(module: str) -> None:

@@ -24,7 +24,7 @@ from pathlib import Path
 
 import numpy as np
 
-from uwb_mitigation.dataset import build_dataset
+from uwb_mitigation.evaluation.dataset import build_dataset
 from uwb_mitigation.evaluation.site_data import gather
 from uwb_mitigation.measurement import Record
 from uwb_mitigation.mitigation import Mitigation, correct_batch
@@ -38,10 +38,10 @@ from uwb_mitigation.positioning.model import Model
 from uwb_mitigation.positioning.start import Height
 from uwb_mitigation.positioning.track_errors import track_errors
 from uwb_mitigation.positioning.tracks import Ranges, TruePath
-from uwb_mitigation.simulation.buildings import RADIO
-from uwb_mitigation.simulation.scene import ANCHORS, FLAT, MORE_ANCHORS, ROUTE
-from uwb_mitigation.simulation.sites import draw_site
 from uwb_mitigation.sources.simulated import SimulatedSource
+from uwb_mitigation.sources.simulation.buildings import RADIO
+from uwb_mitigation.sources.simulation.scene import ANCHORS, FLAT, MORE_ANCHORS, ROUTE
+from uwb_mitigation.sources.simulation.sites import draw_site
 from uwb_mitigation.training import calibrated, calibrating, making
 
 UNSEEN = 7_000_000

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from uwb_mitigation.dataset import build_dataset
 from uwb_mitigation.evaluation import lad
+from uwb_mitigation.evaluation.dataset import build_dataset
 from uwb_mitigation.model.architecture import Remnet
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.runtime import Session

@@ -7,7 +7,7 @@ import sys
 import time
 
 from uwb_mitigation.preprocessing import Preprocessing
-from uwb_mitigation.simulation.buildings import PLACEMENTS
+from uwb_mitigation.sources.simulation.buildings import PLACEMENTS
 from uwb_mitigation.training.simulated import building_dataset
 
 if __name__ == "__main__":

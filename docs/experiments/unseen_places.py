@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from uwb_mitigation.dataset import build_dataset
 from uwb_mitigation.evaluation import zero_shot
+from uwb_mitigation.evaluation.dataset import build_dataset
 from uwb_mitigation.evaluation.metrics import bootstrap_interval, coverage
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.sources.opening import open_recording

@@ -6,7 +6,7 @@ Arguments: the simulated recording, and the bundle.
 import sys
 from pathlib import Path
 
-from uwb_mitigation.dataset import build_dataset
+from uwb_mitigation.evaluation.dataset import build_dataset
 from uwb_mitigation.evaluation.metrics import coverage
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.runtime import Session

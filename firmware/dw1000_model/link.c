@@ -10,7 +10,7 @@
 #define DEFAULT_HEIGHT 8000.0
 #define DEFAULT_NOISE 12.0
 #define PULSE_SAMPLES 2.4 /* full width at half amplitude of a lone path */
-/* Noise is measured well before a first path can arrive, as uwb_mitigation/simulation/radio.py does. */
+/* Noise is measured well before a first path can arrive, as uwb_mitigation/sources/simulation/radio.py does. */
 #define NOISE_FROM 64
 #define NOISE_TO 576
 
@@ -151,7 +151,7 @@ static double find_first_path(const link *path) {
     return (double)after - (high > low ? (high - half) / (high - low) : 0);
 }
 
-/* The same sums as uwb_mitigation/simulation/radio.py: what a link reports does not depend on who asks. */
+/* The same sums as uwb_mitigation/sources/simulation/radio.py: what a link reports does not depend on who asks. */
 static void measure(link *path, const dw1000_link_config *config) {
     double energy = 0, noise = 0, sum = 0, peak = -1;
     for (size_t i = 0; i < ACCUMULATOR_SAMPLES; i++) {

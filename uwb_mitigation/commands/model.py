@@ -16,7 +16,7 @@ from uwb_mitigation.commands.console import JsonOption
 from uwb_mitigation.errors import ParameterError
 
 if TYPE_CHECKING:
-    from uwb_mitigation.dataset import Dataset
+    from uwb_mitigation.evaluation.dataset import Dataset
     from uwb_mitigation.preprocessing import Preprocessing, Scaling
 
 DataOption = Annotated[

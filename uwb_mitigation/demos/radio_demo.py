@@ -27,8 +27,8 @@ from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.nodes import processes, topics
 from uwb_mitigation.nodes.monitor import REFRESH_HZ
 from uwb_mitigation.nodes.probe import Probe, wait, watching
-from uwb_mitigation.simulation.scene import ANCHORS
 from uwb_mitigation.sources.simulated import SimulatedSource
+from uwb_mitigation.sources.simulation.scene import ANCHORS
 
 PLACE = ((6.5, 3.1), (6.501, 3.1), (6.5, 3.101))
 """Where the tag stands, a corner of the robot's route: one anchor in sight, the others behind concrete."""

@@ -12,8 +12,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.dataset import Dataset
 from uwb_mitigation.errors import MissingDependencyError
+from uwb_mitigation.evaluation.dataset import Dataset
 
 LINE_OF_SIGHT = "LOS"
 RIDGE_PENALTY = 10.0

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.dataset import Dataset
 from uwb_mitigation.errors import DatasetError, format_id
+from uwb_mitigation.evaluation.dataset import Dataset
 from uwb_mitigation.measurement import Record
 from uwb_mitigation.mitigation import MAX_RANGE_M
 from uwb_mitigation.positioning.anchors import AnchorMap

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from uwb_mitigation.errors import DatasetError, ParameterError
 
 if TYPE_CHECKING:
-    from uwb_mitigation.dataset import Dataset
+    from uwb_mitigation.evaluation.dataset import Dataset
 
 
 class Group(str, enum.Enum):

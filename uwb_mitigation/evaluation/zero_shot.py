@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.dataset import Dataset
+from uwb_mitigation.evaluation.dataset import Dataset
 from uwb_mitigation.mitigation import Grader
 from uwb_mitigation.model.bundle import Bundle
 from uwb_mitigation.model.runtime import Session

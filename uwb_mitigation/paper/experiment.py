@@ -13,9 +13,9 @@ import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
-from uwb_mitigation.dataset import Dataset
 from uwb_mitigation.errors import DatasetError, ModelError, ParameterError, UwbMitigationError
 from uwb_mitigation.evaluation import baselines, lad, splits
+from uwb_mitigation.evaluation.dataset import Dataset
 from uwb_mitigation.files import write_whole
 from uwb_mitigation.model import floating, graph
 from uwb_mitigation.model.architecture import Architecture, Mlp, Remnet

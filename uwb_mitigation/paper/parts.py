@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from uwb_mitigation.dataset import Dataset, build_dataset
 from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.evaluation.dataset import Dataset, build_dataset
 from uwb_mitigation.paper import rooms
 from uwb_mitigation.paper.deepuwb import DeepUwbRecording
 from uwb_mitigation.preprocessing import Preprocessing, Scaling

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.dataset import Dataset
+from uwb_mitigation.evaluation.dataset import Dataset
 from uwb_mitigation.evaluation.page import rendered
 from uwb_mitigation.paper import figures, published, tables
 from uwb_mitigation.paper.results import Box, ExperimentResults, FirmwareRow, PartErrors, Spread

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from uwb_mitigation.dataset import Dataset
 from uwb_mitigation.errors import DatasetError, ParameterError
+from uwb_mitigation.evaluation.dataset import Dataset
 from uwb_mitigation.evaluation.splits import by_configuration
 from uwb_mitigation.model import floating
 from uwb_mitigation.model.architecture import Remnet

@@ -14,11 +14,6 @@ from uwb_mitigation.measurement import Cir, Encoding, Record
 from uwb_mitigation.paper.deepuwb import CIR_SAMPLES, FIRST_ANCHOR_ID, FIRST_PATH_INDEX, FULL_SCALE
 from uwb_mitigation.paper.rooms import ROOM_ROWS, configuration_of
 from uwb_mitigation.preprocessing import WINDOW_LEAD
-from uwb_mitigation.simulation.channel import check_range
-from uwb_mitigation.simulation.links import Links, draw_fields, place
-from uwb_mitigation.simulation.radio import Radio
-from uwb_mitigation.simulation.rooms import OBSTACLES, ROOMS, draw_obstacles, obstruct
-from uwb_mitigation.simulation.scene import DirectPath
 from uwb_mitigation.sources.simulated import (
     BATCH,
     FIRST_TAG_ID,
@@ -27,6 +22,11 @@ from uwb_mitigation.sources.simulated import (
     Simulated,
     check_seed,
 )
+from uwb_mitigation.sources.simulation.channel import check_range
+from uwb_mitigation.sources.simulation.links import Links, draw_fields, place
+from uwb_mitigation.sources.simulation.radio import Radio
+from uwb_mitigation.sources.simulation.rooms import OBSTACLES, ROOMS, draw_obstacles, obstruct
+from uwb_mitigation.sources.simulation.scene import DirectPath
 
 LATE = "first path too late for a whole window"
 

@@ -27,10 +27,23 @@ from uwb_mitigation.measurement import (
     Truth,
 )
 from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
-from uwb_mitigation.simulation.channel import RESIDENTIAL_LOS, RESIDENTIAL_NLOS, DiffuseField, check_range
-from uwb_mitigation.simulation.links import Links, draw_fields, label, place
-from uwb_mitigation.simulation.radio import Boards, Radio, Reception
-from uwb_mitigation.simulation.scene import ANCHORS, FLAT, MORE_ANCHORS, ROUTE, FloorPlan, Point, along_route
+from uwb_mitigation.sources.simulation.channel import (
+    RESIDENTIAL_LOS,
+    RESIDENTIAL_NLOS,
+    DiffuseField,
+    check_range,
+)
+from uwb_mitigation.sources.simulation.links import Links, draw_fields, label, place
+from uwb_mitigation.sources.simulation.radio import Boards, Radio, Reception
+from uwb_mitigation.sources.simulation.scene import (
+    ANCHORS,
+    FLAT,
+    MORE_ANCHORS,
+    ROUTE,
+    FloorPlan,
+    Point,
+    along_route,
+)
 from uwb_mitigation.sources.source import Source
 
 BATCH = 256

@@ -6,8 +6,6 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from uwb_mitigation.simulation.buildings import PLACEMENTS, RADIO, block_of
-from uwb_mitigation.simulation.channel import check_range
 from uwb_mitigation.sources.simulated import (
     BATCH,
     FIRST_TAG_ID,
@@ -16,6 +14,8 @@ from uwb_mitigation.sources.simulated import (
     OneStream,
     check_seed,
 )
+from uwb_mitigation.sources.simulation.buildings import PLACEMENTS, RADIO, block_of
+from uwb_mitigation.sources.simulation.channel import check_range
 
 
 class SimulatedBuildings(OneStream):

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from uwb_mitigation.dataset import Dataset
 from uwb_mitigation.evaluation import lad, splits
+from uwb_mitigation.evaluation.dataset import Dataset
 from uwb_mitigation.model import floating
 from uwb_mitigation.model.architecture import Remnet
 from uwb_mitigation.model.bundle import Bundle

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.dataset import Dataset
 from uwb_mitigation.errors import ModelError, format_id
+from uwb_mitigation.evaluation.dataset import Dataset
 from uwb_mitigation.evaluation.preference import MUST_GAIN
 from uwb_mitigation.evaluation.site_data import SiteData
 from uwb_mitigation.evaluation.site_page import AnchorRow, OffsetRow, SitePage

@@ -10,8 +10,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.dataset import Dataset
 from uwb_mitigation.errors import DatasetError, format_id
+from uwb_mitigation.evaluation.dataset import Dataset
 from uwb_mitigation.evaluation.site_data import SiteData
 from uwb_mitigation.model.bundle import Bundle
 from uwb_mitigation.model.float_networks import float_network

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.dataset import Dataset
+from uwb_mitigation.evaluation.dataset import Dataset
 from uwb_mitigation.evaluation.intervals import calibrate
 from uwb_mitigation.model.architecture import Architecture
 from uwb_mitigation.model.bundle import Card

@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.dataset import Dataset
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.evaluation import lad, splits
+from uwb_mitigation.evaluation.dataset import Dataset
 from uwb_mitigation.evaluation.preference import MUST_GAIN, preferred
 from uwb_mitigation.model import floating
 from uwb_mitigation.model.prior import LinePrior

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from uwb_mitigation.dataset import Dataset
 from uwb_mitigation.evaluation import lad
+from uwb_mitigation.evaluation.dataset import Dataset
 from uwb_mitigation.model import floating
 from uwb_mitigation.model.bundle import Bundle
 from uwb_mitigation.model.float_networks import float_network, scaled

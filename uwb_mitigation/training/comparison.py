@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.dataset import Dataset
 from uwb_mitigation.evaluation import baselines, lad, splits, zero_shot
+from uwb_mitigation.evaluation.dataset import Dataset
 from uwb_mitigation.evaluation.metrics import bootstrap_interval, coverage, kept_mae
 from uwb_mitigation.evaluation.splits import Group
 from uwb_mitigation.mitigation import Grader

@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from uwb_mitigation.dataset import Dataset
 from uwb_mitigation.errors import DatasetError, ParameterError
+from uwb_mitigation.evaluation.dataset import Dataset
 from uwb_mitigation.evaluation.preference import MUST_GAIN
 from uwb_mitigation.model import graph
 from uwb_mitigation.model.bundle import Bundle, load_bundle, save_bundle

@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from uwb_mitigation import dataset as datasets
-from uwb_mitigation.dataset import Dataset
 from uwb_mitigation.errors import DatasetError
+from uwb_mitigation.evaluation import dataset as datasets
+from uwb_mitigation.evaluation.dataset import Dataset
 from uwb_mitigation.measurement import Record, Truth
 from uwb_mitigation.preprocessing import CirFault, Preprocessing, Scaling
 from uwb_mitigation.sources import opening

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.dataset import Dataset
 from uwb_mitigation.errors import DatasetError, ModelError, ParameterError
 from uwb_mitigation.evaluation import splits
+from uwb_mitigation.evaluation.dataset import Dataset
 from uwb_mitigation.model import floating, graph
 from uwb_mitigation.model.architecture import HEAD
 from uwb_mitigation.model.bundle import Bundle, save_bundle

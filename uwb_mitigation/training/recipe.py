@@ -10,8 +10,8 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.dataset import Dataset
 from uwb_mitigation.evaluation import lad, splits
+from uwb_mitigation.evaluation.dataset import Dataset
 from uwb_mitigation.evaluation.metrics import ErrorStatistics, mae_by_group
 from uwb_mitigation.model import floating
 from uwb_mitigation.model.architecture import Remnet

@@ -9,12 +9,12 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.dataset import Dataset
+from uwb_mitigation.evaluation.dataset import Dataset
 from uwb_mitigation.measurement import Encoding, RangeColumns
 from uwb_mitigation.preprocessing import Preprocessing
-from uwb_mitigation.simulation.buildings import RADIO, block_of
-from uwb_mitigation.simulation.links import label
-from uwb_mitigation.simulation.radio import Reception
+from uwb_mitigation.sources.simulation.buildings import RADIO, block_of
+from uwb_mitigation.sources.simulation.links import label
+from uwb_mitigation.sources.simulation.radio import Reception
 
 
 def building_dataset(

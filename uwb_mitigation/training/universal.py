@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.dataset import Dataset
+from uwb_mitigation.evaluation.dataset import Dataset
 from uwb_mitigation.evaluation.metrics import ErrorStatistics
 from uwb_mitigation.model import floating
 from uwb_mitigation.model.architecture import Remnet
@@ -21,7 +21,7 @@ from uwb_mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.model.prior import LinePrior
 from uwb_mitigation.model.weights import FloatWeights, Int8Weights
 from uwb_mitigation.preprocessing import Preprocessing, Scaling
-from uwb_mitigation.simulation.buildings import PLACEMENTS
+from uwb_mitigation.sources.simulation.buildings import PLACEMENTS
 from uwb_mitigation.training.augmentation import calibration_inputs, normalised, vary_channel, vary_receiver
 from uwb_mitigation.training.cards import card_of, familiarity_of
 from uwb_mitigation.training.fitting import FitOptions, fit_varied

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ParameterError
-from uwb_mitigation.simulation.channel import CENTRE_FREQUENCY_HZ, WAVELENGTH_M, check_range
+from uwb_mitigation.sources.simulation.channel import CENTRE_FREQUENCY_HZ, WAVELENGTH_M, check_range
 
 Point = tuple[float, float]
 

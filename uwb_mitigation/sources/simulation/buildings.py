@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.simulation.channel import (
+from uwb_mitigation.sources.simulation.channel import (
     INDUSTRIAL_LOS,
     INDUSTRIAL_NLOS,
     OFFICE_LOS,
@@ -24,9 +24,9 @@ from uwb_mitigation.simulation.channel import (
     Environment,
     direct_power_db,
 )
-from uwb_mitigation.simulation.links import Environments, Links, draw_fields, place
-from uwb_mitigation.simulation.radio import Boards, Radio
-from uwb_mitigation.simulation.scene import (
+from uwb_mitigation.sources.simulation.links import Environments, Links, draw_fields, place
+from uwb_mitigation.sources.simulation.radio import Boards, Radio
+from uwb_mitigation.sources.simulation.scene import (
     BRICK,
     CONCRETE,
     GLASS,

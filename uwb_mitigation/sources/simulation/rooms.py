@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.simulation.channel import RESIDENTIAL_LOS, RESIDENTIAL_NLOS, Environment
-from uwb_mitigation.simulation.scene import (
+from uwb_mitigation.sources.simulation.channel import RESIDENTIAL_LOS, RESIDENTIAL_NLOS, Environment
+from uwb_mitigation.sources.simulation.scene import (
     BRICK,
     FLAT,
     GLASS,

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.measurement import SAMPLE_PERIOD_S
-from uwb_mitigation.simulation.channel import SPEED_OF_LIGHT_M_PER_NS, Multipath, check_range
+from uwb_mitigation.sources.simulation.channel import SPEED_OF_LIGHT_M_PER_NS, Multipath, check_range
 
 TAPS = 1016
 """Accumulator length: one preamble symbol at PRF 64 MHz (DW1000 user manual, section 7.2.38)."""

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.simulation.channel import (
+from uwb_mitigation.sources.simulation.channel import (
     DiffuseField,
     Environment,
     Multipath,
     draw_diffuse_field,
     propagate,
 )
-from uwb_mitigation.simulation.scene import DirectPath, Point
+from uwb_mitigation.sources.simulation.scene import DirectPath, Point
 
 BORDER_M = 0.2
 CLOSEST_M = 0.5
