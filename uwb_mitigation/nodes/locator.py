@@ -29,12 +29,11 @@ from uwb_mitigation.nodes import clocks, diagnostics, markers, topics
 from uwb_mitigation.nodes.conversions import to_header
 from uwb_mitigation.nodes.lifecycle import ManagedNode
 from uwb_mitigation.nodes.parameter_tables import LOCATOR
-from uwb_mitigation.offsets import NO_OFFSETS
 from uwb_mitigation.positioning.fleet import Fleet, Tag
 from uwb_mitigation.positioning.model import Model
 from uwb_mitigation.positioning.start import Area, Height
 from uwb_mitigation.positioning.tracks import Estimate
-from uwb_mitigation.sources.site import load_anchors, load_learnt, save_learnt
+from uwb_mitigation.sources.site import load_anchors
 
 BATCH = 64
 """Ranges that have queued up are taken so many at a time."""
@@ -43,9 +42,6 @@ SLOW_S = 0.2
 """Smoothed poses, markers, and predictions through a silence come so often."""
 
 SILENT_S = 0.3
-KEEP_S = 60.0
-"""Learnt offsets are written so often, and at the end."""
-
 COAST_S = 30.0
 """A tag that fell silent is predicted for so long: by then its covariance has outgrown most halls."""
 
@@ -84,7 +80,7 @@ class Locator(ManagedNode):
     def __init__(self, *, foreign: Collection[str] = ()) -> None:
         super().__init__("locator", LOCATOR, foreign)
         self._fleet: Fleet | None = None
-        self._subscriptions_made: list[Subscription] = []
+        self._heights: Subscription | None = None
         self._ranges: Subscription | None = None
         self._anchors_out: Publisher | None = None
         self._tf: Publisher | None = None
@@ -93,9 +89,6 @@ class Locator(ManagedNode):
         self._timer: Timer | None = None
         self._malformed = self._lost = 0
         self._told: set[int] = set()
-        self._offsets_file: Path | None = None
-        self._kept = 0
-        self._keep_at_s = time.monotonic() + KEEP_S
         self._processing_ns: list[int] = []
         self._now_ns = clocks.reader(self.get_clock())
         self._meter = diagnostics.Meter(self._now_ns)
@@ -112,19 +105,7 @@ class Locator(ManagedNode):
         anchors = load_anchors(Path(path).expanduser())
         model = Model(acceleration=self.value("acceleration"), range_sd=self.value("range_sd"))
         height = Height(self.value("height"), self.value("height_sd")) if self.value("level") else None
-        self._offsets_file = (
-            Path(self.value("offsets_file")).expanduser() if self.value("offsets_file") else None
-        )
-        known = load_learnt(self._offsets_file, model) if self._offsets_file else NO_OFFSETS
-        self._fleet = Fleet(
-            anchors,
-            model,
-            height=height,
-            area=Area.parse(self.value("area")),
-            known=known,
-            learn_offsets=self.value("learn_offsets"),
-        )
-        self._kept = 0
+        self._fleet = Fleet(anchors, model, height=height, area=Area.parse(self.value("area")))
         self._period_ns = round(_NANOSECONDS / self.value("rate")) if self.value("rate") > 0 else 0
         self._offset_ns = round(self.value("stamp_offset") * _NANOSECONDS)
         self._map, self._plain_frame = self.value("map_frame"), self.value("tag_frame")
@@ -140,17 +121,11 @@ class Locator(ManagedNode):
         self._ranges = topics.create_raw_subscription(
             self, RangeCorrected, topics.RANGE_CORRECTED, self._on_range, self._on_lost
         )
-        for kind, name, callback in (
-            (PoseWithCovarianceStamped, "height_topic", self._on_height),
-            (Odometry, "odometry_topic", self._on_odometry),
-        ):
-            if topic := self.value(name):
-                self._subscriptions_made.append(
-                    topics.create_subscription(self, kind, topic, callback, ReliabilityPolicy.BEST_EFFORT)
-                )
+        if topic := self.value("height_topic"):
+            self._heights = topics.create_subscription(
+                self, PoseWithCovarianceStamped, topic, self._on_height, ReliabilityPolicy.BEST_EFFORT
+            )
         self.get_logger().info(f"{len(anchors)} anchors from {path}")
-        if len(known):
-            self.get_logger().info(f"offsets of {len(known)} pairs from {self._offsets_file}")
 
     def begin(self) -> None:
         self._show_anchors()
@@ -161,13 +136,12 @@ class Locator(ManagedNode):
         if self._timer is not None:
             self.destroy_timer(self._timer)
             self._timer = None
-            self._keep_offsets()
 
     def close(self) -> None:
-        for subscription in (*self._subscriptions_made, self._ranges):
+        for subscription in (self._heights, self._ranges):
             if subscription is not None:
                 self.destroy_subscription(subscription)
-        self._subscriptions_made, self._ranges = [], None
+        self._heights = self._ranges = None
         for outputs in self._outputs.values():
             for publisher in outputs.all():
                 self.destroy_lifecycle_publisher(publisher)
@@ -189,19 +163,6 @@ class Locator(ManagedNode):
         taken, self._processing_ns = self._processing_ns, []
         facts |= diagnostics.percentiles("processing", taken)
         return "host", level, text, facts
-
-    def _keep_offsets(self) -> None:
-        """Write what was learnt since the last time, if anything."""
-        self._keep_at_s = time.monotonic() + KEEP_S
-        fleet, path = self._fleet, self._offsets_file
-        if fleet is None or path is None or fleet.learnt == self._kept:
-            return
-        try:
-            save_learnt(path, fleet.offsets())
-        except ParameterError as error:
-            self.get_logger().warning(f"learnt offsets are not kept: {error}", throttle_duration_sec=600.0)
-        else:
-            self._kept = fleet.learnt
 
     def _open_tf(self) -> None:
         try:
@@ -314,8 +275,6 @@ class Locator(ManagedNode):
                 smoothed = tag.smoother.estimate()
                 if smoothed is not None:
                     outputs.smoothed.publish(encode_pose(self._at_base(smoothed), self._map))
-        if time.monotonic() >= self._keep_at_s:
-            self._keep_offsets()
         if self._anchors_out is not None and fleet.tags and self._anchors_out.get_subscription_count():
             self._show_anchors()
 
@@ -332,21 +291,10 @@ class Locator(ManagedNode):
         publisher.publish(markers.array(shown))
 
     def _on_height(self, message: PoseWithCovarianceStamped) -> None:
-        variance = float(message.pose.covariance[14])
-        self._tell_all(lambda tag: tag.add_height(float(message.pose.pose.position.z), variance), variance)
-
-    def _on_odometry(self, message: Odometry) -> None:
-        velocity, variance = message.twist.twist.linear, float(message.twist.covariance[0])
-        speed = float(np.hypot(velocity.x, velocity.y))
-        self._tell_all(lambda tag: tag.locator.add_speed(speed, max(variance, 1e-4)), speed + variance)
-
-    def _tell_all(self, tell: Callable[[Tag], None], finite: float) -> None:
-        if self._fleet is None or not np.isfinite(finite):
-            return
-        # One robot, one tag: of several, nobody could say whose height or speed it is.
-        if len(self._fleet.tags) == 1:
-            for tag in self._fleet.tags.values():
-                tell(tag)
+        # If there are several tags, it is unknown whose height this is.
+        if self._fleet is not None and len(self._fleet.tags) == 1:
+            (tag,) = self._fleet.tags.values()
+            tag.add_height(float(message.pose.pose.position.z), float(message.pose.covariance[14]))
 
 
 def make_nodes(stop: threading.Event) -> list[Node]:

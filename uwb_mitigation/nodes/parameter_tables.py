@@ -195,12 +195,6 @@ LOCATOR = (
               low=0.0, high=10_000.0, unit="Hz"),
     Parameter("height_topic", "", "Topic of the only tag's height, a PoseWithCovarianceStamped; its z counts. "
               "Empty = none."),
-    Parameter("odometry_topic", "", "Topic of the only tag's odometry, a nav_msgs/Odometry; its speed counts. "
-              "Empty = none."),
-    Parameter("learn_offsets", False, "Take off ranges what was learnt of each pair's constant offset; it is learnt and "
-              "shown in the diagnostics either way."),
-    Parameter("offsets_file", "", "Where learnt offsets are kept through a restart; made if it is not there. Empty = "
-              "they are forgotten."),
     Parameter("map_frame", "map", "Frame of the anchors."),
     Parameter("tag_frame", "uwb_tag", "Frame of the tag with the plain topic names: child frame of uwb/odometry and "
               "/tf. It is at the antenna and has the axes of map_frame. Other tags use tag_N. The namespace of the node "
