@@ -9,14 +9,17 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from graphlib import TopologicalSorter
 from pathlib import Path
 from typing import Any
 
 import pytest
+from compilers import NEEDS_CC
 from conftest import REPOSITORY
 from typer.main import get_command
 
 from uwb_mitigation.commands import cli
+from uwb_mitigation.firmware_export.compiling import compile_objects, run
 
 PACKAGE = REPOSITORY / "uwb_mitigation"
 
@@ -27,6 +30,21 @@ def test_layers_hold_and_only_nodes_import_rclpy_and_only_training_torch():
     code = "import sys; from importlinter.cli import lint_imports; sys.exit(lint_imports(no_cache=True))"
     done = subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+@NEEDS_CC
+@pytest.mark.parametrize("folder", ["src"])
+def test_the_modules_of_the_firmware_do_not_call_each_other_in_circles(folder: str):
+    sources = REPOSITORY / "firmware" / folder
+    objects = compile_objects(("cc",), (f"-I{sources}",), tuple(sorted(sources.glob("*.c"))))
+    symbols = {path: [line.split() for line in run(["nm", "-gP", path]).splitlines()] for path in objects}
+    owner = {name: path for path in objects for name, kind, *_ in symbols[path] if kind != "U"}
+    TopologicalSorter(
+        {
+            path: {owner[name] for name, kind, *_ in symbols[path] if kind == "U" and name in owner}
+            for path in objects
+        }
+    ).prepare()
 
 
 def test_importing_the_package_and_its_command_line_needs_neither_ros_nor_torch():

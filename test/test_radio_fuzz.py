@@ -22,12 +22,12 @@ def build(
 ) -> Path:
     """The fuzz target; `broken` replaces a check in the exchange by another."""
     firmware = firmware_folder()
-    exchange = firmware / "src" / "uwb_twr.c"
+    exchange = firmware / "src" / "uwb_twr_common.c"
     others = {*(firmware / "src").glob("uwb_dw1000*.c"), *(firmware / "src").glob("uwb_twr*.c")} - {exchange}
     if broken is not None:
         text = exchange.read_text()
         assert broken[0] in text
-        exchange = folder / "uwb_twr.c"
+        exchange = folder / "uwb_twr_common.c"
         exchange.write_text(text.replace(*broken))
     options = (*SANITIZED, *flags, f"-I{firmware / 'src'}")
     objects = compile_objects(compiler, options, tuple(sorted(others)))

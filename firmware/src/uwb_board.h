@@ -46,7 +46,7 @@ typedef struct {
     uint32_t measurements;
     uint32_t measurements_lost;
     uint32_t radio_faults; /* frames from the radio's side that were damaged or no measurement */
-    uint32_t radio_faults_told;
+    uint32_t radio_faults_logged;
     float temperature; /* degrees Celsius, for STATUS; the caller may set it */
     uint8_t mode;
     float default_offset_m;
@@ -73,21 +73,6 @@ void uwb_board_tick(uwb_board *board, uint64_t now_us);
 /* Send one frame, if it fits and leaves `reserve` bytes of the queue free; returns whether it did. */
 int uwb_board_send(uwb_board *board, uint8_t type, uint16_t flags, uint64_t time_us, const void *payload,
                    size_t payload_bytes, size_t reserve);
-
-/* Send HELLO, as an answer to the host's frame `*request`, or of its own accord where that is NULL. */
-void uwb_board_hello(uwb_board *board, const uint32_t *request, uint64_t now_us);
-
-/* Take the payload of a SET_OFFSETS, the host's frame `request`, and answer; returns whether it is well formed. */
-int uwb_board_set_offsets(uwb_board *board, const uint8_t *payload, size_t payload_bytes, uint32_t request,
-                          uint64_t now_us);
-
-/* What to take off the ranges of a pair, m: the pair's own offset, else the sum of its tag's and its anchor's, else the
- * default. */
-float uwb_board_offset_m(const uwb_board *board, uint64_t tag_id, uint64_t anchor_id);
-
-/* Correct a measurement and send the result; returns whether it fitted. */
-int uwb_board_correct(uwb_board *board, const uwb_range_cir_t *fields, const uwb_cir *cir, uint16_t flags,
-                      uint64_t time_us);
 
 #ifdef __cplusplus
 }

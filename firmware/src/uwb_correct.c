@@ -3,6 +3,87 @@
 
 #include "uwb_kernels.h"
 
+static const float MAX_POWER_DBM = 1000.0f;
+
+/* The part of the predicted error that needs no network, m; NaN if a power that it needs is not finite, or beyond
+ * 1000 dBm. */
+static float prior_m(const uwb_model *model, float rx_power_dbm, float first_path_power_dbm) {
+    if (model->prior_per_rx_power == 0.0f && model->prior_per_power_gap == 0.0f) {
+        return model->prior_offset_m;
+    }
+    if (!(fabsf(rx_power_dbm) <= MAX_POWER_DBM && fabsf(first_path_power_dbm) <= MAX_POWER_DBM)) {
+        return NAN;
+    }
+    /* The host rounds every product and every sum. Without volatile a compiler may fuse them. */
+    const volatile float level = model->prior_per_rx_power * rx_power_dbm;
+    const volatile float slope = model->prior_per_power_gap * (rx_power_dbm - first_path_power_dbm);
+    return model->prior_offset_m + level + slope;
+}
+
+/* OOD score. Every step is one IEEE-754 operation, as in uwb_mitigation/model/familiarity.py; volatile prevents the
+ * compiler from fusing two. */
+
+enum { LEAD_TAPS = 3, FIRST_PATH_TAP = 6, FIRST_PATH_TAPS = 3 };
+
+/* The sum of the inputs' squares, from the first to the last; of their fourth powers if they are square roots. */
+static float energy(uwb_scaling scaling, const float *window, size_t count) {
+    float sum = 0.0f;
+    for (size_t i = 0; i < count; i++) {
+        const volatile float square = window[i] * window[i];
+        const volatile float fourth = square * square;
+        sum += scaling == UWB_SCALE_PREAMBLE ? fourth : square;
+    }
+    return sum;
+}
+
+/* 10 log10 within 0.03 dB: the exponent is exact, and a parabola stands for the mantissa's logarithm. */
+static float level_db(float power) {
+    const float bounded = power < 1e-30f ? 1e-30f : power > 1e30f ? 1e30f : power;
+    int exponent;
+    const float mantissa = frexpf(bounded, &exponent);
+    const volatile float square = (-4.0f / 3.0f) * mantissa;
+    const volatile float both = (square + 4.0f) * mantissa;
+    const volatile float octaves = both - 8.0f / 3.0f;
+    return ((float)exponent + octaves) * 3.01029992f;
+}
+
+/* OOD score of a measurement with the input `window`. At most 0: in distribution; 1 or more, or NaN: out of
+ * distribution. */
+static float ood_score(const uwb_model *model, const float *window, float range_m, float rx_power_dbm,
+                       float first_path_power_dbm) {
+    if (model->familiarity == NULL) {
+        return 0.0f;
+    }
+    const volatile float level = level_db(energy(model->scaling, window, model->samples));
+    const size_t taps = model->samples < FIRST_PATH_TAP + FIRST_PATH_TAPS ? 2 : FIRST_PATH_TAPS; /* K = 8: two */
+    const volatile float first_path_level = level_db(energy(model->scaling, window + FIRST_PATH_TAP, taps));
+    const volatile float lead_level = level_db(energy(model->scaling, window, LEAD_TAPS));
+    const volatile float free_space_loss = level_db(range_m * range_m); /* beyond that of the first metre */
+    const float features[UWB_FEATURES] = {
+        range_m,
+        rx_power_dbm + free_space_loss,
+        rx_power_dbm - first_path_power_dbm,
+        level - rx_power_dbm,
+        first_path_level - first_path_power_dbm,
+        lead_level - level,
+    };
+    float score = -INFINITY;
+    for (size_t i = 0; i < UWB_FEATURES; i++) {
+        const uwb_band *const band = &model->familiarity->bands[i];
+        if (band->per_unit == 0.0f) {
+            continue;
+        }
+        const float below = band->low - features[i];
+        const float above = features[i] - band->high;
+        const float excess = (below > above ? below : above) * band->per_unit;
+        if (isnan(excess)) {
+            return NAN;
+        }
+        score = excess > score ? excess : score;
+    }
+    return score;
+}
+
 static const float MAX_RANGE_M = 1.0e6f;
 
 static int in_limits(float value, float low, float high) {
@@ -27,8 +108,8 @@ static uwb_range_status range_status(uwb_status status) {
     }
 }
 
-/* The predicted error of the range, m, and how strange the measurement is. The order of checks is the host's: it
- * decides the status. */
+/* The predicted error of the range, m, and the OOD score. The order of checks is that of the host, because it decides
+ * the status. */
 static uwb_status predict(const uwb_model *model, float range_m, const uwb_cir *cir, void *arena,
                           size_t arena_bytes, float *error_m, float *score) {
     const size_t needed = uwb_arena_size(model);
@@ -46,12 +127,12 @@ static uwb_status predict(const uwb_model *model, float range_m, const uwb_cir *
     if (!in_limits(range_m, 0.0f, MAX_RANGE_M)) {
         return UWB_BAD_RANGE;
     }
-    const float prior = uwb_prior_m(model, cir->rx_power_dbm, cir->first_path_power_dbm);
+    const float prior = prior_m(model, cir->rx_power_dbm, cir->first_path_power_dbm);
     if (!in_limits(prior, -FLT_MAX, FLT_MAX)) {
         return UWB_NO_POWER;
     }
     /* Before the network overwrites the window. */
-    *score = uwb_strangeness(model, window, range_m, cir->rx_power_dbm, cir->first_path_power_dbm);
+    *score = ood_score(model, window, range_m, cir->rx_power_dbm, cir->first_path_power_dbm);
     /* volatile: the host rounds the network's product before it adds the prior. */
     volatile float rounded;
     float network_m;
@@ -64,12 +145,12 @@ static uwb_status predict(const uwb_model *model, float range_m, const uwb_cir *
     if (!in_limits(*error_m, -FLT_MAX, FLT_MAX)) {
         return UWB_NOT_FINITE;
     }
-    const int usual = in_limits(*error_m, model->correction_low_m, model->correction_high_m) && *score < 1.0f;
-    return usual ? UWB_OK : UWB_OUT_OF_DISTRIBUTION;
+    const int accepted = in_limits(*error_m, model->correction_low_m, model->correction_high_m) && *score < 1.0f;
+    return accepted ? UWB_OK : UWB_OUT_OF_DISTRIBUTION;
 }
 
-/* The stranger a measurement is, the less of its predicted error is believed. As in the host's Grader: every
- * product and every sum is rounded, for which volatile keeps a compiler from fusing them. */
+/* The higher the OOD score, the less of the predicted error is subtracted. As in the host's Grader, every product and
+ * every sum is rounded: volatile prevents the compiler from fusing them. */
 static void grade(const uwb_model *model, float range_m, float offset_m, float error_m, float score,
                   uwb_corrected *corrected) {
     const volatile float square = error_m * error_m;
@@ -79,9 +160,9 @@ static void grade(const uwb_model *model, float range_m, float offset_m, float e
     if (score > 0.0f) {
         const float known_m = model->familiarity->known_offset_m;
         const volatile float shrunk = (1.0f - score) * (error_m - known_m);
-        const volatile float strange = score * model->variance_uncorrected_m2;
+        const volatile float uncorrected = score * model->variance_uncorrected_m2;
         correction_m = known_m + shrunk;
-        variance_m2 += strange;
+        variance_m2 += uncorrected;
     }
     correction_m = offset_m + correction_m;
     corrected->range_m = range_m - correction_m;

@@ -63,7 +63,7 @@ typedef struct {
 } uwb_dw1000_settings;
 
 /* Channel 5, 64 MHz, 6.8 Mbit/s, preamble of 128. */
-extern const uwb_dw1000_settings uwb_dw1000_usual;
+extern const uwb_dw1000_settings uwb_dw1000_defaults;
 
 typedef struct {
     uwb_dw1000_io io;
@@ -122,9 +122,8 @@ int uwb_dw1000_valid(const uwb_dw1000_settings *settings);
 /* RESTARTED if the chip has lost its settings since. */
 uwb_dw1000_status uwb_dw1000_check(uwb_dw1000 *chip);
 
-/* Duration on the air of a frame of `bytes` octets without check sequence: to the end, and of preamble and SFD alone. */
+/* Duration on the air of a frame of `bytes` octets without check sequence. */
 uint32_t uwb_dw1000_air_us(const uwb_dw1000_settings *settings, size_t bytes);
-uint32_t uwb_dw1000_lead_us(const uwb_dw1000_settings *settings);
 
 #define UWB_DW1000_NO_LIMIT UINT32_MAX /* of the time that the chip listens: until it is told otherwise */
 
@@ -163,9 +162,6 @@ uwb_dw1000_status uwb_dw1000_idle(uwb_dw1000 *chip);
 /* Of the frame received last, before anything enables the receiver again. */
 uwb_dw1000_status uwb_dw1000_read_quality(uwb_dw1000 *chip, const uwb_dw1000_frame *frame,
                                           uwb_dw1000_quality *quality);
-
-/* The strongest sample of the same frame, and its magnitude (LDE_PPINDX, LDE_PPAMPL). */
-uwb_dw1000_status uwb_dw1000_read_peak(uwb_dw1000 *chip, uint16_t *index, uint16_t *amplitude);
 
 /* Samples of the accumulator at 16 and 64 MHz. */
 #define UWB_DW1000_SAMPLES(prf_mhz) ((prf_mhz) == 16 ? 992u : 1016u)

@@ -66,14 +66,6 @@ uwb_dw1000_status uwb_dw1000_read_quality(uwb_dw1000 *chip, const uwb_dw1000_fra
     return UWB_DW1000_OK;
 }
 
-uwb_dw1000_status uwb_dw1000_read_peak(uwb_dw1000 *chip, uint16_t *index, uint16_t *amplitude) {
-    uint8_t peak[4];
-    DW1000_TRY(uwb_dw1000_read(chip, LDE_PPINDX, peak, sizeof peak));
-    *index = (uint16_t)uwb_dw1000_number(peak, 2);
-    *amplitude = (uint16_t)uwb_dw1000_number(peak + 2, 2);
-    return UWB_DW1000_OK;
-}
-
 uwb_dw1000_status uwb_dw1000_read_cir(uwb_dw1000 *chip, size_t first, size_t count, uint8_t *octets) {
     const size_t samples = UWB_DW1000_SAMPLES(chip->settings.prf_mhz);
     if (count > samples || first > samples - count) {

@@ -39,10 +39,7 @@ void uwb_dense(const uint16_t *x, uint16_t *y, const uwb_dense_layer *layer);
 /* bias + 256 * dot product */
 int32_t uwb_dot(const uint16_t *x, const int8_t *weights, uint32_t inputs, int32_t bias);
 
-/* uint8 in uint16: round half to even (value / scale), clipped. */
-void uwb_quantise(const float *values, uint16_t *quantised, uint32_t count, float scale);
-
-/* Where `predict` may put the window, inside the arena. */
+/* Memory for the window, inside the arena. */
 float *uwb_arena_window(const uwb_model *model, void *arena);
 
 /* Channel pairs p0 q0 p1 q1: value `half` (0, 1) of pair `index`, times 256. */

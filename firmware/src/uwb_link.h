@@ -40,9 +40,6 @@ typedef struct {
  * stand in body.bytes until the next byte. */
 int32_t uwb_decoder_push(uwb_decoder *decoder, uint8_t byte, uwb_header_t *header);
 
-/* CRC-32 of IEEE 802.3, continued from `crc`; 0 to begin with. */
-uint32_t uwb_crc32(uint32_t crc, const void *data, size_t bytes);
-
 /* A wire buffer: header and payload stand at UWB_WIRE_LEAD before they are encoded in place. */
 #define UWB_WIRE_LEAD 20
 #define UWB_MAX_WIRE_BYTES (UWB_WIRE_LEAD + UWB_MAX_FRAME_BYTES)

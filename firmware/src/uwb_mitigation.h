@@ -29,7 +29,7 @@ typedef enum {
     UWB_SATURATED,           /* the window holds a saturated sample */
     UWB_NO_PREAMBLE_COUNT,   /* unknown, and the model's scaling needs it */
     UWB_NO_POWER,            /* receive or first-path power unknown, and the model's prior needs it */
-    UWB_OUT_OF_DISTRIBUTION, /* the predicted error lies outside the model's limits, or all is strange to it */
+    UWB_OUT_OF_DISTRIBUTION, /* the predicted error is outside the model's limits, or the OOD score is 1 or more */
     UWB_BAD_RANGE,           /* the range is not finite, negative, or beyond 1000 km */
     UWB_NOT_FINITE           /* the predicted error */
 } uwb_status;
@@ -94,7 +94,7 @@ typedef struct {
 
 /* What the model was trained on; uwb_mitigation/model/familiarity.py says what the features are. */
 typedef struct {
-    float known_offset_m; /* a strange measurement's correction shrinks to it */
+    float known_offset_m; /* correction of a measurement that is out of distribution */
     uwb_band bands[UWB_FEATURES];
 } uwb_familiarity;
 
@@ -127,7 +127,7 @@ typedef struct {
     float variance_m2;
     float variance_per_m2; /* times the square of the predicted error */
     float variance_uncorrected_m2;
-    const uwb_familiarity *familiarity; /* NULL = not known: nothing is strange */
+    const uwb_familiarity *familiarity; /* NULL = unknown: no OOD score */
 } uwb_model;
 
 /* Bytes of arena that the other functions need for `model`; 0 if it is null or cannot be run. */
@@ -139,15 +139,6 @@ uwb_status uwb_preprocess(const uwb_model *model, const uwb_cir *cir, float *win
 /* The network's output for a window of model->samples values, m, without the prior. */
 uwb_status uwb_network(const uwb_model *model, const float *window, void *arena, size_t arena_bytes,
                        float *output_m);
-
-/* The part of the predicted error that needs no network, m; NaN where a power that it needs is not finite, or
- * beyond 1000 dBm. */
-float uwb_prior_m(const uwb_model *model, float rx_power_dbm, float first_path_power_dbm);
-
-/* How strange a measurement with the input `window` is to the model: 0 or less, not at all; 1 or more, or NaN:
- * wholly. */
-float uwb_strangeness(const uwb_model *model, const float *window, float range_m, float rx_power_dbm,
-                      float first_path_power_dbm);
 
 /* What a corrected range is worth; the values of RangeCorrected.msg and of the wire protocol. */
 typedef enum {

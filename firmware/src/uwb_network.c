@@ -2,6 +2,62 @@
 
 #include "uwb_kernels.h"
 
+static size_t widest_layer(const uwb_model *model) {
+    size_t widest = 0;
+    for (uint32_t i = 0; i < model->layer_count; i++) {
+        widest = model->layers[i].inputs > widest ? model->layers[i].inputs : widest;
+        widest = model->layers[i].outputs > widest ? model->layers[i].outputs : widest;
+    }
+    return widest;
+}
+
+size_t uwb_arena_size(const uwb_model *model) {
+    if (model == NULL || model->samples == 0 || model->head_weights == NULL) {
+        return 0;
+    }
+    if (model->layer_count > 0) {
+        /* two halves, between which the layers alternate | window */
+        return 2 * widest_layer(model) * sizeof(uint16_t) + model->samples * sizeof(float);
+    }
+    if (model->module_count == 0 || model->samples < UWB_BLOCK ||
+        (model->first_kernel != 3 && model->first_kernel != UWB_LONGEST_KERNEL)) {
+        return 0;
+    }
+    /* zeros | input | zeros | residual sum | zeros, which only a layer of even length reads */
+    const size_t total = 2 * UWB_BLOCKS(model->samples) + 2 + (model->samples % 2 == 0);
+    return total * UWB_BLOCK_VALUES * sizeof(uint16_t);
+}
+
+float *uwb_arena_window(const uwb_model *model, void *arena) {
+    if (model->layer_count > 0) {
+        uint8_t *const end = (uint8_t *)arena + uwb_arena_size(model);
+        return (float *)(void *)(end - model->samples * sizeof(float));
+    }
+    /* The place of the residual sum is free until the first module: quantised samples, then the window. */
+    const size_t blocks = UWB_BLOCKS(model->samples);
+    uint16_t *const sum = (uint16_t *)arena + (blocks + 2) * UWB_BLOCK_VALUES;
+    return (float *)(void *)(sum + blocks * UWB_BLOCK + UWB_LONGEST_KERNEL + 1);
+}
+
+/* uint8 in uint16: round half to even (value / scale), clipped. */
+static void quantise(const float *values, uint16_t *quantised, uint32_t count, float scale) {
+    for (uint32_t i = 0; i < count; i++) {
+        float value = values[i] / scale;
+        if (!(value > 0.0f)) {
+            value = 0.0f;
+        } else if (value > 255.0f) {
+            value = 255.0f;
+        }
+        /* Adding 2^23 leaves no fraction bits: the FPU rounds half to even, without the C library. */
+        union {
+            float real;
+            uint32_t bits;
+        } rounded;
+        rounded.real = value + 8388608.0f;
+        quantised[i] = (uint16_t)(rounded.bits & 0x1FFu);
+    }
+}
+
 static void clear_position(uint16_t *values, int32_t position, int split) {
     for (int32_t pair = 0; pair < UWB_FILTERS / 2; pair++) {
         uint16_t *const value =
@@ -18,7 +74,7 @@ static const uint16_t *run_remnet(const uwb_model *model, const float *window, u
 
     const uint32_t lead = model->first_kernel / 2u;
     const uint32_t padded = blocks * UWB_BLOCK + model->first_kernel + 1u;
-    uwb_quantise(window, r + lead, length, model->input_scale);
+    quantise(window, r + lead, length, model->input_scale);
     memset(r, 0, lead * sizeof *r);
     memset(r + lead + length, 0, (padded - lead - length) * sizeof *r);
     uwb_conv_first(r, x, blocks, model->first_weights, model->first, model->first_kernel);
@@ -44,7 +100,7 @@ static const uint16_t *run_remnet(const uwb_model *model, const float *window, u
 static const uint16_t *run_dense(const uwb_model *model, const float *window, uint16_t *arena, size_t half) {
     uint16_t *input = arena;
     uint16_t *output = arena + half;
-    uwb_quantise(window, input, model->samples, model->input_scale);
+    quantise(window, input, model->samples, model->input_scale);
     memset(input + model->samples, 0, (model->layers[0].inputs - model->samples) * sizeof *input);
     for (uint32_t i = 0; i < model->layer_count; i++) {
         uwb_dense(input, output, &model->layers[i]);

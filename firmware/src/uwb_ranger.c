@@ -103,7 +103,7 @@ static const char *understand(const uwb_ranger *ranger, const uint8_t *payload, 
     config->window = fixed.window;
     config->reply_us = fixed.reply_us;
     config->patience_us = fixed.patience_us;
-    uwb_twr_fill_times(config, uwb_twr_usual.reply_us, uwb_twr_usual.patience_us);
+    uwb_twr_fill_times(config, uwb_twr_defaults.reply_us, uwb_twr_defaults.patience_us);
     config->interval_us = fixed.interval_us;
     memcpy(config->anchors, payload + sizeof fixed, 8u * fixed.anchor_count);
     return uwb_twr_refusal(&ranger->twr, config);

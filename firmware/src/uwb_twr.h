@@ -46,7 +46,7 @@ typedef struct {
 } uwb_twr_config;
 
 /* Usual radio, a tag with 157 samples that finds its anchors, and times for SPI of a microcontroller. */
-extern const uwb_twr_config uwb_twr_usual;
+extern const uwb_twr_config uwb_twr_defaults;
 
 /* Exchanges that began, and what became of them: `tried` is the sum of those that follow. */
 typedef struct {

@@ -1,4 +1,4 @@
-#include "uwb_twr_exchange.h"
+#include "uwb_twr_common.h"
 
 enum {
     LOOK_US = 100000,            /* between two looks whether the chip is in order */
@@ -18,7 +18,7 @@ static uwb_dw1000_status send_and_rest(uwb_twr *twr, const uwb_twr_frame *frame)
 static uwb_dw1000_status tell(uwb_twr *twr, const uwb_twr_frame *request) {
     const uint32_t window_us = request->time_us < LONGEST_WINDOW_US ? request->time_us : LONGEST_WINDOW_US;
     const uwb_twr_frame here = uwb_twr_frame_to(twr, UWB_TWR_HERE, request->from, request->tag_number, 0);
-    uwb_twr_nap(twr, uwb_twr_now_us(twr) + uwb_twr_random_below(twr, window_us + 1));
+    uwb_twr_sleep_until(twr, uwb_twr_now_us(twr) + uwb_twr_random_below(twr, window_us + 1));
     return send_and_rest(twr, &here);
 }
 

@@ -1,6 +1,6 @@
 #include <math.h>
 
-#include "uwb_twr_exchange.h"
+#include "uwb_twr_common.h"
 
 enum {
     SEEK_WINDOW_US = 8000,     /* in which anchors answer a broadcast */
@@ -183,7 +183,7 @@ uwb_twr_event uwb_twr_tag_turn(uwb_twr *twr, uint64_t until_us) {
     const uint64_t due_us = anchor == NULL                     ? twr->seek_us
                             : anchor->due_us > twr->next_us ? anchor->due_us
                                                             : twr->next_us;
-    uwb_twr_nap(twr, due_us < until_us ? due_us : until_us);
+    uwb_twr_sleep_until(twr, due_us < until_us ? due_us : until_us);
     if (anchor == NULL || due_us >= until_us) {
         return UWB_TWR_NOTHING;
     }

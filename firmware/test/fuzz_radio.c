@@ -81,7 +81,7 @@ static uwb_twr_frame a_poll(fake *chip) {
     uwb_twr_frame frame;
     memset(&frame, 0, sizeof frame);
     frame.kind = UWB_TWR_POLL;
-    frame.pan = uwb_twr_usual.pan;
+    frame.pan = uwb_twr_defaults.pan;
     frame.to = ME;
     frame.from = PEER + (next(chip) & 1u);
     frame.tag_number = (uint32_t)next(chip) << 8 | next(chip);
@@ -316,7 +316,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
     chip->left = size;
     const uint8_t how = next(chip);
     const uwb_dw1000_io io = {chip, transfer, speed, NULL, now_us, wait, sleep};
-    uwb_twr_config config = uwb_twr_usual;
+    uwb_twr_config config = uwb_twr_defaults;
     config.address = ME;
     config.role = how & 1u ? UWB_ROLE_ANCHOR : UWB_ROLE_TAG;
     config.report = 1;

@@ -105,7 +105,7 @@ class TwrAnchor(ctypes.Structure):
 
 
 USUAL_REPLY_US, USUAL_PATIENCE_US = 1500, 6000
-"""For SPI of a microcontroller; those of `uwb_twr_usual`."""
+"""For SPI of a microcontroller; those of `uwb_twr_defaults`."""
 
 
 def config(

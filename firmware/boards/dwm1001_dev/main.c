@@ -243,7 +243,7 @@ int main(void) {
         .queue_bytes = sizeof queue,
         .clock_us = clock_us,
     };
-    uwb_twr_config config = uwb_twr_usual;
+    uwb_twr_config config = uwb_twr_defaults;
     config.role = (GPIO_IN >> BUTTON & 1u) != 0 ? UWB_ROLE_ANCHOR : UWB_ROLE_TAG;
     uwb_ranger_start(&ranger, &board, &io, &config, random, (uint8_t *)measurement, sizeof measurement);
     for (;;) {

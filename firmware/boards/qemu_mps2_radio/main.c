@@ -154,7 +154,7 @@ int main(void) {
     memset(&board, 0, sizeof board);
     board.queue = queue;
     board.queue_bytes = sizeof queue;
-    uwb_ranger_start(&ranger, &board, &io, &uwb_twr_usual, RANDOM, (uint8_t *)measurement,
+    uwb_ranger_start(&ranger, &board, &io, &uwb_twr_defaults, RANDOM, (uint8_t *)measurement,
                      sizeof measurement);
     for (;;) {
         (void)uwb_ranger_turn(&ranger);

@@ -146,7 +146,7 @@ void setup() {
     board.queue_bytes = sizeof queue;
     board.clock_us = clock_us;
     const uwb_dw1000_io io = {nullptr, transfer, speed, reset, uptime_us, wait, rest};
-    uwb_twr_config config = uwb_twr_usual;
+    uwb_twr_config config = uwb_twr_defaults;
     config.role = digitalRead(TAG_SWITCH) == LOW ? UWB_ROLE_TAG : UWB_ROLE_ANCHOR;
     uwb_ranger_start(&ranger, &board, &io, &config, random, (uint8_t *)measurement, sizeof measurement);
     NRF_WDT->CONFIG = 1; /* also while asleep; once started it cannot be stopped */

@@ -119,7 +119,7 @@ static void run_anchor(dw1000_chip *its, void *context) {
     anchor_host *const host = (anchor_host *)context;
     host->chip = its;
     const uwb_dw1000_io io = {host, anchor_transfer, anchor_speed, NULL, anchor_now, anchor_wait, anchor_sleep};
-    uwb_twr_config config = uwb_twr_usual;
+    uwb_twr_config config = uwb_twr_defaults;
     config.role = UWB_ROLE_ANCHOR;
     uwb_twr_start(&twr, &io, &config, 5, (uint8_t *)measurement, sizeof measurement);
     for (;;) {

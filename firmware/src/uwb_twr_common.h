@@ -1,6 +1,6 @@
 /* What the two roles of an exchange share. Internal. */
-#ifndef UWB_TWR_EXCHANGE_H
-#define UWB_TWR_EXCHANGE_H
+#ifndef UWB_TWR_COMMON_H
+#define UWB_TWR_COMMON_H
 
 #include "uwb_twr.h"
 
@@ -8,7 +8,7 @@ uwb_twr_event uwb_twr_tag_turn(uwb_twr *twr, uint64_t until_us);
 uwb_twr_event uwb_twr_anchor_turn(uwb_twr *twr, uint64_t until_us);
 
 uint64_t uwb_twr_now_us(const uwb_twr *twr);
-void uwb_twr_nap(const uwb_twr *twr, uint64_t until_us);
+void uwb_twr_sleep_until(const uwb_twr *twr, uint64_t until_us);
 
 /* A random number below `limit`, which is not 0; and one of 32 bits. */
 uint32_t uwb_twr_random_below(uwb_twr *twr, uint32_t limit);
