@@ -30,7 +30,7 @@ firmware-demo: setup  ## the firmware in an emulated Cortex-M4 as the driver's b
 	@$(IN_ROS) $(VENV)/bin/python -m uwb_mitigation.entry firmware-demo $(if $(RECORDING),--recording '$(RECORDING)')
 
 radio-demo: setup  ## a tag and four anchors on modelled DW1000s, in the simulated flat: raw, corrected and true ranges
-	@$(IN_ROS) $(VENV)/bin/python -m uwb_mitigation.entry radio-demo
+	@$(IN_ROS) $(VENV)/bin/python -m benchmarks radio-demo
 
 # Which lines the tests reach costs half as much time again: shown where it is asked for, as the hosted CI does once.
 COVERAGE ?=
@@ -83,7 +83,7 @@ build/paper/deepuwb.mcap:
 
 $(PAPER)/firmware.json: $(wildcard firmware/src/*.[ch] firmware/src/cortex_m4/* uwb_mitigation/firmware_export/*.py)
 	@echo "2 of 4: the firmware in an emulator"; mkdir -p $(@D)
-	@$(VENV)/bin/uwb-mitigation bench firmware $(if $(QUICK),--inputs 200 --no-portable) --json $@
+	@$(VENV)/bin/python -m benchmarks firmware $(if $(QUICK),--inputs 200 --no-portable) --json $@
 
 # After the bench, which says at once if its tools are not there.
 $(PAPER)/models/protocol.json: $(subst $(space),\ ,$(PAPER_DATA)) | $(PAPER)/firmware.json

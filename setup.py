@@ -88,7 +88,6 @@ setup(
         # What `backend:=firmware` compiles; the boards and the sketch need a checkout.
         (f"share/{PACKAGE}/firmware/src", files("firmware/src", "*.c", "*.h")),
         (f"share/{PACKAGE}/firmware/host", files("firmware/host", "*.c")),
-        (f"share/{PACKAGE}/firmware/dw1000_model", files("firmware/dw1000_model", "*.c", "*.h")),
     ],
     install_requires=required("runtime"),
     extras_require={

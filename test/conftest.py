@@ -17,7 +17,7 @@ from browser import Browser, chromium
 from hypothesis import HealthCheck, settings
 from real_logs import Reading, read_once
 
-from uwb_mitigation.dw1000_model.air import Air
+from benchmarks.dw1000_model.air import Air
 
 if TYPE_CHECKING:
     from ros_harness import Ros

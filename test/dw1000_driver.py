@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from uwb_mitigation.dw1000_model.air import ANTENNA_DELAY_TICKS, Air, Chip, Host
-from uwb_mitigation.dw1000_model.links import Link
+from benchmarks.dw1000_model.air import ANTENNA_DELAY_TICKS, Air, Chip, Host
+from benchmarks.dw1000_model.links import Link
 
 SLOW_HZ, FAST_HZ = 2_000_000, 16_000_000
 WRAP = 1 << 40

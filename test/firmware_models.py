@@ -12,8 +12,8 @@ import model_material
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.benches import random_networks
-from uwb_mitigation.benches.firmware_cost import Network, network_of
+from benchmarks import random_networks
+from benchmarks.firmware import Network, network_of
 from uwb_mitigation.firmware_export.export import golden_windows, write_header
 from uwb_mitigation.firmware_export.header import Golden, ModelConstants
 from uwb_mitigation.firmware_export.packing import pack

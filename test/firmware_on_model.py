@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from uwb_mitigation.dw1000_model.air import Host
+from benchmarks.dw1000_model.air import Host
 from uwb_mitigation.link.radio import RadioSettings
 from uwb_mitigation.measurement import RangeMeasurement
 from uwb_mitigation.radio import host as firmware

@@ -12,7 +12,7 @@ import pytest
 import yaml
 from compilers import NEEDS_CC
 
-from uwb_mitigation.dw1000_model.evb1000 import EmulatedEvb1000s
+from benchmarks.dw1000_model.evb1000 import EmulatedEvb1000s
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.link.layout import Role
 from uwb_mitigation.link.radio import RadioSettings

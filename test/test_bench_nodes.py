@@ -14,9 +14,9 @@ pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 from ros_harness import Ros
 from uwb_mitigation_msgs.msg import RangeCorrected
 
-from uwb_mitigation.benches import nodes, viewer, vitals
-from uwb_mitigation.benches.nodes import RANGES, RATES_HZ, Figures, Latency, Subject, missing_between
-from uwb_mitigation.commands.bench_nodes import _as_json, ratios_of
+from benchmarks import nodes, viewer
+from benchmarks.__main__ import nodes_result
+from benchmarks.nodes import RANGES, RATES_HZ, Figures, Latency, Subject, missing_between
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.measurement import Status
 from uwb_mitigation.mitigation import Mitigation, correct_batch
@@ -57,21 +57,18 @@ def figures(rate_hz: float, p99: float) -> Figures:
     return Figures([rate_hz, 2 * rate_hz, 3 * rate_hz], latency, 50.0, 90.0, 70.0)
 
 
-def test_ratios_compare_medians_and_latencies():
+def test_the_result_has_the_documented_keys_and_ratios_of_medians():
     of = {"relay": figures(1000, 300.0), "mitigator": figures(800, 400.0), "pipeline": figures(2000, 200.0)}
-    assert ratios_of(of) == {
+    result = json.loads(json.dumps(nodes_result(of)))
+    assert result["ratios"] == {
         "mitigator_rate_over_relay": 0.8,
         "pipeline_rate_over_mitigator": 2.5,
         "added_p99_us_at_500_hz": 100.0,
     }
-
-
-def test_the_result_has_the_documented_keys():
-    result = json.loads(json.dumps(_as_json(figures(1000, 300.0))))
-    assert result["max_lossless_rate_hz"] == 2000
-    assert set(result["latency_us"]) == {"100", "500", "1000"}
-    assert set(result["latency_us"]["500"]) == {"p50", "p99", "max"}
-    assert result["cpu_us_per_message"] == 50.0
+    assert result["relay"]["max_lossless_rate_hz"] == 2000
+    assert set(result["relay"]["latency_us"]) == {"100", "500", "1000"}
+    assert set(result["relay"]["latency_us"]["500"]) == {"p50", "p99", "max"}
+    assert result["relay"]["cpu_us_per_message"] == 50.0
 
 
 def test_a_subject_is_measured_at_a_rate_it_can_keep(own_domain: None):
@@ -88,7 +85,7 @@ def test_a_subject_is_measured_at_a_rate_it_can_keep(own_domain: None):
         subject.processes[0].kill()
         subject.processes[0].wait()
         with pytest.raises(UwbMitigationError, match="has ended"):
-            vitals.look(pid)
+            nodes.vitals_of(pid)
         with pytest.raises(UwbMitigationError, match="driver does not answer"):
             subject.play(100.0)
 
@@ -112,7 +109,7 @@ def test_the_viewers_costs_are_measured(own_domain: None, monkeypatch: pytest.Mo
 
 def test_a_soak_tells_what_the_processes_took(own_domain: None, tmp_path: Path):
     result = tmp_path / "soak.json"
-    command = [sys.executable, "-m", "uwb_mitigation.commands.cli", "bench", "soak", "--one-process"]
+    command = [sys.executable, "-m", "benchmarks", "soak", "--one-process"]
     command += ["--messages", "1500", "--rate", "1000", "--json", str(result)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=240, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -128,7 +125,7 @@ def test_a_soak_tells_what_the_processes_took(own_domain: None, tmp_path: Path):
 def test_without_ros_the_bench_says_what_is_missing(tmp_path: Path):
     (tmp_path / "rclpy.py").write_text("raise ModuleNotFoundError('no rclpy here', name='rclpy')\n")
     done = subprocess.run(
-        [sys.executable, "-m", "uwb_mitigation.commands.cli", "bench", "nodes"],
+        [sys.executable, "-m", "benchmarks", "nodes"],
         env={"PYTHONPATH": f"{tmp_path}:{Path(__file__).parent.parent}", "COLUMNS": "160"},
         capture_output=True,
         text=True,
@@ -136,5 +133,5 @@ def test_without_ros_the_bench_says_what_is_missing(tmp_path: Path):
         check=False,
     )
     assert done.returncode == 1
-    assert "needs ROS 2" in done.stderr
+    assert "ROS 2 is not set up" in done.stderr
     assert "Traceback" not in done.stderr

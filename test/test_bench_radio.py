@@ -1,14 +1,15 @@
-"""`uwb-mitigation bench radio`: the soak, and its results for machines."""
+"""The soak of modelled radios, and the benchmark's result for programs."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
 
-from command_line import run
 from compilers import NEEDS_CC
+from typer.testing import CliRunner
 
-from uwb_mitigation.benches import radio
+from benchmarks import __main__ as benchmarks
+from benchmarks import radio
 
 pytestmark = NEEDS_CC
 
@@ -25,21 +26,10 @@ def test_no_range_of_a_soak_is_wrong_and_every_chip_is_back_within_a_second():
     assert sum(soaked.lost.values()) + soaked.delivered >= soaked.exchanges - 1
 
 
-def test_the_bench_writes_what_it_measured(tmp_path: Path):
+def test_the_benchmark_writes_what_it_measured(tmp_path: Path):
     output = tmp_path / "radio.json"
-    run(
-        "bench",
-        "radio",
-        "--seconds",
-        "0.5",
-        "--exchanges",
-        "300",
-        "--evb1000",
-        "0",
-        "--json",
-        output,
-        folder=tmp_path,
-    )
+    arguments = ["radio", "--seconds", "0.5", "--exchanges", "300", "--evb1000", "0", "--json", str(output)]
+    assert CliRunner().invoke(benchmarks.app, arguments, catch_exceptions=False).exit_code == 0
     result = json.loads(output.read_text())
     assert len(result["ranging"]) == 25
     for row in result["ranging"]:

@@ -15,6 +15,7 @@ import sys
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import generated
 import pytest
@@ -26,6 +27,7 @@ from test_launch import generate as generate
 from test_launch import launch
 from typer.testing import CliRunner
 
+from benchmarks import __main__ as benchmarks
 from uwb_mitigation.commands import cli
 from uwb_mitigation.commands import view as view_command
 from uwb_mitigation.errors import RecordingError
@@ -94,7 +96,7 @@ NODES = {
 BLOCK = re.compile(r"^(?:```(?:console|sh|bash)?\n(.*?)^```|((?:    .*\n|\n)+))", re.MULTILINE | re.DOTALL)
 # The name of a node begins lines of drawings, too.
 COMMAND = re.compile(
-    r"\s*(?:\.venv/bin/)?(?:(?:uwb-mitigation|make|ros2) |(?:driver|mitigator|pipeline) --ros)"
+    r"\s*(?:\.venv/bin/)?(?:(?:uwb-mitigation|make|ros2|python -m benchmarks) |(?:driver|mitigator|pipeline) --ros)"
 )
 
 
@@ -120,7 +122,15 @@ def lines_of(*start: str) -> list:
 
 @pytest.mark.parametrize("words", lines_of("uwb-mitigation"))
 def test_a_command_that_is_typed_exists_with_its_options(words: list[str]):
-    command = typer.main.get_command(cli.app)
+    check_options(typer.main.get_command(cli.app), words)
+
+
+@pytest.mark.parametrize("words", lines_of("python", "-m", "benchmarks"))
+def test_a_benchmark_that_is_typed_exists_with_its_options(words: list[str]):
+    check_options(typer.main.get_command(benchmarks.app), words)
+
+
+def check_options(command: Any, words: list[str]) -> None:
     while hasattr(command, "commands"):
         assert words[0] in command.commands
         command, words = command.commands[words[0]], words[1:]

@@ -10,8 +10,8 @@ import pytest
 from compilers import NEEDS_CC
 from dw1000_driver import DATA, RXFCG, TXSTRT, WAIT4RESP, Mode, exchange, pair
 
-from uwb_mitigation.dw1000_model.air import Air
-from uwb_mitigation.dw1000_model.links import Link, link_of
+from benchmarks.dw1000_model.air import Air
+from benchmarks.dw1000_model.links import Link, link_of
 from uwb_mitigation.sources.simulated import SimulatedSurvey
 
 pytestmark = NEEDS_CC

@@ -16,8 +16,8 @@ import serial
 from compilers import NEEDS_CC
 from dw1000_driver import DATA, HPDWARN, RXFCG, TICK_M, TICK_S, TXFRS, TXPUTE, WRAP, Driver
 
-from uwb_mitigation.dw1000_model.evb1000 import EmulatedEvb1000s
-from uwb_mitigation.dw1000_model.usb2spi import FAST_HZ, SLOW_HZ, STALE, Bridge
+from benchmarks.dw1000_model.evb1000 import EmulatedEvb1000s
+from benchmarks.dw1000_model.usb2spi import FAST_HZ, SLOW_HZ, STALE, Bridge
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.sources.simulated import SimulatedSource
 
@@ -288,7 +288,7 @@ def test_the_command_prints_its_ports_unplugs_on_a_signal_and_ends(tmp_path: Pat
     command = [
         sys.executable,
         "-m",
-        "uwb_mitigation.commands.cli",
+        "benchmarks",
         "emulate-evb1000",
         "--boards",
         "3",
@@ -320,7 +320,7 @@ def test_the_command_prints_its_ports_unplugs_on_a_signal_and_ends(tmp_path: Pat
     ],
 )
 def test_the_command_refuses_in_one_line(options: list[str], told: str):
-    command = [sys.executable, "-m", "uwb_mitigation.commands.cli", "emulate-evb1000", *options]
+    command = [sys.executable, "-m", "benchmarks", "emulate-evb1000", *options]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=240)
     assert done.returncode == 1
     assert told in done.stderr

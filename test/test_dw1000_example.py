@@ -10,7 +10,7 @@ import pytest
 from compilers import NEEDS_CC
 from conftest import REPOSITORY
 
-from uwb_mitigation.dw1000_model.library import model_folder, model_objects
+from benchmarks.dw1000_model.library import model_folder, model_objects
 from uwb_mitigation.firmware_export.compiling import WARNINGS, c_compiler, run
 
 pytestmark = NEEDS_CC

@@ -10,8 +10,8 @@ import pytest
 from compilers import NEEDS_CC
 from dw1000_driver import Driver, Mode, exchange, flight_ticks, pair
 
-from uwb_mitigation.dw1000_model.air import Air
-from uwb_mitigation.dw1000_model.links import Link
+from benchmarks.dw1000_model.air import Air
+from benchmarks.dw1000_model.links import Link
 
 pytestmark = NEEDS_CC
 

@@ -15,9 +15,9 @@ import pytest
 from compilers import NEEDS_CC
 from dw1000_driver import DATA, RX_GOOD, RXFCG, RXRFTO, Driver, exchange, pair
 
-from uwb_mitigation.dw1000_model.air import Air, Host
-from uwb_mitigation.dw1000_model.library import model_folder
-from uwb_mitigation.dw1000_model.links import Link, link_of
+from benchmarks.dw1000_model.air import Air, Host
+from benchmarks.dw1000_model.library import model_folder
+from benchmarks.dw1000_model.links import Link, link_of
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.firmware_export.compiling import WARNINGS, c_compiler, firmware_folder, run
 from uwb_mitigation.measurement import Cir, Encoding, RangeMeasurement, Truth

@@ -7,7 +7,7 @@ import pytest
 from compilers import NEEDS_CC
 from dw1000_driver import Driver, Mode, double_buffered, exchange, flight_ticks, pair, send_whole
 
-from uwb_mitigation.dw1000_model.air import Air
+from benchmarks.dw1000_model.air import Air
 
 pytestmark = NEEDS_CC
 

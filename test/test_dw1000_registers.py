@@ -7,7 +7,7 @@ import pytest
 from compilers import NEEDS_CC
 from dw1000_driver import Driver, pair
 
-from uwb_mitigation.dw1000_model.air import Air, Chip
+from benchmarks.dw1000_model.air import Air, Chip
 
 pytestmark = NEEDS_CC
 

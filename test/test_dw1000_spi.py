@@ -9,8 +9,8 @@ from compilers import NEEDS_CC
 from dw1000_driver import TICK_M, WRAP
 from spidev_on_model import dw1000, program, replace_spidev
 
-from uwb_mitigation.dw1000_model.air import Air, Host
-from uwb_mitigation.dw1000_model.links import Link
+from benchmarks.dw1000_model.air import Air, Host
+from benchmarks.dw1000_model.links import Link
 
 pytestmark = NEEDS_CC
 

@@ -14,8 +14,8 @@ from dw1000_driver import TICK_M, TXDLYS, TXSTRT, WAIT4RESP, WRAP
 from firmware_on_model import REPLY_US, ranging, use_virtual_time
 from spidev_on_model import dw1000, program, replace_spidev
 
-from uwb_mitigation.dw1000_model.air import ANTENNA_DELAY_TICKS, Air, Host
-from uwb_mitigation.dw1000_model.links import Link
+from benchmarks.dw1000_model.air import ANTENNA_DELAY_TICKS, Air, Host
+from benchmarks.dw1000_model.links import Link
 from uwb_mitigation.link.layout import Role
 from uwb_mitigation.link.radio import RadioSettings
 from uwb_mitigation.measurement import RangeMeasurement

@@ -57,7 +57,7 @@ def test_help_tells_every_parameter_where_there_is_no_ros(node: str, tmp_path: P
         ("driver", signal.SIGTERM),
         ("monitor", signal.SIGINT),
         ("command_line", signal.SIGINT),
-        ("radio-demo", signal.SIGINT),
+        ("firmware-demo", signal.SIGINT),
     ],
 )
 def test_a_signal_while_an_executable_still_loads_ends_it_at_once(

@@ -20,7 +20,8 @@ import numpy as np
 import pytest
 from firmware_models import Exported
 
-from uwb_mitigation.benches import firmware_cost, random_networks
+from benchmarks import firmware as firmware_cost
+from benchmarks import random_networks
 from uwb_mitigation.firmware_export import emulator, toolchain
 from uwb_mitigation.firmware_export.compiling import WARNINGS, firmware_folder, run
 from uwb_mitigation.firmware_export.emulated_firmware import EmulatedFirmware, window_of

@@ -11,7 +11,7 @@ import model_material
 import numpy as np
 import pytest
 
-from uwb_mitigation.benches import random_networks
+from benchmarks import random_networks
 from uwb_mitigation.errors import ModelError, UwbMitigationError
 from uwb_mitigation.firmware_export import header
 from uwb_mitigation.firmware_export.export import export_bundle

@@ -15,7 +15,7 @@ import pytest
 from compilers import NEEDS_CC, NEEDS_CXX
 from firmware_models import Exported
 
-from uwb_mitigation.benches import random_networks
+from benchmarks import random_networks
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.firmware_export.compiling import firmware_folder, run
 from uwb_mitigation.firmware_export.export import export_bundle

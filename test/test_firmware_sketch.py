@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from compilers import NEEDS_CXX
 
-from uwb_mitigation.dw1000_model.library import model_folder, model_objects
+from benchmarks.dw1000_model.library import model_folder, model_objects
 from uwb_mitigation.firmware_export.compiling import firmware_folder, run
 from uwb_mitigation.firmware_export.export import export_bundle
 from uwb_mitigation.firmware_export.host import library_objects

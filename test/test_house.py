@@ -81,7 +81,7 @@ def test_the_doctor_comes_even_where_numpy_does_not():
     [
         ("numpy", ("process", "in.mcap", "-o", "out.mcap")),
         ("onnx", ("export-c", "-o", "/nowhere")),
-        ("cobs", ("bench", "link")),
+        ("cobs", ("emulate-board", "--duration", "1")),
     ],
 )
 def test_a_command_that_misses_a_package_says_so_in_one_line(package: str, words: tuple[str, ...]):

@@ -64,11 +64,7 @@ def test_shared_files_are_those_of_the_sources(share: Path, folder: str):
 
 
 def test_the_firmware_that_a_computer_compiles_is_shared(share: Path):
-    library = [
-        path
-        for part in ("src", "host", "dw1000_model")
-        for path in (REPOSITORY / "firmware" / part).glob("*.[ch]")
-    ]
+    library = [path for part in ("src", "host") for path in (REPOSITORY / "firmware" / part).glob("*.[ch]")]
     expected = {f"{path.parent.name}/{path.name}": path.read_bytes() for path in library}
     assert files_below(share / "firmware") == expected
 

@@ -223,7 +223,7 @@ def test_through_a_damaging_channel_what_arrives_intact_is_delivered_and_nothing
 
 
 def test_every_intact_frame_and_no_other_comes_through_a_damaging_channel():
-    # `uwb-mitigation bench link --frames 1000000` sends more of them.
+    # `python -m benchmarks link --frames 1000000` sends more of them.
     result = loopback(150_000, ByteFaults(2e-4, 2e-4, 2e-4), payload_bytes=300, seed=12)
 
     assert result.sent == 150_000

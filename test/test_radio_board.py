@@ -7,7 +7,8 @@ import itertools
 import pytest
 from compilers import NEEDS_CC
 
-from uwb_mitigation.dw1000_model.links import Link
+from benchmarks.dw1000_model.boards import Line, ModelledAir
+from benchmarks.dw1000_model.links import Link
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.link import messages
 from uwb_mitigation.link.board import Board, Identity
@@ -16,7 +17,6 @@ from uwb_mitigation.link.layout import RadioState, Role
 from uwb_mitigation.link.radio import Radio, RadioSettings, RadioStatus, SetRadio
 from uwb_mitigation.link.session import BoardSession
 from uwb_mitigation.measurement import RangeMeasurement
-from uwb_mitigation.radio.modelled import Line, ModelledAir
 
 pytestmark = NEEDS_CC
 

@@ -17,7 +17,7 @@ pytestmark = [
     NEEDS_CC,
 ]
 
-COMMAND = [sys.executable, "-m", "uwb_mitigation.entry", "radio-demo", "--seconds"]
+COMMAND = [sys.executable, "-m", "benchmarks", "radio-demo", "--seconds"]
 
 
 def test_each_anchor_ranges_and_the_demo_ends_well():
@@ -46,9 +46,7 @@ def test_ctrl_c_ends_it_with_its_nodes():
 
 
 def test_without_a_range_it_says_so_and_fails():
-    program = (
-        "from uwb_mitigation.demos import radio_demo as d; d.PATIENCE_S = 0.1; d.typer.run(d.radio_demo)"
-    )
+    program = "from benchmarks import radio_demo as d; d.PATIENCE_S = 0.1; raise SystemExit(d.main(1.0))"
     command = [sys.executable, "-c", program]
     done = subprocess.run(command, capture_output=True, text=True, timeout=240, check=False)
     assert done.returncode == 1

@@ -16,15 +16,15 @@ from compilers import NEEDS_CC
 from diagnostic_msgs.msg import DiagnosticStatus
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
-from uwb_mitigation.dw1000_model.evb1000 import EmulatedEvb1000s
-from uwb_mitigation.dw1000_model.links import Link
+from benchmarks.dw1000_model.boards import Line, ModelledAir
+from benchmarks.dw1000_model.evb1000 import EmulatedEvb1000s
+from benchmarks.dw1000_model.links import Link
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.link.emulated_board import EmulatedBoard
 from uwb_mitigation.link.layout import Role
 from uwb_mitigation.link.radio import RadioSettings
 from uwb_mitigation.nodes.parameter_tables import DRIVER
 from uwb_mitigation.nodes.radio_feed import open_radios, settings_of
-from uwb_mitigation.radio.modelled import Line, ModelledAir
 from uwb_mitigation.sources.simulated import SimulatedSource
 
 pytestmark = [

@@ -11,8 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from uwb_mitigation.dw1000_model.library import Request
-from uwb_mitigation.dw1000_model.links import Link
+from benchmarks.dw1000_model.boards import ModelledAir
+from benchmarks.dw1000_model.library import Request
+from benchmarks.dw1000_model.links import Link
 from uwb_mitigation.firmware_export import toolchain
 from uwb_mitigation.firmware_export.compiling import c_compiler, firmware_folder, run
 from uwb_mitigation.firmware_export.host import library_objects
@@ -22,7 +23,6 @@ from uwb_mitigation.link.framing import FrameDecoder
 from uwb_mitigation.link.layout import Role
 from uwb_mitigation.link.radio import RadioSettings
 from uwb_mitigation.measurement import RangeMeasurement
-from uwb_mitigation.radio.modelled import ModelledAir
 
 pytestmark = pytest.mark.skipif(bool(toolchain.missing_tools()), reason=toolchain.APT)
 

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from compilers import NEEDS_CC
 
-from uwb_mitigation.dw1000_model.links import Link
+from benchmarks.dw1000_model import boards as modelled
+from benchmarks.dw1000_model.boards import Line, ModelledAir
+from benchmarks.dw1000_model.links import Link
 from uwb_mitigation.link.layout import Mode, Role
 from uwb_mitigation.link.radio import PREAMBLES, RadioSettings
-from uwb_mitigation.radio import modelled, structures
-from uwb_mitigation.radio.modelled import Line, ModelledAir
+from uwb_mitigation.radio import structures
 
 pytestmark = NEEDS_CC
 

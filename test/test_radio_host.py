@@ -20,8 +20,8 @@ import serial
 from compilers import NEEDS_CC
 from conftest import REPOSITORY
 
-from uwb_mitigation.dw1000_model.air import Air, Chip
-from uwb_mitigation.dw1000_model.evb1000 import ROUND_TRIP_S, EmulatedEvb1000s
+from benchmarks.dw1000_model.air import Air, Chip
+from benchmarks.dw1000_model.evb1000 import ROUND_TRIP_S, EmulatedEvb1000s
 from uwb_mitigation.errors import LinkError, MissingDependencyError, ParameterError
 from uwb_mitigation.link.layout import RadioState, Role
 from uwb_mitigation.link.port import PortAddress

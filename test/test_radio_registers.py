@@ -10,8 +10,8 @@ import pytest
 from compilers import NEEDS_CC
 from firmware_on_model import ModelBus, ranging, use_virtual_time
 
-from uwb_mitigation.dw1000_model.air import Air, Chip, Host
-from uwb_mitigation.dw1000_model.links import Link
+from benchmarks.dw1000_model.air import Air, Chip, Host
+from benchmarks.dw1000_model.links import Link
 from uwb_mitigation.errors import LinkError
 from uwb_mitigation.link.layout import RadioState, Role
 from uwb_mitigation.link.radio import RadioSettings, RadioStatus

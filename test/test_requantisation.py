@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from uwb_mitigation.benches import random_networks
+from benchmarks import random_networks
 from uwb_mitigation.errors import ModelError
 from uwb_mitigation.firmware_export.packing import pack
 from uwb_mitigation.model import requantisation

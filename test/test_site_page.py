@@ -110,7 +110,11 @@ def terminals(tmp_path: Path, ros: Ros) -> Iterator[Terminals]:
     tools.mkdir()
     folder.mkdir()
     stand_in = Path(__file__).with_name("ros2_stand_in.py")
-    for name, what in (("uwb-mitigation", "-m uwb_mitigation.commands.cli"), ("ros2", f'"{stand_in}"')):
+    for name, what in (
+        ("uwb-mitigation", "-m uwb_mitigation.commands.cli"),
+        ("python", ""),
+        ("ros2", f'"{stand_in}"'),
+    ):
         (tools / name).write_text(f'#!/bin/sh\nexec "{sys.executable}" {what} "$@"\n')
         (tools / name).chmod(0o755)
     environment = os.environ | {

@@ -260,7 +260,7 @@ def test_a_bag_of_a_real_run_keeps_its_stamps_and_anchors(hanyang: Path, tmp_pat
 
 @pytest.mark.slow
 def test_real_drives_meet_what_the_documentation_says(hanyang: Path):
-    from uwb_mitigation.benches import positions
+    from benchmarks import positions
 
     runs = [positions.hanyang(folder) for folder in sorted(hanyang.glob("*_*"))]
     assert len(runs) == 6
@@ -278,7 +278,7 @@ def test_real_drives_meet_what_the_documentation_says(hanyang: Path):
 
 
 def test_real_tags_at_rest_are_placed_by_the_line_of_the_others(apartment: Path):
-    from uwb_mitigation.benches import positions
+    from benchmarks import positions
 
     found = positions.apartment(apartment)
     assert found.tags == 5
@@ -288,7 +288,7 @@ def test_real_tags_at_rest_are_placed_by_the_line_of_the_others(apartment: Path)
 
 
 def test_corrected_ranges_halve_the_error_in_the_simulated_flat():
-    from uwb_mitigation.benches import positions
+    from benchmarks import positions
 
     found = positions.flat(6, ranges=2000)
     assert found.corrected.live.rmse < 0.5 * found.raw.snapshot.rmse

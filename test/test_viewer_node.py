@@ -17,7 +17,7 @@ from lifecycle_msgs.msg import Transition
 from uwb_mitigation_msgs.msg import RangeCorrected
 from visualization_msgs.msg import MarkerArray
 
-from uwb_mitigation.benches.visitors import Visitors
+from benchmarks.visitors import Visitors
 from uwb_mitigation.nodes import topics
 
 pytestmark = pytest.mark.ros

@@ -14,7 +14,7 @@ import pytest
 from bokeh.document import Document
 from browser import Browser
 
-from uwb_mitigation.benches.visitors import Visitors
+from benchmarks.visitors import Visitors
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.measurement import Cir, Encoding, Status
 from uwb_mitigation.viewer.page import Page

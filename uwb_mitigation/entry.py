@@ -13,7 +13,7 @@ from collections.abc import Callable
 from typing import Any
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-_DEMOS = {"demo": "replay", "firmware-demo": "firmware_demo", "radio-demo": "radio_demo"}
+_DEMOS = {"demo": "replay", "firmware-demo": "firmware_demo"}
 
 
 def driver() -> None:

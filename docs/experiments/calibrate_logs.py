@@ -1,8 +1,8 @@
 """Calibration without truth on real recordings, whose truth then tells what it brought.
 
-    python docs/experiments/calibrate_logs.py hanyang ../shared/data/hanyang_outdoor LOS_A1
-    python docs/experiments/calibrate_logs.py apartment ../shared/data/evk1000_apartment
-    python docs/experiments/calibrate_logs.py harm ../shared/data/hanyang_outdoor
+    PYTHONPATH=. python docs/experiments/calibrate_logs.py hanyang ../shared/data/hanyang_outdoor LOS_A1
+    PYTHONPATH=. python docs/experiments/calibrate_logs.py apartment ../shared/data/evk1000_apartment
+    PYTHONPATH=. python docs/experiments/calibrate_logs.py harm ../shared/data/hanyang_outdoor
 
 `harm` calibrates each run and both halves of it without ground truth, and compares the ranges and the live track of the same
 ranges with ground truth: raw, and corrected with the written bundle and offsets.
@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from uwb_mitigation.benches.positions import LAG_S, at_truths, hanyang_run
+from benchmarks.positions import LAG_S, at_truths, hanyang_run
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.evaluation.site_data import gather
 from uwb_mitigation.measurement import Record

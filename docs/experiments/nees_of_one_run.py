@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from uwb_mitigation.benches.positions import HEIGHT, at_truths, hanyang_run
+from benchmarks.positions import HEIGHT, at_truths, hanyang_run
 from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.locator import TagLocator, run_live
 from uwb_mitigation.positioning.model import Model

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from uwb_mitigation.benches.positions import HEIGHT, at_truths, hanyang_run
+from benchmarks.positions import HEIGHT, at_truths, hanyang_run
 from uwb_mitigation.positioning.locator import TagLocator, run_live
 from uwb_mitigation.positioning.model import Model
 from uwb_mitigation.positioning.track_errors import TrackErrors

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from uwb_mitigation.benches.positions import HEIGHT, hanyang_run
+from benchmarks.positions import HEIGHT, hanyang_run
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.survey import displacements, survey
 

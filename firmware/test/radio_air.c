@@ -1,5 +1,5 @@
 /* Boards with the firmware's exchange on modelled chips, behind functions that are easy to call from another language:
- * for the tests and for `uwb-mitigation bench radio`. Time is virtual. */
+ * for the tests and for `python -m benchmarks radio`. Time is virtual. */
 #include <stdlib.h>
 #include <string.h>
 

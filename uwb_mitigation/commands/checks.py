@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib import import_module
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -36,20 +34,6 @@ def needs_torch() -> Iterator[None]:
         if error.name != "torch":
             raise
         raise MissingDependencyError("training needs torch", valid="run `make setup-training`") from error
-
-
-def import_bench(name: str) -> ModuleType:
-    """A module of `benches` that runs nodes.
-
-    Raises:
-        MissingDependencyError: there is no ROS.
-    """
-    try:
-        return import_module(f"uwb_mitigation.benches.{name}")
-    except ModuleNotFoundError as error:
-        raise MissingDependencyError(
-            f"this needs ROS 2: {error}", valid="run `make setup`, or source ROS's setup.sh"
-        ) from error
 
 
 def check_output(output: Path) -> None:

@@ -14,15 +14,10 @@ from typer.core import TyperGroup
 import uwb_mitigation
 from uwb_mitigation.commands import (
     antenna_delay,
-    bench_locator,
-    bench_nodes,
-    bench_radio,
-    bench_serial,
     calibrate,
     console,
     data,
     doctor,
-    evb1000,
     firmware,
     link,
     model,
@@ -34,15 +29,6 @@ from uwb_mitigation.commands import (
     view,
 )
 from uwb_mitigation.errors import UwbMitigationError, not_imported
-
-bench = typer.Typer(help="Measure what the parts of the system can do.", no_args_is_help=True)
-bench.command("nodes")(bench_nodes.bench_nodes)
-bench.command("locator")(bench_locator.bench_locator)
-bench.command("soak")(bench_nodes.bench_soak)
-bench.command("serial")(bench_serial.bench_serial)
-bench.command("link")(link.bench_link)
-bench.command("radio")(bench_radio.bench_radio)
-bench.command("firmware")(firmware.bench_firmware)
 
 PANELS: dict[str, dict[str, typer.Typer | Callable[..., None]]] = {
     "Recordings": {
@@ -65,16 +51,14 @@ PANELS: dict[str, dict[str, typer.Typer | Callable[..., None]]] = {
     "Boards": {
         "antenna-delay": antenna_delay.antenna_delay,
         "emulate-board": link.emulate_board,
-        "emulate-evb1000": evb1000.emulate_evb1000,
         "export-c": firmware.export_c,
         "build-image": firmware.build_image,
     },
     "The paper": {
         "paper": paper.app,
     },
-    "Installation and speed": {
+    "Installation": {
         "doctor": doctor.doctor,
-        "bench": bench,
     },
 }
 """Every command where `--help` and docs/commands.md show it: a new one is a line here, and what it says there

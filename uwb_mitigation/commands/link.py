@@ -1,4 +1,4 @@
-"""`uwb-mitigation emulate-board` and `bench link`: a board without hardware, and what the link stands."""
+"""`uwb-mitigation emulate-board`: a board without hardware."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from uwb_mitigation.commands import console
-from uwb_mitigation.commands.console import JsonOption, Table
+from uwb_mitigation.commands.console import JsonOption
 from uwb_mitigation.errors import ParameterError
 
 if TYPE_CHECKING:
@@ -17,9 +17,6 @@ if TYPE_CHECKING:
     from uwb_mitigation.link.emulated_board import EmulatedBoard
     from uwb_mitigation.mitigation import Mitigation
     from uwb_mitigation.sources.source import Source
-
-_LINE_BAUD = 921_600
-_BITS_PER_BYTE = 10
 
 
 def emulate_board(
@@ -81,47 +78,6 @@ def emulate_board(
     console.write_json(json, {"sent": board.sent_measurements})
     if board.failure is not None:
         raise board.failure
-
-
-def bench_link(
-    frames: Annotated[int, typer.Option(help="Frames to send.")] = 200_000,
-    damage: Annotated[float, typer.Option(help="Share of bytes flipped, dropped, inserted, each.")] = 1e-4,
-    seed: Annotated[int, typer.Option(help="Of payloads and damage.")] = 0,
-    json: JsonOption = None,
-) -> None:
-    """Frames through a damaging channel: losses, decoder speed."""
-    from uwb_mitigation.link.faults import ByteFaults, loopback
-
-    if frames < 1:
-        raise ParameterError(f"frames = {frames}", valid="1 or more")
-    if seed < 0:
-        raise ParameterError(f"seed = {seed}", valid="0 or more")
-    with console.progress() as bar:
-        task = bar.add_task("sending", total=frames)
-        result = loopback(
-            frames,
-            ByteFaults(damage, damage, damage),
-            seed=seed,
-            advance=lambda done: bar.update(task, completed=done),
-        )
-    table = Table("frames", "", title=f"link, {damage:g} of bytes flipped, dropped, inserted")
-    for name in ("sent", "intact", "delivered", "lost", "intact_lost", "corrupt_delivered"):
-        table.add_row(name.replace("_", " "), f"{getattr(result, name)}")
-    table.add_row("decoder, MB/s on one core", f"{result.decoder_mb_per_s:.0f}")
-    table.add_row(f"line at {_LINE_BAUD} baud, MB/s", f"{_LINE_BAUD / _BITS_PER_BYTE / 1e6:.3f}")
-    console.out.print(table)
-    console.write_json(
-        json,
-        {
-            "sent": result.sent,
-            "intact": result.intact,
-            "delivered": result.delivered,
-            "lost": result.lost,
-            "intact_lost": result.intact_lost,
-            "corrupt_delivered": result.corrupt_delivered,
-            "decoder_mb_per_s": result.decoder_mb_per_s,
-        },
-    )
 
 
 def _keep_running(

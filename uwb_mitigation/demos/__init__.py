@@ -1,1 +1,1 @@
-"""What `make demo`, `make firmware-demo` and `make radio-demo` show: nodes as processes over real DDS."""
+"""What `make demo` and `make firmware-demo` show: nodes as processes over real DDS."""

@@ -1,4 +1,4 @@
-"""A node that looks at others from outside: what benches and demos subscribe and ask with."""
+"""A node that looks at others from outside: what benchmarks and demos subscribe and ask with."""
 
 from __future__ import annotations
 

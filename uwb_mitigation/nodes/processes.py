@@ -1,4 +1,4 @@
-"""Nodes as processes of their own, for the benches and demos that watch them from outside. No ROS here.
+"""Nodes as processes of their own, for the benchmarks and demos that watch them from outside. No ROS here.
 
 They end with the process that started them, however that ends.
 """

@@ -1,1 +1,1 @@
-"""The paper's experiment, tables and figures, with DeepUWB and its simulated stand-in. Only `commands` and `benches` import it."""
+"""The paper's experiment, tables and figures, with DeepUWB and its simulated stand-in. Only `commands` imports it."""

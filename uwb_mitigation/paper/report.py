@@ -132,7 +132,7 @@ def build(
 ) -> Report:
     """Return every table and figure that the data, the trainings and the firmware results allow."""
     train = f"uwb-mitigation paper protocol --data {shlex.quote(str(study.path))} -o models"
-    bench = "uwb-mitigation bench firmware --json firmware.json"
+    bench = "python -m benchmarks firmware --json firmware.json"
     lacking: dict[str, str] = {}
     shown, pictures = [_data_table(study)], [_samples(study)]
     on_step()

@@ -10,9 +10,8 @@ from statistics import median
 
 from uwb_mitigation_msgs.msg import RangeCorrected
 
-from uwb_mitigation.benches import vitals
-from uwb_mitigation.benches.nodes import Advance, Bench, Step, Subject, open_bench, searches, take_steps
-from uwb_mitigation.benches.visitors import Visitors
+from benchmarks.nodes import Advance, Bench, Step, Subject, open_bench, searches, take_steps, vitals_of
+from benchmarks.visitors import Visitors
 from uwb_mitigation.nodes import topics
 from uwb_mitigation.nodes.probe import wait
 
@@ -74,10 +73,10 @@ def measure(repeats: int, seconds: float, advance: Advance) -> ViewerCosts:
         def look(pages: int) -> None:
             with Visitors(url, pages):
                 time.sleep(_SETTLE_S)
-                before_s, began_s = vitals.look(pid).cpu_s, time.monotonic()
+                before_s, began_s = vitals_of(pid).cpu_s, time.monotonic()
                 time.sleep(seconds)
                 passed_s = time.monotonic() - began_s
-                core_share[pages] = (vitals.look(pid).cpu_s - before_s) / passed_s
+                core_share[pages] = (vitals_of(pid).cpu_s - before_s) / passed_s
 
         unwatched.play(RATE_HZ)
         looks: list[Step] = [

@@ -1,4 +1,4 @@
-"""`uwb-mitigation emulate-evb1000`: radios without hardware, behind the EVB1000's USB-to-SPI protocol."""
+"""`python -m benchmarks emulate-evb1000`: radios without hardware, behind the EVB1000's USB-to-SPI protocol."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from uwb_mitigation.commands.console import JsonOption
 from uwb_mitigation.errors import ParameterError
 
 if TYPE_CHECKING:
-    from uwb_mitigation.dw1000_model.evb1000 import EmulatedEvb1000s
+    from benchmarks.dw1000_model.evb1000 import EmulatedEvb1000s
     from uwb_mitigation.sources.source import Source
 
 _UNPLUGGED_S = 0.5
@@ -62,7 +62,7 @@ def emulate_evb1000(
     Modelled DW1000s behind the USB-to-SPI protocol of the factory's firmware, in wall-clock time: open the ports it
     prints as if they were /dev/ttyACM0 and so on. Emulated only: nothing of this was compared with a board.
     """
-    from uwb_mitigation.dw1000_model.evb1000 import CLEAN_M, EmulatedEvb1000s
+    from benchmarks.dw1000_model.evb1000 import CLEAN_M, EmulatedEvb1000s
 
     for name, value in (("duration", duration), ("unplug-every", unplug_every)):
         if value is not None and not value > 0:

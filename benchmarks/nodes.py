@@ -22,11 +22,11 @@ from pathlib import Path
 from statistics import median
 
 import numpy as np
+import psutil
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
 from uwb_mitigation.bag.codec import after_frame
 from uwb_mitigation.bag.writer import BagWriter
-from uwb_mitigation.benches import vitals
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.measurement import Record
 from uwb_mitigation.nodes import processes, relay, topics
@@ -48,6 +48,36 @@ _LOWEST_HZ, _STEP, _HALVINGS, _HIGHEST_HZ = 1000.0, 1.5, 3, 50_000.0
 _SEARCH_S = 12.0
 _STAMP = struct.Struct("<4xiII")
 _SEQUENCE = struct.Struct("<16xI")
+
+
+@dataclass(frozen=True, slots=True)
+class Vitals:
+    """Processor time so far, s, of all threads; resident memory, MB; open file descriptors; threads."""
+
+    cpu_s: float
+    memory_mb: float
+    descriptors: int
+    threads: int
+
+
+def vitals_of(pid: int) -> Vitals:
+    """Look at a process.
+
+    Raises:
+        UwbMitigationError: there is no such process.
+    """
+    try:
+        process = psutil.Process(pid)
+        with process.oneshot():
+            times = process.cpu_times()
+            return Vitals(
+                times.user + times.system,
+                process.memory_info().rss / 2**20,
+                process.num_fds(),
+                process.num_threads(),
+            )
+    except psutil.Error as error:
+        raise UwbMitigationError(f"process {pid} has ended", valid="its last words are above") from error
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,9 +194,9 @@ class Subject:
         self.trial(RECORDED_HZ, _TRIAL_S)
 
     def measure_latency(self, rate_hz: int, seconds: float) -> Latency:
-        before = [vitals.look(process.pid).cpu_s for process in self.processes]
+        before = [vitals_of(process.pid).cpu_s for process in self.processes]
         trial = self.trial(rate_hz, seconds)
-        after = [vitals.look(process.pid).cpu_s for process in self.processes]
+        after = [vitals_of(process.pid).cpu_s for process in self.processes]
         if not trial.received:
             raise UwbMitigationError(f"{self.name}: nothing arrives at {rate_hz} Hz")
         # Added up over slices: the system counts in hundredths of a second. The settling before, and the
@@ -316,7 +346,7 @@ def measure(repeats: int, slices: int, seconds: float, advance: Advance) -> dict
                     median(latency.p99 for latency in of_rate),
                     max(latency.max for latency in of_rate),
                 )
-            subject.figures.memory_mb = vitals.look(subject.processes[0].pid).memory_mb
+            subject.figures.memory_mb = vitals_of(subject.processes[0].pid).memory_mb
         return {subject.name: subject.figures for subject in subjects}
 
 
@@ -340,3 +370,79 @@ def take_steps(steps: Sequence[Step], advance: Advance) -> None:
         advance(name, done_s / whole_s)
         take()
         done_s += length_s
+
+
+_STALLED_S = 10.0
+LOOKS = 10
+"""The processes are looked at after each such part of the ranges. Allocators fill their pools in the first."""
+
+
+@dataclass(frozen=True, slots=True)
+class Usage:
+    """Of all processes together, after so many ranges."""
+
+    ranges: int
+    memory_mb: float
+    descriptors: int
+    threads: int
+
+
+@dataclass(frozen=True, slots=True)
+class Soaked:
+    """Of a soak.
+
+    Attributes:
+        received, lost: ranges that arrived corrected, and that are missing between them.
+        seconds: wall time.
+        course: what was taken after each tenth of the ranges, or once a second where that is longer.
+    """
+
+    received: int
+    lost: int
+    seconds: float
+    course: tuple[Usage, ...]
+
+
+def soak(messages: int, rate_hz: float, *, one_process: bool, advance: Callable[[int], None]) -> Soaked:
+    """Play `messages` ranges at `rate_hz`.
+
+    Args:
+        one_process: through the pipeline instead of two nodes.
+        advance: told how many have arrived.
+
+    Raises:
+        UwbMitigationError: a node did not start, has ended, or nothing arrives any more.
+    """
+    nodes = ("pipeline",) if one_process else ("mitigator", "driver")
+    with open_bench() as bench:
+        subject = Subject(bench, "soak", RangeCorrected, topics.RANGE_CORRECTED, *nodes)
+        pids = [process.pid for process in subject.processes]
+
+        def look(ranges: int) -> Usage:
+            seen = [vitals_of(pid) for pid in pids]
+            return Usage(
+                ranges,
+                sum(of.memory_mb for of in seen),
+                sum(of.descriptors for of in seen),
+                sum(of.threads for of in seen),
+            )
+
+        subject.forget()
+        subject.play(rate_hz)
+        began_s = moved_s = time.monotonic()
+        received = lost = 0
+        course: list[Usage] = []
+        while received < messages:
+            time.sleep(1.0)
+            arrived, missing = subject.count()
+            received, lost = received + arrived, lost + missing
+            if received * LOOKS >= messages * (len(course) + 1):
+                course.append(look(received))
+            if arrived:
+                moved_s = time.monotonic()
+            elif time.monotonic() - moved_s > _STALLED_S:
+                raise UwbMitigationError(f"nothing arrives any more after {received} ranges")
+            advance(received)
+        seconds = time.monotonic() - began_s
+        subject.pause()
+    return Soaked(received, lost, seconds, tuple(course))

@@ -16,21 +16,21 @@ import numpy as np
 import psutil
 from numpy.typing import NDArray
 
-from uwb_mitigation.dw1000_model.links import Link
+from benchmarks.dw1000_model.boards import Line, ModelledAir
+from benchmarks.dw1000_model.links import Link
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.link.layout import Mode, Role
 from uwb_mitigation.link.port import PortAddress
 from uwb_mitigation.link.radio import RadioSettings
 from uwb_mitigation.measurement import DEVICE_TIME_WRAP, RangeMeasurement
 from uwb_mitigation.radio.evb1000 import Evb1000Bus
-from uwb_mitigation.radio.modelled import Line, ModelledAir
 from uwb_mitigation.radio.port import RadioPort
 
 PPM_PAIRS = ((-20.0, 20.0), (-10.0, 10.0), (0.0, 0.0), (10.0, -10.0), (20.0, -20.0))
 DISTANCES_M = (0.3, 1.0, 5.01, 20.0, 100.0)
 
 INFERENCE_CYCLES = 458_934
-"""Estimated, of the shipped network with K = 157 (`bench firmware`)."""
+"""Estimated, of the shipped network with K = 157 (`python -m benchmarks firmware`)."""
 
 PROCESSOR_HZ = 64e6
 SPI_OVERHEAD_S = 10e-6
@@ -136,10 +136,9 @@ def evb1000_rate_hz(seconds: float) -> float:
 def _emulated(prefix: Path) -> Iterator[tuple[Path, Path]]:
     """Two EVB1000s in a process of their own, as boards would not take of this one's time."""
     paths = (Path(f"{prefix}0"), Path(f"{prefix}1"))
-    program = "from uwb_mitigation.entry import command_line; command_line()"
     # On a clean link: a simulator in that process would hold up the boards now and then.
     options = ("emulate-evb1000", "--link", str(prefix), "--distance", "5")
-    process = subprocess.Popen([sys.executable, "-c", program, *options], stdout=subprocess.DEVNULL)
+    process = subprocess.Popen([sys.executable, "-m", "benchmarks", *options], stdout=subprocess.DEVNULL)
     try:
         until = time.monotonic() + _STARTS_WITHIN_S
         while not all(path.exists() for path in paths):

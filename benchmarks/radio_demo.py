@@ -1,6 +1,6 @@
 """`make radio-demo`: the firmware's exchange on modelled DW1000s, through driver and mitigator over real ROS 2.
 
-python -m uwb_mitigation.entry radio-demo [--seconds S]
+python -m benchmarks radio-demo [--seconds S]
 
 A tag stands in the simulated flat, with four anchors; each is an emulated EVB1000 behind its USB-to-SPI protocol, in
 wall-clock time. What the chips measure, errors out of sight included, follows from the simulator's CIRs.
@@ -12,17 +12,15 @@ import math
 import time
 from collections import defaultdict
 from collections.abc import Mapping
-from typing import Annotated
 
 import numpy as np
-import typer
 from diagnostic_msgs.msg import DiagnosticArray
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 from uwb_mitigation_msgs.msg import RangeCorrected
 
-from uwb_mitigation.dw1000_model.evb1000 import EmulatedEvb1000s
+from benchmarks.dw1000_model.evb1000 import EmulatedEvb1000s
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.nodes import processes, topics
 from uwb_mitigation.nodes.monitor import REFRESH_HZ
@@ -138,23 +136,14 @@ def run(console: Console, seconds: float) -> int:
     return 1 if failed else 0
 
 
-def radio_demo(
-    seconds: Annotated[
-        float, typer.Option(min=0.0, max=3600.0, help="Of ranging, once each anchor has answered.")
-    ] = 15.0,
-) -> None:
-    """Let a tag range with four anchors on modelled chips, through driver and mitigator: raw, corrected, true."""
+def main(seconds: float) -> int:
+    """Run the demonstration and return its exit code."""
     processes.isolate()
     console = Console()
     try:
-        code = run(console, seconds)
+        return run(console, seconds)
     except UwbMitigationError as error:
         console.print(f"radio-demo: {error}", style="red", markup=False)
-        code = 1
+        return 1
     except KeyboardInterrupt:
-        code = 130
-    raise typer.Exit(code)
-
-
-def main() -> None:
-    typer.run(radio_demo)
+        return 130

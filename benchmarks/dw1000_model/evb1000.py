@@ -17,9 +17,9 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
-from uwb_mitigation.dw1000_model.air import ANTENNA_DELAY_TICKS, Air, Chip
-from uwb_mitigation.dw1000_model.links import Link, link_of
-from uwb_mitigation.dw1000_model.usb2spi import Bridge
+from benchmarks.dw1000_model.air import ANTENNA_DELAY_TICKS, Air, Chip
+from benchmarks.dw1000_model.links import Link, link_of
+from benchmarks.dw1000_model.usb2spi import Bridge
 from uwb_mitigation.errors import ParameterError, RecordingError, UwbMitigationError
 from uwb_mitigation.sources.source import Source
 

@@ -16,8 +16,8 @@ from types import TracebackType
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.dw1000_model.library import NextRequest, Request, model_folder, model_objects
-from uwb_mitigation.dw1000_model.links import Link
+from benchmarks.dw1000_model.library import NextRequest, Request, model_folder, model_objects
+from benchmarks.dw1000_model.links import Link
 from uwb_mitigation.errors import LinkError, MissingDependencyError
 from uwb_mitigation.firmware_export.compiling import (
     WARNINGS,

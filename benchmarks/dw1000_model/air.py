@@ -10,8 +10,8 @@ from typing import Protocol
 
 import numpy as np
 
-from uwb_mitigation.dw1000_model.library import LinkConfig, NextRequest, Request, load
-from uwb_mitigation.dw1000_model.links import Link
+from benchmarks.dw1000_model.library import LinkConfig, NextRequest, Request, load
+from benchmarks.dw1000_model.links import Link
 from uwb_mitigation.errors import UwbMitigationError
 
 ANTENNA_DELAY_TICKS = 16436

@@ -12,7 +12,7 @@ import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
-from uwb_mitigation.benches.random_networks import mlp, pressing_windows, remnet
+from benchmarks.random_networks import mlp, pressing_windows, remnet
 from uwb_mitigation.firmware_export import emulator
 from uwb_mitigation.firmware_export.cycles import estimate_cycles
 from uwb_mitigation.firmware_export.export import golden_windows, identity, write_header

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +48,10 @@ class Errors:
     live: TrackErrors
     smoothed: TrackErrors
     snapshot: TrackErrors
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the errors by kind of track."""
+        return {kind: getattr(self, kind).as_json() for kind in ("live", "smoothed", "snapshot")}
 
 
 def columns(source: Source, anchors: AnchorMap, variance_m2: float = math.nan) -> tuple[Ranges, TruePath]:

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from uwb_mitigation_msgs.msg import RangeCir
 
-from uwb_mitigation.benches import vitals
+from benchmarks.nodes import vitals_of
 from uwb_mitigation.link.emulated_board import EmulatedBoard
 from uwb_mitigation.measurement import Record
 from uwb_mitigation.nodes import processes, topics
@@ -129,10 +129,10 @@ def steady(rate_hz: float, seconds: float) -> SteadyResult:
     with _bench(rate_hz) as (board, listener, pid):
         # Counted from rest to rest: what was sent before the driver was connected is none of the loss.
         sent, received = _at_rest(board, listener)
-        cpu_s, began_s = vitals.look(pid).cpu_s, time.monotonic()
+        cpu_s, began_s = vitals_of(pid).cpu_s, time.monotonic()
         board.resume()
         time.sleep(seconds)
-        cpu_s, passed_s = vitals.look(pid).cpu_s - cpu_s, time.monotonic() - began_s
+        cpu_s, passed_s = vitals_of(pid).cpu_s - cpu_s, time.monotonic() - began_s
         all_sent, all_received = _at_rest(board, listener)
     late_ms = sorted(late / 1e6 for late in listener.late_ns[received:])
     return SteadyResult(
@@ -154,7 +154,7 @@ def unplug(cycles: int, rate_hz: float = 200.0) -> UnplugResult:
     """
     resumed_ms = []
     with _bench(rate_hz) as (board, listener, pid):
-        before = vitals.look(pid)
+        before = vitals_of(pid)
         for cycle in range(cycles):
             board.unplug()
             # Long enough for the driver to be in any state of its back-off.
@@ -167,7 +167,7 @@ def unplug(cycles: int, rate_hz: float = 200.0) -> UnplugResult:
 
             wait(resumed, "no range after the port's return")
             resumed_ms.append((listener.last_ns - returned_ns) / 1e6)
-        after = vitals.look(pid)
+        after = vitals_of(pid)
     resumed_ms.sort()
     return UnplugResult(
         cycles=cycles,

@@ -1,0 +1,122 @@
+"""Frames through a channel that damages bytes: what a decoder makes of them, and how fast it is."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.link.faults import ByteFaults, Damaged, damage
+from uwb_mitigation.link.framing import Frame, FrameDecoder, encode_frame
+from uwb_mitigation.link.layout import MessageType
+
+_FRAMES_PER_ROUND = 4096
+_LARGEST_READ = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class LoopbackResult:
+    """What came of sending numbered frames through a damaging channel.
+
+    Attributes:
+        sent: frames sent.
+        intact: frames of which every byte arrived, both delimiters included.
+        delivered: frames that the decoder delivered as they were sent.
+        lost: sent, not delivered.
+        intact_lost: arrived intact, not delivered; 0 for a right decoder.
+        corrupt_delivered: delivered, though never sent so, or sent but damaged within; 0 likewise.
+        bytes_received: bytes fed to the decoder.
+        decoder_s: processor time spent in the decoder.
+    """
+
+    sent: int
+    intact: int
+    delivered: int
+    lost: int
+    intact_lost: int
+    corrupt_delivered: int
+    bytes_received: int
+    decoder_s: float
+
+    @property
+    def decoder_mb_per_s(self) -> float:
+        """Encoded bytes decoded per second of one core, in units of 10^6."""
+        return self.bytes_received / max(self.decoder_s, 1e-9) / 1e6
+
+
+def loopback(
+    frames: int,
+    faults: ByteFaults,
+    *,
+    payload_bytes: int = 700,
+    seed: int = 0,
+    advance: Callable[[int], None] = lambda _: None,
+) -> LoopbackResult:
+    """Send `frames` frames of random payloads, up to `payload_bytes` long, and compare what arrives.
+
+    The decoder reads in pieces of random sizes. `advance` is called with the number of frames done.
+    """
+    random = np.random.default_rng(seed)
+    noise = random.integers(0, 256, 4 * payload_bytes + 1, dtype=np.uint8)
+    noise[random.random(len(noise)) < 0.1] = 0
+    pool = noise.tobytes()
+    decoder = FrameDecoder()
+    intact = delivered = intact_lost = corrupt = 0
+    decoder_s = 0.0
+    for first in range(0, frames, _FRAMES_PER_ROUND):
+        count = min(_FRAMES_PER_ROUND, frames - first)
+        begins = random.integers(0, len(pool) - payload_bytes, count)
+        sizes = random.integers(0, payload_bytes + 1, count)
+        sent = [
+            Frame(MessageType.RANGE_CIR, 0, first + i, first * 7, pool[begin : begin + size])
+            for i, (begin, size) in enumerate(zip(begins.tolist(), sizes.tolist(), strict=True))
+        ]
+        wires = [encode_frame(frame) for frame in sent]
+        ends = np.cumsum([len(wire) for wire in wires])
+        starts = ends - [len(wire) for wire in wires]
+        arrived = damage(b"".join(wires), faults, random)
+        whole = _untouched(arrived, starts, ends)
+        body_whole = _untouched(arrived, starts + 1, ends - 1)
+
+        received: list[Frame] = []
+        at = 0
+        while at < len(arrived.data):
+            size = int(random.integers(1, _LARGEST_READ + 1))
+            piece = arrived.data[at : at + size]
+            began = time.thread_time()
+            received += decoder.feed(piece)
+            decoder_s += time.thread_time() - began
+            at += size
+
+        seen = np.zeros(count, dtype=bool)
+        for frame in received:
+            i = frame.sequence - first
+            if 0 <= i < count and frame == sent[i] and body_whole[i] and not seen[i]:
+                seen[i] = True
+            else:
+                corrupt += 1
+        intact += int(whole.sum())
+        delivered += int(seen.sum())
+        intact_lost += int((whole & ~seen).sum())
+        advance(first + count)
+    return LoopbackResult(
+        sent=frames,
+        intact=intact,
+        delivered=delivered,
+        lost=frames - delivered,
+        intact_lost=intact_lost,
+        corrupt_delivered=corrupt,
+        bytes_received=decoder.counts.bytes_received,
+        decoder_s=decoder_s,
+    )
+
+
+def _untouched(arrived: Damaged, starts: NDArray[np.intp], ends: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """Which of the stretches [start, end) arrived without a change or an insertion inside."""
+    unchanged = np.searchsorted(arrived.changed, starts) == np.searchsorted(arrived.changed, ends)
+    # Something inserted before the first byte lies outside the stretch.
+    closed = np.searchsorted(arrived.inserted, starts + 1) == np.searchsorted(arrived.inserted, ends)
+    return np.asarray(unchanged & closed)
