@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from uwb_mitigation.commands import console
+from uwb_mitigation.commands.board import open_source
 from uwb_mitigation.commands.console import JsonOption
 from uwb_mitigation.errors import ParameterError
 
 if TYPE_CHECKING:
     from benchmarks.dw1000_model.evb1000 import EmulatedEvb1000s
-    from uwb_mitigation.sources.source import Source
 
 _UNPLUGGED_S = 0.5
 
@@ -74,7 +74,7 @@ def emulate_evb1000(
         raise ParameterError(f"ranging = {sorted(switched)}", valid=f"numbers of boards, 0 to {boards - 1}")
     if distance is not None and recording is not None:
         raise ParameterError(f"--distance {distance} with a recording", valid="one of both")
-    with _source(recording, rate, seed) as source:
+    with open_source(recording, rate, seed) as source:
         emulated = EmulatedEvb1000s(
             source if distance is None else None,
             boards=boards,
@@ -96,16 +96,6 @@ def emulate_evb1000(
     console.write_json(json, {"requests": list(emulated.requests)})
     if emulated.failure is not None:
         raise emulated.failure
-
-
-def _source(recording: Path | None, rate: float, seed: int) -> Source:
-    if recording is None:
-        from uwb_mitigation.sources.simulated import SimulatedSource
-
-        return SimulatedSource(seed=seed, rate_hz=rate)
-    from uwb_mitigation.sources.opening import open_recording
-
-    return open_recording(recording)
 
 
 @contextlib.contextmanager

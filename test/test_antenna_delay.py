@@ -1,4 +1,4 @@
-"""`uwb-mitigation antenna-delay`: the delay of emulated boards is found again, and what is no calibration refused."""
+"""`uwb-mitigation board antenna-delay`: the delay of emulated boards is found again, and what is no calibration refused."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_the_delay_of_a_pair_is_found_and_written(tmp_path: Path):
     truth = NOMINAL + 173
     with EmulatedEvb1000s(boards=2, antenna_delay=truth) as boards:
         done = command_line.start(
-            "antenna-delay", "--distance", 3.0, "--port", ",".join(boards.ports), "--exchanges", 40, "--start", NOMINAL,
+            "board", "antenna-delay", "--distance", 3.0, "--port", ",".join(boards.ports), "--exchanges", 40, "--start", NOMINAL,
             "-o", "found.yaml", "--json", "found.json", folder=tmp_path,
         )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -76,7 +76,7 @@ def test_a_tag_alone_takes_all_of_the_offset(tmp_path: Path):
         )
         try:
             done = command_line.run(
-                "antenna-delay", "--distance", 5.01, "--port", boards.ports[0], "--exchanges", 40, "--start", NOMINAL,
+                "board", "antenna-delay", "--distance", 5.01, "--port", boards.ports[0], "--exchanges", 40, "--start", NOMINAL,
                 "--json", "found.json", folder=tmp_path,
             )  # fmt: skip
         finally:
@@ -99,7 +99,7 @@ def test_a_tag_alone_takes_all_of_the_offset(tmp_path: Path):
     ],
 )
 def test_what_cannot_be_is_refused_at_once(options: tuple[str, ...], says: str, tmp_path: Path):
-    done = command_line.run("antenna-delay", *options, folder=tmp_path)
+    done = command_line.run("board", "antenna-delay", *options, folder=tmp_path)
     assert done.returncode == 1
     assert says in done.stderr
 
@@ -109,7 +109,7 @@ def test_a_radio_that_is_not_there_is_named(tmp_path: Path, monkeypatch: pytest.
         pytest.skip("no C compiler: apt install gcc")
     monkeypatch.setattr("uwb_mitigation.radio.antenna_delay.PATIENCE_S", 0.3)
     done = command_line.run(
-        "antenna-delay", "--distance", "5", "--port", tmp_path / "absent", folder=tmp_path
+        "board", "antenna-delay", "--distance", "5", "--port", tmp_path / "absent", folder=tmp_path
     )
     assert done.returncode == 1
     assert "0 ranges of 200" in done.stderr

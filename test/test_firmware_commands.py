@@ -24,7 +24,16 @@ def app() -> typer.Typer:
 def test_export_c_writes_the_header_and_says_where(app: typer.Typer, tmp_path: Path):
     bundle = firmware_models.exact_bundle(tmp_path)
     result = tmp_path / "result.json"
-    arguments = ["export-c", "--model", str(bundle.path), "-o", str(tmp_path / "c"), "--json", str(result)]
+    arguments = [
+        "board",
+        "export-c",
+        "--model",
+        str(bundle.path),
+        "-o",
+        str(tmp_path / "c"),
+        "--json",
+        str(result),
+    ]
     done = CliRunner().invoke(app, arguments)
     assert done.exit_code == 0, done.output
     values = json.loads(result.read_text())
@@ -34,7 +43,9 @@ def test_export_c_writes_the_header_and_says_where(app: typer.Typer, tmp_path: P
 
 
 def test_export_c_of_an_absent_model_names_it(app: typer.Typer, tmp_path: Path):
-    done = CliRunner().invoke(app, ["export-c", "--model", str(tmp_path / "none.onnx"), "-o", str(tmp_path)])
+    done = CliRunner().invoke(
+        app, ["board", "export-c", "--model", str(tmp_path / "none.onnx"), "-o", str(tmp_path)]
+    )
     assert isinstance(done.exception, ModelError)
     assert "none.onnx" in str(done.exception)
 

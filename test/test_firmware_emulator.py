@@ -213,7 +213,9 @@ def test_the_shipped_model_fits_the_dwm1001c(tmp_path: Path):
 
 
 def test_the_image_of_the_dwm1001_dev_fits_it_and_is_written_as_hex(tmp_path: Path):
-    done = command_line.run("build-image", "-o", "radio.hex", "--json", "image.json", folder=tmp_path)
+    done = command_line.run(
+        "board", "build-image", "-o", "radio.hex", "--json", "image.json", folder=tmp_path
+    )
     assert done.returncode == 0, done.stderr
     told = json.loads((tmp_path / "image.json").read_text())
     assert told["flash_bytes"] < 48 << 10

@@ -29,7 +29,7 @@ SKETCH = EXAMPLES / "UwbMitigation"
 def test_the_sketchs_model_is_the_shipped_one(tmp_path: Path):
     export_bundle(load_bundle(default_model_path()), tmp_path)
     expected = (tmp_path / "uwb_model.h").read_text()
-    assert (SKETCH / "uwb_model.h").read_text() == expected, f"uwb-mitigation export-c -o {SKETCH}"
+    assert (SKETCH / "uwb_model.h").read_text() == expected, f"uwb-mitigation board export-c -o {SKETCH}"
 
 
 @NEEDS_CXX

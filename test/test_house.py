@@ -80,8 +80,8 @@ def test_the_doctor_comes_even_where_numpy_does_not():
     ("package", "words"),
     [
         ("numpy", ("process", "in.mcap", "-o", "out.mcap")),
-        ("onnx", ("export-c", "-o", "/nowhere")),
-        ("cobs", ("emulate-board", "--duration", "1")),
+        ("onnx", ("board", "export-c", "-o", "/nowhere")),
+        ("cobs", ("board", "emulate", "--duration", "1")),
     ],
 )
 def test_a_command_that_misses_a_package_says_so_in_one_line(package: str, words: tuple[str, ...]):

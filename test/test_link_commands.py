@@ -1,4 +1,4 @@
-"""`uwb-mitigation emulate-board`, and the benchmark of the link."""
+"""`uwb-mitigation board emulate`, and the benchmark of the link."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_bench_link_writes_what_came_of_the_frames(tmp_path):
 
 def test_an_emulated_board_plays_for_the_time_it_is_given(tmp_path):
     result = tmp_path / "board.json"
-    output = run("emulate-board", "--duration", "0.5", "--rate", "100", "--json", str(result))
+    output = run("board", "emulate", "--duration", "0.5", "--rate", "100", "--json", str(result))
 
     assert "simulated" in output
     assert "/dev/" in output
@@ -43,12 +43,12 @@ def test_an_emulated_board_plays_for_the_time_it_is_given(tmp_path):
 @pytest.mark.parametrize(
     "arguments",
     [
-        ("emulate-board", "--mode", "neither"),
-        ("emulate-board", "--rate", "0"),
-        ("emulate-board", "--duration", "-1"),
-        ("emulate-board", "--lose", "nan"),
-        ("emulate-board", "--seed", "-1"),
-        ("emulate-board", "--link", "/nonexistent/board"),
+        ("board", "emulate", "--mode", "neither"),
+        ("board", "emulate", "--rate", "0"),
+        ("board", "emulate", "--duration", "-1"),
+        ("board", "emulate", "--lose", "nan"),
+        ("board", "emulate", "--seed", "-1"),
+        ("board", "emulate", "--link", "/nonexistent/board"),
     ],
     ids=" ".join,
 )
@@ -59,12 +59,12 @@ def test_an_option_out_of_its_range_is_refused(arguments):
 
 def test_a_recording_that_is_not_there_is_refused(tmp_path: Path):
     with pytest.raises(UwbMitigationError, match="absent"):
-        run("emulate-board", str(tmp_path / "absent.mcap"), "--duration", "1")
+        run("board", "emulate", str(tmp_path / "absent.mcap"), "--duration", "1")
 
 
 def test_an_empty_recording_is_told_instead_of_a_port(tmp_path: Path):
     bag = Foreign(tmp_path / "empty.mcap").ours().finish()
-    result = CliRunner().invoke(app, ["emulate-board", str(bag), "--duration", "1"])
+    result = CliRunner().invoke(app, ["board", "emulate", str(bag), "--duration", "1"])
 
     assert isinstance(result.exception, RecordingError)
     assert "no measurements" in str(result.exception)

@@ -57,7 +57,7 @@ def ros(tmp_path_factory: pytest.TempPathFactory):
     with domain(folder) as ros:
         code = "from uwb_mitigation.commands.cli import main; main()"
         model = str(default_model_path())
-        ros.run([sys.executable, "-c", code, "emulate-board", "--link", str(port), "--model", model])
+        ros.run([sys.executable, "-c", code, "board", "emulate", "--link", str(port), "--model", model])
         ros.start("mitigator")
         ros.start("driver", "publish_clock:=true", "start_delay:=0.0")
         serial = ("source:=serial", f"port:={port}", "mode:=device")

@@ -1,6 +1,6 @@
 /* Removes the range error of ultra-wideband ranging with an int8 network, bit for bit as on the host.
  *
- * No allocation and no globals: a model is constant data that `uwb-mitigation export-c` writes, and
+ * No allocation and no globals: a model is constant data that `uwb-mitigation board export-c` writes, and
  * memory to work in is the caller's. Functions are reentrant as long as arenas are not shared. */
 #ifndef UWB_MITIGATION_H
 #define UWB_MITIGATION_H

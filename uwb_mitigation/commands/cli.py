@@ -13,13 +13,11 @@ from typer.core import TyperGroup
 
 import uwb_mitigation
 from uwb_mitigation.commands import (
-    antenna_delay,
+    board,
     calibrate,
     console,
     data,
     doctor,
-    firmware,
-    link,
     model,
     offset,
     paper,
@@ -49,10 +47,7 @@ PANELS: dict[str, dict[str, typer.Typer | Callable[..., None]]] = {
         "offset": offset.offset,
     },
     "Boards": {
-        "antenna-delay": antenna_delay.antenna_delay,
-        "emulate-board": link.emulate_board,
-        "export-c": firmware.export_c,
-        "build-image": firmware.build_image,
+        "board": board.app,
     },
     "The paper": {
         "paper": paper.app,

@@ -1,4 +1,4 @@
-"""`uwb-mitigation export-c` and `build-image`: a model as C, and the image of a board."""
+"""`uwb-mitigation board export-c` and `build-image`: a model as C, and the image of a board."""
 
 from __future__ import annotations
 

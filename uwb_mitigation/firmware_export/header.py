@@ -61,7 +61,7 @@ def render(network: PackedNetwork, identity: ModelConstants, golden: Golden) -> 
     Floats have nine significant digits, which read back to the same bits.
     """
     parts = [
-        f"/* {_comment(identity.name)}, model {identity.model_id:08x}, written by `uwb-mitigation export-c`. */",
+        f"/* {_comment(identity.name)}, model {identity.model_id:08x}, written by `uwb-mitigation board export-c`. */",
         "#ifndef UWB_MODEL_H\n#define UWB_MODEL_H\n",
         '#include "uwb_mitigation.h"\n',
     ]

@@ -369,5 +369,5 @@ def _check_offsets(pair_m: dict[tuple[int, int], tuple[float, float]]) -> None:
         if abs(value) > MOST_OFFSET_M:
             raise DatasetError(
                 what,
-                valid=f"{MOST_OFFSET_M:g} m at most: set the antenna delay first (`uwb-mitigation antenna-delay`)",
+                valid=f"{MOST_OFFSET_M:g} m at most: set the antenna delay first (`uwb-mitigation board antenna-delay`)",
             )

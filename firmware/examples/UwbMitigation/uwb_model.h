@@ -1,4 +1,4 @@
-/* universal, model 7b0469c5, written by `uwb-mitigation export-c`. */
+/* universal, model 7b0469c5, written by `uwb-mitigation board export-c`. */
 #ifndef UWB_MODEL_H
 #define UWB_MODEL_H
 

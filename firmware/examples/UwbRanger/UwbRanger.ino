@@ -4,7 +4,7 @@
  * takes 150 mA at times. Serial (USB) is the host, wire protocol of docs/protocol.md.
  *
  * It starts as an anchor, so that it can stand alone on a power bank; with D3 at GND at the start, or when its host says
- * so, it is a tag. For corrections on the board put uwb_model.h beside this file: uwb-mitigation export-c -o UwbRanger.
+ * so, it is a tag. For corrections on the board put uwb_model.h beside this file: uwb-mitigation board export-c -o UwbRanger.
  *
  * SPI is done from loop() only, never from an interrupt, and in whole buffers: a byte at a time costs 20 us each. */
 #include <SPI.h>

@@ -1,7 +1,8 @@
-"""`uwb-mitigation antenna-delay`: calibrates a pair of radios at this computer over a known distance."""
+"""`uwb-mitigation board`: an emulated board, the antenna delay of radios, and the firmware of boards."""
 
 from __future__ import annotations
 
+import time
 from dataclasses import asdict
 from enum import Enum
 from pathlib import Path
@@ -9,14 +10,123 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from uwb_mitigation.commands import console
+from uwb_mitigation.commands import console, firmware
 from uwb_mitigation.commands.console import JsonOption, Table
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.files import write_whole
 
 if TYPE_CHECKING:
+    from uwb_mitigation.link.board import Identity
+    from uwb_mitigation.link.emulated_board import EmulatedBoard
     from uwb_mitigation.link.radio import RadioSettings
+    from uwb_mitigation.mitigation import Mitigation
     from uwb_mitigation.radio.antenna_delay import AntennaDelay
+    from uwb_mitigation.sources.source import Source
+
+app = typer.Typer(help="Emulate a board, calibrate radios, build firmware.", no_args_is_help=True)
+
+
+@app.command()
+def emulate(
+    recording: Annotated[
+        Path | None,
+        typer.Argument(metavar="[RECORDING]", help="Played over and over; without it, simulated."),
+    ] = None,
+    link: Annotated[
+        Path | None, typer.Option(help="Symbolic link to the port, kept while the board runs.")
+    ] = None,
+    rate: Annotated[float, typer.Option(help="Measurements a second, Hz.")] = 50.0,
+    model: Annotated[Path | None, typer.Option(help="Bundle that the board holds.")] = None,
+    mode: Annotated[str, typer.Option(help="Who corrects at the start: host or device.")] = "host",
+    duration: Annotated[float | None, typer.Option(help="s, then end; without it, on Ctrl-C.")] = None,
+    damage: Annotated[float, typer.Option(help="Share of bytes flipped, dropped, inserted, each.")] = 0.0,
+    lose: Annotated[float, typer.Option(help="Share of messages lost.")] = 0.0,
+    duplicate: Annotated[float, typer.Option(help="Share of messages that arrive twice.")] = 0.0,
+    stall: Annotated[float, typer.Option(help="s, longest time that the bus holds bytes back.")] = 0.0,
+    reset_every: Annotated[float | None, typer.Option(help="s between resets of the firmware.")] = None,
+    unplug_every: Annotated[float | None, typer.Option(help="s between pulls of the cable.")] = None,
+    seed: Annotated[int, typer.Option(help="Of all faults, and of simulated measurements.")] = 1,
+    json: JsonOption = None,
+) -> None:
+    """Emulate a board on a pseudo-terminal.
+
+    Open the printed port like /dev/ttyACM0.
+    """
+    from uwb_mitigation.link.emulated_board import BoardFaults, EmulatedBoard
+    from uwb_mitigation.link.faults import ByteFaults
+    from uwb_mitigation.link.layout import Mode
+
+    if mode not in ("host", "device"):
+        raise ParameterError(f"mode {mode!r}", valid="host, device")
+    for name, value in (
+        ("duration", duration),
+        ("reset-every", reset_every),
+        ("unplug-every", unplug_every),
+    ):
+        if value is not None and not value > 0:
+            raise ParameterError(f"{name} = {value}", valid="above 0")
+    if seed < 0:
+        raise ParameterError(f"seed = {seed}", valid="0 or more")
+    faults = BoardFaults(ByteFaults(damage, damage, damage), lose, duplicate, stall)
+    identity, mitigation = _firmware(model)
+    with open_source(recording, rate, seed) as source:
+        board = EmulatedBoard(
+            source,
+            rate_hz=rate,
+            identity=identity,
+            corrector=mitigation,
+            mode=Mode[mode.upper()],
+            faults=faults,
+            link=link,
+            seed=seed,
+        )
+        with board:
+            console.out.print(f"{source.name} at {board.port}", soft_wrap=True, highlight=False)
+            _keep_running(board, duration, reset_every, unplug_every)
+    console.write_json(json, {"sent": board.sent_measurements})
+    if board.failure is not None:
+        raise board.failure
+
+
+def _keep_running(
+    board: EmulatedBoard, duration: float | None, reset_every: float | None, unplug_every: float | None
+) -> None:
+    began = reset = plugged = time.monotonic()
+    while board.failure is None and (duration is None or time.monotonic() - began < duration):
+        time.sleep(0.05)
+        now = time.monotonic()
+        if reset_every is not None and now - reset > reset_every:
+            reset = now
+            board.reset()
+        if unplug_every is not None and now - plugged > unplug_every:
+            board.unplug()
+            time.sleep(0.5)
+            board.plug()
+            plugged = time.monotonic()
+            console.out.print(f"plugged in again at {board.port}", soft_wrap=True, highlight=False)
+
+
+def open_source(recording: Path | None, rate: float, seed: int) -> Source:
+    """Return the source of measurements: a recording, or the simulator without one."""
+    if recording is None:
+        from uwb_mitigation.sources.simulated import SimulatedSource
+
+        return SimulatedSource(seed=seed, rate_hz=rate)
+    from uwb_mitigation.sources.opening import open_recording
+
+    return open_recording(recording)
+
+
+def _firmware(model: Path | None) -> tuple[Identity, Mitigation | None]:
+    from uwb_mitigation.link.board import Identity
+
+    if model is None:
+        return Identity(), None
+    from uwb_mitigation.mitigation import Mitigation
+    from uwb_mitigation.model.bundle import load_bundle
+
+    bundle = load_bundle(model)
+    return Identity(model_id=bundle.model_id, window=bundle.preprocessing.samples), Mitigation(bundle)
 
 
 class RadioSource(str, Enum):
@@ -26,6 +136,7 @@ class RadioSource(str, Enum):
     SPI = "spi"
 
 
+@app.command()
 def antenna_delay(
     distance: Annotated[float, typer.Option(help="m, between the antennas, measured to the centimetre.")],
     port: Annotated[
@@ -65,7 +176,7 @@ def antenna_delay(
     channel 5 (Decawave APS014). A driver must not hold the ports. With two ports, both radios get the
     same delay; with one, the anchor keeps its own, and the tag takes all of what the ranges are off.
 
-        uwb-mitigation antenna-delay --distance 5.01 --port /dev/ttyACM0,/dev/ttyACM1 -o antenna_delay.yaml
+        uwb-mitigation board antenna-delay --distance 5.01 --port /dev/ttyACM0,/dev/ttyACM1 -o antenna_delay.yaml
     """
     from uwb_mitigation.radio.antenna_delay import measure
     from uwb_mitigation.radio.opening import opener
@@ -139,3 +250,7 @@ def _parameters(found: AntennaDelay, distance_m: float, port: str, settings: Rad
         "  ros__parameters:\n"
         f"    radio.antenna_delay: {found.antenna_delay}\n"
     )
+
+
+app.command()(firmware.export_c)
+app.command()(firmware.build_image)
