@@ -64,13 +64,29 @@ void dw1000_reset_pin(dw1000_chip *chip);
 /* Seconds since the air's beginning. */
 double dw1000_now(dw1000_chip *chip);
 
+/* Programs in languages that cannot be coroutines: each asks for one request after another. */
+typedef enum { DW1000_SPI, DW1000_DELAY, DW1000_WAIT, DW1000_RESET_PIN } dw1000_request_kind;
+
+typedef struct {
+    int32_t kind; /* dw1000_request_kind */
+    int32_t line; /* the IRQ line after the last request */
+    double now_s; /* and the time */
+    double seconds;
+    const uint8_t *out;
+    uint8_t *in;
+    size_t n;
+    uint32_t hz;
+} dw1000_request;
+
+/* `next` writes the next request, and returns 0 when there is none any more. It is called on the program's stack, and
+ * has to return before anything else happens on the air. */
+void dw1000_program_remote(dw1000_chip *chip, int (*next)(void *context, dw1000_request *request), void *context);
+
 /* Beyond a driver's needs, for tests. */
 
 /* How the host holds RSTn from now on. The chip drives the line too: held high, it is destroyed. */
 typedef enum { DW1000_RESET_LOW, DW1000_RESET_FLOAT, DW1000_RESET_HIGH } dw1000_reset_level;
 void dw1000_reset_drive(dw1000_chip *chip, dw1000_reset_level level);
-/* A pulse on the WAKEUP pin, which ends sleep. */
-void dw1000_wakeup_pin(dw1000_chip *chip);
 /* What the on-chip sensors measure; 25 degrees Celsius and 3.3 V at first. */
 void dw1000_environment(dw1000_chip *chip, double celsius, double volts);
 /* Of the good frames that a chip receives, how many have no leading edge that its detector finds, 0 to 1: LDEERR. */

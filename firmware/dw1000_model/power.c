@@ -1,4 +1,4 @@
-/* Reset, clocks, sleep, OTP memory, LDE microcode, on-chip sensors: what becomes of writes to PMSC, AON, OTP_IF, TX_CAL. */
+/* Commands, resets, clocks, OTP memory, LDE microcode, sensors: the effects of writes to SYS_CTRL, PMSC, OTP_IF, TX_CAL. */
 #include <math.h>
 #include <string.h>
 
@@ -10,18 +10,10 @@
 #define LOCK_US 5.0
 #define RESET_PULSE_S 1e-3
 #define CRYSTAL_RUNS_US 1000.0 /* after RSTn, while the crystal swings */
-#define WAKE_UP_US 4000.0
 #define SENSORS_XTI_US 2.5
 #define SENSORS_PLL_US 1000.0
-#define SELECT_TO_WAKE_US 500.0
-#define SLEEP_UNIT_US (4096 / 10e3 * 1e6) /* of SLEEP_TIM: the low-power oscillator runs at 7 to 13 kHz */
 
 enum { SYSCLKS_AUTO = 0, SYSCLKS_XTI = 1 };
-enum { AON_SAVE = 0x02, SLEEP_EN = 0x01, WAKE_PIN = 0x02, WAKE_SPI = 0x04, WAKE_COUNTER = 0x08, COUNTER_ON = 0x01 };
-#define ONW_RADC (1u << 0)
-#define ONW_RX (1u << 1)
-#define ONW_LDC (1u << 6)
-#define ONW_LLDE (1u << 11)
 #define LDE_CLOCKS 0x0301u
 #define OF_LDE_CLOCKS 0x0303u /* SYSCLKS, and the two bits that the manual has for the loading */
 #define ACCESS_OTP 0x3u
@@ -49,10 +41,6 @@ static void lock(dw1000_chip *chip, transmission *none) {
     (void)none;
     chip->power = POWER_IDLE;
     dw1000_raise_status(chip, ST_CPLOCK);
-    if (chip->listens_on_wake) {
-        chip->listens_on_wake = false;
-        dw1000_enable_receiver(chip, chip->air->now, false);
-    }
 }
 
 static void choose_clock(dw1000_chip *chip) {
@@ -82,16 +70,13 @@ static void silence(dw1000_chip *chip) {
     dw1000_cancel(chip, GROUP_POWER);
     dw1000_cancel(chip, GROUP_LOAD);
     dw1000_cancel(chip, GROUP_SENSORS);
-    chip->glitch = false;
 }
 
-void dw1000_reset_chip(dw1000_chip *chip, instant until_init) {
+static void reset_chip(dw1000_chip *chip, instant until_init) {
     silence(chip);
     dw1000_reset_registers(chip);
     chip->status = 0;
-    chip->chip_side = chip->host_side = 0;
-    chip->lde_loaded = chip->in_reset = chip->rx_in_reset = chip->stale = chip->listens_on_wake = false;
-    chip->counting = false;
+    chip->lde_loaded = chip->in_reset = chip->rx_in_reset = chip->stale = false;
     dw1000_update_line(chip);
     chip->power = POWER_WAKEUP;
     if (until_init > 0) {
@@ -110,7 +95,7 @@ void dw1000_reset_drive(dw1000_chip *chip, dw1000_reset_level level) {
         chip->power = POWER_WAKEUP;
         dw1000_update_line(chip);
     } else if (level == DW1000_RESET_LOW) {
-        dw1000_reset_chip(chip, MICROSECONDS(CRYSTAL_RUNS_US));
+        reset_chip(chip, MICROSECONDS(CRYSTAL_RUNS_US));
         dw1000_cancel(chip, GROUP_POWER);
     } else if (chip->power == POWER_WAKEUP && chip->fault == NULL) {
         dw1000_cancel(chip, GROUP_POWER);
@@ -134,7 +119,7 @@ static void clocks_written(dw1000_chip *chip, bool whole_reset_octet) {
     if (whole_reset_octet) {
         const unsigned lines = clocks >> 28;
         if (lines == 0 && !chip->in_reset) {
-            dw1000_reset_chip(chip, 0);
+            reset_chip(chip, 0);
             dw1000_cancel(chip, GROUP_POWER);
             chip->power = POWER_INIT;
             chip->in_reset = true;
@@ -147,8 +132,6 @@ static void clocks_written(dw1000_chip *chip, bool whole_reset_octet) {
         const bool held = (lines & 1) == 0;
         if (held) {
             dw1000_stop_receiver(chip);
-            dw1000_clear_status(chip, ST_RXOVRR);
-            chip->set[0].full = chip->set[1].full = false;
             chip->stale = false;
         }
         chip->rx_in_reset = held;
@@ -197,71 +180,6 @@ static void measure_to(dw1000_chip *chip, unsigned sub) {
     dw1000_put(chip, TX_CAL, sub + 1, 1, converted(at_23c + (chip->celsius - 23.0) / 1.14));
 }
 
-static void awake(dw1000_chip *chip, transmission *none) {
-    (void)none;
-    const unsigned keep = (unsigned)dw1000_get(chip, AON, AON_WCFG, 2);
-    const bool microcode = (keep & ONW_LLDE) != 0;
-    dw1000_reset_chip(chip, 0);
-    dw1000_cancel(chip, GROUP_POWER);
-    if (keep & ONW_LDC) {
-        memcpy(chip->octets, chip->retained, sizeof chip->octets);
-        /* The antenna delays do not survive (manual 2.12, p. 103). */
-        dw1000_put(chip, TX_ANTD, 0, 1, dw1000_get(chip, LDE_IF, LDE_RXANTD + 1, 1));
-        dw1000_put(chip, LDE_IF, LDE_RXANTD, 2, 0);
-    } else {
-        dw1000_put(chip, AON, AON_WCFG, 2, keep);
-    }
-    dw1000_put(chip, AON, AON_CTRL, 1, 0);
-    chip->lde_loaded = microcode;
-    initialise(chip, NULL);
-    if (keep & ONW_RADC) {
-        measure_to(chip, TC_SARW);
-    }
-    chip->listens_on_wake = (keep & ONW_RX) != 0;
-}
-
-static void begin_to_wake(dw1000_chip *chip, unsigned by) {
-    if (chip->power == POWER_SLEEP && (dw1000_get(chip, AON, AON_CFG0, 1) & by)) {
-        dw1000_cancel(chip, GROUP_POWER);
-        chip->power = POWER_WAKEUP;
-        dw1000_schedule(chip, GROUP_POWER, chip->air->now + MICROSECONDS(WAKE_UP_US), awake, NULL);
-    }
-}
-
-static void slept_enough(dw1000_chip *chip, transmission *none) {
-    (void)none;
-    begin_to_wake(chip, WAKE_COUNTER);
-}
-
-static void fall_asleep(dw1000_chip *chip) {
-    memcpy(chip->retained, chip->octets, sizeof chip->retained);
-    silence(chip);
-    chip->status = 0;
-    chip->set[0].status = chip->set[1].status = 0;
-    dw1000_update_line(chip);
-    chip->power = POWER_SLEEP;
-    const double units = (double)dw1000_get(chip, AON, AON_SLEEP_TIM, 2);
-    if (units > 0 && (dw1000_get(chip, AON, AON_CFG1, 1) & COUNTER_ON)) {
-        dw1000_schedule(chip, GROUP_POWER, chip->air->now + MICROSECONDS(units * SLEEP_UNIT_US), slept_enough, NULL);
-    }
-}
-
-void dw1000_wake_by_select(dw1000_chip *chip, instant held) {
-    if (held >= MICROSECONDS(SELECT_TO_WAKE_US)) {
-        begin_to_wake(chip, WAKE_SPI);
-    }
-}
-
-void dw1000_wakeup_pin(dw1000_chip *chip) {
-    begin_to_wake(chip, WAKE_PIN);
-}
-
-void dw1000_sleep_after(dw1000_chip *chip, unsigned enabling_bit) {
-    if (dw1000_get(chip, PMSC, PMSC_CTRL1, 4) & (1u << enabling_bit)) {
-        fall_asleep(chip);
-    }
-}
-
 void dw1000_environment(dw1000_chip *chip, double celsius, double volts) {
     chip->celsius = celsius;
     chip->volts = volts;
@@ -293,19 +211,6 @@ void dw1000_power_written(dw1000_chip *chip, unsigned file, unsigned sub, size_t
         otp_written(chip);
     } else if (file == TX_CAL && touched(sub, count, TC_SARC, 1)) {
         sensors_written(chip);
-    } else if (file == AON && touched(sub, count, AON_CTRL, 1)) {
-        if ((dw1000_get(chip, AON, AON_CTRL, 1) & AON_SAVE) && (dw1000_get(chip, AON, AON_CFG0, 1) & SLEEP_EN)) {
-            fall_asleep(chip);
-        }
-    } else if (file == DIG_DIAG && touched(sub, count, EVC_CTRL, 1)) {
-        const unsigned command = (unsigned)dw1000_get(chip, DIG_DIAG, EVC_CTRL, 1);
-        if (command & 2) {
-            for (unsigned i = 0; i < COUNTERS; i++) {
-                dw1000_put(chip, DIG_DIAG, 4 + 2 * i, 2, 0);
-            }
-        }
-        chip->counting = command == 1; /* EN together with CLR is not taken */
-        dw1000_put(chip, DIG_DIAG, EVC_CTRL, 1, 0);
     }
 }
 
@@ -333,4 +238,29 @@ void dw1000_fill_otp(dw1000_chip *chip) {
         chip->otp[0x1C] = delay << 16 | delay;
     }
     chip->otp[0x1E] = 0x0110;
+}
+
+/* One write to SYS_CTRL: its octets together, those that were not written as 0. */
+void dw1000_control(dw1000_chip *chip, uint32_t command) {
+    if (command & CTRL_TRXOFF) {
+        dw1000_late_event(chip);
+        dw1000_stop_transmitter(chip);
+        dw1000_stop_receiver(chip);
+        dw1000_clear_status(chip, ST_HPDWARN | ST_TXPUTE);
+        return; /* TXSTRT in the same write does not transmit */
+    }
+    if (chip->power != POWER_IDLE) {
+        return;
+    }
+    if ((command & CTRL_TXSTRT) && chip->tx == TX_OFF && chip->rx == RX_OFF) {
+        dw1000_start_transmission(chip, command);
+    }
+    if (!(command & CTRL_RXENAB) || chip->rx != RX_OFF) {
+        return;
+    }
+    if (chip->tx != TX_OFF) {
+        chip->wait_for_response = true; /* it comes after the frame */
+    } else {
+        dw1000_enable_receiver(chip, chip->air->now);
+    }
 }

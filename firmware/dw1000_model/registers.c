@@ -1,10 +1,10 @@
-/* The register map: what lies where, how long it is, who may write it, and what a reset leaves in it. */
+/* The registers: where each is, its length, whether the host may write it, and its value after a reset. */
 #include <pthread.h>
 #include <string.h>
 
 #include "model.h"
 
-typedef enum { RO, RW, SWINGING } access;
+typedef enum { RO, RW } access;
 
 typedef struct {
     uint8_t file;
@@ -14,8 +14,8 @@ typedef struct {
     uint64_t reset;
 } entry;
 
-/* DW1000 user manual 2.09, section 7.2; in the order of addresses. The receive and transmit buffers, ACC_MEM and what is
- * computed as it is read are elsewhere. */
+/* DW1000 user manual 2.09, section 7.2; in the order of addresses. The buffers, ACC_MEM and what is computed when
+ * it is read are in spi.c. */
 static const entry MAP[] = {
     {DEV_ID, 0x00, 4, RO, 0xDECA0130},
     {EUI, 0x00, 8, RW, 0},
@@ -25,11 +25,11 @@ static const entry MAP[] = {
     {DX_TIME, 0x00, 5, RW, 0},
     {RX_FWTO, 0x00, 2, RW, 0},
     {SYS_MASK, 0x00, 4, RW, 0},
-    {RX_FINFO, 0x00, 4, SWINGING, 0},
-    {RX_FQUAL, 0x00, 8, SWINGING, 0},
-    {RX_TTCKI, 0x00, 4, SWINGING, 0},
-    {RX_TTCKO, 0x00, 5, SWINGING, 0},
-    {RX_TIME, 0x00, 14, SWINGING, 0},
+    {RX_FINFO, 0x00, 4, RO, 0},
+    {RX_FQUAL, 0x00, 8, RO, 0},
+    {RX_TTCKI, 0x00, 4, RO, 0},
+    {RX_TTCKO, 0x00, 5, RO, 0},
+    {RX_TIME, 0x00, 14, RO, 0},
     {TX_TIME, 0x00, 10, RO, 0},
     {TX_ANTD, 0x00, 2, RW, 0},
     {ACK_RESP_T, 0x00, 4, RW, 0},
@@ -111,23 +111,14 @@ static const entry MAP[] = {
     {PMSC, 0x28, 4, RW, 0x00000100},
 };
 #define ENTRIES (sizeof MAP / sizeof *MAP)
-#define LAST_HARMLESS 127u /* of the transmit buffer, while a frame waits in the second receive buffer */
-
-/* Where the octets of an entry lie: those of the swinging set in it, all others one after another. */
-typedef struct {
-    const entry *found;
-    size_t base;
-} location;
-
 static const entry *first_of[64];
 static uint16_t base_of[ENTRIES];
 
 static void lay_out(void) {
-    size_t base = 0, swinging = 0;
+    size_t base = 0;
     for (size_t i = 0; i < ENTRIES; i++) {
-        size_t *const next = MAP[i].type == SWINGING ? &swinging : &base;
-        base_of[i] = (uint16_t)*next;
-        *next += MAP[i].octets;
+        base_of[i] = (uint16_t)base;
+        base += MAP[i].octets;
         if (first_of[MAP[i].file] == NULL) {
             first_of[MAP[i].file] = &MAP[i];
         }
@@ -139,153 +130,137 @@ void dw1000_prepare_map(void) {
     (void)pthread_once(&once, lay_out);
 }
 
-static location locate(unsigned file, unsigned sub) {
-    for (const entry *at = first_of[file & 63]; at != NULL && at < MAP + ENTRIES && at->file == file; at++) {
-        if (sub >= at->sub && sub < at->sub + (unsigned)at->octets) {
-            return (location){at, (size_t)base_of[at - MAP] + (sub - at->sub)};
+/* The entry that contains an octet, or NULL; `*at` becomes its index in the chip's octets. */
+static const entry *locate(unsigned file, unsigned sub, size_t *at) {
+    for (const entry *here = first_of[file & 63]; here != NULL && here < MAP + ENTRIES && here->file == file; here++) {
+        if (sub >= here->sub && sub < here->sub + (unsigned)here->octets) {
+            *at = (size_t)base_of[here - MAP] + (sub - here->sub);
+            return here;
         }
     }
-    return (location){NULL, 0};
+    return NULL;
 }
 
-uint8_t *dw1000_place(dw1000_chip *chip, unsigned file, unsigned sub) {
-    const location at = locate(file, sub);
-    if (at.found == NULL) {
-        return NULL;
-    }
-    return at.found->type == SWINGING ? &chip->set[chip->chip_side].octets[at.base] : &chip->octets[at.base];
-}
-
-/* Values of registers as the chip itself sees them: of the swinging set the side that it writes to. */
 uint64_t dw1000_get(const dw1000_chip *chip, unsigned file, unsigned sub, unsigned octets) {
-    const location at = locate(file, sub);
-    const uint8_t *const from =
-        at.found->type == SWINGING ? &chip->set[chip->chip_side].octets[at.base] : &chip->octets[at.base];
+    size_t at = 0;
     uint64_t value = 0;
+    (void)locate(file, sub, &at);
     for (unsigned i = 0; i < octets; i++) {
-        value |= (uint64_t)from[i] << (8 * i);
+        value |= (uint64_t)chip->octets[at + i] << (8 * i);
     }
     return value;
 }
 
 void dw1000_put(dw1000_chip *chip, unsigned file, unsigned sub, unsigned octets, uint64_t value) {
-    uint8_t *const to = dw1000_place(chip, file, sub);
+    size_t at = 0;
+    (void)locate(file, sub, &at);
     for (unsigned i = 0; i < octets; i++) {
-        to[i] = (uint8_t)(value >> (8 * i));
+        chip->octets[at + i] = (uint8_t)(value >> (8 * i));
+    }
+}
+
+/* An octet as the host reads it: reserved registers read 0xDEADDEAD. */
+uint8_t dw1000_octet(const dw1000_chip *chip, unsigned file, unsigned sub) {
+    size_t at;
+    if (locate(file, sub, &at) == NULL) {
+        return sub & 1 ? 0xDE : 0xAD;
+    }
+    return chip->octets[at];
+}
+
+void dw1000_write_octet(dw1000_chip *chip, unsigned file, unsigned sub, uint8_t octet) {
+    size_t at;
+    const entry *const found = locate(file, sub, &at);
+    if (found != NULL && found->type == RW) {
+        chip->octets[at] = octet;
     }
 }
 
 void dw1000_reset_registers(dw1000_chip *chip) {
+    memset(chip->octets, 0, sizeof chip->octets);
+    memset(chip->rx_buffer, 0, sizeof chip->rx_buffer);
     for (size_t i = 0; i < ENTRIES; i++) {
-        if (MAP[i].octets <= 8) {
-            dw1000_put(chip, MAP[i].file, MAP[i].sub, MAP[i].octets, MAP[i].reset);
-        } else {
-            memset(dw1000_place(chip, MAP[i].file, MAP[i].sub), 0, MAP[i].octets);
-        }
+        dw1000_put(chip, MAP[i].file, MAP[i].sub, MAP[i].octets < 8 ? MAP[i].octets : 8, MAP[i].reset);
     }
     dw1000_put(chip, EUI, 0, 4, chip->otp[0]);
     dw1000_put(chip, EUI, 4, 4, chip->otp[1]);
-    memset(chip->set, 0, sizeof chip->set);
 }
 
-/* Reserved registers read 0xDEADDEAD. */
-static uint8_t reserved(unsigned sub) {
-    return sub & 1 ? 0xDE : 0xAD;
+/* Clocks and chance. */
+
+__extension__ typedef __int128 wide;
+
+#define RATE_BITS 44
+
+uint64_t dw1000_local_units(const dw1000_chip *chip, instant at) {
+    return chip->clock_offset + (uint64_t)(((wide)at * chip->clock_rate) >> RATE_BITS);
 }
 
-static uint8_t octet_of(uint64_t value, unsigned sub, unsigned octets) {
-    if (sub >= octets) {
-        return reserved(sub);
-    }
-    return (uint8_t)(value >> (8 * sub));
+instant dw1000_air_time(const dw1000_chip *chip, uint64_t units) {
+    const wide scaled = (wide)(units - chip->clock_offset) << RATE_BITS;
+    return (instant)((scaled + chip->clock_rate - 1) / chip->clock_rate);
 }
 
-static uint8_t accumulator_octet(const dw1000_chip *chip, unsigned sub) {
-    const uint32_t clocks = (uint32_t)dw1000_get(chip, PMSC, PMSC_CTRL0, 4);
-    const bool on = (clocks & (1u << 6)) && (clocks & (1u << 15));
-    if (!on || sub >= sizeof chip->accumulator) {
-        return 0;
-    }
-    const uint16_t value = (uint16_t)chip->accumulator[sub / 2];
-    return (uint8_t)(sub & 1 ? value >> 8 : value);
+/* The finaliser of splitmix64 (Steele, Lea, Flood 2014), twice. */
+static uint64_t mix(uint64_t x) {
+    x = (x ^ (x >> 30)) * UINT64_C(0xBF58476D1CE4E5B9);
+    x = (x ^ (x >> 27)) * UINT64_C(0x94D049BB133111EB);
+    return x ^ (x >> 31);
 }
 
-void dw1000_read_octets(dw1000_chip *chip, unsigned file, unsigned sub, uint8_t *to, size_t count) {
-    uint64_t value = 0;
-    unsigned octets = 0;
-    switch (file) {
-    case SYS_TIME:
-        value = dw1000_counter_now(chip) & ~(uint64_t)(COUNTER_GRID - 1);
-        octets = 5;
-        break;
-    case SYS_STATUS:
-        value = dw1000_status_of(chip);
-        octets = 5;
-        break;
-    case SYS_STATE:
-        value = dw1000_system_state(chip);
-        octets = 5;
-        break;
-    case SYS_CTRL:
-        octets = 4;
-        break;
-    default:
-        break;
-    }
-    for (size_t i = 0; i < count; i++, sub++) {
-        if (octets != 0) {
-            to[i] = octet_of(value, sub, octets);
-        } else if (file == ACC_MEM) {
-            to[i] = accumulator_octet(chip, sub);
-        } else if (file == RX_BUFFER) {
-            to[i] = sub < FRAME_OCTETS ? chip->set[chip->host_side].buffer[sub] : reserved(sub);
-        } else {
-            const location at = locate(file, sub);
-            if (at.found == NULL) {
-                to[i] = reserved(sub);
-            } else if (at.found->type == SWINGING) {
-                to[i] = chip->set[chip->host_side].octets[at.base];
-            } else {
-                to[i] = chip->octets[at.base];
-            }
-        }
+uint64_t dw1000_dice(uint64_t a, uint64_t b) {
+    return mix(mix(a + UINT64_C(0x9E3779B97F4A7C15)) + b + UINT64_C(0x9E3779B97F4A7C15));
+}
+
+double dw1000_chance(uint64_t bits) {
+    return (double)(bits >> 11) * 0x1p-53;
+}
+
+/* The air interface: channel, pulse rate, code and SFD as the registers set them. */
+
+instant dw1000_symbol_units(unsigned prf) {
+    return (prf == 2 ? 65024 : 63488) * UNITS_PER_TICK;
+}
+
+double dw1000_carrier_hz(unsigned channel) {
+    static const double HZ[] = {0, 3494.4e6, 3993.6e6, 4492.8e6, 3993.6e6, 6489.6e6, 0, 6489.6e6};
+    return channel < sizeof HZ / sizeof *HZ && HZ[channel] > 0 ? HZ[channel] : 6489.6e6;
+}
+
+static bool tuned(const dw1000_chip *chip, unsigned channel) {
+    static const uint32_t PLL[] = {0,          0x09000407, 0x08400508, 0x08401009,
+                                   0x08400508, 0x0800041D, 0,          0x0800041D};
+    return channel < sizeof PLL / sizeof *PLL && PLL[channel] != 0 &&
+           dw1000_get(chip, FS_CTRL, FS_PLLCFG, 4) == PLL[channel];
+}
+
+static void choose_sfd(const dw1000_chip *chip, air_interface *mode, bool decawave, bool user) {
+    mode->decawave_sfd = decawave || user;
+    if (mode->slow) {
+        mode->sfd_symbols = 64;
+    } else if (user) {
+        const unsigned length = (unsigned)dw1000_get(chip, USR_SFD, 0, 1);
+        mode->sfd_symbols = length >= 8 && length <= 64 ? length : 8;
+    } else {
+        mode->sfd_symbols = 8;
     }
 }
 
-void dw1000_write_octets(dw1000_chip *chip, unsigned file, unsigned sub, const uint8_t *from, size_t count) {
-    if (file == SYS_STATUS || file == SYS_CTRL) {
-        uint64_t value = 0;
-        for (size_t i = 0; i < count && sub + i < 5; i++) {
-            value |= (uint64_t)from[i] << (8 * (sub + i));
-        }
-        if (file == SYS_STATUS) {
-            dw1000_acknowledge_status(chip, value & ~ST_READ_ONLY);
-        } else {
-            dw1000_control(chip, (uint32_t)value);
-        }
-        return;
-    }
-    for (size_t i = 0; i < count; i++) {
-        const unsigned at = sub + (unsigned)i;
-        if (file == TX_BUFFER) {
-            if (at < FRAME_OCTETS) {
-                chip->tx_buffer[at] = from[i];
-            }
-            if (at > LAST_HARMLESS && chip->set[1].full && dw1000_doubly_buffered(chip)) {
-                chip->set[1].buffer[LAST_HARMLESS + 1] ^= 0xFF; /* errata RX-1 */
-            }
-            continue;
-        }
-        const location to = locate(file, at);
-        if (to.found != NULL && to.found->type == RW) {
-            chip->octets[to.base] = from[i];
-        }
-    }
-    if (file == SYS_CFG || file == SYS_MASK) {
-        dw1000_update_line(chip);
-    }
-    if (file == TX_BUFFER && chip->tx == TX_ON && chip->suppress_fcs) {
-        dw1000_raise_status(chip, ST_TXBERR);
-    }
-    dw1000_power_written(chip, file, sub, count);
+air_interface dw1000_transmit_mode(const dw1000_chip *chip) {
+    const uint32_t channel = (uint32_t)dw1000_get(chip, CHAN_CTRL, 0, 4);
+    const uint32_t frame = (uint32_t)dw1000_get(chip, TX_FCTRL, 0, 4);
+    air_interface mode = {channel & 15, frame >> 16 & 3, channel >> 22 & 31, false, 8, false, false};
+    mode.tuned = tuned(chip, mode.channel);
+    mode.slow = (frame >> 13 & 3) == 0;
+    choose_sfd(chip, &mode, channel >> 17 & 1, channel >> 20 & 1);
+    return mode;
+}
+
+air_interface dw1000_receive_mode(const dw1000_chip *chip) {
+    const uint32_t channel = (uint32_t)dw1000_get(chip, CHAN_CTRL, 0, 4);
+    air_interface mode = {channel >> 4 & 15, channel >> 18 & 3, channel >> 27, false, 8, false, false};
+    mode.tuned = tuned(chip, mode.channel);
+    mode.slow = (dw1000_get(chip, SYS_CFG, 0, 4) & CFG_RXM110K) != 0;
+    choose_sfd(chip, &mode, channel >> 17 & 1, channel >> 21 & 1);
+    return mode;
 }

@@ -1,4 +1,4 @@
-/* The serial interface: header, data, and the time that they take. */
+/* The serial interface: header, data, and the time that they take; and programs in other languages that use it. */
 #include <string.h>
 
 #include "model.h"
@@ -27,6 +27,78 @@ static header decode(const uint8_t *out, size_t n) {
     return read;
 }
 
+static uint8_t accumulator_octet(const dw1000_chip *chip, unsigned sub) {
+    const uint32_t clocks = (uint32_t)dw1000_get(chip, PMSC, PMSC_CTRL0, 4);
+    const bool on = (clocks & (1u << 6)) && (clocks & (1u << 15));
+    if (!on || sub >= sizeof chip->accumulator) {
+        return 0;
+    }
+    const uint16_t value = (uint16_t)chip->accumulator[sub / 2];
+    return (uint8_t)(sub & 1 ? value >> 8 : value);
+}
+
+static uint32_t system_state(const dw1000_chip *chip) {
+    uint32_t whole = chip->power == POWER_IDLE ? 1 : 0;
+    if (chip->tx != TX_OFF) {
+        whole = chip->tx == TX_WAIT ? 2 : 4;
+    } else if (chip->rx != RX_OFF) {
+        whole = chip->rx == RX_WAIT ? 3 : 5;
+    }
+    return whole << 16;
+}
+
+/* What is computed when it is read, 5 octets; returns whether the register is such a one. */
+static bool computed(const dw1000_chip *chip, unsigned file, uint64_t *value) {
+    const uint64_t counter = dw1000_local_units(chip, chip->air->now) / UNITS_PER_TICK & COUNTER_MASK;
+    *value = file == SYS_TIME     ? counter & ~(uint64_t)(COUNTER_GRID - 1)
+             : file == SYS_STATUS ? dw1000_status_of(chip)
+             : file == SYS_STATE  ? system_state(chip)
+                                  : 0;
+    return file == SYS_TIME || file == SYS_STATUS || file == SYS_STATE || file == SYS_CTRL;
+}
+
+static void read_octets(const dw1000_chip *chip, unsigned file, unsigned sub, uint8_t *to, size_t count) {
+    uint64_t value;
+    const unsigned octets = computed(chip, file, &value) ? file == SYS_CTRL ? 4 : 5 : 0;
+    for (size_t i = 0; i < count; i++, sub++) {
+        if (sub < octets) {
+            to[i] = (uint8_t)(value >> (8 * sub));
+        } else if (file == ACC_MEM) {
+            to[i] = accumulator_octet(chip, sub);
+        } else if (file == RX_BUFFER && sub < FRAME_OCTETS) {
+            to[i] = chip->rx_buffer[sub];
+        } else {
+            to[i] = dw1000_octet(chip, file, sub);
+        }
+    }
+}
+
+static void write_octets(dw1000_chip *chip, unsigned file, unsigned sub, const uint8_t *from, size_t count) {
+    if (file == SYS_STATUS || file == SYS_CTRL) {
+        uint64_t value = 0;
+        for (size_t i = 0; i < count && sub + i < 5; i++) {
+            value |= (uint64_t)from[i] << (8 * (sub + i));
+        }
+        if (file == SYS_STATUS) {
+            dw1000_clear_status(chip, value & ~ST_READ_ONLY);
+        } else {
+            dw1000_control(chip, (uint32_t)value);
+        }
+        return;
+    }
+    for (size_t i = 0; i < count; i++) {
+        const unsigned at = sub + (unsigned)i;
+        if (file == TX_BUFFER && at < FRAME_OCTETS) {
+            chip->tx_buffer[at] = from[i];
+        }
+        dw1000_write_octet(chip, file, at, from[i]);
+    }
+    if (file == SYS_CFG || file == SYS_MASK) {
+        dw1000_update_line(chip);
+    }
+    dw1000_power_written(chip, file, sub, count);
+}
+
 void dw1000_spi(dw1000_chip *chip, const uint8_t *out, uint8_t *in, size_t n, uint32_t hz) {
     dw1000_air *const air = chip->air;
     if (n == 0 || hz == 0) {
@@ -38,15 +110,12 @@ void dw1000_spi(dw1000_chip *chip, const uint8_t *out, uint8_t *in, size_t n, ui
     if (!dw1000_spi_works(chip, hz)) {
         if (in != NULL) {
             for (size_t i = 0; i < n; i++) {
-                in[i] = chip->power == POWER_SLEEP || chip->power == POWER_WAKEUP
-                            ? 0
-                            : (uint8_t)dw1000_dice(air->seed ^ (uint64_t)began, i);
+                in[i] = chip->power == POWER_WAKEUP ? 0 : (uint8_t)dw1000_dice(air->seed ^ (uint64_t)began, i);
             }
         }
         dw1000_pass(air, ends);
-        dw1000_wake_by_select(chip, ends - began);
         if (to.write && to.file == PMSC && n > to.octets && to.octets != 0 && dw1000_clocks_listen(chip, hz)) {
-            dw1000_write_octets(chip, to.file, to.sub, out + to.octets, n - to.octets);
+            write_octets(chip, to.file, to.sub, out + to.octets, n - to.octets);
         }
         return;
     }
@@ -59,10 +128,8 @@ void dw1000_spi(dw1000_chip *chip, const uint8_t *out, uint8_t *in, size_t n, ui
             memset(in, 0, n);
         }
         dw1000_pass(air, ends);
-        if (n > to.octets && !chip->in_reset) {
-            dw1000_write_octets(chip, to.file, to.sub, out + to.octets, n - to.octets);
-        } else if (n > to.octets && to.file == PMSC) {
-            dw1000_write_octets(chip, to.file, to.sub, out + to.octets, n - to.octets);
+        if (n > to.octets && (!chip->in_reset || to.file == PMSC)) {
+            write_octets(chip, to.file, to.sub, out + to.octets, n - to.octets);
         }
         return;
     }
@@ -82,7 +149,7 @@ void dw1000_spi(dw1000_chip *chip, const uint8_t *out, uint8_t *in, size_t n, ui
     }
     while (done < n) {
         const size_t piece = n - done < PIECE ? n - done : PIECE;
-        dw1000_read_octets(chip, to.file, sub, in != NULL ? in + done : unwanted, piece);
+        read_octets(chip, to.file, sub, in != NULL ? in + done : unwanted, piece);
         done += piece;
         sub += (unsigned)piece;
         if (done < n) {
@@ -90,4 +157,26 @@ void dw1000_spi(dw1000_chip *chip, const uint8_t *out, uint8_t *in, size_t n, ui
         }
     }
     dw1000_pass(air, ends);
+}
+
+static void run_remote(dw1000_chip *chip, void *context) {
+    dw1000_request request = {DW1000_DELAY, 0, 0, 0, NULL, NULL, 0, 0};
+    for (;;) {
+        request.line = chip->line;
+        request.now_s = dw1000_seconds_now(chip->air);
+        if (!chip->next(context, &request)) {
+            return;
+        }
+        switch (request.kind) {
+        case DW1000_SPI: dw1000_spi(chip, request.out, request.in, request.n, request.hz); break;
+        case DW1000_WAIT: dw1000_wait(chip, request.seconds); break;
+        case DW1000_RESET_PIN: dw1000_reset_pin(chip); break;
+        default: dw1000_delay(chip, request.seconds); break;
+        }
+    }
+}
+
+void dw1000_program_remote(dw1000_chip *chip, int (*next)(void *context, dw1000_request *request), void *context) {
+    chip->next = next;
+    dw1000_program(chip, run_remote, context);
 }

@@ -1,4 +1,4 @@
-/* Virtual time: a heap of events, and one coroutine for each program. */
+/* Virtual time: a heap of events, and one coroutine for each program. SYS_STATUS and the IRQ line, which wake programs. */
 #define _GNU_SOURCE
 #include <math.h>
 #include <stdio.h>
@@ -294,9 +294,34 @@ void dw1000_wait(dw1000_chip *chip, double at_most_s) {
     chip->waiter = NULL;
 }
 
-void dw1000_wake(dw1000_chip *chip) {
+static void wake(dw1000_chip *chip) {
     if (chip->waiter != NULL) {
         resume_at(chip->waiter, chip->air->now);
         chip->waiter = NULL;
     }
+}
+
+uint64_t dw1000_status_of(const dw1000_chip *chip) {
+    const uint64_t mask = dw1000_get(chip, SYS_MASK, 0, 4) & UINT64_C(0x3FFFFFFE);
+    return chip->status & mask ? chip->status | ST_IRQS : chip->status;
+}
+
+void dw1000_update_line(dw1000_chip *chip) {
+    const bool asserted = (dw1000_status_of(chip) & ST_IRQS) != 0;
+    const bool active_high = (dw1000_get(chip, SYS_CFG, 0, 4) & CFG_HIRQ_POL) != 0;
+    const bool line = asserted == active_high;
+    if (line && !chip->line) {
+        wake(chip);
+    }
+    chip->line = line;
+}
+
+void dw1000_raise_status(dw1000_chip *chip, uint64_t bits) {
+    chip->status |= bits;
+    dw1000_update_line(chip);
+}
+
+void dw1000_clear_status(dw1000_chip *chip, uint64_t bits) {
+    chip->status &= ~bits;
+    dw1000_update_line(chip);
 }

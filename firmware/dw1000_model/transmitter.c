@@ -10,7 +10,7 @@
 #define PHR_SYMBOLS 21
 #define TURNAROUND_US 6.5
 #define KEPT_US 1000.0 /* longer than any flight, and what a receiver does at a frame's end */
-enum { TXCLKS_PLL = 2, ATXSLP = 11 };
+enum { TXCLKS_PLL = 2 };
 
 /* A tick of the chip is 1/64 units of a perfect clock; over a frame the difference does not matter. */
 static instant bit_units(unsigned rate) {
@@ -48,13 +48,9 @@ static void finished(dw1000_chip *chip, transmission *frame) {
     chip->tx = TX_OFF;
     chip->sending = NULL;
     dw1000_raise_status(chip, ST_TXFRS);
-    dw1000_count_event(chip, COUNT_TXFS);
-    chip->acknowledging = false;
     if (chip->wait_for_response) {
         const double wait_us = (double)(dw1000_get(chip, ACK_RESP_T, 0, 4) & 0xFFFFF);
-        dw1000_enable_receiver(chip, chip->air->now + MICROSECONDS(wait_us + TURNAROUND_US), false);
-    } else {
-        dw1000_sleep_after(chip, ATXSLP);
+        dw1000_enable_receiver(chip, chip->air->now + MICROSECONDS(wait_us + TURNAROUND_US));
     }
 }
 
@@ -62,14 +58,11 @@ static void finished(dw1000_chip *chip, transmission *frame) {
 static void take_payload(dw1000_chip *chip, transmission *frame) {
     const uint32_t control = (uint32_t)dw1000_get(chip, TX_FCTRL, 0, 4);
     const size_t offset = control >> 22;
-    if (!chip->acknowledging) {
-        for (size_t i = 0; i < frame->length; i++) {
-            frame->payload[i] = chip->tx_buffer[(offset + i) % FRAME_OCTETS];
-        }
+    for (size_t i = 0; i < frame->length; i++) {
+        frame->payload[i] = chip->tx_buffer[(offset + i) % FRAME_OCTETS];
     }
-    if (!chip->suppress_fcs && frame->length >= 2) {
-        const bool ones = (dw1000_get(chip, SYS_CFG, 0, 4) & CFG_FCS_INIT2F) != 0;
-        const uint16_t check = dw1000_frame_check(frame->payload, frame->length - 2, ones ? 0xFFFF : 0);
+    if (frame->length >= 2) {
+        const uint16_t check = dw1000_frame_check(frame->payload, frame->length - 2);
         frame->payload[frame->length - 2] = (uint8_t)check;
         frame->payload[frame->length - 1] = (uint8_t)(check >> 8);
     }
@@ -111,7 +104,7 @@ static void on_air(dw1000_chip *chip, transmission *frame) {
     dw1000_air *const air = chip->air;
     choose_power(chip, frame);
     chip->tx = TX_ON;
-    chip->status &= ~(ST_TX & ~ST_AAT); /* of a delayed frame only now: while it waits, those of the frame before stand */
+    chip->status &= ~ST_TX; /* of a delayed frame only now: while it waits, those of the frame before stand */
     dw1000_raise_status(chip, ST_TXFRB);
     frame->next = air->flying;
     air->flying = frame;
@@ -176,9 +169,7 @@ void dw1000_start_transmission(dw1000_chip *chip, uint32_t command) {
     dw1000_cancel(chip, GROUP_TX);
     chip->status &= ~(ST_HPDWARN | ST_TXPUTE | (command & CTRL_TXDLYS ? 0 : ST_TX));
     dw1000_update_line(chip);
-    chip->suppress_fcs = (command & CTRL_SFCST) != 0;
     chip->wait_for_response = (command & CTRL_WAIT4RESP) != 0;
-    chip->acknowledging = false;
     transmission *const frame = describe(chip);
     const uint64_t now = dw1000_local_units(chip, chip->air->now), power_up = (uint64_t)MICROSECONDS(POWER_UP_US);
     if (!(command & CTRL_TXDLYS)) {
@@ -192,10 +183,8 @@ void dw1000_start_transmission(dw1000_chip *chip, uint32_t command) {
     const bool clock_held = (dw1000_get(chip, PMSC, PMSC_CTRL0, 1) >> 4 & 3) == TXCLKS_PLL;
     if (lead > COUNTER_MASK / 2) {
         dw1000_raise_status(chip, ST_HPDWARN); /* and it waits for a whole turn of the counter */
-        dw1000_count_event(chip, COUNT_HPW);
     } else if (lead_units < power_up) {
         dw1000_raise_status(chip, ST_TXPUTE);
-        dw1000_count_event(chip, COUNT_TPW);
         give_up(chip, frame);
         return;
     } else if (lead_units < power_up + (uint64_t)MICROSECONDS(LOST_US) && !clock_held) {
@@ -204,22 +193,6 @@ void dw1000_start_transmission(dw1000_chip *chip, uint32_t command) {
         return;
     }
     send_at(chip, frame, (ticks + lead + header) * UNITS_PER_TICK);
-}
-
-void dw1000_start_acknowledgement(dw1000_chip *chip, uint8_t sequence) {
-    forget_old(chip->air);
-    dw1000_cancel(chip, GROUP_TX);
-    transmission *const frame = describe(chip);
-    const bool pending = (dw1000_get(chip, SYS_CFG, 0, 4) & CFG_AACKPEND) != 0;
-    const uint64_t wait = (dw1000_get(chip, ACK_RESP_T, 3, 1)) * (uint64_t)frame->symbol;
-    frame->ranging = false;
-    frame->length = 5;
-    frame->payload[0] = pending ? 0x12 : 0x02;
-    frame->payload[2] = sequence;
-    chip->acknowledging = true;
-    chip->suppress_fcs = chip->wait_for_response = false;
-    const uint64_t ready = dw1000_local_units(chip, chip->air->now) + (uint64_t)MICROSECONDS(POWER_UP_US) + wait;
-    send_at(chip, frame, next_grid(ready + (uint64_t)header_units(frame)));
 }
 
 void dw1000_stop_transmitter(dw1000_chip *chip) {

@@ -1,16 +1,16 @@
-/* The receiver: when it is on, what it notices, and how a reception ends. reception.c fills the registers. */
+/* The receiver: when it is on, which frames it notices, what the registers report of a frame, how a reception ends. */
+#include <math.h>
 #include <string.h>
 
 #include "model.h"
 
 #define WARM_UP_US 16.0
 #define DETECTION_CHUNKS 2 /* of preamble acquisition, before a preamble is noticed */
-#define PHR_SYMBOLS 21
 #define GLITCH_US 0.5
-#define SNIFF_UNIT_US 1.0256
 #define CAPTURE 4.0 /* 6 dB: by how much a frame must be stronger to survive another one */
 #define TIMEOUT_TICKS 65536 /* RX_FWTO's unit */
-enum { ARXSLP = 12 };
+#define SAMPLES_AT_16MHZ 992
+#define SHIFT_TICKS 256 /* at least, of a stamp after an error without a receiver reset */
 
 /* Kinds of damage, by dice. */
 enum { BAD_HEADER, BAD_CODE, BAD_CHECK, NO_SFD, DAMAGES };
@@ -19,10 +19,6 @@ enum { FOR_LOSS = 1, FOR_DAMAGE, FOR_KIND, FOR_CLASH, FOR_EDGE };
 
 static uint32_t configuration(const dw1000_chip *chip) {
     return (uint32_t)dw1000_get(chip, SYS_CFG, 0, 4);
-}
-
-bool dw1000_doubly_buffered(const dw1000_chip *chip) {
-    return (configuration(chip) & CFG_DIS_DRXB) == 0;
 }
 
 /* The same for a frame and a receiver, however often and in whatever order it is asked. */
@@ -52,42 +48,21 @@ void dw1000_stop_receiver(dw1000_chip *chip) {
     chip->rx = RX_OFF;
 }
 
-static void search(dw1000_chip *chip);
-
-/* The receiver ends, or begins anew by itself. */
-static void ended(dw1000_chip *chip, bool again) {
-    dw1000_stop_receiver(chip);
-    if (again) {
-        dw1000_enable_receiver(chip, chip->air->now, true);
-    } else {
-        dw1000_sleep_after(chip, ARXSLP);
-    }
-}
-
-static void failed(dw1000_chip *chip, uint64_t bit, counter which) {
-    const bool again = (configuration(chip) & CFG_RXAUTR) && bit != ST_RXRFTO;
-    chip->stale = chip->stale || (bit & (ST_RXPHE | ST_RXRFSL | ST_RXRFTO | ST_RXFCE | ST_RXOVRR));
+static void failed(dw1000_chip *chip, uint64_t bit) {
+    chip->stale = chip->stale || (bit & (ST_RXPHE | ST_RXRFSL | ST_RXRFTO | ST_RXFCE));
     dw1000_raise_status(chip, bit);
-    dw1000_count_event(chip, which);
-    ended(chip, again);
+    dw1000_stop_receiver(chip);
 }
 
 static void frame_wait_over(dw1000_chip *chip, transmission *none) {
     (void)none;
-    failed(chip, ST_RXRFTO, COUNT_FWTO);
-}
-
-static void preamble_wait_over(dw1000_chip *chip, transmission *none) {
-    (void)none;
-    if (chip->rx == RX_SEARCH) {
-        failed(chip, ST_RXPTO, COUNT_PTO);
-    }
+    failed(chip, ST_RXRFTO);
 }
 
 static void sfd_wait_over(dw1000_chip *chip, transmission *none) {
     (void)none;
     if (chip->rx == RX_PREAMBLE) {
-        failed(chip, ST_RXSFDTO, COUNT_STO);
+        failed(chip, ST_RXSFDTO);
     }
 }
 
@@ -104,11 +79,98 @@ static bool cut_off(const dw1000_chip *chip) {
     return aborted != INT64_MAX && arrival(chip, aborted) <= chip->air->now;
 }
 
+uint16_t dw1000_frame_check(const uint8_t *octets, size_t count) {
+    uint16_t check = 0;
+    for (size_t i = 0; i < count; i++) {
+        check = (uint16_t)(check ^ octets[i]);
+        for (int bit = 0; bit < 8; bit++) {
+            check = (uint16_t)(check & 1 ? check >> 1 ^ 0x8408 : check >> 1);
+        }
+    }
+    return check;
+}
+
+static unsigned accumulated(const dw1000_chip *chip) {
+    const unsigned given = chip->path->preamble_count, all = chip->symbols;
+    const unsigned count = given != 0 ? given : all;
+    return count > 0xFFF ? 0xFFF : count;
+}
+
+static void report_header(dw1000_chip *chip) {
+    const transmission *const frame = chip->frame;
+    const unsigned psr = frame->preamble_code & 3, extension = frame->preamble_code >> 2;
+    const uint32_t info = (uint32_t)frame->length | extension << 11 | frame->rate << 13 |
+                          (uint32_t)frame->ranging << 15 | frame->mode.prf << 16 | psr << 18 |
+                          accumulated(chip) << 20;
+    dw1000_put(chip, RX_FINFO, 0, 4, info);
+}
+
+/* RX_TIME: when the marker reached the antenna by the chip's counter, less what the driver says of its delay. */
+static void report_time(dw1000_chip *chip, bool timed) {
+    dw1000_air *const air = chip->air;
+    const link *const path = chip->path;
+    const uint64_t random = dw1000_dice(air->seed ^ (uint64_t)chip->index << 32, chip->receptions++);
+    const instant at = chip->frame->marker + path->flight + path->excess;
+    const uint64_t units = dw1000_local_units(chip, at) + (uint64_t)chip->rx_delay * UNITS_PER_TICK;
+    uint64_t raw = (units + UNITS_PER_TICK / 2) / UNITS_PER_TICK;
+    if (!timed) {
+        raw = random;
+    } else if (chip->stale) {
+        const uint64_t shift = SHIFT_TICKS + random % (3 * SHIFT_TICKS);
+        raw = random >> 63 ? raw + shift : raw - shift;
+    }
+    dw1000_put(chip, RX_TIME, RX_STAMP, 5, (raw - dw1000_get(chip, LDE_IF, LDE_RXANTD, 2)) & COUNTER_MASK);
+    dw1000_put(chip, RX_TIME, RX_RAWST, 5, raw & COUNTER_MASK & ~(uint64_t)(COUNTER_GRID - 1));
+}
+
+static void report_clock(dw1000_chip *chip) {
+    const transmission *const frame = chip->frame;
+    const double fast = (1 + frame->sender->ppm * 1e-6) / (1 + chip->ppm * 1e-6) - 1;
+    const double interval = frame->mode.prf == 2 ? 0x01FC0000 : 0x01F00000;
+    const double hz = 998.4e6 / 2 / (frame->mode.slow ? 8192 : 1024) / 131072;
+    dw1000_put(chip, RX_TTCKI, 0, 4, (uint64_t)interval);
+    dw1000_put(chip, RX_TTCKO, 0, 3, (uint64_t)llround(fast * interval) & 0x7FFFF);
+    dw1000_put(chip, RX_TTCKO, 3, 2, dw1000_dice(chip->receptions, chip->index) & 0x7FFF);
+    const int64_t integrated = llround(-fast * dw1000_carrier_hz(frame->mode.channel) / hz);
+    dw1000_put(chip, DRX_CONF, DRX_CAR_INT, 3, (uint64_t)integrated & 0x1FFFFF);
+}
+
+static void report_channel(dw1000_chip *chip) {
+    const link *const path = chip->path;
+    const unsigned multiple = (unsigned)dw1000_get(chip, LDE_IF, LDE_CFG1, 1) & 31;
+    const unsigned product = multiple * path->std_noise;
+    const unsigned threshold = path->threshold != 0 ? path->threshold : product > 0xFFFF ? 0xFFFF : product;
+    unsigned all = chip->symbols;
+    if (path->preamble_count != 0 && all <= path->preamble_count) {
+        all = path->preamble_count + 1u; /* what is given is where accumulation stopped */
+    }
+    dw1000_put(chip, RX_FQUAL, 0, 2, path->std_noise);
+    dw1000_put(chip, RX_FQUAL, 2, 2, path->fp_ampl[1]);
+    dw1000_put(chip, RX_FQUAL, 4, 2, path->fp_ampl[2]);
+    dw1000_put(chip, RX_FQUAL, 6, 2, path->cir_pwr);
+    dw1000_put(chip, RX_TIME, FP_INDEX, 2, path->fp_index);
+    dw1000_put(chip, RX_TIME, FP_AMPL1, 2, path->fp_ampl[0]);
+    dw1000_put(chip, LDE_IF, LDE_THRESH, 2, threshold);
+    dw1000_put(chip, LDE_IF, LDE_PPINDX, 2, path->pp_index);
+    dw1000_put(chip, LDE_IF, LDE_PPAMPL, 2, path->pp_ampl);
+    dw1000_put(chip, DRX_CONF, RXPACC_NOSAT, 2, all);
+    const size_t samples = chip->frame->mode.prf == 2 ? ACCUMULATOR_SAMPLES : SAMPLES_AT_16MHZ;
+    memcpy(chip->accumulator, path->iq, samples * 2 * sizeof *path->iq);
+}
+
+static void report_frame(dw1000_chip *chip, const uint8_t *octets, bool timed) {
+    report_header(chip);
+    report_time(chip, timed);
+    report_clock(chip);
+    report_channel(chip);
+    memcpy(chip->rx_buffer, octets, chip->frame->length);
+}
+
 static void frame_over(dw1000_chip *chip, transmission *frame) {
     const uint32_t setting = configuration(chip);
     if (cut_off(chip) || chip->clashed || damaged(chip, BAD_CODE)) {
         if (!(setting & CFG_DIS_RSDE)) {
-            failed(chip, ST_RXRFSL, COUNT_RSE);
+            failed(chip, ST_RXRFSL);
             return;
         }
     }
@@ -120,59 +182,29 @@ static void frame_over(dw1000_chip *chip, transmission *frame) {
     }
     const bool detector = chip->lde_loaded && (dw1000_get(chip, PMSC, PMSC_CTRL1, 4) & (1u << 17));
     const bool timed = detector && dw1000_chance(fate(chip, frame, FOR_EDGE)) >= chip->edges_lost;
-    dw1000_report_frame(chip, octets, timed);
-    const bool ones = (setting & CFG_FCS_INIT2F) != 0;
+    report_frame(chip, octets, timed);
     const size_t length = frame->length;
-    const bool good = length >= 2 && dw1000_frame_check(octets, length - 2, ones ? 0xFFFF : 0) ==
+    const bool good = length >= 2 && dw1000_frame_check(octets, length - 2) ==
                                          (uint16_t)(octets[length - 2] | octets[length - 1] << 8);
     const uint64_t done = timed ? ST_LDEDONE : detector ? ST_LDEERR : 0;
     chip->stale = chip->stale || done == ST_LDEERR;
-    if (!good) {
-        dw1000_raise_status(chip, ST_RXDFR | done);
-        failed(chip, ST_RXFCE, COUNT_FCE);
-        return;
-    }
-    dw1000_count_event(chip, COUNT_FCG);
-    if ((setting & CFG_FFEN) && !dw1000_accepted(chip, octets, length - 2)) {
-        /* The receiver and its time-out just continue (manual 2.12, p. 79). */
-        dw1000_raise_status(chip, ST_AFFREJ);
-        dw1000_count_event(chip, COUNT_FFR);
-        memset(chip->accumulator, 0, sizeof chip->accumulator);
-        let_go(chip);
-        search(chip);
-        return;
-    }
-    const bool asks = length > 4 && (octets[0] & 0x20) && ((octets[0] & 7) == 1 || (octets[0] & 7) == 3);
-    dw1000_raise_status(chip, ST_RXDFR | ST_RXFCG | done | (asks ? ST_AAT : 0));
-    const bool buffers = dw1000_doubly_buffered(chip);
-    if (buffers) {
-        chip->set[chip->chip_side].full = true;
-        chip->chip_side ^= 1u;
-        dw1000_update_line(chip);
-    }
-    if (asks && (setting & CFG_AUTOACK) && (setting & CFG_FFEN)) {
+    dw1000_raise_status(chip, ST_RXDFR | done | (good ? ST_RXFCG : 0));
+    if (good) {
         dw1000_stop_receiver(chip);
-        dw1000_start_acknowledgement(chip, octets[2]);
-        return;
+    } else {
+        failed(chip, ST_RXFCE);
     }
-    ended(chip, buffers && (setting & CFG_RXAUTR));
 }
 
 static void header_over(dw1000_chip *chip, transmission *frame) {
     const bool other_mode = frame->phr_mode != (configuration(chip) & CFG_PHR_MODE) >> 16;
     const bool bad = cut_off(chip) || chip->clashed || other_mode || damaged(chip, BAD_HEADER);
     if (bad && !(configuration(chip) & CFG_DIS_PHE)) {
-        failed(chip, ST_RXPHE, COUNT_PHE);
-        return;
-    }
-    if (dw1000_doubly_buffered(chip) && chip->set[chip->chip_side].full) {
-        /* Both buffers are taken: what is known of the frame that the host has not read yet is spoilt. */
-        dw1000_report_overrun(chip);
-        failed(chip, ST_RXOVRR, COUNT_OVR);
+        failed(chip, ST_RXPHE);
         return;
     }
     chip->rx = RX_DATA;
-    dw1000_report_header(chip);
+    report_header(chip);
     dw1000_raise_status(chip, ST_RXPHD);
     dw1000_schedule(chip, GROUP_FRAME, arrival(chip, frame->end), frame_over, frame);
 }
@@ -215,19 +247,6 @@ static void preamble_noticed(dw1000_chip *chip, transmission *frame) {
     }
 }
 
-/* When a preamble that is heard from `from` on is noticed, which takes `needed`: at once, or in sniff mode within one of
- * the times that the receiver is on (RX_SNIFF: chunks, and one more; about microseconds off). */
-static instant noticed_at(const dw1000_chip *chip, instant from, instant needed, instant symbol) {
-    const uint32_t sniff = (uint32_t)dw1000_get(chip, RX_SNIFF, 0, 4);
-    const unsigned chunks = sniff & 15, units = sniff >> 8 & 0xFF;
-    if (chunks == 0 || units == 0) {
-        return from + needed;
-    }
-    const instant on = (instant)((chunks + 1) * dw1000_acquisition_chunk(chip)) * symbol;
-    const instant turn = on + MICROSECONDS(units * SNIFF_UNIT_US), into = (from - chip->searching) % turn;
-    return into + needed <= on ? from + needed : from - into + turn + needed;
-}
-
 void dw1000_consider(dw1000_chip *chip, transmission *frame) {
     const link *const path = chip->links[frame->sender->index];
     const air_interface mode = dw1000_receive_mode(chip);
@@ -236,8 +255,8 @@ void dw1000_consider(dw1000_chip *chip, transmission *frame) {
         return;
     }
     const instant heard = frame->start + path->flight;
-    const instant needed = (instant)(DETECTION_CHUNKS * dw1000_acquisition_chunk(chip)) * frame->symbol;
-    const instant at = noticed_at(chip, heard > chip->air->now ? heard : chip->air->now, needed, frame->symbol);
+    const unsigned chunk = 8u << (((unsigned)dw1000_get(chip, DRX_CONF, DRX_TUNE2, 4) >> 25) & 3u);
+    const instant at = (heard > chip->air->now ? heard : chip->air->now) + (instant)(DETECTION_CHUNKS * chunk) * frame->symbol;
     if (at > frame->sfd + path->flight || dw1000_chance(fate(chip, frame, FOR_LOSS)) < path->loss) {
         return;
     }
@@ -256,24 +275,13 @@ void dw1000_disturb(dw1000_chip *chip, const transmission *frame) {
     chip->clashed = chip->clashed || (overlaps && chip->path->level < CAPTURE * path->level);
 }
 
-/* Search for preambles: those that are on the air already, too. */
-static void search(dw1000_chip *chip) {
+/* Search for preambles, also for those that are on the air already. */
+static void search(dw1000_chip *chip, transmission *none) {
+    (void)none;
     chip->rx = RX_SEARCH;
-    chip->searching = chip->air->now;
     for (transmission *frame = chip->air->flying; frame != NULL; frame = frame->next) {
         dw1000_consider(chip, frame);
     }
-}
-
-static void listen(dw1000_chip *chip, transmission *none) {
-    (void)none;
-    const unsigned chunks = (unsigned)dw1000_get(chip, DRX_CONF, DRX_PRETOC, 2);
-    if (chunks != 0) {
-        const instant symbol = dw1000_symbol_units(dw1000_receive_mode(chip).prf);
-        const instant wait = (instant)(chunks + 1) * (instant)dw1000_acquisition_chunk(chip) * symbol;
-        dw1000_schedule(chip, GROUP_RX, chip->air->now + wait, preamble_wait_over, NULL);
-    }
-    search(chip);
 }
 
 static void turn_on(dw1000_chip *chip, transmission *none) {
@@ -281,42 +289,24 @@ static void turn_on(dw1000_chip *chip, transmission *none) {
     const uint32_t setting = configuration(chip);
     memset(chip->accumulator, 0, sizeof chip->accumulator);
     chip->rx = RX_WARMUP;
-    dw1000_schedule(chip, GROUP_RX, chip->air->now + MICROSECONDS(WARM_UP_US), listen, NULL);
+    dw1000_schedule(chip, GROUP_RX, chip->air->now + MICROSECONDS(WARM_UP_US), search, NULL);
     if (setting & CFG_RXWTOE) { /* it counts from the enable on, not from the end of the warm-up */
         const instant wait = (instant)dw1000_get(chip, RX_FWTO, 0, 2) * TIMEOUT_TICKS * UNITS_PER_TICK;
         dw1000_schedule(chip, GROUP_RX, chip->air->now + wait, frame_wait_over, NULL);
     }
 }
 
-void dw1000_enable_receiver(dw1000_chip *chip, instant at, bool by_itself) {
+void dw1000_enable_receiver(dw1000_chip *chip, instant at) {
     if (chip->rx_in_reset) {
         return;
     }
     dw1000_stop_receiver(chip);
-    if (!by_itself) {
-        chip->status &= ~(ST_RX | ST_AAT | ST_RXOVRR | ST_HPDWARN);
-        chip->set[chip->chip_side].status = 0;
-        if (!dw1000_doubly_buffered(chip)) {
-            chip->set[0].status = chip->set[1].status = 0;
-        }
-        dw1000_update_line(chip);
-    }
+    dw1000_clear_status(chip, ST_RX | ST_HPDWARN);
     chip->rx = RX_WAIT;
     if (at > chip->air->now) {
         dw1000_schedule(chip, GROUP_RX, at, turn_on, NULL);
     } else {
         turn_on(chip, NULL);
-    }
-}
-
-void dw1000_delay_receiver(dw1000_chip *chip) {
-    const uint64_t now = dw1000_local_units(chip, chip->air->now) / UNITS_PER_TICK;
-    const uint64_t wanted = dw1000_get(chip, DX_TIME, 0, 5) & ~(uint64_t)(COUNTER_GRID - 1);
-    const uint64_t lead = (wanted - now) & COUNTER_MASK;
-    dw1000_enable_receiver(chip, dw1000_air_time(chip, (now + lead) * UNITS_PER_TICK), false);
-    if (lead > COUNTER_MASK / 2) {
-        dw1000_raise_status(chip, ST_HPDWARN);
-        dw1000_count_event(chip, COUNT_HPW);
     }
 }
 
