@@ -15,13 +15,13 @@ WRAP = 1 << 40
 TICK_S = 1 / (128 * 499.2e6)
 TICK_M = 299_792_458 * TICK_S
 
-TXSTRT, TXDLYS, TRXOFF, WAIT4RESP, RXENAB, RXDLYE, HRBPT = 2, 4, 0x40, 0x80, 0x100, 0x200, 1 << 24
-CPLOCK, AAT, TXFRB, TXPRS, TXPHS, TXFRS = (1 << bit for bit in (1, 3, 4, 5, 6, 7))
+TXSTRT, TXDLYS, TRXOFF, WAIT4RESP, RXENAB = 2, 4, 0x40, 0x80, 0x100
+CPLOCK, TXFRB, TXPRS, TXPHS, TXFRS = (1 << bit for bit in (1, 4, 5, 6, 7))
 RXPRD, RXSFDD, LDEDONE, RXPHD, RXPHE, RXDFR, RXFCG, RXFCE = (1 << bit for bit in range(8, 16))
-RXRFSL, RXRFTO, LDEERR, RXOVRR, RXPTO, SLP2INIT, RXSFDTO, HPDWARN, TXBERR, AFFREJ, HSRBP, ICRBP, TXPUTE = (
-    1 << bit for bit in (16, 17, 18, 20, 21, 23, 26, 27, 28, 29, 30, 31, 34)
+RXRFSL, RXRFTO, LDEERR, SLP2INIT, RXSFDTO, HPDWARN, TXPUTE = (
+    1 << bit for bit in (16, 17, 18, 23, 26, 27, 34)
 )
-ERRORS = RXPHE | RXFCE | RXRFSL | RXRFTO | RXPTO | RXSFDTO | AFFREJ
+ERRORS = RXPHE | RXFCE | RXRFSL | RXRFTO | RXSFDTO
 RX_GOOD = RXPRD | RXSFDD | LDEDONE | RXPHD | RXDFR | RXFCG
 
 _PREAMBLES = {64: 0x1, 128: 0x5, 256: 0x9, 512: 0xD, 1024: 0x2, 1536: 0x6, 2048: 0xA, 4096: 0x3}
@@ -189,21 +189,6 @@ def pair(
     drivers[0].start(mode)
     drivers[1].start(receiver or mode)
     return (*drivers, *chips)
-
-
-def double_buffered(air: Air, mode: Mode = Mode()) -> tuple[Driver, Driver]:
-    """A pair whose second listens with both buffers."""
-    a, b, *_ = pair(air, mode=mode)
-    b.set(0x04, 0, b.get(0x04) & ~(1 << 12) | 1 << 29)
-    b.listen()
-    b.host.delay(20e-6)
-    return a, b
-
-
-def send_whole(sender: Driver, data: bytes) -> None:
-    """Send, and let it arrive."""
-    sender.send(data)
-    sender.host.delay(2e-3)
 
 
 DATA = bytes.fromhex("4188") + b"\x07payload"

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import subprocess
-import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,14 +13,15 @@ import model_material
 import numpy as np
 import pytest
 from compilers import NEEDS_CC
-from dw1000_driver import DATA, RX_GOOD, RXFCG, RXRFTO, Driver, exchange, pair
+from conftest import REPOSITORY
+from dw1000_driver import RXRFTO, Driver, exchange, pair
 
 from benchmarks.dw1000_model.air import Air, Host
-from benchmarks.dw1000_model.library import model_folder
+from benchmarks.dw1000_model.library import model_folder, model_objects
 from benchmarks.dw1000_model.links import Link, link_of
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.firmware_export.compiling import WARNINGS, c_compiler, firmware_folder, run
-from uwb_mitigation.measurement import Cir, Encoding, RangeMeasurement, Truth
+from uwb_mitigation.measurement import Cir, RangeMeasurement, Truth
 
 pytestmark = NEEDS_CC
 
@@ -34,20 +35,6 @@ class TestTime:
         air.program(air.chip(), lambda host: host.delay(0.1))
         assert air.run(10.0) == pytest.approx(0.75)
         assert air.run(10.0) == pytest.approx(10.75), "none that could end"
-
-    def test_a_program_goes_on_where_the_last_run_left_it(self, air: Air):
-        seen: list[float] = []
-
-        def every_second(host: Host) -> None:
-            for _ in range(3):
-                host.delay(1.0)
-                seen.append(host.now())
-
-        air.program(air.chip(), every_second)
-        air.run(1.5)
-        assert seen == pytest.approx([1.0], abs=1e-4)
-        air.run(9.0)
-        assert seen == pytest.approx([1.0, 2.0, 3.0], abs=1e-4)
 
     def test_programs_interleave_in_the_order_of_time(self, air: Air):
         seen: list[tuple[int, int]] = []
@@ -65,30 +52,6 @@ class TestTime:
         air.run(1.0)
         assert seen == [(1, 0), (1, 1), (2, 0), (1, 2), (1, 3), (2, 1), (2, 2), (2, 3)]
 
-    def test_at_the_same_time_the_first_to_wait_comes_first(self, air: Air):
-        seen: list[int] = []
-
-        def tick(number: int) -> None:
-            def run(host: Host) -> None:
-                for _ in range(3):
-                    host.delay(0.01)
-                    seen.append(number)
-
-            air.program(air.chip(), run)
-
-        for number in range(6):
-            tick(number)
-        air.run(1.0)
-        assert seen == [*range(6)] * 3
-
-    def test_a_program_may_wait_by_looking(self, air: Air):
-        def look(host: Host) -> None:
-            while host.now() < 50e-6:
-                assert not host.irq()
-
-        air.program(air.chip(), look)
-        assert air.run(1.0) == pytest.approx(50e-6, abs=5e-6)
-
     def test_what_a_program_raises_is_raised_by_run_once(self, air: Air):
         def fail(host: Host) -> None:
             host.delay(0.1)
@@ -98,31 +61,6 @@ class TestTime:
         with pytest.raises(LookupError, match="mine"):
             air.run(1.0)
         air.run(1.0)
-
-    def test_a_new_program_takes_the_place_of_the_old(self, air: Air):
-        seen: list[str] = []
-
-        def forever(host: Host) -> None:
-            while True:
-                host.delay(0.1)
-                seen.append("old")
-
-        chip = air.chip()
-        air.program(chip, forever)
-        air.run(0.35)
-        air.program(chip, lambda host: seen.append("new"))
-        air.run(1.0)
-        assert seen == ["old"] * 3 + ["new"]
-
-    def test_closing_an_air_ends_what_still_runs(self):
-        before = threading.active_count()
-        air = Air()
-        for _ in range(5):
-            air.program(air.chip(), lambda host: host.wait(math.inf))
-        air.run(1.0)
-        air.close()
-        air.close()
-        assert threading.active_count() == before
 
     def test_the_interrupt_wakes_a_program_at_once(self, air: Air):
         woken: list[float] = []
@@ -162,28 +100,6 @@ def test_the_seed_decides():
     assert history(5) != history(6)
 
 
-def test_many_chips_on_one_air(air: Air):
-    """All of 12 hear one, and nobody hears twelve at once."""
-    drivers = [Driver(air.chip()) for _ in range(13)]
-    sender, *others = drivers
-    for number, driver in enumerate(drivers):
-        driver.start()
-        for earlier in drivers[:number]:
-            air.link(driver.host, earlier.host, Link(1.0 + number))
-    for driver in others:
-        driver.listen()
-    sender.host.delay(20e-6)
-    sender.send(DATA)
-    sender.host.delay(1e-3)
-    assert all(driver.status & RX_GOOD == RX_GOOD for driver in others)
-    sender.listen()
-    now = sender.time
-    for driver in others:
-        driver.send_at(DATA, now + 64_000_000)
-    sender.host.delay(3e-3)
-    assert not sender.status & RXFCG
-
-
 class TestLinks:
     def measurement(self, cir: Cir, range_m: float = 4.0) -> RangeMeasurement:
         return RangeMeasurement(0, 1, 2, 3, 4, range_m, cir)
@@ -199,10 +115,6 @@ class TestLinks:
         assert samples[1480:1488].tolist() == [2, 4, 6, 8, 10, 12, 14, 16]
         assert not samples[:1480].any()
         assert not samples[1488:].any()
-
-    def test_magnitudes_have_no_phase(self):
-        part = Cir(np.array([5, 6], np.int16), Encoding.MAGNITUDE, start_index=1014)
-        assert link_of(self.measurement(part)).samples[2028:].tolist() == [5, 0, 6, 0]
 
     @pytest.mark.parametrize(
         ("changes", "range_m", "told"),
@@ -230,13 +142,6 @@ class TestLinks:
         with pytest.raises(ParameterError):
             Link(3.0, **changes)  # type: ignore[arg-type]
 
-    def test_without_an_index_the_first_path_is_found(self, air: Air):
-        samples = np.zeros(2032, np.int16)
-        samples[2 * 700 : 2 * 706 : 2] = [10, 500, 4000, 8000, 5000, 100]
-        a, b, *_ = pair(air, Link(3.0, samples=samples))
-        assert exchange(a, b) & RXFCG
-        assert b.get(0x15, 5, 2) / 64 == pytest.approx(702.0, abs=1 / 64)
-
 
 def test_arbitrary_transactions_break_nothing(tmp_path: Path):
     program = tmp_path / "fuzz_dw1000_model"
@@ -247,3 +152,38 @@ def test_arbitrary_transactions_break_nothing(tmp_path: Path):
     command = [str(program), "300", "1"]
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment, timeout=300)
     assert done.returncode == 0, done.stderr[-3000:]
+
+
+def test_a_driver_may_define_any_name_without_the_models_prefix(tmp_path: Path):
+    objects = model_objects()
+    defined = run(["nm", "-g", "--defined-only", "-P", *objects]).splitlines()
+    names = [line.split()[0] for line in defined if not line.endswith(":")]
+    assert len(names) > 50
+    assert [name for name in names if not name.startswith("dw1000_")] == []
+    short = sorted({"get", "put", "wake", "control", *(name.removeprefix("dw1000_") for name in names)})
+    driver = tmp_path / "driver.c"
+    driver.write_text(
+        "".join(f"int {name}(void);\nint {name}(void) {{ return 0; }}\n" for name in short)
+        + '#include "dw1000_model.h"\nint main(void) { dw1000_air_free(dw1000_air_new(1)); return 0; }\n'
+    )
+    program = tmp_path / "driver"
+    options = ("-fno-builtin", f"-I{model_folder()}")
+    run([*c_compiler(), *options, str(driver), *objects, "-lm", "-lpthread", "-o", str(program)])
+    run([str(program)])
+
+
+def compiled(source: Path, program: Path) -> Path:
+    sources = (*model_folder().glob("*.c"), source)
+    options = ("-std=c11", "-O1", "-g", "-fsanitize=address,undefined", *WARNINGS, f"-I{model_folder()}")
+    run([*c_compiler(), *options, *map(str, sources), "-lm", "-lpthread", "-o", str(program)])
+    return program
+
+
+def test_the_pages_program_prints_what_the_page_says(tmp_path: Path):
+    page = (REPOSITORY / "docs" / "dw1000_model.md").read_text(encoding="utf-8")
+    (text,) = re.findall(r"```c\n(.*?)```", page, re.DOTALL)
+    (promise,) = re.findall(r"prints `(.*?)` twice", page)
+    source = tmp_path / "blink.c"
+    source.write_text(text, encoding="utf-8")
+    done = subprocess.run([compiled(source, tmp_path / "blink")], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines() == [promise] * 2

@@ -1,11 +1,11 @@
-"""The DW1000's model, by the manual: the serial interface, registers, resets, clocks, memories, sleep, sensors."""
+"""The DW1000's model, by the manual: the serial interface, registers, resets, clocks, memories, sensors."""
 
 from __future__ import annotations
 
 import dw1000_driver as dw
 import pytest
 from compilers import NEEDS_CC
-from dw1000_driver import Driver, pair
+from dw1000_driver import Driver, exchange, pair
 
 from benchmarks.dw1000_model.air import Air, Chip
 
@@ -41,11 +41,6 @@ def test_a_sub_address_has_15_bits(driver: Driver):
     assert driver.get(0x2E, 0x0004, 2) == 0xDEAD, "the 7 low bits alone are another register"
 
 
-@pytest.mark.parametrize("cut", [b"", b"\x40", b"\x6e\x84"])
-def test_a_header_that_is_cut_off_does_nothing(chip: Chip, cut: bytes):
-    assert chip.spi(cut, dw.FAST_HZ) == bytes(len(cut))
-
-
 @pytest.mark.parametrize(
     ("file", "sub", "octets", "value"),
     [
@@ -74,11 +69,6 @@ def test_reserved_registers_read_0xdeaddead(driver: Driver):
     assert driver.get(0x28, 0x0C, 4) >> 24 == 0xDE, "RF_TXCTRL has three octets"
 
 
-def test_a_register_ends_where_it_ends(driver: Driver):
-    driver.set(0x18, 0, 0x44332211)
-    assert driver.get(0x18) == 0xDEAD2211
-
-
 def test_a_write_in_pieces_is_a_write(driver: Driver):
     driver.set_by_octets(0x27, 0x08, 0x311A002D)
     assert driver.get(0x27, 0x08) == 0x311A002D
@@ -92,38 +82,6 @@ def test_what_is_read_only_stays(driver: Driver):
     driver.set(0x27, 0x28, 0x1234, 3)
     assert driver.get(0x00) == 0xDECA0130
     assert (driver.get(0x15, 0, 5), driver.get(0x27, 0x28, 3)) == (0, 0)
-
-
-def test_the_transmit_buffer_is_not_read_back(driver: Driver):
-    driver.write(0x09, 0, b"abcd")
-    assert driver.get(0x09) == 0xDEADDEAD
-
-
-def test_a_command_clears_itself(driver: Driver):
-    driver.command(dw.RXENAB)
-    assert driver.get(0x0D) == 0
-
-
-def test_a_command_may_come_octet_by_octet(air: Air, driver: Driver):
-    driver.set(0x0D, 1, 0x01, 1)
-    assert driver.get(0x19, 0, 4) >> 16 & 15 == 5
-    driver.set(0x0D, 0, 0x40, 1)
-    assert driver.get(0x19, 0, 4) >> 16 & 15 == 1
-
-
-def test_what_starts_something_clears_itself(driver: Driver):
-    """Drivers wait for it."""
-    driver.hz = dw.SLOW_HZ
-    driver.set(0x36, 0, 0x0301, 2)
-    driver.set(0x2D, 6, 0x8000, 2)
-    assert driver.get(0x2D, 6, 2) == 0x8000
-    driver.host.delay(150e-6)
-    assert driver.get(0x2D, 6, 2) == 0
-    driver.set(0x2D, 6, 0x0003, 2)
-    assert driver.get(0x2D, 6, 2) == 0x0001
-    for bits in (2, 1):
-        driver.set(0x2F, 0, bits, 1)
-        assert driver.get(0x2F, 0, 1) == 0
 
 
 def test_ones_clear_status_octet_by_octet_and_zeros_do_not(driver: Driver):
@@ -145,19 +103,6 @@ def test_the_interrupt_line_is_status_and_mask_with_its_polarity(driver: Driver,
     assert chip.irq()
 
 
-def test_a_wait_ends_with_the_interrupt_or_its_time(air: Air, driver: Driver, chip: Chip):
-    driver.set(0x0E, 0, dw.RXPTO)
-    driver.set(0x27, 0x24, 10, 2)
-    driver.listen()
-    began = chip.now()
-    chip.wait(1.0)
-    assert 50e-6 < chip.now() - began < 200e-6
-    driver.set(0x0F, 0, dw.RXPTO)
-    began = chip.now()
-    chip.wait(0.25)
-    assert chip.now() - began == pytest.approx(0.25)
-
-
 def test_the_counter_runs_on_its_own_crystal_in_steps_of_512(air: Air):
     chip = air.chip(ppm=20.0, clock_ticks=(1 << 40) - 1000)
     driver = Driver(chip)
@@ -166,12 +111,6 @@ def test_the_counter_runs_on_its_own_crystal_in_steps_of_512(air: Air):
     ended, second = chip.now(), driver.time
     assert first % 512 == second % 512 == 0
     assert (second - first) % (1 << 40) == pytest.approx((ended - began) / dw.TICK_S * (1 + 20e-6), abs=600)
-
-
-def test_a_transaction_takes_its_time(chip: Chip):
-    began = chip.now()
-    chip.spi(bytes(100), 8_000_000)
-    assert chip.now() - began == pytest.approx(100e-6, abs=0.2e-6)
 
 
 class TestClocks:
@@ -205,21 +144,6 @@ class TestClocks:
         assert driver.read(0x00) == ID
         assert driver.status == dw.CPLOCK | dw.SLP2INIT
 
-    def test_the_pll_locks_again_after_the_crystal_was_forced(self, driver: Driver):
-        driver.set(0x36, 0, 0x01, 1)
-        driver.hz = dw.SLOW_HZ
-        driver.set(0x0F, 0, dw.CPLOCK)
-        driver.set(0x36, 0, 0x00, 1)
-        driver.host.delay(20e-6)
-        assert driver.status & dw.CPLOCK
-
-    def test_nothing_is_sent_while_the_crystal_is_forced(self, driver: Driver):
-        driver.set(0x36, 0, 0x01, 1)
-        driver.hz = dw.SLOW_HZ
-        driver.command(dw.TXSTRT)
-        driver.host.delay(1e-3)
-        assert not driver.status & dw.TXFRS
-
 
 class TestResets:
     def test_a_soft_reset_takes_everything_back(self, driver: Driver):
@@ -234,19 +158,6 @@ class TestResets:
         driver.host.delay(20e-6)
         driver.hz = dw.FAST_HZ
         assert driver.read(0x00) == ID
-
-    def test_a_chip_held_in_soft_reset_takes_no_writes(self, driver: Driver):
-        driver.hz = dw.SLOW_HZ
-        driver.set(0x36, 3, 0x00, 1)
-        driver.set(0x18, 0, 0x1234, 2)
-        driver.set(0x36, 3, 0xF0, 1)
-        assert driver.get(0x18, 0, 2) == 0
-
-    def test_the_counter_goes_on_over_a_reset(self, air: Air):
-        driver = Driver(air.chip(clock_ticks=1 << 39))
-        driver.host.reset_pin()
-        driver.host.delay(5e-3)
-        assert driver.time > 1 << 39
 
     def test_rstn_driven_high_destroys_the_chip(self, driver: Driver, chip: Chip):
         chip.reset_drive(0)
@@ -282,9 +193,6 @@ class TestMemories:
         values = {self.read_otp(driver, 0x1E) for _ in range(3)}
         assert 0x0110 not in values
 
-    def test_each_chip_has_an_identity_of_its_own(self, air: Air):
-        assert len({Driver(air.chip()).get(0x01, 0, 8) for _ in range(4)}) == 4
-
     @pytest.mark.parametrize("wrong", ["nothing", "no clock", "no time"])
     def test_without_the_microcode_a_frame_has_no_stamp(self, air: Air, wrong: str):
         a, b, *_ = pair(air)
@@ -313,59 +221,6 @@ class TestMemories:
         assert min((-stamp) % (1 << 40) for stamp in stamps) > 1e9
 
 
-class TestSleep:
-    def asleep(self, driver: Driver, wake: int = 0x07, keep: int = 0x0840) -> None:
-        driver.set(0x2C, 0, keep, 2)
-        driver.set(0x2C, 6, wake, 1)
-        driver.set(0x2C, 2, 0x00, 1)
-        driver.set(0x2C, 2, 0x02, 1)
-
-    def test_a_sleeping_chip_answers_nothing_and_is_woken_by_its_select_line(self, driver: Driver):
-        driver.set(0x04, 0, 0x10001200)
-        self.asleep(driver)
-        driver.hz = dw.SLOW_HZ
-        assert driver.read(0x00) != ID
-        driver.host.spi(bytes(200), dw.SLOW_HZ)
-        driver.host.delay(5e-3)
-        assert driver.read(0x00) == ID
-        assert driver.get(0x04) == 0x10001200, "ONW_LDC brings the configuration back"
-        assert driver.status & dw.SLP2INIT
-
-    def test_sleep_loses_the_antenna_delays(self, driver: Driver, chip: Chip):
-        driver.set(0x18, 0, 16436, 2)
-        driver.set(0x2E, 0x1804, 16436, 2)
-        self.asleep(driver)
-        chip.wakeup_pin()
-        chip.delay(5e-3)
-        assert driver.get(0x18, 0, 2) == 0x4040, "the low octet is the high one of LDE_RXANTD"
-        assert driver.get(0x2E, 0x1804, 2) == 0
-
-    def test_a_driver_that_does_not_rewrite_the_delays_ranges_wrong(self, air: Air):
-        a, b, *_ = pair(air)
-        self.asleep(b)
-        b.host.wakeup_pin()
-        b.host.delay(5e-3)
-        b.set(0x2E, 0x1804, 16436, 2)
-        a.listen()
-        a.host.delay(20e-6)
-        b.send(b"hello")
-        b.host.delay(1e-3)
-        b.set(0x18, 0, 16436, 2)
-        told = b.tx_stamp
-        assert (told - b.get(0x17, 5, 5)) % (1 << 40) != 16436
-
-    def test_without_a_way_to_wake_there_is_only_a_reset(self, driver: Driver, chip: Chip):
-        self.asleep(driver, wake=0x01)
-        driver.hz = dw.SLOW_HZ
-        driver.host.spi(bytes(200), dw.SLOW_HZ)
-        chip.wakeup_pin()
-        chip.delay(5e-3)
-        assert driver.read(0x00) != ID
-        chip.reset_pin()
-        chip.delay(5e-3)
-        assert driver.read(0x00) == ID
-
-
 def test_temperature_and_voltage_by_the_manuals_formulas(driver: Driver, chip: Chip):
     chip.environment(41.0, 3.1)
     driver.set(0x28, 0x11, 0x80, 1)
@@ -384,35 +239,31 @@ def test_temperature_and_voltage_by_the_manuals_formulas(driver: Driver, chip: C
     assert 3.3 + (volts - (otp(driver, 8) & 0xFF)) / 173 == pytest.approx(3.1, abs=0.003)
 
 
-def test_event_counters_count_once_enabled_and_cleared_in_two_writes(driver: Driver):
-    def time_out() -> None:
-        driver.listen()
-        driver.host.delay(1e-3)
+class TestStart:
+    def test_a_soft_reset_at_full_speed_is_heard_though_other_registers_are_not(self, air: Air):
+        """Drivers without a reset line write four octets at a time, and leave SPI fast; it works on boards."""
+        driver = Driver(air.chip())
+        driver.set(0x18, 0, 0x1234, 2)
+        driver.set(0x36, 0, 0xF0300201)
+        driver.set(0x36, 0, 0x00300201)
+        driver.host.delay(10e-3)
+        driver.set(0x18, 0, 0x4321, 2)
+        driver.set(0x36, 0, 0xF0300200)
+        driver.host.delay(5e-3)
+        assert driver.get(0x00) == 0xDECA0130
+        assert driver.get(0x18, 0, 2) == 0
+        assert driver.get(0x36, 0) == 0xF0300200
 
-    driver.set(0x27, 0x24, 5, 2)
-    time_out()
-    driver.set(0x2F, 0, 3)
-    time_out()
-    assert driver.get(0x2F, 0x12, 2) == 0, "clearing and enabling in one write does not enable"
-    driver.set(0x2F, 0, 1)
-    time_out()
-    time_out()
-    assert driver.get(0x2F, 0x12, 2) == 2
-    driver.set(0x2F, 0, 2)
-    assert driver.get(0x2F, 0x12, 2) == 0
-
-
-def test_the_state_says_what_the_chip_does(driver: Driver):
-    def state() -> int:
-        return driver.get(0x19, 0, 4) >> 16 & 15
-
-    driver.fctrl = 0x15C000
-    driver.listen()
-    assert state() == 5
-    driver.command(dw.TRXOFF)
-    driver.send_at(b"x", driver.time + 64_000_000)
-    assert state() == 2
-    driver.host.delay(0.95e-3)
-    assert state() == 4
-    driver.host.delay(1e-3)
-    assert state() == 1
+    @pytest.mark.parametrize("wait_us", [100, 120])
+    def test_microcode_takes_as_long_as_decawaves_drivers_wait(self, air: Air, wait_us: int):
+        a, b, *_ = pair(air)
+        b.hz = dw.SLOW_HZ
+        b.start(load_lde=False)
+        b.hz = dw.SLOW_HZ
+        b.set(0x36, 0, 0xF0300301)
+        b.set(0x2D, 6, 0x8000, 2)
+        b.host.delay(wait_us * 1e-6)
+        b.set(0x36, 0, 0x00, 1)  # the second octet stays 0x03
+        b.host.delay(10e-6)
+        b.hz = dw.FAST_HZ
+        assert bool(exchange(a, b) & dw.LDEDONE) == (wait_us == 120)

@@ -175,10 +175,6 @@ class Chip:
         """Hold RSTn from now on: 0 low, 1 floating, 2 high, which destroys the chip."""
         self._library.dw1000_reset_drive(self.address, level)
 
-    def wakeup_pin(self) -> None:
-        """A pulse on the WAKEUP pin."""
-        self._library.dw1000_wakeup_pin(self.address)
-
     def environment(self, celsius: float, volts: float) -> None:
         """Set what the chip's sensors measure."""
         self._library.dw1000_environment(self.address, celsius, volts)

@@ -108,7 +108,6 @@ def load() -> ctypes.CDLL:
         "delay": (None, (pointer, real)),
         "reset_pin": (None, (pointer,)),
         "reset_drive": (None, (pointer, ctypes.c_int)),
-        "wakeup_pin": (None, (pointer,)),
         "environment": (None, (pointer, real, real)),
         "lose_edges": (None, (pointer, real)),
         "program_otp": (None, (pointer, ctypes.c_uint, ctypes.c_uint32)),

@@ -99,7 +99,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
         case 0: dw1000_link(air, a, b, value & 7 ? &link : NULL); break;
         case 1: dw1000_program(a, program, &from); break;
         case 2: dw1000_reset_pin(a); break;
-        case 3: dw1000_wakeup_pin(a); break;
+        case 3: dw1000_reset_drive(a, DW1000_RESET_LOW); break;
         case 4: dw1000_delay(a, value * 1e-4); break;
         default: transact(a, &from); break;
         }

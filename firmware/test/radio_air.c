@@ -4,7 +4,6 @@
 #include <string.h>
 
 #include "dw1000_model.h"
-#include "dw1000_remote.h"
 #include "uwb_ranger.h"
 
 #ifdef UWB_RADIO_AIR_MODEL
