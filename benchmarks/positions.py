@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.evaluation.lad import fit_prior
-from uwb_mitigation.mitigation import Mitigation, correct_batch
+from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.prior import LinePrior
 from uwb_mitigation.model.shipped import default_model_path
@@ -156,7 +156,7 @@ def apartment(folder: Path) -> StaticErrors:
         if len(used) < 3:
             continue
         prior = fit_prior(configuration[~own], power[~own], first[~own], error[~own])
-        better = range_m - prior.predict_batch_m(power, first)
+        better = range_m - prior.predict_m(power, first)
         left = [
             np.nanmean((better - range_m + error)[~own & (configuration == c)])
             for c in np.unique(configuration[~own])
@@ -193,10 +193,8 @@ def flat(anchor_count: int, seed: int = 1, ranges: int = 3000) -> FlatErrors:
     records = list(drive)
     raw, truth = columns(drive, drive.anchors)
     first = np.array([record.measurement.cir.first_path_power_dbm for record in records], np.float32)
-    predicted = prior.predict_batch_m(raw.rx_power_dbm.astype(np.float32), first)
-    told = correct_batch(
-        Mitigation(load_bundle(default_model_path())), [record.measurement for record in records]
-    )
+    predicted = prior.predict_m(raw.rx_power_dbm.astype(np.float32), first)
+    told = Mitigation(load_bundle(default_model_path())).correct([record.measurement for record in records])
     by_line = raw.range_m - predicted, np.full(len(raw), variance)
     by_network = np.array([one.range_m for one in told]), np.array([one.variance_m2 for one in told])
     lines, networks = (
@@ -228,5 +226,5 @@ def _flat_line() -> tuple[LinePrior, float]:
     power = np.array([record.measurement.cir.rx_power_dbm for record in survey], np.float32)
     first = np.array([record.measurement.cir.first_path_power_dbm for record in survey], np.float32)
     prior = fit_prior(np.array([truth.configuration for truth in truths]), power, first, error)
-    left = np.abs(error - prior.predict_batch_m(power, first))
+    left = np.abs(error - prior.predict_m(power, first))
     return prior, (1.2533 * float(left.mean())) ** 2

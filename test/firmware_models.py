@@ -150,10 +150,8 @@ class Exported:
         """What the network reads of the real measurements, or of every so many."""
         samples = self.weights.architecture.samples
         measured = real_measurements(apartment)[::every]
-        windows = np.zeros((len(measured), samples), np.float32)
-        preprocessing = Preprocessing(samples, Scaling.PREAMBLE)
-        usable = [preprocessing.apply(m.cir, row) is None for m, row in zip(measured, windows, strict=True)]
-        return windows[usable]
+        faults, windows = Preprocessing(samples, Scaling.PREAMBLE).windows_of(measured)
+        return windows[np.equal(faults, 0)]
 
 
 SHAPES = [*itertools.product((3, 5), published.WINDOWS), (0, 157)]

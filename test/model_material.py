@@ -93,6 +93,12 @@ def cir(seed: int = 0, **changes: object) -> Cir:
     return Cir(**(options | changes))  # type: ignore[arg-type]
 
 
+def window_of(of: Cir, preprocessing: Preprocessing) -> tuple[int, np.ndarray]:
+    """The fault of a CIR, 0 if there is none, and its window."""
+    (fault,), (window,) = preprocessing.windows_of([RangeMeasurement(0, 1, 2, 0, 0, 3.0, of)])
+    return fault, window
+
+
 def measurement(range_m: float = 3.0, seed: int = 0, **changes: object) -> RangeMeasurement:
     """A measurement; `changes` are of its CIR."""
     return RangeMeasurement(

@@ -19,7 +19,7 @@ from benchmarks.__main__ import nodes_result
 from benchmarks.nodes import RANGES, RATES_HZ, Figures, Latency, Subject, missing_between
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.measurement import Status
-from uwb_mitigation.mitigation import Mitigation, correct_batch
+from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.shipped import default_model_path
 from uwb_mitigation.nodes import topics
@@ -48,7 +48,7 @@ def test_the_benchs_ranges_are_ones_that_the_model_corrects(tmp_path: Path):
         measurements = [record.measurement for record in source]
     assert [m.sequence for m in measurements] == list(range(RANGES))
     assert {len(m.cir) for m in measurements} == {157}
-    statuses = [result.status for result in correct_batch(mitigation, measurements[:500])]
+    statuses = [result.status for result in mitigation.correct(measurements[:500])]
     assert statuses.count(Status.OK) > 450
 
 

@@ -221,9 +221,9 @@ def test_the_prior_is_the_same_one_by_one_and_in_batches():
     rx = generator.uniform(-100, -70, 500).astype(np.float32)
     first = (rx - generator.uniform(0, 20, 500)).astype(np.float32)
     first[3], rx[4] = np.nan, np.inf
-    batch = LINE.predict_batch_m(rx, first)
-    single = np.array([LINE.predict_m(*pair) for pair in zip(rx, first, strict=True)], np.float32)
-    assert np.array_equal(batch, single, equal_nan=True)
+    batch = LINE.predict_m(rx, first)
+    single = [LINE.predict_m(rx[i : i + 1], first[i : i + 1]) for i in range(500)]
+    assert np.array_equal(batch, np.concatenate(single), equal_nan=True)
     assert np.isnan(batch[[3, 4]]).all()
 
 

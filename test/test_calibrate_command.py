@@ -121,7 +121,7 @@ def test_a_drive_becomes_a_bundle_and_offsets_that_better_other_ranges(site):
     assert "without truth" in bundle.card.origin
     # Without a CIR: the line and the offset count, since the network has nothing to say.
     cir = Cir(np.zeros(0, np.int16), rx_power_dbm=-85.0)
-    corrected = Mitigation(bundle, offsets).correct(RangeMeasurement(0, 7, 1, 0, 0, 5.4, cir))
+    corrected = Mitigation(bundle, offsets).correct([RangeMeasurement(0, 7, 1, 0, 0, 5.4, cir)])[0]
     assert corrected.status == 0
     assert corrected.range_m == pytest.approx(5.0, abs=0.12)
     none = run("quantize", "site.onnx", "--data", "drive.mcap", "-o", "int8.onnx", folder=site)

@@ -145,7 +145,7 @@ def test_a_recipe_that_harms_is_told_as_one(tmp_path, monkeypatch):
 def predicted(fitted, data) -> np.ndarray:
     prior, network = fitted
     of_network = 0 if network is None else floating.predict_m(network, data.inputs)
-    return prior.predict_batch_m(data.rx_power_dbm, data.first_path_power_dbm) + of_network
+    return prior.predict_m(data.rx_power_dbm, data.first_path_power_dbm) + of_network
 
 
 def test_the_cold_start_fits_an_offset_alone_and_the_mean_a_line_too(tmp_path):

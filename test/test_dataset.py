@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from model_material import dataset, record
+from model_material import dataset, record, window_of
 
 from uwb_mitigation.errors import DatasetError, ParameterError
 from uwb_mitigation.evaluation import splits
@@ -21,8 +21,7 @@ from uwb_mitigation.preprocessing import CirFault, Preprocessing
 def test_a_record_becomes_a_row():
     records = [record(seed, f"c{seed}") for seed in range(3)]
     built = build_dataset(records, Preprocessing(157))
-    expected = np.empty(157, np.float32)
-    Preprocessing(157).apply(records[1].measurement.cir, expected)
+    _, expected = window_of(records[1].measurement.cir, Preprocessing(157))
     assert np.array_equal(built.inputs[1], expected)
     assert built.error_m.tolist() == [0.25] * 3
     assert built.rx_power_dbm.tolist() == [-82.0] * 3
@@ -43,8 +42,8 @@ def test_what_is_left_out_is_counted_by_reason():
     assert build_dataset(records, Preprocessing(157)).refused == {
         "no true range": 2,
         "no valid range": 1,
-        CirFault.NO_PREAMBLE_COUNT.value: 1,
-        CirFault.EMPTY.value: 1,
+        CirFault.NO_PREAMBLE_COUNT.text: 1,
+        CirFault.EMPTY.text: 1,
     }
 
 

@@ -70,14 +70,14 @@ def test_ros_that_cannot_be_loaded_is_broken(monkeypatch: pytest.MonkeyPatch, tm
 
 
 def test_arithmetic_that_differs_by_one_bit_is_broken(monkeypatch: pytest.MonkeyPatch):
-    predict = Session.predict_batch_m
+    predict = Session.predict_m
 
     def off_by_one_bit(self, windows):
         outputs = predict(self, windows)
         outputs[3:4].view(np.uint32)[0] ^= 1
         return outputs
 
-    monkeypatch.setattr(Session, "predict_batch_m", off_by_one_bit)
+    monkeypatch.setattr(Session, "predict_m", off_by_one_bit)
     assert states()["shipped model"] == "broken"
 
 

@@ -83,7 +83,7 @@ def test_coverage_counts_errors_within_the_deviations():
 def test_evaluation_is_the_live_path(tmp_path, recording):
     mitigation = Mitigation(bundle(tmp_path, Remnet(samples=157)))
     outcome = evaluate(mitigation, recording)
-    left = [mitigation.correct(item.measurement).range_m - item.truth.range_m for item in recording]
+    left = [mitigation.correct([item.measurement])[0].range_m - item.truth.range_m for item in recording]
     assert outcome.n == 48
     assert outcome.raw.mae == 0.25
     assert outcome.corrected.mae == pytest.approx(np.abs(left).mean())

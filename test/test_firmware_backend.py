@@ -18,7 +18,7 @@ from uwb_mitigation.bag.codec import encode_range
 from uwb_mitigation.errors import MissingDependencyError
 from uwb_mitigation.firmware_export import compiling, toolchain
 from uwb_mitigation.firmware_export.backend import FirmwareMitigation
-from uwb_mitigation.mitigation import Mitigation, correct_batch
+from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import Bundle
 from uwb_mitigation.offsets import Offsets
 
@@ -37,8 +37,8 @@ def test_the_firmware_gives_the_corrected_ranges_of_onnx_runtime(
     measurements = [replace(one, tag_id=n % 3, anchor_id=n % 5) for n, one in enumerate(measurements)]
     offsets = Offsets(0.22, {1: 0.1, 2: 0.3}, {1: -0.05, 2: 0.0}, {(2, 3): 2.5})
     firmware, mitigation = FirmwareMitigation(bundle, offsets), Mitigation(bundle, offsets)
-    for computed, measurement in zip(correct_batch(firmware, measurements), measurements, strict=True):
-        assert repr(computed) == repr(mitigation.correct(measurement))
+    for computed, measurement in zip(firmware.correct(measurements), measurements, strict=True):
+        assert repr(computed) == repr(mitigation.correct([measurement])[0])
 
 
 def test_without_a_compiler_the_error_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -90,7 +90,7 @@ def test_a_mitigator_that_is_told_to_corrects_with_the_firmware(
     assert traces.exists()
     mitigation = Mitigation(bundle)
     for message, measurement in zip(corrected, measurements, strict=True):
-        expected = mitigation.correct(measurement)
+        expected = mitigation.correct([measurement])[0]
         values = np.array([expected.range_m, expected.correction_m, expected.variance_m2], np.float32)
         assert (
             np.array([message.range, message.correction, message.variance], np.float32).tobytes()

@@ -64,7 +64,7 @@ def test_the_sketch_corrects_what_the_radio_sends_in_writes_that_are_safe_on_usb
     assert len(corrections) == len(sent) >= 10
     for measurement, correction in zip(sent, corrections, strict=True):
         assert isinstance(measurement, RangeMeasurement)
-        expected = host.correct(measurement)
+        expected = host.correct([measurement])[0]
         # Through binary32, as a board holds them.
         wanted = Correction(
             0, correction.tag_id, correction.anchor_id, correction.sequence, correction.device_time,

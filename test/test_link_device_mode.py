@@ -53,7 +53,7 @@ def test_what_the_board_corrects_equals_the_hosts_correction_of_what_the_board_s
         raw, corrected = session.receive(board.measure(measurement, now), 0, 0)
         assert isinstance(raw, RangeMeasurement)
         assert isinstance(corrected, Correction)
-        assert bits(corrected.corrected) == bits(mitigation.correct(raw))
+        assert bits(corrected.corrected) == bits(mitigation.correct([raw])[0])
 
 
 def test_what_the_board_corrects_for_a_host_equals_the_hosts_correction(mitigation):
@@ -64,7 +64,9 @@ def test_what_the_board_corrects_for_a_host_equals_the_hosts_correction(mitigati
         held = messages.decode(kind, payload)
         (frame,) = decoder.feed(board.receive(host.encode(kind, payload), now))
         assert frame.flags == Flag.ANSWER
-        assert bits(messages.decode(frame.type, frame.payload).corrected) == bits(mitigation.correct(held))
+        assert bits(messages.decode(frame.type, frame.payload).corrected) == bits(
+            mitigation.correct([held])[0]
+        )
 
 
 def test_a_measurement_the_board_cannot_correct_comes_back_raw_with_its_status(mitigation):

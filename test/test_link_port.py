@@ -50,9 +50,11 @@ class Recording:
 class HalfMetre:
     """A model that predicts half a metre of error for everything."""
 
-    def correct(self, measurement: RangeMeasurement) -> CorrectedRange:
-        raw = measurement.range_m
-        return CorrectedRange(raw - 0.5, raw, 0.5, 0.01, Status.OK, Origin.HOST, IDENTITY.model_id)
+    def correct(self, measurements: list[RangeMeasurement]) -> list[CorrectedRange]:
+        return [
+            CorrectedRange(m.range_m - 0.5, m.range_m, 0.5, 0.01, Status.OK, Origin.HOST, IDENTITY.model_id)
+            for m in measurements
+        ]
 
 
 @pytest.fixture

@@ -33,11 +33,11 @@ IDENTITY = Identity(board_id=0xB0, model_id=0xCAFE, window=157, firmware_name="s
 class HalfMetre:
     """A model that predicts half a metre of error for everything."""
 
-    def correct(self, measurement: RangeMeasurement) -> CorrectedRange:
-        range_m = measurement.range_m - 0.5
-        return CorrectedRange(
-            range_m, measurement.range_m, 0.5, 0.01, Status.OK, Origin.HOST, IDENTITY.model_id
-        )
+    def correct(self, measurements: list[RangeMeasurement]) -> list[CorrectedRange]:
+        return [
+            CorrectedRange(m.range_m - 0.5, m.range_m, 0.5, 0.01, Status.OK, Origin.HOST, IDENTITY.model_id)
+            for m in measurements
+        ]
 
 
 def measurement(sequence: int) -> RangeMeasurement:
@@ -379,7 +379,7 @@ def test_a_malformed_message_is_counted_and_explained():
 
 def test_an_answer_to_nothing_is_counted():
     bench = connected()
-    correction = Correction(0, 1, 2, 3, 4, HalfMetre().correct(measurement(1)))
+    correction = Correction(0, 1, 2, 3, 4, HalfMetre().correct([measurement(1)])[0])
     kind, payload = messages.encode(correction)
     frame = Frame(int(kind), Flag.ANSWER, bench.session._next_sequence, 0, payload)
 

@@ -8,10 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from model_material import LINE, bundle, measurement
+from model_material import LINE, bundle, measurement, window_of
 
 from uwb_mitigation.measurement import Encoding, Origin, Status
-from uwb_mitigation.mitigation import Mitigation, correct_batch
+from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.architecture import Remnet
 from uwb_mitigation.model.prior import LinePrior
 from uwb_mitigation.offsets import Offsets
@@ -54,10 +54,10 @@ BAD = [
 
 def test_the_correction_is_prior_plus_network_in_float32(mitigation):
     subject = measurement(3.1)
-    window = np.empty(157, np.float32)
-    assert Preprocessing(157).apply(subject.cir, window) is None
-    predicted = LINE.predict_m(-82.0, -88.0) + mitigation._session.predict_m(window)
-    result = mitigation.correct(subject)
+    _, window = window_of(subject.cir, Preprocessing(157))
+    powers = np.array([-82.0]), np.array([-88.0])
+    (predicted,) = LINE.predict_m(*powers) + mitigation._session.predict_m(window[None])
+    result = mitigation.correct([subject])[0]
     assert result.status is Status.OK
     assert result.correction_m == float(predicted)
     assert result.range_m == float(np.float32(3.1) - predicted)
@@ -71,16 +71,16 @@ def test_a_range_without_a_cir_gets_the_variance_of_its_offset(tmp_path):
     one = Mitigation(bundle(tmp_path), Offsets(pairs={(7, 1): 0.2}, pair_sd={(7, 1): 0.03}))
     card = one.bundle.card
     without = replace(measurement(samples=np.zeros(0, np.int16)), tag_id=7, anchor_id=1)
-    calibrated = one.correct(without)
+    calibrated = one.correct([without])[0]
     assert calibrated.status is Status.NO_CIR
     assert calibrated.variance_m2 == card.variance_m2 < card.variance_uncorrected_m2
     one.offsets = Offsets()
-    assert one.correct(without).variance_m2 == card.variance_uncorrected_m2
+    assert one.correct([without])[0].variance_m2 == card.variance_uncorrected_m2
 
 
 @pytest.mark.parametrize(("changes", "range_m", "status"), BAD)
 def test_a_bad_measurement_passes_through(mitigation, changes, range_m, status):
-    result = mitigation.correct(measurement(range_m, **changes))
+    result = mitigation.correct([measurement(range_m, **changes)])[0]
     assert result.status is status
     assert result.range_m == range_m or math.isnan(range_m)
     assert math.isnan(result.range_m) == math.isnan(range_m)
@@ -88,21 +88,21 @@ def test_a_bad_measurement_passes_through(mitigation, changes, range_m, status):
 
 
 def test_a_valid_range_passes_through_with_the_variance_of_raw_ranges(mitigation):
-    assert mitigation.correct(measurement(preamble_count=0)).variance_m2 == 0.5
+    assert mitigation.correct([measurement(preamble_count=0)])[0].variance_m2 == 0.5
 
 
 @pytest.mark.parametrize("range_m", [math.nan, math.inf, -1.0])
 def test_an_invalid_range_has_infinite_variance(mitigation, range_m):
-    assert mitigation.correct(measurement(range_m)).variance_m2 == math.inf
+    assert mitigation.correct([measurement(range_m)])[0].variance_m2 == math.inf
 
 
 def test_a_range_of_zero_is_corrected(mitigation):
-    assert mitigation.correct(measurement(0.0)).status is Status.OK
+    assert mitigation.correct([measurement(0.0)])[0].status is Status.OK
 
 
 def test_a_constant_prior_needs_no_power(tmp_path):
     subject = Mitigation(bundle(tmp_path, Remnet(samples=157), prior=LinePrior(0.25)))
-    result = subject.correct(measurement(rx_power_dbm=math.nan, first_path_power_dbm=math.nan))
+    result = subject.correct([measurement(rx_power_dbm=math.nan, first_path_power_dbm=math.nan)])[0]
     assert result.status is Status.OK
 
 
@@ -112,7 +112,7 @@ def test_a_constant_prior_needs_no_power(tmp_path):
 )
 def test_a_bundle_that_needs_no_cir_corrects_whatever_the_cir_is(tmp_path, changes):
     made = bundle(tmp_path, Remnet(samples=157), prior=LinePrior(0.25), needs_cir=False)
-    result = Mitigation(made).correct(measurement(3.0, **changes))
+    result = Mitigation(made).correct([measurement(3.0, **changes)])[0]
     assert result.status is Status.OK
     if changes.get("first_path_power_dbm") is None and changes:
         assert result.correction_m == 0.25
@@ -120,7 +120,7 @@ def test_a_bundle_that_needs_no_cir_corrects_whatever_the_cir_is(tmp_path, chang
 
 def test_a_prediction_beyond_the_limits_is_out_of_distribution(tmp_path):
     subject = Mitigation(bundle(tmp_path, Remnet(samples=157), correction_limits_m=(50.0, 60.0)))
-    result = subject.correct(measurement(3.0))
+    result = subject.correct([measurement(3.0)])[0]
     assert (result.status, result.range_m) == (Status.OUT_OF_DISTRIBUTION, 3.0)
 
 
@@ -135,34 +135,29 @@ def test_a_batch_has_the_bits_of_single_measurements(mitigation, tmp_path, prior
     subjects[5:5] = [measurement(range_m, **changes) for changes, range_m, _ in BAD]
     subjects += [measurement(2.0, samples=np.zeros(0, np.int16), rx_power_dbm=-60.0 - n) for n in range(9)]
     subjects += [measurement(2.0, first_path_power_dbm=math.nan), measurement(2.0, rx_power_dbm=math.nan)] * 4
-    single = [mitigation.correct(subject) for subject in subjects]
+    single = [mitigation.correct([subject])[0] for subject in subjects]
     if prior is not None:
         assert sum(result.status is Status.OK for result in single) > 70
-    assert [repr(result) for result in correct_batch(mitigation, subjects)] == [repr(r) for r in single]
+    assert [repr(result) for result in mitigation.correct(subjects)] == [repr(r) for r in single]
 
 
 def test_an_empty_batch_is_empty(mitigation):
-    assert correct_batch(mitigation, []) == []
+    assert mitigation.correct([]) == []
 
 
 def test_a_batch_of_bad_measurements_needs_no_network(mitigation):
-    assert [result.status for result in correct_batch(mitigation, [measurement(math.nan)])] == [
+    assert [result.status for result in mitigation.correct([measurement(math.nan)])] == [
         Status.OUT_OF_DISTRIBUTION
     ]
 
 
 class FailingSession:
-    def predict_m(self, window):
+    def predict_m(self, windows):
         raise RuntimeError("out of memory")
-
-    predict_batch_m = predict_m
 
 
 class NotANumberSession:
-    def predict_m(self, window):
-        return np.float32(np.nan)
-
-    def predict_batch_m(self, windows):
+    def predict_m(self, windows):
         return np.full(len(windows), np.nan, np.float32)
 
 
@@ -170,5 +165,5 @@ class NotANumberSession:
 def test_a_network_that_fails_lets_the_range_through(tmp_path, session):
     subject = Mitigation(bundle(tmp_path, Remnet(samples=157)))
     subject._session = session
-    results = [subject.correct(measurement(3.0)), *correct_batch(subject, [measurement(3.0)] * 2)]
-    assert [(result.status, result.range_m) for result in results] == [(Status.MODEL_ERROR, 3.0)] * 3
+    results = subject.correct([measurement(3.0)] * 2)
+    assert [(result.status, result.range_m) for result in results] == [(Status.MODEL_ERROR, 3.0)] * 2

@@ -149,7 +149,7 @@ def test_an_mlp_bundle_loads_and_runs(tmp_path, quantised):
     expected = (
         IntegerNetwork(integers).predict_m(inputs) if quantised else floating.predict_m(weights, inputs)
     )
-    computed = np.array([Session(bundle).predict_m(row) for row in inputs])
+    computed = Session(bundle).predict_m(inputs)
     assert np.allclose(computed, expected, atol=0 if quantised else 1e-5)
     if not quantised:
         read = graph.float_weights(bundle.model, shape)

@@ -87,7 +87,7 @@ def test_the_nodes_give_what_the_library_gives_on_a_real_log(ros: Ros, apartment
     log = apartment / "logs" / "19.log.xz"
     mitigation = Mitigation(load_bundle(default_model_path()))
     with open_decaranging(log) as source:
-        expected = [mitigation.correct(record.measurement) for record in source]
+        expected = [mitigation.correct([record.measurement])[0] for record in source]
     _, corrected = listen_to_replay(ros, len(expected), "source:=decaranging", f"path:={log}", "rate:=200.0")
     assert [line["range"] for line in corrected] == [np.float32(item.range_m) for item in expected]
     assert [line["variance"] for line in corrected] == [np.float32(item.variance_m2) for item in expected]

@@ -43,7 +43,7 @@ def test_offsets_are_set_while_it_runs_and_nonsense_leaves_those_before(ros: Ros
 
     def expected(offsets: Offsets) -> np.float32:
         host.offsets = offsets
-        return np.float32(host.correct(asked).range_m)
+        return np.float32(host.correct([asked])[0].range_m)
 
     assert answer().range == expected(Offsets(0.25))
     assert ros.set_parameter("mitigator", "offsets", str(path)).successful

@@ -19,7 +19,7 @@ from uwb_mitigation.link.layout import MAX_OFFSETS, MessageType, Mode
 from uwb_mitigation.link.messages import Correction
 from uwb_mitigation.link.session import RADIO_TRIES, REQUEST_INTERVAL_NS, BoardSession
 from uwb_mitigation.measurement import CorrectedRange, RangeMeasurement, Status
-from uwb_mitigation.mitigation import Mitigation, correct_batch
+from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.architecture import Remnet
 from uwb_mitigation.offsets import NO_OFFSETS, Offsets, dump_offsets, parse_offsets, read_offsets
 
@@ -34,14 +34,9 @@ pairs:
 
 def test_the_most_specific_offset_counts_and_those_of_two_radios_add():
     offsets = parse_offsets(TEXT, "x")
-    assert offsets.of(7, 1) == 1.5
-    assert offsets.of(7, 31) == 0.0625
-    assert offsets.of(8, 1) == 0.25
-    assert offsets.of(7, 9) == -0.0625
-    assert offsets.of(8, 9) == 0.5
-    pairs = np.array(list(itertools.product((7, 8, 2**64 - 1), (1, 31, 9))), np.uint64)
-    expected = [offsets.of(int(tag), int(anchor)) for tag, anchor in pairs]
-    assert offsets.of_columns(*pairs.T).tolist() == expected
+    assert offsets.of([7, 7, 8, 7, 8], [1, 31, 1, 9, 9]).tolist() == [1.5, 0.0625, 0.25, -0.0625, 0.5]
+    unknown = np.array([8, 2**64 - 1], np.uint64)
+    assert offsets.of(unknown, unknown).tolist() == [0.5, 0.5]
 
 
 def test_a_file_that_is_written_is_read_as_it_was():
@@ -53,7 +48,7 @@ def test_a_file_that_is_written_is_read_as_it_was():
 
 def test_a_parameter_is_a_number_or_a_file(tmp_path: Path):
     assert read_offsets("") is NO_OFFSETS
-    assert read_offsets(" 0.22 ").of(1, 2) == float(np.float32(0.22))
+    assert read_offsets(" 0.22 ").of([1], [2]) == np.float32(0.22)
     path = tmp_path / "offsets.yaml"
     path.write_text(TEXT, encoding="utf-8")
     assert read_offsets(str(path)) == parse_offsets(TEXT, "x")
@@ -94,13 +89,6 @@ def test_what_is_no_file_of_offsets_is_refused_in_words(text: str, said: str):
     assert "site.yaml" in str(caught.value)
 
 
-def test_noise_of_identities_does_not_fill_the_memory():
-    offsets = parse_offsets(TEXT, "x")
-    for tag in range(10_000):
-        offsets.of(tag, tag)
-    assert len(offsets._known) < 5_000
-
-
 @pytest.fixture(scope="module")
 def subject(tmp_path_factory) -> Mitigation:
     return Mitigation(bundle(tmp_path_factory.mktemp("bundle"), Remnet(samples=157)))
@@ -112,8 +100,8 @@ def with_offsets(subject: Mitigation, offsets: Offsets) -> Mitigation:
 
 def test_the_offset_comes_off_beside_the_predicted_error(subject: Mitigation):
     offset = 0.25
-    plain, moved = subject.correct(measurement(3.0)), measurement(3.25)
-    result = with_offsets(subject, Offsets(offset)).correct(moved)
+    plain, moved = subject.correct([measurement(3.0)])[0], measurement(3.25)
+    result = with_offsets(subject, Offsets(offset)).correct([moved])[0]
     assert result.status is Status.OK
     assert result.range_raw_m == 3.25
     assert result.correction_m == pytest.approx(plain.correction_m + offset, abs=1e-6)
@@ -136,7 +124,7 @@ def test_a_range_passes_through_less_the_offset(
 ):
     bad = measurement(range_m)
     bad = replace(bad, cir=replace(bad.cir, preamble_count=0))
-    result = with_offsets(subject, Offsets(offset)).correct(bad)
+    result = with_offsets(subject, Offsets(offset)).correct([bad])[0]
     assert result.status is Status.BAD_CIR
     assert str(result.range_m) == str(expected)
     assert result.correction_m == offset
@@ -152,8 +140,8 @@ def test_many_at_once_give_the_same_bits_as_one_by_one(subject: Mitigation):
         replace(measurement(range_m, seed), tag_id=tag, anchor_id=anchor)
         for seed, (range_m, tag, anchor) in enumerate(itertools.product(ranges, (3, 4, 5), (1, 2, 6)))
     ]
-    answers = correct_batch(several, asked)
-    assert [repr(answer) for answer in answers] == [repr(several.correct(one)) for one in asked]
+    answers = several.correct(asked)
+    assert [repr(answer) for answer in answers] == [repr(several.correct([one])[0]) for one in asked]
     assert {answer.status for answer in answers} == {Status.OK, Status.OUT_OF_DISTRIBUTION}
 
 
@@ -163,11 +151,12 @@ class Echo:
     def __init__(self) -> None:
         self.offsets = Offsets(9.0)
 
-    def correct(self, asked: RangeMeasurement) -> CorrectedRange:
-        offset_m = self.offsets.of(asked.tag_id, asked.anchor_id)
+    def correct(self, measurements: list[RangeMeasurement]) -> list[CorrectedRange]:
+        (asked,) = measurements
+        offset_m = float(self.offsets.of([asked.tag_id], [asked.anchor_id])[0])
         plain = messages.decode(*messages.encode(CORRECTION))
         assert isinstance(plain, Correction)
-        return replace(plain.corrected, range_m=asked.range_m - offset_m, correction_m=offset_m)
+        return [replace(plain.corrected, range_m=asked.range_m - offset_m, correction_m=offset_m)]
 
 
 CORRECTION = Correction(0, 1, 2, 3, 4, CorrectedRange(1.0, 1.0, 0.0, 1.0, Status.OK, 1, 5))  # type: ignore[arg-type]

@@ -18,6 +18,7 @@ import pandas as pd
 import pytest
 import requests
 from command_line import run, start
+from model_material import window_of
 
 from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError
 from uwb_mitigation.evaluation.dataset import build_dataset
@@ -274,13 +275,13 @@ def test_a_simulated_configuration_is_one_placement(simulated: list[Record]) -> 
 
 
 def test_simulated_cirs_are_cut_and_normalised_and_powers_known(simulated: list[Record]) -> None:
-    preprocessing, out = Preprocessing(157, Scaling.MAX), np.empty(157, np.float32)
+    preprocessing = Preprocessing(157, Scaling.MAX)
     for record in simulated:
         cir = record.measurement.cir
         assert (len(cir), cir.encoding, cir.preamble_count) == (157, Encoding.MAGNITUDE, 0)
         assert cir.samples.max() * cir.scale == pytest.approx(1.0)
         assert math.isfinite(cir.rx_power_dbm - cir.first_path_power_dbm)
-        assert preprocessing.apply(cir, out) is None
+        assert window_of(cir, preprocessing)[0] == 0
     clear = [r.measurement.cir.samples for r in simulated if r.truth and r.truth.label == "LOS"]
     rise = np.median([np.argmax(samples > 0.3 * FULL_SCALE) for samples in clear])
     assert abs(rise - WINDOW_LEAD) <= 1

@@ -33,7 +33,7 @@ PLAY = ("count:=200", "seed:=1", "simulated_rate:=400.0", *PAUSED)
 def test_the_ranges_are_those_of_the_library_to_the_bit(ros: Ros):
     mitigation = Mitigation(load_bundle(default_model_path()))
     source = SimulatedSource(seed=1, count=200, rate_hz=400.0)
-    expected = [mitigation.correct(record.measurement) for record in source]
+    expected = [mitigation.correct([record.measurement])[0] for record in source]
     received = ros.collect(RangeCorrected, CORRECTED)
     pipeline = ros.start("pipeline", *PLAY)
     ros.play()

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from bag_material import Foreign, chunk_offsets
 from command_line import ENVIRONMENT, command, run, start
-from model_material import bundle, cir
+from model_material import cir
 
 from uwb_mitigation.bag import codec, columns, schemas
 from uwb_mitigation.bag.reader import BagReader
@@ -30,7 +30,6 @@ from uwb_mitigation.measurement import (
     Cir,
     CorrectedColumns,
     CorrectedRange,
-    Encoding,
     Origin,
     RangeMeasurement,
     Record,
@@ -38,11 +37,9 @@ from uwb_mitigation.measurement import (
     Truth,
 )
 from uwb_mitigation.mitigation import Mitigation
-from uwb_mitigation.model.architecture import Remnet
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.shipped import shipped_model_path
 from uwb_mitigation.offsets import NO_OFFSETS, Offsets
-from uwb_mitigation.preprocessing import Preprocessing, Scaling
 from uwb_mitigation.processing.job import Job, attempt, process_bag
 from uwb_mitigation.processing.parallel import run_on_dask
 from uwb_mitigation.processing.planning import plan
@@ -140,75 +137,7 @@ def corrected_of(path: Path) -> list[bytes]:
 
 def one_by_one(measurements: list[RangeMeasurement], offsets: Offsets = NO_OFFSETS) -> list[bytes]:
     mitigation = Mitigation(load_bundle(shipped_model_path("evk1000_apartment")), offsets)
-    return [codec.encode_corrected(m, mitigation.correct(m)) for m in measurements]
-
-
-@pytest.mark.parametrize("scaling", list(Scaling))
-@pytest.mark.parametrize("samples", [157, 8])
-def test_inputs_of_a_batch_are_those_of_single_cirs_to_the_bit(scaling: Scaling, samples: int) -> None:
-    preprocessing = Preprocessing(samples, scaling)
-    measurements = odd_exchanges()
-    (block,) = columns.blocks([codec.encode_range(m) for m in measurements])
-    rows, inputs = preprocessing.apply_batch(block.columns)
-    expected = {}
-    for number, measurement in enumerate(measurements):
-        out = np.empty(samples, np.float32)
-        if preprocessing.apply(measurement.cir, out) is None:
-            expected[number] = out.tobytes()
-    assert {row: line.tobytes() for row, line in zip(rows.tolist(), inputs, strict=True)} == expected
-    assert 5 < len(expected) < len(ROWS) - 5
-
-
-@pytest.mark.parametrize("scaling", list(Scaling))
-def test_a_batch_of_magnitudes_too(scaling: Scaling) -> None:
-    generator = np.random.default_rng(4)
-    windows = generator.integers(0, 9000, (20, 41)).astype(np.int16)
-    windows[3, 7], windows[4], windows[5, 0], windows[6, 30] = -1, 0, 32767, -32768
-    measurements = [
-        replace(
-            exchange(number),
-            cir=Cir(row, Encoding.MAGNITUDE, first_path_index=7.5, preamble_count=9, scale=0.5),
-        )
-        for number, row in enumerate(windows)
-    ]
-    preprocessing = Preprocessing(32, scaling)
-    (block,) = columns.blocks([codec.encode_range(m) for m in measurements])
-    rows, inputs = preprocessing.apply_batch(block.columns)
-    out = np.empty(32, np.float32)
-    usable = [n for n, m in enumerate(measurements) if preprocessing.apply(m.cir, out) is None]
-    assert rows.tolist() == usable
-    assert 3 not in usable
-    for row, line in zip(rows.tolist(), inputs, strict=True):
-        preprocessing.apply(measurements[row].cir, out)
-        assert line.tobytes() == out.tobytes()
-
-
-def test_columns_are_corrected_as_one_by_one_and_the_rest_is_left_out(tmp_path: Path) -> None:
-    mitigation = Mitigation(bundle(tmp_path, Remnet(samples=157), correction_limits_m=(-0.5, 0.5)))
-    measurements = [
-        *odd_exchanges(),
-        *(exchange(n, {"rx_power_dbm": -70.0 - n}) for n in range(50)),
-    ]
-    (block,) = columns.blocks([codec.encode_range(m) for m in measurements])
-    rows, corrected = mitigation.correct_columns(block.columns)
-    values = (corrected.range_m, corrected.correction_m, corrected.variance_m2, corrected.status)
-    answers = dict(zip(rows.tolist(), zip(*(value.tolist() for value in values), strict=True), strict=True))
-    single_answers = [mitigation.correct(m) for m in measurements]
-    assert (
-        answers.items()
-        <= {
-            n: (answer.range_m, answer.correction_m, answer.variance_m2, answer.status)
-            for n, answer in enumerate(single_answers)
-        }.items()
-    )
-    assert (corrected.origin, corrected.model_id) == (Origin.HOST, mitigation.bundle.model_id)
-    assert answers.keys() >= {n for n, answer in enumerate(single_answers) if answer.status is Status.OK}
-    assert set(corrected.status.tolist()) == {Status.OK, Status.OUT_OF_DISTRIBUTION}
-    assert {answer.status for answer in single_answers} >= {
-        Status.OK,
-        Status.BAD_CIR,
-        Status.OUT_OF_DISTRIBUTION,
-    }
+    return [codec.encode_corrected(m, mitigation.correct([m])[0]) for m in measurements]
 
 
 @pytest.mark.parametrize("frame", ["", "a", "antenna", "antenna of the third anchor", "Küche"])
@@ -219,30 +148,28 @@ def test_encoded_blocks_are_what_the_codec_encodes(frame: str, samples: int) -> 
     ]
     measurements[3] = replace(measurements[3], stamp_ns=-1)
     (block,) = columns.blocks([codec.encode_range(m) for m in measurements])
-    rows = np.array([0, 3, 8])
-    correction = np.array([0.25, -0.5, 1.0], np.float32)
-    variance = np.array([0.25, 0.5, 2.0], np.float32)
-    status = np.array([Status.OK, Status.OUT_OF_DISTRIBUTION, Status.OK], np.uint8)
+    correction = np.array([0.25, -0.5, 1.0] * 3, np.float32)
+    variance = np.array([0.25, 0.5, 2.0] * 3, np.float32)
+    status = np.array([Status.OK, Status.OUT_OF_DISTRIBUTION, Status.OK] * 3, np.uint8)
     encoded = block.encode_corrected(
-        rows,
         CorrectedColumns(
-            block.columns.range_m[rows] - correction, correction, variance, status, LIKE.origin, LIKE.model_id
+            block.columns.range_m - correction, correction, variance, status, LIKE.origin, LIKE.model_id
         ),
     )
     assert encoded == [
         codec.encode_corrected(
-            measurements[row],
+            measurement,
             replace(
                 LIKE,
-                range_m=measurements[row].range_m - shift,
-                range_raw_m=measurements[row].range_m,
+                range_m=measurement.range_m - shift,
+                range_raw_m=measurement.range_m,
                 correction_m=shift,
                 variance_m2=spread,
                 status=Status(kind),
             ),
         )
-        for row, shift, spread, kind in zip(
-            rows.tolist(), correction.tolist(), variance.tolist(), status.tolist(), strict=True
+        for measurement, shift, spread, kind in zip(
+            measurements, correction.tolist(), variance.tolist(), status.tolist(), strict=True
         )
     ]
 

@@ -107,7 +107,7 @@ def test_ranges_that_queue_up_are_all_corrected_in_order_and_to_the_bit(ros: Ros
     mitigator.send(signal.SIGCONT)
     ros.spin_until(lambda: len(corrected) == len(measurements))
     assert [m.sequence for m in corrected] == [m.sequence for m in measurements]
-    expected = [np.float32(mitigation.correct(m).range_m) for m in measurements]
+    expected = [np.float32(mitigation.correct([m])[0].range_m) for m in measurements]
     assert np.array_equal([m.range for m in corrected], expected, equal_nan=True)
 
 

@@ -22,9 +22,8 @@ def models() -> dict[Scaling, Mitigation]:
 
 def ratio(model: Mitigation, columns: RangeColumns, error: np.ndarray, blocked: np.ndarray) -> float:
     """MAE over that of a constant offset; each less its own median in line of sight."""
-    correction = np.zeros(len(error))
-    rows, answers = model.correct_columns(columns)
-    correction[rows] = np.where(answers.status == Status.OK, answers.correction_m, 0.0)
+    answers = model.correct_columns(columns)
+    correction = np.where(answers.status == Status.OK, answers.correction_m, 0.0)
     left = error - correction
     mae = [np.abs(values - np.median(values[~blocked])).mean() for values in (left, error)]
     return float(mae[0] / mae[1])

@@ -109,7 +109,7 @@ def test_a_board_that_runs_the_model_gives_what_the_host_gives(ros: Ros, link: P
     corrected = ros.collect(RangeCorrected, CORRECTED)
     host = Mitigation(load_bundle(default_model_path()))
     expected = {
-        r.measurement.sequence: host.correct(r.measurement) for r in SimulatedSource(seed=4, count=200)
+        r.measurement.sequence: host.correct([r.measurement])[0] for r in SimulatedSource(seed=4, count=200)
     }
     with board(link, model=True):
         drive(ros, link, "mode:=device")
@@ -273,7 +273,7 @@ def test_a_board_takes_off_the_offsets_that_the_driver_is_told(ros: Ros, link: P
     def latest_has(offset_m: float) -> bool:
         host.offsets = Offsets(offset_m)
         fresh = corrected[-20:]
-        expected = [np.float32(host.correct(recorded[m.sequence]).range_m) for m in fresh]
+        expected = [np.float32(host.correct([recorded[m.sequence]])[0].range_m) for m in fresh]
         return len(fresh) == 20 and [np.float32(m.range) for m in fresh] == expected
 
     with board(link, model=True, rate_hz=200.0):
@@ -282,7 +282,7 @@ def test_a_board_takes_off_the_offsets_that_the_driver_is_told(ros: Ros, link: P
         # Not one without them, from the first on.
         host.offsets = Offsets(0.25)
         first = corrected[0]
-        assert np.float32(first.range) == np.float32(host.correct(recorded[first.sequence]).range_m)
+        assert np.float32(first.range) == np.float32(host.correct([recorded[first.sequence]])[0].range_m)
         assert latest_has(0.25)
         assert ros.set_parameter("driver", "offsets", "-0.5").successful
         corrected.clear()

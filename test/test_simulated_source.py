@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from model_material import window_of
 from typer.testing import CliRunner
 
 from uwb_mitigation.commands.cli import app
@@ -157,26 +158,21 @@ def test_placements_have_their_own_configuration_and_a_sensible_distance(survey:
 
 
 def test_every_measurement_is_finite_and_fit_for_a_network(drive: list[Record], survey: list[Record]) -> None:
-    preprocessing = Preprocessing()
-    out = np.empty(preprocessing.samples, np.float32)
     for r in drive + survey:
         m = r.measurement
         assert len(m.cir) == TAPS
         assert math.isfinite(m.range_m)
         assert math.isfinite(m.cir.rx_power_dbm)
         assert math.isfinite(m.cir.first_path_power_dbm)
-        assert preprocessing.apply(m.cir, out) is None
-        assert np.isfinite(out).all()
+        fault, window = window_of(m.cir, Preprocessing())
+        assert fault == 0
+        assert np.isfinite(window).all()
 
 
 def test_levels_are_of_the_order_of_real_logs(survey: list[Record]) -> None:
     rx = np.array([r.measurement.cir.rx_power_dbm for r in survey])
     gap = rx - [r.measurement.cir.first_path_power_dbm for r in survey]
-    out = np.empty(157, np.float32)
-    peaks = []
-    for r in survey[::5]:
-        Preprocessing().apply(r.measurement.cir, out)
-        peaks.append(out.max())
+    peaks = [window_of(r.measurement.cir, Preprocessing())[1].max() for r in survey[::5]]
     assert -101.5 < rx.min() < rx.max() < -77.5
     assert -1.0 < np.percentile(gap, 1) < np.percentile(gap, 99) < 25.0
     assert 0.2 < np.min(peaks) < np.max(peaks) < 1.6

@@ -8,11 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from model_material import bundle, measurement
+from model_material import bundle, measurement, window_of
 
 from uwb_mitigation.errors import ModelError
 from uwb_mitigation.measurement import Status
-from uwb_mitigation.mitigation import Mitigation, correct_batch
+from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.architecture import Remnet
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.familiarity import Band, Familiarity, Strangeness, features
@@ -85,7 +85,7 @@ def test_a_level_is_finite_whatever_the_window_holds(level):
 def test_distance_alone_is_not_strange_and_a_weaker_radio_is(tmp_path):
     one = mitigation(tmp_path, power_at_1m_dbm=Band(-74.0, -70.0, 2.0))
     near, far, weak = (
-        one.correct(measurement(range_m, rx_power_dbm=power, first_path_power_dbm=power - 6.0)).status
+        one.correct([measurement(range_m, rx_power_dbm=power, first_path_power_dbm=power - 6.0)])[0].status
         for range_m, power in ((1.0, -72.0), (10.0, -92.0), (1.0, -92.0))
     )
     assert (near, far, weak) == (Status.OK, Status.OK, Status.OUT_OF_DISTRIBUTION)
@@ -102,19 +102,19 @@ def test_the_score_is_the_largest_excess_in_margins():
 
 def test_familiar_measurements_are_corrected_by_the_predicted_error(tmp_path):
     subject, plain = mitigation(tmp_path), Mitigation(bundle(tmp_path, SHAPE))
-    found, expected = subject.correct(measurement()), plain.correct(measurement())
+    found, expected = subject.correct([measurement()])[0], plain.correct([measurement()])[0]
     assert found.correction_m == expected.correction_m
 
 
 def test_the_variance_grows_with_the_predicted_error(tmp_path):
-    result = mitigation(tmp_path).correct(measurement())
+    result = mitigation(tmp_path).correct([measurement()])[0]
     squared = np.float32(result.correction_m) * np.float32(result.correction_m)
     assert result.variance_m2 == float(np.float32(0.0625) + np.float32(0.5) * squared)
 
 
 def test_a_strange_measurement_is_corrected_less_and_has_a_larger_variance(tmp_path):
-    familiar = mitigation(tmp_path).correct(measurement(3.0))
-    strange = mitigation(tmp_path, range_m=Band(1.0, 2.0, 4.0)).correct(measurement(3.0))
+    familiar = mitigation(tmp_path).correct([measurement(3.0)])[0]
+    strange = mitigation(tmp_path, range_m=Band(1.0, 2.0, 4.0)).correct([measurement(3.0)])[0]
     assert strange.status is Status.OK
     assert strange.correction_m == pytest.approx(0.25 + 0.75 * (familiar.correction_m - 0.25), abs=1e-6)
     assert strange.variance_m2 == pytest.approx(familiar.variance_m2 + 0.25 * 0.5, abs=1e-6)
@@ -122,7 +122,7 @@ def test_a_strange_measurement_is_corrected_less_and_has_a_larger_variance(tmp_p
 
 @pytest.mark.parametrize("name", ["range_m", "power_at_1m_dbm", "power_gap_db", "cir_level_db"])
 def test_a_wholly_strange_measurement_passes_through(tmp_path, name):
-    result = mitigation(tmp_path, **{name: Band(500.0, 501.0, 1.0)}).correct(measurement(3.0))
+    result = mitigation(tmp_path, **{name: Band(500.0, 501.0, 1.0)}).correct([measurement(3.0)])[0]
     assert (result.status, result.range_m, result.correction_m) == (Status.OUT_OF_DISTRIBUTION, 3.0, 0.0)
     assert result.variance_m2 == 0.5
 
@@ -133,9 +133,9 @@ def test_batches_grade_to_the_bit_as_single_measurements(tmp_path):
     )
     subjects = [measurement(0.2 * n, n, rx_power_dbm=-75.0 - n / 2) for n in range(40)]
     subjects.append(measurement(rx_power_dbm=1e300))
-    single = [subject.correct(item) for item in subjects]
+    single = [subject.correct([item])[0] for item in subjects]
     assert {result.status for result in single} >= {Status.OK, Status.OUT_OF_DISTRIBUTION}
-    assert [repr(result) for result in correct_batch(subject, subjects)] == [repr(r) for r in single]
+    assert [repr(result) for result in subject.correct(subjects)] == [repr(r) for r in single]
 
 
 def test_a_bundle_keeps_its_familiarity(tmp_path):
@@ -169,11 +169,10 @@ def test_familiarity_of_measurements_covers_them():
 
 def test_the_window_that_is_scored_is_the_networks_input(tmp_path):
     subject = measurement()
-    window = np.empty(157, np.float32)
-    assert Preprocessing(157).apply(subject.cir, window) is None
+    _, window = window_of(subject.cir, Preprocessing(157))
     (row,) = features(window[None], Scaling.PREAMBLE, *(np.float32([v]) for v in (3.0, -82.0, -88.0)))
     level = float(row[3])
     edge = Band(float(np.float32(level + 1)), 500.0, 2.0)
-    result = mitigation(tmp_path, cir_level_db=edge).correct(subject)
-    familiar = mitigation(tmp_path).correct(subject)
+    result = mitigation(tmp_path, cir_level_db=edge).correct([subject])[0]
+    familiar = mitigation(tmp_path).correct([subject])[0]
     assert result.correction_m == pytest.approx((familiar.correction_m + 0.25) / 2, abs=1e-4)

@@ -116,7 +116,7 @@ def test_raw_ranges_are_corrected_as_they_are_shown(tmp_path: Path):
     assert player.corrects
     player.seek(player.seconds)
     mitigation = Mitigation(load_bundle(default_model_path()))
-    expected = mitigation.correct(record(29).measurement).range_m
+    expected = mitigation.correct([record(29).measurement])[0].range_m
     assert latest(scene)[2, 7] == pytest.approx(expected)
 
 

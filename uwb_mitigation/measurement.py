@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import enum
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -204,11 +204,15 @@ class RangeColumns:
     first_path_power_dbm: NDArray[Any]
 
     @staticmethod
-    def of(measurements: Sequence[RangeMeasurement]) -> RangeColumns:
-        """The columns of one measurement or more, whose CIRs have one encoding and one length."""
-        cirs = [measurement.cir for measurement in measurements]
-        numbers = np.array(
-            [
+    def grouped(measurements: Sequence[RangeMeasurement]) -> Iterator[tuple[list[int], RangeColumns]]:
+        """Yield the columns of measurements whose CIRs have one encoding and one length, with their indices."""
+        groups: dict[tuple[int, int], list[int]] = {}
+        for index, measurement in enumerate(measurements):
+            groups.setdefault((measurement.cir.encoding, len(measurement.cir.samples)), []).append(index)
+        for indices in groups.values():
+            members = [measurements[index] for index in indices]
+            cirs = [measurement.cir for measurement in members]
+            numbers = [
                 (
                     m.range_m,
                     m.cir.start_index,
@@ -218,24 +222,27 @@ class RangeColumns:
                     m.cir.rx_power_dbm,
                     m.cir.first_path_power_dbm,
                 )
-                for m in measurements
-            ],
-            np.float64,
-        )
-        range_m, start, first_path, scale, preamble_count, rx_power, first_path_power = numbers.T
-        return RangeColumns(
-            np.array([measurement.tag_id for measurement in measurements], np.uint64),
-            np.array([measurement.anchor_id for measurement in measurements], np.uint64),
-            range_m,
-            cirs[0].encoding,
-            np.stack([cir.samples for cir in cirs]),
-            start,
-            first_path,
-            scale,
-            preamble_count,
-            rx_power,
-            first_path_power,
-        )
+                for m in members
+            ]
+            range_m, start, first_path, scale, preamble_count, rx_power, first_path_power = np.array(
+                numbers, np.float64
+            ).T
+            yield (
+                indices,
+                RangeColumns(
+                    np.array([measurement.tag_id for measurement in members], np.uint64),
+                    np.array([measurement.anchor_id for measurement in members], np.uint64),
+                    range_m,
+                    cirs[0].encoding,
+                    np.array([cir.samples for cir in cirs]),
+                    start,
+                    first_path,
+                    scale,
+                    preamble_count,
+                    rx_power,
+                    first_path_power,
+                ),
+            )
 
     def __len__(self) -> int:
         """The number of exchanges."""
@@ -247,12 +254,13 @@ class CorrectedColumns:
     """n corrected ranges of one origin and one model, field by field as in `CorrectedRange`.
 
     Attributes:
-        range_m, correction_m, variance_m2: float32 (n,).
+        range_m: (n,), of the type of `RangeColumns.range_m`.
+        correction_m, variance_m2: float32 (n,).
         status: uint8 (n,), of `Status`.
         origin, model_id: of every one.
     """
 
-    range_m: NDArray[np.float32]
+    range_m: NDArray[Any]
     correction_m: NDArray[np.float32]
     variance_m2: NDArray[np.float32]
     status: NDArray[np.uint8]

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -32,7 +32,6 @@ MAX_OFFSET_M = 10.0
 MAX_ENTRIES = 10_000
 MAX_TEXT = 1 << 20
 _MAX_ID = (1 << 64) - 1
-_CACHED_PAIRS = 4096
 _SECTIONS = ("default", "anchors", "tags", "pairs")
 _PAIR = ("anchor", "tag", "offset")
 SCHEMA = (
@@ -77,7 +76,6 @@ class Offsets:
         self.pair_sd = {
             pair: _deviation(pair_sd[pair], pair, where) for pair in self.pairs if pair in pair_sd
         }
-        self._known: dict[tuple[int, int], float] = {}
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Offsets):
@@ -99,23 +97,14 @@ class Offsets:
     def __str__(self) -> str:
         return f"{self.default:g} m" + (f", and {len(self)} of anchors, tags and pairs" if len(self) else "")
 
-    def of(self, tag_id: int, anchor_id: int) -> float:
-        """The offset of a pair, m."""
-        pair = tag_id, anchor_id
-        found = self._known.get(pair)
-        if found is None:
-            found = self._find(pair)
-            # Identities may be noise: no more are kept than a site has.
-            if len(self._known) < _CACHED_PAIRS:
-                self._known[pair] = found
-        return found
-
-    def of_columns(self, tag_ids: NDArray[Any], anchor_ids: NDArray[Any]) -> NDArray[np.float32]:
-        """The offsets of pairs, m: uint64 (n,) and (n,) to float32 (n,)."""
+    def of(self, tag_ids: Iterable[int], anchor_ids: Iterable[int]) -> NDArray[np.float32]:
+        """Return the offsets of pairs, m: n ids each to float32 (n,)."""
+        tags, anchors = (
+            ids.tolist() if isinstance(ids, np.ndarray) else list(ids) for ids in (tag_ids, anchor_ids)
+        )
         if not len(self):
-            return np.full(len(tag_ids), self.default, np.float32)
-        pairs = zip(tag_ids.tolist(), anchor_ids.tolist(), strict=True)
-        return np.array([self.of(tag, anchor) for tag, anchor in pairs], np.float32)
+            return np.full(len(tags), self.default, np.float32)
+        return np.array([self._find(pair) for pair in zip(tags, anchors, strict=True)], np.float32)
 
     def _find(self, pair: tuple[int, int]) -> float:
         if pair in self.pairs:

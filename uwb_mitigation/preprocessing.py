@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import enum
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ParameterError
-from uwb_mitigation.measurement import Cir, Encoding, RangeColumns, Status
+from uwb_mitigation.measurement import Encoding, RangeColumns, RangeMeasurement
 
 WINDOW_LEAD = 5
 """Samples of the window before floor(first path): enough to see the noise the path rises from."""
@@ -42,24 +43,38 @@ class Scaling(str, enum.Enum):
     PREAMBLE = "preamble"
 
 
-class CirFault(str, enum.Enum):
-    """Why a channel impulse response cannot be corrected from."""
+class CirFault(enum.IntEnum):
+    """Why a channel impulse response cannot be used; the numbers are those of `uwb_status` in the firmware."""
 
-    EMPTY = "the CIR holds no samples"
-    ODD_LENGTH = "a complex CIR holds an odd number of values"
-    BAD_SCALE = "the CIR's scale is no positive number that float32 can multiply with"
-    NO_FIRST_PATH = "the first-path index is not finite"
-    OUTSIDE = "the window around the first path lies outside the CIR"
-    ALL_ZERO = "the window holds only zeros"
-    NEGATIVE = "a magnitude is negative"
-    SATURATED = "the window holds a saturated sample"
-    NO_PREAMBLE_COUNT = "the preamble count is unknown, and the model's scaling needs it"
-    NO_POWER = "the receive or first-path power is unknown, and the model's prior needs it"
+    EMPTY = 3
+    ODD_LENGTH = 4
+    BAD_SCALE = 5
+    NO_FIRST_PATH = 6
+    OUTSIDE = 7
+    ALL_ZERO = 8
+    NEGATIVE = 9
+    SATURATED = 10
+    NO_PREAMBLE_COUNT = 11
+    NO_POWER = 12
 
     @property
-    def status(self) -> Status:
-        """The status that a corrected range carries for this fault."""
-        return Status.NO_CIR if self is CirFault.EMPTY else Status.BAD_CIR
+    def text(self) -> str:
+        """The reason in words."""
+        return _FAULT_TEXTS[self]
+
+
+_FAULT_TEXTS = {
+    CirFault.EMPTY: "the CIR holds no samples",
+    CirFault.ODD_LENGTH: "a complex CIR holds an odd number of values",
+    CirFault.BAD_SCALE: "the CIR's scale is no positive number that float32 can multiply with",
+    CirFault.NO_FIRST_PATH: "the first-path index is not finite",
+    CirFault.OUTSIDE: "the window around the first path lies outside the CIR",
+    CirFault.ALL_ZERO: "the window holds only zeros",
+    CirFault.NEGATIVE: "a magnitude is negative",
+    CirFault.SATURATED: "the window holds a saturated sample",
+    CirFault.NO_PREAMBLE_COUNT: "the preamble count is unknown, and the model's scaling needs it",
+    CirFault.NO_POWER: "the receive or first-path power is unknown, and the model's prior needs it",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,96 +96,78 @@ class Preprocessing:
         if not 1 <= self.samples <= 1016:
             raise ParameterError(f"window of {self.samples} samples", valid="1 to 1016")
 
-    def apply(self, cir: Cir, out: NDArray[np.float32]) -> CirFault | None:
-        """Write the network's input for `cir` to `out`, float32 of shape (samples,).
+    def apply(self, ranges: RangeColumns) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        """Return the network's inputs.
 
-        Returns None, or what makes the CIR unusable; `out` is then undefined.
+        Returns:
+            `CirFault` of each row, uint8 (n,), 0 = usable; and the inputs of the u usable rows, float32 (u, samples).
         """
-        total = len(cir.samples)
-        if total == 0:
-            return CirFault.EMPTY
-        if not MIN_SCALE <= cir.scale <= MAX_SCALE:
-            return CirFault.BAD_SCALE
-        if not math.isfinite(cir.first_path_index):
-            return CirFault.NO_FIRST_PATH
-        if self.scaling is Scaling.PREAMBLE and cir.preamble_count <= 0:
-            return CirFault.NO_PREAMBLE_COUNT
-        start = math.floor(cir.first_path_index) - WINDOW_LEAD - cir.start_index
-        stop = start + self.samples
-        if start < 0 or stop > len(cir):
-            return CirFault.OUTSIDE
+        is_complex = ranges.encoding == Encoding.COMPLEX_INT16
+        width = 2 if is_complex else 1
+        size, total = width * self.samples, ranges.samples.shape[1]
+        faults, windows, scales, symbols = [], [], [], []
+        numbers = (ranges.first_path_index, ranges.start_index, ranges.scale, ranges.preamble_count)
+        # A loop over Python numbers: for a live range, a batch of one, it is faster than operations on arrays.
+        for samples, first_path, start_index, scale, count in zip(
+            ranges.samples, *(column.tolist() for column in numbers), strict=True
+        ):
+            fault = 0
+            if total == 0:
+                fault = CirFault.EMPTY
+            elif not MIN_SCALE <= scale <= MAX_SCALE:
+                fault = CirFault.BAD_SCALE
+            elif not math.isfinite(first_path):
+                fault = CirFault.NO_FIRST_PATH
+            elif self.scaling is Scaling.PREAMBLE and count <= 0:
+                fault = CirFault.NO_PREAMBLE_COUNT
+            else:
+                start = width * int(math.floor(first_path) - WINDOW_LEAD - start_index)
+                window = samples[start : start + size] if start >= 0 else samples[:0]
+                fault = CirFault.OUTSIDE if len(window) < size else _content_fault(window, total, is_complex)
+            faults.append(fault)
+            if not fault:
+                windows.append(window)
+                scales.append(scale)
+                symbols.append(PREAMBLE_DIVISOR * count)
+        if not windows:
+            return np.array(faults, np.uint8), np.empty((0, self.samples), np.float32)
 
-        # One reduction finds both an all-zero and a saturated window, before anything can overflow.
-        if cir.encoding == Encoding.COMPLEX_INT16:
-            if total % 2:
-                return CirFault.ODD_LENGTH
-            power = cir.samples[2 * start : 2 * stop].astype(np.int32)
-            np.multiply(power, power, out=power)
-            peak = math.isqrt(int(np.maximum.reduce(power)))
-            if 0 < peak < SATURATED:
-                out[:] = power[0::2] + power[1::2]
-                np.sqrt(out, out=out)
-        else:
-            window = cir.samples[start:stop]
-            if int(np.minimum.reduce(window)) < 0:
-                return CirFault.NEGATIVE
-            peak = int(np.maximum.reduce(window))
-            out[:] = window
-        if peak == 0:
-            return CirFault.ALL_ZERO
-        if peak >= SATURATED:
-            return CirFault.SATURATED
-
-        if cir.scale != 1.0:
-            np.multiply(out, np.float32(cir.scale), out=out)
-        if self.scaling is Scaling.MAX:
-            np.divide(out, np.maximum.reduce(out), out=out)
-        else:
-            np.divide(out, np.float32(PREAMBLE_DIVISOR * cir.preamble_count), out=out)
-            np.sqrt(out, out=out)
-        return None
-
-    def apply_batch(self, ranges: RangeColumns) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
-        """The inputs of many CIRs at once, to the bit those of `apply`.
-
-        Returns which rows are usable, ascending, shape (u,), and their inputs, float32 (u, samples). A row
-        is left out exactly where `apply` names a fault; ask `apply` for the fault.
-        """
-        complex_ = ranges.encoding == Encoding.COMPLEX_INT16
-        width = 2 if complex_ else 1
-        length, odd = divmod(ranges.samples.shape[1], width)
-        # In float64 every index, and every difference that decides, is exact.
-        first_path = ranges.first_path_index.astype(np.float64)
-        start = np.floor(first_path) - WINDOW_LEAD - ranges.start_index
-        scale = ranges.scale.astype(np.float64)
-        usable = (start >= 0) & (start + self.samples <= length) & (scale >= MIN_SCALE) & (scale <= MAX_SCALE)
-        if self.scaling is Scaling.PREAMBLE:
-            usable &= ranges.preamble_count > 0
-        rows = np.flatnonzero(usable)
-        if odd or not len(rows):
-            return np.empty(0, np.intp), np.empty((0, self.samples), np.float32)
-
-        every_start = np.lib.stride_tricks.sliding_window_view(ranges.samples, width * self.samples, axis=1)
-        windows = every_start[rows, width * start[rows].astype(np.intp)]
-        # -32768 has no negative of its own in int16: the extremes are compared, not magnitudes.
-        highest, lowest = windows.max(axis=1), windows.min(axis=1)
-        sound = (highest < SATURATED) & ((highest > 0) | (lowest < 0))
-        sound &= (lowest > -SATURATED) if complex_ else (lowest >= 0)
-        if not sound.all():
-            rows, windows = rows[sound], windows[sound]
-        if complex_:
-            power = windows.astype(np.int32)
+        if is_complex:
+            power = np.array(windows, np.int32)
             np.multiply(power, power, out=power)
             inputs = (power[:, 0::2] + power[:, 1::2]).astype(np.float32)
             np.sqrt(inputs, out=inputs)
         else:
-            inputs = windows.astype(np.float32)
-
-        np.multiply(inputs, ranges.scale[rows, None].astype(np.float32, copy=False), out=inputs)
+            inputs = np.array(windows, np.float32)
+        np.multiply(inputs, np.array(scales, np.float32)[:, None], out=inputs)
         if self.scaling is Scaling.MAX:
             np.divide(inputs, inputs.max(axis=1, keepdims=True), out=inputs)
         else:
-            symbols = PREAMBLE_DIVISOR * ranges.preamble_count[rows].astype(np.int64)
-            np.divide(inputs, symbols.astype(np.float32)[:, None], out=inputs)
+            np.divide(inputs, np.array(symbols, np.float32)[:, None], out=inputs)
             np.sqrt(inputs, out=inputs)
-        return rows, inputs
+        return np.array(faults, np.uint8), inputs
+
+    def windows_of(self, measurements: Sequence[RangeMeasurement]) -> tuple[list[int], NDArray[np.float32]]:
+        """Return `CirFault` of each measurement (0 = usable), and the inputs, float32 (n, samples), zeros if unusable."""
+        faults = np.zeros(len(measurements), np.uint8)
+        inputs = np.zeros((len(measurements), self.samples), np.float32)
+        for indices, ranges in RangeColumns.grouped(measurements):
+            found, windows = self.apply(ranges)
+            faults[indices] = found
+            inputs[np.array(indices)[found == 0]] = windows
+        return faults.tolist(), inputs
+
+
+def _content_fault(window: NDArray[np.int16], total: int, is_complex: bool) -> int:
+    """`CirFault` of the samples in a window of a CIR with `total` values; 0 if there is none."""
+    # -32768 has no negative of its own in int16: the extremes are compared, not magnitudes.
+    highest, lowest = int(np.maximum.reduce(window)), int(np.minimum.reduce(window))
+    if is_complex and total % 2:
+        return CirFault.ODD_LENGTH
+    if not is_complex and lowest < 0:
+        return CirFault.NEGATIVE
+    if highest == 0 and lowest == 0:
+        return CirFault.ALL_ZERO
+    if highest >= SATURATED or lowest <= -SATURATED:
+        return CirFault.SATURATED
+    return 0

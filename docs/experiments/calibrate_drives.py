@@ -27,7 +27,7 @@ import numpy as np
 from uwb_mitigation.evaluation.dataset import build_dataset
 from uwb_mitigation.evaluation.site_data import gather
 from uwb_mitigation.measurement import Record
-from uwb_mitigation.mitigation import Mitigation, correct_batch
+from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import Bundle, load_bundle
 from uwb_mitigation.model.shipped import default_model_path
 from uwb_mitigation.offsets import NO_OFFSETS, Offsets
@@ -90,7 +90,7 @@ def error_of(records: list[Record], bundle: Bundle | None, offsets: Offsets) -> 
     truth = np.array([record.truth.range_m for record in records if record.truth is not None])
     if bundle is None:
         return float(np.abs(np.array([record.measurement.range_m for record in records]) - truth).mean())
-    corrected = correct_batch(Mitigation(bundle, offsets), [record.measurement for record in records])
+    corrected = Mitigation(bundle, offsets).correct([record.measurement for record in records])
     return float(np.abs(np.array([one.range_m for one in corrected]) - truth).mean())
 
 
@@ -104,7 +104,7 @@ def position_rmse(
     value = np.array([record.measurement.range_m for record in records])
     variance = np.full(len(value), np.nan)
     if bundle is not None:
-        corrected = correct_batch(Mitigation(bundle, offsets), [record.measurement for record in records])
+        corrected = Mitigation(bundle, offsets).correct([record.measurement for record in records])
         value = np.array([one.range_m for one in corrected])
         variance = np.array([one.variance_m2 for one in corrected])
     ranges = Ranges(stamps, row, np.maximum(value, 0.0), variance, np.full(len(value), np.nan), 101)

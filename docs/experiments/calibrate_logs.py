@@ -24,7 +24,7 @@ from benchmarks.positions import LAG_S, at_truths, hanyang_run
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.evaluation.site_data import gather
 from uwb_mitigation.measurement import Record
-from uwb_mitigation.mitigation import Mitigation, correct_batch
+from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import Bundle, load_bundle
 from uwb_mitigation.model.shipped import default_model_path
 from uwb_mitigation.offsets import NO_OFFSETS, Offsets
@@ -60,9 +60,9 @@ def hanyang(folder: Path, name: str) -> None:
         test = HanyangRun(other)
         anchors, ranges, _, truth = hanyang_run(other)
         ids = np.array([anchor.id for anchor in anchors.anchors], np.uint64)
-        off = found.offsets.of_columns(np.full(len(ranges), ranges.tag_id), ids[ranges.anchor]).astype(float)
+        off = found.offsets.of(np.full(len(ranges), ranges.tag_id), ids[ranges.anchor]).astype(float)
         first = np.array([record.measurement.cir.first_path_power_dbm for record in test])
-        line = found.choice.prior.predict_batch_m(ranges.rx_power_dbm, first).astype(float)
+        line = found.choice.prior.predict_m(ranges.rx_power_dbm, first).astype(float)
         less = off + np.where(np.isfinite(line), line, 0.0)
         for kind, value in (("raw", ranges.range_m), ("calibrated", np.maximum(ranges.range_m - less, 0.0))):
             shifted = Ranges(ranges.stamp_ns, ranges.anchor, value, ranges.variance_m2, ranges.rx_power_dbm)
@@ -123,7 +123,7 @@ def _against_truth(
     row = np.array([run.anchors.index[one.anchor_id] for one in measured])
     value, variance = np.array([one.range_m for one in measured]), np.full(len(measured), np.nan)
     if bundle is not None:
-        corrected = correct_batch(Mitigation(bundle, offsets), measured)
+        corrected = Mitigation(bundle, offsets).correct(measured)
         value = np.array([one.range_m for one in corrected])
         variance = np.array([one.variance_m2 for one in corrected])
     unknown = np.full(len(value), np.nan)
@@ -153,7 +153,7 @@ def apartment(folder: Path) -> None:
     assert data.anchors is not None
     pairs = list(zip(data.tags.tolist(), data.anchors.tolist(), strict=True))
     distance = np.array([true.get(pair, np.nan) for pair in pairs])
-    off = found.offsets.of_columns(data.tags, data.anchors).astype(float)
+    off = found.offsets.of(data.tags, data.anchors).astype(float)
     # What is held out is told against the track: so much further is the truth.
     pseudo = data.range_m - data.error_m
     left = found.choice.held_out[found.choice.chosen] + pseudo - distance

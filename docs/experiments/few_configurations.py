@@ -23,7 +23,7 @@ from uwb_mitigation.training.recipe import Recipe, prior_m
 
 data = build_dataset(DecaRangingFolder(Path(sys.argv[1])), Preprocessing())
 data = data.rows(np.isfinite(data.rx_power_dbm - data.first_path_power_dbm))
-network_m = Session(load_bundle(default_model_path())).predict_batch_m(data.inputs)
+network_m = Session(load_bundle(default_model_path())).predict_m(data.inputs)
 draws = int(sys.argv[2]) if len(sys.argv) > 2 else 60
 for count in (6, 9, 12, 15, 18, 21):
     generator, maes = np.random.default_rng(count), []

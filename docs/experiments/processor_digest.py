@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from uwb_mitigation.mitigation import Mitigation, correct_batch
+from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.shipped import SHIPPED, shipped_model_path
 from uwb_mitigation.sources.opening import open_recording
@@ -29,7 +29,7 @@ def main(recordings: list[Path]) -> None:
             measurements = [record.measurement for record in source]
         for name in SHIPPED:
             bundle = load_bundle(shipped_model_path(name))
-            corrected = correct_batch(Mitigation(bundle), measurements)
+            corrected = Mitigation(bundle).correct(measurements)
             rows = np.array([(row.range_m, row.variance_m2, row.status.value) for row in corrected], float)
             digest = hashlib.sha256(rows.astype("<f8").tobytes()).hexdigest()[:16]
             print(f"{recording.name}: {name} {bundle.model_id:08x}: {len(rows)} ranges, {digest}")

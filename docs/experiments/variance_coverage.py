@@ -18,7 +18,7 @@ card = bundle.card
 with open_recording(Path(sys.argv[1])) as source:
     data = build_dataset(source, card.preprocessing)
 test = data.rows(split_by_name(data.configurations, "paper")[1].test)
-predicted_m = Session(bundle).predict_batch_m(test.inputs)
+predicted_m = Session(bundle).predict_m(test.inputs)
 variance_m2 = card.variance_m2 + card.variance_per_m2 * predicted_m**2
 for sigmas in (1, card.interval95_sigmas):
     print(f"{sigmas:.2f} deviations: {coverage(test.error_m - predicted_m, variance_m2, sigmas):.1%}")

@@ -89,19 +89,19 @@ class MessageBlock:
             first_path_power_dbm=fields["first_path_power"],
         )
 
-    def encode_corrected(self, rows: NDArray[np.intp], corrected: CorrectedColumns) -> list[bytes]:
-        """`RangeCorrected` of some of the block's own `rows`: the bytes of `codec.encode_corrected`."""
+    def encode_corrected(self, corrected: CorrectedColumns) -> list[bytes]:
+        """Return `RangeCorrected` of each row: the bytes of `codec.encode_corrected`."""
         like = CorrectedRange(0.0, 0.0, 0.0, 0.0, Status.OK, corrected.origin, corrected.model_id)
         template = codec.encode_corrected(self.first, like)
         at = len(template) - codec.CORRECTED_SIZE
         size = len(template)
         # What no field names must stay as it is: copies of structured arrays leave such bytes undefined.
-        buffer = bytearray(template * len(rows))
+        buffer = bytearray(template * len(self.rows))
         out = np.frombuffer(buffer, _structure(at, size, _CORRECTED_FIELDS))
         for name in _COPIED:
-            out[name] = self.fields[name][rows]
+            out[name] = self.fields[name]
         out["range"] = corrected.range_m
-        out["range_raw"] = self.fields["range"][rows]
+        out["range_raw"] = self.fields["range"]
         out["correction"] = corrected.correction_m
         out["variance"] = corrected.variance_m2
         out["status"] = corrected.status

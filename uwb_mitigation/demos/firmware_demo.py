@@ -105,7 +105,7 @@ def summarise(
     received: Sequence[RangeCorrected],
 ) -> int:
     """Say what came back. Returns the exit code: 0 if everything did, equal to the bit."""
-    expected = [host.correct(measurement) for measurement in measured]
+    expected = host.correct(measured)
     arrived = {message.sequence: message for message in received}
     different = sum(
         differences(result, arrived[sequence])

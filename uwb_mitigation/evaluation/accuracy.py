@@ -12,7 +12,7 @@ import numpy as np
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.evaluation.metrics import ErrorStatistics, coverage, mae_by_group
 from uwb_mitigation.measurement import Record
-from uwb_mitigation.mitigation import Mitigation, correct_batch
+from uwb_mitigation.mitigation import Mitigation
 
 _BATCH = 256
 
@@ -84,7 +84,7 @@ def evaluate(
     stream = iter(records)
     read = 0
     while batch := list(islice(stream, _BATCH)):
-        results = correct_batch(mitigation, [record.measurement for record in batch])
+        results = mitigation.correct([record.measurement for record in batch])
         for record, result in zip(batch, results, strict=True):
             # An infinite variance marks a range that is none.
             if record.truth is None or not np.isfinite(record.truth.range_m + result.variance_m2):

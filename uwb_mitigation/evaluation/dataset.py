@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.measurement import Record
-from uwb_mitigation.preprocessing import Preprocessing
+from uwb_mitigation.preprocessing import CirFault, Preprocessing
+
+_BATCH = 256
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,8 +101,7 @@ def build_dataset(
     """
     refused: Counter[str] = Counter()
     inputs, numbers, headers, identities, configurations, labels = [], [], [], [], [], []
-    for record in records:
-        on_record()
+    for record, fault, window in _preprocessed(records, preprocessing, on_record):
         measurement, truth = record.measurement, record.truth
         if truth is None or not math.isfinite(truth.range_m):
             refused["no true range"] += 1
@@ -107,10 +109,8 @@ def build_dataset(
         if not (math.isfinite(measurement.range_m) and measurement.range_m >= 0):
             refused["no valid range"] += 1
             continue
-        window = np.empty(preprocessing.samples, np.float32)
-        fault = preprocessing.apply(measurement.cir, window)
-        if fault is not None:
-            refused[fault.value] += 1
+        if fault:
+            refused[CirFault(fault).text] += 1
             continue
         inputs.append(window)
         numbers.append(
@@ -142,6 +142,19 @@ def build_dataset(
         np.array(headers, np.float32),
         *np.array(identities, np.uint64).T,
     )
+
+
+def _preprocessed(
+    records: Iterable[Record], preprocessing: Preprocessing, on_record: Callable[[], None]
+) -> Iterator[tuple[Record, int, NDArray[np.float32]]]:
+    """Yield each record with the `CirFault` of its CIR, 0 if there is none, and its window."""
+    stream = iter(records)
+    while batch := list(islice(stream, _BATCH)):
+        for record, fault, window in zip(
+            batch, *preprocessing.windows_of([record.measurement for record in batch]), strict=True
+        ):
+            on_record()
+            yield record, fault, window
 
 
 def _power(levels: NDArray[np.float64]) -> NDArray[np.float32]:

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError, ParameterError, format_id
-from uwb_mitigation.measurement import LINE_OF_SIGHT_DB, Cir, Record, Status
-from uwb_mitigation.mitigation import Mitigation, correct_batch
+from uwb_mitigation.measurement import LINE_OF_SIGHT_DB, RangeMeasurement, Record, Status
+from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.familiarity import FIRST_PATH_TAPS
 from uwb_mitigation.model.prior import LinePrior
 from uwb_mitigation.offsets import MAX_OFFSET_M, Offsets
@@ -161,7 +161,7 @@ def find_offset(
             if (tag_id is None or record.measurement.tag_id == tag_id)
             and (anchor_id is None or record.measurement.anchor_id == anchor_id)
         ]
-        results = correct_batch(mitigation, [record.measurement for record in wanted])
+        results = mitigation.correct([record.measurement for record in wanted])
         for record, result in zip(wanted, results, strict=True):
             measurement, truth = record.measurement, record.truth
             true_m = distance_m if distance_m is not None else math.nan if truth is None else truth.range_m
@@ -170,12 +170,11 @@ def find_offset(
                 continue
             placement = truth.configuration if truth is not None and distance_m is None else ""
             found = groups.setdefault((measurement.tag_id, measurement.anchor_id, placement), _Gathered())
-            found.gap_db.append(_power_gap_db(measurement.cir, preprocessing))
+            found.gap_db.append(_power_gap_db(measurement, preprocessing))
             predicted = math.nan
             if result.status is Status.OK:
-                predicted = result.correction_m - mitigation.offsets.of(
-                    measurement.tag_id, measurement.anchor_id
-                )
+                offset = mitigation.offsets.of([measurement.tag_id], [measurement.anchor_id])
+                predicted = result.correction_m - float(offset[0])
             else:
                 found.others[result.status.name] += 1
             found.predicted_m.append(predicted)
@@ -196,11 +195,14 @@ def find_offset(
     return _together(placements, mitigation.bundle.model_id)
 
 
-def _power_gap_db(cir: Cir, preprocessing: Preprocessing) -> float:
+def _power_gap_db(measurement: RangeMeasurement, preprocessing: Preprocessing) -> float:
     """Receive level less first-path level, dB; from the CIR if the radio does not report them; NaN if neither has them."""
-    window = np.empty(preprocessing.samples, np.float32)
-    if math.isfinite(cir.power_gap_db) or preprocessing.apply(cir, window) is not None:
-        return cir.power_gap_db
+    reported_db = measurement.cir.power_gap_db
+    if math.isfinite(reported_db):
+        return reported_db
+    (fault,), (window,) = preprocessing.windows_of([measurement])
+    if fault:
+        return reported_db
     energy = window * window
     first_path = max(float(energy[FIRST_PATH_TAPS].sum()), 1e-12)
     return 10.0 * math.log10(float(energy.sum()) / first_path)

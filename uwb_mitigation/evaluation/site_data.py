@@ -158,16 +158,13 @@ def gather(
                 left_out["no height at that time"] += 1
                 continue
             frames.setdefault(measured.tag_id, {}).setdefault(measured.frame_id)
-            window = np.zeros(preprocessing.samples, np.float32)
-            fault = preprocessing.apply(measured.cir, window)
-            if fault is not None:
-                window[:] = 0.0
+            (fault,), (window,) = preprocessing.windows_of([measured])
             stamp_ns += shift
             latest = stamp_ns if latest is None else max(latest, stamp_ns)
             cir = measured.cir
             power = cir.rx_power_dbm, cir.first_path_power_dbm
             rows.setdefault(measured.tag_id, []).append(
-                (stamp_ns, row, measured.range_m, *power, fault is None, height)
+                (stamp_ns, row, measured.range_m, *power, fault == 0, height)
             )
             windows.setdefault(measured.tag_id, []).append(window)
         shifts.append(shift or 0)

@@ -55,8 +55,8 @@ def run(dataset: Dataset, bundle: Bundle) -> ZeroShot:
         dataset.rx_power_dbm,
         dataset.first_path_power_dbm,
     )
-    prior = card.prior.predict_batch_m(dataset.rx_power_dbm, dataset.first_path_power_dbm)
-    predicted = (prior + Session(bundle).predict_batch_m(dataset.inputs)).astype(np.float32)
+    prior = card.prior.predict_m(dataset.rx_power_dbm, dataset.first_path_power_dbm)
+    predicted = (prior + Session(bundle).predict_m(dataset.inputs)).astype(np.float32)
     corrects = grader.passes(predicted, score)
     with np.errstate(invalid="ignore"):
         correction, spread = grader.grade(predicted, score)

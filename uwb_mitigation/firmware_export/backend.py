@@ -3,30 +3,20 @@
 from __future__ import annotations
 
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from uwb_mitigation.firmware_export.export import export_bundle
 from uwb_mitigation.firmware_export.host import HostFirmware
-from uwb_mitigation.measurement import (
-    Cir,
-    CorrectedColumns,
-    CorrectedRange,
-    Origin,
-    RangeColumns,
-    RangeMeasurement,
-    Status,
-)
-from uwb_mitigation.mitigation import passed_through
+from uwb_mitigation.measurement import Cir, CorrectedColumns, RangeColumns, Status
+from uwb_mitigation.mitigation import Backend, passed_through
 from uwb_mitigation.model.bundle import Bundle
 from uwb_mitigation.offsets import NO_OFFSETS, Offsets
 
 
-class FirmwareMitigation:
-    """Corrects ranges with one bundle as `Mitigation` does, to the same bits, by the firmware. A `Backend`.
+class FirmwareMitigation(Backend):
+    """Corrects ranges with one bundle as `Mitigation` does, to the same bits, by the firmware.
 
     Raises:
         MissingDependencyError: there is no C compiler, or the firmware's sources are not installed.
@@ -37,37 +27,29 @@ class FirmwareMitigation:
     def __init__(self, bundle: Bundle, offsets: Offsets = NO_OFFSETS) -> None:
         self.bundle = bundle
         self.offsets = offsets
-        # Once loaded, the library needs its file no more.
+        # The loaded library does not need its file any more.
         with tempfile.TemporaryDirectory(prefix="uwb_firmware_backend_") as name:
             folder = Path(name)
             export_bundle(bundle, folder)
             self._firmware = HostFirmware(folder, folder)
 
-    def correct(self, measurement: RangeMeasurement) -> CorrectedRange:
-        """As `Mitigation.correct`."""
-        range_m, correction_m, variance_m2, status = self._firmware.correct(
-            measurement.range_m, measurement.cir, self.offsets.of(measurement.tag_id, measurement.anchor_id)
+    def correct_columns(self, ranges: RangeColumns) -> CorrectedColumns:
+        """See `Backend`."""
+        offset = self.offsets.of(ranges.tag_id, ranges.anchor_id)
+        *values, status = zip(
+            *(
+                self._firmware.correct(float(ranges.range_m[row]), _cir(ranges, row), float(offset[row]))
+                for row in range(len(ranges))
+            ),
+            strict=True,
         )
-        corrected = passed_through(self.bundle, measurement, Status(status), self.offsets)
-        if status != Status.OK:
-            return corrected
-        return replace(corrected, range_m=range_m, correction_m=correction_m, variance_m2=variance_m2)
-
-    def correct_columns(self, ranges: RangeColumns) -> tuple[NDArray[np.intp], CorrectedColumns]:
-        """As `Backend` says; the rows are those with the status OK."""
-        offset = self.offsets.of_columns(ranges.tag_id, ranges.anchor_id)
-        answers = [
-            self._firmware.correct(float(ranges.range_m[row]), _cir(ranges, row), float(offset[row]))
-            for row in range(len(ranges))
-        ]
-        rows = [row for row, (*_, status) in enumerate(answers) if status == Status.OK]
-        range_m, correction_m, variance_m2 = (
-            np.array([answers[row][:3] for row in rows], np.float32).reshape(-1, 3).T
-        )
-        status = np.full(len(rows), Status.OK, np.uint8)
-        return np.array(rows, np.intp), CorrectedColumns(
-            range_m, correction_m, variance_m2, status, Origin.HOST, self.bundle.model_id
-        )
+        found = passed_through(self.bundle, ranges, offset, np.array(status, np.uint8))
+        is_corrected = found.status == Status.OK
+        for column, computed in zip(
+            (found.range_m, found.correction_m, found.variance_m2), values, strict=True
+        ):
+            column[is_corrected] = np.array(computed, np.float32)[is_corrected]
+        return found
 
 
 def _cir(ranges: RangeColumns, row: int) -> Cir:

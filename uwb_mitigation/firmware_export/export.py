@@ -85,5 +85,5 @@ def compare_with_reference(bundle: Bundle) -> int:
     """Return the number of golden vectors for which ONNX Runtime and the integer reference are not bit-identical."""
     weights = graph.int8_weights(bundle.model, bundle.architecture)
     windows = golden_windows(pack(weights))
-    given, expected = Session(bundle).predict_batch_m(windows), IntegerNetwork(weights).predict_m(windows)
+    given, expected = Session(bundle).predict_m(windows), IntegerNetwork(weights).predict_m(windows)
     return int(np.sum(given.view(np.uint32) != expected.view(np.uint32)))

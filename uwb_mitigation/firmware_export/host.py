@@ -31,20 +31,6 @@ _SHIM = (
     "const uwb_model *uwb_exported_model(void) { return &uwb_model_data; }\n"
 )
 
-_FAULTS = {
-    3: CirFault.EMPTY,
-    4: CirFault.ODD_LENGTH,
-    5: CirFault.BAD_SCALE,
-    6: CirFault.NO_FIRST_PATH,
-    7: CirFault.OUTSIDE,
-    8: CirFault.ALL_ZERO,
-    9: CirFault.NEGATIVE,
-    10: CirFault.SATURATED,
-    11: CirFault.NO_PREAMBLE_COUNT,
-    12: CirFault.NO_POWER,
-}
-"""Values of `uwb_status` for which the host has the same fault."""
-
 
 class _Cir(ctypes.Structure):
     _fields_ = (
@@ -122,12 +108,12 @@ class HostFirmware:
         return outputs
 
     def preprocess(self, cir: Cir, out: NDArray[np.float32]) -> CirFault | None:
-        """As `Preprocessing.apply`."""
+        """Write the network's input to `out`, float32 (K,); return what makes the CIR unusable."""
         status = self._library.uwb_preprocess(self._model, ctypes.byref(_c_cir(cir)), out.ctypes.data)
-        return _FAULTS[status] if status else None
+        return CirFault(status) if status else None
 
     def correct(self, range_m: float, cir: Cir, offset_m: float = 0.0) -> tuple[float, float, float, int]:
-        """Range, correction, variance and status, as `Mitigation.correct` gives them."""
+        """Range, correction, variance and status, as in `CorrectedRange`."""
         result = _Corrected()
         self._library.uwb_correct(
             self._model,

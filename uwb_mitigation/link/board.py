@@ -6,6 +6,7 @@ It is what the emulated board runs, and the shortest way to see what firmware mu
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -44,7 +45,7 @@ class Corrector(Protocol):
 
     offsets: Offsets
 
-    def correct(self, measurement: RangeMeasurement) -> CorrectedRange: ...
+    def correct(self, measurements: Sequence[RangeMeasurement]) -> list[CorrectedRange]: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,7 +168,7 @@ class Board:
         if self._corrector is None:
             return b""
         began_ns = time.perf_counter_ns()
-        corrected = self._corrector.correct(measurement)
+        corrected = self._corrector.correct([measurement])[0]
         correction = Correction(
             0,
             measurement.tag_id,

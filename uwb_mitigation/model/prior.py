@@ -34,24 +34,13 @@ class LinePrior:
     def needs_power(self) -> bool:
         return self.per_rx_power != 0.0 or self.per_power_gap != 0.0
 
-    def predict_m(self, rx_power_dbm: float, first_path_power_dbm: float) -> np.float32:
-        """The prior's predicted error, m; NaN where a power that it needs is not finite, or no power."""
-        if not self.needs_power:
-            constant: np.float32 = np.float32(self.offset_m)
-            return constant
-        if not (abs(rx_power_dbm) <= MAX_POWER_DBM and abs(first_path_power_dbm) <= MAX_POWER_DBM):
-            unknown: np.float32 = np.float32(np.nan)
-            return unknown
-        rx: np.float32 = np.float32(rx_power_dbm)
-        gap = rx - np.float32(first_path_power_dbm)
-        level: np.float32 = np.float32(self.offset_m) + np.float32(self.per_rx_power) * rx
-        predicted: np.float32 = level + np.float32(self.per_power_gap) * gap
-        return predicted
-
-    def predict_batch_m(
+    def predict_m(
         self, rx_power_dbm: NDArray[Any], first_path_power_dbm: NDArray[Any]
     ) -> NDArray[np.float32]:
-        """`predict_m` of arrays of floats, shape (n,), to the bit."""
+        """Return the predicted errors, m, float32 (n,), of arrays of floats (n,).
+
+        NaN where a power that the line needs is not finite or beyond `MAX_POWER_DBM`.
+        """
         if not self.needs_power:
             return np.full(len(rx_power_dbm), self.offset_m, np.float32)
         known = np.abs(rx_power_dbm) <= MAX_POWER_DBM

@@ -19,7 +19,7 @@ from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 from uwb_mitigation.bag.codec import decode_range, encode_corrected
 from uwb_mitigation.errors import RecordingError, UwbMitigationError
 from uwb_mitigation.measurement import LINE_OF_SIGHT_DB, RangeMeasurement, Status
-from uwb_mitigation.mitigation import Backend, Mitigation, correct_batch
+from uwb_mitigation.mitigation import Backend, Mitigation
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.prior import LinePrior
 from uwb_mitigation.model.shipped import model_path
@@ -125,7 +125,7 @@ class Mitigator(ManagedNode):
             mitigation, publisher = self._mitigation, self._corrected
             if mitigation is None or publisher is None:
                 return
-            results = correct_batch(mitigation, measurements)
+            results = mitigation.correct(measurements)
             for measurement, corrected in zip(measurements, results, strict=True):
                 publisher.publish(encode_corrected(measurement, corrected))
                 if self._sensor_ranges is not None:
@@ -135,13 +135,13 @@ class Mitigator(ManagedNode):
         self.health.add_time(time.perf_counter_ns() - began_ns)
         offsets = mitigation.offsets
         needs_count = mitigation.bundle.preprocessing.scaling is Scaling.PREAMBLE
-        for measurement, corrected in zip(measurements, results, strict=True):
+        offset_m = offsets.of([m.tag_id for m in measurements], [m.anchor_id for m in measurements]).tolist()
+        for measurement, corrected, offset in zip(measurements, results, offset_m, strict=True):
             self.health.statuses[corrected.status] += 1
             if needs_count and corrected.status is Status.BAD_CIR and measurement.cir.preamble_count <= 0:
                 self.health.uncounted += 1
             if corrected.status is Status.OK and measurement.cir.power_gap_db < LINE_OF_SIGHT_DB:
-                offset_m = offsets.of(measurement.tag_id, measurement.anchor_id)
-                self.health.direct_m.append(corrected.correction_m - offset_m)
+                self.health.direct_m.append(corrected.correction_m - offset)
             self._meter.add(now_ns - measurement.stamp_ns)
 
     def _make_sensor_ranges(self) -> SensorRanges:

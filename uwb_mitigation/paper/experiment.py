@@ -289,7 +289,7 @@ def baselines_of(train: Dataset, test: Dataset) -> tuple[Baseline, ...]:
     if not line.needs_power:
         reason = "too few configurations, or powers that are all alike"
         return (*rows, Baseline(name="line", errors=None, reason=reason))
-    predicted = line.predict_batch_m(test.rx_power_dbm, test.first_path_power_dbm)
+    predicted = line.predict_m(test.rx_power_dbm, test.first_path_power_dbm)
     return (*rows, row("line", np.nan_to_num(predicted)))
 
 

@@ -197,21 +197,19 @@ class _Corrector:
         answers: list[bytes | None] = [None] * len(messages)
         left = set(range(len(messages)))
         for block in columns.blocks(messages):
-            rows, corrected = self._mitigation.correct_columns(block.columns)
-            encoded = block.encode_corrected(rows, corrected)
-            numbers = block.rows[rows].tolist()
-            for number, answer in zip(numbers, encoded, strict=True):
+            corrected = self._mitigation.correct_columns(block.columns)
+            numbers = block.rows.tolist()
+            for number, answer in zip(numbers, block.encode_corrected(corrected), strict=True):
                 answers[number] = answer
             left.difference_update(numbers)
             self.statuses.update(_NAMES[status] for status in corrected.status.tolist())
-        # What is odd in any way is left to the one definition.
         for number in sorted(left):
             try:
                 measurement = decode_range(messages[number])
             except RecordingError as error:
                 self.skipped[error.what] += 1
                 continue
-            result = self._mitigation.correct(measurement)
+            (result,) = self._mitigation.correct([measurement])
             answers[number] = encode_corrected(measurement, result)
             self.statuses[result.status.name] += 1
         return answers

@@ -298,7 +298,7 @@ def _labelled(
     nothing = site.labelled(rows, true_m, np.zeros(len(rows)), stretch, at_rest[stretch])
     assert nothing.tags is not None
     assert nothing.anchors is not None
-    off = offsets.of_columns(nothing.tags, nothing.anchors).astype(np.float64)
+    off = offsets.of(nothing.tags, nothing.anchors).astype(np.float64)
     return replace(nothing, range_m=nothing.range_m - off, error_m=nothing.error_m - off), nothing.error_m
 
 

@@ -212,7 +212,7 @@ def _hold_out(
             test.inputs, test.range_m.astype(np.float32), test.rx_power_dbm, test.first_path_power_dbm
         )
         integers = quantize(model.network, calibration_inputs(train, seed), exact=False)
-        prior = model.card.prior.predict_batch_m(test.rx_power_dbm, test.first_path_power_dbm)
+        prior = model.card.prior.predict_m(test.rx_power_dbm, test.first_path_power_dbm)
         for name, network_m in (
             ("shipped_float", floating.predict_m(model.network, test.inputs)),
             ("shipped_int8", IntegerNetwork(integers).predict_m(test.inputs)),
@@ -238,7 +238,7 @@ def _baselines(
     yield "ridge_header", baselines.ridge(train, header=True)(test)
     yield "gradient_boosting", baselines.gradient_boosting(train, seed)(test)
     line = lad.fit_prior(train.configurations, train.rx_power_dbm, train.first_path_power_dbm, train.error_m)
-    yield "l1_line", line.predict_batch_m(test.rx_power_dbm, test.first_path_power_dbm)
+    yield "l1_line", line.predict_m(test.rx_power_dbm, test.first_path_power_dbm)
     part = train.rows(splits.thinned(train.configurations, recipe.per_configuration, seed))
     options = replace(choosing.ALONE, seed=seed)
     samples = recipe.architecture.samples

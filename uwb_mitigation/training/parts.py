@@ -35,7 +35,7 @@ def load(
             read = with_truth(source, stretches) if stretches else source
             dataset = datasets.build_dataset(read, preprocessing, on_record)
         except DatasetError as error:
-            if preprocessing.scaling is Scaling.MAX or CirFault.NO_PREAMBLE_COUNT.value not in error.what:
+            if preprocessing.scaling is Scaling.MAX or CirFault.NO_PREAMBLE_COUNT.text not in error.what:
                 raise
             raise DatasetError(error.what, valid="--scaling max does without preamble counts") from error
         name = path.resolve().name

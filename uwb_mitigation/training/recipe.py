@@ -179,4 +179,4 @@ def describe(name: str, recipe: Recipe, prior: LinePrior, validation: CrossValid
 
 def prior_m(prior: LinePrior, dataset: Dataset) -> NDArray[np.float32]:
     """What the prior predicts of each measurement, m; NaN where it needs a power that is unknown."""
-    return prior.predict_batch_m(dataset.rx_power_dbm, dataset.first_path_power_dbm)
+    return prior.predict_m(dataset.rx_power_dbm, dataset.first_path_power_dbm)

@@ -46,8 +46,8 @@ def _block(seed: int, preprocessing: Preprocessing, wide: bool, number: int) -> 
     reception = RADIO.receive(block.links.multipath(rng), rng, block.boards)
     distance = block.links.distance_m
     heard = np.flatnonzero(np.isfinite(reception.first_path_index))
-    usable, inputs = preprocessing.apply_batch(_columns(reception, distance, heard))
-    rows = heard[usable]
+    faults, inputs = preprocessing.apply(_columns(reception, distance, heard))
+    rows = heard[faults == 0]
     is_blocked, is_direct = block.links.path.crossings > 0, reception.direct_above_threshold
     return Dataset(
         preprocessing,

@@ -64,7 +64,7 @@ class Fitted:
         """Prior + network, float64 (n,), m; 0 where a power that it needs is not known: such a range is passed through."""
         prior = self.prior
         first_path = data.first_path_power_dbm if prior.per_power_gap != 0.0 else data.rx_power_dbm
-        predicted = prior.predict_batch_m(data.rx_power_dbm, first_path).astype(np.float64)
+        predicted = prior.predict_m(data.rx_power_dbm, first_path).astype(np.float64)
         if self.factor is not None:
             predicted = predicted + self.factor * _universal_m(data)
         elif self.network is not None:

@@ -36,7 +36,7 @@ from uwb_mitigation.bag.topics import (
 )
 from uwb_mitigation.errors import ParameterError, RecordingError
 from uwb_mitigation.measurement import RangeMeasurement
-from uwb_mitigation.mitigation import Backend, correct_batch
+from uwb_mitigation.mitigation import Backend
 from uwb_mitigation.viewer.feed import Feed
 from uwb_mitigation.viewer.scene import PLAIN, STRIP_S, Report
 from uwb_mitigation.viewer.view import Missing
@@ -218,7 +218,7 @@ class BagPlayer:
             return
         batch, self._uncorrected = self._uncorrected, []
         measurements = [measurement for _, measurement in batch]
-        results = correct_batch(self._backend, measurements)
+        results = self._backend.correct(measurements)
         for (self._clock_s, measurement), corrected in zip(batch, results, strict=True):
             self._feed.corrected(key_of(measurement), corrected)
 
