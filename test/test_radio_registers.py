@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -17,7 +18,8 @@ from uwb_mitigation.link.layout import RadioState, Role
 from uwb_mitigation.link.radio import RadioSettings, RadioStatus
 from uwb_mitigation.measurement import RangeMeasurement
 from uwb_mitigation.nodes import radio_facts
-from uwb_mitigation.radio.host import HostRadio
+from uwb_mitigation.radio import structures
+from uwb_mitigation.radio.host import HostRadio, load
 
 pytestmark = NEEDS_CC
 
@@ -250,6 +252,16 @@ def antenna_delays(air: Air, settings: RadioSettings, revision: int) -> tuple[in
     return of[Role.ANCHOR], of[Role.TAG]
 
 
+@pytest.mark.parametrize(("rate_kbps", "refused"), [(6800, True), (850, False)])
+def test_a_reply_within_the_pause_of_smart_power_is_refused(rate_kbps: int, refused: bool):
+    """FINAL must not leave within 1 ms after POLL with more power than the average allows."""
+    config = structures.config(RadioSettings(rate_kbps=rate_kbps, preamble=64))
+    config.reply_us = 999
+    radio = load().host_radio_new(ctypes.byref(structures.Io()), ctypes.byref(config), 1)
+    assert (load().host_radio_configure(radio, ctypes.byref(config)) is not None) == refused
+    load().host_radio_free(radio)
+
+
 class StickyStatusBus(ModelBus):
     """To a chip whose receiver enable and transmitter start leave the status bits: only a write clears them."""
 
@@ -299,7 +311,7 @@ def test_a_lock_that_is_not_reported_is_a_warning(air: Air):
     run = Run(air, bus=NoLockBus)
     assert len(run.ranges) > 10
     for status in run.statuses:
-        assert status.state is RadioState.NO_CLOCK
+        assert status.state is RadioState.LOCK_UNCONFIRMED
         assert radio_facts.problem(status) == ""
         assert "PLL" in radio_facts.warning(None, status)
 
@@ -307,6 +319,7 @@ def test_a_lock_that_is_not_reported_is_a_warning(air: Air):
 def test_a_clock_that_does_not_lock_is_an_error(air: Air):
     with pytest.raises(LinkError, match="clock"):
         Run(air, bus=NoClockBus)
+    assert radio_facts.problem(RadioStatus(state=RadioState.NO_CLOCK)) != ""
 
 
 def test_temperature_and_voltage_are_read_when_they_are_ready(air: Air):

@@ -10,19 +10,6 @@ typedef struct {
     uint64_t measurement[UWB_TWR_MEASUREMENT_BYTES(WHOLE) / sizeof(uint64_t) + 1];
 } host_radio;
 
-host_radio *host_radio_new(const uwb_dw1000_io *io, const uwb_twr_config *config, uint64_t random);
-void host_radio_free(host_radio *radio);
-void host_radio_fill_times(uwb_twr_config *config, uint32_t reply_us, uint32_t patience_us);
-const char *host_radio_configure(host_radio *radio, const uwb_twr_config *config);
-int host_radio_turn(host_radio *radio, uint64_t until_us);
-const uint8_t *host_radio_measurement(const host_radio *radio, size_t *bytes, uint64_t *measured_us);
-int host_radio_fault(const host_radio *radio);
-uint64_t host_radio_address(const host_radio *radio);
-const uwb_dw1000_settings *host_radio_settings(const host_radio *radio);
-const uwb_twr_counts *host_radio_counts(const host_radio *radio);
-const uwb_twr_anchor *host_radio_anchors(const host_radio *radio, size_t *count);
-int host_radio_sensors(host_radio *radio, float *temperature, float *voltage);
-
 /* NULL: no memory. */
 host_radio *host_radio_new(const uwb_dw1000_io *io, const uwb_twr_config *config, uint64_t random) {
     host_radio *const radio = calloc(1, sizeof *radio);
@@ -59,12 +46,9 @@ const uint8_t *host_radio_measurement(const host_radio *radio, size_t *bytes, ui
     return radio->twr.measurement;
 }
 
-/* Why the chip does not work, a uwb_dw1000_status. 0 while it works, or NO_CLOCK if it has not reported its lock. */
-int host_radio_fault(const host_radio *radio) {
-    if (radio->twr.running) {
-        return radio->twr.chip.lock_unconfirmed ? UWB_DW1000_NO_CLOCK : UWB_DW1000_OK;
-    }
-    return (int)radio->twr.fault;
+/* A UWB_RADIO_STATE_*. */
+int host_radio_state(const host_radio *radio) {
+    return uwb_twr_state(&radio->twr);
 }
 
 /* 0 until the chip has started. */

@@ -3,7 +3,6 @@
 #ifndef UWB_PROTOCOL_H
 #define UWB_PROTOCOL_H
 
-#include <stddef.h>
 #include <stdint.h>
 
 #ifdef __cplusplus
@@ -54,6 +53,7 @@
 #define UWB_RADIO_STATE_ABSENT 2
 #define UWB_RADIO_STATE_NO_CLOCK 3
 #define UWB_RADIO_STATE_RESTARTED 4
+#define UWB_RADIO_STATE_LOCK_UNCONFIRMED 5
 
 #define UWB_OFFSET_OF_ANCHOR 0
 #define UWB_OFFSET_OF_TAG 1
@@ -72,11 +72,6 @@ typedef struct {
     uint64_t time_us; /* board's uptime at the event that the frame tells of; 0 from the host */
 } uwb_header_t;
 UWB_STATIC_ASSERT(sizeof(uwb_header_t) == 16);
-UWB_STATIC_ASSERT(offsetof(uwb_header_t, version) == 0);
-UWB_STATIC_ASSERT(offsetof(uwb_header_t, type) == 1);
-UWB_STATIC_ASSERT(offsetof(uwb_header_t, flags) == 2);
-UWB_STATIC_ASSERT(offsetof(uwb_header_t, sequence) == 4);
-UWB_STATIC_ASSERT(offsetof(uwb_header_t, time_us) == 8);
 
 typedef struct {
     uint64_t address; /* of the anchor */
@@ -86,11 +81,6 @@ typedef struct {
     uint32_t heard_ms; /* since it was last heard; 4294967295 = never */
 } uwb_radio_anchor_t;
 UWB_STATIC_ASSERT(sizeof(uwb_radio_anchor_t) == 24);
-UWB_STATIC_ASSERT(offsetof(uwb_radio_anchor_t, address) == 0);
-UWB_STATIC_ASSERT(offsetof(uwb_radio_anchor_t, tried) == 8);
-UWB_STATIC_ASSERT(offsetof(uwb_radio_anchor_t, ranged) == 12);
-UWB_STATIC_ASSERT(offsetof(uwb_radio_anchor_t, rx_power) == 16);
-UWB_STATIC_ASSERT(offsetof(uwb_radio_anchor_t, heard_ms) == 20);
 
 typedef struct {
     uint64_t tag_id; /* of no meaning for an anchor's */
@@ -100,10 +90,6 @@ typedef struct {
     uint8_t reserved[3];
 } uwb_offset_t;
 UWB_STATIC_ASSERT(sizeof(uwb_offset_t) == 24);
-UWB_STATIC_ASSERT(offsetof(uwb_offset_t, tag_id) == 0);
-UWB_STATIC_ASSERT(offsetof(uwb_offset_t, anchor_id) == 8);
-UWB_STATIC_ASSERT(offsetof(uwb_offset_t, offset) == 16);
-UWB_STATIC_ASSERT(offsetof(uwb_offset_t, of) == 20);
 
 typedef struct {
     uint64_t board_id; /* identity of the board */
@@ -120,17 +106,6 @@ typedef struct {
     char firmware_name[16]; /* UTF-8, filled up with zeros */
 } uwb_hello_t;
 UWB_STATIC_ASSERT(sizeof(uwb_hello_t) == 48);
-UWB_STATIC_ASSERT(offsetof(uwb_hello_t, board_id) == 0);
-UWB_STATIC_ASSERT(offsetof(uwb_hello_t, model_id) == 8);
-UWB_STATIC_ASSERT(offsetof(uwb_hello_t, boot_id) == 12);
-UWB_STATIC_ASSERT(offsetof(uwb_hello_t, request_sequence) == 16);
-UWB_STATIC_ASSERT(offsetof(uwb_hello_t, window) == 20);
-UWB_STATIC_ASSERT(offsetof(uwb_hello_t, max_payload) == 22);
-UWB_STATIC_ASSERT(offsetof(uwb_hello_t, firmware_major) == 24);
-UWB_STATIC_ASSERT(offsetof(uwb_hello_t, firmware_minor) == 25);
-UWB_STATIC_ASSERT(offsetof(uwb_hello_t, firmware_patch) == 26);
-UWB_STATIC_ASSERT(offsetof(uwb_hello_t, mode) == 27);
-UWB_STATIC_ASSERT(offsetof(uwb_hello_t, firmware_name) == 32);
 
 typedef struct {
     uint64_t tag_id; /* identity of the tag */
@@ -155,24 +130,6 @@ typedef struct {
     /* then samples, int16, from samples_offset */
 } uwb_range_cir_t;
 UWB_STATIC_ASSERT(sizeof(uwb_range_cir_t) == 72);
-UWB_STATIC_ASSERT(offsetof(uwb_range_cir_t, tag_id) == 0);
-UWB_STATIC_ASSERT(offsetof(uwb_range_cir_t, anchor_id) == 8);
-UWB_STATIC_ASSERT(offsetof(uwb_range_cir_t, device_time) == 16);
-UWB_STATIC_ASSERT(offsetof(uwb_range_cir_t, sequence) == 24);
-UWB_STATIC_ASSERT(offsetof(uwb_range_cir_t, range) == 28);
-UWB_STATIC_ASSERT(offsetof(uwb_range_cir_t, sample_period) == 32);
-UWB_STATIC_ASSERT(offsetof(uwb_range_cir_t, first_path_index) == 36);
-UWB_STATIC_ASSERT(offsetof(uwb_range_cir_t, scale) == 40);
-UWB_STATIC_ASSERT(offsetof(uwb_range_cir_t, rx_power) == 44);
-UWB_STATIC_ASSERT(offsetof(uwb_range_cir_t, first_path_power) == 48);
-UWB_STATIC_ASSERT(offsetof(uwb_range_cir_t, start_index) == 52);
-UWB_STATIC_ASSERT(offsetof(uwb_range_cir_t, preamble_count) == 56);
-UWB_STATIC_ASSERT(offsetof(uwb_range_cir_t, noise_threshold) == 58);
-UWB_STATIC_ASSERT(offsetof(uwb_range_cir_t, samples_offset) == 60);
-UWB_STATIC_ASSERT(offsetof(uwb_range_cir_t, sample_count) == 62);
-UWB_STATIC_ASSERT(offsetof(uwb_range_cir_t, encoding) == 64);
-UWB_STATIC_ASSERT(offsetof(uwb_range_cir_t, channel) == 65);
-UWB_STATIC_ASSERT(offsetof(uwb_range_cir_t, prf) == 66);
 
 typedef struct {
     uint64_t tag_id; /* of the measurement */
@@ -189,17 +146,6 @@ typedef struct {
     uint8_t reserved[3];
 } uwb_range_corrected_t;
 UWB_STATIC_ASSERT(sizeof(uwb_range_corrected_t) == 56);
-UWB_STATIC_ASSERT(offsetof(uwb_range_corrected_t, tag_id) == 0);
-UWB_STATIC_ASSERT(offsetof(uwb_range_corrected_t, anchor_id) == 8);
-UWB_STATIC_ASSERT(offsetof(uwb_range_corrected_t, device_time) == 16);
-UWB_STATIC_ASSERT(offsetof(uwb_range_corrected_t, sequence) == 24);
-UWB_STATIC_ASSERT(offsetof(uwb_range_corrected_t, model_id) == 28);
-UWB_STATIC_ASSERT(offsetof(uwb_range_corrected_t, range) == 32);
-UWB_STATIC_ASSERT(offsetof(uwb_range_corrected_t, range_raw) == 36);
-UWB_STATIC_ASSERT(offsetof(uwb_range_corrected_t, correction) == 40);
-UWB_STATIC_ASSERT(offsetof(uwb_range_corrected_t, variance) == 44);
-UWB_STATIC_ASSERT(offsetof(uwb_range_corrected_t, compute_us) == 48);
-UWB_STATIC_ASSERT(offsetof(uwb_range_corrected_t, status) == 52);
 
 typedef struct {
     uint8_t level; /* LogLevel */
@@ -207,7 +153,6 @@ typedef struct {
     /* then text, UTF-8, to the payload's end */
 } uwb_log_t;
 UWB_STATIC_ASSERT(sizeof(uwb_log_t) == 8);
-UWB_STATIC_ASSERT(offsetof(uwb_log_t, level) == 0);
 
 typedef struct {
     uint32_t frames_received; /* intact frames from the host since the start */
@@ -219,12 +164,6 @@ typedef struct {
     uint8_t reserved[3];
 } uwb_status_t;
 UWB_STATIC_ASSERT(sizeof(uwb_status_t) == 24);
-UWB_STATIC_ASSERT(offsetof(uwb_status_t, frames_received) == 0);
-UWB_STATIC_ASSERT(offsetof(uwb_status_t, frames_dropped) == 4);
-UWB_STATIC_ASSERT(offsetof(uwb_status_t, measurements) == 8);
-UWB_STATIC_ASSERT(offsetof(uwb_status_t, measurements_lost) == 12);
-UWB_STATIC_ASSERT(offsetof(uwb_status_t, temperature) == 16);
-UWB_STATIC_ASSERT(offsetof(uwb_status_t, mode) == 20);
 
 typedef struct {
     uint32_t request_sequence; /* sequence of the TIME_SYNC answered */
@@ -232,8 +171,6 @@ typedef struct {
     uint64_t received_us; /* board's uptime when the TIME_SYNC's last byte was received */
 } uwb_time_sync_reply_t;
 UWB_STATIC_ASSERT(sizeof(uwb_time_sync_reply_t) == 16);
-UWB_STATIC_ASSERT(offsetof(uwb_time_sync_reply_t, request_sequence) == 0);
-UWB_STATIC_ASSERT(offsetof(uwb_time_sync_reply_t, received_us) == 8);
 
 typedef struct {
     uint32_t request_sequence; /* with ANSWER: sequence of the host's frame answered */
@@ -261,26 +198,6 @@ typedef struct {
     /* then anchor_count addresses, u64, then text, UTF-8, to the payload's end */
 } uwb_radio_t;
 UWB_STATIC_ASSERT(sizeof(uwb_radio_t) == 56);
-UWB_STATIC_ASSERT(offsetof(uwb_radio_t, request_sequence) == 0);
-UWB_STATIC_ASSERT(offsetof(uwb_radio_t, accepted) == 4);
-UWB_STATIC_ASSERT(offsetof(uwb_radio_t, address) == 8);
-UWB_STATIC_ASSERT(offsetof(uwb_radio_t, antenna_delay) == 16);
-UWB_STATIC_ASSERT(offsetof(uwb_radio_t, tx_power) == 20);
-UWB_STATIC_ASSERT(offsetof(uwb_radio_t, reply_us) == 24);
-UWB_STATIC_ASSERT(offsetof(uwb_radio_t, patience_us) == 28);
-UWB_STATIC_ASSERT(offsetof(uwb_radio_t, interval_us) == 32);
-UWB_STATIC_ASSERT(offsetof(uwb_radio_t, pan) == 36);
-UWB_STATIC_ASSERT(offsetof(uwb_radio_t, rate) == 38);
-UWB_STATIC_ASSERT(offsetof(uwb_radio_t, preamble) == 40);
-UWB_STATIC_ASSERT(offsetof(uwb_radio_t, window) == 42);
-UWB_STATIC_ASSERT(offsetof(uwb_radio_t, channel) == 44);
-UWB_STATIC_ASSERT(offsetof(uwb_radio_t, prf) == 45);
-UWB_STATIC_ASSERT(offsetof(uwb_radio_t, preamble_code) == 46);
-UWB_STATIC_ASSERT(offsetof(uwb_radio_t, decawave_sfd) == 47);
-UWB_STATIC_ASSERT(offsetof(uwb_radio_t, role) == 48);
-UWB_STATIC_ASSERT(offsetof(uwb_radio_t, report) == 49);
-UWB_STATIC_ASSERT(offsetof(uwb_radio_t, bias_correction) == 50);
-UWB_STATIC_ASSERT(offsetof(uwb_radio_t, anchor_count) == 51);
 
 typedef struct {
     uint32_t tried; /* exchanges that began; the sum of the seven that follow */
@@ -301,20 +218,6 @@ typedef struct {
     /* then anchor_count times RADIO_ANCHOR */
 } uwb_radio_status_t;
 UWB_STATIC_ASSERT(sizeof(uwb_radio_status_t) == 56);
-UWB_STATIC_ASSERT(offsetof(uwb_radio_status_t, tried) == 0);
-UWB_STATIC_ASSERT(offsetof(uwb_radio_status_t, ranged) == 4);
-UWB_STATIC_ASSERT(offsetof(uwb_radio_status_t, no_answer) == 8);
-UWB_STATIC_ASSERT(offsetof(uwb_radio_status_t, late) == 12);
-UWB_STATIC_ASSERT(offsetof(uwb_radio_status_t, time_out) == 16);
-UWB_STATIC_ASSERT(offsetof(uwb_radio_status_t, damaged) == 20);
-UWB_STATIC_ASSERT(offsetof(uwb_radio_status_t, absurd) == 24);
-UWB_STATIC_ASSERT(offsetof(uwb_radio_status_t, broken) == 28);
-UWB_STATIC_ASSERT(offsetof(uwb_radio_status_t, refused) == 32);
-UWB_STATIC_ASSERT(offsetof(uwb_radio_status_t, restarts) == 36);
-UWB_STATIC_ASSERT(offsetof(uwb_radio_status_t, temperature) == 40);
-UWB_STATIC_ASSERT(offsetof(uwb_radio_status_t, voltage) == 44);
-UWB_STATIC_ASSERT(offsetof(uwb_radio_status_t, state) == 48);
-UWB_STATIC_ASSERT(offsetof(uwb_radio_status_t, anchor_count) == 49);
 
 typedef struct {
     uint32_t request_sequence; /* sequence of the SET_OFFSETS answered */
@@ -323,16 +226,12 @@ typedef struct {
     uint8_t reserved[1];
 } uwb_offsets_t;
 UWB_STATIC_ASSERT(sizeof(uwb_offsets_t) == 8);
-UWB_STATIC_ASSERT(offsetof(uwb_offsets_t, request_sequence) == 0);
-UWB_STATIC_ASSERT(offsetof(uwb_offsets_t, slots) == 4);
-UWB_STATIC_ASSERT(offsetof(uwb_offsets_t, accepted) == 6);
 
 typedef struct {
     uint8_t mode; /* Mode wanted */
     uint8_t reserved[7];
 } uwb_set_mode_t;
 UWB_STATIC_ASSERT(sizeof(uwb_set_mode_t) == 8);
-UWB_STATIC_ASSERT(offsetof(uwb_set_mode_t, mode) == 0);
 
 typedef struct {
     uint64_t address; /* of the radio; 0 in SET_RADIO = the chip's own */
@@ -357,24 +256,6 @@ typedef struct {
     /* then anchor_count addresses, u64 */
 } uwb_set_radio_t;
 UWB_STATIC_ASSERT(sizeof(uwb_set_radio_t) == 48);
-UWB_STATIC_ASSERT(offsetof(uwb_set_radio_t, address) == 0);
-UWB_STATIC_ASSERT(offsetof(uwb_set_radio_t, antenna_delay) == 8);
-UWB_STATIC_ASSERT(offsetof(uwb_set_radio_t, tx_power) == 12);
-UWB_STATIC_ASSERT(offsetof(uwb_set_radio_t, reply_us) == 16);
-UWB_STATIC_ASSERT(offsetof(uwb_set_radio_t, patience_us) == 20);
-UWB_STATIC_ASSERT(offsetof(uwb_set_radio_t, interval_us) == 24);
-UWB_STATIC_ASSERT(offsetof(uwb_set_radio_t, pan) == 28);
-UWB_STATIC_ASSERT(offsetof(uwb_set_radio_t, rate) == 30);
-UWB_STATIC_ASSERT(offsetof(uwb_set_radio_t, preamble) == 32);
-UWB_STATIC_ASSERT(offsetof(uwb_set_radio_t, window) == 34);
-UWB_STATIC_ASSERT(offsetof(uwb_set_radio_t, channel) == 36);
-UWB_STATIC_ASSERT(offsetof(uwb_set_radio_t, prf) == 37);
-UWB_STATIC_ASSERT(offsetof(uwb_set_radio_t, preamble_code) == 38);
-UWB_STATIC_ASSERT(offsetof(uwb_set_radio_t, decawave_sfd) == 39);
-UWB_STATIC_ASSERT(offsetof(uwb_set_radio_t, role) == 40);
-UWB_STATIC_ASSERT(offsetof(uwb_set_radio_t, report) == 41);
-UWB_STATIC_ASSERT(offsetof(uwb_set_radio_t, bias_correction) == 42);
-UWB_STATIC_ASSERT(offsetof(uwb_set_radio_t, anchor_count) == 43);
 
 typedef struct {
     float default_offset; /* m, of pairs that nothing in the tail names, -10 to 10 */
@@ -383,7 +264,5 @@ typedef struct {
     /* then count times OFFSET */
 } uwb_set_offsets_t;
 UWB_STATIC_ASSERT(sizeof(uwb_set_offsets_t) == 8);
-UWB_STATIC_ASSERT(offsetof(uwb_set_offsets_t, default_offset) == 0);
-UWB_STATIC_ASSERT(offsetof(uwb_set_offsets_t, count) == 4);
 
 #endif

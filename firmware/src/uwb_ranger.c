@@ -9,7 +9,7 @@ static uint64_t now_us(const uwb_ranger *ranger) {
     return ranger->twr.io.now_us(ranger->twr.io.context);
 }
 
-static void tell_radio(uwb_ranger *ranger, const uint32_t *request, const char *refusal) {
+static void send_radio(uwb_ranger *ranger, const uint32_t *request, const char *refusal) {
     struct {
         uwb_radio_t fixed;
         uint8_t tail[8 * UWB_MAX_ANCHORS + 120];
@@ -48,7 +48,7 @@ static void tell_radio(uwb_ranger *ranger, const uint32_t *request, const char *
     (void)uwb_board_send(&ranger->board, UWB_TYPE_RADIO, flags, now_us(ranger), &message, sizeof *fixed + at, 0);
 }
 
-static void tell_status(uwb_ranger *ranger) {
+static void send_status(uwb_ranger *ranger) {
     struct {
         uwb_radio_status_t fixed;
         uwb_radio_anchor_t anchors[UWB_MAX_ANCHORS];
@@ -61,15 +61,7 @@ static void tell_status(uwb_ranger *ranger) {
     message.fixed = (uwb_radio_status_t){
         counts->tried, counts->ranged, counts->no_answer, counts->late, counts->time_out, counts->damaged,
         counts->absurd, counts->broken, counts->refused, counts->restarts, ranger->board.temperature, ranger->voltage,
-        UWB_RADIO_STATE_RUNNING, known, {0}};
-    if (!twr->running) {
-        message.fixed.state = twr->fault == UWB_DW1000_BUS        ? UWB_RADIO_STATE_BUS
-                              : twr->fault == UWB_DW1000_ABSENT   ? UWB_RADIO_STATE_ABSENT
-                              : twr->fault == UWB_DW1000_NO_CLOCK ? UWB_RADIO_STATE_NO_CLOCK
-                                                                  : UWB_RADIO_STATE_RESTARTED;
-    } else if (twr->chip.lock_unconfirmed) {
-        message.fixed.state = UWB_RADIO_STATE_NO_CLOCK;
-    }
+        uwb_twr_state(twr), known, {0}};
     for (uint8_t i = 0; i < known; i++) {
         const uwb_twr_anchor *const anchor = &twr->anchors[i];
         const uint64_t silent_ms = (at_us - anchor->heard_us) / 1000;
@@ -81,15 +73,15 @@ static void tell_status(uwb_ranger *ranger) {
     (void)uwb_board_send(&ranger->board, UWB_TYPE_RADIO_STATUS, 0, at_us, &message, bytes, UWB_ANSWER_RESERVE_BYTES);
 }
 
-/* The host's wish, or what is wrong with it. */
-static const char *understand(const uwb_ranger *ranger, const uint8_t *payload, size_t bytes, uwb_twr_config *config) {
+/* Parse SET_RADIO; returns NULL, or the reason why it is refused. */
+static const char *parse(const uwb_ranger *ranger, const uint8_t *payload, size_t bytes, uwb_twr_config *config) {
     uwb_set_radio_t fixed;
     if (bytes < sizeof fixed) {
         return "SET_RADIO is too short";
     }
     memcpy(&fixed, payload, sizeof fixed);
     if (fixed.anchor_count > UWB_MAX_ANCHORS || bytes < sizeof fixed + 8u * fixed.anchor_count) {
-        return "more anchors than 32, or than SET_RADIO tells of";
+        return "more anchors than 32, or than SET_RADIO contains";
     }
     memset(config, 0, sizeof *config);
     config->radio = (uwb_dw1000_settings){fixed.channel, fixed.prf, fixed.preamble_code, fixed.decawave_sfd, fixed.rate,
@@ -115,7 +107,7 @@ static int take(void *context, const uwb_header_t *header, const uint8_t *payloa
     (void)at_us;
     if (header->type == UWB_TYPE_SET_RADIO) {
         uwb_twr_config config;
-        refusal = understand(ranger, payload, bytes, &config);
+        refusal = parse(ranger, payload, bytes, &config);
         if (refusal == NULL) {
             ranger->wanted = config;
             ranger->change = 1;
@@ -123,7 +115,7 @@ static int take(void *context, const uwb_header_t *header, const uint8_t *payloa
     } else if (header->type != UWB_TYPE_GET_RADIO) {
         return 0;
     }
-    tell_radio(ranger, &header->sequence, refusal);
+    send_radio(ranger, &header->sequence, refusal);
     return 1;
 }
 
@@ -138,16 +130,16 @@ void uwb_ranger_start(uwb_ranger *ranger, const uwb_board_config *board, const u
     uwb_board_start(&ranger->board, &own, now_us(ranger));
 }
 
-static void tell(uwb_ranger *ranger) {
+static void send_due(uwb_ranger *ranger) {
     const uint64_t at_us = now_us(ranger);
     uwb_board_tick(&ranger->board, at_us);
-    if (ranger->twr.running && !ranger->address_told) {
-        ranger->address_told = 1;
-        tell_radio(ranger, NULL, NULL);
+    if (ranger->twr.running && !ranger->address_sent) {
+        ranger->address_sent = 1;
+        send_radio(ranger, NULL, NULL);
     }
-    if (at_us >= ranger->told_us) {
-        ranger->told_us = at_us + UWB_STATUS_INTERVAL_US;
-        tell_status(ranger);
+    if (at_us >= ranger->status_due_us) {
+        ranger->status_due_us = at_us + UWB_STATUS_INTERVAL_US;
+        send_status(ranger);
         if (ranger->twr.running && uwb_dw1000_idle(&ranger->twr.chip) == UWB_DW1000_OK) {
             (void)uwb_dw1000_read_sensors(&ranger->twr.chip, &ranger->board.temperature, &ranger->voltage);
         }
@@ -169,7 +161,7 @@ uwb_twr_event uwb_ranger_turn(uwb_ranger *ranger) {
     await_room(ranger);
     if (ranger->change) {
         ranger->change = 0;
-        ranger->address_told = 0;
+        ranger->address_sent = 0;
         (void)uwb_twr_configure(&ranger->twr, &ranger->wanted);
     }
     const uwb_twr_event event = uwb_twr_turn(&ranger->twr, now_us(ranger) + UWB_RANGER_TURN_US);
@@ -177,6 +169,6 @@ uwb_twr_event uwb_ranger_turn(uwb_ranger *ranger) {
         (void)uwb_board_take(&ranger->board, ranger->twr.measurement, uwb_twr_measured_bytes(&ranger->twr),
                              ranger->twr.measured_us);
     }
-    tell(ranger);
+    send_due(ranger);
     return event;
 }

@@ -16,10 +16,10 @@ typedef struct {
     uwb_board board;
     uwb_twr twr;
     uwb_twr_config wanted; /* by the host, from the next turn on */
-    uint64_t told_us;      /* when the next RADIO_STATUS is due */
+    uint64_t status_due_us;      /* when the next RADIO_STATUS is due */
     float voltage;
     uint8_t change;  /* whether `wanted` is to be used */
-    uint8_t address_told;
+    uint8_t address_sent;
 } uwb_ranger;
 
 /* Start, with `board` as for uwb_board_start but for `other` and `context`, which are the ranger's; the rest as for

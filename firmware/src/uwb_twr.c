@@ -3,7 +3,7 @@
 
 #include "uwb_twr_common.h"
 
-enum { START_AGAIN_US = 100000 };
+enum { START_AGAIN_US = 100000, SMART_POWER_REPLY_US = 1000 };
 
 const uwb_twr_config uwb_twr_defaults = {
     {5, 64, 0, 0, 6800, 128, 0, 0, 0}, 0, 0x5542, UWB_ROLE_TAG, 0, 0, 0, 157, 1500, 6000, 0, {0},
@@ -58,6 +58,10 @@ const char *uwb_twr_refusal(const uwb_twr *twr, const uwb_twr_config *config) {
         config->patience_us > 500000 || config->interval_us > 60000000) {
         return "a time is shorter than its frames last, or longer than 0.1 s (reply), 0.5 s (patience), 60 s (interval)";
     }
+    /* FINAL follows POLL after more than this time, so that uwb_dw1000_send_at need not wait. */
+    if (config->radio.rate_kbps == 6800 && config->reply_us < SMART_POWER_REPLY_US) {
+        return "at 6.8 Mbit/s the reply is at least 1 ms: smart power allows one frame per millisecond";
+    }
     return NULL;
 }
 
@@ -111,4 +115,14 @@ uwb_twr_event uwb_twr_turn(uwb_twr *twr, uint64_t until_us) {
 size_t uwb_twr_measured_bytes(const uwb_twr *twr) {
     const uwb_range_cir_t *const fields = (const uwb_range_cir_t *)(const void *)twr->measurement;
     return sizeof *fields + 2u * fields->sample_count;
+}
+
+uint8_t uwb_twr_state(const uwb_twr *twr) {
+    if (twr->running) {
+        return twr->chip.lock_unconfirmed ? UWB_RADIO_STATE_LOCK_UNCONFIRMED : UWB_RADIO_STATE_RUNNING;
+    }
+    return twr->fault == UWB_DW1000_BUS        ? UWB_RADIO_STATE_BUS
+           : twr->fault == UWB_DW1000_ABSENT   ? UWB_RADIO_STATE_ABSENT
+           : twr->fault == UWB_DW1000_NO_CLOCK ? UWB_RADIO_STATE_NO_CLOCK
+                                               : UWB_RADIO_STATE_RESTARTED;
 }

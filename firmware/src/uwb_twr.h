@@ -154,6 +154,9 @@ int uwb_twr_configure(uwb_twr *twr, const uwb_twr_config *config);
 /* One exchange, which may outlast `until_us` by its own duration, or none until then. */
 uwb_twr_event uwb_twr_turn(uwb_twr *twr, uint64_t until_us);
 
+/* Whether the radio works, a UWB_RADIO_STATE_*. */
+uint8_t uwb_twr_state(const uwb_twr *twr);
+
 /* Bytes of the measurement that the last turn gave. */
 size_t uwb_twr_measured_bytes(const uwb_twr *twr);
 

@@ -91,7 +91,8 @@ class RadioSettings:
         _within("antenna_delay", self.antenna_delay, 0, 0x1FFFE)
         _within("window", self.window, 0, 0xFFFF)
         if self.reply_us:
-            _within("reply_us", self.reply_us, 200, 100_000)
+            # Smart power allows one frame per millisecond, at 6.8 Mbit/s only.
+            _within("reply_us", self.reply_us, 1000 if self.rate_kbps == 6800 else 200, 100_000)
         if self.patience_us:
             _within("patience_us", self.patience_us, 400, 500_000)
         _within("interval_us", self.interval_us, 0, 60_000_000)

@@ -12,8 +12,9 @@ COUNTS = tuple(row.name for row in fields(RadioStatus) if row.type == "int")
 """Of the exchanges of a radio, by how they ended."""
 
 _STATES = {
-    RadioState.ABSENT: "no DW1000 answers the board: look at wiring and supply",
+    RadioState.ABSENT: "no DW1000 answers the board: check wiring and supply",
     RadioState.BUS: "the board's SPI fails",
+    RadioState.NO_CLOCK: "the DW1000's clock PLL does not lock: check its supply",
 }
 
 
@@ -32,7 +33,7 @@ def problem(status: RadioStatus) -> str:
 
 def warning(settings: RadioSettings | None, status: RadioStatus) -> str:
     """Return what may keep a radio without a problem from ranging; empty if there is nothing."""
-    if status.state is RadioState.NO_CLOCK:
+    if status.state is RadioState.LOCK_UNCONFIRMED:
         return "the DW1000 has not reported that its clock PLL locked; if it does not range, check its supply"
     if settings is not None and settings.role is Role.TAG and not status.anchors:
         return "no anchor in reach: are they on, with the same channel, rate and PAN?"

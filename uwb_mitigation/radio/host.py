@@ -35,12 +35,10 @@ _RANGED, _FAULT = 1, 2
 
 _loading = threading.Lock()
 _FAULTS = {
-    2: (RadioState.BUS, "the bus failed"),
-    3: (RadioState.ABSENT, "no DW1000 answers: look at wiring and supply"),
-    4: (RadioState.NO_CLOCK, "the DW1000's clock PLL does not lock: check its supply"),
-    5: (RadioState.RESTARTED, "the DW1000 was reset"),
+    RadioState.BUS: "the bus failed",
+    RadioState.ABSENT: "no DW1000 answers: check wiring and supply",
+    RadioState.NO_CLOCK: "the DW1000's clock PLL does not lock: check its supply",
 }
-"""Values of `uwb_dw1000_status` that keep a radio from working."""
 
 
 class HostRadio:
@@ -94,7 +92,7 @@ class HostRadio:
         if self._failure is not None:
             raise self._failure
         if event == _FAULT:
-            _, text = self._fault()
+            text = _FAULTS.get(self._state(), "the DW1000 was reset, or did not finish a command in time")
             raise LinkError(text, where=self._bus.name)
         return self._measurement() if event == _RANGED else None
 
@@ -157,7 +155,7 @@ class HostRadio:
             **counts.as_dict(),
             temperature_c=self._temperature_c,
             voltage=self._voltage,
-            state=self._fault()[0],
+            state=self._state(),
             anchors=tuple(
                 AnchorInReach(
                     anchor.address,
@@ -182,9 +180,8 @@ class HostRadio:
         self._times_us = config.reply_us, config.patience_us
         return config
 
-    def _fault(self) -> tuple[RadioState, str]:
-        fault = self._library.host_radio_fault(self._radio)
-        return _FAULTS.get(fault, (RadioState.RUNNING, "the DW1000 did not do in time what it was told"))
+    def _state(self) -> RadioState:
+        return RadioState(self._library.host_radio_state(self._radio))
 
     def _measurement(self) -> RangeMeasurement:
         count, measured_us = c_size_t(), c_uint64()
@@ -249,7 +246,7 @@ def _compiled() -> ctypes.CDLL:
         "configure": (c_char_p, (radio, POINTER(structures.Config))),
         "turn": (c_int, (radio, c_uint64)),
         "measurement": (c_void_p, (radio, POINTER(c_size_t), POINTER(c_uint64))),
-        "fault": (c_int, (radio,)),
+        "state": (c_int, (radio,)),
         "address": (c_uint64, (radio,)),
         "settings": (POINTER(structures.ChipSettings), (radio,)),
         "counts": (POINTER(structures.TwrCounts), (radio,)),
