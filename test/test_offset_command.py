@@ -162,7 +162,7 @@ def test_line_of_sight_of_the_real_logs_tells_the_boards_delay(apartment: Path, 
     assert not {"12", "14", "5"} & refused
     assert result["ranges"] == sum(pair["ranges"] for pair in result["pairs"])
     offsets = parse_offsets((tmp_path / "o.yaml").read_text(), "o.yaml")
-    assert offsets.of(5, 6) == pytest.approx(result["offset_m"], abs=1e-6)
+    assert offsets.of([5], [6])[0] == pytest.approx(result["offset_m"], abs=1e-6)
     assert not offsets.pairs
 
 
