@@ -12,13 +12,17 @@ import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
+from benchmarks import emulator
 from benchmarks.random_networks import mlp, pressing_windows, remnet
-from uwb_mitigation.firmware_export import emulator
-from uwb_mitigation.firmware_export.cycles import estimate_cycles
-from uwb_mitigation.firmware_export.export import golden_windows, identity, write_header
-from uwb_mitigation.firmware_export.header import Golden, ModelConstants
+from uwb_mitigation.firmware_export.export import (
+    Golden,
+    ModelConstants,
+    golden_windows,
+    identity,
+    write_header,
+)
 from uwb_mitigation.firmware_export.packing import PackedNetwork, pack
-from uwb_mitigation.firmware_export.toolchain import Kernels, Target, build_image, measure_size
+from uwb_mitigation.firmware_export.toolchain import Kernels, Target, build_image
 from uwb_mitigation.model import graph
 from uwb_mitigation.model.architecture import Mlp
 from uwb_mitigation.model.bundle import Bundle, session_options
@@ -143,8 +147,8 @@ def measure(
         optimisation = "-O3" if kernels is Kernels.PORTABLE else "-Os"
         image = build_image(folder, folder, Target.QEMU_MPS2, kernels, optimisation)
         result = emulator.run_windows(image, windows)
-        cycles = estimate_cycles(image, emulator.count_executed(image, windows[len(windows) // 2]))
-        flash = measure_size(folder, folder, kernels, optimisation).flash_bytes
+        cycles = emulator.estimate_cycles(image, emulator.count_executed(image, windows[len(windows) // 2]))
+        flash = emulator.measure_size(folder, folder, kernels, optimisation).flash_bytes
     printed = published.MODELS.get((network.network, packed.samples))
     hz = CLOCK_HZ / cycles
     wrong = (result.records["output_m"].view(np.uint32) != expected.view(np.uint32)) | (

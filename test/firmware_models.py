@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from benchmarks import random_networks
 from benchmarks.firmware import Network, network_of
-from uwb_mitigation.firmware_export.export import golden_windows, write_header
-from uwb_mitigation.firmware_export.header import Golden, ModelConstants
+from uwb_mitigation.firmware_export.export import Golden, ModelConstants, golden_windows, write_header
 from uwb_mitigation.firmware_export.packing import pack
 from uwb_mitigation.measurement import Cir, Encoding, RangeMeasurement
 from uwb_mitigation.model import graph

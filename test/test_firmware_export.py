@@ -13,8 +13,7 @@ import pytest
 
 from benchmarks import random_networks
 from uwb_mitigation.errors import ModelError, UwbMitigationError
-from uwb_mitigation.firmware_export import header
-from uwb_mitigation.firmware_export.export import export_bundle
+from uwb_mitigation.firmware_export.export import export_bundle, number
 from uwb_mitigation.firmware_export.packing import pack
 from uwb_mitigation.model import graph
 from uwb_mitigation.model.architecture import Remnet
@@ -26,7 +25,7 @@ def test_floats_read_back_to_the_same_bits():
     random = np.random.default_rng(0)
     patterns = random.integers(0, 2**32, 20_000, np.uint32).view(np.float32)
     for value in [*patterns[np.isfinite(patterns)], np.float32(0), np.float32(-0.0), np.float32(1e-45)]:
-        text = header.number(value)
+        text = number(value)
         assert re.fullmatch(r"-?\d+(\.\d+)?(e[+-]\d+)?f", text)
         assert re.search(r"[.e]", text), "an integer with the suffix f is no C"
         assert np.float32(text[:-1]).view(np.uint32) == value.view(np.uint32)
@@ -35,14 +34,14 @@ def test_floats_read_back_to_the_same_bits():
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), 0.1, 1e300])
 def test_what_is_no_finite_float32_is_refused(value: float):
     with pytest.raises(ModelError, match="float32"):
-        header.number(value)
+        number(value)
 
 
 def test_the_shipped_model_is_exported_with_its_identity(tmp_path: Path):
     bundle = load_bundle(default_model_path())
     text = export_bundle(bundle, tmp_path / "new" / "folder").read_text()
     assert f"0x{bundle.model_id:08x}u" in text
-    assert header.number(bundle.prior.per_rx_power) in text
+    assert number(bundle.prior.per_rx_power) in text
 
 
 def test_exporting_twice_gives_the_same_bytes(tmp_path: Path):

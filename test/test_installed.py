@@ -242,7 +242,7 @@ def test_a_driver_that_misses_what_its_source_needs_says_so_in_one_line(tmp_path
 
 CORRECT_WITH_THE_FIRMWARE = """
 import uwb_mitigation
-from uwb_mitigation.firmware_export.backend import FirmwareMitigation
+from uwb_mitigation.firmware_export.host import FirmwareMitigation
 from uwb_mitigation.firmware_export.compiling import firmware_folder
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.shipped import default_model_path

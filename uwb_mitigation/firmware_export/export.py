@@ -1,23 +1,67 @@
-"""From a model bundle to a folder with the C header that the firmware is built with."""
+"""From a model bundle to `uwb_model.h`: constants only, with golden vectors to test a build against."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ModelError, UwbMitigationError
 from uwb_mitigation.files import write_whole
-from uwb_mitigation.firmware_export.header import Golden, ModelConstants, render
-from uwb_mitigation.firmware_export.host import MODEL_HEADER
-from uwb_mitigation.firmware_export.packing import PackedNetwork, pack
+from uwb_mitigation.firmware_export.packing import Channels, PackedNetwork, pack
 from uwb_mitigation.model import graph
 from uwb_mitigation.model.bundle import Bundle
+from uwb_mitigation.model.familiarity import Familiarity
 from uwb_mitigation.model.integer import IntegerNetwork
+from uwb_mitigation.model.prior import LinePrior
+from uwb_mitigation.model.requantisation import Sum
 from uwb_mitigation.model.runtime import Session
+from uwb_mitigation.preprocessing import Scaling
 
+MODEL_HEADER = "uwb_model.h"
 GOLDEN_VECTORS = 8
+
+_COLUMNS = 100
+_SCALINGS = {Scaling.MAX: "UWB_SCALE_MAX", Scaling.PREAMBLE: "UWB_SCALE_PREAMBLE"}
+
+
+@dataclass(frozen=True, slots=True)
+class ModelConstants:
+    """What a model is beside its network; numbers are float32 values.
+
+    Attributes:
+        name: for people.
+        model_id: of the bundle.
+        scaling: of the preprocessing.
+        prior: predicts the part of the error that the network does not.
+        correction_limits_m: predicted errors outside mean an input unlike the training data.
+        variance_m2, variance_uncorrected_m2: of a range corrected, and passed through.
+        variance_per_m2: by which the former grows with the square of the predicted error.
+        familiarity: what the training data was like; None = not known.
+    """
+
+    name: str
+    model_id: int
+    scaling: Scaling
+    prior: LinePrior
+    correction_limits_m: tuple[float, float]
+    variance_m2: float
+    variance_uncorrected_m2: float
+    variance_per_m2: float = 0.0
+    familiarity: Familiarity | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Golden:
+    """Inputs, float32 (n, K), and the network's outputs, float32 (n,), m."""
+
+    windows: NDArray[np.float32]
+    outputs_m: NDArray[np.float32]
 
 
 def export_bundle(bundle: Bundle, folder: Path) -> Path:
@@ -87,3 +131,160 @@ def compare_with_reference(bundle: Bundle) -> int:
     windows = golden_windows(pack(weights))
     given, expected = Session(bundle).predict_m(windows), IntegerNetwork(weights).predict_m(windows)
     return int(np.sum(given.view(np.uint32) != expected.view(np.uint32)))
+
+
+def render(network: PackedNetwork, identity: ModelConstants, golden: Golden) -> str:
+    """The text of `uwb_model.h`: `uwb_model_data`, and golden vectors under UWB_GOLDEN_VECTORS.
+
+    Floats have nine significant digits, which read back to the same bits.
+    """
+    parts = [
+        f"/* {_comment(identity.name)}, model {identity.model_id:08x}, written by `uwb-mitigation board export-c`. */",
+        "#ifndef UWB_MODEL_H\n#define UWB_MODEL_H\n",
+        '#include "uwb_mitigation.h"\n',
+    ]
+    if network.modules:
+        parts += _remnet(network)
+    else:
+        parts += _mlp(network)
+    parts.append(_array("int8_t", "uwb_head_weights", network.head_weights))
+    if identity.familiarity is not None:
+        parts.append(_familiarity(identity.familiarity))
+    parts.append(_model(network, identity))
+    parts.append(_golden(golden))
+    parts.append("#endif")
+    return "\n".join(parts) + "\n"
+
+
+def _remnet(network: PackedNetwork) -> Iterable[str]:
+    assert network.first is not None
+    yield _array("int16_t", "uwb_first_weights", network.first_weights.reshape(-1))
+    yield _channels("uwb_first", network.first)
+    for number, module in enumerate(network.modules, start=1):
+        prefix = f"uwb_module{number}"
+        yield _array("int8_t", f"{prefix}_residual_weights", module.residual_weights)
+        yield _channels(f"{prefix}_residual", module.residual)
+        yield _array("int8_t", f"{prefix}_reduce_weights", module.reduce_weights)
+        yield _channels(f"{prefix}_reduce", module.reduce)
+        yield _channels(f"{prefix}_skip", module.skip)
+    yield "static const uwb_module uwb_modules[] = {"
+    for number, module in enumerate(network.modules, start=1):
+        prefix = f"uwb_module{number}"
+        yield f"    {{{prefix}_residual_weights, {prefix}_residual, {_sum(module.residual_sum)},"
+        yield f"     {prefix}_reduce_weights, {prefix}_reduce, {prefix}_skip, {_sum(module.output_sum)}}},"
+    yield "};\n"
+
+
+def _mlp(network: PackedNetwork) -> Iterable[str]:
+    for number, layer in enumerate(network.layers, start=1):
+        yield _array("int8_t", f"uwb_dense{number}_weights", layer.weights)
+        yield _channels(f"uwb_dense{number}", layer.channels)
+    yield "static const uwb_dense_layer uwb_layers[] = {"
+    for number, layer in enumerate(network.layers, start=1):
+        yield f"    {{uwb_dense{number}_weights, uwb_dense{number}, {layer.inputs}u, {layer.outputs}u}},"
+    yield "};\n"
+
+
+def _familiarity(familiarity: Familiarity) -> str:
+    bands = "".join(
+        f"    {{{number(band.low)}, {number(band.high)}, {number(np.float32(1) / np.float32(band.margin))}}},\n"
+        if band
+        else "    {0.0f, 0.0f, 0.0f},\n"
+        for band in familiarity.bands
+    )
+    offset = number(familiarity.known_offset_m)
+    return f"static const uwb_familiarity uwb_familiar = {{{offset}, {{\n{bands}}}}};\n"
+
+
+def _model(network: PackedNetwork, identity: ModelConstants) -> str:
+    remnet = bool(network.modules)
+    prior, (low, high) = identity.prior, identity.correction_limits_m
+    values = [
+        f"0x{identity.model_id:08x}u",
+        f"{network.samples}u",
+        _SCALINGS[identity.scaling],
+        number(network.input_scale),
+        f"{network.first_kernel}u",
+        f"{len(network.modules)}u",
+        "uwb_first_weights" if remnet else "NULL",
+        "uwb_first" if remnet else "NULL",
+        "uwb_modules" if remnet else "NULL",
+        f"{len(network.layers)}u",
+        "NULL" if remnet else "uwb_layers",
+        "uwb_head_weights",
+        f"{len(network.head_weights)}u",
+        f"{network.head_bias}",
+        number(network.head_scale),
+        number(prior.offset_m),
+        number(prior.per_rx_power),
+        number(prior.per_power_gap),
+        number(low),
+        number(high),
+        number(identity.variance_m2),
+        number(identity.variance_per_m2),
+        number(identity.variance_uncorrected_m2),
+        "NULL" if identity.familiarity is None else "&uwb_familiar",
+    ]
+    return f"static const uwb_model uwb_model_data = {{\n{_wrapped(values)}}};\n"
+
+
+def _golden(golden: Golden) -> str:
+    count, samples = golden.windows.shape
+    rows = "\n".join(f"    {{\n{_wrapped(map(number, row.tolist()))}    }}," for row in golden.windows)
+    outputs = _wrapped(map(number, golden.outputs_m.tolist()))
+    return (
+        "#ifdef UWB_GOLDEN_VECTORS\n"
+        f"enum {{ UWB_GOLDEN_COUNT = {count} }};\n"
+        f"static const float uwb_golden_windows[{count}][{samples}] = {{\n{rows}\n}};\n"
+        f"static const float uwb_golden_outputs_m[{count}] = {{\n{outputs}}};\n"
+        "#endif\n"
+    )
+
+
+def number(value: float | np.floating[Any]) -> str:
+    """A float32 as a C literal that reads back to the same bits.
+
+    Raises:
+        ModelError: it is not finite, or no float32 value.
+    """
+    with np.errstate(over="ignore"):
+        single = np.float32(value)
+    if not np.isfinite(single) or float(single) != float(value):
+        raise ModelError(f"{value!r} is no finite float32 value")
+    digits = f"{float(single):.9g}"
+    if not re.search(r"[.e]", digits):
+        digits += ".0"
+    return digits + "f"
+
+
+def _array(kind: str, name: str, values: NDArray[np.generic]) -> str:
+    # The assembly loads words.
+    return (
+        f"static const {kind} {name}[{values.size}] __attribute__((aligned(4))) = {{\n"
+        f"{_wrapped(map(str, values.tolist()))}}};\n"
+    )
+
+
+def _channels(name: str, channels: Channels) -> str:
+    pairs = zip(channels.bias.tolist(), channels.multiplier.tolist(), strict=True)
+    # -2147483648 is, in C, minus a number too large for int.
+    texts = (f"{{{'INT32_MIN' if bias == -(2**31) else bias}, {multiplier}}}" for bias, multiplier in pairs)
+    return f"static const uwb_channel {name}[{len(channels.bias)}] = {{\n{_wrapped(texts)}}};\n"
+
+
+def _sum(total: Sum) -> str:
+    return f"{{{total.first}, {total.second}, {total.offset}}}"
+
+
+def _wrapped(items: Iterable[str]) -> str:
+    lines, line = [], "   "
+    for item in items:
+        if len(line) + len(item) + 2 > _COLUMNS:
+            lines.append(line)
+            line = "   "
+        line += f" {item},"
+    return "".join(f"{text}\n" for text in [*lines, line])
+
+
+def _comment(text: str) -> str:
+    return re.sub(r"[^\w .,()=+-]", "_", text)[:80]

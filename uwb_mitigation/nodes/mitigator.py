@@ -51,7 +51,7 @@ def load(model: str, backend: str = "onnxruntime") -> Backend:
     bundle = load_bundle(model_path(model))
     if backend == "firmware":
         # Only here: it compiles.
-        from uwb_mitigation.firmware_export.backend import FirmwareMitigation
+        from uwb_mitigation.firmware_export.host import FirmwareMitigation
 
         return FirmwareMitigation(bundle)
     return Mitigation(bundle)

@@ -1,4 +1,4 @@
-/* Runs a model over a file of inputs in the emulator. Arguments: program, input file, output file.
+/* Runs a model over input.bin in the emulator and writes output.bin.
  *
  * Input: uint32 kind, uint32 count, then records. Kind 0: float window[K]. Kind 1: struct cir_record.
  * Output: for each record, kind 0: uint32 status, float output. Kind 1: uint32 status,
@@ -150,13 +150,8 @@ static int run_cirs(int32_t input, int32_t output, uint32_t count, report *seen)
 }
 
 int main(void) {
-    static char line[1024];
-    char *arguments[3];
-    if (semihosting_arguments(line, sizeof line, arguments, 3) != 3) {
-        return 1;
-    }
-    const int32_t input = semihosting_open(arguments[1], SEMIHOSTING_READ);
-    const int32_t output = semihosting_open(arguments[2], SEMIHOSTING_WRITE);
+    const int32_t input = semihosting_open("input.bin", SEMIHOSTING_READ);
+    const int32_t output = semihosting_open("output.bin", SEMIHOSTING_WRITE);
     uint32_t header[2];
     if (input < 0 || output < 0 || !semihosting_read(input, header, sizeof header)) {
         return 2;
