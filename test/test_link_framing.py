@@ -11,8 +11,9 @@ from cobs import cobs
 from hypothesis import given
 from hypothesis import strategies as st
 
+from benchmarks.link import loopback
 from uwb_mitigation.errors import ParameterError
-from uwb_mitigation.link.faults import ByteFaults, damage, loopback
+from uwb_mitigation.link.faults import ByteFaults, damage
 from uwb_mitigation.link.framing import Frame, FrameDecoder, FrameEncoder, encode_frame
 from uwb_mitigation.link.layout import MAX_ENCODED_BYTES, MAX_PAYLOAD_BYTES, MessageType
 

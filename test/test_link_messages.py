@@ -8,6 +8,7 @@ import shutil
 import struct
 import subprocess
 
+import generated
 import numpy as np
 import pytest
 from hypothesis import given
@@ -28,7 +29,7 @@ from uwb_mitigation.link.messages import (
 )
 from uwb_mitigation.measurement import Cir, CorrectedRange, Encoding, Origin, RangeMeasurement, Status
 
-HELLO = Hello(0xB0A2D, 0xCAFE, 157, Mode.BOTH, 99, 3, 4224, (1, 2, 3), "uwb-nano33")
+HELLO = Hello(0xB0A2D, 0xCAFE, 157, Mode.DEVICE, 99, 3, 4224, 1, 2, 3, "uwb-nano33")
 CORRECTION = Correction(
     5, 1, 2, 3, 2**40 - 1, CorrectedRange(2.5, 3.0, 0.5, 0.25, Status.OK, Origin.DEVICE, 0xCAFE), 7100
 )
@@ -228,7 +229,7 @@ def test_the_c_header_compiles_and_its_assertions_hold(compiler, language, tmp_p
     if shutil.which(compiler) is None:
         pytest.skip(f"no compiler: {compiler}")
     header = tmp_path / "uwb_protocol.h"
-    header.write_text(layout.c_header())
+    header.write_text(generated.c_header())
 
     subprocess.run(
         [compiler, "-x", language, "-Wall", "-Wextra", "-Werror", "-fsyntax-only", str(header)], check=True

@@ -147,23 +147,11 @@ def test_the_hello_already_tells_the_clocks_offset():
     assert event.stamp_ns == pytest.approx(took_place, abs=0.1 * MS)
 
 
-def test_in_both_mode_a_correction_has_the_stamp_of_its_measurement():
-    bench = connected(mode=Mode.BOTH)
-
-    raw, corrected = bench.measure(5)
-
-    assert isinstance(corrected, Correction)
-    assert corrected.stamp_ns == raw.stamp_ns
-    assert corrected.corrected.origin is Origin.DEVICE
-    assert corrected.corrected.range_m == 3.5
-
-
 @pytest.mark.parametrize(
     ("mode", "kinds"),
     [
         (Mode.HOST, [RangeMeasurement]),
         (Mode.DEVICE, [Correction]),
-        (Mode.BOTH, [RangeMeasurement, Correction]),
     ],
 )
 def test_each_mode_sends_what_it_says(mode, kinds):
@@ -199,18 +187,18 @@ def test_a_board_without_a_model_refuses_to_correct_and_is_asked_once():
 
 
 def test_after_a_reset_the_mode_is_asked_for_again():
-    bench = connected(mode=Mode.BOTH)
+    bench = connected(mode=Mode.DEVICE)
     bench.reboot()
     bench.host_hears(bench.board.hello(0))
     bench.run(600)
 
-    assert bench.board.mode is Mode.BOTH
+    assert bench.board.mode is Mode.DEVICE
 
 
-def test_corrections_by_another_model_than_expected_are_withheld_and_ranges_are_not():
-    bench = connected(mode=Mode.BOTH, expected_model_id=0xBEEF)
+def test_corrections_by_another_model_than_expected_are_withheld():
+    bench = connected(mode=Mode.DEVICE, expected_model_id=0xBEEF)
 
-    assert [type(event) for event in bench.measure(1)] == [RangeMeasurement]
+    assert bench.measure(1) == []
     assert not bench.session.model_matches
     assert bench.session.counts.wrong_model == 1
 
@@ -441,7 +429,7 @@ hello = st.builds(
         )
     ),
     st.integers(0, 3),
-    st.integers(0, 2),
+    st.sampled_from(Mode),
     st.integers(0, 20),
 )
 
@@ -453,7 +441,7 @@ hello = st.builds(
     )
 )
 def test_no_board_makes_a_session_fail(conversation):
-    session = BoardSession(mode=Mode.BOTH)
+    session = BoardSession(mode=Mode.DEVICE)
     now = 0
     for data, pause in conversation:
         now += pause

@@ -17,7 +17,7 @@ import pytest
 from uwb_mitigation.link import layout, messages, radio
 from uwb_mitigation.link.framing import Frame, FrameDecoder, encode_frame
 from uwb_mitigation.link.layout import Flag, LogLevel, MessageType, Mode, RadioState, Role
-from uwb_mitigation.link.offsets import OffsetsAnswer, SetOffsets
+from uwb_mitigation.link.messages import OffsetsAnswer, SetOffsets
 from uwb_mitigation.link.radio import RadioSettings
 from uwb_mitigation.measurement import Cir, CorrectedRange, Encoding, Origin, RangeMeasurement, Status
 from uwb_mitigation.offsets import Offsets
@@ -72,10 +72,10 @@ MAGNITUDES = RangeMeasurement(
 )
 SENT = {
     "get_info": (messages.GetInfo(), 0, 0, 0),
-    "set_mode": (messages.SetMode(Mode.BOTH), 0, 1, 0),
+    "set_mode": (messages.SetMode(Mode.DEVICE), 0, 1, 0),
     "time_sync": (messages.TimeSync(), 0, 0xFFFFFFFF, 0),
     "hello": (
-        messages.Hello(0x1122334455667788, 0xDEADBEEF, 157, Mode.BOTH, 42, 1, 4224, (1, 2, 3), "nano33"),
+        messages.Hello(0x1122334455667788, 0xDEADBEEF, 157, Mode.DEVICE, 42, 1, 4224, 1, 2, 3, "nano33"),
         Flag.ANSWER,
         0,
         1_000_000,
@@ -145,11 +145,11 @@ SENT |= {
         0,
     ),
     "offsets": (OffsetsAnswer(4, 64, True), Flag.ANSWER, 13, 9_000_000),
-    "get_radio": (radio.GetRadio(), 0, 2, 0),
-    "set_radio": (radio.SetRadio(SETTINGS), 0, 3, 0),
-    "radio": (radio.Radio(SETTINGS, 3), Flag.ANSWER, 10, 8_000_000),
+    "get_radio": (messages.GetRadio(), 0, 2, 0),
+    "set_radio": (messages.SetRadio(SETTINGS), 0, 3, 0),
+    "radio": (messages.Radio(SETTINGS, 3), Flag.ANSWER, 10, 8_000_000),
     "radio_refused": (
-        radio.Radio(RadioSettings(), 3, False, "more anchors than 32"),
+        messages.Radio(RadioSettings(), 3, False, "more anchors than 32"),
         Flag.ANSWER,
         11,
         8_000_000,
@@ -169,7 +169,10 @@ SENT |= {
             31.5,
             3.25,
             RadioState.BUS,
-            (radio.AnchorInReach(1, 20, 7, -80.5, 12), radio.AnchorInReach(2**64 - 2, 8, 0, math.nan, None)),
+            (
+                radio.AnchorInReach(1, 20, 7, -80.5, 12),
+                radio.AnchorInReach(2**64 - 2, 8, 0, math.nan, radio.NEVER_MS),
+            ),
         ),
         0,
         12,

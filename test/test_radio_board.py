@@ -14,7 +14,8 @@ from uwb_mitigation.link import messages
 from uwb_mitigation.link.board import Board, Identity
 from uwb_mitigation.link.events import Event, LinkState, RadioRefused
 from uwb_mitigation.link.layout import RadioState, Role
-from uwb_mitigation.link.radio import Radio, RadioSettings, RadioStatus, SetRadio
+from uwb_mitigation.link.messages import Radio, SetRadio
+from uwb_mitigation.link.radio import RadioSettings, RadioStatus
 from uwb_mitigation.link.session import BoardSession
 from uwb_mitigation.measurement import RangeMeasurement
 

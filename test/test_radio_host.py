@@ -24,8 +24,9 @@ from benchmarks.dw1000_model.air import Air, Chip
 from benchmarks.dw1000_model.evb1000 import ROUND_TRIP_S, EmulatedEvb1000s
 from uwb_mitigation.errors import LinkError, MissingDependencyError, ParameterError
 from uwb_mitigation.link.layout import RadioState, Role
+from uwb_mitigation.link.messages import Radio
 from uwb_mitigation.link.port import PortAddress
-from uwb_mitigation.link.radio import Radio, RadioSettings
+from uwb_mitigation.link.radio import RadioSettings
 from uwb_mitigation.measurement import RangeMeasurement
 from uwb_mitigation.radio import spidev_bus
 from uwb_mitigation.radio.evb1000 import Evb1000Bus

@@ -136,7 +136,7 @@ static int answer(uwb_board *board, const uwb_header_t *header, size_t payload_b
         hello(board, &header->sequence, now_us);
         return 1;
     case UWB_TYPE_SET_MODE:
-        if (payload_bytes < sizeof(uwb_set_mode_t) || payload[0] > UWB_MODE_BOTH) {
+        if (payload_bytes < sizeof(uwb_set_mode_t) || payload[0] > UWB_MODE_DEVICE) {
             return 0;
         }
         if (board->config.model != NULL || payload[0] == UWB_MODE_HOST) {

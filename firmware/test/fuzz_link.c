@@ -35,7 +35,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
     uint8_t *const wire = malloc(UWB_MAX_WIRE_BYTES);
     void *const arena = malloc(arena_bytes);
     check(board != NULL && host != NULL && queue != NULL && wire != NULL && arena != NULL, "memory");
-    const uwb_board_config config = {1, 2, {0, 1, 0}, UWB_MODE_BOTH, "fuzzed",   &uwb_model_data,
+    const uwb_board_config config = {1, 2, {0, 1, 0}, UWB_MODE_DEVICE, "fuzzed", &uwb_model_data,
                                      arena, arena_bytes, queue, 9000, NULL, NULL, NULL};
     uwb_board_start(board, &config, 0);
     uint64_t now_us = 0;
@@ -62,7 +62,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
         }
         now_us += 300000u;
         uwb_board_tick(board, now_us);
-        check(board->queue.used <= board->queue.capacity && board->mode <= UWB_MODE_BOTH, "bounds");
+        check(board->queue.used <= board->queue.capacity && board->mode <= UWB_MODE_DEVICE, "bounds");
         if (how & 8) {
             drain(board, host, (how & 16) ? (size_t)how * 8 : SIZE_MAX);
         }

@@ -51,14 +51,14 @@ def decoder(data: bytes) -> None:
 def session(data: bytes) -> None:
     """A board that says anything at any time, in frames whose CRC is right or in plain noise."""
     script = Script(data)
-    host = BoardSession(mode=Mode.BOTH)
+    host = BoardSession(mode=Mode.DEVICE)
     now = 0
     while script:
         kind = script.number(1)
         now += script.number(2) * 10**5
         host.receive(_made_up(kind, script), now, EPOCH + now)
         if kind % 16 == 15:
-            host.set_mode(Mode(kind % 3))
+            host.set_mode(Mode(kind % 2))
         if kind % 16 == 14:
             host.closed(now)
         assert len(host.outgoing()) <= 1 << 17
@@ -86,7 +86,7 @@ def _made_up(kind: int, script: Script) -> bytes:
     if kind % 4 == 0:
         return script.take(script.number(1))
     if kind % 4 == 1:
-        hello = messages.Hello(1, script.number(1), 157, Mode(kind % 3), script.number(1), script.number(1))
+        hello = messages.Hello(1, script.number(1), 157, Mode(kind % 2), script.number(1), script.number(1))
         return encode_frame(Frame(1, kind & 1, script.number(1), 0, messages.encode(hello)[1]))
     frame = Frame(
         script.number(1) % 70,

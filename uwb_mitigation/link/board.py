@@ -27,11 +27,12 @@ from uwb_mitigation.link.messages import (
     GetInfo,
     Hello,
     Log,
+    OffsetsAnswer,
     SetMode,
+    SetOffsets,
     TimeSync,
     TimeSyncReply,
 )
-from uwb_mitigation.link.offsets import OffsetsAnswer, SetOffsets
 from uwb_mitigation.measurement import CorrectedRange, RangeMeasurement
 from uwb_mitigation.offsets import NO_OFFSETS, Offsets
 
@@ -103,15 +104,12 @@ class Board:
         """Send a measurement received at `now_us`, as the mode says."""
         self._measurements += 1
         kind, payload = messages.encode(measurement)
-        sent = b""
-        if self.mode is not Mode.DEVICE:
-            sent += self._encoder.encode(kind, payload, time_us=now_us)
-        if self.mode is not Mode.HOST:
-            # A board computes from the binary32 values that it also sends.
-            held = messages.decode(kind, payload)
-            assert isinstance(held, RangeMeasurement)
-            sent += self._correct(held, now_us, _UNASKED)
-        return sent
+        if self.mode is Mode.HOST:
+            return self._encoder.encode(kind, payload, time_us=now_us)
+        # A board computes from binary32 values, as it would send them.
+        held = messages.decode(kind, payload)
+        assert isinstance(held, RangeMeasurement)
+        return self._correct(held, now_us, _UNASKED)
 
     def log(self, level: LogLevel, text: str, now_us: int) -> bytes:
         """Send a line for a person."""
@@ -181,6 +179,7 @@ class Board:
         return self._send(correction, now_us, flags)
 
     def _hello(self, now_us: int, request: int | None) -> bytes:
+        major, minor, patch = self._identity.firmware_version
         hello = Hello(
             board_id=self._identity.board_id,
             model_id=self._identity.model_id,
@@ -189,7 +188,9 @@ class Board:
             boot_id=self._boot_id,
             request_sequence=request or 0,
             max_payload=MAX_PAYLOAD_BYTES,
-            firmware_version=self._identity.firmware_version,
+            firmware_major=major,
+            firmware_minor=minor,
+            firmware_patch=patch,
             firmware_name=self._identity.firmware_name,
         )
         return self._send(hello, now_us, _UNASKED if request is None else Flag.ANSWER)

@@ -7,8 +7,8 @@ from collections import Counter
 from dataclasses import dataclass, field
 
 from uwb_mitigation.link.layout import Mode
-from uwb_mitigation.link.messages import BoardStatus, Correction, Hello, Log
-from uwb_mitigation.link.radio import Radio, RadioStatus
+from uwb_mitigation.link.messages import BoardStatus, Correction, Hello, Log, Radio
+from uwb_mitigation.link.radio import RadioStatus
 from uwb_mitigation.measurement import RangeMeasurement
 
 

@@ -1,16 +1,21 @@
 """The wire protocol as one table: frame header, message types, fields, limits.
 
-Python packs and parses from this table, and `c_header` renders it as the C header that firmware
-includes, so the two sides cannot differ. All integers and floats are little-endian; every field lies at
-a multiple of its own size and every fixed part is a multiple of 8 bytes long, so that a microcontroller
-can read a decoded frame in place.
+`messages` encodes and decodes from this table, and `docs/generated.py` renders it as the protocol's page and as the C
+header `firmware/src/uwb_protocol.h`. All integers and floats are little-endian; every field is at a multiple of its
+own size and every fixed part is a multiple of 8 bytes long, so that a microcontroller can read a decoded frame in
+place.
 """
 
 from __future__ import annotations
 
 import enum
+import itertools
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
+
+from uwb_mitigation.measurement import DEVICE_TIME_WRAP, Encoding, Status
 
 PROTOCOL_VERSION = 1
 """First byte of every frame. Its place, and that of the CRC, are the same in all versions."""
@@ -53,14 +58,12 @@ class Flag(enum.IntFlag):
 
 
 class Mode(enum.IntEnum):
-    """What a board sends of its own measurements."""
+    """What a board sends of its own measurements. The value 2 is reserved."""
 
     HOST = 0
     """RANGE_CIR only: the host corrects."""
     DEVICE = 1
     """RANGE_CORRECTED only: the board corrects."""
-    BOTH = 2
-    """RANGE_CIR, then the RANGE_CORRECTED that belongs to it."""
 
 
 class Role(enum.IntEnum):
@@ -107,11 +110,28 @@ class LogLevel(enum.IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """One field: its name, its `struct` code (a reserved run of `n` bytes is `nx`), its meaning."""
+    """One field of a layout.
+
+    Attributes:
+        name: in the protocol and in C.
+        code: of `struct`; reserved bytes are `nx`.
+        meaning: with the unit.
+        attribute: of the message, or of the object in it, such as a CIR; empty = `name`.
+        kind: converts the decoded number, such as an enumeration; raises ValueError for invalid numbers.
+        computed: the field describes the tail (a length or a position) and is no attribute.
+    """
 
     name: str
     code: str
     meaning: str
+    attribute: str = ""
+    kind: Callable[[int], Any] | None = None
+    computed: bool = False
+
+    @property
+    def is_text(self) -> bool:
+        """Whether it is UTF-8 of fixed length, filled up with zeros."""
+        return self.code.endswith("s")
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,15 +152,27 @@ class Layout:
         """The fixed part as a `struct.Struct`; reserved bytes take no value."""
         return struct.Struct("<" + "".join(field.code for field in self.fields))
 
+    @property
+    def used(self) -> tuple[Field, ...]:
+        """The fields without reserved bytes: those that `packing` takes values for."""
+        return tuple(field for field in self.fields if not field.code.endswith("x"))
+
     def offsets(self) -> dict[str, int]:
         """{field name: byte offset}, reserved bytes left out."""
-        offsets = {}
-        at = 0
-        for field in self.fields:
-            if not field.code.endswith("x"):
-                offsets[field.name] = at
-            at += struct.calcsize("<" + field.code)
-        return offsets
+        sizes = [struct.calcsize("<" + field.code) for field in self.fields]
+        starts = itertools.accumulate(sizes, initial=0)
+        return {field.name: at for field, at in zip(self.fields, starts, strict=False) if field in self.used}
+
+
+def device_time(ticks: int) -> int:
+    """Return `ticks` unchanged.
+
+    Raises:
+        ValueError: it has more than 40 bits.
+    """
+    if ticks >= DEVICE_TIME_WRAP:
+        raise ValueError("40 bits")
+    return ticks
 
 
 HEADER = Layout(
@@ -162,17 +194,17 @@ _RADIO_SETTINGS = (
     Field("patience_us", "I", "how long a tag waits for an anchor's frames; 0 as above"),
     Field("interval_us", "I", "between the beginnings of two exchanges, at least"),
     Field("pan", "H", "network; radios of others are not heard"),
-    Field("rate", "H", "kbit/s: 110, 850, 6800"),
+    Field("rate", "H", "kbit/s: 110, 850, 6800", "rate_kbps"),
     Field("preamble", "H", "symbols: 64 to 4096"),
     Field("window", "H", "complex samples of a measurement; 0 = none, 1016 and more = all"),
     Field("channel", "B", "1 to 5, 7"),
-    Field("prf", "B", "MHz: 16, 64"),
+    Field("prf", "B", "MHz: 16, 64", "prf_mhz"),
     Field("preamble_code", "B", "0 = the first for channel and PRF"),
-    Field("decawave_sfd", "B", "0 = the standard's start-of-frame delimiter, 1 = Decawave's"),
-    Field("role", "B", "Role"),
-    Field("report", "B", "1 = an anchor gives its ranges to its host too"),
-    Field("bias_correction", "B", "1 = ranges are corrected for the power received (APS011)"),
-    Field("anchor_count", "B", "anchors that a tag is to poll; 0 = those that it finds"),
+    Field("decawave_sfd", "B", "0 = the standard's start-of-frame delimiter, 1 = Decawave's", kind=bool),
+    Field("role", "B", "Role", kind=Role),
+    Field("report", "B", "1 = an anchor gives its ranges to its host too", kind=bool),
+    Field("bias_correction", "B", "1 = ranges are corrected for the power received (APS011)", kind=bool),
+    Field("anchor_count", "B", "anchors that a tag is to poll; 0 = those that it finds", computed=True),
     Field("reserved_too", "4x", ""),
 )
 """What RADIO and SET_RADIO have in common."""
@@ -220,7 +252,7 @@ PAYLOADS = {
             Field("firmware_major", "B", "firmware version"),
             Field("firmware_minor", "B", ""),
             Field("firmware_patch", "B", ""),
-            Field("mode", "B", "Mode in force"),
+            Field("mode", "B", "Mode in force", kind=Mode),
             Field("reserved", "4x", ""),
             Field("firmware_name", "16s", "UTF-8, filled up with zeros"),
         ),
@@ -230,22 +262,29 @@ PAYLOADS = {
         (
             Field("tag_id", "Q", "identity of the tag"),
             Field("anchor_id", "Q", "identity of the anchor"),
-            Field("device_time", "Q", "DW1000 ticks of 1 / (128 x 499.2 MHz) at the reception, 40 bits"),
+            Field(
+                "device_time",
+                "Q",
+                "DW1000 ticks of 1 / (128 x 499.2 MHz) at the reception, 40 bits",
+                kind=device_time,
+            ),
             Field("sequence", "I", "counts the exchanges; wraps"),
-            Field("range", "f", "m, measured; NaN = the exchange gave none"),
-            Field("sample_period", "f", "s"),
+            Field("range", "f", "m, measured; NaN = the exchange gave none", "range_m"),
+            Field("sample_period", "f", "s", "sample_period_s"),
             Field("first_path_index", "f", "accumulator index; NaN = unknown"),
             Field("scale", "f", "accumulator units per count of samples"),
-            Field("rx_power", "f", "dBm; NaN = unknown"),
-            Field("first_path_power", "f", "dBm; NaN = unknown"),
+            Field("rx_power", "f", "dBm; NaN = unknown", "rx_power_dbm"),
+            Field("first_path_power", "f", "dBm; NaN = unknown", "first_path_power_dbm"),
             Field("start_index", "i", "accumulator index of the first sample"),
             Field("preamble_count", "H", "RXPACC; 0 = unknown"),
             Field("noise_threshold", "H", "LDE_THRESH, accumulator units; 0 = unknown"),
-            Field("samples_offset", "H", "bytes from the payload's start to the samples; even"),
-            Field("sample_count", "H", "int16 values: two for a complex sample"),
-            Field("encoding", "B", "0 = complex, interleaved re, im; 1 = magnitude"),
+            Field(
+                "samples_offset", "H", "bytes from the payload's start to the samples; even", computed=True
+            ),
+            Field("sample_count", "H", "int16 values: two for a complex sample", computed=True),
+            Field("encoding", "B", "0 = complex, interleaved re, im; 1 = magnitude", kind=Encoding),
             Field("channel", "B", "UWB channel; 0 = unknown"),
-            Field("prf", "B", "MHz: 16 or 64; 0 = unknown"),
+            Field("prf", "B", "MHz: 16 or 64; 0 = unknown", "prf_mhz"),
             Field("reserved", "5x", ""),
         ),
         tail="samples, int16, from samples_offset",
@@ -255,21 +294,28 @@ PAYLOADS = {
         (
             Field("tag_id", "Q", "of the measurement"),
             Field("anchor_id", "Q", "of the measurement"),
-            Field("device_time", "Q", "of the measurement, 40 bits"),
+            Field("device_time", "Q", "of the measurement, 40 bits", kind=device_time),
             Field("sequence", "I", "of the measurement"),
             Field("model_id", "I", "identity of the model that corrected; 0 = none"),
-            Field("range", "f", "m, corrected; NaN = no valid range"),
-            Field("range_raw", "f", "m, as measured"),
-            Field("correction", "f", "m, offset + predicted error; the offset alone when passed through"),
-            Field("variance", "f", "m^2; infinite where the range is not valid"),
+            Field("range", "f", "m, corrected; NaN = no valid range", "range_m"),
+            Field("range_raw", "f", "m, as measured", "range_raw_m"),
+            Field(
+                "correction",
+                "f",
+                "m, offset + predicted error; the offset alone when passed through",
+                "correction_m",
+            ),
+            Field("variance", "f", "m^2; infinite where the range is not valid", "variance_m2"),
             Field("compute_us", "I", "time that the correction took on the board"),
-            Field("status", "B", "0 OK, 1 NO_CIR, 2 BAD_CIR, 3 OUT_OF_DISTRIBUTION, 4 MODEL_ERROR"),
+            Field(
+                "status", "B", "0 OK, 1 NO_CIR, 2 BAD_CIR, 3 OUT_OF_DISTRIBUTION, 4 MODEL_ERROR", kind=Status
+            ),
             Field("reserved", "3x", ""),
         ),
     ),
     MessageType.LOG: Layout(
         "LOG",
-        (Field("level", "B", "LogLevel"), Field("reserved", "7x", "")),
+        (Field("level", "B", "LogLevel", kind=LogLevel), Field("reserved", "7x", "")),
         tail="text, UTF-8, to the payload's end",
     ),
     MessageType.STATUS: Layout(
@@ -279,8 +325,8 @@ PAYLOADS = {
             Field("frames_dropped", "I", "damaged or unknown frames from the host since the start"),
             Field("measurements", "I", "exchanges since the start"),
             Field("measurements_lost", "I", "exchanges not sent because the link was full"),
-            Field("temperature", "f", "degrees Celsius; NaN = not measured"),
-            Field("mode", "B", "Mode in force"),
+            Field("temperature", "f", "degrees Celsius; NaN = not measured", "temperature_c"),
+            Field("mode", "B", "Mode in force", kind=Mode),
             Field("reserved", "3x", ""),
         ),
     ),
@@ -296,7 +342,7 @@ PAYLOADS = {
         "RADIO",
         (
             Field("request_sequence", "I", "with ANSWER: sequence of the host's frame answered"),
-            Field("accepted", "B", "0 = SET_RADIO was refused, and the text says why"),
+            Field("accepted", "B", "0 = SET_RADIO was refused, and the text says why", kind=bool),
             Field("reserved", "3x", ""),
             *_RADIO_SETTINGS,
         ),
@@ -315,10 +361,10 @@ PAYLOADS = {
             Field("broken", "I", "lost: the chip was reset meanwhile, or its bus failed"),
             Field("refused", "I", "frames that belonged to no exchange of this radio"),
             Field("restarts", "I", "of the chip, but for the first"),
-            Field("temperature", "f", "of the chip, degrees Celsius; NaN = not measured"),
+            Field("temperature", "f", "of the chip, degrees Celsius; NaN = not measured", "temperature_c"),
             Field("voltage", "f", "of the chip, V; NaN = not measured"),
-            Field("state", "B", "RadioState"),
-            Field("anchor_count", "B", "anchors that the tail tells of"),
+            Field("state", "B", "RadioState", kind=RadioState),
+            Field("anchor_count", "B", "anchors that the tail tells of", computed=True),
             Field("reserved", "6x", ""),
         ),
         tail="anchor_count times RADIO_ANCHOR",
@@ -328,13 +374,13 @@ PAYLOADS = {
         (
             Field("request_sequence", "I", "sequence of the SET_OFFSETS answered"),
             Field("slots", "H", "offsets that the board can keep beside the default"),
-            Field("accepted", "B", "0 = they were too many: those before stay in force"),
+            Field("accepted", "B", "0 = they were too many: those before stay in force", kind=bool),
             Field("reserved", "1x", ""),
         ),
     ),
     MessageType.GET_INFO: Layout("GET_INFO", ()),
     MessageType.SET_MODE: Layout(
-        "SET_MODE", (Field("mode", "B", "Mode wanted"), Field("reserved", "7x", ""))
+        "SET_MODE", (Field("mode", "B", "Mode wanted", kind=Mode), Field("reserved", "7x", ""))
     ),
     MessageType.TIME_SYNC: Layout("TIME_SYNC", ()),
     MessageType.GET_RADIO: Layout("GET_RADIO", ()),
@@ -342,8 +388,8 @@ PAYLOADS = {
     MessageType.SET_OFFSETS: Layout(
         "SET_OFFSETS",
         (
-            Field("default_offset", "f", "m, of pairs that nothing in the tail names, -10 to 10"),
-            Field("count", "H", "offsets in the tail"),
+            Field("default_offset", "f", "m, of pairs that nothing in the tail names, -10 to 10", "default"),
+            Field("count", "H", "offsets in the tail", computed=True),
             Field("reserved", "2x", ""),
         ),
         tail="count times OFFSET",
@@ -355,68 +401,3 @@ HEADER_BYTES = HEADER.packing().size
 MAX_FRAME_BYTES = HEADER_BYTES + MAX_PAYLOAD_BYTES + CRC_BYTES
 MAX_ENCODED_BYTES = MAX_FRAME_BYTES + -(-MAX_FRAME_BYTES // 254)
 """COBS adds one byte for each 254 begun; the delimiters are not counted."""
-
-_C_TYPES = {"B": "uint8_t", "H": "uint16_t", "I": "uint32_t", "Q": "uint64_t", "i": "int32_t", "f": "float"}
-
-
-def c_header() -> str:
-    """The table as the C header `uwb_protocol.h`: constants, structs, and assertions on their layout."""
-    lines = [
-        "/* Wire protocol between board and host: docs/protocol.md.",
-        "   Generated by uwb_mitigation.link.layout.c_header; do not edit. */",
-        "#ifndef UWB_PROTOCOL_H",
-        "#define UWB_PROTOCOL_H",
-        "",
-        "#include <stdint.h>",
-        "",
-        "#ifdef __cplusplus",
-        "#define UWB_STATIC_ASSERT(condition) static_assert(condition, #condition)",
-        "#elif __STDC_VERSION__ >= 201112L",
-        "#define UWB_STATIC_ASSERT(condition) _Static_assert(condition, #condition)",
-        "#else",
-        "#define UWB_STATIC_ASSERT(condition) extern char uwb_static_assertion[(condition) ? 1 : -1]",
-        "#endif",
-        "",
-        f"#define UWB_PROTOCOL_VERSION {PROTOCOL_VERSION}",
-        f"#define UWB_HEADER_BYTES {HEADER_BYTES}",
-        f"#define UWB_CRC_BYTES {CRC_BYTES}",
-        f"#define UWB_MAX_SAMPLES {MAX_SAMPLES}",
-        f"#define UWB_MAX_PAYLOAD_BYTES {MAX_PAYLOAD_BYTES}",
-        f"#define UWB_MAX_FRAME_BYTES {MAX_FRAME_BYTES}",
-        f"#define UWB_MAX_ENCODED_BYTES {MAX_ENCODED_BYTES}",
-        f"#define UWB_MAX_ANCHORS {MAX_ANCHORS}",
-        f"#define UWB_MAX_OFFSETS {MAX_OFFSETS}",
-        "",
-    ]
-    for prefix, members in (
-        ("TYPE", MessageType),
-        ("FLAG", Flag),
-        ("MODE", Mode),
-        ("ROLE", Role),
-        ("RADIO_STATE", RadioState),
-        ("OFFSET_OF", OffsetOf),
-        ("LOG_LEVEL", LogLevel),
-    ):
-        lines += [f"#define UWB_{prefix}_{member.name} {member.value}" for member in members]
-        lines.append("")
-    for layout in (HEADER, RADIO_ANCHOR, OFFSET, *PAYLOADS.values()):
-        if layout.fields:
-            lines += _c_struct(layout)
-    lines += ["#endif", ""]
-    return "\n".join(lines)
-
-
-def _c_struct(layout: Layout) -> list[str]:
-    name = f"uwb_{layout.name.lower()}_t"
-    lines = ["typedef struct {"]
-    for field in layout.fields:
-        if field.code[:-1]:
-            element = "char" if field.code.endswith("s") else "uint8_t"
-            member = f"{element} {field.name}[{field.code[:-1]}];"
-        else:
-            member = f"{_C_TYPES[field.code]} {field.name};"
-        lines.append(f"    {member} /* {field.meaning} */" if field.meaning else f"    {member}")
-    if layout.tail:
-        lines.append(f"    /* then {layout.tail} */")
-    # The size is the sum of the sizes of the fields: no padding, so that the offsets are right as well.
-    return [*lines, f"}} {name};", f"UWB_STATIC_ASSERT(sizeof({name}) == {layout.packing().size});", ""]

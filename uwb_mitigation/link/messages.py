@@ -1,54 +1,29 @@
-"""Payloads to typed values and back. A measurement travels as `RangeMeasurement` itself.
+"""Messages and their payloads: values, and how they are encoded and decoded after the tables of `layout`. No I/O.
 
-Floats travel as IEEE-754 binary32, as in the ROS messages: a correction computed on either side of the
-link starts from the same bits.
+A measurement is sent as `RangeMeasurement` itself. Floats are IEEE-754 binary32 on the wire, as in the ROS messages:
+a correction computed on either side of the link starts from the same bits.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import enum
 import math
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from functools import partial
+from operator import attrgetter
+from typing import Any
 
 import numpy as np
 
 from uwb_mitigation.errors import LinkError, ParameterError
-from uwb_mitigation.link.layout import MAX_SAMPLES, PAYLOADS, LogLevel, MessageType, Mode
-from uwb_mitigation.link.offsets import (
-    OffsetsAnswer,
-    SetOffsets,
-    decode_offsets,
-    decode_set_offsets,
-    encode_offsets,
-)
-from uwb_mitigation.link.radio import (
-    GetRadio,
-    Radio,
-    RadioStatus,
-    SetRadio,
-    decode_radio,
-    decode_radio_status,
-    decode_set_radio,
-    encode_radio,
-    encode_radio_status,
-)
-from uwb_mitigation.measurement import (
-    DEVICE_TIME_WRAP,
-    Cir,
-    CorrectedRange,
-    Encoding,
-    Origin,
-    RangeMeasurement,
-    Status,
-)
-
-_packing = {kind: layout.packing() for kind, layout in PAYLOADS.items()}
-_SAMPLES_OFFSET = _packing[MessageType.RANGE_CIR].size
-_FIRMWARE_NAME_BYTES = 16
-
-_Enum = TypeVar("_Enum", Mode, LogLevel, Encoding, Status)
+from uwb_mitigation.link import layout
+from uwb_mitigation.link.layout import Field, LogLevel, MessageType, Mode, OffsetOf
+from uwb_mitigation.link.radio import AnchorInReach, RadioSettings, RadioStatus
+from uwb_mitigation.measurement import Cir, CorrectedRange, Origin, RangeMeasurement
+from uwb_mitigation.offsets import Offsets
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,9 +36,9 @@ class Hello:
         window: window length K of the board's model; 0 = it has none.
         mode: what the board sends of its own measurements.
         boot_id: differs from one start of the firmware to the next.
-        request_sequence: of the host's frame that this answers; of no meaning if it answers none.
-        max_payload: longest payload the board accepts, bytes.
-        firmware_version: major, minor, patch.
+        request_sequence: of the host's frame that this answers; without meaning if it answers none.
+        max_payload: longest payload that the board accepts, bytes.
+        firmware_major, firmware_minor, firmware_patch: version of the firmware.
         firmware_name: at most 16 bytes of UTF-8; more is cut off.
     """
 
@@ -74,13 +49,20 @@ class Hello:
     boot_id: int
     request_sequence: int = 0
     max_payload: int = 0
-    firmware_version: tuple[int, int, int] = (0, 0, 0)
+    firmware_major: int = 0
+    firmware_minor: int = 0
+    firmware_patch: int = 0
     firmware_name: str = ""
+
+    @property
+    def firmware_version(self) -> str:
+        """As `major.minor.patch`."""
+        return f"{self.firmware_major}.{self.firmware_minor}.{self.firmware_patch}"
 
 
 @dataclass(frozen=True, slots=True)
 class Correction:
-    """A range that the board corrected, and which measurement it belongs to.
+    """A range that the board corrected, and the measurement that it belongs to.
 
     Attributes:
         stamp_ns, tag_id, anchor_id, sequence, device_time: as in `RangeMeasurement`.
@@ -129,20 +111,71 @@ class TimeSyncReply:
 
 
 @dataclass(frozen=True, slots=True)
+class Radio:
+    """The settings of a board's radio.
+
+    Attributes:
+        settings: in force, or about to be; includes the chip's own values once the chip has started.
+        request_sequence: of the host's frame that this answers.
+        accepted: False if the requested settings are refused.
+        text: why they are refused.
+    """
+
+    settings: RadioSettings
+    request_sequence: int = 0
+    accepted: bool = True
+    text: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class OffsetsAnswer:
+    """The answer to a `SetOffsets`.
+
+    Attributes:
+        request_sequence: of the frame that this answers.
+        slots: offsets that the board can keep in addition to the default.
+        accepted: whether they are in force.
+    """
+
+    request_sequence: int
+    slots: int
+    accepted: bool
+
+
+@dataclass(frozen=True, slots=True)
+class GetInfo:
+    """Requests a HELLO."""
+
+
+@dataclass(frozen=True, slots=True)
 class SetMode:
-    """Asks for a mode; the board answers with a HELLO that tells the mode then in force."""
+    """Requests a mode; the board answers with a HELLO that contains the mode then in force."""
 
     mode: Mode
 
 
 @dataclass(frozen=True, slots=True)
-class GetInfo:
-    """Asks for a HELLO."""
+class TimeSync:
+    """Requests a TIME_SYNC_REPLY."""
 
 
 @dataclass(frozen=True, slots=True)
-class TimeSync:
-    """Asks for a TIME_SYNC_REPLY."""
+class GetRadio:
+    """Requests a RADIO."""
+
+
+@dataclass(frozen=True, slots=True)
+class SetRadio:
+    """Requests settings; the board answers with a RADIO that accepts or refuses them."""
+
+    settings: RadioSettings
+
+
+@dataclass(frozen=True, slots=True)
+class SetOffsets:
+    """Requests that the board subtracts these offsets from its ranges; it answers with an `OffsetsAnswer`."""
+
+    offsets: Offsets
 
 
 Message = (
@@ -154,294 +187,262 @@ Message = (
     | TimeSyncReply
     | Radio
     | RadioStatus
-    | SetMode
+    | OffsetsAnswer
     | GetInfo
+    | SetMode
     | TimeSync
     | GetRadio
     | SetRadio
-    | OffsetsAnswer
     | SetOffsets
 )
 
+Values = dict[str, Any]
+
 
 def encode(message: Message) -> tuple[MessageType, bytes]:
-    """The message's type and payload.
+    """Return the message's type and payload.
 
-    Of a measurement, the stamp and the frame id stay behind: the frame's header carries the time.
+    The stamp and the frame id of a measurement are left out: the frame's header contains the time.
 
     Raises:
         ParameterError: a value does not fit its field.
     """
+    codec = _by_class[type(message)]
     try:
-        return _encode(message)
+        return codec.kind, codec.encode(message)
     except (struct.error, OverflowError) as error:
         kind = type(message).__name__
         raise ParameterError(f"a value of {kind} does not fit its field: {error}") from error
 
 
-def _encode(message: Message) -> tuple[MessageType, bytes]:
-    if isinstance(message, RangeMeasurement):
-        return MessageType.RANGE_CIR, _encode_measurement(message)
-    if isinstance(message, Correction):
-        corrected = message.corrected
-        return _pack(
-            MessageType.RANGE_CORRECTED,
-            message.tag_id,
-            message.anchor_id,
-            message.device_time,
-            message.sequence,
-            corrected.model_id,
-            corrected.range_m,
-            corrected.range_raw_m,
-            corrected.correction_m,
-            corrected.variance_m2,
-            message.compute_us,
-            corrected.status,
-        )
-    if isinstance(message, Hello):
-        return _pack(
-            MessageType.HELLO,
-            message.board_id,
-            message.model_id,
-            message.boot_id,
-            message.request_sequence,
-            message.window,
-            message.max_payload,
-            *message.firmware_version,
-            message.mode,
-            _cut_utf8(message.firmware_name, _FIRMWARE_NAME_BYTES),
-        )
-    if isinstance(message, Log):
-        kind, fixed = _pack(MessageType.LOG, message.level)
-        return kind, fixed + message.text.encode("utf-8", "replace")
-    if isinstance(message, BoardStatus):
-        return _pack(
-            MessageType.STATUS,
-            message.frames_received,
-            message.frames_dropped,
-            message.measurements,
-            message.measurements_lost,
-            message.temperature_c,
-            message.mode,
-        )
-    if isinstance(message, TimeSyncReply):
-        return _pack(MessageType.TIME_SYNC_REPLY, message.request_sequence, message.received_us)
-    if isinstance(message, Radio | SetRadio):
-        return encode_radio(message)
-    if isinstance(message, RadioStatus):
-        return encode_radio_status(message)
-    if isinstance(message, SetOffsets | OffsetsAnswer):
-        return encode_offsets(message)
-    if isinstance(message, SetMode):
-        return _pack(MessageType.SET_MODE, message.mode)
-    if isinstance(message, GetInfo):
-        return _pack(MessageType.GET_INFO)
-    if isinstance(message, GetRadio):
-        return _pack(MessageType.GET_RADIO)
-    return _pack(MessageType.TIME_SYNC)
-
-
 def decode(kind: int, payload: bytes, *, stamp_ns: int = 0) -> Message | None:
-    """The message of type `kind` in `payload`; None if this version of the protocol has no such type.
+    """Return the message of type `kind` in `payload`; None if this version of the protocol has no such type.
 
-    `stamp_ns` becomes the stamp of a measurement or correction. The samples of a measurement are a
-    read-only view of `payload`.
+    `stamp_ns` becomes the stamp of a measurement or correction. The samples of a measurement are a read-only view of
+    `payload`.
 
     Raises:
         LinkError: the payload is too short for its type, or a field has a value outside its range.
     """
-    packing = _packing.get(kind)  # type: ignore[call-overload]
-    if packing is None:
-        return None
-    if len(payload) < packing.size:
+    codec = _by_type.get(kind)
+    return None if codec is None else codec.decode(payload, stamp_ns)
+
+
+class _Tail:
+    """What follows the fixed part: nothing, unless a subclass says otherwise."""
+
+    def encode(self, message: Any) -> tuple[Values, bytes]:
+        """Return the computed fields of the fixed part, and the bytes of the tail."""
+        return {}, b""
+
+    def decode(self, payload: bytes, start: int, computed: Values) -> Values:
+        """Return the attributes in the tail, which begins at byte `start`; raise LinkError if it is invalid."""
+        return {}
+
+
+class _Samples(_Tail):
+    def encode(self, message: RangeMeasurement) -> tuple[Values, bytes]:
+        samples = message.cir.samples
+        if len(samples) > layout.MAX_SAMPLES:
+            raise ParameterError(
+                f"a CIR of {len(samples)} values", where="RANGE_CIR", valid=f"at most {layout.MAX_SAMPLES}"
+            )
+        computed = {"samples_offset": _by_type[MessageType.RANGE_CIR].size, "sample_count": len(samples)}
+        return computed, np.asarray(samples, dtype="<i2").tobytes()
+
+    def decode(self, payload: bytes, start: int, computed: Values) -> Values:
+        at, count = computed["samples_offset"], computed["sample_count"]
+        if count > layout.MAX_SAMPLES or at < start or at % 2 or at + 2 * count > len(payload):
+            raise LinkError(
+                f"{count} samples at byte {at} of a payload of {len(payload)} bytes",
+                where="RANGE_CIR",
+                valid=f"at most {layout.MAX_SAMPLES}, inside the payload, at an even byte from {start}",
+            )
+        return {"samples": np.frombuffer(payload, "<i2", count, at)}
+
+
+class _Text(_Tail):
+    def encode(self, message: Log) -> tuple[Values, bytes]:
+        return {}, message.text.encode("utf-8", "replace")
+
+    def decode(self, payload: bytes, start: int, computed: Values) -> Values:
+        return {"text": payload[start:].decode("utf-8", "replace")}
+
+
+class _Anchors(_Tail):
+    """Addresses, then text in the messages that have one."""
+
+    def __init__(self, with_text: bool) -> None:
+        self._with_text = with_text
+
+    def encode(self, message: Radio | SetRadio) -> tuple[Values, bytes]:
+        anchors = message.settings.anchors
+        text = message.text if isinstance(message, Radio) else ""
+        tail = struct.pack(f"<{len(anchors)}Q", *anchors) + text.encode("utf-8", "replace")
+        return {"anchor_count": len(anchors)}, tail
+
+    def decode(self, payload: bytes, start: int, computed: Values) -> Values:
+        end = _end_of_rows(payload, start, computed["anchor_count"], 8, layout.MAX_ANCHORS)
+        addresses = struct.unpack(f"<{computed['anchor_count']}Q", payload[start:end])
+        text = {"text": payload[end:].decode("utf-8", "replace")} if self._with_text else {}
+        return {"anchors": addresses} | text
+
+
+class _AnchorsInReach(_Tail):
+    _row = layout.RADIO_ANCHOR.packing()
+
+    def encode(self, message: RadioStatus) -> tuple[Values, bytes]:
+        rows = [self._row.pack(*dataclasses.astuple(anchor)) for anchor in message.anchors]
+        return {"anchor_count": len(rows)}, b"".join(rows)
+
+    def decode(self, payload: bytes, start: int, computed: Values) -> Values:
+        end = _end_of_rows(payload, start, computed["anchor_count"], self._row.size, layout.MAX_ANCHORS)
+        return {"anchors": tuple(AnchorInReach(*row) for row in self._row.iter_unpack(payload[start:end]))}
+
+
+class _Offsets(_Tail):
+    _row = layout.OFFSET.packing()
+
+    def encode(self, message: SetOffsets) -> tuple[Values, bytes]:
+        offsets = message.offsets
+        rows = [
+            *((tag, anchor, m, OffsetOf.PAIR) for (tag, anchor), m in offsets.pairs.items()),
+            *((0, anchor, m, OffsetOf.ANCHOR) for anchor, m in offsets.anchors.items()),
+            *((tag, 0, m, OffsetOf.TAG) for tag, m in offsets.tags.items()),
+        ]
+        return {"count": len(rows)}, b"".join(self._row.pack(*row) for row in rows)
+
+    def decode(self, payload: bytes, start: int, computed: Values) -> Values:
+        end = _end_of_rows(payload, start, computed["count"], self._row.size, 0xFFFF)
+        by_kind: dict[int, dict[Any, float]] = {kind: {} for kind in OffsetOf}
+        for tag, anchor, offset_m, kind in self._row.iter_unpack(payload[start:end]):
+            key = {OffsetOf.PAIR: (tag, anchor), OffsetOf.ANCHOR: anchor, OffsetOf.TAG: tag}.get(kind)
+            if key is None:
+                raise LinkError(f"an offset of {kind}", where="SET_OFFSETS", valid="0 to 2")
+            by_kind[kind].setdefault(key, offset_m)
+        names = {"anchors": OffsetOf.ANCHOR, "tags": OffsetOf.TAG, "pairs": OffsetOf.PAIR}
+        return {name: by_kind[kind] for name, kind in names.items()}
+
+
+def _end_of_rows(payload: bytes, start: int, count: int, size: int, most: int) -> int:
+    """Return where `count` rows of `size` bytes end; raise LinkError if they are not in the payload."""
+    end = start + count * size
+    if count > most or end > len(payload):
         raise LinkError(
-            f"a payload of {len(payload)} bytes",
-            where=MessageType(kind).name,
-            valid=f"at least {packing.size}",
+            f"{count} rows of {size} bytes in a payload of {len(payload)} bytes",
+            valid=f"at most {most}, from byte {start}",
         )
-    values = packing.unpack_from(payload)
-    return _decoders[MessageType(kind)](payload, values, stamp_ns)
+    return end
 
 
-def _encode_measurement(measurement: RangeMeasurement) -> bytes:
-    cir = measurement.cir
-    if len(cir.samples) > MAX_SAMPLES:
-        raise ParameterError(
-            f"a CIR of {len(cir.samples)} values", where="RANGE_CIR", valid=f"at most {MAX_SAMPLES}"
-        )
-    fixed = _packing[MessageType.RANGE_CIR].pack(
-        measurement.tag_id,
-        measurement.anchor_id,
-        measurement.device_time,
-        measurement.sequence,
-        measurement.range_m,
-        cir.sample_period_s,
-        cir.first_path_index,
-        cir.scale,
-        cir.rx_power_dbm,
-        cir.first_path_power_dbm,
-        cir.start_index,
-        cir.preamble_count,
-        cir.noise_threshold,
-        _SAMPLES_OFFSET,
-        len(cir.samples),
-        cir.encoding,
-        cir.channel,
-        cir.prf_mhz,
-    )
-    return fixed + np.asarray(cir.samples, dtype="<i2").tobytes()
+class _Codec:
+    """Encodes and decodes the payloads of one type of message.
+
+    Args:
+        kind, make: its type and class.
+        inner: name and class of an attribute whose own attributes are fields of the payload.
+        tail: what follows the fixed part.
+
+    Attributes:
+        size: bytes of the fixed part.
+    """
+
+    def __init__(
+        self,
+        kind: MessageType,
+        make: type,
+        inner: tuple[str, Callable[..., Any]] = ("", dict),
+        tail: _Tail | None = None,
+    ) -> None:
+        table = layout.PAYLOADS[kind]
+        self.kind = kind
+        self.make, self._inner, self._tail = make, inner, tail or _Tail()
+        self._own = {attribute.name for attribute in dataclasses.fields(make)}
+        self._packing = table.packing()
+        self.size = self._packing.size
+        self._names = [field.attribute or field.name for field in table.used]
+        self._getters = [(field.name, self._getter(field)) for field in table.used]
+        self._converted = [
+            (field.attribute or field.name, field)
+            for field in table.used
+            if field.kind is not None or field.is_text
+        ]
+        self._computed = [field.name for field in table.used if field.computed]
+        self._inner_names = [name for name in self._names if name not in (*self._own, *self._computed)]
+
+    def _getter(self, field: Field) -> Callable[[Any], Any] | None:
+        if field.computed:
+            return None
+        name = field.attribute or field.name
+        get = attrgetter(name if name in self._own else f"{self._inner[0]}.{name}")
+        return (lambda message: _cut_utf8(get(message), int(field.code[:-1]))) if field.is_text else get
+
+    def encode(self, message: Any) -> bytes:
+        """Return the payload; raise struct.error or OverflowError if a value does not fit its field."""
+        computed, tail = self._tail.encode(message)
+        values = [computed[name] if get is None else get(message) for name, get in self._getters]
+        return self._packing.pack(*values) + tail
+
+    def decode(self, payload: bytes, stamp_ns: int) -> Message:
+        """Return the message in `payload`; raise LinkError if it contains none."""
+        if len(payload) < self.size:
+            raise LinkError(
+                f"a payload of {len(payload)} bytes", where=self.kind.name, valid=f"at least {self.size}"
+            )
+        values: Values = dict(zip(self._names, self._packing.unpack_from(payload), strict=True))
+        for name, field in self._converted:
+            values[name] = self._convert(field, values[name])
+        computed = {name: values.pop(name) for name in self._computed}
+        if "stamp_ns" in self._own:
+            values["stamp_ns"] = stamp_ns
+        try:
+            tail = self._tail.decode(payload, self.size, computed)
+            attribute, make_inner = self._inner
+            if attribute:
+                inner = {name: values.pop(name) for name in self._inner_names}
+                inner |= {name: tail.pop(name) for name in [*tail] if name not in self._own}
+                values[attribute] = make_inner(**inner)
+            message: Message = self.make(**values, **tail)
+        except (LinkError, ParameterError) as error:
+            raise LinkError(error.what, where=self.kind.name, valid=error.valid) from error
+        return message
+
+    def _convert(self, field: Field, value: Any) -> Any:
+        if field.kind is None:
+            return value.rstrip(b"\0").decode("utf-8", "replace")
+        try:
+            return field.kind(value)
+        except ValueError as error:
+            valid = str(error)
+            if isinstance(field.kind, type(enum.IntEnum)):
+                valid = ", ".join(f"{number} {name}" for name, number in field.kind.__members__.items())
+            where = f"{self.kind.name} {field.name}"
+            raise LinkError(f"the value {value}", where=where, valid=valid) from None
 
 
-def _decode_measurement(payload: bytes, values: tuple[Any, ...], stamp_ns: int) -> RangeMeasurement:
-    (
-        tag_id,
-        anchor_id,
-        device_time,
-        sequence,
-        range_m,
-        sample_period_s,
-        first_path_index,
-        scale,
-        rx_power_dbm,
-        first_path_power_dbm,
-        start_index,
-        preamble_count,
-        noise_threshold,
-        samples_offset,
-        sample_count,
-        encoding,
-        channel,
-        prf_mhz,
-    ) = values
-    _check_device_time("RANGE_CIR", device_time)
-    if (
-        sample_count > MAX_SAMPLES
-        or samples_offset < _SAMPLES_OFFSET
-        or samples_offset % 2
-        or samples_offset + 2 * sample_count > len(payload)
-    ):
-        raise LinkError(
-            f"{sample_count} samples at byte {samples_offset} of a payload of {len(payload)} bytes",
-            where="RANGE_CIR",
-            valid=f"at most {MAX_SAMPLES}, inside the payload, at an even byte from {_SAMPLES_OFFSET}",
-        )
-    cir = Cir(
-        samples=np.frombuffer(payload, "<i2", sample_count, samples_offset),
-        encoding=_member(Encoding, encoding, "RANGE_CIR encoding"),
-        start_index=start_index,
-        first_path_index=first_path_index,
-        sample_period_s=sample_period_s,
-        scale=scale,
-        preamble_count=preamble_count,
-        noise_threshold=noise_threshold,
-        rx_power_dbm=rx_power_dbm,
-        first_path_power_dbm=first_path_power_dbm,
-        channel=channel,
-        prf_mhz=prf_mhz,
-    )
-    return RangeMeasurement(stamp_ns, tag_id, anchor_id, sequence, device_time, range_m, cir)
-
-
-def _decode_correction(_: bytes, values: tuple[Any, ...], stamp_ns: int) -> Correction:
-    (
-        tag_id,
-        anchor_id,
-        device_time,
-        sequence,
-        model_id,
-        range_m,
-        range_raw_m,
-        correction_m,
-        variance_m2,
-        compute_us,
-        status,
-    ) = values
-    _check_device_time("RANGE_CORRECTED", device_time)
-    corrected = CorrectedRange(
-        range_m=range_m,
-        range_raw_m=range_raw_m,
-        correction_m=correction_m,
-        variance_m2=variance_m2,
-        status=_member(Status, status, "RANGE_CORRECTED status"),
-        origin=Origin.DEVICE,
-        model_id=model_id,
-    )
-    return Correction(stamp_ns, tag_id, anchor_id, sequence, device_time, corrected, compute_us)
-
-
-def _decode_hello(_: bytes, values: tuple[Any, ...], __: int) -> Hello:
-    board_id, model_id, boot_id, request_sequence, window, max_payload, *version, mode, name = values
-    major, minor, patch = version
-    return Hello(
-        board_id=board_id,
-        model_id=model_id,
-        window=window,
-        mode=_member(Mode, mode, "HELLO mode"),
-        boot_id=boot_id,
-        request_sequence=request_sequence,
-        max_payload=max_payload,
-        firmware_version=(major, minor, patch),
-        firmware_name=name.rstrip(b"\0").decode("utf-8", "replace"),
-    )
-
-
-def _decode_log(payload: bytes, values: tuple[Any, ...], _: int) -> Log:
-    text = payload[_packing[MessageType.LOG].size :].decode("utf-8", "replace")
-    return Log(_member(LogLevel, values[0], "LOG level"), text)
-
-
-def _decode_status(_: bytes, values: tuple[Any, ...], __: int) -> BoardStatus:
-    frames_received, frames_dropped, measurements, measurements_lost, temperature_c, mode = values
-    return BoardStatus(
-        frames_received,
-        frames_dropped,
-        measurements,
-        measurements_lost,
-        _member(Mode, mode, "STATUS mode"),
-        temperature_c,
-    )
-
-
-def _decode_set_mode(_: bytes, values: tuple[Any, ...], __: int) -> SetMode:
-    return SetMode(_member(Mode, values[0], "SET_MODE mode"))
-
-
-_decoders: dict[MessageType, Callable[[bytes, tuple[Any, ...], int], Message]] = {
-    MessageType.RANGE_CIR: _decode_measurement,
-    MessageType.RANGE_CORRECTED: _decode_correction,
-    MessageType.HELLO: _decode_hello,
-    MessageType.LOG: _decode_log,
-    MessageType.STATUS: _decode_status,
-    MessageType.TIME_SYNC_REPLY: lambda _, values, __: TimeSyncReply(*values),
-    MessageType.SET_MODE: _decode_set_mode,
-    MessageType.GET_INFO: lambda *_: GetInfo(),
-    MessageType.TIME_SYNC: lambda *_: TimeSync(),
-    MessageType.RADIO: decode_radio,
-    MessageType.RADIO_STATUS: decode_radio_status,
-    MessageType.GET_RADIO: lambda *_: GetRadio(),
-    MessageType.SET_RADIO: decode_set_radio,
-    MessageType.OFFSETS: decode_offsets,
-    MessageType.SET_OFFSETS: decode_set_offsets,
-}
-
-
-def _pack(kind: MessageType, *values: Any) -> tuple[MessageType, bytes]:
-    return kind, _packing[kind].pack(*values)
-
-
-def _member(enumeration: type[_Enum], value: int, where: str) -> _Enum:
-    try:
-        return enumeration(value)
-    except ValueError:
-        valid = ", ".join(f"{member.value} {member.name}" for member in enumeration)
-        raise LinkError(f"the value {value}", where=where, valid=valid) from None
-
-
-def _check_device_time(where: str, ticks: int) -> None:
-    if ticks >= DEVICE_TIME_WRAP:
-        raise LinkError(f"a device time of {ticks} ticks", where=where, valid="40 bits")
+_CODECS = (
+    _Codec(MessageType.HELLO, Hello),
+    _Codec(MessageType.RANGE_CIR, RangeMeasurement, ("cir", Cir), _Samples()),
+    _Codec(
+        MessageType.RANGE_CORRECTED, Correction, ("corrected", partial(CorrectedRange, origin=Origin.DEVICE))
+    ),
+    _Codec(MessageType.LOG, Log, tail=_Text()),
+    _Codec(MessageType.STATUS, BoardStatus),
+    _Codec(MessageType.TIME_SYNC_REPLY, TimeSyncReply),
+    _Codec(MessageType.RADIO, Radio, ("settings", RadioSettings), _Anchors(with_text=True)),
+    _Codec(MessageType.RADIO_STATUS, RadioStatus, tail=_AnchorsInReach()),
+    _Codec(MessageType.OFFSETS, OffsetsAnswer),
+    _Codec(MessageType.GET_INFO, GetInfo),
+    _Codec(MessageType.SET_MODE, SetMode),
+    _Codec(MessageType.TIME_SYNC, TimeSync),
+    _Codec(MessageType.GET_RADIO, GetRadio),
+    _Codec(MessageType.SET_RADIO, SetRadio, ("settings", RadioSettings), _Anchors(with_text=False)),
+    _Codec(MessageType.SET_OFFSETS, SetOffsets, ("offsets", Offsets), _Offsets()),
+)
+_by_type: dict[int, _Codec] = {codec.kind: codec for codec in _CODECS}
+_by_class = {codec.make: codec for codec in _CODECS}
 
 
 def _cut_utf8(text: str, size: int) -> bytes:
-    """At most `size` bytes of UTF-8, without half a character at the end."""
+    """Return at most `size` bytes of UTF-8, without half a character at the end."""
     return text.encode("utf-8", "replace")[:size].decode("utf-8", "ignore").encode()

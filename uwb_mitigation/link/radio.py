@@ -1,31 +1,19 @@
-"""What configures a board's radio and what a radio says of itself: values, and how they travel. No I/O."""
+"""The settings and the status of a radio. No I/O."""
 
 from __future__ import annotations
 
 import math
-import struct
 from dataclasses import dataclass
-from typing import Any
 
-from uwb_mitigation.errors import LinkError, ParameterError
-from uwb_mitigation.link.layout import (
-    MAX_ANCHORS,
-    PAYLOADS,
-    RADIO_ANCHOR,
-    MessageType,
-    RadioState,
-    Role,
-)
+from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.link.layout import MAX_ANCHORS, RadioState, Role
 
 CHANNELS = (1, 2, 3, 4, 5, 7)
 PREAMBLES = (64, 128, 256, 512, 1024, 1536, 2048, 4096)
 RATES_KBPS = (110, 850, 6800)
 PRFS_MHZ = (16, 64)
 NEVER_MS = 0xFFFFFFFF
-
-_packing = {kind: PAYLOADS[kind].packing() for kind in PAYLOADS}
-_anchor = RADIO_ANCHOR.packing()
-_RADIO_HEAD = 2
+"""`AnchorInReach.heard_ms` of an anchor that was never received."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,36 +90,19 @@ class RadioSettings:
 
 
 @dataclass(frozen=True, slots=True)
-class Radio:
-    """What a board says of its radio.
-
-    Attributes:
-        settings: in force, or about to be; what was left to the chip stands there once the chip has started.
-        request_sequence: of the host's frame that this answers.
-        accepted: False if the settings that were asked for are refused.
-        text: why they are.
-    """
-
-    settings: RadioSettings
-    request_sequence: int = 0
-    accepted: bool = True
-    text: str = ""
-
-
-@dataclass(frozen=True, slots=True)
 class AnchorInReach:
-    """How a tag fares with one anchor; `heard_ms` since it was last heard, None = never; NaN = power unknown."""
+    """Exchanges of a tag with one anchor; the fields of `layout.RADIO_ANCHOR`, in their order."""
 
     address: int
     tried: int
     ranged: int
     rx_power_dbm: float
-    heard_ms: int | None
+    heard_ms: int
 
 
 @dataclass(frozen=True, slots=True)
 class RadioStatus:
-    """How a radio fares, since its board's start; the counts are those of `layout.PAYLOADS[RADIO_STATUS]`."""
+    """Counts since the board's start, and state; the fields of `layout.PAYLOADS[RADIO_STATUS]`."""
 
     tried: int = 0
     ranged: int = 0
@@ -149,174 +120,12 @@ class RadioStatus:
     anchors: tuple[AnchorInReach, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class GetRadio:
-    """Asks for a RADIO."""
-
-
-@dataclass(frozen=True, slots=True)
-class SetRadio:
-    """Asks for settings; the board answers with a RADIO that accepts or refuses them."""
-
-    settings: RadioSettings
-
-
 def preamble_codes(channel: int, prf_mhz: int) -> range:
     """The codes that IEEE 802.15.4 has for a channel, at 16 or 64 MHz."""
     if prf_mhz == 64:
         return range(17, 21) if channel in (4, 7) else range(9, 13)
     first = {1: 1, 2: 3, 3: 5, 4: 7, 5: 3, 7: 7}[channel]
     return range(first, first + 2)
-
-
-def encode_radio(message: Radio | SetRadio) -> tuple[MessageType, bytes]:
-    """Raises struct.error where a value does not fit its field."""
-    settings = message.settings
-    values = (
-        settings.address,
-        settings.antenna_delay,
-        settings.tx_power,
-        settings.reply_us,
-        settings.patience_us,
-        settings.interval_us,
-        settings.pan,
-        settings.rate_kbps,
-        settings.preamble,
-        settings.window,
-        settings.channel,
-        settings.prf_mhz,
-        settings.preamble_code,
-        settings.decawave_sfd,
-        settings.role,
-        settings.report,
-        settings.bias_correction,
-        len(settings.anchors),
-    )
-    anchors = struct.pack(f"<{len(settings.anchors)}Q", *settings.anchors)
-    if isinstance(message, SetRadio):
-        return MessageType.SET_RADIO, _packing[MessageType.SET_RADIO].pack(*values) + anchors
-    fixed = _packing[MessageType.RADIO].pack(message.request_sequence, message.accepted, *values)
-    return MessageType.RADIO, fixed + anchors + message.text.encode("utf-8", "replace")
-
-
-def decode_radio(payload: bytes, values: tuple[Any, ...], _: int = 0) -> Radio:
-    """Raises LinkError where a value is impossible."""
-    settings, end = _settings(payload, values[_RADIO_HEAD:], MessageType.RADIO)
-    return Radio(settings, values[0], bool(values[1]), payload[end:].decode("utf-8", "replace"))
-
-
-def decode_set_radio(payload: bytes, values: tuple[Any, ...], _: int = 0) -> SetRadio:
-    """Raises LinkError where a value is impossible."""
-    return SetRadio(_settings(payload, values, MessageType.SET_RADIO)[0])
-
-
-def encode_radio_status(status: RadioStatus) -> tuple[MessageType, bytes]:
-    """Raises struct.error where a value does not fit its field."""
-    fixed = _packing[MessageType.RADIO_STATUS].pack(
-        status.tried,
-        status.ranged,
-        status.no_answer,
-        status.late,
-        status.time_out,
-        status.damaged,
-        status.absurd,
-        status.broken,
-        status.refused,
-        status.restarts,
-        status.temperature_c,
-        status.voltage,
-        status.state,
-        len(status.anchors),
-    )
-    anchors = b"".join(
-        _anchor.pack(
-            anchor.address,
-            anchor.tried,
-            anchor.ranged,
-            anchor.rx_power_dbm,
-            NEVER_MS if anchor.heard_ms is None else anchor.heard_ms,
-        )
-        for anchor in status.anchors
-    )
-    return MessageType.RADIO_STATUS, fixed + anchors
-
-
-def decode_radio_status(payload: bytes, values: tuple[Any, ...], _: int = 0) -> RadioStatus:
-    """Raises LinkError where a value is impossible."""
-    state, anchor_count = values[-2:]
-    start = _packing[MessageType.RADIO_STATUS].size
-    _check_tail("RADIO_STATUS", payload, start, anchor_count, _anchor.size)
-    rows = _anchor.iter_unpack(payload[start : start + anchor_count * _anchor.size])
-    anchors = tuple(
-        AnchorInReach(address, tried, ranged, power, None if heard == NEVER_MS else heard)
-        for address, tried, ranged, power, heard in rows
-    )
-    made: Any = RadioStatus  # a star of unknown length
-    status: RadioStatus = made(*values[:-2], _enumerated(RadioState, state, "RADIO_STATUS state"), anchors)
-    return status
-
-
-def _settings(payload: bytes, values: tuple[Any, ...], kind: MessageType) -> tuple[RadioSettings, int]:
-    (
-        address,
-        antenna_delay,
-        tx_power,
-        reply_us,
-        patience_us,
-        interval_us,
-        pan,
-        rate,
-        preamble,
-        window,
-        channel,
-        prf,
-        code,
-        decawave_sfd,
-        role,
-        report,
-        bias_correction,
-        count,
-    ) = values
-    start = _packing[kind].size
-    _check_tail(kind.name, payload, start, count, 8)
-    settings = RadioSettings(
-        role=_enumerated(Role, role, f"{kind.name} role"),
-        address=address,
-        pan=pan,
-        channel=channel,
-        prf_mhz=prf,
-        preamble=preamble,
-        preamble_code=code,
-        rate_kbps=rate,
-        decawave_sfd=bool(decawave_sfd),
-        tx_power=tx_power,
-        antenna_delay=antenna_delay,
-        window=window,
-        anchors=struct.unpack_from(f"<{count}Q", payload, start),
-        reply_us=reply_us,
-        patience_us=patience_us,
-        interval_us=interval_us,
-        report=bool(report),
-        bias_correction=bool(bias_correction),
-    )
-    return settings, start + 8 * count
-
-
-def _check_tail(where: str, payload: bytes, start: int, count: int, size: int) -> None:
-    if count > MAX_ANCHORS or start + count * size > len(payload):
-        raise LinkError(
-            f"{count} anchors in a payload of {len(payload)} bytes",
-            where=where,
-            valid=f"at most {MAX_ANCHORS}, of {size} bytes each from byte {start}",
-        )
-
-
-def _enumerated(kind: Any, value: int, where: str) -> Any:
-    try:
-        return kind(value)
-    except ValueError:
-        valid = ", ".join(f"{member.value} {member.name}" for member in kind)
-        raise LinkError(f"the value {value}", where=where, valid=valid) from None
 
 
 def _one_of(name: str, value: int, allowed: tuple[int, ...] | range) -> None:

@@ -26,9 +26,19 @@ from uwb_mitigation.link.events import (
 )
 from uwb_mitigation.link.framing import DecoderCounts, Frame, FrameDecoder, FrameEncoder
 from uwb_mitigation.link.layout import Flag, MessageType, Mode
-from uwb_mitigation.link.messages import BoardStatus, Correction, Hello, Log, TimeSyncReply
-from uwb_mitigation.link.offsets import OffsetsAnswer, SetOffsets
-from uwb_mitigation.link.radio import GetRadio, Radio, RadioSettings, RadioStatus, SetRadio
+from uwb_mitigation.link.messages import (
+    BoardStatus,
+    Correction,
+    GetRadio,
+    Hello,
+    Log,
+    OffsetsAnswer,
+    Radio,
+    SetOffsets,
+    SetRadio,
+    TimeSyncReply,
+)
+from uwb_mitigation.link.radio import RadioSettings, RadioStatus
 from uwb_mitigation.measurement import RangeMeasurement
 from uwb_mitigation.offsets import Offsets
 

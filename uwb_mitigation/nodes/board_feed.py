@@ -19,9 +19,9 @@ from uwb_mitigation.link.events import (
     VersionMismatch,
 )
 from uwb_mitigation.link.layout import PROTOCOL_VERSION, LogLevel, Mode
-from uwb_mitigation.link.messages import BoardStatus, Correction, Log
+from uwb_mitigation.link.messages import BoardStatus, Correction, Log, Radio
 from uwb_mitigation.link.port import BoardPort
-from uwb_mitigation.link.radio import Radio, RadioSettings, RadioStatus
+from uwb_mitigation.link.radio import RadioSettings, RadioStatus
 from uwb_mitigation.measurement import RangeMeasurement
 from uwb_mitigation.nodes import diagnostics, radio_facts
 from uwb_mitigation.nodes.feed import EVENT_TIMEOUT_S, Description, LiveFeed, Value
@@ -84,7 +84,7 @@ class BoardFeed(LiveFeed):
         if report.hello is not None:
             hardware = f"board {format_id(report.hello.board_id)}"
             facts |= {
-                "firmware": f"{report.hello.firmware_name} {'.'.join(map(str, report.hello.firmware_version))}",
+                "firmware": f"{report.hello.firmware_name} {report.hello.firmware_version}",
                 "model id": diagnostics.model_id(report.hello.model_id),
                 "mode": report.hello.mode.name.lower(),
             }

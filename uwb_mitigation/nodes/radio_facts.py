@@ -6,7 +6,7 @@ from dataclasses import fields
 
 from uwb_mitigation.errors import format_id
 from uwb_mitigation.link.layout import RadioState, Role
-from uwb_mitigation.link.radio import RadioSettings, RadioStatus
+from uwb_mitigation.link.radio import NEVER_MS, RadioSettings, RadioStatus
 
 COUNTS = tuple(row.name for row in fields(RadioStatus) if row.type == "int")
 """Of the exchanges of a radio, by how they ended."""
@@ -60,7 +60,7 @@ def anchors(status: RadioStatus) -> dict[str, object]:
     """Those in reach, for diagnostics."""
     said: dict[str, object] = {}
     for anchor in status.anchors:
-        heard = "never" if anchor.heard_ms is None else f"{anchor.heard_ms / 1000:.1f} s ago"
+        heard = "never" if anchor.heard_ms == NEVER_MS else f"{anchor.heard_ms / 1000:.1f} s ago"
         said[f"anchor {format_id(anchor.address)}"] = (
             f"{anchor.ranged} of {anchor.tried} ranged, {anchor.rx_power_dbm:.1f} dBm, heard {heard}"
         )

@@ -8,7 +8,8 @@ from typing import Any
 
 from uwb_mitigation.errors import ParameterError, format_id
 from uwb_mitigation.link.layout import Role
-from uwb_mitigation.link.radio import Radio, RadioSettings
+from uwb_mitigation.link.messages import Radio
+from uwb_mitigation.link.radio import RadioSettings
 from uwb_mitigation.measurement import RangeMeasurement
 from uwb_mitigation.nodes import diagnostics, radio_facts
 from uwb_mitigation.nodes.feed import Description, LiveFeed, Value

@@ -162,7 +162,7 @@ class HostRadio:
                     anchor.tried,
                     anchor.ranged,
                     anchor.rx_power_dbm,
-                    min((now_us - anchor.heard_us) // 1000, NEVER_MS - 1) if anchor.heard_us else None,
+                    min((now_us - anchor.heard_us) // 1000, NEVER_MS - 1) if anchor.heard_us else NEVER_MS,
                 )
                 for anchor in table[: count.value]
             ),

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.link.event_queue import EventQueue
 from uwb_mitigation.link.layout import RadioState
-from uwb_mitigation.link.radio import Radio, RadioSettings, RadioStatus
+from uwb_mitigation.link.messages import Radio
+from uwb_mitigation.link.radio import RadioSettings, RadioStatus
 from uwb_mitigation.measurement import RangeMeasurement
 from uwb_mitigation.radio.bus import Bus
 from uwb_mitigation.radio.host import HostRadio, load
