@@ -19,13 +19,12 @@ from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.prior import LinePrior
 from uwb_mitigation.model.shipped import default_model_path
 from uwb_mitigation.positioning.anchors import AnchorMap
+from uwb_mitigation.positioning.geometry import Area, Height
 from uwb_mitigation.positioning.locator import TagLocator, run_live
 from uwb_mitigation.positioning.model import Model
-from uwb_mitigation.positioning.smoothing import smooth
-from uwb_mitigation.positioning.snapshot import snapshot
-from uwb_mitigation.positioning.start import Area, Height, places
-from uwb_mitigation.positioning.track_errors import TrackErrors, errors_of, track_errors
-from uwb_mitigation.positioning.tracks import Ranges, Track, TruePath
+from uwb_mitigation.positioning.smoother import smooth
+from uwb_mitigation.positioning.start import places, snapshot
+from uwb_mitigation.positioning.tracks import Ranges, Track, TrackErrors, TruePath, errors_of, track_errors
 from uwb_mitigation.sources.decaranging import DecaRangingFolder
 from uwb_mitigation.sources.hanyang import ANTENNA_M, HanyangRun
 from uwb_mitigation.sources.simulated import SimulatedSource, SimulatedSurvey

@@ -16,11 +16,10 @@ from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.offsets import NO_OFFSETS, Offsets
 from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
 from uwb_mitigation.positioning.fleet import Fleet
+from uwb_mitigation.positioning.geometry import Height
 from uwb_mitigation.positioning.model import Model
 from uwb_mitigation.positioning.offset_learning import FADING_S, faded_sd
-from uwb_mitigation.positioning.start import Height
-from uwb_mitigation.positioning.track_errors import TrackErrors, track_errors
-from uwb_mitigation.positioning.tracks import Ranges, Track
+from uwb_mitigation.positioning.tracks import Ranges, Track, TrackErrors, track_errors
 from uwb_mitigation.sources.site import load_learnt, save_learnt
 
 TAG = 7

@@ -14,13 +14,12 @@ from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
 from uwb_mitigation.positioning.filter import FIRST_ERROR, OFFSET, RangeFilter
 from uwb_mitigation.positioning.fleet import Fleet
-from uwb_mitigation.positioning.geometry import Shape, geometry, shape
+from uwb_mitigation.positioning.geometry import Area, Height, Shape, geometry, shape
 from uwb_mitigation.positioning.locator import SILENCE_S, TagLocator, run_live
 from uwb_mitigation.positioning.model import Model
-from uwb_mitigation.positioning.smoothing import smooth
-from uwb_mitigation.positioning.start import Area, Height, places
-from uwb_mitigation.positioning.track_errors import errors_of, track_errors
-from uwb_mitigation.positioning.tracks import Estimate, Heights, Track, TruePath
+from uwb_mitigation.positioning.smoother import smooth
+from uwb_mitigation.positioning.start import places
+from uwb_mitigation.positioning.tracks import Estimate, Heights, Track, TruePath, errors_of, track_errors
 
 PLAIN = Model(long=100.0, short=100.0)
 """No range is doubted."""

@@ -7,16 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from drives import HALL, circuit, drive
+from uwb_mitigation.positioning.other_anchors import position_scatter
+from uwb_mitigation.positioning.rests import stretches
 
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
+from uwb_mitigation.positioning.geometry import Area, Height
 from uwb_mitigation.positioning.localised import PosePath, solve_localised
-from uwb_mitigation.positioning.model import Model
-from uwb_mitigation.positioning.other_anchors import position_scatter
-from uwb_mitigation.positioning.regressors import SLOPE_SD, Regressors
-from uwb_mitigation.positioning.rests import stretches
+from uwb_mitigation.positioning.model import SLOPE_SD, Model, Regressors
 from uwb_mitigation.positioning.self_calibration import calibrate
-from uwb_mitigation.positioning.start import Area, Height
 from uwb_mitigation.positioning.tracks import Ranges
 
 LEVEL = Height(1.0)

@@ -5,17 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from drives import HALL, block, drive
+from uwb_mitigation.positioning.chain import Chain
 
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
-from uwb_mitigation.positioning.chain import Chain
+from uwb_mitigation.positioning.geometry import Height
 from uwb_mitigation.positioning.locator import TagLocator, run_live
 from uwb_mitigation.positioning.model import Model
-from uwb_mitigation.positioning.smoother import Parameters, Smoother, knots_of
-from uwb_mitigation.positioning.smoothing import smooth
-from uwb_mitigation.positioning.start import Height
-from uwb_mitigation.positioning.track_errors import track_errors
-from uwb_mitigation.positioning.tracks import Ranges, Track
+from uwb_mitigation.positioning.smoother import Parameters, Smoother, knots_of, smooth
+from uwb_mitigation.positioning.tracks import Ranges, Track, track_errors
 
 
 def test_a_chain_solves_as_a_dense_matrix_does():

@@ -10,7 +10,7 @@ from drives import HALL, NANOSECONDS, circuit, drive
 
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
-from uwb_mitigation.positioning.start import Area, Height
+from uwb_mitigation.positioning.geometry import Area, Height
 from uwb_mitigation.positioning.survey import displacements, survey
 
 LEVEL = Height(1.0)

@@ -20,9 +20,9 @@ from uwb_mitigation.bag.topics import ODOMETRY, ODOMETRY_TRUTH, POSE_TYPE
 from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.measurement import Cir, CorrectedRange, Origin, RangeMeasurement, Record, Status
 from uwb_mitigation.positioning.anchors import dump_anchors, parse_anchors
+from uwb_mitigation.positioning.geometry import Area, Height
 from uwb_mitigation.positioning.locator import TagLocator, run_live
 from uwb_mitigation.positioning.model import Model
-from uwb_mitigation.positioning.start import Area, Height
 from uwb_mitigation.positioning.tracks import Estimate, Ranges, TruePath
 from uwb_mitigation.processing import tracking
 from uwb_mitigation.processing.residuals import held_out

@@ -32,12 +32,11 @@ from uwb_mitigation.model.bundle import Bundle, load_bundle
 from uwb_mitigation.model.shipped import default_model_path
 from uwb_mitigation.offsets import NO_OFFSETS, Offsets
 from uwb_mitigation.positioning.anchors import AnchorMap
+from uwb_mitigation.positioning.geometry import Height
 from uwb_mitigation.positioning.localised import PosePath
 from uwb_mitigation.positioning.locator import TagLocator, run_live
 from uwb_mitigation.positioning.model import Model
-from uwb_mitigation.positioning.start import Height
-from uwb_mitigation.positioning.track_errors import track_errors
-from uwb_mitigation.positioning.tracks import Ranges, TruePath
+from uwb_mitigation.positioning.tracks import Ranges, TruePath, track_errors
 from uwb_mitigation.sources.simulated import SimulatedSource
 from uwb_mitigation.sources.simulation.buildings import RADIO
 from uwb_mitigation.sources.simulation.scene import ANCHORS, FLAT, MORE_ANCHORS, ROUTE

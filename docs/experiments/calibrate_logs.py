@@ -28,12 +28,11 @@ from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import Bundle, load_bundle
 from uwb_mitigation.model.shipped import default_model_path
 from uwb_mitigation.offsets import NO_OFFSETS, Offsets
+from uwb_mitigation.positioning.geometry import Height
 from uwb_mitigation.positioning.locator import TagLocator, run_live
 from uwb_mitigation.positioning.model import Model
 from uwb_mitigation.positioning.smoother import Smoother
-from uwb_mitigation.positioning.start import Height
-from uwb_mitigation.positioning.track_errors import track_errors
-from uwb_mitigation.positioning.tracks import Ranges
+from uwb_mitigation.positioning.tracks import Ranges, track_errors
 from uwb_mitigation.sources.decaranging import DecaRangingFolder
 from uwb_mitigation.sources.hanyang import ANTENNA_M, HanyangRun
 from uwb_mitigation.training import calibrated

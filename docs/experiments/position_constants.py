@@ -11,7 +11,7 @@ import numpy as np
 from benchmarks.positions import HEIGHT, at_truths, hanyang_run
 from uwb_mitigation.positioning.locator import TagLocator, run_live
 from uwb_mitigation.positioning.model import Model
-from uwb_mitigation.positioning.track_errors import TrackErrors
+from uwb_mitigation.positioning.tracks import TrackErrors
 
 LEAST_COVERAGE = 0.85
 CHANGES = [

@@ -14,10 +14,9 @@ from uwb_mitigation.errors import ParameterError, RecordingError, format_id
 
 if TYPE_CHECKING:
     from uwb_mitigation.positioning.anchors import AnchorMap
-    from uwb_mitigation.positioning.start import Area, Height
+    from uwb_mitigation.positioning.geometry import Area, Height
     from uwb_mitigation.positioning.survey import SurveyResult
-    from uwb_mitigation.positioning.track_errors import TrackErrors
-    from uwb_mitigation.positioning.tracks import Heights
+    from uwb_mitigation.positioning.tracks import Heights, TrackErrors
     from uwb_mitigation.processing.residuals import HeldOut
     from uwb_mitigation.processing.tracking import TagTracks
     from uwb_mitigation.sources.recorded_ranges import RecordedRanges
@@ -254,7 +253,7 @@ def _read(bag: Path, anchors: Path | None, stamp_offset: float) -> tuple[AnchorM
 
 def height_of(height: float | None, sd: float) -> Height | None:
     """What --height and --height-sd say."""
-    from uwb_mitigation.positioning.start import Height
+    from uwb_mitigation.positioning.geometry import Height
 
     return None if height is None else Height(height, sd)
 
@@ -277,7 +276,7 @@ def heights_of(
 
 def area_of(text: str | None) -> Area | None:
     """What --area says."""
-    from uwb_mitigation.positioning.start import Area
+    from uwb_mitigation.positioning.geometry import Area
 
     return Area.parse(text or "")
 

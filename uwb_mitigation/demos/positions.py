@@ -14,10 +14,9 @@ from uwb_mitigation.nodes import topics
 from uwb_mitigation.nodes.conversions import NANOSECONDS
 from uwb_mitigation.nodes.monitor import Monitor
 from uwb_mitigation.positioning.anchors import AnchorMap
-from uwb_mitigation.positioning.snapshot import snapshot
-from uwb_mitigation.positioning.start import Height
-from uwb_mitigation.positioning.track_errors import TrackErrors, track_errors
-from uwb_mitigation.positioning.tracks import Ranges, Track, TruePath
+from uwb_mitigation.positioning.geometry import Height
+from uwb_mitigation.positioning.start import snapshot
+from uwb_mitigation.positioning.tracks import Ranges, Track, TrackErrors, TruePath, track_errors
 
 
 class Positions:

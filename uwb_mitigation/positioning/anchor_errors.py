@@ -1,12 +1,14 @@
-"""Errors in the anchors file: an anchor that is not where the file says, and two that are swapped.
+"""Checks of a calibration without ground truth: observability, errors in the anchors file, and agreement of the anchors.
 
-The ranges of such an anchor look like ranges with an offset. The difference is that the error depends on the direction
-to the tag. So the hypothesis of another position competes with that of an offset, by their likelihoods.
+The ranges of an anchor that is not where the anchors file says look like ranges with an offset. The difference is that
+the error depends on the direction to the tag. So the hypothesis of another position competes with that of an offset, by
+their likelihoods.
 """
 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -14,14 +16,17 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.anchors import AnchorMap
-from uwb_mitigation.positioning.joint import JointFit, JointSolver, Links, links_of
-from uwb_mitigation.positioning.model import Model
-from uwb_mitigation.positioning.own_offsets import Columns
-from uwb_mitigation.positioning.rests import Stretches
-from uwb_mitigation.positioning.smoother import Parameters
-from uwb_mitigation.positioning.start import Area, Height
-from uwb_mitigation.positioning.starting import first_positions
-from uwb_mitigation.positioning.tracks import Ranges
+from uwb_mitigation.positioning.geometry import Area, Height, Shape, directions, shape
+from uwb_mitigation.positioning.joint import (
+    FAR_S,
+    JointFit,
+    Links,
+    Setting,
+    Stretches,
+    fit_joint,
+    links_of,
+)
+from uwb_mitigation.positioning.model import Regressors
 
 MISPLACED_M = 0.4
 """A smaller displacement looks like reflections."""
@@ -39,56 +44,140 @@ sigma, Decawave APS014), or if its median residual is that many times the median
 MISFIT_M, MISFIT_SHARE = 0.5, 0.08
 """Swaps are examined if this share of the ranges has larger residuals."""
 
+MOVES_M = 1.0
+MIN_INDEPENDENT = 20
+"""Independent ranges in addition to those that the positions at rest need."""
+
+MIRRORED = 4.5
+"""Mirror images cannot be distinguished if their likelihoods differ by a factor of less than e^4.5."""
+
+MAX_REFITS = 8
+MAX_GROUPS = 5
+
 _DISPLACEMENT_SD_M = 2.0
 _STEPS = 6
-_MOST_RANGES = 1000
+_MAX_RANGES = 1000
+
+FirstPositions = Callable[
+    [Setting, Stretches, NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.bool_]]
+]
+
+
+def check_anchors(
+    anchors: AnchorMap, used: NDArray[np.intp], height: Height | None, area: Area | None = None
+) -> None:
+    """Refuse anchors that do not determine positions and offsets.
+
+    Args:
+        used: rows of the received anchors.
+        area: of the tags; it can exclude the mirror image of a track at a plane of anchors.
+
+    Raises:
+        DatasetError: too few, or all on a line (without a height: in a plane).
+    """
+    needed = 4 if height is not None else 5
+    if len(used) < needed:
+        raise DatasetError(
+            f"{len(used)} anchors were heard",
+            valid=f"{needed} or more" + (", or four and --height" if height is None else ""),
+        )
+    position = anchors.position[used]
+    if height is not None:
+        position = position * (1.0, 1.0, 0.0)
+    kind = shape(position)
+    if kind in (Shape.POINT, Shape.LINE):
+        raise DatasetError("the anchors are all on a line", valid="one or more that are not on this line")
+    if height is None and area is None and kind is Shape.PLANE:
+        raise DatasetError(
+            "the anchors are all in a plane: the mirror image of the track explains the ranges equally well",
+            valid="--height of the tag, --area on one side of the plane, or an anchor above or below that plane",
+        )
+
+
+def check_motion(links: Links, fit: JointFit, setting: Setting) -> None:
+    """Refuse recordings in which positions and offsets cannot be separated.
+
+    Raises:
+        DatasetError: the tags do not move enough, or there are too few independent ranges.
+    """
+    spread = float(np.linalg.norm(np.ptp(fit.position, axis=0)))
+    if spread < MOVES_M:
+        raise DatasetError(
+            f"the tag moves by {spread:.1f} m only: its position and the offset cannot be separated",
+            valid=f"a drive of {MOVES_M:g} m or more, or tags at several positions",
+        )
+    independent = float(links.share.sum())
+    needed = MIN_INDEPENDENT + 1.5 * setting.dims * int(links.at_rest.sum())
+    if independent < needed:
+        raise DatasetError(
+            f"{len(links.of)} ranges, {independent:.0f} of them independent: too few",
+            valid=f"{needed:.0f} or more: a longer drive, or more anchors at each position",
+        )
+
+
+def mirrored(setting: Setting, links: Links, fit: JointFit) -> NDArray[np.bool_]:
+    """Return which segments have a mirror image beyond the anchors that explains the ranges equally well, bool (s,)."""
+    used = setting.anchors.position[np.unique(links.anchor)]
+    axes = slice(0, setting.dims)
+    centre = used.mean(axis=0)
+    normal = np.zeros(3)
+    normal[axes] = np.linalg.svd(used[:, axes] - centre[axes])[2][-1]
+    image = fit.position - 2.0 * ((fit.position - centre) @ normal)[:, None] * normal
+    fixed = links.corrected(links.rows @ fit.parameters)
+    try:
+        other = fit_joint(setting, fixed, Regressors.none(len(links)), image, scale_m=fit.scale_m)
+    except DatasetError:
+        return np.zeros(len(fit.stretch_loss), np.bool_)
+    apart = np.linalg.norm(other.position - fit.position, axis=1) > MOVES_M
+    if setting.area is not None:
+        apart &= setting.area.holds(other.position)
+    share = np.bincount(links.knot_stretch, apart) / np.bincount(links.knot_stretch)
+    return (other.stretch_loss - fit.stretch_loss < MIRRORED) & (share > 0.5)
 
 
 def check_anchor_positions(
-    anchors: AnchorMap,
-    tags: list[Ranges],
+    setting: Setting,
     found: Stretches,
-    solved: Columns,
+    solved: Regressors,
     links: Links,
     fit: JointFit,
-    height: Height | None,
-    area: Area | None,
-    model: Model,
+    first_positions: FirstPositions,
 ) -> None:
     """Refuse ranges that other anchor positions explain much better.
 
     Args:
-        tags: all ranges. found, solved, links, fit: the solution with the positions of the file.
+        found, solved, links, fit: the solution with the positions of the file.
+        first_positions: as in `self_calibration`.
 
     Raises:
         DatasetError: names the anchors.
     """
+    anchors = setting.anchors.anchors
     fix = "their true positions in the anchors file (`uwb-mitigation survey` finds them)"
     best: tuple[float, int, float] | None = None
     for row in _suspects(links, solved, fit):
-        moved_m, gain = _displaced(row, anchors, found, solved, fit, height, model)
+        moved_m, gain = _displaced(row, setting, found, solved, fit)
         if moved_m > MISPLACED_M and gain > LIKELIER and (best is None or gain > best[0]):
             best = gain, row, moved_m
     misfit = float((links.share * (np.abs(fit.residual_m) > MISFIT_M)).sum() / links.share.sum())
-    if misfit > MISFIT_SHARE:
-        pair = _swapped(anchors, tags, found, solved, fit, height, area, model)
-        if pair is not None:
-            a, b = (anchors.anchors[row] for row in pair)
-            raise DatasetError(
-                f"anchors {a} and {b} contradict the others: swapped, they explain the ranges", valid=fix
-            )
+    pair = _swapped(setting, found, solved, fit, first_positions) if misfit > MISFIT_SHARE else None
+    if pair is not None:
+        a, b = (anchors[row] for row in pair)
+        raise DatasetError(
+            f"anchors {a} and {b} contradict the others: swapped, they explain the ranges", valid=fix
+        )
     if best is not None:
         _, row, moved_m = best
         raise DatasetError(
-            f"anchor {anchors.anchors[row]} contradicts the others: {moved_m:.1f} m from its position in the anchors "
+            f"anchor {anchors[row]} contradicts the others: {moved_m:.1f} m from its position in the anchors "
             "file, it explains the ranges",
             valid=fix,
         )
 
 
-def _suspects(links: Links, solved: Columns, fit: JointFit) -> list[int]:
+def _suspects(links: Links, solved: Regressors, fit: JointFit) -> list[int]:
     used = np.unique(links.anchor)
-    own = {name: float(value) for name, value in zip(solved.names, fit.parameters, strict=True)}
+    own = dict(zip(solved.names, fit.parameters.tolist(), strict=True))
     offset = np.array([own.get(f"anchor {row}", 0.0) for row in used])
     size = np.abs(fit.residual_m)
     misfit = np.array([np.median(size[links.anchor == row]) for row in used])
@@ -99,44 +188,36 @@ def _suspects(links: Links, solved: Columns, fit: JointFit) -> list[int]:
 
 
 def _displaced(
-    row: int,
-    anchors: AnchorMap,
-    found: Stretches,
-    solved: Columns,
-    fit: JointFit,
-    height: Height | None,
-    model: Model,
+    row: int, setting: Setting, found: Stretches, solved: Regressors, fit: JointFit
 ) -> tuple[float, float]:
-    """The horizontal displacement of an anchor that explains the ranges best, m, and the gain in log likelihood."""
+    """Return the displacement of the anchor that explains the ranges best, m, and the gain in log likelihood."""
     keep = np.array([name != f"anchor {row}" for name in solved.names])
-    base = Columns(
-        tuple(name for name, kept in zip(solved.names, keep, strict=True) if kept),
-        solved.rows[:, keep],
-        solved.alike,
-        solved.mean[keep],
-        solved.sd[keep],
-    )
-    links = links_of(found, base.rows, base.alike, model)
-    own = links.anchor == row
+    base, anchors = solved.only(keep), setting.anchors
+    links = links_of(found, base.rows, base.alike, setting.model)
+    own = (links.anchor == row)[:, None]
     position, shared, moved = fit.position, fit.parameters[keep], anchors
     gain, axes = 0.0, slice(0, 2)
-    parameters = base.parameters(links)
     try:
         for _ in range(_STEPS):
-            away = position[links.knot] - moved.position[links.anchor]
-            away[:, 2] += links.rise
-            unit = away / np.maximum(np.linalg.norm(away, axis=1), 0.05)[:, None]
-            rows = np.concatenate([parameters.rows, -unit[:, axes] * own[:, None]], axis=1)
+            tag = position[links.knot] + links.rise[:, None] * (0.0, 0.0, 1.0)
+            unit, _ = directions(tag, moved.position[links.anchor])
+            rows = np.concatenate([links.rows, -unit[:, axes] * own], axis=1)
             shift = moved.position[row, axes] - anchors.position[row, axes]
-            with_shift = Parameters(
-                rows,
-                np.concatenate([parameters.mean, -shift]),
-                np.concatenate([parameters.sd, np.full(2, _DISPLACEMENT_SD_M)]),
+            prior = replace(
+                base,
+                mean=np.concatenate([base.mean, -shift]),
+                sd=np.concatenate([base.sd, np.full(2, _DISPLACEMENT_SD_M)]),
             )
-            solver = JointSolver(
-                moved, replace(links, rows=rows), with_shift, model, height, fit.scale_m, position
+            other = fit_joint(
+                replace(setting, anchors=moved),
+                replace(links, rows=rows),
+                prior,
+                position,
+                np.concatenate([shared, np.zeros(2)]),
+                scale_m=fit.scale_m,
+                around=position,
+                near=True,
             )
-            other = solver.fit(position, np.concatenate([shared, np.zeros(2)]), near=True)
             position, shared, step = other.position, other.parameters[:-2], other.parameters[-2:]
             where = moved.position.copy()
             where[row, axes] += step
@@ -150,50 +231,115 @@ def _displaced(
 
 
 def _swapped(
-    anchors: AnchorMap,
-    tags: list[Ranges],
-    found: Stretches,
-    solved: Columns,
-    fit: JointFit,
-    height: Height | None,
-    area: Area | None,
-    model: Model,
+    setting: Setting, found: Stretches, solved: Regressors, fit: JointFit, first_positions: FirstPositions
 ) -> tuple[int, int] | None:
-    """The pair of anchors that explains the ranges best if swapped; None: no pair does so much better."""
-    part = np.arange(min(len(found.ranges), _MOST_RANGES))
-    few = Stretches(
-        found.ranges.take(part),
-        found.tag[part],
-        found.row[part],
-        found.of[part],
-        found.at_rest,
-        found.rise[part],
-    )
-    few = few.keep(np.isin(np.arange(len(found)), few.of))
-    columns = solved.take(np.isin(np.arange(len(found.ranges)), part))
-    expected = columns.rows @ solved.mean
+    """Return the pair of anchors that explains the ranges best if swapped; None: no pair is much better."""
+    few = found.first(_MAX_RANGES)
+    columns = solved.take(np.arange(len(few.ranges)))
+    links = links_of(few, columns.rows, columns.alike, setting.model)
     scale = np.maximum(fit.scale_m, 0.1)
 
     def loss(order: NDArray[np.intp]) -> float:
-        tried = anchors.moved(anchors.position[order], anchors.sd)
-        position, placed = first_positions(tried, tags, few, expected, height, area, model)
+        anchors = setting.anchors
+        tried = replace(setting, anchors=anchors.moved(anchors.position[order], anchors.sd))
+        position, placed = first_positions(tried, few, columns.rows @ solved.mean)
         if not placed.all():
             return np.inf
-        links = links_of(few, columns.rows, columns.alike, model)
         try:
-            return (
-                JointSolver(tried, links, columns.parameters(links), model, height, scale).fit(position).loss
-            )
+            return fit_joint(tried, links, columns, position, scale_m=scale).loss
         except DatasetError:
             return np.inf
 
-    order = np.arange(len(anchors))
-    now = loss(order)
+    order = np.arange(len(setting.anchors))
+    limit = (1.0 - LARGER) * loss(order) - LIKELIER
     best: tuple[int, int] | None = None
-    limit = (1.0 - LARGER) * now - LIKELIER
     for a, b in itertools.combinations(np.unique(found.ranges.anchor).tolist(), 2):
         swapped = order.copy()
         swapped[[a, b]] = b, a
         if (value := loss(swapped)) < limit:
             best, limit = (a, b), value
     return best
+
+
+def _without(setting: Setting, links: Links, fit: JointFit, rows: NDArray[np.intp]) -> JointFit:
+    """Return the positions from the other anchors, with the same links' corrections."""
+    rest = links.without(np.isin(links.anchor, rows))
+    return fit_joint(
+        setting,
+        rest,
+        Regressors.none(len(rest)),
+        fit.position,
+        scale_m=fit.scale_m,
+        around=fit.position,
+        near=True,
+    )
+
+
+def position_scatter(
+    setting: Setting, links: Links, fit: JointFit, correction_m: NDArray[np.float64]
+) -> float:
+    """Return the error of the horizontal positions without ground truth, RMSE in m: the jackknife over the anchors.
+
+    Errors of ranges that contradict each other move the track when an anchor is left out. An error that all anchors have in
+    common is not seen.
+
+    Args:
+        correction_m: float64 (n,), subtracted from each range.
+
+    Returns:
+        NaN if too few anchors remain.
+    """
+    used = np.unique(links.anchor)
+    groups = min(MAX_GROUPS, len(used))
+    parts = [used[k::groups] for k in range(groups)]
+    if len(used) - max(map(len, parts)) < setting.dims + 1:
+        return float("nan")
+    corrected = links.corrected(correction_m)
+    tracks = np.array([_without(setting, corrected, fit, part).position[:, :2] for part in parts])
+    squared = np.sum((tracks - tracks.mean(axis=0)) ** 2, axis=(0, 2))
+    return float(np.sqrt(squared.mean() * (groups - 1) / groups))
+
+
+def seen_by_others(
+    setting: Setting, found: Stretches, links: Links, fit: JointFit
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return for each range the distance of its anchor from the other anchors' track, and its standard deviation."""
+    distance = np.full(len(found.ranges), np.nan)
+    sd = np.full(len(found.ranges), np.nan)
+    used = np.unique(links.anchor)
+    corrected = links.corrected(links.rows @ fit.parameters)
+    # With many anchors, a few are left out at once: enough others remain.
+    for part in (used[k::MAX_REFITS] for k in range(min(MAX_REFITS, len(used)))):
+        try:
+            seen = _without(setting, corrected, fit, part)
+            covariance = seen.covariances()
+        except (DatasetError, np.linalg.LinAlgError):
+            continue
+        own = np.isin(links.anchor, part)
+        received = np.zeros(len(links.time_s), np.bool_)
+        received[links.knot[~own]] = True
+        knot = links.knot[own]
+        tag = seen.position[knot] + links.ahead_s[own][:, None] * seen.velocity[knot]
+        tag[:, 2] += links.rise[own]
+        unit, length = directions(tag, setting.anchors.position[links.anchor[own]])
+        known = np.sqrt(np.einsum("ni,nij,nj->n", unit, covariance[knot], unit))
+        known[~(_gap_s(links, received)[knot] <= FAR_S)] = np.nan
+        of_link, sd_of = np.full(len(links), np.nan), np.full(len(links), np.nan)
+        of_link[own], sd_of[own] = length, known
+        mine = np.isin(found.ranges.anchor, part)
+        distance[mine], sd[mine] = of_link[links.of[mine]], sd_of[links.of[mine]]
+    return distance, sd
+
+
+def _gap_s(links: Links, received: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return the time from each knot to the nearest one of its segment that still has ranges; inf: there is none."""
+    # Segments are moved so far apart that none is near another.
+    time = links.time_s + links.knot_stretch * (float(links.time_s.max(initial=0.0)) + 1e6)
+    there = time[received]
+    if not len(there):
+        return np.full(len(time), np.inf)
+    after = np.searchsorted(there, time).clip(min(1, len(there) - 1), len(there) - 1)
+    nearest: NDArray[np.float64] = np.minimum(
+        np.abs(time - there[after]), np.abs(time - there[np.maximum(after - 1, 0)])
+    )
+    return nearest

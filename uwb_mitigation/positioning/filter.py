@@ -1,10 +1,9 @@
-"""The filter of one tag that has a place: constant velocity, a range at a time.
+"""The filter of one tag with a known position: constant velocity, one range at a time.
 
-State: position (0-2), velocity (3-5), the offset that the tag's ranges share (6), and what persists of the error
-of each anchor's ranges (7...); or, with `pair_offsets`, an offset of each anchor's ranges in place of the one. An
-extended Kalman filter with a Schmidt (considered) part: offset and errors keep their uncertainty and correlations,
-but a range moves them only where the data can tell (S. F. Schmidt 1966; partial updates as in Brink, "Partial-Update
-Schmidt-Kalman Filter", 2017). Covariances by Joseph's form, which holds for any gain.
+State: position (0-2), velocity (3-5), the offset that the tag's ranges share (6), and the persisting error of each
+anchor's ranges (7...). An extended Kalman filter with a Schmidt (considered) part: offset and errors keep their
+uncertainty and correlations, but a range changes them only if they are observable (S. F. Schmidt 1966; partial updates
+as in Brink, "Partial-Update Schmidt-Kalman Filter", 2017). Covariances in Joseph's form, which is valid for any gain.
 """
 
 from __future__ import annotations
@@ -21,39 +20,25 @@ from uwb_mitigation.positioning.model import Model
 OFFSET = 6
 FIRST_ERROR = 7
 _SHORTEST_M = 0.05
-"""Closer to an anchor a range has no direction to speak of."""
+"""Closer to an anchor, a range has no defined direction."""
 
 
 class RangeFilter:
     """Args:
-        anchors: rows of these are what `update` takes.
+        anchors: `update` takes rows of these.
         model: motion and errors.
         time_s: of the first state.
         position: float64 (3,), m.
         covariance: float64 (3, 3) of `position`, m^2; a variance of 0 in z with `level`.
-        level: the height is known and stays: no vertical motion.
-        pair_offsets: of each anchor's ranges, float64 (m,) in m and (m, m) in m^2; None = one that all share, known
-            to the model's deviation.
+        level: the height is known and constant: no vertical motion.
 
     Attributes:
         time_s: of the state, s.
         x, p: state float64 (n,) and its covariance (n, n).
-        first_error: where the persisting errors begin in it.
-        learns: whether ranges move offset and errors too, rather than only being judged by them.
+        learns: whether ranges also change offset and errors, which are only considered otherwise.
     """
 
-    __slots__ = (
-        "_anchors",
-        "_claimed",
-        "_h",
-        "_level",
-        "_model",
-        "first_error",
-        "learns",
-        "p",
-        "time_s",
-        "x",
-    )
+    __slots__ = ("_anchors", "_claimed", "_h", "_level", "_model", "learns", "p", "time_s", "x")
 
     def __init__(
         self,
@@ -64,10 +49,8 @@ class RangeFilter:
         covariance: NDArray[np.float64],
         *,
         level: bool = False,
-        pair_offsets: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
     ) -> None:
-        self.first_error = FIRST_ERROR if pair_offsets is None else OFFSET + len(anchors)
-        n = self.first_error + len(anchors)
+        n = FIRST_ERROR + len(anchors)
         self._anchors = anchors.position
         self._model = model
         self._level = level
@@ -82,25 +65,21 @@ class RangeFilter:
         self.p[:3, :3] = covariance
         for axis in range(2 if level else 3):
             self.p[3 + axis, 3 + axis] = model.speed**2
-        if pair_offsets is None:
-            self.p[OFFSET, OFFSET] = model.offset_sd**2
-        else:
-            offsets = slice(OFFSET, self.first_error)
-            self.x[offsets], self.p[offsets, offsets] = pair_offsets
-        diagonal = np.arange(self.first_error, n)
-        self.p[diagonal, diagonal] = self._claimed
+        self.p[OFFSET, OFFSET] = model.offset_sd**2
+        errors = np.arange(FIRST_ERROR, n)
+        self.p[errors, errors] = self._claimed
 
     def copy(self) -> RangeFilter:
-        """The same filter, to go another way."""
+        """Return an independent copy."""
         other = object.__new__(RangeFilter)
-        for name in ("_anchors", "_level", "_model", "first_error", "learns", "time_s"):
+        for name in ("_anchors", "_level", "_model", "learns", "time_s"):
             setattr(other, name, getattr(self, name))
         for name in ("_claimed", "_h", "p", "x"):
             setattr(other, name, getattr(self, name).copy())
         return other
 
-    def predict(self, time_s: float, pace: float = 1.0) -> None:
-        """Go to a later time, in which errors fade `pace` times as fast; an earlier one changes nothing."""
+    def predict(self, time_s: float) -> None:
+        """Predict the state at a later time; an earlier time has no effect."""
         dt = time_s - self.time_s
         if dt <= 0.0:
             return
@@ -109,13 +88,12 @@ class RangeFilter:
         x[:3] += dt * x[3:6]
         p[:3] += dt * p[3:6]
         p[:, :3] += dt * p[:, 3:6]
-        first = self.first_error
-        kept = math.exp(-dt * pace / model.persistence_s)
-        x[first:] *= kept
-        p[first:] *= kept
-        p[:, first:] *= kept
+        decay = math.exp(-dt / model.persistence_s)
+        x[FIRST_ERROR:] *= decay
+        p[FIRST_ERROR:] *= decay
+        p[:, FIRST_ERROR:] *= decay
         diagonal = p.reshape(-1)[:: len(x) + 1]
-        diagonal[first:] += (1.0 - kept * kept) * self._claimed
+        diagonal[FIRST_ERROR:] += (1.0 - decay * decay) * self._claimed
         q = model.acceleration**2 * dt
         for axis in range(2 if self._level else 3):
             p[axis, axis] += q * dt * dt / 3.0
@@ -125,64 +103,34 @@ class RangeFilter:
             p[axis + 3, axis + 3] += q
 
     def update(self, anchor: int, range_m: float, variance_m2: float) -> tuple[float, float]:
-        """Take in a range at the state's own time.
+        """Update with a range at the time of the state.
 
         Args:
             anchor: a row of the anchors.
             range_m: finite, m.
-            variance_m2: of its error, the persisting part included; NaN = unknown.
+            variance_m2: of its error, including the persisting part; NaN: unknown.
 
         Returns:
-            The innovation divided by its standard deviation, and that deviation in m.
+            The innovation divided by its standard deviation, and this standard deviation in m.
         """
-        model = self._model
+        model, x, h, row = self._model, self.x, self._h, FIRST_ERROR + anchor
         variance = model.variance(variance_m2)
         claimed = self._claimed[anchor]
-        # What a range claims beyond what the pair's persisting error stands for is new with this range.
+        # The part of the variance that the pair's persisting error does not explain is white noise.
         white = max(model.white * variance, variance - claimed)
         self._claimed[anchor] += 0.1 * ((1.0 - model.white) * variance - claimed)
-        error, h, ph, expected = self._observe(anchor, range_m)
-        s = expected + white
-        sd = math.sqrt(s)
-        z = error / sd
-        s *= model.inflation(z)
-        gain = ph / s
-        if not self.learns:
-            gain[OFFSET:] = 0.0
-        self._apply(gain, h, ph, error, s - expected)
-        return z, sd
-
-    def innovation(self, anchor: int, range_m: float, variance_m2: float) -> float:
-        """The normalised innovation that `update` would find, and nothing changed."""
-        variance = self._model.variance(variance_m2)
-        white = max(self._model.white * variance, variance - self._claimed[anchor])
-        error, _, _, expected = self._observe(anchor, range_m)
-        return error / math.sqrt(expected + white)
-
-    def take_off(self, change_m: NDArray[np.float64]) -> None:
-        """From here on, ranges come with so much more taken off, float64 (m,): what they share, and each one's."""
-        shared = float(change_m.mean())
-        self.x[OFFSET] -= shared
-        self.x[FIRST_ERROR:] -= change_m - shared
-
-    def _observe(
-        self, anchor: int, range_m: float
-    ) -> tuple[float, NDArray[np.float64], NDArray[np.float64], float]:
-        """By how much a range is longer than expected; how it depends on the state, h; P h; and h' P h."""
-        x, h, row = self.x, self._h, self.first_error + anchor
-        offset = OFFSET if self.first_error == FIRST_ERROR else OFFSET + anchor
-        h[OFFSET:] = 0.0
+        h[FIRST_ERROR:] = 0.0
         away = x[:3] - self._anchors[anchor]
         distance = math.sqrt(away @ away)
         h[:3] = away / max(distance, _SHORTEST_M)
-        h[offset] = 1.0
-        h[row] = 1.0
-        ph = self.p @ h
-        return float(range_m - distance - x[offset] - x[row]), h, ph, float(h @ ph)
+        h[OFFSET] = h[row] = 1.0
+        return self._correct(h, float(range_m - distance - x[OFFSET] - x[row]), white)
 
     def update_height(self, height_m: float, variance_m2: float) -> float:
-        """Take in the height of the tag; returns the normalised innovation."""
-        return self._direct(2, height_m, variance_m2)
+        """Update with the height of the tag; return the normalised innovation."""
+        h = np.zeros(len(self.x))
+        h[2] = 1.0
+        return self._correct(h, height_m - float(self.x[2]), variance_m2)[0]
 
     def confine(self, low: Sequence[float], high: Sequence[float]) -> bool:
         """Project the position onto a box; return whether it was outside.
@@ -191,7 +139,7 @@ class RangeFilter:
         that repeated projections do not count as new information.
         """
         x = self.x
-        # This runs after each update, where numbers of NumPy are slow.
+        # This runs after each update. Python numbers are faster here than NumPy scalars.
         x0, x1, x2 = x[:3].tolist()
         if low[0] <= x0 <= high[0] and low[1] <= x1 <= high[1] and low[2] <= x2 <= high[2]:
             return False
@@ -200,7 +148,7 @@ class RangeFilter:
             if beyond == 0.0:
                 continue
             gain = self.p[:, axis] / max(self.p[axis, axis], 1e-12)
-            # Where the correlation with another coordinate is steep, the linear model does not hold.
+            # If the correlation with another coordinate is steep, the linear model is not valid.
             gain[:3] = np.clip(gain[:3], -1.0, 1.0)
             if not self.learns:
                 gain[OFFSET:] = 0.0
@@ -208,51 +156,22 @@ class RangeFilter:
         x[:3] = np.clip(x[:3], low, high)
         return True
 
-    def update_speed(self, speed_m_per_s: float, variance_m2: float) -> float:
-        """Take in the horizontal speed that wheels tell; returns the normalised innovation.
-
-        Where the estimate itself hardly moves, a speed has no direction: then only standing still says something.
-        """
-        vx, vy = self.x[3], self.x[4]
-        speed = math.hypot(vx, vy)
-        if speed < 0.1 or speed_m_per_s < 0.05:
-            if speed_m_per_s > 0.05:
-                return 0.0
-            return max(self._direct(axis, 0.0, variance_m2) for axis in (3, 4))
-        h = np.zeros(len(self.x))
-        h[3], h[4] = vx / speed, vy / speed
-        return self._plain(h, speed_m_per_s - speed, variance_m2)
-
-    def _direct(self, row: int, value: float, variance_m2: float) -> float:
-        h = np.zeros(len(self.x))
-        h[row] = 1.0
-        return self._plain(h, value - float(self.x[row]), variance_m2)
-
-    def _plain(self, h: NDArray[np.float64], innovation: float, variance_m2: float) -> float:
+    def _correct(self, h: NDArray[np.float64], innovation: float, noise: float) -> tuple[float, float]:
+        """Robust update with a measurement with Jacobian h (n,) and noise variance; return as `update`."""
         ph = self.p @ h
-        expected = float(h @ ph)
-        s = expected + variance_m2
-        z = innovation / math.sqrt(s)
-        s *= self._model.inflation(z)
-        gain = ph / s
+        predicted = float(h @ ph)
+        sd = math.sqrt(predicted + noise)
+        z = innovation / sd
+        s = (predicted + noise) * self._model.inflation(z)
+        k = ph / s
         if not self.learns:
-            gain[OFFSET:] = 0.0
-        self._apply(gain, h, ph, innovation, s - expected)
-        return z
-
-    def _apply(
-        self,
-        gain: NDArray[np.float64],
-        h: NDArray[np.float64],
-        ph: NDArray[np.float64],
-        innovation: float,
-        noise: float,
-    ) -> None:
-        """Joseph's (I - K h) P (I - K h)' + K r K', written as updates of rank one."""
-        self.x += gain * innovation
-        a = self.p - np.multiply.outer(gain, ph)
-        a -= np.multiply.outer(a @ h - noise * gain, gain)
+            k[OFFSET:] = 0.0
+        self.x += k * innovation
+        # Joseph's form (I - K H) P (I - K H)' + K R K', as updates of rank one.
+        a = self.p - np.multiply.outer(k, ph)
+        a -= np.multiply.outer(a @ h - (s - predicted) * k, k)
         self.p = a
+        return z, sd
 
     @property
     def position(self) -> NDArray[np.float64]:

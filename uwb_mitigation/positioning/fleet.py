@@ -1,46 +1,136 @@
-"""All tags of a site: a locator for each, and what a person should know of them."""
+"""All tags of a site: a locator and a fixed-lag smoother for each, and their diagnostics."""
 
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import Counter, deque
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from uwb_mitigation.errors import format_id
-from uwb_mitigation.offsets import NO_OFFSETS, Offsets
+from uwb_mitigation.errors import DatasetError, format_id
 from uwb_mitigation.positioning.anchors import AnchorMap
-from uwb_mitigation.positioning.fixed_lag import FixedLag
-from uwb_mitigation.positioning.geometry import Shape, protection_levels, shape
+from uwb_mitigation.positioning.filter import RangeFilter
+from uwb_mitigation.positioning.geometry import Area, Height, Shape, protection_levels, shape
 from uwb_mitigation.positioning.locator import SILENCE_S, TagLocator
-from uwb_mitigation.positioning.model import Model
-from uwb_mitigation.positioning.offset_learning import OffsetLearner
-from uwb_mitigation.positioning.start import Area, Height
-from uwb_mitigation.positioning.tracks import Estimate
+from uwb_mitigation.positioning.model import Model, Regressors
+from uwb_mitigation.positioning.smoother import Smoother, fused_with_batch
+from uwb_mitigation.positioning.tracks import Estimate, Heights, Ranges, Track
 
 MAX_TAGS = 256
-"""More tags than that are no tags: damaged numbers, rather."""
+"""More tags are probably damaged numbers."""
 
 UNKNOWN_HEIGHT_SD_M = 0.1
 """Standard deviation of a measured height without a variance."""
+
+LAG_S = 1.0
+"""What a robot does next shows its present position for about this time."""
+
+_BEFORE_S = 0.5
+_EVERY_S = 0.1
+_MAX_RANGES = 400
+_ITERATIONS = 3
+_SECOND_NS = 1_000_000_000
+
+
+class FixedLag:
+    """Keeps the latest states of the filter and ranges of a tag, and smooths over them on request.
+
+    Args:
+        anchors, model, height, area: as of `TagLocator`.
+    """
+
+    def __init__(
+        self, anchors: AnchorMap, model: Model, height: Height | None, area: Area | None = None
+    ) -> None:
+        self._anchors, self._model, self._height, self._area = anchors, model, height, area
+        self._states: deque[tuple[int, RangeFilter]] = deque()
+        self._ranges: deque[tuple[int, int, float, float]] = deque()
+        self._heights: deque[tuple[int, float, float]] = deque(maxlen=_MAX_RANGES)
+
+    def add_height(self, height_m: float, variance_m2: float) -> None:
+        """Add the tag's height at the time of the latest range; the variance is positive."""
+        if self._ranges:
+            self._heights.append((self._ranges[-1][0], height_m, variance_m2))
+
+    def add(self, known: RangeFilter, stamp_ns: int, anchor: int, range_m: float, variance_m2: float) -> None:
+        """Add a range, and the filter after it."""
+        if self._ranges and stamp_ns < self._ranges[-1][0]:
+            self.clear()
+        self._ranges.append((stamp_ns, anchor, range_m, variance_m2))
+        if not self._states or stamp_ns - self._states[-1][0] >= _EVERY_S * _SECOND_NS:
+            self._states.append((stamp_ns, known.copy()))
+        oldest = stamp_ns - round((LAG_S + _BEFORE_S + _EVERY_S) * _SECOND_NS)
+        for kept in (self._states, self._ranges, self._heights):
+            while kept and kept[0][0] < oldest:  # type: ignore[index]
+                kept.popleft()  # type: ignore[attr-defined]
+
+    def clear(self) -> None:
+        """Forget everything: the tag was lost."""
+        self._states.clear()
+        self._ranges.clear()
+        self._heights.clear()
+
+    def estimate(self) -> Estimate | None:
+        """Return the position `LAG_S` before the latest range; None: it is not known for that long."""
+        if not self._states or len(self._ranges) < 2:
+            return None
+        start_ns, known = self._states[0]
+        wanted_ns = self._ranges[-1][0] - round(LAG_S * _SECOND_NS)
+        after = [row for row in self._ranges if row[0] > start_ns]
+        if start_ns > wanted_ns or len(after) < 2:
+            return None
+        # Errors persist for a second: at a high rate a part of the ranges contains the same information.
+        after = after[:: math.ceil(len(after) / _MAX_RANGES)]
+        stamp, anchor, range_m, variance = (np.array(column) for column in zip(*after, strict=True))
+        ranges = Ranges(stamp, anchor, range_m, variance, np.full(len(after), np.nan))
+        first = known.copy()
+        first.predict(first.time_s + (int(stamp[0]) - start_ns) / _SECOND_NS)
+        offset = Regressors.one("offset", np.ones(len(after)), 0.0, max(self._model.offset_sd, 1e-3))
+        states = [(at, one) for at, one in self._states if at > start_ns] or [(int(stamp[0]), first)]
+        initial = Track.of([_estimate_of(one, at) for at, one in states])
+        heights = None
+        if self._heights:
+            heights = Heights(*(np.array(column) for column in zip(*self._heights, strict=True)))
+        smoother = Smoother(
+            self._anchors,
+            self._model,
+            ranges,
+            height=self._height,
+            parameters=offset,
+            after=first,
+            heights=heights,
+        )
+        try:
+            track = smoother.fit(initial, _ITERATIONS).track
+        except DatasetError:
+            return None
+        at = int(np.abs(track.stamp_ns - wanted_ns).argmin())
+        batch = track.take(slice(at, at + 1))
+        batch.position[:] += (wanted_ns - int(track.stamp_ns[at])) / _SECOND_NS * batch.velocity
+        live_ns, live = [state for state in self._states if state[0] <= wanted_ns][-1]
+        live = live.copy()
+        live.predict(live.time_s + (wanted_ns - live_ns) / _SECOND_NS)
+        state, covariance, spread = fused_with_batch(live.x[None, :6], live.p[None, :6, :6], batch)
+        position = state[0, :3] if self._area is None else self._area.clip(state[0, :3])
+        return Estimate(wanted_ns, position, state[0, 3:], (covariance + spread)[0])
+
+
+def _estimate_of(known: RangeFilter, stamp_ns: int) -> Estimate:
+    return Estimate(stamp_ns, known.x[:3], known.x[3:6], known.p[:6, :6])
 
 
 @dataclass(slots=True)
 class Tag:
     """Attributes:
     tag_id: its number.
-    locator, smoother, learner: of this tag.
-    taken_off: float64 (m,), what is taken off its ranges now, m.
+    locator, smoother: of this tag.
     latest_ns: stamp of its latest range.
     """
 
     tag_id: int
     locator: TagLocator
     smoother: FixedLag
-    learner: OffsetLearner
-    taken_off: NDArray[np.float64]
     latest_ns: int = 0
 
     def add_height(self, height_m: float, variance_m2: float) -> None:
@@ -56,8 +146,6 @@ class Tag:
 class Fleet:
     """Args:
         anchors, model, height, area: as of `TagLocator`.
-        known: offsets of pairs that were learnt before, with their deviations.
-        learn_offsets: what is learnt of pairs' offsets is taken off their ranges too.
 
     Attributes:
         anchors: as given.
@@ -73,15 +161,12 @@ class Fleet:
         *,
         height: Height | None = None,
         area: Area | None = None,
-        known: Offsets = NO_OFFSETS,
-        learn_offsets: bool = False,
     ) -> None:
         self.anchors = anchors
         self.tags: dict[int, Tag] = {}
         self.strangers: Counter[int] = Counter()
         self.invalid = 0
         self._model, self._height, self._area = model, height, area
-        self._known, self._applies = known, learn_offsets
 
     def add(
         self, tag_id: int, anchor_id: int, stamp_ns: int, range_m: float, variance_m2: float
@@ -104,52 +189,19 @@ class Fleet:
             if len(self.tags) >= MAX_TAGS:
                 self.invalid += 1
                 return None
-            tag = self.tags[tag_id] = self._new(tag_id)
-        better_m = max(range_m - float(tag.taken_off[row]), 0.0)
-        estimate = tag.locator.add(stamp_ns, row, better_m, variance_m2)
+            tag = self.tags[tag_id] = Tag(
+                tag_id,
+                TagLocator(self.anchors, self._model, height=self._height, area=self._area),
+                FixedLag(self.anchors, self._model, self._height, self._area),
+            )
+        estimate = tag.locator.add(stamp_ns, row, range_m, variance_m2)
         tag.latest_ns = stamp_ns
         known = tag.locator.filter
         if known is None:
             tag.smoother.clear()
         elif estimate is not None:
-            tag.smoother.add(known, stamp_ns, row, better_m, variance_m2)
-            if tag.learner.add(tag.locator, row, range_m, variance_m2) and self._applies:
-                known.take_off(tag.learner.offset_m - tag.taken_off)
-                tag.taken_off = tag.learner.offset_m
+            tag.smoother.add(known, stamp_ns, row, range_m, variance_m2)
         return tag, estimate
-
-    def _new(self, tag_id: int) -> Tag:
-        learner = OffsetLearner(self.anchors, self._model, level=self._height is not None)
-        pairs = [(tag_id, anchor.id) for anchor in self.anchors.anchors]
-        learner.know(
-            np.array([self._known.pairs.get(pair, math.nan) for pair in pairs]),
-            np.array([self._known.pair_sd.get(pair, self._model.pair_sd) for pair in pairs]),
-        )
-        return Tag(
-            tag_id,
-            TagLocator(self.anchors, self._model, height=self._height, area=self._area),
-            FixedLag(self.anchors, self._model, self._height, self._area),
-            learner,
-            learner.offset_m.copy() if self._applies else np.zeros(len(self.anchors)),
-        )
-
-    @property
-    def learnt(self) -> int:
-        """How many ranges offsets were learnt from."""
-        return sum(int(tag.learner.learnt.sum()) for tag in self.tags.values())
-
-    def offsets(self) -> Offsets:
-        """What is known of pairs' offsets now, and of those of tags that were not heard since."""
-        pairs, deviations = dict(self._known.pairs), dict(self._known.pair_sd)
-        for tag in self.tags.values():
-            columns = zip(
-                self.anchors.anchors, tag.learner.learnt, tag.learner.offset_m, tag.learner.sd_m, strict=True
-            )
-            for anchor, learnt, offset_m, sd_m in columns:
-                pair = tag.tag_id, anchor.id
-                if learnt or pair in pairs:
-                    pairs[pair], deviations[pair] = float(offset_m), float(sd_m)
-        return Offsets(pairs=pairs, pair_sd=deviations)
 
     def warnings(self) -> list[str]:
         """What a person should know, in words; empty = all is well."""
@@ -200,12 +252,6 @@ class Fleet:
                 f"{name} out of order": counts.backwards,
                 f"{name} innovation mean": f"{health.mean:.2f}",
                 f"{name} innovation square": f"{health.square:.2f}",
-            }
-            sd = tag.learner.sd_m
-            found |= {
-                f"{name} anchor {format_id(anchor.id)} offset m": f"{tag.learner.offset_m[row]:.3f} +- {sd[row]:.3f}"
-                for row, anchor in enumerate(self.anchors.anchors)
-                if locator.states[row].ranges
             }
             geometry = locator.geometry()
             if geometry is not None and known is not None:

@@ -1,4 +1,4 @@
-"""How anchors lie, as seen from a tag and among themselves."""
+"""Geometry: where a tag can be, the arrangement of anchors, dilution of precision, and protection levels."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from uwb_mitigation.errors import ParameterError
 
 FLAT = 0.05
 """Anchors whose spread in a direction is a smaller part of their largest one have no extent in it."""
@@ -38,6 +40,68 @@ class Geometry:
     shape: Shape
 
 
+@dataclass(frozen=True, slots=True)
+class Height:
+    """The tag's height, as far as known: m, and its standard deviation."""
+
+    value: float
+    sd: float = 0.1
+
+    def __post_init__(self) -> None:
+        if not (abs(self.value) <= 1e5 and 0.0 < self.sd <= 1e3):
+            raise ParameterError(
+                f"height {self.value} with deviation {self.sd}", valid="metres, deviation over 0"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class Area:
+    """Where a tag can be: two opposite corners of a box, m."""
+
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+
+    def __post_init__(self) -> None:
+        if not all(a < b for a, b in zip(self.low, self.high, strict=True)):
+            raise ParameterError(
+                f"area from {self.low} to {self.high}", valid="three smaller, then three larger"
+            )
+
+    @classmethod
+    def parse(cls, text: str) -> Area | None:
+        """The box that `X,Y,Z,X,Y,Z` says, m; None where it is empty.
+
+        Raises:
+            ParameterError: it says no box.
+        """
+        if not text:
+            return None
+        try:
+            x, y, z, x1, y1, z1 = (float(word) for word in text.split(","))
+        except ValueError as error:
+            raise ParameterError(f"area {text!r}", valid="six numbers: X,Y,Z,X,Y,Z") from error
+        return cls((x, y, z), (x1, y1, z1))
+
+    def holds(self, position: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Which of the places float64 (n, 3) lie in it."""
+        inside: NDArray[np.bool_] = np.all((position >= self.low) & (position <= self.high), axis=-1)
+        return inside
+
+    def clip(self, position: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the nearest point of the box to each position float64 (..., 3)."""
+        nearest: NDArray[np.float64] = np.clip(position, self.low, self.high)
+        return nearest
+
+
+def directions(
+    tag: NDArray[np.float64], anchor: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return unit vectors (n, 3) from anchors to tags, and distances (n,), 0.05 m at least."""
+    away = tag - anchor
+    distance = np.maximum(np.sqrt(np.einsum("ni,ni->n", away, away)), 0.05)
+    return away / distance[:, None], distance
+
+
 def shape(position: NDArray[np.float64]) -> Shape:
     """How anchors at float64 (m, 3) are spread."""
     if len(position) < 2:
@@ -58,7 +122,7 @@ def geometry(anchors: NDArray[np.float64], position: NDArray[np.float64], *, lev
         level: the height is known: only x and y are sought, and VDOP is 0.
     """
     kind = shape(anchors)
-    slope = _slopes(anchors, position, level)
+    slope = directions(position, anchors)[0][:, : 2 if level else 3]
     normal = slope.T @ slope
     size = len(normal)
     if len(anchors) < size or np.linalg.cond(normal) > 1e10:
@@ -66,27 +130,6 @@ def geometry(anchors: NDArray[np.float64], position: NDArray[np.float64], *, lev
     spread = np.diag(np.linalg.inv(normal))
     vdop = 0.0 if level else math.sqrt(spread[2])
     return Geometry(len(anchors), math.sqrt(spread[0] + spread[1]), vdop, kind)
-
-
-def gdop(anchors: NDArray[np.float64], position: NDArray[np.float64], *, level: bool = False) -> float:
-    """Dilution of the place and of an offset that all ranges share, together; inf = the ranges do not tell.
-
-    As in satellite navigation, whose receivers have a clock to find too.
-    """
-    slope = _slopes(anchors, position, level)
-    slope = np.concatenate([slope, np.ones((len(slope), 1))], axis=1)
-    normal = slope.T @ slope
-    if len(anchors) < len(normal) or np.linalg.cond(normal) > 1e10:
-        return math.inf
-    return math.sqrt(np.trace(np.linalg.inv(normal)))
-
-
-def _slopes(anchors: NDArray[np.float64], position: NDArray[np.float64], level: bool) -> NDArray[np.float64]:
-    """By how much each range grows with x, y and, unless `level`, z."""
-    away = position - anchors
-    distance = np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-6)
-    slopes: NDArray[np.float64] = (away / distance)[:, : 2 if level else 3]
-    return slopes
 
 
 PROTECTION = 3.29

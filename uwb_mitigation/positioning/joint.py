@@ -1,12 +1,14 @@
-"""Places, tracks, and what all ranges have in common, found together: robust least squares without a known position.
+"""Positions, tracks, and what all ranges have in common, estimated together without known positions of the tags.
 
-Of each stretch of motion the track is sought, at knots that a `Chain` ties together; of each place at rest one
-position. They share the parameters: ranges that geometry tells more often than it has unknowns tell these too. Ranges of
-a pair err alike for about a second (see `model`), so each weighs as one of as many as say something new.
+Ranges are divided into segments of motion and positions at rest (`stretches`). Of each segment of motion the track is
+estimated, at knots connected by a motion model; of each position at rest, one position. They share the parameters.
+Ranges of a pair have similar errors for about a second (see `model`), so that their weights correspond to the number of
+independent ones.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,37 +16,193 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.anchors import AnchorMap
-from uwb_mitigation.positioning.chain import Chain, Solution
-from uwb_mitigation.positioning.model import Model
-from uwb_mitigation.positioning.rests import Stretches
-from uwb_mitigation.positioning.scatter import scatter_of
-from uwb_mitigation.positioning.smoother import Parameters
-from uwb_mitigation.positioning.start import Height
+from uwb_mitigation.positioning.geometry import Area, Height, directions
+from uwb_mitigation.positioning.least_squares import LeastSquares, Solution
+from uwb_mitigation.positioning.model import MAD_TO_SD, Model, Regressors, scatter_of
+from uwb_mitigation.positioning.tracks import Ranges
+
+STILL_M = 0.06
+"""Ranges of one pair that scatter less (1.48 x median absolute deviation) are from a tag at rest: the noise of a DW1000 is
+2 to 5 cm."""
+
+FEW = 3
+"""If the median number of ranges per anchor is smaller, a tag is taken as at one position."""
+
+BIN_S = 1.0
+LEAST_S = 4.0
+"""Shorter rests are part of the motion around them."""
+
+RECEIVED_AT_ONCE = 3
+"""If fewer anchors are received between pauses (median), the recording is so slow that pauses mean nothing."""
+
+GAP_S = 10.0
+"""After a longer pause a tag may be anywhere."""
 
 KNOT_S = 0.15
 LEAST_SCALE_M = 0.02
 _FIRST_SCALE_M = 0.3
 UNDERSTATED = 1.5
-"""By how much deviations are multiplied: errors of one place come again with each lap, and a track bends to what persists,
-which counting new ranges does not know. Of simulated drives, with it 9 of 10 offsets lie within two deviations."""
+"""Factor of standard deviations: errors of one position return with each lap, and a track follows persisting errors, which
+the number of independent ranges does not contain. With it, 9 of 10 offsets of simulated drives are within two standard
+deviations."""
 
 SLOW_SD_M, SLOW_S = 0.05, 20.0
-"""Errors of a pair that stay the same for many seconds: reflections at one place, and the range bias of a DW1000, which
+"""Errors of a pair that stay the same for many seconds: reflections at one position, and the range bias of a DW1000, which
 changes by 0.1 m with the received power (Decawave APS011). Averaging does not reduce them. Where the geometry is weak, as
 outside of the anchors, they contribute most of the error of the common offset."""
 
 AROUND_M = 5.0
-"""Keeps a place of which too few anchors are left from running away, and no other."""
+"""Standard deviation of the prior of a known position: it only affects positions with too few anchors."""
 
 FAR_S = 0.5
-"""A range that lies further from every knot has no place on a track."""
+"""A range further in time from every knot has no position on a track."""
 
 _SECOND_NS = 1_000_000_000
 _ITERATIONS = 25
 _HUBER_ITERATIONS = 4
-_SETTLED_M = 1e-3
-_NOWHERE = 1e-8
-_STILL = 1e-6
+_CONVERGED_M = 1e-3
+_NO_PRIOR = 1e-8
+_STATIONARY = 1e-6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Setting:
+    """What is known before: anchors, error model, and the constant height of all tags and their area, if any."""
+
+    anchors: AnchorMap
+    model: Model
+    height: Height | None = None
+    area: Area | None = None
+
+    @property
+    def dims(self) -> int:
+        """The number of unknown coordinates of a position."""
+        return 2 if self.height is not None else 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stretches:
+    """Ranges of all tags, one stretch after the other.
+
+    Attributes:
+        ranges: in the order of the stretches, each in the order of time; `tag_id` says nothing.
+        tag: int (n,), which of the tags each is of.
+        row: int (n,), and which of that tag's ranges.
+        of: int (n,), the stretch of each, from 0.
+        at_rest: bool (s,), of each stretch.
+        rise: float64 (n,), the height of the tag above the common one at each range.
+    """
+
+    ranges: Ranges
+    tag: NDArray[np.intp]
+    row: NDArray[np.intp]
+    of: NDArray[np.intp]
+    at_rest: NDArray[np.bool_]
+    rise: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        """The number of stretches."""
+        return len(self.at_rest)
+
+    def keep(self, wanted: NDArray[np.bool_]) -> Stretches:
+        """Those stretches, bool (s,)."""
+        rows = np.flatnonzero(wanted[self.of])
+        number = np.cumsum(wanted) - 1
+        return Stretches(
+            self.ranges.take(rows),
+            self.tag[rows],
+            self.row[rows],
+            number[self.of[rows]],
+            self.at_rest[wanted],
+            self.rise[rows],
+        )
+
+    def first(self, count: int) -> Stretches:
+        """Only the first ranges."""
+        part = slice(0, count)
+        of = self.of[part]
+        rows = self.tag[part], self.row[part]
+        return Stretches(self.ranges.take(part), *rows, of, self.at_rest[: int(of[-1]) + 1], self.rise[part])
+
+
+def stretches(tags: Sequence[Ranges]) -> Stretches:
+    """Divide the ranges of tags into positions at rest and segments of motion.
+
+    A tag may be moved between positions at rest only without ranging, during a pause of more than `GAP_S`.
+    """
+    tag, row, of, at_rest = [], [], [], list[bool]()
+    for number, ranges in enumerate(tags):
+        for piece, is_still in _segments(ranges):
+            tag.append(np.full(len(piece), number))
+            row.append(piece)
+            of.append(np.full(len(piece), len(at_rest)))
+            at_rest.append(is_still)
+    tag_of, row_of = np.concatenate(tag), np.concatenate(row)
+    taken = [one.take(row_of[tag_of == number]) for number, one in enumerate(tags)]
+    columns = Ranges(
+        np.concatenate([one.stamp_ns for one in taken]),
+        np.concatenate([one.anchor for one in taken]),
+        np.concatenate([one.range_m for one in taken]),
+        np.concatenate([one.variance_m2 for one in taken]),
+        np.concatenate([one.rx_power_dbm for one in taken]),
+    )
+    return Stretches(columns, tag_of, row_of, np.concatenate(of), np.array(at_rest), np.zeros(len(columns)))
+
+
+def _segments(ranges: Ranges) -> list[tuple[NDArray[np.intp], bool]]:
+    """Return the rows of each segment of one tag, and whether it is at rest."""
+    rows = np.arange(len(ranges))
+    # Whatever the pauses: pairs may have been recorded one after the other.
+    if _is_sparse(ranges, rows) or _is_still(ranges, rows):
+        return [(rows, True)]
+    parts = np.split(rows, np.flatnonzero(np.diff(ranges.stamp_ns) > GAP_S * _SECOND_NS) + 1)
+    return [segment for part in parts for segment in _parts(ranges, part)]
+
+
+def _parts(ranges: Ranges, rows: NDArray[np.intp]) -> list[tuple[NDArray[np.intp], bool]]:
+    """A stretch without silence, divided where rests begin and end."""
+    if _is_sparse(ranges, rows) or _is_still(ranges, rows):
+        return [(rows, True)]
+    number = (ranges.stamp_ns[rows] - ranges.stamp_ns[rows[0]]) // round(BIN_S * _SECOND_NS)
+    # Whether a bin and the next together hold one place: ranges of each anchor alike over both.
+    bins = int(number[-1]) + 1
+    starts = np.searchsorted(number, np.arange(bins + 1))
+    alike = np.zeros(bins, np.bool_)
+    for k in range(bins - 1):
+        alike[k] = _is_still(ranges, rows[starts[k] : starts[k + 2]], least=2)
+    still = alike | np.concatenate([[False], alike[:-1]])
+    edges = np.flatnonzero(np.diff(still)) + 1
+    found: list[tuple[NDArray[np.intp], bool]] = []
+    moving: list[NDArray[np.intp]] = []
+    for run in np.split(np.arange(bins), edges):
+        piece = rows[starts[run[0]] : starts[run[-1] + 1]]
+        if still[run[0]] and len(run) * BIN_S >= LEAST_S and _is_still(ranges, piece):
+            if moving:
+                found.append((np.concatenate(moving), False))
+                moving = []
+            found.append((piece, True))
+        elif len(piece):
+            moving.append(piece)
+    if moving:
+        found.append((np.concatenate(moving), False))
+    return found
+
+
+def _is_sparse(ranges: Ranges, rows: NDArray[np.intp]) -> bool:
+    """Whether there is no motion to be followed."""
+    return float(np.median(np.unique(ranges.anchor[rows], return_counts=True)[1])) < FEW
+
+
+def _is_still(ranges: Ranges, rows: NDArray[np.intp], least: int = FEW) -> bool:
+    """Whether the ranges of most anchors scatter by no more than noise."""
+    anchor, value = ranges.anchor[rows], ranges.range_m[rows]
+    spread = []
+    for one in np.unique(anchor):
+        own = value[anchor == one]
+        if len(own) >= least:
+            spread.append(MAD_TO_SD * float(np.median(np.abs(own - np.median(own)))))
+    # Two anchors may be at a tag's side while it passes them: of three one sees it go.
+    return len(spread) >= 3 and float(np.quantile(spread, 0.8)) < STILL_M
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,14 +242,18 @@ class Links:
         return self.knot_stretch[self.knot]
 
     def without(self, left_out: NDArray[np.bool_]) -> Links:
-        """The same knots, without those links (n,); `of` says nothing any more."""
+        """The same knots, without those links (n,); `of` is not valid any more."""
         kept = ~left_out
         columns = ("knot", "anchor", "ahead_s", "range_m", "share", "rise", "rows", "alike")
         return replace(self, **{name: getattr(self, name)[kept] for name in columns})
 
+    def corrected(self, correction_m: NDArray[np.float64]) -> Links:
+        """The same links without parameters, and with a correction float64 (n,) subtracted."""
+        return replace(self, range_m=self.range_m - correction_m, rows=np.zeros((len(self), 0)))
+
 
 def links_of(stretches: Stretches, rows: NDArray[np.float64], alike: NDArray[np.intp], model: Model) -> Links:
-    """Links of ranges whose parameters' rows are float64 (r, q), and which err as much as others `alike`, int (r,)."""
+    """Return the links of ranges whose derivatives by the parameters are float64 (r, q), and their kinds `alike` int (r,)."""
     ranges = stretches.ranges
     knot, ahead, share = np.zeros(len(ranges), np.intp), np.zeros(len(ranges)), np.ones(len(ranges))
     knot_stretch: list[NDArray[np.intp]] = []
@@ -156,14 +318,14 @@ def _share(anchor: NDArray[np.intp], seconds: float, persistence_s: float) -> ND
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointFit:
-    """What was found.
+    """The result of `fit_joint`.
 
     Attributes:
         position, velocity: float64 (K, 3), at the knots.
         parameters: float64 (q,), and their covariance (q, q).
-        residual_m: float64 (n,), of each link. weight: float64 (n,), what robustness left of it.
-        scale_m: float64 (g,), standard deviation of residuals that are no outliers, of links that err alike.
-        stretch_loss: float64 (s,), robust loss of each stretch, in units of `scale_m`.
+        residual_m: float64 (n,), of each link.
+        scale_m: float64 (g,), standard deviation of residuals that are no outliers, for each kind of links.
+        stretch_loss: float64 (s,), robust loss of each segment, in units of `scale_m`.
     """
 
     position: NDArray[np.float64]
@@ -171,7 +333,6 @@ class JointFit:
     parameters: NDArray[np.float64]
     covariance: NDArray[np.float64]
     residual_m: NDArray[np.float64]
-    weight: NDArray[np.float64]
     scale_m: NDArray[np.float64]
     stretch_loss: NDArray[np.float64]
     _solution: Solution
@@ -179,7 +340,7 @@ class JointFit:
 
     @property
     def loss(self) -> float:
-        """Of all; to compare fits by, of the same scale."""
+        """Of all; to compare fits with the same scale."""
         return float(self.stretch_loss.sum())
 
     def covariances(self) -> NDArray[np.float64]:
@@ -192,175 +353,167 @@ class JointFit:
         return found
 
 
-class JointSolver:
-    """Fits places, tracks and parameters to links.
+def fit_joint(
+    setting: Setting,
+    links: Links,
+    prior: Regressors,
+    position: NDArray[np.float64],
+    parameters: NDArray[np.float64] | None = None,
+    *,
+    scale_m: NDArray[np.float64] | None = None,
+    around: NDArray[np.float64] | None = None,
+    near: bool = False,
+) -> JointFit:
+    """Fit positions, tracks and parameters to links.
 
     Args:
-        anchors: where they are.
-        links: of which each knot has one or more.
-        parameters: their means and deviations; the rows are the links'.
-        height: of all tags, where it stays the same.
-        scale_m: float64 (g,), of the residuals; None = estimated.
-        around: float64 (K, 3), where the knots are known to be, to `AROUND_M`; None = nothing is known.
+        links: each knot has one or more.
+        prior: mean and standard deviation of the parameters; its rows are those of the links.
+        position: float64 (K, 3), roughly right, to start from.
+        parameters: to start from; None: the mean of the prior.
+        scale_m: float64 (g,), of the residuals; None: estimated.
+        around: float64 (K, 3), prior of the positions, with `AROUND_M`; None: no prior.
+        near: the start is a solution of nearly the same problem.
 
     Raises:
-        DatasetError: from `fit`, where the ranges do not determine it.
+        DatasetError: the ranges do not determine the solution.
     """
+    return _Joint(setting, links, prior, scale_m, around).fit(position, parameters, near)
+
+
+class _Joint:
+    """The problem of `fit_joint`."""
 
     def __init__(
         self,
-        anchors: AnchorMap,
+        setting: Setting,
         links: Links,
-        parameters: Parameters,
-        model: Model,
-        height: Height | None = None,
-        scale_m: NDArray[np.float64] | None = None,
-        around: NDArray[np.float64] | None = None,
+        prior: Regressors,
+        scale_m: NDArray[np.float64] | None,
+        around: NDArray[np.float64] | None,
     ) -> None:
-        self._anchors, self._links, self._model, self._height = anchors, links, model, height
-        self._around = (
-            np.tile(anchors.position.mean(axis=0), (len(links.time_s), 1)) if around is None else around
-        )
-        self._nearness = _NOWHERE if around is None else 1.0 / AROUND_M**2
-        self._d = 2 if height is not None else 3
-        self._mean = parameters.mean
-        self._certainty = 1.0 / np.maximum(parameters.sd, 1e-6) ** 2
-        self._scale = scale_m
-        self._order = np.argsort(links.knot, kind="stable")
-        self._dt = np.diff(links.time_s)
-        self._tied = np.diff(links.knot_stretch) == 0
+        self._setting, self._links, self._prior, self._scale = setting, links, prior, scale_m
+        centre = setting.anchors.position.mean(axis=0)
+        self._around = np.tile(centre, (len(links.time_s), 1)) if around is None else around
+        self._nearness = _NO_PRIOR if around is None else 1.0 / AROUND_M**2
+        self._level = 0.0 if setting.height is None else setting.height.value
 
     def fit(
-        self,
-        position: NDArray[np.float64],
-        parameters: NDArray[np.float64] | None = None,
-        *,
-        near: bool = False,
+        self, position: NDArray[np.float64], parameters: NDArray[np.float64] | None, near: bool
     ) -> JointFit:
-        """From positions float64 (K, 3) that are roughly right; `near` = they are a solution's, of much the same."""
-        d, links = self._d, self._links
+        d, links, model = self._setting.dims, self._links, self._setting.model
         x = np.zeros((len(links.time_s), 2 * d))
         x[:, :d] = position[:, :d]
-        shared = self._mean.copy() if parameters is None else parameters
-        scale = (
-            np.full(int(links.alike.max(initial=0)) + 1, _FIRST_SCALE_M)
-            if self._scale is None
-            else self._scale
-        )
+        shared = self._prior.mean.copy() if parameters is None else parameters
+        kinds = int(links.alike.max(initial=0)) + 1
+        scale = np.full(kinds, _FIRST_SCALE_M) if self._scale is None else self._scale
         solution: Solution | None = None
         try:
             for iteration in range(_ITERATIONS):
-                direction, _, error = self._errors(x, shared)
+                unit, error = self._residuals(x, shared)
                 if self._scale is None and (iteration or parameters is not None):
-                    found = np.maximum(scatter_of(error, links.alike, len(scale)), LEAST_SCALE_M)
+                    found = np.maximum(scatter_of(error, links.alike, kinds), LEAST_SCALE_M)
                     scale = found if near else np.maximum(found, 0.5 * scale)
                 z = error / scale[links.alike]
-                robust = self._model.weight(z)
+                robust = model.weight(z)
                 if iteration < _HUBER_ITERATIONS and not near:
                     robust = np.minimum(1.0, 1.0 / np.maximum(np.abs(z), 1e-9))
                 weight = robust * links.share / scale[links.alike] ** 2
-                solution = self._linearised(x, shared, direction, error, weight).solve()
+                solution = self._linearised(x, shared, unit, error, weight).solve()
                 step = float(np.abs(solution.x[:, :d] - x[:, :d]).max())
                 x, shared = solution.x, solution.shared
                 if not np.isfinite(step) or step > 1e6:
                     raise np.linalg.LinAlgError
-                if step < _SETTLED_M and (near or iteration > _HUBER_ITERATIONS + 2):
+                if step < _CONVERGED_M and (near or iteration > _HUBER_ITERATIONS + 2):
                     break
         except np.linalg.LinAlgError as error_:
             raise DatasetError(
                 "the ranges do not determine where the tags were", valid="more ranges, or anchors"
             ) from error_
         assert solution is not None
-        _, _, error = self._errors(x, shared)
+        unit, error = self._residuals(x, shared)
         z = error / scale[links.alike]
-        loss = np.bincount(links.stretch, self._model.loss(z) * links.share, minlength=len(links.at_rest))
+        loss = np.bincount(links.stretch, model.loss(z) * links.share, minlength=len(links.at_rest))
         place, velocity = np.full((len(x), 3), self._level), np.zeros((len(x), 3))
         place[:, :d], velocity[:, :d] = x[:, :d], x[:, d:]
+        weight = model.weight(z) * links.share / scale[links.alike] ** 2
+        covariance = self._covariance(solution, unit, weight)
         return JointFit(
             place,
             velocity,
             shared,
-            self._covariance(solution, x, shared, scale),
+            covariance,
             error,
-            self._model.weight(z),
             scale,
             loss.astype(np.float64),
             solution,
-            self._height,
+            self._setting.height,
         )
 
     def _covariance(
-        self,
-        solution: Solution,
-        x: NDArray[np.float64],
-        shared: NDArray[np.float64],
-        scale: NDArray[np.float64],
+        self, solution: Solution, unit: NDArray[np.float64], weight: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """The covariance of the parameters: of noise, and of errors that stay the same for `SLOW_S`."""
+        """Return the covariance of the parameters: of noise, and of errors that stay the same for `SLOW_S`."""
         links = self._links
-        direction, _, error = self._errors(x, shared)
-        weight = self._model.weight(error / scale[links.alike]) * links.share / scale[links.alike] ** 2
-        rows = solution.reduced(links.knot, self._own(direction), links.rows)
+        problem = LeastSquares(len(links.time_s), 2 * self._setting.dims, links.rows.shape[1])
+        rows = solution.reduced(problem.add(*self._rows(problem, unit), 0.0, 1.0))
         gain = weight[:, None] * rows @ solution.shared_covariance
         chunk = (links.time_s[links.knot] // SLOW_S).astype(np.intp)
-        group = np.stack([links.stretch, chunk, links.anchor])
-        _, of = np.unique(group, axis=1, return_inverse=True)
-        summed = np.zeros((int(of.max(initial=0)) + 1, len(shared)))
+        _, of = np.unique(np.stack([links.stretch, chunk, links.anchor]), axis=1, return_inverse=True)
+        summed = np.zeros((int(of.max(initial=0)) + 1, links.rows.shape[1]))
         np.add.at(summed, of.reshape(-1), gain)
         found: NDArray[np.float64] = (
             UNDERSTATED**2 * solution.shared_covariance + SLOW_SD_M**2 * summed.T @ summed
         )
         return found
 
-    @property
-    def _level(self) -> float:
-        return 0.0 if self._height is None else float(self._height.value)
-
-    def _errors(
+    def _residuals(
         self, x: NDArray[np.float64], shared: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Unit vectors (n, 3) from anchors to tags, distances (n,), and what is left of the ranges (n,)."""
-        d, links = self._d, self._links
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return unit vectors (n, 3) from anchors to tags, and residuals (n,)."""
+        d, links = self._setting.dims, self._links
         at = x[links.knot]
         tag = np.full((len(at), 3), self._level)
         tag[:, :d] = at[:, :d] + links.ahead_s[:, None] * at[:, d:]
         tag[:, 2] += links.rise
-        away = tag - self._anchors.position[links.anchor]
-        distance = np.maximum(np.sqrt(np.einsum("ni,ni->n", away, away)), 0.05)
-        return away / distance[:, None], distance, links.range_m - distance - links.rows @ shared
+        unit, distance = directions(tag, self._setting.anchors.position[links.anchor])
+        return unit, links.range_m - distance - links.rows @ shared
 
-    def _own(self, direction: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The derivative of each range with respect to the position and velocity of its knot, float64 (n, 2 d)."""
-        level = direction[:, : self._d]
-        return np.concatenate([level, self._links.ahead_s[:, None] * level], axis=1)
+    def _rows(
+        self, problem: LeastSquares, unit: NDArray[np.float64]
+    ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+        """Return the columns and derivatives of each link: of position and velocity, and of the parameters."""
+        d, links = self._setting.dims, self._links
+        n, q = links.rows.shape
+        shared = np.broadcast_to(problem.of_shared(range(q)), (n, q))
+        columns = np.concatenate([problem.of_knot(links.knot[:, None], range(2 * d)), shared], axis=1)
+        level = unit[:, :d]
+        return columns, np.concatenate([level, links.ahead_s[:, None] * level, links.rows], axis=1)
 
     def _linearised(
         self,
         x: NDArray[np.float64],
         shared: NDArray[np.float64],
-        direction: NDArray[np.float64],
+        unit: NDArray[np.float64],
         error: NDArray[np.float64],
         weight: NDArray[np.float64],
-    ) -> Chain:
-        d, links = self._d, self._links
-        own = self._own(direction)
-        # The unknowns themselves are solved for, not their changes: motion and priors are linear in them.
-        target = error + links.rows @ shared + np.einsum("nb,nb->n", own, x[links.knot])
-        chain = Chain.empty(len(x), 2 * d, len(shared))
-        order = self._order
-        chain.add_rows(links.knot[order], own[order], links.rows[order], target[order], weight[order])
-        self._add_motion(chain)
-        chain.shared += np.diag(self._certainty)
-        chain.right_shared += self._certainty * self._mean
+    ) -> LeastSquares:
+        d, links, model = self._setting.dims, self._links, self._setting.model
+        problem = LeastSquares(len(x), 2 * d, len(shared))
+        columns, rows = self._rows(problem, unit)
+        # The unknowns are solved for, not their changes: motion and priors are linear in them.
+        target = error + np.einsum("nc,nc->n", rows, np.append(x.reshape(-1), shared)[columns])
+        problem.add(columns, rows, target, weight)
+        connected = np.flatnonzero(np.diff(links.knot_stretch) == 0)
+        problem.add_motion(connected, np.diff(links.time_s)[connected], d, model.acceleration**2)
+        if len(shared):
+            problem.add_prior(
+                problem.of_shared(range(len(shared))), self._prior.mean, self._prior.information
+            )
+        first = np.flatnonzero(np.diff(links.knot_stretch, prepend=-1))
+        speed = np.where(links.at_rest[links.knot_stretch[first]], _STATIONARY, model.speed)
+        every = np.arange(len(x))
         for axis in range(d):
-            chain.diagonal[:, axis, axis] += self._nearness
-            chain.right[:, axis] += self._nearness * self._around[:, axis]
-        return chain
-
-    def _add_motion(self, chain: Chain) -> None:
-        d, links = self._d, self._links
-        chain.add_motion(self._dt, d, self._model.acceleration, self._tied)
-        first = np.concatenate([[True], ~self._tied])
-        speed = np.where(links.at_rest[links.knot_stretch], _STILL, self._model.speed)[first]
-        for axis in range(d, 2 * d):
-            chain.diagonal[first, axis, axis] += 1.0 / speed**2
+            problem.add_prior(problem.of_knot(every, axis), self._around[:, axis], self._nearness)
+            problem.add_prior(problem.of_knot(first, d + axis), 0.0, 1.0 / speed**2)
+        return problem

@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.anchors import AnchorMap
-from uwb_mitigation.positioning.model import Model
-from uwb_mitigation.positioning.persisting import normal_equations
-from uwb_mitigation.positioning.regressors import Regressors
+from uwb_mitigation.positioning.geometry import directions
+from uwb_mitigation.positioning.model import Model, Regressors, scatter_of
 from uwb_mitigation.positioning.tracks import Ranges
 
 GAP_S = 0.5
@@ -48,6 +47,9 @@ FINE_LAG_S = 0.02
 LEVER_STEPS = 5
 SEARCHED = 4000
 """Of more ranges, so many tell about which lag it is."""
+
+MIN_SD_M = 0.01
+"""Of white noise and of persisting errors."""
 
 _STEPS = 40
 _PERSISTENCE_S = 1.0
@@ -380,9 +382,8 @@ class _Fit:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Range less distance and what is expected beside it (n,), unit vectors (n, 3) from anchor to antenna, rotations (n, 3, 3)."""
         position, turn = _at(self.paths, self.tag, self.stamp_ns, lag)
-        away = position + np.einsum("nij,nj->ni", turn, lever[self.tag]) - self.anchor
-        distance = np.maximum(np.linalg.norm(away, axis=1), 0.05)
-        return self.range_m - self.known.rows @ self.known.mean - distance, away / distance[:, None], turn
+        unit, distance = directions(position + np.einsum("nij,nj->ni", turn, lever[self.tag]), self.anchor)
+        return self.range_m - self.known.rows @ self.known.mean - distance, unit, turn
 
     def solve(
         self,
@@ -426,7 +427,7 @@ class _Fit:
             left = error - x[pairs][self.pair] - self.known.rows @ x[pairs.stop :]
             known = np.isfinite(left) & np.isfinite(rows).all(axis=1)
             _check_enough(int(known.sum()), free_lag or bool(free_lever.any()))
-            normal, right = self._normal(rows, left, group, known)
+            normal, right = _normal_equations(rows[known], left[known], group[known], self.known.alike[known])
             covariance = np.linalg.inv(normal + np.diag(certainty))
             move = covariance @ (right + certainty * (mean - x))
             move[0] = np.clip(move[0], -0.3, 0.3)
@@ -437,7 +438,11 @@ class _Fit:
         # scores of long blocks shows it (Liang and Zeger, Biometrika 1986).
         block = since // round(BLOCK_S * _SECOND_NS)
         scores = np.array(
-            [self._normal(rows, left, group, known & (block == one))[1] for one in np.unique(block[known])]
+            [
+                _normal_equations(rows[one], left[one], group[one], self.known.alike[one])[1]
+                for number in np.unique(block[known])
+                for one in [known & (block == number)]
+            ]
         )
         blocks = max(len(scores), 2)
         robust = covariance @ (scores.T @ scores) @ covariance * (blocks / (blocks - 1))
@@ -445,11 +450,59 @@ class _Fit:
         arm = np.where(free_lever, x[arms].reshape(lever.shape), expected)
         return _Unknowns(float(x[0]), arm, x[pairs].copy(), sd)
 
-    def _normal(
-        self,
-        rows: NDArray[np.float64],
-        left: NDArray[np.float64],
-        group: NDArray[np.intp],
-        some: NDArray[np.bool_],
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        return normal_equations(rows[some], left[some], group[some], self.known.alike[some], _MODEL)
+
+def _normal_equations(
+    rows: NDArray[np.float64],
+    left_m: NDArray[np.float64],
+    group: NDArray[np.intp],
+    alike: NDArray[np.intp],
+    model: Model = _MODEL,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the normal matrix (q, q) and right side (q,) of n ranges, robust against outliers among ranges and groups.
+
+    Random effects: the ranges of a group share an error of unknown variance. It does not affect what changes within the
+    group, and reduces the weight of the group's mean to that of one range (Searle, Casella, McCulloch, Variance Components,
+    1992, section 3.3). Both variances are estimated from the residuals, by medians.
+
+    Args:
+        rows: float64 (n, q), what each range grows by with each unknown.
+        left_m: float64 (n,), what is not explained yet.
+        group: int (n,), whose errors persist together.
+        alike: int (n,), ranges that should err about as much have the same number, from 0.
+    """
+    order = np.argsort(group, kind="stable")
+    rows, left_m, group, alike = rows[order], left_m[order], group[order], alike[order]
+    starts = np.flatnonzero(np.diff(group, prepend=group[0] - 1))
+    count = np.diff(np.append(starts, len(group)))
+    of = np.repeat(np.arange(len(starts)), count)
+    kinds = int(alike.max(initial=0)) + 1
+
+    def mean(
+        values: NDArray[np.float64], weight: NDArray[np.float64], total: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        found: NDArray[np.float64] = np.add.reduceat((values.T * weight).T, starts) / total[:, None]
+        return found
+
+    middle = np.array([np.median(part) for part in np.split(left_m, starts[1:])])
+    within = left_m - middle[of]
+    # Of n values around their own median: n - 1 are left.
+    several = count[of] > 1
+    larger = np.sqrt(count / np.maximum(count - 1.0, 1.0))[of]
+    if several.any():
+        white = scatter_of((within * larger)[several], alike[several], kinds)
+    else:
+        white = np.full(kinds, MIN_SD_M)
+    white = np.maximum(white, MIN_SD_M)
+    weight = model.weight(within / white[alike]) / white[alike] ** 2
+    total = np.add.reduceat(weight, starts)
+    both = np.concatenate([rows, left_m[:, None]], axis=1)
+    shared = mean(both, weight, total)
+    apart = both - shared[of]
+    scaled = apart * weight[:, None]
+    kind = np.array([int(np.median(part)) for part in np.split(alike, starts[1:])])
+    spread = scatter_of(shared[:, -1], kind, kinds)[kind]
+    persists = np.sqrt(np.maximum(spread**2 - 1.0 / total, MIN_SD_M**2))
+    variance = persists**2 + 1.0 / total
+    of_group = model.weight(shared[:, -1] / np.sqrt(variance)) / variance
+    outer = scaled.T @ apart + (shared * of_group[:, None]).T @ shared
+    return outer[:-1, :-1], outer[:-1, -1]

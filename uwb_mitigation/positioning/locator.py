@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.filter import FIRST_ERROR, RangeFilter
-from uwb_mitigation.positioning.geometry import Geometry, geometry
+from uwb_mitigation.positioning.geometry import Area, Geometry, Height, geometry
 from uwb_mitigation.positioning.model import Model
-from uwb_mitigation.positioning.start import IMPLAUSIBLE, Area, Height, Place, places
+from uwb_mitigation.positioning.start import IMPLAUSIBLE, Place, places
 from uwb_mitigation.positioning.tracks import Estimate, Heights, Ranges, Track
 
 WINDOW_S = 1.0
@@ -220,12 +220,6 @@ class TagLocator:
             for candidate in self._candidates:
                 if candidate.filter is one:
                     candidate.loss += float(self._model.loss(np.float64(z)))
-
-    def add_speed(self, speed_m_per_s: float, variance_m2: float) -> None:
-        """Take in the tag's horizontal speed, at the time of the latest range."""
-        for one in self._filters():
-            one.update_speed(speed_m_per_s, variance_m2)
-            self._confine(one)
 
     def at(self, stamp_ns: int) -> Estimate | None:
         """Where the tag is at a time from the latest range on, without another range; None = not known.

@@ -9,7 +9,7 @@ together.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,7 +90,92 @@ class Model:
         return loss
 
     def variance(self, published_m2: float) -> float:
-        """The variance to use of a range: the published one, or the assumed one where none is known."""
+        """Return the variance of a range: the published one, or the default if that is unknown."""
         if math.isfinite(published_m2) and published_m2 > 0.0:
             return published_m2
         return self.range_sd**2
+
+    def variances(self, published_m2: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return `variance` of each range, float64 (n,)."""
+        known = np.isfinite(published_m2) & (published_m2 > 0.0)
+        return np.where(known, published_m2, self.range_sd**2)
+
+
+MAD_TO_SD = 1.4826
+LEAST_ALIKE = 20
+"""Errors that tell by how much such ranges err."""
+
+
+def scatter_of(error_m: NDArray[np.float64], alike: NDArray[np.intp], kinds: int) -> NDArray[np.float64]:
+    """Of each kind the deviation from 0, float64 (kinds,), m: 1.48 times the median of errors (n,) without sign.
+
+    Args:
+        alike: int (n,), the kind of each. Where one has fewer than `LEAST_ALIKE`, that of all counts.
+    """
+    found = np.full(kinds, MAD_TO_SD * float(np.median(np.abs(error_m))))
+    for kind in range(kinds):
+        own = error_m[alike == kind]
+        if len(own) >= LEAST_ALIKE:
+            found[kind] = MAD_TO_SD * float(np.median(np.abs(own)))
+    return found
+
+
+NETWORK_SD = 0.03
+"""Prior standard deviation of the factor of the universal network's predictions. It is small because errors of the
+predictor reduce a free factor, and the remaining errors would appear in the offsets."""
+
+SLOPE_SD = 0.1
+"""Prior standard deviation of the slope of a line in the received power, m/dB."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Regressors:
+    """Unknown parameters on which all ranges depend linearly: offsets, a factor of predictions, a line in received power.
+
+    Attributes:
+        names: of the q parameters.
+        rows: float64 (n, q), derivative of each range with respect to each parameter; 0: unknown.
+        mean, sd: float64 (q,), prior knowledge; an infinite sd: none.
+        alike: int (n,), ranges whose errors have the same standard deviation have the same number, from 0.
+    """
+
+    names: tuple[str, ...]
+    rows: NDArray[np.float64]
+    mean: NDArray[np.float64]
+    sd: NDArray[np.float64]
+    alike: NDArray[np.intp]
+
+    @classmethod
+    def one(cls, name: str, row: NDArray[np.float64], mean: float, sd: float) -> Regressors:
+        """A single parameter with the derivatives float64 (n,); all ranges have errors of the same kind."""
+        return cls((name,), row[:, None], np.array([mean]), np.array([sd]), np.zeros(len(row), np.intp))
+
+    @classmethod
+    def none(cls, ranges: int) -> Regressors:
+        """No parameters, for that number of ranges."""
+        return cls((), np.zeros((ranges, 0)), np.zeros(0), np.zeros(0), np.zeros(ranges, np.intp))
+
+    @property
+    def information(self) -> NDArray[np.float64]:
+        """Inverse variances of the priors, float64 (q,)."""
+        inverse: NDArray[np.float64] = 1.0 / np.maximum(self.sd, 1e-6) ** 2
+        return inverse
+
+    def take(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> Regressors:
+        """Those of the ranges at `index`."""
+        return replace(self, rows=self.rows[index], alike=self.alike[index])
+
+    def only(self, kept: NDArray[np.bool_]) -> Regressors:
+        """Only the parameters `kept`, bool (q,)."""
+        names = tuple(name for name, is_kept in zip(self.names, kept, strict=True) if is_kept)
+        return Regressors(names, self.rows[:, kept], self.mean[kept], self.sd[kept], self.alike)
+
+    def joined(self, other: Regressors) -> Regressors:
+        """These parameters, then the others; kinds of errors as here."""
+        return Regressors(
+            self.names + other.names,
+            np.concatenate([self.rows, other.rows], axis=1),
+            np.concatenate([self.mean, other.mean]),
+            np.concatenate([self.sd, other.sd]),
+            self.alike,
+        )

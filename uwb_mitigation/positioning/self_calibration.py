@@ -1,7 +1,7 @@
-"""Offsets of radios, and what else all ranges share, from ranges to known anchors alone: nobody knows where the tags were.
+"""Offsets of radios, and what else all ranges have in common, from ranges to known anchors without ground truth.
 
-What geometry cannot tell apart is not solved for: an offset of its own has an anchor, a tag or a pair only where the
-ranges say so by more than their own uncertainty; otherwise all share one.
+Parameters that geometry cannot separate are not estimated: an anchor, a tag or a pair gets its own offset only if this is
+significant; otherwise all share one.
 """
 
 from __future__ import annotations
@@ -11,27 +11,37 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.positioning.anchor_errors import check_anchor_positions
-from uwb_mitigation.positioning.anchors import AnchorMap
-from uwb_mitigation.positioning.joint import SLOW_S, JointFit, JointSolver, Links, links_of
-from uwb_mitigation.positioning.model import Model
-from uwb_mitigation.positioning.observability import (
+from uwb_mitigation.positioning.anchor_errors import (
+    check_anchor_positions,
     check_anchors,
     check_motion,
     mirrored,
+    position_scatter,
+    seen_by_others,
 )
-from uwb_mitigation.positioning.other_anchors import position_scatter, seen_by_others
-from uwb_mitigation.positioning.own_offsets import Columns, candidates, with_own_offsets
-from uwb_mitigation.positioning.regressors import Regressors
-from uwb_mitigation.positioning.rests import Stretches, stretches
-from uwb_mitigation.positioning.start import Area, Height
-from uwb_mitigation.positioning.starting import first_positions, likely_offset
-from uwb_mitigation.positioning.tracks import Ranges
+from uwb_mitigation.positioning.anchors import AnchorMap
+from uwb_mitigation.positioning.geometry import Area, Height
+from uwb_mitigation.positioning.joint import (
+    KNOT_S,
+    SLOW_S,
+    JointFit,
+    Links,
+    Setting,
+    Stretches,
+    fit_joint,
+    links_of,
+    stretches,
+)
+from uwb_mitigation.positioning.locator import TagLocator, run_live
+from uwb_mitigation.positioning.model import Model, Regressors
+from uwb_mitigation.positioning.start import Place, places
+from uwb_mitigation.positioning.tracks import Ranges, Track
 
 UNTOLD_M = 0.2
-"""An offset that is known no better is as good as unknown: antenna delays that nobody calibrated differ by as much."""
+"""A common offset with a larger standard deviation is unknown: uncalibrated antenna delays differ by as much."""
 
 SEVERAL = 3.0
 """An offset is subtracted only if it is at least this number of standard deviations away from zero."""
@@ -40,41 +50,59 @@ HEIGHT_SD_M = 0.1
 """Of a measured height."""
 
 MODEL = Model(long=1.5, short=1.5)
-"""Of errors about as often too long as too short, once offsets and predictions are taken off: what is doubted sooner on
-one side than on the other would pull an offset to that other."""
+"""Once offsets and predictions are subtracted, errors are as often too long as too short. Different thresholds would bias
+the offsets."""
+
+COMMON_SD_M, OWN_SD_M = 1.0, 0.3
+"""Prior standard deviations of the common offset, and of own offsets about it."""
+
+MIN_CONFIDENCE = 0.99
+OBSERVABLE = 0.6
+"""An own offset is estimated if its standard deviation is a smaller part of the scatter of such offsets."""
+
+MIN_SHARE = 0.5
+"""If a smaller share of the own offsets is observable, none is estimated."""
+
+MIN_OWN_SD_M = 0.02
+
+OFFSETS_M = np.arange(-1.0, 2.01, 0.5)
+START_SD_M = 0.2
+WINDOW_S = 0.5
+MAX_WINDOWS = 12
+
+_SECOND_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SelfCalibration:
-    """What was found.
+    """The result.
 
     Attributes:
-        stretches, links, fit: as in `rests` and `joint`.
+        setting, stretches, links, fit: as in `joint`.
         solved: the parameters: `offset`, `anchor ROW`, `tag NUMBER`, `pair NUMBER ROW`, and the regressors'.
-        level: `pair`, `anchor` or `one`: what has an offset of its own.
-        not_told: what geometry cannot tell apart, and what was left out, in words.
+        level: `pair`, `anchor` or `one`: what has its own offset.
+        not_told: messages about parameters that are not observable, and about ranges that were left out.
         tag_ids: of the tags.
-        pseudo_m, pseudo_sd_m: float64 (r,), in the order of `stretches.ranges`: how far each range's anchor is from where
-            the *other* anchors see the tag, and how well that is known; NaN = not at all.
+        untold_m: the estimate of a common offset that is not significant and therefore not subtracted; 0: it is.
         own_sd_m: standard deviation of own offsets about the common one, for pairs that get the common one.
-        position_scatter_m: `position_scatter` of raw ranges, and of calibrated ones on held-out parts; NaN = unknown.
+        pseudo_m, pseudo_sd_m: float64 (r,), in the order of `stretches.ranges`: the distance of each range's anchor from the
+            track of the *other* anchors, and its standard deviation; NaN: unknown.
+        position_scatter_m: `position_scatter` of raw ranges, and of calibrated ones on held-out parts; NaN: unknown.
     """
 
+    setting: Setting
     stretches: Stretches
     links: Links
     fit: JointFit
-    solved: Columns
+    solved: Regressors
     level: str
     not_told: tuple[str, ...]
     tag_ids: tuple[int, ...]
-    anchors: AnchorMap
-    pseudo_m: NDArray[np.float64]
-    pseudo_sd_m: NDArray[np.float64]
     untold_m: float
     own_sd_m: float
-    height: Height | None
-    model: Model
-    position_scatter_m: tuple[float, float] = (float("nan"), float("nan"))
+    pseudo_m: NDArray[np.float64]
+    pseudo_sd_m: NDArray[np.float64]
+    position_scatter_m: tuple[float, float]
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -90,15 +118,9 @@ class SelfCalibration:
         gone = np.ones(len(self.links), np.bool_)
         gone[self.links.of[~left_out]] = False
         links = self.links.without(gone)
-        solver = JointSolver(
-            self.anchors,
-            links,
-            self.solved.parameters(links),
-            self.model,
-            self.height,
-            around=self.fit.position,
-        )
-        return replace(self, fit=solver.fit(self.fit.position, self.fit.parameters, near=True))
+        fit, start = self.fit, self.fit.position
+        again = fit_joint(self.setting, links, self.solved, start, fit.parameters, around=start, near=True)
+        return replace(self, fit=again)
 
     def value(self, name: str) -> tuple[float, float]:
         """A parameter and its standard deviation; (0, 0) where it was not solved for."""
@@ -113,9 +135,9 @@ class SelfCalibration:
         # How well anchors were measured bounds it: an anchor's misplacement looks like an offset, its mean over all
         # directions from which the tag saw it being about half of it in variance.
         placed = (
-            self.anchors.sd[row] ** 2 / 2.0
+            self.setting.anchors.sd[row] ** 2 / 2.0
             if len(at) > 1
-            else np.mean(self.anchors.sd**2) / len(self.anchors) + self.own_sd_m**2
+            else np.mean(self.setting.anchors.sd**2) / len(self.setting.anchors) + self.own_sd_m**2
         )
         variance = self.fit.covariance[np.ix_(at, at)].sum() + placed + self.untold_m**2
         return float(self.fit.parameters[at].sum()), float(np.sqrt(variance))
@@ -144,7 +166,7 @@ class SelfCalibration:
         for number, (tag, row) in enumerate(pairs):
             rows[number, self._columns(tag, row)] = 1.0
         of_mean = rows.mean(axis=0)
-        placed = float(np.mean(self.anchors.sd**2)) / 2.0 / len(self.anchors)
+        placed = float(np.mean(self.setting.anchors.sd**2)) / 2.0 / len(self.setting.anchors)
         variance = of_mean @ self.fit.covariance @ of_mean + placed + self.untold_m**2
         return float(of_mean @ self.fit.parameters), float(np.sqrt(variance))
 
@@ -169,154 +191,298 @@ def calibrate(
     heights_m: NDArray[np.float64] | None = None,
     model: Model | None = None,
 ) -> SelfCalibration:
-    """Solve for all of it.
+    """Estimate tracks, offsets and regressors.
 
     Args:
-        anchors: where they are.
-        tags: what was recorded of each, of unknown places; each in the order of time.
+        anchors: their positions.
+        tags: the ranges of each tag, in the order of time. A tag that is carried between several positions without ranging
+            needs a pause of more than `GAP_S` there, or an id of its own for each position.
         regressors: as many rows as there are ranges.
-        height: of all tags, where it stays the same. area: where tags can be.
-        heights_m: float64 (r,), the measured height at each range, in place of `height`.
+        height: of all tags, if constant.
+        area: of the tags.
+        heights_m: float64 (r,), the measured height at each range, instead of `height`.
 
     Raises:
-        DatasetError: geometry does not tell; says what is missing.
+        DatasetError: the geometry does not determine the solution; the message says what is missing.
     """
-    model = model or MODEL
-    tags = list(tags)
+    model, tags = model or MODEL, list(tags)
     if heights_m is not None:
-        # Positions to start from are found with the median height, and only these.
+        # Initial positions are found with the median height.
         height = Height(float(np.median(heights_m)), max(float(np.std(heights_m)), HEIGHT_SD_M))
+    setting = Setting(anchors, model, height, area)
     known = regressors or Regressors.none(sum(map(len, tags)))
     check_anchors(anchors, np.unique(np.concatenate([one.anchor for one in tags])), height, area)
-    told: list[str] = []
-    found = stretches(tags, anchors, height, model)
-    begins = np.cumsum([0, *map(len, tags)])
-    of_range = begins[found.tag] + found.row
-    rows, alike = known.rows[of_range], known.alike[of_range]
+    notes: list[str] = []
+    found = stretches(tags)
+    of_range = np.cumsum([0, *map(len, tags)])[found.tag] + found.row
+    known = known.take(of_range)
     if heights_m is not None and height is not None:
         found = replace(found, rise=heights_m[of_range] - height.value)
-    expected = rows @ known.mean
-    offset = likely_offset(anchors, found, expected, height, area, model)
-    position, placed = first_positions(anchors, tags, found, expected + offset, height, area, model)
+    expected = known.rows @ known.mean
+    offset = likely_offset(setting, found, expected)
+    position, placed = first_positions(setting, found, expected + offset)
     if heights_m is not None and height is not None:
-        # The spread of the heights was for the start: each height is known as well as it was measured.
-        height = Height(height.value, HEIGHT_SD_M)
+        # The spread of the heights was for the initial positions: each height has the accuracy of its measurement.
+        setting = replace(setting, height=Height(height.value, HEIGHT_SD_M))
     if not placed.all():
-        told.append(
-            f"{int((~placed).sum())} of {len(placed)} stretches left out: no place of the tag can be told"
+        notes.append(
+            f"{int((~placed).sum())} of {len(placed)} stretches left out: no position of the tag can be determined"
         )
     if not placed.any():
         raise DatasetError(
-            "no place of a tag can be told",
-            valid="four anchors or more that hear a tag at once, --height or --area",
+            "no position of a tag can be determined",
+            valid="four anchors or more that receive a tag at once, --height or --area",
         )
     kept = placed[found.of]
-    found, rows, alike = found.keep(placed), rows[kept], alike[kept]
-    solved = Columns.shared(rows, alike, known, offset)
-    links = links_of(found, solved.rows, solved.alike, model)
-    # Knots of stretches that were left out are gone from the positions, too.
-    fit = JointSolver(anchors, links, solved.parameters(links), model, height).fit(position)
-    ambiguous = mirrored(anchors, links, fit, height, area, model)
+    common = Regressors.one("offset", np.ones(len(kept)), offset, COMMON_SD_M)
+    solved = replace(common.joined(known), alike=known.alike).take(kept)
+    found = found.keep(placed)
+    # The positions contain no knots of segments that were left out.
+    links, fit = _fitted(setting, found, solved, position)
+    ambiguous = mirrored(setting, links, fit)
+    if ambiguous.all():
+        raise DatasetError(
+            "the track has two mirror images, and either explains the ranges equally well",
+            valid="--height or --area to choose one, or an anchor that is not on the others' line (above or below their plane)",
+        )
     if ambiguous.any():
-        told.append(
-            f"{int(ambiguous.sum())} of {len(ambiguous)} stretches left out: their mirror images are as good"
+        notes.append(
+            f"{int(ambiguous.sum())} of {len(ambiguous)} stretches left out: their mirror images fit equally well"
         )
-        if ambiguous.all():
-            raise DatasetError(
-                "the track has two mirror images, and either explains the ranges as well",
-                valid="--height or --area to say which, or an anchor beside the others' line (above or below their plane)",
-            )
-        kept, knots = ~ambiguous[found.of], ~ambiguous[links.knot_stretch]
-        found, solved, position = found.keep(~ambiguous), solved.take(kept), fit.position[knots]
-        links = links_of(found, solved.rows, solved.alike, model)
-        fit = JointSolver(anchors, links, solved.parameters(links), model, height).fit(position)
-    check_motion(links, fit, height)
+        position = fit.position[~ambiguous[links.knot_stretch]]
+        solved, found = solved.take(~ambiguous[found.of]), found.keep(~ambiguous)
+        links, fit = _fitted(setting, found, solved, position)
+    check_motion(links, fit, setting)
+    common_sd, shared_only = float(np.sqrt(fit.covariance[0, 0])), solved
     level, own_sd = "one", 0.0
-    tag_ids = tuple(one.tag_id for one in tags)
-
-    def result(untold_m: float) -> SelfCalibration:
-        no_truth = np.zeros(0)
-        return SelfCalibration(
-            found, links, fit, solved, level, tuple(told), tag_ids, anchors, no_truth, no_truth, untold_m, own_sd, height, model
-        )  # fmt: skip
-
-    def held_out_scatter(some: Columns, fitted: JointFit) -> float:
-        """Of positions, with parameters from the other half of the drive."""
-        of_some = links_of(found, some.rows, some.alike, model)
-        block = (of_some.time_s[of_some.knot] // SLOW_S).astype(int) + of_some.stretch
-        correction = np.zeros(len(of_some))
-        for half in range(2):
-            held_out = block % 2 == half
-            if held_out.any() and not held_out.all():
-                rest = of_some.without(held_out)
-                solver = JointSolver(
-                    anchors, rest, some.parameters(rest), model, height, around=fitted.position
-                )
-                parameters = solver.fit(fitted.position, fitted.parameters, near=True).parameters
-            else:
-                parameters = fitted.parameters
-            correction[held_out] = of_some.rows[held_out] @ parameters
-        return position_scatter(anchors, of_some, fitted, correction, height, model)
-
     # Without the common offset the true ranges are unknown: own offsets would contain its error.
-    common_sd = float(np.sqrt(fit.covariance[0, 0]))
-    tried = candidates(found) if common_sd <= UNTOLD_M else []
-    shared_only = solved
-    for group, columns in tried:
-        richer, better, shared, sd_of_group = with_own_offsets(
-            anchors, found, solved, columns, fit, height, model
-        )
+    for group, members in candidates(found) if common_sd <= UNTOLD_M else []:
+        richer, better, shared, sd_of_group = with_own_offsets(setting, found, solved, members, fit)
         if group == "anchor":
             own_sd = sd_of_group
         if richer is None or better is None:
-            told.append(f"offsets of {group}s of their own: not told from chance, so that all share one")
+            notes.append(f"own offsets of {group}s are not significant, so that all share one")
             break
-        before, after = (held_out_scatter(one, result) for one, result in ((solved, fit), (richer, better)))
+        before, after = (_held_out_scatter(setting, found, *one) for one in ((solved, fit), (richer, better)))
         if after > before:
-            told.append(
-                f"offsets of {group}s of their own: positions without one anchor scatter by {after:.3f} m with them, by "
+            notes.append(
+                f"own offsets of {group}s: positions without one anchor scatter by {after:.3f} m with them, by "
                 f"{before:.3f} m without them, so that all share one"
             )
             break
         solved, fit, level = richer, better, "pair" if group != "anchor" else "anchor"
         if shared:
             names = ", ".join(_with_ids(name, anchors, tags) for name in shared)
-            told.append(f"{names}: their own offsets are not significant, so that they get the common offset")
+            notes.append(
+                f"{names}: their own offsets are not significant, so that they get the common offset"
+            )
     if level == "anchor" and len(np.unique(found.tag)) == 1:
-        # Of one tag an anchor's offset is the pair's.
+        # With one tag, the offset of an anchor is that of the pair.
         level = "pair"
-    links = links_of(found, solved.rows, solved.alike, model)
-    fit = JointSolver(anchors, links, solved.parameters(links), model, height).fit(
-        fit.position, fit.parameters
+    links, fit = _fitted(setting, found, solved, fit.position, fit.parameters)
+    check_anchor_positions(setting, found, solved, links, fit, first_positions)
+    unknown, nan = np.full(len(found.ranges), np.nan), float("nan")
+    ids = tuple(one.tag_id for one in tags)
+    trial = SelfCalibration(
+        setting, found, links, fit, solved, level, (), ids, 0.0, own_sd, unknown, unknown, (nan, nan)
     )
-    check_anchor_positions(anchors, tags, found, solved, links, fit, height, area, model)
-    untold = 0.0
-    trial = result(0.0)
     if common_sd > UNTOLD_M or not any(trial.applied(*pair)[0] for pair in trial.pairs()):
         value, sd = trial.mean()
-        untold, level = float(np.hypot(value, sd)), "one"
-        told.append(
+        notes.append(
             f"the offset is not significant, so that no offset is subtracted: {value:.2f} m with a standard deviation of "
             f"{sd:.2f} m. Drive between the anchors, not only past them"
         )
+        q = len(shared_only.names)
         solved = replace(
-            shared_only,
-            mean=np.array([0.0, *shared_only.mean[1:]]),
-            sd=np.array([1e-4, *shared_only.sd[1:]]),
+            shared_only, mean=np.append(0.0, shared_only.mean[1:]), sd=np.append(1e-4, shared_only.sd[1:])
         )
-        links = links_of(found, solved.rows, solved.alike, model)
-        start = np.array([0.0, *fit.parameters[1 : len(solved.names)]])
-        fit = JointSolver(anchors, links, solved.parameters(links), model, height).fit(fit.position, start)
+        links, fit = _fitted(setting, found, solved, fit.position, np.append(0.0, fit.parameters[1:q]))
+        trial = replace(
+            trial, links=links, fit=fit, solved=solved, level="one", untold_m=float(np.hypot(value, sd))
+        )
+    pseudo, pseudo_sd = seen_by_others(setting, found, links, fit)
     scatter = (
-        position_scatter(anchors, links, fit, np.zeros(len(links)), height, model),
-        held_out_scatter(solved, fit),
+        position_scatter(setting, links, fit, np.zeros(len(links))),
+        _held_out_scatter(setting, found, solved, fit),
     )
-    pseudo, pseudo_sd = seen_by_others(anchors, found, links, fit, height, model)
-    return replace(result(untold), pseudo_m=pseudo, pseudo_sd_m=pseudo_sd, position_scatter_m=scatter)
+    return replace(
+        trial, not_told=tuple(notes), pseudo_m=pseudo, pseudo_sd_m=pseudo_sd, position_scatter_m=scatter
+    )
+
+
+def _fitted(
+    setting: Setting,
+    found: Stretches,
+    solved: Regressors,
+    position: NDArray[np.float64],
+    parameters: NDArray[np.float64] | None = None,
+    *,
+    near: bool = False,
+) -> tuple[Links, JointFit]:
+    """Return the links of the ranges, and the fit to them from positions (K, 3) and parameters to start from."""
+    links = links_of(found, solved.rows, solved.alike, setting.model)
+    return links, fit_joint(setting, links, solved, position, parameters, near=near)
+
+
+def _held_out_scatter(setting: Setting, found: Stretches, solved: Regressors, fit: JointFit) -> float:
+    """Return the scatter of positions, with parameters from the other half of the drive."""
+    links = links_of(found, solved.rows, solved.alike, setting.model)
+    block = (links.time_s[links.knot] // SLOW_S).astype(int) + links.stretch
+    correction, start = np.zeros(len(links)), fit.position
+    for half in range(2):
+        held_out, parameters = block % 2 == half, fit.parameters
+        if held_out.any() and not held_out.all():
+            rest = links.without(held_out)
+            again = fit_joint(setting, rest, solved, start, parameters, around=start, near=True)
+            parameters = again.parameters
+        correction[held_out] = links.rows[held_out] @ parameters
+    return position_scatter(setting, links, fit, correction)
+
+
+def candidates(found: Stretches) -> list[tuple[str, dict[str, NDArray[np.bool_]]]]:
+    """Return what may have its own offset, in the order in which it is tried: {name: which ranges}."""
+    row, tag = found.ranges.anchor, found.tag
+    tried = [("anchor", {f"anchor {one}": row == one for one in np.unique(row).tolist()})]
+    # The offset of a tag that stays at one position can hardly be separated from this position.
+    places_of = {one: len(np.unique(found.of[tag == one])) for one in np.unique(tag).tolist()}
+    several = [
+        one for one, count in places_of.items() if count > 1 or not found.at_rest[found.of[tag == one][0]]
+    ]
+    if len(several) > 1:
+        tried.append(("tag", {f"tag {one}": tag == one for one in several}))
+        pairs = {
+            f"pair {one} {anchor}": (tag == one) & (row == anchor)
+            for one in several
+            for anchor in np.unique(row[tag == one]).tolist()
+        }
+        tried.append(("pair", pairs))
+    return tried
+
+
+def with_own_offsets(
+    setting: Setting,
+    found: Stretches,
+    solved: Regressors,
+    members: dict[str, NDArray[np.bool_]],
+    fit: JointFit,
+) -> tuple[Regressors | None, JointFit | None, list[str], float]:
+    """Add offsets of these groups of ranges, if they are significant.
+
+    Empirical Bayes: the scatter of the offsets beyond their own uncertainty is their prior standard deviation.
+
+    Returns:
+        Parameters and fit with own offsets (None: not significant), the names of those that are not observable, and their
+        scatter in m, which is also the error of the common offset as a replacement of an own one.
+    """
+    count, kinds = len(members), solved.alike
+
+    def with_groups(names: list[str], sd: float) -> Regressors:
+        rows = np.column_stack([members[name].astype(float) for name in names])
+        return solved.joined(
+            Regressors(tuple(names), rows, np.zeros(len(names)), np.full(len(names), sd), kinds)
+        )
+
+    def fitted(some: Regressors) -> JointFit:
+        start = np.append(fit.parameters, np.zeros(len(some.names) - len(fit.parameters)))
+        return _fitted(setting, found, some, fit.position, start, near=True)[1]
+
+    trial = fitted(with_groups(list(members), OWN_SD_M))
+    # Deviations from their mean: the mean is the common offset.
+    centred = np.eye(count) - 1.0 / count
+    own = centred @ trial.parameters[-count:]
+    variance = np.diag(centred @ trial.covariance[-count:, -count:] @ centred)
+    # The estimate without the prior.
+    prior = OWN_SD_M**2 * (1.0 - 1.0 / count)
+    alone = 1.0 / np.maximum(1.0 / variance - 1.0 / prior, 1e-9)
+    free = own * alone / variance
+    excess = float(np.sum(free**2 / alone))
+    scatter = float(np.sum((free**2 - alone) / alone**2) / np.sum(1.0 / alone**2))
+    sd = float(np.sqrt(max(scatter, 0.0)))
+    if excess < chi2.ppf(MIN_CONFIDENCE, max(count - 1, 1)) or scatter < MIN_OWN_SD_M**2:
+        return None, None, [], sd
+    observable = np.sqrt(1.0 / (1.0 / alone + 1.0 / scatter)) < OBSERVABLE * sd
+    if observable.mean() < MIN_SHARE:
+        return None, None, [], sd
+    names = [name for name, is_observable in zip(members, observable, strict=True) if is_observable]
+    better = with_groups(names, sd)
+    return better, fitted(better), [name for name in members if name not in names], sd
+
+
+def likely_offset(setting: Setting, found: Stretches, expected_m: NDArray[np.float64]) -> float:
+    """Return the one of `OFFSETS_M` with which the ranges of a few moments agree best; 0 if no moment has enough ranges.
+
+    Args:
+        expected_m: float64 (r,), also subtracted from the ranges.
+    """
+    rng = np.random.default_rng(1)
+    moments = []
+    window = (found.ranges.stamp_ns - found.ranges.stamp_ns[0]) // round(WINDOW_S * _SECOND_NS)
+    key = np.where(found.at_rest[found.of], -1 - found.of, window * len(found) + found.of)
+    for one in rng.permutation(np.unique(key)).tolist():
+        row, value = _medians(found.ranges, np.flatnonzero(key == one), expected_m)
+        if len(row) > setting.dims + 1:
+            moments.append((row, value))
+        if len(moments) == MAX_WINDOWS:
+            break
+    if not moments:
+        return 0.0
+    loss = np.zeros(len(OFFSETS_M))
+    for row, value in moments:
+        for k, offset in enumerate(OFFSETS_M.tolist()):
+            possible = _places(setting, row, value - offset)
+            loss[k] += possible[0].loss if possible else 50.0
+    return float(OFFSETS_M[int(np.argmin(loss))])
+
+
+def first_positions(
+    setting: Setting, found: Stretches, expected_m: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return initial positions float64 (K, 3) at the knots of the segments that have any; which these are, bool (s,)."""
+    position: list[NDArray[np.float64]] = []
+    placed = np.zeros(len(found), np.bool_)
+    edges = np.searchsorted(found.of, np.arange(len(found) + 1))
+    for number in range(len(found)):
+        own = np.arange(edges[number], edges[number + 1])
+        if found.at_rest[number]:
+            row, value = _medians(found.ranges, own, expected_m)
+            possible = _places(setting, row, value) if len(row) > setting.dims else []
+            if possible:
+                position.append(possible[0].position[None])
+                placed[number] = True
+            continue
+        ranges = found.ranges.take(own)
+        better = replace(ranges, range_m=np.maximum(ranges.range_m - expected_m[own], 0.0))
+        locator = TagLocator(setting.anchors, setting.model, height=setting.height, area=setting.area)
+        track = run_live(better, locator).track
+        if len(track) >= 2:
+            position.append(_at_knots(track, ranges))
+            placed[number] = True
+    return np.concatenate(position) if position else np.zeros((0, 3)), placed
+
+
+def _places(setting: Setting, row: NDArray[np.intp], range_m: NDArray[np.float64]) -> list[Place]:
+    where, sd = setting.anchors.position[row], np.full(len(row), START_SD_M)
+    return places(where, range_m, sd, setting.model, height=setting.height, area=setting.area)
+
+
+def _at_knots(track: Track, ranges: Ranges) -> NDArray[np.float64]:
+    since = (ranges.stamp_ns - ranges.stamp_ns[0]) / _SECOND_NS
+    knots = np.unique(np.rint(since / KNOT_S).astype(np.int64)) * KNOT_S
+    own = (track.stamp_ns - ranges.stamp_ns[0]) / _SECOND_NS
+    return np.stack([np.interp(knots, own, axis) for axis in track.position.T], axis=1)
+
+
+def _medians(
+    ranges: Ranges, rows: NDArray[np.intp], expected_m: NDArray[np.float64]
+) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """Return the anchors received in `rows`, and the median corrected range of each."""
+    value = ranges.range_m[rows] - expected_m[rows]
+    received = np.unique(ranges.anchor[rows])
+    return received, np.array([np.median(value[ranges.anchor[rows] == one]) for one in received])
 
 
 def _with_ids(name: str, anchors: AnchorMap, tags: Sequence[Ranges]) -> str:
-    """The name of an own offset, with the ids of tag and anchor in place of their numbers."""
+    """Return the name of an own offset, with the ids of tag and anchor instead of their numbers."""
     kind, *numbers = name.split()
     if kind == "anchor":
         return f"anchor {anchors.anchors[int(numbers[0])]}"

@@ -1,8 +1,14 @@
-"""The track that fits all ranges of a recording best, looking ahead as well as back.
+"""The track that fits all ranges of a recording best, from ranges before and after each position.
 
-The same model as the filter's: white acceleration; of each range's error a white part, one that persists (a process
-of each anchor, at every knot), an offset that all share, and one of each anchor. Knots lie a tenth of a second apart where there are
-ranges; each range touches one. Iteratively reweighted Gauss-Newton on `chain`.
+`Smoother` uses the error model of the filter: white acceleration; each range error is the sum of white noise, a persisting
+error (one process per anchor), a common offset, and an offset of each anchor. Knots are 0.1 s apart where there are ranges;
+each range belongs to one knot. It is solved by iteratively reweighted Gauss-Newton.
+
+`smooth` fuses its track with those of the live filter forwards and backwards. The batch smoother is best if offsets and smooth
+motion replace geometry: far away from a small group of anchors. With NLOS errors and weakly observable heights it relies
+too much on its model, and its errors exceed those of the live filter. So its covariance is enlarged, and the three
+tracks are fused by covariance intersection, which is consistent for any correlation of their errors (Julier, Uhlmann 1997;
+weights of Niehsen 2002).
 """
 
 from __future__ import annotations
@@ -14,44 +20,35 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.anchors import AnchorMap
-from uwb_mitigation.positioning.chain import Chain, Solution
 from uwb_mitigation.positioning.filter import FIRST_ERROR, OFFSET, RangeFilter
-from uwb_mitigation.positioning.model import Model
-from uwb_mitigation.positioning.start import Height
+from uwb_mitigation.positioning.geometry import Area, Height, directions
+from uwb_mitigation.positioning.least_squares import LeastSquares, Solution
+from uwb_mitigation.positioning.locator import TagLocator, run_live
+from uwb_mitigation.positioning.model import Model, Regressors
 from uwb_mitigation.positioning.tracks import Heights, Ranges, Track
 
 KNOT_S = 0.1
+BATCH_BIAS_M = 0.2
+"""Standard deviation of the batch smoother's bias that its covariance does not contain: a typical NLOS error."""
+
 _ITERATIONS = 12
-_SETTLED_M = 2e-3
+_CONVERGED_M = 2e-3
+_OLDEST_NS = 1_000_000_000
 _SECOND_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Parameters:
-    """What ranges have in common, beside the track, to be estimated with it.
-
-    Attributes:
-        rows: float64 (n, q), by how much each range grows with each parameter.
-        mean, sd: float64 (q,), what is known before: an sd of inf = nothing.
-    """
-
-    rows: NDArray[np.float64]
-    mean: NDArray[np.float64]
-    sd: NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Smoothed:
-    """What the smoother found.
+    """The result of the smoother.
 
     Attributes:
         track: at the knots.
-        parameters: float64 (q,), and their covariance (q, q); without any asked for, the offset that all share,
-            then that of each anchor from which there are ranges, in the order of their rows.
-        anchors: float64 (m, 3), where they were found to be, and `anchor_covariance` (m, 3, m, 3); as given
-            where they were not asked for.
-        residual_m: float64 (n,), what is left of each range, its anchor's persisting error not taken off.
-        weight: float64 (n,), what robustness left of each range: 1 = all.
+        parameters: float64 (q,), and their covariance (q, q). By default: the common offset, then that of each anchor with
+            ranges, in the order of their rows.
+        anchors: float64 (m, 3), estimated positions, and `anchor_covariance` (m, 3, m, 3); as given if they are not
+            estimated.
+        residual_m: float64 (n,), of each range, including the persisting error of its anchor.
+        weight: float64 (n,), robust weight of each range; 1: full weight.
     """
 
     track: Track
@@ -64,25 +61,24 @@ class Smoothed:
 
 
 def knots_of(stamp_ns: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
-    """Multiples of the spacing next to which there are ranges, int64 (K,) ns since the first; and the knot of each."""
+    """Return the knots, int64 (K,) ns since the first stamp, and the knot of each stamp, int (n,)."""
     spacing = round(KNOT_S * _SECOND_NS)
     number, of = np.unique((stamp_ns - stamp_ns[0] + spacing // 2) // spacing, return_inverse=True)
     return number * spacing, of
 
 
 class Smoother:
-    """Fits a track to ranges, and with it what else is unknown.
+    """Fits a track to ranges, together with other unknowns.
 
     Args:
         anchors, model: as of the filter.
-        ranges: two or more, in order.
-        height: of the tag, where it stays the same.
-        parameters: beside the track; None = an offset of all ranges and one of each anchor, known to the
-            model's deviations.
-        find_anchors: the anchors' positions are unknown too.
-        around: where anchors that are sought are known to be, and to which deviation in each axis, float64
-            (m, 3) both; None = as `anchors` says.
-        after: the filter at the first range's time, whose state and covariance are where the track begins.
+        ranges: two or more, in the order of time.
+        height: of the tag, if constant.
+        parameters: further unknowns; None: a common offset and one of each anchor, with the model's standard deviations.
+        find_anchors: also estimate the positions of the anchors.
+        around: prior positions of estimated anchors and their standard deviations, float64 (m, 3) both; None: those of
+            `anchors`.
+        after: the filter at the time of the first range, whose state and covariance are the prior of the track.
         heights: measured heights of the tag; not together with `height`.
 
     Raises:
@@ -96,7 +92,7 @@ class Smoother:
         ranges: Ranges,
         *,
         height: Height | None = None,
-        parameters: Parameters | None = None,
+        parameters: Regressors | None = None,
         find_anchors: bool = False,
         around: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
         after: RangeFilter | None = None,
@@ -107,58 +103,52 @@ class Smoother:
         n = len(ranges)
         self._model, self._height, self._find, self._after = model, height, find_anchors, after
         self._d = 2 if height is not None else 3
-        # Anchors that no range comes from have no errors to tell.
+        # Anchors without ranges have no persisting errors to estimate.
         self._used, self._slot = np.unique(ranges.anchor, return_inverse=True)
         self._known = anchors.position
-        place, self._spread = around or (anchors.position, np.repeat(anchors.sd[:, None], 3, axis=1))
-        self._expected = place - anchors.position
-        self._where = anchors.position[self._used].copy()
+        self._around, self._spread = around or (anchors.position, np.repeat(anchors.sd[:, None], 3, axis=1))
         self._ranges = ranges
         self._origin_ns = int(ranges.stamp_ns[0])
         self._knots_ns, self._of = knots_of(ranges.stamp_ns)
         self._time_s = self._knots_ns / _SECOND_NS
         self._ahead_s = (ranges.stamp_ns - self._origin_ns - self._knots_ns[self._of]) / _SECOND_NS
-        known = np.isfinite(ranges.variance_m2) & (ranges.variance_m2 > 0)
-        self._variance = np.where(known, ranges.variance_m2, model.range_sd**2)
-        usual = np.array([np.median(self._variance[self._slot == s]) for s in range(len(self._used))])
-        self._persisting = (1.0 - model.white) * usual
+        self._variance = model.variances(ranges.variance_m2)
+        median = np.array([np.median(self._variance[self._slot == s]) for s in range(len(self._used))])
+        self._persisting = (1.0 - model.white) * median
         if not find_anchors:
             self._persisting = self._persisting + anchors.sd[self._used] ** 2
         self._white = np.maximum(model.white * self._variance, self._variance - self._persisting[self._slot])
         if parameters is None:
             own = np.eye(len(self._used))[self._slot]
             sd = np.array([model.offset_sd, *[model.pair_sd] * len(self._used)])
-            parameters = Parameters(np.concatenate([np.ones((n, 1)), own], axis=1), np.zeros(len(sd)), sd)
-        self._rows, self._mean = parameters.rows, parameters.mean
-        self._certainty = 1.0 / np.maximum(parameters.sd, 1e-6) ** 2
-        self._height_m = self._height_information = np.zeros(len(self._knots_ns))
-        if heights is not None and height is None:
-            value, variance = heights.at(self._origin_ns + self._knots_ns)
-            self._height_m = np.nan_to_num(value)
-            self._height_information = np.nan_to_num(1.0 / variance)
+            rows = np.concatenate([np.ones((n, 1)), own], axis=1)
+            names = ("offset", *(f"anchor {row}" for row in self._used))
+            parameters = Regressors(names, rows, np.zeros(len(sd)), sd, np.zeros(n, np.intp))
+        self._parameters = parameters
+        self._heights = heights if height is None else None
 
     def fit(self, initial: Track, iterations: int = _ITERATIONS) -> Smoothed:
-        """The track, starting from one that is roughly right.
+        """Return the track, starting from one that is roughly right.
 
         Raises:
             DatasetError: the ranges do not determine it.
         """
-        knots, d = len(self._time_s), self._d
+        knots, d, p = len(self._time_s), self._d, len(self._parameters.mean)
         stamp = (initial.stamp_ns - self._origin_ns) / _SECOND_NS
         x = np.zeros((knots, 2 * d + len(self._used)))
         for axis in range(d):
             x[:, axis] = np.interp(self._time_s, stamp, initial.position[:, axis])
-        shared = np.concatenate([self._mean, np.zeros(self._extra)])
+        extra = (self._height is not None) + (3 * len(self._used) if self._find else 0)
+        shared = np.concatenate([self._parameters.mean, np.zeros(extra)])
         solution: Solution | None = None
         try:
             for _ in range(iterations):
-                chain = self._linearise(x, shared)
-                solution = chain.solve()
-                moved = float(np.abs(solution.x[:, :d] - x[:, :d]).max())
+                solution = self._linearised(x, shared).solve()
+                step = float(np.abs(solution.x[:, :d] - x[:, :d]).max())
                 x, shared = solution.x, solution.shared
-                if not np.isfinite(moved):
+                if not np.isfinite(step):
                     raise np.linalg.LinAlgError
-                if moved < _SETTLED_M:
+                if step < _CONVERGED_M:
                     break
             assert solution is not None
             covariances = solution.covariances(2 * d)
@@ -166,138 +156,7 @@ class Smoother:
             raise DatasetError(
                 "the ranges do not determine a track", valid="more ranges, or anchors"
             ) from error
-        return self._result(x, shared, solution, covariances)
-
-    @property
-    def _extra(self) -> int:
-        """Shared unknowns beside the parameters: the height's error, and the anchors' places."""
-        return (self._height is not None) + (3 * len(self._used) if self._find else 0)
-
-    def _places(self, shared: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
-        """The height, and the anchors' positions, that shared unknowns stand for."""
-        at = len(self._mean)
-        height = 0.0
-        if self._height is not None:
-            height = self._height.value + shared[at]
-            at += 1
-        where = self._where
-        if self._find:
-            where = where + shared[at:].reshape(-1, 3)
-        return height, where
-
-    def _geometry(
-        self, x: NDArray[np.float64], shared: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Unit vectors (n, 3) from anchor to tag, and distances (n,)."""
-        d = self._d
-        height, where = self._places(shared)
-        at = x[self._of]
-        tag = np.full((len(at), 3), height)
-        tag[:, :d] = at[:, :d] + self._ahead_s[:, None] * at[:, d : 2 * d]
-        away = tag - where[self._slot]
-        distance = np.maximum(np.sqrt(np.einsum("ni,ni->n", away, away)), 0.05)
-        return away / distance[:, None], distance
-
-    def _linearise(self, x: NDArray[np.float64], shared: NDArray[np.float64]) -> Chain:
-        d, m, q = self._d, len(self._used), len(shared)
-        direction, distance = self._geometry(x, shared)
-        p = len(self._mean)
-        rows = np.zeros((len(distance), q))
-        rows[:, :p] = self._rows
-        at = p
-        if self._height is not None:
-            rows[:, at] = direction[:, 2]
-            at += 1
-        if self._find:
-            for axis in range(3):
-                rows[np.arange(len(rows)), at + 3 * self._slot + axis] = -direction[:, axis]
-        own = np.zeros((len(distance), 2 * d + m))
-        own[:, :d] = direction[:, :d]
-        own[:, d : 2 * d] = self._ahead_s[:, None] * direction[:, :d]
-        own[np.arange(len(own)), 2 * d + self._slot] = 1.0
-        error = self._ranges.range_m - distance - self._rows @ shared[:p]
-        # The unknowns themselves are solved for, not their changes: motion and priors are linear in them.
-        target = error - x[self._of, 2 * d + self._slot] + rows @ shared
-        target += np.einsum("nb,nb->n", own, x[self._of])
-        weight = self._model.weight(error / np.sqrt(self._variance)) / self._white
-
-        chain = Chain.empty(len(x), own.shape[1], q)
-        order = np.argsort(self._of, kind="stable")
-        chain.add_rows(self._of[order], own[order], rows[order], target[order], weight[order])
-        self._add_motion(chain)
-        self._add_priors(chain)
-        return chain
-
-    def _add_motion(self, chain: Chain) -> None:
-        d, model = self._d, self._model
-        dt = np.diff(self._time_s)
-        chain.add_motion(dt, d, model.acceleration)
-        kept = np.exp(-dt / model.persistence_s)
-        for slot, variance in enumerate(self._persisting):
-            i = 2 * d + slot
-            noise = 1.0 / (variance * (1.0 - kept**2))
-            chain.diagonal[1:, i, i] += noise
-            chain.diagonal[:-1, i, i] += noise * kept**2
-            chain.beside[:, i, i] -= noise * kept
-
-    def _add_priors(self, chain: Chain) -> None:
-        d, p = self._d, len(self._mean)
-        for axis in range(p):
-            chain.shared[axis, axis] += self._certainty[axis]
-            chain.right_shared[axis] += self._certainty[axis] * self._mean[axis]
-        at = p
-        if self._height is not None and self._after is None:
-            chain.shared[at, at] += 1.0 / self._height.sd**2
-        at += self._height is not None
-        if self._find:
-            for slot, row in enumerate(self._used):
-                for axis in range(3):
-                    i = at + 3 * slot + axis
-                    certainty = 1.0 / max(self._spread[row, axis], 1e-6) ** 2
-                    chain.shared[i, i] += certainty
-                    chain.right_shared[i] += certainty * self._expected[row, axis]
-        if d == 3:
-            chain.diagonal[:, 2, 2] += self._height_information
-            chain.right[:, 2] += self._height_information * self._height_m
-        if self._after is None:
-            for axis in range(d):
-                chain.diagonal[0, d + axis, d + axis] += 1.0 / self._model.speed**2
-            for slot, variance in enumerate(self._persisting):
-                chain.diagonal[0, 2 * d + slot, 2 * d + slot] += 1.0 / variance
-            return
-        self._add_filter(chain, self._after)
-
-    def _add_filter(self, chain: Chain, after: RangeFilter) -> None:
-        """What a filter knows of the first knot, of offset and height too, in their correlation."""
-        d = self._d
-        own = [*range(d), *range(3, 3 + d), *(FIRST_ERROR + int(row) for row in self._used)]
-        index, shared = [*own, OFFSET], [0]
-        if self._height is not None:
-            index, shared = [*index, 2], [0, len(self._mean)]
-        mean = after.x[index].copy()
-        if self._height is not None:
-            mean[-1] -= self._height.value
-        information = np.linalg.inv(after.p[np.ix_(index, index)] + 1e-9 * np.eye(len(index)))
-        told = information @ mean
-        k = len(own)
-        chain.diagonal[0] += information[:k, :k]
-        chain.border[0][:, shared] += information[:k, k:]
-        chain.shared[np.ix_(shared, shared)] += information[k:, k:]
-        chain.right[0] += told[:k]
-        chain.right_shared[shared] += told[k:]
-        # The offset's own prior is in the filter already.
-        chain.shared[0, 0] -= self._certainty[0]
-        chain.right_shared[0] -= self._certainty[0] * self._mean[0]
-
-    def _result(
-        self,
-        x: NDArray[np.float64],
-        shared: NDArray[np.float64],
-        solution: Solution,
-        covariances: NDArray[np.float64],
-    ) -> Smoothed:
-        d, p, knots = self._d, len(self._mean), len(x)
-        height, where = self._places(shared)
+        height, anchors = self._split(shared)
         position, velocity = np.full((knots, 3), height), np.zeros((knots, 3))
         position[:, :d], velocity[:, :d] = x[:, :d], x[:, d : 2 * d]
         full = np.zeros((knots, 6, 6))
@@ -305,14 +164,11 @@ class Smoother:
         full[np.ix_(range(knots), axes, axes)] = covariances
         if self._height is not None:
             full[:, 2, 2] = solution.shared_covariance[p, p]
-        _, distance = self._geometry(x, shared)
-        error = self._ranges.range_m - distance - self._rows @ shared[:p]
-        anchors = self._known.copy()
+        _, residual = self._residuals(x, shared)
         anchor_covariance = np.diag(self._spread.reshape(-1) ** 2)
         if self._find:
-            anchors[self._used] = where
-            at = p + (self._height is not None)
             own = (3 * self._used[:, None] + np.arange(3)).reshape(-1)
+            at = len(shared) - len(own)
             anchor_covariance[np.ix_(own, own)] = solution.shared_covariance[at:, at:]
         return Smoothed(
             Track(self._origin_ns + self._knots_ns, position, velocity, full),
@@ -320,6 +176,211 @@ class Smoother:
             solution.shared_covariance[:p, :p].copy(),
             anchors,
             anchor_covariance.reshape(len(anchors), 3, len(anchors), 3),
-            error,
-            self._model.weight(error / np.sqrt(self._variance)),
+            residual,
+            self._model.weight(residual / np.sqrt(self._variance)),
         )
+
+    def _split(self, shared: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        """Return the height (0 if it is not shared) and the positions of all anchors (m, 3)."""
+        height, anchors = 0.0, self._known.copy()
+        if self._height is not None:
+            height = self._height.value + shared[len(self._parameters.mean)]
+        if self._find:
+            anchors[self._used] += shared[-3 * len(self._used) :].reshape(-1, 3)
+        return height, anchors
+
+    def _residuals(
+        self, x: NDArray[np.float64], shared: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return unit vectors (n, 3) from anchor to tag, and residuals (n,) that include persisting errors."""
+        d = self._d
+        height, anchors = self._split(shared)
+        at = x[self._of]
+        tag = np.full((len(at), 3), height)
+        tag[:, :d] = at[:, :d] + self._ahead_s[:, None] * at[:, d : 2 * d]
+        unit, distance = directions(tag, anchors[self._ranges.anchor])
+        rows = self._parameters.rows
+        return unit, self._ranges.range_m - distance - rows @ shared[: rows.shape[1]]
+
+    def _linearised(self, x: NDArray[np.float64], shared: NDArray[np.float64]) -> LeastSquares:
+        d, model, of, slot = self._d, self._model, self._of[:, None], self._slot[:, None]
+        knots, p = len(x), len(self._parameters.mean)
+        problem = LeastSquares(knots, x.shape[1], len(shared))
+        unit, residual = self._residuals(x, shared)
+        error = problem.of_knot(of, 2 * d + slot)
+        columns = [problem.of_knot(of, range(2 * d)), error]
+        values = [unit[:, :d], self._ahead_s[:, None] * unit[:, :d], np.ones((len(of), 1))]
+        columns.append(np.broadcast_to(problem.of_shared(range(p)), (len(of), p)))
+        values.append(self._parameters.rows)
+        if self._height is not None:
+            columns.append(np.full((len(of), 1), problem.of_shared(p)))
+            values.append(unit[:, 2:])
+        if self._find:
+            columns.append(problem.of_shared(len(shared) - 3 * len(self._used) + 3 * slot + np.arange(3)))
+            values.append(-unit)
+        # The unknowns are solved for, not their changes: motion and priors are linear in them.
+        both, row = np.concatenate(columns, axis=1), np.concatenate(values, axis=1)
+        target = residual - x[self._of, 2 * d + self._slot]
+        target += np.einsum("nc,nc->n", row, np.append(x.reshape(-1), shared)[both])
+        problem.add(both, row, target, model.weight(residual / np.sqrt(self._variance)) / self._white)
+
+        dt, every = np.diff(self._time_s), np.arange(knots - 1)
+        problem.add_motion(every, dt, d, model.acceleration**2)
+        decay = np.exp(-dt / model.persistence_s)
+        for i, variance in enumerate(self._persisting, 2 * d):
+            pair = problem.of_knot(np.stack([every + 1, every], axis=1), i)
+            row = np.stack([np.ones(len(dt)), -decay], axis=1)
+            problem.add(pair, row, 0.0, 1.0 / (variance * (1.0 - decay**2)))
+        self._add_priors(problem)
+        return problem
+
+    def _add_priors(self, problem: LeastSquares) -> None:
+        d, p, m = self._d, len(self._parameters.mean), len(self._used)
+        # The prior of a filter contains the offset, and the height.
+        first = 0 if self._after is None else 1
+        if p > first:
+            own = slice(first, None)
+            mean, information = self._parameters.mean[own], self._parameters.information[own]
+            problem.add_prior(problem.of_shared(range(first, p)), mean, information)
+        if self._find:
+            mean = (self._around - self._known)[self._used].reshape(-1)
+            information = 1.0 / np.maximum(self._spread[self._used].reshape(-1), 1e-6) ** 2
+            at = problem.shared - 3 * m
+            problem.add_prior(problem.of_shared(range(at, problem.shared)), mean, information)
+        if self._heights is not None:
+            value, variance = self._heights.at(self._origin_ns + self._knots_ns)
+            known = np.flatnonzero(np.isfinite(value))
+            if len(known):
+                problem.add_prior(problem.of_knot(known, 2), value[known], 1.0 / variance[known])
+        if self._after is None:
+            if self._height is not None:
+                problem.add_prior(problem.of_shared(p), 0.0, 1.0 / self._height.sd**2)
+            problem.add_prior(problem.of_knot(0, range(d, 2 * d)), 0.0, 1.0 / self._model.speed**2)
+            problem.add_prior(problem.of_knot(0, range(2 * d, 2 * d + m)), 0.0, 1.0 / self._persisting)
+            return
+        index = [*range(d), *range(3, 3 + d), *(FIRST_ERROR + self._used), OFFSET]
+        columns = [*problem.of_knot(0, range(2 * d + m)), problem.of_shared(0)]
+        mean = self._after.x.copy()
+        if self._height is not None:
+            index, columns = [*index, 2], [*columns, problem.of_shared(p)]
+            mean[2] -= self._height.value
+        information = np.linalg.inv(self._after.p[np.ix_(index, index)] + 1e-9 * np.eye(len(index)))
+        root = np.linalg.cholesky((information + information.T) / 2.0).T
+        problem.add(np.tile(columns, (len(index), 1)), root, root @ mean[index], 1.0)
+
+
+def smooth(
+    anchors: AnchorMap,
+    model: Model,
+    ranges: Ranges,
+    live: Track,
+    *,
+    height: Height | None = None,
+    area: Area | None = None,
+    heights: Heights | None = None,
+) -> Track:
+    """Return positions at ten stamps a second, each from all ranges before and after it.
+
+    Args:
+        anchors, model, height, area: As of `TagLocator`.
+        ranges: Two or more.
+        live: The track of `run_live` from the same ranges; not empty.
+        heights: Measured heights of the tag.
+    """
+    stamp_ns = int(ranges.stamp_ns[0]) + knots_of(ranges.stamp_ns)[0]
+    end_ns = int(ranges.stamp_ns[-1])
+    backwards = slice(None, None, -1)
+    reversed_ranges = ranges.take(backwards)
+    mirrored = Ranges(
+        end_ns - reversed_ranges.stamp_ns,
+        reversed_ranges.anchor,
+        reversed_ranges.range_m,
+        reversed_ranges.variance_m2,
+        reversed_ranges.rx_power_dbm,
+        ranges.tag_id,
+    )
+    mirrored_heights = heights and Heights(
+        end_ns - heights.stamp_ns[backwards], heights.height_m[backwards], heights.variance_m2[backwards]
+    )
+    locator = TagLocator(anchors, model, height=height, area=area)
+    later = _at(run_live(mirrored, locator, mirrored_heights).track, (end_ns - stamp_ns)[backwards])
+    flip = np.diag([1.0, 1.0, 1.0, -1.0, -1.0, -1.0])
+    later = later[0][backwards] @ flip, flip @ later[1][backwards] @ flip
+    state, covariance, spread = _fused(_at(live, stamp_ns), later)
+    # Without a position of either filter the batch smoother's choice among several optima is arbitrary.
+    found = np.asarray(np.isfinite(state).all(axis=1), np.bool_)
+    try:
+        batch = Smoother(anchors, model, ranges, height=height, heights=heights).fit(live).track
+    except DatasetError:
+        batch = None
+    if batch is not None:
+        state, covariance, more = fused_with_batch(state, covariance, batch)
+        spread += more
+    position = state[:, :3] if area is None else area.clip(state[:, :3])
+    return Track(stamp_ns, position, state[:, 3:], covariance + spread).take(found)
+
+
+def fused_with_batch(
+    state: NDArray[np.float64], covariance: NDArray[np.float64], batch: Track
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Fuse states (k, 6) of the filter, with covariances (k, 6, 6), with the batch smoother's at the same times.
+
+    Returns:
+        As `_fused`.
+    """
+    own = np.concatenate([batch.position, batch.velocity], axis=1)
+    own_covariance = batch.covariance + np.diag([BATCH_BIAS_M**2] * 3 + [0.0] * 3)
+    apart = (own - state)[:, :3]
+    expected = _regular((covariance + own_covariance)[:, :3, :3])
+    squared = np.einsum("ni,ni->n", apart, np.linalg.solve(expected, apart[..., None])[..., 0])
+    # If it contradicts the filters, it is in another optimum.
+    own_covariance *= np.fmax(squared / 3.0, 1.0)[:, None, None]
+    return _fused((state, covariance), (own, own_covariance))
+
+
+def _at(track: Track, stamp_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """States float64 (k, 6) and covariances (k, 6, 6) predicted from the latest estimates; NaN without a recent one."""
+    if len(track) == 0:
+        return np.full((len(stamp_ns), 6), np.nan), np.full((len(stamp_ns), 6, 6), np.nan)
+    latest = np.searchsorted(track.stamp_ns, stamp_ns, side="right") - 1
+    age_ns = stamp_ns - track.stamp_ns[latest]
+    age_s = age_ns[:, None] / _SECOND_NS
+    state = np.concatenate(
+        [track.position[latest] + age_s * track.velocity[latest], track.velocity[latest]], axis=1
+    )
+    covariance = track.covariance[latest].copy()
+    absent = (latest < 0) | (age_ns > _OLDEST_NS)
+    state[absent], covariance[absent] = np.nan, np.nan
+    return state, covariance
+
+
+def _fused(
+    one: tuple[NDArray[np.float64], NDArray[np.float64]],
+    other: tuple[NDArray[np.float64], NDArray[np.float64]],
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Fuse states (k, 6) with covariances (k, 6, 6) by covariance intersection; where one is NaN, take the other.
+
+    Returns:
+        States, covariances, and the spread of the two means (k, 6, 6), as in a mixture: where they differ, one is wrong.
+    """
+    (a, p), (b, q) = one, other
+    state, covariance = np.where(np.isfinite(a), a, b), np.where(np.isfinite(p), p, q)
+    spread = np.zeros_like(covariance)
+    both = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
+    p, q = _regular(p[both]), _regular(q[both])
+    trace = [np.einsum("nii->n", c[:, :3, :3]) for c in (p, q)]
+    weight = (trace[1] / (trace[0] + trace[1]))[:, None, None]
+    of_p, of_q = weight * np.linalg.inv(p), (1.0 - weight) * np.linalg.inv(q)
+    found = np.linalg.inv(of_p + of_q)
+    covariance[both] = found
+    apart = a[both] - b[both]
+    spread[both] = weight * (1.0 - weight) * np.einsum("ni,nj->nij", apart, apart)
+    weighted = of_p @ a[both][..., None] + of_q @ b[both][..., None]
+    state[both] = (found @ weighted)[..., 0]
+    return state, covariance, spread
+
+
+def _regular(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Without the zero variances of a level tag."""
+    regular: NDArray[np.float64] = covariance + 1e-9 * np.eye(covariance.shape[-1])
+    return regular

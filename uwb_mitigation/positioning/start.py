@@ -1,4 +1,4 @@
-"""Every place from which a handful of ranges may come: a robust fit from many starts at once."""
+"""Positions from a few ranges, without a start: all positions that explain them, and least squares as a baseline."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.positioning.anchors import AnchorMap
+from uwb_mitigation.positioning.geometry import Area, Height
 from uwb_mitigation.positioning.model import Model
+from uwb_mitigation.positioning.tracks import Ranges, Track
 
 IMPLAUSIBLE = 9.0
 """Places less likely than the best by e^-9 are none: one in eight thousand."""
@@ -21,59 +23,10 @@ _WALL_SD_M = 0.02
 _NEAR_WALL_M = 0.5
 _AROUND = 24
 _SPHERE = 96
-
-
-@dataclass(frozen=True, slots=True)
-class Height:
-    """The tag's height, as far as known: m, and its standard deviation."""
-
-    value: float
-    sd: float = 0.1
-
-    def __post_init__(self) -> None:
-        if not (abs(self.value) <= 1e5 and 0.0 < self.sd <= 1e3):
-            raise ParameterError(
-                f"height {self.value} with deviation {self.sd}", valid="metres, deviation over 0"
-            )
-
-
-@dataclass(frozen=True, slots=True)
-class Area:
-    """Where a tag can be: two opposite corners of a box, m."""
-
-    low: tuple[float, float, float]
-    high: tuple[float, float, float]
-
-    def __post_init__(self) -> None:
-        if not all(a < b for a, b in zip(self.low, self.high, strict=True)):
-            raise ParameterError(
-                f"area from {self.low} to {self.high}", valid="three smaller, then three larger"
-            )
-
-    @classmethod
-    def parse(cls, text: str) -> Area | None:
-        """The box that `X,Y,Z,X,Y,Z` says, m; None where it is empty.
-
-        Raises:
-            ParameterError: it says no box.
-        """
-        if not text:
-            return None
-        try:
-            x, y, z, x1, y1, z1 = (float(word) for word in text.split(","))
-        except ValueError as error:
-            raise ParameterError(f"area {text!r}", valid="six numbers: X,Y,Z,X,Y,Z") from error
-        return cls((x, y, z), (x1, y1, z1))
-
-    def holds(self, position: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Which of the places float64 (n, 3) lie in it."""
-        inside: NDArray[np.bool_] = np.all((position >= self.low) & (position <= self.high), axis=-1)
-        return inside
-
-    def clip(self, position: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the nearest point of the box to each position float64 (..., 3)."""
-        nearest: NDArray[np.float64] = np.clip(position, self.low, self.high)
-        return nearest
+_LEAST_SQUARES = Model(long=100.0, short=100.0)
+_FRESH_S = 0.5
+_EVERY_S = 0.1
+_SECOND_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -242,7 +195,7 @@ def _linearised(
     distance = np.sqrt(np.einsum("nki,nki->nk", away, away))
     z = (range_m - distance) / sd_m
     weight = model.weight(z)
-    slope = away / np.maximum(distance, 1e-6)[..., None] / sd_m[:, None]
+    slope = away / np.maximum(distance, 1e-6)[..., None] / sd_m[..., None]
     rows = slope * weight[..., None]
     cost = model.loss(z).sum(axis=1)
     gradient = -np.einsum("nki,nk->ni", rows, z)
@@ -252,3 +205,47 @@ def _linearised(
     cost = cost + 0.5 * np.einsum("ni,ni->n", pull, apart)
     hessian[:, [0, 1, 2], [0, 1, 2]] += prior.information
     return cost, gradient + pull, hessian, rows
+
+
+def snapshot(anchors: AnchorMap, ranges: Ranges, height: Height | None = None) -> Track:
+    """Return the baseline: least squares on the latest range of each anchor, without motion model or robust loss.
+
+    A position ten times a second, if enough anchors (two, or three without a height) were received within half a second;
+    velocities and covariances are NaN. Of several solutions the one with the least squares is chosen; the descent starts at
+    the centre of the anchors, and on all sides of it.
+    """
+    stamps, latest = _latest(len(anchors), ranges)
+    enough = np.isfinite(latest).sum(axis=1) >= (2 if height is not None else 3)
+    stamps, latest = stamps[enough], latest[enough]
+    present = np.isfinite(latest)
+    range_m, sd_m = np.where(present, latest, 0.0), np.where(present, 1.0, np.inf)
+    reach = np.nanmedian(latest, axis=1, keepdims=True) if len(latest) else np.zeros((0, 1))
+    prior = _Prior.of(len(latest), None if height is None else Height(height.value, 1e-4))
+    best, least = np.zeros((len(latest), 3)), np.full(len(latest), np.inf)
+    sides = np.array([[0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, -0.5]]) + 0.01
+    for side in sides:
+        x = anchors.position.mean(axis=0) + reach * side
+        if height is not None:
+            x[:, 2] = height.value
+        x, cost, *_ = _descend(x, anchors.position, range_m, sd_m, _LEAST_SQUARES, prior)
+        better = cost < least
+        best, least = np.where(better[:, None], x, best), np.where(better, cost, least)
+    unknown = np.full((len(stamps), 6, 6), np.nan)
+    return Track(stamps, best, unknown[:, 0, :3], unknown)
+
+
+def _latest(count: int, ranges: Ranges) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return stamps int64 (t,) and the latest range of each anchor within `_FRESH_S`, float64 (t, count); NaN: none."""
+    every = round(_EVERY_S * _SECOND_NS)
+    number = (ranges.stamp_ns - ranges.stamp_ns[:1]) // every
+    # The last range of each interval.
+    ends = np.flatnonzero(np.diff(number, append=number[-1:] + 1)) if len(number) else np.zeros(0, np.intp)
+    found = np.full((len(ends), count), np.nan)
+    for row in range(count):
+        own = np.flatnonzero(ranges.anchor == row)
+        before = np.searchsorted(own, ends, side="right") - 1
+        some = before >= 0
+        last = own[before[some]]
+        age = ranges.stamp_ns[ends[some]] - ranges.stamp_ns[last]
+        found[some, row] = np.where(age <= _FRESH_S * _SECOND_NS, ranges.range_m[last], np.nan)
+    return ranges.stamp_ns[ends], found

@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.anchors import AnchorMap
-from uwb_mitigation.positioning.geometry import Shape, shape
+from uwb_mitigation.positioning.geometry import Area, Height, Shape, shape
 from uwb_mitigation.positioning.locator import TagLocator, run_live
 from uwb_mitigation.positioning.model import Model
 from uwb_mitigation.positioning.smoother import Smoothed, Smoother
-from uwb_mitigation.positioning.start import Area, Height
 from uwb_mitigation.positioning.tracks import Heights, Ranges, Track
 
 MISPLACED_M = 0.3

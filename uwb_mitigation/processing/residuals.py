@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.positioning.anchors import AnchorMap
+from uwb_mitigation.positioning.geometry import Height
 from uwb_mitigation.positioning.model import Model
 from uwb_mitigation.positioning.smoother import Smoother
-from uwb_mitigation.positioning.start import Height
 from uwb_mitigation.positioning.tracks import Heights, Ranges, Track, TruePath
 from uwb_mitigation.processing.tracking import TagTracks
 

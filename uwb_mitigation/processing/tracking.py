@@ -19,14 +19,20 @@ from uwb_mitigation.bag.topics import (
 from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.errors import DatasetError, format_id
 from uwb_mitigation.positioning.anchors import AnchorMap
-from uwb_mitigation.positioning.geometry import Shape, geometry, shape
+from uwb_mitigation.positioning.geometry import Area, Height, Shape, geometry, shape
 from uwb_mitigation.positioning.locator import TagLocator, run_live
 from uwb_mitigation.positioning.model import Model
-from uwb_mitigation.positioning.smoothing import smooth
-from uwb_mitigation.positioning.snapshot import snapshot
-from uwb_mitigation.positioning.start import Area, Height
-from uwb_mitigation.positioning.track_errors import NO_ERRORS, TrackErrors, track_errors
-from uwb_mitigation.positioning.tracks import Estimate, Heights, Ranges, Track
+from uwb_mitigation.positioning.smoother import smooth
+from uwb_mitigation.positioning.start import snapshot
+from uwb_mitigation.positioning.tracks import (
+    NO_ERRORS,
+    Estimate,
+    Heights,
+    Ranges,
+    Track,
+    TrackErrors,
+    track_errors,
+)
 from uwb_mitigation.sources.recorded_ranges import TagRecording
 
 POOR_HDOP = 10.0

@@ -16,11 +16,10 @@ from uwb_mitigation.evaluation.site_data import SiteData
 from uwb_mitigation.model.bundle import Bundle
 from uwb_mitigation.model.float_networks import float_network
 from uwb_mitigation.offsets import Offsets
+from uwb_mitigation.positioning.geometry import Area, Height
 from uwb_mitigation.positioning.localised import PosePath, solve_localised
-from uwb_mitigation.positioning.regressors import NETWORK_SD, SLOPE_SD, Regressors
-from uwb_mitigation.positioning.scatter import MAD_TO_SD
+from uwb_mitigation.positioning.model import MAD_TO_SD, NETWORK_SD, SLOPE_SD, Regressors
 from uwb_mitigation.positioning.self_calibration import SelfCalibration, calibrate
-from uwb_mitigation.positioning.start import Area, Height
 from uwb_mitigation.training import site_model
 from uwb_mitigation.training.calibrated import Calibrated
 

@@ -1,0 +1,162 @@
+"""Weighted linear least squares over a chain of knots and a few unknowns that all knots share.
+
+A measurement is a sparse row: it depends on the unknowns of one knot or of two neighbours, and on shared ones. The normal
+equations are banded, with a border for the shared unknowns:
+
+    [ A   C ] [ x ]   [ h ]        A: (K b, K b), banded; C: (K b, q); G: (q, q)
+    [ C'  G ] [ t ] = [ g ]
+
+LAPACK's banded Cholesky factorisation solves A in K b^3 operations, and the Schur complement of A the rest.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.sparse import csr_matrix, vstack
+
+
+class LeastSquares:
+    """Collects the rows of a problem.
+
+    Args:
+        knots, unknowns, shared: K knots in the order of time, b unknowns of each, and q shared unknowns.
+    """
+
+    def __init__(self, knots: int, unknowns: int, shared: int) -> None:
+        self.knots, self.unknowns, self.shared = knots, unknowns, shared
+        self._jacobians: list[csr_matrix] = []
+        self._targets: list[NDArray[np.float64]] = []
+        self._weights: list[NDArray[np.float64]] = []
+
+    def of_knot(
+        self, knot: NDArray[np.intp] | int, unknown: NDArray[np.intp] | int | range
+    ) -> NDArray[np.intp]:
+        """Columns of unknowns of knots; the arguments are broadcast."""
+        return np.asarray(knot) * self.unknowns + np.asarray(unknown)
+
+    def of_shared(self, unknown: NDArray[np.intp] | int | range) -> NDArray[np.intp]:
+        """Columns of shared unknowns."""
+        return self.knots * self.unknowns + np.asarray(unknown)
+
+    def add(
+        self,
+        columns: NDArray[np.intp],
+        values: NDArray[np.float64],
+        target: NDArray[np.float64] | float,
+        weight: NDArray[np.float64] | float,
+    ) -> csr_matrix:
+        """Add n rows: values (n, c) at columns (n, c), targets (n,) and inverse variances (n,); all are broadcast.
+
+        Returns:
+            The rows as a sparse matrix, for `Solution.reduced`.
+        """
+        columns, values = np.broadcast_arrays(np.atleast_2d(columns), np.atleast_2d(values))
+        n, width = values.shape
+        jacobian = csr_matrix(
+            (values.reshape(-1), columns.reshape(-1), np.arange(0, n * width + 1, width)),
+            shape=(n, self.knots * self.unknowns + self.shared),
+        )
+        self._jacobians.append(jacobian)
+        self._targets.append(np.broadcast_to(np.asarray(target, np.float64), n))
+        self._weights.append(np.broadcast_to(np.asarray(weight, np.float64), n))
+        return jacobian
+
+    def add_prior(
+        self,
+        columns: NDArray[np.intp],
+        mean: NDArray[np.float64] | float,
+        information: NDArray[np.float64] | float,
+    ) -> None:
+        """Add independent priors of the unknowns at `columns`, with inverse variances."""
+        self.add(np.reshape(columns, (-1, 1)), np.ones((np.size(columns), 1)), mean, information)
+
+    def add_motion(self, knot: NDArray[np.intp], dt: NDArray[np.float64], axes: int, density: float) -> None:
+        """Connect knots (n,) to their successors by white acceleration.
+
+        Args:
+            dt: float64 (n,), s, positive.
+            axes: d: the first d unknowns of a knot are its position, the next d its velocity.
+            density: spectral density of the acceleration, m^2/s^3.
+        """
+        for axis in range(axes):
+            # p1 - p0 - (v0 + v1) dt / 2 and v1 - v0 are independent.
+            p, v = self.of_knot(knot, axis), self.of_knot(knot, axes + axis)
+            mean = np.stack([np.ones(len(dt)), -np.ones(len(dt)), -dt / 2.0, -dt / 2.0], axis=1)
+            columns = np.stack([p + self.unknowns, p, v, v + self.unknowns], axis=1)
+            self.add(columns, mean, 0.0, 12.0 / (density * dt**3))
+            self.add(
+                np.stack([v + self.unknowns, v], axis=1), np.array([1.0, -1.0]), 0.0, 1.0 / (density * dt)
+            )
+
+    def solve(self) -> Solution:
+        """Return the solution.
+
+        Raises:
+            numpy.linalg.LinAlgError: the rows do not determine it.
+        """
+        n, b, q = self.knots * self.unknowns, self.unknowns, self.shared
+        jacobian = vstack(self._jacobians, format="csr")
+        weighted = jacobian.T.multiply(np.concatenate(self._weights)).tocsr()
+        normal, right = weighted @ jacobian, weighted @ np.concatenate(self._targets)
+        band = np.zeros((2 * b, n))
+        a = normal[:n, :n]
+        for below in range(min(2 * b, n)):
+            band[below, : n - below] = a.diagonal(-below)
+        factor = cholesky_banded(band, lower=True, check_finite=False)
+        border = normal[:n, n:].toarray()
+        both = np.column_stack([right[:n], border])
+        solved = cho_solve_banded((factor, True), both, overwrite_b=True, check_finite=False)
+        x, y = solved[:, 0], solved[:, 1:]
+        schur = normal[n:, n:].toarray() - border.T @ y
+        covariance = np.linalg.inv((schur + schur.T) / 2.0) if q else np.zeros((0, 0))
+        t = covariance @ (right[n:] - border.T @ x)
+        return Solution((x - y @ t).reshape(self.knots, b), t, covariance, y, band)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """Attributes:
+    x: float64 (K, b). shared: (q,). shared_covariance: (q, q).
+    """
+
+    x: NDArray[np.float64]
+    shared: NDArray[np.float64]
+    shared_covariance: NDArray[np.float64]
+    _y: NDArray[np.float64]
+    _band: NDArray[np.float64]
+
+    def reduced(self, jacobian: csr_matrix) -> NDArray[np.float64]:
+        """Return the derivatives (n, q) of rows with respect to the shared unknowns, with the knots adapted to these."""
+        n = len(self._y)
+        found: NDArray[np.float64] = jacobian[:, n:].toarray() - jacobian[:, :n] @ self._y
+        return found
+
+    def covariances(self, first: int) -> NDArray[np.float64]:
+        """Return the marginal covariance of each knot's `first` unknowns, float64 (K, first, first).
+
+        The blocks of the inverse of a block-tridiagonal matrix come from a sweep in each direction. The border adds the
+        effect of the shared unknowns' covariance.
+        """
+        knots, b = self.x.shape
+        i, j = np.indices((b, b))
+        at = np.arange(knots)[:, None, None] * b
+        diagonal = self._band[np.abs(i - j), at + np.minimum(i, j)]
+        beside = self._band[b + j - i, at[:-1] + i]
+        ahead = np.zeros((knots, b, b))
+        for k in range(1, knots):
+            e = beside[k - 1]
+            ahead[k] = e.T @ np.linalg.solve(diagonal[k - 1] - ahead[k - 1], e)
+        found = np.empty((knots, first, first))
+        back = np.zeros((b, b))
+        for k in range(knots - 1, -1, -1):
+            found[k] = np.linalg.inv(diagonal[k] - ahead[k] - back)[:first, :first]
+            if k:
+                e = beside[k - 1]
+                back = e @ np.linalg.solve(diagonal[k] - back, e.T)
+        y = self._y.reshape(knots, b, -1)[:, :first]
+        found += np.einsum("kiq,qr,kjr->kij", y, self.shared_covariance, y)
+        return found
