@@ -311,7 +311,7 @@ def test_an_anchor_that_disagrees_with_all_others_is_named():
     assert locator.disagreeing() == [2]
 
 
-def test_heights_and_speeds_that_are_told_help():
+def test_measured_heights_reduce_the_covariance():
     ranges, truth = drive(seconds=20)
     spreads = []
     for told in (False, True):
@@ -320,10 +320,8 @@ def test_heights_and_speeds_that_are_told_help():
             estimate = locator.add(int(ranges.stamp_ns[i]), int(ranges.anchor[i]), float(ranges.range_m[i]))
             if told and i % 4 == 0:
                 locator.add_height(1.0, 0.01)
-                locator.add_speed(0.7, 0.01)
         spreads.append(estimate.covariance.diagonal())
     assert spreads[1][2] < 0.5 * spreads[0][2]
-    assert spreads[1][3:5].sum() < spreads[0][3:5].sum()
     assert np.abs(estimate.position - truth.position[-1]).max() < 0.4
 
 

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from drives import HALL, circuit, drive
-from uwb_mitigation.positioning.other_anchors import position_scatter
-from uwb_mitigation.positioning.rests import stretches
 
 from uwb_mitigation.errors import DatasetError
+from uwb_mitigation.positioning.anchor_errors import position_scatter
 from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
 from uwb_mitigation.positioning.geometry import Area, Height
+from uwb_mitigation.positioning.joint import stretches
 from uwb_mitigation.positioning.localised import PosePath, solve_localised
 from uwb_mitigation.positioning.model import SLOPE_SD, Model, Regressors
 from uwb_mitigation.positioning.self_calibration import calibrate
@@ -135,7 +135,7 @@ def test_tags_at_a_dozen_unknown_places_tell_offset_and_line():
 
 @pytest.mark.parametrize("heard", [1, 2])
 def test_one_tag_carried_from_place_to_place_rests_at_each(heard):
-    anchors, tags, _ = places_at_rest()
+    _, tags, _ = places_at_rest()
     order = np.repeat(np.arange(len(tags)), heard)
     carried = Ranges(
         np.concatenate([tags[n].stamp_ns + k * 60 * 10**9 for k, n in enumerate(order)])
@@ -147,45 +147,14 @@ def test_one_tag_carried_from_place_to_place_rests_at_each(heard):
         ),
         7,
     )
-    found = stretches([carried], anchors, LEVEL, Model())
+    found = stretches([carried])
     assert found.at_rest.tolist() == [True] * len(tags)
-
-
-def without_pause(rate_hz, heard, blocks, seed=3):
-    """One tag that was carried from place to place, as if no time had passed between them."""
-    anchors, tags, truth = places_at_rest(seed=seed)
-    rng = np.random.default_rng(seed)
-    anchor, value, power, place = [], [], [], []
-    for number, tag in enumerate(tags):
-        # Not every anchor is heard everywhere, so that where a place ends is not plain.
-        rows = np.flatnonzero(rng.random(len(tag)) > 0.1)
-        rows = np.repeat(rows, heard) if blocks else np.tile(rows, heard)
-        anchor.append(tag.anchor[rows])
-        value.append(tag.range_m[rows] + rng.normal(0.0, 0.01, len(rows)))
-        power.append(tag.rx_power_dbm[rows])
-        place.append(np.full(len(rows), number))
-    anchor, value, power, place = map(np.concatenate, (anchor, value, power, place))
-    stamp = np.rint(np.arange(len(anchor)) / rate_hz * 1e9).astype(np.int64)
-    return anchors, Ranges(stamp, anchor, value, np.full(len(anchor), np.nan), power, 7), place, truth
-
-
-@pytest.mark.parametrize(
-    ("rate_hz", "heard", "blocks"), [(10.0, 1, False), (0.02, 1, False), (10.0, 4, False), (2.0, 4, True)]
-)
-def test_places_are_told_without_a_pause_between_them(rate_hz, heard, blocks):
-    anchors, ranges, place, truth = without_pause(rate_hz, heard, blocks)
-    level = Regressors.one("level", ranges.rx_power_dbm + 88, 0.0, SLOPE_SD)
-    found = calibrate(anchors, [ranges], level, height=LEVEL)
-    assert found.stretches.at_rest.tolist() == [True] * len(truth)
-    assert (found.stretches.of == place[found.stretches.row]).mean() > 0.97
-    assert np.median(np.linalg.norm((found.fit.position - truth)[:, :2], axis=1)) < 0.1
-    assert found.value("offset")[0] == pytest.approx(0.1, abs=0.08)
 
 
 @pytest.mark.parametrize("rate_hz", [40.0, 10.0, 5.0, 2.0, 1.0])
 def test_a_drive_is_none_from_place_to_place(rate_hz):
     ranges, _ = drive(seconds=120, rate_hz=rate_hz)
-    assert not stretches([ranges], HALL, LEVEL, Model()).at_rest.any()
+    assert not stretches([ranges]).at_rest.any()
 
 
 def test_poses_of_recordings_that_overlap_are_in_the_order_of_time():
@@ -217,7 +186,7 @@ def test_a_rest_within_a_drive_is_one_place():
         return circuit(np.minimum(time_s, 20.0) + np.maximum(time_s - 40.0, 0.0))
 
     ranges, _ = drive(seconds=60, rate_hz=25.0, path=path, model=Model(range_sd=0.02))
-    found = stretches([ranges], HALL, LEVEL, Model())
+    found = stretches([ranges])
     assert found.at_rest.tolist() == [False, True, False]
     resting = found.ranges.stamp_ns[found.of == 1] / 1e9
     assert resting[0] == pytest.approx(20.0, abs=2.0)
@@ -419,7 +388,7 @@ def test_measured_heights_replace_a_constant_one():
 def test_positions_scatter_less_if_anchors_agree(solved):
     def scatter(offset_m):
         correction = np.asarray(offset_m)[solved.links.anchor]
-        return position_scatter(HALL, solved.links, solved.fit, correction, LEVEL, Model())
+        return position_scatter(solved.setting, solved.links, solved.fit, correction)
 
     assert scatter(OWN + 0.25) < 0.6 * scatter(np.full(5, 0.25)) < scatter(0.25 - OWN)
     raw, calibrated = solved.position_scatter_m

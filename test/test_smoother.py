@@ -5,41 +5,38 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from drives import HALL, block, drive
-from uwb_mitigation.positioning.chain import Chain
 
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
 from uwb_mitigation.positioning.geometry import Height
+from uwb_mitigation.positioning.least_squares import LeastSquares
 from uwb_mitigation.positioning.locator import TagLocator, run_live
-from uwb_mitigation.positioning.model import Model
-from uwb_mitigation.positioning.smoother import Parameters, Smoother, knots_of, smooth
+from uwb_mitigation.positioning.model import Model, Regressors
+from uwb_mitigation.positioning.smoother import Smoother, knots_of, smooth
 from uwb_mitigation.positioning.tracks import Ranges, Track, track_errors
 
 
-def test_a_chain_solves_as_a_dense_matrix_does():
+def test_least_squares_solves_as_a_dense_matrix_does():
     rng = np.random.default_rng(1)
     knots, b, q = 6, 3, 2
-    size = knots * b + q
-    rows = rng.normal(0, 1, (200, size))
-    for k in range(knots):  # each row touches two neighbouring knots and the border
-        rows[k::knots, : k * b] = 0
-        rows[k::knots, min(k + 2, knots) * b : knots * b] = 0
-    full, right = rows.T @ rows, rows.T @ rng.normal(0, 1, 200)
-    chain = Chain.empty(knots, b, q)
-    for k in range(knots):
-        here = slice(k * b, (k + 1) * b)
-        chain.diagonal[k], chain.border[k], chain.right[k] = full[here, here], full[here, -q:], right[here]
-        if k + 1 < knots:
-            chain.beside[k] = full[here, (k + 1) * b : (k + 2) * b]
-    chain.shared[:], chain.right_shared[:] = full[-q:, -q:], right[-q:]
-    solution = chain.solve()
-    wanted, inverse = np.linalg.solve(full, right), np.linalg.inv(full)
+    problem = LeastSquares(knots, b, q)
+    dense, target = np.zeros((200, knots * b + q)), rng.normal(0, 1, 200)
+    columns, values = np.zeros((200, 2 * b + q), int), rng.normal(0, 1, (200, 2 * b + q))
+    for n in range(200):  # each row has unknowns of two neighbouring knots and the shared ones
+        first = (n % (knots - 1)) * b
+        columns[n] = [*range(first, first + 2 * b), *range(knots * b, knots * b + q)]
+        dense[n, columns[n]] = values[n]
+    rows = problem.add(columns, values, target, 4.0)
+    solution = problem.solve()
+    inverse = np.linalg.inv(4.0 * dense.T @ dense)
+    wanted = inverse @ (4.0 * dense.T @ target)
     np.testing.assert_allclose(solution.x.reshape(-1), wanted[:-q], atol=1e-9)
     np.testing.assert_allclose(solution.shared, wanted[-q:], atol=1e-9)
     np.testing.assert_allclose(solution.shared_covariance, inverse[-q:, -q:], atol=1e-9)
-    for k, found in enumerate(solution.covariances()):
-        np.testing.assert_allclose(found, inverse[k * b : (k + 1) * b, k * b : (k + 1) * b], atol=1e-9)
-    np.testing.assert_allclose(solution.covariances(2), solution.covariances()[:, :2, :2], atol=1e-12)
+    for k, found in enumerate(solution.covariances(2)):
+        np.testing.assert_allclose(found, inverse[k * b : k * b + 2, k * b : k * b + 2], atol=1e-9)
+    adapted = dense[:, -q:] - dense[:, :-q] @ np.linalg.lstsq(dense[:, :-q], dense[:, -q:])[0]
+    np.testing.assert_allclose(solution.reduced(rows), adapted, atol=1e-9)
 
 
 def test_the_smoother_agrees_with_gtsam():
@@ -142,7 +139,7 @@ def test_parameters_that_ranges_share_are_found_with_the_track():
     power = np.random.default_rng(4).normal(0, 1, len(ranges))
     ranges.range_m[:] += 0.3 * power + 0.5 * (ranges.anchor == 3)
     rows = np.stack([power, ranges.anchor == 3], axis=1).astype(float)
-    wanted = Parameters(rows, np.zeros(2), np.array([1.0, 1.0]))
+    wanted = Regressors(("line", "anchor"), rows, np.zeros(2), np.ones(2), np.zeros(len(rows), int))
     found = Smoother(HALL, Model(), ranges, parameters=wanted).fit(
         Track(truth.stamp_ns, truth.position, *_nothing(len(truth)))
     )

@@ -198,7 +198,17 @@ def test_only_anchors_that_contradict_the_others_are_accused():
     assert track_tag(recording_of(wrong, truth), HALL, Model(), height).disagreeing == [2]
 
 
-def test_a_bad_geometry_and_failed_smoothing_are_reported(monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize("shift", [(1.0, 0.0, 0.0), (0.0, 0.0, 1.5)])
+def test_failed_smoothing_is_reported(monkeypatch: pytest.MonkeyPatch, shift: tuple[float, float, float]):
+    monkeypatch.setattr(
+        tracking, "smooth", lambda *given, **_: replace(given[3], position=given[3].position + shift)
+    )
+    ranges, truth = drive(seconds=10)
+    (warning,) = track_tag(recording_of(ranges, truth), HALL, Model()).warnings
+    assert "smoothing failed" in warning
+
+
+def test_a_bad_geometry_is_reported():
     near_line = HALL.moved(HALL.position * (1, 0.02, 0) + (0, -6, 1), HALL.sd)
     ranges, truth = drive(near_line, seconds=10)
     area = Area((-50, 0, 0), (50, 50, 3))
@@ -213,12 +223,6 @@ def test_a_bad_geometry_and_failed_smoothing_are_reported(monkeypatch: pytest.Mo
         area=Area((0, -5, 0), (200, 50, 3)),
     )
     assert "poor geometry" in found.warnings[0]
-    monkeypatch.setattr(
-        tracking, "smooth", lambda *given, **_: replace(given[3], position=given[3].position + 1.0)
-    )
-    ranges, truth = drive(seconds=10)
-    (warning,) = track_tag(recording_of(ranges, truth), HALL, Model(), Height(1.0)).warnings
-    assert "smoothing failed" in warning
 
 
 def test_topics_of_several_tags():

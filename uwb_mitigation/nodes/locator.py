@@ -30,8 +30,8 @@ from uwb_mitigation.nodes.conversions import to_header
 from uwb_mitigation.nodes.lifecycle import ManagedNode
 from uwb_mitigation.nodes.parameter_tables import LOCATOR
 from uwb_mitigation.positioning.fleet import Fleet, Tag
+from uwb_mitigation.positioning.geometry import Area, Height
 from uwb_mitigation.positioning.model import Model
-from uwb_mitigation.positioning.start import Area, Height
 from uwb_mitigation.positioning.tracks import Estimate
 from uwb_mitigation.sources.site import load_anchors
 

@@ -62,8 +62,8 @@ class FixedLag:
             self._states.append((stamp_ns, known.copy()))
         oldest = stamp_ns - round((LAG_S + _BEFORE_S + _EVERY_S) * _SECOND_NS)
         for kept in (self._states, self._ranges, self._heights):
-            while kept and kept[0][0] < oldest:  # type: ignore[index]
-                kept.popleft()  # type: ignore[attr-defined]
+            while kept and kept[0][0] < oldest:
+                kept.popleft()
 
     def clear(self) -> None:
         """Forget everything: the tag was lost."""

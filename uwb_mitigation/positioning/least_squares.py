@@ -36,11 +36,12 @@ class LeastSquares:
         self, knot: NDArray[np.intp] | int, unknown: NDArray[np.intp] | int | range
     ) -> NDArray[np.intp]:
         """Columns of unknowns of knots; the arguments are broadcast."""
-        return np.asarray(knot) * self.unknowns + np.asarray(unknown)
+        columns: NDArray[np.intp] = np.asarray(knot) * self.unknowns + np.asarray(unknown, np.intp)
+        return columns
 
     def of_shared(self, unknown: NDArray[np.intp] | int | range) -> NDArray[np.intp]:
         """Columns of shared unknowns."""
-        return self.knots * self.unknowns + np.asarray(unknown)
+        return self.knots * self.unknowns + np.asarray(unknown, np.intp)
 
     def add(
         self,

@@ -46,9 +46,6 @@ UNTOLD_M = 0.2
 SEVERAL = 3.0
 """An offset is subtracted only if it is at least this number of standard deviations away from zero."""
 
-HEIGHT_SD_M = 0.1
-"""Of a measured height."""
-
 MODEL = Model(long=1.5, short=1.5)
 """Once offsets and predictions are subtracted, errors are as often too long as too short. Different thresholds would bias
 the offsets."""
@@ -189,6 +186,7 @@ def calibrate(
     height: Height | None = None,
     area: Area | None = None,
     heights_m: NDArray[np.float64] | None = None,
+    height_sd_m: float = 0.1,
     model: Model | None = None,
 ) -> SelfCalibration:
     """Estimate tracks, offsets and regressors.
@@ -200,7 +198,8 @@ def calibrate(
         regressors: as many rows as there are ranges.
         height: of all tags, if constant.
         area: of the tags.
-        heights_m: float64 (r,), the measured height at each range, instead of `height`.
+        heights_m: float64 (r,), the measured height at each range, instead of `height`; `height_sd_m`: their standard
+            deviation.
 
     Raises:
         DatasetError: the geometry does not determine the solution; the message says what is missing.
@@ -208,7 +207,7 @@ def calibrate(
     model, tags = model or MODEL, list(tags)
     if heights_m is not None:
         # Initial positions are found with the median height.
-        height = Height(float(np.median(heights_m)), max(float(np.std(heights_m)), HEIGHT_SD_M))
+        height = Height(float(np.median(heights_m)), max(float(np.std(heights_m)), height_sd_m))
     setting = Setting(anchors, model, height, area)
     known = regressors or Regressors.none(sum(map(len, tags)))
     check_anchors(anchors, np.unique(np.concatenate([one.anchor for one in tags])), height, area)
@@ -223,7 +222,7 @@ def calibrate(
     position, placed = first_positions(setting, found, expected + offset)
     if heights_m is not None and height is not None:
         # The spread of the heights was for the initial positions: each height has the accuracy of its measurement.
-        setting = replace(setting, height=Height(height.value, HEIGHT_SD_M))
+        setting = replace(setting, height=Height(height.value, height_sd_m))
     if not placed.all():
         notes.append(
             f"{int((~placed).sum())} of {len(placed)} stretches left out: no position of the tag can be determined"

@@ -240,13 +240,13 @@ class Smoother:
         first = 0 if self._after is None else 1
         if p > first:
             own = slice(first, None)
-            mean, information = self._parameters.mean[own], self._parameters.information[own]
-            problem.add_prior(problem.of_shared(range(first, p)), mean, information)
+            prior = self._parameters.mean[own], self._parameters.information[own]
+            problem.add_prior(problem.of_shared(range(first, p)), *prior)
         if self._find:
-            mean = (self._around - self._known)[self._used].reshape(-1)
-            information = 1.0 / np.maximum(self._spread[self._used].reshape(-1), 1e-6) ** 2
-            at = problem.shared - 3 * m
-            problem.add_prior(problem.of_shared(range(at, problem.shared)), mean, information)
+            shift = (self._around - self._known)[self._used].reshape(-1)
+            sd = np.maximum(self._spread[self._used].reshape(-1), 1e-6)
+            columns = problem.of_shared(range(problem.shared - 3 * m, problem.shared))
+            problem.add_prior(columns, shift, 1.0 / sd**2)
         if self._heights is not None:
             value, variance = self._heights.at(self._origin_ns + self._knots_ns)
             known = np.flatnonzero(np.isfinite(value))
@@ -259,14 +259,14 @@ class Smoother:
             problem.add_prior(problem.of_knot(0, range(2 * d, 2 * d + m)), 0.0, 1.0 / self._persisting)
             return
         index = [*range(d), *range(3, 3 + d), *(FIRST_ERROR + self._used), OFFSET]
-        columns = [*problem.of_knot(0, range(2 * d + m)), problem.of_shared(0)]
-        mean = self._after.x.copy()
+        at = [*problem.of_knot(0, range(2 * d + m)), problem.of_shared(0)]
+        state = self._after.x.copy()
         if self._height is not None:
-            index, columns = [*index, 2], [*columns, problem.of_shared(p)]
-            mean[2] -= self._height.value
+            index, at = [*index, 2], [*at, problem.of_shared(p)]
+            state[2] -= self._height.value
         information = np.linalg.inv(self._after.p[np.ix_(index, index)] + 1e-9 * np.eye(len(index)))
         root = np.linalg.cholesky((information + information.T) / 2.0).T
-        problem.add(np.tile(columns, (len(index), 1)), root, root @ mean[index], 1.0)
+        problem.add(np.tile(at, (len(index), 1)), root, root @ state[index], 1.0)
 
 
 def smooth(

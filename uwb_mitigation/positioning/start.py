@@ -228,7 +228,8 @@ def snapshot(anchors: AnchorMap, ranges: Ranges, height: Height | None = None) -
         if height is not None:
             x[:, 2] = height.value
         x, cost, *_ = _descend(x, anchors.position, range_m, sd_m, _LEAST_SQUARES, prior)
-        better = cost < least
+        # Mirror images have equal costs: rounding must not choose between them.
+        better = cost < least - 1e-6
         best, least = np.where(better[:, None], x, best), np.where(better, cost, least)
     unknown = np.full((len(stamps), 6, 6), np.nan)
     return Track(stamps, best, unknown[:, 0, :3], unknown)

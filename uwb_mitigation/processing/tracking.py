@@ -40,9 +40,10 @@ CONTRADICTION_M = 0.4
 """NLOS errors of the other anchors move their track by up to about this much."""
 
 WORSE = 1.1
-LEAST_COVERAGE = 0.85
-"""Where the truth is known, smoothing has failed if its RMSE exceeds `WORSE` times the live one, or its 95 % ellipses
-contain a smaller share of the true positions than this."""
+MIN_COVERAGE = 0.85
+MIN_HEIGHT_RMSE_M = 0.1
+"""If the truth is known, smoothing has failed if its horizontal RMSE or that of the height exceeds `WORSE` times the live one
+(heights: and this minimum), or its 95 % ellipses contain a smaller share of the true positions than `MIN_COVERAGE`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,10 +112,15 @@ def track_tag(
             f"no position for {1.0 - share:.0%} of the ranges, because several positions explain them or too few anchors "
             "were received. Give a height or an area"
         )
-    if of_smoothed.rmse > WORSE * of_live.rmse or of_smoothed.coverage95 < LEAST_COVERAGE:
+    if (
+        of_smoothed.rmse > WORSE * of_live.rmse
+        or of_smoothed.height_rmse > WORSE * max(of_live.height_rmse, MIN_HEIGHT_RMSE_M)
+        or of_smoothed.coverage95 < MIN_COVERAGE
+    ):
         warnings.append(
-            f"smoothing failed: RMSE {of_smoothed.rmse:.3f} m (live {of_live.rmse:.3f} m), "
-            f"{of_smoothed.coverage95:.0%} of the true positions in the 95 % ellipses. Use the live track"
+            f"smoothing failed: RMSE {of_smoothed.rmse:.3f} m (live {of_live.rmse:.3f} m), height "
+            f"{of_smoothed.height_rmse:.3f} m (live {of_live.height_rmse:.3f} m), {of_smoothed.coverage95:.0%} of the true "
+            "positions in the 95 % ellipses. Use the live track"
         )
 
     def live_without(row: int) -> Track:
