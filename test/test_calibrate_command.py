@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from rosbags.typesys import Stores, get_typestore
 from uwb_mitigation.bag.poses import encode_odometry
 from uwb_mitigation.bag.topics import TF_TYPE
 from uwb_mitigation.bag.writer import BagWriter
+from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.measurement import Cir, RangeMeasurement, Record
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import load_bundle
@@ -150,6 +152,8 @@ def test_a_localisation_that_lags_tells_the_truth(site):
     assert done.returncode == 0, done.stderr
     result = json.loads((site / "o.json").read_text())
     assert result["truth"] == "/odom"
+    raw, calibrated = result["position_error_m"]
+    assert calibrated < 0.6 * raw
     assert result["localisation"]["time_offset_s"] == pytest.approx(0.3, abs=0.02)
     assert np.abs(np.array(result["localisation"]["lever_arm_m"]) - LEVER)[:2].max() < 0.05
     assert "with truth from /odom" in load_bundle(site / "odom.onnx").card.origin
@@ -158,35 +162,36 @@ def test_a_localisation_that_lags_tells_the_truth(site):
 
 
 @pytest.mark.parametrize("truth", [None, "/odom"])
-def test_offsets_are_found_without_the_stretches_that_are_held_out(site, truth, monkeypatch):
-    from uwb_mitigation.training import calibrating, site_model
+def test_offsets_are_found_without_the_segments_that_are_held_out(site, truth, monkeypatch):
+    from uwb_mitigation.training import selection
 
-    told = []
+    seen = []
 
-    def look(data, has_cirs, source, seed, on_share, *, offsets_without):
+    def look(data, candidates, seed, without_offsets_of, on_share):
         rows = np.arange(len(data))
         own = data.anchors == 2
-        told.append([offsets_without(rows[:0]), offsets_without(rows[own & (rows > len(rows) // 4)]), own])
-        return choose(data, has_cirs, source, seed, on_share, offsets_without=offsets_without)
+        some = rows[own & (rows > len(rows) // 4)]
+        seen.append([without_offsets_of(rows[:0]), without_offsets_of(some), own])
+        return choose(data, candidates, seed, without_offsets_of, on_share)
 
-    choose = site_model.choose
-    monkeypatch.setattr(calibrating.site_model, "choose", look)
+    choose = selection.select_for_site
+    monkeypatch.setattr(selection, "select_for_site", look)
     options = ("--truth-topic", truth, "--estimate-lever-arm") if truth else ()
     done = run("calibrate", "drive.mcap", *LEVEL, "-o", "w.onnx", "--force", *options, folder=site)
     assert done.returncode == 0, done.stderr
-    ((nothing, without, own),) = told
+    ((nothing, without, own),) = seen
     assert np.abs(nothing).max() < 2e-3
     assert np.abs(without[own]).max() > 3.0 * np.abs(nothing).max()
     assert np.abs(without).max() < 0.15
 
 
-def test_of_a_stretch_that_is_held_out_ranges_of_unknown_truth_are_too():
-    from uwb_mitigation.training.calibrating import _whole_stretch
+def test_ranges_of_unknown_truth_are_held_out_with_their_segment():
+    from uwb_mitigation.training.site_calibration import _whole_segments
 
-    stretch = np.array([0, 0, 0, 0, 0, 0, 1, 1, 1, 2, 2])
+    segment = np.array([0, 0, 0, 0, 0, 0, 1, 1, 1, 2, 2])
     labelled = np.array([1, 2, 4, 7, 8])
     for held_out, gone in (([1, 2], [0, 1, 2, 3]), ([4], [4, 5]), ([7, 8], [6, 7, 8]), ([], [])):
-        found = _whole_stretch(np.array(held_out, int), labelled, stretch)
+        found = _whole_segments(np.array(held_out, int), labelled, segment)
         assert np.flatnonzero(found).tolist() == gone
 
 
@@ -269,20 +274,6 @@ def test_the_lever_arm_is_the_transform_to_the_frame_of_the_ranges(site):
     assert "no transform" not in done.stderr
 
 
-def test_what_makes_positions_worse_is_refused(site, monkeypatch):
-    from uwb_mitigation.training.calibrated import Calibrated
-
-    before = Calibrated.__init__
-
-    def worse(self, *fields):
-        before(self, *fields[:-1], (0.2, 0.21))
-
-    monkeypatch.setattr(Calibrated, "__init__", worse)
-    done = run("calibrate", "drive.mcap", *LEVEL, "-o", "p.onnx", "--json", "p.json", folder=site)
-    assert done.returncode == 1
-    assert "not written" in json.loads((site / "p.json").read_text())["refused"]
-
-
 def test_what_is_refused_is_said_in_the_json_and_writes_nothing(site):
     done = run("calibrate", "short.mcap", *LEVEL, "-o", "short.onnx", "--json", "s.json", folder=site)
     assert done.returncode == 1
@@ -293,30 +284,120 @@ def test_what_is_refused_is_said_in_the_json_and_writes_nothing(site):
     assert not (site / "short.offsets.yaml").exists()
 
 
-def test_a_calibration_that_would_harm_is_written_by_force_only(site, monkeypatch):
-    from uwb_mitigation.training.calibrated import Calibrated
+def no_range_gain(fields):
+    chosen, n = fields["selection"].chosen, len(fields["data"])
+    return {"selection": replace(fields["selection"], errors={chosen: np.tile(fields["raw_m"], 2)[: 2 * n]})}
 
-    monkeypatch.setattr(Calibrated, "calibrated_mae_m", property(lambda self: self.raw_mae_m + 0.01))
-    options = ("drive.mcap", *LEVEL, "-o", "harm.onnx", "--json", "h.json")
-    done = run("calibrate", *options, folder=site)
-    assert done.returncode == 1
+
+def worse_scatter(fields):
+    return {"solution": replace(fields["solution"], position_scatter_m=(0.2, 0.21))}
+
+
+def worse_position(fields):
+    return {"position_error_m": (0.2, 0.21)}
+
+
+@pytest.mark.parametrize(
+    ("change", "options"), [(no_range_gain, ()), (worse_scatter, ()), (worse_position, WITH_TRUTH)]
+)
+def test_a_calibration_without_gain_is_written_by_force_only(site, monkeypatch, change, options):
+    from uwb_mitigation.training import site_calibration
+
+    make = site_calibration.Calibrated
+    monkeypatch.setattr(site_calibration, "Calibrated", lambda **fields: make(**fields | change(fields)))
+    words = ("drive.mcap", *LEVEL, *options, "-o", "harm.onnx", "--json", "h.json")
+    assert run("calibrate", *words, folder=site).returncode == 1
     assert "not written" in json.loads((site / "h.json").read_text())["refused"]
     assert not (site / "harm.onnx").exists()
-    assert run("calibrate", *options, "--force", folder=site).returncode == 0
-    assert (site / "harm.onnx").exists()
+    assert run("calibrate", *words, "--force", folder=site).returncode == 0
+    (site / "harm.onnx").unlink()
+    (site / "harm.offsets.yaml").unlink()
+
+
+def anchors_file(site, name, position):
+    from drives import HALL
+
+    save_anchors(site / name, HALL.moved(position, HALL.sd), force=True)
+    return ("--anchors", name, "--height", 1.0)
+
+
+@pytest.mark.parametrize("options", [WITH_TRUTH, (*WITH_TRUTH[:2], *WITH_TRUTH[4:])])
+@pytest.mark.parametrize(
+    ("move", "named"),
+    [
+        ((0, (1.5, 0.0, 0.0)), ["anchor 1"]),
+        ((3, (0.0, 1.0, 0.0)), ["anchor 4"]),
+        ((4, (-0.8, 0.8, 0.0)), ["anchor 5"]),
+        ((0, 2), ["anchors 1 and 3"]),
+        ((1, 4), ["anchors 2 and 5"]),
+    ],
+)
+def test_anchors_at_wrong_positions_are_named_with_truth_too(site, move, named, options):
+    from drives import HALL
+
+    position = HALL.position.copy()
+    if isinstance(move[1], int):
+        position[list(move)] = position[list(move)[::-1]]
+    else:
+        position[move[0]] += move[1]
+    where = anchors_file(site, "wrong.yaml", position)
+    words = ("calibrate", "drive.mcap", *where, *options, "-o", "wrong.onnx", "--json", "wrong.json")
+    # --force is for a calibration without gain only.
+    done = run(*words, "--force", folder=site)
+    assert done.returncode == 1
+    refused = json.loads((site / "wrong.json").read_text())["refused"]
+    assert all(name in refused for name in named), refused
+    assert not (site / "wrong.onnx").exists()
+
+
+def test_a_small_displacement_and_a_long_tail_accuse_no_anchor():
+    from drives import HALL
+
+    from uwb_mitigation.training.anchor_check import check_anchors
+
+    ranges, path = drive(seconds=80, rate_hz=20.0, offset_m=0.2)
+    rng = np.random.default_rng(4)
+    blocked = (ranges.anchor == 3) & (rng.random(len(ranges)) < 0.8)
+    tail = np.where(blocked, rng.exponential(1.0, len(ranges)), 0.0)
+    known = np.ones(len(ranges), bool)
+    for anchors, value in (
+        (HALL.moved(HALL.position + np.array([0.15, 0.0, 0.0]), HALL.sd), ranges.range_m),
+        (HALL, ranges.range_m + tail),
+    ):
+        site = SimpleNamespace(anchors=anchors, tags=(replace(ranges, range_m=value),))
+        check_anchors(site, path.position, known)
+
+
+def test_a_tag_has_the_body_of_its_own_frame_in_any_namespace():
+    from uwb_mitigation.commands.calibrate import _body
+
+    assert _body(7, ["left/tag_7", "left/tag_8"], "x") == "left/tag_7"
+    assert _body(7, ["base_link"], "x") == "base_link"
+    for names in (["tag_8"], ["base_link", "camera"], ["left/tag_7", "right/tag_7"]):
+        with pytest.raises(RecordingError):
+            _body(7, names, "x")
+
+
+def test_the_lever_arm_is_read_from_every_bag_and_must_be_the_same(site, monkeypatch):
+    from uwb_mitigation.bag import pose_paths
+    from uwb_mitigation.commands.calibrate import _lever_arm_in
+
+    arms = {"a": None, "b": (0.4, 0.1, 0.0), "c": (0.4, 0.1, 0.2)}
+    monkeypatch.setattr(pose_paths, "read_lever_arm", lambda bag, body, frame: arms[bag])
+    assert _lever_arm_in(["a", "b"], ["base_link"] * 2, ["antenna"]) == arms["b"]
+    assert _lever_arm_in(["a"], ["base_link"], ["antenna"]) is None
+    with pytest.raises(RecordingError):
+        _lever_arm_in(["b", "c"], ["base_link"] * 2, ["antenna"])
 
 
 def test_cirs_bring_the_universal_network_in(tmp_path, monkeypatch):
     """Without torch, whose candidate takes long: then it is said."""
-    import importlib.util
-
     from uwb_mitigation.model.float_networks import float_network
     from uwb_mitigation.model.shipped import default_model_path
-    from uwb_mitigation.training import site_model
-    from uwb_mitigation.training.site_model import network_m
+    from uwb_mitigation.training import candidates
+    from uwb_mitigation.training.candidates import network_m
 
-    monkeypatch.setattr(site_model.importlib.util, "find_spec", lambda name: None)
-    assert importlib.util is site_model.importlib.util
+    monkeypatch.setattr(candidates.importlib.util, "find_spec", lambda name: None)
     source = SimulatedSource.with_anchors(5, seed=4, count=1600, rate_hz=20.0)
     save_anchors(tmp_path / "anchors.yaml", source.anchors)
     with BagWriter(tmp_path / "drive.mcap", {"simulated": "true"}) as bag:

@@ -159,7 +159,19 @@ def test_train_without_a_prior_leaves_all_to_the_network(tmp_path, recording):
     pytest.importorskip("torch", reason="run `make setup-training`")
     path = tmp_path / "alone.onnx"
     result = run(
-        "train", "--data", "any", "-o", path, "--samples", 8, "--epochs", 1, "--folds", 2, "--no-prior"
+        "train",
+        "--data",
+        "any",
+        "-o",
+        path,
+        "--samples",
+        8,
+        "--epochs",
+        1,
+        "--folds",
+        2,
+        "--recipe",
+        "network",
     )
     assert result.exit_code == 0, result.output
     assert not load_bundle(path).prior.needs_power

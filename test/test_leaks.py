@@ -29,22 +29,25 @@ pytest.importorskip("sklearn", reason="run `make setup-training`")
 from uwb_mitigation.paper import experiment, learning_rate, pruning, search
 from uwb_mitigation.paper import parts as recordings
 from uwb_mitigation.paper.parts import Parts
-from uwb_mitigation.training import cards, choosing, comparison, recipe
+from uwb_mitigation.training import candidates, cards, comparison, fitting, selection, train
+from uwb_mitigation.training.candidates import Candidate, FittedModel, Recipe
 from uwb_mitigation.training.options import FitOptions
 
 SAMPLES = 8
 QUICK = FitOptions(epochs=1)
-RECIPE = recipe.Recipe(Remnet(SAMPLES, modules=1, filters=4), QUICK)
+RECIPE = Recipe(Remnet(SAMPLES, modules=1, filters=4), QUICK, QUICK)
 
 LEARNERS = {
     (comparison, "fit"),
     (comparison, "calibration_inputs"),
     (comparison, "quantize"),
-    (comparison.recipes, "fit_graded"),
-    (recipe, "fit"),
-    (recipe, "calibration_inputs"),
-    (recipe, "quantize"),
-    (recipe, "describe"),
+    (fitting, "fit"),
+    (candidates, "fit_own"),
+    (train, "fit_own"),
+    (train, "fit_with_card"),
+    (train, "calibration_inputs"),
+    (train, "quantize"),
+    (train, "describe"),
     (lad, "fit_prior"),
     (lad, "constant"),
     (baselines, "los_median"),
@@ -52,8 +55,7 @@ LEARNERS = {
     (baselines, "ridge"),
     (baselines, "gradient_boosting"),
     (cards, "calibrate"),
-    (experiment.fitting, "fit"),
-    (experiment.fitting, "descend"),
+    (fitting, "descend"),
     (experiment, "calibrate"),
     (experiment, "quantize"),
     (search, "fit"),
@@ -113,7 +115,7 @@ class Watch:
 
     def names_in(self, value: Any) -> set[str]:
         """The configurations that a learner's argument comes from."""
-        if isinstance(value, recipe.CrossValidation):
+        if isinstance(value, train.CrossValidation):
             value = value.dataset
         if isinstance(value, Dataset):
             return set(value.configurations.tolist())
@@ -144,7 +146,7 @@ def watch(data: Dataset, monkeypatch: pytest.MonkeyPatch) -> Watch:
         return watch.folds(divide(names, folds, seed), names)
 
     monkeypatch.setattr(splits, "by_configuration", by_configuration)
-    monkeypatch.setattr(choosing, "ALONE", QUICK)
+    monkeypatch.setattr(candidates, "ALONE", QUICK)
     return watch
 
 
@@ -155,20 +157,20 @@ def in_room_2(data: Dataset) -> NDArray[np.bool_]:
 def test_no_row_of_the_comparison_has_seen_what_it_is_tested_on(data, watch):
     comparison.run(data, RECIPE, Group.CONFIGURATION, folds=2, seeds=1)
     watch.called("baselines.los_median", "baselines.overall_median", "baselines.ridge")
-    watch.called("baselines.gradient_boosting", "recipe.fit_graded", "lad.fit_prior", "cards.calibrate")
+    watch.called("baselines.gradient_boosting", "train.fit_with_card", "lad.fit_prior", "cards.calibrate")
     watch.called("comparison.fit", "comparison.calibration_inputs", "comparison.quantize")
 
 
 def test_cross_validation_fits_and_calibrates_without_the_fold(data, watch):
-    found = recipe.cross_validate(data, RECIPE, 3, 0)
-    watch.called("recipe.fit", "recipe.calibration_inputs", "recipe.quantize", "lad.fit_prior")
+    found = train.cross_validate(data, RECIPE, 3, 0)
+    watch.called("fitting.fit", "train.calibration_inputs", "train.quantize", "lad.fit_prior")
     for split in splits.by_configuration(data.configurations, 3, 0):
         expected = data.error_m[split.test] - np.median(data.error_m[split.train])
         assert np.allclose(found.errors["overall_median"][split.test], expected)
 
 
 def test_a_choice_is_told_by_folds_that_had_no_say_in_it(data, watch, monkeypatch):
-    prefer = choosing.preferred
+    prefer = selection.preferred
     nested = []
 
     def preferred(errors: dict[str, NDArray[np.float64]], must_gain: float) -> str:
@@ -178,27 +180,26 @@ def test_a_choice_is_told_by_folds_that_had_no_say_in_it(data, watch, monkeypatc
             assert nested[-1] == {int((~np.isin(data.configurations, list(held_out))).sum())}
         return prefer(errors, must_gain)
 
-    monkeypatch.setattr(choosing, "preferred", preferred)
-    candidates = choosing.standard(RECIPE, QUICK)
-    choosing.choose(data, [candidates[0], candidates[2]], 3, 0)
+    monkeypatch.setattr(selection, "preferred", preferred)
+    own = candidates.own_models(RECIPE)
+    selection.select_nested(data, [own[0], own[2]], 3, 0)
     assert nested
-    watch.called("lad.constant", "recipe.fit")
+    watch.called("lad.constant", "fitting.fit")
 
 
 def test_the_learning_curve_is_told_on_configurations_that_it_is_not_fitted_to(data, monkeypatch):
     fitted: list[set[str]] = []
-    predict = choosing.prior_m
 
-    def fit(part: Dataset, seed: int) -> choosing.Fitted:
+    def fit(part: Dataset, seed: int) -> FittedModel:
         fitted.append(set(part.names))
-        return lad.constant(part.configurations, part.error_m), None
+        return FittedModel(lad.constant(part.configurations, part.error_m))
 
-    def prior_m(prior: Any, part: Dataset) -> NDArray[np.float32]:
+    def correction_m(model: FittedModel, part: Dataset) -> NDArray[np.float64]:
         assert not fitted[-1] & set(part.names)
-        return predict(prior, part)
+        return np.full(len(part), model.prior.offset_m)
 
-    monkeypatch.setattr(choosing, "prior_m", prior_m)
-    choosing.choose(data, [choosing.Candidate("constant", fit)], 3, 0)
+    monkeypatch.setattr(FittedModel, "correction_m", correction_m)
+    selection.select_nested(data, [Candidate("constant", fit)], 3, 0)
     assert fitted
 
 

@@ -41,7 +41,7 @@ from uwb_mitigation.sources.simulated import SimulatedSource
 from uwb_mitigation.sources.simulation.buildings import RADIO
 from uwb_mitigation.sources.simulation.scene import ANCHORS, FLAT, MORE_ANCHORS, ROUTE
 from uwb_mitigation.sources.simulation.sites import draw_site
-from uwb_mitigation.training import calibrated, calibrating, making
+from uwb_mitigation.training import site_calibration, train
 
 UNSEEN = 7_000_000
 """Added to the seed of a building: the universal model's begin at 0 and at 1 000 003."""
@@ -115,14 +115,11 @@ def trained(records: list[Record], universal: Bundle, folder: Path) -> Bundle:
     """What `train --data` makes of the drive's true ranges, a configuration a metre and pair as the simulator names."""
     dataset = build_dataset(records, universal.preprocessing)
     from uwb_mitigation.model.architecture import Remnet
-    from uwb_mitigation.training.choosing import ALONE
     from uwb_mitigation.training.options import FitOptions
-    from uwb_mitigation.training.recipe import Recipe
+    from uwb_mitigation.training.candidates import Recipe
 
     recipe = Recipe(Remnet(samples=universal.preprocessing.samples), FitOptions())
-    return making.of_recipe(
-        dataset, "drive", recipe, ALONE, "auto", folder / "trained.onnx", 4, lambda what, share: None
-    ).bundle
+    return train.train_own(train.Job(dataset, "drive", folder / "trained.onnx", 4), recipe).bundle
 
 
 def one(seed: int, seconds: float, truth_topic: bool, with_train: bool, flat: bool) -> dict[str, object]:
@@ -147,26 +144,30 @@ def one(seed: int, seconds: float, truth_topic: bool, with_train: bool, flat: bo
             [np.zeros_like(heading), np.zeros_like(heading), np.sin(heading / 2), np.cos(heading / 2)], axis=1
         )
         path = PosePath(stamps + round(LAG_S * 1e9), frame + noise, quaternion)
-        found = calibrating.with_truth(
+        found = site_calibration.with_truth(
             site, universal, [[path]], "/odom", time_offset_s=None, estimate_lever_arm=True, seed=0
         )
     else:
-        found = calibrating.without_truth(site, universal, height=height, area=None, seed=0)
+        found = site_calibration.without_truth(site, universal, height=height, area=None, seed=0)
     took = time.perf_counter() - began
     test = list(other)
-    off = np.array([found.pair_m[101, k + 1][0] for k in range(anchors) if (101, k + 1) in found.pair_m])
-    sd = np.array([found.pair_m[101, k + 1][1] for k in range(anchors) if (101, k + 1) in found.pair_m])
-    true = np.array([drive.offset_m[k] for k in range(anchors) if (101, k + 1) in found.pair_m])
+    off = np.array(
+        [found.solution.pairs[101, k + 1][0] for k in range(anchors) if (101, k + 1) in found.solution.pairs]
+    )
+    sd = np.array(
+        [found.solution.pairs[101, k + 1][1] for k in range(anchors) if (101, k + 1) in found.solution.pairs]
+    )
+    true = np.array([drive.offset_m[k] for k in range(anchors) if (101, k + 1) in found.solution.pairs])
     known = Offsets(pairs={(101, k + 1): off for k, off in enumerate(drive.offset_m.tolist())})
     with tempfile.TemporaryDirectory() as folder:
-        bundle, _ = calibrated.write(Path(folder) / "site.onnx", found, universal, "drive")
+        bundle, _ = found.write(Path(folder) / "site.onnx", universal, "drive")
         row: dict[str, object] = {
             "seed": seed,
             "anchors": anchors,
             "size_m": list(drive.plan.size),
             "walls": len(drive.plan.walls),
-            "chosen": found.choice.chosen,
-            "level": found.level,
+            "chosen": found.selection.chosen,
+            "level": found.solution.level,
             "seconds": took,
             "raw_mae": error_of(test, None, NO_OFFSETS),
             "calibrated_mae": error_of(test, bundle, found.offsets),
@@ -179,11 +180,11 @@ def one(seed: int, seconds: float, truth_topic: bool, with_train: bool, flat: bo
             "in_two_sd": float((np.abs(off - true) <= 2.0 * sd).mean()),
             "sd": float(sd.mean()),
         }
-        if found.localised is not None:
-            row["time_offset_error"] = found.localised.time_offset_s - LAG_S
-            row["lever_error"] = (found.localised.lever_arm_m[0] - LEVER_M).tolist()
-            row["time_offset_sd"] = found.localised.time_offset_sd_s
-            row["lever_sd"] = found.localised.lever_arm_sd_m[0].tolist()
+        if found.solution.localised is not None:
+            row["time_offset_error"] = found.solution.localised.time_offset_s - LAG_S
+            row["lever_error"] = (found.solution.localised.lever_arm_m[0] - LEVER_M).tolist()
+            row["time_offset_sd"] = found.solution.localised.time_offset_sd_s
+            row["lever_sd"] = found.solution.localised.lever_arm_sd_m[0].tolist()
         if with_train:
             bundle = trained(records, universal, Path(folder))
             row["trained_mae"] = error_of(test, bundle, NO_OFFSETS)
@@ -208,14 +209,14 @@ def speed(minutes: float) -> dict[str, object]:
     drive = Drive(1, 0, 6, 60.0 * minutes)
     site = gather([drive], drive.anchors, universal.preprocessing)
     began, cpu = time.perf_counter(), time.process_time()
-    found = calibrating.without_truth(site, universal, height=Height(0.0, 0.05), area=None, seed=0)
+    found = site_calibration.without_truth(site, universal, height=Height(0.0, 0.05), area=None, seed=0)
     return {
         "minutes": minutes,
         "ranges": sum(map(len, site.tags)),
         "seconds": time.perf_counter() - began,
         "cpu_seconds": time.process_time() - cpu,
         "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-        "chosen": found.choice.chosen,
+        "chosen": found.selection.chosen,
     }
 
 

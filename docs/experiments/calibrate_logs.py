@@ -35,17 +35,17 @@ from uwb_mitigation.positioning.smoother import Smoother
 from uwb_mitigation.positioning.tracks import Ranges, track_errors
 from uwb_mitigation.sources.decaranging import DecaRangingFolder
 from uwb_mitigation.sources.hanyang import ANTENNA_M, HanyangRun
-from uwb_mitigation.training import calibrated
-from uwb_mitigation.training.calibrated import Calibrated
-from uwb_mitigation.training.calibrating import without_truth
+from uwb_mitigation.training.site_calibration import Calibrated, without_truth
 
 HEIGHT = Height(ANTENNA_M, 0.2)
 
 
 def told(found: Calibrated) -> None:
     print(found.sentence())
-    print({f"{tag}-{anchor}": f"{v:.3f}+-{sd:.3f}" for (tag, anchor), (v, sd) in found.pair_m.items()})
-    print(found.choice.prior, found.notes)
+    print(
+        {f"{tag}-{anchor}": f"{v:.3f}+-{sd:.3f}" for (tag, anchor), (v, sd) in found.solution.pairs.items()}
+    )
+    print(found.selection.model.prior, found.notes)
 
 
 def hanyang(folder: Path, name: str) -> None:
@@ -61,7 +61,7 @@ def hanyang(folder: Path, name: str) -> None:
         ids = np.array([anchor.id for anchor in anchors.anchors], np.uint64)
         off = found.offsets.of(np.full(len(ranges), ranges.tag_id), ids[ranges.anchor]).astype(float)
         first = np.array([record.measurement.cir.first_path_power_dbm for record in test])
-        line = found.choice.prior.predict_m(ranges.rx_power_dbm, first).astype(float)
+        line = found.selection.model.prior.predict_m(ranges.rx_power_dbm, first).astype(float)
         less = off + np.where(np.isfinite(line), line, 0.0)
         for kind, value in (("raw", ranges.range_m), ("calibrated", np.maximum(ranges.range_m - less, 0.0))):
             shifted = Ranges(ranges.stamp_ns, ranges.anchor, value, ranges.variance_m2, ranges.rx_power_dbm)
@@ -97,16 +97,16 @@ def harm(folder: Path) -> None:
                 print(row + f"refused: {error}", flush=True)
                 continue
             with tempfile.TemporaryDirectory() as temporary:
-                bundle, _ = calibrated.write(Path(temporary) / "site.onnx", found, source, path.name)
+                bundle, _ = found.write(Path(temporary) / "site.onnx", source, path.name)
             mae, rmse, _ = _against_truth(run, part, bundle, found.offsets, height)
             covered = [
                 abs(value - true[run.anchors.index[anchor]]) <= 2.0 * sd
-                for (_, anchor), (value, sd) in found.pair_m.items()
+                for (_, anchor), (value, sd) in found.solution.pairs.items()
             ]
             print(
                 row
                 + f"calibrated MAE {mae:.3f} m, live RMSE {rmse:.3f} m; {'refused' if found.harms else 'written'}; offsets "
-                f"{[f'{value:.2f} +- {sd:.2f}' for value, sd in found.pair_m.values()]}, median errors "
+                f"{[f'{value:.2f} +- {sd:.2f}' for value, sd in found.solution.pairs.values()]}, median errors "
                 f"{[f'{value:.2f}' for value in true]}, {sum(covered)} of {len(covered)} within two standard deviations"
                 + "".join(f"; {note}" for note in found.notes),
                 flush=True,
@@ -155,7 +155,7 @@ def apartment(folder: Path) -> None:
     off = found.offsets.of(data.tags, data.anchors).astype(float)
     # What is held out is told against the track: so much further is the truth.
     pseudo = data.range_m - data.error_m
-    left = found.choice.held_out[found.choice.chosen] + pseudo - distance
+    left = found.held_out_m + pseudo - distance
     known = np.isfinite(distance)
     raw = (data.range_m + off - distance)[known]
     print(

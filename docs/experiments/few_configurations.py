@@ -16,10 +16,9 @@ from uwb_mitigation.model.runtime import Session
 from uwb_mitigation.model.shipped import default_model_path
 from uwb_mitigation.preprocessing import Preprocessing
 from uwb_mitigation.sources.decaranging import DecaRangingFolder
-from uwb_mitigation.training import choosing, cold_start
-from uwb_mitigation.training.choosing import line
+from uwb_mitigation.training import candidates, selection
+from uwb_mitigation.training.candidates import Recipe, prior_m
 from uwb_mitigation.training.options import FitOptions
-from uwb_mitigation.training.recipe import Recipe, prior_m
 
 data = build_dataset(DecaRangingFolder(Path(sys.argv[1])), Preprocessing())
 data = data.rows(np.isfinite(data.rx_power_dbm - data.first_path_power_dbm))
@@ -31,7 +30,7 @@ for count in (6, 9, 12, 15, 18, 21):
         seen = np.isin(data.configurations, generator.permutation(data.names)[:count])
         train, test, names = data.rows(seen), data.rows(~seen), data.configurations[seen]
         constant = lad.constant(names, train.error_m).offset_m
-        own_line = prior_m(line(train), test)
+        own_line = prior_m(candidates.fit_line(train), test)
         network = network_m[~seen] + lad.constant(names, train.error_m - network_m[seen]).offset_m
         predicted = (constant, own_line, network, (own_line + network) / 2)
         maes.append([np.abs(test.error_m - values).mean() for values in predicted])
@@ -39,8 +38,9 @@ for count in (6, 9, 12, 15, 18, 21):
     print(count, *table.mean(axis=0).round(3), f"{np.mean(table[:, 3] < table[:, 1]):.0%}")
 
 # Of all of them, by 6 folds of placements, what `train` chooses from; networks that are trained on them are left out.
-plain = [item for item in choosing.standard(Recipe(Remnet(), FitOptions())) if not item.trains]
-choice = choosing.choose(data, cold_start.offered(plain, data, load_bundle(default_model_path())), 6, 0)
+plain = [item for item in candidates.own_models(Recipe(Remnet(), FitOptions())) if not item.trains]
+offered = candidates.with_cold_start(plain, data, load_bundle(default_model_path()))
+choice = selection.select_nested(data, offered, 6, 0)
 print({name: round(mae, 3) for name, mae in choice.mae().items()})
 is_27 = data.configurations == "evk1000_apartment/27"
 print(

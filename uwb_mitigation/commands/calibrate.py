@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -29,9 +30,10 @@ if TYPE_CHECKING:
     from uwb_mitigation.model.bundle import Bundle
     from uwb_mitigation.positioning.anchors import AnchorMap
     from uwb_mitigation.positioning.localised import PosePath
-    from uwb_mitigation.training.calibrated import Calibrated
+    from uwb_mitigation.training.site_calibration import Calibrated
 
 MOST_SHOWN = 40
+SAME_ARM_M = 0.01
 BASE_FRAME = "base_link"
 """The robot's frame if the poses do not name it."""
 
@@ -107,7 +109,7 @@ def calibrate(
     ] = None,
     seed: Annotated[int, typer.Option(help="Of what is held out, and of a network that is tuned.")] = 0,
     force: Annotated[
-        bool, typer.Option("--force", help="Replace what exists, and write even what makes ranges worse.")
+        bool, typer.Option("--force", help="Replace existing files, and write a calibration without gain.")
     ] = False,
     json: JsonOption = None,
 ) -> None:
@@ -122,11 +124,10 @@ def calibrate(
     """
     from uwb_mitigation.commands.bundles import bundle_for
     from uwb_mitigation.sources.site import anchors_file, load_anchors
-    from uwb_mitigation.training import calibrated, calibrating
+    from uwb_mitigation.training import site_calibration
 
     check_output(output)
-    beside = calibrated.offsets_file(output)
-    for file in (output, beside, *([report] if report else [])):
+    for file in (output, site_calibration.offsets_file(output), *([report] if report else [])):
         if file.exists() and not force:
             raise ParameterError("exists already", where=str(file), valid="--force replaces it")
     with_poses = (frames, time_offset, lever_arm, estimate_lever_arm or None)
@@ -136,11 +137,10 @@ def calibrate(
         )
     if height is not None and height_topic is not None:
         raise ParameterError("--height and --height-topic", valid="one of them")
-    if not abs(stamp_offset) <= 3600.0:
-        raise ParameterError(f"stamp offset {stamp_offset}", valid="-3600 to 3600 s")
-    place, box, arm = height_of(height, height_sd), area_of(area), _lever_arm(lever_arm)
-    if time_offset is not None and not abs(time_offset) <= 3600.0:
-        raise ParameterError(f"time offset {time_offset}", valid="-3600 to 3600 s")
+    for what, seconds in (("stamp offset", stamp_offset), ("time offset", time_offset)):
+        if seconds is not None and not abs(seconds) <= 3600.0:
+            raise ParameterError(f"{what} {seconds}", valid="-3600 to 3600 s")
+    at_height, box, arm = height_of(height, height_sd), area_of(area), _lever_arm(lever_arm)
     known = load_anchors(anchors or anchors_file(bags[0]))
     source = bundle_for(None, bags[0])
     try:
@@ -151,12 +151,12 @@ def calibrate(
             _warn(f"left out: {count} x {why}")
         with console.stage_bars() as on_progress:
             if truth_topic is None:
-                found = calibrating.without_truth(
-                    site, source, height=place, area=box, seed=seed, on_progress=on_progress
+                found = site_calibration.without_truth(
+                    site, source, height=at_height, area=box, seed=seed, on_progress=on_progress
                 )
             else:
                 paths, arms = _poses(bags, site, truth_topic, frames, arm)
-                found = calibrating.with_truth(
+                found = site_calibration.with_truth(
                     site,
                     source,
                     paths,
@@ -168,22 +168,26 @@ def calibrate(
                     on_progress=on_progress,
                 )
     except DatasetError as error:
-        console.write_json(json, _refused(str(error), truth_topic))
+        # --force does not override this: the anchors, the offsets or the geometry are wrong.
+        refused: dict[str, object] = {"offsets_m": {}, "raw_mae_m": None, "calibrated_mae_m": None}
+        console.write_json(json, refused | {"truth": truth_topic or "none", "refused": str(error)})
         raise
     _show(found)
     if found.harms and not force:
         harm = DatasetError(
-            f"not written: held-out ranges err by {found.calibrated_mae_m:.3f} m after calibration, by "
-            f"{found.raw_mae_m:.3f} m before; positions scatter by {found.position_scatter_m[1]:.3f} m and "
-            f"{found.position_scatter_m[0]:.3f} m" + "".join(f"; {note}" for note in found.notes[:1]),
+            f"not written: {found.sentence()}" + "".join(f" {note}." for note in found.notes[:1]),
             valid="a longer drive, or --force",
         )
         console.write_json(json, found.as_json() | {"refused": str(harm)})
         raise harm
     name = ", ".join(bag.resolve().name for bag in bags)
     if report is not None:
-        _write_report(report, found, name)
-    bundle, beside = calibrated.write(output, found, source, name)
+        from uwb_mitigation.files import write_whole
+        from uwb_mitigation.training.site_page import site_page
+
+        write_whole(report, site_page(found, name))
+        console.out.print(f"Wrote {report}.", markup=False, soft_wrap=True)
+    bundle, beside = found.write(output, source, name)
     console.out.print(
         f"Wrote {output} (model {bundle.model_id:08x}) and {beside}.", markup=False, soft_wrap=True
     )
@@ -201,9 +205,8 @@ def _gather(
 
     heights = None if height_topic is None else [read_heights(bag, height_topic) for bag in bags]
     with ExitStack() as stack, console.reading() as on_record:
-        recordings = [stack.enter_context(open_recording(bag)) for bag in bags]
         return gather(
-            recordings,
+            [stack.enter_context(open_recording(bag)) for bag in bags],
             anchors,
             source.preprocessing,
             on_record,
@@ -219,11 +222,11 @@ def _poses(
     frames: tuple[str, str] | None,
     arm: tuple[float, float, float] | None,
 ) -> tuple[list[list[PosePath]], NDArray[np.float64]]:
-    """The poses of the body that carries each tag, for each bag; and the lever arms (T, 3)."""
+    """For each tag, the poses of the body that carries it in each bag; and the lever arms, (T, 3)."""
     import numpy as np
 
-    from uwb_mitigation.bag.pose_paths import read_bodies, read_lever_arm
-    from uwb_mitigation.bag.poses import UWB_TAG, tag_frame, tag_of_frame
+    from uwb_mitigation.bag.pose_paths import read_bodies
+    from uwb_mitigation.bag.poses import UWB_TAG, tag_of_frame
 
     if arm is not None and len(site.tags) > 1:
         raise ParameterError(
@@ -233,44 +236,59 @@ def _poses(
     bodies = [read_bodies(bag, topic, frames) for bag in bags]
     paths, arms = [], np.zeros((len(site.tags), 3))
     for number, tag in enumerate(site.tags):
-        own, body = [], ""
-        for bag, known in zip(bags, bodies, strict=True):
-            body = tag_frame(tag.tag_id)
-            if body not in known:
-                # Poses of another tag's own frame are no poses of a robot that carries this tag.
-                others = list(known)
-                if len(others) != 1 or tag_of_frame(others[0]) is not None:
-                    raise RecordingError(
-                        f"no body for tag {format_id(tag.tag_id)}: poses of {', '.join(sorted(known))}",
-                        where=f"{bag}, topic {topic}",
-                        valid=f"--frames MAP CHILD, or poses of {body}",
-                    )
-                body = others[0]
-            own.append(known[body])
-        paths.append(own)
+        names = [
+            _body(tag.tag_id, known, f"{bag}, topic {topic}") for bag, known in zip(bags, bodies, strict=True)
+        ]
+        paths.append([known[name] for name, known in zip(names, bodies, strict=True)])
         if arm is not None:
             arms[number] = arm
-        elif body not in (tag_frame(tag.tag_id), UWB_TAG):
-            found = [read_lever_arm(bags[0], body or BASE_FRAME, frame) for frame in site.frames[tag.tag_id]]
-            known_arms = [one for one in found if one is not None]
-            if known_arms:
-                arms[number] = known_arms[0]
-            else:
+        elif tag_of_frame(names[0]) is None and names[0].rpartition("/")[2] != UWB_TAG:
+            found = _lever_arm_in(bags, names, site.frames[tag.tag_id])
+            arms[number] = found or (0.0, 0.0, 0.0)
+            if found is None:
                 _warn(
-                    f"tag {format_id(tag.tag_id)}: no transform from {body or BASE_FRAME} to its antenna in the bag, so that the lever "
-                    "arm is 0; set --lever-arm"
+                    f"tag {format_id(tag.tag_id)}: no transform from {names[0] or BASE_FRAME} to its antenna in the bag, so "
+                    "that the lever arm is 0; set --lever-arm"
                 )
     return paths, arms
 
 
-def _refused(why: str, truth: str | None) -> dict[str, object]:
-    return {
-        "offsets_m": {},
-        "raw_mae_m": None,
-        "calibrated_mae_m": None,
-        "truth": truth or "none",
-        "refused": why,
-    }
+def _body(tag_id: int, bodies: Iterable[str], where: str) -> str:
+    """The body that carries a tag: its own frame in any namespace, otherwise the only body that is no tag."""
+    from uwb_mitigation.bag.poses import tag_frame, tag_of_frame
+
+    names = sorted(bodies)
+    own = [name for name in names if tag_of_frame(name) == tag_id]
+    # Poses of another tag's own frame are not those of a robot that carries this tag.
+    if len(own) != 1 and not (len(names) == 1 and tag_of_frame(names[0]) is None):
+        raise RecordingError(
+            f"{'several bodies' if own else 'no body'} for tag {format_id(tag_id)}: poses of {', '.join(names)}",
+            where=where,
+            valid=f"--frames MAP CHILD, or poses of {tag_frame(tag_id)}",
+        )
+    return own[0] if own else names[0]
+
+
+def _lever_arm_in(
+    bags: list[Path], bodies: list[str], frames: Iterable[str]
+) -> tuple[float, float, float] | None:
+    """The transform from the robot to the antenna, from the bags that contain it; None: no bag does."""
+    from uwb_mitigation.bag.pose_paths import read_lever_arm
+
+    read = [
+        (bag, read_lever_arm(bag, body or BASE_FRAME, frame))
+        for bag, body in zip(bags, bodies, strict=True)
+        for frame in frames
+    ]
+    found = [(bag, arm) for bag, arm in read if arm is not None]
+    for bag, arm in found[1:]:
+        if math.dist(arm, found[0][1]) > SAME_ARM_M:
+            raise RecordingError(
+                f"the lever arm differs from that in {found[0][0]}",
+                where=str(bag),
+                valid="--lever-arm, or bags with the antenna at one position",
+            )
+    return found[0][1] if found else None
 
 
 def _lever_arm(text: str | None) -> tuple[float, float, float] | None:
@@ -286,48 +304,36 @@ def _lever_arm(text: str | None) -> tuple[float, float, float] | None:
 
 
 def _show(found: Calibrated) -> None:
-    from uwb_mitigation.commands.console import Table
+    from uwb_mitigation.commands.model_tables import say, show_table
 
-    if found.localised is not None:
-        one = found.localised
-        console.out.print(
-            f"time offset {one.time_offset_s:.3f} +- {one.time_offset_sd_s:.3f} s", highlight=False
-        )
+    solution = found.solution
+    if solution.localised is not None:
+        one = solution.localised
+        say(f"time offset {one.time_offset_s:.3f} +- {one.time_offset_sd_s:.3f} s")
         for ranges, arm, arm_sd in zip(found.site.tags, one.lever_arm_m, one.lever_arm_sd_m, strict=True):
             known = ", ".join(
                 f"{value:.3f}" + ("" if sd == 0.0 or math.isnan(sd) else f" +- {sd:.3f}")
                 for value, sd in zip(arm.tolist(), arm_sd.tolist(), strict=True)
             )
-            console.out.print(f"tag {format_id(ranges.tag_id)}: lever arm {known} m", highlight=False)
-    table = Table("tag", "anchor", "offset m", "deviation m", title="Offsets", title_justify="left")
-    for column in table.columns[2:]:
-        column.justify = "right"
-    for (tag, anchor), (value, sd) in list(found.pair_m.items())[:MOST_SHOWN]:
-        table.add_row(str(tag), str(anchor), f"{value:.3f}", f"{sd:.3f}")
-    console.out.print(table)
-    if len(found.pair_m) > MOST_SHOWN:
-        console.out.print(f"and {len(found.pair_m) - MOST_SHOWN} pairs more")
-    table = Table("model", "MAE m", title="On stretches and anchors held out", title_justify="left")
-    table.columns[1].justify = "right"
-    table.add_row("raw", f"{found.raw_mae_m:.3f}")
-    for name, mae in found.choice.mae().items():
-        chosen = name == found.choice.chosen
-        table.add_row(name + (" (chosen)" if chosen else ""), f"{mae:.3f}", style="bold" if chosen else None)
-    console.out.print(table)
+            say(f"tag {format_id(ranges.tag_id)}: lever arm {known} m")
+    rows = [(format_id(tag), format_id(anchor), *own) for (tag, anchor), own in solution.pairs.items()]
+    columns = ("tag", "anchor", "offset m", "standard deviation m")
+    show_table("Offsets", columns, rows[:MOST_SHOWN])
+    if len(rows) > MOST_SHOWN:
+        say(f"and {len(rows) - MOST_SHOWN} pairs more")
+    chosen = found.selection.chosen
+    errors = {"raw": found.raw_mae_m, **found.selection.mae()}
+    show_table(
+        "On held-out segments and anchors",
+        ("model", "MAE m", ""),
+        [(name, mae, "<-" if name == chosen else "") for name, mae in errors.items()],
+        chosen,
+    )
     for note in found.notes:
         _warn(note)
-    if found.outliers:
-        _warn(f"{found.outliers} outliers left out of all figures")
-    console.out.print(found.sentence(), markup=False, highlight=False, soft_wrap=True)
-
-
-def _write_report(path: Path, found: Calibrated, name: str) -> None:
-    from uwb_mitigation.evaluation.site_page import site_page
-    from uwb_mitigation.files import write_whole
-    from uwb_mitigation.training.calibrated import shown
-
-    write_whole(path, site_page(shown(found, name)))
-    console.out.print(f"Wrote {path}.", markup=False, soft_wrap=True)
+    if solution.outliers:
+        _warn(f"{solution.outliers} outliers left out of all figures")
+    say(found.sentence())
 
 
 def _warn(text: str) -> None:

@@ -30,7 +30,6 @@ _OF_DATA = {
     "scaling": "--scaling",
     "first_kernel": "--first-kernel",
     "per_configuration": "--per-configuration",
-    "prior": "--prior/--no-prior",
 }
 _OF_CROSS_VALIDATION = {"seeds": "--seeds", "folds": "--folds", "scaling": "--scaling"}
 
@@ -79,9 +78,6 @@ def train(
     ] = 20,
     seed: Annotated[int, typer.Option(help="Of the split, the weights and the order.")] = 0,
     folds: Annotated[int, typer.Option(help="Folds of the cross-validation.")] = 6,
-    prior: Annotated[
-        bool, typer.Option("--prior/--no-prior", help="With --data: --no-prior is --recipe network.")
-    ] = True,
     json: JsonOption = None,
 ) -> None:
     """Train what the data can carry: a float bundle.
@@ -115,27 +111,25 @@ def train(
     architecture = Remnet(samples=samples, first_kernel=first_kernel)
     check_output(output)
     with needs_torch():
-        from uwb_mitigation.training import choosing, making
-        from uwb_mitigation.training.recipe import Recipe
+        from uwb_mitigation.training import candidates, fitting  # noqa: F401
+        from uwb_mitigation.training import train as training
 
-    if from_bag is not None:
-        source = bundle_for(model, from_bag)
-        name, dataset = _dataset(from_bag, source.preprocessing, truth or ())
-        with console.stage_bars() as on_progress:
-            made = making.of_another(
-                dataset, name, source, options, output, folds, on_progress, offer_cold_start=model is None
-            )
-    else:
-        assert data is not None
-        if choose not in (making.AUTO, *choosing.STANDARD):
-            raise ParameterError(f"recipe {choose!r}", valid=", ".join((making.AUTO, *choosing.STANDARD)))
-        choose = choose if prior else choosing.NETWORK
-        recipe = Recipe(architecture, options, per_configuration=per_configuration)
-        alone = replace(choosing.ALONE, **asked)
-        name, dataset = _dataset(data, Preprocessing(samples, chosen_scaling))
-        with console.stage_bars() as on_progress:
-            made = making.of_recipe(dataset, name, recipe, alone, choose, output, folds, on_progress)
-    model_tables.show_made(made)
+    if data is not None and choose not in (training.AUTO, *candidates.OWN):
+        raise ParameterError(f"recipe {choose!r}", valid=", ".join((training.AUTO, *candidates.OWN)))
+    recording = data or from_bag
+    assert recording is not None
+    source = None if from_bag is None else bundle_for(model, from_bag)
+    preprocessing = Preprocessing(samples, chosen_scaling) if source is None else source.preprocessing
+    name, dataset = _dataset(recording, preprocessing, truth or ())
+    with console.stage_bars() as on_progress:
+        job = training.Job(dataset, name, output, folds, on_progress)
+        if source is None:
+            alone = replace(candidates.ALONE, **asked)
+            recipe = candidates.Recipe(architecture, options, alone, per_configuration=per_configuration)
+            made = training.train_own(job, recipe, choose)
+        else:
+            made = training.train_from_bundle(job, source, options, offer_cold_start=model is None)
+    model_tables.show_trained(made)
     console.write_json(json, made.as_json())
 
 
@@ -158,13 +152,13 @@ def quantize(
     The scales of its activations come from the data it was trained on, or calibrated with.
     """
     from uwb_mitigation.model.bundle import load_bundle
-    from uwb_mitigation.training import parts, quantization
+    from uwb_mitigation.training import quantization, recordings
 
     source = load_bundle(model)
     quantization.check(source, percentile)
     check_output(output)
     with console.reading() as on_record:
-        dataset = parts.load_inputs(data, source.preprocessing, on_record)
+        dataset = recordings.load_inputs(data, source.preprocessing, on_record)
     console.show_refused(dataset.refused)
     made = quantization.quantize_bundle(source, dataset, percentile, output)
     bundle, difference = made.bundle, made.difference_m
@@ -227,7 +221,7 @@ def evaluate(
     mitigation = Mitigation(bundle_for(model, data), read_offsets(offsets or ""))
     with open_recording(data) as source, console.reading() as on_record:
         result = accuracy.evaluate(mitigation, source, on_record)
-    model_tables.show_outcome(result)
+    model_tables.show_accuracy(result)
     console.write_json(json, result.as_json())
 
 
@@ -248,7 +242,7 @@ def _compare(data: Path, group: str, folds: int, seeds: int, scaling: Scaling, j
 
     with needs_torch():
         from uwb_mitigation.training import comparison
-        from uwb_mitigation.training.recipe import Recipe
+        from uwb_mitigation.training.candidates import Recipe
 
     _, dataset = _dataset(data, Preprocessing(Remnet().samples, scaling))
     universal = load_bundle(default_model_path(scaling))
@@ -262,10 +256,10 @@ def _compare(data: Path, group: str, folds: int, seeds: int, scaling: Scaling, j
 
 def _dataset(data: Path, preprocessing: Preprocessing, truth: Sequence[Path] = ()) -> tuple[str, Dataset]:
     """The recording's name, and its measurements; tells what is left out."""
-    from uwb_mitigation.training import parts
+    from uwb_mitigation.training import recordings
 
     with console.reading() as on_record:
-        name, dataset = parts.load(data, preprocessing, truth, on_record)
+        name, dataset = recordings.load(data, preprocessing, truth, on_record)
     console.show_refused(dataset.refused)
     return name, dataset
 

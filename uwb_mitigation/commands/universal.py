@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -14,9 +13,6 @@ from uwb_mitigation.commands import console, model_tables
 from uwb_mitigation.commands.checks import check_output, needs_torch, scaling_of
 from uwb_mitigation.commands.console import JsonOption
 from uwb_mitigation.errors import ParameterError
-
-if TYPE_CHECKING:
-    from uwb_mitigation.evaluation.metrics import ErrorStatistics
 
 MOST_BLOCKS = 10_000
 
@@ -78,7 +74,7 @@ def train_universal(
     if float_output is not None:
         save_bundle(float_output, graph.float_model(made.network), replace(made.card, name=float_output.stem))
     bundle = save_bundle(output, graph.int8_model(made.integers), replace(made.card, quantised=True))
-    _show(made.held_out)
+    model_tables.show_held_out(made.held_out)
     model_tables.show_bundle(bundle)
     console.write_json(
         json,
@@ -92,15 +88,3 @@ def train_universal(
             },
         },
     )
-
-
-def _show(held_out: Mapping[str, Mapping[str, ErrorStatistics]]) -> None:
-    from uwb_mitigation.commands.console import Table
-
-    table = Table(title="MAE in a simulated world that was held out, m", title_justify="left")
-    table.add_column("")
-    for label in held_out["raw"]:
-        table.add_column(label, justify="right")
-    for row, by in held_out.items():
-        table.add_row(row, *(f"{statistics.mae:.3f}" for statistics in by.values()))
-    console.out.print(table)

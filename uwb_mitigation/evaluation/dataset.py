@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,11 @@ from uwb_mitigation.measurement import Record
 from uwb_mitigation.preprocessing import CirFault, Preprocessing
 
 _BATCH = 256
+
+_COLUMNS = (
+    *("inputs", "rx_power_dbm", "first_path_power_dbm", "range_m", "error_m", "configurations", "labels"),
+    *("headers", "tags", "anchors"),
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,34 +60,23 @@ class Dataset:
 
     def rows(self, chosen: NDArray[np.intp] | NDArray[np.bool_]) -> Dataset:
         """The part with these rows."""
-        return Dataset(
-            self.preprocessing,
-            self.inputs[chosen],
-            self.rx_power_dbm[chosen],
-            self.first_path_power_dbm[chosen],
-            self.range_m[chosen],
-            self.error_m[chosen],
-            self.configurations[chosen],
-            self.labels[chosen],
-            headers=None if self.headers is None else self.headers[chosen],
-            tags=None if self.tags is None else self.tags[chosen],
-            anchors=None if self.anchors is None else self.anchors[chosen],
-        )
+        columns = {name: getattr(self, name) for name in _COLUMNS}
+        part: dict[str, Any] = {
+            name: None if values is None else values[chosen] for name, values in columns.items()
+        }
+        return replace(self, refused={}, **part)
+
+    def shifted(self, by_m: NDArray[np.float64]) -> Dataset:
+        """The same with ranges, and so errors, that are longer by `by_m`, shape (n,)."""
+        return replace(self, range_m=self.range_m + by_m, error_m=self.error_m + by_m)
 
     @classmethod
     def joined(cls, parts: Sequence[Dataset]) -> Dataset:
-        """All rows of one or more parts with the same preprocessing, one after the other; without headers and
-        identities."""
-        return cls(
-            parts[0].preprocessing,
-            np.concatenate([part.inputs for part in parts]),
-            np.concatenate([part.rx_power_dbm for part in parts]),
-            np.concatenate([part.first_path_power_dbm for part in parts]),
-            np.concatenate([part.range_m for part in parts]),
-            np.concatenate([part.error_m for part in parts]),
-            np.concatenate([part.configurations for part in parts]),
-            np.concatenate([part.labels for part in parts]),
-        )
+        """All rows of one or more parts with the same preprocessing, one after the other; without headers and ids."""
+        columns: dict[str, Any] = {
+            name: np.concatenate([getattr(part, name) for part in parts]) for name in _COLUMNS[:7]
+        }
+        return cls(parts[0].preprocessing, **columns)
 
     @property
     def names(self) -> list[str]:

@@ -70,16 +70,16 @@ class SiteData:
         self,
         rows: NDArray[np.intp],
         true_m: NDArray[np.float64],
-        offset_m: NDArray[np.float64],
         stretch: NDArray[np.intp],
         at_rest: NDArray[np.bool_],
     ) -> Dataset:
-        """A dataset whose errors are those of ranges less their radios' offset, float64 (k,) each.
+        """A dataset of some ranges.
 
         Args:
-            rows: which of all ranges.
-            stretch: int (k,), of motion or rest; `at_rest`: bool (k,). A configuration is a pair at rest, or a pair for
-                `CHUNK_S` of motion; its name begins with what is held out together, "stretch 3.1/".
+            rows: indices, (k,), into the ranges of all tags. true_m: (k,), their true ranges.
+            stretch: int (k,), segment of the track. at_rest: bool (k,), whether the tag is stationary. A configuration is a
+                pair while the tag is stationary, or for `CHUNK_S` of motion. Its name begins with what is held out
+                together: "stretch 3.1/".
         """
         every = {
             name: np.concatenate([getattr(one, name) for one in self.tags])[rows]
@@ -96,14 +96,13 @@ class SiteData:
             for s, f, c, t, a in zip(stretch, fold, chunk, tag, every["anchor"], strict=True)
         ]
         identities = np.array([anchor.id for anchor in self.anchors.anchors], np.uint64)
-        less = every["range_m"] - offset_m
         return Dataset(
             self.preprocessing,
             self.inputs[rows],
             self.rx_power_dbm[rows],
             self.first_path_power_dbm[rows],
-            less,
-            less - true_m,
+            every["range_m"],
+            every["range_m"] - true_m,
             np.array(names),
             np.full(len(rows), ""),
             tags=tag,

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.evaluation.dataset import Dataset
 from uwb_mitigation.mitigation import Grader
-from uwb_mitigation.model.bundle import Bundle
+from uwb_mitigation.model.bundle import Bundle, Card
 from uwb_mitigation.model.runtime import Session
 
 LOS = "LOS"
@@ -38,16 +38,17 @@ class ZeroShot:
     passed: NDArray[np.bool_]
 
 
-def run(dataset: Dataset, bundle: Bundle) -> ZeroShot:
-    """Correct a dataset that is preprocessed as for `bundle`.
+@dataclass(frozen=True, slots=True, eq=False)
+class Graded:
+    """What a model makes of its predictions: corrections (0 where it passes a range through) and variances, each (n,)."""
 
-    The offset of a pair of boards is a median over placements of what is left in them: errors of one placement
-    are not independent.
+    correction_m: NDArray[np.float32]
+    variance_m2: NDArray[np.float32]
+    passed: NDArray[np.bool_]
 
-    Raises:
-        ModelError: ONNX Runtime refuses the bundle's network.
-    """
-    card = bundle.card
+
+def grade(dataset: Dataset, card: Card, predicted_m: NDArray[np.float32]) -> Graded:
+    """Apply the limits, the OOD score and the variances of a card to predictions, shape (n,)."""
     grader = Grader(card)
     score = grader.score(
         dataset.inputs,
@@ -55,13 +56,25 @@ def run(dataset: Dataset, bundle: Bundle) -> ZeroShot:
         dataset.rx_power_dbm,
         dataset.first_path_power_dbm,
     )
-    prior = card.prior.predict_m(dataset.rx_power_dbm, dataset.first_path_power_dbm)
-    predicted = (prior + Session(bundle).predict_m(dataset.inputs)).astype(np.float32)
-    corrects = grader.passes(predicted, score)
+    corrects = grader.passes(predicted_m, score)
     with np.errstate(invalid="ignore"):
-        correction, spread = grader.grade(predicted, score)
-    left = dataset.error_m - np.where(corrects, correction, 0.0)
-    variance = np.where(corrects, spread, np.float32(card.variance_uncorrected_m2))
+        correction, variance = grader.grade(predicted_m, score)
+    uncorrected = np.float32(card.variance_uncorrected_m2)
+    return Graded(np.where(corrects, correction, 0.0), np.where(corrects, variance, uncorrected), ~corrects)
+
+
+def run(dataset: Dataset, bundle: Bundle) -> ZeroShot:
+    """Correct a dataset that is preprocessed as for `bundle`.
+
+    The offset of a pair of boards is a median over placements: errors of one placement are not independent.
+
+    Raises:
+        ModelError: ONNX Runtime refuses the bundle's network.
+    """
+    prior = bundle.card.prior.predict_m(dataset.rx_power_dbm, dataset.first_path_power_dbm)
+    predicted = (prior + Session(bundle).predict_m(dataset.inputs)).astype(np.float32)
+    graded = grade(dataset, bundle.card, predicted)
+    left = dataset.error_m - graded.correction_m
 
     names, of = np.unique(dataset.configurations, return_inverse=True)
     means = np.bincount(of, left) / np.bincount(of)
@@ -69,4 +82,5 @@ def run(dataset: Dataset, bundle: Bundle) -> ZeroShot:
     los_offset = float(np.median(means[is_los])) if is_los.any() else 0.0
     others = np.array([np.median(np.delete(means, k)) if len(means) > 1 else 0.0 for k in range(len(means))])
     errors = dict(zip(NAMES, (left, left - los_offset, left - others[of]), strict=True))
-    return ZeroShot(errors, los_offset, variance, card.interval95_sigmas, ~corrects)
+    sigmas95 = bundle.card.interval95_sigmas
+    return ZeroShot(errors, los_offset, graded.variance_m2, sigmas95, graded.passed)

@@ -1,1 +1,1 @@
-"""Fitting and quantising the model. Of the whole package only `networks`, `augmentation` and `fitting` here import torch."""
+"""Select, fit and quantise models. Only `networks`, `augmentation` and `fitting` import torch at the top."""

@@ -1,4 +1,4 @@
-"""Every row that the shipped recipe is measured against, on the same splits: `evaluate --cross-validate`."""
+"""The rows that the shipped recipe is compared with, on the same splits: `evaluate --cross-validate`."""
 
 from __future__ import annotations
 
@@ -12,42 +12,32 @@ from uwb_mitigation.evaluation import baselines, lad, splits, zero_shot
 from uwb_mitigation.evaluation.dataset import Dataset
 from uwb_mitigation.evaluation.metrics import bootstrap_interval, coverage, kept_mae
 from uwb_mitigation.evaluation.splits import Group
-from uwb_mitigation.mitigation import Grader
-from uwb_mitigation.model import floating
 from uwb_mitigation.model.architecture import Mlp, Remnet
 from uwb_mitigation.model.bundle import Bundle
 from uwb_mitigation.model.integer import IntegerNetwork
-from uwb_mitigation.training import choosing
-from uwb_mitigation.training import recipe as recipes
+from uwb_mitigation.training import candidates, train
+from uwb_mitigation.training.candidates import Recipe, network_m, prior_m
 from uwb_mitigation.training.fitting import fit
 from uwb_mitigation.training.quantization import calibration_inputs, quantize
-from uwb_mitigation.training.recipe import Recipe
 
 INNER_FOLDS = 4
-"""Of the training part, to calibrate intervals with: what calibrates them must be held out too."""
+"""Folds of the training part that calibrate the intervals, on configurations that are held out in turn."""
 
 REJECTED = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
 
 NAMES = (
-    "raw",
-    "los_median",
-    "overall_median",
-    "ridge",
-    "ridge_header",
-    "gradient_boosting",
-    "l1_line",
-    "mlp",
-    "remnet_float",
-    "remnet_int8",
-    "shipped_float",
-    "shipped_int8",
+    *("raw", "los_median", "overall_median", "ridge", "ridge_header", "gradient_boosting", "l1_line", "mlp"),
+    *("remnet_float", "remnet_int8", "shipped_float", "shipped_int8"),
 )
-"""The rows of the table, in its order; those of `zero_shot.NAMES` stand behind them."""
+"""The rows of the table, in its order; those of `zero_shot.NAMES` follow."""
+
+Coverage = Mapping[str, tuple[float, float]]
+"""{label, or "" for all: shares of the errors within the 68 % and the 95 % intervals}."""
 
 
 @dataclass(frozen=True, slots=True)
 class ErrorRow:
-    """One row of the table: {label: MAE}, m, mean over seeds; the interval is of the first seed's errors."""
+    """One row of the table: MAE, m, mean and standard deviation over seeds; `ci95` from the errors of the first seed."""
 
     name: str
     mae_mean: float
@@ -60,29 +50,33 @@ class ErrorRow:
 class Comparison:
     """Attributes:
     rows: of the table.
-    coverage68, coverage95: shares of the shipped recipe's errors within the intervals it promised, over seeds.
-    coverage_by_label: {label: (68 %, 95 %)}.
+    coverage: of the shipped recipe, over seeds.
     rejection: (share rejected, MAE of the rest), the ranges with the largest variance first.
     passed_through: share of held-out ranges that the shipped recipe does not correct.
     group, folds, seeds, configurations: of the splits.
-    universal_coverage: {label, or "" for all: shares of the errors of `universal_los_offset` within the intervals that
-        were promised (68 %, 95 %)}; None without a universal model.
+    universal_coverage: of `universal_los_offset`; None without a universal model.
     """
 
     rows: tuple[ErrorRow, ...]
-    coverage68: float
-    coverage95: float
-    coverage_by_label: Mapping[str, tuple[float, float]]
+    coverage: Coverage
     rejection: tuple[tuple[float, float], ...]
     passed_through: float
     group: Group
     folds: int
     seeds: int
     configurations: int
-    universal_coverage: Mapping[str, tuple[float, float]] | None = None
+    universal_coverage: Coverage | None = None
 
     def as_json(self) -> dict[str, object]:
         """The result of `uwb-mitigation evaluate --cross-validate`."""
+
+        def table(coverage: Coverage) -> dict[str, dict[str, float]]:
+            return {
+                label: {"coverage68": narrow, "coverage95": wide}
+                for label, (narrow, wide) in coverage.items()
+            }
+
+        universal, (narrow, wide) = self.universal_coverage, self.coverage[""]
         return {
             "split": f"{self.folds} splits by {self.group.value}",
             "seeds": self.seeds,
@@ -97,26 +91,20 @@ class Comparison:
                 }
                 for row in self.rows
             ],
-            "coverage68": self.coverage68,
-            "coverage95": self.coverage95,
-            "coverage_by_label": {
-                label: {"coverage68": narrow, "coverage95": wide}
-                for label, (narrow, wide) in self.coverage_by_label.items()
-            },
+            "coverage68": narrow,
+            "coverage95": wide,
+            "coverage_by_label": {label: row for label, row in table(self.coverage).items() if label},
             "rejection": [{"rejected": share, "mae": mae} for share, mae in self.rejection],
             "passed_through": self.passed_through,
             "universal_coverage": None
-            if self.universal_coverage is None
-            else {
-                label or "all": {"coverage68": narrow, "coverage95": wide}
-                for label, (narrow, wide) in self.universal_coverage.items()
-            },
+            if universal is None
+            else {label or "all": row for label, row in table(universal).items()},
         }
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Held:
-    """What one seed's folds left of every measurement: errors by row, and the variance that was promised."""
+class _HeldOut:
+    """The errors that the folds of one seed leave, by row, and the variances that were promised, each (n,)."""
 
     errors: Mapping[str, NDArray[np.float64]]
     variance_m2: NDArray[np.float64]
@@ -133,118 +121,109 @@ def run(
     on_fold: Callable[[], None] = lambda: None,
     universal: Bundle | None = None,
 ) -> Comparison:
-    """Fit every row anew for each fold and each seed, and test it on configurations that it has not seen; beside
-    them, a model that is not fitted to any of the data, where it reads such inputs.
+    """Fit every row for each fold and each seed, and test it on held-out configurations.
+
+    `universal` adds a model that is not fitted to the data, if it reads such inputs.
 
     Raises:
-        DatasetError, ParameterError: see `splits.by_group` and `fit`.
-        MissingDependencyError: scikit-learn is not installed.
+        DatasetError, ParameterError: see `splits.by_group` and `fit`. MissingDependencyError: no scikit-learn.
     """
     known = np.isfinite(dataset.rx_power_dbm) & np.isfinite(dataset.first_path_power_dbm)
     dataset = dataset.rows(known) if known.any() else dataset
     held = [_hold_out(dataset, recipe, group, folds, seed, on_fold) for seed in range(seeds)]
-    labels = list(dict.fromkeys(dataset.labels.tolist()))
     found = {name: np.array([part.errors[name] for part in held]) for name in NAMES}
     unfitted = None
     if universal is not None and universal.preprocessing == dataset.preprocessing:
         unfitted = zero_shot.run(dataset, universal)
         found |= {name: error[None] for name, error in unfitted.errors.items()}
+    labels = list(dict.fromkeys(dataset.labels.tolist()))
     rows = []
     for name, errors in found.items():
         maes = np.abs(errors).mean(axis=1)
-        rows.append(
-            ErrorRow(
-                name,
-                float(maes.mean()),
-                float(maes.std()),
-                {label: float(np.abs(errors[:, dataset.labels == label]).mean()) for label in labels},
-                bootstrap_interval(errors[0], dataset.configurations),
-            )
-        )
+        by_label = {label: float(np.abs(errors[:, dataset.labels == label]).mean()) for label in labels}
+        interval = bootstrap_interval(errors[0], dataset.configurations)
+        rows.append(ErrorRow(name, float(maes.mean()), float(maes.std()), by_label, interval))
     final = np.array([part.errors["shipped_int8"] for part in held])
     variance = np.array([part.variance_m2 for part in held])
     wide = variance * np.array([part.sigmas95 for part in held]) ** 2
-
-    def covered(chosen: NDArray[np.bool_]) -> tuple[float, float]:
-        left = final[:, chosen]
-        return coverage(left, variance[:, chosen], 1.0), coverage(left, wide[:, chosen], 1.0)
-
-    every = covered(np.ones(len(dataset), np.bool_))
     return Comparison(
-        tuple(rows),
-        *every,
-        {label: covered(dataset.labels == label) for label in labels},
-        tuple((share, kept_mae(final.ravel(), variance.ravel(), share)) for share in REJECTED),
-        float(np.mean([part.passed for part in held])),
-        group,
-        len(splits.by_group(dataset, group, folds, 0)),
-        seeds,
-        len(dataset.names),
-        None if unfitted is None else _unfitted_coverage(unfitted, dataset),
+        rows=tuple(rows),
+        coverage=_coverage(dataset.labels, final, variance, wide),
+        rejection=tuple((share, kept_mae(final.ravel(), variance.ravel(), share)) for share in REJECTED),
+        passed_through=float(np.mean([part.passed for part in held])),
+        group=group,
+        folds=len(splits.by_group(dataset, group, folds, 0)),
+        seeds=seeds,
+        configurations=len(dataset.names),
+        universal_coverage=None
+        if unfitted is None
+        else _coverage(
+            dataset.labels,
+            unfitted.errors["universal_los_offset"][None],
+            unfitted.variance_m2[None].astype(np.float64),
+            unfitted.variance_m2[None].astype(np.float64) * unfitted.sigmas95**2,
+        ),
     )
 
 
-def _unfitted_coverage(unfitted: zero_shot.ZeroShot, dataset: Dataset) -> dict[str, tuple[float, float]]:
-    left, covered = unfitted.errors["universal_los_offset"], {}
-    for label in ("", *dict.fromkeys(dataset.labels.tolist())):
-        rows = (dataset.labels == label) | (label == "")
-        covered[label] = (
-            coverage(left[rows], unfitted.variance_m2[rows], 1.0),
-            coverage(left[rows], unfitted.variance_m2[rows], unfitted.sigmas95),
+def _coverage(
+    labels: NDArray[np.str_],
+    error_m: NDArray[np.float64],
+    variance_m2: NDArray[np.float64],
+    wide_m2: NDArray[np.float64],
+) -> Coverage:
+    """Coverage by label (n,) of errors (seeds, n) and their variances."""
+    found = {}
+    for label in ("", *dict.fromkeys(labels.tolist())):
+        own = (labels == label) | (label == "")
+        found[label] = (
+            coverage(error_m[:, own], variance_m2[:, own], 1.0),
+            coverage(error_m[:, own], wide_m2[:, own], 1.0),
         )
-    return covered
+    return found
 
 
 def _hold_out(
     dataset: Dataset, recipe: Recipe, group: Group, folds: int, seed: int, on_fold: Callable[[], None]
-) -> _Held:
+) -> _HeldOut:
     recipe = replace(recipe, fit=replace(recipe.fit, seed=seed))
     errors = {name: dataset.error_m.copy() for name in NAMES}
     variance, sigmas95 = np.empty(len(dataset)), np.empty(len(dataset))
     passed = np.zeros(len(dataset), np.bool_)
-    for split in splits.by_group(dataset, group, folds, seed):
-        train, test = dataset.rows(split.train), dataset.rows(split.test)
-        for name, predicted in _baselines(train, test, recipe, seed):
-            errors[name][split.test] -= predicted
-        model = recipes.fit_graded(train, recipe, INNER_FOLDS)
-        grader = Grader(model.card)
-        score = grader.score(
-            test.inputs, test.range_m.astype(np.float32), test.rx_power_dbm, test.first_path_power_dbm
-        )
-        integers = quantize(model.network, calibration_inputs(train, seed), exact=False)
-        prior = model.card.prior.predict_m(test.rx_power_dbm, test.first_path_power_dbm)
-        for name, network_m in (
-            ("shipped_float", floating.predict_m(model.network, test.inputs)),
+    for fold in splits.by_group(dataset, group, folds, seed):
+        part, test = dataset.rows(fold.train), dataset.rows(fold.test)
+        for name, predicted in _baselines(part, test, recipe, seed):
+            errors[name][fold.test] -= predicted
+        card, network = train.fit_with_card(part, recipe, INNER_FOLDS)
+        integers = quantize(network, calibration_inputs(part, seed), exact=False)
+        prior = prior_m(card.prior, test)
+        for name, output in (
+            ("shipped_float", network_m(network, test.inputs).astype(np.float32)),
             ("shipped_int8", IntegerNetwork(integers).predict_m(test.inputs)),
         ):
-            predicted = (prior + network_m).astype(np.float32)
-            corrects = grader.passes(predicted, score)
-            with np.errstate(invalid="ignore"):
-                correction, spread = grader.grade(predicted, score)
-            errors[name][split.test] -= np.where(corrects, correction, 0.0)
-        variance[split.test] = np.where(corrects, spread, model.card.variance_uncorrected_m2)
-        sigmas95[split.test] = model.card.interval95_sigmas
-        passed[split.test] = ~corrects
+            graded = zero_shot.grade(test, card, (prior + output).astype(np.float32))
+            errors[name][fold.test] -= graded.correction_m
+        variance[fold.test] = graded.variance_m2
+        sigmas95[fold.test] = card.interval95_sigmas
+        passed[fold.test] = graded.passed
         on_fold()
-    return _Held(errors, variance, sigmas95, passed)
+    return _HeldOut(errors, variance, sigmas95, passed)
 
 
 def _baselines(
-    train: Dataset, test: Dataset, recipe: Recipe, seed: int
+    part: Dataset, test: Dataset, recipe: Recipe, seed: int
 ) -> Iterator[tuple[str, NDArray[np.floating]]]:
-    yield "los_median", baselines.los_median(train)(test)
-    yield "overall_median", baselines.overall_median(train)(test)
-    yield "ridge", baselines.ridge(train, header=False)(test)
-    yield "ridge_header", baselines.ridge(train, header=True)(test)
-    yield "gradient_boosting", baselines.gradient_boosting(train, seed)(test)
-    line = lad.fit_prior(train.configurations, train.rx_power_dbm, train.first_path_power_dbm, train.error_m)
-    yield "l1_line", line.predict_m(test.rx_power_dbm, test.first_path_power_dbm)
-    part = train.rows(splits.thinned(train.configurations, recipe.per_configuration, seed))
-    options = replace(choosing.ALONE, seed=seed)
-    samples = recipe.architecture.samples
-    perceptron = fit(Mlp(samples=samples), part.inputs, part.error_m, options)
-    yield "mlp", floating.predict_m(perceptron, test.inputs)
-    alone = fit(Remnet(samples=samples), part.inputs, part.error_m, options)
-    yield "remnet_float", floating.predict_m(alone, test.inputs)
-    integers = quantize(alone, calibration_inputs(train, seed), exact=False)
+    yield "los_median", baselines.los_median(part)(test)
+    yield "overall_median", baselines.overall_median(part)(test)
+    yield "ridge", baselines.ridge(part, header=False)(test)
+    yield "ridge_header", baselines.ridge(part, header=True)(test)
+    yield "gradient_boosting", baselines.gradient_boosting(part, seed)(test)
+    line = lad.fit_prior(part.configurations, part.rx_power_dbm, part.first_path_power_dbm, part.error_m)
+    yield "l1_line", prior_m(line, test)
+    some = part.rows(splits.thinned(part.configurations, recipe.per_configuration, seed))
+    options, samples = replace(candidates.ALONE, seed=seed), recipe.architecture.samples
+    yield "mlp", network_m(fit(Mlp(samples=samples), some.inputs, some.error_m, options), test.inputs)
+    alone = fit(Remnet(samples=samples), some.inputs, some.error_m, options)
+    yield "remnet_float", network_m(alone, test.inputs)
+    integers = quantize(alone, calibration_inputs(part, seed), exact=False)
     yield "remnet_int8", IntegerNetwork(integers).predict_m(test.inputs)

@@ -35,7 +35,6 @@ def fit(
     on_epoch: Callable[[], None] = lambda: None,
     *,
     start: FloatWeights | None = None,
-    chances: NDArray[np.floating] | None = None,
 ) -> FloatWeights:
     """Fit a network to `targets` (n,), m, from `inputs` (n, K), by mean absolute error.
 
@@ -43,16 +42,13 @@ def fit(
 
     Args:
         start: weights that are trained further; without it, fresh ones.
-        chances: (n,), how likely each row is drawn, of any sum. An epoch is then n rows drawn with replacement;
-            without it, every row once.
 
     Raises:
-        DatasetError: there are no inputs, they are not finite, or the loss diverges; `chances` has another length,
-            or is not finite, negative, or zero for all.
+        DatasetError: there are no inputs, they are not finite, or the loss diverges.
     """
     with single_thread(options.seed):
         network = networks.build(architecture, options.dropout, start)
-        descend(network, inputs, targets, options, on_epoch, chances)
+        descend(network, inputs, targets, options, on_epoch)
         return networks.weights_of(network)
 
 
@@ -119,7 +115,6 @@ def descend(
     targets: NDArray[np.floating],
     options: FitOptions,
     on_epoch: Callable[[], None] = lambda: None,
-    chances: NDArray[np.floating] | None = None,
 ) -> None:
     """Train `network`, (n, K) to (n,), for the epochs of `options`, in batches in random order.
 
@@ -127,16 +122,10 @@ def descend(
         DatasetError: see `fit`.
     """
     source, wanted = as_tensors(inputs, targets)
-    odds = None if chances is None else _odds(chances, len(source))
     optimizer = adam(network, options)
     network.train()
     for epoch in range(1, options.epochs + 1):
-        order = (
-            torch.randperm(len(source))
-            if odds is None
-            else torch.multinomial(odds, len(source), replacement=True)
-        )
-        for rows in order.split(options.batch):
+        for rows in torch.randperm(len(source)).split(options.batch):
             _check(step(network, optimizer, source[rows], wanted[rows]), epoch)
         on_epoch()
 
@@ -180,13 +169,3 @@ def step(network: nn.Module, optimizer: torch.optim.Optimizer, inputs: Tensor, t
 def _check(loss: float, epoch: int) -> None:
     if not math.isfinite(loss):
         raise DatasetError(f"the loss is {loss} in epoch {epoch}", valid="try a lower learning rate")
-
-
-def _odds(chances: NDArray[np.floating], count: int) -> Tensor:
-    total = chances.sum() if chances.shape == (count,) and np.isfinite(chances).all() else 0.0
-    if not total > 0 or chances.min() < 0:
-        raise DatasetError(
-            f"chances of shape {chances.shape}, sum {chances.sum()}",
-            valid=f"{count}, none negative, not all 0",
-        )
-    return torch.from_numpy(chances / total)

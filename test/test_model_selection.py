@@ -1,0 +1,353 @@
+"""Model selection, and `train` with data of one's own, from data and from a bundle."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from model_material import bundle, dataset, measurement, windows
+from typer.testing import CliRunner
+
+from uwb_mitigation.commands.cli import app
+from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError
+from uwb_mitigation.evaluation import lad
+from uwb_mitigation.measurement import Record, Truth
+from uwb_mitigation.model.architecture import Remnet
+from uwb_mitigation.model.bundle import load_bundle
+from uwb_mitigation.model.prior import LinePrior
+from uwb_mitigation.model.shipped import default_model_path
+from uwb_mitigation.sources import opening
+from uwb_mitigation.sources.truth_table import load_truth, with_truth
+
+pytest.importorskip("torch", reason="run `make setup-training`")
+from uwb_mitigation.model.float_networks import float_network
+from uwb_mitigation.training import candidates, comparison, recordings, selection, train
+from uwb_mitigation.training.candidates import Candidate, FittedModel, Recipe, network_m
+from uwb_mitigation.training.options import FitOptions
+from uwb_mitigation.training.selection import NESTED, Selection
+
+SHAPE = Remnet(samples=8)
+RECIPE = Recipe(SHAPE, FitOptions(epochs=1))
+CONSTANTS = [
+    Candidate(name, lambda data, seed, offset=offset: FittedModel(LinePrior(offset)))
+    for name, offset in (("none", 0.0), ("half", 0.5), ("quarter", 0.25))
+]
+
+
+def numbered(error_of):
+    """A dataset of 12 configurations whose errors are those of `error_of`(configuration number)."""
+    data = dataset(12, 5, samples=8)
+    error = np.array([error_of(int(name[1:])) for name in data.configurations], float)
+    return replace(data, error_m=error, range_m=3.0 + error)
+
+
+# --- selection ---
+
+
+def test_the_simplest_candidate_is_preferred_unless_a_richer_one_gains():
+    errors = {"a": np.array([1.0]), "b": np.array([0.99]), "c": np.array([0.9])}
+    assert selection.preferred(errors, 0.02) == "c"
+    assert selection.preferred(errors, 0.2) == "a"
+
+
+def test_a_constant_error_needs_no_line_and_an_error_that_follows_the_power_does():
+    constant = selection.select_nested(numbered(lambda number: 0.3), candidates.own_models(RECIPE), 3, 0)
+    assert constant.chosen == candidates.CONSTANT
+    assert constant.mae()[NESTED] < 1e-6
+    data = dataset(14, 5, samples=8)
+    data = replace(data, error_m=-5.1 - 0.069 * data.rx_power_dbm.astype(float))
+    line = selection.select_nested(data, candidates.own_models(RECIPE), 3, 0)
+    assert line.chosen == candidates.LINE
+    assert line.model.prior.per_rx_power == pytest.approx(-0.069, abs=1e-3)
+
+
+def test_the_nested_error_is_of_configurations_that_the_selection_has_not_seen():
+    # The candidate that is best in each fold is worst elsewhere.
+    data = numbered(lambda number: 0.5 if number < 6 else 0.0)
+    found = selection.select_nested(data, CONSTANTS[:2], 2, 0)
+    assert np.isin(np.abs(found.errors[NESTED]), (0.0, 0.5)).all()
+    assert found.mae()[NESTED] >= min(found.mae()[name] for name in ("none", "half"))
+
+
+def test_a_trained_network_must_show_its_gain_in_the_nested_error(monkeypatch):
+    data = numbered(lambda number: 0.3)
+    offered = [replace(item, trains=item.name == "quarter") for item in CONSTANTS]
+    assert selection.select_nested(data, offered, 3, 0).chosen == "quarter"
+    prefer = selection.preferred
+
+    def preferred(errors, must_gain=0.02):
+        """The inner folds prefer another one, so the selection leaves more than the candidate."""
+        is_inner = len(next(iter(errors.values()))) < len(data)
+        return "half" if is_inner else prefer(errors, must_gain)
+
+    monkeypatch.setattr(selection, "preferred", preferred)
+    assert selection.select_nested(data, offered, 3, 0).chosen == "half"
+
+
+@pytest.mark.parametrize(
+    ("points", "needed"),
+    [
+        # 0.95 x 0.15 = 0.1425 = 0.1 + 1 / n
+        (tuple((n, 0.1 + 1.0 / n) for n in (5, 10, 20)), 24),
+        (((5, 0.2), (10, 0.2), (20, 0.2)), None),
+        (((5, 0.1), (10, 0.2), (20, 0.3)), None),
+        (((2, 0.2), (3, 0.2)), None),
+    ],
+)
+def test_the_learning_curve_gives_the_number_of_configurations_that_are_needed(points, needed):
+    found = Selection("line", {}, FittedModel(LinePrior(0.0)), points, 3, 0, 20).configurations_needed()
+    assert found == needed if needed is None else found == pytest.approx(needed, abs=1)
+
+
+@pytest.mark.parametrize(("configurations", "folds"), [(3, 6), (4, 2), (4, 3), (5, 4), (7, 6)])
+def test_the_least_number_of_configurations_is_enough(configurations, folds):
+    assert configurations >= selection.min_configurations(folds)
+    selection.select_nested(dataset(configurations, 2, samples=8), CONSTANTS, min(folds, configurations), 0)
+
+
+# --- candidates ---
+
+
+def test_the_cold_start_fits_an_offset_and_the_mean_a_line_too(tmp_path):
+    data, source = dataset(20, 3, samples=32), bundle(tmp_path)
+    offered = candidates.with_cold_start(candidates.own_models(RECIPE), data, source)
+    found = {item.name: item.fit(data, 0).correction_m(data) for item in offered if not item.trains}
+    network = network_m(float_network(source), data.inputs)
+    shift = lad.constant(data.configurations, data.error_m - network).offset_m
+    assert np.std(network) > 0.01
+    assert found[candidates.COLD_START] == pytest.approx(network + shift, abs=1e-5)
+    mean = (found[candidates.LINE] + found[candidates.COLD_START]) / 2
+    assert found[candidates.MEAN] == pytest.approx(mean, abs=1e-5)
+
+
+def test_the_cold_start_is_preferred_with_few_configurations_only(tmp_path):
+    source, own = bundle(tmp_path), candidates.own_models(RECIPE)
+
+    def names(data) -> list[str]:
+        return [item.name for item in candidates.with_cold_start(own, data, source)]
+
+    assert names(dataset(19, 2)) == [candidates.COLD_START, *candidates.OWN]
+    many = dataset(20, 2)
+    assert names(many) == [
+        "constant",
+        candidates.COLD_START,
+        "line",
+        candidates.MEAN,
+        "line+network",
+        "network",
+    ]
+    assert names(dataset(20, 2, samples=8)) == list(candidates.OWN)
+    many.rx_power_dbm[:2] = np.nan  # one configuration of the twenty without power levels
+    assert candidates.MEAN not in names(many)
+
+
+@pytest.mark.parametrize("name", [candidates.CONSTANT, candidates.LINE])
+def test_a_model_without_network_has_one_that_predicts_nothing(name):
+    fitted = candidates.fit_own(dataset(8, 5, samples=8), RECIPE.of(name), 0)
+    assert not network_m(fitted.network, windows(5, 8)).any()
+    assert fitted.prior.needs_power == (name == candidates.LINE)
+
+
+def test_a_network_alone_has_its_own_options():
+    alone = FitOptions(epochs=7)
+    recipe = replace(RECIPE, alone=alone)
+    assert recipe.of(candidates.NETWORK).fit == alone
+    assert recipe.of(candidates.LINE_NETWORK).fit == RECIPE.fit
+
+
+# --- true ranges from a table ---
+
+
+def write(folder, *rows: str, header: str = "tag_id,anchor_id,range_m,start_s,stop_s,configuration"):
+    path = folder / "truth.csv"
+    path.write_text("\n".join((header, *rows)) + "\n")
+    return path
+
+
+def at(seconds: float) -> Record:
+    return Record(replace(measurement(3.0), stamp_ns=10**18 + round(seconds * 1e9)))
+
+
+def test_a_truth_table_gives_pairs_and_times_their_ranges(tmp_path):
+    table = load_truth(write(tmp_path, "1,2,2.5,0,10,door", "1,2,3.5,10,,"))
+    truths = [item.truth for item in with_truth([at(0), at(9.9), at(10), at(500)], table)]
+    assert [truth.range_m for truth in truths] == [2.5, 2.5, 3.5, 3.5]
+    assert [truth.configuration for truth in truths[::2]] == ["door", "truth.csv line 3"]
+    assert next(with_truth([at(0)], load_truth(write(tmp_path, "1,3,2.5,,,")))).truth is None
+
+
+@pytest.mark.parametrize(
+    ("row", "named"),
+    [
+        ("1,2,nan,,,", "range_m"),
+        ("1,2,-1,,,", "range_m"),
+        ("one,2,3,,,", "tag_id"),
+        ("1,99999999999999999999,3,,,", "anchor_id"),
+        ("1,2,3,5,5,", "start_s"),
+        ("1,2", "range_m"),
+    ],
+)
+def test_a_wrong_row_is_named(tmp_path, row, named):
+    with pytest.raises(RecordingError, match=named) as caught:
+        load_truth(write(tmp_path, row))
+    assert "line 2" in str(caught.value)
+
+
+def test_a_file_that_is_not_a_truth_table_is_refused(tmp_path):
+    (tmp_path / "binary.csv").write_bytes(b"\xff\x00\xfe")
+    without_anchor = write(tmp_path, "1,2", header="tag_id,range_m").rename(tmp_path / "columns.csv")
+    for path in (tmp_path / "absent.csv", tmp_path / "binary.csv", write(tmp_path), without_anchor):
+        with pytest.raises(RecordingError):
+            load_truth(path)
+
+
+# --- the command ---
+
+
+class Recorded(list):
+    simulated = False
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        return None
+
+
+def run_or_raise(*arguments: object) -> str:
+    result = CliRunner().invoke(app, [str(value) for value in arguments], catch_exceptions=True)
+    if result.exception is not None:
+        raise result.exception
+    return result.output
+
+
+EIGHT_PLACES = [f"{place},2,3.0,,,place {place}" for place in range(8)]
+
+
+@pytest.fixture
+def eight_places(monkeypatch) -> Recorded:
+    """A recording of ranges that err by 0.25 m."""
+    ranges = [
+        Record(replace(measurement(3.25, 10 * place + number), tag_id=place))
+        for place in range(8)
+        for number in range(4)
+    ]
+    monkeypatch.setattr(opening, "open_recording", lambda path: Recorded(ranges))
+    return Recorded(ranges)
+
+
+def loads(monkeypatch, data) -> None:
+    monkeypatch.setattr(recordings, "load", lambda *_: ("made up", data))
+
+
+def test_a_bag_of_few_places_starts_from_the_universal_network(tmp_path, monkeypatch, eight_places):
+    as_it_is = Candidate(candidates.AS_SHIPPED, lambda data, seed: FittedModel(LinePrior(0.0)))
+    monkeypatch.setattr(candidates, "from_bundle", lambda source, options: [as_it_is])
+    output, table = tmp_path / "own.onnx", write(tmp_path, *EIGHT_PLACES)
+    run_or_raise("train", "--from-bag", "bag", "--truth", table, "-o", output, "--folds", 2)
+    training = load_bundle(output).card.training
+    assert training["chosen"] == candidates.COLD_START
+    assert training["started_from"] == f"{load_bundle(default_model_path()).model_id:08x}"
+    # No network was fitted, so the card contains no epochs.
+    assert training["recipe"] == {"line": False, "network": True}
+
+
+def test_a_named_model_gets_the_offset_of_the_bag(tmp_path, eight_places):
+    # The same shape as the universal network, which replaces no model that is named.
+    started = bundle(tmp_path, Remnet(), prior=LinePrior(5.0))
+    output, result = tmp_path / "own.onnx", tmp_path / "own.json"
+    run_or_raise(
+        "train", "--from-bag", "bag", "--truth", write(tmp_path, *EIGHT_PLACES), "--model", started.path, "-o", output,
+        "--epochs", 1, "--folds", 2, "--json", result,
+    )  # fmt: skip
+    found = json.loads(result.read_text())
+    assert found["helped"]
+    assert candidates.COLD_START not in [row["name"] for row in found["choice"]["rows"]]
+    assert found["choice"]["chosen"] in ("own offset", "constant")
+    assert load_bundle(output).card.training["started_from"] == f"{started.model_id:08x}"
+
+
+def test_the_card_contains_how_a_network_was_trained_further(tmp_path, monkeypatch):
+    data, source = dataset(8, 3), bundle(tmp_path)
+    monkeypatch.setattr(selection, "preferred", lambda errors, gain: [*errors][-1])
+    job = train.Job(data, "bag", tmp_path / "own.onnx", 2)
+    made = train.train_from_bundle(job, source, FitOptions(epochs=1), offer_cold_start=False)
+    assert made.bundle.card.training["chosen"] == candidates.TRAINED_FURTHER
+    assert made.bundle.card.training["recipe"]["epochs"] == 1
+
+
+def test_few_configurations_start_from_the_universal_network(tmp_path, monkeypatch):
+    loads(monkeypatch, dataset(6, 3, samples=157))
+    far_off = Candidate("far off", lambda data, seed: FittedModel(LinePrior(9.0)))
+    monkeypatch.setattr(candidates, "own_models", lambda recipe: [far_off])
+    output, result = tmp_path / "cold.onnx", tmp_path / "cold.json"
+    told = run_or_raise("train", "--data", tmp_path, "-o", output, "--folds", 2, "--json", result)
+    found, made = json.loads(result.read_text()), load_bundle(output)
+    start = load_bundle(default_model_path())
+    assert found["choice"]["chosen"] == made.card.training["chosen"] == candidates.COLD_START
+    # The mark is in the line of the chosen one, also with 80 columns.
+    assert [line for line in told.splitlines() if "<-" in line and candidates.COLD_START in line]
+    mae = {row["name"]: row["mae"] for row in found["choice"]["rows"]}
+    assert found["helped"] == (mae[NESTED] < mae["raw"])
+    assert set(found) == {"model_id", "n", "refused", "rows", "helped", "by_configuration", "choice"}
+    inputs = windows(5, 157)
+    expected = network_m(float_network(start), inputs)
+    assert network_m(float_network(made), inputs) == pytest.approx(expected, abs=1e-6)
+
+
+def test_a_model_that_harms_is_reported(tmp_path, monkeypatch):
+    # Without one of two configurations that err by 1 m, the constant is that of the two that err by -1 m.
+    data = dataset(4, 3, samples=8)
+    loads(monkeypatch, replace(data, error_m=np.where(np.isin(data.configurations, ("c0", "c1")), 1.0, -1.0)))
+    output, result = tmp_path / "x.onnx", tmp_path / "x.json"
+    words = ("--recipe", "constant", "--samples", 8, "-o", output, "--json", result)
+    assert "this did not help" in run_or_raise("train", "--data", tmp_path, *words)
+    assert json.loads(result.read_text())["helped"] is False
+    assert load_bundle(output).card.training["recipe"] == {"line": False, "network": False}
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        (),
+        ("--data", "a", "--from-bag", "b"),
+        ("--data", "a", "--truth", "c"),
+        ("--data", "a", "--recipe", "best"),
+        ("--from-bag", "b", "--recipe", "auto"),
+        ("--from-bag", "b", "--samples", 157),
+        ("--from-bag", "b", "--scaling", "max"),
+        ("--from-bag", "b", "--first-kernel", 3),
+        ("--from-bag", "b", "--per-configuration", 20),
+    ],
+)
+def test_contradictory_options_are_refused(tmp_path, arguments):
+    with pytest.raises(ParameterError):
+        run_or_raise("train", *arguments, "-o", tmp_path / "x.onnx")
+
+
+@pytest.mark.parametrize(
+    ("configurations", "arguments", "needed"),
+    [(2, (), "3 or more"), (3, ("--folds", 2), "4 or more"), (1, ("--recipe", "line"), "2 or more")],
+)
+def test_too_few_configurations_are_refused(tmp_path, monkeypatch, configurations, arguments, needed):
+    loads(monkeypatch, dataset(configurations, 3))
+    with pytest.raises(DatasetError, match=needed):
+        run_or_raise("train", "--data", tmp_path, "-o", tmp_path / "x.onnx", *arguments)
+
+
+def test_data_without_preamble_counts_needs_the_other_scaling(tmp_path, monkeypatch, eight_places):
+    for item in eight_places:
+        object.__setattr__(item.measurement.cir, "preamble_count", 0)
+        object.__setattr__(item, "truth", Truth(3.0, configuration=f"{item.measurement.tag_id}"))
+    seen = []
+    monkeypatch.setattr(
+        comparison, "run", lambda data, *_: seen.append(data.preprocessing.scaling.value) or 1 / 0
+    )
+    with pytest.raises(ZeroDivisionError):
+        run_or_raise("evaluate", "--data", "bag", "--cross-validate", "tag", "--scaling", "max")
+    assert seen == ["max"]
+    for command in (("train", "-o", tmp_path / "x.onnx"), ("evaluate", "--cross-validate", "configuration")):
+        with pytest.raises(DatasetError, match="--scaling max"):
+            run_or_raise(*command, "--data", "bag")

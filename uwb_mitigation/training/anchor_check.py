@@ -1,0 +1,135 @@
+"""Errors in the anchors file that a localisation reveals: an anchor at another position, and two swapped anchors.
+
+The ranges of such an anchor look like ranges with an offset, but their error depends on the direction to the tag.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from uwb_mitigation.errors import DatasetError
+from uwb_mitigation.evaluation.site_data import SiteData
+from uwb_mitigation.positioning.anchor_errors import LARGER, LIKELIER, MISPLACED_M
+from uwb_mitigation.positioning.model import MAD_TO_SD
+
+INDEPENDENT_S = 2.0
+"""The errors of the ranges of an anchor within this time count as one."""
+
+MIN_GROUPS = 8
+"""An anchor with fewer independent errors is not examined."""
+
+MIN_SD_M = 0.1
+MAX_RANGES = 2000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _AnchorRanges:
+    """The ranges of one anchor.
+
+    Attributes:
+        antenna: (n, 3), where the tag was, m. range_m: (n,). tag: int (n,).
+        weight: the number of independent errors, divided by n.
+    """
+
+    antenna: NDArray[np.float64]
+    range_m: NDArray[np.float64]
+    tag: NDArray[np.intp]
+    weight: float
+
+    def residual_m(self, position: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The error of each range to an anchor at `position`, without the median of each tag."""
+        error: NDArray[np.float64] = self.range_m - np.linalg.norm(self.antenna - position, axis=1)
+        for tag in np.unique(self.tag):
+            error[self.tag == tag] -= np.median(error[self.tag == tag])
+        return error
+
+    def loss(self, position: NDArray[np.float64], sd_m: float) -> float:
+        """Negative log likelihood (Cauchy) of the ranges to an anchor at `position`, with an offset of each tag."""
+        return float(self.weight * np.log1p((self.residual_m(position) / sd_m) ** 2).sum())
+
+    def displaced(self, position: NDArray[np.float64], sd_m: float) -> NDArray[np.float64]:
+        """The horizontal displacement from `position` that explains the ranges best, m, shape (3,)."""
+        found = least_squares(
+            lambda shift: self.residual_m(position + np.append(shift, 0.0)),
+            np.zeros(2),
+            loss="cauchy",
+            f_scale=sd_m,
+        )
+        return np.append(found.x, 0.0)
+
+
+def check_anchors(site: SiteData, antenna: NDArray[np.float64], known: NDArray[np.bool_]) -> None:
+    """Refuse ranges that other anchor positions explain much better.
+
+    Args:
+        antenna: (r, 3), the position of the tag's antenna at each range of the site. known: bool (r,), whether it is
+            known and the range is no outlier.
+
+    Raises:
+        DatasetError: names the anchors.
+    """
+    anchors = site.anchors
+    ranges = _by_anchor(site, antenna, known)
+    if not ranges:
+        return
+    spread = np.concatenate([own.residual_m(anchors.position[row]) for row, own in ranges.items()])
+    sd_m = max(MIN_SD_M, MAD_TO_SD * float(np.median(np.abs(spread))))
+    now = {row: own.loss(anchors.position[row], sd_m) for row, own in ranges.items()}
+    shift = {row: own.displaced(anchors.position[row], sd_m) for row, own in ranges.items()}
+    gain = {row: now[row] - own.loss(anchors.position[row] + shift[row], sd_m) for row, own in ranges.items()}
+    suspects = [
+        row for row in ranges if np.linalg.norm(shift[row]) > MISPLACED_M and _is_better(gain[row], now[row])
+    ]
+    fix = "their true positions in the anchors file (`uwb-mitigation survey` finds them)"
+    best: tuple[float, int, int] | None = None
+    for a, b in itertools.combinations(suspects, 2):
+        swapped = ranges[a].loss(anchors.position[b], sd_m) + ranges[b].loss(anchors.position[a], sd_m)
+        swap_gain = now[a] + now[b] - swapped
+        # Two free displacements explain more than a swap, but not much more if the anchors are swapped.
+        is_swap = swap_gain > (1.0 - LARGER) * (gain[a] + gain[b])
+        if is_swap and (best is None or swap_gain > best[0]):
+            best = swap_gain, a, b
+    if best is not None:
+        first, second = (anchors.anchors[row] for row in best[1:])
+        raise DatasetError(
+            f"anchors {first} and {second} contradict the localisation: swapped, they explain the ranges",
+            valid=fix,
+        )
+    if suspects:
+        row = max(suspects, key=lambda one: gain[one])
+        raise DatasetError(
+            f"anchor {anchors.anchors[row]} contradicts the localisation: {float(np.linalg.norm(shift[row])):.1f} m from its "
+            "position in the anchors file, it explains the ranges",
+            valid=fix,
+        )
+
+
+def _is_better(gain: float, loss: float) -> bool:
+    return gain > max(LIKELIER, LARGER * loss)
+
+
+def _by_anchor(
+    site: SiteData, antenna: NDArray[np.float64], known: NDArray[np.bool_]
+) -> dict[int, _AnchorRanges]:
+    tag = np.repeat(np.arange(len(site.tags)), list(map(len, site.tags)))
+    row, stamp_ns, range_m = (
+        np.concatenate([getattr(one, name) for one in site.tags])
+        for name in ("anchor", "stamp_ns", "range_m")
+    )
+    ranges = {}
+    for anchor in np.unique(row).tolist():
+        own = np.flatnonzero(known & (row == anchor))
+        group = stamp_ns[own] // round(INDEPENDENT_S * 1e9)
+        independent = len(np.unique(np.stack([group, tag[own]]), axis=1).T) if len(own) else 0
+        if independent < MIN_GROUPS:
+            continue
+        chosen = own[:: math.ceil(len(own) / MAX_RANGES)]
+        weight = min(1.0, independent / len(chosen))
+        ranges[anchor] = _AnchorRanges(antenna[chosen], range_m[chosen], tag[chosen], weight)
+    return ranges

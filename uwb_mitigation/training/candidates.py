@@ -1,0 +1,353 @@
+"""Candidates of model selection: the models that can be fitted to labelled ranges, each list from simple to rich.
+
+`train` chooses between models of its own (`own_models`) or from models that start from a bundle (`from_bundle`), both
+with the universal network and an offset (`with_cold_start`); `calibrate` chooses between the models of a site
+(`site_models`). Only candidates that train a network need torch.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.evaluation import lad, splits
+from uwb_mitigation.evaluation.dataset import Dataset
+from uwb_mitigation.model import graph
+from uwb_mitigation.model.architecture import Remnet
+from uwb_mitigation.model.bundle import Bundle, session_options
+from uwb_mitigation.model.float_networks import float_network, scaled
+from uwb_mitigation.model.prior import LinePrior
+from uwb_mitigation.model.weights import FloatWeights
+from uwb_mitigation.training.options import FitOptions
+
+OWN = CONSTANT, LINE, LINE_NETWORK, NETWORK = "constant", "line", "line+network", "network"
+"""Models that are fitted to the data alone."""
+
+COLD_START, MEAN = "cold start", "line and cold start"
+AS_SHIPPED, OWN_OFFSET, TRAINED_FURTHER = "as shipped", "own offset", "trained further"
+SITE_OFFSETS, SITE_LINE = "offsets", "offsets + line"
+SITE_UNIVERSAL, SITE_UNIVERSAL_LINE = "offsets + universal network", "offsets + universal network + line"
+SITE_TUNED = "fine-tuned network"
+
+ALONE = FitOptions(epochs=20, learning_rate=1e-3, dropout=0.2)
+"""Options of a network without a line: it needs more training than one that refines a line."""
+
+TUNING = FitOptions(epochs=2, learning_rate=3e-4, dropout=0.2)
+TUNED_PER_CONFIGURATION, TUNED_INPUTS = 6, 2500
+"""The fine-tuned network of a site is fitted to at most this number of inputs per configuration, and in total."""
+
+PER_CONFIGURATION = 20
+ENOUGH_FOR_MEAN = 20
+"""Number of configurations from which a line is averaged with the universal network."""
+
+FACTORS, MIN_SPREAD_M = (0.0, 1.5), 0.05
+"""Bounds of the factor of the universal network's predictions, and their least spread that determines it."""
+
+_BATCH = 1024
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FittedModel:
+    """A prior, and a network or None. `factor`: the network is the universal one, multiplied by this factor."""
+
+    prior: LinePrior
+    network: FloatWeights | None = None
+    factor: float | None = None
+
+    def correction_m(self, data: Dataset) -> NDArray[np.float64]:
+        """Prior + network, shape (n,), m; 0 where a power that the prior needs is unknown."""
+        predicted = prior_m(self.prior, data).astype(np.float64)
+        if self.factor is not None and data.headers is not None:
+            predicted = predicted + self.factor * _universal_m(data)
+        elif self.network is not None:
+            predicted = predicted + network_m(self.network, data.inputs)
+        return np.where(np.isfinite(predicted), predicted, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """One model to choose.
+
+    Attributes:
+        name: in tables.
+        fit: called with a dataset and a seed.
+        trains: whether it trains a network. Such a model is kept only if the nested error shows a gain.
+    """
+
+    name: str
+    fit: Callable[[Dataset, int], FittedModel]
+    trains: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """How an own model is fitted; the card records it.
+
+    Attributes:
+        architecture: of the network.
+        fit: options of a network that refines a line. alone: options of a network without a line.
+        line: fit a line; otherwise the network predicts the whole error.
+        network: fit the network; otherwise it predicts 0. With neither, the prior is a constant.
+        per_configuration: the network is fitted to at most this number of ranges of a configuration, so that a long
+            recording of one placement does not outweigh a short one.
+    """
+
+    architecture: Remnet
+    fit: FitOptions
+    alone: FitOptions = ALONE
+    line: bool = True
+    network: bool = True
+    per_configuration: int = PER_CONFIGURATION
+
+    def of(self, name: str) -> Recipe:
+        """The recipe of one of `OWN`."""
+        network = name in (LINE_NETWORK, NETWORK)
+        options = self.alone if name == NETWORK else self.fit
+        return replace(self, line=name in (LINE, LINE_NETWORK), network=network, fit=options)
+
+
+def prior_m(prior: LinePrior, data: Dataset) -> NDArray[np.float32]:
+    """The prediction of a prior, shape (n,), m; NaN where it needs a power that is unknown."""
+    needs_gap = prior.per_power_gap != 0.0
+    first_path = data.first_path_power_dbm if needs_gap else data.rx_power_dbm
+    return prior.predict_m(data.rx_power_dbm, first_path)
+
+
+def network_m(network: FloatWeights, inputs: NDArray[np.float32]) -> NDArray[np.float64]:
+    """The prediction of a network, shape (n,), m, by ONNX Runtime, which is many times as fast as NumPy."""
+    import onnxruntime
+
+    session = onnxruntime.InferenceSession(
+        graph.float_model(network), session_options(), providers=["CPUExecutionProvider"]
+    )
+    (source,), (result,) = session.get_inputs(), session.get_outputs()
+    parts = [
+        session.run([result.name], {source.name: inputs[start : start + _BATCH, None, :]})[0][:, 0]
+        for start in range(0, len(inputs), _BATCH)
+    ]
+    return np.concatenate(parts).astype(np.float64)
+
+
+def fit_own(
+    data: Dataset, recipe: Recipe, seed: int, on_epoch: Callable[[], None] = lambda: None
+) -> FittedModel:
+    """Fit an own model. Without a network, it contains the network as it is initialised, which predicts 0.
+
+    Raises:
+        DatasetError: see `fitting.fit`.
+    """
+    from uwb_mitigation.training import fitting, networks
+
+    prior = LinePrior(0.0)
+    if recipe.line:
+        prior = fit_line(data)
+    elif not recipe.network:
+        prior = lad.constant(data.configurations, data.error_m)
+    if not recipe.network:
+        with fitting.single_thread(seed):
+            return FittedModel(prior, networks.weights_of(networks.build(recipe.architecture, 0)))
+    options = replace(recipe.fit, seed=seed)
+    start = recipe.architecture, options, on_epoch
+    return FittedModel(prior, _fit_residuals(data, prior, recipe.per_configuration, *start))
+
+
+def _fit_residuals(
+    data: Dataset,
+    prior: LinePrior,
+    per_configuration: int,
+    architecture: Remnet,
+    options: FitOptions,
+    on_epoch: Callable[[], None] = lambda: None,
+    start: FloatWeights | None = None,
+) -> FloatWeights:
+    """Fit a network to the errors that a prior leaves."""
+    from uwb_mitigation.training import fitting
+
+    part = data.rows(splits.thinned(data.configurations, per_configuration, options.seed))
+    residual = part.error_m - prior_m(prior, part)
+    # Ranges whose power is unknown have no prior and are passed through where it is needed.
+    known = np.isfinite(residual)
+    return fitting.fit(architecture, part.inputs[known], residual[known], options, on_epoch, start=start)
+
+
+def fit_line(data: Dataset) -> LinePrior:
+    """The line in both powers (see `lad.fit_prior`)."""
+    return lad.fit_prior(data.configurations, data.rx_power_dbm, data.first_path_power_dbm, data.error_m)
+
+
+def own_models(recipe: Recipe) -> list[Candidate]:
+    """A constant, a line, a network on the residuals of the line, and a network alone."""
+
+    def own(name: str) -> Callable[[Dataset, int], FittedModel]:
+        return lambda data, seed: fit_own(data, recipe.of(name), seed)
+
+    return [
+        _constant(),
+        _line(),
+        Candidate(LINE_NETWORK, own(LINE_NETWORK), trains=True),
+        Candidate(NETWORK, own(NETWORK), trains=True),
+    ]
+
+
+def _constant() -> Candidate:
+    return Candidate(
+        CONSTANT, lambda data, seed: FittedModel(lad.constant(data.configurations, data.error_m))
+    )
+
+
+def _line() -> Candidate:
+    return Candidate(LINE, lambda data, seed: FittedModel(fit_line(data)))
+
+
+def from_bundle(source: Bundle, options: FitOptions) -> list[Candidate]:
+    """The model of a bundle as it is, with another offset, a constant, a line, and the network trained further.
+
+    The latter is trained on the residuals of a new prior: a line if the bundle has one, otherwise an offset.
+
+    Raises:
+        ModelError: the network is not a REMNet.
+    """
+    network = float_network(source)
+
+    def shifted(data: Dataset, seed: int) -> FittedModel:
+        residual = data.error_m - prior_m(source.prior, data) - network_m(network, data.inputs)
+        known = np.isfinite(residual)
+        shift = lad.constant(data.configurations[known], residual[known]).offset_m if known.any() else 0.0
+        prior = replace(source.prior, offset_m=float(np.float32(source.prior.offset_m + shift)))
+        return FittedModel(prior, network)
+
+    def trained(data: Dataset, seed: int) -> FittedModel:
+        prior = fit_line(data) if source.prior.needs_power else _offset(data, network)
+        assert isinstance(source.architecture, Remnet)
+        start = source.architecture, replace(options, seed=seed)
+        return FittedModel(prior, _fit_residuals(data, prior, PER_CONFIGURATION, *start, start=network))
+
+    return [
+        Candidate(AS_SHIPPED, lambda data, seed: FittedModel(source.prior, network)),
+        Candidate(OWN_OFFSET, shifted),
+        _constant(),
+        _line(),
+        Candidate(TRAINED_FURTHER, trained, trains=True),
+    ]
+
+
+def with_cold_start(candidates: Sequence[Candidate], data: Dataset, universal: Bundle) -> list[Candidate]:
+    """Add the universal network with an offset of the data, if the data is preprocessed for it.
+
+    With few configurations it comes first, so that it is preferred. With `ENOUGH_FOR_MEAN` or more it follows the
+    constant, and its mean with the line follows the line: the line contributes its own scatter, the network the errors that
+    are particular to the site, and the mean less of both.
+    """
+    if data.preprocessing != universal.preprocessing:
+        return list(candidates)
+    network = float_network(universal)
+    start = Candidate(COLD_START, lambda data, seed: FittedModel(_offset(data, network), network))
+    if is_few(data):
+        return [start, *candidates]
+    half = scaled(network, 0.5)
+    known = np.isfinite(data.rx_power_dbm - data.first_path_power_dbm)
+    has_line = len(data.rows(known).names) >= ENOUGH_FOR_MEAN
+
+    def mean(data: Dataset, seed: int) -> FittedModel:
+        line, offset = fit_line(data), _offset(data, network).offset_m
+        total = (line.offset_m + offset, line.per_rx_power, line.per_power_gap)
+        return FittedModel(LinePrior(*(float(np.float32(value / 2)) for value in total)), half)
+
+    behind = {CONSTANT: [start], LINE: [Candidate(MEAN, mean)] if has_line else []}
+    return [item for one in candidates for item in (one, *behind.get(one.name, ()))]
+
+
+def is_few(data: Dataset) -> bool:
+    """Whether there are so few configurations that the cold start is preferred."""
+    return len(data.names) < ENOUGH_FOR_MEAN
+
+
+def _offset(data: Dataset, network: FloatWeights) -> LinePrior:
+    return lad.constant(data.configurations, data.error_m - network_m(network, data.inputs))
+
+
+def site_models(
+    data: Dataset, has_cirs: bool, universal: Bundle
+) -> tuple[Dataset, list[Candidate], list[str]]:
+    """The models of a site, next to the offsets of its radios.
+
+    Returns:
+        The data with the universal network's predictions, which are then computed only once; the candidates; notes
+        about candidates that are missing.
+    """
+    offsets = Candidate(SITE_OFFSETS, _constant().fit)
+    if not has_cirs:
+        line = Candidate(SITE_LINE, lambda data, seed: FittedModel(_site_line(data, data.error_m)))
+        return data, [offsets, line], ["networks: the recording has no CIRs"]
+    start = float_network(universal)
+    data = replace(data, headers=network_m(start, data.inputs)[:, None].astype(np.float32))
+
+    def with_network(line: bool) -> Callable[[Dataset, int], FittedModel]:
+        def fit(data: Dataset, seed: int) -> FittedModel:
+            factor = _factor(data)
+            residual = data.error_m - factor * _universal_m(data)
+            # The bundle of a network passes ranges through whose first-path power is unknown.
+            has_line = line and _has_both_powers(data)
+            prior = _site_line(data, residual) if has_line else lad.constant(data.configurations, residual)
+            return FittedModel(prior, scaled(start, factor), factor)
+
+        return fit
+
+    found = [
+        offsets,
+        Candidate(SITE_UNIVERSAL, with_network(line=False)),
+        Candidate(SITE_UNIVERSAL_LINE, with_network(line=True)),
+    ]
+    if importlib.util.find_spec("torch") is None:
+        return data, found, ["the fine-tuned network: torch is not installed (`make setup-training`)"]
+
+    def tuned(data: Dataset, seed: int) -> FittedModel:
+        from uwb_mitigation.training import fitting
+
+        shift = lad.constant(data.configurations, data.error_m - _universal_m(data))
+        part = data.rows(splits.thinned(data.configurations, TUNED_PER_CONFIGURATION, seed))
+        if len(part) > TUNED_INPUTS:
+            chosen = np.random.default_rng(seed).choice(len(part), TUNED_INPUTS, replace=False)
+            part = part.rows(np.sort(chosen))
+        options, wanted = replace(TUNING, seed=seed), part.error_m - shift.offset_m
+        return FittedModel(
+            shift, fitting.fit(universal.architecture, part.inputs, wanted, options, start=start)
+        )
+
+    return data, [*found, Candidate(SITE_TUNED, tuned)], []
+
+
+def _universal_m(data: Dataset) -> NDArray[np.float64]:
+    """The universal network's predictions, which `site_models` keeps in the headers."""
+    assert data.headers is not None
+    return data.headers[:, 0].astype(np.float64)
+
+
+def _factor(data: Dataset) -> float:
+    """The factor of the universal network's predictions that explains the errors best.
+
+    Noise of the predictions would reduce the factor, and offsets that are estimated with it would suffer.
+    """
+    predicted, error = (
+        lad.means(data.configurations, values) for values in (_universal_m(data), data.error_m)
+    )
+    if len(predicted) < lad.MIN_CONFIGURATIONS or float(np.ptp(predicted)) < MIN_SPREAD_M:
+        return 1.0
+    design = np.column_stack([np.ones(len(predicted)), predicted])
+    factor = float(lad.least_absolute_deviations(design, error)[1])
+    return float(np.float32(np.clip(factor, *FACTORS)))
+
+
+def _has_both_powers(data: Dataset) -> bool:
+    return bool(np.isfinite(data.rx_power_dbm - data.first_path_power_dbm).mean() > 0.5)
+
+
+def _site_line(data: Dataset, error_m: NDArray[np.float64]) -> LinePrior:
+    """A line in both powers if both are known, otherwise in the received power if known, otherwise a constant."""
+    if _has_both_powers(data):
+        return lad.fit_prior(data.configurations, data.rx_power_dbm, data.first_path_power_dbm, error_m)
+    return lad.fit_level(data.configurations, data.rx_power_dbm, error_m)

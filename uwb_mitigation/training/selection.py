@@ -1,0 +1,241 @@
+"""Model selection: held-out errors of candidates, and the simplest one that no richer one improves by 2 %."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.errors import DatasetError
+from uwb_mitigation.evaluation import splits
+from uwb_mitigation.evaluation.dataset import Dataset
+from uwb_mitigation.evaluation.splits import Split
+from uwb_mitigation.training.candidates import Candidate, FittedModel
+
+MUST_GAIN = 0.02
+"""A richer candidate is chosen if it reduces the error by at least this share: less is chance."""
+
+COLD_START_MUST_GAIN = 0.10
+"""The same with few configurations, whose errors show large differences only."""
+
+NESTED = "chosen (nested)"
+"""Row of the errors of the selection itself, on configurations that neither a fit nor the selection has seen."""
+
+CURVE_DRAWS, CURVE_SHARES, CURVE_MIN_POINTS = 8, (0.3, 0.5, 0.75, 1.0), 3
+"""Of the learning curve: draws, shares of the configurations, and points that are needed to extrapolate it."""
+
+SEGMENT_FOLDS, ANCHOR_FOLDS = 4, 2
+"""Of a site's data: folds over segments of the track, and over anchors."""
+
+_NOTHING: Callable[[], None] = lambda: None  # noqa: E731
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Selection:
+    """The chosen candidate and the evidence for it.
+
+    Attributes:
+        chosen: name of the candidate.
+        errors: {candidate, `raw` or NESTED: held-out errors}, m. Of a site, those on held-out segments, shape (n,), are
+            followed by those on held-out anchors.
+        model: the candidate, fitted to all of the data.
+        curve: (number of configurations, MAE on others) of the chosen candidate; empty for a site.
+        folds, seed: of the splits. configurations: the number in all of the data.
+    """
+
+    chosen: str
+    errors: Mapping[str, NDArray[np.float64]]
+    model: FittedModel
+    curve: tuple[tuple[int, float], ...] = ()
+    folds: int = 0
+    seed: int = 0
+    configurations: int = 0
+
+    def mae(self) -> dict[str, float]:
+        """{name: MAE of the held-out errors}, m."""
+        return {name: float(np.abs(error).mean()) for name, error in self.errors.items()}
+
+    def as_json(self) -> dict[str, object]:
+        """For `train --json`."""
+        return {
+            "chosen": self.chosen,
+            "rows": [{"name": name, "mae": mae} for name, mae in self.mae().items()],
+            "learning_curve": [{"configurations": count, "mae": mae} for count, mae in self.curve],
+            "configurations_needed": self.configurations_needed(),
+        }
+
+    def configurations_needed(self, share: float = 0.95) -> int | None:
+        """The number of configurations for `share` of today's error; None if unknown, or if more do not help.
+
+        Extrapolated by MAE = a + b / n, least squares through the learning curve.
+        """
+        if len(self.curve) < CURVE_MIN_POINTS:
+            return None
+        count, mae = np.array(self.curve, float).T
+        design = np.column_stack([np.ones(len(count)), 1 / count])
+        (floor, slope), *_ = np.linalg.lstsq(design, mae, rcond=None)
+        wanted = share * (floor + slope / self.configurations)
+        if slope <= 0 or wanted <= floor:
+            return None
+        return int(np.ceil(slope / (wanted - floor)))
+
+
+def preferred(errors: Mapping[str, NDArray[np.float64]], must_gain: float = MUST_GAIN) -> str:
+    """The first candidate, in order of preference, that no later one improves by the share `must_gain`."""
+    best, best_mae = "", np.inf
+    for name, error in errors.items():
+        mae = float(np.abs(error).mean())
+        if not best or mae < (1 - must_gain) * best_mae:
+            best, best_mae = name, mae
+    return best
+
+
+def held_out_errors(
+    data: Dataset,
+    candidates: Sequence[Candidate],
+    folds: Iterable[Split],
+    seed: int,
+    on_fit: Callable[[], None] = _NOTHING,
+    *,
+    prepare: Callable[[Split], Dataset] | None = None,
+) -> dict[str, NDArray[np.float64]]:
+    """The errors of each candidate on the test rows of each fold, after a fit to its other rows: {name: shape (n,)}.
+
+    Rows that no fold tests keep their raw errors. `prepare` replaces the data for one fold.
+    """
+    errors = {candidate.name: data.error_m.copy() for candidate in candidates}
+    for fold in folds:
+        part = data if prepare is None else prepare(fold)
+        train, test = part.rows(fold.train), part.rows(fold.test)
+        for candidate in candidates:
+            left = test.error_m - candidate.fit(train, seed).correction_m(test)
+            errors[candidate.name][fold.test] = left
+            on_fit()
+    return errors
+
+
+def select_nested(
+    data: Dataset,
+    candidates: Sequence[Candidate],
+    folds: int,
+    seed: int,
+    on_share: Callable[[float], None] = lambda share: None,
+    *,
+    must_gain: float = MUST_GAIN,
+) -> Selection:
+    """Select by cross-validation over configurations, and measure the selection itself by a nested one.
+
+    Raises:
+        DatasetError, ParameterError: see `splits.by_configuration` and the fits.
+    """
+    inner_folds, done = max(2, folds - 2), 0
+    total = folds * len(candidates) * (1 + inner_folds) + len(_sizes(len(data.names))) * CURVE_DRAWS
+
+    def on_fit() -> None:
+        nonlocal done
+        done += 1
+        on_share(done / total)
+
+    names = [candidate.name for candidate in candidates]
+    errors = {name: data.error_m.copy() for name in ("raw", *names, NESTED)}
+    for fold in splits.by_configuration(data.configurations, folds, seed):
+        outer = held_out_errors(data, candidates, [fold], seed, on_fit)
+        train = data.rows(fold.train)
+        inner = splits.by_configuration(train.configurations, inner_folds, seed)
+        choice = preferred(held_out_errors(train, candidates, inner, seed, on_fit), must_gain)
+        for name in names:
+            errors[name][fold.test] = outer[name][fold.test]
+        errors[NESTED][fold.test] = outer[choice][fold.test]
+    chosen = preferred({name: errors[name] for name in names}, must_gain)
+    if untrained := [item.name for item in candidates if not item.trains]:
+        fallback = preferred({name: errors[name] for name in untrained}, must_gain)
+        # One of many candidates always looks good on the folds that selected it; the nested error does not.
+        if preferred({fallback: errors[fallback], chosen: errors[NESTED]}, must_gain) == fallback:
+            chosen = fallback
+    (candidate,) = (item for item in candidates if item.name == chosen)
+    curve = _learning_curve(data, candidate, seed, on_fit)
+    model = candidate.fit(data, seed)
+    return Selection(chosen, errors, model, curve, folds, seed, len(data.names))
+
+
+def min_configurations(folds: int) -> int:
+    """The number of configurations that `select_nested` needs, so that each part of a fold fills the inner folds."""
+    return 4 if folds == 2 else 3
+
+
+def select_for_site(
+    data: Dataset,
+    candidates: Sequence[Candidate],
+    seed: int,
+    without_offsets_of: Callable[[NDArray[np.intp]], NDArray[np.float64]],
+    on_share: Callable[[float], None] = lambda share: None,
+) -> Selection:
+    """Select by errors on held-out segments of the track and on held-out anchors.
+
+    Args:
+        data: from `SiteData.labelled`, with the offsets subtracted.
+        without_offsets_of: returns for rows that are held out the change of each range's offset, shape (n,), m, if the
+            offsets are estimated without these rows. Offsets are estimated again for held-out segments, but not for
+            held-out anchors, whose own ranges alone determine them.
+
+    Raises:
+        DatasetError: one segment cannot be divided.
+    """
+    assert data.anchors is not None
+    segments = _folds(np.array([name.split("/")[0] for name in data.configurations]), SEGMENT_FOLDS, seed)
+    anchors = _folds(data.anchors.astype(str), ANCHOR_FOLDS, seed)
+    if not segments:
+        raise DatasetError(
+            "one segment of ranges: nothing can be held out", valid="a longer drive, or more positions"
+        )
+    total, done = (len(segments) + len(anchors)) * len(candidates) + 1, 0
+
+    def on_fit() -> None:
+        nonlocal done
+        done += 1
+        on_share(done / total)
+
+    def prepare(fold: Split) -> Dataset:
+        return data.shifted(without_offsets_of(fold.test))
+
+    errors = held_out_errors(data, candidates, segments, seed, on_fit, prepare=prepare)
+    if anchors:
+        beside = held_out_errors(data, candidates, anchors, seed, on_fit)
+        errors = {name: np.concatenate([error, beside[name]]) for name, error in errors.items()}
+    chosen = preferred(errors)
+    (candidate,) = (item for item in candidates if item.name == chosen)
+    return Selection(chosen, errors, candidate.fit(data, seed), folds=len(segments), seed=seed)
+
+
+def _folds(groups: NDArray[np.str_], folds: int, seed: int) -> list[Split]:
+    """At most `folds` folds over groups, shape (n,); none of a single group."""
+    count = min(folds, len(np.unique(groups)))
+    return splits.by_configuration(groups, count, seed) if count >= 2 else []
+
+
+def _sizes(configurations: int) -> list[int]:
+    """The numbers of configurations of the points of a learning curve; a fifth is always held out."""
+    most = configurations - max(1, configurations // 5)
+    return sorted({max(2, round(share * most)) for share in CURVE_SHARES if most >= 2})
+
+
+def _learning_curve(
+    data: Dataset, candidate: Candidate, seed: int, on_fit: Callable[[], None]
+) -> tuple[tuple[int, float], ...]:
+    names = np.array(data.names)
+    sizes = _sizes(len(names))
+    if not sizes:
+        raise DatasetError(f"{len(names)} configurations have no learning curve", valid="3 or more")
+    generator = np.random.default_rng(seed)
+    found: dict[int, list[float]] = {size: [] for size in sizes}
+    for _ in range(CURVE_DRAWS):
+        order = generator.permutation(names)
+        # The same configurations are held out for every size, so that the sizes compare.
+        test = np.flatnonzero(np.isin(data.configurations, order[sizes[-1] :]))
+        for size in sizes:
+            fold = Split(np.flatnonzero(np.isin(data.configurations, order[:size])), test)
+            errors = held_out_errors(data, [candidate], [fold], seed, on_fit)[candidate.name]
+            found[size].append(float(np.abs(errors[test]).mean()))
+    return tuple((size, float(np.mean(maes))) for size, maes in found.items())

@@ -1,0 +1,587 @@
+"""Calibrate a site from a drive: true ranges from a joint solution or a localisation, then offsets and a model.
+
+`without_truth` and `with_truth` solve for the true ranges and the offsets; `_calibrated` selects the model for both.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.errors import DatasetError, ModelError, format_id
+from uwb_mitigation.evaluation.dataset import Dataset
+from uwb_mitigation.evaluation.site_data import SiteData
+from uwb_mitigation.files import write_together
+from uwb_mitigation.model import graph
+from uwb_mitigation.model.bundle import Bundle, made_bundle
+from uwb_mitigation.model.float_networks import float_network, scaled
+from uwb_mitigation.offsets import Offsets, dump_offsets
+from uwb_mitigation.positioning.geometry import Area, Height
+from uwb_mitigation.positioning.localised import Localised, PosePath, solve_localised
+from uwb_mitigation.positioning.model import MAD_TO_SD, NETWORK_SD, SLOPE_SD, Regressors
+from uwb_mitigation.positioning.self_calibration import SelfCalibration, calibrate
+from uwb_mitigation.training import candidates as models
+from uwb_mitigation.training import selection as selections
+from uwb_mitigation.training.anchor_check import check_anchors
+from uwb_mitigation.training.cards import card_of, familiarity_of
+from uwb_mitigation.training.selection import MUST_GAIN, Selection
+
+MAX_TRUTH_SD_M = 0.25
+"""Ranges whose true range has a larger standard deviation are left out."""
+
+MIN_LABELLED = 40
+MAX_OFFSET_M = 1.0
+"""Radios of one kind without individual antenna delays differ by 0.3 m at three sigma (Decawave APS014)."""
+
+OUTLIER_M, OUTLIER_SDS = 3.0, 10.0
+"""A range is an outlier if its error is further than both from the median error."""
+
+NETWORK_GROUPS = 8
+"""Ranges have a common standard deviation in each of this number of equal groups, by the size of their correction."""
+
+WINDOW_S = 1.0
+"""Ranges of this time give one position error."""
+
+NETWORK, LEVEL = "network", "level"
+NAN_PAIR = (math.nan, math.nan)
+
+Pairs = Mapping[tuple[int, int], tuple[float, float]]
+"""{(tag id, anchor id): (offset, standard deviation)}, m."""
+
+Progress = Callable[[str, float], None]
+"""Called with the current step and the finished share of it, 0 to 1."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Solution:
+    """True ranges and offsets, before the model is selected.
+
+    Attributes:
+        rows: int (n,), the ranges of the site that the model is fitted to. true_m: (n,), their true ranges.
+        antenna: (n, 3), the position of the tag's antenna at each of them, m.
+        segment: int (n,), segment of the track. stationary: bool, for each segment.
+        pairs, offsets: of the radios. level: what has its own offset: `pair`, `anchor` or `one`.
+        outliers: number of ranges that were left out of all figures because their errors are implausible.
+        notes: what was not observable, or was left out.
+        change_without: returns for held-out rows of `rows` the change of the offsets of pairs that are estimated without
+            them, m.
+        truth: topic of the localisation; None: the ranges alone. localised: its time offset and lever arms.
+        track: (k, 3), positions of the tags. track_of: (k,), their segments.
+        places: {tag id: position} of stationary tags; {`tag id #number`: position} of a tag with several positions.
+        network_sd: standard deviation of the network's factor in the joint solution; 0: not estimated.
+        line: received power in the joint solution, m/dB, and its standard deviation.
+        common_sd_m: standard deviation of the mean offset, which the held-out errors contain too; 0 with ground truth.
+        position_scatter_m: scatter of positions between tracks without one anchor, raw and calibrated; NaN: unknown.
+    """
+
+    rows: NDArray[np.intp]
+    true_m: NDArray[np.float64]
+    antenna: NDArray[np.float64]
+    segment: NDArray[np.intp]
+    stationary: NDArray[np.bool_]
+    pairs: Pairs
+    offsets: Offsets
+    level: str
+    outliers: int
+    notes: tuple[str, ...]
+    change_without: Callable[[NDArray[np.intp]], Mapping[tuple[int, int], float]]
+    truth: str | None = None
+    localised: Localised | None = None
+    track: NDArray[np.float64]
+    track_of: NDArray[np.intp]
+    places: Mapping[str, tuple[float, float, float]]
+    network_sd: float = 0.0
+    line: tuple[float, float] = (0.0, 0.0)
+    common_sd_m: float = 0.0
+    position_scatter_m: tuple[float, float] = NAN_PAIR
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Calibrated:
+    """A calibration, before it is written.
+
+    Attributes:
+        site: what was recorded. solution: true ranges and offsets.
+        data: the ranges of `solution.rows`, with the offsets subtracted. raw_m: their errors as measured, (n,).
+        selection: the model. notes: all notes.
+        position_error_m: RMSE of the horizontal position that the held-out errors cause, raw and with the chosen model.
+    """
+
+    site: SiteData
+    solution: Solution
+    data: Dataset
+    raw_m: NDArray[np.float64]
+    selection: Selection
+    notes: tuple[str, ...]
+    position_error_m: tuple[float, float]
+
+    @property
+    def offsets(self) -> Offsets:
+        return self.solution.offsets
+
+    @property
+    def held_out_m(self) -> NDArray[np.float64]:
+        """Errors of the chosen model on held-out segments, shape (n,), m."""
+        return self.selection.errors[self.selection.chosen][: len(self.data)]
+
+    @property
+    def raw_mae_m(self) -> float:
+        """MAE of the ranges as measured."""
+        return float(np.abs(self.raw_m).mean())
+
+    @property
+    def calibrated_mae_m(self) -> float:
+        """MAE of the chosen model on held-out segments and anchors."""
+        return self.selection.mae()[self.selection.chosen]
+
+    @property
+    def harms(self) -> bool:
+        """Whether held-out ranges do not gain `MUST_GAIN`, or positions get worse."""
+        raw, calibrated = self.solution.position_scatter_m
+        scatters = calibrated > raw
+        if self.solution.truth is not None:
+            raw, calibrated = self.position_error_m
+            scatters = calibrated > (1.0 + MUST_GAIN) * raw
+        return self.calibrated_mae_m > (1.0 - MUST_GAIN) * self.raw_mae_m or scatters
+
+    @property
+    def sure_gain(self) -> float:
+        """The least share by which the held-out error is lower, if the mean offset is wrong by two standard deviations.
+
+        Without ground truth the held-out ranges are compared with a track that contains the error of the mean offset.
+        """
+        wrong = 2.0 * self.solution.common_sd_m
+        raw, left = self.raw_m, self.held_out_m
+        return min(
+            1.0 - float(np.abs(left + by).mean() / max(np.abs(raw + by).mean(), 1e-9))
+            for by in (-wrong, 0.0, wrong)
+        )
+
+    def sentence(self) -> str:
+        """The result in one sentence."""
+        truth, chosen = self.solution.truth, self.selection.chosen
+        against = "residuals against the other anchors (not ground truth)"
+        text = (
+            f"Held-out range {against if truth is None else f'errors against {truth}'}: {self.raw_mae_m:.3f} m raw, "
+            f"{self.calibrated_mae_m:.3f} m calibrated ({chosen})"
+        )
+        for what, (raw, calibrated) in (
+            ("positions without one anchor scatter by", self.solution.position_scatter_m),
+            ("position error on held-out segments", self.position_error_m),
+        ):
+            if not math.isnan(raw):
+                text += f"; {what} {raw:.3f} m raw, {calibrated:.3f} m calibrated"
+        if self.harms:
+            return f"{text}: no gain."
+        if (gain := self.sure_gain) <= 0.0:
+            return f"{text}. The gain is smaller than its uncertainty."
+        return f"{text}: at least {gain:.0%} less."
+
+    def as_json(self) -> dict[str, object]:
+        """The result of `uwb-mitigation calibrate`."""
+        solution, model = self.solution, self.selection.model
+        factor = 0.0 if model.network is None else 1.0 if model.factor is None else model.factor
+        prior = model.prior
+        return {
+            "offsets_m": {f"{tag}-{anchor}": value for (tag, anchor), (value, _) in solution.pairs.items()},
+            "offset_sd_m": {f"{tag}-{anchor}": sd for (tag, anchor), (_, sd) in solution.pairs.items()},
+            "offsets_of": solution.level,
+            "raw_mae_m": self.raw_mae_m,
+            "calibrated_mae_m": self.calibrated_mae_m,
+            "truth": solution.truth or "none",
+            "refused": None,
+            "chosen": self.selection.chosen,
+            "candidates": self.selection.mae(),
+            "ranges": sum(map(len, self.site.tags)),
+            "labelled": len(self.data),
+            "outliers": solution.outliers,
+            "position_scatter_m": _json_pair(solution.position_scatter_m),
+            "position_error_m": _json_pair(self.position_error_m),
+            "network_factor": [factor, solution.network_sd],
+            "line": {
+                "offset_m": prior.offset_m,
+                "per_rx_power": prior.per_rx_power,
+                "per_power_gap": prior.per_power_gap,
+            },
+            "places": {name: list(position) for name, position in solution.places.items()},
+            "notes": list(self.notes),
+            "left_out": dict(self.site.left_out),
+            "localisation": None if solution.localised is None else solution.localised.as_json(),
+        }
+
+    def write(self, output: Path, universal: Bundle, name: str) -> tuple[Bundle, Path]:
+        """Write the bundle, and the offsets as `X.offsets.yaml`, both or none of them.
+
+        Args:
+            name: of the recordings, for people.
+
+        Raises:
+            ModelError: they cannot be written.
+        """
+        truth, model, n = self.solution.truth, self.selection.model, len(self.data)
+        how = "without truth" if truth is None else f"with truth from {truth}"
+        metrics = {"raw": self.raw_mae_m, **self.selection.mae()}
+        training = {
+            "data": f"{name}, calibrated {how}",
+            "calibrated": how,
+            "chosen": self.selection.chosen,
+            "measurements": n,
+            "configurations": len(self.data.names),
+            "split": "held out: stretches of the track, and anchors",
+            "started_from": f"{universal.model_id:08x}",
+            "recipe": {"line": model.prior.needs_power, "network": model.network is not None},
+            "metrics_m": {row: {"mae": round(value, 4)} for row, value in metrics.items()},
+        }
+        has_network = model.network is not None
+        network = scaled(float_network(universal), 0.0) if model.network is None else model.network
+        familiarity = familiarity_of(self.data) if has_network else None
+        fitted = output.stem, universal.architecture, self.data, model.prior
+        card = card_of(*fitted, self.data, self.held_out_m, training, familiarity)
+        if has_network:
+            # The drive has not seen every part of the site, so the limits include the universal model's.
+            (low, high), (lowest, highest) = universal.card.correction_limits_m, card.correction_limits_m
+            card = replace(card, correction_limits_m=(min(low, lowest), max(high, highest)))
+        bundle, content = made_bundle(
+            output, graph.float_model(network), replace(card, needs_cir=has_network)
+        )
+        beside = offsets_file(output)
+        comment = (
+            f"Offsets of the radios, m, beside model {bundle.model_id:08x} ({output.name}): use both together.\n"
+            f"Found by uwb-mitigation calibrate in {name}, {how}."
+        )
+        write_together({output: content, beside: dump_offsets(self.offsets, comment)}, ModelError)
+        return bundle, beside
+
+
+def _json_pair(pair: tuple[float, float]) -> list[float | None]:
+    return [None if math.isnan(value) else value for value in pair]
+
+
+def offsets_file(bundle: Path) -> Path:
+    """The file of the offsets that belong to a site's bundle."""
+    return bundle.with_suffix(".offsets.yaml")
+
+
+def without_truth(
+    site: SiteData,
+    universal: Bundle,
+    *,
+    height: Height | None,
+    area: Area | None,
+    seed: int,
+    on_progress: Progress = lambda what, share: None,
+) -> Calibrated:
+    """Calibrate from the ranges alone.
+
+    Raises:
+        DatasetError: the geometry does not determine the solution, an anchor is not where the file says, or an offset is
+            implausible.
+    """
+    on_progress("solving for track and offsets", 0.05)
+    known = regressors(site, universal)
+    found = calibrate(site.anchors, site.tags, known, height=height, area=area, heights_m=site.height_m)
+    on_progress("solving for track and offsets", 0.4)
+    track, ids = found.stretches, [anchor.id for anchor in site.anchors.anchors]
+    of_range = site.begins[track.tag] + track.row
+    is_known = np.isfinite(found.pseudo_m) & (found.pseudo_sd_m <= MAX_TRUTH_SD_M)
+    is_known, outliers = _without_outliers(track.ranges.range_m - found.pseudo_m, is_known)
+    notes = list(found.not_told)
+    if (unknown := int((~is_known).sum()) - outliers) > 0:
+        notes.append(
+            f"{unknown} of {len(is_known)} ranges left out of the fit: the other anchors tell too little of where the tag was"
+        )
+    used = np.flatnonzero(is_known & _has_input(site)[of_range])
+    pairs = {(found.tag_ids[tag], ids[row]): found.applied(tag, row) for tag, row in found.pairs()}
+    common = found.mean()[0] if found.mean_is_significant else 0.0
+    offsets = Offsets(common)
+    if found.level == "pair":
+        offsets = _pair_offsets(common, pairs)
+    elif found.level == "anchor":
+        own = {ids[row]: found.applied(tag, row)[0] for tag, row in found.pairs()}
+        offsets = Offsets(common, anchors=own)
+
+    def change_without(held_out: NDArray[np.intp]) -> dict[tuple[int, int], float]:
+        again = found.found_without(_whole_segments(used[held_out], used, track.of))
+        return {
+            (found.tag_ids[tag], ids[row]): again.pair(tag, row)[0] - found.pair(tag, row)[0]
+            for tag, row in found.pairs()
+            if found.applied(tag, row)[0] != 0.0
+        }
+
+    solution = Solution(
+        rows=of_range[used],
+        true_m=found.pseudo_m[used],
+        antenna=found.fit.position[found.links.knot[found.links.of]][used],
+        segment=track.of[used],
+        stationary=track.at_rest,
+        pairs=pairs,
+        offsets=offsets,
+        level=found.level,
+        outliers=outliers,
+        notes=tuple(notes),
+        change_without=change_without,
+        track=found.fit.position,
+        track_of=found.links.knot_stretch,
+        places=_places(found),
+        network_sd=found.value(NETWORK)[1],
+        line=found.value(LEVEL),
+        common_sd_m=found.mean()[1],
+        position_scatter_m=found.position_scatter_m,
+    )
+    return _calibrated(site, universal, solution, seed, lambda s: on_progress("choosing", 0.4 + 0.6 * s))
+
+
+def with_truth(
+    site: SiteData,
+    universal: Bundle,
+    paths: Sequence[Sequence[PosePath]],
+    topic: str,
+    *,
+    time_offset_s: float | None,
+    lever_arms_m: NDArray[np.float64] | None = None,
+    estimate_lever_arm: bool = False,
+    seed: int,
+    on_progress: Progress = lambda what, share: None,
+) -> Calibrated:
+    """Calibrate against the poses of a localisation.
+
+    Args:
+        paths: for each tag, the poses of the robot that carries it, for each recording.
+        time_offset_s, lever_arms_m, estimate_lever_arm: see `solve_localised`.
+
+    Raises:
+        DatasetError: as for `without_truth`; or too few ranges within the times of the localisation.
+    """
+    on_progress("time offset and lever arm", 0.05)
+    joined = [
+        PosePath.joined([one.shifted(by) for one, by in zip(own, site.shift_ns, strict=True)])
+        for own in paths
+    ]
+    known = regressors(site, universal)
+    found = solve_localised(
+        site.anchors,
+        site.tags,
+        joined,
+        known,
+        time_offset_s=time_offset_s,
+        lever_arms_m=lever_arms_m,
+        estimate_lever_arm=estimate_lever_arm,
+    )
+    on_progress("time offset and lever arm", 0.3)
+    error = np.concatenate([one.range_m for one in site.tags]) - found.distance_m
+    kept, outliers = _without_outliers(error, np.isfinite(error))
+    rows = np.flatnonzero(kept & _has_input(site))
+    check_anchors(site, found.position, kept)
+    ids = [anchor.id for anchor in site.anchors.anchors]
+    pairs = {
+        (site.tags[tag].tag_id, ids[row]): found.pair(tag, row, float(site.anchors.sd[row]))
+        for tag, row in found.pairs
+    }
+    common = float(np.median([value for value, sd in pairs.values() if sd <= MAX_TRUTH_SD_M] or [0.0]))
+    spread = MAD_TO_SD * float(np.median([abs(value - common) for value, _ in pairs.values()]))
+    # Few ranges say less about the offset of a pair than the other pairs do.
+    few = common, math.hypot(MAX_TRUTH_SD_M, spread)
+    pairs = {pair: few if own[1] > MAX_TRUTH_SD_M else own for pair, own in pairs.items()}
+    tag = np.repeat(np.arange(len(site.tags)), list(map(len, site.tags)))
+
+    def change_without(held_out: NDArray[np.intp]) -> dict[tuple[int, int], float]:
+        rest = np.setdiff1d(rows, rows[held_out])
+        own = [rest[tag[rest] == number] for number in range(len(site.tags))]
+        again = solve_localised(
+            site.anchors,
+            [one.take(part - begin) for one, part, begin in zip(site.tags, own, site.begins, strict=True)],
+            joined,
+            known.take(rest),
+            time_offset_s=found.time_offset_s,
+            lever_arms_m=found.lever_arm_m,
+        )
+        return {
+            (site.tags[number].tag_id, ids[row]): again.pair(number, row, 0.0)[0]
+            - found.pair(number, row, 0.0)[0]
+            for number, row in again.pairs
+        }
+
+    solution = Solution(
+        rows=rows,
+        true_m=found.distance_m[rows],
+        antenna=found.position[rows],
+        segment=tag[rows],
+        stationary=np.zeros(len(site.tags), np.bool_),
+        pairs=pairs,
+        offsets=_pair_offsets(common, pairs),
+        level="pair",
+        outliers=outliers,
+        notes=(),
+        change_without=change_without,
+        truth=topic,
+        localised=found,
+        track=found.position[rows],
+        track_of=tag[rows],
+        places={},
+    )
+    return _calibrated(site, universal, solution, seed, lambda s: on_progress("choosing", 0.3 + 0.7 * s))
+
+
+def _calibrated(
+    site: SiteData, universal: Bundle, solution: Solution, seed: int, on_share: Callable[[float], None]
+) -> Calibrated:
+    """Select the model; raises `DatasetError` for too few ranges and implausible offsets."""
+    if len(solution.rows) < MIN_LABELLED:
+        raise DatasetError(
+            f"{len(solution.rows)} ranges whose true length can be told: too few",
+            valid=f"{MIN_LABELLED} or more",
+        )
+    _check_offsets(solution.pairs)
+    raw = site.labelled(
+        solution.rows, solution.true_m, solution.segment, solution.stationary[solution.segment]
+    )
+    assert raw.tags is not None
+    assert raw.anchors is not None
+    pair_of = list(zip(raw.tags.tolist(), raw.anchors.tolist(), strict=True))
+    data = raw.shifted(-solution.offsets.of(raw.tags, raw.anchors).astype(np.float64))
+
+    def offset_change(held_out: NDArray[np.intp]) -> NDArray[np.float64]:
+        of_pair = solution.change_without(held_out)
+        return np.array([-of_pair.get(pair, 0.0) for pair in pair_of])
+
+    with_network, candidates, missing = models.site_models(data, site.has_cirs, universal)
+    selection = selections.select_for_site(with_network, candidates, seed, offset_change, on_share)
+    without_cir = int((~_has_input(site)).sum())
+    notes = (
+        [f"{without_cir} ranges without a usable CIR: used for track and offsets only"] if without_cir else []
+    )
+    left = selection.errors[selection.chosen][: len(data)]
+    raw_error, error = (position_error_m(site, solution, error_m) for error_m in (raw.error_m, left))
+    return Calibrated(
+        site=site,
+        solution=solution,
+        data=data,
+        raw_m=raw.error_m,
+        selection=selection,
+        notes=(*solution.notes, *notes, *missing),
+        position_error_m=(raw_error, error),
+    )
+
+
+def position_error_m(site: SiteData, solution: Solution, error_m: NDArray[np.float64]) -> float:
+    """RMSE of the horizontal position that range errors cause, m: least squares on the ranges of each second.
+
+    Args:
+        error_m: (n,), of the ranges of `solution.rows`.
+
+    Returns:
+        NaN if no second has ranges to three anchors that determine a position.
+    """
+    stamp, row = (
+        np.concatenate([getattr(one, name) for one in site.tags])[solution.rows]
+        for name in ("stamp_ns", "anchor")
+    )
+    away = solution.antenna - site.anchors.position[row]
+    unit = away[:, :2] / np.maximum(np.linalg.norm(away, axis=1), 0.05)[:, None]
+    window = (stamp - stamp.min()) // round(WINDOW_S * 1e9)
+    squared = []
+    _, index = np.unique(np.stack([solution.segment, window]), axis=1, return_inverse=True)
+    index = index.reshape(-1)
+    order = np.argsort(index, kind="stable")
+    for part in np.split(order, np.flatnonzero(np.diff(index[order])) + 1):
+        # Determined by more than noise: singular values of unit vectors grow with the square root of their number.
+        if len(np.unique(row[part])) >= 3 and np.linalg.svd(unit[part])[1][1] > 0.3 * math.sqrt(len(part)):
+            shift = np.linalg.lstsq(unit[part], error_m[part], rcond=None)[0]
+            squared.append(float(shift @ shift))
+    return math.sqrt(float(np.mean(squared))) if squared else math.nan
+
+
+def regressors(site: SiteData, universal: Bundle) -> Regressors:
+    """What explains long ranges next to offsets: the universal network with CIRs, otherwise the received power."""
+    if site.has_cirs:
+        predicted = models.network_m(float_network(universal), site.inputs)
+        rows = np.where(np.isfinite(predicted) & site.with_cir, predicted, 0.0)[:, None]
+        # Ranges with a small correction have errors of centimetres, those with a large one of decimetres.
+        size = np.abs(rows[:, 0])
+        edges = np.quantile(size[site.with_cir], np.linspace(0.0, 1.0, NETWORK_GROUPS + 1)[1:-1])
+        # Ranges without a CIR are not corrected, so they have their own standard deviation.
+        group = np.where(site.with_cir, np.searchsorted(edges, size), NETWORK_GROUPS)
+        return Regressors((NETWORK,), rows, np.ones(1), np.array([NETWORK_SD]), group)
+    power = site.rx_power_dbm.astype(np.float64)
+    known = np.isfinite(power)
+    if known.mean() < 0.5 or np.ptp(power[known]) < 1.0:
+        return Regressors.none(len(power))
+    return Regressors.one(LEVEL, np.where(known, power - np.median(power[known]), 0.0), 0.0, SLOPE_SD)
+
+
+def _places(found: SelfCalibration) -> dict[str, tuple[float, float, float]]:
+    """The positions of stationary tags, see `Solution.places`."""
+    resting = np.flatnonzero(found.links.at_rest).tolist()
+    tag_of = dict(zip(found.stretches.of.tolist(), found.stretches.tag.tolist(), strict=True))
+    positions = Counter(tag_of[segment] for segment in resting)
+    number: Counter[int] = Counter()
+    places = {}
+    for segment in resting:
+        tag = tag_of[segment]
+        number[tag] += 1
+        suffix = f" #{number[tag]}" if positions[tag] > 1 else ""
+        x, y, z = found.fit.position[found.links.knot_stretch == segment][0].tolist()
+        places[f"{found.tag_ids[tag]}{suffix}"] = (x, y, z)
+    return places
+
+
+def _pair_offsets(common: float, pairs: Pairs) -> Offsets:
+    sds = {pair: sd for pair, (_, sd) in pairs.items() if math.isfinite(sd)}
+    return Offsets(common, pairs={pair: value for pair, (value, _) in pairs.items()}, pair_sd=sds)
+
+
+def _without_outliers(
+    error_m: NDArray[np.float64], known: NDArray[np.bool_]
+) -> tuple[NDArray[np.bool_], int]:
+    """Those of the `known` errors that are no outliers, bool (n,), and the number of outliers."""
+    if not known.any():
+        return known, 0
+    away = np.abs(error_m - np.median(error_m[known]))
+    limit = max(OUTLIER_M, OUTLIER_SDS * MAD_TO_SD * float(np.median(away[known])))
+    kept = known & (away <= limit)
+    return kept, int(known.sum() - kept.sum())
+
+
+def _whole_segments(
+    held_out: NDArray[np.intp], labelled: NDArray[np.intp], segment: NDArray[np.intp]
+) -> NDArray[np.bool_]:
+    """All ranges that are held out with some labelled ones: also those of unknown truth between them.
+
+    Args:
+        held_out: some of `labelled`, which ascend.
+        segment: int (r,), of all ranges, each segment in the order of time.
+    """
+    every = np.arange(len(segment))
+    before = np.maximum(np.searchsorted(labelled, every, side="right") - 1, 0)
+    after = np.minimum(before + 1, len(labelled) - 1)
+    nearest = np.where(segment[labelled[before]] == segment, labelled[before], labelled[after])
+    found: NDArray[np.bool_] = np.isin(nearest, held_out) & (segment[nearest] == segment)
+    return found
+
+
+def _has_input(site: SiteData) -> NDArray[np.bool_]:
+    """The ranges that the model is fitted to, bool (r,): the others contribute to track and offsets only."""
+    return site.with_cir if site.has_cirs else np.ones(len(site.with_cir), np.bool_)
+
+
+def _check_offsets(pairs: Pairs) -> None:
+    median = float(np.median([value for value, _ in pairs.values()]))
+    for (tag, anchor), (value, _) in pairs.items():
+        what = f"an offset of {value:.2f} m of tag {format_id(tag)} and anchor {format_id(anchor)}"
+        if abs(value - median) > MAX_OFFSET_M:
+            raise DatasetError(
+                f"{what}; the median of all pairs is {median:.2f} m",
+                valid=f"the true position of anchor {format_id(anchor)} in the anchors file; radios of one kind differ by "
+                f"less than {MAX_OFFSET_M:g} m",
+            )
+        if abs(value) > MAX_OFFSET_M:
+            raise DatasetError(
+                what,
+                valid=f"{MAX_OFFSET_M:g} m at most: set the antenna delay first (`uwb-mitigation board antenna-delay`)",
+            )

@@ -1,0 +1,285 @@
+"""From labelled ranges to a float bundle: select a model, fit it to all of the data and write it, as `train` does."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.errors import DatasetError, ParameterError
+from uwb_mitigation.evaluation import splits
+from uwb_mitigation.evaluation.dataset import Dataset
+from uwb_mitigation.evaluation.metrics import ErrorStatistics, mae_by_group
+from uwb_mitigation.model import floating, graph
+from uwb_mitigation.model.architecture import Remnet
+from uwb_mitigation.model.bundle import Bundle, Card, load_bundle, save_bundle
+from uwb_mitigation.model.float_networks import float_network, scaled
+from uwb_mitigation.model.integer import IntegerNetwork
+from uwb_mitigation.model.prior import LinePrior
+from uwb_mitigation.model.shipped import default_model_path
+from uwb_mitigation.model.weights import FloatWeights
+from uwb_mitigation.training import candidates as models
+from uwb_mitigation.training import selection as selections
+from uwb_mitigation.training.candidates import Candidate, Recipe, fit_own, prior_m
+from uwb_mitigation.training.cards import card_of, familiarity_of
+from uwb_mitigation.training.options import FitOptions
+from uwb_mitigation.training.quantization import calibration_inputs, quantize
+from uwb_mitigation.training.selection import NESTED, Selection
+
+AUTO = "auto"
+MAX_NAMED = 100
+"""If there are more configurations, the card contains their number instead of their names."""
+
+Progress = Callable[[str, float], None]
+"""Called with the current step and the finished share of it, 0 to 1."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CrossValidation:
+    """Errors on held-out configurations, each of shape (n,), m, in the order of the dataset.
+
+    Attributes:
+        errors: of an own model {`raw`, `overall_median`, `l1_line` (if it has a line), `float`, `int8`}; otherwise those
+            of the selection, and `float`.
+        folds, seed: of the splits.
+    """
+
+    dataset: Dataset
+    errors: Mapping[str, NDArray[np.float64]]
+    folds: int
+    seed: int
+
+    def statistics(self) -> dict[str, dict[str, float]]:
+        """{name: {mae, std, p95}}, m."""
+        return {name: asdict(ErrorStatistics.of(error)) for name, error in self.errors.items()}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrainedBundle:
+    """A bundle that was written, and its errors on held-out configurations.
+
+    Attributes:
+        selection: None if the recipe was given.
+        validation: source of the card's intervals.
+        after_m: MAE of the model, m; if it was selected, of the selection (nested).
+        before_m: {name: MAE that it has to improve on}, m.
+    """
+
+    bundle: Bundle
+    selection: Selection | None
+    validation: CrossValidation
+    after_m: float
+    before_m: dict[str, float]
+
+    @property
+    def helped(self) -> bool:
+        return self.after_m < min(self.before_m.values())
+
+    @property
+    def prefers_cold_start(self) -> bool:
+        """Whether another candidate had to be `COLD_START_MUST_GAIN` better than the cold start."""
+        names = () if self.selection is None else self.selection.errors
+        return models.COLD_START in names and models.is_few(self.validation.dataset)
+
+    def as_json(self) -> dict[str, object]:
+        """The result of `uwb-mitigation train`."""
+        errors, dataset = self.validation.errors, self.validation.dataset
+        tested = errors.get("int8", errors["float"])
+        groups = mae_by_group(dataset.configurations, errors["raw"], tested).items()
+        return {
+            "model_id": self.bundle.model_id,
+            "n": len(dataset),
+            "refused": dict(dataset.refused),
+            "helped": self.helped,
+            "rows": [{"name": row, **values} for row, values in self.validation.statistics().items()],
+            "by_configuration": {
+                key: {"n": n, "raw_mae": before, "corrected_mae": after} for key, (n, before, after) in groups
+            },
+            **({} if self.selection is None else {"choice": self.selection.as_json()}),
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """What is trained on.
+
+    Attributes:
+        dataset: labelled ranges. name: of the recording, for the card.
+        output: bundle to write.
+        folds: of the cross-validation.
+    """
+
+    dataset: Dataset
+    name: str
+    output: Path
+    folds: int
+    on_progress: Progress = lambda what, share: None
+
+
+def train_own(job: Job, recipe: Recipe, wanted: str = AUTO) -> TrainedBundle:
+    """Train an own model: one of `candidates.OWN`, or the best of these and of the cold start (AUTO).
+
+    Raises:
+        ParameterError: unknown model. DatasetError: too few configurations; see also `fitting.fit`.
+    """
+    if wanted not in (AUTO, *models.OWN):
+        raise ParameterError(f"recipe {wanted!r}", valid=", ".join((AUTO, *models.OWN)))
+    dataset, folds = job.dataset, min(job.folds, len(job.dataset.names))
+    _check_configurations(dataset, selections.min_configurations(job.folds) if wanted == AUTO else 2)
+    selection, seed = None, recipe.fit.seed
+    if wanted == AUTO:
+        universal = load_bundle(default_model_path(dataset.preprocessing.scaling))
+        candidates = models.with_cold_start(models.own_models(recipe), dataset, universal)
+        selection = _select(job, candidates, seed)
+        wanted = selection.chosen
+        if wanted in (models.COLD_START, models.MEAN):
+            return _write_selected(job, selection, universal, recipe.fit, ("raw",))
+    recipe = recipe.of(wanted)
+    total, done = recipe.fit.epochs * (folds + 1), 0
+
+    def on_epoch() -> None:
+        nonlocal done
+        done += 1
+        job.on_progress("training", done / total)
+
+    validation = cross_validate(dataset, recipe, folds, seed, on_epoch)
+    fitted = fit_own(dataset, recipe, seed, on_epoch)
+    card = describe(job.output.stem, recipe, fitted.prior, validation, job.name)
+    mae = {row: statistics["mae"] for row, statistics in validation.statistics().items()}
+    after = mae["int8"] if selection is None else selection.mae()[NESTED]
+    assert fitted.network is not None
+    bundle = save_bundle(job.output, graph.float_model(fitted.network), card)
+    return TrainedBundle(bundle, selection, validation, after, {"raw": mae["raw"]})
+
+
+def train_from_bundle(
+    job: Job, source: Bundle, options: FitOptions, *, offer_cold_start: bool
+) -> TrainedBundle:
+    """Train a model that starts from `source`, or from the universal network with `offer_cold_start`.
+
+    Raises:
+        DatasetError: too few configurations; see also `fitting.fit`. ModelError: the network is not a REMNet.
+    """
+    _check_configurations(job.dataset, selections.min_configurations(job.folds))
+    candidates = models.from_bundle(source, options)
+    universal = load_bundle(default_model_path(job.dataset.preprocessing.scaling))
+    if offer_cold_start:
+        # The source is the universal model then: with another offset it is the cold start.
+        candidates = [item for item in candidates if item.name != models.OWN_OFFSET]
+        candidates = models.with_cold_start(candidates, job.dataset, universal)
+    selection = _select(job, candidates, options.seed)
+    start = universal if selection.chosen in (models.COLD_START, models.MEAN) else source
+    return _write_selected(job, selection, start, options, ("raw", models.AS_SHIPPED))
+
+
+def _select(job: Job, candidates: Sequence[Candidate], seed: int) -> Selection:
+    is_cold = candidates[0].name == models.COLD_START
+    return selections.select_nested(
+        job.dataset,
+        candidates,
+        min(job.folds, len(job.dataset.names)),
+        seed,
+        lambda share: job.on_progress("choosing", share),
+        must_gain=selections.COLD_START_MUST_GAIN if is_cold else selections.MUST_GAIN,
+    )
+
+
+def _write_selected(
+    job: Job, selection: Selection, start: Bundle, options: FitOptions, before: Sequence[str]
+) -> TrainedBundle:
+    """Write a model that starts from a bundle; the intervals are from its held-out errors in the selection."""
+    silent = scaled(float_network(start), 0.0)
+    assert isinstance(silent.architecture, Remnet)
+    prior, network = selection.model.prior, selection.model.network
+    is_trained = selection.chosen == models.TRAINED_FURTHER
+    recipe = Recipe(silent.architecture, options, line=prior.needs_power, network=is_trained)
+    errors = {**selection.errors, "float": selection.errors[selection.chosen]}
+    validation = CrossValidation(job.dataset, errors, selection.folds, selection.seed)
+    card = describe(job.output.stem, recipe, prior, validation, job.name)
+    training = {
+        **card.training,
+        "started_from": f"{start.model_id:08x}",
+        "chosen": selection.chosen,
+        # How a network was fitted that was not trained further is in the card of its bundle.
+        "recipe": {**card.training["recipe"], "network": network is not None},
+    }
+    model = graph.float_model(silent if network is None else network)
+    bundle = save_bundle(job.output, model, replace(card, training=training))
+    mae = selection.mae()
+    return TrainedBundle(bundle, selection, validation, mae[NESTED], {row: mae[row] for row in before})
+
+
+def cross_validate(
+    dataset: Dataset,
+    recipe: Recipe,
+    folds: int,
+    seed: int,
+    on_epoch: Callable[[], None] = lambda: None,
+    *,
+    quantised: bool = True,
+) -> CrossValidation:
+    """Fit an own model without each fold of configurations in turn, and test it on them.
+
+    Raises:
+        DatasetError, ParameterError: see `splits.by_configuration` and `fitting.fit`.
+    """
+    names = ["raw", "overall_median", *(["l1_line"] if recipe.line else []), "float"]
+    errors = {name: dataset.error_m.copy() for name in (*names, *(["int8"] if quantised else []))}
+    for fold in splits.by_configuration(dataset.configurations, folds, seed):
+        train, test = dataset.rows(fold.train), dataset.rows(fold.test)
+        fitted = fit_own(train, recipe, recipe.fit.seed, on_epoch)
+        assert fitted.network is not None
+        residual = test.error_m - prior_m(fitted.prior, test)
+        errors["overall_median"][fold.test] -= np.median(train.error_m)
+        if recipe.line:
+            errors["l1_line"][fold.test] = residual
+        errors["float"][fold.test] = residual - floating.predict_m(fitted.network, test.inputs)
+        if quantised:
+            integers = quantize(fitted.network, calibration_inputs(train, seed), exact=False)
+            errors["int8"][fold.test] = residual - IntegerNetwork(integers).predict_m(test.inputs)
+    return CrossValidation(dataset, errors, folds, seed)
+
+
+def fit_with_card(dataset: Dataset, recipe: Recipe, inner_folds: int) -> tuple[Card, FloatWeights]:
+    """Fit an own model to all of the dataset; the card's intervals are from a cross-validation within it.
+
+    Raises:
+        DatasetError: see `cross_validate`.
+    """
+    folds, seed = min(inner_folds, len(dataset.names)), recipe.fit.seed
+    validation = cross_validate(dataset, recipe, folds, seed, quantised=False)
+    fitted = fit_own(dataset, recipe, seed)
+    assert fitted.network is not None
+    return describe("", recipe, fitted.prior, validation, ""), fitted.network
+
+
+def describe(name: str, recipe: Recipe, prior: LinePrior, validation: CrossValidation, data: str) -> Card:
+    """The card of a float model that was fitted to the dataset of `validation`."""
+    dataset = validation.dataset
+    options = asdict(recipe.fit) | {"per_configuration": recipe.per_configuration} if recipe.network else {}
+    training = {
+        "data": data,
+        "configurations": names if len(names := dataset.names) <= MAX_NAMED else len(names),
+        "measurements": len(dataset),
+        "split": f"{validation.folds} folds by configuration",
+        "seed": validation.seed,
+        "recipe": {"line": recipe.line, "network": recipe.network} | options,
+        "metrics_m": {
+            row: {key: round(value, 4) for key, value in statistics.items()}
+            for row, statistics in validation.statistics().items()
+        },
+    }
+    left = validation.errors["float"]
+    familiarity = familiarity_of(dataset)
+    return card_of(name, recipe.architecture, dataset, prior, dataset, left, training, familiarity)
+
+
+def _check_configurations(dataset: Dataset, needed: int) -> None:
+    if (count := len(dataset.names)) < needed:
+        raise DatasetError(
+            f"{count} configuration{'' if count == 1 else 's'}, that is placements of tag and anchor",
+            valid=f"{needed} or more, each under a name of its own in `configuration` of the true ranges",
+        )
