@@ -115,8 +115,8 @@ def trained(records: list[Record], universal: Bundle, folder: Path) -> Bundle:
     """What `train --data` makes of the drive's true ranges, a configuration a metre and pair as the simulator names."""
     dataset = build_dataset(records, universal.preprocessing)
     from uwb_mitigation.model.architecture import Remnet
-    from uwb_mitigation.training.options import FitOptions
     from uwb_mitigation.training.candidates import Recipe
+    from uwb_mitigation.training.options import FitOptions
 
     recipe = Recipe(Remnet(samples=universal.preprocessing.samples), FitOptions())
     return train.train_own(train.Job(dataset, "drive", folder / "trained.onnx", 4), recipe).bundle
