@@ -15,7 +15,8 @@ from command_line import run
 from conftest import REPOSITORY
 from drives import HALL, NANOSECONDS, circuit, drive
 
-from uwb_mitigation.bag.poses import encode_pose, read_positions, tag_topic
+from uwb_mitigation.bag.pose_paths import read_truth
+from uwb_mitigation.bag.poses import encode_pose, tag_topic
 from uwb_mitigation.bag.topics import ODOMETRY, ODOMETRY_TRUTH, POSE_TYPE
 from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.measurement import Cir, CorrectedRange, Origin, RangeMeasurement, Record, Status
@@ -74,15 +75,15 @@ def test_a_track_is_written_judged_and_read_by_evo(hall: Path, tmp_path: Path):
         assert one["corrected_m"] < 0.3
         assert one["raw_m"] > 0.4, "they are 0.6 m too long"
     assert anchors_file(out).read_text() == dump_anchors(HALL, "anchors of the track of hall.mcap")
-    (live,) = read_positions(out, ODOMETRY)
-    (truth,) = read_positions(out, ODOMETRY_TRUTH)
-    assert (live.tag_id, truth.tag_id) == (7, 7)
-    off = live.path.position - truth.path.at(live.path.stamp_ns)
+    (live,), (truth,) = (read_truth(out, topic).items() for topic in (ODOMETRY, ODOMETRY_TRUTH))
+    assert (live[0], truth[0]) == (7, 7)
+    live = live[1]
+    off = live.position - truth[1].at(live.stamp_ns)
     assert np.nanmean(np.hypot(*off[:, :2].T)) < 0.2
     evo = pytest.importorskip("evo.tools.file_interface")
     read = evo.read_tum_trajectory_file(tum)
     assert read.num_poses >= 400
-    np.testing.assert_allclose(read.timestamps[0], live.path.stamp_ns[0] / 1e9, atol=2.0)
+    np.testing.assert_allclose(read.timestamps[0], live.stamp_ns[0] / 1e9, atol=2.0)
 
 
 def test_held_out_residuals_show_the_offset_of_one_anchor():

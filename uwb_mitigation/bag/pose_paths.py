@@ -10,13 +10,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from uwb_mitigation.bag.poses import POSITION_TYPES
-from uwb_mitigation.bag.topics import ODOMETRY_TYPE, POSE_TYPE, RANGE_SENSOR_TYPE, TF, TF_STATIC, TF_TYPE
+from uwb_mitigation.bag.poses import POSITION_TYPES, tag_of_frame
+from uwb_mitigation.bag.topics import (
+    ODOMETRY_TRUTH,
+    ODOMETRY_TYPE,
+    POSE_TYPE,
+    RANGE_SENSOR_TYPE,
+    TF,
+    TF_STATIC,
+    TF_TYPE,
+)
 from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.positioning.localised import PosePath
-from uwb_mitigation.positioning.tracks import Heights
+from uwb_mitigation.positioning.tracks import Heights, TruePath
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
@@ -34,20 +42,20 @@ _NANOSECONDS = 1_000_000_000
 _Row = tuple[int, float, float, float, float, float, float, float]
 
 
-def read_poses(path: Path, topic: str, frames: tuple[str, str] | None = None) -> PosePath:
-    """The poses of one frame in the anchors' frame; arguments and errors as of `read_bodies`.
+def read_truth(path: Path, topic: str = ODOMETRY_TRUTH) -> dict[int | None, TruePath]:
+    """Return the positions of tags on a topic, {tag id: path}; None: of another frame. Without the topic: empty.
 
     Raises:
-        RecordingError: also if the topic contains several child frames and `frames` does not choose one.
+        RecordingError: the bag cannot be read, or the topic has another type.
     """
-    bodies = read_bodies(path, topic, frames)
-    if len(bodies) > 1:
-        raise RecordingError(
-            f"poses of several frames: {', '.join(sorted(bodies))}",
-            where=f"{path}, topic {topic}",
-            valid="--frames MAP CHILD to choose one",
-        )
-    return next(iter(bodies.values()))
+    from uwb_mitigation.bag.reader import BagReader
+
+    bag = BagReader(path)
+    if topic not in bag.topics:
+        return {}
+    _check_topic(path, bag.topics, topic, POSITION_TYPES)
+    bodies = _bodies(bag, topic, f"{path}, topic {topic}", oriented=False)
+    return {tag_of_frame(child): TruePath(one.stamp_ns, one.position) for child, one in bodies.items()}
 
 
 def read_bodies(path: Path, topic: str, frames: tuple[str, str] | None = None) -> dict[str, PosePath]:
@@ -74,24 +82,31 @@ def read_bodies(path: Path, topic: str, frames: tuple[str, str] | None = None) -
                 "transforms between many frames", where=where, valid="--frames MAP BASE_LINK"
             )
         edges = _edges(bag, [topic, TF_STATIC], where)
-        return {_frame(frames[1]): _chained(edges, _frame(frames[0]), _frame(frames[1]), where)}
+        return {_frame(frames[1]): _composed(edges, _frame(frames[0]), _frame(frames[1]), where)}
+    bodies = _bodies(bag, topic, where)
+    if frames is None or not set(bodies) - {""}:
+        return bodies
+    if (wanted := _frame(frames[1])) not in bodies:
+        raise RecordingError(
+            f"no poses of {wanted}", where=where, valid=f"--frames of: {', '.join(sorted(bodies))}"
+        )
+    return {wanted: bodies[wanted]}
+
+
+def _bodies(bag: BagReader, topic: str, where: str, *, oriented: bool = True) -> dict[str, PosePath]:
+    """{child frame: poses}; `oriented`: messages without an orientation are left out."""
     decode = _Decoder(where)
     rows: dict[str, list[_Row]] = {}
     for message in bag.messages([topic]):
         decoded = decode(message)
         pose = decoded.pose if hasattr(decoded.pose, "position") else decoded.pose.pose
-        row = _row(decoded.header.stamp, pose.position, pose.orientation)
+        row = _row(decoded.header.stamp, pose.position, pose.orientation if oriented else None)
         child = _frame(getattr(decoded, "child_frame_id", ""))
         if row is not None and (child in rows or len(rows) < _MOST_FRAMES):
             rows.setdefault(child, []).append(row)
-    if frames is not None and set(rows) - {""}:
-        wanted = _frame(frames[1])
-        if wanted not in rows:
-            raise RecordingError(
-                f"no poses of {wanted}", where=where, valid=f"--frames of: {', '.join(sorted(rows))}"
-            )
-        rows = {wanted: rows[wanted]}
-    return {child: _path(own, where) for child, own in rows.items()} or {"": _path([], where)}
+    if oriented and not rows:
+        rows[""] = []
+    return {child: _path(own, where, 2 if oriented else 1) for child, own in rows.items()}
 
 
 def read_lever_arm(path: Path, base: str, frame: str) -> tuple[float, float, float] | None:
@@ -108,10 +123,9 @@ def read_lever_arm(path: Path, base: str, frame: str) -> tuple[float, float, flo
     if not topics or not frame or _frame(frame) == _frame(base):
         return None
     try:
-        rows = _composed(_edges(bag, topics, where), _frame(base), _frame(frame), where)
+        position = _composed(_edges(bag, topics, where), _frame(base), _frame(frame), where).position
     except RecordingError:
         return None
-    position = np.array([row[1:4] for row in rows])
     if float(np.ptp(position, axis=0).max()) > MOVES_M:
         raise RecordingError(f"{frame} moves relative to {base}", where=where, valid="--lever-arm X,Y,Z")
     x, y, z = np.median(position, axis=0).tolist()
@@ -225,21 +239,23 @@ def _frame(name: str) -> str:
 
 
 def _row(stamp: Any, position: Any, orientation: Any) -> _Row | None:
-    """None where it is no pose."""
-    turn = (orientation.x, orientation.y, orientation.z, orientation.w)
+    """Return a pose with a unit quaternion (without an orientation: the identity); None: the numbers are not valid."""
+    turn = (0.0, 0.0, 0.0, 1.0)
+    if orientation is not None:
+        turn = (orientation.x, orientation.y, orientation.z, orientation.w)
     row = (stamp.sec * _NANOSECONDS + stamp.nanosec, position.x, position.y, position.z, *turn)
-    length = math.sqrt(sum(value * value for value in turn))
+    length = math.hypot(*turn)
     if not all(map(math.isfinite, row)) or not 0.5 < length < 2.0:
         return None
     x, y, z, w = (value / length for value in turn)
     return row[0], row[1], row[2], row[3], x, y, z, w
 
 
-def _path(rows: list[_Row], where: str) -> PosePath:
+def _path(rows: list[_Row], where: str, needed: int = 2) -> PosePath:
     rows = sorted(set(rows))
     stamps = np.array([row[0] for row in rows], np.int64)
-    first = np.flatnonzero(np.diff(stamps, prepend=np.iinfo(np.int64).min // 2))
-    if len(first) < 2:
+    _, first = np.unique(stamps, return_index=True)
+    if len(first) < needed:
         raise RecordingError(
             f"{len(first)} poses", where=where, valid="two or more with a position and orientation"
         )
@@ -247,13 +263,9 @@ def _path(rows: list[_Row], where: str) -> PosePath:
     return PosePath(stamps[first], values[:, :3], values[:, 3:])
 
 
-def _chained(edges: dict[str, dict[str, list[_Row]]], root: str, leaf: str, where: str) -> PosePath:
-    return _path(_composed(edges, root, leaf, where), where)
-
-
-def _composed(edges: dict[str, dict[str, list[_Row]]], root: str, leaf: str, where: str) -> list[_Row]:
-    """The transforms from the root's frame to the leaf's, one after the other, at the times of the most frequent."""
-    chain: list[list[_Row]] = []
+def _composed(edges: dict[str, dict[str, list[_Row]]], root: str, leaf: str, where: str) -> PosePath:
+    """Return the composed transforms from the root's frame to the leaf's, at the times of the most frequent one."""
+    chain: list[PosePath] = []
     frame = leaf
     while frame != root:
         if frame not in edges or len(chain) > len(edges):
@@ -263,48 +275,15 @@ def _composed(edges: dict[str, dict[str, list[_Row]]], root: str, leaf: str, whe
                 where=where,
                 valid=f"--frames of: {known or 'there are none'}",
             )
-        parent = max(edges[frame], key=lambda one, own=edges[frame]: len(own[one]))  # type: ignore[misc]
-        chain.append(sorted(set(edges[frame][parent])))
-        frame = parent
+        frame, rows = max(edges[frame].items(), key=lambda edge: len(edge[1]))
+        chain.append(_path(rows, where, 1))
     if not chain:
         raise RecordingError(f"--frames {root} {leaf}", where=where, valid="two different frames")
-    chain.reverse()
-    busiest = max(chain, key=len)
-    stamps = np.unique(np.array([row[0] for row in busiest], np.int64))
-    position, turn = np.zeros((len(stamps), 3)), np.tile([0.0, 0.0, 0.0, 1.0], (len(stamps), 1))
-    for rows in chain:
-        step, by = _held(rows, stamps)
-        position = position + _turned(turn, step)
-        turn = _times(turn, by)
-    return [(int(s), *p, *q) for s, p, q in zip(stamps, position.tolist(), turn.tolist(), strict=True)]
-
-
-def _held(rows: list[_Row], stamps: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Interpolated between two; before the first and after the last as those are: a transform holds until the next."""
-    own = np.array([row[0] for row in rows], np.int64)
-    values = np.array([row[1:] for row in rows], np.float64)
-    if len(own) == 1:
-        return np.tile(values[0, :3], (len(stamps), 1)), np.tile(values[0, 3:], (len(stamps), 1))
-    after = np.clip(np.searchsorted(own, stamps), 1, len(own) - 1)
-    before = after - 1
-    part = ((stamps - own[before]) / np.maximum(own[after] - own[before], 1)).clip(0.0, 1.0)[:, None]
-    first, second = values[before, 3:], values[after, 3:]
-    second = np.where(np.einsum("ni,ni->n", first, second)[:, None] < 0.0, -second, second)
-    turn = (1.0 - part) * first + part * second
-    position = (1.0 - part) * values[before, :3] + part * values[after, :3]
-    return position, turn / np.linalg.norm(turn, axis=1, keepdims=True)
-
-
-def _turned(q: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Vectors (n, 3) turned by unit quaternions (n, 4)."""
-    axis, w = q[:, :3], q[:, 3:]
-    twice = 2.0 * np.cross(axis, v)
-    turned: NDArray[np.float64] = v + w * twice + np.cross(axis, twice)
-    return turned
-
-
-def _times(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Products of quaternions (n, 4), x, y, z, w: first b, then a."""
-    axis = a[:, 3:] * b[:, :3] + b[:, 3:] * a[:, :3] + np.cross(a[:, :3], b[:, :3])
-    real = a[:, 3:] * b[:, 3:] - np.einsum("ni,ni->n", a[:, :3], b[:, :3])[:, None]
-    return np.concatenate([axis, real], axis=1)
+    stamps = max(chain, key=len).stamp_ns
+    position, turn = np.zeros((len(stamps), 3)), Rotation.identity(len(stamps))
+    for step in reversed(chain):
+        # A transform is valid until the next one: before the first and after the last they are constant.
+        inside = stamps.clip(step.stamp_ns[0], step.stamp_ns[-1])
+        moved, turned = step.interpolated(inside)
+        position, turn = position + turn.apply(moved), turn * turned
+    return PosePath(stamps, position, turn.as_quat())

@@ -1,25 +1,19 @@
 """Estimates to and from the CDR bytes of standard messages: poses and odometry, in the frame of the anchors.
 
-Orientation is not observed by ranges: it is sent as none, with a variance that says so. What others recorded of
-a robot's position is read by the types that the bag itself declares.
+Ranges do not observe the orientation: it is the identity, with a variance that says so. `pose_paths` reads poses from bags.
 """
 
 from __future__ import annotations
 
 import math
 import struct
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from uwb_mitigation.bag import schemas
 from uwb_mitigation.bag.codec import LITTLE_ENDIAN
 from uwb_mitigation.bag.topics import ODOMETRY_TYPE
 from uwb_mitigation.errors import RecordingError, format_id
-from uwb_mitigation.positioning.tracks import Estimate, TruePath
+from uwb_mitigation.positioning.tracks import Estimate
 
 MAP = "map"
 """The anchors' frame (REP-105)."""
@@ -118,62 +112,6 @@ def decode_place(data: bytes) -> tuple[int, int, tuple[float, float, float]] | N
     if tag_id is None or not all(map(math.isfinite, (x, y, z))):
         return None
     return seconds * _NANOSECONDS + nanoseconds, tag_id, (x, y, z)
-
-
-@dataclass(frozen=True, slots=True)
-class FramePath:
-    """Where one frame was, as recorded.
-
-    Attributes:
-        child_frame: of an odometry; empty where the type has none.
-        path: stamps and positions, in order.
-    """
-
-    child_frame: str
-    path: TruePath
-
-    @property
-    def tag_id(self) -> int | None:
-        """The tag whose frame it is, as `tag_frame` names it; None = another frame."""
-        return tag_of_frame(self.child_frame)
-
-
-def read_positions(path: Path, topic: str) -> list[FramePath]:
-    """The positions of every frame on a topic of a bag; of a topic that is not there, none.
-
-    Raises:
-        RecordingError: the bag cannot be read, or the topic is of another type.
-    """
-    from uwb_mitigation.bag.reader import BagReader  # needs mcap, which a node on a robot does without
-
-    bag = BagReader(path)
-    store = schemas.typestore()
-    found: dict[str, list[tuple[int, float, float, float]]] = {}
-    for message in bag.messages([topic]):
-        schema = message.channel.schema
-        name = schema.name if schema is not None else ""
-        if name not in POSITION_TYPES:
-            raise RecordingError(
-                f"messages of type {name!r}", where=f"{path}, topic {topic}", valid=", ".join(POSITION_TYPES)
-            )
-        try:
-            decoded: Any = store.deserialize_cdr(message.data, name)
-        except Exception as error:  # Of no common type.
-            raise RecordingError(f"a message is damaged: {error}", where=f"{path}, topic {topic}") from error
-        pose = decoded.pose if name.endswith("PoseStamped") else decoded.pose.pose
-        stamp = decoded.header.stamp
-        row = (stamp.sec * _NANOSECONDS + stamp.nanosec, pose.position.x, pose.position.y, pose.position.z)
-        if all(map(math.isfinite, row)):
-            found.setdefault(getattr(decoded, "child_frame_id", ""), []).append(row)
-    return [FramePath(frame, _path(rows)) for frame, rows in found.items()]
-
-
-def _path(rows: list[tuple[int, float, float, float]]) -> TruePath:
-    rows = sorted(set(rows))
-    stamps = np.array([row[0] for row in rows], np.int64)
-    positions: NDArray[np.float64] = np.array([row[1:] for row in rows], np.float64)
-    first = np.flatnonzero(np.diff(stamps, prepend=-1))
-    return TruePath(stamps[first], positions[first])
 
 
 def _header(stamp_ns: int, frame_id: str) -> bytes:

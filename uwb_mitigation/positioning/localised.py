@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
 
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.anchors import AnchorMap
@@ -109,39 +110,28 @@ class PosePath:
             np.concatenate([path.orientation for path in paths])[order],
         )
 
+    def interpolated(self, stamp_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64], Rotation]:
+        """Return positions (k, 3) and rotations (k,) at stamps from the first to the last."""
+        unique, first = np.unique(self.stamp_ns, return_index=True)
+        own, wanted = ((stamps - unique[0]) / _SECOND_NS for stamps in (unique, stamp_ns))
+        position = np.stack([np.interp(wanted, own, axis) for axis in self.position[first].T], axis=1)
+        if len(own) == 1:
+            return position, Rotation.from_quat(np.tile(self.orientation[first], (len(stamp_ns), 1)))
+        return position, Slerp(own, Rotation.from_quat(self.orientation[first]))(wanted)
+
     def at(
         self, stamp_ns: NDArray[np.int64], later_s: float
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Positions (k, 3) and rotation matrices (k, 3, 3) at stamps + `later_s`; NaN outside, and in gaps over `GAP_S`.
-
-        Between two poses the quaternion is interpolated linearly and scaled to length 1: turns are small there.
-        """
-        own = (self.stamp_ns - self.stamp_ns[0]) / _SECOND_NS
-        wanted = (stamp_ns - self.stamp_ns[0]) / _SECOND_NS + later_s
-        after = np.clip(np.searchsorted(own, wanted), 1, len(own) - 1)
-        before = after - 1
-        span = own[after] - own[before]
-        part = (wanted - own[before]) / np.maximum(span, 1e-9)
-        outside = (part < -1e-9) | (part > 1.0 + 1e-9) | (span > GAP_S)
-        part = np.where(outside, np.nan, part)[:, None]
-        position = (1.0 - part) * self.position[before] + part * self.position[after]
-        first, second = self.orientation[before], self.orientation[after]
-        second = np.where(np.einsum("ni,ni->n", first, second)[:, None] < 0.0, -second, second)
-        turn = (1.0 - part) * first + part * second
-        return position, _matrices(turn / np.linalg.norm(turn, axis=1, keepdims=True))
-
-
-def _matrices(q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rotation matrices (k, 3, 3) of unit quaternions (k, 4), x, y, z, w."""
-    x, y, z, w = q.T
-    return np.stack(
-        [
-            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], axis=1),
-            np.stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], axis=1),
-            np.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], axis=1),
-        ],
-        axis=1,
-    )
+        """Positions (k, 3) and rotation matrices (k, 3, 3) at stamps + `later_s`; NaN outside, and in gaps over `GAP_S`."""
+        wanted = stamp_ns + round(later_s * _SECOND_NS)
+        after = np.searchsorted(self.stamp_ns, wanted).clip(1, len(self) - 1)
+        span_ns = self.stamp_ns[after] - self.stamp_ns[after - 1]
+        inside = wanted.clip(self.stamp_ns[0], self.stamp_ns[-1])
+        unknown = (wanted != inside) | (span_ns > GAP_S * _SECOND_NS)
+        position, turn = self.interpolated(inside)
+        matrices = turn.as_matrix()
+        position[unknown], matrices[unknown] = np.nan, np.nan
+        return position, matrices
 
 
 @dataclass(frozen=True, slots=True, eq=False)

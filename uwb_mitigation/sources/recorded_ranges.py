@@ -10,10 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from uwb_mitigation.bag.codec import decode_corrected, decode_range
-from uwb_mitigation.bag.poses import read_positions
+from uwb_mitigation.bag.pose_paths import read_truth
 from uwb_mitigation.bag.reader import BagReader, check_channel
 from uwb_mitigation.bag.topics import (
-    ODOMETRY_TRUTH,
     RANGE_CIR_TYPE,
     RANGE_CORRECTED,
     RANGE_CORRECTED_TYPE,
@@ -114,7 +113,7 @@ def read_ranges(path: Path, anchors: AnchorMap, stamp_offset_s: float = 0.0) -> 
             where=str(path),
             valid=f"the bag's ranges come from anchors: {seen}",
         )
-    truths = {one.tag_id: one.path for one in read_positions(path, ODOMETRY_TRUTH)}
+    truths = read_truth(path)
     nowhere = TruePath(np.zeros(0, np.int64), np.zeros((0, 3)))
     tags = []
     for tag in sorted(raw.keys() | corrected.keys()):
