@@ -282,8 +282,6 @@ def _composed(edges: dict[str, dict[str, list[_Row]]], root: str, leaf: str, whe
     stamps = max(chain, key=len).stamp_ns
     position, turn = np.zeros((len(stamps), 3)), Rotation.identity(len(stamps))
     for step in reversed(chain):
-        # A transform is valid until the next one: before the first and after the last they are constant.
-        inside = stamps.clip(step.stamp_ns[0], step.stamp_ns[-1])
-        moved, turned = step.interpolated(inside)
+        moved, turned = step.interpolated(stamps)
         position, turn = position + turn.apply(moved), turn * turned
     return PosePath(stamps, position, turn.as_quat())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,11 +17,20 @@ if TYPE_CHECKING:
     from uwb_mitigation.positioning.anchors import AnchorMap
     from uwb_mitigation.positioning.geometry import Area, Height
     from uwb_mitigation.positioning.survey import SurveyResult
-    from uwb_mitigation.positioning.tracks import Heights, TrackErrors
+    from uwb_mitigation.positioning.tracks import Heights
     from uwb_mitigation.processing.residuals import HeldOut
     from uwb_mitigation.processing.tracking import TagTracks
     from uwb_mitigation.sources.recorded_ranges import RecordedRanges
 
+_FORMATS = {
+    "rmse": "{:.3f}",
+    "median": "{:.3f}",
+    "p95": "{:.3f}",
+    "coverage95": "{:.1%}",
+    "nees_per_dof": "{:.2f}",
+    "exceeded": "{:.2%}",
+    "height_rmse": "{:.3f}",
+}
 BagArgument = Annotated[
     Path, typer.Argument(metavar="BAG", help="An MCAP bag with ranges, corrected or raw.")
 ]
@@ -175,16 +185,14 @@ def survey(
     place, box = height_of(height, height_sd), area_of(area)
     known, recorded = _read(bag, anchors, stamp_offset)
     measured = heights_of(bag, height_topic, height_sd, height, recorded)
-    rows = []
-    by_text = {
+    ids = {
         text: row for identity, row in known.index.items() for text in (str(identity), format_id(identity))
     }
-    for text in fixed or []:
-        if text.lower() not in by_text:
-            raise ParameterError(
-                f"--fixed {text:.40}", valid=f"one of {', '.join(map(format_id, known.index))}"
-            )
-        rows.append(by_text[text.lower()])
+    if unknown := [text for text in fixed or [] if text.lower() not in ids]:
+        raise ParameterError(
+            f"--fixed {unknown[0]:.40}", valid=f"one of {', '.join(map(format_id, known.index))}"
+        )
+    rows = [ids[text.lower()] for text in fixed or []]
     tag = max(recorded.tags, key=lambda one: len(one.ranges))
     with console.progress() as bar:
         bar.add_task(f"surveying from {len(tag.ranges)} ranges of tag {format_id(tag.tag_id)}", total=None)
@@ -203,33 +211,7 @@ def survey(
     )
     _show_survey(result, known)
     console.out.print(f"Wrote {len(known)} anchors to {output}.", markup=False, soft_wrap=True)
-    console.write_json(
-        json,
-        {
-            "output": str(output),
-            "anchors": [
-                {
-                    "id": anchor.id,
-                    "x": x,
-                    "y": y,
-                    "z": z,
-                    "sd": anchor.sd,
-                    "moved_m": float(result.moved_m[row]),
-                }
-                for row, anchor in enumerate(result.anchors.anchors)
-                for x, y, z in [anchor.position]
-            ],
-            "misplaced": [known.anchors[row].id for row in result.misplaced],
-            "swapped": [[known.anchors[row].id for row in pair] for pair in result.swapped],
-            "alternatives": {
-                str(known.anchors[row].id): position.tolist() for row, position in result.alternatives.items()
-            },
-            "undetermined": [known.anchors[row].id for row in result.undetermined],
-            "mirrored": result.mirrored,
-            "mean_loss": result.loss,
-            "explained": result.explained,
-        },
-    )
+    console.write_json(json, {"output": str(output)} | result.as_json())
 
 
 def _read(bag: Path, anchors: Path | None, stamp_offset: float) -> tuple[AnchorMap, RecordedRanges]:
@@ -281,22 +263,41 @@ def area_of(text: str | None) -> Area | None:
     return Area.parse(text or "")
 
 
-def _show_tracks(tracks: list[TagTracks], anchors: AnchorMap) -> None:
+def _table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     from uwb_mitigation.commands.console import Table
 
-    table = Table("tag", "track", title="Horizontal errors, m", title_justify="left")
-    for column in ("epochs", "RMSE", "median", "p95", "in ellipse", "NEES", "beyond", "height"):
-        table.add_column(column, justify="right")
+    table = Table(title=title, title_justify="left")
+    for column in columns:
+        table.add_column(column, justify="left" if column in ("tag", "track", "anchor") else "right")
+    for row in rows:
+        table.add_row(*row)
+    console.out.print(table)
+
+
+def _show_tracks(tracks: list[TagTracks], anchors: AnchorMap) -> None:
+    rows = []
     for one in tracks:
         kind = "corrected" if one.recording.corrected else "raw"
-        rows = (
-            ("snapshots, raw", len(one.snapshot), one.snapshot_errors),
-            (f"live, {kind}", len(one.live), one.live_errors),
-            (f"smoothed, {kind}", len(one.smoothed), one.smoothed_errors),
-        )
-        for name, epochs, errors in rows:
-            table.add_row(format_id(one.recording.tag_id), name, *_cells(epochs, errors))
-    console.out.print(table)
+        for name, track, errors in (
+            ("snapshots, raw", one.snapshot, one.snapshot_errors),
+            (f"live, {kind}", one.live, one.live_errors),
+            (f"smoothed, {kind}", one.smoothed, one.smoothed_errors),
+        ):
+            cells = [_number(getattr(errors, field), form) for field, form in _FORMATS.items()]
+            rows.append([format_id(one.recording.tag_id), name, str(errors.epochs or len(track)), *cells])
+    columns = (
+        "tag",
+        "track",
+        "epochs",
+        "RMSE",
+        "median",
+        "p95",
+        "in ellipse",
+        "NEES",
+        "beyond",
+        "height",
+    )
+    _table("Horizontal errors, m", columns, rows)
     console.out.print(
         "In ellipse: true positions inside the 95 % ellipses. NEES: 1 is consistent, more is overconfident. "
         "Beyond: errors beyond the protection levels. Height: RMSE of z.",
@@ -315,45 +316,23 @@ def _show_tracks(tracks: list[TagTracks], anchors: AnchorMap) -> None:
 
 
 def _show_residuals(residuals: list[HeldOut], anchors: AnchorMap) -> None:
-    from uwb_mitigation.commands.console import Table
-
-    table = Table("anchor", title="Residuals of held-out ranges, m", title_justify="left")
-    for column in ("ranges", "raw", "corrected"):
-        table.add_column(column, justify="right")
+    rows = []
     for one in residuals:
         name = "all" if one.anchor_id is None else str(anchors.anchors[anchors.index[one.anchor_id]])
-        cells = (_number(one.raw_m, "{:.3f}"), _number(one.corrected_m, "{:.3f}"))
-        table.add_row(name, str(one.ranges), *cells, end_section=one is residuals[-2:][0])
-    console.out.print(table)
+        rows.append([name, str(one.ranges), *(_number(v, "{:.3f}") for v in (one.raw_m, one.corrected_m))])
+    _table("Residuals of held-out ranges, m", ("anchor", "ranges", "raw", "corrected"), rows)
     console.out.print(
         "Median absolute residuals. The ranges of each anchor are compared with a track of the other anchors' ranges.",
         style="dim",
     )
 
 
-def _cells(epochs: int, errors: TrackErrors) -> tuple[str, ...]:
-    return (
-        str(errors.epochs or epochs),
-        _number(errors.rmse, "{:.3f}"),
-        _number(errors.median, "{:.3f}"),
-        _number(errors.p95, "{:.3f}"),
-        _number(errors.coverage95, "{:.1%}"),
-        _number(errors.nees_per_dof, "{:.2f}"),
-        _number(errors.exceeded, "{:.2%}"),
-        _number(errors.height_rmse, "{:.3f}"),
-    )
-
-
 def _show_survey(result: SurveyResult, guesses: AnchorMap) -> None:
-    from uwb_mitigation.commands.console import Table
-
-    table = Table("anchor", title="Anchors, m", title_justify="left")
-    for column in ("x", "y", "z", "deviation", "off its guess"):
-        table.add_column(column, justify="right")
-    for row, anchor in enumerate(result.anchors.anchors):
-        cells = (*anchor.position, anchor.sd, float(result.moved_m[row]))
-        table.add_row(str(anchor), *(f"{value:.2f}" for value in cells))
-    console.out.print(table)
+    rows = [
+        [str(anchor), *(f"{value:.2f}" for value in (*anchor.position, anchor.sd, moved_m))]
+        for anchor, moved_m in zip(result.anchors.anchors, result.moved_m.tolist(), strict=True)
+    ]
+    _table("Anchors, m", ("anchor", "x", "y", "z", "deviation", "off its guess"), rows)
     if not result.explained:
         _warn(
             f"these anchors do not explain the ranges (mean loss {result.loss:.1f}; 0.5 or less where they do): do not "
@@ -383,27 +362,14 @@ def _show_survey(result: SurveyResult, guesses: AnchorMap) -> None:
 
 
 def _result(tracks: list[TagTracks], recorded: RecordedRanges, anchors: AnchorMap) -> dict[str, Any]:
-    from uwb_mitigation.processing.tracking import pooled
+    from uwb_mitigation.processing.tracking import KINDS, pooled
 
     known = any(one.live_errors.epochs for one in tracks)
-    kinds = ("live", "smoothed", "snapshot")
     hdops = [one.hdop for one in tracks if math.isfinite(one.hdop)]
+    overall = {kind: pooled([getattr(one, f"{kind}_errors") for one in tracks]).as_json() for kind in KINDS}
     return {
-        "tags": [
-            {"tag_id": one.recording.tag_id, "ranges": len(one.recording.ranges)}
-            | one.smoothed_errors.as_json()
-            | {"epochs": one.smoothed_errors.epochs or len(one.smoothed)}
-            | {
-                "warnings": one.warnings,
-                "disagreeing": [anchors.anchors[row].id for row in one.disagreeing],
-            }
-            | {kind: getattr(one, f"{kind}_errors").as_json() for kind in kinds if known}
-            for one in tracks
-        ],
-        **{
-            kind: pooled([getattr(one, f"{kind}_errors") for one in tracks]).as_json() if known else None
-            for kind in kinds
-        },
+        "tags": [one.as_json(anchors) for one in tracks],
+        **(overall if known else dict.fromkeys(KINDS)),
         "hdop_median": max(hdops) if hdops else None,
         "corrected": all(one.recording.corrected for one in tracks),
         "unknown_anchors": {str(identity): count for identity, count in recorded.strangers.items()},

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.anchors import AnchorMap
@@ -111,13 +111,18 @@ class PosePath:
         )
 
     def interpolated(self, stamp_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64], Rotation]:
-        """Return positions (k, 3) and rotations (k,) at stamps from the first to the last."""
-        unique, first = np.unique(self.stamp_ns, return_index=True)
-        own, wanted = ((stamps - unique[0]) / _SECOND_NS for stamps in (unique, stamp_ns))
-        position = np.stack([np.interp(wanted, own, axis) for axis in self.position[first].T], axis=1)
-        if len(own) == 1:
-            return position, Rotation.from_quat(np.tile(self.orientation[first], (len(stamp_ns), 1)))
-        return position, Slerp(own, Rotation.from_quat(self.orientation[first]))(wanted)
+        """Return positions (k, 3) and rotations (k,) at stamps; before the first pose and after the last as there.
+
+        Between two poses the quaternion is interpolated linearly and normalised: rotations are small there.
+        """
+        after = np.searchsorted(self.stamp_ns, stamp_ns).clip(0, len(self) - 1)
+        before = np.maximum(after - 1, 0)
+        span_ns = np.maximum(self.stamp_ns[after] - self.stamp_ns[before], 1)
+        part = ((stamp_ns - self.stamp_ns[before]) / span_ns).clip(0.0, 1.0)[:, None]
+        position = (1.0 - part) * self.position[before] + part * self.position[after]
+        first, second = self.orientation[before], self.orientation[after]
+        second = np.where(np.einsum("ni,ni->n", first, second)[:, None] < 0.0, -second, second)
+        return position, Rotation.from_quat((1.0 - part) * first + part * second)
 
     def at(
         self, stamp_ns: NDArray[np.int64], later_s: float
@@ -125,10 +130,9 @@ class PosePath:
         """Positions (k, 3) and rotation matrices (k, 3, 3) at stamps + `later_s`; NaN outside, and in gaps over `GAP_S`."""
         wanted = stamp_ns + round(later_s * _SECOND_NS)
         after = np.searchsorted(self.stamp_ns, wanted).clip(1, len(self) - 1)
-        span_ns = self.stamp_ns[after] - self.stamp_ns[after - 1]
-        inside = wanted.clip(self.stamp_ns[0], self.stamp_ns[-1])
-        unknown = (wanted != inside) | (span_ns > GAP_S * _SECOND_NS)
-        position, turn = self.interpolated(inside)
+        gap = self.stamp_ns[after] - self.stamp_ns[after - 1] > GAP_S * _SECOND_NS
+        unknown = (wanted < self.stamp_ns[0]) | (wanted > self.stamp_ns[-1]) | gap
+        position, turn = self.interpolated(wanted)
         matrices = turn.as_matrix()
         position[unknown], matrices[unknown] = np.nan, np.nan
         return position, matrices

@@ -77,6 +77,24 @@ class SurveyResult:
     def explained(self) -> bool:
         return self.loss < UNEXPLAINED
 
+    def as_json(self) -> dict[str, object]:
+        """The keys of `survey --json`; anchors by their ids."""
+        ids = [anchor.id for anchor in self.anchors.anchors]
+        return {
+            "anchors": [
+                dict(zip("xyz", anchor.position, strict=True))
+                | {"id": anchor.id, "sd": anchor.sd, "moved_m": float(self.moved_m[row])}
+                for row, anchor in enumerate(self.anchors.anchors)
+            ],
+            "misplaced": [ids[row] for row in self.misplaced],
+            "swapped": [[ids[row] for row in pair] for pair in self.swapped],
+            "alternatives": {str(ids[row]): where.tolist() for row, where in self.alternatives.items()},
+            "undetermined": [ids[row] for row in self.undetermined],
+            "mirrored": self.mirrored,
+            "mean_loss": self.loss,
+            "explained": self.explained,
+        }
+
 
 def survey(
     guesses: AnchorMap,

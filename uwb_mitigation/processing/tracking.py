@@ -35,6 +35,7 @@ from uwb_mitigation.positioning.tracks import (
 )
 from uwb_mitigation.sources.recorded_ranges import TagRecording
 
+KINDS = ("live", "smoothed", "snapshot")
 POOR_HDOP = 10.0
 CONTRADICTION_M = 0.4
 """NLOS errors of the other anchors move their track by up to about this much."""
@@ -70,6 +71,19 @@ class TagTracks:
     hdop: float
     disagreeing: list[int]
     warnings: list[str]
+
+    def as_json(self, anchors: AnchorMap) -> dict[str, object]:
+        """A tag of `track --json`; the errors of each kind of track only if the truth is known."""
+        errors = {kind: getattr(self, f"{kind}_errors").as_json() for kind in KINDS}
+        return {
+            "tag_id": self.recording.tag_id,
+            "ranges": len(self.recording.ranges),
+            **self.smoothed_errors.as_json(),
+            "epochs": self.smoothed_errors.epochs or len(self.smoothed),
+            "warnings": self.warnings,
+            "disagreeing": [anchors.anchors[row].id for row in self.disagreeing],
+            **(errors if self.live_errors.epochs else {}),
+        }
 
 
 def track_tag(
