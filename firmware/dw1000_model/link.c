@@ -73,17 +73,13 @@ static double find_first_path(const link *path) {
 
 /* The same sums as uwb_mitigation/sources/simulation/radio.py: what a link reports does not depend on who asks. */
 static void measure(link *path, const dw1000_link_config *config) {
-    double energy = 0, noise = 0, sum = 0, peak = -1;
+    double energy = 0, noise = 0, sum = 0;
     for (size_t i = 0; i < ACCUMULATOR_SAMPLES; i++) {
         const double re = path->iq[2 * i], im = path->iq[2 * i + 1], squared = re * re + im * im;
         energy += squared;
         if (i >= NOISE_FROM && i < NOISE_TO) {
             noise += squared;
             sum += sqrt(squared);
-        }
-        if (squared > peak) {
-            peak = squared;
-            path->pp_index = (uint16_t)i;
         }
     }
     const double taps = NOISE_TO - NOISE_FROM, mean = sum / taps;
@@ -93,7 +89,6 @@ static void measure(link *path, const dw1000_link_config *config) {
     const double power = fmax(rint((energy - noise / taps * all) / 0x1p17), 1.0);
     path->std_noise = config->std_noise ? config->std_noise : word(fmax(1.0, sqrt(fmax(0, noise / taps - mean * mean))));
     path->threshold = config->noise_threshold;
-    path->pp_ampl = word(sqrt(peak));
     path->cir_pwr = word(power);
     const double found = config->first_path_index > 0 ? config->first_path_index : find_first_path(path);
     path->fp_index = word(found * 64);

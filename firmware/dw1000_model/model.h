@@ -24,29 +24,23 @@ typedef int64_t instant;
 enum {
     DEV_ID = 0x00, EUI = 0x01, PANADR = 0x03, SYS_CFG = 0x04, SYS_TIME = 0x06, TX_FCTRL = 0x08, TX_BUFFER = 0x09,
     DX_TIME = 0x0A, RX_FWTO = 0x0C, SYS_CTRL = 0x0D, SYS_MASK = 0x0E, SYS_STATUS = 0x0F, RX_FINFO = 0x10,
-    RX_BUFFER = 0x11, RX_FQUAL = 0x12, RX_TTCKI = 0x13, RX_TTCKO = 0x14, RX_TIME = 0x15, TX_TIME = 0x17,
-    TX_ANTD = 0x18, SYS_STATE = 0x19, ACK_RESP_T = 0x1A, RX_SNIFF = 0x1D, TX_POWER = 0x1E, CHAN_CTRL = 0x1F,
-    USR_SFD = 0x21, AGC_CTRL = 0x23, EXT_SYNC = 0x24, ACC_MEM = 0x25, GPIO_CTRL = 0x26, DRX_CONF = 0x27,
-    RF_CONF = 0x28, TX_CAL = 0x2A, FS_CTRL = 0x2B, AON = 0x2C, OTP_IF = 0x2D, LDE_IF = 0x2E, DIG_DIAG = 0x2F,
-    PMSC = 0x36
+    RX_BUFFER = 0x11, RX_FQUAL = 0x12, RX_TIME = 0x15, TX_TIME = 0x17,
+    TX_ANTD = 0x18, ACK_RESP_T = 0x1A, TX_POWER = 0x1E, CHAN_CTRL = 0x1F, USR_SFD = 0x21, AGC_CTRL = 0x23,
+    EXT_SYNC = 0x24, ACC_MEM = 0x25, DRX_CONF = 0x27, RF_CONF = 0x28, TX_CAL = 0x2A, FS_CTRL = 0x2B, AON = 0x2C,
+    OTP_IF = 0x2D, LDE_IF = 0x2E, PMSC = 0x36
 };
 
 /* Sub-addresses that the model itself reads or writes. */
 enum {
-    RX_STAMP = 0, FP_INDEX = 5, FP_AMPL1 = 7, RX_RAWST = 9, TX_RAWST = 5, DRX_TUNE2 = 0x08, DRX_SFDTOC = 0x20,
-    DRX_PRETOC = 0x24, DRX_CAR_INT = 0x28, RXPACC_NOSAT = 0x2C, RF_SAR_BIAS = 0x11, RF_SAR_SWITCH = 0x12,
-    TC_SARC = 0x00, TC_SARL = 0x03, FS_PLLCFG = 0x07, AON_WCFG = 0x00, AON_CTRL = 0x02,
-    AON_CFG0 = 0x06,
-    OTP_ADDR = 0x04, OTP_CTRL = 0x06, OTP_RDAT = 0x0A, LDE_THRESH = 0x0000, LDE_CFG1 = 0x0806,
-    LDE_PPINDX = 0x1000, LDE_PPAMPL = 0x1002, LDE_RXANTD = 0x1804, EVC_CTRL = 0x00, PMSC_CTRL0 = 0x00,
+    FP_INDEX = 5, FP_AMPL1 = 7, RX_RAWST = 9, TX_RAWST = 5, DRX_TUNE2 = 0x08, DRX_SFDTOC = 0x20, RXPACC_NOSAT = 0x2C,
+    RF_SAR_BIAS = 0x11, RF_SAR_SWITCH = 0x12, TC_SARC = 0x00, TC_SARL = 0x03, FS_PLLCFG = 0x07, OTP_ADDR = 0x04,
+    OTP_CTRL = 0x06, OTP_RDAT = 0x0A, LDE_THRESH = 0x0000, LDE_CFG1 = 0x0806, LDE_RXANTD = 0x1804, PMSC_CTRL0 = 0x00,
     PMSC_CTRL1 = 0x04
 };
 
 /* SYS_CFG */
 #define CFG_HIRQ_POL (1u << 9)
 #define CFG_DIS_DRXB (1u << 12)
-#define CFG_DIS_PHE (1u << 13)
-#define CFG_DIS_RSDE (1u << 14)
 #define CFG_PHR_MODE (3u << 16)
 #define CFG_DIS_STXP (1u << 18)
 #define CFG_RXM110K (1u << 22)
@@ -78,7 +72,6 @@ enum {
 #define ST_RXRFSL BIT(16)
 #define ST_RXRFTO BIT(17)
 #define ST_LDEERR BIT(18)
-#define ST_RXPTO BIT(21)
 #define ST_SLP2INIT BIT(23)
 #define ST_RXSFDTO BIT(26)
 #define ST_HPDWARN BIT(27)
@@ -87,7 +80,7 @@ enum {
 #define ST_TX (ST_TXFRB | ST_TXPRS | ST_TXPHS | ST_TXFRS)
 #define ST_RX                                                                                                        \
     (ST_RXPRD | ST_RXSFDD | ST_LDEDONE | ST_RXPHD | ST_RXPHE | ST_RXDFR | ST_RXFCG | ST_RXFCE | ST_RXRFSL |           \
-     ST_RXRFTO | ST_LDEERR | ST_RXPTO | ST_RXSFDTO)
+     ST_RXRFTO | ST_LDEERR | ST_RXSFDTO)
 
 /* Events of a group are cancelled together. */
 typedef enum { GROUP_POWER, GROUP_LOAD, GROUP_SENSORS, GROUP_TX, GROUP_RX, GROUP_FRAME, GROUP_LATE, GROUPS } event_group;
@@ -113,7 +106,7 @@ typedef struct {
     uint64_t key; /* of its dice */
     instant flight, excess;
     double loss, damage, level; /* level: received power, linear */
-    uint16_t fp_index, fp_ampl[3], cir_pwr, std_noise, threshold, pp_index, pp_ampl, preamble_count;
+    uint16_t fp_index, fp_ampl[3], cir_pwr, std_noise, threshold, preamble_count;
     int16_t iq[2 * ACCUMULATOR_SAMPLES];
 } link;
 
@@ -212,7 +205,6 @@ double dw1000_chance(uint64_t bits);
 air_interface dw1000_transmit_mode(const dw1000_chip *chip);
 air_interface dw1000_receive_mode(const dw1000_chip *chip);
 instant dw1000_symbol_units(unsigned prf);
-double dw1000_carrier_hz(unsigned channel);
 
 /* events.c: virtual time, programs, SYS_STATUS and the IRQ line. */
 void *dw1000_memory(size_t bytes); /* zeroed; ends the process if there is none */

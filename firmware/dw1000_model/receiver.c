@@ -17,10 +17,6 @@ enum { BAD_HEADER, BAD_CODE, BAD_CHECK, NO_SFD, DAMAGES };
 /* What a frame's dice are thrown for. */
 enum { FOR_LOSS = 1, FOR_DAMAGE, FOR_KIND, FOR_CLASH, FOR_EDGE };
 
-static uint32_t configuration(const dw1000_chip *chip) {
-    return (uint32_t)dw1000_get(chip, SYS_CFG, 0, 4);
-}
-
 /* The same for a frame and a receiver, however often and in whatever order it is asked. */
 static uint64_t fate(const dw1000_chip *chip, const transmission *frame, unsigned what) {
     const uint64_t pair = (uint64_t)frame->sender->index << 32 | (uint64_t)chip->index;
@@ -119,20 +115,8 @@ static void report_time(dw1000_chip *chip, bool timed) {
         const uint64_t shift = SHIFT_TICKS + random % (3 * SHIFT_TICKS);
         raw = random >> 63 ? raw + shift : raw - shift;
     }
-    dw1000_put(chip, RX_TIME, RX_STAMP, 5, (raw - dw1000_get(chip, LDE_IF, LDE_RXANTD, 2)) & COUNTER_MASK);
+    dw1000_put(chip, RX_TIME, 0, 5, (raw - dw1000_get(chip, LDE_IF, LDE_RXANTD, 2)) & COUNTER_MASK);
     dw1000_put(chip, RX_TIME, RX_RAWST, 5, raw & COUNTER_MASK & ~(uint64_t)(COUNTER_GRID - 1));
-}
-
-static void report_clock(dw1000_chip *chip) {
-    const transmission *const frame = chip->frame;
-    const double fast = (1 + frame->sender->ppm * 1e-6) / (1 + chip->ppm * 1e-6) - 1;
-    const double interval = frame->mode.prf == 2 ? 0x01FC0000 : 0x01F00000;
-    const double hz = 998.4e6 / 2 / (frame->mode.slow ? 8192 : 1024) / 131072;
-    dw1000_put(chip, RX_TTCKI, 0, 4, (uint64_t)interval);
-    dw1000_put(chip, RX_TTCKO, 0, 3, (uint64_t)llround(fast * interval) & 0x7FFFF);
-    dw1000_put(chip, RX_TTCKO, 3, 2, dw1000_dice(chip->receptions, chip->index) & 0x7FFF);
-    const int64_t integrated = llround(-fast * dw1000_carrier_hz(frame->mode.channel) / hz);
-    dw1000_put(chip, DRX_CONF, DRX_CAR_INT, 3, (uint64_t)integrated & 0x1FFFFF);
 }
 
 static void report_channel(dw1000_chip *chip) {
@@ -151,8 +135,6 @@ static void report_channel(dw1000_chip *chip) {
     dw1000_put(chip, RX_TIME, FP_INDEX, 2, path->fp_index);
     dw1000_put(chip, RX_TIME, FP_AMPL1, 2, path->fp_ampl[0]);
     dw1000_put(chip, LDE_IF, LDE_THRESH, 2, threshold);
-    dw1000_put(chip, LDE_IF, LDE_PPINDX, 2, path->pp_index);
-    dw1000_put(chip, LDE_IF, LDE_PPAMPL, 2, path->pp_ampl);
     dw1000_put(chip, DRX_CONF, RXPACC_NOSAT, 2, all);
     const size_t samples = chip->frame->mode.prf == 2 ? ACCUMULATOR_SAMPLES : SAMPLES_AT_16MHZ;
     memcpy(chip->accumulator, path->iq, samples * 2 * sizeof *path->iq);
@@ -161,22 +143,18 @@ static void report_channel(dw1000_chip *chip) {
 static void report_frame(dw1000_chip *chip, const uint8_t *octets, bool timed) {
     report_header(chip);
     report_time(chip, timed);
-    report_clock(chip);
     report_channel(chip);
     memcpy(chip->rx_buffer, octets, chip->frame->length);
 }
 
 static void frame_over(dw1000_chip *chip, transmission *frame) {
-    const uint32_t setting = configuration(chip);
     if (cut_off(chip) || chip->clashed || damaged(chip, BAD_CODE)) {
-        if (!(setting & CFG_DIS_RSDE)) {
-            failed(chip, ST_RXRFSL);
-            return;
-        }
+        failed(chip, ST_RXRFSL);
+        return;
     }
     uint8_t octets[FRAME_OCTETS];
     memcpy(octets, frame->payload, sizeof octets);
-    if (damaged(chip, BAD_CHECK) || damaged(chip, BAD_CODE) || chip->clashed || cut_off(chip)) {
+    if (damaged(chip, BAD_CHECK)) {
         const uint64_t where = fate(chip, frame, FOR_CLASH);
         octets[where % (frame->length ? frame->length : 1)] ^= (uint8_t)(1u << (where >> 32 & 7));
     }
@@ -197,9 +175,8 @@ static void frame_over(dw1000_chip *chip, transmission *frame) {
 }
 
 static void header_over(dw1000_chip *chip, transmission *frame) {
-    const bool other_mode = frame->phr_mode != (configuration(chip) & CFG_PHR_MODE) >> 16;
-    const bool bad = cut_off(chip) || chip->clashed || other_mode || damaged(chip, BAD_HEADER);
-    if (bad && !(configuration(chip) & CFG_DIS_PHE)) {
+    const bool other_mode = frame->phr_mode != dw1000_get(chip, SYS_CFG, 2, 1) % 4;
+    if (cut_off(chip) || chip->clashed || other_mode || damaged(chip, BAD_HEADER)) {
         failed(chip, ST_RXPHE);
         return;
     }
@@ -286,11 +263,10 @@ static void search(dw1000_chip *chip, transmission *none) {
 
 static void turn_on(dw1000_chip *chip, transmission *none) {
     (void)none;
-    const uint32_t setting = configuration(chip);
     memset(chip->accumulator, 0, sizeof chip->accumulator);
     chip->rx = RX_WARMUP;
     dw1000_schedule(chip, GROUP_RX, chip->air->now + MICROSECONDS(WARM_UP_US), search, NULL);
-    if (setting & CFG_RXWTOE) { /* it counts from the enable on, not from the end of the warm-up */
+    if (dw1000_get(chip, SYS_CFG, 0, 4) & CFG_RXWTOE) { /* it counts from the enable on, not from the end of the warm-up */
         const instant wait = (instant)dw1000_get(chip, RX_FWTO, 0, 2) * TIMEOUT_TICKS * UNITS_PER_TICK;
         dw1000_schedule(chip, GROUP_RX, chip->air->now + wait, frame_wait_over, NULL);
     }

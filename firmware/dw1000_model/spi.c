@@ -37,24 +37,13 @@ static uint8_t accumulator_octet(const dw1000_chip *chip, unsigned sub) {
     return (uint8_t)(sub & 1 ? value >> 8 : value);
 }
 
-static uint32_t system_state(const dw1000_chip *chip) {
-    uint32_t whole = chip->power == POWER_IDLE ? 1 : 0;
-    if (chip->tx != TX_OFF) {
-        whole = chip->tx == TX_WAIT ? 2 : 4;
-    } else if (chip->rx != RX_OFF) {
-        whole = chip->rx == RX_WAIT ? 3 : 5;
-    }
-    return whole << 16;
-}
-
 /* What is computed when it is read, 5 octets; returns whether the register is such a one. */
 static bool computed(const dw1000_chip *chip, unsigned file, uint64_t *value) {
     const uint64_t counter = dw1000_local_units(chip, chip->air->now) / UNITS_PER_TICK & COUNTER_MASK;
     *value = file == SYS_TIME     ? counter & ~(uint64_t)(COUNTER_GRID - 1)
              : file == SYS_STATUS ? dw1000_status_of(chip)
-             : file == SYS_STATE  ? system_state(chip)
                                   : 0;
-    return file == SYS_TIME || file == SYS_STATUS || file == SYS_STATE || file == SYS_CTRL;
+    return file == SYS_TIME || file == SYS_STATUS || file == SYS_CTRL;
 }
 
 static void read_octets(const dw1000_chip *chip, unsigned file, unsigned sub, uint8_t *to, size_t count) {

@@ -23,10 +23,6 @@ void host_radio_free(host_radio *radio) {
     free(radio);
 }
 
-void host_radio_fill_times(uwb_twr_config *config, uint32_t reply_us, uint32_t patience_us) {
-    uwb_twr_fill_times(config, reply_us, patience_us);
-}
-
 /* NULL, or why the configuration is refused. */
 const char *host_radio_configure(host_radio *radio, const uwb_twr_config *config) {
     const char *const refusal = uwb_twr_refusal(&radio->twr, config);

@@ -99,14 +99,12 @@ typedef struct {
 
 /* What the chip knows of the reception beside the frame. */
 typedef struct {
-    uint16_t noise;           /* STD_NOISE */
     uint16_t first_path_amplitude[3]; /* FP_AMPL1 to FP_AMPL3 */
     uint16_t preamble_count;          /* RXPACC without the part of the SFD */
     uint16_t noise_threshold; /* LDE_THRESH */
     uint16_t power;           /* CIR_PWR */
     float rx_power_dbm;         /* as in DecaRanging's logs: not corrected for the saturation above -88 dBm */
     float first_path_power_dbm; /* NaN where an amplitude that it needs is 0 */
-    float clock_offset_ppm;     /* by how much the sender's clock is faster than ours */
 } uwb_dw1000_quality;
 
 /* Reset the chip, set its clocks up, load the leading-edge detector, read the OTP memory, and configure. NULL settings:

@@ -3,7 +3,7 @@
 #include "uwb_dw1000_registers.h"
 
 /* PMSC_CTRL0: FACE with RXCLKS in the first octet, in the second AMCE and what start leaves there. */
-enum { RX_CLOCK_PLL = 0x48, AMCE = 0x80, CTRL0_USUAL = 0x02 };
+enum { RX_CLOCK_PLL = 0x48, AMCE = 0x80, CTRL0_DEFAULT = 0x02 };
 
 /* The manual says 2.5 us, but that is too short while the PLL clocks the chip. */
 enum { SENSORS_US = 1000 };
@@ -20,35 +20,20 @@ static uint16_t sfd_part(const uwb_dw1000_settings *settings) {
     }
 }
 
-/* Carrier frequency, MHz. */
-static float carrier_mhz(uint8_t channel) {
-    static const float carriers[] = {0, 3494.4f, 3993.6f, 4492.8f, 3993.6f, 6489.6f, 0, 6489.6f};
-    return carriers[channel & 7u];
-}
-
-static float clock_offset_ppm(const uwb_dw1000_settings *settings, uint32_t integrator) {
-    const int32_t value = (int32_t)(integrator << 11) / 2048; /* 21 bits with a sign */
-    const float per_step_hz = 998.4e6f / 2 / (settings->rate_kbps == 110 ? 8192 : 1024) / 131072;
-    return -(float)value * per_step_hz / carrier_mhz(settings->channel);
-}
-
 uwb_dw1000_status uwb_dw1000_read_quality(uwb_dw1000 *chip, const uwb_dw1000_frame *frame,
                                           uwb_dw1000_quality *quality) {
-    uint8_t fqual[8], receiver[RXPACC_NOSAT + 2 - DRX_CAR_INT];
-    uint64_t threshold;
+    uint8_t fqual[8];
+    uint64_t threshold, unsaturated;
     DW1000_TRY(uwb_dw1000_read(chip, RX_FQUAL, fqual, sizeof fqual));
     DW1000_TRY(uwb_dw1000_get(chip, LDE_THRESH, 2, &threshold));
-    DW1000_TRY(uwb_dw1000_read(chip, DRX_CAR_INT, receiver, sizeof receiver));
-    quality->noise = (uint16_t)uwb_dw1000_number(fqual, 2);
+    DW1000_TRY(uwb_dw1000_get(chip, RXPACC_NOSAT, 2, &unsaturated));
     quality->first_path_amplitude[0] = frame->first_path_amplitude;
     quality->first_path_amplitude[1] = (uint16_t)uwb_dw1000_number(fqual + 2, 2);
     quality->first_path_amplitude[2] = (uint16_t)uwb_dw1000_number(fqual + 4, 2);
     quality->power = (uint16_t)uwb_dw1000_number(fqual + 6, 2);
     quality->noise_threshold = (uint16_t)threshold;
-    quality->clock_offset_ppm = clock_offset_ppm(&chip->settings, (uint32_t)uwb_dw1000_number(receiver, 3));
 
     const uint16_t sfd = sfd_part(&chip->settings);
-    const uint64_t unsaturated = uwb_dw1000_number(receiver + (RXPACC_NOSAT - DRX_CAR_INT), 2);
     uint16_t count = frame->preamble_count;
     if (count == unsaturated && count > sfd) {
         count = (uint16_t)(count - sfd);
@@ -72,8 +57,8 @@ uwb_dw1000_status uwb_dw1000_read_cir(uwb_dw1000 *chip, size_t first, size_t cou
         return UWB_DW1000_BAD_ARGUMENT;
     }
     /* Octet by octet: the chip may hang where both change at once. Without these clocks it reads as zeros or noise. */
-    static const uwb_dw1000_entry on[] = {{PMSC_CTRL0, 1, RX_CLOCK_PLL}, {PMSC_CTRL0 + 1, 1, CTRL0_USUAL | AMCE}, {0, 0, 0}};
-    static const uwb_dw1000_entry off[] = {{PMSC_CTRL0, 1, 0}, {PMSC_CTRL0 + 1, 1, CTRL0_USUAL}, {0, 0, 0}};
+    static const uwb_dw1000_entry on[] = {{PMSC_CTRL0, 1, RX_CLOCK_PLL}, {PMSC_CTRL0 + 1, 1, CTRL0_DEFAULT | AMCE}, {0, 0, 0}};
+    static const uwb_dw1000_entry off[] = {{PMSC_CTRL0, 1, 0}, {PMSC_CTRL0 + 1, 1, CTRL0_DEFAULT}, {0, 0, 0}};
     DW1000_TRY(uwb_dw1000_set_all(chip, on));
     DW1000_TRY(uwb_dw1000_read(chip, ACC_MEM | (uint32_t)(4 * first), octets, 1 + 4 * count));
     return uwb_dw1000_set_all(chip, off);

@@ -1,5 +1,5 @@
-/* A board with a DW1000 of its own: ranges go to the host as its mode says, the host configures the radio, and is told
- * how it fares. What the sketch and bare metal share, and the computer where the radio is its own. */
+/* A board with its own DW1000: it sends ranges to the host as its mode says, takes the radio's settings from the host and
+ * reports the state of the radio. */
 #ifndef UWB_RANGER_H
 #define UWB_RANGER_H
 

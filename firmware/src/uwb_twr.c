@@ -46,7 +46,7 @@ const char *uwb_twr_refusal(const uwb_twr *twr, const uwb_twr_config *config) {
     if (config->pan == 0xFFFF || config->address == UWB_TWR_EVERYBODY) {
         return "the address or the PAN is that of a broadcast";
     }
-    if (config->anchor_count > UWB_TWR_MAX_ANCHORS) {
+    if (config->anchor_count > UWB_MAX_ANCHORS) {
         return "more than 32 anchors";
     }
     const size_t whole = UWB_DW1000_SAMPLES(config->radio.prf_mhz);

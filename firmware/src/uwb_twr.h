@@ -23,7 +23,6 @@
 extern "C" {
 #endif
 
-#define UWB_TWR_MAX_ANCHORS UWB_MAX_ANCHORS
 #define UWB_TWR_STAMPS 3
 
 /* Memory for a measurement with `samples` complex samples. */
@@ -42,7 +41,7 @@ typedef struct {
     uint32_t reply_us;     /* from ANSWER's reception to FINAL: what the tag's bus and processor need, and the air */
     uint32_t patience_us;  /* for an anchor's frames */
     uint32_t interval_us;  /* between the beginnings of two exchanges, at least */
-    uint64_t anchors[UWB_TWR_MAX_ANCHORS];
+    uint64_t anchors[UWB_MAX_ANCHORS];
 } uwb_twr_config;
 
 /* Usual radio, a tag with 157 samples that finds its anchors, and times for SPI of a microcontroller. */
@@ -124,7 +123,7 @@ typedef struct {
     uint8_t started; /* once */
     uint8_t turn;    /* place of the anchor that was polled last */
     uint8_t known;   /* anchors in the table */
-    uwb_twr_anchor anchors[UWB_TWR_MAX_ANCHORS];
+    uwb_twr_anchor anchors[UWB_MAX_ANCHORS];
     uint64_t measured_us; /* of io.now_us, when the measurement's last frame was received */
     uint8_t *measurement;
     size_t measurement_bytes;

@@ -59,8 +59,7 @@ static uwb_dw1000_status exchange(uwb_twr *twr, const uwb_twr_frame *polled, uin
             return status;
         }
     }
-    /* A chip that was reset meanwhile has forgotten how long the frame is, and how to send it: nobody takes it. */
-    /* From here on this side has its range, whatever becomes of REPORT. */
+    /* This side has its range even if REPORT is lost. A chip that was reset meanwhile cannot send it. */
     (void)send_and_rest(twr, &report);
     return UWB_DW1000_OK;
 }

@@ -25,7 +25,7 @@ static uwb_twr_anchor *find(uwb_twr *twr, uint64_t address) {
 
 static void meet(uwb_twr *twr, uint64_t address, uint64_t now_us) {
     uwb_twr_anchor *anchor = find(twr, address);
-    if (anchor == NULL && twr->known < UWB_TWR_MAX_ANCHORS) {
+    if (anchor == NULL && twr->known < UWB_MAX_ANCHORS) {
         anchor = &twr->anchors[twr->known++];
         *anchor = (uwb_twr_anchor){address, now_us, 0, 0, 0, 0, 0, NAN};
     }

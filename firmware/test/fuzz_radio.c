@@ -336,7 +336,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
             chip->steps = 0;
             ranged++;
         }
-        check(twr->known <= UWB_TWR_MAX_ANCHORS, "anchors fit their table");
+        check(twr->known <= UWB_MAX_ANCHORS, "anchors fit their table");
         const uwb_twr_counts *const counts = &twr->counts;
         check(counts->tried == counts->ranged + counts->no_answer + counts->late + counts->time_out + counts->damaged +
                                    counts->absurd + counts->broken,

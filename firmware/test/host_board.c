@@ -13,15 +13,6 @@ typedef struct {
     uint64_t now_us;
 } host_board;
 
-host_board *host_board_new(int mode, int with_model, size_t queue_bytes);
-void host_board_free(host_board *host);
-void host_board_receive(host_board *host, const uint8_t *bytes, size_t count, uint64_t now_us);
-void host_board_measure(host_board *host, const uint8_t *bytes, size_t count, uint64_t now_us);
-void host_board_tick(host_board *host, uint64_t now_us);
-size_t host_board_output(host_board *host, uint8_t *bytes, size_t limit);
-int host_decode(const uint8_t *bytes, size_t count, uwb_header_t *header, uint8_t *payload, uint32_t *counts);
-size_t host_encode(const uwb_header_t *header, const uint8_t *payload, size_t payload_bytes, uint8_t *wire);
-
 host_board *host_board_new(int mode, int with_model, size_t queue_bytes) {
     host_board *const host = calloc(1, sizeof *host);
     if (host == NULL || queue_bytes > sizeof host->queue) {

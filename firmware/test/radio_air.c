@@ -187,28 +187,6 @@ static void run(dw1000_chip *chip, void *context) {
     }
 }
 
-radio_air *radio_air_new(uint64_t seed, size_t store_values);
-void radio_air_free(radio_air *air);
-int radio_air_board(radio_air *air, double ppm, uint64_t clock_ticks, uint16_t tx_delay, uint16_t rx_delay,
-                    const uwb_twr_config *config, uint64_t random);
-int radio_air_remote(radio_air *air, double ppm, uint64_t clock_ticks, uint16_t tx_delay, uint16_t rx_delay,
-                     int (*next)(void *context, dw1000_request *request));
-void radio_air_line(radio_air *air, int board, double baud, int mode, double inference_s, double overhead_s);
-void radio_air_link(radio_air *air, int a, int b, double distance_m, double excess_m, const int16_t *iq,
-                    size_t samples, double first_path_index, uint16_t preamble_count, uint16_t noise_threshold,
-                    uint16_t std_noise, double loss, double damage);
-void radio_air_unlink(radio_air *air, int a, int b);
-void radio_air_reset(radio_air *air, int board);
-double radio_air_run(radio_air *air, double seconds);
-uint32_t radio_air_results(radio_air *air, const radio_result **results, const int16_t **store);
-void radio_air_forget(radio_air *air);
-const uwb_twr_counts *radio_air_counts(const radio_air *air, int board);
-uint64_t radio_air_address(const radio_air *air, int board);
-uint64_t radio_air_line_lost(const radio_air *air, int board);
-int radio_air_write(radio_air *air, int board, const uint8_t *bytes, size_t count);
-size_t radio_air_read(radio_air *air, int board, uint8_t *bytes);
-size_t radio_air_size(int which);
-
 radio_air *radio_air_new(uint64_t seed, size_t store_values) {
     radio_air *const air = calloc(1, sizeof *air);
     if (air == NULL) {
@@ -229,14 +207,6 @@ void radio_air_free(radio_air *air) {
     free(air);
 }
 
-/* A chip whose program is elsewhere. */
-int radio_air_remote(radio_air *air, double ppm, uint64_t clock_ticks, uint16_t tx_delay, uint16_t rx_delay,
-                     int (*next)(void *context, dw1000_request *request)) {
-    const int board = radio_air_board(air, ppm, clock_ticks, tx_delay, rx_delay, &uwb_twr_defaults, 1);
-    dw1000_program_remote(air->boards[board]->chip, next, NULL);
-    return board;
-}
-
 int radio_air_board(radio_air *air, double ppm, uint64_t clock_ticks, uint16_t tx_delay, uint16_t rx_delay,
                     const uwb_twr_config *config, uint64_t random) {
     radio_board *const board = calloc(1, sizeof *board);
@@ -250,6 +220,14 @@ int radio_air_board(radio_air *air, double ppm, uint64_t clock_ticks, uint16_t t
     air->boards[air->count] = board;
     dw1000_program(board->chip, run, board);
     return air->count++;
+}
+
+/* A chip whose program is elsewhere. */
+int radio_air_remote(radio_air *air, double ppm, uint64_t clock_ticks, uint16_t tx_delay, uint16_t rx_delay,
+                     int (*next)(void *context, dw1000_request *request)) {
+    const int board = radio_air_board(air, ppm, clock_ticks, tx_delay, rx_delay, &uwb_twr_defaults, 1);
+    dw1000_program_remote(air->boards[board]->chip, next, NULL);
+    return board;
 }
 
 void radio_air_line(radio_air *air, int board, double baud, int mode, double inference_s, double overhead_s) {

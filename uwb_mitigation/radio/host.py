@@ -176,7 +176,7 @@ class HostRadio:
 
     def _config(self, settings: RadioSettings) -> structures.Config:
         config = structures.config(settings, 0, 0)
-        self._library.host_radio_fill_times(ctypes.byref(config), self._bus.reply_us, self._bus.patience_us)
+        self._library.uwb_twr_fill_times(ctypes.byref(config), self._bus.reply_us, self._bus.patience_us)
         self._times_us = config.reply_us, config.patience_us
         return config
 
@@ -239,10 +239,10 @@ def _compiled() -> ctypes.CDLL:
     run([*c_compiler(), "-shared", *objects, "-o", str(output), "-lm"])
     library = ctypes.CDLL(str(output))
     radio = c_void_p
+    library.uwb_twr_fill_times.argtypes = (POINTER(structures.Config), c_uint32, c_uint32)
     signatures: dict[str, tuple[object, tuple[object, ...]]] = {
         "new": (c_void_p, (POINTER(structures.Io), POINTER(structures.Config), c_uint64)),
         "free": (None, (radio,)),
-        "fill_times": (None, (POINTER(structures.Config), c_uint32, c_uint32)),
         "configure": (c_char_p, (radio, POINTER(structures.Config))),
         "turn": (c_int, (radio, c_uint64)),
         "measurement": (c_void_p, (radio, POINTER(c_size_t), POINTER(c_uint64))),

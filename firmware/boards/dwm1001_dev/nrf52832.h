@@ -23,7 +23,6 @@
 enum {
     PIN_INPUT = 0,
     PIN_INPUT_PULLUP = 3 << 2,
-    PIN_OUTPUT = 1 | 1 << 1,
     PIN_OPEN_DRAIN = 1 | 6 << 8 /* drives low, never high */
 };
 

@@ -2,8 +2,6 @@
  * its Serial1. qemu-system-arm -M mps2-an386 (ARM DAI 0386; UART and timer: ARM DDI 0479, sections 4.3 and 4.1).
  *
  * No interrupt is taken: they are masked, and only end WFI. */
-#include <stdint.h>
-
 #include "uwb_board.h"
 #include "uwb_model.h"
 

@@ -1,9 +1,7 @@
-/* The frame of the two stride-2 kernels, which differ in their taps only: a block of r becomes four
+/* y = relu(conv3 stride 2(r)) + relu(conv1 stride 2(r)), for odd and even lengths, which differ in their taps only:
+ * outputs centre on even positions, or windows begin on them. A block of r becomes four
  * positions of both branches, wide in r0 to r3 and narrow in r4 to r7. All 32 FPU registers hold
  * weights: for each channel pair tap 0, tap 2, tap 1, skip. */
-#ifndef UWB_REDUCE_H
-#define UWB_REDUCE_H
-
 #include "uwb_assembly.h"
 
 #if UWB_CORTEX_M4
@@ -31,7 +29,7 @@
 
         /* \taps pair, start_wide, start_narrow, ... computes one channel pair. r3 and r7 start as the biases
          * of all four, because their own first products come last. */
-        .macro reduce name
+        .macro reduce name, taps
         function \name
         push    {r4-r11, lr}
         vpush   {s16-s31}
@@ -67,14 +65,14 @@
 2:      /* block */
         str     r12, [sp, #Y_OFFSET]
         ldrd    r3, r7, [sp, #BIAS]
-        taps    0, r3, r3, r3, r7, r7, r7
-        taps    1, r0, r1, r2, r4, r5, r6
-        taps    2, r0, r1, r2, r4, r5, r6
-        taps    3, r0, r1, r2, r4, r5, r6
-        taps    4, r0, r1, r2, r4, r5, r6
-        taps    5, r0, r1, r2, r4, r5, r6
-        taps    6, r0, r1, r2, r4, r5, r6
-        taps    7, r0, r1, r2, r4, r5, r6
+        \taps   0, r3, r3, r3, r7, r7, r7
+        \taps   1, r0, r1, r2, r4, r5, r6
+        \taps   2, r0, r1, r2, r4, r5, r6
+        \taps   3, r0, r1, r2, r4, r5, r6
+        \taps   4, r0, r1, r2, r4, r5, r6
+        \taps   5, r0, r1, r2, r4, r5, r6
+        \taps   6, r0, r1, r2, r4, r5, r6
+        \taps   7, r0, r1, r2, r4, r5, r6
         ldrd    r8, r9, [sp, #MULTIPLIER]
         .irp accumulator, r0, r1, r2, r3
         requantise \accumulator, r8
@@ -118,5 +116,60 @@
         end_function \name
         .endm
 
-#endif
+        .macro taps_odd pair, wide0, wide1, wide2, narrow0, narrow1, narrow2
+        fetch_pair r8, r9, 4 * \pair + 2        /* tap 1, skip: even positions */
+        ldrd    r10, r11, [lr, #(ROW_BYTES * \pair)]
+        smlad   r0, r10, r8, \wide0
+        smlad   r4, r10, r9, \narrow0
+        smlad   r1, r11, r8, \wide1
+        smlad   r5, r11, r9, \narrow1
+        ldrd    r10, r11, [lr, #(ROW_BYTES * \pair + 8)]
+        smlad   r2, r10, r8, \wide2
+        smlad   r6, r10, r9, \narrow2
+        smlad   r3, r11, r8, r3
+        smlad   r7, r11, r9, r7
+        fetch_pair r8, r9, 4 * \pair            /* tap 0, tap 2: odd positions */
+        ldr     r10, [lr, #(ROW_BYTES * \pair + BEFORE_BLOCK)]
+        smlad   r0, r10, r8, r0
+        ldrd    r10, r11, [lr, #(ROW_BYTES * \pair + 16)]
+        smlad   r0, r10, r9, r0
+        smlad   r1, r10, r8, r1
+        smlad   r1, r11, r9, r1
+        smlad   r2, r11, r8, r2
+        ldrd    r10, r11, [lr, #(ROW_BYTES * \pair + 24)]
+        smlad   r2, r10, r9, r2
+        smlad   r3, r10, r8, r3
+        smlad   r3, r11, r9, r3
+        .endm
+
+        .macro taps_even pair, wide0, wide1, wide2, narrow0, narrow1, narrow2
+        fetch_pair r8, r9, 4 * \pair            /* tap 0, tap 2: even positions */
+        fetch   r10, 4 * \pair + 3              /* skip: the same */
+        ldrd    r11, r12, [lr, #(ROW_BYTES * \pair)]
+        smlad   r0, r11, r8, \wide0
+        smlad   r4, r11, r10, \narrow0
+        smlad   r0, r12, r9, r0
+        smlad   r1, r12, r8, \wide1
+        smlad   r5, r12, r10, \narrow1
+        ldrd    r11, r12, [lr, #(ROW_BYTES * \pair + 8)]
+        smlad   r1, r11, r9, r1
+        smlad   r2, r11, r8, \wide2
+        smlad   r6, r11, r10, \narrow2
+        smlad   r2, r12, r9, r2
+        smlad   r3, r12, r8, r3
+        smlad   r7, r12, r10, r7
+        ldr     r11, [lr, #(ROW_BYTES * \pair + BLOCK_BYTES)]
+        smlad   r3, r11, r9, r3
+        fetch   r8, 4 * \pair + 2               /* tap 1: odd positions */
+        ldrd    r11, r12, [lr, #(ROW_BYTES * \pair + 16)]
+        smlad   r0, r11, r8, r0
+        smlad   r1, r12, r8, r1
+        ldrd    r11, r12, [lr, #(ROW_BYTES * \pair + 24)]
+        smlad   r2, r11, r8, r2
+        smlad   r3, r12, r8, r3
+        .endm
+
+        reduce  uwb_conv_reduce_odd, taps_odd
+        reduce  uwb_conv_reduce_even, taps_even
+
 #endif
