@@ -1,25 +1,17 @@
-# make demo    all the set-up, then a driver and a mitigator over real ROS 2, live
-# make test    all the set-up, then every test
-# make setup   the set-up alone; make help lists the rest
-
-# Of the environment, when it is made; without it, the one that it was made with, or python3.
-PYTHON ?=
-RECORDING ?=
-RATE ?=
 VENV := .venv
-BOOTSTRAP = $(if $(PYTHON),'$(PYTHON)' bootstrap.py,python3 bootstrap.py --keep-python)
+# An environment that is made again keeps its Python.
+BOOTSTRAP = '$(or $(PYTHON),$(wildcard $(VENV)/bin/python),python3)' bootstrap.py
 # Empty unless ROS is the system's: bootstrap.py writes it.
 IN_ROS = . $(VENV)/environment.sh;
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-training setup-docs demo firmware-demo radio-demo paper test colcon docs docs-links lint lock clean
+.PHONY: help setup setup-training demo firmware-demo radio-demo paper test test-fast colcon path-for-colcon docs docs-links lint lock clean
 
 help:  ## show this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 24
 
 setup:  ## install everything that running needs into .venv
 	@$(BOOTSTRAP) run
-
 setup-training:  ## the same, with torch and the test tools
 	@$(BOOTSTRAP) develop
 
@@ -32,85 +24,56 @@ firmware-demo: setup  ## the firmware in an emulated Cortex-M4 as the driver's b
 radio-demo: setup  ## a tag and four anchors on modelled DW1000s, in the simulated flat: raw, corrected and true ranges
 	@$(IN_ROS) $(VENV)/bin/python -m benchmarks radio-demo
 
-# Which lines the tests reach costs half as much time again: shown where it is asked for, as the hosted CI does once.
-COVERAGE ?=
+test-fast: setup-training  ## the tests that need neither ROS nor torch and are quick: a minute on two cores
+	@$(VENV)/bin/python -m pytest -q -n auto --fast
 
 # More at once than processors: nodes spend most of a test on waiting for each other.
 test: setup-training  ## run every test (COVERAGE=yes: and show what they reach)
 	@$(IN_ROS) $(VENV)/bin/python -m pytest -n $$(($$(nproc) + 2)) $(if $(COVERAGE),--cov --cov-report=term:skip-covered)
 
-# ROS's CMake macros take neither an apostrophe nor a letter beyond ASCII in a path: below such a one, the packages
-# are found by a link, and built and installed beside it.
-ELSEWHERE := $(shell pwd | LC_ALL=C tr -d '[:alnum:] /._+@,:=-' | grep -q . && echo "$${TMPDIR:-/tmp}/uwb_mitigation_$$(pwd | cksum | cut -d ' ' -f 1)")
-WORKSPACE = $(or $(ELSEWHERE),$(CURDIR))
-CHECKOUT = $(if $(ELSEWHERE),$(ELSEWHERE)/checkout,$(CURDIR))
-PLACES = --base-paths "$(CHECKOUT)" "$(CHECKOUT)/msg_defs" --build-base "$(WORKSPACE)/build" --install-base "$(WORKSPACE)/install"
-
 # What a machine with ROS 2 does by hand; without one, the environment stands in for /opt/ros/jazzy.
-COLCON = $(IN_ROS) PATH="$(CHECKOUT)/$(VENV)/bin:$$PATH" \
-  AMENT_PREFIX_PATH="$${AMENT_PREFIX_PATH:-$(CHECKOUT)/$(VENV)}" CMAKE_TOOLCHAIN_FILE="$(CHECKOUT)/cmake/ros_wheels.cmake" colcon
+COLCON = $(IN_ROS) PATH="$(CURDIR)/$(VENV)/bin:$$PATH" AMENT_PREFIX_PATH="$${AMENT_PREFIX_PATH:-$(CURDIR)/$(VENV)}" \
+  CMAKE_TOOLCHAIN_FILE="$(CURDIR)/cmake/ros_wheels.cmake" colcon
+COLCON_TESTS = $(addprefix test/test_,installed.py preprocessing.py mitigation.py bag_codec.py link_messages.py launch.py)
 
-# What was installed, and tests that take a second or two; `make test` runs all of them.
-COLCON_TESTS = test/test_installed.py test/test_measurement.py test/test_preprocessing.py test/test_mitigation.py \
-  test/test_bag_codec.py test/test_link_messages.py test/test_tally.py test/test_launch.py
-
-colcon: setup-training  ## colcon build and colcon test (what was installed, and the quick tests)
-	@$(if $(ELSEWHERE),mkdir -p "$(ELSEWHERE)" && ln -sfn "$(CURDIR)" "$(CHECKOUT)")
-	@$(COLCON) build $(PLACES)
-	@$(COLCON) test $(PLACES) \
-	  --event-handlers console_cohesion+ --return-code-on-test-failure \
+colcon: path-for-colcon setup-training  ## colcon build and colcon test (what was installed, and the quick tests)
+	@$(COLCON) build --base-paths . msg_defs
+	@$(COLCON) test --base-paths . msg_defs --event-handlers console_cohesion+ --return-code-on-test-failure \
 	  --packages-select uwb_mitigation --pytest-args $(COLCON_TESTS)
-	@$(COLCON) test-result --test-result-base "$(WORKSPACE)/build" --verbose
-	@grep -q 'skipped="0" tests="[1-9]' "$(WORKSPACE)/build/uwb_mitigation/pytest.xml"  # a test that was skipped, or none at all, is a failure too
+	@$(COLCON) test-result --verbose
+	@grep -q 'skipped="0" tests="[1-9]' build/uwb_mitigation/pytest.xml  # a skipped test, or none at all, is a failure too
 
-# The paper's experiment. A step whose output is newer than its inputs is skipped, and of one that was interrupted,
-# networks that are trained already. Other data, and quick runs, have folders of their own.
-DATA ?=
-QUICK ?=
+path-for-colcon:
+	@! pwd | LC_ALL=C grep -q '[^][:alnum:] /._+@,:=-]' || \
+	  { echo "colcon: CMake's macros of ROS do not accept the path $(CURDIR): move the checkout to one of ASCII letters, digits and spaces" >&2; exit 1; }
+
+# The paper's experiment. Networks that an interrupted run has trained are kept. Other data, and quick runs, have folders of their own.
 PAPER_QUICK = --windows 157,16 --seeds 1
 space := $(subst ,, )
 PAPER = build/paper/$(if $(DATA),$(subst /,_,$(subst $(space),_,$(DATA))),simulated)$(if $(QUICK),-quick)
-PAPER_DATA = $(if $(DATA),$(DATA),build/paper/deepuwb.mcap)
+PAPER_DATA = $(or $(DATA),build/paper/deepuwb.mcap)
 
-paper: setup-training  ## the paper's experiment, the firmware's bench and their report: 50 minutes (QUICK=1: 5; DATA=deepuwb.pkl)
+paper: setup-training  ## the paper's experiment, the firmware's cost and their report: 50 minutes (QUICK=1: 5; DATA=deepuwb.pkl)
 	@test -z '$(DATA)' || test -e '$(DATA)' || { echo "DATA=$(DATA) is not there" >&2; exit 1; }
-	@$(MAKE) --no-print-directory $(PAPER)/report.html
+	@mkdir -p $(PAPER); test -e '$(PAPER_DATA)' || $(VENV)/bin/uwb-mitigation paper simulate -o $(PAPER_DATA)
+	@$(VENV)/bin/python -m benchmarks firmware $(if $(QUICK),--inputs 200 --no-portable) --json $(PAPER)/firmware.json
+	@$(VENV)/bin/uwb-mitigation paper protocol --data '$(PAPER_DATA)' -o $(PAPER)/models $(if $(QUICK),$(PAPER_QUICK))
+	@$(VENV)/bin/uwb-mitigation paper report --data '$(PAPER_DATA)' -o $(PAPER) --models $(PAPER)/models --firmware $(PAPER)/firmware.json
 	@echo "$(CURDIR)/$(PAPER)/report.html"
-
-build/paper/deepuwb.mcap:
-	@echo "1 of 4: simulated rooms in DeepUWB's shape"; mkdir -p $(@D)
-	@$(VENV)/bin/uwb-mitigation paper simulate --force -o $@
-
-$(PAPER)/firmware.json: $(wildcard firmware/src/*.[ch] firmware/src/cortex_m4/* uwb_mitigation/firmware_export/*.py)
-	@echo "2 of 4: the firmware in an emulator"; mkdir -p $(@D)
-	@$(VENV)/bin/python -m benchmarks firmware $(if $(QUICK),--inputs 200 --no-portable) --json $@
-
-# After the bench, which says at once if its tools are not there.
-$(PAPER)/models/protocol.json: $(subst $(space),\ ,$(PAPER_DATA)) | $(PAPER)/firmware.json
-	@echo "3 of 4: the networks, about $(if $(QUICK),4,48) minutes on two cores"
-	@$(VENV)/bin/uwb-mitigation paper protocol --data '$(PAPER_DATA)' -o $(@D) $(if $(QUICK),$(PAPER_QUICK))
-
-$(PAPER)/report.html: $(PAPER)/models/protocol.json $(PAPER)/firmware.json $(wildcard uwb_mitigation/paper/* uwb_mitigation/paper/templates/*)
-	@echo "4 of 4: the page"
-	@$(VENV)/bin/uwb-mitigation paper report --data '$(PAPER_DATA)' -o $(@D) \
-	  --models $(PAPER)/models --firmware $(PAPER)/firmware.json
-
-setup-docs:
-	@$(BOOTSTRAP) docs
 
 SPHINX = $(VENV)/bin/sphinx-build --fail-on-warning --keep-going --nitpicky --fresh-env --quiet --jobs auto -c docs -d build/doctrees .
 
-docs: setup-docs  ## build the documentation into build/site; a warning or a link within that leads nowhere is an error
+docs:  ## build the documentation into build/site; a warning or a link within that leads nowhere is an error
+	@$(BOOTSTRAP) docs
 	@$(SPHINX) build/site
 	@echo build/site/docs/index.html
 
-docs-links: setup-docs  ## look whether the documentation's links to elsewhere are alive (needs a network)
+docs-links:  ## look whether the documentation's links to elsewhere are alive (needs a network)
+	@$(BOOTSTRAP) docs
 	@$(SPHINX) -b linkcheck build/links
 
 lint: setup-training  ## ruff and mypy
-	@$(VENV)/bin/ruff check .
-	@$(VENV)/bin/ruff format --check .
-	@$(VENV)/bin/mypy
+	@$(VENV)/bin/ruff check . && $(VENV)/bin/ruff format --check . && $(VENV)/bin/mypy
 
 lock:  ## write requirements/*.txt anew from requirements/*.in, and jazzy/*.txt beside what ROS brings (needs uv)
 	cd requirements && for part in runtime ros develop training docs; do \

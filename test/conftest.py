@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 from browser import Browser, chromium
+from fast import SLOW_FIXTURES, is_fast
 from hypothesis import HealthCheck, settings
 from real_logs import Reading, read_once
 
@@ -32,6 +33,30 @@ settings.register_profile(
 settings.load_profile("suite")
 
 REPOSITORY = Path(__file__).resolve().parent.parent
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--fast", action="store_true", help="only quick tests without ROS and torch, see fast.py"
+    )
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    is_slow_file = collection_path.match("test_*.py") and not is_fast(collection_path)
+    return True if config.getoption("--fast") and is_slow_file else None
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if not config.getoption("--fast"):
+        return
+    slow = [
+        item
+        for item in items
+        if {mark.name for mark in item.iter_markers()} & {"ros", "slow"}
+        or SLOW_FIXTURES & set(getattr(item, "fixturenames", ()))
+    ]
+    config.hook.pytest_deselected(items=slow)
+    items[:] = [item for item in items if item not in slow]
 
 
 @pytest.fixture(scope="session")

@@ -1,0 +1,62 @@
+"""Which test files are quick: those that import neither ROS nor torch, nnor what compiles the firmware, opens a browser or solves for a site.
+
+The answer follows from the imports, so that a new test file is classified without a list.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+TESTS = Path(__file__).resolve().parent
+SLOW_MODULES = {
+    *("rclpy", "torch", "launch", "uwb_mitigation_msgs", "selenium"),
+    *("uwb_mitigation.firmware_export.compiling", "compilers", "command_line"),
+    # Many drives are simulated and solved for.
+    *(
+        "uwb_mitigation.positioning.self_calibration",
+        "uwb_mitigation.positioning.survey",
+        "image_source_rooms",
+    ),
+}
+SLOW_FIXTURES = {"ros", "browser", "air", "apartment", "apartment_reading"}
+
+
+def is_fast(path: Path) -> bool:
+    """Whether no module that a test file imports, directly or indirectly, is in `SLOW_MODULES`."""
+    seen: set[str] = set()
+    waiting = list(_imports(path))
+    while waiting:
+        name = waiting.pop()
+        if name in SLOW_MODULES or name.partition(".")[0] in SLOW_MODULES:
+            return False
+        if name not in seen and (file := _file_of(name)) is not None:
+            waiting += _imports(file)
+        seen.add(name)
+    return True
+
+
+def _file_of(name: str) -> Path | None:
+    """The file of a module of this repository."""
+    place = TESTS / name if "." not in name else TESTS.parent / name.replace(".", "/")
+    return next((file for file in (place.with_suffix(".py"), place / "__init__.py") if file.is_file()), None)
+
+
+@cache
+def _imports(path: Path) -> tuple[str, ...]:
+    return tuple(_find_imports(path))
+
+
+def _find_imports(path: Path) -> Iterator[str]:
+    """Modules that a file imports: of the package when it is loaded, of a test also later."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for node in ast.walk(tree) if path.parent == TESTS else tree.body:
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            yield node.module
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+        elif isinstance(node, ast.Call) and ast.unparse(node.func) == "pytest.importorskip":
+            yield str(ast.literal_eval(node.args[0]))
