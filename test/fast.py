@@ -1,4 +1,4 @@
-"""Which test files are quick: those that import neither ROS nor torch, nnor what compiles the firmware, opens a browser or solves for a site.
+"""Which test files are quick: `--fast` runs only those, see `SLOW_MODULES`.
 
 The answer follows from the imports, so that a new test file is classified without a list.
 """
@@ -13,13 +13,11 @@ from pathlib import Path
 TESTS = Path(__file__).resolve().parent
 SLOW_MODULES = {
     *("rclpy", "torch", "launch", "uwb_mitigation_msgs", "selenium"),
+    # They compile the firmware, or start commands.
     *("uwb_mitigation.firmware_export.compiling", "compilers", "command_line"),
     # Many drives are simulated and solved for.
-    *(
-        "uwb_mitigation.positioning.self_calibration",
-        "uwb_mitigation.positioning.survey",
-        "image_source_rooms",
-    ),
+    *("uwb_mitigation.positioning.self_calibration", "uwb_mitigation.positioning.survey"),
+    "image_source_rooms",
 }
 SLOW_FIXTURES = {"ros", "browser", "air", "apartment", "apartment_reading"}
 
