@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from benchmarks.dw1000_model.library import NextRequest, Request, model_folder, model_objects
 from benchmarks.dw1000_model.links import Link
-from uwb_mitigation.errors import LinkError, MissingDependencyError
+from uwb_mitigation.errors import LinkError
 from uwb_mitigation.firmware_export.compiling import (
     WARNINGS,
     c_compiler,
@@ -214,11 +214,7 @@ def _library() -> ctypes.CDLL:
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     output = folder / "radio_air.so"
     firmware = firmware_folder()
-    program = firmware / "test" / "radio_air.c"
-    if not program.is_file():
-        raise MissingDependencyError(
-            "modelled boards are not installed", where=str(program), valid="run from a source checkout"
-        )
+    program = Path(__file__).with_name("radio_air.c")
     options = ("-std=c99", "-O2", "-fPIC", *WARNINGS, f"-I{model_folder()}", f"-I{firmware / 'src'}")
     objects = compile_objects(c_compiler(), options, (program, *sorted((firmware / "src").glob("*.c"))))
     run([*c_compiler(), "-shared", *objects, *model_objects(), "-o", str(output), "-lm", "-lpthread"])
