@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from benchmarks.dw1000_model.boards import Line, ModelledAir
 from benchmarks.dw1000_model.links import Link
 from uwb_mitigation.errors import UwbMitigationError
+from uwb_mitigation.link.connection import PortAddress
 from uwb_mitigation.link.layout import Mode, Role
-from uwb_mitigation.link.port import PortAddress
 from uwb_mitigation.link.radio import RadioSettings
 from uwb_mitigation.measurement import DEVICE_TIME_WRAP, RangeMeasurement
 from uwb_mitigation.radio.evb1000 import Evb1000Bus

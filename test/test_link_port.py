@@ -16,12 +16,13 @@ import pytest
 
 from uwb_mitigation.errors import LinkError, ParameterError, RecordingError
 from uwb_mitigation.link.board import Identity
+from uwb_mitigation.link.connection import PortAddress
 from uwb_mitigation.link.emulated_board import BoardFaults, EmulatedBoard
 from uwb_mitigation.link.events import Connected, Disconnected, Event, Loss
 from uwb_mitigation.link.faults import ByteFaults
 from uwb_mitigation.link.layout import Mode
 from uwb_mitigation.link.messages import Correction
-from uwb_mitigation.link.port import BoardPort, PortAddress
+from uwb_mitigation.link.port import BoardPort
 from uwb_mitigation.measurement import Cir, CorrectedRange, Origin, RangeMeasurement, Record, Status
 from uwb_mitigation.radio.evb1000 import Evb1000Bus
 
@@ -210,7 +211,7 @@ def test_a_port_that_is_not_there_is_reported_and_awaited(tmp_path):
     path = tmp_path / "later"
     port = BoardPort(PortAddress(str(path)))
     assert port.get(0.01) is None
-    assert port.report().problem == f"{path} is not there"
+    assert "is not there" in port.report().problem
 
     with EmulatedBoard(link=path):
         wait_for(port, of(Connected))

@@ -353,7 +353,7 @@ def test_unknown_types_are_counted_and_skipped():
     own = encode_frame(Frame(MessageType.GET_INFO, 0, sequence + 1, 0, b""))
 
     assert bench.host_hears(strange + own) == []
-    assert bench.session.counts.unknown_types == {99: 1, MessageType.GET_INFO: 1}
+    assert bench.session.counts.unknown_type == {99: 1, MessageType.GET_INFO: 1}
 
 
 def test_a_malformed_message_is_counted_and_explained():

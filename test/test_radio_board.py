@@ -135,7 +135,7 @@ def test_settings_that_a_board_cannot_use_are_refused_in_words():
         host.run(0.5)
         _, payload = messages.encode(SetRadio(RadioSettings(channel=6)))
         assert messages.decode(messages.MessageType.SET_RADIO, payload) == SetRadio(RadioSettings(channel=6))
-        host.session._radio_wanted = RadioSettings(channel=6)
+        host.session._radio_request.begin(SetRadio(RadioSettings(channel=6)))
         host.run(1)
         (refusal,) = host.seen(RadioRefused)
         assert "channel" in refusal.text

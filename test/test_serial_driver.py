@@ -23,9 +23,10 @@ from ros_harness import Process, Ros
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
 from uwb_mitigation.link.board import Identity
+from uwb_mitigation.link.connection import PortAddress
 from uwb_mitigation.link.emulated_board import BoardFaults, EmulatedBoard
 from uwb_mitigation.link.faults import ByteFaults
-from uwb_mitigation.link.port import BoardPort, PortAddress
+from uwb_mitigation.link.port import BoardPort
 from uwb_mitigation.measurement import Origin, Status
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import load_bundle
@@ -296,12 +297,12 @@ def test_a_port_that_is_absent_or_forbidden_is_told_once_on_the_console(
     ros: Ros, link: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     driver = drive(ros, link)
-    absent = f"{link} is not there; waiting for the board"
+    absent = f"{link}: is not there (plug the board in); waiting for the board"
     driver.wait_for_output(absent)
     with board(link):
         driver.wait_for_output("connected to board")
     driver.wait_for_output("the board is gone")
-    ros.diagnosis("driver", lambda status: status.message == f"{link} is not there")
+    ros.diagnosis("driver", lambda status: status.message.startswith(f"{link}: is not there"))
     ros.spin_until(lambda: driver.output.count(absent) == 2)
     assert driver.signal(signal.SIGINT) == 0
     assert driver.output.count(absent) == 2

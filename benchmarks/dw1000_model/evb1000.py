@@ -8,19 +8,17 @@ from __future__ import annotations
 import heapq
 import itertools
 import math
-import os
 import select
 import threading
 import time
-import tty
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 
 from benchmarks.dw1000_model.air import ANTENNA_DELAY_TICKS, Air, Chip
 from benchmarks.dw1000_model.links import Link, link_of
 from benchmarks.dw1000_model.usb2spi import Bridge
 from uwb_mitigation.errors import ParameterError, RecordingError, UwbMitigationError
+from uwb_mitigation.link.emulated_board import PseudoTerminal
 from uwb_mitigation.sources.source import Source
 
 MAX_BOARDS = 33
@@ -30,7 +28,6 @@ ROUND_TRIP_S = 1.5e-3
 PPM = (3.0, -4.0, 7.0, -9.0, 1.0, 12.0, -2.0)
 """By how much the boards' crystals are fast, in turn: no two that range agree."""
 
-_READ_BYTES = 4096
 _LONGEST_WAIT_S = 0.02
 CLEAN_M = 3.0
 
@@ -41,44 +38,20 @@ class _Board:
     def __init__(self, chip: Chip, bridge: Bridge, link: Path | None) -> None:
         self.chip = chip
         self.bridge = bridge
-        self.link = link
-        self.port = ""
-        self.fds: tuple[int, int] | None = None
+        self.terminal = PseudoTerminal(link)
         self.backlog = bytearray()
         self.requests = 0
 
     def plug(self) -> None:
-        """Give it power, and a port, usually under another name than before."""
-        if self.fds is not None:
-            return
-        controller, port = os.openpty()
-        tty.setraw(port)
-        os.set_blocking(controller, False)
-        self.fds = (controller, port)
-        self.port = os.ttyname(port)
-        self.bridge.reset()
-        self.backlog.clear()
-        if self.link is not None:
-            try:
-                self.link.unlink(missing_ok=True)
-                self.link.symlink_to(self.port)
-            except OSError as error:
-                self.unplug()
-                raise ParameterError(
-                    f"cannot link to the port: {error.strerror}", where=str(self.link)
-                ) from error
+        """Give it power, and a port."""
+        if self.terminal.plug():
+            self.bridge.reset()
+            self.backlog.clear()
 
     def unplug(self) -> None:
         """Pull the cable: the port is gone, and the chip without power."""
-        if self.fds is None:
-            return
-        for fd in self.fds:
-            os.close(fd)
-        self.fds = None
-        self.port = ""
-        if self.link is not None:
-            self.link.unlink(missing_ok=True)
-        self.chip.reset_drive(0)
+        if self.terminal.unplug():
+            self.chip.reset_drive(0)
 
 
 class EmulatedEvb1000s:
@@ -155,8 +128,6 @@ class EmulatedEvb1000s:
                 link = None
                 if port_links is not None:
                     link = port_links.with_name(f"{port_links.name}{number}")
-                if link is not None and link.exists() and not link.is_symlink():
-                    raise ParameterError("the port's link would replace a file", where=str(link))
                 self._boards.append(_Board(chip, Bridge(chip.spi, ranging=number in ranging), link))
             clean = Link(clean_m, loss=loss, damage=damage)
             for one, other in itertools.combinations(self._boards, 2):
@@ -181,7 +152,7 @@ class EmulatedEvb1000s:
     def ports(self) -> tuple[str, ...]:
         """The boards' ports, for the host to open; empty where unplugged."""
         with self._lock:
-            return tuple(board.port for board in self._boards)
+            return tuple(board.terminal.port for board in self._boards)
 
     @property
     def distances_m(self) -> tuple[float, ...]:
@@ -202,7 +173,7 @@ class EmulatedEvb1000s:
         """Plug it in again: the chip starts anew."""
         with self._lock:
             board = self._boards[number]
-            if board.fds is None:
+            if board.terminal.fd is None:
                 board.chip.reset_drive(1)
             board.plug()
 
@@ -259,8 +230,12 @@ class EmulatedEvb1000s:
     def _run(self) -> None:
         while not self._stop.is_set():
             with self._lock:
-                fds = {board.fds[0]: number for number, board in enumerate(self._boards) if board.fds}
-                full = [board.fds[0] for board in self._boards if board.fds and board.backlog]
+                fds = {
+                    board.terminal.fd: number
+                    for number, board in enumerate(self._boards)
+                    if board.terminal.fd is not None
+                }
+                full = [fd for fd, number in fds.items() if self._boards[number].backlog]
                 due = self._answers[0][0] if self._answers else math.inf
             patience_s = min(max(due - time.monotonic(), 0.0), _LONGEST_WAIT_S)
             try:
@@ -274,9 +249,9 @@ class EmulatedEvb1000s:
                 for fd in {*readable, *writable}:
                     board = self._boards[fds[fd]]
                     # While this waited, the cable may have been pulled, and plugged again.
-                    if board.fds is not None and board.fds[0] == fd:
-                        self._serve(fds[fd], fd, now)
-                        self._write(board)
+                    if board.terminal.fd == fd:
+                        self._serve(fds[fd], now)
+                        board.terminal.write(board.backlog)
                 self._answer(time.monotonic())
 
     def _keep_time(self, now: float) -> None:
@@ -284,13 +259,9 @@ class EmulatedEvb1000s:
         if late > 0:
             self._air.run(late)
 
-    def _serve(self, number: int, fd: int, now: float) -> None:
-        try:
-            data = os.read(fd, _READ_BYTES)
-        except OSError:
-            return
+    def _serve(self, number: int, now: float) -> None:
         board = self._boards[number]
-        for answer in board.bridge.receive(data):
+        for answer in board.bridge.receive(board.terminal.read()):
             board.requests += 1
             # A long transaction at the slow speed takes longer than the bus.
             due = max(now + self._round_trip_s, self._began + board.chip.now())
@@ -300,13 +271,7 @@ class EmulatedEvb1000s:
         while self._answers and self._answers[0][0] <= now:
             _, _, number, answer = heapq.heappop(self._answers)
             board = self._boards[number]
-            board.backlog += answer
-            self._write(board)
-
-    def _write(self, board: _Board) -> None:
-        if board.fds is None:
-            board.backlog.clear()
-        elif board.backlog:
-            # The bus holds back what the host does not take yet.
-            with suppress(OSError):
-                del board.backlog[: os.write(board.fds[0], board.backlog)]
+            if board.terminal.fd is not None:
+                board.backlog += answer
+                # The bus holds back what the host does not take yet.
+                board.terminal.write(board.backlog)

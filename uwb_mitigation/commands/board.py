@@ -42,7 +42,6 @@ def emulate(
     damage: Annotated[float, typer.Option(help="Share of bytes flipped, dropped, inserted, each.")] = 0.0,
     lose: Annotated[float, typer.Option(help="Share of messages lost.")] = 0.0,
     duplicate: Annotated[float, typer.Option(help="Share of messages that arrive twice.")] = 0.0,
-    stall: Annotated[float, typer.Option(help="s, longest time that the bus holds bytes back.")] = 0.0,
     reset_every: Annotated[float | None, typer.Option(help="s between resets of the firmware.")] = None,
     unplug_every: Annotated[float | None, typer.Option(help="s between pulls of the cable.")] = None,
     seed: Annotated[int, typer.Option(help="Of all faults, and of simulated measurements.")] = 1,
@@ -67,7 +66,7 @@ def emulate(
             raise ParameterError(f"{name} = {value}", valid="above 0")
     if seed < 0:
         raise ParameterError(f"seed = {seed}", valid="0 or more")
-    faults = BoardFaults(ByteFaults(damage, damage, damage), lose, duplicate, stall)
+    faults = BoardFaults(ByteFaults(damage, damage, damage), lose, duplicate)
     identity, mitigation = _firmware(model)
     with open_source(recording, rate, seed) as source:
         board = EmulatedBoard(

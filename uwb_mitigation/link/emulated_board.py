@@ -5,13 +5,14 @@ Linux and macOS only, as pseudo-terminals are.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
 import select
 import threading
 import time
 import tty
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,8 +22,7 @@ from uwb_mitigation.errors import ParameterError, RecordingError, UwbMitigationE
 from uwb_mitigation.link.board import Board, Corrector, Identity
 from uwb_mitigation.link.faults import ByteFaults, damage
 from uwb_mitigation.link.layout import PROTOCOL_VERSION, Mode
-from uwb_mitigation.measurement import RangeMeasurement
-from uwb_mitigation.sources.source import Source
+from uwb_mitigation.measurement import RangeMeasurement, Record
 
 _READ_BYTES = 4096
 _FLOOD_BYTES = 4096
@@ -40,18 +40,16 @@ class BoardFaults:
     Attributes:
         channel: damage to bytes.
         lose, duplicate: probabilities that what is sent at once is lost, or arrives twice.
-        stall_s: longest time that the bus holds back what is sent, at random.
         boot_noise: bytes of noise before each HELLO.
         version: protocol version that the board speaks.
 
     Raises:
-        ParameterError: a probability is outside 0 to 1, or a length negative.
+        ParameterError: a probability is outside 0 to 1.
     """
 
     channel: ByteFaults = _CLEAN
     lose: float = 0.0
     duplicate: float = 0.0
-    stall_s: float = 0.0
     boot_noise: int = 0
     version: int = PROTOCOL_VERSION
 
@@ -59,12 +57,79 @@ class BoardFaults:
         for name in ("lose", "duplicate"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ParameterError(f"{name} = {getattr(self, name)}", valid="0 to 1")
-        for name in ("stall_s", "boot_noise"):
-            if not getattr(self, name) >= 0:
-                raise ParameterError(f"{name} = {getattr(self, name)}", valid="0 or more")
 
 
 _HEALTHY = BoardFaults()
+
+
+class PseudoTerminal:
+    """A port for a host, with a symbolic link to it. Not for several threads at once.
+
+    Args:
+        link: path of the symbolic link, kept up to date; None = no link.
+
+    Attributes:
+        port: path of the port for the host to open; empty while unplugged.
+        fd: the other end of the port, without blocking; None while unplugged.
+
+    Raises:
+        ParameterError: `link` is the path of a file.
+    """
+
+    def __init__(self, link: Path | None) -> None:
+        if link is not None and link.exists() and not link.is_symlink():
+            raise ParameterError("the port's link would replace a file", where=str(link))
+        self.port = ""
+        self.fd: int | None = None
+        self._link = link
+        self._held = -1
+
+    def plug(self) -> bool:
+        """Make the port, usually under another name than before; return whether there was none.
+
+        Raises:
+            ParameterError: the link cannot be made.
+        """
+        if self.fd is not None:
+            return False
+        self.fd, self._held = os.openpty()
+        tty.setraw(self._held)
+        os.set_blocking(self.fd, False)
+        self.port = os.ttyname(self._held)
+        if self._link is not None:
+            try:
+                self._link.unlink(missing_ok=True)
+                self._link.symlink_to(self.port)
+            except OSError as error:
+                self.unplug()
+                raise ParameterError(
+                    f"cannot link to the port: {error.strerror}", where=str(self._link)
+                ) from error
+        return True
+
+    def unplug(self) -> bool:
+        """Remove the port, as if the cable were pulled; return whether there was one."""
+        if self.fd is None:
+            return False
+        for fd in (self.fd, self._held):
+            os.close(fd)
+        self.fd, self.port = None, ""
+        if self._link is not None:
+            self._link.unlink(missing_ok=True)
+        return True
+
+    def read(self) -> bytes:
+        """Return what the host has sent."""
+        # A pseudo-terminal reports EIO while nobody has its other end open.
+        with contextlib.suppress(OSError):
+            return b"" if self.fd is None else os.read(self.fd, _READ_BYTES)
+        return b""
+
+    def write(self, data: bytearray) -> None:
+        """Send what the host takes at the moment, and remove it from `data`."""
+        with contextlib.suppress(OSError):
+            if self.fd is not None:
+                del data[: os.write(self.fd, data)]
 
 
 class EmulatedBoard:
@@ -74,7 +139,7 @@ class EmulatedBoard:
     the time of playing. The methods that make something go wrong may be called from any thread.
 
     Args:
-        source: what the board measures; None = it never measures.
+        source: what the board measures, iterated over and over; None = it never measures.
         rate_hz: measurements per second.
         identity, corrector, mode: see `Board`.
         faults: what goes wrong all the time.
@@ -86,13 +151,12 @@ class EmulatedBoard:
         RecordingError: the source holds no measurement that can be read.
 
     Attributes:
-        port: path of the port for the host to open; empty while unplugged.
         failure: why playing ended early; None while all is well.
     """
 
     def __init__(
         self,
-        source: Source | None = None,
+        source: Iterable[Record] | None = None,
         *,
         rate_hz: float = 50.0,
         identity: Identity = _IDENTITY,
@@ -104,9 +168,7 @@ class EmulatedBoard:
     ) -> None:
         if not 0 < rate_hz <= 1e6:
             raise ParameterError(f"a rate of {rate_hz} Hz", valid="above 0, at most 1e6")
-        if link is not None and link.exists() and not link.is_symlink():
-            raise ParameterError("the port's link would replace a file", where=str(link))
-        self.port = ""
+        self._terminal = PseudoTerminal(link)
         self.failure: UwbMitigationError | None = None
         self.sent_measurements = 0
         self._measuring = True
@@ -120,44 +182,32 @@ class EmulatedBoard:
         self._corrector = corrector
         self._mode = mode
         self._faults = faults
-        self._link = link
         self._random = np.random.default_rng(seed)
         self._boots = int(self._random.integers(1, 1 << 31))
         self._lock = threading.RLock()
         self._stop = threading.Event()
-        self._fds: tuple[int, int] | None = None
         self._backlog = bytearray()
         self._mute_until = 0.0
         self._flood_until = 0.0
-        self._stalled_until = 0.0
         self.plug()
         self._thread = threading.Thread(target=self._run, name="emulated board", daemon=True)
         self._thread.start()
 
+    @property
+    def port(self) -> str:
+        """Path of the port for the host to open; empty while unplugged."""
+        return self._terminal.port
+
     def plug(self) -> None:
         """Plug the board in, usually under another name than before: it boots."""
         with self._lock:
-            if self._fds is not None:
-                return
-            controller, port = os.openpty()
-            tty.setraw(port)
-            os.set_blocking(controller, False)
-            self._fds = (controller, port)
-            self.port = os.ttyname(port)
-            self._show_link()
-            self.reset()
+            if self._terminal.plug():
+                self.reset()
 
     def unplug(self) -> None:
         """Pull the cable: the port is gone, and the board without power."""
         with self._lock:
-            if self._fds is None:
-                return
-            for fd in self._fds:
-                os.close(fd)
-            self._fds = None
-            self.port = ""
-            if self._link is not None:
-                self._link.unlink(missing_ok=True)
+            self._terminal.unplug()
 
     def reset(self) -> None:
         """Restart the firmware; the port stays."""
@@ -216,24 +266,12 @@ class EmulatedBoard:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _show_link(self) -> None:
-        if self._link is None:
-            return
-        try:
-            self._link.unlink(missing_ok=True)
-            self._link.symlink_to(self.port)
-        except OSError as error:
-            self.unplug()
-            raise ParameterError(
-                f"cannot link to the port: {error.strerror}", where=str(self._link)
-            ) from error
-
     def _run(self) -> None:
         due = time.monotonic()
         while not self._stop.is_set():
             now = time.monotonic()
             with self._lock:
-                plugged = self._fds is not None
+                plugged = self._terminal.fd is not None
                 if plugged and self._measuring and now >= due:
                     self._measure()
             if now >= due:
@@ -262,11 +300,9 @@ class EmulatedBoard:
     def _exchange(self, patience_s: float) -> None:
         """Read from and write to the host, for at most `patience_s`."""
         with self._lock:
-            if self._fds is None:
+            if (controller := self._terminal.fd) is None:
                 return
-            controller = self._fds[0]
-            held = time.monotonic() < max(self._mute_until, self._stalled_until)
-            sending = bool(self._backlog) and not held
+            sending = bool(self._backlog) and time.monotonic() >= self._mute_until
         try:
             readable, writable, _ = select.select(
                 [controller], [controller] if sending else [], [], patience_s
@@ -275,29 +311,25 @@ class EmulatedBoard:
             return
         with self._lock:
             # While this waited, the cable may have been pulled, and plugged again.
-            if self._fds is None or self._fds[0] != controller:
+            if self._terminal.fd != controller:
                 return
             if readable:
-                data = _read(controller)
-                self._transmit(self._board.receive(data, self._uptime_us()))
+                self._transmit(self._board.receive(self._terminal.read(), self._uptime_us()))
             if time.monotonic() < self._flood_until and len(self._backlog) < _FLOOD_BYTES:
                 self._backlog += self._random.bytes(_FLOOD_BYTES)
             self._transmit(self._board.tick(self._uptime_us()))
             if writable:
-                written = _write(controller, self._backlog)
-                del self._backlog[:written]
+                self._terminal.write(self._backlog)
 
     def _transmit(self, data: bytes) -> None:
         if not data or time.monotonic() < self._mute_until:
             return
         faults = self._faults
-        chances = self._random.random(3)
+        chances = self._random.random(2)
         if chances[0] < faults.lose:
             return
         if chances[1] < faults.duplicate:
             data += data
-        if faults.stall_s:
-            self._stalled_until = time.monotonic() + faults.stall_s * chances[2]
         if faults.channel != _CLEAN:
             data = damage(data, faults.channel, self._random).data
         self._backlog += data
@@ -306,26 +338,11 @@ class EmulatedBoard:
         return (time.monotonic_ns() - self._booted_ns) // 1000
 
 
-def _endless(source: Source | None) -> Iterator[RangeMeasurement]:
+def _endless(source: Iterable[Record] | None) -> Iterator[RangeMeasurement]:
     empty = True
     while source is not None:
         for record in source:
             empty = False
             yield record.measurement
         if empty:
-            raise RecordingError("the source holds no measurements", where=source.name)
-
-
-def _read(fd: int) -> bytes:
-    try:
-        return os.read(fd, _READ_BYTES)
-    except OSError:
-        # A pseudo-terminal reports EIO while nobody has its other end open.
-        return b""
-
-
-def _write(fd: int, data: bytearray) -> int:
-    try:
-        return os.write(fd, data)
-    except OSError:
-        return 0
+            raise RecordingError("the source holds no measurements")

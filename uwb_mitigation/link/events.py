@@ -104,7 +104,7 @@ class SessionCounts:
         lost: missing in the board's numbering.
         stale: numbered at or before one that was already received.
         withheld: while not connected.
-        unknown_types: of types that this version does not know, {type: count}.
+        unknown_type: of types that this version does not know, {type: count}.
         malformed: of a known type, but with impossible contents.
         wrong_model: corrections by another model than the expected one.
         wrong_offsets: corrections that are not known to hold the offsets asked for.
@@ -116,7 +116,7 @@ class SessionCounts:
     lost: int = 0
     stale: int = 0
     withheld: int = 0
-    unknown_types: Counter[int] = field(default_factory=Counter)
+    unknown_type: Counter[int] = field(default_factory=Counter)
     malformed: int = 0
     wrong_model: int = 0
     wrong_offsets: int = 0

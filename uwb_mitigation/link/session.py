@@ -6,6 +6,8 @@ owns the port calls `receive` after each read, `tick` at least ten times a secon
 
 from __future__ import annotations
 
+from collections import Counter
+from dataclasses import fields
 from typing import TypeVar
 
 from uwb_mitigation.errors import LinkError
@@ -40,7 +42,7 @@ from uwb_mitigation.link.messages import (
 )
 from uwb_mitigation.link.radio import RadioSettings, RadioStatus
 from uwb_mitigation.measurement import RangeMeasurement
-from uwb_mitigation.offsets import Offsets
+from uwb_mitigation.offsets import NO_OFFSETS, Offsets
 
 _MS = 10**6
 REQUEST_INTERVAL_NS = 500 * _MS
@@ -71,6 +73,38 @@ _STAMPED = (MessageType.RANGE_CIR, MessageType.RANGE_CORRECTED)
 
 _Key = TypeVar("_Key")
 _Value = TypeVar("_Value")
+
+
+class _Request:
+    """A request that is repeated until the board answers it.
+
+    Args:
+        unanswered: the problem if the board answers none of `RADIO_TRIES` requests; empty = repeat for ever.
+    """
+
+    def __init__(self, unanswered: str = "") -> None:
+        self.unanswered = unanswered
+        self.message: messages.Message | None = None
+        self.pending = False
+        self.tries = 0
+        self.sent: dict[int, None] = {}
+
+    def begin(self, message: messages.Message) -> None:
+        """Request something else: answers to earlier requests no longer count."""
+        self.repeat(message)
+        self.sent.clear()
+
+    def repeat(self, message: messages.Message | None) -> None:
+        """Request `message` from now on; None = nothing."""
+        self.message, self.pending, self.tries = message, message is not None, 0
+
+    def is_answered_by(self, sequence: int) -> bool:
+        """Whether the frame `sequence` was one of the requests; then the request is done."""
+        if sequence not in self.sent:
+            return False
+        self.sent.clear()
+        self.pending = False
+        return True
 
 
 class BoardSession:
@@ -107,14 +141,13 @@ class BoardSession:
         self._expected_model_id = expected_model_id
         self._outgoing = bytearray()
         self._mode = mode
-        self._mode_pending: Mode | None = None
-        self._mode_requests: dict[int, None] = {}
-        self._radio_wanted: RadioSettings | None = None
-        self._radio_requests: dict[int, None] = {}
-        self._radio_tries = 0
-        self._offsets_wanted: Offsets | None = None
-        self._offsets_requests: dict[int, None] = {}
-        self._offsets_tries = 0
+        self._mode_request = _Request()
+        self._radio_request = _Request(
+            "its firmware knows no settings of a radio: flash a newer one, or set none"
+        )
+        self._offsets_request = _Request(
+            "its firmware knows no offsets: flash a newer one, or correct on the host"
+        )
         self._offsets_held = False
         self._boot: tuple[int, int] | None = None
         self._next_request_ns = 0
@@ -130,6 +163,16 @@ class BoardSession:
     def decoder_counts(self) -> DecoderCounts:
         """What became of the bytes received."""
         return self._decoder.counts
+
+    def totals(self) -> dict[str, int]:
+        """Return the counts of frames for diagnostics, {name: count}."""
+        decoder, counts = self._decoder.counts, self.counts
+        totals = {"frames": decoder.frames, "corrupt": decoder.corrupt}
+        totals["foreign_version"] = decoder.foreign_versions.total()
+        for row in fields(counts):
+            value = getattr(counts, row.name)
+            totals[row.name] = value.total() if isinstance(value, Counter) else value
+        return totals
 
     @property
     def model_matches(self) -> bool:
@@ -156,34 +199,29 @@ class BoardSession:
         return now_ns - self._heard_ns
 
     def set_mode(self, mode: Mode) -> None:
-        """Ask the board for `mode`, until it answers; a `ModeChanged` or `ModeRefused` follows."""
+        """Request `mode` until the board answers; a `ModeChanged` or `ModeRefused` follows."""
         self._mode = mode
-        self._mode_pending = mode
-        self._mode_requests.clear()
+        self._mode_request.begin(messages.SetMode(mode))
         self._next_request_ns = 0
 
     def set_radio(self, settings: RadioSettings) -> None:
-        """Ask the board, now and after each of its starts, to use `settings`; a `Radio` or `RadioRefused` follows.
+        """Request `settings` now and after each start of the board; a `Radio` or `RadioRefused` follows.
 
         Raises:
             ParameterError: no radio has such settings.
         """
         settings.check()
-        self._radio_wanted = settings
-        self._radio_tries = 0
-        self._radio_requests.clear()
+        self._radio_request.begin(SetRadio(settings))
         self._next_request_ns = 0
 
     def set_offsets(self, offsets: Offsets) -> None:
-        """Ask the board, now and after each of its starts, to take these off its ranges.
+        """Request, now and after each start of the board, that it subtracts these offsets from its ranges.
 
-        Until it says that it does, its corrections are counted and not delivered. A board that cannot is told of by
-        `OffsetsRefused`, but for offsets of 0, which such a board has.
+        Until the board confirms them, its corrections are counted and not delivered. `OffsetsRefused` follows if it
+        cannot use them, except for offsets of 0, which a board without offsets has anyway.
         """
-        self._offsets_wanted = offsets
         self._offsets_held = False
-        self._offsets_tries = 0
-        self._offsets_requests.clear()
+        self._offsets_request.begin(SetOffsets(offsets))
         self._next_request_ns = 0
 
     def outgoing(self) -> bytes:
@@ -213,27 +251,25 @@ class BoardSession:
             if self.state is not LinkState.READY:
                 self._send(*messages.encode(messages.GetInfo()))
                 return events
-            if self._offsets_wanted is not None and self._offsets_tries <= RADIO_TRIES:
-                events += self._ask_offsets(self._offsets_wanted)
-            if self._mode_pending is not None:
-                request = self._send(*messages.encode(messages.SetMode(self._mode_pending)))
-                if request is not None:
-                    _remember(self._mode_requests, request, None)
-            elif self._radio_wanted is not None and self._radio_tries <= RADIO_TRIES:
-                events += self._ask_radio(self._radio_wanted)
+            if self._ask(self._offsets_request) and self._offsets:
+                events.append(OffsetsRefused(self._offsets_request.unanswered))
+            if self._mode_request.pending:
+                self._ask(self._mode_request)
+            elif self._ask(self._radio_request):
+                events.append(RadioRefused(self._radio_request.unanswered))
         if self.state is LinkState.READY and now_ns >= self._next_sync_ns:
             self._sync(now_ns, stamp_ns)
         return events
 
     def _accept(self, frame: Frame, now_ns: int, stamp_ns: int) -> list[Event]:
         try:
-            return self._understand(frame, now_ns, stamp_ns)
+            return self._parse(frame, now_ns, stamp_ns)
         except LinkError as error:
             self.counts.malformed += 1
             self.last_malformed = str(error)
             return []
 
-    def _understand(self, frame: Frame, now_ns: int, stamp_ns: int) -> list[Event]:
+    def _parse(self, frame: Frame, now_ns: int, stamp_ns: int) -> list[Event]:
         if frame.type == MessageType.HELLO:
             return self._accept_hello(frame, now_ns, stamp_ns)
         if self.state is not LinkState.READY:
@@ -259,7 +295,7 @@ class BoardSession:
         if isinstance(message, RangeMeasurement | Log | BoardStatus | RadioStatus):
             return [message]
         # The host's own types are as strange from a board as those that nobody knows.
-        self.counts.unknown_types[frame.type] += 1
+        self.counts.unknown_type[frame.type] += 1
         return []
 
     def _accept_hello(self, frame: Frame, now_ns: int, stamp_ns: int) -> list[Event]:
@@ -285,56 +321,48 @@ class BoardSession:
             self._stale_run = 0
             self._syncs = 0
             self._next_sync_ns = now_ns
-            self._mode_pending = None if self._mode == hello.mode else self._mode
-            self._radio_tries = self._offsets_tries = 0
+            self._mode_request.repeat(
+                None if self._mode in (None, hello.mode) else messages.SetMode(self._mode)
+            )
+            self._radio_request.repeat(self._radio_request.message)
+            self._offsets_request.repeat(self._offsets_request.message)
             self._offsets_held = False
             self._next_request_ns = now_ns
             events.append(Connected(hello))
-        elif frame.flags & Flag.ANSWER and hello.request_sequence in self._mode_requests:
-            wanted, self._mode_pending = self._mode_pending, None
-            self._mode_requests.clear()
-            if wanted is not None:
-                changed = hello.mode == wanted
-                events.append(ModeChanged(wanted) if changed else ModeRefused(wanted, hello.mode))
+        elif frame.flags & Flag.ANSWER and self._mode_request.is_answered_by(hello.request_sequence):
+            wanted = self._mode or hello.mode
+            events.append(ModeChanged(wanted) if hello.mode == wanted else ModeRefused(wanted, hello.mode))
         return events
 
-    def _ask_radio(self, wanted: RadioSettings) -> list[Event]:
-        self._radio_tries += 1
-        if self._radio_tries > RADIO_TRIES:
-            return [RadioRefused("its firmware knows no settings of a radio: flash a newer one, or set none")]
-        request = self._send(*messages.encode(SetRadio(wanted)))
-        if request is not None:
-            _remember(self._radio_requests, request, None)
-        return []
+    @property
+    def _offsets(self) -> Offsets:
+        message = self._offsets_request.message
+        return message.offsets if isinstance(message, SetOffsets) else NO_OFFSETS
 
-    def _ask_offsets(self, wanted: Offsets) -> list[Event]:
-        self._offsets_tries += 1
-        if self._offsets_tries > RADIO_TRIES:
-            text = "its firmware knows no offsets: flash a newer one, or correct on the host"
-            return [OffsetsRefused(text)] if wanted else []
-        request = self._send(*messages.encode(SetOffsets(wanted)))
-        if request is not None:
-            _remember(self._offsets_requests, request, None)
-        return []
+    def _ask(self, request: _Request) -> bool:
+        """Send a pending request; return whether it is given up, as it was never answered."""
+        if not request.pending or request.message is None:
+            return False
+        request.tries += 1
+        if request.unanswered and request.tries > RADIO_TRIES:
+            request.pending = False
+            return True
+        sequence = self._send(*messages.encode(request.message))
+        if sequence is not None:
+            _remember(request.sent, sequence, None)
+        return False
 
     def _accept_offsets(self, answer: OffsetsAnswer) -> list[Event]:
-        if answer.request_sequence not in self._offsets_requests:
+        if not self._offsets_request.is_answered_by(answer.request_sequence):
             self.counts.unasked += 1
             return []
-        self._offsets_requests.clear()
-        self._offsets_tries = RADIO_TRIES + 1
         self._offsets_held = answer.accepted
-        if answer.accepted or self._offsets_wanted is None:
-            return []
-        text = f"it keeps {answer.slots} offsets, and {len(self._offsets_wanted)} were asked for"
-        return [OffsetsRefused(text)]
+        text = f"it keeps {answer.slots} offsets, and {len(self._offsets)} were requested"
+        return [] if answer.accepted else [OffsetsRefused(text)]
 
     def _accept_radio(self, radio: Radio, answer: bool) -> list[Event]:
-        if answer and radio.request_sequence in self._radio_requests:
-            self._radio_requests.clear()
-            self._radio_tries = RADIO_TRIES + 1
-            if not radio.accepted:
-                return [RadioRefused(radio.text)]
+        if answer and self._radio_request.is_answered_by(radio.request_sequence) and not radio.accepted:
+            return [RadioRefused(radio.text)]
         self.radio = radio
         return [radio]
 
@@ -342,7 +370,7 @@ class BoardSession:
         if not self.model_matches:
             self.counts.wrong_model += 1
             return []
-        if self._offsets_wanted and not self._offsets_held:
+        if self._offsets and not self._offsets_held:
             self.counts.wrong_offsets += 1
             return []
         if answer:
@@ -392,9 +420,8 @@ class BoardSession:
         self.hello = None
         self.radio = None
         self.foreign_version = None
-        self._mode_requests.clear()
-        self._radio_requests.clear()
-        self._offsets_requests.clear()
+        for request in (self._mode_request, self._radio_request, self._offsets_request):
+            request.sent.clear()
         self._syncs_sent.clear()
         self._next_request_ns = now_ns
         return [Disconnected(loss)] if was_ready else []

@@ -25,9 +25,10 @@ from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
 from uwb_mitigation.bag.codec import encode_range
 from uwb_mitigation.bag.poses import encode_place
 from uwb_mitigation.errors import ParameterError, UwbMitigationError
+from uwb_mitigation.link.connection import PortAddress
 from uwb_mitigation.link.layout import Mode
 from uwb_mitigation.link.messages import Correction
-from uwb_mitigation.link.port import BoardPort, PortAddress
+from uwb_mitigation.link.port import BoardPort
 from uwb_mitigation.link.radio import RadioSettings
 from uwb_mitigation.measurement import RangeMeasurement, Record
 from uwb_mitigation.nodes import clocks, conversions, diagnostics, topics

@@ -15,7 +15,7 @@ import time
 import serial
 
 from uwb_mitigation.errors import LinkError
-from uwb_mitigation.link.port import PortAddress, why_not_opened
+from uwb_mitigation.link.connection import PortAddress
 
 ANSWER_WITHIN_S = 0.4
 ASK_AT_MOST = 3
@@ -50,19 +50,7 @@ class Evb1000Bus:
     def __init__(self, address: PortAddress) -> None:
         self._address = address
         self._fast = False
-        path = address.find()
-        if path is None:
-            raise LinkError("is not there", where=str(address), valid="plug the board in")
-        try:
-            port = serial.Serial(None, timeout=0, exclusive=True)
-            port.port = path
-            port.open()
-        except (OSError, ValueError) as error:
-            raise LinkError(
-                f"cannot be opened: {why_not_opened(address, error)}", where=str(address)
-            ) from error
-        self._port: serial.Serial | None = port
-        os.set_blocking(port.fileno(), False)
+        self._port: serial.Serial | None = address.open()
         try:
             self.version = self._greet()
         except LinkError:

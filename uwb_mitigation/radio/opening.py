@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 
-from uwb_mitigation.link.port import PortAddress
+from uwb_mitigation.link.connection import PortAddress
 from uwb_mitigation.radio.bus import Bus
 
 

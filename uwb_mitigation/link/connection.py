@@ -1,0 +1,218 @@
+"""A connection to hardware that a thread keeps open: opened, served, and opened again after a loss.
+
+Boards on serial ports (`port`) and radios of this computer (`uwb_mitigation.radio.port`) are built on it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import threading
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import serial
+from serial.tools import list_ports
+
+from uwb_mitigation.errors import LinkError, ParameterError, UwbMitigationError
+
+FIRST_RETRY_S = 0.1
+LAST_RETRY_S = 0.4
+"""Hardware that came back is found well within a second; a search costs next to nothing."""
+
+CAPACITY = 1024
+"""Default number of events that wait; beyond it the oldest are dropped."""
+
+_Event = TypeVar("_Event")
+
+
+class Connection(ABC, Generic[_Event]):
+    """Keeps hardware connected until `close`, and queues its events. Methods may be called from any thread.
+
+    Nothing that the hardware does ends the thread or raises: `problem` contains what is wrong.
+
+    Args:
+        name: of the thread.
+        problem: before the first try.
+        capacity: see `CAPACITY`.
+
+    Attributes:
+        openings: how often the hardware was opened.
+        overflowed: events that were dropped because nobody took them in time.
+    """
+
+    def __init__(self, name: str, problem: str, capacity: int = CAPACITY) -> None:
+        self.openings = 0
+        self.overflowed = 0
+        self._problem = problem
+        self._worked = False
+        self._capacity = capacity
+        self._events: deque[_Event] = deque()
+        # Guards the state of the connection; waiting for it waits for events.
+        self._lock = threading.RLock()
+        self._changed = threading.Condition(self._lock)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+
+    def get(self, timeout_s: float) -> _Event | None:
+        """Return the next event; None if there is none within the time, or once the connection is closed."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._events or self.closed, timeout_s)
+            return self._events.popleft() if self._events and not self.closed else None
+
+    @property
+    def problem(self) -> str:
+        """What keeps the hardware from working; empty while nothing does."""
+        with self._lock:
+            return self._problem
+
+    @property
+    def closed(self) -> bool:
+        """True once `close` was called."""
+        return self._stop.is_set()
+
+    def close(self) -> None:
+        """End the thread and close the hardware; may be called twice."""
+        self._stop.set()
+        with self._changed:
+            self._changed.notify_all()
+        self._thread.join()
+
+    @abstractmethod
+    def _connect(self) -> None:
+        """Open the hardware and serve it until the connection is closed.
+
+        Raises:
+            UwbMitigationError: it cannot be opened, or was lost.
+        """
+
+    def _lost(self, text: str) -> None:
+        """Called after each loss and each failed try, while the lock is held."""
+
+    def _put(self, events: Iterable[_Event]) -> None:
+        with self._changed:
+            self._events.extend(events)
+            while len(self._events) > self._capacity:
+                self._events.popleft()
+                self.overflowed += 1
+            self._changed.notify_all()
+
+    def _run(self) -> None:
+        retry_s = FIRST_RETRY_S
+        while not self.closed:
+            self._worked = False
+            try:
+                self._connect()
+            except UwbMitigationError as error:
+                with self._lock:
+                    self._lost(str(error))
+                    self._problem = str(error)
+            if self._worked:
+                retry_s = FIRST_RETRY_S
+            self._stop.wait(retry_s)
+            retry_s = min(2 * retry_s, LAST_RETRY_S)
+
+
+@dataclass(frozen=True, slots=True)
+class PortAddress:
+    """Where a board is: a device file, or a USB device wherever it is plugged in.
+
+    Attributes:
+        device: path of the device file; empty = find by USB.
+        vendor, product: USB ids.
+        serial_number: of the USB device; empty = the first that has the ids.
+    """
+
+    device: str = ""
+    vendor: int = 0
+    product: int = 0
+    serial_number: str = ""
+
+    @classmethod
+    def parse(cls, text: str) -> PortAddress:
+        """Read `/dev/ttyACM0`, `usb:2341:805a` or `usb:2341:805a:SERIAL` (ids in hexadecimal).
+
+        Raises:
+            ParameterError: the text is none of these.
+        """
+        if text.startswith("/"):
+            return cls(device=text)
+        kind, *parts = text.split(":", 3)
+        try:
+            if kind == "usb" and len(parts) in (2, 3):
+                vendor, product = int(parts[0], 16), int(parts[1], 16)
+                if 0 <= vendor <= 0xFFFF and 0 <= product <= 0xFFFF:
+                    return cls("", vendor, product, parts[2] if len(parts) == 3 else "")
+        except ValueError:
+            pass
+        raise ParameterError(
+            f"the port {text!r}" if text else "no port is given",
+            valid="port:=/dev/ttyACM0, or port:=usb:VENDOR:PRODUCT[:SERIAL]",
+        )
+
+    def __str__(self) -> str:
+        if self.device:
+            return self.device
+        tail = f":{self.serial_number}" if self.serial_number else ""
+        return f"usb:{self.vendor:04x}:{self.product:04x}{tail}"
+
+    def find(self) -> str | None:
+        """Path of the device file, or None while there is none."""
+        if self.device:
+            return self.device if os.path.exists(self.device) else None
+        for port in list_ports.comports():
+            if (port.vid, port.pid) == (self.vendor, self.product) and self.serial_number in (
+                "",
+                port.serial_number,
+            ):
+                return str(port.device)
+        return None
+
+    def open(self, baud: int = 9600, dtr: bool = True) -> serial.Serial:
+        """Open the port for this process alone, without blocking reads and writes.
+
+        Raises:
+            LinkError: it is absent, in use or forbidden; the message contains the remedy.
+        """
+        path = self.find()
+        if path is None:
+            raise LinkError("is not there", where=str(self), valid="plug the board in")
+        try:
+            port = serial.Serial(None, baud, timeout=0, exclusive=True)
+            port.dtr = dtr
+            port.port = path
+            port.open()
+        except (OSError, ValueError) as error:
+            # SerialException is an OSError; a ValueError is a baud rate that the port refuses.
+            raise LinkError(f"cannot be opened: {_why_not_opened(path, error)}", where=str(self)) from error
+        os.set_blocking(port.fileno(), False)
+        return port
+
+
+def users_of(path: str) -> list[str]:
+    """Return the other programs that have a device file open, such as `minicom (process 123)`; only those of this user
+    unless it is root.
+    """
+    device, found = os.path.realpath(path), []
+    for process in os.listdir("/proc"):
+        if not process.isdigit() or int(process) == os.getpid():
+            continue
+        with contextlib.suppress(OSError):
+            folder = f"/proc/{process}/fd"
+            if any(os.readlink(f"{folder}/{fd}") == device for fd in os.listdir(folder)):
+                with open(f"/proc/{process}/comm", encoding="utf-8") as name:
+                    found.append(f"{name.read().strip()} (process {process})")
+    return found
+
+
+def _why_not_opened(path: str, error: Exception) -> str:
+    code = getattr(error, "errno", None)
+    if code in (errno.EAGAIN, errno.EBUSY):
+        users = ", ".join(users_of(path)) or "another program"
+        return f"in use by {users} (close it; sudo fuser -v {path} lists the users)"
+    remedy = " (sudo usermod -aG dialout $USER, then log in again)" if code == errno.EACCES else ""
+    return f"{error}{remedy}"
