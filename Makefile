@@ -47,8 +47,7 @@ path-for-colcon:
 
 # The paper's experiment. Networks that an interrupted run has trained are kept. Other data, and quick runs, have folders of their own.
 PAPER_QUICK = --windows 157,16 --seeds 1
-space := $(subst ,, )
-PAPER = build/paper/$(if $(DATA),$(subst /,_,$(subst $(space),_,$(DATA))),simulated)$(if $(QUICK),-quick)
+PAPER = build/paper/$(if $(DATA),$(shell echo '$(DATA)' | tr '/ ' '__'),simulated)$(if $(QUICK),-quick)
 PAPER_DATA = $(or $(DATA),build/paper/deepuwb.mcap)
 
 paper: setup-training  ## the paper's experiment, the firmware's cost and their report: 50 minutes (QUICK=1: 5; DATA=deepuwb.pkl)

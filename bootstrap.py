@@ -80,7 +80,8 @@ def set_up(goal: str) -> None:
         if stamp.is_file() and stamp.read_text() == digest.hexdigest():
             return
         print(f"setup: {name} ...", flush=True)
-        stamp.unlink(missing_ok=True)
+        if name != "environment":  # which may have to be restored
+            stamp.unlink(missing_ok=True)
         action()
         STAMPS.mkdir(exist_ok=True)
         stamp.write_text(digest.hexdigest())
