@@ -47,13 +47,6 @@ def test_a_header_has_one_to_three_octets(chip: Chip, header: list[int]):
     assert chip.spi(bytes([*header, 0, 0, 0, 0]), dw.FAST_HZ)[len(header) :] == ID
 
 
-def test_a_sub_address_has_15_bits(driver: Driver):
-    driver.set(0x2E, 0x2804, 0x3AE0, 2)
-    assert driver.get(0x2E, 0x2804, 2) == 0x3AE0
-    assert driver.get(0x2E, 0x2805, 1) == 0x3A
-    assert driver.get(0x2E, 0x0004, 2) == 0xDEAD, "the 7 low bits alone are another register"
-
-
 @pytest.mark.parametrize(
     ("file", "sub", "octets", "value"),
     [
@@ -119,20 +112,6 @@ class TestClocks:
         driver.hz = dw.FAST_HZ
         assert driver.read(0x00) == ID
 
-    def test_what_is_written_too_fast_is_lost(self, driver: Driver):
-        driver.set(0x36, 0, 0x01, 1)
-        driver.set(0x18, 0, 0x1234, 2)
-        driver.hz = dw.SLOW_HZ
-        assert driver.get(0x18, 0, 2) == 0
-
-    def test_a_driver_that_does_not_wait_after_a_reset_reads_nothing(self, driver: Driver):
-        driver.hz = dw.SLOW_HZ
-        driver.host.reset_pin()
-        assert driver.read(0x00) != ID
-        driver.host.delay(5e-3)
-        assert driver.read(0x00) == ID
-        assert driver.status == dw.CPLOCK | dw.SLP2INIT
-
 
 class TestResets:
     def test_a_soft_reset_takes_everything_back(self, driver: Driver):
@@ -168,16 +147,6 @@ class TestMemories:
         driver.set(0x2D, 6, 0x00, 1)
         return value
 
-    def test_the_otp_memory_holds_what_a_driver_needs(self, air: Air):
-        driver = Driver(air.chip(tx_delay_ticks=16400, rx_delay_ticks=16450))
-        driver.hz = dw.SLOW_HZ
-        driver.set(0x36, 0, 0x01, 1)
-        assert self.read_otp(driver, 0x1C) == 32850 << 16 | 32850
-        assert self.read_otp(driver, 0x1E) & 0x1F == 0x10
-        assert self.read_otp(driver, 0x04) & 0xFF, "an LDO tuning value"
-        eui = self.read_otp(driver, 0) | self.read_otp(driver, 1) << 32
-        assert driver.get(0x01, 0, 8) == eui
-
     def test_the_otp_memory_is_not_read_from_the_pll(self, driver: Driver):
         values = {self.read_otp(driver, 0x1E) for _ in range(3)}
         assert 0x0110 not in values
@@ -208,40 +177,6 @@ class TestMemories:
             stamps.append((b.rx_stamp - b.time) % (1 << 40))
         # Stamps lie a millisecond in the past where they mean something.
         assert min((-stamp) % (1 << 40) for stamp in stamps) > 1e9
-
-
-def test_temperature_and_voltage_by_the_manuals_formulas(driver: Driver, chip: Chip):
-    chip.environment(41.0, 3.1)
-    driver.set(0x28, 0x11, 0x80, 1)
-    driver.set(0x28, 0x12, 0x0A, 1)
-    driver.set(0x28, 0x12, 0x0F, 1)
-    driver.set(0x2A, 0, 1, 1)
-    driver.host.delay(50e-6)
-    assert driver.read(0x2A, 3, 2) == bytes(2), "with the PLL as clock it takes a millisecond"
-    driver.host.delay(1e-3)
-    driver.set(0x2A, 0, 0, 1)
-    volts, celsius = driver.read(0x2A, 3, 2)
-    driver.set(0x36, 0, 0x01, 1)
-    driver.hz = dw.SLOW_HZ
-    otp = TestMemories().read_otp
-    assert 23 + 1.14 * (celsius - (otp(driver, 9) & 0xFF)) == pytest.approx(41.0, abs=0.6)
-    assert 3.3 + (volts - (otp(driver, 8) & 0xFF)) / 173 == pytest.approx(3.1, abs=0.003)
-
-
-class TestStart:
-    def test_a_soft_reset_at_full_speed_is_heard_though_other_registers_are_not(self, air: Air):
-        """Drivers without a reset line write four octets at a time, and leave SPI fast; it works on boards."""
-        driver = Driver(air.chip())
-        driver.set(0x18, 0, 0x1234, 2)
-        driver.set(0x36, 0, 0xF0300201)
-        driver.set(0x36, 0, 0x00300201)
-        driver.host.delay(10e-3)
-        driver.set(0x18, 0, 0x4321, 2)
-        driver.set(0x36, 0, 0xF0300200)
-        driver.host.delay(5e-3)
-        assert driver.get(0x00) == 0xDECA0130
-        assert driver.get(0x18, 0, 2) == 0
-        assert driver.get(0x36, 0) == 0xF0300200
 
 
 class TestFrames:
@@ -306,12 +241,6 @@ class TestStamps:
         assert a.tx_stamp == wanted - wanted % 512 + 16436
         assert b.rx_stamp == pytest.approx(a.tx_stamp + 10.0 / dw.TICK_M, abs=1)
 
-    def test_an_antenna_delay_that_is_not_set_is_in_the_stamps(self, air: Air):
-        a, b, *_ = pair(air, Link(10.0))
-        b.set(0x2E, 0x1804, 0, 2)
-        assert exchange(a, b) & dw.RXFCG
-        assert flight_ticks(a, b) == pytest.approx(10.0 / dw.TICK_M + 16436, abs=1)
-
 
 class TestTransmitter:
     def test_a_start_while_the_receiver_is_on_is_dropped_without_a_word(self, air: Air):
@@ -372,27 +301,6 @@ class TestTransmitter:
         )
         assert self.send_with_lead(a, 10.2, held_clock=True) & dw.TXFRS
 
-    def test_hpdwarn_goes_with_trxoff_and_not_by_writing(self, air: Air):
-        a, *_ = pair(air)
-        a.send_at(dw.DATA, a.time)
-        a.set(0x0F, 0, dw.HPDWARN)
-        assert a.status & dw.HPDWARN
-        a.off()
-        assert not a.status & dw.HPDWARN
-
-    def test_wait_for_response_turns_the_receiver_on(self, air: Air):
-        a, b, *_ = pair(air)
-        a.set(0x1A, 0, 100)
-        b.listen()
-        b.host.delay(20e-6)
-        a.send(dw.DATA, dw.WAIT4RESP)
-        a.host.delay(300e-6)
-        b.off()
-        b.send(b"answer")
-        b.host.delay(1e-3)
-        assert a.status & dw.RXFCG
-        assert a.received() == b"answer"
-
 
 @pytest.mark.parametrize(
     ("smart", "rate", "preamble", "octet"),
@@ -417,12 +325,6 @@ def test_transmit_power_has_two_formats(air: Air, smart: bool, rate: int, preamb
 
 
 class TestReceiver:
-    def test_status_clears_at_the_next_enable(self, air: Air):
-        a, b, *_ = pair(air)
-        assert exchange(a, b) & dw.RX_GOOD == dw.RX_GOOD
-        b.listen()
-        assert b.status & (dw.RX_GOOD | dw.ERRORS) == 0
-
     def test_the_frame_wait_time_out(self, air: Air):
         _, b, *_ = pair(air)
         b.set(0x0C, 0, 1000, 2)
@@ -513,14 +415,6 @@ class TestChannel:
             part = np.frombuffer(b.accumulator(first, 157), "<i2")
             assert np.array_equal(part, link.samples[2 * first : 2 * (first + 157)])
 
-    def test_at_16_mhz_there_are_992_samples(self, air: Air):
-        link = Link(3.0, samples=np.full(2032, 1000, np.int16), first_path_index=745.5)
-        a, b, *_ = pair(air, link, Mode(prf=16))
-        assert exchange(a, b) & dw.RXFCG
-        whole = np.frombuffer(b.accumulator(0, 1016), "<i2")
-        assert (whole[: 2 * 992] == 1000).all()
-        assert not whole[2 * 992 :].any()
-
     def test_the_first_octet_of_every_read_is_a_dummy(self, air: Air):
         a, b, *_ = pair(air, Link(3.0, samples=np.arange(2032, dtype=np.int16)))
         assert exchange(a, b) & dw.RXFCG
@@ -579,13 +473,6 @@ class TestChannel:
             assert receive == pytest.approx(cir.rx_power_dbm, abs=1e-3)
             assert near == pytest.approx(cir.first_path_power_dbm, abs=1e-3)
 
-    def test_of_a_whole_preamble_the_count_holds_the_sfd(self, air: Air):
-        a, b, *_ = pair(air, mode=Mode(preamble=256))
-        assert exchange(a, b) & dw.RXFCG
-        count = b.get(0x10) >> 20
-        assert count == b.get(0x27, 0x2C, 2)
-        assert 256 - 2 * 16 <= count <= 256 + 8
-
 
 def history(seed: int) -> list[int]:
     """What three frames a link met that loses and damages."""
@@ -639,13 +526,6 @@ class TestLinks:
         cir = replace(Cir(np.ones(40, np.int16), start_index=700), **changes)
         with pytest.raises(ParameterError, match=told):
             link_of(self.measurement(cir, range_m))
-
-    @pytest.mark.parametrize(
-        "changes", [{"loss": 1.1}, {"excess_m": math.inf}, {"samples": np.zeros(3, np.int16)}]
-    )
-    def test_what_is_out_of_range_is_refused(self, changes: dict[str, object]):
-        with pytest.raises(ParameterError):
-            Link(3.0, **changes)  # type: ignore[arg-type]
 
 
 def test_a_driver_may_define_any_name_without_the_models_prefix(tmp_path: Path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,27 +19,40 @@ from uwb_mitigation.bag.codec import encode_range
 from uwb_mitigation.errors import MissingDependencyError
 from uwb_mitigation.firmware_export import compiling, toolchain
 from uwb_mitigation.firmware_export.host import FirmwareMitigation
+from uwb_mitigation.measurement import Status
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import Bundle
 from uwb_mitigation.offsets import Offsets
+from uwb_mitigation.preprocessing import Scaling
 
 if TYPE_CHECKING:
     from ros_harness import Ros
 
 
 @NEEDS_CC
-@pytest.mark.parametrize("bundle_in", [firmware_models.choosy_bundle, firmware_models.mlp_bundle])
+@pytest.mark.parametrize(
+    "bundle_in",
+    [
+        firmware_models.choosy_bundle,
+        partial(firmware_models.choosy_bundle, samples=8),
+        partial(firmware_models.choosy_bundle, scaling=Scaling.MAX),
+        firmware_models.mlp_bundle,
+    ],
+)
 def test_the_firmware_gives_the_corrected_ranges_of_onnx_runtime(
     bundle_in: Callable[[Path], Bundle], tmp_path: Path
 ):
     bundle = bundle_in(tmp_path)
     random = np.random.default_rng(8)
-    measurements = [firmware_models.random_measurement(random) for _ in range(300)]
+    measurements = [firmware_models.random_measurement(random) for _ in range(600)]
     measurements = [replace(one, tag_id=n % 3, anchor_id=n % 5) for n, one in enumerate(measurements)]
     offsets = Offsets(0.22, {1: 0.1, 2: 0.3}, {1: -0.05, 2: 0.0}, {(2, 3): 2.5})
     firmware, mitigation = FirmwareMitigation(bundle, offsets), Mitigation(bundle, offsets)
+    statuses = set()
     for computed, measurement in zip(firmware.correct(measurements), measurements, strict=True):
         assert repr(computed) == repr(mitigation.correct([measurement])[0])
+        statuses.add(computed.status)
+    assert statuses >= {Status.OK, Status.NO_CIR, Status.BAD_CIR, Status.OUT_OF_DISTRIBUTION}
 
 
 def test_without_a_compiler_the_error_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -21,7 +21,6 @@ import pytest
 from firmware_models import Exported
 
 from benchmarks import emulator, random_networks
-from benchmarks import firmware as firmware_cost
 from uwb_mitigation.firmware_export import toolchain
 from uwb_mitigation.firmware_export.compiling import WARNINGS, firmware_folder, run
 from uwb_mitigation.firmware_export.emulated_firmware import EmulatedFirmware, window_of
@@ -97,20 +96,6 @@ def test_any_length_and_number_of_modules(samples: int, modules: int, tmp_path: 
     image = toolchain.build_image(tmp_path, tmp_path, Target.QEMU_MPS2)
     result = emulator.run_windows(image, windows)
     assert np.array_equal(bits(result.records["output_m"]), bits(IntegerNetwork(weights).predict_m(windows)))
-
-
-def test_a_measured_row_holds_what_the_emulator_told():
-    (subject,) = firmware_cost.random_shapes([8], [3], dense=False)
-    row = firmware_cost.measure(subject, inputs=50)
-    assert (row.model, row.k, row.k0, row.mismatches, row.inputs) == ("remnet", 8, 3, 0, 50)
-    assert row.instructions < row.cycles_estimated < 2 * row.instructions
-    assert 0 < row.stack_bytes < row.ram_bytes < row.flash_bytes
-
-
-def test_a_wrong_weight_is_a_mismatch():
-    (subject,) = firmware_cost.random_shapes([8], [3], dense=False)
-    subject.packed.head_weights[0] ^= 1
-    assert firmware_cost.measure(subject, inputs=50).mismatches > 10
 
 
 def test_trace_and_counter_agree_and_portable_c_takes_four_times_the_instructions(tmp_path: Path):

@@ -44,14 +44,6 @@ def test_the_shipped_model_is_exported_with_its_identity(tmp_path: Path):
     assert number(bundle.prior.per_rx_power) in text
 
 
-def test_exporting_twice_gives_the_same_bytes(tmp_path: Path):
-    bundle = firmware_models.exact_bundle(tmp_path)
-    assert (
-        export_bundle(bundle, tmp_path / "a").read_bytes()
-        == export_bundle(bundle, tmp_path / "b").read_bytes()
-    )
-
-
 def test_a_float_bundle_is_refused_with_the_remedy(tmp_path: Path):
     architecture = Remnet(samples=32)
     model = graph.float_model(model_material.random_weights(architecture))

@@ -29,7 +29,6 @@ from uwb_mitigation.model.bundle import load_bundle, save_bundle
 from uwb_mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.model.prior import LinePrior
 from uwb_mitigation.model.shipped import default_model_path, shipped_model_path
-from uwb_mitigation.offsets import Offsets
 from uwb_mitigation.preprocessing import Preprocessing, Scaling
 
 pytestmark = NEEDS_CC
@@ -40,12 +39,6 @@ SANITIZED = ("-O1", "-fsanitize=undefined", "-fno-sanitize-recover=all")
 
 def bits(values: np.ndarray) -> np.ndarray:
     return np.asarray(values, np.float32).view(np.uint32)
-
-
-def test_oracle_windows_are_not_all_alike():
-    weights = random_networks.remnet(157, 3)
-    windows = random_networks.pressing_windows(157, weights.activation_scale["input"], 500)
-    assert len(np.unique(IntegerNetwork(weights).predict_m(windows))) > 300
 
 
 @pytest.fixture(scope="module", params=firmware_models.SHAPES, ids=firmware_models.shape_name)
@@ -116,25 +109,6 @@ def test_preprocessing_gives_the_same_bits_and_the_same_faults(
     assert 0 in faults
 
 
-def test_corrected_ranges_equal_the_mitigators(tmp_path: Path):
-    bundle = firmware_models.exact_bundle(tmp_path)
-    export_bundle(bundle, tmp_path)
-    firmware, mitigation = HostFirmware(tmp_path, tmp_path, SANITIZED), Mitigation(bundle)
-    random = np.random.default_rng(11)
-    seen = set()
-    for _ in range(1000):
-        measurement = firmware_models.random_measurement(random)
-        offset_m = float(np.float32(random.choice([0.0, 0.22, -0.7, 3.3])))
-        mitigation.offsets = Offsets(offset_m)
-        expected = mitigation.correct([measurement])[0]
-        computed = firmware.correct(measurement.range_m, measurement.cir, offset_m)
-        assert computed[3] == int(expected.status)
-        values = [expected.range_m, expected.correction_m, expected.variance_m2]
-        assert np.array_equal(bits(np.array(computed[:3])), bits(np.array(values)))
-        seen.add(expected.status)
-    assert seen == {Status.OK, Status.NO_CIR, Status.BAD_CIR, Status.OUT_OF_DISTRIBUTION}
-
-
 @pytest.mark.filterwarnings("ignore:overflow")
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_a_prediction_that_overflows_is_a_failure_of_the_model_as_for_the_mitigator(
@@ -154,30 +128,6 @@ def test_a_prediction_that_overflows_is_a_failure_of_the_model_as_for_the_mitiga
     assert expected.status is (Status.MODEL_ERROR if sign < 0 else Status.OUT_OF_DISTRIBUTION)
     computed = firmware.correct(measurement.range_m, measurement.cir)
     assert computed == (expected.range_m, 0.0, expected.variance_m2, int(expected.status))
-
-
-@pytest.mark.parametrize("scaling", Scaling)
-@pytest.mark.parametrize("samples", [8, 32])
-def test_what_is_strange_to_the_model_is_graded_as_by_the_mitigator(
-    samples: int, scaling: Scaling, tmp_path: Path
-):
-    bundle = firmware_models.choosy_bundle(tmp_path, samples, scaling)
-    export_bundle(bundle, tmp_path)
-    firmware, mitigation = HostFirmware(tmp_path, tmp_path, SANITIZED), Mitigation(bundle)
-    random = np.random.default_rng(12)
-    variances, statuses = set(), set()
-    for _ in range(800):
-        measurement = firmware_models.random_measurement(random)
-        measurement = replace(measurement, range_m=float(np.float32(random.uniform(0, 6))))
-        expected = mitigation.correct([measurement])[0]
-        computed = firmware.correct(measurement.range_m, measurement.cir)
-        assert computed[3] == int(expected.status)
-        values = [expected.range_m, expected.correction_m, expected.variance_m2]
-        assert np.array_equal(bits(np.array(computed[:3])), bits(np.array(values)))
-        variances.add(expected.variance_m2)
-        statuses.add(expected.status)
-    assert len(variances) > (100 if scaling is Scaling.PREAMBLE else 50)
-    assert statuses >= {Status.OK, Status.OUT_OF_DISTRIBUTION}
 
 
 @pytest.mark.parametrize(

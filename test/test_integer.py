@@ -8,7 +8,7 @@ from fractions import Fraction
 import numpy as np
 import onnxruntime
 import pytest
-from model_material import bundle, integer_network, random_int8, windows
+from model_material import integer_network, random_int8, windows
 
 from uwb_mitigation.model import graph
 from uwb_mitigation.model.architecture import Remnet
@@ -94,27 +94,3 @@ def test_a_sum_is_rounded_as_by_a_fused_multiply_add():
     apart = float(np.rint(first * np.float32(47) + second * np.float32(135)))
     assert fused != apart
     assert (network.add("module1", {"module1.reduce": a, "module1.skip": b}) == fused).all()
-
-
-def test_it_saturates_and_never_wraps():
-    weights = random_int8(Remnet(samples=16))
-    tensors = IntegerNetwork(weights).tensors(np.full((1, 16), 1e30, np.float32))
-    assert tensors["input"].min() == 255
-    assert max(int(values.max()) for values in tensors.values()) == 255
-
-
-def test_padding_is_a_literal_zero():
-    weights = random_int8(Remnet(samples=16))
-    network = IntegerNetwork(weights)
-    values = np.zeros((1, 1, 16), np.uint8)
-    values[0, 0, 0] = 7
-    first = network.accumulate("first", values)[0, :, 0]
-    kernel = weights.weight["first"][:, 0, :].astype(int)
-    assert np.array_equal(first, 7 * kernel[:, 1] + weights.bias["first"])
-
-
-def test_it_reads_what_a_bundle_holds(tmp_path):
-    saved = bundle(tmp_path, Remnet(samples=8), seed=3)
-    inputs = windows(20, 8)
-    expected = IntegerNetwork(random_int8(Remnet(samples=8), seed=3)).predict_m(inputs)
-    assert np.array_equal(integer_network(saved).predict_m(inputs), expected)
