@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import command_line
@@ -102,15 +101,3 @@ def test_what_cannot_be_is_refused_at_once(options: tuple[str, ...], says: str, 
     done = command_line.run("board", "antenna-delay", *options, folder=tmp_path)
     assert done.returncode == 1
     assert says in done.stderr
-
-
-def test_a_radio_that_is_not_there_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    if shutil.which("cc") is None:
-        pytest.skip("no C compiler: apt install gcc")
-    monkeypatch.setattr("uwb_mitigation.radio.antenna_delay.PATIENCE_S", 0.3)
-    done = command_line.run(
-        "board", "antenna-delay", "--distance", "5", "--port", tmp_path / "absent", folder=tmp_path
-    )
-    assert done.returncode == 1
-    assert "0 ranges of 200" in done.stderr
-    assert str(tmp_path / "absent") in done.stderr

@@ -12,17 +12,14 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
 from ros_harness import Ros
-from uwb_mitigation_msgs.msg import RangeCorrected
 
-from benchmarks import nodes, viewer
+from benchmarks import nodes
 from benchmarks.__main__ import nodes_result
-from benchmarks.nodes import RANGES, RATES_HZ, Figures, Latency, Subject, missing_between
-from uwb_mitigation.errors import UwbMitigationError
+from benchmarks.nodes import RANGES, RATES_HZ, Figures, Latency, missing_between
 from uwb_mitigation.measurement import Status
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.shipped import default_model_path
-from uwb_mitigation.nodes import topics
 from uwb_mitigation.sources.opening import open_recording
 
 pytestmark = pytest.mark.ros
@@ -69,42 +66,6 @@ def test_the_result_has_the_documented_keys_and_ratios_of_medians():
     assert set(result["relay"]["latency_us"]) == {"100", "500", "1000"}
     assert set(result["relay"]["latency_us"]["500"]) == {"p50", "p99", "max"}
     assert result["relay"]["cpu_us_per_message"] == 50.0
-
-
-def test_a_subject_is_measured_at_a_rate_it_can_keep(own_domain: None):
-    with nodes.open_bench() as bench:
-        subject = Subject(bench, "pipeline", RangeCorrected, topics.RANGE_CORRECTED, "pipeline")
-        trial = subject.trial(200.0, 1.0)
-        assert trial.lost == 0
-        assert 150 <= trial.received <= 250
-        assert min(trial.late_ns) > 0
-        latency = subject.measure_latency(100, 0.5)
-        assert 0 < latency.p50 <= latency.p99 <= latency.max
-        assert subject.figures.cpu_us_per_message > 0
-        pid = subject.processes[0].pid
-        subject.processes[0].kill()
-        subject.processes[0].wait()
-        with pytest.raises(UwbMitigationError, match="has ended"):
-            nodes.vitals_of(pid)
-        with pytest.raises(UwbMitigationError, match="driver does not answer"):
-            subject.play(100.0)
-
-
-def test_the_viewers_costs_are_measured(own_domain: None, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(viewer, "PAGES", (0, 1))
-    monkeypatch.setattr(viewer, "_SETTLE_S", 1.0)
-    monkeypatch.setattr(viewer, "_SLICES", 1)
-    monkeypatch.setattr(Subject, "search_rate", lambda self: self.figures.rates_hz.append(1000.0))
-    told: list[float] = []
-    costs = viewer.measure(2, 2.0, lambda text, share: told.append(share))
-    assert list(costs.core_share) == [0, 1]
-    assert 0.0 <= costs.core_share[0] < costs.core_share[1], "an open page is drawn"
-    assert costs.rates_hz == dict.fromkeys(viewer.SUBJECTS, [1000.0] * 2)
-    assert costs.rate_ratios == dict.fromkeys(viewer.SUBJECTS, 1.0)
-    assert list(costs.range_us) == list(viewer.SUBJECTS)
-    assert all(range_us > 0.0 for range_us in costs.range_us.values())
-    assert told == sorted(told)
-    assert told[-1] < 1.0
 
 
 def test_a_soak_tells_what_the_processes_took(own_domain: None, tmp_path: Path):

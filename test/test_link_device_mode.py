@@ -6,13 +6,11 @@ import struct
 from itertools import islice
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from uwb_mitigation.link import messages
 from uwb_mitigation.link.board import Board, Identity
-from uwb_mitigation.link.framing import FrameDecoder, FrameEncoder
-from uwb_mitigation.link.layout import Flag, Mode
+from uwb_mitigation.link.layout import Mode
 from uwb_mitigation.link.messages import Correction
 from uwb_mitigation.link.session import BoardSession
 from uwb_mitigation.measurement import CorrectedRange, RangeMeasurement
@@ -55,32 +53,3 @@ def test_what_the_board_corrects_equals_the_hosts_correction_of_what_the_board_s
         assert isinstance(raw, RangeMeasurement)
         assert isinstance(corrected, Correction)
         assert bits(corrected.corrected) == bits(mitigation.correct([raw])[0])
-
-
-def test_what_the_board_corrects_for_a_host_equals_the_hosts_correction(mitigation):
-    _, board = connect(mitigation, Mode.HOST)
-    host, decoder = FrameEncoder(), FrameDecoder()
-    for now, measurement in enumerate(recorded(50)):
-        kind, payload = messages.encode(measurement)
-        held = messages.decode(kind, payload)
-        (frame,) = decoder.feed(board.receive(host.encode(kind, payload), now))
-        assert frame.flags == Flag.ANSWER
-        assert bits(messages.decode(frame.type, frame.payload).corrected) == bits(
-            mitigation.correct([held])[0]
-        )
-
-
-def test_a_measurement_the_board_cannot_correct_comes_back_raw_with_its_status(mitigation):
-    session, board = connect(mitigation, Mode.DEVICE)
-    (measurement,) = recorded(1)
-    empty = messages.decode(*messages.encode(measurement))
-    kind, payload = messages.encode(empty)
-    broken = bytearray(payload)
-    broken[72:] = np.zeros(len(payload) - 72, np.uint8).tobytes()
-    zeros = messages.decode(kind, bytes(broken))
-
-    (event,) = session.receive(board.measure(zeros, 5), 0, 0)
-
-    assert event.corrected.status.name == "BAD_CIR"
-    assert event.corrected.range_m == np.float32(measurement.range_m)
-    assert event.corrected.correction_m == 0

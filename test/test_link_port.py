@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from uwb_mitigation.errors import LinkError, ParameterError, RecordingError
+from uwb_mitigation.errors import LinkError, ParameterError
 from uwb_mitigation.link.board import Identity
 from uwb_mitigation.link.connection import PortAddress
 from uwb_mitigation.link.emulated_board import BoardFaults, EmulatedBoard
@@ -107,14 +107,6 @@ def test_measurements_arrive_complete_and_in_order(port):
     assert first.device_time == first.sequence * 7
 
 
-def test_a_stamp_is_the_time_of_the_measurement_on_the_hosts_clock(port):
-    before = time.time_ns()
-    wait_until(lambda: port._session.clock.synchronised)
-    event = wait_for(port, lambda event: isinstance(event, RangeMeasurement) and event.stamp_ns > before)
-
-    assert event.stamp_ns <= time.time_ns()
-
-
 def test_the_board_corrects_when_it_is_told_to(port):
     port.set_mode(Mode.DEVICE)
 
@@ -153,43 +145,6 @@ def test_a_board_that_resets_is_connected_again(board, port):
     wait_for(port, of(RangeMeasurement))
 
 
-def test_noise_before_the_hello_does_no_harm(board, port):
-    board.set_faults(BoardFaults(boot_noise=5000))
-    wait_for(port, of(RangeMeasurement))
-    board.reset()
-    wait_for(port, of(Disconnected))
-
-    wait_for(port, of(RangeMeasurement))
-
-    assert port.report().counts["corrupt"] > 0
-
-
-def test_a_board_that_falls_silent_is_reported_and_taken_back(board, port):
-    wait_for(port, of(RangeMeasurement))
-    board.mute(3.5)
-
-    wait_for(port, lambda event: event == Disconnected(Loss.SILENT))
-    assert port.report().problem == "waiting for the board's HELLO"
-
-    wait_for(port, of(RangeMeasurement))
-    assert port.report().problem == ""
-
-
-def test_after_a_flood_of_noise_measurements_arrive_again(board, port):
-    before = wait_for(port, of(RangeMeasurement)).sequence
-    board.flood(0.3)
-    wait_until(lambda: port.report().counts["corrupt"] > 100)
-
-    wait_for(port, lambda event: isinstance(event, RangeMeasurement) and event.sequence > before + 150)
-
-
-def test_a_board_of_another_version_is_reported(link):
-    with EmulatedBoard(link=link, faults=BoardFaults(version=3)):
-        port = BoardPort(PortAddress(str(link)))
-        wait_until(lambda: port.report().problem.endswith("another version of the protocol: 3"))
-        port.close()
-
-
 def test_through_a_channel_that_damages_loses_and_repeats_only_what_was_sent_arrives(link):
     faults = BoardFaults(channel=ByteFaults(2e-4, 2e-4, 2e-4), lose=0.05, duplicate=0.05)
     with EmulatedBoard(Recording(), rate_hz=1000, faults=faults, link=link, seed=4):
@@ -216,15 +171,6 @@ def test_a_port_that_is_not_there_is_reported_and_awaited(tmp_path):
     with EmulatedBoard(link=path):
         wait_for(port, of(Connected))
         port.close()
-
-
-def test_a_file_that_is_no_port_is_reported(tmp_path):
-    path = tmp_path / "file"
-    path.write_text("no port")
-    port = BoardPort(PortAddress(str(path)))
-
-    wait_until(lambda: "cannot be opened" in port.report().problem)
-    port.close()
 
 
 @pytest.mark.parametrize("exclusive", [True, False])
@@ -282,44 +228,6 @@ def test_events_that_nobody_fetches_are_dropped_and_counted(board, link):
 
     assert isinstance(oldest, RangeMeasurement)
     assert oldest.sequence > 10
-
-
-def test_a_board_that_nobody_reads_loses_measurements_and_not_memory(link):
-    with EmulatedBoard(Recording(), rate_hz=5000, link=link) as board:
-        wait_until(lambda: board._board.measurements_lost > 100)
-        assert len(board._backlog) < 100_000
-
-
-def test_a_source_without_measurements_makes_no_board(link):
-    with pytest.raises(RecordingError, match="no measurements"):
-        EmulatedBoard(Recording(count=0), link=link)
-
-    assert not link.is_symlink()
-
-
-def test_a_measurement_that_no_frame_holds_is_reported(link):
-    class Monstrous(Recording):
-        def __iter__(self) -> Iterator[Record]:
-            yield Record(RangeMeasurement(0, 1, 2, 3, 4, 5.0, Cir(np.zeros(5000, np.int16))))
-
-    with EmulatedBoard(Monstrous(), link=link) as board:
-        wait_until(lambda: board.failure is not None)
-
-    assert isinstance(board.failure, ParameterError)
-
-
-def test_the_link_to_the_port_is_not_made_over_a_file(link):
-    link.write_text("precious")
-
-    with pytest.raises(ParameterError, match="replace a file"):
-        EmulatedBoard(link=link)
-    assert link.read_text() == "precious"
-
-
-def test_closing_the_board_removes_the_link(link):
-    EmulatedBoard(link=link).close()
-
-    assert not link.is_symlink()
 
 
 @pytest.mark.parametrize(

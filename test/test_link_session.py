@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from uwb_mitigation.link import messages
 from uwb_mitigation.link.board import Board, Identity
@@ -103,22 +101,6 @@ def test_a_session_asks_who_is_there_and_is_connected_by_the_answer():
     assert bench.session.hello.window == 157
 
 
-def test_it_asks_again_until_it_is_answered():
-    bench = Bench(BoardSession())
-    bench.run(2000, deaf=True)
-    assert bench.session.state is LinkState.CONNECTING
-
-    bench.run(600)
-
-    assert bench.session.state is LinkState.READY
-
-
-def test_the_hello_of_a_board_that_boots_connects_too():
-    bench = Bench(BoardSession())
-
-    assert isinstance(bench.host_hears(bench.board.hello(0))[0], Connected)
-
-
 def test_before_the_hello_nothing_is_delivered_but_counted():
     bench = Bench(BoardSession())
 
@@ -137,16 +119,6 @@ def test_a_measurement_arrives_with_its_stamp_on_the_nodes_clock():
     assert event.stamp_ns == pytest.approx(took_place, abs=0.1 * MS)
 
 
-def test_the_hello_already_tells_the_clocks_offset():
-    bench = Bench(BoardSession())
-    bench.host_hears(bench.board.hello(0))
-    took_place = EPOCH + bench.now
-
-    (event,) = bench.measure(5, late_ns=30 * MS)
-
-    assert event.stamp_ns == pytest.approx(took_place, abs=0.1 * MS)
-
-
 @pytest.mark.parametrize(
     ("mode", "kinds"),
     [
@@ -158,15 +130,6 @@ def test_each_mode_sends_what_it_says(mode, kinds):
     bench = connected(mode=mode)
 
     assert [type(event) for event in bench.measure(1)] == kinds
-
-
-def test_a_mode_is_confirmed():
-    bench = connected()
-    bench.session.set_mode(Mode.DEVICE)
-    bench.run(100)
-
-    assert bench.seen(ModeChanged) == [ModeChanged(Mode.DEVICE)]
-    assert bench.board.mode is Mode.DEVICE
 
 
 def test_a_lost_request_for_a_mode_is_repeated():
@@ -203,13 +166,6 @@ def test_corrections_by_another_model_than_expected_are_withheld():
     assert bench.session.counts.wrong_model == 1
 
 
-def test_corrections_by_the_expected_model_are_delivered():
-    bench = connected(mode=Mode.DEVICE, expected_model_id=IDENTITY.model_id)
-
-    assert [type(event) for event in bench.measure(1)] == [Correction]
-    assert bench.session.model_matches
-
-
 def test_a_board_of_another_version_is_named_once_and_nothing_of_it_delivered():
     bench = Bench(BoardSession(), version=7)
     bench.run(5000)
@@ -229,15 +185,6 @@ def test_a_board_that_gets_the_right_firmware_is_connected():
 
     assert bench.session.state is LinkState.READY
     assert bench.session.foreign_version is None
-
-
-def test_a_connected_board_that_is_flashed_with_another_version_is_noticed():
-    bench = connected()
-    bench.reboot(version=2)
-    bench.run(5000)
-
-    assert bench.seen(Disconnected) == [Disconnected(Loss.SILENT)]
-    assert bench.session.state is LinkState.WRONG_VERSION
 
 
 def test_a_board_that_says_nothing_for_3_s_is_gone_and_comes_back():
@@ -277,21 +224,6 @@ def test_a_reset_is_known_by_the_boot_id_and_restarts_the_clock():
     assert event.stamp_ns == pytest.approx(took_place, abs=0.1 * MS)
 
 
-def test_after_a_reset_the_same_uptime_is_another_time():
-    bench = Bench(BoardSession())
-    bench.host_hears(bench.board.hello(0))
-    bench.now = 50 * MS
-    bench.measure(1)
-    bench.now = 60 * MS
-    bench.reboot()
-    bench.host_hears(bench.board.hello(0))
-    bench.now = 110 * MS
-
-    (event,) = bench.measure(1)
-
-    assert event.stamp_ns == EPOCH + 110 * MS
-
-
 def test_a_reset_whose_hello_is_lost_is_known_by_the_numbering():
     bench = connected()
     bench.run(20_000)
@@ -322,15 +254,6 @@ def test_a_frame_that_arrives_twice_is_delivered_once():
 
     assert len(bench.host_hears(data + data)) == 1
     assert bench.session.counts.stale == 1
-
-
-def test_a_hello_that_arrives_twice_counts_once():
-    bench = connected()
-    again = bench.board.hello(bench.uptime_us)
-
-    assert bench.host_hears(again + again) == []
-    assert bench.session.counts.stale == 1
-    assert bench.session.counts.lost == 0
 
 
 def test_the_numbering_may_wrap():
@@ -406,45 +329,3 @@ def test_the_clock_is_synchronised_soon_and_then_once_a_second():
 
     assert bench.session.clock.synchronised
     assert 8 + 8 <= requests <= 8 + 14
-
-
-encoded = st.builds(
-    lambda kind, flags, sequence, time_us, payload: encode_frame(
-        Frame(kind, flags, sequence, time_us, payload)
-    ),
-    st.sampled_from([*MessageType, 0, 99]),
-    st.integers(0, 3),
-    st.one_of(st.integers(0, 20), st.integers(0, 2**32 - 1)),
-    st.integers(0, 2**64 - 1),
-    st.one_of(st.binary(max_size=120), st.binary(min_size=48, max_size=90)),
-)
-hello = st.builds(
-    lambda boot, mode, sequence: encode_frame(
-        Frame(
-            MessageType.HELLO,
-            1,
-            sequence,
-            0,
-            messages.encode(messages.Hello(1, 2, 157, Mode(mode), boot, sequence, 4224))[1],
-        )
-    ),
-    st.integers(0, 3),
-    st.sampled_from(Mode),
-    st.integers(0, 20),
-)
-
-
-@settings(max_examples=200)
-@given(
-    st.lists(
-        st.tuples(st.one_of(encoded, hello, st.binary(max_size=60)), st.integers(0, 4 * 10**9)), max_size=30
-    )
-)
-def test_no_board_makes_a_session_fail(conversation):
-    session = BoardSession(mode=Mode.DEVICE)
-    now = 0
-    for data, pause in conversation:
-        now += pause
-        session.receive(data, now, EPOCH + now)
-        assert len(session.outgoing()) < 1000
-    assert (session.hello is not None) == (session.state is LinkState.READY)

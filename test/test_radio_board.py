@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import itertools
 
-import pytest
 from compilers import NEEDS_CC
 
 from benchmarks.dw1000_model.boards import Line, ModelledAir
 from benchmarks.dw1000_model.links import Link
-from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.link import messages
 from uwb_mitigation.link.board import Board, Identity
 from uwb_mitigation.link.events import Event, LinkState, RadioRefused
 from uwb_mitigation.link.layout import RadioState, Role
-from uwb_mitigation.link.messages import Radio, SetRadio
+from uwb_mitigation.link.messages import SetRadio
 from uwb_mitigation.link.radio import RadioSettings, RadioStatus
 from uwb_mitigation.link.session import BoardSession
 from uwb_mitigation.measurement import RangeMeasurement
@@ -106,18 +104,6 @@ def test_the_host_configures_the_radio_while_it_ranges():
     assert (len(ranges[-1].cir), ranges[-1].cir.prf_mhz) == (40, 16)
 
 
-def test_a_board_takes_the_time_that_slow_frames_need():
-    slow = {"rate_kbps": 110, "preamble": 2048}
-    with ModelledAir() as air:
-        tag = air.add(RadioSettings(), line=Line())
-        anchor = air.add(RadioSettings(role=Role.ANCHOR, **slow, reply_us=15_000, patience_us=40_000))
-        air.link(tag, anchor, Link(6))
-        host = Host(air, tag, RadioSettings(**slow))
-        host.run(1.5)
-    assert not host.seen(RadioRefused)
-    assert len(host.seen(RangeMeasurement)) > 5
-
-
 def test_a_tag_becomes_an_anchor_and_reports():
     with ModelledAir() as air:
         tag = air.add(RadioSettings())
@@ -143,18 +129,6 @@ def test_settings_that_a_board_cannot_use_are_refused_in_words():
         assert host.session.radio.settings.channel == 5
 
 
-def test_no_radio_has_settings_that_are_refused_before_they_are_sent():
-    for wrong in (
-        {"channel": 6},
-        {"pan": 0xFFFF},
-        {"preamble_code": 1},
-        {"anchors": (0,)},
-        {"reply_us": 999},
-    ):
-        with pytest.raises(ParameterError, match=next(iter(wrong))):
-            BoardSession().set_radio(RadioSettings(**wrong))
-
-
 def test_older_firmware_keeps_ranging_and_the_host_says_that_it_knows_no_radio():
     board, session, events = Board(Identity()), BoardSession(), []
     session.set_radio(RadioSettings())
@@ -166,9 +140,3 @@ def test_older_firmware_keeps_ranging_and_the_host_says_that_it_knows_no_radio()
     assert "flash" in refusal.text
     assert session.state is LinkState.READY
     assert session.radio is None
-
-
-def test_an_older_host_hears_of_a_radio_and_counts_what_it_does_not_know():
-    radio = messages.encode(Radio(RadioSettings()))
-    assert radio[0] not in (1, 2, 3, 4, 5, 6)
-    assert messages.decode(200, radio[1]) is None

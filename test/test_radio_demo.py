@@ -45,14 +45,6 @@ def test_ctrl_c_ends_it_with_its_nodes():
     assert not any(Path(f"/proc/{node}").exists() for node in nodes)
 
 
-def test_without_a_range_it_says_so_and_fails():
-    program = "from benchmarks import radio_demo as d; d.PATIENCE_S = 0.1; raise SystemExit(d.main(1.0))"
-    command = [sys.executable, "-c", program]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=240, check=False)
-    assert done.returncode == 1
-    assert "no range within 0.1 s" in " ".join(done.stdout.split())
-
-
 def children(pid: int) -> list[str]:
     """Processes that this one has started, Linux only."""
     return Path(f"/proc/{pid}/task/{pid}/children").read_text().split()

@@ -24,7 +24,7 @@ from uwb_mitigation.link.emulated_board import EmulatedBoard
 from uwb_mitigation.link.layout import Role
 from uwb_mitigation.link.radio import RadioSettings
 from uwb_mitigation.nodes.parameter_tables import DRIVER
-from uwb_mitigation.nodes.radio_feed import open_radios, settings_of
+from uwb_mitigation.nodes.radio_feed import settings_of
 from uwb_mitigation.sources.simulated import SimulatedSource
 
 pytestmark = [
@@ -84,14 +84,6 @@ def test_settings_are_applied_and_refused_live(
     ros.spin_until(lambda: len(raw[-1].cir.samples) == 64, 120.0)
 
 
-def test_an_absent_board_is_told_and_waited_for(ros: ros_harness.Ros, tmp_path: Path):
-    driver = ros.start("driver", "source:=evb1000", f"port:={tmp_path / 'absent'}")
-    driver.wait_for_output("waiting for the radio")
-    status = ros.diagnosis("driver", lambda status: level_of(status) == 2)
-    assert str(tmp_path / "absent") in status.message
-    assert driver.exit_code() is None
-
-
 @pytest.mark.parametrize(
     ("name", "value", "named"),
     [
@@ -111,13 +103,6 @@ def test_what_no_radio_has_is_refused_by_name(name: str, value: object, named: s
 
 def test_parameters_that_nobody_set_ask_nothing_of_a_boards_radio():
     assert settings_of(DEFAULTS.__getitem__) == RadioSettings()
-
-
-def test_a_port_is_asked_for():
-    for source, valid in (("evb1000", "/dev/ttyACM0"), ("spi", "/dev/spidev")):
-        values = DEFAULTS | {"source": source}
-        with pytest.raises(ParameterError, match=valid):
-            open_radios(values.__getitem__, lambda: 0)
 
 
 class ModelledBoard:

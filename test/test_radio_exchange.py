@@ -9,9 +9,9 @@ import pytest
 from compilers import NEEDS_CC
 
 from benchmarks.dw1000_model import boards as modelled
-from benchmarks.dw1000_model.boards import Line, ModelledAir
+from benchmarks.dw1000_model.boards import ModelledAir
 from benchmarks.dw1000_model.links import Link
-from uwb_mitigation.link.layout import Mode, Role
+from uwb_mitigation.link.layout import Role
 from uwb_mitigation.link.radio import PREAMBLES, RadioSettings
 from uwb_mitigation.radio import structures
 
@@ -213,20 +213,6 @@ def test_the_bias_of_the_power_is_taken_off_when_asked_for():
     table = [-110, -105, -100, -93, -82, -69, -51, -27, 0, 21, 35, 42, 49, 62, 71, 76, 81, 86]
     bias_m = np.interp(-true_dbm, np.arange(61, 97, 2), table) / 1000
     assert abs(rows["range_m"].mean() - 5 + bias_m) < 0.005
-
-
-@pytest.mark.parametrize(("mode", "at_least_hz"), [(Mode.HOST, 100), (Mode.DEVICE, 80)])
-def test_rates_on_a_serial_line(mode: Mode, at_least_hz: float):
-    """8 MHz SPI, 921600 baud, 157 samples; an inference takes its estimated cycles at 64 MHz."""
-    line = Line(mode=mode, inference_s=458_934 / 64e6, overhead_s=10e-6)
-    with ModelledAir() as air:
-        tag = air.add(RadioSettings(), line=line)
-        air.link(tag, air.add(RadioSettings(role=Role.ANCHOR)), Link(5))
-        air.run(3)
-        rows, _ = air.ranges()
-        lost = air.measurements_lost(tag)
-    assert lost == 0
-    assert len(rows) / 3 >= at_least_hz
 
 
 def test_a_chip_that_is_reset_or_out_of_reach_is_back_within_a_second_and_no_range_is_wrong():

@@ -157,23 +157,6 @@ def test_a_tag_and_an_anchor_on_usb_range_are_unplugged_and_come_back(
         anchor.close()
 
 
-def test_a_radio_that_stays_away_is_looked_for_several_times_a_second():
-    pauses: list[float | None] = []
-
-    class Impatient(threading.Event):
-        def wait(self, timeout: float | None = None) -> bool:
-            pauses.append(timeout)
-            return super().wait(1e-3)
-
-    port = RadioPort(bus("/nowhere"), RadioSettings())
-    port._stop = Impatient()
-    try:
-        wait_until(lambda: len(pauses) > 50)
-        assert max(pauses) < 0.5
-    finally:
-        port.close()
-
-
 def test_a_board_that_modem_manager_has_written_to_is_opened(boards: tuple[EmulatedEvb1000s, Path]):
     _, prefix = boards
     with serial.Serial(f"{prefix}1") as port:
@@ -234,11 +217,6 @@ def answering(controller: int, answer: bytes) -> Iterator[None]:
     finally:
         stop.set()
         thread.join()
-
-
-def test_settings_that_no_radio_has_are_refused_at_once():
-    with pytest.raises(ParameterError, match="channel"):
-        RadioPort(bus("/nowhere"), RadioSettings(channel=6))
 
 
 class FakeSpi:
