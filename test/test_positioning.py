@@ -15,7 +15,7 @@ from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
 from uwb_mitigation.positioning.filter import FIRST_ERROR, OFFSET, RangeFilter
 from uwb_mitigation.positioning.fleet import Fleet
 from uwb_mitigation.positioning.geometry import Area, Height, Shape, geometry, shape
-from uwb_mitigation.positioning.locator import SILENCE_S, TagLocator, run_live
+from uwb_mitigation.positioning.locator import SILENCE_S, Setting, TagLocator, run_live
 from uwb_mitigation.positioning.model import Model
 from uwb_mitigation.positioning.smoother import smooth
 from uwb_mitigation.positioning.start import places
@@ -174,7 +174,7 @@ def test_measured_heights_near_the_floor_keep_the_right_solution(seed: int):
     heights = Heights(stamps[known], height[known], np.full(known.sum(), 0.0004))
     area = Area((-4, -4, 0), (30, 4, 3))
     live = run_live(ranges, TagLocator(FLAT, area=area), heights).track
-    smoothed = smooth(FLAT, Model(), ranges, live, area=area, heights=heights)
+    smoothed = smooth(Setting(FLAT, area=area, heights=heights), ranges, live)
     for track in (live, smoothed):
         assert len(track) > 250
         assert area.holds(track.position).all()

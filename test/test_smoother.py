@@ -10,7 +10,7 @@ from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
 from uwb_mitigation.positioning.geometry import Height
 from uwb_mitigation.positioning.least_squares import LeastSquares
-from uwb_mitigation.positioning.locator import TagLocator, run_live
+from uwb_mitigation.positioning.locator import Setting, TagLocator, run_live
 from uwb_mitigation.positioning.model import Model, Regressors
 from uwb_mitigation.positioning.smoother import Smoother, knots_of, smooth
 from uwb_mitigation.positioning.tracks import Ranges, Track, track_errors
@@ -162,7 +162,7 @@ def test_a_track_smoothed_among_obstacles_is_not_worse_than_live(seed: int):
     block(ranges, seed)
     live = run_live(ranges, TagLocator(anchors)).track
     of_live = track_errors(live, truth)
-    errors = track_errors(smooth(anchors, Model(), ranges, live), truth)
+    errors = track_errors(smooth(Setting(anchors), ranges, live), truth)
     assert errors.epochs > 380
     assert errors.rmse < 1.1 * of_live.rmse
     assert errors.height_rmse < 1.2 * of_live.height_rmse

@@ -22,12 +22,11 @@ from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.measurement import Cir, CorrectedRange, Origin, RangeMeasurement, Record, Status
 from uwb_mitigation.positioning.anchors import dump_anchors, parse_anchors
 from uwb_mitigation.positioning.geometry import Area, Height
-from uwb_mitigation.positioning.locator import TagLocator, run_live
+from uwb_mitigation.positioning.locator import Setting, TagLocator, run_live
 from uwb_mitigation.positioning.model import Model
 from uwb_mitigation.positioning.tracks import Estimate, Ranges, TruePath
 from uwb_mitigation.processing import tracking
-from uwb_mitigation.processing.residuals import held_out
-from uwb_mitigation.processing.tracking import track_tag
+from uwb_mitigation.processing.tracking import held_out, track_tag
 from uwb_mitigation.sources.hanyang import HanyangRun
 from uwb_mitigation.sources.opening import open_recording
 from uwb_mitigation.sources.recorded_ranges import TagRecording
@@ -88,16 +87,16 @@ def test_a_track_is_written_judged_and_read_by_evo(hall: Path, tmp_path: Path):
 
 def test_held_out_residuals_show_the_offset_of_one_anchor():
     ranges, truth = drive(seconds=40, offset_m=0.0)
-    one = track_tag(TagRecording(7, ranges, ranges, False, truth), HALL, Model(), Height(1.0, 0.1))
+    one = track_tag(TagRecording(7, ranges, ranges, False, truth), Setting(HALL, height=Height(1.0, 0.1)))
     wrong, worse = (replace(ranges, range_m=ranges.range_m + m * (ranges.anchor == 2)) for m in (1.0, 1.5))
     one = replace(one, recording=TagRecording(7, wrong, worse, True, truth))
-    found = held_out([one], HALL, Model(), Height(1.0, 0.1))
+    found = held_out([one], Setting(HALL, height=Height(1.0, 0.1)))
     assert found[2].raw_m == pytest.approx(1.0, abs=0.1)
     assert found[2].corrected_m - found[2].raw_m == pytest.approx(0.5, abs=1e-6), (
         "its ranges do not move the track"
     )
     few = replace(one, recording=replace(one.recording, raw=wrong.take(wrong.anchor < 3), corrected=False))
-    assert [(other.ranges, math.isnan(other.raw_m)) for other in held_out([few], HALL, Model())] == [
+    assert [(other.ranges, math.isnan(other.raw_m)) for other in held_out([few], Setting(HALL))] == [
         (0, True)
     ] * 6
 
@@ -110,7 +109,7 @@ def test_what_cannot_be_tracked_is_said_in_a_line(hall: Path, tmp_path: Path):
     line = tmp_path / "line.yaml"
     line.write_text(dump_anchors(HALL.moved(HALL.position * (1, 0, 0) + (0, 0, 1), HALL.sd)))
     told = str(run("track", hall, "-o", out, "--anchors", line, "--height", "1.0", folder=tmp_path).stderr)
-    assert "no place can be told" in told
+    assert "no position can be determined" in told
     assert "all on a line" in told
     others = tmp_path / "others.yaml"
     others.write_text("anchors: [{id: 50, x: 0, y: 0, z: 0}]")
@@ -193,19 +192,19 @@ def test_only_anchors_that_contradict_the_others_are_accused():
     locator = TagLocator(HALL, height=height)
     run_live(blocked, locator)
     assert locator.disagreeing() == [2]  # by its last ranges alone
-    assert track_tag(recording_of(blocked, truth), HALL, Model(), height).disagreeing == []
+    assert track_tag(recording_of(blocked, truth), Setting(HALL, height=height)).disagreeing == []
     wrong, truth = drive(seconds=60, seed=1)
     wrong.range_m[wrong.anchor == 2] += 1.5
-    assert track_tag(recording_of(wrong, truth), HALL, Model(), height).disagreeing == [2]
+    assert track_tag(recording_of(wrong, truth), Setting(HALL, height=height)).disagreeing == [2]
 
 
 @pytest.mark.parametrize("shift", [(1.0, 0.0, 0.0), (0.0, 0.0, 1.5)])
 def test_failed_smoothing_is_reported(monkeypatch: pytest.MonkeyPatch, shift: tuple[float, float, float]):
     monkeypatch.setattr(
-        tracking, "smooth", lambda *given, **_: replace(given[3], position=given[3].position + shift)
+        tracking, "smooth", lambda *given: replace(given[2], position=given[2].position + shift)
     )
     ranges, truth = drive(seconds=10)
-    (warning,) = track_tag(recording_of(ranges, truth), HALL, Model()).warnings
+    (warning,) = track_tag(recording_of(ranges, truth), Setting(HALL)).warnings
     assert "smoothing failed" in warning
 
 
@@ -213,15 +212,14 @@ def test_a_bad_geometry_is_reported():
     near_line = HALL.moved(HALL.position * (1, 0.02, 0) + (0, -6, 1), HALL.sd)
     ranges, truth = drive(near_line, seconds=10)
     area = Area((-50, 0, 0), (50, 50, 3))
-    found = track_tag(recording_of(ranges, truth), near_line, Model(range_sd=0.02), Height(1.0), area)
+    found = track_tag(
+        recording_of(ranges, truth), Setting(near_line, Model(range_sd=0.02), Height(1.0), area)
+    )
     assert not found.warnings
     ranges, far = drive(near_line, seconds=10, path=lambda t: np.add(circuit(t), (80, 0, 0)))
     found = track_tag(
         recording_of(ranges, far),
-        near_line,
-        Model(range_sd=0.02),
-        Height(1.0),
-        area=Area((0, -5, 0), (200, 50, 3)),
+        Setting(near_line, Model(range_sd=0.02), Height(1.0), Area((0, -5, 0), (200, 50, 3))),
     )
     assert "poor geometry" in found.warnings[0]
 

@@ -18,8 +18,7 @@ if TYPE_CHECKING:
     from uwb_mitigation.positioning.geometry import Area, Height
     from uwb_mitigation.positioning.survey import SurveyResult
     from uwb_mitigation.positioning.tracks import Heights
-    from uwb_mitigation.processing.residuals import HeldOut
-    from uwb_mitigation.processing.tracking import TagTracks
+    from uwb_mitigation.processing.tracking import HeldOut, TagTracks
     from uwb_mitigation.sources.recorded_ranges import RecordedRanges
 
 _FORMATS = {
@@ -111,9 +110,9 @@ def track(
     """
     from uwb_mitigation.bag.writer import BagWriter
     from uwb_mitigation.files import write_whole
+    from uwb_mitigation.positioning.locator import Setting
     from uwb_mitigation.positioning.model import Model
-    from uwb_mitigation.processing.residuals import held_out
-    from uwb_mitigation.processing.tracking import track_tag, tum_file, write_tracks
+    from uwb_mitigation.processing.tracking import held_out, track_tag, tum_file, write_tracks
     from uwb_mitigation.processing.tracking import tum as tum_text
     from uwb_mitigation.sources.site import anchors_file, save_anchors
 
@@ -121,6 +120,7 @@ def track(
     place, box = height_of(height, height_sd), area_of(area)
     known, recorded = _read(bag, anchors, stamp_offset)
     measured = heights_of(bag, height_topic, height_sd, height, recorded)
+    setting = Setting(known, model, place, box, measured)
     if tum is not None and tum.exists() and not force:
         raise ParameterError("exists already", where=str(tum), valid="--force replaces it")
     tracks = []
@@ -129,13 +129,13 @@ def track(
         task = bar.add_task("tracking", total=len(recorded.tags))
         for tag in recorded.tags:
             bar.update(task, description=f"tracking tag {format_id(tag.tag_id)}: {len(tag.ranges)} ranges")
-            tracks.append(track_tag(tag, known, model, place, box, measured))
+            tracks.append(track_tag(tag, setting))
             bar.advance(task)
         write_tracks(out, tracks)
     if force or not anchors_file(output).exists():
         save_anchors(anchors_file(output), known, f"anchors of the track of {bag.name}", force=True)
     _show_tracks(tracks, known)
-    residuals = held_out(tracks, known, model, place, measured)
+    residuals = held_out(tracks, setting)
     _show_residuals(residuals, known)
     console.out.print(f"Wrote {out.counts.total()} messages to {out.file}.", markup=False, soft_wrap=True)
     if tum is not None:

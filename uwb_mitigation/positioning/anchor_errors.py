@@ -21,11 +21,11 @@ from uwb_mitigation.positioning.joint import (
     FAR_S,
     JointFit,
     Links,
-    Setting,
     Stretches,
     fit_joint,
     links_of,
 )
+from uwb_mitigation.positioning.locator import Setting
 from uwb_mitigation.positioning.model import Regressors
 
 MISPLACED_M = 0.4

@@ -12,7 +12,7 @@ from uwb_mitigation.errors import DatasetError, format_id
 from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.filter import RangeFilter
 from uwb_mitigation.positioning.geometry import Area, Height, Shape, protection_levels, shape
-from uwb_mitigation.positioning.locator import SILENCE_S, TagLocator
+from uwb_mitigation.positioning.locator import SILENCE_S, Setting, TagLocator
 from uwb_mitigation.positioning.model import Model, Regressors
 from uwb_mitigation.positioning.smoother import Smoother, fused_with_batch
 from uwb_mitigation.positioning.tracks import Estimate, Heights, Ranges, Track
@@ -37,13 +37,11 @@ class FixedLag:
     """Keeps the latest states of the filter and ranges of a tag, and smooths over them on request.
 
     Args:
-        anchors, model, height, area: as of `TagLocator`.
+        setting: anchors, error model, height and area.
     """
 
-    def __init__(
-        self, anchors: AnchorMap, model: Model, height: Height | None, area: Area | None = None
-    ) -> None:
-        self._anchors, self._model, self._height, self._area = anchors, model, height, area
+    def __init__(self, setting: Setting) -> None:
+        self._setting = setting
         self._states: deque[tuple[int, RangeFilter]] = deque()
         self._ranges: deque[tuple[int, int, float, float]] = deque()
         self._heights: deque[tuple[int, float, float]] = deque(maxlen=_MAX_RANGES)
@@ -75,7 +73,7 @@ class FixedLag:
         """Return the position `LAG_S` before the latest range; None: it is not known for that long."""
         if not self._states or len(self._ranges) < 2:
             return None
-        start_ns, known = self._states[0]
+        setting, (start_ns, known) = self._setting, self._states[0]
         wanted_ns = self._ranges[-1][0] - round(LAG_S * _SECOND_NS)
         after = [row for row in self._ranges if row[0] > start_ns]
         if start_ns > wanted_ns or len(after) < 2:
@@ -86,17 +84,17 @@ class FixedLag:
         ranges = Ranges(stamp, anchor, range_m, variance, np.full(len(after), np.nan))
         first = known.copy()
         first.predict(first.time_s + (int(stamp[0]) - start_ns) / _SECOND_NS)
-        offset = Regressors.one("offset", np.ones(len(after)), 0.0, max(self._model.offset_sd, 1e-3))
+        offset = Regressors.one("offset", np.ones(len(after)), 0.0, max(setting.model.offset_sd, 1e-3))
         states = [(at, one) for at, one in self._states if at > start_ns] or [(int(stamp[0]), first)]
         initial = Track.of([_estimate_of(one, at) for at, one in states])
         heights = None
         if self._heights:
             heights = Heights(*(np.array(column) for column in zip(*self._heights, strict=True)))
         smoother = Smoother(
-            self._anchors,
-            self._model,
+            setting.anchors,
+            setting.model,
             ranges,
-            height=self._height,
+            height=setting.height,
             parameters=offset,
             after=first,
             heights=heights,
@@ -112,7 +110,7 @@ class FixedLag:
         live = live.copy()
         live.predict(live.time_s + (wanted_ns - live_ns) / _SECOND_NS)
         state, covariance, spread = fused_with_batch(live.x[None, :6], live.p[None, :6, :6], batch)
-        position = state[0, :3] if self._area is None else self._area.clip(state[0, :3])
+        position = state[0, :3] if setting.area is None else setting.area.clip(state[0, :3])
         return Estimate(wanted_ns, position, state[0, 3:], (covariance + spread)[0])
 
 
@@ -166,7 +164,7 @@ class Fleet:
         self.tags: dict[int, Tag] = {}
         self.strangers: Counter[int] = Counter()
         self.invalid = 0
-        self._model, self._height, self._area = model, height, area
+        self._setting = Setting(anchors, model, height, area)
 
     def add(
         self, tag_id: int, anchor_id: int, stamp_ns: int, range_m: float, variance_m2: float
@@ -191,8 +189,8 @@ class Fleet:
                 return None
             tag = self.tags[tag_id] = Tag(
                 tag_id,
-                TagLocator(self.anchors, self._model, height=self._height, area=self._area),
-                FixedLag(self.anchors, self._model, self._height, self._area),
+                self._setting.locator(),
+                FixedLag(self._setting),
             )
         estimate = tag.locator.add(stamp_ns, row, range_m, variance_m2)
         tag.latest_ns = stamp_ns
@@ -225,12 +223,12 @@ class Fleet:
 
     def _why(self, locator: TagLocator) -> str:
         rows = locator.heard(SILENCE_S)
-        needed = 2 if self._height is not None else 3
+        needed = self._setting.dims
         if len(rows) < needed:
             return f"no place: {len(rows)} anchors heard, {needed} or more needed"
         kind = shape(self.anchors.position[rows])
         text = f"no place: {locator.candidates} are plausible" if locator.candidates > 1 else "no place yet"
-        if kind is Shape.LINE or (kind is Shape.PLANE and self._height is None):
+        if kind is Shape.LINE or (kind is Shape.PLANE and self._setting.height is None):
             text += f"; the anchors heard are {kind.value}: give a height, or an area that leaves one place"
         return text
 

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.positioning.anchors import AnchorMap
-from uwb_mitigation.positioning.geometry import Area, Height, directions
+from uwb_mitigation.positioning.geometry import Height, directions
 from uwb_mitigation.positioning.least_squares import LeastSquares, Solution
+from uwb_mitigation.positioning.locator import Setting
 from uwb_mitigation.positioning.model import MAD_TO_SD, Model, Regressors, scatter_of
 from uwb_mitigation.positioning.tracks import Ranges
 
@@ -63,21 +63,6 @@ _HUBER_ITERATIONS = 4
 _CONVERGED_M = 1e-3
 _NO_PRIOR = 1e-8
 _STATIONARY = 1e-6
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Setting:
-    """What is known before: anchors, error model, and the constant height of all tags and their area, if any."""
-
-    anchors: AnchorMap
-    model: Model
-    height: Height | None = None
-    area: Area | None = None
-
-    @property
-    def dims(self) -> int:
-        """The number of unknown coordinates of a position."""
-        return 2 if self.height is not None else 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -490,38 +490,31 @@ def _as_estimate(known: RangeFilter, stamp_ns: int) -> Estimate:
 
 @dataclass(slots=True)
 class LiveRun:
-    """A recording as the live locator would have told it.
+    """The estimates of the live locator for a recording.
 
     Attributes:
-        track: an estimate for each range from which one came.
-        locator: as it was at the end.
+        track: an estimate for each range with one.
+        locator: at the end.
     """
 
     track: Track
     locator: TagLocator
-    estimates: list[Estimate] = field(default_factory=list)
 
 
 def run_live(ranges: Ranges, locator: TagLocator, heights: Heights | None = None) -> LiveRun:
-    """Feed recorded ranges, and heights where there are any, to a locator."""
+    """Process recorded ranges, and measured heights if there are any, with a locator."""
     estimates: list[Estimate] = []
-    columns = zip(
-        ranges.stamp_ns.tolist(),
-        ranges.anchor.tolist(),
-        ranges.range_m.tolist(),
-        ranges.variance_m2.tolist(),
-        strict=True,
-    )
+    columns = (ranges.stamp_ns, ranges.anchor, ranges.range_m, ranges.variance_m2)
     measured: list[tuple[int, float, float]] = []
     if heights is not None:
         of_heights = (heights.stamp_ns, heights.height_m, heights.variance_m2)
         measured = list(zip(*(column.tolist() for column in of_heights), strict=True))
     next_height, latest_ns = 0, None
-    for stamp_ns, anchor, range_m, variance_m2 in columns:
+    for stamp_ns, anchor, range_m, variance_m2 in zip(*(one.tolist() for one in columns), strict=True):
         while next_height < len(measured) and measured[next_height][0] <= stamp_ns:
             height_ns, *height = measured[next_height]
             next_height += 1
-            # The locator takes a height as of the latest range: skip those in a gap of the ranges.
+            # A height is valid at the time of the latest range: skip those in a gap of the ranges.
             if latest_ns is not None and height_ns - latest_ns <= HEIGHT_AGE_NS:
                 locator.add_height(*height)
         latest_ns = stamp_ns
@@ -529,3 +522,27 @@ def run_live(ranges: Ranges, locator: TagLocator, heights: Heights | None = None
         if estimate is not None:
             estimates.append(estimate)
     return LiveRun(Track.of(estimates), locator)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Setting:
+    """What is known before: anchors, error model, and of the tags a constant height, an area or measured heights, if any."""
+
+    anchors: AnchorMap
+    model: Model = field(default_factory=Model)
+    height: Height | None = None
+    area: Area | None = None
+    heights: Heights | None = None
+
+    @property
+    def dims(self) -> int:
+        """The number of unknown coordinates of a position."""
+        return 2 if self.height is not None else 3
+
+    def locator(self) -> TagLocator:
+        """Return a new locator of a tag."""
+        return TagLocator(self.anchors, self.model, height=self.height, area=self.area)
+
+    def live(self, ranges: Ranges) -> LiveRun:
+        """Process the recorded ranges of a tag with a new locator."""
+        return run_live(ranges, self.locator(), self.heights)

@@ -29,13 +29,12 @@ from uwb_mitigation.positioning.joint import (
     SLOW_S,
     JointFit,
     Links,
-    Setting,
     Stretches,
     fit_joint,
     links_of,
     stretches,
 )
-from uwb_mitigation.positioning.locator import TagLocator, run_live
+from uwb_mitigation.positioning.locator import Setting
 from uwb_mitigation.positioning.model import Model, Regressors
 from uwb_mitigation.positioning.start import Place, places
 from uwb_mitigation.positioning.tracks import Ranges, Track
@@ -451,8 +450,7 @@ def first_positions(
             continue
         ranges = found.ranges.take(own)
         better = replace(ranges, range_m=np.maximum(ranges.range_m - expected_m[own], 0.0))
-        locator = TagLocator(setting.anchors, setting.model, height=setting.height, area=setting.area)
-        track = run_live(better, locator).track
+        track = setting.live(better).track
         if len(track) >= 2:
             position.append(_at_knots(track, ranges))
             placed[number] = True

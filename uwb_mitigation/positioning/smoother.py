@@ -13,7 +13,7 @@ weights of Niehsen 2002).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.filter import FIRST_ERROR, OFFSET, RangeFilter
-from uwb_mitigation.positioning.geometry import Area, Height, directions
+from uwb_mitigation.positioning.geometry import Height, directions
 from uwb_mitigation.positioning.least_squares import LeastSquares, Solution
-from uwb_mitigation.positioning.locator import TagLocator, run_live
+from uwb_mitigation.positioning.locator import Setting
 from uwb_mitigation.positioning.model import Model, Regressors
 from uwb_mitigation.positioning.tracks import Heights, Ranges, Track
 
@@ -126,6 +126,11 @@ class Smoother:
             parameters = Regressors(names, rows, np.zeros(len(sd)), sd, np.zeros(n, np.intp))
         self._parameters = parameters
         self._heights = heights if height is None else None
+
+    @classmethod
+    def of(cls, setting: Setting, ranges: Ranges) -> Smoother:
+        """Return the smoother of a recording."""
+        return cls(setting.anchors, setting.model, ranges, height=setting.height, heights=setting.heights)
 
     def fit(self, initial: Track, iterations: int = _ITERATIONS) -> Smoothed:
         """Return the track, starting from one that is roughly right.
@@ -269,54 +274,38 @@ class Smoother:
         problem.add(np.tile(at, (len(index), 1)), root, root @ state[index], 1.0)
 
 
-def smooth(
-    anchors: AnchorMap,
-    model: Model,
-    ranges: Ranges,
-    live: Track,
-    *,
-    height: Height | None = None,
-    area: Area | None = None,
-    heights: Heights | None = None,
-) -> Track:
+def smooth(setting: Setting, ranges: Ranges, live: Track) -> Track:
     """Return positions at ten stamps a second, each from all ranges before and after it.
 
     Args:
-        anchors, model, height, area: As of `TagLocator`.
-        ranges: Two or more.
-        live: The track of `run_live` from the same ranges; not empty.
-        heights: Measured heights of the tag.
+        setting: anchors, error model, and what is known of the tag.
+        ranges: two or more.
+        live: the track of `Setting.live` from the same ranges; not empty.
     """
     stamp_ns = int(ranges.stamp_ns[0]) + knots_of(ranges.stamp_ns)[0]
-    end_ns = int(ranges.stamp_ns[-1])
-    backwards = slice(None, None, -1)
+    end_ns, backwards = int(ranges.stamp_ns[-1]), slice(None, None, -1)
     reversed_ranges = ranges.take(backwards)
-    mirrored = Ranges(
-        end_ns - reversed_ranges.stamp_ns,
-        reversed_ranges.anchor,
-        reversed_ranges.range_m,
-        reversed_ranges.variance_m2,
-        reversed_ranges.rx_power_dbm,
-        ranges.tag_id,
+    mirrored = replace(reversed_ranges, stamp_ns=end_ns - reversed_ranges.stamp_ns)
+    heights = setting.heights and Heights(
+        end_ns - setting.heights.stamp_ns[backwards],
+        setting.heights.height_m[backwards],
+        setting.heights.variance_m2[backwards],
     )
-    mirrored_heights = heights and Heights(
-        end_ns - heights.stamp_ns[backwards], heights.height_m[backwards], heights.variance_m2[backwards]
-    )
-    locator = TagLocator(anchors, model, height=height, area=area)
-    later = _at(run_live(mirrored, locator, mirrored_heights).track, (end_ns - stamp_ns)[backwards])
+    track = replace(setting, heights=heights).live(mirrored).track
+    later = _at(track, (end_ns - stamp_ns)[backwards])
     flip = np.diag([1.0, 1.0, 1.0, -1.0, -1.0, -1.0])
     later = later[0][backwards] @ flip, flip @ later[1][backwards] @ flip
     state, covariance, spread = _fused(_at(live, stamp_ns), later)
     # Without a position of either filter the batch smoother's choice among several optima is arbitrary.
     found = np.asarray(np.isfinite(state).all(axis=1), np.bool_)
     try:
-        batch = Smoother(anchors, model, ranges, height=height, heights=heights).fit(live).track
+        batch = Smoother.of(setting, ranges).fit(live).track
     except DatasetError:
         batch = None
     if batch is not None:
         state, covariance, more = fused_with_batch(state, covariance, batch)
         spread += more
-    position = state[:, :3] if area is None else area.clip(state[:, :3])
+    position = state[:, :3] if setting.area is None else setting.area.clip(state[:, :3])
     return Track(stamp_ns, position, state[:, 3:], covariance + spread).take(found)
 
 

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.anchors import AnchorMap
-from uwb_mitigation.positioning.geometry import Area, Height, Shape, shape
-from uwb_mitigation.positioning.locator import TagLocator, run_live
+from uwb_mitigation.positioning.geometry import Area, Height, Shape, directions, shape
+from uwb_mitigation.positioning.locator import Setting
 from uwb_mitigation.positioning.model import Model
 from uwb_mitigation.positioning.smoother import Smoothed, Smoother
 from uwb_mitigation.positioning.tracks import Heights, Ranges, Track
@@ -121,9 +121,8 @@ def survey(
     Raises:
         DatasetError: too few anchors, all on a line, or a tag that hardly moves; says which.
     """
-    model = model or Model()
-    used = np.unique(ranges.anchor)
-    needed = 3 if height is not None else 4
+    setting = Setting(guesses, model or Model(), height, area, heights)
+    model, used, needed = setting.model, np.unique(ranges.anchor), setting.dims + 1
     if len(used) < needed:
         raise DatasetError(f"{len(used)} anchors were heard", valid=f"{needed} or more for a survey")
     if shape(guesses.position[used]) is Shape.LINE:
@@ -132,11 +131,11 @@ def survey(
 
     def fit(order: list[int]) -> tuple[Smoothed, float]:
         start = guesses.moved(guesses.position[order], deviations)
-        found = _fit(start, ranges, height, area, heights, model)
-        expected = np.where(np.isfinite(ranges.variance_m2), ranges.variance_m2, model.range_sd**2)
-        return found, float(model.loss(found.residual_m / np.sqrt(expected)).mean())
+        found = _fit(replace(setting, anchors=start), ranges)
+        sd = np.sqrt(model.variances(ranges.variance_m2))
+        return found, float(model.loss(found.residual_m / sd).mean())
 
-    order, swapped = _unswap(guesses, ranges, off_m, height, area, heights, model)
+    order, swapped = _unswap(setting, ranges, off_m)
     identity = list(range(len(guesses)))
     found, loss = fit(identity)
     if swapped:
@@ -157,7 +156,7 @@ def survey(
     moved = displacements(found.anchors[used], guesses.position[used])
     distance = np.zeros(len(guesses))
     # A level drive tells heights badly, and they were taken as measured.
-    axes = slice(0, 2) if height is not None else slice(0, 3)
+    axes = slice(0, setting.dims)
     distance[used] = np.linalg.norm(moved[:, axes], axis=1)
     relative = np.linalg.norm(_relative_sd(found.anchors, found.anchor_covariance)[:, axes], axis=1)
     odd = [int(row) for row in used if distance[row] > max(MISPLACED_M, _UNLIKELY * relative[row])]
@@ -165,7 +164,7 @@ def survey(
         row: other
         for row in used.tolist()
         if row not in fixed
-        for other in [_alternative(found, ranges, row, model, level=height is not None)]
+        for other in [_alternative(setting, found, ranges, row)]
         if other is not None
     }
     plain, mirror = (
@@ -185,40 +184,32 @@ def survey(
     )
 
 
-def _fit(
-    start: AnchorMap,
-    ranges: Ranges,
-    height: Height | None,
-    area: Area | None,
-    heights: Heights | None,
-    model: Model,
-) -> Smoothed:
-    track = _first_track(start, ranges, height, area, heights, model)
-    spread = np.ptp(track.position[:, :2], axis=0)
-    if float(np.hypot(*spread)) < _MOVES_M:
+def _fit(setting: Setting, ranges: Ranges) -> Smoothed:
+    start = setting.anchors
+    track = setting.live(ranges).track
+    if len(track) < 2:
         raise DatasetError(
-            f"the tag moves by {np.hypot(*spread):.1f} m only", valid=f"{_MOVES_M:g} m or more"
+            "no position of the tag can be determined",
+            valid="better guesses, an area, or a height; four anchors or more",
         )
-    known = start
+    spread = float(np.hypot(*np.ptp(track.position[:, :2], axis=0)))
+    if spread < _MOVES_M:
+        raise DatasetError(f"the tag moves by {spread:.1f} m only", valid=f"{_MOVES_M:g} m or more")
     around = np.repeat(start.sd[:, None], 3, axis=1)
-    if height is not None:
+    if setting.height is not None:
         around[:, 2] = np.minimum(around[:, 2], TAPE_M)
-    fit = None
+    variance, known, fit = setting.model.variances(ranges.variance_m2), start, None
     for step in _STEPS_M:
-        variance = np.where(np.isfinite(ranges.variance_m2), ranges.variance_m2, model.range_sd**2)
-        trusted = replace(ranges, variance_m2=np.maximum(variance, step**2))
-        smoother = Smoother(
+        fit = Smoother(
             known,
-            model,
-            trusted,
-            height=height,
-            heights=heights,
+            setting.model,
+            replace(ranges, variance_m2=np.maximum(variance, step**2)),
+            height=setting.height,
+            heights=setting.heights,
             find_anchors=True,
             around=(start.position, around),
-        )
-        fit = smoother.fit(track)
-        track = fit.track
-        known = known.moved(fit.anchors, start.sd)
+        ).fit(track)
+        track, known = fit.track, known.moved(fit.anchors, start.sd)
     assert fit is not None
     return fit
 
@@ -229,15 +220,13 @@ def _misfit(found: NDArray[np.float64], guessed: NDArray[np.float64], *, mirrore
     return float(np.sqrt(np.mean(displacements(found * (side, 1.0, 1.0), guessed)[:, :2] ** 2)))
 
 
-def _alternative(
-    fit: Smoothed, ranges: Ranges, row: int, model: Model, *, level: bool
-) -> NDArray[np.float64] | None:
-    """Another position of an anchor from which its ranges to the track are explained as well, or None.
+def _alternative(setting: Setting, fit: Smoothed, ranges: Ranges, row: int) -> NDArray[np.float64] | None:
+    """Return another position of an anchor that explains its ranges to the track equally well, or None.
 
-    Candidate: the mirror image beyond the track's plane (its line in plan, of a level drive), refined with the track held.
+    Candidate: the mirror image beyond the track's plane (with a constant height: its line in plan), refined for this track.
     """
     own = ranges.anchor == row
-    track, axes = fit.track, 2 if level else 3
+    track, axes, model = fit.track, setting.dims, setting.model
     tag = np.stack(
         [np.interp(ranges.stamp_ns[own], track.stamp_ns, axis) for axis in track.position.T], axis=1
     )
@@ -247,14 +236,13 @@ def _alternative(
     anchor = fit.anchors[row]
     other = anchor - 2.0 * float((anchor - centre) @ normal) * normal
     found_m = np.linalg.norm(tag - anchor, axis=1)
-    sd = np.sqrt(np.where(np.isfinite(ranges.variance_m2[own]), ranges.variance_m2[own], model.range_sd**2))
+    sd = np.sqrt(model.variances(ranges.variance_m2[own]))
     # Residuals of the fit, with what it attributes to offsets: the other position has to explain the same ranges.
     range_m = found_m + fit.residual_m[own]
     for _ in range(10):
-        away = other - tag
-        expected = np.maximum(np.linalg.norm(away, axis=1), 1e-6)
+        unit, expected = directions(other, tag)
         z = (range_m - expected) / sd
-        slope = (away / expected[:, None] / sd[:, None])[:, :axes]
+        slope = (unit / sd[:, None])[:, :axes]
         weighted = slope * model.weight(z)[:, None]
         other[:axes] += np.linalg.solve(weighted.T @ slope + np.eye(axes), weighted.T @ z)
     worse = float(model.loss((range_m - np.linalg.norm(other - tag, axis=1)) / sd).mean())
@@ -302,33 +290,9 @@ def _deviations(guesses: AnchorMap, off_m: float, fixed: frozenset[int]) -> NDAr
     return np.array([sd if row in fixed else max(off_m, sd) for row, sd in enumerate(guesses.sd.tolist())])
 
 
-def _first_track(
-    anchors: AnchorMap,
-    ranges: Ranges,
-    height: Height | None,
-    area: Area | None,
-    heights: Heights | None,
-    model: Model,
-) -> Track:
-    track = run_live(ranges, TagLocator(anchors, model, height=height, area=area), heights).track
-    if len(track) < 2:
-        raise DatasetError(
-            "no place of the tag can be told",
-            valid="better guesses, an area, or a height; four anchors or more",
-        )
-    return track
-
-
-def _unswap(
-    guesses: AnchorMap,
-    ranges: Ranges,
-    off_m: float,
-    height: Height | None,
-    area: Area | None,
-    heights: Heights | None,
-    model: Model,
-) -> tuple[list[int], list[tuple[int, int]]]:
-    """The order of guesses that explains the first minute best, of all with one pair swapped; and that pair."""
+def _unswap(setting: Setting, ranges: Ranges, off_m: float) -> tuple[list[int], list[tuple[int, int]]]:
+    """Return the order of guesses that explains the first minute best, of all with one pair swapped; and that pair."""
+    guesses, model = setting.anchors, setting.model
     trial = ranges.take(ranges.stamp_ns < ranges.stamp_ns[0] + _TRIAL_NS)
     if len(trial) > _TRIAL_RANGES:
         # Chosen by chance: every so-manieth might always be of the same anchor.
@@ -338,11 +302,11 @@ def _unswap(
     identity = list(range(len(guesses)))
 
     def loss(order: list[int]) -> float:
-        anchors = guesses.moved(guesses.position[order], np.full(len(guesses), off_m))
-        track = run_live(trial, TagLocator(anchors, model, height=height, area=area), heights).track
+        tried = replace(setting, anchors=guesses.moved(guesses.position[order], np.full(len(guesses), off_m)))
+        track = tried.live(trial).track
         if len(track) < 2:
             return np.inf
-        fit = Smoother(anchors, model, trial, height=height, heights=heights).fit(track, iterations=4)
+        fit = Smoother.of(tried, trial).fit(track, iterations=4)
         return float(model.loss(fit.residual_m / np.sqrt(off_m**2 / 4.0 + model.range_sd**2)).mean())
 
     best, order, swapped = loss(identity), identity, list[tuple[int, int]]()

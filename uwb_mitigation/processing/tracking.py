@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from uwb_mitigation.bag.poses import encode_odometry, encode_pose, tag_frame, tag_topic
 from uwb_mitigation.bag.topics import (
@@ -19,24 +20,26 @@ from uwb_mitigation.bag.topics import (
 from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.errors import DatasetError, format_id
 from uwb_mitigation.positioning.anchors import AnchorMap
-from uwb_mitigation.positioning.geometry import Area, Height, Shape, geometry, shape
-from uwb_mitigation.positioning.locator import TagLocator, run_live
-from uwb_mitigation.positioning.model import Model
-from uwb_mitigation.positioning.smoother import smooth
+from uwb_mitigation.positioning.geometry import Shape, geometry, shape
+from uwb_mitigation.positioning.locator import Setting, TagLocator
+from uwb_mitigation.positioning.smoother import Smoother, smooth
 from uwb_mitigation.positioning.start import snapshot
 from uwb_mitigation.positioning.tracks import (
     NO_ERRORS,
     Estimate,
-    Heights,
     Ranges,
     Track,
     TrackErrors,
+    TruePath,
     track_errors,
 )
 from uwb_mitigation.sources.recorded_ranges import TagRecording
 
 KINDS = ("live", "smoothed", "snapshot")
 POOR_HDOP = 10.0
+MIN_OTHERS = 3
+"""Other anchors that a track without an anchor needs."""
+
 CONTRADICTION_M = 0.4
 """NLOS errors of the other anchors move their track by up to about this much."""
 
@@ -86,33 +89,26 @@ class TagTracks:
         }
 
 
-def track_tag(
-    recording: TagRecording,
-    anchors: AnchorMap,
-    model: Model,
-    height: Height | None = None,
-    area: Area | None = None,
-    heights: Heights | None = None,
-) -> TagTracks:
-    """The tracks of one tag.
+def track_tag(recording: TagRecording, setting: Setting) -> TagTracks:
+    """Return the tracks of one tag.
 
     Raises:
-        DatasetError: no place of the tag can be told: says why, as far as the anchors show it.
+        DatasetError: no position of the tag can be determined; the message contains the reason, if the anchors show it.
     """
-    ranges = recording.ranges
-    locator = TagLocator(anchors, model, height=height, area=area)
-    live = run_live(ranges, locator, heights).track
+    ranges, anchors = recording.ranges, setting.anchors
+    run = setting.live(ranges)
+    live, locator = run.track, run.locator
     if len(live) < 2:
-        raise DatasetError(*_nowhere(recording, anchors, locator, height or heights))
-    smoothed = smooth(anchors, model, ranges, live, height=height, area=area, heights=heights)
-    snapshots = snapshot(anchors, recording.raw, height)
+        raise _no_position(recording, setting, locator)
+    smoothed = smooth(setting, ranges, live)
+    snapshots = snapshot(anchors, recording.raw, setting.height)
     truth = recording.truth
     of_live, of_smoothed, of_snapshots = (
         track_errors(track, truth) if len(truth) else NO_ERRORS for track in (live, smoothed, snapshots)
     )
     sample = smoothed.position[:: max(len(smoothed) // 200, 1)]
     used = anchors.position[np.unique(ranges.anchor)]
-    level = height is not None or heights is not None
+    level = setting.height is not None or setting.heights is not None
     hdop = float(np.median([geometry(used, place, level=level).hdop for place in sample]))
     warnings = []
     if not hdop <= POOR_HDOP:
@@ -137,12 +133,12 @@ def track_tag(
             "positions in the 95 % ellipses. Use the live track"
         )
 
-    def live_without(row: int) -> Track:
-        others = ranges.take(ranges.anchor != row)
-        return run_live(others, TagLocator(anchors, model, height=height, area=area), heights).track
-
-    # A locator accuses by its last ranges only: evidence comes from the whole recording.
-    odd = [row for row in locator.disagreeing() if contradicts(anchors, ranges, row, live_without(row))]
+    # The locator judges by its last ranges only: use the whole recording.
+    odd = [
+        row
+        for row in locator.disagreeing()
+        if contradicts(anchors, ranges, row, setting.live(ranges.take(ranges.anchor != row)).track)
+    ]
     return TagTracks(
         recording, live, smoothed, snapshots, of_live, of_smoothed, of_snapshots, hdop, odd, warnings
     )
@@ -165,22 +161,80 @@ def contradicts(anchors: AnchorMap, ranges: Ranges, row: int, others: Track) -> 
     return abs(low) > CONTRADICTION_M
 
 
-def _nowhere(
-    recording: TagRecording, anchors: AnchorMap, locator: TagLocator, height: Height | Heights | None
-) -> tuple[str]:
-    used = anchors.position[np.unique(recording.ranges.anchor)]
-    what = f"tag {format_id(recording.tag_id)}: no place can be told from {len(recording.ranges)} ranges"
+def _no_position(recording: TagRecording, setting: Setting, locator: TagLocator) -> DatasetError:
+    used = setting.anchors.position[np.unique(recording.ranges.anchor)]
+    what = f"tag {format_id(recording.tag_id)}: no position can be determined from {len(recording.ranges)} ranges"
     if locator.candidates > 1:
-        what += f": {locator.candidates} places are as good"
-    needed = 3 if height is not None else 4
-    kind = shape(used)
+        what += f": {locator.candidates} positions explain them equally well"
+    level = setting.height is not None or setting.heights is not None
+    needed, kind = 3 if level else 4, shape(used)
     if locator.undetermined:
-        what += ": the ranges do not determine it"
+        what += ": the geometry is too weak"
     if len(used) < needed:
-        what += f"; {len(used)} anchors were heard, {needed} are needed"
-    if kind in (Shape.LINE, Shape.POINT) or (kind is Shape.PLANE and height is None):
-        what += f"; the anchors are {kind.value}: give a height or an area that leaves one place"
-    return (what,)
+        what += f"; {len(used)} anchors were received, {needed} are needed"
+    if kind in (Shape.LINE, Shape.POINT) or (kind is Shape.PLANE and not level):
+        what += f"; the anchors are {kind.value}: give a height or an area that contains only one position"
+    return DatasetError(what)
+
+
+@dataclass(frozen=True, slots=True)
+class HeldOut:
+    """Medians of absolute held-out residuals, m; NaN: unknown.
+
+    Attributes:
+        anchor_id: None = all anchors.
+        ranges: the number of residuals.
+        raw_m, corrected_m: of measured and of corrected ranges; corrected NaN if the bag has none.
+    """
+
+    anchor_id: int | None
+    ranges: int
+    raw_m: float
+    corrected_m: float
+
+    def as_json(self) -> dict[str, float | int | None]:
+        values = {"raw_m": self.raw_m, "corrected_m": self.corrected_m}
+        return {"anchor_id": self.anchor_id, "ranges": self.ranges} | {
+            name: value if np.isfinite(value) else None for name, value in values.items()
+        }
+
+
+def held_out(tracks: Sequence[TagTracks], setting: Setting) -> list[HeldOut]:
+    """Return the held-out residuals of each anchor, and of all anchors last.
+
+    The ranges of each anchor are compared with a track that was estimated without this anchor. This needs no ground truth,
+    and a wrong offset of an anchor cannot hide, because its own ranges do not move the track.
+    """
+    raw = [(one.live, one.recording.raw) for one in tracks]
+    corrected = [(one.live, one.recording.ranges) for one in tracks if one.recording.corrected]
+
+    def of(row: int, kind: list[tuple[Track, Ranges]]) -> NDArray[np.float64]:
+        parts = [_residuals(live, ranges, row, setting) for live, ranges in kind]
+        return np.concatenate([np.zeros(0), *parts])
+
+    by_anchor = [(of(row, raw), of(row, corrected)) for row in range(len(setting.anchors))]
+    every = [np.concatenate(kind) for kind in zip(*by_anchor, strict=True)]
+    identities = [*(anchor.id for anchor in setting.anchors.anchors), None]
+    return [
+        HeldOut(identity, len(before), _median(before), _median(after))
+        for identity, (before, after) in zip(identities, [*by_anchor, every], strict=True)
+    ]
+
+
+def _residuals(initial: Track, ranges: Ranges, row: int, setting: Setting) -> NDArray[np.float64]:
+    """Return range minus distance of an anchor's ranges, where the track of the others is known."""
+    own = ranges.anchor == row
+    if len(np.unique(ranges.anchor[~own])) < MIN_OTHERS or not own.any():
+        return np.zeros(0)
+    track = Smoother.of(setting, ranges.take(~own)).fit(initial).track
+    position = TruePath(track.stamp_ns, track.position).at(ranges.stamp_ns[own])
+    residual = ranges.range_m[own] - np.linalg.norm(position - setting.anchors.position[row], axis=1)
+    known: NDArray[np.float64] = residual[np.isfinite(residual)]
+    return known
+
+
+def _median(residual: NDArray[np.float64]) -> float:
+    return float(np.median(np.abs(residual))) if len(residual) else float("nan")
 
 
 def pooled(errors: list[TrackErrors]) -> TrackErrors:
