@@ -101,24 +101,6 @@ def test_the_covariance_stays_one_and_the_state_finite(steps, learns: bool):
     assert np.isfinite(one.x).all()
 
 
-def test_a_range_that_is_too_long_is_doubted_more_than_one_too_short_and_never_wholly():
-    moved = []
-    for error in (-5.0, 5.0, 50.0):
-        one = RangeFilter(HALL, Model(), 0.0, np.array([6.0, 4.5, 1.0]), 0.01 * np.eye(3))
-        one.update(0, float(np.linalg.norm(one.position - HALL.position[0])) + error, 0.01)
-        moved.append(float(np.linalg.norm(one.position - (6.0, 4.5, 1.0))))
-    short, long, far = moved
-    assert short > long > far > 0
-
-
-def test_what_is_considered_is_not_moved_but_keeps_its_correlation():
-    one = RangeFilter(HALL, Model(), 0.0, np.array([6.0, 4.0, 1.0]), np.eye(3))
-    one.update(0, 8.0, 0.01)
-    assert (one.x[OFFSET:] == 0).all()
-    assert one.p[OFFSET, OFFSET] == pytest.approx(Model().offset_sd ** 2)
-    assert np.abs(one.p[:3, OFFSET]).max() > 0
-
-
 def test_live_estimates_of_many_drives_are_honest():
     found = []
     for seed in range(6):
@@ -130,14 +112,6 @@ def test_live_estimates_of_many_drives_are_honest():
     assert 0.5 < np.mean([e.nees_per_dof for e in found]) < 1.5
     assert np.mean([e.coverage95 for e in found]) > 0.88
     assert np.mean([e.exceeded for e in found]) < 0.01
-
-
-def test_outliers_do_not_carry_the_filter_away():
-    ranges, truth = drive(seconds=40)
-    wrong = np.random.default_rng(3).random(len(ranges)) < 0.1
-    ranges.range_m[wrong] += 8.0
-    ranges.range_m[::97] = 0.5
-    assert track_errors(run_live(ranges, TagLocator(HALL)).track, truth).rmse < 0.35
 
 
 def test_of_two_mirror_images_nothing_is_told_until_an_area_excludes_one():
@@ -164,7 +138,7 @@ def test_every_position_lies_inside_the_area(seed: int):
     assert errors.height_rmse < 0.6
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_measured_heights_near_the_floor_keep_the_right_solution(seed: int):
     ranges, truth = drive(FLAT, path=flight, seed=seed, seconds=30)
     rng = np.random.default_rng(seed)
@@ -236,24 +210,6 @@ def test_anchors_almost_on_a_line_never_decide_by_chance(seed: int, height: Heig
         assert found[1] is None
     (warning,) = fleet.warnings()
     assert "all on a line" in warning
-
-
-def test_the_default_acceleration_suits_simulated_drones():
-    def rmse(acceleration: float) -> float:
-        found = []
-        for seed in range(3):
-            ranges, truth = drive(HALL, path=lambda t: np.add(flight(t), (6, 4.5, 0)), seed=seed, seconds=40)
-            block(ranges, seed)
-            live = run_live(ranges, TagLocator(HALL, Model(acceleration=acceleration))).track
-            found.append(track_errors(live, truth).rmse)
-        return float(np.mean(found))
-
-    assert rmse(Model().acceleration) < rmse(3.0)
-
-
-def test_two_anchors_alone_tell_nothing():
-    ranges, _ = drive(AnchorMap(HALL.anchors[:2]), seconds=5)
-    assert len(run_live(ranges, TagLocator(AnchorMap(HALL.anchors[:2]))).track) == 0
 
 
 def test_the_covariance_grows_through_a_silence_and_the_tag_is_found_within_two_seconds_after():

@@ -87,13 +87,6 @@ def test_what_ranges_do_not_determine_is_reported(minute):
     assert not survey(HALL, level_drive, off_m=0.05).undetermined
 
 
-def test_the_whole_may_lie_and_turn_as_it_likes():
-    angle = 0.3
-    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
-    off = displacements(HALL.position @ turn.T + (2.0, -1.0, 0.5), HALL.position)
-    np.testing.assert_allclose(off, 0.0, atol=1e-9)
-
-
 def test_what_cannot_be_surveyed_is_refused_in_words(minute):
     with pytest.raises(DatasetError, match="2 anchors were heard"):
         survey(HALL, minute.take(minute.anchor < 2), height=LEVEL)
