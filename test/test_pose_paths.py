@@ -88,14 +88,18 @@ def test_poses_are_read_whatever_tells_them(tmp_path, topic, make, frames):
     assert np.allclose(np.abs(path.orientation), [0.0, 0.0, 0.0, 1.0])
 
 
+def odometry(second: int, child: str = "base_link") -> Any:
+    covariance = np.diag([1.0, 1, 0.04, 1, 1, 1]).reshape(-1)
+    sure = of("geometry_msgs/msg/PoseWithCovariance", pose(second), covariance)
+    zero = of("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)
+    twist = of("geometry_msgs/msg/Twist", zero, zero)
+    moving = of("geometry_msgs/msg/TwistWithCovariance", twist, np.zeros(36))
+    return of("nav_msgs/msg/Odometry", header(second), child, sure, moving)
+
+
 def of_two_tags(second: int) -> Any:
     """An odometry of tag 7 in even seconds and of tag 8 in odd ones."""
-    sure = of("geometry_msgs/msg/PoseWithCovariance", pose(second), np.zeros(36))
-    zero = of("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)
-    twist = of(
-        "geometry_msgs/msg/TwistWithCovariance", of("geometry_msgs/msg/Twist", zero, zero), np.zeros(36)
-    )
-    return of("nav_msgs/msg/Odometry", header(second), f"tag_{7 + second % 2}", sure, twist)
+    return odometry(second, f"tag_{7 + second % 2}")
 
 
 def test_each_child_frame_is_a_body_of_its_own(tmp_path):
@@ -133,17 +137,6 @@ def measured_range(second: int) -> Any:
     """0.1 m higher each second; the sensor reports more than its maximum in second 3."""
     value = 9.0 if second == 3 else 0.5 + 0.1 * second
     return of("sensor_msgs/msg/Range", header(second), 1, 0.1, 0.0, 4.0, value, 0.0004)
-
-
-def odometry(second: int) -> Any:
-    sure = of(
-        "geometry_msgs/msg/PoseWithCovariance", pose(second), np.diag([1.0, 1, 0.04, 1, 1, 1]).reshape(-1)
-    )
-    zero = of("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)
-    twist = of(
-        "geometry_msgs/msg/TwistWithCovariance", of("geometry_msgs/msg/Twist", zero, zero), np.zeros(36)
-    )
-    return of("nav_msgs/msg/Odometry", header(second), "base_link", sure, twist)
 
 
 @pytest.mark.parametrize(
