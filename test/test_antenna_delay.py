@@ -16,7 +16,7 @@ from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.link.layout import Role
 from uwb_mitigation.link.radio import RadioSettings
 from uwb_mitigation.radio.antenna_delay import find
-from uwb_mitigation.radio.opening import opener
+from uwb_mitigation.radio.bus import opener
 from uwb_mitigation.radio.port import RadioPort
 
 NOMINAL = 2 * 16436

@@ -16,6 +16,7 @@ import serial
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
 from diagnostic_msgs.msg import DiagnosticStatus
+from faulty_board import FaultyBoard
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
@@ -57,7 +58,7 @@ def board(link: Path, *, model: bool = False, rate_hz: float = 50.0, **options) 
                 0xB0A2D, mitigation.bundle.model_id, mitigation.bundle.preprocessing.samples
             ),
         }
-    return EmulatedBoard(SimulatedSource(seed=4, count=200), rate_hz=rate_hz, link=link, **options)
+    return FaultyBoard(SimulatedSource(seed=4, count=200), rate_hz=rate_hz, link=link, **options)
 
 
 def drive(ros: Ros, link: Path, *parameters: str) -> Process:
@@ -159,7 +160,7 @@ def test_an_absent_port_is_waited_for(ros: Ros, link: Path):
 
 
 def test_a_board_of_another_protocol_version_is_named(ros: Ros, link: Path):
-    with board(link, faults=BoardFaults(version=9)):
+    with board(link, version=9):
         driver = drive(ros, link)
         status = ros.diagnosis("driver", lambda s: "version" in s.message)
     assert status.level == DiagnosticStatus.ERROR
@@ -189,11 +190,11 @@ def test_unplugging_costs_neither_descriptors_nor_threads(ros: Ros, link: Path):
 
 def test_resets_noise_and_damage_cost_frames_but_not_the_driver(ros: Ros, link: Path):
     received = ros.collect(RangeCir, RAW)
-    faults = BoardFaults(ByteFaults(2e-5, 2e-5, 2e-5), lose=0.05, duplicate=0.05, boot_noise=500)
+    faults = BoardFaults(ByteFaults(2e-5, 2e-5, 2e-5), lose=0.05, duplicate=0.05)
     known = {
         r.measurement.sequence: np.float32(r.measurement.range_m) for r in SimulatedSource(seed=4, count=200)
     }
-    with board(link, rate_hz=200.0, faults=faults) as device:
+    with board(link, rate_hz=200.0, faults=faults, boot_noise=500) as device:
         driver = drive(ros, link)
         for _ in range(3):
             received_before = len(received)
@@ -216,7 +217,7 @@ def test_a_signal_ends_the_driver_at_once_in_any_state(
 ):
     device = None
     if state != "absent":
-        device = board(link) if state != "silent" else EmulatedBoard(None, link=link)
+        device = board(link) if state != "silent" else FaultyBoard(None, link=link)
     try:
         driver = drive(ros, link)
         ros.diagnosis("driver", lambda s: True)

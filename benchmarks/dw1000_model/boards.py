@@ -7,7 +7,6 @@ import ctypes
 import functools
 import shutil
 import tempfile
-from collections.abc import Callable
 from ctypes import POINTER, c_double, c_int, c_size_t, c_uint16, c_uint32, c_uint64, c_void_p
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,7 @@ from types import TracebackType
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.dw1000_model.library import NextRequest, Request, model_folder, model_objects
+from benchmarks.dw1000_model.library import model_folder, model_objects
 from benchmarks.dw1000_model.links import Link
 from uwb_mitigation.errors import LinkError
 from uwb_mitigation.firmware_export.compiling import (
@@ -88,7 +87,6 @@ class ModelledAir:
         self._library = _library()
         self._air = self._library.radio_air_new(seed, _STORE_VALUES)
         self._boards = 0
-        self._callbacks: list[object] = []
 
     def __enter__(self) -> ModelledAir:
         return self
@@ -123,19 +121,6 @@ class ModelledAir:
             self._library.radio_air_line(
                 self._air, board, line.baud, int(line.mode), line.inference_s, line.overhead_s
             )
-        return board
-
-    def add_remote(self, next_request: Callable[[Request], bool], *, ppm: float = 0.0) -> int:
-        """A chip whose host's program is elsewhere; its number.
-
-        `next_request` is told of the request before, writes the next one, and returns False when there is none any
-        more. Nothing else happens on the air meanwhile.
-        """
-        callback = NextRequest(lambda _, request: int(next_request(request[0])))
-        self._callbacks.append(callback)
-        delay = NOMINAL_DELAY_TICKS
-        board: int = self._library.radio_air_remote(self._air, ppm, 0, delay, delay, callback)
-        self._boards += 1
         return board
 
     def link(self, a: int, b: int, channel: Link | None) -> None:
@@ -227,7 +212,6 @@ def _library() -> ctypes.CDLL:
             c_int,
             (air, c_double, c_uint64, c_uint16, c_uint16, POINTER(structures.Config), c_uint64),
         ),
-        "remote": (c_int, (air, c_double, c_uint64, c_uint16, c_uint16, NextRequest)),
         "line": (None, (air, board, c_double, c_int, c_double, c_double)),
         "link": (
             None,

@@ -178,7 +178,7 @@ def antenna_delay(
         uwb-mitigation board antenna-delay --distance 5.01 --port /dev/ttyACM0,/dev/ttyACM1 -o antenna_delay.yaml
     """
     from uwb_mitigation.radio.antenna_delay import measure
-    from uwb_mitigation.radio.opening import opener
+    from uwb_mitigation.radio.bus import opener
 
     if not 0.3 <= distance <= 100.0:
         raise ParameterError(f"--distance {distance}", valid="0.3 to 100 m")

@@ -28,7 +28,6 @@ class Target(str, enum.Enum):
 
     QEMU_MPS2 = "qemu_mps2"
     QEMU_MPS2_LINK = "qemu_mps2_link"
-    QEMU_MPS2_RADIO = "qemu_mps2_radio"
     DWM1001_DEV = "dwm1001_dev"
 
 

@@ -21,11 +21,10 @@ import numpy as np
 from uwb_mitigation.errors import ParameterError, RecordingError, UwbMitigationError
 from uwb_mitigation.link.board import Board, Corrector, Identity
 from uwb_mitigation.link.faults import ByteFaults, damage
-from uwb_mitigation.link.layout import PROTOCOL_VERSION, Mode
+from uwb_mitigation.link.layout import Mode
 from uwb_mitigation.measurement import RangeMeasurement, Record
 
 _READ_BYTES = 4096
-_FLOOD_BYTES = 4096
 _CLEAN = ByteFaults()
 _IDENTITY = Identity()
 
@@ -40,8 +39,6 @@ class BoardFaults:
     Attributes:
         channel: damage to bytes.
         lose, duplicate: probabilities that what is sent at once is lost, or arrives twice.
-        boot_noise: bytes of noise before each HELLO.
-        version: protocol version that the board speaks.
 
     Raises:
         ParameterError: a probability is outside 0 to 1.
@@ -50,8 +47,6 @@ class BoardFaults:
     channel: ByteFaults = _CLEAN
     lose: float = 0.0
     duplicate: float = 0.0
-    boot_noise: int = 0
-    version: int = PROTOCOL_VERSION
 
     def __post_init__(self) -> None:
         for name in ("lose", "duplicate"):
@@ -136,7 +131,7 @@ class EmulatedBoard:
     """Opens a pseudo-terminal and behaves there as a board that plays `source` over and over.
 
     Measurements keep their ids, sequence and device time; what they were stamped with is replaced by
-    the time of playing. The methods that make something go wrong may be called from any thread.
+    the time of playing. The methods may be called from any thread.
 
     Args:
         source: what the board measures, iterated over and over; None = it never measures.
@@ -187,8 +182,6 @@ class EmulatedBoard:
         self._lock = threading.RLock()
         self._stop = threading.Event()
         self._backlog = bytearray()
-        self._mute_until = 0.0
-        self._flood_until = 0.0
         self.plug()
         self._thread = threading.Thread(target=self._run, name="emulated board", daemon=True)
         self._thread.start()
@@ -214,32 +207,13 @@ class EmulatedBoard:
         with self._lock:
             self._boots += 1
             self._booted_ns = time.monotonic_ns()
-            self._board = Board(
-                self._identity,
-                self._corrector,
-                mode=self._mode,
-                boot_id=self._boots,
-                version=self._faults.version,
-            )
+            self._board = self._boot()
             # What the firmware had not yet sent is lost, in the middle of a frame or not.
             self._backlog.clear()
-            self._backlog += self._random.bytes(self._faults.boot_noise)
             self._transmit(self._board.hello(0))
 
-    def set_faults(self, faults: BoardFaults) -> None:
-        """Change what goes wrong; another protocol version holds from the next reset."""
-        with self._lock:
-            self._faults = faults
-
-    def mute(self, seconds: float) -> None:
-        """Send nothing for a while, as firmware that hangs."""
-        with self._lock:
-            self._mute_until = time.monotonic() + seconds
-
-    def flood(self, seconds: float) -> None:
-        """Send noise as fast as the port takes it."""
-        with self._lock:
-            self._flood_until = time.monotonic() + seconds
+    def _boot(self) -> Board:
+        return Board(self._identity, self._corrector, mode=self._mode, boot_id=self._boots)
 
     def pause(self) -> None:
         """Measure nothing until `resume`; all else goes on."""
@@ -248,11 +222,6 @@ class EmulatedBoard:
     def resume(self) -> None:
         """Measure again."""
         self._measuring = True
-
-    @property
-    def mode(self) -> Mode:
-        """The mode in force."""
-        return self._board.mode
 
     def close(self) -> None:
         """Unplug, and end the thread; may be called twice."""
@@ -302,7 +271,7 @@ class EmulatedBoard:
         with self._lock:
             if (controller := self._terminal.fd) is None:
                 return
-            sending = bool(self._backlog) and time.monotonic() >= self._mute_until
+            sending = bool(self._backlog)
         try:
             readable, writable, _ = select.select(
                 [controller], [controller] if sending else [], [], patience_s
@@ -315,14 +284,12 @@ class EmulatedBoard:
                 return
             if readable:
                 self._transmit(self._board.receive(self._terminal.read(), self._uptime_us()))
-            if time.monotonic() < self._flood_until and len(self._backlog) < _FLOOD_BYTES:
-                self._backlog += self._random.bytes(_FLOOD_BYTES)
             self._transmit(self._board.tick(self._uptime_us()))
             if writable:
                 self._terminal.write(self._backlog)
 
     def _transmit(self, data: bytes) -> None:
-        if not data or time.monotonic() < self._mute_until:
+        if not data:
             return
         faults = self._faults
         chances = self._random.random(2)

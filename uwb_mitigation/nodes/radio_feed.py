@@ -14,7 +14,7 @@ from uwb_mitigation.measurement import RangeMeasurement
 from uwb_mitigation.nodes import diagnostics, radio_facts
 from uwb_mitigation.nodes.feed import Description, LiveFeed, Value
 from uwb_mitigation.offsets import Offsets
-from uwb_mitigation.radio.opening import opener
+from uwb_mitigation.radio.bus import opener
 from uwb_mitigation.radio.port import RadioEvent, RadioLost, RadioPort
 
 RADIOS = ("evb1000", "spi")

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from typing import Protocol
+
+from uwb_mitigation.link.connection import PortAddress
 
 
 class Bus(Protocol):
@@ -47,3 +51,25 @@ class Bus(Protocol):
     def close(self) -> None:
         """May be called twice."""
         ...
+
+
+def opener(source: str, place: str, reset: str = "") -> Callable[[], Bus]:
+    """Return what opens the bus of one radio.
+
+    Args:
+        source: `evb1000` or `spi`.
+        place: `/dev/ttyACM0`, `usb:0483:5740`; or `/dev/spidev0.0`.
+        reset: of spi, the reset line, as `gpiochip0:25`; empty = not wired.
+
+    Raises:
+        ParameterError: `place` is not valid.
+        MissingDependencyError: what this kind of bus needs is not installed.
+    """
+    # Each kind imports its own dependencies, and only when it is wanted.
+    if source == "spi":
+        from uwb_mitigation.radio.spidev_bus import SpidevBus
+
+        return functools.partial(SpidevBus, place, reset)
+    from uwb_mitigation.radio.evb1000 import Evb1000Bus
+
+    return functools.partial(Evb1000Bus, PortAddress.parse(place))
