@@ -18,37 +18,21 @@ TICK_M = 299_792_458 * TICK_S
 TXSTRT, TXDLYS, TRXOFF, WAIT4RESP, RXENAB = 2, 4, 0x40, 0x80, 0x100
 CPLOCK, TXFRB, TXPRS, TXPHS, TXFRS = (1 << bit for bit in (1, 4, 5, 6, 7))
 RXPRD, RXSFDD, LDEDONE, RXPHD, RXPHE, RXDFR, RXFCG, RXFCE = (1 << bit for bit in range(8, 16))
-RXRFSL, RXRFTO, LDEERR, SLP2INIT, RXSFDTO, HPDWARN, TXPUTE = (
-    1 << bit for bit in (16, 17, 18, 23, 26, 27, 34)
-)
+RXRFSL, RXRFTO, LDEERR, RXSFDTO, HPDWARN, TXPUTE = (1 << bit for bit in (16, 17, 18, 26, 27, 34))
 ERRORS = RXPHE | RXFCE | RXRFSL | RXRFTO | RXSFDTO
 RX_GOOD = RXPRD | RXSFDD | LDEDONE | RXPHD | RXDFR | RXFCG
 
-_PREAMBLES = {64: 0x1, 128: 0x5, 256: 0x9, 512: 0xD, 1024: 0x2, 1536: 0x6, 2048: 0xA, 4096: 0x3}
-_PLL = {1: 0x09000407, 2: 0x08400508, 3: 0x08401009, 4: 0x08400508, 5: 0x0800041D, 7: 0x0800041D}
-_CODE = {1: (1, 9), 2: (3, 9), 3: (5, 9), 4: (7, 17), 5: (3, 9), 7: (7, 17)}
-_TUNE2 = {8: (0x311A002D, 0x313B006B), 16: (0x331A0052, 0x333B00BE), 32: (0x351A009A, 0x353B015E),
-          64: (0x371A011D, 0x373B0296)}  # fmt: skip
+_PREAMBLES = {64: 0x1, 128: 0x5, 256: 0x9, 1024: 0x2}
+_CODE = 9
 
 
 @dataclass(frozen=True)
 class Mode:
-    """How the air is used; rate 0 is 110 kbit/s, 1 850, 2 6.8M."""
+    """How the air is used, on channel 5 at PRF 64 MHz; rate 0 is 110 kbit/s, 2 is 6.8M."""
 
-    channel: int = 5
-    prf: int = 64
     rate: int = 2
     preamble: int = 128
-    decawave_sfd: bool = False
-    code: int = 0
     long_frames: bool = False
-
-    @property
-    def chunk(self) -> int:
-        """The preamble acquisition chunk that the manual recommends."""
-        return (
-            8 if self.preamble <= 128 else 16 if self.preamble <= 512 else 32 if self.preamble == 1024 else 64
-        )
 
 
 class Driver:
@@ -87,8 +71,8 @@ class Driver:
     def command(self, bits: int) -> None:
         self.set(0x0D, 0, bits, 4)
 
-    def start(self, mode: Mode = Mode(), *, load_lde: bool = True, delays: bool = True) -> None:
-        """Reset and configure; `load_lde` and `delays` are what a driver may forget."""
+    def start(self, mode: Mode = Mode(), *, load_lde: bool = True) -> None:
+        """Reset and configure; `load_lde` is what a driver may forget."""
         self.hz = SLOW_HZ
         self.host.reset_pin()
         self.host.delay(5e-3)
@@ -101,25 +85,17 @@ class Driver:
         self.host.delay(1e-3)
         self.hz = FAST_HZ
         self.configure(mode)
-        if delays:
-            self.set(0x18, 0, ANTENNA_DELAY_TICKS, 2)
-            self.set(0x2E, 0x1804, ANTENNA_DELAY_TICKS, 2)
+        self.set(0x18, 0, ANTENNA_DELAY_TICKS, 2)
+        self.set(0x2E, 0x1804, ANTENNA_DELAY_TICKS, 2)
 
     def configure(self, mode: Mode) -> None:
-        by_prf = mode.prf == 64
-        code = mode.code or _CODE[mode.channel][by_prf]
-        user = mode.decawave_sfd and mode.rate == 1
-        self.set(0x1F, 0, mode.channel * 0x11 | mode.decawave_sfd << 17 | (1 + by_prf) << 18 | user << 20
-                 | user << 21 | code << 22 | code << 27)  # fmt: skip
-        if user:
-            self.set(0x21, 0, 16, 1)
-        self.set(0x2B, 7, _PLL[mode.channel])
-        self.set(0x27, 8, _TUNE2[mode.chunk][by_prf])
-        sfd = 64 if mode.rate == 0 else 16 if user else 8
-        self.set(0x27, 0x20, mode.preamble + 1 + sfd - mode.chunk, 2)
+        self.set(0x1F, 0, 0x55 | 2 << 18 | _CODE << 22 | _CODE << 27)
+        self.set(0x2B, 7, 0x0800041D)
+        self.set(0x27, 8, 0x313B006B)  # acquisition chunks of 8 symbols
+        self.set(0x27, 0x20, mode.preamble + 1 + (64 if mode.rate == 0 else 8) - 8, 2)
         self.set(0x2E, 0x0806, 0x6D, 1)
         self.set(0x04, 0, 0x1200 | (mode.rate == 0) << 22 | (3 if mode.long_frames else 0) << 16)
-        self.fctrl = mode.rate << 13 | 0x8000 | (1 + by_prf) << 16 | _PREAMBLES[mode.preamble] << 18
+        self.fctrl = mode.rate << 13 | 0x8000 | 2 << 16 | _PREAMBLES[mode.preamble] << 18
 
     def load(self, data: bytes) -> None:
         """Put a frame into the transmit buffer."""
@@ -146,9 +122,6 @@ class Driver:
         self.set(0x36, 3, 0xE0, 1)
         self.set(0x36, 3, 0xF0, 1)
 
-    def received(self) -> bytes:
-        return self.read(0x11, 0, (self.get(0x10, 0, 2) & 0x3FF) - 2)
-
     @property
     def time(self) -> int:
         return self.get(0x06, 0, 5)
@@ -173,33 +146,25 @@ class Driver:
         return data
 
 
-def pair(
-    air: Air,
-    link: Link | None = None,
-    mode: Mode = Mode(),
-    *,
-    ppm: tuple[float, float] = (0.0, 0.0),
-    clocks: tuple[int, int] = (0, 0),
-    receiver: Mode | None = None,
-) -> tuple[Driver, Driver, Chip, Chip]:
+def pair(air: Air, link: Link | None = None, mode: Mode = Mode()) -> tuple[Driver, Driver, Chip, Chip]:
     """Two started chips, joined by a link of 3 m: their drivers, from outside of the air, and they themselves."""
-    chips = [air.chip(ppm=p, clock_ticks=c) for p, c in zip(ppm, clocks, strict=True)]
+    chips = air.chip(), air.chip()
     air.link(*chips, link or Link(3.0))
     drivers = [Driver(chip) for chip in chips]
-    drivers[0].start(mode)
-    drivers[1].start(receiver or mode)
+    for driver in drivers:
+        driver.start(mode)
     return (*drivers, *chips)
 
 
 DATA = bytes.fromhex("4188") + b"\x07payload"
 
 
-def exchange(sender: Driver, receiver: Driver, data: bytes = DATA) -> int:
+def exchange(sender: Driver, receiver: Driver) -> int:
     """Send while the other listens; the receiver's status then."""
     receiver.listen()
     receiver.host.delay(20e-6)
-    sender.send(data)
-    sender.host.delay(40e-3 if sender.fctrl >> 13 & 3 == 0 else 6e-3)
+    sender.send(DATA)
+    sender.host.delay(6e-3)
     return receiver.status
 
 

@@ -1,16 +1,17 @@
-"""The DW1000's model against the facts of the manual on which the firmware's driver relies, and as a library."""
+"""The DW1000's model as a library, and what a wrong driver would get from it, as from the chip.
+
+`test_radio_exchange.py` tests frames, timestamps and accumulators through the firmware's own driver.
+"""
 
 from __future__ import annotations
 
 import math
 import re
 import subprocess
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import dw1000_driver as dw
-import model_material
 import numpy as np
 import pytest
 from compilers import NEEDS_CC
@@ -22,8 +23,7 @@ from benchmarks.dw1000_model.library import model_folder, model_objects
 from benchmarks.dw1000_model.links import Link, link_of
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.firmware_export.compiling import WARNINGS, c_compiler, run
-from uwb_mitigation.measurement import Cir, RangeMeasurement, Truth
-from uwb_mitigation.sources.simulated import SimulatedSurvey
+from uwb_mitigation.measurement import Cir, RangeMeasurement
 
 pytestmark = NEEDS_CC
 
@@ -40,34 +40,6 @@ def chip(air: Air) -> Chip:
 @pytest.fixture
 def driver(chip: Chip) -> Driver:
     return Driver(chip)
-
-
-@pytest.mark.parametrize("header", [[0x00], [0x40, 0x00], [0x40, 0x80, 0x00]], ids=["1", "2", "3 octets"])
-def test_a_header_has_one_to_three_octets(chip: Chip, header: list[int]):
-    assert chip.spi(bytes([*header, 0, 0, 0, 0]), dw.FAST_HZ)[len(header) :] == ID
-
-
-@pytest.mark.parametrize(
-    ("file", "sub", "octets", "value"),
-    [
-        (0x00, 0x00, 4, 0xDECA0130),
-        (0x03, 0x00, 4, 0xFFFFFFFF),
-        (0x04, 0x00, 4, 0x1200),
-        (0x08, 0x00, 5, 0x15400C),
-        (0x1E, 0x00, 4, 0x1E080222),
-        (0x1F, 0x00, 4, 0x21040055),
-        (0x23, 0x12, 2, 0x0055),
-        (0x27, 0x20, 2, 4161),
-        (0x2B, 0x0E, 1, 0x60),
-        (0x2E, 0x0806, 1, 0x6C),
-        (0x36, 0x00, 4, 0xF0300200),
-        (0x36, 0x04, 4, 0x81020738),
-    ],
-)
-def test_a_reset_leaves_the_manuals_values(driver: Driver, file: int, sub: int, octets: int, value: int):
-    driver.host.reset_pin()
-    driver.host.delay(5e-3)
-    assert driver.get(file, sub, octets) == value
 
 
 def test_ones_clear_status_octet_by_octet_and_zeros_do_not(driver: Driver):
@@ -89,16 +61,6 @@ def test_the_interrupt_line_is_status_and_mask_with_its_polarity(driver: Driver,
     assert chip.irq()
 
 
-def test_the_counter_runs_on_its_own_crystal_in_steps_of_512(air: Air):
-    chip = air.chip(ppm=20.0, clock_ticks=(1 << 40) - 1000)
-    driver = Driver(chip)
-    began, first = chip.now(), driver.time
-    chip.delay(1.0)
-    ended, second = chip.now(), driver.time
-    assert first % 512 == second % 512 == 0
-    assert (second - first) % (1 << 40) == pytest.approx((ended - began) / dw.TICK_S * (1 + 20e-6), abs=600)
-
-
 class TestClocks:
     def test_spi_that_is_too_fast_before_the_pll_has_locked_reads_garbage(self, driver: Driver):
         driver.set(0x36, 0, 0x01, 1)
@@ -114,19 +76,6 @@ class TestClocks:
 
 
 class TestResets:
-    def test_a_soft_reset_takes_everything_back(self, driver: Driver):
-        driver.set(0x18, 0, 0x1234, 2)
-        driver.hz = dw.SLOW_HZ
-        driver.set(0x36, 0, 0x01, 1)
-        driver.set(0x36, 3, 0x00, 1)
-        driver.host.delay(20e-6)
-        driver.set(0x36, 3, 0xF0, 1)
-        assert driver.get(0x18, 0, 2) == 0
-        assert driver.get(0x36, 0) == 0xF0300200
-        driver.host.delay(20e-6)
-        driver.hz = dw.FAST_HZ
-        assert driver.read(0x00) == ID
-
     def test_rstn_driven_high_destroys_the_chip(self, driver: Driver, chip: Chip):
         chip.reset_drive(0)
         chip.delay(1e-3)
@@ -177,69 +126,6 @@ class TestMemories:
             stamps.append((b.rx_stamp - b.time) % (1 << 40))
         # Stamps lie a millisecond in the past where they mean something.
         assert min((-stamp) % (1 << 40) for stamp in stamps) > 1e9
-
-
-class TestFrames:
-    @pytest.mark.parametrize(
-        "mode",
-        [Mode(channel=channel, prf=prf) for channel in (1, 2, 3, 4, 5, 7) for prf in (16, 64)]
-        + [Mode(rate=rate, preamble=p) for rate, p in ((0, 1024), (0, 2048), (1, 256), (1, 512), (2, 64))]
-        + [Mode(preamble=1536), Mode(preamble=4096), Mode(rate=1, decawave_sfd=True)]
-        + [Mode(rate=0, preamble=2048, decawave_sfd=True), Mode(long_frames=True)],
-        ids=str,
-    )
-    def test_in_every_mode_a_frame_arrives_whole_and_in_time(self, air: Air, mode: Mode):
-        a, b, *_ = pair(air, Link(30.0), mode)
-        data = dw.DATA * (80 if mode.long_frames else 5)
-        assert exchange(a, b, data) & (dw.RX_GOOD | dw.ERRORS) == dw.RX_GOOD
-        assert b.received() == data
-        assert flight_ticks(a, b) == pytest.approx(30.0 / dw.TICK_M, abs=1)
-        assert a.status & TX_GOOD == TX_GOOD
-
-    @pytest.mark.parametrize(
-        ("mode", "octets", "air_time_us"),
-        [
-            # Symbols of 993.59 or 1017.63 ns, 21 of the header, 48 bits more for each 330 bits of data.
-            (Mode(prf=16), 12, 136 * 0.99359 + 21 * 1.02564 + (96 + 48) * 0.128205),
-            (Mode(), 127, 136 * 1.01763 + 21 * 1.02564 + (1016 + 4 * 48) * 0.128205),
-            (Mode(rate=0, preamble=1024), 12, 1088 * 1.01763 + 21 * 8.20513 + (96 + 48) * 8.20513),
-        ],
-        ids=str,
-    )
-    def test_a_frame_takes_its_air_time(self, air: Air, mode: Mode, octets: int, air_time_us: float):
-        a, *_ = pair(air, mode=mode)
-        a.set(0x0E, 0, dw.TXFRS)
-        a.load(bytes(octets - 2))
-        a.command(dw.TXSTRT)
-        began = a.host.now()
-        a.host.wait(10e-3)
-        # The transmitter takes 10 us to start, and waits for the grid.
-        assert (a.host.now() - began) * 1e6 == pytest.approx(air_time_us + 10, abs=0.5)
-
-
-class TestStamps:
-    @pytest.mark.parametrize("ppm", [(-20.0, 20.0), (0.0, 0.0), (20.0, -20.0)])
-    def test_a_stamp_is_the_marker_at_the_antenna_on_the_grid(self, air: Air, ppm: tuple[float, float]):
-        a, b, *_ = pair(air, Link(10.0, excess_m=1.5), ppm=ppm, clocks=(dw.WRAP - 10**9, 0))
-        flights = []
-        for _ in range(3):
-            assert exchange(a, b) & dw.RXFCG
-            assert a.get(0x17, 5, 5) % 512 == 0
-            assert (a.tx_stamp - a.get(0x17, 5, 5)) % dw.WRAP == 16436
-            flights.append(flight_ticks(a, b))
-        # Between clocks that differ a flight means little, but its change over 6 ms is their difference.
-        if ppm == (0.0, 0.0):
-            expected = (11.5 / dw.TICK_M - (dw.WRAP - 10**9) + dw.WRAP // 2) % dw.WRAP - dw.WRAP // 2
-            assert flights == pytest.approx([expected] * 3, abs=1)
-
-    def test_a_delayed_frame_leaves_at_its_time_on_the_grid(self, air: Air):
-        a, b, *_ = pair(air, Link(10.0), clocks=(12345, 12345))
-        b.listen()
-        wanted = a.time + 64_000_000 + 333
-        a.send_at(dw.DATA, wanted)
-        a.host.delay(2e-3)
-        assert a.tx_stamp == wanted - wanted % 512 + 16436
-        assert b.rx_stamp == pytest.approx(a.tx_stamp + 10.0 / dw.TICK_M, abs=1)
 
 
 class TestTransmitter:
@@ -400,30 +286,6 @@ class TestSending:
 
 
 class TestChannel:
-    def simulated(self, seed: int = 3) -> Iterator[tuple[Link, object]]:
-        for record in SimulatedSurvey(seed=seed, configurations=4, exchanges=1):
-            yield link_of(record.measurement, record.truth), record.measurement
-
-    def test_the_accumulator_is_the_links_bit_for_bit_whole_and_in_part(self, air: Air):
-        a, b, one, two = pair(air)
-        for link, _ in self.simulated():
-            air.link(one, two, link)
-            assert exchange(a, b) & dw.RXFCG
-            whole = np.frombuffer(b.accumulator(0, 1016), "<i2")
-            assert np.array_equal(whole, link.samples)
-            first = b.get(0x15, 5, 2) // 64 - 5
-            part = np.frombuffer(b.accumulator(first, 157), "<i2")
-            assert np.array_equal(part, link.samples[2 * first : 2 * (first + 157)])
-
-    def test_the_first_octet_of_every_read_is_a_dummy(self, air: Air):
-        a, b, *_ = pair(air, Link(3.0, samples=np.arange(2032, dtype=np.int16)))
-        assert exchange(a, b) & dw.RXFCG
-        b.set(0x36, 0, 0x8248, 2)
-        for sample in (0, 100, 745):
-            dummy, *octets = b.read(0x25, 4 * sample, 5)
-            assert bytes(octets) == np.array([2 * sample, 2 * sample + 1], "<i2").tobytes()
-            assert dummy not in (octets[0], 0)
-
     def test_without_its_clocks_the_accumulator_reads_nothing(self, air: Air):
         a, b, *_ = pair(air)
         assert exchange(a, b) & dw.RXFCG
@@ -448,58 +310,10 @@ class TestChannel:
         a.listen()
         assert not any(a.accumulator(0, 1016))
 
-    def test_the_registers_follow_from_the_accumulator(self, air: Air):
-        a, b, one, two = pair(air)
-        for link, measurement in self.simulated():
-            air.link(one, two, link)
-            assert exchange(a, b) & dw.RXFCG
-            cir = measurement.cir
-            samples = cir.samples.astype(np.float64)
-            magnitude = np.hypot(samples[0::2], samples[1::2])
-            index = b.get(0x15, 5, 2) / 64
-            assert index == pytest.approx(cir.first_path_index, abs=1 / 64)
-            first = int(index)
-            told = [b.get(0x15, 7, 2), b.get(0x12, 2, 2), b.get(0x12, 4, 2)]
-            assert told == pytest.approx(magnitude[first + 1 : first + 4], abs=0.51)
-            assert b.get(0x2E, 0, 2) == cir.noise_threshold
-            assert b.get(0x12, 0, 2) == pytest.approx(cir.noise_threshold / 13, abs=1)
-            count = b.get(0x10) >> 20
-            assert count == cir.preamble_count
-            assert b.get(0x27, 0x2C, 2) > count, "accumulation stopped early"
-            # One step of CIR_PWR is what a level cannot be told better than.
-            step = b.get(0x12, 6, 2)
-            receive = 10 * math.log10(step * 2**17 / count**2) - 121.74
-            near = 10 * math.log10(sum(f * f for f in told) / count**2) - 121.74
-            assert receive == pytest.approx(cir.rx_power_dbm, abs=1e-3)
-            assert near == pytest.approx(cir.first_path_power_dbm, abs=1e-3)
-
-
-def history(seed: int) -> list[int]:
-    """What three frames a link met that loses and damages."""
-    with Air(seed) as air:
-        a, b, *_ = pair(air, Link(3.0, loss=0.3, damage=0.3))
-        seen = []
-        for _ in range(30):
-            seen.append(exchange(a, b))
-            seen.append(b.rx_stamp)
-            b.off()
-            b.reset_receiver()
-        return seen
-
-
-def test_the_seed_decides():
-    assert history(5) == history(5)
-    assert history(5) != history(6)
-
 
 class TestLinks:
     def measurement(self, cir: Cir, range_m: float = 4.0) -> RangeMeasurement:
         return RangeMeasurement(0, 1, 2, 3, 4, range_m, cir)
-
-    def test_the_error_is_the_links_excess(self):
-        link = link_of(self.measurement(model_material.cir(1)), Truth(3.5))
-        assert (link.distance_m, link.excess_m) == (3.5, 0.5)
-        assert link_of(self.measurement(model_material.cir(1))).excess_m == 0
 
     def test_a_part_of_an_accumulator_lies_where_it_was(self):
         part = Cir(np.arange(1, 9, dtype=np.int16), start_index=740, first_path_index=741.5, scale=2.0)

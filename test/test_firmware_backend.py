@@ -17,7 +17,7 @@ from compilers import NEEDS_CC
 
 from uwb_mitigation.bag.codec import encode_range
 from uwb_mitigation.errors import MissingDependencyError
-from uwb_mitigation.firmware_export import compiling, toolchain
+from uwb_mitigation.firmware_export import compiling
 from uwb_mitigation.firmware_export.host import FirmwareMitigation
 from uwb_mitigation.measurement import Status
 from uwb_mitigation.mitigation import Mitigation
@@ -70,13 +70,6 @@ def test_cc_may_be_empty_and_may_carry_options(words: str, monkeypatch: pytest.M
     monkeypatch.setattr(compiling.shutil, "which", lambda name: {"gcc": "/usr/bin/gcc"}.get(name))
     monkeypatch.delenv("CC")
     assert compiling.c_compiler() == ("gcc",)
-
-
-def test_what_only_a_checkout_has_is_said_to_need_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(toolchain, "firmware_folder", lambda: tmp_path)
-    monkeypatch.setattr(toolchain, "require_tools", lambda: None)
-    with pytest.raises(MissingDependencyError, match="run from a source checkout"):
-        toolchain.build_image(tmp_path, tmp_path, toolchain.Target.QEMU_MPS2)
 
 
 @NEEDS_CC

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from benchmarks import random_networks
-from uwb_mitigation.errors import ModelError, UwbMitigationError
+from uwb_mitigation.errors import ModelError
 from uwb_mitigation.firmware_export.export import export_bundle, number
 from uwb_mitigation.firmware_export.packing import pack
 from uwb_mitigation.model import graph
@@ -85,12 +85,6 @@ def test_a_sum_without_exact_integers_is_refused_by_name():
     scales = {**weights.activation_scale, "module1.sum": weights.activation_scale["first"] / np.float32(3)}
     with pytest.raises(ModelError, match=r"module1\.sum"):
         pack(replace(weights, activation_scale=scales))
-
-
-def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(UwbMitigationError, match="file"):
-        export_bundle(firmware_models.exact_bundle(tmp_path), tmp_path / "file")
 
 
 def test_a_hostile_name_cannot_end_the_comment(tmp_path: Path):

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import shutil
-import subprocess
 from pathlib import Path
 
 import firmware_models
@@ -12,7 +10,7 @@ import numpy as np
 import pytest
 from compilers import NEEDS_CC
 
-from uwb_mitigation.firmware_export.compiling import compile_objects, firmware_folder, run
+from uwb_mitigation.firmware_export.compiling import firmware_folder
 from uwb_mitigation.firmware_export.export import export_bundle
 from uwb_mitigation.firmware_export.host import link
 from uwb_mitigation.link import messages
@@ -299,19 +297,6 @@ def test_a_clock_request_is_answered_before_all_that_waits(library: ctypes.CDLL)
     c.close()
 
 
-def test_an_answer_that_does_not_fit_is_counted(library: ctypes.CDLL):
-    c = BoardInC(library, Mode.HOST, queue=6000)
-    host = FrameEncoder()
-    measured = firmware_models.random_measurement(np.random.default_rng(3))
-    for _ in range(200):
-        c.receive(host.encode(*messages.encode(measured)), 5, read=False)
-    *answers, status = [messages.decode(f.type, f.payload) for f in FrameDecoder().feed(c.tick(2_000_000))]
-    assert all(isinstance(answer, messages.Correction) for answer in answers)
-    assert isinstance(status, messages.BoardStatus)
-    assert status.measurements_lost == 200 - len(answers) > 0
-    c.close()
-
-
 def test_damage_on_the_radios_side_is_told_in_a_log(library: ctypes.CDLL):
     c = BoardInC(library, Mode.HOST)
     assert c.measure(b"\0\x05ab\0", 5) == b""
@@ -320,17 +305,3 @@ def test_damage_on_the_radios_side_is_told_in_a_log(library: ctypes.CDLL):
     assert b"radio" in log.payload
     assert len(FrameDecoder().feed(c.tick(2_000_000))) == 1
     c.close()
-
-
-@pytest.mark.skipif(shutil.which("clang") is None, reason="no libFuzzer: apt install clang")
-@pytest.mark.parametrize("target", ["fuzz_link", "fuzz_correct"])
-def test_fuzzing_for_a_moment_finds_nothing(target: str, bundle: Bundle, tmp_path: Path):
-    export_bundle(bundle, tmp_path)
-    source, program = firmware_folder() / "src", tmp_path / target
-    flags = ("-g", "-O1", "-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=all", f"-I{source}")
-    objects = compile_objects(("clang",), flags, tuple(sorted(source.glob("*.c"))))
-    main = str(firmware_folder() / "test" / f"{target}.c")
-    run(["clang", *flags, "-DUWB_LIBFUZZER", f"-I{tmp_path}", main, *objects, "-lm", "-o", str(program)])
-    options = ("-runs=1500", "-seed=1", "-max_len=4096", "-len_control=0")
-    done = subprocess.run([program, *options], cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr[-2000:]

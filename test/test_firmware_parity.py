@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from compilers import NEEDS_CC, NEEDS_CXX
 from firmware_models import Exported
-from model_material import window_of
 
 from benchmarks import random_networks
 from uwb_mitigation.errors import UwbMitigationError
@@ -29,7 +28,7 @@ from uwb_mitigation.model.bundle import load_bundle, save_bundle
 from uwb_mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.model.prior import LinePrior
 from uwb_mitigation.model.shipped import default_model_path, shipped_model_path
-from uwb_mitigation.preprocessing import Preprocessing, Scaling
+from uwb_mitigation.preprocessing import Scaling
 
 pytestmark = NEEDS_CC
 
@@ -76,37 +75,6 @@ def test_any_length_and_number_of_modules(samples: int, modules: int, tmp_path: 
     windows = random_networks.pressing_windows(samples, weights.activation_scale["input"], 40)
     computed = HostFirmware(tmp_path, tmp_path, SANITIZED).predict_m(windows)
     assert np.array_equal(bits(computed), bits(IntegerNetwork(weights).predict_m(windows)))
-
-
-@pytest.fixture(scope="module")
-def firmware(tmp_path_factory: pytest.TempPathFactory) -> dict[Scaling, HostFirmware]:
-    """A small model for each scaling."""
-    built = {}
-    for scaling in Scaling:
-        folder = tmp_path_factory.mktemp(scaling.value)
-        identity = firmware_models.identity(scaling=scaling)
-        firmware_models.write_model(folder, random_networks.remnet(32, 3), identity)
-        built[scaling] = HostFirmware(folder, folder, SANITIZED)
-    return built
-
-
-@pytest.mark.parametrize("scaling", list(Scaling))
-def test_preprocessing_gives_the_same_bits_and_the_same_faults(
-    scaling: Scaling, firmware: dict[Scaling, HostFirmware]
-):
-    random = np.random.default_rng(7)
-    preprocessing = Preprocessing(32, scaling)
-    computed = np.zeros(32, np.float32)
-    faults = set()
-    for _ in range(2000):
-        cir = firmware_models.random_cir(random)
-        fault, expected = window_of(cir, preprocessing)
-        assert (firmware[scaling].preprocess(cir, computed) or 0) == fault
-        if not fault:
-            assert np.array_equal(bits(computed), bits(expected))
-        faults.add(fault)
-    assert len(faults) >= 8
-    assert 0 in faults
 
 
 @pytest.mark.filterwarnings("ignore:overflow")

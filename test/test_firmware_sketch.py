@@ -24,6 +24,18 @@ from uwb_mitigation.sources.simulated import SimulatedSource
 
 EXAMPLES = Path(__file__).parent.parent / "firmware" / "examples"
 SKETCH = EXAMPLES / "UwbMitigation"
+STUB = firmware_folder() / "test" / "arduino_stub"
+
+
+def compile_sketch(name: str, folder: Path, compiler: tuple[str, ...], *files: str) -> Path:
+    """Compile a sketch against the stand-in and the model in `folder`, if there is one; return the program."""
+    # The fresh export, not the committed header: that one has a test of its own.
+    sketch, program = folder / f"{name}.cpp", folder / "sketch"
+    sketch.write_text((EXAMPLES / name / f"{name}.ino").read_text())
+    warnings = ("-Wall", "-Wextra", "-Werror", "-include", str(STUB / "Arduino.h"))
+    includes = (f"-I{STUB}", f"-I{firmware_folder() / 'src'}", f"-I{model_folder()}", f"-I{folder}")
+    run([*compiler, *warnings, *includes, str(sketch), *files, "-o", str(program)])
+    return program
 
 
 def test_the_sketchs_model_is_the_shipped_one(tmp_path: Path):
@@ -34,18 +46,9 @@ def test_the_sketchs_model_is_the_shipped_one(tmp_path: Path):
 
 @NEEDS_CXX
 def test_the_sketch_corrects_what_the_radio_sends_in_writes_that_are_safe_on_usb(tmp_path: Path):
-    firmware = firmware_folder()
-    stub, library = firmware / "test" / "arduino_stub", firmware / "src"
     export_bundle(load_bundle(default_model_path()), tmp_path)
-    program = tmp_path / "sketch"
-    flags = ("-std=gnu++14", "-O1", "-Wall", "-Wextra", "-Werror", "-include", str(stub / "Arduino.h"))
-    # The fresh export, not the committed header: that one has a test of its own.
-    sketch = tmp_path / "UwbMitigation.cpp"
-    sketch.write_text((SKETCH / "UwbMitigation.ino").read_text())
-    includes = (f"-I{stub}", f"-I{library}", f"-I{tmp_path}")
-    files = (str(sketch), str(stub / "main.cpp"), *library_objects())
-    run(["c++", *flags, *includes, *files, "-lm", "-o", str(program)])
-
+    files = (str(STUB / "main.cpp"), *library_objects(), "-lm")
+    program = compile_sketch("UwbMitigation", tmp_path, ("c++", "-std=gnu++14", "-O1"), *files)
     encoder = FrameEncoder()
     wires = [encoder.encode(*messages.encode(r.measurement)) for r in SimulatedSource(seed=2, count=25)]
     done = subprocess.run(
@@ -77,32 +80,18 @@ def test_the_sketch_corrects_what_the_radio_sends_in_writes_that_are_safe_on_usb
 @pytest.mark.parametrize("name", ["UwbMitigation", "UwbRanger"])
 def test_the_sketches_compile_for_the_boards_processor(tmp_path: Path, name: str):
     """As the Arduino core for the nRF52840 compiles, but for its headers: sizes of types, warnings, what is inlined."""
-    firmware = firmware_folder()
     export_bundle(load_bundle(default_model_path()), tmp_path)
-    sketch = tmp_path / f"{name}.cpp"
-    sketch.write_text((EXAMPLES / name / f"{name}.ino").read_text())
-    stub = firmware / "test" / "arduino_stub"
     cpu = ("-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=softfp", "-mfpu=fpv4-sp-d16")
-    flags = ("-std=gnu++14", "-Os", "-Wall", "-Wextra", "-Werror", "-include", str(stub / "Arduino.h"))
-    includes = (f"-I{stub}", f"-I{firmware / 'src'}", f"-I{tmp_path}")
-    run(["arm-none-eabi-g++", *cpu, *flags, *includes, "-c", str(sketch), "-o", str(tmp_path / "sketch.o")])
+    compile_sketch(name, tmp_path, ("arm-none-eabi-g++", *cpu, "-std=gnu++14", "-Os", "-c"))
 
 
 @NEEDS_CXX
 @pytest.mark.parametrize("with_model", [False, True], ids=["without a model", "with one"])
 def test_the_sketch_with_a_radio_ranges_on_a_modelled_chip(tmp_path: Path, with_model: bool):
-    firmware = firmware_folder()
-    stub = firmware / "test" / "arduino_stub"
     if with_model:
         export_bundle(load_bundle(default_model_path()), tmp_path)
-    sketch = tmp_path / "UwbRanger.cpp"
-    sketch.write_text((EXAMPLES / "UwbRanger" / "UwbRanger.ino").read_text())
-    flags = ("-std=gnu++17", "-O1", "-Wall", "-Wextra", "-Werror", "-include", str(stub / "Arduino.h"))
-    includes = (f"-I{stub}", f"-I{firmware / 'src'}", f"-I{model_folder()}", f"-I{tmp_path}")
-    files = (str(sketch), str(stub / "radio_main.cpp"), *library_objects(), *model_objects())
-    program = tmp_path / "sketch"
-    run(["c++", *flags, *includes, *files, "-lm", "-lpthread", "-o", str(program)])
-
+    files = (str(STUB / "radio_main.cpp"), *library_objects(), *model_objects(), "-lm", "-lpthread")
+    program = compile_sketch("UwbRanger", tmp_path, ("c++", "-std=gnu++17", "-O1"), *files)
     done = subprocess.run([program, "0.5"], capture_output=True, timeout=240, check=False)
 
     assert done.returncode == 0

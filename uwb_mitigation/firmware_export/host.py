@@ -24,7 +24,6 @@ from uwb_mitigation.measurement import Cir, CorrectedColumns, RangeColumns, Stat
 from uwb_mitigation.mitigation import Backend, passed_through
 from uwb_mitigation.model.bundle import Bundle
 from uwb_mitigation.offsets import NO_OFFSETS, Offsets
-from uwb_mitigation.preprocessing import CirFault
 
 _OPTIONS = ("-std=c99", "-O3", "-fPIC", *WARNINGS)
 
@@ -81,7 +80,6 @@ class HostFirmware:
             ctypes.c_size_t,
             ctypes.POINTER(ctypes.c_float),
         )
-        library.uwb_preprocess.argtypes = (ctypes.c_void_p, ctypes.POINTER(_Cir), ctypes.c_void_p)
         library.uwb_correct.argtypes = (
             ctypes.c_void_p,
             ctypes.c_float,
@@ -109,11 +107,6 @@ class HostFirmware:
                 raise ModelError(f"the firmware refuses the model: status {status}")
             outputs[index] = value.value
         return outputs
-
-    def preprocess(self, cir: Cir, out: NDArray[np.float32]) -> CirFault | None:
-        """Write the network's input to `out`, float32 (K,); return what makes the CIR unusable."""
-        status = self._library.uwb_preprocess(self._model, ctypes.byref(_c_cir(cir)), out.ctypes.data)
-        return CirFault(status) if status else None
 
     def correct(self, range_m: float, cir: Cir, offset_m: float = 0.0) -> tuple[float, float, float, int]:
         """Range, correction, variance and status, as in `CorrectedRange`."""
