@@ -209,7 +209,7 @@ class Fleet:
             found.append(f"ranges of anchors that are not in the anchors file: {names}")
         for tag in self.tags.values():
             locator, name = tag.locator, f"tag {format_id(tag.tag_id)}"
-            if not locator.following:
+            if locator.filter is None:
                 found.append(f"{name}: {self._why(locator)}")
             odd = [self.anchors.anchors[row] for row in locator.disagreeing()]
             found += [

@@ -1,6 +1,6 @@
-"""One tag from its first range on: finds its place, follows it, notices when it is lost, and finds it again.
+"""The position of one tag from its first range: initialisation, tracking, detection of a lost track, and relocalisation.
 
-While more than one place explains the ranges, each is followed by a filter of its own, and nothing is told.
+While several positions explain the ranges, each is followed by a filter of its own, and no position is published.
 """
 
 from __future__ import annotations
@@ -13,23 +13,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.positioning.anchors import AnchorMap
-from uwb_mitigation.positioning.filter import FIRST_ERROR, RangeFilter
+from uwb_mitigation.positioning.filter import FIRST_ERROR, OFFSET, RangeFilter
 from uwb_mitigation.positioning.geometry import Area, Geometry, Height, geometry
 from uwb_mitigation.positioning.model import Model
 from uwb_mitigation.positioning.start import IMPLAUSIBLE, Place, places
 from uwb_mitigation.positioning.tracks import Estimate, Heights, Ranges, Track
 
 WINDOW_S = 1.0
-"""A place is sought from the ranges of so long: every anchor has had its turn, and a robot is a metre on."""
+"""A position is searched from the ranges of this time: every anchor had its turn, and a robot has moved by a metre."""
 
 SILENCE_S = 3.0
-"""After a longer silence of all anchors the place is sought anew: a line through the old one may mislead."""
+"""After a longer time without ranges the position is searched again: the predicted one may mislead."""
 
 STRANGE = 3.0
-"""A range with a larger normalised innovation disagrees with the filter."""
+"""A range with a larger normalised innovation contradicts the filter."""
 
 DISAGREES = 1.5
-"""An anchor whose normalised innovations have such a mean disagrees: what persists for a second averages out."""
+"""An anchor contradicts the others if the mean of its normalised innovations is larger: persisting errors average out."""
+
+HEIGHT_AGE_NS = 200_000_000
 
 _BENDS_M = 0.5
 """A height that moves an estimate by more in plan is not a linear measurement: the position is searched again."""
@@ -40,10 +42,8 @@ _SEPARABLE = 9.0
 _UNDETERMINED_M = 5.0
 """A position with a larger horizontal standard deviation is not determined by the ranges."""
 
-HEIGHT_AGE_NS = 200_000_000
-
 _KEPT_RANGES = 400
-_MOST_PLACES = 12
+_MAX_PLACES = 12
 _RETRY_S = 0.25
 _LEARN_SPARE = 2
 _NANOSECONDS = 1_000_000_000
@@ -51,19 +51,17 @@ _NANOSECONDS = 1_000_000_000
 
 @dataclass(slots=True)
 class AnchorState:
-    """What the latest ranges of one anchor said.
+    """Statistics of the latest ranges of one anchor.
 
     Attributes:
-        ranges: how many in all.
-        heard_s: time of the latest; -inf = never.
-        z: its normalised innovation.
-        strange: share of the latest ranges (some twenty) that disagreed.
-        mean_z: running mean of the normalised innovation over some fifty ranges, each at most 5.
+        ranges: total number.
+        heard_s: time of the latest; -inf: none.
+        strange: share of the latest ranges (about twenty) that contradicted the filter.
+        mean_z: running mean of the normalised innovation over about fifty ranges, each limited to 5.
     """
 
     ranges: int = 0
     heard_s: float = -math.inf
-    z: float = 0.0
     strange: float = 0.0
     mean_z: float = 0.0
 
@@ -76,7 +74,7 @@ class _Candidate:
 
 @dataclass(slots=True)
 class TagCounts:
-    """What befell a tag: ranges that were skipped since they ran backwards, times it was found, lost, silent."""
+    """Numbers of ranges out of order, and of times a tag was found, lost, and without ranges."""
 
     backwards: int = 0
     found: int = 0
@@ -86,7 +84,7 @@ class TagCounts:
 
 @dataclass(slots=True)
 class InnovationMeans:
-    """Running means over some hundred ranges: of the normalised innovation, and of its square (1 is ideal)."""
+    """Running means over about a hundred ranges: of the normalised innovation, and of its square (1 is ideal)."""
 
     mean: float = 0.0
     square: float = 1.0
@@ -97,27 +95,26 @@ class InnovationMeans:
         self.square += 0.01 * (z * z - self.square)
 
 
-@dataclass(slots=True)
-class _Heard:
-    time_s: float
-    anchor: int
-    range_m: float
-    variance_m2: float
-
-
 class TagLocator:
     """Args:
         anchors, model: as of the filter.
-        height: of the tag, where it stays the same.
-        area: where the tag can be; None = wherever the ranges reach.
+        height: of the tag, if constant.
+        area: where the tag can be; None: no limits.
 
     Attributes:
         anchors: as given.
         states: of each anchor.
-        counts, health: what happened so far.
-        candidates: how many places are plausible; 1 = the tag is followed, 0 = too little is known.
+        counts, health: statistics since the start.
+        filter: the filter that follows the tag; None: its position is searched.
         undetermined: the ranges do not determine the horizontal position at all.
     """
+
+    filter: RangeFilter | None
+    _last_known: RangeFilter | None
+    _candidates: list[_Candidate]
+    _ambiguous_with: list[NDArray[np.float64]]
+    _origin_ns: int | None
+    _time_s: float
 
     def __init__(
         self,
@@ -129,88 +126,66 @@ class TagLocator:
     ) -> None:
         self.anchors = anchors
         self.states = [AnchorState() for _ in range(len(anchors))]
-        self.counts = TagCounts()
-        self.health = InnovationMeans()
-        self._model = model or Model()
-        self._height = height
-        self._area = area
-        self._filter: RangeFilter | None = None
-        self._last_known: RangeFilter | None = None
-        self._candidates: list[_Candidate] = []
-        self._ambiguous_with: list[NDArray[np.float64]] = []
+        self.counts, self.health = TagCounts(), InnovationMeans()
         self.undetermined = False
-        self._pressed = False
+        self._model, self._height, self._area = model or Model(), height, area
         self._heights: deque[tuple[float, float, float]] = deque(maxlen=_KEPT_RANGES)
-        self._recent: deque[_Heard] = deque(maxlen=_KEPT_RANGES)
-        self._origin_ns: int | None = None
-        self._time_s = -math.inf
-        self._next_try_s = -math.inf
-        self._checked_s = -math.inf
-        self._sought_since_s = -math.inf
+        self._recent: deque[tuple[float, int, float, float]] = deque(maxlen=_KEPT_RANGES)
+        self._pressed = False
+        self.restart()
 
     @property
     def candidates(self) -> int:
-        if self._filter is not None:
-            return 1
-        return len(self._candidates) + len(self._ambiguous_with)
-
-    @property
-    def following(self) -> bool:
-        """Whether the tag has one place."""
-        return self._filter is not None
-
-    @property
-    def filter(self) -> RangeFilter | None:
-        """The filter that follows the tag; None while its place is sought."""
-        return self._filter
+        """The number of plausible positions; 1: the tag is followed, 0: there are too few ranges."""
+        return 1 if self.filter is not None else len(self._candidates) + len(self._ambiguous_with)
 
     def add(
         self, stamp_ns: int, anchor: int, range_m: float, variance_m2: float = math.nan
     ) -> Estimate | None:
-        """Take in a range.
+        """Update with a range.
 
         Args:
-            stamp_ns: of the range; one up to `WINDOW_S` older than the latest is taken as if it came with that.
+            stamp_ns: of the range; if it is up to `WINDOW_S` older than the latest one, that time is used.
             anchor: a row of the anchors.
-            range_m: m; one that is not finite or negative is skipped.
-            variance_m2: m^2; NaN = unknown. An infinite one is skipped.
+            range_m: m; a range that is not finite or negative is skipped.
+            variance_m2: m^2; NaN: unknown. A range with an infinite one is skipped.
 
         Returns:
-            Where the tag is now; None while that is not known.
+            The estimate; None: the position is not known.
         """
         if not (math.isfinite(range_m) and range_m >= 0.0) or variance_m2 == math.inf:
             return None
         time_s = self._seconds(stamp_ns)
         if time_s < self._time_s:
             if time_s < self._time_s - WINDOW_S:
-                # A replay that starts again: what was known belongs to another time.
+                # A replay starts again.
                 self.restart(stamp_ns)
                 time_s = 0.0
             else:
                 self.counts.backwards += 1
                 time_s = self._time_s
-        if self._filter is not None and time_s - self._time_s > SILENCE_S:
+        if self.filter is not None and time_s - self._time_s > SILENCE_S:
             self.counts.silent += 1
             self._seek(time_s)
         self._time_s = time_s
-        self._recent.append(_Heard(time_s, anchor, range_m, variance_m2))
+        self._recent.append((time_s, anchor, range_m, variance_m2))
         state = self.states[anchor]
         state.ranges += 1
         state.heard_s = time_s
-        if self._filter is None:
+        if self.filter is None:
             self._search(time_s, anchor, range_m, variance_m2)
         else:
-            self._follow(self._filter, time_s, anchor, range_m, variance_m2)
-        return self._estimate(stamp_ns) if self._filter is not None else None
+            self._follow(self.filter, time_s, anchor, range_m, variance_m2)
+        return None if self.filter is None else _as_estimate(self.filter, stamp_ns)
 
     def add_height(self, height_m: float, variance_m2: float) -> None:
-        """Take in the tag's height (finite) with its variance (positive), at the time of the latest range."""
+        """Update with the tag's height (finite) and its variance (positive), at the time of the latest range."""
         self._heights.append((self._time_s, height_m, variance_m2))
         if self._height is None and any(_bends(one, height_m, variance_m2) for one in self._filters()):
             found = self._places()
-            if found and len(found) <= _MOST_PLACES:
-                self._last_known = self._filter or self._last_known
-                self._filter = None
+            if found and len(found) <= _MAX_PLACES:
+                self._last_known = self.filter or self._last_known
+                self.filter = None
                 self._start(found, self._time_s)
                 self._settle()
                 return
@@ -222,22 +197,18 @@ class TagLocator:
                     candidate.loss += float(self._model.loss(np.float64(z)))
 
     def at(self, stamp_ns: int) -> Estimate | None:
-        """Where the tag is at a time from the latest range on, without another range; None = not known.
-
-        While its place is sought after a silence, that is where the last known motion leads.
-        """
-        known = self._filter
-        if known is None:
+        """Predict the position at a time after the latest range; None: not known."""
+        if self.filter is None:
             return None
-        ahead = known.copy()
+        ahead = self.filter.copy()
         ahead.predict(self._seconds(stamp_ns))
         self._confine(ahead)
         return _as_estimate(ahead, stamp_ns)
 
     def restart(self, stamp_ns: int | None = None) -> None:
-        """Forget the place, not the counts."""
+        """Forget the position, not the statistics."""
         self._origin_ns = stamp_ns
-        self._filter = self._last_known = None
+        self.filter = self._last_known = None
         self._candidates, self._ambiguous_with = [], []
         self._recent.clear()
         self._heights.clear()
@@ -246,21 +217,21 @@ class TagLocator:
             state.heard_s, state.strange = -math.inf, 0.0
 
     def heard(self, within_s: float = WINDOW_S) -> list[int]:
-        """Rows of the anchors that were heard within so long before the latest range."""
+        """Return the rows of the anchors that were received within that time before the latest range."""
         return [i for i, s in enumerate(self.states) if s.heard_s >= self._time_s - within_s]
 
     def disagreeing(self) -> list[int]:
-        """Rows of anchors whose ranges disagree with those of most others."""
+        """Return the rows of anchors whose ranges contradict those of most others."""
         heard = self.heard(5.0)
         odd = [i for i in heard if abs(self.states[i].mean_z) > DISAGREES]
         return odd if 2 * len(odd) < len(heard) else []
 
     def geometry(self) -> Geometry | None:
-        """How the anchors heard now lie as seen from the tag; None while its place is not known."""
-        if self._filter is None:
+        """Return the geometry of the anchors that are received; None: the position is not known."""
+        if self.filter is None:
             return None
         rows = self.heard()
-        return geometry(self.anchors.position[rows], self._filter.position, level=self._dims == 2)
+        return geometry(self.anchors.position[rows], self.filter.position, level=self._dims == 2)
 
     def _seconds(self, stamp_ns: int) -> float:
         if self._origin_ns is None:
@@ -268,10 +239,7 @@ class TagLocator:
         return (stamp_ns - self._origin_ns) / _NANOSECONDS
 
     def _filters(self) -> list[RangeFilter]:
-        return [self._filter] if self._filter is not None else [c.filter for c in self._candidates]
-
-    def _estimate(self, stamp_ns: int) -> Estimate | None:
-        return _as_estimate(self._filter, stamp_ns) if self._filter is not None else None
+        return [self.filter] if self.filter is not None else [c.filter for c in self._candidates]
 
     def _follow(
         self, known: RangeFilter, time_s: float, anchor: int, range_m: float, variance_m2: float
@@ -282,7 +250,6 @@ class TagLocator:
             self._pressed = True
         self.health.add(z)
         state = self.states[anchor]
-        state.z = z
         state.strange += 0.1 * ((abs(z) > STRANGE) - state.strange)
         state.mean_z += 0.02 * (max(-5.0, min(5.0, z)) - state.mean_z)
         if time_s - self._checked_s >= _RETRY_S:
@@ -313,7 +280,7 @@ class TagLocator:
         return 2 if self._known_height() is not None else 3
 
     def _doubt(self, known: RangeFilter) -> None:
-        """Most anchors disagree: is there a place that explains their ranges much better?"""
+        """Most anchors contradict the filter: search for a position that explains their ranges much better."""
         found = self._places()
         if not found:
             return
@@ -325,14 +292,14 @@ class TagLocator:
         if loss > best.loss + IMPLAUSIBLE and apart @ apart > 9.0 * known.horizontal_sd**2:
             self.counts.lost += 1
             self._last_known = None
-            self._filter = None
+            self.filter = None
             self._start(found, self._time_s)
             self._settle()
 
     def _seek(self, time_s: float) -> None:
-        """Give up the place, but remember it."""
-        self._last_known = self._filter
-        self._filter = None
+        """Search the position again, with the present one as prior."""
+        self._last_known = self.filter
+        self.filter = None
         self._candidates = []
         self._recent.clear()
         self._sought_since_s = time_s
@@ -352,16 +319,16 @@ class TagLocator:
         if time_s < self._next_try_s:
             return
         self._next_try_s = time_s + _RETRY_S
-        # Every anchor in reach has its turn first, unless enough have spoken.
+        # Wait until every anchor had its turn, or enough were received.
         if time_s - self._sought_since_s < WINDOW_S / 2 and len(self.heard()) < self._dims + _LEARN_SPARE:
             return
         found = self._places()
-        if found and len(found) <= _MOST_PLACES:
+        if found and len(found) <= _MAX_PLACES:
             self._start(found, time_s)
             self._settle()
 
     def _settle(self) -> None:
-        """Drop places that became implausible or fell together; follow the one that is left."""
+        """Remove candidates that are implausible or equal; follow the last one."""
         best = min(candidate.loss for candidate in self._candidates)
         kept: list[_Candidate] = []
         for candidate in sorted(self._candidates, key=lambda c: c.loss):
@@ -371,7 +338,7 @@ class TagLocator:
                 kept.append(candidate)
         self._candidates = kept
         if len(kept) == 1 and self._is_unique(kept[0].filter):
-            self._filter = kept[0].filter
+            self.filter = kept[0].filter
             self._last_known = None
             self._candidates = []
             self.counts.found += 1
@@ -379,7 +346,7 @@ class TagLocator:
             for state in self.states:
                 state.strange = 0.0
         elif self._time_s - self._sought_since_s > 10.0 * WINDOW_S:
-            # What seemed a place from one second's ranges may have been none: look again with new ones.
+            # The candidates from one second of ranges may all be wrong: search again.
             self._sought_since_s = self._time_s
             self._candidates = []
 
@@ -414,19 +381,16 @@ class TagLocator:
         return not (self._ambiguous_with or self.undetermined)
 
     def _window(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Anchors' positions (k, 3), median ranges (k,) and their deviations (k,) of the last second."""
-        by_anchor: dict[int, list[_Heard]] = {}
-        for heard in self._recent:
-            if heard.time_s >= self._time_s - WINDOW_S:
-                by_anchor.setdefault(heard.anchor, []).append(heard)
-        self._rows = list(by_anchor)
+        """Return positions (k, 3), median ranges (k,) and their standard deviations (k,) of the last second's anchors."""
+        recent = [one for one in self._recent if one[0] >= self._time_s - WINDOW_S]
+        self._rows = list(dict.fromkeys(one[1] for one in recent))
         ranges, sds = [], []
-        for row, group in by_anchor.items():
-            ranges.append(float(np.median([heard.range_m for heard in group])))
-            variance = float(np.median([self._model.variance(heard.variance_m2) for heard in group]))
-            age = self._time_s - float(np.mean([heard.time_s for heard in group]))
-            spread = variance + self.anchors.sd[row] ** 2 + (self._model.speed * age) ** 2 / 3.0
-            sds.append(math.sqrt(spread))
+        for row in self._rows:
+            times, _, values, variances = zip(*(one for one in recent if one[1] == row), strict=True)
+            ranges.append(float(np.median(values)))
+            variance = float(np.median(self._model.variances(np.array(variances))))
+            age = self._time_s - float(np.mean(times))
+            sds.append(math.sqrt(variance + self.anchors.sd[row] ** 2 + (self._model.speed * age) ** 2 / 3.0))
         return self.anchors.position[self._rows], np.array(ranges), np.array(sds)
 
     def _places(self) -> list[Place]:
@@ -436,50 +400,44 @@ class TagLocator:
         return places(anchors, range_m, sd_m, self._model, height=self._known_height(), area=self._area)
 
     def _start(self, found: list[Place], time_s: float) -> None:
-        """A filter at each place; what the pairs' errors did to the place is kept as their correlation."""
+        """Start a filter at each position, with the correlation between the position and the errors of the ranges."""
         self._candidates, self._ambiguous_with = [], []
         # The next check whether the position is unique must not wait.
         self._next_try_s = -math.inf
-        model = self._model
+        model, height = self._model, self._height
         for place in found:
-            covariance = place.covariance.copy()
+            position, covariance = place.position.copy(), place.covariance.copy()
             offset = place.gain.sum(axis=1)
             covariance += np.multiply.outer(offset, offset) * model.offset_sd**2
-            # The tag has moved on since the middle of the window.
+            # The tag has moved since the middle of the window.
             covariance[[0, 1, 2], [0, 1, 2]] += (model.speed * WINDOW_S / 2.0) ** 2
-            position = place.position.copy()
-            if self._height is not None:
-                position[2] = self._height.value
+            if height is not None:
+                position[2] = height.value
                 covariance[2] = covariance[:, 2] = 0.0
-                covariance[2, 2] = self._height.sd**2
-            one = RangeFilter(
-                self.anchors, model, time_s, position, covariance, level=self._height is not None
-            )
-            for row, effect in zip(self._rows, place.gain.T, strict=True):
-                cross = effect * one.p[FIRST_ERROR + row, FIRST_ERROR + row]
-                one.p[:3, FIRST_ERROR + row] = cross
-                one.p[FIRST_ERROR + row, :3] = cross
-            one.p[:3, FIRST_ERROR - 1] = offset * model.offset_sd**2
-            one.p[FIRST_ERROR - 1, :3] = one.p[:3, FIRST_ERROR - 1]
-            if self._height is not None:
-                one.p[2, 3:] = 0.0
-                one.p[3:, 2] = 0.0
+                covariance[2, 2] = height.sd**2
+            one = RangeFilter(self.anchors, model, time_s, position, covariance, level=height is not None)
+            errors = FIRST_ERROR + np.array(self._rows)
+            one.p[:3, errors] = place.gain * one.p[errors, errors]
+            one.p[:3, OFFSET] = offset * model.offset_sd**2
+            if height is not None:
+                one.p[2, OFFSET:] = 0.0
+            one.p[OFFSET:, :3] = one.p[:3, OFFSET:].T
             self._candidates.append(_Candidate(one, place.loss + self._surprise(place, time_s)))
 
     def _surprise(self, place: Place, time_s: float) -> float:
-        """How unlikely a place is after where the tag was last known to be."""
+        """Return minus the log likelihood of a position after the last known one."""
         if self._last_known is None:
             return 0.0
         before = self._last_known.copy()
         before.predict(time_s)
         apart = place.position[:2] - before.position[:2]
         spread = before.p[:2, :2] + place.covariance[:2, :2]
-        # Bounded: a tag that was carried away is found all the same.
+        # Limited, so that a kidnapped tag is also found.
         return min(IMPLAUSIBLE, 0.5 * float(apart @ np.linalg.solve(spread, apart)))
 
 
 def _bends(one: RangeFilter, height_m: float, variance_m2: float) -> bool:
-    """Whether a height would move an estimate so far in plan that the filter's linear model does not hold."""
+    """Return whether a height would move an estimate so far in plan that the filter's linear model is not valid."""
     share = math.hypot(one.p[0, 2], one.p[1, 2]) / (one.p[2, 2] + variance_m2)
     return bool(share * abs(height_m - float(one.x[2])) > _BENDS_M)
 
