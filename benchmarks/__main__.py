@@ -166,9 +166,9 @@ def link(
 ) -> None:
     """Frames through a damaging channel: losses, speed of the decoder."""
     from benchmarks.link import loopback
-    from uwb_mitigation.link.faults import ByteFaults
+    from uwb_mitigation.link.faults import Faults
 
-    faults = ByteFaults(damage, damage, damage)
+    faults = Faults(damage, damage, damage)
     with console.share_bar("sending") as advance:
         done = loopback(frames, faults, seed=seed, advance=lambda count: advance(count / frames))
     result = asdict(done) | {"decoder_mb_per_s": done.decoder_mb_per_s}

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.link.faults import ByteFaults, Damaged, damage
+from uwb_mitigation.link.faults import Damaged, Faults, damage
 from uwb_mitigation.link.framing import Frame, FrameDecoder, encode_frame
 from uwb_mitigation.link.layout import MessageType
 
@@ -49,7 +49,7 @@ class LoopbackResult:
 
 def loopback(
     frames: int,
-    faults: ByteFaults,
+    faults: Faults,
     *,
     payload_bytes: int = 700,
     seed: int = 0,

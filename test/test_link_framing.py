@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from benchmarks.link import loopback
 from uwb_mitigation.errors import ParameterError
-from uwb_mitigation.link.faults import ByteFaults
+from uwb_mitigation.link.faults import Faults
 from uwb_mitigation.link.framing import Frame, FrameDecoder, FrameEncoder, encode_frame
 from uwb_mitigation.link.layout import MAX_ENCODED_BYTES, MAX_PAYLOAD_BYTES, MessageType
 
@@ -137,12 +137,12 @@ def test_a_flood_takes_no_memory(flood):
 @pytest.mark.parametrize(
     "faults",
     [
-        ByteFaults(),
-        ByteFaults(flip=1e-3),
-        ByteFaults(drop=1e-3),
-        ByteFaults(insert=1e-3),
-        ByteFaults(1e-4, 1e-4, 1e-4),
-        ByteFaults(0.05, 0.05, 0.05),
+        Faults(),
+        Faults(flip=1e-3),
+        Faults(drop=1e-3),
+        Faults(insert=1e-3),
+        Faults(1e-4, 1e-4, 1e-4),
+        Faults(0.05, 0.05, 0.05),
     ],
     ids=["clean", "flips", "drops", "insertions", "all", "storm"],
 )
@@ -152,4 +152,4 @@ def test_through_a_damaging_channel_what_arrives_intact_is_delivered_and_nothing
     assert result.intact_lost == 0
     assert result.corrupt_delivered == 0
     assert result.delivered >= result.intact
-    assert result.intact == 6000 or faults != ByteFaults()
+    assert result.intact == 6000 or faults != Faults()

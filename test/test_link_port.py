@@ -17,9 +17,9 @@ import pytest
 from uwb_mitigation.errors import LinkError, ParameterError
 from uwb_mitigation.link.board import Identity
 from uwb_mitigation.link.connection import PortAddress
-from uwb_mitigation.link.emulated_board import BoardFaults, EmulatedBoard
+from uwb_mitigation.link.emulated_board import EmulatedBoard
 from uwb_mitigation.link.events import Connected, Disconnected, Event, Loss
-from uwb_mitigation.link.faults import ByteFaults
+from uwb_mitigation.link.faults import Faults
 from uwb_mitigation.link.layout import Mode
 from uwb_mitigation.link.messages import Correction
 from uwb_mitigation.link.port import BoardPort
@@ -146,7 +146,7 @@ def test_a_board_that_resets_is_connected_again(board, port):
 
 
 def test_through_a_channel_that_damages_loses_and_repeats_only_what_was_sent_arrives(link):
-    faults = BoardFaults(channel=ByteFaults(2e-4, 2e-4, 2e-4), lose=0.05, duplicate=0.05)
+    faults = Faults(2e-4, 2e-4, 2e-4, lose=0.05, duplicate=0.05)
     with EmulatedBoard(Recording(), rate_hz=1000, faults=faults, link=link, seed=4):
         port = BoardPort(PortAddress(str(link)))
         received = [wait_for(port, of(RangeMeasurement)) for _ in range(300)]

@@ -25,8 +25,8 @@ from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
 from uwb_mitigation.link.board import Identity
 from uwb_mitigation.link.connection import PortAddress
-from uwb_mitigation.link.emulated_board import BoardFaults, EmulatedBoard
-from uwb_mitigation.link.faults import ByteFaults
+from uwb_mitigation.link.emulated_board import EmulatedBoard
+from uwb_mitigation.link.faults import Faults
 from uwb_mitigation.link.port import BoardPort
 from uwb_mitigation.measurement import Origin, Status
 from uwb_mitigation.mitigation import Mitigation
@@ -190,7 +190,7 @@ def test_unplugging_costs_neither_descriptors_nor_threads(ros: Ros, link: Path):
 
 def test_resets_noise_and_damage_cost_frames_but_not_the_driver(ros: Ros, link: Path):
     received = ros.collect(RangeCir, RAW)
-    faults = BoardFaults(ByteFaults(2e-5, 2e-5, 2e-5), lose=0.05, duplicate=0.05)
+    faults = Faults(2e-5, 2e-5, 2e-5, lose=0.05, duplicate=0.05)
     known = {
         r.measurement.sequence: np.float32(r.measurement.range_m) for r in SimulatedSource(seed=4, count=200)
     }

@@ -51,8 +51,8 @@ def emulate(
 
     Open the printed port like /dev/ttyACM0.
     """
-    from uwb_mitigation.link.emulated_board import BoardFaults, EmulatedBoard
-    from uwb_mitigation.link.faults import ByteFaults
+    from uwb_mitigation.link.emulated_board import EmulatedBoard
+    from uwb_mitigation.link.faults import Faults
     from uwb_mitigation.link.layout import Mode
 
     if mode not in ("host", "device"):
@@ -66,7 +66,7 @@ def emulate(
             raise ParameterError(f"{name} = {value}", valid="above 0")
     if seed < 0:
         raise ParameterError(f"seed = {seed}", valid="0 or more")
-    faults = BoardFaults(ByteFaults(damage, damage, damage), lose, duplicate)
+    faults = Faults(damage, damage, damage, lose, duplicate)
     identity, mitigation = _firmware(model)
     with open_source(recording, rate, seed) as source:
         board = EmulatedBoard(

@@ -13,48 +13,22 @@ import threading
 import time
 import tty
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from uwb_mitigation.errors import ParameterError, RecordingError, UwbMitigationError
 from uwb_mitigation.link.board import Board, Corrector, Identity
-from uwb_mitigation.link.faults import ByteFaults, damage
+from uwb_mitigation.link.faults import Faults, damage
 from uwb_mitigation.link.layout import Mode
 from uwb_mitigation.measurement import RangeMeasurement, Record
 
 _READ_BYTES = 4096
-_CLEAN = ByteFaults()
+_HEALTHY = Faults()
 _IDENTITY = Identity()
 
 MAX_BACKLOG_BYTES = 1 << 16
 """What waits for a host that does not read; measurements beyond it are lost, and counted."""
-
-
-@dataclass(frozen=True, slots=True)
-class BoardFaults:
-    """What goes wrong on the way to the host.
-
-    Attributes:
-        channel: damage to bytes.
-        lose, duplicate: probabilities that what is sent at once is lost, or arrives twice.
-
-    Raises:
-        ParameterError: a probability is outside 0 to 1.
-    """
-
-    channel: ByteFaults = _CLEAN
-    lose: float = 0.0
-    duplicate: float = 0.0
-
-    def __post_init__(self) -> None:
-        for name in ("lose", "duplicate"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ParameterError(f"{name} = {getattr(self, name)}", valid="0 to 1")
-
-
-_HEALTHY = BoardFaults()
 
 
 class PseudoTerminal:
@@ -157,7 +131,7 @@ class EmulatedBoard:
         identity: Identity = _IDENTITY,
         corrector: Corrector | None = None,
         mode: Mode = Mode.HOST,
-        faults: BoardFaults = _HEALTHY,
+        faults: Faults = _HEALTHY,
         link: Path | None = None,
         seed: int = 0,
     ) -> None:
@@ -297,8 +271,8 @@ class EmulatedBoard:
             return
         if chances[1] < faults.duplicate:
             data += data
-        if faults.channel != _CLEAN:
-            data = damage(data, faults.channel, self._random).data
+        if faults != _HEALTHY:
+            data = damage(data, faults, self._random).data
         self._backlog += data
 
     def _uptime_us(self) -> int:

@@ -11,13 +11,14 @@ from uwb_mitigation.errors import ParameterError
 
 
 @dataclass(frozen=True, slots=True)
-class ByteFaults:
-    """How often a channel damages bytes: probabilities per byte.
+class Faults:
+    """Probabilities of what goes wrong on the way: per byte, and for all that is sent at once.
 
     Attributes:
         flip: that one of its bits arrives inverted.
         drop: that it does not arrive.
         insert: that a random byte arrives before it.
+        lose, duplicate: that what is sent at once is lost, or arrives twice.
 
     Raises:
         ParameterError: a probability is outside 0 to 1.
@@ -26,9 +27,11 @@ class ByteFaults:
     flip: float = 0.0
     drop: float = 0.0
     insert: float = 0.0
+    lose: float = 0.0
+    duplicate: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("flip", "drop", "insert"):
+        for name in ("flip", "drop", "insert", "lose", "duplicate"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ParameterError(f"{name} = {getattr(self, name)}", valid="0 to 1")
 
@@ -48,7 +51,7 @@ class Damaged:
     inserted: NDArray[np.intp]
 
 
-def damage(data: bytes, faults: ByteFaults, random: np.random.Generator) -> Damaged:
+def damage(data: bytes, faults: Faults, random: np.random.Generator) -> Damaged:
     """Send `data` through a channel with `faults`."""
     sent = np.frombuffer(data, np.uint8)
     draws = random.random((3, len(sent)), dtype=np.float32)

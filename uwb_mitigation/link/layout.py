@@ -134,19 +134,17 @@ class Field:
         return self.code.endswith("s")
 
 
-@dataclass(frozen=True, slots=True)
 class Layout:
     """The fixed part of a header or payload, and what may follow it.
 
-    Attributes:
+    Args:
         name: as in `MessageType`, or HEADER.
         fields: in the order of their bytes.
         tail: what the bytes after the fixed part are; empty = nothing.
     """
 
-    name: str
-    fields: tuple[Field, ...]
-    tail: str = ""
+    def __init__(self, name: str, *fields: Field, tail: str = "") -> None:
+        self.name, self.fields, self.tail = name, fields, tail
 
     def packing(self) -> struct.Struct:
         """The fixed part as a `struct.Struct`; reserved bytes take no value."""
@@ -177,13 +175,11 @@ def device_time(ticks: int) -> int:
 
 HEADER = Layout(
     "HEADER",
-    (
-        Field("version", "B", "PROTOCOL_VERSION"),
-        Field("type", "B", "MessageType"),
-        Field("flags", "H", "Flag"),
-        Field("sequence", "I", "counts the sender's frames from 0 at its start; wraps"),
-        Field("time_us", "Q", "board's uptime at the event that the frame tells of; 0 from the host"),
-    ),
+    Field("version", "B", "PROTOCOL_VERSION"),
+    Field("type", "B", "MessageType"),
+    Field("flags", "H", "Flag"),
+    Field("sequence", "I", "counts the sender's frames from 0 at its start; wraps"),
+    Field("time_us", "Q", "board's uptime at the event that the frame tells of; 0 from the host"),
 )
 
 _RADIO_SETTINGS = (
@@ -211,13 +207,11 @@ _RADIO_SETTINGS = (
 
 RADIO_ANCHOR = Layout(
     "RADIO_ANCHOR",
-    (
-        Field("address", "Q", "of the anchor"),
-        Field("tried", "I", "exchanges that began"),
-        Field("ranged", "I", "exchanges that gave a range"),
-        Field("rx_power", "f", "dBm, of its last frame; NaN = unknown"),
-        Field("heard_ms", "I", "since it was last heard; 4294967295 = never"),
-    ),
+    Field("address", "Q", "of the anchor"),
+    Field("tried", "I", "exchanges that began"),
+    Field("ranged", "I", "exchanges that gave a range"),
+    Field("rx_power", "f", "dBm, of its last frame; NaN = unknown"),
+    Field("heard_ms", "I", "since it was last heard; 4294967295 = never"),
 )
 """One anchor in the tail of a RADIO_STATUS."""
 
@@ -226,175 +220,151 @@ MAX_ANCHORS = 32
 
 OFFSET = Layout(
     "OFFSET",
-    (
-        Field("tag_id", "Q", "of no meaning for an anchor's"),
-        Field("anchor_id", "Q", "of no meaning for a tag's"),
-        Field("offset", "f", "m, -10 to 10"),
-        Field("of", "B", "OffsetOf"),
-        Field("reserved", "3x", ""),
-    ),
+    Field("tag_id", "Q", "of no meaning for an anchor's"),
+    Field("anchor_id", "Q", "of no meaning for a tag's"),
+    Field("offset", "f", "m, -10 to 10"),
+    Field("of", "B", "OffsetOf"),
+    Field("reserved", "3x", ""),
 )
 """One offset in the tail of a SET_OFFSETS."""
 
 MAX_OFFSETS = 64
 """That a board keeps beside its default."""
 
-PAYLOADS = {
-    MessageType.HELLO: Layout(
+_TABLES = (
+    Layout(
         "HELLO",
-        (
-            Field("board_id", "Q", "identity of the board"),
-            Field("model_id", "I", "identity of the board's model; 0 = it has none"),
-            Field("boot_id", "I", "differs from one start of the firmware to the next"),
-            Field("request_sequence", "I", "with ANSWER: sequence of the host's frame answered"),
-            Field("window", "H", "window length K of the board's model; 0 = it has none"),
-            Field("max_payload", "H", "longest payload that the board accepts, bytes"),
-            Field("firmware_major", "B", "firmware version"),
-            Field("firmware_minor", "B", ""),
-            Field("firmware_patch", "B", ""),
-            Field("mode", "B", "Mode in force", kind=Mode),
-            Field("reserved", "4x", ""),
-            Field("firmware_name", "16s", "UTF-8, filled up with zeros"),
-        ),
+        Field("board_id", "Q", "identity of the board"),
+        Field("model_id", "I", "identity of the board's model; 0 = it has none"),
+        Field("boot_id", "I", "differs from one start of the firmware to the next"),
+        Field("request_sequence", "I", "with ANSWER: sequence of the host's frame answered"),
+        Field("window", "H", "window length K of the board's model; 0 = it has none"),
+        Field("max_payload", "H", "longest payload that the board accepts, bytes"),
+        Field("firmware_major", "B", "firmware version"),
+        Field("firmware_minor", "B", ""),
+        Field("firmware_patch", "B", ""),
+        Field("mode", "B", "Mode in force", kind=Mode),
+        Field("reserved", "4x", ""),
+        Field("firmware_name", "16s", "UTF-8, filled up with zeros"),
     ),
-    MessageType.RANGE_CIR: Layout(
+    Layout(
         "RANGE_CIR",
-        (
-            Field("tag_id", "Q", "identity of the tag"),
-            Field("anchor_id", "Q", "identity of the anchor"),
-            Field(
-                "device_time",
-                "Q",
-                "DW1000 ticks of 1 / (128 x 499.2 MHz) at the reception, 40 bits",
-                kind=device_time,
-            ),
-            Field("sequence", "I", "counts the exchanges; wraps"),
-            Field("range", "f", "m, measured; NaN = the exchange gave none", "range_m"),
-            Field("sample_period", "f", "s", "sample_period_s"),
-            Field("first_path_index", "f", "accumulator index; NaN = unknown"),
-            Field("scale", "f", "accumulator units per count of samples"),
-            Field("rx_power", "f", "dBm; NaN = unknown", "rx_power_dbm"),
-            Field("first_path_power", "f", "dBm; NaN = unknown", "first_path_power_dbm"),
-            Field("start_index", "i", "accumulator index of the first sample"),
-            Field("preamble_count", "H", "RXPACC; 0 = unknown"),
-            Field("noise_threshold", "H", "LDE_THRESH, accumulator units; 0 = unknown"),
-            Field(
-                "samples_offset", "H", "bytes from the payload's start to the samples; even", computed=True
-            ),
-            Field("sample_count", "H", "int16 values: two for a complex sample", computed=True),
-            Field("encoding", "B", "0 = complex, interleaved re, im; 1 = magnitude", kind=Encoding),
-            Field("channel", "B", "UWB channel; 0 = unknown"),
-            Field("prf", "B", "MHz: 16 or 64; 0 = unknown", "prf_mhz"),
-            Field("reserved", "5x", ""),
+        Field("tag_id", "Q", "identity of the tag"),
+        Field("anchor_id", "Q", "identity of the anchor"),
+        Field(
+            "device_time",
+            "Q",
+            "DW1000 ticks of 1 / (128 x 499.2 MHz) at the reception, 40 bits",
+            kind=device_time,
         ),
+        Field("sequence", "I", "counts the exchanges; wraps"),
+        Field("range", "f", "m, measured; NaN = the exchange gave none", "range_m"),
+        Field("sample_period", "f", "s", "sample_period_s"),
+        Field("first_path_index", "f", "accumulator index; NaN = unknown"),
+        Field("scale", "f", "accumulator units per count of samples"),
+        Field("rx_power", "f", "dBm; NaN = unknown", "rx_power_dbm"),
+        Field("first_path_power", "f", "dBm; NaN = unknown", "first_path_power_dbm"),
+        Field("start_index", "i", "accumulator index of the first sample"),
+        Field("preamble_count", "H", "RXPACC; 0 = unknown"),
+        Field("noise_threshold", "H", "LDE_THRESH, accumulator units; 0 = unknown"),
+        Field("samples_offset", "H", "bytes from the payload's start to the samples; even", computed=True),
+        Field("sample_count", "H", "int16 values: two for a complex sample", computed=True),
+        Field("encoding", "B", "0 = complex, interleaved re, im; 1 = magnitude", kind=Encoding),
+        Field("channel", "B", "UWB channel; 0 = unknown"),
+        Field("prf", "B", "MHz: 16 or 64; 0 = unknown", "prf_mhz"),
+        Field("reserved", "5x", ""),
         tail="samples, int16, from samples_offset",
     ),
-    MessageType.RANGE_CORRECTED: Layout(
+    Layout(
         "RANGE_CORRECTED",
-        (
-            Field("tag_id", "Q", "of the measurement"),
-            Field("anchor_id", "Q", "of the measurement"),
-            Field("device_time", "Q", "of the measurement, 40 bits", kind=device_time),
-            Field("sequence", "I", "of the measurement"),
-            Field("model_id", "I", "identity of the model that corrected; 0 = none"),
-            Field("range", "f", "m, corrected; NaN = no valid range", "range_m"),
-            Field("range_raw", "f", "m, as measured", "range_raw_m"),
-            Field(
-                "correction",
-                "f",
-                "m, offset + predicted error; the offset alone when passed through",
-                "correction_m",
-            ),
-            Field("variance", "f", "m^2; infinite where the range is not valid", "variance_m2"),
-            Field("compute_us", "I", "time that the correction took on the board"),
-            Field(
-                "status", "B", "0 OK, 1 NO_CIR, 2 BAD_CIR, 3 OUT_OF_DISTRIBUTION, 4 MODEL_ERROR", kind=Status
-            ),
-            Field("reserved", "3x", ""),
+        Field("tag_id", "Q", "of the measurement"),
+        Field("anchor_id", "Q", "of the measurement"),
+        Field("device_time", "Q", "of the measurement, 40 bits", kind=device_time),
+        Field("sequence", "I", "of the measurement"),
+        Field("model_id", "I", "identity of the model that corrected; 0 = none"),
+        Field("range", "f", "m, corrected; NaN = no valid range", "range_m"),
+        Field("range_raw", "f", "m, as measured", "range_raw_m"),
+        Field(
+            "correction",
+            "f",
+            "m, offset + predicted error; the offset alone when passed through",
+            "correction_m",
         ),
+        Field("variance", "f", "m^2; infinite where the range is not valid", "variance_m2"),
+        Field("compute_us", "I", "time that the correction took on the board"),
+        Field("status", "B", "0 OK, 1 NO_CIR, 2 BAD_CIR, 3 OUT_OF_DISTRIBUTION, 4 MODEL_ERROR", kind=Status),
+        Field("reserved", "3x", ""),
     ),
-    MessageType.LOG: Layout(
+    Layout(
         "LOG",
-        (Field("level", "B", "LogLevel", kind=LogLevel), Field("reserved", "7x", "")),
+        Field("level", "B", "LogLevel", kind=LogLevel),
+        Field("reserved", "7x", ""),
         tail="text, UTF-8, to the payload's end",
     ),
-    MessageType.STATUS: Layout(
+    Layout(
         "STATUS",
-        (
-            Field("frames_received", "I", "intact frames from the host since the start"),
-            Field("frames_dropped", "I", "damaged or unknown frames from the host since the start"),
-            Field("measurements", "I", "exchanges since the start"),
-            Field("measurements_lost", "I", "exchanges not sent because the link was full"),
-            Field("temperature", "f", "degrees Celsius; NaN = not measured", "temperature_c"),
-            Field("mode", "B", "Mode in force", kind=Mode),
-            Field("reserved", "3x", ""),
-        ),
+        Field("frames_received", "I", "intact frames from the host since the start"),
+        Field("frames_dropped", "I", "damaged or unknown frames from the host since the start"),
+        Field("measurements", "I", "exchanges since the start"),
+        Field("measurements_lost", "I", "exchanges not sent because the link was full"),
+        Field("temperature", "f", "degrees Celsius; NaN = not measured", "temperature_c"),
+        Field("mode", "B", "Mode in force", kind=Mode),
+        Field("reserved", "3x", ""),
     ),
-    MessageType.TIME_SYNC_REPLY: Layout(
+    Layout(
         "TIME_SYNC_REPLY",
-        (
-            Field("request_sequence", "I", "sequence of the TIME_SYNC answered"),
-            Field("reserved", "4x", ""),
-            Field("received_us", "Q", "board's uptime when the TIME_SYNC's last byte was received"),
-        ),
+        Field("request_sequence", "I", "sequence of the TIME_SYNC answered"),
+        Field("reserved", "4x", ""),
+        Field("received_us", "Q", "board's uptime when the TIME_SYNC's last byte was received"),
     ),
-    MessageType.RADIO: Layout(
+    Layout(
         "RADIO",
-        (
-            Field("request_sequence", "I", "with ANSWER: sequence of the host's frame answered"),
-            Field("accepted", "B", "0 = SET_RADIO was refused, and the text says why", kind=bool),
-            Field("reserved", "3x", ""),
-            *_RADIO_SETTINGS,
-        ),
+        Field("request_sequence", "I", "with ANSWER: sequence of the host's frame answered"),
+        Field("accepted", "B", "0 = SET_RADIO was refused, and the text says why", kind=bool),
+        Field("reserved", "3x", ""),
+        *_RADIO_SETTINGS,
         tail="anchor_count addresses, u64, then text, UTF-8, to the payload's end",
     ),
-    MessageType.RADIO_STATUS: Layout(
+    Layout(
         "RADIO_STATUS",
-        (
-            Field("tried", "I", "exchanges that began; the sum of the seven that follow"),
-            Field("ranged", "I", "exchanges that gave a range"),
-            Field("no_answer", "I", "lost: POLL was not answered"),
-            Field("late", "I", "lost: FINAL could not be sent in time"),
-            Field("time_out", "I", "lost: FINAL or REPORT did not come"),
-            Field("damaged", "I", "lost: what came was no intact frame"),
-            Field("absurd", "I", "lost: stamps that no exchange can have"),
-            Field("broken", "I", "lost: the chip was reset meanwhile, or its bus failed"),
-            Field("refused", "I", "frames that belonged to no exchange of this radio"),
-            Field("restarts", "I", "of the chip, but for the first"),
-            Field("temperature", "f", "of the chip, degrees Celsius; NaN = not measured", "temperature_c"),
-            Field("voltage", "f", "of the chip, V; NaN = not measured"),
-            Field("state", "B", "RadioState", kind=RadioState),
-            Field("anchor_count", "B", "anchors that the tail tells of", computed=True),
-            Field("reserved", "6x", ""),
-        ),
+        Field("tried", "I", "exchanges that began; the sum of the seven that follow"),
+        Field("ranged", "I", "exchanges that gave a range"),
+        Field("no_answer", "I", "lost: POLL was not answered"),
+        Field("late", "I", "lost: FINAL could not be sent in time"),
+        Field("time_out", "I", "lost: FINAL or REPORT did not come"),
+        Field("damaged", "I", "lost: what came was no intact frame"),
+        Field("absurd", "I", "lost: stamps that no exchange can have"),
+        Field("broken", "I", "lost: the chip was reset meanwhile, or its bus failed"),
+        Field("refused", "I", "frames that belonged to no exchange of this radio"),
+        Field("restarts", "I", "of the chip, but for the first"),
+        Field("temperature", "f", "of the chip, degrees Celsius; NaN = not measured", "temperature_c"),
+        Field("voltage", "f", "of the chip, V; NaN = not measured"),
+        Field("state", "B", "RadioState", kind=RadioState),
+        Field("anchor_count", "B", "anchors that the tail tells of", computed=True),
+        Field("reserved", "6x", ""),
         tail="anchor_count times RADIO_ANCHOR",
     ),
-    MessageType.OFFSETS: Layout(
+    Layout(
         "OFFSETS",
-        (
-            Field("request_sequence", "I", "sequence of the SET_OFFSETS answered"),
-            Field("slots", "H", "offsets that the board can keep beside the default"),
-            Field("accepted", "B", "0 = they were too many: those before stay in force", kind=bool),
-            Field("reserved", "1x", ""),
-        ),
+        Field("request_sequence", "I", "sequence of the SET_OFFSETS answered"),
+        Field("slots", "H", "offsets that the board can keep beside the default"),
+        Field("accepted", "B", "0 = they were too many: those before stay in force", kind=bool),
+        Field("reserved", "1x", ""),
     ),
-    MessageType.GET_INFO: Layout("GET_INFO", ()),
-    MessageType.SET_MODE: Layout(
-        "SET_MODE", (Field("mode", "B", "Mode wanted", kind=Mode), Field("reserved", "7x", ""))
-    ),
-    MessageType.TIME_SYNC: Layout("TIME_SYNC", ()),
-    MessageType.GET_RADIO: Layout("GET_RADIO", ()),
-    MessageType.SET_RADIO: Layout("SET_RADIO", _RADIO_SETTINGS, tail="anchor_count addresses, u64"),
-    MessageType.SET_OFFSETS: Layout(
+    Layout("GET_INFO"),
+    Layout("SET_MODE", Field("mode", "B", "Mode wanted", kind=Mode), Field("reserved", "7x", "")),
+    Layout("TIME_SYNC"),
+    Layout("GET_RADIO"),
+    Layout("SET_RADIO", *_RADIO_SETTINGS, tail="anchor_count addresses, u64"),
+    Layout(
         "SET_OFFSETS",
-        (
-            Field("default_offset", "f", "m, of pairs that nothing in the tail names, -10 to 10", "default"),
-            Field("count", "H", "offsets in the tail", computed=True),
-            Field("reserved", "2x", ""),
-        ),
+        Field("default_offset", "f", "m, of pairs that nothing in the tail names, -10 to 10", "default"),
+        Field("count", "H", "offsets in the tail", computed=True),
+        Field("reserved", "2x", ""),
         tail="count times OFFSET",
     ),
-}
+)
+PAYLOADS = {MessageType[table.name]: table for table in _TABLES}
 """Every message type and its payload. A payload may be longer than its layout, never shorter."""
 
 HEADER_BYTES = HEADER.packing().size

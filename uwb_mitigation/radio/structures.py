@@ -30,58 +30,45 @@ class Io(ctypes.Structure):
     )
 
 
+def _fields(**names: type) -> tuple[tuple[str, type], ...]:
+    return tuple(names.items())
+
+
+def _of(kind: type, names: str) -> dict[str, type]:
+    """Return fields of one type, {name: type}."""
+    return dict.fromkeys(names.split(), kind)
+
+
 class ChipSettings(ctypes.Structure):
     """`uwb_dw1000_settings`."""
 
-    _fields_ = (
-        ("channel", c_uint8),
-        ("prf_mhz", c_uint8),
-        ("preamble_code", c_uint8),
-        ("decawave_sfd", c_uint8),
-        ("rate_kbps", c_uint16),
-        ("preamble", c_uint16),
-        ("tx_power", c_uint32),
-        ("antenna_delay", c_uint32),
-        ("anchor", c_uint8),
+    _fields_ = _fields(
+        **_of(c_uint8, "channel prf_mhz preamble_code decawave_sfd"),
+        **_of(c_uint16, "rate_kbps preamble"),
+        **_of(c_uint32, "tx_power antenna_delay"),
+        anchor=c_uint8,
     )
 
 
 class Config(ctypes.Structure):
     """`uwb_twr_config`."""
 
-    _fields_ = (
-        ("radio", ChipSettings),
-        ("address", c_uint64),
-        ("pan", c_uint16),
-        ("role", c_uint8),
-        ("report", c_uint8),
-        ("bias_correction", c_uint8),
-        ("anchor_count", c_uint8),
-        ("window", c_uint16),
-        ("reply_us", c_uint32),
-        ("patience_us", c_uint32),
-        ("interval_us", c_uint32),
-        ("anchors", c_uint64 * MAX_ANCHORS),
+    _fields_ = _fields(
+        radio=ChipSettings,
+        address=c_uint64,
+        pan=c_uint16,
+        **_of(c_uint8, "role report bias_correction anchor_count"),
+        window=c_uint16,
+        **_of(c_uint32, "reply_us patience_us interval_us"),
+        anchors=c_uint64 * MAX_ANCHORS,
     )
 
 
 class TwrCounts(ctypes.Structure):
     """`uwb_twr_counts`."""
 
-    _fields_ = tuple(
-        (name, c_uint32)
-        for name in (
-            "tried",
-            "ranged",
-            "no_answer",
-            "late",
-            "time_out",
-            "damaged",
-            "absurd",
-            "broken",
-            "refused",
-            "restarts",
-        )
+    _fields_ = _fields(
+        **_of(c_uint32, "tried ranged no_answer late time_out damaged absurd broken refused restarts")
     )
 
     def as_dict(self) -> dict[str, int]:
@@ -92,15 +79,10 @@ class TwrCounts(ctypes.Structure):
 class TwrAnchor(ctypes.Structure):
     """`uwb_twr_anchor`."""
 
-    _fields_ = (
-        ("address", c_uint64),
-        ("heard_us", c_uint64),
-        ("due_us", c_uint64),
-        ("tried", c_uint32),
-        ("ranged", c_uint32),
-        ("answer_us", c_uint32),
-        ("misses", c_uint32),
-        ("rx_power_dbm", c_float),
+    _fields_ = _fields(
+        **_of(c_uint64, "address heard_us due_us"),
+        **_of(c_uint32, "tried ranged answer_us misses"),
+        rx_power_dbm=c_float,
     )
 
 
