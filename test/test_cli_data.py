@@ -41,18 +41,6 @@ def test_info_shows_and_tells_what_a_bag_holds(tmp_path: Path) -> None:
     assert result["simulated"] is True
 
 
-def test_long_ids_are_complete_where_the_terminal_is_narrow(tmp_path: Path) -> None:
-    with BagWriter(tmp_path / "bag.mcap", {"source": "a test", "simulated": "true"}) as bag:
-        for anchor in (7, 0x1122334455667788):
-            cir = Cir(np.arange(-20, 20, dtype=np.int16))
-            bag.write(Record(RangeMeasurement(10**18, 0xDECA0000FFFF0001, anchor, 0, 0, 4.5, cir)))
-    shown = run("data", "info", "bag.mcap", folder=tmp_path, columns=80).stdout
-    cells = [[cell.strip() for cell in line.split("│")] for line in shown.splitlines() if "│" in line]
-    anchors, tags = ("".join(row[column] for row in cells) for column in (1, 2))
-    assert anchors == "70x1122334455667788"
-    assert tags == 2 * "0xdeca0000ffff0001"
-
-
 def test_import_joins_recordings_and_keeps_that_they_were_simulated(tmp_path: Path) -> None:
     write_bag(tmp_path / "one.mcap")
     write_bag(tmp_path / "two", 3)
@@ -62,23 +50,6 @@ def test_import_joins_recordings_and_keeps_that_they_were_simulated(tmp_path: Pa
     assert bag.message_count == 18
     assert bag.metadata["uwb_mitigation"]["simulated"] == "true"
     assert json.loads((tmp_path / "import.json").read_text())["ranges"] == 9
-
-
-def test_import_does_not_replace_a_bag_unless_forced(tmp_path: Path) -> None:
-    write_bag(tmp_path / "one.mcap")
-    write_bag(tmp_path / "out.mcap", 1)
-    refused = run("data", "import", "one.mcap", "-o", "out.mcap", folder=tmp_path)
-    assert refused.returncode == 1
-    assert "--force" in refused.stderr
-    assert BagReader(tmp_path / "out.mcap").message_count == 2
-    assert run("data", "import", "one.mcap", "-o", "out.mcap", "--force", folder=tmp_path).returncode == 0
-    assert BagReader(tmp_path / "out.mcap").message_count == 12
-
-
-def test_a_bag_can_be_replaced_by_an_import_of_itself(tmp_path: Path) -> None:
-    write_bag(tmp_path / "bag.mcap")
-    assert run("data", "import", "bag.mcap", "-o", "bag.mcap", "--force", folder=tmp_path).returncode == 0
-    assert BagReader(tmp_path / "bag.mcap").message_count == 12
 
 
 def test_a_damaged_bag_is_shown_as_far_as_it_goes_and_exits_1(tmp_path: Path) -> None:

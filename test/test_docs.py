@@ -5,14 +5,11 @@
 
 from __future__ import annotations
 
-import ast
 import importlib.metadata
 import importlib.util
 import json
 import re
 import shlex
-import sys
-from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -21,28 +18,21 @@ import generated
 import pytest
 import typer
 import yaml
-from browser import Browser
 from conftest import REPOSITORY
 from test_launch import generate as generate
 from test_launch import launch
-from typer.testing import CliRunner
 
 from benchmarks import __main__ as benchmarks
 from uwb_mitigation.commands import cli
-from uwb_mitigation.commands import view as view_command
 from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.nodes.parameter_tables import TABLES
 from uwb_mitigation.sources.opening import open_recording
-from uwb_mitigation.sources.site import anchors_file, load_anchors
 
 PAGES = sorted(
     path
     for pattern in ("*.md", "docs/*.md", "models/*.md", "firmware/**/*.md")
     for path in REPOSITORY.glob(pattern)
 )
-
-
-SEEING = REPOSITORY / "docs" / "seeing.md"
 
 
 def links(page: Path) -> list[str]:
@@ -68,18 +58,6 @@ def test_every_page_of_the_documentation_can_be_reached():
         read.add(page)
         waiting += [(page.parent / target).resolve() for target in links(page) if "://" not in target]
     assert {page for page in PAGES if page.parent.name == "docs"} <= read
-
-
-def test_no_page_holds_a_placeholder():
-    bare = re.compile(r"^[A-Z]{4,}$", re.MULTILINE)
-    assert [page.name for page in PAGES if bare.search(page.read_text(encoding="utf-8"))] == []
-
-
-def test_the_page_of_nodes_names_each_executable_and_each_lifecycle():
-    text = (REPOSITORY / "docs" / "nodes.md").read_text(encoding="utf-8")
-    executables, lifecycle = (text[text.index(head) :].partition("\n\n")[0] for head in ("| exec", "| trans"))
-    assert sorted(re.findall(r"^\| `(\w+)`", executables, re.MULTILINE)) == sorted(NODES)
-    assert re.findall(r"`(\w+)`", lifecycle.splitlines()[0]) == list(TABLES)
 
 
 # What a page tells the reader to type.
@@ -136,20 +114,6 @@ def check_options(command: Any, words: list[str]) -> None:
         command, words = command.commands[words[0]], words[1:]
     known = {name for parameter in command.params for name in (*parameter.opts, *parameter.secondary_opts)}
     assert {word.partition("=")[0] for word in words if word.startswith("-")} <= known | {"--help"}
-
-
-def test_the_recording_of_the_view_example_shows_anchors_and_ranges(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    example = re.findall(r"^ +uwb-mitigation (.*)$", view_command.view.__doc__, re.M)
-    assert all(f"    uwb-mitigation {line}\n" in SEEING.read_text() for line in example)
-    simulate, view = map(shlex.split, example)
-    bag = Path(view[1])
-    assert CliRunner().invoke(cli.app, [*simulate, "--ranges", "100"]).exit_code == 0
-    assert load_anchors(anchors_file(bag))
-    with open_recording(bag) as source:
-        measurement = next(iter(source)).measurement
-    assert measurement.cir is not None
-    assert measurement.cir.rx_power_dbm is not None
 
 
 @pytest.mark.parametrize("words", lines_of("make"))
@@ -263,80 +227,4 @@ def test_what_pages_take_from_the_code_is_what_the_code_says():
     assert not stale, "run: python docs/generated.py"
 
 
-def test_all_that_can_be_taken_from_the_code_stands_on_a_page():
-    pages = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
-    assert set(re.findall(r"^<!-- generated: (\w+) -->$", pages, re.M)) == set(generated.PARTS)
-
-
-def test_a_page_that_asks_for_what_nothing_makes_is_refused():
-    with pytest.raises(KeyError):
-        generated.fill("<!-- generated: nothing -->\n<!-- end -->\n")
-
-
-def test_every_experiment_is_named_by_a_page():
-    pages = "".join(page.read_text() for page in (REPOSITORY / "docs").glob("*.md"))
-    scripts = list((REPOSITORY / "docs" / "experiments").glob("*.py"))
-    assert scripts
-    assert not [script.name for script in scripts if f"docs/experiments/{script.name}" not in pages]
-
-
-def imported_on_import(body: list[ast.stmt]) -> Iterator[str]:
-    """The top-level packages that a module imports when it is imported itself."""
-    for node in body:
-        if isinstance(node, ast.Import):
-            yield from (alias.name.partition(".")[0] for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            yield str(node.module).partition(".")[0]
-        elif isinstance(node, ast.Try):
-            yield from imported_on_import(node.body)
-
-
-def test_make_docs_installs_or_mocks_all_that_the_modules_import():
-    """Autodoc imports every module, and in a fresh clone there is nothing but what the goal `docs` installs."""
-    locks = [REPOSITORY / "requirements" / f"{part}.txt" for part in ("ros", "runtime", "docs")]
-    locked = {re.split(r"[ =]", line)[0] for lock in locks for line in lock.read_text().splitlines()}
-    conf = (REPOSITORY / "docs" / "conf.py").read_text()
-    mocked = re.search(r"^autodoc_mock_imports = \[name for name in (\(.*?\)) if", conf, re.M)
-    assert mocked
-    distributions = importlib.metadata.packages_distributions()
-    available = {
-        *ast.literal_eval(mocked[1]),
-        *sys.stdlib_module_names,
-        "uwb_mitigation",
-        "uwb_mitigation_msgs",
-    }
-    for name, sources in distributions.items():
-        if any(re.sub(r"[-_.]+", "-", source).lower() in locked for source in sources):
-            available.add(name)
-    modules = (REPOSITORY / "uwb_mitigation").rglob("*.py")
-    missing = {
-        (path.name, name)
-        for path in modules
-        for name in imported_on_import(ast.parse(path.read_text(encoding="utf-8")).body)
-        if name not in available
-    }
-    assert missing == set()
-
-
 # What a reader sees.
-
-
-@pytest.mark.parametrize(("width", "pages"), [(1280, "[is]*.html"), (400, "*.html")])
-def test_no_page_of_the_site_is_cut_off(browser: Browser, width: int, pages: str):
-    site = REPOSITORY / "build" / "site"
-    if not (site / "docs" / "index.html").is_file():
-        pytest.skip("no site: run make docs")
-    cut = {}
-    for page in sorted(site.glob(f"docs/{pages}")):
-        browser.open(page.as_uri(), width)
-        if beyond := browser.cut_off(width):
-            cut[page.name] = beyond
-        if page.stem in ("index", "seeing"):
-            browser.screenshot(f"docs_{page.stem}_{width}")
-    assert cut == {}
-
-
-def test_the_readmes_pictures_are_small():
-    pictures = re.findall(r"!\[.+?\]\((\S+?)\)", (REPOSITORY / "README.md").read_text(encoding="utf-8"))
-    assert pictures
-    assert all((REPOSITORY / picture).stat().st_size < 200_000 for picture in pictures)

@@ -8,16 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from uwb_mitigation.errors import ModelError, RecordingError
+from uwb_mitigation.errors import ModelError
 from uwb_mitigation.files import partial_of, read_bounded, write_together, write_whole
-
-
-def test_a_file_up_to_the_ceiling_is_read_and_no_more(tmp_path: Path) -> None:
-    path = tmp_path / "file"
-    path.write_bytes(bytes(10))
-    assert read_bounded(path, 10, RecordingError) == bytes(10)
-    with pytest.raises(RecordingError, match="more than 9 bytes"):
-        read_bounded(path, 9, RecordingError)
 
 
 @pytest.mark.parametrize(
@@ -30,14 +22,6 @@ def test_what_holds_nothing_is_refused_by_name_and_with_what_would_be_valid(
     with pytest.raises(ModelError, match=rf"{told}.*\(a model\)") as caught:
         read_bounded(tmp_path / name, 10, ModelError, "a model")
     assert caught.value.where == str(tmp_path / name)
-
-
-def test_what_was_there_is_replaced_and_nothing_stays_beside_it(tmp_path: Path) -> None:
-    path = tmp_path / "file"
-    path.write_text("old")
-    write_whole(path, "new")
-    assert path.read_text() == "new"
-    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_a_link_is_followed_and_stays(tmp_path: Path) -> None:

@@ -128,20 +128,6 @@ def start_and_end(command: list[str | Path], words: str, folder: Path) -> None:
         assert node.signal(signal.SIGINT) == 0, node.output
 
 
-def test_the_command_line_takes_its_model_from_the_installation(prefix: Path, share: Path, tmp_path: Path):
-    code = (
-        "import uwb_mitigation, uwb_mitigation.nodes.monitor; from uwb_mitigation.model.shipped import *\n"
-        "print(uwb_mitigation.__file__); print(default_model_path())"
-    )
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
-    package, model = map(Path, done.stdout.splitlines())
-    assert package.is_relative_to(prefix), done.stderr
-    assert model.parent == share / "models"
-    command = [prefix / "lib" / NAME / "uwb-mitigation", "--version"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (0, "")
-
-
 def test_the_messages_are_installed_as_an_interface_package():
     prefix = prefix_of(MESSAGES)
     sources = files_below(REPOSITORY / "msg_defs" / "msg")
@@ -172,15 +158,6 @@ def test_a_colcon_build_that_does_not_know_of_the_messages_names_the_command_tha
     manifest.parent.mkdir(parents=True)
     manifest.touch()
     subprocess.run(command, cwd=REPOSITORY, env=environment, check=True, capture_output=True)
-
-
-@pytest.mark.skipif(shutil.which("cmake") is None, reason="no CMake: apt install cmake")
-@pytest.mark.parametrize("name", ["jürgen", "it's"])
-def test_a_path_that_the_macros_of_ros_cannot_take_is_refused_in_words(tmp_path: Path, name: str):
-    command = ["cmake", "-S", str(REPOSITORY / "msg_defs"), "-B", str(tmp_path / name)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode != 0
-    assert "colcon build --build-base /tmp/build --install-base /tmp/install" in " ".join(done.stderr.split())
 
 
 def without(absent: Iterable[str], name: str) -> list[str]:
@@ -225,19 +202,6 @@ def test_what_an_executable_misses_is_one_line(tmp_path: Path, name: str, absent
     assert done.returncode == 1
     (line,) = done.stderr.splitlines()
     assert line.startswith(told)
-
-
-def test_a_driver_that_misses_what_its_source_needs_says_so_in_one_line(tmp_path: Path):
-    pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
-    from ros_harness import domain
-
-    options = ["--ros-args", "-p", "source:=mcap", "-p", "path:=absent.mcap"]
-    command = [*without(["mcap"], "driver"), *options]
-    with domain(tmp_path) as ros:
-        driver = ros.run(command)
-        assert driver.wait() == 1
-    assert "mcap is not installed (run uwb-mitigation doctor)" in driver.output
-    assert "Traceback" not in driver.output
 
 
 CORRECT_WITH_THE_FIRMWARE = """
@@ -311,45 +275,6 @@ def test_every_ros_package_that_is_imported_is_declared_and_no_other():
 
 
 # Where a rosdep key is not `python3-` and the name of the distribution; None: there is none, or it is too old.
-KEYS = {
-    "bokeh": "python3-bokeh-pip",
-    "cobs": "python-cobs-pip",
-    "onnxruntime": "python3-onnxruntime-pip",
-    "pyserial": "python3-serial",
-    "pyyaml": "python3-yaml",
-    "rosbags": "python3-rosbags-pip",
-    "lz4": None,
-    "mcap": None,
-    "onnx": None,
-    "pooch": None,
-    "zstandard": None,
-}
-
-
-def machine_requirements() -> set[str]:
-    lines = (REPOSITORY / "requirements" / "ros_machine.txt").read_text().splitlines()
-    return {line.partition(">")[0] for line in lines if line and not line.startswith(("#", "-"))}
-
-
-@pytest.mark.parametrize("library", [library for libraries in LIBRARIES.values() for library in libraries])
-def test_every_library_has_a_rosdep_key_in_the_manifest_or_stands_in_the_requirements_of_a_ros_machine(
-    library: str,
-):
-    package = pytest.importorskip("catkin_pkg.package", reason="run make setup-training")
-    declared = {entry.name for entry in package.parse_package(str(REPOSITORY)).exec_depends}
-    key = KEYS.get(library, f"python3-{library}")
-    assert key in declared or library in machine_requirements()
-
-
-def test_every_library_that_tests_import_is_declared():
-    package = pytest.importorskip("catkin_pkg.package", reason="run make setup-training")
-    manifest = package.parse_package(str(REPOSITORY))
-    declared = {entry.name for entry in (*manifest.exec_depends, *manifest.test_depends)}
-    tests = [*(REPOSITORY / "test").glob("*.py")]
-    ours = {*(path.stem for path in tests), NAME, "generated"}
-    used = set(imported(tests, at_start=True)) - ours - set(sys.stdlib_module_names)
-    keys = {KEYS.get(name, f"python3-{name}") for name in used - declared - machine_requirements()}
-    assert keys <= declared | {"python3-serial", "python3-yaml"}
 
 
 def test_every_interface_that_the_messages_use_is_declared():

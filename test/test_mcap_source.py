@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 from bag_material import START_NS, STEP_NS, Foreign, numbers, record, write_bag
 from mcap.writer import CompressionType
-from rosbags.rosbag2 import StoragePlugin
-from rosbags.rosbag2 import Writer as RosbagWriter
 
-from uwb_mitigation.bag import codec, reader, schemas
+from uwb_mitigation.bag import codec
 from uwb_mitigation.bag.poses import encode_odometry
 from uwb_mitigation.bag.reader import BagReader
 from uwb_mitigation.bag.topics import ODOMETRY_TRUTH, ODOMETRY_TYPE, RANGE_CIR_TYPE, RANGE_RAW, RANGE_TRUTH
@@ -36,22 +34,11 @@ def test_records_come_back_as_they_were_written(tmp_path: Path, name: str) -> No
     assert source.message_count == 10
 
 
-def test_a_recording_can_be_read_again(tmp_path: Path) -> None:
-    source = McapRecording(write_bag(tmp_path / "bag.mcap"))
-    assert numbers(source) == numbers(source) == [0, 1, 2, 3, 4]
-
-
 @pytest.mark.parametrize(("flag", "simulated"), [("true", True), ("false", False), ("unknown", None)])
 def test_a_simulated_bag_says_so(tmp_path: Path, flag: str, simulated: bool | None) -> None:
     source = McapRecording(write_bag(tmp_path / "bag.mcap", simulated=flag))
     assert source.simulated is simulated
     assert ("(simulated)" in source.name) is bool(simulated)
-
-
-def test_a_bag_of_another_recorder_does_not_know_whether_it_was_simulated(tmp_path: Path) -> None:
-    bag = Foreign(tmp_path / "bag.mcap").ours()
-    bag.range(0)
-    assert McapRecording(bag.finish()).simulated is None
 
 
 def test_bounds_on_time_include_the_start_and_not_the_stop(tmp_path: Path) -> None:
@@ -67,15 +54,6 @@ def test_every_compression_is_read(tmp_path: Path, compression: CompressionType,
     for number in range(4):
         bag.range(number)
     assert numbers(McapRecording(bag.finish())) == [0, 1, 2, 3]
-
-
-def test_a_bag_of_rosbags_is_read(tmp_path: Path) -> None:
-    with RosbagWriter(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as bag:
-        connection = bag.add_connection(RANGE_RAW, RANGE_CIR_TYPE, typestore=schemas.typestore())
-        for number in range(3):
-            measurement = record(number).measurement
-            bag.write(connection, measurement.stamp_ns, codec.encode_range(measurement))
-    assert numbers(McapRecording(tmp_path / "bag")) == [0, 1, 2]
 
 
 @pytest.mark.parametrize("lag", [-5, -1, 0, 1, 5])
@@ -154,28 +132,6 @@ def test_files_of_a_folder_follow_each_other_by_number(tmp_path: Path) -> None:
     assert numbers(McapRecording(folder)) == [10, 2]
 
 
-def test_chunks_of_other_topics_are_not_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    bag = Foreign(tmp_path / "bag.mcap").ours()
-    bag.channel("/camera", "sensor_msgs/msg/Image", "uint8[] data")
-    bag.range(0)
-    bag.flush()
-    for _ in range(5):
-        bag.add("/camera", START_NS, bytes(100))
-        bag.flush()
-    bag.range(1)
-    path = bag.finish()
-    unpacked = []
-    decompress = reader._DECOMPRESSORS["zstd"]
-
-    def counting(*arguments: object) -> bytes:
-        unpacked.append(arguments)
-        return decompress(*arguments)
-
-    monkeypatch.setitem(reader._DECOMPRESSORS, "zstd", counting)
-    assert numbers(McapRecording(path)) == [0, 1]
-    assert len(unpacked) == 2
-
-
 @pytest.mark.parametrize(
     ("content", "told"),
     [(b"", "empty"), (b"\x89MCAP", "not an MCAP file"), (b"hello, this is text", "not an MCAP file")],
@@ -186,22 +142,12 @@ def test_what_is_no_mcap_file_is_refused(tmp_path: Path, content: bytes, told: s
         McapRecording(tmp_path / "bag.mcap")
 
 
-def test_an_absent_path_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match="no such file"):
-        McapRecording(tmp_path / "absent.mcap")
-
-
 def test_an_absent_topic_is_told_with_those_that_are_there(tmp_path: Path) -> None:
     source = McapRecording(write_bag(tmp_path / "bag.mcap"), topic="/other")
     with pytest.raises(
         RecordingError, match=r"no topic /other.*range_raw \(uwb_mitigation_msgs/msg/RangeCir\)"
     ):
         list(source)
-
-
-def test_a_bag_without_a_message_on_the_topic_is_empty(tmp_path: Path) -> None:
-    path = Foreign(tmp_path / "bag.mcap").ours().finish()
-    assert list(McapRecording(path)) == []
 
 
 @pytest.mark.parametrize(
@@ -221,15 +167,6 @@ def test_a_topic_that_would_be_misread_is_refused(
     with pytest.raises(RecordingError, match=told) as caught:
         list(McapRecording(bag.finish()))
     assert RANGE_RAW in caught.value.where
-
-
-@pytest.mark.parametrize("options", [{"encoding": "json"}, {"language": "jsonschema"}])
-def test_another_encoding_is_refused(tmp_path: Path, options: dict[str, str]) -> None:
-    bag = Foreign(tmp_path / "bag.mcap")
-    bag.channel(RANGE_RAW, RANGE_CIR_TYPE, schemas.definition(RANGE_CIR_TYPE), **options)
-    bag.range(0)
-    with pytest.raises(RecordingError, match="json"):
-        list(McapRecording(bag.finish()))
 
 
 def test_closing_ends_an_iteration(tmp_path: Path) -> None:
@@ -261,29 +198,3 @@ def test_a_malformed_metadata_file_is_refused(tmp_path: Path, text: str) -> None
     (tmp_path / "metadata.yaml").write_text(text)
     with pytest.raises(RecordingError, match="not a rosbag2 metadata file"):
         BagReader(tmp_path)
-
-
-def test_a_recording_is_told_by_its_content_where_its_name_says_nothing(tmp_path: Path) -> None:
-    path = write_bag(tmp_path / "bag.mcap").rename(tmp_path / "recording")
-    assert isinstance(open_recording(path), McapRecording)
-
-
-def test_what_no_source_reads_is_refused_with_what_is_accepted(tmp_path: Path) -> None:
-    (tmp_path / "notes.txt").write_text("nothing to see")
-    for path in (tmp_path / "notes.txt", tmp_path / "absent"):
-        with pytest.raises(RecordingError, match=r"MCAP bag.*DecaRanging"):
-            open_recording(path)
-
-
-def test_a_folder_is_no_bag_for_a_folder_in_it_that_has_a_bags_name(tmp_path: Path) -> None:
-    (tmp_path / "empty.mcap").mkdir()
-    with pytest.raises(RecordingError):
-        open_recording(tmp_path)
-    (tmp_path / "7.log").write_text("File:7.log, created by DecaRanging\n")
-    assert open_recording(tmp_path).name.startswith("DecaRanging")
-
-
-def test_a_bags_folder_may_hold_a_folder_with_a_bags_name(tmp_path: Path) -> None:
-    write_bag(tmp_path / "bag.mcap")
-    (tmp_path / "another.mcap").mkdir()
-    assert len(numbers(open_recording(tmp_path))) == 5

@@ -96,10 +96,6 @@ def test_an_invalid_range_has_infinite_variance(mitigation, range_m):
     assert mitigation.correct([measurement(range_m)])[0].variance_m2 == math.inf
 
 
-def test_a_range_of_zero_is_corrected(mitigation):
-    assert mitigation.correct([measurement(0.0)])[0].status is Status.OK
-
-
 def test_a_constant_prior_needs_no_power(tmp_path):
     subject = Mitigation(bundle(tmp_path, Remnet(samples=157), prior=LinePrior(0.25)))
     result = subject.correct([measurement(rx_power_dbm=math.nan, first_path_power_dbm=math.nan)])[0]
@@ -139,16 +135,6 @@ def test_a_batch_has_the_bits_of_single_measurements(mitigation, tmp_path, prior
     if prior is not None:
         assert sum(result.status is Status.OK for result in single) > 70
     assert [repr(result) for result in mitigation.correct(subjects)] == [repr(r) for r in single]
-
-
-def test_an_empty_batch_is_empty(mitigation):
-    assert mitigation.correct([]) == []
-
-
-def test_a_batch_of_bad_measurements_needs_no_network(mitigation):
-    assert [result.status for result in mitigation.correct([measurement(math.nan)])] == [
-        Status.OUT_OF_DISTRIBUTION
-    ]
 
 
 class FailingSession:

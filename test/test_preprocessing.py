@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from model_material import cir, window_of
 
-from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.measurement import Cir, Encoding
 from uwb_mitigation.preprocessing import CirFault, Preprocessing, Scaling
 
@@ -81,29 +80,6 @@ def test_inputs_are_the_contract_to_the_bit(scaling, encoding, data):
         assert out.tolist() == reference(subject, 8, scaling)
 
 
-def test_the_window_starts_five_samples_before_the_first_path():
-    samples = np.zeros(100, np.int16)
-    samples[20] = 100
-    subject = Cir(samples, Encoding.MAGNITUDE, first_path_index=25.9, preamble_count=1)
-    _, out = apply(subject, 8, Scaling.MAX)
-    assert out.tolist() == [1, 0, 0, 0, 0, 0, 0, 0]
-
-
-@pytest.mark.parametrize("start_index", [0, 700, -3])
-def test_the_window_follows_the_start_index(start_index):
-    samples = np.arange(1, 101, dtype=np.int16)
-    subject = Cir(samples, Encoding.MAGNITUDE, start_index, start_index + 5.0, preamble_count=1)
-    _, out = apply(subject, 8, Scaling.MAX)
-    assert out[0] == np.float32(1) / np.float32(8)
-
-
-@pytest.mark.parametrize("first_path", [5.0, 97.99])
-def test_a_window_may_touch_either_end(first_path):
-    samples = np.ones(100, np.int16)
-    subject = Cir(samples, Encoding.MAGNITUDE, first_path_index=first_path, preamble_count=1)
-    assert fault(subject, 8) == 0
-
-
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
@@ -134,10 +110,6 @@ def test_each_fault_is_found(changes, expected):
     assert fault(cir(**changes)) == expected
 
 
-def test_the_last_window_that_fits_is_read():
-    assert fault(cir(first_path_index=864.99)) == 0
-
-
 def test_a_saturated_sample_outside_the_window_does_no_harm():
     samples = cir().samples.copy()
     samples[0] = 32767
@@ -146,17 +118,3 @@ def test_a_saturated_sample_outside_the_window_does_no_harm():
 
 def test_the_scaling_by_maximum_needs_no_preamble_count():
     assert fault(cir(preamble_count=0), scaling=Scaling.MAX) == 0
-
-
-def test_inputs_of_any_valid_scale_are_finite():
-    for scale in (1e-30, 1e30):
-        for scaling in Scaling:
-            found, out = apply(cir(scale=scale), scaling=scaling)
-            assert found == 0
-            assert np.isfinite(out).all()
-
-
-@pytest.mark.parametrize("samples", [0, 1017, -1])
-def test_a_window_length_out_of_range_is_refused(samples):
-    with pytest.raises(ParameterError, match="1 to 1016"):
-        Preprocessing(samples)

@@ -21,32 +21,26 @@ from bag_material import Foreign, chunk_offsets
 from command_line import ENVIRONMENT, command, run, start
 from model_material import cir
 
-from uwb_mitigation.bag import codec, columns, schemas
+from uwb_mitigation.bag import codec
 from uwb_mitigation.bag.reader import BagReader
-from uwb_mitigation.bag.topics import RANGE_CIR_TYPE, RANGE_CORRECTED, RANGE_RAW
+from uwb_mitigation.bag.topics import RANGE_CORRECTED, RANGE_RAW
 from uwb_mitigation.bag.writer import BagWriter
-from uwb_mitigation.errors import MissingDependencyError, ParameterError, RecordingError
+from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.measurement import (
-    Cir,
-    CorrectedColumns,
-    CorrectedRange,
-    Origin,
     RangeMeasurement,
     Record,
-    Status,
     Truth,
 )
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.shipped import shipped_model_path
 from uwb_mitigation.offsets import NO_OFFSETS, Offsets
-from uwb_mitigation.processing.job import Job, attempt, process_bag
+from uwb_mitigation.processing.job import Job, process_bag
 from uwb_mitigation.processing.parallel import run_on_dask
 from uwb_mitigation.processing.planning import plan
 
 REPOSITORY = Path(__file__).parent.parent
 START_NS = 1_700_000_000_000_000_000
-LIKE = CorrectedRange(0.0, 0.0, 0.0, 0.0625, Status.OK, Origin.HOST, 77)
 
 # What a row of a batch may be: changes to the CIR, and the range.
 ROWS: list[tuple[dict[str, object], float]] = [
@@ -140,55 +134,6 @@ def one_by_one(measurements: list[RangeMeasurement], offsets: Offsets = NO_OFFSE
     return [codec.encode_corrected(m, mitigation.correct([m])[0]) for m in measurements]
 
 
-@pytest.mark.parametrize("frame", ["", "a", "antenna", "antenna of the third anchor", "Küche"])
-@pytest.mark.parametrize("samples", [40, 41])
-def test_encoded_blocks_are_what_the_codec_encodes(frame: str, samples: int) -> None:
-    measurements = [
-        replace(exchange(n), frame_id=frame, cir=Cir(np.arange(samples, dtype=np.int16))) for n in range(9)
-    ]
-    measurements[3] = replace(measurements[3], stamp_ns=-1)
-    (block,) = columns.blocks([codec.encode_range(m) for m in measurements])
-    correction = np.array([0.25, -0.5, 1.0] * 3, np.float32)
-    variance = np.array([0.25, 0.5, 2.0] * 3, np.float32)
-    status = np.array([Status.OK, Status.OUT_OF_DISTRIBUTION, Status.OK] * 3, np.uint8)
-    encoded = block.encode_corrected(
-        CorrectedColumns(
-            block.columns.range_m - correction, correction, variance, status, LIKE.origin, LIKE.model_id
-        ),
-    )
-    assert encoded == [
-        codec.encode_corrected(
-            measurement,
-            replace(
-                LIKE,
-                range_m=measurement.range_m - shift,
-                range_raw_m=measurement.range_m,
-                correction_m=shift,
-                variance_m2=spread,
-                status=Status(kind),
-            ),
-        )
-        for measurement, shift, spread, kind in zip(
-            measurements, correction.tolist(), variance.tolist(), status.tolist(), strict=True
-        )
-    ]
-
-
-def test_a_block_holds_one_layout_and_nothing_that_does_not_decode() -> None:
-    good = [codec.encode_range(exchange(n)) for n in range(10)]
-    short = [codec.encode_range(exchange(n, {"samples": np.ones(40, np.int16)})) for n in range(10)]
-    frame_end = 16 + len("antenna") + 1
-    broken = []
-    for place, value in ((1, 0), (11, 0xFF), (frame_end + 4 + 48, 9), (frame_end + 4 + 56, 1)):
-        message = bytearray(good[0])
-        message[place] = value
-        broken.append(bytes(message))
-    unterminated = [message[:23] + b"!" + message[24:] for message in good]
-    messages = [*good, *short, *broken, *unterminated, b"", b"\0\1\0\0"]
-    found = columns.blocks(messages)
-    assert [block.rows.tolist() for block in found] == [list(range(10)), list(range(10, 20))]
-
-
 def test_corrected_ranges_are_those_of_one_by_one_to_the_bit(tmp_path: Path) -> None:
     measurements = odd_exchanges() + exchanges(300)
     measurements += [exchange(n, {"samples": np.zeros(0, np.int16)}) for n in range(3)]
@@ -198,20 +143,6 @@ def test_corrected_ranges_are_those_of_one_by_one_to_the_bit(tmp_path: Path) -> 
     assert corrected_of(tmp_path / "out.mcap") == one_by_one(measurements)
     assert outcome.ranges == len(measurements) == outcome.statuses.total()
     assert set(outcome.statuses) >= {"OK", "NO_CIR", "BAD_CIR", "OUT_OF_DISTRIBUTION"}
-
-
-def test_each_corrected_range_stands_behind_its_raw_one_with_its_log_time(tmp_path: Path) -> None:
-    process_bag(job(write_bag(tmp_path / "in.mcap", exchanges(20)), tmp_path / "out.mcap"))
-    messages = list(BagReader(tmp_path / "out.mcap").messages())
-    for number, message in enumerate(messages):
-        if message.channel.topic == RANGE_RAW:
-            behind = messages[number + 1]
-            assert behind.channel.topic == RANGE_CORRECTED
-            assert behind.log_time_ns == message.log_time_ns
-            key, _ = codec.decode_corrected(behind.data)
-            assert key == codec.key_of(codec.decode_range(message.data))
-    times = [message.log_time_ns for message in messages]
-    assert times == sorted(times)
 
 
 def test_everything_else_is_copied_byte_for_byte(tmp_path: Path) -> None:
@@ -235,17 +166,6 @@ def test_everything_else_is_copied_byte_for_byte(tmp_path: Path) -> None:
     assert others(tmp_path / "out.mcap") == others(source)
 
 
-def test_two_publishers_of_one_topic_stay_apart(tmp_path: Path) -> None:
-    foreign = Foreign(tmp_path / "in.mcap").ours()
-    foreign.range(0)
-    for kind in ("a/msg/One", "a/msg/Two"):
-        foreign.channel("/other", kind, "uint8 data")
-        foreign.add("/other", START_NS, b"x")
-    process_bag(job(foreign.finish(), tmp_path / "out.mcap"))
-    kinds = [m.channel.schema.name for m in BagReader(tmp_path / "out.mcap").messages(["/other"])]
-    assert sorted(kinds) == ["a/msg/One", "a/msg/Two"]
-
-
 def test_messages_that_do_not_decode_are_copied_and_counted(tmp_path: Path) -> None:
     foreign = Foreign(tmp_path / "in.mcap").ours()
     foreign.range(0)
@@ -265,19 +185,6 @@ def test_corrected_ranges_of_the_input_are_replaced_and_counted(tmp_path: Path) 
     assert [m[1:] for m in BagReader(tmp_path / "once.mcap").messages()] == [
         m[1:] for m in BagReader(tmp_path / "twice.mcap").messages()
     ]
-
-
-def test_a_bag_can_be_replaced_by_its_corrected_self(tmp_path: Path) -> None:
-    source = write_bag(tmp_path / "in.mcap", exchanges(10))
-    process_bag(job(source, source, force=True))
-    assert len(corrected_of(source)) == 10
-
-
-def test_an_output_says_where_it_comes_from_and_that_it_was_simulated(tmp_path: Path) -> None:
-    process_bag(job(write_bag(tmp_path / "in.mcap", exchanges(2)), tmp_path / "out"))
-    known = BagReader(tmp_path / "out").metadata["uwb_mitigation"]
-    assert known["simulated"] == "true"
-    assert known["source"].startswith("in.mcap, corrected by model ")
 
 
 @pytest.mark.parametrize("library", ["rosbags", "mcap"])
@@ -300,31 +207,6 @@ def test_other_readers_open_the_output(tmp_path: Path, library: str) -> None:
             assert statistics.message_start_time == START_NS
             assert statistics.message_end_time == START_NS + 11 * 10_000_000
     assert found[RANGE_RAW] == found[RANGE_CORRECTED] == 12
-
-
-@pytest.mark.parametrize(
-    ("make", "told"),
-    [
-        (lambda path: path.write_bytes(b"nothing of the kind"), "not an MCAP file"),
-        (lambda path: path.write_bytes(b""), "empty"),
-        (lambda path: Foreign(path).finish(), "no topic /uwb/range_raw"),
-    ],
-)
-def test_what_is_no_recording_of_ranges_leaves_no_output(tmp_path: Path, make, told: str) -> None:
-    make(tmp_path / "in.mcap")
-    with pytest.raises(RecordingError, match=told):
-        process_bag(job(tmp_path / "in.mcap", tmp_path / "out.mcap"))
-    assert [path.name for path in tmp_path.iterdir()] == ["in.mcap"]
-
-
-def test_another_version_of_the_message_is_refused(tmp_path: Path) -> None:
-    foreign = Foreign(tmp_path / "in.mcap")
-    text = schemas.definition(RANGE_CIR_TYPE).replace("uint64 anchor_id", "uint32 anchor_id")
-    foreign.channel(RANGE_RAW, RANGE_CIR_TYPE, text)
-    foreign.range(0)
-    with pytest.raises(RecordingError, match="another version of"):
-        process_bag(job(foreign.finish(), tmp_path / "out.mcap"))
-    assert not (tmp_path / "out.mcap").exists()
 
 
 def cut(path: Path) -> int:
@@ -383,15 +265,6 @@ def test_offsets_of_a_file_are_taken_off_each_pair(tmp_path: Path) -> None:
     assert np.subtract(more, without)[:3] == pytest.approx([0.2, 0.35, -0.1], abs=1e-6)
 
 
-def test_cirs_without_a_preamble_count_get_the_model_that_needs_none(tmp_path: Path) -> None:
-    write_bag(tmp_path / "in.mcap", [exchange(n, {"preamble_count": 0}) for n in range(4)])
-    done = start("process", "in.mcap", "-o", "out.mcap", "--json", "out.json", folder=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert "universal_amplitude" in done.stderr
-    amplitude = load_bundle(shipped_model_path("universal_amplitude"))
-    assert json.loads((tmp_path / "out.json").read_text())["model_id"] == amplitude.model_id
-
-
 def test_an_output_that_is_there_is_kept_unless_forced(tmp_path: Path) -> None:
     source = write_bag(tmp_path / "in.mcap", exchanges(4))
     output = write_bag(tmp_path / "out.mcap", exchanges(1))
@@ -402,16 +275,6 @@ def test_an_output_that_is_there_is_kept_unless_forced(tmp_path: Path) -> None:
     assert corrected_of(output) == []
     assert run("process", source, "-o", output, "--force", folder=tmp_path).returncode == 0
     assert len(corrected_of(output)) == 4
-
-
-def test_a_link_that_leads_nowhere_is_replaced_only_when_forced(tmp_path: Path) -> None:
-    source = write_bag(tmp_path / "in.mcap", exchanges(4))
-    (tmp_path / "out.mcap").symlink_to(tmp_path / "nowhere.mcap")
-    with pytest.raises(RecordingError, match="--force"):
-        process_bag(job(source, tmp_path / "out.mcap"))
-    process_bag(job(source, tmp_path / "out.mcap", force=True))
-    assert len(corrected_of(tmp_path / "out.mcap")) == 4
-    assert not (tmp_path / "nowhere.mcap").exists()
 
 
 def test_one_bad_bag_is_reported_and_does_not_stop_the_rest(tmp_path: Path) -> None:
@@ -530,17 +393,6 @@ def test_a_worker_that_dies_costs_its_own_bag_only(tmp_path: Path) -> None:
     assert not list(tmp_path.glob("*.part"))
 
 
-def test_a_package_that_a_worker_misses_is_the_error_of_its_bag(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    source = write_bag(tmp_path / "in.mcap", exchanges(1))
-    monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
-    monkeypatch.setattr(schemas, "typestore", schemas.typestore.__wrapped__)
-    outcome = attempt(job(source, tmp_path / "out.mcap"))
-    assert str(outcome.error) == "rosbags is not installed (run uwb-mitigation doctor)"
-    assert not outcome.written
-
-
 def test_a_cluster_does_the_same_and_one_bad_bag_does_not_stop_it(tmp_path: Path) -> None:
     distributed = pytest.importorskip("distributed", reason="python -m pip install distributed")
     sources = [write_bag(tmp_path / f"in{n}.mcap", exchanges(50)) for n in range(3)]
@@ -570,9 +422,3 @@ def test_a_scheduler_that_does_not_answer_is_named(tmp_path: Path) -> None:
             with pytest.raises(ParameterError, match="no Dask scheduler"):
                 list(run_on_dask([job(tmp_path / "a", tmp_path / "b")], address))
     assert distributed
-
-
-def test_without_dask_the_error_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(MissingDependencyError, match="pip install distributed"):
-        list(run_on_dask([job(tmp_path / "a", tmp_path / "b")], "tcp://127.0.0.1:8786"))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import sys
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -13,7 +12,6 @@ pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
 from conftest import REPOSITORY
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from ros_harness import Ros, domain
 from uwb_mitigation_msgs.msg import RangeCorrected
 
@@ -91,24 +89,6 @@ def test_the_nodes_have_the_topics_of_the_page(ros: Ros, column: int, of_node: s
 
     ros.spin_until(lambda: documented <= found())
     assert found() == documented
-
-
-def test_every_topic_has_the_quality_of_service_of_the_page(ros: Ros):
-    for topic, *_ in rows("topics.md", "# Topics"):
-        for end in ros.node.get_publishers_info_by_topic(topic.split("`")[1]):
-            if end.node_name in NODES:
-                assert end.qos_profile.reliability == ReliabilityPolicy.RELIABLE
-                assert end.qos_profile.durability == DurabilityPolicy.VOLATILE
-    text = (DOCS / "topics.md").read_text()
-    assert f"| the three range topics | reliable | volatile | keep last {topics.DEPTH} |" in text
-
-
-def test_the_nodes_have_no_services_but_those_of_every_node(ros: Ros):
-    for node in NODES:
-        found = partial(ros.node.get_service_names_and_types_by_node, node, "/")
-        ros.spin_until(lambda found=found: bool(found()))
-        services = [name for name, _ in found()]
-        assert [name for name in services if not EVERY_SERVICE.fullmatch(name)] == []
 
 
 @pytest.mark.parametrize(

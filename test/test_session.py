@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from pathlib import Path
 
 import numpy as np
 import onnx
@@ -16,8 +15,7 @@ from uwb_mitigation.model import floating, graph
 from uwb_mitigation.model.architecture import Remnet
 from uwb_mitigation.model.bundle import save_bundle, session_options
 from uwb_mitigation.model.runtime import Session
-from uwb_mitigation.model.shipped import default_model_path, model_path, shipped_model_path
-from uwb_mitigation.preprocessing import Scaling
+from uwb_mitigation.model.shipped import default_model_path
 
 
 def test_the_int8_graph_fuses_to_integer_operators(tmp_path):
@@ -62,27 +60,6 @@ def test_a_graph_that_onnx_runtime_refuses_is_a_model_error(tmp_path):
     assert caught.value.where.endswith("broken.onnx")
 
 
-def test_the_shipped_model_is_found_in_a_checkout():
-    assert default_model_path().name == "universal.onnx"
-    assert default_model_path(Scaling.MAX).name == "universal_amplitude.onnx"
-
-
-def test_a_model_is_named_by_its_file_or_as_it_ships(tmp_path):
-    assert model_path("") == model_path(None) == default_model_path()
-    assert model_path(Path("evk1000_apartment")) == shipped_model_path("evk1000_apartment")
-    (tmp_path / "own.onnx").touch()
-    assert model_path(str(tmp_path / "own.onnx")) == tmp_path / "own.onnx"
-
-
-def test_the_shipped_model_is_found_in_a_sourced_workspace(tmp_path, monkeypatch):
-    folder = tmp_path / "share" / "uwb_mitigation" / "models"
-    folder.mkdir(parents=True)
-    (folder / "universal.onnx").touch()
-    monkeypatch.setattr("uwb_mitigation.model.shipped.__file__", "/nowhere/else/at/all/m/shipped.py")
-    monkeypatch.setenv("AMENT_PREFIX_PATH", f"/none:{tmp_path}")
-    assert default_model_path() == folder / "universal.onnx"
-
-
 def test_the_shipped_model_is_found_beside_an_installation(tmp_path, monkeypatch):
     folder = tmp_path / "share" / "uwb_mitigation" / "models"
     folder.mkdir(parents=True)
@@ -91,13 +68,3 @@ def test_the_shipped_model_is_found_beside_an_installation(tmp_path, monkeypatch
     monkeypatch.setattr("uwb_mitigation.model.shipped.__file__", str(module))
     monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
     assert default_model_path() == folder / "universal.onnx"
-
-
-def test_a_model_that_is_nowhere_lists_where_it_was_sought(monkeypatch):
-    monkeypatch.setattr("uwb_mitigation.model.shipped.__file__", "/a/b/c/d/uwb_mitigation/model/shipped.py")
-    monkeypatch.setattr("sys.prefix", "/prefix")
-    monkeypatch.setenv("AMENT_PREFIX_PATH", "/ament")
-    with pytest.raises(ModelError) as caught:
-        default_model_path()
-    assert "/ament/share/uwb_mitigation/models" in str(caught.value)
-    assert "/prefix/share/uwb_mitigation/models" in str(caught.value)

@@ -23,11 +23,3 @@ def test_a_tag_goes_through_doorways_and_not_through_walls(seed):
     places = along_route(route, np.arange(0.0, 40.0, 0.05))
     assert site.plan.direct_path(places[:-1], places[1:]).crossings.sum() == 0
     assert np.hypot(*np.diff(places, axis=0).T).max() < 0.06
-
-
-def test_the_same_seed_is_the_same_site_and_another_route_is_another():
-    (one, route), (again, same) = drawn(3), drawn(3)
-    assert one.plan == again.plan
-    assert one.anchors == again.anchors
-    assert route == same
-    assert one.route(np.random.default_rng(9)) != route

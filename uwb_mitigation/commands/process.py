@@ -104,11 +104,10 @@ def _process_one(job: Job) -> Outcome:
 def _follow(jobs: list[Job], outcomes: Iterable[Outcome]) -> list[Outcome]:
     """Show the progress; return the outcomes in the order of the jobs."""
     found: dict[Job, Outcome] = {}
-    with console.progress() as bar:
-        task = bar.add_task(f"0 of {len(jobs)} bags", total=len(jobs))
+    with console.step_bar("bags", len(jobs)) as advance:
         for outcome in outcomes:
             found[outcome.job] = outcome
-            bar.update(task, completed=len(found), description=f"{len(found)} of {len(jobs)} bags")
+            advance()
     return [found[job] for job in jobs]
 
 
@@ -143,20 +142,17 @@ def _show(outcomes: list[Outcome], result: dict[str, Any]) -> None:
     table = Table("bag", title=f"Corrected by model {result['model_id']:08x}", title_justify="left")
     for column in ("messages", "ranges", "OK", "passed through", "replaced", "skipped"):
         table.add_column(column, justify="right")
-    if any(outcome.error for outcome in outcomes):
-        table.add_column("")
+    table.add_column("")
     for outcome in outcomes:
         passed = outcome.ranges - outcome.statuses["OK"]
         numbers = (outcome.messages, outcome.ranges, outcome.statuses["OK"], passed, outcome.replaced)
-        state = [] if outcome.error is None else ["damaged" if outcome.written else "failed"]
+        state = "" if outcome.error is None else "damaged" if outcome.written else "failed"
         table.add_row(
-            escape(outcome.job.source.name), *map(str, numbers), str(outcome.skipped.total()), *state
+            escape(outcome.job.source.name), *map(str, numbers), str(outcome.skipped.total()), state
         )
     console.out.print(table)
     console.out.print(f"{result['ranges']} ranges, {result['ranges_per_s']:.0f} ranges/s", highlight=False)
     for outcome in outcomes:
-        if outcome.replaced:
-            _note(outcome.job.source, f"{outcome.replaced} corrected ranges that it held were replaced")
         for kind, count in outcome.skipped.items():
             _note(outcome.job.source, f"{count} x {kind}")
 

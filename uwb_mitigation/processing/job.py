@@ -13,21 +13,19 @@ from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 
-from uwb_mitigation.bag import columns, schemas
+from uwb_mitigation.bag import schemas
 from uwb_mitigation.bag.codec import decode_range, encode_corrected
 from uwb_mitigation.bag.reader import BagReader, RawMessage, check_channel
 from uwb_mitigation.bag.topics import RANGE_CIR_TYPE, RANGE_CORRECTED, RANGE_RAW
 from uwb_mitigation.bag.writer import METADATA_RECORD, BagWriter
 from uwb_mitigation.errors import DamagedRecordingError, RecordingError, UwbMitigationError, not_imported
-from uwb_mitigation.measurement import Status
+from uwb_mitigation.measurement import RangeMeasurement
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.offsets import NO_OFFSETS, Offsets
 
 BATCH = 256
 """Messages taken together: enough to vectorise, little enough that the network's inputs stay in cache."""
-
-_NAMES = {int(status): status.name for status in Status}
 
 Report = Callable[[int, int], None]
 """Called with (messages done, messages in all, as the bag's index says)."""
@@ -193,23 +191,16 @@ class _Corrector:
                     out.write_serialized(self._corrected, answer, log_ns, publish_ns, sequence)
 
     def _correct(self, messages: list[bytes]) -> list[bytes | None]:
-        """`RangeCorrected` for each message; None where it does not decode."""
+        """Return `RangeCorrected` for each message; None if it does not decode."""
         answers: list[bytes | None] = [None] * len(messages)
-        left = set(range(len(messages)))
-        for block in columns.blocks(messages):
-            corrected = self._mitigation.correct_columns(block.columns)
-            numbers = block.rows.tolist()
-            for number, answer in zip(numbers, block.encode_corrected(corrected), strict=True):
-                answers[number] = answer
-            left.difference_update(numbers)
-            self.statuses.update(_NAMES[status] for status in corrected.status.tolist())
-        for number in sorted(left):
+        decoded: dict[int, RangeMeasurement] = {}
+        for number, message in enumerate(messages):
             try:
-                measurement = decode_range(messages[number])
-            except RecordingError as error:
+                decoded[number] = decode_range(message)
+            except RecordingError as error:  # noqa: PERF203
                 self.skipped[error.what] += 1
-                continue
-            (result,) = self._mitigation.correct([measurement])
+        corrected = self._mitigation.correct([*decoded.values()])
+        for (number, measurement), result in zip(decoded.items(), corrected, strict=True):
             answers[number] = encode_corrected(measurement, result)
             self.statuses[result.status.name] += 1
         return answers
