@@ -5,18 +5,17 @@ from __future__ import annotations
 import enum
 import math
 import time
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from uwb_mitigation.commands import console
-from uwb_mitigation.commands.console import JsonOption
+from uwb_mitigation.commands.console import JsonOption, Table
 from uwb_mitigation.errors import DamagedRecordingError, ParameterError, RecordingError, format_id
 
 if TYPE_CHECKING:
-    from uwb_mitigation.sources.inventory import Inventory
-    from uwb_mitigation.sources.pauses import Pauses
     from uwb_mitigation.sources.source import Source
 
 app = typer.Typer(help="Bring recordings into bags, simulate them, look at them.", no_args_is_help=True)
@@ -53,73 +52,34 @@ CirOption = Annotated[
 ]
 
 
+OutputOption = Annotated[
+    Path,
+    typer.Option(
+        "-o", "--output", metavar="OUT", help="OUT.mcap for one file, any other name for a bag folder."
+    ),
+]
+ForceOption = Annotated[bool, typer.Option("--force", help="Replace OUT if it exists.")]
+
+
 @app.command("import")
 def import_recordings(
     sources: Annotated[list[Path], typer.Argument(metavar="SRC...", help="Recordings: logs, folders, bags.")],
-    output: Annotated[
-        Path,
-        typer.Option(
-            "-o", "--output", metavar="OUT", help="OUT.mcap for one file, any other name for a bag folder."
-        ),
-    ],
+    output: OutputOption,
     cir: CirOption = CirChoice.FINAL,
     longest_pause: LongestPauseOption = _LONGEST_PAUSE_S,
-    force: Annotated[bool, typer.Option("--force", help="Replace OUT if it exists.")] = False,
+    force: ForceOption = False,
     json: JsonOption = None,
 ) -> None:
     """Write recordings into one MCAP bag, with truth where known."""
-    from uwb_mitigation.bag.writer import BagWriter
-    from uwb_mitigation.sources.inventory import Inventory
-    from uwb_mitigation.sources.pauses import Pauses
-
     opened = [_opened(path, cir) for path in sources]
-    inventory = Inventory()
-    origin = {
-        "source": "; ".join(source.name for source in opened),
-        "simulated": _simulated(opened),
-    }
-    # A tag that is known to move goes on through a pause: its time is not to be cut.
+    # The time of a tag that is known to move continues through a pause.
     in_motion = any(getattr(source, "in_motion", False) for source in opened)
-    pauses = Pauses(math.inf if in_motion else longest_pause, _today_ns())
-    damage: list[DamagedRecordingError] = []
-    with BagWriter(output, origin, force=force) as bag, console.progress() as bar:
-        task = bar.add_task("importing", total=None)
-        for source in opened:
-            try:
-                with source:
-                    for record in inventory.watch(source):
-                        bag.write(pauses.without(record))
-                        if inventory.ranges % _STRIDE == 0:
-                            bar.update(task, description=f"importing: {inventory.ranges} ranges")
-            except DamagedRecordingError as error:  # noqa: PERF203 - once a source
-                damage.append(error)
-        if inventory.ranges == 0:
-            raise (
-                damage[0] if damage else RecordingError("no ranges in it", where=", ".join(map(str, sources)))
-            )
-    for source in opened:
-        _show(source, inventory if len(opened) == 1 else None)
-    if len(opened) == 1:
-        _save_anchors(opened[0], output)
-    if len(opened) > 1:
-        _show_inventory(inventory)
-    messages = bag.counts.total()
-    _show_pauses(pauses)
-    console.out.print(f"Wrote {messages} messages to {bag.file}.", markup=False, soft_wrap=True)
-    console.write_json(json, {"messages": messages, "output": str(bag.file), **inventory.as_json()})
-    # What was readable is kept; that it is not everything must not pass unnoticed.
-    if damage:
-        raise damage[0]
+    _write(opened, output, math.inf if in_motion else longest_pause, force, json)
 
 
 @app.command()
 def simulate(
-    output: Annotated[
-        Path,
-        typer.Option(
-            "-o", "--output", metavar="OUT", help="OUT.mcap for one file, any other name for a bag folder."
-        ),
-    ],
+    output: OutputOption,
     like: Annotated[
         Like,
         typer.Option(
@@ -136,7 +96,7 @@ def simulate(
     exchanges: Annotated[int, typer.Option(help="For each placement at rest; a drive has none.")] = 20,
     anchors: Annotated[int, typer.Option(help="That a drive goes past, 4 to 8.")] = 4,
     longest_pause: LongestPauseOption = _LONGEST_PAUSE_S,
-    force: Annotated[bool, typer.Option("--force", help="Replace OUT if it exists.")] = False,
+    force: ForceOption = False,
     json: JsonOption = None,
 ) -> None:
     """Simulate ranges with their truth, and write them to a bag.
@@ -151,33 +111,68 @@ def write_simulated(
     source: Source, total: int, seed: int, output: Path, longest_pause: float, force: bool, json: Path | None
 ) -> None:
     """Write a simulated source to a bag; `total` is the number of ranges for the progress bar."""
+    _write([source], output, longest_pause, force, json, total, {"seed": seed, "simulated": True})
+
+
+def _write(
+    sources: Sequence[Source],
+    output: Path,
+    longest_pause: float,
+    force: bool,
+    json: Path | None,
+    total: int | None = None,
+    more: dict[str, Any] | None = None,
+) -> None:
+    """Write sources into one bag, and show what it holds.
+
+    Raises:
+        RecordingError: there are no ranges; or a source is damaged, after the bag was written.
+    """
     from uwb_mitigation.bag.writer import BagWriter
     from uwb_mitigation.sources.inventory import Inventory
     from uwb_mitigation.sources.pauses import Pauses
 
     inventory = Inventory()
-    origin = {"source": source.name, "simulated": "true"}
-    pauses = Pauses(longest_pause, _today_ns())
+    kinds = {source.simulated for source in sources}
+    simulated = "true" if True in kinds else "unknown" if None in kinds else "false"
+    origin = {"source": "; ".join(source.name for source in sources), "simulated": simulated}
+    pauses = Pauses(longest_pause, int(time.time() // 86_400) * 86_400 * 10**9)
+    damage: list[DamagedRecordingError] = []
     with BagWriter(output, origin, force=force) as bag, console.progress() as bar:
-        task = bar.add_task("simulating", total=total)
-        for record in inventory.watch(source):
-            bag.write(pauses.without(record))
-            if inventory.ranges % _STRIDE == 0:
-                bar.update(task, completed=inventory.ranges)
-    _show(source, None)
-    _show_pauses(pauses)
-    _save_anchors(source, output)
+        task = bar.add_task("writing", total=total)
+        for source in sources:
+            try:
+                with source:
+                    for record in inventory.watch(source):
+                        bag.write(pauses.without(record))
+                        if inventory.ranges % _STRIDE == 0:
+                            done = inventory.ranges
+                            bar.update(task, completed=done, description=f"writing: {done} ranges")
+            except DamagedRecordingError as error:  # noqa: PERF203 - once a source
+                damage.append(error)
+        if inventory.ranges == 0:
+            raise damage[0] if damage else RecordingError("no ranges in it", where=origin["source"])
+    found = inventory.as_json()
+    for source in sources:
+        _show_source(source)
+    if total is None:
+        _show_inventory(found)
+    if pauses.cut:
+        _print(
+            f"Cut {pauses.cut} pauses to {pauses.longest_s:g} s each, {pauses.cut_s:.0f} s in all; "
+            "--longest-pause inf keeps them."
+        )
+    if len(sources) == 1:
+        _save_anchors(sources[0], output)
+    messages = bag.counts.total()
     lost = ", ".join(f"{count} x {why}" for why, count in inventory.skipped.items())
-    console.out.print(
-        f"Wrote {inventory.ranges} ranges of {_pairs(inventory)} to {bag.file}"
-        + (f"; left out: {lost}." if lost else "."),
-        markup=False,
-        highlight=False,
-        soft_wrap=True,
+    _print(
+        f"Wrote {messages} messages, {inventory.ranges} ranges of {_pairs(found)}, to {bag.file}"
+        + (f"; left out: {lost}." if lost and total is not None else ".")
     )
-    console.write_json(
-        json, {"output": str(bag.file), "seed": seed, "simulated": True, **inventory.as_json()}
-    )
+    console.write_json(json, {"messages": messages, "output": str(bag.file), **(more or {}), **found})
+    if damage:
+        raise damage[0]
 
 
 def simulated_source(like: Like, seed: int, ranges: int, exchanges: int, anchors: int = 4) -> Source:
@@ -227,25 +222,22 @@ def info(
     source = _opened(path, cir)
     inventory = Inventory()
     try:
-        with source, console.progress() as bar:
-            task = bar.add_task("reading", total=None)
+        with source, console.reading() as on_record:
             for _ in inventory.watch(source):
-                if inventory.ranges % _STRIDE == 0:
-                    bar.update(task, description=f"reading: {inventory.ranges} ranges")
+                on_record()
     finally:
         # What was readable is shown before an error of the rest.
+        found = inventory.as_json()
         if inventory.ranges or inventory.skipped:
-            _show(source, inventory)
+            _show_source(source)
+            _show_inventory(found)
     messages = source.message_count if isinstance(source, McapRecording) else inventory.ranges
-    console.write_json(
-        json,
-        {
-            "messages": messages,
-            "source": source.name,
-            "simulated": source.simulated,
-            **inventory.as_json(),
-        },
-    )
+    about = {"messages": messages, "source": source.name, "simulated": source.simulated}
+    console.write_json(json, {**about, **found})
+
+
+def _print(text: str) -> None:
+    console.out.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
 def _save_anchors(source: Source, bag: Path) -> None:
@@ -255,74 +247,44 @@ def _save_anchors(source: Source, bag: Path) -> None:
         path = anchors_file(bag)
         # The bag itself was refused, or `--force` given, before.
         save_anchors(path, source.anchors, f"anchors of {source.name}", force=True)
-        console.out.print(f"Wrote {len(source.anchors)} anchors to {path}.", markup=False, soft_wrap=True)
+        _print(f"Wrote {len(source.anchors)} anchors to {path}.")
 
 
-def _show(source: Source, inventory: Inventory | None) -> None:
+_KINDS = {
+    True: "simulated: no radio was involved",
+    False: "measured by radios",
+    None: "unknown whether radios measured it or a simulator made it",
+}
+
+
+def _show_source(source: Source) -> None:
     console.out.print(source.name, style="bold", markup=False, soft_wrap=True)
-    told = {
-        True: "simulated: no radio was involved",
-        False: "measured by radios",
-        None: "unknown whether radios measured it or a simulator made it",
-    }
-    console.out.print(told[source.simulated])
-    if inventory is not None:
-        _show_inventory(inventory)
+    console.out.print(_KINDS[source.simulated])
 
 
-def _simulated(sources: list[Source]) -> str:
-    """Of all together, as a bag's metadata says it."""
-    kinds = {source.simulated for source in sources}
-    return "true" if True in kinds else "unknown" if None in kinds else "false"
-
-
-def _show_pauses(pauses: Pauses) -> None:
-    if pauses.cut:
-        console.out.print(
-            f"Cut {pauses.cut} pauses to {pauses.longest_s:g} s each, {pauses.cut_s:.0f} s in all; "
-            "--longest-pause inf keeps them.",
-            highlight=False,
-            soft_wrap=True,
-        )
-
-
-def _today_ns() -> int:
-    """Today at 0:00 UTC, where recordings begin that bear no date."""
-    return int(time.time() // 86_400) * 86_400 * 10**9
-
-
-def _show_inventory(inventory: Inventory) -> None:
-    from uwb_mitigation.commands.console import Table
-
+def _show_inventory(found: dict[str, Any]) -> None:
     console.out.print(
-        f"{inventory.ranges} ranges, {inventory.with_truth} with truth, "
-        f"{_pairs(inventory)}, {inventory.duration_s:.1f} s"
+        f"{found['ranges']} ranges, {found['with_truth']} with truth, {_pairs(found)}, {found['duration_s']:.1f} s"
     )
     pairs = Table("anchor", "tag", "label", title="Pairs", title_justify="left")
     for column in ("ranges", "rate (Hz)", "mean range (m)", "mean true (m)"):
         pairs.add_column(column, justify="right")
-    for pair in inventory.pairs.values():
-        pairs.add_row(
-            format_id(pair.anchor_id),
-            format_id(pair.tag_id),
-            pair.label,
-            str(pair.ranges),
-            _number(pair.rate_hz, 1),
-            _number(pair.mean_m, 3),
-            _number(pair.mean_true_m, 3),
-        )
+    for pair in found["by_pair"]:
+        means = (_number(pair[name], 3) for name in ("mean_range_m", "mean_true_range_m"))
+        ids = (format_id(pair[name]) for name in ("anchor_id", "tag_id"))
+        pairs.add_row(*ids, pair["label"], str(pair["ranges"]), _number(pair["rate_hz"], 1), *means)
     console.out.print(pairs)
-    if inventory.skipped:
+    if found["skipped"]:
         oddities = Table("oddity", title="Oddities", title_justify="left")
         oddities.add_column("count", justify="right")
-        for kind, count in inventory.skipped.most_common():
+        for kind, count in sorted(found["skipped"].items(), key=lambda item: -item[1]):
             oddities.add_row(kind, str(count))
         console.out.print(oddities)
 
 
-def _pairs(inventory: Inventory) -> str:
-    return f"{inventory.pair_count} pair{'' if inventory.pair_count == 1 else 's'}"
+def _pairs(found: dict[str, Any]) -> str:
+    return f"{found['pairs']} pair{'' if found['pairs'] == 1 else 's'}"
 
 
-def _number(value: float, digits: int) -> str:
-    return f"{value:.{digits}f}" if math.isfinite(value) else "-"
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"

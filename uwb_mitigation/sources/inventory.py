@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from uwb_mitigation.measurement import Record
 from uwb_mitigation.sources.source import Source
@@ -14,132 +15,62 @@ from uwb_mitigation.sources.source import Source
 _SECOND_NS = 1e9
 
 
-@dataclass(slots=True)
-class Pair:
-    """The exchanges of one anchor with one tag under one label.
-
-    Attributes:
-        anchor_id, tag_id: the two radios, or the places they stood at.
-        label: propagation condition; empty = unknown.
-        ranges: how many.
-        first_ns, last_ns: stamps of the earliest and the latest.
-        sum_m, finite: sum and count of the ranges that are finite.
-        true_sum_m, known: sum and count of the true distances that are known.
-    """
-
-    anchor_id: int
-    tag_id: int
-    label: str
-    ranges: int = 0
-    first_ns: int = 0
-    last_ns: int = 0
-    sum_m: float = 0.0
-    finite: int = 0
-    true_sum_m: float = 0.0
-    known: int = 0
-
-    def add(self, record: Record) -> None:
-        """Take in one record."""
-        measurement = record.measurement
-        stamp_ns = measurement.stamp_ns
-        self.first_ns = min(self.first_ns, stamp_ns) if self.ranges else stamp_ns
-        self.last_ns = max(self.last_ns, stamp_ns) if self.ranges else stamp_ns
-        self.ranges += 1
-        if math.isfinite(measurement.range_m):
-            self.sum_m += measurement.range_m
-            self.finite += 1
-        if record.truth is not None:
-            self.true_sum_m += record.truth.range_m
-            self.known += 1
-
-    @property
-    def mean_m(self) -> float:
-        """Mean of the finite ranges; NaN = there is none."""
-        return self.sum_m / self.finite if self.finite else math.nan
-
-    @property
-    def mean_true_m(self) -> float:
-        """Mean of the true distances; NaN = none is known."""
-        return self.true_sum_m / self.known if self.known else math.nan
-
-    @property
-    def rate_hz(self) -> float:
-        """Exchanges a second between the first and the last; NaN = no time passes between them."""
-        span_ns = self.last_ns - self.first_ns
-        return (self.ranges - 1) * _SECOND_NS / span_ns if span_ns > 0 else math.nan
-
-
-@dataclass(slots=True)
 class Inventory:
-    """What has been read of a source so far.
+    """What has been read so far.
 
     Attributes:
-        ranges: records.
-        with_truth: records whose true distance is known.
-        pairs: by (anchor, tag, label), in the order of their first exchange.
+        ranges: number of records.
+        with_truth: number of records with a true range.
         skipped: oddities, {kind: count}.
     """
 
-    ranges: int = 0
-    with_truth: int = 0
-    pairs: dict[tuple[int, int, str], Pair] = field(default_factory=dict)
-    skipped: Counter[str] = field(default_factory=Counter)
+    def __init__(self) -> None:
+        self.ranges = self.with_truth = 0
+        self.skipped: Counter[str] = Counter()
+        self._rows: dict[tuple[int, int, str], list[tuple[int, float, float]]] = {}
 
     def watch(self, source: Source) -> Iterator[Record]:
-        """Pass the records of `source` on, and count them; oddities join even when reading ends in an error."""
+        """Pass on the records of `source` and count them; oddities are added even if reading ends in an error."""
         try:
             for record in source:
-                self._add(record)
+                measured, truth = record.measurement, record.truth
+                key = (measured.anchor_id, measured.tag_id, truth.label if truth else "")
+                row = (measured.stamp_ns, measured.range_m, truth.range_m if truth else np.nan)
+                self._rows.setdefault(key, []).append(row)
+                self.ranges += 1
+                self.with_truth += truth is not None
                 yield record
         finally:
             self.skipped += source.skipped
 
-    @property
-    def pair_count(self) -> int:
-        """Pairs of an anchor and a tag, whatever their labels."""
-        return len({(pair.anchor_id, pair.tag_id) for pair in self.pairs.values()})
-
-    @property
-    def duration_s(self) -> float:
-        """Time from the earliest to the latest exchange; 0 when there are fewer than two."""
-        if not self.pairs:
-            return 0.0
-        first = min(pair.first_ns for pair in self.pairs.values())
-        return (max(pair.last_ns for pair in self.pairs.values()) - first) / _SECOND_NS
-
     def as_json(self) -> dict[str, Any]:
-        """The result as JSON knows it: what is not known is null."""
+        """Return the result for JSON, with null for unknown values; pairs in the order of their first exchange."""
+        stamps = [row[0] for rows in self._rows.values() for row in rows]
         return {
             "ranges": self.ranges,
             "with_truth": self.with_truth,
-            "pairs": self.pair_count,
-            "duration_s": self.duration_s,
+            "pairs": len({key[:2] for key in self._rows}),
+            "duration_s": (max(stamps) - min(stamps)) / _SECOND_NS if stamps else 0.0,
             "skipped": dict(self.skipped),
-            "by_pair": [
-                {
-                    "anchor_id": pair.anchor_id,
-                    "tag_id": pair.tag_id,
-                    "label": pair.label,
-                    "ranges": pair.ranges,
-                    "rate_hz": _known(pair.rate_hz),
-                    "mean_range_m": _known(pair.mean_m),
-                    "mean_true_range_m": _known(pair.mean_true_m),
-                }
-                for pair in self.pairs.values()
-            ],
+            "by_pair": [_pair(*key, rows) for key, rows in self._rows.items()],
         }
 
-    def _add(self, record: Record) -> None:
-        measurement = record.measurement
-        label = record.truth.label if record.truth is not None else ""
-        key = (measurement.anchor_id, measurement.tag_id, label)
-        pair = self.pairs.get(key)
-        if pair is None:
-            pair = self.pairs[key] = Pair(*key)
-        pair.add(record)
-        self.ranges += 1
-        self.with_truth += record.truth is not None
+
+def _pair(anchor_id: int, tag_id: int, label: str, rows: list[tuple[int, float, float]]) -> dict[str, Any]:
+    stamps = [row[0] for row in rows]
+    span_ns = max(stamps) - min(stamps)
+    return {
+        "anchor_id": anchor_id,
+        "tag_id": tag_id,
+        "label": label,
+        "ranges": len(rows),
+        "rate_hz": (len(rows) - 1) * _SECOND_NS / span_ns if span_ns > 0 else None,
+        "mean_range_m": _mean(np.array([row[1] for row in rows])),
+        "mean_true_range_m": _mean(np.array([row[2] for row in rows])),
+    }
 
 
-def _known(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+def _mean(values: NDArray[np.float64]) -> float | None:
+    """The mean of the finite values; None if there are none."""
+    finite = values[np.isfinite(values)]
+    return float(finite.mean()) if len(finite) else None
