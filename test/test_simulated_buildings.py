@@ -7,7 +7,7 @@ import pytest
 
 from uwb_mitigation.evaluation.dataset import Dataset, build_dataset
 from uwb_mitigation.preprocessing import Preprocessing
-from uwb_mitigation.sources.simulated_buildings import SimulatedBuildings
+from uwb_mitigation.sources.simulated import SimulatedBuildings
 from uwb_mitigation.sources.simulation import buildings
 from uwb_mitigation.sources.simulation.buildings import (
     PLACEMENTS,

@@ -23,6 +23,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from sites import draw_site
 
 from uwb_mitigation.evaluation.dataset import build_dataset
 from uwb_mitigation.evaluation.site_data import gather
@@ -40,7 +41,6 @@ from uwb_mitigation.positioning.tracks import Ranges, TruePath, track_errors
 from uwb_mitigation.sources.simulated import SimulatedSource
 from uwb_mitigation.sources.simulation.buildings import RADIO
 from uwb_mitigation.sources.simulation.scene import ANCHORS, FLAT, MORE_ANCHORS, ROUTE
-from uwb_mitigation.sources.simulation.sites import draw_site
 from uwb_mitigation.training import site_calibration, train
 
 UNSEEN = 7_000_000

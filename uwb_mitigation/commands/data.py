@@ -182,7 +182,7 @@ def simulated_source(like: Like, seed: int, ranges: int, exchanges: int, anchors
         ParameterError: a number is out of its range.
     """
     from uwb_mitigation.sources import simulated
-    from uwb_mitigation.sources.simulated_buildings import SimulatedBuildings
+    from uwb_mitigation.sources.simulated import SimulatedBuildings
 
     if like in (Like.SURVEY, Like.BUILDINGS):
         if exchanges < 1 or ranges % exchanges:

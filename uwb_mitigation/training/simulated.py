@@ -26,7 +26,7 @@ def building_dataset(
     *,
     wide: bool = False,
 ) -> Dataset:
-    """One range of each of the first `blocks` x 256 placements of `sources.simulated_buildings`, in its order.
+    """One range of each of the first `blocks` x 256 placements of `sources.simulated`, in its order.
 
     Those that are not received, or whose window cannot be used, are left out. The same for every number of
     `workers` (processes); `on_block` is called after each block. `wide`: see `block_of`.
