@@ -234,8 +234,8 @@ def _swapped(
     setting: Setting, found: Stretches, solved: Regressors, fit: JointFit, first_positions: FirstPositions
 ) -> tuple[int, int] | None:
     """Return the pair of anchors that explains the ranges best if swapped; None: no pair is much better."""
-    few = found.first(_MAX_RANGES)
-    columns = solved.take(np.arange(len(few.ranges)))
+    part = np.arange(len(found.ranges)) < _MAX_RANGES
+    few, columns = found.only(part), solved.take(part)
     links = links_of(few, columns.rows, columns.alike, setting.model)
     scale = np.maximum(fit.scale_m, 0.1)
 

@@ -1,11 +1,11 @@
-"""Where the anchors are: the anchors file, checked in words, and the arrays that estimation takes.
+"""The anchors of a site: their file, and arrays for estimation.
 
     anchors:
       - {id: 1, x: 0.0, y: 0.0, z: 2.1}
       - {id: 2, x: 7.6, y: 0.0, z: 2.1, sd: 0.05, name: door}
 
-Metres in the frame `map`; `sd` is the standard deviation of each coordinate, 0.05 m unless said; `id` is the
-64-bit identity that ranges carry, decimal or 0x... . Nothing else may stand in it.
+Metres in the frame `map`; `sd`: standard deviation of each coordinate, 0.05 m by default; `id`: the 64-bit id of the
+ranges, decimal or 0x... . Other fields are errors.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from numpy.typing import NDArray
 from uwb_mitigation.errors import ParameterError, format_id
 
 SD_M = 0.05
-"""How well a tape measure places an anchor."""
+"""Accuracy of a tape measure."""
 
 MAX_ANCHORS = 256
 MAX_TEXT = 1 << 20
 MAX_COORDINATE_M = 1e5
 MILLIMETRES = 200.0
-"""Anchors that far apart are out of each other's reach: such coordinates are millimetres."""
+"""Anchors further apart do not receive each other: such coordinates are probably millimetres."""
 
 _MAX_ID = (1 << 64) - 1
 _NEEDED = ("id", "x", "y", "z")
@@ -59,30 +59,26 @@ class Anchor:
 class AnchorMap:
     """The anchors of a site; immutable.
 
-    Args:
-        anchors: one or more, of different identities.
-
     Attributes:
-        anchors: as given.
+        anchors: one or more, with different ids.
         position: float64 (m, 3), m.
         sd: float64 (m,), m.
-        index: where an identity is among them.
+        index: {id: row}.
 
     Raises:
-        ParameterError: there is none, too many, or one identity twice.
+        ParameterError: no anchor, too many, or an id twice.
     """
 
     def __init__(self, anchors: Sequence[Anchor], where: str = "anchors") -> None:
         if not 1 <= len(anchors) <= MAX_ANCHORS:
             raise ParameterError(f"{len(anchors)} anchors", where=where, valid=f"1 to {MAX_ANCHORS}")
         self.anchors = tuple(anchors)
-        self.index: dict[int, int] = {}
-        for number, anchor in enumerate(self.anchors):
-            if anchor.id in self.index:
-                raise ParameterError(
-                    f"anchor {format_id(anchor.id)} is there twice", where=where, valid="one entry for each"
-                )
-            self.index[anchor.id] = number
+        self.index = {anchor.id: row for row, anchor in enumerate(self.anchors)}
+        if len(self.index) < len(self.anchors):
+            twice = next(a.id for row, a in enumerate(self.anchors) if self.index[a.id] != row)
+            raise ParameterError(
+                f"anchor {format_id(twice)} is there twice", where=where, valid="one entry for each"
+            )
         self.position: NDArray[np.float64] = np.array(
             [anchor.position for anchor in self.anchors], np.float64
         )
@@ -94,7 +90,7 @@ class AnchorMap:
         return len(self.anchors)
 
     def moved(self, position: NDArray[np.float64], sd: NDArray[np.float64]) -> AnchorMap:
-        """The same anchors at other places: float64 (m, 3) and (m,)."""
+        """Return the same anchors at other positions: float64 (m, 3) and (m,)."""
         return AnchorMap(
             [
                 Anchor(anchor.id, (float(p[0]), float(p[1]), float(p[2])), float(s), anchor.name)
@@ -104,14 +100,10 @@ class AnchorMap:
 
 
 def parse_anchors(text: str, where: str) -> AnchorMap:
-    """The anchors of a file's text.
-
-    Args:
-        text: YAML (so JSON too) as the module's text shows.
-        where: what to call the file in errors.
+    """Parse the text of an anchors file, YAML or JSON; `where`: its name in errors.
 
     Raises:
-        ParameterError: it is no YAML, or not of that form; names entry and field.
+        ParameterError: it has another form; names entry and field.
     """
     if len(text) > MAX_TEXT:
         raise ParameterError(f"{len(text)} characters", where=where, valid=f"{MAX_TEXT} at most")
@@ -135,7 +127,7 @@ def parse_anchors(text: str, where: str) -> AnchorMap:
 
 
 def dump_anchors(anchors: AnchorMap, comment: str = "") -> str:
-    """The text of an anchors file, which `parse_anchors` reads; `comment` goes ahead, a line a line."""
+    """Return the text of an anchors file, after the lines of `comment`."""
     out = io.StringIO()
     for line in comment.splitlines():
         out.write(f"# {line}\n")
@@ -166,15 +158,12 @@ def _anchor(entry: Any, where: str) -> Anchor:
     name = entry.get("name", "")
     if not isinstance(name, str) or len(name) > 100:
         raise ParameterError(f"name = {name!r:.60}", where=where, valid="text of at most 100 characters")
-    return Anchor(_identity(entry["id"], where), (x, y, z), sd, name)
-
-
-def _identity(value: object, where: str) -> int:
-    if isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= _MAX_ID:
-        return value
-    raise ParameterError(
-        f"id = {value!r:.60}", where=where, valid="a whole number of 64 bits, such as 3 or 0x1f"
-    )
+    identity = entry["id"]
+    if not isinstance(identity, int) or isinstance(identity, bool) or not 0 <= identity <= _MAX_ID:
+        raise ParameterError(
+            f"id = {identity!r:.60}", where=where, valid="a whole number of 64 bits, such as 3 or 0x1f"
+        )
+    return Anchor(identity, (x, y, z), sd, name)
 
 
 def _number(entry: dict[str, Any], name: str, where: str, low: float, high: float) -> float:

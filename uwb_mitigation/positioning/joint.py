@@ -91,23 +91,13 @@ class Stretches:
 
     def keep(self, wanted: NDArray[np.bool_]) -> Stretches:
         """Those stretches, bool (s,)."""
-        rows = np.flatnonzero(wanted[self.of])
-        number = np.cumsum(wanted) - 1
-        return Stretches(
-            self.ranges.take(rows),
-            self.tag[rows],
-            self.row[rows],
-            number[self.of[rows]],
-            self.at_rest[wanted],
-            self.rise[rows],
-        )
+        return self.only(wanted[self.of])
 
-    def first(self, count: int) -> Stretches:
-        """Only the first ranges."""
-        part = slice(0, count)
-        of = self.of[part]
-        rows = self.tag[part], self.row[part]
-        return Stretches(self.ranges.take(part), *rows, of, self.at_rest[: int(of[-1]) + 1], self.rise[part])
+    def only(self, kept: NDArray[np.bool_]) -> Stretches:
+        """Only these ranges, bool (n,), and the segments that contain them."""
+        numbers, of = np.unique(self.of[kept], return_inverse=True)
+        columns = (self.tag[kept], self.row[kept], of, self.at_rest[numbers], self.rise[kept])
+        return Stretches(self.ranges.take(kept), *columns)
 
 
 def stretches(tags: Sequence[Ranges]) -> Stretches:
@@ -124,13 +114,7 @@ def stretches(tags: Sequence[Ranges]) -> Stretches:
             at_rest.append(is_still)
     tag_of, row_of = np.concatenate(tag), np.concatenate(row)
     taken = [one.take(row_of[tag_of == number]) for number, one in enumerate(tags)]
-    columns = Ranges(
-        np.concatenate([one.stamp_ns for one in taken]),
-        np.concatenate([one.anchor for one in taken]),
-        np.concatenate([one.range_m for one in taken]),
-        np.concatenate([one.variance_m2 for one in taken]),
-        np.concatenate([one.rx_power_dbm for one in taken]),
-    )
+    columns = Ranges.joined(taken)
     return Stretches(columns, tag_of, row_of, np.concatenate(of), np.array(at_rest), np.zeros(len(columns)))
 
 

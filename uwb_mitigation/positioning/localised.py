@@ -201,9 +201,8 @@ def solve_localised(
     Raises:
         DatasetError: too few ranges lie within the localisation's times, or arms and offsets cannot be separated.
     """
-    stamp = np.concatenate([one.stamp_ns for one in tags])
-    row = np.concatenate([one.anchor for one in tags])
-    value = np.concatenate([one.range_m for one in tags])
+    every = Ranges.joined(tags)
+    stamp, row, value = every.stamp_ns, every.anchor, every.range_m
     tag = np.repeat(np.arange(len(tags)), list(map(len, tags)))
     if (fewest := min(map(len, paths))) < 2:
         raise DatasetError(f"{fewest} poses of the localisation", valid="two or more")

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +21,7 @@ class Ranges:
         stamp_ns: int64 (n,).
         anchor: int (n,), rows of an `AnchorMap`.
         range_m: float64 (n,), finite.
-        variance_m2: float64 (n,); NaN = unknown.
-        rx_power_dbm: float64 (n,); NaN = unknown.
+        variance_m2, rx_power_dbm: float64 (n,); NaN: unknown.
         tag_id: of all of them.
     """
 
@@ -36,22 +37,26 @@ class Ranges:
 
     def take(self, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> Ranges:
         """The ranges at `index`."""
-        return Ranges(
-            self.stamp_ns[index],
-            self.anchor[index],
-            self.range_m[index],
-            self.variance_m2[index],
-            self.rx_power_dbm[index],
-            self.tag_id,
-        )
+        return replace(self, **{name: getattr(self, name)[index] for name in _COLUMNS})
+
+    @classmethod
+    def joined(cls, parts: Sequence[Ranges]) -> Ranges:
+        """All ranges, one part after the other; the tag id is 0."""
+        columns: dict[str, Any] = {
+            name: np.concatenate([getattr(one, name) for one in parts]) for name in _COLUMNS
+        }
+        return cls(**columns)
+
+
+_COLUMNS = ("stamp_ns", "anchor", "range_m", "variance_m2", "rx_power_dbm")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
-    """Where a tag is at one time.
+    """Position and velocity of a tag at one time.
 
     Attributes:
-        stamp_ns: of the estimate.
+        stamp_ns: its time.
         position, velocity: float64 (3,), m and m/s, in the anchors' frame.
         covariance: float64 (6, 6), of position and velocity.
     """
@@ -82,7 +87,7 @@ class Track:
 
     @classmethod
     def of(cls, estimates: list[Estimate]) -> Track:
-        """Estimates as a track; of none, an empty one."""
+        """Return estimates as a track."""
         return cls(
             np.array([e.stamp_ns for e in estimates], np.int64),
             np.array([e.position for e in estimates], np.float64).reshape(-1, 3),
@@ -97,7 +102,7 @@ class Track:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TruePath:
-    """Where a tag truly was: int64 (n,) stamps in order, float64 (n, 3) positions in m."""
+    """True positions of a tag: int64 (n,) stamps in order, float64 (n, 3) positions in m."""
 
     stamp_ns: NDArray[np.int64]
     position: NDArray[np.float64]
@@ -106,10 +111,10 @@ class TruePath:
         return len(self.stamp_ns)
 
     def at(self, stamp_ns: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Positions float64 (k, 3) at other times, by interpolation; NaN outside, and in gaps of over 1 s."""
+        """Return positions float64 (k, 3) at other times, by interpolation; NaN outside, and in gaps of over 1 s."""
         if len(self) == 0:
             return np.full((len(stamp_ns), 3), np.nan)
-        # Relative: seconds since the epoch leave a float64 no more than a fraction of a microsecond.
+        # Relative: a float64 resolves seconds since the epoch to a fraction of a microsecond only.
         own, wanted = (stamps - self.stamp_ns[0] for stamps in (self.stamp_ns, stamp_ns))
         found = np.stack([np.interp(wanted, own, axis, np.nan, np.nan) for axis in self.position.T], axis=1)
         after = np.clip(np.searchsorted(own, wanted), 1, max(len(own) - 1, 1))
@@ -170,21 +175,21 @@ class TrackErrors:
     height_rmse: float
 
     def as_json(self) -> dict[str, float | int | None]:
-        """The keys of `track --json`; what is not known is null."""
-        values = {
-            "horizontal_rmse_m": self.rmse,
-            "median_m": self.median,
-            "p95_m": self.p95,
-            "coverage95": self.coverage95,
-            "nees_per_dof": self.nees_per_dof,
-            "protection_exceeded": self.exceeded,
-            "height_rmse_m": self.height_rmse,
-        }
+        """The keys of `track --json`; unknown values are null."""
+        keys = ("rmse", "median", "p95", "coverage95", "nees_per_dof", "exceeded", "height_rmse")
+        values = {_JSON_KEYS.get(key, key): getattr(self, key) for key in keys}
         return {"epochs": self.epochs} | {
             name: value if math.isfinite(value) else None for name, value in values.items()
         }
 
 
+_JSON_KEYS = {
+    "rmse": "horizontal_rmse_m",
+    "median": "median_m",
+    "p95": "p95_m",
+    "exceeded": "protection_exceeded",
+    "height_rmse": "height_rmse_m",
+}
 NO_ERRORS = TrackErrors(0, *(math.nan,) * 7)
 
 

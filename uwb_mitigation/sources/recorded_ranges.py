@@ -56,6 +56,7 @@ class RecordedRanges:
 
 
 _Row = tuple[int, int, float, float, float]
+_DTYPE = np.dtype([("s", "i8"), ("a", "i8"), ("r", "f8"), ("v", "f8"), ("p", "f8")])
 
 
 def read_ranges(path: Path, anchors: AnchorMap, stamp_offset_s: float = 0.0) -> RecordedRanges:
@@ -138,12 +139,6 @@ def _add(
 
 
 def _columns(tag_id: int, rows: list[_Row]) -> Ranges:
-    rows = sorted(rows, key=lambda row: row[0])
-    return Ranges(
-        np.array([row[0] for row in rows], np.int64),
-        np.array([row[1] for row in rows], np.intp),
-        np.array([row[2] for row in rows], np.float64),
-        np.array([row[3] for row in rows], np.float64),
-        np.array([row[4] for row in rows], np.float64),
-        tag_id,
-    )
+    columns = np.array(sorted(rows, key=lambda row: row[0]), _DTYPE)
+    stamp, anchor, range_m, variance, power = (columns[name].copy() for name in "sarvp")
+    return Ranges(stamp, anchor, range_m, variance, power, tag_id)
