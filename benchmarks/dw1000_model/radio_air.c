@@ -222,14 +222,6 @@ int radio_air_board(radio_air *air, double ppm, uint64_t clock_ticks, uint16_t t
     return air->count++;
 }
 
-/* A chip whose program is elsewhere. */
-int radio_air_remote(radio_air *air, double ppm, uint64_t clock_ticks, uint16_t tx_delay, uint16_t rx_delay,
-                     int (*next)(void *context, dw1000_request *request)) {
-    const int board = radio_air_board(air, ppm, clock_ticks, tx_delay, rx_delay, &uwb_twr_defaults, 1);
-    dw1000_program_remote(air->boards[board]->chip, next, NULL);
-    return board;
-}
-
 void radio_air_line(radio_air *air, int board, double baud, int mode, double inference_s, double overhead_s) {
     air->boards[board]->baud = baud;
     air->boards[board]->mode = (uint8_t)mode;

@@ -60,7 +60,8 @@ def build_image(
     """Build the DWM1001-DEV's image, as Intel HEX.
 
     Ranging firmware with a model for corrections on the board. One image: the board is an anchor until its host, or its
-    button held at the start, makes it a tag. Built and emulated only: it was never run on a board.
+    button held at the start, makes it a tag. It was never run on a board; its driver and exchange
+    were tested on a modelled chip.
     """
     import tempfile
 
