@@ -325,7 +325,6 @@ def test_truth_is_not_made_up_in_gaps():
     np.testing.assert_array_equal(at[:, 0], [np.nan, 0, 0.5, np.nan, np.nan])
 
 
-@pytest.mark.parametrize("name", ["acceleration", "range_sd", "white", "long"])
-def test_a_model_out_of_range_is_refused(name: str):
-    with pytest.raises(ParameterError, match=name):
-        Model(**{name: math.nan})
+def test_a_model_out_of_range_is_refused():
+    with pytest.raises(ParameterError, match="range_sd"):
+        Model(range_sd=math.nan)

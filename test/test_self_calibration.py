@@ -23,14 +23,7 @@ OWN = np.array([0.2, -0.1, 0.05, -0.2, 0.05])
 
 
 def with_own(ranges: Ranges, own=OWN) -> Ranges:
-    return Ranges(
-        ranges.stamp_ns,
-        ranges.anchor,
-        ranges.range_m + own[ranges.anchor],
-        ranges.variance_m2,
-        ranges.rx_power_dbm,
-        ranges.tag_id,
-    )
+    return replace(ranges, range_m=ranges.range_m + own[ranges.anchor])
 
 
 @pytest.fixture(scope="module")
@@ -133,25 +126,15 @@ def test_tags_at_a_dozen_unknown_places_tell_offset_and_line():
     assert np.median(np.linalg.norm((found.fit.position - truth)[:, :2], axis=1)) < 0.08
 
 
-@pytest.mark.parametrize("heard", [1, 2])
-def test_one_tag_carried_from_place_to_place_rests_at_each(heard):
+def test_one_tag_that_pauses_between_positions_rests_at_each():
     _, tags, _ = places_at_rest()
-    order = np.repeat(np.arange(len(tags)), heard)
-    carried = Ranges(
-        np.concatenate([tags[n].stamp_ns + k * 60 * 10**9 for k, n in enumerate(order)])
-        if heard == 1
-        else np.concatenate([tags[n].stamp_ns + (60 * n + 2 * (k % 2)) * 10**9 for k, n in enumerate(order)]),
-        *(
-            np.concatenate([getattr(tags[n], name) for n in order])
-            for name in ("anchor", "range_m", "variance_m2", "rx_power_dbm")
-        ),
-        7,
+    carried = Ranges.joined(
+        [replace(tag, stamp_ns=tag.stamp_ns + 60 * n * 10**9) for n, tag in enumerate(tags)]
     )
-    found = stretches([carried])
-    assert found.at_rest.tolist() == [True] * len(tags)
+    assert stretches([carried]).at_rest.tolist() == [True] * len(tags)
 
 
-@pytest.mark.parametrize("rate_hz", [40.0, 10.0, 5.0, 2.0, 1.0])
+@pytest.mark.parametrize("rate_hz", [40.0, 1.0])
 def test_a_drive_is_none_from_place_to_place(rate_hz):
     ranges, _ = drive(seconds=120, rate_hz=rate_hz)
     assert not stretches([ranges]).at_rest.any()
