@@ -17,7 +17,7 @@ from uwb_mitigation_msgs.msg import RangeCorrected
 from uwb_mitigation.bag.codec import encode_corrected
 from uwb_mitigation.measurement import Cir, CorrectedRange, Origin, RangeMeasurement, Status
 from uwb_mitigation.nodes import processes, topics
-from uwb_mitigation.nodes.probe import Probe, wait, watching
+from uwb_mitigation.nodes.processes import Probe, wait, watching
 from uwb_mitigation.positioning.anchors import Anchor, AnchorMap, dump_anchors
 from uwb_mitigation.positioning.filter import RangeFilter
 from uwb_mitigation.positioning.model import Model

@@ -30,7 +30,7 @@ from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.measurement import Record
 from uwb_mitigation.nodes import processes, relay, topics
-from uwb_mitigation.nodes.probe import Probe, wait, watching
+from uwb_mitigation.nodes.processes import Probe, wait, watching
 from uwb_mitigation.preprocessing import WINDOW_LEAD
 from uwb_mitigation.sources.simulated import SimulatedSource
 

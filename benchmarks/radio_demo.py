@@ -24,7 +24,7 @@ from benchmarks.dw1000_model.evb1000 import EmulatedEvb1000s
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.nodes import processes, topics
 from uwb_mitigation.nodes.monitor import REFRESH_HZ
-from uwb_mitigation.nodes.probe import Probe, wait, watching
+from uwb_mitigation.nodes.processes import Probe, wait, watching
 from uwb_mitigation.sources.simulated import SimulatedSource
 from uwb_mitigation.sources.simulation.scene import ANCHORS
 

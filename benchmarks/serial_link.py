@@ -21,7 +21,7 @@ from benchmarks.nodes import vitals_of
 from uwb_mitigation.link.emulated_board import EmulatedBoard
 from uwb_mitigation.measurement import Record
 from uwb_mitigation.nodes import processes, topics
-from uwb_mitigation.nodes.probe import Probe, wait, watching
+from uwb_mitigation.nodes.processes import Probe, wait, watching
 from uwb_mitigation.preprocessing import WINDOW_LEAD
 from uwb_mitigation.sources.simulated import SimulatedSource
 from uwb_mitigation.sources.source import Source

@@ -13,7 +13,7 @@ from uwb_mitigation_msgs.msg import RangeCorrected
 from benchmarks.nodes import Advance, Bench, Step, Subject, open_bench, searches, take_steps, vitals_of
 from benchmarks.visitors import Visitors
 from uwb_mitigation.nodes import topics
-from uwb_mitigation.nodes.probe import wait
+from uwb_mitigation.nodes.processes import wait
 
 RATE_HZ = 100.0
 SENT_HZ = 500

@@ -55,11 +55,11 @@ def _program(module: str) -> None:
 
 def _node(name: str) -> None:
     if {"-h", "--help"} & set(sys.argv[1:]):
-        from uwb_mitigation.nodes.help import text_for
+        from uwb_mitigation.nodes.parameter_tables import help_text
 
-        # Whoever reads it, such as `head`, may have enough of it.
+        # A reader such as `head` may close the pipe early.
         signal.signal(signal.SIGPIPE, signal.SIG_DFL)
-        print(text_for(name))
+        print(help_text(name))
     elif name == "monitor":
         # It draws in this thread, and is spun by another.
         _load("uwb_mitigation.nodes.monitor")()

@@ -52,10 +52,10 @@ def view(
 
     from uwb_mitigation.sources.site import anchors_file, load_anchors
     from uwb_mitigation.viewer.feed import Feed
+    from uwb_mitigation.viewer.page import View
     from uwb_mitigation.viewer.playback import BagPlayer
     from uwb_mitigation.viewer.scene import Scene
     from uwb_mitigation.viewer.server import ViewerServer
-    from uwb_mitigation.viewer.view import View
 
     scene, lock = Scene(), Lock()
     feed = Feed(scene, lock)

@@ -27,7 +27,7 @@ from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.shipped import default_model_path
 from uwb_mitigation.nodes import processes, topics
-from uwb_mitigation.nodes.probe import Probe, watching
+from uwb_mitigation.nodes.processes import Probe, watching
 from uwb_mitigation.sources.opening import open_recording
 from uwb_mitigation.sources.simulated import SimulatedSource
 

@@ -11,7 +11,6 @@ from rich.table import Table
 from uwb_mitigation_msgs.msg import RangeCorrected
 
 from uwb_mitigation.nodes import topics
-from uwb_mitigation.nodes.conversions import NANOSECONDS
 from uwb_mitigation.nodes.monitor import Monitor
 from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.geometry import Height
@@ -81,7 +80,7 @@ class Positions:
 
 
 def _stamp(message: Any) -> int:
-    return int(message.header.stamp.sec * NANOSECONDS + message.header.stamp.nanosec)
+    return int(message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec)
 
 
 def _place(message: Any) -> tuple[int, float, float, float]:

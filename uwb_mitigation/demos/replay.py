@@ -20,7 +20,7 @@ from uwb_mitigation.demos.positions import Positions
 from uwb_mitigation.errors import DatasetError, UwbMitigationError
 from uwb_mitigation.nodes import processes, topics
 from uwb_mitigation.nodes.monitor import REFRESH_HZ, Monitor, live_table, summary
-from uwb_mitigation.nodes.probe import wait, watching
+from uwb_mitigation.nodes.processes import wait, watching
 from uwb_mitigation.positioning.anchors import AnchorMap, dump_anchors
 from uwb_mitigation.sources.simulated import SimulatedSource
 from uwb_mitigation.sources.source import Source

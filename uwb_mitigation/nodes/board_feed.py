@@ -24,7 +24,8 @@ from uwb_mitigation.link.port import BoardPort
 from uwb_mitigation.link.radio import RadioSettings, RadioStatus
 from uwb_mitigation.measurement import RangeMeasurement
 from uwb_mitigation.nodes import diagnostics, radio_facts
-from uwb_mitigation.nodes.feed import EVENT_TIMEOUT_S, Description, LiveFeed, Value
+from uwb_mitigation.nodes.diagnostics import Description
+from uwb_mitigation.nodes.feed import EVENT_TIMEOUT_S, LiveFeed, Value
 from uwb_mitigation.nodes.radio_feed import PREFIX, settings_of
 from uwb_mitigation.offsets import Offsets
 

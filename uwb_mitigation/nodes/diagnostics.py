@@ -1,27 +1,38 @@
-"""What a node tells `/diagnostics`: one status, its level chosen by the node, its facts as text."""
+"""Diagnostics of the nodes: the message, rate and latency, and the mitigator's health with its warnings."""
 
 from __future__ import annotations
 
+import math
+import statistics
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
+from uwb_mitigation.measurement import Status
+
 OK = DiagnosticStatus.OK
 WARN = DiagnosticStatus.WARN
 ERROR = DiagnosticStatus.ERROR
+
+Description = tuple[str, bytes, str, dict[str, object]]
+"""Hardware id, level, message and values of a diagnostic status."""
+
+LATENCIES = 20_000
+"""Number of latencies that are kept."""
 
 
 def report(
     node: Node, hardware_id: str, level: bytes, message: str, facts: Mapping[str, object]
 ) -> DiagnosticArray:
-    """The message of one status, stamped on the node's clock and named after the node."""
+    """Return a message with one status, stamped on the node's clock and named after the node."""
     status = DiagnosticStatus(
         level=level,
-        name=name_of(node),
+        name=f"{node.get_fully_qualified_name().lstrip('/')}: ranges",
         message=message,
         hardware_id=hardware_id,
         values=[KeyValue(key=key, value=str(value)) for key, value in facts.items()],
@@ -31,13 +42,8 @@ def report(
     return array
 
 
-def name_of(node: Node) -> str:
-    """Return the name of the node's status."""
-    return f"{node.get_fully_qualified_name().lstrip('/')}: ranges"
-
-
 def percentiles(name: str, values_ns: list[int]) -> dict[str, object]:
-    """Facts `NAME p50 ms` and `NAME p99 ms`; none without values."""
+    """Return the values `NAME p50 ms` and `NAME p99 ms`; empty without data."""
     if not values_ns:
         return {}
     p50, p99 = np.percentile(values_ns, (50, 99)) / 1e6
@@ -45,21 +51,20 @@ def percentiles(name: str, values_ns: list[int]) -> dict[str, object]:
 
 
 def model_id(identity: int) -> str:
-    """As the tools print it, in hexadecimal, and as `ros2 topic echo` does."""
+    """Return a model id in hexadecimal, as the tools print it, and in decimal, as `ros2 topic echo` does."""
     return f"{identity:08x} ({identity})"
 
 
 class Meter:
-    """Rate and latency of what passes, over the time since it was last asked.
+    """Rate and latency since the previous call of `facts`.
 
     Args:
-        now_ns: the clock that the rate is counted on, the node's: ranges that a recording plays at ten
-            times its speed come at ten times their rate only by a clock that is not simulated.
+        now_ns: the node's clock, ns. If it is simulated, the rate is that of the recording.
     """
 
     def __init__(self, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
-        # Appending and clearing a deque are atomic: one thread adds, another asks.
-        self._latencies_ns: deque[int] = deque(maxlen=20_000)
+        # deque.append and popleft are atomic: one thread adds, another reads.
+        self._latencies_ns: deque[int] = deque(maxlen=LATENCIES)
         self._now_ns = now_ns
         self._since_ns = now_ns()
         self._passed = self._reported = 0
@@ -69,11 +74,187 @@ class Meter:
         self._passed += 1
 
     def facts(self) -> dict[str, object]:
-        """Rate, and percentiles of the latency where anything passed; begins a new period."""
-        latencies = [self._latencies_ns.popleft() for _ in range(len(self._latencies_ns))]
+        """Return rate and percentiles of the latency, and begin a new period."""
         now_ns = self._now_ns()
         period_s, self._since_ns = (now_ns - self._since_ns) / 1e9, now_ns
         passed, self._reported = self._passed - self._reported, self._passed
         # A simulated clock may stand still, or jump back when a recording starts over.
         rate = f"{passed / period_s:.1f}" if period_s > 0 else "unknown"
-        return {"rate Hz": rate} | percentiles("latency", latencies)
+        return {"rate Hz": rate} | percentiles("latency", _drained(self._latencies_ns))
+
+
+@dataclass(frozen=True, slots=True)
+class Threshold:
+    """When the diagnostics warn.
+
+    Attributes:
+        fact: the value that is compared, over the last period.
+        limit: the highest value that is OK.
+        text: the warning above it.
+    """
+
+    fact: str
+    limit: float
+    text: str
+
+
+OUT_OF_DISTRIBUTION = Threshold(
+    "share of ranges OUT_OF_DISTRIBUTION", 0.2, "many ranges are unlike the model's training data"
+)
+UNUSABLE = Threshold("share of ranges NO_CIR or BAD_CIR", 0.2, "many ranges have no usable CIR")
+UNCOUNTED = Threshold(
+    "share of ranges without the preamble count that the model needs",
+    0.2,
+    "many CIRs have no preamble count, and this model needs it: set model to universal_amplitude",
+)
+DROPPED = Threshold("share of ranges dropped", 0.0, "ranges were dropped: the queue was too short")
+SLOW = Threshold("p99 of the processing time, ms", 20.0, "correcting takes long: the processor is overloaded")
+SILENT = Threshold("s without a range", 5.0, "no ranges arrive")
+OFFSET = Threshold(
+    "size of the median predicted error of ranges that look like line of sight, m",
+    0.15,
+    "the model takes much off ranges that look like line of sight: it holds other boards' offset",
+)
+
+MAX_LOS, MIN_LOS = 1000, 200
+"""Latest LOS ranges whose median is compared with OFFSET, and the smallest number of them."""
+
+
+class MitigatorHealth:
+    """Counts ranges. One thread adds, another reads.
+
+    Args:
+        publishers: returns the number of publishers of ranges.
+        now_s: a steady clock.
+
+    Attributes:
+        statuses: number of ranges by status, since the start.
+        lost: ranges that the middleware reports as lost: the publisher's queue was too short.
+        numbering: finds these, and the ranges that the subscription's queue dropped.
+        malformed: messages that could not be decoded.
+        uncounted: ranges whose CIR lacks the preamble count that the model needs, in this period.
+        los_m: predicted errors of the latest LOS ranges without the offsets of the radios.
+        predicts_excess_alone: whether the median of `los_m` should be near 0.
+    """
+
+    def __init__(
+        self, publishers: Callable[[], int] = lambda: 1, now_s: Callable[[], float] = time.monotonic
+    ) -> None:
+        self.statuses: Counter[Status] = Counter()
+        self.lost = 0
+        self.numbering = Numbering(publishers)
+        self.malformed = 0
+        self.uncounted = 0
+        self.los_m: deque[float] = deque(maxlen=MAX_LOS)
+        self.predicts_excess_alone = False
+        self._processing_ns: deque[int] = deque(maxlen=LATENCIES)
+        self._now_s = now_s
+        self._last_s = now_s()
+        self._before: tuple[Counter[Status], int] = (Counter(), 0)
+
+    @property
+    def dropped(self) -> int:
+        """Ranges that a queue has dropped, as far as known."""
+        return max(self.lost, self.numbering.missing)
+
+    def add_time(self, processing_ns: int) -> None:
+        """Add the processing time of a range or of a batch."""
+        self._processing_ns.append(processing_ns)
+        self._last_s = self._now_s()
+
+    def period(self) -> tuple[list[str], dict[str, object], bool]:
+        """Begin a new period.
+
+        Returns:
+            The warnings of the period that ends, its values for the diagnostics, and whether the model failed.
+        """
+        before, dropped_before = self._before
+        self._before = self.statuses.copy(), self.dropped
+        statuses = self._before[0] - before
+        dropped = self._before[1] - dropped_before
+        processing_ns = _drained(self._processing_ns)
+        los_m = self.los_m.copy()
+        median_m = statistics.median(los_m) if los_m else math.nan
+        total = max(statuses.total(), 1)
+        uncounted, self.uncounted = self.uncounted / total, 0
+        out_of_distribution = statuses[Status.OUT_OF_DISTRIBUTION] / total
+        values = {
+            OUT_OF_DISTRIBUTION: out_of_distribution,
+            UNUSABLE: (statuses[Status.NO_CIR] + statuses[Status.BAD_CIR]) / total - uncounted,
+            UNCOUNTED: uncounted,
+            DROPPED: dropped / max(statuses.total() + dropped, 1),
+            SLOW: float(np.percentile(processing_ns, 99)) / 1e6 if processing_ns else 0.0,
+            SILENT: self._now_s() - self._last_s,
+            OFFSET: abs(median_m) if self.predicts_excess_alone and len(los_m) >= MIN_LOS else 0.0,
+        }
+        facts: dict[str, object] = {f"ranges {status.name}": self.statuses[status] for status in Status}
+        facts |= {
+            "out of distribution": f"{out_of_distribution:.3f}",
+            "dropped by a queue": f"{self.dropped}" + ("" if self.numbering.complete else " or more"),
+            "malformed": self.malformed,
+            "line of sight: ranges": len(los_m),
+        }
+        if los_m:
+            facts["line of sight: median predicted error m"] = f"{median_m:.3f}"
+        facts |= percentiles("processing", processing_ns)
+        warnings = [threshold.text for threshold, value in values.items() if value > threshold.limit]
+        return warnings, facts, statuses[Status.MODEL_ERROR] > 0
+
+
+NOT_NUMBERED = 2**64 - 1
+"""Sequence number of rmw if the middleware provides none (RMW_MESSAGE_INFO_SEQUENCE_NUMBER_UNSUPPORTED)."""
+
+
+class Numbering:
+    """Counts dropped messages by the sequence numbers of their publishers.
+
+    A queue with keep-last drops messages silently. A message does not identify its publisher: a number that
+    follows a known last number belongs to that publisher. Any other number is the first of a new publisher if
+    there are more publishers than known ones, and otherwise a gap after the nearest lower number. The gap may
+    be attributed to the wrong publisher, but the total is right.
+
+    Args:
+        publishers: returns the number of publishers; called only for a number that does not follow a known one.
+
+    Attributes:
+        missing: numbers that were never received.
+        complete: False once a message had no number.
+    """
+
+    def __init__(self, publishers: Callable[[], int]) -> None:
+        self.missing = 0
+        self.complete = True
+        self._publishers = publishers
+        # The last number of each publisher; the latest is at the end.
+        self._last: list[int] = []
+
+    def add(self, number: int) -> None:
+        """Add the number of a received message."""
+        last = self._last
+        if last and last[-1] == number - 1:
+            last[-1] = number
+        elif number == NOT_NUMBERED:
+            self.complete = False
+        elif number - 1 in last:
+            last.remove(number - 1)
+            last.append(number)
+        else:
+            self._add_gap_or_publisher(number)
+
+    def _add_gap_or_publisher(self, number: int) -> None:
+        publishers = self._publishers()
+        lower = [last for last in self._last if last < number]
+        if len(self._last) < publishers or not lower:
+            # A publisher has joined or restarted: it replaces the one that was received the longest ago.
+            self._last.append(number)
+            del self._last[: max(len(self._last) - max(publishers, 1), 0)]
+            return
+        nearest = max(lower)
+        self.missing += number - nearest - 1
+        self._last.remove(nearest)
+        self._last.append(number)
+
+
+def _drained(values: deque[int]) -> list[int]:
+    """Remove and return all values; another thread may append meanwhile."""
+    return [values.popleft() for _ in range(len(values))]

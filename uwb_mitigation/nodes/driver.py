@@ -10,8 +10,9 @@ import threading
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
+import numpy as np
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
@@ -22,7 +23,7 @@ from rclpy.time import Time
 from rosgraph_msgs.msg import Clock as ClockMessage
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
 
-from uwb_mitigation.bag.codec import encode_range
+from uwb_mitigation.bag.codec import encode_corrected, encode_range, encode_truth
 from uwb_mitigation.bag.poses import encode_place
 from uwb_mitigation.errors import ParameterError, UwbMitigationError
 from uwb_mitigation.link.connection import PortAddress
@@ -30,47 +31,43 @@ from uwb_mitigation.link.layout import Mode
 from uwb_mitigation.link.messages import Correction
 from uwb_mitigation.link.port import BoardPort
 from uwb_mitigation.link.radio import RadioSettings
-from uwb_mitigation.measurement import RangeMeasurement, Record
-from uwb_mitigation.nodes import clocks, conversions, diagnostics, topics
+from uwb_mitigation.measurement import Cir, RangeMeasurement, Record
+from uwb_mitigation.nodes import diagnostics, topics
 from uwb_mitigation.nodes.board_feed import BoardFeed
-from uwb_mitigation.nodes.feed import Description, Feed
+from uwb_mitigation.nodes.diagnostics import Description
+from uwb_mitigation.nodes.feed import Feed
 from uwb_mitigation.nodes.lifecycle import ManagedNode
 from uwb_mitigation.nodes.parameter_tables import DRIVER
-from uwb_mitigation.nodes.playback import ReplayOptions
 from uwb_mitigation.nodes.radio_feed import PREFIX, RADIOS, RadioFeed, open_radios, settings_of
-from uwb_mitigation.nodes.replay_feed import ReplayFeed
+from uwb_mitigation.nodes.replay import ReplayFeed, ReplayOptions
 from uwb_mitigation.offsets import NO_OFFSETS, read_offsets
 from uwb_mitigation.sources.source import Source
 
-if TYPE_CHECKING:
-    from uwb_mitigation.nodes.sensor_ranges import SensorRanges
-
-
-def _recording_path(path: str) -> Path:
-    if not path:
-        raise ParameterError("parameter path is empty", valid="the recording to replay, as -p path:=FILE")
-    return Path(path).expanduser()
+_NO_CIR = Cir(np.zeros(0, np.int16))
 
 
 def open_source(value: Callable[[str], Any]) -> Source:
-    """The recording or simulation that the parameters describe; `value(name)` gives a parameter's value.
+    """Open the recording or simulation of the parameters; `value(name)` returns a parameter's value.
 
     Raises:
-        ParameterError, RecordingError: there is no such source.
+        ParameterError: the parameter path is empty.
+        RecordingError: the recording cannot be read.
     """
-    # Each kind imports its own dependencies, and only when it is wanted.
-    kind = value("source")
-    if kind == "mcap":
+    # The imports are here because each source needs other dependencies.
+    if value("source") == "simulated":
+        from uwb_mitigation.sources.simulated import SimulatedSource
+
+        return SimulatedSource(seed=value("seed"), count=value("count"), rate_hz=value("simulated_rate"))
+    if not value("path"):
+        raise ParameterError("parameter path is empty", valid="the recording to replay, as -p path:=FILE")
+    path = Path(value("path")).expanduser()
+    if value("source") == "mcap":
         from uwb_mitigation.sources.mcap import McapRecording
 
-        return McapRecording(_recording_path(value("path")), topic=value("topic"))
-    if kind == "decaranging":
-        from uwb_mitigation.sources.decaranging import CirOf, open_decaranging
+        return McapRecording(path, topic=value("topic"))
+    from uwb_mitigation.sources.decaranging import CirOf, open_decaranging
 
-        return open_decaranging(_recording_path(value("path")), cir=CirOf(value("cir")))
-    from uwb_mitigation.sources.simulated import SimulatedSource
-
-    return SimulatedSource(seed=value("seed"), count=value("count"), rate_hz=value("simulated_rate"))
+    return open_decaranging(path, cir=CirOf(value("cir")))
 
 
 def _model_id(digits: str) -> int | None:
@@ -124,7 +121,7 @@ class Driver(ManagedNode):
         self._truths: Publisher | None = None
         self._places: Publisher | None = None
         self._clock_publisher: Publisher | None = None
-        self._sensor_ranges: SensorRanges | None = None
+        self._sensor_ranges: topics.SensorRanges | None = None
         self._frame_id: str = self.value("frame_id")
         self.add_on_set_parameters_callback(self._check)
         self._offsets = self._prepared_offsets = NO_OFFSETS
@@ -171,26 +168,22 @@ class Driver(ManagedNode):
         self._offsets = read_offsets(str(self.value("offsets")))
         self._corrected = topics.create_publisher(self, RangeCorrected, topics.RANGE_CORRECTED)
         if self.value("sensor_ranges"):
-            # sensor_msgs takes a twelfth of the time that a node takes to start.
-            from uwb_mitigation.nodes.sensor_ranges import SensorRanges
-
-            self._sensor_ranges = SensorRanges(self)
+            self._sensor_ranges = topics.SensorRanges(self)
 
         def make() -> BoardFeed:
-            now_ns = clocks.reader(self.get_clock())
             port = BoardPort(
                 address,
                 baud=self.value("baud"),
                 dtr=self.value("dtr"),
                 mode=Mode[self.value("mode").upper()],
                 expected_model_id=board_model,
-                stamp_clock=now_ns,
+                stamp_clock=self.now_ns,
             )
             feed = BoardFeed(
                 port,
                 on_range=self._publish_range,
                 on_correction=self._publish_correction,
-                now_ns=now_ns,
+                now_ns=self.now_ns,
                 logger=self.get_logger(),
             )
             feed.apply(["offsets"], self.value, self._offsets)
@@ -205,9 +198,10 @@ class Driver(ManagedNode):
         settings_of(self.value)
 
         def make() -> RadioFeed:
-            now_ns = clocks.reader(self.get_clock())
-            radios = open_radios(self.value, now_ns)
-            return RadioFeed(radios, on_range=self._publish_range, now_ns=now_ns, logger=self.get_logger())
+            radios = open_radios(self.value, self.now_ns)
+            return RadioFeed(
+                radios, on_range=self._publish_range, now_ns=self.now_ns, logger=self.get_logger()
+            )
 
         return make
 
@@ -282,8 +276,7 @@ class Driver(ManagedNode):
         ]
         for (record, stamp_ns), measurement in zip(records, measurements, strict=True):
             if record.truth is not None and self._truths is not None:
-                header = conversions.to_header(stamp_ns, measurement.frame_id)
-                self._truths.publish(conversions.to_range_truth(record.truth, measurement, header))
+                self._truths.publish(encode_truth(measurement, record.truth))
             if record.tag_position is not None and self._places is not None:
                 self._places.publish(encode_place(record.tag_position, measurement.tag_id, stamp_ns))
         self._publish_measurements(measurements)
@@ -306,9 +299,12 @@ class Driver(ManagedNode):
             self._ranges.publish(encode_range(measurement))
 
     def _publish_correction(self, correction: Correction) -> None:
-        header = conversions.to_header(correction.stamp_ns, self._frame_id)
         assert self._corrected is not None
-        self._corrected.publish(conversions.to_range_corrected(correction, header))
+        c, raw_m = correction, correction.corrected.range_raw_m
+        measurement = RangeMeasurement(
+            c.stamp_ns, c.tag_id, c.anchor_id, c.sequence, c.device_time, raw_m, _NO_CIR, self._frame_id
+        )
+        self._corrected.publish(encode_corrected(measurement, correction.corrected))
         if self._sensor_ranges is not None:
             self._sensor_ranges.publish(
                 correction.anchor_id, correction.stamp_ns, self._frame_id, correction.corrected

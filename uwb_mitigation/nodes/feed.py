@@ -8,13 +8,11 @@ from typing import Any, Protocol
 
 from uwb_mitigation.measurement import RangeMeasurement
 from uwb_mitigation.nodes import diagnostics
+from uwb_mitigation.nodes.diagnostics import Description
 from uwb_mitigation.offsets import Offsets
 
 Value = Callable[[str], Any]
 """Returns the value of a parameter."""
-
-Description = tuple[str, bytes, str, dict[str, object]]
-"""Hardware id, level, message and values for the diagnostics."""
 
 EVENT_TIMEOUT_S = 0.5
 

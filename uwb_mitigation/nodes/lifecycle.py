@@ -1,89 +1,70 @@
-"""What the lifecycle nodes of this package share: transitions that can be repeated, and errors that show.
-
-rclpy swallows what a transition raises. Here it is logged, kept for the diagnostics, and whatever the
-transition had opened is closed again, so that the same transition may be asked for once more.
-"""
+"""What the lifecycle nodes of this package share: parameters, transitions, diagnostics and clocks."""
 
 from __future__ import annotations
 
+import json
+import os
+import time
 import traceback
-from collections import deque
 from collections.abc import Callable, Collection, Sequence
+from pathlib import Path
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import State
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock, ClockType
+from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
-from rclpy.subscription import Subscription
+from rclpy.node import Node
+from rclpy.parameter import Parameter as RosParameter
 
-from uwb_mitigation.errors import UwbMitigationError, not_imported
+from uwb_mitigation.errors import ParameterError, UwbMitigationError, did_you_mean, not_imported
+from uwb_mitigation.files import write_whole
 from uwb_mitigation.nodes import diagnostics, topics
-from uwb_mitigation.nodes.parameter_tables import Parameter
-from uwb_mitigation.nodes.parameters import declare, warn_of_unknown_qos
+from uwb_mitigation.nodes.parameter_tables import KEPT_PARAMETERS, TABLES, Parameter
+
+SAME_NAME_S = 40.0
+"""A killed node stays in the graph for up to 20 s: a second node of the same name is reported after this time."""
+
+_QOS = "qos_overrides."
 
 
-class Namesakes:
-    """Finds out whether another node has the name of this one: ROS then mixes up their parameters and transitions.
-
-    A node that was killed stays in the graph for some seconds. So the graph is only a hint, and diagnostics under the
-    node's name that this node has not sent are the proof.
-    """
-
-    def __init__(self, node: LifecycleNode) -> None:
-        self._node = node
-        self._subscription: Subscription | None = None
-        self._sent: deque[tuple[int, int]] = deque(maxlen=10)
-        self._found = False
-
-    def sent(self, report: DiagnosticArray) -> None:
-        self._sent.append((report.header.stamp.sec, report.header.stamp.nanosec))
-
-    def problems(self) -> list[str]:
-        """Return what is wrong in a line; empty if the name is unique."""
-        node = self._node
-        own = (node.get_name(), node.get_namespace())
-        shared = node.get_node_names_and_namespaces().count(own) > 1
-        if shared and self._subscription is None:
-            self._subscription = node.create_subscription(
-                DiagnosticArray, topics.DIAGNOSTICS, self._on_report, 10
-            )
-        elif not shared and self._subscription is not None:
-            node.destroy_subscription(self._subscription)
-            self._subscription, self._found = None, False
-        name = node.get_fully_qualified_name()
-        remedy = "give it a namespace (-r __ns:=/left) or a name (-r __node:=left)"
-        return [f"another node has the name {name}: {remedy}"] if self._found else []
-
-    def _on_report(self, message: DiagnosticArray) -> None:
-        name = diagnostics.name_of(self._node)
-        stamp = (message.header.stamp.sec, message.header.stamp.nanosec)
-        self._found |= stamp not in self._sent and any(status.name == name for status in message.status)
+def clock_reader(clock: Clock) -> Callable[[], int]:
+    """Return a function that returns the clock's time, ns; it calls rclpy, which is slow, only for simulated time."""
+    if clock.clock_type == ClockType.STEADY_TIME:
+        return time.monotonic_ns
+    if clock.clock_type == ClockType.SYSTEM_TIME:
+        return time.time_ns
+    # The parameter use_sim_time may be set at any time.
+    return lambda: int(clock.now().nanoseconds) if clock.ros_time_is_active else time.time_ns()
 
 
 class ManagedNode(LifecycleNode):
-    """A lifecycle node with a parameter table and one diagnostic status a second.
+    """A lifecycle node with a parameter table and one diagnostic status per second.
 
-    A subclass says what each transition does: `open` (configure), `begin` (activate), `end` (deactivate) and
-    `close` (cleanup, shutdown). `end` and `close` must stand being called when there is nothing to end
-    or to close.
+    A subclass implements the transitions: `open` (configure), `begin` (activate), `end` (deactivate) and
+    `close` (cleanup, shutdown). `end` and `close` may be called when there is nothing to end or to close.
+    rclpy hides exceptions of a transition. Here they are logged and shown in the diagnostics, and what the
+    transition has opened is closed, so that it can be requested again.
 
     Args:
         table: the node's parameters.
-        foreign: names of parameters that belong to another node of this process, and are no mistake.
+        foreign: names of parameters of other nodes in this process.
 
     Attributes:
-        error: why the latest transition failed; None after one that succeeded.
+        error: the error of the latest transition; None after success.
     """
 
     def __init__(self, name: str, table: Sequence[Parameter], foreign: Collection[str] = ()) -> None:
         super().__init__(name)
         declare(self, table, foreign)
         self.error: UwbMitigationError | None = None
-        self._namesakes = Namesakes(self)
+        self.now_ns = clock_reader(self.get_clock())
+        self._unique_name_s = time.monotonic()
         self._reported: set[str] = set()
         self._diagnostics = self.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, 10)
-        # By a steady clock: diagnostics are wanted most when the node's own clock stands still.
+        # Steady: diagnostics must be published even if the node's clock is simulated and stands still.
         self.create_timer(1.0, self._publish_diagnostics, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def open(self) -> None:
@@ -98,15 +79,15 @@ class ManagedNode(LifecycleNode):
     def close(self) -> None:
         raise NotImplementedError
 
-    def describe(self) -> tuple[str, bytes, str, dict[str, object]]:
-        """Hardware id, level, message and facts for the diagnostics."""
+    def describe(self) -> diagnostics.Description:
+        """Return the content of the diagnostics."""
         raise NotImplementedError
 
     def autostart(self) -> None:
-        """Configure and activate, if the parameter `autostart` says so.
+        """Configure and activate if the parameter `autostart` is set.
 
         Raises:
-            UwbMitigationError: configure failed, and without a lifecycle manager nobody will mend it.
+            UwbMitigationError: configure failed.
         """
         if not self.value("autostart"):
             return
@@ -116,7 +97,7 @@ class ManagedNode(LifecycleNode):
             raise self.error
 
     def value(self, name: str) -> Any:
-        """The value of a parameter."""
+        """Return the value of a parameter."""
         return self.get_parameter(name).value
 
     @property
@@ -126,8 +107,8 @@ class ManagedNode(LifecycleNode):
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         result = self._attempt(self.open, self.close)
         if result == TransitionCallbackReturn.SUCCESS:
-            # Those of quality of service are declared with the publishers and subscriptions.
-            warn_of_unknown_qos(self)
+            # QoS parameters are declared with the publishers and subscriptions.
+            _warn_of_unknown_qos(self)
         return result
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -184,7 +165,7 @@ class ManagedNode(LifecycleNode):
             level, text = diagnostics.ERROR, f"{label}: {self.error}"
         elif not self.is_active:
             level, text = diagnostics.WARN, f"not active: {label}"
-        problems = [*topics.not_received(self), *self._namesakes.problems()]
+        problems = topics.not_received(self) + self._same_name()
         for problem in problems:
             if problem not in self._reported:
                 self.get_logger().warning(problem)
@@ -192,6 +173,121 @@ class ManagedNode(LifecycleNode):
         if problems:
             text = "; ".join([*problems, text] if level > diagnostics.OK else problems)
             level = max(level, diagnostics.WARN)
-        report = diagnostics.report(self, hardware, level, text, facts)
-        self._namesakes.sent(report)
-        self._diagnostics.publish(report)
+        self._diagnostics.publish(diagnostics.report(self, hardware, level, text, facts))
+
+    def _same_name(self) -> list[str]:
+        """Return a warning if another node has this name: ROS then mixes up their parameters and transitions."""
+        own = (self.get_name(), self.get_namespace())
+        if self.get_node_names_and_namespaces().count(own) < 2:
+            self._unique_name_s = time.monotonic()
+        if time.monotonic() - self._unique_name_s < SAME_NAME_S:
+            return []
+        remedy = "set a namespace (-r __ns:=/left) or a name (-r __node:=left)"
+        return [f"another node has the name {self.get_fully_qualified_name()}: {remedy}"]
+
+
+def declare(node: Node, table: Sequence[Parameter], foreign: Collection[str] = ()) -> None:
+    """Declare a table on a node, refuse unknown parameters, and check every later value.
+
+    Args:
+        foreign: names of parameters of other nodes in this process.
+
+    Raises:
+        ParameterError: a parameter given at start-up is unknown, or its value has the wrong type or range.
+    """
+    rows = {row.name: row for row in table}
+    keep = _restore_live_parameters(node, {row.name for row in table if row.live})
+    for row in table:
+        try:
+            node.declare_parameter(row.name, row.default, _descriptor(row))
+        except (InvalidParameterTypeException, InvalidParameterValueException) as error:
+            raise ParameterError(f"parameter {row.name}: {error}", valid=row.valid) from error
+        row.check(node.get_parameter(row.name).value)
+    _refuse_unknown(node, foreign)
+    if keep is not None:
+        node.add_post_set_parameters_callback(keep)
+
+    def check(changes: list[Any]) -> SetParametersResult:
+        try:
+            for change in changes:
+                if change.name in rows:
+                    rows[change.name].check(change.value)
+        except ParameterError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    node.add_on_set_parameters_callback(check)
+
+
+def _descriptor(row: Parameter) -> ParameterDescriptor:
+    # Typed dynamically and checked here: rclpy would refuse `2` for a float, and its error does not name the parameter.
+    descriptor = ParameterDescriptor(
+        description=row.description,
+        read_only=not row.live,
+        dynamic_typing=True,
+        additional_constraints=row.valid if row.choices else "",
+    )
+    if row.low is not None and row.high is not None:
+        if isinstance(row.default, float):
+            span = FloatingPointRange(from_value=float(row.low), to_value=float(row.high))
+            descriptor.floating_point_range = [span]
+        else:
+            bounds = IntegerRange(from_value=int(row.low), to_value=int(row.high), step=1)
+            descriptor.integer_range = [bounds]
+    return descriptor
+
+
+def _refuse_unknown(node: Node, foreign: Collection[str]) -> None:
+    """Raise ParameterError for an unknown parameter; log the parameters of other nodes in one line."""
+    all_nodes = {row.name for table in TABLES.values() for row in table}
+    given = [name for name in _undeclared(node) if not name.startswith(_QOS) and name not in foreign]
+    for name in given:
+        if name not in all_nodes:
+            known = [*foreign, *(known for known in node._parameters if not known.startswith(_QOS))]
+            raise ParameterError(
+                f"parameter {name} is unknown", valid=did_you_mean(name, known) or "see --help"
+            )
+    if given:
+        node.get_logger().info(f"ignored parameters of other nodes: {', '.join(given)}")
+
+
+def _restore_live_parameters(node: Node, live: Collection[str]) -> Callable[[list[Any]], None] | None:
+    """Restore the parameters that were set before a respawn; return the callback that saves new values."""
+    folder = os.environ.get(KEPT_PARAMETERS)
+    if not folder:
+        return None
+    path = Path(folder, node.get_fully_qualified_name().strip("/").replace("/", "."))
+    kept: dict[str, Any] = {}
+    if path.is_file():
+        kept = json.loads(path.read_text(encoding="utf-8"))
+        # rclpy has no public access to the parameters given at start-up.
+        node._parameter_overrides.update(
+            {name: RosParameter(name, value=value) for name, value in kept.items()}
+        )
+        values = ", ".join(f"{name} = {value!r}" for name, value in kept.items())
+        node.get_logger().info(f"restored after a restart, as set while the node ran: {values}")
+
+    def keep(changes: list[Any]) -> None:
+        kept.update({change.name: change.value for change in changes if change.name in live})
+        try:
+            write_whole(path, json.dumps(kept))
+        except UwbMitigationError as error:
+            node.get_logger().warning(f"parameters will be lost after a respawn: {error}")
+
+    return keep
+
+
+def _warn_of_unknown_qos(node: Node) -> None:
+    """Log every QoS override for a topic that the node does not have."""
+    known = [name for name in node._parameters if name.startswith(_QOS)]
+    for name in _undeclared(node):
+        if name.startswith(_QOS):
+            hint = did_you_mean(name, known)
+            node.get_logger().warning(
+                f"parameter {name} is unknown and has no effect" + (f": {hint}" if hint else "")
+            )
+
+
+def _undeclared(node: Node) -> list[str]:
+    # rclpy has no public access to the parameters given at start-up.
+    return [name for name in sorted(node._parameter_overrides) if not node.has_parameter(name)]

@@ -25,8 +25,7 @@ from visualization_msgs.msg import MarkerArray
 from uwb_mitigation.bag.codec import decode_corrected
 from uwb_mitigation.bag.poses import encode_odometry, encode_pose, tag_frame, tag_of_frame
 from uwb_mitigation.errors import MissingDependencyError, ParameterError, RecordingError, format_id
-from uwb_mitigation.nodes import clocks, diagnostics, markers, topics
-from uwb_mitigation.nodes.conversions import to_header
+from uwb_mitigation.nodes import diagnostics, markers, topics
 from uwb_mitigation.nodes.lifecycle import ManagedNode
 from uwb_mitigation.nodes.parameter_tables import LOCATOR
 from uwb_mitigation.positioning.fleet import Fleet, Tag
@@ -90,8 +89,7 @@ class Locator(ManagedNode):
         self._malformed = self._lost = 0
         self._told: set[int] = set()
         self._processing_ns: list[int] = []
-        self._now_ns = clocks.reader(self.get_clock())
-        self._meter = diagnostics.Meter(self._now_ns)
+        self._meter = diagnostics.Meter(self.now_ns)
         # Without its anchors it stays, for the log and the diagnostics to say so.
         with contextlib.suppress(ParameterError, MissingDependencyError):
             self.autostart()
@@ -150,7 +148,7 @@ class Locator(ManagedNode):
                 self.destroy_lifecycle_publisher(publisher)
         self._outputs, self._anchors_out, self._tf, self._fleet = {}, None, None, None
 
-    def describe(self) -> tuple[str, bytes, str, dict[str, object]]:
+    def describe(self) -> diagnostics.Description:
         fleet = self._fleet
         if fleet is None:
             return "host", diagnostics.WARN, "no anchors", {}
@@ -218,7 +216,7 @@ class Locator(ManagedNode):
         now_ns = time.perf_counter_ns()
         if len(self._processing_ns) < 20_000:
             self._processing_ns.append(now_ns - began_ns)
-        self._meter.add(self._now_ns() - key.stamp_ns)
+        self._meter.add(self.now_ns() - key.stamp_ns)
 
     def _outputs_of(self, tag: Tag) -> _Outputs:
         outputs = self._outputs.get(tag.tag_id)
@@ -244,7 +242,7 @@ class Locator(ManagedNode):
             outputs.transform_ns = estimate.stamp_ns
             x, y, z = estimate.position.tolist()
             transform = TransformStamped(
-                header=to_header(estimate.stamp_ns, self._map),
+                header=topics.header(estimate.stamp_ns, self._map),
                 child_frame_id=outputs.frame,
                 transform=Transform(translation=Vector3(x=x, y=y, z=z), rotation=Quaternion(w=1.0)),
             )
@@ -260,7 +258,7 @@ class Locator(ManagedNode):
         return replace(estimate, position=estimate.position - (0.0, 0.0, z), covariance=covariance)
 
     def _on_timer(self) -> None:
-        fleet, now_ns = self._fleet, self._now_ns()
+        fleet, now_ns = self._fleet, self.now_ns()
         if fleet is None or not self.is_active:
             return
         for tag in list(fleet.tags.values()):
@@ -282,7 +280,7 @@ class Locator(ManagedNode):
         fleet, publisher = self._fleet, self._anchors_out
         if fleet is None or publisher is None:
             return
-        now_ns = self._now_ns()
+        now_ns = self.now_ns()
         shown = markers.anchor_markers(fleet.anchors, self._map, now_ns)
         for number, tag in enumerate(fleet.tags.values()):
             picture = self._outputs_of(tag).picture

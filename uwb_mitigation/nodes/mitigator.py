@@ -5,35 +5,33 @@ from __future__ import annotations
 import importlib.util
 import threading
 import time
+from array import array
 from collections.abc import Collection, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.serialization import deserialize_message
+from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.subscription import Subscription
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
 from uwb_mitigation.bag.codec import decode_range, encode_corrected
 from uwb_mitigation.errors import RecordingError, UwbMitigationError
-from uwb_mitigation.measurement import LINE_OF_SIGHT_DB, RangeMeasurement, Status
+from uwb_mitigation.measurement import LINE_OF_SIGHT_DB, Encoding, RangeMeasurement, Status
 from uwb_mitigation.mitigation import Backend, Mitigation
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.prior import LinePrior
 from uwb_mitigation.model.shipped import model_path
-from uwb_mitigation.nodes import clocks, conversions, diagnostics, topics
-from uwb_mitigation.nodes.health import MitigatorHealth
+from uwb_mitigation.nodes import diagnostics, topics
+from uwb_mitigation.nodes.diagnostics import MitigatorHealth
 from uwb_mitigation.nodes.lifecycle import ManagedNode
 from uwb_mitigation.nodes.parameter_tables import MITIGATOR
 from uwb_mitigation.offsets import NO_OFFSETS, Offsets, read_offsets
 from uwb_mitigation.preprocessing import Scaling
 
-if TYPE_CHECKING:
-    from uwb_mitigation.nodes.sensor_ranges import SensorRanges
-
-# ONNX Runtime is loaded while the node joins the graph; that it is absent is told before.
+# ONNX Runtime is imported later: fail early if it is missing.
 if importlib.util.find_spec("onnxruntime") is None:
     raise ModuleNotFoundError("No module named 'onnxruntime'", name="onnxruntime")
 
@@ -76,15 +74,14 @@ class Mitigator(ManagedNode):
         self._subscribe = subscribe
         self._raw: Subscription | None = None
         self._corrected: Publisher | None = None
-        self._sensor_ranges: SensorRanges | None = None
+        self._sensor_ranges: topics.SensorRanges | None = None
         self._mitigation: Backend | None = None
         self._prepared: tuple[str, Backend] | None = None
         self._offsets = NO_OFFSETS
         self._prepared_offsets: Offsets | None = None
         # A driver in the same process corrects from its own thread, while transitions run in the executor's.
         self._lock = threading.Lock()
-        self._now_ns = clocks.reader(self.get_clock())
-        self._meter = diagnostics.Meter(self._now_ns)
+        self._meter = diagnostics.Meter(self.now_ns)
         self.add_on_set_parameters_callback(self._prepare)
         self.add_post_set_parameters_callback(self._swap)
         self.autostart()
@@ -92,7 +89,7 @@ class Mitigator(ManagedNode):
     def open(self) -> None:
         self._corrected = topics.create_publisher(self, RangeCorrected, topics.RANGE_CORRECTED)
         if self.value("sensor_ranges"):
-            self._sensor_ranges = self._make_sensor_ranges()
+            self._sensor_ranges = topics.SensorRanges(self)
         if self._subscribe:
             # Serialised messages: decoding them here takes a third of what rclpy takes for its objects.
             self._raw = topics.create_raw_subscription(
@@ -131,7 +128,7 @@ class Mitigator(ManagedNode):
                 if self._sensor_ranges is not None:
                     m = measurement
                     self._sensor_ranges.publish(m.anchor_id, m.stamp_ns, m.frame_id, corrected)
-        now_ns = self._now_ns()
+        now_ns = self.now_ns()
         self.health.add_time(time.perf_counter_ns() - began_ns)
         offsets = mitigation.offsets
         needs_count = mitigation.bundle.preprocessing.scaling is Scaling.PREAMBLE
@@ -141,14 +138,8 @@ class Mitigator(ManagedNode):
             if needs_count and corrected.status is Status.BAD_CIR and measurement.cir.preamble_count <= 0:
                 self.health.uncounted += 1
             if corrected.status is Status.OK and measurement.cir.power_gap_db < LINE_OF_SIGHT_DB:
-                self.health.direct_m.append(corrected.correction_m - offset)
+                self.health.los_m.append(corrected.correction_m - offset)
             self._meter.add(now_ns - measurement.stamp_ns)
-
-    def _make_sensor_ranges(self) -> SensorRanges:
-        # Only here, where it is asked for: sensor_msgs takes a twelfth of the time that a node takes to start.
-        from uwb_mitigation.nodes.sensor_ranges import SensorRanges
-
-        return SensorRanges(self)
 
     def subscription_count(self) -> int:
         """How many listen to the corrected ranges."""
@@ -159,33 +150,20 @@ class Mitigator(ManagedNode):
         if self._corrected is not None:
             self._corrected.wait_for_all_acked(timeout)
 
-    def describe(self) -> tuple[str, bytes, str, dict[str, object]]:
-        period = self.health.period()
+    def describe(self) -> diagnostics.Description:
+        warnings, facts, failed = self.health.period()
         level, text = diagnostics.OK, "correcting"
-        if warnings := period.warnings():
+        if warnings:
             level, text = diagnostics.WARN, "; ".join(warnings)
-        if period.statuses[Status.MODEL_ERROR]:
+        if failed:
             level, text = diagnostics.ERROR, "the model fails on some ranges"
-        facts: dict[str, object] = {
-            f"ranges {status.name}": self.health.statuses[status] for status in Status
-        }
-        facts |= {
-            "out of distribution": f"{period.share(Status.OUT_OF_DISTRIBUTION):.3f}",
-            "dropped by a queue": self.health.dropped_text,
-            "malformed": self.health.malformed,
-        }
         facts |= self._meter.facts()
-        facts |= diagnostics.percentiles("processing", period.processing_ns)
         if (mitigation := self._mitigation) is not None:
-            bundle = mitigation.bundle
             facts |= {
-                "model": bundle.name,
-                "model id": diagnostics.model_id(bundle.model_id),
+                "model": mitigation.bundle.name,
+                "model id": diagnostics.model_id(mitigation.bundle.model_id),
                 "offsets": str(mitigation.offsets),
-                "line of sight: ranges": period.direct_ranges,
             }
-            if period.direct_ranges:
-                facts["line of sight: median predicted error m"] = f"{period.direct_m:.3f}"
         return "host", level, text, facts
 
     def _publisher_count(self) -> int:
@@ -215,10 +193,13 @@ class Mitigator(ManagedNode):
             return decode_range(data)
         except RecordingError:
             pass
-        # Of another byte order, or with an encoding of a later version: rclpy may still read it.
+        # rclpy may be able to decode another byte order, and the range next to an encoding of a later version.
         try:
-            return conversions.from_range_cir(deserialize_message(data, RangeCir))
-        except Exception as error:  # Of no common type, and no message may end the node.
+            message = deserialize_message(data, RangeCir)
+            if message.cir.encoding not in tuple(Encoding):
+                message.cir.encoding, message.cir.samples = int(Encoding.COMPLEX_INT16), array("h")
+            return decode_range(serialize_message(message))
+        except Exception as error:  # rclpy raises various types, and no message may end the node.
             self.health.malformed += 1
             self.get_logger().warning(f"a message cannot be read: {error}", throttle_duration_sec=10.0)
             return None
@@ -244,7 +225,7 @@ class Mitigator(ManagedNode):
     def _judge_anew(self, mitigation: Backend) -> None:
         # A prior has the offset of the boards that it was fitted to, unless another is set beside it.
         self.health.predicts_excess_alone = bool(self._offsets) or mitigation.bundle.prior == LinePrior(0.0)
-        self.health.direct_m.clear()
+        self.health.los_m.clear()
 
     def _prepare(self, changes: list[Any]) -> SetParametersResult:
         """Load a model or offsets that are to be set, or refuse them; ranges wait in the queue meanwhile."""

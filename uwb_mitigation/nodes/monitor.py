@@ -5,7 +5,10 @@ from __future__ import annotations
 import contextlib
 import math
 import sys
+from collections import Counter, deque
+from dataclasses import dataclass
 
+import numpy as np
 from rclpy.context import Context
 from rclpy.node import Node
 from rich.console import Console, Group
@@ -14,15 +17,72 @@ from rich.table import Table
 from rich.text import Text
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
 
-from uwb_mitigation.bag.codec import decode_corrected, decode_truth
+from uwb_mitigation.bag.codec import Key, decode_corrected, decode_truth
 from uwb_mitigation.errors import RecordingError, UwbMitigationError, format_id
-from uwb_mitigation.measurement import Status
+from uwb_mitigation.measurement import CorrectedRange, Status, Truth
 from uwb_mitigation.nodes import topics
-from uwb_mitigation.nodes.probe import watching
-from uwb_mitigation.nodes.signals import stop_event
-from uwb_mitigation.nodes.tally import Tally
+from uwb_mitigation.nodes.processes import watching
+from uwb_mitigation.nodes.spinning import stop_event
+from uwb_mitigation.viewer.scene import History, Pair, Sample, Truths
 
 REFRESH_HZ = 5
+
+MAX_LATENCIES = 100_000
+"""The latest latencies that are summarised: a monitor may run for days."""
+
+
+@dataclass(slots=True)
+class ErrorSums:
+    """Sums of absolute errors before and after mitigation, over ranges whose truth is known."""
+
+    n: int = 0
+    raw_m: float = 0.0
+    corrected_m: float = 0.0
+
+
+class Tally:
+    """Counts, latencies and errors of the received ranges, by pair."""
+
+    def __init__(self) -> None:
+        self.pairs: dict[Pair, History] = {}
+        self.raw = 0
+        self.corrected = 0
+        self.statuses: Counter[Status] = Counter()
+        self.errors: dict[str, ErrorSums] = {}
+        self._latencies_s: deque[float] = deque(maxlen=MAX_LATENCIES)
+        self._truths = Truths()
+
+    @property
+    def missing(self) -> int:
+        """Number of raw ranges without a corrected range."""
+        return self.raw - self.corrected
+
+    @property
+    def total(self) -> ErrorSums:
+        parts = self.errors.values()
+        return ErrorSums(
+            sum(e.n for e in parts), sum(e.raw_m for e in parts), sum(e.corrected_m for e in parts)
+        )
+
+    def latency_ms(self, percentile: float) -> float:
+        """Return a percentile of the time from stamp to reception; NaN without data."""
+        return float(np.percentile(self._latencies_s or [math.nan], percentile)) * 1e3
+
+    def add_truth(self, key: Key, truth: Truth) -> None:
+        self._truths.add(key, truth)
+
+    def add_corrected(self, key: Key, corrected: CorrectedRange, arrival_s: float) -> None:
+        """Add a corrected range; `arrival_s` is on the clock of its stamp."""
+        sample = Sample.of(arrival_s, corrected, self._truths.take(key))
+        self.corrected += 1
+        self.statuses[sample.status] += 1
+        self._latencies_s.append(arrival_s - key.stamp_ns / 1e9)
+        self.pairs.setdefault((key.anchor_id, key.tag_id), History()).add(sample, arrival_s)
+        if math.isfinite(sample.true_m) and math.isfinite(sample.raw_m):
+            errors = self.errors.setdefault(sample.label, ErrorSums())
+            errors.n += 1
+            errors.raw_m += abs(sample.raw_m - sample.true_m)
+            errors.corrected_m += abs(sample.range_m - sample.true_m)
 
 
 class Monitor(Node):
@@ -39,52 +99,35 @@ class Monitor(Node):
             self.create_subscription(kind, topic, callback, topics.RANGES, raw=True)
 
     def _on_raw(self, data: bytes) -> None:
-        self.tally.add_raw()
+        self.tally.raw += 1
 
     def _on_truth(self, data: bytes) -> None:
         with contextlib.suppress(RecordingError):
             self.tally.add_truth(*decode_truth(data))
 
     def _on_corrected(self, data: bytes) -> None:
-        now_ns = self.get_clock().now().nanoseconds
-        # What cannot be read is missing, and is counted as such.
+        now_s = self.get_clock().now().nanoseconds / 1e9
+        # A malformed message counts as missing.
         with contextlib.suppress(RecordingError):
-            key, corrected = decode_corrected(data)
-            pair = (key.anchor_id, key.tag_id)
-            self.tally.add_corrected(key, pair, corrected, now_ns / 1e9, (now_ns - key.stamp_ns) / 1e9)
+            self.tally.add_corrected(*decode_corrected(data), now_s)
 
 
-def metres(value: float) -> str:
-    return f"{value:.3f}" if math.isfinite(value) else "-"
+def _text(value: float, digits: int = 3) -> str:
+    return f"{value:.{digits}f}" if math.isfinite(value) else "-"
 
 
 def live_table(tally: Tally, title: str) -> Table:
-    """One row for each anchor-tag pair."""
+    """Return a table with one row for each anchor-tag pair."""
     table = Table(title=title, title_justify="left")
-    for column in (
-        "anchor",
-        "tag",
-        "Hz",
-        "raw",
-        "corrected",
-        "sigma",
-        "true",
-        "status",
-        "label",
-    ):
-        table.add_column(
-            column, justify="left" if column in ("status", "label") else "right", overflow="fold"
-        )
+    for column in ("anchor", "tag", "Hz", "raw", "corrected", "sigma", "true", "status", "label"):
+        table.add_column(column, justify="left" if column in ("status", "label") else "right", overflow="fold")
     for (anchor, tag), history in sorted(tally.pairs.copy().items()):
-        sample, rate_hz = history.samples[-1], history.rate_hz()
+        sample = history.samples[-1]
         table.add_row(
             format_id(anchor),
             format_id(tag),
-            f"{rate_hz:.1f}" if math.isfinite(rate_hz) else "-",
-            metres(sample.raw_m),
-            metres(sample.range_m),
-            metres(sample.sigma_m),
-            metres(sample.true_m),
+            _text(history.rate_hz(), 1),
+            *map(_text, (sample.raw_m, sample.range_m, sample.sigma_m, sample.true_m)),
             Text(sample.status.name, style="green" if sample.status is Status.OK else "yellow"),
             sample.label,
         )
@@ -92,7 +135,7 @@ def live_table(tally: Tally, title: str) -> Table:
 
 
 def summary(tally: Tally) -> Group:
-    """Counts, latency, and mean absolute errors where the truth is known."""
+    """Return counts, latency, and mean absolute errors of ranges whose truth is known."""
     statuses = ", ".join(
         f"{tally.statuses[status]} {status.name}" for status in Status if tally.statuses[status]
     )
@@ -112,19 +155,14 @@ def summary(tally: Tally) -> Group:
             if label == "all":
                 table.add_section()
             ratio = errors.corrected_m / errors.raw_m if errors.raw_m else math.nan
-            table.add_row(
-                label or "-",
-                str(errors.n),
-                f"{errors.raw_m / errors.n:.3f}",
-                f"{errors.corrected_m / errors.n:.3f}",
-                f"{ratio:.2f}",
-            )
+            means = (f"{value / errors.n:.3f}" for value in (errors.raw_m, errors.corrected_m))
+            table.add_row(label or "-", str(errors.n), *means, f"{ratio:.2f}")
         lines.append(table)
     return Group(*lines)
 
 
 def main() -> None:
-    """Show what passes on the topics until Ctrl-C."""
+    """Show the ranges on the topics until Ctrl-C."""
     stop = stop_event()
     console = Console()
     try:

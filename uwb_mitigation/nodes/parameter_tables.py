@@ -1,6 +1,7 @@
-"""The parameter tables of the nodes: name, type, default, range and meaning in one place. No ROS here.
+"""The parameter tables of the nodes: name, type, default, range and description. No ROS here.
 
-Ours, since generate_parameter_library makes its own code at build time and is not on PyPI. From them come the declarations (`parameters`), `--help`, the files in `params/` and the parameter reference.
+The declarations, `--help`, launch arguments, the files in `params/` and the parameter reference are made from them.
+generate_parameter_library is not used: it generates code at build time and is not on PyPI.
 """
 
 from __future__ import annotations
@@ -234,3 +235,18 @@ TABLES: dict[str, tuple[Parameter, ...]] = {
     "locator": LOCATOR,
     "viewer": VIEWER,
 }
+
+
+def help_text(name: str) -> str:
+    """Return what `NODE --help` prints: usage and parameters of an executable."""
+    nodes = ("driver", "mitigator", "locator") if name == "pipeline" else (name,)
+    rows = {row.name: row for node in nodes for row in TABLES.get(node, ())}
+    lines = [f"usage: {name} [--ros-args [-p NAME:=VALUE] [--params-file FILE] [-r FROM:=TO] ...]"]
+    if rows:
+        lines.append(
+            "parameters with their defaults (* = can be set while the node runs); see docs/parameters.md:"
+        )
+    for row in rows.values():
+        lines.append(f"  {row.name}:={row.default_text}{' *' if row.live else ''}")
+        lines.append(f"      {row.description} ({row.valid})")
+    return "\n".join(lines)

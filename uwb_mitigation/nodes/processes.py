@@ -1,6 +1,6 @@
-"""Nodes as processes of their own, for the benchmarks and demos that watch them from outside. No ROS here.
+"""Nodes as processes, and a probe that watches them from outside: for benchmarks and demos.
 
-They end with the process that started them, however that ends.
+The processes end with the process that started them, however that ends.
 """
 
 from __future__ import annotations
@@ -11,15 +11,34 @@ import signal
 import subprocess
 import sys
 import threading
-from typing import NoReturn
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, NoReturn, TypeVar
 
-_PATIENCE_S = 30.0
+import rclpy
+from rcl_interfaces.srv import SetParameters
+from rclpy.client import Client
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
+from rclpy.signals import SignalHandlerOptions
+
+from uwb_mitigation.errors import UwbMitigationError
+from uwb_mitigation.nodes.spinning import spin
+
+AnyNode = TypeVar("AnyNode", bound=Node)
+
+TIMEOUT_S = 30.0
+_DEPTH = 50_000
 
 
 def isolate() -> None:
-    """Keep this process's nodes, and those that it starts, on this machine and on a domain of their own.
+    """Keep this process's nodes, and those that it starts, on this machine and in a domain of their own.
 
-    So they meet no robot and no second demo. What the environment says already is left as it is.
+    Environment variables that are already set are not changed.
     """
     os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
@@ -28,12 +47,15 @@ def isolate() -> None:
 def start(
     node: str, *parameters: str, namespace: str = "", log_level: str = "warn"
 ) -> subprocess.Popen[bytes]:
-    """Start a node of this package with parameters such as `rate:=2.0`; `stop` is to be called in the end.
+    """Start a node of this package with parameters such as `rate:=2.0`; call `stop` in the end.
 
-    It ends with the thread that calls: by Linux, should this process be killed.
+    If this process is killed, Linux ends the node with the calling thread.
     """
-    if threading.current_thread() is threading.main_thread():
-        _leave_on_sigterm()
+    # SIGTERM must raise as Ctrl-C does, so that the nodes are stopped.
+    if threading.current_thread() is threading.main_thread() and (
+        signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    ):
+        signal.signal(signal.SIGTERM, _exit)
     command = [sys.executable, "-m", "uwb_mitigation.entry", node, "--ros-args", "--log-level", log_level]
     if (setpriv := shutil.which("setpriv")) is not None:
         command = [setpriv, "--pdeathsig", "INT", *command]
@@ -41,19 +63,18 @@ def start(
         command += ["-r", f"__ns:=/{namespace}"]
     for parameter in parameters:
         command += ["-p", parameter]
-    # A group of its own: Ctrl-C reaches this process, which ends the nodes in order. But of one session, as a launch
-    # has them: Linux shares processors between sessions first, and a nice value counts within one.
+    # A process group of its own: Ctrl-C reaches this process only, which ends the nodes in order. But the same session,
+    # as in a launch: Linux shares the processors between sessions first, and a nice value counts within one.
     if sys.version_info >= (3, 11):
         return subprocess.Popen(command, process_group=0)
     return subprocess.Popen(command, preexec_fn=os.setpgrp)
 
 
 def stop(*processes: subprocess.Popen[bytes]) -> list[int]:
-    """End nodes as Ctrl-C would, and return their exit codes; kill only what does not end.
+    """End nodes as Ctrl-C does, and return their exit codes; kill a node only if it does not end.
 
-    Another signal meanwhile is not listened to: it must not leave one of them behind.
+    Other signals are ignored meanwhile, so that no node is left behind.
     """
-    # Only the main thread may say so, and only it is interrupted.
     numbers = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
     before = {number: signal.signal(number, signal.SIG_IGN) for number in numbers}
     try:
@@ -66,19 +87,84 @@ def stop(*processes: subprocess.Popen[bytes]) -> list[int]:
             signal.signal(number, handler)
 
 
-def _leave_on_sigterm() -> None:
-    """From now on SIGTERM raises, as Ctrl-C does, so that whoever started nodes stops them."""
-    if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
-        signal.signal(signal.SIGTERM, _leave)
-
-
-def _leave(number: int, frame: object) -> NoReturn:
+def _exit(number: int, frame: object) -> NoReturn:
     sys.exit(128 + number)
 
 
 def _exit_code(process: subprocess.Popen[bytes]) -> int:
     try:
-        return process.wait(timeout=_PATIENCE_S)
+        return process.wait(timeout=TIMEOUT_S)
     except subprocess.TimeoutExpired:
         process.kill()
         return process.wait()
+
+
+def wait(
+    condition: Callable[[], bool], failure: str, processes: Sequence[subprocess.Popen[bytes]] = ()
+) -> None:
+    """Wait until a condition holds.
+
+    Raises:
+        UwbMitigationError: `failure`: timeout, or a process has ended.
+    """
+    deadline = time.monotonic() + TIMEOUT_S
+    while not condition():
+        if time.monotonic() > deadline or any(process.poll() is not None for process in processes):
+            raise UwbMitigationError(failure)
+        time.sleep(0.001)
+
+
+@contextmanager
+def watching(make_node: Callable[[Context], AnyNode]) -> Iterator[AnyNode]:
+    """A node in its own ROS context, spun by a thread until the block ends."""
+    context = Context()
+    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
+    node = make_node(context)
+    stop = threading.Event()
+    thread = threading.Thread(target=spin, args=(node, stop), name="probe", daemon=True)
+    thread.start()
+    try:
+        yield node
+    finally:
+        stop.set()
+        thread.join()
+        node.destroy_node()
+        rclpy.try_shutdown(context=context)
+
+
+class Probe(Node):
+    """Subscribes with a long queue, and sets parameters of other nodes."""
+
+    def __init__(self, context: Context) -> None:
+        super().__init__("probe", context=context)
+        # Never destroyed: the events executor may call a client that is destroyed while it spins.
+        self._setters: dict[str, Client] = {}
+
+    def subscribe(
+        self, kind: type, topic: str, callback: Callable[[Any], None], *, raw: bool = False
+    ) -> None:
+        """Call `callback` with every message, or with its bytes if `raw`, from the thread that spins."""
+        self.create_subscription(kind, topic, callback, QoSProfile(depth=_DEPTH), raw=raw)
+
+    def publisher(self, kind: type, topic: str) -> Publisher:
+        """Return a publisher with a long queue."""
+        return self.create_publisher(kind, topic, QoSProfile(depth=_DEPTH))
+
+    def set_parameters_of(
+        self, node: str, processes: Sequence[subprocess.Popen[bytes]] = (), **values: object
+    ) -> None:
+        """Set parameters of `node`, which is in `processes`.
+
+        Raises:
+            UwbMitigationError: it does not answer, or refuses a value.
+        """
+        if node not in self._setters:
+            self._setters[node] = self.create_client(SetParameters, f"{node}/set_parameters")
+        client = self._setters[node]
+        wait(client.service_is_ready, f"{node} does not answer", processes)
+        named = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+        future = client.call_async(SetParameters.Request(parameters=named))
+        wait(future.done, f"{node} does not answer", processes)
+        for result in future.result().results:
+            if not result.successful:
+                raise UwbMitigationError(f"{node}: {result.reason}")

@@ -12,7 +12,8 @@ from uwb_mitigation.link.messages import Radio
 from uwb_mitigation.link.radio import RadioSettings
 from uwb_mitigation.measurement import RangeMeasurement
 from uwb_mitigation.nodes import diagnostics, radio_facts
-from uwb_mitigation.nodes.feed import Description, LiveFeed, Value
+from uwb_mitigation.nodes.diagnostics import Description
+from uwb_mitigation.nodes.feed import LiveFeed, Value
 from uwb_mitigation.offsets import Offsets
 from uwb_mitigation.radio.bus import opener
 from uwb_mitigation.radio.port import RadioEvent, RadioLost, RadioPort

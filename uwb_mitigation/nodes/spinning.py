@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import gc
 import importlib
+import signal
 import sys
 import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import rclpy
 from rclpy.context import Context
@@ -19,29 +20,43 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from uwb_mitigation.errors import ParameterError, UwbMitigationError, not_imported
-from uwb_mitigation.nodes.signals import stop_event
+from uwb_mitigation.nodes.parameter_tables import TABLES
 
-PATIENCE_S = 0.2
+SPIN_S = 0.2
+
+_stop = threading.Event()
+
+
+def stop_event() -> threading.Event:
+    """Return the event that SIGINT and SIGTERM set from now on; a second signal ends the process at once."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        if signal.getsignal(number) is not _on_signal:
+            signal.signal(number, _on_signal)
+    return _stop
+
+
+def _on_signal(number: int, frame: Any) -> None:
+    _stop.set()
+    signal.signal(number, signal.SIG_DFL)
 
 
 def spin(nodes: Node | Sequence[Node], stop: threading.Event) -> None:
-    """Serve the callbacks of one node, or of several, until `stop` is set."""
+    """Run the callbacks of one or several nodes until `stop` is set."""
     all_nodes = nodes if isinstance(nodes, Sequence) else [nodes]
     executor = make_executor(all_nodes[0].context if all_nodes else None)
     for node in all_nodes:
         executor.add_node(node)
-    # What was imported stays for good: a full collection would walk all of it, and delay a range by
-    # tens of milliseconds.
+    # A full collection walks all imported objects and would delay a range by tens of milliseconds.
     gc.collect()
     gc.freeze()
     while not stop.is_set():
-        executor.spin_once(timeout_sec=PATIENCE_S)
+        executor.spin_once(timeout_sec=SPIN_S)
 
 
 def make_executor(context: Context | None = None) -> Executor:
-    """The events executor, a quarter of the default executor's cost a message; older rclpy lacks it.
+    """Return the events executor, which costs a quarter of the default one per message; older rclpy lacks it.
 
-    Its own `spin()` never returns on shutdown: turn it by `spin_once`.
+    Its `spin()` does not return at shutdown: call `spin_once`.
     """
     try:
         from rclpy.experimental import EventsExecutor
@@ -50,26 +65,60 @@ def make_executor(context: Context | None = None) -> Executor:
     return EventsExecutor(context=context)
 
 
-def main(module: str) -> None:
-    """Be the process of a module of `nodes`, whose `make_nodes` is called once it is loaded."""
-    sys.exit(_run(f"uwb_mitigation.nodes.{module}"))
+def load(name: str) -> Callable[[threading.Event], list[Node]]:
+    """Import an executable and return the function that makes its nodes.
+
+    The function gets the event that ends the process. `pipeline` is driver and mitigator in one process, and a locator
+    if `anchors` is given: measurements go to the mitigator in memory, and `/uwb/range_raw` is published only while it
+    has subscribers. Names, topics, parameters and diagnostics are those of the single nodes.
+    """
+    parts = ("driver", "mitigator", "locator") if name == "pipeline" else (name,)
+    modules = [importlib.import_module(f"uwb_mitigation.nodes.{part}") for part in parts]
+    if len(modules) == 1:
+        make_nodes: Callable[[threading.Event], list[Node]] = modules[0].make_nodes
+        return make_nodes
+    driver, mitigator, locator = modules
+    # Parameters on the command line reach all nodes.
+    foreign = {row.name for part in parts for row in TABLES[part]}
+
+    def make_pipeline(stop: threading.Event) -> list[Node]:
+        made: list[Node] = []
+        try:
+            consumer = mitigator.Mitigator(subscribe=False, foreign=foreign)
+            made.append(consumer)
+            made.insert(0, driver.Driver(stop, consumer, foreign=foreign))
+            # rclpy has no public access to the parameters given at start-up.
+            anchors = consumer._parameter_overrides.get("anchors")
+            if anchors is not None and anchors.value:
+                made.append(locator.Locator(foreign=foreign))
+        except BaseException:
+            for node in made:
+                node.destroy_node()
+            raise
+        return made
+
+    return make_pipeline
 
 
-def _run(module: str) -> int:
-    """Initialise ROS, load a module, make its nodes, spin them, and end cleanly. Returns the process's exit code.
+def main(name: str) -> None:
+    """Run an executable until a signal, or until one of its nodes ends it; then exit with its code."""
+    sys.exit(_run(name))
 
-    SIGINT and SIGTERM set the event that `make_nodes` is given; so may a node, with its `exit_code`
-    set before. Nodes are destroyed in their order. ROS's own handlers would tear the context down
-    under callbacks that still publish.
+
+def _run(name: str) -> int:
+    """Initialise ROS, make the nodes, spin them, and destroy them in order; return the exit code.
+
+    SIGINT and SIGTERM set the event that the nodes get. ROS's own handlers would shut the context down while
+    callbacks still publish.
     """
     nodes: Sequence[Node] = ()
     try:
         _initialise()
         try:
-            with _participant():
-                make_nodes = importlib.import_module(module).make_nodes
-                stop = stop_event()
-                nodes = make_nodes(stop)
+            # Before the signals are caught: until then they end the process at once.
+            make_nodes = load(name)
+            stop = stop_event()
+            nodes = make_nodes(stop)
         except (rclpy_implementation.RCLError, NameValidationException) as error:
             raise ParameterError(_first_line(error), valid="check the names given to --ros-args") from error
         spin(nodes, stop)
@@ -88,42 +137,23 @@ def _run(module: str) -> int:
     return max((int(getattr(node, "exit_code", 0)) for node in nodes), default=0)
 
 
-@contextmanager
-def _participant() -> Iterator[None]:
-    """Join the graph by a hidden node, until there are others: the middleware's participant is the process's.
-
-    Finding each other takes the middleware longer than loading takes Python, and goes on meanwhile.
-    """
-    node = Node(
-        "_loading",
-        use_global_arguments=False,
-        enable_rosout=False,
-        start_parameter_services=False,
-    )
-    try:
-        yield
-    finally:
-        node.destroy_node()
-
-
 def _initialise() -> None:
     """Initialise ROS without its signal handlers.
 
     Raises:
-        ParameterError: an argument that ROS cannot read, or that is none of ROS's.
+        ParameterError: an argument is unknown, or ROS cannot parse it.
     """
     words = list(sys.argv)
     try:
         rclpy.init(args=words, signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:
         raise ParameterError(_first_line(error), valid="check what follows --ros-args") from error
-    strangers = remove_ros_args(words)[1:]
-    if strangers:
+    if unknown := remove_ros_args(words)[1:]:
         raise ParameterError(
-            f"arguments {' '.join(strangers)!r}", valid="parameters follow --ros-args, as in -p name:=value"
+            f"arguments {' '.join(unknown)!r}", valid="parameters follow --ros-args, as in -p name:=value"
         )
 
 
 def _first_line(error: Exception) -> str:
-    """What ROS says, without the places in its own source files."""
+    """Return the first line of a ROS error without positions in ROS's source files."""
     return str(error).strip().splitlines()[0].split(", at /")[0]

@@ -1,17 +1,18 @@
-"""Topic names and qualities of service (REP-2003), and the publishers and subscriptions of ranges.
+"""Topic names, quality of service (REP-2003), publishers, subscriptions, and ranges as sensor_msgs/Range.
 
-The names are relative: `/uwb/range_raw` without a namespace, `/board1/uwb/range_raw` under `board1`.
-History, depth and reliability can be overridden by the standard parameters
-`qos_overrides.TOPIC.publisher.POLICY` and `qos_overrides.TOPIC.subscription.POLICY`.
+The names are relative: `/uwb/range_raw` without a namespace, `/board1/uwb/range_raw` in `board1`. History, depth and
+reliability can be overridden by the standard parameters `qos_overrides.TOPIC.publisher.POLICY` and
+`qos_overrides.TOPIC.subscription.POLICY`.
 """
 
 from __future__ import annotations
 
-import inspect
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from builtin_interfaces.msg import Time
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.exceptions import ParameterException
 from rclpy.lifecycle import LifecycleNode
@@ -19,8 +20,10 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
+from std_msgs.msg import Header
 
-from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.errors import ParameterError, format_id
+from uwb_mitigation.measurement import CorrectedRange
 
 RANGE_RAW = "uwb/range_raw"
 RANGE_CORRECTED = "uwb/range_corrected"
@@ -34,8 +37,14 @@ TF = "/tf"
 DIAGNOSTICS = "/diagnostics"
 CLOCK = "/clock"
 
-# A reader that stalls loses nothing until it is this many ranges behind: 1 s at 1 kHz.
 DEPTH = 1000
+"""A subscriber that stalls loses no range for 1 s at 1 kHz."""
+
+MAX_SENSOR_RANGE_M = 300.0
+"""Range of a DW1000 in free space (data sheet, section 1)."""
+
+MAX_SENSOR_TOPICS = 256
+"""Ids are received over the air: there are at most this many topics of sensor_msgs/Range."""
 
 
 def _ranges(reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE) -> QoSProfile:
@@ -49,24 +58,23 @@ def _ranges(reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE) -> QoSP
 
 RANGES = _ranges()
 
-
 LATCHED = QoSProfile(
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
     history=HistoryPolicy.KEEP_LAST,
     depth=1,
 )
-"""Of what a late subscriber wants too."""
+"""For messages that a late subscriber needs too."""
 
 
 def create_publisher(node: LifecycleNode, kind: type, topic: str) -> Publisher:
-    """A lifecycle publisher of ranges.
+    """Return a lifecycle publisher of ranges.
 
     Raises:
-        ParameterError: an overridden quality of service is none.
+        ParameterError: an overridden quality of service is invalid.
     """
     with _checked(node, topic):
-        # rclpy writes overrides into the profile it is given: each gets one of its own.
+        # rclpy writes overrides into the given profile: each publisher needs its own.
         return node.create_lifecycle_publisher(
             kind, topic, _ranges(), qos_overriding_options=QoSOverridingOptions.with_default_policies()
         )
@@ -78,19 +86,17 @@ def create_subscription(
     topic: str,
     callback: Callable[[Any], None],
     reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE,
+    **options: Any,
 ) -> Subscription:
     """Return a subscription; a best-effort one also receives from best-effort publishers, such as odometry.
 
     Raises:
-        ParameterError: an overridden quality of service is none.
+        ParameterError: an overridden quality of service is invalid.
     """
+    overriding = QoSOverridingOptions.with_default_policies()
     with _checked(node, topic):
         return node.create_subscription(
-            kind,
-            topic,
-            callback,
-            _ranges(reliability),
-            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+            kind, topic, callback, _ranges(reliability), qos_overriding_options=overriding, **options
         )
 
 
@@ -101,38 +107,32 @@ def create_raw_subscription(
     callback: Callable[[bytes, int], None],
     on_lost: Callable[[Any], None],
 ) -> Subscription:
-    """A subscription of ranges that hands over serialised bytes, and the number that their publisher gave them.
+    """Return a subscription of serialised ranges; `callback` gets the bytes and the publisher's sequence number.
 
     Raises:
-        ParameterError: an overridden quality of service is none.
+        ParameterError: an overridden quality of service is invalid.
     """
 
-    def taken(*message: Any) -> None:
-        # rclpy's executors pass message and info; its events executor passes both as one tuple.
-        data, info = message if len(message) == 2 else message[0]
+    def take(data: Any, info: Any = None) -> None:
+        # rclpy's events executor passes (data, info) as one tuple.
+        if info is None:
+            data, info = data
         callback(data, number_of(info))
 
-    # By its signature rclpy tells that the info is wanted.
-    vars(taken)["__signature__"] = inspect.signature(lambda data, info: None)
-    with _checked(node, topic):
-        return node.create_subscription(
-            kind,
-            topic,
-            taken,
-            _ranges(),
-            raw=True,
-            event_callbacks=SubscriptionEventCallbacks(message_lost=on_lost),
-            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-        )
+    events = SubscriptionEventCallbacks(message_lost=on_lost)
+    subscription = create_subscription(node, kind, topic, take, raw=True, event_callbacks=events)
+    # rclpy passes the info only to callbacks that require two arguments.
+    subscription._callback_type = Subscription.CallbackType.WithMessageInfo
+    return subscription
 
 
 def number_of(info: dict[str, int]) -> int:
-    """The number of a message from its publisher, as rclpy's `take_message` has it."""
+    """Return the publisher's sequence number from the info of rclpy's `take_message`."""
     return info["publication_sequence_number"]
 
 
 def not_received(node: LifecycleNode) -> list[str]:
-    """Return a line for each best-effort publisher from which a reliable subscription of the node receives nothing."""
+    """Return a warning for each best-effort publisher from which a reliable subscription of the node receives nothing."""
     return [
         f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name} publishes by best effort and is not received: set "
         f"qos_overrides.{subscription.topic_name}.subscription.reliability:=best_effort"
@@ -143,9 +143,57 @@ def not_received(node: LifecycleNode) -> list[str]:
     ]
 
 
+def header(stamp_ns: int, frame_id: str) -> Header:
+    """Return a message header."""
+    seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
+    return Header(stamp=Time(sec=seconds, nanosec=nanoseconds), frame_id=frame_id)
+
+
+class SensorRanges:
+    """Publishes ranges as sensor_msgs/Range on `uwb/range_corrected/anchor_ID`; an invalid range is +Inf (REP-117).
+
+    sensor_msgs has no radiation type for radio: it is 0, and the field of view is the full circle.
+    """
+
+    def __init__(self, node: LifecycleNode) -> None:
+        # Only here: sensor_msgs takes a twelfth of the start-up time of a node.
+        from sensor_msgs.msg import Range
+
+        self._kind = Range
+        self._node = node
+        self._publishers: dict[int, Publisher] = {}
+
+    def publish(self, anchor_id: int, stamp_ns: int, frame_id: str, corrected: CorrectedRange) -> None:
+        publisher = self._publishers.get(anchor_id)
+        if publisher is None:
+            if len(self._publishers) == MAX_SENSOR_TOPICS:
+                text = f"more than {MAX_SENSOR_TOPICS} anchors: no topic for anchor {format_id(anchor_id)}"
+                self._node.get_logger().warning(text, throttle_duration_sec=60.0)
+                return
+            topic = f"{RANGE_CORRECTED}/anchor_{format_id(anchor_id)}"
+            publisher = self._publishers[anchor_id] = create_publisher(self._node, self._kind, topic)
+            publisher.on_activate(None)
+        valid = math.isfinite(corrected.range_m) and math.isfinite(corrected.variance_m2)
+        publisher.publish(
+            self._kind(
+                header=header(stamp_ns, frame_id),
+                field_of_view=2 * math.pi,
+                max_range=MAX_SENSOR_RANGE_M,
+                range=float(corrected.range_m) if valid else math.inf,
+                variance=float(corrected.variance_m2) if valid else math.inf,
+            )
+        )
+
+    def close(self) -> None:
+        """Destroy the publishers; may be called twice."""
+        for publisher in self._publishers.values():
+            self._node.destroy_lifecycle_publisher(publisher)
+        self._publishers.clear()
+
+
 @contextmanager
 def _checked(node: LifecycleNode, topic: str) -> Iterator[None]:
-    # rclpy raises a different type for each way of being wrong.
+    # rclpy raises various types for invalid overrides.
     try:
         yield
     except (RuntimeError, ValueError, TypeError, AttributeError, AssertionError, ParameterException) as error:

@@ -9,9 +9,11 @@ from __future__ import annotations
 import html
 import math
 import time
+from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any
+from threading import Lock
+from typing import TYPE_CHECKING, Any
 
 import jinja2
 import numpy as np
@@ -32,15 +34,22 @@ from uwb_mitigation.viewer.models import (
 )
 from uwb_mitigation.viewer.scene import (
     ERROR_EDGES_M,
-    FARTHEST_M,
+    MAX_RANGE_M,
     NO_DATA_S,
     STRIP_S,
     History,
+    Missing,
     Pair,
     Scene,
     Trace,
 )
-from uwb_mitigation.viewer.view import REFRESH_S, View
+
+if TYPE_CHECKING:
+    from uwb_mitigation.viewer.playback import BagPlayer
+
+REFRESH_S = 0.1
+SHARE = 0.3
+"""Share of a core for drawing all open pages: above it they are drawn less often."""
 
 COLOURS = {
     Status.OK: "#15803d",
@@ -65,6 +74,46 @@ _REPORTS_STYLE = (
 )
 
 _TEMPLATES = jinja2.Environment(loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"))
+
+
+@dataclass(slots=True)
+class Drawing:
+    """What drawing costs, over all pages of a server.
+
+    Attributes:
+        pages: number of open pages.
+        cost_s: processor time of one drawing, a running mean.
+    """
+
+    pages: int = 0
+    cost_s: float = 0.0
+
+    def pause_s(self) -> float:
+        """Return the time from one drawing of a page to the next."""
+        return max(REFRESH_S, self.cost_s * self.pages / SHARE)
+
+    def drawn(self, took_s: float) -> None:
+        self.cost_s += 0.1 * (took_s - self.cost_s)
+
+
+@dataclass(slots=True)
+class View:
+    """What all pages of a server show.
+
+    Attributes:
+        lock: held while the scene is changed or drawn.
+        window: number of samples that the network reads.
+        player: of a recording; None: live.
+        missing: the reasons for an empty page.
+    """
+
+    scene: Scene
+    lock: Lock
+    title: str = "UWB ranges"
+    window: int = 157
+    player: BagPlayer | None = None
+    missing: Missing = field(default_factory=Missing)
+    drawing: Drawing = field(default_factory=Drawing)
 
 
 class Page:
@@ -93,7 +142,7 @@ class Page:
         document.title = view.title
         document.template = _TEMPLATES.get_template("page.html.j2")
         document.template_variables.update(
-            page_title=view.title, recording=view.player is not None, parameters=view.parameters, nonce=nonce
+            page_title=view.title, recording=view.player is not None, nonce=nonce
         )
         document.config.update(reconnect_session=False, notify_connection_status=False, notifications=None)
         models.pairs.selected.on_change("indices", self._on_row)
@@ -158,27 +207,29 @@ class Page:
             self._models.pause.label = "Pause" if player.playing else "Play"
 
     def _draw_pairs(self, scene: Scene) -> None:
-        latest = list(scene.latest())
-        rows = [pair for pair, _, _ in latest]
-        if self._selected is None and rows:
-            self._selected = rows[0]
-        live = [(_no_data(scene, entry[1]), entry) for entry in latest]
-        self._models.pairs.data = {
-            "anchor": [format_id(anchor) for anchor, _ in rows],
-            "tag": [format_id(tag) for _, tag in rows],
-            "rate": [
-                0.0 if silent else history.rate_hz(scene.age_s(history)) for silent, (_, history, _) in live
-            ],
-            "raw": [sample.raw_m for _, _, sample in latest],
-            "range": [sample.range_m for _, _, sample in latest],
-            "sigma": [sample.sigma_m for _, _, sample in latest],
-            "status": [silent or sample.status.name for silent, (_, _, sample) in live],
-            "colour": [SILENT if silent else COLOURS[sample.status] for silent, (_, _, sample) in live],
-            "row_colour": [SILENT if silent else "" for silent, _ in live],
-            "correction": [sample.raw_m - sample.range_m for _, _, sample in latest],
-        }
-        self._rows = rows
-        _choose(self._models.pairs, rows, self._selected)
+        rows: dict[str, list[object]] = {column: [] for column in self._models.pairs.data}
+        self._rows = []
+        for pair, history, sample in scene.latest():
+            self._rows.append(pair)
+            silent = _no_data(scene, history)
+            values = {
+                "anchor": format_id(pair[0]),
+                "tag": format_id(pair[1]),
+                "rate": 0.0 if silent else history.rate_hz(scene.age_s(history)),
+                "raw": sample.raw_m,
+                "range": sample.range_m,
+                "sigma": sample.sigma_m,
+                "status": silent or sample.status.name,
+                "colour": SILENT if silent else COLOURS[sample.status],
+                "row_colour": SILENT if silent else "",
+                "correction": sample.raw_m - sample.range_m,
+            }
+            for column, value in values.items():
+                rows[column].append(value)
+        if self._selected is None and self._rows:
+            self._selected = self._rows[0]
+        self._models.pairs.data = rows
+        _choose(self._models.pairs, self._rows, self._selected)
 
     def _draw_summary(self, scene: Scene) -> None:
         count = len(self._rows)
@@ -187,8 +238,8 @@ class Page:
             parts[1] += f", {scene.not_shown} of them of further pairs, which are not shown"
         if math.isfinite(scene.now_s):
             parts.insert(0, f"{_utc(scene.now_s)}")
-        raw_m, corrected_m = scene.mean_errors_m()
         if scene.errors:
+            raw_m, corrected_m = scene.error_sums_m / scene.errors
             parts.append(f"mean absolute error {raw_m:.3f} m raw, {corrected_m:.3f} m corrected")
         text = html.escape(" · ".join(parts))
         if self._models.summary.text != text:
@@ -332,8 +383,8 @@ class Page:
             self._models.errors.data = {
                 "left": ERROR_EDGES_M[:-1],
                 "right": ERROR_EDGES_M[1:],
-                "raw": scene.raw_errors.astype(float),
-                "corrected": scene.corrected_errors.astype(float),
+                "raw": scene.error_counts[0].astype(float),
+                "corrected": scene.error_counts[1].astype(float),
             }
 
     def _draw_reports(self, scene: Scene) -> None:
@@ -445,7 +496,7 @@ def _utc(time_s: float) -> str:
 
 def _drawable(value_m: float) -> float:
     """NaN where a length would leave no room for any other."""
-    return value_m if abs(value_m) < FARTHEST_M else math.nan
+    return value_m if abs(value_m) < MAX_RANGE_M else math.nan
 
 
 def _finite(value: float) -> float:

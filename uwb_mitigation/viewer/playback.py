@@ -1,7 +1,7 @@
-"""Plays a bag into a scene, as its topics would have come live, from any place and at its own pace.
+"""Plays a bag into a scene, as its topics would have come live, from any position and at its own pace.
 
-Nothing is read but what is shown: a seek reads the minute before, playing reads on from there. So a bag of any size
-opens at once and takes no memory.
+Only what is shown is read: a seek reads the minute before, and playing continues from there. So a bag of any size opens
+at once and needs no memory.
 """
 
 from __future__ import annotations
@@ -38,47 +38,45 @@ from uwb_mitigation.errors import ParameterError, RecordingError
 from uwb_mitigation.measurement import RangeMeasurement
 from uwb_mitigation.mitigation import Backend
 from uwb_mitigation.viewer.feed import Feed
-from uwb_mitigation.viewer.scene import PLAIN, STRIP_S, Report
-from uwb_mitigation.viewer.view import Missing
+from uwb_mitigation.viewer.scene import MAX_MESSAGES, PLAIN, STRIP_S, Missing, Report
 
 DIAGNOSTICS = "/diagnostics"
 DIAGNOSTICS_TYPE = "diagnostic_msgs/msg/DiagnosticArray"
 
-MAX_MESSAGES = 40_000
-"""Read at a seek: where a minute holds more, only its end is."""
-
-LONGEST_STEP_S = 1.0
-"""A page that was not looked at for longer goes on from where it was."""
+MAX_STEP_S = 1.0
+"""If no page was open for longer, playing continues where it was."""
 
 _BATCH = 256
-_OURS = {
+_RANGE_TYPES = {
     RANGE_RAW: RANGE_CIR_TYPE,
     RANGE_TRUTH: RANGE_TRUTH_TYPE,
     RANGE_CORRECTED: RANGE_CORRECTED_TYPE,
 }
-_POSITIONS = {POSE: POSE_TYPE, ODOMETRY: ODOMETRY_TYPE, POSE_SMOOTHED: POSE_TYPE}
+_POSITION_TYPES = {POSE: POSE_TYPE, ODOMETRY: ODOMETRY_TYPE, POSE_SMOOTHED: POSE_TYPE}
 _POSITION_TOPIC = re.compile(r"(.*)/uwb/(?:(tag_(?:\d+|0x[0-9a-f]+))/)?(pose|odometry|pose_smoothed)")
 
 
 class BagPlayer:
-    """The ranges or the tracks of a bag; implements `view.Player`.
+    """The ranges or the tracks of a bag; moves the scene of `feed`, which all pages show.
 
     If the bag contains raw ranges only, they are corrected for display.
 
     Args:
         path: an MCAP file or a rosbag2 folder.
         feed: puts messages into the scene.
-        backend: makes what corrects raw ranges; called only where the bag holds no corrected ones.
-        namespace: of the topics, as `/board1`; None = the only namespace with ranges (or tracks) in the bag.
+        backend: makes the correction of raw ranges; called only if the bag contains no corrected ranges.
+        namespace: of the topics, as `/board1`; None: the only namespace with ranges (or tracks) in the bag.
 
     Attributes:
+        seconds: length of the recording.
+        position_s: the current position.
+        playing: whether `advance` moves.
         corrects: whether the bag contains raw ranges only.
         missing: what the bag does not contain; for the page.
 
     Raises:
-        RecordingError: the path is absent or no MCAP bag, contains neither ranges nor tracks, or ranges of another
-            version.
-        ParameterError: ranges of several namespaces, and none was named.
+        RecordingError: the path is not an MCAP bag, or contains neither ranges nor tracks, or ranges of another version.
+        ParameterError: the bag has several namespaces, and none was given.
     """
 
     def __init__(
@@ -89,10 +87,11 @@ class BagPlayer:
         topics, bounds = self._bag.topics, self._bag.bounds_ns
         prefix = _namespace(path, topics) if namespace is None else namespace.rstrip("/")
         has_ranges = bool({prefix + RANGE_RAW, prefix + RANGE_CORRECTED} & topics.keys())
-        if bounds is None or not (has_ranges or _positions(prefix, topics)):
+        positions = _positions(prefix, topics)
+        if bounds is None or not (has_ranges or positions):
             raise _no_ranges(path, topics)
         for channel in self._bag.channels:
-            if kind := _OURS.get(channel.topic.removeprefix(prefix)):
+            if kind := _RANGE_TYPES.get(channel.topic.removeprefix(prefix)):
                 check_channel(channel, kind, path)
         self._start_ns, end_ns = bounds
         self.seconds = (end_ns - self._start_ns) / 1e9
@@ -104,80 +103,75 @@ class BagPlayer:
             if has_ranges
             else "The recording contains tracks without ranges.",
             anchors="No anchor positions: set --anchors FILE.",
-            positions=""
-            if _positions(prefix, topics)
-            else "No tag positions: `uwb-mitigation track` estimates them.",
+            positions="" if positions else "No tag positions: `uwb-mitigation track` estimates them.",
         )
         self._backend = backend() if self.corrects else None
-        self._takers = self._takers_of(prefix, topics)
+        self._callbacks = self._callbacks_of(prefix, topics)
         self._uncorrected: list[tuple[float, RangeMeasurement]] = []
-        self._ahead: RawMessage | None = None
+        self._next: RawMessage | None = None
         self._messages: Iterator[RawMessage] = iter(())
-        self._looked_s = time.monotonic()
+        self._advanced_s = time.monotonic()
         self._clock_s = 0.0
-        feed.set_clock(lambda: self._clock_s)
+        feed.scene.clock = lambda: self._clock_s
         per_s = self._bag.message_count / max(self.seconds, 1e-9)
         self._window_s = min(STRIP_S, MAX_MESSAGES / max(per_s, 1e-9))
-        self._take_first(prefix + ANCHORS)
+        # Anchors are published once at the beginning.
+        if (topic := prefix + ANCHORS) in self._callbacks:
+            with contextlib.suppress(RecordingError):
+                for message in islice(self._bag.messages([topic]), 1):
+                    self._callbacks[topic](message.data)
         self.seek(0.0)
 
     def play(self, on: bool) -> None:
-        """Go on, or stand still; at its end the recording begins anew."""
+        """Play or pause; at the end, the recording starts again."""
         if on and self.position_s >= self.seconds:
             self.seek(0.0)
         self.playing = on
-        self._looked_s = time.monotonic()
+        self._advanced_s = time.monotonic()
 
     def seek(self, position_s: float) -> None:
-        """Bring the scene to a place, with the minute before it."""
+        """Show a position, with the minute before it."""
         self.position_s = min(max(position_s, 0.0), self.seconds)
         self._feed.clear()
         start_ns = self._start_ns + int((self.position_s - self._window_s) * 1e9)
-        self._ahead = None
-        self._messages = self._bag.messages(self._takers, max(start_ns, 0))
+        self._next = None
+        self._messages = self._bag.messages(self._callbacks, max(start_ns, 0))
         self._read()
-        self._looked_s = time.monotonic()
+        self._advanced_s = time.monotonic()
 
     def advance(self) -> None:
-        """Move on by the time that has passed since the last call."""
+        """Move on by the time since the last call."""
         now_s = time.monotonic()
-        passed_s, self._looked_s = min(now_s - self._looked_s, LONGEST_STEP_S), now_s
+        passed_s, self._advanced_s = min(now_s - self._advanced_s, MAX_STEP_S), now_s
         if self.playing:
             self.position_s = min(self.position_s + passed_s, self.seconds)
             self.playing = self.position_s < self.seconds
         self._read()
 
     def _read(self) -> None:
-        """Take what was recorded up to here; of more than `MAX_MESSAGES` the rest comes with the next call."""
+        """Read up to the current position; of more than `MAX_MESSAGES`, the rest follows with the next call."""
         stop_ns = self._start_ns + round(self.position_s * 1e9)
         try:
             for _ in range(MAX_MESSAGES):
-                message = self._ahead or next(self._messages, None)
-                self._ahead = None
+                message = self._next or next(self._messages, None)
+                self._next = None
                 if message is None:
                     break
                 if message.log_time_ns > stop_ns:
-                    self._ahead = message
+                    self._next = message
                     break
                 self._clock_s = (message.log_time_ns - self._start_ns) / 1e9
-                self._takers[message.channel.topic](message.data)
+                self._callbacks[message.channel.topic](message.data)
         except RecordingError as error:
             self._messages = iter(())
             self._feed.report("recording", Report(2, f"{error.what}: nothing beyond can be shown"))
         self._correct()
         self._clock_s = self.position_s
 
-    def _take_first(self, topic: str) -> None:
-        """Of what is said once at the beginning, wherever the recording is looked at."""
-        if topic in self._takers:
-            with contextlib.suppress(RecordingError):
-                for message in islice(self._bag.messages([topic]), 1):
-                    self._takers[topic](message.data)
-
-    def _takers_of(self, prefix: str, topics: dict[str, str]) -> dict[str, Callable[[bytes], None]]:
-        """What takes the messages of each topic that is shown."""
+    def _callbacks_of(self, prefix: str, topics: dict[str, str]) -> dict[str, Callable[[bytes], None]]:
+        """Return the callback of each topic that is shown."""
         feed = self._feed
-        takers: dict[str, Callable[[bytes], None]] = {
+        callbacks: dict[str, Callable[[bytes], None]] = {
             prefix + RANGE_RAW: self._raw if self.corrects else feed.range_raw,
             prefix + RANGE_TRUTH: feed.range_truth,
             prefix + RANGE_CORRECTED: feed.range_corrected,
@@ -189,17 +183,17 @@ class BagPlayer:
         }
         for topic, (tag, plain) in _positions(prefix, topics).items():
             name = f"{tag} smoothed" if plain == POSE_SMOOTHED else tag
-            standard[topic] = _POSITIONS[plain], partial(feed.pose, name)
+            standard[topic] = _POSITION_TYPES[plain], partial(feed.pose, name)
         for topic, (kind, take) in standard.items():
             if topics.get(topic, "").replace("/msg/", "/") == kind.replace("/msg/", "/"):
-                takers[topic] = partial(self._take_standard, kind, take)
-        return {topic: take for topic, take in takers.items() if topic in topics}
+                callbacks[topic] = partial(self._standard, kind, take)
+        return {topic: take for topic, take in callbacks.items() if topic in topics}
 
-    def _take_standard(self, kind: str, take: Callable[[Any], None], data: bytes) -> None:
-        """A standard message, by the types that ROS 2 Jazzy has."""
+    def _standard(self, kind: str, take: Callable[[Any], None], data: bytes) -> None:
+        """Take a standard message, by the types of ROS 2 Jazzy."""
         try:
             take(schemas.typestore().deserialize_cdr(data, kind))
-        except Exception:  # Of no common type, or what it says is out of all proportion.
+        except Exception:  # rosbags raises various types, and values may be implausible.
             self._feed.malformed += 1
 
     def _raw(self, data: bytes) -> None:
@@ -217,8 +211,7 @@ class BagPlayer:
         if self._backend is None:
             return
         batch, self._uncorrected = self._uncorrected, []
-        measurements = [measurement for _, measurement in batch]
-        results = self._backend.correct(measurements)
+        results = self._backend.correct([measurement for _, measurement in batch])
         for (self._clock_s, measurement), corrected in zip(batch, results, strict=True):
             self._feed.corrected(key_of(measurement), corrected)
 
@@ -259,5 +252,5 @@ def _namespace(path: Path, topics: dict[str, str]) -> str:
 def _no_ranges(path: Path, topics: dict[str, str]) -> RecordingError:
     known = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items()))
     return RecordingError(
-        "no ranges and no tracks", where=str(path), valid=f"the bag holds: {known or 'no topic'}"
+        "no ranges and no tracks", where=str(path), valid=f"the bag contains: {known or 'no topic'}"
     )

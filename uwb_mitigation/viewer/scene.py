@@ -1,7 +1,7 @@
 """What the viewer shows at one moment: pairs with their last minute and last CIRs, tags, anchors, diagnostics.
 
-Plain bookkeeping with a bound on everything that a stream could fill. It is fed in the order of time, by a node
-from topics or by a recording; no ROS, no page, no I/O here.
+It is fed in the order of time, by topics or by a recording. No ROS, no page, no I/O here. All limits of what a stream
+can fill are in this file.
 """
 
 from __future__ import annotations
@@ -9,60 +9,77 @@ from __future__ import annotations
 import math
 import time
 from collections import OrderedDict, deque
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import islice
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from uwb_mitigation.bag.codec import Key
 from uwb_mitigation.bag.poses import tag_frame
 from uwb_mitigation.measurement import Cir, CorrectedRange, Encoding, Status, Truth
 
-STRIP_S = 60.0
-"""A pair's strip chart holds the last minute."""
-
-WATERFALL = 50
-"""Exchanges whose CIRs are kept for each pair."""
-
+# Limits. Ids and texts come from the air or the network: of more entries, the oldest are removed.
 MAX_PAIRS, MAX_TAGS, MAX_REPORTS, MAX_ANCHORS = 256, 64, 64, 256
-"""Ids come from the air: of more than these, those unheard the longest are forgotten, pairs once they are silent."""
+MAX_TRUTHS, MAX_WITHOUT_TRUTH = 10_000, 1000
+"""Truths that wait for their corrected ranges, and corrected ranges that wait for their truths."""
+MAX_STRIP, MAX_TRAIL = 6000, 1200
+"""Points of a strip chart (100 ranges per second for a minute) and of a tag's trail."""
+WATERFALL = 50
+"""CIRs that are kept of each pair."""
+MAX_VALUES = 2 * 1016
+"""Values of a CIR: the DW1000's complete accumulator, real and imaginary."""
+MAX_TEXT = 400
+"""Characters that are kept of a name or a message."""
+MAX_ID_DIGITS = 20
+"""Decimal digits of a 64-bit id."""
+MAX_RANGE_M = 10_000.0
+"""A longer range is shown in the table only, and a larger error is not counted: no radio measures it."""
+MAX_COORDINATE_M = 2e7
+"""Coordinates of any position on Earth; a position further away is ignored."""
+MAX_MESSAGES = 40_000
+"""Messages of a recording that are read at a seek; of more in a minute, only the last are."""
 
-SILENT_S = 10.0
-"""A pair unheard for as long makes room for another: of too many, some are shown rather than each for a moment."""
-
+# Times.
+STRIP_S = 60.0
+"""Length of the strip chart of a pair."""
+REPLACE_S = 10.0
+"""If there are too many pairs, a pair without data for this time makes room for a new one."""
 NO_DATA_S, NO_DATA_INTERVALS = 3.0, 3.0
-"""A pair or a tag has no data after this time, or after this many of its mean intervals if that is longer."""
-
+"""A pair or a tag has no data after this time, or after this number of its mean intervals if that is longer."""
 STALE_S = 5.0
 """A node is STALE if its last diagnostics are older than this, as in rqt_robot_monitor."""
-
-MAX_STRIP, MAX_TRAIL = 6000, 1200
-"""Points of a strip (100 ranges a second for a minute) and of a tag's trail."""
-
-MAX_TRUTHS = 10_000
-"""Truths that wait for their corrected ranges."""
-
-MAX_VALUES = 2 * 1016
-"""Of a CIR's samples: the DW1000's whole accumulator, real and imaginary."""
-
-MAX_TEXT = 400
-"""Letters kept of a name or a message."""
-
-FARTHEST_M = 10_000.0
-"""A range of more is in the table alone, and no error of more is counted: no radio has measured it."""
-
-FARTHEST_PLACE_M = 2e7
-"""From the origin of any coordinates of a place on Earth: one of more is left out."""
+STALE = 3
+"""Diagnostic level STALE."""
 
 ERROR_EDGES_M = np.linspace(-1.0, 2.0, 61)
-"""Bins of the error histogram; what lies beyond counts in the outermost."""
+"""Bins of the error histogram; larger errors count in the outermost."""
 
 Pair = tuple[int, int]
 """Anchor and tag."""
 
 PLAIN = "tag"
-"""The tag whose topics have the plain names, whatever its number is; others are called as `tag_frame` has it."""
+"""Name of the tag whose topics have the plain names; the others are named as `tag_frame` does."""
+
+K = TypeVar("K")
+V = TypeVar("V")
+
+
+class Latest(OrderedDict[K, V]):
+    """A dictionary that keeps the latest `limit` entries that were added."""
+
+    def __init__(self, limit: int) -> None:
+        super().__init__()
+        self._limit = limit
+
+    def add(self, key: K, value: V) -> V:
+        self[key] = value
+        self.move_to_end(key)
+        if len(self) > self._limit:
+            self.popitem(last=False)
+        return value
 
 
 @dataclass(slots=True)
@@ -71,9 +88,8 @@ class Sample:
 
     Attributes:
         time_s: its stamp.
-        raw_m, range_m, sigma_m: as measured, corrected, and the corrected one's standard deviation.
-        status: of `measurement.Status`.
-        true_m, label: NaN and empty = unknown.
+        raw_m, range_m, sigma_m: measured and corrected range, and standard deviation of the corrected one.
+        true_m, label: NaN and empty: unknown.
     """
 
     time_s: float
@@ -86,63 +102,51 @@ class Sample:
 
     @classmethod
     def of(cls, time_s: float, corrected: CorrectedRange, truth: Truth | None) -> Sample:
-        return cls(
-            time_s,
-            corrected.range_raw_m,
-            corrected.range_m,
-            math.sqrt(corrected.variance_m2) if corrected.variance_m2 >= 0 else math.nan,
-            corrected.status,
-            math.nan if truth is None else truth.range_m,
-            "" if truth is None else truth.label,
-        )
+        sigma_m = math.sqrt(corrected.variance_m2) if corrected.variance_m2 >= 0 else math.nan
+        sample = cls(time_s, corrected.range_raw_m, corrected.range_m, sigma_m, corrected.status)
+        if truth is not None:
+            sample.true_m, sample.label = truth.range_m, truth.label
+        return sample
 
 
 class Truths:
-    """Truths until their corrected ranges come; bounded, should those be lost."""
+    """Truths that wait for their corrected ranges; bounded, since those may be lost."""
 
     def __init__(self) -> None:
-        self._kept: OrderedDict[Hashable, Truth] = OrderedDict()
+        self._kept: Latest[Key, Truth] = Latest(MAX_TRUTHS)
 
     def __len__(self) -> int:
         return len(self._kept)
 
-    def add(self, key: Hashable, truth: Truth) -> None:
-        self._kept[key] = truth
-        if len(self._kept) > MAX_TRUTHS:
-            self._kept.popitem(last=False)
+    def add(self, key: Key, truth: Truth) -> None:
+        self._kept.add(key, truth)
 
-    def take(self, key: Hashable) -> Truth | None:
+    def take(self, key: Key) -> Truth | None:
         return self._kept.pop(key, None)
 
 
 class Trace:
-    """One CIR; its magnitudes are computed when somebody looks at them, which of most nobody does.
+    """One CIR; its magnitudes are computed only if it is shown."""
 
-    Attributes:
-        time_s: the stamp of its range.
-        cir: as it came.
-    """
+    __slots__ = ("_magnitude", "cir")
 
-    __slots__ = ("_magnitude", "cir", "time_s")
-
-    def __init__(self, cir: Cir, time_s: float) -> None:
+    def __init__(self, cir: Cir) -> None:
         self.cir = cir
-        self.time_s = time_s
         self._magnitude: NDArray[np.float32] | None = None
 
     @classmethod
-    def of(cls, cir: Cir, time_s: float) -> Trace | None:
-        """None where the CIR holds no samples, or they are not what its encoding says, or out of all proportion."""
+    def of(cls, cir: Cir) -> Trace | None:
+        """Return the trace of a CIR; None if it is empty, too long or implausible."""
         odd = cir.encoding is Encoding.COMPLEX_INT16 and len(cir.samples) % 2
         if odd or not 0 < len(cir.samples) <= MAX_VALUES:
             return None
-        # The largest sample times the scale must be a float32 still, and the first path's index an int32, as the others'.
+        # The largest sample times the scale must be a float32, and the index of the first path an int32.
         if not abs(cir.scale) < 1e30 or (
             math.isfinite(cir.first_path_index) and abs(cir.first_path_index) >= 2**31
         ):
             return None
-        # They may be a view into a message of any size.
-        return cls(replace(cir, samples=cir.samples.copy()), time_s)
+        # A copy: the samples may be a view into a large message.
+        return cls(replace(cir, samples=cir.samples.copy()))
 
     @property
     def magnitude(self) -> NDArray[np.float32]:
@@ -156,7 +160,7 @@ class Trace:
 
     @property
     def origin(self) -> int:
-        """The sample of the accumulator that holds the first path; of an unknown one, the first that came."""
+        """Sample of the accumulator with the first path; the first sample if that is unknown."""
         first = self.cir.first_path_index
         return math.floor(first) if math.isfinite(first) else self.cir.start_index
 
@@ -174,7 +178,7 @@ class History:
     traces: deque[Trace] = field(default_factory=lambda: deque(maxlen=WATERFALL))
 
     def add(self, sample: Sample, now_s: float) -> None:
-        """A range; what is older than a minute is forgotten."""
+        """Add a range, and remove ranges that are older than a minute."""
         self.samples.append(sample)
         while self.samples[0].time_s < now_s - STRIP_S:
             self.samples.popleft()
@@ -184,12 +188,12 @@ class History:
         return self.samples[-1] if self.samples else None
 
     def rate_hz(self, age_s: float = 0.0) -> float:
-        """Ranges a second over the last twenty; NaN before the second one.
+        """Return the rate of the last twenty ranges; NaN before the second one.
 
         Args:
             age_s: time since the last range; the rate decreases if this is several mean intervals.
         """
-        # At once: the monitor's table looks from another thread than the one that adds.
+        # A list at once: the monitor's table is drawn in another thread than the one that adds.
         recent = [sample.time_s for sample in list(islice(reversed(self.samples), 20))]
         span = recent[0] - recent[-1] if recent else 0.0
         if not span > 0:
@@ -198,20 +202,19 @@ class History:
         return rate_hz if age_s * rate_hz <= NO_DATA_INTERVALS else len(recent) / (span + age_s)
 
     def has_data(self, age_s: float) -> bool:
-        """Return whether the last range is recent enough, relative to the mean interval of this pair."""
+        """Return whether the last range is recent, relative to the mean interval of this pair."""
         rate_hz = self.rate_hz()
         return age_s <= max(NO_DATA_S, NO_DATA_INTERVALS / rate_hz if rate_hz > 0 else 0.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """Where a tag is said to be, in metres.
+    """Estimated position of a tag, m.
 
     Attributes:
-        ellipse: the horizontal 95 % ellipse: half axes (m) and the angle of the larger (rad); NaN = unknown.
+        ellipse: horizontal 95 % ellipse: half axes (m) and angle of the major axis (rad); NaN: unknown.
     """
 
-    time_s: float
     x: float
     y: float
     z: float = math.nan
@@ -220,7 +223,7 @@ class Pose:
 
 @dataclass(slots=True)
 class Tag:
-    """A tag's latest pose, when it was received on the scene's clock, and where it came from."""
+    """A tag's latest pose, when it was received on the scene's clock, and its trail."""
 
     pose: Pose | None = None
     received_s: float = math.nan
@@ -229,7 +232,7 @@ class Tag:
 
 @dataclass(frozen=True, slots=True)
 class AnchorPlace:
-    """An anchor on the map, in metres."""
+    """An anchor on the map, m."""
 
     x: float
     y: float
@@ -257,7 +260,13 @@ class Report:
         return replace(self, level=STALE, message=f"no diagnostics for {age_s:.0f} s; last: {self.message}")
 
 
-STALE = 3
+@dataclass(slots=True)
+class Missing:
+    """What the page says if it has no ranges, anchors or positions to show; empty: nothing."""
+
+    ranges: str = "No ranges received."
+    anchors: str = "No anchor positions."
+    positions: str = ""
 
 
 class Scene:
@@ -266,11 +275,11 @@ class Scene:
     Attributes:
         clock: returns the time that ages are measured with, s: a steady clock live, the recording's time in a replay.
             Stamps are not compared with it: they may come from another computer.
-        now_s: the latest stamp seen plus the time since then; NaN before any.
-        ranges, not_shown: how many came, and how many of them are of pairs beyond `MAX_PAIRS`.
-        pairs: {(anchor, tag): its last minute}, those heard last at the end.
+        now_s: the latest stamp plus the time since then; NaN before any.
+        ranges, not_shown: number of ranges, and of those of pairs beyond `MAX_PAIRS`.
+        pairs: {(anchor, tag): its last minute}, the latest at the end.
         tags, true_trails, anchors, reports: {id or name: ...}.
-        revision: grows with every change, so that a page may leave alone what has not changed.
+        revision: increases with every change, so that a page draws only changes.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -278,13 +287,12 @@ class Scene:
         self._latest_s = self._received_s = math.nan
         self.ranges = self.not_shown = 0
         self.pairs: OrderedDict[Pair, History] = OrderedDict()
-        self.tags: OrderedDict[str, Tag] = OrderedDict()
-        self.true_trails: OrderedDict[str, deque[tuple[float, float]]] = OrderedDict()
+        self.tags: Latest[str, Tag] = Latest(MAX_TAGS)
+        self.true_trails: Latest[str, deque[tuple[float, float]]] = Latest(MAX_TAGS)
         self.anchors: dict[int, AnchorPlace] = {}
-        self.reports: OrderedDict[str, Report] = OrderedDict()
-        self.raw_errors = np.zeros(len(ERROR_EDGES_M) - 1, np.int64)
-        self.corrected_errors = np.zeros_like(self.raw_errors)
-        self.raw_error_sum_m = self.corrected_error_sum_m = 0.0
+        self.reports: Latest[str, Report] = Latest(MAX_REPORTS)
+        self.error_counts = np.zeros((2, len(ERROR_EDGES_M) - 1), np.int64)
+        self.error_sums_m = np.zeros(2)
         self.errors = 0
         self.revision = 0
 
@@ -297,10 +305,10 @@ class Scene:
         return max(self.clock() - entry.received_s, 0.0)
 
     def history(self, pair: Pair) -> History | None:
-        """The history of a pair, made anew for a new one; the pair counts as heard. None: there are too many."""
+        """Return the history of a pair, a new one for a new pair; None if there are too many."""
         history = self.pairs.get(pair)
         if history is None:
-            if len(self.pairs) == MAX_PAIRS and not self._forget_silent():
+            if len(self.pairs) == MAX_PAIRS and not self._remove_silent():
                 return None
             history = self.pairs[pair] = History()
         self.pairs.move_to_end(pair)
@@ -308,9 +316,10 @@ class Scene:
         return history
 
     def add_sample(self, pair: Pair, sample: Sample) -> None:
-        """A corrected range. Time that jumps back by more than a second (a replay's loop) starts the strips anew.
+        """Add a corrected range.
 
-        The clocks of two pairs may differ by less than a strip: only a pair's own time tells of a jump sooner.
+        If the time of a pair jumps back by more than a second (a replay in a loop), the strips start again. Clocks of
+        different pairs may differ by less than a strip.
         """
         known = self.pairs.get(pair)
         latest = None if known is None else known.latest
@@ -326,19 +335,17 @@ class Scene:
             history.received_s = self.clock()
 
     def add_error(self, sample: Sample) -> None:
-        """Count a range in the histogram, where its truth is known."""
-        raw_m, corrected_m = sample.raw_m - sample.true_m, sample.range_m - sample.true_m
-        if not (abs(raw_m) <= FARTHEST_M and abs(corrected_m) <= FARTHEST_M):
+        """Count a range in the histograms if its truth is known."""
+        errors_m = np.array([sample.raw_m - sample.true_m, sample.range_m - sample.true_m])
+        if not (np.abs(errors_m) <= MAX_RANGE_M).all():
             return
-        for errors, value in ((self.raw_errors, raw_m), (self.corrected_errors, corrected_m)):
-            place = int(np.searchsorted(ERROR_EDGES_M, value, side="right")) - 1
-            errors[min(max(place, 0), len(errors) - 1)] += 1
-        self.raw_error_sum_m += abs(raw_m)
-        self.corrected_error_sum_m += abs(corrected_m)
+        bins = np.searchsorted(ERROR_EDGES_M, errors_m, side="right") - 1
+        self.error_counts[[0, 1], np.clip(bins, 0, self.error_counts.shape[1] - 1)] += 1
+        self.error_sums_m += np.abs(errors_m)
         self.errors += 1
 
     def set_truth(self, sample: Sample, truth: Truth) -> None:
-        """Add the truth of a range that was added without it."""
+        """Set the truth of a range that was added without it."""
         sample.true_m, sample.label = truth.range_m, truth.label
         self.add_error(sample)
         self.revision += 1
@@ -348,36 +355,30 @@ class Scene:
             history.traces.append(trace)
 
     def add_pose(self, tag: str, pose: Pose) -> None:
-        if not _on_earth(pose.x, pose.y):
-            return
-        entry = self._tag(tag)
-        entry.pose, entry.received_s = pose, self.clock()
-        entry.trail.append((pose.x, pose.y))
+        if _is_plausible(pose.x, pose.y):
+            entry = self.tags.add(tag[:MAX_TEXT], self.tags.get(tag[:MAX_TEXT]) or Tag())
+            entry.pose, entry.received_s = pose, self.clock()
+            entry.trail.append((pose.x, pose.y))
+            self.revision += 1
 
     def add_true_position(self, tag: str, x: float, y: float) -> None:
-        """Where a tag truly was, by the name that the truth has for it."""
-        if not _on_earth(x, y):
-            return
-        trail = self.true_trails.setdefault(tag[:MAX_TEXT], deque(maxlen=MAX_TRAIL))
-        trail.append((x, y))
-        if len(self.true_trails) > MAX_TAGS:
-            self.true_trails.popitem(last=False)
-        self.revision += 1
+        """Add the true position of a tag, by the name that the truth has for it."""
+        if _is_plausible(x, y):
+            trail = self.true_trails.get(tag[:MAX_TEXT]) or deque(maxlen=MAX_TRAIL)
+            self.true_trails.add(tag[:MAX_TEXT], trail).append((x, y))
+            self.revision += 1
 
     def set_anchors(self, anchors: dict[int, AnchorPlace]) -> None:
-        placed = ((identity, place) for identity, place in anchors.items() if _on_earth(place.x, place.y))
-        self.anchors = dict(islice(placed, MAX_ANCHORS))
+        plausible = ((id_, place) for id_, place in anchors.items() if _is_plausible(place.x, place.y))
+        self.anchors = dict(islice(plausible, MAX_ANCHORS))
         self.revision += 1
 
     def add_report(self, name: str, report: Report) -> None:
-        self.reports[name[:MAX_TEXT]] = replace(report, message=report.message[:MAX_TEXT])
-        self.reports.move_to_end(name[:MAX_TEXT])
-        if len(self.reports) > MAX_REPORTS:
-            self.reports.popitem(last=False)
+        self.reports.add(name[:MAX_TEXT], replace(report, message=report.message[:MAX_TEXT]))
         self.revision += 1
 
     def rewind(self) -> None:
-        """Forget the last minute, but not what was counted, the anchors and the diagnostics."""
+        """Remove the last minute, but not the counts, the anchors and the diagnostics."""
         self._latest_s = self._received_s = math.nan
         for history in self.pairs.values():
             history.samples.clear()
@@ -386,51 +387,36 @@ class Scene:
         self.true_trails.clear()
 
     def clear(self) -> None:
-        """Forget everything but the anchors."""
+        """Remove everything except the anchors."""
         self.rewind()
         self.pairs.clear()
         self.ranges = self.not_shown = 0
         self.reports.clear()
-        for errors in (self.raw_errors, self.corrected_errors):
-            errors[:] = 0
-        self.raw_error_sum_m = self.corrected_error_sum_m = 0.0
+        self.error_counts[:] = 0
+        self.error_sums_m[:] = 0
         self.errors = 0
         self.revision += 1
 
-    def mean_errors_m(self) -> tuple[float, float]:
-        """Mean absolute error of raw and of corrected ranges whose truth is known; NaN without any."""
-        if not self.errors:
-            return math.nan, math.nan
-        return self.raw_error_sum_m / self.errors, self.corrected_error_sum_m / self.errors
-
     def latest(self) -> Iterator[tuple[Pair, History, Sample]]:
-        """Every pair with its last range, by anchor and tag; also those that have stopped."""
+        """Yield every pair with its last range, by anchor and tag; also pairs that have stopped."""
         for pair, history in sorted(self.pairs.items()):
             if history.latest is not None:
                 yield pair, history, history.latest
 
     def tag_of(self, tag_id: int) -> Tag | None:
-        """The tag of ranges: the one of its name, else the plain one where no second tag lacks a name of its own."""
+        """Return the tag of ranges: the one of its name, else the plain one if it is the only tag without a name."""
         own = self.tags.get(tag_frame(tag_id))
         nameless = {tag for _, tag in self.pairs if tag_frame(tag) not in self.tags}
         return self.tags.get(PLAIN) if own is None and nameless == {tag_id} else own
 
-    def _forget_silent(self) -> bool:
-        """Forget the pair unheard the longest, if that is long enough."""
+    def _remove_silent(self) -> bool:
+        """Remove the pair without data for the longest time, if that is long enough."""
         pair, history = next(iter(self.pairs.items()))
-        if history.latest is not None and self.age_s(history) < SILENT_S:
+        if history.latest is not None and self.age_s(history) < REPLACE_S:
             return False
         del self.pairs[pair]
         return True
 
-    def _tag(self, tag: str) -> Tag:
-        self.revision += 1
-        entry = self.tags.setdefault(tag[:MAX_TEXT], Tag())
-        self.tags.move_to_end(tag[:MAX_TEXT])
-        if len(self.tags) > MAX_TAGS:
-            self.tags.popitem(last=False)
-        return entry
 
-
-def _on_earth(x: float, y: float) -> bool:
-    return abs(x) <= FARTHEST_PLACE_M and abs(y) <= FARTHEST_PLACE_M
+def _is_plausible(x: float, y: float) -> bool:
+    return abs(x) <= MAX_COORDINATE_M and abs(y) <= MAX_COORDINATE_M

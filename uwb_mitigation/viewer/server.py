@@ -1,16 +1,16 @@
-"""Serves the viewer's page over http from a thread of its own, with everything that the page needs: no network."""
+"""Serves the viewer's page over HTTP from its own thread; the page needs no other server."""
 
 from __future__ import annotations
 
 import asyncio
-import html
 import logging
 import queue
 import secrets
+import socket
 import threading
-from collections.abc import Callable, Mapping
 from typing import Any
 
+import psutil
 from bokeh.application import Application
 from bokeh.application.handlers.function import FunctionHandler
 from bokeh.server.server import BaseServer
@@ -22,15 +22,12 @@ from tornado.ioloop import IOLoop
 from tornado.web import OutputTransform, RequestHandler
 
 from uwb_mitigation.errors import ParameterError
-from uwb_mitigation.viewer.page import Page
-from uwb_mitigation.viewer.view import View
+from uwb_mitigation.viewer.page import Page, View
 
-Parameters = Callable[[], Mapping[str, Mapping[str, object]]]
-"""{node: {parameter: value}}; called from the server's thread."""
+ALL_ADDRESSES = ("0.0.0.0", "*")
 
-
-EVERY = ("0.0.0.0", "*")
-"""Hosts that mean every address of this machine."""
+_NONCE = "X-Nonce"
+"""Header that hands the nonce of a response to the page; a value from the client is replaced."""
 
 
 class ViewerServer:
@@ -38,30 +35,20 @@ class ViewerServer:
 
     Args:
         view: what the pages show.
-        host, port: where to listen; port 0 takes a free one, which `port` then tells.
+        host, port: where to listen; port 0 takes a free one, and `port` then has its number.
         origins: further `host:port` that are accepted in the headers Host and Origin, for a proxy or a host name.
-        parameters: what `/parameters` shows.
 
     Raises:
-        ParameterError: the address cannot be listened on.
+        ParameterError: the address cannot be used.
     """
 
     def __init__(
-        self,
-        view: View,
-        host: str = "localhost",
-        port: int = 5006,
-        origins: tuple[str, ...] = (),
-        parameters: Parameters | None = None,
+        self, view: View, host: str = "localhost", port: int = 5006, origins: tuple[str, ...] = ()
     ) -> None:
-        view.parameters = parameters is not None
         self._loop: IOLoop | None = None
         outcome: queue.Queue[int | Exception] = queue.Queue()
         self._thread = threading.Thread(
-            target=self._run,
-            args=(outcome, view, host, port, origins, parameters),
-            name="viewer",
-            daemon=True,
+            target=self._run, args=(outcome, view, host, port, origins), name="viewer", daemon=True
         )
         self._thread.start()
         found = outcome.get()
@@ -73,8 +60,7 @@ class ViewerServer:
                 valid="a free port, and a name or an IPv4 address of this machine",
             ) from found
         self.port = found
-        # Every address is none that a browser could name.
-        self.url = f"http://{'localhost' if host in EVERY else host}:{self.port}/"
+        self.url = f"http://{'localhost' if host in ALL_ADDRESSES else host}:{self.port}/"
 
     def close(self) -> None:
         """Stop serving; may be called twice."""
@@ -96,16 +82,15 @@ class ViewerServer:
         host: str,
         port: int,
         origins: tuple[str, ...],
-        parameters: Parameters | None,
     ) -> None:
         asyncio.set_event_loop(asyncio.new_event_loop())
-        # A tab that is closed while data is sent to it is not worth a warning.
+        # Bokeh warns if a tab is closed while data is sent to it.
         logging.getLogger("bokeh.server.views.ws").setLevel(logging.ERROR)
         loop = IOLoop.current()
         sockets = []
         try:
-            sockets, port = bind_sockets("" if host in EVERY else host, port)
-            application = _Application(view, _hosts(host, port, origins), parameters)
+            sockets, port = bind_sockets("" if host in ALL_ADDRESSES else host, port)
+            application = _Application(view, accepted_hosts(host, port, origins))
             http = HTTPServer(application)
             http.add_sockets(sockets)
             server = BaseServer(loop, application, http)
@@ -122,7 +107,7 @@ class ViewerServer:
         finally:
             server.unlisten()
             server.stop()
-            # Its connections too, so that pages learn of it at once.
+            # With its connections, so that the pages notice at once.
             loop.close(all_fds=True)
 
 
@@ -133,11 +118,8 @@ class _Application(BokehTornado):  # type: ignore[misc]
     (DNS rebinding).
     """
 
-    def __init__(self, view: View, hosts: list[str], parameters: Parameters | None) -> None:
+    def __init__(self, view: View, hosts: list[str]) -> None:
         self._hosts = create_hosts_allowlist(hosts, None)
-        patterns = (
-            [] if parameters is None else [(r"/parameters", _ParametersPage, {"parameters": parameters})]
-        )
 
         def open_page(document: Any) -> None:
             Page(document, view, document.session_context.request.headers.get(_NONCE, ""))
@@ -145,7 +127,6 @@ class _Application(BokehTornado):  # type: ignore[misc]
         super().__init__(
             {"/": Application(FunctionHandler(open_page))},
             extra_websocket_origins=self._hosts,
-            extra_patterns=patterns,
             # A closed tab is forgotten soon, so that it costs nothing.
             check_unused_sessions_milliseconds=1000,
             unused_session_lifetime_milliseconds=2000,
@@ -154,13 +135,9 @@ class _Application(BokehTornado):  # type: ignore[misc]
 
     def find_handler(self, request: HTTPServerRequest, **kwargs: Any) -> Any:
         request.headers[_NONCE] = secrets.token_urlsafe(16)
-        if check_allowlist(request.host, self._hosts):
+        if check_allowlist(request.host.lower(), self._hosts):
             return super().find_handler(request, **kwargs)
         return self.get_handler_delegate(request, _UnknownHost)
-
-
-_NONCE = "X-Nonce"
-"""Header that hands the nonce of a response to the page; one from the client is replaced."""
 
 
 class _SecurityPolicy(OutputTransform):  # type: ignore[misc]
@@ -191,35 +168,27 @@ class _UnknownHost(RequestHandler):  # type: ignore[misc]
     def prepare(self) -> None:
         self.set_status(403)
         self.finish(
-            "The viewer does not accept this host name. Add HOST:PORT to the viewer's parameter origins.\n"
+            "The viewer does not accept this host name. Set the node's parameter origins, or the option --origins of "
+            "`uwb-mitigation view`, to HOST:PORT of this address.\n"
         )
 
 
-class _ParametersPage(RequestHandler):  # type: ignore[misc]
-    """The nodes' parameters as a plain table; nothing can be set from here."""
+def accepted_hosts(host: str, port: int, more: tuple[str, ...]) -> list[str]:
+    """Return the `host:port` that requests may name as Host and as Origin.
 
-    def initialize(self, parameters: Parameters) -> None:
-        self._parameters = parameters
-
-    def get(self) -> None:
-        rows: list[str] = []
-        for node, values in self._parameters().items():
-            rows.append(f"<tr><th colspan=2>{html.escape(node)}</th></tr>")
-            rows += [
-                f"<tr><td>{html.escape(name)}</td><td>{html.escape(str(value))}</td></tr>"
-                for name, value in values.items()
-            ]
-        self.write(
-            '<!DOCTYPE html><html lang="en"><meta charset="utf-8"><title>Parameters</title>'
-            '<meta name="viewport" content="width=device-width"><link rel="icon" href="data:,">'
-            "<style>body{font:14px/1.4 system-ui,sans-serif;margin:16px}td,th{text-align:left;padding:2px 12px 2px 0;"
-            "overflow-wrap:anywhere}</style>"
-            "<h1>Parameters</h1><p>As they are now. Set one with <code>ros2 param set NODE NAME VALUE</code>.</p>"
-            f"<table>{''.join(rows) or '<tr><td>no node has answered</td></tr>'}</table></html>"
-        )
+    A page at all addresses accepts the addresses and the name of this machine, which no other site can resolve to.
+    """
+    names = {"localhost", "127.0.0.1"}
+    if host in ALL_ADDRESSES:
+        names |= _own_names()
+    else:
+        names.add(host.lower())
+    return [*(f"{name}:{port}" for name in sorted(names)), *(origin.lower() for origin in more)]
 
 
-def _hosts(host: str, port: int, more: tuple[str, ...]) -> list[str]:
-    """Return the `host:port` that requests may name as Host and as Origin."""
-    names = {"localhost", "127.0.0.1"} | ({host} if host not in EVERY else set())
-    return [*(f"{name}:{port}" for name in sorted(names)), *more]
+def _own_names() -> set[str]:
+    """Return the name and the IPv4 addresses of this machine."""
+    name = socket.gethostname().lower()
+    entries = [entry for interface in psutil.net_if_addrs().values() for entry in interface]
+    addresses = {entry.address for entry in entries if entry.family == socket.AF_INET}
+    return {name, f"{name}.local"} | addresses
