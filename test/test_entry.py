@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 from conftest import REPOSITORY
-
 from uwb_mitigation.nodes.help import USAGES
 
 NODES = ("driver", "mitigator", "pipeline", "monitor")

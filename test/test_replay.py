@@ -1,42 +1,232 @@
-"""Replay: pause, seek, rate and loop while it plays, and the same ranges every time."""
+"""Replay: pace, pause, seek, rate, loop, stop and errors, and the same ranges every time."""
 
 from __future__ import annotations
 
 import itertools
 import threading
 import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
-from players import ListSource, Player, stop_after
+from rclpy.clock import Clock, ClockType
 from ros_harness import PAUSED, Ros
 from rosgraph_msgs.msg import Clock as ClockMessage
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
 from uwb_mitigation.bag.writer import BagWriter
+from uwb_mitigation.errors import DamagedRecordingError, UwbMitigationError
+from uwb_mitigation.measurement import Cir, RangeMeasurement, Record
+from uwb_mitigation.nodes.replay import Pace, ReplayFeed, ReplayOptions
+from uwb_mitigation.offsets import NO_OFFSETS
 from uwb_mitigation.sources.simulated import SimulatedSource
 
 MS = 1_000_000
 COUNT = 400
+SILENT = SimpleNamespace(info=lambda text: None, warning=lambda text, **_: None)
+
+
+class ListSource:
+    """Records at given times, numbered from 0; may end with an error, and may be slow."""
+
+    name = "list"
+    simulated = True
+
+    def __init__(self, stamps_ns: Sequence[int], error: Exception | None = None, slow_s: float = 0.0) -> None:
+        self.stamps_ns, self.error, self.slow_s = stamps_ns, error, slow_s
+        self.skipped: Counter[str] = Counter()
+
+    def __iter__(self) -> Iterator[Record]:
+        for index, stamp_ns in enumerate(self.stamps_ns):
+            time.sleep(self.slow_s)
+            yield Record(RangeMeasurement(stamp_ns, 1, 2, index, 0, 1.0, Cir(np.zeros(0, np.int16))))
+        if self.error is not None:
+            raise self.error
+
+    def close(self) -> None:
+        pass
 
 
 def steps(count: int, step_ns: int) -> ListSource:
     return ListSource(range(10**18, 10**18 + count * step_ns, step_ns))
 
 
+class Player:
+    """Plays a source; `on_record(player, sequence)` is called for each record, from the playing thread."""
+
+    def __init__(
+        self,
+        source: ListSource,
+        on_record: Callable[[Player, int], None] = lambda player, sequence: None,
+        **options: object,
+    ) -> None:
+        self.clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self.sequences: list[int] = []
+        self.recorded: list[int] = []
+        self.stamps: list[int] = []
+        self.early: list[bool] = []
+        self.batches: list[int] = []
+        self.clock_times: list[int] = []
+        self.ends: list[UwbMitigationError | None] = []
+        self.ended = threading.Event()
+        self.on_record = on_record
+        self.feed = ReplayFeed(
+            source,
+            self.clock,
+            ReplayOptions(**({"longest_pause_s": 100.0} | options)),
+            SILENT,
+            subscribers=lambda: 0,
+            publish=self.publish,
+            on_time=self.on_time,
+            on_end=self.end,
+        )
+
+    def publish(self, records: Sequence[tuple[Record, int]]) -> None:
+        self.batches.append(len(records))
+        self.early.append(self.clock.now().nanoseconds < records[-1][1])
+        for record, stamp_ns in records:
+            self.sequences.append(record.measurement.sequence)
+            self.recorded.append(record.measurement.stamp_ns)
+            self.stamps.append(stamp_ns)
+            self.on_record(self, record.measurement.sequence)
+
+    def set(self, **values: object) -> None:
+        self.feed.apply(values, values.__getitem__, NO_OFFSETS)
+
+    def on_time(self, time_ns: int) -> None:
+        self.clock_times.append(time_ns)
+
+    def end(self, error: UwbMitigationError | None) -> None:
+        self.ends.append(error)
+        self.ended.set()
+
+    def stop(self) -> None:
+        """Play no further; called from the playing thread."""
+        self.feed.stop()
+        self.ended.set()
+
+    def play(self) -> Player:
+        self.feed.start()
+        assert self.ended.wait(240)
+        self.feed.stop()
+        return self
+
+    @property
+    def offsets(self) -> list[int]:
+        return [stamp - self.stamps[0] for stamp in self.stamps]
+
+
+def stop_after(count: int) -> Callable[[Player, int], None]:
+    return lambda player, _: player.stop() if len(player.sequences) == count else None
+
+
 def published_with(player: Player, sequence: int) -> int:
-    """How many records had come when the call with this one ended: what is late comes together."""
+    """Return the number of records at the end of the call with this one: late records come together."""
     ends = itertools.accumulate(player.batches)
     return next(end for end in ends if end > player.sequences.index(sequence))
 
 
-def test_a_seek_forwards_leaves_records_out_and_stamps_go_on():
+def test_stamps_keep_the_recorded_intervals_divided_by_the_rate():
+    player = Player(ListSource([1_000_000_000, 1_020_000_000, 1_080_000_000]), rate=2.0).play()
+    assert player.offsets == [0, 10_000_000, 40_000_000]
+    assert player.ends == [None]
+    assert not any(player.early)
+
+
+def test_a_long_pause_is_cut():
+    player = Player(ListSource([0, 3_600_000_000_000]), longest_pause_s=0.05).play()
+    assert player.offsets == [0, 50_000_000]
+
+
+def test_recorded_stamps_stay_and_the_clock_leads_up_to_them():
+    stamps = [1_000_000_000, 2_000_000_000]
+    player = Player(ListSource(stamps), recorded_stamps=True).play()
+    assert player.stamps == stamps
+    assert player.clock_times == sorted(player.clock_times)
+    assert (player.clock_times[0], player.clock_times[-1]) == tuple(stamps)
+    assert len(player.clock_times) >= 4
+
+
+def test_a_loop_goes_on_in_time_and_never_at_a_negative_one():
+    player = Player(ListSource([0, 10 * MS, 20 * MS]), stop_after(7), loop=True, recorded_stamps=True).play()
+    assert player.recorded[:7] == [step % 3 * 10 * MS for step in range(7)]
+    assert min(player.clock_times) >= 0
+    player = Player(ListSource([0, 10 * MS, 20 * MS]), stop_after(7), loop=True).play()
+    # A late record may come in one call with the seventh.
+    assert player.offsets[:7] == [step * 10 * MS for step in range(7)]
+
+
+@pytest.mark.parametrize("error", [DamagedRecordingError("torn", where="file:7"), ZeroDivisionError("a bug")])
+def test_an_error_of_the_source_is_reported_after_everything_before_it_was_played(error: Exception, capsys):
+    player = Player(ListSource([0, 1], error)).play()
+    assert len(player.sequences) == 2
+    assert str(error) in str(player.ends[0])
+    assert len(player.ends) == 1
+
+
+def test_a_stop_during_a_pause_ends_the_thread_and_reports_no_end():
+    player = Player(ListSource([0, 3_000_000_000_000]), longest_pause_s=1e4)
+    player.feed.start()
+    while not player.sequences:
+        time.sleep(0.001)
+    player.feed.stop()
+    assert "replay" not in [thread.name for thread in threading.enumerate()]
+    assert player.ends == []
+
+
+def test_a_wall_clock_that_is_set_neither_stops_nor_hurries_a_replay(monkeypatch: pytest.MonkeyPatch):
+    step_ns = [0]
+    wall_ns = time.time_ns
+    monkeypatch.setattr(time, "time_ns", lambda: wall_ns() + step_ns[0])
+    pace = Pace(Clock(clock_type=ClockType.SYSTEM_TIME))
+    began_ns = pace.now_ns()
+    stamps = []
+    for step, step_s in enumerate((0, 0, -3600, 10_800)):
+        step_ns[0] = step_s * 10**9
+        stamps.append(pace.stamp_ns(began_ns + step * MS))
+    assert 0 < pace.now_ns() - began_ns < 60 * 10**9
+    assert stamps[1] - stamps[0] == MS
+    assert [round((b - a) / 1e9) for a, b in pairwise(stamps)] == [0, -3600, 14_400]
+
+
+def test_a_process_that_is_interrupted_between_two_clocks_does_not_take_one_for_set(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    steady_ns, interrupted_ns = [0], [0]
+
+    def wall_ns() -> int:
+        steady_ns[0] += interrupted_ns[0]
+        wall = 10**18 + steady_ns[0]
+        steady_ns[0] += interrupted_ns[0]
+        return wall
+
+    monkeypatch.setattr(time, "monotonic_ns", lambda: steady_ns[0])
+    monkeypatch.setattr(time, "time_ns", wall_ns)
+    pace = Pace(Clock(clock_type=ClockType.SYSTEM_TIME))
+    stamps = []
+    for due_ns, interrupted_ns[0] in ((0, 0), (25 * MS, 5 * MS), (50 * MS, 0)):
+        stamps.append(pace.stamp_ns(due_ns))
+    assert [b - a for a, b in pairwise(stamps)] == [25 * MS, 25 * MS]
+
+
+def test_a_source_that_cannot_keep_its_rate_is_reported():
+    player = Player(ListSource([each * 1000 for each in range(120)], slow_s=0.005)).play()
+    _, level, text, facts = player.feed.describe()
+    assert float(facts["behind s"]) > 0.5
+    assert level > b"\0"
+    assert "behind" in text
+
+
+def test_a_seek_forwards_skips_records_and_stamps_go_on():
     player = Player(
-        steps(100, 100 * MS), lambda player, sequence: player.playback.seek(9.0) if sequence == 3 else None
+        steps(100, 100 * MS), lambda player, sequence: player.set(seek_to=9.0) if sequence == 3 else None
     ).play()
     before = published_with(player, 3)
     assert player.sequences == [*range(before), *range(90, 100)]
@@ -49,7 +239,7 @@ def test_a_seek_backwards_plays_again():
 
     def back(player: Player, sequence: int) -> None:
         if sequence == 5 and next(seeks, False):
-            player.playback.seek(0.02)
+            player.set(seek_to=0.02)
 
     player = Player(steps(8, 10 * MS), back).play()
     before = published_with(player, 5)
@@ -57,86 +247,62 @@ def test_a_seek_backwards_plays_again():
     assert player.stamps == sorted(player.stamps)
 
 
-def test_a_replay_can_start_anywhere_and_ends_at_once_beyond_the_end():
-    assert Player(steps(20, 10 * MS), from_s=0.15).play().sequences == [15, 16, 17, 18, 19]
-    assert Player(steps(20, 10 * MS), from_s=5.0).play().sequences == []
-
-
-def test_a_loop_plays_from_the_start_after_a_seek():
-    player = Player(steps(10, 5 * MS), stop_after(7), from_s=0.04, loop=True).play()
-    # A record that was late already came in one call with the seventh.
-    assert player.sequences[:7] == [8, 9, 0, 1, 2, 3, 4]
-
-
-def test_a_pause_holds_the_records_and_their_time():
-    resumed = threading.Event()
-
-    def resume(player: Player) -> None:
-        resumed.set()
-        player.playback.paused = False
-
-    def pause(player: Player, sequence: int) -> None:
-        if sequence == 1:
-            player.playback.paused = True
-            threading.Timer(0.3, resume, [player]).start()
-        if sequence == 2:
-            assert resumed.is_set()
-
-    player = Player(steps(5, 200 * MS), pause).play()
-    assert player.sequences == [0, 1, 2, 3, 4]
-    gaps = np.diff(player.stamps)
-    # The rest of the wait for the next record comes after the pause.
-    assert gaps[1] > 450 * MS
-    assert list(gaps[2:]) == [200 * MS] * 2
-
-
 def test_a_seek_does_not_wait_for_the_record_that_was_next():
     def skip(player: Player, sequence: int) -> None:
         if sequence == 0:
-            player.playback.seek(120.0)
-
+            player.set(seek_to=120.0)
         if sequence == 2:
             player.stop()
 
     player = Player(steps(4, 60_000 * MS), skip, longest_pause_s=30.0).play()
     assert player.sequences == [0, 2]
-    first, second = player.stamps
-    assert second - first < 10_000 * MS
+    assert player.offsets[1] < 10_000 * MS
 
 
-def test_the_clock_stands_still_in_a_pause():
-    class Watched(Player):
-        def tell_time(self, time_ns: int) -> None:
-            super().tell_time(time_ns)
-            if self.clock_times.count(time_ns) == 5:
-                self.playback.paused = False
+def test_a_replay_can_start_anywhere_and_a_loop_then_plays_from_the_start():
+    assert Player(steps(20, 10 * MS), from_s=5.0).play().sequences == []
+    player = Player(steps(10, 5 * MS), stop_after(7), from_s=0.04, loop=True).play()
+    assert player.sequences[:7] == [8, 9, 0, 1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("recorded_stamps", [False, True])
+def test_a_pause_holds_the_records_and_their_time(recorded_stamps: bool):
+    resumed = threading.Event()
+
+    def resume(player: Player) -> None:
+        resumed.set()
+        player.set(paused=False)
 
     def pause(player: Player, sequence: int) -> None:
         if sequence == 1:
-            player.playback.paused = True
-
-    player = Watched(steps(3, 100 * MS), pause, recorded_stamps=True).play()
-    assert player.sequences == [0, 1, 2], "a clock that goes on ends no pause here"
-    assert player.clock_times == sorted(player.clock_times)
-
-
-def test_another_rate_changes_the_distances_from_there_on():
-    def faster(player: Player, sequence: int) -> None:
+            player.set(paused=True)
+            threading.Timer(0.3, resume, [player]).start()
         if sequence == 2:
-            player.playback.rate = 10.0
+            assert resumed.is_set()
 
-    player = Player(steps(12, 50 * MS), faster).play()
+    player = Player(steps(5, 200 * MS), pause, recorded_stamps=recorded_stamps).play()
+    assert player.sequences == [0, 1, 2, 3, 4]
+    assert player.clock_times == sorted(player.clock_times)
+    if not recorded_stamps:
+        gaps = np.diff(player.stamps)
+        # The rest of the wait for the next record follows the pause.
+        assert gaps[1] > 450 * MS
+        assert list(gaps[2:]) == [200 * MS] * 2
+
+
+def test_another_rate_changes_the_intervals_from_there_on():
+    player = Player(
+        steps(12, 50 * MS), lambda player, sequence: player.set(rate=10.0) if sequence == 2 else None
+    ).play()
     gaps = np.diff(player.stamps)
     assert list(gaps[:2]) == [50 * MS] * 2
     assert list(gaps[4:]) == [5 * MS] * 7
 
 
 def test_late_records_come_several_at_once_and_in_order():
-    def delay(player: Player, sequence: int) -> None:
-        if sequence == 0:
-            time.sleep(0.02)
-
-    player = Player(steps(500, 1000), delay).play()
+    player = Player(
+        steps(500, 1000), lambda player, sequence: time.sleep(0.02) if sequence == 0 else None
+    ).play()
     assert player.sequences == list(range(500))
     assert max(player.batches) > 1
     assert player.batches[0] == 1
@@ -157,17 +323,12 @@ def test_the_same_bag_gives_the_same_corrected_ranges_twice(ros: Ros, bag: Path)
     def play(rate: str) -> list[tuple]:
         received = ros.collect(RangeCorrected, "/uwb/range_corrected")
         pipeline = ros.start(
-            "pipeline",
-            "source:=mcap",
-            f"path:={bag}",
-            f"rate:={rate}",
-            "publish_clock:=true",
-            *PAUSED,
+            "pipeline", "source:=mcap", f"path:={bag}", f"rate:={rate}", "publish_clock:=true", *PAUSED
         )
         ros.play()
         assert pipeline.wait() == 0, pipeline.output
         ros.spin_until(lambda: len(received) == COUNT)
-        # The next one must not be taken for this one.
+        # The next pipeline must not be taken for this one.
         ros.spin_until(lambda: ros.node.count_publishers("/uwb/range_corrected") == 0)
         return [
             (m.header.stamp.sec, m.header.stamp.nanosec, m.sequence, m.range, m.variance, m.status)
@@ -178,7 +339,7 @@ def test_the_same_bag_gives_the_same_corrected_ranges_twice(ros: Ros, bag: Path)
 
 
 @pytest.mark.ros
-def test_a_running_replay_is_paused_sought_and_sped_up_by_parameters(ros: Ros, bag: Path):
+def test_parameters_pause_seek_and_speed_up_a_running_replay(ros: Ros, bag: Path):
     received = ros.collect(RangeCir, "/uwb/range_raw")
     clock = ros.collect(ClockMessage, "/clock")
     driver = ros.start(
@@ -186,9 +347,8 @@ def test_a_running_replay_is_paused_sought_and_sped_up_by_parameters(ros: Ros, b
     )
     ros.spin_until(lambda: len(clock) > 5)
     assert received == []
-    assert ros.set_parameter("driver", "seek_to", 3.0).successful
-    assert ros.set_parameter("driver", "rate", 5.0).successful
-    assert ros.set_parameter("driver", "paused", False).successful
+    for name, value in (("seek_to", 3.0), ("rate", 5.0), ("paused", False)):
+        assert ros.set_parameter("driver", name, value).successful
     assert driver.wait() == 0, driver.output
     ros.spin_until(lambda: len(received) == COUNT // 4)
     assert [m.sequence for m in received] == list(range(300, COUNT))

@@ -21,6 +21,7 @@ from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 from ros_harness import Process, Ros
+from uwb_mitigation.nodes.conversions import key_of
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
 from uwb_mitigation.link.board import Identity
@@ -32,7 +33,6 @@ from uwb_mitigation.measurement import Origin, Status
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.shipped import default_model_path
-from uwb_mitigation.nodes.conversions import key_of
 from uwb_mitigation.offsets import Offsets
 from uwb_mitigation.sources.simulated import SimulatedSource
 

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from bokeh.document import Document
 from browser import Browser
+from uwb_mitigation.viewer.view import Drawing, Missing, View
 
 from benchmarks.visitors import Visitors
 from uwb_mitigation.errors import ParameterError
@@ -20,7 +21,6 @@ from uwb_mitigation.measurement import Cir, Encoding, Status
 from uwb_mitigation.viewer.page import Page
 from uwb_mitigation.viewer.scene import MAX_PAIRS, SILENT_S, AnchorPlace, Pose, Report, Sample, Scene, Trace
 from uwb_mitigation.viewer.server import ViewerServer
-from uwb_mitigation.viewer.view import Drawing, Missing, View
 
 HOSTILE = "<img src=x onerror=window.pwned=1><script>window.pwned=1</script>$$x$$"
 

@@ -120,7 +120,9 @@ def live_table(tally: Tally, title: str) -> Table:
     """Return a table with one row for each anchor-tag pair."""
     table = Table(title=title, title_justify="left")
     for column in ("anchor", "tag", "Hz", "raw", "corrected", "sigma", "true", "status", "label"):
-        table.add_column(column, justify="left" if column in ("status", "label") else "right", overflow="fold")
+        table.add_column(
+            column, justify="left" if column in ("status", "label") else "right", overflow="fold"
+        )
     for (anchor, tag), history in sorted(tally.pairs.copy().items()):
         sample = history.samples[-1]
         table.add_row(

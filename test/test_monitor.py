@@ -1,0 +1,56 @@
+"""The monitor's counts, latency and errors."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
+
+from rich.console import Console
+
+from uwb_mitigation.bag.codec import Key
+from uwb_mitigation.measurement import CorrectedRange, Origin, Status, Truth
+from uwb_mitigation.nodes.monitor import Tally, summary
+
+
+def corrected(tally: Tally, sequence: int, raw: float, out: float, latency_s: float = 0.001) -> None:
+    result = CorrectedRange(out, raw, raw - out, 0.04, Status.OK, Origin.HOST, 1)
+    key = Key(sequence * 100_000_000, 1, 7, sequence)
+    tally.add_corrected(key, result, key.stamp_ns / 1e9 + latency_s)
+
+
+def test_counts_rate_latency_and_sigma():
+    tally = Tally()
+    for index in range(100):
+        tally.raw += 1
+        corrected(tally, index, 2.2, 1.9, latency_s=(1 + index % 3) / 1000)
+    tally.raw += 1
+    assert (tally.corrected, tally.missing, tally.errors) == (100, 1, {})
+    assert tally.latency_ms(50) == pytest.approx(2.0)
+    assert tally.pairs[7, 1].rate_hz() == pytest.approx(10.0, rel=1e-2)
+    assert tally.pairs[7, 1].samples[-1].sigma_m == pytest.approx(0.2)
+
+
+def test_errors_are_absolute_and_grouped_by_label():
+    tally = Tally()
+    for sequence, true_m, label, raw, out in (
+        (1, 2.0, "LOS", 2.2, 1.9),
+        (2, 3.0, "NLOS", 4.0, 3.5),
+        (3, 2.0, "LOS", math.nan, math.nan),
+    ):
+        tally.add_truth(Key(sequence * 100_000_000, 1, 7, sequence), Truth(true_m, label))
+        corrected(tally, sequence, raw, out)
+    assert tally.errors["LOS"].raw_m == pytest.approx(0.2)
+    assert tally.errors["LOS"].corrected_m == pytest.approx(0.1)
+    assert tally.total.n == 2
+    assert tally.total.corrected_m == pytest.approx(0.6)
+
+
+def test_a_summary_without_data_shows_no_nan():
+    console = Console(width=100, record=True)
+    console.print(summary(Tally()))
+    shown = console.export_text()
+    assert "0 ranges received" in shown
+    assert "nan" not in shown
