@@ -143,7 +143,7 @@ def test_a_recording_that_has_ended_is_not_played_again(generate, one_process: s
 def test_every_parameter_is_an_argument_and_reaches_its_node_with_its_type(generate):
     said = {"source": "serial", "port": "usb:2341:805a", "locate": "true", "viewer": "true"}
     arguments, _ = described(generate, "uwb.launch.py")
-    examples = {"radio.address": "1234", "offsets": "0.25", "level": "true", "height": "1", "publish_tf": "True",
+    examples = {"frame_id": "1234", "radio.address": "34", "offsets": "0.25", "level": "true", "height": "1e-1", "publish_tf": "True",
                 "viewer_port": "8080", "locator_rate": "20", "rate": "2", "radio.pan": "7", "area": "0,0,0,9,9,3"}  # fmt: skip
     assert set(examples) <= set(arguments)
     for node, table in TABLES.items():
@@ -152,12 +152,18 @@ def test_every_parameter_is_an_argument_and_reaches_its_node_with_its_type(gener
     nodes = {
         node.executable: settings(node) for node in launch(generate, "uwb.launch.py", **said, **examples)
     }
-    # launch_ros reads a text as YAML: an address of digits alone has to stay a text.
-    assert yaml.safe_load(nodes["driver"]["radio.address"]) == "1234"
+    # launch_ros reads a text as YAML: a path that looks like a number has to stay a text.
+    assert yaml.safe_load(nodes["driver"]["frame_id"]) == "1234"
     expected = {
-        "driver": {"offsets": 0.25, "rate": 2.0, "radio.pan": 7, "port": "usb:2341:805a"},
+        "driver": {
+            "radio.address": 34,
+            "offsets": 0.25,
+            "rate": 2.0,
+            "radio.pan": 7,
+            "port": "usb:2341:805a",
+        },
         "mitigator": {"offsets": 0.25},
-        "locator": {"level": True, "height": 1.0, "publish_tf": True, "rate": 20.0, "area": "0,0,0,9,9,3"},
+        "locator": {"level": True, "height": 0.1, "publish_tf": True, "rate": 20.0, "area": "0,0,0,9,9,3"},
         "viewer": {"port": 8080},
     }
     for node, values in expected.items():
@@ -177,6 +183,7 @@ def test_every_parameter_is_an_argument_and_reaches_its_node_with_its_type(gener
         ({"source": "simulated", "sensor_ranges": "maybe"}, "sensor_ranges = 'maybe'"),
         ({"source": "simulated", "simulated_rate": "-1"}, "simulated_rate = -1"),
         ({"source": "simulated", "height": "1.0"}, "height:=1.0.*locate:=true"),
+        ({"source": "simulated", "frame_id": "12e4"}, "12e4 is read as a number"),
         ({"source": "serial"}, "serial without a port"),
         ({"source": "decaranging"}, "decaranging without a path"),
     ],

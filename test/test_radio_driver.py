@@ -19,7 +19,7 @@ from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 from benchmarks.dw1000_model.boards import Line, ModelledAir
 from benchmarks.dw1000_model.evb1000 import EmulatedEvb1000s
 from benchmarks.dw1000_model.links import Link
-from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.errors import ParameterError, format_id
 from uwb_mitigation.link.emulated_board import EmulatedBoard
 from uwb_mitigation.link.layout import Role
 from uwb_mitigation.link.radio import RadioSettings
@@ -93,12 +93,23 @@ def test_settings_are_applied_and_refused_live(
         ("radio.data_rate", 111, "rate"),
         ("radio.anchors", "12,xyz", "radio.anchors"),
         ("radio.address", "0", "radio.address"),
+        ("radio.address", "12e4", "radio.address"),
+        ("radio.address", "1122334455667788", "radio.address"),
         ("radio.preamble_code", 3, "preamble_code"),
     ],
 )
 def test_what_no_radio_has_is_refused_by_name(name: str, value: object, named: str):
     with pytest.raises(ParameterError, match=named):
         settings_of(lambda key: value if key == name else DEFAULTS[key])
+
+
+@pytest.mark.parametrize("address", [34, 0xDECA010203040506])
+def test_an_address_is_read_as_it_is_printed(address: int):
+    values = DEFAULTS | {"radio.address": format_id(address), "radio.anchors": f"7, {format_id(address)}"}
+    settings = settings_of(values.__getitem__)
+    assert (settings.address, settings.anchors) == (address, (7, address))
+    if address < 1 << 16:
+        assert settings_of((values | {"radio.address": address}).__getitem__).address == address
 
 
 def test_parameters_that_nobody_set_ask_nothing_of_a_boards_radio():

@@ -11,7 +11,6 @@ import psutil
 import pytest
 import ros_harness
 from browser import Browser
-from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from lifecycle_msgs.msg import Transition
 from uwb_mitigation_msgs.msg import RangeCorrected
@@ -63,17 +62,6 @@ def test_the_page_shows_what_is_published(ros: ros_harness.Ros, browser: Browser
     browser.wait("a CIR", lambda: len(column("cir", "magnitude")) > 100)
     browser.wait("diagnostics", lambda: browser.cell("mitigator: ranges"))
     assert browser.run("return document.title").startswith("UWB ranges")
-    browser.open(found[1] + "parameters")
-    browser.wait(
-        "their parameters", lambda: "simulated_rate" in browser.run("return document.body.innerText")
-    )
-    for _ in range(3):
-        browser.open(found[1] + "parameters")
-    ros.spin_for(0.5)
-    assert ros.node.count_clients("/mitigator/get_parameters") == 1, "looking again takes nothing more"
-    ros.spin_until(lambda: ros.node.count_subscribers("/uwb/range_raw") == 1)
-    browser.open(found[1])
-    browser.wait("ranges again", lambda: len(column("pairs", "range")) >= 2)
     browser.run("window.before = true")
     viewer.signal(signal.SIGKILL)
     ros.start("viewer", f"port:={found[1].rsplit(':')[-1].strip('/')}")
@@ -125,33 +113,6 @@ def test_it_shows_anchors_to_others_where_there_is_no_locator(ros: ros_harness.R
     )
 
 
-def test_ranges_that_come_too_fast_are_passed_over_and_counted(ros: ros_harness.Ros):
-    corrected = ros.node.create_publisher(RangeCorrected, "/uwb/range_corrected", 10)
-    said: list[str] = []
-
-    def hear(message: DiagnosticArray) -> None:
-        said.extend(status.message for status in message.status if status.name == "viewer: ranges")
-
-    ros.node.create_subscription(DiagnosticArray, "/diagnostics", hear, 10)
-    viewer = ros.start("viewer", "port:=0")
-    ros.spin_until(lambda: corrected.get_subscription_count() == 1 and bool(said))
-
-    def told() -> re.Match[str] | None:
-        """What it says of more ranges at once than it takes."""
-        os.kill(viewer.pid, signal.SIGSTOP)
-        for _ in range(300):
-            corrected.publish(RangeCorrected(anchor_id=1, tag_id=2))
-        os.kill(viewer.pid, signal.SIGCONT)
-        said.clear()
-        ros.spin_until(lambda: len(said) > 2)
-        return re.search(r"serving 0 pages; (\d+) ranges passed over", said[-1])
-
-    # Of those before the first that it hears it knows nothing.
-    found = told() or told() or told()
-    assert found is not None, said
-    assert int(found[1]) >= 100
-
-
 def test_tags_of_their_own_are_found_whatever_the_names_around_are(ros: ros_harness.Ros):
     viewer = ros.start(
         "viewer", "port:=0", arguments=("-r", "__ns:=/uwb", "-r", "/uwb/uwb/pose:=/robot/pose")
@@ -189,7 +150,7 @@ def test_a_viewer_that_is_put_away_looks_at_nothing_and_begins_anew(ros: ros_har
     publish(20)
     ros.spin_for(0.5)
     said = ros.diagnosis("viewer", lambda status: status.message.startswith("serving"))
-    assert said.message == "serving 0 pages", "what came while it was put away was not passed over"
+    assert said.message == "serving 0 pages"
 
 
 def test_an_anchors_file_that_is_none_is_named(ros: ros_harness.Ros, tmp_path: Path):

@@ -7,6 +7,7 @@ that a caller can act on them. No other module defines exceptions.
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable
 
 
@@ -102,3 +103,15 @@ def not_installed(package: str) -> MissingDependencyError:
 def format_id(number: int) -> str:
     """Return an id of a tag, anchor or board as text: small numbers in decimal, others as `0x` and 16 hex digits."""
     return str(number) if number < 1 << 16 else f"0x{number:016x}"
+
+
+def parse_id(text: str) -> int:
+    """Return the id of a text as `format_id` writes it; raise ValueError for any other text.
+
+    A larger decimal number is refused: it is rather an address in hexadecimal digits without `0x`.
+    """
+    if re.fullmatch(r"0[xX][0-9a-fA-F]{1,16}", text):
+        return int(text, 16)
+    if re.fullmatch(r"[0-9]{1,5}", text) and int(text) < 1 << 16:
+        return int(text)
+    raise ValueError(f"not an id: {text}")

@@ -12,7 +12,7 @@ import typer
 
 from uwb_mitigation.commands import console, firmware
 from uwb_mitigation.commands.console import JsonOption, Table
-from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.errors import ParameterError, parse_id
 from uwb_mitigation.files import write_whole
 
 if TYPE_CHECKING:
@@ -150,7 +150,10 @@ def antenna_delay(
     reset: Annotated[str, typer.Option(help="The chip's reset line, as gpiochip0:25 (spi).")] = "",
     anchor: Annotated[
         str | None,
-        typer.Option(metavar="ADDRESS", help="Of the anchor, in hexadecimal, where several answer."),
+        typer.Option(
+            metavar="ADDRESS",
+            help="Address of the anchor if several answer, as the tools print it: 34 or 0xdeca010203040506.",
+        ),
     ] = None,
     exchanges: Annotated[int, typer.Option(min=20, max=100_000, help="Ranges to measure.")] = 200,
     channel: Annotated[int, typer.Option(help="1 to 5, or 7: a delay holds for one channel and PRF.")] = 5,
@@ -213,9 +216,11 @@ def _settings(
     from uwb_mitigation.link.radio import RadioSettings
 
     try:
-        anchors = () if anchor is None else (int(anchor, 16),)
+        anchors = () if anchor is None else (parse_id(anchor),)
     except ValueError:
-        raise ParameterError(f"--anchor {anchor:.40}", valid="up to sixteen hexadecimal digits") from None
+        raise ParameterError(
+            f"--anchor {anchor:.40}", valid="a number below 65536, or 0x and up to 16 hexadecimal digits"
+        ) from None
     settings = RadioSettings(
         channel=channel,
         prf_mhz=prf,

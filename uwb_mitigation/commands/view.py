@@ -28,15 +28,21 @@ def view(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Where the anchors are; without it, BAG's own X.anchors.yaml, else what BAG says of them.",
+            help="Anchors file. Default: X.anchors.yaml next to BAG, else the markers in BAG.",
         ),
     ] = None,
     model: ModelOption = None,
     namespace: Annotated[
-        str | None, typer.Option(help="Of the ranges, as /board1; needed only where BAG has several.")
+        str | None, typer.Option(help="Namespace of the ranges, such as /board1, if BAG has several.")
     ] = None,
-    host: Annotated[str, typer.Option(help="Address to serve at; 0.0.0.0 = every one.")] = "localhost",
+    host: Annotated[
+        str, typer.Option(help="Address to serve at; 0.0.0.0 = every address of this machine.")
+    ] = "localhost",
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 = a free one.")] = 5006,
+    origins: Annotated[
+        list[str] | None,
+        typer.Option(metavar="HOST:PORT", help="Further address of the page, for a proxy or a host name."),
+    ] = None,
     browser: Annotated[bool, typer.Option("--browser", help="Open the page in the browser.")] = False,
 ) -> None:
     """Look at a recording in the browser: map, ranges, CIRs.
@@ -64,11 +70,9 @@ def view(
     if anchors is not None or own.is_file():
         feed.anchors(load_anchors(anchors or own))
     if player.corrects:
-        console.err.print(
-            "The bag holds raw ranges alone: they are corrected as they are shown.", style="yellow"
-        )
+        console.err.print("The bag contains raw ranges only: they are corrected for display.", style="yellow")
     shown = View(scene, lock, title=bag.resolve().name, player=player, missing=player.missing)
-    with ViewerServer(shown, host, port) as server:
+    with ViewerServer(shown, host, port, tuple(origins or ())) as server:
         console.out.print(f"{server.url} shows {bag}; Ctrl-C ends it.", markup=False, soft_wrap=True)
         player.play(True)
         if browser:

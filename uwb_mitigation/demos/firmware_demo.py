@@ -8,6 +8,7 @@ from __future__ import annotations
 import itertools
 import threading
 import time
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,21 +20,22 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rich.console import Console
 from uwb_mitigation_msgs.msg import RangeCorrected
 
+from uwb_mitigation.demos.base import Nodes, run_demo
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.firmware_export.emulated_firmware import EmulatedFirmware
 from uwb_mitigation.link import messages as wire
-from uwb_mitigation.measurement import CorrectedRange, Origin, RangeMeasurement, Status
+from uwb_mitigation.measurement import CorrectedRange, Origin, RangeMeasurement
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.shipped import default_model_path
-from uwb_mitigation.nodes import processes, topics
+from uwb_mitigation.nodes import topics
 from uwb_mitigation.nodes.processes import Probe, watching
 from uwb_mitigation.sources.opening import open_recording
 from uwb_mitigation.sources.simulated import SimulatedSource
 
 READY_TIMEOUT_S = 60.0
-PATIENCE_S = 60.0
-"""Without a corrected range for so long, the rest counts as lost."""
+TIMEOUT_S = 60.0
+"""After this time without a corrected range, the rest counts as lost."""
 
 
 class BoardListener:
@@ -91,7 +93,7 @@ def play(
             board.measure(measurement)
             show()
         seen, since = -1, time.monotonic()
-        while len(listener.corrected) < len(measured) and time.monotonic() - since < PATIENCE_S:
+        while len(listener.corrected) < len(measured) and time.monotonic() - since < TIMEOUT_S:
             if len(listener.corrected) != seen:
                 seen, since = len(listener.corrected), time.monotonic()
                 show()
@@ -103,8 +105,8 @@ def summarise(
     host: Mitigation,
     measured: Sequence[RangeMeasurement],
     received: Sequence[RangeCorrected],
-) -> int:
-    """Say what came back. Returns the exit code: 0 if everything did, equal to the bit."""
+) -> list[str]:
+    """Print what came back; return the failures: ranges that are lost, doubled or not equal to the bit."""
     expected = host.correct(measured)
     arrived = {message.sequence: message for message in received}
     different = sum(
@@ -113,34 +115,27 @@ def summarise(
         if sequence in arrived
     )
     lost = len(measured) - len(arrived)
-    statuses = ", ".join(
-        f"{count} {status.name}"
-        for status in Status
-        if (count := sum(result.status is status for result in expected))
-    )
+    counts = Counter(result.status.name for result in expected)
+    statuses = ", ".join(f"{count} {name}" for name, count in counts.items())
     console.print(f"{len(measured)} ranges measured, {len(arrived)} corrected by the board, {lost} lost")
     console.print(
         f"{len(arrived) - different} equal to the host's to the bit, {different} different ({statuses})"
     )
-    return 1 if lost or different or len(received) != len(arrived) else 0
+    good = not lost and not different and len(received) == len(arrived)
+    return [] if good else ["board and host differ"]
 
 
-def run(console: Console, measured: Sequence[RangeMeasurement]) -> int:
-    """Start board and driver, play, compare. Returns the exit code."""
+def run(console: Console, measured: Sequence[RangeMeasurement]) -> list[str]:
+    """Start board and driver, play, compare; return the failures."""
     bundle = load_bundle(default_model_path())
     console.print(f"building the firmware with model {bundle.name}, id {bundle.model_id:08x}")
     with EmulatedFirmware(bundle) as board, watching(Probe) as probe:
         console.print(f"emulated Cortex-M4 on {board.port}")
         listener = BoardListener(probe)
-        driver = processes.start("driver", "source:=serial", f"port:={board.port}", "mode:=device")
-        try:
+        with Nodes() as nodes:
+            nodes.start("driver", "source:=serial", f"port:={board.port}", "mode:=device")
             play(board, listener, measured, console)
-        finally:
-            (code,) = processes.stop(driver)
-    failed = summarise(console, Mitigation(bundle), measured, listener.corrected)
-    if code:
-        console.print(f"driver ended with exit code {code}", style="red")
-    return failed or int(bool(code))
+    return nodes.failures + summarise(console, Mitigation(bundle), measured, listener.corrected)
 
 
 def firmware_demo(
@@ -151,16 +146,7 @@ def firmware_demo(
     count: Annotated[int, typer.Option(min=1, max=100_000, help="Ranges to measure, at most.")] = 200,
 ) -> None:
     """Run the firmware in an emulator as a board of the driver, and compare its ranges with the host's."""
-    processes.isolate()
-    console = Console()
-    try:
-        code = run(console, numbered(recording, count))
-    except UwbMitigationError as error:
-        console.print(f"firmware-demo: {error}", style="red", markup=False)
-        code = 1
-    except KeyboardInterrupt:
-        code = 130
-    raise typer.Exit(code)
+    run_demo("firmware-demo", lambda console: run(console, numbered(recording, count)))
 
 
 def main() -> None:

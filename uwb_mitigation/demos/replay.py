@@ -5,7 +5,6 @@ python -m uwb_mitigation.entry demo [--recording PATH] [--rate FACTOR]
 
 from __future__ import annotations
 
-import subprocess
 import tempfile
 import time
 from dataclasses import dataclass
@@ -16,11 +15,12 @@ import typer
 from rich.console import Console
 from rich.live import Live
 
+from uwb_mitigation.demos.base import Nodes, run_demo
 from uwb_mitigation.demos.positions import Positions
 from uwb_mitigation.errors import DatasetError, UwbMitigationError
-from uwb_mitigation.nodes import processes, topics
+from uwb_mitigation.nodes import topics
 from uwb_mitigation.nodes.monitor import REFRESH_HZ, Monitor, live_table, summary
-from uwb_mitigation.nodes.processes import wait, watching
+from uwb_mitigation.nodes.processes import watching
 from uwb_mitigation.positioning.anchors import AnchorMap, dump_anchors
 from uwb_mitigation.sources.simulated import SimulatedSource
 from uwb_mitigation.sources.source import Source
@@ -34,8 +34,7 @@ SETTLE_S = 3.0
 
 @dataclass(frozen=True, slots=True)
 class Programme:
-    """What is to be played: the driver's parameters, what a person should know of it, its anchors and the boards'
-    offset if known."""
+    """What is played: title, the driver's parameters, the anchors and the boards' offset if known."""
 
     title: str
     parameters: tuple[str, ...]
@@ -61,8 +60,7 @@ def simulated(rate: float) -> Programme:
 
 
 def offset_of(source: Source) -> tuple[float | None, str]:
-    """What the boards' antenna delays add, from the true distances in line of sight, as `uwb-mitigation offset` has it,
-    and a word of it; None where nothing tells."""
+    """Return the boards' offset from true distances in line of sight and a text about it; None if it is unknown."""
     from uwb_mitigation.evaluation.radio_offsets import find_offset
     from uwb_mitigation.mitigation import Mitigation
     from uwb_mitigation.model.bundle import load_bundle
@@ -72,11 +70,11 @@ def offset_of(source: Source) -> tuple[float | None, str]:
         found = find_offset(Mitigation(load_bundle(default_model_path())), source)
     except DatasetError:
         return None, ""
-    return found.offset_m, f", {found.offset_m:.2f} m of antenna delays taken off"
+    return found.offset_m, f", {found.offset_m:.2f} m of antenna delays subtracted"
 
 
 def recorded(path: Path, rate: float) -> Programme:
-    """Read the recording once, so that it fits into about a quarter of a minute unless told otherwise."""
+    """Return the programme of a recording; its default rate lets it take about 15 s."""
     from uwb_mitigation.sources.mcap import McapRecording
     from uwb_mitigation.sources.opening import open_recording
 
@@ -100,64 +98,47 @@ def recorded(path: Path, rate: float) -> Programme:
     )
 
 
-def watch(programme: Programme, console: Console) -> int:
-    """Run the nodes and show what they say. Returns the exit code."""
+def watch(programme: Programme, console: Console) -> list[str]:
+    """Run the nodes and show their ranges; return the failures."""
     with watching(Monitor) as monitor, tempfile.TemporaryDirectory() as folder:
-        offsets = () if programme.offset_m is None else (f"offsets:={programme.offset_m:.4f}",)
-        nodes = {"mitigator": processes.start("mitigator", *offsets)}
+        tally = monitor.tally
         positions: Positions | None = None
-        try:
+        raw, corrected, anchors = (
+            monitor.resolve_topic_name(name)
+            for name in (topics.RANGE_RAW, topics.RANGE_CORRECTED, topics.ANCHORS)
+        )
+        with Nodes() as nodes:
+            offsets = () if programme.offset_m is None else (f"offsets:={programme.offset_m:.4f}",)
+            nodes.start("mitigator", *offsets)
             if programme.anchors is not None:
                 positions = Positions(monitor, programme.anchors)
                 file = Path(folder) / "anchors.yaml"
                 file.write_text(dump_anchors(programme.anchors), encoding="utf-8")
-                nodes["locator"] = processes.start("locator", f"anchors:={file}", "level:=true", "rate:=0.0")
-                pose = monitor.resolve_topic_name(topics.ANCHORS)
-                wait(
-                    lambda: monitor.count_publishers(pose) > 0,
-                    "the locator did not come up",
-                    [nodes["locator"]],
+                nodes.start("locator", f"anchors:={file}", "level:=true", "rate:=0.0")
+                nodes.wait(
+                    lambda: monitor.count_publishers(anchors) > 0, "the locator did not start: see above"
                 )
-            wait_for_mitigator(monitor, nodes["mitigator"])
-            # Both the mitigator and this process are to receive the first range too.
-            nodes["driver"] = processes.start("driver", *programme.parameters, "wait_for_subscribers:=2")
+            nodes.wait(
+                lambda: monitor.count_publishers(corrected) > 0 and monitor.count_subscribers(raw) > 1,
+                "the mitigator did not start: see above",
+            )
+            # The mitigator and this process shall receive the first range.
+            nodes.start("driver", *programme.parameters, "wait_for_subscribers:=2")
             with Live(console=console, refresh_per_second=REFRESH_HZ) as live:
-                while all(node.poll() is None for node in nodes.values()):
-                    live.update(live_table(monitor.tally, programme.title))
+                while nodes.running:
+                    live.update(live_table(tally, programme.title))
                     time.sleep(1 / REFRESH_HZ)
-                # What the mitigator has in hand still arrives after the driver is gone.
+                # The last corrected ranges may arrive after the end of the driver.
                 settled = time.monotonic() + SETTLE_S
-                while monitor.tally.missing and time.monotonic() < settled:
+                while tally.missing and time.monotonic() < settled:
                     time.sleep(0.05)
-                live.update(live_table(monitor.tally, programme.title))
-        finally:
-            codes = processes.stop(*nodes.values())
-        console.print(summary(monitor.tally))
-        table = positions.table() if positions is not None else None
-        if table is not None:
+                live.update(live_table(tally, programme.title))
+        console.print(summary(tally))
+        if positions is not None and (table := positions.table()) is not None:
             console.print(table)
-        failed = [
-            f"{name} ended with exit code {code}" for name, code in zip(nodes, codes, strict=True) if code
-        ]
-        if monitor.tally.missing or not monitor.tally.corrected:
-            failed.append(f"{monitor.tally.corrected} of {monitor.tally.raw} ranges came back corrected")
-    for failure in failed:
-        console.print(failure, style="red")
-    return 1 if failed else 0
-
-
-def wait_for_mitigator(monitor: Monitor, mitigator: subprocess.Popen[bytes]) -> None:
-    """Wait until the mitigator is connected both ways.
-
-    Raises:
-        UwbMitigationError: it ended, or did not come up in time.
-    """
-    raw, corrected = (monitor.resolve_topic_name(name) for name in (topics.RANGE_RAW, topics.RANGE_CORRECTED))
-    wait(
-        lambda: monitor.count_publishers(corrected) > 0 and monitor.count_subscribers(raw) > 1,
-        "the mitigator did not come up: see its message above",
-        [mitigator],
-    )
+    if tally.missing or not tally.corrected:
+        nodes.failures.append(f"{tally.corrected} of {tally.raw} ranges came back corrected")
+    return nodes.failures
 
 
 def demo(
@@ -169,18 +150,11 @@ def demo(
         float, typer.Option(min=0.0, max=10_000.0, help="Speed of the replay; 0 = about 15 s in all.")
     ] = 0.0,
 ) -> None:
-    """Replay a recording through driver and mitigator, show it live, and sum it up."""
-    processes.isolate()
-    console = Console()
-    try:
-        programme = simulated(rate) if recording is None else recorded(recording, rate)
-        code = watch(programme, console)
-    except UwbMitigationError as error:
-        console.print(f"demo: {error}", style="red", markup=False)
-        code = 1
-    except KeyboardInterrupt:
-        code = 130
-    raise typer.Exit(code)
+    """Replay a recording through driver and mitigator, show it live, and print a summary."""
+    run_demo(
+        "demo",
+        lambda console: watch(simulated(rate) if recording is None else recorded(recording, rate), console),
+    )
 
 
 def main() -> None:

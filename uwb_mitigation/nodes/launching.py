@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 import functools
 import json
+import re
 import shutil
 import sys
 import tempfile
@@ -21,6 +22,9 @@ LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
 
 _WILDCARDS = ("*", "**", "/*", "/**")
 """Sections of a parameter file that are for every node."""
+
+_FLOAT = re.compile(r"[-+]?(\.\d+|\d+\.\d*|\d+(\.\d*)?[eE][-+]?\d+|\.\d+[eE][-+]?\d+)")
+"""Numbers of YAML 1.2 with a point or an exponent; PyYAML reads YAML 1.1, in which 1e-1 is a text."""
 
 _LAUNCH_FILES = (".launch.py", ".launch.xml", ".launch.yaml", ".launch.yml")
 _OWN = ("uwb.launch.py", "boards.launch.py")
@@ -95,7 +99,7 @@ def value_of(row: Parameter, text: str) -> Value:
     """Return the value of a parameter from the text of an argument.
 
     Raises:
-        ParameterError: the text is no valid value.
+        ParameterError: the text is not a valid value.
     """
     value: Any = text
     if row.or_number or not isinstance(row.default, str):
@@ -107,12 +111,24 @@ def value_of(row: Parameter, text: str) -> Value:
 
 
 def for_launch(value: Value) -> Value:
-    """Return the value as launch_ros has to get it: it reads a text as YAML, so a text such as 1234 needs quotes."""
-    return json.dumps(value) if isinstance(value, str) and _read(value) != value else value
+    """Return the value for launch_ros, which reads a text as YAML: a text such as 1234 needs quotes.
+
+    Raises:
+        ParameterError: a text such as 12e4, which ROS reads as a number although launch_ros does not quote it.
+    """
+    if not isinstance(value, str) or _read(value) == value:
+        return value
+    if yaml.safe_load(value) == value:
+        raise ParameterError(
+            f"text {value} is read as a number by ROS", valid="another notation, such as 0x12e4"
+        )
+    return json.dumps(value)
 
 
 def _read(text: str) -> Any:
-    """Return the value of a text in YAML; None where it is not YAML."""
+    """Return the value of a text in YAML, with the numbers of YAML 1.2 such as 1e-1; None if it is not YAML."""
+    if _FLOAT.fullmatch(text):
+        return float(text)
     try:
         return yaml.safe_load(text)
     except yaml.YAMLError:

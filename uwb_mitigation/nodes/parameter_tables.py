@@ -129,8 +129,8 @@ DRIVER = (
               "by another model are withheld. Empty = any (serial)."),
     Parameter("radio.role", "tag", "What the first radio is: a tag, which ranges with anchors, or an anchor, which "
               "answers (serial, evb1000, spi).", choices=("tag", "anchor"), live=True),
-    Parameter("radio.address", "", "Its address, up to sixteen hexadecimal digits; empty = the chip's own "
-              "(serial, evb1000, spi).", live=True),
+    Parameter("radio.address", "", "Its address, such as 34 or '0xdeca010203040506'; empty = the chip's own "
+              "(serial, evb1000, spi).", live=True, or_number=True),
     Parameter("radio.pan", 0x5542, "Network; frames of others are refused (serial, evb1000, spi).",
               low=0, high=0xFFFE, live=True),
     Parameter("radio.channel", 5, "UWB channel: 1 to 5, or 7 (serial, evb1000, spi).", low=1, high=7, live=True),
@@ -152,7 +152,7 @@ DRIVER = (
     Parameter("radio.window", 157, "Samples of the CIR that come with a range; 1016 = all (serial, evb1000, spi).",
               low=0, high=1016, live=True),
     Parameter("radio.anchors", "", "Addresses that a tag polls in turn, with commas between; empty = those that it "
-              "finds (serial, evb1000, spi).", live=True),
+              "finds (serial, evb1000, spi).", live=True, or_number=True),
     Parameter("radio.rate", 0.0, "Exchanges a second at most; 0 = as fast as they go (serial, evb1000, spi).",
               low=0.0, high=1000.0, live=True, unit="Hz"),
     Parameter("radio.report", False, "An anchor gives its ranges here too (serial, evb1000, spi).", live=True),

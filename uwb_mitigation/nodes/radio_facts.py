@@ -22,7 +22,7 @@ def told(settings: RadioSettings) -> str:
     """In a line of the log."""
     return (
         f"{settings.role.name.lower()}, channel {settings.channel}, {settings.rate_kbps} kbit/s, preamble "
-        f"{settings.preamble}, PAN {settings.pan:04x}"
+        f"{settings.preamble}, PAN 0x{settings.pan:04x}"
     )
 
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from typing import Any
 
-from uwb_mitigation.errors import ParameterError, format_id
+from uwb_mitigation.errors import ParameterError, format_id, parse_id
 from uwb_mitigation.link.layout import Role
 from uwb_mitigation.link.messages import Radio
 from uwb_mitigation.link.radio import RadioSettings
@@ -37,7 +38,7 @@ def settings_of(value: Callable[[str], Any]) -> RadioSettings:
 
     settings = RadioSettings(
         role=Role[of("role").upper()],
-        address=_address(of("address"), PREFIX + "address") if of("address") else 0,
+        address=_address(str(of("address")), PREFIX + "address") if of("address") != "" else 0,
         pan=of("pan"),
         channel=of("channel"),
         prf_mhz=int(of("prf")),
@@ -49,7 +50,9 @@ def settings_of(value: Callable[[str], Any]) -> RadioSettings:
         antenna_delay=of("antenna_delay"),
         window=of("window"),
         anchors=tuple(
-            _address(part.strip(), PREFIX + "anchors") for part in of("anchors").split(",") if part.strip()
+            _address(part.strip(), PREFIX + "anchors")
+            for part in str(of("anchors")).split(",")
+            if part.strip()
         ),
         interval_us=round(1e6 / of("rate")) if of("rate") else 0,
         report=of("report"),
@@ -154,11 +157,11 @@ class RadioFeed(LiveFeed):
 
 
 def _address(text: str, name: str) -> int:
-    """Raise ParameterError unless `text` is an address of up to sixteen hexadecimal digits, other than 0."""
-    try:
-        address = int(text, 16)
-    except ValueError:
-        address = 0
-    if not 0 < address < 2**64 - 1:
-        raise ParameterError(f"parameter {name} = {text!r:.40}", valid="up to sixteen hexadecimal digits")
-    return address
+    """Return an address; raise ParameterError if the text is none."""
+    with contextlib.suppress(ValueError):
+        if 0 < (address := parse_id(text)) < 2**64 - 1:
+            return address
+    raise ParameterError(
+        f"parameter {name} = {text!r:.40}",
+        valid="a number below 65536, or 0x and up to 16 hexadecimal digits in quotes",
+    )
