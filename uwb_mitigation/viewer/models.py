@@ -31,8 +31,22 @@ RAW, CORRECTED, TRUE, SMOOTHED = "#94a3b8", "#2563eb", "#111827", "#0f766e"
 _MARK, _WINDOW = "#b91c1c", "#fde68a"
 
 
-STACKED = "stacked"
-"""Name of the columns for a narrow box: the page shows these or the others."""
+COLUMNS = (
+    ("anchor", "anchor", 64, "text", None),
+    ("tag", "tag", 64, "text", None),
+    ("rate", "Hz", 46, "1", None),
+    ("raw", "raw", 54, "3", None),
+    ("range", "corrected", 66, "3", None),
+    ("sigma", "sigma", 50, "3", None),
+    ("correction", "correction", 70, "bar", None),
+    ("status", "status", 160, "status", None),
+    ("anchor", "pair", 76, "pair", "stacked"),
+    ("range", "corrected, raw", 92, "ranges", "stacked"),
+    ("correction", "correction, \u03c3", 90, "corrections", "stacked"),
+    ("status", "status", 98, "broken", "stacked"),
+)
+"""Columns of the table: field, title, width, the function of the page's script that renders the cells, and name. The
+page shows the columns with a name if it is narrow, otherwise the others."""
 
 
 class Models:
@@ -186,19 +200,15 @@ class Models:
         return DataTable(
             source=self.pairs,
             columns=[
-                _column("anchor", "anchor", 64, "text"),
-                _column("tag", "tag", 64, "text"),
-                _column("rate", "Hz", 46, "1"),
-                _column("raw", "raw", 54, "3"),
-                _column("range", "corrected", 66, "3"),
-                _column("sigma", "sigma", 50, "3"),
-                _column("correction", "correction", 70, "bar"),
-                _column("status", "status", 160, "status"),
-                # The same columns for a narrow page.
-                _column("anchor", "pair", 76, "pair", STACKED),
-                _column("range", "corrected, raw", 92, "ranges", STACKED),
-                _column("correction", "correction, \u03c3", 90, "corrections", STACKED),
-                _column("status", "status", 98, "broken", STACKED),
+                TableColumn(
+                    field=field,
+                    title=title,
+                    width=width,
+                    formatter=HTMLTemplateFormatter(template=cell),
+                    name=name,
+                    visible=name is None,
+                )
+                for field, title, width, cell, name in COLUMNS
             ],
             index_position=None,
             sortable=False,
@@ -229,14 +239,6 @@ def _slider(seconds: float) -> Slider:
         step=0.1,
         title=f"Time in the recording, s of {seconds:.1f}",
         sizing_mode="stretch_width",
-    )
-
-
-def _column(field: str, title: str, width: int, cell: str, name: str | None = None) -> TableColumn:
-    """A column; `cell` names the function of the page's script that renders its cells."""
-    formatter = HTMLTemplateFormatter(template=cell)
-    return TableColumn(
-        field=field, title=title, width=width, formatter=formatter, name=name, visible=name is None
     )
 
 

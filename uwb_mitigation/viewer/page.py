@@ -1,14 +1,11 @@
-"""How a scene is drawn into the models of one page, and what clicks on it do.
-
-A page is one browser tab. It draws at most ten times a second, only what has changed, and slower where drawing all open
-pages would take more than its share of a core.
-"""
+"""How a scene is drawn into the models of one page, and what clicks on it do."""
 
 from __future__ import annotations
 
 import html
 import math
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path
@@ -117,11 +114,10 @@ class View:
 
 
 class Page:
-    """One open page.
+    """One open page. It draws at most ten times a second, and only what has changed.
 
     Args:
-        document: the session's, into which the page is laid out.
-        view: what it looks at.
+        document: the session's document, into which the page is laid out.
         nonce: of the scripts in the page, for its Content-Security-Policy.
     """
 
@@ -135,7 +131,7 @@ class Page:
         self._models = models = Models(None if view.player is None else view.player.seconds)
         # Before the model is in the document: later it is not subscribed.
         models.map_figure.on_event(Reset, self._on_reset)
-        # As one, or Bokeh looks for new models after each: half of what opening a page takes.
+        # At once: Bokeh searches for new models after each root, which is half of the time to open a page.
         with document.models.freeze():
             for model in models.roots.values():
                 document.add_root(model)
@@ -152,12 +148,12 @@ class Page:
             models.slider.on_change("value_throttled", self._on_slider)
         document.add_periodic_callback(self.tick, int(1000 * REFRESH_S))
         self.draw()
-        # Last: of a page that could not be opened no session tells that it is gone.
-        document.on_session_destroyed(self._gone)
+        # Last: a session that could not be opened does not report its end.
+        document.on_session_destroyed(self._on_closed)
         view.drawing.pages += 1
 
     def tick(self) -> None:
-        """Draw if it is time and nobody has paused the page."""
+        """Draw if it is time and the page is not paused."""
         now_s, player = time.monotonic(), self._view.player
         if player is not None:
             player.advance()
@@ -171,7 +167,7 @@ class Page:
         self._due_s = now_s + self._view.drawing.pause_s() - 0.5 * REFRESH_S
 
     def draw(self) -> None:
-        """Bring every model up to the scene."""
+        """Update every model from the scene."""
         self._draw_player()
         with self._view.lock:
             scene = self._view.scene
@@ -180,125 +176,122 @@ class Page:
                 return
             self._draw_pairs(scene)
             self._draw_summary(scene)
-            self._draw_notice(scene)
             self._draw_map(scene)
             history = None if self._selected is None else scene.pairs.get(self._selected)
             self._draw_strip(scene, history)
             self._draw_trace(() if history is None else tuple(history.traces))
-            self._draw_errors(scene)
             self._draw_reports(scene)
+            if self._changed("errors", scene.errors):
+                raw, corrected = scene.error_counts.astype(float)
+                left, right = ERROR_EDGES_M[:-1], ERROR_EDGES_M[1:]
+                self._models.errors.data = {"left": left, "right": right, "raw": raw, "corrected": corrected}
 
     def select(self, pair: Pair) -> None:
-        """Show another pair's CIR and strip."""
+        """Show the CIR and the strip of a pair."""
         self._selected = pair
         self.draw()
 
-    # What is shown --------------------------------------------------------------------------------------------
+    # Drawing --------------------------------------------------------------------------------------------------
 
     def _draw_player(self) -> None:
         player, slider = self._view.player, self._models.slider
         if player is None or slider is None:
             return
         if self._changed("position", position_s := min(round(player.position_s, 1), slider.end)):
-            # The page's script moves the handle to it, unless the user is dragging it.
+            # The page's script moves the handle, unless the user is dragging it.
             slider.tags = [position_s]
         if self._changed("playing", player.playing):
             self._models.pause.active = not player.playing
             self._models.pause.label = "Pause" if player.playing else "Play"
 
     def _draw_pairs(self, scene: Scene) -> None:
-        rows: dict[str, list[object]] = {column: [] for column in self._models.pairs.data}
-        self._rows = []
+        rows = []
         for pair, history, sample in scene.latest():
-            self._rows.append(pair)
             silent = _no_data(scene, history)
-            values = {
-                "anchor": format_id(pair[0]),
-                "tag": format_id(pair[1]),
-                "rate": 0.0 if silent else history.rate_hz(scene.age_s(history)),
-                "raw": sample.raw_m,
-                "range": sample.range_m,
-                "sigma": sample.sigma_m,
-                "status": silent or sample.status.name,
-                "colour": SILENT if silent else COLOURS[sample.status],
-                "row_colour": SILENT if silent else "",
-                "correction": sample.raw_m - sample.range_m,
-            }
-            for column, value in values.items():
-                rows[column].append(value)
+            rows.append(
+                {
+                    "anchor": format_id(pair[0]),
+                    "tag": format_id(pair[1]),
+                    "rate": 0.0 if silent else history.rate_hz(scene.age_s(history)),
+                    "raw": sample.raw_m,
+                    "range": sample.range_m,
+                    "sigma": sample.sigma_m,
+                    "correction": sample.raw_m - sample.range_m,
+                    "status": silent or sample.status.name,
+                    "colour": SILENT if silent else COLOURS[sample.status],
+                    "row_colour": SILENT if silent else "",
+                }
+            )
+        self._rows = [pair for pair, _, _ in scene.latest()]
         if self._selected is None and self._rows:
             self._selected = self._rows[0]
-        self._models.pairs.data = rows
+        _set_rows(self._models.pairs, rows)
         _choose(self._models.pairs, self._rows, self._selected)
 
     def _draw_summary(self, scene: Scene) -> None:
+        """Show counts, why the page is empty, and what has stopped."""
         count = len(self._rows)
         parts = [f"{count} pair{'' if count == 1 else 's'}", f"{scene.ranges} ranges"]
         if scene.not_shown:
             parts[1] += f", {scene.not_shown} of them of further pairs, which are not shown"
         if math.isfinite(scene.now_s):
-            parts.insert(0, f"{_utc(scene.now_s)}")
+            parts.insert(0, _utc(scene.now_s))
         if scene.errors:
             raw_m, corrected_m = scene.error_sums_m / scene.errors
             parts.append(f"mean absolute error {raw_m:.3f} m raw, {corrected_m:.3f} m corrected")
-        text = html.escape(" · ".join(parts))
-        if self._models.summary.text != text:
-            self._models.summary.text = text
-
-    def _draw_notice(self, scene: Scene) -> None:
-        """State why the page is empty, and what has stopped."""
         missing, lines = self._view.missing, []
         histories = [history for _, history, _ in scene.latest()]
         if not histories:
             lines.append(missing.ranges)
         elif all(_no_data(scene, history) for history in histories):
             lines.append(f"No ranges for {min(map(scene.age_s, histories)):.0f} s.")
-        if not scene.anchors:
-            lines.append(missing.anchors)
-        if not scene.tags:
-            lines.append(missing.positions)
-        text = "".join(f'<div style="{_NOTICE_STYLE}">{html.escape(line)}</div>' for line in lines if line)
-        if self._models.notice.text != text:
-            self._models.notice.text = text
+        lines += [missing.anchors] if not scene.anchors else []
+        lines += [missing.positions] if not scene.tags else []
+        notice = "".join(f'<div style="{_NOTICE_STYLE}">{html.escape(line)}</div>' for line in lines if line)
+        for div, text in (
+            (self._models.summary, html.escape(" · ".join(parts))),
+            (self._models.notice, notice),
+        ):
+            if div.text != text:
+                div.text = text
 
     def _draw_map(self, scene: Scene) -> None:
         models = self._models
         if self._changed("anchors", scene.anchors):
-            places = list(scene.anchors.items())
-            models.anchors.data = {
-                "x": [place.x for _, place in places],
-                "y": [place.y for _, place in places],
-                "name": [place.name or format_id(identity) for identity, place in places],
-                "id": [str(identity) for identity, _ in places],
-            }
+            anchors = [
+                {"x": place.x, "y": place.y, "name": place.name or format_id(identity), "id": str(identity)}
+                for identity, place in scene.anchors.items()
+            ]
+            _set_rows(models.anchors, anchors)
         _choose(models.anchors, list(scene.anchors), None if self._selected is None else self._selected[0])
-        posed = [(name, tag, tag.pose) for name, tag in scene.tags.items() if tag.pose is not None]
-        ellipses = [pose.ellipse for _, _, pose in posed]
-        silent = {
-            name: f"no data for {age_s:.0f} s"
-            for name, tag, _ in posed
-            if (age_s := scene.age_s(tag)) > NO_DATA_S
-        }
-        colours = {name: SMOOTHED if name.endswith(" smoothed") else CORRECTED for name in scene.tags}
-        models.tags.data = {
-            "x": [pose.x for _, _, pose in posed],
-            "y": [pose.y for _, _, pose in posed],
-            "name": [f"{name}: {silent[name]}" if name in silent else name for name, _, _ in posed],
-            "colour": [SILENT if name in silent else colours[name] for name, _, _ in posed],
-            "width": [_finite(_drawable(2 * larger)) for larger, _, _ in ellipses],
-            "height": [_finite(_drawable(2 * smaller)) for _, smaller, _ in ellipses],
-            "angle": [_finite(angle) for _, _, angle in ellipses],
-        }
-        models.trails.data = _lines([tag.trail for tag in scene.tags.values()]) | {
-            "colour": list(colours.values())
-        }
-        models.true_trails.data = _lines(list(scene.true_trails.values()))
+        tags, trails = [], []
+        for name, tag in scene.tags.items():
+            colour = SMOOTHED if name.endswith(" smoothed") else CORRECTED
+            trails.append(_line(tag.trail) | {"colour": colour})
+            if (pose := tag.pose) is None:
+                continue
+            silent = scene.age_s(tag) > NO_DATA_S
+            major, minor, angle = pose.ellipse
+            tags.append(
+                {
+                    "x": pose.x,
+                    "y": pose.y,
+                    "name": f"{name}: no data for {scene.age_s(tag):.0f} s" if silent else name,
+                    "colour": SILENT if silent else colour,
+                    "width": _finite(_drawable(2 * major)),
+                    "height": _finite(_drawable(2 * minor)),
+                    "angle": _finite(angle),
+                }
+            )
+        _set_rows(models.tags, tags)
+        _set_rows(models.trails, trails)
+        _set_rows(models.true_trails, [_line(trail) for trail in scene.true_trails.values()])
         fitted = bool(scene.anchors), bool(scene.anchors or scene.tags or scene.true_trails)
-        # The view is chosen for the first content and for the first anchors, and then only by the user.
+        # The view is set for the first content and for the first anchors, and then only by the user.
         if fitted > self._fitted or not models.extent.data["x"]:
             self._fitted = fitted
             self._fit(scene)
-        self._draw_ranges(scene)
+        self._draw_circles(scene)
 
     def _fit(self, scene: Scene) -> None:
         """Let the map show everything that is on it now."""
@@ -311,9 +304,9 @@ class Page:
         corners = {"x": [x.min() - room, x.max() + room], "y": [y.min() - room, y.max() + room]}
         self._models.extent.data = {name: [float(value) for value in ends] for name, ends in corners.items()}
 
-    def _draw_ranges(self, scene: Scene) -> None:
-        """Circles and rays of the chosen pair's tag: a map of all tags' would show nothing."""
-        columns: dict[str, list[object]] = {name: [] for name in self._models.circles.data}
+    def _draw_circles(self, scene: Scene) -> None:
+        """Draw circles and rays of the tag of the selected pair."""
+        rows = []
         tag_id = None if self._selected is None else self._selected[1]
         tag = None if tag_id is None else scene.tag_of(tag_id)
         pose = None if tag is None else tag.pose
@@ -328,26 +321,26 @@ class Page:
                 math.sqrt(max(_finite(_drawable(value)) ** 2 - height_m * height_m, 0.0))
                 for value in (sample.raw_m, sample.range_m)
             )
-            end = (place.x, place.y) if pose is None else (pose.x, pose.y)
-            values = (place.x, place.y, raw_m, range_m, COLOURS[sample.status], *end)
-            for column, value in zip(columns.values(), values, strict=True):
-                column.append(value)
-        self._models.circles.data = columns
+            x1, y1 = (place.x, place.y) if pose is None else (pose.x, pose.y)
+            row = {"x": place.x, "y": place.y, "raw": raw_m, "range": range_m, "x1": x1, "y1": y1}
+            rows.append(row | {"colour": COLOURS[sample.status]})
+        _set_rows(self._models.circles, rows)
 
     def _draw_strip(self, scene: Scene, history: History | None) -> None:
-        # Of a silent pair too: its ranges grow older.
+        # Also for a pair without new data: its ranges grow older.
         if not self._changed("strip", (self._selected, scene.now_s, scene.ranges)):
             return
         now_s = scene.now_s
         kept = () if history is None else tuple(history.samples)
         samples = [sample for sample in kept if sample.time_s >= now_s - STRIP_S]
         self._models.show_empty("strip", all(math.isnan(_drawable(sample.raw_m)) for sample in samples))
-        self._models.strip.data = {
-            "age": np.array([sample.time_s - now_s for sample in samples], np.float32),
-            "raw": np.array([_drawable(sample.raw_m) for sample in samples], np.float32),
-            "range": np.array([_drawable(sample.range_m) for sample in samples], np.float32),
-            "true": np.array([_drawable(sample.true_m) for sample in samples], np.float32),
+        values = {
+            "age": [sample.time_s - now_s for sample in samples],
+            "raw": [_drawable(sample.raw_m) for sample in samples],
+            "range": [_drawable(sample.range_m) for sample in samples],
+            "true": [_drawable(sample.true_m) for sample in samples],
         }
+        self._models.strip.data = {name: np.array(column, np.float32) for name, column in values.items()}
         title = "no pair chosen"
         if self._selected is not None:
             title = f"anchor {format_id(self._selected[0])}, tag {format_id(self._selected[1])}"
@@ -356,41 +349,33 @@ class Page:
 
     def _draw_trace(self, traces: tuple[Trace, ...]) -> None:
         models = self._models
-        # By which is the newest: stamps may be alike.
+        # The newest trace, not its stamp: stamps may be equal.
         if not self._changed("traces", (self._selected, traces[-1] if traces else None)):
             return
         models.show_empty("cir", not traces)
         models.waterfall.data = {"image": [_waterfall_image(traces)]}
         if not traces:
-            models.trace.data = {name: [] for name in models.trace.data}
-            models.marks.data = {name: [] for name in models.marks.data}
+            _set_rows(models.trace, [])
+            _set_rows(models.marks, [])
             return
         trace = traces[-1]
         cir, magnitude = trace.cir, trace.magnitude
         sample = np.arange(len(magnitude)) + (cir.start_index - trace.origin)
         shown = (sample >= -TRACE_BEFORE) & (sample < TRACE_AFTER)
         models.trace.data = {"sample": sample[shown].astype(np.float32), "magnitude": magnitude[shown]}
-        models.marks.data = {
-            "noise": [float(cir.noise_threshold)],
-            "first": [_finite(cir.first_path_index - trace.origin)],
-            "top": [1.05 * float(magnitude[shown].max()) if shown.any() else 1.0],
-            "from": [-float(WINDOW_LEAD)],
-            "to": [float(self._view.window - WINDOW_LEAD)],
+        marks = {
+            "noise": float(cir.noise_threshold),
+            "first": _finite(cir.first_path_index - trace.origin),
+            "top": 1.05 * float(magnitude[shown].max()) if shown.any() else 1.0,
+            "from": -float(WINDOW_LEAD),
+            "to": float(self._view.window - WINDOW_LEAD),
         }
-
-    def _draw_errors(self, scene: Scene) -> None:
-        if self._changed("errors", scene.errors):
-            self._models.errors.data = {
-                "left": ERROR_EDGES_M[:-1],
-                "right": ERROR_EDGES_M[1:],
-                "raw": scene.error_counts[0].astype(float),
-                "corrected": scene.error_counts[1].astype(float),
-            }
+        _set_rows(models.marks, [marks])
 
     def _draw_reports(self, scene: Scene) -> None:
         rows = [(name, report.at(scene.clock())) for name, report in sorted(scene.reports.items())]
         if self._changed("reports", rows):
-            # Words of messages, which may hold anything: nothing else on the page is made of such.
+            # Texts of messages may contain anything; nothing else on the page is made of them.
             cells = [
                 f"<tr><td>{html.escape(name)}</td>"
                 f"<td>{_level(report.level)}</td><td>{html.escape(report.message)}</td></tr>"
@@ -406,22 +391,22 @@ class Page:
         self._drawn[name] = value
         return True
 
-    # What is clicked ------------------------------------------------------------------------------------------
+    # Events ---------------------------------------------------------------------------------------------------
 
     def _on_row(self, _attribute: str, _old: object, new: list[int]) -> None:
         if new and new[0] < len(self._rows) and self._rows[new[0]] != self._selected:
             self.select(self._rows[new[0]])
 
     def _on_anchor(self, _attribute: str, _old: object, new: list[int]) -> None:
-        """A click on an anchor chooses its pair with the tag that is shown, else its first."""
+        """Select the pair of a clicked anchor with the tag that is shown, else its first pair."""
         source, selected = self._models.anchors, self._selected
-        places = [int(identity) for identity in source.data["id"]]
-        anchor = places[new[0]] if new and new[0] < len(places) else None
+        anchors = [int(identity) for identity in source.data["id"]]
+        anchor = anchors[new[0]] if new and new[0] < len(anchors) else None
         pairs = [pair for pair in self._rows if pair[0] == anchor]
         if pairs and selected not in pairs:
             self.select(next((pair for pair in pairs if selected and pair[1] == selected[1]), pairs[0]))
         else:
-            _choose(source, places, None if selected is None else selected[0])
+            _choose(source, anchors, None if selected is None else selected[0])
 
     def _on_reset(self, _event: Reset) -> None:
         with self._view.lock:
@@ -440,7 +425,7 @@ class Page:
             self._view.player.seek(new)
             self.draw()
 
-    def _gone(self, _context: Any) -> None:
+    def _on_closed(self, _context: Any) -> None:
         self._view.drawing.pages -= 1
 
 
@@ -450,41 +435,39 @@ def _no_data(scene: Scene, history: History) -> str:
     return "" if history.has_data(age_s) else f"no data for {age_s:.0f} s"
 
 
+def _set_rows(source: ColumnDataSource, rows: list[dict[str, Any]]) -> None:
+    source.data = {column: [row[column] for row in rows] for column in source.data}
+
+
 def _choose(source: ColumnDataSource, rows: list[Any], chosen: object) -> None:
-    """Mark a row of a source, or none."""
+    """Select a row of a source, or none."""
     indices = [rows.index(chosen)] if chosen in rows else []
     if source.selected.indices != indices:
         source.selected.indices = indices
 
 
 def _waterfall_image(traces: tuple[Trace, ...]) -> np.ndarray[Any, np.dtype[np.uint8]]:
-    """Each exchange a row, the newest on top, its levels over 40 dB below its own peak; uint8 (WATERFALL, width)."""
+    """Return one exchange per row, the newest on top, levels from -40 dB to its peak; uint8 (WATERFALL, width)."""
     image = blank_waterfall()
     for row, trace in enumerate(reversed(traces)):
         begin = trace.origin - TRACE_BEFORE - trace.cir.start_index
         low, high = max(begin, 0), min(begin + image.shape[1], len(trace.magnitude))
-        if low >= high:
-            continue
         part = trace.magnitude[low:high]
-        peak = float(part.max())
-        if peak > 0.0:
+        if low < high and (peak := float(part.max())) > 0.0:
             level = 1.0 + np.log10(np.maximum(part / peak, 1e-2)) / 2.0
             image[row, low - begin : high - begin] = (255.0 * level).astype(np.uint8)
     return image
 
 
 def _level(level: int) -> str:
-    """The level of a diagnostic, coloured."""
+    """Return the coloured level of a diagnostic."""
     if not 0 <= level < len(LEVELS):
         return "?"
     return f'<span style="color:{LEVEL_COLOURS[level]};font-weight:600;white-space:nowrap">{LEVELS[level]}</span>'
 
 
-def _lines(trails: list[Any]) -> dict[str, list[list[float]]]:
-    return {
-        "xs": [[x for x, _ in trail] for trail in trails],
-        "ys": [[y for _, y in trail] for trail in trails],
-    }
+def _line(trail: Iterable[tuple[float, float]]) -> dict[str, Any]:
+    return {"xs": [x for x, _ in trail], "ys": [y for _, y in trail]}
 
 
 def _utc(time_s: float) -> str:
@@ -495,7 +478,7 @@ def _utc(time_s: float) -> str:
 
 
 def _drawable(value_m: float) -> float:
-    """NaN where a length would leave no room for any other."""
+    """Return NaN for a length that would leave no room for any other."""
     return value_m if abs(value_m) < MAX_RANGE_M else math.nan
 
 
