@@ -23,8 +23,8 @@ from uwb_mitigation.errors import ParameterError, format_id
 from uwb_mitigation.link.emulated_board import EmulatedBoard
 from uwb_mitigation.link.layout import Role
 from uwb_mitigation.link.radio import RadioSettings
+from uwb_mitigation.nodes.live_feeds import settings_of
 from uwb_mitigation.nodes.parameter_tables import DRIVER
-from uwb_mitigation.nodes.radio_feed import settings_of
 from uwb_mitigation.sources.simulated import SimulatedSource
 
 pytestmark = [

@@ -17,7 +17,7 @@ from uwb_mitigation.errors import LinkError
 from uwb_mitigation.link.layout import RadioState, Role
 from uwb_mitigation.link.radio import RadioSettings, RadioStatus
 from uwb_mitigation.measurement import RangeMeasurement
-from uwb_mitigation.nodes import radio_facts
+from uwb_mitigation.nodes import live_feeds
 from uwb_mitigation.radio import structures
 from uwb_mitigation.radio.host import HostRadio, load
 
@@ -312,14 +312,14 @@ def test_a_lock_that_is_not_reported_is_a_warning(air: Air):
     assert len(run.ranges) > 10
     for status in run.statuses:
         assert status.state is RadioState.LOCK_UNCONFIRMED
-        assert radio_facts.problem(status) == ""
-        assert "PLL" in radio_facts.warning(None, status)
+        assert live_feeds.radio_problem(status) == ""
+        assert "PLL" in live_feeds.radio_warning(None, status)
 
 
 def test_a_clock_that_does_not_lock_is_an_error(air: Air):
     with pytest.raises(LinkError, match="clock"):
         Run(air, bus=NoClockBus)
-    assert radio_facts.problem(RadioStatus(state=RadioState.NO_CLOCK)) != ""
+    assert live_feeds.radio_problem(RadioStatus(state=RadioState.NO_CLOCK)) != ""
 
 
 def test_temperature_and_voltage_are_read_when_they_are_ready(air: Air):

@@ -33,12 +33,10 @@ from uwb_mitigation.link.port import BoardPort
 from uwb_mitigation.link.radio import RadioSettings
 from uwb_mitigation.measurement import Cir, RangeMeasurement, Record
 from uwb_mitigation.nodes import diagnostics, topics
-from uwb_mitigation.nodes.board_feed import BoardFeed
 from uwb_mitigation.nodes.diagnostics import Description
-from uwb_mitigation.nodes.feed import Feed
 from uwb_mitigation.nodes.lifecycle import ManagedNode
+from uwb_mitigation.nodes.live_feeds import PREFIX, BoardFeed, Feed, RadioFeed, open_radios, settings_of
 from uwb_mitigation.nodes.parameter_tables import DRIVER
-from uwb_mitigation.nodes.radio_feed import PREFIX, RADIOS, RadioFeed, open_radios, settings_of
 from uwb_mitigation.nodes.replay import ReplayFeed, ReplayOptions
 from uwb_mitigation.offsets import NO_OFFSETS, read_offsets
 from uwb_mitigation.sources.source import Source
@@ -129,9 +127,13 @@ class Driver(ManagedNode):
         self.autostart()
 
     def open(self) -> None:
-        kind = self.value("source")
-        prepare = {"serial": self._prepare_board} | dict.fromkeys(RADIOS, self._prepare_radios)
-        self._make_feed = prepare.get(kind, self._prepare_replay)()
+        # Each checks its parameters and opens what it needs, and returns the factory of its feed.
+        prepare = {
+            "serial": self._prepare_board,
+            "evb1000": self._prepare_radios,
+            "spi": self._prepare_radios,
+        }
+        self._make_feed = prepare.get(self.value("source"), self._prepare_replay)()
         self._ranges = topics.create_publisher(self, RangeCir, topics.RANGE_RAW)
 
     def begin(self) -> None:
@@ -179,13 +181,8 @@ class Driver(ManagedNode):
                 expected_model_id=board_model,
                 stamp_clock=self.now_ns,
             )
-            feed = BoardFeed(
-                port,
-                on_range=self._publish_range,
-                on_correction=self._publish_correction,
-                now_ns=self.now_ns,
-                logger=self.get_logger(),
-            )
+            log = self.get_logger()
+            feed = BoardFeed(port, self._publish_range, self._publish_correction, self.now_ns, log)
             feed.apply(["offsets"], self.value, self._offsets)
             # A board whose radio is not configured here keeps its own settings.
             if settings_of(self.value) != RadioSettings():
@@ -199,9 +196,7 @@ class Driver(ManagedNode):
 
         def make() -> RadioFeed:
             radios = open_radios(self.value, self.now_ns)
-            return RadioFeed(
-                radios, on_range=self._publish_range, now_ns=self.now_ns, logger=self.get_logger()
-            )
+            return RadioFeed(radios, self._publish_range, self.now_ns, self.get_logger())
 
         return make
 
@@ -215,6 +210,7 @@ class Driver(ManagedNode):
 
         def make() -> ReplayFeed:
             assert self._ranges is not None
+            subscribed = self._ranges.get_subscription_count
             return ReplayFeed(
                 source,
                 # A node that drives /clock must not wait for /clock.
@@ -231,9 +227,7 @@ class Driver(ManagedNode):
                     from_s=self.value("seek_to"),
                 ),
                 self.get_logger(),
-                subscribers=self._ranges.get_subscription_count
-                if self._consumer is None
-                else self._consumer.subscription_count,
+                subscribers=subscribed if self._consumer is None else self._consumer.subscription_count,
                 publish=self._publish_records,
                 on_time=self._publish_clock,
                 on_end=self._finish,
@@ -247,14 +241,10 @@ class Driver(ManagedNode):
         try:
             if any(name.startswith(PREFIX) for name in wanted):
                 settings_of(lambda name: wanted.get(name, self.value(name)))
-        except ParameterError as error:
-            return SetParametersResult(successful=False, reason=str(error))
-        try:
             if "offsets" in wanted:
                 self._prepared_offsets = read_offsets(str(wanted["offsets"]))
         except UwbMitigationError as error:
-            reason = f"parameter offsets = {wanted['offsets']!r}: {error}"
-            return SetParametersResult(successful=False, reason=reason)
+            return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     def _apply(self, changes: list[Any]) -> None:

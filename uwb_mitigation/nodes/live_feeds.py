@@ -1,0 +1,442 @@
+"""What the driver publishes from: the interface of its feeds, boards on serial links, and radios of this computer."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import asdict, fields, replace
+from typing import Any, Protocol
+
+from uwb_mitigation.errors import ParameterError, format_id, parse_id
+from uwb_mitigation.link.connection import Connection
+from uwb_mitigation.link.events import (
+    Connected,
+    Disconnected,
+    Event,
+    ModeChanged,
+    ModeRefused,
+    OffsetsRefused,
+    RadioRefused,
+    VersionMismatch,
+)
+from uwb_mitigation.link.layout import PROTOCOL_VERSION, LogLevel, Mode, RadioState, Role
+from uwb_mitigation.link.messages import BoardStatus, Correction, Log, Radio
+from uwb_mitigation.link.port import BoardPort
+from uwb_mitigation.link.radio import RadioSettings, RadioStatus
+from uwb_mitigation.measurement import RangeMeasurement
+from uwb_mitigation.nodes import diagnostics
+from uwb_mitigation.nodes.diagnostics import Description
+from uwb_mitigation.offsets import Offsets
+from uwb_mitigation.radio.bus import opener
+from uwb_mitigation.radio.port import RadioEvent, RadioLost, RadioPort
+
+Value = Callable[[str], Any]
+"""Returns the value of a parameter."""
+
+EVENT_TIMEOUT_S = 0.5
+
+PREFIX = "radio."
+"""Prefix of the parameters of radios."""
+
+_STATES = {
+    RadioState.ABSENT: "no DW1000 answers the board: check wiring and supply",
+    RadioState.BUS: "the board's SPI fails",
+    RadioState.NO_CLOCK: "the DW1000's clock PLL does not lock: check its supply",
+}
+_COUNTS = tuple(row.name for row in fields(RadioStatus) if row.type == "int")
+
+
+class Feed(Protocol):
+    """A source that is playing or connected; `stop` ends it and may be called twice."""
+
+    def start(self) -> None: ...
+
+    def stop(self) -> None: ...
+
+    def describe(self) -> Description: ...
+
+    def apply(self, changed: Collection[str], value: Value, offsets: Offsets) -> None:
+        """Use new values of the parameters `changed`."""
+
+
+class LiveFeed:
+    """Takes the events of connections, in one thread for each, and publishes their ranges.
+
+    Args:
+        ports: closed by `stop`.
+        on_range: publishes a range; called by one thread at a time.
+        now_ns: the clock of the stamps.
+        logger: with `info`, `warning` and `error`, as rclpy's.
+
+    Attributes:
+        ranges: number of ranges that were published.
+    """
+
+    def __init__(
+        self,
+        ports: Sequence[Connection[Any]],
+        on_range: Callable[[RangeMeasurement], None],
+        now_ns: Callable[[], int],
+        logger: Any,
+    ) -> None:
+        self.ranges = 0
+        self.meter = diagnostics.Meter(now_ns)
+        self._logger = logger
+        self._ports = ports
+        self._on_range = on_range
+        self._now_ns = now_ns
+        self._publishing = threading.Lock()
+        self._threads = [
+            threading.Thread(target=self._run, args=(port,), name="feed", daemon=True) for port in ports
+        ]
+
+    def start(self) -> None:
+        for thread in self._threads:
+            thread.start()
+
+    def stop(self) -> None:
+        """Close the connections and wait for the threads."""
+        for port in self._ports:
+            port.close()
+        for thread in self._threads:
+            if thread.is_alive():
+                thread.join()
+
+    def handle(self, event: Any, port: Any) -> None:
+        """Take an event that is not a range."""
+        raise NotImplementedError
+
+    def check(self, port: Any) -> None:
+        """Called after every event, and at least every `EVENT_TIMEOUT_S`."""
+
+    def _run(self, port: Connection[Any]) -> None:
+        while not port.closed:
+            event = port.get(EVENT_TIMEOUT_S)
+            if isinstance(event, RangeMeasurement):
+                with self._publishing:
+                    self.ranges += 1
+                    self._on_range(event)
+                    self.meter.add(self._now_ns() - event.stamp_ns)
+            elif event is not None:
+                self.handle(event, port)
+            self.check(port)
+
+
+class BoardFeed(LiveFeed):
+    """Publishes ranges and corrections of a board, and logs its events.
+
+    Args:
+        port: closed by `stop`.
+        on_range, now_ns, logger: see `LiveFeed`.
+        on_correction: publishes a range that the board has corrected.
+    """
+
+    def __init__(
+        self,
+        port: BoardPort,
+        on_range: Callable[[RangeMeasurement], None],
+        on_correction: Callable[[Correction], None],
+        now_ns: Callable[[], int],
+        logger: Any,
+    ) -> None:
+        super().__init__([port], on_range, now_ns, logger)
+        self._port = port
+        self._corrections = 0
+        self._status: BoardStatus | None = None
+        self._radio: RadioSettings | None = None
+        self._radio_status: RadioStatus | None = None
+        self._problem = self._logged = ""
+        self._checked_s = 0.0
+        self._on_correction = on_correction
+        self._refused_offsets = self._refused_radio = ""
+
+    def apply(self, changed: Collection[str], value: Value, offsets: Offsets) -> None:
+        """Send new settings to the board."""
+        if any(name.startswith(PREFIX) for name in changed):
+            self._refused_radio = ""
+            self._port.set_radio(settings_of(value))
+        if {"mode", "offsets"} & set(changed) and value("mode") != "host":
+            self._refused_offsets = ""
+            self._port.set_offsets(offsets)
+        if "mode" in changed:
+            self._port.set_mode(Mode[value("mode").upper()])
+
+    def describe(self) -> Description:
+        report, radio, status = self._port.report(), self._radio, self._radio_status
+        facts: dict[str, object] = {
+            "port": report.port or "none",
+            "ranges published": self.ranges,
+            "corrections published": self._corrections,
+        }
+        hardware = "no board"
+        if (hello := report.hello) is not None:
+            hardware = f"board {format_id(hello.board_id)}"
+            facts |= {
+                "firmware": f"{hello.firmware_name} {'.'.join(map(str, hello.firmware_version))}",
+                "model id": diagnostics.model_id(hello.model_id),
+                "mode": hello.mode.name.lower(),
+            }
+        facts |= self.meter.facts() | {
+            "clock offset s": f"{report.clock_offset_s:.6f}",
+            "clock drift ppm": f"{report.clock_drift_ppm:.2f}",
+            "clock uncertainty us": f"{report.clock_uncertainty_us:.1f}",
+        }
+        facts |= report.counts
+        if self._status is not None:
+            facts |= {f"board: {name}": value for name, value in asdict(self._status).items()}
+        if radio is not None:
+            hardware += f", radio {format_id(radio.address)}"
+        problem, warning = report.problem, ""
+        if not problem and self._refused_offsets:
+            problem = f"the offsets are not set: {self._refused_offsets}"
+        if not problem and self._refused_radio:
+            problem = f"the radio's settings are not used: {self._refused_radio}"
+        if status is not None:
+            facts |= radio_facts(radio, status, "radio: ") | anchor_facts(status)
+            problem, warning = problem or radio_problem(status), radio_warning(radio, status)
+        if problem:
+            return hardware, diagnostics.ERROR, problem, facts
+        if warning:
+            return hardware, diagnostics.WARN, warning, facts
+        return hardware, diagnostics.OK, "connected", facts
+
+    def check(self, port: BoardPort) -> None:
+        """Log a problem once if it is older than `EVENT_TIMEOUT_S`; a handshake takes less."""
+        now_s = time.monotonic()
+        if now_s - self._checked_s < EVENT_TIMEOUT_S:
+            return
+        self._checked_s = now_s
+        before, self._problem = self._problem, port.problem
+        if self._problem and self._problem == before != self._logged and not port.closed:
+            self._logger.warning(f"{self._problem}; waiting for the board")
+            self._logged = self._problem
+
+    def handle(self, event: Event, port: BoardPort) -> None:
+        log = self._logger
+        match event:
+            case Correction():
+                self._corrections += 1
+                self._on_correction(event)
+                self.meter.add(self._now_ns() - event.stamp_ns)
+            case BoardStatus():
+                self._status = event
+            case RadioStatus():
+                self._radio_status = event
+            case Radio(settings=settings):
+                # A board repeats it at times.
+                if settings != self._radio:
+                    log.info(f"the board's radio {format_id(settings.address)}: {settings_text(settings)}")
+                self._radio = settings
+            case RadioRefused(text=text):
+                self._refused_radio = text
+                log.error(f"the radio's settings are not used: {text}")
+            case Connected(hello=hello):
+                self._refused_offsets = self._refused_radio = self._logged = ""
+                self._radio = self._radio_status = None
+                model, mode = diagnostics.model_id(hello.model_id), hello.mode.name
+                log.info(f"connected to board {format_id(hello.board_id)}, model {model}, mode {mode}")
+            case Disconnected(loss=loss):
+                if not port.closed:
+                    log.warning(f"the board is gone: {loss.value}; waiting for it")
+            case VersionMismatch(version=version):
+                log.error(
+                    f"the board uses version {version} of the protocol, this driver version {PROTOCOL_VERSION}: "
+                    "update the older one"
+                )
+            case ModeChanged(mode=mode):
+                log.info(f"the board is in mode {mode.name}")
+            case ModeRefused(mode=mode, wanted=wanted):
+                log.warning(f"the board stays in mode {mode.name} instead of {wanted.name}: has it a model?")
+            case OffsetsRefused(text=text):
+                self._refused_offsets = text
+                log.error(f"the board's corrections are not published: the offsets are not set: {text}")
+            case Log(level=level, text=text):
+                # rclpy binds the severity to the line of code.
+                if level >= LogLevel.WARNING:
+                    log.warning(f"board: {text}")
+                else:
+                    log.info(f"board: {text}")
+
+
+class RadioFeed(LiveFeed):
+    """Publishes the ranges of radios of this computer, and logs their events.
+
+    Args:
+        ports: one or several radios, the tag first; closed by `stop`.
+        on_range, now_ns, logger: see `LiveFeed`.
+    """
+
+    def __init__(
+        self,
+        ports: Sequence[RadioPort],
+        on_range: Callable[[RangeMeasurement], None],
+        now_ns: Callable[[], int],
+        logger: Any,
+    ) -> None:
+        super().__init__(ports, on_range, now_ns, logger)
+        self._radios = list(ports)
+
+    def apply(self, changed: Collection[str], value: Value, offsets: Offsets) -> None:
+        """Use new radio settings from the next exchange on."""
+        if any(name.startswith(PREFIX) for name in changed):
+            settings = settings_of(value)
+            for number, port in enumerate(self._radios):
+                port.set_radio(_role_of(settings, number))
+
+    def describe(self) -> Description:
+        reports = [port.report() for port in self._radios]
+        first = reports[0]
+        facts: dict[str, object] = {"ranges published": self.ranges}
+        facts |= self.meter.facts()
+        for number, report in enumerate(reports):
+            prefix = f"radio {number}: " if len(reports) > 1 else ""
+            facts[f"{prefix}port"] = report.name or "none"
+            facts |= radio_facts(report.settings, report.status, prefix)
+        facts |= anchor_facts(first.status)
+        hardware = "no radio" if first.settings is None else f"radio {format_id(first.settings.address)}"
+        if problems := [report.problem for report in reports if report.problem]:
+            return hardware, diagnostics.ERROR, "; ".join(problems), facts
+        if warnings := [
+            text for report in reports if (text := radio_warning(report.settings, report.status))
+        ]:
+            return hardware, diagnostics.WARN, warnings[0], facts
+        tag = first.settings is not None and first.settings.role is Role.TAG
+        return hardware, diagnostics.OK, "ranging" if tag else "answering", facts
+
+    def handle(self, event: RadioEvent, port: RadioPort) -> None:
+        match event:
+            case Radio(settings=settings):
+                name, text = port.report().name, settings_text(settings)
+                self._logger.info(f"radio {format_id(settings.address)} at {name}: {text}")
+            case RadioLost(text=text) if not port.closed:
+                self._logger.warning(f"{text}; waiting for the radio")
+
+
+def settings_of(value: Value) -> RadioSettings:
+    """Return the radio settings of the parameters `radio.*`.
+
+    Raises:
+        ParameterError: a setting is invalid; names the parameter.
+    """
+
+    def of(name: str) -> Any:
+        return value(PREFIX + name)
+
+    anchors = [part.strip() for part in str(of("anchors")).split(",") if part.strip()]
+    settings = RadioSettings(
+        role=Role[of("role").upper()],
+        address=_address(of("address"), "address") if of("address") != "" else 0,
+        pan=of("pan"),
+        channel=of("channel"),
+        prf_mhz=int(of("prf")),
+        preamble=of("preamble"),
+        preamble_code=of("preamble_code"),
+        rate_kbps=of("data_rate"),
+        decawave_sfd=of("decawave_sfd"),
+        tx_power=of("tx_power"),
+        antenna_delay=of("antenna_delay"),
+        window=of("window"),
+        anchors=tuple(_address(part, "anchors") for part in anchors),
+        interval_us=round(1e6 / of("rate")) if of("rate") else 0,
+        report=of("report"),
+        bias_correction=of("bias_correction"),
+    )
+    try:
+        settings.check()
+    except ParameterError as error:
+        raise ParameterError(f"parameters {PREFIX}*: {error.what}", valid=error.valid) from error
+    return settings
+
+
+def open_radios(value: Value, now_ns: Callable[[], int]) -> list[RadioPort]:
+    """Open the radios of `source`, `port` and `radio.*`. The first has the role of the parameter, the others are anchors.
+
+    Raises:
+        ParameterError: a port or a setting is invalid.
+        MissingDependencyError: there is no C compiler.
+    """
+    settings = settings_of(value)
+    names = [part.strip() for part in value("port").split(",") if part.strip()]
+    if not names:
+        valid = "/dev/ttyACM0 or usb:0483:5740, or several with commas"
+        if value("source") == "spi":
+            valid = "/dev/spidevBUS.SELECT"
+        raise ParameterError("parameter port is empty", valid=valid)
+    if settings.address and len(names) > 1:
+        raise ParameterError(
+            f"parameter {PREFIX}address with {len(names)} ports", valid="empty: each has its chip's address"
+        )
+    openers = [opener(value("source"), name, value(PREFIX + "reset")) for name in names]
+    ports: list[RadioPort] = []
+    try:
+        for number, open_bus in enumerate(openers):
+            ports.append(RadioPort(open_bus, _role_of(settings, number), stamp_clock=now_ns))
+    except Exception:
+        for port in ports:
+            port.close()
+        raise
+    return ports
+
+
+def _role_of(settings: RadioSettings, number: int) -> RadioSettings:
+    return settings if number == 0 else replace(settings, role=Role.ANCHOR, anchors=())
+
+
+def _address(value: object, name: str) -> int:
+    """Return an address; raise ParameterError if the value is none."""
+    with contextlib.suppress(ValueError):
+        if 0 < (address := parse_id(str(value))) < 2**64 - 1:
+            return address
+    raise ParameterError(
+        f"parameter {PREFIX}{name} = {str(value)!r:.40}",
+        valid="a number below 65536, or 0x and up to 16 hexadecimal digits in quotes",
+    )
+
+
+def settings_text(settings: RadioSettings) -> str:
+    """Return the settings for a line of the log."""
+    return (
+        f"{settings.role.name.lower()}, channel {settings.channel}, {settings.rate_kbps} kbit/s, preamble "
+        f"{settings.preamble}, PAN 0x{settings.pan:04x}"
+    )
+
+
+def radio_problem(status: RadioStatus) -> str:
+    """Return what keeps a board's radio from ranging; empty if there is nothing."""
+    return _STATES.get(status.state, "")
+
+
+def radio_warning(settings: RadioSettings | None, status: RadioStatus) -> str:
+    """Return what may keep a radio without a problem from ranging; empty if there is nothing."""
+    if status.state is RadioState.LOCK_UNCONFIRMED:
+        return "the DW1000 has not reported that its clock PLL locked; if it does not range, check its supply"
+    if settings is not None and settings.role is Role.TAG and not status.anchors:
+        return "no anchor in reach: are they on, with the same channel, rate and PAN?"
+    return ""
+
+
+def radio_facts(settings: RadioSettings | None, status: RadioStatus, prefix: str) -> dict[str, object]:
+    """Return the values of a radio for the diagnostics, without those of the anchors."""
+    values: dict[str, object] = {}
+    if settings is not None:
+        values = {
+            "address": format_id(settings.address),
+            "role": settings.role.name.lower(),
+            "antenna delay": settings.antenna_delay,
+        }
+    values |= {name.replace("_", " "): getattr(status, name) for name in _COUNTS}
+    values |= {"temperature C": f"{status.temperature_c:.1f}", "voltage V": f"{status.voltage:.2f}"}
+    return {f"{prefix}{name}": value for name, value in values.items()}
+
+
+def anchor_facts(status: RadioStatus) -> dict[str, object]:
+    """Return the values of the anchors in reach for the diagnostics."""
+    values: dict[str, object] = {}
+    for anchor in status.anchors:
+        heard = "never" if anchor.heard_ms is None else f"{anchor.heard_ms / 1000:.1f} s ago"
+        values[f"anchor {format_id(anchor.address)}"] = (
+            f"{anchor.ranged} of {anchor.tried} ranged, {anchor.rx_power_dbm:.1f} dBm, heard {heard}"
+        )
+    return values
