@@ -25,11 +25,12 @@ import numpy as np
 import psutil
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
+from benchmarks.relay import RELAYED
 from uwb_mitigation.bag.codec import after_frame
 from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.measurement import Record
-from uwb_mitigation.nodes import processes, relay, topics
+from uwb_mitigation.nodes import processes, topics
 from uwb_mitigation.nodes.processes import Probe, wait, watching
 from uwb_mitigation.preprocessing import WINDOW_LEAD
 from uwb_mitigation.sources.simulated import SimulatedSource
@@ -249,7 +250,8 @@ class Bench:
         if node in ("driver", "pipeline"):
             words = ["source:=mcap", f"path:={self._bag}", "loop:=true", "paused:=true"]
             words += ["wait_for_subscribers:=0", "start_delay:=0.0"]
-        process = processes.start(node, *words, namespace=namespace, log_level="error")
+        module = "benchmarks.relay" if node == "relay" else processes.ENTRY
+        process = processes.start(node, *words, namespace=namespace, log_level="error", module=module)
         self.processes.append(process)
         return process
 
@@ -318,8 +320,8 @@ def measure(repeats: int, slices: int, seconds: float, advance: Advance) -> dict
     """
     with open_bench() as bench:
         subjects = [
-            Subject(bench, "relay", RangeCir, relay.RELAYED, "relay", "driver"),
-            Subject(bench, "relay_serialised", RangeCir, relay.RELAYED, "relay serialised:=true", "driver"),
+            Subject(bench, "relay", RangeCir, RELAYED, "relay", "driver"),
+            Subject(bench, "relay_serialised", RangeCir, RELAYED, "relay serialised:=true", "driver"),
             Subject(bench, "mitigator", RangeCorrected, topics.RANGE_CORRECTED, "mitigator", "driver"),
             Subject(bench, "pipeline", RangeCorrected, topics.RANGE_CORRECTED, "pipeline"),
         ]

@@ -32,6 +32,8 @@ from uwb_mitigation.nodes.spinning import spin
 AnyNode = TypeVar("AnyNode", bound=Node)
 
 TIMEOUT_S = 30.0
+ENTRY = "uwb_mitigation.entry"
+"""Module of the executables of this package."""
 _DEPTH = 50_000
 
 
@@ -45,7 +47,7 @@ def isolate() -> None:
 
 
 def start(
-    node: str, *parameters: str, namespace: str = "", log_level: str = "warn"
+    node: str, *parameters: str, namespace: str = "", log_level: str = "warn", module: str = ENTRY
 ) -> subprocess.Popen[bytes]:
     """Start a node of this package with parameters such as `rate:=2.0`; call `stop` in the end.
 
@@ -56,7 +58,7 @@ def start(
         signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
     ):
         signal.signal(signal.SIGTERM, _exit)
-    command = [sys.executable, "-m", "uwb_mitigation.entry", node, "--ros-args", "--log-level", log_level]
+    command = [sys.executable, "-m", module, node, "--ros-args", "--log-level", log_level]
     if (setpriv := shutil.which("setpriv")) is not None:
         command = [setpriv, "--pdeathsig", "INT", *command]
     if namespace:

@@ -1,17 +1,17 @@
-"""A node that only republishes ranges: the floor that rclpy sets, which `bench nodes` compares with.
+"""A node that only republishes ranges: the lower bound set by rclpy, which `benchmarks nodes` compares with.
 
-`-p serialised:=true` passes the bytes through without making objects of them, which is less than any node
-that looks at a message can do.
+`-p serialised:=true` passes the bytes through without creating objects, which is less than any useful node does.
 """
 
 from __future__ import annotations
 
-import threading
-
+import rclpy
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 from uwb_mitigation_msgs.msg import RangeCir
 
 from uwb_mitigation.nodes import topics
+from uwb_mitigation.nodes.spinning import spin, stop_event
 
 RELAYED = "uwb/range_relayed"
 
@@ -24,5 +24,6 @@ class Relay(Node):
         self.create_subscription(RangeCir, topics.RANGE_RAW, publisher.publish, topics.RANGES, raw=serialised)
 
 
-def make_nodes(stop: threading.Event) -> list[Node]:
-    return [Relay()]
+if __name__ == "__main__":
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    spin(Relay(), stop_event())
