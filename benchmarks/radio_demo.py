@@ -21,10 +21,10 @@ from rich.table import Table
 from uwb_mitigation_msgs.msg import RangeCorrected
 
 from benchmarks.dw1000_model.evb1000 import EmulatedEvb1000s
-from uwb_mitigation.errors import UwbMitigationError
-from uwb_mitigation.nodes import processes, topics
+from uwb_mitigation.demos.base import Nodes, run_demo
+from uwb_mitigation.nodes import topics
 from uwb_mitigation.nodes.monitor import REFRESH_HZ
-from uwb_mitigation.nodes.processes import Probe, wait, watching
+from uwb_mitigation.nodes.processes import Probe, watching
 from uwb_mitigation.sources.simulated import SimulatedSource
 from uwb_mitigation.sources.simulation.scene import ANCHORS
 
@@ -88,62 +88,41 @@ class RadioListener:
         return dict(sorted(known.items()))
 
 
-def run(console: Console, seconds: float) -> int:
-    """Start boards and nodes, and show what they say. Returns the exit code."""
+def run(console: Console, seconds: float) -> list[str]:
+    """Start boards and nodes, and show their ranges; return the failures."""
     with (
         SimulatedSource(route=PLACE) as source,
         EmulatedEvb1000s(source, boards=1 + len(ANCHORS)) as boards,
         watching(Probe) as probe,
     ):
         listener = RadioListener(probe)
-        nodes = {"mitigator": processes.start("mitigator")}
-        try:
+        with Nodes() as nodes:
+            nodes.start("mitigator")
             corrected = probe.resolve_topic_name(topics.RANGE_CORRECTED)
-            wait(
-                lambda: probe.count_publishers(corrected) > 0,
-                "the mitigator did not come up: see its message above",
-                [nodes["mitigator"]],
+            nodes.wait(
+                lambda: probe.count_publishers(corrected) > 0, "the mitigator did not start: see above"
             )
             ports = ",".join(boards.ports)
-            nodes["driver"] = processes.start("driver", "source:=evb1000", f"port:={ports}", *RADIO)
+            nodes.start("driver", "source:=evb1000", f"port:={ports}", *RADIO)
             console.print(f"a tag and {len(ANCHORS)} anchors, all emulated: {ports}", soft_wrap=True)
-            patience = ended = time.monotonic() + PATIENCE_S
-            started = False
+            ends_s, started = time.monotonic() + PATIENCE_S, False
             with Live(console=console, refresh_per_second=REFRESH_HZ) as live:
-                while time.monotonic() < (ended if started else patience):
-                    if any(node.poll() is not None for node in nodes.values()):
-                        break
+                while time.monotonic() < ends_s and nodes.running:
                     if not started and not listener.silent:
-                        started, ended = True, time.monotonic() + seconds
+                        started, ends_s = True, time.monotonic() + seconds
                     live.update(listener.table(dict(enumerate(boards.distances_m))))
                     time.sleep(1 / REFRESH_HZ)
             # A live table ends its last line on a terminal only.
             if not console.is_terminal:
                 console.line()
-        finally:
-            codes = processes.stop(*nodes.values())
-        failed = [
-            f"{name} ended with exit code {code}" for name, code in zip(nodes, codes, strict=True) if code
-        ]
-        if boards.failure is not None:
-            failed.append(str(boards.failure))
+        failures = nodes.failures + ([] if boards.failure is None else [str(boards.failure)])
     if not listener.ranges:
-        failed.append(f"no range within {PATIENCE_S:g} s; {listener.problem}")
+        failures.append(f"no range within {PATIENCE_S:g} s; {listener.problem}")
     elif listener.silent:
-        failed.append(f"no range with anchors {', '.join(map(str, listener.silent))}; {listener.problem}")
-    for failure in failed:
-        console.print(failure, style="red", markup=False)
-    return 1 if failed else 0
+        failures.append(f"no range with anchors {', '.join(map(str, listener.silent))}; {listener.problem}")
+    return failures
 
 
 def main(seconds: float) -> int:
     """Run the demonstration and return its exit code."""
-    processes.isolate()
-    console = Console()
-    try:
-        return run(console, seconds)
-    except UwbMitigationError as error:
-        console.print(f"radio-demo: {error}", style="red", markup=False)
-        return 1
-    except KeyboardInterrupt:
-        return 130
+    return run_demo("radio-demo", lambda console: run(console, seconds))

@@ -16,7 +16,7 @@ from uwb_mitigation.nodes.spinning import spin, stop_event
 RELAYED = "uwb/range_relayed"
 
 
-class Relay(Node):
+class Relay(Node):  # type: ignore[misc]
     def __init__(self) -> None:
         super().__init__("relay")
         serialised = bool(self.declare_parameter("serialised", False).value)

@@ -5,9 +5,7 @@ from __future__ import annotations
 import subprocess
 from collections.abc import Callable, Sequence
 from types import TracebackType
-from typing import NoReturn
 
-import typer
 from rich.console import Console
 
 from uwb_mitigation.errors import UwbMitigationError
@@ -52,18 +50,16 @@ class Nodes:
         ]
 
 
-def run_demo(name: str, run: Callable[[Console], Sequence[str]]) -> NoReturn:
-    """Run a demo in its own ROS domain; print its failures, and exit with 0, 1 or 130 (Ctrl-C)."""
+def run_demo(name: str, run: Callable[[Console], Sequence[str]]) -> int:
+    """Run a demo in its own ROS domain and print its failures; return the exit code: 0, 1 or 130 (Ctrl-C)."""
     processes.isolate()
     console = Console()
     try:
         failures = run(console)
-        for failure in failures:
-            console.print(failure, style="red", markup=False)
-        code = 1 if failures else 0
     except UwbMitigationError as error:
-        console.print(f"{name}: {error}", style="red", markup=False)
-        code = 1
+        failures = [f"{name}: {error}"]
     except KeyboardInterrupt:
-        code = 130
-    raise typer.Exit(code)
+        return 130
+    for failure in failures:
+        console.print(failure, style="red", markup=False)
+    return 1 if failures else 0

@@ -146,7 +146,7 @@ def firmware_demo(
     count: Annotated[int, typer.Option(min=1, max=100_000, help="Ranges to measure, at most.")] = 200,
 ) -> None:
     """Run the firmware in an emulator as a board of the driver, and compare its ranges with the host's."""
-    run_demo("firmware-demo", lambda console: run(console, numbered(recording, count)))
+    raise typer.Exit(run_demo("firmware-demo", lambda console: run(console, numbered(recording, count))))
 
 
 def main() -> None:

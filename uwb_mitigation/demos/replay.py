@@ -151,10 +151,11 @@ def demo(
     ] = 0.0,
 ) -> None:
     """Replay a recording through driver and mitigator, show it live, and print a summary."""
-    run_demo(
+    code = run_demo(
         "demo",
         lambda console: watch(simulated(rate) if recording is None else recorded(recording, rate), console),
     )
+    raise typer.Exit(code)
 
 
 def main() -> None:
