@@ -34,8 +34,8 @@ def nodes_of(context):
     names = (*PARAMETERS, *OWN, *FILES, "boards")
     launching.check_names(getattr(context, "argv", ()), names)
     said = {name: LaunchConfiguration(name).perform(context) for name in names}
-    flag = {name: launching.boolean(name, said[name]) for name in ("use_sim_time", "respawn")}
-    level = launching.log_level(said["log_level"])
+    flag = {name: launching.choice(name, said[name]) == "true" for name in ("use_sim_time", "respawn")}
+    level = launching.choice("log_level", said["log_level"], launching.LOG_LEVELS)
     files = {node: [said[f"{node}_params"], *filter(None, [said["params"]])] for node in NODES}
     for node in NODES:
         launching.from_files(node, *files[node])

@@ -39,8 +39,8 @@ def nodes_of(context):
     launching.check_names(getattr(context, "argv", ()), {*PARAMETERS, *OWN, *FILES})
     said = {name: LaunchConfiguration(name).perform(context) for name in (*PARAMETERS, *OWN, *FILES)}
     flags = ("one_process", "locate", "viewer", "use_sim_time", "respawn")
-    flag = {name: launching.boolean(name, said[name]) for name in flags}
-    level = launching.log_level(said["log_level"])
+    flag = {name: launching.choice(name, said[name]) == "true" for name in flags}
+    level = launching.choice("log_level", said["log_level"], launching.LOG_LEVELS)
     files = {node: [said[f"{node}_params"], *filter(None, [said["params"]])] for node in NODES}
     given = {node: launching.from_files(node, *files[node]) for node in NODES}
     wanted = {"locator": flag["locate"], "viewer": flag["viewer"]}

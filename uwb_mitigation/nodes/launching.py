@@ -118,7 +118,7 @@ def for_launch(value: Value) -> Value:
     """
     if not isinstance(value, str) or _read(value) == value:
         return value
-    if yaml.safe_load(value) == value:
+    if _FLOAT.fullmatch(value) and yaml.safe_load(value) == value:
         raise ParameterError(
             f"text {value} is read as a number by ROS", valid="another notation, such as 0x12e4"
         )
@@ -135,22 +135,11 @@ def _read(text: str) -> Any:
         return None
 
 
-def boolean(name: str, text: str) -> bool:
-    """Return the value of an argument that is true or false.
-
-    Raises:
-        ParameterError: it is neither.
-    """
-    return _choice(name, text.lower(), ("true", "false")) == "true"
-
-
-def log_level(text: str) -> str:
-    """Return the log level.
-
-    Raises:
-        ParameterError: there is no such level.
-    """
-    return _choice("log_level", text.lower(), LOG_LEVELS)
+def choice(name: str, text: str, choices: Sequence[str] = ("true", "false")) -> str:
+    """Return the value of an argument in lower case; raise ParameterError if it is not one of the choices."""
+    if text.lower() not in choices:
+        raise ParameterError(f"argument {name}:={text}", valid=f"one of {', '.join(choices)}")
+    return text.lower()
 
 
 def check_names(words: Sequence[str], known: Collection[str]) -> None:
@@ -172,17 +161,18 @@ def check_names(words: Sequence[str], known: Collection[str]) -> None:
 
 
 def check_driver(values: Mapping[str, Any]) -> None:
-    """Raise ParameterError where the source needs a port or a recording, and none is given."""
+    """Raise ParameterError if the source needs a port or a recording, and none is given."""
+    serial = ("port", "/dev/ttyACM0")
+    needed = {
+        "serial": serial,
+        "evb1000": serial,
+        "spi": ("port", "/dev/spidev0.0"),
+        "mcap": ("path", "FILE"),
+        "decaranging": ("path", "FILE"),
+    }
     source = values.get("source")
-    name = (
-        "port"
-        if source in ("serial", "evb1000", "spi")
-        else "path"
-        if source in ("mcap", "decaranging")
-        else ""
-    )
+    name, example = needed.get(str(source), ("", ""))
     if name and not values.get(name):
-        example = {"port": "/dev/spidev0.0" if source == "spi" else "/dev/ttyACM0", "path": "FILE"}[name]
         raise ParameterError(f"source {source} without a {name}", valid=f"{name}:={example}")
 
 
@@ -245,12 +235,6 @@ def kept_parameters() -> dict[str, str]:
     folder = tempfile.mkdtemp(prefix="uwb_mitigation_")
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     return {KEPT_PARAMETERS: folder}
-
-
-def _choice(name: str, text: str, choices: Sequence[str]) -> str:
-    if text not in choices:
-        raise ParameterError(f"argument {name}:={text}", valid=f"one of {', '.join(choices)}")
-    return text
 
 
 def _entries(tree: Any, section: str) -> Iterator[tuple[str, str, Any]]:
