@@ -61,7 +61,7 @@ class Viewer(ManagedNode):
         self._ranges: dict[str, Subscription] = {}
         self._anchors: AnchorMap | None = None
         self._anchors_out: Publisher | None = None
-        self._timers: list[Timer] = []
+        self._periodic: list[Timer] = []
         self._server: ViewerServer | None = None
         self._scene = Scene()
         self._lock = threading.Lock()
@@ -93,7 +93,7 @@ class Viewer(ManagedNode):
         self._subscribe_ranges(RangeTruth, topics.RANGE_TRUTH)
         self._subscribe_ranges(RangeCorrected, topics.RANGE_CORRECTED)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._timers = [
+        self._periodic = [
             self.create_timer(SEARCH_S, self._search, clock=steady),
             self.create_timer(TAKE_S, self._take_ranges, clock=steady),
         ]
@@ -119,7 +119,7 @@ class Viewer(ManagedNode):
         self._view = None
 
     def close(self) -> None:
-        for timer in self._timers:
+        for timer in self._periodic:
             self.destroy_timer(timer)
         if self._range_node is not None:
             self._range_node.destroy_node()
@@ -127,7 +127,7 @@ class Viewer(ManagedNode):
             self.destroy_subscription(subscription)
         if self._anchors_out is not None:
             self.destroy_lifecycle_publisher(self._anchors_out)
-        self._others, self._ranges, self._timers, self._anchors_out, self._range_node = {}, {}, [], None, None
+        self._others, self._ranges, self._periodic, self._anchors_out, self._range_node = {}, {}, [], None, None
 
     def describe(self) -> diagnostics.Description:
         pages = 0 if self._view is None else self._view.drawing.pages
