@@ -127,7 +127,13 @@ class Viewer(ManagedNode):
             self.destroy_subscription(subscription)
         if self._anchors_out is not None:
             self.destroy_lifecycle_publisher(self._anchors_out)
-        self._others, self._ranges, self._periodic, self._anchors_out, self._range_node = {}, {}, [], None, None
+        self._others, self._ranges, self._periodic, self._anchors_out, self._range_node = (
+            {},
+            {},
+            [],
+            None,
+            None,
+        )
 
     def describe(self) -> diagnostics.Description:
         pages = 0 if self._view is None else self._view.drawing.pages
