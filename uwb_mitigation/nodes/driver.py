@@ -111,7 +111,6 @@ class Driver(ManagedNode):
         self._ended = ended
         self._consumer = consumer
         self.exit_code = 0
-        self._source: Source | None = None
         self._make_feed: Callable[[], Feed] | None = None
         self._feed: Feed | None = None
         self._ranges: Publisher | None = None
@@ -134,7 +133,7 @@ class Driver(ManagedNode):
             "spi": self._prepare_radios,
         }
         self._make_feed = prepare.get(self.value("source"), self._prepare_replay)()
-        self._ranges = topics.create_publisher(self, RangeCir, topics.RANGE_RAW)
+        self._ranges = self.publisher(RangeCir, topics.RANGE_RAW)
 
     def begin(self) -> None:
         assert self._make_feed is not None
@@ -146,20 +145,10 @@ class Driver(ManagedNode):
             self._feed.stop()
 
     def close(self) -> None:
+        super().close()
         self._feed = self._make_feed = None
-        if self._source is not None:
-            self._source.close()
-            self._source = None
-        for publisher in (self._ranges, self._corrected, self._truths, self._places):
-            if publisher is not None:
-                self.destroy_lifecycle_publisher(publisher)
         self._ranges = self._corrected = self._truths = self._places = None
-        if self._clock_publisher is not None:
-            self.destroy_publisher(self._clock_publisher)
-            self._clock_publisher = None
-        if self._sensor_ranges is not None:
-            self._sensor_ranges.close()
-            self._sensor_ranges = None
+        self._clock_publisher = self._sensor_ranges = None
 
     def describe(self) -> Description:
         return ("none", diagnostics.OK, "", {}) if self._feed is None else self._feed.describe()
@@ -168,9 +157,9 @@ class Driver(ManagedNode):
         address = PortAddress.parse(self.value("port"))
         board_model = _model_id(self.value("board_model"))
         self._offsets = read_offsets(str(self.value("offsets")))
-        self._corrected = topics.create_publisher(self, RangeCorrected, topics.RANGE_CORRECTED)
+        self._corrected = self.publisher(RangeCorrected, topics.RANGE_CORRECTED)
         if self.value("sensor_ranges"):
-            self._sensor_ranges = topics.SensorRanges(self)
+            self._sensor_ranges = self.until_close(topics.SensorRanges(self), topics.SensorRanges.close)
 
         def make() -> BoardFeed:
             port = BoardPort(
@@ -201,12 +190,13 @@ class Driver(ManagedNode):
         return make
 
     def _prepare_replay(self) -> Callable[[], Feed]:
-        source = self._source = open_source(self.value)
-        self._truths = topics.create_publisher(self, RangeTruth, topics.RANGE_TRUTH)
-        self._places = topics.create_publisher(self, Odometry, topics.ODOMETRY_TRUTH)
+        source = self.until_close(open_source(self.value), lambda source: source.close())
+        self._truths = self.publisher(RangeTruth, topics.RANGE_TRUTH)
+        self._places = self.publisher(Odometry, topics.ODOMETRY_TRUTH)
         own_clock = self.value("publish_clock")
         if own_clock:
-            self._clock_publisher = self.create_publisher(ClockMessage, topics.CLOCK, 10)
+            clock = self.create_publisher(ClockMessage, topics.CLOCK, 10)
+            self._clock_publisher = self.until_close(clock, self.destroy_publisher)
 
         def make() -> ReplayFeed:
             assert self._ranges is not None

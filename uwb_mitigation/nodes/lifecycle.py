@@ -7,8 +7,9 @@ import os
 import time
 import traceback
 from collections.abc import Callable, Collection, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import State
@@ -18,6 +19,8 @@ from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValu
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
 
 from uwb_mitigation.errors import ParameterError, UwbMitigationError, did_you_mean, not_imported
 from uwb_mitigation.files import write_whole
@@ -28,6 +31,8 @@ SAME_NAME_S = 40.0
 """A killed node stays in the graph for up to 20 s: a second node of the same name is reported after this time."""
 
 _QOS = "qos_overrides."
+
+Made = TypeVar("Made")
 
 
 def clock_reader(clock: Clock) -> Callable[[], int]:
@@ -63,6 +68,7 @@ class ManagedNode(LifecycleNode):
         self.now_ns = clock_reader(self.get_clock())
         self._unique_name_s = time.monotonic()
         self._reported: set[str] = set()
+        self._opened: list[Callable[[], object]] = []
         self._diagnostics = self.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, 10)
         # Steady: diagnostics must be published even if the node's clock is simulated and stands still.
         self.create_timer(1.0, self._publish_diagnostics, clock=Clock(clock_type=ClockType.STEADY_TIME))
@@ -77,7 +83,22 @@ class ManagedNode(LifecycleNode):
         raise NotImplementedError
 
     def close(self) -> None:
-        raise NotImplementedError
+        """Destroy what `open` has created; a subclass also resets its attributes."""
+        while self._opened:
+            self._opened.pop()()
+
+    def until_close(self, made: Made, destroy: Callable[[Made], object]) -> Made:
+        """Return what `open` has made; `close` destroys it."""
+        self._opened.append(partial(destroy, made))
+        return made
+
+    def publisher(self, kind: type, topic: str, qos: QoSProfile | None = None) -> Publisher:
+        """Return a lifecycle publisher until `close`, by default with the QoS of ranges."""
+        if qos is None:
+            made = topics.create_publisher(self, kind, topic)
+        else:
+            made = self.create_lifecycle_publisher(kind, topic, qos)
+        return self.until_close(made, self.destroy_lifecycle_publisher)
 
     def describe(self) -> diagnostics.Description:
         """Return the content of the diagnostics."""

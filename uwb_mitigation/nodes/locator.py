@@ -16,7 +16,7 @@ from nav_msgs.msg import Odometry
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import ReliabilityPolicy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from uwb_mitigation_msgs.msg import RangeCorrected
@@ -53,7 +53,7 @@ class _Outputs:
     def __init__(self, node: Locator, prefix: str, frame: str) -> None:
         def publisher(kind: type, topic: str) -> Publisher:
             head, _, tail = topic.rpartition("/")
-            return topics.create_publisher(node, kind, f"{head}/{prefix}{tail}")
+            return node.publisher(kind, f"{head}/{prefix}{tail}")
 
         self.pose = publisher(PoseWithCovarianceStamped, topics.POSE)
         self.odometry = publisher(Odometry, topics.ODOMETRY)
@@ -79,7 +79,6 @@ class Locator(ManagedNode):
     def __init__(self, *, foreign: Collection[str] = ()) -> None:
         super().__init__("locator", LOCATOR, foreign)
         self._fleet: Fleet | None = None
-        self._heights: Subscription | None = None
         self._ranges: Subscription | None = None
         self._anchors_out: Publisher | None = None
         self._tf: Publisher | None = None
@@ -115,14 +114,16 @@ class Locator(ManagedNode):
         self._lever = np.array([self.value(f"lever_arm_{axis}") for axis in "xyz"])
         if self.value("publish_tf"):
             self._open_tf()
-        self._anchors_out = self.create_lifecycle_publisher(MarkerArray, topics.ANCHORS, topics.LATCHED)
-        self._ranges = topics.create_raw_subscription(
+        self._anchors_out = self.publisher(MarkerArray, topics.ANCHORS, topics.LATCHED)
+        ranges = topics.create_raw_subscription(
             self, RangeCorrected, topics.RANGE_CORRECTED, self._on_range, self._on_lost
         )
+        self._ranges = self.until_close(ranges, self.destroy_subscription)
         if topic := self.value("height_topic"):
-            self._heights = topics.create_subscription(
+            heights = topics.create_subscription(
                 self, PoseWithCovarianceStamped, topic, self._on_height, ReliabilityPolicy.BEST_EFFORT
             )
+            self.until_close(heights, self.destroy_subscription)
         self.get_logger().info(f"{len(anchors)} anchors from {path}")
 
     def begin(self) -> None:
@@ -136,17 +137,8 @@ class Locator(ManagedNode):
             self._timer = None
 
     def close(self) -> None:
-        for subscription in (self._heights, self._ranges):
-            if subscription is not None:
-                self.destroy_subscription(subscription)
-        self._heights = self._ranges = None
-        for outputs in self._outputs.values():
-            for publisher in outputs.all():
-                self.destroy_lifecycle_publisher(publisher)
-        for publisher in (self._anchors_out, self._tf):
-            if publisher is not None:
-                self.destroy_lifecycle_publisher(publisher)
-        self._outputs, self._anchors_out, self._tf, self._fleet = {}, None, None, None
+        super().close()
+        self._outputs, self._anchors_out, self._tf, self._fleet, self._ranges = {}, None, None, None, None
 
     def describe(self) -> diagnostics.Description:
         fleet = self._fleet
@@ -170,7 +162,7 @@ class Locator(ManagedNode):
                 "publish_tf needs tf2_msgs, which is not installed",
                 valid="apt install ros-jazzy-tf2-msgs, or publish_tf:=false",
             ) from error
-        self._tf = self.create_lifecycle_publisher(TFMessage, topics.TF, 100)
+        self._tf = self.publisher(TFMessage, topics.TF, QoSProfile(depth=100))
         self._make_tf = lambda transforms: TFMessage(transforms=transforms)
 
     def _on_lost(self, info: Any) -> None:

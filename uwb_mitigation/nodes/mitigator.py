@@ -87,13 +87,14 @@ class Mitigator(ManagedNode):
         self.autostart()
 
     def open(self) -> None:
-        self._corrected = topics.create_publisher(self, RangeCorrected, topics.RANGE_CORRECTED)
+        self._corrected = self.publisher(RangeCorrected, topics.RANGE_CORRECTED)
         if self.value("sensor_ranges"):
-            self._sensor_ranges = topics.SensorRanges(self)
+            self._sensor_ranges = self.until_close(topics.SensorRanges(self), topics.SensorRanges.close)
         if self._subscribe:
             # Serialised messages: decoding them here takes a third of what rclpy takes for its objects.
-            self._raw = topics.create_raw_subscription(
-                self, RangeCir, topics.RANGE_RAW, self._on_raw, self._on_lost
+            self._raw = self.until_close(
+                topics.create_raw_subscription(self, RangeCir, topics.RANGE_RAW, self._on_raw, self._on_lost),
+                self.destroy_subscription,
             )
 
     def begin(self) -> None:
@@ -105,15 +106,8 @@ class Mitigator(ManagedNode):
             self._mitigation = None
 
     def close(self) -> None:
-        if self._raw is not None:
-            self.destroy_subscription(self._raw)
-            self._raw = None
-        if self._sensor_ranges is not None:
-            self._sensor_ranges.close()
-            self._sensor_ranges = None
-        if self._corrected is not None:
-            self.destroy_lifecycle_publisher(self._corrected)
-            self._corrected = None
+        super().close()
+        self._raw = self._sensor_ranges = self._corrected = None
 
     def correct(self, measurements: Sequence[RangeMeasurement]) -> None:
         """Publish the corrected ranges of measurements; while inactive, do nothing."""

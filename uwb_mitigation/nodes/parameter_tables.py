@@ -84,6 +84,37 @@ _SENSOR_RANGES = Parameter(
     "a range that is none as +Inf. The driver does so with what the board has corrected.",
 )  # fmt: skip
 
+
+def _radio(name: str, default: Value, description: str, **options: Any) -> Parameter:
+    text = f"{description} (serial, evb1000, spi)."
+    return Parameter(f"radio.{name}", default, text, live=True, **options)
+
+
+RADIO = (
+    _radio("role", "tag", "What the first radio is: a tag, which ranges with anchors, or an anchor, which answers",
+           choices=("tag", "anchor")),
+    _radio("address", "", "Its address, such as 34 or '0xdeca010203040506'; empty = the chip's own", or_number=True),
+    _radio("pan", 0x5542, "Network; frames of others are refused", low=0, high=0xFFFE),
+    _radio("channel", 5, "UWB channel: 1 to 5, or 7", low=1, high=7),
+    _radio("prf", 64, "Pulse repetition frequency: 16 or 64", low=16, high=64, unit="MHz"),
+    _radio("preamble", 128, "Preamble: 64, 128, 256, 512, 1024, 1536, 2048 or 4096 symbols; a longer one increases range "
+           "and air time", low=64, high=4096, unit="symbols"),
+    _radio("preamble_code", 0, "0 = the first code of the standard for channel and PRF", low=0, high=24),
+    _radio("data_rate", 6800, "110, 850 or 6800", low=110, high=6800, unit="kbit/s"),
+    _radio("decawave_sfd", False, "Decawave's start-of-frame delimiter instead of the standard's"),
+    _radio("tx_power", 0, "Register TX_POWER in smart-power format (lowest octet: frames of any length; below 6.8 Mbit/s "
+           "it is used for all). 0: value from OTP, or the manual's", low=0, high=0xFFFFFFFF),
+    _radio("antenna_delay", 0, "Total TX + RX antenna delay. 0: value from OTP, or 2 x 16436",
+           low=0, high=0x1FFFE, unit="ticks"),
+    _radio("window", 157, "Samples of the CIR of each range; 1016 = all", low=0, high=1016),
+    _radio("anchors", "", "Addresses that a tag polls in turn, with commas between; empty = those that it finds",
+           or_number=True),
+    _radio("rate", 0.0, "Highest number of exchanges per second; 0 = as fast as possible",
+           low=0.0, high=1000.0, unit="Hz"),
+    _radio("report", False, "An anchor publishes its ranges here too"),
+    _radio("bias_correction", False, "Correct ranges for the received power (APS011); the models were trained without"),
+)  # fmt: skip
+
 DRIVER = (
     Parameter("source", "simulated", "Where measurements come from.",
               choices=("mcap", "decaranging", "simulated", "serial", "evb1000", "spi"), filed=False),
@@ -127,37 +158,7 @@ DRIVER = (
               live=True, or_number=True),
     Parameter("board_model", "", "Model id that the board must hold, eight hexadecimal digits; its corrections "
               "by another model are withheld. Empty = any (serial)."),
-    Parameter("radio.role", "tag", "What the first radio is: a tag, which ranges with anchors, or an anchor, which "
-              "answers (serial, evb1000, spi).", choices=("tag", "anchor"), live=True),
-    Parameter("radio.address", "", "Its address, such as 34 or '0xdeca010203040506'; empty = the chip's own "
-              "(serial, evb1000, spi).", live=True, or_number=True),
-    Parameter("radio.pan", 0x5542, "Network; frames of others are refused (serial, evb1000, spi).",
-              low=0, high=0xFFFE, live=True),
-    Parameter("radio.channel", 5, "UWB channel: 1 to 5, or 7 (serial, evb1000, spi).", low=1, high=7, live=True),
-    Parameter("radio.prf", 64, "Pulse repetition frequency: 16 or 64 (serial, evb1000, spi).",
-              low=16, high=64, live=True, unit="MHz"),
-    Parameter("radio.preamble", 128, "Preamble: 64, 128, 256, 512, 1024, 1536, 2048 or 4096 symbols; the longer, the "
-              "farther and the slower (serial, evb1000, spi).", low=64, high=4096, live=True, unit="symbols"),
-    Parameter("radio.preamble_code", 0, "0 = the first that the standard has for channel and PRF "
-              "(serial, evb1000, spi).",
-              low=0, high=24, live=True),
-    Parameter("radio.data_rate", 6800, "110, 850 or 6800 (serial, evb1000, spi).",
-              low=110, high=6800, live=True, unit="kbit/s"),
-    Parameter("radio.decawave_sfd", False, "Decawave's start-of-frame delimiter instead of the standard's "
-              "(serial, evb1000, spi).", live=True),
-    Parameter("radio.tx_power", 0, "Register TX_POWER in smart-power format (lowest octet: frames of any length; "
-              "below 6.8 Mbit/s it is used for all). 0: value from OTP, or the manual's (serial, evb1000, spi).", low=0, high=0xFFFFFFFF, live=True),
-    Parameter("radio.antenna_delay", 0, "Total TX + RX antenna delay. 0: value from OTP, or 2 x 16436 "
-              "(serial, evb1000, spi).", low=0, high=0x1FFFE, live=True, unit="ticks"),
-    Parameter("radio.window", 157, "Samples of the CIR that come with a range; 1016 = all (serial, evb1000, spi).",
-              low=0, high=1016, live=True),
-    Parameter("radio.anchors", "", "Addresses that a tag polls in turn, with commas between; empty = those that it "
-              "finds (serial, evb1000, spi).", live=True, or_number=True),
-    Parameter("radio.rate", 0.0, "Exchanges a second at most; 0 = as fast as they go (serial, evb1000, spi).",
-              low=0.0, high=1000.0, live=True, unit="Hz"),
-    Parameter("radio.report", False, "An anchor gives its ranges here too (serial, evb1000, spi).", live=True),
-    Parameter("radio.bias_correction", False, "Correct ranges for the received power (APS011); the models were "
-              "trained without (serial, evb1000, spi).", live=True),
+    *RADIO,
     Parameter("radio.reset", "", "The chip's reset line, as gpiochip0:25; empty = not wired (spi)."),
     Parameter("frame_id", "uwb_antenna", "Frame of the receiving antenna, where the source names none."),
     _SENSOR_RANGES,

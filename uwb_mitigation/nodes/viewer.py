@@ -21,7 +21,6 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
-from rclpy.timer import Timer
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
 from visualization_msgs.msg import MarkerArray
 
@@ -61,7 +60,6 @@ class Viewer(ManagedNode):
         self._ranges: dict[str, Subscription] = {}
         self._anchors: AnchorMap | None = None
         self._anchors_out: Publisher | None = None
-        self._periodic: list[Timer] = []
         self._server: ViewerServer | None = None
         self._scene = Scene()
         self._lock = threading.Lock()
@@ -75,14 +73,14 @@ class Viewer(ManagedNode):
         if path := self.value("anchors"):
             self._anchors = load_anchors(Path(path).expanduser())
             self._feed.anchors(self._anchors)
-            self._anchors_out = self.create_lifecycle_publisher(MarkerArray, topics.ANCHORS, topics.LATCHED)
+            self._anchors_out = self.publisher(MarkerArray, topics.ANCHORS, topics.LATCHED)
         else:
             self._subscribe(MarkerArray, topics.ANCHORS, self._feed.markers, topics.LATCHED)
         self._subscribe(DiagnosticArray, topics.DIAGNOSTICS, self._feed.diagnostics)
         self._subscribe(PoseWithCovarianceStamped, topics.POSE, partial(self._feed.pose, PLAIN))
         self._subscribe(Odometry, topics.ODOMETRY_TRUTH, self._feed.true_position)
         # No executor spins this node: waking up for every range would take time from the mitigator.
-        self._range_node = Node(
+        range_node = Node(
             f"_{self.get_name()}_ranges",
             namespace=self.get_namespace(),
             context=self.context,
@@ -90,13 +88,13 @@ class Viewer(ManagedNode):
             enable_rosout=False,
             start_parameter_services=False,
         )
+        self._range_node = self.until_close(range_node, lambda node: node.destroy_node())
         self._subscribe_ranges(RangeTruth, topics.RANGE_TRUTH)
         self._subscribe_ranges(RangeCorrected, topics.RANGE_CORRECTED)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._periodic = [
-            self.create_timer(SEARCH_S, self._search, clock=steady),
-            self.create_timer(TAKE_S, self._take_ranges, clock=steady),
-        ]
+        for period_s, callback in ((SEARCH_S, self._search), (TAKE_S, self._take_ranges)):
+            timer = self.create_timer(period_s, callback, clock=steady)
+            self.until_close(timer, self.destroy_timer)
 
     def begin(self) -> None:
         self._view = View(
@@ -119,21 +117,8 @@ class Viewer(ManagedNode):
         self._view = None
 
     def close(self) -> None:
-        for timer in self._periodic:
-            self.destroy_timer(timer)
-        if self._range_node is not None:
-            self._range_node.destroy_node()
-        for subscription in self._others.values():
-            self.destroy_subscription(subscription)
-        if self._anchors_out is not None:
-            self.destroy_lifecycle_publisher(self._anchors_out)
-        self._others, self._ranges, self._periodic, self._anchors_out, self._range_node = (
-            {},
-            {},
-            [],
-            None,
-            None,
-        )
+        super().close()
+        self._others, self._ranges, self._anchors_out, self._range_node = {}, {}, None, None
 
     def describe(self) -> diagnostics.Description:
         pages = 0 if self._view is None else self._view.drawing.pages
@@ -145,7 +130,8 @@ class Viewer(ManagedNode):
         self, kind: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile = _QOS
     ) -> None:
         if topic not in self._others:
-            self._others[topic] = self.create_subscription(kind, topic, callback, qos)
+            made = self.create_subscription(kind, topic, callback, qos)
+            self._others[topic] = self.until_close(made, self.destroy_subscription)
 
     def _subscribe_ranges(self, kind: type, topic: str) -> None:
         """Let ranges queue up until `_take_ranges`."""

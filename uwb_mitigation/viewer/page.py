@@ -232,8 +232,6 @@ class Page:
         """Show counts, why the page is empty, and what has stopped."""
         count = len(self._rows)
         parts = [f"{count} pair{'' if count == 1 else 's'}", f"{scene.ranges} ranges"]
-        if scene.not_shown:
-            parts[1] += f", {scene.not_shown} of them of further pairs, which are not shown"
         if math.isfinite(scene.now_s):
             parts.insert(0, _utc(scene.now_s))
         if scene.errors:

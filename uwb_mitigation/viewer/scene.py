@@ -45,8 +45,6 @@ MAX_MESSAGES = 40_000
 # Times.
 STRIP_S = 60.0
 """Length of the strip chart of a pair."""
-REPLACE_S = 10.0
-"""If there are too many pairs, a pair without data for this time makes room for a new one."""
 NO_DATA_S, NO_DATA_INTERVALS = 3.0, 3.0
 """A pair or a tag has no data after this time, or after this number of its mean intervals if that is longer."""
 STALE_S = 5.0
@@ -276,7 +274,7 @@ class Scene:
         clock: returns the time that ages are measured with, s: a steady clock live, the recording's time in a replay.
             Stamps are not compared with it: they may come from another computer.
         now_s: the latest stamp plus the time since then; NaN before any.
-        ranges, not_shown: number of ranges, and of those of pairs beyond `MAX_PAIRS`.
+        ranges: number of ranges.
         pairs: {(anchor, tag): its last minute}, the latest at the end.
         tags, true_trails, anchors, reports: {id or name: ...}.
         revision: increases with every change, so that a page draws only changes.
@@ -285,8 +283,8 @@ class Scene:
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self.clock = clock
         self._latest_s = self._received_s = math.nan
-        self.ranges = self.not_shown = 0
-        self.pairs: OrderedDict[Pair, History] = OrderedDict()
+        self.ranges = 0
+        self.pairs: Latest[Pair, History] = Latest(MAX_PAIRS)
         self.tags: Latest[str, Tag] = Latest(MAX_TAGS)
         self.true_trails: Latest[str, deque[tuple[float, float]]] = Latest(MAX_TAGS)
         self.anchors: dict[int, AnchorPlace] = {}
@@ -304,16 +302,10 @@ class Scene:
         """Return the time since the last data of a pair or tag."""
         return max(self.clock() - entry.received_s, 0.0)
 
-    def history(self, pair: Pair) -> History | None:
-        """Return the history of a pair, a new one for a new pair; None if there are too many."""
-        history = self.pairs.get(pair)
-        if history is None:
-            if len(self.pairs) == MAX_PAIRS and not self._remove_silent():
-                return None
-            history = self.pairs[pair] = History()
-        self.pairs.move_to_end(pair)
+    def history(self, pair: Pair) -> History:
+        """Return the history of a pair, a new one for a new pair."""
         self.revision += 1
-        return history
+        return self.pairs.add(pair, self.pairs.get(pair) or History())
 
     def add_sample(self, pair: Pair, sample: Sample) -> None:
         """Add a corrected range.
@@ -328,11 +320,9 @@ class Scene:
         if not sample.time_s < self._latest_s:
             self._latest_s, self._received_s = sample.time_s, self.clock()
         self.ranges += 1
-        if (history := self.history(pair)) is None:
-            self.not_shown += 1
-        else:
-            history.add(sample, self._latest_s)
-            history.received_s = self.clock()
+        history = self.history(pair)
+        history.add(sample, self._latest_s)
+        history.received_s = self.clock()
 
     def add_error(self, sample: Sample) -> None:
         """Count a range in the histograms if its truth is known."""
@@ -351,8 +341,7 @@ class Scene:
         self.revision += 1
 
     def add_trace(self, pair: Pair, trace: Trace) -> None:
-        if (history := self.history(pair)) is not None:
-            history.traces.append(trace)
+        self.history(pair).traces.append(trace)
 
     def add_pose(self, tag: str, pose: Pose) -> None:
         if _is_plausible(pose.x, pose.y):
@@ -390,7 +379,7 @@ class Scene:
         """Remove everything except the anchors."""
         self.rewind()
         self.pairs.clear()
-        self.ranges = self.not_shown = 0
+        self.ranges = 0
         self.reports.clear()
         self.error_counts[:] = 0
         self.error_sums_m[:] = 0
@@ -408,14 +397,6 @@ class Scene:
         own = self.tags.get(tag_frame(tag_id))
         nameless = {tag for _, tag in self.pairs if tag_frame(tag) not in self.tags}
         return self.tags.get(PLAIN) if own is None and nameless == {tag_id} else own
-
-    def _remove_silent(self) -> bool:
-        """Remove the pair without data for the longest time, if that is long enough."""
-        pair, history = next(iter(self.pairs.items()))
-        if history.latest is not None and self.age_s(history) < REPLACE_S:
-            return False
-        del self.pairs[pair]
-        return True
 
 
 def _is_plausible(x: float, y: float) -> bool:
