@@ -113,12 +113,6 @@ def test_one_process_takes_what_both_take(generate):
     assert [Path(file).name for file in pipeline.parameters[:2]] == ["driver.yaml", "mitigator.yaml"]
 
 
-def test_a_locator_starts_where_it_is_asked_for(generate):
-    *_, locator = launch(generate, "uwb.launch.py", source="simulated", locate="true", anchors="a.yaml")
-    assert (locator.executable, locator.respawn) == ("locator", True)
-    assert settings(locator) == {"anchors": "a.yaml", "use_sim_time": False}
-
-
 def test_a_viewer_starts_where_it_is_asked_for(generate):
     said = {"source": "simulated", "anchors": "a.yaml", "viewer": "true"}
     *_, viewer = launch(generate, "uwb.launch.py", **said, one_process="true")

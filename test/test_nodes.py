@@ -127,16 +127,6 @@ def test_a_loop_goes_on(ros: Ros, bag: Path):
     assert driver.signal(signal.SIGINT) == 0, driver.output
 
 
-def test_the_simulated_source_runs_until_it_is_told_to_stop(ros: Ros):
-    received = ros.collect(RangeCir, RAW)
-    driver = ros.start("driver", "simulated_rate:=100.0", "start_delay:=0.2")
-    ros.spin_until(lambda: len(received) > 50)
-    status = ros.diagnosis("driver", lambda status: bool(status.values))
-    assert status.hardware_id == "simulated"
-    assert driver.signal(signal.SIGTERM) == 0, driver.output
-    assert "Traceback" not in driver.output
-
-
 @pytest.mark.parametrize(
     ("parameters", "named"),
     [

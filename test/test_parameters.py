@@ -11,7 +11,6 @@ import pytest
 
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
-from rclpy.qos import ReliabilityPolicy
 from ros_harness import PAUSED, Ros, domain
 from uwb_mitigation_msgs.msg import RangeCir
 
@@ -43,16 +42,15 @@ def replaying(tmp_path_factory: pytest.TempPathFactory):
         ("mode", "cloud", ("mode", "cloud", "host, device")),
         ("seek_to", -5.0, ("seek_to", "-5.0", "1000000000")),
         ("seed", 7, ("seed", "read-only")),
+        ("rate", 3, None),
     ],
 )
-def test_a_value_is_refused_by_name_value_and_range(replaying: Ros, name: str, value: object, told: tuple):
+def test_a_value_is_refused_by_name_value_and_range(
+    replaying: Ros, name: str, value: object, told: tuple | None
+):
     result = replaying.set_parameter("driver", name, value)
-    assert not result.successful
-    assert all(word in result.reason for word in told), result.reason
-
-
-def test_a_whole_number_is_good_enough_for_a_number(replaying: Ros):
-    assert replaying.set_parameter("driver", "rate", 3).successful
+    assert result.successful == (told is None)
+    assert all(word in result.reason for word in told or ()), result.reason
 
 
 def test_a_parameter_that_no_node_knows_is_refused_with_what_was_meant(ros: Ros, tmp_path: Path):
@@ -102,22 +100,6 @@ def test_parameters_that_were_set_survive_a_respawn(
         "mitigator", lambda one: any(v.key == "offsets" and "0.22" in v.value for v in one.values)
     )
     assert status
-
-
-def test_known_parameters_are_not_reported(ros: Ros):
-    driver = ros.start("driver", "rate:=2.0", "use_sim_time:=false")
-    driver.wait_for_output("replaying")
-    assert "unknown" not in driver.output
-
-
-def test_quality_of_service_can_be_overridden(ros: Ros):
-    ros.start("mitigator", "qos_overrides./uwb/range_raw.subscription.reliability:=best_effort")
-    ros.wait_for_subscribers("/uwb/range_raw", 1)
-    ros.wait_for_publishers("/uwb/range_corrected", 1)
-    (raw,) = ros.node.get_subscriptions_info_by_topic("/uwb/range_raw")
-    (corrected,) = ros.node.get_publishers_info_by_topic("/uwb/range_corrected")
-    assert raw.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
-    assert corrected.qos_profile.reliability == ReliabilityPolicy.RELIABLE
 
 
 @pytest.mark.parametrize("value", ["reliability:=perhaps", "depth:=deep"])

@@ -109,13 +109,6 @@ def test_several_pipelines_side_by_side_keep_to_themselves(ros: Ros):
         assert [m.sequence for m in messages] == list(range(200))
 
 
-def test_a_pipeline_without_a_source_says_why_and_leaves(ros: Ros):
-    pipeline = ros.start("pipeline", "source:=mcap", "path:=/nonexistent.mcap")
-    assert pipeline.wait() == 1
-    assert "/nonexistent.mcap" in pipeline.output
-    assert "Traceback" not in pipeline.output
-
-
 def test_a_signal_ends_it_cleanly(ros: Ros):
     received = ros.collect(RangeCorrected, CORRECTED)
     pipeline = ros.start("pipeline", "simulated_rate:=200.0", "start_delay:=0.2")

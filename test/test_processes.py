@@ -16,7 +16,7 @@ pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
 TIMEOUT_S = 240.0
 RUNS = {
-    "bench": ["-c", "from uwb_mitigation.entry import command_line; command_line()", "bench", "nodes"],
+    "bench": ["-m", "benchmarks", "nodes"],
     "demo": ["-m", "uwb_mitigation.entry", "demo"],
 }
 
@@ -34,7 +34,6 @@ def nodes_of(pid: int) -> list[psutil.Process]:
 @pytest.mark.parametrize(
     ("run", "number", "code"),
     [
-        ("bench", signal.SIGTERM, 143),
         ("bench", signal.SIGKILL, -9),
         ("demo", signal.SIGTERM, 143),
         ("demo", signal.SIGINT, 130),

@@ -284,23 +284,6 @@ def test_the_newest_exchange_is_on_top(browser: Browser, view: View, server: Vie
     assert colours == [peak, none]
 
 
-def test_tags_are_told_apart_by_their_names(browser: Browser, view: View, server: ViewerServer) -> None:
-    with view.lock:
-        scene = view.scene
-        scene.set_anchors({1: AnchorPlace(0, 0, 0)})
-        for tag, name, x in ((7, "tag", 1.0), (8, "tag_8", 6.0)):
-            scene.add_sample((1, tag), Sample(1000.0, 5.3, 5.1, 0.1, Status.OK))
-            scene.add_pose(name, Pose(x, 3, 0))
-    opened(browser, server)
-    assert data(browser, "map", "x1") == [1.0]
-    browser.wait("the table", lambda: browser.cell("8")).click()
-    browser.wait("the ray to the other tag", lambda: data(browser, "map", "x1") == [6.0])
-    with view.lock:
-        scene.add_sample((1, 9), Sample(1000.0, 5.3, 5.1, 0.1, Status.OK))
-        assert scene.tag_of(8) is scene.tags["tag_8"]
-        assert scene.tag_of(7) is None, "the plain pose may be of either"
-
-
 def test_what_no_radio_measured_spoils_nothing(browser: Browser, view: View, server: ViewerServer) -> None:
     fill(view)
     nan, inf = math.nan, math.inf
