@@ -392,7 +392,7 @@ def test_the_lever_arm_is_read_from_every_bag_and_must_be_the_same(site, monkeyp
 
 def test_cirs_bring_the_universal_network_in(tmp_path, monkeypatch):
     """Without torch, whose candidate takes long: then it is said."""
-    from uwb_mitigation.model.float_networks import float_network
+    from uwb_mitigation.model.floating import float_network
     from uwb_mitigation.model.shipped import default_model_path
     from uwb_mitigation.training import candidates
     from uwb_mitigation.training.candidates import network_m

@@ -433,19 +433,3 @@ def test_the_real_logs_equal_a_naive_reading(apartment):
         for measurement, (_, lines) in list(zip(measurements, exchanges, strict=True))[::8]:
             expected = [int(value) for line in lines or [] for value in line.split(b", ")]
             assert measurement.cir.samples.tolist() == expected
-
-
-@pytest.mark.slow
-def test_the_real_folder_is_in_order_of_time_and_has_all_truth(apartment_reading):
-    records = apartment_reading.records
-    assert len(records) == 4151
-    stamps = np.array([record.measurement.stamp_ns for record in records])
-    assert (np.diff(stamps) >= 0).all()
-    assert Oddity.MOVED.value not in apartment_reading.skipped
-    truths = {record.truth.configuration: record.truth for record in records if record.truth is not None}
-    assert len(truths) == 28
-    nineteen = truths["evk1000_apartment/19"]
-    assert nineteen.range_m == pytest.approx(math.hypot(7.76 - 3.46, 6.79 - 6.4))
-    assert nineteen.label == "NDP NLOS"
-    errors = [r.measurement.range_m - r.truth.range_m for r in records if r.truth and r.truth.label == "LOS"]
-    assert np.median(errors) == pytest.approx(0.22, abs=0.05)

@@ -17,7 +17,6 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
-import yaml
 from compilers import NEEDS_CC
 from conftest import REPOSITORY
 
@@ -67,25 +66,6 @@ def test_the_firmware_that_a_computer_compiles_is_shared(share: Path):
     library = [path for part in ("src", "host") for path in (REPOSITORY / "firmware" / part).glob("*.[ch]")]
     expected = {f"{path.parent.name}/{path.name}": path.read_bytes() for path in library}
     assert files_below(share / "firmware") == expected
-
-
-def test_nothing_else_is_shared(share: Path):
-    ours = {path.name for path in share.iterdir() if not path.name.startswith(("package.", "local_setup."))}
-    assert ours - {"hook", "colcon-core"} == {
-        "launch",
-        "params",
-        "models",
-        "udev",
-        "rviz",
-        "foxglove",
-        "firmware",
-        "requirements",
-    }
-    assert (share / "package.xml").read_bytes() == (REPOSITORY / "package.xml").read_bytes()
-    for name in files_below(share / "launch"):
-        assert name.endswith(".launch.py"), "ros2 launch completes no other names"
-    for path in (share / "params").iterdir():
-        assert set(yaml.safe_load(path.read_text())["/**"]) == {"ros__parameters"}
 
 
 def test_the_executables_are_where_ros2_run_looks(prefix: Path):

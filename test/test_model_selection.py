@@ -22,7 +22,7 @@ from uwb_mitigation.sources import opening
 from uwb_mitigation.sources.truth_table import load_truth, with_truth
 
 pytest.importorskip("torch", reason="run `make setup-training`")
-from uwb_mitigation.model.float_networks import float_network
+from uwb_mitigation.model.floating import float_network
 from uwb_mitigation.training import candidates, comparison, recordings, selection, train
 from uwb_mitigation.training.candidates import Candidate, FittedModel, Recipe, network_m
 from uwb_mitigation.training.options import FitOptions

@@ -14,7 +14,6 @@ from uwb_mitigation.errors import ModelError
 from uwb_mitigation.measurement import Status
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.architecture import Remnet
-from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.familiarity import Band, Familiarity, Strangeness, features
 from uwb_mitigation.preprocessing import Preprocessing, Scaling
 
@@ -74,14 +73,6 @@ def test_energy_before_the_first_path_needs_no_level(scaling):
     assert Strangeness(only.bands).score(found) == pytest.approx([0.5], abs=0.02)
 
 
-@pytest.mark.parametrize("level", [0.0, 1e-20, 1e16])
-def test_a_level_is_finite_whatever_the_window_holds(level):
-    window = np.full((1, 157), level, np.float32)
-    assert np.isfinite(
-        features(window, Scaling.PREAMBLE, *(np.float32([value]) for value in (3.0, -80.0, -85.0)))
-    ).all()
-
-
 def test_distance_alone_is_not_strange_and_a_weaker_radio_is(tmp_path):
     one = mitigation(tmp_path, power_at_1m_dbm=Band(-74.0, -70.0, 2.0))
     near, far, weak = (
@@ -98,12 +89,6 @@ def test_the_score_is_the_largest_excess_in_margins():
     assert scale.score(values).tolist()[1:4] == [0.5, 0.75, 1.5]
     assert scale.score(values)[0] <= 0
     assert np.isnan(scale.score(values)[4])
-
-
-def test_familiar_measurements_are_corrected_by_the_predicted_error(tmp_path):
-    subject, plain = mitigation(tmp_path), Mitigation(bundle(tmp_path, SHAPE))
-    found, expected = subject.correct([measurement()])[0], plain.correct([measurement()])[0]
-    assert found.correction_m == expected.correction_m
 
 
 def test_the_variance_grows_with_the_predicted_error(tmp_path):
@@ -136,12 +121,6 @@ def test_batches_grade_to_the_bit_as_single_measurements(tmp_path):
     single = [subject.correct([item])[0] for item in subjects]
     assert {result.status for result in single} >= {Status.OK, Status.OUT_OF_DISTRIBUTION}
     assert [repr(result) for result in subject.correct(subjects)] == [repr(r) for r in single]
-
-
-def test_a_bundle_keeps_its_familiarity(tmp_path):
-    saved = bundle(tmp_path, SHAPE, familiarity=bands(), variance_per_m2=0.5, interval95_sigmas=3.25)
-    card = load_bundle(saved.path).card
-    assert (card.familiarity, card.variance_per_m2, card.interval95_sigmas) == (bands(), 0.5, 3.25)
 
 
 @pytest.mark.parametrize("band", [(2.0, 1.0, 1.0), (0.0, 1.0, 0.0), (math.nan, 1.0, 1.0), (0.1, 1.0, 1.0)])

@@ -73,9 +73,11 @@ class Offsets:
             (tag, anchor): _checked(value, f"anchor {format_id(anchor)}, tag {format_id(tag)}", where)
             for (tag, anchor), value in pairs.items()
         }
-        self.pair_sd = {
-            pair: _deviation(pair_sd[pair], pair, where) for pair in self.pairs if pair in pair_sd
-        }
+        self.pair_sd = {pair: float(pair_sd[pair]) for pair in self.pairs if pair in pair_sd}
+        for (tag, anchor), sd in self.pair_sd.items():
+            if not 0.0 < sd <= MAX_OFFSET_M:
+                what = f"sd = {sd!r:.60} m of anchor {format_id(anchor)}, tag {format_id(tag)}"
+                raise ParameterError(what, where=where, valid=f"more than 0, {MAX_OFFSET_M:g} m at most")
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Offsets):
@@ -218,7 +220,7 @@ def _by_identity(entries: object, name: str, where: str) -> dict[int, float]:
 def _by_pair(
     entries: object, where: str
 ) -> tuple[dict[tuple[int, int], float], dict[tuple[int, int], float]]:
-    """Offsets and deviations."""
+    """Return offsets and standard deviations by pair."""
     if not isinstance(entries, list):
         raise ParameterError(f"pairs = {entries!r:.60}", where=where, valid=SCHEMA)
     found: dict[tuple[int, int], float] = {}
@@ -232,7 +234,7 @@ def _by_pair(
             raise ParameterError("the pair is there twice", where=place, valid="one entry for each")
         found[pair] = _number(entry["offset"], "offset", place)
         if "sd" in entry:
-            deviations[pair] = _deviation(_number(entry["sd"], "sd", place), pair, place)
+            deviations[pair] = _number(entry["sd"], "sd", place)
     return found, deviations
 
 
@@ -248,17 +250,6 @@ def _number(value: object, name: str, where: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise ParameterError(f"{name} = {value!r:.60}", where=where, valid="a number of metres")
     return _checked(value, name, where)
-
-
-def _deviation(value: float, pair: tuple[int, int], where: str) -> float:
-    if not 0.0 < value <= MAX_OFFSET_M:
-        tag, anchor = pair
-        raise ParameterError(
-            f"sd = {value!r:.60} m of anchor {format_id(anchor)}, tag {format_id(tag)}",
-            where=where,
-            valid=f"more than 0, {MAX_OFFSET_M:g} m at most",
-        )
-    return float(value)
 
 
 def _checked(value: float, name: str, where: str) -> float:

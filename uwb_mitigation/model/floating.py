@@ -1,11 +1,16 @@
-"""The float network in numpy: what calibration looks into, and a check on torch and ONNX Runtime."""
+"""The float network in numpy: of a bundle, its activations for calibration, and a check on torch and ONNX Runtime."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.model.architecture import HEAD, Convolution, Mlp
+from uwb_mitigation.errors import ModelError
+from uwb_mitigation.model import graph
+from uwb_mitigation.model.architecture import HEAD, Convolution, Mlp, Remnet
+from uwb_mitigation.model.bundle import Bundle
 from uwb_mitigation.model.weights import FloatWeights, activation_tensors, layer_inputs, sum_operands
 
 CHUNK = 256
@@ -53,3 +58,32 @@ def predict_m(weights: FloatWeights, inputs: NDArray[np.float32]) -> NDArray[np.
         flat = activations(weights, inputs[start : start + CHUNK])[last]
         outputs.append(flat.reshape(len(flat), -1) @ weights.weight[HEAD][:, 0] + weights.bias[HEAD])
     return np.concatenate(outputs) if outputs else np.zeros(0, np.float32)
+
+
+def float_network(source: Bundle) -> FloatWeights:
+    """The float network that an int8 bundle stands for; of a float bundle its own.
+
+    Raises:
+        ModelError: it is no REMNet.
+    """
+    if not isinstance(source.architecture, Remnet):
+        raise ModelError("no REMNet to start from", where=str(source.path), valid="a bundle of `train`")
+    if not source.quantised:
+        return graph.float_weights(source.model, source.architecture)
+    integers = graph.int8_weights(source.model, source.architecture)
+    reads = layer_inputs(source.architecture)
+    weight, bias = {}, {}
+    for layer, values in integers.weight.items():
+        scale = integers.weight_scale[layer]
+        shaped = scale if layer == HEAD else scale[:, None, None]
+        weight[layer] = (values * shaped).astype(np.float32)
+        unit = integers.activation_scale[reads[layer]] * scale
+        bias[layer] = (integers.bias[layer] * unit).astype(np.float32)
+    return FloatWeights(source.architecture, weight, bias)
+
+
+def scaled(network: FloatWeights, factor: float) -> FloatWeights:
+    """The network that predicts `factor` times as much; with 0 it predicts nothing."""
+    weight = {**network.weight, HEAD: network.weight[HEAD] * np.float32(factor)}
+    bias = {**network.bias, HEAD: network.bias[HEAD] * np.float32(factor)}
+    return replace(network, weight=weight, bias=bias)

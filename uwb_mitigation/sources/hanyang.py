@@ -19,7 +19,7 @@ from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.measurement import Cir, RangeMeasurement, Record
 from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
 from uwb_mitigation.positioning.tracks import TruePath
-from uwb_mitigation.sources.csv_rows import read_rows
+from uwb_mitigation.sources.csv_rows import identity, read_rows
 from uwb_mitigation.sources.source import Source
 
 TAG_ID = 1
@@ -35,6 +35,7 @@ _RANGE_COLUMNS = ("field.stamp", "field.id", "field.x", "field.y", "field.z", "f
 _POWERS = ("field.rssi", "field.rssi_fp")
 _PATH_COLUMNS = ("timestamp", "x", "y", "z")
 _ANCHOR_SD_M = 0.02
+_Row = tuple[int, int, float, float, float]
 
 
 def is_run(folder: Path) -> bool:
@@ -67,7 +68,7 @@ class HanyangRun(Source):
         self._odd: Counter[str] = Counter()
         files = sorted(path for path in folder.iterdir() if _ANCHOR.fullmatch(path.name))
         anchors: dict[int, Anchor] = {}
-        rows: list[tuple[int, int, float, float, float]] = []
+        rows: list[_Row] = []
         for path in files:
             self._read_anchor(path, anchors, rows)
         self.anchors = AnchorMap([anchors[key] for key in sorted(anchors)], str(folder))
@@ -87,15 +88,10 @@ class HanyangRun(Source):
                 tag_position=(place[0], place[1], place[2]) if math.isfinite(place[0]) else None,
             )
 
-    def _read_anchor(
-        self,
-        path: Path,
-        anchors: dict[int, Anchor],
-        rows: list[tuple[int, int, float, float, float]],
-    ) -> None:
+    def _read_anchor(self, path: Path, anchors: dict[int, Anchor], rows: list[_Row]) -> None:
         for line, row in read_rows(path, _RANGE_COLUMNS, MAX_BYTES):
             where = f"{path}: line {line}"
-            stamp_ns, key = (_whole(row[name], where) for name in ("field.stamp", "field.id"))
+            stamp_ns, key = (identity(row, name, where) for name in ("field.stamp", "field.id"))
             x, y, z = (_number(row[f"field.{axis}"], where) for axis in "xyz")
             anchor = Anchor(key, (x, y, z), _ANCHOR_SD_M)
             if anchors.setdefault(key, anchor) != anchor:
@@ -120,22 +116,12 @@ class HanyangRun(Source):
         ]
         table: NDArray[np.float64] = np.array(rows, np.float64).reshape(-1, 4)
         table = table[np.isfinite(table).all(axis=1)]
-        lost = (
-            np.abs(table[:, 3] - np.median(table[:, 3])) > GNSS_LOST_M
-            if len(table)
-            else np.zeros(0, np.bool_)
-        )
-        if lost.any():
-            self._odd["place without GNSS"] += int(lost.sum())
+        height = np.median(table[:, 3]) if len(table) else 0.0
+        lost = np.abs(table[:, 3] - height) > GNSS_LOST_M
+        self._odd += Counter({"place without GNSS": int(lost.sum())})
         table = table[~lost]
         table = table[np.argsort(table[:, 0], kind="stable")]
         return TruePath(table[:, 0].astype(np.int64), table[:, 1:] + (0.0, 0.0, ANTENNA_M))
-
-
-def _whole(text: str, where: str) -> int:
-    if text.isascii() and text.isdigit() and len(text) <= 19:
-        return int(text)
-    raise RecordingError(f"{text!r:.40} is no whole number", where=where, valid="0 to 10^19")
 
 
 def _number(text: str | None, where: str) -> float:

@@ -19,7 +19,7 @@ from uwb_mitigation.evaluation.dataset import Dataset
 from uwb_mitigation.model import graph
 from uwb_mitigation.model.architecture import Remnet
 from uwb_mitigation.model.bundle import Bundle, session_options
-from uwb_mitigation.model.float_networks import float_network, scaled
+from uwb_mitigation.model.floating import float_network, scaled
 from uwb_mitigation.model.prior import LinePrior
 from uwb_mitigation.model.weights import FloatWeights
 from uwb_mitigation.training.options import FitOptions

@@ -20,7 +20,7 @@ from uwb_mitigation.evaluation.site_data import SiteData
 from uwb_mitigation.files import write_together
 from uwb_mitigation.model import graph
 from uwb_mitigation.model.bundle import Bundle, made_bundle
-from uwb_mitigation.model.float_networks import float_network, scaled
+from uwb_mitigation.model.floating import float_network, scaled
 from uwb_mitigation.offsets import Offsets, dump_offsets
 from uwb_mitigation.positioning.geometry import Area, Height
 from uwb_mitigation.positioning.localised import Localised, PosePath, solve_localised

@@ -16,7 +16,7 @@ from uwb_mitigation.evaluation.metrics import ErrorStatistics, mae_by_group
 from uwb_mitigation.model import floating, graph
 from uwb_mitigation.model.architecture import Remnet
 from uwb_mitigation.model.bundle import Bundle, Card, load_bundle, save_bundle
-from uwb_mitigation.model.float_networks import float_network, scaled
+from uwb_mitigation.model.floating import float_network, scaled
 from uwb_mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.model.prior import LinePrior
 from uwb_mitigation.model.shipped import default_model_path
