@@ -22,7 +22,7 @@ import uwb_mitigation
 from uwb_mitigation.bag import schemas
 from uwb_mitigation.bag.codec import encode_range, encode_truth
 from uwb_mitigation.bag.poses import encode_place
-from uwb_mitigation.bag.reader import Channel
+from uwb_mitigation.bag.reader import Channel, Schema
 from uwb_mitigation.bag.rosbag2 import (
     METADATA_NAME,
     NO_QOS,
@@ -85,11 +85,11 @@ class BagWriter:
         self._partial = partial_file(path)
         self._metadata = {"version": uwb_mitigation.__version__, **metadata}
         self.counts: Counter[str] = Counter()
-        self._channels: dict[str, int] = {}
-        self._copied: dict[tuple[object, ...], int] = {}
+        self._ours: dict[str, int] = {}
+        self._numbers: dict[tuple[object, ...], int] = {}
         self._names: dict[int, str] = {}
         self._topics: dict[str, TopicCount] = {}
-        self._schemas: dict[tuple[str, str, bytes], int] = {}
+        self._schemas: dict[Schema, int] = {}
         self._first_ns: int | None = None
         self._last_ns = 0
         self._stream: BinaryIO | None = None
@@ -144,18 +144,7 @@ class BagWriter:
         Its recorded quality of service comes with it, spelt as by the current rosbag2.
         """
         metadata = channel.metadata | {_QOS_KEY: dump(recorded_qos(channel.metadata.get(_QOS_KEY, "")))}
-        key = (channel.topic, channel.encoding, channel.schema, *sorted(metadata.items()))
-        if key not in self._copied:
-            schema = channel.schema
-            self._copied[key] = self._add_channel(
-                channel.topic,
-                schema.name if schema else "",
-                schema.encoding if schema else "",
-                schema.data if schema else None,
-                channel.encoding,
-                metadata,
-            )
-        return self._copied[key]
+        return self._add_channel(replace(channel, metadata=metadata))
 
     def corrected_channel(self) -> int:
         """Register `/uwb/range_corrected`, for messages that are serialised already; returns its number."""
@@ -204,39 +193,28 @@ class BagWriter:
         )
 
     def _our_channel(self, topic: str, type_name: str) -> int:
-        channel = self._channels.get(topic)
-        if channel is None:
-            channel = self._channels[topic] = self._add_channel(
-                topic,
-                type_name,
-                SchemaEncoding.ROS2,
-                schemas.definition(type_name).encode(),
-                MessageEncoding.CDR,
-                {_QOS_KEY: NO_QOS, _HASH_KEY: schemas.type_hash(type_name)},
-            )
-        return channel
+        number = self._ours.get(topic)
+        if number is None:
+            schema = Schema(type_name, SchemaEncoding.ROS2, schemas.definition(type_name).encode())
+            metadata = {_QOS_KEY: NO_QOS, _HASH_KEY: schemas.type_hash(type_name)}
+            number = self._add_channel(Channel(0, topic, MessageEncoding.CDR, metadata, schema))
+            self._ours[topic] = number
+        return number
 
-    def _add_channel(
-        self,
-        topic: str,
-        type_name: str,
-        schema_encoding: str,
-        schema: bytes | None,
-        encoding: str,
-        metadata: Mapping[str, str],
-    ) -> int:
+    def _add_channel(self, channel: Channel) -> int:
+        topic, schema, metadata = channel.topic, channel.schema, channel.metadata
+        key = (topic, channel.encoding, schema, *sorted(metadata.items()))
+        if key in self._numbers:
+            return self._numbers[key]
         with self._writing():
-            schema_id = _NO_SCHEMA
-            if schema is not None:
-                key = (type_name, schema_encoding, schema)
-                if key not in self._schemas:
-                    self._schemas[key] = self._mcap.register_schema(type_name, schema_encoding, schema)
-                schema_id = self._schemas[key]
-            number = self._mcap.register_channel(topic, encoding, schema_id, dict(metadata))
-        self._names[number] = topic
+            if schema is not None and schema not in self._schemas:
+                self._schemas[schema] = self._mcap.register_schema(schema.name, schema.encoding, schema.data)
+            schema_id = _NO_SCHEMA if schema is None else self._schemas[schema]
+            number = self._mcap.register_channel(topic, channel.encoding, schema_id, metadata)
+        self._numbers[key], self._names[number] = number, topic
         # A topic may have several channels, of several publishers; rosbag2 lists it once.
-        qos = recorded_qos(metadata[_QOS_KEY])
-        self._topics.setdefault(topic, TopicCount(topic, type_name, metadata.get(_HASH_KEY, ""), 0, qos))
+        kind, qos = schema.name if schema else "", recorded_qos(metadata[_QOS_KEY])
+        self._topics.setdefault(topic, TopicCount(topic, kind, metadata.get(_HASH_KEY, ""), 0, qos))
         return number
 
     def _finish(self) -> None:

@@ -125,15 +125,13 @@ def _result(outcomes: list[Outcome], seconds: float, model_id: int) -> dict[str,
 
 
 def _bag(outcome: Outcome) -> dict[str, Any]:
+    counts = {name: getattr(outcome, name) for name in ("messages", "ranges", "replaced", "seconds")}
     return {
         "source": str(outcome.job.source),
         "output": str(outcome.job.output) if outcome.written else None,
-        "messages": outcome.messages,
-        "ranges": outcome.ranges,
+        **counts,
         "statuses": dict(outcome.statuses),
-        "replaced": outcome.replaced,
         "skipped": dict(outcome.skipped),
-        "seconds": outcome.seconds,
         "error": str(outcome.error) if outcome.error else None,
     }
 

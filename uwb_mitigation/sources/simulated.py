@@ -8,7 +8,6 @@ from a generator of its own. Stamps begin at 0 and follow the rate; nothing wait
 from __future__ import annotations
 
 import math
-from abc import abstractmethod
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -88,9 +87,13 @@ class Simulated(Source):
         self._count = count
         self._radio = radio
 
-    @abstractmethod
+    def _batches(self) -> Iterable[tuple[Exchanges, np.random.Generator]]:
+        """In the order of time, each with the generator that the radio draws from."""
+        raise NotImplementedError
+
     def _measurements(self) -> Iterator[Record]:
         """All of them in order of time; what is left out is counted in `skipped`."""
+        return self._received(self._batches())
 
     def __iter__(self) -> Iterator[Record]:
         self.skipped = Counter()
@@ -130,18 +133,7 @@ class Simulated(Source):
             yield Record(measurement, truth, None if links.at_rest else (x, y, 0.0))
 
 
-class OneStream(Simulated):
-    """A source that simulates a single row of batches, up to its count."""
-
-    @abstractmethod
-    def _batches(self) -> Iterator[tuple[Exchanges, np.random.Generator]]:
-        """In order of time, each with the generator that the radio is to draw from."""
-
-    def _measurements(self) -> Iterator[Record]:
-        return self._received(self._batches())
-
-
-class SimulatedSource(OneStream):
+class SimulatedSource(Simulated):
     """Tags on a robot's route through a flat, ranging to fixed anchors in turn; a `Source`.
 
     Each metre of the route is a configuration of its own for each pair, "simulated seed 1/tag 101/
@@ -239,7 +231,7 @@ class SimulatedSource(OneStream):
         )
 
 
-class SimulatedSurvey(OneStream):
+class SimulatedSurvey(Simulated):
     """Independent placements at rest, many exchanges each, like a surveyed data set; a `Source`.
 
     Both antennas lie anywhere in the plan, 0.2 m from its border and at least `CLOSEST_M` apart. A
@@ -303,7 +295,7 @@ class SimulatedSurvey(OneStream):
             )
 
 
-class SimulatedBuildings(OneStream):
+class SimulatedBuildings(Simulated):
     """Placements at rest in random buildings, about as many in line of sight as behind obstacles; a `Source`.
 
     A configuration is one placement: "simulated buildings seed 1/flat 12/placement 801". The range error is the
