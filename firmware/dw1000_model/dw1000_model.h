@@ -1,6 +1,6 @@
 /* A model of the DW1000, register by register, in virtual time: several chips share one air, and the program of each
- * chip's host is a coroutine. Any driver that talks to the chip through SPI runs on it; docs/dw1000_model.md says what
- * is modelled, and what fails as it does on the chip.
+ * chip's host is a coroutine. Any driver that talks to the chip through SPI runs on it; docs/dw1000_model.md lists what
+ * is modelled, and which errors of a driver show as on the chip.
  *
  * One air is used by one thread at a time; airs do not know of each other. The same seed and programs give the same run. */
 #ifndef DW1000_MODEL_H
@@ -16,10 +16,10 @@ extern "C" {
 typedef struct dw1000_air dw1000_air;
 typedef struct dw1000_chip dw1000_chip;
 
-/* What a frame meets on its way. What is 0 has a default, so that `{.distance_m = 3}` is a clean link. */
+/* Properties of a link. Fields that are 0 have defaults, so that `{.distance_m = 3}` is a clean link. */
 typedef struct {
     double distance_m;       /* along the straight line, 0 to 100,000 */
-    double excess_m;         /* by how much the detected first path is late */
+    double excess_m;         /* excess path of the detected first path */
     const int16_t *iq;       /* real, imaginary, real, ...: copied. NULL = one path and a little noise */
     size_t samples;          /* complex ones, at most 1016; the chip's accumulator is filled up with zeros */
     double first_path_index; /* in samples, 1/64 is kept; 0 = where the accumulator first rises to half of a peak */
@@ -34,14 +34,14 @@ typedef struct {
 dw1000_air *dw1000_air_new(uint64_t seed);
 void dw1000_air_free(dw1000_air *air);
 
-/* A chip that was powered a while ago and is idle. `ppm`: by how much its crystal is fast. `clock_ticks`: its 40-bit
+/* A chip that was powered a while ago and is idle. `ppm`: error of its crystal, positive if it is fast. `clock_ticks`: its 40-bit
  * counter at time 0; a reset does not change it. `tx_delay_ticks`, `rx_delay_ticks`: from counter to antenna and back,
  * which a driver has to know; the OTP memory holds their sum. */
 dw1000_chip *dw1000_chip_new(dw1000_air *air, double ppm, uint64_t clock_ticks, uint16_t tx_delay_ticks,
                              uint16_t rx_delay_ticks);
 
-/* Join two chips, both ways; once more = anew; NULL = they no longer hear each other. Frames that are being received
- * keep what they began with. */
+/* Link two chips in both directions, in place of an earlier link; NULL: remove the link. A frame that is being received
+ * keeps the link it began with. */
 void dw1000_link(dw1000_air *air, dw1000_chip *a, dw1000_chip *b, const dw1000_link_config *config);
 
 /* Give a chip's host a program, from now on, in place of the one before. */
@@ -95,7 +95,7 @@ void dw1000_lose_edges(dw1000_chip *chip, double probability);
 void dw1000_program_otp(dw1000_chip *chip, unsigned address, uint32_t word);
 /* Transmit power of the last frame for preamble and data, and for the PHR: dB above the lowest that TX_POWER can set. */
 void dw1000_sent_power(const dw1000_chip *chip, double *data_db, double *header_db);
-/* What destroyed the chip, in words; NULL = nothing has. */
+/* What destroyed the chip; NULL: the chip works. */
 const char *dw1000_fault(const dw1000_chip *chip);
 
 #ifdef __cplusplus

@@ -71,7 +71,7 @@ static double find_first_path(const link *path) {
     return (double)after - (high > low ? (high - half) / (high - low) : 0);
 }
 
-/* The same sums as uwb_mitigation/sources/simulation/radio.py: what a link reports does not depend on who asks. */
+/* The same sums as uwb_mitigation/sources/simulation/radio.py: so that both give the same register values. */
 static void measure(link *path, const dw1000_link_config *config) {
     double energy = 0, noise = 0, sum = 0;
     for (size_t i = 0; i < ACCUMULATOR_SAMPLES; i++) {

@@ -1,5 +1,5 @@
-/* What the model's files share. None of it is for users of the library; symbols have its prefix all the same, so that
- * a driver can define `get` or `control`. */
+/* Types and functions shared by the model's files, not for users of the library. All symbols have the prefix, so that a
+ * driver can define `get` or `control`. */
 #ifndef DW1000_MODEL_INTERNAL_H
 #define DW1000_MODEL_INTERNAL_H
 
@@ -100,7 +100,7 @@ typedef struct {
     event_group group;
 } event;
 
-/* What the receiver's registers tell of a link, worked out once. Shared by both directions. */
+/* A link, and the receiver's register values for it. Shared by both directions. */
 typedef struct {
     unsigned users;
     uint64_t key; /* of its dice */
@@ -207,7 +207,7 @@ air_interface dw1000_receive_mode(const dw1000_chip *chip);
 instant dw1000_symbol_units(unsigned prf);
 
 /* events.c: virtual time, programs, SYS_STATUS and the IRQ line. */
-void *dw1000_memory(size_t bytes); /* zeroed; ends the process if there is none */
+void *dw1000_memory(size_t bytes); /* zeroed; aborts if memory is exhausted */
 void dw1000_schedule(dw1000_chip *chip, event_group group, instant at, handler *fire, transmission *frame);
 void dw1000_cancel(dw1000_chip *chip, event_group group);
 void dw1000_pass(dw1000_air *air, instant until);

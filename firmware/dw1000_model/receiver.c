@@ -7,7 +7,7 @@
 #define WARM_UP_US 16.0
 #define DETECTION_CHUNKS 2 /* of preamble acquisition, before a preamble is noticed */
 #define GLITCH_US 0.5
-#define CAPTURE 4.0 /* 6 dB: by how much a frame must be stronger to survive another one */
+#define CAPTURE 4.0 /* 6 dB: a frame that is stronger than another one by this survives it */
 #define TIMEOUT_TICKS 65536 /* RX_FWTO's unit */
 #define SAMPLES_AT_16MHZ 992
 #define SHIFT_TICKS 256 /* at least, of a stamp after an error without a receiver reset */

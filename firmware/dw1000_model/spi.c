@@ -5,7 +5,7 @@
 
 /* Chip select to first clock, last clock to chip select, chip select idle (datasheet 2.12, table 18). */
 #define FRAMING_NS 96.0
-/* A register that changes while it is read is seen as it is then: long reads are taken in pieces. */
+/* Registers may change during a read: long reads are done in pieces. */
 #define PIECE 64
 
 typedef struct {

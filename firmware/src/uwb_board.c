@@ -80,7 +80,7 @@ static int correct(uwb_board *board, const uwb_range_cir_t *fields, const uwb_ci
 
 static const float MAX_OFFSET_M = 10.0f;
 
-/* NaN is none. */
+/* False for NaN. */
 static int is_offset(float offset_m) {
     return offset_m >= -MAX_OFFSET_M && offset_m <= MAX_OFFSET_M;
 }

@@ -36,7 +36,7 @@ static float energy(uwb_scaling scaling, const float *window, size_t count) {
     return sum;
 }
 
-/* 10 log10 within 0.03 dB: the exponent is exact, and a parabola stands for the mantissa's logarithm. */
+/* 10 log10 within 0.03 dB: the exponent is exact, and a parabola approximates the logarithm of the mantissa. */
 static float level_db(float power) {
     const float bounded = power < 1e-30f ? 1e-30f : power > 1e30f ? 1e30f : power;
     int exponent;

@@ -1,6 +1,6 @@
-/* Driver of the Decawave DW1000, for microcontrollers and for computers: what is wired to the chip is behind callbacks.
+/* Driver of the Decawave DW1000, for microcontrollers and for computers. Callbacks reach the chip.
  *
- * No allocation and no globals; every wait is bounded, and every function says what went wrong. Register names are
+ * No allocation and no globals; every wait is bounded, and every function returns a status. Register names are
  * those of the DW1000 User Manual. One frame is received at a time (single buffer, no automatic re-enabling): the
  * accumulator belongs to the frame that was received last until the receiver is enabled again. */
 #ifndef UWB_DW1000_H
@@ -20,7 +20,7 @@ extern "C" {
 
 typedef enum {
     UWB_DW1000_OK = 0,
-    UWB_DW1000_BAD_ARGUMENT, /* a setting that the chip has not, or a length beyond its memory */
+    UWB_DW1000_BAD_ARGUMENT, /* a setting that the chip does not have, or a length beyond its memory */
     UWB_DW1000_BUS,          /* the transfer callback failed */
     UWB_DW1000_ABSENT,       /* DEV_ID is not a DW1000's: wiring, supply, or SPI too fast */
     UWB_DW1000_NO_CLOCK,     /* the clock PLL did not report its lock, and the chip ignores SPI at full speed */
@@ -31,7 +31,7 @@ typedef enum {
     UWB_DW1000_UNSENT        /* a transmission did not end in time */
 } uwb_dw1000_status;
 
-/* What joins the driver and a chip. */
+/* Callbacks that connect the driver to a chip. */
 typedef struct {
     void *context;
     /* One chip-select period: `header`, then `bytes` octets out of `out`, or into `in` where `out` is NULL. Returns 0,
@@ -44,10 +44,10 @@ typedef struct {
     /* Return when the IRQ line is high, at `until_us`, or earlier: the driver then looks at SYS_STATUS. Other work may
      * be done meanwhile. With no IRQ wired, return at once, or after a pause. */
     void (*wait)(void *context, uint64_t until_us);
-    void (*sleep)(void *context, uint32_t us); /* at least so long */
+    void (*sleep)(void *context, uint32_t us); /* at least for this time */
 } uwb_dw1000_io;
 
-/* What both ends must agree in, but for the preamble's length and the power. */
+/* Both ends must have the same settings, except for the preamble's length and the power. */
 typedef struct {
     uint8_t channel;         /* 1, 2, 3, 4, 5, 7 */
     uint8_t prf_mhz;         /* 16, 64 */
@@ -67,7 +67,7 @@ extern const uwb_dw1000_settings uwb_dw1000_defaults;
 
 typedef struct {
     uwb_dw1000_io io;
-    uwb_dw1000_settings settings; /* in force; nothing in it is 0 for unknown any more */
+    uwb_dw1000_settings settings; /* in force, with the values of the chip where 0 was given */
     uint64_t eui;                 /* of the chip: from the OTP memory, or lot and part if that holds none */
     uint32_t otp_antenna_delay;   /* OTP memory: TX + RX, 31:16 at 64 MHz, 15:0 at 16 MHz */
     uint32_t otp_trek_delay[4];   /* per direction, 31:16 anchor, 15:0 tag: channel 2 at 6.8M and 110k, channel 5 */
@@ -97,7 +97,7 @@ typedef struct {
     uint8_t octets[UWB_DW1000_MAX_FRAME_BYTES];
 } uwb_dw1000_frame;
 
-/* What the chip knows of the reception beside the frame. */
+/* Measurements of the chip on a received frame. */
 typedef struct {
     uint16_t first_path_amplitude[3]; /* FP_AMPL1 to FP_AMPL3 */
     uint16_t preamble_count;          /* RXPACC without the part of the SFD */
@@ -111,7 +111,7 @@ typedef struct {
  * the usual ones. */
 uwb_dw1000_status uwb_dw1000_start(uwb_dw1000 *chip, const uwb_dw1000_io *io, const uwb_dw1000_settings *settings);
 
-/* Other settings for a chip that was started. BAD_ARGUMENT leaves it as it was. */
+/* Other settings for a chip that was started. BAD_ARGUMENT changes nothing. */
 uwb_dw1000_status uwb_dw1000_configure(uwb_dw1000 *chip, const uwb_dw1000_settings *settings);
 
 /* Whether the settings are ones that a chip has. */
@@ -123,7 +123,7 @@ uwb_dw1000_status uwb_dw1000_check(uwb_dw1000 *chip);
 /* Duration on the air of a frame of `bytes` octets without check sequence. */
 uint32_t uwb_dw1000_air_us(const uwb_dw1000_settings *settings, size_t bytes);
 
-#define UWB_DW1000_NO_LIMIT UINT32_MAX /* of the time that the chip listens: until it is told otherwise */
+#define UWB_DW1000_NO_LIMIT UINT32_MAX /* listen without a timeout */
 
 /* Send now, or with smart power 1 ms after the frame before; then, if `answer_us` is not 0, listen for that time. */
 uwb_dw1000_status uwb_dw1000_send(uwb_dw1000 *chip, const uint8_t *octets, size_t bytes, uint32_t answer_us);
@@ -148,7 +148,7 @@ uwb_dw1000_status uwb_dw1000_sent(uwb_dw1000 *chip, uint64_t until_us, uint64_t 
 uwb_dw1000_status uwb_dw1000_listen(uwb_dw1000 *chip, uint32_t for_us);
 
 /* Wait for a frame until `until_us`, and read it. On anything but OK the receiver is off, or as on DAMAGED and TIMEOUT
- * ready to be enabled anew. */
+ * ready to be enabled again. */
 uwb_dw1000_status uwb_dw1000_receive(uwb_dw1000 *chip, uwb_dw1000_frame *frame, uint64_t until_us);
 
 /* As TIMEOUT if nothing has been received by `until_us`, but leaves the receiver on. */
@@ -157,7 +157,7 @@ uwb_dw1000_status uwb_dw1000_receive_or_stay(uwb_dw1000 *chip, uwb_dw1000_frame 
 /* Transmitter and receiver off. */
 uwb_dw1000_status uwb_dw1000_idle(uwb_dw1000 *chip);
 
-/* Of the frame received last, before anything enables the receiver again. */
+/* Read the quality of the last frame, before the receiver is enabled again. */
 uwb_dw1000_status uwb_dw1000_read_quality(uwb_dw1000 *chip, const uwb_dw1000_frame *frame,
                                           uwb_dw1000_quality *quality);
 
@@ -171,10 +171,10 @@ uwb_dw1000_status uwb_dw1000_read_cir(uwb_dw1000 *chip, size_t first, size_t cou
 /* Degrees Celsius and volts. */
 uwb_dw1000_status uwb_dw1000_read_sensors(uwb_dw1000 *chip, float *temperature, float *voltage);
 
-/* What a true received power is where uwb_dw1000_quality says `rx_power_dbm` (fit of figure 22 of the manual). */
+/* The true received power for the `rx_power_dbm` of uwb_dw1000_quality (fit of figure 22 of the manual). */
 float uwb_dw1000_true_power_dbm(float rx_power_dbm, uint8_t prf_mhz);
 
-/* By how many metres a range is too long at a true power (application note APS011). */
+/* Error of a range at a true power, m, positive if it is too long (application note APS011). */
 float uwb_dw1000_range_bias_m(float true_power_dbm, uint8_t channel, uint8_t prf_mhz);
 
 #ifdef __cplusplus

@@ -56,7 +56,7 @@ uwb_dw1000_status uwb_dw1000_read_cir(uwb_dw1000 *chip, size_t first, size_t cou
     if (count > samples || first > samples - count) {
         return UWB_DW1000_BAD_ARGUMENT;
     }
-    /* Octet by octet: the chip may hang where both change at once. Without these clocks it reads as zeros or noise. */
+    /* Octet by octet: the chip may hang if both change together. Without these clocks it reads as zeros or noise. */
     static const uwb_dw1000_entry on[] = {{PMSC_CTRL0, 1, RX_CLOCK_PLL}, {PMSC_CTRL0 + 1, 1, CTRL0_DEFAULT | AMCE}, {0, 0, 0}};
     static const uwb_dw1000_entry off[] = {{PMSC_CTRL0, 1, 0}, {PMSC_CTRL0 + 1, 1, CTRL0_DEFAULT}, {0, 0, 0}};
     DW1000_TRY(uwb_dw1000_set_all(chip, on));

@@ -1,6 +1,6 @@
 /* The wire protocol: bytes to frames and back. docs/protocol.md specifies it, uwb_protocol.h is its table.
  *
- * No allocation and no globals; every function is bounded by what it is given. Fields of this header's structs are
+ * No allocation and no globals; every function has bounded run time. Fields of this header's structs are
  * to be read, not written. */
 #ifndef UWB_LINK_H
 #define UWB_LINK_H
@@ -37,10 +37,10 @@ typedef struct {
 } uwb_decoder;
 
 /* Take one byte. Returns the bytes of payload if it completes an intact frame, else -1. Its header and payload
- * stand in body.bytes until the next byte. */
+ * are in body.bytes until the next byte. */
 int32_t uwb_decoder_push(uwb_decoder *decoder, uint8_t byte, uwb_header_t *header);
 
-/* A wire buffer: header and payload stand at UWB_WIRE_LEAD before they are encoded in place. */
+/* A wire buffer: header and payload are at UWB_WIRE_LEAD before they are encoded in place. */
 #define UWB_WIRE_LEAD 20
 #define UWB_MAX_WIRE_BYTES (UWB_WIRE_LEAD + UWB_MAX_FRAME_BYTES)
 
@@ -71,7 +71,7 @@ int uwb_queue_frame(uwb_queue *queue, const uwb_header_t *header, const void *pa
 /* Put a frame before all others if it fits; returns whether it did. */
 int uwb_queue_urgent(uwb_queue *queue, const uwb_header_t *header, const void *payload, size_t payload_bytes);
 
-/* What is left of the frame that is being sent, or else the whole next one; returns its length, 0 if nothing waits. */
+/* The rest of the frame that is being sent, or else the whole next one; returns its length, 0 if nothing waits. */
 size_t uwb_queue_peek(uwb_queue *queue, uint64_t now_us, const uint8_t **bytes);
 
 /* Forget `count` bytes of that, which have been sent. */

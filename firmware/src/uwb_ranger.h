@@ -10,7 +10,7 @@
 extern "C" {
 #endif
 
-#define UWB_RANGER_TURN_US 5000u /* the host is heard between two turns */
+#define UWB_RANGER_TURN_US 5000u /* frames of the host are handled between two turns */
 
 typedef struct {
     uwb_board board;

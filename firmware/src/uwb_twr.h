@@ -6,8 +6,8 @@
  *     FINAL  ─────────────────────────►   the tag's stamps: the anchor has the range
  *        ◄─────────────────────  REPORT   the anchor's stamps: the tag has it too
  *
- * Each side draws a number for each exchange, which all later frames of it bear: a frame of another exchange, of
- * another network or sent again by somebody is refused, and counted. The channel impulse response that comes with a
+ * Each side draws a number for each exchange, and all later frames of the exchange contain both: frames of another
+ * exchange or network, and repeated ones, are refused and counted. The channel impulse response that comes with a
  * range is that of the last frame received: REPORT at a tag, FINAL at an anchor; so it is never read while the other
  * side waits for a frame sent in time.
  *
@@ -54,11 +54,11 @@ typedef struct {
     uint32_t no_answer; /* to POLL */
     uint32_t late;      /* FINAL could not be sent in time */
     uint32_t time_out;  /* FINAL or REPORT did not come */
-    uint32_t damaged;   /* something came instead that was no frame */
-    uint32_t absurd;    /* stamps that no exchange can have */
+    uint32_t damaged;   /* something was received that is not a valid frame */
+    uint32_t absurd;    /* implausible timestamps */
     uint32_t broken;    /* the chip was reset meanwhile, or the bus failed */
 
-    uint32_t refused;  /* frames that were none of the exchange's */
+    uint32_t refused;  /* frames that do not belong to the exchange */
     uint32_t restarts; /* of the chip, but for the first */
 } uwb_twr_counts;
 
@@ -69,12 +69,12 @@ typedef struct {
     uint64_t due_us;
     uint32_t tried;
     uint32_t ranged;
-    uint32_t answer_us; /* from POLL to ANSWER, when last heard; 0 = not yet */
-    uint32_t misses;    /* since it was last heard */
+    uint32_t answer_us; /* from POLL to ANSWER in the last exchange; 0 = none yet */
+    uint32_t misses;    /* since its last answer */
     float rx_power_dbm;
 } uwb_twr_anchor;
 
-/* How frames are told apart and refused. */
+/* Types of frames. */
 typedef enum { UWB_TWR_SEEK = 1, UWB_TWR_HERE, UWB_TWR_POLL, UWB_TWR_ANSWER, UWB_TWR_FINAL, UWB_TWR_REPORT } uwb_twr_kind;
 
 typedef struct {
@@ -113,7 +113,7 @@ typedef struct {
     uwb_twr_config config;
     uint64_t address; /* in force; 0 until the chip was started */
     uint64_t random;
-    uint64_t next_us; /* when a tag may begin anew, an anchor looks whether the chip is in order */
+    uint64_t next_us; /* when a tag may begin again, an anchor checks the chip */
     uint64_t seek_us; /* when a tag looks for anchors again */
     uint32_t reply_us; /* grows while FINAL comes late */
     uint32_t misses;   /* in a row, of whatever anchor */
@@ -144,10 +144,10 @@ void uwb_twr_start(uwb_twr *twr, const uwb_dw1000_io *io, const uwb_twr_config *
  * ones take on top of it. */
 void uwb_twr_fill_times(uwb_twr_config *config, uint32_t reply_us, uint32_t patience_us);
 
-/* What keeps a configuration from being used, in words; NULL = nothing. */
+/* Why a configuration is refused; NULL = it is valid. */
 const char *uwb_twr_refusal(const uwb_twr *twr, const uwb_twr_config *config);
 
-/* Use another configuration from the next turn on; returns 0 if it is refused. Counts go on, anchors are found anew. */
+/* Use another configuration from the next turn on; returns 0 if it is refused. Counts go on, anchors are searched again. */
 int uwb_twr_configure(uwb_twr *twr, const uwb_twr_config *config);
 
 /* One exchange, which may outlast `until_us` by its own duration, or none until then. */

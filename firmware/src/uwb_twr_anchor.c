@@ -14,7 +14,7 @@ static uwb_dw1000_status send_and_rest(uwb_twr *twr, const uwb_twr_frame *frame)
     return status == UWB_DW1000_OK ? uwb_dw1000_sent(&twr->chip, uwb_twr_now_us(twr) + SENT_US, NULL) : status;
 }
 
-/* Tell a tag that looks for anchors, at a random time that hardly another anchor chooses. */
+/* Answer a tag that looks for anchors, at a random time so that answers rarely collide. */
 static uwb_dw1000_status tell(uwb_twr *twr, const uwb_twr_frame *request) {
     const uint32_t window_us = request->time_us < LONGEST_WINDOW_US ? request->time_us : LONGEST_WINDOW_US;
     const uwb_twr_frame here = uwb_twr_frame_to(twr, UWB_TWR_HERE, request->from, request->tag_number, 0);

@@ -46,7 +46,7 @@ static int belongs(const uwb_twr *twr, const uwb_twr_frame *frame, const uwb_twr
     return frame->kind == kind && frame->pan == twr->config.pan && frame->to == twr->address &&
            (frame->from == sent->to || (sent->to == UWB_TWR_EVERYBODY && frame->from != twr->address)) &&
            frame->tag_number == sent->tag_number &&
-           /* A tag learns the anchor's number from ANSWER, and then all frames bear it. */
+           /* A tag learns the anchor's number from ANSWER; all later frames contain it. */
            (kind == UWB_TWR_ANSWER || frame->anchor_number == sent->anchor_number);
 }
 
@@ -147,6 +147,6 @@ uwb_twr_event uwb_twr_lost(uwb_twr *twr, uwb_dw1000_status status, uint32_t *whe
     }
     twr->running = 0;
     twr->fault = status;
-    /* A chip that can be started again at once is no fault. */
+    /* A chip that can be restarted immediately is not a fault. */
     return status == UWB_DW1000_BUS ? UWB_TWR_FAULT : UWB_TWR_NOTHING;
 }

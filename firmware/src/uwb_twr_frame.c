@@ -5,13 +5,13 @@
 /* IEEE 802.15.4: a data frame, both ends in one PAN, addresses of 64 bits; a broadcast's destination has 16. */
 static const uint8_t CONTROL[2][2] = {{0x41, 0xCC}, {0x41, 0xC8}};
 static const uint16_t BROADCAST = 0xFFFF;
-/* First octet of the payload, so that other data frames on the air are not taken for ours. */
+/* First octet of the payload, so that other data frames on the air are ignored. */
 static const uint8_t MARK = 0x75;
 
 #define KNOWN_BYTES sizeof(((uwb_twr_frame *)0)->known)
 
 /* Addresses, mark, kind, and for a SEEK the tag's number, time and `known`. All other frames have both numbers and room
- * for three stamps: they are equally long, so that the chip is not told the length anew for each. */
+ * for three stamps: they have equal lengths, so that the length is written to the chip only once. */
 #define SEEK_BYTES (15u + 2u + 4u + 4u + KNOWN_BYTES)
 #define EXCHANGE_BYTES (21u + 2u + 4u + 4u + 5u * UWB_TWR_STAMPS)
 

@@ -6,11 +6,11 @@ enum {
     SEEK_WINDOW_US = 8000,     /* in which anchors answer a broadcast */
     SEEK_INTERVAL_US = 1000000,
     SEEK_SELDOM = 32,          /* times the window at least, so that seeking takes little of the time on slow buses */
-    SEEK_SOON_US = 50000,      /* after one that found somebody */
+    SEEK_SOON_US = 50000,      /* after one that found an anchor */
     JITTER_US = 400,           /* so that two tags do not stay in step */
     SLOWEST_REPLY_US = 50000,
-    MISSES_TO_REST = 3,        /* an anchor that did not answer so often is left alone for as long as it has patience, */
-    LONGEST_REST = 3,          /* and twice as long each time, up to eight times */
+    MISSES_TO_REST = 3,        /* missed answers after which an anchor is skipped for one timeout, */
+    LONGEST_REST = 3,          /* doubled with each further miss, up to eight timeouts */
     FORGET_US = 10000000
 };
 
@@ -49,7 +49,7 @@ static uwb_dw1000_status send(uwb_twr *twr, const uwb_twr_frame *frame, uint32_t
     return uwb_dw1000_send(&twr->chip, octets, uwb_twr_write(frame, octets), answer_us);
 }
 
-/* Ask who is there. */
+/* Broadcast SEEK and collect the anchors that answer. */
 static uwb_twr_event seek(uwb_twr *twr) {
     uwb_twr_frame frame = uwb_twr_frame_to(twr, UWB_TWR_SEEK, UWB_TWR_EVERYBODY, uwb_twr_random(twr), 0);
     const uint32_t window_us = SEEK_WINDOW_US + twr->config.patience_us;
@@ -90,7 +90,7 @@ static uwb_twr_event seek(uwb_twr *twr) {
     return status == UWB_DW1000_OK ? UWB_TWR_NOTHING : uwb_twr_lost(twr, status, NULL);
 }
 
-/* The next anchor in turn that is not left alone, or the one that is due first. */
+/* The next anchor in turn that is not skipped, or the one that is due first. */
 static uwb_twr_anchor *next(uwb_twr *twr, uint64_t now_us) {
     uwb_twr_anchor *first = NULL;
     for (uint8_t i = 1; i <= twr->known; i++) {

@@ -20,10 +20,10 @@ WARNINGS = ("-Wall", "-Wextra", "-Wconversion", "-Wpedantic", "-Werror")
 
 
 def firmware_folder() -> Path:
-    """The folder `firmware/`: whole in a checkout, with the library's `src` alone where it is installed.
+    """Return the folder `firmware/`: complete in a checkout, an installation contains only the sources.
 
     Raises:
-        MissingDependencyError: it is neither here nor there; the message lists where it was looked for.
+        MissingDependencyError: it does not exist; the message lists the searched folders.
     """
     folders = shared_folders("firmware")
     for folder in folders:
@@ -37,10 +37,10 @@ def firmware_folder() -> Path:
 
 
 def c_compiler() -> tuple[str, ...]:
-    """The words that start the C compiler of this computer: those of CC, as make takes them, or cc, or gcc.
+    """Return the command of the C compiler: CC with its options as in make, or cc, or gcc.
 
     Raises:
-        MissingDependencyError: there is none.
+        MissingDependencyError: no C compiler is installed.
     """
     words = tuple(shlex.split(os.environ.get("CC", ""))) or ("cc" if shutil.which("cc") else "gcc",)
     if shutil.which(words[0]) is None:

@@ -32,17 +32,17 @@ _SCALINGS = {Scaling.MAX: "UWB_SCALE_MAX", Scaling.PREAMBLE: "UWB_SCALE_PREAMBLE
 
 @dataclass(frozen=True, slots=True)
 class ModelConstants:
-    """What a model is beside its network; numbers are float32 values.
+    """Properties of a model other than its network; numbers are float32 values.
 
     Attributes:
-        name: for people.
+        name: for the comment.
         model_id: of the bundle.
         scaling: of the preprocessing.
         prior: predicts the part of the error that the network does not.
-        correction_limits_m: predicted errors outside mean an input unlike the training data.
+        correction_limits_m: a predicted error outside means an input that is out of distribution.
         variance_m2, variance_uncorrected_m2: of a range corrected, and passed through.
-        variance_per_m2: by which the former grows with the square of the predicted error.
-        familiarity: what the training data was like; None = not known.
+        variance_per_m2: growth of the former with the square of the predicted error.
+        familiarity: distribution of the training data; None: unknown.
     """
 
     name: str
@@ -90,7 +90,7 @@ def export_bundle(bundle: Bundle, folder: Path) -> Path:
 
 
 def write_header(folder: Path, network: PackedNetwork, identity: ModelConstants, golden: Golden) -> Path:
-    """Write `uwb_model.h` to `folder`, which is made if need be; whole or not at all."""
+    """Write `uwb_model.h` to `folder`, which is created if it does not exist; the write is atomic."""
     path = folder / MODEL_HEADER
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -101,7 +101,7 @@ def write_header(folder: Path, network: PackedNetwork, identity: ModelConstants,
 
 
 def identity(bundle: Bundle) -> ModelConstants:
-    """What the header says of a bundle beside its network."""
+    """Return the properties of a bundle that the header contains in addition to its network."""
     card = bundle.card
     return ModelConstants(
         name=card.name,

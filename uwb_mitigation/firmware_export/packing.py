@@ -80,8 +80,8 @@ def pack(weights: Int8Weights) -> PackedNetwork:
     """Pack a network.
 
     Raises:
-        ModelError: its shape is none that the firmware has kernels for, or a layer has no exact
-            integer constants; the message names the layer and channel.
+        ModelError: the firmware has no kernels for its shape, or a layer has no exact integer
+            constants; the message names the layer and channel.
     """
     if isinstance(weights.architecture, Mlp):
         return _pack_mlp(weights, weights.architecture)

@@ -1,6 +1,6 @@
 /* Decawave DWM1001-DEV: an nRF52832 with a DW1000, on the wire to the host through the UART of its J-Link.
  *
- * It starts as an anchor, so that it can stand alone on a power bank; with the button BT2 held at the start, or when its
+ * It starts as an anchor, so that it can run without a host on a power bank; with the button BT2 held at the start, or when its
  * host says so, it is a tag. Never run on a board: built, its size looked at, and its exchange run on a modelled chip. */
 #include <string.h>
 
@@ -38,7 +38,7 @@ __attribute__((section(".vectors.device"), used)) static void (*const vectors[16
     stop, stop, uart_interrupt, stop, stop, stop, stop, stop, stop, stop, stop, stop, stop, stop, stop, stop,
 };
 
-/* The watchdog starts it anew. */
+/* The watchdog restarts the board. */
 void board_exit(int code) {
     (void)code;
     GPIO_OUTCLR = 1u << LED_RED;

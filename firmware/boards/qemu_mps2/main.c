@@ -5,7 +5,7 @@
  * uwb_corrected, float window[K] after preprocessing. Then struct report.
  *
  * Counts are ticks of SysTick around uwb_network, with interrupts off. Run with -icount shift=6, a tick is
- * 40 ns and an instruction 64 ns: one instruction is told from the next. */
+ * 40 ns and an instruction 64 ns: the count is exact to one instruction. */
 #include <string.h>
 
 #include "semihosting.h"

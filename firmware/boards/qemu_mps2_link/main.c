@@ -31,7 +31,7 @@ void board_exit(int code) {
     }
 }
 
-/* SysTick counts 10 ms down, again and again; its pending bit says that it has begun anew. */
+/* SysTick counts 10 ms down, again and again; its pending bit shows that it was reloaded. */
 static uint64_t uptime_us(uint64_t *periods_us) {
     uint32_t left = SYST_CVR;
     if (ICSR & PENDSTSET) {

@@ -9,7 +9,7 @@
 
 #include "uwb_model.h"
 
-/* The size of a USB packet: one is written whole, when there is room for it, or not at all. */
+/* The size of a USB packet: one is written whole, and only if there is room for it. */
 static const size_t PACKET = 64;
 static const uint32_t RADIO_BAUD = 921600;
 static const uint32_t WATCHDOG_S = 4;

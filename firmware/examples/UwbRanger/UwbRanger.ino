@@ -3,8 +3,8 @@
  * 3.3 V only. D13 SPICLK, D12 SPIMISO, D11 SPIMOSI, D10 SPICSn, D2 IRQ, D9 RSTn, GND, 3V3 with 10 uF at the module: it
  * takes 150 mA at times. Serial (USB) is the host, wire protocol of docs/protocol.md.
  *
- * It starts as an anchor, so that it can stand alone on a power bank; with D3 at GND at the start, or when its host says
- * so, it is a tag. For corrections on the board put uwb_model.h beside this file: uwb-mitigation board export-c -o UwbRanger.
+ * It starts as an anchor, so that it can run without a host on a power bank; with D3 at GND at the start, or when its host says
+ * so, it is a tag. For corrections on the board put uwb_model.h next to this file: uwb-mitigation board export-c -o UwbRanger.
  *
  * SPI is done from loop() only, never from an interrupt, and in whole buffers: a byte at a time costs 20 us each. */
 #include <SPI.h>
@@ -19,7 +19,7 @@ static uint32_t arena[12288 / 4];
 #endif
 
 static const int RADIO_CS = 10, RADIO_IRQ = 2, RADIO_RESET = 9, TAG_SWITCH = 3;
-static const size_t PACKET = 64; /* of USB: one is written whole, when there is room for it, or not at all */
+static const size_t PACKET = 64; /* of USB: one is written whole, only if there is room for it */
 static const size_t WHOLE = 1016;
 static const uint32_t WATCHDOG_S = 4;
 static const SPISettings SLOW(2000000, MSBFIRST, SPI_MODE0), FAST(8000000, MSBFIRST, SPI_MODE0);
