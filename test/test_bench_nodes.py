@@ -13,14 +13,8 @@ pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
 from ros_harness import Ros
 
-from benchmarks import nodes
 from benchmarks.__main__ import nodes_result
 from benchmarks.nodes import RANGES, RATES_HZ, Figures, Latency, missing_between
-from uwb_mitigation.measurement import Status
-from uwb_mitigation.mitigation import Mitigation
-from uwb_mitigation.model.bundle import load_bundle
-from uwb_mitigation.model.shipped import default_model_path
-from uwb_mitigation.sources.opening import open_recording
 
 pytestmark = pytest.mark.ros
 
@@ -36,17 +30,6 @@ def test_ranges_that_are_missing_are_counted_across_the_bags_end():
     assert missing_between([RANGES - 2, RANGES - 1, 0, 1]) == 0
     assert missing_between([RANGES - 2, 1]) == 2
     assert missing_between([]) == missing_between([3]) == 0
-
-
-def test_the_benchs_ranges_are_ones_that_the_model_corrects(tmp_path: Path):
-    nodes.write_bag(tmp_path / "ranges.mcap")
-    mitigation = Mitigation(load_bundle(default_model_path()))
-    with open_recording(tmp_path / "ranges.mcap") as source:
-        measurements = [record.measurement for record in source]
-    assert [m.sequence for m in measurements] == list(range(RANGES))
-    assert {len(m.cir) for m in measurements} == {157}
-    statuses = [result.status for result in mitigation.correct(measurements[:500])]
-    assert statuses.count(Status.OK) > 450
 
 
 def figures(rate_hz: float, p99: float) -> Figures:

@@ -279,8 +279,13 @@ def test_a_rejected_vector_raises_its_count(line):
         assert getattr(decoder.counts, kind) == decoder.counts.corrupt == 1
 
 
-def test_the_file_is_read_with_lines_of_bounded_length():
-    assert max(map(len, FILE.read_text().splitlines())) < 20_000
+@pytest.mark.parametrize("name", SENT)
+def test_a_message_is_decoded_to_what_was_encoded(name: str):
+    kind, payload = messages.encode(SENT[name][0])
+    decoded = messages.decode(kind, payload)
+
+    assert decoded is not None
+    assert messages.encode(decoded) == (kind, payload)
 
 
 if __name__ == "__main__":

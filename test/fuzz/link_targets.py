@@ -45,7 +45,6 @@ def decoder(data: bytes) -> None:
         assert len(fed._tail) <= MAX_ENCODED_BYTES
     last = Frame(4, 0, 1, 2, b"the end")
     assert fed.feed(encode_frame(last))[-1:] == [last]
-    assert fed.counts.bytes_discarded <= fed.counts.bytes_received
 
 
 def session(data: bytes) -> None:

@@ -18,7 +18,6 @@ from uwb_mitigation.link.layout import (
     MAX_PAYLOAD_BYTES,
     PROTOCOL_VERSION,
     Flag,
-    LogLevel,
     Mode,
 )
 from uwb_mitigation.link.messages import (
@@ -26,7 +25,6 @@ from uwb_mitigation.link.messages import (
     Correction,
     GetInfo,
     Hello,
-    Log,
     OffsetsAnswer,
     SetMode,
     SetOffsets,
@@ -110,10 +108,6 @@ class Board:
         held = messages.decode(kind, payload)
         assert isinstance(held, RangeMeasurement)
         return self._correct(held, now_us, _UNASKED)
-
-    def log(self, level: LogLevel, text: str, now_us: int) -> bytes:
-        """Send a line for a person."""
-        return self._send(Log(level, text), now_us)
 
     def tick(self, now_us: int) -> bytes:
         """The STATUS, when it is due."""

@@ -59,7 +59,6 @@ class DecoderCounts:
         foreign_versions: intact frames of other protocol versions, {version: count}.
         last_foreign_version: the last one of them; None = there was none.
         bytes_received: all bytes fed.
-        bytes_discarded: bytes of stretches that gave no frame, delimiters not counted.
     """
 
     frames: int = 0
@@ -70,7 +69,6 @@ class DecoderCounts:
     foreign_versions: Counter[int] = field(default_factory=Counter)
     last_foreign_version: int | None = None
     bytes_received: int = 0
-    bytes_discarded: int = 0
 
     @property
     def corrupt(self) -> int:
@@ -143,7 +141,6 @@ class FrameDecoder:
         stretches = data.split(DELIMITER)
         if self._overrun:
             # The rest of a stretch that is already counted as oversize.
-            counts.bytes_discarded += len(stretches[0])
             if len(stretches) == 1:
                 return
             stretches[0] = b""
@@ -152,15 +149,11 @@ class FrameDecoder:
             stretches[0] = self._tail + stretches[0]
         tail = stretches.pop()
         for stretch in stretches:
-            if stretch:
-                frame = self._decode(stretch)
-                if frame is None:
-                    counts.bytes_discarded += len(stretch)
-                else:
-                    frames.append(frame)
+            frame = self._decode(stretch) if stretch else None
+            if frame is not None:
+                frames.append(frame)
         if len(tail) > MAX_ENCODED_BYTES:
             counts.oversize += 1
-            counts.bytes_discarded += len(tail)
             self._overrun = True
             tail = b""
         self._tail = tail

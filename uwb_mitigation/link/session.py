@@ -123,7 +123,6 @@ class BoardSession:
         hello: what the board last said of itself; None while not connected.
         radio: what it last said of its radio; None while not connected, or where it says nothing.
         foreign_version: with WRONG_VERSION, the version that the board speaks.
-        last_malformed: what was wrong with the last frame counted as malformed.
         counts: of frames; those of damaged bytes are in `decoder_counts`.
         clock: the board's clock on the node's.
     """
@@ -133,7 +132,6 @@ class BoardSession:
         self.hello: Hello | None = None
         self.radio: Radio | None = None
         self.foreign_version: int | None = None
-        self.last_malformed = ""
         self.counts = SessionCounts()
         self.clock = DeviceClock()
         self._decoder = FrameDecoder()
@@ -264,9 +262,8 @@ class BoardSession:
     def _accept(self, frame: Frame, now_ns: int, stamp_ns: int) -> list[Event]:
         try:
             return self._parse(frame, now_ns, stamp_ns)
-        except LinkError as error:
+        except LinkError:
             self.counts.malformed += 1
-            self.last_malformed = str(error)
             return []
 
     def _parse(self, frame: Frame, now_ns: int, stamp_ns: int) -> list[Event]:
