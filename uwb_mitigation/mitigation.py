@@ -70,7 +70,7 @@ class Grader:
         """Return corrections (m) and variances (m^2) of predicted errors that `passes` accepts, float32 (n,)."""
         correction: NDArray[np.float32] = predicted
         variance: NDArray[np.float32] = self._variance + self._variance_per_m2 * (predicted * predicted)
-        if self._strangeness is not None:
+        if self._strangeness is not None and (score > 0.0).any():
             shrunk = self._known_offset + (np.float32(1.0) - score) * (predicted - self._known_offset)
             correction = np.where(score > 0.0, shrunk, predicted)
             variance = variance + np.maximum(score, np.float32(0.0)) * self._variance_uncorrected
@@ -173,11 +173,13 @@ class Mitigation(Backend):
         powers = (ranges.rx_power_dbm, ranges.first_path_power_dbm)
         prior = prior_of.predict_m(*powers)
         faults, windows = self.bundle.preprocessing.apply(ranges)
-        usable, known = faults == 0, np.isfinite(prior)
-        readable = usable & known & valid
+        readable = (faults == 0) & np.isfinite(prior) & valid
         status = np.zeros(n, np.uint8)
         if not readable.all():
-            status[~known] = _BAD_CIR  # CirFault.NO_POWER, which the preprocessing does not check
+            usable = faults == 0
+            status[~np.isfinite(prior)] = (
+                _BAD_CIR  # CirFault.NO_POWER, which the preprocessing does not check
+            )
             status[~valid] = _OUT_OF_DISTRIBUTION
             status[~usable] = _BAD_CIR if ranges.samples.shape[1] else _NO_CIR
             windows = windows[readable[usable]]
@@ -196,15 +198,22 @@ class Mitigation(Backend):
             by_prior = valid & ~readable & np.isfinite(alone)
             predicted[by_prior], status[by_prior] = alone[by_prior], _OK
 
-        passes = (status == _OK) & self._grader.passes(predicted, score)
-        if not passes.all():
-            refused = (status == _OK) & ~passes
-            status[refused] = np.where(np.isfinite(predicted[refused]), _OUT_OF_DISTRIBUTION, _MODEL_ERROR)
-        found, rows = passed_through(self.bundle, ranges, offset, status), _rows(passes)
-        correction, found.variance_m2[rows] = self._grader.grade(predicted[rows], score[rows])
-        correction = offset[rows] + correction
-        found.correction_m[rows] = correction
-        found.range_m[rows] = ranges.range_m[rows].astype(np.float32, copy=False) - correction
+        passes = self._grader.passes(predicted, score)
+        rows = _rows(passes)
+        graded, variance = self._grader.grade(predicted[rows], score[rows])
+        correction = offset[rows] + graded
+        corrected_m = ranges.range_m[rows].astype(np.float32, copy=False) - correction
+        if len(correction) == n:
+            model_id = self.bundle.model_id
+            return CorrectedColumns(corrected_m, correction, variance, status, Origin.HOST, model_id)
+        refused = (status == _OK) & ~passes
+        status[refused] = np.where(np.isfinite(predicted[refused]), _OUT_OF_DISTRIBUTION, _MODEL_ERROR)
+        found = passed_through(self.bundle, ranges, offset, status)
+        found.range_m[rows], found.correction_m[rows], found.variance_m2[rows] = (
+            corrected_m,
+            correction,
+            variance,
+        )
         return found
 
 

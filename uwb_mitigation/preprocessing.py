@@ -139,7 +139,8 @@ class Preprocessing:
             np.sqrt(inputs, out=inputs)
         else:
             inputs = np.array(windows, np.float32)
-        np.multiply(inputs, np.array(scales, np.float32)[:, None], out=inputs)
+        if any(scale != 1.0 for scale in scales):
+            np.multiply(inputs, np.array(scales, np.float32)[:, None], out=inputs)
         if self.scaling is Scaling.MAX:
             np.divide(inputs, inputs.max(axis=1, keepdims=True), out=inputs)
         else:
