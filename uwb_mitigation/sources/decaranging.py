@@ -140,8 +140,7 @@ class DecaRangingLog(Source):
         return 0
 
     def _after(self, text: bytes) -> str:
-        lines = text.count(b"\n")
-        return f"{self.path}: after line {lines}"
+        return f"{self.path}: after line {text.count(10)}"
 
     def _count(self, oddity: Oddity) -> None:
         self.skipped[oddity.value] += 1
@@ -184,7 +183,8 @@ class DecaRangingLog(Source):
                 if lines != length or length > MAX_ACCUMULATOR:
                     self._count(Oddity.MALFORMED)
                 elif owner is self._cir_of:
-                    frames[owner] = frames[owner][0], self._with_samples(frames[owner][1], match["pairs"])
+                    time, cir = frames[owner]
+                    frames[owner] = time, self._with_samples(cir, match["pairs"])
                 owner = None
             elif kind == "range":
                 empty = Cir(_NO_SAMPLES, channel=channel, prf_mhz=prf)
