@@ -10,7 +10,7 @@ from scipy.optimize import least_squares
 from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
 from uwb_mitigation.positioning.least_squares import LeastSquares
 from uwb_mitigation.positioning.locator import Setting, TagLocator, run_live
-from uwb_mitigation.positioning.model import Model, Regressors
+from uwb_mitigation.positioning.model import Model
 from uwb_mitigation.positioning.smoother import Smoother, knots_of, smooth
 from uwb_mitigation.positioning.tracks import Track, TruePath, track_errors
 
@@ -84,18 +84,6 @@ def test_smoothed_tracks_of_many_drives_are_honest_and_better_than_live_ones():
         smooth.append(track_errors(Smoother(HALL, Model(), ranges).fit(first).track, truth))
     assert np.mean([e.rmse for e in smooth]) < 0.95 * np.mean(live)
     assert 0.5 < np.mean([e.nees_per_dof for e in smooth]) < 1.6
-
-
-def test_parameters_that_ranges_share_are_found_with_the_track():
-    ranges, truth = drive(seconds=60, offset_m=0.0)
-    power = np.random.default_rng(4).normal(0, 1, len(ranges))
-    ranges.range_m[:] += 0.3 * power + 0.5 * (ranges.anchor == 3)
-    rows = np.stack([power, ranges.anchor == 3], axis=1).astype(float)
-    wanted = Regressors(("line", "anchor"), rows, np.zeros(2), np.ones(2), np.zeros(len(rows), int))
-    found = Smoother(HALL, Model(), ranges, parameters=wanted).fit(known_track(truth))
-    sd = np.sqrt(np.diag(found.parameter_covariance))
-    assert np.abs(found.parameters - (0.3, 0.5)).max() < 3 * sd.max()
-    assert np.abs(found.parameters[0] - 0.3) < 0.01
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.filter import RangeFilter
 from uwb_mitigation.positioning.geometry import Area, Height, Shape, protection_levels, shape
 from uwb_mitigation.positioning.locator import SILENCE_S, Setting, TagLocator
-from uwb_mitigation.positioning.model import Model, Regressors
+from uwb_mitigation.positioning.model import Model
 from uwb_mitigation.positioning.smoother import Smoother, fused_with_batch
 from uwb_mitigation.positioning.tracks import Estimate, Heights, Ranges, Track
 
@@ -84,7 +84,6 @@ class FixedLag:
         ranges = Ranges(stamp, anchor, range_m, variance, np.full(len(after), np.nan))
         first = known.copy()
         first.predict(first.time_s + (int(stamp[0]) - start_ns) / _SECOND_NS)
-        offset = Regressors.one("offset", np.ones(len(after)), 0.0, max(setting.model.offset_sd, 1e-3))
         states = [(at, one) for at, one in self._states if at > start_ns] or [(int(stamp[0]), first)]
         initial = Track.of([_estimate_of(one, at) for at, one in states])
         heights = None
@@ -92,10 +91,10 @@ class FixedLag:
             heights = Heights(*(np.array(column) for column in zip(*self._heights, strict=True)))
         smoother = Smoother(
             setting.anchors,
-            setting.model,
+            # The filter has no offsets of single anchors, and 1.5 s do not determine them.
+            replace(setting.model, pair_sd=0.0),
             ranges,
             height=setting.height,
-            parameters=offset,
             after=first,
             heights=heights,
         )

@@ -24,7 +24,7 @@ from uwb_mitigation.positioning.filter import FIRST_ERROR, OFFSET, RangeFilter
 from uwb_mitigation.positioning.geometry import Height, directions
 from uwb_mitigation.positioning.least_squares import LeastSquares, Solution
 from uwb_mitigation.positioning.locator import Setting
-from uwb_mitigation.positioning.model import Model, Regressors
+from uwb_mitigation.positioning.model import Model
 from uwb_mitigation.positioning.tracks import Heights, Ranges, Track
 
 KNOT_S = 0.1
@@ -43,21 +43,15 @@ class Smoothed:
 
     Attributes:
         track: at the knots.
-        parameters: float64 (q,), and their covariance (q, q). By default: the common offset, then that of each anchor with
-            ranges, in the order of their rows.
         anchors: float64 (m, 3), estimated positions, and `anchor_covariance` (m, 3, m, 3); as given if they are not
             estimated.
         residual_m: float64 (n,), of each range, including the persisting error of its anchor.
-        weight: float64 (n,), robust weight of each range; 1: full weight.
     """
 
     track: Track
-    parameters: NDArray[np.float64]
-    parameter_covariance: NDArray[np.float64]
     anchors: NDArray[np.float64]
     anchor_covariance: NDArray[np.float64]
     residual_m: NDArray[np.float64]
-    weight: NDArray[np.float64]
 
 
 def knots_of(stamp_ns: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
@@ -74,7 +68,6 @@ class Smoother:
         anchors, model: as of the filter.
         ranges: two or more, in the order of time.
         height: of the tag, if constant.
-        parameters: further unknowns; None: a common offset and one of each anchor, with the model's standard deviations.
         find_anchors: also estimate the positions of the anchors.
         around: prior positions of estimated anchors and their standard deviations, float64 (m, 3) both; None: those of
             `anchors`.
@@ -92,7 +85,6 @@ class Smoother:
         ranges: Ranges,
         *,
         height: Height | None = None,
-        parameters: Regressors | None = None,
         find_anchors: bool = False,
         around: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
         after: RangeFilter | None = None,
@@ -100,7 +92,6 @@ class Smoother:
     ) -> None:
         if len(ranges) < 2:
             raise DatasetError(f"{len(ranges)} ranges", valid="two or more for a track")
-        n = len(ranges)
         self._model, self._height, self._find, self._after = model, height, find_anchors, after
         self._d = 2 if height is not None else 3
         # Anchors without ranges have no persisting errors to estimate.
@@ -118,13 +109,8 @@ class Smoother:
         if not find_anchors:
             self._persisting = self._persisting + anchors.sd[self._used] ** 2
         self._white = np.maximum(model.white * self._variance, self._variance - self._persisting[self._slot])
-        if parameters is None:
-            own = np.eye(len(self._used))[self._slot]
-            sd = np.array([model.offset_sd, *[model.pair_sd] * len(self._used)])
-            rows = np.concatenate([np.ones((n, 1)), own], axis=1)
-            names = ("offset", *(f"anchor {row}" for row in self._used))
-            parameters = Regressors(names, rows, np.zeros(len(sd)), sd, np.zeros(n, np.intp))
-        self._parameters = parameters
+        # A common offset, and one of each anchor.
+        self._offset_sd = np.array([model.offset_sd, *[model.pair_sd] * len(self._used)])
         self._heights = heights if height is None else None
 
     @classmethod
@@ -138,13 +124,13 @@ class Smoother:
         Raises:
             DatasetError: the ranges do not determine it.
         """
-        knots, d, p = len(self._time_s), self._d, len(self._parameters.mean)
+        knots, d, p = len(self._time_s), self._d, len(self._offset_sd)
         stamp = (initial.stamp_ns - self._origin_ns) / _SECOND_NS
         x = np.zeros((knots, 2 * d + len(self._used)))
         for axis in range(d):
             x[:, axis] = np.interp(self._time_s, stamp, initial.position[:, axis])
         extra = (self._height is not None) + (3 * len(self._used) if self._find else 0)
-        shared = np.concatenate([self._parameters.mean, np.zeros(extra)])
+        shared = np.zeros(p + extra)
         solution: Solution | None = None
         try:
             for _ in range(iterations):
@@ -177,19 +163,16 @@ class Smoother:
             anchor_covariance[np.ix_(own, own)] = solution.shared_covariance[at:, at:]
         return Smoothed(
             Track(self._origin_ns + self._knots_ns, position, velocity, full),
-            shared[:p].copy(),
-            solution.shared_covariance[:p, :p].copy(),
             anchors,
             anchor_covariance.reshape(len(anchors), 3, len(anchors), 3),
             residual,
-            self._model.weight(residual / np.sqrt(self._variance)),
         )
 
     def _split(self, shared: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
         """Return the height (0 if it is not shared) and the positions of all anchors (m, 3)."""
         height, anchors = 0.0, self._known.copy()
         if self._height is not None:
-            height = self._height.value + shared[len(self._parameters.mean)]
+            height = self._height.value + shared[len(self._offset_sd)]
         if self._find:
             anchors[self._used] += shared[-3 * len(self._used) :].reshape(-1, 3)
         return height, anchors
@@ -204,19 +187,16 @@ class Smoother:
         tag = np.full((len(at), 3), height)
         tag[:, :d] = at[:, :d] + self._ahead_s[:, None] * at[:, d : 2 * d]
         unit, distance = directions(tag, anchors[self._ranges.anchor])
-        rows = self._parameters.rows
-        return unit, self._ranges.range_m - distance - rows @ shared[: rows.shape[1]]
+        return unit, self._ranges.range_m - distance - shared[0] - shared[1 + self._slot]
 
     def _linearised(self, x: NDArray[np.float64], shared: NDArray[np.float64]) -> LeastSquares:
         d, model, of, slot = self._d, self._model, self._of[:, None], self._slot[:, None]
-        knots, p = len(x), len(self._parameters.mean)
+        knots, p = len(x), len(self._offset_sd)
         problem = LeastSquares(knots, x.shape[1], len(shared))
         unit, residual = self._residuals(x, shared)
         error = problem.of_knot(of, 2 * d + slot)
-        columns = [problem.of_knot(of, range(2 * d)), error]
-        values = [unit[:, :d], self._ahead_s[:, None] * unit[:, :d], np.ones((len(of), 1))]
-        columns.append(np.broadcast_to(problem.of_shared(range(p)), (len(of), p)))
-        values.append(self._parameters.rows)
+        columns = [problem.of_knot(of, range(2 * d)), error, problem.of_shared(slot * (0, 1) + (0, 1))]
+        values = [unit[:, :d], self._ahead_s[:, None] * unit[:, :d], np.ones((len(of), 3))]
         if self._height is not None:
             columns.append(np.full((len(of), 1), problem.of_shared(p)))
             values.append(unit[:, 2:])
@@ -240,13 +220,12 @@ class Smoother:
         return problem
 
     def _add_priors(self, problem: LeastSquares) -> None:
-        d, p, m = self._d, len(self._parameters.mean), len(self._used)
-        # The prior of a filter contains the offset, and the height.
+        d, p, m = self._d, len(self._offset_sd), len(self._used)
+        # The prior of a filter contains the common offset, and the height.
         first = 0 if self._after is None else 1
-        if p > first:
-            own = slice(first, None)
-            prior = self._parameters.mean[own], self._parameters.information[own]
-            problem.add_prior(problem.of_shared(range(first, p)), *prior)
+        problem.add_prior(
+            problem.of_shared(range(first, p)), 0.0, 1.0 / np.maximum(self._offset_sd[first:], 1e-6) ** 2
+        )
         if self._find:
             shift = (self._around - self._known)[self._used].reshape(-1)
             sd = np.maximum(self._spread[self._used].reshape(-1), 1e-6)
