@@ -20,10 +20,8 @@ from uwb_mitigation.link.connection import PortAddress
 from uwb_mitigation.link.emulated_board import EmulatedBoard
 from uwb_mitigation.link.events import Connected, Disconnected, Event, Loss
 from uwb_mitigation.link.faults import Faults
-from uwb_mitigation.link.layout import Mode
-from uwb_mitigation.link.messages import Correction
 from uwb_mitigation.link.port import BoardPort
-from uwb_mitigation.measurement import Cir, CorrectedRange, Origin, RangeMeasurement, Record, Status
+from uwb_mitigation.measurement import Cir, RangeMeasurement, Record
 from uwb_mitigation.radio.evb1000 import Evb1000Bus
 
 PATIENCE_S = 240
@@ -48,16 +46,6 @@ class Recording:
             yield Record(RangeMeasurement(0, 1, 2, i, i * 7, 4.0, Cir(samples, preamble_count=9)))
 
 
-class HalfMetre:
-    """A model that predicts half a metre of error for everything."""
-
-    def correct(self, measurements: list[RangeMeasurement]) -> list[CorrectedRange]:
-        return [
-            CorrectedRange(m.range_m - 0.5, m.range_m, 0.5, 0.01, Status.OK, Origin.HOST, IDENTITY.model_id)
-            for m in measurements
-        ]
-
-
 @pytest.fixture
 def link(tmp_path: Path) -> Path:
     return tmp_path / "uwb_board"
@@ -65,9 +53,7 @@ def link(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def board(link: Path) -> Iterator[EmulatedBoard]:
-    with EmulatedBoard(
-        Recording(), rate_hz=200, identity=IDENTITY, corrector=HalfMetre(), link=link
-    ) as emulated:
+    with EmulatedBoard(Recording(), rate_hz=200, identity=IDENTITY, link=link) as emulated:
         yield emulated
 
 
@@ -105,15 +91,6 @@ def test_measurements_arrive_complete_and_in_order(port):
     assert sequences == list(range(first.sequence + 1, first.sequence + 51))
     assert first.cir.samples.tolist() == [first.sequence % 100] * 314
     assert first.device_time == first.sequence * 7
-
-
-def test_the_board_corrects_when_it_is_told_to(port):
-    port.set_mode(Mode.DEVICE)
-
-    correction = wait_for(port, of(Correction))
-
-    assert correction.corrected.range_m == 3.5
-    assert correction.corrected.origin is Origin.DEVICE
 
 
 def test_a_board_that_is_unplugged_and_comes_back_under_another_name_is_found_again(board, port, tmp_path):

@@ -104,16 +104,6 @@ def test_the_host_configures_the_radio_while_it_ranges():
     assert (len(ranges[-1].cir), ranges[-1].cir.prf_mhz) == (40, 16)
 
 
-def test_a_tag_becomes_an_anchor_and_reports():
-    with ModelledAir() as air:
-        tag = air.add(RadioSettings())
-        board = air.add(RadioSettings(), line=Line())
-        air.link(tag, board, Link(4))
-        host = Host(air, board, RadioSettings(role=Role.ANCHOR, report=True))
-        host.run(1.5)
-        assert {measured.anchor_id for measured in host.seen(RangeMeasurement)} == {air.address(board)}
-
-
 def test_settings_that_a_board_cannot_use_are_refused_in_words():
     with ModelledAir() as air:
         board = air.add(RadioSettings(), line=Line())

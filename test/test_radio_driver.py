@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
 import threading
-import tty
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,7 +17,7 @@ from benchmarks.dw1000_model.boards import Line, ModelledAir
 from benchmarks.dw1000_model.evb1000 import EmulatedEvb1000s
 from benchmarks.dw1000_model.links import Link
 from uwb_mitigation.errors import ParameterError, format_id
-from uwb_mitigation.link.emulated_board import EmulatedBoard
+from uwb_mitigation.link.emulated_board import EmulatedBoard, PseudoTerminal
 from uwb_mitigation.link.layout import Role
 from uwb_mitigation.link.radio import RadioSettings
 from uwb_mitigation.nodes.live_feeds import settings_of
@@ -122,10 +119,8 @@ class ModelledBoard:
     STEP_S = 0.005
 
     def __init__(self, link: Path) -> None:
-        self._controller, port = os.openpty()
-        tty.setraw(port)
-        os.set_blocking(self._controller, False)
-        link.symlink_to(os.ttyname(port))
+        self._terminal = PseudoTerminal(link)
+        self._terminal.plug()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
@@ -137,19 +132,17 @@ class ModelledBoard:
             far = air.add(RadioSettings(role=Role.ANCHOR, channel=2, prf_mhz=16))
             air.link(tag, near, Link(5))
             air.link(tag, far, Link(9))
-            waiting = b""
+            waiting = bytearray()
             while not self._stop.wait(self.STEP_S):
-                with contextlib.suppress(BlockingIOError):
-                    air.write(tag, os.read(self._controller, 4096))
+                air.write(tag, self._terminal.read())
                 air.run(self.STEP_S)
                 waiting += air.read(tag)
-                with contextlib.suppress(BlockingIOError):
-                    waiting = waiting[os.write(self._controller, waiting) :]
+                self._terminal.write(waiting)
 
     def close(self) -> None:
         self._stop.set()
         self._thread.join()
-        os.close(self._controller)
+        self._terminal.unplug()
 
 
 def test_the_radio_of_a_board_on_a_serial_line_is_configured_and_tells_how_it_fares(

@@ -10,7 +10,6 @@ import select
 import sys
 import threading
 import time
-import tty
 import types
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -60,42 +59,6 @@ def wait_until(true: Callable[[], bool]) -> None:
     while not true():
         assert time.monotonic() < until
         time.sleep(0.02)
-
-
-@pytest.mark.parametrize(
-    "answers",
-    [
-        [b"\x02\x00\x03yEVB1000 USB2SPI 1.0\0", b"yEVB1000 USB2SPI 1.0\0"],
-        [b"", b"yEVB1000 USB2SPI 1.0\0\x03"],
-        [b"", b"\x02", b"yEVB1000 USB2SPI 1.0\0y"],
-    ],
-    ids=["a late answer first", "a question that is ignored", "both"],
-)
-def test_a_board_is_asked_again_and_its_answer_ends_at_the_nul(answers: list[bytes]):
-    board, port = os.openpty()
-    tty.setraw(port)
-    late = list(answers)
-
-    def answer() -> None:
-        while late:
-            assert os.read(board, 100) == b"deca?"
-            os.write(board, late.pop(0))
-
-    answering = threading.Thread(target=answer)
-    answering.start()
-    try:
-        found = Evb1000Bus(PortAddress.parse(os.ttyname(port)))
-        assert found.version == "EVB1000 USB2SPI 1.0"
-        assert not select.select([port], [], [], 0)[0], (
-            "the octet after the NUL is no part of the next answer"
-        )
-        found.close()
-    finally:
-        late.clear()
-        os.write(port, b"deca?")
-        answering.join()
-        os.close(board)
-        os.close(port)
 
 
 @pytest.fixture(scope="module")
@@ -240,24 +203,6 @@ class FakeSpi:
     def close(self) -> None:
         if self.air is not None:
             self.air.close()
-
-
-def test_a_chip_on_spidev_starts_and_looks_for_anchors(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setitem(sys.modules, "spidev", types.SimpleNamespace(SpiDev=FakeSpi))
-    spi = SpidevBus("/dev/spidev0.0")
-    radio = HostRadio(spi, RadioSettings())
-    try:
-        until = time.monotonic() + GENEROUS_S
-        while not radio.address:
-            assert time.monotonic() < until
-            assert radio.turn(0.1) is None
-        assert radio.settings.preamble_code == 9
-        assert radio.status().state is RadioState.RUNNING
-        radio.read_sensors()
-        assert abs(radio.status().temperature_c - 25) < 3
-    finally:
-        radio.close()
-        spi.close()
 
 
 class FakeGpio:
