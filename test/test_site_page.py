@@ -1,4 +1,4 @@
-"""docs/site.md as its reader goes through it: every command, in order, with emulated boards.
+"""docs/tutorials/your_site.md as its reader goes through it: every command, in order, with emulated boards.
 
 A block of `bash` on the page is typed as it stands. Its first line may name a terminal (`# terminal: driver`): what
 is typed there stays, until the next block for that terminal interrupts it.
@@ -33,7 +33,7 @@ pytestmark = [
     NEEDS_CC,
 ]
 
-PAGE = REPOSITORY / "docs" / "site.md"
+PAGE = REPOSITORY / "docs" / "tutorials" / "your_site.md"
 FENCED = re.compile(r"^```(\w+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 TERMINAL = re.compile(r"# terminal: (\w+)\n")
 TIMEOUT_S = 240.0
