@@ -1,4 +1,5 @@
-"""Sphinx's configuration, for `make docs`: the pages are the repository's Markdown files, where they stand."""
+"""Configuration of Sphinx for `make docs`. The pages are the Markdown files of the repository; the reference pages are
+generated when this file is read."""
 
 from __future__ import annotations
 
@@ -6,43 +7,65 @@ import sys
 from importlib.util import find_spec
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+DOCS = Path(__file__).resolve().parent
+sys.path[:0] = [str(DOCS.parent), str(DOCS)]
 
-import scipy.stats  # noqa: F401 - Before autodoc mocks torch: on import, scipy tests whether classes are torch's.
+import generated
+import scipy.stats  # noqa: F401 - must be imported before autodoc mocks torch: scipy checks for torch classes
 from sphinx.application import Sphinx
 
 import uwb_mitigation
+
+generated.write_reference()
 
 project = "uwb_mitigation"
 author = "uwb_mitigation maintainers"
 release = uwb_mitigation.__version__
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon"]
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.napoleon",
+    "sphinx_copybutton",
+]
 root_doc = "docs/index"
-include_patterns = ["docs/*.md", "docs/api/*.rst", "models/*.md", "firmware/README.md"]
-# Folders that hold no page, so that they are not searched.
+include_patterns = [
+    "docs/index.md",
+    "docs/tutorials/*.md",
+    "docs/guides/*.md",
+    "docs/reference/**",
+    "docs/background/*.md",
+    "models/*.md",
+    "firmware/README.md",
+]
+# Sphinx does not need to search these folders.
 exclude_patterns = [".[a-z]*", "build", "install", "log", "test", "uwb_mitigation", "requirements"]
 highlight_language = "text"
-# Anchors as GitHub makes them, so that a link works in both places.
+# Use the same anchors as GitHub, so that links work in both places.
 myst_heading_anchors = 4
+# The copy button leaves out prompts and printed output.
+copybutton_prompt_text = "$ "
 
 html_theme = "furo"
 html_title = f"uwb_mitigation {release}"
 html_copy_source = False
 html_show_copyright = False
 html_static_path = ["style"]
-html_css_files = ["tables.css"]
-html_extra_path = ["site"]  # sends the reader of the top folder to docs/index.html
+html_css_files = ["pages.css"]
+html_extra_path = ["site"]  # redirects from the top folder to docs/index.html
+# Ranks guides above the API reference in the results of a search.
+html_search_scorer = str(DOCS / "style" / "scorer.js")
 
-# The API, from docstrings: Google's sections, names in single backticks.
-templates_path = [str(Path(__file__).resolve().parent / "templates")]
+# The API reference is generated from docstrings in Google style, with names in single backticks.
+templates_path = [str(DOCS / "templates")]
 default_role = "code"
 autodoc_member_order = "bysource"
-# The goal `docs` does not install these. What is installed is not mocked: scipy tests whether classes are torch's.
+# `make docs` does not install these packages. An installed package is not mocked, because scipy checks for torch classes.
 autodoc_mock_imports = [name for name in ("torch", "distributed", "matplotlib") if find_spec(name) is None]
-napoleon_use_ivar = True  # else an attribute that has a docstring of its own is described twice
-napoleon_attr_annotations = False  # a class shows them in its signature
-# Annotations name types of libraries, whose pages are elsewhere.
+napoleon_use_ivar = True  # otherwise attributes with docstrings are listed twice
+napoleon_attr_annotations = False  # the signature of the class shows the types
+# Annotations contain types of other libraries, which have no pages here.
 nitpick_ignore_regex = [("py:.*", ".*")]
 
 # External links, for `make docs-links`.
@@ -51,10 +74,10 @@ linkcheck_timeout = 20
 
 
 def as_rst(app: object, what: str, name: str, thing: object, options: object, lines: list[str]) -> None:
-    """What docstrings here write as Markdown does, as reStructuredText has it.
+    """Convert Markdown in docstrings to reStructuredText.
 
-    One that begins with its attributes has them at the margin, once its quotes are off: no section yet. An indented
-    block below a paragraph is an example.
+    If a docstring starts with the section Attributes, its content is not indented: indent it. An indented block below
+    a paragraph is a code example: insert `::`.
     """
     if lines and lines[0] == "Attributes:" and not lines[1].startswith(" "):
         lines[1:] = [f"    {line}" for line in lines[1:]]

@@ -1,9 +1,10 @@
-"""Writes what pages take from the code, between `<!-- generated: NAME -->` and `<!-- end -->`, the parameter
-files in `params/`, and the wire protocol's C header. No Sphinx here, and no ROS.
+"""Generate the reference pages (`docs/reference`, not committed), the parameter files (`params/`) and the C header of the
+wire protocol.
 
     python docs/generated.py
 
-A test holds the pages and the code together.
+`make docs` calls `write_reference`. Each page is a template in `docs/templates/reference`, in which the lines
+`<!-- generated: NAME -->` are replaced by text from the code. This module imports neither Sphinx nor ROS.
 """
 
 from __future__ import annotations
@@ -22,43 +23,68 @@ from typer.cli import get_docs_for_click
 from uwb_mitigation.commands import cli
 from uwb_mitigation.link import layout
 from uwb_mitigation.link.layout import Layout, MessageType
+from uwb_mitigation.nodes import health
 from uwb_mitigation.nodes.parameter_tables import TABLES
 
-PAGES = Path(__file__).resolve().parent
-REPOSITORY = PAGES.parent
+DOCS = Path(__file__).resolve().parent
+TEMPLATES = DOCS / "templates" / "reference"
+REFERENCE = DOCS / "reference"
+REPOSITORY = DOCS.parent
 PACKAGE = REPOSITORY / "uwb_mitigation"
 MESSAGES = REPOSITORY / "msg_defs" / "msg"
 PARAMETERS = REPOSITORY / "params"
 C_HEADER = REPOSITORY / "firmware" / "src" / "uwb_protocol.h"
 
-_MARKED = re.compile(r"^(<!-- generated: (\w+) -->\n).*?^(<!-- end -->)$", re.MULTILINE | re.DOTALL)
+_MARK = re.compile(r"^<!-- generated: (\w+) -->$", re.MULTILINE)
 _LISTS = re.compile(r"^\*\*Commands\*\*:\n\n(?:\* .*\n)+\n*", re.MULTILINE)
 _FIELD = re.compile(r"(?P<type>\S+) +(?P<name>\w+)(?: *= *(?P<value>\S+))?(?: +# (?P<meaning>.*))?")
 
 
-def fill(page: str) -> str:
-    """The page with what its marks name between them.
+def fill(template: str) -> str:
+    """Return the template with every mark replaced.
 
     Raises:
-        KeyError: nothing has such a name.
+        KeyError: a mark has an unknown name.
     """
-    return _MARKED.sub(lambda part: f"{part[1]}\n{PARTS[part[2]]().strip()}\n\n{part[3]}", page)
+    return _MARK.sub(lambda mark: PARTS[mark[1]]().strip(), template)
 
 
-def files() -> dict[Path, str]:
-    """Every page with marks, every parameter file, and the C header, and its text as it should be."""
-    pages = {path: path.read_text(encoding="utf-8") for path in sorted(PAGES.glob("*.md"))}
-    texts = {path: fill(page) for path, page in pages.items() if _MARKED.search(page)}
-    texts |= {PARAMETERS / f"{node}.yaml": parameter_file(node) for node in TABLES}
+def reference() -> dict[Path, str]:
+    """Return the path and the text of every reference page."""
+    pages = {
+        REFERENCE / template.name: fill(template.read_text(encoding="utf-8"))
+        for template in sorted(TEMPLATES.glob("*.md"))
+    }
+    return pages | {REFERENCE / "commands" / f"{name}.md": command_page(name) for name in _command_names()}
+
+
+def committed_files() -> dict[Path, str]:
+    """Return the path and the text of every parameter file and of the C header."""
+    texts = {PARAMETERS / f"{node}.yaml": parameter_file(node) for node in TABLES}
     return texts | {C_HEADER: c_header()}
 
 
+def write_reference() -> None:
+    """Write the reference pages, and delete pages of commands that no longer exist.
+
+    A page whose text has not changed keeps its modification time.
+    """
+    pages = reference()
+    for old in set(REFERENCE.glob("*.md")) | set(REFERENCE.glob("commands/*.md")):
+        if old not in pages:
+            old.unlink()
+    for path, text in pages.items():
+        if not path.is_file() or path.read_text(encoding="utf-8") != text:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text, encoding="utf-8")
+
+
 def parameter_file(node: str) -> str:
-    """A ROS parameter file that holds every parameter at its default, with its meaning."""
+    """Return a ROS parameter file with every parameter of a node at its default."""
     lines = [f"# Parameters of the {node} node, at their defaults.", "/**:", "  ros__parameters:"]
     for row in TABLES[node]:
         lines += [f"    # {line}" for line in textwrap.wrap(f"{row.description} ({row.valid})", 100)]
-        # What the user has to say is shown, and left out.
+        # A parameter without a useful default is a comment.
         lines.append(
             f"    {'' if row.filed else '# '}{row.name}: {row.default_text if row.filed else ''}".rstrip()
         )
@@ -66,13 +92,13 @@ def parameter_file(node: str) -> str:
 
 
 def parameters() -> str:
-    """The parameters of every node: a table each."""
+    """Return a section with a table of parameters for each node."""
     lines: list[str] = []
     for node, table in TABLES.items():
         lines += [
-            f"## `{node}`",
+            f"## Parameters of `{node}`",
             "",
-            "| name | default | unit | valid | changes live | meaning |",
+            "| name | default | unit | valid | live | meaning |",
             "|---|---|---|---|---|---|",
         ]
         lines += [
@@ -85,7 +111,7 @@ def parameters() -> str:
 
 
 def messages() -> str:
-    """Every message of the interface package: a section each."""
+    """Return a section for each message of the interface package."""
     return "\n".join(line for path in sorted(MESSAGES.glob("*.msg")) for line in _message(path))
 
 
@@ -93,7 +119,7 @@ def _message(path: Path) -> Iterator[str]:
     lines = path.read_text(encoding="utf-8").splitlines()
     rows = [_FIELD.fullmatch(line) for line in lines if line and not line.startswith("#")]
     if None in rows:
-        raise ValueError(f"{path}: a line that is no field")
+        raise ValueError(f"{path}: not a field definition")
     yield f"## {path.stem}\n"
     yield " ".join(line.removeprefix("# ") for line in lines if line.startswith("#")) + "\n"
     fields = [row for row in rows if row and not row["value"]]
@@ -106,20 +132,46 @@ def _message(path: Path) -> Iterator[str]:
     yield ""
 
 
-def commands() -> str:
-    """Every command with its options, as `--help` has them."""
-    command = typer.main.get_command(cli.app)
-    text = get_docs_for_click(obj=command, ctx=typer.Context(command), name="uwb-mitigation")
-    # Sections follow for all that the lists name, in words that were not cut short.
-    sections = _LISTS.sub("", text)
-    return sections[sections.index("\n## ") :]
+def thresholds() -> str:
+    """Return the rows of the table of warnings of the mitigator."""
+    found = [each for each in vars(health).values() if isinstance(each, health.Threshold)]
+    return "\n".join(f"| WARN | {each.fact} above {each.limit:g} | {each.text} |" for each in found)
+
+
+def command_list() -> str:
+    """Return tables of all commands by topic with links to their pages, and their table of contents."""
+    known = typer.main.get_command(cli.app).commands  # type: ignore[attr-defined]
+    lines: list[str] = []
+    for topic, names in cli.PANELS.items():
+        lines += ["", f"## {topic}", "", "| command | purpose |", "|---|---|"]
+        for name in names:
+            about = (known[name].help or "").partition("\n")[0]
+            lines.append(f"| [`{name}`](commands/{name}.md) | {about} |")
+    lines += ["", "```{toctree}", ":hidden:", "", *(f"commands/{name}" for name in _command_names()), "```"]
+    return "\n".join(lines)
+
+
+def _command_names() -> list[str]:
+    return [name for names in cli.PANELS.values() for name in names]
+
+
+def command_page(name: str) -> str:
+    """Return the page of a command or of a group of commands, with all options as in `--help`."""
+    command = typer.main.get_command(cli.app).commands[name]  # type: ignore[attr-defined]
+    text = get_docs_for_click(
+        obj=command, ctx=typer.Context(command, info_name=name), name=name, call_prefix="uwb-mitigation"
+    )
+    # Each command of a list has a section of its own, with the full text.
+    text = _LISTS.sub("", text)
+    text = re.sub(r"^## (?!`)", "### ", text, flags=re.MULTILINE)
+    return text.strip() + "\n"
 
 
 _WIRE_TYPES = {"B": "u8", "H": "u16", "I": "u32", "Q": "u64", "i": "i32", "f": "f32"}
 
 
 def wire_layout(table: Layout) -> str:
-    """One header or payload of the wire protocol: its type, its length and its fields."""
+    """Return type, length and table of fields of a header or payload of the wire protocol."""
     number = f"Type {MessageType[table.name].value}; " if table.name in MessageType.__members__ else ""
     if not table.fields:
         return f"{number}no payload."
@@ -138,13 +190,13 @@ def wire_layout(table: Layout) -> str:
 
 
 def wire_values(*kinds: type[enum.IntEnum]) -> str:
-    """What the values of enumerations mean."""
+    """Return a table of the values of enumerations."""
     lines = ["| value | name |", "|---|---|"]
     return "\n".join(lines + [f"| {member.value} | {member.name} |" for kind in kinds for member in kind])
 
 
 def wire_limits() -> str:
-    """How long the parts of a frame may be."""
+    """Return a table of the maximum lengths of the parts of a frame."""
     return f"""\
 | limit | bytes |
 |---|---|
@@ -158,13 +210,13 @@ def wire_limits() -> str:
 
 
 def layers() -> str:
-    """The package's parts, each layer above what it may import, as the contract in pyproject.toml has them."""
+    """Return the layers of the package, top layer first, from the contract in pyproject.toml."""
     return "\n".join(["```text", *(layer.replace(" |", ",") for layer in _layers()), "```"])
 
 
 def parts() -> str:
-    """What lives in each part, as its own docstring says."""
-    lines = ["| part | what lives there |", "|---|---|"]
+    """Return a table of the packages with the first paragraphs of their docstrings."""
+    lines = ["| package | contents |", "|---|---|"]
     for name in (name for layer in _layers() for name in re.findall(r"\w+", layer)):
         folder = (PACKAGE / name).is_dir()
         module = PACKAGE / name / "__init__.py" if folder else PACKAGE / f"{name}.py"
@@ -175,7 +227,7 @@ def parts() -> str:
 
 
 def _layers() -> list[str]:
-    from importlinter.api import read_configuration  # no need of what else is here
+    from importlinter.api import read_configuration  # only this function needs it
 
     contracts = read_configuration(str(REPOSITORY / "pyproject.toml"))["contracts_options"]
     (found,) = (contract["layers"] for contract in contracts if contract["type"] == "layers")
@@ -251,7 +303,8 @@ def _c_struct(table: Layout) -> list[str]:
 PARTS = {
     "messages": messages,
     "parameters": parameters,
-    "commands": commands,
+    "thresholds": thresholds,
+    "command_list": command_list,
     "layers": layers,
     "parts": parts,
     "wire_limits": wire_limits,
@@ -267,6 +320,6 @@ PARTS = {
 
 
 if __name__ == "__main__":
-    for path, text in files().items():
+    write_reference()
+    for path, text in committed_files().items():
         path.write_text(text, encoding="utf-8")
-        print(path)
