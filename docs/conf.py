@@ -7,14 +7,16 @@ import sys
 from importlib.util import find_spec
 from pathlib import Path
 
-DOCS = Path(__file__).resolve().parent
-sys.path[:0] = [str(DOCS.parent), str(DOCS)]
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import generated
 import scipy.stats  # noqa: F401 - must be imported before autodoc mocks torch: scipy checks for torch classes
 from sphinx.application import Sphinx
 
 import uwb_mitigation
+
+DOCS = Path(__file__).resolve().parent
 
 generated.write_reference()
 

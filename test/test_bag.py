@@ -195,7 +195,7 @@ def test_the_examples_in_the_documentation_run(
     write_bag(tmp_path / "apartment.mcap")
     monkeypatch.chdir(tmp_path)
     for example in examples:
-        exec(compile(example, "docs/bags.md", "exec"), {})
+        exec(compile(example, "docs/guides/recordings.md", "exec"), {})
     shown = capsys.readouterr().out
     assert "2 7 5.5 40" in shown
     assert f"{START_NS} 0.5 NDP NLOS" in shown

@@ -204,7 +204,7 @@ def test_the_source_on_the_page_is_read_corrected_and_written_to_a_bag(
     (tmp_path / "anchor.jsonl").write_text("".join(json.dumps(r) + "\n" for r in (row, lost, row)))
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
-    exec(compile(use, "docs/sources.md", "exec"), {})
+    exec(compile(use, "docs/guides/recordings.md", "exec"), {})
     assert capsys.readouterr().out.count("4.310 m -> ") == 2
     with open_recording(tmp_path / "anchor.mcap") as recording:
         records = list(recording)

@@ -98,7 +98,7 @@ def test_a_radio_that_is_weaker_by_a_wall_or_two_is_made_worse_by_an_eighth_at_m
         for record in records
     ]
     outcome = evaluate(mitigation, weak)
-    # Above 1.02 too: a bundle that does better here calls for another table in docs/evaluation.md.
+    # Above 1.02 too: a bundle that does better here calls for another table in docs/background/results.md.
     assert 1.02 < outcome.corrected.mae / outcome.raw.mae <= 1.12
 
 

@@ -201,7 +201,7 @@ def test_the_image_of_the_dwm1001_dev_fits_it_and_is_written_as_hex(tmp_path: Pa
     told = json.loads((tmp_path / "image.json").read_text())
     assert told["flash_bytes"] < 48 << 10
     assert told["ram_bytes"] < 48 << 10, "the rest of 64 kB is the stack's"
-    # As docs/hardware.md publishes it, but for what one compiler differs from another in.
+    # As docs/guides/boards.md publishes it, but for what one compiler differs from another in.
     page = (Path(__file__).parents[1] / "docs" / "hardware.md").read_text()
     (row,) = re.findall(
         r"^\| DWM1001-DEV \| ([\d,]+) of ([\d,]+) \| ([\d,]+) of ([\d,]+) \|", page, re.MULTILINE

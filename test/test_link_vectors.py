@@ -25,7 +25,7 @@ from uwb_mitigation.offsets import Offsets
 FILE = Path(__file__).parent / "data" / "link_vectors.txt"
 
 PREAMBLE = """\
-# Golden vectors of the wire protocol, version 1; docs/protocol.md says what they mean. One per line:
+# Golden vectors of the wire protocol, version 1; docs/reference/protocol.md says what they mean. One per line:
 #   frame NAME TYPE FLAGS SEQUENCE TIME_US PAYLOAD WIRE   decodes to these fields; WIRE holds both delimiters
 #   value NAME FIELD NUMBER                               a field of that frame's payload; floats as their 32 bits
 #   reject NAME KIND WIRE                                 gives no frame; KIND is the count that it raises

@@ -82,7 +82,7 @@ def test_an_offset_that_was_added_is_found(universal: Mitigation, direct: list[R
     assert after.sd_m == pytest.approx(before.sd_m, abs=0.02)
     assert before.ranges >= 20
     assert len(at_one_place(before)) > 1
-    # What the simulator adds for the boards: docs/simulator.md.
+    # What the simulator adds for the boards: docs/background/how_it_works.md.
     assert before.offset_m == pytest.approx(0.22, abs=3.0 * before.sd_m)
     # What the mitigator has been told already does not count twice.
     told = Mitigation(universal.bundle, Offsets(0.625))

@@ -30,7 +30,7 @@ def ratio(model: Mitigation, columns: RangeColumns, error: np.ndarray, blocked: 
 
 
 # MAE over that of a constant offset, by first-path indices that are 0, 5 and 10 taps too late. The aim is 1.02; what
-# exceeds it is in docs/evaluation.md.
+# exceeds it is in docs/background/results.md.
 MOST = {
     (Scaling.PREAMBLE, "open hall"): (1.9, 1.65, 2.6),
     (Scaling.PREAMBLE, "drone room"): (1.4, 1.15, 1.25),

@@ -1,4 +1,4 @@
-"""A line, the simulated network, and their mean on few configurations: docs/evaluation.md, *Few configurations*.
+"""A line, the simulated network, and their mean on few configurations: docs/background/results.md, *Few configurations*.
 
 Arguments: the folder of the logs, and how many draws (60).
 """

@@ -1,4 +1,4 @@
-"""How far the NEES of a single run may be from 1 where the model is exactly right: docs/positioning.md.
+"""How far the NEES of a single run may be from 1 where the model is exactly right: docs/background/positioning.md.
 
 Each of Hanyang's runs is driven again with its own times, anchors and true path, and with ranges that err just as the
 model says; 20 times. Arguments: the folder of the runs, and how often.

@@ -1,4 +1,4 @@
-"""The constants of the position filter one at a time, and chosen for each run by the others: docs/positioning.md.
+"""The constants of the position filter one at a time, and chosen for each run by the others: docs/background/positioning.md.
 
 Argument: the folder of Hanyang's runs.
 """

@@ -1,4 +1,4 @@
-"""What a line may have beside the received power, on the logs: docs/evaluation.md, *Tried, and what came of it*.
+"""What a line may have beside the received power, on the logs: docs/background/results.md, *Tried, and what came of it*.
 
 Arguments: the folder of the logs, and how many splits by configuration (10).
 """

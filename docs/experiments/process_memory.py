@@ -1,4 +1,4 @@
-"""Write a bag of synthetic ranges here, process it, and print the peak of memory on the way: docs/process.md, *Memory*.
+"""Write a bag of synthetic ranges here, process it, and print the peak of memory on the way: docs/background/results.md, *Memory*.
 
 Argument: how many ranges.
 """

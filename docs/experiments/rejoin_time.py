@@ -1,4 +1,4 @@
-"""How long a node that was killed takes to come back: docs/nodes.md, *Back after a kill*.
+"""How long a node that was killed takes to come back: docs/background/results.md, *Back after a kill*.
 
 By turns: the mitigator and a subscription in plain rclpy, a driver on a recording that waits for three
 subscribers, and a publisher in plain rclpy that does. What plain rclpy takes is Python's and the middleware's.

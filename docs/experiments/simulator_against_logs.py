@@ -1,4 +1,4 @@
-"""What the simulator makes, beside the logs: docs/simulator.md.
+"""What the simulator makes, beside the logs: docs/background/how_it_works.md.
 
 Arguments: the folder of the logs, and how many simulated ranges (6000).
 """

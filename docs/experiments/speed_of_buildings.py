@@ -1,4 +1,4 @@
-"""How fast the simulator makes buildings as arrays: docs/simulator.md, *Speed*.
+"""How fast the simulator makes buildings as arrays: docs/background/how_it_works.md, *Speed*.
 
 Arguments: how many placements, in hundreds of thousands or less.
 """

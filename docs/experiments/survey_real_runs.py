@@ -1,4 +1,4 @@
-"""Anchors of Hanyang's runs found by `survey` from guesses that are 1.5 m off in plan: docs/positioning.md.
+"""Anchors of Hanyang's runs found by `survey` from guesses that are 1.5 m off in plan: docs/background/positioning.md.
 
 Arguments: the folder of the runs, and how many guesses a run.
 """

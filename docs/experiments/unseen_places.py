@@ -1,4 +1,4 @@
-"""What models leave in places that they were not fitted to: docs/evaluation.md, *Places it never saw*.
+"""What models leave in places that they were not fitted to: docs/background/results.md, *Places it never saw*.
 
 Arguments: the recording, and bundles.
 """

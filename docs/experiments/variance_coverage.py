@@ -1,4 +1,4 @@
-"""Whether the variances of a bundle of the paper's experiment hold in the medium room: docs/training.md.
+"""Whether the variances of a bundle of the paper's experiment hold in the medium room: docs/background/results.md.
 
 Arguments: the simulated recording, and the bundle.
 """

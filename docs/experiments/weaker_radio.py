@@ -1,4 +1,4 @@
-"""What models do to a radio that is weaker or stronger: docs/evaluation.md, *Unlike the training data*.
+"""What models do to a radio that is weaker or stronger: docs/background/results.md, *Unlike the training data*.
 
 Arguments: the folder of the logs, to take one range in how many, and bundles or names of shipped ones. For a model that
 holds no offset of boards, that of the line-of-sight placements is taken off first.

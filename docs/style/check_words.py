@@ -141,7 +141,9 @@ def check(path: Path, texts: Iterable[Text], expressions: Iterable[Expression]) 
 
 def main(arguments: list[str] | None = None) -> int:
     """Check the files, print the findings and return the exit code."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("paths", nargs="*", type=Path, help="files or folders (default: the repository)")
     parser.add_argument("--code", action="store_true", default=CHECK_CODE, help="check code, too")
     parser.add_argument("--all", action="store_true", help="print findings below the limit, too")
@@ -149,7 +151,9 @@ def main(arguments: list[str] | None = None) -> int:
     expressions = load()
     failed = False
     files = [path for path in tracked(given.paths or [REPOSITORY]) if path.is_file() and path != WORDS]
-    for kind, readers in (("documents", DOCUMENTS), ("code", CODE)) if given.code else (("documents", DOCUMENTS),):
+    for kind, readers in (
+        (("documents", DOCUMENTS), ("code", CODE)) if given.code else (("documents", DOCUMENTS),)
+    ):
         words, lines = 0, []
         for path in files:
             if reader := readers.get(path.suffix):

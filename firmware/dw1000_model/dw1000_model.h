@@ -1,5 +1,5 @@
 /* A model of the DW1000, register by register, in virtual time: several chips share one air, and the program of each
- * chip's host is a coroutine. Any driver that talks to the chip through SPI runs on it; docs/dw1000_model.md lists what
+ * chip's host is a coroutine. Any driver that talks to the chip through SPI runs on it; the README lists what
  * is modelled, and which errors of a driver show as on the chip.
  *
  * One air is used by one thread at a time; airs do not know of each other. The same seed and programs give the same run. */

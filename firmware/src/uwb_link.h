@@ -1,4 +1,4 @@
-/* The wire protocol: bytes to frames and back. docs/protocol.md specifies it, uwb_protocol.h is its table.
+/* The wire protocol: bytes to frames and back. docs/reference/protocol.md specifies it, uwb_protocol.h is its table.
  *
  * No allocation and no globals; every function has bounded run time. Fields of this header's structs are
  * to be read, not written. */

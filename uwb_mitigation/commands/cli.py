@@ -56,7 +56,7 @@ PANELS: dict[str, dict[str, typer.Typer | Callable[..., None]]] = {
         "doctor": doctor.doctor,
     },
 }
-"""Every command where `--help` and docs/commands.md show it: a new one is a line here, and what it says there
+"""Every command where `--help` and docs/reference/commands.md show it: a new one is a line here, and what it says there
 is the first line of its docstring."""
 
 

@@ -58,7 +58,9 @@ def doctor(json: JsonOption = None) -> None:
     broken = [name for name, state, _ in findings if state == "broken"]
     console.write_json(json, {"ok": not broken, "findings": [finding._asdict() for finding in findings]})
     if broken:
-        raise UwbMitigationError(f"broken: {', '.join(broken)}", valid="run make setup, or see docs/robot.md")
+        raise UwbMitigationError(
+            f"broken: {', '.join(broken)}", valid="run make setup, or see docs/guides/installation.md"
+        )
     console.out.print("No problems found.")
 
 

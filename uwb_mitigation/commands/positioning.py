@@ -38,7 +38,7 @@ AnchorsOption = Annotated[
     typer.Option(
         "--anchors",
         metavar="FILE",
-        help="Where the anchors are (docs/positioning.md shows how it looks); without it, BAG's own X.anchors.yaml.",
+        help="Positions of the anchors (format: docs/background/positioning.md). Default: X.anchors.yaml of BAG.",
     ),
 ]
 HeightOption = Annotated[

@@ -97,7 +97,7 @@ class Locator(ManagedNode):
         path = self.value("anchors")
         if not path:
             raise ParameterError(
-                "parameter anchors is empty", valid="anchors:=FILE, as docs/positioning.md shows"
+                "parameter anchors is empty", valid="anchors:=FILE, as docs/background/positioning.md shows"
             )
         anchors = load_anchors(Path(path).expanduser())
         model = Model(acceleration=self.value("acceleration"), range_sd=self.value("range_sd"))

@@ -170,7 +170,7 @@ MITIGATOR = (
               "evk1000_apartment); empty = universal. A bundle that cannot be "
               "used is refused, and the one before stays.", live=True),
     Parameter("offsets", "", "What the radios' antenna delays add to ranges, taken off before the model: a number of "
-              "metres, or a file by anchor, tag or pair (docs/tuning.md); empty = 0. What is no offset is refused, and "
+              "metres, or a file by anchor, tag or pair (docs/guides/calibration.md); empty = 0. What is no offset is refused, and "
               "those before stay.", live=True, or_number=True),
     Parameter("backend", "onnxruntime", "What computes: ONNX Runtime, or the firmware's C compiled for this "
               "computer at activation, to the same bits.", choices=("onnxruntime", "firmware")),
@@ -179,7 +179,7 @@ MITIGATOR = (
 )  # fmt: skip
 
 LOCATOR = (
-    Parameter("anchors", "", "File that says where the anchors are, as docs/positioning.md shows; needed."),
+    Parameter("anchors", "", "File with the positions of the anchors (format: docs/background/positioning.md). Required."),
     Parameter("tag", 0, "Number of the tag whose topics have the plain names; others have uwb/tag_N/pose and so "
               "on. 0 = the one that is heard first.", low=0, high=2**63 - 1),
     Parameter("level", False, "The tag's antenna stays at one height, that of `height`."),

@@ -1,6 +1,6 @@
 """DeepUWB (doi 10.5281/zenodo.4290069) as a source: `dataset.pkl`, a pickled pandas data frame, one row per sample.
 
-The data has no true ranges, times, ids or powers, and its CIRs are cut and normalised. docs/deepuwb.md describes
+The data has no true ranges, times, ids or powers, and its CIRs are cut and normalised. docs/background/results.md describes
 the values that replace them.
 """
 

@@ -32,7 +32,9 @@ def load_anchors(path: Path) -> AnchorMap:
     Raises:
         ParameterError: it cannot be read, or is not as `positioning.anchors` says.
     """
-    data = read_bounded(path, MAX_TEXT, ParameterError, "an anchors file, as docs/positioning.md shows")
+    data = read_bounded(
+        path, MAX_TEXT, ParameterError, "an anchors file, as docs/background/positioning.md shows"
+    )
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:

@@ -1,4 +1,4 @@
-"""How simulated inputs are varied in training, beyond what the simulator draws. What it helps is in docs/evaluation.md."""
+"""How simulated inputs are varied in training, beyond what the simulator draws. What it helps is in docs/background/results.md."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 /* Arduino Nano 33 BLE Sense between an EVB1000 and the host: corrects ranges, or passes them on.
  *
- * Serial  (USB)     the host, wire protocol of docs/protocol.md
- * Serial1 (D0, D1)  the EVB1000, 921600 baud: frames RANGE_CIR of the same protocol (docs/firmware.md)
+ * Serial  (USB)     the host, wire protocol of docs/reference/protocol.md
+ * Serial1 (D0, D1)  the EVB1000, 921600 baud: frames RANGE_CIR of the same protocol (docs/guides/boards.md)
  *
  * Green LED: the host reads. Orange LED: blinks with the measurements. Nothing in loop() waits, except that a
  * correction takes a few milliseconds: meanwhile the core's interrupt receives Serial1. */

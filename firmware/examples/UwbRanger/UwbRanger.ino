@@ -1,7 +1,7 @@
 /* Arduino Nano 33 BLE Sense with a DWM1000 module on its SPI: ranges, and corrects ranges if there is a model.
  *
  * 3.3 V only. D13 SPICLK, D12 SPIMISO, D11 SPIMOSI, D10 SPICSn, D2 IRQ, D9 RSTn, GND, 3V3 with 10 uF at the module: it
- * takes 150 mA at times. Serial (USB) is the host, wire protocol of docs/protocol.md.
+ * takes 150 mA at times. Serial (USB) is the host, wire protocol of docs/reference/protocol.md.
  *
  * It starts as an anchor, so that it can run without a host on a power bank; with D3 at GND at the start, or when its host says
  * so, it is a tag. For corrections on the board put uwb_model.h next to this file: uwb-mitigation board export-c -o UwbRanger.

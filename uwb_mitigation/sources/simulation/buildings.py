@@ -1,6 +1,6 @@
 """Random buildings, random boards in them, and placements balanced over what stands between the antennas.
 
-Distributions are assumed unless a source is named; docs/simulator.md tells which of them real ranges had a say in.
+Distributions are assumed unless a source is named; docs/background/how_it_works.md tells which of them real ranges had a say in.
 The chip is the same everywhere: pulse, detector and compression are those of `simulation.radio`.
 """
 
@@ -122,7 +122,7 @@ DETOUR_M = 4.0
 DETOUR_MOST = 3.0
 """Behind obstacles the first cluster comes later in proportion to the distance, since all detours of a shape grow with
 it: as late as the environment has it at so many m, and at most so many times later, 8.1 ns (the report's own program:
-8.3). Assumed, and kept because it helped on the real logs (docs/simulator.md)."""
+8.3). Assumed, and kept because it helped on the real logs (docs/background/how_it_works.md)."""
 
 PLACEMENTS, BUILDINGS = 256, 4
 """In one block, which is what one generator draws."""

@@ -2,7 +2,7 @@
 
 Channel 2, PRF 64 MHz. The range error is not drawn from a distribution: it is where the leading-edge
 detector finds the first path, less where the straight line would have put it. What was fitted to the
-EVK1000 logs, and how well, is in docs/simulator.md.
+EVK1000 logs, and how well, is in docs/background/how_it_works.md.
 """
 
 from __future__ import annotations
