@@ -1,6 +1,11 @@
-"""What a line may have beside the received power, on the logs: docs/background/results.md, *Tried, and what came of it*.
+"""Compare features for the linear bias model in addition to the received power, on the EVK1000 logs.
 
-Arguments: the folder of the logs, and how many splits by configuration (10).
+Arguments: the folder of the logs, and the number of splits by configuration (10).
+
+The energy before the first path is the only feature of the CIR that might generalise: 13 % better by tag location, but 3 % worse
+between the halves of the flat. It does not ship, because it gains less than 5 % by configuration and depends on the position
+of the window. The first-path level contains the same information as the power gap. Averages over the last ten exchanges gain
+0.007 m, which is noise that a filter removes, too.
 """
 
 import sys
@@ -16,7 +21,7 @@ from uwb_mitigation.sources.decaranging import CirOf, DecaRangingFolder
 
 
 def features(data):
-    """Columns that a line may have beside 1 and RSL; energies in dB, from magnitudes, which are squared inputs."""
+    """Return candidate columns in addition to 1 and RSL. Energies are in dB, from magnitudes, which are squared inputs."""
     energy, of_cir = data.inputs.astype(float) ** 4, baselines.features(data, header=False)
     level = [
         10 * np.log10(energy[:, taps].sum(1) + 1e-12)

@@ -1,6 +1,6 @@
-"""Write a bag of synthetic ranges here, process it, and print the peak of memory on the way: docs/background/results.md, *Memory*.
+"""Write a bag of synthetic ranges in the current folder, process it, and print the peak memory.
 
-Argument: how many ranges.
+Argument: the number of ranges. With 200,000 ranges the peak is 90 MiB at 10 % and 91 MiB at the end.
 """
 
 import resource

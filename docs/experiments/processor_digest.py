@@ -1,10 +1,11 @@
-"""Print a digest of every corrected range of the shipped models: equal on two processors if all bits are equal.
+"""Print a digest of all corrected ranges of the shipped models. Two processors with equal lines give equal bits.
 
     python docs/experiments/processor_digest.py RECORDING...
 
-Run it on both processors with the same recordings, and compare the lines. Nothing but the packages in
-`requirements/runtime.txt` is needed. A recording is any that `evaluate` reads; simulate it once and copy it, because
-the simulator itself uses functions (exp, log) that differ between processors.
+Run it on both processors with the same recordings and compare the lines. It needs only the packages in
+`requirements/runtime.txt`. Simulate a recording once and copy it, because the simulator uses functions (exp, log) that differ
+between processors. An aarch64 system can be emulated: unpack the arm64 packages of Python with `dpkg -x`, add the wheels
+(`pip download --platform manylinux_2_28_aarch64 --only-binary=:all:`) and `qemu-aarch64-static`, and use `chroot`.
 """
 
 from __future__ import annotations

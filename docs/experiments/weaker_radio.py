@@ -1,7 +1,10 @@
-"""What models do to a radio that is weaker or stronger: docs/background/results.md, *Unlike the training data*.
+"""Evaluate models with a radio that receives less or more power than the training data.
 
-Arguments: the folder of the logs, to take one range in how many, and bundles or names of shipped ones. For a model that
-holds no offset of boards, that of the line-of-sight placements is taken off first.
+Arguments: the folder of the EVK1000 logs, the step between the ranges that are used, and bundles or names of shipped ones. For a model
+without the offset of boards, the offset of the LOS placements is subtracted first.
+
+`universal` is at worst 1.1 % worse than the raw ranges minus offset (at -17 dB). `evk1000_apartment` is 10 to 11 % worse at -13 dB: a
+single range cannot show whether the radio is weaker or a wall is in between.
 """
 
 import sys
@@ -28,7 +31,7 @@ offset_m = np.median([np.mean(values) for values in errors.values()])
 
 
 def heard(record, level, less_m):
-    """The record of a radio that hears so many dB more, its range less an offset."""
+    """Return the record of a radio that receives `level` dB more, with an offset subtracted from its range."""
     cir = record.measurement.cir
     powers = {
         "rx_power_dbm": cir.rx_power_dbm + level,
