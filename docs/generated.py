@@ -12,6 +12,7 @@ from __future__ import annotations
 import ast
 import enum
 import re
+import shutil
 import textwrap
 from collections.abc import Iterator
 from functools import partial
@@ -65,11 +66,13 @@ def committed_files() -> dict[Path, str]:
 
 
 def write_reference() -> None:
-    """Write the reference pages, and delete pages of commands that no longer exist.
+    """Write the reference pages, and delete those of commands and modules that no longer exist.
 
     A page whose text has not changed keeps its modification time.
     """
     pages = reference()
+    # Sphinx generates the pages of modules again, but does not delete old ones.
+    shutil.rmtree(REFERENCE / "api", ignore_errors=True)
     for old in set(REFERENCE.glob("*.md")) | set(REFERENCE.glob("commands/*.md")):
         if old not in pages:
             old.unlink()
