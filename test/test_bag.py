@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from bag_material import START_NS, corrected, record, same, write_corrected
+from bag_material import corrected, record, same, write_corrected
 from mcap.reader import SeekingReader
 from rosbags.interfaces import (
     Qos,
@@ -184,21 +184,6 @@ def test_comments_and_constants_do_not_make_another_schema(type_name: str) -> No
     bare, _ = schemas.typestore().generate_msgdef(type_name, ros_version=2)
     assert bare != schemas.definition(type_name)
     assert schemas.difference(bare, type_name) is None
-
-
-def test_the_examples_in_the_documentation_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    text = (Path(__file__).parent.parent / "docs" / "bags.md").read_text(encoding="utf-8")
-    examples = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
-    assert len(examples) == 2
-    write_bag(tmp_path / "apartment.mcap")
-    monkeypatch.chdir(tmp_path)
-    for example in examples:
-        exec(compile(example, "docs/guides/recordings.md", "exec"), {})
-    shown = capsys.readouterr().out
-    assert "2 7 5.5 40" in shown
-    assert f"{START_NS} 0.5 NDP NLOS" in shown
 
 
 @pytest.mark.parametrize("version", [8, 9])

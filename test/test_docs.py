@@ -1,15 +1,16 @@
-"""The documentation points at things that are there, says what the code says, and its commands can be typed.
+"""The documentation: links, commands, code blocks, generated files, language check, and the built site.
 
-`make docs` checks links, anchors and the rest of the markup.
+`make docs` checks anchors and the rest of the markup.
 """
 
 from __future__ import annotations
 
-import importlib.metadata
 import importlib.util
 import json
 import re
 import shlex
+import subprocess
+import sys
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ import generated
 import pytest
 import typer
 import yaml
+from browser import Browser
 from conftest import REPOSITORY
 from test_launch import generate as generate
 from test_launch import launch
@@ -30,13 +32,20 @@ from uwb_mitigation.sources.opening import open_recording
 
 PAGES = sorted(
     path
-    for pattern in ("*.md", "docs/*.md", "models/*.md", "firmware/**/*.md")
+    for pattern in ("*.md", "docs/**/*.md", "models/*.md", "firmware/**/*.md")
     for path in REPOSITORY.glob(pattern)
+    if not path.is_relative_to(generated.REFERENCE)
 )
+GENERATED = generated.reference()
+
+
+def folder_of(page: Path) -> Path:
+    """Return the folder that links of a page refer to. A template is filled in into the folder of the reference."""
+    return generated.REFERENCE if page.parent == generated.TEMPLATES else page.parent
 
 
 def links(page: Path) -> list[str]:
-    """Targets of a page's links, code left out."""
+    """Return the targets of the links of a page, without code."""
     text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
     prose = [line for line in text.splitlines() if not line.startswith("    ")]
     return re.findall(r"\]\(([^)\s#]+)", "\n".join(prose))
@@ -45,7 +54,8 @@ def links(page: Path) -> list[str]:
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))
 def test_links_between_pages_lead_somewhere(page: Path):
     local = [target for target in links(page) if not re.match(r"[a-z]+:", target)]
-    assert [target for target in local if not (page.parent / target).exists()] == []
+    targets = {target: (folder_of(page) / target).resolve() for target in local}
+    assert [link for link, path in targets.items() if path not in GENERATED and not path.exists()] == []
 
 
 def test_every_page_of_the_documentation_can_be_reached():
@@ -53,14 +63,16 @@ def test_every_page_of_the_documentation_can_be_reached():
     waiting = [REPOSITORY / "README.md"]
     while waiting:
         page = waiting.pop()
+        if page.parent == generated.REFERENCE and (template := generated.TEMPLATES / page.name).is_file():
+            page = template
         if page in read or page.suffix != ".md" or not page.is_file():
             continue
         read.add(page)
-        waiting += [(page.parent / target).resolve() for target in links(page) if "://" not in target]
-    assert {page for page in PAGES if page.parent.name == "docs"} <= read
+        waiting += [(folder_of(page) / target).resolve() for target in links(page) if "://" not in target]
+    assert {page for page in PAGES if page.is_relative_to(REPOSITORY / "docs")} <= read
 
 
-# What a page tells the reader to type.
+# Commands and code blocks.
 
 
 NODES = {
@@ -72,7 +84,7 @@ NODES = {
     "viewer": ("viewer",),
 }
 BLOCK = re.compile(r"^(?:```(?:console|sh|bash)?\n(.*?)^```|((?:    .*\n|\n)+))", re.MULTILINE | re.DOTALL)
-# The name of a node begins lines of drawings, too.
+# Names of nodes also start lines of drawings.
 COMMAND = re.compile(
     r"\s*(?:\.venv/bin/)?(?:(?:uwb-mitigation|make|ros2|python -m benchmarks) |(?:driver|mitigator|pipeline) --ros)"
 )
@@ -122,7 +134,7 @@ def test_a_make_target_that_is_typed_exists(words: list[str]):
     assert [word for word in words if "=" not in word and word not in targets] == []
 
 
-def test_what_python_is_told_to_run_exists():
+def test_scripts_and_modules_in_python_commands_exist():
     text = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
     scripts = set(re.findall(r"\bpython3? ([\w/]+/\w+\.py)", text))
     assert len(scripts) > 5
@@ -139,7 +151,7 @@ def check_parameters(node: str, values: dict[str, object]) -> None:
 
 
 def check_node(words: list[str]) -> None:
-    """Look at what follows `ros2 run uwb_mitigation`."""
+    """Check the words after `ros2 run uwb_mitigation`."""
     node, *options = words
     assert node in NODES
     given = [option for flag, option in pairwise(options) if flag == "-p"]
@@ -181,22 +193,19 @@ def test_parameter_files_on_pages_hold_known_parameters():
     ]
     assert any("/**" in file for file in found)
     for file in found:
-        if "/**" in file:  # else it is another file, such as that of the anchors
+        if "/**" in file:  # otherwise another file, such as anchors
             check_parameters("pipeline", file["/**"]["ros__parameters"])
 
 
-# Pages and the code that they are about.
-
-
-def code_of(page: str) -> list[str]:
-    return re.findall(r"^```python\n(.*?)^```", (REPOSITORY / "docs" / page).read_text(), re.M | re.S)
+# Pages and the code that they describe.
 
 
 def test_the_source_on_the_page_is_read_corrected_and_written_to_a_bag(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    module, use, _ = code_of("sources.md")
-    (example,) = re.findall(r'^\{"time_s".*\}$', (REPOSITORY / "docs" / "sources.md").read_text(), re.M)
+    page = (REPOSITORY / "docs" / "guides" / "recordings.md").read_text()
+    module, use, _ = re.findall(r"^```python\n(.*?)^```", page, re.M | re.S)
+    (example,) = re.findall(r"^```json\n(.*?)^```", page, re.M | re.S)
     row = json.loads(example)
     row["cir"] = [[abs(900 - 6 * abs(tap - 8)) // (1 + abs(tap - 8)), 40] for tap in range(170)]
     lost = {**row, "range": None}
@@ -220,11 +229,91 @@ def test_the_source_on_the_page_is_read_corrected_and_written_to_a_bag(
         list(JsonLines(tmp_path / "anchor.jsonl"))
 
 
-def test_what_pages_take_from_the_code_is_what_the_code_says():
+def test_committed_generated_files_are_up_to_date():
     stale = [
-        path.name for path, text in generated.files().items() if path.read_text(encoding="utf-8") != text
+        path.name
+        for path, text in generated.committed_files().items()
+        if path.read_text(encoding="utf-8") != text
     ]
     assert not stale, "run: python docs/generated.py"
 
 
-# What a reader sees.
+def test_the_templates_use_everything_that_can_be_generated():
+    templates = "\n".join(page.read_text(encoding="utf-8") for page in generated.TEMPLATES.glob("*.md"))
+    assert set(re.findall(r"^<!-- generated: (\w+) -->$", templates, re.M)) == set(generated.PARTS)
+    assert not [path.name for path, text in GENERATED.items() if "<!-- generated" in text]
+
+
+# The language check.
+
+
+def run_check(tmp_path: Path, name: str, text: str, *options: str) -> subprocess.CompletedProcess[str]:
+    (tmp_path / name).write_text(text, encoding="utf-8")
+    command = [sys.executable, generated.DOCS / "style" / "check_words.py", *options, tmp_path / name]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "line"),
+    [
+        ("page.md", "Plain.\n\nIt is computed anew.\n", 3),
+        ("page.rst", "Patience: 3 s.\n", 1),
+        ("code.py", '"""Fine."""\n\nx = 1  # the same anew\n', 3),
+        ("code.py", 'raise ValueError("the file is mended now")\n', 1),
+        ("code.c", "int x;\n/* written\n   anew */\n", 3),
+        ("Message.msg", "# fine\nfloat32 range # m, anew\n", 2),
+    ],
+)
+def test_the_language_check_finds_an_expression(tmp_path: Path, name: str, text: str, line: int):
+    done = run_check(tmp_path, name, text, "--code")
+    assert done.returncode == 1
+    assert f"{name}:{line}: " in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("page.md", "Use `anew`.\n\n```text\nanew\n```\n\n    anew\n"),
+        ("code.py", "anew = 1\n"),
+        ("code.c", "int anew;\n"),
+    ],
+)
+def test_the_language_check_ignores_code(tmp_path: Path, name: str, text: str):
+    assert run_check(tmp_path, name, text, "--code").returncode == 0
+
+
+# The built site.
+
+
+@pytest.fixture
+def site() -> Path:
+    folder = REPOSITORY / "build" / "site"
+    if not (folder / "docs" / "index.html").is_file():
+        pytest.skip("no site: run make docs")
+    return folder / "docs"
+
+
+def test_code_blocks_fit_on_a_screen_of_1280_pixels(browser: Browser, site: Path):
+    wide = "return [...document.querySelectorAll('pre')].filter((e) => e.scrollWidth > e.clientWidth).map((e) => e.textContent)"
+    found = {}
+    for folder in ("tutorials", "guides", "background"):
+        for page in sorted((site / folder).glob("*.html")):
+            browser.open(page.as_uri(), 1280)
+            if blocks := browser.run(wide):
+                found[page.name] = blocks
+    assert found == {}
+
+
+def test_code_blocks_have_copy_buttons(browser: Browser, site: Path):
+    browser.open((site / "guides" / "installation.html").as_uri(), 1280)
+    blocks = browser.run("return document.querySelectorAll('div.highlight pre').length")
+    assert blocks > 0
+    assert browser.run("return document.querySelectorAll('button.copybtn').length") == blocks
+
+
+@pytest.mark.parametrize("query", ["calibrate", "antenna delay", "recording"])
+def test_the_search_ranks_guides_above_the_api(browser: Browser, site: Path, query: str):
+    browser.open(f"{(site.parent / 'search.html').as_uri()}?q={query.replace(' ', '+')}", 1280)
+    script = "return [...document.querySelectorAll('ul.search li a')].map((e) => e.getAttribute('href'))"
+    found = browser.wait("results", lambda: browser.run(script))
+    assert "/reference/api" not in found[0]

@@ -368,7 +368,7 @@ def compiled(source: Path, program: Path) -> Path:
 
 
 def test_the_pages_program_prints_what_the_page_says(tmp_path: Path):
-    page = (REPOSITORY / "docs" / "dw1000_model.md").read_text(encoding="utf-8")
+    page = (REPOSITORY / "firmware" / "dw1000_model" / "README.md").read_text(encoding="utf-8")
     (text,) = re.findall(r"```c\n(.*?)```", page, re.DOTALL)
     (promise,) = re.findall(r"prints `(.*?)` twice", page)
     source = tmp_path / "blink.c"

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import select
 import time
 from collections.abc import Sequence
@@ -201,14 +200,6 @@ def test_the_image_of_the_dwm1001_dev_fits_it_and_is_written_as_hex(tmp_path: Pa
     told = json.loads((tmp_path / "image.json").read_text())
     assert told["flash_bytes"] < 48 << 10
     assert told["ram_bytes"] < 48 << 10, "the rest of 64 kB is the stack's"
-    # As docs/guides/boards.md publishes it, but for what one compiler differs from another in.
-    page = (Path(__file__).parents[1] / "docs" / "hardware.md").read_text()
-    (row,) = re.findall(
-        r"^\| DWM1001-DEV \| ([\d,]+) of ([\d,]+) \| ([\d,]+) of ([\d,]+) \|", page, re.MULTILINE
-    )
-    flash, flash_room, ram, ram_room = (int(number.replace(",", "")) for number in row)
-    assert (flash, ram) == pytest.approx((told["flash_bytes"], told["ram_bytes"]), rel=0.03)
-    assert (flash_room, ram_room) == (told["flash_room"], told["ram_room"])
     lines = (tmp_path / "radio.hex").read_text().splitlines()
     assert lines[0].startswith(":10000000")
     assert lines[-1] == ":00000001FF"

@@ -1,4 +1,4 @@
-"""The reference pages beside running nodes: topics, services, diagnostics, and the node that a page tells to write."""
+"""The reference pages compared with running nodes: topics, services, diagnostics, and the example of a node."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import re
 import sys
 from pathlib import Path
 
+import generated
 import pytest
 
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
@@ -20,12 +21,13 @@ from uwb_mitigation.nodes import topics
 
 pytestmark = pytest.mark.ros
 
-DOCS = REPOSITORY / "docs"
-# What the entries of the table of topics mean for the nodes started here.
+PAGES = {path.stem: text for path, text in generated.reference().items()}
+GUIDES = REPOSITORY / "docs" / "guides"
+# The nodes of this test for each entry in the table of topics.
 ENTRIES = {
     "`driver`": {"driver", "board"},
     "`driver` on replay": {"driver"},
-    "where it is known where the tag was": set(),
+    "if the recording contains true positions": set(),
     "`driver` with `publish_clock:=true`": {"driver"},
     "`driver` with `source:=serial`": {"board"},
     "`mitigator`": {"mitigator"},
@@ -40,8 +42,8 @@ EVERY_SERVICE = re.compile(
 
 
 def rows(page: str, heading: str) -> list[list[str]]:
-    """The cells of the tables below a heading."""
-    text = (DOCS / page).read_text()
+    """Return the cells of the tables below a heading of a reference page."""
+    text = PAGES[page]
     section = text[text.index(f"{heading}\n") + len(heading) :].partition("\n#")[0]
     lines = [line for line in section.splitlines() if line.startswith("| `")]
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
@@ -71,7 +73,7 @@ def ros(tmp_path_factory: pytest.TempPathFactory):
 def test_the_nodes_have_the_topics_of_the_page(ros: Ros, column: int, of_node: str):
     documented = {
         (node, topic, row[1].strip("`"))
-        for row in rows("topics.md", "# Topics")
+        for row in rows("nodes", "## Topics")
         for topic in re.findall("`([^`]+)`", row[0])
         for entry in re.split("[;,] ", row[column])
         if entry
@@ -95,12 +97,12 @@ def test_the_nodes_have_the_topics_of_the_page(ros: Ros, column: int, of_node: s
     ("node", "heading"),
     [
         ("mitigator", "## `mitigator`"),
-        ("driver", "## `driver`, of a recording or the simulator"),
-        ("board", "## `driver`, of a board"),
+        ("driver", "## `driver` with a recording"),
+        ("board", "## `driver` with a board"),
     ],
 )
 def test_the_diagnostics_have_the_keys_of_the_page(ros: Ros, node: str, heading: str):
-    keys = {key for row in rows("diagnostics.md", heading) for key in re.findall("`([^`]+)`", row[0])}
+    keys = {key for row in rows("diagnostics", heading) for key in re.findall("`([^`]+)`", row[0])}
     open_ended = tuple(key.partition(": ")[0] + ": " for key in keys if ": " in key)
     expected = {key for key in keys if ": " not in key}
     arrays = ros.collect(DiagnosticArray, topics.DIAGNOSTICS, 100)
@@ -119,7 +121,7 @@ def test_the_diagnostics_have_the_keys_of_the_page(ros: Ros, node: str, heading:
 
 
 def test_the_node_on_the_page_about_sources_is_heard_by_the_mitigator(tmp_path: Path):
-    code = re.findall(r"^```python\n(.*?)^```", (DOCS / "sources.md").read_text(), re.M | re.S)[-1]
+    code = re.findall(r"^```python\n(.*?)^```", (GUIDES / "recordings.md").read_text(), re.M | re.S)[-1]
     with domain(tmp_path) as ros:
         received = ros.collect(RangeCorrected, "/uwb/range_corrected")
         ros.start("mitigator")
