@@ -69,8 +69,9 @@ docs-links:  ## look whether the documentation's links to elsewhere are alive (n
 	@$(BOOTSTRAP) docs
 	@$(SPHINX) -b linkcheck build/links
 
-lint: setup-training  ## ruff and mypy
+lint: setup-training  ## ruff, mypy and the language check
 	@$(VENV)/bin/ruff check . && $(VENV)/bin/ruff format --check . && $(VENV)/bin/mypy
+	@$(VENV)/bin/python docs/style/check_words.py
 
 lock:  ## write requirements/*.txt anew from requirements/*.in, and jazzy/*.txt beside what ROS brings (needs uv)
 	cd requirements && for part in runtime ros develop training docs; do \

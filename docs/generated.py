@@ -24,7 +24,6 @@ from typer.cli import get_docs_for_click
 from uwb_mitigation.commands import cli
 from uwb_mitigation.link import layout
 from uwb_mitigation.link.layout import Layout, MessageType
-from uwb_mitigation.nodes import health
 from uwb_mitigation.nodes.parameter_tables import TABLES
 
 DOCS = Path(__file__).resolve().parent
@@ -137,8 +136,17 @@ def _message(path: Path) -> Iterator[str]:
 
 def thresholds() -> str:
     """Return the rows of the table of warnings of the mitigator."""
-    found = [each for each in vars(health).values() if isinstance(each, health.Threshold)]
-    return "\n".join(f"| WARN | {each.fact} above {each.limit:g} | {each.text} |" for each in found)
+    # Importing the module would need ROS.
+    source = ast.parse((PACKAGE / "nodes" / "diagnostics.py").read_text(encoding="utf-8"))
+    calls = [node.value for node in source.body if isinstance(node, ast.Assign)]
+    rows = [
+        [ast.literal_eval(argument) for argument in call.args]
+        for call in calls
+        if isinstance(call, ast.Call) and ast.unparse(call.func) == "Threshold"
+    ]
+    if not rows:
+        raise ValueError("nodes/diagnostics.py defines no thresholds")
+    return "\n".join(f"| WARN | {fact} above {limit:g} | {text} |" for fact, limit, text in rows)
 
 
 def command_list() -> str:
