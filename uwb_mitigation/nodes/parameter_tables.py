@@ -245,7 +245,7 @@ def help_text(name: str) -> str:
     lines = [f"usage: {name} [--ros-args [-p NAME:=VALUE] [--params-file FILE] [-r FROM:=TO] ...]"]
     if rows:
         lines.append(
-            "parameters with their defaults (* = can be set while the node runs); see docs/parameters.md:"
+            "parameters with their defaults (* = can be set while the node runs); see docs/reference/nodes.md:"
         )
     for row in rows.values():
         lines.append(f"  {row.name}:={row.default_text}{' *' if row.live else ''}")
