@@ -347,79 +347,69 @@ def fit_joint(
     Raises:
         DatasetError: the ranges do not determine the solution.
     """
-    return _Joint(setting, links, prior, scale_m, around).fit(position, parameters, near)
+    d, model, problem = setting.dims, setting.model, _Problem(setting, links, prior, around)
+    x = np.zeros((len(links.time_s), 2 * d))
+    x[:, :d] = position[:, :d]
+    shared = prior.mean.copy() if parameters is None else parameters
+    kinds = int(links.alike.max(initial=0)) + 1
+    scale = np.full(kinds, _FIRST_SCALE_M) if scale_m is None else scale_m
+    solution: Solution | None = None
+    try:
+        for iteration in range(_ITERATIONS):
+            unit, error = problem.residuals(x, shared)
+            if scale_m is None and (iteration or parameters is not None):
+                found = np.maximum(scatter_of(error, links.alike, kinds), LEAST_SCALE_M)
+                scale = found if near else np.maximum(found, 0.5 * scale)
+            z = error / scale[links.alike]
+            robust = model.weight(z)
+            if iteration < _HUBER_ITERATIONS and not near:
+                robust = np.minimum(1.0, 1.0 / np.maximum(np.abs(z), 1e-9))
+            weight = robust * links.share / scale[links.alike] ** 2
+            solution = problem.linearised(x, shared, unit, error, weight).solve()
+            step = float(np.abs(solution.x[:, :d] - x[:, :d]).max())
+            x, shared = solution.x, solution.shared
+            if not np.isfinite(step) or step > 1e6:
+                raise np.linalg.LinAlgError
+            if step < _CONVERGED_M and (near or iteration > _HUBER_ITERATIONS + 2):
+                break
+    except np.linalg.LinAlgError as error_:
+        raise DatasetError(
+            "the ranges do not determine where the tags were", valid="more ranges, or anchors"
+        ) from error_
+    assert solution is not None
+    unit, error = problem.residuals(x, shared)
+    z = error / scale[links.alike]
+    loss = np.bincount(links.stretch, model.loss(z) * links.share, minlength=len(links.at_rest))
+    place, velocity = np.full((len(x), 3), problem.level), np.zeros((len(x), 3))
+    place[:, :d], velocity[:, :d] = x[:, :d], x[:, d:]
+    weight = model.weight(z) * links.share / scale[links.alike] ** 2
+    covariance = problem.covariance(solution, unit, weight)
+    return JointFit(
+        place,
+        velocity,
+        shared,
+        covariance,
+        error,
+        scale,
+        loss.astype(np.float64),
+        solution,
+        setting.height,
+    )
 
 
-class _Joint:
-    """The problem of `fit_joint`."""
+class _Problem:
+    """The linearised problem of `fit_joint`."""
 
     def __init__(
-        self,
-        setting: Setting,
-        links: Links,
-        prior: Regressors,
-        scale_m: NDArray[np.float64] | None,
-        around: NDArray[np.float64] | None,
+        self, setting: Setting, links: Links, prior: Regressors, around: NDArray[np.float64] | None
     ) -> None:
-        self._setting, self._links, self._prior, self._scale = setting, links, prior, scale_m
+        self._setting, self._links, self._prior = setting, links, prior
         centre = setting.anchors.position.mean(axis=0)
         self._around = np.tile(centre, (len(links.time_s), 1)) if around is None else around
         self._nearness = _NO_PRIOR if around is None else 1.0 / AROUND_M**2
-        self._level = 0.0 if setting.height is None else setting.height.value
+        self.level = 0.0 if setting.height is None else setting.height.value
 
-    def fit(
-        self, position: NDArray[np.float64], parameters: NDArray[np.float64] | None, near: bool
-    ) -> JointFit:
-        d, links, model = self._setting.dims, self._links, self._setting.model
-        x = np.zeros((len(links.time_s), 2 * d))
-        x[:, :d] = position[:, :d]
-        shared = self._prior.mean.copy() if parameters is None else parameters
-        kinds = int(links.alike.max(initial=0)) + 1
-        scale = np.full(kinds, _FIRST_SCALE_M) if self._scale is None else self._scale
-        solution: Solution | None = None
-        try:
-            for iteration in range(_ITERATIONS):
-                unit, error = self._residuals(x, shared)
-                if self._scale is None and (iteration or parameters is not None):
-                    found = np.maximum(scatter_of(error, links.alike, kinds), LEAST_SCALE_M)
-                    scale = found if near else np.maximum(found, 0.5 * scale)
-                z = error / scale[links.alike]
-                robust = model.weight(z)
-                if iteration < _HUBER_ITERATIONS and not near:
-                    robust = np.minimum(1.0, 1.0 / np.maximum(np.abs(z), 1e-9))
-                weight = robust * links.share / scale[links.alike] ** 2
-                solution = self._linearised(x, shared, unit, error, weight).solve()
-                step = float(np.abs(solution.x[:, :d] - x[:, :d]).max())
-                x, shared = solution.x, solution.shared
-                if not np.isfinite(step) or step > 1e6:
-                    raise np.linalg.LinAlgError
-                if step < _CONVERGED_M and (near or iteration > _HUBER_ITERATIONS + 2):
-                    break
-        except np.linalg.LinAlgError as error_:
-            raise DatasetError(
-                "the ranges do not determine where the tags were", valid="more ranges, or anchors"
-            ) from error_
-        assert solution is not None
-        unit, error = self._residuals(x, shared)
-        z = error / scale[links.alike]
-        loss = np.bincount(links.stretch, model.loss(z) * links.share, minlength=len(links.at_rest))
-        place, velocity = np.full((len(x), 3), self._level), np.zeros((len(x), 3))
-        place[:, :d], velocity[:, :d] = x[:, :d], x[:, d:]
-        weight = model.weight(z) * links.share / scale[links.alike] ** 2
-        covariance = self._covariance(solution, unit, weight)
-        return JointFit(
-            place,
-            velocity,
-            shared,
-            covariance,
-            error,
-            scale,
-            loss.astype(np.float64),
-            solution,
-            self._setting.height,
-        )
-
-    def _covariance(
+    def covariance(
         self, solution: Solution, unit: NDArray[np.float64], weight: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Return the covariance of the parameters: of noise, and of errors that stay the same for `SLOW_S`."""
@@ -436,13 +426,13 @@ class _Joint:
         )
         return found
 
-    def _residuals(
+    def residuals(
         self, x: NDArray[np.float64], shared: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return unit vectors (n, 3) from anchors to tags, and residuals (n,)."""
         d, links = self._setting.dims, self._links
         at = x[links.knot]
-        tag = np.full((len(at), 3), self._level)
+        tag = np.full((len(at), 3), self.level)
         tag[:, :d] = at[:, :d] + links.ahead_s[:, None] * at[:, d:]
         tag[:, 2] += links.rise
         unit, distance = directions(tag, self._setting.anchors.position[links.anchor])
@@ -459,7 +449,7 @@ class _Joint:
         level = unit[:, :d]
         return columns, np.concatenate([level, links.ahead_s[:, None] * level, links.rows], axis=1)
 
-    def _linearised(
+    def linearised(
         self,
         x: NDArray[np.float64],
         shared: NDArray[np.float64],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -238,22 +238,14 @@ def _median(residual: NDArray[np.float64]) -> float:
 
 
 def pooled(errors: list[TrackErrors]) -> TrackErrors:
-    """Errors of several tags as if of one: weighted by epochs; medians and percentiles are means of theirs."""
+    """Return the errors of all tags, weighted by epochs; medians and percentiles are means."""
     known = [one for one in errors if one.epochs]
     if not known:
         return NO_ERRORS
-    weight = np.array([one.epochs for one in known], float)
-    weight /= weight.sum()
-
-    def mean(name: str) -> float:
-        return float(weight @ np.array([getattr(one, name) for one in known]))
-
-    rmse = float(np.sqrt(weight @ np.array([one.rmse**2 for one in known])))
-    return TrackErrors(
-        sum(one.epochs for one in known),
-        rmse,
-        *(mean(name) for name in ("median", "p95", "coverage95", "nees_per_dof", "exceeded", "height_rmse")),
-    )
+    epochs, *columns = np.array([astuple(one) for one in known]).T
+    columns[0] = columns[0] ** 2
+    rmse, *means = (float(epochs @ column / epochs.sum()) for column in columns)
+    return TrackErrors(int(epochs.sum()), float(np.sqrt(rmse)), *means)
 
 
 def write_tracks(bag: BagWriter, tracks: list[TagTracks]) -> None:
