@@ -311,7 +311,10 @@ def test_measured_heights_replace_a_constant_one():
 
     ranges, path = drive(seconds=60, rate_hz=20.0, offset_m=0.25, path=up_and_down)
     truth = np.linalg.norm(path.position - HALL.position[ranges.anchor], axis=1)
-    measured = calibrate(HALL, [ranges], heights_m=path.position[:, 2])
+    measured, uncertain = (
+        calibrate(HALL, [ranges], heights_m=path.position[:, 2], height_sd_m=sd) for sd in (0.1, 0.5)
+    )
+    assert np.median(uncertain.pseudo_sd_m) > 1.2 * np.median(measured.pseudo_sd_m)
     constant = calibrate(HALL, [ranges], height=LEVEL)
     assert measured.pair(0, 0)[0] == pytest.approx(0.25, abs=0.06)
     wrong = [np.median(np.abs(one.pseudo_m - truth)) for one in (measured, constant)]

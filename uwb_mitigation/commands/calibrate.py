@@ -152,7 +152,13 @@ def calibrate(
         with console.stage_bars() as on_progress:
             if truth_topic is None:
                 found = site_calibration.without_truth(
-                    site, source, height=at_height, area=box, seed=seed, on_progress=on_progress
+                    site,
+                    source,
+                    height=at_height,
+                    area=box,
+                    seed=seed,
+                    height_sd_m=height_sd,
+                    on_progress=on_progress,
                 )
             else:
                 paths, arms = _poses(bags, site, truth_topic, frames, arm)

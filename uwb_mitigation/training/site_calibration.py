@@ -275,9 +275,13 @@ def without_truth(
     height: Height | None,
     area: Area | None,
     seed: int,
+    height_sd_m: float = 0.1,
     on_progress: Progress = lambda what, share: None,
 ) -> Calibrated:
     """Calibrate from the ranges alone.
+
+    Args:
+        height_sd_m: standard deviation of measured heights.
 
     Raises:
         DatasetError: the geometry does not determine the solution, an anchor is not where the file says, or an offset is
@@ -285,7 +289,15 @@ def without_truth(
     """
     on_progress("solving for track and offsets", 0.05)
     known = regressors(site, universal)
-    found = calibrate(site.anchors, site.tags, known, height=height, area=area, heights_m=site.height_m)
+    found = calibrate(
+        site.anchors,
+        site.tags,
+        known,
+        height=height,
+        area=area,
+        heights_m=site.height_m,
+        height_sd_m=height_sd_m,
+    )
     on_progress("solving for track and offsets", 0.4)
     track, ids = found.stretches, [anchor.id for anchor in site.anchors.anchors]
     of_range = site.begins[track.tag] + track.row
