@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import atexit
 import ctypes
 import functools
-import shutil
-import tempfile
 from ctypes import POINTER, c_double, c_int, c_size_t, c_uint16, c_uint32, c_uint64, c_void_p
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,10 +17,11 @@ from benchmarks.dw1000_model.links import Link
 from uwb_mitigation.errors import LinkError
 from uwb_mitigation.firmware_export.compiling import (
     WARNINGS,
+    Signatures,
     c_compiler,
     compile_objects,
     firmware_folder,
-    run,
+    load_library,
 )
 from uwb_mitigation.link.layout import Mode
 from uwb_mitigation.link.radio import RadioSettings
@@ -195,17 +193,12 @@ class ModelledAir:
 
 @functools.cache
 def _library() -> ctypes.CDLL:
-    folder = Path(tempfile.mkdtemp(prefix="uwb_radio_air_"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    output = folder / "radio_air.so"
     firmware = firmware_folder()
     program = Path(__file__).with_name("radio_air.c")
     options = ("-std=c99", "-O2", "-fPIC", *WARNINGS, f"-I{model_folder()}", f"-I{firmware / 'src'}")
     objects = compile_objects(c_compiler(), options, (program, *sorted((firmware / "src").glob("*.c"))))
-    run([*c_compiler(), "-shared", *objects, *model_objects(), "-o", str(output), "-lm", "-lpthread"])
-    library = ctypes.CDLL(str(output))
     air, board = c_void_p, c_int
-    signatures: dict[str, tuple[object, tuple[object, ...]]] = {
+    signatures: Signatures = {
         "new": (c_void_p, (c_uint64, c_size_t)),
         "free": (None, (air,)),
         "board": (
@@ -240,7 +233,4 @@ def _library() -> ctypes.CDLL:
         "read": (c_size_t, (air, board, c_void_p)),
         "line_lost": (c_uint64, (air, board)),
     }
-    for name, (result, arguments) in signatures.items():
-        function = getattr(library, f"radio_air_{name}")
-        function.restype, function.argtypes = result, arguments
-    return library
+    return load_library("radio_air_", (*objects, *model_objects()), signatures)

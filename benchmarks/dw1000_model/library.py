@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import atexit
 import ctypes
 import functools
-import shutil
-import tempfile
 from pathlib import Path
 
 from uwb_mitigation.errors import MissingDependencyError
 from uwb_mitigation.firmware_export.compiling import (
     WARNINGS,
+    Signatures,
     c_compiler,
     compile_objects,
     firmware_folder,
-    run,
+    load_library,
 )
 
 _OPTIONS = ("-std=c11", "-O2", "-fPIC", *WARNINGS)
@@ -88,13 +86,8 @@ def load() -> ctypes.CDLL:
     Raises:
         MissingDependencyError, UwbMitigationError: as `model_objects`.
     """
-    folder = tempfile.mkdtemp(prefix="uwb_dw1000_model_")
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    path = f"{folder}/libdw1000_model.so"
-    run([*c_compiler(), "-shared", *model_objects(), "-o", path, "-lm", "-lpthread"])
-    library = ctypes.CDLL(path)
     pointer, real, size = ctypes.c_void_p, ctypes.c_double, ctypes.c_size_t
-    declared: dict[str, tuple[object, tuple[object, ...]]] = {
+    signatures: Signatures = {
         "air_new": (pointer, (ctypes.c_uint64,)),
         "air_free": (None, (pointer,)),
         "chip_new": (pointer, (pointer, real, ctypes.c_uint64, ctypes.c_uint16, ctypes.c_uint16)),
@@ -115,8 +108,4 @@ def load() -> ctypes.CDLL:
         "now": (real, (pointer,)),
         "fault": (ctypes.c_char_p, (pointer,)),
     }
-    for name, (result, arguments) in declared.items():
-        function = getattr(library, f"dw1000_{name}")
-        function.restype = result
-        function.argtypes = arguments
-    return library
+    return load_library("dw1000_", model_objects(), signatures)

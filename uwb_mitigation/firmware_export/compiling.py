@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import ctypes
 import functools
 import os
 import re
@@ -10,12 +11,13 @@ import shlex
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from uwb_mitigation.errors import MissingDependencyError, UwbMitigationError
 from uwb_mitigation.model.shipped import shared_folders
 
+Signatures = Mapping[str, tuple[object, tuple[object, ...]]]
 WARNINGS = ("-Wall", "-Wextra", "-Wconversion", "-Wpedantic", "-Werror")
 
 
@@ -59,6 +61,27 @@ def compile_objects(
     for source, output in zip(sources, objects, strict=True):
         run([*compiler, *options, "-c", str(source), "-o", output])
     return objects
+
+
+def load_library(prefix: str, objects: Sequence[str], signatures: Signatures) -> ctypes.CDLL:
+    """Link object files into a shared library and load it into this process.
+
+    Args:
+        prefix: of the functions' names.
+        signatures: result and arguments of the functions, {name without prefix: (result, arguments)}.
+
+    Raises:
+        UwbMitigationError: the objects cannot be linked.
+    """
+    folder = tempfile.mkdtemp(prefix=f"uwb_{prefix}")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    path = f"{folder}/{prefix}library.so"
+    run([*c_compiler(), "-shared", *objects, "-o", path, "-lm", "-lpthread"])
+    library = ctypes.CDLL(path)
+    for name, (result, arguments) in signatures.items():
+        function = getattr(library, f"{prefix}{name}")
+        function.restype, function.argtypes = result, arguments
+    return library
 
 
 def run(command: Sequence[str], timeout_s: float = 300, folder: Path | None = None) -> str:

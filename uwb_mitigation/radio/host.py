@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-import atexit
 import ctypes
 import functools
 import secrets
-import shutil
-import tempfile
 import threading
 import time
 from collections.abc import Callable
 from ctypes import POINTER, c_char_p, c_float, c_int, c_size_t, c_uint32, c_uint64, c_void_p
 from dataclasses import replace
-from pathlib import Path
 
 from uwb_mitigation.errors import LinkError, ParameterError
 from uwb_mitigation.firmware_export.compiling import (
     WARNINGS,
+    Signatures,
     c_compiler,
     compile_objects,
     firmware_folder,
-    run,
+    load_library,
 )
 from uwb_mitigation.link import messages
 from uwb_mitigation.link.layout import MessageType, RadioState
@@ -233,14 +230,8 @@ def _compiled() -> ctypes.CDLL:
     )
     options = (*_OPTIONS, f"-I{firmware / 'src'}")
     objects = compile_objects(c_compiler(), options, (*sources, firmware / "host" / "host_radio.c"))
-    folder = Path(tempfile.mkdtemp(prefix="uwb_host_radio_"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    output = folder / "host_radio.so"
-    run([*c_compiler(), "-shared", *objects, "-o", str(output), "-lm"])
-    library = ctypes.CDLL(str(output))
     radio = c_void_p
-    library.uwb_twr_fill_times.argtypes = (POINTER(structures.Config), c_uint32, c_uint32)
-    signatures: dict[str, tuple[object, tuple[object, ...]]] = {
+    signatures: Signatures = {
         "new": (c_void_p, (POINTER(structures.Io), POINTER(structures.Config), c_uint64)),
         "free": (None, (radio,)),
         "configure": (c_char_p, (radio, POINTER(structures.Config))),
@@ -253,7 +244,6 @@ def _compiled() -> ctypes.CDLL:
         "anchors": (POINTER(structures.TwrAnchor), (radio, POINTER(c_size_t))),
         "sensors": (c_int, (radio, POINTER(c_float), POINTER(c_float))),
     }
-    for name, (result, arguments) in signatures.items():
-        function = getattr(library, f"host_radio_{name}")
-        function.restype, function.argtypes = result, arguments
+    library = load_library("host_radio_", objects, signatures)
+    library.uwb_twr_fill_times.argtypes = (POINTER(structures.Config), c_uint32, c_uint32)
     return library
