@@ -118,15 +118,6 @@ def test_recorded_stamps_and_clock_on_request(ros: Ros, bag: Path):
     assert recorded[0] <= times[-1] <= recorded[-1]
 
 
-def test_a_loop_goes_on(ros: Ros, bag: Path):
-    received = ros.collect(RangeCir, RAW)
-    driver = ros.start(
-        "driver", "source:=mcap", f"path:={bag}", "rate:=20.0", "start_delay:=0.2", "loop:=true"
-    )
-    ros.spin_until(lambda: len(received) > 650)
-    assert driver.signal(signal.SIGINT) == 0, driver.output
-
-
 @pytest.mark.parametrize(
     ("parameters", "named"),
     [

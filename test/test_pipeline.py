@@ -3,24 +3,18 @@
 from __future__ import annotations
 
 import signal
-import threading
-from collections.abc import Sequence
 
 import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
-import rclpy
 from ros_harness import PAUSED, Ros
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
-from uwb_mitigation.bag.codec import encode_range
-from uwb_mitigation.measurement import RangeMeasurement
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.shipped import default_model_path
-from uwb_mitigation.nodes import driver
 from uwb_mitigation.sources.simulated import SimulatedSource
 
 pytestmark = pytest.mark.ros
@@ -54,47 +48,6 @@ def test_the_raw_ranges_are_there_for_who_subscribes(ros: Ros):
     assert [m.header for m in raw] == [m.header for m in corrected]
     assert [m.range for m in raw] == [m.range_raw for m in corrected]
     assert all(len(m.cir.samples) for m in raw)
-
-
-class Consumer:
-    """Takes the driver's measurements, in the mitigator's place."""
-
-    def __init__(self) -> None:
-        self.taken: list[RangeMeasurement] = []
-
-    def correct(self, measurements: Sequence[RangeMeasurement]) -> None:
-        self.taken += measurements
-
-    def subscription_count(self) -> int:
-        return 1
-
-    def wait_for_all_acked(self, timeout: object) -> None:
-        """Nothing is on its way."""
-
-
-def test_no_raw_range_is_built_while_nobody_subscribes(ros: Ros, monkeypatch: pytest.MonkeyPatch):
-    built: list[RangeMeasurement] = []
-
-    def encode(measurement: RangeMeasurement) -> bytes:
-        built.append(measurement)
-        return encode_range(measurement)
-
-    monkeypatch.setattr(driver, "encode_range", encode)
-    words = ["-p", "simulated_rate:=400.0", "-p", "start_delay:=0.0"]
-    rclpy.init(args=["driver", "--ros-args", *words], domain_id=ros.domain)
-    playing = None
-    try:
-        consumer = Consumer()
-        playing = driver.Driver(threading.Event(), consumer)
-        ros.spin_until(lambda: len(consumer.taken) > 200)
-        assert built == []
-        raw = ros.collect(RangeCir, RAW)
-        ros.spin_until(lambda: len(raw) > 0)
-        assert len(built) > 0
-    finally:
-        if playing is not None:
-            playing.destroy_node()
-        rclpy.try_shutdown()
 
 
 def test_several_pipelines_side_by_side_keep_to_themselves(ros: Ros):

@@ -396,13 +396,6 @@ def test_simulated_ranges_are_called_so(ros: Ros):
 
 
 @pytest.mark.ros
-def test_all_subscribers_that_are_counted_hear_the_first_range_without_a_delay(ros: Ros):
-    received = [ros.collect(RangeCir, RAW) for _ in range(3)]
-    ros.start("driver", "count:=50", "simulated_rate:=500.0", "wait_for_subscribers:=3")
-    ros.spin_until(lambda: all(len(messages) == 50 for messages in received))
-
-
-@pytest.mark.ros
 def test_offsets_are_set_while_it_runs_and_nonsense_leaves_those_before(ros: Ros, tmp_path: Path):
     path = tmp_path / "offsets.yaml"
     path.write_text("pairs: [{anchor: 2, tag: 1, offset: 1.5}]")

@@ -17,9 +17,9 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
 from rclpy.clock import Clock, ClockType
-from ros_harness import PAUSED, Ros
+from ros_harness import Ros
 from rosgraph_msgs.msg import Clock as ClockMessage
-from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
+from uwb_mitigation_msgs.msg import RangeCir
 
 from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.errors import DamagedRecordingError, UwbMitigationError
@@ -316,26 +316,6 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for record in source:
             writer.write(record)
     return path
-
-
-@pytest.mark.ros
-def test_the_same_bag_gives_the_same_corrected_ranges_twice(ros: Ros, bag: Path):
-    def play(rate: str) -> list[tuple]:
-        received = ros.collect(RangeCorrected, "/uwb/range_corrected")
-        pipeline = ros.start(
-            "pipeline", "source:=mcap", f"path:={bag}", f"rate:={rate}", "publish_clock:=true", *PAUSED
-        )
-        ros.play()
-        assert pipeline.wait() == 0, pipeline.output
-        ros.spin_until(lambda: len(received) == COUNT)
-        # The next pipeline must not be taken for this one.
-        ros.spin_until(lambda: ros.node.count_publishers("/uwb/range_corrected") == 0)
-        return [
-            (m.header.stamp.sec, m.header.stamp.nanosec, m.sequence, m.range, m.variance, m.status)
-            for m in received
-        ]
-
-    assert play("8.0") == play("40.0")
 
 
 @pytest.mark.ros

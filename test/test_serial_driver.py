@@ -17,9 +17,6 @@ pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from faulty_board import FaultyBoard
-from rcl_interfaces.msg import Parameter as ParameterMessage
-from rcl_interfaces.msg import ParameterType, ParameterValue
-from rcl_interfaces.srv import SetParameters
 from ros_harness import Process, Ros
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
@@ -62,12 +59,6 @@ def board(link: Path, *, model: bool = False, rate_hz: float = 50.0, **options) 
 
 def drive(ros: Ros, link: Path, *parameters: str) -> Process:
     return ros.start("driver", "source:=serial", f"port:={link}", *parameters)
-
-
-def set_mode(ros: Ros, mode: str) -> bool:
-    value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=mode)
-    request = SetParameters.Request(parameters=[ParameterMessage(name="mode", value=value)])
-    return ros.call(SetParameters, "/driver/set_parameters", request).results[0].successful
 
 
 def fact(status: DiagnosticStatus, key: str) -> str:
@@ -130,9 +121,9 @@ def test_the_mode_changes_without_a_restart(ros: Ros, link: Path):
     with board(link, model=True, rate_hz=200.0):
         driver = drive(ros, link)
         for mode, origin in (("host", Origin.HOST), ("device", Origin.DEVICE), ("host", Origin.HOST)):
-            assert set_mode(ros, mode)
+            assert ros.set_parameter("driver", "mode", mode).successful
             ros.spin_until(lambda o=origin: [m.source for m in corrected[-20:]] == [o] * 20)
-        assert not set_mode(ros, "sideways")
+        assert not ros.set_parameter("driver", "mode", "sideways").successful
         assert driver.exit_code() is None
     keys = Counter(
         (m.header.stamp.sec, m.header.stamp.nanosec, m.anchor_id, m.tag_id, m.sequence) for m in corrected
@@ -148,16 +139,6 @@ def test_corrections_by_another_model_than_the_expected_one_are_withheld(ros: Ro
     assert status.level == DiagnosticStatus.ERROR
     assert "another model" in status.message
     assert corrected == []
-
-
-def test_an_absent_port_is_waited_for(ros: Ros, link: Path):
-    received = ros.collect(RangeCir, RAW)
-    driver = drive(ros, link)
-    status = ros.diagnosis("driver", lambda s: s.level == DiagnosticStatus.ERROR)
-    assert str(link) in status.message
-    with board(link):
-        ros.spin_until(lambda: len(received) >= 10)
-    assert driver.exit_code() is None
 
 
 def test_a_board_of_another_protocol_version_is_named(ros: Ros, link: Path):

@@ -36,7 +36,7 @@ from uwb_mitigation.sources.site import anchors_file, load_anchors
 from uwb_mitigation.viewer import playback
 from uwb_mitigation.viewer.feed import Feed
 from uwb_mitigation.viewer.playback import BagPlayer
-from uwb_mitigation.viewer.scene import Scene, Trace
+from uwb_mitigation.viewer.scene import Scene
 
 COUNT = 400
 """Ranges of the bag, 10 ms apart, of two anchors by turns."""
@@ -194,17 +194,6 @@ def test_a_bag_that_was_cut_shows_what_is_left_and_says_so(bag: Path, tmp_path: 
     assert "nothing beyond" in scene.reports["recording"].message
     player.seek(0.0)
     assert latest(scene)
-
-
-def test_a_cir_that_nobody_looks_at_is_not_computed(monkeypatch: pytest.MonkeyPatch):
-    scene = Scene()
-    feed = Feed(scene, threading.Lock())
-    with monkeypatch.context() as patched:
-        patched.setattr(Trace, "magnitude", property(lambda trace: pytest.fail("nobody looks")))
-        feed.range_raw(encode_range(record(1).measurement))
-    (trace,) = scene.pairs[2, 7].traces
-    samples = record(1).measurement.cir.samples.astype(float)
-    assert trace.magnitude == pytest.approx(np.hypot(samples[::2], samples[1::2]))
 
 
 def test_an_anchor_of_no_64_bits_is_passed_over() -> None:
