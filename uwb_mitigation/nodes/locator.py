@@ -1,4 +1,4 @@
-"""The node `locator`: subscribes to `/uwb/range_corrected`, publishes where the tags are."""
+"""The node `locator`: subscribes to `/uwb/range_corrected`, publishes the positions of the tags."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Collection
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -35,20 +36,19 @@ from uwb_mitigation.positioning.tracks import Estimate
 from uwb_mitigation.sources.site import load_anchors
 
 BATCH = 64
-"""Ranges that have queued up are taken so many at a time."""
+"""Number of queued ranges that are taken at once."""
 
-SLOW_S = 0.2
-"""Smoothed poses, markers, and predictions through a silence come so often."""
+PERIOD_S = 0.2
+"""Period of smoothed poses, of markers, and of predictions without ranges."""
 
-SILENT_S = 0.3
-COAST_S = 30.0
-"""A tag that fell silent is predicted for so long: by then its covariance has outgrown most halls."""
+PREDICT_AFTER_S, PREDICT_UNTIL_S = 0.3, 30.0
+"""A tag without ranges is predicted between these ages of its last range: later its covariance exceeds most halls."""
 
 _NANOSECONDS = 1_000_000_000
 
 
 class _Outputs:
-    """The publishers of one tag, its frame, and what it said last."""
+    """The publishers of one tag, its frame, and the stamps of its last messages."""
 
     def __init__(self, node: Locator, prefix: str, frame: str) -> None:
         def publisher(kind: type, topic: str) -> Publisher:
@@ -60,7 +60,7 @@ class _Outputs:
         self.smoothed = publisher(PoseWithCovarianceStamped, topics.POSE_SMOOTHED)
         self.frame = frame
         self.picture = markers.TagPicture()
-        self.told_ns = self.smoothed_ns = self.transform_ns = -(1 << 62)
+        self.published_ns = self.smoothed_ns = self.transform_ns = -(1 << 62)
 
     def all(self) -> tuple[Publisher, ...]:
         return self.pose, self.odometry, self.smoothed
@@ -69,8 +69,8 @@ class _Outputs:
 class Locator(ManagedNode):
     """Lifecycle: configure reads the anchors and makes the topics, activate begins to follow tags.
 
-    An anchors file that is absent or wrong leaves the node unconfigured, and log and diagnostics say why; it may be
-    configured again once the file is mended.
+    If the anchors file is missing or invalid, the node stays unconfigured, and log and diagnostics name the reason;
+    configure it again after the file is fixed.
 
     Args:
         foreign: see `ManagedNode`.
@@ -86,10 +86,10 @@ class Locator(ManagedNode):
         self._outputs: dict[int, _Outputs] = {}
         self._timer: Timer | None = None
         self._malformed = self._lost = 0
-        self._told: set[int] = set()
+        self._unknown_anchors: set[int] = set()
         self._processing_ns: list[int] = []
         self._meter = diagnostics.Meter(self.now_ns)
-        # Without its anchors it stays, for the log and the diagnostics to say so.
+        # Without anchors it keeps running, so that the diagnostics name the reason.
         with contextlib.suppress(ParameterError, MissingDependencyError):
             self.autostart()
 
@@ -128,7 +128,9 @@ class Locator(ManagedNode):
 
     def begin(self) -> None:
         self._show_anchors()
-        self._timer = self.create_timer(SLOW_S, self._on_timer, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._timer = self.create_timer(
+            PERIOD_S, self._on_timer, clock=Clock(clock_type=ClockType.STEADY_TIME)
+        )
         self.get_logger().info("locating")
 
     def end(self) -> None:
@@ -169,18 +171,11 @@ class Locator(ManagedNode):
         self._lost += info.total_count_change
 
     def _on_range(self, data: bytes, number: int) -> None:
-        # Subscriptions go on firing while a lifecycle node is inactive.
-        if self._fleet is None or self._ranges is None or not self.is_active:
-            return
-        take = self._ranges.handle.take_message
-        for _ in range(BATCH):
-            self._take(self._fleet, data)
-            # What else has queued up comes with it; the executor then finds its own turn empty.
-            taken = take(RangeCorrected, True)
-            if taken is None:
-                return
-            data, _ = taken
-        self._take(self._fleet, data)
+        # Subscriptions stay active while a lifecycle node is inactive.
+        if self._fleet is not None and self._ranges is not None and self.is_active:
+            # Messages in the queue are taken too; the executor then finds it empty.
+            for each, _ in chain([(data, number)], topics.queued(self._ranges, BATCH)):
+                self._take(self._fleet, each)
 
     def _take(self, fleet: Fleet, data: bytes) -> None:
         began_ns = time.perf_counter_ns()
@@ -193,8 +188,8 @@ class Locator(ManagedNode):
         stamp_ns = key.stamp_ns + self._offset_ns
         found = fleet.add(key.tag_id, key.anchor_id, stamp_ns, corrected.range_m, corrected.variance_m2)
         if found is None:
-            if key.anchor_id in fleet.strangers and key.anchor_id not in self._told:
-                self._told.add(key.anchor_id)
+            if key.anchor_id in fleet.strangers and key.anchor_id not in self._unknown_anchors:
+                self._unknown_anchors.add(key.anchor_id)
                 self.get_logger().warning(
                     f"ranges of anchor {format_id(key.anchor_id)} are left out: it is not in the anchors file"
                 )
@@ -202,9 +197,9 @@ class Locator(ManagedNode):
         tag, estimate = found
         outputs = self._outputs_of(tag)
         outputs.picture.statuses[fleet.anchors.index[key.anchor_id]] = corrected.status
-        if estimate is not None and not 0 <= stamp_ns - outputs.told_ns < self._period_ns:
-            outputs.told_ns = stamp_ns
-            self._tell(outputs, estimate)
+        if estimate is not None and not 0 <= stamp_ns - outputs.published_ns < self._period_ns:
+            outputs.published_ns = stamp_ns
+            self._publish_estimate(outputs, estimate)
         now_ns = time.perf_counter_ns()
         if len(self._processing_ns) < 20_000:
             self._processing_ns.append(now_ns - began_ns)
@@ -225,11 +220,11 @@ class Locator(ManagedNode):
             self.get_logger().info(f"tag {format_id(tag.tag_id)} on {outputs.pose.topic_name}")
         return outputs
 
-    def _tell(self, outputs: _Outputs, estimate: Estimate) -> None:
+    def _publish_estimate(self, outputs: _Outputs, estimate: Estimate) -> None:
         outputs.picture.add(estimate)
         outputs.pose.publish(encode_pose(self._at_base(estimate), self._map))
         outputs.odometry.publish(encode_odometry(estimate, self._map, outputs.frame))
-        # Listeners of tf warn of a stamp that they have already.
+        # tf warns of a repeated stamp.
         if self._tf is not None and estimate.stamp_ns > outputs.transform_ns:
             outputs.transform_ns = estimate.stamp_ns
             x, y, z = estimate.position.tolist()
@@ -255,11 +250,11 @@ class Locator(ManagedNode):
             return
         for tag in list(fleet.tags.values()):
             outputs = self._outputs_of(tag)
-            silent_s = (now_ns + self._offset_ns - tag.latest_ns) / _NANOSECONDS
-            if SILENT_S < silent_s < COAST_S:
+            age_s = (now_ns + self._offset_ns - tag.latest_ns) / _NANOSECONDS
+            if PREDICT_AFTER_S < age_s < PREDICT_UNTIL_S:
                 ahead = tag.locator.at(now_ns + self._offset_ns)
                 if ahead is not None:
-                    self._tell(outputs, ahead)
+                    self._publish_estimate(outputs, ahead)
             elif outputs.smoothed_ns != tag.latest_ns and outputs.smoothed.get_subscription_count():
                 outputs.smoothed_ns = tag.latest_ns
                 smoothed = tag.smoother.estimate()

@@ -7,6 +7,7 @@ import threading
 import time
 from array import array
 from collections.abc import Collection, Sequence
+from itertools import chain
 from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
@@ -36,15 +37,15 @@ if importlib.util.find_spec("onnxruntime") is None:
     raise ModuleNotFoundError("No module named 'onnxruntime'", name="onnxruntime")
 
 BATCH = 16
-"""Ranges that have queued up are corrected so many at once: a batch costs half of its ranges one by one."""
+"""Number of queued ranges that are corrected at once, for half of the time of single ranges."""
 
 
 def load(model: str, backend: str = "onnxruntime") -> Backend:
-    """The bundle that the parameter `model` names, ready to correct by `backend`.
+    """Return the bundle of the parameter `model`, ready to correct by `backend`.
 
     Raises:
-        ModelError: it is absent, corrupt, or refused by the backend.
-        MissingDependencyError: the firmware is asked for where there is no C compiler.
+        ModelError: it is missing, corrupt, or refused by the backend.
+        MissingDependencyError: `firmware` without a C compiler.
     """
     bundle = load_bundle(model_path(model))
     if backend == "firmware":
@@ -58,10 +59,9 @@ def load(model: str, backend: str = "onnxruntime") -> Backend:
 class Mitigator(ManagedNode):
     """Lifecycle: configure makes publisher and subscription, activate loads the model.
 
-    A model that cannot be loaded leaves the node inactive and says so in the log and in the
-    diagnostics; activating again, when the file is mended, loads it. Nothing is published while
-    inactive, and nothing is queued. Ranges come from the topic or, in one process with their driver,
-    through `correct`.
+    If the model cannot be loaded, the node stays inactive, and log and diagnostics name the reason; activate it again
+    after the file is fixed. While inactive, nothing is published or queued. Ranges come from the topic or, in one
+    process with their driver, through `correct`.
 
     Args:
         subscribe: take ranges from the topic.
@@ -91,7 +91,7 @@ class Mitigator(ManagedNode):
         if self.value("sensor_ranges"):
             self._sensor_ranges = self.until_close(topics.SensorRanges(self), topics.SensorRanges.close)
         if self._subscribe:
-            # Serialised messages: decoding them here takes a third of what rclpy takes for its objects.
+            # Serialised messages: decoding them here takes a third of the time of rclpy.
             self._raw = self.until_close(
                 topics.create_raw_subscription(self, RangeCir, topics.RANGE_RAW, self._on_raw, self._on_lost),
                 self.destroy_subscription,
@@ -136,11 +136,11 @@ class Mitigator(ManagedNode):
             self._meter.add(now_ns - measurement.stamp_ns)
 
     def subscription_count(self) -> int:
-        """How many listen to the corrected ranges."""
+        """Return the number of subscribers of the corrected ranges."""
         return self._corrected.get_subscription_count() if self._corrected is not None else 0
 
     def wait_for_all_acked(self, timeout: Duration) -> None:
-        """Wait until every subscriber has what was published."""
+        """Wait until every subscriber has received everything."""
         if self._corrected is not None:
             self._corrected.wait_for_all_acked(timeout)
 
@@ -164,21 +164,16 @@ class Mitigator(ManagedNode):
         return self._raw.get_publisher_count() if self._raw is not None else 0
 
     def _on_raw(self, data: bytes, number: int) -> None:
-        # Subscriptions go on firing while a lifecycle node is inactive.
+        # Subscriptions stay active while a lifecycle node is inactive.
         if self._mitigation is None or self._raw is None:
             return
         batch = []
-        self.health.numbering.add(number)
-        take = self._raw.handle.take_message
-        while True:
-            measurement = self._decode(data)
+        # Messages in the queue are taken too; the executor then finds it empty.
+        for each, its_number in chain([(data, number)], topics.queued(self._raw, BATCH - 1)):
+            self.health.numbering.add(its_number)
+            measurement = self._decode(each)
             if measurement is not None:
                 batch.append(measurement)
-            # What else has queued up comes with it; the executor then finds its own turn empty.
-            if len(batch) == BATCH or (taken := take(RangeCir, True)) is None:
-                break
-            data, info = taken
-            self.health.numbering.add(topics.number_of(info))
         if batch:
             self.correct(batch)
 
@@ -202,12 +197,12 @@ class Mitigator(ManagedNode):
         self.health.lost += info.total_count_change
 
     def _use(self, mitigation: Backend) -> None:
-        # Between two ranges, never within one: none is lost, none is corrected by half a model.
+        # Between two ranges: none is lost, and none is corrected with parts of two models.
         mitigation.offsets = self._offsets
         with self._lock:
             self._mitigation = mitigation
         bundle = mitigation.bundle
-        self._judge_anew(mitigation)
+        self._reset_offset_check(mitigation)
         limits = ": on other boards or behind other walls it may harm"
         if bundle.prior == LinePrior(0.0):
             limits = f"; offsets of these radios: {self._offsets}"
@@ -216,13 +211,13 @@ class Mitigator(ManagedNode):
             f"{bundle.card.origin}{limits}"
         )
 
-    def _judge_anew(self, mitigation: Backend) -> None:
-        # A prior has the offset of the boards that it was fitted to, unless another is set beside it.
+    def _reset_offset_check(self, mitigation: Backend) -> None:
+        # A prior includes the offset of the boards of its training, unless another offset is set.
         self.health.predicts_excess_alone = bool(self._offsets) or mitigation.bundle.prior == LinePrior(0.0)
         self.health.los_m.clear()
 
     def _prepare(self, changes: list[Any]) -> SetParametersResult:
-        """Load a model or offsets that are to be set, or refuse them; ranges wait in the queue meanwhile."""
+        """Load a new model or new offsets, or refuse them; ranges wait in the queue meanwhile."""
         for change in changes:
             if change.name == "offsets":
                 try:
@@ -239,7 +234,7 @@ class Mitigator(ManagedNode):
         return SetParametersResult(successful=True)
 
     def _swap(self, changes: list[Any]) -> None:
-        # Called once the whole set was accepted; another callback may have refused what was prepared before.
+        # Called after the whole set was accepted: another callback may have refused it after `_prepare`.
         prepared, self._prepared = self._prepared, None
         offsets, self._prepared_offsets = self._prepared_offsets, None
         for change in changes:
@@ -248,7 +243,7 @@ class Mitigator(ManagedNode):
                     self._offsets = offsets
                     if self._mitigation is not None:
                         self._mitigation.offsets = offsets
-                        self._judge_anew(self._mitigation)
+                        self._reset_offset_check(self._mitigation)
                 self.get_logger().info(f"offsets: {offsets}")
             if change.name == "model" and prepared is not None and prepared[0] == change.value:
                 self.error = None

@@ -117,7 +117,7 @@ def create_raw_subscription(
         # rclpy's events executor passes (data, info) as one tuple.
         if info is None:
             data, info = data
-        callback(data, number_of(info))
+        callback(data, info["publication_sequence_number"])
 
     events = SubscriptionEventCallbacks(message_lost=on_lost)
     subscription = create_subscription(node, kind, topic, take, raw=True, event_callbacks=events)
@@ -126,9 +126,18 @@ def create_raw_subscription(
     return subscription
 
 
-def number_of(info: dict[str, int]) -> int:
-    """Return the publisher's sequence number from the info of rclpy's `take_message`."""
-    return info["publication_sequence_number"]
+def queued(subscription: Subscription, limit: int) -> Iterator[tuple[bytes, int]]:
+    """Yield messages that wait in the queue of a raw subscription, with the publisher's sequence number.
+
+    Args:
+        limit: the highest number of messages: they may arrive as fast as they are taken.
+    """
+    take, kind = subscription.handle.take_message, subscription.msg_type
+    for _ in range(limit):
+        if (taken := take(kind, True)) is None:
+            return
+        data, info = taken
+        yield data, info["publication_sequence_number"]
 
 
 def not_received(node: LifecycleNode) -> list[str]:

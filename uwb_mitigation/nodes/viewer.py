@@ -9,7 +9,6 @@ import re
 import threading
 from collections.abc import Callable
 from functools import partial
-from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -144,24 +143,17 @@ class Viewer(ManagedNode):
 
     def _take_ranges(self) -> None:
         # A truth is published before its corrected range: taken after it and used before it, none is missed.
-        corrected, truths, raw = map(
-            self._queued, (topics.RANGE_CORRECTED, topics.RANGE_TRUTH, topics.RANGE_RAW)
+        corrected, truths, raw = (
+            list(topics.queued(self._ranges[topic], _QOS.depth)) if topic in self._ranges else []
+            for topic in (topics.RANGE_CORRECTED, topics.RANGE_TRUTH, topics.RANGE_RAW)
         )
-        for feed, queued in (
+        for take, queued in (
             (self._feed.range_truth, truths),
             (self._feed.range_raw, raw),
             (self._feed.range_corrected, corrected),
         ):
-            for data in queued:
-                feed(data)
-
-    def _queued(self, topic: str) -> list[bytes]:
-        """Take the messages in the queue of a topic."""
-        if (subscription := self._ranges.get(topic)) is None:
-            return []
-        take, kind = subscription.handle.take_message, subscription.msg_type
-        # Bounded: messages may arrive as fast as they are taken.
-        return [data for data, _ in takewhile(bool, (take(kind, True) for _ in range(_QOS.depth)))]
+            for data, _ in queued:
+                take(data)
 
     def _search(self) -> None:
         """Subscribe to topics that are needed, or exist, only by now."""
