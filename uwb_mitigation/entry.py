@@ -1,4 +1,4 @@
-"""The executables, and how they end while they still load. Standard library only: loading the rest takes a second.
+"""The executables, and how a signal ends them while they load. Standard library only: the rest loads in a second.
 
 python -m uwb_mitigation.entry NODE --ros-args ..., or DEMO ...
 """

@@ -81,7 +81,7 @@ def _model_id(digits: str) -> int | None:
 
 
 class Consumer(Protocol):
-    """What takes measurements in the same process: the mitigator of a pipeline."""
+    """Takes measurements in the same process: the mitigator of a pipeline."""
 
     def correct(self, measurements: Sequence[RangeMeasurement]) -> None: ...
 

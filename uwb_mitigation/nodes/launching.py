@@ -231,7 +231,7 @@ def _parameters_in(path: Path, node: str, not_shared: Collection[str]) -> dict[s
 
 
 def kept_parameters() -> dict[str, str]:
-    """Return the environment by which a respawned node gets back the parameters that were set while it ran."""
+    """Return the environment that lets a respawned node restore the parameters that were set while it ran."""
     folder = tempfile.mkdtemp(prefix="uwb_mitigation_")
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     return {KEPT_PARAMETERS: folder}

@@ -1,4 +1,4 @@
-"""What RViz and Foxglove show of a site: anchors, rays to the tags, ellipses and trails."""
+"""Markers for RViz and Foxglove: anchors, rays to the tags, ellipses and trails."""
 
 from __future__ import annotations
 
@@ -6,20 +6,19 @@ from collections import deque
 from typing import Any
 
 import numpy as np
-from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Pose, Quaternion, Vector3
-from std_msgs.msg import ColorRGBA, Header
+from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
 from uwb_mitigation.measurement import Status
+from uwb_mitigation.nodes import topics
 from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.tracks import Estimate
 
 TRAIL = 400
-_NANOSECONDS = 1_000_000_000
 _ELLIPSE95 = 2.448  # root of the 95th percentile of chi-squared with two degrees of freedom
 
-# Told apart by those who see no red or green, too (Okabe and Ito's palette).
+# Colours for colour-blind readers too (Okabe and Ito's palette).
 _BLUE = ColorRGBA(r=0.0, g=0.45, b=0.7, a=1.0)
 _ORANGE = ColorRGBA(r=0.9, g=0.62, b=0.0, a=0.9)
 _GREY = ColorRGBA(r=0.6, g=0.6, b=0.6, a=0.7)
@@ -53,7 +52,7 @@ def anchor_markers(anchors: AnchorMap, frame: str, stamp_ns: int) -> list[Any]:
         size = max(0.2, 2.0 * anchor.sd)
         ball = _marker("anchors", row, Marker.SPHERE, frame, stamp_ns, _BLUE)
         ball.pose, ball.scale = pose, Vector3(x=size, y=size, z=size)
-        # Not drawn: tells programs which anchor it is.
+        # Not drawn: the id of the anchor for programs.
         ball.text = str(anchor.id)
         text = _marker("names", row, Marker.TEXT_VIEW_FACING, frame, stamp_ns, _GREY)
         x, y, z = anchor.position
@@ -96,9 +95,8 @@ def array(markers: list[Any]) -> MarkerArray:
 
 
 def _marker(namespace: str, number: int, kind: int, frame: str, stamp_ns: int, colour: ColorRGBA) -> Any:
-    seconds, nanoseconds = divmod(stamp_ns, _NANOSECONDS)
     return Marker(
-        header=Header(stamp=Time(sec=seconds, nanosec=nanoseconds), frame_id=frame),
+        header=topics.header(stamp_ns, frame),
         ns=namespace,
         id=number,
         type=kind,
