@@ -87,6 +87,13 @@ def test_messages_equal_those_of_the_rosbags_library(
     for data, type_name in zip(ours, TYPES, strict=True):
         theirs = store.serialize_cdr(store.deserialize_cdr(data, type_name), type_name)
         assert bytes(theirs) == data
+    key = codec.key_of(measurement)
+    assert codec.encode_range(codec.decode_range(ours[0])) == ours[0]
+    for decoded, expected in (
+        (codec.decode_truth(ours[1]), (key, truth)),
+        (codec.decode_corrected(ours[2]), (key, correction)),
+    ):
+        assert repr(decoded) == repr(expected)
 
 
 @given(measurements, st.data())

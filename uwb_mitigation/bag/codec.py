@@ -38,8 +38,6 @@ _TRUTH = struct.Struct("<QQIf")
 _CORRECTED = struct.Struct("<QQIffffBB2xI")
 _LENGTH = struct.Struct("<I")
 
-CORRECTED_SIZE = _CORRECTED.size
-"""Bytes of a `RangeCorrected` behind its header."""
 
 _ENCODINGS = {int(encoding): encoding for encoding in Encoding}
 _STATUSES = {int(status): status for status in Status}
