@@ -12,10 +12,9 @@ from model_material import integer_network, random_int8, windows
 
 from uwb_mitigation.model import graph
 from uwb_mitigation.model.architecture import Remnet
-from uwb_mitigation.model.bundle import load_bundle, session_options
+from uwb_mitigation.model.bundle import Session, load_bundle, session_options
 from uwb_mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.model.requantisation import neon_sum_table, sum_table
-from uwb_mitigation.model.runtime import Session
 from uwb_mitigation.model.shipped import SHIPPED, default_model_path, shipped_model_path
 from uwb_mitigation.model.weights import Int8Weights, layer_inputs, sum_operands
 

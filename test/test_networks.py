@@ -10,9 +10,8 @@ from model_material import card, random_weights, windows
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.model import floating, graph
 from uwb_mitigation.model.architecture import HEAD, Mlp, Remnet
-from uwb_mitigation.model.bundle import load_bundle, save_bundle, session_options
+from uwb_mitigation.model.bundle import Session, load_bundle, save_bundle, session_options
 from uwb_mitigation.model.integer import IntegerNetwork
-from uwb_mitigation.model.runtime import Session
 from uwb_mitigation.model.weights import FloatWeights
 from uwb_mitigation.training.quantization import quantize
 

@@ -36,8 +36,7 @@ from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.shipped import shipped_model_path
 from uwb_mitigation.offsets import NO_OFFSETS, Offsets
 from uwb_mitigation.processing.job import Job, process_bag
-from uwb_mitigation.processing.parallel import run_on_dask
-from uwb_mitigation.processing.planning import plan
+from uwb_mitigation.processing.parallel import plan, run_on_dask
 
 REPOSITORY = Path(__file__).parent.parent
 START_NS = 1_700_000_000_000_000_000

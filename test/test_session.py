@@ -13,8 +13,7 @@ from model_material import bundle, card, random_weights, windows
 from uwb_mitigation.errors import ModelError
 from uwb_mitigation.model import floating, graph
 from uwb_mitigation.model.architecture import Remnet
-from uwb_mitigation.model.bundle import save_bundle, session_options
-from uwb_mitigation.model.runtime import Session
+from uwb_mitigation.model.bundle import Session, save_bundle, session_options
 from uwb_mitigation.model.shipped import default_model_path
 
 

@@ -16,9 +16,8 @@ from uwb_mitigation.measurement import (
     RangeMeasurement,
     Status,
 )
-from uwb_mitigation.model.bundle import Bundle, Card
+from uwb_mitigation.model.bundle import Bundle, Card, Session
 from uwb_mitigation.model.familiarity import Strangeness, features
-from uwb_mitigation.model.runtime import Session
 from uwb_mitigation.offsets import NO_OFFSETS, Offsets
 
 MAX_RANGE_M = 1e6

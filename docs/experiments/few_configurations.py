@@ -14,8 +14,7 @@ import numpy as np
 from uwb_mitigation.evaluation import lad
 from uwb_mitigation.evaluation.dataset import build_dataset
 from uwb_mitigation.model.architecture import Remnet
-from uwb_mitigation.model.bundle import load_bundle
-from uwb_mitigation.model.runtime import Session
+from uwb_mitigation.model.bundle import Session, load_bundle
 from uwb_mitigation.model.shipped import default_model_path
 from uwb_mitigation.preprocessing import Preprocessing
 from uwb_mitigation.sources.decaranging import DecaRangingFolder

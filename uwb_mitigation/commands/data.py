@@ -129,8 +129,7 @@ def _write(
         RecordingError: there are no ranges; or a source is damaged, after the bag was written.
     """
     from uwb_mitigation.bag.writer import BagWriter
-    from uwb_mitigation.sources.inventory import Inventory
-    from uwb_mitigation.sources.pauses import Pauses
+    from uwb_mitigation.sources.inventory import Inventory, Pauses
 
     inventory = Inventory()
     kinds = {source.simulated for source in sources}

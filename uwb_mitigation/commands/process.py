@@ -52,12 +52,12 @@ def process(
     All other messages stay as they are.
     """
     from uwb_mitigation.offsets import read_offsets
-    from uwb_mitigation.processing import parallel, planning
+    from uwb_mitigation.processing import parallel
     from uwb_mitigation.processing.job import Job
 
     if workers is not None and workers < 1:
         raise ParameterError(f"jobs = {workers}", valid="1 or more")
-    bags = planning.plan(sources, output)
+    bags = parallel.plan(sources, output)
     # A model that does not load would fail every bag in the same way.
     bundle = bundle_for(model, bags[0].source)
     known = read_offsets(offsets or "")

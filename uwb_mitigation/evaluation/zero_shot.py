@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.evaluation.dataset import Dataset
 from uwb_mitigation.mitigation import Grader
-from uwb_mitigation.model.bundle import Bundle, Card
-from uwb_mitigation.model.runtime import Session
+from uwb_mitigation.model.bundle import Bundle, Card, Session
 
 LOS = "LOS"
 

@@ -15,12 +15,11 @@ from uwb_mitigation.errors import ModelError, UwbMitigationError
 from uwb_mitigation.files import write_whole
 from uwb_mitigation.firmware_export.packing import Channels, PackedNetwork, pack
 from uwb_mitigation.model import graph
-from uwb_mitigation.model.bundle import Bundle
+from uwb_mitigation.model.bundle import Bundle, Session
 from uwb_mitigation.model.familiarity import Familiarity
 from uwb_mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.model.prior import LinePrior
 from uwb_mitigation.model.requantisation import Sum
-from uwb_mitigation.model.runtime import Session
 from uwb_mitigation.preprocessing import Scaling
 
 MODEL_HEADER = "uwb_model.h"

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ModelError, UwbMitigationError
 from uwb_mitigation.files import read_bounded, write_whole
@@ -148,6 +149,20 @@ class Bundle:
     @property
     def quantised(self) -> bool:
         return self.card.quantised
+
+
+class Session:
+    """Runs the network of a bundle."""
+
+    def __init__(self, bundle: Bundle) -> None:
+        self._session = bundle.session
+        (source,), (result,) = self._session.get_inputs(), self._session.get_outputs()
+        self._input, self._outputs = source.name, [result.name]
+
+    def predict_m(self, windows: NDArray[np.float32]) -> NDArray[np.float32]:
+        """The network's outputs, m, float32 (n,), for inputs float32 (n, K)."""
+        output: NDArray[np.float32] = self._session.run(self._outputs, {self._input: windows[:, None, :]})[0]
+        return output[:, 0]
 
 
 def load_bundle(path: Path | str) -> Bundle:
