@@ -167,8 +167,8 @@ def measure(
         mismatches=int(np.count_nonzero(wrong)),
         inputs=len(windows),
         hz=hz,
-        energy_mj=None if printed is None else printed.power_mw / hz,
-        paper_hz=None if printed is None else printed.rate_hz,
+        energy_mj=None if printed is None else printed.board[3] / hz,
+        paper_hz=None if printed is None else printed.board[0],
     )
 
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from model_material import dataset, record, window_of
+from model_material import record, window_of
 
-from uwb_mitigation.errors import DatasetError, ParameterError
+from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.evaluation import splits
 from uwb_mitigation.evaluation.dataset import build_dataset
 from uwb_mitigation.measurement import Truth
@@ -59,14 +59,6 @@ def test_nothing_usable_is_an_error_that_says_why():
         build_dataset([], Preprocessing(157))
 
 
-def test_rows_picks_from_every_array():
-    whole = dataset(3, 4)
-    part = whole.rows(np.array([1, 5]))
-    assert part.configurations.tolist() == ["c0", "c1"]
-    assert np.array_equal(part.inputs, whole.inputs[[1, 5]])
-    assert len(part) == 2
-
-
 @settings(max_examples=60)
 @given(
     names=st.lists(st.sampled_from("abcdefgh"), min_size=4, max_size=80),
@@ -85,18 +77,6 @@ def test_no_configuration_is_on_both_sides_and_each_is_tested_once(names, folds,
         assert len(part.train) + len(part.test) == len(names)
     tested = np.concatenate([part.test for part in parts])
     assert np.array_equal(np.sort(tested), np.arange(len(names)))
-
-
-def test_a_split_depends_on_the_seed_alone():
-    names = dataset(12, 2).configurations
-    first, again, other = (splits.by_configuration(names, 4, seed)[0].test for seed in (1, 1, 2))
-    assert np.array_equal(first, again)
-    assert not np.array_equal(first, other)
-
-
-def test_one_fold_is_no_split():
-    with pytest.raises(ParameterError, match="at least 2"):
-        splits.by_configuration(np.array(["a", "b"]), 1, 0)
 
 
 def test_thinning_leaves_at_most_so_many_of_each():

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from uwb_mitigation.commands.cli import app
 from uwb_mitigation.errors import DatasetError, ModelError, ParameterError
 from uwb_mitigation.evaluation.accuracy import evaluate
-from uwb_mitigation.evaluation.metrics import ErrorStatistics, coverage, mae_by_group
+from uwb_mitigation.evaluation.metrics import ErrorStatistics
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.architecture import Remnet
 from uwb_mitigation.model.bundle import load_bundle
@@ -71,15 +71,6 @@ def test_statistics_of_nothing_are_refused(errors):
         ErrorStatistics.of(np.array(errors))
 
 
-def test_groups_are_told_apart():
-    groups = mae_by_group(np.array(["b", "a", "b"]), np.array([1.0, 2.0, -3.0]), np.array([0.5, 0.0, 0.5]))
-    assert groups == {"b": (2, 2.0, 0.5), "a": (1, 2.0, 0.0)}
-
-
-def test_coverage_counts_errors_within_the_deviations():
-    assert coverage(np.array([0.5, -1.5, 0.9, 4.0]), 1.0, 1.0) == 0.5
-
-
 def test_evaluation_is_the_live_path(tmp_path, recording):
     mitigation = Mitigation(bundle(tmp_path, Remnet(samples=157)))
     outcome = evaluate(mitigation, recording)
@@ -104,12 +95,6 @@ def test_the_intervals_are_those_that_the_bundle_promises(tmp_path, sigmas, cove
     mitigation = Mitigation(bundle(tmp_path, Remnet(samples=157), **promised))
     outcome = evaluate(mitigation, [record(preamble_count=0)])
     assert (outcome.coverage68, outcome.coverage95) == (0.0, covered)
-
-
-def test_what_only_cross_validation_reads_is_refused_without(recording):
-    for option in (("--seeds", 3), ("--folds", 6), ("--scaling", "max")):
-        with pytest.raises(ParameterError, match=f"^{option[0]} .with --cross-validate"):
-            raise run("evaluate", "--data", "any", *option).exception
 
 
 def test_what_has_no_truth_or_no_range_is_left_out(tmp_path):
@@ -153,28 +138,6 @@ def test_train_quantize_evaluate_from_end_to_end(tmp_path, recording):
     found = json.loads((tmp_path / "e.json").read_text())
     assert found["trained_on"] == sorted(found["by_configuration"])
     assert "optimistic" in result.output
-
-
-def test_train_without_a_prior_leaves_all_to_the_network(tmp_path, recording):
-    pytest.importorskip("torch", reason="run `make setup-training`")
-    path = tmp_path / "alone.onnx"
-    result = run(
-        "train",
-        "--data",
-        "any",
-        "-o",
-        path,
-        "--samples",
-        8,
-        "--epochs",
-        1,
-        "--folds",
-        2,
-        "--recipe",
-        "network",
-    )
-    assert result.exit_code == 0, result.output
-    assert not load_bundle(path).prior.needs_power
 
 
 def test_an_int8_bundle_is_not_quantised_again(tmp_path, recording):

@@ -22,11 +22,12 @@ from uwb_mitigation.sources import opening
 from uwb_mitigation.sources.truth_table import load_truth, with_truth
 
 pytest.importorskip("torch", reason="run `make setup-training`")
+from uwb_mitigation.evaluation import recordings
 from uwb_mitigation.model.floating import float_network
-from uwb_mitigation.training import candidates, comparison, recordings, selection, train
+from uwb_mitigation.training import candidates, comparison, selection, train
 from uwb_mitigation.training.candidates import Candidate, FittedModel, Recipe, network_m
 from uwb_mitigation.training.options import FitOptions
-from uwb_mitigation.training.selection import NESTED, Selection
+from uwb_mitigation.training.selection import NESTED
 
 SHAPE = Remnet(samples=8)
 RECIPE = Recipe(SHAPE, FitOptions(epochs=1))
@@ -84,21 +85,6 @@ def test_a_trained_network_must_show_its_gain_in_the_nested_error(monkeypatch):
 
     monkeypatch.setattr(selection, "preferred", preferred)
     assert selection.select_nested(data, offered, 3, 0).chosen == "half"
-
-
-@pytest.mark.parametrize(
-    ("points", "needed"),
-    [
-        # 0.95 x 0.15 = 0.1425 = 0.1 + 1 / n
-        (tuple((n, 0.1 + 1.0 / n) for n in (5, 10, 20)), 24),
-        (((5, 0.2), (10, 0.2), (20, 0.2)), None),
-        (((5, 0.1), (10, 0.2), (20, 0.3)), None),
-        (((2, 0.2), (3, 0.2)), None),
-    ],
-)
-def test_the_learning_curve_gives_the_number_of_configurations_that_are_needed(points, needed):
-    found = Selection("line", {}, FittedModel(LinePrior(0.0)), points, 3, 0, 20).configurations_needed()
-    assert found == needed if needed is None else found == pytest.approx(needed, abs=1)
 
 
 @pytest.mark.parametrize(("configurations", "folds"), [(3, 6), (4, 2), (4, 3), (5, 4), (7, 6)])

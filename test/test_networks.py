@@ -59,20 +59,6 @@ def test_the_mlp_has_the_papers_parameters():
     assert Mlp().multiply_accumulates == 157 * 240 + 240 * 64 + 64 * 16 + 16
 
 
-def test_a_first_kernel_of_five_has_32_parameters_more():
-    assert parameters(RemnetModule(Remnet(first_kernel=5), 0.5)) == 5905 + 32
-
-
-def test_attention_adds_82_parameters_a_module_and_weighs_channels_between_0_and_1():
-    torch.manual_seed(2)
-    module = RemnetModule(Remnet(32), 0.0, attention=True)
-    assert parameters(module) == 5649 + 3 * 82
-    values = torch.rand(4, 32, 16)
-    ratio = module.attention[0](values) / values
-    assert torch.allclose(ratio, ratio[:, :1].expand_as(ratio), rtol=1e-3)
-    assert 0 < ratio.min() < ratio.max() < 1
-
-
 @pytest.mark.parametrize(
     "shape",
     [
@@ -123,16 +109,6 @@ def test_the_int8_mlp_equals_onnx_runtime_on_every_bit(shape):
     inputs[0], inputs[1] = 0, 1e30
     computed = session.run(None, {"cir": inputs[:, None, :]})[0][:, 0]
     assert np.array_equal(computed, IntegerNetwork(weights).predict_m(inputs))
-
-
-def test_the_int8_mlp_runs_fused():
-    options = session_options()
-    weights = quantize(mlp_weights(Mlp(16, (8, 4))), windows(20, 16), exact=False)
-    session = onnxruntime.InferenceSession(
-        graph.int8_model(weights), options, providers=["CPUExecutionProvider"]
-    )
-    expected = IntegerNetwork(weights).predict_m(windows(9, 16))
-    assert np.array_equal(session.run(None, {"cir": windows(9, 16)[:, None, :]})[0][:, 0], expected)
 
 
 @pytest.mark.parametrize("quantised", [True, False])

@@ -107,13 +107,6 @@ def test_without_receive_levels_line_of_sight_is_seen_in_the_cir(direct: list[Re
         find_offset(amplitude, without_levels(blocked[:1] * 20))
 
 
-def test_ranges_of_one_place_leave_what_the_place_does(universal: Mitigation, direct: list[Record]):
-    one = direct[0]
-    found = find_offset(universal, [one] * 50, one.truth.range_m if one.truth else None)
-    assert found.placements[0].noise_sd_m < 0.01
-    assert found.sd_m >= 0.15
-
-
 def test_what_is_not_line_of_sight_is_refused_with_what_shows_it(universal: Mitigation, direct: list[Record]):
     with pytest.raises(DatasetError, match=r"not line of sight: the first path is \d+\.\d dB below"):
         find_offset(universal, weaker_first_path(direct, 9.0), 3.0)
@@ -205,11 +198,3 @@ def test_what_makes_no_sense_is_refused_before_the_work(options: tuple[str, ...]
     outcome = command_line.run("offset", "none.mcap", *options, folder=tmp_path)
     assert outcome.returncode != 0
     assert said in outcome.stderr
-
-
-def test_the_spread_of_a_few_wild_ranges_moves_nothing(universal: Mitigation, direct: list[Record]):
-    one = direct[0]
-    wild = [*[one] * 40, *longer([one] * 5, 8.0)]
-    distance = one.truth.range_m if one.truth else 1.0
-    calm = find_offset(universal, [one] * 40, distance)
-    assert np.isclose(find_offset(universal, wild, distance).offset_m, calm.offset_m, atol=1e-6)

@@ -10,25 +10,18 @@ from shutil import copytree
 import numpy as np
 import pytest
 from command_line import run
-from model_material import card, dataset, integer_network, random_weights, windows
+from model_material import dataset, integer_network
 
 pytest.importorskip("torch", reason="training is not set up: run make setup-training")
 
-from uwb_mitigation.errors import DatasetError, ModelError, ParameterError, UwbMitigationError
+
+from uwb_mitigation.errors import DatasetError, ParameterError, UwbMitigationError
 from uwb_mitigation.evaluation.dataset import Dataset
-from uwb_mitigation.model import floating, graph
-from uwb_mitigation.model.architecture import HEAD, Mlp, Remnet
-from uwb_mitigation.model.bundle import load_bundle, save_bundle
-from uwb_mitigation.model.weights import FloatWeights
+from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.paper import experiment
-from uwb_mitigation.paper import search as searches
-from uwb_mitigation.paper.learning_rate import range_test
-from uwb_mitigation.paper.parts import Parts, narrowed
-from uwb_mitigation.paper.pruning import prune, prune_bundle
+from uwb_mitigation.paper.data import Parts, narrowed
 from uwb_mitigation.paper.results import RESULTS, ExperimentResults, read
-from uwb_mitigation.paper.search import Trial, front, search
 from uwb_mitigation.preprocessing import Preprocessing, Scaling
-from uwb_mitigation.training.fitting import fit
 from uwb_mitigation.training.options import FitOptions
 
 QUICK = FitOptions(epochs=2, learning_rate=1e-3, weight_decay=0.0)
@@ -41,7 +34,7 @@ def parts(seed: int = 0) -> Parts:
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("protocol")
-    wanted = experiment.tasks(["remnet", "remnet_attention", "mlp"], [32], seeds=1)
+    wanted = experiment.tasks(["remnet", "mlp"], [32], seeds=1)
     return folder, experiment.run(parts(), folder, wanted, QUICK)
 
 
@@ -66,13 +59,11 @@ def test_tasks_are_every_window_and_seed_of_remnet_and_the_longest_of_the_rest()
 def test_every_form_of_a_network_is_measured(finished):
     folder, result = finished
     assert read(ExperimentResults, folder / RESULTS) == result
-    remnet, attention, mlp = result.models
+    remnet, mlp = result.models
     assert remnet.mae_optimised == pytest.approx(remnet.mae_float, abs=1e-6)
     assert remnet.mae_int8 == pytest.approx(remnet.mae_float, abs=0.02)
     assert remnet.float_errors.all.n == remnet.float_errors.los.n + remnet.float_errors.nlos.n
-    assert (remnet.parameters, attention.parameters) == (5649, 5649 + 3 * 82)
-    assert attention.mae_float > 0
-    assert attention.mae_int8 is None
+    assert remnet.parameters == 5649
     assert set(remnet.calibration_mae) == {"max", "p99.99", "p99.9", "p99", "mse"}
     assert remnet.calibration_mae[remnet.calibration] == min(remnet.calibration_mae.values())
     for model in (remnet, mlp):
@@ -176,135 +167,6 @@ def test_shorter_windows_are_scaled_by_their_own_maximum():
         narrowed(data, 64)
 
 
-# --- search ---
-
-KNOWN = dataset(9, 10, samples=16)
-ONCE = FitOptions(epochs=1, weight_decay=0.0)
-
-
-def searched(journal, known: Dataset = KNOWN, **changes):
-    return search(known, journal, ONCE, **({"random": 4, "grid": 3} | changes))
-
-
-def test_a_search_tries_random_networks_then_neighbours_of_the_best(tmp_path, monkeypatch):
-    trials = searched(tmp_path / "journal.jsonl")
-    assert [trial.stage for trial in trials] == ["random"] * 4 + ["grid"] * 3
-    best = min((t for t in trials if t.stage == "random"), key=lambda t: t.mae_m).architecture
-    for trial in trials[4:]:
-        for name, values in searches.SPACE.items():
-            steps = values.index(getattr(trial.architecture, name)) - values.index(getattr(best, name))
-            assert abs(steps) <= 1
-    # A seed draws the same networks; an interrupted search continues where it stopped.
-    lines = (tmp_path / "journal.jsonl").read_text().split("\n\n")
-    (tmp_path / "torn.jsonl").write_text("\n".join([*lines[:2], lines[2][:30]]))
-    fits = []
-    monkeypatch.setattr(searches, "fit", lambda *arguments: fits.append(1) or fit(*arguments))
-    assert searched(tmp_path / "torn.jsonl") == trials
-    assert len(fits) == 5
-    assert searched(tmp_path / "journal.jsonl") == trials
-    assert len(fits) == 5
-    searched(tmp_path / "journal.jsonl", dataset(9, 10, samples=16, seed=4), grid=0)
-    assert len(fits) == 9
-
-
-def test_windows_are_searched_over(tmp_path):
-    trials = searched(tmp_path / "journal.jsonl", random=8, grid=0, windows=[16, 8])
-    assert {trial.architecture.samples for trial in trials} == {16, 8}
-
-
-def test_invalid_searches_are_rejected(tmp_path):
-    with pytest.raises(DatasetError):  # every network diverges
-        searched(tmp_path / "a", replace(KNOWN, error_m=KNOWN.error_m + 3e38), random=2, grid=0)
-    for change in ({"random": 0}, {"grid": -1}, {"windows": [17]}, {"windows": [0]}, {"workers": 0}):
-        with pytest.raises(ParameterError):
-            searched(tmp_path / "b", **change)
-
-
-def test_the_front_contains_only_networks_that_no_other_dominates():
-    shapes = [Remnet(16, filters=filters) for filters in (4, 8, 12, 16)]
-    trials = [Trial(shape, mae, "random") for shape, mae in zip(shapes, (0.5, None, 0.6, 0.4), strict=True)]
-    assert front(trials) == [trials[0], trials[3]]
-
-
-# --- range test ---
-
-
-def learnable() -> tuple[np.ndarray, np.ndarray]:
-    inputs = windows(400, 16)
-    return inputs, inputs[:, :4].mean(axis=1) - 0.3
-
-
-def test_the_range_test_finds_rates_that_train_and_ends_when_the_loss_explodes():
-    result = range_test(Remnet(16), *learnable(), ONCE, low=1e-6, high=3.0, steps=300)
-    assert 1e-5 < result.suggested <= result.highest < 1.0
-    assert len(result.rates) == len(result.losses_m) <= 300
-    assert list(result.rates) == sorted(result.rates)
-    result = range_test(Remnet(16), *learnable(), ONCE, low=1e-3, high=10.0, steps=400)
-    assert result.diverged
-    assert result.rates[-1] < 10.0
-    for change in ({"low": 0.0}, {"low": 1.0, "high": 0.1}, {"steps": 3}):
-        with pytest.raises(ParameterError):
-            range_test(Remnet(16), *learnable(), ONCE, **change)
-
-
-# --- pruning ---
-
-
-def test_pruning_removes_channels_that_contribute_nothing():
-    weights = random_weights(Remnet(32, filters=8))
-    dead = {0: 1, 1: 4, 2: 0, 3: 7}
-    for name in weights.weight:
-        if name != HEAD:
-            module = 0 if name == "first" else int(name[6])
-            channels = 0 if name == "first" else module - 1 if name.endswith("residual") else module
-            weights.weight[name][dead[channels]] = 0
-            weights.bias[name][dead[channels]] = 0
-    smaller = prune(weights, 7)
-    assert smaller.architecture == Remnet(32, filters=7)
-    inputs = windows(20, 32)
-    assert np.allclose(floating.predict_m(smaller, inputs), floating.predict_m(weights, inputs), atol=1e-5)
-
-
-def test_training_after_pruning_reduces_the_error():
-    data = dataset(10, 20)
-    weights = random_weights(Remnet(32))
-    targets = floating.predict_m(weights, data.inputs)
-    options = FitOptions(epochs=8, learning_rate=2e-3, dropout=0.0, weight_decay=0.0)
-    smaller = prune(weights, 8)
-    errors = [
-        np.abs(targets - floating.predict_m(network, data.inputs)).mean()
-        for network in (smaller, fit(smaller.architecture, data.inputs, targets, options, start=smaller))
-    ]
-    assert errors[1] < 0.5 * errors[0]
-
-
-def test_networks_that_cannot_be_pruned_are_rejected():
-    for filters in (0, 16, 17):
-        with pytest.raises(ParameterError):
-            prune(random_weights(Remnet(16)), filters)
-    weight = {"dense1": np.zeros((3, 4), np.float32), HEAD: np.zeros((3, 1), np.float32)}
-    bias = {"dense1": np.zeros(3, np.float32), HEAD: np.zeros(1, np.float32)}
-    with pytest.raises(ModelError):
-        prune(FloatWeights(Mlp(4, (3,)), weight, bias), 2)
-
-
-@pytest.mark.parametrize(
-    "change", [{"data": "other"}, {"split": "other"}, {"measurements": 1}, {"tested_on": 1}]
-)
-def test_a_bundle_that_possibly_saw_the_test_part_is_rejected(tmp_path, change):
-    here = {"data": "made up", "split": "by seed", "measurements": 120, "tested_on": 60}
-    model = graph.float_model(random_weights(Remnet(32)))
-    for training, fits in ((here, True), (here | change, False), ({}, False)):
-        path = tmp_path / "trained.onnx"
-        bundle = save_bundle(path, model, card(Remnet(32), quantised=False, training=training))
-        if fits:
-            pruned, _ = prune_bundle(bundle, parts(), 4, QUICK, tmp_path / "smaller.onnx")
-            assert pruned.architecture == Remnet(32, filters=4)
-        else:
-            with pytest.raises(ModelError):
-                prune_bundle(bundle, parts(), 4, QUICK, tmp_path / "smaller.onnx")
-
-
 # --- commands ---
 
 
@@ -323,37 +185,13 @@ def paper(*words: object, folder: Path) -> dict:
     return json.loads((folder / "out.json").read_text())
 
 
-def test_protocol_then_prune(folder):
+def test_the_command_writes_its_results(folder):
     quick = ("--networks", "remnet", "--windows", 8, "--seeds", 1, "--epochs", 1, "--workers", 1)
     result = paper("protocol", "--data", "rooms.mcap", "-o", "models", *quick, folder=folder)
     assert json.loads((folder / "models" / RESULTS).read_text()) == result
     assert (result["data"], result["split"]) == ("rooms.mcap (simulated)", "paper")
     assert (result["train"], result["test"]) == (131, 48)  # the share of the published rows
     assert result["command"].startswith("uwb-mitigation paper protocol --data rooms.mcap")
-    source = folder / "models" / "remnet_8_seed0_float.onnx"
-    words = ("--data", "rooms.mcap", "-o", "smaller.onnx", "--filters", 4, "--epochs", 1)
-    summary = paper("prune", source, *words, folder=folder)
-    pruned, whole = load_bundle(folder / "smaller.onnx"), load_bundle(source)
-    assert pruned.architecture == Remnet(8, filters=4)
-    # The card describes the smaller network.
-    training = pruned.card.training
-    assert training["pruned"]["from"] == f"{whole.model_id:08x}"
-    assert training["pruned"]["architecture"]["filters"] == whole.architecture.filters
-    assert training["metrics_m"]["float"]["mae"] == round(summary["mae"]["tuned"], 4)
-    assert training["metrics_m"]["raw"]["mae"] == round(result["models"][0]["mae_raw"], 4)
-    assert pruned.card.variance_m2 != whole.card.variance_m2
-
-
-def test_search_and_range_test_draw_figures(folder):
-    quick = ("--random", 2, "--grid", 1, "--windows", 8, "--epochs", 1, "--workers", 1)
-    result = paper("search", "--data", "rooms.mcap", "-o", "search", *quick, folder=folder)
-    assert len(result["trials"]) == 3
-    assert 1 <= len(result["front"]) <= 3
-    words = ("--data", "rooms.mcap", "--samples", 8, "--steps", 40, "--plot", "range.png")
-    result = paper("lr-range", *words, folder=folder)
-    assert 0 < result["suggested"] <= result["highest"]
-    for name in ("search/front.png", "range.png"):
-        assert (folder / name).read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize(

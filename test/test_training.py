@@ -60,12 +60,6 @@ def test_without_powers_the_prior_is_the_median_over_configurations():
     assert prior == LinePrior(1.5)
 
 
-def test_powers_that_are_all_alike_bear_no_line():
-    names = np.array(list("abcdefgh"))
-    prior = fit_prior(names, np.full(8, -80.0), np.full(8, -85.0), np.arange(8.0))
-    assert prior == LinePrior(3.5)
-
-
 def test_a_prior_of_nothing_is_refused():
     with pytest.raises(DatasetError, match="no measurements"):
         fit_prior(np.array([]), np.array([]), np.array([]), np.array([]))
@@ -75,12 +69,6 @@ torch = pytest.importorskip("torch", reason="run `make setup-training`")
 from uwb_mitigation.training import train  # noqa: E402
 from uwb_mitigation.training.candidates import Recipe, fit_own  # noqa: E402
 from uwb_mitigation.training.fitting import FitOptions, fit  # noqa: E402
-from uwb_mitigation.training.networks import build, weights_of  # noqa: E402
-
-
-def test_an_unfitted_network_corrects_nothing():
-    weights = weights_of(build(SHAPE, 0.5))
-    assert not floating.predict_m(weights, windows(5, 32)).any()
 
 
 def test_a_seed_gives_the_same_weights():
@@ -108,19 +96,6 @@ def test_a_network_learns_what_its_inputs_tell():
     weights = fit(SHAPE, inputs, targets, FitOptions(epochs=12, learning_rate=2e-3, dropout=0.1))
     left = np.abs(targets - floating.predict_m(weights, inputs)).mean()
     assert left < 0.4 * np.abs(targets - np.median(targets)).mean()
-
-
-def test_training_goes_on_from_given_weights():
-    start = fit(SHAPE, windows(64, 32), windows(64, 32).mean(axis=1), FitOptions(epochs=1))
-    options = FitOptions(epochs=1, learning_rate=1e-8)
-    again = fit(SHAPE, windows(64, 32), windows(64, 32).mean(axis=1), options, start=start)
-    assert all(np.allclose(start.weight[name], again.weight[name], atol=1e-5) for name in start.weight)
-
-
-def test_every_epoch_is_reported():
-    calls = []
-    fit(SHAPE, windows(4, 32), np.zeros(4), FitOptions(epochs=3), lambda: calls.append(1))
-    assert len(calls) == 3
 
 
 def test_a_loss_that_diverges_ends_the_training():
@@ -163,21 +138,6 @@ def test_the_card_tells_the_errors_on_configurations_not_seen():
     assert card.variance_m2 < card.variance_uncorrected_m2
     assert card.training["configurations"] == data.names
     assert card.training["metrics_m"]["raw"]["mae"] == round(float(np.abs(data.error_m).mean()), 4)
-
-
-def test_a_card_names_no_thousands_of_configurations():
-    data = dataset(101, 1, samples=8)
-    recipe = Recipe(Remnet(samples=8), FitOptions(epochs=1))
-    validation = train.CrossValidation(data, {"raw": data.error_m, "float": data.error_m}, 2, 0)
-    card = train.describe("name", recipe, LinePrior(0.5), validation, "data")
-    assert card.training["configurations"] == 101
-
-
-def test_without_a_line_the_network_is_alone():
-    data = dataset(6, 10)
-    recipe = Recipe(SHAPE, FitOptions(epochs=1), line=False)
-    assert fit_own(data, recipe, 0).prior == LinePrior(0.0)
-    assert "l1_line" not in train.cross_validate(data, recipe, 2, 0).errors
 
 
 def test_measurements_without_power_do_not_spoil_the_network():

@@ -35,15 +35,6 @@ def test_the_same_whatever_the_number_of_workers(small: Universal) -> None:
         assert again.network.weight[name].tobytes() == weight.tobytes()
 
 
-def test_nothing_that_is_not_heard_of_the_channel_gets_in(small: Universal) -> None:
-    # No offset, no power level: the network alone, and no correction where a measurement is strange.
-    prior, familiarity = small.card.prior, small.card.familiarity
-    assert (prior.offset_m, prior.per_rx_power, prior.per_power_gap) == (0.0, 0.0, 0.0)
-    assert familiarity is not None
-    assert familiarity.known_offset_m == 0.0
-    assert "simulated" in small.card.training["data"]
-
-
 def test_it_is_graded_by_condition_in_another_world(small: Universal) -> None:
     for row in ("raw", "float", "int8"):
         assert set(small.held_out[row]) == {"all", "LOS", "NLOS", "NDP NLOS"}
@@ -81,14 +72,6 @@ def test_receivers_vary_in_pulse_first_path_clipping_and_length() -> None:
     assert np.abs(place - 7.0).max() <= augmentation.EARLY_TAPS + 0.1
     assert np.mean(np.abs(place - 7.0) > 1e-6) == pytest.approx(share, abs=0.05)
     assert np.std(place) == pytest.approx(augmentation.EARLY_TAPS * np.sqrt(share / 3.0), rel=0.15)
-
-
-def test_int8_is_calibrated_on_louder_inputs_too_unless_levels_are_left_out() -> None:
-    inputs = np.array([[0.5, 2.0, 1.0]], np.float32)
-    assert augmentation.calibration_inputs(inputs, Scaling.MAX).tolist() == [[0.0625, 1.0, 0.25]]
-    both = augmentation.calibration_inputs(inputs, Scaling.PREAMBLE)
-    assert (both[0] == inputs[0]).all()
-    assert (both[1] > 1.5 * inputs[0]).all()
 
 
 def test_the_command_writes_both_bundles(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from uwb_mitigation.evaluation.dataset import build_dataset
 from uwb_mitigation.evaluation.metrics import coverage
 from uwb_mitigation.model.bundle import Session, load_bundle
-from uwb_mitigation.paper.rooms import split_by_name
+from uwb_mitigation.paper.data import split_by_name
 from uwb_mitigation.sources.opening import open_recording
 
 bundle = load_bundle(Path(sys.argv[2]))

@@ -151,8 +151,9 @@ def quantize(
 
     The scales of its activations come from the data it was trained on, or calibrated with.
     """
+    from uwb_mitigation.evaluation import recordings
     from uwb_mitigation.model.bundle import load_bundle
-    from uwb_mitigation.training import quantization, recordings
+    from uwb_mitigation.training import quantization
 
     source = load_bundle(model)
     quantization.check(source, percentile)
@@ -256,7 +257,7 @@ def _compare(data: Path, group: str, folds: int, seeds: int, scaling: Scaling, j
 
 def _dataset(data: Path, preprocessing: Preprocessing, truth: Sequence[Path] = ()) -> tuple[str, Dataset]:
     """The recording's name, and its measurements; tells what is left out."""
-    from uwb_mitigation.training import recordings
+    from uwb_mitigation.evaluation import recordings
 
     with console.reading() as on_record:
         name, dataset = recordings.load(data, preprocessing, truth, on_record)

@@ -85,7 +85,7 @@ def show_trained(made: TrainedBundle) -> None:
 
 
 def show_selection(choice: Selection) -> None:
-    """The candidates, and the outlook from the learning curve."""
+    """The held-out errors of the candidates."""
     show_table(
         f"{choice.configurations} configurations, {choice.folds} folds by configuration",
         ("candidate", "MAE, m", "", ""),
@@ -95,12 +95,6 @@ def show_selection(choice: Selection) -> None:
         ],
         choice.chosen,
     )
-    curve = ", ".join(f"{mae:.3f} m with {count}" for count, mae in choice.curve)
-    needed = choice.configurations_needed()
-    more = "more configurations of this kind are not expected to lower it by 5%, or too few show it"
-    if needed is not None:
-        more = f"by extrapolation, {needed} configurations lower it by 5%"
-    say(f"MAE of {choice.chosen} by configurations: {curve}; {more}.")
 
 
 def show_comparison(result: Comparison) -> None:

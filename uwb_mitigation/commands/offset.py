@@ -9,7 +9,7 @@ import typer
 
 from uwb_mitigation.commands import console
 from uwb_mitigation.commands.bundles import ModelOption, bundle_for
-from uwb_mitigation.commands.console import JsonOption, Table
+from uwb_mitigation.commands.console import JsonOption
 from uwb_mitigation.errors import ParameterError, format_id
 
 if TYPE_CHECKING:
@@ -99,33 +99,26 @@ def _identity(name: str, text: str) -> int:
 
 
 def _show(found: FoundOffset) -> None:
-    table = Table("anchor", "tag", "placement", "ranges", "offset m", "sd m", "gap dB", "predicted m")
-    for column in table.columns[3:]:
-        column.justify = "right"
+    from uwb_mitigation.commands.model_tables import say, show_table
+
+    rows: list[tuple[object, ...]] = []
     for one in found.placements[:MOST_SHOWN]:
-        values = (one.offset_m, one.sd_m) if not one.refused else ()
-        table.add_row(
-            format_id(one.anchor_id),
-            format_id(one.tag_id),
-            one.placement,
-            str(one.ranges),
-            *(f"{value:.3f}" for value in values),
-            *("" for _ in range(2 - len(values))),
-            f"{one.power_gap_db:.1f}",
-            f"{one.predicted_m:.3f}",
-        )
-    console.out.print(table)
+        pair = format_id(one.anchor_id), format_id(one.tag_id)
+        values = ("", "") if one.refused else (one.offset_m, one.sd_m)
+        rows.append((*pair, one.placement, one.ranges, *values, f"{one.power_gap_db:.1f}", one.predicted_m))
+    show_table(
+        "", ("anchor", "tag", "placement", "ranges", "offset m", "sd m", "gap dB", "predicted m"), rows
+    )
     if len(found.placements) > MOST_SHOWN:
-        console.out.print(f"and {len(found.placements) - MOST_SHOWN} placements more")
+        say(f"and {len(found.placements) - MOST_SHOWN} placements more")
     refused = [one for one in found.placements if one.refused]
     for one in refused[:MOST_SHOWN]:
-        console.err.print(
-            f"left out: anchor {format_id(one.anchor_id)}, tag {format_id(one.tag_id)} {one.placement}: {one.refused}",
-            markup=False,
-        )
+        pair = format_id(one.anchor_id), format_id(one.tag_id)
+        text = f"left out: anchor {pair[0]}, tag {pair[1]} {one.placement}: {one.refused}"
+        console.err.print(text, markup=False)
     if len(refused) > MOST_SHOWN:
         console.err.print(f"left out: {len(refused) - MOST_SHOWN} placements more")
-    console.out.print(
+    say(
         f"offset {found.offset_m:.3f} m, standard deviation {found.sd_m:.3f} m, of {found.ranges} ranges, "
         f"beside model {found.model_id:08x}"
     )

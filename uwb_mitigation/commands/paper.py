@@ -4,23 +4,21 @@ from __future__ import annotations
 
 import os
 import shlex
-import statistics
 import sys
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from uwb_mitigation.commands import console
-from uwb_mitigation.commands.checks import check_output, needs_torch, scaling_of
+from uwb_mitigation.commands.checks import needs_torch, scaling_of
 from uwb_mitigation.commands.console import JsonOption
 from uwb_mitigation.errors import ParameterError, UwbMitigationError
 
 if TYPE_CHECKING:
-    from uwb_mitigation.paper.parts import Parts
+    from uwb_mitigation.paper.data import Parts
     from uwb_mitigation.paper.results import ExperimentResults
-    from uwb_mitigation.paper.search import Trial
 
 app = typer.Typer(
     help="The paper's experiment, tables and figures; DeepUWB, downloaded or simulated.", no_args_is_help=True
@@ -41,9 +39,6 @@ WorkersOption = Annotated[
     int | None, typer.Option(help="Processes with one thread each; default: one per processor.")
 ]
 FolderOption = Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of the results.")]
-EpochsOption = Annotated[int, typer.Option(help="Passes over the data.")]
-RateOption = Annotated[float, typer.Option(help="Learning rate of Adam.")]
-SeedOption = Annotated[int, typer.Option(help="Seed of all random numbers.")]
 
 
 @app.command()
@@ -81,7 +76,7 @@ def simulate(
             "-o", "--output", metavar="OUT", help="OUT.mcap for one file, any other name for a bag folder."
         ),
     ],
-    seed: SeedOption = 1,
+    seed: Annotated[int, typer.Option(help="Seed of all random numbers.")] = 1,
     ranges: Annotated[int, typer.Option(help="Number of ranges; default: that of DeepUWB.")] = 55_158,
     exchanges: Annotated[int, typer.Option(help="Ranges of each placement.")] = 20,
     force: Annotated[bool, typer.Option("--force", help="Replace OUT if it exists.")] = False,
@@ -103,14 +98,14 @@ def protocol(
     data: DataOption,
     output: FolderOption,
     networks: Annotated[
-        str, typer.Option(help="Some of remnet, remnet_k5, remnet_attention, mlp; separated by commas.")
+        str, typer.Option(help="Some of remnet, remnet_k5, mlp; separated by commas.")
     ] = "remnet,mlp",
     windows: Annotated[
         str, typer.Option(help="Window lengths K, separated by commas.")
     ] = "157,128,64,32,16,8",
     seeds: Annotated[int, typer.Option(help="Number of networks of each kind.")] = 5,
-    epochs: EpochsOption = 30,
-    learning_rate: RateOption = 3e-4,
+    epochs: Annotated[int, typer.Option(help="Passes over the data.")] = 30,
+    learning_rate: Annotated[float, typer.Option(help="Learning rate of Adam.")] = 3e-4,
     split: SplitOption = "auto",
     scaling: ScalingOption = "max",
     workers: WorkersOption = None,
@@ -138,154 +133,6 @@ def protocol(
 
 
 @app.command()
-def search(
-    data: DataOption,
-    output: FolderOption,
-    random: Annotated[int, typer.Option(help="Number of networks drawn at random.")] = 24,
-    grid: Annotated[int, typer.Option(help="Maximum number of neighbours of the best of them.")] = 16,
-    windows: Annotated[
-        str, typer.Option(help="Window lengths K to draw from, separated by commas.")
-    ] = "157,64,32",
-    epochs: EpochsOption = 8,
-    seed: SeedOption = 0,
-    split: SplitOption = "auto",
-    scaling: ScalingOption = "max",
-    workers: WorkersOption = None,
-    json: JsonOption = None,
-) -> None:
-    """Search REMNet architectures: error against operations.
-
-    Random search, then a grid around the best, over N, k0, kn, F and K: MAE against multiply-accumulates.
-
-    Networks are judged on a fifth of the training configurations; the test part is not used.
-
-    Writes journal.jsonl, from which an interrupted search continues, and front.png.
-    """
-    lengths = _lengths(windows)
-    with needs_torch():
-        from uwb_mitigation.paper import figures
-        from uwb_mitigation.paper import search as searches
-        from uwb_mitigation.paper.experiment import PAPER
-
-    _make_folder(output)
-    train = _parts(data, max(lengths), scaling, split).train
-    with console.share_bar("searching") as update:
-        trials = searches.search(
-            train,
-            output / "journal.jsonl",
-            replace(PAPER, epochs=epochs, seed=seed),
-            random=random,
-            grid=grid,
-            windows=lengths,
-            workers=_workers(workers),
-            on_progress=update,
-        )
-    best = searches.front(trials)
-    columns = ("K", "N", "k0", "kn", "F", "parameters", "multiply-accumulates", "MAE, m")
-    rows = []
-    for trial in best:
-        shape = trial.architecture
-        sizes = (shape.samples, shape.modules, shape.first_kernel, shape.kernel, shape.filters)
-        rows.append((*sizes, shape.parameters, shape.multiply_accumulates, f"{trial.mae_m:.4f}"))
-    _show_table(f"Pareto front of {len(trials)} networks, cheapest first", columns, rows)
-    figures.draw_front(trials, output / "front.png")
-    console.write_json(
-        json, {"trials": list(map(_trial_json, trials)), "front": list(map(_trial_json, best))}
-    )
-
-
-@app.command("lr-range")
-def lr_range(
-    data: DataOption,
-    samples: Annotated[int, typer.Option(help="Window length K.")] = 157,
-    low: Annotated[float, typer.Option(help="First learning rate.")] = 1e-6,
-    high: Annotated[float, typer.Option(help="Last learning rate.")] = 0.3,
-    steps: Annotated[int, typer.Option(help="Batches.")] = 600,
-    seed: SeedOption = 0,
-    split: SplitOption = "auto",
-    scaling: ScalingOption = "max",
-    plot: Annotated[Path | None, typer.Option(metavar="PNG", help="Draw the loss over the rate.")] = None,
-    json: JsonOption = None,
-) -> None:
-    """Run the learning-rate range test of Smith (2017) on the training part."""
-    with needs_torch():
-        from uwb_mitigation.paper.experiment import PAPER
-        from uwb_mitigation.paper.learning_rate import range_test
-    from uwb_mitigation.model.architecture import Remnet
-
-    train = _parts(data, samples, scaling, split).train
-    options = replace(PAPER, seed=seed)
-    with console.step_bar("range test", steps) as on_step:
-        result = range_test(
-            Remnet(samples),
-            train.inputs,
-            train.error_m,
-            options,
-            low=low,
-            high=high,
-            steps=steps,
-            on_step=on_step,
-        )
-    console.out.print(
-        f"steepest descent of the loss at {result.suggested:.2g}, minimum at {result.highest:.2g}"
-        f"{'; divergence beyond' if result.diverged else ''}",
-        highlight=False,
-    )
-    if plot is not None:
-        from uwb_mitigation.paper import figures
-
-        figures.draw_range_test(result, plot)
-    console.write_json(json, asdict(result))
-
-
-@app.command()
-def prune(
-    model: Annotated[
-        Path, typer.Argument(metavar="MODEL_FLOAT", help="Float bundle of a REMNet from `paper protocol`.")
-    ],
-    data: DataOption,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="Bundle to write.")],
-    filters: Annotated[int, typer.Option(help="Filters F to keep.")] = 8,
-    epochs: EpochsOption = 10,
-    seed: SeedOption = 0,
-    split: SplitOption = "auto",
-    json: JsonOption = None,
-) -> None:
-    """Remove the weakest filters of a REMNet and train the rest.
-
-    Writes a smaller float bundle. Trains on the training part of the split and tests on its test part.
-
-    Rejects a bundle that was trained on another split or other data: it may have seen the test part.
-    """
-    with needs_torch():
-        from uwb_mitigation.paper.experiment import PAPER
-        from uwb_mitigation.paper.pruning import prune_bundle
-    from uwb_mitigation.model.bundle import load_bundle
-
-    source = load_bundle(model)
-    check_output(output)
-    preprocessing = source.preprocessing
-    parts = _parts(data, preprocessing.samples, preprocessing.scaling.value, split)
-    with console.step_bar("training", epochs) as on_epoch:
-        options = replace(PAPER, epochs=epochs, seed=seed)
-        bundle, mae = prune_bundle(source, parts, filters, options, output, on_epoch)
-    after = bundle.architecture
-    cost = {
-        "multiply_accumulates": after.multiply_accumulates,
-        "multiply_accumulates_before": source.architecture.multiply_accumulates,
-        "parameters": after.parameters,
-    }
-    console.out.print(
-        f"{output}: {filters} filters, {cost['parameters']} parameters, "
-        f"{cost['multiply_accumulates_before'] / cost['multiply_accumulates']:.1f} x fewer multiply-accumulates\n"
-        f"test MAE: {mae['before']:.4f} m before, {mae['pruned']:.4f} m pruned, {mae['tuned']:.4f} m trained again",
-        markup=False,
-        highlight=False,
-    )
-    console.write_json(json, {"model_id": bundle.model_id, "mae": dict(mae), **cost})
-
-
-@app.command()
 def report(
     data: DataOption,
     output: FolderOption,
@@ -303,7 +150,7 @@ def report(
     from uwb_mitigation.files import write_whole
     from uwb_mitigation.paper import published, results
     from uwb_mitigation.paper import report as reports
-    from uwb_mitigation.paper.parts import load
+    from uwb_mitigation.paper.data import load
     from uwb_mitigation.preprocessing import Preprocessing, Scaling
 
     trainings = None if models is None else results.read(results.ExperimentResults, models / results.RESULTS)
@@ -312,8 +159,7 @@ def report(
     with console.reading() as on_record:
         longest = Preprocessing(max(published.WINDOWS), Scaling.MAX)
         study = reports.Study(data, *load(data, longest, on_record), _command())
-    with console.step_bar("drawing", reports.STEPS) as on_step:
-        result = reports.build(study, trainings, bench, on_step)
+    result = reports.build(study, trainings, bench)
     page = output / "report.html"
     write_whole(page, result.html())
     console.write_json(json, result.as_json())
@@ -331,13 +177,13 @@ def _command() -> str:
     return shlex.join(["uwb-mitigation", *sys.argv[1:]])
 
 
-def _parts(data: Path, samples: int, scaling: str, split: str) -> Parts:
-    from uwb_mitigation.paper import parts
+def _parts(path: Path, samples: int, scaling: str, split: str) -> Parts:
+    from uwb_mitigation.paper import data as parts
     from uwb_mitigation.preprocessing import Preprocessing
 
     preprocessing = Preprocessing(samples, scaling_of(scaling))
     with console.reading() as on_record:
-        name, _, dataset = parts.load(data, preprocessing, on_record)
+        name, _, dataset = parts.load(path, preprocessing, on_record)
     console.show_refused(dataset.refused)
     return parts.divided(name, dataset, split)
 
@@ -369,54 +215,34 @@ def _make_folder(path: Path) -> None:
         raise UwbMitigationError(f"cannot be created: {error.strerror}", where=str(path)) from error
 
 
-def _show_table(title: str, columns: tuple[str, ...], rows: list[tuple[Any, ...]]) -> None:
-    from rich.box import SIMPLE_HEAD
-
-    from uwb_mitigation.commands.console import Table
-
-    # Without lines between columns it fits a terminal with 80 columns.
-    table = Table(title=title, box=SIMPLE_HEAD, padding=(0, 0, 0, 1))
-    for column in columns:
-        table.add_column(column, justify="left" if column == "network" else "right", no_wrap=True)
-    for row in rows:
-        table.add_row(*map(str, row))
-    console.out.print(table)
-
-
 def _show_experiment(result: ExperimentResults) -> None:
-    def mean(values: list[Any], form: str) -> str:
-        known = [value for value in values if value is not None]
-        return format(statistics.fmean(known), form) if known else "-"
+    from uwb_mitigation.commands.model_tables import say, show_table
+    from uwb_mitigation.paper.results import Spread
 
-    blank = ("", "", "", "")
-    rows: list[tuple[Any, ...]] = []
+    def mean(values: list[Any], form: str) -> str:
+        spread = Spread.of(values)
+        return format(spread.mean, form) if spread else "-"
+
+    rows: list[list[Any]] = []
     if result.models:
-        rows.append(("raw", "", "", "", f"{result.models[0].mae_raw:.4f}", *blank))
-    for baseline in result.baselines:
-        left = baseline.errors.all.mae if baseline.errors else None
-        rows.append((baseline.name, "", "", "", mean([left], ".4f"), *blank))
+        rows.append(["raw", "", "", "", f"{result.models[0].mae_raw:.4f}"])
+    rows += [
+        [one.name, "", "", "", mean([one.errors and one.errors.all.mae], ".4f")] for one in result.baselines
+    ]
     for network, samples in dict.fromkeys((model.network, model.samples) for model in result.models):
         models = result.of(network, samples)
-        last = [model.mae_float if model.mae_int8 is None else model.mae_int8 for model in models]
-        rows.append(
-            (
-                *(network, samples, len(models), models[0].parameters),
-                *(mean([model.mae_m[form] for model in models], ".4f") for form in range(3)),
-                f"{statistics.stdev(last):.4f}" if len(last) > 1 else "-",
-                mean([model.bytes_int8 for model in models], ".0f"),
-            )
-        )
-    title = (
-        f"{result.data}, split {result.split}: {result.train} to train on, {result.test} to test, "
-        f"{result.options.epochs} epochs; MAE in m, mean and standard deviation (of the last form) over seeds"
-    )
+        maes = [mean([model.by_form("mae")[form] for model in models], ".4f") for form in range(3)]
+        last = Spread.of([model.left.all.mae for model in models])
+        deviation = "-" if last is None or last.std is None else f"{last.std:.4f}"
+        size = mean([model.bytes_int8 for model in models], ".0f")
+        rows.append([network, samples, len(models), models[0].parameters, *maes, deviation, size])
     columns = ("network", "K", "seeds", "params", "float", "optimised", "int8", "std", "bytes")
-    _show_table(title, columns, rows)
+    show_table(
+        f"{result.data}, split {result.split}: {result.train} to train on, {result.test} to test, "
+        f"{result.options.epochs} epochs; MAE in m, mean and standard deviation (of the last form) over seeds",
+        columns,
+        rows,
+    )
     for baseline in result.baselines:
         if baseline.reason:
-            console.out.print(f"{baseline.name}: not available: {baseline.reason}", markup=False)
-
-
-def _trial_json(trial: Trial) -> dict[str, Any]:
-    costs = ("parameters", "multiply_accumulates")
-    return asdict(trial) | {name: getattr(trial.architecture, name) for name in costs}
+            say(f"{baseline.name}: not available: {baseline.reason}")

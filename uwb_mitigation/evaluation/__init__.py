@@ -1,1 +1,1 @@
-"""How good a correction is: metrics, splits by configuration, and the baselines it must beat. Only `results` and `material` read files."""
+"""How good a correction is: metrics, splits by configuration, and the baselines it must beat."""

@@ -1,8 +1,7 @@
-"""The offset of two radios from ranges of a known length in line of sight: measured - predicted error - distance.
+"""The offset of two radios from ranges of a known distance in line of sight: measured - predicted error - distance.
 
-A CIR does not know its radios' antenna delays, so one true distance must be known. What a model cannot know of the place
-where the antennas stood is in the answer too, however long they stood there: hence a standard deviation that more
-ranges alone do not make small, but more placements do.
+A CIR does not show the antenna delays of its radios, so one true distance must be known. The offset also contains what
+the model does not know of the position, so more placements reduce its standard deviation, more ranges of one hardly.
 """
 
 from __future__ import annotations
@@ -10,7 +9,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass
 from itertools import islice
 
 import numpy as np
@@ -25,40 +24,32 @@ from uwb_mitigation.offsets import MAX_OFFSET_M, Offsets
 from uwb_mitigation.preprocessing import Preprocessing, Scaling
 
 PLACEMENT_SD_M = 0.15
-"""Of the offset found at one placement, beside noise. The spread (1.48 x median absolute deviation) between the seven
-line-of-sight placements of the EVK1000 logs is 0.12 m after `universal`, and seven say that roughly."""
+"""Standard deviation of the offset of one placement without noise: 0.12 m between the seven LOS placements of the EVK1000
+logs (1.48 x median absolute deviation after `universal`), and seven placements determine that roughly."""
 
-LARGEST_EXCESS_M = 0.25
-LARGEST_ERROR_M = 0.5
-"""A model that predicts more sees something between the antennas: one of the excess alone, and one whose prior holds the
-offset of boards too."""
+MAX_EXCESS_M, MAX_ERROR_M = 0.25, 0.5
+"""A model that predicts more sees an obstacle; the second limit is for a model whose prior contains the boards' offset."""
 
-FEWEST_RANGES = 10
+MIN_RANGES = 10
 _BATCH = 256
 _MAD_TO_SD = 1.4826
 _OF_MEDIAN = math.sqrt(math.pi / 2.0)
 
-
-@dataclass(slots=True)
-class _Gathered:
-    offset_m: list[float] = field(default_factory=list)
-    predicted_m: list[float] = field(default_factory=list)
-    gap_db: list[float] = field(default_factory=list)
-    others: Counter[str] = field(default_factory=Counter)
+_Sample = tuple[float, float, float, str]
+"""Offset, m; predicted error, m, or NaN; power gap, dB, or NaN; status."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlacementOffset:
-    """What one pair says at one placement.
+    """The offset of one pair at one placement.
 
     Attributes:
-        tag_id, anchor_id, placement: which.
-        ranges: that it counts on.
-        offset_m, sd_m: of its ranges, by medians; NaN where refused.
-        noise_sd_m: the part of `sd_m` that more ranges make smaller.
-        power_gap_db: receive level less first-path level, median, as reported or from the CIR; NaN = unknown.
+        ranges: the number that it is computed from.
+        offset_m, sd_m: by medians; NaN if refused.
+        noise_sd_m: the part of `sd_m` that more ranges reduce.
+        power_gap_db: receive level less first-path level, median, as reported or from the CIR; NaN: unknown.
         predicted_m: the model's predicted error, median; NaN without any.
-        refused: why it does not count; empty = it does.
+        refused: why it does not count; empty if it does.
     """
 
     tag_id: int
@@ -75,12 +66,12 @@ class PlacementOffset:
 
 @dataclass(frozen=True, slots=True)
 class FoundOffset:
-    """What a recording says.
+    """The offset of a recording.
 
     Attributes:
-        offset_m, sd_m: median over placements, and how sure it is.
-        ranges: that it counts on.
-        placements: all of them, those refused too.
+        offset_m, sd_m: median over placements, and its standard deviation.
+        ranges: the number that it is computed from.
+        placements: all, also refused ones.
         model_id: of the model that predicted.
     """
 
@@ -91,7 +82,7 @@ class FoundOffset:
     model_id: int
 
     def offsets(self, *, together: bool = False) -> Offsets:
-        """The median for pairs that were not there, and unless `together` each pair's own."""
+        """The median for unknown pairs and, unless `together`, the offset of each pair."""
         pairs: dict[tuple[int, int], list[float]] = {}
         for placement in self.placements:
             if not placement.refused and not together:
@@ -99,32 +90,12 @@ class FoundOffset:
         return Offsets(self.offset_m, pairs={pair: float(np.median(found)) for pair, found in pairs.items()})
 
     def as_json(self) -> dict[str, object]:
-        """The result of `uwb-mitigation offset`."""
-
-        def number(value: float) -> float | None:
-            return value if math.isfinite(value) else None
-
-        return {
-            "offset_m": self.offset_m,
-            "sd_m": self.sd_m,
-            "ranges": self.ranges,
-            "model_id": self.model_id,
-            "pairs": [
-                {
-                    "tag_id": one.tag_id,
-                    "anchor_id": one.anchor_id,
-                    "placement": one.placement,
-                    "ranges": one.ranges,
-                    "offset_m": number(one.offset_m),
-                    "sd_m": number(one.sd_m),
-                    "noise_sd_m": number(one.noise_sd_m),
-                    "power_gap_db": number(one.power_gap_db),
-                    "predicted_m": number(one.predicted_m),
-                    "refused": one.refused or None,
-                }
-                for one in self.placements
-            ],
-        }
+        """The result of `uwb-mitigation offset`; null: unknown."""
+        rows = [asdict(one) | {"refused": one.refused or None} for one in self.placements]
+        for row in rows:
+            row |= {key: None for key, value in row.items() if isinstance(value, float) and math.isnan(value)}
+        found = {"offset_m": self.offset_m, "sd_m": self.sd_m, "ranges": self.ranges}
+        return found | {"model_id": self.model_id, "pairs": rows}
 
 
 def find_offset(
@@ -140,15 +111,15 @@ def find_offset(
 
     Args:
         mitigation: predicts the excess; its own offsets do not matter.
-        distance_m: between the antennas; None = as each record's truth says.
-        tag_id, anchor_id: only these; None = any.
+        distance_m: between the antennas; None: from the truth of each record.
+        tag_id, anchor_id: only these; None: any.
         on_record: called for each record that was read.
 
     Raises:
-        ParameterError: one distance is to be that of several pairs.
+        ParameterError: one distance for several pairs.
         DatasetError: nothing looks like line of sight, or there is no truth.
     """
-    groups: dict[tuple[int, int, str], _Gathered] = {}
+    groups: dict[tuple[int, int, str], list[_Sample]] = {}
     preprocessing = Preprocessing(mitigation.bundle.preprocessing.samples, Scaling.MAX)
     without_truth = 0
     stream = iter(records)
@@ -158,27 +129,24 @@ def find_offset(
         wanted = [
             record
             for record in batch
-            if (tag_id is None or record.measurement.tag_id == tag_id)
-            and (anchor_id is None or record.measurement.anchor_id == anchor_id)
+            if tag_id in (None, record.measurement.tag_id)
+            and anchor_id in (None, record.measurement.anchor_id)
         ]
         results = mitigation.correct([record.measurement for record in wanted])
         for record, result in zip(wanted, results, strict=True):
-            measurement, truth = record.measurement, record.truth
+            measured, truth = record.measurement, record.truth
             true_m = distance_m if distance_m is not None else math.nan if truth is None else truth.range_m
             if not math.isfinite(true_m):
                 without_truth += 1
                 continue
             placement = truth.configuration if truth is not None and distance_m is None else ""
-            found = groups.setdefault((measurement.tag_id, measurement.anchor_id, placement), _Gathered())
-            found.gap_db.append(_power_gap_db(measurement, preprocessing))
             predicted = math.nan
             if result.status is Status.OK:
-                offset = mitigation.offsets.of([measurement.tag_id], [measurement.anchor_id])
-                predicted = result.correction_m - float(offset[0])
-            else:
-                found.others[result.status.name] += 1
-            found.predicted_m.append(predicted)
-            found.offset_m.append(measurement.range_m - predicted - true_m)
+                known = mitigation.offsets.of([measured.tag_id], [measured.anchor_id])
+                predicted = result.correction_m - float(known[0])
+            offset, gap = measured.range_m - predicted - true_m, _power_gap_db(measured, preprocessing)
+            sample = offset, predicted, gap, result.status.name
+            groups.setdefault((measured.tag_id, measured.anchor_id, placement), []).append(sample)
     if not groups:
         if without_truth:
             raise DatasetError(f"none of {without_truth} ranges has a true distance", valid="give --distance")
@@ -190,9 +158,9 @@ def find_offset(
             f"one distance for {len(pairs)} pairs ({some}{', ...' if len(pairs) > 5 else ''})",
             valid="choose one with --anchor and --tag",
         )
-    largest_m = LARGEST_EXCESS_M if mitigation.bundle.prior == LinePrior(0.0) else LARGEST_ERROR_M
-    placements = tuple(_judge(*key, groups[key], largest_m) for key in sorted(groups))
-    return _together(placements, mitigation.bundle.model_id)
+    limit_m = MAX_EXCESS_M if mitigation.bundle.prior == LinePrior(0.0) else MAX_ERROR_M
+    placements = tuple(_placement_offset(*key, groups[key], limit_m) for key in sorted(groups))
+    return _combined(placements, mitigation.bundle.model_id)
 
 
 def _power_gap_db(measurement: RangeMeasurement, preprocessing: Preprocessing) -> float:
@@ -208,19 +176,16 @@ def _power_gap_db(measurement: RangeMeasurement, preprocessing: Preprocessing) -
     return 10.0 * math.log10(float(energy.sum()) / first_path)
 
 
-def _judge(
-    tag_id: int, anchor_id: int, placement: str, found: _Gathered, largest_m: float
+def _placement_offset(
+    tag_id: int, anchor_id: int, placement: str, samples: list[_Sample], limit_m: float
 ) -> PlacementOffset:
-    offset, predicted, gap = (
-        np.array(values, np.float64) for values in (found.offset_m, found.predicted_m, found.gap_db)
-    )
+    offset, predicted, gap = np.array([sample[:3] for sample in samples], np.float64).T
     known, judged = np.isfinite(gap), np.isfinite(predicted)
     direct = known & (gap < LINE_OF_SIGHT_DB)
-    used = offset[direct & judged]
-    n = len(offset)
+    used, n = offset[direct & judged], len(offset)
     median_gap = float(np.median(gap[known])) if known.any() else math.nan
     median_predicted = float(np.median(predicted[judged])) if judged.any() else math.nan
-    refused = ""
+    found, noise, refused = math.nan, math.nan, ""
     if 2 * known.sum() < n:
         refused = "neither the radio nor the CIR has the power of the first path: nothing shows line of sight"
     elif 2 * direct.sum() < known.sum():
@@ -229,33 +194,21 @@ def _judge(
             f"(line of sight: less than {LINE_OF_SIGHT_DB:g} dB)"
         )
     elif not len(used) or 2 * judged.sum() < n:
-        statuses = ", ".join(f"{count} {name}" for name, count in found.others.most_common())
+        others = Counter(status for *_, status in samples if status != Status.OK.name).most_common()
+        statuses = ", ".join(f"{count} {name}" for name, count in others)
         refused = f"the model can judge {judged.sum()} of {n} ranges ({statuses})"
-    elif median_predicted > largest_m:
+    elif median_predicted > limit_m:
         refused = f"not line of sight: the model predicts {median_predicted:.2f} m too long"
     elif abs(float(np.median(used))) > MAX_OFFSET_M:
         refused = f"{np.median(used):.1f} m off: is the distance in metres, the antenna delay set?"
-    if refused:
-        none = math.nan
-        return PlacementOffset(
-            tag_id, anchor_id, placement, 0, none, none, none, median_gap, median_predicted, refused
-        )
-    noise = _OF_MEDIAN * _spread(used) / math.sqrt(len(used))
-    return PlacementOffset(
-        tag_id,
-        anchor_id,
-        placement,
-        len(used),
-        float(np.median(used)),
-        math.hypot(noise, PLACEMENT_SD_M),
-        noise,
-        median_gap,
-        median_predicted,
-        "",
-    )
+    else:
+        found, noise = float(np.median(used)), _OF_MEDIAN * _spread(used) / math.sqrt(len(used))
+    sd, count = math.hypot(noise, PLACEMENT_SD_M), 0 if refused else len(used)
+    levels = median_gap, median_predicted
+    return PlacementOffset(tag_id, anchor_id, placement, count, found, sd, noise, *levels, refused)
 
 
-def _together(placements: tuple[PlacementOffset, ...], model_id: int) -> FoundOffset:
+def _combined(placements: tuple[PlacementOffset, ...], model_id: int) -> FoundOffset:
     good = [one for one in placements if not one.refused]
     if not good:
         first = placements[0]
@@ -264,20 +217,19 @@ def _together(placements: tuple[PlacementOffset, ...], model_id: int) -> FoundOf
             f"anchor {format_id(first.anchor_id)}, tag {format_id(first.tag_id)}: {first.refused}{more}",
             valid="range with nothing between or beside the antennas",
         )
-    if (ranges := sum(one.ranges for one in good)) < FEWEST_RANGES:
+    if (ranges := sum(one.ranges for one in good)) < MIN_RANGES:
         raise DatasetError(
             f"{ranges} ranges look like line of sight",
-            valid=f"{FEWEST_RANGES} at least, and some hundred are better",
+            valid=f"{MIN_RANGES} at least, and some hundred are better",
         )
-    offset = np.array([one.offset_m for one in good])
-    noise = np.array([one.noise_sd_m for one in good])
+    offset, noise = np.array([(one.offset_m, one.noise_sd_m) for one in good]).T
     spread = max(_spread(offset), PLACEMENT_SD_M)
-    # Of two or fewer the median is the mean.
+    # The median of two or fewer is their mean.
     factor = _OF_MEDIAN if len(good) > 2 else 1.0
     sd = factor * math.hypot(spread, float(np.sqrt(np.mean(noise * noise)))) / math.sqrt(len(good))
     return FoundOffset(float(np.median(offset)), sd, ranges, placements, model_id)
 
 
 def _spread(values: NDArray[np.float64]) -> float:
-    """A standard deviation that a few wild values do not move."""
+    """A robust standard deviation."""
     return _MAD_TO_SD * float(np.median(np.abs(values - np.median(values))))

@@ -6,6 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -129,86 +130,69 @@ def gather(
         DatasetError: no range is of an anchor in the map.
     """
     left_out: Counter[str] = Counter()
-    rows: dict[int, list[tuple[int, int, float, float, float, bool, float]]] = {}
+    unknown: Counter[int] = Counter()
+    rows: list[tuple[int, int, int, float, float, float, float, bool]] = []
+    windows: list[NDArray[np.float32]] = []
     frames: dict[int, dict[str, None]] = {}
-    offset_ns = round(stamp_offset_s * _SECOND_NS)
-    windows: dict[int, list[NDArray[np.float32]]] = {}
-    strangers: Counter[int] = Counter()
     shifts: list[int] = []
     latest: int | None = None
     for number, recording in enumerate(recordings):
         shift: int | None = None
-        here = latest
+        end_of_previous = latest
         for record in recording:
             on_record()
             measured = record.measurement
-            stamp_ns = measured.stamp_ns + offset_ns
+            stamp_ns = measured.stamp_ns + round(stamp_offset_s * _SECOND_NS)
             if shift is None:
-                shift = 0 if here is None or stamp_ns > here else here - stamp_ns + BETWEEN_NS
+                is_later = end_of_previous is None or stamp_ns > end_of_previous
+                shift = 0 if is_later else end_of_previous - stamp_ns + BETWEEN_NS  # type: ignore[operator]
             row = anchors.index.get(measured.anchor_id)
-            if row is None:
-                strangers[measured.anchor_id] += 1
-                continue
-            if not (math.isfinite(measured.range_m) and 0 <= measured.range_m <= MAX_RANGE_M):
-                left_out["no valid range"] += 1
-                continue
             height = math.nan if heights is None else float(heights[number].at(np.array([stamp_ns]))[0][0])
-            if heights is not None and math.isnan(height):
+            if row is None:
+                unknown[measured.anchor_id] += 1
+            elif not (math.isfinite(measured.range_m) and 0 <= measured.range_m <= MAX_RANGE_M):
+                left_out["no valid range"] += 1
+            elif heights is not None and math.isnan(height):
                 left_out["no height at that time"] += 1
-                continue
-            frames.setdefault(measured.tag_id, {}).setdefault(measured.frame_id)
-            (fault,), (window,) = preprocessing.windows_of([measured])
-            stamp_ns += shift
-            latest = stamp_ns if latest is None else max(latest, stamp_ns)
-            cir = measured.cir
-            power = cir.rx_power_dbm, cir.first_path_power_dbm
-            rows.setdefault(measured.tag_id, []).append(
-                (stamp_ns, row, measured.range_m, *power, fault == 0, height)
-            )
-            windows.setdefault(measured.tag_id, []).append(window)
+            else:
+                frames.setdefault(measured.tag_id, {}).setdefault(measured.frame_id)
+                (fault,), (window,) = preprocessing.windows_of([measured])
+                stamp_ns += shift
+                latest = stamp_ns if latest is None else max(latest, stamp_ns)
+                power = measured.cir.rx_power_dbm, measured.cir.first_path_power_dbm
+                rows.append((measured.tag_id, stamp_ns, row, measured.range_m, *power, height, fault == 0))
+                windows.append(window)
         shifts.append(shift or 0)
-    for identity, count in strangers.items():
+    for identity, count in unknown.items():
         left_out[f"anchor {format_id(identity)} is not in the anchors file"] += count
     if not rows:
-        seen = ", ".join(map(format_id, sorted(strangers))) or "none"
+        seen = ", ".join(map(format_id, sorted(unknown))) or "none"
         raise DatasetError(
             f"no range of the anchors {', '.join(map(format_id, sorted(anchors.index)))}",
             valid=f"the recording's ranges come from anchors: {seen}",
         )
-    with_cir = np.array([row[5] for tag in sorted(rows) for row in rows[tag]])
-    has_cirs = bool(with_cir.mean() >= WITH_CIR)
-    tags, inputs, powers, usable, level_m = [], [], [], list[bool](), list[float]()
-    for tag in sorted(rows):
-        order = sorted(range(len(rows[tag])), key=lambda i, own=rows[tag]: own[i][0])  # type: ignore[misc]
-        part = [rows[tag][i] for i in order]
-        usable += [row[5] for row in part]
-        level_m += [row[6] for row in part]
-        rx = np.array([row[3] for row in part], np.float64)
-        tags.append(
-            Ranges(
-                np.array([row[0] for row in part], np.int64),
-                np.array([row[1] for row in part], np.intp),
-                np.array([row[2] for row in part], np.float64),
-                np.full(len(part), np.nan),
-                np.where(np.isfinite(rx), rx, np.nan),
-                tag,
-            )
-        )
-        inputs.append(np.stack([windows[tag][i] for i in order]))
-        powers.append(np.array([row[3:5] for row in part], np.float64))
-    reported = np.concatenate(powers)
-    level = np.where(np.isfinite(reported), reported, np.nan).astype(np.float32)
+    kinds: list[type] = [np.uint64, np.int64, np.intp, *[np.float64] * 4, np.bool_]
+    columns: list[NDArray[Any]] = [
+        np.array(column, kind) for column, kind in zip(zip(*rows, strict=True), kinds, strict=True)
+    ]
+    order = np.lexsort((columns[1], columns[0]))
+    tag, stamp, anchor, range_m, rx, first_path, height_m, with_cir = (column[order] for column in columns)
+    rx, first_path = (np.where(np.isfinite(power), power, np.nan) for power in (rx, first_path))
+    tags = tuple(
+        Ranges(stamp[own], anchor[own], range_m[own], np.full(len(own), np.nan), rx[own], int(tag[own[0]]))
+        for own in np.split(np.arange(len(tag)), np.flatnonzero(np.diff(tag)) + 1)
+    )
     return SiteData(
-        anchors,
-        tuple(tags),
-        preprocessing,
-        np.concatenate(inputs),
-        level[:, 0],
-        level[:, 1],
-        has_cirs,
-        np.array(usable),
-        None if heights is None else np.array(level_m),
-        {tag: tuple(own) for tag, own in frames.items()},
-        left_out,
-        tuple(shifts),
+        anchors=anchors,
+        tags=tags,
+        preprocessing=preprocessing,
+        inputs=np.stack([windows[index] for index in order]),
+        rx_power_dbm=rx.astype(np.float32),
+        first_path_power_dbm=first_path.astype(np.float32),
+        has_cirs=bool(with_cir.mean() >= WITH_CIR),
+        with_cir=with_cir,
+        height_m=None if heights is None else height_m,
+        frames={tag_id: tuple(own) for tag_id, own in frames.items()},
+        left_out=left_out,
+        shift_ns=tuple(shifts),
     )

@@ -14,7 +14,7 @@ import onnxruntime
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError, ModelError, ParameterError, UwbMitigationError
-from uwb_mitigation.evaluation import baselines, lad, splits
+from uwb_mitigation.evaluation import baselines, splits
 from uwb_mitigation.evaluation.dataset import Dataset
 from uwb_mitigation.files import write_whole
 from uwb_mitigation.model import floating, graph
@@ -24,8 +24,8 @@ from uwb_mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.model.prior import LinePrior
 from uwb_mitigation.model.weights import FloatWeights, Int8Weights
 from uwb_mitigation.paper import published
+from uwb_mitigation.paper.data import Parts, fingerprint
 from uwb_mitigation.paper.jobs import run_jobs
-from uwb_mitigation.paper.parts import Parts, fingerprint
 from uwb_mitigation.paper.results import (
     FORMS,
     RESULTS,
@@ -35,7 +35,8 @@ from uwb_mitigation.paper.results import (
     Settings,
     TrainedModel,
 )
-from uwb_mitigation.training import fitting, networks
+from uwb_mitigation.training import fitting
+from uwb_mitigation.training.candidates import fit_line, prior_m
 from uwb_mitigation.training.cards import card_of
 from uwb_mitigation.training.options import FitOptions
 from uwb_mitigation.training.quantization import MSE, quantize
@@ -43,20 +44,15 @@ from uwb_mitigation.training.quantization import MSE, quantize
 PAPER = FitOptions(published.EPOCHS, published.LEARNING_RATE, published.BATCH, dropout=0.5, weight_decay=0.0)
 """The paper does not report its dropout rate."""
 
-NETWORKS = ("remnet", "remnet_k5", "remnet_attention", "mlp")
-"""REMNet with k0 = 3 (which the paper's parameter counts require), with k0 = 5 (as its text says), with the attention of
-the original network (float only), and the baseline."""
+NETWORKS = ("remnet", "remnet_k5", "mlp")
+"""REMNet with k0 = 3 (which the paper's parameter counts require), with k0 = 5 (as its text says), and the baseline."""
 
 JOURNAL = "journal.jsonl"
 VARIANCE_FOLDS = 5
 
-CALIBRATIONS: Mapping[str, float | None] = {
-    "max": 100.0,
-    "p99.99": 99.99,
-    "p99.9": 99.9,
-    "p99": 99.0,
-    "mse": MSE,
-}
+CALIBRATIONS: Mapping[str, float | None] = dict(
+    zip(("max", "p99.99", "p99.9", "p99", "mse"), (100.0, 99.99, 99.9, 99.0, MSE), strict=True)
+)
 """{name: percentile of `quantize`} to choose activation scales by."""
 
 CALIBRATION_INPUTS, CHECKED_INPUTS = 512, 1024
@@ -87,7 +83,7 @@ class Task:
 
 
 def tasks(networks_: Sequence[str], windows: Sequence[int], seeds: int) -> list[Task]:
-    """Return every window length and seed; for the MLP and the attention network only the longest window.
+    """Return every window length and seed; for the MLP only the longest window.
 
     Raises:
         ParameterError: unknown network, or no seeds or windows.
@@ -97,7 +93,7 @@ def tasks(networks_: Sequence[str], windows: Sequence[int], seeds: int) -> list[
     return [
         Task(network, samples, seed)
         for network in networks_
-        for samples in (windows if network in ("remnet", "remnet_k5") else [max(windows)])
+        for samples in ([max(windows)] if network == "mlp" else windows)
         for seed in range(seeds)
     ]
 
@@ -166,58 +162,40 @@ def train_task(task: Task, parts: Parts, folder: Path, options: FitOptions) -> T
     """Train one network from random weights to int8, on parts with the task's windows; raises as `fit` and `quantize`."""
     train, test, architecture = parts.train, parts.test, task.architecture
     start = time.perf_counter()
-    found: dict[str, Any] = {"parameters": architecture.parameters}
-    predicted: dict[str, NDArray[np.float32]]
-    if task.network == "remnet_attention" and isinstance(architecture, Remnet):
-        with fitting.single_thread(options.seed):
-            module = networks.RemnetModule(architecture, options.dropout, attention=True)
-            fitting.descend(module, train.inputs, train.error_m, options)
-            predicted = {"float": fitting.predict_m(module, test.inputs)}
-        seconds = time.perf_counter() - start
-        found["parameters"] = sum(values.numel() for values in module.parameters())
-    else:
-        weights = fitting.fit(architecture, train.inputs, train.error_m, options)
-        seconds = time.perf_counter() - start
-        files, maes, network = _export(task.name, weights, parts, folder, options)
-        predicted = {form: _predict_m(files[form], test.inputs, fuse=form == "int8") for form in FORMS}
-        found |= {f"bytes_{form}": path.stat().st_size for form, path in files.items()}
-        found |= {"calibration": network, "calibration_mae": maes}
-    errors = {
-        form: ErrorsByCondition.of(test.error_m, test.error_m - outputs, test.labels)
-        for form, outputs in predicted.items()
-    }
-    found |= {f"mae_{form}": one.all.mae for form, one in errors.items()}
-    if errors["float"].all.mae_raw is None:
-        raise DatasetError("the test part is empty", valid="at least one measurement")
-    return TrainedModel(
-        network=task.network,
-        samples=task.samples,
-        seed=task.seed,
-        multiply_accumulates=architecture.multiply_accumulates,
-        mae_raw=errors["float"].all.mae_raw,
-        float_errors=errors["float"],
-        int8_errors=errors.get("int8"),
-        seconds=seconds,
-        samples_per_s=len(train) * options.epochs / max(seconds, 1e-9),
-        **found,
-    )
-
-
-def _export(
-    name: str, weights: FloatWeights, parts: Parts, folder: Path, options: FitOptions
-) -> tuple[dict[str, Path], dict[str, float], str]:
-    """Write the three files; return them, the MAE of each calibration, and the chosen calibration."""
-    files = {form: folder / f"{name}_{form}.onnx" for form in FORMS}
-    card = describe(name, weights.architecture, parts, options)
-    maes, best, network = calibrate(weights, parts.train.inputs, parts.train.error_m, options.seed)
+    found: dict[str, Any] = {}
+    weights = fitting.fit(architecture, train.inputs, train.error_m, options)
+    seconds = time.perf_counter() - start
+    files = {form: folder / f"{task.name}_{form}.onnx" for form in FORMS}
+    card = describe(task.name, architecture, parts, options)
+    maes, best, integers = calibrate(weights, train.inputs, train.error_m, options.seed)
     save_bundle(files["float"], graph.float_model(weights), card)
     # Optimisations that do not depend on the processor, so that the file runs on another one.
     settings = session_options()
     settings.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_EXTENDED
     settings.optimized_model_filepath = str(files["optimised"])
     _session(files["float"], settings)
-    save_bundle(files["int8"], graph.int8_model(network), replace(card, quantised=True))
-    return files, maes, best
+    save_bundle(files["int8"], graph.int8_model(integers), replace(card, quantised=True))
+    predicted = {form: _predict_m(files[form], test.inputs, fuse=form == "int8") for form in FORMS}
+    found |= {f"bytes_{form}": path.stat().st_size for form, path in files.items()}
+    found |= {"calibration": best, "calibration_mae": maes}
+    errors = {
+        form: ErrorsByCondition.of(test.error_m, test.error_m - outputs, test.labels)
+        for form, outputs in predicted.items()
+    }
+    found |= {f"mae_{form}": one.all.mae for form, one in errors.items()}
+    return TrainedModel(
+        network=task.network,
+        samples=task.samples,
+        seed=task.seed,
+        parameters=architecture.parameters,
+        multiply_accumulates=architecture.multiply_accumulates,
+        mae_raw=float(np.abs(test.error_m).mean()),
+        float_errors=errors["float"],
+        int8_errors=errors["int8"],
+        seconds=seconds,
+        samples_per_s=len(train) * options.epochs / max(seconds, 1e-9),
+        **found,
+    )
 
 
 def calibrate(
@@ -279,18 +257,14 @@ def baselines_of(train: Dataset, test: Dataset) -> tuple[Baseline, ...]:
             name=name, errors=ErrorsByCondition.of(test.error_m, test.error_m - predicted, test.labels)
         )
 
-    rows = [
-        row("los_median", baselines.los_median(train)(test)),
-        row("overall_median", baselines.overall_median(train)(test)),
-    ]
-    if not all(np.isfinite(part.rx_power_dbm - part.first_path_power_dbm).any() for part in (train, test)):
-        return (*rows, Baseline(name="line", errors=None, reason="the data has no received power"))
-    line = lad.fit_prior(train.configurations, train.rx_power_dbm, train.first_path_power_dbm, train.error_m)
+    medians = {"los_median": baselines.los_median, "overall_median": baselines.overall_median}
+    rows = [row(name, fit(train)(test)) for name, fit in medians.items()]
+    line, reason = LinePrior(0.0), "the data has no received power"
+    if all(np.isfinite(part.rx_power_dbm - part.first_path_power_dbm).any() for part in (train, test)):
+        line, reason = fit_line(train), "too few configurations, or powers that are all alike"
     if not line.needs_power:
-        reason = "too few configurations, or powers that are all alike"
         return (*rows, Baseline(name="line", errors=None, reason=reason))
-    predicted = line.predict_m(test.rx_power_dbm, test.first_path_power_dbm)
-    return (*rows, row("line", np.nan_to_num(predicted)))
+    return (*rows, row("line", np.nan_to_num(prior_m(line, test))))
 
 
 def describe(name: str, architecture: Architecture, parts: Parts, options: FitOptions) -> Card:

@@ -7,17 +7,14 @@ import io
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.errors import MissingDependencyError, UwbMitigationError
+from uwb_mitigation.errors import MissingDependencyError
 from uwb_mitigation.measurement import SAMPLE_PERIOD_S
-from uwb_mitigation.paper.learning_rate import RangeTest
 from uwb_mitigation.paper.results import Box, Spread
-from uwb_mitigation.paper.search import Trial, front
 from uwb_mitigation.preprocessing import WINDOW_LEAD
 
 try:
@@ -191,45 +188,6 @@ def over_k(
                     fontsize=9,
                 )
         return _svg(figure)
-
-
-def draw_front(trials: Sequence[Trial], path: Path) -> None:
-    """Write a PNG of MAE over multiply-accumulates, with the Pareto front."""
-    figure, axes = _axes("multiply-accumulates of one inference", "validation MAE (m)")
-    measured = [trial for trial in trials if trial.mae_m is not None]
-    axes.scatter([t.multiply_accumulates for t in measured], [t.mae_m for t in measured], s=14, color="0.65")
-    best = front(trials)
-    axes.plot([t.multiply_accumulates for t in best], [t.mae_m for t in best], "o-", label="front")
-    for trial in best:
-        shape = trial.architecture
-        name = f"K{shape.samples} N{shape.modules} F{shape.filters}"
-        axes.annotate(name, (trial.multiply_accumulates, trial.mae_m), fontsize=7)
-    _save(figure, axes, path)
-
-
-def draw_range_test(result: RangeTest, path: Path) -> None:
-    """Write a PNG of the smoothed loss over the learning rate."""
-    figure, axes = _axes("learning rate", "training MAE (m), smoothed")
-    axes.plot(result.rates, result.losses_m)
-    axes.axvline(result.suggested, color="C2", linestyle="--", label=f"steepest: {result.suggested:.1e}")
-    axes.axvline(result.highest, color="C3", linestyle=":", label=f"least loss: {result.highest:.1e}")
-    _save(figure, axes, path)
-
-
-def _axes(across: str, up: str) -> tuple[Figure, Any]:
-    figure = Figure(figsize=(6.4, 4.0), dpi=150, layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
-    axes.set(xscale="log", xlabel=across, ylabel=up)
-    return figure, axes
-
-
-def _save(figure: Figure, axes: Any, path: Path) -> None:
-    axes.legend()
-    try:
-        figure.savefig(path, format="png")
-    except OSError as error:
-        raise UwbMitigationError(f"cannot be written: {error.strerror}", where=str(path)) from error
 
 
 def _svg(figure: Figure) -> str:

@@ -41,19 +41,32 @@ def run_jobs(
     """
     if workers < 1:
         raise ParameterError(f"{workers} workers", valid="1 or more")
-    results = _read(journal, mark)
+    results: dict[str, dict[str, Any]] = {}
+    try:
+        lines = journal.read_text(encoding="utf-8", errors="replace").splitlines() if journal.exists() else []
+        stream = journal.open("a", encoding="utf-8")
+    except OSError as error:
+        raise UwbMitigationError(f"cannot be used: {error.strerror}", where=str(journal)) from error
+    for line in lines:
+        with contextlib.suppress(ValueError, TypeError, KeyError):  # empty or incomplete line
+            entry = json.loads(line)
+            if entry["mark"] == mark and entry["name"] in jobs:
+                results[entry["name"]] = dict(entry["result"])
     missing = sorted((name for name in jobs if name not in results), key=lambda name: -cost(jobs[name]))
     total = sum(map(cost, jobs.values())) or 1.0
 
     def finish(name: str, result: dict[str, Any]) -> None:
         results[name] = result
-        _append(journal, {"mark": mark, "name": name, "result": result})
-        on_progress(sum(cost(job) for name, job in jobs.items() if name in results) / total)
+        # The line before may be incomplete, if its process was killed.
+        stream.write(f"\n{json.dumps({'mark': mark, 'name': name, 'result': result})}\n")
+        stream.flush()
+        on_progress(sum(cost(jobs[done]) for done in results) / total)
 
-    if workers == 1 or len(missing) < 2:
-        for name in missing:
-            finish(name, work(jobs[name]))
-    else:
+    with stream:
+        if workers == 1 or len(missing) < 2:
+            for name in missing:
+                finish(name, work(jobs[name]))
+            return {name: results[name] for name in jobs}
         # Not forked: a forked child would inherit torch's thread pools in an undefined state.
         context = multiprocessing.get_context("spawn")
         with ProcessPoolExecutor(min(workers, len(missing)), context) as pool:
@@ -71,26 +84,3 @@ def run_jobs(
                     process.terminate()
                 raise
     return {name: results[name] for name in jobs}
-
-
-def _append(journal: Path, entry: dict[str, Any]) -> None:
-    try:
-        with journal.open("a", encoding="utf-8") as stream:
-            # The line before may be incomplete, if its process was killed.
-            stream.write(f"\n{json.dumps(entry)}\n")
-    except OSError as error:
-        raise UwbMitigationError(f"cannot be written: {error.strerror}", where=str(journal)) from error
-
-
-def _read(journal: Path, mark: int) -> dict[str, dict[str, Any]]:
-    try:
-        lines = journal.read_text(encoding="utf-8", errors="replace").splitlines() if journal.exists() else []
-    except OSError as error:
-        raise UwbMitigationError(f"cannot be read: {error.strerror}", where=str(journal)) from error
-    found = {}
-    for line in lines:
-        with contextlib.suppress(ValueError, TypeError, KeyError):  # empty or incomplete line
-            entry = json.loads(line)
-            if entry["mark"] == mark:
-                found[str(entry["name"])] = dict(entry["result"])
-    return found

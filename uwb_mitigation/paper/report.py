@@ -14,16 +14,14 @@ from numpy.typing import NDArray
 from uwb_mitigation.evaluation.dataset import Dataset
 from uwb_mitigation.evaluation.page import rendered
 from uwb_mitigation.paper import figures, published, tables
+from uwb_mitigation.paper.data import TEST_ROOM
 from uwb_mitigation.paper.results import Box, ExperimentResults, FirmwareRow, PartErrors, Spread
 from uwb_mitigation.paper.rooms import ROOM_ROWS, ROOMS, has_rooms, parse_configuration
 from uwb_mitigation.paper.tables import Cell, Provenance, Table
 
-STEPS = 4
-"""Number of calls of `on_step`."""
-
-_ALL = "none: all measurements"
-_TEST_ROOM = "medium room"
 LOS = "LOS"
+MAX_SAMPLES = 3
+"""Number of conditions that Fig. 3 shows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +109,7 @@ class Study:
         return _map(self.dataset.configurations, _material) if self.has_rooms else self.labels
 
     def provenance(self, seeds: str = "none") -> Provenance:
-        return Provenance(self.name, _ALL, seeds, self.command)
+        return Provenance(self.name, "none: all measurements", seeds, self.command)
 
 
 def _map(names: NDArray[np.str_], shown: Callable[[str], str]) -> NDArray[np.str_]:
@@ -125,20 +123,16 @@ def _material(configuration: str) -> str:
 
 
 def build(
-    study: Study,
-    trainings: ExperimentResults | None = None,
-    firmware: Sequence[FirmwareRow] = (),
-    on_step: Callable[[], None] = lambda: None,
+    study: Study, trainings: ExperimentResults | None = None, firmware: Sequence[FirmwareRow] = ()
 ) -> Report:
     """Return every table and figure that the data, the trainings and the firmware results allow."""
     train = f"uwb-mitigation paper protocol --data {shlex.quote(str(study.path))} -o models"
     bench = "python -m benchmarks firmware --json firmware.json"
     lacking: dict[str, str] = {}
-    shown, pictures = [_data_table(study)], [_samples(study)]
-    on_step()
-    for letter in "ab":
-        pictures.append(_components(study, letter))
-        on_step()
+    shown, pictures = (
+        [_data_table(study)],
+        [_samples(study), *(_components(study, letter) for letter in "ab")],
+    )
     if trainings is None:
         lacking["Tables 1 and 2, Fig. 5"] = train
     else:
@@ -154,13 +148,10 @@ def build(
         pictures.append(_over_k(trainings, trained))
     if firmware:
         random = "fixed, of the windows and of random weights; the cost depends on neither"
-        emulated = Provenance(
-            "windows that test every rounding", "none: no accuracy is measured", random, bench
-        )
-        shown.append(tables.firmware(firmware, emulated, bench))
+        windows, split = "windows that test every rounding", "none: no accuracy is measured"
+        shown.append(tables.firmware(firmware, Provenance(windows, split, random, bench), bench))
     else:
         lacking["Table 3"] = bench
-    on_step()
     notices = _notices(study, trainings)
     return Report(study.name, study.simulated, study.command, lacking, notices, tuple(shown), tuple(pictures))
 
@@ -198,13 +189,17 @@ def _data_table(study: Study) -> Table:
 
     def row(name: str, chosen: NDArray[np.bool_], published_rows: int | None = None) -> tuple[Cell, ...]:
         part = PartErrors.of(study.dataset.error_m[chosen], study.dataset.error_m[chosen])
-        paper = (published.RAW_MAE_M, published.RAW_SIGMA_M) if name == _TEST_ROOM else (None, None)
+        is_test_room = name == ROOMS[TEST_ROOM]
         return (
             Cell(name, "head"),
             tables.number(published_rows, "{:,}", "paper"),
-            *(tables.number(value, "{:.4f}", "paper") for value in paper),
+            *tables.numbers(
+                (published.RAW_MAE_M, published.RAW_SIGMA_M) if is_test_room else (None, None),
+                "{:.4f}",
+                "paper",
+            ),
             tables.number(part.n, "{:,}", "measured"),
-            *(tables.number(value, "{:.4f}", "measured") for value in (part.mae_raw, part.sigma_raw)),
+            *tables.numbers((part.mae_raw, part.sigma_raw), "{:.4f}", "measured"),
         )
 
     rows = []
@@ -226,14 +221,12 @@ def _data_table(study: Study) -> Table:
     )
 
 
-def _samples(study: Study, most: int = 3) -> Picture:
+def _samples(study: Study) -> Picture:
     labels, errors = study.labels, study.dataset.error_m
-    names, counts = np.unique(labels, return_counts=True)
-    order = sorted(
-        zip(names.tolist(), counts.tolist(), strict=True), key=lambda pair: (pair[0] != LOS, -pair[1])
-    )
+    # LOS first, then the most frequent conditions.
+    names = sorted(np.unique(labels).tolist(), key=lambda name: (name != LOS, -(labels == name).sum()))
     chosen = []
-    for name, _ in order[:most]:
+    for name in names[:MAX_SAMPLES]:
         rows = np.flatnonzero(labels == name)
         median = rows[np.argsort(errors[rows], kind="stable")[(len(rows) - 1) // 2]]
         chosen.append((name, float(errors[median]), study.dataset.inputs[median]))

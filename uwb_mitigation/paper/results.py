@@ -1,11 +1,11 @@
-"""Result files: `protocol.json` of the experiment and the JSON result of `bench firmware`. One schema writes and reads them."""
+"""Result files: `protocol.json` of the experiment and the JSON result of `benchmarks firmware`. One schema writes and reads them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,10 +14,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from uwb_mitigation.errors import DatasetError, UwbMitigationError
 from uwb_mitigation.files import read_bounded
 
-RESULTS = "protocol.json"
-MAX_BYTES = 64 * 2**20
+RESULTS, MAX_BYTES = "protocol.json", 64 * 2**20
 FORMS = ("float", "optimised", "int8")
-"""Of a trained network, in the order of the paper's columns."""
+"""Forms of a trained network, in the order of the paper's columns."""
 
 Count = Annotated[int, Field(ge=0)]
 Number = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -30,11 +29,9 @@ class _Entry(BaseModel):
 
 
 class PartErrors(_Entry):
-    """Errors on a part of the test data, m. If `n` is 0, everything else is None.
+    """Errors on a part of the test data, m: MAE, standard deviation and quantiles before (`raw`) and after correction.
 
-    Attributes:
-        mae_raw, sigma_raw, box_raw: mean absolute error, standard deviation and quantiles before correction.
-        mae, sigma, box: after correction.
+    If `n` is 0, everything else is None.
     """
 
     n: Count
@@ -47,31 +44,23 @@ class PartErrors(_Entry):
 
     @classmethod
     def of(cls, raw_m: NDArray[np.floating], left_m: NDArray[np.floating]) -> PartErrors:
-        """Return the statistics of errors (n,) before and after correction."""
+        """Return the statistics of errors, shape (n,), before and after correction."""
         if len(raw_m) == 0:
             return cls(n=0)
-        mae, sigma, box = zip(
-            *((np.abs(e).mean(), np.std(e), quantiles(e)) for e in (raw_m, left_m)), strict=True
-        )
-        return cls(
-            n=len(raw_m),
-            mae_raw=mae[0],
-            sigma_raw=sigma[0],
-            box_raw=box[0],
-            mae=mae[1],
-            sigma=sigma[1],
-            box=box[1],
-        )
-
-
-def quantiles(error_m: NDArray[np.floating]) -> Box:
-    """Return the `Box` of errors (n,), n at least 1."""
-    low, first, median, third, high = (float(v) for v in np.percentile(error_m, (5, 25, 50, 75, 95)))
-    return low, first, median, third, high
+        found: dict[str, Any] = {
+            f"{name}{suffix}": value
+            for suffix, error in (("_raw", raw_m), ("", left_m))
+            for name, value in (
+                ("mae", np.abs(error).mean()),
+                ("sigma", np.std(error)),
+                ("box", tuple(np.percentile(error, (5, 25, 50, 75, 95)).tolist())),
+            )
+        }
+        return cls(n=len(raw_m), **found)
 
 
 class ErrorsByCondition(_Entry):
-    """Errors on the test part, on its LOS part and on its NLOS part."""
+    """Errors on the test part, on its LOS part and on its NLOS part; rows without a label count in `all` only."""
 
     all: PartErrors
     los: PartErrors
@@ -81,7 +70,7 @@ class ErrorsByCondition(_Entry):
     def of(
         cls, error_m: NDArray[np.floating], left_m: NDArray[np.floating], labels: NDArray[np.str_]
     ) -> ErrorsByCondition:
-        """Return the statistics of errors (n,) before and after correction; rows without a label count in `all` only."""
+        """Return the statistics of errors, shape (n,), before and after correction."""
         los = labels == "LOS"
         parts = {"all": np.ones(len(labels), np.bool_), "los": los, "nlos": ~los & (labels != "")}
         return cls(**{name: PartErrors.of(error_m[rows], left_m[rows]) for name, rows in parts.items()})
@@ -91,11 +80,8 @@ class TrainedModel(_Entry):
     """One network, trained with one seed. None where a network has no such form.
 
     Attributes:
-        network, samples, seed: which; `samples` is the window length K.
-        parameters, multiply_accumulates: of one inference.
-        mae_float, mae_optimised, mae_int8: on the test part, m (Table 1).
-        bytes_float, bytes_optimised, bytes_int8: file sizes (Table 2).
-        float_errors, int8_errors: on the test part (Fig. 5).
+        samples: window length K.
+        mae_*: on the test part, m (Table 1). bytes_*: file sizes (Table 2). *_errors: on the test part (Fig. 5).
         calibration_mae: {calibration: MAE of int8 on the training part, m}; `calibration` is the chosen one.
         seconds: training time; `samples_per_s` during it.
     """
@@ -119,29 +105,18 @@ class TrainedModel(_Entry):
     seconds: Number
     samples_per_s: Number
 
-    @property
-    def mae_m(self) -> tuple[float | None, ...]:
-        """Of each of `FORMS`."""
-        return self.mae_float, self.mae_optimised, self.mae_int8
-
-    @property
-    def size_bytes(self) -> tuple[int | None, ...]:
-        """Of each of `FORMS`."""
-        return self.bytes_float, self.bytes_optimised, self.bytes_int8
+    def by_form(self, kind: str) -> list[float | None]:
+        """`mae` or `bytes` of each of `FORMS`."""
+        return [getattr(self, f"{kind}_{form}") for form in FORMS]
 
     @property
     def left(self) -> ErrorsByCondition:
-        """Of int8 if the network has this form, otherwise of float."""
+        """Errors of int8 if the network has this form, otherwise of float."""
         return self.int8_errors or self.float_errors
 
 
 class Baseline(_Entry):
-    """A correction without a network, on the same split.
-
-    Attributes:
-        name: `los_median`, `overall_median` (of the training errors) or `line` (`evaluation.lad`).
-        errors: on the test part; None if the data does not allow this baseline, for this `reason`.
-    """
+    """A correction without a network, on the same split; `errors` is None if the data does not allow it, for this `reason`."""
 
     name: str
     errors: ErrorsByCondition | None
@@ -160,12 +135,7 @@ class Settings(_Entry):
 
 
 class ExperimentResults(_Entry):
-    """Results of the paper's experiment, with the description of data, split and command.
-
-    Attributes:
-        train, test: number of measurements in each part.
-        options: of every fit, except for the seed.
-    """
+    """Results of the paper's experiment; `train` and `test` are the numbers of measurements, `options` those of every fit."""
 
     data: str
     split: str
@@ -183,14 +153,12 @@ class ExperimentResults(_Entry):
 
 
 class FirmwareRow(_Entry):
-    """One network on an emulated Cortex-M4; cycles, rate and energy are estimates, the rest is measured.
+    """One network on an emulated Cortex-M4; rate (64 MHz, no wait states) and energy are estimates, the rest is measured.
 
     Attributes:
-        network, samples, first_kernel, kernels: which; `first_kernel` is 0 for an MLP.
-        instructions: of one inference.
-        rate_hz: at 64 MHz without wait states.
+        first_kernel: 0 for an MLP.
         energy_mj: at the paper's power; None if the paper has no such network.
-        mismatches, inputs: number of outputs that differ from ONNX Runtime's, and of inputs.
+        mismatches: number of outputs that differ from ONNX Runtime's.
     """
 
     network: str = Field(validation_alias="model")
@@ -207,7 +175,7 @@ class FirmwareRow(_Entry):
 
 
 class FirmwareResults(_Entry):
-    """The JSON result of `bench firmware`."""
+    """The JSON result of `benchmarks firmware`."""
 
     rows: tuple[FirmwareRow, ...]
 
@@ -222,7 +190,9 @@ def read(kind: type[Entry], path: Path) -> Entry:
         UwbMitigationError: it cannot be read, is empty or too large.
         DatasetError: it is not such a file; `what` contains the entry.
     """
-    data = read_bounded(path, MAX_BYTES, UwbMitigationError, "output of `paper protocol` or `bench firmware`")
+    data = read_bounded(
+        path, MAX_BYTES, UwbMitigationError, "output of `paper protocol` or `benchmarks firmware`"
+    )
     try:
         return kind.model_validate_json(data)
     except ValidationError as error:
@@ -233,7 +203,7 @@ def read(kind: type[Entry], path: Path) -> Entry:
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """Mean and standard deviation over seeds; the latter is None for a single seed."""
+    """Mean and standard deviation (n - 1) over seeds; the latter is None for a single seed."""
 
     mean: float
     std: float | None
@@ -245,6 +215,5 @@ class Spread:
         known = [value for value in values if value is not None]
         if not known:
             return None
-        # Seeds are a sample of all seeds, hence n - 1.
         std = float(np.std(known, ddof=1)) if len(known) > 1 else None
         return cls(float(np.mean(known)), std, len(known))

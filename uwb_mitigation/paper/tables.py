@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from uwb_mitigation.model.architecture import Mlp, Remnet
@@ -12,7 +12,6 @@ from uwb_mitigation.paper.results import FORMS, ExperimentResults, FirmwareRow, 
 NAMES = {
     "remnet": "REMNet",
     "remnet_k5": "REMNet, k0 = 5",
-    "remnet_attention": "REMNet with attention",
     "mlp": "MLP",
     "raw": "No correction",
     "los_median": "Median error in LOS",
@@ -22,6 +21,8 @@ NAMES = {
     "portable": "portable C",
 }
 """{name in result files: name for people}."""
+
+_ROWS = [*(("remnet", samples) for samples in published.WINDOWS), ("mlp", max(published.WINDOWS))]
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,27 +87,29 @@ def number(value: float | None, form: str, kind: str, otherwise: Cell = NONE) ->
     return otherwise if value is None else Cell(form.format(value), kind, value)
 
 
+def numbers(values: Iterable[float | None], form: str, kind: str) -> list[Cell]:
+    """Return `number` of each value."""
+    return [number(value, form, kind) for value in values]
+
+
 def accuracy(trainings: ExperimentResults, provenance: Provenance, missing: str, measured: str) -> Table:
     """Return Table 1, MAE before and after graph optimisation and quantisation; `measured` heads our columns."""
     rows = []
-    for network, samples, models, printed in _networks(trainings):
-        paper = [printed.parameters, *printed.mae_m] if printed else [None] * 4
-        rows.append(
-            (
-                *_heads(network, samples),
-                number(paper[0], "{:.0f}", "paper"),
-                *(number(mae, "{:.4f}", "paper") for mae in paper[1:]),
-                _parameters(network, samples, models),
-                *(_seeds(models, [model.mae_m[form] for model in models], 4) for form in range(len(FORMS))),
-            )
-        )
+    for heads, parameters, models, printed in _networks(trainings):
+        paper = [NONE] * 4
+        if printed:
+            paper = [
+                number(printed.parameters, "{:.0f}", "paper"),
+                *numbers(printed.mae_m, "{:.4f}", "paper"),
+            ]
+        rows.append((*heads, *paper, parameters, *_forms(models, "mae", 1.0, 4)))
     known = {baseline.name: baseline for baseline in trainings.baselines}
     left = {name: b.errors.all.mae if b.errors else None for name, b in known.items()}
     left["raw"] = trainings.models[0].mae_raw if trainings.models else None
     for name in dict.fromkeys(["raw", "los_median", "overall_median", "line", *known]):
         cell = number(left[name], "{:.4f}", "measured") if name in left else MISSING
         head = Cell(NAMES.get(name, name), "head"), Cell("–", "head")
-        rows.append((*head, NONE, NONE, NONE, NONE, NONE, cell, NONE, NONE))
+        rows.append((*head, *[NONE] * 5, cell, NONE, NONE))
     reasons = [f" {NAMES.get(name, name)}: {b.reason}." for name, b in known.items() if b.reason]
     return Table(
         "table1",
@@ -126,16 +129,9 @@ def accuracy(trainings: ExperimentResults, provenance: Provenance, missing: str,
 def sizes(trainings: ExperimentResults, provenance: Provenance, missing: str) -> Table:
     """Return Table 2, file sizes."""
     rows = []
-    for network, samples, models, printed in _networks(trainings):
-        kilobytes = [[size and size / 1000 for size in model.size_bytes] for model in models]
-        rows.append(
-            (
-                *_heads(network, samples),
-                _parameters(network, samples, models),
-                *(number(size, "{:.3f}", "paper") for size in (printed.size_kb if printed else [None] * 3)),
-                *(_seeds(models, [sizes[form] for sizes in kilobytes], 3) for form in range(len(FORMS))),
-            )
-        )
+    for heads, parameters, models, printed in _networks(trainings):
+        paper = numbers(printed.size_kb if printed else [None] * 3, "{:.3f}", "paper")
+        rows.append((*heads, parameters, *paper, *_forms(models, "bytes", 1000.0, 3)))
     return Table(
         "table2",
         "Table 2. Size for each length of the CIR, before and after optimisation",
@@ -158,31 +154,23 @@ def firmware(bench: Sequence[FirmwareRow], provenance: Provenance, missing: str)
         network, samples, first_kernel, kernels = key
         printed, row = published.MODELS.get((network, samples)), found.get(key)
         name = NAMES.get(network, network) + (f", k0 = {first_kernel}" if first_kernel not in (0, 3) else "")
-        paper = (
-            (printed.rate_hz, printed.supply_v, printed.current_ma, printed.power_mw, printed.energy_mj)
-            if printed
-            else [None] * 5
-        )
+        paper = [NONE] * 5
+        if printed:
+            paper = [
+                *numbers(printed.board[:4], "{:.1f}", "paper"),
+                number(printed.board[4], "{:g}", "paper"),
+            ]
         own = [MISSING, MISSING if printed else NONE, *[MISSING] * 4]
         if row is not None:
             own = [
                 number(row.rate_hz, "≈ {:.1f}", "estimated"),
                 number(row.energy_mj, "≈ {:.3f}", "estimated"),
                 number(row.instructions, "{:,.0f}", "measured"),
-                number(row.ram_bytes / 1000, "{:.1f}", "measured"),
-                number(row.flash_bytes / 1000, "{:.1f}", "measured"),
+                *numbers((row.ram_bytes / 1000, row.flash_bytes / 1000), "{:.1f}", "measured"),
                 Cell(f"{row.mismatches} of {row.inputs:,}", "measured", row.mismatches, n=row.inputs),
             ]
-        forms = ("{:.1f}", "{:.1f}", "{:.1f}", "{:.1f}", "{:g}")
-        rows.append(
-            (
-                Cell(name, "head"),
-                Cell(str(samples), "head"),
-                Cell(NAMES.get(kernels, kernels), "head"),
-                *(number(value, form, "paper") for value, form in zip(paper, forms, strict=True)),
-                *own,
-            )
-        )
+        heads = [Cell(text, "head") for text in (name, str(samples), NAMES.get(kernels, kernels))]
+        rows.append((*heads, *paper, *own))
     return Table(
         "table3",
         "Table 3. Real-time performance on the microcontroller",
@@ -201,31 +189,35 @@ def firmware(bench: Sequence[FirmwareRow], provenance: Provenance, missing: str)
     )
 
 
-_ROWS = [*(("remnet", samples) for samples in published.WINDOWS), ("mlp", max(published.WINDOWS))]
-_Row = tuple[str, int, tuple[TrainedModel, ...], "published.PaperModel | None"]
+_Row = tuple[list[Cell], Cell, tuple[TrainedModel, ...], "published.PaperModel | None"]
 
 
 def _networks(trainings: ExperimentResults) -> list[_Row]:
-    """The paper's networks, and all others that were trained."""
-    keys = dict.fromkeys([*_ROWS, *((model.network, model.samples) for model in trainings.models)])
-    return [(*key, trainings.of(*key), published.MODELS.get(key)) for key in keys]
+    """Heads, parameters, models and printed values of the paper's networks and of all others that were trained."""
+    rows = []
+    for network, samples in dict.fromkeys(
+        [*_ROWS, *((one.network, one.samples) for one in trainings.models)]
+    ):
+        models = trainings.of(network, samples)
+        heads = [Cell(NAMES.get(network, network), "head"), Cell(str(samples), "head")]
+        # Counting parameters needs no training.
+        shape = Mlp if network == "mlp" else Remnet
+        count = models[0].parameters if models else shape(samples).parameters
+        printed = published.MODELS.get((network, samples))
+        rows.append((heads, number(count, "{}", "measured"), models, printed))
+    return rows
 
 
-def _heads(network: str, samples: int) -> tuple[Cell, Cell]:
-    return Cell(NAMES.get(network, network), "head"), Cell(str(samples), "head")
-
-
-def _parameters(network: str, samples: int, models: Sequence[TrainedModel]) -> Cell:
-    """Of the trained network, otherwise of the architecture: counting needs no training."""
-    shape = Mlp if network == "mlp" else Remnet
-    return number(models[0].parameters if models else shape(samples).parameters, "{}", "measured")
-
-
-def _seeds(models: Sequence[TrainedModel], values: list[float | None], digits: int) -> Cell:
-    spread = Spread.of(values)
-    if spread is None:
-        return NONE if models else MISSING
-    text = f"{spread.mean:.{digits}f}"
-    if spread.std and float(around := f"{spread.std:.{digits}f}"):
-        text += f" ± {around}"
-    return Cell(text, "measured", spread.mean, spread.std, spread.n)
+def _forms(models: Sequence[TrainedModel], kind: str, unit: float, digits: int) -> list[Cell]:
+    """Mean and standard deviation over seeds of each form."""
+    cells = []
+    for values in zip(*(model.by_form(kind) for model in models), strict=True):
+        spread = Spread.of([None if value is None else value / unit for value in values])
+        if spread is None:
+            cells.append(NONE)
+            continue
+        text = f"{spread.mean:.{digits}f}"
+        if spread.std and float(around := f"{spread.std:.{digits}f}"):
+            text += f" ± {around}"
+        cells.append(Cell(text, "measured", spread.mean, spread.std, spread.n))
+    return cells or [MISSING] * len(FORMS)

@@ -9,9 +9,6 @@ from torch.nn import functional
 from uwb_mitigation.model.architecture import HEAD, Architecture, Convolution, Mlp, Remnet
 from uwb_mitigation.model.weights import FloatWeights
 
-ATTENTION_REDUCTION = 8
-"""Channels to hidden units of squeeze and excitation: 82 parameters a module at F = 16."""
-
 
 class SameConvolution(nn.Module):
     """A convolution with 'same' padding as TensorFlow's, and its ReLU: (n, L, C) to (n, ceil(L/s), F).
@@ -37,40 +34,15 @@ class SameConvolution(nn.Module):
         return functional.relu(functional.linear(torch.cat(taps, 2), weight, self.bias))
 
 
-class SqueezeExcitation(nn.Module):
-    """Channel attention (Hu et al. 2018) on (n, L, F): weighs each channel by what all of them average."""
-
-    def __init__(self, filters: int) -> None:
-        super().__init__()
-        hidden = max(filters // ATTENTION_REDUCTION, 1)
-        self.squeeze, self.excite = nn.Linear(filters, hidden), nn.Linear(hidden, filters)
-        for layer in (self.squeeze, self.excite):
-            nn.init.xavier_uniform_(layer.weight)
-            nn.init.zeros_(layer.bias)
-
-    def forward(self, values: Tensor) -> Tensor:
-        weight = torch.sigmoid(self.excite(functional.relu(self.squeeze(values.mean(1)))))
-        return values * weight[:, None, :]
-
-
 class RemnetModule(nn.Module):
-    """The network of `Remnet`: (n, K) to (n,).
+    """The network of `Remnet`: (n, K) to (n,); `dropout`: share of the head's inputs that are dropped."""
 
-    Args:
-        dropout: share of the head's inputs that are dropped.
-        attention: weigh each residual by squeeze and excitation, as the original network does (Angarano et
-            al. 2021); such a network is for comparison and cannot be exported.
-    """
-
-    def __init__(self, architecture: Remnet, dropout: float, *, attention: bool = False) -> None:
+    def __init__(self, architecture: Remnet, dropout: float) -> None:
         super().__init__()
         self.architecture = architecture
         # Module names hold no dots.
         self.layers = nn.ModuleDict(
             {_key(layer.name): SameConvolution(layer) for layer in architecture.convolutions}
-        )
-        self.attention = nn.ModuleList(
-            SqueezeExcitation(architecture.filters) for _ in range(architecture.modules if attention else 0)
         )
         self.dropout = nn.Dropout(dropout)
         self.head = _head(architecture.features)
@@ -79,10 +51,7 @@ class RemnetModule(nn.Module):
         values = self.layers["first"](inputs[:, :, None])
         for module in range(1, self.architecture.modules + 1):
             prefix = f"module{module}"
-            residual = self.layers[_key(f"{prefix}.residual")](values)
-            if self.attention:
-                residual = self.attention[module - 1](residual)
-            summed = residual + values
+            summed = self.layers[_key(f"{prefix}.residual")](values) + values
             values = self.layers[_key(f"{prefix}.reduce")](summed)
             values = values + self.layers[_key(f"{prefix}.skip")](summed)
         output: Tensor = self.head(self.dropout(values.transpose(1, 2).flatten(1)))[:, 0]
@@ -138,7 +107,7 @@ def build(architecture: Architecture, dropout: float, start: FloatWeights | None
 
 
 def weights_of(network: Network) -> FloatWeights:
-    """A copy of the parameters; of a REMNet without attention only."""
+    """A copy of the parameters."""
     weight, bias = {}, {}
     for name, layer in network.by_name().items():
         values = layer.weight.detach().numpy()

@@ -23,9 +23,6 @@ COLD_START_MUST_GAIN = 0.10
 NESTED = "chosen (nested)"
 """Row of the errors of the selection itself, on configurations that neither a fit nor the selection has seen."""
 
-CURVE_DRAWS, CURVE_SHARES, CURVE_MIN_POINTS = 8, (0.3, 0.5, 0.75, 1.0), 3
-"""Of the learning curve: draws, shares of the configurations, and points that are needed to extrapolate it."""
-
 SEGMENT_FOLDS, ANCHOR_FOLDS = 4, 2
 """Of a site's data: folds over segments of the track, and over anchors."""
 
@@ -41,14 +38,12 @@ class Selection:
         errors: {candidate, `raw` or NESTED: held-out errors}, m. Of a site, those on held-out segments, shape (n,), are
             followed by those on held-out anchors.
         model: the candidate, fitted to all of the data.
-        curve: (number of configurations, MAE on others) of the chosen candidate; empty for a site.
         folds, seed: of the splits. configurations: the number in all of the data.
     """
 
     chosen: str
     errors: Mapping[str, NDArray[np.float64]]
     model: FittedModel
-    curve: tuple[tuple[int, float], ...] = ()
     folds: int = 0
     seed: int = 0
     configurations: int = 0
@@ -62,24 +57,7 @@ class Selection:
         return {
             "chosen": self.chosen,
             "rows": [{"name": name, "mae": mae} for name, mae in self.mae().items()],
-            "learning_curve": [{"configurations": count, "mae": mae} for count, mae in self.curve],
-            "configurations_needed": self.configurations_needed(),
         }
-
-    def configurations_needed(self, share: float = 0.95) -> int | None:
-        """The number of configurations for `share` of today's error; None if unknown, or if more do not help.
-
-        Extrapolated by MAE = a + b / n, least squares through the learning curve.
-        """
-        if len(self.curve) < CURVE_MIN_POINTS:
-            return None
-        count, mae = np.array(self.curve, float).T
-        design = np.column_stack([np.ones(len(count)), 1 / count])
-        (floor, slope), *_ = np.linalg.lstsq(design, mae, rcond=None)
-        wanted = share * (floor + slope / self.configurations)
-        if slope <= 0 or wanted <= floor:
-            return None
-        return int(np.ceil(slope / (wanted - floor)))
 
 
 def preferred(errors: Mapping[str, NDArray[np.float64]], must_gain: float = MUST_GAIN) -> str:
@@ -131,7 +109,7 @@ def select_nested(
         DatasetError, ParameterError: see `splits.by_configuration` and the fits.
     """
     inner_folds, done = max(2, folds - 2), 0
-    total = folds * len(candidates) * (1 + inner_folds) + len(_sizes(len(data.names))) * CURVE_DRAWS
+    total = folds * len(candidates) * (1 + inner_folds)
 
     def on_fit() -> None:
         nonlocal done
@@ -155,9 +133,7 @@ def select_nested(
         if preferred({fallback: errors[fallback], chosen: errors[NESTED]}, must_gain) == fallback:
             chosen = fallback
     (candidate,) = (item for item in candidates if item.name == chosen)
-    curve = _learning_curve(data, candidate, seed, on_fit)
-    model = candidate.fit(data, seed)
-    return Selection(chosen, errors, model, curve, folds, seed, len(data.names))
+    return Selection(chosen, errors, candidate.fit(data, seed), folds, seed, len(data.names))
 
 
 def min_configurations(folds: int) -> int:
@@ -213,29 +189,3 @@ def _folds(groups: NDArray[np.str_], folds: int, seed: int) -> list[Split]:
     """At most `folds` folds over groups, shape (n,); none of a single group."""
     count = min(folds, len(np.unique(groups)))
     return splits.by_configuration(groups, count, seed) if count >= 2 else []
-
-
-def _sizes(configurations: int) -> list[int]:
-    """The numbers of configurations of the points of a learning curve; a fifth is always held out."""
-    most = configurations - max(1, configurations // 5)
-    return sorted({max(2, round(share * most)) for share in CURVE_SHARES if most >= 2})
-
-
-def _learning_curve(
-    data: Dataset, candidate: Candidate, seed: int, on_fit: Callable[[], None]
-) -> tuple[tuple[int, float], ...]:
-    names = np.array(data.names)
-    sizes = _sizes(len(names))
-    if not sizes:
-        raise DatasetError(f"{len(names)} configurations have no learning curve", valid="3 or more")
-    generator = np.random.default_rng(seed)
-    found: dict[int, list[float]] = {size: [] for size in sizes}
-    for _ in range(CURVE_DRAWS):
-        order = generator.permutation(names)
-        # The same configurations are held out for every size, so that the sizes compare.
-        test = np.flatnonzero(np.isin(data.configurations, order[sizes[-1] :]))
-        for size in sizes:
-            fold = Split(np.flatnonzero(np.isin(data.configurations, order[:size])), test)
-            errors = held_out_errors(data, [candidate], [fold], seed, on_fit)[candidate.name]
-            found[size].append(float(np.abs(errors[test]).mean()))
-    return tuple((size, float(np.mean(maes))) for size, maes in found.items())

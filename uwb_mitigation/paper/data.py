@@ -1,4 +1,4 @@
-"""A recording as the training and the test part of an experiment."""
+"""The data of an experiment: splits of a recording into a training and a test part, and shorter windows."""
 
 from __future__ import annotations
 
@@ -8,14 +8,51 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.errors import DatasetError, ParameterError
+from uwb_mitigation.evaluation import splits
 from uwb_mitigation.evaluation.dataset import Dataset, build_dataset
-from uwb_mitigation.paper import rooms
+from uwb_mitigation.evaluation.splits import Split
 from uwb_mitigation.paper.deepuwb import DeepUwbRecording
+from uwb_mitigation.paper.rooms import has_rooms, parse_configuration
 from uwb_mitigation.preprocessing import Preprocessing, Scaling
 from uwb_mitigation.sources.opening import open_recording
 from uwb_mitigation.sources.source import Source
+
+AUTO, PAPER, CONFIGURATIONS = "auto", "paper", "configurations"
+TRAINING_ROOMS = {PAPER: (1, 3), "all_but_room_2": (0, 1, 3, 4)}
+"""{split: rooms to train on}. Both are tested in the medium room. `paper` has 36,023 training and 13,210 test rows;
+`all_but_room_2` has 41,948 training rows and is used by later work."""
+
+TEST_ROOM = 2
+SPLITS = (AUTO, CONFIGURATIONS, *TRAINING_ROOMS)
+FOLDS = 4
+"""Of data without rooms; one fold is the test part."""
+
+
+def split_by_name(configurations: NDArray[np.str_], name: str) -> tuple[str, Split]:
+    """Return one of `SPLITS` and its description. AUTO is `paper` for DeepUWB, otherwise `configurations`.
+
+    Raises:
+        ParameterError: unknown split.
+        DatasetError: a part is empty, or the configurations have no rooms.
+    """
+    if name not in SPLITS:
+        raise ParameterError(f"split {name!r}", valid=", ".join(SPLITS))
+    if name == AUTO:
+        name = PAPER if has_rooms(configurations) else CONFIGURATIONS
+    if name == CONFIGURATIONS:
+        fold = splits.by_configuration(configurations, FOLDS, seed=0)[0]
+        return f"{CONFIGURATIONS}: 1 of {FOLDS} parts held out", fold
+    rooms = np.array([parse_configuration(str(one))[0] for one in configurations], np.intp)
+    train, test = np.flatnonzero(np.isin(rooms, TRAINING_ROOMS[name])), np.flatnonzero(rooms == TEST_ROOM)
+    if not (len(train) and len(test)):
+        raise DatasetError(
+            f"split {name!r}: {len(train)} training rows and {len(test)} test rows",
+            valid=f"rows of room {TEST_ROOM} and of rooms {TRAINING_ROOMS[name]}",
+        )
+    return name, Split(train, test)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,8 +89,8 @@ def load(
 
 
 def divided(name: str, dataset: Dataset, split: str) -> Parts:
-    """Return training and test part by one of `rooms.SPLITS`; raises as `split_by_name`."""
-    described, rows = rooms.split_by_name(dataset.configurations, split)
+    """Return training and test part by one of `SPLITS`; raises as `split_by_name`."""
+    described, rows = split_by_name(dataset.configurations, split)
     return Parts(name, described, dataset.rows(rows.train), dataset.rows(rows.test))
 
 
