@@ -1,8 +1,8 @@
 """Calibrate real recordings without ground truth, and compare the result with ground truth.
 
-    PYTHONPATH=. python docs/experiments/calibrate_logs.py hanyang ../shared/data/hanyang_outdoor LOS_A1
-    PYTHONPATH=. python docs/experiments/calibrate_logs.py apartment ../shared/data/evk1000_apartment
-    PYTHONPATH=. python docs/experiments/calibrate_logs.py harm ../shared/data/hanyang_outdoor
+    PYTHONPATH=. python docs/experiments/calibrate_logs.py hanyang $UWB_MITIGATION_DATA/hanyang_outdoor LOS_A1
+    PYTHONPATH=. python docs/experiments/calibrate_logs.py apartment $UWB_MITIGATION_DATA/evk1000_apartment
+    PYTHONPATH=. python docs/experiments/calibrate_logs.py harm $UWB_MITIGATION_DATA/hanyang_outdoor
 
 `hanyang` calibrates with one drive and tracks the others with and without the result. `apartment` uses the stationary tags of
 the EVK1000 logs; almost none of them received enough anchors, so they are refused. `harm` calibrates each drive and both halves

@@ -1,6 +1,6 @@
-"""Random sites: buildings small enough that every anchor hears a tag nearly everywhere, and drives through their doorways.
+"""Random sites: buildings small enough that every anchor receives a tag almost everywhere, and drives through their doorways.
 
-Beyond what `buildings` says nothing is from a source: sizes, clearances and where anchors hang are assumed.
+Sizes, clearances and positions of anchors are assumed; everything else is as in the simulated buildings.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ SITES = ("flat", "office")
 
 SIDE_M = (6.0, 20.0)
 HEARD = 0.75
-"""Each anchor hears a tag at such a share, or more, of the places where it can go."""
+"""Minimum share of the reachable positions at which each anchor receives a tag."""
 
 GOES = 0.5
-"""A tag can go to such a share of the plan, or more, through doorways."""
+"""Minimum share of the plan that a tag can reach through doorways."""
 
 BEFORE_WALL_M = 0.3
 CLEARANCE_M = 0.3
-"""Of the tag from walls and whatever stands."""
+"""Distance of the tag from walls and obstacles."""
 
 CELL_M = 0.15
 WAYPOINTS = 12
@@ -67,7 +67,7 @@ class Site:
 
 
 def draw_site(anchors: int, rng: np.random.Generator) -> Site:
-    """A random site; drawn again until it has walls, its anchors hear, and its doorways lead somewhere.
+    """Return a random site with walls, anchors that receive the tag, and doorways that connect its rooms.
 
     Args:
         anchors: how many, evenly along the outer walls.
