@@ -13,7 +13,7 @@ from uwb_mitigation.positioning.model import Model
 from uwb_mitigation.positioning.tracks import Ranges, Track
 
 IMPLAUSIBLE = 9.0
-"""Places less likely than the best by e^-9 are none: one in eight thousand."""
+"""Positions that are less likely than the best one by a factor of e^9 (eight thousand) are not plausible."""
 
 _STEPS = 40
 _STUCK = 0.01
@@ -31,12 +31,12 @@ _SECOND_NS = 1_000_000_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Place:
-    """Where ranges may come from.
+    """A candidate position.
 
     Attributes:
         position: float64 (3,), m.
         covariance: float64 (3, 3), m^2, of a tag whose ranges err independently.
-        gain: float64 (3, k), what an error of each range does to the position.
+        gain: float64 (3, k), derivative of the position with respect to each range.
         loss: minus the log likelihood, up to a constant.
     """
 
@@ -55,10 +55,10 @@ def places(
     height: Height | None = None,
     area: Area | None = None,
 ) -> list[Place]:
-    """All local optima that are plausible beside the best, the best first.
+    """Return all plausible local optima, the best first.
 
-    Starts lie on the circle (the sphere, where the height is unknown) that the shortest range draws around
-    its anchor, on that of the next one, and at the anchors' centre; each descends by Levenberg and Marquardt.
+    Levenberg-Marquardt starts on the circles (spheres, if the height is unknown) of the two shortest ranges around their
+    anchors, and at the centre of the anchors.
 
     Args:
         anchors: float64 (k, 3), m, of each range.
@@ -72,7 +72,7 @@ def places(
     x = _starts(anchors, range_m, height)
     prior = _Prior.of(len(x), height)
     x, cost, gradient, hessian = _descend(x, anchors, range_m, sd_m, model, prior)
-    # A start that got stuck on its way is no place, unless all did.
+    # A start that has not converged is no solution, unless none has.
     step = np.linalg.solve(hessian + 1e-9 * np.eye(3), gradient[..., None])[..., 0]
     arrived = np.einsum("ni,ni->n", step, gradient) < _STUCK
     if arrived.any():

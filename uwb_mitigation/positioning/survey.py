@@ -1,8 +1,7 @@
-"""Where the anchors are, from the ranges of a tag that moves among them and rough guesses.
+"""Survey of the anchors, from rough guesses and the ranges of a tag that moves among them.
 
-Track and anchors are found together. Ranges alone say nothing of where the whole lies or how it is turned: that
-comes from the guesses, or from anchors that are held. Swapped anchors are tried first: a swap is further than a
-descent from the guesses can go.
+Track and anchors are estimated together. Ranges do not determine position and orientation of the whole: these come from
+the guesses, or from fixed anchors. Swapped anchors are tried first, because Gauss-Newton does not find them from the guesses.
 """
 
 from __future__ import annotations
@@ -22,19 +21,19 @@ from uwb_mitigation.positioning.smoother import Smoothed, Smoother
 from uwb_mitigation.positioning.tracks import Heights, Ranges, Track
 
 MISPLACED_M = 0.3
-"""An anchor that far from where it should be is misplaced, if that is also `_UNLIKELY` of its deviations."""
+"""An anchor is misplaced if it is further from its guess than this and than `_UNLIKELY` standard deviations."""
 
 _UNLIKELY = 2.2
 """In a plane an error exceeds so many root mean squares once in 126 times: exp(-2.2^2)."""
 
 TAPE_M = 0.1
-"""How well a height that was measured is known."""
+"""Accuracy of a measured height."""
 
 _STEPS_M = (1.0, 0.5, 0.25, 0.0)
-"""Ranges are trusted in steps: at first a metre off is nothing strange."""
+"""Standard deviations of ranges decrease in steps, so that the first steps tolerate errors of a metre."""
 
 UNEXPLAINED = 0.6
-"""In real drives it was 0.7 and more wherever anchors were not found, and wherever a pair was called swapped that was not."""
+"""In real drives the loss was 0.7 or more if anchors were not found, or if a pair was wrongly reported as swapped."""
 
 _TRIAL_NS = 60_000_000_000
 _TRIAL_RANGES = 800
@@ -107,14 +106,14 @@ def survey(
     heights: Heights | None = None,
     model: Model | None = None,
 ) -> SurveyResult:
-    """Find the anchors.
+    """Estimate the positions of the anchors.
 
     Args:
-        guesses: where they may be.
+        guesses: approximate positions.
         ranges: of one tag that moves.
-        off_m: how far guesses may be off (standard deviation of each coordinate). With a `height`, that of
-            anchors is taken as off by no more than `TAPE_M`: a level drive hardly tells it, a tape does.
-        fixed: rows of anchors that are known as well as their own deviations say.
+        off_m: standard deviation of each coordinate of the guesses. With a `height`, that of the heights of anchors is at
+            most `TAPE_M`: a drive at constant height hardly determines them.
+        fixed: rows of anchors with the standard deviations of `guesses`.
         height, area, model: as of `TagLocator`.
         heights: measured heights of the tag.
 
