@@ -31,7 +31,6 @@ SYSTEM_ROS = (ROS_PREFIX / "setup.sh").is_file()
 # Those of jazzy/ pin the numpy, protobuf and PyYAML of Ubuntu 24.04, which ROS's compiled messages need.
 LOCKS = ROOT / "requirements" / "jazzy" if SYSTEM_ROS else ROOT / "requirements"
 TORCH = "2.13.0"
-TORCH_CPU_INDEX = "https://download.pytorch.org/whl/cpu"
 
 
 def main() -> None:
@@ -100,8 +99,8 @@ def set_up(goal: str) -> None:
     if goal == "develop":
         install("tools", "develop", "training")
         # The default index would add gigabytes of CUDA.
-        torch = ("--retries", "0", "--extra-index-url", TORCH_CPU_INDEX, f"torch=={TORCH}")
-        step("torch", [TORCH], lambda: pip("--no-deps", "--no-compile", *torch))
+        index = ("--retries", "0", "--extra-index-url", "https://download.pytorch.org/whl/cpu")
+        step("torch", [TORCH], lambda: pip("--no-deps", "--no-compile", *index, f"torch=={TORCH}"))
     if goal == "docs":
         install("documentation", "docs")
     # With PYTHONDONTWRITEBYTECODE, nodes would otherwise take twice as long to start. Templates do not compile.
