@@ -1,5 +1,4 @@
 """The link to a board: wire protocol, board session, clock estimate, and an emulated board.
 
-Everything but `emulated_board` works on bytes and times that it is handed; `docs/reference/protocol.md` is the
-protocol in words.
+Only `connection`, `port` and `emulated_board` do I/O. `docs/reference/protocol.md` describes the protocol.
 """
