@@ -15,11 +15,10 @@ import dw1000_driver as dw
 import numpy as np
 import pytest
 from compilers import NEEDS_CC
-from conftest import REPOSITORY
 from dw1000_driver import Driver, Mode, exchange, flight_ticks, pair
 
 from benchmarks.dw1000_model.air import Air, Chip
-from benchmarks.dw1000_model.library import model_folder, model_objects
+from benchmarks.dw1000_model.library import MODEL_FOLDER, model_objects
 from benchmarks.dw1000_model.links import Link, link_of
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.firmware_export.compiling import WARNINGS, c_compiler, run
@@ -355,20 +354,20 @@ def test_a_driver_may_define_any_name_without_the_models_prefix(tmp_path: Path):
         + '#include "dw1000_model.h"\nint main(void) { dw1000_air_free(dw1000_air_new(1)); return 0; }\n'
     )
     program = tmp_path / "driver"
-    options = ("-fno-builtin", f"-I{model_folder()}")
+    options = ("-fno-builtin", f"-I{MODEL_FOLDER}")
     run([*c_compiler(), *options, str(driver), *objects, "-lm", "-lpthread", "-o", str(program)])
     run([str(program)])
 
 
 def compiled(source: Path, program: Path) -> Path:
-    sources = (*model_folder().glob("*.c"), source)
-    options = ("-std=c11", "-O1", "-g", "-fsanitize=address,undefined", *WARNINGS, f"-I{model_folder()}")
+    sources = (*MODEL_FOLDER.glob("*.c"), source)
+    options = ("-std=c11", "-O1", "-g", "-fsanitize=address,undefined", *WARNINGS, f"-I{MODEL_FOLDER}")
     run([*c_compiler(), *options, *map(str, sources), "-lm", "-lpthread", "-o", str(program)])
     return program
 
 
 def test_the_pages_program_prints_what_the_page_says(tmp_path: Path):
-    page = (REPOSITORY / "firmware" / "dw1000_model" / "README.md").read_text(encoding="utf-8")
+    page = (MODEL_FOLDER / "README.md").read_text(encoding="utf-8")
     (text,) = re.findall(r"```c\n(.*?)```", page, re.DOTALL)
     (promise,) = re.findall(r"prints `(.*?)` twice", page)
     source = tmp_path / "blink.c"

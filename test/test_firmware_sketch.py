@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from compilers import NEEDS_CXX
 
-from benchmarks.dw1000_model.library import model_folder, model_objects
+from benchmarks.dw1000_model.library import MODEL_FOLDER, model_objects
 from uwb_mitigation.firmware_export.compiling import firmware_folder, run
 from uwb_mitigation.firmware_export.export import export_bundle
 from uwb_mitigation.firmware_export.host import library_objects
@@ -33,7 +33,7 @@ def compile_sketch(name: str, folder: Path, compiler: tuple[str, ...], *files: s
     sketch, program = folder / f"{name}.cpp", folder / "sketch"
     sketch.write_text((EXAMPLES / name / f"{name}.ino").read_text())
     warnings = ("-Wall", "-Wextra", "-Werror", "-include", str(STUB / "Arduino.h"))
-    includes = (f"-I{STUB}", f"-I{firmware_folder() / 'src'}", f"-I{model_folder()}", f"-I{folder}")
+    includes = (f"-I{STUB}", f"-I{firmware_folder() / 'src'}", f"-I{MODEL_FOLDER}", f"-I{folder}")
     run([*compiler, *warnings, *includes, str(sketch), *files, "-o", str(program)])
     return program
 

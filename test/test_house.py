@@ -28,9 +28,9 @@ def test_layers_hold_and_only_nodes_import_rclpy_and_only_training_torch():
 
 
 @NEEDS_CC
-@pytest.mark.parametrize("folder", ["src", "dw1000_model"])
+@pytest.mark.parametrize("folder", ["firmware/src", "benchmarks/dw1000_model/chip"])
 def test_the_modules_of_the_firmware_do_not_call_each_other_in_circles(folder: str):
-    sources = REPOSITORY / "firmware" / folder
+    sources = REPOSITORY / folder
     objects = compile_objects(("cc",), (f"-I{sources}",), tuple(sorted(sources.glob("*.c"))))
     symbols = {path: [line.split() for line in run(["nm", "-gP", path]).splitlines()] for path in objects}
     owner = {name: path for path in objects for name, kind, *_ in symbols[path] if kind != "U"}

@@ -12,7 +12,7 @@ from types import TracebackType
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.dw1000_model.library import model_folder, model_objects
+from benchmarks.dw1000_model.library import MODEL_FOLDER, model_objects
 from benchmarks.dw1000_model.links import Link
 from uwb_mitigation.errors import LinkError
 from uwb_mitigation.firmware_export.compiling import (
@@ -195,7 +195,7 @@ class ModelledAir:
 def _library() -> ctypes.CDLL:
     firmware = firmware_folder()
     program = Path(__file__).with_name("radio_air.c")
-    options = ("-std=c99", "-O2", "-fPIC", *WARNINGS, f"-I{model_folder()}", f"-I{firmware / 'src'}")
+    options = ("-std=c99", "-O2", "-fPIC", *WARNINGS, f"-I{MODEL_FOLDER}", f"-I{firmware / 'src'}")
     objects = compile_objects(c_compiler(), options, (program, *sorted((firmware / "src").glob("*.c"))))
     air, board = c_void_p, c_int
     signatures: Signatures = {

@@ -6,13 +6,11 @@ import ctypes
 import functools
 from pathlib import Path
 
-from uwb_mitigation.errors import MissingDependencyError
 from uwb_mitigation.firmware_export.compiling import (
     WARNINGS,
     Signatures,
     c_compiler,
     compile_objects,
-    firmware_folder,
     load_library,
 )
 
@@ -54,29 +52,18 @@ class Request(ctypes.Structure):
 NextRequest = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.POINTER(Request))
 
 
-def model_folder() -> Path:
-    """The folder with the model's sources.
-
-    Raises:
-        MissingDependencyError: they are not installed.
-    """
-    folder = firmware_folder() / "dw1000_model"
-    if not (folder / "dw1000_model.h").is_file():
-        raise MissingDependencyError(
-            "the DW1000's model is not installed", where=str(folder), valid="install the package again"
-        )
-    return folder
+MODEL_FOLDER = Path(__file__).with_name("chip")  # the C sources of the model
 
 
 def model_objects() -> tuple[str, ...]:
     """Object files of the model for this computer; compiled once a process.
 
     Raises:
-        MissingDependencyError: there is no C compiler, or the sources are not installed.
+        MissingDependencyError: there is no C compiler.
         UwbMitigationError: they do not compile.
     """
-    folder = model_folder()
-    return compile_objects(c_compiler(), (*_OPTIONS, f"-I{folder}"), tuple(sorted(folder.glob("*.c"))))
+    sources = tuple(sorted(MODEL_FOLDER.glob("*.c")))
+    return compile_objects(c_compiler(), (*_OPTIONS, f"-I{MODEL_FOLDER}"), sources)
 
 
 @functools.cache
