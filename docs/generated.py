@@ -26,6 +26,11 @@ from uwb_mitigation.link import layout
 from uwb_mitigation.link.layout import Layout, MessageType
 from uwb_mitigation.nodes.parameter_tables import TABLES
 
+try:
+    import tomllib
+except ModuleNotFoundError:  # Python 3.10, for which Sphinx and pytest install it
+    import tomli as tomllib
+
 DOCS = Path(__file__).resolve().parent
 TEMPLATES = DOCS / "templates" / "reference"
 REFERENCE = DOCS / "reference"
@@ -238,9 +243,8 @@ def parts() -> str:
 
 
 def _layers() -> list[str]:
-    from importlinter.api import read_configuration  # only this function needs it
-
-    contracts = read_configuration(str(REPOSITORY / "pyproject.toml"))["contracts_options"]
+    with (REPOSITORY / "pyproject.toml").open("rb") as file:
+        contracts = tomllib.load(file)["tool"]["importlinter"]["contracts"]
     (found,) = (contract["layers"] for contract in contracts if contract["type"] == "layers")
     return [str(layer) for layer in found]
 
