@@ -81,7 +81,9 @@ class TrainedModel(_Entry):
 
     Attributes:
         samples: window length K.
-        mae_*: on the test part, m (Table 1). bytes_*: file sizes (Table 2). *_errors: on the test part (Fig. 5).
+        mae_raw, mae_float, mae_optimised, mae_int8: Mean absolute error on the test part, m (Table 1).
+        bytes_float, bytes_optimised, bytes_int8: File sizes (Table 2).
+        float_errors, int8_errors: Errors on the test part (Fig. 5).
         calibration_mae: {calibration: MAE of int8 on the training part, m}; `calibration` is the chosen one.
         seconds: training time; `samples_per_s` during it.
     """
