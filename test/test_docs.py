@@ -32,7 +32,7 @@ from uwb_mitigation.sources.opening import open_recording
 
 PAGES = sorted(
     path
-    for pattern in ("*.md", "docs/**/*.md", "models/*.md", "firmware/**/*.md")
+    for pattern in ("*.md", "docs/**/*.md", "models/*.md", "firmware/*.md", "benchmarks/**/*.md")
     for path in REPOSITORY.glob(pattern)
     if not path.is_relative_to(generated.REFERENCE)
 )
