@@ -46,6 +46,7 @@ def test_errors_are_absolute_and_grouped_by_label():
     assert tally.errors["LOS"].corrected_m == pytest.approx(0.1)
     assert tally.total.n == 2
     assert tally.total.corrected_m == pytest.approx(0.6)
+    assert tally.missing == 0  # a board that corrects sends no raw ranges
 
 
 def test_a_summary_without_data_shows_no_nan():

@@ -54,8 +54,8 @@ class Tally:
 
     @property
     def missing(self) -> int:
-        """Number of raw ranges without a corrected range."""
-        return self.raw - self.corrected
+        """Number of raw ranges without a corrected range; 0 if the board corrects and sends no raw ranges."""
+        return max(self.raw - self.corrected, 0)
 
     @property
     def total(self) -> ErrorSums:
