@@ -13,7 +13,7 @@ pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
 from ros_harness import Ros
 
-from benchmarks.__main__ import nodes_result
+from benchmarks.cli import nodes_result
 from benchmarks.nodes import RANGES, RATES_HZ, Figures, Latency, missing_between
 
 pytestmark = pytest.mark.ros

@@ -17,7 +17,9 @@ from uwb_mitigation.nodes.parameter_tables import TABLES
 def run(executable: str, *words: str, path: Path | None = None) -> subprocess.Popen[str]:
     """Start an executable, or a demo; `path` holds modules that come before those installed."""
     start = ["-c", f"from uwb_mitigation.entry import {executable}; {executable}()"]
-    if "demo" in executable:
+    if executable == "benchmarks":
+        start = ["-m", "benchmarks", "radio-demo"]
+    elif "demo" in executable:
         start = ["-m", "uwb_mitigation.entry", executable]
     modules = os.pathsep.join(str(entry) for entry in (path, REPOSITORY) if entry is not None)
     return subprocess.Popen(
@@ -50,6 +52,7 @@ def test_help_lists_every_parameter_without_ros(node: str, tables: list[str], tm
         ("monitor", signal.SIGINT),
         ("command_line", signal.SIGINT),
         ("firmware-demo", signal.SIGINT),
+        ("benchmarks", signal.SIGINT),
     ],
 )
 def test_a_signal_while_an_executable_still_loads_ends_it_at_once(

@@ -86,12 +86,12 @@ def test_a_tag_and_an_anchor_on_usb_range_are_unplugged_and_come_back(
             )
             assert len(measured.cir) == 157
             assert abs(time.time_ns() - measured.stamp_ns) < GENEROUS_S * 1e9
-        assert tag.report().problem == ""
+        wait_until(lambda: tag.report().problem == "")
 
         taken: list[int] = []
-        # With the pause before a try, all of it takes less than a second of USB: 0.2 s and 0.4 s. A busy computer
-        # may need two tries.
-        while len(taken) < 3 and not (taken and taken[-1] < 0.4 / ROUND_TRIP_S):
+        # Requests of 0.4 s on USB, plus the pause before a try, restart a radio within a second. A busy computer
+        # exceeds the timeout of a request and needs more than one try.
+        while len(taken) < 10 and not (taken and taken[-1] < 0.4 / ROUND_TRIP_S):
             emulated.unplug(0)
             lost = wait_for(tag, RadioLost)[-1]
             assert "radio0" in lost.text
@@ -103,14 +103,15 @@ def test_a_tag_and_an_anchor_on_usb_range_are_unplugged_and_come_back(
         assert 50 < min(taken) < 0.4 / ROUND_TRIP_S
         wait_for(tag, RangeMeasurement, 2)
 
+        openings = anchor.report().openings
         emulated.unplug(1)
         wait_until(lambda: "is not there" in anchor.report().problem)
         before = tag.report().status
-        wait_until(lambda: tag.report().status.no_answer + tag.report().status.time_out > before.no_answer)
-        assert tag.report().status.state is RadioState.RUNNING
+        wait_until(lambda: tag.report().status.no_answer > before.no_answer)
+        wait_until(lambda: tag.report().status.state is RadioState.RUNNING)
         emulated.plug(1)
         wait_for(tag, RangeMeasurement, 2)
-        assert anchor.report().openings == 2
+        assert anchor.report().openings > openings
 
         tag.set_radio(RadioSettings(window=16))
         wait_for(tag, Radio)

@@ -42,11 +42,14 @@ def viewer() -> None:
 
 def command_line() -> None:
     """`uwb-mitigation`."""
-    _program("uwb_mitigation.commands.cli")
+    run_program("uwb_mitigation.commands.cli")
 
 
-def _program(module: str) -> None:
-    """Run a module that leaves signals to Python, and is told of Ctrl-C by an exception."""
+def run_program(module: str) -> None:
+    """Import a module and call its `main`, which receives Ctrl-C as KeyboardInterrupt.
+
+    A signal during the import ends the process without a traceback, with exit code 128 + its number.
+    """
     run = _load(module)
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
@@ -96,6 +99,6 @@ def _end(number: int, frame: Any) -> None:
 if __name__ == "__main__":
     name = sys.argv.pop(1)
     if name in _DEMOS:
-        _program(f"uwb_mitigation.demos.{_DEMOS[name]}")
+        run_program(f"uwb_mitigation.demos.{_DEMOS[name]}")
     else:
         _node(name)

@@ -174,7 +174,7 @@ class BoardFeed(LiveFeed):
         if (hello := report.hello) is not None:
             hardware = f"board {format_id(hello.board_id)}"
             facts |= {
-                "firmware": f"{hello.firmware_name} {'.'.join(map(str, hello.firmware_version))}",
+                "firmware": f"{hello.firmware_name} {hello.firmware_version}",
                 "model id": diagnostics.model_id(hello.model_id),
                 "mode": hello.mode.name.lower(),
             }

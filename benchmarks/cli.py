@@ -1,0 +1,329 @@
+"""Measure nodes, positions, radios, firmware and links: `python -m benchmarks NAME [--json FILE]`, in a checkout.
+
+Two more commands start emulated EVB1000s (`emulate-evb1000`) and the demonstration with radios (`radio-demo`).
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from benchmarks.emulate_evb1000 import emulate_evb1000
+from uwb_mitigation.commands import console
+from uwb_mitigation.commands.console import JsonOption, Table
+from uwb_mitigation.errors import UwbMitigationError, not_imported
+
+if TYPE_CHECKING:
+    from benchmarks.nodes import Figures
+
+app = typer.Typer(
+    name="python -m benchmarks",
+    help="Measure what the parts of the system can do.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+app.command("emulate-evb1000")(emulate_evb1000)
+
+
+@app.command()
+def nodes(
+    repeats: Annotated[
+        int, typer.Option(min=1, help="Searches for the highest rate; the median counts.")
+    ] = 3,
+    slices: Annotated[int, typer.Option(min=1, help="Slices for each latency; the median counts.")] = 5,
+    seconds: Annotated[float, typer.Option(min=0.5, help="Duration of a slice.")] = 2.0,
+    viewer: Annotated[
+        bool, typer.Option("--viewer", help="Measure the load of the viewer with 0, 1 and 10 pages instead.")
+    ] = False,
+    json: JsonOption = None,
+) -> None:
+    """Rate and latency of relay, mitigator and one-process pipeline.
+
+    The subjects take turns with the same ranges. One run takes about five minutes.
+    """
+    from benchmarks import nodes as bench
+    from benchmarks import viewer as viewer_bench
+
+    with console.progress() as bar:
+        task = bar.add_task("starting the nodes", total=1.0)
+
+        def advance(text: str, share: float) -> None:
+            bar.update(task, description=text, completed=share)
+
+        if viewer:
+            costs = viewer_bench.measure(repeats, 5.0 * seconds, advance)
+            result: dict[str, Any] = asdict(costs) | {"rate_ratios": costs.rate_ratios}
+        else:
+            result = nodes_result(bench.measure(repeats, slices, seconds, advance))
+    _report(result, json)
+
+
+@app.command()
+def soak(
+    messages: Annotated[
+        int, typer.Option(min=1000, help="Number of ranges; the default is 8 h at 40 Hz.")
+    ] = (1_152_000),
+    rate: Annotated[float, typer.Option(min=1.0, max=20_000.0, help="Ranges per second.")] = 2000.0,
+    one_process: Annotated[
+        bool, typer.Option("--one-process", help="Use the pipeline instead of two nodes.")
+    ] = False,
+    json: JsonOption = None,
+) -> None:
+    """Memory, descriptors and threads of the nodes over many ranges."""
+    from benchmarks import nodes as bench
+
+    with console.progress() as bar:
+        task = bar.add_task("ranges corrected", total=messages)
+        outcome = bench.soak(
+            messages, rate, one_process=one_process, advance=lambda done: bar.update(task, completed=done)
+        )
+    _report(asdict(outcome), json)
+
+
+@app.command()
+def locator(
+    data: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder with hanyang_outdoor and evk1000_apartment; default: simulated drives only."
+        ),
+    ] = None,
+    rate: Annotated[float, typer.Option(min=1.0, max=5000.0, help="Ranges per second to the node.")] = 1000.0,
+    seconds: Annotated[float, typer.Option(min=1.0, help="Duration of the stream.")] = 20.0,
+    json: JsonOption = None,
+) -> None:
+    """Position errors, time of the filter, latency and loss of the node."""
+    from benchmarks import locator as cost
+    from benchmarks import positions
+
+    with console.progress() as bar:
+        task = bar.add_task("filter", total=None)
+        us_per_range = cost.filter_us()
+        node = cost.node(rate, seconds, lambda text: bar.update(task, description=text))
+        runs, static = [], None
+        if data is not None:
+            for folder in sorted((data / "hanyang_outdoor").glob("*_*")):
+                bar.update(task, description=f"Hanyang {folder.name}")
+                runs.append(positions.hanyang(folder))
+            if (data / "evk1000_apartment").is_dir():
+                bar.update(task, description="EVK1000 apartment")
+                static = positions.apartment(data / "evk1000_apartment")
+        flats = []
+        for count in (4, 6, 8):
+            bar.update(task, description=f"simulated flat, {count} anchors")
+            flats.append(positions.flat(count))
+    result: dict[str, Any] = {
+        "us_per_range": us_per_range,
+        "node_p50_ms": node.p50_ms if math.isfinite(node.p50_ms) else None,
+        "node_p99_ms": node.p99_ms if math.isfinite(node.p99_ms) else None,
+        "lost": node.lost,
+        "sent": node.sent,
+        "hanyang": {run.name: run.as_json() for run in runs},
+        "flat": [
+            {"anchors": flat.anchors}
+            | {kind: getattr(flat, kind).as_json() for kind in ("raw", "corrected", "universal")}
+            for flat in flats
+        ],
+    }
+    if static is not None:
+        result["apartment"] = asdict(static)
+    _report(result, json)
+
+
+@app.command()
+def serial(
+    rate: Annotated[
+        float, typer.Option(min=1.0, max=10_000.0, help="Ranges per second of the board.")
+    ] = 1000.0,
+    seconds: Annotated[float, typer.Option(min=1.0, max=1e6, help="Duration of the steady stream.")] = 60.0,
+    unplugs: Annotated[int, typer.Option(min=1, max=1_000_000, help="Number of unplugged cables.")] = 50,
+    json: JsonOption = None,
+) -> None:
+    """The driver on the serial link of an emulated board: loss, latency, reconnection."""
+    from benchmarks import serial_link as bench
+
+    with console.progress() as bar:
+        task = bar.add_task("streaming", total=None)
+        steady = bench.steady(rate, seconds)
+        bar.update(task, description="unplugging")
+        unplug = bench.unplug(unplugs)
+    _report({"steady": asdict(steady), "unplug": asdict(unplug)}, json)
+
+
+@app.command()
+def link(
+    frames: Annotated[int, typer.Option(min=1, help="Number of frames.")] = 200_000,
+    damage: Annotated[float, typer.Option(help="Share of bytes flipped, dropped, inserted, each.")] = 1e-4,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of payloads and damage.")] = 0,
+    json: JsonOption = None,
+) -> None:
+    """Frames through a damaging channel: losses, speed of the decoder."""
+    from benchmarks.link import loopback
+    from uwb_mitigation.link.faults import Faults
+
+    faults = Faults(damage, damage, damage)
+    with console.share_bar("sending") as advance:
+        done = loopback(frames, faults, seed=seed, advance=lambda count: advance(count / frames))
+    result = asdict(done) | {"decoder_mb_per_s": done.decoder_mb_per_s}
+    _report({key: value for key, value in result.items() if key not in ("bytes_received", "decoder_s")}, json)
+
+
+@app.command()
+def radio(
+    seconds: Annotated[
+        float, typer.Option(min=0.5, max=60.0, help="Virtual time for each distance and pair of clocks.")
+    ] = 3.0,
+    exchanges: Annotated[int, typer.Option(min=0, max=10_000_000, help="Exchanges of the soak; 0: skip.")] = (
+        200_000
+    ),
+    evb1000: Annotated[
+        float, typer.Option(min=0.0, max=600.0, help="Seconds of two emulated EVB1000s; 0: skip.")
+    ] = 10.0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the soak.")] = 1,
+    json: JsonOption = None,
+) -> None:
+    """The firmware's ranging on modelled radios: error, rates, soak.
+
+    The chips are modelled register by register, in virtual time. The emulated EVB1000s answer in wall-clock time: a
+    busy computer slows them down. None of this was measured on a board.
+    """
+    from benchmarks import radio as bench
+    from uwb_mitigation.link.layout import Mode
+
+    with console.progress() as bar:
+        task = bar.add_task("ranging", total=len(bench.PPM_PAIRS) * len(bench.DISTANCES_M))
+        rows = bench.ranging(seconds, lambda: bar.advance(task))
+        host_hz, device_hz = bench.line_rate_hz(Mode.HOST), bench.line_rate_hz(Mode.DEVICE)
+        evb1000_hz = None
+        if evb1000:
+            task = bar.add_task("EVB1000s", total=None)
+            evb1000_hz = bench.evb1000_rate_hz(evb1000)
+        soaked = None
+        if exchanges:
+            task = bar.add_task("soak", total=exchanges)
+            soaked = asdict(bench.soak(exchanges, seed, lambda done: bar.update(task, completed=done)))
+    _report(
+        {
+            "ranging": [asdict(row) for row in rows],
+            "host_rate_hz": host_hz,
+            "device_rate_hz": device_hz,
+            "evb1000_rate_hz": evb1000_hz,
+            "soak": soaked,
+        },
+        json,
+    )
+
+
+@app.command()
+def firmware(
+    model: Annotated[
+        Path | None, typer.Option(help="Measure only this int8 bundle.", show_default=False)
+    ] = None,
+    inputs: Annotated[
+        int, typer.Option(min=1, max=1_000_000, help="Windows per network to compare with ONNX Runtime.")
+    ] = 5000,
+    portable: Annotated[
+        bool, typer.Option("--portable/--no-portable", help="Also the portable C, on fewer windows.")
+    ] = True,
+    json: JsonOption = None,
+) -> None:
+    """The firmware in an emulated Cortex-M4: cost, equality with ONNX Runtime.
+
+    Instructions are counted exactly; cycles are estimated for zero wait states. Only a board can show wait states,
+    caches and power.
+    """
+    from benchmarks import firmware as bench
+    from uwb_mitigation.firmware_export.toolchain import Kernels, require_tools
+    from uwb_mitigation.model.bundle import load_bundle
+
+    require_tools()
+    networks = list(bench.random_shapes()) if model is None else [bench.trained(load_bundle(model))]
+    rows = []
+    with console.step_bar("emulating", len(networks)) as advance:
+        for network in networks:
+            rows.append(bench.measure(network, inputs=inputs))
+            if portable:
+                # Ten times slower, and compared with ONNX Runtime on the host as well.
+                rows.append(bench.measure(network, kernels=Kernels.PORTABLE, inputs=min(inputs, 100)))
+            advance()
+    _report({"rows": [asdict(row) for row in rows]}, json)
+
+
+@app.command("radio-demo")
+def radio_demo(
+    seconds: Annotated[
+        float, typer.Option(min=0.0, max=3600.0, help="Duration of ranging after each anchor has answered.")
+    ] = 15.0,
+) -> None:
+    """A tag ranges with four anchors on modelled chips, through driver and mitigator."""
+    from benchmarks import radio_demo as demo
+
+    raise typer.Exit(demo.main(seconds))
+
+
+def nodes_result(figures: Mapping[str, Figures]) -> dict[str, Any]:
+    """Return figures by subject as plain values, with the ratios between the subjects under `ratios`."""
+    result: dict[str, Any] = {}
+    for name, of in figures.items():
+        values = asdict(of)
+        values["latency_us"] = {str(rate): latency for rate, latency in values["latency_us"].items()}
+        result[name] = {"max_lossless_rate_hz": of.max_lossless_rate_hz} | values
+    relay, mitigator, pipeline = (figures[name] for name in ("relay", "mitigator", "pipeline"))
+    result["ratios"] = {
+        "mitigator_rate_over_relay": mitigator.max_lossless_rate_hz / (relay.max_lossless_rate_hz or 1.0),
+        "pipeline_rate_over_mitigator": pipeline.max_lossless_rate_hz
+        / (mitigator.max_lossless_rate_hz or 1.0),
+        "added_p99_us_at_500_hz": mitigator.latency_us[500].p99 - relay.latency_us[500].p99,
+    }
+    return result
+
+
+def _report(result: Mapping[str, Any], json: Path | None) -> None:
+    """Print a table for each list of rows, and one for all other values; write the JSON file."""
+    scalars = Table("figure", "value", title_justify="left")
+    for key, value in result.items():
+        if isinstance(value, list | tuple) and value:
+            rows = [_flat(row) for row in value]
+            table = Table(*rows[0], title=key)
+            for row in rows:
+                table.add_row(*map(_text, row.values()))
+            console.out.print(table)
+        else:
+            for name, figure in _flat({key: value}).items():
+                scalars.add_row(name, _text(figure))
+    if scalars.row_count:
+        console.out.print(scalars)
+    console.write_json(json, result)
+
+
+def _flat(value: Any, prefix: str = "") -> dict[str, Any]:
+    """Return the leaves of nested mappings, {path with dots: value}."""
+    if not isinstance(value, Mapping):
+        return {prefix: value}
+    start = f"{prefix}." if prefix else ""
+    return {path: leaf for key, of in value.items() for path, leaf in _flat(of, f"{start}{key}").items()}
+
+
+def _text(value: Any) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def main() -> None:
+    """Run the command line; an error of the package or a missing library ends it with one line and exit code 1."""
+    try:
+        app()
+    except (UwbMitigationError, ImportError) as error:
+        failure = not_imported(error) if isinstance(error, ImportError) else error
+        if failure is None:
+            raise
+        console.err.print(f"benchmarks: {failure}", style="red", markup=False, soft_wrap=True)
+        sys.exit(1)
+    except KeyboardInterrupt:
+        sys.exit(130)
