@@ -25,7 +25,6 @@ from sensor_msgs.msg import Range
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
 from uwb_mitigation.bag.codec import encode_range
-from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.measurement import Status
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import load_bundle
@@ -159,23 +158,6 @@ def test_every_transition_of_the_driver_can_be_repeated_and_a_replay_starts_over
 
 
 @pytest.mark.ros
-def test_a_driver_that_cannot_be_configured_says_why_and_can_be_mended(ros: Ros, tmp_path: Path):
-    path = tmp_path / "late.mcap"
-    received = ros.collect(RangeCir, RAW)
-    ros.start("driver", "source:=mcap", f"path:={path}", "start_delay:=0.0", "autostart:=false")
-    assert not ros.change_state("driver", Transition.TRANSITION_CONFIGURE)
-    assert ros.state_of("driver") == "unconfigured"
-    status = ros.diagnosis("driver", lambda status: status.level == DiagnosticStatus.ERROR)
-    assert str(path) in status.message
-    with BagWriter(path, {"source": "a test", "simulated": "true"}) as writer:
-        for record in SimulatedSource(seed=1, count=5):
-            writer.write(record)
-    assert ros.change_state("driver", Transition.TRANSITION_CONFIGURE)
-    assert ros.change_state("driver", Transition.TRANSITION_ACTIVATE)
-    ros.spin_until(lambda: len(received) == 5)
-
-
-@pytest.mark.ros
 def test_diagnostics_go_on_when_simulated_time_stands_still_and_are_stamped_with_it(ros: Ros):
     clock = ros.node.create_publisher(Clock, "/clock", 10)
     arrays = ros.collect(DiagnosticArray, "/diagnostics")
@@ -264,18 +246,6 @@ def test_a_model_that_includes_an_offset_causes_a_warning_after_enough_ranges():
     assert OFFSET.text not in warnings(health)
 
 
-def test_drops_are_found_by_the_publishers_numbers():
-    numbering = Numbering(lambda: 1)
-    for number in (1, 2, 3):
-        numbering.add(number)
-    assert numbering.missing == 0
-    numbering.add(14)
-    assert numbering.missing == 10
-    for number in (1, 2):  # Started anew.
-        numbering.add(number)
-    assert numbering.missing == 10
-
-
 @pytest.mark.parametrize("count", [2, 3, 5])
 def test_drops_of_several_publishers_add_up_whoever_they_are_of(count: int):
     random = np.random.default_rng(count)
@@ -319,29 +289,6 @@ def test_a_middleware_without_numbers_may_hide_drops():
 
 
 @pytest.mark.ros
-@pytest.mark.parametrize("count", [2, 3])
-def test_several_drivers_into_one_mitigator_lose_nothing_also_when_one_starts_anew(ros: Ros, count: int):
-    corrected = ros.collect(RangeCorrected, CORRECTED)
-    ros.start("mitigator").wait_for_output("correcting with model")
-    ros.wait_for_publishers(CORRECTED, 1)
-    drivers = [
-        ros.start("driver", "simulated_rate:=150.0", arguments=("-r", f"__node:=driver{number}"))
-        for number in range(count)
-    ]
-    ros.spin_until(lambda: len(corrected) > 300)
-    drivers[0].send(signal.SIGKILL)
-    drivers[0].wait()
-    ros.start("driver", "simulated_rate:=150.0", arguments=("-r", "__node:=driver0"))
-    ros.wait_for_publishers(RAW, count)
-    before = len(corrected)
-    ros.spin_until(lambda: len(corrected) > before + 500)
-    status = ros.diagnosis("mitigator", lambda status: status.message != SILENT.text)
-    facts = {value.key: value.value for value in status.values}
-    assert facts["dropped by a queue"] == "0"
-    assert DROPPED.text not in status.message
-
-
-@pytest.mark.ros
 def test_a_publisher_by_best_effort_is_named_and_heard_where_it_is_asked_for(ros: Ros):
     data = encode_range(next(iter(SimulatedSource(seed=2))).measurement)
     publisher = ros.node.create_publisher(RangeCir, RAW, qos_profile_sensor_data)
@@ -382,17 +329,6 @@ def test_corrected_ranges_come_as_sensor_msgs_too_where_they_are_asked_for(ros: 
     publisher.publish(encode_range(replace(measurement, range_m=math.nan)))
     ros.spin_until(lambda: bool(plain) and plain[-1].range == math.inf)
     assert plain[-1].variance == math.inf
-
-
-@pytest.mark.ros
-def test_simulated_ranges_are_called_so(ros: Ros):
-    raw = ros.collect(RangeCir, RAW)
-    driver = ros.start("driver", *ENDLESS)
-    driver.wait_for_output("simulated ranges, which no radio measured")
-    status = ros.diagnosis("driver", lambda status: "simulated" in status.message)
-    assert status.level == DiagnosticStatus.WARN
-    ros.spin_until(lambda: len(raw) > 0)
-    assert raw[0].header.frame_id.startswith("simulated_")
 
 
 @pytest.mark.ros

@@ -221,6 +221,7 @@ def test_a_source_that_cannot_keep_its_rate_is_reported():
     _, level, text, facts = player.feed.describe()
     assert float(facts["behind s"]) > 0.5
     assert level > b"\0"
+    assert "simulated" in text
     assert "behind" in text
 
 

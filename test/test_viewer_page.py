@@ -18,11 +18,10 @@ from browser import Browser
 from benchmarks.visitors import Visitors
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.measurement import Cir, Encoding, Status
-from uwb_mitigation.viewer.page import Drawing, Page, View
+from uwb_mitigation.viewer.page import Page, View
 from uwb_mitigation.viewer.scene import (
     MAX_PAIRS,
     AnchorPlace,
-    Missing,
     Pose,
     Report,
     Sample,
@@ -376,16 +375,6 @@ def test_clocks_may_differ_and_jump() -> None:
     assert len(scene.pairs[1, 7].samples) == 1, "a replay began anew"
 
 
-def test_an_empty_page_states_what_is_missing(browser: Browser, view: View, server: ViewerServer) -> None:
-    view.missing = Missing("no driver", "no anchors", "no locator")
-    opened(browser, server)
-    assert data(browser, "pairs", "anchor") == []
-    for reason in ("no driver", "no anchors", "no locator"):
-        browser.wait(reason, partial(browser.cell, reason))
-    browser.screenshot("viewer_empty")
-    assert browser.complaints() == []
-
-
 def test_nothing_from_a_message_is_run(browser: Browser, view: View, server: ViewerServer) -> None:
     fill(view)
     opened(browser, server)
@@ -440,22 +429,6 @@ def test_only_scripts_of_the_page_run(browser: Browser, view: View, server: View
     assert browser.run("return window.pwned ?? null") is None
 
 
-def test_a_swipe_over_a_figure_scrolls_the_page_of_a_phone(
-    browser: Browser, view: View, server: ViewerServer
-) -> None:
-    fill(view)
-    with browser.touch_screen():
-        opened(browser, server, 400, 800)
-        for name in ("map", "cir", "strip", "waterfall", "errors"):
-            before = browser.scroll_to(name)
-            browser.swipe(200, 400, 250 if before < 500 else -250)
-            browser.wait(
-                f"the page to scroll by {name}",
-                lambda before=before: abs(browser.run("return scrollY") - before) > 100,
-            )
-        assert browser.complaints() == []
-
-
 @pytest.mark.parametrize("width", [1280, 1024, 400])
 def test_nothing_is_cut_off_on_a_narrow_screen(
     browser: Browser, view: View, server: ViewerServer, width: int
@@ -474,53 +447,12 @@ def test_nothing_is_cut_off_on_a_narrow_screen(
     browser.screenshot(f"viewer_{width}")
 
 
-def test_a_table_stays_where_it_was_scrolled_to(browser: Browser, view: View, server: ViewerServer) -> None:
-    with view.lock:
-        for anchor in range(100):
-            view.scene.add_sample((anchor, 7), Sample(1000.0, 5.3, 5.1, 0.1, Status.OK))
-    opened(browser, server)
-    browser.wait("the table", lambda: browser.cell("1"))
-    browser.run(IN_TABLE + "view.scrollTop = 1500")
-    browser.wait("its end", lambda: browser.cell("70"))
-    with view.lock:
-        view.scene.add_sample((70, 7), Sample(1010.0, 9.9, 9.5, 0.1, Status.OK))
-    browser.wait("the new range", lambda: browser.cell("9.500"))
-    assert browser.run(IN_TABLE + "return view.scrollTop") == 1500
-
-
 def test_a_screenshot_is_an_image(browser: Browser, view: View, server: ViewerServer) -> None:
     fill(view)
     opened(browser, server)
     browser.run("document.getElementById('screenshot').click()")
     assert browser.run("return window.lastScreenshot").startswith("data:image/png;base64,")
     assert browser.complaints() == []
-
-
-def test_the_page_comes_back_with_the_server(browser: Browser, view: View) -> None:
-    fill(view)
-    with ViewerServer(view, port=0) as first:
-        opened(browser, first)
-    browser.wait(
-        "the notice",
-        lambda: browser.run("return getComputedStyle(document.getElementById('lost')).display") == "block",
-    )
-    browser.screenshot("viewer_lost")
-    fresh = View(Scene(), Lock(), "UWB ranges again")
-    fill(fresh)
-    with ViewerServer(fresh, port=first.port):
-        browser.wait("the page", lambda: browser.run("return document.title") == "UWB ranges again")
-
-
-def test_ten_pages_at_once(browser: Browser, view: View, server: ViewerServer) -> None:
-    fill(view)
-    opened(browser, server)
-    with Visitors(server.url, 9) as others:
-        browser.wait("ten pages", lambda: view.drawing.pages == 10)
-        with view.lock:
-            view.scene.add_sample((1, 7), Sample(1010.0, 9.9, 9.5, 0.1, Status.OK))
-        browser.wait("the new range", lambda: data(browser, "pairs", "range")[0] == pytest.approx(9.5))
-        browser.wait("it to reach the others", lambda: all(others.received))
-    browser.wait("the closed ones to be forgotten", lambda: view.drawing.pages == 1)
 
 
 def test_a_page_that_is_left_is_forgotten(browser: Browser, view: View, server: ViewerServer) -> None:
@@ -531,12 +463,6 @@ def test_a_page_that_is_left_is_forgotten(browser: Browser, view: View, server: 
     browser.wait("it to be forgotten", lambda: view.drawing.pages == 0)
     browser.driver.back()
     browser.wait("it to be there again", lambda: view.drawing.pages == 1 and browser.ready())
-
-
-def test_many_pages_are_drawn_less_often() -> None:
-    drawing = Drawing(pages=10, cost_s=0.03)
-    assert drawing.pause_s() == pytest.approx(1.0)
-    assert Drawing(pages=1, cost_s=0.002).pause_s() == pytest.approx(0.1)
 
 
 def test_a_page_at_all_addresses_accepts_those_of_this_machine(view: View) -> None:
