@@ -24,12 +24,18 @@ from uwb_mitigation_msgs.msg import RangeCir
 from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.errors import DamagedRecordingError, UwbMitigationError
 from uwb_mitigation.measurement import Cir, RangeMeasurement, Record
-from uwb_mitigation.nodes.replay import Pace, ReplayFeed, ReplayOptions
+from uwb_mitigation.nodes.parameter_tables import DRIVER
+from uwb_mitigation.nodes.replay import Pace, ReplayFeed
 from uwb_mitigation.offsets import NO_OFFSETS
 from uwb_mitigation.sources.simulated import SimulatedSource
 
 MS = 1_000_000
 COUNT = 400
+DEFAULTS = {row.name: row.default for row in DRIVER} | {
+    "longest_pause": 100.0,
+    "wait_for_subscribers": 0,
+    "start_delay": 0.0,
+}
 SILENT = SimpleNamespace(info=lambda text: None, warning=lambda text, **_: None)
 
 
@@ -80,7 +86,7 @@ class Player:
         self.feed = ReplayFeed(
             source,
             self.clock,
-            ReplayOptions(**({"longest_pause_s": 100.0} | options)),
+            (DEFAULTS | options).__getitem__,
             SILENT,
             subscribers=lambda: 0,
             publish=self.publish,
@@ -141,13 +147,13 @@ def test_stamps_keep_the_recorded_intervals_divided_by_the_rate():
 
 
 def test_a_long_pause_is_cut():
-    player = Player(ListSource([0, 3_600_000_000_000]), longest_pause_s=0.05).play()
+    player = Player(ListSource([0, 3_600_000_000_000]), longest_pause=0.05).play()
     assert player.offsets == [0, 50_000_000]
 
 
 def test_recorded_stamps_stay_and_the_clock_leads_up_to_them():
     stamps = [1_000_000_000, 2_000_000_000]
-    player = Player(ListSource(stamps), recorded_stamps=True).play()
+    player = Player(ListSource(stamps), publish_clock=True).play()
     assert player.stamps == stamps
     assert player.clock_times == sorted(player.clock_times)
     assert (player.clock_times[0], player.clock_times[-1]) == tuple(stamps)
@@ -155,7 +161,7 @@ def test_recorded_stamps_stay_and_the_clock_leads_up_to_them():
 
 
 def test_a_loop_goes_on_in_time_and_never_at_a_negative_one():
-    player = Player(ListSource([0, 10 * MS, 20 * MS]), stop_after(7), loop=True, recorded_stamps=True).play()
+    player = Player(ListSource([0, 10 * MS, 20 * MS]), stop_after(7), loop=True, publish_clock=True).play()
     assert player.recorded[:7] == [step % 3 * 10 * MS for step in range(7)]
     assert min(player.clock_times) >= 0
     player = Player(ListSource([0, 10 * MS, 20 * MS]), stop_after(7), loop=True).play()
@@ -172,7 +178,7 @@ def test_an_error_of_the_source_is_reported_after_everything_before_it_was_playe
 
 
 def test_a_stop_during_a_pause_ends_the_thread_and_reports_no_end():
-    player = Player(ListSource([0, 3_000_000_000_000]), longest_pause_s=1e4)
+    player = Player(ListSource([0, 3_000_000_000_000]), longest_pause=1e4)
     player.feed.start()
     while not player.sequences:
         time.sleep(0.001)
@@ -255,19 +261,19 @@ def test_a_seek_does_not_wait_for_the_record_that_was_next():
         if sequence == 2:
             player.stop()
 
-    player = Player(steps(4, 60_000 * MS), skip, longest_pause_s=30.0).play()
+    player = Player(steps(4, 60_000 * MS), skip, longest_pause=30.0).play()
     assert player.sequences == [0, 2]
     assert player.offsets[1] < 10_000 * MS
 
 
 def test_a_replay_can_start_anywhere_and_a_loop_then_plays_from_the_start():
-    assert Player(steps(20, 10 * MS), from_s=5.0).play().sequences == []
-    player = Player(steps(10, 5 * MS), stop_after(7), from_s=0.04, loop=True).play()
+    assert Player(steps(20, 10 * MS), seek_to=5.0).play().sequences == []
+    player = Player(steps(10, 5 * MS), stop_after(7), seek_to=0.04, loop=True).play()
     assert player.sequences[:7] == [8, 9, 0, 1, 2, 3, 4]
 
 
-@pytest.mark.parametrize("recorded_stamps", [False, True])
-def test_a_pause_holds_the_records_and_their_time(recorded_stamps: bool):
+@pytest.mark.parametrize("publish_clock", [False, True])
+def test_a_pause_holds_the_records_and_their_time(publish_clock: bool):
     resumed = threading.Event()
 
     def resume(player: Player) -> None:
@@ -281,10 +287,10 @@ def test_a_pause_holds_the_records_and_their_time(recorded_stamps: bool):
         if sequence == 2:
             assert resumed.is_set()
 
-    player = Player(steps(5, 200 * MS), pause, recorded_stamps=recorded_stamps).play()
+    player = Player(steps(5, 200 * MS), pause, publish_clock=publish_clock).play()
     assert player.sequences == [0, 1, 2, 3, 4]
     assert player.clock_times == sorted(player.clock_times)
-    if not recorded_stamps:
+    if not publish_clock:
         gaps = np.diff(player.stamps)
         # The rest of the wait for the next record follows the pause.
         assert gaps[1] > 450 * MS

@@ -397,7 +397,7 @@ def test_another_host_name_is_refused(view: View, server: ViewerServer, path: st
         assert fetch(server, path, Host=f"{own}:{server.port}").status != 403
     for name in ("evil.example", f"evil.example:{server.port}", "localhost", f"localhost:{server.port + 1}"):
         assert fetch(server, path, Host=name).status == 403
-    assert view.drawing.pages == 0 or path == ""
+    assert view.pages == 0 or path == ""
     with ViewerServer(view, port=0, origins=("robot.local:5006",)) as other:
         assert fetch(other, Host="robot.local:5006").status == 200
 
@@ -458,17 +458,17 @@ def test_a_screenshot_is_an_image(browser: Browser, view: View, server: ViewerSe
 def test_a_page_that_is_left_is_forgotten(browser: Browser, view: View, server: ViewerServer) -> None:
     fill(view)
     opened(browser, server)
-    assert view.drawing.pages == 1
+    assert view.pages == 1
     browser.open("about:blank")
-    browser.wait("it to be forgotten", lambda: view.drawing.pages == 0)
+    browser.wait("it to be forgotten", lambda: view.pages == 0)
     browser.driver.back()
-    browser.wait("it to be there again", lambda: view.drawing.pages == 1 and browser.ready())
+    browser.wait("it to be there again", lambda: view.pages == 1 and browser.ready())
 
 
 def test_a_page_at_all_addresses_accepts_those_of_this_machine(view: View) -> None:
     with ViewerServer(view, "0.0.0.0", 0) as server, Visitors(server.url, 1):
         assert server.url == f"http://localhost:{server.port}/"
-        assert view.drawing.pages == 1
+        assert view.pages == 1
         for name in (socket.gethostname(), "127.0.0.1"):
             assert fetch(server, Host=f"{name}:{server.port}").status == 200
         for name in ("203.0.113.7", "evil.example"):

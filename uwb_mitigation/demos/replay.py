@@ -9,19 +9,22 @@ import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
+import numpy as np
 import typer
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
 from rich.console import Console
 from rich.live import Live
 
 from uwb_mitigation.demos.base import Nodes, run_demo
-from uwb_mitigation.demos.positions import Positions
 from uwb_mitigation.errors import DatasetError, UwbMitigationError
 from uwb_mitigation.nodes import topics
 from uwb_mitigation.nodes.monitor import REFRESH_HZ, Monitor, live_table, summary
 from uwb_mitigation.nodes.processes import watching
 from uwb_mitigation.positioning.anchors import AnchorMap, dump_anchors
+from uwb_mitigation.positioning.tracks import TruePath
 from uwb_mitigation.sources.simulated import SimulatedSource
 from uwb_mitigation.sources.source import Source
 
@@ -45,9 +48,9 @@ class Programme:
 def simulated(rate: float) -> Programme:
     """The simulator's default scene; what is too weak to be received gives no range, as on the air."""
     source = SimulatedSource(count=SIMULATED_EXCHANGES, rate_hz=SIMULATED_RATE_HZ)
-    offset_m, told = offset_of(source)
+    offset_m = offset_of(source)
     return Programme(
-        f"simulated recording, {len(list(source))} ranges{told}",
+        f"simulated recording, {len(list(source))} ranges",
         (
             "source:=simulated",
             f"count:={SIMULATED_EXCHANGES}",
@@ -59,18 +62,17 @@ def simulated(rate: float) -> Programme:
     )
 
 
-def offset_of(source: Source) -> tuple[float | None, str]:
-    """Return the boards' offset from true distances in line of sight and a text about it; None if it is unknown."""
+def offset_of(source: Source) -> float | None:
+    """Return the boards' offset (m) from true distances in line of sight; None if it is unknown."""
     from uwb_mitigation.evaluation.radio_offsets import find_offset
     from uwb_mitigation.mitigation import Mitigation
     from uwb_mitigation.model.bundle import load_bundle
     from uwb_mitigation.model.shipped import default_model_path
 
     try:
-        found = find_offset(Mitigation(load_bundle(default_model_path())), source)
+        return find_offset(Mitigation(load_bundle(default_model_path())), source).offset_m
     except DatasetError:
-        return None, ""
-    return found.offset_m, f", {found.offset_m:.2f} m of antenna delays subtracted"
+        return None
 
 
 def recorded(path: Path, rate: float) -> Programme:
@@ -85,33 +87,55 @@ def recorded(path: Path, rate: float) -> Programme:
             if last_ns is not None:
                 length_s += min((stamp_ns - last_ns) / 1e9, LONGEST_PAUSE_S)
             count, last_ns = count + 1, stamp_ns
-        offset_m, told = offset_of(source) if count else (None, "")
+        offset_m = offset_of(source) if count else None
         name = source.name
         kind = "mcap" if isinstance(source, McapRecording) else "decaranging"
     if not count:
         raise UwbMitigationError("the recording holds no range", where=str(path))
     rate = rate or max(1.0, length_s / TARGET_S)
     return Programme(
-        f"{name}, {count} ranges, {rate:.1f} x recorded speed{told}",
+        f"{name}, {count} ranges, {rate:.1f} x recorded speed",
         (f"source:={kind}", f"path:={path.resolve()}", f"rate:={rate}", f"longest_pause:={LONGEST_PAUSE_S}"),
         offset_m=offset_m,
     )
+
+
+def position_rmse(poses: list[Any], truth: list[Any]) -> float:
+    """Return the horizontal RMSE (m) of poses where the truth is known."""
+    (stamps, positions), (true_stamps, true_positions) = _stamped(poses), _stamped(truth)
+    offset = positions - TruePath(true_stamps, true_positions).at(stamps)
+    return float(np.sqrt(np.nanmean(np.sum(offset[:, :2] ** 2, axis=1))))
+
+
+def _stamped(messages: list[Any]) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
+    rows = {}
+    for message in messages:
+        at = message.pose.pose.position
+        rows[message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec] = (at.x, at.y, at.z)
+    stamps = sorted(rows)
+    return np.array(stamps, np.int64), np.array([rows[stamp] for stamp in stamps], np.float64)
 
 
 def watch(programme: Programme, console: Console) -> list[str]:
     """Run the nodes and show their ranges; return the failures."""
     with watching(Monitor) as monitor, tempfile.TemporaryDirectory() as folder:
         tally = monitor.tally
-        positions: Positions | None = None
+        poses: list[Any] = []
+        truth: list[Any] = []
+        monitor.create_subscription(PoseWithCovarianceStamped, topics.POSE, poses.append, topics.RANGES)
+        monitor.create_subscription(Odometry, topics.ODOMETRY_TRUTH, truth.append, topics.RANGES)
         raw, corrected, anchors = (
             monitor.resolve_topic_name(name)
             for name in (topics.RANGE_RAW, topics.RANGE_CORRECTED, topics.ANCHORS)
         )
+        title, offset_m = programme.title, programme.offset_m
         with Nodes() as nodes:
-            offsets = () if programme.offset_m is None else (f"offsets:={programme.offset_m:.4f}",)
-            nodes.start("mitigator", *offsets)
+            if offset_m is None:
+                nodes.start("mitigator")
+            else:
+                title += f", {offset_m:.2f} m of antenna delays subtracted"
+                nodes.start("mitigator", f"offsets:={offset_m:.4f}")
             if programme.anchors is not None:
-                positions = Positions(monitor, programme.anchors)
                 file = Path(folder) / "anchors.yaml"
                 file.write_text(dump_anchors(programme.anchors), encoding="utf-8")
                 nodes.start("locator", f"anchors:={file}", "level:=true", "rate:=0.0")
@@ -126,16 +150,18 @@ def watch(programme: Programme, console: Console) -> list[str]:
             nodes.start("driver", *programme.parameters, "wait_for_subscribers:=2")
             with Live(console=console, refresh_per_second=REFRESH_HZ) as live:
                 while nodes.running:
-                    live.update(live_table(tally, programme.title))
+                    live.update(live_table(tally, title))
                     time.sleep(1 / REFRESH_HZ)
                 # The last corrected ranges may arrive after the end of the driver.
                 settled = time.monotonic() + SETTLE_S
                 while tally.missing and time.monotonic() < settled:
                     time.sleep(0.05)
-                live.update(live_table(tally, programme.title))
+                live.update(live_table(tally, title))
         console.print(summary(tally))
-        if positions is not None and (table := positions.table()) is not None:
-            console.print(table)
+        if len(poses) > 1 and len(truth) > 1:
+            console.print(
+                f"horizontal position error of the locator: {position_rmse(poses, truth):.3f} m RMSE"
+            )
     if tally.missing or not tally.corrected:
         nodes.failures.append(f"{tally.corrected} of {tally.raw} ranges came back corrected")
     return nodes.failures

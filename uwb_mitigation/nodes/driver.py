@@ -37,7 +37,7 @@ from uwb_mitigation.nodes.diagnostics import Description
 from uwb_mitigation.nodes.lifecycle import ManagedNode
 from uwb_mitigation.nodes.live_feeds import PREFIX, BoardFeed, Feed, RadioFeed, open_radios, settings_of
 from uwb_mitigation.nodes.parameter_tables import DRIVER
-from uwb_mitigation.nodes.replay import ReplayFeed, ReplayOptions
+from uwb_mitigation.nodes.replay import ReplayFeed
 from uwb_mitigation.offsets import NO_OFFSETS, read_offsets
 from uwb_mitigation.sources.source import Source
 
@@ -205,17 +205,7 @@ class Driver(ManagedNode):
                 source,
                 # A node that drives /clock must not wait for /clock.
                 Clock(clock_type=ClockType.STEADY_TIME) if own_clock else self.get_clock(),
-                ReplayOptions(
-                    rate=self.value("rate"),
-                    loop=self.value("loop"),
-                    longest_pause_s=self.value("longest_pause"),
-                    recorded_stamps=own_clock,
-                    wanted_subscribers=self.value("wait_for_subscribers"),
-                    longest_wait_s=self.value("longest_wait"),
-                    start_delay_s=self.value("start_delay"),
-                    paused=self.value("paused"),
-                    from_s=self.value("seek_to"),
-                ),
+                self.value,
                 self.get_logger(),
                 subscribers=subscribed if self._consumer is None else self._consumer.subscription_count,
                 publish=self._publish_records,

@@ -273,7 +273,7 @@ class Locator(ManagedNode):
             picture = self._outputs_of(tag).picture
             heard = tag.locator.heard()
             shown += markers.tag_markers(picture, heard, fleet.anchors, self._map, number, now_ns)
-        publisher.publish(markers.array(shown))
+        publisher.publish(MarkerArray(markers=shown))
 
     def _on_height(self, message: PoseWithCovarianceStamped) -> None:
         # If there are several tags, it is unknown whose height this is.

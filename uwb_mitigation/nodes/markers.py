@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import Point, Pose, Quaternion, Vector3
 from std_msgs.msg import ColorRGBA
-from visualization_msgs.msg import Marker, MarkerArray
+from visualization_msgs.msg import Marker
 
 from uwb_mitigation.measurement import Status
 from uwb_mitigation.nodes import topics
@@ -87,11 +87,6 @@ def tag_markers(
     trail.scale.x = 0.03
     trail.points = [_point(place) for place in picture.trail]
     return [rays, ellipse, trail]
-
-
-def array(markers: list[Any]) -> MarkerArray:
-    """The message."""
-    return MarkerArray(markers=markers)
 
 
 def _marker(namespace: str, number: int, kind: int, frame: str, stamp_ns: int, colour: ColorRGBA) -> Any:

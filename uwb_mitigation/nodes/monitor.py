@@ -23,7 +23,7 @@ from uwb_mitigation.measurement import CorrectedRange, Status, Truth
 from uwb_mitigation.nodes import topics
 from uwb_mitigation.nodes.processes import watching
 from uwb_mitigation.nodes.spinning import stop_event
-from uwb_mitigation.viewer.scene import History, Pair, Sample, Truths
+from uwb_mitigation.viewer.scene import MAX_TRUTHS, History, Latest, Pair, Sample
 
 REFRESH_HZ = 5
 
@@ -50,7 +50,7 @@ class Tally:
         self.statuses: Counter[Status] = Counter()
         self.errors: dict[str, ErrorSums] = {}
         self._latencies_s: deque[float] = deque(maxlen=MAX_LATENCIES)
-        self._truths = Truths()
+        self._truths: Latest[Key, Truth] = Latest(MAX_TRUTHS)
 
     @property
     def missing(self) -> int:
@@ -73,7 +73,7 @@ class Tally:
 
     def add_corrected(self, key: Key, corrected: CorrectedRange, arrival_s: float) -> None:
         """Add a corrected range; `arrival_s` is on the clock of its stamp."""
-        sample = Sample.of(arrival_s, corrected, self._truths.take(key))
+        sample = Sample.of(arrival_s, corrected, self._truths.pop(key, None))
         self.corrected += 1
         self.statuses[sample.status] += 1
         self._latencies_s.append(arrival_s - key.stamp_ns / 1e9)

@@ -7,7 +7,6 @@ import time
 import traceback
 from collections import deque
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from rclpy.clock import Clock, ClockType
@@ -76,33 +75,6 @@ class Pace:
         return self._clock.clock_type == ClockType.ROS_TIME and bool(self._clock.ros_time_is_active)
 
 
-@dataclass(frozen=True, slots=True)
-class ReplayOptions:
-    """How a recording is replayed.
-
-    Attributes:
-        rate: speed relative to the recording.
-        loop: start again at the end.
-        longest_pause_s: longer pauses of the recording are shortened to this.
-        recorded_stamps: keep the recorded stamps and drive `/clock`, instead of stamps on the node's clock.
-        wanted_subscribers: wait for this number of subscribers, but not longer than `longest_wait_s`.
-        start_delay_s: wait this long after that, until the rest of the graph is connected; negative: 3 s, or 0 if
-            several subscribers are wanted.
-        paused: start paused.
-        from_s: start this long after the first record.
-    """
-
-    rate: float = 1.0
-    loop: bool = False
-    longest_pause_s: float = 1e9
-    recorded_stamps: bool = False
-    wanted_subscribers: int = 0
-    longest_wait_s: float = 0.0
-    start_delay_s: float = 0.0
-    paused: bool = False
-    from_s: float = 0.0
-
-
 class ReplayFeed:
     """Publishes the records of a source when they are due, from its own thread; implements `Feed`.
 
@@ -112,10 +84,11 @@ class ReplayFeed:
     Args:
         source: closed by the caller.
         clock: the node's clock; simulated time paces the replay, otherwise a steady clock does.
+        value: returns the value of a parameter of the driver. With `publish_clock`, stamps are the recorded ones.
         logger: with `info` and `warning`, as rclpy's.
         subscribers: returns the number of subscribers.
         publish: publishes [(record, stamp_ns), ...].
-        on_time: with `recorded_stamps`, called with the recorded time (ns) at every tick, to drive `/clock`.
+        on_time: with `publish_clock`, called with the recorded time (ns) at every tick, to drive `/clock`.
         on_end: called once from the playing thread with the error or None, unless `stop` came first.
 
     Attributes:
@@ -127,7 +100,7 @@ class ReplayFeed:
         self,
         source: Source,
         clock: Clock,
-        options: ReplayOptions,
+        value: Callable[[str], Any],
         logger: Any,
         *,
         subscribers: Callable[[], int],
@@ -139,17 +112,16 @@ class ReplayFeed:
         self.late_ns = 0
         self._source = source
         self._clock = Pace(clock)
-        self._options = options
+        self._value = value
         self._logger = logger
         self._subscribers = subscribers
         self._publish = publish
         self._on_time = on_time
         self._on_end = on_end
-        self._wanted_rate = self._rate = options.rate
-        self._wants_pause, self._paused = options.paused, False
-        self._seeks: deque[int] = deque()
-        if options.from_s:
-            self._seeks.append(int(options.from_s * 1e9))
+        self._recorded_stamps = value("publish_clock")
+        self._wanted_rate = self._rate = float(value("rate"))
+        self._wants_pause, self._paused = value("paused"), False
+        self._seeks = deque([int(value("seek_to") * 1e9)])
         self._late: list[tuple[Record, int]] = []
         # The played time `_base_ns` is due at `_base_clock_ns`.
         self._base_ns = self._base_clock_ns = 0
@@ -215,18 +187,16 @@ class ReplayFeed:
 
     def _wait_for_subscribers(self) -> None:
         """Wait until enough subscribers are there and the graph had time to connect, or the wait is over."""
-        options, started_s = self._options, time.monotonic()
-        while (count := self._subscribers()) < options.wanted_subscribers:
-            if time.monotonic() - started_s >= options.longest_wait_s:
-                self._logger.warning(
-                    f"{count} of {options.wanted_subscribers} subscribers have come; playing all the same"
-                )
+        wanted, started_s = self._value("wait_for_subscribers"), time.monotonic()
+        while (count := self._subscribers()) < wanted:
+            if time.monotonic() - started_s >= self._value("longest_wait"):
+                self._logger.warning(f"{count} of {wanted} subscribers are there; the replay starts")
                 return
             if self._stopping.wait(TICK_S):
                 return
-        delay_s = options.start_delay_s
+        delay_s = self._value("start_delay")
         if delay_s < 0.0:
-            delay_s = 0.0 if options.wanted_subscribers > 1 else ANNOUNCEMENT_S
+            delay_s = 0.0 if wanted > 1 else ANNOUNCEMENT_S
         self._stopping.wait(delay_s)
 
     def _play(self) -> None:
@@ -235,7 +205,7 @@ class ReplayFeed:
         while not self._stopping.is_set():
             from_ns = self._seeks.popleft() if self._seeks else 0
             found, due_ns = self._play_from(from_ns, due_ns)
-            if not self._seeks and not (self._options.loop and found):
+            if not self._seeks and not (self._value("loop") and found):
                 return
 
     def _play_from(self, from_ns: int, due_ns: int) -> tuple[bool, int]:
@@ -246,7 +216,7 @@ class ReplayFeed:
         """
         first_ns: int | None = None
         last_ns: int | None = None
-        pause_ns, longest_ns = 1, int(self._options.longest_pause_s * 1e9)
+        pause_ns, longest_ns = 1, int(self._value("longest_pause") * 1e9)
         try:
             for record in self._source:
                 recorded_ns = record.measurement.stamp_ns
@@ -265,7 +235,7 @@ class ReplayFeed:
                     return True, min(due_ns, self._position_ns(self._clock.now_ns()))
                 self.late_ns = late_ns
                 stamp_ns = recorded_ns
-                if not self._options.recorded_stamps:
+                if not self._recorded_stamps:
                     stamp_ns = self._clock.stamp_ns(self._clock_ns(due_ns))
                 self._late.append((record, stamp_ns))
                 if late_ns < LATE_NS or len(self._late) == BATCH:
@@ -293,7 +263,7 @@ class ReplayFeed:
                 self._base_ns, self._base_clock_ns = min(self._position_ns(now_ns), due_ns), now_ns
                 self._paused, self._rate = self._wants_pause, self._wanted_rate
             ahead_ns = self._clock_ns(due_ns) - now_ns
-            if self._options.recorded_stamps:
+            if self._recorded_stamps:
                 # Simulated recordings start at 0: there is no time before it.
                 self._on_time(max(recorded_ns - int(max(ahead_ns, 0) * self._rate), 0))
             if ahead_ns <= 0 and not self._paused:

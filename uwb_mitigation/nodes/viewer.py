@@ -106,7 +106,7 @@ class Viewer(ManagedNode):
         self._server = ViewerServer(self._view, self.value("host"), self.value("port"), origins)
         if self._anchors is not None and self._anchors_out is not None:
             shown = markers.anchor_markers(self._anchors, self.value("map_frame"), self.now_ns())
-            self._anchors_out.publish(markers.array(shown))
+            self._anchors_out.publish(MarkerArray(markers=shown))
         self.get_logger().info(f"the page is at {self._server.url}")
 
     def end(self) -> None:
@@ -120,7 +120,7 @@ class Viewer(ManagedNode):
         self._others, self._ranges, self._anchors_out, self._range_node = {}, {}, None, None
 
     def describe(self) -> diagnostics.Description:
-        pages = 0 if self._view is None else self._view.drawing.pages
+        pages = 0 if self._view is None else self._view.pages
         url = "" if self._server is None else self._server.url
         facts: dict[str, object] = {"url": url, "pages": pages, "malformed": self._feed.malformed}
         return url, diagnostics.OK, f"serving {pages} page{'' if pages == 1 else 's'}", facts
@@ -160,7 +160,7 @@ class Viewer(ManagedNode):
         if self._view is not None:
             self._view.missing = self._missing()
         # CIRs are most of the traffic, and a pipeline publishes none without a subscriber.
-        if self._view is not None and self._view.drawing.pages:
+        if self._view is not None and self._view.pages:
             self._subscribe_ranges(RangeCir, topics.RANGE_RAW)
         elif self._range_node is not None and topics.RANGE_RAW in self._ranges:
             self._range_node.destroy_subscription(self._ranges.pop(topics.RANGE_RAW))

@@ -14,10 +14,11 @@ import numpy as np
 
 from uwb_mitigation.bag.codec import Key, decode_corrected, decode_range, decode_truth
 from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.measurement import CorrectedRange, RangeMeasurement
+from uwb_mitigation.measurement import CorrectedRange, RangeMeasurement, Truth
 from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.viewer.scene import (
     MAX_ID_DIGITS,
+    MAX_TRUTHS,
     MAX_WITHOUT_TRUTH,
     AnchorPlace,
     Latest,
@@ -26,7 +27,6 @@ from uwb_mitigation.viewer.scene import (
     Sample,
     Scene,
     Trace,
-    Truths,
 )
 
 Decoded = TypeVar("Decoded")
@@ -46,12 +46,12 @@ class Feed:
         self.malformed = 0
         self.scene = scene
         self._lock = lock
-        self._truths = Truths()
+        self._truths: Latest[Key, Truth] = Latest(MAX_TRUTHS)
         self._without_truth: Latest[Key, Sample] = Latest(MAX_WITHOUT_TRUTH)
 
     def clear(self) -> None:
         """Remove everything except the anchors."""
-        self._truths = Truths()
+        self._truths.clear()
         self._without_truth.clear()
         with self._lock:
             self.scene.clear()
@@ -85,7 +85,7 @@ class Feed:
             self.corrected(*decoded)
 
     def corrected(self, key: Key, corrected: CorrectedRange) -> None:
-        truth = self._truths.take(key)
+        truth = self._truths.pop(key, None)
         sample = Sample.of(key.stamp_ns / 1e9, corrected, truth)
         with self._lock:
             self.scene.add_sample((key.anchor_id, key.tag_id), sample)

@@ -45,8 +45,8 @@ if TYPE_CHECKING:
     from uwb_mitigation.viewer.playback import BagPlayer
 
 REFRESH_S = 0.1
-SHARE = 0.3
-"""Share of a core for drawing all open pages: above it they are drawn less often."""
+FAST_PAGES = 3
+"""Number of pages that are drawn every `REFRESH_S`; more pages are drawn less often."""
 
 COLOURS = {
     Status.OK: "#15803d",
@@ -74,26 +74,6 @@ _TEMPLATES = jinja2.Environment(loader=jinja2.FileSystemLoader(Path(__file__).pa
 
 
 @dataclass(slots=True)
-class Drawing:
-    """What drawing costs, over all pages of a server.
-
-    Attributes:
-        pages: number of open pages.
-        cost_s: processor time of one drawing, a running mean.
-    """
-
-    pages: int = 0
-    cost_s: float = 0.0
-
-    def pause_s(self) -> float:
-        """Return the time from one drawing of a page to the next."""
-        return max(REFRESH_S, self.cost_s * self.pages / SHARE)
-
-    def drawn(self, took_s: float) -> None:
-        self.cost_s += 0.1 * (took_s - self.cost_s)
-
-
-@dataclass(slots=True)
 class View:
     """What all pages of a server show.
 
@@ -102,6 +82,7 @@ class View:
         window: number of samples that the network reads.
         player: of a recording; None: live.
         missing: the reasons for an empty page.
+        pages: number of open pages.
     """
 
     scene: Scene
@@ -110,7 +91,7 @@ class View:
     window: int = 157
     player: BagPlayer | None = None
     missing: Missing = field(default_factory=Missing)
-    drawing: Drawing = field(default_factory=Drawing)
+    pages: int = 0
 
 
 class Page:
@@ -150,7 +131,7 @@ class Page:
         self.draw()
         # Last: a session that could not be opened does not report its end.
         document.on_session_destroyed(self._on_closed)
-        view.drawing.pages += 1
+        view.pages += 1
 
     def tick(self) -> None:
         """Draw if it is time and the page is not paused."""
@@ -161,10 +142,8 @@ class Page:
             return
         if now_s < self._due_s:
             return
-        before_s = time.thread_time()
         self.draw()
-        self._view.drawing.drawn(time.thread_time() - before_s)
-        self._due_s = now_s + self._view.drawing.pause_s() - 0.5 * REFRESH_S
+        self._due_s = now_s + REFRESH_S * (max(1.0, self._view.pages / FAST_PAGES) - 0.5)
 
     def draw(self) -> None:
         """Update every model from the scene."""
@@ -424,7 +403,7 @@ class Page:
             self.draw()
 
     def _on_closed(self, _context: Any) -> None:
-        self._view.drawing.pages -= 1
+        self._view.pages -= 1
 
 
 def _no_data(scene: Scene, history: History) -> str:

@@ -17,7 +17,6 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.bag.codec import Key
 from uwb_mitigation.bag.poses import tag_frame
 from uwb_mitigation.measurement import Cir, CorrectedRange, Encoding, Status, Truth
 
@@ -105,22 +104,6 @@ class Sample:
         if truth is not None:
             sample.true_m, sample.label = truth.range_m, truth.label
         return sample
-
-
-class Truths:
-    """Truths that wait for their corrected ranges; bounded, since those may be lost."""
-
-    def __init__(self) -> None:
-        self._kept: Latest[Key, Truth] = Latest(MAX_TRUTHS)
-
-    def __len__(self) -> int:
-        return len(self._kept)
-
-    def add(self, key: Key, truth: Truth) -> None:
-        self._kept.add(key, truth)
-
-    def take(self, key: Key) -> Truth | None:
-        return self._kept.pop(key, None)
 
 
 class Trace:
