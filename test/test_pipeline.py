@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import signal
-
 import numpy as np
 import pytest
 
@@ -60,11 +58,3 @@ def test_several_pipelines_side_by_side_keep_to_themselves(ros: Ros):
     ros.spin_until(lambda: all(len(messages) == 200 for messages in received.values()))
     for messages in received.values():
         assert [m.sequence for m in messages] == list(range(200))
-
-
-def test_a_signal_ends_it_cleanly(ros: Ros):
-    received = ros.collect(RangeCorrected, CORRECTED)
-    pipeline = ros.start("pipeline", "simulated_rate:=200.0", "start_delay:=0.2")
-    ros.spin_until(lambda: len(received) > 20)
-    assert pipeline.signal(signal.SIGINT) == 0, pipeline.output
-    assert "Traceback" not in pipeline.output

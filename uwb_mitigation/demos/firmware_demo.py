@@ -33,24 +33,8 @@ from uwb_mitigation.nodes.processes import Probe, watching
 from uwb_mitigation.sources.opening import open_recording
 from uwb_mitigation.sources.simulated import SimulatedSource
 
-READY_TIMEOUT_S = 60.0
 TIMEOUT_S = 60.0
-"""After this time without a corrected range, the rest counts as lost."""
-
-
-class BoardListener:
-    """Keeps what the board corrected, and whether the driver has it in mode DEVICE."""
-
-    def __init__(self, probe: Probe) -> None:
-        self.ready = threading.Event()
-        self.corrected: list[RangeCorrected] = []
-        probe.subscribe(RangeCorrected, topics.RANGE_CORRECTED, self.corrected.append)
-        probe.subscribe(DiagnosticArray, topics.DIAGNOSTICS, self._on_diagnostics)
-
-    def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        facts = {value.key: value.value for status in message.status for value in status.values}
-        if facts.get("mode") == "device":
-            self.ready.set()
+"""Longest wait for mode DEVICE, and for the next corrected range: then the rest counts as lost."""
 
 
 def numbered(recording: Path | None, count: int) -> list[RangeMeasurement]:
@@ -69,73 +53,52 @@ def numbered(recording: Path | None, count: int) -> list[RangeMeasurement]:
     return held
 
 
-def differences(expected: CorrectedRange, message: RangeCorrected) -> bool:
-    """Whether board and host differ in any bit, or the message does not say that the board corrected."""
-    values = [expected.range_m, expected.correction_m, expected.variance_m2]
-    computed = [message.range, message.correction, message.variance]
+def equals(expected: CorrectedRange, message: RangeCorrected) -> bool:
+    """Return whether a range that the board has corrected has the bits of the host's."""
+    values = (expected.range_m, expected.correction_m, expected.variance_m2)
+    computed = (message.range, message.correction, message.variance)
     first, second = (np.array(row, np.float32).tobytes() for row in (values, computed))
-    same = first == second and message.status == int(expected.status)
-    return not (same and message.source == Origin.DEVICE and message.model_id == expected.model_id)
-
-
-def play(
-    board: EmulatedFirmware, listener: BoardListener, measured: Sequence[RangeMeasurement], console: Console
-) -> None:
-    """Measure with the board's radio, and wait until all has come back or nothing more does."""
-    with console.status("waiting for the driver to bring the board into mode DEVICE") as status:
-
-        def show() -> None:
-            status.update(f"{len(listener.corrected)} of {len(measured)} ranges corrected")
-
-        if not listener.ready.wait(READY_TIMEOUT_S):
-            raise UwbMitigationError("the driver has not brought the board into mode DEVICE")
-        for measurement in measured:
-            board.measure(measurement)
-            show()
-        seen, since = -1, time.monotonic()
-        while len(listener.corrected) < len(measured) and time.monotonic() - since < TIMEOUT_S:
-            if len(listener.corrected) != seen:
-                seen, since = len(listener.corrected), time.monotonic()
-                show()
-            time.sleep(0.05)
-
-
-def summarise(
-    console: Console,
-    host: Mitigation,
-    measured: Sequence[RangeMeasurement],
-    received: Sequence[RangeCorrected],
-) -> list[str]:
-    """Print what came back; return the failures: ranges that are lost, doubled or not equal to the bit."""
-    expected = host.correct(measured)
-    arrived = {message.sequence: message for message in received}
-    different = sum(
-        differences(result, arrived[sequence])
-        for sequence, result in enumerate(expected)
-        if sequence in arrived
-    )
-    lost = len(measured) - len(arrived)
-    counts = Counter(result.status.name for result in expected)
-    statuses = ", ".join(f"{count} {name}" for name, count in counts.items())
-    console.print(f"{len(measured)} ranges measured, {len(arrived)} corrected by the board, {lost} lost")
-    console.print(
-        f"{len(arrived) - different} equal to the host's to the bit, {different} different ({statuses})"
-    )
-    good = not lost and not different and len(received) == len(arrived)
-    return [] if good else ["board and host differ"]
+    same_origin = message.source == Origin.DEVICE and message.model_id == expected.model_id
+    return first == second and message.status == int(expected.status) and same_origin
 
 
 def run(console: Console, measured: Sequence[RangeMeasurement]) -> list[str]:
-    """Start board and driver, play, compare; return the failures."""
+    """Start board and driver, measure with the board's radio, and compare; return the failures."""
     bundle = load_bundle(default_model_path())
     console.print(f"building the firmware with model {bundle.name}, id {bundle.model_id:08x}")
+    corrected: list[RangeCorrected] = []
+    ready = threading.Event()
+
+    def on_diagnostics(message: DiagnosticArray) -> None:
+        if any(v.key == "mode" and v.value == "device" for status in message.status for v in status.values):
+            ready.set()
+
     with EmulatedFirmware(bundle) as board, watching(Probe) as probe:
         console.print(f"emulated Cortex-M4 on {board.port}")
-        listener = BoardListener(probe)
-        with Nodes() as nodes:
+        probe.subscribe(RangeCorrected, topics.RANGE_CORRECTED, corrected.append)
+        probe.subscribe(DiagnosticArray, topics.DIAGNOSTICS, on_diagnostics)
+        with Nodes() as nodes, console.status("waiting for the corrected ranges"):
             nodes.start("driver", "source:=serial", f"port:={board.port}", "mode:=device")
-            play(board, listener, measured, console)
-    return nodes.failures + summarise(console, Mitigation(bundle), measured, listener.corrected)
+            if not ready.wait(TIMEOUT_S):
+                raise UwbMitigationError("the driver has not brought the board into mode DEVICE")
+            for measurement in measured:
+                board.measure(measurement)
+            seen, since_s = -1, time.monotonic()
+            while len(corrected) < len(measured) and time.monotonic() - since_s < TIMEOUT_S:
+                if len(corrected) != seen:
+                    seen, since_s = len(corrected), time.monotonic()
+                time.sleep(0.05)
+    expected = Mitigation(bundle).correct(measured)
+    arrived = {message.sequence: message for message in corrected}
+    equal = sum(equals(expected[sequence], message) for sequence, message in arrived.items())
+    lost, different = len(measured) - len(arrived), len(arrived) - equal
+    statuses = Counter(result.status.name for result in expected)
+    told = ", ".join(f"{count} {name}" for name, count in statuses.items())
+    console.print(f"{len(measured)} ranges measured, {len(arrived)} corrected by the board, {lost} lost")
+    console.print(f"{equal} equal to the host's to the bit, {different} different ({told})")
+    if lost or different or len(corrected) != len(arrived):
+        nodes.failures.append("board and host differ")
+    return nodes.failures
 
 
 def firmware_demo(

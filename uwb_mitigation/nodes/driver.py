@@ -6,11 +6,12 @@ that runs the model itself also publishes on `/uwb/range_corrected`.
 
 from __future__ import annotations
 
+import re
 import threading
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from nav_msgs.msg import Odometry
@@ -40,6 +41,9 @@ from uwb_mitigation.nodes.parameter_tables import DRIVER
 from uwb_mitigation.nodes.replay import ReplayFeed
 from uwb_mitigation.offsets import NO_OFFSETS, read_offsets
 from uwb_mitigation.sources.source import Source
+
+if TYPE_CHECKING:
+    from uwb_mitigation.nodes.mitigator import Mitigator
 
 _NO_CIR = Cir(np.zeros(0, np.int16))
 
@@ -72,22 +76,9 @@ def _model_id(digits: str) -> int | None:
     """Raise ParameterError unless `digits` is empty or eight hexadecimal digits."""
     if not digits:
         return None
-    try:
-        if len(digits) == 8:
-            return int(digits, 16)
-    except ValueError:
-        pass
+    if re.fullmatch("[0-9a-fA-F]{8}", digits):
+        return int(digits, 16)
     raise ParameterError(f"parameter board_model = {digits!r}", valid="eight hexadecimal digits, or empty")
-
-
-class Consumer(Protocol):
-    """Takes measurements in the same process: the mitigator of a pipeline."""
-
-    def correct(self, measurements: Sequence[RangeMeasurement]) -> None: ...
-
-    def subscription_count(self) -> int: ...
-
-    def wait_for_all_acked(self, timeout: Duration) -> None: ...
 
 
 class Driver(ManagedNode):
@@ -97,7 +88,7 @@ class Driver(ManagedNode):
 
     Args:
         ended: set when a replay has ended.
-        consumer: takes the measurements; `/uwb/range_raw` is then published only if it has subscribers.
+        consumer: in the same process, takes the measurements; `/uwb/range_raw` is then published only if it has subscribers.
         foreign: see `ManagedNode`.
 
     Attributes:
@@ -105,7 +96,7 @@ class Driver(ManagedNode):
     """
 
     def __init__(
-        self, ended: threading.Event, consumer: Consumer | None = None, foreign: Collection[str] = ()
+        self, ended: threading.Event, consumer: Mitigator | None = None, foreign: Collection[str] = ()
     ) -> None:
         super().__init__("driver", DRIVER, foreign)
         self._ended = ended

@@ -40,6 +40,9 @@ EVENT_TIMEOUT_S = 0.5
 PREFIX = "radio."
 """Prefix of the parameters of radios."""
 
+_OFFSETS, _RADIO = "the offsets are not set", "the radio's settings are not used"
+"""What a board may refuse."""
+
 _STATES = {
     RadioState.ABSENT: "no DW1000 answers the board: check wiring and supply",
     RadioState.BUS: "the board's SPI fails",
@@ -150,15 +153,16 @@ class BoardFeed(LiveFeed):
         self._problem = self._logged = ""
         self._checked_s = 0.0
         self._on_correction = on_correction
-        self._refused_offsets = self._refused_radio = ""
+        # What the board has refused, and why.
+        self._refused: dict[str, str] = {}
 
     def apply(self, changed: Collection[str], value: Value, offsets: Offsets) -> None:
         """Send new settings to the board."""
         if any(name.startswith(PREFIX) for name in changed):
-            self._refused_radio = ""
+            self._refused.pop(_RADIO, None)
             self._port.set_radio(settings_of(value))
         if {"mode", "offsets"} & set(changed) and value("mode") != "host":
-            self._refused_offsets = ""
+            self._refused.pop(_OFFSETS, None)
             self._port.set_offsets(offsets)
         if "mode" in changed:
             self._port.set_mode(Mode[value("mode").upper()])
@@ -188,19 +192,14 @@ class BoardFeed(LiveFeed):
             facts |= {f"board: {name}": value for name, value in asdict(self._status).items()}
         if radio is not None:
             hardware += f", radio {format_id(radio.address)}"
-        problem, warning = report.problem, ""
-        if not problem and self._refused_offsets:
-            problem = f"the offsets are not set: {self._refused_offsets}"
-        if not problem and self._refused_radio:
-            problem = f"the radio's settings are not used: {self._refused_radio}"
+        problems = [report.problem, *(f"{what}: {text}" for what, text in self._refused.copy().items())]
+        warning = ""
         if status is not None:
             facts |= radio_facts(radio, status, "radio: ") | anchor_facts(status)
-            problem, warning = problem or radio_problem(status), radio_warning(radio, status)
-        if problem:
-            return hardware, diagnostics.ERROR, problem, facts
-        if warning:
-            return hardware, diagnostics.WARN, warning, facts
-        return hardware, diagnostics.OK, "connected", facts
+            problems.append(_STATES.get(status.state, ""))
+            warning = radio_warning(radio, status)
+        problem = next(filter(None, problems), "")
+        return hardware, *_level(problem, warning, "connected"), facts
 
     def check(self, port: BoardPort) -> None:
         """Log a problem once if it is older than `EVENT_TIMEOUT_S`; a handshake takes less."""
@@ -230,10 +229,11 @@ class BoardFeed(LiveFeed):
                     log.info(f"the board's radio {format_id(settings.address)}: {settings_text(settings)}")
                 self._radio = settings
             case RadioRefused(text=text):
-                self._refused_radio = text
-                log.error(f"the radio's settings are not used: {text}")
+                self._refused[_RADIO] = text
+                log.error(f"{_RADIO}: {text}")
             case Connected(hello=hello):
-                self._refused_offsets = self._refused_radio = self._logged = ""
+                self._refused.clear()
+                self._logged = ""
                 self._radio = self._radio_status = None
                 model, mode = diagnostics.model_id(hello.model_id), hello.mode.name
                 log.info(f"connected to board {format_id(hello.board_id)}, model {model}, mode {mode}")
@@ -250,8 +250,8 @@ class BoardFeed(LiveFeed):
             case ModeRefused(mode=mode, wanted=wanted):
                 log.warning(f"the board stays in mode {mode.name} instead of {wanted.name}: has it a model?")
             case OffsetsRefused(text=text):
-                self._refused_offsets = text
-                log.error(f"the board's corrections are not published: the offsets are not set: {text}")
+                self._refused[_OFFSETS] = text
+                log.error(f"the board's corrections are not published: {_OFFSETS}: {text}")
             case Log(level=level, text=text):
                 # rclpy binds the severity to the line of code.
                 if level >= LogLevel.WARNING:
@@ -268,25 +268,17 @@ class RadioFeed(LiveFeed):
         on_range, now_ns, logger: see `LiveFeed`.
     """
 
-    def __init__(
-        self,
-        ports: Sequence[RadioPort],
-        on_range: Callable[[RangeMeasurement], None],
-        now_ns: Callable[[], int],
-        logger: Any,
-    ) -> None:
-        super().__init__(ports, on_range, now_ns, logger)
-        self._radios = list(ports)
+    _ports: Sequence[RadioPort]
 
     def apply(self, changed: Collection[str], value: Value, offsets: Offsets) -> None:
         """Use new radio settings from the next exchange on."""
         if any(name.startswith(PREFIX) for name in changed):
             settings = settings_of(value)
-            for number, port in enumerate(self._radios):
+            for number, port in enumerate(self._ports):
                 port.set_radio(_role_of(settings, number))
 
     def describe(self) -> Description:
-        reports = [port.report() for port in self._radios]
+        reports = [port.report() for port in self._ports]
         first = reports[0]
         facts: dict[str, object] = {"ranges published": self.ranges}
         facts |= self.meter.facts()
@@ -296,14 +288,11 @@ class RadioFeed(LiveFeed):
             facts |= radio_facts(report.settings, report.status, prefix)
         facts |= anchor_facts(first.status)
         hardware = "no radio" if first.settings is None else f"radio {format_id(first.settings.address)}"
-        if problems := [report.problem for report in reports if report.problem]:
-            return hardware, diagnostics.ERROR, "; ".join(problems), facts
-        if warnings := [
-            text for report in reports if (text := radio_warning(report.settings, report.status))
-        ]:
-            return hardware, diagnostics.WARN, warnings[0], facts
-        tag = first.settings is not None and first.settings.role is Role.TAG
-        return hardware, diagnostics.OK, "ranging" if tag else "answering", facts
+        problem = "; ".join(report.problem for report in reports if report.problem)
+        warnings = (radio_warning(report.settings, report.status) for report in reports)
+        is_tag = first.settings is not None and first.settings.role is Role.TAG
+        level = _level(problem, next(filter(None, warnings), ""), "ranging" if is_tag else "answering")
+        return hardware, *level, facts
 
     def handle(self, event: RadioEvent, port: RadioPort) -> None:
         match event:
@@ -403,9 +392,11 @@ def settings_text(settings: RadioSettings) -> str:
     )
 
 
-def radio_problem(status: RadioStatus) -> str:
-    """Return what keeps a board's radio from ranging; empty if there is nothing."""
-    return _STATES.get(status.state, "")
+def _level(problem: str, warning: str, ok: str) -> tuple[bytes, str]:
+    """Return level and message of a diagnostic status."""
+    if problem:
+        return diagnostics.ERROR, problem
+    return (diagnostics.WARN, warning) if warning else (diagnostics.OK, ok)
 
 
 def radio_warning(settings: RadioSettings | None, status: RadioStatus) -> str:

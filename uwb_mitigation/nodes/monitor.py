@@ -5,10 +5,10 @@ from __future__ import annotations
 import contextlib
 import math
 import sys
-from collections import Counter, deque
-from dataclasses import dataclass
+from collections import Counter, defaultdict, deque
 
 import numpy as np
+from numpy.typing import NDArray
 from rclpy.context import Context
 from rclpy.node import Node
 from rich.console import Console, Group
@@ -31,24 +31,19 @@ MAX_LATENCIES = 100_000
 """The latest latencies that are summarised: a monitor may run for days."""
 
 
-@dataclass(slots=True)
-class ErrorSums:
-    """Sums of absolute errors before and after mitigation, over ranges whose truth is known."""
-
-    n: int = 0
-    raw_m: float = 0.0
-    corrected_m: float = 0.0
-
-
 class Tally:
-    """Counts, latencies and errors of the received ranges, by pair."""
+    """Counts, latencies and errors of the received ranges, by pair.
+
+    Attributes:
+        errors: of ranges whose truth is known, {label: (number, sum of raw, sum of corrected absolute errors in m)}.
+    """
 
     def __init__(self) -> None:
         self.pairs: dict[Pair, History] = {}
         self.raw = 0
         self.corrected = 0
         self.statuses: Counter[Status] = Counter()
-        self.errors: dict[str, ErrorSums] = {}
+        self.errors: defaultdict[str, NDArray[np.float64]] = defaultdict(lambda: np.zeros(3))
         self._latencies_s: deque[float] = deque(maxlen=MAX_LATENCIES)
         self._truths: Latest[Key, Truth] = Latest(MAX_TRUTHS)
 
@@ -56,13 +51,6 @@ class Tally:
     def missing(self) -> int:
         """Number of raw ranges without a corrected range; 0 if the board corrects and sends no raw ranges."""
         return max(self.raw - self.corrected, 0)
-
-    @property
-    def total(self) -> ErrorSums:
-        parts = self.errors.values()
-        return ErrorSums(
-            sum(e.n for e in parts), sum(e.raw_m for e in parts), sum(e.corrected_m for e in parts)
-        )
 
     def latency_ms(self, percentile: float) -> float:
         """Return a percentile of the time from stamp to reception; NaN without data."""
@@ -79,10 +67,8 @@ class Tally:
         self._latencies_s.append(arrival_s - key.stamp_ns / 1e9)
         self.pairs.setdefault((key.anchor_id, key.tag_id), History()).add(sample, arrival_s)
         if math.isfinite(sample.true_m) and math.isfinite(sample.raw_m):
-            errors = self.errors.setdefault(sample.label, ErrorSums())
-            errors.n += 1
-            errors.raw_m += abs(sample.raw_m - sample.true_m)
-            errors.corrected_m += abs(sample.range_m - sample.true_m)
+            raw_m, corrected_m = abs(sample.raw_m - sample.true_m), abs(sample.range_m - sample.true_m)
+            self.errors[sample.label] += (1, raw_m, corrected_m)
 
 
 class Monitor(Node):
@@ -153,12 +139,14 @@ def summary(tally: Tally) -> Group:
         table = Table(title="mean absolute error, m", title_justify="left")
         for column in ("label", "ranges", "raw MAE", "corrected MAE", "ratio"):
             table.add_column(column, justify="left" if column == "label" else "right")
-        for label, errors in [*sorted(tally.errors.items()), ("all", tally.total)]:
+        for label, errors in [*sorted(tally.errors.items()), ("all", sum(tally.errors.values()))]:
             if label == "all":
                 table.add_section()
-            ratio = errors.corrected_m / errors.raw_m if errors.raw_m else math.nan
-            means = (f"{value / errors.n:.3f}" for value in (errors.raw_m, errors.corrected_m))
-            table.add_row(label or "-", str(errors.n), *means, f"{ratio:.2f}")
+            n, raw_m, corrected_m = np.asarray(errors).tolist()
+            ratio = corrected_m / raw_m if raw_m else math.nan
+            table.add_row(
+                label or "-", f"{n:.0f}", f"{raw_m / n:.3f}", f"{corrected_m / n:.3f}", f"{ratio:.2f}"
+            )
         lines.append(table)
     return Group(*lines)
 
