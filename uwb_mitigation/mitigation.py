@@ -26,6 +26,7 @@ MAX_RANGE_M = 1e6
 _STATUSES = {int(status): status for status in Status}
 # NumPy takes microseconds to convert a member of an enumeration.
 _INFINITE = np.float32(np.inf)
+_ALL = slice(None)
 _OK, _NO_CIR, _BAD_CIR, _OUT_OF_DISTRIBUTION, _MODEL_ERROR = _STATUSES
 
 
@@ -57,10 +58,7 @@ class Grader:
         """Return the OOD score of n measurements, float32 (n,); 0 if the card has no bands."""
         if self._strangeness is None:
             return np.zeros(len(windows), np.float32)
-        numbers = (range_m, rx_power_dbm, first_path_power_dbm)
-        with np.errstate(over="ignore"):  # A value beyond float32 counts as infinite.
-            reported = [values.astype(np.float32, copy=False) for values in numbers]
-        values = features(windows, self._scaling, *reported)
+        values = features(windows, self._scaling, range_m, rx_power_dbm, first_path_power_dbm)
         return self._strangeness.score(values)
 
     def grade(
@@ -69,7 +67,7 @@ class Grader:
         """Return corrections (m) and variances (m^2) of predicted errors that `passes` accepts, float32 (n,)."""
         correction: NDArray[np.float32] = predicted
         variance: NDArray[np.float32] = self._variance + self._variance_per_m2 * (predicted * predicted)
-        if self._strangeness is not None and (score > 0.0).any():
+        if self._strangeness is not None and np.count_nonzero(score > 0.0):
             shrunk = self._known_offset + (np.float32(1.0) - score) * (predicted - self._known_offset)
             correction = np.where(score > 0.0, shrunk, predicted)
             variance = variance + np.maximum(score, np.float32(0.0)) * self._variance_uncorrected
@@ -170,23 +168,22 @@ class Mitigation(Backend):
         range_m = _less(ranges.range_m, offset)
         valid = _valid(range_m)
         powers = (ranges.rx_power_dbm, ranges.first_path_power_dbm)
-        prior = prior_of.predict_m(*powers)
+        predicted = prior_of.predict_m(*powers)
         faults, windows = self.bundle.preprocessing.apply(ranges)
-        readable = (faults == 0) & np.isfinite(prior) & valid
-        status = np.zeros(n, np.uint8)
-        if not readable.all():
-            usable = faults == 0
-            status[~np.isfinite(prior)] = (
-                _BAD_CIR  # CirFault.NO_POWER, which the preprocessing does not check
-            )
+        usable, known = faults == 0, np.isfinite(predicted)
+        readable = usable & known & valid
+        rows = _rows(readable)
+        status, score = np.zeros(n, np.uint8), np.zeros(n, np.float32)
+        if rows is not _ALL:
+            # CirFault.NO_POWER, which the preprocessing does not check
+            status[~known] = _BAD_CIR
             status[~valid] = _OUT_OF_DISTRIBUTION
             status[~usable] = _BAD_CIR if ranges.samples.shape[1] else _NO_CIR
             windows = windows[readable[usable]]
-        predicted, score = np.full(n, np.nan, np.float32), np.zeros(n, np.float32)
+            predicted[~readable] = np.nan
         if len(windows):
-            rows = _rows(readable)
             try:
-                predicted[rows] = prior[rows] + self._session.predict_m(windows)
+                predicted[rows] += self._session.predict_m(windows)
             except Exception:  # Whatever ONNX Runtime raises, a consumer must still get its range.
                 predicted[rows] = np.nan
             score[rows] = self._grader.score(windows, range_m[rows], *(power[rows] for power in powers))
@@ -202,7 +199,7 @@ class Mitigation(Backend):
         graded, variance = self._grader.grade(predicted[rows], score[rows])
         correction = offset[rows] + graded
         corrected_m = ranges.range_m[rows].astype(np.float32, copy=False) - correction
-        if len(correction) == n:
+        if rows is _ALL:
             model_id = self.bundle.model_id
             return CorrectedColumns(corrected_m, correction, variance, status, Origin.HOST, model_id)
         refused = (status == _OK) & ~passes
@@ -218,13 +215,13 @@ class Mitigation(Backend):
 
 def _rows(chosen: NDArray[np.bool_]) -> slice | NDArray[np.bool_]:
     """An index of the chosen rows; a slice, which is faster, if all are chosen."""
-    return slice(None) if chosen.all() else chosen
+    return _ALL if np.count_nonzero(chosen) == len(chosen) else chosen
 
 
 def _less(range_m: NDArray[np.floating], offset_m: NDArray[np.float32]) -> NDArray[np.floating]:
     """Ranges less offsets, in float32 as boards have it; without an offset the range as it is."""
     found: NDArray[np.floating] = range_m.copy()
-    if offset_m.any():
+    if np.count_nonzero(offset_m):
         with np.errstate(over="ignore"):  # A range beyond float32 is invalid, as an infinite one is.
             found = np.where(offset_m == 0.0, range_m, range_m.astype(np.float32, copy=False) - offset_m)
     return found

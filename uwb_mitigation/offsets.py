@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -99,13 +99,13 @@ class Offsets:
     def __str__(self) -> str:
         return f"{self.default:g} m" + (f", and {len(self)} of anchors, tags and pairs" if len(self) else "")
 
-    def of(self, tag_ids: Iterable[int], anchor_ids: Iterable[int]) -> NDArray[np.float32]:
+    def of(
+        self, tag_ids: Sequence[int] | NDArray[Any], anchor_ids: Sequence[int] | NDArray[Any]
+    ) -> NDArray[np.float32]:
         """Return the offsets of pairs, m: n ids each to float32 (n,)."""
-        tags, anchors = (
-            ids.tolist() if isinstance(ids, np.ndarray) else list(ids) for ids in (tag_ids, anchor_ids)
-        )
         if not len(self):
-            return np.full(len(tags), self.default, np.float32)
+            return np.full(len(tag_ids), self.default, np.float32)
+        tags, anchors = (np.asarray(ids, np.uint64).tolist() for ids in (tag_ids, anchor_ids))
         return np.array([self._find(pair) for pair in zip(tags, anchors, strict=True)], np.float32)
 
     def _find(self, pair: tuple[int, int]) -> float:

@@ -25,8 +25,8 @@ from uwb_mitigation.preprocessing import Scaling
 FIRST_PATH_TAPS = slice(6, 9)
 """The three taps of a window that the first-path power is computed from."""
 
-LEAD_TAPS = slice(0, 3)
-"""The taps of a window that precede the rising edge of a first path at its correct place."""
+LEAD_TAPS = 3
+"""The number of first taps of a window that precede the rising edge of a first path at its correct place."""
 
 MIN_POWER, MAX_POWER = np.float32(1e-30), np.float32(1e30)
 """Bounds on what a level is taken of, so that it is always finite."""
@@ -158,9 +158,7 @@ class Familiarity:
 def features(
     windows: NDArray[np.float32],
     scaling: Scaling,
-    range_m: NDArray[np.float32],
-    rx_power_dbm: NDArray[np.float32],
-    first_path_power_dbm: NDArray[np.float32],
+    *reported: NDArray[np.floating],
 ) -> NDArray[np.float32]:
     """The features of n measurements, float32 (n, 6).
 
@@ -168,7 +166,8 @@ def features(
         windows: inputs of the network, (n, K). Energy is their square; with the scaling PREAMBLE, which takes a
             square root, it is their fourth power.
         scaling: of the windows.
-        range_m, rx_power_dbm, first_path_power_dbm: (n,); where one is not finite, so is a feature.
+        reported: range (m), receive power and first-path power (dBm), each (n,); converted to float32. If one is
+            not finite or beyond float32, neither is a feature.
 
     Every step is one float32 operation, and sums are taken from the first tap to the last.
     """
@@ -176,20 +175,21 @@ def features(
         energy = windows * windows
         if scaling is Scaling.PREAMBLE:
             np.multiply(energy, energy, out=energy)
-        sums = np.empty((len(windows), 4), np.float32)
-        sums[:, 0] = np.add.accumulate(energy, axis=1)[:, -1]
-        sums[:, 1] = np.add.accumulate(energy[:, FIRST_PATH_TAPS], axis=1)[:, -1]
-        np.multiply(range_m, range_m, out=sums[:, 2])
-        sums[:, 3] = np.add.accumulate(energy[:, LEAD_TAPS], axis=1)[:, -1]
+        numbers: NDArray[np.float32] = np.array(reported, np.float32)
+        range_m, rx_power_dbm, first_path_power_dbm = numbers
+        sums = np.empty((4, len(windows)), np.float32)
+        total = np.add.accumulate(energy, axis=1)
+        sums[0], sums[1] = total[:, -1], np.add.accumulate(energy[:, FIRST_PATH_TAPS], axis=1)[:, -1]
+        sums[2], sums[3] = range_m * range_m, total[:, LEAD_TAPS - 1]
         level = _level_db(sums)
-        out = np.empty((len(windows), 6), np.float32)
-        out[:, 0] = range_m
-        np.add(rx_power_dbm, level[:, 2], out=out[:, 1])
-        np.subtract(rx_power_dbm, first_path_power_dbm, out=out[:, 2])
-        np.subtract(level[:, 0], rx_power_dbm, out=out[:, 3])
-        np.subtract(level[:, 1], first_path_power_dbm, out=out[:, 4])
-        np.subtract(level[:, 3], level[:, 0], out=out[:, 5])
-    return out
+        found = np.empty((6, len(windows)), np.float32)
+        found[0] = range_m
+        np.add(rx_power_dbm, level[2], out=found[1])
+        np.subtract(rx_power_dbm, first_path_power_dbm, out=found[2])
+        np.subtract(level[:2], numbers[1:], out=found[3:5])
+        np.subtract(level[3], level[0], out=found[5])
+    by_measurement: NDArray[np.float32] = found.T
+    return by_measurement
 
 
 class Strangeness:
