@@ -2,4 +2,5 @@
 
 from uwb_mitigation.entry import run_program
 
-run_program("benchmarks.cli")
+if __name__ == "__main__":
+    run_program("benchmarks.cli")

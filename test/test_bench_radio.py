@@ -8,7 +8,7 @@ from pathlib import Path
 from compilers import NEEDS_CC
 from typer.testing import CliRunner
 
-from benchmarks import __main__ as benchmarks
+from benchmarks import cli as benchmarks
 from benchmarks import radio
 
 pytestmark = NEEDS_CC

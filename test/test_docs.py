@@ -24,7 +24,7 @@ from conftest import REPOSITORY
 from test_launch import generate as generate
 from test_launch import launch
 
-from benchmarks import __main__ as benchmarks
+from benchmarks import cli as benchmarks
 from uwb_mitigation.commands import cli
 from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.nodes.parameter_tables import TABLES

@@ -9,7 +9,7 @@ import firmware_models
 import pytest
 from typer.testing import CliRunner
 
-from benchmarks import __main__ as benchmarks
+from benchmarks import cli as benchmarks
 from uwb_mitigation.commands import cli
 from uwb_mitigation.errors import MissingDependencyError
 from uwb_mitigation.firmware_export import toolchain

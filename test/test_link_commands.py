@@ -9,7 +9,7 @@ import pytest
 from bag_material import Foreign
 from typer.testing import CliRunner
 
-from benchmarks import __main__ as benchmarks
+from benchmarks import cli as benchmarks
 from uwb_mitigation.commands.cli import app
 from uwb_mitigation.errors import ParameterError, RecordingError, UwbMitigationError
 
