@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+from dataclasses import replace
 from pathlib import Path
 
 import firmware_models
@@ -14,7 +15,8 @@ from uwb_mitigation.firmware_export.compiling import firmware_folder
 from uwb_mitigation.firmware_export.export import export_bundle
 from uwb_mitigation.firmware_export.host import link
 from uwb_mitigation.link import messages
-from uwb_mitigation.link.board import Board, Identity
+from uwb_mitigation.link.board import Board
+from uwb_mitigation.link.emulated_board import EMULATED
 from uwb_mitigation.link.framing import Frame, FrameDecoder, FrameEncoder, encode_frame
 from uwb_mitigation.link.layout import (
     HEADER,
@@ -165,7 +167,7 @@ def test_damaged_streams_give_the_frames_and_counts_that_python_gives(library: c
 
 
 def python_board(bundle: Bundle, mode: Mode) -> Board:
-    identity = Identity(0xE0, bundle.model_id, bundle.architecture.samples)
+    identity = replace(EMULATED, model_id=bundle.model_id, window=bundle.architecture.samples)
     return Board(identity, Mitigation(bundle), mode=mode)
 
 

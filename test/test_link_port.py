@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 
 from uwb_mitigation.errors import LinkError, ParameterError
-from uwb_mitigation.link.board import Identity
 from uwb_mitigation.link.connection import PortAddress
 from uwb_mitigation.link.emulated_board import EmulatedBoard
 from uwb_mitigation.link.events import Connected, Disconnected, Event, Loss
 from uwb_mitigation.link.faults import Faults
+from uwb_mitigation.link.messages import Hello
 from uwb_mitigation.link.port import BoardPort
 from uwb_mitigation.measurement import Cir, RangeMeasurement, Record
 from uwb_mitigation.radio.evb1000 import Evb1000Bus
@@ -27,7 +27,7 @@ from uwb_mitigation.radio.evb1000 import Evb1000Bus
 PATIENCE_S = 240
 """How long a test waits for what must come; nothing is asserted about how soon it does."""
 
-IDENTITY = Identity(board_id=0xB0, model_id=0xCAFE, window=157)
+IDENTITY = Hello(board_id=0xB0, model_id=0xCAFE, window=157)
 
 
 class Recording:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from uwb_mitigation.link import messages
-from uwb_mitigation.link.board import Board, Identity
+from uwb_mitigation.link.board import Board
 from uwb_mitigation.link.events import (
     Connected,
     Disconnected,
@@ -19,13 +19,13 @@ from uwb_mitigation.link.events import (
 )
 from uwb_mitigation.link.framing import Frame, FrameDecoder, FrameEncoder, encode_frame
 from uwb_mitigation.link.layout import Flag, LogLevel, MessageType, Mode
-from uwb_mitigation.link.messages import BoardStatus, Correction, Log
+from uwb_mitigation.link.messages import BoardStatus, Correction, Hello, Log
 from uwb_mitigation.link.session import BoardSession
 from uwb_mitigation.measurement import Cir, CorrectedRange, Origin, RangeMeasurement, Status
 
 MS = 10**6
 EPOCH = 1_760_000_000 * 10**9
-IDENTITY = Identity(board_id=0xB0, model_id=0xCAFE, window=157, firmware_name="simulated")
+IDENTITY = Hello(board_id=0xB0, model_id=0xCAFE, window=157, firmware_name="simulated")
 
 
 class HalfMetre:

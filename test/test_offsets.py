@@ -13,10 +13,10 @@ from model_material import bundle, measurement
 
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.link import messages
-from uwb_mitigation.link.board import Board, Identity
+from uwb_mitigation.link.board import Board
 from uwb_mitigation.link.events import OffsetsRefused
 from uwb_mitigation.link.layout import MAX_OFFSETS, MessageType, Mode
-from uwb_mitigation.link.messages import Correction
+from uwb_mitigation.link.messages import Correction, Hello
 from uwb_mitigation.link.session import RADIO_TRIES, REQUEST_INTERVAL_NS, BoardSession
 from uwb_mitigation.measurement import CorrectedRange, RangeMeasurement, Status
 from uwb_mitigation.mitigation import Mitigation
@@ -175,7 +175,7 @@ class Pair:
             self.session.set_offsets(wanted)
 
     def start(self, boot: int = 1) -> None:
-        self.board = Board(Identity(model_id=5), Echo(), mode=Mode.DEVICE, boot_id=boot)
+        self.board = Board(Hello(model_id=5), Echo(), mode=Mode.DEVICE, boot_id=boot)
         self.deliver(self.board.hello(self.now))
 
     def deliver(self, data: bytes) -> None:

@@ -9,10 +9,10 @@ from compilers import NEEDS_CC
 from benchmarks.dw1000_model.boards import Line, ModelledAir
 from benchmarks.dw1000_model.links import Link
 from uwb_mitigation.link import messages
-from uwb_mitigation.link.board import Board, Identity
+from uwb_mitigation.link.board import Board
 from uwb_mitigation.link.events import Event, LinkState, RadioRefused
 from uwb_mitigation.link.layout import RadioState, Role
-from uwb_mitigation.link.messages import SetRadio
+from uwb_mitigation.link.messages import Hello, SetRadio
 from uwb_mitigation.link.radio import RadioSettings, RadioStatus
 from uwb_mitigation.link.session import BoardSession
 from uwb_mitigation.measurement import RangeMeasurement
@@ -120,7 +120,7 @@ def test_settings_that_a_board_cannot_use_are_refused_in_words():
 
 
 def test_older_firmware_keeps_ranging_and_the_host_says_that_it_knows_no_radio():
-    board, session, events = Board(Identity()), BoardSession(), []
+    board, session, events = Board(Hello()), BoardSession(), []
     session.set_radio(RadioSettings())
     for step in range(600):
         now_ns = step * 10**7

@@ -20,10 +20,10 @@ from faulty_board import FaultyBoard
 from ros_harness import Process, Ros
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
-from uwb_mitigation.link.board import Identity
 from uwb_mitigation.link.connection import PortAddress
 from uwb_mitigation.link.emulated_board import EmulatedBoard
 from uwb_mitigation.link.faults import Faults
+from uwb_mitigation.link.messages import Hello
 from uwb_mitigation.link.port import BoardPort
 from uwb_mitigation.measurement import Origin
 from uwb_mitigation.mitigation import Mitigation
@@ -50,9 +50,7 @@ def board(link: Path, *, model: bool = False, rate_hz: float = 50.0, **options) 
         mitigation = Mitigation(load_bundle(default_model_path()))
         options |= {
             "corrector": mitigation,
-            "identity": Identity(
-                0xB0A2D, mitigation.bundle.model_id, mitigation.bundle.preprocessing.samples
-            ),
+            "identity": Hello(0xB0A2D, mitigation.bundle.model_id, mitigation.bundle.preprocessing.samples),
         }
     return FaultyBoard(SimulatedSource(seed=4, count=200), rate_hz=rate_hz, link=link, **options)
 

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from uwb_mitigation.link import messages
-from uwb_mitigation.link.board import Board, Identity
+from uwb_mitigation.link.board import Board
 from uwb_mitigation.link.events import LinkState
 from uwb_mitigation.link.framing import Frame, FrameDecoder, encode_frame
 from uwb_mitigation.link.layout import MAX_ENCODED_BYTES, MAX_PAYLOAD_BYTES, Mode
@@ -68,7 +68,7 @@ def session(data: bytes) -> None:
 def board(data: bytes) -> None:
     """A host that says anything: answers are frames, and never many times what was asked."""
     script = Script(data)
-    firmware = Board(Identity())
+    firmware = Board(messages.Hello())
     now = 0
     while script:
         kind = script.number(1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -16,8 +16,8 @@ from uwb_mitigation.errors import ParameterError, parse_id
 from uwb_mitigation.files import write_whole
 
 if TYPE_CHECKING:
-    from uwb_mitigation.link.board import Identity
     from uwb_mitigation.link.emulated_board import EmulatedBoard
+    from uwb_mitigation.link.messages import Hello
     from uwb_mitigation.link.radio import RadioSettings
     from uwb_mitigation.mitigation import Mitigation
     from uwb_mitigation.radio.antenna_delay import AntennaDelay
@@ -116,16 +116,18 @@ def open_source(recording: Path | None, rate: float, seed: int) -> Source:
     return open_recording(recording)
 
 
-def _firmware(model: Path | None) -> tuple[Identity, Mitigation | None]:
-    from uwb_mitigation.link.board import Identity
+def _firmware(model: Path | None) -> tuple[Hello, Mitigation | None]:
+    from uwb_mitigation.link.emulated_board import EMULATED
 
     if model is None:
-        return Identity(), None
+        return EMULATED, None
     from uwb_mitigation.mitigation import Mitigation
     from uwb_mitigation.model.bundle import load_bundle
 
     bundle = load_bundle(model)
-    return Identity(model_id=bundle.model_id, window=bundle.preprocessing.samples), Mitigation(bundle)
+    return replace(EMULATED, model_id=bundle.model_id, window=bundle.preprocessing.samples), Mitigation(
+        bundle
+    )
 
 
 class RadioSource(str, Enum):

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Protocol
 
 from uwb_mitigation.errors import LinkError
@@ -47,24 +47,13 @@ class Corrector(Protocol):
     def correct(self, measurements: Sequence[RangeMeasurement]) -> list[CorrectedRange]: ...
 
 
-@dataclass(frozen=True, slots=True)
-class Identity:
-    """What a board says of itself in its HELLO; see `messages.Hello`."""
-
-    board_id: int = 0xE0
-    model_id: int = 0
-    window: int = 0
-    firmware_version: tuple[int, int, int] = (0, 1, 0)
-    firmware_name: str = "emulated"
-
-
 class Board:
     """One start of a board, from boot to reset. `now_us` is its uptime.
 
     Every method returns bytes to send, whole frames.
 
     Args:
-        identity: what HELLO says.
+        identity: the HELLO, without what depends on the state of the board.
         corrector: the board's model; None = it has none and refuses any mode but HOST. Its offsets are those that
             the host sets; none at the start.
         mode: the mode that it starts in.
@@ -74,7 +63,7 @@ class Board:
 
     def __init__(
         self,
-        identity: Identity,
+        identity: Hello,
         corrector: Corrector | None = None,
         *,
         mode: Mode = Mode.HOST,
@@ -173,19 +162,12 @@ class Board:
         return self._send(correction, now_us, flags)
 
     def _hello(self, now_us: int, request: int | None) -> bytes:
-        major, minor, patch = self._identity.firmware_version
-        hello = Hello(
-            board_id=self._identity.board_id,
-            model_id=self._identity.model_id,
-            window=self._identity.window,
+        hello = replace(
+            self._identity,
             mode=self.mode,
             boot_id=self._boot_id,
             request_sequence=request or 0,
             max_payload=MAX_PAYLOAD_BYTES,
-            firmware_major=major,
-            firmware_minor=minor,
-            firmware_patch=patch,
-            firmware_name=self._identity.firmware_name,
         )
         return self._send(hello, now_us, _UNASKED if request is None else Flag.ANSWER)
 

@@ -18,14 +18,15 @@ from pathlib import Path
 import numpy as np
 
 from uwb_mitigation.errors import ParameterError, RecordingError, UwbMitigationError
-from uwb_mitigation.link.board import Board, Corrector, Identity
+from uwb_mitigation.link.board import Board, Corrector
 from uwb_mitigation.link.faults import Faults, damage
 from uwb_mitigation.link.layout import Mode
+from uwb_mitigation.link.messages import Hello
 from uwb_mitigation.measurement import RangeMeasurement, Record
 
 _READ_BYTES = 4096
 _HEALTHY = Faults()
-_IDENTITY = Identity()
+EMULATED = Hello(0xE0, firmware_minor=1, firmware_name="emulated")
 
 MAX_BACKLOG_BYTES = 1 << 16
 """What waits for a host that does not read; measurements beyond it are lost, and counted."""
@@ -128,7 +129,7 @@ class EmulatedBoard:
         source: Iterable[Record] | None = None,
         *,
         rate_hz: float = 50.0,
-        identity: Identity = _IDENTITY,
+        identity: Hello = EMULATED,
         corrector: Corrector | None = None,
         mode: Mode = Mode.HOST,
         faults: Faults = _HEALTHY,

@@ -10,7 +10,7 @@ import dataclasses
 import enum
 import math
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from operator import attrgetter
@@ -42,11 +42,11 @@ class Hello:
         firmware_name: at most 16 bytes of UTF-8; more is cut off.
     """
 
-    board_id: int
-    model_id: int
-    window: int
-    mode: Mode
-    boot_id: int
+    board_id: int = 0
+    model_id: int = 0
+    window: int = 0
+    mode: Mode = Mode.HOST
+    boot_id: int = 0
     request_sequence: int = 0
     max_payload: int = 0
     firmware_major: int = 0
@@ -229,15 +229,51 @@ def decode(kind: int, payload: bytes, *, stamp_ns: int = 0) -> Message | None:
 
 
 class _Tail:
-    """What follows the fixed part: nothing, unless a subclass says otherwise."""
+    """What follows the fixed part: rows of equal size, then text; nothing by default.
+
+    Args:
+        row: format of a row for `struct`; empty = no rows.
+        count: name of the field with the number of rows.
+        max_rows: a larger number is invalid.
+        rows: returns the rows of a message.
+        attributes: returns the attributes in decoded rows.
+        has_text: the rest of the payload is the attribute `text`.
+    """
+
+    def __init__(
+        self,
+        row: struct.Struct | None = None,
+        count: str = "anchor_count",
+        max_rows: int = layout.MAX_ANCHORS,
+        rows: Callable[[Any], Iterable[tuple[Any, ...]]] = lambda _: (),
+        attributes: Callable[[Iterable[tuple[Any, ...]]], Values] = lambda _: {},
+        has_text: bool = False,
+    ) -> None:
+        self._row, self._count, self._max_rows = row, count, max_rows
+        self._rows, self._attributes, self._has_text = rows, attributes, has_text
 
     def encode(self, message: Any) -> tuple[Values, bytes]:
         """Return the computed fields of the fixed part, and the bytes of the tail."""
-        return {}, b""
+        rows = [self._row.pack(*row) for row in self._rows(message)] if self._row else []
+        text = message.text.encode("utf-8", "replace") if self._has_text else b""
+        return {self._count: len(rows)}, b"".join(rows) + text
 
     def decode(self, payload: bytes, start: int, computed: Values) -> Values:
         """Return the attributes in the tail, which begins at byte `start`; raise LinkError if it is invalid."""
-        return {}
+        values: Values = {}
+        if self._row is not None:
+            count = computed[self._count]
+            end = start + count * self._row.size
+            if count > self._max_rows or end > len(payload):
+                raise LinkError(
+                    f"{count} rows of {self._row.size} bytes in a payload of {len(payload)} bytes",
+                    valid=f"at most {self._max_rows}, from byte {start}",
+                )
+            values = self._attributes(self._row.iter_unpack(payload[start:end]))
+            start = end
+        if self._has_text:
+            values["text"] = payload[start:].decode("utf-8", "replace")
+        return values
 
 
 class _Samples(_Tail):
@@ -261,78 +297,30 @@ class _Samples(_Tail):
         return {"samples": np.frombuffer(payload, "<i2", count, at)}
 
 
-class _Text(_Tail):
-    def encode(self, message: Log) -> tuple[Values, bytes]:
-        return {}, message.text.encode("utf-8", "replace")
-
-    def decode(self, payload: bytes, start: int, computed: Values) -> Values:
-        return {"text": payload[start:].decode("utf-8", "replace")}
-
-
-class _Anchors(_Tail):
-    """Addresses, then text in the messages that have one."""
-
-    def __init__(self, with_text: bool) -> None:
-        self._with_text = with_text
-
-    def encode(self, message: Radio | SetRadio) -> tuple[Values, bytes]:
-        anchors = message.settings.anchors
-        text = message.text if isinstance(message, Radio) else ""
-        tail = struct.pack(f"<{len(anchors)}Q", *anchors) + text.encode("utf-8", "replace")
-        return {"anchor_count": len(anchors)}, tail
-
-    def decode(self, payload: bytes, start: int, computed: Values) -> Values:
-        end = _end_of_rows(payload, start, computed["anchor_count"], 8, layout.MAX_ANCHORS)
-        addresses = struct.unpack(f"<{computed['anchor_count']}Q", payload[start:end])
-        text = {"text": payload[end:].decode("utf-8", "replace")} if self._with_text else {}
-        return {"anchors": addresses} | text
+def _anchors(has_text: bool) -> _Tail:
+    return _Tail(
+        struct.Struct("<Q"),
+        rows=lambda message: ((address,) for address in message.settings.anchors),
+        attributes=lambda rows: {"anchors": tuple(address for (address,) in rows)},
+        has_text=has_text,
+    )
 
 
-class _AnchorsInReach(_Tail):
-    _row = layout.RADIO_ANCHOR.packing()
-
-    def encode(self, message: RadioStatus) -> tuple[Values, bytes]:
-        rows = [self._row.pack(*dataclasses.astuple(anchor)) for anchor in message.anchors]
-        return {"anchor_count": len(rows)}, b"".join(rows)
-
-    def decode(self, payload: bytes, start: int, computed: Values) -> Values:
-        end = _end_of_rows(payload, start, computed["anchor_count"], self._row.size, layout.MAX_ANCHORS)
-        return {"anchors": tuple(AnchorInReach(*row) for row in self._row.iter_unpack(payload[start:end]))}
+def _offset_rows(message: SetOffsets) -> Iterator[tuple[int, int, float, OffsetOf]]:
+    offsets = message.offsets
+    yield from ((tag, anchor, m, OffsetOf.PAIR) for (tag, anchor), m in offsets.pairs.items())
+    yield from ((0, anchor, m, OffsetOf.ANCHOR) for anchor, m in offsets.anchors.items())
+    yield from ((tag, 0, m, OffsetOf.TAG) for tag, m in offsets.tags.items())
 
 
-class _Offsets(_Tail):
-    _row = layout.OFFSET.packing()
-
-    def encode(self, message: SetOffsets) -> tuple[Values, bytes]:
-        offsets = message.offsets
-        rows = [
-            *((tag, anchor, m, OffsetOf.PAIR) for (tag, anchor), m in offsets.pairs.items()),
-            *((0, anchor, m, OffsetOf.ANCHOR) for anchor, m in offsets.anchors.items()),
-            *((tag, 0, m, OffsetOf.TAG) for tag, m in offsets.tags.items()),
-        ]
-        return {"count": len(rows)}, b"".join(self._row.pack(*row) for row in rows)
-
-    def decode(self, payload: bytes, start: int, computed: Values) -> Values:
-        end = _end_of_rows(payload, start, computed["count"], self._row.size, 0xFFFF)
-        by_kind: dict[int, dict[Any, float]] = {kind: {} for kind in OffsetOf}
-        for tag, anchor, offset_m, kind in self._row.iter_unpack(payload[start:end]):
-            key = {OffsetOf.PAIR: (tag, anchor), OffsetOf.ANCHOR: anchor, OffsetOf.TAG: tag}.get(kind)
-            if key is None:
-                raise LinkError(f"an offset of {kind}", where="SET_OFFSETS", valid="0 to 2")
-            by_kind[kind].setdefault(key, offset_m)
-        names = {"anchors": OffsetOf.ANCHOR, "tags": OffsetOf.TAG, "pairs": OffsetOf.PAIR}
-        return {name: by_kind[kind] for name, kind in names.items()}
-
-
-def _end_of_rows(payload: bytes, start: int, count: int, size: int, most: int) -> int:
-    """Return where `count` rows of `size` bytes end; raise LinkError if they are not in the payload."""
-    end = start + count * size
-    if count > most or end > len(payload):
-        raise LinkError(
-            f"{count} rows of {size} bytes in a payload of {len(payload)} bytes",
-            valid=f"at most {most}, from byte {start}",
-        )
-    return end
+def _offsets_in(rows: Iterable[tuple[Any, ...]]) -> Values:
+    found: dict[str, dict[Any, float]] = {"anchors": {}, "tags": {}, "pairs": {}}
+    for tag, anchor, offset_m, kind in rows:
+        if kind not in set(OffsetOf):
+            raise LinkError(f"an offset of {kind}", where="SET_OFFSETS", valid="0 to 2")
+        name = f"{OffsetOf(kind).name.lower()}s"
+        found[name].setdefault({"anchors": anchor, "tags": tag}.get(name, (tag, anchor)), offset_m)
+    return found
 
 
 class _Codec:
@@ -426,18 +414,31 @@ _CODECS = (
     _Codec(
         MessageType.RANGE_CORRECTED, Correction, ("corrected", partial(CorrectedRange, origin=Origin.DEVICE))
     ),
-    _Codec(MessageType.LOG, Log, tail=_Text()),
+    _Codec(MessageType.LOG, Log, tail=_Tail(has_text=True)),
     _Codec(MessageType.STATUS, BoardStatus),
     _Codec(MessageType.TIME_SYNC_REPLY, TimeSyncReply),
-    _Codec(MessageType.RADIO, Radio, ("settings", RadioSettings), _Anchors(with_text=True)),
-    _Codec(MessageType.RADIO_STATUS, RadioStatus, tail=_AnchorsInReach()),
+    _Codec(MessageType.RADIO, Radio, ("settings", RadioSettings), _anchors(has_text=True)),
+    _Codec(
+        MessageType.RADIO_STATUS,
+        RadioStatus,
+        tail=_Tail(
+            layout.RADIO_ANCHOR.packing(),
+            rows=lambda status: map(dataclasses.astuple, status.anchors),
+            attributes=lambda rows: {"anchors": tuple(AnchorInReach(*row) for row in rows)},
+        ),
+    ),
     _Codec(MessageType.OFFSETS, OffsetsAnswer),
     _Codec(MessageType.GET_INFO, GetInfo),
     _Codec(MessageType.SET_MODE, SetMode),
     _Codec(MessageType.TIME_SYNC, TimeSync),
     _Codec(MessageType.GET_RADIO, GetRadio),
-    _Codec(MessageType.SET_RADIO, SetRadio, ("settings", RadioSettings), _Anchors(with_text=False)),
-    _Codec(MessageType.SET_OFFSETS, SetOffsets, ("offsets", Offsets), _Offsets()),
+    _Codec(MessageType.SET_RADIO, SetRadio, ("settings", RadioSettings), _anchors(has_text=False)),
+    _Codec(
+        MessageType.SET_OFFSETS,
+        SetOffsets,
+        ("offsets", Offsets),
+        _Tail(layout.OFFSET.packing(), "count", 0xFFFF, _offset_rows, _offsets_in),
+    ),
 )
 _by_type: dict[int, _Codec] = {codec.kind: codec for codec in _CODECS}
 _by_class = {codec.make: codec for codec in _CODECS}
