@@ -16,20 +16,18 @@ from benchmarks import emulator
 from benchmarks.random_networks import mlp, pressing_windows, remnet
 from uwb_mitigation.firmware_export.export import (
     Golden,
-    ModelConstants,
     golden_windows,
-    identity,
     write_header,
 )
 from uwb_mitigation.firmware_export.packing import PackedNetwork, pack
 from uwb_mitigation.firmware_export.toolchain import Kernels, Target, build_image
 from uwb_mitigation.model import graph
 from uwb_mitigation.model.architecture import Mlp
-from uwb_mitigation.model.bundle import Bundle, session_options
+from uwb_mitigation.model.bundle import Bundle, Card, session_options
 from uwb_mitigation.model.prior import LinePrior
 from uwb_mitigation.model.weights import Int8Weights
 from uwb_mitigation.paper import published
-from uwb_mitigation.preprocessing import Scaling
+from uwb_mitigation.preprocessing import Preprocessing, Scaling
 
 CLOCK_HZ = 64e6
 """Of the paper's board, an Arduino Nano 33 BLE Sense."""
@@ -45,14 +43,15 @@ class Network:
         network: `remnet` or `mlp`, as in `paper.published`.
         first_kernel: k0; 0 for an MLP.
         packed: what the firmware is given.
-        card: what the header says beside it.
+        card, model_id: properties of the model in the header.
         onnx: the serialised ONNX model.
     """
 
     network: str
     first_kernel: int
     packed: PackedNetwork
-    card: ModelConstants
+    card: Card
+    model_id: int
     onnx: bytes
 
     def expect(self, windows: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -103,10 +102,10 @@ def random_shapes(
     for first_kernel in first_kernels:
         for samples in windows:
             weights = remnet(samples, first_kernel)
-            yield network_of(weights, _nameless(), graph.int8_model(weights))
+            yield network_of(weights, None, 0, graph.int8_model(weights))
     if dense:
         weights = mlp()
-        yield network_of(weights, _nameless(), graph.int8_model(weights))
+        yield network_of(weights, None, 0, graph.int8_model(weights))
 
 
 def trained(bundle: Bundle) -> Network:
@@ -115,13 +114,26 @@ def trained(bundle: Bundle) -> Network:
     Raises:
         ModelError: as `export_bundle`.
     """
-    return network_of(graph.int8_weights(bundle.model, bundle.architecture), identity(bundle), bundle.model)
+    return network_of(
+        graph.int8_weights(bundle.model, bundle.architecture), bundle.card, bundle.model_id, bundle.model
+    )
 
 
-def network_of(weights: Int8Weights, card: ModelConstants, onnx: bytes) -> Network:
+def network_of(weights: Int8Weights, card: Card | None, model_id: int, onnx: bytes) -> Network:
+    """Return a network to measure; `card` None = a neutral one."""
     shape = weights.architecture
     network, first_kernel = ("mlp", 0) if isinstance(shape, Mlp) else ("remnet", shape.first_kernel)
-    return Network(network, first_kernel, pack(weights), card, onnx)
+    card = card or Card(
+        "random weights",
+        shape,
+        Preprocessing(shape.samples, Scaling.PREAMBLE),
+        LinePrior(0.0),
+        quantised=True,
+        variance_m2=1.0,
+        variance_uncorrected_m2=1.0,
+        correction_limits_m=(-1e3, 1e3),
+    )
+    return Network(network, first_kernel, pack(weights), card, model_id, onnx)
 
 
 def measure(
@@ -143,7 +155,9 @@ def measure(
     examples = golden_windows(packed)
     with tempfile.TemporaryDirectory(prefix="uwb_firmware_") as name:
         folder = Path(name)
-        write_header(folder, packed, network.card, Golden(examples, network.expect(examples)))
+        write_header(
+            folder, packed, network.card, network.model_id, Golden(examples, network.expect(examples))
+        )
         optimisation = "-O3" if kernels is Kernels.PORTABLE else "-Os"
         image = build_image(folder, folder, Target.QEMU_MPS2, kernels, optimisation)
         result = emulator.run_windows(image, windows)
@@ -170,7 +184,3 @@ def measure(
         energy_mj=None if printed is None else printed.board[3] / hz,
         paper_hz=None if printed is None else printed.board[0],
     )
-
-
-def _nameless() -> ModelConstants:
-    return ModelConstants("random weights", 0, Scaling.PREAMBLE, LinePrior(0.0), (-1e3, 1e3), 1.0, 1.0)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from benchmarks import random_networks
 from benchmarks.firmware import Network, network_of
-from uwb_mitigation.firmware_export.export import Golden, ModelConstants, golden_windows, write_header
+from uwb_mitigation.firmware_export.export import Golden, golden_windows, write_header
 from uwb_mitigation.firmware_export.packing import pack
 from uwb_mitigation.measurement import Cir, Encoding, RangeMeasurement
 from uwb_mitigation.model import graph
@@ -27,20 +27,16 @@ from uwb_mitigation.paper import published
 from uwb_mitigation.preprocessing import Preprocessing, Scaling
 from uwb_mitigation.sources.decaranging import open_decaranging
 
-
-def identity(
-    scaling: Scaling = Scaling.PREAMBLE,
-    prior: LinePrior | None = None,
-    limits_m: tuple[float, float] = (-4.0, 4.0),
-) -> ModelConstants:
-    return ModelConstants("random", 0x1234ABCD, scaling, prior or LinePrior(0.25), limits_m, 0.0625, 0.25)
+MODEL_ID = 0x1234ABCD
 
 
-def write_model(folder: Path, weights: Int8Weights, card: ModelConstants | None = None) -> Path:
+def write_model(folder: Path, weights: Int8Weights, **changes: object) -> Path:
+    """Export a network with the card of `model_material`, but for `changes`."""
     network = pack(weights)
     windows = golden_windows(network)
     golden = Golden(windows, IntegerNetwork(weights).predict_m(windows))
-    return write_header(folder, network, card or identity(), golden)
+    card = model_material.card(weights.architecture, **({"prior": LinePrior(0.25)} | changes))
+    return write_header(folder, network, card, MODEL_ID, golden)
 
 
 def exact_bundle(folder: Path, samples: int = 32, **changes: object) -> Bundle:
@@ -165,5 +161,5 @@ def exported(shape: tuple[int, int], folder: Path) -> Exported:
     first_kernel, samples = shape
     weights = random_networks.remnet(samples, first_kernel) if first_kernel else random_networks.mlp(samples)
     write_model(folder, weights)
-    subject = network_of(weights, identity(), graph.int8_model(weights))
+    subject = network_of(weights, None, MODEL_ID, graph.int8_model(weights))
     return Exported(weights, subject, folder)

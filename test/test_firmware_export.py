@@ -89,7 +89,7 @@ def test_a_sum_without_exact_integers_is_refused_by_name():
 
 def test_a_hostile_name_cannot_end_the_comment(tmp_path: Path):
     weights = random_networks.remnet(16, 3)
-    card = replace(firmware_models.identity(), name='*/ #include "/etc/passwd" /*\n')
-    text = firmware_models.write_model(tmp_path, weights, card).read_text()
+    name = '*/ #include "/etc/passwd" /*\n'
+    text = firmware_models.write_model(tmp_path, weights, name=name).read_text()
     assert "passwd" in text.splitlines()[0]
     assert text.splitlines()[0].count("*/") == 1

@@ -28,7 +28,7 @@ from uwb_mitigation.model.bundle import load_bundle, save_bundle
 from uwb_mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.model.prior import LinePrior
 from uwb_mitigation.model.shipped import default_model_path, shipped_model_path
-from uwb_mitigation.preprocessing import Scaling
+from uwb_mitigation.preprocessing import Preprocessing, Scaling
 
 pytestmark = NEEDS_CC
 
@@ -143,8 +143,13 @@ def test_golden_vectors_notice_a_changed_weight(tmp_path: Path):
 
 @pytest.mark.parametrize("scaling", list(Scaling))
 def test_arbitrary_cirs_break_no_promise_under_the_sanitizers(scaling: Scaling, tmp_path: Path):
-    card = firmware_models.identity(scaling, model_material.LINE, (-1e4, 1e4))
-    firmware_models.write_model(tmp_path, random_networks.remnet(16, 3), card)
+    firmware_models.write_model(
+        tmp_path,
+        random_networks.remnet(16, 3),
+        preprocessing=Preprocessing(16, scaling),
+        prior=model_material.LINE,
+        correction_limits_m=(-1e4, 1e4),
+    )
     seen = run([build_program("fuzz_correct", tmp_path, ADDRESS_SANITIZED), "4000", "1"])
     statuses = {int(line.split()[1].rstrip(":")) for line in seen.splitlines()}
     assert {0, 4, 5, 6, 7, 9, 12, 14} <= statuses

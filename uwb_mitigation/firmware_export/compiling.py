@@ -77,7 +77,11 @@ def load_library(prefix: str, objects: Sequence[str], signatures: Signatures) ->
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     path = f"{folder}/{prefix}library.so"
     run([*c_compiler(), "-shared", *objects, "-o", path, "-lm", "-lpthread"])
-    library = ctypes.CDLL(path)
+    return declare(ctypes.CDLL(path), prefix, signatures)
+
+
+def declare(library: ctypes.CDLL, prefix: str, signatures: Signatures) -> ctypes.CDLL:
+    """Set result and arguments of a library's functions, see `load_library`; return the library."""
     for name, (result, arguments) in signatures.items():
         function = getattr(library, f"{prefix}{name}")
         function.restype, function.argtypes = result, arguments

@@ -15,10 +15,9 @@ from uwb_mitigation.errors import ModelError, UwbMitigationError
 from uwb_mitigation.files import write_whole
 from uwb_mitigation.firmware_export.packing import Channels, PackedNetwork, pack
 from uwb_mitigation.model import graph
-from uwb_mitigation.model.bundle import Bundle, Session
+from uwb_mitigation.model.bundle import Bundle, Card, Session
 from uwb_mitigation.model.familiarity import Familiarity
 from uwb_mitigation.model.integer import IntegerNetwork
-from uwb_mitigation.model.prior import LinePrior
 from uwb_mitigation.model.requantisation import Sum
 from uwb_mitigation.preprocessing import Scaling
 
@@ -27,32 +26,6 @@ GOLDEN_VECTORS = 8
 
 _COLUMNS = 100
 _SCALINGS = {Scaling.MAX: "UWB_SCALE_MAX", Scaling.PREAMBLE: "UWB_SCALE_PREAMBLE"}
-
-
-@dataclass(frozen=True, slots=True)
-class ModelConstants:
-    """Properties of a model other than its network; numbers are float32 values.
-
-    Attributes:
-        name: for the comment.
-        model_id: of the bundle.
-        scaling: of the preprocessing.
-        prior: predicts the part of the error that the network does not.
-        correction_limits_m: a predicted error outside means an input that is out of distribution.
-        variance_m2, variance_uncorrected_m2: of a range corrected, and passed through.
-        variance_per_m2: growth of the former with the square of the predicted error.
-        familiarity: distribution of the training data; None: unknown.
-    """
-
-    name: str
-    model_id: int
-    scaling: Scaling
-    prior: LinePrior
-    correction_limits_m: tuple[float, float]
-    variance_m2: float
-    variance_uncorrected_m2: float
-    variance_per_m2: float = 0.0
-    familiarity: Familiarity | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,34 +58,18 @@ def export_bundle(bundle: Bundle, folder: Path) -> Path:
         raise ModelError(error.what, where=where, valid=error.valid) from error
     windows = golden_windows(network)
     golden = Golden(windows, IntegerNetwork(weights).predict_m(windows))
-    return write_header(folder, network, identity(bundle), golden)
+    return write_header(folder, network, bundle.card, bundle.model_id, golden)
 
 
-def write_header(folder: Path, network: PackedNetwork, identity: ModelConstants, golden: Golden) -> Path:
+def write_header(folder: Path, network: PackedNetwork, card: Card, model_id: int, golden: Golden) -> Path:
     """Write `uwb_model.h` to `folder`, which is created if it does not exist; the write is atomic."""
     path = folder / MODEL_HEADER
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UwbMitigationError(f"cannot be written: {error.strerror}", where=str(path)) from error
-    write_whole(path, render(network, identity, golden))
+    write_whole(path, render(network, card, model_id, golden))
     return path
-
-
-def identity(bundle: Bundle) -> ModelConstants:
-    """Return the properties of a bundle that the header contains in addition to its network."""
-    card = bundle.card
-    return ModelConstants(
-        name=card.name,
-        model_id=bundle.model_id,
-        scaling=card.preprocessing.scaling,
-        prior=card.prior,
-        correction_limits_m=card.correction_limits_m,
-        variance_m2=card.variance_m2,
-        variance_uncorrected_m2=card.variance_uncorrected_m2,
-        variance_per_m2=card.variance_per_m2,
-        familiarity=card.familiarity,
-    )
 
 
 def golden_windows(network: PackedNetwork) -> NDArray[np.float32]:
@@ -132,24 +89,21 @@ def compare_with_reference(bundle: Bundle) -> int:
     return int(np.sum(given.view(np.uint32) != expected.view(np.uint32)))
 
 
-def render(network: PackedNetwork, identity: ModelConstants, golden: Golden) -> str:
-    """The text of `uwb_model.h`: `uwb_model_data`, and golden vectors under UWB_GOLDEN_VECTORS.
+def render(network: PackedNetwork, card: Card, model_id: int, golden: Golden) -> str:
+    """Return the text of `uwb_model.h`: `uwb_model_data`, and golden vectors under UWB_GOLDEN_VECTORS.
 
     Floats have nine significant digits, which read back to the same bits.
     """
     parts = [
-        f"/* {_comment(identity.name)}, model {identity.model_id:08x}, written by `uwb-mitigation board export-c`. */",
+        f"/* {_comment(card.name)}, model {model_id:08x}, written by `uwb-mitigation board export-c`. */",
         "#ifndef UWB_MODEL_H\n#define UWB_MODEL_H\n",
         '#include "uwb_mitigation.h"\n',
     ]
-    if network.modules:
-        parts += _remnet(network)
-    else:
-        parts += _mlp(network)
+    parts += _remnet(network) if network.modules else _mlp(network)
     parts.append(_array("int8_t", "uwb_head_weights", network.head_weights))
-    if identity.familiarity is not None:
-        parts.append(_familiarity(identity.familiarity))
-    parts.append(_model(network, identity))
+    if card.familiarity is not None:
+        parts.append(_familiarity(card.familiarity))
+    parts.append(_model(network, card, model_id))
     parts.append(_golden(golden))
     parts.append("#endif")
     return "\n".join(parts) + "\n"
@@ -195,13 +149,13 @@ def _familiarity(familiarity: Familiarity) -> str:
     return f"static const uwb_familiarity uwb_familiar = {{{offset}, {{\n{bands}}}}};\n"
 
 
-def _model(network: PackedNetwork, identity: ModelConstants) -> str:
+def _model(network: PackedNetwork, card: Card, model_id: int) -> str:
     remnet = bool(network.modules)
-    prior, (low, high) = identity.prior, identity.correction_limits_m
+    prior, (low, high) = card.prior, card.correction_limits_m
     values = [
-        f"0x{identity.model_id:08x}u",
+        f"0x{model_id:08x}u",
         f"{network.samples}u",
-        _SCALINGS[identity.scaling],
+        _SCALINGS[card.preprocessing.scaling],
         number(network.input_scale),
         f"{network.first_kernel}u",
         f"{len(network.modules)}u",
@@ -219,10 +173,10 @@ def _model(network: PackedNetwork, identity: ModelConstants) -> str:
         number(prior.per_power_gap),
         number(low),
         number(high),
-        number(identity.variance_m2),
-        number(identity.variance_per_m2),
-        number(identity.variance_uncorrected_m2),
-        "NULL" if identity.familiarity is None else "&uwb_familiar",
+        number(card.variance_m2),
+        number(card.variance_per_m2),
+        number(card.variance_uncorrected_m2),
+        "NULL" if card.familiarity is None else "&uwb_familiar",
     ]
     return f"static const uwb_model uwb_model_data = {{\n{_wrapped(values)}}};\n"
 

@@ -6,7 +6,9 @@ import ctypes
 import math
 import tempfile
 from collections.abc import Sequence
+from ctypes import POINTER, byref, c_float, c_int, c_int32, c_size_t, c_uint16, c_void_p
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +16,10 @@ from numpy.typing import NDArray
 from uwb_mitigation.errors import ModelError
 from uwb_mitigation.firmware_export.compiling import (
     WARNINGS,
+    Signatures,
     c_compiler,
     compile_objects,
+    declare,
     firmware_folder,
     run,
 )
@@ -35,26 +39,41 @@ _SHIM = (
 
 
 class _Cir(ctypes.Structure):
+    """`uwb_cir`."""
+
     _fields_ = (
-        ("samples", ctypes.POINTER(ctypes.c_int16)),
-        ("count", ctypes.c_size_t),
-        ("encoding", ctypes.c_int),
-        ("start_index", ctypes.c_int32),
-        ("first_path_index", ctypes.c_float),
-        ("scale", ctypes.c_float),
-        ("preamble_count", ctypes.c_uint16),
-        ("rx_power_dbm", ctypes.c_float),
-        ("first_path_power_dbm", ctypes.c_float),
+        ("samples", c_void_p),
+        ("count", c_size_t),
+        ("encoding", c_int),
+        ("start_index", c_int32),
+        ("first_path_index", c_float),
+        ("scale", c_float),
+        ("preamble_count", c_uint16),
+        ("rx_power_dbm", c_float),
+        ("first_path_power_dbm", c_float),
     )
 
 
 class _Corrected(ctypes.Structure):
+    """`uwb_corrected`."""
+
     _fields_ = (
-        ("range_m", ctypes.c_float),
-        ("correction_m", ctypes.c_float),
-        ("variance_m2", ctypes.c_float),
-        ("status", ctypes.c_int),
+        ("range_m", c_float),
+        ("correction_m", c_float),
+        ("variance_m2", c_float),
+        ("status", c_int),
     )
+
+
+_SIGNATURES: Signatures = {
+    "exported_model": (c_void_p, ()),
+    "arena_size": (c_size_t, (c_void_p,)),
+    "network": (c_int, (c_void_p, c_void_p, c_void_p, c_size_t, POINTER(c_float))),
+    "correct": (
+        None,
+        (c_void_p, c_float, c_float, POINTER(_Cir), c_void_p, c_size_t, POINTER(_Corrected)),
+    ),
+}
 
 
 class HostFirmware:
@@ -71,37 +90,22 @@ class HostFirmware:
     """
 
     def __init__(self, export: Path, build: Path, flags: Sequence[str] = ()) -> None:
-        library = ctypes.CDLL(str(build_shared_library(export, build, flags)))
-        library.uwb_exported_model.restype = ctypes.c_void_p
-        library.uwb_arena_size.restype = ctypes.c_size_t
-        library.uwb_arena_size.argtypes = (ctypes.c_void_p,)
-        library.uwb_network.argtypes = (
-            *(ctypes.c_void_p,) * 3,
-            ctypes.c_size_t,
-            ctypes.POINTER(ctypes.c_float),
-        )
-        library.uwb_correct.argtypes = (
-            ctypes.c_void_p,
-            ctypes.c_float,
-            ctypes.c_float,
-            ctypes.POINTER(_Cir),
-            ctypes.c_void_p,
-            ctypes.c_size_t,
-            ctypes.POINTER(_Corrected),
-        )
-        self._library = library
-        self._model = library.uwb_exported_model()
-        self.arena_bytes: int = library.uwb_arena_size(self._model)
-        self._arena = ctypes.create_string_buffer(self.arena_bytes)
+        shim = build / "exported_model.c"
+        shim.write_text(_SHIM, encoding="utf-8")
+        path = link(shim, export, build / "libuwb_mitigation.so", flags, shared=True)
+        self._library = declare(ctypes.CDLL(str(path)), "uwb_", _SIGNATURES)
+        self._model = self._library.uwb_exported_model()
+        self._arena_bytes: int = self._library.uwb_arena_size(self._model)
+        self._arena = ctypes.create_string_buffer(self._arena_bytes)
 
     def predict_m(self, windows: NDArray[np.float32]) -> NDArray[np.float32]:
         """The network's outputs, float32 (n,), for windows float32 (n, K), m."""
         windows = np.ascontiguousarray(windows, np.float32)
         outputs = np.empty(len(windows), np.float32)
-        value = ctypes.c_float()
+        value = c_float()
         for index, window in enumerate(windows):
             status = self._library.uwb_network(
-                self._model, window.ctypes.data, self._arena, self.arena_bytes, ctypes.byref(value)
+                self._model, window.ctypes.data, self._arena, self._arena_bytes, byref(value)
             )
             if status:
                 raise ModelError(f"the firmware refuses the model: status {status}")
@@ -110,24 +114,14 @@ class HostFirmware:
 
     def correct(self, range_m: float, cir: Cir, offset_m: float = 0.0) -> tuple[float, float, float, int]:
         """Range, correction, variance and status, as in `CorrectedRange`."""
-        result = _Corrected()
-        self._library.uwb_correct(
-            self._model,
-            range_m,
-            offset_m,
-            ctypes.byref(_c_cir(cir)),
-            self._arena,
-            self.arena_bytes,
-            ctypes.byref(result),
-        )
+        samples = np.ascontiguousarray(cir.samples, np.int16)
+        values = {name: getattr(cir, name) for name, _ in _Cir._fields_[2:]}
+        if not math.isfinite(cir.first_path_index):
+            values["first_path_index"] = math.nan
+        c_cir, result = _Cir(samples.ctypes.data, len(samples), **values), _Corrected()
+        arena = self._arena, self._arena_bytes
+        self._library.uwb_correct(self._model, range_m, offset_m, byref(c_cir), *arena, byref(result))
         return result.range_m, result.correction_m, result.variance_m2, result.status
-
-
-def build_shared_library(export: Path, build: Path, flags: Sequence[str] = ()) -> Path:
-    """Compile the library and the model in `export` to a shared library in `build`."""
-    shim = build / "exported_model.c"
-    shim.write_text(_SHIM, encoding="utf-8")
-    return link(shim, export, build / "libuwb_mitigation.so", flags, shared=True)
 
 
 def link(
@@ -146,24 +140,6 @@ def library_objects(flags: Sequence[str] = ()) -> tuple[str, ...]:
     sources = firmware_folder() / "src"
     options = (*_OPTIONS, *flags, f"-I{sources}")
     return compile_objects(c_compiler(), options, tuple(sorted(sources.glob("*.c"))))
-
-
-def _c_cir(cir: Cir) -> _Cir:
-    samples = np.ascontiguousarray(cir.samples, np.int16)
-    result = _Cir(
-        samples.ctypes.data_as(ctypes.POINTER(ctypes.c_int16)),
-        len(samples),
-        int(cir.encoding),
-        cir.start_index,
-        cir.first_path_index if math.isfinite(cir.first_path_index) else math.nan,
-        cir.scale,
-        cir.preamble_count,
-        cir.rx_power_dbm,
-        cir.first_path_power_dbm,
-    )
-    # The structure holds a bare pointer: keep what it points to.
-    result.owner = samples
-    return result
 
 
 class FirmwareMitigation(Backend):
@@ -204,13 +180,8 @@ class FirmwareMitigation(Backend):
 
 
 def _cir(ranges: RangeColumns, row: int) -> Cir:
-    return Cir(
-        samples=ranges.samples[row],
-        encoding=ranges.encoding,
-        start_index=int(ranges.start_index[row]),
-        first_path_index=float(ranges.first_path_index[row]),
-        scale=float(ranges.scale[row]),
-        preamble_count=int(ranges.preamble_count[row]),
-        rx_power_dbm=float(ranges.rx_power_dbm[row]),
-        first_path_power_dbm=float(ranges.first_path_power_dbm[row]),
-    )
+    values: dict[str, Any] = {
+        name: (float if kind is c_float else int)(getattr(ranges, name)[row])
+        for name, kind in _Cir._fields_[3:]
+    }
+    return Cir(ranges.samples[row], ranges.encoding, **values)

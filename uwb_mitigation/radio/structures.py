@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from ctypes import c_float, c_int, c_size_t, c_uint8, c_uint16, c_uint32, c_uint64, c_void_p
+from dataclasses import asdict
 
 from uwb_mitigation.link.layout import MAX_ANCHORS
 from uwb_mitigation.link.radio import RadioSettings
@@ -99,27 +100,14 @@ def config(
         ParameterError: a setting that no radio has.
     """
     settings.check()
-    radio = ChipSettings(
-        settings.channel,
-        settings.prf_mhz,
-        settings.preamble_code,
-        settings.decawave_sfd,
-        settings.rate_kbps,
-        settings.preamble,
-        settings.tx_power,
-        settings.antenna_delay,
-    )
+    values = asdict(settings)
+    anchors = values.pop("anchors")
+    radio = {name: values.pop(name) for name, *_ in ChipSettings._fields_ if name in values}
+    values["reply_us"] = settings.reply_us or reply_us
+    values["patience_us"] = settings.patience_us or patience_us
     return Config(
-        radio,
-        settings.address,
-        settings.pan,
-        settings.role,
-        settings.report,
-        settings.bias_correction,
-        len(settings.anchors),
-        settings.window,
-        settings.reply_us or reply_us,
-        settings.patience_us or patience_us,
-        settings.interval_us,
-        (c_uint64 * MAX_ANCHORS)(*settings.anchors),
+        radio=ChipSettings(**radio),
+        anchor_count=len(anchors),
+        anchors=(c_uint64 * MAX_ANCHORS)(*anchors),
+        **values,
     )
