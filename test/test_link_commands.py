@@ -9,26 +9,12 @@ import pytest
 from bag_material import Foreign
 from typer.testing import CliRunner
 
-from benchmarks import cli as benchmarks
 from uwb_mitigation.commands.cli import app
-from uwb_mitigation.errors import ParameterError, RecordingError, UwbMitigationError
+from uwb_mitigation.errors import ParameterError, RecordingError
 
 
 def run(*arguments: str) -> str:
     return CliRunner().invoke(app, list(arguments), catch_exceptions=False).output
-
-
-def test_bench_link_writes_what_came_of_the_frames(tmp_path):
-    result = tmp_path / "link.json"
-    arguments = ["link", "--frames", "3000", "--damage", "0.0005", "--json", str(result)]
-    assert CliRunner().invoke(benchmarks.app, arguments, catch_exceptions=False).exit_code == 0
-
-    written = json.loads(result.read_text())
-    assert written["sent"] == 3000
-    assert written["delivered"] + written["lost"] == 3000
-    assert 0 < written["lost"] < 3000
-    assert written["intact_lost"] == written["corrupt_delivered"] == 0
-    assert written["decoder_mb_per_s"] > 0
 
 
 def test_an_emulated_board_plays_for_the_time_it_is_given(tmp_path):
@@ -55,11 +41,6 @@ def test_an_emulated_board_plays_for_the_time_it_is_given(tmp_path):
 def test_an_option_out_of_its_range_is_refused(arguments):
     with pytest.raises(ParameterError):
         run(*arguments)
-
-
-def test_a_recording_that_is_not_there_is_refused(tmp_path: Path):
-    with pytest.raises(UwbMitigationError, match="absent"):
-        run("board", "emulate", str(tmp_path / "absent.mcap"), "--duration", "1")
 
 
 def test_an_empty_recording_is_told_instead_of_a_port(tmp_path: Path):

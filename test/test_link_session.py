@@ -119,17 +119,9 @@ def test_a_measurement_arrives_with_its_stamp_on_the_nodes_clock():
     assert event.stamp_ns == pytest.approx(took_place, abs=0.1 * MS)
 
 
-@pytest.mark.parametrize(
-    ("mode", "kinds"),
-    [
-        (Mode.HOST, [RangeMeasurement]),
-        (Mode.DEVICE, [Correction]),
-    ],
-)
-def test_each_mode_sends_what_it_says(mode, kinds):
-    bench = connected(mode=mode)
-
-    assert [type(event) for event in bench.measure(1)] == kinds
+@pytest.mark.parametrize(("mode", "kind"), [(Mode.HOST, RangeMeasurement), (Mode.DEVICE, Correction)])
+def test_each_mode_sends_what_it_says(mode, kind):
+    assert [type(event) for event in connected(mode=mode).measure(1)] == [kind]
 
 
 def test_a_lost_request_for_a_mode_is_repeated():
@@ -269,32 +261,28 @@ def test_the_numbering_may_wrap():
     assert bench.session.counts.lost == 0
 
 
-def test_unknown_types_are_counted_and_skipped():
+CORRECTION = Correction(0, 1, 2, 3, 4, HalfMetre().correct([measurement(1)])[0])
+
+
+@pytest.mark.parametrize(
+    ("kind", "flags", "payload", "counted"),
+    [
+        (99, 0, b"from the future", {"unknown_type": 1}),
+        (MessageType.GET_INFO, 0, b"", {"unknown_type": 1}),
+        (MessageType.RANGE_CIR, 0, b"short", {"malformed": 1}),
+        (MessageType.RANGE_CORRECTED, Flag.ANSWER, messages.encode(CORRECTION)[1], {"unasked": 1}),
+    ],
+    ids=["unknown", "host's own", "malformed", "answer without request"],
+)
+def test_frames_that_are_not_delivered_are_counted(kind, flags, payload, counted):
     bench = connected()
-    sequence = bench.session._next_sequence
-    strange = encode_frame(Frame(99, 0, sequence, 0, b"from the future"))
-    own = encode_frame(Frame(MessageType.GET_INFO, 0, sequence + 1, 0, b""))
-
-    assert bench.host_hears(strange + own) == []
-    assert bench.session.counts.unknown_type == {99: 1, MessageType.GET_INFO: 1}
-
-
-def test_a_malformed_message_is_counted():
-    bench = connected()
-    sequence = bench.session._next_sequence
-
-    assert bench.host_hears(encode_frame(Frame(MessageType.RANGE_CIR, 0, sequence, 0, b"short"))) == []
-    assert bench.session.counts.malformed == 1
-
-
-def test_an_answer_to_nothing_is_counted():
-    bench = connected()
-    correction = Correction(0, 1, 2, 3, 4, HalfMetre().correct([measurement(1)])[0])
-    kind, payload = messages.encode(correction)
-    frame = Frame(int(kind), Flag.ANSWER, bench.session._next_sequence, 0, payload)
+    before = bench.session.totals()
+    frame = Frame(int(kind), flags, bench.session._next_sequence, 0, payload)
 
     assert bench.host_hears(encode_frame(frame)) == []
-    assert bench.session.counts.unasked == 1
+    after = bench.session.totals()
+    rejections = ("unknown_type", "malformed", "unasked", "stale", "withheld", "lost")
+    assert {name: 1 for name in rejections if after[name] != before[name]} == counted
 
 
 def test_what_waits_to_be_sent_is_bounded():

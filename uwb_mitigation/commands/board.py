@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import asdict, replace
 from enum import Enum
@@ -16,7 +17,6 @@ from uwb_mitigation.errors import ParameterError, parse_id
 from uwb_mitigation.files import write_whole
 
 if TYPE_CHECKING:
-    from uwb_mitigation.link.emulated_board import EmulatedBoard
     from uwb_mitigation.link.messages import Hello
     from uwb_mitigation.link.radio import RadioSettings
     from uwb_mitigation.mitigation import Mitigation
@@ -42,8 +42,6 @@ def emulate(
     damage: Annotated[float, typer.Option(help="Share of bytes flipped, dropped, inserted, each.")] = 0.0,
     lose: Annotated[float, typer.Option(help="Share of messages lost.")] = 0.0,
     duplicate: Annotated[float, typer.Option(help="Share of messages that arrive twice.")] = 0.0,
-    reset_every: Annotated[float | None, typer.Option(help="s between resets of the firmware.")] = None,
-    unplug_every: Annotated[float | None, typer.Option(help="s between pulls of the cable.")] = None,
     seed: Annotated[int, typer.Option(help="Of all faults, and of simulated measurements.")] = 1,
     json: JsonOption = None,
 ) -> None:
@@ -57,13 +55,8 @@ def emulate(
 
     if mode not in ("host", "device"):
         raise ParameterError(f"mode {mode!r}", valid="host, device")
-    for name, value in (
-        ("duration", duration),
-        ("reset-every", reset_every),
-        ("unplug-every", unplug_every),
-    ):
-        if value is not None and not value > 0:
-            raise ParameterError(f"{name} = {value}", valid="above 0")
+    if duration is not None and not duration > 0:
+        raise ParameterError(f"duration = {duration}", valid="above 0")
     if seed < 0:
         raise ParameterError(f"seed = {seed}", valid="0 or more")
     faults = Faults(damage, damage, damage, lose, duplicate)
@@ -81,28 +74,12 @@ def emulate(
         )
         with board:
             console.out.print(f"{source.name} at {board.port}", soft_wrap=True, highlight=False)
-            _keep_running(board, duration, reset_every, unplug_every)
+            end_s = time.monotonic() + (duration or math.inf)
+            while board.failure is None and time.monotonic() < end_s:
+                time.sleep(0.05)
     console.write_json(json, {"sent": board.sent_measurements})
     if board.failure is not None:
         raise board.failure
-
-
-def _keep_running(
-    board: EmulatedBoard, duration: float | None, reset_every: float | None, unplug_every: float | None
-) -> None:
-    began = reset = plugged = time.monotonic()
-    while board.failure is None and (duration is None or time.monotonic() - began < duration):
-        time.sleep(0.05)
-        now = time.monotonic()
-        if reset_every is not None and now - reset > reset_every:
-            reset = now
-            board.reset()
-        if unplug_every is not None and now - plugged > unplug_every:
-            board.unplug()
-            time.sleep(0.5)
-            board.plug()
-            plugged = time.monotonic()
-            console.out.print(f"plugged in again at {board.port}", soft_wrap=True, highlight=False)
 
 
 def open_source(recording: Path | None, rate: float, seed: int) -> Source:

@@ -28,18 +28,9 @@ from uwb_mitigation.offsets import Offsets
 
 @dataclass(frozen=True, slots=True)
 class Hello:
-    """Who the board is and what it does.
+    """Identity and state of a board; the fields of `layout.PAYLOADS[HELLO]`.
 
-    Attributes:
-        board_id: 64-bit identity of the board.
-        model_id: identity of the board's model; 0 = it has none.
-        window: window length K of the board's model; 0 = it has none.
-        mode: what the board sends of its own measurements.
-        boot_id: differs from one start of the firmware to the next.
-        request_sequence: of the host's frame that this answers; without meaning if it answers none.
-        max_payload: longest payload that the board accepts, bytes.
-        firmware_major, firmware_minor, firmware_patch: version of the firmware.
-        firmware_name: at most 16 bytes of UTF-8; more is cut off.
+    `firmware_name` has at most 16 bytes of UTF-8; more is cut off.
     """
 
     board_id: int = 0
@@ -129,13 +120,7 @@ class Radio:
 
 @dataclass(frozen=True, slots=True)
 class OffsetsAnswer:
-    """The answer to a `SetOffsets`.
-
-    Attributes:
-        request_sequence: of the frame that this answers.
-        slots: offsets that the board can keep in addition to the default.
-        accepted: whether they are in force.
-    """
+    """The answer to a `SetOffsets`; the fields of `layout.PAYLOADS[OFFSETS]`."""
 
     request_sequence: int
     slots: int
