@@ -262,11 +262,6 @@ def test_offsets_above_a_metre_are_refused(site):
     assert "and anchor 2;" in json.loads((site / "far.json").read_text())["refused"]
 
 
-def test_the_area_is_where_tags_are_sought(site):
-    done = run("calibrate", "drive.mcap", *LEVEL, "--area=30,30,0,40,40,2", "-o", "x.onnx", folder=site)
-    assert (done.returncode, "--area" in done.stderr) == (1, True)
-
-
 def test_the_lever_arm_is_the_transform_to_the_frame_of_the_ranges(site):
     result, done = figures(site, "rare.mcap", "--height", 1.0, "--truth-topic", "/odom")
     assert result["localisation"]["lever_arm_m"] == LEVER.tolist()

@@ -96,16 +96,6 @@ def test_intervals_of_nothing_are_refused():
         calibrate(np.array([np.nan]), np.array([0.0]), np.array(["a"]))
 
 
-def test_medians_are_of_what_they_say():
-    data = dataset(6, 4, samples=8)
-    error = np.where(data.configurations == "c0", 0.2, 1.0)
-    data = replace(data, error_m=error, labels=np.where(error < 0.5, "LOS", "NLOS"))
-    assert baselines.los_median(data)(data)[0] == 0.2
-    assert baselines.overall_median(data)(data)[0] == 1.0
-    unlabelled = replace(data, labels=np.full(len(data), ""))
-    assert baselines.los_median(unlabelled)(data)[0] == 1.0
-
-
 def test_features_are_finite_whatever_a_header_leaves_out():
     data = dataset(3, 4, samples=64)
     data.rx_power_dbm[:] = np.nan

@@ -24,7 +24,7 @@ from uwb_mitigation.sources.truth_table import load_truth, with_truth
 pytest.importorskip("torch", reason="run `make setup-training`")
 from uwb_mitigation.evaluation import recordings
 from uwb_mitigation.model.floating import float_network
-from uwb_mitigation.training import candidates, comparison, selection, train
+from uwb_mitigation.training import candidates, comparison, selection
 from uwb_mitigation.training.candidates import Candidate, FittedModel, Recipe, network_m
 from uwb_mitigation.training.options import FitOptions
 from uwb_mitigation.training.selection import NESTED
@@ -136,13 +136,6 @@ def test_a_model_without_network_has_one_that_predicts_nothing(name):
     assert fitted.prior.needs_power == (name == candidates.LINE)
 
 
-def test_a_network_alone_has_its_own_options():
-    alone = FitOptions(epochs=7)
-    recipe = replace(RECIPE, alone=alone)
-    assert recipe.of(candidates.NETWORK).fit == alone
-    assert recipe.of(candidates.LINE_NETWORK).fit == RECIPE.fit
-
-
 # --- true ranges from a table ---
 
 
@@ -228,18 +221,6 @@ def loads(monkeypatch, data) -> None:
     monkeypatch.setattr(recordings, "load", lambda *_: ("made up", data))
 
 
-def test_a_bag_of_few_places_starts_from_the_universal_network(tmp_path, monkeypatch, eight_places):
-    as_it_is = Candidate(candidates.AS_SHIPPED, lambda data, seed: FittedModel(LinePrior(0.0)))
-    monkeypatch.setattr(candidates, "from_bundle", lambda source, options: [as_it_is])
-    output, table = tmp_path / "own.onnx", write(tmp_path, *EIGHT_PLACES)
-    run_or_raise("train", "--from-bag", "bag", "--truth", table, "-o", output, "--folds", 2)
-    training = load_bundle(output).card.training
-    assert training["chosen"] == candidates.COLD_START
-    assert training["started_from"] == f"{load_bundle(default_model_path()).model_id:08x}"
-    # No network was fitted, so the card contains no epochs.
-    assert training["recipe"] == {"line": False, "network": True}
-
-
 def test_a_named_model_gets_the_offset_of_the_bag(tmp_path, eight_places):
     # The same shape as the universal network, which replaces no model that is named.
     started = bundle(tmp_path, Remnet(), prior=LinePrior(5.0))
@@ -253,15 +234,6 @@ def test_a_named_model_gets_the_offset_of_the_bag(tmp_path, eight_places):
     assert candidates.COLD_START not in [row["name"] for row in found["choice"]["rows"]]
     assert found["choice"]["chosen"] in ("own offset", "constant")
     assert load_bundle(output).card.training["started_from"] == f"{started.model_id:08x}"
-
-
-def test_the_card_contains_how_a_network_was_trained_further(tmp_path, monkeypatch):
-    data, source = dataset(8, 3), bundle(tmp_path)
-    monkeypatch.setattr(selection, "preferred", lambda errors, gain: [*errors][-1])
-    job = train.Job(data, "bag", tmp_path / "own.onnx", 2)
-    made = train.train_from_bundle(job, source, FitOptions(epochs=1), offer_cold_start=False)
-    assert made.bundle.card.training["chosen"] == candidates.TRAINED_FURTHER
-    assert made.bundle.card.training["recipe"]["epochs"] == 1
 
 
 def test_few_configurations_start_from_the_universal_network(tmp_path, monkeypatch):

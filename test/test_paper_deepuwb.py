@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import math
@@ -9,9 +10,8 @@ import os
 import pickle
 import threading
 from collections.abc import Callable, Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -289,81 +289,46 @@ CONTENT = bytes(range(256)) * 1000
 SHA256 = hashlib.sha256(CONTENT).hexdigest()
 
 
-class Server(ThreadingHTTPServer):
-    daemon_threads = True
-
-    def __init__(self) -> None:
-        super().__init__(("127.0.0.1", 0), _Handler)
-        self.requests: list[str] = []
-        self.truncated = 0
-
-    def url(self, path: str = "/dataset.pkl") -> str:
-        return f"http://127.0.0.1:{self.server_address[1]}{path}"
-
-
-class _Handler(BaseHTTPRequestHandler):
-    server: Server
-
-    def do_GET(self) -> None:
-        self.server.requests.append(self.path)
-        body = CONTENT
-        if self.path == "/absent":
-            self.send_error(404)
-            return
-        self.send_response(200)
-        self.send_header("Content-Length", str(len(body)))
-        self.end_headers()
-        if self.server.truncated > 0:
-            self.server.truncated -= 1
-            body = body[: len(body) // 2]
-        self.wfile.write(body)
-
-    def log_message(self, format: str, *args: Any) -> None:
-        pass
+class Quiet(SimpleHTTPRequestHandler):
+    def log_message(self, *_: object) -> None:
+        """Commands share this process's stderr, which the test reads."""
 
 
 @pytest.fixture
-def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
-    """A mirror."""
-    monkeypatch.setattr("time.sleep", lambda seconds: None)
-    with Server() as running:
+def mirror(tmp_path: Path) -> Iterator[str]:
+    """The address of a mirror's folder."""
+    folder = tmp_path / "mirror"
+    folder.mkdir()
+    (folder / "dataset.pkl").write_bytes(CONTENT)
+    handler = functools.partial(Quiet, directory=str(folder))
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as running:
         thread = threading.Thread(target=running.serve_forever, args=(0.01,))
         thread.start()
-        yield running
+        yield f"http://127.0.0.1:{running.server_address[1]}"
         running.shutdown()
         thread.join()
 
 
 def test_a_wrong_checksum_leaves_no_file_and_a_file_with_the_checksum_is_kept(
-    server: Server, tmp_path: Path
+    mirror: str, tmp_path: Path
 ) -> None:
+    path = tmp_path / "a.pkl"
     with pytest.raises(RecordingError):
-        fetch_deepuwb(tmp_path / "a.pkl", server.url(), "0" * 64)
-    assert not list(tmp_path.iterdir())
-    fetch_deepuwb(tmp_path / "a.pkl", server.url(), SHA256)
-    server.requests.clear()
-    fetch_deepuwb(tmp_path / "a.pkl", server.url(), SHA256)
-    assert not server.requests
+        fetch_deepuwb(path, f"{mirror}/dataset.pkl", "0" * 64)
+    assert not path.exists()
+    fetch_deepuwb(path, f"{mirror}/dataset.pkl", SHA256.upper())
+    written = path.stat().st_mtime_ns
+    fetch_deepuwb(path, f"{mirror}/absent", SHA256)
+    assert path.stat().st_mtime_ns == written
 
 
-def test_a_truncated_download_is_repeated(server: Server, tmp_path: Path) -> None:
-    server.truncated = 2
-    fetch_deepuwb(tmp_path / "a.pkl", server.url(), SHA256.upper())
-    assert (tmp_path / "a.pkl").read_bytes() == CONTENT
-    assert server.requests == ["/dataset.pkl"] * 3
-    server.truncated = 9
-    with pytest.raises(RecordingError):
-        fetch_deepuwb(tmp_path / "b.pkl", server.url(), SHA256)
-    assert [path.name for path in tmp_path.iterdir()] == ["a.pkl"]
-
-
-def test_the_command_downloads_or_fails_with_one_line(server: Server, tmp_path: Path) -> None:
-    mirror = ("--url", server.url(), "--sha256", SHA256)
-    done = start("paper", "fetch", *mirror, "--json", "fetch.json", folder=tmp_path)
+def test_the_command_downloads_or_fails_with_one_line(mirror: str, tmp_path: Path) -> None:
+    words = ("--url", f"{mirror}/dataset.pkl", "--sha256", SHA256, "--json", "fetch.json")
+    done = start("paper", "fetch", *words, folder=tmp_path)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "deepuwb.pkl").read_bytes() == CONTENT
     assert json.loads((tmp_path / "fetch.json").read_text())["bytes"] == len(CONTENT)
-    for url in (server.url("/absent"), "file:///etc/passwd", "nonsense"):
+    for url in (f"{mirror}/absent", "file:///etc/passwd", "nonsense"):
         done = run("paper", "fetch", "-o", "x.pkl", "--url", url, "--sha256", SHA256, folder=tmp_path)
         assert done.returncode == 1
         assert len(done.stderr.strip().splitlines()) == 1

@@ -16,7 +16,7 @@ from command_line import run
 from model_material import dataset
 
 from uwb_mitigation.paper import report, tables
-from uwb_mitigation.paper.report import Report, Study, build, principal_components
+from uwb_mitigation.paper.report import Report, Study, build
 from uwb_mitigation.paper.results import ExperimentResults, FirmwareRow
 from uwb_mitigation.preprocessing import Preprocessing, Scaling
 
@@ -179,15 +179,6 @@ def test_parts_without_results_are_left_out_with_the_command_that_makes_them(no_
     assert "--data 'my logs' " in made.lacking["Tables 1 and 2, Fig. 5"]
 
 
-def test_shortened_training_adds_a_notice(no_cloud):
-    every = [trained(samples=k, seed=seed) for k in (157, 128, 64, 32, 16, 8) for seed in range(5)]
-    complete, *shortened = (
-        len(build(study(), one).notices)
-        for one in (results(*every), results(*every, epochs=2), results(*every[:-5]))
-    )
-    assert shortened == [complete + 1] * 2
-
-
 def test_missing_measurements_and_estimates_are_marked(full):
     for table in full.tables[1:]:
         assert table.has_gaps
@@ -253,19 +244,6 @@ def test_hostile_names_are_only_text():
     page = build(made, results(trained(network=HOSTILE), data=HOSTILE, split=HOSTILE)).html()
     assert not Page(page).all("script")
     assert "<script" not in page
-
-
-def test_components_are_those_of_the_covariance():
-    inputs = np.random.default_rng(0).normal(size=(200, 6)) * (5, 3, 2, 1, 1, 1) + 7
-    points, explained = principal_components(inputs)
-    values = np.sort(np.linalg.eigvalsh(np.cov(inputs.T)))[::-1]
-    assert points.var(axis=0, ddof=1) == pytest.approx(values[:3])
-    assert explained == pytest.approx(values[:3] / values.sum())
-    for shape in ((1, 157), (2, 157), (5, 1)):
-        points, explained = principal_components(np.ones(shape, np.float32))
-        assert points.shape == (shape[0], 3)
-        assert not points.any()
-        assert not explained.any()
 
 
 def test_the_command_writes_the_page_and_rejects_wrong_files(apartment, tmp_path):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from model_material import card, integer_network, random_int8, random_weights, windows
+from model_material import random_weights, windows
 
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.model import floating, graph
@@ -13,7 +13,7 @@ from uwb_mitigation.model.bundle import load_bundle, save_bundle
 from uwb_mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.model.requantisation import nudge
 from uwb_mitigation.model.shipped import SHIPPED, shipped_model_path
-from uwb_mitigation.training.quantization import calibration_inputs, nudge_bundle, quantize
+from uwb_mitigation.training.quantization import quantize
 
 SHAPE = Remnet(samples=32)
 
@@ -42,23 +42,11 @@ def test_the_integers_are_exact_for_the_firmware_already():
         assert np.array_equal(again.weight_scale[name], integers.weight_scale[name])
 
 
-def test_a_bundle_is_written_again_with_nudged_scales_only(tmp_path):
-    shape = Remnet(samples=8)
-    model = graph.int8_model(random_int8(shape, seed=1, exact=False))
-    before = save_bundle(tmp_path / "before.onnx", model, card(shape))
-    after = nudge_bundle(before, tmp_path / "nudged.onnx")
-    assert after.card == before.card
-    assert after.model_id != before.model_id
-    old, new = integer_network(before).weights, integer_network(after).weights
-    expected = random_int8(shape, seed=1)
-    assert new.activation_scale == expected.activation_scale != old.activation_scale
-    assert all(np.array_equal(new.weight[name], old.weight[name]) for name in old.weight)
-
-
 @pytest.mark.parametrize("name", SHIPPED)
 def test_a_shipped_model_is_what_the_nudge_makes_of_it(name, tmp_path):
     shipped = load_bundle(shipped_model_path(name))
-    assert nudge_bundle(shipped, tmp_path / "again.onnx").model == shipped.model
+    nudged = nudge(graph.int8_weights(shipped.model, shipped.architecture))
+    assert save_bundle(tmp_path / "again.onnx", graph.int8_model(nudged), shipped.card).model == shipped.model
 
 
 def test_a_network_with_dead_filters_can_be_quantised():
@@ -90,10 +78,3 @@ def test_a_layer_with_tiny_weights_can_be_quantised_for_all_processors(layer):
 def test_calibration_inputs_that_cannot_be_are_refused(inputs):
     with pytest.raises(DatasetError, match="calibration inputs"):
         quantize(random_weights(SHAPE), inputs.astype(np.float32))
-
-
-def test_calibration_takes_from_every_configuration():
-    from model_material import dataset
-
-    data = dataset(5, 100)
-    assert len(calibration_inputs(data, 0)) == 5 * 40

@@ -8,14 +8,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from model_material import bundle, measurement, window_of
+from model_material import bundle, measurement
 
 from uwb_mitigation.errors import ModelError
 from uwb_mitigation.measurement import Status
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.architecture import Remnet
 from uwb_mitigation.model.familiarity import Band, Familiarity, Strangeness, features
-from uwb_mitigation.preprocessing import Preprocessing, Scaling
+from uwb_mitigation.preprocessing import Scaling
 
 WIDE = Band(-1000.0, 1000.0, 1.0)
 SHAPE = Remnet(samples=157)
@@ -144,14 +144,3 @@ def test_familiarity_of_measurements_covers_them():
     found = Familiarity.of(0.3, values)
     assert (Strangeness(found.bands).score(values) <= 0).all()
     assert replace(found, known_offset_m=0.0).bands == found.bands
-
-
-def test_the_window_that_is_scored_is_the_networks_input(tmp_path):
-    subject = measurement()
-    _, window = window_of(subject.cir, Preprocessing(157))
-    (row,) = features(window[None], Scaling.PREAMBLE, *(np.float32([v]) for v in (3.0, -82.0, -88.0)))
-    level = float(row[3])
-    edge = Band(float(np.float32(level + 1)), 500.0, 2.0)
-    result = mitigation(tmp_path, cir_level_db=edge).correct([subject])[0]
-    familiar = mitigation(tmp_path).correct([subject])[0]
-    assert result.correction_m == pytest.approx((familiar.correction_m + 0.25) / 2, abs=1e-4)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -16,7 +15,7 @@ from uwb_mitigation.preprocessing import Scaling
 
 torch = pytest.importorskip("torch", reason="training is not set up: run make setup-training")
 
-from uwb_mitigation.training import augmentation, universal  # noqa: E402
+from uwb_mitigation.training import universal  # noqa: E402
 from uwb_mitigation.training.options import FitOptions  # noqa: E402
 from uwb_mitigation.training.universal import Plan, Universal  # noqa: E402
 
@@ -39,39 +38,6 @@ def test_it_is_graded_by_condition_in_another_world(small: Universal) -> None:
     for row in ("raw", "float", "int8"):
         assert set(small.held_out[row]) == {"all", "LOS", "NLOS", "NDP NLOS"}
     assert small.held_out["raw"]["LOS"].mae < small.held_out["raw"]["NDP NLOS"].mae
-
-
-def test_decays_vary_behind_the_first_path_alone_and_some_inputs_are_louder() -> None:
-    inputs = torch.ones(4000, 157) * torch.linspace(1.0, 0.1, 157)
-    varied = augmentation.vary_channel(inputs, torch.Generator().manual_seed(0)).numpy()
-    gain = varied[:, 0]
-    assert gain.min() == 1.0
-    assert np.mean(gain > 1.0) == pytest.approx(augmentation.LOUDER_SHARE, abs=0.03)
-    assert gain.max() == pytest.approx(10 ** (augmentation.LOUDER_DB / 40), rel=0.02)
-    first = augmentation.FIRST_VARIED
-    np.testing.assert_allclose(
-        varied[:, : first + 1], gain[:, None] * inputs[:, : first + 1].numpy(), rtol=1e-6
-    )
-    # An amplitude is the square of an input.
-    decay = 2.0 * np.log(varied[:, first + 100] / gain / inputs[0, first + 100].item())
-    assert np.mean(decay) == pytest.approx(0.0, abs=0.05)
-    assert np.std(decay) == pytest.approx(augmentation.DECAY_NEPERS, rel=0.05)
-
-
-def test_receivers_vary_in_pulse_first_path_clipping_and_length() -> None:
-    inputs = torch.zeros(4000, 157)
-    inputs[:, 7], inputs[:, 100] = 1.0, 0.5
-    varied = augmentation.vary_receiver(inputs, torch.Generator().manual_seed(0)).numpy()
-    assert np.isfinite(varied).all()
-    assert varied.min() == 0.0
-    ends_early = varied[:, 98:103].max(axis=1) == 0.0
-    share = augmentation.OTHER_RECEIVERS
-    assert 0.4 < ends_early.mean() / (share * augmentation.DAMAGED_SHARE) < 1.3
-    amplitude = varied[:, 5:10] ** 2
-    place = (amplitude @ np.arange(5, 10)) / amplitude.sum(axis=1)
-    assert np.abs(place - 7.0).max() <= augmentation.EARLY_TAPS + 0.1
-    assert np.mean(np.abs(place - 7.0) > 1e-6) == pytest.approx(share, abs=0.05)
-    assert np.std(place) == pytest.approx(augmentation.EARLY_TAPS * np.sqrt(share / 3.0), rel=0.15)
 
 
 def test_the_command_writes_both_bundles(tmp_path: Path) -> None:

@@ -39,7 +39,7 @@ def overall_median(train: Dataset) -> Predict:
 
 def ridge(train: Dataset, *, header: bool) -> Predict:
     """Ridge regression on standardised features of the CIR, and of the header where asked for."""
-    pipeline, linear, preprocessing = _scikit("pipeline"), _scikit("linear_model"), _scikit("preprocessing")
+    pipeline, linear, preprocessing = scikit("pipeline"), scikit("linear_model"), scikit("preprocessing")
     model = pipeline.make_pipeline(preprocessing.StandardScaler(), linear.Ridge(RIDGE_PENALTY))
     model.fit(features(train, header=header), train.error_m, ridge__sample_weight=_weights(train))
     return lambda part: np.asarray(model.predict(features(part, header=header)), np.float64)
@@ -47,7 +47,7 @@ def ridge(train: Dataset, *, header: bool) -> Predict:
 
 def gradient_boosting(train: Dataset, seed: int) -> Predict:
     """Boosted trees under absolute error on all features."""
-    model = _scikit("ensemble").HistGradientBoostingRegressor(
+    model = scikit("ensemble").HistGradientBoostingRegressor(
         loss="absolute_error", max_iter=TREES, max_leaf_nodes=LEAVES, random_state=seed
     )
     # On data this small its threads spend their time waiting for each other.
@@ -101,10 +101,9 @@ def _weights(train: Dataset) -> NDArray[np.float64]:
     return np.asarray(len(train) / (len(count) * count[of]), np.float64)
 
 
-def _scikit(module: str):  # type: ignore[no-untyped-def]
+def scikit(module: str):  # type: ignore[no-untyped-def]
+    """Return a module of scikit-learn; raises `MissingDependencyError`."""
     try:
         return importlib.import_module(f"sklearn.{module}")
     except ModuleNotFoundError as error:
-        raise MissingDependencyError(
-            "the baselines need scikit-learn", valid="run `make setup-training`"
-        ) from error
+        raise MissingDependencyError("this needs scikit-learn", valid="run `make setup-training`") from error

@@ -1,7 +1,7 @@
 """The line prior fitted by least absolute deviations on one mean per configuration.
 
-Least absolute deviations, because a few configurations are surveyed badly or have no path at all and
-err by metres; one mean per configuration, because measurements of one are not independent.
+Least absolute deviations, because a few configurations have errors of metres (wrong survey, no direct path); one mean per
+configuration, because its measurements are not independent.
 """
 
 from __future__ import annotations
@@ -13,60 +13,45 @@ from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.model.prior import LinePrior
 
 MIN_CONFIGURATIONS = 6
-"""Fewer do not bear a line of three coefficients: the prior is then their median."""
+"""With fewer, the prior is their median: they do not determine a line of three coefficients."""
+
+MIN_POWER_RANGE_DB = 1.0
+"""Received powers that span less do not determine a line in them alone."""
 
 
 def fit_prior(
     configurations: NDArray[np.str_],
     rx_power_dbm: NDArray[np.floating],
-    first_path_power_dbm: NDArray[np.floating],
+    first_path_power_dbm: NDArray[np.floating] | None,
     error_m: NDArray[np.floating],
 ) -> LinePrior:
     """The prior of measurements with these values, each of shape (n,).
 
-    Powers may be NaN where unknown: those rows count for nothing, and where too few configurations
-    remain, or their powers are all alike, the prior is the median over configurations.
+    Rows with an unknown power (NaN) are ignored. If too few configurations remain, or if their powers are all alike, the
+    prior is the median over configurations.
+
+    Args:
+        first_path_power_dbm: None: a line in the received power alone.
 
     Raises:
         DatasetError: there are no measurements.
     """
     if len(error_m) == 0:
         raise DatasetError("no measurements to fit a prior to")
-    gap = rx_power_dbm - first_path_power_dbm
-    known = np.isfinite(gap)
-    names = np.unique(configurations[known])
-    if len(names) < MIN_CONFIGURATIONS:
+    powers = [rx_power_dbm]
+    if first_path_power_dbm is not None:
+        powers.append(rx_power_dbm - first_path_power_dbm)
+    known = np.isfinite(np.sum(powers, axis=0))
+    names = configurations[known]
+    columns = [means(names, values[known]) for values in powers] if known.any() else []
+    if not columns or len(columns[0]) < MIN_CONFIGURATIONS:
         return constant(configurations, error_m)
-    design = np.column_stack(
-        [
-            np.ones(len(names)),
-            means(configurations[known], rx_power_dbm[known]),
-            means(configurations[known], gap[known]),
-        ]
-    )
-    if np.linalg.matrix_rank(design, tol=1e-3) < design.shape[1]:
+    design = np.column_stack([np.ones(len(columns[0])), *columns])
+    is_flat = len(powers) == 1 and float(np.ptp(columns[0])) < MIN_POWER_RANGE_DB
+    if is_flat or np.linalg.matrix_rank(design, tol=1e-3) < design.shape[1]:
         return constant(configurations, error_m)
-    target = means(configurations[known], error_m[known])
-    offset, per_rx_power, per_power_gap = (
-        float(np.float32(value)) for value in least_absolute_deviations(design, target)
-    )
-    return LinePrior(offset, per_rx_power, per_power_gap)
-
-
-def fit_level(
-    configurations: NDArray[np.str_], rx_power_dbm: NDArray[np.floating], error_m: NDArray[np.floating]
-) -> LinePrior:
-    """A line in the received power alone, as `fit_prior`: for radios that tell no other. Arguments of shape (n,)."""
-    known = np.isfinite(rx_power_dbm)
-    names = np.unique(configurations[known])
-    if len(names) < MIN_CONFIGURATIONS:
-        return constant(configurations, error_m)
-    level, target = (means(configurations[known], values[known]) for values in (rx_power_dbm, error_m))
-    if float(np.ptp(level)) < 1.0:
-        return constant(configurations, error_m)
-    design = np.column_stack([np.ones(len(names)), level])
-    offset, slope = least_absolute_deviations(design, target)
-    return LinePrior(float(np.float32(offset)), float(np.float32(slope)))
+    found = least_absolute_deviations(design, means(names, error_m[known]))
+    return LinePrior(*(float(np.float32(value)) for value in found))
 
 
 def least_absolute_deviations(

@@ -32,7 +32,6 @@ from uwb_mitigation.paper.results import (
     Baseline,
     ErrorsByCondition,
     ExperimentResults,
-    Settings,
     TrainedModel,
 )
 from uwb_mitigation.training import fitting
@@ -120,8 +119,8 @@ def run(
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UwbMitigationError(f"cannot be created: {error.strerror}", where=str(folder)) from error
-    settings = asdict(replace(options, seed=0))
-    mark = fingerprint(json.dumps(settings, sort_keys=True), parts.train, parts.test)
+    settings = replace(options, seed=0)
+    mark = fingerprint(json.dumps(asdict(settings), sort_keys=True), parts.train, parts.test)
     trained = run_jobs(
         _Worker(parts, folder, options),
         {task.name: task for task in wanted},
@@ -137,7 +136,7 @@ def run(
         command=command,
         train=len(parts.train),
         test=len(parts.test),
-        options=Settings(**settings),
+        options=settings,
         models=tuple(TrainedModel.model_validate(model) for model in trained.values()),
         baselines=baselines_of(parts.train, parts.test),
     )

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from uwb_mitigation.evaluation.baselines import scikit
 from uwb_mitigation.evaluation.dataset import Dataset
 from uwb_mitigation.evaluation.page import rendered
 from uwb_mitigation.paper import figures, published, tables
@@ -245,25 +246,21 @@ def _samples(study: Study) -> Picture:
     )
 
 
-def principal_components(
-    inputs: NDArray[np.floating], dimensions: int = 3
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Project inputs (n, k) onto the directions of their largest variance.
+def principal_components(inputs: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Project inputs (n, k) onto the three directions of their largest variance.
 
     Returns:
-        Coordinates (n, d) and the share of the variance along each, (d,). Components that the data does not have are 0.
-        The largest weight of a component is positive, so that the same data gives the same picture.
+        Coordinates (n, 3) and the share of the variance along each, (3,). Components that the data does not have are 0.
+
+    Raises:
+        MissingDependencyError: scikit-learn is not installed.
     """
-    centred = inputs.astype(np.float64) - inputs.mean(axis=0, dtype=np.float64)
-    _, singular, components = np.linalg.svd(centred, full_matrices=False)
-    components, power = components[:dimensions], singular**2
-    found = len(components)
-    largest = np.abs(components).argmax(axis=1)
-    components = components * np.sign(components[np.arange(found), largest])[:, None]
-    points, explained = np.zeros((len(inputs), dimensions)), np.zeros(dimensions)
-    points[:, :found] = centred @ components.T
-    if power.sum() > 0:
-        explained[:found] = power[:found] / power.sum()
+    points, explained = np.zeros((len(inputs), 3)), np.zeros(3)
+    count = min(3, *inputs.shape)
+    if np.ptp(inputs, axis=0).any():
+        found = scikit("decomposition").PCA(count, svd_solver="full")
+        points[:, :count] = found.fit_transform(inputs.astype(np.float64))
+        explained[:count] = found.explained_variance_ratio_
     return points, explained
 
 

@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from uwb_mitigation.errors import DatasetError, UwbMitigationError
 from uwb_mitigation.files import read_bounded
+from uwb_mitigation.training.options import FitOptions
 
 RESULTS, MAX_BYTES = "protocol.json", 64 * 2**20
 FORMS = ("float", "optimised", "int8")
@@ -125,17 +126,6 @@ class Baseline(_Entry):
     reason: str = ""
 
 
-class Settings(_Entry):
-    """Options of every fit (`training.options.FitOptions`)."""
-
-    epochs: Count
-    learning_rate: Number
-    batch: Count
-    dropout: Number
-    weight_decay: Number
-    seed: Count
-
-
 class ExperimentResults(_Entry):
     """Results of the paper's experiment; `train` and `test` are the numbers of measurements, `options` those of every fit."""
 
@@ -144,7 +134,7 @@ class ExperimentResults(_Entry):
     command: str = ""
     train: Count
     test: Count
-    options: Settings
+    options: FitOptions
     models: tuple[TrainedModel, ...]
     baselines: tuple[Baseline, ...] = ()
 

@@ -350,4 +350,4 @@ def _site_line(data: Dataset, error_m: NDArray[np.float64]) -> LinePrior:
     """A line in both powers if both are known, otherwise in the received power if known, otherwise a constant."""
     if _has_both_powers(data):
         return lad.fit_prior(data.configurations, data.rx_power_dbm, data.first_path_power_dbm, error_m)
-    return lad.fit_level(data.configurations, data.rx_power_dbm, error_m)
+    return lad.fit_prior(data.configurations, data.rx_power_dbm, None, error_m)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.evaluation import baselines, lad, splits, zero_shot
+from uwb_mitigation.evaluation import baselines, splits, zero_shot
 from uwb_mitigation.evaluation.dataset import Dataset
 from uwb_mitigation.evaluation.metrics import bootstrap_interval, coverage, kept_mae
 from uwb_mitigation.evaluation.splits import Group
@@ -218,8 +218,7 @@ def _baselines(
     yield "ridge", baselines.ridge(part, header=False)(test)
     yield "ridge_header", baselines.ridge(part, header=True)(test)
     yield "gradient_boosting", baselines.gradient_boosting(part, seed)(test)
-    line = lad.fit_prior(part.configurations, part.rx_power_dbm, part.first_path_power_dbm, part.error_m)
-    yield "l1_line", prior_m(line, test)
+    yield "l1_line", prior_m(candidates.fit_line(part), test)
     some = part.rows(splits.thinned(part.configurations, recipe.per_configuration, seed))
     options, samples = replace(candidates.ALONE, seed=seed), recipe.architecture.samples
     yield "mlp", network_m(fit(Mlp(samples=samples), some.inputs, some.error_m, options), test.inputs)

@@ -119,18 +119,6 @@ def quantize_bundle(source: Bundle, dataset: Dataset, percentile: float, output:
     return Quantised(save_bundle(output, graph.int8_model(integers), card), difference)
 
 
-def nudge_bundle(source: Bundle, output: Path) -> Bundle:
-    """Write an int8 bundle again with the scales that `nudge` chooses. Its integers and its card stay the same.
-
-    Raises:
-        ModelError: the bundle is not quantised, or no scales are possible; see `nudge`.
-    """
-    if not source.quantised:
-        raise ModelError("a float bundle", where=str(source.path), valid="a bundle that is quantised")
-    weights = nudge(graph.int8_weights(source.model, source.architecture))
-    return save_bundle(output, graph.int8_model(weights), source.card)
-
-
 def _weight_scale(name: str, weight: NDArray[np.float32]) -> NDArray[np.float32]:
     """One scale for each filter; the head is one output."""
     peak = np.atleast_1d(np.abs(weight).max(axis=None if name == HEAD else tuple(range(1, weight.ndim))))

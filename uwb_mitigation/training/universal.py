@@ -24,7 +24,8 @@ from uwb_mitigation.preprocessing import Preprocessing, Scaling
 from uwb_mitigation.sources.simulation.buildings import PLACEMENTS
 from uwb_mitigation.training.augmentation import calibration_inputs, normalised, vary_channel, vary_receiver
 from uwb_mitigation.training.cards import card_of, familiarity_of
-from uwb_mitigation.training.fitting import FitOptions, fit_varied
+from uwb_mitigation.training.fitting import fit
+from uwb_mitigation.training.options import FitOptions
 from uwb_mitigation.training.quantization import quantize
 from uwb_mitigation.training.simulated import building_dataset
 
@@ -102,15 +103,15 @@ def train(
         on_share(0.2 + 0.75 * epochs / plan.fit.epochs, "training")
 
     options = replace(plan.fit, seed=plan.seed)
-    network = fit_varied(
+    network = fit(
         Remnet(samples=plan.samples),
         world.inputs,
         world.error_m,
-        vary_channel
-        if is_leveled
-        else lambda inputs, generator: normalised(vary_receiver(vary_channel(inputs, generator), generator)),
         options,
         count_epoch,
+        vary=vary_channel
+        if is_leveled
+        else lambda inputs, generator: normalised(vary_receiver(vary_channel(inputs, generator), generator)),
     )
     some = world.inputs[:: max(1, len(world) // CALIBRATION_INPUTS)]
     integers = quantize(network, calibration_inputs(some, plan.scaling))
