@@ -241,3 +241,16 @@ def test_a_usb_device_is_found_by_its_ids_and_serial_number(monkeypatch):
     assert PortAddress.parse("usb:2341:805a").find() == "/dev/ttyACM0"
     assert PortAddress.parse("usb:2341:805a:B").find() == "/dev/ttyACM1"
     assert PortAddress.parse("usb:2341:805a:C").find() is None
+
+
+@pytest.mark.parametrize(
+    "error", [OSError("sysfs"), TypeError("int() argument"), ValueError("invalid literal")]
+)
+def test_a_usb_device_that_is_unplugged_while_ports_are_listed_is_awaited(monkeypatch, error: Exception):
+    def comports() -> list[object]:
+        raise error
+
+    monkeypatch.setattr("serial.tools.list_ports.comports", comports)
+
+    with pytest.raises(LinkError):
+        PortAddress.parse("usb:2341:805a").open()

@@ -141,6 +141,18 @@ def test_a_board_without_a_model_refuses_to_correct_and_is_asked_once():
     assert [type(event) for event in bench.measure(1)] == [RangeMeasurement]
 
 
+def test_a_board_that_does_not_leave_its_mode_refuses_the_mode_of_the_host():
+    class Correcting(Board):
+        mode = property(lambda board: Mode.DEVICE, lambda board, value: None)
+
+    bench = Bench(BoardSession(mode=Mode.HOST))
+    bench.board = Correcting(IDENTITY, HalfMetre())
+    bench.run(1000)
+
+    assert bench.seen(ModeRefused) == [ModeRefused(Mode.HOST, Mode.DEVICE)]
+    assert bench.seen(ModeChanged) == []
+
+
 def test_after_a_reset_the_mode_is_asked_for_again():
     bench = connected(mode=Mode.DEVICE)
     bench.reboot()

@@ -19,8 +19,8 @@ from benchmarks.dw1000_model.links import Link
 from uwb_mitigation.errors import ParameterError, format_id
 from uwb_mitigation.link.emulated_board import EmulatedBoard, PseudoTerminal
 from uwb_mitigation.link.layout import Role
-from uwb_mitigation.link.radio import RadioSettings
-from uwb_mitigation.nodes.live_feeds import settings_of
+from uwb_mitigation.link.radio import NEVER_MS, AnchorInReach, RadioSettings, RadioStatus
+from uwb_mitigation.nodes.live_feeds import anchor_facts, settings_of
 from uwb_mitigation.nodes.parameter_tables import DRIVER
 from uwb_mitigation.sources.simulated import SimulatedSource
 
@@ -107,6 +107,15 @@ def test_an_address_is_read_as_it_is_printed(address: int):
     assert (settings.address, settings.anchors) == (address, (7, address))
     if address < 1 << 16:
         assert settings_of((values | {"radio.address": address}).__getitem__).address == address
+
+
+def test_an_anchor_that_never_answered_was_never_heard():
+    status = RadioStatus(
+        anchors=(AnchorInReach(7, 9, 0, np.nan, NEVER_MS), AnchorInReach(8, 9, 9, -80.0, 1500))
+    )
+    never, heard = anchor_facts(status).values()
+    assert never == "0 of 9 ranged, nan dBm, heard never"
+    assert heard == "9 of 9 ranged, -80.0 dBm, heard 1.5 s ago"
 
 
 def test_parameters_that_nobody_set_ask_nothing_of_a_boards_radio():

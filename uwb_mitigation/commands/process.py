@@ -140,13 +140,14 @@ def _show(outcomes: list[Outcome], result: dict[str, Any]) -> None:
     table = Table("bag", title=f"Corrected by model {result['model_id']:08x}", title_justify="left")
     for column in ("messages", "ranges", "OK", "passed through", "replaced", "skipped"):
         table.add_column(column, justify="right")
-    table.add_column("")
+    if any(outcome.error for outcome in outcomes):
+        table.add_column("")
     for outcome in outcomes:
         passed = outcome.ranges - outcome.statuses["OK"]
         numbers = (outcome.messages, outcome.ranges, outcome.statuses["OK"], passed, outcome.replaced)
-        state = "" if outcome.error is None else "damaged" if outcome.written else "failed"
+        state = [] if outcome.error is None else ["damaged" if outcome.written else "failed"]
         table.add_row(
-            escape(outcome.job.source.name), *map(str, numbers), str(outcome.skipped.total()), state
+            escape(outcome.job.source.name), *map(str, numbers), str(outcome.skipped.total()), *state
         )
     console.out.print(table)
     console.out.print(f"{result['ranges']} ranges, {result['ranges_per_s']:.0f} ranges/s", highlight=False)

@@ -178,16 +178,18 @@ class PortAddress:
         Raises:
             LinkError: it is absent, in use or forbidden; the message contains the remedy.
         """
-        path = self.find()
-        if path is None:
-            raise LinkError("is not there", where=str(self), valid="plug the board in")
+        path = ""
         try:
+            path = self.find() or ""
+            if not path:
+                raise LinkError("is not there", where=str(self), valid="plug the board in")
             port = serial.Serial(None, baud, timeout=0, exclusive=True)
             port.dtr = dtr
             port.port = path
             port.open()
-        except (OSError, ValueError) as error:
-            # SerialException is an OSError; a ValueError is a baud rate that the port refuses.
+        except (OSError, TypeError, ValueError) as error:
+            # SerialException is an OSError; a ValueError is a baud rate that the port refuses; pyserial raises a
+            # TypeError if a USB device is unplugged while it lists the ports.
             raise LinkError(f"cannot be opened: {_why_not_opened(path, error)}", where=str(self)) from error
         os.set_blocking(port.fileno(), False)
         return port

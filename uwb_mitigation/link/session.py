@@ -327,7 +327,7 @@ class BoardSession:
             self._next_request_ns = now_ns
             events.append(Connected(hello))
         elif frame.flags & Flag.ANSWER and self._mode_request.is_answered_by(hello.request_sequence):
-            wanted = self._mode or hello.mode
+            wanted = hello.mode if self._mode is None else self._mode
             events.append(ModeChanged(wanted) if hello.mode == wanted else ModeRefused(wanted, hello.mode))
         return events
 

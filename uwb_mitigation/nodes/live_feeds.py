@@ -24,7 +24,7 @@ from uwb_mitigation.link.events import (
 from uwb_mitigation.link.layout import PROTOCOL_VERSION, LogLevel, Mode, RadioState, Role
 from uwb_mitigation.link.messages import BoardStatus, Correction, Log, Radio
 from uwb_mitigation.link.port import BoardPort
-from uwb_mitigation.link.radio import RadioSettings, RadioStatus
+from uwb_mitigation.link.radio import NEVER_MS, RadioSettings, RadioStatus
 from uwb_mitigation.measurement import RangeMeasurement
 from uwb_mitigation.nodes import diagnostics
 from uwb_mitigation.nodes.diagnostics import Description
@@ -426,7 +426,7 @@ def anchor_facts(status: RadioStatus) -> dict[str, object]:
     """Return the values of the anchors in reach for the diagnostics."""
     values: dict[str, object] = {}
     for anchor in status.anchors:
-        heard = "never" if anchor.heard_ms is None else f"{anchor.heard_ms / 1000:.1f} s ago"
+        heard = "never" if anchor.heard_ms == NEVER_MS else f"{anchor.heard_ms / 1000:.1f} s ago"
         values[f"anchor {format_id(anchor.address)}"] = (
             f"{anchor.ranged} of {anchor.tried} ranged, {anchor.rx_power_dbm:.1f} dBm, heard {heard}"
         )
