@@ -14,7 +14,7 @@ from bag_material import START_NS, STEP_NS, Foreign, chunk_offsets, numbers, pre
 from mcap.writer import IndexType
 
 from uwb_mitigation.bag import codec
-from uwb_mitigation.bag.reader import MAX_RECORD
+from uwb_mitigation.bag.reader import MAX_RECORD, BagReader
 from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.errors import DamagedRecordingError, RecordingError
 from uwb_mitigation.sources.mcap import McapRecording
@@ -52,8 +52,8 @@ def test_an_unfinished_recording_is_read_by_time_and_in_order(tmp_path: Path) ->
         bag.flush()
     path = bag.cut()
     assert prefix(path)[0] == [0, 1, 2, 3, 4, 5]
-    later = McapRecording(path, stop_ns=START_NS + 2 * STEP_NS)
-    assert [item.measurement.sequence for _, item in zip(range(2), later, strict=False)] == [0, 1]
+    first = next(BagReader(path).messages(start_ns=START_NS + 2 * STEP_NS))
+    assert first.log_time_ns == START_NS + 2 * STEP_NS
 
 
 def test_a_torn_chunk_costs_itself_only(tmp_path: Path) -> None:

@@ -130,12 +130,10 @@ class _FileIndex:
 
     def may_contain(self, chunk: _Chunk, topics: Collection[str] | None) -> bool:
         """Whether a chunk may contain messages of `topics`, so that it must be decompressed."""
+        if topics is None or not chunk.channel_ids:
+            return True
         channels = [self.channels.get(number) for number in chunk.channel_ids]
-        return (
-            topics is None
-            or not channels
-            or any(channel is None or channel.topic in topics for channel in channels)
-        )
+        return any(channel is None or channel.topic in topics for channel in channels)
 
 
 class BagReader:
@@ -184,13 +182,8 @@ class BagReader:
         """Channels of all files; a topic has one for each file and publisher."""
         return [channel for found in self._indexes for channel in found.channels.values()]
 
-    def messages(
-        self,
-        topics: Collection[str] | None = None,
-        start_ns: int | None = None,
-        stop_ns: int | None = None,
-    ) -> Iterator[RawMessage]:
-        """Yield the messages of `topics` (None: all) with start_ns <= log time < stop_ns.
+    def messages(self, topics: Collection[str] | None = None, start_ns: int = -1) -> Iterator[RawMessage]:
+        """Yield the messages of `topics` (None: all) whose log time is not before `start_ns`.
 
         They are in the order of their log times within a file; files follow one another. A file with
         messages outside chunks is read in its own order.
@@ -199,29 +192,21 @@ class BagReader:
             DamagedRecordingError: a file is damaged; every message before the damage has been yielded. A chunk
                 that is truncated or fails its checksum yields none.
         """
-        start = -1 if start_ns is None else start_ns
-        stop = 1 << 64 if stop_ns is None else stop_ns
         for path, found in zip(self.files, self._indexes, strict=True):
             try:
                 with _BoundedFile(path) as file:
                     read = _in_file_order if found.bounds_ns else self._in_time_order
-                    for message in read(file, found, topics, start, stop):
-                        if start <= message.log_time_ns < stop:
+                    for message in read(file, found, topics, start_ns):
+                        if message.log_time_ns >= start_ns:
                             yield message
             except OSError as error:  # noqa: PERF203 - once a file
                 raise RecordingError(f"cannot be read: {error.strerror}", where=str(path)) from error
 
     def _in_time_order(
-        self, file: _BoundedFile, found: _FileIndex, topics: Collection[str] | None, start: int, stop: int
+        self, file: _BoundedFile, found: _FileIndex, topics: Collection[str] | None, start_ns: int
     ) -> Iterator[RawMessage]:
-        chunks = sorted(
-            (
-                chunk
-                for chunk in found.chunks
-                if chunk.last_ns >= start and chunk.first_ns < stop and found.may_contain(chunk, topics)
-            ),
-            key=lambda chunk: (chunk.first_ns, chunk.offset),
-        )
+        wanted = (c for c in found.chunks if c.last_ns >= start_ns and found.may_contain(c, topics))
+        chunks = sorted(wanted, key=lambda chunk: (chunk.first_ns, chunk.offset))
         damage = found.damage
         pending: list[RawMessage] = []
         for number, chunk in enumerate(chunks):
@@ -438,7 +423,7 @@ def _scan(file: _BoundedFile) -> _FileIndex:
 
 
 def _in_file_order(
-    file: _BoundedFile, found: _FileIndex, topics: Collection[str] | None, start: int, stop: int
+    file: _BoundedFile, found: _FileIndex, topics: Collection[str] | None, start_ns: int
 ) -> Iterator[RawMessage]:
     """Yield the messages of a file in which some are not in chunks."""
     offset, end = MAGIC_SIZE, found.damage[0] if found.damage else file.size

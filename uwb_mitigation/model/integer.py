@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.model.architecture import HEAD, Convolution, Mlp, Remnet
+from uwb_mitigation.model.requantisation import requantisation_scale, requantise, saturate, sum_table
 from uwb_mitigation.model.weights import Int8Weights, activation_tensors, layer_inputs, sum_operands
 
 _BATCH = 256
@@ -44,7 +45,8 @@ class IntegerNetwork:
         architecture = self.weights.architecture
         with np.errstate(over="ignore"):  # An infinite quotient saturates as any other large one.
             quotient = np.divide(inputs, self.weights.activation_scale["input"], dtype=np.float32)
-        values = {"input": _saturate(quotient if isinstance(architecture, Mlp) else quotient[:, None, :])}
+        integers = saturate(np.rint(quotient))
+        values = {"input": integers if isinstance(architecture, Mlp) else integers[:, None, :]}
         for tensor in activation_tensors(architecture)[1:]:
             if tensor not in self._reads:
                 values[tensor] = self.add(tensor, values)
@@ -69,30 +71,24 @@ class IntegerNetwork:
     def requantisation(self, name: str) -> NDArray[np.float32]:
         """The factors from accumulator to output of layer `name`, float32 (filters,)."""
         scale = self.weights.activation_scale
-        factors: NDArray[np.float32] = (scale[self._reads[name]] * self.weights.weight_scale[name]) / scale[
-            name
-        ]
-        return factors
+        return requantisation_scale(scale[self._reads[name]], self.weights.weight_scale[name], scale[name])
 
     def convolve(self, name: str, values: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Convolution `name` with its ReLU."""
-        accumulator = self.accumulate(name, values).astype(np.float32)
-        return _saturate(accumulator * self.requantisation(name)[:, None])
+        return requantise(self.accumulate(name, values), self.requantisation(name)[:, None])
 
     def connect(self, name: str, values: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Dense layer `name` with its ReLU, (n, outputs), of (n, inputs)."""
         # Exact in float64, as in `accumulate`.
         sums = values.astype(float) @ self.weights.weight[name].T.astype(float) + self.weights.bias[name]
-        return _saturate(sums.astype(np.float32) * self.requantisation(name))
+        return requantise(sums, self.requantisation(name))
 
     def add(self, name: str, values: dict[str, NDArray[np.uint8]]) -> NDArray[np.uint8]:
         """The sum `name` of its two operands."""
         scale = self.weights.activation_scale
         first, second = sum_operands(name)
-        left = values[first] * np.float64(scale[first] / scale[name])
-        right = values[second].astype(np.float32) * (scale[second] / scale[name])
-        # Exact in binary64; the one rounding to binary32 is the fused multiply-add's.
-        return _saturate((left + right.astype(np.float64)).astype(np.float32))
+        table = sum_table(scale[first] / scale[name], scale[second] / scale[name])
+        return table[values[first], values[second]]
 
     def head(self, values: NDArray[np.uint8]) -> NDArray[np.float32]:
         """The head's output, float32 (n,), of the last tensor, m."""
@@ -101,8 +97,3 @@ class IntegerNetwork:
         factor = self.weights.activation_scale[self._reads[HEAD]] * self.weights.weight_scale[HEAD]
         output: NDArray[np.float32] = accumulator[:, 0].astype(np.float32) * factor
         return output
-
-
-def _saturate(values: NDArray[np.float32]) -> NDArray[np.uint8]:
-    clipped: NDArray[np.uint8] = np.clip(np.rint(values), 0, 255).astype(np.uint8)
-    return clipped

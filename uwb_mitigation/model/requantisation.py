@@ -52,7 +52,7 @@ class Requantisation:
 
     def apply(self, accumulator: NDArray[np.int64]) -> NDArray[np.uint8]:
         product = ((accumulator << WEIGHT_SCALE_BITS) + self.offset) * self.multiplier
-        return _saturate(product >> (32 + REQUANTISATION_SHIFT))
+        return saturate(product >> (32 + REQUANTISATION_SHIFT))
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,13 +68,15 @@ class Sum:
         a = np.arange(256, dtype=np.int64)[:, None]
         b = np.arange(256, dtype=np.int64)[None, :]
         total = (self.first * a + self.second * b + self.offset) >> SUM_SHIFT
-        return _saturate(total)
+        return saturate(total)
 
 
-def requantise(accumulator: NDArray[np.int64], scale: np.float32) -> NDArray[np.uint8]:
-    """ONNX Runtime's requantisation of int32 values: the formula that `solve_requantisation` meets."""
-    scaled = np.rint(accumulator.astype(np.float32) * np.float32(scale))
-    return _saturate(scaled)
+def requantise(accumulator: NDArray[np.number], scale: np.float32 | NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Return ONNX Runtime's requantisation of int32 values: the formula that `solve_requantisation` reproduces.
+
+    `scale` is one factor or an array that broadcasts with `accumulator`.
+    """
+    return saturate(np.rint(accumulator.astype(np.float32) * scale))
 
 
 def sum_table(first: np.float32, second: np.float32, *, fused: bool = True) -> NDArray[np.uint8]:
@@ -90,7 +92,7 @@ def sum_table(first: np.float32, second: np.float32, *, fused: bool = True) -> N
         total = exact.astype(np.float32)
     else:
         total = (values * np.float32(first))[:, None] + products
-    return _saturate(np.rint(total))
+    return saturate(np.rint(total))
 
 
 def neon_sum_table(first: np.float32, second: np.float32) -> NDArray[np.uint8] | None:
@@ -108,7 +110,7 @@ def neon_sum_table(first: np.float32, second: np.float32) -> NDArray[np.uint8] |
     if scaled.max() >= 1 << 22:
         return None
     values = np.arange(256, dtype=np.int64)
-    return _saturate((scaled[0] * values[:, None] + scaled[1] * values + (1 << (shift - 1))) >> shift)
+    return saturate((scaled[0] * values[:, None] + scaled[1] * values + (1 << (shift - 1))) >> shift)
 
 
 def requantisation_scale(
@@ -312,6 +314,7 @@ def _neighbours(value: np.float32) -> list[np.float32]:
     return around
 
 
-def _saturate(values: NDArray[np.int64] | NDArray[np.float32]) -> NDArray[np.uint8]:
+def saturate(values: NDArray[np.int64] | NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Return the values limited to 0 to 255, as uint8."""
     clipped: NDArray[np.uint8] = np.clip(values, 0, _LEVELS).astype(np.uint8)
     return clipped

@@ -36,8 +36,6 @@ class McapRecording(Source):
     Args:
         path: an MCAP file, or a folder with `metadata.yaml` or `*.mcap`.
         topic: where the raw ranges are, of type `uwb_mitigation_msgs/msg/RangeCir`.
-        truth_topic: where their truth is, of type `uwb_mitigation_msgs/msg/RangeTruth`; need not exist.
-        start_ns, stop_ns: bounds on log times, start <= time < stop; None = open.
 
     Attributes:
         message_count: messages on all topics of the bag, as its own index says.
@@ -47,20 +45,9 @@ class McapRecording(Source):
             the bag, or when its type, schema or field layout is not what this package reads.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        *,
-        topic: str = RANGE_RAW,
-        truth_topic: str = RANGE_TRUTH,
-        start_ns: int | None = None,
-        stop_ns: int | None = None,
-    ) -> None:
+    def __init__(self, path: Path, *, topic: str = RANGE_RAW) -> None:
         self._path = path
         self._topic = topic
-        self._truth_topic = truth_topic
-        self._start_ns = start_ns
-        self._stop_ns = stop_ns
         self._closed = False
         bag = BagReader(path)
         self.message_count = bag.message_count
@@ -137,10 +124,10 @@ class McapRecording(Source):
 
     def _decoded(self, bag: BagReader) -> Iterator[RangeMeasurement | tuple[Key, Truth] | tuple[At, Place]]:
         checked: set[int] = set()
-        types = {self._topic: RANGE_CIR_TYPE, self._truth_topic: RANGE_TRUTH_TYPE}
+        types = {self._topic: RANGE_CIR_TYPE, RANGE_TRUTH: RANGE_TRUTH_TYPE}
         if bag.topics.get(ODOMETRY_TRUTH) == ODOMETRY_TYPE:
             types[ODOMETRY_TRUTH] = ODOMETRY_TYPE
-        for message in bag.messages(types, self._start_ns, self._stop_ns):
+        for message in bag.messages(types):
             if self._closed:
                 return
             topic = message.channel.topic
@@ -151,7 +138,7 @@ class McapRecording(Source):
             try:
                 if topic == self._topic:
                     yield decode_range(message.data)
-                elif topic == self._truth_topic:
+                elif topic == RANGE_TRUTH:
                     yield decode_truth(message.data)
                 elif (place := decode_place(message.data)) is not None:
                     stamp_ns, tag_id, position = place
