@@ -5,18 +5,20 @@ from __future__ import annotations
 import json
 import random
 import zlib
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
 import onnx
+import onnxruntime
 import pytest
-from model_material import bundle, card, random_int8, random_weights
+from model_material import bundle, card, random_int8, random_weights, windows
 
 from uwb_mitigation.errors import ModelError
 from uwb_mitigation.model import bundle as bundles
-from uwb_mitigation.model import graph
+from uwb_mitigation.model import floating, graph
 from uwb_mitigation.model.architecture import Remnet
-from uwb_mitigation.model.bundle import load_bundle, parse_bundle, save_bundle
+from uwb_mitigation.model.bundle import Session, load_bundle, parse_bundle, save_bundle, session_options
 from uwb_mitigation.model.prior import LinePrior
 from uwb_mitigation.model.shipped import default_model_path, shipped_model_path
 from uwb_mitigation.preprocessing import Scaling
@@ -169,3 +171,38 @@ def test_the_model_card_is_of_the_shipped_model(shipped):
     text = shipped.with_suffix(".md").read_text(encoding="utf-8")
     assert f"Model id `{load_bundle(shipped).model_id:08x}`" in text
     assert f"{shipped.stat().st_size:,} bytes" in text
+
+
+def test_the_int8_graph_fuses_to_integer_operators(tmp_path):
+    model = bundle(tmp_path, Remnet())
+    options = session_options()
+    options.optimized_model_filepath = str(tmp_path / "optimised.onnx")
+    onnxruntime.InferenceSession(model.model, options, providers=["CPUExecutionProvider"])
+    nodes = Counter(node.op_type for node in onnx.load(tmp_path / "optimised.onnx").graph.node)
+    assert nodes == {
+        "QuantizeLinear": 1,
+        "Transpose": 2,
+        "QLinearConv": 10,
+        "QLinearAdd": 6,
+        "Flatten": 1,
+        "QGemm": 1,
+    }
+
+
+@pytest.mark.parametrize("samples", [157, 8])
+def test_the_float_graph_computes_what_numpy_computes(tmp_path, samples):
+    shape = Remnet(samples=samples)
+    weights = random_weights(shape)
+    model = save_bundle(tmp_path / "float.onnx", graph.float_model(weights), card(shape, quantised=False))
+    inputs = windows(50, samples)
+    assert np.allclose(Session(model).predict_m(inputs), floating.predict_m(weights, inputs), atol=1e-5)
+
+
+def test_the_shipped_model_is_found_beside_an_installation(tmp_path, monkeypatch):
+    folder = tmp_path / "share" / "uwb_mitigation" / "models"
+    folder.mkdir(parents=True)
+    (folder / "universal.onnx").touch()
+    module = tmp_path / "lib/python3.12/site-packages/uwb_mitigation/model/shipped.py"
+    monkeypatch.setattr("uwb_mitigation.model.shipped.__file__", str(module))
+    monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
+    assert default_model_path() == folder / "universal.onnx"

@@ -34,13 +34,6 @@ def test_records_come_back_as_they_were_written(tmp_path: Path, name: str) -> No
     assert source.message_count == 10
 
 
-@pytest.mark.parametrize(("flag", "simulated"), [("true", True), ("false", False), ("unknown", None)])
-def test_a_simulated_bag_says_so(tmp_path: Path, flag: str, simulated: bool | None) -> None:
-    source = McapRecording(write_bag(tmp_path / "bag.mcap", simulated=flag))
-    assert source.simulated is simulated
-    assert ("(simulated)" in source.name) is bool(simulated)
-
-
 def test_reading_from_a_time_includes_it(tmp_path: Path) -> None:
     bag = BagReader(write_bag(tmp_path / "bag.mcap"))
     read = bag.messages([RANGE_RAW], START_NS + 3 * STEP_NS)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -130,19 +129,6 @@ def test_a_range_passes_through_less_the_offset(
     assert result.correction_m == offset
     assert str(result.range_raw_m) == str(range_m)
     assert math.isfinite(result.variance_m2) is valid
-
-
-def test_many_at_once_give_the_same_bits_as_one_by_one(subject: Mitigation):
-    offsets = Offsets(0.1, {1: 0.2, 2: -0.3}, {3: 0.05}, {(4, 2): 5.0})
-    several = with_offsets(subject, offsets)
-    ranges = (3.0, 0.05, math.nan, 1e300, -0.2, 20.0)
-    asked = [
-        replace(measurement(range_m, seed), tag_id=tag, anchor_id=anchor)
-        for seed, (range_m, tag, anchor) in enumerate(itertools.product(ranges, (3, 4, 5), (1, 2, 6)))
-    ]
-    answers = several.correct(asked)
-    assert [repr(answer) for answer in answers] == [repr(several.correct([one])[0]) for one in asked]
-    assert {answer.status for answer in answers} == {Status.OK, Status.OUT_OF_DISTRIBUTION}
 
 
 class Echo:

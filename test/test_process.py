@@ -186,28 +186,6 @@ def test_corrected_ranges_of_the_input_are_replaced_and_counted(tmp_path: Path) 
     ]
 
 
-@pytest.mark.parametrize("library", ["rosbags", "mcap"])
-def test_other_readers_open_the_output(tmp_path: Path, library: str) -> None:
-    process_bag(job(write_bag(tmp_path / "in.mcap", exchanges(12)), tmp_path / "out"))
-    file = tmp_path / "out" / "out_0.mcap"
-    if library == "rosbags":
-        from rosbags.rosbag2 import Reader
-
-        with Reader(tmp_path / "out") as reader:
-            found = Counter(connection.topic for connection, _, _ in reader.messages())
-    else:
-        from mcap.reader import make_reader
-
-        with file.open("rb") as stream:
-            reader = make_reader(stream, validate_crcs=True)
-            found = Counter(channel.topic for _, channel, _ in reader.iter_messages())
-            statistics = reader.get_summary().statistics
-            assert statistics.message_count == found.total()
-            assert statistics.message_start_time == START_NS
-            assert statistics.message_end_time == START_NS + 11 * 10_000_000
-    assert found[RANGE_RAW] == found[RANGE_CORRECTED] == 12
-
-
 def cut(path: Path) -> int:
     """Break a bag behind its first chunk; returns where."""
     end = chunk_offsets(path)[0][1]
