@@ -21,10 +21,9 @@ from rich.table import Table
 from uwb_mitigation_msgs.msg import RangeCorrected
 
 from benchmarks.dw1000_model.evb1000 import EmulatedEvb1000s
-from uwb_mitigation.demos.base import Nodes, run_demo
 from uwb_mitigation.nodes import topics
 from uwb_mitigation.nodes.monitor import REFRESH_HZ
-from uwb_mitigation.nodes.processes import Probe, watching
+from uwb_mitigation.nodes.processes import Nodes, Probe, run_demo, watching
 from uwb_mitigation.sources.simulated import SimulatedSource
 from uwb_mitigation.sources.simulation.scene import ANCHORS
 

@@ -20,7 +20,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rich.console import Console
 from uwb_mitigation_msgs.msg import RangeCorrected
 
-from uwb_mitigation.demos.base import Nodes, run_demo
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.firmware_export.emulated_firmware import EmulatedFirmware
 from uwb_mitigation.link import messages as wire
@@ -29,7 +28,7 @@ from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.shipped import default_model_path
 from uwb_mitigation.nodes import topics
-from uwb_mitigation.nodes.processes import Probe, watching
+from uwb_mitigation.nodes.processes import Nodes, Probe, run_demo, watching
 from uwb_mitigation.sources.opening import open_recording
 from uwb_mitigation.sources.simulated import SimulatedSource
 

@@ -18,11 +18,10 @@ from nav_msgs.msg import Odometry
 from rich.console import Console
 from rich.live import Live
 
-from uwb_mitigation.demos.base import Nodes, run_demo
 from uwb_mitigation.errors import DatasetError, UwbMitigationError
 from uwb_mitigation.nodes import topics
 from uwb_mitigation.nodes.monitor import REFRESH_HZ, Monitor, live_table, summary
-from uwb_mitigation.nodes.processes import watching
+from uwb_mitigation.nodes.processes import Nodes, run_demo, watching
 from uwb_mitigation.positioning.anchors import AnchorMap, dump_anchors
 from uwb_mitigation.positioning.tracks import TruePath
 from uwb_mitigation.sources.simulated import SimulatedSource

@@ -104,11 +104,12 @@ class Driver(ManagedNode):
         self.exit_code = 0
         self._make_feed: Callable[[], Feed] | None = None
         self._feed: Feed | None = None
-        self._ranges: Publisher | None = None
-        self._corrected: Publisher | None = None
-        self._truths: Publisher | None = None
-        self._places: Publisher | None = None
-        self._clock_publisher: Publisher | None = None
+        # `open` sets those that its source needs.
+        self._ranges: Publisher
+        self._corrected: Publisher
+        self._truths: Publisher
+        self._places: Publisher
+        self._clock_publisher: Publisher
         self._sensor_ranges: topics.SensorRanges | None = None
         self._frame_id: str = self.value("frame_id")
         self.add_on_set_parameters_callback(self._check)
@@ -138,8 +139,7 @@ class Driver(ManagedNode):
     def close(self) -> None:
         super().close()
         self._feed = self._make_feed = None
-        self._ranges = self._corrected = self._truths = self._places = None
-        self._clock_publisher = self._sensor_ranges = None
+        self._sensor_ranges = None
 
     def describe(self) -> Description:
         return ("none", diagnostics.OK, "", {}) if self._feed is None else self._feed.describe()
@@ -190,7 +190,6 @@ class Driver(ManagedNode):
             self._clock_publisher = self.until_close(clock, self.destroy_publisher)
 
         def make() -> ReplayFeed:
-            assert self._ranges is not None
             subscribed = self._ranges.get_subscription_count
             return ReplayFeed(
                 source,
@@ -236,21 +235,19 @@ class Driver(ManagedNode):
             for record, stamp_ns in records
         ]
         for (record, stamp_ns), measurement in zip(records, measurements, strict=True):
-            if record.truth is not None and self._truths is not None:
+            if record.truth is not None:
                 self._truths.publish(encode_truth(measurement, record.truth))
-            if record.tag_position is not None and self._places is not None:
+            if record.tag_position is not None:
                 self._places.publish(encode_place(record.tag_position, measurement.tag_id, stamp_ns))
         self._publish_measurements(measurements)
 
     def _publish_clock(self, recorded_ns: int) -> None:
-        if self._clock_publisher is not None:
-            self._clock_publisher.publish(ClockMessage(clock=Time(nanoseconds=recorded_ns).to_msg()))
+        self._clock_publisher.publish(ClockMessage(clock=Time(nanoseconds=recorded_ns).to_msg()))
 
     def _publish_range(self, measurement: RangeMeasurement) -> None:
         self._publish_measurements([replace(measurement, frame_id=self._frame_id)])
 
     def _publish_measurements(self, measurements: Sequence[RangeMeasurement]) -> None:
-        assert self._ranges is not None
         if self._consumer is not None:
             self._consumer.correct(measurements)
             if not self._ranges.get_subscription_count():
@@ -260,7 +257,6 @@ class Driver(ManagedNode):
             self._ranges.publish(encode_range(measurement))
 
     def _publish_correction(self, correction: Correction) -> None:
-        assert self._corrected is not None
         c, raw_m = correction, correction.corrected.range_raw_m
         measurement = RangeMeasurement(
             c.stamp_ns, c.tag_id, c.anchor_id, c.sequence, c.device_time, raw_m, _NO_CIR, self._frame_id
@@ -273,7 +269,6 @@ class Driver(ManagedNode):
 
     def _finish(self, error: UwbMitigationError | None) -> None:
         """End the node after everything was acknowledged."""
-        assert self._ranges is not None
         self._ranges.wait_for_all_acked(Duration(seconds=5))
         if self._consumer is not None:
             self._consumer.wait_for_all_acked(Duration(seconds=5))

@@ -148,8 +148,7 @@ class ManagedNode(LifecycleNode):
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         return self._attempt(self._end_and_close)
 
-    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        return self._attempt(self._end_and_close)
+    on_shutdown = on_cleanup
 
     def destroy_node(self) -> None:
         self._end_and_close()
