@@ -128,9 +128,6 @@ class Ros:
     def wait_for_subscribers(self, topic: str, count: int) -> None:
         self.spin_until(lambda: self.node.count_subscribers(topic) >= count)
 
-    def wait_for_publishers(self, topic: str, count: int) -> None:
-        self.spin_until(lambda: self.node.count_publishers(topic) >= count)
-
     def find_each_other(self, publisher: Publisher, question: RangeCir, answers: list) -> None:
         """Ask until a node has answered and owes no answer any more: it is found, and finds us, one after the other."""
         numbers = itertools.count(1)

@@ -21,7 +21,7 @@ pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from rclpy.serialization import deserialize_message
-from ros_harness import PAUSED, Ros, domain
+from ros_harness import PAUSED, Ros
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
 
 from uwb_mitigation.bag.codec import encode_range
@@ -148,54 +148,28 @@ def good_message() -> RangeCir:
     return deserialize_message(encode_range(measurement), RangeCir)
 
 
-def changed(**fields) -> RangeCir:
-    message = good_message()
-    for name, value in fields.items():
-        owner = message.cir if hasattr(message.cir, name) else message
-        setattr(owner, name, value)
-    return message
-
-
-@pytest.mark.parametrize(
-    ("message", "status"),
-    [
-        pytest.param(changed(samples=array("h")), Status.NO_CIR, id="no samples"),
-        pytest.param(changed(encoding=9), Status.NO_CIR, id="unknown encoding"),
-        pytest.param(changed(scale=math.inf), Status.BAD_CIR, id="infinite scale"),
-    ],
-)
-def test_a_range_that_cannot_be_corrected_passes_through(quiet_mitigator, message: RangeCir, status: Status):
-    answer = quiet_mitigator(message)
-    assert answer.status == status
-    assert answer.range == answer.range_raw == np.float32(message.range)
-    assert answer.correction == 0.0
-    assert answer.variance > quiet_mitigator(good_message()).variance
-
-
-@pytest.mark.parametrize("range_m", [math.nan, math.inf, -1.0])
-def test_a_range_that_is_none_passes_through_without_weight(quiet_mitigator, range_m: float):
-    answer = quiet_mitigator(changed(range=range_m))
-    assert answer.status != Status.OK
-    assert np.array_equal([answer.range], [range_m], equal_nan=True)
-    assert answer.variance == math.inf
-
-
-@pytest.fixture(scope="module")
-def quiet_mitigator(tmp_path_factory: pytest.TempPathFactory):
-    """A function that sends one raw range to a running mitigator and returns its answer."""
-    with domain(tmp_path_factory.mktemp("mitigator")) as ros:
-        ros.start("mitigator")
-        publisher = ros.node.create_publisher(RangeCir, RAW, 10)
-        corrected = ros.collect(RangeCorrected, CORRECTED)
-        ros.find_each_other(publisher, good_message(), corrected)
-
-        def ask(message: RangeCir) -> RangeCorrected:
-            corrected.clear()
-            publisher.publish(message)
-            ros.spin_until(lambda: len(corrected) == 1)
-            return corrected[0]
-
-        yield ask
+def test_ranges_that_cannot_be_corrected_pass_through(ros: Ros):
+    changes = (
+        ({"samples": array("h")}, Status.NO_CIR),
+        ({"encoding": 9}, Status.NO_CIR),
+        ({"scale": math.inf}, Status.BAD_CIR),
+        ({"range": math.nan}, Status.BAD_CIR),
+    )
+    ros.start("mitigator")
+    publisher = ros.node.create_publisher(RangeCir, RAW, 10)
+    corrected = ros.collect(RangeCorrected, CORRECTED)
+    ros.find_each_other(publisher, good_message(), corrected)
+    for change, status in changes:
+        message = good_message()
+        for name, value in change.items():
+            setattr(message.cir if hasattr(message.cir, name) else message, name, value)
+        corrected.clear()
+        publisher.publish(message)
+        ros.spin_until(lambda: len(corrected) == 1)
+        (answer,) = corrected
+        assert (answer.status, answer.correction) == (status, 0.0)
+        assert np.array_equal([answer.range, answer.range_raw], [message.range] * 2, equal_nan=True)
+        assert math.isinf(answer.variance) == math.isnan(message.range)
 
 
 def test_two_nodes_with_one_name_are_reported_and_a_killed_one_is_not(ros: Ros):

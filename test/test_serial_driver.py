@@ -129,16 +129,6 @@ def test_the_mode_changes_without_a_restart(ros: Ros, link: Path):
     assert max(keys.values()) == 1
 
 
-def test_corrections_by_another_model_than_the_expected_one_are_withheld(ros: Ros, link: Path):
-    corrected = ros.collect(RangeCorrected, CORRECTED)
-    with board(link, model=True):
-        drive(ros, link, "mode:=device", "board_model:='0badf00d'")
-        status = ros.diagnosis("driver", lambda s: int(fact(s, "wrong_model") or 0) > 10)
-    assert status.level == DiagnosticStatus.ERROR
-    assert "another model" in status.message
-    assert corrected == []
-
-
 def test_a_board_of_another_protocol_version_is_named(ros: Ros, link: Path):
     with board(link, version=9):
         driver = drive(ros, link)

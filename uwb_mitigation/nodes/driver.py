@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import re
 import threading
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from nav_msgs.msg import Odometry
-from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.node import Node
@@ -35,7 +34,7 @@ from uwb_mitigation.link.radio import RadioSettings
 from uwb_mitigation.measurement import Cir, RangeMeasurement, Record
 from uwb_mitigation.nodes import diagnostics, topics
 from uwb_mitigation.nodes.diagnostics import Description
-from uwb_mitigation.nodes.lifecycle import ManagedNode
+from uwb_mitigation.nodes.lifecycle import ManagedNode, refuse_errors
 from uwb_mitigation.nodes.live_feeds import PREFIX, BoardFeed, Feed, RadioFeed, open_radios, settings_of
 from uwb_mitigation.nodes.parameter_tables import DRIVER
 from uwb_mitigation.nodes.replay import ReplayFeed
@@ -112,7 +111,7 @@ class Driver(ManagedNode):
         self._clock_publisher: Publisher
         self._sensor_ranges: topics.SensorRanges | None = None
         self._frame_id: str = self.value("frame_id")
-        self.add_on_set_parameters_callback(self._check)
+        refuse_errors(self, self._check)
         self._offsets = self._prepared_offsets = NO_OFFSETS
         self.add_post_set_parameters_callback(self._apply)
         self.autostart()
@@ -205,17 +204,12 @@ class Driver(ManagedNode):
 
         return make
 
-    def _check(self, changes: list[Any]) -> SetParametersResult:
-        """Refuse radio settings that contradict each other, and offsets that cannot be read."""
-        wanted = {change.name: change.value for change in changes}
-        try:
-            if any(name.startswith(PREFIX) for name in wanted):
-                settings_of(lambda name: wanted.get(name, self.value(name)))
-            if "offsets" in wanted:
-                self._prepared_offsets = read_offsets(str(wanted["offsets"]))
-        except UwbMitigationError as error:
-            return SetParametersResult(successful=False, reason=str(error))
-        return SetParametersResult(successful=True)
+    def _check(self, values: Mapping[str, Any]) -> None:
+        """Raise for radio settings that contradict each other, and for offsets that cannot be read."""
+        if any(name.startswith(PREFIX) for name in values):
+            settings_of(lambda name: values.get(name, self.value(name)))
+        if "offsets" in values:
+            self._prepared_offsets = read_offsets(str(values["offsets"]))
 
     def _apply(self, changes: list[Any]) -> None:
         """Pass live parameters, which were checked, to the feed."""

@@ -6,7 +6,7 @@ import json
 import os
 import time
 import traceback
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -227,16 +227,24 @@ def declare(node: Node, table: Sequence[Parameter], foreign: Collection[str] = (
     if keep is not None:
         node.add_post_set_parameters_callback(keep)
 
-    def check(changes: list[Any]) -> SetParametersResult:
+    def check(values: Mapping[str, Any]) -> None:
+        for name in values.keys() & rows.keys():
+            rows[name].check(values[name])
+
+    refuse_errors(node, check)
+
+
+def refuse_errors(node: Node, check: Callable[[Mapping[str, Any]], None]) -> None:
+    """Refuse every later set of parameters, {name: value}, for which `check` raises a UwbMitigationError."""
+
+    def checked(changes: list[Any]) -> SetParametersResult:
         try:
-            for change in changes:
-                if change.name in rows:
-                    rows[change.name].check(change.value)
-        except ParameterError as error:
+            check({change.name: change.value for change in changes})
+        except UwbMitigationError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
-    node.add_on_set_parameters_callback(check)
+    node.add_on_set_parameters_callback(checked)
 
 
 def _descriptor(row: Parameter) -> ParameterDescriptor:

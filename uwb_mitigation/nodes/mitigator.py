@@ -6,11 +6,10 @@ import importlib.util
 import threading
 import time
 from array import array
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from itertools import chain
 from typing import Any
 
-from rcl_interfaces.msg import SetParametersResult
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -19,7 +18,7 @@ from rclpy.subscription import Subscription
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
 from uwb_mitigation.bag.codec import decode_range, encode_corrected
-from uwb_mitigation.errors import RecordingError, UwbMitigationError
+from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.measurement import LINE_OF_SIGHT_DB, Encoding, RangeMeasurement, Status
 from uwb_mitigation.mitigation import Backend, Mitigation
 from uwb_mitigation.model.bundle import load_bundle
@@ -27,7 +26,7 @@ from uwb_mitigation.model.prior import LinePrior
 from uwb_mitigation.model.shipped import model_path
 from uwb_mitigation.nodes import diagnostics, topics
 from uwb_mitigation.nodes.diagnostics import MitigatorHealth
-from uwb_mitigation.nodes.lifecycle import ManagedNode
+from uwb_mitigation.nodes.lifecycle import ManagedNode, refuse_errors
 from uwb_mitigation.nodes.parameter_tables import MITIGATOR
 from uwb_mitigation.offsets import NO_OFFSETS, Offsets, read_offsets
 from uwb_mitigation.preprocessing import Scaling
@@ -82,7 +81,7 @@ class Mitigator(ManagedNode):
         # A driver in the same process corrects from its own thread, while transitions run in the executor's.
         self._lock = threading.Lock()
         self._meter = diagnostics.Meter(self.now_ns)
-        self.add_on_set_parameters_callback(self._prepare)
+        refuse_errors(self, self._prepare)
         self.add_post_set_parameters_callback(self._swap)
         self.autostart()
 
@@ -216,22 +215,12 @@ class Mitigator(ManagedNode):
         self.health.predicts_excess_alone = bool(self._offsets) or mitigation.bundle.prior == LinePrior(0.0)
         self.health.los_m.clear()
 
-    def _prepare(self, changes: list[Any]) -> SetParametersResult:
-        """Load a new model or new offsets, or refuse them; ranges wait in the queue meanwhile."""
-        for change in changes:
-            if change.name == "offsets":
-                try:
-                    self._prepared_offsets = read_offsets(str(change.value))
-                except UwbMitigationError as error:
-                    reason = f"parameter offsets = {change.value!r}: {error}"
-                    return SetParametersResult(successful=False, reason=reason)
-            if change.name == "model" and isinstance(change.value, str):
-                try:
-                    self._prepared = change.value, load(change.value, self.value("backend"))
-                except UwbMitigationError as error:
-                    reason = f"parameter model = {change.value!r}: {error}"
-                    return SetParametersResult(successful=False, reason=reason)
-        return SetParametersResult(successful=True)
+    def _prepare(self, values: Mapping[str, Any]) -> None:
+        """Load a new model or new offsets, or raise; ranges wait in the queue meanwhile."""
+        if "offsets" in values:
+            self._prepared_offsets = read_offsets(str(values["offsets"]))
+        if isinstance(model := values.get("model"), str):
+            self._prepared = model, load(model, self.value("backend"))
 
     def _swap(self, changes: list[Any]) -> None:
         # Called after the whole set was accepted: another callback may have refused it after `_prepare`.
