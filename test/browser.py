@@ -54,6 +54,16 @@ class Browser:
         """Whether a page of Bokeh's is there and has drawn."""
         return bool(self.run("return !!(window.Bokeh && Bokeh.documents[0]?.is_idle)"))
 
+    def column(self, model: str, name: str) -> list[Any]:
+        """Return a column of the source of a named table or figure; empty before the page is there."""
+        return self.run(
+            "const m = window.Bokeh?.documents[0]?.get_model_by_name(arguments[0]);"
+            "const sources = !m ? [] : m.source ? [m.source] : m.renderers.map((r) => r.data_source);"
+            "return Array.from(sources.find((s) => arguments[1] in s.data)?.data[arguments[1]] ?? [])",
+            model,
+            name,
+        )
+
     def cell(self, text: str) -> Any:
         """The element with a text, in whatever shadow tree; None where there is none."""
         return self.run(

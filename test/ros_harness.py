@@ -36,6 +36,11 @@ PAUSED = ("paused:=true", "start_delay:=0.0", "longest_wait:=3600.0")
 os.environ |= {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_PYTHON_CHECK_FIELDS": "1"}
 
 
+def facts_of(status: DiagnosticStatus) -> dict[str, str]:
+    """Return the values of a diagnostic status."""
+    return {fact.key: fact.value for fact in status.values}
+
+
 class Process:
     """A running program whose output is kept."""
 

@@ -17,7 +17,7 @@ from drives import HALL, drive
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
-from ros_harness import Ros
+from ros_harness import Ros, facts_of
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
@@ -84,7 +84,7 @@ def facts(received: list[DiagnosticArray]) -> dict[str, str]:
     for array in reversed(received):
         for status in array.status:
             if status.name.startswith("locator"):
-                return {value.key: value.value for value in status.values} | {"": status.message}
+                return facts_of(status) | {"": status.message}
     return {}
 
 

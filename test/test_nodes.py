@@ -153,7 +153,7 @@ def test_ranges_that_cannot_be_corrected_pass_through(ros: Ros):
         ({"samples": array("h")}, Status.NO_CIR),
         ({"encoding": 9}, Status.NO_CIR),
         ({"scale": math.inf}, Status.BAD_CIR),
-        ({"range": math.nan}, Status.BAD_CIR),
+        ({"range": math.nan}, Status.OUT_OF_DISTRIBUTION),
     )
     ros.start("mitigator")
     publisher = ros.node.create_publisher(RangeCir, RAW, 10)

@@ -11,6 +11,7 @@ import pytest
 import ros_harness
 from compilers import NEEDS_CC
 from diagnostic_msgs.msg import DiagnosticStatus
+from ros_harness import facts_of
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
 from benchmarks.dw1000_model.boards import Line, ModelledAir
@@ -40,10 +41,6 @@ def boards(tmp_path: Path) -> Iterator[EmulatedEvb1000s]:
 
 def level_of(status: DiagnosticStatus) -> int:
     return status.level[0] if isinstance(status.level, bytes) else status.level
-
-
-def facts_of(status: DiagnosticStatus) -> dict[str, str]:
-    return {fact.key: fact.value for fact in status.values}
 
 
 def test_a_tag_and_two_anchors_range_through_the_mitigator(

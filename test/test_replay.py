@@ -241,19 +241,6 @@ def test_a_seek_forwards_skips_records_and_stamps_go_on():
     assert player.stamps[-1] - player.stamps[0] < 5000 * MS
 
 
-def test_a_seek_backwards_plays_again():
-    seeks = iter([True])
-
-    def back(player: Player, sequence: int) -> None:
-        if sequence == 5 and next(seeks, False):
-            player.set(seek_to=0.02)
-
-    player = Player(steps(8, 10 * MS), back).play()
-    before = published_with(player, 5)
-    assert player.sequences == [*range(before), *range(2, 8)]
-    assert player.stamps == sorted(player.stamps)
-
-
 def test_a_seek_does_not_wait_for_the_record_that_was_next():
     def skip(player: Player, sequence: int) -> None:
         if sequence == 0:

@@ -17,7 +17,7 @@ pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from faulty_board import FaultyBoard
-from ros_harness import Process, Ros
+from ros_harness import Process, Ros, facts_of
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
 from uwb_mitigation.link.connection import PortAddress
@@ -60,7 +60,7 @@ def drive(ros: Ros, link: Path, *parameters: str) -> Process:
 
 
 def fact(status: DiagnosticStatus, key: str) -> str:
-    return next((value.value for value in status.values if value.key == key), "")
+    return facts_of(status).get(key, "")
 
 
 def fewest(status: DiagnosticStatus, *keys: str) -> int:

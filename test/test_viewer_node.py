@@ -22,6 +22,14 @@ from uwb_mitigation.nodes import topics
 pytestmark = pytest.mark.ros
 
 
+def address(viewer: ros_harness.Process) -> str:
+    """Return the URL of the page of a viewer that has started."""
+    viewer.wait_for_output("the page is at")
+    found = re.search(r"the page is at (\S+)", viewer.output)
+    assert found is not None
+    return found[1]
+
+
 def test_the_page_shows_what_is_published(ros: ros_harness.Ros, browser: Browser, tmp_path: Path):
     published = ros.collect(RangeCorrected, "/uwb/range_corrected")
     ros.start("mitigator")
@@ -34,47 +42,36 @@ def test_the_page_shows_what_is_published(ros: ros_harness.Ros, browser: Browser
     )
     ros.start("locator", f"anchors:={anchors}")
     viewer = ros.start("viewer", "port:=0")
-    viewer.wait_for_output("the page is at")
-    found = re.search(r"the page is at (\S+)", viewer.output)
-    assert found is not None
+    url = address(viewer)
     assert ros.node.count_subscribers("/uwb/range_raw") == 1, (
         "CIRs are for the mitigator, while no page is open"
     )
-    browser.open(found[1])
-
-    def column(model: str, name: str) -> list:
-        script = """
-            const model = window.Bokeh && Bokeh.documents[0] && Bokeh.documents[0].get_model_by_name(arguments[0]);
-            if (!model) return [];
-            const sources = model.source ? [model.source] : model.renderers.map((r) => r.data_source);
-            const source = sources.find((s) => arguments[1] in s.data);
-            return source ? Array.from(source.data[arguments[1]]) : [];"""
-        return browser.run(script, model, name)
+    browser.open(url)
 
     def seen() -> bool:
         ros.spin_for(0.05)
-        shown = column("pairs", "range")
+        shown = browser.column("pairs", "range")
         values = {round(message.range, 6) for message in published}
         return bool(shown) and all(round(value, 6) in values for value in shown)
 
     browser.wait("ranges as published", seen)
-    browser.wait("the locator's anchors by their ids", lambda: sorted(map(int, column("map", "id"))) == ids)
-    browser.wait("a CIR", lambda: len(column("cir", "magnitude")) > 100)
+    browser.wait(
+        "the locator's anchors by their ids", lambda: sorted(map(int, browser.column("map", "id"))) == ids
+    )
+    browser.wait("a CIR", lambda: len(browser.column("cir", "magnitude")) > 100)
     browser.wait("diagnostics", lambda: browser.cell("mitigator: ranges"))
     assert browser.run("return document.title").startswith("UWB ranges")
     browser.run("window.before = true")
     viewer.signal(signal.SIGKILL)
-    ros.start("viewer", f"port:={found[1].rsplit(':')[-1].strip('/')}")
+    ros.start("viewer", f"port:={url.rsplit(':')[-1].strip('/')}")
     browser.wait("the page to come back by itself", lambda: not browser.run("return window.before ?? false"))
-    browser.wait("ranges of the new one", lambda: len(column("pairs", "range")) >= 2)
+    browser.wait("ranges of the new one", lambda: len(browser.column("pairs", "range")) >= 2)
 
 
 def test_nodes_that_are_killed_turn_stale_and_a_missing_node_is_named(ros: ros_harness.Ros, browser: Browser):
     viewer = ros.start("viewer", "port:=0")
-    viewer.wait_for_output("the page is at")
-    found = re.search(r"the page is at (\S+)", viewer.output)
-    assert found is not None
-    browser.open(found[1])
+    url = address(viewer)
+    browser.open(url)
     browser.wait("the page", browser.ready)
 
     def shown(text: str) -> bool:
@@ -85,14 +82,15 @@ def test_nodes_that_are_killed_turn_stale_and_a_missing_node_is_named(ros: ros_h
     driver = ros.start("driver", "source:=simulated", "simulated_rate:=40.0")
     browser.wait("what else to start", lambda: shown("Start the mitigator"))
     mitigator = ros.start("mitigator")
-    statuses = "return Array.from(Bokeh.documents[0].get_model_by_name('pairs').source.data['status'])"
-    browser.wait("ranges", lambda: len(browser.run(statuses)) >= 2)
+    browser.wait("ranges", lambda: len(browser.column("pairs", "status")) >= 2)
     browser.wait("diagnostics", lambda: shown("mitigator: ranges"))
     for node in (driver, mitigator):
         node.signal(signal.SIGKILL)
-    browser.wait("no data", lambda: all("no data for" in status for status in browser.run(statuses)))
+    browser.wait(
+        "no data", lambda: all("no data for" in status for status in browser.column("pairs", "status"))
+    )
     browser.wait("STALE", lambda: shown("no diagnostics for"))
-    assert set(browser.run(statuses.replace("status", "rate"))) == {0}
+    assert set(browser.column("pairs", "rate")) == {0}
 
 
 def test_it_shows_anchors_to_others_where_there_is_no_locator(ros: ros_harness.Ros, tmp_path: Path):
@@ -126,10 +124,8 @@ def test_tags_of_their_own_are_found_whatever_the_names_around_are(ros: ros_harn
 def test_a_viewer_that_is_put_away_subscribes_to_nothing_and_can_begin_again(ros: ros_harness.Ros):
     corrected = ros.node.create_publisher(RangeCorrected, "/uwb/range_corrected", 10)
     viewer = ros.start("viewer", "port:=0")
-    viewer.wait_for_output("the page is at")
-    found = re.search(r"the page is at (\S+)", viewer.output)
-    assert found is not None
-    with Visitors(found[1], 1):
+    url = address(viewer)
+    with Visitors(url, 1):
         ros.spin_until(lambda: ros.node.count_subscribers("/uwb/range_raw") == 1)
         assert ros.change_state("viewer", Transition.TRANSITION_DEACTIVATE)
         ros.spin_until(lambda: ros.node.count_subscribers("/uwb/range_raw") == 0)

@@ -89,17 +89,6 @@ IN_TABLE = (
 """For a script: the table's own box, and its cells and headers."""
 
 
-def data(browser: Browser, model: str, column: str) -> list[object]:
-    """A column of the source behind a named table or figure."""
-    return browser.run(
-        "const m = Bokeh.documents[0].get_model_by_name(arguments[0]);"
-        "const s = m.source ?? m.renderers.map((r) => r.data_source).find((d) => arguments[1] in d.data);"
-        "return Array.from(s.data[arguments[1]])",
-        model,
-        column,
-    )
-
-
 def selected(browser: Browser, model: str) -> list[int]:
     """The rows chosen in a named table, or among a map's anchors."""
     return browser.run(
@@ -117,14 +106,14 @@ def opened(browser: Browser, server: ViewerServer, width: int = 1280, height: in
 def test_it_shows_what_the_scene_holds(browser: Browser, view: View, server: ViewerServer) -> None:
     fill(view)
     opened(browser, server)
-    assert data(browser, "pairs", "anchor") == ["1", "2"]
-    assert data(browser, "pairs", "range") == pytest.approx([5.1, 5.3])
-    assert data(browser, "pairs", "rate") == pytest.approx([10.0, 10.0])
-    assert data(browser, "pairs", "status") == ["OK", "OUT_OF_DISTRIBUTION"]
-    assert max(data(browser, "cir", "magnitude")) == 1000.0
-    assert sum(data(browser, "errors", "raw")) == 100
-    assert len(data(browser, "strip", "raw")) == 50
-    assert data(browser, "map", "range") == pytest.approx([math.sqrt(5.1**2 - 1), math.sqrt(5.3**2 - 1)])
+    assert browser.column("pairs", "anchor") == ["1", "2"]
+    assert browser.column("pairs", "range") == pytest.approx([5.1, 5.3])
+    assert browser.column("pairs", "rate") == pytest.approx([10.0, 10.0])
+    assert browser.column("pairs", "status") == ["OK", "OUT_OF_DISTRIBUTION"]
+    assert max(browser.column("cir", "magnitude")) == 1000.0
+    assert sum(browser.column("errors", "raw")) == 100
+    assert len(browser.column("strip", "raw")) == 50
+    assert browser.column("map", "range") == pytest.approx([math.sqrt(5.1**2 - 1), math.sqrt(5.3**2 - 1)])
     summary = browser.run("return Bokeh.documents[0].get_model_by_name('summary').text")
     assert "mean absolute error 0.350 m raw, 0.250 m corrected" in summary
     assert browser.complaints() == []
@@ -140,16 +129,16 @@ def test_pairs_tags_and_nodes_without_data_turn_grey(
     opened(browser, server)
     assert browser.cell("10.0 Hz")
     assert not browser.cell("STALE")
-    assert set(data(browser, "pairs", "row_colour")) == {""}
+    assert set(browser.column("pairs", "row_colour")) == {""}
     clock.now_s = 1.0
-    browser.wait("a lower rate", lambda: 0 < data(browser, "pairs", "rate")[0] < 9)
+    browser.wait("a lower rate", lambda: 0 < browser.column("pairs", "rate")[0] < 9)
     clock.now_s = 12.0
-    browser.wait("no data", lambda: data(browser, "pairs", "status") == ["no data for 12 s"] * 2)
-    assert data(browser, "pairs", "rate") == [0.0, 0.0]
+    browser.wait("no data", lambda: browser.column("pairs", "status") == ["no data for 12 s"] * 2)
+    assert browser.column("pairs", "rate") == [0.0, 0.0]
     cell = browser.wait("the row", lambda: browser.cell("5.100"))
     assert browser.run("return getComputedStyle(arguments[0]).color", cell) == "rgb(156, 163, 175)"
-    assert data(browser, "map", "name")[-1] == "tag: no data for 12 s"
-    assert data(browser, "map", "range") == []
+    assert browser.column("map", "name")[-1] == "tag: no data for 12 s"
+    assert browser.column("map", "range") == []
     assert browser.cell("STALE")
     assert browser.cell("no diagnostics for 12 s; last: 10.0 Hz")
     assert browser.cell("damaged"), "it is not of a node"
@@ -157,7 +146,7 @@ def test_pairs_tags_and_nodes_without_data_turn_grey(
     browser.screenshot("viewer_no_data")
     with view.lock:
         view.scene.add_sample((1, 7), Sample(1017.0, 5.3, 5.1, 0.1, Status.OK))
-    browser.wait("data", lambda: data(browser, "pairs", "status")[0] == "OK")
+    browser.wait("data", lambda: browser.column("pairs", "status")[0] == "OK")
     assert not browser.cell("No ranges for 12 s.")
 
 
@@ -197,7 +186,7 @@ def test_the_map_keeps_its_view_until_the_user_changes_it(
         with view.lock:
             view.scene.add_pose("tag", Pose(x, 3, 0))
             view.scene.add_sample((1, 7), Sample(1005.0, x, x, 0.1, Status.OK))
-        browser.wait("the tag", lambda: data(browser, "map", "name") and x in data(browser, "map", "x1"))
+        browser.wait("the tag", lambda: browser.column("map", "name") and x in browser.column("map", "x1"))
 
     moved(50.0)
     assert view_of_map() == first
@@ -213,7 +202,7 @@ def test_the_map_keeps_its_view_until_the_user_changes_it(
     moved(90.0)
     with view.lock:
         view.scene.set_anchors({5: AnchorPlace(-70, 0, 2)})
-    browser.wait("the new anchor", lambda: "5" in data(browser, "map", "id"))
+    browser.wait("the new anchor", lambda: "5" in browser.column("map", "id"))
     assert view_of_map() == zoomed
 
 
@@ -229,7 +218,7 @@ def test_a_paused_page_stands_still_and_goes_on(browser: Browser, view: View, se
     opened(browser, server)
 
     def shown(value: float) -> bool:
-        return data(browser, "pairs", "range")[0] == pytest.approx(value)
+        return browser.column("pairs", "range")[0] == pytest.approx(value)
 
     for value in (9.5, 9.6):
         with view.lock:
@@ -253,9 +242,9 @@ def test_a_row_that_is_drawn_anew_within_a_click_is_chosen(
     ActionChains(browser.driver).click_and_hold(row).perform()
     with view.lock:
         view.scene.add_sample((2, 7), Sample(1005.0, 9.9, 9.5, 0.1, Status.OUT_OF_DISTRIBUTION))
-    browser.wait("the new range", lambda: data(browser, "pairs", "range")[1] == pytest.approx(9.5))
+    browser.wait("the new range", lambda: browser.column("pairs", "range")[1] == pytest.approx(9.5))
     ActionChains(browser.driver).release().perform()
-    browser.wait("the other CIR", lambda: max(data(browser, "cir", "magnitude")) == 2000.0)
+    browser.wait("the other CIR", lambda: max(browser.column("cir", "magnitude")) == 2000.0)
     browser.wait("it in the table", lambda: browser.cell("9.500"))
 
 
@@ -264,7 +253,7 @@ def test_a_click_on_an_anchor_shows_its_pair(browser: Browser, view: View, serve
     opened(browser, server)
     assert selected(browser, "pairs") == selected(browser, "map") == [0]
     browser.click_figure("map", 8.0, 0.0)
-    browser.wait("the other CIR", lambda: max(data(browser, "cir", "magnitude")) == 2000.0)
+    browser.wait("the other CIR", lambda: max(browser.column("cir", "magnitude")) == 2000.0)
     browser.wait("its row", lambda: selected(browser, "pairs") == selected(browser, "map") == [1])
     browser.click_figure("map", 4.0, 1.5)
     browser.wait("the anchor to stay chosen", lambda: selected(browser, "map") == [1])
@@ -313,7 +302,7 @@ def test_what_no_radio_measured_spoils_nothing(browser: Browser, view: View, ser
         cell for cell in browser.run(IN_TABLE + "return cells.map((e) => e.textContent)") if "e+" in cell
     ]
     assert shown == ["3.0e+38", "-3.0e+38", "6.0e+38"]
-    assert data(browser, "map", "range") == []
+    assert browser.column("map", "range") == []
     ends = browser.run(
         "return ['strip', 'map'].flatMap((name) => ['x_range', 'y_range'].flatMap((range) => {"
         "  const {start, end} = Bokeh.documents[0].get_model_by_name(name)[range]; return [start, end]}))"
