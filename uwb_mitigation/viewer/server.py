@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import queue
 import secrets
 import socket
 import threading
+from concurrent.futures import Future
 from typing import Any
 
 import psutil
@@ -46,20 +46,18 @@ class ViewerServer:
         self, view: View, host: str = "localhost", port: int = 5006, origins: tuple[str, ...] = ()
     ) -> None:
         self._loop: IOLoop | None = None
-        outcome: queue.Queue[int | Exception] = queue.Queue()
+        outcome: Future[int] = Future()
         self._thread = threading.Thread(
             target=self._run, args=(outcome, view, host, port, origins), name="viewer", daemon=True
         )
         self._thread.start()
-        found = outcome.get()
-        if isinstance(found, Exception):
-            if not isinstance(found, OSError | ValueError):
-                raise found
+        try:
+            self.port = outcome.result()
+        except (OSError, ValueError) as error:
             raise ParameterError(
-                f"the page cannot be served at {host}:{port}: {found}",
+                f"the page cannot be served at {host}:{port}: {error}",
                 valid="a free port, and a name or an IPv4 address of this machine",
-            ) from found
-        self.port = found
+            ) from error
         self.url = f"http://{'localhost' if host in ALL_ADDRESSES else host}:{self.port}/"
 
     def close(self) -> None:
@@ -77,7 +75,7 @@ class ViewerServer:
 
     def _run(
         self,
-        outcome: queue.Queue[int | Exception],
+        outcome: Future[int],
         view: View,
         host: str,
         port: int,
@@ -97,11 +95,11 @@ class ViewerServer:
         except Exception as error:
             for listening in sockets:
                 listening.close()
-            outcome.put(error)
+            outcome.set_exception(error)
             return
         self._loop = loop
         server.start()
-        loop.add_callback(outcome.put, port)
+        loop.add_callback(outcome.set_result, port)
         try:
             loop.start()
         finally:
