@@ -251,7 +251,7 @@ def test_the_templates_use_everything_that_can_be_generated():
     ("name", "text", "lines"),
     [
         ("page.md", "Use `anew`.\n\nIt is computed anew.\n\n    anew\n", [3]),
-        ("code.py", 'anew = 1\n\nx = 1  # the same anew\nraise E("it is mended now")\n', [3, 4]),
+        ("code.py", 'anew = 1\n\nx = 1  # the same anew\nraise ValueError("it is mended now")\n', [3, 4]),
         ("code.c", "int anew;\n/* written\n   anew */\n", [3]),
         ("Message.msg", "# fine\nfloat32 range # m, anew\n", [2]),
     ],
