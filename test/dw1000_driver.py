@@ -22,16 +22,13 @@ RXRFSL, RXRFTO, LDEERR, RXSFDTO, HPDWARN, TXPUTE = (1 << bit for bit in (16, 17,
 ERRORS = RXPHE | RXFCE | RXRFSL | RXRFTO | RXSFDTO
 RX_GOOD = RXPRD | RXSFDD | LDEDONE | RXPHD | RXDFR | RXFCG
 
-_PREAMBLES = {64: 0x1, 128: 0x5, 256: 0x9, 1024: 0x2}
 _CODE = 9
 
 
 @dataclass(frozen=True)
 class Mode:
-    """How the air is used, on channel 5 at PRF 64 MHz; rate 0 is 110 kbit/s, 2 is 6.8M."""
+    """How the air is used, on channel 5 at PRF 64 MHz, 6.8 Mbit/s, with 128 symbols."""
 
-    rate: int = 2
-    preamble: int = 128
     long_frames: bool = False
 
 
@@ -60,10 +57,6 @@ class Driver:
     def set(self, file: int, sub: int, value: int, octets: int = 4) -> None:
         self.write(file, sub, value.to_bytes(octets, "little"))
 
-    def set_by_octets(self, file: int, sub: int, value: int, octets: int = 4) -> None:
-        for at in range(octets):
-            self.set(file, sub + at, value >> (8 * at) & 0xFF, 1)
-
     @property
     def status(self) -> int:
         return self.get(0x0F, 0, 5)
@@ -71,7 +64,7 @@ class Driver:
     def command(self, bits: int) -> None:
         self.set(0x0D, 0, bits, 4)
 
-    def start(self, mode: Mode = Mode(), *, load_lde: bool = True) -> None:
+    def start(self, *, load_lde: bool = True) -> None:
         """Reset and configure; `load_lde` is what a driver may forget."""
         self.hz = SLOW_HZ
         self.host.reset_pin()
@@ -84,7 +77,7 @@ class Driver:
         self.set(0x36, 0, 0x0200, 2)
         self.host.delay(1e-3)
         self.hz = FAST_HZ
-        self.configure(mode)
+        self.configure(Mode())
         self.set(0x18, 0, ANTENNA_DELAY_TICKS, 2)
         self.set(0x2E, 0x1804, ANTENNA_DELAY_TICKS, 2)
 
@@ -92,10 +85,10 @@ class Driver:
         self.set(0x1F, 0, 0x55 | 2 << 18 | _CODE << 22 | _CODE << 27)
         self.set(0x2B, 7, 0x0800041D)
         self.set(0x27, 8, 0x313B006B)  # acquisition chunks of 8 symbols
-        self.set(0x27, 0x20, mode.preamble + 1 + (64 if mode.rate == 0 else 8) - 8, 2)
+        self.set(0x27, 0x20, 129, 2)
         self.set(0x2E, 0x0806, 0x6D, 1)
-        self.set(0x04, 0, 0x1200 | (mode.rate == 0) << 22 | (3 if mode.long_frames else 0) << 16)
-        self.fctrl = mode.rate << 13 | 0x8000 | 2 << 16 | _PREAMBLES[mode.preamble] << 18
+        self.set(0x04, 0, 0x1200 | (3 if mode.long_frames else 0) << 16)
+        self.fctrl = 2 << 13 | 0x8000 | 2 << 16 | 0x5 << 18
 
     def load(self, data: bytes) -> None:
         """Put a frame into the transmit buffer."""
@@ -146,13 +139,13 @@ class Driver:
         return data
 
 
-def pair(air: Air, link: Link | None = None, mode: Mode = Mode()) -> tuple[Driver, Driver, Chip, Chip]:
+def pair(air: Air, link: Link | None = None) -> tuple[Driver, Driver, Chip, Chip]:
     """Two started chips, joined by a link of 3 m: their drivers, from outside of the air, and they themselves."""
     chips = air.chip(), air.chip()
     air.link(*chips, link or Link(3.0))
     drivers = [Driver(chip) for chip in chips]
     for driver in drivers:
-        driver.start(mode)
+        driver.start()
     return (*drivers, *chips)
 
 

@@ -41,14 +41,6 @@ def driver(chip: Chip) -> Driver:
     return Driver(chip)
 
 
-def test_ones_clear_status_octet_by_octet_and_zeros_do_not(driver: Driver):
-    driver.set(0x0F, 0, 0x00, 1)
-    driver.set(0x0F, 2, 0x80, 1)
-    assert driver.status == dw.CPLOCK
-    driver.set_by_octets(0x0F, 0, dw.CPLOCK, 5)
-    assert driver.status == 0
-
-
 def test_the_interrupt_line_is_status_and_mask_with_its_polarity(driver: Driver, chip: Chip):
     assert not chip.irq()
     driver.set(0x0E, 0, dw.CPLOCK)
@@ -187,40 +179,7 @@ class TestTransmitter:
         assert self.send_with_lead(a, 10.2, held_clock=True) & dw.TXFRS
 
 
-@pytest.mark.parametrize(
-    ("smart", "rate", "preamble", "octet"),
-    [
-        (True, 2, 64, 3),
-        (True, 2, 128, 2),
-        (True, 2, 256, 1),
-        (True, 2, 1024, 0),
-        (True, 0, 128, 0),
-        (False, 2, 64, 2),
-    ],
-)
-def test_transmit_power_has_two_formats(air: Air, smart: bool, rate: int, preamble: int, octet: int):
-    a, _, sender, _ = pair(air, mode=Mode(rate=rate, preamble=preamble))
-    a.set(0x04, 0, a.get(0x04) | (not smart) << 18)
-    word = 0x25456585
-    a.set(0x1E, 0, word)
-    a.send(dw.DATA)
-    a.host.delay(20e-3)
-    level_db = [8.5, 11.5, 14.5, 17.5]
-    assert sender.sent_power_db == (level_db[octet], level_db[octet if smart else 1])
-
-
 class TestReceiver:
-    def test_the_frame_wait_time_out(self, air: Air):
-        _, b, *_ = pair(air)
-        b.set(0x0C, 0, 1000, 2)
-        b.set(0x04, 0, b.get(0x04) | 1 << 28)
-        b.set(0x0E, 0, dw.RXRFTO)
-        b.listen()
-        began = b.host.now()
-        b.host.wait(1.0)
-        assert b.host.now() - began == pytest.approx(1000 * 512 / 499.2e6, abs=2e-6)
-        assert b.status & dw.ERRORS == dw.RXRFTO
-
     @pytest.mark.parametrize("error", ["header", "time-out"])
     def test_without_a_receiver_reset_after_an_error_the_next_stamp_is_wrong(self, air: Air, error: str):
         a, b, *_ = pair(air)

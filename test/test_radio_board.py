@@ -9,10 +9,9 @@ from compilers import NEEDS_CC
 from benchmarks.dw1000_model.boards import Line, ModelledAir
 from benchmarks.dw1000_model.links import Link
 from uwb_mitigation.link import messages
-from uwb_mitigation.link.board import Board
-from uwb_mitigation.link.events import Event, LinkState, RadioRefused
+from uwb_mitigation.link.events import Event, RadioRefused
 from uwb_mitigation.link.layout import RadioState, Role
-from uwb_mitigation.link.messages import Hello, SetRadio
+from uwb_mitigation.link.messages import SetRadio
 from uwb_mitigation.link.radio import RadioSettings, RadioStatus
 from uwb_mitigation.link.session import BoardSession
 from uwb_mitigation.measurement import RangeMeasurement
@@ -117,16 +116,3 @@ def test_settings_that_a_board_cannot_use_are_refused_in_words():
         assert "channel" in refusal.text
         assert host.session.radio is not None
         assert host.session.radio.settings.channel == 5
-
-
-def test_older_firmware_keeps_ranging_and_the_host_says_that_it_knows_no_radio():
-    board, session, events = Board(Hello()), BoardSession(), []
-    session.set_radio(RadioSettings())
-    for step in range(600):
-        now_ns = step * 10**7
-        events += session.receive(board.receive(session.outgoing(), now_ns // 1000), now_ns, now_ns)
-        board.tick(now_ns // 1000)
-    (refusal,) = [event for event in events if isinstance(event, RadioRefused)]
-    assert "flash" in refusal.text
-    assert session.state is LinkState.READY
-    assert session.radio is None

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from uwb_mitigation.commands import console, firmware
+from uwb_mitigation.commands import console
 from uwb_mitigation.commands.console import JsonOption, Table
+from uwb_mitigation.commands.model_tables import say
 from uwb_mitigation.errors import ParameterError, parse_id
 from uwb_mitigation.files import write_whole
 
@@ -22,6 +23,10 @@ if TYPE_CHECKING:
     from uwb_mitigation.mitigation import Mitigation
     from uwb_mitigation.radio.antenna_delay import AntennaDelay
     from uwb_mitigation.sources.source import Source
+
+ModelOption = Annotated[
+    Path | None, typer.Option(help="Int8 bundle; the shipped one if left out.", show_default=False)
+]
 
 app = typer.Typer(help="Emulate a board, calibrate radios, build firmware.", no_args_is_help=True)
 
@@ -73,7 +78,7 @@ def emulate(
             seed=seed,
         )
         with board:
-            console.out.print(f"{source.name} at {board.port}", soft_wrap=True, highlight=False)
+            say(f"{source.name} at {board.port}")
             end_s = time.monotonic() + (duration or math.inf)
             while board.failure is None and time.monotonic() < end_s:
                 time.sleep(0.05)
@@ -179,12 +184,9 @@ def antenna_delay(
         console.out.print(content, end="", soft_wrap=True, highlight=False, markup=False)
     else:
         write_whole(output, content)
-        console.out.print(
+        say(
             f"{output}: radio.antenna_delay {found.antenna_delay}; "
-            f"ros2 run uwb_mitigation driver --ros-args --params-file {output} ...",
-            soft_wrap=True,
-            highlight=False,
-            markup=False,
+            f"ros2 run uwb_mitigation driver --ros-args --params-file {output} ..."
         )
     console.write_json(json, {"distance_m": distance, **asdict(found)})
 
@@ -235,5 +237,70 @@ def _parameters(found: AntennaDelay, distance_m: float, port: str, settings: Rad
     )
 
 
-app.command()(firmware.export_c)
-app.command()(firmware.build_image)
+@app.command()
+def export_c(
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for uwb_model.h; made if need be.")
+    ],
+    model: ModelOption = None,
+    json: JsonOption = None,
+) -> None:
+    """Write a model as a C header for the firmware.
+
+    It holds weights, constants and golden vectors.
+    """
+    from uwb_mitigation.firmware_export.export import GOLDEN_VECTORS, export_bundle
+    from uwb_mitigation.model.bundle import load_bundle
+    from uwb_mitigation.model.shipped import model_path
+
+    bundle = load_bundle(model_path(model))
+    header = export_bundle(bundle, output)
+    facts = {
+        "header": str(header),
+        "model_id": bundle.model_id,
+        "k": bundle.architecture.samples,
+        "parameters": bundle.architecture.parameters,
+        "golden_vectors": GOLDEN_VECTORS,
+    }
+    say(f"{header}: model {bundle.model_id:08x}, K = {facts['k']}, {facts['parameters']} parameters")
+    console.write_json(json, facts)
+
+
+@app.command()
+def build_image(
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="FILE.hex", help="Drag it onto the board's drive.")
+    ] = Path("dwm1001-dev.hex"),
+    model: ModelOption = None,
+    json: JsonOption = None,
+) -> None:
+    """Build the DWM1001-DEV's image, as Intel HEX.
+
+    Ranging firmware with a model for corrections on the board. One image: the board is an anchor until its host, or its
+    button held at the start, makes it a tag. It was never run on a board; its driver and exchange
+    were tested on a modelled chip.
+    """
+    import tempfile
+
+    from uwb_mitigation.firmware_export import toolchain
+    from uwb_mitigation.firmware_export.export import export_bundle
+    from uwb_mitigation.model.bundle import load_bundle
+    from uwb_mitigation.model.shipped import model_path
+
+    if not output.absolute().parent.is_dir():
+        raise ParameterError(f"--output {output}", valid="a file in a folder that is there")
+    bundle = load_bundle(model_path(model))
+    with tempfile.TemporaryDirectory() as folder:
+        export_bundle(bundle, Path(folder))
+        image = toolchain.build_image(Path(folder), Path(folder), toolchain.Target.DWM1001_DEV)
+        toolchain.write_hex(image, output)
+    say(
+        f"{output}: {image.flash_bytes:,} of {image.flash_room:,} bytes of flash, {image.static_bytes:,} of "
+        f"{image.ram_room:,} of RAM, the rest for the stack; model {bundle.model_id:08x}"
+    )
+    facts = asdict(image) | {
+        "image": str(output),
+        "ram_bytes": image.static_bytes,
+        "model_id": bundle.model_id,
+    }
+    console.write_json(json, {name: value for name, value in facts.items() if name != "elf"})

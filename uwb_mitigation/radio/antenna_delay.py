@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -111,15 +112,13 @@ def measure(
         UwbMitigationError: as `find`; or nothing ranges, or several anchors do.
         ParameterError, MissingDependencyError: as `RadioPort`.
     """
-    ports: list[RadioPort] = []
-    try:
-        for number, opener in enumerate(openers):
-            wanted = settings if number == 0 else replace(settings, role=Role.ANCHOR, anchors=())
-            ports.append(RadioPort(opener, wanted))
+    wanted = settings, replace(settings, role=Role.ANCHOR, anchors=())
+    with ExitStack() as stack:
+        ports = [
+            stack.enter_context(closing(RadioPort(opener, of)))
+            for opener, of in zip(openers, wanted, strict=False)
+        ]
         return _measure(ports, distance_m, exchanges, on_range)
-    finally:
-        for port in ports:
-            port.close()
 
 
 def _measure(

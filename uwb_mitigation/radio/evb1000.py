@@ -66,18 +66,12 @@ class Evb1000Bus:
         payload = header + (out or b"")
         data = count if out is None else len(out)
         if data > MAX_READ_BYTES:
-            raise LinkError(
-                f"{data} octets in one transaction", where=str(self._address), valid=f"{MAX_READ_BYTES}"
-            )
+            raise self._error(f"{data} octets in one transaction", f"{MAX_READ_BYTES}")
         request = _HEAD.pack(_START, flags, _HEAD.size + len(payload) + 1, data) + payload + bytes([_END])
         self._send(request)
         answer = self._receive(3 + (count if out is None else 0))
         if answer[0] != _START or answer[-1] != _END or answer[1]:
-            raise LinkError(
-                f"the board answered {answer[:2].hex()}...{answer[-1:].hex()}",
-                where=str(self._address),
-                valid="0200...03",
-            )
+            raise self._error(f"the board answered {answer[:2].hex()}...{answer[-1:].hex()}", "0200...03")
         return answer[2:-1]
 
     def speed(self, fast: bool) -> None:
@@ -105,9 +99,9 @@ class Evb1000Bus:
         if text.startswith("y"):
             return text[1:]
         if text.startswith("n"):
-            raise LinkError("the board ranges by itself", where=str(self._address), valid=_HOW)
+            raise self._error("the board ranges by itself")
         told = f"the board answers deca? with {text!r}" if text else "no answer to deca?"
-        raise LinkError(told, where=str(self._address), valid=f"an EVB1000; {_HOW}")
+        raise self._error(told, f"an EVB1000; {_HOW}")
 
     def _ask(self) -> str:
         """Return the answer to `deca?`, up to its first NUL; a stale octet follows that."""
@@ -134,7 +128,7 @@ class Evb1000Bus:
             while data:
                 _, writable, _ = select.select([], [fd], [], max(0.0, until - time.monotonic()))
                 if not writable:
-                    raise LinkError("the board takes nothing", where=str(self._address), valid=_HOW)
+                    raise self._error("the board takes nothing")
                 data = data[os.write(fd, data) :]
         except OSError as error:
             raise self._lost(error.strerror or str(error)) from error
@@ -145,11 +139,7 @@ class Evb1000Bus:
         while len(answer) < count:
             piece = self._read_some(until - time.monotonic())
             if not piece:
-                raise LinkError(
-                    f"{len(answer)} octets of {count} within {ANSWER_WITHIN_S} s",
-                    where=str(self._address),
-                    valid=_HOW,
-                )
+                raise self._error(f"{len(answer)} octets of {count} within {ANSWER_WITHIN_S} s")
             answer += piece
         return answer[:count]
 
@@ -171,6 +161,9 @@ class Evb1000Bus:
         if self._port is None:
             raise self._lost("closed")
         return int(self._port.fileno())
+
+    def _error(self, what: str, valid: str = _HOW) -> LinkError:
+        return LinkError(what, where=str(self._address), valid=valid)
 
     def _lost(self, why: str) -> LinkError:
         return LinkError(f"was lost: {why}", where=str(self._address), valid="plug the board in")
