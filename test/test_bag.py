@@ -60,43 +60,36 @@ def test_rosbags_opens_a_bag_and_agrees_on_every_field(tmp_path: Path, name: str
         for connection, stamp_ns, data in reader.messages():
             message = store.deserialize_cdr(data, connection.msgtype)
             number = message.sequence
-            expected = record(number)
-            assert stamp_ns == expected.measurement.stamp_ns
-            assert (
-                message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
-                == expected.measurement.stamp_ns
-            )
+            measurement = record(number).measurement
+            stamp = message.header.stamp
+            assert stamp_ns == stamp.sec * 10**9 + stamp.nanosec == measurement.stamp_ns
             assert message.header.frame_id == "antenna"
             assert (message.tag_id, message.anchor_id) == (7, 1 + number % 2)
             if connection.topic == RANGE_RAW:
-                cir, wanted = message.cir, expected.measurement.cir
-                assert (message.device_time, message.range) == (number * 1000, 4.5 + number)
-                assert np.array_equal(cir.samples, wanted.samples)
-                assert cir.sample_period == np.float32(wanted.sample_period_s)
-                assert (cir.start_index, cir.first_path_index, cir.encoding, cir.scale) == (
-                    700,
-                    740.25 + number,
-                    0,
-                    1.0,
-                )
-                assert (cir.preamble_count, cir.noise_threshold) == (200 + number, 1500)
-                assert (cir.rx_power, cir.first_path_power) == (-79.5, -83.25)
-                assert (cir.channel, cir.prf) == (2, 64)
+                samples = message.cir.samples
+                assert np.array_equal(samples, measurement.cir.samples)
+                expected = {"device_time": number * 1000, "range": 4.5 + number}
+                expected_cir = {
+                    "start_index": 700,
+                    "first_path_index": 740.25 + number,
+                    "encoding": 0,
+                    "scale": 1.0,
+                    "preamble_count": 200 + number,
+                    "noise_threshold": 1500,
+                    "rx_power": -79.5,
+                    "first_path_power": -83.25,
+                    "channel": 2,
+                    "prf": 64,
+                    "sample_period": np.float32(measurement.cir.sample_period_s),
+                }
+                assert {name: getattr(message.cir, name) for name in expected_cir} == expected_cir
             elif connection.topic == RANGE_TRUTH:
-                assert (message.range, message.label) == (4.0 + number, "NDP NLOS")
-                assert message.configuration == f"place {number}"
+                place = f"place {number}"
+                expected = {"range": 4.0 + number, "label": "NDP NLOS", "configuration": place}
             else:
-                assert (message.range, message.range_raw, message.correction) == (
-                    4.25 + number,
-                    4.5 + number,
-                    0.25,
-                )
-                assert (message.variance, message.status, message.source, message.model_id) == (
-                    0.0625,
-                    0,
-                    1,
-                    77,
-                )
+                expected = {"range": 4.25 + number, "range_raw": 4.5 + number, "correction": 0.25}
+                expected |= {"variance": 0.0625, "status": 0, "source": 1, "model_id": 77}
+            assert {name: getattr(message, name) for name in expected} == expected
 
 
 def test_the_mcap_library_reads_a_bag_with_every_checksum_tested(tmp_path: Path) -> None:

@@ -95,18 +95,8 @@ def test_all_apartment_logs_become_one_bag_that_rosbags_agrees_with(
 
     from uwb_mitigation.bag import schemas
 
-    done = run(
-        "data",
-        "import",
-        apartment,
-        "-o",
-        "apartment.mcap",
-        "--longest-pause",
-        "inf",
-        "--json",
-        "import.json",
-        folder=tmp_path,
-    )
+    options = "-o apartment.mcap --longest-pause inf --json import.json"
+    done = run("data", "import", apartment, *options.split(), folder=tmp_path)
     assert done.returncode == 0, done.stderr
     result = json.loads((tmp_path / "import.json").read_text())
     assert result["pairs"] == 28

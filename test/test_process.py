@@ -223,17 +223,8 @@ def test_offsets_of_a_file_are_taken_off_each_pair(tmp_path: Path) -> None:
     # Of the three anchors one has its own offset, one its own with this tag.
     offsets = "default: 0.2\nanchors: {2: 0.35}\npairs: [{anchor: 3, tag: 7, offset: -0.1}]\n"
     (tmp_path / "offsets.yaml").write_text(offsets)
-    done = run(
-        "process",
-        "in.mcap",
-        "-o",
-        "out.mcap",
-        "--offsets",
-        "offsets.yaml",
-        "--model",
-        "evk1000_apartment",
-        folder=tmp_path,
-    )
+    words = "process in.mcap -o out.mcap --offsets offsets.yaml --model evk1000_apartment"
+    done = run(*words.split(), folder=tmp_path)
     assert done.returncode == 0, done.stderr
     expected = one_by_one(exchanges(30), Offsets(0.2, {2: 0.35}, pairs={(7, 3): -0.1}))
     assert corrected_of(tmp_path / "out.mcap") == expected
