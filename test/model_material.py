@@ -117,6 +117,18 @@ def record(seed: int = 0, configuration: str = "1", **changes: object) -> Record
     return Record(measurement(3.25, seed, **changes), Truth(3.0, "LOS", configuration))
 
 
+class Recorded(list):  # type: ignore[type-arg]
+    """An open recording of records in memory."""
+
+    simulated = False
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        return None
+
+
 def dataset(configurations: int = 12, each: int = 20, samples: int = 32, seed: int = 0) -> Dataset:
     """A synthetic dataset: the error is a line in the powers plus the level of the first inputs."""
     generator = np.random.default_rng(seed)

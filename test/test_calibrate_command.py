@@ -196,10 +196,7 @@ def test_ranges_of_unknown_truth_are_held_out_with_their_segment():
 
 
 def test_a_localisation_needs_few_ranges_beside_it(site):
-    done = run(
-        "calibrate", "few.mcap", *LEVEL, "-o", "few.onnx", "--json", "f.json", "--truth-topic", "/odom", "--estimate-lever-arm", "--force",
-        folder=site,
-    )  # fmt: skip
+    done = run("calibrate", "few.mcap", *LEVEL, "-o", "few.onnx", "--json", "f.json", "--truth-topic", "/odom", "--estimate-lever-arm", "--force", folder=site)  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "no transform" not in done.stderr  # uwb_tag is the antenna itself
     # Less a quarter, which is held out in turn, it is fewer than tell a lag and a lever arm.
@@ -359,7 +356,8 @@ def test_a_small_displacement_and_a_long_tail_accuse_no_anchor():
         (HALL.moved(HALL.position + np.array([0.15, 0.0, 0.0]), HALL.sd), ranges.range_m),
         (HALL, ranges.range_m + tail),
     ):
-        site = SimpleNamespace(anchors=anchors, tags=(replace(ranges, range_m=value),))
+        moved = replace(ranges, range_m=value)
+        site = SimpleNamespace(anchors=anchors, ranges=moved, tag=np.zeros(len(moved), int))
         check_anchors(site, path.position, known)
 
 
@@ -402,10 +400,7 @@ def test_cirs_bring_the_universal_network_in(tmp_path, monkeypatch):
             if number % 7 == 0:
                 measured = replace(measured, cir=replace(measured.cir, samples=np.zeros(0, np.int16)))
             bag.write(replace(record, measurement=measured, truth=None))
-    done = run(
-        "calibrate", "drive.mcap", "--anchors", "anchors.yaml", "--height", 0.0, "-o", "site.onnx", "--json", "r.json",
-        folder=tmp_path,
-    )  # fmt: skip
+    done = run("calibrate", "drive.mcap", "--anchors", "anchors.yaml", "--height", 0.0, "-o", "site.onnx", "--json", "r.json", folder=tmp_path)  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "torch is not installed" in done.stderr
     result = json.loads((tmp_path / "r.json").read_text())

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from model_material import bundle, record
+from model_material import Recorded, bundle, record
 from typer.testing import CliRunner
 
 from uwb_mitigation.commands.cli import app
@@ -23,24 +23,6 @@ from uwb_mitigation.sources import opening
 
 def run(*arguments: object):
     return CliRunner().invoke(app, [str(value) for value in arguments], catch_exceptions=True)
-
-
-class Recorded:
-    """A source of records made here."""
-
-    simulated = False
-
-    def __init__(self, records):
-        self.records = records
-
-    def __iter__(self):
-        return iter(self.records)
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        return None
 
 
 @pytest.fixture

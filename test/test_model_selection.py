@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from model_material import bundle, dataset, measurement, windows
+from model_material import Recorded, bundle, dataset, measurement, windows
 from typer.testing import CliRunner
 
 from uwb_mitigation.commands.cli import app
@@ -183,16 +183,6 @@ def test_a_file_that_is_not_a_truth_table_is_refused(tmp_path):
 
 
 # --- the command ---
-
-
-class Recorded(list):
-    simulated = False
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        return None
 
 
 def run_or_raise(*arguments: object) -> str:

@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from uwb_mitigation.positioning.localised import PosePath
     from uwb_mitigation.training.site_calibration import Calibrated
 
-MOST_SHOWN = 40
 SAME_ARM_M = 0.01
 BASE_FRAME = "base_link"
 """The robot's frame if the poses do not name it."""
@@ -324,9 +323,7 @@ def _show(found: Calibrated) -> None:
             say(f"tag {format_id(ranges.tag_id)}: lever arm {known} m")
     rows = [(format_id(tag), format_id(anchor), *own) for (tag, anchor), own in solution.pairs.items()]
     columns = ("tag", "anchor", "offset m", "standard deviation m")
-    show_table("Offsets", columns, rows[:MOST_SHOWN])
-    if len(rows) > MOST_SHOWN:
-        say(f"and {len(rows) - MOST_SHOWN} pairs more")
+    show_table("Offsets", columns, rows)
     chosen = found.selection.chosen
     errors = {"raw": found.raw_mae_m, **found.selection.mae()}
     show_table(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from uwb_mitigation.commands import console
@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from uwb_mitigation.training.comparison import Comparison, Coverage
     from uwb_mitigation.training.selection import Selection
     from uwb_mitigation.training.train import TrainedBundle
+
+MOST_SHOWN = 40
 
 _ROWS = {
     "raw": "raw",
@@ -40,16 +42,18 @@ _CANDIDATES = {
 
 
 def show_table(
-    title: str, columns: Iterable[str], rows: Iterable[Iterable[object]], marked: str = ""
+    title: str, columns: Iterable[str], rows: Sequence[Iterable[object]], marked: str = ""
 ) -> None:
-    """Print a table; numbers are right-aligned and have three decimals. The row named `marked` is bold."""
+    """Print the first 40 rows; numbers are right-aligned and have three decimals. The row named `marked` is bold."""
     table = Table(title=title, title_justify="left")
     for number, column in enumerate(columns):
         table.add_column(column, justify="right" if number else "left")
-    for row in rows:
+    for row in rows[:MOST_SHOWN]:
         cells = [f"{cell:.3f}" if isinstance(cell, float) else str(cell) for cell in row]
         table.add_row(*cells, style="bold" if marked and marked in cells else None)
     console.out.print(table)
+    if len(rows) > MOST_SHOWN:
+        say(f"and {len(rows) - MOST_SHOWN} rows more")
 
 
 def say(text: str) -> None:

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from uwb_mitigation.evaluation.radio_offsets import FoundOffset
 
 FARTHEST_M = 1000.0
-MOST_SHOWN = 40
 
 
 def offset(
@@ -99,18 +98,16 @@ def _identity(name: str, text: str) -> int:
 
 
 def _show(found: FoundOffset) -> None:
-    from uwb_mitigation.commands.model_tables import say, show_table
+    from uwb_mitigation.commands.model_tables import MOST_SHOWN, say, show_table
 
     rows: list[tuple[object, ...]] = []
-    for one in found.placements[:MOST_SHOWN]:
+    for one in found.placements:
         pair = format_id(one.anchor_id), format_id(one.tag_id)
         values = ("", "") if one.refused else (one.offset_m, one.sd_m)
         rows.append((*pair, one.placement, one.ranges, *values, f"{one.power_gap_db:.1f}", one.predicted_m))
     show_table(
         "", ("anchor", "tag", "placement", "ranges", "offset m", "sd m", "gap dB", "predicted m"), rows
     )
-    if len(found.placements) > MOST_SHOWN:
-        say(f"and {len(found.placements) - MOST_SHOWN} placements more")
     refused = [one for one in found.placements if one.refused]
     for one in refused[:MOST_SHOWN]:
         pair = format_id(one.anchor_id), format_id(one.tag_id)

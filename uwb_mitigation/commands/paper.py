@@ -7,7 +7,7 @@ import shlex
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -217,31 +217,17 @@ def _make_folder(path: Path) -> None:
 
 def _show_experiment(result: ExperimentResults) -> None:
     from uwb_mitigation.commands.model_tables import say, show_table
-    from uwb_mitigation.paper.results import Spread
+    from uwb_mitigation.paper import tables
 
-    def mean(values: list[Any], form: str) -> str:
-        spread = Spread.of(values)
-        return format(spread.mean, form) if spread else "-"
-
-    rows: list[list[Any]] = []
-    if result.models:
-        rows.append(["raw", "", "", "", f"{result.models[0].mae_raw:.4f}"])
-    rows += [
-        [one.name, "", "", "", mean([one.errors and one.errors.all.mae], ".4f")] for one in result.baselines
-    ]
-    for network, samples in dict.fromkeys((model.network, model.samples) for model in result.models):
-        models = result.of(network, samples)
-        maes = [mean([model.by_form("mae")[form] for model in models], ".4f") for form in range(3)]
-        last = Spread.of([model.left.all.mae for model in models])
-        deviation = "-" if last is None or last.std is None else f"{last.std:.4f}"
-        size = mean([model.bytes_int8 for model in models], ".0f")
-        rows.append([network, samples, len(models), models[0].parameters, *maes, deviation, size])
-    columns = ("network", "K", "seeds", "params", "float", "optimised", "int8", "std", "bytes")
+    provenance = tables.Provenance(result.data, result.split, "", "")
+    table = tables.accuracy(result, provenance, "", "Measured")
+    # Without the paper's columns, and without networks that were not trained.
+    rows = [row for row in table.rows if tables.MISSING not in row]
     show_table(
         f"{result.data}, split {result.split}: {result.train} to train on, {result.test} to test, "
-        f"{result.options.epochs} epochs; MAE in m, mean and standard deviation (of the last form) over seeds",
-        columns,
-        rows,
+        f"{result.options.epochs} epochs; MAE in m, mean and standard deviation over seeds",
+        (*table.columns[:2], *table.columns[6:]),
+        [[cell.text for cell in (*row[:2], *row[6:])] for row in rows],
     )
     for baseline in result.baselines:
         if baseline.reason:

@@ -10,7 +10,7 @@ from itertools import islice
 import numpy as np
 
 from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.evaluation.metrics import ErrorStatistics, coverage, mae_by_group
+from uwb_mitigation.evaluation.metrics import ErrorStatistics, GroupMae, coverage, mae_by_group
 from uwb_mitigation.measurement import Record
 from uwb_mitigation.mitigation import Mitigation
 
@@ -38,32 +38,17 @@ class Accuracy:
     corrected: ErrorStatistics
     coverage68: float
     coverage95: float
-    by_label: Mapping[str, tuple[int, float, float]]
-    by_configuration: Mapping[str, tuple[int, float, float]]
+    by_label: Mapping[str, GroupMae]
+    by_configuration: Mapping[str, GroupMae]
     statuses: Mapping[str, int]
     model_id: int
     trained_on: tuple[str, ...]
 
     def as_json(self) -> dict[str, object]:
         """The result of `uwb-mitigation evaluate`."""
-
-        def table(groups: Mapping[str, tuple[int, float, float]]) -> dict[str, object]:
-            return {
-                name: {"n": n, "raw_mae": before, "corrected_mae": after}
-                for name, (n, before, after) in groups.items()
-            }
-
-        return {
-            "n": self.n,
-            "raw": asdict(self.raw),
-            "corrected": asdict(self.corrected),
-            "coverage68": self.coverage68,
-            "coverage95": self.coverage95,
-            "by_label": table(self.by_label),
-            "by_configuration": table(self.by_configuration),
-            "statuses": dict(self.statuses),
-            "model_id": self.model_id,
-            "trained_on": list(self.trained_on),
+        groups = {"by_label": self.by_label, "by_configuration": self.by_configuration}
+        return asdict(self) | {
+            key: {name: group._asdict() for name, group in of.items()} for key, of in groups.items()
         }
 
 

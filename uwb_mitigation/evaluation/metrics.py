@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,14 +38,22 @@ class ErrorStatistics:
         return cls(float(magnitude.mean()), float(np.std(error_m)), float(np.percentile(magnitude, 95)))
 
 
+class GroupMae(NamedTuple):
+    """Number of ranges of a group and their MAE before and after correction, m."""
+
+    n: int
+    raw_mae: float
+    corrected_mae: float
+
+
 def mae_by_group(
     names: NDArray[np.str_], raw_m: NDArray[np.floating], corrected_m: NDArray[np.floating]
-) -> dict[str, tuple[int, float, float]]:
-    """{name: (n, MAE of `raw_m`, MAE of `corrected_m`)} of errors of shape (n,), in order of first use."""
+) -> dict[str, GroupMae]:
+    """{name: MAE of `raw_m` and `corrected_m`} of errors of shape (n,), in order of first use."""
     groups = {}
     for name in dict.fromkeys(names.tolist()):
         rows = names == name
-        groups[name] = (
+        groups[name] = GroupMae(
             int(rows.sum()),
             float(np.abs(raw_m[rows]).mean()),
             float(np.abs(corrected_m[rows]).mean()),

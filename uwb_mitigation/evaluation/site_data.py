@@ -67,6 +67,16 @@ class SiteData:
         """Where each tag's ranges begin among all."""
         return np.cumsum([0, *map(len, self.tags)])[:-1].astype(np.intp)
 
+    @property
+    def ranges(self) -> Ranges:
+        """The ranges of all tags."""
+        return Ranges.joined(self.tags)
+
+    @property
+    def tag(self) -> NDArray[np.intp]:
+        """Index of the tag of each range, shape (r,)."""
+        return np.repeat(np.arange(len(self.tags)), list(map(len, self.tags)))
+
     def labelled(
         self,
         rows: NDArray[np.intp],
@@ -82,19 +92,16 @@ class SiteData:
                 pair while the tag is stationary, or for `CHUNK_S` of motion. Its name begins with what is held out
                 together: "stretch 3.1/".
         """
-        every = {
-            name: np.concatenate([getattr(one, name) for one in self.tags])[rows]
-            for name in ("stamp_ns", "anchor", "range_m")
-        }
-        tag = np.repeat([one.tag_id for one in self.tags], list(map(len, self.tags))).astype(np.uint64)[rows]
+        ranges = self.ranges.take(rows)
+        tag = np.array([one.tag_id for one in self.tags], np.uint64)[self.tag[rows]]
         first = np.full(int(stretch.max()) + 1, np.iinfo(np.int64).max)
-        np.minimum.at(first, stretch, every["stamp_ns"])
-        since = (every["stamp_ns"] - first[stretch]) / _SECOND_NS
+        np.minimum.at(first, stretch, ranges.stamp_ns)
+        since = (ranges.stamp_ns - first[stretch]) / _SECOND_NS
         chunk = np.where(at_rest, 0, since // CHUNK_S).astype(int)
         fold = np.where(at_rest, 0, since // FOLD_S).astype(int)
         names = [
             f"stretch {s}.{f}/{c}/tag {t}/anchor {a}"
-            for s, f, c, t, a in zip(stretch, fold, chunk, tag, every["anchor"], strict=True)
+            for s, f, c, t, a in zip(stretch, fold, chunk, tag, ranges.anchor, strict=True)
         ]
         identities = np.array([anchor.id for anchor in self.anchors.anchors], np.uint64)
         return Dataset(
@@ -102,12 +109,12 @@ class SiteData:
             self.inputs[rows],
             self.rx_power_dbm[rows],
             self.first_path_power_dbm[rows],
-            every["range_m"],
-            every["range_m"] - true_m,
+            ranges.range_m,
+            ranges.range_m - true_m,
             np.array(names),
             np.full(len(rows), ""),
             tags=tag,
-            anchors=identities[every["anchor"]],
+            anchors=identities[ranges.anchor],
         )
 
 

@@ -117,11 +117,8 @@ def _is_better(gain: float, loss: float) -> bool:
 def _by_anchor(
     site: SiteData, antenna: NDArray[np.float64], known: NDArray[np.bool_]
 ) -> dict[int, _AnchorRanges]:
-    tag = np.repeat(np.arange(len(site.tags)), list(map(len, site.tags)))
-    row, stamp_ns, range_m = (
-        np.concatenate([getattr(one, name) for one in site.tags])
-        for name in ("anchor", "stamp_ns", "range_m")
-    )
+    tag, every = site.tag, site.ranges
+    row, stamp_ns, range_m = every.anchor, every.stamp_ns, every.range_m
     ranges = {}
     for anchor in np.unique(row).tolist():
         own = np.flatnonzero(known & (row == anchor))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,16 +81,7 @@ class Comparison:
             "split": f"{self.folds} splits by {self.group.value}",
             "seeds": self.seeds,
             "configurations": self.configurations,
-            "rows": [
-                {
-                    "name": row.name,
-                    "mae_mean": row.mae_mean,
-                    "mae_std": row.mae_std,
-                    "by_label": dict(row.by_label),
-                    "ci95": list(row.ci95),
-                }
-                for row in self.rows
-            ],
+            "rows": [asdict(row) for row in self.rows],
             "coverage68": narrow,
             "coverage95": wide,
             "coverage_by_label": {label: row for label, row in table(self.coverage).items() if label},

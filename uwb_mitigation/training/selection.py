@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -27,6 +28,12 @@ SEGMENT_FOLDS, ANCHOR_FOLDS = 4, 2
 """Of a site's data: folds over segments of the track, and over anchors."""
 
 _NOTHING: Callable[[], None] = lambda: None  # noqa: E731
+
+
+def counted(total: int, on_share: Callable[[float], None]) -> Callable[[], None]:
+    """Return what is called after each of `total` steps, and calls `on_share` with the finished share."""
+    numbers = itertools.count(1)
+    return lambda: on_share(next(numbers) / total)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,14 +115,8 @@ def select_nested(
     Raises:
         DatasetError, ParameterError: see `splits.by_configuration` and the fits.
     """
-    inner_folds, done = max(2, folds - 2), 0
-    total = folds * len(candidates) * (1 + inner_folds)
-
-    def on_fit() -> None:
-        nonlocal done
-        done += 1
-        on_share(done / total)
-
+    inner_folds = max(2, folds - 2)
+    on_fit = counted(folds * len(candidates) * (1 + inner_folds), on_share)
     names = [candidate.name for candidate in candidates]
     errors = {name: data.error_m.copy() for name in ("raw", *names, NESTED)}
     for fold in splits.by_configuration(data.configurations, folds, seed):
@@ -166,12 +167,7 @@ def select_for_site(
         raise DatasetError(
             "one segment of ranges: nothing can be held out", valid="a longer drive, or more positions"
         )
-    total, done = (len(segments) + len(anchors)) * len(candidates) + 1, 0
-
-    def on_fit() -> None:
-        nonlocal done
-        done += 1
-        on_share(done / total)
+    on_fit = counted((len(segments) + len(anchors)) * len(candidates) + 1, on_share)
 
     def prepare(fold: Split) -> Dataset:
         return data.shifted(without_offsets_of(fold.test))

@@ -386,7 +386,7 @@ def with_truth(
         estimate_lever_arm=estimate_lever_arm,
     )
     on_progress("time offset and lever arm", 0.3)
-    error = np.concatenate([one.range_m for one in site.tags]) - found.distance_m
+    error = site.ranges.range_m - found.distance_m
     kept, outliers = _without_outliers(error, np.isfinite(error))
     rows = np.flatnonzero(kept & _has_input(site))
     check_anchors(site, found.position, kept)
@@ -400,7 +400,7 @@ def with_truth(
     # Few ranges say less about the offset of a pair than the other pairs do.
     few = common, math.hypot(MAX_TRUTH_SD_M, spread)
     pairs = {pair: few if own[1] > MAX_TRUTH_SD_M else own for pair, own in pairs.items()}
-    tag = np.repeat(np.arange(len(site.tags)), list(map(len, site.tags)))
+    tag = site.tag
 
     def change_without(held_out: NDArray[np.intp]) -> dict[tuple[int, int], float]:
         rest = np.setdiff1d(rows, rows[held_out])
@@ -490,10 +490,8 @@ def position_error_m(site: SiteData, solution: Solution, error_m: NDArray[np.flo
     Returns:
         NaN if no second has ranges to three anchors that determine a position.
     """
-    stamp, row = (
-        np.concatenate([getattr(one, name) for one in site.tags])[solution.rows]
-        for name in ("stamp_ns", "anchor")
-    )
+    ranges = site.ranges.take(solution.rows)
+    stamp, row = ranges.stamp_ns, ranges.anchor
     away = solution.antenna - site.anchors.position[row]
     unit = away[:, :2] / np.maximum(np.linalg.norm(away, axis=1), 0.05)[:, None]
     window = (stamp - stamp.min()) // round(WINDOW_S * 1e9)

@@ -88,16 +88,14 @@ class TrainedBundle:
         """The result of `uwb-mitigation train`."""
         errors, dataset = self.validation.errors, self.validation.dataset
         tested = errors.get("int8", errors["float"])
-        groups = mae_by_group(dataset.configurations, errors["raw"], tested).items()
+        groups = mae_by_group(dataset.configurations, errors["raw"], tested)
         return {
             "model_id": self.bundle.model_id,
             "n": len(dataset),
             "refused": dict(dataset.refused),
             "helped": self.helped,
             "rows": [{"name": row, **values} for row, values in self.validation.statistics().items()],
-            "by_configuration": {
-                key: {"n": n, "raw_mae": before, "corrected_mae": after} for key, (n, before, after) in groups
-            },
+            "by_configuration": {name: group._asdict() for name, group in groups.items()},
             **({} if self.selection is None else {"choice": self.selection.as_json()}),
         }
 
@@ -138,13 +136,8 @@ def train_own(job: Job, recipe: Recipe, wanted: str = AUTO) -> TrainedBundle:
         if wanted in (models.COLD_START, models.MEAN):
             return _write_selected(job, selection, universal, recipe.fit, ("raw",))
     recipe = recipe.of(wanted)
-    total, done = recipe.fit.epochs * (folds + 1), 0
-
-    def on_epoch() -> None:
-        nonlocal done
-        done += 1
-        job.on_progress("training", done / total)
-
+    total = recipe.fit.epochs * (folds + 1)
+    on_epoch = selections.counted(total, lambda share: job.on_progress("training", share))
     validation = cross_validate(dataset, recipe, folds, seed, on_epoch)
     fitted = fit_own(dataset, recipe, seed, on_epoch)
     card = describe(job.output.stem, recipe, fitted.prior, validation, job.name)

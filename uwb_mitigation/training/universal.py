@@ -27,6 +27,7 @@ from uwb_mitigation.training.cards import card_of, familiarity_of
 from uwb_mitigation.training.fitting import fit
 from uwb_mitigation.training.options import FitOptions
 from uwb_mitigation.training.quantization import quantize
+from uwb_mitigation.training.selection import counted
 from uwb_mitigation.training.simulated import building_dataset
 
 CALIBRATION_INPUTS = 512
@@ -75,13 +76,7 @@ def train(
     """The model of `plan`, the same for any number of `workers`; `on_share` hears how much is done, and of what."""
     preprocessing = Preprocessing(plan.samples, plan.scaling)
     worlds = plan.blocks + plan.held_out_blocks
-    made = 0
-
-    def count_block() -> None:
-        nonlocal made
-        made += 1
-        on_share(0.2 * made / worlds, "simulating")
-
+    count_block = counted(worlds, lambda share: on_share(0.2 * share, "simulating"))
     # Augmentation needs the levels, whatever of them the scaling leaves.
     leveled = Preprocessing(plan.samples)
     # Levels show which receivers and sites are out of distribution. Without levels, training has to contain them.
@@ -95,13 +90,7 @@ def train(
         count_block,
         wide=not is_leveled,
     )
-    epochs = 0
-
-    def count_epoch() -> None:
-        nonlocal epochs
-        epochs += 1
-        on_share(0.2 + 0.75 * epochs / plan.fit.epochs, "training")
-
+    count_epoch = counted(plan.fit.epochs, lambda share: on_share(0.2 + 0.75 * share, "training"))
     options = replace(plan.fit, seed=plan.seed)
     network = fit(
         Remnet(samples=plan.samples),
