@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from itertools import chain, islice
 from itertools import count as counting
-from itertools import islice
 
 import numpy as np
 
@@ -63,11 +64,12 @@ class SimulatedDeepUwb(Simulated):
         ends = np.rint(np.cumsum(ROOM_ROWS) * (ranges / sum(ROOM_ROWS))).astype(int)
         self.rows: tuple[int, ...] = tuple(np.diff(ends, prepend=0).tolist())
 
-    def _measurements(self) -> Iterator[Record]:
+    def __iter__(self) -> Iterator[Record]:
+        self.skipped = Counter()
         for room, rows in enumerate(self.rows):
             # Endless: the number of lost frames is not known in advance.
-            batches = (self._batch(room, batch) for batch in counting())
-            yield from islice(self._shaped(self._received(batches)), rows)
+            records = chain.from_iterable(self._records(*self._batch(room, batch)) for batch in counting())
+            yield from islice(self._shaped(records), rows)
 
     def _shaped(self, records: Iterable[Record]) -> Iterator[Record]:
         for record in records:

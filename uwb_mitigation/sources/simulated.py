@@ -91,17 +91,9 @@ class Simulated(Source):
         """In the order of time, each with the generator that the radio draws from."""
         raise NotImplementedError
 
-    def _measurements(self) -> Iterator[Record]:
-        """All of them in order of time; what is left out is counted in `skipped`."""
-        return self._received(self._batches())
-
     def __iter__(self) -> Iterator[Record]:
         self.skipped = Counter()
-        yield from self._measurements()
-
-    def _received(self, batches: Iterable[tuple[Exchanges, np.random.Generator]]) -> Iterator[Record]:
-        """What the radio makes of batches, each with the generator that it is to draw from."""
-        for exchanges, rng in batches:
+        for exchanges, rng in self._batches():
             yield from self._records(exchanges, rng)
 
     def _records(self, exchanges: Exchanges, rng: np.random.Generator) -> Iterator[Record]:
