@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from uwb_mitigation.evaluation.dataset import Dataset
-from uwb_mitigation.measurement import Cir, RangeMeasurement, Record, Truth
+from uwb_mitigation.measurement import Cir, Encoding, RangeMeasurement, Record, Truth
 from uwb_mitigation.model import graph
 from uwb_mitigation.model.architecture import HEAD, Remnet
 from uwb_mitigation.model.bundle import Bundle, Card, save_bundle
@@ -91,6 +92,12 @@ def cir(seed: int = 0, **changes: object) -> Cir:
         "prf_mhz": 64,
     }
     return Cir(**(options | changes))  # type: ignore[arg-type]
+
+
+def amplitudes_only(of: Cir, **changes: object) -> Cir:
+    """The CIR as reported by boards that send amplitudes, without a preamble count."""
+    magnitude = np.hypot(*of.samples.reshape(-1, 2).astype(float).T).clip(max=32000).astype(np.int16)
+    return replace(of, samples=magnitude, encoding=Encoding.MAGNITUDE, preamble_count=0, **changes)  # type: ignore[arg-type]
 
 
 def window_of(of: Cir, preprocessing: Preprocessing) -> tuple[int, np.ndarray]:

@@ -7,11 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from model_material import amplitudes_only
 
 from uwb_mitigation.evaluation import zero_shot
 from uwb_mitigation.evaluation.accuracy import Accuracy, evaluate
 from uwb_mitigation.evaluation.dataset import build_dataset
-from uwb_mitigation.measurement import Cir, Encoding, Record
+from uwb_mitigation.measurement import Cir, Record
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.shipped import default_model_path, shipped_model_path
@@ -30,12 +31,6 @@ def mitigation() -> Mitigation:
 @pytest.fixture(scope="module")
 def records(apartment_reading) -> list[Record]:
     return apartment_reading.records[::EVERY]
-
-
-def magnitudes_without_preamble(cir: Cir) -> Cir:
-    parts = cir.samples.reshape(-1, 2).astype(float)
-    magnitude = np.hypot(*parts.T).clip(max=32000).astype(np.int16)
-    return replace(cir, samples=magnitude, encoding=Encoding.MAGNITUDE, preamble_count=0)
 
 
 def noise(cir: Cir) -> Cir:
@@ -63,7 +58,7 @@ def louder(decibels: float) -> Callable[[Cir], Cir]:
 
 
 DAMAGED = {
-    "magnitudes, no preamble count": magnitudes_without_preamble,
+    "magnitudes, no preamble count": amplitudes_only,
     "noise": noise,
     **{f"shifted by {taps}": shifted(taps) for taps in (-30, -10, -5, 30, 80)},
     **{f"clipped at {level}": clipped(level) for level in (100, 500, 2000)},

@@ -10,11 +10,12 @@ from pathlib import Path
 import command_line
 import numpy as np
 import pytest
+from model_material import amplitudes_only
 
 from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.errors import DatasetError, ParameterError
 from uwb_mitigation.evaluation.radio_offsets import FoundOffset, find_offset
-from uwb_mitigation.measurement import Encoding, Record
+from uwb_mitigation.measurement import Record
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.shipped import default_model_path
@@ -57,18 +58,10 @@ def weaker_first_path(records: list[Record], by_db: float) -> Iterator[Record]:
 
 
 def without_levels(records: list[Record]) -> Iterator[Record]:
-    """What boards report that send amplitudes only."""
+    """The records without preamble counts and power levels."""
+    unknown = {"rx_power_dbm": float("nan"), "first_path_power_dbm": float("nan")}
     for record in records:
-        cir = record.measurement.cir
-        magnitude = np.hypot(*cir.samples.reshape(-1, 2).astype(float).T).clip(max=32000).astype(np.int16)
-        cir = replace(
-            cir,
-            samples=magnitude,
-            encoding=Encoding.MAGNITUDE,
-            preamble_count=0,
-            rx_power_dbm=float("nan"),
-            first_path_power_dbm=float("nan"),
-        )
+        cir = amplitudes_only(record.measurement.cir, **unknown)
         yield replace(record, measurement=replace(record.measurement, cir=cir))
 
 
