@@ -17,7 +17,6 @@ from uwb_mitigation.evaluation.metrics import ErrorStatistics
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.architecture import Remnet
 from uwb_mitigation.model.bundle import load_bundle
-from uwb_mitigation.model.shipped import shipped_model_path
 from uwb_mitigation.sources import opening
 
 
@@ -132,9 +131,3 @@ def test_an_int8_bundle_is_not_quantised_again(tmp_path, recording):
 def test_a_place_that_cannot_be_written_is_refused_before_training(tmp_path, recording, output):
     result = run("train", "--data", "any", "-o", tmp_path / output)
     assert isinstance(result.exception, ParameterError)
-
-
-def test_the_model_of_the_real_logs_takes_their_error_down(apartment_reading):
-    mitigation = Mitigation(load_bundle(shipped_model_path("evk1000_apartment")))
-    outcome = evaluate(mitigation, apartment_reading.records[:400])
-    assert outcome.corrected.mae < 0.6 * outcome.raw.mae
