@@ -39,6 +39,33 @@ class Browser:
             {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False},
         )
 
+    @contextmanager
+    def touch_screen(self) -> Iterator[None]:
+        """Pages opened meanwhile are on a phone."""
+        emulate = "Emulation.setTouchEmulationEnabled"
+        self.driver.execute_cdp_cmd(emulate, {"enabled": True, "maxTouchPoints": 1})
+        try:
+            yield
+        finally:
+            self.driver.execute_cdp_cmd(emulate, {"enabled": False})
+
+    def scroll_to(self, name: str) -> float:
+        """Scroll a named figure of Bokeh's into the middle; returns where the page is then."""
+        return self.run(
+            "const view = Bokeh.index.find_one(Bokeh.documents[0].get_model_by_name(arguments[0]));"
+            "view.el.scrollIntoView({block: 'center'}); return scrollY",
+            name,
+        )
+
+    def swipe(self, x: int, y: int, distance: int) -> None:
+        """Move a finger upwards by some pixels."""
+        steps = [("touchStart", y), *(("touchMove", y - distance * step // 10) for step in range(1, 11))]
+        for kind, at in steps:
+            touch = {"type": kind, "touchPoints": [{"x": x, "y": at}]}
+            self.driver.execute_cdp_cmd("Input.dispatchTouchEvent", touch)
+            time.sleep(0.02)
+        self.driver.execute_cdp_cmd("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+
     def run(self, script: str, *arguments: object) -> Any:
         return self.driver.execute_script(script, *arguments)
 

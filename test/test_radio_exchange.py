@@ -18,6 +18,7 @@ from uwb_mitigation.radio import structures
 pytestmark = NEEDS_CC
 
 WRAP = 1 << 40
+LOST = ("no_answer", "late", "time_out", "damaged", "absurd", "broken")
 
 
 def accumulator(samples: int = 1016, first_path: int = 745, seed: int = 0) -> np.ndarray:
@@ -212,3 +213,27 @@ def test_the_bias_of_the_power_is_taken_off_when_asked_for():
     table = [-110, -105, -100, -93, -82, -69, -51, -27, 0, 21, 35, 42, 49, 62, 71, 76, 81, 86]
     bias_m = np.interp(-true_dbm, np.arange(61, 97, 2), table) / 1000
     assert abs(rows["range_m"].mean() - 5 + bias_m) < 0.005
+
+
+def test_a_chip_that_is_reset_or_out_of_reach_is_back_within_a_second_and_no_range_is_wrong():
+    random = np.random.default_rng(4)
+    channel = Link(8, loss=0.1, damage=0.01)
+    with ModelledAir(7) as air:
+        tag, anchor = pair(air, channel, window=0)
+        air.run(1)
+        for step in range(30):
+            what = step % 3
+            if what == 2:
+                air.link(tag, anchor, None)
+                air.run(random.uniform(0.05, 1))
+                air.link(tag, anchor, channel)
+            else:
+                air.reset((tag, anchor)[what])
+            air.ranges()
+            air.run(1 + random.uniform(0, 0.01))
+            rows, _ = air.ranges()
+            assert len(rows), f"nothing within a second after {('tag', 'anchor', 'link')[what]}"
+            assert abs(rows["range_m"] - 8).max() < 0.1
+        counts = air.counts(tag)
+    assert counts["tried"] - counts["ranged"] - sum(counts[name] for name in LOST) in (0, 1)
+    assert counts["restarts"] >= 10

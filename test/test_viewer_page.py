@@ -418,6 +418,22 @@ def test_only_scripts_of_the_page_run(browser: Browser, view: View, server: View
     assert browser.run("return window.pwned ?? null") is None
 
 
+def test_a_swipe_over_a_figure_scrolls_the_page_of_a_phone(
+    browser: Browser, view: View, server: ViewerServer
+) -> None:
+    fill(view)
+    with browser.touch_screen():
+        opened(browser, server, 400, 800)
+        for name in ("map", "cir", "strip", "waterfall", "errors"):
+            before = browser.scroll_to(name)
+            browser.swipe(200, 400, 250 if before < 500 else -250)
+            browser.wait(
+                f"the page to scroll by {name}",
+                lambda before=before: abs(browser.run("return scrollY") - before) > 100,
+            )
+        assert browser.complaints() == []
+
+
 @pytest.mark.parametrize("width", [1280, 1024, 400])
 def test_nothing_is_cut_off_on_a_narrow_screen(
     browser: Browser, view: View, server: ViewerServer, width: int

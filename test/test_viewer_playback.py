@@ -247,6 +247,43 @@ def viewing(bag: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
         running.wait()
 
 
+def test_the_slider_can_be_dragged_while_the_recording_plays(browser: Browser, tmp_path: Path):
+    from selenium.webdriver.common.action_chains import ActionChains
+
+    long = tmp_path / "long.mcap"
+    with BagWriter(long, {}) as out:
+        for number in range(0, 30_000, 100):
+            write_corrected(out, record(number).measurement, corrected(number))
+
+    def slider(attribute: str) -> float:
+        return browser.run("return Bokeh.documents[0].get_model_by_name('slider')[arguments[0]]", attribute)
+
+    with viewing(long) as (_, url):
+        browser.open(url)
+        browser.wait("the page", browser.ready)
+        browser.wait("it to play", lambda: slider("value") > 0)
+        left, right, y = browser.run(
+            "const view = Bokeh.index.find_one(Bokeh.documents[0].get_model_by_name('slider'));"
+            "const box = view.slider_el.getBoundingClientRect();"
+            "return [box.left, box.right, (box.top + box.bottom) / 2]"
+        )
+
+        def at(value: float) -> tuple[int, int]:
+            return round(left + (right - left) * value / slider("end")), round(y)
+
+        actions = ActionChains(browser.driver, duration=100)
+        mouse = actions.w3c_actions.pointer_action
+        mouse.move_to_location(*at(slider("value"))).pointer_down()
+        mouse.move_to_location(*at(250.0)).pause(1.0).move_to_location(*at(200.0)).pause(1.0)
+        actions.perform()
+        assert slider("value") == pytest.approx(200.0, abs=1.0), "it stays where it is held"
+        actions = ActionChains(browser.driver)
+        actions.w3c_actions.pointer_action.pointer_up()
+        actions.perform()
+        browser.wait("it to play from there", lambda: slider("value") > 202.0)
+        assert slider("value") < 250.0
+
+
 def test_the_page_has_a_slider_and_plays(browser: Browser, bag: Path):
 
     def model(name: str, attribute: str) -> object:
