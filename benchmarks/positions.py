@@ -20,7 +20,7 @@ from uwb_mitigation.model.prior import LinePrior
 from uwb_mitigation.model.shipped import default_model_path
 from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.geometry import Area, Height
-from uwb_mitigation.positioning.locator import Setting, TagLocator, run_live
+from uwb_mitigation.positioning.locator import Setting, TagLocator
 from uwb_mitigation.positioning.model import Model
 from uwb_mitigation.positioning.smoother import smooth
 from uwb_mitigation.positioning.start import places, snapshot
@@ -94,7 +94,7 @@ def hanyang(folder: Path, model: Model | None = None) -> Errors:
     """One run in its authors' window, the height known."""
     model = model or Model()
     anchors, ranges, _, truth = hanyang_run(folder)
-    live = run_live(ranges, TagLocator(anchors, model, height=HEIGHT)).track
+    live = TagLocator(Setting(anchors, model, height=HEIGHT)).run(ranges)
     smoothed = smooth(Setting(anchors, model, HEIGHT), ranges, live)
     tracks = (live, smoothed, snapshot(anchors, ranges, HEIGHT))
     return Errors(folder.name, *(at_truths(track, truth) for track in tracks))
@@ -209,7 +209,7 @@ def flat(anchor_count: int, seed: int = 1, ranges: int = 3000) -> FlatErrors:
 
 def _flat_errors(name: str, anchors: AnchorMap, ranges: Ranges, truth: TruePath) -> Errors:
     model, height = Model(), Height(0.0, 0.05)
-    live = run_live(ranges, TagLocator(anchors, model, height=height)).track
+    live = TagLocator(Setting(anchors, model, height=height)).run(ranges)
     smoothed = smooth(Setting(anchors, model, height), ranges, live)
     tracks = (live, smoothed, snapshot(anchors, ranges, height))
     return Errors(name, *(track_errors(track, truth) for track in tracks))

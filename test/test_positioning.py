@@ -15,7 +15,7 @@ from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
 from uwb_mitigation.positioning.filter import FIRST_ERROR, OFFSET, RangeFilter
 from uwb_mitigation.positioning.fleet import Fleet
 from uwb_mitigation.positioning.geometry import Area, Height, Shape, geometry, shape
-from uwb_mitigation.positioning.locator import SILENCE_S, Setting, TagLocator, run_live
+from uwb_mitigation.positioning.locator import SILENCE_S, Setting, TagLocator
 from uwb_mitigation.positioning.model import Model
 from uwb_mitigation.positioning.smoother import smooth
 from uwb_mitigation.positioning.start import places
@@ -114,7 +114,7 @@ def test_live_estimates_of_many_drives_are_honest():
     for seed in range(6):
         offset = np.random.default_rng(seed).normal(0, Model().offset_sd)
         ranges, truth = drive(seconds=25, seed=seed, offset_m=offset)
-        errors = track_errors(run_live(ranges, TagLocator(HALL)).track, truth)
+        errors = track_errors(TagLocator(Setting(HALL)).run(ranges), truth)
         assert errors.rmse < 0.25
         found.append(errors)
     assert 0.5 < np.mean([e.nees_per_dof for e in found]) < 1.5
@@ -125,19 +125,19 @@ def test_live_estimates_of_many_drives_are_honest():
 def test_of_two_mirror_images_nothing_is_told_until_an_area_excludes_one():
     wall = AnchorMap([Anchor(1, (0, 0, 1)), Anchor(2, (10, 0, 1)), Anchor(3, (5, 0, 1.0))])
     ranges, truth = drive(wall, seconds=8)
-    locator = TagLocator(wall, height=Height(1.0))
-    assert len(run_live(ranges, locator).track) == 0
+    locator = TagLocator(Setting(wall, height=Height(1.0)))
+    assert len(locator.run(ranges)) == 0
     assert locator.candidates == 2
-    inside = TagLocator(wall, height=Height(1.0), area=Area((-50, 0.1, 0), (50, 50, 3)))
-    assert track_errors(run_live(ranges, inside).track, truth).rmse < 0.4
+    inside = TagLocator(Setting(wall, height=Height(1.0), area=Area((-50, 0.1, 0), (50, 50, 3))))
+    assert track_errors(inside.run(ranges), truth).rmse < 0.4
 
 
 @pytest.mark.parametrize("seed", [2, 3])
 def test_every_position_lies_inside_the_area(seed: int):
     area = Area((-4, -4, 0), (0.9, 4, 3))
     ranges, truth = drive(WALL, path=flight, seed=seed)
-    locator = TagLocator(WALL, area=area)
-    track = run_live(block(ranges, seed), locator).track
+    locator = TagLocator(Setting(WALL, area=area))
+    track = locator.run(block(ranges, seed))
     assert len(track) > 0.9 * len(ranges)
     assert area.holds(track.position).all()
     assert area.holds(locator.at(int(ranges.stamp_ns[-1]) + 5 * NANOSECONDS).position).all()
@@ -155,7 +155,7 @@ def test_measured_heights_near_the_floor_keep_the_right_solution(seed: int):
     known = np.isfinite(height)
     heights = Heights(stamps[known], height[known], np.full(known.sum(), 0.0004))
     area = Area((-4, -4, 0), (30, 4, 3))
-    live = run_live(ranges, TagLocator(FLAT, area=area), heights).track
+    live = TagLocator(Setting(FLAT, area=area, heights=heights)).run(ranges)
     smoothed = smooth(Setting(FLAT, area=area, heights=heights), ranges, live)
     for track in (live, smoothed):
         assert len(track) > 250
@@ -172,7 +172,7 @@ def test_late_heights_correct_a_wrong_height_at_once(anchors: AnchorMap, area: A
     ranges, truth = drive(anchors, path=flight, seconds=8, seed=2)
     late = truth.stamp_ns > 4 * NANOSECONDS
     heights = Heights(truth.stamp_ns[late], truth.position[late, 2], np.full(late.sum(), 0.0004))
-    track = run_live(ranges, TagLocator(anchors, area=area), heights).track
+    track = TagLocator(Setting(anchors, area=area, heights=heights)).run(ranges)
     track = track.take(track.stamp_ns > 4.1 * NANOSECONDS)
     assert len(track) > 150
     errors = track_errors(track, truth)
@@ -184,7 +184,7 @@ def lagged(
     anchors: AnchorMap, ranges: Ranges, truth: TruePath, area: Area | None = None, heights: bool = False
 ) -> tuple[Track, Track]:
     """Return the live track of a fleet, and the one that is smoothed with a lag."""
-    fleet, live, smoothed = Fleet(anchors, Model(), area=area), list[Estimate](), list[Estimate]()
+    fleet, live, smoothed = Fleet(Setting(anchors, Model(), area=area)), list[Estimate](), list[Estimate]()
     columns = (ranges.stamp_ns, ranges.anchor, ranges.range_m)
     for i, (stamp_ns, row, range_m) in enumerate(zip(*(one.tolist() for one in columns), strict=True)):
         found = fleet.add(7, row + 1, stamp_ns, range_m, 0.01)
@@ -227,7 +227,7 @@ def test_anchors_almost_on_a_line_never_decide_by_chance(seed: int, height: Heig
     line = AnchorMap([Anchor(i, (2.5 * i, *rng.normal((0, 1), 0.03)), 0.03) for i in range(1, 6)])
     ranges, _ = drive(line, seconds=30, seed=seed)
     block(ranges, seed)
-    fleet = Fleet(line, Model(), height=height)
+    fleet = Fleet(Setting(line, Model(), height=height))
     for i in range(len(ranges)):
         found = fleet.add(
             7, int(ranges.anchor[i]) + 1, int(ranges.stamp_ns[i]), float(ranges.range_m[i]), 0.01
@@ -241,13 +241,13 @@ def test_anchors_almost_on_a_line_never_decide_by_chance(seed: int, height: Heig
 def test_the_covariance_grows_through_a_silence_and_the_tag_is_found_within_two_seconds_after():
     ranges, truth = drive(seconds=40)
     before = ranges.take(ranges.stamp_ns < 15 * NANOSECONDS)
-    locator = TagLocator(HALL)
-    run_live(before, locator)
+    locator = TagLocator(Setting(HALL))
+    locator.run(before)
     spread = [locator.at((15 + s) * NANOSECONDS).covariance[0, 0] for s in range(10)]
     assert (np.diff(spread) > 0).all()
     assert spread[-1] > 10
     assert SILENCE_S < 10
-    after = run_live(ranges.take(ranges.stamp_ns >= 25 * NANOSECONDS), locator).track
+    after = locator.run(ranges.take(ranges.stamp_ns >= 25 * NANOSECONDS))
     late = after.take(after.stamp_ns >= 27 * NANOSECONDS)
     assert late.stamp_ns[0] < 27.1 * NANOSECONDS
     errors = track_errors(late, truth)
@@ -262,27 +262,27 @@ def test_a_tag_that_was_carried_away_is_found_within_two_seconds():
         return position
 
     ranges, truth = drive(seconds=40, path=carried)
-    locator = TagLocator(HALL)
-    track = run_live(ranges, locator).track
+    locator = TagLocator(Setting(HALL))
+    track = locator.run(ranges)
     late = track.take(track.stamp_ns >= 22 * NANOSECONDS)
     assert len(late) > 600
-    assert locator.counts.lost >= 1
+    assert locator.counts["lost"] >= 1
     assert track_errors(late, truth).nees_per_dof < 2
 
 
 def test_bad_input_is_skipped_and_a_replay_that_starts_again_starts_the_tag_again():
     ranges, truth = drive(seconds=10)
-    locator = TagLocator(HALL)
+    locator = TagLocator(Setting(HALL))
     for value in (math.nan, math.inf, -1.0):
         assert locator.add(0, 0, value) is None
     assert locator.add(0, 0, 5.0, math.inf) is None
-    run_live(ranges, locator)
+    locator.run(ranges)
     stamp = int(ranges.stamp_ns[-1])
     assert locator.add(stamp - 1000, 0, float(ranges.range_m[-1])) is not None
-    assert locator.counts.backwards == 1
-    again = run_live(ranges, locator).track
+    assert locator.counts["backwards"] == 1
+    again = locator.run(ranges)
     assert track_errors(again, truth).rmse < 0.3
-    assert locator.counts.found == 2
+    assert locator.counts["found"] == 2
 
 
 def test_all_places_that_explain_ranges_are_found():

@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 
 from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
 from uwb_mitigation.positioning.least_squares import LeastSquares
-from uwb_mitigation.positioning.locator import Setting, TagLocator, run_live
+from uwb_mitigation.positioning.locator import Setting, TagLocator
 from uwb_mitigation.positioning.model import Model
 from uwb_mitigation.positioning.smoother import Smoother, knots_of, smooth
 from uwb_mitigation.positioning.tracks import Track, TruePath, track_errors
@@ -44,7 +44,7 @@ def test_the_smoother_agrees_with_nonlinear_least_squares():
     ranges, truth = drive(seconds=4, model=Model(white=1.0), offset_m=0.0)
     knots_ns, of = knots_of(ranges.stamp_ns)
     ranges = ranges.take(np.flatnonzero(ranges.stamp_ns == knots_ns[of]))
-    mine = Smoother(HALL, model, ranges).fit(known_track(truth), 30)
+    mine = Smoother(Setting(HALL, model), ranges).fit(known_track(truth), 30)
     knots_ns, of = knots_of(ranges.stamp_ns)
     sd = np.sqrt(model.range_sd**2 + HALL.sd[ranges.anchor] ** 2)
     dt = np.diff(knots_ns)[:, None] / 1e9
@@ -79,9 +79,9 @@ def test_smoothed_tracks_of_many_drives_are_honest_and_better_than_live_ones():
         rng = np.random.default_rng(seed)
         ranges, truth = drive(seconds=25, seed=seed, offset_m=rng.normal(0, Model().offset_sd))
         ranges.range_m[:] += rng.normal(0, Model().pair_sd, len(HALL))[ranges.anchor]
-        first = run_live(ranges, TagLocator(HALL)).track
+        first = TagLocator(Setting(HALL)).run(ranges)
         live.append(track_errors(first, truth).rmse)
-        smooth.append(track_errors(Smoother(HALL, Model(), ranges).fit(first).track, truth))
+        smooth.append(track_errors(Smoother(Setting(HALL, Model()), ranges).fit(first).track, truth))
     assert np.mean([e.rmse for e in smooth]) < 0.95 * np.mean(live)
     assert 0.5 < np.mean([e.nees_per_dof for e in smooth]) < 1.6
 
@@ -92,7 +92,7 @@ def test_a_track_smoothed_among_obstacles_is_not_worse_than_live(seed: int):
     anchors = AnchorMap([Anchor(i, tuple(p), 0.03) for i, p in enumerate(box.tolist(), 1)])
     ranges, truth = drive(anchors, seconds=40, seed=seed)
     block(ranges, seed)
-    live = run_live(ranges, TagLocator(anchors)).track
+    live = TagLocator(Setting(anchors)).run(ranges)
     of_live = track_errors(live, truth)
     errors = track_errors(smooth(Setting(anchors), ranges, live), truth)
     assert errors.epochs > 380

@@ -22,7 +22,7 @@ from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.measurement import Cir, CorrectedRange, Origin, RangeMeasurement, Record, Status
 from uwb_mitigation.positioning.anchors import dump_anchors, parse_anchors
 from uwb_mitigation.positioning.geometry import Area, Height
-from uwb_mitigation.positioning.locator import Setting, TagLocator, run_live
+from uwb_mitigation.positioning.locator import Setting, TagLocator
 from uwb_mitigation.positioning.model import Model
 from uwb_mitigation.positioning.tracks import Estimate, Ranges, TruePath
 from uwb_mitigation.processing import tracking
@@ -164,8 +164,8 @@ def test_only_anchors_that_contradict_the_others_are_accused():
     blocked, truth = drive(seconds=60, seed=1)
     late = (blocked.anchor == 2) & (blocked.stamp_ns > 30 * NANOSECONDS)
     blocked.range_m[late] += np.random.default_rng(1).exponential(1.5, int(late.sum()))
-    locator = TagLocator(HALL, height=height)
-    run_live(blocked, locator)
+    locator = TagLocator(Setting(HALL, height=height))
+    locator.run(blocked)
     assert locator.disagreeing() == [2]  # by its last ranges alone
     assert track_tag(recording_of(blocked, truth), Setting(HALL, height=height)).disagreeing == []
     wrong, truth = drive(seconds=60, seed=1)

@@ -39,7 +39,7 @@ from uwb_mitigation.offsets import NO_OFFSETS, Offsets
 from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.geometry import Height
 from uwb_mitigation.positioning.localised import PosePath
-from uwb_mitigation.positioning.locator import TagLocator, run_live
+from uwb_mitigation.positioning.locator import Setting, TagLocator
 from uwb_mitigation.positioning.model import Model
 from uwb_mitigation.positioning.tracks import Ranges, TruePath, track_errors
 from uwb_mitigation.sources.simulated import SimulatedSource
@@ -111,7 +111,7 @@ def position_rmse(
         value = np.array([one.range_m for one in corrected])
         variance = np.array([one.variance_m2 for one in corrected])
     ranges = Ranges(stamps, row, np.maximum(value, 0.0), variance, np.full(len(value), np.nan), 101)
-    track = run_live(ranges, TagLocator(anchors, Model(), height=Height(0.0, 0.05))).track
+    track = TagLocator(Setting(anchors, Model(), height=Height(0.0, 0.05))).run(ranges)
     return track_errors(track, truth).rmse
 
 

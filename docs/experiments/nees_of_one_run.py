@@ -14,7 +14,7 @@ import numpy as np
 
 from benchmarks.positions import HEIGHT, at_truths, hanyang_run
 from uwb_mitigation.positioning.anchors import AnchorMap
-from uwb_mitigation.positioning.locator import TagLocator, run_live
+from uwb_mitigation.positioning.locator import Setting, TagLocator
 from uwb_mitigation.positioning.model import Model
 from uwb_mitigation.positioning.smoother import Smoother
 from uwb_mitigation.positioning.tracks import Ranges, TruePath
@@ -57,8 +57,8 @@ for folder in sorted(Path(sys.argv[1]).glob("*_*")):
     found = []
     for seed in range(again):
         drawn = erring(ranges, path, anchors, model, np.random.default_rng(seed))
-        live = run_live(drawn, TagLocator(anchors, model, height=HEIGHT)).track
-        smoothed = Smoother(anchors, model, drawn, height=HEIGHT).fit(live).track
+        live = TagLocator(Setting(anchors, model, height=HEIGHT)).run(drawn)
+        smoothed = Smoother(Setting(anchors, model, height=HEIGHT), drawn).fit(live).track
         found.append([at_truths(track, window).nees_per_dof for track in (live, smoothed)])
     low, middle, high = np.percentile(found, (5, 50, 95), axis=0)
     print(

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.positions import HEIGHT, at_truths, hanyang_run
-from uwb_mitigation.positioning.locator import TagLocator, run_live
+from uwb_mitigation.positioning.locator import Setting, TagLocator
 from uwb_mitigation.positioning.model import Model
 from uwb_mitigation.positioning.tracks import TrackErrors
 
@@ -34,7 +34,7 @@ runs = [hanyang_run(folder) for folder in folders]
 
 def live(run: int, model: Model) -> TrackErrors:
     anchors, ranges, _, truth = runs[run]
-    return at_truths(run_live(ranges, TagLocator(anchors, model, height=HEIGHT)).track, truth)
+    return at_truths(TagLocator(Setting(anchors, model, height=HEIGHT)).run(ranges), truth)
 
 
 found = [[live(run, Model(**change)) for run in range(len(folders))] for change in CHANGES]

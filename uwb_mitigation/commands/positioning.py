@@ -174,6 +174,7 @@ def survey(
     file says, and pairs that were swapped, are named. Ranges do not tell where the whole lies and how it is turned:
     the guesses do, or anchors that are `--fixed`.
     """
+    from uwb_mitigation.positioning.locator import Setting
     from uwb_mitigation.positioning.model import Model
     from uwb_mitigation.positioning.survey import survey as find
     from uwb_mitigation.sources.site import save_anchors
@@ -196,16 +197,8 @@ def survey(
     tag = max(recorded.tags, key=lambda one: len(one.ranges))
     with console.progress() as bar:
         bar.add_task(f"surveying from {len(tag.ranges)} ranges of tag {format_id(tag.tag_id)}", total=None)
-        result = find(
-            known,
-            tag.ranges,
-            off_m=off,
-            fixed=frozenset(rows),
-            height=place,
-            area=box,
-            heights=measured,
-            model=Model(acceleration=acceleration),
-        )
+        setting = Setting(known, Model(acceleration=acceleration), place, box, measured)
+        result = find(setting, tag.ranges, off_m=off, fixed=frozenset(rows))
     save_anchors(
         output, result.anchors, f"surveyed from {bag.name}, tag {format_id(tag.tag_id)}", force=force
     )

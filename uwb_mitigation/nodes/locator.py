@@ -31,6 +31,7 @@ from uwb_mitigation.nodes.lifecycle import ManagedNode
 from uwb_mitigation.nodes.parameter_tables import LOCATOR
 from uwb_mitigation.positioning.fleet import Fleet, Tag
 from uwb_mitigation.positioning.geometry import Area, Height
+from uwb_mitigation.positioning.locator import Setting
 from uwb_mitigation.positioning.model import Model
 from uwb_mitigation.positioning.tracks import Estimate
 from uwb_mitigation.sources.site import load_anchors
@@ -102,7 +103,7 @@ class Locator(ManagedNode):
         anchors = load_anchors(Path(path).expanduser())
         model = Model(acceleration=self.value("acceleration"), range_sd=self.value("range_sd"))
         height = Height(self.value("height"), self.value("height_sd")) if self.value("level") else None
-        self._fleet = Fleet(anchors, model, height=height, area=Area.parse(self.value("area")))
+        self._fleet = Fleet(Setting(anchors, model, height, Area.parse(self.value("area"))))
         self._period_ns = round(_NANOSECONDS / self.value("rate")) if self.value("rate") > 0 else 0
         self._offset_ns = round(self.value("stamp_offset") * _NANOSECONDS)
         self._map, self._plain_frame = self.value("map_frame"), self.value("tag_frame")

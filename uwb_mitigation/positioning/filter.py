@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.model import Model
+from uwb_mitigation.positioning.tracks import Estimate
 
 OFFSET = 6
 FIRST_ERROR = 7
@@ -172,6 +173,10 @@ class RangeFilter:
         a -= np.multiply.outer(a @ h - (s - predicted) * k, k)
         self.p = a
         return z, sd
+
+    def estimate(self, stamp_ns: int) -> Estimate:
+        """Return position and velocity, at the stamp that the state is for."""
+        return Estimate(stamp_ns, self.x[:3].copy(), self.x[3:6].copy(), self.p[:6, :6].copy())
 
     @property
     def position(self) -> NDArray[np.float64]:

@@ -9,11 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from uwb_mitigation.errors import DatasetError, format_id
-from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.filter import RangeFilter
-from uwb_mitigation.positioning.geometry import Area, Height, Shape, protection_levels, shape
+from uwb_mitigation.positioning.geometry import Shape, protection_levels, shape
 from uwb_mitigation.positioning.locator import SILENCE_S, Setting, TagLocator
-from uwb_mitigation.positioning.model import Model
 from uwb_mitigation.positioning.smoother import Smoother, fused_with_batch
 from uwb_mitigation.positioning.tracks import Estimate, Heights, Ranges, Track
 
@@ -34,14 +32,11 @@ _SECOND_NS = 1_000_000_000
 
 
 class FixedLag:
-    """Keeps the latest states of the filter and ranges of a tag, and smooths over them on request.
-
-    Args:
-        setting: anchors, error model, height and area.
-    """
+    """Keeps the latest states of the filter and ranges of a tag, and smooths over them on request."""
 
     def __init__(self, setting: Setting) -> None:
-        self._setting = setting
+        # The filter has no offsets of single anchors, and 1.5 s do not determine them.
+        self._setting = replace(setting, model=replace(setting.model, pair_sd=0.0))
         self._states: deque[tuple[int, RangeFilter]] = deque()
         self._ranges: deque[tuple[int, int, float, float]] = deque()
         self._heights: deque[tuple[int, float, float]] = deque(maxlen=_MAX_RANGES)
@@ -85,21 +80,12 @@ class FixedLag:
         first = known.copy()
         first.predict(first.time_s + (int(stamp[0]) - start_ns) / _SECOND_NS)
         states = [(at, one) for at, one in self._states if at > start_ns] or [(int(stamp[0]), first)]
-        initial = Track.of([_estimate_of(one, at) for at, one in states])
-        heights = None
+        initial = Track.of([one.estimate(at) for at, one in states])
         if self._heights:
-            heights = Heights(*(np.array(column) for column in zip(*self._heights, strict=True)))
-        smoother = Smoother(
-            setting.anchors,
-            # The filter has no offsets of single anchors, and 1.5 s do not determine them.
-            replace(setting.model, pair_sd=0.0),
-            ranges,
-            height=setting.height,
-            after=first,
-            heights=heights,
-        )
+            columns = zip(*self._heights, strict=True)
+            setting = replace(setting, heights=Heights(*(np.array(column) for column in columns)))
         try:
-            track = smoother.fit(initial, _ITERATIONS).track
+            track = Smoother(setting, ranges, after=first).fit(initial, _ITERATIONS).track
         except DatasetError:
             return None
         at = int(np.abs(track.stamp_ns - wanted_ns).argmin())
@@ -111,10 +97,6 @@ class FixedLag:
         state, covariance, spread = fused_with_batch(live.x[None, :6], live.p[None, :6, :6], batch)
         position = state[0, :3] if setting.area is None else setting.area.clip(state[0, :3])
         return Estimate(wanted_ns, position, state[0, 3:], (covariance + spread)[0])
-
-
-def _estimate_of(known: RangeFilter, stamp_ns: int) -> Estimate:
-    return Estimate(stamp_ns, known.x[:3], known.x[3:6], known.p[:6, :6])
 
 
 @dataclass(slots=True)
@@ -141,29 +123,21 @@ class Tag:
 
 
 class Fleet:
-    """Args:
-        anchors, model, height, area: as of `TagLocator`.
+    """The tags of a site.
 
     Attributes:
-        anchors: as given.
+        anchors: those of the setting.
         tags: by their numbers, in the order in which they were heard.
         strangers: ranges of anchors that are not on the map, {anchor id: count}.
         invalid: ranges that were not finite, or negative.
     """
 
-    def __init__(
-        self,
-        anchors: AnchorMap,
-        model: Model,
-        *,
-        height: Height | None = None,
-        area: Area | None = None,
-    ) -> None:
-        self.anchors = anchors
+    def __init__(self, setting: Setting) -> None:
+        self.anchors = setting.anchors
         self.tags: dict[int, Tag] = {}
         self.strangers: Counter[int] = Counter()
         self.invalid = 0
-        self._setting = Setting(anchors, model, height, area)
+        self._setting = setting
 
     def add(
         self, tag_id: int, anchor_id: int, stamp_ns: int, range_m: float, variance_m2: float
@@ -186,11 +160,7 @@ class Fleet:
             if len(self.tags) >= MAX_TAGS:
                 self.invalid += 1
                 return None
-            tag = self.tags[tag_id] = Tag(
-                tag_id,
-                self._setting.locator(),
-                FixedLag(self._setting),
-            )
+            tag = self.tags[tag_id] = Tag(tag_id, TagLocator(self._setting), FixedLag(self._setting))
         estimate = tag.locator.add(stamp_ns, row, range_m, variance_m2)
         tag.latest_ns = stamp_ns
         known = tag.locator.filter
@@ -241,14 +211,14 @@ class Fleet:
         }
         for tag in self.tags.values():
             locator, name = tag.locator, f"tag {format_id(tag.tag_id)}"
-            counts, health, known = locator.counts, locator.health, locator.filter
+            counts, known = locator.counts, locator.filter
             found |= {
                 f"{name} places": locator.candidates,
                 f"{name} anchors used": len(locator.heard()),
-                f"{name} found, lost, silent": f"{counts.found}, {counts.lost}, {counts.silent}",
-                f"{name} out of order": counts.backwards,
-                f"{name} innovation mean": f"{health.mean:.2f}",
-                f"{name} innovation square": f"{health.square:.2f}",
+                f"{name} found, lost, silent": f"{counts['found']}, {counts['lost']}, {counts['silent']}",
+                f"{name} out of order": counts["backwards"],
+                f"{name} innovation mean": f"{locator.innovation_mean:.2f}",
+                f"{name} innovation square": f"{locator.innovation_square:.2f}",
             }
             geometry = locator.geometry()
             if geometry is not None and known is not None:

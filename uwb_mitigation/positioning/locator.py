@@ -6,7 +6,7 @@ While several positions explain the ranges, each is followed by a filter of its 
 from __future__ import annotations
 
 import math
-from collections import deque
+from collections import Counter, deque
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -25,7 +25,7 @@ WINDOW_S = 1.0
 SILENCE_S = 3.0
 """After a longer time without ranges the position is searched again: the predicted one may mislead."""
 
-STRANGE = 3.0
+OUTLIER = 3.0
 """A range with a larger normalised innovation contradicts the filter."""
 
 DISAGREES = 1.5
@@ -49,20 +49,34 @@ _LEARN_SPARE = 2
 _NANOSECONDS = 1_000_000_000
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Setting:
+    """Prior knowledge: anchors, error model, and of the tags a constant height, an area or measured heights, if any."""
+
+    anchors: AnchorMap
+    model: Model = field(default_factory=Model)
+    height: Height | None = None
+    area: Area | None = None
+    heights: Heights | None = None
+
+    @property
+    def dims(self) -> int:
+        """The number of unknown coordinates of a position."""
+        return 2 if self.height is not None else 3
+
+
 @dataclass(slots=True)
-class AnchorState:
+class _AnchorState:
     """Statistics of the latest ranges of one anchor.
 
     Attributes:
-        ranges: total number.
-        heard_s: time of the latest; -inf: none.
-        strange: share of the latest ranges (about twenty) that contradicted the filter.
+        received_s: time of the latest; -inf: none.
+        outliers: share of the latest ranges (about twenty) that contradicted the filter.
         mean_z: running mean of the normalised innovation over about fifty ranges, each limited to 5.
     """
 
-    ranges: int = 0
-    heard_s: float = -math.inf
-    strange: float = 0.0
+    received_s: float = -math.inf
+    outliers: float = 0.0
     mean_z: float = 0.0
 
 
@@ -72,39 +86,15 @@ class _Candidate:
     loss: float
 
 
-@dataclass(slots=True)
-class TagCounts:
-    """Numbers of ranges out of order, and of times a tag was found, lost, and without ranges."""
-
-    backwards: int = 0
-    found: int = 0
-    lost: int = 0
-    silent: int = 0
-
-
-@dataclass(slots=True)
-class InnovationMeans:
-    """Running means over about a hundred ranges: of the normalised innovation, and of its square (1 is ideal)."""
-
-    mean: float = 0.0
-    square: float = 1.0
-
-    def add(self, z: float) -> None:
-        z = max(-10.0, min(10.0, z))
-        self.mean += 0.01 * (z - self.mean)
-        self.square += 0.01 * (z * z - self.square)
-
-
 class TagLocator:
-    """Args:
-        anchors, model: as of the filter.
-        height: of the tag, if constant.
-        area: where the tag can be; None: no limits.
+    """Locates one tag.
 
     Attributes:
-        anchors: as given.
-        states: of each anchor.
-        counts, health: statistics since the start.
+        anchors: those of the setting.
+        counts: numbers of ranges out of order (`backwards`), and of times the tag was `found`, `lost`, and without ranges
+            (`silent`).
+        innovation_mean, innovation_square: running means over about a hundred ranges: of the normalised innovation, and of
+            its square (1 is ideal).
         filter: the filter that follows the tag; None: its position is searched.
         undetermined: the ranges do not determine the horizontal position at all.
     """
@@ -116,19 +106,14 @@ class TagLocator:
     _origin_ns: int | None
     _time_s: float
 
-    def __init__(
-        self,
-        anchors: AnchorMap,
-        model: Model | None = None,
-        *,
-        height: Height | None = None,
-        area: Area | None = None,
-    ) -> None:
-        self.anchors = anchors
-        self.states = [AnchorState() for _ in range(len(anchors))]
-        self.counts, self.health = TagCounts(), InnovationMeans()
+    def __init__(self, setting: Setting) -> None:
+        self.anchors = setting.anchors
+        self.counts: Counter[str] = Counter()
+        self.innovation_mean, self.innovation_square = 0.0, 1.0
         self.undetermined = False
-        self._model, self._height, self._area = model or Model(), height, area
+        self._setting, self._model = setting, setting.model
+        self._height, self._area = setting.height, setting.area
+        self._states = [_AnchorState() for _ in range(len(self.anchors))]
         self._heights: deque[tuple[float, float, float]] = deque(maxlen=_KEPT_RANGES)
         self._recent: deque[tuple[float, int, float, float]] = deque(maxlen=_KEPT_RANGES)
         self._pressed = False
@@ -162,21 +147,40 @@ class TagLocator:
                 self.restart(stamp_ns)
                 time_s = 0.0
             else:
-                self.counts.backwards += 1
+                self.counts["backwards"] += 1
                 time_s = self._time_s
         if self.filter is not None and time_s - self._time_s > SILENCE_S:
-            self.counts.silent += 1
+            self.counts["silent"] += 1
             self._seek(time_s)
         self._time_s = time_s
         self._recent.append((time_s, anchor, range_m, variance_m2))
-        state = self.states[anchor]
-        state.ranges += 1
-        state.heard_s = time_s
+        self._states[anchor].received_s = time_s
         if self.filter is None:
             self._search(time_s, anchor, range_m, variance_m2)
         else:
             self._follow(self.filter, time_s, anchor, range_m, variance_m2)
-        return None if self.filter is None else _as_estimate(self.filter, stamp_ns)
+        return None if self.filter is None else self.filter.estimate(stamp_ns)
+
+    def run(self, ranges: Ranges) -> Track:
+        """Process recorded ranges, and the measured heights of the setting; return an estimate for each range with one."""
+        estimates: list[Estimate] = []
+        heights: deque[tuple[int, float, float]] = deque()
+        if (known := self._setting.heights) is not None:
+            columns = (known.stamp_ns, known.height_m, known.variance_m2)
+            heights.extend(zip(*(column.tolist() for column in columns), strict=True))
+        latest_ns = None
+        of_ranges = (ranges.stamp_ns, ranges.anchor, ranges.range_m, ranges.variance_m2)
+        for stamp_ns, anchor, range_m, variance_m2 in zip(*(one.tolist() for one in of_ranges), strict=True):
+            while heights and heights[0][0] <= stamp_ns:
+                height_ns, *height = heights.popleft()
+                # A height is valid at the time of the latest range: skip those in a gap of the ranges.
+                if latest_ns is not None and height_ns - latest_ns <= HEIGHT_AGE_NS:
+                    self.add_height(*height)
+            latest_ns = stamp_ns
+            estimate = self.add(stamp_ns, anchor, range_m, variance_m2)
+            if estimate is not None:
+                estimates.append(estimate)
+        return Track.of(estimates)
 
     def add_height(self, height_m: float, variance_m2: float) -> None:
         """Update with the tag's height (finite) and its variance (positive), at the time of the latest range."""
@@ -203,7 +207,7 @@ class TagLocator:
         ahead = self.filter.copy()
         ahead.predict(self._seconds(stamp_ns))
         self._confine(ahead)
-        return _as_estimate(ahead, stamp_ns)
+        return ahead.estimate(stamp_ns)
 
     def restart(self, stamp_ns: int | None = None) -> None:
         """Forget the position, not the statistics."""
@@ -213,17 +217,17 @@ class TagLocator:
         self._recent.clear()
         self._heights.clear()
         self._time_s = self._next_try_s = self._checked_s = self._sought_since_s = -math.inf
-        for state in self.states:
-            state.heard_s, state.strange = -math.inf, 0.0
+        for state in self._states:
+            state.received_s, state.outliers = -math.inf, 0.0
 
     def heard(self, within_s: float = WINDOW_S) -> list[int]:
         """Return the rows of the anchors that were received within that time before the latest range."""
-        return [i for i, s in enumerate(self.states) if s.heard_s >= self._time_s - within_s]
+        return [i for i, s in enumerate(self._states) if s.received_s >= self._time_s - within_s]
 
     def disagreeing(self) -> list[int]:
         """Return the rows of anchors whose ranges contradict those of most others."""
         heard = self.heard(5.0)
-        odd = [i for i in heard if abs(self.states[i].mean_z) > DISAGREES]
+        odd = [i for i in heard if abs(self._states[i].mean_z) > DISAGREES]
         return odd if 2 * len(odd) < len(heard) else []
 
     def geometry(self) -> Geometry | None:
@@ -248,15 +252,17 @@ class TagLocator:
         z, _ = known.update(anchor, range_m, variance_m2)
         if self._area is not None and self._confine(known):
             self._pressed = True
-        self.health.add(z)
-        state = self.states[anchor]
-        state.strange += 0.1 * ((abs(z) > STRANGE) - state.strange)
+        limited = max(-10.0, min(10.0, z))
+        self.innovation_mean += 0.01 * (limited - self.innovation_mean)
+        self.innovation_square += 0.01 * (limited * limited - self.innovation_square)
+        state = self._states[anchor]
+        state.outliers += 0.1 * ((abs(z) > OUTLIER) - state.outliers)
         state.mean_z += 0.02 * (max(-5.0, min(5.0, z)) - state.mean_z)
         if time_s - self._checked_s >= _RETRY_S:
             self._checked_s = time_s
             heard = self.heard()
             known.learns = len(heard) >= self._dims + _LEARN_SPARE
-            odd = sum(self.states[i].strange > 0.5 for i in heard)
+            odd = sum(self._states[i].outliers > 0.5 for i in heard)
             # At the edge of the area the filter may follow a solution that is outside of it.
             if self._pressed or (2 * odd >= len(heard) > 0 and odd):
                 self._pressed = False
@@ -290,7 +296,7 @@ class TagLocator:
         best = found[0]
         apart = best.position[:2] - known.position[:2]
         if loss > best.loss + IMPLAUSIBLE and apart @ apart > 9.0 * known.horizontal_sd**2:
-            self.counts.lost += 1
+            self.counts["lost"] += 1
             self._last_known = None
             self.filter = None
             self._start(found, self._time_s)
@@ -341,10 +347,10 @@ class TagLocator:
             self.filter = kept[0].filter
             self._last_known = None
             self._candidates = []
-            self.counts.found += 1
+            self.counts["found"] += 1
             self._checked_s = self._time_s + WINDOW_S
-            for state in self.states:
-                state.strange = 0.0
+            for state in self._states:
+                state.outliers = 0.0
         elif self._time_s - self._sought_since_s > 10.0 * WINDOW_S:
             # The candidates from one second of ranges may all be wrong: search again.
             self._sought_since_s = self._time_s
@@ -440,67 +446,3 @@ def _bends(one: RangeFilter, height_m: float, variance_m2: float) -> bool:
     """Return whether a height would move an estimate so far in plan that the filter's linear model is not valid."""
     share = math.hypot(one.p[0, 2], one.p[1, 2]) / (one.p[2, 2] + variance_m2)
     return bool(share * abs(height_m - float(one.x[2])) > _BENDS_M)
-
-
-def _as_estimate(known: RangeFilter, stamp_ns: int) -> Estimate:
-    return Estimate(stamp_ns, known.x[:3].copy(), known.x[3:6].copy(), known.p[:6, :6].copy())
-
-
-@dataclass(slots=True)
-class LiveRun:
-    """The estimates of the live locator for a recording.
-
-    Attributes:
-        track: an estimate for each range with one.
-        locator: at the end.
-    """
-
-    track: Track
-    locator: TagLocator
-
-
-def run_live(ranges: Ranges, locator: TagLocator, heights: Heights | None = None) -> LiveRun:
-    """Process recorded ranges, and measured heights if there are any, with a locator."""
-    estimates: list[Estimate] = []
-    columns = (ranges.stamp_ns, ranges.anchor, ranges.range_m, ranges.variance_m2)
-    measured: list[tuple[int, float, float]] = []
-    if heights is not None:
-        of_heights = (heights.stamp_ns, heights.height_m, heights.variance_m2)
-        measured = list(zip(*(column.tolist() for column in of_heights), strict=True))
-    next_height, latest_ns = 0, None
-    for stamp_ns, anchor, range_m, variance_m2 in zip(*(one.tolist() for one in columns), strict=True):
-        while next_height < len(measured) and measured[next_height][0] <= stamp_ns:
-            height_ns, *height = measured[next_height]
-            next_height += 1
-            # A height is valid at the time of the latest range: skip those in a gap of the ranges.
-            if latest_ns is not None and height_ns - latest_ns <= HEIGHT_AGE_NS:
-                locator.add_height(*height)
-        latest_ns = stamp_ns
-        estimate = locator.add(stamp_ns, anchor, range_m, variance_m2)
-        if estimate is not None:
-            estimates.append(estimate)
-    return LiveRun(Track.of(estimates), locator)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Setting:
-    """What is known before: anchors, error model, and of the tags a constant height, an area or measured heights, if any."""
-
-    anchors: AnchorMap
-    model: Model = field(default_factory=Model)
-    height: Height | None = None
-    area: Area | None = None
-    heights: Heights | None = None
-
-    @property
-    def dims(self) -> int:
-        """The number of unknown coordinates of a position."""
-        return 2 if self.height is not None else 3
-
-    def locator(self) -> TagLocator:
-        """Return a new locator of a tag."""
-        return TagLocator(self.anchors, self.model, height=self.height, area=self.area)
-
-    def live(self, ranges: Ranges) -> LiveRun:
-        """Process the recorded ranges of a tag with a new locator."""
-        return run_live(ranges, self.locator(), self.heights)

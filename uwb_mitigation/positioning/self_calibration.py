@@ -34,7 +34,7 @@ from uwb_mitigation.positioning.joint import (
     links_of,
     stretches,
 )
-from uwb_mitigation.positioning.locator import Setting
+from uwb_mitigation.positioning.locator import Setting, TagLocator
 from uwb_mitigation.positioning.model import Model, Regressors
 from uwb_mitigation.positioning.start import Place, places
 from uwb_mitigation.positioning.tracks import Ranges, Track
@@ -186,7 +186,6 @@ def calibrate(
     area: Area | None = None,
     heights_m: NDArray[np.float64] | None = None,
     height_sd_m: float = 0.1,
-    model: Model | None = None,
 ) -> SelfCalibration:
     """Estimate tracks, offsets and regressors.
 
@@ -203,11 +202,10 @@ def calibrate(
     Raises:
         DatasetError: the geometry does not determine the solution; the message says what is missing.
     """
-    model, tags = model or MODEL, list(tags)
     if heights_m is not None:
         # Initial positions are found with the median height.
         height = Height(float(np.median(heights_m)), max(float(np.std(heights_m)), height_sd_m))
-    setting = Setting(anchors, model, height, area)
+    setting = Setting(anchors, MODEL, height, area)
     known = regressors or Regressors.none(sum(map(len, tags)))
     check_anchors(anchors, np.unique(np.concatenate([one.anchor for one in tags])), height, area)
     notes: list[str] = []
@@ -450,7 +448,7 @@ def first_positions(
             continue
         ranges = found.ranges.take(own)
         better = replace(ranges, range_m=np.maximum(ranges.range_m - expected_m[own], 0.0))
-        track = setting.live(better).track
+        track = TagLocator(setting).run(better)
         if len(track) >= 2:
             position.append(_at_knots(track, ranges))
             placed[number] = True

@@ -19,12 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.filter import FIRST_ERROR, OFFSET, RangeFilter
-from uwb_mitigation.positioning.geometry import Height, directions
+from uwb_mitigation.positioning.geometry import directions
 from uwb_mitigation.positioning.least_squares import LeastSquares, Solution
-from uwb_mitigation.positioning.locator import Setting
-from uwb_mitigation.positioning.model import Model
+from uwb_mitigation.positioning.locator import Setting, TagLocator
 from uwb_mitigation.positioning.tracks import Heights, Ranges, Track
 
 KNOT_S = 0.1
@@ -65,14 +63,12 @@ class Smoother:
     """Fits a track to ranges, together with other unknowns.
 
     Args:
-        anchors, model: as of the filter.
+        setting: anchors, error model, and what is known of the height.
         ranges: two or more, in the order of time.
-        height: of the tag, if constant.
         find_anchors: also estimate the positions of the anchors.
         around: prior positions of estimated anchors and their standard deviations, float64 (m, 3) both; None: those of
             `anchors`.
         after: the filter at the time of the first range, whose state and covariance are the prior of the track.
-        heights: measured heights of the tag; not together with `height`.
 
     Raises:
         DatasetError: fewer than two ranges.
@@ -80,20 +76,18 @@ class Smoother:
 
     def __init__(
         self,
-        anchors: AnchorMap,
-        model: Model,
+        setting: Setting,
         ranges: Ranges,
         *,
-        height: Height | None = None,
         find_anchors: bool = False,
         around: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
         after: RangeFilter | None = None,
-        heights: Heights | None = None,
     ) -> None:
         if len(ranges) < 2:
             raise DatasetError(f"{len(ranges)} ranges", valid="two or more for a track")
-        self._model, self._height, self._find, self._after = model, height, find_anchors, after
-        self._d = 2 if height is not None else 3
+        anchors, model = setting.anchors, setting.model
+        self._model, self._height, self._find, self._after = model, setting.height, find_anchors, after
+        self._d = setting.dims
         # Anchors without ranges have no persisting errors to estimate.
         self._used, self._slot = np.unique(ranges.anchor, return_inverse=True)
         self._known = anchors.position
@@ -111,12 +105,7 @@ class Smoother:
         self._white = np.maximum(model.white * self._variance, self._variance - self._persisting[self._slot])
         # A common offset, and one of each anchor.
         self._offset_sd = np.array([model.offset_sd, *[model.pair_sd] * len(self._used)])
-        self._heights = heights if height is None else None
-
-    @classmethod
-    def of(cls, setting: Setting, ranges: Ranges) -> Smoother:
-        """Return the smoother of a recording."""
-        return cls(setting.anchors, setting.model, ranges, height=setting.height, heights=setting.heights)
+        self._heights = setting.heights if setting.height is None else None
 
     def fit(self, initial: Track, iterations: int = _ITERATIONS) -> Smoothed:
         """Return the track, starting from one that is roughly right.
@@ -259,7 +248,7 @@ def smooth(setting: Setting, ranges: Ranges, live: Track) -> Track:
     Args:
         setting: anchors, error model, and what is known of the tag.
         ranges: two or more.
-        live: the track of `Setting.live` from the same ranges; not empty.
+        live: the track of a `TagLocator` from the same ranges; not empty.
     """
     stamp_ns = int(ranges.stamp_ns[0]) + knots_of(ranges.stamp_ns)[0]
     end_ns, backwards = int(ranges.stamp_ns[-1]), slice(None, None, -1)
@@ -270,7 +259,7 @@ def smooth(setting: Setting, ranges: Ranges, live: Track) -> Track:
         setting.heights.height_m[backwards],
         setting.heights.variance_m2[backwards],
     )
-    track = replace(setting, heights=heights).live(mirrored).track
+    track = TagLocator(replace(setting, heights=heights)).run(mirrored)
     later = _at(track, (end_ns - stamp_ns)[backwards])
     flip = np.diag([1.0, 1.0, 1.0, -1.0, -1.0, -1.0])
     later = later[0][backwards] @ flip, flip @ later[1][backwards] @ flip
@@ -278,7 +267,7 @@ def smooth(setting: Setting, ranges: Ranges, live: Track) -> Track:
     # Without a position of either filter the batch smoother's choice among several optima is arbitrary.
     found = np.asarray(np.isfinite(state).all(axis=1), np.bool_)
     try:
-        batch = Smoother.of(setting, ranges).fit(live).track
+        batch = Smoother(setting, ranges).fit(live).track
     except DatasetError:
         batch = None
     if batch is not None:

@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.anchors import AnchorMap
-from uwb_mitigation.positioning.geometry import Area, Height, Shape, directions, shape
-from uwb_mitigation.positioning.locator import Setting
-from uwb_mitigation.positioning.model import Model
+from uwb_mitigation.positioning.geometry import Shape, directions, shape
+from uwb_mitigation.positioning.locator import Setting, TagLocator
 from uwb_mitigation.positioning.smoother import Smoothed, Smoother
-from uwb_mitigation.positioning.tracks import Heights, Ranges, Track
+from uwb_mitigation.positioning.tracks import Ranges, Track
 
 MISPLACED_M = 0.3
 """An anchor is misplaced if it is further from its guess than this and than `_UNLIKELY` standard deviations."""
@@ -96,32 +95,21 @@ class SurveyResult:
 
 
 def survey(
-    guesses: AnchorMap,
-    ranges: Ranges,
-    *,
-    off_m: float = 1.0,
-    fixed: frozenset[int] = frozenset(),
-    height: Height | None = None,
-    area: Area | None = None,
-    heights: Heights | None = None,
-    model: Model | None = None,
+    setting: Setting, ranges: Ranges, *, off_m: float = 1.0, fixed: frozenset[int] = frozenset()
 ) -> SurveyResult:
     """Estimate the positions of the anchors.
 
     Args:
-        guesses: approximate positions.
+        setting: its anchors are at approximate positions.
         ranges: of one tag that moves.
         off_m: standard deviation of each coordinate of the guesses. With a `height`, that of the heights of anchors is at
             most `TAPE_M`: a drive at constant height hardly determines them.
-        fixed: rows of anchors with the standard deviations of `guesses`.
-        height, area, model: as of `TagLocator`.
-        heights: measured heights of the tag.
+        fixed: rows of anchors that have the standard deviations of the file.
 
     Raises:
         DatasetError: too few anchors, all on a line, or a tag that hardly moves; says which.
     """
-    setting = Setting(guesses, model or Model(), height, area, heights)
-    model, used, needed = setting.model, np.unique(ranges.anchor), setting.dims + 1
+    guesses, model, used, needed = setting.anchors, setting.model, np.unique(ranges.anchor), setting.dims + 1
     if len(used) < needed:
         raise DatasetError(f"{len(used)} anchors were heard", valid=f"{needed} or more for a survey")
     if shape(guesses.position[used]) is Shape.LINE:
@@ -185,7 +173,7 @@ def survey(
 
 def _fit(setting: Setting, ranges: Ranges) -> Smoothed:
     start = setting.anchors
-    track = setting.live(ranges).track
+    track = TagLocator(setting).run(ranges)
     if len(track) < 2:
         raise DatasetError(
             "no position of the tag can be determined",
@@ -200,11 +188,8 @@ def _fit(setting: Setting, ranges: Ranges) -> Smoothed:
     variance, known, fit = setting.model.variances(ranges.variance_m2), start, None
     for step in _STEPS_M:
         fit = Smoother(
-            known,
-            setting.model,
+            replace(setting, anchors=known),
             replace(ranges, variance_m2=np.maximum(variance, step**2)),
-            height=setting.height,
-            heights=setting.heights,
             find_anchors=True,
             around=(start.position, around),
         ).fit(track)
@@ -302,10 +287,10 @@ def _unswap(setting: Setting, ranges: Ranges, off_m: float) -> tuple[list[int], 
 
     def loss(order: list[int]) -> float:
         tried = replace(setting, anchors=guesses.moved(guesses.position[order], np.full(len(guesses), off_m)))
-        track = tried.live(trial).track
+        track = TagLocator(tried).run(trial)
         if len(track) < 2:
             return np.inf
-        fit = Smoother.of(tried, trial).fit(track, iterations=4)
+        fit = Smoother(tried, trial).fit(track, iterations=4)
         return float(model.loss(fit.residual_m / np.sqrt(off_m**2 / 4.0 + model.range_sd**2)).mean())
 
     best, order, swapped = loss(identity), identity, list[tuple[int, int]]()

@@ -96,8 +96,8 @@ def track_tag(recording: TagRecording, setting: Setting) -> TagTracks:
         DatasetError: no position of the tag can be determined; the message contains the reason, if the anchors show it.
     """
     ranges, anchors = recording.ranges, setting.anchors
-    run = setting.live(ranges)
-    live, locator = run.track, run.locator
+    locator = TagLocator(setting)
+    live = locator.run(ranges)
     if len(live) < 2:
         raise _no_position(recording, setting, locator)
     smoothed = smooth(setting, ranges, live)
@@ -137,7 +137,7 @@ def track_tag(recording: TagRecording, setting: Setting) -> TagTracks:
     odd = [
         row
         for row in locator.disagreeing()
-        if contradicts(anchors, ranges, row, setting.live(ranges.take(ranges.anchor != row)).track)
+        if contradicts(anchors, ranges, row, TagLocator(setting).run(ranges.take(ranges.anchor != row)))
     ]
     return TagTracks(
         recording, live, smoothed, snapshots, of_live, of_smoothed, of_snapshots, hdop, odd, warnings
@@ -226,7 +226,7 @@ def _residuals(initial: Track, ranges: Ranges, row: int, setting: Setting) -> ND
     own = ranges.anchor == row
     if len(np.unique(ranges.anchor[~own])) < MIN_OTHERS or not own.any():
         return np.zeros(0)
-    track = Smoother.of(setting, ranges.take(~own)).fit(initial).track
+    track = Smoother(setting, ranges.take(~own)).fit(initial).track
     position = TruePath(track.stamp_ns, track.position).at(ranges.stamp_ns[own])
     residual = ranges.range_m[own] - np.linalg.norm(position - setting.anchors.position[row], axis=1)
     known: NDArray[np.float64] = residual[np.isfinite(residual)]
