@@ -95,7 +95,7 @@ def test_one_offset_is_found_where_none_differs(minute):
     found = calibrate(HALL, [minute[0]], height=LEVEL)
     assert found.level == "one"
     assert found.pair(0, 0)[0] == pytest.approx(0.25, abs=0.05)
-    assert any("share one" in note for note in found.not_told)
+    assert any("share one" in note for note in found.notes)
 
 
 def test_ranges_that_err_more_than_others_weigh_less(minute):
@@ -224,7 +224,7 @@ def test_an_offset_that_slow_errors_can_explain_is_not_subtracted():
     found = calibrate(near, [replace(ranges, range_m=ranges.range_m + late)], height=LEVEL)
     assert [found.applied(0, row)[0] for row in range(5)] == [0.0] * 5
     assert found.applied(0, 0)[1] > 0.5
-    assert any("not significant" in note for note in found.not_told)
+    assert any("not significant" in note for note in found.notes)
 
 
 def test_an_anchor_with_few_ranges_gets_the_common_offset(minute):
@@ -236,7 +236,7 @@ def test_an_anchor_with_few_ranges_gets_the_common_offset(minute):
     # The others scatter by 0.16 m, and so may this one.
     assert 0.15 < found.pair(0, 4)[1] < 0.3
     assert found.pair(0, 3)[0] != found.value("offset")[0]
-    assert any("anchor 5" in note for note in found.not_told)
+    assert any("anchor 5" in note for note in found.notes)
 
 
 def test_an_area_excludes_the_mirror_image_in_a_plane():
@@ -323,8 +323,7 @@ def test_measured_heights_replace_a_constant_one():
 
 def test_positions_scatter_less_if_anchors_agree(solved):
     def scatter(offset_m):
-        correction = np.asarray(offset_m)[solved.links.anchor]
-        return position_scatter(solved.setting, solved.links, solved.fit, correction)
+        return position_scatter(solved.fit, np.asarray(offset_m)[solved.fit.links.anchor])
 
     assert scatter(OWN + 0.25) < 0.6 * scatter(np.full(5, 0.25)) < scatter(0.25 - OWN)
     raw, calibrated = solved.position_scatter_m

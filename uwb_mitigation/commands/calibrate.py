@@ -11,7 +11,7 @@ import typer
 
 from uwb_mitigation.commands import console
 from uwb_mitigation.commands.checks import check_output
-from uwb_mitigation.commands.console import JsonOption
+from uwb_mitigation.commands.console import JsonOption, say, show_table, warn
 from uwb_mitigation.commands.positioning import (
     AreaOption,
     HeightOption,
@@ -147,7 +147,7 @@ def calibrate(
         if height_topic is not None and len(site.tags) > 1:
             raise ParameterError(f"--height-topic with {len(site.tags)} tags", valid="bags with one tag")
         for why, count in site.left_out.items():
-            _warn(f"left out: {count} x {why}")
+            warn(f"left out: {count} x {why}")
         with console.stage_bars() as on_progress:
             if truth_topic is None:
                 found = site_calibration.without_truth(
@@ -191,11 +191,9 @@ def calibrate(
         from uwb_mitigation.training.site_page import site_page
 
         write_whole(report, site_page(found, name))
-        console.out.print(f"Wrote {report}.", markup=False, soft_wrap=True)
+        say(f"Wrote {report}.")
     bundle, beside = found.write(output, source, name)
-    console.out.print(
-        f"Wrote {output} (model {bundle.model_id:08x}) and {beside}.", markup=False, soft_wrap=True
-    )
+    say(f"Wrote {output} (model {bundle.model_id:08x}) and {beside}.")
     console.write_json(json, found.as_json() | {"model_id": bundle.model_id, "offsets_file": str(beside)})
 
 
@@ -251,7 +249,7 @@ def _poses(
             found = _lever_arm_in(bags, names, site.frames[tag.tag_id])
             arms[number] = found or (0.0, 0.0, 0.0)
             if found is None:
-                _warn(
+                warn(
                     f"tag {format_id(tag.tag_id)}: no transform from {names[0] or BASE_FRAME} to its antenna in the bag, so "
                     "that the lever arm is 0; set --lever-arm"
                 )
@@ -309,8 +307,6 @@ def _lever_arm(text: str | None) -> tuple[float, float, float] | None:
 
 
 def _show(found: Calibrated) -> None:
-    from uwb_mitigation.commands.model_tables import say, show_table
-
     solution = found.solution
     if solution.localised is not None:
         one = solution.localised
@@ -333,11 +329,7 @@ def _show(found: Calibrated) -> None:
         chosen,
     )
     for note in found.notes:
-        _warn(note)
+        warn(note)
     if solution.outliers:
-        _warn(f"{solution.outliers} outliers left out of all figures")
+        warn(f"{solution.outliers} outliers left out of all figures")
     say(found.sentence())
-
-
-def _warn(text: str) -> None:
-    console.err.print(text, style="yellow", markup=False, highlight=False, soft_wrap=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,6 +16,8 @@ from rich.table import Table as RichTable
 
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.files import write_whole
+
+MOST_SHOWN = 40
 
 
 class Table(RichTable):
@@ -29,6 +31,43 @@ class Table(RichTable):
 # rich leaves colours and cursor movement out where a stream is not a terminal.
 out = Console()
 err = Console(stderr=True)
+
+
+def say(text: str) -> None:
+    """Print a line without highlighting numbers or breaking it."""
+    out.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def warn(text: str) -> None:
+    """Print a warning on standard error."""
+    err.print(text, style="yellow", markup=False, highlight=False, soft_wrap=True)
+
+
+def show_table(
+    title: str,
+    columns: Iterable[str],
+    rows: Sequence[Iterable[object]],
+    marked: str = "",
+    *,
+    left: int = 1,
+    most: int = MOST_SHOWN,
+) -> None:
+    """Print the first rows of a table; numbers have three decimals.
+
+    Args:
+        marked: the row with this name is bold.
+        left: the number of left-aligned columns; the others are right-aligned.
+        most: the number of rows.
+    """
+    table = Table(title=title, title_justify="left")
+    for number, column in enumerate(columns):
+        table.add_column(column, justify="left" if number < left else "right")
+    for row in rows[:most]:
+        cells = [f"{cell:.3f}" if isinstance(cell, float) else str(cell) for cell in row]
+        table.add_row(*cells, style="bold" if marked and marked in cells else None)
+    out.print(table)
+    if len(rows) > most:
+        say(f"and {len(rows) - most} rows more")
 
 
 def progress() -> Progress:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from uwb_mitigation.commands import console
-from uwb_mitigation.commands.console import JsonOption, Table
+from uwb_mitigation.commands.console import JsonOption, Table, say
 from uwb_mitigation.errors import DamagedRecordingError, ParameterError, RecordingError, format_id
 
 if TYPE_CHECKING:
@@ -157,7 +157,7 @@ def _write(
     if total is None:
         _show_inventory(found)
     if pauses.cut:
-        _print(
+        say(
             f"Cut {pauses.cut} pauses to {pauses.longest_s:g} s each, {pauses.cut_s:.0f} s in all; "
             "--longest-pause inf keeps them."
         )
@@ -165,7 +165,7 @@ def _write(
         _save_anchors(sources[0], output)
     messages = bag.counts.total()
     lost = ", ".join(f"{count} x {why}" for why, count in inventory.skipped.items())
-    _print(
+    say(
         f"Wrote {messages} messages, {inventory.ranges} ranges of {_pairs(found)}, to {bag.file}"
         + (f"; left out: {lost}." if lost and total is not None else ".")
     )
@@ -235,10 +235,6 @@ def info(
     console.write_json(json, {**about, **found})
 
 
-def _print(text: str) -> None:
-    console.out.print(text, markup=False, highlight=False, soft_wrap=True)
-
-
 def _save_anchors(source: Source, bag: Path) -> None:
     from uwb_mitigation.sources.site import KnowsAnchors, anchors_file, save_anchors
 
@@ -246,7 +242,7 @@ def _save_anchors(source: Source, bag: Path) -> None:
         path = anchors_file(bag)
         # The bag itself was refused, or `--force` given, before.
         save_anchors(path, source.anchors, f"anchors of {source.name}", force=True)
-        _print(f"Wrote {len(source.anchors)} anchors to {path}.")
+        say(f"Wrote {len(source.anchors)} anchors to {path}.")
 
 
 _KINDS = {

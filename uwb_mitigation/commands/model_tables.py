@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from uwb_mitigation.commands import console
-from uwb_mitigation.commands.console import Table
+from uwb_mitigation.commands.console import say, show_table
 
 if TYPE_CHECKING:
     from uwb_mitigation.evaluation.accuracy import Accuracy
@@ -15,8 +14,6 @@ if TYPE_CHECKING:
     from uwb_mitigation.training.comparison import Comparison, Coverage
     from uwb_mitigation.training.selection import Selection
     from uwb_mitigation.training.train import TrainedBundle
-
-MOST_SHOWN = 40
 
 _ROWS = {
     "raw": "raw",
@@ -39,26 +36,6 @@ _CANDIDATES = {
     "network": "the network alone",
     "chosen (nested)": "of choosing, on what no choice has seen",
 }
-
-
-def show_table(
-    title: str, columns: Iterable[str], rows: Sequence[Iterable[object]], marked: str = ""
-) -> None:
-    """Print the first 40 rows; numbers are right-aligned and have three decimals. The row named `marked` is bold."""
-    table = Table(title=title, title_justify="left")
-    for number, column in enumerate(columns):
-        table.add_column(column, justify="right" if number else "left")
-    for row in rows[:MOST_SHOWN]:
-        cells = [f"{cell:.3f}" if isinstance(cell, float) else str(cell) for cell in row]
-        table.add_row(*cells, style="bold" if marked and marked in cells else None)
-    console.out.print(table)
-    if len(rows) > MOST_SHOWN:
-        say(f"and {len(rows) - MOST_SHOWN} rows more")
-
-
-def say(text: str) -> None:
-    """Print a line without highlighting numbers or breaking it."""
-    console.out.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
 def show_trained(made: TrainedBundle) -> None:

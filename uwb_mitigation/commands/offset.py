@@ -98,7 +98,7 @@ def _identity(name: str, text: str) -> int:
 
 
 def _show(found: FoundOffset) -> None:
-    from uwb_mitigation.commands.model_tables import MOST_SHOWN, say, show_table
+    from uwb_mitigation.commands.console import MOST_SHOWN, say, show_table
 
     rows: list[tuple[object, ...]] = []
     for one in found.placements:

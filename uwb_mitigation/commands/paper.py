@@ -216,7 +216,7 @@ def _make_folder(path: Path) -> None:
 
 
 def _show_experiment(result: ExperimentResults) -> None:
-    from uwb_mitigation.commands.model_tables import say, show_table
+    from uwb_mitigation.commands.console import say, show_table
     from uwb_mitigation.paper import tables
 
     provenance = tables.Provenance(result.data, result.split, "", "")

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from uwb_mitigation.commands import console
-from uwb_mitigation.commands.console import JsonOption
+from uwb_mitigation.commands.console import JsonOption, say, show_table, warn
 from uwb_mitigation.errors import ParameterError, RecordingError, format_id
 
 if TYPE_CHECKING:
@@ -21,15 +20,17 @@ if TYPE_CHECKING:
     from uwb_mitigation.processing.tracking import HeldOut, TagTracks
     from uwb_mitigation.sources.recorded_ranges import RecordedRanges
 
-_FORMATS = {
-    "rmse": "{:.3f}",
-    "median": "{:.3f}",
-    "p95": "{:.3f}",
-    "coverage95": "{:.1%}",
-    "nees_per_dof": "{:.2f}",
-    "exceeded": "{:.2%}",
-    "height_rmse": "{:.3f}",
+_COLUMNS = {
+    "rmse": ("RMSE", "{:.3f}"),
+    "median": ("median", "{:.3f}"),
+    "p95": ("p95", "{:.3f}"),
+    "coverage95": ("in ellipse", "{:.1%}"),
+    "nees_per_dof": ("NEES", "{:.2f}"),
+    "exceeded": ("beyond", "{:.2%}"),
+    "height_rmse": ("height", "{:.3f}"),
 }
+"""Fields of `TrackErrors`: the titles and formats of their columns."""
+
 BagArgument = Annotated[
     Path, typer.Argument(metavar="BAG", help="An MCAP bag with ranges, corrected or raw.")
 ]
@@ -137,7 +138,7 @@ def track(
     _show_tracks(tracks, known)
     residuals = held_out(tracks, setting)
     _show_residuals(residuals, known)
-    console.out.print(f"Wrote {out.counts.total()} messages to {out.file}.", markup=False, soft_wrap=True)
+    say(f"Wrote {out.counts.total()} messages to {out.file}.")
     if tum is not None:
         for one in tracks:
             write_whole(tum_file(tum, one.recording.tag_id, len(tracks) > 1), tum_text(one.smoothed))
@@ -202,8 +203,8 @@ def survey(
     save_anchors(
         output, result.anchors, f"surveyed from {bag.name}, tag {format_id(tag.tag_id)}", force=force
     )
-    _show_survey(result, known)
-    console.out.print(f"Wrote {len(known)} anchors to {output}.", markup=False, soft_wrap=True)
+    _show_survey(result)
+    say(f"Wrote {len(known)} anchors to {output}.")
     console.write_json(json, {"output": str(output)} | result.as_json())
 
 
@@ -220,14 +221,14 @@ def _read(bag: Path, anchors: Path | None, stamp_offset: float) -> tuple[AnchorM
         bar.add_task("reading", total=None)
         recorded = read_ranges(bag, known, stamp_offset)
     for identity, count in recorded.strangers.items():
-        _warn(f"{count} ranges of anchor {format_id(identity)} left out: it is not in the anchors file")
+        warn(f"{count} ranges of anchor {format_id(identity)} left out: it is not in the anchors file")
     for why, count in recorded.skipped.items():
-        _warn(f"left out: {count} x {why}")
+        warn(f"left out: {count} x {why}")
     return known, recorded
 
 
 def height_of(height: float | None, sd: float) -> Height | None:
-    """What --height and --height-sd say."""
+    """Return the height of --height and --height-sd."""
     from uwb_mitigation.positioning.geometry import Height
 
     return None if height is None else Height(height, sd)
@@ -250,21 +251,10 @@ def heights_of(
 
 
 def area_of(text: str | None) -> Area | None:
-    """What --area says."""
+    """Return the box of --area."""
     from uwb_mitigation.positioning.geometry import Area
 
     return Area.parse(text or "")
-
-
-def _table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    from uwb_mitigation.commands.console import Table
-
-    table = Table(title=title, title_justify="left")
-    for column in columns:
-        table.add_column(column, justify="left" if column in ("tag", "track", "anchor") else "right")
-    for row in rows:
-        table.add_row(*row)
-    console.out.print(table)
 
 
 def _show_tracks(tracks: list[TagTracks], anchors: AnchorMap) -> None:
@@ -276,82 +266,79 @@ def _show_tracks(tracks: list[TagTracks], anchors: AnchorMap) -> None:
             (f"live, {kind}", one.live, one.live_errors),
             (f"smoothed, {kind}", one.smoothed, one.smoothed_errors),
         ):
-            cells = [_number(getattr(errors, field), form) for field, form in _FORMATS.items()]
+            cells = [_number(getattr(errors, field), form) for field, (_, form) in _COLUMNS.items()]
             rows.append([format_id(one.recording.tag_id), name, str(errors.epochs or len(track)), *cells])
-    columns = (
-        "tag",
-        "track",
-        "epochs",
-        "RMSE",
-        "median",
-        "p95",
-        "in ellipse",
-        "NEES",
-        "beyond",
-        "height",
-    )
-    _table("Horizontal errors, m", columns, rows)
+    columns = ("tag", "track", "epochs", *(title for title, _ in _COLUMNS.values()))
+    show_table("Horizontal errors, m", columns, rows, left=2, most=len(rows))
     console.out.print(
         "In ellipse: true positions inside the 95 % ellipses. NEES: 1 is consistent, more is overconfident. "
         "Beyond: errors beyond the protection levels. Height: RMSE of z.",
         style="dim",
     )
     for one in tracks:
+        name = f"tag {format_id(one.recording.tag_id)}"
         if not one.live_errors.epochs:
-            console.out.print(f"tag {format_id(one.recording.tag_id)}: no truth in the bag, so no errors")
+            say(f"{name}: no truth in the bag, so no errors")
         for warning in one.warnings:
-            _warn(f"tag {format_id(one.recording.tag_id)}: {warning}.")
+            warn(f"{name}: {warning}.")
         for row in one.disagreeing:
-            _warn(
+            warn(
                 f"anchor {anchors.anchors[row]}: its ranges contradict those of the other anchors. Check its position in "
                 "the anchors file."
             )
 
 
 def _show_residuals(residuals: list[HeldOut], anchors: AnchorMap) -> None:
-    rows = []
-    for one in residuals:
-        name = "all" if one.anchor_id is None else str(anchors.anchors[anchors.index[one.anchor_id]])
-        rows.append([name, str(one.ranges), *(_number(v, "{:.3f}") for v in (one.raw_m, one.corrected_m))])
-    _table("Residuals of held-out ranges, m", ("anchor", "ranges", "raw", "corrected"), rows)
+    rows = [
+        [
+            "all" if one.anchor_id is None else anchors.anchors[anchors.index[one.anchor_id]],
+            one.ranges,
+            *(_number(value, "{:.3f}") for value in (one.raw_m, one.corrected_m)),
+        ]
+        for one in residuals
+    ]
+    show_table(
+        "Residuals of held-out ranges, m", ("anchor", "ranges", "raw", "corrected"), rows, most=len(rows)
+    )
     console.out.print(
         "Median absolute residuals. The ranges of each anchor are compared with a track of the other anchors' ranges.",
         style="dim",
     )
 
 
-def _show_survey(result: SurveyResult, guesses: AnchorMap) -> None:
+def _show_survey(result: SurveyResult) -> None:
+    anchors = result.anchors.anchors
     rows = [
-        [str(anchor), *(f"{value:.2f}" for value in (*anchor.position, anchor.sd, moved_m))]
-        for anchor, moved_m in zip(result.anchors.anchors, result.moved_m.tolist(), strict=True)
+        [anchor, *(f"{value:.2f}" for value in (*anchor.position, anchor.sd, moved_m))]
+        for anchor, moved_m in zip(anchors, result.moved_m.tolist(), strict=True)
     ]
-    _table("Anchors, m", ("anchor", "x", "y", "z", "deviation", "off its guess"), rows)
+    columns = ("anchor", "x", "y", "z", "standard deviation", "distance from guess")
+    show_table("Anchors, m", columns, rows, most=len(rows))
     if not result.explained:
-        _warn(
-            f"these anchors do not explain the ranges (mean loss {result.loss:.1f}; 0.5 or less where they do): do not "
-            "trust them; begin with better guesses, and drive past every anchor on more than one side"
+        warn(
+            f"these anchors do not explain the ranges: the mean loss is {result.loss:.1f}, but 0.5 or less if they do. Do "
+            "not use them. Start with better guesses, and drive past every anchor on more than one side"
         )
     for row, (x, y, z) in result.alternatives.items():
-        _warn(
-            f"anchor {guesses.anchors[row]}: the ranges explain ({x:.2f}, {y:.2f}, {z:.2f}) as well; only the guess "
-            "decides. Drive a route that leaves its line or plane, or measure this anchor"
+        warn(
+            f"anchor {anchors[row]}: ({x:.2f}, {y:.2f}, {z:.2f}) explains the ranges equally well; only the guess decides. "
+            "Drive a route that leaves its line or plane, or measure this anchor"
         )
     if result.undetermined:
-        names = ", ".join(str(guesses.anchors[row]) for row in result.undetermined)
-        _warn(
+        names = ", ".join(str(anchors[row]) for row in result.undetermined)
+        warn(
             f"the ranges do not determine the positions of the anchors {names}, only the guesses do. Without --height, "
             "ranges do not determine how the whole is tilted: set --fixed for three measured anchors, or a smaller --off"
         )
     if result.mirrored:
-        _warn(
+        warn(
             "the mirror image of all anchors fits the guesses about as well, and ranges cannot distinguish the two. "
-            "Measure one anchor beside the line of the others, and set --fixed"
+            "Measure one anchor that is not on the line of the others, and set --fixed"
         )
     for a, b in result.swapped:
-        _warn(f"anchors {guesses.anchors[a]} and {guesses.anchors[b]} are swapped in the file")
-    for row in result.misplaced:
-        if not any(row in pair for pair in result.swapped):
-            _warn(f"anchor {guesses.anchors[row]} is {result.moved_m[row]:.2f} m from where the file says")
+        warn(f"anchors {anchors[a]} and {anchors[b]} are swapped in the file")
+    for row in set(result.misplaced).difference(*result.swapped):
+        warn(f"anchor {anchors[row]} is {result.moved_m[row]:.2f} m from its position in the file")
 
 
 def _result(tracks: list[TagTracks], recorded: RecordedRanges, anchors: AnchorMap) -> dict[str, Any]:
@@ -372,7 +359,3 @@ def _result(tracks: list[TagTracks], recorded: RecordedRanges, anchors: AnchorMa
 
 def _number(value: float, form: str) -> str:
     return form.format(value) if math.isfinite(value) else "-"
-
-
-def _warn(text: str) -> None:
-    console.err.print(text, style="yellow", markup=False, highlight=False, soft_wrap=True)

@@ -157,7 +157,7 @@ def _show(outcomes: list[Outcome], result: dict[str, Any]) -> None:
 
 
 def _note(path: Path, text: str) -> None:
-    console.err.print(f"{path}: {text}", style="yellow", markup=False, soft_wrap=True, highlight=False)
+    console.warn(f"{path}: {text}")
 
 
 def _raise_failures(outcomes: list[Outcome]) -> None:

@@ -94,7 +94,7 @@ def check_anchors(
         )
 
 
-def check_motion(links: Links, fit: JointFit, setting: Setting) -> None:
+def check_motion(fit: JointFit) -> None:
     """Refuse recordings in which positions and offsets cannot be separated.
 
     Raises:
@@ -106,24 +106,26 @@ def check_motion(links: Links, fit: JointFit, setting: Setting) -> None:
             f"the tag moves by {spread:.1f} m only: its position and the offset cannot be separated",
             valid=f"a drive of {MOVES_M:g} m or more, or tags at several positions",
         )
-    independent = float(links.share.sum())
-    needed = MIN_INDEPENDENT + 1.5 * setting.dims * int(links.at_rest.sum())
+    independent = float(fit.links.share.sum())
+    needed = MIN_INDEPENDENT + 1.5 * fit.setting.dims * int(fit.links.at_rest.sum())
     if independent < needed:
         raise DatasetError(
-            f"{len(links.of)} ranges, {independent:.0f} of them independent: too few",
+            f"{len(fit.links.of)} ranges, {independent:.0f} of them independent: too few",
             valid=f"{needed:.0f} or more: a longer drive, or more anchors at each position",
         )
 
 
-def mirrored(setting: Setting, links: Links, fit: JointFit) -> NDArray[np.bool_]:
+def mirrored(fit: JointFit) -> NDArray[np.bool_]:
     """Return which segments have a mirror image beyond the anchors that explains the ranges equally well, bool (s,)."""
+    setting, links = fit.setting, fit.links
     used = setting.anchors.position[np.unique(links.anchor)]
     axes = slice(0, setting.dims)
     centre = used.mean(axis=0)
     normal = np.zeros(3)
     normal[axes] = np.linalg.svd(used[:, axes] - centre[axes])[2][-1]
     image = fit.position - 2.0 * ((fit.position - centre) @ normal)[:, None] * normal
-    fixed = links.corrected(links.rows @ fit.parameters)
+    corrected = links.range_m - links.rows @ fit.parameters
+    fixed = replace(links, range_m=corrected, rows=np.zeros((len(links), 0)))
     try:
         other = fit_joint(setting, fixed, Regressors.none(len(links)), image, scale_m=fit.scale_m)
     except DatasetError:
@@ -135,33 +137,25 @@ def mirrored(setting: Setting, links: Links, fit: JointFit) -> NDArray[np.bool_]
     return (other.stretch_loss - fit.stretch_loss < MIRRORED) & (share > 0.5)
 
 
-def check_anchor_positions(
-    setting: Setting,
-    found: Stretches,
-    solved: Regressors,
-    links: Links,
-    fit: JointFit,
-    first_positions: FirstPositions,
-) -> None:
+def check_anchor_positions(found: Stretches, fit: JointFit, first_positions: FirstPositions) -> None:
     """Refuse ranges that other anchor positions explain much better.
 
     Args:
-        found, solved, links, fit: the solution with the positions of the file.
+        found, fit: the solution with the positions of the file.
         first_positions: as in `self_calibration`.
 
     Raises:
         DatasetError: names the anchors.
     """
-    anchors = setting.anchors.anchors
+    anchors, links = fit.setting.anchors.anchors, fit.links
     fix = "their true positions in the anchors file (`uwb-mitigation survey` finds them)"
     best: tuple[float, int, float] | None = None
-    for row in _suspects(links, solved, fit):
-        moved_m, gain = _displaced(row, setting, found, solved, fit)
+    for row in _suspects(fit):
+        moved_m, gain = _displaced(row, found, fit)
         if moved_m > MISPLACED_M and gain > LIKELIER and (best is None or gain > best[0]):
             best = gain, row, moved_m
     misfit = float((links.share * (np.abs(fit.residual_m) > MISFIT_M)).sum() / links.share.sum())
-    pair = _swapped(setting, found, solved, fit, first_positions) if misfit > MISFIT_SHARE else None
-    if pair is not None:
+    if misfit > MISFIT_SHARE and (pair := _swapped(found, fit, first_positions)) is not None:
         a, b = (anchors[row] for row in pair)
         raise DatasetError(
             f"anchors {a} and {b} contradict the others: swapped, they explain the ranges", valid=fix
@@ -175,9 +169,10 @@ def check_anchor_positions(
         )
 
 
-def _suspects(links: Links, solved: Regressors, fit: JointFit) -> list[int]:
+def _suspects(fit: JointFit) -> list[int]:
+    links = fit.links
     used = np.unique(links.anchor)
-    own = dict(zip(solved.names, fit.parameters.tolist(), strict=True))
+    own = dict(zip(fit.prior.names, fit.parameters.tolist(), strict=True))
     offset = np.array([own.get(f"anchor {row}", 0.0) for row in used])
     size = np.abs(fit.residual_m)
     misfit = np.array([np.median(size[links.anchor == row]) for row in used])
@@ -187,13 +182,11 @@ def _suspects(links: Links, solved: Regressors, fit: JointFit) -> list[int]:
     return [int(row) for row in used[suspect]]
 
 
-def _displaced(
-    row: int, setting: Setting, found: Stretches, solved: Regressors, fit: JointFit
-) -> tuple[float, float]:
+def _displaced(row: int, found: Stretches, fit: JointFit) -> tuple[float, float]:
     """Return the displacement of the anchor that explains the ranges best, m, and the gain in log likelihood."""
-    keep = np.array([name != f"anchor {row}" for name in solved.names])
-    base, anchors = solved.only(keep), setting.anchors
-    links = links_of(found, base.rows, base.alike, setting.model)
+    setting, keep = fit.setting, np.array([name != f"anchor {row}" for name in fit.prior.names])
+    base, anchors = fit.prior.only(keep), setting.anchors
+    links = links_of(found, base, setting.model)
     own = (links.anchor == row)[:, None]
     position, shared, moved = fit.position, fit.parameters[keep], anchors
     gain, axes = 0.0, slice(0, 2)
@@ -230,19 +223,17 @@ def _displaced(
     return float(np.linalg.norm(moved.position[row] - anchors.position[row])), gain
 
 
-def _swapped(
-    setting: Setting, found: Stretches, solved: Regressors, fit: JointFit, first_positions: FirstPositions
-) -> tuple[int, int] | None:
+def _swapped(found: Stretches, fit: JointFit, first_positions: FirstPositions) -> tuple[int, int] | None:
     """Return the pair of anchors that explains the ranges best if swapped; None: no pair is much better."""
-    part = np.arange(len(found.ranges)) < _MAX_RANGES
-    few, columns = found.only(part), solved.take(part)
-    links = links_of(few, columns.rows, columns.alike, setting.model)
+    setting, part = fit.setting, np.arange(len(found.ranges)) < _MAX_RANGES
+    few, columns = found.only(part), fit.prior.take(part)
+    links = links_of(few, columns, setting.model)
     scale = np.maximum(fit.scale_m, 0.1)
 
     def loss(order: NDArray[np.intp]) -> float:
         anchors = setting.anchors
         tried = replace(setting, anchors=anchors.moved(anchors.position[order], anchors.sd))
-        position, placed = first_positions(tried, few, columns.rows @ solved.mean)
+        position, placed = first_positions(tried, few, columns.rows @ columns.mean)
         if not placed.all():
             return np.inf
         try:
@@ -261,23 +252,7 @@ def _swapped(
     return best
 
 
-def _without(setting: Setting, links: Links, fit: JointFit, rows: NDArray[np.intp]) -> JointFit:
-    """Return the positions from the other anchors, with the same links' corrections."""
-    rest = links.without(np.isin(links.anchor, rows))
-    return fit_joint(
-        setting,
-        rest,
-        Regressors.none(len(rest)),
-        fit.position,
-        scale_m=fit.scale_m,
-        around=fit.position,
-        near=True,
-    )
-
-
-def position_scatter(
-    setting: Setting, links: Links, fit: JointFit, correction_m: NDArray[np.float64]
-) -> float:
+def position_scatter(fit: JointFit, correction_m: NDArray[np.float64]) -> float:
     """Return the error of the horizontal positions without ground truth, RMSE in m: the jackknife over the anchors.
 
     Errors of ranges that contradict each other move the track when an anchor is left out. An error that all anchors have in
@@ -289,29 +264,24 @@ def position_scatter(
     Returns:
         NaN if too few anchors remain.
     """
-    used = np.unique(links.anchor)
+    used = np.unique(fit.links.anchor)
     groups = min(MAX_GROUPS, len(used))
     parts = [used[k::groups] for k in range(groups)]
-    if len(used) - max(map(len, parts)) < setting.dims + 1:
+    if len(used) - max(map(len, parts)) < fit.setting.dims + 1:
         return float("nan")
-    corrected = links.corrected(correction_m)
-    tracks = np.array([_without(setting, corrected, fit, part).position[:, :2] for part in parts])
+    tracks = np.array([fit.without_anchors(part, correction_m).position[:, :2] for part in parts])
     squared = np.sum((tracks - tracks.mean(axis=0)) ** 2, axis=(0, 2))
     return float(np.sqrt(squared.mean() * (groups - 1) / groups))
 
 
-def seen_by_others(
-    setting: Setting, found: Stretches, links: Links, fit: JointFit
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def seen_by_others(fit: JointFit) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return for each range the distance of its anchor from the other anchors' track, and its standard deviation."""
-    distance = np.full(len(found.ranges), np.nan)
-    sd = np.full(len(found.ranges), np.nan)
-    used = np.unique(links.anchor)
-    corrected = links.corrected(links.rows @ fit.parameters)
+    links, used = fit.links, np.unique(fit.links.anchor)
+    distance, sd = np.full(len(links), np.nan), np.full(len(links), np.nan)
     # With many anchors, a few are left out at once: enough others remain.
     for part in (used[k::MAX_REFITS] for k in range(min(MAX_REFITS, len(used)))):
         try:
-            seen = _without(setting, corrected, fit, part)
+            seen = fit.without_anchors(part, links.rows @ fit.parameters)
             covariance = seen.covariances()
         except (DatasetError, np.linalg.LinAlgError):
             continue
@@ -321,14 +291,11 @@ def seen_by_others(
         knot = links.knot[own]
         tag = seen.position[knot] + links.ahead_s[own][:, None] * seen.velocity[knot]
         tag[:, 2] += links.rise[own]
-        unit, length = directions(tag, setting.anchors.position[links.anchor[own]])
+        unit, distance[own] = directions(tag, fit.setting.anchors.position[links.anchor[own]])
         known = np.sqrt(np.einsum("ni,nij,nj->n", unit, covariance[knot], unit))
         known[~(_gap_s(links, received)[knot] <= FAR_S)] = np.nan
-        of_link, sd_of = np.full(len(links), np.nan), np.full(len(links), np.nan)
-        of_link[own], sd_of[own] = length, known
-        mine = np.isin(found.ranges.anchor, part)
-        distance[mine], sd[mine] = of_link[links.of[mine]], sd_of[links.of[mine]]
-    return distance, sd
+        sd[own] = known
+    return distance[links.of], sd[links.of]
 
 
 def _gap_s(links: Links, received: NDArray[np.bool_]) -> NDArray[np.float64]:

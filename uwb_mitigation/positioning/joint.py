@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.positioning.geometry import Height, directions
+from uwb_mitigation.positioning.geometry import directions
 from uwb_mitigation.positioning.least_squares import LeastSquares, Solution
 from uwb_mitigation.positioning.locator import Setting
 from uwb_mitigation.positioning.model import MAD_TO_SD, Model, Regressors, scatter_of
@@ -216,14 +216,10 @@ class Links:
         columns = ("knot", "anchor", "ahead_s", "range_m", "share", "rise", "rows", "alike")
         return replace(self, **{name: getattr(self, name)[kept] for name in columns})
 
-    def corrected(self, correction_m: NDArray[np.float64]) -> Links:
-        """The same links without parameters, and with a correction float64 (n,) subtracted."""
-        return replace(self, range_m=self.range_m - correction_m, rows=np.zeros((len(self), 0)))
 
-
-def links_of(stretches: Stretches, rows: NDArray[np.float64], alike: NDArray[np.intp], model: Model) -> Links:
-    """Return the links of ranges whose derivatives by the parameters are float64 (r, q), and their kinds `alike` int (r,)."""
-    ranges = stretches.ranges
+def links_of(stretches: Stretches, parameters: Regressors, model: Model) -> Links:
+    """Return the links of ranges that depend on parameters."""
+    ranges, rows, alike = stretches.ranges, parameters.rows, parameters.alike
     knot, ahead, share = np.zeros(len(ranges), np.intp), np.zeros(len(ranges)), np.ones(len(ranges))
     knot_stretch: list[NDArray[np.intp]] = []
     times: list[NDArray[np.float64]] = []
@@ -290,6 +286,7 @@ class JointFit:
     """The result of `fit_joint`.
 
     Attributes:
+        setting, links, prior: the problem.
         position, velocity: float64 (K, 3), at the knots.
         parameters: float64 (q,), and their covariance (q, q).
         residual_m: float64 (n,), of each link.
@@ -297,6 +294,9 @@ class JointFit:
         stretch_loss: float64 (s,), robust loss of each segment, in units of `scale_m`.
     """
 
+    setting: Setting
+    links: Links
+    prior: Regressors
     position: NDArray[np.float64]
     velocity: NDArray[np.float64]
     parameters: NDArray[np.float64]
@@ -305,21 +305,55 @@ class JointFit:
     scale_m: NDArray[np.float64]
     stretch_loss: NDArray[np.float64]
     _solution: Solution
-    _height: Height | None
 
     @property
     def loss(self) -> float:
-        """Of all; to compare fits with the same scale."""
+        """Loss of all segments, to compare fits with the same scale."""
         return float(self.stretch_loss.sum())
 
     def covariances(self) -> NDArray[np.float64]:
-        """Of the positions, float64 (K, 3, 3)."""
-        d = 2 if self._height is not None else 3
+        """Return the covariances of the positions, float64 (K, 3, 3)."""
+        d, height = self.setting.dims, self.setting.height
         found = np.zeros((len(self.position), 3, 3))
         found[:, :d, :d] = self._solution.covariances(d)
-        if self._height is not None:
-            found[:, 2, 2] = self._height.sd**2
+        if height is not None:
+            found[:, 2, 2] = height.sd**2
         return found
+
+    def without(self, left_out: NDArray[np.bool_]) -> JointFit:
+        """Fit again without those links, bool (n,), starting here."""
+        links, start = self.links.without(left_out), self.position
+        return fit_joint(self.setting, links, self.prior, start, self.parameters, around=start, near=True)
+
+    def without_anchors(self, rows: NDArray[np.intp], correction_m: NDArray[np.float64]) -> JointFit:
+        """Fit the positions only, to the other anchors' ranges minus a correction, float64 (n,)."""
+        corrected = replace(
+            self.links, range_m=self.links.range_m - correction_m, rows=np.zeros((len(self.links), 0))
+        )
+        links = corrected.without(np.isin(self.links.anchor, rows))
+        return fit_joint(
+            self.setting,
+            links,
+            Regressors.none(len(links)),
+            self.position,
+            scale_m=self.scale_m,
+            around=self.position,
+            near=True,
+        )
+
+
+def fit_stretches(
+    setting: Setting,
+    stretches: Stretches,
+    prior: Regressors,
+    position: NDArray[np.float64],
+    parameters: NDArray[np.float64] | None = None,
+    *,
+    near: bool = False,
+) -> JointFit:
+    """Fit positions, tracks and parameters to the ranges of segments; as `fit_joint`."""
+    links = links_of(stretches, prior, setting.model)
+    return fit_joint(setting, links, prior, position, parameters, near=near)
 
 
 def fit_joint(
@@ -379,22 +413,13 @@ def fit_joint(
     assert solution is not None
     unit, error = problem.residuals(x, shared)
     z = error / scale[links.alike]
-    loss = np.bincount(links.stretch, model.loss(z) * links.share, minlength=len(links.at_rest))
+    losses = np.bincount(links.stretch, model.loss(z) * links.share, minlength=len(links.at_rest))
+    loss = losses.astype(np.float64)
     place, velocity = np.full((len(x), 3), problem.level), np.zeros((len(x), 3))
     place[:, :d], velocity[:, :d] = x[:, :d], x[:, d:]
     weight = model.weight(z) * links.share / scale[links.alike] ** 2
     covariance = problem.covariance(solution, unit, weight)
-    return JointFit(
-        place,
-        velocity,
-        shared,
-        covariance,
-        error,
-        scale,
-        loss.astype(np.float64),
-        solution,
-        setting.height,
-    )
+    return JointFit(setting, links, prior, place, velocity, shared, covariance, error, scale, loss, solution)
 
 
 class _Problem:

@@ -1,8 +1,7 @@
-"""Ranges beside a robot's own localisation: how far clocks and antenna are from it, and how long ranges truly were.
+"""Ranges together with a robot's own localisation: time offset, lever arms, and the true ranges.
 
-A pose tells where the robot's frame is, not the antenna: that sits off it by a lever arm, in the robot's frame. And
-radio and localisation stamp by clocks and delays of their own. Both, and the offset of each pair, by robust least squares
-(Gauss-Newton) on the ranges themselves.
+A pose is that of the robot's frame, and the antenna has a lever arm in this frame. Radio and localisation have their own
+clocks and delays. Both, and the offset of each pair, are estimated from the ranges by robust least squares (Gauss-Newton).
 """
 
 from __future__ import annotations
@@ -22,40 +21,37 @@ from uwb_mitigation.positioning.model import Model, Regressors, scatter_of
 from uwb_mitigation.positioning.tracks import Ranges
 
 GAP_S = 0.5
-"""In longer gaps of the localisation nothing is known of the pose."""
+"""In longer gaps of the localisation the pose is unknown."""
 
-MOST_LAG_S = 2.0
-LAGS_S = np.arange(-MOST_LAG_S, MOST_LAG_S + 0.01, 0.1)
+MAX_LAG_S = 2.0
+COARSE_LAGS_S = np.arange(-MAX_LAG_S, MAX_LAG_S + 0.01, 0.1)
+FINE_LAGS_S = np.arange(-0.1, 0.101, 0.02)
 LAG_SD_S, LEVER_SD_M, OFFSET_SD_M = 2.0, 1.0, 2.0
-LEAST_RANGES = 40
-MOST_RANGES = 20_000
-"""Of more, so many are fitted to, spread evenly: none of these unknowns needs more."""
+MIN_RANGES = 40
+MAX_RANGES, SEARCHED = 20_000, 4000
+"""The fit, and the search for the time offset, use at most this number of ranges."""
 
 SMOOTHED_S = 0.2
-"""Where poses jitter, times halfway between two of them would look best, since there the jitter is less."""
+"""Poses jitter, but less halfway between two of them: without smoothing, such time offsets would look best."""
 
 SLOPE_S = 0.1
-"""The velocity of a pose is from so long before and after it."""
+"""The velocity of a pose is the difference over this time before and after it."""
 
 SEPARATED_M = 0.1
-"""A lever arm that is known less well cannot be separated from the offsets."""
+"""A lever arm with a larger standard deviation cannot be separated from the offsets."""
 
 BLOCK_S, UNDERSTATED = 10.0, 1.5
-"""Errors of blocks of that duration count as independent. Errors that come again with each lap are not in their scatter:
+"""Errors of blocks of this duration count as independent. Errors that come again with each lap are not in their scatter:
 hence the factor."""
 
-FINE_LAG_S = 0.02
 LEVER_STEPS = 5
-SEARCHED = 4000
-"""Of more ranges, so many tell about which lag it is."""
-
 MIN_SD_M = 0.01
 """Of white noise and of persisting errors."""
 
-_STEPS = 40
-_PERSISTENCE_S = 1.0
+_ITERATIONS = 40
+_FIXED_SD = 1e-9
 _SMALL_M = 0.02
-_MOST_NEIGHBOURS = 20
+_MAX_NEIGHBOURS = 20
 _WORST_CONDITION = 1e6
 _SECOND_NS = 1_000_000_000
 _MODEL = Model(long=1.5, short=1.5)
@@ -85,7 +81,7 @@ class PosePath:
         reach = (
             int(np.max(np.searchsorted(time_s, time_s + SMOOTHED_S, side="right") - np.arange(len(self)))) - 1
         )
-        stride = max(1, reach // _MOST_NEIGHBOURS)
+        stride = max(1, reach // _MAX_NEIGHBOURS)
         for step in range(-(reach // stride) * stride, reach + 1, stride):
             here = np.arange(max(-step, 0), len(self) - max(step, 0))
             since = (time_s[here + step] - time_s[here]) / SMOOTHED_S
@@ -138,7 +134,7 @@ class PosePath:
         return position, matrices
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Localised:
     """What was found.
 
@@ -201,67 +197,58 @@ def solve_localised(
     Raises:
         DatasetError: too few ranges lie within the localisation's times, or arms and offsets cannot be separated.
     """
-    every = Ranges.joined(tags)
-    stamp, row, value = every.stamp_ns, every.anchor, every.range_m
+    ranges = Ranges.joined(tags)
     tag = np.repeat(np.arange(len(tags)), list(map(len, tags)))
     if (fewest := min(map(len, paths))) < 2:
         raise DatasetError(f"{fewest} poses of the localisation", valid="two or more")
-    pairs, of_pair = np.unique(np.stack([tag, row]), axis=1, return_inverse=True)
-    of_pair = of_pair.reshape(-1)
-    chosen = np.arange(len(stamp))
-    if len(chosen) > MOST_RANGES:
-        chosen = np.sort(np.random.default_rng(1).choice(chosen, MOST_RANGES, replace=False))
-    fitted = _Fit(
-        anchors.position[row[chosen]],
-        stamp[chosen],
-        value[chosen],
-        of_pair[chosen],
-        tag[chosen],
-        pairs.shape[1],
-        known.take(chosen),
-        [path.smoothed() for path in paths],
-    )
+    pairs, of_pair = np.unique(np.stack([tag, ranges.anchor]), axis=1, return_inverse=True)
+    chosen = np.arange(len(ranges))
+    if len(chosen) > MAX_RANGES:
+        chosen = np.sort(np.random.default_rng(1).choice(chosen, MAX_RANGES, replace=False))
+    smoothed = [path.smoothed() for path in paths]
+    anchor = anchors.position[ranges.anchor]
+    problem = _Problem(ranges, tag, of_pair.reshape(-1), anchor, known, smoothed, pairs.shape[1]).take(chosen)
     levers = np.zeros((len(tags), 3)) if lever_arms_m is None else lever_arms_m
     start, free = levers, np.full(levers.shape, estimate_lever_arm)
-    lag = time_offset_s
+    lag, free_lag = time_offset_s, time_offset_s is None
     if lag is None:
-        lag, start = fitted.likely(levers, estimate_lever_arm)
-    unknown = fitted.solve(lag, start, levers, time_offset_s is None, free)
+        lag, start = problem.likely(levers, estimate_lever_arm)
+    lag, lever, offset, sd = problem.solve(lag, start, levers, free_lag, free)
     if estimate_lever_arm:
-        free = unknown.lever_sd < SEPARATED_M
+        lever_sd = sd[1 : 1 + levers.size].reshape(levers.shape)
+        free = lever_sd < SEPARATED_M
         if not free[:, :2].all():
             raise DatasetError(
                 "lever arm and offsets cannot be separated: the standard deviation of the arm is "
-                f"{unknown.lever_sd[:, :2].max():.2f} m",
+                f"{lever_sd[:, :2].max():.2f} m",
                 valid="--lever-arm or a transform in the bag instead of --estimate-lever-arm, or a drive with more turns",
             )
         if not free.all():
             # A level drive does not observe the height of the arm: it would trade off against the offsets.
-            unknown = fitted.solve(
-                unknown.lag, np.where(free, unknown.lever, levers), levers, time_offset_s is None, free
-            )
-    position, turn = _at(paths, tag, stamp, unknown.lag)
-    antenna = position + np.einsum("nij,nj->ni", turn, unknown.lever[tag])
-    distance = np.linalg.norm(antenna - anchors.position[row], axis=1)
-    _check_enough(int(np.isfinite(distance).sum()), time_offset_s is None or estimate_lever_arm)
-    arm_sd = np.where(free, unknown.lever_sd, np.nan) if estimate_lever_arm else np.zeros(levers.shape)
+            start = np.where(free, lever, levers)
+            lag, lever, offset, sd = problem.solve(lag, start, levers, free_lag, free)
+    position, turn = _poses_at(paths, tag, ranges.stamp_ns, lag)
+    antenna = position + np.einsum("nij,nj->ni", turn, lever[tag])
+    distance = np.linalg.norm(antenna - anchor, axis=1)
+    _check_enough(int(np.isfinite(distance).sum()), free_lag or estimate_lever_arm)
+    lever_sd = np.where(free, sd[1 : 1 + levers.size].reshape(levers.shape), np.nan)
     return Localised(
-        unknown.lag,
-        float(unknown.sd[0]) if time_offset_s is None else 0.0,
-        unknown.lever,
-        arm_sd,
-        tuple((int(a), int(b)) for a, b in pairs.T),
-        unknown.offset,
-        unknown.sd[1 + levers.size :][: pairs.shape[1]],
-        antenna,
-        distance,
+        time_offset_s=lag,
+        time_offset_sd_s=float(sd[0]) if free_lag else 0.0,
+        lever_arm_m=lever,
+        lever_arm_sd_m=lever_sd if estimate_lever_arm else np.zeros(levers.shape),
+        pairs=tuple((int(a), int(b)) for a, b in pairs.T),
+        offset_m=offset,
+        offset_sd_m=sd[1 + levers.size :][: pairs.shape[1]],
+        position=antenna,
+        distance_m=distance,
     )
 
 
-def _at(
+def _poses_at(
     paths: Sequence[PosePath], tag: NDArray[np.intp], stamp_ns: NDArray[np.int64], later_s: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """As `PosePath.at`, of the path of each tag (n,)."""
+    """`PosePath.at` of the path of each tag (n,)."""
     position, turn = np.zeros((len(tag), 3)), np.zeros((len(tag), 3, 3))
     for number, path in enumerate(paths):
         own = tag == number
@@ -270,113 +257,93 @@ def _at(
 
 
 def _check_enough(count: int, alignment_unknown: bool) -> None:
-    """Of the offsets alone, whose deviations are known beforehand, any range tells."""
-    least = LEAST_RANGES if alignment_unknown else 1
+    """Offsets alone can be estimated from any number of ranges, because their priors are known."""
+    least = MIN_RANGES if alignment_unknown else 1
     if count < least:
         raise DatasetError(
             f"{count} ranges lie within the localisation's times",
-            valid=f"{least} or more: do their clocks agree to {MOST_LAG_S:g} s?",
+            valid=f"{least} or more: do their clocks agree to {MAX_LAG_S:g} s?",
         )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Unknowns:
-    """Of T tags and their pairs; sd: float64 (1 + 3 T + pairs + regressors,), in this order."""
+class _Problem:
+    """n ranges of tags (n,) and pairs (n,) to anchors at (n, 3), and the paths of the T tags. Lever arms are (T, 3)."""
 
-    lag: float
-    lever: NDArray[np.float64]
-    offset: NDArray[np.float64]
-    sd: NDArray[np.float64]
-
-    @property
-    def lever_sd(self) -> NDArray[np.float64]:
-        return self.sd[1 : 1 + self.lever.size].reshape(self.lever.shape)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Fit:
-    """n ranges (n,) of tags (n,) to anchors (n, 3), of `count` pairs; `known` of them. Lever arms are float64 (T, 3)."""
-
-    anchor: NDArray[np.float64]
-    stamp_ns: NDArray[np.int64]
-    range_m: NDArray[np.float64]
-    pair: NDArray[np.intp]
+    ranges: Ranges
     tag: NDArray[np.intp]
-    count: int
+    pair: NDArray[np.intp]
+    anchor: NDArray[np.float64]
     known: Regressors
     paths: Sequence[PosePath]
+    pairs: int
+
+    def take(self, index: NDArray[np.intp]) -> _Problem:
+        columns = {name: getattr(self, name)[index] for name in ("tag", "pair", "anchor")}
+        return replace(self, ranges=self.ranges.take(index), known=self.known.take(index), **columns)
 
     def likely(self, lever: NDArray[np.float64], free_lever: bool) -> tuple[float, NDArray[np.float64]]:
-        """The lag with which ranges agree best, and the lever arm beside it: from each lag anew, since a wrong one has
-        turns look like outliers.
+        """Return the time offset with which the ranges agree best, and its lever arms.
+
+        The lever arms are estimated for each time offset again, because with a wrong one turns look like outliers.
 
         Raises:
             DatasetError: hardly any range lies within the localisation's times.
         """
-        few = self if len(self.range_m) <= SEARCHED else self._some(SEARCHED)
+        count = min(len(self.ranges), SEARCHED)
+        few = self.take(np.linspace(0, len(self.ranges) - 1, count).astype(int))
         best = (math.inf, 0.0, lever)
-        for around, lags in ((0.0, LAGS_S), (None, np.arange(-0.1, 0.101, FINE_LAG_S))):
-            middle = best[1] if around is None else around
-            for lag in (middle + lags).tolist():
-                arm = few._lever(lag, lever) if free_lever else lever
-                best = min(best, (few._spread(lag, arm), lag, arm), key=lambda one: one[0])
+        for lags in (COARSE_LAGS_S, FINE_LAGS_S):
+            for lag in (best[1] + lags).tolist():
+                arm = few._lever_arm(lag, lever) if free_lever else lever
+                left = np.abs(few._centred(lag, arm)[0])
+                if np.isfinite(left).sum() >= MIN_RANGES:
+                    best = min(best, (float(np.nanmedian(left)), lag, arm), key=lambda one: one[0])
         if not math.isfinite(best[0]):
             raise DatasetError(
                 "hardly any range lies within the localisation's times",
-                valid=f"clocks that agree to {MOST_LAG_S:g} s, or --time-offset",
+                valid=f"clocks that agree to {MAX_LAG_S:g} s, or --time-offset",
             )
         return best[1], best[2]
 
-    def _some(self, count: int) -> _Fit:
-        part = np.linspace(0, len(self.range_m) - 1, count).astype(int)
-        columns = ("anchor", "stamp_ns", "range_m", "pair", "tag")
-        some = {name: getattr(self, name)[part] for name in columns}
-        return replace(self, known=self.known.take(part), **some)
-
-    def _left(self, lag: float, lever: NDArray[np.float64]) -> NDArray[np.float64]:
-        error = self._errors(lag, lever)[0]
-        left: NDArray[np.float64] = error - self._medians(error)[self.pair]
-        return left
-
-    def _spread(self, lag: float, lever: NDArray[np.float64]) -> float:
-        left = np.abs(self._left(lag, lever))
-        return float(np.nanmedian(left)) if np.isfinite(left).sum() >= LEAST_RANGES else math.inf
-
-    def _lever(self, lag: float, lever: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The lever arm that goes best with a lag: least absolute deviations, by reweighting."""
+    def _lever_arm(self, lag: float, lever: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the lever arms for a time offset: least absolute deviations, by reweighting."""
         for _ in range(LEVER_STEPS):
-            left = self._left(lag, lever)
-            _, unit, turn = self._errors(lag, lever)
-            rows = np.einsum("ni,nij->nj", unit, turn)
+            left, rows = self._centred(lag, lever)
             known = np.isfinite(left) & np.isfinite(rows).all(axis=1)
-            if int(known.sum()) < LEAST_RANGES:
+            if int(known.sum()) < MIN_RANGES:
                 return lever
             lever = lever.copy()
-            for tag in range(len(lever)):
+            for tag in np.unique(self.tag[known]):
                 own = known & (self.tag == tag)
-                if not own.any():
-                    continue
                 weight = 1.0 / np.maximum(np.abs(left[own]), _SMALL_M)
-                certainty = float(weight.sum()) * _SMALL_M**2 / LEVER_SD_M**2
-                normal = rows[own].T @ (weight[:, None] * rows[own]) + certainty * np.eye(3)
-                right = rows[own].T @ (weight * left[own]) - certainty * lever[tag]
+                information = float(weight.sum()) * _SMALL_M**2 / LEVER_SD_M**2
+                normal = rows[own].T @ (weight[:, None] * rows[own]) + information * np.eye(3)
+                right = rows[own].T @ (weight * left[own]) - information * lever[tag]
                 lever[tag] += np.linalg.solve(normal, right)
         return lever
 
     def _medians(self, error: NDArray[np.float64]) -> NDArray[np.float64]:
-        found = np.zeros(self.count)
-        for pair in range(self.count):
-            own = error[self.pair == pair]
-            found[pair] = np.nanmedian(own) if np.isfinite(own).any() else 0.0
+        found = np.zeros(self.pairs)
+        for pair in np.unique(self.pair[np.isfinite(error)]):
+            found[pair] = np.nanmedian(error[self.pair == pair])
         return found
 
     def _errors(
         self, lag: float, lever: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Range less distance and what is expected beside it (n,), unit vectors (n, 3) from anchor to antenna, rotations (n, 3, 3)."""
-        position, turn = _at(self.paths, self.tag, self.stamp_ns, lag)
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Range minus distance and known corrections (n,), and derivatives of the distance by the lever arm (n, 3)."""
+        position, turn = _poses_at(self.paths, self.tag, self.ranges.stamp_ns, lag)
         unit, distance = directions(position + np.einsum("nij,nj->ni", turn, lever[self.tag]), self.anchor)
-        return self.range_m - self.known.rows @ self.known.mean - distance, unit, turn
+        error = self.ranges.range_m - self.known.rows @ self.known.mean - distance
+        return error, np.einsum("ni,nij->nj", unit, turn)
+
+    def _centred(
+        self, lag: float, lever: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """`_errors`, without the median error of each pair."""
+        error, rows = self._errors(lag, lever)
+        return error - self._medians(error)[self.pair], rows
 
     def solve(
         self,
@@ -385,63 +352,67 @@ class _Fit:
         expected: NDArray[np.float64],
         free_lag: bool,
         free_lever: NDArray[np.bool_],
-    ) -> _Unknowns:
-        """From a lag and lever arms; `expected`: the arms as known before, bool (T, 3): which coordinates are estimated."""
+    ) -> tuple[float, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Fit by Gauss-Newton, from a time offset and lever arms.
+
+        Args:
+            expected: prior of the lever arms.
+            free_lag, free_lever: whether the time offset is estimated, and which coordinates of the arms, bool (T, 3).
+
+        Returns:
+            Time offset, lever arms, offsets of the pairs, and the standard deviations of all in this order.
+        """
         arms = slice(1, 1 + lever.size)
-        pairs = slice(arms.stop, arms.stop + self.count)
+        pairs = slice(arms.stop, arms.stop + self.pairs)
         size = pairs.stop + len(self.known.mean)
-        certainty = 1.0 / np.array(
+        prior_sd = np.concatenate(
             [
-                LAG_SD_S**2 if free_lag else 1e-18,
-                *np.where(free_lever.reshape(-1), LEVER_SD_M**2, 1e-18).tolist(),
-                *[OFFSET_SD_M**2] * self.count,
-                *(self.known.sd**2).tolist(),
+                [LAG_SD_S if free_lag else _FIXED_SD],
+                np.where(free_lever.reshape(-1), LEVER_SD_M, _FIXED_SD),
+                np.full(self.pairs, OFFSET_SD_M),
+                self.known.sd,
             ]
         )
-        # What is known of regressors' factors is taken off with their means.
+        information = 1.0 / prior_sd**2
+        # The means of the regressors are subtracted already.
         mean = np.array([0.0 if free_lag else lag, *expected.reshape(-1), *np.zeros(size - arms.stop)])
         offsets = self._medians(self._errors(lag, lever)[0])
         x = np.array([lag, *lever.reshape(-1), *offsets, *np.zeros(size - pairs.stop)])
-        # Ranges of a pair err alike for about so long (see `model`).
-        since = self.stamp_ns - self.stamp_ns.min()
-        chunk = since // round(2.0 * _PERSISTENCE_S * _SECOND_NS)
-        group = chunk * self.count + self.pair
+        # The errors of a pair persist for about this time (see `model`).
+        since = self.ranges.stamp_ns - self.ranges.stamp_ns.min()
+        group = since // round(2.0 * _MODEL.persistence_s * _SECOND_NS) * self.pairs + self.pair
         every = np.arange(len(self.pair))
-        for step_number in range(_STEPS):
+        for iteration in range(_ITERATIONS):
             arm = x[arms].reshape(lever.shape)
-            error, unit, turn = self._errors(x[0], arm)
-            beside, before = (self._errors(x[0] + by, arm)[0] for by in (SLOPE_S, -SLOPE_S))
+            error, of_arm = self._errors(x[0], arm)
+            after, before = (self._errors(x[0] + by, arm)[0] for by in (SLOPE_S, -SLOPE_S))
             rows = np.zeros((len(error), size))
-            rows[:, 0] = (before - beside) / (2.0 * SLOPE_S)
-            for axis in range(3):
-                rows[every, 1 + 3 * self.tag + axis] = np.einsum("ni,ni->n", unit, turn[:, :, axis])
+            rows[:, 0] = (before - after) / (2.0 * SLOPE_S)
+            rows[every[:, None], 1 + 3 * self.tag[:, None] + np.arange(3)] = of_arm
             rows[every, pairs.start + self.pair] = 1.0
             rows[:, pairs.stop :] = self.known.rows
             left = error - x[pairs][self.pair] - self.known.rows @ x[pairs.stop :]
             known = np.isfinite(left) & np.isfinite(rows).all(axis=1)
             _check_enough(int(known.sum()), free_lag or bool(free_lever.any()))
             normal, right = _normal_equations(rows[known], left[known], group[known], self.known.alike[known])
-            covariance = np.linalg.inv(normal + np.diag(certainty))
-            move = covariance @ (right + certainty * (mean - x))
-            move[0] = np.clip(move[0], -0.3, 0.3)
-            x = x + move
-            if float(np.abs(move).max()) < 1e-5 and step_number > 3:
+            covariance = np.linalg.inv(normal + np.diag(information))
+            step = covariance @ (right + information * (mean - x))
+            step[0] = np.clip(step[0], -0.3, 0.3)
+            x = x + step
+            if float(np.abs(step).max()) < 1e-5 and iteration > 3:
                 break
-        # Errors persist for longer than a group, and those of the localisation are in all pairs: the scatter of the
-        # scores of long blocks shows it (Liang and Zeger, Biometrika 1986).
+        # Errors persist for longer than a group, and those of the localisation are in all pairs: the sandwich estimator
+        # with the scores of long blocks includes both (Liang and Zeger, Biometrika 1986).
         block = since // round(BLOCK_S * _SECOND_NS)
+        parts = [known & (block == number) for number in np.unique(block[known])]
         scores = np.array(
-            [
-                _normal_equations(rows[one], left[one], group[one], self.known.alike[one])[1]
-                for number in np.unique(block[known])
-                for one in [known & (block == number)]
-            ]
+            [_normal_equations(rows[p], left[p], group[p], self.known.alike[p])[1] for p in parts]
         )
         blocks = max(len(scores), 2)
         robust = covariance @ (scores.T @ scores) @ covariance * (blocks / (blocks - 1))
         sd = UNDERSTATED * np.sqrt(np.diag(covariance) + np.diag(robust))
         arm = np.where(free_lever, x[arms].reshape(lever.shape), expected)
-        return _Unknowns(float(x[0]), arm, x[pairs].copy(), sd)
+        return float(x[0]), arm, x[pairs].copy(), sd
 
 
 def _normal_equations(
@@ -449,7 +420,6 @@ def _normal_equations(
     left_m: NDArray[np.float64],
     group: NDArray[np.intp],
     alike: NDArray[np.intp],
-    model: Model = _MODEL,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the normal matrix (q, q) and right side (q,) of n ranges, robust against outliers among ranges and groups.
 
@@ -458,10 +428,10 @@ def _normal_equations(
     1992, section 3.3). Both variances are estimated from the residuals, by medians.
 
     Args:
-        rows: float64 (n, q), what each range grows by with each unknown.
-        left_m: float64 (n,), what is not explained yet.
-        group: int (n,), whose errors persist together.
-        alike: int (n,), ranges that should err about as much have the same number, from 0.
+        rows: float64 (n, q), derivative of each range by each unknown.
+        left_m: float64 (n,), residuals.
+        group: int (n,), ranges whose errors persist together have the same number.
+        alike: int (n,), ranges whose errors have the same standard deviation have the same number, from 0.
     """
     order = np.argsort(group, kind="stable")
     rows, left_m, group, alike = rows[order], left_m[order], group[order], alike[order]
@@ -470,32 +440,24 @@ def _normal_equations(
     of = np.repeat(np.arange(len(starts)), count)
     kinds = int(alike.max(initial=0)) + 1
 
-    def mean(
-        values: NDArray[np.float64], weight: NDArray[np.float64], total: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        found: NDArray[np.float64] = np.add.reduceat((values.T * weight).T, starts) / total[:, None]
-        return found
-
     middle = np.array([np.median(part) for part in np.split(left_m, starts[1:])])
     within = left_m - middle[of]
     # Of n values around their own median: n - 1 are left.
     several = count[of] > 1
     larger = np.sqrt(count / np.maximum(count - 1.0, 1.0))[of]
+    white = np.full(kinds, MIN_SD_M)
     if several.any():
-        white = scatter_of((within * larger)[several], alike[several], kinds)
-    else:
-        white = np.full(kinds, MIN_SD_M)
-    white = np.maximum(white, MIN_SD_M)
-    weight = model.weight(within / white[alike]) / white[alike] ** 2
+        white = np.maximum(scatter_of((within * larger)[several], alike[several], kinds), MIN_SD_M)
+    weight = _MODEL.weight(within / white[alike]) / white[alike] ** 2
     total = np.add.reduceat(weight, starts)
     both = np.concatenate([rows, left_m[:, None]], axis=1)
-    shared = mean(both, weight, total)
+    shared = np.add.reduceat(both * weight[:, None], starts) / total[:, None]
     apart = both - shared[of]
     scaled = apart * weight[:, None]
     kind = np.array([int(np.median(part)) for part in np.split(alike, starts[1:])])
     spread = scatter_of(shared[:, -1], kind, kinds)[kind]
     persists = np.sqrt(np.maximum(spread**2 - 1.0 / total, MIN_SD_M**2))
     variance = persists**2 + 1.0 / total
-    of_group = model.weight(shared[:, -1] / np.sqrt(variance)) / variance
+    of_group = _MODEL.weight(shared[:, -1] / np.sqrt(variance)) / variance
     outer = scaled.T @ apart + (shared * of_group[:, None]).T @ shared
     return outer[:-1, :-1], outer[:-1, -1]

@@ -28,10 +28,8 @@ from uwb_mitigation.positioning.joint import (
     KNOT_S,
     SLOW_S,
     JointFit,
-    Links,
     Stretches,
-    fit_joint,
-    links_of,
+    fit_stretches,
     stretches,
 )
 from uwb_mitigation.positioning.locator import Setting, TagLocator
@@ -39,7 +37,7 @@ from uwb_mitigation.positioning.model import Model, Regressors
 from uwb_mitigation.positioning.start import Place, places
 from uwb_mitigation.positioning.tracks import Ranges, Track
 
-UNTOLD_M = 0.2
+MAX_COMMON_SD_M = 0.2
 """A common offset with a larger standard deviation is unknown: uncalibrated antenna delays differ by as much."""
 
 SEVERAL = 3.0
@@ -67,43 +65,36 @@ WINDOW_S = 0.5
 MAX_WINDOWS = 12
 
 _SECOND_NS = 1_000_000_000
+_UNKNOWN = np.zeros(0)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class SelfCalibration:
     """The result.
 
     Attributes:
-        setting, stretches, links, fit: as in `joint`.
-        solved: the parameters: `offset`, `anchor ROW`, `tag NUMBER`, `pair NUMBER ROW`, and the regressors'.
+        stretches, fit: as in `joint`. Parameters: `offset`, `anchor ROW`, `tag NUMBER`, `pair NUMBER ROW`, and the
+            regressors'.
         level: `pair`, `anchor` or `one`: what has its own offset.
-        not_told: messages about parameters that are not observable, and about ranges that were left out.
+        notes: messages about parameters that are not observable, and about ranges that were left out.
         tag_ids: of the tags.
-        untold_m: the estimate of a common offset that is not significant and therefore not subtracted; 0: it is.
+        unobserved_m: the estimate of a common offset that is not significant and therefore not subtracted; 0: it is.
         own_sd_m: standard deviation of own offsets about the common one, for pairs that get the common one.
         pseudo_m, pseudo_sd_m: float64 (r,), in the order of `stretches.ranges`: the distance of each range's anchor from the
             track of the *other* anchors, and its standard deviation; NaN: unknown.
         position_scatter_m: `position_scatter` of raw ranges, and of calibrated ones on held-out parts; NaN: unknown.
     """
 
-    setting: Setting
     stretches: Stretches
-    links: Links
     fit: JointFit
-    solved: Regressors
     level: str
-    not_told: tuple[str, ...]
+    notes: tuple[str, ...] = ()
     tag_ids: tuple[int, ...]
-    untold_m: float
+    unobserved_m: float = 0.0
     own_sd_m: float
-    pseudo_m: NDArray[np.float64]
-    pseudo_sd_m: NDArray[np.float64]
-    position_scatter_m: tuple[float, float]
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Of the parameters."""
-        return self.solved.names
+    pseudo_m: NDArray[np.float64] = _UNKNOWN
+    pseudo_sd_m: NDArray[np.float64] = _UNKNOWN
+    position_scatter_m: tuple[float, float] = (np.nan, np.nan)
 
     def found_without(self, left_out: NDArray[np.bool_]) -> SelfCalibration:
         """The same parameters and tracks from all but those of `stretches.ranges`, bool (r,); the pseudo-truth stays.
@@ -111,31 +102,24 @@ class SelfCalibration:
         Raises:
             DatasetError: the other ranges do not determine them.
         """
-        gone = np.ones(len(self.links), np.bool_)
-        gone[self.links.of[~left_out]] = False
-        links = self.links.without(gone)
-        fit, start = self.fit, self.fit.position
-        again = fit_joint(self.setting, links, self.solved, start, fit.parameters, around=start, near=True)
-        return replace(self, fit=again)
+        links_left_out = np.ones(len(self.fit.links), np.bool_)
+        links_left_out[self.fit.links.of[~left_out]] = False
+        return replace(self, fit=self.fit.without(links_left_out))
 
     def value(self, name: str) -> tuple[float, float]:
-        """A parameter and its standard deviation; (0, 0) where it was not solved for."""
-        if name not in self.names:
+        """A parameter and its standard deviation; (0, 0): it was not estimated."""
+        if name not in self.fit.prior.names:
             return 0.0, 0.0
-        at = self.names.index(name)
+        at = self.fit.prior.names.index(name)
         return float(self.fit.parameters[at]), float(np.sqrt(self.fit.covariance[at, at]))
 
     def pair(self, tag: int, row: int) -> tuple[float, float]:
         """The offset of a tag (its number) and an anchor (its row), m, and its standard deviation."""
-        at = self._columns(tag, row)
-        # How well anchors were measured bounds it: an anchor's misplacement looks like an offset, its mean over all
-        # directions from which the tag saw it being about half of it in variance.
-        placed = (
-            self.setting.anchors.sd[row] ** 2 / 2.0
-            if len(at) > 1
-            else np.mean(self.setting.anchors.sd**2) / len(self.setting.anchors) + self.own_sd_m**2
-        )
-        variance = self.fit.covariance[np.ix_(at, at)].sum() + placed + self.untold_m**2
+        at, sd = self._columns(tag, row), self.fit.setting.anchors.sd
+        # The error of an anchor's position looks like an offset. Averaged over all directions from which the tag received it,
+        # about half of its variance remains.
+        placed = sd[row] ** 2 / 2.0 if len(at) > 1 else np.mean(sd**2) / len(sd) + self.own_sd_m**2
+        variance = self.fit.covariance[np.ix_(at, at)].sum() + placed + self.unobserved_m**2
         return float(self.fit.parameters[at].sum()), float(np.sqrt(variance))
 
     def applied(self, tag: int, row: int) -> tuple[float, float]:
@@ -157,19 +141,19 @@ class SelfCalibration:
 
     def mean(self) -> tuple[float, float]:
         """The mean offset of all pairs, m, and its standard deviation."""
-        pairs = self.pairs()
-        rows = np.zeros((len(pairs), len(self.names)))
+        pairs, sd = self.pairs(), self.fit.setting.anchors.sd
+        rows = np.zeros((len(pairs), len(self.fit.parameters)))
         for number, (tag, row) in enumerate(pairs):
             rows[number, self._columns(tag, row)] = 1.0
         of_mean = rows.mean(axis=0)
-        placed = float(np.mean(self.setting.anchors.sd**2)) / 2.0 / len(self.setting.anchors)
-        variance = of_mean @ self.fit.covariance @ of_mean + placed + self.untold_m**2
+        placed = float(np.mean(sd**2)) / 2.0 / len(sd)
+        variance = of_mean @ self.fit.covariance @ of_mean + placed + self.unobserved_m**2
         return float(of_mean @ self.fit.parameters), float(np.sqrt(variance))
 
     def _columns(self, tag: int, row: int) -> list[int]:
         """The parameters that are added to the ranges of a tag and an anchor."""
         wanted = {"offset", f"anchor {row}", f"tag {tag}", f"pair {tag} {row}"}
-        return [i for i, name in enumerate(self.names) if name in wanted]
+        return [i for i, name in enumerate(self.fit.prior.names) if name in wanted]
 
     def pairs(self) -> list[tuple[int, int]]:
         """(tag number, anchor row) of all pairs that there are ranges of."""
@@ -231,11 +215,11 @@ def calibrate(
         )
     kept = placed[found.of]
     common = Regressors.one("offset", np.ones(len(kept)), offset, COMMON_SD_M)
-    solved = replace(common.joined(known), alike=known.alike).take(kept)
+    shared = replace(common.joined(known), alike=known.alike).take(kept)
     found = found.keep(placed)
     # The positions contain no knots of segments that were left out.
-    links, fit = _fitted(setting, found, solved, position)
-    ambiguous = mirrored(setting, links, fit)
+    fit = fit_stretches(setting, found, shared, position)
+    ambiguous = mirrored(fit)
     if ambiguous.all():
         raise DatasetError(
             "the track has two mirror images, and either explains the ranges equally well",
@@ -245,94 +229,68 @@ def calibrate(
         notes.append(
             f"{int(ambiguous.sum())} of {len(ambiguous)} stretches left out: their mirror images fit equally well"
         )
-        position = fit.position[~ambiguous[links.knot_stretch]]
-        solved, found = solved.take(~ambiguous[found.of]), found.keep(~ambiguous)
-        links, fit = _fitted(setting, found, solved, position)
-    check_motion(links, fit, setting)
-    common_sd, shared_only = float(np.sqrt(fit.covariance[0, 0])), solved
+        position = fit.position[~ambiguous[fit.links.knot_stretch]]
+        shared, found = shared.take(~ambiguous[found.of]), found.keep(~ambiguous)
+        fit = fit_stretches(setting, found, shared, position)
+    check_motion(fit)
+    common_sd = float(np.sqrt(fit.covariance[0, 0]))
     level, own_sd = "one", 0.0
     # Without the common offset the true ranges are unknown: own offsets would contain its error.
-    for group, members in candidates(found) if common_sd <= UNTOLD_M else []:
-        richer, better, shared, sd_of_group = with_own_offsets(setting, found, solved, members, fit)
+    for group, members in candidates(found) if common_sd <= MAX_COMMON_SD_M else []:
+        better, unobservable, sd_of_group = with_own_offsets(found, fit, members)
         if group == "anchor":
             own_sd = sd_of_group
-        if richer is None or better is None:
+        if better is None:
             notes.append(f"own offsets of {group}s are not significant, so that all share one")
             break
-        before, after = (_held_out_scatter(setting, found, *one) for one in ((solved, fit), (richer, better)))
+        before, after = _held_out_scatter(fit), _held_out_scatter(better)
         if after > before:
             notes.append(
                 f"own offsets of {group}s: positions without one anchor scatter by {after:.3f} m with them, by "
                 f"{before:.3f} m without them, so that all share one"
             )
             break
-        solved, fit, level = richer, better, "pair" if group != "anchor" else "anchor"
-        if shared:
-            names = ", ".join(_with_ids(name, anchors, tags) for name in shared)
+        fit, level = better, "pair" if group != "anchor" else "anchor"
+        if unobservable:
+            names = ", ".join(_with_ids(name, anchors, tags) for name in unobservable)
             notes.append(
                 f"{names}: their own offsets are not significant, so that they get the common offset"
             )
     if level == "anchor" and len(np.unique(found.tag)) == 1:
         # With one tag, the offset of an anchor is that of the pair.
         level = "pair"
-    links, fit = _fitted(setting, found, solved, fit.position, fit.parameters)
-    check_anchor_positions(setting, found, solved, links, fit, first_positions)
-    unknown, nan = np.full(len(found.ranges), np.nan), float("nan")
+    fit = fit_stretches(setting, found, fit.prior, fit.position, fit.parameters)
+    check_anchor_positions(found, fit, first_positions)
     ids = tuple(one.tag_id for one in tags)
-    trial = SelfCalibration(
-        setting, found, links, fit, solved, level, (), ids, 0.0, own_sd, unknown, unknown, (nan, nan)
-    )
-    if common_sd > UNTOLD_M or not any(trial.applied(*pair)[0] for pair in trial.pairs()):
-        value, sd = trial.mean()
+    result = SelfCalibration(stretches=found, fit=fit, level=level, tag_ids=ids, own_sd_m=own_sd)
+    if common_sd > MAX_COMMON_SD_M or not any(result.applied(*pair)[0] for pair in result.pairs()):
+        value, sd = result.mean()
         notes.append(
             f"the offset is not significant, so that no offset is subtracted: {value:.2f} m with a standard deviation of "
             f"{sd:.2f} m. Drive between the anchors, not only past them"
         )
-        q = len(shared_only.names)
-        solved = replace(
-            shared_only, mean=np.append(0.0, shared_only.mean[1:]), sd=np.append(1e-4, shared_only.sd[1:])
-        )
-        links, fit = _fitted(setting, found, solved, fit.position, np.append(0.0, fit.parameters[1:q]))
-        trial = replace(
-            trial, links=links, fit=fit, solved=solved, level="one", untold_m=float(np.hypot(value, sd))
-        )
-    pseudo, pseudo_sd = seen_by_others(setting, found, links, fit)
-    scatter = (
-        position_scatter(setting, links, fit, np.zeros(len(links))),
-        _held_out_scatter(setting, found, solved, fit),
-    )
+        zero = replace(shared, mean=np.append(0.0, shared.mean[1:]), sd=np.append(1e-4, shared.sd[1:]))
+        start = np.append(0.0, fit.parameters[1 : len(zero.names)])
+        fit = fit_stretches(setting, found, zero, fit.position, start)
+        result = replace(result, fit=fit, level="one", unobserved_m=float(np.hypot(value, sd)))
+    pseudo, pseudo_sd = seen_by_others(fit)
+    scatter = position_scatter(fit, np.zeros(len(fit.links))), _held_out_scatter(fit)
     return replace(
-        trial, not_told=tuple(notes), pseudo_m=pseudo, pseudo_sd_m=pseudo_sd, position_scatter_m=scatter
+        result, notes=tuple(notes), pseudo_m=pseudo, pseudo_sd_m=pseudo_sd, position_scatter_m=scatter
     )
 
 
-def _fitted(
-    setting: Setting,
-    found: Stretches,
-    solved: Regressors,
-    position: NDArray[np.float64],
-    parameters: NDArray[np.float64] | None = None,
-    *,
-    near: bool = False,
-) -> tuple[Links, JointFit]:
-    """Return the links of the ranges, and the fit to them from positions (K, 3) and parameters to start from."""
-    links = links_of(found, solved.rows, solved.alike, setting.model)
-    return links, fit_joint(setting, links, solved, position, parameters, near=near)
-
-
-def _held_out_scatter(setting: Setting, found: Stretches, solved: Regressors, fit: JointFit) -> float:
+def _held_out_scatter(fit: JointFit) -> float:
     """Return the scatter of positions, with parameters from the other half of the drive."""
-    links = links_of(found, solved.rows, solved.alike, setting.model)
+    links = fit.links
     block = (links.time_s[links.knot] // SLOW_S).astype(int) + links.stretch
-    correction, start = np.zeros(len(links)), fit.position
+    correction = np.zeros(len(links))
     for half in range(2):
         held_out, parameters = block % 2 == half, fit.parameters
         if held_out.any() and not held_out.all():
-            rest = links.without(held_out)
-            again = fit_joint(setting, rest, solved, start, parameters, around=start, near=True)
-            parameters = again.parameters
+            parameters = fit.without(held_out).parameters
         correction[held_out] = links.rows[held_out] @ parameters
-    return position_scatter(setting, links, fit, correction)
+    return position_scatter(fit, correction)
 
 
 def candidates(found: Stretches) -> list[tuple[str, dict[str, NDArray[np.bool_]]]]:
@@ -356,33 +314,25 @@ def candidates(found: Stretches) -> list[tuple[str, dict[str, NDArray[np.bool_]]
 
 
 def with_own_offsets(
-    setting: Setting,
-    found: Stretches,
-    solved: Regressors,
-    members: dict[str, NDArray[np.bool_]],
-    fit: JointFit,
-) -> tuple[Regressors | None, JointFit | None, list[str], float]:
-    """Add offsets of these groups of ranges, if they are significant.
+    found: Stretches, fit: JointFit, members: dict[str, NDArray[np.bool_]]
+) -> tuple[JointFit | None, list[str], float]:
+    """Add offsets of these groups of ranges to a fit, if they are significant.
 
     Empirical Bayes: the scatter of the offsets beyond their own uncertainty is their prior standard deviation.
 
     Returns:
-        Parameters and fit with own offsets (None: not significant), the names of those that are not observable, and their
-        scatter in m, which is also the error of the common offset as a replacement of an own one.
+        The fit with own offsets (None: not significant), the names of those that are not observable, and their scatter
+        in m, which is also the error of the common offset as a replacement of an own one.
     """
-    count, kinds = len(members), solved.alike
+    count = len(members)
 
-    def with_groups(names: list[str], sd: float) -> Regressors:
-        rows = np.column_stack([members[name].astype(float) for name in names])
-        return solved.joined(
-            Regressors(tuple(names), rows, np.zeros(len(names)), np.full(len(names), sd), kinds)
-        )
+    def with_groups(names: list[str], sd: float) -> JointFit:
+        rows, zero = np.column_stack([members[name].astype(float) for name in names]), np.zeros(len(names))
+        own = Regressors(tuple(names), rows, zero, np.full(len(names), sd), fit.prior.alike)
+        start = np.append(fit.parameters, zero)
+        return fit_stretches(fit.setting, found, fit.prior.joined(own), fit.position, start, near=True)
 
-    def fitted(some: Regressors) -> JointFit:
-        start = np.append(fit.parameters, np.zeros(len(some.names) - len(fit.parameters)))
-        return _fitted(setting, found, some, fit.position, start, near=True)[1]
-
-    trial = fitted(with_groups(list(members), OWN_SD_M))
+    trial = with_groups(list(members), OWN_SD_M)
     # Deviations from their mean: the mean is the common offset.
     centred = np.eye(count) - 1.0 / count
     own = centred @ trial.parameters[-count:]
@@ -395,13 +345,12 @@ def with_own_offsets(
     scatter = float(np.sum((free**2 - alone) / alone**2) / np.sum(1.0 / alone**2))
     sd = float(np.sqrt(max(scatter, 0.0)))
     if excess < chi2.ppf(MIN_CONFIDENCE, max(count - 1, 1)) or scatter < MIN_OWN_SD_M**2:
-        return None, None, [], sd
+        return None, [], sd
     observable = np.sqrt(1.0 / (1.0 / alone + 1.0 / scatter)) < OBSERVABLE * sd
     if observable.mean() < MIN_SHARE:
-        return None, None, [], sd
+        return None, [], sd
     names = [name for name, is_observable in zip(members, observable, strict=True) if is_observable]
-    better = with_groups(names, sd)
-    return better, fitted(better), [name for name in members if name not in names], sd
+    return with_groups(names, sd), [name for name in members if name not in names], sd
 
 
 def likely_offset(setting: Setting, found: Stretches, expected_m: NDArray[np.float64]) -> float:

@@ -303,7 +303,7 @@ def without_truth(
     of_range = site.begins[track.tag] + track.row
     is_known = np.isfinite(found.pseudo_m) & (found.pseudo_sd_m <= MAX_TRUTH_SD_M)
     is_known, outliers = _without_outliers(track.ranges.range_m - found.pseudo_m, is_known)
-    notes = list(found.not_told)
+    notes = list(found.notes)
     if (unknown := int((~is_known).sum()) - outliers) > 0:
         notes.append(
             f"{unknown} of {len(is_known)} ranges left out of the fit: the other anchors tell too little of where the tag was"
@@ -329,7 +329,7 @@ def without_truth(
     solution = Solution(
         rows=of_range[used],
         true_m=found.pseudo_m[used],
-        antenna=found.fit.position[found.links.knot[found.links.of]][used],
+        antenna=found.fit.position[found.fit.links.knot[found.fit.links.of]][used],
         segment=track.of[used],
         stationary=track.at_rest,
         pairs=pairs,
@@ -339,7 +339,7 @@ def without_truth(
         notes=tuple(notes),
         change_without=change_without,
         track=found.fit.position,
-        track_of=found.links.knot_stretch,
+        track_of=found.fit.links.knot_stretch,
         places=_places(found),
         network_sd=found.value(NETWORK)[1],
         line=found.value(LEVEL),
@@ -527,7 +527,7 @@ def regressors(site: SiteData, universal: Bundle) -> Regressors:
 
 def _places(found: SelfCalibration) -> dict[str, tuple[float, float, float]]:
     """The positions of stationary tags, see `Solution.places`."""
-    resting = np.flatnonzero(found.links.at_rest).tolist()
+    resting = np.flatnonzero(found.fit.links.at_rest).tolist()
     tag_of = dict(zip(found.stretches.of.tolist(), found.stretches.tag.tolist(), strict=True))
     positions = Counter(tag_of[segment] for segment in resting)
     number: Counter[int] = Counter()
@@ -536,7 +536,7 @@ def _places(found: SelfCalibration) -> dict[str, tuple[float, float, float]]:
         tag = tag_of[segment]
         number[tag] += 1
         suffix = f" #{number[tag]}" if positions[tag] > 1 else ""
-        x, y, z = found.fit.position[found.links.knot_stretch == segment][0].tolist()
+        x, y, z = found.fit.position[found.fit.links.knot_stretch == segment][0].tolist()
         places[f"{found.tag_ids[tag]}{suffix}"] = (x, y, z)
     return places
 
