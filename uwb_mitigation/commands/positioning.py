@@ -261,13 +261,11 @@ def _show_tracks(tracks: list[TagTracks], anchors: AnchorMap) -> None:
     rows = []
     for one in tracks:
         kind = "corrected" if one.recording.corrected else "raw"
-        for name, track, errors in (
-            ("snapshots, raw", one.snapshot, one.snapshot_errors),
-            (f"live, {kind}", one.live, one.live_errors),
-            (f"smoothed, {kind}", one.smoothed, one.smoothed_errors),
-        ):
+        names = {"snapshot": "snapshots, raw", "live": f"live, {kind}", "smoothed": f"smoothed, {kind}"}
+        for key, name in names.items():
+            errors, track = one.errors[key], getattr(one, key)
             cells = [_number(getattr(errors, field), form) for field, (_, form) in _COLUMNS.items()]
-            rows.append([format_id(one.recording.tag_id), name, str(errors.epochs or len(track)), *cells])
+            rows.append([format_id(one.recording.tag_id), name, errors.epochs or len(track), *cells])
     columns = ("tag", "track", "epochs", *(title for title, _ in _COLUMNS.values()))
     show_table("Horizontal errors, m", columns, rows, left=2, most=len(rows))
     console.out.print(
@@ -277,7 +275,7 @@ def _show_tracks(tracks: list[TagTracks], anchors: AnchorMap) -> None:
     )
     for one in tracks:
         name = f"tag {format_id(one.recording.tag_id)}"
-        if not one.live_errors.epochs:
+        if not one.errors["live"].epochs:
             say(f"{name}: no truth in the bag, so no errors")
         for warning in one.warnings:
             warn(f"{name}: {warning}.")
@@ -344,9 +342,9 @@ def _show_survey(result: SurveyResult) -> None:
 def _result(tracks: list[TagTracks], recorded: RecordedRanges, anchors: AnchorMap) -> dict[str, Any]:
     from uwb_mitigation.processing.tracking import KINDS, pooled
 
-    known = any(one.live_errors.epochs for one in tracks)
+    known = any(one.errors["live"].epochs for one in tracks)
     hdops = [one.hdop for one in tracks if math.isfinite(one.hdop)]
-    overall = {kind: pooled([getattr(one, f"{kind}_errors") for one in tracks]).as_json() for kind in KINDS}
+    overall = {kind: pooled([one.errors[kind] for one in tracks]).as_json() for kind in KINDS}
     return {
         "tags": [one.as_json(anchors) for one in tracks],
         **(overall if known else dict.fromkeys(KINDS)),

@@ -240,36 +240,29 @@ def links_of(stretches: Stretches, parameters: Regressors, model: Model) -> Link
         times.append(time_s)
         known += len(time_s)
     is_resting = stretches.at_rest[stretches.of]
-    # Links at rest by place and anchor, all others by themselves.
-    key = np.where(
-        is_resting,
-        stretches.of * 1024 + ranges.anchor,
-        len(stretches) * 1024 + np.arange(len(ranges)),
-    )
+    # One link for each pair of a position at rest, and one for each other range.
+    of_pair = stretches.of * 1024 + ranges.anchor
+    key = np.where(is_resting, of_pair, len(stretches) * 1024 + np.arange(len(ranges)))
     _, first, of = np.unique(key, return_index=True, return_inverse=True)
-    value, shared, kind = ranges.range_m[first].copy(), rows[first].copy(), alike[first].copy()
-    rise = stretches.rise[first].copy()
+    columns = np.column_stack([ranges.range_m, stretches.rise, alike, rows])
+    shared = columns[first]
     order = np.argsort(of, kind="stable")
-    groups = np.split(order, np.searchsorted(of[order], np.arange(1, len(first))))
-    for link, group in enumerate(groups):
+    for link, group in enumerate(np.split(order, np.searchsorted(of[order], np.arange(1, len(first))))):
         if len(group) > 1:
-            value[link] = np.median(ranges.range_m[group])
-            rise[link] = np.median(stretches.rise[group])
-            shared[link] = np.median(rows[group], axis=0)
-            kind[link] = int(np.median(alike[group]))
+            shared[link] = np.median(columns[group], axis=0)
     return Links(
-        knot[first],
-        ranges.anchor[first],
-        ahead[first],
-        value,
-        share[first],
-        rise,
-        shared,
-        kind,
-        of,
-        np.concatenate(knot_stretch),
-        np.concatenate(times),
-        stretches.at_rest,
+        knot=knot[first],
+        anchor=ranges.anchor[first],
+        ahead_s=ahead[first],
+        range_m=shared[:, 0],
+        share=share[first],
+        rise=shared[:, 1],
+        rows=shared[:, 3:],
+        alike=shared[:, 2].astype(np.intp),
+        of=of,
+        knot_stretch=np.concatenate(knot_stretch),
+        time_s=np.concatenate(times),
+        at_rest=stretches.at_rest,
     )
 
 

@@ -7,7 +7,7 @@ significant; otherwise all share one.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,7 +65,6 @@ WINDOW_S = 0.5
 MAX_WINDOWS = 12
 
 _SECOND_NS = 1_000_000_000
-_UNKNOWN = np.zeros(0)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -92,8 +91,8 @@ class SelfCalibration:
     tag_ids: tuple[int, ...]
     unobserved_m: float = 0.0
     own_sd_m: float
-    pseudo_m: NDArray[np.float64] = _UNKNOWN
-    pseudo_sd_m: NDArray[np.float64] = _UNKNOWN
+    pseudo_m: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    pseudo_sd_m: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     position_scatter_m: tuple[float, float] = (np.nan, np.nan)
 
     def found_without(self, left_out: NDArray[np.bool_]) -> SelfCalibration:

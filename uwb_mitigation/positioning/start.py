@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,8 +70,8 @@ def places(
     if len(range_m) < dims:
         return []
     x = _starts(anchors, range_m, height)
-    prior = _Prior.of(len(x), height)
-    x, cost, gradient, hessian = _descend(x, anchors, range_m, sd_m, model, prior)
+    problem = _Problem.of(len(x), anchors, range_m, sd_m, model, height)
+    x, cost, gradient, hessian = problem.descend(x)
     # A start that has not converged is no solution, unless none has.
     step = np.linalg.solve(hessian + 1e-9 * np.eye(3), gradient[..., None])[..., 0]
     arrived = np.einsum("ni,ni->n", step, gradient) < _STUCK
@@ -89,17 +89,16 @@ def places(
         outside = np.flatnonzero(keep & (excess != 0.0).any(axis=1))
         if len(outside):
             # Optima just outside, because of range errors: find the best positions on the wall.
-            walls = prior.take(outside).with_walls(area.clip(x[outside]), excess[outside] != 0.0)
-            x[outside], cost[outside], *_ = _descend(
-                area.clip(x[outside]), anchors, range_m, sd_m, model, walls
-            )
+            wall = area.clip(x[outside])
+            walls = problem.with_walls(outside, wall, excess[outside] != 0.0)
+            x[outside], cost[outside], *_ = walls.descend(wall)
             x = area.clip(x)
         keep &= cost <= cost[keep].min() + IMPLAUSIBLE
     result: list[Place] = []
     for i in np.flatnonzero(keep)[np.argsort(cost[keep])]:
         if any(_same(x[i], place) for place in result):
             continue
-        _, _, h, rows = _linearised(x[i : i + 1], anchors, range_m, sd_m, model, _Prior.of(1, height))
+        _, _, h, rows = problem.at(np.array([i])).linearised(x[i : i + 1])
         covariance = np.linalg.inv(h[0] + 1e-6 * np.eye(3))
         # Of the damped normal equations, ranges only: their errors move the position by this much.
         gain = covariance @ (rows[0] / sd_m[:, None]).T
@@ -108,50 +107,84 @@ def places(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Prior:
-    """Independent priors of n positions: mean float64 (n, 3) and inverse variance (n, 3), 0 = none."""
+class _Problem:
+    """k ranges, or n sets of k ranges (n, k), and independent priors of n positions.
 
+    Attributes:
+        anchors: float64 (k, 3). range_m, sd_m: float64 (k,) or (n, k).
+        mean, information: float64 (n, 3), priors and their inverse variances; 0: no prior.
+    """
+
+    anchors: NDArray[np.float64]
+    range_m: NDArray[np.float64]
+    sd_m: NDArray[np.float64]
+    model: Model
     mean: NDArray[np.float64]
     information: NDArray[np.float64]
 
     @classmethod
-    def of(cls, count: int, height: Height | None) -> _Prior:
-        prior = cls(np.zeros((count, 3)), np.zeros((count, 3)))
+    def of(
+        cls,
+        count: int,
+        anchors: NDArray[np.float64],
+        range_m: NDArray[np.float64],
+        sd_m: NDArray[np.float64],
+        model: Model,
+        height: Height | None,
+    ) -> _Problem:
+        """The problem of that number of positions."""
+        mean, information = np.zeros((2, count, 3))
         if height is not None:
-            prior.mean[:, 2], prior.information[:, 2] = height.value, 1.0 / height.sd**2
-        return prior
+            mean[:, 2], information[:, 2] = height.value, 1.0 / height.sd**2
+        return cls(anchors, range_m, sd_m, model, mean, information)
 
-    def take(self, rows: NDArray[np.intp]) -> _Prior:
-        return _Prior(self.mean[rows], self.information[rows])
+    def at(self, rows: NDArray[np.intp]) -> _Problem:
+        """The same ranges with the priors of those positions."""
+        return replace(self, mean=self.mean[rows], information=self.information[rows])
 
-    def with_walls(self, wall: NDArray[np.float64], held: NDArray[np.bool_]) -> _Prior:
-        """The same, with the coordinates `held` bool (n, 3) at the walls."""
-        return _Prior(np.where(held, wall, self.mean), np.where(held, 1.0 / _WALL_SD_M**2, self.information))
+    def with_walls(
+        self, rows: NDArray[np.intp], wall: NDArray[np.float64], held: NDArray[np.bool_]
+    ) -> _Problem:
+        """`at`, with the coordinates `held` bool (n, 3) at the walls."""
+        own = self.at(rows)
+        information = np.where(held, 1.0 / _WALL_SD_M**2, own.information)
+        return replace(own, mean=np.where(held, wall, own.mean), information=information)
 
+    def descend(
+        self, x: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Levenberg-Marquardt from n starts: positions, loss, gradient and Hessian."""
+        damping = np.full(len(x), 1e-2)
+        cost, gradient, hessian, _ = self.linearised(x)
+        for _ in range(_STEPS):
+            diagonal = np.einsum("nii->ni", hessian)
+            damped = hessian + (damping[:, None] * diagonal + 1e-9)[:, :, None] * np.eye(3)
+            trial = x - np.linalg.solve(damped, gradient[..., None])[..., 0]
+            found = self.linearised(trial)
+            better = found[0] <= cost
+            x = np.where(better[:, None], trial, x)
+            cost = np.where(better, found[0], cost)
+            gradient = np.where(better[:, None], found[1], gradient)
+            hessian = np.where(better[:, None, None], found[2], hessian)
+            damping = np.clip(np.where(better, damping / 4.0, damping * 8.0), 1e-8, 1e8)
+        return x, cost, gradient, hessian
 
-def _descend(
-    x: NDArray[np.float64],
-    anchors: NDArray[np.float64],
-    range_m: NDArray[np.float64],
-    sd_m: NDArray[np.float64],
-    model: Model,
-    prior: _Prior,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Levenberg-Marquardt from n starts: positions, loss, gradient and Hessian."""
-    damping = np.full(len(x), 1e-2)
-    cost, gradient, hessian, _ = _linearised(x, anchors, range_m, sd_m, model, prior)
-    for _ in range(_STEPS):
-        diagonal = np.einsum("nii->ni", hessian)
-        damped = hessian + (damping[:, None] * diagonal + 1e-9)[:, :, None] * np.eye(3)
-        trial = x - np.linalg.solve(damped, gradient[..., None])[..., 0]
-        found = _linearised(trial, anchors, range_m, sd_m, model, prior)
-        better = found[0] <= cost
-        x = np.where(better[:, None], trial, x)
-        cost = np.where(better, found[0], cost)
-        gradient = np.where(better[:, None], found[1], gradient)
-        hessian = np.where(better[:, None, None], found[2], hessian)
-        damping = np.clip(np.where(better, damping / 4.0, damping * 8.0), 1e-8, 1e8)
-    return x, cost, gradient, hessian
+    def linearised(
+        self, x: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Loss (n,), its gradient (n, 3), a Gauss-Newton Hessian (n, 3, 3), and weighted rows (n, k, 3) at positions x."""
+        away = x[:, None] - self.anchors
+        distance = np.sqrt(np.einsum("nki,nki->nk", away, away))
+        z = (self.range_m - distance) / self.sd_m
+        slope = away / np.maximum(distance, 1e-6)[..., None] / self.sd_m[..., None]
+        rows = slope * self.model.weight(z)[..., None]
+        apart = x - self.mean
+        pull = self.information * apart
+        cost = self.model.loss(z).sum(axis=1) + 0.5 * np.einsum("ni,ni->n", pull, apart)
+        gradient = pull - np.einsum("nki,nk->ni", rows, z)
+        hessian = np.einsum("nki,nkj->nij", rows, slope)
+        hessian[:, [0, 1, 2], [0, 1, 2]] += self.information
+        return cost, gradient, hessian, rows
 
 
 def _same(position: NDArray[np.float64], place: Place) -> bool:
@@ -182,31 +215,6 @@ def _starts(
     return starts
 
 
-def _linearised(
-    x: NDArray[np.float64],
-    anchors: NDArray[np.float64],
-    range_m: NDArray[np.float64],
-    sd_m: NDArray[np.float64],
-    model: Model,
-    prior: _Prior,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Loss (n,), its gradient (n, 3), a Gauss-Newton Hessian (n, 3, 3), and weighted rows (n, k, 3) at places x."""
-    away = x[:, None] - anchors
-    distance = np.sqrt(np.einsum("nki,nki->nk", away, away))
-    z = (range_m - distance) / sd_m
-    weight = model.weight(z)
-    slope = away / np.maximum(distance, 1e-6)[..., None] / sd_m[..., None]
-    rows = slope * weight[..., None]
-    cost = model.loss(z).sum(axis=1)
-    gradient = -np.einsum("nki,nk->ni", rows, z)
-    hessian = np.einsum("nki,nkj->nij", rows, slope)
-    apart = x - prior.mean
-    pull = prior.information * apart
-    cost = cost + 0.5 * np.einsum("ni,ni->n", pull, apart)
-    hessian[:, [0, 1, 2], [0, 1, 2]] += prior.information
-    return cost, gradient + pull, hessian, rows
-
-
 def snapshot(anchors: AnchorMap, ranges: Ranges, height: Height | None = None) -> Track:
     """Return the baseline: least squares on the latest range of each anchor, without motion model or robust loss.
 
@@ -220,14 +228,15 @@ def snapshot(anchors: AnchorMap, ranges: Ranges, height: Height | None = None) -
     present = np.isfinite(latest)
     range_m, sd_m = np.where(present, latest, 0.0), np.where(present, 1.0, np.inf)
     reach = np.nanmedian(latest, axis=1, keepdims=True) if len(latest) else np.zeros((0, 1))
-    prior = _Prior.of(len(latest), None if height is None else Height(height.value, 1e-4))
+    exact = None if height is None else Height(height.value, 1e-4)
+    problem = _Problem.of(len(latest), anchors.position, range_m, sd_m, _LEAST_SQUARES, exact)
     best, least = np.zeros((len(latest), 3)), np.full(len(latest), np.inf)
     sides = np.array([[0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, -0.5]]) + 0.01
     for side in sides:
         x = anchors.position.mean(axis=0) + reach * side
         if height is not None:
             x[:, 2] = height.value
-        x, cost, *_ = _descend(x, anchors.position, range_m, sd_m, _LEAST_SQUARES, prior)
+        x, cost, *_ = problem.descend(x)
         # Mirror images have equal costs: rounding must not choose between them.
         better = cost < least - 1e-6
         best, least = np.where(better[:, None], x, best), np.where(better, cost, least)

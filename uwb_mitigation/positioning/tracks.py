@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -95,6 +95,10 @@ class Track:
             np.array([e.covariance for e in estimates], np.float64).reshape(-1, 6, 6),
         )
 
+    def __iter__(self) -> Iterator[Estimate]:
+        columns = (self.stamp_ns.tolist(), self.position, self.velocity, self.covariance)
+        return (Estimate(*row) for row in zip(*columns, strict=True))
+
     def take(self, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> Track:
         """The estimates at `index`."""
         return Track(self.stamp_ns[index], self.position[index], self.velocity[index], self.covariance[index])
@@ -176,11 +180,8 @@ class TrackErrors:
 
     def as_json(self) -> dict[str, float | int | None]:
         """The keys of `track --json`; unknown values are null."""
-        keys = ("rmse", "median", "p95", "coverage95", "nees_per_dof", "exceeded", "height_rmse")
-        values = {_JSON_KEYS.get(key, key): getattr(self, key) for key in keys}
-        return {"epochs": self.epochs} | {
-            name: value if math.isfinite(value) else None for name, value in values.items()
-        }
+        values = {_JSON_KEYS.get(key, key): value for key, value in asdict(self).items()}
+        return {name: value if math.isfinite(value) else None for name, value in values.items()}
 
 
 _JSON_KEYS = {

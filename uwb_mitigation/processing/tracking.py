@@ -1,4 +1,4 @@
-"""The tracks of a recording: as told live, smoothed afterwards, and by snapshots, each judged where truth is known."""
+"""The tracks of a recording: live, smoothed, and by snapshots, each with its errors if the truth is known."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.bag.poses import encode_odometry, encode_pose, tag_frame, tag_topic
+from uwb_mitigation.bag.poses import encode_odometry, encode_place, encode_pose, tag_frame, tag_topic
 from uwb_mitigation.bag.topics import (
     ODOMETRY,
     ODOMETRY_TRUTH,
@@ -26,7 +26,6 @@ from uwb_mitigation.positioning.smoother import Smoother, smooth
 from uwb_mitigation.positioning.start import snapshot
 from uwb_mitigation.positioning.tracks import (
     NO_ERRORS,
-    Estimate,
     Ranges,
     Track,
     TrackErrors,
@@ -56,9 +55,9 @@ class TagTracks:
 
     Attributes:
         recording: what they were made of.
-        live: an estimate for each range, without looking ahead. smoothed: ten a second, looking ahead.
+        live: an estimate for each range, from it and earlier ones. smoothed: ten a second, from all ranges.
         snapshot: least squares on raw ranges.
-        live_errors, smoothed_errors, snapshot_errors: beside the truth.
+        errors: of each of the `KINDS`.
         hdop: median horizontal dilution of precision along the track.
         disagreeing: rows of anchors whose ranges contradict the track of the other anchors.
         warnings: What makes the tracks unreliable; empty = nothing found.
@@ -68,24 +67,22 @@ class TagTracks:
     live: Track
     smoothed: Track
     snapshot: Track
-    live_errors: TrackErrors
-    smoothed_errors: TrackErrors
-    snapshot_errors: TrackErrors
+    errors: dict[str, TrackErrors]
     hdop: float
     disagreeing: list[int]
     warnings: list[str]
 
     def as_json(self, anchors: AnchorMap) -> dict[str, object]:
         """A tag of `track --json`; the errors of each kind of track only if the truth is known."""
-        errors = {kind: getattr(self, f"{kind}_errors").as_json() for kind in KINDS}
+        errors = {kind: self.errors[kind].as_json() for kind in KINDS}
         return {
             "tag_id": self.recording.tag_id,
             "ranges": len(self.recording.ranges),
-            **self.smoothed_errors.as_json(),
-            "epochs": self.smoothed_errors.epochs or len(self.smoothed),
+            **errors["smoothed"],
+            "epochs": self.errors["smoothed"].epochs or len(self.smoothed),
             "warnings": self.warnings,
             "disagreeing": [anchors.anchors[row].id for row in self.disagreeing],
-            **(errors if self.live_errors.epochs else {}),
+            **(errors if self.errors["live"].epochs else {}),
         }
 
 
@@ -103,9 +100,9 @@ def track_tag(recording: TagRecording, setting: Setting) -> TagTracks:
     smoothed = smooth(setting, ranges, live)
     snapshots = snapshot(anchors, recording.raw, setting.height)
     truth = recording.truth
-    of_live, of_smoothed, of_snapshots = (
-        track_errors(track, truth) if len(truth) else NO_ERRORS for track in (live, smoothed, snapshots)
-    )
+    tracks = zip(KINDS, (live, smoothed, snapshots), strict=True)
+    errors = {kind: track_errors(track, truth) for kind, track in tracks}
+    of_live, of_smoothed = errors["live"], errors["smoothed"]
     sample = smoothed.position[:: max(len(smoothed) // 200, 1)]
     used = anchors.position[np.unique(ranges.anchor)]
     level = setting.height is not None or setting.heights is not None
@@ -139,9 +136,7 @@ def track_tag(recording: TagRecording, setting: Setting) -> TagTracks:
         for row in locator.disagreeing()
         if contradicts(anchors, ranges, row, TagLocator(setting).run(ranges.take(ranges.anchor != row)))
     ]
-    return TagTracks(
-        recording, live, smoothed, snapshots, of_live, of_smoothed, of_snapshots, hdop, odd, warnings
-    )
+    return TagTracks(recording, live, smoothed, snapshots, errors, hdop, odd, warnings)
 
 
 def contradicts(anchors: AnchorMap, ranges: Ranges, row: int, others: Track) -> bool:
@@ -267,24 +262,18 @@ def write_tracks(bag: BagWriter, tracks: list[TagTracks]) -> None:
 def _messages(one: TagTracks, several: bool) -> Iterator[tuple[int, str, str, bytes]]:
     tag = one.recording.tag_id
     name, frame = (tag if several else None), tag_frame(tag)
-    for estimate in _estimates(one.live):
+    for estimate in one.live:
         data = encode_odometry(estimate, child_frame_id=frame)
         yield estimate.stamp_ns, tag_topic(ODOMETRY, name), ODOMETRY_TYPE, data
-    for estimate in _estimates(one.smoothed):
+    for estimate in one.smoothed:
         yield estimate.stamp_ns, tag_topic(POSE_SMOOTHED, name), POSE_TYPE, encode_pose(estimate)
     truth = one.recording.truth
-    for stamp, place in zip(truth.stamp_ns.tolist(), truth.position, strict=True):
-        exact = Estimate(stamp, place, np.zeros(3), np.zeros((6, 6)))
-        yield stamp, ODOMETRY_TRUTH, ODOMETRY_TYPE, encode_odometry(exact, child_frame_id=frame)
-
-
-def _estimates(track: Track) -> list[Estimate]:
-    columns = zip(track.stamp_ns.tolist(), track.position, track.velocity, track.covariance, strict=True)
-    return [Estimate(*row) for row in columns]
+    for stamp, position in zip(truth.stamp_ns.tolist(), truth.position.tolist(), strict=True):
+        yield stamp, ODOMETRY_TRUTH, ODOMETRY_TYPE, encode_place(position, tag, stamp)
 
 
 def tum(track: Track) -> str:
-    """A track in TUM's format: stamp in s, position, orientation as a quaternion (none: ranges do not tell it)."""
+    """Return a track in TUM's format: stamp in s, position, and the identity as orientation, which is unobservable."""
     lines = (
         f"{stamp // 1_000_000_000}.{stamp % 1_000_000_000:09d} {x:.6f} {y:.6f} {z:.6f} 0 0 0 1\n"
         for stamp, (x, y, z) in zip(track.stamp_ns.tolist(), track.position.tolist(), strict=True)
