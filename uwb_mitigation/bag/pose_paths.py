@@ -1,11 +1,12 @@
-"""Where a robot's own localisation says that the robot was: positions and orientations from a topic of a bag.
+"""Poses of a robot's own localisation: positions and orientations from a topic of a bag.
 
-Messages are decoded by the types that the bag itself declares, so that no interface package need be installed.
+Messages are decoded with the types that the bag itself declares, so that no interface package is needed.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwb_mitigation.bag.poses import POSITION_TYPES, tag_of_frame
+from uwb_mitigation.bag.reader import BagReader, Channel
 from uwb_mitigation.bag.topics import (
     ODOMETRY_TRUTH,
     ODOMETRY_TYPE,
@@ -29,15 +31,14 @@ from uwb_mitigation.positioning.tracks import Heights, TruePath
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
-    from uwb_mitigation.bag.reader import BagReader, Channel, RawMessage
 
-MOST_POSES = 2_000_000
+MAX_POSES = 2_000_000
 MOVES_M = 0.05
 """An antenna whose position in the robot's frame changes more has no lever arm."""
 
 HEIGHT_TYPES = (RANGE_SENSOR_TYPE, ODOMETRY_TYPE, POSE_TYPE)
 _READABLE_TYPES = tuple(dict.fromkeys((*POSITION_TYPES, TF_TYPE, *HEIGHT_TYPES)))
-_MOST_FRAMES = 64
+_MAX_FRAMES = 64
 _NANOSECONDS = 1_000_000_000
 _Row = tuple[int, float, float, float, float, float, float, float]
 
@@ -48,8 +49,6 @@ def read_truth(path: Path, topic: str = ODOMETRY_TRUTH) -> dict[int | None, True
     Raises:
         RecordingError: the bag cannot be read, or the topic has another type.
     """
-    from uwb_mitigation.bag.reader import BagReader
-
     bag = BagReader(path)
     if topic not in bag.topics:
         return {}
@@ -71,8 +70,6 @@ def read_bodies(path: Path, topic: str, frames: tuple[str, str] | None = None) -
     Raises:
         RecordingError: the bag cannot be read, has no such topic or frame, or its messages cannot be used.
     """
-    from uwb_mitigation.bag.reader import BagReader
-
     bag = BagReader(path)
     where = f"{path}, topic {topic}"
     _check_topic(path, bag.topics, topic, (*POSITION_TYPES, TF_TYPE))
@@ -95,14 +92,12 @@ def read_bodies(path: Path, topic: str, frames: tuple[str, str] | None = None) -
 
 def _bodies(bag: BagReader, topic: str, where: str, *, oriented: bool = True) -> dict[str, PosePath]:
     """{child frame: poses}; `oriented`: messages without an orientation are left out."""
-    decode = _Decoder(where)
     rows: dict[str, list[_Row]] = {}
-    for message in bag.messages([topic]):
-        decoded = decode(message)
+    for decoded in _decoded(bag, [topic], where):
         pose = decoded.pose if hasattr(decoded.pose, "position") else decoded.pose.pose
         row = _row(decoded.header.stamp, pose.position, pose.orientation if oriented else None)
         child = _frame(getattr(decoded, "child_frame_id", ""))
-        if row is not None and (child in rows or len(rows) < _MOST_FRAMES):
+        if row is not None and (child in rows or len(rows) < _MAX_FRAMES):
             rows.setdefault(child, []).append(row)
     if oriented and not rows:
         rows[""] = []
@@ -115,8 +110,6 @@ def read_lever_arm(path: Path, base: str, frame: str) -> tuple[float, float, flo
     Raises:
         RecordingError: the frame moves relative to the robot.
     """
-    from uwb_mitigation.bag.reader import BagReader
-
     bag = BagReader(path)
     topics = [name for name in (TF, TF_STATIC) if bag.topics.get(name) == TF_TYPE]
     where = f"{path}, {' and '.join(topics)}"
@@ -134,13 +127,12 @@ def read_lever_arm(path: Path, base: str, frame: str) -> tuple[float, float, flo
 
 def _edges(bag: BagReader, topics: list[str], where: str) -> dict[str, dict[str, list[_Row]]]:
     """{child frame: {parent frame: transforms}}."""
-    decode = _Decoder(where)
     edges: dict[str, dict[str, list[_Row]]] = {}
-    for message in bag.messages(topics):
-        for one in decode(message).transforms:
+    for decoded in _decoded(bag, topics, where):
+        for one in decoded.transforms:
             row = _row(one.header.stamp, one.transform.translation, one.transform.rotation)
             child = _frame(one.child_frame_id)
-            if row is not None and (child in edges or len(edges) < _MOST_FRAMES):
+            if row is not None and (child in edges or len(edges) < _MAX_FRAMES):
                 edges.setdefault(child, {}).setdefault(_frame(one.header.frame_id), []).append(row)
     return edges
 
@@ -158,15 +150,11 @@ def read_heights(path: Path, topic: str, sd_m: float = 0.1) -> Heights:
     Raises:
         RecordingError: The bag cannot be read, has no such topic, or the topic contains no valid height.
     """
-    from uwb_mitigation.bag.reader import BagReader
-
     bag = BagReader(path)
     where = f"{path}, topic {topic}"
     _check_topic(path, bag.topics, topic, HEIGHT_TYPES)
-    decode = _Decoder(where)
     rows: dict[int, tuple[float, float]] = {}
-    for message in bag.messages([topic]):
-        decoded = decode(message)
+    for decoded in _decoded(bag, [topic], where):
         if bag.topics[topic] == RANGE_SENSOR_TYPE:
             height, variance = float(decoded.range), float(getattr(decoded, "variance", 0.0))
             valid = decoded.min_range <= height <= decoded.max_range
@@ -194,43 +182,35 @@ def _check_topic(path: Path, topics: dict[str, str], topic: str, types: tuple[st
     raise RecordingError(what, where=str(path), valid=valid)
 
 
-class _Decoder:
-    """Decodes messages by the schemas of their channels."""
-
-    def __init__(self, where: str) -> None:
-        self._where = where
-        self._stores: dict[int, tuple[Typestore, str]] = {}
-        self._count = 0
-
-    def __call__(self, message: RawMessage) -> Any:
-        self._count += 1
-        if self._count > MOST_POSES:
-            raise RecordingError(
-                f"more than {MOST_POSES} messages", where=self._where, valid="a shorter recording"
-            )
+def _decoded(bag: BagReader, topics: list[str], where: str) -> Iterator[Any]:
+    """Decode the messages of topics by the schemas of their channels."""
+    stores: dict[int, tuple[Typestore, str]] = {}
+    for count, message in enumerate(bag.messages(topics)):
+        if count >= MAX_POSES:
+            raise RecordingError(f"more than {MAX_POSES} messages", where=where, valid="a shorter recording")
         key = id(message.channel)
-        if key not in self._stores:
-            self._stores[key] = self._store(message.channel)
-        store, name = self._stores[key]
+        if key not in stores:
+            stores[key] = _store(message.channel, where)
+        store, name = stores[key]
         try:
-            return store.deserialize_cdr(message.data, name)
+            decoded = store.deserialize_cdr(message.data, name)
         except Exception as error:  # Of no common type.
-            raise RecordingError(f"a message is damaged: {error}", where=self._where) from error
+            raise RecordingError(f"a message is damaged: {error}", where=where) from error
+        yield decoded
 
-    def _store(self, channel: Channel) -> tuple[Typestore, str]:
-        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-        name = channel.schema.name if channel.schema is not None else ""
-        if channel.schema is None or name not in _READABLE_TYPES:
-            raise RecordingError(
-                f"messages of type {name!r}", where=self._where, valid=", ".join(_READABLE_TYPES)
-            )
-        store = get_typestore(Stores.EMPTY)
-        try:
-            store.register(get_types_from_msg(channel.schema.data.decode(), name))
-        except Exception as error:  # Of no common type.
-            raise RecordingError(f"the type {name} cannot be read: {error}", where=self._where) from error
-        return store, name
+def _store(channel: Channel, where: str) -> tuple[Typestore, str]:
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    name = channel.schema.name if channel.schema is not None else ""
+    if channel.schema is None or name not in _READABLE_TYPES:
+        raise RecordingError(f"messages of type {name!r}", where=where, valid=", ".join(_READABLE_TYPES))
+    store = get_typestore(Stores.EMPTY)
+    try:
+        store.register(get_types_from_msg(channel.schema.data.decode(), name))
+    except Exception as error:  # Of no common type.
+        raise RecordingError(f"the type {name} cannot be read: {error}", where=where) from error
+    return store, name
 
 
 def _frame(name: str) -> str:

@@ -13,9 +13,11 @@ from uwb_mitigation.commands import console
 from uwb_mitigation.commands.checks import check_output
 from uwb_mitigation.commands.console import JsonOption, say, show_table, warn
 from uwb_mitigation.commands.positioning import (
+    AnchorsOption,
     AreaOption,
     HeightOption,
     HeightSdOption,
+    HeightTopicOption,
     OffsetOption,
     area_of,
     height_of,
@@ -51,12 +53,7 @@ def calibrate(
             help="Bundle to write; its offsets go beside it, X.offsets.yaml.",
         ),
     ],
-    anchors: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="Where the anchors are; without it, the first BAG's own X.anchors.yaml."
-        ),
-    ] = None,
+    anchors: AnchorsOption = None,
     height: HeightOption = None,
     height_sd: HeightSdOption = 0.1,
     area: AreaOption = None,
@@ -93,14 +90,7 @@ def calibrate(
             help="With --truth-topic: estimate the lever arm, starting from that value. Needs a drive with turns.",
         ),
     ] = False,
-    height_topic: Annotated[
-        str | None,
-        typer.Option(
-            metavar="TOPIC",
-            help="Measured height of the tag, in place of --height: sensor_msgs/Range, nav_msgs/Odometry or "
-            "geometry_msgs/PoseWithCovarianceStamped.",
-        ),
-    ] = None,
+    height_topic: HeightTopicOption = None,
     stamp_offset: OffsetOption = 0.0,
     report: Annotated[
         Path | None,

@@ -39,7 +39,7 @@ AnchorsOption = Annotated[
     typer.Option(
         "--anchors",
         metavar="FILE",
-        help="Positions of the anchors (format: docs/background/positioning.md). Default: X.anchors.yaml of BAG.",
+        help="Positions of the anchors (format: docs/background/positioning.md). Default: X.anchors.yaml of the first BAG.",
     ),
 ]
 HeightOption = Annotated[
@@ -53,8 +53,7 @@ HeightTopicOption = Annotated[
         "--height-topic",
         metavar="TOPIC",
         help="Topic of BAG with the measured height of the tag's antenna: sensor_msgs/Range (height above z = 0), "
-        "nav_msgs/Odometry or geometry_msgs/PoseWithCovarianceStamped. --height-sd is used where a message has no "
-        "variance.",
+        "nav_msgs/Odometry or geometry_msgs/PoseWithCovarianceStamped. --height-sd is used if a message has no variance.",
     ),
 ]
 AreaOption = Annotated[
@@ -238,8 +237,6 @@ def heights_of(
     bag: Path, topic: str | None, sd: float, height: float | None, recorded: RecordedRanges
 ) -> Heights | None:
     """Read the heights of --height-topic."""
-    from uwb_mitigation.bag.pose_paths import read_heights
-
     if topic is None:
         return None
     if height is not None:
@@ -247,6 +244,8 @@ def heights_of(
     if len(recorded.tags) > 1:
         tags = ", ".join(format_id(tag.tag_id) for tag in recorded.tags)
         raise ParameterError(f"--height-topic with the tags {tags}", valid="a bag with one tag")
+    from uwb_mitigation.bag.pose_paths import read_heights
+
     return read_heights(bag, topic, sd)
 
 

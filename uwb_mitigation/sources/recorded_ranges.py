@@ -1,9 +1,9 @@
-"""The ranges of a bag by tag, in columns, as positioning takes them; and where the tags truly were."""
+"""The ranges of a bag by tag, in columns for positioning, and the true positions of the tags."""
 
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,14 +25,13 @@ from uwb_mitigation.positioning.tracks import Ranges, TruePath
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TagRecording:
-    """What a bag holds of one tag.
+    """The ranges of one tag in a bag.
 
     Attributes:
-        tag_id: of all of it.
-        raw: ranges as measured, of unknown variance.
-        ranges: the corrected ones where the bag has such, with their variances; else the raw ones.
-        corrected: whether `ranges` are.
-        truth: where the tag was; empty = not known.
+        raw: ranges as measured, with unknown variances.
+        ranges: corrected ranges with their variances, if the bag contains any; otherwise the raw ranges.
+        corrected: whether `ranges` are corrected.
+        truth: true positions; empty: unknown.
     """
 
     tag_id: int
@@ -55,6 +54,7 @@ class RecordedRanges:
     skipped: Counter[str]
 
 
+_Key = tuple[int, int, int, int]
 _Row = tuple[int, int, float, float, float]
 _DTYPE = np.dtype([("s", "i8"), ("a", "i8"), ("r", "f8"), ("v", "f8"), ("p", "f8")])
 
@@ -70,14 +70,18 @@ def read_ranges(path: Path, anchors: AnchorMap, stamp_offset_s: float = 0.0) -> 
     Raises:
         RecordingError: the bag cannot be read, or has no range of an anchor in the map.
     """
-    bag = BagReader(path)
-    raw: dict[int, list[_Row]] = {}
-    corrected: dict[int, list[_Row]] = {}
-    strangers: Counter[int] = Counter()
-    skipped: Counter[str] = Counter()
-    checked: set[int] = set()
-    powers: dict[tuple[int, int, int, int], float] = {}
-    offset_ns = round(stamp_offset_s * 1e9)
+    bag, offset_ns = BagReader(path), round(stamp_offset_s * 1e9)
+    raw, corrected = defaultdict[int, list[_Row]](list), defaultdict[int, list[_Row]](list)
+    strangers, skipped, checked = Counter[int](), Counter[str](), set[int]()
+    powers: dict[_Key, float] = {}
+
+    def add(table: dict[int, list[_Row]], key: _Key, value: float, variance: float, power: float) -> bool:
+        row = anchors.index.get(key[2])
+        if row is None or not (math.isfinite(value) and value >= 0.0) or variance == math.inf:
+            return False
+        table[key[1]].append((key[0] + offset_ns, row, value, variance, power))
+        return True
+
     for message in bag.messages((RANGE_RAW, RANGE_CORRECTED)):
         is_raw = message.channel.topic == RANGE_RAW
         if id(message.channel) not in checked:
@@ -87,25 +91,24 @@ def read_ranges(path: Path, anchors: AnchorMap, stamp_offset_s: float = 0.0) -> 
             if is_raw:
                 measured = decode_range(message.data)
                 key = (measured.stamp_ns, measured.tag_id, measured.anchor_id, measured.sequence)
-                value, variance, table = measured.range_m, math.nan, raw
-                powers[key] = power = measured.cir.rx_power_dbm
+                powers[key] = measured.cir.rx_power_dbm
+                row = (measured.range_m, math.nan, powers[key])
             else:
                 found, made = decode_corrected(message.data)
                 key = (found.stamp_ns, found.tag_id, found.anchor_id, found.sequence)
-                value, variance, table = made.range_m, made.variance_m2, corrected
-                power = powers.get(key, math.nan)
+                row = (made.range_m, made.variance_m2, powers.get(key, math.nan))
                 if key not in powers:
-                    # A bag of corrected ranges alone: what was measured is in them.
-                    _add(raw, key, made.range_raw_m, math.nan, math.nan, anchors, offset_ns)
+                    # A bag without raw ranges: corrected ranges contain the measured ones.
+                    add(raw, key, made.range_raw_m, math.nan, math.nan)
         except RecordingError as error:
             skipped[error.what] += 1
             continue
-        if key[2] not in anchors.index:
-            strangers[key[2]] += is_raw or not raw
-        elif not (math.isfinite(value) and value >= 0.0) or variance == math.inf:
-            skipped["range that is not valid"] += is_raw or not raw
-        else:
-            _add(table, key, value, variance, power, anchors, offset_ns)
+        if not add(raw if is_raw else corrected, key, *row):
+            is_new = is_raw or not raw
+            if key[2] not in anchors.index:
+                strangers[key[2]] += is_new
+            else:
+                skipped["range that is not valid"] += is_new
     if not raw and not corrected:
         place = ", ".join(map(str, sorted(anchors.index)))
         seen = ", ".join(map(str, sorted(strangers))) or "none"
@@ -122,20 +125,6 @@ def read_ranges(path: Path, anchors: AnchorMap, stamp_offset_s: float = 0.0) -> 
         usable = _columns(tag, corrected[tag]) if tag in corrected else measured_ranges
         tags.append(TagRecording(tag, measured_ranges, usable, tag in corrected, truths.get(tag, nowhere)))
     return RecordedRanges(tags, strangers, skipped + bag.oddities)
-
-
-def _add(
-    table: dict[int, list[_Row]],
-    key: tuple[int, int, int, int],
-    value: float,
-    variance: float,
-    power: float,
-    anchors: AnchorMap,
-    offset_ns: int,
-) -> None:
-    row = anchors.index.get(key[2])
-    if row is not None and math.isfinite(value) and value >= 0.0:
-        table.setdefault(key[1], []).append((key[0] + offset_ns, row, value, variance, power))
 
 
 def _columns(tag_id: int, rows: list[_Row]) -> Ranges:
