@@ -113,7 +113,7 @@ class Tag:
     latest_ns: int = 0
 
     def add_height(self, height_m: float, variance_m2: float) -> None:
-        """Take in the tag's height at the time of its latest range; one that is not finite is skipped."""
+        """Update with the tag's height at the time of its latest range; a height that is not finite is skipped."""
         if not (math.isfinite(height_m) and math.isfinite(variance_m2)):
             return
         # A variance of 0 means unknown in ROS.
@@ -127,7 +127,7 @@ class Fleet:
 
     Attributes:
         anchors: those of the setting.
-        tags: by their numbers, in the order in which they were heard.
+        tags: {tag id: tag}, in the order of their first ranges.
         strangers: ranges of anchors that are not on the map, {anchor id: count}.
         invalid: ranges that were not finite, or negative.
     """
@@ -142,10 +142,10 @@ class Fleet:
     def add(
         self, tag_id: int, anchor_id: int, stamp_ns: int, range_m: float, variance_m2: float
     ) -> tuple[Tag, Estimate | None] | None:
-        """Take in a range.
+        """Update with a range.
 
         Returns:
-            Its tag, and where that is now, as far as known; None where the range was left out.
+            The tag and its estimate (None: unknown); None: the range was skipped.
         """
         row = self.anchors.index.get(anchor_id)
         if row is None:
@@ -171,7 +171,7 @@ class Fleet:
         return tag, estimate
 
     def warnings(self) -> list[str]:
-        """What a person should know, in words; empty = all is well."""
+        """Return warnings for the diagnostics; empty: none."""
         found = []
         if self.strangers:
             names = ", ".join(format_id(identity) for identity in sorted(self.strangers)[:5])
@@ -194,15 +194,15 @@ class Fleet:
         rows = locator.heard(SILENCE_S)
         needed = self._setting.dims
         if len(rows) < needed:
-            return f"no place: {len(rows)} anchors heard, {needed} or more needed"
-        kind = shape(self.anchors.position[rows])
-        text = f"no place: {locator.candidates} are plausible" if locator.candidates > 1 else "no place yet"
+            return f"position unknown: {len(rows)} anchors received, {needed} or more needed"
+        kind, count = shape(self.anchors.position[rows]), locator.candidates
+        text = f"position ambiguous: {count} candidates" if count > 1 else "position unknown"
         if kind is Shape.LINE or (kind is Shape.PLANE and self._setting.height is None):
-            text += f"; the anchors heard are {kind.value}: give a height, or an area that leaves one place"
+            text += f"; the received anchors are {kind.value}: set height, or an area that contains one candidate only"
         return text
 
     def facts(self) -> dict[str, object]:
-        """Numbers for the diagnostics."""
+        """Return the values for the diagnostics."""
         found: dict[str, object] = {
             "anchors": len(self.anchors),
             "tags": len(self.tags),

@@ -16,7 +16,7 @@ FLAT = 0.05
 
 
 class Shape(enum.Enum):
-    """How a set of anchors is spread."""
+    """Arrangement of a set of anchors."""
 
     POINT = "fewer than two places"
     LINE = "all on a line"
@@ -26,23 +26,15 @@ class Shape(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class Geometry:
-    """What a metre of range error becomes.
+    """Dilution of precision, horizontal and vertical; inf: the ranges do not determine the position."""
 
-    Attributes:
-        anchors: how many were heard.
-        hdop, vdop: dilution of precision, horizontal and vertical; inf = the ranges do not tell.
-        shape: of the anchors that were heard.
-    """
-
-    anchors: int
     hdop: float
     vdop: float
-    shape: Shape
 
 
 @dataclass(frozen=True, slots=True)
 class Height:
-    """The tag's height, as far as known: m, and its standard deviation."""
+    """The tag's height and its standard deviation, m."""
 
     value: float
     sd: float = 0.1
@@ -56,7 +48,7 @@ class Height:
 
 @dataclass(frozen=True, slots=True)
 class Area:
-    """Where a tag can be: two opposite corners of a box, m."""
+    """The box in which tags can be: two opposite corners, m."""
 
     low: tuple[float, float, float]
     high: tuple[float, float, float]
@@ -69,10 +61,10 @@ class Area:
 
     @classmethod
     def parse(cls, text: str) -> Area | None:
-        """The box that `X,Y,Z,X,Y,Z` says, m; None where it is empty.
+        """Parse `X,Y,Z,X,Y,Z`, m; an empty text gives None.
 
         Raises:
-            ParameterError: it says no box.
+            ParameterError: the text is no box.
         """
         if not text:
             return None
@@ -83,7 +75,7 @@ class Area:
         return cls((x, y, z), (x1, y1, z1))
 
     def holds(self, position: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Which of the places float64 (n, 3) lie in it."""
+        """Return which positions float64 (n, 3) are inside."""
         inside: NDArray[np.bool_] = np.all((position >= self.low) & (position <= self.high), axis=-1)
         return inside
 
@@ -103,7 +95,7 @@ def directions(
 
 
 def shape(position: NDArray[np.float64]) -> Shape:
-    """How anchors at float64 (m, 3) are spread."""
+    """Return the arrangement of anchors at float64 (m, 3)."""
     if len(position) < 2:
         return Shape.POINT
     spread = np.linalg.svd(position - position.mean(axis=0), compute_uv=False)
@@ -115,21 +107,19 @@ def shape(position: NDArray[np.float64]) -> Shape:
 
 
 def geometry(anchors: NDArray[np.float64], position: NDArray[np.float64], *, level: bool = False) -> Geometry:
-    """The geometry of anchors float64 (m, 3) as seen from a position float64 (3,).
+    """Return the dilution of precision for anchors float64 (m, 3) at a position float64 (3,).
 
     Args:
         anchors, position: m.
-        level: the height is known: only x and y are sought, and VDOP is 0.
+        level: the height is known: only x and y are estimated, and VDOP is 0.
     """
-    kind = shape(anchors)
     slope = directions(position, anchors)[0][:, : 2 if level else 3]
     normal = slope.T @ slope
     size = len(normal)
     if len(anchors) < size or np.linalg.cond(normal) > 1e10:
-        return Geometry(len(anchors), math.inf, 0.0 if level else math.inf, kind)
+        return Geometry(math.inf, 0.0 if level else math.inf)
     spread = np.diag(np.linalg.inv(normal))
-    vdop = 0.0 if level else math.sqrt(spread[2])
-    return Geometry(len(anchors), math.sqrt(spread[0] + spread[1]), vdop, kind)
+    return Geometry(math.sqrt(spread[0] + spread[1]), 0.0 if level else math.sqrt(spread[2]))
 
 
 PROTECTION = 3.29
@@ -137,10 +127,10 @@ PROTECTION = 3.29
 
 
 def protection_levels(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Bounds float64 (..., 3) of the error in x, y and z that covariances (..., d, d) stand for, m.
+    """Return bounds float64 (..., 3) of the errors in x, y and z, m, from covariances (..., d, d).
 
-    The covariance holds the considered offsets too, so that these bounds cover errors that last. They are a
-    statement of the model, not a certified integrity figure as in aviation.
+    The covariance includes the considered offsets, so that these bounds cover persisting errors. They follow from the model
+    and are no certified integrity figures as in aviation.
     """
     variances = np.einsum("...ii->...i", covariance)[..., :3]
     levels: NDArray[np.float64] = PROTECTION * np.sqrt(variances)

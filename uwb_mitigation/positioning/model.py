@@ -1,9 +1,8 @@
-"""How a tag moves and how its ranges err: the assumptions that filter, smoothers and survey share.
+"""Motion and range error models of filter, smoothers and survey.
 
-A range errs in three parts. White noise is small: two ranges in a row differ by a centimetre or two. What
-is left persists while the tag moves about a metre, since multipath and obstacles do: a Gauss-Markov process of
-each pair. And one offset stays, of the tag's own antenna delay. A published variance tells the first two
-together.
+The error of a range has three parts. White noise is small: two ranges in a row differ by a centimetre or two. Multipath and
+obstacles persist while the tag moves by about a metre: a Gauss-Markov process of each pair. The antenna delay of the tag is
+a constant offset. A published variance is the sum of the first two.
 """
 
 from __future__ import annotations
@@ -19,21 +18,20 @@ from uwb_mitigation.errors import ParameterError
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """How a tag moves and how its ranges err.
+    """Motion and range error model.
 
     Attributes:
         acceleration: root of the spectral density of white acceleration, m/s^1.5: 1 for robots, people and
             drones (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 6.2.2).
         speed: standard deviation of an unknown velocity, m/s in each axis.
-        range_sd: of a range that comes without a variance, m: 0.10 is what the DW1000's data sheet promises.
-        white: part of a range's variance that is new with each range.
+        range_sd: of a range without a variance, m: 0.10 is the value of the DW1000's data sheet.
+        white: share of white noise in the variance of a range.
         persistence_s: time constant of the other part: a metre at walking speed.
-        offset_sd: of the offset that a tag's ranges share, m. 0.15: of a radio whose antenna delay nobody calibrated,
-            ranges are off by 0.30 m at three sigma (Decawave APS014), and a pair has two.
-        pair_sd: of what an anchor's own antenna delay adds to that, m; the smoother and what learns offsets have
-            it, the live filter does not.
-        long, short: thresholds of a normalised residual, beyond which a range that is too long or too short
-            weighs less. Obstacles only lengthen: too long is doubted sooner.
+        offset_sd: of the common offset of a tag's ranges, m. 0.15: without calibration of its antenna delay, a radio changes
+            ranges by 0.30 m at three sigma (Decawave APS014), and a pair has two radios.
+        pair_sd: of the additional offset of each anchor, m; the live filter does not use it.
+        long, short: thresholds of the normalised residual of a range that is too long or too short, from which its weight
+            decreases. Obstacles lengthen ranges only, so `long` is the smaller one.
     """
 
     acceleration: float = 1.0
@@ -66,21 +64,21 @@ class Model:
                 )
 
     def inflation(self, z: float) -> float:
-        """By how much the variance of a range grows whose normalised residual is `z` (measured - expected)."""
+        """Return the factor of the variance of a range with the normalised residual `z` (measured - expected)."""
         limit = self.long if z > 0.0 else self.short
         return 1.0 if abs(z) <= limit else (z / limit) ** 2
 
     def weight(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
-        """What is left of the weight of ranges with normalised residuals `z`: the inverse of `inflation`."""
+        """Return the factor of the weights of ranges with normalised residuals `z`: the inverse of `inflation`."""
         ratio = np.where(z > 0.0, self.long, self.short) / np.maximum(np.abs(z), 1e-12)
         weight: NDArray[np.float64] = np.minimum(1.0, ratio) ** 2
         return weight
 
     def loss(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Minus the log likelihood of normalised residuals, whose derivative is z * weight(z).
+        """Return minus the log likelihood of normalised residuals; its derivative is z * weight(z).
 
-        Huber's parabola within the thresholds; beyond, a logarithm, where Huber has a line: a reflection that is
-        ten metres off pulls less than one that is one metre off, yet never nothing.
+        Within the thresholds it is a parabola, beyond them a logarithm (Huber's loss: a line), so that a large outlier has less
+        influence than a small one.
         """
         limit = np.where(z > 0.0, self.long, self.short)
         ratio = np.maximum(np.abs(z) / limit, 1e-12)
@@ -102,20 +100,20 @@ class Model:
 
 
 MAD_TO_SD = 1.4826
-LEAST_ALIKE = 20
-"""Errors that tell by how much such ranges err."""
+MIN_ALIKE = 20
+"""Minimum number of errors for an estimate of their standard deviation."""
 
 
 def scatter_of(error_m: NDArray[np.float64], alike: NDArray[np.intp], kinds: int) -> NDArray[np.float64]:
-    """Of each kind the deviation from 0, float64 (kinds,), m: 1.48 times the median of errors (n,) without sign.
+    """Return the standard deviation of each kind of errors (n,), float64 (kinds,), m: 1.48 times the median absolute error.
 
     Args:
-        alike: int (n,), the kind of each. Where one has fewer than `LEAST_ALIKE`, that of all counts.
+        alike: int (n,), the kind of each. A kind with fewer than `MIN_ALIKE` errors gets the value of all errors.
     """
     found = np.full(kinds, MAD_TO_SD * float(np.median(np.abs(error_m))))
     for kind in range(kinds):
         own = error_m[alike == kind]
-        if len(own) >= LEAST_ALIKE:
+        if len(own) >= MIN_ALIKE:
             found[kind] = MAD_TO_SD * float(np.median(np.abs(own)))
     return found
 

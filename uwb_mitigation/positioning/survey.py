@@ -48,17 +48,18 @@ _SAME_LOSS = 0.2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurveyResult:
-    """Attributes:
-    anchors: where they were found, with deviations.
-    moved_m: float64 (m,), how far from the guesses, the whole laid onto them as well as it fits.
-    misplaced: rows of anchors too far from their guesses.
-    swapped: pairs of rows that stand in each other's places.
-    track: of the tag.
-    loss: mean robust loss of a range; below about 0.5 the anchors explain the ranges.
-    alternatives: {row: float64 (3,)}, other positions of single anchors that explain the ranges as well.
-    undetermined: rows of anchors that the ranges place, relative to the others, to no better than `MISPLACED_M`.
-    mirrored: the mirror image of all anchors fits the guesses about as well; ranges never decide between the two.
-    explained: whether it is below `UNEXPLAINED`: else the anchors may be anywhere.
+    """The result.
+
+    Attributes:
+        anchors: at the estimated positions, with standard deviations.
+        moved_m: float64 (m,), distances from the guesses after alignment.
+        misplaced: rows of anchors too far from their guesses.
+        swapped: pairs of rows that are swapped in the file.
+        track: of the tag.
+        loss: mean robust loss of a range.
+        alternatives: {row: float64 (3,)}, other positions of single anchors that explain the ranges equally well.
+        undetermined: rows of anchors whose standard deviation relative to the others exceeds `MISPLACED_M`.
+        mirrored: the mirror image of all anchors fits the guesses about as well; ranges never decide between the two.
     """
 
     anchors: AnchorMap
@@ -73,6 +74,7 @@ class SurveyResult:
 
     @property
     def explained(self) -> bool:
+        """Whether the loss is below `UNEXPLAINED`: otherwise the anchors may be anywhere."""
         return self.loss < UNEXPLAINED
 
     def as_json(self) -> dict[str, object]:
@@ -114,19 +116,21 @@ def survey(
         raise DatasetError(f"{len(used)} anchors were heard", valid=f"{needed} or more for a survey")
     if shape(guesses.position[used]) is Shape.LINE:
         raise DatasetError("the anchors are all on a line", valid="one or more beside it")
-    deviations = _deviations(guesses, off_m, fixed)
+    deviations = np.array(
+        [sd if row in fixed else max(off_m, sd) for row, sd in enumerate(guesses.sd.tolist())]
+    )
+    identity = np.arange(len(guesses))
 
-    def fit(order: list[int]) -> tuple[Smoothed, float]:
+    def fit(order: NDArray[np.intp]) -> tuple[Smoothed, float]:
         start = guesses.moved(guesses.position[order], deviations)
         found = _fit(replace(setting, anchors=start), ranges)
         sd = np.sqrt(model.variances(ranges.variance_m2))
         return found, float(model.loss(found.residual_m / sd).mean())
 
-    order, swapped = _unswap(setting, ranges, off_m)
-    identity = list(range(len(guesses)))
+    order = _unswap(setting, ranges, off_m)
     found, loss = fit(identity)
-    if swapped:
-        # In a square, swapped opposite anchors are the mirror image of the right ones: ranges do not tell the two apart.
+    if (order != identity).any():
+        # In a square, swapped opposite anchors are the mirror image of the right ones: ranges cannot distinguish the two.
         exchanged, lower = fit(order)
         here, mirror = (
             _misfit(fitted.anchors[used], guesses.position[used], mirrored=side)
@@ -138,11 +142,12 @@ def survey(
         if better and mirror > limit:
             found, loss = exchanged, lower
         else:
-            swapped = []
+            order = identity
+    swapped = np.flatnonzero(order != identity).tolist()
     sd = np.sqrt(np.einsum("ijij->i", found.anchor_covariance) / 3.0)
     moved = displacements(found.anchors[used], guesses.position[used])
     distance = np.zeros(len(guesses))
-    # A level drive tells heights badly, and they were taken as measured.
+    # A drive at constant height hardly determines heights: they were taken as measured.
     axes = slice(0, setting.dims)
     distance[used] = np.linalg.norm(moved[:, axes], axis=1)
     relative = np.linalg.norm(_relative_sd(found.anchors, found.anchor_covariance)[:, axes], axis=1)
@@ -155,14 +160,13 @@ def survey(
         if other is not None
     }
     plain, mirror = (
-        _misfit(found.anchors[used], guesses.position[order if swapped else identity][used], mirrored=side)
-        for side in (False, True)
+        _misfit(found.anchors[used], guesses.position[order][used], mirrored=side) for side in (False, True)
     )
     return SurveyResult(
         guesses.moved(found.anchors, np.maximum(sd, 1e-3)),
         distance,
         odd,
-        swapped,
+        [(swapped[0], swapped[1])] if swapped else [],
         found.track,
         loss,
         alternatives,
@@ -235,10 +239,10 @@ def _alternative(setting: Setting, fit: Smoothed, ranges: Ranges, row: int) -> N
 
 
 def displacements(found: NDArray[np.float64], guessed: NDArray[np.float64]) -> NDArray[np.float64]:
-    """By how much each anchor (m, 3) is off its guess once the whole was laid onto the guesses.
+    """Return the displacement of each anchor (m, 3) from its guess, after alignment with the guesses.
 
-    Shifted, and turned about the vertical, by robust least squares: one anchor that is off does not carry the
-    others with it.
+    The alignment, a translation and a rotation about the vertical, is a robust fit: one misplaced anchor does not displace the
+    others.
     """
     weight = np.ones(len(found))
     off = found - guessed
@@ -257,7 +261,11 @@ def displacements(found: NDArray[np.float64], guessed: NDArray[np.float64]) -> N
 
 
 def _relative_sd(position: NDArray[np.float64], covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Deviations (m, 3) of anchors (m, 3) with a covariance (m, 3, m, 3), where a shift or turn of the whole is none."""
+    """Return standard deviations (m, 3) of anchors (m, 3), except for translation and rotation of the whole.
+
+    Args:
+        covariance: float64 (m, 3, m, 3).
+    """
     m = len(position)
     whole = np.zeros((m, 3, 4))
     whole[:, [0, 1, 2], [0, 1, 2]] = 1.0
@@ -270,22 +278,17 @@ def _relative_sd(position: NDArray[np.float64], covariance: NDArray[np.float64])
     return sd
 
 
-def _deviations(guesses: AnchorMap, off_m: float, fixed: frozenset[int]) -> NDArray[np.float64]:
-    return np.array([sd if row in fixed else max(off_m, sd) for row, sd in enumerate(guesses.sd.tolist())])
-
-
-def _unswap(setting: Setting, ranges: Ranges, off_m: float) -> tuple[list[int], list[tuple[int, int]]]:
-    """Return the order of guesses that explains the first minute best, of all with one pair swapped; and that pair."""
+def _unswap(setting: Setting, ranges: Ranges, off_m: float) -> NDArray[np.intp]:
+    """Return the order of guesses that explains the first minute best, of all with at most one pair swapped, int (m,)."""
     guesses, model = setting.anchors, setting.model
     trial = ranges.take(ranges.stamp_ns < ranges.stamp_ns[0] + _TRIAL_NS)
     if len(trial) > _TRIAL_RANGES:
-        # Chosen by chance: every so-manieth might always be of the same anchor.
+        # A random choice: with a constant stride, all might be from the same anchor.
         chosen = np.random.default_rng(1).choice(len(trial), _TRIAL_RANGES, replace=False)
         trial = trial.take(np.sort(chosen))
-    rows = [int(row) for row in np.unique(trial.anchor)]
-    identity = list(range(len(guesses)))
+    identity = np.arange(len(guesses))
 
-    def loss(order: list[int]) -> float:
+    def loss(order: NDArray[np.intp]) -> float:
         tried = replace(setting, anchors=guesses.moved(guesses.position[order], np.full(len(guesses), off_m)))
         track = TagLocator(tried).run(trial)
         if len(track) < 2:
@@ -293,13 +296,12 @@ def _unswap(setting: Setting, ranges: Ranges, off_m: float) -> tuple[list[int], 
         fit = Smoother(tried, trial).fit(track, iterations=4)
         return float(model.loss(fit.residual_m / np.sqrt(off_m**2 / 4.0 + model.range_sd**2)).mean())
 
-    best, order, swapped = loss(identity), identity, list[tuple[int, int]]()
+    best, order = loss(identity), identity
     if best < _SWAP_GAIN:
-        return order, swapped
-    for a, b in itertools.combinations(rows, 2):
-        trial_order = identity.copy()
-        trial_order[a], trial_order[b] = b, a
-        found = loss(trial_order)
-        if found < best - _SWAP_GAIN:
-            best, order, swapped = found, trial_order, [(a, b)]
-    return order, swapped
+        return order
+    for a, b in itertools.combinations(np.unique(trial.anchor).tolist(), 2):
+        swapped = identity.copy()
+        swapped[[a, b]] = b, a
+        if (found := loss(swapped)) < best - _SWAP_GAIN:
+            best, order = found, swapped
+    return order
