@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from uwb_mitigation.commands import console
-from uwb_mitigation.commands.console import JsonOption, Table
-from uwb_mitigation.commands.model_tables import say
+from uwb_mitigation.commands.console import JsonOption, Table, say
 from uwb_mitigation.errors import ParameterError, parse_id
 from uwb_mitigation.files import write_whole
 
