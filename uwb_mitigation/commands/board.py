@@ -13,6 +13,7 @@ import typer
 
 from uwb_mitigation.commands import console
 from uwb_mitigation.commands.console import JsonOption, Table, say
+from uwb_mitigation.errors import ParameterError, parse_id
 from uwb_mitigation.files import write_whole
 
 if TYPE_CHECKING:
