@@ -17,7 +17,7 @@ demo: setup  ## replay RECORDING=path (default: simulated) through driver and mi
 	@$(IN_ROS) $(VENV)/bin/python -m uwb_mitigation.entry demo $(if $(RECORDING),--recording '$(RECORDING)') $(if $(RATE),--rate $(RATE))
 
 firmware-demo: setup  ## the firmware in an emulated Cortex-M4 as the driver's board (RECORDING=path), compared with the host
-	@$(IN_ROS) $(VENV)/bin/python -m uwb_mitigation.entry firmware-demo $(if $(RECORDING),--recording '$(RECORDING)')
+	@$(IN_ROS) $(VENV)/bin/python -m benchmarks firmware-demo $(if $(RECORDING),--recording '$(RECORDING)')
 
 radio-demo: setup  ## a tag and four anchors on modelled DW1000s, in the simulated flat: raw, corrected and true ranges
 	@$(IN_ROS) $(VENV)/bin/python -m benchmarks radio-demo

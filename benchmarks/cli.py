@@ -1,6 +1,6 @@
 """Measure nodes, positions, radios, firmware and links: `python -m benchmarks NAME [--json FILE]`, in a checkout.
 
-Two more commands start emulated EVB1000s (`emulate-evb1000`) and the demonstration with radios (`radio-demo`).
+Three more commands: emulated EVB1000s (`emulate-evb1000`) and two demonstrations (`radio-demo`, `firmware-demo`).
 """
 
 from __future__ import annotations
@@ -266,6 +266,20 @@ def radio_demo(
     from benchmarks import radio_demo as demo
 
     raise typer.Exit(demo.main(seconds))
+
+
+@app.command("firmware-demo")
+def firmware_demo(
+    recording: Annotated[
+        Path | None,
+        typer.Option(help="DecaRanging log, folder of logs, or MCAP bag. Default: a simulated recording."),
+    ] = None,
+    count: Annotated[int, typer.Option(min=1, max=100_000, help="Maximum number of ranges.")] = 200,
+) -> None:
+    """Run the firmware in an emulator as a board of the driver, and compare its ranges with the host's."""
+    from benchmarks import firmware_demo as demo
+
+    raise typer.Exit(demo.main(recording, count))
 
 
 def nodes_result(figures: Mapping[str, Figures]) -> dict[str, Any]:

@@ -51,7 +51,7 @@ def test_help_lists_every_parameter_without_ros(node: str, tables: list[str], tm
         ("driver", signal.SIGTERM),
         ("monitor", signal.SIGINT),
         ("command_line", signal.SIGINT),
-        ("firmware-demo", signal.SIGINT),
+        ("demo", signal.SIGINT),
         ("benchmarks", signal.SIGINT),
     ],
 )

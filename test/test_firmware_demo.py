@@ -17,7 +17,7 @@ pytestmark = pytest.mark.ros
 
 @pytest.mark.skipif(bool(MISSING), reason=f"{', '.join(MISSING)} not found: {toolchain.APT}")
 def test_the_demo_ends_by_itself_with_every_range_equal_to_the_hosts():
-    command = [sys.executable, "-m", "uwb_mitigation.entry", "firmware-demo", "--count", "20"]
+    command = [sys.executable, "-m", "benchmarks", "firmware-demo", "--count", "20"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=240, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "20 corrected by the board, 0 lost" in done.stdout

@@ -20,9 +20,9 @@ import pytest
 from firmware_models import Exported
 
 from benchmarks import emulator, random_networks
+from benchmarks.emulated_firmware import EmulatedFirmware, window_of
 from uwb_mitigation.firmware_export import toolchain
 from uwb_mitigation.firmware_export.compiling import WARNINGS, firmware_folder, run
-from uwb_mitigation.firmware_export.emulated_firmware import EmulatedFirmware, window_of
 from uwb_mitigation.firmware_export.export import export_bundle
 from uwb_mitigation.firmware_export.toolchain import Kernels, Target
 from uwb_mitigation.link import messages

@@ -1,6 +1,6 @@
 """The executables, and how a signal ends them while they load. Standard library only: the rest loads in a second.
 
-python -m uwb_mitigation.entry NODE --ros-args ..., or DEMO ...
+python -m uwb_mitigation.entry NODE --ros-args ..., or demo ...
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from collections.abc import Callable
 from typing import Any
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-_DEMOS = {"demo": "replay", "firmware-demo": "firmware_demo"}
 
 
 def driver() -> None:
@@ -98,7 +97,7 @@ def _end(number: int, frame: Any) -> None:
 
 if __name__ == "__main__":
     name = sys.argv.pop(1)
-    if name in _DEMOS:
-        run_program(f"uwb_mitigation.demos.{_DEMOS[name]}")
+    if name == "demo":
+        run_program("uwb_mitigation.demo")
     else:
         _node(name)

@@ -1,6 +1,6 @@
 """`make firmware-demo`: the firmware in an emulated Cortex-M4 corrects, the driver publishes, the host compares.
 
-python -m uwb_mitigation.entry firmware-demo [--recording PATH] [--count N]
+python -m benchmarks firmware-demo [--recording PATH] [--count N]
 """
 
 from __future__ import annotations
@@ -12,16 +12,14 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-import typer
 from diagnostic_msgs.msg import DiagnosticArray
 from rich.console import Console
 from uwb_mitigation_msgs.msg import RangeCorrected
 
+from benchmarks.emulated_firmware import EmulatedFirmware
 from uwb_mitigation.errors import UwbMitigationError
-from uwb_mitigation.firmware_export.emulated_firmware import EmulatedFirmware
 from uwb_mitigation.link import messages as wire
 from uwb_mitigation.measurement import CorrectedRange, Origin, RangeMeasurement
 from uwb_mitigation.mitigation import Mitigation
@@ -100,16 +98,6 @@ def run(console: Console, measured: Sequence[RangeMeasurement]) -> list[str]:
     return nodes.failures
 
 
-def firmware_demo(
-    recording: Annotated[
-        Path | None,
-        typer.Option(help="DecaRanging log, folder of logs, or MCAP bag. Default: a simulated recording."),
-    ] = None,
-    count: Annotated[int, typer.Option(min=1, max=100_000, help="Ranges to measure, at most.")] = 200,
-) -> None:
-    """Run the firmware in an emulator as a board of the driver, and compare its ranges with the host's."""
-    raise typer.Exit(run_demo("firmware-demo", lambda console: run(console, numbered(recording, count))))
-
-
-def main() -> None:
-    typer.run(firmware_demo)
+def main(recording: Path | None, count: int) -> int:
+    """Run the demonstration and return its exit code."""
+    return run_demo("firmware-demo", lambda console: run(console, numbered(recording, count)))
