@@ -17,7 +17,6 @@ SLOW_MODULES = {
     *("uwb_mitigation.firmware_export.compiling", "compilers", "command_line"),
     # Many drives are simulated and solved for.
     *("uwb_mitigation.positioning.self_calibration", "uwb_mitigation.positioning.survey"),
-    "image_source_rooms",
 }
 SLOW_FIXTURES = {"ros", "browser", "air", "apartment", "apartment_reading"}
 

@@ -248,18 +248,6 @@ def test_a_row_that_is_drawn_anew_within_a_click_is_chosen(
     browser.wait("it in the table", lambda: browser.cell("9.500"))
 
 
-def test_a_click_on_an_anchor_shows_its_pair(browser: Browser, view: View, server: ViewerServer) -> None:
-    fill(view)
-    opened(browser, server)
-    assert selected(browser, "pairs") == selected(browser, "map") == [0]
-    browser.click_figure("map", 8.0, 0.0)
-    browser.wait("the other CIR", lambda: max(browser.column("cir", "magnitude")) == 2000.0)
-    browser.wait("its row", lambda: selected(browser, "pairs") == selected(browser, "map") == [1])
-    browser.click_figure("map", 4.0, 1.5)
-    browser.wait("the anchor to stay chosen", lambda: selected(browser, "map") == [1])
-    assert browser.complaints() == []
-
-
 def test_the_newest_exchange_is_on_top(browser: Browser, view: View, server: ViewerServer) -> None:
     fill(view, upto_s=0.5)
     opened(browser, server)
@@ -310,14 +298,6 @@ def test_what_no_radio_measured_spoils_nothing(browser: Browser, view: View, ser
     assert max(map(abs, ends)) < 100
     summary = browser.run("return Bokeh.documents[0].get_model_by_name('summary').text")
     assert "mean absolute error 0.350 m raw, 0.250 m corrected" in summary
-
-
-def test_a_cir_keeps_no_message_in_memory() -> None:
-    samples = np.ones(1_000_000, np.int16)[:2032]
-    trace = Trace.of(Cir(samples, Encoding.COMPLEX_INT16, 730, 750.4))
-    assert trace is not None
-    assert trace.cir.samples.base is None
-    assert len(trace.magnitude) == 1016
 
 
 def drawn(document: Document, figure: str, column: str) -> np.ndarray:
@@ -450,14 +430,6 @@ def test_nothing_is_cut_off_on_a_narrow_screen(
     cut = "return cells.filter((e) => e.scrollWidth > e.clientWidth).map((e) => e.textContent)"
     assert browser.run(IN_TABLE + cut) == []
     browser.screenshot(f"viewer_{width}")
-
-
-def test_a_screenshot_is_an_image(browser: Browser, view: View, server: ViewerServer) -> None:
-    fill(view)
-    opened(browser, server)
-    browser.run("document.getElementById('screenshot').click()")
-    assert browser.run("return window.lastScreenshot").startswith("data:image/png;base64,")
-    assert browser.complaints() == []
 
 
 def test_a_page_that_is_left_is_forgotten(browser: Browser, view: View, server: ViewerServer) -> None:
