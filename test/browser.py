@@ -101,24 +101,6 @@ class Browser:
             text,
         )
 
-    def click_figure(self, name: str, x: float, y: float) -> None:
-        """Click where a named figure of Bokeh's shows a place, as a mouse does."""
-        from selenium.webdriver.common.action_chains import ActionChains
-
-        left, top = self.run(
-            "const view = Bokeh.index.find_one(Bokeh.documents[0].get_model_by_name(arguments[0]));"
-            "view.el.scrollIntoView({block: 'center'});"
-            "const at = view.canvas_view.el.getBoundingClientRect();"
-            "return [at.x + view.frame.x_scale.compute(arguments[1]), at.y + view.frame.y_scale.compute(arguments[2])]",
-            name,
-            x,
-            y,
-        )
-        actions = ActionChains(self.driver)
-        actions.w3c_actions.pointer_action.move_to_location(round(left), round(top))
-        actions.w3c_actions.pointer_action.click()
-        actions.perform()
-
     def complaints(self) -> list[str]:
         """What the page wrote to the console beyond information."""
         return [line["message"] for line in self.driver.get_log("browser") if line["level"] != "INFO"]

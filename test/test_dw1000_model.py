@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 import subprocess
 from pathlib import Path
@@ -22,8 +21,6 @@ from uwb_mitigation.firmware_export.compiling import WARNINGS, c_compiler, run
 pytestmark = NEEDS_CC
 
 ID = bytes.fromhex("3001cade")
-TX_GOOD = dw.TXFRB | dw.TXPRS | dw.TXPHS | dw.TXFRS
-MS_TICKS = 63_897_600
 
 
 @pytest.fixture
@@ -61,57 +58,6 @@ class TestClocks:
         assert driver.read(0x00) == ID
 
 
-class TestTransmitter:
-    def test_a_start_while_the_receiver_is_on_is_dropped_without_a_word(self, air: Air):
-        a, b, *_ = pair(air)
-        a.listen()
-        before = a.status
-        a.send(dw.DATA)
-        a.host.delay(2e-3)
-        assert a.status == before
-        a.off()
-        assert exchange(a, b) & dw.RXFCG
-
-    def send_with_lead(self, a: Driver, lead_us: float, *, held_clock: bool = False) -> int:
-        """A delayed send with so much time from the command to the start of the preamble; the status after it."""
-        header = (128 + 8) * 65024
-        a.load(dw.DATA)
-        a.set(0x36, 0, 0x20 if held_clock else 0x00, 1)
-        write_s = (5 + 1) * 8 / a.hz + (4 + 1) * 8 / a.hz + 2 * 96e-9
-        now = a.host.now() + write_s
-        # The counter began at 0, with the air.
-        wanted = math.ceil((now + lead_us * 1e-6) / dw.TICK_S + header)
-        a.set(0x0A, 0, -(-wanted // 512) * 512 % dw.WRAP, 5)
-        a.command(dw.TXSTRT | dw.TXDLYS)
-        a.host.delay(5e-3)
-        status = a.status
-        a.off()
-        return status
-
-    @pytest.mark.parametrize(
-        ("lead_us", "told"),
-        [
-            (-400.0, dw.HPDWARN),
-            (-0.1, dw.HPDWARN),
-            (0.5, dw.TXPUTE),
-            (9.8, dw.TXPUTE),
-            (10.1, 0),
-            (10.3, 0),
-            (10.5, dw.TXFRS),
-        ],
-    )
-    def test_a_late_frame_is_told_or_lost(self, air: Air, lead_us: float, told: int):
-        a, *_ = pair(air)
-        assert self.send_with_lead(a, lead_us) & (dw.HPDWARN | dw.TXPUTE | dw.TXFRS) == told
-
-    def test_the_window_of_errata_tx_1_closes_with_the_clock_held(self, air: Air):
-        a, *_ = pair(air)
-        assert self.send_with_lead(a, 10.2) & dw.TXFRS == 0, (
-            "a driver without the work-around and a time-out hangs"
-        )
-        assert self.send_with_lead(a, 10.2, held_clock=True) & dw.TXFRS
-
-
 class TestReceiver:
     @pytest.mark.parametrize("error", ["header", "time-out"])
     def test_without_a_receiver_reset_after_an_error_the_next_stamp_is_wrong(self, air: Air, error: str):
@@ -137,17 +83,6 @@ class TestReceiver:
         b.reset_receiver()
         assert exchange(a, b) & dw.RXFCG
         assert flight_ticks(a, b) == pytest.approx(3.0 / dw.TICK_M, abs=1)
-
-
-class TestChannel:
-    def test_without_its_clocks_the_accumulator_reads_nothing(self, air: Air):
-        a, b, *_ = pair(air)
-        assert exchange(a, b) & dw.RXFCG
-        assert not any(b.accumulator(740, 20, clocks=False))
-        b.set(0x36, 0, 0x48, 1)
-        assert not any(b.read(0x25, 4 * 740, 81)[1:]), "FACE without AMCE"
-        b.set(0x36, 0, 0x8208, 2)
-        assert not any(b.read(0x25, 4 * 740, 81)[1:]), "AMCE without FACE"
 
 
 def test_a_driver_may_define_any_name_without_the_models_prefix(tmp_path: Path):

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from uwb_mitigation.errors import LinkError, ParameterError
+from uwb_mitigation.errors import LinkError
 from uwb_mitigation.link.connection import PortAddress
 from uwb_mitigation.link.emulated_board import EmulatedBoard
 from uwb_mitigation.link.events import Connected, Disconnected, Event, Loss
@@ -188,14 +188,6 @@ def test_closing_ends_a_wait_for_events_in_another_thread(link):
     assert events == [None]
 
 
-def test_closing_twice_does_no_harm_and_voids_what_waits(port):
-    wait_until(lambda: port.report().counts["frames"] > 20)
-    port.close()
-    port.close()
-
-    assert port.get(PATIENCE_S) is None
-
-
 def test_events_that_nobody_fetches_are_dropped_and_counted(board, link):
     port = BoardPort(PortAddress(str(link)), capacity=5)
     wait_until(lambda: port.report().counts["overflowed"] > 20)
@@ -218,12 +210,6 @@ def test_events_that_nobody_fetches_are_dropped_and_counted(board, link):
 def test_an_address_names_a_file_or_a_usb_device(text, address):
     assert PortAddress.parse(text) == address
     assert PortAddress.parse(str(address)) == address
-
-
-@pytest.mark.parametrize("text", ["", "COM3", "usb:", "usb:2341", "usb:xyz:1", "usb:12345:1", "usb:-1:1"])
-def test_any_other_address_is_refused(text):
-    with pytest.raises(ParameterError, match="usb:VENDOR:PRODUCT"):
-        PortAddress.parse(text)
 
 
 def test_a_usb_device_is_found_by_its_ids_and_serial_number(monkeypatch):

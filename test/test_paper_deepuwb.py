@@ -188,16 +188,6 @@ def test_other_files_are_rejected_by_name(tmp_path: Path, content: bytes) -> Non
 # --- rooms and splits ---
 
 
-def test_names_of_configurations_contain_room_and_materials() -> None:
-    for number, material in enumerate(rooms.MATERIALS):
-        name = rooms.configuration_of(3, "".join("1" if at == number else "0" for at in range(10)))
-        assert rooms.parse_configuration(name) == (3, (material,))
-    assert rooms.parse_configuration("deepuwb/room1/clear") == (1, ())
-    for name in ("", "deepuwb", "deepuwb/room5/wall", "deepuwb/room1/gold", "by the door"):
-        with pytest.raises(DatasetError):
-            rooms.parse_configuration(name)
-
-
 def test_the_splits_have_the_published_sizes() -> None:
     names = np.repeat([rooms.configuration_of(room, OBSTACLES[0]) for room in range(5)], rooms.ROOM_ROWS)
     for split, sizes in (("paper", (36_023, 13_210)), ("all_but_room_2", (41_948, 13_210))):

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from browser import Browser
 from command_line import run
 from model_material import dataset
 
@@ -152,31 +151,10 @@ def test_every_table_and_figure_is_there_and_refers_to_nothing_outside(full):
     assert "simulated data" in page.text[""]
 
 
-@pytest.mark.parametrize("width", [1280, 400])
-def test_nothing_is_cut_off(browser: Browser, full, tmp_path: Path, width: int):
-    (tmp_path / "report.html").write_text(full.html(), encoding="utf-8")
-    browser.open((tmp_path / "report.html").as_uri(), width)
-    assert browser.cut_off(width) == []
-    assert browser.complaints() == []
-    browser.screenshot(f"report_{width}")
-
-
 def test_the_same_data_gives_the_same_page_and_radio_data_is_not_called_simulated():
     plain = build(study()).html().split("</style>")[1]
     assert "simulated" not in plain.lower()
     assert build(study()).html().split("</style>")[1] == plain
-
-
-def test_parts_without_results_are_left_out_with_the_command_that_makes_them(no_cloud):
-    made = build(study("my logs"))
-    assert [*(one.id for one in made.tables), *(one.id for one in made.figures)] == [
-        "data",
-        "fig3",
-        "fig4a",
-        "fig4b",
-    ]
-    assert len(made.lacking) == 2
-    assert "--data 'my logs' " in made.lacking["Tables 1 and 2, Fig. 5"]
 
 
 def test_missing_measurements_and_estimates_are_marked(full):
@@ -219,24 +197,6 @@ def test_baselines_are_below_the_networks(no_cloud):
     assert row_of(made, "table1", "No correction")[7].value == 0.2
     assert row_of(made, "table1", "Median error in LOS")[7].kind == "missing"
     assert row_of(made, "table1", "L1 line")[7].kind == "none"
-
-
-def test_rooms_and_materials_group_deepuwb(no_cloud):
-    made = study()
-    names = [f"deepuwb/room{row % 5}/{('clear', 'wall')[row % 2]}" for row in range(len(made.dataset))]
-    built = build(replace(made, dataset=replace(made.dataset, configurations=np.array(names))))
-    assert set(built.figures[1].numbers["groups"]) == {row[0].text for row in built.tables[0].rows[:5]}
-    assert set(built.figures[2].numbers["groups"]) == {"none (LOS)", "wall"}
-    medium = row_of(built, "data", "medium room")
-    assert [cell.value for cell in medium if cell.kind == "paper"] == [13_210, 0.1242, 0.1642]
-
-
-def test_the_sample_of_each_condition_has_the_median_error(full):
-    made = study()
-    shown = full.figures[0].numbers["samples"]
-    assert [one["label"] for one in shown] == ["LOS", "NLOS"]
-    errors = np.sort(made.dataset.error_m[made.labels == "LOS"])
-    assert shown[0]["error_m"] == errors[(len(errors) - 1) // 2]
 
 
 def test_hostile_names_are_only_text():

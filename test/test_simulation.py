@@ -9,13 +9,9 @@ import pytest
 
 from uwb_mitigation.sources.simulation.channel import (
     FREE_SPACE_LOSS_1M_DB,
-    RESIDENTIAL_LOS,
-    RESIDENTIAL_NLOS,
     WAVELENGTH_M,
     Multipath,
     direct_power_db,
-    draw_diffuse_field,
-    propagate,
 )
 from uwb_mitigation.sources.simulation.radio import (
     EDGE_LEAD_TAPS,
@@ -54,28 +50,10 @@ def lone_paths(n: int, power_db: float, delay_ns: float = 0.0) -> Multipath:
 # --- channel ---------------------------------------------------------------------------------------
 
 
-def test_the_diffuse_field_holds_unit_power_and_no_ray_comes_before_the_straight_line() -> None:
-    for environment in (RESIDENTIAL_LOS, RESIDENTIAL_NLOS):
-        field = draw_diffuse_field(environment, 500, rng())
-        np.testing.assert_allclose(field.mean_power.sum(axis=1), 1.0)
-        assert field.delay_ns.min() >= 0.0
-        assert np.isfinite(field.delay_ns).all()
-
-
 def test_the_direct_path_loses_free_space_and_obstacles() -> None:
     power = direct_power_db(np.array([1.0, 10.0]), np.array([0.0, 6.0]))
     np.testing.assert_allclose(power, [-FREE_SPACE_LOSS_1M_DB, -FREE_SPACE_LOSS_1M_DB - 26.0])
     assert pytest.approx(44.5, abs=0.1) == FREE_SPACE_LOSS_1M_DB
-
-
-def test_mean_diffuse_power_out_of_sight_follows_the_path_loss_law() -> None:
-    n, e = 20_000, RESIDENTIAL_NLOS
-    field = draw_diffuse_field(e, 1, rng()).take(np.zeros(n, np.intp))
-    distance = np.full(n, 4.0)
-    paths = propagate(distance, np.full(n, 60.0), np.zeros(n), e, field, field.fade(rng()), rng())
-    diffuse_db = 10 * math.log10((np.abs(paths.gain[:, 1:]) ** 2).sum(axis=1).mean())
-    expected = -e.path_loss_db(distance)[0] + field.shadowing_db[0]
-    assert diffuse_db == pytest.approx(expected, abs=0.1)
 
 
 # --- scene -----------------------------------------------------------------------------------------

@@ -47,20 +47,6 @@ def _no_warnings():
         yield
 
 
-def test_the_features_are_levels_in_decibels():
-    window = np.zeros((1, 157), np.float32)
-    window[0, 6:9] = (0.5, 1.0, 0.75)
-    window[0, 50] = 0.9
-    found = features(window, Scaling.PREAMBLE, *(np.float32([value]) for value in (3.0, -80.0, -85.0)))
-    fourth = window.astype(float) ** 4
-    assert found[0, 0] == 3.0
-    assert found[0, 1] == pytest.approx(-80.0 + 20 * math.log10(3.0), abs=0.05)
-    assert found[0, 2] == 5.0
-    assert found[0, 3] == pytest.approx(10 * math.log10(fourth.sum()) + 80, abs=0.05)
-    assert found[0, 4] == pytest.approx(10 * math.log10(fourth[0, 6:9].sum()) + 85, abs=0.05)
-    assert found[0, 5] < -200.0
-
-
 @pytest.mark.parametrize("scaling", Scaling)
 def test_energy_before_the_first_path_needs_no_level(scaling):
     amplitude = np.zeros((1, 157), np.float32)
@@ -80,15 +66,6 @@ def test_distance_alone_is_not_strange_and_a_weaker_radio_is(tmp_path):
         for range_m, power in ((1.0, -72.0), (10.0, -92.0), (1.0, -92.0))
     )
     assert (near, far, weak) == (Status.OK, Status.OK, Status.OUT_OF_DISTRIBUTION)
-
-
-def test_the_score_is_the_largest_excess_in_margins():
-    scale = Strangeness(bands(range_m=Band(1.0, 6.0, 2.0), power_at_1m_dbm=Band(-90.0, -80.0, 4.0)).bands)
-    rows = [(3.0, -85.0), (7.0, -85.0), (7.0, -77.0), (3.0, -96.0), (math.nan, -85.0)]
-    values = np.array([(range_m, power, 0.0, 0.0, 0.0, 0.0) for range_m, power in rows], np.float32)
-    assert scale.score(values).tolist()[1:4] == [0.5, 0.75, 1.5]
-    assert scale.score(values)[0] <= 0
-    assert np.isnan(scale.score(values)[4])
 
 
 def test_the_variance_grows_with_the_predicted_error(tmp_path):
