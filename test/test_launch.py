@@ -134,6 +134,14 @@ def test_a_recording_that_has_ended_is_not_played_again(generate, one_process: s
     )
 
 
+@pytest.mark.parametrize("text", ["0xdeca010203040506", "'0xdeca010203040506'"])
+def test_an_address_of_64_bits_reaches_the_driver_as_a_text(generate, text: str):
+    said = {"source": "evb1000", "port": "/dev/ttyACM0", "radio.address": text, "radio.anchors": text}
+    (driver,) = (node for node in launch(generate, "uwb.launch.py", **said) if node.executable == "driver")
+    for name in ("radio.address", "radio.anchors"):
+        assert yaml.safe_load(settings(driver)[name]) == "0xdeca010203040506"
+
+
 def test_every_parameter_is_an_argument_and_reaches_its_node_with_its_type(generate):
     said = {"source": "serial", "port": "usb:2341:805a", "locate": "true", "viewer": "true"}
     arguments, _ = described(generate, "uwb.launch.py")

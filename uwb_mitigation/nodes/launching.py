@@ -104,8 +104,9 @@ def value_of(row: Parameter, text: str) -> Value:
     value: Any = text
     if row.or_number or not isinstance(row.default, str):
         value = _read(text)
-    if row.or_number and not isinstance(value, (int, float)):
-        value = text
+    if row.or_number and not (isinstance(value, (int, float)) and abs(value) < 1 << 63):
+        # ROS has no larger numbers: an address of 64 bits stays a text. It may be in quotes, as on the command line.
+        value = value if isinstance(value, str) and text[0] in "'\"" else text
     row.check(value)
     return float(value) if isinstance(row.default, float) else value
 
