@@ -133,7 +133,7 @@ def calibrate(
     known = load_anchors(anchors or anchors_file(bags[0]))
     source = bundle_for(None, bags[0])
     try:
-        site = _gather(bags, known, source, stamp_offset, height_topic)
+        site = _gather(bags, known, source, stamp_offset, height_topic, height_sd)
         if height_topic is not None and len(site.tags) > 1:
             raise ParameterError(f"--height-topic with {len(site.tags)} tags", valid="bags with one tag")
         for why, count in site.left_out.items():
@@ -188,7 +188,12 @@ def calibrate(
 
 
 def _gather(
-    bags: list[Path], anchors: AnchorMap, source: Bundle, stamp_offset: float, height_topic: str | None
+    bags: list[Path],
+    anchors: AnchorMap,
+    source: Bundle,
+    stamp_offset: float,
+    height_topic: str | None,
+    height_sd: float,
 ) -> SiteData:
     from contextlib import ExitStack
 
@@ -196,7 +201,7 @@ def _gather(
     from uwb_mitigation.evaluation.site_data import gather
     from uwb_mitigation.sources.opening import open_recording
 
-    heights = None if height_topic is None else [read_heights(bag, height_topic) for bag in bags]
+    heights = None if height_topic is None else [read_heights(bag, height_topic, height_sd) for bag in bags]
     with ExitStack() as stack, console.reading() as on_record:
         return gather(
             [stack.enter_context(open_recording(bag)) for bag in bags],
