@@ -58,9 +58,8 @@ def doctor(json: JsonOption = None) -> None:
     broken = [name for name, state, _ in findings if state == "broken"]
     console.write_json(json, {"ok": not broken, "findings": [finding._asdict() for finding in findings]})
     if broken:
-        raise UwbMitigationError(
-            f"broken: {', '.join(broken)}", valid="run make setup, or see docs/guides/installation.md"
-        )
+        remedy = "run make setup, or see docs/guides/installation.md"
+        raise UwbMitigationError(f"broken: {', '.join(broken)}", valid=remedy)
     console.out.print("No problems found.")
 
 
@@ -72,8 +71,7 @@ def examine() -> Iterator[Finding]:
     yield from _ports()
     yield _check("torch", partial(metadata.version, "torch"), "torch", "training: make setup-training")
     for tool, use in _TOOLS.items():
-        found = shutil.which(tool)
-        yield Finding(tool, "ok" if found else "optional", found or f"for {use}")
+        yield Finding(tool, "ok" if (found := shutil.which(tool)) else "optional", found or f"for {use}")
 
 
 def _check(name: str, look: Callable[[], str], distribution: str = "", purpose: str = "") -> Finding:
