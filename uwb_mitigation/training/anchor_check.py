@@ -1,4 +1,4 @@
-"""Errors in the anchors file that a localisation reveals: an anchor at another position, and two swapped anchors.
+"""Find errors in the anchors file with a localisation: a wrong anchor position, or two swapped anchors.
 
 The ranges of such an anchor look like ranges with an offset, but their error depends on the direction to the tag.
 """
@@ -19,7 +19,7 @@ from uwb_mitigation.positioning.anchor_errors import LARGER, LIKELIER, MISPLACED
 from uwb_mitigation.positioning.model import MAD_TO_SD
 
 INDEPENDENT_S = 2.0
-"""The errors of the ranges of an anchor within this time count as one."""
+"""Range errors of an anchor within this time count as one independent error."""
 
 MIN_GROUPS = 8
 """An anchor with fewer independent errors is not examined."""
@@ -33,7 +33,7 @@ class _AnchorRanges:
     """The ranges of one anchor.
 
     Attributes:
-        antenna: (n, 3), where the tag was, m. range_m: (n,). tag: int (n,).
+        antenna: (n, 3), position of the tag, m. range_m: (n,). tag: int (n,).
         weight: the number of independent errors, divided by n.
     """
 
@@ -43,18 +43,18 @@ class _AnchorRanges:
     weight: float
 
     def residual_m(self, position: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The error of each range to an anchor at `position`, without the median of each tag."""
+        """Return the error of each range to an anchor at `position` minus the median of its tag."""
         error: NDArray[np.float64] = self.range_m - np.linalg.norm(self.antenna - position, axis=1)
         for tag in np.unique(self.tag):
             error[self.tag == tag] -= np.median(error[self.tag == tag])
         return error
 
     def loss(self, position: NDArray[np.float64], sd_m: float) -> float:
-        """Negative log likelihood (Cauchy) of the ranges to an anchor at `position`, with an offset of each tag."""
+        """Return the negative log likelihood (Cauchy) for an anchor at `position`, with per-tag offsets."""
         return float(self.weight * np.log1p((self.residual_m(position) / sd_m) ** 2).sum())
 
     def displaced(self, position: NDArray[np.float64], sd_m: float) -> NDArray[np.float64]:
-        """The horizontal displacement from `position` that explains the ranges best, m, shape (3,)."""
+        """Return the horizontal displacement from `position` that fits the ranges best, m, shape (3,)."""
         found = least_squares(
             lambda shift: self.residual_m(position + np.append(shift, 0.0)),
             np.zeros(2),
@@ -65,7 +65,7 @@ class _AnchorRanges:
 
 
 def check_anchors(site: SiteData, antenna: NDArray[np.float64], known: NDArray[np.bool_]) -> None:
-    """Refuse ranges that other anchor positions explain much better.
+    """Raise an error if other anchor positions fit the ranges much better.
 
     Args:
         antenna: (r, 3), the position of the tag's antenna at each range of the site. known: bool (r,), whether it is
@@ -91,7 +91,7 @@ def check_anchors(site: SiteData, antenna: NDArray[np.float64], known: NDArray[n
     for a, b in itertools.combinations(suspects, 2):
         swapped = ranges[a].loss(anchors.position[b], sd_m) + ranges[b].loss(anchors.position[a], sd_m)
         swap_gain = now[a] + now[b] - swapped
-        # Two free displacements explain more than a swap, but not much more if the anchors are swapped.
+        # Two free displacements always fit better than a swap, but only slightly better if the anchors are swapped.
         is_swap = swap_gain > (1.0 - LARGER) * (gain[a] + gain[b])
         if is_swap and (best is None or swap_gain > best[0]):
             best = swap_gain, a, b

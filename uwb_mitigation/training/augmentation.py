@@ -1,4 +1,4 @@
-"""How simulated inputs are varied in training, beyond what the simulator draws. What it helps is in docs/background/results.md."""
+"""Augmentation of simulated training inputs. docs/background/results.md shows its effect."""
 
 from __future__ import annotations
 
@@ -10,33 +10,33 @@ from torch import Tensor
 from uwb_mitigation.preprocessing import Scaling
 
 DECAY_NEPERS = 0.7
-"""Standard deviation by which amplitudes decay more, or less, than simulated, over 100 taps: how fast a room's echoes die
-away says little of the first path, and the simulator knows a handful of environments."""
+"""Standard deviation of the change of the amplitude decay over 100 taps: the decay of the echoes of a room contains little
+information about the first path, and the simulator has only a few environments."""
 
 FIRST_VARIED = 12
-"""Up to this tap an input stays as it is: there the first path stands."""
+"""Taps before this one contain the first path and are not changed."""
 
 LOUDER_SHARE, LOUDER_DB = 0.15, 22.0
-"""So many of the inputs are made louder by up to so much, which no DW1000 could be: its gain control compresses. A
-model that never met such levels predicts errors of metres for them."""
+"""Share of the inputs that are amplified, and maximum gain. No DW1000 reaches these levels, because its gain control
+compresses, but a model that was not trained with them predicts errors of metres for them."""
 
 OTHER_RECEIVERS = 0.5
-"""Share of the inputs that are changed to those of another receiver."""
+"""Share of the inputs that are changed to imitate another receiver."""
 
 PULSE = (-0.08, 0.15)
-"""Bounds of the share of a tap's amplitude that each neighbour receives: receivers differ in bandwidth."""
+"""Bounds of the share of a tap's amplitude that is added to each neighbour: receivers differ in bandwidth."""
 
 EARLY_TAPS = 0.7
-"""First-path detectors differ by up to so many taps in either direction."""
+"""Maximum shift of the first path in either direction, taps: first-path detectors differ."""
 
 DAMAGED_SHARE = 0.05
-"""Share of these inputs that are clipped at 40 % of their maximum or more, and share of those that end early."""
+"""Share of these inputs that are clipped at 40 % of their maximum or more; also the share that is truncated."""
 
 
 def vary_channel(inputs: Tensor, generator: torch.Generator) -> Tensor:
-    """Inputs (n, K), scaled by the preamble count, each with a decay of its own, some louder."""
+    """Vary the decay of each input (n, K), scaled by the preamble count, and amplify some of them."""
     n, samples = inputs.shape
-    # The scaling is a square root of amplitudes.
+    # The scaled inputs are square roots of amplitudes.
     nepers = torch.randn(n, 1, generator=generator) * DECAY_NEPERS / 100
     varied = inputs * torch.exp(0.5 * nepers * (torch.arange(samples) - FIRST_VARIED).clamp(min=0))
     is_louder = torch.rand(n, 1, generator=generator) < LOUDER_SHARE
@@ -46,7 +46,7 @@ def vary_channel(inputs: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def vary_receiver(inputs: Tensor, generator: torch.Generator) -> Tensor:
-    """Inputs (n, K) as receivers with another pulse, another detector, clipping or short windows report them."""
+    """Change inputs (n, K) to those of receivers with another pulse or detector, clipping or short windows."""
     n, samples = inputs.shape
 
     def uniform(low: float, high: float) -> Tensor:
@@ -70,14 +70,15 @@ def vary_receiver(inputs: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def normalised(inputs: Tensor) -> Tensor:
-    """Inputs (n, K), scaled by the preamble count, as `Scaling.MAX` has them."""
+    """Convert inputs (n, K) that are scaled by the preamble count to `Scaling.MAX`."""
     amplitude = inputs * inputs
     return amplitude / amplitude.amax(1, keepdim=True)
 
 
 def calibration_inputs(inputs: NDArray[np.float32], scaling: Scaling) -> NDArray[np.float32]:
-    """What int8 is calibrated on: inputs scaled by the preamble count as `scaling` has them, and with levels the same
-    again louder: where its activations saturate, a strong radio would be harmed."""
+    """Convert inputs that are scaled by the preamble count to `scaling`, for the calibration of int8.
+
+    With levels, amplified copies are appended, so that the activations do not saturate with a strong radio."""
     if scaling is Scaling.MAX:
         amplitudes: NDArray[np.float32] = normalised(torch.from_numpy(inputs)).numpy()
         return amplitudes

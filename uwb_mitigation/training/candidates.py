@@ -1,8 +1,8 @@
-"""Candidates of model selection: the models that can be fitted to labelled ranges, each list from simple to rich.
+"""Candidates for model selection: models that can be fitted to labelled ranges, in order of complexity.
 
-`train` chooses between models of its own (`own_models`) or from models that start from a bundle (`from_bundle`), both
-with the universal network and an offset (`with_cold_start`); `calibrate` chooses between the models of a site
-(`site_models`). Only candidates that train a network need torch.
+`train` chooses between new models (`own_models`) or models that start from a bundle (`from_bundle`), both with the
+universal network and an offset (`with_cold_start`); `calibrate` chooses between the models of a site (`site_models`).
+Only candidates that train a network need torch.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from uwb_mitigation.model.weights import FloatWeights
 from uwb_mitigation.training.options import FitOptions
 
 OWN = CONSTANT, LINE, LINE_NETWORK, NETWORK = "constant", "line", "line+network", "network"
-"""Models that are fitted to the data alone."""
+"""Models that are fitted to the data only."""
 
 COLD_START, MEAN = "cold start", "line and cold start"
 AS_SHIPPED, OWN_OFFSET, TRAINED_FURTHER = "as shipped", "own offset", "trained further"
@@ -45,7 +45,7 @@ ENOUGH_FOR_MEAN = 20
 """Number of configurations from which a line is averaged with the universal network."""
 
 FACTORS, MIN_SPREAD_M = (0.0, 1.5), 0.05
-"""Bounds of the factor of the universal network's predictions, and their least spread that determines it."""
+"""Bounds of the factor of the universal network's predictions, and the minimum spread that makes it observable."""
 
 _BATCH = 1024
 
@@ -59,7 +59,7 @@ class FittedModel:
     factor: float | None = None
 
     def correction_m(self, data: Dataset) -> NDArray[np.float64]:
-        """Prior + network, shape (n,), m; 0 where a power that the prior needs is unknown."""
+        """Return prior + network, shape (n,), m; 0 where a power that the prior needs is unknown."""
         predicted = prior_m(self.prior, data).astype(np.float64)
         if self.factor is not None and data.headers is not None:
             predicted = predicted + self.factor * _universal_m(data)
@@ -70,10 +70,10 @@ class FittedModel:
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """One model to choose.
+    """One candidate model.
 
     Attributes:
-        name: in tables.
+        name: Name in tables.
         fit: called with a dataset and a seed.
         trains: whether it trains a network. Such a model is kept only if the nested error shows a gain.
     """
@@ -85,10 +85,10 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """How an own model is fitted; the card records it.
+    """Options for fitting a new model; they are recorded in the card.
 
     Attributes:
-        architecture: of the network.
+        architecture: Architecture of the network.
         fit: options of a network that refines a line. alone: options of a network without a line.
         line: fit a line; otherwise the network predicts the whole error.
         network: fit the network; otherwise it predicts 0. With neither, the prior is a constant.
@@ -104,21 +104,21 @@ class Recipe:
     per_configuration: int = PER_CONFIGURATION
 
     def of(self, name: str) -> Recipe:
-        """The recipe of one of `OWN`."""
+        """Return the recipe of one of `OWN`."""
         network = name in (LINE_NETWORK, NETWORK)
         options = self.alone if name == NETWORK else self.fit
         return replace(self, line=name in (LINE, LINE_NETWORK), network=network, fit=options)
 
 
 def prior_m(prior: LinePrior, data: Dataset) -> NDArray[np.float32]:
-    """The prediction of a prior, shape (n,), m; NaN where it needs a power that is unknown."""
+    """Return the prediction of a prior, shape (n,), m; NaN where it needs a power that is unknown."""
     needs_gap = prior.per_power_gap != 0.0
     first_path = data.first_path_power_dbm if needs_gap else data.rx_power_dbm
     return prior.predict_m(data.rx_power_dbm, first_path)
 
 
 def network_m(network: FloatWeights, inputs: NDArray[np.float32]) -> NDArray[np.float64]:
-    """The prediction of a network, shape (n,), m, by ONNX Runtime, which is many times as fast as NumPy."""
+    """Return the prediction of a network, shape (n,), m. ONNX Runtime is much faster than NumPy."""
     import onnxruntime
 
     session = onnxruntime.InferenceSession(
@@ -135,7 +135,7 @@ def network_m(network: FloatWeights, inputs: NDArray[np.float32]) -> NDArray[np.
 def fit_own(
     data: Dataset, recipe: Recipe, seed: int, on_epoch: Callable[[], None] = lambda: None
 ) -> FittedModel:
-    """Fit an own model. Without a network, it contains the network as it is initialised, which predicts 0.
+    """Fit a new model. Without a network, it contains the initial network, which predicts 0.
 
     Raises:
         DatasetError: see `fitting.fit`.
@@ -164,23 +164,23 @@ def _fit_residuals(
     on_epoch: Callable[[], None] = lambda: None,
     start: FloatWeights | None = None,
 ) -> FloatWeights:
-    """Fit a network to the errors that a prior leaves."""
+    """Fit a network to the residuals of a prior."""
     from uwb_mitigation.training import fitting
 
     part = data.rows(splits.thinned(data.configurations, per_configuration, options.seed))
     residual = part.error_m - prior_m(prior, part)
-    # Ranges whose power is unknown have no prior and are passed through where it is needed.
+    # If the prior needs a power that is unknown, the range is passed through.
     known = np.isfinite(residual)
     return fitting.fit(architecture, part.inputs[known], residual[known], options, on_epoch, start=start)
 
 
 def fit_line(data: Dataset) -> LinePrior:
-    """The line in both powers (see `lad.fit_prior`)."""
+    """Fit a line in both powers (see `lad.fit_prior`)."""
     return lad.fit_prior(data.configurations, data.rx_power_dbm, data.first_path_power_dbm, data.error_m)
 
 
 def own_models(recipe: Recipe) -> list[Candidate]:
-    """A constant, a line, a network on the residuals of the line, and a network alone."""
+    """Return a constant, a line, a network on the residuals of the line, and a network without a line."""
 
     def own(name: str) -> Callable[[Dataset, int], FittedModel]:
         return lambda data, seed: fit_own(data, recipe.of(name), seed)
@@ -204,9 +204,9 @@ def _line() -> Candidate:
 
 
 def from_bundle(source: Bundle, options: FitOptions) -> list[Candidate]:
-    """The model of a bundle as it is, with another offset, a constant, a line, and the network trained further.
+    """Return the unchanged model of a bundle, the same with another offset, a constant, a line, and a fine-tuned network.
 
-    The latter is trained on the residuals of a new prior: a line if the bundle has one, otherwise an offset.
+    The fine-tuned network is trained on the residuals of a new prior: a line if the bundle has one, otherwise an offset.
 
     Raises:
         ModelError: the network is not a REMNet.
@@ -238,9 +238,9 @@ def from_bundle(source: Bundle, options: FitOptions) -> list[Candidate]:
 def with_cold_start(candidates: Sequence[Candidate], data: Dataset, universal: Bundle) -> list[Candidate]:
     """Add the universal network with an offset of the data, if the data is preprocessed for it.
 
-    With few configurations it comes first, so that it is preferred. With `ENOUGH_FOR_MEAN` or more it follows the
-    constant, and its mean with the line follows the line: the line contributes its own scatter, the network the errors that
-    are particular to the site, and the mean less of both.
+    With few configurations it is the first candidate, so that it is preferred. With `ENOUGH_FOR_MEAN` or more it follows
+    the constant, and its mean with the line follows the line. The mean reduces both the scatter of the line and the
+    site-specific errors of the network.
     """
     if data.preprocessing != universal.preprocessing:
         return list(candidates)
@@ -262,7 +262,7 @@ def with_cold_start(candidates: Sequence[Candidate], data: Dataset, universal: B
 
 
 def is_few(data: Dataset) -> bool:
-    """Whether there are so few configurations that the cold start is preferred."""
+    """Whether the cold start is preferred because there are few configurations."""
     return len(data.names) < ENOUGH_FOR_MEAN
 
 
@@ -273,11 +273,11 @@ def _offset(data: Dataset, network: FloatWeights) -> LinePrior:
 def site_models(
     data: Dataset, has_cirs: bool, universal: Bundle
 ) -> tuple[Dataset, list[Candidate], list[str]]:
-    """The models of a site, next to the offsets of its radios.
+    """Return the models of a site, which are used together with the offsets of its radios.
 
     Returns:
-        The data with the universal network's predictions, which are then computed only once; the candidates; notes
-        about candidates that are missing.
+        The data with the predictions of the universal network, so that they are computed only once; the candidates;
+        notes about missing candidates.
     """
     offsets = Candidate(SITE_OFFSETS, _constant().fit)
     if not has_cirs:
@@ -290,7 +290,7 @@ def site_models(
         def fit(data: Dataset, seed: int) -> FittedModel:
             factor = _factor(data)
             residual = data.error_m - factor * _universal_m(data)
-            # The bundle of a network passes ranges through whose first-path power is unknown.
+            # A bundle with a network passes a range through if its first-path power is unknown.
             has_line = line and _has_both_powers(data)
             prior = _site_line(data, residual) if has_line else lad.constant(data.configurations, residual)
             return FittedModel(prior, scaled(start, factor), factor)
@@ -322,15 +322,15 @@ def site_models(
 
 
 def _universal_m(data: Dataset) -> NDArray[np.float64]:
-    """The universal network's predictions, which `site_models` keeps in the headers."""
+    """Return the predictions of the universal network, which `site_models` stores in the headers."""
     assert data.headers is not None
     return data.headers[:, 0].astype(np.float64)
 
 
 def _factor(data: Dataset) -> float:
-    """The factor of the universal network's predictions that explains the errors best.
+    """Fit the factor of the universal network's predictions to the errors.
 
-    Noise of the predictions would reduce the factor, and offsets that are estimated with it would suffer.
+    Noise of the predictions would bias the factor towards 0, and with it the estimated offsets.
     """
     predicted, error = (
         lad.means(data.configurations, values) for values in (_universal_m(data), data.error_m)
@@ -347,7 +347,7 @@ def _has_both_powers(data: Dataset) -> bool:
 
 
 def _site_line(data: Dataset, error_m: NDArray[np.float64]) -> LinePrior:
-    """A line in both powers if both are known, otherwise in the received power if known, otherwise a constant."""
+    """Fit a line in both powers if both are known, otherwise in the received power if known, otherwise a constant."""
     if _has_both_powers(data):
         return lad.fit_prior(data.configurations, data.rx_power_dbm, data.first_path_power_dbm, error_m)
     return lad.fit_prior(data.configurations, data.rx_power_dbm, None, error_m)

@@ -1,4 +1,4 @@
-"""What a bundle's card tells: variances, limits, where it comes from. All cards that training writes are made here."""
+"""Create the card of a trained bundle: variances, correction limits and origin of the model."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ def card_of(
     training: Mapping[str, Any],
     familiarity: Familiarity | None = None,
 ) -> Card:
-    """The card of a float model.
+    """Return the card of a float model.
 
-    Variances are conformal (see `evaluation.intervals`): of corrected ranges from the errors left on configurations
-    that were held out; of ranges passed through from the raw errors.
+    Variances are conformal (see `evaluation.intervals`). The variance of corrected ranges is computed from the residuals
+    on held-out configurations, the variance of passed-through ranges from the raw errors.
 
     Args:
-        dataset: what the model was fitted to.
-        unseen: measurements that what left `left_m` (n,), m, was not fitted to.
-        training: where the model comes from, for people.
+        dataset: training data of the model.
+        unseen: held-out measurements, whose residuals are `left_m` (n,), m.
+        training: human-readable origin of the model.
 
     Raises:
         DatasetError: no error is finite.
@@ -61,10 +61,10 @@ def card_of(
 
 
 def familiarity_of(dataset: Dataset, known_offset_m: float | None = None) -> Familiarity | None:
-    """The bands of familiarity of a model that was fitted to `dataset`.
+    """Return the in-distribution bands of a model that was fitted to `dataset`.
 
-    Without levels (scaling MAX), the bands are those of the features that need none; None if a model needs levels and
-    no measurement has both powers.
+    Without levels (scaling MAX), only features that need no levels have bands. Returns None if a model needs levels
+    and no measurement has both powers.
     """
     scaling = dataset.preprocessing.scaling
     with_levels = scaling is Scaling.PREAMBLE

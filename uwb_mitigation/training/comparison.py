@@ -1,4 +1,4 @@
-"""The rows that the shipped recipe is compared with, on the same splits: `evaluate --cross-validate`."""
+"""Compare the shipped recipe with baselines on the same splits: `evaluate --cross-validate`."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from uwb_mitigation.training.fitting import fit
 from uwb_mitigation.training.quantization import calibration_inputs, quantize
 
 INNER_FOLDS = 4
-"""Folds of the training part that calibrate the intervals, on configurations that are held out in turn."""
+"""Folds of the training part, by configuration, for calibrating the intervals."""
 
 REJECTED = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
 
@@ -29,7 +29,7 @@ NAMES = (
     *("raw", "los_median", "overall_median", "ridge", "ridge_header", "gradient_boosting", "l1_line", "mlp"),
     *("remnet_float", "remnet_int8", "shipped_float", "shipped_int8"),
 )
-"""The rows of the table, in its order; those of `zero_shot.NAMES` follow."""
+"""The rows of the table in order; the rows of `zero_shot.NAMES` follow."""
 
 Coverage = Mapping[str, tuple[float, float]]
 """{label, or "" for all: shares of the errors within the 68 % and the 95 % intervals}."""
@@ -49,12 +49,12 @@ class ErrorRow:
 @dataclass(frozen=True, slots=True)
 class Comparison:
     """Attributes:
-    rows: of the table.
-    coverage: of the shipped recipe, over seeds.
-    rejection: (share rejected, MAE of the rest), the ranges with the largest variance first.
+    rows: rows of the table.
+    coverage: coverage of the shipped recipe, over seeds.
+    rejection: (share rejected, MAE of the remaining ranges); ranges with the largest variance are rejected first.
     passed_through: share of held-out ranges that the shipped recipe does not correct.
-    group, folds, seeds, configurations: of the splits.
-    universal_coverage: of `universal_los_offset`; None without a universal model.
+    group, folds, seeds, configurations: parameters of the splits.
+    universal_coverage: coverage of `universal_los_offset`; None without a universal model.
     """
 
     rows: tuple[ErrorRow, ...]
@@ -68,7 +68,7 @@ class Comparison:
     universal_coverage: Coverage | None = None
 
     def as_json(self) -> dict[str, object]:
-        """The result of `uwb-mitigation evaluate --cross-validate`."""
+        """Return the result of `uwb-mitigation evaluate --cross-validate`."""
 
         def table(coverage: Coverage) -> dict[str, dict[str, float]]:
             return {
@@ -95,7 +95,7 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _HeldOut:
-    """The errors that the folds of one seed leave, by row, and the variances that were promised, each (n,)."""
+    """Residuals of the folds of one seed by row, and the predicted variances, each (n,)."""
 
     errors: Mapping[str, NDArray[np.float64]]
     variance_m2: NDArray[np.float64]
@@ -114,7 +114,7 @@ def run(
 ) -> Comparison:
     """Fit every row for each fold and each seed, and test it on held-out configurations.
 
-    `universal` adds a model that is not fitted to the data, if it reads such inputs.
+    `universal` adds a model that is not fitted to the data, if its preprocessing matches.
 
     Raises:
         DatasetError, ParameterError: see `splits.by_group` and `fit`. MissingDependencyError: no scikit-learn.
@@ -163,7 +163,7 @@ def _coverage(
     variance_m2: NDArray[np.float64],
     wide_m2: NDArray[np.float64],
 ) -> Coverage:
-    """Coverage by label (n,) of errors (seeds, n) and their variances."""
+    """Return the coverage by label (n,) of errors (seeds, n) and their variances."""
     found = {}
     for label in ("", *dict.fromkeys(labels.tolist())):
         own = (labels == label) | (label == "")

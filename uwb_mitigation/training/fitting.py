@@ -1,4 +1,4 @@
-"""The training loop: torch's gradients and its Adam, on data in memory."""
+"""Training loop with Adam in PyTorch, on data in memory."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from uwb_mitigation.training import networks
 from uwb_mitigation.training.options import FitOptions
 
 STAGES = ((0.6, 1.0), (0.9, 0.3), (1.0, 0.1))
-"""Up to which share of the steps `fit` with `vary` keeps which factor of the learning rate."""
+"""Schedule of `fit` with `vary`: (share of the steps until which it applies, factor of the learning rate)."""
 
 MEAN_KEEPS = 0.999
-"""Of its running mean of the weights, at each step."""
+"""Decay of the running mean of the weights per step."""
 
 
 def fit(
@@ -39,8 +39,8 @@ def fit(
     The same seed gives the same weights on the same machine. `on_epoch` is called after each pass.
 
     Args:
-        start: weights that are trained further; by default, new ones.
-        vary: changes each batch. The learning rate then falls in `STAGES`, and the result is a running mean of the
+        start: initial weights; by default random.
+        vary: augments each batch. The learning rate then decreases in `STAGES`, and the result is a running mean of the
             weights, which removes the scatter of the last steps.
 
     Raises:
@@ -51,7 +51,7 @@ def fit(
     source = torch.from_numpy(np.ascontiguousarray(inputs))
     wanted = torch.from_numpy(targets.astype(np.float32))
     with single_thread(options.seed):
-        # A separate generator: variations change neither the order nor the dropout.
+        # A separate generator, so that augmentation changes neither the order nor the dropout.
         generator = torch.Generator().manual_seed(options.seed + 77)
         network = networks.build(architecture, options.dropout, start)
         # The paper's betas and epsilon (section III-B) are torch's defaults.
@@ -78,7 +78,7 @@ def fit(
                     )
                 done += 1
                 if vary is not None:
-                    # The mean follows the first steps faster, so that it does not keep the initial weights.
+                    # The mean adapts faster during the first steps, so that the initial weights have no effect.
                     kept = min(MEAN_KEEPS, (1 + done) / (10 + done))
                     for mean, weight in zip(means, network.parameters(), strict=True):
                         mean.lerp_(weight.detach(), 1.0 - kept)

@@ -1,4 +1,4 @@
-"""The networks as torch modules, and their parameters as numpy arrays: what is trained, and how it is initialised."""
+"""The networks as PyTorch modules, their initialisation, and the conversion of their parameters to NumPy arrays."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from uwb_mitigation.model.weights import FloatWeights
 
 
 class SameConvolution(nn.Module):
-    """A convolution with 'same' padding as TensorFlow's, and its ReLU: (n, L, C) to (n, ceil(L/s), F).
+    """A convolution with TensorFlow's 'same' padding and ReLU: (n, L, C) to (n, ceil(L/s), F).
 
-    As one product of matrices, channels last: at the paper's batch of 32 torch's own convolutions take 1.4 times as
-    long, forward and backward.
+    It is computed as one matrix product, channels last: with the paper's batch size of 32 the convolutions of PyTorch
+    take 1.4 times as long, forward and backward.
     """
 
     def __init__(self, layer: Convolution) -> None:
         super().__init__()
         self.padding, self.stride = (0, 0, *layer.padding), layer.stride
         self.reach = (-(-layer.length // layer.stride) - 1) * layer.stride + 1
-        # Keras's defaults, which the paper trained with.
+        # Defaults of Keras, which the paper used.
         self.weight = nn.Parameter(
             nn.init.xavier_uniform_(torch.empty(layer.filters, layer.inputs, layer.kernel))
         )
@@ -40,7 +40,7 @@ class RemnetModule(nn.Module):
     def __init__(self, architecture: Remnet, dropout: float) -> None:
         super().__init__()
         self.architecture = architecture
-        # Module names hold no dots.
+        # PyTorch does not allow dots in module names.
         self.layers = nn.ModuleDict(
             {_key(layer.name): SameConvolution(layer) for layer in architecture.convolutions}
         )
@@ -93,7 +93,7 @@ Network = RemnetModule | MlpModule
 
 
 def build(architecture: Architecture, dropout: float, start: FloatWeights | None = None) -> Network:
-    """A network with fresh weights, or those of `start`; `dropout` is REMNet's alone, as in the paper."""
+    """Return a network with random weights or with those of `start`. Only REMNet has dropout, as in the paper."""
     network = (
         MlpModule(architecture) if isinstance(architecture, Mlp) else RemnetModule(architecture, dropout)
     )
@@ -107,7 +107,7 @@ def build(architecture: Architecture, dropout: float, start: FloatWeights | None
 
 
 def weights_of(network: Network) -> FloatWeights:
-    """A copy of the parameters."""
+    """Return a copy of the parameters."""
     weight, bias = {}, {}
     for name, layer in network.by_name().items():
         values = layer.weight.detach().numpy()
@@ -118,7 +118,7 @@ def weights_of(network: Network) -> FloatWeights:
 
 def _head(features: int) -> nn.Linear:
     head = nn.Linear(features, 1)
-    # It corrects what a prior leaves: it starts from no correction.
+    # The network refines a prior, so it initially predicts no correction.
     nn.init.zeros_(head.weight)
     nn.init.zeros_(head.bias)
     return head

@@ -1,4 +1,4 @@
-"""How a network is fitted. No torch here, so that a command line can check options before it is needed."""
+"""Training options. This module does not import torch, so that the command line can check options quickly."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from uwb_mitigation.errors import ParameterError
 
 @dataclass(frozen=True, slots=True)
 class FitOptions:
-    """How a network is fitted; the defaults are what the shipped bundle was trained with.
+    """Training options of a network; the defaults are those of the shipped bundle.
 
     Attributes:
         epochs: passes over the data.
-        learning_rate: of Adam with decoupled weight decay (paper, section III-B).
-        batch: inputs a step.
-        dropout: share of the head's inputs that are dropped; REMNet's alone.
-        weight_decay: decoupled.
-        seed: of the initial weights, the order and the dropout.
+        learning_rate: learning rate of Adam with decoupled weight decay (paper, section III-B).
+        batch: batch size.
+        dropout: dropout rate of the head's inputs; only for REMNet.
+        weight_decay: decoupled weight decay.
+        seed: seed of the initial weights, the order and the dropout.
     """
 
     epochs: int = 5

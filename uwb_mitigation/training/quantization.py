@@ -1,7 +1,7 @@
-"""From float weights to int8: scales from calibration inputs, integers from the scales. No torch here.
+"""Quantise float weights to int8 with scales from calibration inputs. This module does not import torch.
 
-Weights are symmetric, a scale for each filter, and kept to 7 bits: two products of an unsigned and a
-signed byte then fit the 16-bit sums of processors without VNNI, so that every processor agrees.
+Weights are quantised symmetrically per filter and limited to 7 bits: two products of an unsigned and a signed byte
+then fit the 16-bit sums of processors without VNNI, so that all processors give the same result.
 """
 
 from __future__ import annotations
@@ -27,17 +27,18 @@ WEIGHT_LIMIT = 63
 """Largest magnitude of an integer weight: 7 bits."""
 
 MSE = None
-"""In place of a percentile: of each activation, the scale with the least mean squared rounding error."""
+"""Instead of a percentile: choose the scale of each activation with the least mean squared rounding error."""
 
 LEAST_RATIO = 2.0**-12
-"""Of the scales of a sum's operands: below 2^-14 of the result's scale, ONNX Runtime uses another formula on ARM."""
+"""Minimum ratio of the scales of a sum's operands: below 2^-14 of the result's scale, ONNX Runtime on ARM uses another
+formula."""
 
 CALIBRATION_PER_CONFIGURATION = 40
-"""Inputs of each configuration that the scales of the activations are found from."""
+"""Number of inputs per configuration for computing the scales of the activations."""
 
 
 def calibration_inputs(dataset: Dataset, seed: int) -> NDArray[np.float32]:
-    """Inputs of every configuration, for `quantize`."""
+    """Return inputs of every configuration for `quantize`."""
     rows = splits.thinned(dataset.configurations, CALIBRATION_PER_CONFIGURATION, seed)
     return dataset.inputs[rows]
 
@@ -49,17 +50,17 @@ def quantize(
     *,
     exact: bool = True,
 ) -> Int8Weights:
-    """The int8 network that stands for `weights` on inputs such as `calibration`, float32 (n, K).
+    """Quantise `weights` to int8 with calibration inputs, float32 (n, K).
 
     Args:
-        percentile: of each activation's values, what the largest integer stands for; 100 is the maximum. `MSE`
-            weighs what is clipped against what is rounded.
-        exact: move scales by a few ulps where the firmware's integer arithmetic needs it to agree to
-            the bit (see `nudge`). Takes seconds, and no metric can tell.
+        percentile: percentile of each activation that maps to the largest integer; 100 is the maximum. `MSE`
+            minimises the sum of clipping and rounding errors.
+        exact: move scales by a few ulps where the integer arithmetic of the firmware needs it for bit-exact
+            results (see `nudge`). Takes seconds and does not affect the accuracy.
 
     Raises:
         DatasetError: there are no calibration inputs, or they are not finite or of another length.
-        ModelError: no scales let integer arithmetic stand for the network.
+        ModelError: no scales allow exact integer arithmetic.
     """
     architecture = weights.architecture
     if calibration.ndim != 2 or calibration.shape[1] != architecture.samples or not len(calibration):
@@ -86,14 +87,14 @@ def quantize(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Quantised:
-    """A bundle that was written; `difference_m` (n,) is how far it is from float on the calibration inputs."""
+    """A bundle that was written; `difference_m` (n,) is its difference from float on the calibration inputs."""
 
     bundle: Bundle
     difference_m: NDArray[np.float32]
 
 
 def check(source: Bundle, percentile: float) -> None:
-    """Refuse what `quantize_bundle` does; before data is read for it."""
+    """Check the arguments of `quantize_bundle` before data is read; raises the same errors."""
     if source.quantised:
         raise ModelError("already quantised", where=str(source.path), valid="the float bundle it was made of")
     if not source.card.needs_cir:
@@ -120,23 +121,23 @@ def quantize_bundle(source: Bundle, dataset: Dataset, percentile: float, output:
 
 
 def _weight_scale(name: str, weight: NDArray[np.float32]) -> NDArray[np.float32]:
-    """One scale for each filter; the head is one output."""
+    """Return one scale for each filter; the head has one output."""
     peak = np.atleast_1d(np.abs(weight).max(axis=None if name == HEAD else tuple(range(1, weight.ndim))))
-    # A filter of zeros has no peak: any scale stands for it, its neighbours' causes no surprise.
+    # A filter of zeros has no peak and works with any scale: use that of the other filters.
     peak = np.where(peak > 0, peak, peak.max() if peak.any() else 1.0)
     scale: NDArray[np.float32] = (peak / WEIGHT_LIMIT).astype(np.float32)
     return scale
 
 
 def _by_output(scale: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArray[np.float32]:
-    """`scale` (outputs,) shaped to go with `weight`, whose outputs come first."""
+    """Reshape `scale` (outputs,) to broadcast with `weight`, whose first axis is the outputs."""
     return scale.reshape(-1, *[1] * (weight.ndim - 1))
 
 
 def _peaks(
     weights: FloatWeights, calibration: NDArray[np.float32], percentile: float | None
 ) -> dict[str, float]:
-    """What the largest integer is to stand for in each activation; of each chunk's, the largest."""
+    """Return the value of each activation that maps to the largest integer: the maximum over chunks."""
     peaks: dict[str, float] = {}
     for start in range(0, len(calibration), floating.CHUNK):
         chunk = calibration[start : start + floating.CHUNK]
@@ -147,11 +148,11 @@ def _peaks(
 
 
 def _mse_peak(values: NDArray[np.float32]) -> float:
-    """The share of the maximum that quantises `values` with the least mean squared error."""
+    """Return the share of the maximum that quantises `values` with the least mean squared error."""
     most = float(values.max())
     if most <= 0:
         return 0.0
-    # A histogram makes the search independent of how many values there are.
+    # A histogram makes the cost of the search independent of the number of values.
     counts, edges = np.histogram(values, bins=2048, range=(0.0, most))
     centres = (edges[:-1] + edges[1:]) / 2
     candidates = most * np.linspace(0.3, 1.0, 71)
@@ -165,11 +166,11 @@ def _mse_peak(values: NDArray[np.float32]) -> float:
 def _activation_scales(
     peaks: Mapping[str, float], weight_scale: Mapping[str, NDArray[np.float32]], reads: Mapping[str, str]
 ) -> dict[str, np.float32]:
-    """Scales at which 255 stands for the peaks, or for more where integer arithmetic asks for it.
+    """Return scales at which 255 represents the peaks, or more where integer arithmetic requires it.
 
-    It asks that a convolution's output has steps of at least 16 of its accumulator's, that the scales of a
-    sum's operands add up to at most twice its own, and that their ratio is at least `LEAST_RATIO`. Only a tensor that is hardly ever active, or operands
-    that never peak together, are touched by it.
+    It requires that a step of a convolution's output is at least 16 steps of its accumulator, that the scales of a sum's
+    operands add up to at most twice its own scale, and that their ratio is at least `LEAST_RATIO`. This affects only
+    tensors that are rarely active and operands that never peak together.
     """
     scale: dict[str, np.float32] = {}
     for tensor, peak in peaks.items():

@@ -1,4 +1,4 @@
-"""Model selection: held-out errors of candidates, and the simplest one that no richer one improves by 2 %."""
+"""Model selection: choose the simplest candidate that no more complex one improves by 2 % on held-out data."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from uwb_mitigation.evaluation.splits import Split
 from uwb_mitigation.training.candidates import Candidate, FittedModel
 
 MUST_GAIN = 0.02
-"""A richer candidate is chosen if it reduces the error by at least this share: less is chance."""
+"""A more complex candidate must reduce the error by at least this share; smaller gains are not significant."""
 
 COLD_START_MUST_GAIN = 0.10
-"""The same with few configurations, whose errors show large differences only."""
+"""Required gain with few configurations, where only large differences are significant."""
 
 NESTED = "chosen (nested)"
-"""Row of the errors of the selection itself, on configurations that neither a fit nor the selection has seen."""
+"""Name of the errors of the selection procedure, on configurations that neither a fit nor the selection used."""
 
 SEGMENT_FOLDS, ANCHOR_FOLDS = 4, 2
-"""Of a site's data: folds over segments of the track, and over anchors."""
+"""Number of folds of site data over segments of the track and over anchors."""
 
 _NOTHING: Callable[[], None] = lambda: None  # noqa: E731
 
 
 def counted(total: int, on_share: Callable[[float], None]) -> Callable[[], None]:
-    """Return what is called after each of `total` steps, and calls `on_share` with the finished share."""
+    """Return a callback for each of `total` steps; it calls `on_share` with the finished share."""
     numbers = itertools.count(1)
     return lambda: on_share(next(numbers) / total)
 
@@ -42,10 +42,10 @@ class Selection:
 
     Attributes:
         chosen: name of the candidate.
-        errors: {candidate, `raw` or NESTED: held-out errors}, m. Of a site, those on held-out segments, shape (n,), are
-            followed by those on held-out anchors.
-        model: the candidate, fitted to all of the data.
-        folds, seed: of the splits. configurations: the number in all of the data.
+        errors: {candidate, `raw` or NESTED: held-out errors}, m. For a site, errors on held-out segments, shape (n,), are
+            followed by errors on held-out anchors.
+        model: the chosen candidate, fitted to all of the data.
+        folds, seed: parameters of the splits. configurations: number of configurations in the data.
     """
 
     chosen: str
@@ -56,11 +56,11 @@ class Selection:
     configurations: int = 0
 
     def mae(self) -> dict[str, float]:
-        """{name: MAE of the held-out errors}, m."""
+        """Return {name: MAE of the held-out errors}, m."""
         return {name: float(np.abs(error).mean()) for name, error in self.errors.items()}
 
     def as_json(self) -> dict[str, object]:
-        """For `train --json`."""
+        """Return the content of `train --json`."""
         return {
             "chosen": self.chosen,
             "rows": [{"name": name, "mae": mae} for name, mae in self.mae().items()],
@@ -68,7 +68,7 @@ class Selection:
 
 
 def preferred(errors: Mapping[str, NDArray[np.float64]], must_gain: float = MUST_GAIN) -> str:
-    """The first candidate, in order of preference, that no later one improves by the share `must_gain`."""
+    """Return the first candidate, in order of preference, that no later one improves by the share `must_gain`."""
     best, best_mae = "", np.inf
     for name, error in errors.items():
         mae = float(np.abs(error).mean())
@@ -86,9 +86,9 @@ def held_out_errors(
     *,
     prepare: Callable[[Split], Dataset] | None = None,
 ) -> dict[str, NDArray[np.float64]]:
-    """The errors of each candidate on the test rows of each fold, after a fit to its other rows: {name: shape (n,)}.
+    """Cross-validate each candidate; return its errors on the test rows of all folds, {name: shape (n,)}.
 
-    Rows that no fold tests keep their raw errors. `prepare` replaces the data for one fold.
+    Rows that are in no test part keep their raw errors. `prepare` replaces the data for one fold.
     """
     errors = {candidate.name: data.error_m.copy() for candidate in candidates}
     for fold in folds:
@@ -110,7 +110,7 @@ def select_nested(
     *,
     must_gain: float = MUST_GAIN,
 ) -> Selection:
-    """Select by cross-validation over configurations, and measure the selection itself by a nested one.
+    """Select by cross-validation over configurations; estimate the error of the selection by nested cross-validation.
 
     Raises:
         DatasetError, ParameterError: see `splits.by_configuration` and the fits.
@@ -130,7 +130,7 @@ def select_nested(
     chosen = preferred({name: errors[name] for name in names}, must_gain)
     if untrained := [item.name for item in candidates if not item.trains]:
         fallback = preferred({name: errors[name] for name in untrained}, must_gain)
-        # One of many candidates always looks good on the folds that selected it; the nested error does not.
+        # The error on the folds that were used for the selection is optimistic; the nested error is not.
         if preferred({fallback: errors[fallback], chosen: errors[NESTED]}, must_gain) == fallback:
             chosen = fallback
     (candidate,) = (item for item in candidates if item.name == chosen)
@@ -138,7 +138,7 @@ def select_nested(
 
 
 def min_configurations(folds: int) -> int:
-    """The number of configurations that `select_nested` needs, so that each part of a fold fills the inner folds."""
+    """Return the minimum number of configurations for `select_nested`, so that no inner fold is empty."""
     return 4 if folds == 2 else 3
 
 
@@ -149,13 +149,13 @@ def select_for_site(
     without_offsets_of: Callable[[NDArray[np.intp]], NDArray[np.float64]],
     on_share: Callable[[float], None] = lambda share: None,
 ) -> Selection:
-    """Select by errors on held-out segments of the track and on held-out anchors.
+    """Select a model by errors on held-out segments of the track and on held-out anchors.
 
     Args:
         data: from `SiteData.labelled`, with the offsets subtracted.
-        without_offsets_of: returns for rows that are held out the change of each range's offset, shape (n,), m, if the
-            offsets are estimated without these rows. Offsets are estimated again for held-out segments, but not for
-            held-out anchors, whose own ranges alone determine them.
+        without_offsets_of: returns for held-out rows the change of each range's offset, shape (n,), m, if the offsets
+            are estimated without these rows. Offsets are re-estimated for held-out segments, but not for held-out
+            anchors, whose offsets can only be estimated from their own ranges.
 
     Raises:
         DatasetError: one segment cannot be divided.
@@ -182,6 +182,6 @@ def select_for_site(
 
 
 def _folds(groups: NDArray[np.str_], folds: int, seed: int) -> list[Split]:
-    """At most `folds` folds over groups, shape (n,); none of a single group."""
+    """Return at most `folds` folds over groups, shape (n,); empty for a single group."""
     count = min(folds, len(np.unique(groups)))
     return splits.by_configuration(groups, count, seed) if count >= 2 else []

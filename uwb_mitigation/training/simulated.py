@@ -1,4 +1,4 @@
-"""Simulated placements as arrays, without a recording between the simulator and the trainer."""
+"""Generate simulated placements directly as arrays, without writing a recording."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ def building_dataset(
     *,
     wide: bool = False,
 ) -> Dataset:
-    """One range of each of the first `blocks` x 256 placements of `sources.simulated`, in its order.
+    """Return one range of each of the first `blocks` x 256 placements of `sources.simulated`, in its order.
 
-    Those that are not received, or whose window cannot be used, are left out. The same for every number of
-    `workers` (processes); `on_block` is called after each block. `wide`: see `block_of`.
+    Ranges that are not received, or whose window is not usable, are omitted. The result does not depend on the number
+    of `workers` (processes); `on_block` is called after each block. `wide`: see `block_of`.
     """
     simulate = partial(_block, seed, preprocessing, wide)
     parts = []
-    # Not forked: a caller may hold threads (torch, a progress bar).
+    # Do not fork: the caller may run threads (torch, a progress bar).
     with multiprocessing.get_context("spawn").Pool(workers) as pool:
         for part in pool.imap(simulate, range(blocks)):
             parts.append(part)

@@ -33,20 +33,20 @@ from uwb_mitigation.training.cards import card_of, familiarity_of
 from uwb_mitigation.training.selection import MUST_GAIN, Selection
 
 MAX_TRUTH_SD_M = 0.25
-"""Ranges whose true range has a larger standard deviation are left out."""
+"""Ranges whose true range has a larger standard deviation are not used."""
 
 MIN_LABELLED = 40
 MAX_OFFSET_M = 1.0
 """Radios of one kind without individual antenna delays differ by 0.3 m at three sigma (Decawave APS014)."""
 
 OUTLIER_M, OUTLIER_SDS = 3.0, 10.0
-"""A range is an outlier if its error is further than both from the median error."""
+"""A range is an outlier if the distance of its error from the median exceeds both limits."""
 
 NETWORK_GROUPS = 8
-"""Ranges have a common standard deviation in each of this number of equal groups, by the size of their correction."""
+"""Number of equal groups by size of the correction; the ranges of a group have a common standard deviation."""
 
 WINDOW_S = 1.0
-"""Ranges of this time give one position error."""
+"""Duration of the ranges from which one position error is computed."""
 
 NETWORK, LEVEL = "network", "level"
 NAN_PAIR = (math.nan, math.nan)
@@ -66,12 +66,12 @@ class Solution:
         rows: int (n,), the ranges of the site that the model is fitted to. true_m: (n,), their true ranges.
         antenna: (n, 3), the position of the tag's antenna at each of them, m.
         segment: int (n,), segment of the track. stationary: bool, for each segment.
-        pairs, offsets: of the radios. level: what has its own offset: `pair`, `anchor` or `one`.
-        outliers: number of ranges that were left out of all figures because their errors are implausible.
-        notes: what was not observable, or was left out.
-        change_without: returns for held-out rows of `rows` the change of the offsets of pairs that are estimated without
-            them, m.
-        truth: topic of the localisation; None: the ranges alone. localised: its time offset and lever arms.
+        pairs, offsets: offsets of the radios. level: granularity of the offsets: `pair`, `anchor` or `one`.
+        outliers: number of ranges that were excluded everywhere because their errors are implausible.
+        notes: unobservable quantities and excluded data.
+        change_without: returns for held-out rows of `rows` the change of the pair offsets, m, if they are estimated
+            without these rows.
+        truth: topic of the localisation; None: only ranges were used. localised: its time offset and lever arms.
         track: (k, 3), positions of the tags. track_of: (k,), their segments.
         places: {tag id: position} of stationary tags; {`tag id #number`: position} of a tag with several positions.
         network_sd: standard deviation of the network's factor in the joint solution; 0: not estimated.
@@ -107,10 +107,10 @@ class Calibrated:
     """A calibration, before it is written.
 
     Attributes:
-        site: what was recorded. solution: true ranges and offsets.
+        site: recorded data. solution: true ranges and offsets.
         data: the ranges of `solution.rows`, with the offsets subtracted. raw_m: their errors as measured, (n,).
-        selection: the model. notes: all notes.
-        position_error_m: RMSE of the horizontal position that the held-out errors cause, raw and with the chosen model.
+        selection: the selected model. notes: all notes.
+        position_error_m: RMSE of the horizontal position due to held-out errors, raw and with the chosen model.
     """
 
     site: SiteData
@@ -127,22 +127,22 @@ class Calibrated:
 
     @property
     def held_out_m(self) -> NDArray[np.float64]:
-        """Errors of the chosen model on held-out segments, shape (n,), m."""
+        """Return the errors of the chosen model on held-out segments, shape (n,), m."""
         return self.selection.errors[self.selection.chosen][: len(self.data)]
 
     @property
     def raw_mae_m(self) -> float:
-        """MAE of the ranges as measured."""
+        """Return the MAE of the measured ranges."""
         return float(np.abs(self.raw_m).mean())
 
     @property
     def calibrated_mae_m(self) -> float:
-        """MAE of the chosen model on held-out segments and anchors."""
+        """Return the MAE of the chosen model on held-out segments and anchors."""
         return self.selection.mae()[self.selection.chosen]
 
     @property
     def harms(self) -> bool:
-        """Whether held-out ranges do not gain `MUST_GAIN`, or positions get worse."""
+        """Whether held-out ranges improve by less than `MUST_GAIN`, or positions become worse."""
         raw, calibrated = self.solution.position_scatter_m
         scatters = calibrated > raw
         if self.solution.truth is not None:
@@ -152,7 +152,7 @@ class Calibrated:
 
     @property
     def sure_gain(self) -> float:
-        """The least share by which the held-out error is lower, if the mean offset is wrong by two standard deviations.
+        """Return the reduction of the held-out error (share) if the mean offset is wrong by two standard deviations.
 
         Without ground truth the held-out ranges are compared with a track that contains the error of the mean offset.
         """
@@ -164,7 +164,7 @@ class Calibrated:
         )
 
     def sentence(self) -> str:
-        """The result in one sentence."""
+        """Return the result in one sentence."""
         truth, chosen = self.solution.truth, self.selection.chosen
         against = "residuals against the other anchors (not ground truth)"
         text = (
@@ -184,7 +184,7 @@ class Calibrated:
         return f"{text}: at least {gain:.0%} less."
 
     def as_json(self) -> dict[str, object]:
-        """The result of `uwb-mitigation calibrate`."""
+        """Return the result of `uwb-mitigation calibrate`."""
         solution, model = self.solution, self.selection.model
         factor = 0.0 if model.network is None else 1.0 if model.factor is None else model.factor
         prior = model.prior
@@ -216,10 +216,10 @@ class Calibrated:
         }
 
     def write(self, output: Path, universal: Bundle, name: str) -> tuple[Bundle, Path]:
-        """Write the bundle, and the offsets as `X.offsets.yaml`, both or none of them.
+        """Write the bundle and the offsets (`X.offsets.yaml`) atomically.
 
         Args:
-            name: of the recordings, for people.
+            name: human-readable name of the recordings.
 
         Raises:
             ModelError: they cannot be written.
@@ -244,7 +244,7 @@ class Calibrated:
         fitted = output.stem, universal.architecture, self.data, model.prior
         card = card_of(*fitted, self.data, self.held_out_m, training, familiarity)
         if has_network:
-            # The drive has not seen every part of the site, so the limits include the universal model's.
+            # The drive does not cover the whole site, so the limits include those of the universal model.
             (low, high), (lowest, highest) = universal.card.correction_limits_m, card.correction_limits_m
             card = replace(card, correction_limits_m=(min(low, lowest), max(high, highest)))
         bundle, content = made_bundle(
@@ -264,7 +264,7 @@ def _json_pair(pair: tuple[float, float]) -> list[float | None]:
 
 
 def offsets_file(bundle: Path) -> Path:
-    """The file of the offsets that belong to a site's bundle."""
+    """Return the path of the offsets file that belongs to the bundle of a site."""
     return bundle.with_suffix(".offsets.yaml")
 
 
@@ -278,13 +278,13 @@ def without_truth(
     height_sd_m: float = 0.1,
     on_progress: Progress = lambda what, share: None,
 ) -> Calibrated:
-    """Calibrate from the ranges alone.
+    """Calibrate from ranges only, without ground truth.
 
     Args:
         height_sd_m: standard deviation of measured heights.
 
     Raises:
-        DatasetError: the geometry does not determine the solution, an anchor is not where the file says, or an offset is
+        DatasetError: the solution is not observable, an anchor position in the file is wrong, or an offset is
             implausible.
     """
     on_progress("solving for track and offsets", 0.05)
@@ -397,7 +397,7 @@ def with_truth(
     }
     common = float(np.median([value for value, sd in pairs.values() if sd <= MAX_TRUTH_SD_M] or [0.0]))
     spread = MAD_TO_SD * float(np.median([abs(value - common) for value, _ in pairs.values()]))
-    # Few ranges say less about the offset of a pair than the other pairs do.
+    # With few ranges, the other pairs determine the offset of a pair better than its own ranges.
     few = common, math.hypot(MAX_TRUTH_SD_M, spread)
     pairs = {pair: few if own[1] > MAX_TRUTH_SD_M else own for pair, own in pairs.items()}
     tag = site.tag
@@ -482,10 +482,10 @@ def _calibrated(
 
 
 def position_error_m(site: SiteData, solution: Solution, error_m: NDArray[np.float64]) -> float:
-    """RMSE of the horizontal position that range errors cause, m: least squares on the ranges of each second.
+    """Return the RMSE of the horizontal position due to range errors, m: least squares on the ranges of each second.
 
     Args:
-        error_m: (n,), of the ranges of `solution.rows`.
+        error_m: (n,), errors of the ranges of `solution.rows`.
 
     Returns:
         NaN if no second has ranges to three anchors that determine a position.
@@ -500,7 +500,7 @@ def position_error_m(site: SiteData, solution: Solution, error_m: NDArray[np.flo
     index = index.reshape(-1)
     order = np.argsort(index, kind="stable")
     for part in np.split(order, np.flatnonzero(np.diff(index[order])) + 1):
-        # Determined by more than noise: singular values of unit vectors grow with the square root of their number.
+        # Check that the position is observable: singular values of unit vectors grow with the square root of their number.
         if len(np.unique(row[part])) >= 3 and np.linalg.svd(unit[part])[1][1] > 0.3 * math.sqrt(len(part)):
             shift = np.linalg.lstsq(unit[part], error_m[part], rcond=None)[0]
             squared.append(float(shift @ shift))
@@ -508,11 +508,11 @@ def position_error_m(site: SiteData, solution: Solution, error_m: NDArray[np.flo
 
 
 def regressors(site: SiteData, universal: Bundle) -> Regressors:
-    """What explains long ranges next to offsets: the universal network with CIRs, otherwise the received power."""
+    """Return the regressors in addition to offsets: the universal network with CIRs, otherwise the received power."""
     if site.has_cirs:
         predicted = models.network_m(float_network(universal), site.inputs)
         rows = np.where(np.isfinite(predicted) & site.with_cir, predicted, 0.0)[:, None]
-        # Ranges with a small correction have errors of centimetres, those with a large one of decimetres.
+        # Ranges with small corrections have errors of centimetres; those with large ones have errors of decimetres.
         size = np.abs(rows[:, 0])
         edges = np.quantile(size[site.with_cir], np.linspace(0.0, 1.0, NETWORK_GROUPS + 1)[1:-1])
         # Ranges without a CIR are not corrected, so they have their own standard deviation.
@@ -526,7 +526,7 @@ def regressors(site: SiteData, universal: Bundle) -> Regressors:
 
 
 def _places(found: SelfCalibration) -> dict[str, tuple[float, float, float]]:
-    """The positions of stationary tags, see `Solution.places`."""
+    """Return the positions of stationary tags, see `Solution.places`."""
     resting = np.flatnonzero(found.fit.links.at_rest).tolist()
     tag_of = dict(zip(found.stretches.of.tolist(), found.stretches.tag.tolist(), strict=True))
     positions = Counter(tag_of[segment] for segment in resting)
@@ -549,7 +549,7 @@ def _pair_offsets(common: float, pairs: Pairs) -> Offsets:
 def _without_outliers(
     error_m: NDArray[np.float64], known: NDArray[np.bool_]
 ) -> tuple[NDArray[np.bool_], int]:
-    """Those of the `known` errors that are no outliers, bool (n,), and the number of outliers."""
+    """Return the mask of `known` errors that are not outliers, bool (n,), and the number of outliers."""
     if not known.any():
         return known, 0
     away = np.abs(error_m - np.median(error_m[known]))
@@ -561,11 +561,11 @@ def _without_outliers(
 def _whole_segments(
     held_out: NDArray[np.intp], labelled: NDArray[np.intp], segment: NDArray[np.intp]
 ) -> NDArray[np.bool_]:
-    """All ranges that are held out with some labelled ones: also those of unknown truth between them.
+    """Return all ranges of the held-out segments, including the unlabelled ranges between the labelled ones.
 
     Args:
-        held_out: some of `labelled`, which ascend.
-        segment: int (r,), of all ranges, each segment in the order of time.
+        held_out: subset of `labelled`, which is sorted.
+        segment: int (r,), segment of each range, in the order of time.
     """
     every = np.arange(len(segment))
     before = np.maximum(np.searchsorted(labelled, every, side="right") - 1, 0)
@@ -576,7 +576,7 @@ def _whole_segments(
 
 
 def _has_input(site: SiteData) -> NDArray[np.bool_]:
-    """The ranges that the model is fitted to, bool (r,): the others contribute to track and offsets only."""
+    """Return the mask of ranges for fitting the model, bool (r,). The others affect only track and offsets."""
     return site.with_cir if site.has_cirs else np.ones(len(site.with_cir), np.bool_)
 
 

@@ -1,4 +1,4 @@
-"""The HTML page of a site's calibration: the track, errors before and after, and what was found."""
+"""The HTML page of a site's calibration: the track, errors before and after, and the results."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ WIDTH, HEIGHT, MARGIN = 720.0, 480.0, 36.0
 
 
 def site_page(found: Calibrated, name: str) -> str:
-    """One HTML page without external resources; `name`: of the recordings.
+    """Return one HTML page without external resources; `name`: name of the recordings.
 
     Raises:
         MissingDependencyError: jinja2 is not installed.
@@ -58,7 +58,7 @@ def site_page(found: Calibrated, name: str) -> str:
 
 
 def _plan(found: Calibrated) -> dict[str, object]:
-    """Anchors, tracks and stationary positions in pixels, and the number of pixels per metre."""
+    """Return anchors, tracks and stationary positions in pixels, and the number of pixels per metre."""
     solution = found.solution
     tracks = [solution.track[solution.track_of == one][:, :2] for one in np.unique(solution.track_of)]
     anchors = found.site.anchors.position[:, :2]

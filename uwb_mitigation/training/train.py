@@ -1,4 +1,4 @@
-"""From labelled ranges to a float bundle: select a model, fit it to all of the data and write it, as `train` does."""
+"""Train a float bundle from labelled ranges: select a model, fit it to all data and write it. Used by `train`."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ class CrossValidation:
     """Errors on held-out configurations, each of shape (n,), m, in the order of the dataset.
 
     Attributes:
-        errors: of an own model {`raw`, `overall_median`, `l1_line` (if it has a line), `float`, `int8`}; otherwise those
-            of the selection, and `float`.
-        folds, seed: of the splits.
+        errors: for a new model {`raw`, `overall_median`, `l1_line` (if it has a line), `float`, `int8`}; otherwise the
+            errors of the selection, and `float`.
+        folds, seed: parameters of the splits.
     """
 
     dataset: Dataset
@@ -64,8 +64,8 @@ class TrainedBundle:
     Attributes:
         selection: None if the recipe was given.
         validation: source of the card's intervals.
-        after_m: MAE of the model, m; if it was selected, of the selection (nested).
-        before_m: {name: MAE that it has to improve on}, m.
+        after_m: MAE of the model, m; nested MAE of the selection if the model was selected.
+        before_m: {name: MAE of the baseline}, m.
     """
 
     bundle: Bundle
@@ -80,12 +80,12 @@ class TrainedBundle:
 
     @property
     def prefers_cold_start(self) -> bool:
-        """Whether another candidate had to be `COLD_START_MUST_GAIN` better than the cold start."""
+        """Whether other candidates had to improve on the cold start by `COLD_START_MUST_GAIN`."""
         names = () if self.selection is None else self.selection.errors
         return models.COLD_START in names and models.is_few(self.validation.dataset)
 
     def as_json(self) -> dict[str, object]:
-        """The result of `uwb-mitigation train`."""
+        """Return the result of `uwb-mitigation train`."""
         errors, dataset = self.validation.errors, self.validation.dataset
         tested = errors.get("int8", errors["float"])
         groups = mae_by_group(dataset.configurations, errors["raw"], tested)
@@ -102,12 +102,12 @@ class TrainedBundle:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """What is trained on.
+    """Input and output of a training.
 
     Attributes:
-        dataset: labelled ranges. name: of the recording, for the card.
-        output: bundle to write.
-        folds: of the cross-validation.
+        dataset: labelled ranges. name: name of the recording for the card.
+        output: path of the bundle.
+        folds: number of folds of the cross-validation.
     """
 
     dataset: Dataset
@@ -118,7 +118,7 @@ class Job:
 
 
 def train_own(job: Job, recipe: Recipe, wanted: str = AUTO) -> TrainedBundle:
-    """Train an own model: one of `candidates.OWN`, or the best of these and of the cold start (AUTO).
+    """Train a new model: one of `candidates.OWN`, or the best of these and the cold start (AUTO).
 
     Raises:
         ParameterError: unknown model. DatasetError: too few configurations; see also `fitting.fit`.
@@ -160,7 +160,7 @@ def train_from_bundle(
     candidates = models.from_bundle(source, options)
     universal = load_bundle(default_model_path(job.dataset.preprocessing.scaling))
     if offer_cold_start:
-        # The source is the universal model then: with another offset it is the cold start.
+        # The source is the universal model: with another offset it is the cold start.
         candidates = [item for item in candidates if item.name != models.OWN_OFFSET]
         candidates = models.with_cold_start(candidates, job.dataset, universal)
     selection = _select(job, candidates, options.seed)
@@ -196,7 +196,7 @@ def _write_selected(
         **card.training,
         "started_from": f"{start.model_id:08x}",
         "chosen": selection.chosen,
-        # How a network was fitted that was not trained further is in the card of its bundle.
+        # If the network was not fine-tuned, its training options are in the card of the source bundle.
         "recipe": {**card.training["recipe"], "network": network is not None},
     }
     model = graph.float_model(silent if network is None else network)
@@ -214,7 +214,7 @@ def cross_validate(
     *,
     quantised: bool = True,
 ) -> CrossValidation:
-    """Fit an own model without each fold of configurations in turn, and test it on them.
+    """Cross-validate a new model over configurations.
 
     Raises:
         DatasetError, ParameterError: see `splits.by_configuration` and `fitting.fit`.
@@ -237,7 +237,7 @@ def cross_validate(
 
 
 def fit_with_card(dataset: Dataset, recipe: Recipe, inner_folds: int) -> tuple[Card, FloatWeights]:
-    """Fit an own model to all of the dataset; the card's intervals are from a cross-validation within it.
+    """Fit a new model to the whole dataset; the intervals of the card are from a cross-validation on it.
 
     Raises:
         DatasetError: see `cross_validate`.
@@ -250,7 +250,7 @@ def fit_with_card(dataset: Dataset, recipe: Recipe, inner_folds: int) -> tuple[C
 
 
 def describe(name: str, recipe: Recipe, prior: LinePrior, validation: CrossValidation, data: str) -> Card:
-    """The card of a float model that was fitted to the dataset of `validation`."""
+    """Return the card of a float model that was fitted to the dataset of `validation`."""
     dataset = validation.dataset
     options = asdict(recipe.fit) | {"per_configuration": recipe.per_configuration} if recipe.network else {}
     training = {

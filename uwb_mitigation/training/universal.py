@@ -1,7 +1,7 @@
-"""A model for places and boards that it never saw: trained in simulated buildings, graded in others.
+"""Train a model for unknown sites and boards in simulated buildings, and evaluate it in other ones.
 
-Nothing in it is fitted to an error of a real range. Each step was kept because it helped on the real logs or in
-simulated worlds that were not trained on (models/universal.md).
+The model is not fitted to errors of real ranges. Each step was kept because it improved the results on the real logs
+or in held-out simulated buildings (models/universal.md).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from uwb_mitigation.training.simulated import building_dataset
 
 CALIBRATION_INPUTS = 512
 HELD_OUT_SEED = 1_000_003
-"""Added to the seed: of the worlds that the model is graded in."""
+"""Added to the seed to get the held-out buildings for the evaluation."""
 
 
 RECIPE = FitOptions(epochs=10, learning_rate=1e-3, batch=64, dropout=0.1)
@@ -41,11 +41,11 @@ RECIPE = FitOptions(epochs=10, learning_rate=1e-3, batch=64, dropout=0.1)
 @dataclass(frozen=True, slots=True)
 class Plan:
     """Attributes:
-    seed: of the worlds and of the network.
+    seed: seed of the buildings and of the network.
     samples: window length K.
     scaling: preamble, or max for windows without preamble counts.
-    blocks, held_out_blocks: of 256 placements, to train on and to grade with.
-    fit: how the network is fitted; the seed is that of the plan.
+    blocks, held_out_blocks: number of blocks of 256 placements for training and for evaluation.
+    fit: training options; the seed is that of the plan.
     """
 
     seed: int = 0
@@ -59,9 +59,9 @@ class Plan:
 @dataclass(frozen=True, slots=True, eq=False)
 class Universal:
     """Attributes:
-    card: of the float network; the same for int8 but for `quantised`.
+    card: card of the float network; for int8 only `quantised` differs.
     network, integers: float and int8.
-    held_out: {row: {label: statistics}}, of `raw`, `float` and `int8` in the simulated world that was held out.
+    held_out: {row: {label: statistics}} of `raw`, `float` and `int8` in the held-out simulated buildings.
     """
 
     card: Card
@@ -73,13 +73,13 @@ class Universal:
 def train(
     plan: Plan, name: str, workers: int, on_share: Callable[[float, str], None] = lambda share, what: None
 ) -> Universal:
-    """The model of `plan`, the same for any number of `workers`; `on_share` hears how much is done, and of what."""
+    """Train the model of `plan`. The result does not depend on `workers`; `on_share` gets the step and its progress."""
     preprocessing = Preprocessing(plan.samples, plan.scaling)
     worlds = plan.blocks + plan.held_out_blocks
     count_block = counted(worlds, lambda share: on_share(0.2 * share, "simulating"))
-    # Augmentation needs the levels, whatever of them the scaling leaves.
+    # Augmentation needs the levels, even if the scaling removes them.
     leveled = Preprocessing(plan.samples)
-    # Levels show which receivers and sites are out of distribution. Without levels, training has to contain them.
+    # With levels, other receivers and sites are detected as out of distribution. Without, train on them.
     is_leveled = plan.scaling is Scaling.PREAMBLE
     world = building_dataset(plan.seed, plan.blocks, leveled, workers, count_block, wide=not is_leveled)
     held_out = building_dataset(
@@ -109,7 +109,7 @@ def train(
 
 
 def _graded(plan: Plan, name: str, network: FloatWeights, integers: Int8Weights, test: Dataset) -> Universal:
-    """Intervals, limits and familiarity by the world `test`, which was held out."""
+    """Return intervals, limits and in-distribution bands from the held-out buildings `test`."""
     error = test.error_m
     left = {
         "raw": error,
@@ -143,13 +143,13 @@ def _graded(plan: Plan, name: str, network: FloatWeights, integers: Int8Weights,
                 for row, by in statistics.items()
             },
         },
-        # The correction shrinks to zero out of distribution: an offset belongs to the radio, not to the channel.
+        # The correction shrinks to zero out of distribution, because an offset depends on the radio, not on the channel.
         familiarity_of(test, known_offset_m=0.0),
     )
     return Universal(card, network, integers, statistics)
 
 
 def _alike(labels: NDArray[np.str_]) -> NDArray[np.intp]:
-    """Rows, as many of each condition: how often each occurs at a site is not known, and intervals are to hold in all."""
+    """Return rows with each condition equally often: its frequency at a site is unknown, and intervals must hold in all."""
     conditions = [np.flatnonzero(labels == label) for label in np.unique(labels)]
     return np.concatenate([part[: min(map(len, conditions))] for part in conditions])
