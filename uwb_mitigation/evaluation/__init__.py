@@ -1,1 +1,1 @@
-"""How good a correction is: metrics, splits by configuration, and the baselines it must beat."""
+"""Evaluation of corrections: metrics, splits by configuration, and baselines."""

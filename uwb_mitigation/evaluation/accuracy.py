@@ -1,4 +1,4 @@
-"""What a bundle does to a labelled recording, by the very path that live measurements take."""
+"""Evaluate a bundle on a labelled recording with the same code as for live measurements."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ _BATCH = 256
 
 @dataclass(frozen=True, slots=True)
 class Accuracy:
-    """What one model does to one recording.
+    """Accuracy of one model on one recording.
 
     Attributes:
-        n: measurements with truth and a valid range.
-        raw, corrected: statistics of the error before and after.
-        coverage68, coverage95: shares of corrected errors within the intervals that the bundle promises: 1 and
-            its `interval95_sigmas` of the reported standard deviations.
+        n: number of measurements with a true range and a valid range.
+        raw, corrected: statistics of the errors before and after correction.
+        coverage68, coverage95: shares of corrected errors within the predicted intervals: 1 and
+            `interval95_sigmas` reported standard deviations.
         by_label, by_configuration: {name: (n, MAE before, MAE after)}.
-        statuses: {status: measurements}; on any but OK the raw range counts as corrected.
-        model_id: of the model.
-        trained_on: configurations that are in the model's training data too, as its card names them: where there
-            are any, the result is optimistic.
+        statuses: {status: number of measurements}; unless the status is OK, the corrected range is the raw range.
+        model_id: id of the model.
+        trained_on: configurations that are also in the training data according to the card. If not empty, the
+            result is optimistic.
     """
 
     n: int
@@ -45,7 +45,7 @@ class Accuracy:
     trained_on: tuple[str, ...]
 
     def as_json(self) -> dict[str, object]:
-        """The result of `uwb-mitigation evaluate`."""
+        """Return the result of `uwb-mitigation evaluate`."""
         groups = {"by_label": self.by_label, "by_configuration": self.by_configuration}
         return asdict(self) | {
             key: {name: group._asdict() for name, group in of.items()} for key, of in groups.items()
@@ -57,12 +57,12 @@ def evaluate(
     records: Iterable[Record],
     on_record: Callable[[], None] = lambda: None,
 ) -> Accuracy:
-    """Correct every measurement and compare with its truth; those without a true or a valid range are left out.
+    """Correct every measurement that has a true range and a valid range, and compare it with the truth.
 
     `on_record` is called for each record that was read.
 
     Raises:
-        DatasetError: nothing is left to compare.
+        DatasetError: no measurement can be compared.
     """
     raw, corrected, variance, labels, configurations = [], [], [], [], []
     statuses: Counter[str] = Counter()
@@ -71,7 +71,7 @@ def evaluate(
     while batch := list(islice(stream, _BATCH)):
         results = mitigation.correct([record.measurement for record in batch])
         for record, result in zip(batch, results, strict=True):
-            # An infinite variance marks a range that is none.
+            # An infinite variance marks an invalid range.
             if record.truth is None or not np.isfinite(record.truth.range_m + result.variance_m2):
                 continue
             raw.append(result.range_raw_m - record.truth.range_m)
@@ -87,7 +87,7 @@ def evaluate(
         raise DatasetError(f"none of {read} measurements has a valid range and a true one")
     before, after, spread = np.array(raw), np.array(corrected), np.array(variance)
     card = mitigation.bundle.card
-    # For people, says the card: whatever JSON holds may stand there.
+    # This part of the card is for people and may contain any JSON value.
     learnt = card.training.get("configurations")
     known = {name for name in set(configurations) if isinstance(learnt, list) and name in learnt}
     return Accuracy(

@@ -1,6 +1,6 @@
-"""What a network must beat: constants, regressions on features of the CIR and of the header. Needs scikit-learn.
+"""Baselines: constants, and regressions on features of the CIR and of the header. Needs scikit-learn.
 
-The nine features of the CIR are those that the literature classifies propagation by (Marano et al.,
+The nine features of the CIR are those used in the literature to classify NLOS propagation (Marano et al.,
 "NLOS identification and mitigation for localization based on UWB experimental data", JSAC 2010).
 """
 
@@ -27,18 +27,18 @@ Predict = Callable[[Dataset], NDArray[np.floating]]
 
 
 def los_median(train: Dataset) -> Predict:
-    """The median error in line of sight; of all where nothing is labelled so."""
+    """Predict the median error in LOS, or of all measurements if none has the label LOS."""
     seen = train.error_m[train.labels == LINE_OF_SIGHT]
     return _constant(float(np.median(seen if len(seen) else train.error_m)))
 
 
 def overall_median(train: Dataset) -> Predict:
-    """The median error."""
+    """Predict the median error."""
     return _constant(float(np.median(train.error_m)))
 
 
 def ridge(train: Dataset, *, header: bool) -> Predict:
-    """Ridge regression on standardised features of the CIR, and of the header where asked for."""
+    """Fit a ridge regression on standardised features of the CIR and, with `header`, of the header."""
     pipeline, linear, preprocessing = scikit("pipeline"), scikit("linear_model"), scikit("preprocessing")
     model = pipeline.make_pipeline(preprocessing.StandardScaler(), linear.Ridge(RIDGE_PENALTY))
     model.fit(features(train, header=header), train.error_m, ridge__sample_weight=_weights(train))
@@ -46,20 +46,20 @@ def ridge(train: Dataset, *, header: bool) -> Predict:
 
 
 def gradient_boosting(train: Dataset, seed: int) -> Predict:
-    """Boosted trees under absolute error on all features."""
+    """Fit gradient-boosted trees with absolute error on all features."""
     model = scikit("ensemble").HistGradientBoostingRegressor(
         loss="absolute_error", max_iter=TREES, max_leaf_nodes=LEAVES, random_state=seed
     )
-    # On data this small its threads spend their time waiting for each other.
+    # On data this small, threads only add overhead.
     with importlib.import_module("threadpoolctl").threadpool_limits(1):
         model.fit(features(train, header=True), train.error_m, sample_weight=_weights(train))
     return lambda part: np.asarray(model.predict(features(part, header=True)), np.float64)
 
 
 def features(dataset: Dataset, *, header: bool) -> NDArray[np.float64]:
-    """Nine features of each CIR's window, and six of its header where asked for: float64 (n, 9 or 15).
+    """Return nine features of each CIR window and, with `header`, six of its header: float64 (n, 9 or 15).
 
-    What a header does not tell is 0 for all.
+    Unknown values of the header are 0.
     """
     amplitude = dataset.inputs.astype(np.float64) ** 2
     power = amplitude**2
@@ -96,7 +96,7 @@ def _constant(value: float) -> Predict:
 
 
 def _weights(train: Dataset) -> NDArray[np.float64]:
-    """Every configuration weighs the same."""
+    """Return weights of the rows that give every configuration the same total weight."""
     _, of, count = np.unique(train.configurations, return_inverse=True, return_counts=True)
     return np.asarray(len(train) / (len(count) * count[of]), np.float64)
 

@@ -1,4 +1,4 @@
-"""Labelled measurements as arrays: what training, calibration and baselines work on."""
+"""Labelled measurements as arrays, for training, calibration and baselines."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ _COLUMNS = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Dataset:
-    """Measurements with truth, preprocessed; every array has n rows.
+    """Preprocessed measurements with true ranges; every array has n rows.
 
     Attributes:
-        preprocessing: what made the inputs.
+        preprocessing: preprocessing of the inputs.
         inputs: float32 (n, K).
         rx_power_dbm, first_path_power_dbm: float32; NaN = unknown.
-        range_m: as measured.
+        range_m: measured range.
         error_m: measured - true.
-        configurations: name of the placement; measurements of one are not independent, and those
-            without a name count as one.
+        configurations: name of the placement. Measurements of one placement are not independent; all
+            measurements without a name count as one placement.
         labels: propagation condition; may be empty.
-        refused: measurements left out, {why: count}.
+        refused: {reason: number of measurements that were not used}.
         headers: float32 (n, 2), preamble count and noise threshold; None = not kept.
-        tags, anchors: identities, int (n,), for splits by place; None = not kept.
+        tags, anchors: ids, int (n,), for splits by location; None = not kept.
     """
 
     preprocessing: Preprocessing
@@ -59,7 +59,7 @@ class Dataset:
         return len(self.error_m)
 
     def rows(self, chosen: NDArray[np.intp] | NDArray[np.bool_]) -> Dataset:
-        """The part with these rows."""
+        """Return a dataset with these rows."""
         columns = {name: getattr(self, name) for name in _COLUMNS}
         part: dict[str, Any] = {
             name: None if values is None else values[chosen] for name, values in columns.items()
@@ -67,12 +67,12 @@ class Dataset:
         return replace(self, refused={}, **part)
 
     def shifted(self, by_m: NDArray[np.float64]) -> Dataset:
-        """The same with ranges, and so errors, that are longer by `by_m`, shape (n,)."""
+        """Return a copy with `by_m`, shape (n,), added to ranges and errors."""
         return replace(self, range_m=self.range_m + by_m, error_m=self.error_m + by_m)
 
     @classmethod
     def joined(cls, parts: Sequence[Dataset]) -> Dataset:
-        """All rows of one or more parts with the same preprocessing, one after the other; without headers and ids."""
+        """Concatenate parts with the same preprocessing, without headers and ids."""
         columns: dict[str, Any] = {
             name: np.concatenate([getattr(part, name) for part in parts]) for name in _COLUMNS[:7]
         }
@@ -80,19 +80,19 @@ class Dataset:
 
     @property
     def names(self) -> list[str]:
-        """The configurations, sorted."""
+        """Return the sorted configurations."""
         return [str(name) for name in np.unique(self.configurations)]
 
 
 def build_dataset(
     records: Iterable[Record], preprocessing: Preprocessing, on_record: Callable[[], None] = lambda: None
 ) -> Dataset:
-    """Preprocess every measurement that has a true range; count by reason what is left out.
+    """Preprocess every measurement that has a true range; count the others by reason.
 
     `on_record` is called with each record that was read.
 
     Raises:
-        DatasetError: nothing is left.
+        DatasetError: no measurement is usable.
     """
     refused: Counter[str] = Counter()
     inputs, numbers, headers, identities, configurations, labels = [], [], [], [], [], []
@@ -153,5 +153,5 @@ def _preprocessed(
 
 
 def _power(levels: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Levels as float32, NaN where not finite: a log writes -inf for a signal that it did not see."""
+    """Return levels as float32, NaN if not finite: logs contain -inf if no signal was received."""
     return np.where(np.isfinite(levels), levels, np.nan).astype(np.float32)

@@ -1,8 +1,8 @@
 """Conformal intervals by configuration, scaled by the predicted error.
 
-The error left of a range is compared with a scale that grows with the predicted error; quantiles of that ratio
-on configurations that were held out then promise a coverage on configurations to come (Vovk et al.,
-"Algorithmic Learning in a Random World", chapter 2; a configuration, not a range, is what is exchangeable).
+The residual of a range is divided by a scale that grows with the predicted error. Quantiles of this ratio on held-out
+configurations guarantee the coverage on new configurations (Vovk et al., "Algorithmic Learning in a Random World",
+chapter 2; configurations, not ranges, are exchangeable).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from uwb_mitigation.errors import DatasetError
 
 GROWTH = 0.1
-"""Of the squared scale, with the square of the predicted error: far walls leave larger errors than near ones."""
+"""Factor of the squared predicted error in the squared scale: larger errors leave larger residuals."""
 
 LEAST_SCALE_M = 1e-3
 
@@ -27,7 +27,7 @@ class Intervals:
 
     Attributes:
         variance_m2, variance_per_m2: float32 values.
-        sigmas95: standard deviations that cover 95 %.
+        sigmas95: number of standard deviations that cover 95 %.
     """
 
     variance_m2: float
@@ -38,9 +38,9 @@ class Intervals:
 def calibrate(
     left_m: NDArray[np.floating], predicted_m: NDArray[np.floating], configurations: NDArray[np.str_]
 ) -> Intervals:
-    """Intervals from the errors left and the errors predicted on held-out configurations, each of shape (n,).
+    """Compute intervals from residuals and predicted errors on held-out configurations, each of shape (n,).
 
-    Rows that are not finite count for nothing.
+    Rows that are not finite are ignored.
 
     Raises:
         DatasetError: no row is finite.
@@ -61,7 +61,7 @@ def calibrate(
 
 
 def _quantile(ratio: NDArray[np.floating], configurations: NDArray[np.str_], level: float) -> float:
-    """The quantile at which a configuration to come is covered: all weigh the same, and one more is yet to come."""
+    """Return the conformal quantile for a new configuration: equal weights, with one additional weight for it."""
     _, of, count = np.unique(configurations, return_inverse=True, return_counts=True)
     order = np.argsort(ratio, kind="stable")
     reached = np.cumsum(1 / count[of][order])

@@ -1,7 +1,7 @@
-"""The line prior fitted by least absolute deviations on one mean per configuration.
+"""Fit the line prior by least absolute deviations to the mean of each configuration.
 
-Least absolute deviations, because a few configurations have errors of metres (wrong survey, no direct path); one mean per
-configuration, because its measurements are not independent.
+Least absolute deviations are used because a few configurations have errors of metres (wrong survey, no direct path), and
+one mean per configuration because its measurements are not independent.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.model.prior import LinePrior
 
 MIN_CONFIGURATIONS = 6
-"""With fewer, the prior is their median: they do not determine a line of three coefficients."""
+"""With fewer configurations, the prior is their median, because three coefficients are not observable."""
 
 MIN_POWER_RANGE_DB = 1.0
-"""Received powers that span less do not determine a line in them alone."""
+"""Minimum span of the received powers for fitting a line in the received power."""
 
 
 def fit_prior(
@@ -25,13 +25,13 @@ def fit_prior(
     first_path_power_dbm: NDArray[np.floating] | None,
     error_m: NDArray[np.floating],
 ) -> LinePrior:
-    """The prior of measurements with these values, each of shape (n,).
+    """Fit the prior to measurements; all arrays have the shape (n,).
 
-    Rows with an unknown power (NaN) are ignored. If too few configurations remain, or if their powers are all alike, the
+    Rows with an unknown power (NaN) are ignored. If too few configurations remain, or if their powers are almost equal, the
     prior is the median over configurations.
 
     Args:
-        first_path_power_dbm: None: a line in the received power alone.
+        first_path_power_dbm: None: fit a line in the received power only.
 
     Raises:
         DatasetError: there are no measurements.
@@ -57,14 +57,14 @@ def fit_prior(
 def least_absolute_deviations(
     design: NDArray[np.floating], target: NDArray[np.floating]
 ) -> NDArray[np.floating]:
-    """Coefficients (p,) that minimise `sum(abs(target - design @ coefficients))`; design (n, p), target (n,).
+    """Return coefficients (p,) that minimise `sum(abs(target - design @ coefficients))`; design (n, p), target (n,).
 
-    Iteratively reweighted least squares, its floor on the residuals lowered step by step (Schlossmacher,
-    "An iterative technique for absolute deviations curve fitting", JASA 1973), then a step onto the
-    vertex: an optimum passes through p of the points.
+    Iteratively reweighted least squares with a decreasing floor on the residuals (Schlossmacher,
+    "An iterative technique for absolute deviations curve fitting", JASA 1973), then a step to the
+    vertex, because an optimum passes through p of the points.
     """
     points, unknowns = design.shape
-    # Columns of one size: the powers are large numbers beside the intercept's ones.
+    # Scale the columns: powers are much larger than the ones of the intercept.
     size = np.abs(design).max(axis=0)
     scaled = design / np.where(size > 0, size, 1)
     weight = np.ones(points)
@@ -84,12 +84,12 @@ def least_absolute_deviations(
 
 
 def constant(configurations: NDArray[np.str_], error_m: NDArray[np.floating]) -> LinePrior:
-    """The median over configurations of their mean errors; arguments of shape (n,), n > 0."""
+    """Return the median over configurations of their mean errors; arguments of shape (n,), n > 0."""
     return LinePrior(float(np.float32(np.median(means(configurations, error_m)))))
 
 
 def means(configurations: NDArray[np.str_], values: NDArray[np.floating]) -> NDArray[np.float64]:
-    """The mean of each configuration, in the order of their names."""
+    """Return the mean of each configuration, in the order of their names."""
     _, of = np.unique(configurations, return_inverse=True)
     means: NDArray[np.float64] = np.bincount(of, values.astype(np.float64)) / np.bincount(of)
     return means

@@ -25,10 +25,10 @@ class ErrorStatistics:
 
     @classmethod
     def of(cls, error_m: NDArray[np.floating]) -> ErrorStatistics:
-        """The statistics of errors of shape (n,).
+        """Return the statistics of errors of shape (n,).
 
         Raises:
-            DatasetError: there are none, or one is not finite.
+            DatasetError: `error_m` is empty, or a value is not finite.
         """
         if len(error_m) == 0 or not np.isfinite(error_m).all():
             raise DatasetError(
@@ -49,7 +49,7 @@ class GroupMae(NamedTuple):
 def mae_by_group(
     names: NDArray[np.str_], raw_m: NDArray[np.floating], corrected_m: NDArray[np.floating]
 ) -> dict[str, GroupMae]:
-    """{name: MAE of `raw_m` and `corrected_m`} of errors of shape (n,), in order of first use."""
+    """Return {name: MAE of `raw_m` and `corrected_m`} of errors of shape (n,), in order of first use."""
     groups = {}
     for name in dict.fromkeys(names.tolist()):
         rows = names == name
@@ -64,14 +64,14 @@ def mae_by_group(
 def coverage(
     error_m: NDArray[np.floating], variance_m2: NDArray[np.floating] | float, sigmas: float
 ) -> float:
-    """The share of errors within `sigmas` standard deviations of zero."""
+    """Return the share of errors within `sigmas` standard deviations of zero."""
     return float(np.mean(np.abs(error_m) <= sigmas * np.sqrt(variance_m2)))
 
 
 def bootstrap_interval(
     error_m: NDArray[np.floating], configurations: NDArray[np.str_]
 ) -> tuple[float, float]:
-    """The 95 % interval of the mean absolute error of errors (n,), by drawing whole configurations with replacement.
+    """Return the 95 % interval of the MAE of errors (n,) by resampling whole configurations with replacement.
 
     Percentile bootstrap (Efron and Tibshirani, "An Introduction to the Bootstrap", chapter 13) over clusters.
     """
@@ -83,6 +83,6 @@ def bootstrap_interval(
 
 
 def kept_mae(error_m: NDArray[np.floating], variance_m2: NDArray[np.floating], rejected: float) -> float:
-    """MAE of errors (n,) that are left when the share `rejected` of them, largest variance first, is not used."""
+    """Return the MAE of errors (n,) after rejecting the share `rejected` with the largest variances."""
     kept = np.argsort(variance_m2, kind="stable")[: max(1, round((1 - rejected) * len(error_m)))]
     return float(np.abs(error_m[kept]).mean())

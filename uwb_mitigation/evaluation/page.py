@@ -8,7 +8,7 @@ from uwb_mitigation.errors import MissingDependencyError
 
 
 def rendered(template: str, folder: Path = Path(__file__).parent / "templates", **values: object) -> str:
-    """Return the page that a template in `folder` makes of the values.
+    """Render a template in `folder` with the values.
 
     Raises:
         MissingDependencyError: jinja2 is not installed.

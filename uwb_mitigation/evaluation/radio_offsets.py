@@ -1,7 +1,7 @@
-"""The offset of two radios from ranges of a known distance in line of sight: measured - predicted error - distance.
+"""Estimate the offset of two radios from LOS ranges at a known distance: measured - predicted error - distance.
 
-A CIR does not show the antenna delays of its radios, so one true distance must be known. The offset also contains what
-the model does not know of the position, so more placements reduce its standard deviation, more ranges of one hardly.
+A CIR does not show the antenna delays of its radios, so one true distance must be known. The offset also contains the
+model error of the placement. More placements reduce its standard deviation; more ranges at one placement hardly do.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from uwb_mitigation.preprocessing import Preprocessing, Scaling
 
 PLACEMENT_SD_M = 0.15
 """Standard deviation of the offset of one placement without noise: 0.12 m between the seven LOS placements of the EVK1000
-logs (1.48 x median absolute deviation after `universal`), and seven placements determine that roughly."""
+logs (1.48 x median absolute deviation after `universal`), a rough estimate from seven placements."""
 
 MAX_EXCESS_M, MAX_ERROR_M = 0.25, 0.5
-"""A model that predicts more sees an obstacle; the second limit is for a model whose prior contains the boards' offset."""
+"""If the predicted error is larger, the path is NLOS. The second limit is for models whose prior contains the offset."""
 
 MIN_RANGES = 10
 _BATCH = 256
@@ -44,12 +44,12 @@ class PlacementOffset:
     """The offset of one pair at one placement.
 
     Attributes:
-        ranges: the number that it is computed from.
-        offset_m, sd_m: by medians; NaN if refused.
+        ranges: number of ranges that were used.
+        offset_m, sd_m: computed with medians; NaN if refused.
         noise_sd_m: the part of `sd_m` that more ranges reduce.
-        power_gap_db: receive level less first-path level, median, as reported or from the CIR; NaN: unknown.
-        predicted_m: the model's predicted error, median; NaN without any.
-        refused: why it does not count; empty if it does.
+        power_gap_db: median of receive level minus first-path level, as reported or from the CIR; NaN: unknown.
+        predicted_m: median of the predicted errors; NaN if there are none.
+        refused: reason why the placement is not used; empty if it is.
     """
 
     tag_id: int
@@ -70,9 +70,9 @@ class FoundOffset:
 
     Attributes:
         offset_m, sd_m: median over placements, and its standard deviation.
-        ranges: the number that it is computed from.
-        placements: all, also refused ones.
-        model_id: of the model that predicted.
+        ranges: number of ranges that were used.
+        placements: all placements, including refused ones.
+        model_id: id of the model for the predicted errors.
     """
 
     offset_m: float
@@ -82,7 +82,7 @@ class FoundOffset:
     model_id: int
 
     def offsets(self, *, together: bool = False) -> Offsets:
-        """The median for unknown pairs and, unless `together`, the offset of each pair."""
+        """Return the median for unknown pairs and, unless `together`, the offset of each pair."""
         pairs: dict[tuple[int, int], list[float]] = {}
         for placement in self.placements:
             if not placement.refused and not together:
@@ -90,7 +90,7 @@ class FoundOffset:
         return Offsets(self.offset_m, pairs={pair: float(np.median(found)) for pair, found in pairs.items()})
 
     def as_json(self) -> dict[str, object]:
-        """The result of `uwb-mitigation offset`; null: unknown."""
+        """Return the result of `uwb-mitigation offset`; null: unknown."""
         rows = [asdict(one) | {"refused": one.refused or None} for one in self.placements]
         for row in rows:
             row |= {key: None for key, value in row.items() if isinstance(value, float) and math.isnan(value)}
@@ -107,17 +107,17 @@ def find_offset(
     anchor_id: int | None = None,
     on_record: Callable[[], None] = lambda: None,
 ) -> FoundOffset:
-    """The offset of the radios in a recording.
+    """Estimate the offset of the radios in a recording.
 
     Args:
-        mitigation: predicts the excess; its own offsets do not matter.
-        distance_m: between the antennas; None: from the truth of each record.
-        tag_id, anchor_id: only these; None: any.
+        mitigation: predicts the range error; its own offsets have no effect.
+        distance_m: distance of the antennas; None: use the true range of each record.
+        tag_id, anchor_id: use only this tag or anchor; None: all.
         on_record: called for each record that was read.
 
     Raises:
-        ParameterError: one distance for several pairs.
-        DatasetError: nothing looks like line of sight, or there is no truth.
+        ParameterError: `distance_m` is given, but there are several pairs.
+        DatasetError: no placement is in LOS, or there are no true ranges.
     """
     groups: dict[tuple[int, int, str], list[_Sample]] = {}
     preprocessing = Preprocessing(mitigation.bundle.preprocessing.samples, Scaling.MAX)
@@ -164,7 +164,7 @@ def find_offset(
 
 
 def _power_gap_db(measurement: RangeMeasurement, preprocessing: Preprocessing) -> float:
-    """Receive level less first-path level, dB; from the CIR if the radio does not report them; NaN if neither has them."""
+    """Return receive level minus first-path level, dB, as reported or else from the CIR; NaN if unknown."""
     reported_db = measurement.cir.power_gap_db
     if math.isfinite(reported_db):
         return reported_db
@@ -231,5 +231,5 @@ def _combined(placements: tuple[PlacementOffset, ...], model_id: int) -> FoundOf
 
 
 def _spread(values: NDArray[np.float64]) -> float:
-    """A robust standard deviation."""
+    """Return a robust standard deviation."""
     return _MAD_TO_SD * float(np.median(np.abs(values - np.median(values))))

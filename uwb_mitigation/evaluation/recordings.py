@@ -1,4 +1,4 @@
-"""Read a recording as a data set to train, calibrate or evaluate on."""
+"""Read a recording as a dataset for training, calibration or evaluation."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ def load(
     truth: Sequence[Path] = (),
     on_record: Callable[[], None] = lambda: None,
 ) -> tuple[str, Dataset]:
-    """A recording's name, with the word "simulated" where it is, and its labelled measurements.
+    """Return the name of a recording (marked "simulated" if it is) and its labelled measurements.
 
     Args:
-        truth: tables of true ranges, which then count instead of the recording's own.
+        truth: tables of true ranges that replace those of the recording.
 
     Raises:
-        RecordingError, DatasetError: it cannot be read, or holds nothing that can be used.
+        RecordingError, DatasetError: it cannot be read, or no measurement is usable.
     """
     stretches = [row for table in truth for row in load_truth(table)]
     with opening.open_recording(path) as source:
@@ -46,12 +46,12 @@ def load(
 def load_inputs(
     path: Path, preprocessing: Preprocessing, on_record: Callable[[], None] = lambda: None
 ) -> Dataset:
-    """A recording's measurements, with true ranges or without: their errors say nothing.
+    """Return the measurements of a recording with or without true ranges; do not use their errors.
 
-    Without a truth, and so without a name for it, a minute of a pair is a configuration.
+    Without ground truth, each minute of a pair is one configuration.
 
     Raises:
-        RecordingError, DatasetError: it cannot be read, or holds no CIR that can be used.
+        RecordingError, DatasetError: it cannot be read, or no CIR is usable.
     """
     with opening.open_recording(path) as source:
         return datasets.build_dataset(map(_named, source), preprocessing, on_record)

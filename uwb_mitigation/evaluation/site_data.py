@@ -1,4 +1,4 @@
-"""What was recorded at a site, in columns, and as a `Dataset` once it is known how long its ranges truly were."""
+"""Recorded ranges of a site in columns, and their conversion to a `Dataset` when the true ranges are known."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from uwb_mitigation.positioning.tracks import Heights, Ranges
 from uwb_mitigation.preprocessing import Preprocessing
 
 WITH_CIR = 0.5
-"""If a smaller share of the ranges has a CIR that can be used, no CIR is used."""
+"""If the share of ranges with a usable CIR is smaller, no CIR is used."""
 
 CHUNK_S = 2.0
-"""Ranges of a pair in motion err alike for about so long: a configuration."""
+"""Duration of a configuration in motion: the errors of a pair are correlated for about this time."""
 
 FOLD_S = 10.0
-"""Stretches of motion that are held out as a whole."""
+"""Duration of the segments of motion that are held out as a whole."""
 
 BETWEEN_NS = 3_600_000_000_000
 _SECOND_NS = 1_000_000_000
@@ -37,16 +37,16 @@ class SiteData:
     """Ranges of all tags of all recordings, one tag after the other.
 
     Attributes:
-        anchors: of the site.
-        tags: of each, in the order of time.
-        preprocessing, inputs: float32 (r, K), zeros where there is no CIR.
+        anchors: anchors of the site.
+        tags: data of each tag, in the order of time.
+        preprocessing, inputs: float32 (r, K), zeros if there is no CIR.
         rx_power_dbm, first_path_power_dbm: float32 (r,), NaN = unknown.
-        has_cirs: whether the inputs say anything.
-        with_cir: bool (r,), which ranges have a CIR that can be used.
+        has_cirs: whether CIRs are used.
+        with_cir: bool (r,), ranges with a usable CIR.
         height_m: float64 (r,), measured heights of the tags; None: not measured.
         frames: {tag id: the frame ids of its ranges}.
-        left_out: {why: count}.
-        shift_ns: what was added to the stamps of each recording, so that none overlap.
+        left_out: {reason: number of excluded ranges}.
+        shift_ns: time added to the stamps of each recording, so that recordings do not overlap.
     """
 
     anchors: AnchorMap
@@ -64,12 +64,12 @@ class SiteData:
 
     @property
     def begins(self) -> NDArray[np.intp]:
-        """Where each tag's ranges begin among all."""
+        """Index of the first range of each tag."""
         return np.cumsum([0, *map(len, self.tags)])[:-1].astype(np.intp)
 
     @property
     def ranges(self) -> Ranges:
-        """The ranges of all tags."""
+        """Ranges of all tags."""
         return Ranges.joined(self.tags)
 
     @property
@@ -84,13 +84,13 @@ class SiteData:
         stretch: NDArray[np.intp],
         at_rest: NDArray[np.bool_],
     ) -> Dataset:
-        """A dataset of some ranges.
+        """Return a dataset of selected ranges.
 
         Args:
             rows: indices, (k,), into the ranges of all tags. true_m: (k,), their true ranges.
             stretch: int (k,), segment of the track. at_rest: bool (k,), whether the tag is stationary. A configuration is a
-                pair while the tag is stationary, or for `CHUNK_S` of motion. Its name begins with what is held out
-                together: "stretch 3.1/".
+                pair while the tag is stationary, or for `CHUNK_S` of motion. Its name begins with the unit that is
+                held out as a whole: "stretch 3.1/".
         """
         ranges = self.ranges.take(rows)
         tag = np.array([one.tag_id for one in self.tags], np.uint64)[self.tag[rows]]
@@ -130,11 +130,11 @@ def gather(
     """Read recordings, without their ground truth.
 
     Args:
-        stamp_offset_s: what to add to the stamps of ranges: -0.2 if they lag by 0.2 s.
-        heights: of the tags, for each recording. Ranges without a height are left out.
+        stamp_offset_s: time offset added to the stamps of ranges: -0.2 if they are 0.2 s late.
+        heights: heights of the tags for each recording. Ranges without a height are excluded.
 
     Raises:
-        DatasetError: no range is of an anchor in the map.
+        DatasetError: no range belongs to an anchor in the map.
     """
     left_out: Counter[str] = Counter()
     unknown: Counter[int] = Counter()

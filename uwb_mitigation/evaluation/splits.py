@@ -1,7 +1,7 @@
-"""Splits that never put one configuration on both sides.
+"""Splits that keep each configuration either in the training part or in the test part.
 
-Within a configuration both antennas stand still and the error hardly changes: a split by measurement
-would test whether a model remembers the place, not whether it corrects a range.
+Within a configuration both antennas are stationary and the error hardly changes. A split by measurement would
+therefore test whether the model memorised the placement, not whether it corrects ranges at new placements.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class Group(str, enum.Enum):
-    """What is held out as a whole."""
+    """The unit that is held out as a whole."""
 
     CONFIGURATION = "configuration"
     TAG = "tag"
@@ -29,14 +29,14 @@ class Group(str, enum.Enum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Split:
-    """Rows to fit on and rows to test on, integer indices."""
+    """Integer indices of the training rows and of the test rows."""
 
     train: NDArray[np.intp]
     test: NDArray[np.intp]
 
 
 def by_configuration(configurations: NDArray[np.str_], folds: int, seed: int) -> list[Split]:
-    """Folds for cross-validation over names of shape (n,): each configuration is tested in exactly one.
+    """Return folds for cross-validation over names of shape (n,); each configuration is tested in exactly one fold.
 
     Raises:
         ParameterError: fewer than two folds.
@@ -59,13 +59,13 @@ def by_configuration(configurations: NDArray[np.str_], folds: int, seed: int) ->
 
 
 def by_group(dataset: Dataset, group: Group, folds: int, seed: int) -> list[Split]:
-    """The splits that `group` names; every configuration lies on one side of each.
+    """Return the splits by `group`; no configuration is in both parts of a split.
 
-    CONFIGURATION: `folds` folds of configurations. TAG: each tag location is left out in turn. HALF: the
-    anchors in the order of their identities, those of the first half against the others, both ways.
+    CONFIGURATION: `folds` folds of configurations. TAG: each tag location is held out in turn. HALF: the anchors are
+    sorted by id and divided into two halves; each half is held out in turn.
 
     Raises:
-        ParameterError, DatasetError: see `by_configuration`; a tag's or anchor's split needs two of them.
+        ParameterError, DatasetError: see `by_configuration`; TAG and HALF need at least two tags or anchors.
     """
     if group is Group.CONFIGURATION:
         return by_configuration(dataset.configurations, folds, seed)
@@ -80,7 +80,7 @@ def by_group(dataset: Dataset, group: Group, folds: int, seed: int) -> list[Spli
     splits = []
     for part in parts:
         held_out = np.isin(ids, part)
-        # Measurements without a configuration's name count as one: they must not lie on both sides.
+        # Measurements without a configuration name count as one configuration and must not be in both parts.
         apart = ~np.isin(dataset.configurations, np.unique(dataset.configurations[held_out]))
         if not apart.any():
             raise DatasetError("one configuration holds every tag or anchor", valid="named configurations")
@@ -89,7 +89,7 @@ def by_group(dataset: Dataset, group: Group, folds: int, seed: int) -> list[Spli
 
 
 def thinned(configurations: NDArray[np.str_], most: int, seed: int) -> NDArray[np.intp]:
-    """Rows in order, at most `most` of each configuration, drawn without replacement."""
+    """Return sorted rows, at most `most` of each configuration, drawn without replacement."""
     generator = np.random.default_rng(seed)
     chosen = []
     _, of = np.unique(configurations, return_inverse=True)

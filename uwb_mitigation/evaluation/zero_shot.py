@@ -1,4 +1,4 @@
-"""A model where it was not surveyed: with no offset, with one known distance in sight, with all but one placement."""
+"""Evaluate a model at an unknown site without offset, with the LOS offset, and with that of all other placements."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from uwb_mitigation.model.bundle import Bundle, Card, Session
 LOS = "LOS"
 
 NAMES = ("universal", "universal_los_offset", "universal_offset")
-"""The rows: no offset; the median of the line-of-sight placements' errors taken off; that of all other placements."""
+"""Rows: no offset; minus the median error of the LOS placements; minus the median error of all other placements."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ZeroShot:
-    """What a bundle that knows nothing of the place leaves of n measurements.
+    """Residuals of a bundle on n measurements at an unknown site.
 
     Attributes:
-        errors: {row of `NAMES`: float64 (n,), m}; without a placement in line of sight, `universal_los_offset` is
+        errors: {row of `NAMES`: float64 (n,), m}; without LOS placements, `universal_los_offset` equals
             `universal`.
-        los_offset_m: what was taken off; 0 without a placement in line of sight.
-        variance_m2: float32 (n,), as promised.
-        sigmas95: deviations that are to cover 95 %.
+        los_offset_m: subtracted offset; 0 without LOS placements.
+        variance_m2: predicted variances, float32 (n,).
+        sigmas95: number of standard deviations that should cover 95 %.
         passed: bool (n,), not corrected.
     """
 
@@ -39,7 +39,7 @@ class ZeroShot:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Graded:
-    """What a model makes of its predictions: corrections (0 where it passes a range through) and variances, each (n,)."""
+    """Corrections (0 if a range is passed through) and variances from the predictions of a model, each (n,)."""
 
     correction_m: NDArray[np.float32]
     variance_m2: NDArray[np.float32]

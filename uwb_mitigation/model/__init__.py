@@ -1,5 +1,5 @@
-"""The model: its architecture, the bundle file that ships it, and the two ways to run it.
+"""The model: architecture, bundle file, and two ways to run it.
 
-`bundle` is one ONNX file with its metadata inside, run with ONNX Runtime; `integer` is
-the numpy oracle that ONNX Runtime and the firmware are tested against.
+`bundle` runs an ONNX file that contains its metadata with ONNX Runtime. `integer` is the NumPy reference
+implementation for testing ONNX Runtime and the firmware.
 """

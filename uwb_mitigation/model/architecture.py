@@ -1,4 +1,4 @@
-"""The shapes of REMNet (paper, section II-A, Fig. 2) and of its baseline, from which all else derives sizes."""
+"""The shapes of REMNet (paper, section II-A, Fig. 2) and of its baseline."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TypeAlias
 from uwb_mitigation.errors import ParameterError
 
 HEAD = "head"
-"""Name of the dense layer that reads the last module's output, flattened channel by channel."""
+"""Name of the dense layer after the last module, whose output is flattened channel by channel."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,7 +19,7 @@ class Convolution:
         name: `first`, or `module1.residual`, `module1.reduce`, `module1.skip` and so on.
         inputs, filters: channels in and out.
         kernel, stride: in samples.
-        length: samples in time at its input.
+        length: length of its input in samples.
     """
 
     name: str
@@ -31,7 +31,7 @@ class Convolution:
 
     @property
     def padding(self) -> tuple[int, int]:
-        """Zeros before and after the input."""
+        """Number of zeros before and after the input."""
         return same_padding(self.length, self.kernel, self.stride)
 
 
@@ -40,12 +40,12 @@ class Remnet:
     """REMNet without attention: conv k0; N residual reduction modules; flatten; dense.
 
     Each module computes `r = relu(conv_kn(x)) + x; out = relu(conv_kn,s2(r)) + relu(conv_k1,s2(r))`
-    with 'same' padding as TensorFlow's: total = max((ceil(L/s) - 1) s + k - L, 0), the smaller half
-    before. The module keeps F channels and takes length L to ceil(L/2).
+    with TensorFlow's 'same' padding: total = max((ceil(L/s) - 1) s + k - L, 0), the smaller half
+    before. The module keeps F channels and reduces the length from L to ceil(L/2).
 
     Attributes:
         samples: input length K.
-        first_kernel: k0. The paper's text says 5; its parameter counts need 3.
+        first_kernel: k0. The paper's text says 5; its parameter counts require 3.
         kernel: kn.
         filters: F.
         modules: N.
@@ -70,7 +70,7 @@ class Remnet:
 
     @property
     def lengths(self) -> tuple[int, ...]:
-        """Length in time at the input of each module, and of the last one's output."""
+        """Length of the input of each module, and of the output of the last one."""
         lengths = [self.samples]
         for _ in range(self.modules):
             lengths.append(-(-lengths[-1] // 2))
@@ -78,7 +78,7 @@ class Remnet:
 
     @property
     def convolutions(self) -> tuple[Convolution, ...]:
-        """Every convolution in the order of evaluation: first, then residual, reduce, skip a module."""
+        """Every convolution in the order of evaluation: first, then residual, reduce and skip of each module."""
         f, k = self.filters, self.kernel
         layers = [Convolution("first", 1, f, self.first_kernel, 1, self.samples)]
         for number, length in enumerate(self.lengths[:-1], start=1):
@@ -104,7 +104,7 @@ class Remnet:
 
     @property
     def multiply_accumulates(self) -> int:
-        """Multiply-accumulates of one inference, padding counted as work."""
+        """Multiply-accumulates of one inference, including padding."""
         f, k = self.filters, self.kernel
         total = self.samples * self.first_kernel * f
         for length, half in zip(self.lengths, self.lengths[1:], strict=False):
@@ -125,7 +125,7 @@ class Dense:
 class Mlp:
     """The paper's baseline: dense layers with ReLU on the window, then the head.
 
-    The paper gives a count of parameters, 54,401, and no sizes; the default has exactly that many.
+    The paper reports 54,401 parameters, but no layer sizes; the default has exactly this number.
 
     Attributes:
         samples: input length K.
@@ -170,6 +170,6 @@ Architecture: TypeAlias = Remnet | Mlp
 
 
 def same_padding(length: int, kernel: int, stride: int) -> tuple[int, int]:
-    """Zeros before and after that make 'same' padding (see `Remnet`)."""
+    """Return the number of zeros before and after for 'same' padding (see `Remnet`)."""
     total = max((-(-length // stride) - 1) * stride + kernel - length, 0)
     return total // 2, total - total // 2

@@ -40,23 +40,23 @@ _REMEDY = "write one with `uwb-mitigation train` and `quantize`"
 
 @dataclass(frozen=True, slots=True)
 class Card:
-    """What a bundle says of its network.
+    """Description of the network in a bundle.
 
     Attributes:
-        name: for people.
-        architecture: the network's shape.
-        preprocessing: what makes the network's input; its window is the architecture's K.
-        prior: predicts the part of the error that the network does not.
-        quantised: int8, or float32.
-        variance_m2: of a corrected range whose predicted error is 0, m^2: one standard deviation covers 68 %
-            of the errors on unseen configurations.
-        variance_uncorrected_m2: of a range passed through, m^2.
-        correction_limits_m: predicted errors outside of these mean an input unlike the training data.
-        training: data, split, seed, recipe and metrics; for people, JSON values only.
-        variance_per_m2: the variance grows by so much times the square of the predicted error, without unit.
-        interval95_sigmas: standard deviations that cover 95 % of the errors on unseen configurations.
-        familiarity: bands outside of which a measurement is unlike the training data; None = not known.
-        needs_cir: False = the network predicts nothing, so that a range without a CIR is corrected, too, by the prior.
+        name: human-readable name.
+        architecture: shape of the network.
+        preprocessing: preprocessing of the input; its window length is K of the architecture.
+        prior: linear model whose residuals the network predicts.
+        quantised: True: int8; False: float32.
+        variance_m2: variance of a corrected range whose predicted error is 0, m^2: one standard deviation covers
+            68 % of the errors on unseen configurations.
+        variance_uncorrected_m2: variance of a range that is passed through, m^2.
+        correction_limits_m: predicted errors outside of these limits mean that the input is out of distribution.
+        training: data, split, seed, recipe and metrics; human-readable, JSON values only.
+        variance_per_m2: increase of the variance per squared predicted error, without unit.
+        interval95_sigmas: number of standard deviations that cover 95 % of the errors on unseen configurations.
+        familiarity: bands outside of which a measurement is out of distribution; None = unknown.
+        needs_cir: False = the network predicts 0, so that the prior also corrects ranges without a CIR.
     """
 
     name: str
@@ -75,7 +75,7 @@ class Card:
 
     @property
     def origin(self) -> str:
-        """The boards and the site that the bundle was trained on, for people."""
+        """Boards and site of the training data, human-readable."""
         data, boards = (self.training.get(key) for key in ("data", "boards"))
         learnt = self.training.get("configurations")
         extent = f" ({len(learnt)} configurations)" if isinstance(learnt, list) else ""
@@ -100,7 +100,7 @@ class Card:
         for name, value in numbers.items():
             if not math.isfinite(value):
                 raise ModelError(f"{name} = {value}", valid="a finite number")
-            # Both sides of the link compute in float32: what the file says is what is used.
+            # Host and firmware compute in float32: store exactly the values that are used.
             if float(np.float32(value)) != value:
                 raise ModelError(f"{name} = {value!r} is no float32 value")
         for name in ("variance_m2", "variance_uncorrected_m2"):
@@ -122,7 +122,7 @@ class Card:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bundle:
-    """A loaded model: its card, the bytes of the file, and a session that runs it."""
+    """A loaded model: card, bytes of the file, and inference session."""
 
     path: Path
     model: bytes
@@ -160,7 +160,7 @@ class Session:
         self._input, self._outputs = source.name, [result.name]
 
     def predict_m(self, windows: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The network's outputs, m, float32 (n,), for inputs float32 (n, K)."""
+        """Return the outputs of the network, m, float32 (n,), for inputs float32 (n, K)."""
         output: NDArray[np.float32] = self._session.run(self._outputs, {self._input: windows[:, None, :]})[0]
         return output[:, 0]
 
@@ -169,15 +169,15 @@ def load_bundle(path: Path | str) -> Bundle:
     """Read and check a bundle.
 
     Raises:
-        ModelError: the file is absent, too large, damaged, no ONNX model, not one of ours, or its
-            metadata and its graph contradict each other.
+        ModelError: the file is missing, too large, damaged, not an ONNX model, not a bundle of this package, or its
+            metadata and its graph are inconsistent.
     """
     path = Path(path)
     return parse_bundle(read_bounded(path, MAX_BYTES, ModelError, _REMEDY), path)
 
 
 def parse_bundle(data: bytes, path: Path) -> Bundle:
-    """Check the bytes of a bundle; `path` names them in errors.
+    """Check the bytes of a bundle; errors contain `path`.
 
     Raises:
         ModelError: see `load_bundle`.
@@ -224,9 +224,9 @@ def _session(data: bytes, where: str) -> onnxruntime.InferenceSession:
 def session_options() -> onnxruntime.SessionOptions:
     """Return the options of every session of this package.
 
-    One thread: the network takes tens of microseconds, less than waking a second thread.
+    They use one thread: the network takes tens of microseconds, less than waking a second thread.
     """
-    # ONNX Runtime imports in 0.4 s: only what runs a network waits for it.
+    # ONNX Runtime takes 0.4 s to import: import it only when a network is run.
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
@@ -238,10 +238,10 @@ def session_options() -> onnxruntime.SessionOptions:
 
 
 def save_bundle(path: Path, graph: bytes, card: Card) -> Bundle:
-    """Write a bundle whole or not at all, and return it as `load_bundle` would.
+    """Write a bundle atomically and return it as `load_bundle` would.
 
     Args:
-        graph: a serialised ONNX model, without metadata of ours.
+        graph: a serialised ONNX model without the metadata of a bundle.
 
     Raises:
         ModelError: the card does not fit the graph, or the file cannot be written.
@@ -252,7 +252,7 @@ def save_bundle(path: Path, graph: bytes, card: Card) -> Bundle:
 
 
 def made_bundle(path: Path, graph: bytes, card: Card) -> tuple[Bundle, bytes]:
-    """A bundle as `save_bundle` returns it, and the bytes that are still to be written to `path`.
+    """Return a bundle like `save_bundle`, and its bytes, which the caller must write to `path`.
 
     Raises:
         ModelError: the card does not fit the graph.
@@ -267,7 +267,7 @@ def assemble_bundle(graph: bytes, card: Card) -> bytes:
 
     fields = asdict(card)
     if card.needs_cir:
-        # Bundles did not have this field at first.
+        # Older bundles do not have this field.
         del fields["needs_cir"]
     if card.familiarity is not None and card.familiarity.lead_level_db is None:
         del fields["familiarity"]["lead_level_db"]
@@ -285,7 +285,7 @@ def assemble_bundle(graph: bytes, card: Card) -> bytes:
         model = onnx.load_model_from_string(graph)
         onnx.helper.set_model_props(model, {METADATA_KEY: text})
         data: bytes = model.SerializeToString(deterministic=True)
-    except Exception as error:  # protobuf's errors are not part of the interface of onnx.
+    except Exception as error:  # protobuf's errors are not part of the API of onnx.
         raise ModelError(f"not an ONNX graph: {error}") from error
     (marker,) = _MARKER.finditer(data)
     start = marker.start(1)
@@ -293,7 +293,7 @@ def assemble_bundle(graph: bytes, card: Card) -> bytes:
 
 
 def _checksum(data: bytes, digits: int) -> int:
-    """CRC-32 of `data` with the eight digits at `digits` zeroed; never 0, which means no model."""
+    """Return the CRC-32 of `data` with the eight digits at `digits` set to zero; never 0, which means no model."""
     view = memoryview(data)
     crc = zlib.crc32(view[digits + len(_BLANK) :], zlib.crc32(_BLANK, zlib.crc32(view[:digits])))
     return crc or 1
@@ -317,7 +317,7 @@ def _card(metadata: dict[str, Any]) -> Card:
         variance_uncorrected_m2=float(metadata["variance_uncorrected_m2"]),
         correction_limits_m=(float(low), float(high)),
         training=dict(metadata["training"]),
-        # Bundles made before there were these hold none.
+        # Older bundles do not contain these fields.
         variance_per_m2=float(metadata.get("variance_per_m2", 0.0)),
         interval95_sigmas=float(metadata.get("interval95_sigmas", 1.96)),
         familiarity=_familiarity(metadata.get("familiarity")),
@@ -334,7 +334,7 @@ def _familiarity(metadata: dict[str, Any] | None) -> Familiarity | None:
 
 
 def _architecture_metadata(architecture: Architecture) -> dict[str, Any]:
-    """REMNet's goes without saying: the first bundles knew no other."""
+    """Return the metadata of the architecture; REMNet has no type, because older bundles contain no other network."""
     return asdict(architecture) | ({"kind": "mlp"} if isinstance(architecture, Mlp) else {})
 
 

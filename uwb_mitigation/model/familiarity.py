@@ -1,13 +1,13 @@
-"""How far a measurement lies outside of what a model was trained on: cheap enough for a microcontroller.
+"""OOD score of a measurement relative to the training data, cheap enough for a microcontroller.
 
 Six features, each with a band of values that are in distribution: the range, the receive power normalised to 1 m by
 free-space propagation (Friis, "A note on a simple transmission formula", Proc. IRE 1946), its excess over the
-first-path power, two levels of the CIR less the powers that the radio reports of the same signal, and the energy
+first-path power, two levels of the CIR minus the powers that the radio reports for the same signal, and the energy
 before the first path relative to the whole window. A model for CIRs without levels has bands for the first and the last.
-At 1 m a weaker or a stronger radio differs from walls that the training data had; as received, it does not.
-The radio computes both powers from the very accumulator, so the last two hardly vary (DW1000 user manual,
-section 4.7): a CIR that is noise, clipped, or cut at the wrong place contradicts them. The energy before the first
-path needs no level: where it is much of the window's energy, the window is noise or starts too late.
+The power at 1 m distinguishes a weaker or stronger radio from walls in the training data; the received power does not.
+The radio computes both powers from the accumulator, so the two level differences hardly vary (DW1000 user manual,
+section 4.7) unless the CIR is noise, clipped, or cut at the wrong position. The energy before the first path needs no
+level: if it is a large part of the energy of the window, the window is noise or starts too late.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from uwb_mitigation.errors import ModelError
 from uwb_mitigation.preprocessing import Scaling
 
 FIRST_PATH_TAPS = slice(6, 9)
-"""The three taps of a window that the first-path power is computed from."""
+"""The three taps of a window from which the first-path power is computed."""
 
 LEAD_TAPS = 3
-"""The number of first taps of a window that precede the rising edge of a first path at its correct place."""
+"""Number of taps before the rising edge of the first path if the window is cut correctly."""
 
 MIN_POWER, MAX_POWER = np.float32(1e-30), np.float32(1e30)
-"""Bounds on what a level is taken of, so that it is always finite."""
+"""Bounds of powers before conversion to levels, so that levels are finite."""
 
 _DB_PER_OCTAVE = np.float32(10 * math.log10(2))
 _SQUARE, _LINEAR, _CONSTANT = np.float32(-4 / 3), np.float32(4), np.float32(8 / 3)
@@ -37,11 +37,11 @@ _SQUARE, _LINEAR, _CONSTANT = np.float32(-4 / 3), np.float32(4), np.float32(8 / 
 
 @dataclass(frozen=True, slots=True)
 class Widening:
-    """How far beyond the training data a feature still counts as familiar, in half widths of the data.
+    """Extension of a band beyond the training data, in half widths of the data.
 
     Attributes:
-        below, above: of the lowest and the highest value.
-        least: the half width counts as at least so much.
+        below, above: extension below the lowest and above the highest value.
+        least: minimum of the half width.
     """
 
     below: float
@@ -49,9 +49,9 @@ class Widening:
     least: float
 
 
-# A placement farther off is what a model is for, and its error itself lengthens the range. A signal weaker or
-# stronger than distance and the walls of the training data make it, or a first path stronger than the line of
-# sight had, is another radio's.
+# The model should also work at larger distances, and the error itself increases the range. A signal that is weaker
+# or stronger than distance and the walls of the training data explain, or a first path that is stronger than in LOS,
+# comes from another radio.
 _WIDENINGS = (
     Widening(1.0, 2.0, 1.0),
     Widening(0.0, 0.0, 3.0),
@@ -63,7 +63,7 @@ _WIDENINGS = (
 
 @dataclass(frozen=True, slots=True)
 class Band:
-    """Values from `low` to `high` are familiar; `margin` beyond them they are wholly strange."""
+    """Values from `low` to `high` are in distribution; at `margin` beyond, the OOD score is 1."""
 
     low: float
     high: float
@@ -78,7 +78,7 @@ class Band:
 
     @classmethod
     def of(cls, values: NDArray[np.floating], widening: Widening) -> Band:
-        """The band of finite values (n,), widened; its margin is half the width that they have."""
+        """Return the extended band of finite values (n,); its margin is half the width of the values."""
         low, high = float(values.min()), float(values.max())
         half = max((high - low) / 2, widening.least)
         bounds = (low - widening.below * half, high + widening.above * half, half)
@@ -86,22 +86,22 @@ class Band:
 
 
 LEAD, LEAD_WITHOUT_LEVELS = Band(-1000.0, -16.0, 4.0), Band(-1000.0, -20.0, 4.0)
-"""Least bands of `lead_level_db`. They do not follow the training data downwards, because a detector reports the first energy above its noise threshold: in
+"""Minimum bands of `lead_level_db`. They do not follow the training data downwards, because a detector reports the first energy above its noise threshold: in
 the simulated buildings 99 % of the values are below -24 dB. Of windows that start 5 taps too late, 75 % are above
 -10 dB. Without levels no other feature detects them, so the band ends earlier."""
 
 
 @dataclass(frozen=True, slots=True)
 class Familiarity:
-    """The bands of the training data, and where a correction shrinks to outside of them.
+    """Bands of the training data, and the value to which the correction shrinks outside of them.
 
     Attributes:
         known_offset_m: the median error over the configurations of the training data.
-        range_m: of the measured range.
-        power_at_1m_dbm: of the receive power + 20 log10 of the measured range.
-        power_gap_db: of the receive power less the first-path power.
-        cir_level_db: of the window's energy less the receive power.
-        first_path_level_db: of the energy at the first path less the first-path power.
+        range_m: measured range.
+        power_at_1m_dbm: receive power + 20 log10 of the measured range.
+        power_gap_db: receive power minus first-path power.
+        cir_level_db: energy of the window minus receive power.
+        first_path_level_db: energy at the first path minus first-path power.
         lead_level_db: energy before the first path relative to the energy of the window.
 
     A feature without a band (None) is not checked.
@@ -122,7 +122,7 @@ class Familiarity:
 
     @property
     def bands(self) -> tuple[Band | None, ...]:
-        """In the order of the columns of `features`."""
+        """Bands in the order of the columns of `features`."""
         return tuple(getattr(self, field.name) for field in fields(self)[1:])
 
     @property
@@ -132,12 +132,12 @@ class Familiarity:
 
     @classmethod
     def of(cls, known_offset_m: float, values: NDArray[np.float32]) -> Familiarity:
-        """The bands of training data with these `features`.
+        """Compute the bands of training data with these `features`.
 
-        A feature without finite values gets no band; rows that lack one of the others are ignored.
+        A feature without finite values has no band; rows in which another feature is not finite are ignored.
 
         Raises:
-            ModelError: no row has them all.
+            ModelError: no row is complete.
         """
         finite: NDArray[np.bool_] = np.isfinite(values)
         known: NDArray[np.bool_] = np.any(finite, axis=0)
@@ -149,7 +149,7 @@ class Familiarity:
             for column, is_known, widening in zip(values[rows].T[:-1], known[:-1], _WIDENINGS, strict=True)
         )
         lead = LEAD if known[1:-1].any() else LEAD_WITHOUT_LEVELS
-        # What the training data contains is in distribution, whatever its first-path index means.
+        # The training data is in distribution, regardless of the meaning of its first-path index.
         highest = max(lead.high, float(np.float32(np.percentile(values[rows, -1], 99))))
         lead = replace(lead, high=highest)
         return cls(float(np.float32(known_offset_m)), *(*bands, lead))
@@ -160,16 +160,16 @@ def features(
     scaling: Scaling,
     *reported: NDArray[np.floating],
 ) -> NDArray[np.float32]:
-    """The features of n measurements, float32 (n, 6).
+    """Return the features of n measurements, float32 (n, 6).
 
     Args:
         windows: inputs of the network, (n, K). Energy is their square; with the scaling PREAMBLE, which takes a
             square root, it is their fourth power.
         scaling: of the windows.
         reported: range (m), receive power and first-path power (dBm), each (n,); converted to float32. If one is
-            not finite or beyond float32, neither is a feature.
+            not finite or exceeds float32, the features that depend on it are not finite.
 
-    Every step is one float32 operation, and sums are taken from the first tap to the last.
+    Every step is one float32 operation, and sums run from the first tap to the last.
     """
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
         energy = windows * windows
@@ -193,7 +193,7 @@ def features(
 
 
 class Strangeness:
-    """Scores features against the bands of a `Familiarity`."""
+    """Computes OOD scores of features with the bands of a `Familiarity`."""
 
     def __init__(self, bands: Iterable[Band | None]) -> None:
         checked = {column: astuple(band) for column, band in enumerate(bands) if band is not None}
@@ -204,9 +204,9 @@ class Strangeness:
         self._per_unit = np.float32(1) / table[:, 2]
 
     def score(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The largest excess over a band, in margins, of `features` (n, 6): float32 (n,).
+        """Return the largest excess over a band, in margins, of `features` (n, 6): float32 (n,).
 
-        0 or less: all are familiar; 1 or more, or NaN: wholly strange.
+        0 or less: in distribution; 1 or more, or NaN: out of distribution.
         """
         values = values[:, self._columns]
         with np.errstate(over="ignore", invalid="ignore"):
@@ -217,7 +217,7 @@ class Strangeness:
 
 
 def _level_db(power: NDArray[np.float32]) -> NDArray[np.float32]:
-    """10 log10 of a power, within 0.03 dB: the exponent is exact, a parabola is the mantissa's logarithm."""
+    """Return 10 log10 of a power within 0.03 dB: exact exponent, parabola for the logarithm of the mantissa."""
     mantissa, exponent = np.frexp(np.minimum(np.maximum(power, MIN_POWER), MAX_POWER))
     octaves = (_SQUARE * mantissa + _LINEAR) * mantissa - _CONSTANT
     level: NDArray[np.float32] = (exponent.astype(np.float32) + octaves) * _DB_PER_OCTAVE

@@ -1,4 +1,4 @@
-"""The float network in numpy: of a bundle, its activations for calibration, and a check on torch and ONNX Runtime."""
+"""The float network in NumPy: activations for calibration, and a reference for PyTorch and ONNX Runtime."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from uwb_mitigation.model.bundle import Bundle
 from uwb_mitigation.model.weights import FloatWeights, activation_tensors, layer_inputs, sum_operands
 
 CHUNK = 256
-"""Inputs evaluated at once: bounds the memory."""
+"""Batch size, which limits the memory."""
 
 
 def activations(weights: FloatWeights, inputs: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
-    """Every activation of the float network for inputs (n, K), {tensor: (n, channels, length)}; of an MLP,
+    """Return all activations of the float network for inputs (n, K), {tensor: (n, channels, length)}; for an MLP,
     (n, outputs).
     """
     architecture = weights.architecture
@@ -51,7 +51,7 @@ def _convolve(weights: FloatWeights, layer: Convolution, values: NDArray[np.floa
 
 
 def predict_m(weights: FloatWeights, inputs: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The float network's outputs, (n,), for inputs of shape (n, K), m."""
+    """Return the outputs of the float network, (n,), m, for inputs of shape (n, K)."""
     last = activation_tensors(weights.architecture)[-1]
     outputs = []
     for start in range(0, len(inputs), CHUNK):
@@ -61,10 +61,10 @@ def predict_m(weights: FloatWeights, inputs: NDArray[np.float32]) -> NDArray[np.
 
 
 def float_network(source: Bundle) -> FloatWeights:
-    """The float network that an int8 bundle stands for; of a float bundle its own.
+    """Return the float network of a bundle; an int8 network is dequantised.
 
     Raises:
-        ModelError: it is no REMNet.
+        ModelError: it is not a REMNet.
     """
     if not isinstance(source.architecture, Remnet):
         raise ModelError("no REMNet to start from", where=str(source.path), valid="a bundle of `train`")
@@ -83,7 +83,7 @@ def float_network(source: Bundle) -> FloatWeights:
 
 
 def scaled(network: FloatWeights, factor: float) -> FloatWeights:
-    """The network that predicts `factor` times as much; with 0 it predicts nothing."""
+    """Return a network whose predictions are multiplied by `factor`."""
     weight = {**network.weight, HEAD: network.weight[HEAD] * np.float32(factor)}
     bias = {**network.bias, HEAD: network.bias[HEAD] * np.float32(factor)}
     return replace(network, weight=weight, bias=bias)

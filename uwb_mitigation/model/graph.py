@@ -1,9 +1,9 @@
-"""REMNet, or its baseline, as an ONNX graph, in float32 and in int8, and back from the graph to its weights.
+"""Convert REMNet or its baseline to an ONNX graph, float32 or int8, and read the weights from the graph.
 
-Both graphs take `cir`, float32 (n, 1, K), and yield `error`, float32 (n, 1), in metres. The int8 one
-is written with QuantizeLinear and DequantizeLinear around float operators, in the pattern that ONNX
+Both graphs have the input `cir`, float32 (n, 1, K), and the output `error`, float32 (n, 1), m. The int8 graph is
+written with QuantizeLinear and DequantizeLinear around float operators, in the pattern that ONNX
 Runtime fuses into QLinearConv, QLinearAdd and QGemm. Activations are uint8 with zero point 0, so that
-padding is a literal zero and the ReLU is the saturation; weights are int8 with zero point 0.
+padding is zero and the saturation is the ReLU; weights are int8 with zero point 0.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ OUTPUT = "error"
 
 Number = TypeVar("Number", bound=np.generic)
 
-# The oldest pair that has all these operators as they are used here; every ONNX Runtime in use reads it.
+# The oldest versions that support all operators of these graphs; every current ONNX Runtime reads them.
 OPSET = 13
 IR_VERSION = 7
 
@@ -68,13 +68,13 @@ class _Graph:
             opset_imports=[helper.make_opsetid("", OPSET)],
         )
         onnx.checker.check_model(model, full_check=True)
-        # Repeatable bytes, so that the same training gives the same model id.
+        # Deterministic bytes, so that the same training gives the same model id.
         serialised: bytes = model.SerializeToString(deterministic=True)
         return serialised
 
 
 def float_model(weights: FloatWeights) -> bytes:
-    """The serialised float32 graph."""
+    """Return the serialised float32 graph."""
     graph = _Graph()
 
     def parameters(layer: str) -> list[str]:
@@ -88,20 +88,20 @@ def float_model(weights: FloatWeights) -> bytes:
 
 
 def int8_model(weights: Int8Weights) -> bytes:
-    """The serialised int8 graph, in QDQ form."""
+    """Return the serialised int8 graph in QDQ form."""
     graph = _Graph()
     zero = graph.constant("zero_uint8", np.uint8(0))
     for tensor in activation_tensors(weights.architecture):
         graph.constant(f"{tensor}.scale", np.float32(weights.activation_scale[tensor]))
     reads = layer_inputs(weights.architecture)
     if isinstance(weights.architecture, Remnet):
-        # The same scale on both sides of Flatten lets the runtime flatten the integers.
+        # With the same scale before and after Flatten, the runtime flattens the integers.
         graph.constant("flat.scale", np.float32(weights.activation_scale[reads[HEAD]]))
 
     def parameters(layer: str) -> list[str]:
         scale = weights.weight_scale[layer]
         accumulator = np.float32(weights.activation_scale[reads[layer]]) * scale
-        # The head is one output: a scale for its tensor. Other layers have one for each filter.
+        # The head has one scale for the tensor; other layers have one for each filter.
         if layer == HEAD:
             scale, accumulator = scale[0], accumulator[0]
         written = _as_written(layer, weights.weight[layer])
@@ -129,7 +129,7 @@ def int8_model(weights: Int8Weights) -> bytes:
     copies: dict[str, Callable[[], int]] = {}
 
     def quantised(tensor: str, value: str) -> str:
-        """Quantise `value` where it is first named, and dequantise it anew for each reader."""
+        """Quantise `value` when it is first used, and add a dequantisation for each reader."""
         pair = [f"{tensor}.scale", zero]
         if tensor not in copies:
             graph.node("QuantizeLinear", [value, *pair], f"{tensor}.quantised")
@@ -142,7 +142,7 @@ def int8_model(weights: Int8Weights) -> bytes:
 
 
 def float_weights(model: bytes, architecture: Architecture) -> FloatWeights:
-    """The weights of a graph that `float_model` wrote.
+    """Return the weights of a graph that `float_model` wrote.
 
     Raises:
         ModelError: an initializer is absent or of another shape or type.
@@ -157,7 +157,7 @@ def float_weights(model: bytes, architecture: Architecture) -> FloatWeights:
 
 
 def int8_weights(model: bytes, architecture: Architecture) -> Int8Weights:
-    """The integers and scales of a graph that `int8_model` wrote.
+    """Return the integers and scales of a graph that `int8_model` wrote.
 
     Raises:
         ModelError: an initializer is absent or of another shape or type.
@@ -180,7 +180,7 @@ def _constants(model: bytes) -> dict[str, NDArray[np.generic]]:
     try:
         graph = onnx.load_model_from_string(model).graph
         return {tensor.name: numpy_helper.to_array(tensor) for tensor in graph.initializer}
-    except Exception as error:  # protobuf's errors are not part of onnx's interface
+    except Exception as error:  # protobuf's errors are not part of the API of onnx
         raise ModelError(f"not an ONNX graph: {error}") from error
 
 
@@ -197,7 +197,7 @@ def _name(architecture: Architecture) -> str:
 
 
 def _as_written(layer: str, weight: NDArray[Number]) -> NDArray[Number]:
-    """Weights as the graph holds them, or back: a dense layer's are transposed, inputs first."""
+    """Convert weights to the layout of the graph, or back: dense layers are transposed, inputs first."""
     return np.ascontiguousarray(weight.T) if layer != HEAD and weight.ndim == 2 else weight
 
 
@@ -207,7 +207,7 @@ def _write(
     parameters: Callable[[str], list[str]],
     read: Callable[[str, str], str],
 ) -> None:
-    """Write a network's nodes. `read(tensor, value)` names what a reader of `tensor` is given."""
+    """Write the nodes of a network. `read(tensor, value)` returns the name of the value that readers of `tensor` use."""
     if isinstance(architecture, Mlp):
         _write_mlp(graph, architecture, parameters, read)
         return

@@ -1,4 +1,4 @@
-"""The part of the predicted error that needs no network: a line in what the radio reports beside the CIR."""
+"""The part of the predicted error without a network: a linear model of the powers that the radio reports."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 MAX_POWER_DBM = 1000.0
-"""A level beyond, of either sign, is none: also keeps the line clear of float32 overflow."""
+"""Levels with a larger absolute value are invalid; this also prevents float32 overflow."""
 
 
 @dataclass(frozen=True, slots=True)
 class LinePrior:
     """`offset_m + per_rx_power * rx_power + per_power_gap * (rx_power - first_path_power)`.
 
-    Coefficients are held as float32 values and the line is evaluated in float32, each product and
-    sum rounded once and in this order, so that host and microcontroller agree to the last bit.
-    With both slopes zero it is a constant, and the powers are not needed.
+    Coefficients are float32 values and the line is evaluated in float32. Each product and sum is rounded once and in
+    this order, so that host and microcontroller give identical bits. If both slopes are zero, the line is a constant
+    and needs no powers.
 
     Attributes:
-        offset_m: m.
+        offset_m: constant term, m.
         per_rx_power: m per dBm.
         per_power_gap: m per dB.
     """
@@ -39,7 +39,7 @@ class LinePrior:
     ) -> NDArray[np.float32]:
         """Return the predicted errors, m, float32 (n,), of arrays of floats (n,).
 
-        NaN where a power that the line needs is not finite or beyond `MAX_POWER_DBM`.
+        NaN if a power that the line needs is not finite or its absolute value exceeds `MAX_POWER_DBM`.
         """
         if not self.needs_power:
             return np.full(len(rx_power_dbm), self.offset_m, np.float32)

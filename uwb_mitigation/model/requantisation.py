@@ -1,4 +1,4 @@
-"""Integer constants that reproduce ONNX Runtime's float requantisation, output for output.
+"""Integer constants that reproduce the float requantisation of ONNX Runtime exactly.
 
 ONNX Runtime (MLAS) computes, in float32:
 
@@ -7,16 +7,16 @@ ONNX Runtime (MLAS) computes, in float32:
 - a sum of two uint8 tensors: `clip(rint(fma(a, ra, fl(rb * b))), 0, 255)`, `ra = fl(sa / sy)`, `rb = fl(sb / sy)`.
   Its NEON kernel for ARM computes the sum in integers instead: see `neon_sum_table`.
 
-`rint` rounds half to even. As a function of integers each is a staircase of at most 255 steps, so a
-line through the right integer gaps is the same function:
+`rint` rounds half to even. Each function of integers has at most 255 steps, so a line with suitable
+integer constants gives the same function:
 
 - `clip((256 acc + offset) * multiplier >> 32 + REQUANTISATION_SHIFT, 0, 255)`: SMMUL, then USAT with
-  its shift. Weights come scaled by 256, and bias and offset make one constant;
+  its shift. Weights are scaled by 256, and bias and offset are combined into one constant;
 - `clip(first * a + second * b + offset >> SUM_SHIFT, 0, 255)`: two MLA, then USAT.
 
-`solve_*` find such constants or say that none exist, which happens where two steps differ by less
-than the line can express. `nudge_*` then move a scale by as little as makes them exist; a quantiser
-calls `nudge` on its result, so that the ONNX file and the C code hold the same scales.
+`solve_*` search for such constants and return None if they do not exist, which happens if two steps differ by less
+than the line can express. `nudge_*` then change a scale by the minimum amount for which they exist. A quantiser
+calls `nudge` on its result, so that the ONNX file and the C code contain the same scales.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from uwb_mitigation.model.architecture import HEAD
 from uwb_mitigation.model.weights import Int8Weights, activation_tensors, layer_inputs, sum_operands
 
 WEIGHT_SCALE_BITS = 8
-"""Weights are multiplied by 2^8 before the dot product, to give the offset a place."""
+"""Weights are multiplied by 2^8 before the dot product, so that the offset can have fraction bits."""
 
 REQUANTISATION_SHIFT = 11
 """Right shift after the high word of the product: scales below 2^-4 keep 31 bits of multiplier."""
@@ -64,7 +64,7 @@ class Sum:
     offset: int
 
     def table(self) -> NDArray[np.uint8]:
-        """The result for every a (rows) and b (columns), uint8 of shape (256, 256)."""
+        """Return the result for every a (rows) and b (columns), uint8 of shape (256, 256)."""
         a = np.arange(256, dtype=np.int64)[:, None]
         b = np.arange(256, dtype=np.int64)[None, :]
         total = (self.first * a + self.second * b + self.offset) >> SUM_SHIFT
@@ -80,14 +80,14 @@ def requantise(accumulator: NDArray[np.number], scale: np.float32 | NDArray[np.f
 
 
 def sum_table(first: np.float32, second: np.float32, *, fused: bool = True) -> NDArray[np.uint8]:
-    """ONNX Runtime's sum for every a (rows) and b (columns), from the two ratios of scales.
+    """Return ONNX Runtime's sum for every a (rows) and b (columns), from the two ratios of scales.
 
-    `fused` is what processors with a fused multiply-add compute; others round `a * ra` as well.
+    `fused`: for processors with a fused multiply-add; others also round `a * ra`.
     """
     values = np.arange(256, dtype=np.float32)
     products = np.float32(second) * values
     if fused:
-        # Both terms are exact in binary64, and so is their sum: one rounding to binary32 is the fma.
+        # Both terms and their sum are exact in binary64, so that one rounding to binary32 gives the fma.
         exact = values.astype(np.float64)[:, None] * np.float64(first) + products.astype(np.float64)
         total = exact.astype(np.float32)
     else:
@@ -116,15 +116,15 @@ def neon_sum_table(first: np.float32, second: np.float32) -> NDArray[np.uint8] |
 def requantisation_scale(
     input_scale: np.float32, weight_scale: NDArray[np.float32] | np.float32, output_scale: np.float32
 ) -> NDArray[np.float32]:
-    """`fl(fl(x * w) / y)`, float32 of the shape of `weight_scale`."""
+    """Return `fl(fl(x * w) / y)`, float32 with the shape of `weight_scale`."""
     product = np.float32(input_scale) * np.asarray(weight_scale, np.float32)
     return np.asarray(product / np.float32(output_scale), np.float32)
 
 
 def _thresholds(scale: np.float32, low: int, high: int) -> NDArray[np.int64]:
-    """The smallest accumulator that gives at least k, for k = 1, 2, ... while it is in (low, high]."""
+    """Return the smallest accumulators that give at least k = 1, 2, ..., as long as they are in (low, high]."""
     steps = np.arange(1, _LEVELS + 1)
-    # Float rounding moves a step by less than one accumulator: three candidates bracket it.
+    # Float rounding moves a step by less than one accumulator, so three candidates are enough.
     candidates = np.floor((steps - 0.5) / np.float64(scale)).astype(np.int64)[:, None] + np.arange(-1, 3)
     candidates = np.clip(candidates, -(1 << 24), 1 << 24)
     reached = np.rint(candidates.astype(np.float32) * np.float32(scale)) >= steps[:, None]
@@ -134,19 +134,19 @@ def _thresholds(scale: np.float32, low: int, high: int) -> NDArray[np.int64]:
 
 
 def solve_requantisation(scale: np.float32, low: int, high: int) -> Requantisation | None:
-    """Constants equal to `requantise` for every accumulator from `low` to `high`; None if there are none.
+    """Return constants that reproduce `requantise` for every accumulator from `low` to `high`, or None.
 
-    Also None where an accumulator, times 256, leaves 31 bits, or the scale is 2^-4 or more.
+    None: there are no such constants, 256 times an accumulator exceeds 31 bits, or the scale is 2^-4 or more.
     """
     scale = np.float32(scale)
     nominal = float(scale) * 2.0 ** (32 - WEIGHT_SCALE_BITS + REQUANTISATION_SHIFT)
     if not 1.0 <= nominal < 2**31 - 1:
         return None
     steps = _thresholds(scale, low, high)
-    # Steps are counted from the level of `low`, which need not be 0: a bias may lift every output.
+    # Count steps from the level of `low`, which can be above 0 because of the bias.
     level = int(requantise(np.array([low]), scale)[0])
     k = np.arange(level + 1, level + 1 + len(steps), dtype=np.int64)
-    # Past this the last step leaves its gap for certain.
+    # With larger values the last step is always outside of its gap.
     reach = max(1.0, nominal / max(1, abs(low), abs(high)))
     trials = np.unique(np.rint(nominal + np.linspace(-reach, reach, 129)).astype(np.int64))
     trials = trials[(trials > 0) & (trials < 2**31)]
@@ -167,14 +167,14 @@ def solve_requantisation(scale: np.float32, low: int, high: int) -> Requantisati
 
 
 def _reaching(level: NDArray[np.int64] | int, multiplier: int) -> NDArray[np.int64]:
-    """The smallest scaled accumulator whose product reaches `level`."""
+    """Return the smallest scaled accumulator whose product reaches `level`."""
     return -((-(np.asarray(level, np.int64) << (32 + REQUANTISATION_SHIFT))) // multiplier)
 
 
 def _offset_between(
     lowest: NDArray[np.int64], *, at_least: int | None, at_most: int | None, nominal: int
 ) -> int | None:
-    """The middle of the offsets that put every step in its gap, which is 256 wide; None if empty."""
+    """Return the middle of the offsets for which every step is in its gap of width 256; None if there are none."""
     floors = [int(lowest.max())] if lowest.size else []
     ceilings = [int(lowest.min()) + 255] if lowest.size else []
     floors += [at_least] if at_least is not None else []
@@ -187,10 +187,10 @@ def _offset_between(
 
 
 def solve_sum(first: np.float32, second: np.float32) -> Sum | None:
-    """Constants equal to `sum_table(first, second)` for all 65,536 pairs; None if there are none near.
+    """Return constants that reproduce `sum_table(first, second)` for all 65,536 pairs; None if none are found.
 
-    `first` and `second` are the ratios of the operands' scales to the result's. Also None where
-    their sum exceeds 2, which would leave 31 bits, and where fused and separate arithmetic differ.
+    `first` and `second` are the ratios of the operands' scales to the result's. Also None if
+    their sum exceeds 2, which needs more than 31 bits, or if fused and separate arithmetic differ.
     """
     ratios = np.array([first, second], np.float32).astype(np.float64)
     if not (np.all(ratios > 0) and float(ratios.sum()) <= 2.0):
@@ -200,7 +200,7 @@ def solve_sum(first: np.float32, second: np.float32) -> Sum | None:
         return None
     a, b = np.meshgrid(np.arange(256), np.arange(256), indexing="ij")
     exact = ratios[0] * a + ratios[1] * b + 0.5
-    # Only pairs beside a step can go wrong: coefficients are off by at most 17 * 2^-22.
+    # Only pairs next to a step can be wrong, because the coefficients differ by at most 17 * 2^-22.
     critical = np.abs(exact - np.rint(exact)) < 2.0**-9
     a, b, k = (values[critical].astype(np.int64) for values in (a, b, table))
     unit = np.int64(1) << SUM_SHIFT
@@ -223,7 +223,7 @@ def solve_sum(first: np.float32, second: np.float32) -> Sum | None:
 def accumulator_range(
     weight: NDArray[np.int8], bias: NDArray[np.int32]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Smallest and largest accumulator of each output for uint8 inputs; `weight` has outputs first."""
+    """Return the smallest and largest accumulator of each output for uint8 inputs; `weight` has outputs first."""
     rows = weight.reshape(len(weight), -1).astype(np.int64)
     return (
         bias + 255 * np.minimum(rows, 0).sum(axis=1),
@@ -238,10 +238,10 @@ def nudge_weight_scale(
     low: NDArray[np.int64],
     high: NDArray[np.int64],
 ) -> NDArray[np.float32]:
-    """`weight_scale` with each channel's value moved by the fewest ulps that make it solvable.
+    """Return `weight_scale` with the value of each channel moved by as few ulps as needed to be solvable.
 
     Raises:
-        ModelError: no value within 64 ulps is; the channel's scale is then out of range.
+        ModelError: no value within 64 ulps is solvable; the scale of the channel is then out of range.
     """
     nudged = np.array(weight_scale, np.float32)
     for channel in range(len(nudged)):
@@ -278,12 +278,12 @@ def nudge_sum_scale(first: np.float32, second: np.float32, total: np.float32) ->
 
 
 def nudge(weights: Int8Weights) -> Int8Weights:
-    """`weights` with scales moved by a few ulps, so that every layer has exact integer constants.
+    """Return `weights` with scales moved by a few ulps, so that every layer has exact integer constants.
 
-    The integers stay as they are. A network that is exact already is returned with equal scales.
+    The integers do not change. The scales of a network that is already exact do not change either.
 
     Raises:
-        ModelError: a scale is far outside of what the integer forms can express; names the layer.
+        ModelError: the integer forms cannot express a scale; the message contains the layer.
     """
     activation = dict(weights.activation_scale)
     weight_scale = dict(weights.weight_scale)
@@ -305,7 +305,7 @@ def nudge(weights: Int8Weights) -> Int8Weights:
 
 
 def _neighbours(value: np.float32) -> list[np.float32]:
-    """`value` and the float32 values around it, nearest first."""
+    """Return `value` and its neighbouring float32 values, nearest first."""
     around = [np.float32(value)]
     up = down = np.float32(value)
     for _ in range(_MAX_ULPS):

@@ -1,4 +1,4 @@
-"""Finds the models, and other files, that ship with the package, wherever it is installed."""
+"""Find the models and other files of the installed package."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from typing import TYPE_CHECKING
 from uwb_mitigation.errors import ModelError, did_you_mean
 
 if TYPE_CHECKING:
-    # The doctor comes even where numpy does not.
+    # `doctor` must work without NumPy.
     from uwb_mitigation.preprocessing import Scaling
 
 DEFAULT, AMPLITUDE, SITE = SHIPPED = ("universal", "universal_amplitude", "evk1000_apartment")
-"""For places and boards that they never saw, with preamble counts and without; and an example of a surveyed site."""
+"""Models for unknown sites and boards, with and without preamble counts, and an example of a surveyed site."""
 
 _SHARE = Path("share", "uwb_mitigation")
 
 
 def default_model_path(scaling: Scaling | None = None) -> Path:
-    """The model where none is named, for inputs of that scaling (preamble by default): see `shipped_model_path`."""
+    """Return the path of the default model for inputs with a scaling (default: preamble); see `shipped_model_path`."""
     return shipped_model_path(AMPLITUDE if scaling is not None and scaling.value == "max" else DEFAULT)
 
 
 def model_path(named: str | Path | None) -> Path:
-    """Return the path of a bundle: a file, or one of `SHIPPED`; the default if none is named.
+    """Return the path of a bundle: a file, or one of `SHIPPED`; the default for None.
 
     Raises:
-        ModelError: there is no such shipped model or file; names the shipped ones.
+        ModelError: there is no such shipped model or file; the message lists the shipped ones.
     """
     if not named or str(named) == ".":
         return default_model_path()
@@ -46,10 +46,10 @@ def model_path(named: str | Path | None) -> Path:
 
 
 def shipped_model_path(name: str) -> Path:
-    """One of `SHIPPED`: of a source checkout, of this installation, or of a sourced ROS workspace.
+    """Return the path of one of `SHIPPED` in a source checkout, this installation, or a sourced ROS workspace.
 
     Raises:
-        ModelError: it is in none of these; the message lists them.
+        ModelError: the model is in none of these folders; the message lists them.
     """
     candidates = [folder / f"{name}.onnx" for folder in shared_folders("models")]
     for candidate in candidates:
@@ -63,7 +63,7 @@ def shipped_model_path(name: str) -> Path:
 
 
 def shared_folders(name: str) -> list[Path]:
-    """Where the package's shared folder `name` may be: in a checkout, in this installation, in sourced workspaces."""
+    """Return possible paths of the shared folder `name`: in a checkout, this installation and sourced workspaces."""
     package = Path(__file__).resolve().parent.parent
     folders = [package.parent / name]
     # lib/python3.x/site-packages/uwb_mitigation, or Debian's local/lib/python3.x/dist-packages.

@@ -1,4 +1,4 @@
-"""The network's parameters as plain numpy arrays: what training yields, and what the graphs are written from."""
+"""Parameters of a network as NumPy arrays: the result of training, and the content of the graphs."""
 
 from __future__ import annotations
 
@@ -32,18 +32,17 @@ class FloatWeights:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Int8Weights:
-    """Parameters in integers, with the scales that give them their meaning.
+    """Integer parameters and their scales.
 
-    A value is `scale * integer` everywhere: weights are symmetric, and activations are non-negative,
-    so that no zero point is needed. A layer's bias is in units of its input's scale times its
-    weight's scale, that is, of its accumulator.
+    Every value is `scale * integer`: weights are symmetric and activations are non-negative, so that no zero point is
+    needed. The unit of a bias is that of the accumulator of its layer: scale of the input times scale of the weight.
 
     Attributes:
         architecture: the network they belong to.
         weight: {layer: int8, shapes as in `FloatWeights`}.
         weight_scale: {layer: (filters,) float32}; the head's is (1,).
         bias: {layer: int32}.
-        activation_scale: {tensor: float32}; tensors are named as `graph.py` names them.
+        activation_scale: {tensor: float32}; the tensors have the same names as in `graph.py`.
     """
 
     architecture: Architecture
@@ -61,11 +60,11 @@ class Int8Weights:
 
 
 def activation_tensors(architecture: Architecture) -> tuple[str, ...]:
-    """Every tensor that int8 quantisation gives a scale, in the order of evaluation.
+    """Return every tensor that has a scale in int8, in the order of evaluation.
 
-    `input`; of a REMNet `first`, then for each module its convolutions, `moduleN.sum` (the residual's
-    sum) and `moduleN` (its output); of an MLP its layers. A layer's output has the layer's name; a
-    tensor that is no layer's is the sum of its `sum_operands`.
+    The first is `input`. REMNet: `first`, then for each module its convolutions, `moduleN.sum` (sum of the residual)
+    and `moduleN` (its output). MLP: its layers. The output of a layer has the name of the layer; a tensor that is not
+    the output of a layer is the sum of its `sum_operands`.
     """
     if isinstance(architecture, Mlp):
         return ("input", *(layer.name for layer in architecture.layers))
@@ -78,7 +77,7 @@ def activation_tensors(architecture: Architecture) -> tuple[str, ...]:
 
 
 def layer_inputs(architecture: Architecture) -> dict[str, str]:
-    """{layer: the tensor that it reads}, in the order of evaluation."""
+    """Return {layer: its input tensor}, in the order of evaluation."""
     if isinstance(architecture, Mlp):
         tensors = activation_tensors(architecture)
         return dict(zip((*tensors[1:], HEAD), tensors, strict=True))
@@ -94,7 +93,7 @@ def layer_inputs(architecture: Architecture) -> dict[str, str]:
 
 
 def sum_operands(tensor: str) -> tuple[str, str]:
-    """The two tensors that `moduleN.sum` or `moduleN` adds."""
+    """Return the two operands of `moduleN.sum` or `moduleN`."""
     module, _, part = tensor.partition(".")
     if not part:
         return f"{module}.reduce", f"{module}.skip"
@@ -103,7 +102,7 @@ def sum_operands(tensor: str) -> tuple[str, str]:
 
 
 def weight_shapes(architecture: Architecture) -> dict[str, tuple[int, ...]]:
-    """{layer: shape of its weights}; its outputs come first, but for the head's."""
+    """Return {layer: shape of its weights}; outputs first, except for the head."""
     shapes: dict[str, tuple[int, ...]]
     if isinstance(architecture, Mlp):
         shapes = {layer.name: (layer.outputs, layer.inputs) for layer in architecture.layers}

@@ -30,8 +30,7 @@ MSE = None
 """Instead of a percentile: choose the scale of each activation with the least mean squared rounding error."""
 
 LEAST_RATIO = 2.0**-12
-"""Minimum ratio of the scales of a sum's operands: below 2^-14 of the result's scale, ONNX Runtime on ARM uses another
-formula."""
+"""Minimum ratio of the scales of a sum's operands: below 2^-14 of the result's scale, ONNX Runtime on ARM differs."""
 
 CALIBRATION_PER_CONFIGURATION = 40
 """Number of inputs per configuration for computing the scales of the activations."""
