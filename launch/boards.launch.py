@@ -1,4 +1,4 @@
-"""Starts a driver and a mitigator for each of several boards, each pair in a namespace of its own.
+"""Start a driver and a mitigator for each of several boards, each pair in its own namespace.
 
     ros2 launch uwb_mitigation boards.launch.py boards:='left=/dev/uwb/1A2B right=usb:2341:805a:3C4D'
 

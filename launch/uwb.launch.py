@@ -1,11 +1,11 @@
-"""Starts driver and mitigator, and respawns them when they crash.
+"""Start driver and mitigator, and respawn them when they crash.
 
     ros2 launch uwb_mitigation uwb.launch.py source:=serial port:=/dev/ttyACM0
     ros2 launch uwb_mitigation uwb.launch.py source:=mcap path:=recording.mcap
-    ros2 launch uwb_mitigation uwb.launch.py params:=robot.yaml             # which names the source
+    ros2 launch uwb_mitigation uwb.launch.py params:=robot.yaml             # sets the source
 
 `locate:=true anchors:=anchors.yaml` also starts a locator, `viewer:=true` a page at http://localhost:5006; without a
-source they are started alone. Every parameter of these nodes is an argument; `--show-args` lists them. For several
+source, only these start. Every parameter of these nodes is an argument; `--show-args` lists them. For several
 boards give each a namespace, such as `namespace:=board1`, or see `boards.launch.py`. `one_process:=true` runs driver
 and mitigator in one process, which needs less CPU and publishes no CIR unless there is a subscriber.
 """
@@ -66,7 +66,7 @@ def nodes_of(context):
         values["viewer"].pop("anchors", None)
     settings = {node: [*files[node], values[node], common] for node in started}
     if flag["one_process"] and source:
-        # Without a name: it would be given to both nodes of the process.
+        # Without a node name, because it would apply to both nodes of the process.
         both = [said["driver_params"], *files["mitigator"], values["driver"] | values["mitigator"], common]
         settings = {"pipeline": both} | {node: settings[node] for node in started if node in wanted}
     ends = source in ("mcap", "decaranging")
@@ -79,7 +79,7 @@ def nodes_of(context):
             namespace=said["namespace"],
             parameters=parameters,
             output="screen",
-            # The end of a recording ends its driver, which must not start again.
+            # The driver ends after the recording and must not be respawned.
             respawn=flag["respawn"] and not (name in ("driver", "pipeline") and ends),
             respawn_delay=0.5,
             additional_env=kept,

@@ -1,4 +1,4 @@
-"""`make demo`: a recording through `driver` and `mitigator`, two processes over real DDS, watched live.
+"""`make demo`: replay a recording through `driver` and `mitigator`, two processes over DDS, and show it live.
 
 python -m uwb_mitigation.entry demo [--recording PATH] [--rate FACTOR]
 """
@@ -36,7 +36,7 @@ SETTLE_S = 3.0
 
 @dataclass(frozen=True, slots=True)
 class Programme:
-    """What is played: title, the driver's parameters, the anchors and the boards' offset if known."""
+    """A demo: title, the driver's parameters, and if known the anchors and the offset of the boards."""
 
     title: str
     parameters: tuple[str, ...]
@@ -45,7 +45,7 @@ class Programme:
 
 
 def simulated(rate: float) -> Programme:
-    """The simulator's default scene; what is too weak to be received gives no range, as on the air."""
+    """Return the demo of the simulator's default scene, in which weak signals give no range."""
     source = SimulatedSource(count=SIMULATED_EXCHANGES, rate_hz=SIMULATED_RATE_HZ)
     offset_m = offset_of(source)
     return Programme(
@@ -62,7 +62,7 @@ def simulated(rate: float) -> Programme:
 
 
 def offset_of(source: Source) -> float | None:
-    """Return the boards' offset (m) from true distances in line of sight; None if it is unknown."""
+    """Return the offset of the boards (m) from LOS ranges with truth; None if it is unknown."""
     from uwb_mitigation.evaluation.radio_offsets import find_offset
     from uwb_mitigation.mitigation import Mitigation
     from uwb_mitigation.model.bundle import load_bundle
@@ -145,7 +145,7 @@ def watch(programme: Programme, console: Console) -> list[str]:
                 lambda: monitor.count_publishers(corrected) > 0 and monitor.count_subscribers(raw) > 1,
                 "the mitigator did not start: see above",
             )
-            # The mitigator and this process shall receive the first range.
+            # The mitigator and this process must receive the first range.
             nodes.start("driver", *programme.parameters, "wait_for_subscribers:=2")
             with Live(console=console, refresh_per_second=REFRESH_HZ) as live:
                 while nodes.running:

@@ -1,4 +1,4 @@
-"""The executables, and how a signal ends them while they load. Standard library only: the rest loads in a second.
+"""Entry points, with signal handling during imports. Standard library only: other imports take a second.
 
 python -m uwb_mitigation.entry NODE --ros-args ..., or demo ...
 """
@@ -40,7 +40,7 @@ def viewer() -> None:
 
 
 def command_line() -> None:
-    """`uwb-mitigation`."""
+    """Run the command `uwb-mitigation`."""
     run_program("uwb_mitigation.commands.cli")
 
 
@@ -63,20 +63,20 @@ def _node(name: str) -> None:
         signal.signal(signal.SIGPIPE, signal.SIG_DFL)
         print(help_text(name))
     elif name == "monitor":
-        # It draws in this thread, and is spun by another.
+        # The monitor draws in this thread and spins in another.
         _load("uwb_mitigation.nodes.monitor")()
     else:
         if name == "viewer":
-            # Where a processor is short, ranges are corrected before they are drawn. Here, before the middleware has threads.
+            # On a loaded CPU, correcting ranges has priority. Set this before the middleware starts its threads.
             os.nice(10)
-        # Which catches signals itself once the node is loaded.
+        # It installs signal handlers after the node is loaded.
         _load("uwb_mitigation.nodes.spinning")(name)
 
 
 def _load(module: str) -> Callable[..., Any]:
-    """The `main` of a module. Until it is loaded a signal ends the process at once, with 128 + its number.
+    """Return `main` of a module; a signal during the import exits immediately with 128 + its number.
 
-    A library that is not there ends it with one line.
+    If a dependency is missing, the process exits with a one-line error.
     """
     for number in _SIGNALS:
         signal.signal(number, _end)

@@ -1,4 +1,4 @@
-"""The sub-commands of `uwb-mitigation`, one module a group, named after it. Each parses options, calls the library and
-shows the result; none holds logic of its own. Heavy imports stay inside the command functions, so that
-`--help` answers at once.
+"""The sub-commands of `uwb-mitigation`, one module for each group. Each parses options, calls the library and
+shows the result; the logic is in the library. Heavy imports are inside the command functions, so that
+`--help` is fast.
 """

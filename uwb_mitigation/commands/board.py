@@ -112,7 +112,7 @@ def _firmware(model: Path | None) -> tuple[Hello, Mitigation | None]:
 
 
 class RadioSource(str, Enum):
-    """What hangs between this computer and the chip."""
+    """Interface between this computer and the chip."""
 
     EVB1000 = "evb1000"
     SPI = "spi"
@@ -157,9 +157,9 @@ def antenna_delay(
 ) -> None:
     """Calibrate a pair of radios over a known distance.
 
-    Put both up in line of sight of each other, well above the floor, at a distance that you measured: 5.01 m suits
-    channel 5 (Decawave APS014). A driver must not hold the ports. With two ports, both radios get the
-    same delay; with one, the anchor keeps its own, and the tag takes all of what the ranges are off.
+    Place both in line of sight of each other, well above the floor, at a measured distance: 5.01 m suits
+    channel 5 (Decawave APS014). No driver may have the ports open. With two ports, both radios get the
+    same delay; with one, the anchor keeps its delay, and the tag's delay compensates the complete error.
 
         uwb-mitigation board antenna-delay --distance 5.01 --port /dev/ttyACM0,/dev/ttyACM1 -o antenna_delay.yaml
     """
@@ -246,7 +246,7 @@ def export_c(
 ) -> None:
     """Write a model as a C header for the firmware.
 
-    It holds weights, constants and golden vectors.
+    It contains weights, constants and golden vectors.
     """
     from uwb_mitigation.firmware_export.export import GOLDEN_VECTORS, export_bundle
     from uwb_mitigation.model.bundle import load_bundle
@@ -273,11 +273,11 @@ def build_image(
     model: ModelOption = None,
     json: JsonOption = None,
 ) -> None:
-    """Build the DWM1001-DEV's image, as Intel HEX.
+    """Build the DWM1001-DEV image as Intel HEX.
 
-    Ranging firmware with a model for corrections on the board. One image: the board is an anchor until its host, or its
-    button held at the start, makes it a tag. It was never run on a board; its driver and exchange
-    were tested on a modelled chip.
+    It contains the ranging firmware with a model that corrects on the board. The board is an anchor unless its host, or
+    its button pressed during start-up, makes it a tag. The image has not been run on a board; its driver and
+    exchange were tested on a chip model.
     """
     import tempfile
 

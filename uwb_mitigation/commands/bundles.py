@@ -1,4 +1,4 @@
-"""Which model a command works with where none is named."""
+"""Default model of a command."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ ModelOption = Annotated[
 
 
 def bundle_for(named: Path | None, recording: Path) -> Bundle:
-    """The bundle that is named, or the shipped one that reads the CIRs of a recording; tells if it is not `universal`.
+    """Return the named bundle, or the shipped one (logged unless `universal`) that can read a recording's CIRs.
 
     Raises:
-        ModelError: it cannot be loaded.
+        ModelError: the bundle cannot be loaded.
     """
     from uwb_mitigation.model.bundle import load_bundle
     from uwb_mitigation.model.shipped import AMPLITUDE, model_path
@@ -43,7 +43,7 @@ def bundle_for(named: Path | None, recording: Path) -> Bundle:
 
 
 def _lacks_counts(recording: Path) -> bool:
-    """Whether the first CIR has none; what cannot be read is for the command to tell, and a damaged CIR tells nothing."""
+    """Return whether the first CIR has no preamble count; False if it is damaged. The command reports read errors."""
     from uwb_mitigation.sources.opening import open_recording
 
     try:

@@ -1,4 +1,4 @@
-"""`uwb-mitigation calibrate`: a site's model and offsets from a drive past its anchors, without a survey."""
+"""`uwb-mitigation calibrate`: model and offsets of a site from a drive past its anchors, without ground truth."""
 
 from __future__ import annotations
 
@@ -102,10 +102,10 @@ def calibrate(
     ] = False,
     json: JsonOption = None,
 ) -> None:
-    """Calibrate a site from a drive, without surveyed places.
+    """Calibrate a site from a drive, without surveyed positions.
 
-    Drive a tag past four anchors or more for two minutes, or put tags at a dozen places. Track, offsets of the
-    radios, and a model of what the walls do are found together, and tested on parts of the drive that were held out.
+    Drive a tag past four anchors or more for two minutes, or put tags at a dozen positions. The track, the offsets of
+    the radios and a model of the NLOS errors are estimated jointly and tested on held-out parts of the drive.
 
         uwb-mitigation calibrate drive.mcap --anchors anchors.yaml --height 0.4 -o site.onnx
 
@@ -220,7 +220,7 @@ def _poses(
     frames: tuple[str, str] | None,
     arm: tuple[float, float, float] | None,
 ) -> tuple[list[list[PosePath]], NDArray[np.float64]]:
-    """For each tag, the poses of the body that carries it in each bag; and the lever arms, (T, 3)."""
+    """Return, for each tag, the poses of its body in each bag; and the lever arms, (T, 3)."""
     import numpy as np
 
     from uwb_mitigation.bag.pose_paths import read_bodies
@@ -252,7 +252,7 @@ def _poses(
 
 
 def _body(tag_id: int, bodies: Iterable[str], where: str) -> str:
-    """The body that carries a tag: its own frame in any namespace, otherwise the only body that is no tag."""
+    """Return the body of a tag: its own frame in any namespace, otherwise the only body that is not a tag."""
     from uwb_mitigation.bag.poses import tag_frame, tag_of_frame
 
     names = sorted(bodies)
@@ -270,7 +270,7 @@ def _body(tag_id: int, bodies: Iterable[str], where: str) -> str:
 def _lever_arm_in(
     bags: list[Path], bodies: list[str], frames: Iterable[str]
 ) -> tuple[float, float, float] | None:
-    """The transform from the robot to the antenna, from the bags that contain it; None: no bag does."""
+    """Return the transform from robot to antenna from the bags that contain it; None if no bag does."""
     from uwb_mitigation.bag.pose_paths import read_lever_arm
 
     read = [

@@ -1,4 +1,4 @@
-"""What commands check before the work, not after it."""
+"""Checks that commands make before the work."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ OffsetsOption = Annotated[
 
 @contextmanager
 def needs_torch() -> Iterator[None]:
-    """Around imports: say which command installs torch where it is missing."""
+    """Wrap imports: if torch is missing, the error names the command that installs it."""
     try:
         yield
     except ModuleNotFoundError as error:
@@ -37,10 +37,10 @@ def needs_torch() -> Iterator[None]:
 
 
 def check_output(output: Path) -> None:
-    """Refuse a place that no bundle can be written to.
+    """Check that a bundle can be written to a path.
 
     Raises:
-        ParameterError: it is one.
+        ParameterError: it cannot.
     """
     if output.suffix != ".onnx" or output.is_dir() or not output.resolve().parent.is_dir():
         raise ParameterError(
@@ -49,10 +49,10 @@ def check_output(output: Path) -> None:
 
 
 def scaling_of(name: str) -> Scaling:
-    """The scaling of that name.
+    """Return the scaling of that name.
 
     Raises:
-        ParameterError: there is none.
+        ParameterError: the name is unknown.
     """
     from uwb_mitigation.preprocessing import Scaling
 

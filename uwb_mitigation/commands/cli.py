@@ -1,4 +1,4 @@
-"""The command `uwb-mitigation`: assembles the sub-commands and turns errors into one clear line."""
+"""The command `uwb-mitigation`: assembles the sub-commands and turns errors into one-line messages."""
 
 from __future__ import annotations
 
@@ -56,12 +56,12 @@ PANELS: dict[str, dict[str, typer.Typer | Callable[..., None]]] = {
         "doctor": doctor.doctor,
     },
 }
-"""Every command where `--help` and docs/reference/commands.md show it: a new one is a line here, and what it says there
-is the first line of its docstring."""
+"""Panel of each command in `--help` and docs/reference/commands.md. Add new commands here; the text shown is the
+first line of the docstring."""
 
 
 class _InOrder(TyperGroup):
-    """Shows commands in the order of `PANELS`: typer would put groups behind all others."""
+    """Shows commands in the order of `PANELS`; typer would list groups last."""
 
     def list_commands(self, ctx: object) -> list[str]:
         return [name for commands in PANELS.values() for name in commands]
@@ -100,9 +100,9 @@ def _root(
 
 
 def _fill(command: Any) -> None:
-    """Let the help of a command and of those below it take the terminal's width: typer keeps a docstring's lines."""
+    """Wrap the help of a command and its sub-commands at the terminal's width; typer keeps a docstring's lines."""
     paragraphs = inspect.cleandoc(command.help or "").split("\n\n")
-    # An example in a style, even in none, keeps its indent: typer takes off what all lines but the first begin with.
+    # Style tags keep the indent of an example: typer removes the common indent of all lines but the first.
     command.help = "\n\n".join(
         f"[none]{text}[/none]" if text.startswith(" ") else text.replace("\n", " ") for text in paragraphs
     )
@@ -118,7 +118,7 @@ def _fail(error: UwbMitigationError) -> NoReturn:
 def main() -> None:
     """Run the command line; exit 1 with one line on bad input, 130 on Ctrl-C.
 
-    Where the reader of standard output (head, less) goes away, typer and rich end it: silently, with 1.
+    If the reader of standard output (head, less) exits, typer and rich exit with 1 and without a message.
     """
     command = typer.main.get_command(app)
     _fill(command)

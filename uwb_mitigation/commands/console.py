@@ -1,4 +1,4 @@
-"""What every sub-command shares: where tables, progress and JSON results go."""
+"""Output of the sub-commands: tables, progress and JSON results."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ MOST_SHOWN = 40
 
 
 class Table(RichTable):
-    """A table that breaks a long word over two lines: rich would cut it off where the terminal is narrow."""
+    """A table that wraps long words; rich would truncate them in a narrow terminal."""
 
     def add_column(self, *arguments: Any, **options: Any) -> None:
         super().add_column(*arguments, **{"overflow": "fold", **options})
 
 
-# Results go to standard output, progress to standard error, so that a pipe carries results alone.
-# rich leaves colours and cursor movement out where a stream is not a terminal.
+# Results go to standard output, progress to standard error, so that a pipe contains only results.
+# rich omits colours and cursor movement if a stream is not a terminal.
 out = Console()
 err = Console(stderr=True)
 
 
 def say(text: str) -> None:
-    """Print a line without highlighting numbers or breaking it."""
+    """Print a line without highlighted numbers or line breaks."""
     out.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
@@ -57,7 +57,7 @@ def show_table(
     Args:
         marked: the row with this name is bold.
         left: the number of left-aligned columns; the others are right-aligned.
-        most: the number of rows.
+        most: maximum number of rows.
     """
     table = Table(title=title, title_justify="left")
     for number, column in enumerate(columns):
@@ -71,7 +71,7 @@ def show_table(
 
 
 def progress() -> Progress:
-    """A progress bar with elapsed and remaining time, on standard error where that is a terminal."""
+    """Return a progress bar with elapsed and remaining time, on standard error if it is a terminal."""
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -86,7 +86,7 @@ def progress() -> Progress:
 
 @contextlib.contextmanager
 def share_bar(name: str) -> Iterator[Callable[[float], None]]:
-    """A progress bar with remaining time; yields what takes the share that is done."""
+    """Show a progress bar with remaining time; yield a function that sets the completed fraction."""
     with progress() as bar:
         task = bar.add_task(name, total=1.0)
         yield lambda share: bar.update(task, completed=share)
@@ -94,7 +94,7 @@ def share_bar(name: str) -> Iterator[Callable[[float], None]]:
 
 @contextlib.contextmanager
 def step_bar(name: str, steps: int) -> Iterator[Callable[[], None]]:
-    """A progress bar with remaining time; yields what is called after each step."""
+    """Show a progress bar with remaining time; yield a function to call after each step."""
     with progress() as bar:
         task = bar.add_task(name, total=steps)
         yield lambda: bar.advance(task)
@@ -102,7 +102,7 @@ def step_bar(name: str, steps: int) -> Iterator[Callable[[], None]]:
 
 @contextlib.contextmanager
 def stage_bars() -> Iterator[Callable[[str, float], None]]:
-    """A progress bar for each thing that is done, one after the other; yields what takes its name and share."""
+    """Show a progress bar for each stage in turn; yield a function that sets name and completed fraction."""
     with progress() as bar:
         tasks: dict[str, TaskID] = {}
 
@@ -116,7 +116,7 @@ def stage_bars() -> Iterator[Callable[[str, float], None]]:
 
 @contextlib.contextmanager
 def reading() -> Iterator[Callable[[], None]]:
-    """A progress bar of no known end; yields what is called after each range."""
+    """Show a progress bar of unknown length; yield a function to call after each range."""
     with progress() as bar:
         task, ranges = bar.add_task("reading", total=None), itertools.count(1)
 
@@ -128,13 +128,13 @@ def reading() -> Iterator[Callable[[], None]]:
 
 
 def show_refused(refused: Mapping[str, int]) -> None:
-    """What was left out, {why: count}."""
+    """Print the number of refused ranges by reason, {reason: count}."""
     for reason, count in refused.items():
         err.print(f"left out: {count} x {reason}", markup=False)
 
 
 def write_json(path: Path | None, result: Mapping[str, Any]) -> None:
-    """Write `result` to `path`, whole or not at all; do nothing without a path.
+    """Write `result` to `path` atomically; do nothing without a path.
 
     Raises:
         UwbMitigationError: the file cannot be written.
@@ -149,7 +149,7 @@ def write_json(path: Path | None, result: Mapping[str, Any]) -> None:
 
 
 def _check_json_target(path: Path | None) -> Path | None:
-    """Refuse a place that cannot hold the result before the work begins, not after."""
+    """Refuse a path that cannot be written, before the work begins."""
     if path is not None and (path.is_dir() or not path.absolute().parent.is_dir()):
         raise typer.BadParameter(f"{path} is a folder, or lies in one that is not there")
     return path

@@ -1,4 +1,4 @@
-"""`uwb-mitigation data`: bring recordings into bags or simulate them, and show what a recording holds."""
+"""`uwb-mitigation data`: import recordings into bags, simulate them, and show the contents of a recording."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ if TYPE_CHECKING:
 app = typer.Typer(help="Bring recordings into bags, simulate them, look at them.", no_args_is_help=True)
 
 _STRIDE = 100
-"""Ranges between two updates of a progress bar."""
+"""Number of ranges between two updates of a progress bar."""
 
 
 class CirChoice(str, enum.Enum):
-    """Which frame of a DecaRanging exchange gives the CIR."""
+    """Frame of a DecaRanging exchange whose CIR is used."""
 
     FINAL = "final"
     POLL = "poll"
 
 
 class Like(str, enum.Enum):
-    """What is simulated."""
+    """Kind of simulated recording."""
 
     DRIVE = "drive"
     SURVEY = "survey"
@@ -72,7 +72,7 @@ def import_recordings(
 ) -> None:
     """Write recordings into one MCAP bag, with truth where known."""
     opened = [_opened(path, cir) for path in sources]
-    # The time of a tag that is known to move continues through a pause.
+    # If a tag is known to move, its time continues during a pause.
     in_motion = any(getattr(source, "in_motion", False) for source in opened)
     _write(opened, output, math.inf if in_motion else longest_pause, force, json)
 
@@ -123,7 +123,7 @@ def _write(
     total: int | None = None,
     more: dict[str, Any] | None = None,
 ) -> None:
-    """Write sources into one bag, and show what it holds.
+    """Write sources into one bag, and show its contents.
 
     Raises:
         RecordingError: there are no ranges; or a source is damaged, after the bag was written.
@@ -198,7 +198,7 @@ def simulated_source(like: Like, seed: int, ranges: int, exchanges: int, anchors
 
 
 def _opened(path: Path, cir: CirChoice) -> Source:
-    """Open any recording, DeepUWB's pickle included; raises as `open_recording`."""
+    """Open any recording, including DeepUWB's pickle; raises the errors of `open_recording`."""
     from uwb_mitigation.sources.opening import open_recording
 
     if path.suffix == ".pkl":
@@ -214,7 +214,7 @@ def info(
     cir: CirOption = CirChoice.FINAL,
     json: JsonOption = None,
 ) -> None:
-    """Show what a recording holds: pairs, counts, oddities."""
+    """Show the contents of a recording: pairs, counts, warnings."""
     from uwb_mitigation.sources.inventory import Inventory
     from uwb_mitigation.sources.mcap import McapRecording
 
@@ -225,7 +225,7 @@ def info(
             for _ in inventory.watch(source):
                 on_record()
     finally:
-        # What was readable is shown before an error of the rest.
+        # Show the readable part before an error of the rest is raised.
         found = inventory.as_json()
         if inventory.ranges or inventory.skipped:
             _show_source(source)
@@ -240,7 +240,7 @@ def _save_anchors(source: Source, bag: Path) -> None:
 
     if isinstance(source, KnowsAnchors):
         path = anchors_file(bag)
-        # The bag itself was refused, or `--force` given, before.
+        # An existing bag was already refused, unless `--force` is given.
         save_anchors(path, source.anchors, f"anchors of {source.name}", force=True)
         say(f"Wrote {len(source.anchors)} anchors to {path}.")
 

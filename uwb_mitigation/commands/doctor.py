@@ -1,4 +1,4 @@
-"""`uwb-mitigation doctor`: checks the installation by using each part of it; serial ports are not opened."""
+"""`uwb-mitigation doctor`: checks each part of the installation by using it; opens no serial ports."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ LIBRARIES = {
     "models, positions, reports and data sets": ("onnx", "scipy", "pydantic", "pandas", "pooch"),
     "the command line, the viewer and benchmarks": ("typer", "rich", "bokeh", "psutil"),
 }
-"""{purpose: libraries that it needs}; nothing works without the first ones."""
+"""{purpose: required libraries}; the first entry is required by everything."""
 
 MODULES = {"pyyaml": "yaml", "pyserial": "serial"}
 _TOOLS = {
@@ -90,7 +90,7 @@ def _version(distribution: str) -> str:
 
 
 def _load_ros() -> str:
-    """Load ROS in a process of its own, since it ends a process that cannot load its middleware."""
+    """Load ROS in a separate process, since it aborts the process if it cannot load its middleware."""
     done = subprocess.run([sys.executable, "-c", _ROS], capture_output=True, text=True, timeout=60)
     if done.returncode:
         raise RuntimeError(done.stderr or f"exit code {done.returncode}")
@@ -116,5 +116,5 @@ def _ports() -> Iterator[Finding]:
     for port in sorted(list_ports.comports()):
         if os.access(port.device, os.R_OK | os.W_OK):
             yield Finding(port.device, "ok", port.description)
-        elif port.vid is not None:  # One without USB belongs to the computer, and rarely has a board.
+        elif port.vid is not None:  # A port without USB is built in, and rarely has a board.
             yield Finding(port.device, "broken", "permission denied: join the group dialout, log in again")

@@ -1,4 +1,4 @@
-"""`uwb-mitigation train`, `quantize` and `evaluate`: make models, and measure them."""
+"""`uwb-mitigation train`, `quantize` and `evaluate`: create and evaluate models."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ DataOption = Annotated[
     Path, typer.Option(help="Recording with true ranges: a bag, or a folder of DecaRanging logs.")
 ]
 OutputOption = Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="Bundle to write.")]
-# What only one way of `train` or `evaluate` reads: it is refused, not ignored, with the other.
+# Options that only one mode of `train` or `evaluate` uses; the other mode refuses them.
 _OF_DATA = {
     "choose": "--recipe",
     "samples": "--samples",
@@ -80,14 +80,14 @@ def train(
     folds: Annotated[int, typer.Option(help="Folds of the cross-validation.")] = 6,
     json: JsonOption = None,
 ) -> None:
-    """Train what the data can carry: a float bundle.
+    """Train a float bundle of a complexity that the data supports.
 
-    What that is, is chosen by cross-validation over configurations, and then trained on all of the data.
+    Cross-validation over configurations selects the model, which is then trained on all of the data.
 
-    Among the candidates is `cold start`, a network that was trained in simulated buildings with an offset of these
-    data; with fewer than 20 configurations it is preferred, with more its mean with the line is offered too. Not
-    with --recipe or --model. A network that is trained on the data is kept only where choosing it gains on what no choice
-    has seen.
+    One candidate is `cold start`, a network trained in simulated buildings, with an offset estimated from these data.
+    With fewer than 20 configurations it is preferred; with more, its mean with the line is a candidate too. It is not
+    used with --recipe or --model. A network trained on the data is kept only if its selection improves held-out
+    errors.
     """
     from uwb_mitigation.model.architecture import Remnet
     from uwb_mitigation.preprocessing import Preprocessing
@@ -149,7 +149,7 @@ def quantize(
 ) -> None:
     """Quantise a float bundle to int8.
 
-    The scales of its activations come from the data it was trained on, or calibrated with.
+    Its training or calibration data determine the scales of the activations.
     """
     from uwb_mitigation.evaluation import recordings
     from uwb_mitigation.model.bundle import load_bundle
@@ -200,7 +200,7 @@ def evaluate(
     ] = "preamble",
     json: JsonOption = None,
 ) -> None:
-    """Tell the error of a recording with truth, raw and corrected."""
+    """Compute the raw and corrected errors of a recording with truth."""
     if cross_validate is not None:
         if offsets is not None:
             raise ParameterError(
@@ -256,7 +256,7 @@ def _compare(data: Path, group: str, folds: int, seeds: int, scaling: Scaling, j
 
 
 def _dataset(data: Path, preprocessing: Preprocessing, truth: Sequence[Path] = ()) -> tuple[str, Dataset]:
-    """The recording's name, and its measurements; tells what is left out."""
+    """Return name and measurements of a recording; print the number of refused ranges."""
     from uwb_mitigation.evaluation import recordings
 
     with console.reading() as on_record:
@@ -266,6 +266,6 @@ def _dataset(data: Path, preprocessing: Preprocessing, truth: Sequence[Path] = (
 
 
 def _given(context: typer.Context, flags: Mapping[str, str]) -> str:
-    """Those of `flags`, {parameter: option}, that the command line holds, with commas."""
+    """Return the options of `flags`, {parameter: option}, in the command line, separated by commas."""
     sources = {flag: context.get_parameter_source(name) for name, flag in flags.items()}
     return ", ".join(flag for flag, source in sources.items() if source and source.name == "COMMANDLINE")

@@ -1,4 +1,4 @@
-"""The tables in which `train`, `train-universal` and `evaluate` show their results."""
+"""Tables with the results of `train`, `train-universal` and `evaluate`."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _CANDIDATES = {
 
 
 def show_trained(made: TrainedBundle) -> None:
-    """The selection, the cross-validation and the verdict of `train`."""
+    """Show the selection, the cross-validation and the verdict of `train`."""
     from uwb_mitigation.training import candidates, selection
 
     if made.selection is not None:
@@ -66,7 +66,7 @@ def show_trained(made: TrainedBundle) -> None:
 
 
 def show_selection(choice: Selection) -> None:
-    """The held-out errors of the candidates."""
+    """Show the held-out errors of the candidates."""
     show_table(
         f"{choice.configurations} configurations, {choice.folds} folds by configuration",
         ("candidate", "MAE, m", "", ""),
@@ -79,7 +79,7 @@ def show_selection(choice: Selection) -> None:
 
 
 def show_comparison(result: Comparison) -> None:
-    """The table of `evaluate --cross-validate`."""
+    """Show the table of `evaluate --cross-validate`."""
     labels = list(result.rows[0].by_label)
 
     def covered(of: Coverage) -> str:
@@ -109,19 +109,19 @@ def show_comparison(result: Comparison) -> None:
 
 
 def show_held_out(held_out: Mapping[str, Mapping[str, ErrorStatistics]]) -> None:
-    """The table of `train-universal`."""
+    """Show the table of `train-universal`."""
     rows = [(row, *(statistics.mae for statistics in by.values())) for row, by in held_out.items()]
     show_table("MAE in a simulated world that was held out, m", ("", *held_out["raw"]), rows)
 
 
 def show_bundle(bundle: Bundle) -> None:
-    """File, size and id of a bundle."""
+    """Show file, size and id of a bundle."""
     kind = "int8" if bundle.quantised else "float32"
     say(f"{bundle.path}: {kind}, {len(bundle.model)} bytes, model id {bundle.model_id:08x}")
 
 
 def show_accuracy(result: Accuracy) -> None:
-    """The table of `evaluate`."""
+    """Show the table of `evaluate`."""
     after = result.corrected
     rows: list[tuple[object, ...]] = [("all", result.n, result.raw.mae, after.mae, after.std, after.p95)]
     rows += [(label or "no label", *values, "", "") for label, values in result.by_label.items()]

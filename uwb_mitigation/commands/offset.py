@@ -1,4 +1,4 @@
-"""`uwb-mitigation offset`: what two radios' antenna delays add to every range, from one known distance."""
+"""`uwb-mitigation offset`: estimate the range offset of two radios (antenna delays) at one known distance."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ def offset(
     ] = False,
     json: JsonOption = None,
 ) -> None:
-    """Find what the radios' antenna delays add to every range.
+    """Estimate the range offset due to the antenna delays.
 
-    Place tag and anchor at a known distance, two metres or more, with nothing between or beside them, and record some
-    hundred ranges. What does not look like line of sight is refused. More placements make the answer surer,
-    more ranges of one hardly.
+    Place tag and anchor at a known distance of two metres or more, without obstacles between or next to them, and
+    record some hundred ranges. NLOS ranges are refused. More placements reduce the uncertainty; more ranges of
+    one placement have little effect.
 
         uwb-mitigation offset los.mcap --distance 5.00 -o offsets.yaml
         ros2 param set /mitigator offsets offsets.yaml

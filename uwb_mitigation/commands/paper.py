@@ -115,7 +115,7 @@ def protocol(
 
     Baselines (medians, and a line in the received power) are fitted on the same training part.
 
-    An interrupted run continues: networks that are finished in DIR are not trained again.
+    An interrupted run continues: networks already in DIR are not trained again.
     """
     lengths = _lengths(windows)
     with needs_torch():
@@ -146,7 +146,7 @@ def report(
     json: JsonOption = None,
 ) -> None:
     """Write one HTML page: the paper's tables and figures next to yours."""
-    # Read everything before the work begins, so that a missing library or a wrong file stops at once.
+    # Read everything before the work begins, so that a missing library or a wrong file is an early error.
     from uwb_mitigation.files import write_whole
     from uwb_mitigation.paper import published, results
     from uwb_mitigation.paper import report as reports
@@ -173,7 +173,7 @@ def report(
 
 
 def _command() -> str:
-    """The command line of this process, for the provenance of results."""
+    """Return the command line of this process, for the provenance of results."""
     return shlex.join(["uwb-mitigation", *sys.argv[1:]])
 
 
@@ -221,7 +221,7 @@ def _show_experiment(result: ExperimentResults) -> None:
 
     provenance = tables.Provenance(result.data, result.split, "", "")
     table = tables.accuracy(result, provenance, "", "Measured")
-    # Without the paper's columns, and without networks that were not trained.
+    # Omit the columns of the paper and networks that were not trained.
     rows = [row for row in table.rows if tables.MISSING not in row]
     show_table(
         f"{result.data}, split {result.split}: {result.train} to train on, {result.test} to test, "

@@ -1,4 +1,4 @@
-"""`uwb-mitigation track` and `survey`: where a recording's tags were, and where its anchors are."""
+"""`uwb-mitigation track` and `survey`: estimate the positions of a recording's tags and anchors."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _COLUMNS = {
     "exceeded": ("beyond", "{:.2%}"),
     "height_rmse": ("height", "{:.3f}"),
 }
-"""Fields of `TrackErrors`: the titles and formats of their columns."""
+"""{field of `TrackErrors`: title and format of its column}."""
 
 BagArgument = Annotated[
     Path, typer.Argument(metavar="BAG", help="An MCAP bag with ranges, corrected or raw.")
@@ -98,11 +98,11 @@ def track(
     force: Annotated[bool, typer.Option("--force", help="Replace what exists.")] = False,
     json: JsonOption = None,
 ) -> None:
-    """Tell where the tags of a recording were: live, and smoothed looking ahead.
+    """Estimate the tracks of a recording's tags: filtered and smoothed.
 
-    Corrected ranges are taken where the bag has them (`uwb-mitigation process`), raw ones otherwise. Where the
-    bag knows the truth, a table shows the errors of both, beside least squares on raw ranges. A second table needs no
-    truth: residuals of raw and of corrected ranges. Positions of anchors are written to OUT.anchors.yaml.
+    It uses the corrected ranges of the bag (`uwb-mitigation process`), or raw ranges if there are none. If the
+    bag contains the truth, a table shows the errors of both and of least squares on raw ranges. A second table,
+    which needs no truth, shows the residuals of raw and corrected ranges. Anchor positions are written to OUT.anchors.yaml.
 
         uwb-mitigation data import LOS_A1 -o a1.mcap
 
@@ -168,11 +168,11 @@ def survey(
     force: Annotated[bool, typer.Option("--force", help="Replace FILE if it exists.")] = False,
     json: JsonOption = None,
 ) -> None:
-    """Find the anchors from rough guesses and the ranges of a tag driven past them.
+    """Estimate anchor positions from rough guesses and a drive past them.
 
-    Drive a loop of a minute or more that passes every anchor on more than one side. Anchors that are not where the
-    file says, and pairs that were swapped, are named. Ranges do not tell where the whole lies and how it is turned:
-    the guesses do, or anchors that are `--fixed`.
+    Drive a loop of a minute or more that passes every anchor on more than one side. The output names anchors that are
+    not at the position in the file, and swapped pairs. Translation and rotation of all anchors are unobservable from
+    ranges: they come from the guesses, or from anchors that are `--fixed`.
     """
     from uwb_mitigation.positioning.locator import Setting
     from uwb_mitigation.positioning.model import Model

@@ -1,4 +1,4 @@
-"""`uwb-mitigation process`: recorded bags to corrected bags."""
+"""`uwb-mitigation process`: write corrected bags from recorded bags."""
 
 from __future__ import annotations
 
@@ -47,9 +47,9 @@ def process(
     force: Annotated[bool, typer.Option("--force", help="Replace outputs that exist.")] = False,
     json: JsonOption = None,
 ) -> None:
-    """Copy bags with a corrected range behind each raw one.
+    """Copy bags and add a corrected range after each raw one.
 
-    All other messages stay as they are.
+    All other messages are unchanged.
     """
     from uwb_mitigation.offsets import read_offsets
     from uwb_mitigation.processing import parallel
@@ -58,12 +58,12 @@ def process(
     if workers is not None and workers < 1:
         raise ParameterError(f"jobs = {workers}", valid="1 or more")
     bags = parallel.plan(sources, output)
-    # A model that does not load would fail every bag in the same way.
+    # Load the model first: an invalid model would give the same error for every bag.
     bundle = bundle_for(model, bags[0].source)
     known = read_offsets(offsets or "")
     jobs = []
     for planned in bags:
-        # Absolute, since a worker of a cluster has a working directory of its own.
+        # Absolute paths, since a worker of a cluster has another working directory.
         source, place, path = planned.source.absolute(), planned.output.absolute(), bundle.path.absolute()
         jobs.append(Job(source, place, path, force, known))
         if not planned.alone:
@@ -161,7 +161,7 @@ def _note(path: Path, text: str) -> None:
 
 
 def _raise_failures(outcomes: list[Outcome]) -> None:
-    """One line for one bag; for several a line for each, and how many."""
+    """Raise an error with a line for each failed bag and, for several bags, their number."""
     errors: list[UwbMitigationError] = [outcome.error for outcome in outcomes if outcome.error is not None]
     if not errors:
         return

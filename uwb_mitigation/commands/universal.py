@@ -1,4 +1,4 @@
-"""`uwb-mitigation train-universal`: the model for places and boards that it never saw."""
+"""`uwb-mitigation train-universal`: train the model for unknown sites and boards."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ def train_universal(
     ] = None,
     json: JsonOption = None,
 ) -> None:
-    """Train a model for places that it never saw, in simulated buildings.
+    """Train a model for unknown sites in simulated buildings.
 
-    Simulates, trains, quantises, and grades the int8 network in a world that it was not trained on.
+    Simulates, trains, quantises, and evaluates the int8 network in a simulated world that it was not trained on.
 
     The same seed gives the same bundle on the same machine.
 

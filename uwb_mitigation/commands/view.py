@@ -1,4 +1,4 @@
-"""`uwb-mitigation view`: a recording on the viewer's page."""
+"""`uwb-mitigation view`: show a recording on the viewer's page."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ def view(
     ] = None,
     browser: Annotated[bool, typer.Option("--browser", help="Open the page in the browser.")] = False,
 ) -> None:
-    """Look at a recording in the browser: map, ranges, CIRs.
+    """Show a recording in the browser: map, ranges, CIRs.
 
-    The page of the node `viewer`, with a slider for the time; no ROS is needed. It plays at the recording's own pace,
-    until Ctrl-C here.
+    It serves the page of the node `viewer` with a slider for the time, without ROS. It plays in real time until
+    Ctrl-C.
 
         uwb-mitigation data simulate --like drive -o flat.mcap
 

@@ -78,14 +78,14 @@ class Meter:
         now_ns = self._now_ns()
         period_s, self._since_ns = (now_ns - self._since_ns) / 1e9, now_ns
         passed, self._reported = self._passed - self._reported, self._passed
-        # A simulated clock may stand still, or jump back when a recording starts over.
+        # A simulated clock may pause, or jump back when a recording restarts.
         rate = f"{passed / period_s:.1f}" if period_s > 0 else "unknown"
         return {"rate Hz": rate} | percentiles("latency", _drained(self._latencies_ns))
 
 
 @dataclass(frozen=True, slots=True)
 class Threshold:
-    """When the diagnostics warn.
+    """Threshold of a diagnostic warning.
 
     Attributes:
         fact: the value that is compared, over the last period.
@@ -117,7 +117,7 @@ OFFSET = Threshold(
 )
 
 MAX_LOS, MIN_LOS = 1000, 200
-"""Latest LOS ranges whose median is compared with OFFSET, and the smallest number of them."""
+"""Maximum and minimum number of latest LOS ranges whose median is compared with OFFSET."""
 
 
 class MitigatorHealth:
@@ -129,8 +129,8 @@ class MitigatorHealth:
 
     Attributes:
         statuses: number of ranges by status, since the start.
-        lost: ranges that the middleware reports as lost: the publisher's queue was too short.
-        numbering: finds these, and the ranges that the subscription's queue dropped.
+        lost: ranges that the middleware reports as lost, because the publisher's queue was too short.
+        numbering: counts the lost ranges and those dropped by the subscription's queue.
         malformed: messages that could not be decoded.
         uncounted: ranges whose CIR lacks the preamble count that the model needs, in this period.
         los_m: predicted errors of the latest LOS ranges without the offsets of the radios.
@@ -154,7 +154,7 @@ class MitigatorHealth:
 
     @property
     def dropped(self) -> int:
-        """Ranges that a queue has dropped, as far as known."""
+        """Number of ranges that are known to have been dropped by a queue."""
         return max(self.lost, self.numbering.missing)
 
     def add_time(self, processing_ns: int) -> None:
@@ -245,7 +245,7 @@ class Numbering:
         publishers = self._publishers()
         lower = [last for last in self._last if last < number]
         if len(self._last) < publishers or not lower:
-            # A publisher has joined or restarted: it replaces the one that was received the longest ago.
+            # A publisher has joined or restarted: it replaces the publisher with the oldest last message.
             self._last.append(number)
             del self._last[: max(len(self._last) - max(publishers, 1), 0)]
             return

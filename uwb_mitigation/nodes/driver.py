@@ -1,6 +1,6 @@
 """The node `driver`: publishes measurements on `/uwb/range_raw`, from a recording, the simulator, a board or radios.
 
-Reading and simulating is in `sources`, the protocol of boards in `link`, radios at this computer in `radio`. A board
+`sources` reads and simulates, `link` has the protocol of boards, `radio` has the radios at this computer. A board
 that runs the model itself also publishes on `/uwb/range_corrected`.
 """
 
@@ -54,7 +54,7 @@ def open_source(value: Callable[[str], Any]) -> Source:
         ParameterError: the parameter path is empty.
         RecordingError: the recording cannot be read.
     """
-    # The imports are here because each source needs other dependencies.
+    # Import here, because each source needs other dependencies.
     if value("source") == "simulated":
         from uwb_mitigation.sources.simulated import SimulatedSource
 
@@ -83,7 +83,7 @@ def _model_id(digits: str) -> int | None:
 class Driver(ManagedNode):
     """Lifecycle: configure opens the source, activate starts its feed (a recording from its start).
 
-    A port is opened at activate. If it is missing, that is no error: the feed waits for it.
+    A port is opened at activate. A missing port is not an error: the feed waits for it.
 
     Args:
         ended: set when a replay has ended.
@@ -103,7 +103,7 @@ class Driver(ManagedNode):
         self.exit_code = 0
         self._make_feed: Callable[[], Feed] | None = None
         self._feed: Feed | None = None
-        # `open` sets those that its source needs.
+        # `open` creates the publishers that its source needs.
         self._ranges: Publisher
         self._corrected: Publisher
         self._truths: Publisher
@@ -117,7 +117,7 @@ class Driver(ManagedNode):
         self.autostart()
 
     def open(self) -> None:
-        # Each checks its parameters and opens what it needs, and returns the factory of its feed.
+        # Each function checks its parameters, opens its source, and returns the factory of its feed.
         prepare = {
             "serial": self._prepare_board,
             "evb1000": self._prepare_radios,
@@ -192,7 +192,7 @@ class Driver(ManagedNode):
             subscribed = self._ranges.get_subscription_count
             return ReplayFeed(
                 source,
-                # A node that drives /clock must not wait for /clock.
+                # A node that publishes /clock must not wait for /clock.
                 Clock(clock_type=ClockType.STEADY_TIME) if own_clock else self.get_clock(),
                 self.value,
                 self.get_logger(),
@@ -212,7 +212,7 @@ class Driver(ManagedNode):
             self._prepared_offsets = read_offsets(str(values["offsets"]))
 
     def _apply(self, changes: list[Any]) -> None:
-        """Pass live parameters, which were checked, to the feed."""
+        """Pass live parameters, already checked, to the feed."""
         changed = {change.name for change in changes}
         if "offsets" in changed:
             self._offsets = self._prepared_offsets
@@ -247,7 +247,7 @@ class Driver(ManagedNode):
             if not self._ranges.get_subscription_count():
                 return
         for measurement in measurements:
-            # Serialised here: rclpy would need three times as long for its objects.
+            # Serialise here: rclpy takes three times as long for its message objects.
             self._ranges.publish(encode_range(measurement))
 
     def _publish_correction(self, correction: Correction) -> None:

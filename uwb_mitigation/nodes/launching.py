@@ -21,10 +21,10 @@ from uwb_mitigation.nodes.parameter_tables import KEPT_PARAMETERS, STANDARD, TAB
 LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
 
 _WILDCARDS = ("*", "**", "/*", "/**")
-"""Sections of a parameter file that are for every node."""
+"""Sections of a parameter file that apply to every node."""
 
 _FLOAT = re.compile(r"[-+]?(\.\d+|\d+\.\d*|\d+(\.\d*)?[eE][-+]?\d+|\.\d+[eE][-+]?\d+)")
-"""Numbers of YAML 1.2 with a point or an exponent; PyYAML reads YAML 1.1, in which 1e-1 is a text."""
+"""Floats of YAML 1.2; PyYAML reads YAML 1.1, in which 1e-1 is a string."""
 
 _LAUNCH_FILES = (".launch.py", ".launch.xml", ".launch.yaml", ".launch.yml")
 _OWN = ("uwb.launch.py", "boards.launch.py")
@@ -46,8 +46,8 @@ def plain_errors(function: Callable[[Any], list[Any]]) -> Callable[[Any], list[A
 def arguments(nodes: Iterable[str]) -> dict[str, dict[str, Parameter]]:
     """Return the arguments of a launch file, {argument: {node: parameter}}.
 
-    An argument has the name of its parameter and is for every node with that parameter. Where parameters of one name
-    differ in their defaults, they are different things: the later node's argument is NODE_PARAMETER.
+    An argument has the name of its parameter and is for every node with that parameter. If parameters of
+    one name differ in their defaults, they are different parameters: the later node's argument is NODE_PARAMETER.
     """
     found: dict[str, dict[str, Parameter]] = {}
     for node in nodes:
@@ -72,7 +72,7 @@ def parameters(
     """Return the parameters that arguments set, {node: {parameter: value}}.
 
     Args:
-        said: {argument: text}; an empty text leaves the parameter to the files.
+        said: {argument: text}; an empty text keeps the value of the files.
         nodes: the nodes that are started.
         known: the nodes whose parameters are arguments.
 
@@ -105,7 +105,7 @@ def value_of(row: Parameter, text: str) -> Value:
     if row.or_number or not isinstance(row.default, str):
         value = _read(text)
     if row.or_number and not (isinstance(value, (int, float)) and abs(value) < 1 << 63):
-        # ROS has no larger numbers: an address of 64 bits stays a text. It may be in quotes, as on the command line.
+        # ROS integers are signed: an address of 64 bits stays a string. It may be in quotes, as on the command line.
         value = value if isinstance(value, str) and text[0] in "'\"" else text
     row.check(value)
     return float(value) if isinstance(row.default, float) else value
@@ -147,10 +147,10 @@ def check_names(words: Sequence[str], known: Collection[str]) -> None:
     """Raise ParameterError for an argument of `ros2 launch` that the launch file does not declare.
 
     Args:
-        words: what follows the name of the launch file on the command line.
+        words: the command-line arguments after the name of the launch file.
         known: the declared arguments.
     """
-    # The arguments of a launch file that includes this one are its own.
+    # A launch file that includes this one may declare further arguments.
     if any(word.endswith(_LAUNCH_FILES) and Path(word).name not in _OWN for word in sys.argv):
         return
     for word in words:
@@ -192,7 +192,7 @@ def from_files(node: str, own: str, shared: str = "") -> dict[str, Any]:
 
 
 def others_meaning(node: str) -> dict[str, Value]:
-    """Return the parameters whose names mean something else for an earlier node, such as the viewer's port.
+    """Return the parameters whose names have another meaning for an earlier node, such as the viewer's port.
 
     In the section for all nodes of a shared file they belong to that earlier node, as arguments do.
 
@@ -239,7 +239,7 @@ def kept_parameters() -> dict[str, str]:
 
 
 def _entries(tree: Any, section: str) -> Iterator[tuple[str, str, Any]]:
-    """Section, name and value of every parameter in a file."""
+    """Yield section, name and value of every parameter in a file."""
     for key, branch in tree.items() if isinstance(tree, dict) else ():
         if key == "ros__parameters":
             yield from ((section, name, value) for name, value in _flat(branch, ""))

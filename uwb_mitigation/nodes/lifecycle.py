@@ -1,4 +1,4 @@
-"""What the lifecycle nodes of this package share: parameters, transitions, diagnostics and clocks."""
+"""Base of the lifecycle nodes of this package: parameters, transitions, diagnostics and clocks."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from uwb_mitigation.nodes import diagnostics, topics
 from uwb_mitigation.nodes.parameter_tables import KEPT_PARAMETERS, TABLES, Parameter
 
 SAME_NAME_S = 40.0
-"""A killed node stays in the graph for up to 20 s: a second node of the same name is reported after this time."""
+"""A second node of the same name is reported after this time: a killed node stays in the graph for up to 20 s."""
 
 _QOS = "qos_overrides."
 
@@ -49,9 +49,9 @@ class ManagedNode(LifecycleNode):
     """A lifecycle node with a parameter table and one diagnostic status per second.
 
     A subclass implements the transitions: `open` (configure), `begin` (activate), `end` (deactivate) and
-    `close` (cleanup, shutdown). `end` and `close` may be called when there is nothing to end or to close.
-    rclpy hides exceptions of a transition. Here they are logged and shown in the diagnostics, and what the
-    transition has opened is closed, so that it can be requested again.
+    `close` (cleanup, shutdown). `end` and `close` may be called without `begin` or `open`.
+    rclpy hides exceptions of a transition. This class logs them, shows them in the diagnostics, and closes what
+    the transition has opened, so that it can be requested again.
 
     Args:
         table: the node's parameters.
@@ -70,7 +70,7 @@ class ManagedNode(LifecycleNode):
         self._reported: set[str] = set()
         self._opened: list[Callable[[], object]] = []
         self._diagnostics = self.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, 10)
-        # Steady: diagnostics must be published even if the node's clock is simulated and stands still.
+        # Use a steady clock: diagnostics must be published even if a simulated clock is paused.
         self.create_timer(1.0, self._publish_diagnostics, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def open(self) -> None:
@@ -88,7 +88,7 @@ class ManagedNode(LifecycleNode):
             self._opened.pop()()
 
     def until_close(self, made: Made, destroy: Callable[[Made], object]) -> Made:
-        """Return what `open` has made; `close` destroys it."""
+        """Return `made`, and let `close` destroy it."""
         self._opened.append(partial(destroy, made))
         return made
 
@@ -133,7 +133,7 @@ class ManagedNode(LifecycleNode):
         return result
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        # Publishers first: `begin` may start threads that publish.
+        # Activate publishers first: `begin` may start threads that publish.
         super().on_activate(state)
         result = self._attempt(self.begin, self.end)
         if result != TransitionCallbackReturn.SUCCESS:
@@ -196,7 +196,7 @@ class ManagedNode(LifecycleNode):
         self._diagnostics.publish(diagnostics.report(self, hardware, level, text, facts))
 
     def _same_name(self) -> list[str]:
-        """Return a warning if another node has this name: ROS then mixes up their parameters and transitions."""
+        """Return a warning if another node has this name: parameter and transition calls are then ambiguous."""
         own = (self.get_name(), self.get_namespace())
         if self.get_node_names_and_namespaces().count(own) < 2:
             self._unique_name_s = time.monotonic()
@@ -248,7 +248,7 @@ def refuse_errors(node: Node, check: Callable[[Mapping[str, Any]], None]) -> Non
 
 
 def _descriptor(row: Parameter) -> ParameterDescriptor:
-    # Typed dynamically and checked here: rclpy would refuse `2` for a float, and its error does not name the parameter.
+    # Dynamic typing and own checks: rclpy refuses `2` for a float, and its error does not name the parameter.
     descriptor = ParameterDescriptor(
         description=row.description,
         read_only=not row.live,

@@ -1,4 +1,4 @@
-"""What the driver publishes from: the interface of its feeds, boards on serial links, and radios of this computer."""
+"""Feeds of the driver: their interface, boards on serial links, and radios at this computer."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ PREFIX = "radio."
 """Prefix of the parameters of radios."""
 
 _OFFSETS, _RADIO = "the offsets are not set", "the radio's settings are not used"
-"""What a board may refuse."""
+"""Settings that a board may refuse."""
 
 _STATES = {
     RadioState.ABSENT: "no DW1000 answers the board: check wiring and supply",
@@ -65,7 +65,7 @@ class Feed(Protocol):
 
 
 class LiveFeed:
-    """Takes the events of connections, in one thread for each, and publishes their ranges.
+    """Handles the events of each connection in its own thread, and publishes the ranges.
 
     Args:
         ports: closed by `stop`.
@@ -108,11 +108,11 @@ class LiveFeed:
                 thread.join()
 
     def handle(self, event: Any, port: Any) -> None:
-        """Take an event that is not a range."""
+        """Handle an event that is not a range."""
         raise NotImplementedError
 
     def check(self, port: Any) -> None:
-        """Called after every event, and at least every `EVENT_TIMEOUT_S`."""
+        """Check the state; called after every event, and at least every `EVENT_TIMEOUT_S`."""
 
     def _run(self, port: Connection[Any]) -> None:
         while not port.closed:
@@ -153,7 +153,7 @@ class BoardFeed(LiveFeed):
         self._problem = self._logged = ""
         self._checked_s = 0.0
         self._on_correction = on_correction
-        # What the board has refused, and why.
+        # Refused settings and the reasons.
         self._refused: dict[str, str] = {}
 
     def apply(self, changed: Collection[str], value: Value, offsets: Offsets) -> None:
@@ -202,7 +202,7 @@ class BoardFeed(LiveFeed):
         return hardware, *_level(problem, warning, "connected"), facts
 
     def check(self, port: BoardPort) -> None:
-        """Log a problem once if it is older than `EVENT_TIMEOUT_S`; a handshake takes less."""
+        """Log a problem once if it lasts longer than `EVENT_TIMEOUT_S`; a handshake is shorter."""
         now_s = time.monotonic()
         if now_s - self._checked_s < EVENT_TIMEOUT_S:
             return
@@ -224,7 +224,7 @@ class BoardFeed(LiveFeed):
             case RadioStatus():
                 self._radio_status = event
             case Radio(settings=settings):
-                # A board repeats it at times.
+                # A board may repeat its settings.
                 if settings != self._radio:
                     log.info(f"the board's radio {format_id(settings.address)}: {settings_text(settings)}")
                 self._radio = settings
@@ -253,7 +253,7 @@ class BoardFeed(LiveFeed):
                 self._refused[_OFFSETS] = text
                 log.error(f"the board's corrections are not published: {_OFFSETS}: {text}")
             case Log(level=level, text=text):
-                # rclpy binds the severity to the line of code.
+                # rclpy allows only one severity for each line of code.
                 if level >= LogLevel.WARNING:
                     log.warning(f"board: {text}")
                 else:
@@ -374,7 +374,7 @@ def _role_of(settings: RadioSettings, number: int) -> RadioSettings:
 
 
 def _address(value: object, name: str) -> int:
-    """Return an address; raise ParameterError if the value is none."""
+    """Return an address; raise ParameterError if the value is not an address."""
     with contextlib.suppress(ValueError):
         if 0 < (address := parse_id(str(value))) < 2**64 - 1:
             return address
@@ -385,7 +385,7 @@ def _address(value: object, name: str) -> int:
 
 
 def settings_text(settings: RadioSettings) -> str:
-    """Return the settings for a line of the log."""
+    """Return the settings as text for the log."""
     return (
         f"{settings.role.name.lower()}, channel {settings.channel}, {settings.rate_kbps} kbit/s, preamble "
         f"{settings.preamble}, PAN 0x{settings.pan:04x}"
@@ -400,7 +400,7 @@ def _level(problem: str, warning: str, ok: str) -> tuple[bytes, str]:
 
 
 def radio_warning(settings: RadioSettings | None, status: RadioStatus) -> str:
-    """Return what may keep a radio without a problem from ranging; empty if there is nothing."""
+    """Return a possible reason why a radio without a problem does not range, or an empty string."""
     if status.state is RadioState.LOCK_UNCONFIRMED:
         return "the DW1000 has not reported that its clock PLL locked; if it does not range, check its supply"
     if settings is not None and settings.role is Role.TAG and not status.anchors:

@@ -37,13 +37,13 @@ from uwb_mitigation.positioning.tracks import Estimate
 from uwb_mitigation.sources.site import load_anchors
 
 BATCH = 64
-"""Number of queued ranges that are taken at once."""
+"""Maximum number of queued ranges that one callback processes."""
 
 PERIOD_S = 0.2
 """Period of smoothed poses, of markers, and of predictions without ranges."""
 
 PREDICT_AFTER_S, PREDICT_UNTIL_S = 0.3, 30.0
-"""A tag without ranges is predicted between these ages of its last range: later its covariance exceeds most halls."""
+"""A tag without ranges is predicted between these ages of its last range; later the covariance exceeds most halls."""
 
 _NANOSECONDS = 1_000_000_000
 
@@ -68,7 +68,7 @@ class _Outputs:
 
 
 class Locator(ManagedNode):
-    """Lifecycle: configure reads the anchors and makes the topics, activate begins to follow tags.
+    """Lifecycle: configure reads the anchors and creates the topics, activate starts tracking tags.
 
     If the anchors file is missing or invalid, the node stays unconfigured, and log and diagnostics name the reason;
     configure it again after the file is fixed.
@@ -174,7 +174,7 @@ class Locator(ManagedNode):
     def _on_range(self, data: bytes, number: int) -> None:
         # Subscriptions stay active while a lifecycle node is inactive.
         if self._fleet is not None and self._ranges is not None and self.is_active:
-            # Messages in the queue are taken too; the executor then finds it empty.
+            # Also process the queued messages; the executor then finds the queue empty.
             for each, _ in chain([(data, number)], topics.queued(self._ranges, BATCH)):
                 self._take(self._fleet, each)
 
@@ -237,7 +237,7 @@ class Locator(ManagedNode):
             self._tf.publish(self._make_tf([transform]))
 
     def _at_base(self, estimate: Estimate) -> Estimate:
-        """Return the estimate of the robot's origin. Its heading is unknown: a horizontal arm points anywhere."""
+        """Return the estimate of the robot's origin. Its heading is unknown, so a horizontal lever arm may point anywhere."""
         x, y, z = self._lever.tolist()
         if not (x or y or z):
             return estimate
@@ -277,7 +277,7 @@ class Locator(ManagedNode):
         publisher.publish(MarkerArray(markers=shown))
 
     def _on_height(self, message: PoseWithCovarianceStamped) -> None:
-        # If there are several tags, it is unknown whose height this is.
+        # With several tags, it is unknown to which tag this height belongs.
         if self._fleet is not None and len(self._fleet.tags) == 1:
             (tag,) = self._fleet.tags.values()
             tag.add_height(float(message.pose.pose.position.z), float(message.pose.covariance[14]))

@@ -16,9 +16,9 @@ from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.tracks import Estimate
 
 TRAIL = 400
-_ELLIPSE95 = 2.448  # root of the 95th percentile of chi-squared with two degrees of freedom
+_ELLIPSE95 = 2.448  # square root of the 95th percentile of chi-squared with two degrees of freedom
 
-# Colours for colour-blind readers too (Okabe and Ito's palette).
+# Colour-blind safe palette of Okabe and Ito.
 _BLUE = ColorRGBA(r=0.0, g=0.45, b=0.7, a=1.0)
 _ORANGE = ColorRGBA(r=0.9, g=0.62, b=0.0, a=0.9)
 _GREY = ColorRGBA(r=0.6, g=0.6, b=0.6, a=0.7)
@@ -26,11 +26,11 @@ _SKY = ColorRGBA(r=0.34, g=0.71, b=0.91, a=0.35)
 
 
 class TagPicture:
-    """What is shown of one tag.
+    """State of one tag for its markers.
 
     Attributes:
-        estimate: the latest. trail: positions before.
-        statuses: of the latest range of each anchor, {row: status}.
+        estimate: the latest estimate. trail: earlier positions.
+        statuses: status of the latest range of each anchor, {row: status}.
     """
 
     def __init__(self) -> None:
@@ -45,14 +45,14 @@ class TagPicture:
 
 
 def anchor_markers(anchors: AnchorMap, frame: str, stamp_ns: int) -> list[Any]:
-    """A ball and a name for every anchor."""
+    """Return a sphere and a label for every anchor."""
     found = []
     for row, anchor in enumerate(anchors.anchors):
         pose = Pose(position=_point(anchor.position), orientation=Quaternion(w=1.0))
         size = max(0.2, 2.0 * anchor.sd)
         ball = _marker("anchors", row, Marker.SPHERE, frame, stamp_ns, _BLUE)
         ball.pose, ball.scale = pose, Vector3(x=size, y=size, z=size)
-        # Not drawn: the id of the anchor for programs.
+        # RViz does not draw this text; programs read the id of the anchor from it.
         ball.text = str(anchor.id)
         text = _marker("names", row, Marker.TEXT_VIEW_FACING, frame, stamp_ns, _GREY)
         x, y, z = anchor.position
@@ -65,7 +65,7 @@ def anchor_markers(anchors: AnchorMap, frame: str, stamp_ns: int) -> list[Any]:
 def tag_markers(
     picture: TagPicture, heard: list[int], anchors: AnchorMap, frame: str, number: int, stamp_ns: int
 ) -> list[Any]:
-    """Rays to the anchors heard, blue where the range was corrected; the 95 % ellipse; the trail."""
+    """Return rays to the ranged anchors (blue: corrected range), the 95 % ellipse and the trail."""
     estimate = picture.estimate
     if estimate is None:
         return []

@@ -36,19 +36,19 @@ if importlib.util.find_spec("onnxruntime") is None:
     raise ModuleNotFoundError("No module named 'onnxruntime'", name="onnxruntime")
 
 BATCH = 16
-"""Number of queued ranges that are corrected at once, for half of the time of single ranges."""
+"""Maximum batch size: correcting queued ranges in a batch takes half the time of single ranges."""
 
 
 def load(model: str, backend: str = "onnxruntime") -> Backend:
     """Return the bundle of the parameter `model`, ready to correct by `backend`.
 
     Raises:
-        ModelError: it is missing, corrupt, or refused by the backend.
+        ModelError: the bundle is missing, corrupt, or refused by the backend.
         MissingDependencyError: `firmware` without a C compiler.
     """
     bundle = load_bundle(model_path(model))
     if backend == "firmware":
-        # Only here: it compiles.
+        # Import on demand: it compiles C code.
         from uwb_mitigation.firmware_export.host import FirmwareMitigation
 
         return FirmwareMitigation(bundle)
@@ -56,7 +56,7 @@ def load(model: str, backend: str = "onnxruntime") -> Backend:
 
 
 class Mitigator(ManagedNode):
-    """Lifecycle: configure makes publisher and subscription, activate loads the model.
+    """Lifecycle: configure creates publisher and subscription, activate loads the model.
 
     If the model cannot be loaded, the node stays inactive, and log and diagnostics name the reason; activate it again
     after the file is fixed. While inactive, nothing is published or queued. Ranges come from the topic or, in one
@@ -78,7 +78,7 @@ class Mitigator(ManagedNode):
         self._prepared: tuple[str, Backend] | None = None
         self._offsets = NO_OFFSETS
         self._prepared_offsets: Offsets | None = None
-        # A driver in the same process corrects from its own thread, while transitions run in the executor's.
+        # A driver in the same process calls `correct` from its own thread; transitions run in the executor's.
         self._lock = threading.Lock()
         self._meter = diagnostics.Meter(self.now_ns)
         refuse_errors(self, self._prepare)
@@ -90,7 +90,7 @@ class Mitigator(ManagedNode):
         if self.value("sensor_ranges"):
             self._sensor_ranges = self.until_close(topics.SensorRanges(self), topics.SensorRanges.close)
         if self._subscribe:
-            # Serialised messages: decoding them here takes a third of the time of rclpy.
+            # Subscribe to serialised messages: decoding them here takes a third of the time of rclpy.
             self._raw = self.until_close(
                 topics.create_raw_subscription(self, RangeCir, topics.RANGE_RAW, self._on_raw, self._on_lost),
                 self.destroy_subscription,
@@ -167,7 +167,7 @@ class Mitigator(ManagedNode):
         if self._mitigation is None or self._raw is None:
             return
         batch = []
-        # Messages in the queue are taken too; the executor then finds it empty.
+        # Also process the queued messages; the executor then finds the queue empty.
         for each, its_number in chain([(data, number)], topics.queued(self._raw, BATCH - 1)):
             self.health.numbering.add(its_number)
             measurement = self._decode(each)
@@ -196,7 +196,7 @@ class Mitigator(ManagedNode):
         self.health.lost += info.total_count_change
 
     def _use(self, mitigation: Backend) -> None:
-        # Between two ranges: none is lost, and none is corrected with parts of two models.
+        # Swap between two ranges, so that none is lost or corrected with parts of two models.
         mitigation.offsets = self._offsets
         with self._lock:
             self._mitigation = mitigation

@@ -28,14 +28,14 @@ from uwb_mitigation.viewer.scene import MAX_TRUTHS, History, Latest, Pair, Sampl
 REFRESH_HZ = 5
 
 MAX_LATENCIES = 100_000
-"""The latest latencies that are summarised: a monitor may run for days."""
+"""Number of latest latencies in the summary; bounds the memory of a monitor that runs for days."""
 
 
 class Tally:
     """Counts, latencies and errors of the received ranges, by pair.
 
     Attributes:
-        errors: of ranges whose truth is known, {label: (number, sum of raw, sum of corrected absolute errors in m)}.
+        errors: {label: (number, sum of raw, sum of corrected absolute errors in m)} of ranges with known truth.
     """
 
     def __init__(self) -> None:

@@ -1,6 +1,6 @@
 """The parameter tables of the nodes: name, type, default, range and description. No ROS here.
 
-The declarations, `--help`, launch arguments, the files in `params/` and the parameter reference are made from them.
+The declarations, `--help`, launch arguments, files in `params/` and the parameter reference are generated from them.
 generate_parameter_library is not used: it generates code at build time and is not on PyPI.
 """
 
@@ -27,13 +27,13 @@ class Parameter:
 
     Attributes:
         name, default: as declared; the default's type is the parameter's type.
-        description: what it does.
-        unit: of a number; empty = none.
-        or_number: a text that may be given as a number too.
+        description: one sentence for the user.
+        unit: unit of a number; empty if it has no unit.
+        or_number: whether a string parameter also accepts a number.
         low, high: inclusive range of a number.
-        choices: the values a string may take; empty = any.
-        filed: stands in the parameter file; otherwise it is what the user has to say.
-        live: may be set while the node runs; otherwise it is read-only after start-up.
+        choices: valid values of a string; empty: any.
+        filed: whether the parameter file contains it; otherwise the user must set it.
+        live: whether it may be set while the node runs; otherwise it is read-only after start-up.
     """
 
     name: str
@@ -49,7 +49,7 @@ class Parameter:
 
     @property
     def valid(self) -> str:
-        """The range of valid values in words."""
+        """Return the range of valid values as text."""
         if self.choices:
             return "one of " + ", ".join(self.choices)
         if self.low is not None and self.high is not None:
@@ -59,13 +59,13 @@ class Parameter:
 
     @property
     def default_text(self) -> str:
-        """The default as YAML has it."""
+        """Return the default in YAML syntax."""
         if isinstance(self.default, bool):
             return str(self.default).lower()
         return str(self.default) or "''"
 
     def check(self, value: Any) -> None:
-        """Raise ParameterError unless `value` has the right type and lies in the range."""
+        """Raise ParameterError unless `value` has the right type and is in the range."""
         numeric = isinstance(self.default, float) and type(value) is int
         numeric |= self.or_number and type(value) in (int, float)
         if type(value) is not type(self.default) and not numeric:
@@ -224,11 +224,11 @@ VIEWER = (
 )  # fmt: skip
 
 KEPT_PARAMETERS = "UWB_MITIGATION_KEPT_PARAMETERS"
-"""Environment variable of a folder where nodes keep the parameters that were set while they ran. A launch file makes
-the folder, for as long as it runs: a node that it respawns gets them back."""
+"""Environment variable with the folder where nodes save parameters that were set at run time. A launch file creates
+the folder while it runs, and a respawned node restores its parameters from there."""
 
 STANDARD = ("qos_overrides.", "use_sim_time", "start_type_description_service")
-"""Beginnings of the names of parameters that rclpy declares for every node."""
+"""Prefixes of the parameters that rclpy declares for every node."""
 
 TABLES: dict[str, tuple[Parameter, ...]] = {
     "driver": DRIVER,
@@ -239,7 +239,7 @@ TABLES: dict[str, tuple[Parameter, ...]] = {
 
 
 def help_text(name: str) -> str:
-    """Return what `NODE --help` prints: usage and parameters of an executable."""
+    """Return the text of `NODE --help`: usage and parameters of an executable."""
     nodes = ("driver", "mitigator", "locator") if name == "pipeline" else (name,)
     rows = {row.name: row for node in nodes for row in TABLES.get(node, ())}
     lines = [f"usage: {name} [--ros-args [-p NAME:=VALUE] [--params-file FILE] [-r FROM:=TO] ...]"]

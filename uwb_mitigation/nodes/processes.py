@@ -1,6 +1,6 @@
-"""Nodes as processes, and a probe that watches them from outside: for benchmarks and demos.
+"""Start nodes as processes and observe them with a probe, for benchmarks and demos.
 
-The processes end with the process that started them, however that ends.
+The processes end when their parent process ends, even if it is killed.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _DEPTH = 50_000
 
 
 def isolate() -> None:
-    """Keep this process's nodes, and those that it starts, on this machine and in a domain of their own.
+    """Restrict the nodes of this process and its children to this machine and a separate ROS domain.
 
     Environment variables that are already set are not changed.
     """
@@ -51,7 +51,7 @@ def isolate() -> None:
 def start(
     node: str, *parameters: str, namespace: str = "", log_level: str = "warn", module: str = ENTRY
 ) -> subprocess.Popen[bytes]:
-    """Start a node of this package with parameters such as `rate:=2.0`; call `stop` in the end.
+    """Start a node of this package with parameters such as `rate:=2.0`; call `stop` at the end.
 
     If this process is killed, Linux ends the node with the calling thread.
     """
@@ -67,17 +67,17 @@ def start(
         command += ["-r", f"__ns:=/{namespace}"]
     for parameter in parameters:
         command += ["-p", parameter]
-    # A process group of its own: Ctrl-C reaches this process only, which ends the nodes in order. But the same session,
-    # as in a launch: Linux shares the processors between sessions first, and a nice value counts within one.
+    # A new process group, so that Ctrl-C reaches only this process, which stops the nodes in order. The same session,
+    # as in a launch: Linux schedules sessions first, and a nice value applies within a session.
     if sys.version_info >= (3, 11):
         return subprocess.Popen(command, process_group=0)
     return subprocess.Popen(command, preexec_fn=os.setpgrp)
 
 
 def stop(*processes: subprocess.Popen[bytes]) -> list[int]:
-    """End nodes as Ctrl-C does, and return their exit codes; kill a node only if it does not end.
+    """Stop nodes with SIGINT and return their exit codes; kill a node if it does not end.
 
-    Other signals are ignored meanwhile, so that no node is left behind.
+    Other signals are ignored meanwhile, so that no node keeps running.
     """
     numbers = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
     before = {number: signal.signal(number, signal.SIG_IGN) for number in numbers}
@@ -109,7 +109,7 @@ def wait(
     """Wait until a condition holds.
 
     Raises:
-        UwbMitigationError: `failure`: timeout, or a process has ended.
+        UwbMitigationError: with the text `failure`, at a timeout or if a process has ended.
     """
     deadline = time.monotonic() + TIMEOUT_S
     while not condition():
@@ -120,7 +120,7 @@ def wait(
 
 @contextmanager
 def watching(make_node: Callable[[Context], AnyNode]) -> Iterator[AnyNode]:
-    """A node in its own ROS context, spun by a thread until the block ends."""
+    """Yield a node in its own ROS context, spun by a thread until the block ends."""
     context = Context()
     rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
     node = make_node(context)
@@ -141,7 +141,7 @@ class Probe(Node):
 
     def __init__(self, context: Context) -> None:
         super().__init__("probe", context=context)
-        # Never destroyed: the events executor may call a client that is destroyed while it spins.
+        # Keep the clients: the events executor may call a client that is destroyed while it spins.
         self._setters: dict[str, Client] = {}
 
     def subscribe(
@@ -160,7 +160,7 @@ class Probe(Node):
         """Set parameters of `node`, which is in `processes`.
 
         Raises:
-            UwbMitigationError: it does not answer, or refuses a value.
+            UwbMitigationError: the node does not answer, or refuses a value.
         """
         if node not in self._setters:
             self._setters[node] = self.create_client(SetParameters, f"{node}/set_parameters")
@@ -178,7 +178,7 @@ class Nodes:
     """The nodes of a demo, as processes; they are stopped at the end of the block.
 
     Attributes:
-        failures: what went wrong; after the block with the nodes that ended with an error.
+        failures: error messages; after the block, also the nodes that ended with an error.
     """
 
     def __init__(self) -> None:

@@ -23,22 +23,22 @@ TICK_S = 0.02
 """Interval at which commands and a simulated clock are checked, and /clock is published."""
 
 LATE_NS, BATCH = 1_000_000, 16
-"""A record that is later than this is published with the next ones, at most BATCH at once."""
+"""A record that is later than this is published in a batch with the next ones, of at most BATCH records."""
 
 CLOCK_STEP_NS = 1_000_000
-"""If the node's clock moves by more than this against the steady clock, it was set: stamps follow it."""
+"""If the node's clock shifts by more than this relative to the steady clock, it was set, and stamps follow it."""
 
 ANNOUNCEMENT_S = 3.0
 """The middleware repeats its announcements after this time, if the first ones were lost."""
 
 BEHIND_S = 0.5
-"""A replay that is later than this is reported."""
+"""A delay of the replay above this is reported."""
 
 
 class Pace:
     """The clock that paces a replay, and its stamps on a node's clock.
 
-    The pace is steady: a system clock that is set must not stop or hurry a replay. Only simulated time is followed.
+    This is simulated time if it is active, else a steady clock: setting the system clock does not affect the replay.
     """
 
     def __init__(self, clock: Clock) -> None:
@@ -64,7 +64,7 @@ class Pace:
     def _read_both(self) -> tuple[int, int]:
         """Return the offset of the node's clock to the steady clock, and its uncertainty, ns.
 
-        A process that is interrupted between the two readings must not take that for a clock that was set.
+        The uncertainty distinguishes an interruption of the process between the two readings from a clock that was set.
         """
         before_ns = time.monotonic_ns()
         offset_ns = self._stamp_now_ns() - before_ns
@@ -78,8 +78,8 @@ class Pace:
 class ReplayFeed:
     """Publishes the records of a source when they are due, from its own thread; implements `Feed`.
 
-    A record is due at its offset from the first record, divided by the rate. Records that are late may be published
-    several at once. Rate, pause and position may change at any time; they take effect within `TICK_S`.
+    A record is due at its offset from the first record, divided by the rate. Late records may be published in
+    batches. Rate, pause and position may change at any time; they take effect within `TICK_S`.
 
     Args:
         source: closed by the caller.
@@ -93,7 +93,7 @@ class ReplayFeed:
 
     Attributes:
         played: number of records published.
-        late_ns: how late the latest record was.
+        late_ns: delay of the latest record.
     """
 
     def __init__(
@@ -136,7 +136,7 @@ class ReplayFeed:
         self._thread.start()
 
     def stop(self) -> None:
-        """End before the next record, and wait for that; may be called twice."""
+        """Stop before the next record, and join the thread; may be called twice."""
         self._stopping.set()
         if self._thread.is_alive() and self._thread is not threading.current_thread():
             self._thread.join()
@@ -177,7 +177,7 @@ class ReplayFeed:
         except UwbMitigationError as problem:
             error = problem
         except Exception as bug:
-            # Otherwise the thread would end silently, and the node would publish nothing for ever.
+            # Otherwise the thread would end without a message, and the node would stop publishing.
             traceback.print_exc()
             error = UwbMitigationError(f"the source failed: {bug!r}", where=self._source.name)
         if not self._stopping.is_set():
@@ -186,7 +186,7 @@ class ReplayFeed:
             self._on_end(error)
 
     def _wait_for_subscribers(self) -> None:
-        """Wait until enough subscribers are there and the graph had time to connect, or the wait is over."""
+        """Wait until there are enough subscribers and the graph had time to connect, or until the timeout."""
         wanted, started_s = self._value("wait_for_subscribers"), time.monotonic()
         while (count := self._subscribers()) < wanted:
             if time.monotonic() - started_s >= self._value("longest_wait"):
@@ -253,18 +253,18 @@ class ReplayFeed:
             self._late = []
 
     def _wait_until(self, due_ns: int, recorded_ns: int) -> int | None:
-        """Wait; return how late it is, ns, or None if playing shall not go on."""
+        """Wait until a record is due; return the delay, ns, or None if playing must stop."""
         while True:
             if self._stopping.is_set() or self._seeks:
                 return None
             now_ns = self._clock.now_ns()
             if self._paused or self._wants_pause or self._wanted_rate != self._rate:
-                # Continue from here at the new rate; never past the next record, so that stamps stay in order.
+                # Continue at the new rate, but never past the next record, so that stamps stay in order.
                 self._base_ns, self._base_clock_ns = min(self._position_ns(now_ns), due_ns), now_ns
                 self._paused, self._rate = self._wants_pause, self._wanted_rate
             ahead_ns = self._clock_ns(due_ns) - now_ns
             if self._recorded_stamps:
-                # Simulated recordings start at 0: there is no time before it.
+                # Simulated recordings start at 0, and ROS time cannot be negative.
                 self._on_time(max(recorded_ns - int(max(ahead_ns, 0) * self._rate), 0))
             if ahead_ns <= 0 and not self._paused:
                 return -ahead_ns

@@ -1,4 +1,4 @@
-"""How a node of this package starts, spins and ends."""
+"""Start, spin and shut down the nodes of this package."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _stop = threading.Event()
 
 
 def stop_event() -> threading.Event:
-    """Return the event that SIGINT and SIGTERM set from now on; a second signal ends the process at once."""
+    """Return the event that SIGINT and SIGTERM set from now on; a second signal terminates the process immediately."""
     for number in (signal.SIGINT, signal.SIGTERM):
         if signal.getsignal(number) is not _on_signal:
             signal.signal(number, _on_signal)
@@ -54,7 +54,7 @@ def spin(nodes: Node | Sequence[Node], stop: threading.Event) -> None:
 
 
 def make_executor(context: Context | None = None) -> Executor:
-    """Return the events executor, which costs a quarter of the default one per message; older rclpy lacks it.
+    """Return the events executor (a quarter of the default's CPU time per message), or the default in older rclpy.
 
     Its `spin()` does not return at shutdown: call `spin_once`.
     """
@@ -70,7 +70,7 @@ def load(name: str) -> Callable[[threading.Event], list[Node]]:
 
     The function gets the event that ends the process. `pipeline` is driver and mitigator in one process, and a locator
     if `anchors` is given: measurements go to the mitigator in memory, and `/uwb/range_raw` is published only while it
-    has subscribers. Names, topics, parameters and diagnostics are those of the single nodes.
+    has subscribers. Names, topics, parameters and diagnostics are the same as of separate nodes.
     """
     parts = ("driver", "mitigator", "locator") if name == "pipeline" else (name,)
     modules = [importlib.import_module(f"uwb_mitigation.nodes.{part}") for part in parts]
@@ -101,7 +101,7 @@ def load(name: str) -> Callable[[threading.Event], list[Node]]:
 
 
 def main(name: str) -> None:
-    """Run an executable until a signal, or until one of its nodes ends it; then exit with its code."""
+    """Run an executable until a signal or until one of its nodes ends it; exit with its code."""
     sys.exit(_run(name))
 
 
@@ -115,7 +115,7 @@ def _run(name: str) -> int:
     try:
         _initialise()
         try:
-            # Before the signals are caught: until then they end the process at once.
+            # Load before the handlers are installed: until then a signal terminates the process immediately.
             make_nodes = load(name)
             stop = stop_event()
             nodes = make_nodes(stop)

@@ -38,13 +38,13 @@ DIAGNOSTICS = "/diagnostics"
 CLOCK = "/clock"
 
 DEPTH = 1000
-"""A subscriber that stalls loses no range for 1 s at 1 kHz."""
+"""Queue depth: a subscriber that stalls for 1 s at 1 kHz loses no range."""
 
 MAX_SENSOR_RANGE_M = 300.0
-"""Range of a DW1000 in free space (data sheet, section 1)."""
+"""Maximum range of a DW1000 in free space (data sheet, section 1)."""
 
 MAX_SENSOR_TOPICS = 256
-"""Ids are received over the air: there are at most this many topics of sensor_msgs/Range."""
+"""Maximum number of sensor_msgs/Range topics; bounded because ids are received over the air."""
 
 
 def _ranges(reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE) -> QoSProfile:
@@ -64,7 +64,7 @@ LATCHED = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,
     depth=1,
 )
-"""For messages that a late subscriber needs too."""
+"""QoS of messages that late-joining subscribers need too."""
 
 
 def create_publisher(node: LifecycleNode, kind: type, topic: str) -> Publisher:
@@ -74,7 +74,7 @@ def create_publisher(node: LifecycleNode, kind: type, topic: str) -> Publisher:
         ParameterError: an overridden quality of service is invalid.
     """
     with _checked(node, topic):
-        # rclpy writes overrides into the given profile: each publisher needs its own.
+        # rclpy writes overrides into the given profile, so each publisher needs a copy.
         return node.create_lifecycle_publisher(
             kind, topic, _ranges(), qos_overriding_options=QoSOverridingOptions.with_default_policies()
         )
@@ -130,7 +130,7 @@ def queued(subscription: Subscription, limit: int) -> Iterator[tuple[bytes, int]
     """Yield messages that wait in the queue of a raw subscription, with the publisher's sequence number.
 
     Args:
-        limit: the highest number of messages: they may arrive as fast as they are taken.
+        limit: maximum number of messages, since they may arrive as fast as they are processed.
     """
     take, kind = subscription.handle.take_message, subscription.msg_type
     for _ in range(limit):
@@ -161,11 +161,11 @@ def header(stamp_ns: int, frame_id: str) -> Header:
 class SensorRanges:
     """Publishes ranges as sensor_msgs/Range on `uwb/range_corrected/anchor_ID`; an invalid range is +Inf (REP-117).
 
-    sensor_msgs has no radiation type for radio: it is 0, and the field of view is the full circle.
+    sensor_msgs has no radiation type for radio, so it is 0; the field of view is the full circle.
     """
 
     def __init__(self, node: LifecycleNode) -> None:
-        # Only here: sensor_msgs takes a twelfth of the start-up time of a node.
+        # Import on demand: sensor_msgs takes a twelfth of the start-up time of a node.
         from sensor_msgs.msg import Range
 
         self._kind = Range
@@ -202,7 +202,7 @@ class SensorRanges:
 
 @contextmanager
 def _checked(node: LifecycleNode, topic: str) -> Iterator[None]:
-    # rclpy raises various types for invalid overrides.
+    # rclpy raises various exception types for invalid overrides.
     try:
         yield
     except (RuntimeError, ValueError, TypeError, AttributeError, AssertionError, ParameterException) as error:

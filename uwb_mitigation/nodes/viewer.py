@@ -1,6 +1,6 @@
-"""The node `viewer`: a page in the browser on the topics.
+"""The node `viewer`: shows the topics on a page in the browser.
 
-It publishes only diagnostics and, if it was given an anchors file, the markers of the anchors.
+It publishes only diagnostics and, with an anchors file, the markers of the anchors.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ _QOS = QoSProfile(
 )
 
 SEARCH_S = 0.5
-"""Interval at which new topics are searched."""
+"""Interval of the search for new topics."""
 
 TAKE_S = 0.1
-"""Interval at which ranges are taken from their queues; of more than `_QOS.depth` only the last are shown."""
+"""Interval at which ranges are taken from their queues; only the last `_QOS.depth` are shown."""
 
 
 class Viewer(ManagedNode):
@@ -78,7 +78,7 @@ class Viewer(ManagedNode):
         self._subscribe(DiagnosticArray, topics.DIAGNOSTICS, self._feed.diagnostics)
         self._subscribe(PoseWithCovarianceStamped, topics.POSE, partial(self._feed.pose, PLAIN))
         self._subscribe(Odometry, topics.ODOMETRY_TRUTH, self._feed.true_position)
-        # No executor spins this node: waking up for every range would take time from the mitigator.
+        # No executor spins this node: waking up for every range would take CPU time from the mitigator.
         range_node = Node(
             f"_{self.get_name()}_ranges",
             namespace=self.get_namespace(),
@@ -135,14 +135,14 @@ class Viewer(ManagedNode):
     def _subscribe_ranges(self, kind: type, topic: str) -> None:
         """Let ranges queue up until `_take_ranges`."""
         if self._range_node is not None and topic not in self._ranges:
-            # Remapping arguments are those of this node.
+            # Resolve with the remapping arguments of this node.
             name = self.resolve_topic_name(topic)
             self._ranges[topic] = self._range_node.create_subscription(
                 kind, name, lambda _: None, _QOS, raw=True
             )
 
     def _take_ranges(self) -> None:
-        # A truth is published before its corrected range: taken after it and used before it, none is missed.
+        # A truth is published before its corrected range: reading truths last and adding them first misses none.
         corrected, truths, raw = (
             list(topics.queued(self._ranges[topic], _QOS.depth)) if topic in self._ranges else []
             for topic in (topics.RANGE_CORRECTED, topics.RANGE_TRUTH, topics.RANGE_RAW)
@@ -156,15 +156,15 @@ class Viewer(ManagedNode):
                 take(data)
 
     def _search(self) -> None:
-        """Subscribe to topics that are needed, or exist, only by now."""
+        """Subscribe to topics that have become available or necessary."""
         if self._view is not None:
             self._view.missing = self._missing()
-        # CIRs are most of the traffic, and a pipeline publishes none without a subscriber.
+        # Subscribe to CIRs on demand: they are most of the traffic, and a pipeline publishes them only if subscribed.
         if self._view is not None and self._view.pages:
             self._subscribe_ranges(RangeCir, topics.RANGE_RAW)
         elif self._range_node is not None and topics.RANGE_RAW in self._ranges:
             self._range_node.destroy_subscription(self._ranges.pop(topics.RANGE_RAW))
-        # The locator publishes every further tag on its own topic; a remapping of the plain topic does not apply to it.
+        # The locator publishes every further tag on a separate topic; a remapping of the plain topic does not apply to it.
         head, _, tail = self.resolve_topic_name(topics.POSE, only_expand=True).rpartition("/")
         own = re.compile(rf"{re.escape(head)}/(tag_(?:\d+|0x[0-9a-f]+))/{re.escape(tail)}")
         for topic, _ in self.get_topic_names_and_types():

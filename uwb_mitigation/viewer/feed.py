@@ -1,6 +1,6 @@
-"""From messages to a scene, for live topics and for recordings.
+"""Convert messages to a scene, for live topics and for recordings.
 
-Ranges are CDR bytes, the rest are message objects; those of rclpy and of rosbags have the same fields.
+Ranges are CDR bytes, all others are message objects; those of rclpy and of rosbags have the same fields.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ CHI2_95 = 5.991
 
 
 class Feed:
-    """Puts messages into a scene, under the lock that its pages hold while they draw.
+    """Adds messages to a scene, with the lock that its pages hold while they draw.
 
     Attributes:
         malformed: number of messages that could not be decoded.
@@ -112,7 +112,7 @@ class Feed:
                 self.scene.add_true_position(str(message.child_frame_id), position.x, position.y)
 
     def markers(self, message: Any) -> None:
-        """Take the anchors of a visualization_msgs/MarkerArray: namespace `anchors`, the text is the anchor's id."""
+        """Add the anchors of a visualization_msgs/MarkerArray: namespace `anchors`; the text is the anchor's id."""
         found: dict[int, AnchorPlace] = {}
         for marker in message.markers:
             position, text = marker.pose.position, marker.text
@@ -133,7 +133,7 @@ class Feed:
     def diagnostics(self, message: Any) -> None:
         """Add a diagnostic_msgs/DiagnosticArray."""
         for status in message.status:
-            # An octet is bytes in rclpy and a number in rosbags.
+            # An octet is bytes in rclpy and int in rosbags.
             level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
             self.report(str(status.name), Report(level, str(status.message), self.scene.clock()))
 

@@ -1,4 +1,4 @@
-"""The Bokeh models of one page: figures and tables, and the sources that a page draws a scene into."""
+"""The Bokeh models of one page: figures and tables, and the data sources that a page fills from a scene."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from bokeh.plotting import figure
 from uwb_mitigation.viewer.scene import STRIP_S, WATERFALL
 
 TRACE_BEFORE, TRACE_AFTER = 20, 180
-"""Samples before and after the first path that are shown."""
+"""Number of samples shown before and after the first path."""
 
 RAW, CORRECTED, TRUE, SMOOTHED = "#94a3b8", "#2563eb", "#111827", "#0f766e"
 _MARK, _WINDOW = "#b91c1c", "#fde68a"
@@ -45,15 +45,15 @@ COLUMNS = (
     ("correction", "correction, \u03c3", 90, "corrections", "stacked"),
     ("status", "status", 98, "broken", "stacked"),
 )
-"""Columns of the table: field, title, width, the function of the page's script that renders the cells, and name. The
-page shows the columns with a name if it is narrow, otherwise the others."""
+"""Columns of the table: field, title, width, JavaScript function that renders the cells, and name. A narrow page
+shows the columns with a name, a wide page the others."""
 
 
 class Models:
-    """Everything that a page consists of; the attributes are what it draws into and listens to.
+    """All Bokeh models of a page; the attributes are the models that it updates and subscribes to.
 
     Args:
-        seconds: length of a recording; None = live, without a slider.
+        seconds: duration of the recording; None: live, without a slider.
     """
 
     def __init__(self, seconds: float | None) -> None:
@@ -63,7 +63,7 @@ class Models:
         self.anchors = _source("x", "y", "name", "id")
         self.tags = _source("x", "y", "name", "width", "height", "angle", "colour")
         self.trails, self.true_trails = _source("xs", "ys", "colour"), _source("xs", "ys")
-        # The map shows these corners until the user changes its view: it must not follow the data.
+        # The map shows these corners until the user changes the view; it must not follow the data.
         self.extent = _source("x", "y")
         self.circles = _source("x", "y", "raw", "range", "colour", "x1", "y1")
         self.strip = _source("age", "raw", "range", "true")
@@ -71,7 +71,7 @@ class Models:
         self.marks = _source("noise", "first", "top", "from", "to")
         self.waterfall = ColumnDataSource({"image": [blank_waterfall()]})
         self.errors = _source("left", "right", "raw", "corrected")
-        # A figure without data would have no ranges: unseen corners stand in until some comes.
+        # A figure without data has no axis ranges: invisible corners define them until data arrives.
         self.corners = {name: _source("corner_x", "corner_y") for name in ("cir", "strip")}
         self.summary, self.notice, self.reports = (
             Div(text="", sizing_mode="stretch_width", disable_math=True) for _ in range(3)
@@ -98,14 +98,14 @@ class Models:
             self.roots[name].scatter("corner_x", "corner_y", source=corners, size=0, alpha=0)
 
     def show_empty(self, name: str, empty: bool) -> None:
-        """Tell whether a figure of `corners` has nothing to show."""
+        """Set the invisible corners of a figure of `corners` if it is empty, otherwise remove them."""
         corners = [0.0, 10.0] if empty else []
         if self.corners[name].data["corner_x"] != corners:
             self.corners[name].data = {"corner_x": corners, "corner_y": corners}
 
     def _map(self) -> figure:
         plot = _figure("Map", 480, "x, m", "y, m", match_aspect=True, tools="pan,wheel_zoom,reset,save")
-        # Tick labels of another width must not resize the frame, which would change the view.
+        # Fixed borders: tick labels of another width would resize the frame and change the view.
         plot.min_border_left, plot.min_border_right = 70, 20
         unfilled = {"source": self.circles, "fill_color": None}
         extent = plot.scatter("x", "y", source=self.extent, size=0, alpha=0)
@@ -161,7 +161,7 @@ class Models:
         plot.x_range = Range1d(-TRACE_BEFORE, TRACE_AFTER)
         plot.y_range = Range1d(WATERFALL, 0)
         levels = LinearColorMapper("Viridis256", low=0, high=255)
-        # By its first row, which is the newest; the axis runs downwards.
+        # Anchor the image at its first row, the newest, because the axis points down.
         plot.image(
             "image", x=-TRACE_BEFORE, y=0, dw=TRACE_BEFORE + TRACE_AFTER, dh=WATERFALL,
             source=self.waterfall, color_mapper=levels,
@@ -214,7 +214,7 @@ class Models:
             sortable=False,
             reorderable=False,
             editable=False,
-            # Ten times a second it would scroll back from where somebody reads.
+            # Otherwise each update would scroll the table back to the selection.
             scroll_to_selection=False,
             height=290,
             sizing_mode="stretch_width",
@@ -223,7 +223,7 @@ class Models:
 
 
 def blank_waterfall() -> np.ndarray[Any, np.dtype[np.uint8]]:
-    """uint8 (WATERFALL, samples shown), of no CIR."""
+    """Return the image without any CIR, uint8 (WATERFALL, samples shown)."""
     return np.zeros((WATERFALL, TRACE_BEFORE + TRACE_AFTER), np.uint8)
 
 
@@ -254,7 +254,7 @@ def _figure(title: str, height: int, x: str, y: str, **options: Any) -> figure:
 
 
 def _with_legend(plot: figure) -> figure:
-    """Its legend beside the title's line, where it covers no data."""
+    """Move the legend to the line of the title, where it covers no data."""
     plot.add_layout(plot.legend[0], "above")
     plot.legend.orientation = "horizontal"
     plot.legend.label_text_font_size = "11px"

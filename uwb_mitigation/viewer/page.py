@@ -1,4 +1,4 @@
-"""How a scene is drawn into the models of one page, and what clicks on it do."""
+"""Draw a scene into the models of one page, and handle clicks on it."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ SILENT = "#9ca3af"
 """Colour of pairs and tags without recent data."""
 
 ROOM_M = 5.0
-"""Room around a tag on a map without anchors."""
+"""Margin around a tag on a map without anchors."""
 
 _NOTICE_STYLE = "background:#fef3c7;color:#78350f;padding:4px 10px;border-radius:4px;margin-bottom:4px"
 _REPORTS_STYLE = (
@@ -75,12 +75,12 @@ _TEMPLATES = jinja2.Environment(loader=jinja2.FileSystemLoader(Path(__file__).pa
 
 @dataclass(slots=True)
 class View:
-    """What all pages of a server show.
+    """State that all pages of a server share.
 
     Attributes:
         lock: held while the scene is changed or drawn.
         window: number of samples that the network reads.
-        player: of a recording; None: live.
+        player: player of a recording; None: live.
         missing: the reasons for an empty page.
         pages: number of open pages.
     """
@@ -98,8 +98,8 @@ class Page:
     """One open page. It draws at most ten times a second, and only what has changed.
 
     Args:
-        document: the session's document, into which the page is laid out.
-        nonce: of the scripts in the page, for its Content-Security-Policy.
+        document: the session's document; the page is added to it.
+        nonce: nonce of the page's scripts for the Content-Security-Policy.
     """
 
     def __init__(self, document: Document, view: View, nonce: str = "") -> None:
@@ -110,9 +110,9 @@ class Page:
         self._due_s = 0.0
         self._drawn: dict[str, object] = {}
         self._models = models = Models(None if view.player is None else view.player.seconds)
-        # Before the model is in the document: later it is not subscribed.
+        # Register before the model is added to the document: later registrations have no effect.
         models.map_figure.on_event(Reset, self._on_reset)
-        # At once: Bokeh searches for new models after each root, which is half of the time to open a page.
+        # Add all roots in one step: Bokeh searches for new models after each, half of the time to open a page.
         with document.models.freeze():
             for model in models.roots.values():
                 document.add_root(model)
@@ -129,7 +129,7 @@ class Page:
             models.slider.on_change("value_throttled", self._on_slider)
         document.add_periodic_callback(self.tick, int(1000 * REFRESH_S))
         self.draw()
-        # Last: a session that could not be opened does not report its end.
+        # Register last: a session that could not be opened does not report its end.
         document.on_session_destroyed(self._on_closed)
         view.pages += 1
 
@@ -150,7 +150,7 @@ class Page:
         self._draw_player()
         with self._view.lock:
             scene = self._view.scene
-            # Ages change without data: once a second is enough.
+            # Ages change without data; drawing them once a second is enough.
             if not self._changed("scene", (scene.revision, self._selected, math.floor(scene.clock()))):
                 return
             self._draw_pairs(scene)
@@ -208,7 +208,7 @@ class Page:
         _choose(self._models.pairs, self._rows, self._selected)
 
     def _draw_summary(self, scene: Scene) -> None:
-        """Show counts, why the page is empty, and what has stopped."""
+        """Show counts, the reason for an empty page, and the pairs and tags that have stopped."""
         count = len(self._rows)
         parts = [f"{count} pair{'' if count == 1 else 's'}", f"{scene.ranges} ranges"]
         if math.isfinite(scene.now_s):
@@ -271,12 +271,12 @@ class Page:
         self._draw_circles(scene)
 
     def _fit(self, scene: Scene) -> None:
-        """Let the map show everything that is on it now."""
+        """Fit the view of the map to its current content."""
         places = [(place.x, place.y) for place in scene.anchors.values()]
         for trail in (*(tag.trail for tag in scene.tags.values()), *scene.true_trails.values()):
             places += trail
         x, y = np.array(places or [(0.0, 0.0), (10.0, 10.0)]).T
-        # A single tag needs room to move.
+        # Without anchors, leave a margin in which the tag can move.
         room = 0.0 if scene.anchors or not places else ROOM_M
         corners = {"x": [x.min() - room, x.max() + room], "y": [y.min() - room, y.max() + room]}
         self._models.extent.data = {name: [float(value) for value in ends] for name, ends in corners.items()}
@@ -304,7 +304,7 @@ class Page:
         _set_rows(self._models.circles, rows)
 
     def _draw_strip(self, scene: Scene, history: History | None) -> None:
-        # Also for a pair without new data: its ranges grow older.
+        # Also draw a pair without new data, because its ranges age.
         if not self._changed("strip", (self._selected, scene.now_s, scene.ranges)):
             return
         now_s = scene.now_s
@@ -326,7 +326,7 @@ class Page:
 
     def _draw_trace(self, traces: tuple[Trace, ...]) -> None:
         models = self._models
-        # The newest trace, not its stamp: stamps may be equal.
+        # Compare the newest trace instead of its stamp, because stamps may be equal.
         if not self._changed("traces", (self._selected, traces[-1] if traces else None)):
             return
         models.show_empty("cir", not traces)
@@ -352,7 +352,7 @@ class Page:
     def _draw_reports(self, scene: Scene) -> None:
         rows = [(name, report.at(scene.clock())) for name, report in sorted(scene.reports.items())]
         if self._changed("reports", rows):
-            # Texts of messages may contain anything; nothing else on the page is made of them.
+            # Escape these texts: they come from messages and may contain HTML.
             cells = [
                 f"<tr><td>{html.escape(name)}</td>"
                 f"<td>{_level(report.level)}</td><td>{html.escape(report.message)}</td></tr>"
@@ -375,7 +375,7 @@ class Page:
             self.select(self._rows[new[0]])
 
     def _on_anchor(self, _attribute: str, _old: object, new: list[int]) -> None:
-        """Select the pair of a clicked anchor with the tag that is shown, else its first pair."""
+        """Select the pair of a clicked anchor with the selected tag, else its first pair."""
         source, selected = self._models.anchors, self._selected
         anchors = [int(identity) for identity in source.data["id"]]
         anchor = anchors[new[0]] if new and new[0] < len(anchors) else None
@@ -417,14 +417,14 @@ def _set_rows(source: ColumnDataSource, rows: list[dict[str, Any]]) -> None:
 
 
 def _choose(source: ColumnDataSource, rows: list[Any], chosen: object) -> None:
-    """Select a row of a source, or none."""
+    """Select a row of a source, or clear the selection."""
     indices = [rows.index(chosen)] if chosen in rows else []
     if source.selected.indices != indices:
         source.selected.indices = indices
 
 
 def _waterfall_image(traces: tuple[Trace, ...]) -> np.ndarray[Any, np.dtype[np.uint8]]:
-    """Return one exchange per row, the newest on top, levels from -40 dB to its peak; uint8 (WATERFALL, width)."""
+    """Return one exchange per row, newest first, levels from -40 dB to its peak; uint8 (WATERFALL, width)."""
     image = blank_waterfall()
     for row, trace in enumerate(reversed(traces)):
         begin = trace.origin - TRACE_BEFORE - trace.cir.start_index
@@ -437,7 +437,7 @@ def _waterfall_image(traces: tuple[Trace, ...]) -> np.ndarray[Any, np.dtype[np.u
 
 
 def _level(level: int) -> str:
-    """Return the coloured level of a diagnostic."""
+    """Return the HTML of a diagnostic level, with its colour."""
     if not 0 <= level < len(LEVELS):
         return "?"
     return f'<span style="color:{LEVEL_COLOURS[level]};font-weight:600;white-space:nowrap">{LEVELS[level]}</span>'
@@ -455,7 +455,7 @@ def _utc(time_s: float) -> str:
 
 
 def _drawable(value_m: float) -> float:
-    """Return NaN for a length that would leave no room for any other."""
+    """Return NaN for a length that would make all others invisible."""
     return value_m if abs(value_m) < MAX_RANGE_M else math.nan
 
 

@@ -1,7 +1,7 @@
-"""Plays a bag into a scene, as its topics would have come live, from any position and at its own pace.
+"""Play a bag into a scene as if its topics were live, from any position and in real time.
 
-Only what is shown is read: a seek reads the minute before, and playing continues from there. So a bag of any size opens
-at once and needs no memory.
+Only the data on the page is read: a seek reads the minute before, and playing continues from there. A bag of any size
+therefore opens quickly and needs little memory.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ DIAGNOSTICS = "/diagnostics"
 DIAGNOSTICS_TYPE = "diagnostic_msgs/msg/DiagnosticArray"
 
 MAX_STEP_S = 1.0
-"""If no page was open for longer, playing continues where it was."""
+"""If no page was open for longer than this, playing continues from the last position."""
 
 _BATCH = 256
 _RANGE_TYPES = {
@@ -57,22 +57,22 @@ _POSITION_TOPIC = re.compile(r"(.*)/uwb/(?:(tag_(?:\d+|0x[0-9a-f]+))/)?(pose|odo
 
 
 class BagPlayer:
-    """The ranges or the tracks of a bag; moves the scene of `feed`, which all pages show.
+    """Player of the ranges or tracks of a bag; updates the scene of `feed`, which all pages show.
 
     If the bag contains raw ranges only, they are corrected for display.
 
     Args:
         path: an MCAP file or a rosbag2 folder.
-        feed: puts messages into the scene.
-        backend: makes the correction of raw ranges; called only if the bag contains no corrected ranges.
-        namespace: of the topics, as `/board1`; None: the only namespace with ranges (or tracks) in the bag.
+        feed: adds messages to the scene.
+        backend: returns the backend that corrects raw ranges; called only if the bag has no corrected ranges.
+        namespace: namespace of the topics, such as `/board1`; None: the only namespace with ranges (or tracks) in the bag.
 
     Attributes:
-        seconds: length of the recording.
+        seconds: duration of the recording.
         position_s: the current position.
-        playing: whether `advance` moves.
+        playing: whether `advance` changes the position.
         corrects: whether the bag contains raw ranges only.
-        missing: what the bag does not contain; for the page.
+        missing: messages for the page on data that the bag does not contain.
 
     Raises:
         RecordingError: the path is not an MCAP bag, or contains neither ranges nor tracks, or ranges of another version.
@@ -140,7 +140,7 @@ class BagPlayer:
         self._advanced_s = time.monotonic()
 
     def advance(self) -> None:
-        """Move on by the time since the last call."""
+        """Advance by the time since the last call."""
         now_s = time.monotonic()
         passed_s, self._advanced_s = min(now_s - self._advanced_s, MAX_STEP_S), now_s
         if self.playing:
@@ -149,7 +149,7 @@ class BagPlayer:
         self._read()
 
     def _read(self) -> None:
-        """Read up to the current position; of more than `MAX_MESSAGES`, the rest follows with the next call."""
+        """Read up to the current position; at most `MAX_MESSAGES`, the rest at the next call."""
         stop_ns = self._start_ns + round(self.position_s * 1e9)
         try:
             for _ in range(MAX_MESSAGES):
@@ -190,10 +190,10 @@ class BagPlayer:
         return {topic: take for topic, take in callbacks.items() if topic in topics}
 
     def _standard(self, kind: str, take: Callable[[Any], None], data: bytes) -> None:
-        """Take a standard message, by the types of ROS 2 Jazzy."""
+        """Decode a standard message with the types of ROS 2 Jazzy, and pass it to `take`."""
         try:
             take(schemas.typestore().deserialize_cdr(data, kind))
-        except Exception:  # rosbags raises various types, and values may be implausible.
+        except Exception:  # rosbags raises various types, and values may be invalid.
             self._feed.malformed += 1
 
     def _raw(self, data: bytes) -> None:

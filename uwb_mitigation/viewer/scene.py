@@ -1,7 +1,7 @@
-"""What the viewer shows at one moment: pairs with their last minute and last CIRs, tags, anchors, diagnostics.
+"""State of the viewer: pairs with their last minute and last CIRs, tags, anchors, diagnostics.
 
-It is fed in the order of time, by topics or by a recording. No ROS, no page, no I/O here. All limits of what a stream
-can fill are in this file.
+Topics or a recording add data in the order of time. No ROS, no page, no I/O here. This file has all limits of the
+memory that a stream can fill.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ from numpy.typing import NDArray
 from uwb_mitigation.bag.poses import tag_frame
 from uwb_mitigation.measurement import Cir, CorrectedRange, Encoding, Status, Truth
 
-# Limits. Ids and texts come from the air or the network: of more entries, the oldest are removed.
+# Limits. Ids and texts come from the air or the network; above a limit, the oldest entries are removed.
 MAX_PAIRS, MAX_TAGS, MAX_REPORTS, MAX_ANCHORS = 256, 64, 64, 256
 MAX_TRUTHS, MAX_WITHOUT_TRUTH = 10_000, 1000
-"""Truths that wait for their corrected ranges, and corrected ranges that wait for their truths."""
+"""Maximum number of truths without corrected ranges, and of corrected ranges without truths."""
 MAX_STRIP, MAX_TRAIL = 6000, 1200
-"""Points of a strip chart (100 ranges per second for a minute) and of a tag's trail."""
+"""Maximum points of a strip chart (100 ranges per second for a minute) and of a tag's trail."""
 WATERFALL = 50
-"""CIRs that are kept of each pair."""
+"""Maximum number of CIRs of each pair."""
 MAX_VALUES = 2 * 1016
-"""Values of a CIR: the DW1000's complete accumulator, real and imaginary."""
+"""Maximum number of values of a CIR: the DW1000's complete accumulator, real and imaginary."""
 MAX_TEXT = 400
-"""Characters that are kept of a name or a message."""
+"""Maximum number of characters of a name or a message."""
 MAX_ID_DIGITS = 20
-"""Decimal digits of a 64-bit id."""
+"""Maximum number of decimal digits of a 64-bit id."""
 MAX_RANGE_M = 10_000.0
-"""A longer range is shown in the table only, and a larger error is not counted: no radio measures it."""
+"""A longer range is shown in the table only, and a larger error is not counted: both are implausible."""
 MAX_COORDINATE_M = 2e7
 """Coordinates of any position on Earth; a position further away is ignored."""
 MAX_MESSAGES = 40_000
-"""Messages of a recording that are read at a seek; of more in a minute, only the last are."""
+"""Maximum number of messages that are read at a seek; older ones are skipped."""
 
 # Times.
 STRIP_S = 60.0
@@ -52,7 +52,7 @@ STALE = 3
 """Diagnostic level STALE."""
 
 ERROR_EDGES_M = np.linspace(-1.0, 2.0, 61)
-"""Bins of the error histogram; larger errors count in the outermost."""
+"""Bins of the error histogram; larger errors count in the outermost bins."""
 
 Pair = tuple[int, int]
 """Anchor and tag."""
@@ -84,9 +84,9 @@ class Sample:
     """One corrected range of a pair; its truth may arrive later.
 
     Attributes:
-        time_s: its stamp.
+        time_s: stamp.
         raw_m, range_m, sigma_m: measured and corrected range, and standard deviation of the corrected one.
-        true_m, label: NaN and empty: unknown.
+        true_m, label: true range and label; NaN and empty if unknown.
     """
 
     time_s: float
@@ -121,17 +121,17 @@ class Trace:
         odd = cir.encoding is Encoding.COMPLEX_INT16 and len(cir.samples) % 2
         if odd or not 0 < len(cir.samples) <= MAX_VALUES:
             return None
-        # The largest sample times the scale must be a float32, and the index of the first path an int32.
+        # The largest sample times the scale must fit a float32, and the index of the first path an int32.
         if not abs(cir.scale) < 1e30 or (
             math.isfinite(cir.first_path_index) and abs(cir.first_path_index) >= 2**31
         ):
             return None
-        # A copy: the samples may be a view into a large message.
+        # Copy the samples: they may be a view into a large message.
         return cls(replace(cir, samples=cir.samples.copy()))
 
     @property
     def magnitude(self) -> NDArray[np.float32]:
-        """In accumulator units, float32 (n,)."""
+        """Magnitudes in accumulator units, float32 (n,)."""
         if self._magnitude is None:
             values = self.cir.samples.astype(np.float32)
             if self.cir.encoding is Encoding.COMPLEX_INT16:
@@ -141,7 +141,7 @@ class Trace:
 
     @property
     def origin(self) -> int:
-        """Sample of the accumulator with the first path; the first sample if that is unknown."""
+        """Accumulator index of the first path; the first sample if it is unknown."""
         first = self.cir.first_path_index
         return math.floor(first) if math.isfinite(first) else self.cir.start_index
 
@@ -174,7 +174,7 @@ class History:
         Args:
             age_s: time since the last range; the rate decreases if this is several mean intervals.
         """
-        # A list at once: the monitor's table is drawn in another thread than the one that adds.
+        # Copy in one step: the monitor draws its table in another thread than the one that adds ranges.
         recent = [sample.time_s for sample in list(islice(reversed(self.samples), 20))]
         span = recent[0] - recent[-1] if recent else 0.0
         if not span > 0:
@@ -204,7 +204,7 @@ class Pose:
 
 @dataclass(slots=True)
 class Tag:
-    """A tag's latest pose, when it was received on the scene's clock, and its trail."""
+    """A tag's latest pose, its time of reception on the scene's clock, and its trail."""
 
     pose: Pose | None = None
     received_s: float = math.nan
@@ -234,7 +234,7 @@ class Report:
     received_s: float = math.nan
 
     def at(self, now_s: float) -> Report:
-        """Return what to show at a time: STALE with the age if the node has stopped reporting."""
+        """Return the report at a time: STALE with the age if the node has stopped reporting."""
         age_s = now_s - self.received_s
         if not age_s > STALE_S:
             return self
@@ -243,7 +243,7 @@ class Report:
 
 @dataclass(slots=True)
 class Missing:
-    """What the page says if it has no ranges, anchors or positions to show; empty: nothing."""
+    """Messages of the page if there are no ranges, anchors or positions; empty: no message."""
 
     ranges: str = "No ranges received."
     anchors: str = "No anchor positions."
@@ -251,14 +251,14 @@ class Missing:
 
 
 class Scene:
-    """Everything that the page shows.
+    """All data that the page shows.
 
     Attributes:
-        clock: returns the time that ages are measured with, s: a steady clock live, the recording's time in a replay.
-            Stamps are not compared with it: they may come from another computer.
+        clock: returns the time for ages, s: a steady clock live, the recording's time in a replay. Stamps are not
+            compared with it, because they may come from another computer.
         now_s: the latest stamp plus the time since then; NaN before any.
         ranges: number of ranges.
-        pairs: {(anchor, tag): its last minute}, the latest at the end.
+        pairs: {(anchor, tag): history of its last minute}, the latest at the end.
         tags, true_trails, anchors, reports: {id or name: ...}.
         revision: increases with every change, so that a page draws only changes.
     """
@@ -334,7 +334,7 @@ class Scene:
             self.revision += 1
 
     def add_true_position(self, tag: str, x: float, y: float) -> None:
-        """Add the true position of a tag, by the name that the truth has for it."""
+        """Add the true position of a tag; `tag` is its name in the truth."""
         if _is_plausible(x, y):
             trail = self.true_trails.get(tag[:MAX_TEXT]) or deque(maxlen=MAX_TRAIL)
             self.true_trails.add(tag[:MAX_TEXT], trail).append((x, y))
@@ -376,7 +376,7 @@ class Scene:
                 yield pair, history, history.latest
 
     def tag_of(self, tag_id: int) -> Tag | None:
-        """Return the tag of ranges: the one of its name, else the plain one if it is the only tag without a name."""
+        """Return the tag of a range: the tag of that name, else the plain tag if it is the only one without a name."""
         own = self.tags.get(tag_frame(tag_id))
         nameless = {tag for _, tag in self.pairs if tag_frame(tag) not in self.tags}
         return self.tags.get(PLAIN) if own is None and nameless == {tag_id} else own

@@ -1,4 +1,4 @@
-"""Serves the viewer's page over HTTP from its own thread; the page needs no other server."""
+"""Serve the viewer's page over HTTP from its own thread; the page needs no other server."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ from uwb_mitigation.viewer.page import Page, View
 ALL_ADDRESSES = ("0.0.0.0", "*")
 
 _NONCE = "X-Nonce"
-"""Header that hands the nonce of a response to the page; a value from the client is replaced."""
+"""Header that passes the nonce of a response to the page; a value from the client is replaced."""
 
 
 class ViewerServer:
     """A page at `url` until `close`.
 
     Args:
-        view: what the pages show.
-        host, port: where to listen; port 0 takes a free one, and `port` then has its number.
+        view: the view that the pages show.
+        host, port: address to bind; port 0 selects a free port, and the attribute `port` has its number.
         origins: further `host:port` that are accepted in the headers Host and Origin, for a proxy or a host name.
 
     Raises:
@@ -105,7 +105,7 @@ class ViewerServer:
         finally:
             server.unlisten()
             server.stop()
-            # With its connections, so that the pages notice at once.
+            # Also close its connections, so that the pages detect it immediately.
             loop.close(all_fds=True)
 
 
@@ -125,7 +125,7 @@ class _Application(BokehTornado):  # type: ignore[misc]
         super().__init__(
             {"/": Application(FunctionHandler(open_page))},
             extra_websocket_origins=self._hosts,
-            # A closed tab is forgotten soon, so that it costs nothing.
+            # Discard sessions of closed tabs soon, so that they use no resources.
             check_unused_sessions_milliseconds=1000,
             unused_session_lifetime_milliseconds=2000,
         )
@@ -174,7 +174,7 @@ class _UnknownHost(RequestHandler):  # type: ignore[misc]
 def accepted_hosts(host: str, port: int, more: tuple[str, ...]) -> list[str]:
     """Return the `host:port` that requests may name as Host and as Origin.
 
-    A page at all addresses accepts the addresses and the name of this machine, which no other site can resolve to.
+    With the wildcard address, these are the addresses and the name of this machine; no other site can resolve to them.
     """
     names = {"localhost", "127.0.0.1"}
     if host in ALL_ADDRESSES:
