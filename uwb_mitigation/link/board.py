@@ -1,6 +1,6 @@
-"""The board's side of the protocol, as firmware has it. No I/O.
+"""The board's side of the protocol. No I/O.
 
-It is what the emulated board runs, and the shortest way to see what firmware must do.
+The emulated board runs it; it is also the shortest reference implementation for firmware.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _UNASKED = Flag(0)
 
 
 class Corrector(Protocol):
-    """What corrects on the board, such as `Mitigation`."""
+    """Corrects ranges on the board, such as `Mitigation`."""
 
     offsets: Offsets
 
@@ -48,17 +48,17 @@ class Corrector(Protocol):
 
 
 class Board:
-    """One start of a board, from boot to reset. `now_us` is its uptime.
+    """A board from one boot to the next reset. `now_us` is its uptime.
 
-    Every method returns bytes to send, whole frames.
+    Every method returns the bytes to send: complete frames.
 
     Args:
-        identity: the HELLO, without what depends on the state of the board.
-        corrector: the board's model; None = it has none and refuses any mode but HOST. Its offsets are those that
-            the host sets; none at the start.
-        mode: the mode that it starts in.
-        boot_id: differs from one start to the next.
-        version: protocol version that it speaks; another than the host's shows a mismatch.
+        identity: the HELLO; fields that depend on the state of the board are replaced.
+        corrector: the board's model; None = no model, and all modes but HOST are refused. The host sets its offsets,
+            which are empty after boot.
+        mode: the mode after boot.
+        boot_id: differs between two boots.
+        version: protocol version of the board; to test a mismatch, use another than the host's.
     """
 
     def __init__(
@@ -84,22 +84,22 @@ class Board:
         self.measurements_lost = 0
 
     def hello(self, now_us: int) -> bytes:
-        """The HELLO that follows the boot."""
+        """Return the HELLO after boot."""
         return self._hello(now_us, None)
 
     def measure(self, measurement: RangeMeasurement, now_us: int) -> bytes:
-        """Send a measurement received at `now_us`, as the mode says."""
+        """Send a measurement received at `now_us`, raw or corrected according to the mode."""
         self._measurements += 1
         kind, payload = messages.encode(measurement)
         if self.mode is Mode.HOST:
             return self._encoder.encode(kind, payload, time_us=now_us)
-        # A board computes from binary32 values, as it would send them.
+        # A board computes with the same binary32 values that it would send.
         held = messages.decode(kind, payload)
         assert isinstance(held, RangeMeasurement)
         return self._correct(held, now_us, _UNASKED)
 
     def tick(self, now_us: int) -> bytes:
-        """The STATUS, when it is due."""
+        """Return the STATUS if it is due."""
         if now_us < self._status_due_us:
             return b""
         self._status_due_us = now_us + STATUS_INTERVAL_US
@@ -114,11 +114,11 @@ class Board:
         return self._send(status, now_us)
 
     def receive(self, data: bytes, now_us: int) -> bytes:
-        """Answer what the host sent."""
+        """Return the answers to the host's frames in the data."""
         foreign = self._decoder.counts.foreign_versions.total()
         sent = b"".join(self._answer(frame, now_us) for frame in self._decoder.feed(data))
         if self._decoder.counts.foreign_versions.total() > foreign:
-            # A host of another version learns from this which one the board speaks.
+            # This frame shows the board's version to a host of another version.
             sent += self.hello(now_us)
         return sent
 

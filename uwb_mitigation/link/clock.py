@@ -1,9 +1,8 @@
-"""A board's clock on the host's: offset and drift from what the link shows of both. No I/O.
+"""Estimate of the offset and drift between a board's clock and the host's clock. No I/O.
 
-What is known for certain bounds the estimate: a frame is never received before what it tells of, and a
-round trip encloses the moment at which the board answered it. Within the bounds a Kalman filter with two
-states, offset and drift, weighs each round trip by its duration, so that one delayed by a busy bus or
-host hardly counts.
+Causality bounds the estimate: a frame never arrives before the event that it reports, and the board answers
+between the start and the end of a round trip. Within these bounds, a Kalman filter with the states offset
+and drift weighs each round trip by its duration: round trips that a busy bus or host delays have little weight.
 """
 
 from __future__ import annotations
@@ -11,39 +10,39 @@ from __future__ import annotations
 import bisect
 
 _FLOOR_NS = 20e3
-"""Uncertainty of the best of exchanges: time stamps of both sides are not better."""
+"""Standard deviation of the best round trip, limited by the timestamps of both sides."""
 
 _LATE_ARRIVAL_NS = 20e6
-"""How late a frame may well arrive: the weight of one-way arrivals while there was no round trip."""
+"""Typical delay of a frame: standard deviation of one-way arrivals before the first round trip."""
 
 _FIRST_ARRIVAL_NS = 1e6
-"""Weight of the first arrival: if it was late, the next early one corrects it, whatever its weight."""
+"""Standard deviation of the first arrival. If it was late, the next early arrival corrects the estimate."""
 
 _START_DRIFT = 100e-6
 """Twice the tolerance of a common crystal."""
 
 _DRIFT_WALK_PER_S = 1.7e-14
-"""Variance that a second adds to the drift: one part in 10^6 a minute, as a warming crystal does."""
+"""Process noise of the drift, variance per second: 1 ppm per minute, as for a crystal that warms up."""
 
 _OFFSET_WALK_NS2_PER_S = 1e6
-"""Variance that a second adds to the offset: 1 us, for what the drift's walk does not cover."""
+"""Process noise of the offset, variance per second: 1 us, for errors that the drift does not model."""
 
 _STEP_NS = 100e6
-"""A correction larger than this is a clock that was set, not one that drifts."""
+"""A larger correction means that a clock was set."""
 
 _MAX_AGE_NS = 10 * 10**9
-"""A measurement that seems older than this when it arrives is a fault of the board's clock."""
+"""If a measurement is older than this when it arrives, the board's clock is wrong."""
 
 _HISTORY = 1024
 
 
 class DeviceClock:
-    """Maps a board's counter to the host's clock, strictly increasing.
+    """Strictly increasing map from a board's counter to the host's clock.
 
     Args:
         tick_hz: rate of the counter.
-        wrap: the counter's modulus, such as `DEVICE_TIME_WRAP`; None if it never wraps. A gap may hold
-            any number of wraps: the host's clock tells how many.
+        wrap: the counter's modulus, such as `DEVICE_TIME_WRAP`; None if it never wraps. A gap may contain
+            any number of wraps: the host's clock determines the number.
     """
 
     def __init__(self, tick_hz: float = 1e6, wrap: int | None = None) -> None:
@@ -52,7 +51,7 @@ class DeviceClock:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything, as when the board started anew."""
+        """Reset the estimate, for example after the board was restarted."""
         self._last: tuple[int, int] | None = None
         self._restart()
 
@@ -76,7 +75,7 @@ class DeviceClock:
 
     @property
     def drift(self) -> float:
-        """Seconds that the host's clock gains on the board's per second of the board's."""
+        """Seconds that the host's clock gains per second of the board's clock."""
         return self._drift
 
     @property
@@ -90,13 +89,13 @@ class DeviceClock:
         return float(max(self._p_offset, 0.0) ** 0.5)
 
     def arrival(self, ticks: int, arrived_ns: int) -> None:
-        """Take note that a frame that tells of the counter value `ticks` was there at `arrived_ns`."""
+        """Add a frame that reports an event at counter value `ticks` and arrived at `arrived_ns`."""
         self._arrival(self._board_ns(ticks, arrived_ns), arrived_ns)
 
     def exchange(self, sent_ns: int, received: int, replied: int, arrived_ns: int) -> None:
-        """Take note of a round trip: sent by the host, received and replied by the board, back again.
+        """Add a round trip: the host sends, the board receives and replies, the host receives the reply.
 
-        A round trip that contradicts itself (shorter than the board's part in it) is ignored.
+        Inconsistent round trips (shorter than the time between the board's reception and reply) are ignored.
         """
         received_ns = self._board_ns(received, arrived_ns)
         replied_ns = self._board_ns(replied, arrived_ns)
@@ -116,10 +115,10 @@ class DeviceClock:
         self._confine(at, low, high)
 
     def stamp(self, ticks: int, arrived_ns: int) -> int:
-        """The host's time at `ticks`, of which a frame arrived at `arrived_ns`; ns.
+        """Return the host's time, ns, at `ticks`, the event time of a frame that arrived at `arrived_ns`.
 
-        The same ticks give the same stamp again, later ticks a later stamp, and no stamp lies after the
-        arrival: only a clock that was set or a board that was reset can move stamps back.
+        The same ticks always map to the same stamp, later ticks to a later stamp, and no stamp is after the
+        arrival. Stamps move back only after a clock was set or a board was reset.
         """
         board_ns = self._board_ns(ticks, arrived_ns)
         self._arrival(board_ns, arrived_ns)
@@ -164,11 +163,11 @@ class DeviceClock:
             self._update(board_ns, high, _FLOOR_NS**2)
             self._confine(board_ns, float("-inf"), high)
         elif not self._enclosed:
-            # The later, the less it says: a stall of seconds must not count as an offset.
+            # A late arrival has a small weight, so that a stall of seconds does not change the offset.
             self._update(board_ns, high, _LATE_ARRIVAL_NS**2 + late_ns**2)
 
     def _update(self, at: int, offset: float, variance: float) -> None:
-        """The filter's step for a measured `offset` at board time `at`."""
+        """Update the filter with a measured `offset` at board time `at`."""
         ahead = at - self._at
         if ahead > 0:
             ahead_s = ahead / 1e9
@@ -179,7 +178,7 @@ class DeviceClock:
             self._p_drift = min(self._p_drift + _DRIFT_WALK_PER_S * ahead_s, _START_DRIFT**2)
             self._at = at
             ahead = 0
-        # A sample from before the last update is seen through the drift: H = [1, ahead].
+        # The sample may be older than the last update: the measurement matrix is H = [1, ahead].
         cross_offset = self._p_offset + ahead * self._p_cross
         cross_drift = self._p_cross + ahead * self._p_drift
         total = cross_offset + ahead * cross_drift + variance
@@ -192,7 +191,7 @@ class DeviceClock:
         self._p_drift -= gain_drift * cross_drift
 
     def _confine(self, at: int, low: float, high: float) -> None:
-        """Move the estimate into what is certain; start anew where that is a step."""
+        """Clip the estimate to its bounds; restart the filter if the correction is a clock step."""
         predicted = self._offset + self._drift * (at - self._at)
         nearest = min(max(predicted, low), high)
         if nearest == predicted:

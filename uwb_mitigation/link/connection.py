@@ -1,6 +1,6 @@
-"""A connection to hardware that a thread keeps open: opened, served, and opened again after a loss.
+"""A connection to hardware that a thread opens, serves, and reopens after a loss.
 
-Boards on serial ports (`port`) and radios of this computer (`uwb_mitigation.radio.port`) are built on it.
+Used for boards on serial ports (`port`) and radios of this computer (`uwb_mitigation.radio.port`).
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from uwb_mitigation.errors import LinkError, ParameterError, UwbMitigationError
 
 FIRST_RETRY_S = 0.1
 LAST_RETRY_S = 0.4
-"""Hardware that came back is found well within a second; a search costs next to nothing."""
+"""Hardware that was plugged in again is found within a second; the search takes little time."""
 
 CAPACITY = 1024
-"""Default number of events that wait; beyond it the oldest are dropped."""
+"""Default size of the event queue; if it is full, the oldest events are dropped."""
 
 _Event = TypeVar("_Event")
 
@@ -33,16 +33,16 @@ _Event = TypeVar("_Event")
 class Connection(ABC, Generic[_Event]):
     """Keeps hardware connected until `close`, and queues its events. Methods may be called from any thread.
 
-    Nothing that the hardware does ends the thread or raises: `problem` contains what is wrong.
+    Hardware errors neither end the thread nor raise an exception; `problem` describes them.
 
     Args:
         name: of the thread.
-        problem: before the first try.
+        problem: value of `problem` before the first attempt.
         capacity: see `CAPACITY`.
 
     Attributes:
         openings: how often the hardware was opened.
-        overflowed: events that were dropped because nobody took them in time.
+        overflowed: number of events dropped because the queue was full.
     """
 
     def __init__(self, name: str, problem: str, capacity: int = CAPACITY) -> None:
@@ -52,21 +52,21 @@ class Connection(ABC, Generic[_Event]):
         self._worked = False
         self._capacity = capacity
         self._events: deque[_Event] = deque()
-        # Guards the state of the connection; waiting for it waits for events.
+        # Guards the state of the connection; the condition signals new events.
         self._lock = threading.RLock()
         self._changed = threading.Condition(self._lock)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
     def get(self, timeout_s: float) -> _Event | None:
-        """Return the next event; None if there is none within the time, or once the connection is closed."""
+        """Return the next event; None after the timeout or if the connection is closed."""
         with self._changed:
             self._changed.wait_for(lambda: self._events or self.closed, timeout_s)
             return self._events.popleft() if self._events and not self.closed else None
 
     @property
     def problem(self) -> str:
-        """What keeps the hardware from working; empty while nothing does."""
+        """Reason why the hardware does not work; empty if it works."""
         with self._lock:
             return self._problem
 
@@ -76,7 +76,7 @@ class Connection(ABC, Generic[_Event]):
         return self._stop.is_set()
 
     def close(self) -> None:
-        """End the thread and close the hardware; may be called twice."""
+        """Stop the thread and close the hardware; may be called twice."""
         self._stop.set()
         with self._changed:
             self._changed.notify_all()
@@ -91,7 +91,7 @@ class Connection(ABC, Generic[_Event]):
         """
 
     def _lost(self, text: str) -> None:
-        """Called after each loss and each failed try, while the lock is held."""
+        """Handle a loss or a failed attempt; called with the lock held."""
 
     def _put(self, events: Iterable[_Event]) -> None:
         with self._changed:
@@ -119,12 +119,12 @@ class Connection(ABC, Generic[_Event]):
 
 @dataclass(frozen=True, slots=True)
 class PortAddress:
-    """Where a board is: a device file, or a USB device wherever it is plugged in.
+    """Address of a board: a device file, or the ids of a USB device.
 
     Attributes:
-        device: path of the device file; empty = find by USB.
+        device: path of the device file; empty = search by USB ids.
         vendor, product: USB ids.
-        serial_number: of the USB device; empty = the first that has the ids.
+        serial_number: of the USB device; empty = the first device with the ids.
     """
 
     device: str = ""
@@ -137,7 +137,7 @@ class PortAddress:
         """Read `/dev/ttyACM0`, `usb:2341:805a` or `usb:2341:805a:SERIAL` (ids in hexadecimal).
 
         Raises:
-            ParameterError: the text is none of these.
+            ParameterError: the text has another format.
         """
         if text.startswith("/"):
             return cls(device=text)
@@ -161,7 +161,7 @@ class PortAddress:
         return f"usb:{self.vendor:04x}:{self.product:04x}{tail}"
 
     def find(self) -> str | None:
-        """Path of the device file, or None while there is none."""
+        """Return the path of the device file, or None if it does not exist."""
         if self.device:
             return self.device if os.path.exists(self.device) else None
         for port in list_ports.comports():
@@ -173,7 +173,7 @@ class PortAddress:
         return None
 
     def open(self, baud: int = 9600, dtr: bool = True) -> serial.Serial:
-        """Open the port for this process alone, without blocking reads and writes.
+        """Open the port exclusively, with non-blocking reads and writes.
 
         Raises:
             LinkError: it is absent, in use or forbidden; the message contains the remedy.

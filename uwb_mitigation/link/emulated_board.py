@@ -1,6 +1,6 @@
-"""A board without hardware: plays measurements over a pseudo-terminal, with faults on demand.
+"""An emulated board: plays measurements over a pseudo-terminal, with optional transmission faults.
 
-Linux and macOS only, as pseudo-terminals are.
+Linux and macOS only, because other systems have no pseudo-terminals.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ _HEALTHY = Faults()
 EMULATED = Hello(0xE0, firmware_minor=1, firmware_name="emulated")
 
 MAX_BACKLOG_BYTES = 1 << 16
-"""What waits for a host that does not read; measurements beyond it are lost, and counted."""
+"""Size of the output queue. If the host does not read, further measurements are dropped and counted."""
 
 
 class PseudoTerminal:
-    """A port for a host, with a symbolic link to it. Not for several threads at once.
+    """A port for a host, with a symbolic link to it. Not thread-safe.
 
     Args:
         link: path of the symbolic link, kept up to date; None = no link.
 
     Attributes:
         port: path of the port for the host to open; empty while unplugged.
-        fd: the other end of the port, without blocking; None while unplugged.
+        fd: the other end of the port, non-blocking; None while unplugged.
 
     Raises:
         ParameterError: `link` is the path of a file.
@@ -55,10 +55,10 @@ class PseudoTerminal:
         self._held = -1
 
     def plug(self) -> bool:
-        """Make the port, usually under another name than before; return whether there was none.
+        """Create the port, usually with a new name; return False if it already exists.
 
         Raises:
-            ParameterError: the link cannot be made.
+            ParameterError: the link cannot be created.
         """
         if self.fd is not None:
             return False
@@ -78,7 +78,7 @@ class PseudoTerminal:
         return True
 
     def unplug(self) -> bool:
-        """Remove the port, as if the cable were pulled; return whether there was one."""
+        """Remove the port, as if the cable were pulled; return False if there is no port."""
         if self.fd is None:
             return False
         for fd in (self.fd, self._held):
@@ -90,38 +90,38 @@ class PseudoTerminal:
 
     def read(self) -> bytes:
         """Return what the host has sent."""
-        # A pseudo-terminal reports EIO while nobody has its other end open.
+        # A pseudo-terminal reports EIO while its other end is closed.
         with contextlib.suppress(OSError):
             return b"" if self.fd is None else os.read(self.fd, _READ_BYTES)
         return b""
 
     def write(self, data: bytearray) -> None:
-        """Send what the host takes at the moment, and remove it from `data`."""
+        """Write as much of `data` as the port accepts, and remove it from `data`."""
         with contextlib.suppress(OSError):
             if self.fd is not None:
                 del data[: os.write(self.fd, data)]
 
 
 class EmulatedBoard:
-    """Opens a pseudo-terminal and behaves there as a board that plays `source` over and over.
+    """A board on a pseudo-terminal that plays `source` in a loop.
 
-    Measurements keep their ids, sequence and device time; what they were stamped with is replaced by
-    the time of playing. The methods may be called from any thread.
+    Measurements keep their ids, sequence and device time; their stamps are replaced by the time of playback.
+    The methods may be called from any thread.
 
     Args:
-        source: what the board measures, iterated over and over; None = it never measures.
+        source: measurements, played in a loop; None = no measurements.
         rate_hz: measurements per second.
         identity, corrector, mode: see `Board`.
-        faults: what goes wrong all the time.
+        faults: transmission faults, applied to all data.
         link: path of a symbolic link to the port, kept up to date; None = no link.
-        seed: of everything random.
+        seed: of all random numbers.
 
     Raises:
-        ParameterError: the rate is not finite and positive, or `link` names what is no symbolic link.
-        RecordingError: the source holds no measurement that can be read.
+        ParameterError: the rate is not finite and positive, or `link` is an existing file that is no symbolic link.
+        RecordingError: the source contains no readable measurement.
 
     Attributes:
-        failure: why playing ended early; None while all is well.
+        failure: error that ended the playback; None if there was no error.
     """
 
     def __init__(
@@ -143,7 +143,7 @@ class EmulatedBoard:
         self.sent_measurements = 0
         self._measuring = True
         self._source = source
-        # Before there is a port: what holds nothing is told to who asks for the board.
+        # Read the source before the port exists: the caller gets the error of an empty source.
         records = _endless(source)
         first = [] if source is None else [next(records)]
         self._records: Iterator[RangeMeasurement] = itertools.chain(first, records)
@@ -167,13 +167,13 @@ class EmulatedBoard:
         return self._terminal.port
 
     def plug(self) -> None:
-        """Plug the board in, usually under another name than before: it boots."""
+        """Plug the board in, usually with a new port name; it boots."""
         with self._lock:
             if self._terminal.plug():
                 self.reset()
 
     def unplug(self) -> None:
-        """Pull the cable: the port is gone, and the board without power."""
+        """Pull the cable: remove the port and power off the board."""
         with self._lock:
             self._terminal.unplug()
 
@@ -183,7 +183,7 @@ class EmulatedBoard:
             self._boots += 1
             self._booted_ns = time.monotonic_ns()
             self._board = self._boot()
-            # What the firmware had not yet sent is lost, in the middle of a frame or not.
+            # Unsent bytes of the firmware are lost, also those of a partly sent frame.
             self._backlog.clear()
             self._transmit(self._board.hello(0))
 
@@ -191,7 +191,7 @@ class EmulatedBoard:
         return Board(self._identity, self._corrector, mode=self._mode, boot_id=self._boots)
 
     def pause(self) -> None:
-        """Measure nothing until `resume`; all else goes on."""
+        """Stop measuring until `resume`; the link continues."""
         self._measuring = False
 
     def resume(self) -> None:
@@ -199,7 +199,7 @@ class EmulatedBoard:
         self._measuring = True
 
     def close(self) -> None:
-        """Unplug, and end the thread; may be called twice."""
+        """Unplug the board and stop the thread; may be called twice."""
         self._stop.set()
         self._thread.join()
         self.unplug()
@@ -219,7 +219,7 @@ class EmulatedBoard:
                 if plugged and self._measuring and now >= due:
                     self._measure()
             if now >= due:
-                # After a pause the board does not make up for what it missed.
+                # After a pause the board does not send the missed measurements.
                 due = max(due + self._period_s, now - 0.1)
             if plugged:
                 self._exchange(min(max(due - time.monotonic(), 0.0), 0.02))
@@ -237,7 +237,7 @@ class EmulatedBoard:
                 self._transmit(self._board.measure(measurement, self._uptime_us()))
                 self.sent_measurements += 1
         except UwbMitigationError as error:
-            # A recording that ends in damage, or a measurement that no frame holds.
+            # The end of the recording is damaged, or a measurement does not fit into a frame.
             self.failure = error
             self._records = iter(())
 
@@ -254,7 +254,7 @@ class EmulatedBoard:
         except (OSError, ValueError):
             return
         with self._lock:
-            # While this waited, the cable may have been pulled, and plugged again.
+            # During the wait, the cable may have been unplugged and plugged in again.
             if self._terminal.fd != controller:
                 return
             if readable:

@@ -1,4 +1,4 @@
-"""What a `BoardSession` tells its owner: states, events, counts."""
+"""States, events and counts of a `BoardSession`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from uwb_mitigation.measurement import RangeMeasurement
 
 
 class LinkState(enum.Enum):
-    """Where the session stands."""
+    """State of the session."""
 
     CONNECTING = "waiting for the board's HELLO"
     READY = "connected"
@@ -31,35 +31,35 @@ class Loss(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class Connected:
-    """The board has introduced itself; measurements follow."""
+    """The board has sent its HELLO; measurements follow."""
 
     hello: Hello
 
 
 @dataclass(frozen=True, slots=True)
 class Disconnected:
-    """Nothing is delivered until the next `Connected`."""
+    """The connection was lost. No data is delivered until the next `Connected`."""
 
     loss: Loss
 
 
 @dataclass(frozen=True, slots=True)
 class VersionMismatch:
-    """The board speaks another version of the protocol: nothing of it is delivered."""
+    """The board uses another protocol version; its data is not delivered."""
 
     version: int
 
 
 @dataclass(frozen=True, slots=True)
 class ModeChanged:
-    """The board has confirmed the mode that was asked for."""
+    """The board has confirmed the requested mode."""
 
     mode: Mode
 
 
 @dataclass(frozen=True, slots=True)
 class ModeRefused:
-    """The board answered a request for `wanted` by staying in `mode`."""
+    """The board was requested to use the mode `wanted` but stays in `mode`."""
 
     wanted: Mode
     mode: Mode
@@ -67,14 +67,14 @@ class ModeRefused:
 
 @dataclass(frozen=True, slots=True)
 class RadioRefused:
-    """The board does not use the settings of the radio that were asked for; `text` says why."""
+    """The board does not use the requested radio settings; `text` is the reason."""
 
     text: str
 
 
 @dataclass(frozen=True, slots=True)
 class OffsetsRefused:
-    """The board does not use the offsets that were asked for; `text` says why. Its corrections are not delivered."""
+    """The board does not use the requested offsets; `text` is the reason. Its corrections are not delivered."""
 
     text: str
 
@@ -98,19 +98,19 @@ Event = (
 
 @dataclass(slots=True)
 class SessionCounts:
-    """Frames that arrived intact and were not delivered, and frames that did not arrive.
+    """Counts of intact frames that were not delivered, and of lost frames.
 
     Attributes:
-        lost: missing in the board's numbering.
-        stale: numbered at or before one that was already received.
-        withheld: while not connected.
-        unknown_type: of types that this version does not know, {type: count}.
-        malformed: of a known type, but with impossible contents.
+        lost: missing sequence numbers.
+        stale: sequence number not above that of a frame already received.
+        withheld: received while not connected.
+        unknown_type: of types unknown to this version, {type: count}.
+        malformed: of a known type, but with invalid contents.
         wrong_model: corrections by another model than the expected one.
-        wrong_offsets: corrections that are not known to hold the offsets asked for.
-        unasked: answers to nothing that was asked.
-        unsent: requests dropped because what is to be sent piled up.
-        connections: HELLOs that began a connection.
+        wrong_offsets: corrections before the board confirmed the requested offsets.
+        unasked: unsolicited answers.
+        unsent: requests dropped because the output queue was full.
+        connections: HELLOs that started a connection.
     """
 
     lost: int = 0

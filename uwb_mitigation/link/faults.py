@@ -1,4 +1,4 @@
-"""A channel that damages bytes, seeded. No I/O."""
+"""A channel that damages bytes, with a seeded generator. No I/O."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from uwb_mitigation.errors import ParameterError
 
 @dataclass(frozen=True, slots=True)
 class Faults:
-    """Probabilities of what goes wrong on the way: per byte, and for all that is sent at once.
+    """Probabilities of transmission faults, per byte and per block of data sent together.
 
     Attributes:
-        flip: that one of its bits arrives inverted.
-        drop: that it does not arrive.
-        insert: that a random byte arrives before it.
-        lose, duplicate: that what is sent at once is lost, or arrives twice.
+        flip: one bit of the byte is inverted.
+        drop: the byte is lost.
+        insert: a random byte is inserted before the byte.
+        lose, duplicate: the block is lost, or arrives twice.
 
     Raises:
         ParameterError: a probability is outside 0 to 1.
@@ -38,12 +38,12 @@ class Faults:
 
 @dataclass(frozen=True, slots=True)
 class Damaged:
-    """What arrives, and where in the bytes sent it was damaged.
+    """Received bytes, and the positions of the damage in the sent bytes.
 
     Attributes:
-        data: the bytes that arrive.
+        data: the received bytes.
         changed: sorted positions of bytes that were flipped or dropped.
-        inserted: sorted positions of bytes that something was inserted before.
+        inserted: sorted positions of bytes before which a byte was inserted.
     """
 
     data: bytes
@@ -61,7 +61,7 @@ def damage(data: bytes, faults: Faults, random: np.random.Generator) -> Damaged:
 
     received = sent.copy()
     received[flips] ^= np.uint8(1) << random.integers(0, 8, len(flips), dtype=np.uint8)
-    # An insertion at i lands before byte i: positions shift by the bytes dropped before it.
+    # An insertion at i goes before byte i: subtract the number of bytes dropped before it.
     kept_before = np.cumsum(~dropped) - ~dropped
     received = np.insert(
         received[~dropped], kept_before[inserted], random.integers(0, 256, len(inserted), dtype=np.uint8)

@@ -1,7 +1,7 @@
-"""Frames to bytes and back: COBS between zero delimiters, a fixed header, a CRC-32.
+"""Frame encoder and decoder: COBS between zero delimiters, a fixed header, a CRC-32.
 
-The decoder takes a stream cut anywhere, keeps at most one frame of it, and starts afresh at the next
-delimiter after damage. What a payload means is for `messages`.
+The decoder accepts chunks of any size, buffers at most one frame, and resynchronises at the next
+delimiter after damage. `messages` decodes the payloads.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ DELIMITER = b"\0"
 # The CRC-32 of any message followed by its own CRC, little-endian, is this constant.
 _CRC_RESIDUE = 0x2144DF1C
 
-# Bounds what splitting a flood of delimiters takes in memory.
+# Limits the memory for splitting data that consists mainly of delimiters.
 _SLICE_BYTES = 1 << 16
 
 _MIN_FRAME_BYTES = HEADER_BYTES + CRC_BYTES
@@ -48,17 +48,17 @@ class Frame(NamedTuple):
 
 @dataclass(slots=True)
 class DecoderCounts:
-    """What became of the bytes that a decoder was fed.
+    """Counts of the data that a decoder received.
 
     Attributes:
         frames: intact frames delivered.
-        bad_cobs: stretches between delimiters that are not COBS.
-        bad_length: COBS, but shorter than header and CRC.
-        bad_crc: of a frame's length, but damaged.
-        oversize: stretches longer than the longest frame.
+        bad_cobs: segments between delimiters that are not valid COBS.
+        bad_length: valid COBS, but shorter than header and CRC.
+        bad_crc: valid length, but wrong CRC.
+        oversize: segments longer than the longest frame.
         foreign_versions: intact frames of other protocol versions, {version: count}.
-        last_foreign_version: the last one of them; None = there was none.
-        bytes_received: all bytes fed.
+        last_foreign_version: version of the last of these frames; None = not yet received.
+        bytes_received: number of all bytes.
     """
 
     frames: int = 0
@@ -72,15 +72,15 @@ class DecoderCounts:
 
     @property
     def corrupt(self) -> int:
-        """Stretches that were no intact frame of any version."""
+        """Number of segments that are not an intact frame of any version."""
         return self.bad_cobs + self.bad_length + self.bad_crc + self.oversize
 
 
 def encode_frame(frame: Frame, version: int = PROTOCOL_VERSION) -> bytes:
-    """The frame as it goes on the wire, with a delimiter before and after.
+    """Return the encoded frame, with a delimiter before and after it.
 
-    The leading one closes whatever noise, boot text or half a frame lies before it, so that a frame
-    is lost only if one of its own bytes is.
+    The leading delimiter terminates preceding noise, boot text or partial frames, so that a frame is lost
+    only if one of its own bytes is damaged.
 
     Raises:
         ParameterError: the payload is longer than `MAX_PAYLOAD_BYTES`.
@@ -94,10 +94,10 @@ def encode_frame(frame: Frame, version: int = PROTOCOL_VERSION) -> bytes:
 
 
 class FrameEncoder:
-    """Numbers and encodes the frames of one sender, from its start.
+    """Numbers and encodes the frames of one sender.
 
     Attributes:
-        sequence: of the next frame.
+        sequence: sequence number of the next frame.
     """
 
     def __init__(self, version: int = PROTOCOL_VERSION) -> None:
@@ -105,16 +105,16 @@ class FrameEncoder:
         self._version = version
 
     def encode(self, kind: int, payload: bytes, *, flags: int = 0, time_us: int = 0) -> bytes:
-        """The next frame on the wire; see `encode_frame`."""
+        """Return the next frame, encoded; see `encode_frame`."""
         wire = encode_frame(Frame(kind, flags, self.sequence, time_us, payload), self._version)
         self.sequence = (self.sequence + 1) % (1 << 32)
         return wire
 
 
 class FrameDecoder:
-    """Turns a byte stream, in chunks of any size, into the intact frames in it.
+    """Decodes the intact frames in a byte stream, which arrives in chunks of any size.
 
-    Raises nothing on any input; what it drops is counted in `counts`. Between calls it holds at most
+    Never raises; `counts` contains the number of dropped frames. Between calls it buffers at most
     `MAX_ENCODED_BYTES` bytes.
     """
 
@@ -124,14 +124,14 @@ class FrameDecoder:
         self._overrun = False
 
     def feed(self, data: bytes) -> list[Frame]:
-        """The frames that `data` completes, in order."""
+        """Return the frames that `data` completes, in order."""
         frames: list[Frame] = []
         for start in range(0, len(data), _SLICE_BYTES):
             self._feed_slice(data[start : start + _SLICE_BYTES], frames)
         return frames
 
     def reset(self) -> None:
-        """Forget a half-received frame, as when the port was opened anew; counts stay."""
+        """Discard a partly received frame, for example after the port was reopened; keep the counts."""
         self._tail = b""
         self._overrun = False
 
@@ -140,7 +140,7 @@ class FrameDecoder:
         counts.bytes_received += len(data)
         stretches = data.split(DELIMITER)
         if self._overrun:
-            # The rest of a stretch that is already counted as oversize.
+            # The rest of a segment that is already counted as oversize.
             if len(stretches) == 1:
                 return
             stretches[0] = b""

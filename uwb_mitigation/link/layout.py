@@ -1,9 +1,8 @@
-"""The wire protocol as one table: frame header, message types, fields, limits.
+"""Tables of the wire protocol: frame header, message types, fields, limits.
 
-`messages` encodes and decodes from this table, and `docs/generated.py` renders it as the protocol's page and as the C
-header `firmware/src/uwb_protocol.h`. All integers and floats are little-endian; every field is at a multiple of its
-own size and every fixed part is a multiple of 8 bytes long, so that a microcontroller can read a decoded frame in
-place.
+`messages` encodes and decodes with these tables; `docs/generated.py` generates the protocol's page and the C header
+`firmware/src/uwb_protocol.h` from them. All integers and floats are little-endian. Every field is aligned to its own
+size and every fixed part is a multiple of 8 bytes long, so that a microcontroller can read a decoded frame in place.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from typing import Any
 from uwb_mitigation.measurement import DEVICE_TIME_WRAP, Encoding, Status
 
 PROTOCOL_VERSION = 1
-"""First byte of every frame. Its place, and that of the CRC, are the same in all versions."""
+"""First byte of every frame. Its position and that of the CRC are the same in all versions."""
 
 CRC_BYTES = 4
 """The CRC-32 of IEEE 802.3 (as zlib computes it) over header and payload, last in the frame."""
@@ -27,7 +26,7 @@ MAX_SAMPLES = 2032
 """int16 values of a RANGE_CIR: 1016 complex samples, the accumulator's length at 64 MHz PRF."""
 
 MAX_PAYLOAD_BYTES = 4224
-"""Ceiling of a payload: the largest RANGE_CIR, and 88 bytes for the fields of later revisions."""
+"""Maximum size of a payload: the largest RANGE_CIR, and 88 bytes for fields of later revisions."""
 
 
 class MessageType(enum.IntEnum):
@@ -113,11 +112,11 @@ class Field:
     """One field of a layout.
 
     Attributes:
-        name: in the protocol and in C.
-        code: of `struct`; reserved bytes are `nx`.
-        meaning: with the unit.
-        attribute: of the message, or of the object in it, such as a CIR; empty = `name`.
-        kind: converts the decoded number, such as an enumeration; raises ValueError for invalid numbers.
+        name: name in the protocol and in C.
+        code: format of `struct`; reserved bytes are `nx`.
+        meaning: description, with the unit.
+        attribute: attribute of the message or of an object in it, such as a CIR; empty = `name`.
+        kind: converter of the decoded number, such as an enumeration; raises ValueError for invalid numbers.
         computed: the field describes the tail (a length or a position) and is no attribute.
     """
 
@@ -130,33 +129,33 @@ class Field:
 
     @property
     def is_text(self) -> bool:
-        """Whether it is UTF-8 of fixed length, filled up with zeros."""
+        """Whether the field is UTF-8 of fixed length, padded with zeros."""
         return self.code.endswith("s")
 
 
 class Layout:
-    """The fixed part of a header or payload, and what may follow it.
+    """The fixed part of a header or payload, and its optional tail.
 
     Args:
         name: as in `MessageType`, or HEADER.
         fields: in the order of their bytes.
-        tail: what the bytes after the fixed part are; empty = nothing.
+        tail: description of the bytes after the fixed part; empty = no tail.
     """
 
     def __init__(self, name: str, *fields: Field, tail: str = "") -> None:
         self.name, self.fields, self.tail = name, fields, tail
 
     def packing(self) -> struct.Struct:
-        """The fixed part as a `struct.Struct`; reserved bytes take no value."""
+        """Return the fixed part as a `struct.Struct`; reserved bytes have no value."""
         return struct.Struct("<" + "".join(field.code for field in self.fields))
 
     @property
     def used(self) -> tuple[Field, ...]:
-        """The fields without reserved bytes: those that `packing` takes values for."""
+        """The fields without reserved bytes: those with a value in `packing`."""
         return tuple(field for field in self.fields if not field.code.endswith("x"))
 
     def offsets(self) -> dict[str, int]:
-        """{field name: byte offset}, reserved bytes left out."""
+        """Return {field name: byte offset}, without reserved bytes."""
         sizes = [struct.calcsize("<" + field.code) for field in self.fields]
         starts = itertools.accumulate(sizes, initial=0)
         return {field.name: at for field, at in zip(self.fields, starts, strict=False) if field in self.used}
@@ -203,7 +202,7 @@ _RADIO_SETTINGS = (
     Field("anchor_count", "B", "anchors that a tag is to poll; 0 = those that it finds", computed=True),
     Field("reserved_too", "4x", ""),
 )
-"""What RADIO and SET_RADIO have in common."""
+"""Common fields of RADIO and SET_RADIO."""
 
 RADIO_ANCHOR = Layout(
     "RADIO_ANCHOR",
@@ -216,7 +215,7 @@ RADIO_ANCHOR = Layout(
 """One anchor in the tail of a RADIO_STATUS."""
 
 MAX_ANCHORS = 32
-"""That a tag polls in turn."""
+"""Maximum number of anchors that a tag polls."""
 
 OFFSET = Layout(
     "OFFSET",
@@ -229,7 +228,7 @@ OFFSET = Layout(
 """One offset in the tail of a SET_OFFSETS."""
 
 MAX_OFFSETS = 64
-"""That a board keeps beside its default."""
+"""Maximum number of offsets on a board, in addition to the default."""
 
 _TABLES = (
     Layout(

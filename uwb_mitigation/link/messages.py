@@ -1,4 +1,4 @@
-"""Messages and their payloads: values, and how they are encoded and decoded after the tables of `layout`. No I/O.
+"""Messages, and the encoding and decoding of their payloads with the tables of `layout`. No I/O.
 
 A measurement is sent as `RangeMeasurement` itself. Floats are IEEE-754 binary32 on the wire, as in the ROS messages:
 a correction computed on either side of the link starts from the same bits.
@@ -30,7 +30,7 @@ from uwb_mitigation.offsets import Offsets
 class Hello:
     """Identity and state of a board; the fields of `layout.PAYLOADS[HELLO]`.
 
-    `firmware_name` has at most 16 bytes of UTF-8; more is cut off.
+    `firmware_name` has at most 16 bytes of UTF-8; longer names are truncated.
     """
 
     board_id: int = 0
@@ -47,7 +47,7 @@ class Hello:
 
     @property
     def firmware_version(self) -> str:
-        """As `major.minor.patch`."""
+        """Firmware version as `major.minor.patch`."""
         return f"{self.firmware_major}.{self.firmware_minor}.{self.firmware_patch}"
 
 
@@ -72,7 +72,7 @@ class Correction:
 
 @dataclass(frozen=True, slots=True)
 class Log:
-    """A line of text for a person."""
+    """A log message of the board."""
 
     level: LogLevel
     text: str
@@ -80,9 +80,9 @@ class Log:
 
 @dataclass(frozen=True, slots=True)
 class BoardStatus:
-    """Sign of life and counts since the board's start; the fields of `layout.PAYLOADS[STATUS]`.
+    """Heartbeat and counts since the board's start; the fields of `layout.PAYLOADS[STATUS]`.
 
-    `temperature_c` is NaN where the board measures none.
+    `temperature_c` is NaN if the board does not measure it.
     """
 
     frames_received: int
@@ -106,10 +106,10 @@ class Radio:
     """The settings of a board's radio.
 
     Attributes:
-        settings: in force, or about to be; includes the chip's own values once the chip has started.
-        request_sequence: of the host's frame that this answers.
+        settings: active settings, or those that become active next; includes the chip's own values once the chip has started.
+        request_sequence: sequence number of the host's frame that this answers.
         accepted: False if the requested settings are refused.
-        text: why they are refused.
+        text: reason of the refusal.
     """
 
     settings: RadioSettings
@@ -134,7 +134,7 @@ class GetInfo:
 
 @dataclass(frozen=True, slots=True)
 class SetMode:
-    """Requests a mode; the board answers with a HELLO that contains the mode then in force."""
+    """Requests a mode; the board answers with a HELLO that contains the active mode."""
 
     mode: Mode
 
@@ -214,7 +214,7 @@ def decode(kind: int, payload: bytes, *, stamp_ns: int = 0) -> Message | None:
 
 
 class _Tail:
-    """What follows the fixed part: rows of equal size, then text; nothing by default.
+    """Tail after the fixed part: rows of equal size, then text; empty by default.
 
     Args:
         row: format of a row for `struct`; empty = no rows.
@@ -314,7 +314,7 @@ class _Codec:
     Args:
         kind, make: its type and class.
         inner: name and class of an attribute whose own attributes are fields of the payload.
-        tail: what follows the fixed part.
+        tail: tail after the fixed part.
 
     Attributes:
         size: bytes of the fixed part.
@@ -430,5 +430,5 @@ _by_class = {codec.make: codec for codec in _CODECS}
 
 
 def _cut_utf8(text: str, size: int) -> bytes:
-    """Return at most `size` bytes of UTF-8, without half a character at the end."""
+    """Return at most `size` bytes of UTF-8, without a partial character at the end."""
     return text.encode("utf-8", "replace")[:size].decode("utf-8", "ignore").encode()

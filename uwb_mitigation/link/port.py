@@ -1,4 +1,4 @@
-"""The serial port of a board, kept open in a thread. What the bytes mean is in `session`."""
+"""The serial port of a board, kept open by a thread. `session` decodes the bytes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from uwb_mitigation.link.session import BoardSession
 from uwb_mitigation.offsets import Offsets
 
 REOPEN_AFTER_SILENCE_NS = 10 * 10**9
-"""A port that stays open but dead, as after a suspend, works again only after it is reopened."""
+"""Timeout after which the port is reopened. After a suspend, an open port may never receive data again."""
 
 _TICK_S = 0.05
 _READ_BYTES = 1 << 16
@@ -33,11 +33,11 @@ class PortReport:
     """The state of a port and its board, for diagnostics.
 
     Attributes:
-        port: the device file in use; empty while there is none.
-        problem: what keeps the board from being connected; empty while it is.
-        hello: what the connected board says of itself.
+        port: the device file in use; empty = no port is open.
+        problem: reason why the board is not connected; empty while it is.
+        hello: HELLO of the connected board.
         clock_offset_s: host's clock minus the board's uptime.
-        clock_drift_ppm: what the host's clock gains on the board's.
+        clock_drift_ppm: drift of the host's clock relative to the board's.
         clock_uncertainty_us: standard deviation of the offset; NaN before the first round trip.
         counts: {name: count} of frames and events that were lost, and why.
     """
@@ -52,11 +52,11 @@ class PortReport:
 
 
 class BoardPort(Connection[Event]):
-    """Keeps a board connected until `close`, through unplugging, resets, silence and noise.
+    """Keeps a board connected until `close`; reconnects after unplugging, resets, timeouts and noise.
 
     Args:
         address: where the board is.
-        baud: of a real serial line; native USB ignores it.
+        baud: baud rate of a serial line; native USB ignores it.
         dtr: the level of DTR. Boards with native USB send only while it is set; on boards with a
             USB bridge, its change resets the board.
         mode, expected_model_id: see `BoardSession`.
@@ -115,7 +115,7 @@ class BoardPort(Connection[Event]):
 
     @property
     def problem(self) -> str:
-        """What keeps the board from being connected; empty while it is."""
+        """Reason why the board is not connected; empty while it is."""
         with self._lock:
             session = self._session
             if self._problem:
@@ -130,7 +130,7 @@ class BoardPort(Connection[Event]):
     def _connect(self) -> None:
         port = self._address.open(self._baud, self._dtr)
         with contextlib.suppress(OSError, ValueError, NotImplementedError):
-            # Bridges hold bytes back for 16 ms otherwise. Other ports do not know the flag.
+            # Without this flag USB bridges delay bytes by 16 ms. Other ports do not support it.
             port.set_low_latency_mode(True)
         others = ", ".join(users_of(port.port))
         connections = self._session.counts.connections
@@ -162,7 +162,7 @@ class BoardPort(Connection[Event]):
                 self._put(self._session.receive(data, now_ns, stamp_ns))
                 if self._session.silent_ns(now_ns) > REOPEN_AFTER_SILENCE_NS:
                     raise LinkError("is silent", where=str(self._address))
-                # While the port takes nothing, requests wait in the session, which bounds them.
+                # While the port accepts no bytes, requests wait in the bounded queue of the session.
                 if not outgoing:
                     outgoing += self._session.outgoing()
             if outgoing:

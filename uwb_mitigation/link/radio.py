@@ -18,32 +18,32 @@ NEVER_MS = 0xFFFFFFFF
 
 @dataclass(frozen=True, slots=True)
 class RadioSettings:
-    """What a radio is to do; both ends of a link must agree in channel, PRF, code, rate, delimiter and PAN.
+    """Settings of a radio. Both ends of a link must use the same channel, PRF, code, rate, delimiter and PAN.
 
     Attributes:
         role: tag or anchor.
         address: 64 bits; 0 = the chip's own.
-        pan: network; frames of others are refused.
+        pan: PAN id; frames of other networks are ignored.
         channel: 1 to 5, 7.
         prf_mhz: 16, 64.
         preamble: symbols; may differ between the ends.
-        preamble_code: 0 = the first that the standard has for channel and PRF.
+        preamble_code: 0 = the first code of the standard for channel and PRF.
         rate_kbps: 110, 850, 6800.
         decawave_sfd: Decawave's start-of-frame delimiter instead of the standard's.
         tx_power: register TX_POWER in smart-power format, as in the OTP memory: octets, from the lowest, for frames of
             any length, up to 500, 250 and 125 us. Below 6.8 Mbit/s the lowest octet is used for all frames. 0: the
-            calibrated value of the OTP memory, or the manual's if there is none.
+            calibrated value of the OTP memory, or the manual's if it is not programmed.
         antenna_delay: total TX + RX antenna delay in ticks; 0: the value of the OTP memory (of a TREK1000 board the one
-            for this role, channel and rate), or 2 x 16436 if there is none.
-        window: complex samples of the accumulator that come with a range, from 5 before the first path; 0 = none,
+            for this role, channel and rate), or 2 x 16436 if it is not programmed.
+        window: number of complex accumulator samples per range, from 5 before the first path; 0 = none,
             1016 or more = all.
-        anchors: addresses that a tag polls in turn; empty = those that it finds by broadcast.
-        reply_us: from the reception of ANSWER to FINAL; 0 = what the tag's bus and processor usually need, and more where
-            frames are long.
-        patience_us: how long a tag waits for an anchor's frames; 0 = as long as anchors like itself need, so too.
-        interval_us: between the beginnings of two exchanges, at least.
-        report: an anchor gives its host its ranges too.
-        bias_correction: ranges are corrected for the received power (APS011); the models were trained without.
+        anchors: addresses that a tag polls in turn; empty = anchors found by broadcast.
+        reply_us: time from the reception of ANSWER to FINAL; 0 = default for the tag's bus and processor, plus the
+            duration of long frames.
+        patience_us: timeout of a tag for an anchor's frames; 0 = default, also plus the duration of long frames.
+        interval_us: minimum time between the starts of two exchanges.
+        report: an anchor also sends its ranges to its host.
+        bias_correction: correct ranges for the received power (APS011); the models were trained without it.
     """
 
     role: Role = Role.TAG
@@ -66,7 +66,7 @@ class RadioSettings:
     bias_correction: bool = False
 
     def check(self) -> None:
-        """Raise ParameterError, naming the setting, for what no radio has."""
+        """Raise ParameterError, with the name of the setting, for an invalid value."""
         _one_of("channel", self.channel, CHANNELS)
         _one_of("prf_mhz", self.prf_mhz, PRFS_MHZ)
         _one_of("preamble", self.preamble, PREAMBLES)
@@ -79,7 +79,7 @@ class RadioSettings:
         _within("antenna_delay", self.antenna_delay, 0, 0x1FFFE)
         _within("window", self.window, 0, 0xFFFF)
         if self.reply_us:
-            # Smart power allows one frame per millisecond, at 6.8 Mbit/s only.
+            # Smart power allows one frame per millisecond; it exists at 6.8 Mbit/s only.
             _within("reply_us", self.reply_us, 1000 if self.rate_kbps == 6800 else 200, 100_000)
         if self.patience_us:
             _within("patience_us", self.patience_us, 400, 500_000)
@@ -91,7 +91,7 @@ class RadioSettings:
 
 @dataclass(frozen=True, slots=True)
 class AnchorInReach:
-    """Exchanges of a tag with one anchor; the fields of `layout.RADIO_ANCHOR`, in their order."""
+    """Exchanges of a tag with one anchor; the fields of `layout.RADIO_ANCHOR`, in the same order."""
 
     address: int
     tried: int
@@ -102,7 +102,7 @@ class AnchorInReach:
 
 @dataclass(frozen=True, slots=True)
 class RadioStatus:
-    """Counts since the board's start, and state; the fields of `layout.PAYLOADS[RADIO_STATUS]`."""
+    """State, and counts since the board's start; the fields of `layout.PAYLOADS[RADIO_STATUS]`."""
 
     tried: int = 0
     ranged: int = 0
@@ -121,7 +121,7 @@ class RadioStatus:
 
 
 def preamble_codes(channel: int, prf_mhz: int) -> range:
-    """The codes that IEEE 802.15.4 has for a channel, at 16 or 64 MHz."""
+    """Return the preamble codes of IEEE 802.15.4 for a channel and a PRF of 16 or 64 MHz."""
     if prf_mhz == 64:
         return range(17, 21) if channel in (4, 7) else range(9, 13)
     first = {1: 1, 2: 3, 3: 5, 4: 7, 5: 3, 7: 7}[channel]

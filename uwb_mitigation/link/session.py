@@ -1,7 +1,7 @@
-"""What the host has to remember of a board: handshake, mode, clock, losses. No I/O.
+"""The host's state of the link to a board: handshake, mode, clock, losses. No I/O.
 
-A `BoardSession` is handed the bytes that arrived and the time, and gives events and bytes to send; who
-owns the port calls `receive` after each read, `tick` at least ten times a second, and sends `outgoing`.
+A `BoardSession` takes received bytes and the time, and returns events and bytes to send. The owner of the
+port calls `receive` after each read, `tick` at least ten times a second, and sends `outgoing`.
 """
 
 from __future__ import annotations
@@ -46,23 +46,23 @@ from uwb_mitigation.offsets import NO_OFFSETS, Offsets
 
 _MS = 10**6
 REQUEST_INTERVAL_NS = 500 * _MS
-"""Between two tries of a request that is not answered."""
+"""Interval between retries of an unanswered request."""
 
 SYNC_INTERVAL_NS = 1000 * _MS
-"""Between two round trips for the clock, more or less: an even pace could beat with the board's work."""
+"""Mean interval between time synchronisations. It is varied to avoid beats with the board's own period."""
 
 FIRST_SYNC_INTERVAL_NS = 47 * _MS
 FIRST_SYNCS = 8
-"""Round trips in quick succession after a HELLO, until the clock stands."""
+"""Number of round trips in quick succession after a HELLO, for a first clock estimate."""
 
 SILENCE_NS = 3000 * _MS
-"""A board says something at least once a second; after this long without it is taken for gone."""
+"""Timeout of the link. A board sends at least one frame per second."""
 
 MAX_GAP = 1 << 20
-"""More frames missing at once than a link can carry in any silence: the numbers are those of another start."""
+"""Largest plausible gap in sequence numbers. A larger gap means that the board was restarted."""
 
 RADIO_TRIES = 6
-"""A board that has not answered so many wishes for its radio, or for offsets, does not know them."""
+"""Number of requests for radio settings or offsets after which an unanswered request counts as unsupported."""
 
 _MAX_STALE = 3
 _MAX_AWAITED = 1024
@@ -79,7 +79,7 @@ class _Request:
     """A request that is repeated until the board answers it.
 
     Args:
-        unanswered: the problem if the board answers none of `RADIO_TRIES` requests; empty = repeat for ever.
+        unanswered: the problem if the board answers none of `RADIO_TRIES` requests; empty = repeat forever.
     """
 
     def __init__(self, unanswered: str = "") -> None:
@@ -90,7 +90,7 @@ class _Request:
         self.sent: dict[int, None] = {}
 
     def begin(self, message: messages.Message) -> None:
-        """Request something else: answers to earlier requests no longer count."""
+        """Start a new request; answers to earlier requests are ignored."""
         self.repeat(message)
         self.sent.clear()
 
@@ -110,21 +110,21 @@ class _Request:
 class BoardSession:
     """The host's side of the protocol with one board.
 
-    Two clocks are handed in: `now_ns` is steady and measures intervals; `stamp_ns` is the node's clock,
-    which the stamps of measurements are on. Both are to be read just after the bytes were.
+    There are two clocks: `now_ns` is monotonic and measures intervals; `stamp_ns` is the node's clock, used
+    for the stamps of measurements. Read both clocks immediately after the bytes.
 
     Args:
-        mode: what the board is to send; None leaves that to the board.
-        expected_model_id: identity of the model that the board should hold; corrections by another are
+        mode: mode to request; None = do not change the board's mode.
+        expected_model_id: identity of the expected model on the board; corrections by other models are
             counted and not delivered. None accepts any.
 
     Attributes:
-        state: where the session stands.
-        hello: what the board last said of itself; None while not connected.
-        radio: what it last said of its radio; None while not connected, or where it says nothing.
-        foreign_version: with WRONG_VERSION, the version that the board speaks.
-        counts: of frames; those of damaged bytes are in `decoder_counts`.
-        clock: the board's clock on the node's.
+        state: state of the session.
+        hello: last HELLO of the board; None while not connected.
+        radio: last RADIO of the board; None while not connected or if the board has sent none.
+        foreign_version: with WRONG_VERSION, the protocol version of the board.
+        counts: of frames; `decoder_counts` contains those of damaged bytes.
+        clock: estimate of the board's clock relative to the node's.
     """
 
     def __init__(self, *, mode: Mode | None = None, expected_model_id: int | None = None) -> None:
@@ -159,7 +159,7 @@ class BoardSession:
 
     @property
     def decoder_counts(self) -> DecoderCounts:
-        """What became of the bytes received."""
+        """Decoder counts of the received bytes."""
         return self._decoder.counts
 
     def totals(self) -> dict[str, int]:
@@ -174,7 +174,7 @@ class BoardSession:
 
     @property
     def model_matches(self) -> bool:
-        """False if the connected board holds another model than the expected one."""
+        """False if the connected board has another model than the expected one."""
         return (
             self.hello is None
             or self._expected_model_id is None
@@ -182,18 +182,18 @@ class BoardSession:
         )
 
     def opened(self, now_ns: int) -> list[Event]:
-        """The port was opened: begin the handshake."""
+        """Start the handshake after the port was opened."""
         return self.closed(now_ns)
 
     def closed(self, now_ns: int) -> list[Event]:
-        """The port was lost or closed: what was half received or not yet sent is void."""
+        """Discard partly received and unsent bytes after the port was lost or closed."""
         self._decoder.reset()
         self._outgoing.clear()
         self._heard_ns = now_ns
         return self._disconnect(Loss.CLOSED, now_ns)
 
     def silent_ns(self, now_ns: int) -> int:
-        """How long nothing intact has been received."""
+        """Time since the last intact frame was received."""
         return now_ns - self._heard_ns
 
     def set_mode(self, mode: Mode) -> None:
@@ -223,13 +223,13 @@ class BoardSession:
         self._next_request_ns = 0
 
     def outgoing(self) -> bytes:
-        """Take what is to be sent; to be called, and its bytes sent, right after `receive` and `tick`."""
+        """Return the bytes to send and clear the queue. Call it and send the bytes right after `receive` and `tick`."""
         data = bytes(self._outgoing)
         self._outgoing.clear()
         return data
 
     def receive(self, data: bytes, now_ns: int, stamp_ns: int) -> list[Event]:
-        """What the bytes that just arrived tell, in order. Raises nothing on any bytes."""
+        """Return the events in the received bytes, in order. Never raises; invalid bytes are counted."""
         events: list[Event] = []
         frames = self._decoder.feed(data)
         if frames:
@@ -240,7 +240,7 @@ class BoardSession:
         return events + self.tick(now_ns, stamp_ns)
 
     def tick(self, now_ns: int, stamp_ns: int) -> list[Event]:
-        """Let time pass: repeat requests, keep the clock, notice silence."""
+        """Repeat requests, synchronise the clock, and check for a timeout."""
         events: list[Event] = []
         if self.state is LinkState.READY and self.silent_ns(now_ns) > SILENCE_NS:
             events += self._disconnect(Loss.SILENT, now_ns)
@@ -291,7 +291,7 @@ class BoardSession:
             self._send(*messages.encode(GetRadio()))
         if isinstance(message, RangeMeasurement | Log | BoardStatus | RadioStatus):
             return [message]
-        # The host's own types are as strange from a board as those that nobody knows.
+        # A board never sends the types of the host: count them as unknown.
         self.counts.unknown_type[frame.type] += 1
         return []
 
@@ -337,7 +337,7 @@ class BoardSession:
         return message.offsets if isinstance(message, SetOffsets) else NO_OFFSETS
 
     def _ask(self, request: _Request) -> bool:
-        """Send a pending request; return whether it is given up, as it was never answered."""
+        """Send a pending request; return True if it was given up after too many unanswered tries."""
         if not request.pending or request.message is None:
             return False
         request.tries += 1
@@ -371,7 +371,7 @@ class BoardSession:
             self.counts.wrong_offsets += 1
             return []
         if answer:
-            # This host asks no board to correct for it.
+            # This host never requests corrections from a board.
             self.counts.unasked += 1
             return []
         return [correction]
@@ -401,7 +401,7 @@ class BoardSession:
             return []
         self._foreign_frames = seen
         version = counts.last_foreign_version
-        # A connected board of the right version may be preceded in the buffers by what ran before it.
+        # The buffers may still contain frames of firmware that ran before the connected board was restarted.
         if self.state is LinkState.READY or version is None:
             return []
         self._heard_ns = now_ns
@@ -434,7 +434,7 @@ class BoardSession:
             self._next_sync_ns = now_ns + round(SYNC_INTERVAL_NS * (0.7 + self._syncs * _GOLDEN % 0.6))
 
     def _send(self, kind: MessageType, payload: bytes) -> int | None:
-        """Queue a frame; its sequence number, or None if too much waits already."""
+        """Queue a frame; return its sequence number, or None if the queue is full."""
         if len(self._outgoing) + len(payload) > _MAX_OUTGOING_BYTES:
             self.counts.unsent += 1
             return None
@@ -444,7 +444,7 @@ class BoardSession:
 
 
 def _remember(memory: dict[_Key, _Value], key: _Key, value: _Value) -> None:
-    """Add to a memory of bounded size, which forgets the oldest."""
+    """Add an entry to a dictionary of bounded size; the oldest entry is dropped."""
     memory[key] = value
     if len(memory) > _MAX_AWAITED:
         del memory[next(iter(memory))]
