@@ -1,1 +1,1 @@
-"""Recorded bags to corrected bags: which, how one is made, and how many are made at once. No output to people here."""
+"""Correct recorded bags: selection of bags, processing of one bag, and parallel processing. Nothing here prints."""

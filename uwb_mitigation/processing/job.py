@@ -1,7 +1,7 @@
-"""One bag in, one corrected bag out.
+"""Process one bag into one corrected bag.
 
-Every message is copied as it is; behind each raw range goes what the mitigation makes of it, with the same
-log time. The bytes are those that correcting one by one would give.
+Every message is copied unchanged. Each raw range is followed by its corrected range with the same log time. The output is
+byte-identical to that of correcting the ranges one by one.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.offsets import NO_OFFSETS, Offsets
 
 BATCH = 256
-"""Messages taken together: enough to vectorise, little enough that the network's inputs stay in cache."""
+"""Messages per batch: large enough for vectorisation, small enough for the network's inputs to fit into the cache."""
 
 Report = Callable[[int, int], None]
-"""Called with (messages done, messages in all, as the bag's index says)."""
+"""Progress callback: (processed messages, total messages according to the bag's index)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """What to make of which bag.
+    """Input, output and settings of processing one bag.
 
     Attributes:
         source: an MCAP file or rosbag2 folder.
-        output: an MCAP file or, without `.mcap`, a rosbag2 folder.
-        model: the bundle to correct with.
-        force: replace `output` if it is there.
-        offsets: of the radios.
+        output: an MCAP file if it ends in `.mcap`, otherwise a rosbag2 folder.
+        model: the bundle.
+        force: replace an existing `output`.
+        offsets: offsets of the radios.
     """
 
     source: Path
@@ -52,17 +52,17 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What became of a job.
+    """The result of a job.
 
     Attributes:
         job: the job.
         messages: messages read.
-        ranges: raw ranges that were corrected or passed through.
+        ranges: the number of raw ranges, corrected or passed through.
         statuses: corrected ranges by status, {name: count}.
-        replaced: corrected ranges of the input, left out for the new ones.
-        skipped: oddities, {kind: count}.
+        replaced: corrected ranges of the input, which are not copied.
+        skipped: warnings, {kind: count}.
         seconds: wall time of reading, correcting and writing.
-        error: why there is no output or, after damage, why it is not the whole bag; None = success.
+        error: why the output is missing or (damaged input) incomplete; None = success.
         written: whether there is an output.
     """
 
@@ -78,7 +78,7 @@ class Outcome:
 
 
 def attempt(job: Job, report: Report | None = None) -> Outcome:
-    """`process_bag`, with what prevents it as the outcome's error: one bag must not stop the rest."""
+    """Run `process_bag` and return its errors in the outcome, so that one bag does not stop the others."""
     try:
         return process_bag(job, report)
     except UwbMitigationError as error:
@@ -95,15 +95,15 @@ def attempt(job: Job, report: Report | None = None) -> Outcome:
 
 
 def process_bag(job: Job, report: Report | None = None) -> Outcome:
-    """Do the job. Damage in the input ends the output there, and is the outcome's error.
+    """Process one bag. If the input is damaged, the output ends there and the outcome contains the error.
 
     Raises:
-        RecordingError: the input is no bag of ours or holds no raw ranges, or the output is there already
-            or cannot be written. Nothing is left of an output then.
+        RecordingError: the input is not a bag of this package or has no raw ranges, or the output exists
+            or cannot be written. A partial output is removed.
         ModelError: the model cannot be used.
     """
     mitigation = Mitigation(load_bundle(job.model), job.offsets)
-    # Once a process, and as long as thousands of ranges take: no part of a bag's own time.
+    # The model is loaded once per process and takes as long as thousands of ranges: do not count it in the bag's time.
     schemas.typestore()
     started = time.perf_counter()
     bag = BagReader(job.source)
@@ -120,7 +120,7 @@ def process_bag(job: Job, report: Report | None = None) -> Outcome:
         while True:
             batch: list[RawMessage] = []
             try:
-                # Not list(islice()): what was read before damage must stay.
+                # Not list(islice()): messages before the damage must be kept.
                 for message in islice(messages, BATCH):
                     batch.append(message)  # noqa: PERF402
             except DamagedRecordingError as error:
@@ -155,13 +155,13 @@ def process_bag(job: Job, report: Report | None = None) -> Outcome:
 
 
 class _Corrector:
-    """Writes batches of messages with the corrected ranges among them."""
+    """Writes batches of messages and inserts the corrected ranges."""
 
     def __init__(self, source: Path, mitigation: Mitigation, out: BagWriter) -> None:
         self._source = source
         self._mitigation = mitigation
         self._out = out
-        # The bag keeps its channels, so that an identity stands for one channel of one file.
+        # The bag keeps references to its channels, so that an id() identifies one channel of one file.
         self._channels: dict[int, int] = {}
         self._corrected = out.corrected_channel()
         self.statuses: Counter[str] = Counter()

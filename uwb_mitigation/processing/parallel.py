@@ -1,4 +1,4 @@
-"""Which bags to process and where each goes; several at once in processes on this machine, or on a Dask cluster."""
+"""Select bags and output paths; process bags in parallel on this machine or on a Dask cluster."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from uwb_mitigation.processing.job import Job, Outcome, attempt
 
 @dataclass(frozen=True, slots=True)
 class Planned:
-    """A bag and its output; `alone`: it is the only one."""
+    """A bag and its output; `alone`: there is no other bag."""
 
     source: Path
     output: Path
@@ -27,15 +27,14 @@ class Planned:
 
 
 def plan(sources: Sequence[Path], output: Path) -> list[Planned]:
-    """Every bag in `sources` with its output.
+    """Return every bag in `sources` with its output path.
 
-    One bag goes to `output` itself. Several, or a folder of bags, go into the folder `output`, under
-    their names and in the subfolders that they were found in. Outputs of an earlier run that lie within
-    a source folder are left out.
+    A single bag is written to `output` itself. Several bags, or a folder of bags, are written to the folder `output` with
+    their names and subfolders. Outputs of an earlier run inside a source folder are skipped.
 
     Raises:
-        RecordingError: a source is absent, or a folder without a bag.
-        ParameterError: `output` is a file where a folder is wanted, or two bags would go to one place.
+        RecordingError: a source is missing, or a folder contains no bag.
+        ParameterError: `output` is a file instead of a folder, or two bags have the same output path.
     """
     if len(sources) == 1 and _is_one_bag(sources[0]):
         return [Planned(sources[0], output, True)]
@@ -48,7 +47,7 @@ def plan(sources: Sequence[Path], output: Path) -> list[Planned]:
         if _is_one_bag(source):
             found = [(source, Path(source.resolve().name))]
         else:
-            # Of one folder its contents are mirrored, of several also their names.
+            # Mirror the contents of a single folder; with several folders, also keep their names.
             root = Path() if len(sources) == 1 else Path(source.resolve().name)
             found = [(bag, root / bag.relative_to(source)) for bag in _bags(source, output.resolve())]
             if not found:
@@ -66,7 +65,7 @@ def plan(sources: Sequence[Path], output: Path) -> list[Planned]:
 
 
 def _is_one_bag(path: Path) -> bool:
-    """Whether a path is a file, or a folder that its `metadata.yaml` describes as one bag."""
+    """Return whether a path is a file, or a folder with a `metadata.yaml` of one bag."""
     if not path.exists():
         raise RecordingError("no such file or folder", where=str(path))
     if not path.is_dir():
@@ -76,7 +75,7 @@ def _is_one_bag(path: Path) -> bool:
 
 
 def _bags(folder: Path, without: Path) -> Iterator[Path]:
-    """The bags below a folder that is no bag itself."""
+    """Return the bags below a folder that is not a bag itself."""
     for place, folders, files in os.walk(folder):
         here = Path(place)
         below = []
@@ -96,7 +95,7 @@ def _may_be_one_bag(path: Path) -> bool:
     try:
         return _is_one_bag(path)
     except RecordingError:
-        # Processing it fails in the same way, and is reported without stopping the rest.
+        # Processing this bag fails with the same error, which is reported without stopping the others.
         return True
 
 
@@ -106,9 +105,9 @@ def num_cores() -> int:
 
 
 def run_here(jobs: Sequence[Job], workers: int) -> Iterator[Outcome]:
-    """Process the bags in at most `workers` processes; yield outcomes as they are ready.
+    """Process the bags in at most `workers` processes; yield each outcome when it is ready.
 
-    If a process dies, for example because memory runs out, the remaining bags are processed one at a time, so that
+    If a process crashes, for example because memory runs out, the remaining bags are processed one at a time, so that
     only the bag that causes it fails.
     """
     unfinished = []
@@ -128,14 +127,14 @@ def run_here(jobs: Sequence[Job], workers: int) -> Iterator[Outcome]:
 
 
 def run_on_dask(jobs: Sequence[Job], address: str) -> Iterator[Outcome]:
-    """Process the bags on the Dask cluster with the scheduler at `address`; yield outcomes as they are ready.
+    """Process the bags on the Dask cluster with the scheduler at `address`; yield each outcome when it is ready.
 
-    The workers need this package, and the same paths as here. A bag that has started is finished even if the
+    The workers need this package and the same file paths. A bag that has started is finished even if the
     iterator is closed, since Dask cannot interrupt it.
 
     Raises:
         MissingDependencyError: `distributed` is not installed.
-        ParameterError: no scheduler answers.
+        ParameterError: no scheduler responds.
     """
     try:
         from distributed import Client
@@ -145,7 +144,7 @@ def run_on_dask(jobs: Sequence[Job], address: str) -> Iterator[Outcome]:
             "a scheduler needs Dask", valid="python -m pip install distributed"
         ) from error
     try:
-        # A client that fails on the address itself takes a minute to close.
+        # If the client itself tries an invalid address, closing it takes a minute.
         get_address_host(address)
         client = Client(address, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:
@@ -170,7 +169,7 @@ def _processes(workers: int) -> ProcessPoolExecutor:
 def _run(
     executor: Executor, work: Callable[[Job], Outcome], jobs: Sequence[Job]
 ) -> Iterator[tuple[Job, Outcome | None]]:
-    """Yield jobs with their outcomes as they are ready; None: a worker process died before."""
+    """Yield each job with its outcome when it is ready; None: a worker process crashed before."""
     futures = {executor.submit(work, job): job for job in jobs}
     try:
         for future in as_completed(futures):
@@ -179,7 +178,7 @@ def _run(
                 yield job, future.result()
             except BrokenProcessPool:
                 yield job, None
-            except Exception as error:  # Of the cluster or of pickling, of no common type.
+            except Exception as error:  # Errors of the cluster or of pickling have no common type.
                 reason = f"cannot be processed: {type(error).__name__}: {error}"
                 yield job, Outcome(job, error=RecordingError(reason, where=str(job.source)))
     finally:

@@ -1,4 +1,4 @@
-"""The tracks of a recording: live, smoothed, and by snapshots, each with its errors if the truth is known."""
+"""Live, smoothed and snapshot tracks of a recording, with their errors if the ground truth is known."""
 
 from __future__ import annotations
 
@@ -51,16 +51,16 @@ MIN_HEIGHT_RMSE_M = 0.1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TagTracks:
-    """The tracks of one tag, and their errors; `NO_ERRORS` where the truth is not known.
+    """The tracks of one tag and their errors; `NO_ERRORS` if the truth is unknown.
 
     Attributes:
-        recording: what they were made of.
-        live: an estimate for each range, from it and earlier ones. smoothed: ten a second, from all ranges.
+        recording: the input.
+        live: an estimate for each range, from this and earlier ranges. smoothed: ten per second, from all ranges.
         snapshot: least squares on raw ranges.
-        errors: of each of the `KINDS`.
+        errors: errors of each of the `KINDS`.
         hdop: median horizontal dilution of precision along the track.
         disagreeing: rows of anchors whose ranges contradict the track of the other anchors.
-        warnings: What makes the tracks unreliable; empty = nothing found.
+        warnings: reasons why the tracks may be unreliable; empty = none.
     """
 
     recording: TagRecording
@@ -73,7 +73,7 @@ class TagTracks:
     warnings: list[str]
 
     def as_json(self, anchors: AnchorMap) -> dict[str, object]:
-        """A tag of `track --json`; the errors of each kind of track only if the truth is known."""
+        """Return the entry of a tag in `track --json`; it contains errors only if the truth is known."""
         errors = {kind: self.errors[kind].as_json() for kind in KINDS}
         return {
             "tag_id": self.recording.tag_id,
@@ -244,9 +244,9 @@ def pooled(errors: list[TrackErrors]) -> TrackErrors:
 
 
 def write_tracks(bag: BagWriter, tracks: list[TagTracks]) -> None:
-    """Live estimates to `/uwb/odometry`, smoothed ones to `/uwb/pose_smoothed`, the truth to `/uwb/odometry_truth`.
+    """Write live estimates to `/uwb/odometry`, smoothed ones to `/uwb/pose_smoothed`, the truth to `/uwb/odometry_truth`.
 
-    Of several tags, each has topics of its own, as from the node.
+    With several tags, each tag has separate topics, like those of the node.
 
     Raises:
         RecordingError: the bag cannot be written.
@@ -282,5 +282,5 @@ def tum(track: Track) -> str:
 
 
 def tum_file(path: Path, tag_id: int, several: bool) -> Path:
-    """Where the TUM file of a tag goes: `path`, or with the tag's number in its name where there are several."""
+    """Return the path of a tag's TUM file: `path`, with the tag's number in the name if there are several tags."""
     return path.with_name(f"{path.stem}.{tag_frame(tag_id)}{path.suffix}") if several else path

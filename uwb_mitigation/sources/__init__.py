@@ -1,4 +1,4 @@
-"""Where measurements come from: recordings, radios and the simulator, behind one small interface.
+"""Sources of measurements: recordings, radios and the simulator, with a common interface.
 
-`source` defines the interface; each other module is one kind of source; `opening` picks by path.
+`source` defines the interface, each other module implements one kind of source, and `opening` selects it by path.
 """

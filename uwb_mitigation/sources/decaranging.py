@@ -31,7 +31,7 @@ MAX_ACCUMULATOR = 1016
 """Samples of the accumulator at 64 MHz PRF; 992 at 16 MHz (DW1000 user manual, section 7.2.38)."""
 
 MAX_BYTES, MAX_CSV_BYTES = 1 << 30, 1 << 20
-"""Of a decompressed log (one hour has 80 MB), and of a file of the survey."""
+"""Maximum size of a decompressed log (one hour has 80 MB), and of a file of the survey."""
 
 _TOKEN = re.compile(
     rb"(?m)^(?:"
@@ -46,7 +46,7 @@ _TOKEN = re.compile(
     rb"|(?P<error>RX E)"
     rb"|(?P<malformed>Mode: |RX |Accum Len|Anchor ToF))"
 )
-"""Everything that is used of a log; the last group that matches tells its kind."""
+"""All parts of a log that are used; the last group that matches determines the kind."""
 
 _NUMBER = re.compile(rb"[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?")
 _NO_SAMPLES: NDArray[np.int16] = np.zeros(0, np.int16)
@@ -93,7 +93,7 @@ class DecaRangingLog(Source):
     """The exchanges of one log, `.log` or `.log.xz`; a `Source`.
 
     No range is lost: if its CIR is missing or malformed, the measurement has a CIR without samples. Malformed parts are
-    counted in `skipped`. `stamp_ns` is the start time in the first line (as UTC; 0 if there is none) plus the time by the
+    counted in `skipped`. `stamp_ns` is the start time in the first line (as UTC; 0 if missing) plus the time by the
     radio's 40-bit counter since the first received frame; gaps above 17.2 s are invisible in this counter.
 
     Args:
@@ -134,7 +134,7 @@ class DecaRangingLog(Source):
             raise DamagedRecordingError(fault, where=self._after(text))
 
     def start_ns(self) -> int:
-        """Return the start time in the first line, ns since the epoch; 0 if there is none or it cannot be read."""
+        """Return the start time in the first line, ns since the epoch; 0 if it is missing or unreadable."""
         with contextlib.suppress(OSError, EOFError, lzma.LZMAError), _opened(self.path) as stream:
             return _start_ns(stream.readline(4096))
         return 0
@@ -206,7 +206,7 @@ class DecaRangingLog(Source):
         power, first = (self._number(match[name], -1000.0, 1000.0) for name in ("power", "first"))
         return Cir(
             _NO_SAMPLES,
-            # ten bits, and six after the point
+            # fixed point: ten integer and six fractional bits
             first_path_index=self._number(match["path"], 0.0, 1024 - 2**-6),
             preamble_count=int(match["preamble"]),
             noise_threshold=int(match["noise"], 16),
@@ -236,12 +236,12 @@ def _opened(path: Path) -> lzma.LZMAFile:
 
 
 def _read(path: Path) -> tuple[bytes, str]:
-    """Return the complete lines of a log, with line feeds only, and what is damaged (empty: nothing)."""
+    """Return the complete lines of a log, with line feeds only, and a description of the damage (empty: none)."""
     pieces: list[bytes] = []
     fault = ""
     try:
         with _opened(path) as stream:
-            # Small pieces, so that everything before a damage is kept.
+            # Read small blocks, so that all data before a damage is kept.
             while piece := stream.read(1 << 13):
                 pieces.append(piece)
                 if len(pieces) << 13 > MAX_BYTES:
@@ -256,7 +256,7 @@ def _read(path: Path) -> tuple[bytes, str]:
 
 
 def _start_ns(head: bytes) -> int:
-    """The start time of a first line, as UTC; 0 if there is none."""
+    """Return the start time in a log's first line, as UTC; 0 if missing."""
     match = _TOKEN.match(head)
     try:
         stated = match["start"].decode() if match is not None and match["start"] else ""

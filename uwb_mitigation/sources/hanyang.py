@@ -1,6 +1,6 @@
-"""Hanyang University's outdoor runs: one moving tag, four anchors, and the place of the tag by RTK GNSS. No CIRs.
+"""Hanyang University's outdoor runs: one moving tag, four anchors, and RTK GNSS positions of the tag. No CIRs.
 
-A folder a run (github.com/cucudasluv/UWB-dataset): `A3.csv`, `A5.csv`, ... of one anchor each, and `trajectory.csv`;
+One folder per run (github.com/cucudasluv/UWB-dataset): one file per anchor (`A3.csv`, `A5.csv`, ...) and `trajectory.csv`;
 each may be compressed with xz. The tag's antenna is 1.0 m above the trajectory's z.
 """
 
@@ -27,7 +27,7 @@ ANTENNA_M = 1.0
 """Height of the tag's antenna above the trajectory."""
 
 GNSS_LOST_M = 0.5
-"""Where the trajectory's z is further from its median, GNSS was lost: such places are no truth."""
+"""If the trajectory's z is further from its median, GNSS was lost and the positions are not ground truth."""
 
 MAX_BYTES = 64 << 20
 _ANCHOR = re.compile(r"A(\d{1,4})\.csv(\.xz)?")
@@ -39,7 +39,7 @@ _Row = tuple[int, int, float, float, float]
 
 
 def is_run(folder: Path) -> bool:
-    """Whether a folder holds such a run."""
+    """Return whether a folder contains such a run."""
     names = {entry.name for entry in folder.iterdir()}
     return bool(names & {"trajectory.csv", "trajectory.csv.xz"}) and any(map(_ANCHOR.fullmatch, names))
 
@@ -48,15 +48,15 @@ class HanyangRun(Source):
     """One run; a `Source`.
 
     Args:
-        folder: of the run.
+        folder: the folder of the run.
 
     Attributes:
-        anchors: as the files say where they stood.
-        truth: where the tag's antenna was, stretches of lost GNSS left out.
-        in_motion: pauses are not to be cut, since the tag moves on.
+        anchors: anchor positions from the files.
+        truth: positions of the tag's antenna, without segments of lost GNSS.
+        in_motion: keep pauses, because the tag moves during them.
 
     Raises:
-        RecordingError: a file is absent, too large, or of another form; names file and line.
+        RecordingError: a file is missing, too large or malformed; the message names file and line.
     """
 
     simulated = False
@@ -100,7 +100,7 @@ class HanyangRun(Source):
                 )
             power, first_path = (_number(row.get(name, "nan"), where) for name in _POWERS)
             if not math.isfinite(first_path):
-                # -inf stands for a first path that the radio did not measure.
+                # -inf: the radio did not measure the first path.
                 self._odd["first-path power that is not finite"] += 1
                 first_path = math.nan
             rows.append((stamp_ns, key, _number(row["field.distanceFromTag"], where), power, first_path))
@@ -109,7 +109,7 @@ class HanyangRun(Source):
         path = folder / "trajectory.csv"
         if not path.exists():
             path = folder / "trajectory.csv.xz"
-        # The stamps were written as floats, and have lost some 256 ns.
+        # The stamps were written as floats, with a rounding error of up to 256 ns.
         rows = [
             [_number(row[name], f"{path}: line {line}") for name in _PATH_COLUMNS]
             for line, row in read_rows(path, _PATH_COLUMNS, MAX_BYTES)
