@@ -1,4 +1,4 @@
-"""What an import does besides reading: counts, pairs, times and oddities in one pass; long pauses are cut."""
+"""Statistics of an import (counts, pairs, times, warnings) in one pass, and shortening of long pauses."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from uwb_mitigation.sources.source import Source
 _SECOND_NS = 1e9
 
 FIRST_DATE_NS = 946_684_800 * 10**9
-"""2000-01-01T00:00:00Z: stamps before it are of a clock that knows no date."""
+"""2000-01-01T00:00:00Z: earlier stamps come from a clock without a date."""
 
 
 class Inventory:
-    """What has been read so far.
+    """Statistics of the records read so far.
 
     Attributes:
         ranges: number of records.
         with_truth: number of records with a true range.
-        skipped: oddities, {kind: count}.
+        skipped: warnings, {kind: count}.
     """
 
     def __init__(self) -> None:
@@ -35,7 +35,7 @@ class Inventory:
         self._rows: dict[tuple[int, int, str], list[tuple[int, float, float]]] = {}
 
     def watch(self, source: Source) -> Iterator[Record]:
-        """Pass on the records of `source` and count them; oddities are added even if reading ends in an error."""
+        """Yield and count the records of `source`; its warnings are added even if reading ends in an error."""
         try:
             for record in source:
                 measured, truth = record.measurement, record.truth
@@ -76,20 +76,20 @@ def _pair(anchor_id: int, tag_id: int, label: str, rows: list[tuple[int, float, 
 
 
 def _mean(values: NDArray[np.float64]) -> float | None:
-    """The mean of the finite values; None if there are none."""
+    """Return the mean of the finite values; None without any."""
     finite = values[np.isfinite(values)]
     return float(finite.mean()) if len(finite) else None
 
 
 @dataclass(slots=True)
 class Pauses:
-    """Moves the stamps of records that come one after the other; ranges, ids and `device_time` stay.
+    """Shifts the stamps of consecutive records; ranges, ids and `device_time` are unchanged.
 
     Attributes:
-        longest_s: what is longer is cut to this; infinite = nothing is cut.
-        start_ns: where records without a date begin.
-        cut: how many pauses were cut.
-        cut_s: how much in all.
+        longest_s: longer pauses are shortened to this; infinite = never.
+        start_ns: first stamp of records without a date.
+        cut: number of shortened pauses.
+        cut_s: total time removed.
     """
 
     longest_s: float
@@ -104,11 +104,11 @@ class Pauses:
             raise ParameterError(f"longest pause = {self.longest_s} s", valid="0 or more; inf cuts none")
 
     def without(self, record: Record) -> Record:
-        """The record at its new time."""
+        """Return the record with its new stamp."""
         stamp_ns = record.measurement.stamp_ns
         last_ns, self._last_ns = self._last_ns, stamp_ns
         if stamp_ns < FIRST_DATE_NS and (last_ns is None or last_ns >= FIRST_DATE_NS):
-            # Behind what has a date, what has none goes on.
+            # Records without a date continue after those with one.
             start_ns = self.start_ns if last_ns is None else last_ns + self._shift_ns
             self._shift_ns = start_ns - stamp_ns
         elif last_ns is not None and stamp_ns - last_ns > self.longest_s * 1e9:

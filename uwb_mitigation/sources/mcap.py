@@ -1,6 +1,6 @@
-"""Measurements from an MCAP bag: raw ranges with their CIRs, joined with the truth where the bag holds it.
+"""Measurements from an MCAP bag: raw ranges with their CIRs, joined with the ground truth if the bag contains it.
 
-The truth is of the range, and of where the tag was (`/uwb/odometry_truth`, at the stamp of the range).
+The truth consists of the true range and of the tag's position (`/uwb/odometry_truth`, at the stamp of the range).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from uwb_mitigation.measurement import RangeMeasurement, Record, Truth
 from uwb_mitigation.sources.source import Source
 
 JOIN_WINDOW = 32
-"""How many exchanges a range and its truth may lie apart; bounds what waits in memory."""
+"""Maximum number of exchanges between a range and its truth; it limits the memory for pending ranges."""
 
 
 class McapRecording(Source):
@@ -35,14 +35,14 @@ class McapRecording(Source):
 
     Args:
         path: an MCAP file, or a folder with `metadata.yaml` or `*.mcap`.
-        topic: where the raw ranges are, of type `uwb_mitigation_msgs/msg/RangeCir`.
+        topic: topic of the raw ranges, type `uwb_mitigation_msgs/msg/RangeCir`.
 
     Attributes:
-        message_count: messages on all topics of the bag, as its own index says.
+        message_count: number of messages on all topics, from the bag's index.
 
     Raises:
-        RecordingError: the path is absent or no MCAP bag. Iterating raises it when the topic is not in
-            the bag, or when its type, schema or field layout is not what this package reads.
+        RecordingError: the path is missing or not an MCAP bag. Iterating raises it if the bag does not contain
+            the topic, or if its type, schema or field layout is not supported.
     """
 
     def __init__(self, path: Path, *, topic: str = RANGE_RAW) -> None:
@@ -77,7 +77,7 @@ class McapRecording(Source):
         self._closed = True
 
     def _join(self, bag: BagReader) -> Iterator[Record]:
-        """Pair ranges with their truths, whichever of the two comes first; in the order of the ranges."""
+        """Pair ranges with their truths, which may come before or after them; in the order of the ranges."""
         waiting: deque[_Waiting] = deque()
         by_key: dict[Key, _Waiting] = {}
         early: dict[Key, Truth] = {}
@@ -131,7 +131,7 @@ class McapRecording(Source):
             if self._closed:
                 return
             topic = message.channel.topic
-            # The bag keeps its channels, so that an identity stands for one channel of one file.
+            # The bag keeps references to its channels, so that an id() identifies one channel of one file.
             if id(message.channel) not in checked and topic != ODOMETRY_TRUTH:
                 check_channel(message.channel, types[topic], self._path)
                 checked.add(id(message.channel))
@@ -151,7 +151,7 @@ Place = tuple[float, float, float]
 
 
 class At(NamedTuple):
-    """When which tag was at a place."""
+    """Tag and stamp of a true position."""
 
     stamp_ns: int
     tag_id: int
@@ -159,7 +159,7 @@ class At(NamedTuple):
 
 @dataclass(slots=True)
 class _Waiting:
-    """A range that its truth may still reach."""
+    """A range that waits for its truth."""
 
     measurement: RangeMeasurement
     truth: Truth | None
@@ -167,7 +167,7 @@ class _Waiting:
 
 
 def _settle(at: At, place: Place, waiting: deque[_Waiting], places: dict[At, Place]) -> None:
-    """Give a place to the ranges of its tag and stamp, those that came and those that will."""
+    """Assign a true position to earlier and later ranges with the same tag and stamp."""
     for entry in waiting:
         if (entry.measurement.stamp_ns, entry.measurement.tag_id) == at:
             entry.place = place

@@ -1,4 +1,4 @@
-"""Opens a recording by its path: which kind of source it is, nobody should have to say."""
+"""Open a recording by its path; the kind of source is detected."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ _SQLITE_MAGIC = b"SQLite format 3\x00"
 
 
 def open_recording(path: Path, *, cir: Literal["final", "poll"] = "final") -> Source:
-    """The source that reads `path`, picked by what the path holds; the suffix decides only for logs.
+    """Return the source for `path`, selected by its content; only logs are recognised by their suffix.
 
     Args:
         path: a file or folder.
-        cir: of a DecaRanging exchange, which frame's CIR to take: `final` or `poll`.
+        cir: which frame's CIR of a DecaRanging exchange to use: `final` or `poll`.
 
     Raises:
-        RecordingError: there is nothing at `path`, or no source reads it.
+        RecordingError: `path` does not exist, or no source can read it.
     """
     try:
         is_bag = _is_bag(path)
@@ -52,7 +52,7 @@ def open_recording(path: Path, *, cir: Literal["final", "poll"] = "final") -> So
 
 def _is_bag(path: Path) -> bool:
     if path.is_dir():
-        # A folder of such a name may be a bag itself, but does not make one of the folder it lies in.
+        # A folder of such a name may be a bag itself, but does not make its parent folder a bag.
         names = [entry.name for entry in path.iterdir() if entry.is_file()]
         return any(name == "metadata.yaml" or name.endswith((".mcap", ".db3")) for name in names)
     if path.suffix in (".mcap", ".db3"):

@@ -45,8 +45,8 @@ class TagRecording:
 class RecordedRanges:
     """Attributes:
     tags: by their numbers.
-    strangers: ranges of anchors that are not in the map, {anchor id: count}.
-    skipped: other ranges that were left out, {why: count}.
+    strangers: number of ranges from anchors that are not in the map, {anchor id: count}.
+    skipped: other skipped ranges, {reason: count}.
     """
 
     tags: list[TagRecording]
@@ -64,8 +64,8 @@ def read_ranges(path: Path, anchors: AnchorMap, stamp_offset_s: float = 0.0) -> 
 
     Args:
         path: the bag.
-        anchors: those that ranges may come from.
-        stamp_offset_s: what to add to the stamps of the ranges (not of the truth): -0.2 where they lag by 0.2 s.
+        anchors: the map; ranges of other anchors are skipped.
+        stamp_offset_s: added to the stamps of the ranges (not of the truth): -0.2 if they are late by 0.2 s.
 
     Raises:
         RecordingError: the bag cannot be read, or has no range of an anchor in the map.

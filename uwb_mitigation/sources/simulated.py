@@ -1,8 +1,8 @@
-"""Measurements from the simulator: a robot that drives through a flat, and static placements in that flat and in
-random buildings, with boards that differ from placement to placement.
+"""Simulated measurements: a robot that drives through a flat, and static placements in that flat and in
+random buildings, with different boards for each placement.
 
-All yield the same for the same arguments, however much is consumed: every stretch of the scene draws
-from a generator of its own. Stamps begin at 0 and follow the rate; nothing waits for a clock.
+The same arguments give the same measurements, independent of how many are consumed: each segment of the scene
+has its own random generator. Stamps begin at 0 and follow the rate, not a clock.
 """
 
 from __future__ import annotations
@@ -48,11 +48,11 @@ from uwb_mitigation.sources.simulation.scene import (
 from uwb_mitigation.sources.source import Source
 
 BATCH = 256
-"""Exchanges simulated together: enough to vectorise, little enough to stay in cache."""
+"""Exchanges per batch: large enough for vectorisation, small enough for the cache."""
 
 SEGMENT_S = 2.0
 SPEED_M_PER_S = 0.5
-"""A segment is a metre of the route: clusters keep their places over it, fading does not."""
+"""A segment is a metre of the route: clusters stay the same within it, fading changes."""
 
 FIRST_TAG_ID = 101
 NOT_RECEIVED = "frame too weak to be received"
@@ -64,7 +64,7 @@ SURVEY_RATE_HZ = 20.0
 
 @dataclass(frozen=True, slots=True)
 class Exchanges:
-    """n exchanges before the radio: which, between whom, of which configuration, over which links."""
+    """n exchanges before the radio model: their numbers, ids, configurations and links."""
 
     sequence: NDArray[np.int64]
     anchor_id: NDArray[np.int64]
@@ -75,7 +75,7 @@ class Exchanges:
 
 
 class Simulated(Source):
-    """What the sources share: a `sources.source.Source` over batches of exchanges."""
+    """Common base of these sources: a `sources.source.Source` over batches of exchanges."""
 
     simulated = True
 
@@ -88,7 +88,7 @@ class Simulated(Source):
         self._radio = radio
 
     def _batches(self) -> Iterable[tuple[Exchanges, np.random.Generator]]:
-        """In the order of time, each with the generator that the radio draws from."""
+        """Yield batches in the order of time, each with the radio's random generator."""
         raise NotImplementedError
 
     def __iter__(self) -> Iterator[Record]:
@@ -101,7 +101,7 @@ class Simulated(Source):
         distance = links.distance_m
         reception = self._radio.receive(links.multipath(rng), rng, exchanges.boards)
         for i, sequence in enumerate(exchanges.sequence.tolist()):
-            # A batch is always simulated whole: what it draws must not depend on `count`.
+            # Always simulate a complete batch: its random numbers must not depend on `count`.
             if self._count and sequence >= self._count:
                 return
             if np.isnan(reception.first_path_index[i]):
@@ -128,20 +128,20 @@ class Simulated(Source):
 class SimulatedSource(Simulated):
     """Tags on a robot's route through a flat, ranging to fixed anchors in turn; a `Source`.
 
-    Each metre of the route is a configuration of its own for each pair, "simulated seed 1/tag 101/
-    anchor 3/segment 7": within it the clusters of the diffuse field stay, the fading changes.
+    Each metre of the route is a separate configuration for each pair, "simulated seed 1/tag 101/
+    anchor 3/segment 7": within it the clusters of the diffuse field stay the same and the fading changes.
 
     Args:
         seed: 0 to 2^32 - 1.
-        count: exchanges to simulate; 0 = endless. One too weak to be received yields nothing and is
+        count: exchanges to simulate; 0 = endless. An exchange below the sensitivity is not yielded but
             counted in `skipped`.
-        rate_hz: exchanges a second over all pairs, 0.1 to 100000.
+        rate_hz: exchanges per second over all pairs, 0.1 to 100000.
         tags: 1 to 64, spread evenly along the route.
         anchors: positions in m; their identities are 1, 2, ... in this order.
         plan, radio, route: the scene, the receiver, the closed route (m).
 
     Attributes:
-        anchors: where they stand; all antennas are level, at z = 0.
+        anchors: their positions; all antennas are at z = 0.
 
     Raises:
         ParameterError: an argument is out of its range.
@@ -176,7 +176,7 @@ class SimulatedSource(Simulated):
 
     @classmethod
     def with_anchors(cls, number: int, *, seed: int, count: int, rate_hz: float = 20.0) -> SimulatedSource:
-        """A drive through the default flat past 4 to 8 anchors.
+        """Return a drive through the default flat past 4 to 8 anchors.
 
         Raises:
             ParameterError: an argument is out of its range.
@@ -224,15 +224,15 @@ class SimulatedSource(Simulated):
 
 
 class SimulatedSurvey(Simulated):
-    """Independent placements at rest, many exchanges each, like a surveyed data set; a `Source`.
+    """Independent static placements with many exchanges each, like a surveyed data set; a `Source`.
 
-    Both antennas lie anywhere in the plan, 0.2 m from its border and at least `CLOSEST_M` apart. A
-    placement has one channel: its exchanges differ by noise and sampling phase alone.
+    Both antennas have random positions in the plan, 0.2 m from its border and at least `CLOSEST_M` apart. A
+    placement has one channel: its exchanges differ only in noise and sampling phase.
 
     Args:
         seed: 0 to 2^32 - 1.
         configurations: 1 to 10^7 placements. exchanges: 1 to 1000 for each.
-        rate_hz: exchanges a second, 0.1 to 100000.
+        rate_hz: exchanges per second, 0.1 to 100000.
         plan, radio: the scene, the receiver.
 
     Raises:
@@ -288,10 +288,10 @@ class SimulatedSurvey(Simulated):
 
 
 class SimulatedBuildings(Simulated):
-    """Placements at rest in random buildings, about as many in line of sight as behind obstacles; a `Source`.
+    """Static placements in random buildings, about as many LOS as NLOS; a `Source`.
 
-    A configuration is one placement: "simulated buildings seed 1/flat 12/placement 801". The range error is the
-    channel's alone: antenna delays are calibrated.
+    A configuration is one placement: "simulated buildings seed 1/flat 12/placement 801". The range error comes
+    only from the channel: antenna delays are calibrated.
 
     Args:
         seed: 0 to 2^32 - 1.

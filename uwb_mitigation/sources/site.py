@@ -12,25 +12,25 @@ from uwb_mitigation.positioning.anchors import MAX_TEXT, AnchorMap, dump_anchors
 
 @runtime_checkable
 class KnowsAnchors(Protocol):
-    """A source that knows where its anchors stood.
+    """A source with known anchor positions.
 
     Attributes:
-        anchors: all of them.
+        anchors: all anchors.
     """
 
     anchors: AnchorMap
 
 
 def anchors_file(bag: Path) -> Path:
-    """Where the anchors of a bag lie: beside it, `X.anchors.yaml` of `X.mcap`."""
+    """Return the path of a bag's anchors file: `X.anchors.yaml` in the folder of `X.mcap`."""
     return bag.with_name(bag.name.removesuffix(".mcap") + ".anchors.yaml")
 
 
 def load_anchors(path: Path) -> AnchorMap:
-    """The anchors in a file.
+    """Read an anchors file.
 
     Raises:
-        ParameterError: it cannot be read, or is not as `positioning.anchors` says.
+        ParameterError: it cannot be read, or does not have the format of `positioning.anchors`.
     """
     data = read_bounded(
         path, MAX_TEXT, ParameterError, "an anchors file, as docs/background/positioning.md shows"
@@ -43,10 +43,10 @@ def load_anchors(path: Path) -> AnchorMap:
 
 
 def save_anchors(path: Path, anchors: AnchorMap, comment: str = "", *, force: bool = False) -> None:
-    """Write an anchors file, whole or not at all.
+    """Write an anchors file atomically.
 
     Raises:
-        ParameterError: it is there and `force` is not given, or it cannot be written.
+        ParameterError: it exists and `force` is not given, or it cannot be written.
     """
     if path.exists() and not force:
         raise ParameterError("exists already", where=str(path), valid="--force replaces it")

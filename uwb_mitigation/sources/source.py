@@ -15,16 +15,15 @@ Self = TypeVar("Self", bound="Source")
 class Source(ABC):
     """Yields measurements in the order of their times; a consumer may stop at any point.
 
-    A recording can be iterated again and then yields the same. What a source leaves out, repairs or
-    finds odd is counted in `skipped` by kind while it iterates (each iteration starts the count
-    anew), so that nothing is dropped silently. Iterating raises `RecordingError` when the input is
-    not what the source reads, and `DamagedRecordingError` where readable input ends early, after
-    everything before the damage has been yielded.
+    A recording can be iterated several times with the same result. An iteration counts skipped, repaired
+    and suspicious data in `skipped` by kind (each iteration resets the counts), so that no data is dropped
+    silently. Iterating raises `RecordingError` if the input has another format, and `DamagedRecordingError` if
+    it is damaged or truncated, after yielding everything before the damage.
 
     Attributes:
-        name: what a person sees: kind and place, and the word "simulated" where it is.
-        simulated: True where no radio was involved; None = not known.
-        skipped: oddities of the current or last iteration, {kind: count}.
+        name: name for users: kind, path, and the word "simulated" if it is.
+        simulated: whether the data is simulated; None = unknown.
+        skipped: warnings of the current or last iteration, {kind: count}.
     """
 
     name: str
@@ -35,7 +34,7 @@ class Source(ABC):
     def __iter__(self) -> Iterator[Record]: ...
 
     def close(self) -> None:
-        """Release files and ports, where any are held; may be called twice, and from another thread than iterates."""
+        """Close files and ports, if any; may be called twice, and from a thread other than the iterating one."""
         return
 
     def __enter__(self: Self) -> Self:

@@ -1,4 +1,4 @@
-"""True ranges in a CSV file, for recordings that hold none: which pair stood how far apart, and when.
+"""True ranges of pairs over time in a CSV file, for recordings without ground truth.
 
 Columns `tag_id`, `anchor_id` (decimal) and `range_m`; optionally `start_s` and `stop_s`, seconds from the
 recording's first measurement (empty = from its start, to its end), `configuration` and `label`.
@@ -23,7 +23,7 @@ _NEEDED = ("tag_id", "anchor_id", "range_m")
 
 @dataclass(frozen=True, slots=True)
 class Stretch:
-    """What is true of one pair from `start_s` (included) to `stop_s` (not) of a recording."""
+    """The true range of one pair from `start_s` (inclusive) to `stop_s` (exclusive)."""
 
     tag_id: int
     anchor_id: int
@@ -33,10 +33,10 @@ class Stretch:
 
 
 def load_truth(path: Path) -> list[Stretch]:
-    """The rows of a truth table; one without a configuration's name is a configuration of its own.
+    """Read the rows of a truth table; each row without a configuration name is a separate configuration.
 
     Raises:
-        RecordingError: the file is absent, too large, or malformed; names the line.
+        RecordingError: the file is missing, too large or malformed; the message names the line.
     """
     found = [_stretch(row, path, line) for line, row in read_rows(path, _NEEDED, MAX_CSV_BYTES)]
     if not found:
@@ -45,7 +45,7 @@ def load_truth(path: Path) -> list[Stretch]:
 
 
 def with_truth(records: Iterable[Record], stretches: Sequence[Stretch]) -> Iterator[Record]:
-    """The records with the truth of the first stretch that holds each; others have none."""
+    """Yield the records with the truth of the first row that covers their time, if any."""
     by_pair: dict[tuple[int, int], list[Stretch]] = {}
     for stretch in stretches:
         by_pair.setdefault((stretch.tag_id, stretch.anchor_id), []).append(stretch)

@@ -1,4 +1,4 @@
-"""A physical simulator of UWB ranging: propagation, a DW1000-like receiver, a flat to place them in.
+"""A physical simulator of UWB ranging: propagation, a DW1000-like receiver, and buildings.
 
-Pure and seeded: no I/O, no ROS, no clock. `sources.simulated` turns it into measurements.
+Deterministic for a seed: no I/O, no ROS, no clock. `sources.simulated` generates measurements from it.
 """

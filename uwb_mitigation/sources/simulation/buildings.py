@@ -1,7 +1,7 @@
-"""Random buildings, random boards in them, and placements balanced over what stands between the antennas.
+"""Random buildings with random boards, and placements balanced over LOS, NLOS and a lost direct path.
 
-Distributions are assumed unless a source is named; docs/background/how_it_works.md tells which of them real ranges had a say in.
-The chip is the same everywhere: pulse, detector and compression are those of `simulation.radio`.
+Distributions without a source are assumptions; docs/background/how_it_works.md lists those that were tuned on real ranges.
+The chip is always the same: pulse, detector and compression are those of `simulation.radio`.
 """
 
 from __future__ import annotations
@@ -46,13 +46,13 @@ OUTDOOR: Environments = (OUTDOOR_LOS, RESIDENTIAL_NLOS)
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """Buildings of one use.
+    """Distribution of buildings of one type.
 
     Attributes:
-        name: for people. share: of all buildings.
-        length_m, width_m, room_m: bounds of the plan's sides and of a room's.
-        environments: of the diffuse field, {which: share}.
-        screens_per_m2: of metal furniture and machines, on average.
+        name: display name. share: share of all buildings.
+        length_m, width_m, room_m: bounds of the sides of the plan and of a room.
+        environments: of the diffuse field, {environment: share}.
+        screens_per_m2: mean density of metal furniture and machines.
     """
 
     name: str
@@ -87,24 +87,24 @@ WIDE_KINDS = (
 
 HEAVY = ((CONCRETE, (0.15, 0.40)), (BRICK, (0.20, 0.50)))
 LIGHT = ((PLASTERBOARD, (0.02, 0.05)), (WOOD, (0.03, 0.06)), (GLASS, (0.006, 0.02)))
-"""Materials of ITU-R P.2040-1 with bounds of their thickness, m: of load-bearing walls, and of partitions."""
+"""Materials of ITU-R P.2040-1 with bounds of their thickness, m: load-bearing walls, and partitions."""
 
 HEAVY_SHARE = 0.85
-"""Of walls that are heavy."""
+"""Share of load-bearing walls."""
 
 DOORWAY_SHARE = 0.8
 DOORWAY_M = (0.8, 1.2)
 METAL_M = (0.5, 2.0)
 PERSON_M = 0.45
 PEOPLE = 1.0
-"""On average, in each building."""
+"""Mean number per building."""
 
 RADIO = Radio(range_offset_m=0.0)
-"""The chip, its antenna delays calibrated: the error is the channel's alone."""
+"""The chip with calibrated antenna delays: the range error comes only from the channel."""
 
 GAIN_DB = (-6.0, 6.0)
-"""Transmit power and both antennas, beyond those of the EVB1000: a DW1000's power is set in steps over 30 dB, and
-regulators bound its density; small antennas gain -2 to 3 dB."""
+"""Transmit power and both antennas, relative to the EVB1000: a DW1000's power is adjustable in steps over 30 dB and
+limited by regulations; small antennas have a gain of -2 to 3 dB."""
 
 WIDE_GAIN_SHARE, WIDE_GAIN_DB = 0.1, (-15.0, 15.0)
 """Share of blocks with a power amplifier, an external antenna or attenuation."""
@@ -116,23 +116,23 @@ number of dB, with a mean between these bounds; reflections do not."""
 NOISE_FIGURE_DB, WIDE_NOISE_FIGURE_DB = (8.0, 12.0), (7.0, 14.0)
 PREAMBLES = (128, 256, 512, 1024)
 DETECTION_SYMBOLS = 24
-"""Spent on detecting the preamble, so that they are not accumulated (the logs: 1000 of 1024)."""
+"""Symbols used for preamble detection, which are not accumulated (the logs: 1000 of 1024 are)."""
 
 DETOUR_M = 4.0
 DETOUR_MOST = 3.0
-"""Behind obstacles the first cluster comes later in proportion to the distance, since all detours of a shape grow with
-it: as late as the environment has it at so many m, and at most so many times later, 8.1 ns (the report's own program:
-8.3). Assumed, and kept because it helped on the real logs (docs/background/how_it_works.md)."""
+"""Behind obstacles, the delay of the first cluster is proportional to the distance, because detours scale with it: first
+the distance (m) with the environment's delay, then the maximum factor, which gives 8.1 ns (the report's program:
+8.3). An assumption; it was kept because it improved the results on the real logs (docs/background/how_it_works.md)."""
 
 PLACEMENTS, BUILDINGS = 256, 4
-"""In one block, which is what one generator draws."""
+"""Placements per block; each block has one random generator."""
 
 CANDIDATES = 16
-"""Placements drawn for each one that is kept."""
+"""Candidate placements for each one that is kept."""
 
 
 def draw_plan(kind: Kind, rng: np.random.Generator) -> FloorPlan:
-    """A rectangle divided into rooms, most with a doorway, and what metal and people stand in it."""
+    """Draw a rectangle divided into rooms, most with a doorway, with metal furniture and people."""
     size = (float(rng.uniform(*kind.length_m)), float(rng.uniform(*kind.width_m)))
     room_m = float(rng.uniform(*kind.room_m))
     walls: list[Wall] = []
@@ -179,7 +179,7 @@ def _wall(
     rng: np.random.Generator,
     doors_m: NDArray[np.float64],
 ) -> list[Wall]:
-    """One wall, of one material, in the pieces that doorways at `doors_m` from its start leave."""
+    """Return the pieces of a wall of one material between doorways at `doors_m` from its start."""
     choices = HEAVY if rng.random() < HEAVY_SHARE else LIGHT
     material, bounds = choices[int(rng.integers(len(choices)))]
     thickness = float(rng.uniform(*bounds))
@@ -205,7 +205,7 @@ def _screen(name: str, length_m: float, size: tuple[float, float], rng: np.rando
 
 
 def draw_boards(n: int, rng: np.random.Generator, *, wide: bool = False) -> Boards:
-    """n pairs of boards: transmit power and antennas, noise, preamble length."""
+    """Draw n pairs of boards: transmit power and antennas, noise, preamble length."""
     gain_db = WIDE_GAIN_DB if wide and rng.random() < WIDE_GAIN_SHARE else GAIN_DB
     return Boards(
         rng.uniform(*gain_db, n),
@@ -224,18 +224,17 @@ class Block:
     boards: Boards
 
     def configuration(self, seed: int, number: int, placement: int) -> str:
-        """The name of a placement, that counts from 0, of block `number`."""
+        """Return the name of a placement (from 0) of block `number`."""
         building = number * BUILDINGS + int(self.building[placement])
         return f"simulated buildings seed {seed}/{self.kind} {building}/placement {number * PLACEMENTS + placement}"
 
 
 def block_of(seed: int, number: int, *, wide: bool = False) -> tuple[Block, np.random.Generator]:
-    """A block of `PLACEMENTS` placements of one kind of building, and the generator that fading and noise are to be
-    drawn from: about a third each in line of sight, behind obstacles, and so far behind them that the direct path
-    is lost.
+    """Draw a block of `PLACEMENTS` placements in one type of building; also return the generator for fading and noise.
 
-    Sixteen times as many are drawn, and of each condition as many kept as it takes; what would be too weak to be
-    received is kept only where there is nothing else.
+    About a third of the placements each is in line of sight, behind obstacles, and behind obstacles with a lost direct path.
+    Sixteen times as many candidates are drawn, and the required number of each condition is kept. Candidates below the
+    sensitivity are used only if there are no others.
 
     Args:
         wide: also open sites, tilted antennas, and wider gains and noise figures.
@@ -282,7 +281,7 @@ def _conditions(
     path: DirectPath,
     boards: Boards,
 ) -> NDArray[np.int64]:
-    """About which condition each candidate will have, from mean levels."""
+    """Predict the condition of each candidate from mean levels."""
     direct, diffuse = _mean_powers_db(environments, anchor, tag, path)
     is_heard = RADIO.direct_margin_db(direct, diffuse, boards) > 0
     condition = np.where(path.crossings == 0, IN_SIGHT, np.where(is_heard, BLOCKED, LOST))
@@ -298,7 +297,7 @@ def mean_level_dbm(
     path: DirectPath,
     boards: Boards,
 ) -> NDArray[np.float64]:
-    """The mean receive level of links between antennas at float64 (n, 2) in m, over what meets `path`, dBm (n,)."""
+    """Return the mean receive level, dBm (n,), of links between antennas at float64 (n, 2) in m with obstacles `path`."""
     powers = _mean_powers_db(environments, anchor, tag, path)
     level: NDArray[np.float64] = (
         RADIO.tx_power_dbm
@@ -311,7 +310,7 @@ def mean_level_dbm(
 def _mean_powers_db(
     environments: Environments, anchor: NDArray[np.float64], tag: NDArray[np.float64], path: DirectPath
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Of the direct path and of all others, relative to what was sent."""
+    """Return the power of the direct path and of all others relative to the transmit power."""
     distance = np.hypot(*(tag - anchor).T)
     direct = direct_power_db(distance, path.loss_db + math.prod(PATTERN_LOSS_DB))
     diffuse = -np.where(path.crossings > 0, *(e.path_loss_db(distance) for e in environments[::-1]))
@@ -319,7 +318,7 @@ def _mean_powers_db(
 
 
 def _balanced(conditions: NDArray[np.int64], count: int, rng: np.random.Generator) -> NDArray[np.intp]:
-    """`count` rows, ascending, the three conditions in turn as long as there are any; weak ones come last."""
+    """Return `count` rows, ascending: the three conditions in turn as long as available, weak ones last."""
     order = rng.permutation(len(conditions))
     turn = np.empty(len(conditions), np.int64)
     for condition in (IN_SIGHT, BLOCKED, LOST, WEAK):

@@ -1,7 +1,7 @@
-"""Multipath propagation: the direct path, and a diffuse field of clusters and rays behind it.
+"""Multipath propagation: the direct path, followed by a diffuse field of clusters and rays.
 
-The direct path is deterministic (free space, and what the obstacles on it take); the diffuse field
-follows the IEEE 802.15.4a channel model. What a receiver makes of them is in `simulation.radio`.
+The direct path is deterministic (free-space and obstacle loss); the diffuse field follows the IEEE 802.15.4a
+channel model. The receiver model is in `simulation.radio`.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ CENTRE_FREQUENCY_HZ = 3993.6e6
 WAVELENGTH_M = SPEED_OF_LIGHT_M_PER_NS * 1e9 / CENTRE_FREQUENCY_HZ
 
 FREE_SPACE_LOSS_1M_DB = 20.0 * math.log10(4.0 * math.pi / WAVELENGTH_M)
-"""Friis, isotropic antennas, at 1 m."""
+"""Free-space loss at 1 m (Friis, isotropic antennas)."""
 
 PATTERN_LOSS_DB = (4.0, 1.0)
 """Shape and scale of the gamma-distributed loss that two small antennas' patterns add to the direct
-path. They see it from one direction each, and the diffuse field from all, so only their ratio counts.
-Its mean of 4 dB is that of the receive over first-path level in line of sight in the EVK1000 logs."""
+path. The direct path has one direction, the diffuse field has all, so only their ratio matters. The mean of
+4 dB is the mean difference of receive and first-path level in the LOS EVK1000 logs."""
 
 MAX_CLUSTERS = 10
 RAYS_PER_CLUSTER = 28
-"""Enough that the rays left out hold less than 0.1 % of a residential cluster's mean power."""
+"""The omitted rays contain less than 0.1 % of the mean power of a residential cluster."""
 
 
 def check_range(where: str, name: str, value: float, low: float, high: float, *, whole: bool = False) -> None:
-    """Raise ParameterError, naming all three, unless `value` is a number from `low` to `high`.
+    """Raise a ParameterError with all three unless `value` is a number from `low` to `high`.
 
-    NaN is refused, and with `whole` so is what is not an integer.
+    NaN is rejected; with `whole`, also a number that is not an integer.
     """
     given: object = value
     if not isinstance(given, Integral if whole else Real) or not low <= value <= high:
@@ -51,15 +51,15 @@ class Environment:
     """Statistics of the diffuse field and of path loss, in the notation of the 802.15.4a report.
 
     Attributes:
-        name: for people.
+        name: display name.
         path_loss_1m_db: PL0. path_loss_exponent: n. shadowing_db: sigma_S.
         frequency_exponent: kappa, of the path loss.
         mean_clusters: L. cluster_rate_per_ns: Lambda.
         ray_rates_per_ns: lambda_1, lambda_2. ray_mix: beta, the probability of lambda_1.
         cluster_decay_ns: Gamma. ray_decay_ns: gamma_0. cluster_shadowing_db: sigma_cluster.
         nakagami_log_mean, nakagami_log_std: m is log-normal, exp of a normal with these.
-        first_cluster_delay_ns: mean (exponential) delay of the first cluster behind the straight line.
-        ray_decay_growth: k_gamma, how much longer rays decay for each ns that their cluster comes later.
+        first_cluster_delay_ns: mean (exponential) delay of the first cluster relative to the straight line.
+        ray_decay_growth: k_gamma, increase of the ray decay time per ns of cluster delay.
 
     Raises:
         ParameterError: a value is not finite or is out of its range.
@@ -104,17 +104,17 @@ class Environment:
             check_range(f"environment {self.name}", name, value, low, high)
 
     def path_loss_db(self, distance_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Mean path loss at channel 2, dB, by the report's section II-A: a power law in distance and
-        in frequency, and a factor of 1/2 for what stands close to an antenna."""
+        """Return the mean path loss at channel 2, dB, by the report's section II-A: a power law in distance and
+        in frequency, and a factor of 1/2 for objects close to an antenna."""
         frequency = 20.0 * (self.frequency_exponent + 1.0) * math.log10(CENTRE_FREQUENCY_HZ / 5e9)
         at_1m = self.path_loss_1m_db + frequency + 10.0 * math.log10(2.0)
         return at_1m + 10.0 * self.path_loss_exponent * np.log10(distance_m)
 
 
 # Molisch et al., "IEEE 802.15.4a channel model - final report", 2004, residential environments (CM1, CM2);
-# only the last figure of each is not from there. In line of sight the diffuse field starts with the
-# direct path; out of it, its mean delay is that of the EVK1000 logs' range errors without a direct
-# path, beyond the error in line of sight (0.8 m; the report's own program uses 1 / Lambda = 8.3 ns).
+# except for the last value of each. For LOS the diffuse field starts with the direct path. For NLOS its mean delay
+# is the mean range error of the EVK1000 logs without a direct path minus that of LOS (0.8 m; the report's
+# program uses 1 / Lambda = 8.3 ns).
 RESIDENTIAL_LOS = Environment(
     "residential LOS",
     43.9,
@@ -150,9 +150,9 @@ RESIDENTIAL_NLOS = Environment(
     2.7,
 )
 
-# The same report's office (CM3, CM4; the clusters of CM4 as its own program draws them) and industrial environments (CM7,
-# CM8). It gives no ray rates for industry, where every nanosecond had a path, and for CM8 one long cluster: here it
-# has the clusters of CM7, and of CM8 the path loss. Behind obstacles the first cluster is as late as at home.
+# The same report's office (CM3, CM4; clusters of CM4 as in its program) and industrial environments (CM7,
+# CM8). It gives no ray rates for industry, where every nanosecond had a path, and one long cluster for CM8. Here CM8 uses
+# the clusters of CM7 with its own path loss. Behind obstacles the first cluster has the residential delay.
 OFFICE_LOS = Environment(
     "office LOS", 35.4, 1.63, 1.9, 0.03, 5.4, 0.016, (0.19, 2.97), 0.0184, 14.6, 6.4, 3.0, 0.42, 0.31, 0.0
 )
@@ -197,7 +197,7 @@ INDUSTRIAL_NLOS = Environment(
 )
 
 
-# The same report's outdoor environment (CM5), with fewer clusters than its 13.6, because `MAX_CLUSTERS` limits them.
+# The same report's outdoor environment (CM5), with fewer clusters than 13.6 because of `MAX_CLUSTERS`.
 OUTDOOR_LOS = Environment(
     "outdoor LOS", 45.6, 1.76, 0.83, 0.12, 6.0, 0.0048, (0.27, 2.41), 0.0078, 31.7, 3.7, 3.0, 0.77, 0.78, 0.0
 )
@@ -205,14 +205,14 @@ OUTDOOR_LOS = Environment(
 
 @dataclass(frozen=True, slots=True)
 class DiffuseField:
-    """Where the rays of n placements lie and what they carry on average: it changes over metres.
+    """Delays and mean powers of the rays of n placements; they change over metres.
 
     Attributes:
-        delay_ns: float64 (n, rays), behind the straight line.
+        delay_ns: float64 (n, rays), relative to the straight line.
         mean_power: float64 (n, rays), sums to 1 over the rays.
         nakagami_m: float64 (n, rays), fading parameter, at least 0.5.
-        shadowing_db: float64 (n,), of the total.
-        pattern_loss_db: float64 (n,), of the direct path (`PATTERN_LOSS_DB`).
+        shadowing_db: float64 (n,), of the total power.
+        pattern_loss_db: float64 (n,), loss of the direct path (`PATTERN_LOSS_DB`).
     """
 
     delay_ns: NDArray[np.float64]
@@ -222,7 +222,7 @@ class DiffuseField:
     pattern_loss_db: NDArray[np.float64]
 
     def take(self, index: NDArray[np.intp]) -> DiffuseField:
-        """The placements at `index`, in that order."""
+        """Return the placements at `index`, in that order."""
         return DiffuseField(
             self.delay_ns[index],
             self.mean_power[index],
@@ -234,10 +234,10 @@ class DiffuseField:
     def fade(self, rng: np.random.Generator) -> NDArray[np.complex128]:
         """Draw the rays' gains, complex128 (n, rays): Nakagami magnitude, uniform phase.
 
-        Fading changes over half a wavelength: one draw serves a placement at rest, a moving antenna
-        needs one for each exchange.
+        Fading changes over half a wavelength: draw once for a static placement, and for each exchange if an
+        antenna moves.
         """
-        # Most rays are of clusters that are not there, or have decayed by 60 dB and more.
+        # Most rays belong to unused clusters, or have decayed by 60 dB or more.
         heard = self.mean_power > 1e-6
         m = self.nakagami_m[heard]
         power = rng.standard_gamma(m) * (self.mean_power[heard] / m)
@@ -250,11 +250,11 @@ class DiffuseField:
 def draw_diffuse_field(
     environment: Environment, n: int, rng: np.random.Generator, later: NDArray[np.float64] | float = 1.0
 ) -> DiffuseField:
-    """Draw the diffuse fields of `n` independent placements; `later`, (n,): factor of the delay of their first clusters.
+    """Draw the diffuse fields of `n` independent placements; `later`, (n,): factor of the delay of the first cluster.
 
     Clusters: a Poisson number (at least one), exponential gaps, exponential decay, log-normal power.
     Rays: gaps from a mixture of two exponentials, exponential decay, log-normal Nakagami m
-    (802.15.4a report, sections II-C to II-E). The first ray of a cluster lies at its start.
+    (802.15.4a report, sections II-C to II-E). The first ray of a cluster is at its start.
     """
     e = environment
     count = np.clip(rng.poisson(e.mean_clusters, n), 1, MAX_CLUSTERS)
@@ -281,11 +281,11 @@ def draw_diffuse_field(
 
 @dataclass(frozen=True, slots=True)
 class Multipath:
-    """What arrives at the receiver over n links, for each 1 mW sent.
+    """Received paths of n links for 1 mW transmit power.
 
     Attributes:
-        delay_ns: float64 (n, paths), behind a straight line through air; the direct path is first.
-        gain: complex128 (n, paths), field: its squared magnitude is a power.
+        delay_ns: float64 (n, paths), relative to a straight line through air; the direct path is first.
+        gain: complex128 (n, paths), field strength: its squared magnitude is a power.
     """
 
     delay_ns: NDArray[np.float64]
@@ -293,7 +293,7 @@ class Multipath:
 
 
 def direct_power_db(distance_m: NDArray[np.float64], loss_db: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Power of the direct path relative to what was sent, dB: Friis, less what obstacles take."""
+    """Return the power of the direct path relative to the transmit power, dB: Friis minus obstacle loss."""
     return -FREE_SPACE_LOSS_1M_DB - 20.0 * np.log10(distance_m) - loss_db
 
 
@@ -308,15 +308,14 @@ def propagate(
 ) -> Multipath:
     """Join the direct path and the diffuse field of n links.
 
-    The environment's path loss gives the power of all paths of a link that nothing blocks, so in
-    line of sight the diffuse field carries that less the direct path's; where the direct path holds
-    all of it (close by), the diffuse field keeps a twentieth. Out of line of sight the environment's
-    figures are those of the diffuse field itself.
+    For LOS, the environment's path loss gives the power of all paths, so the diffuse field has this power minus
+    that of the direct path, but at least a twentieth (at short distances the direct path can have all of it). For
+    NLOS, the environment's path loss is that of the diffuse field itself.
 
     Args:
         distance_m, loss_db, excess_m: (n,), straight-line distance; loss and extra optical length of
             the direct path (`simulation.scene`).
-        environment, field, fading: (n, ...) of one environment; see `draw_diffuse_field`.
+        environment, field, fading: (n, ...), all of one environment; see `draw_diffuse_field`.
 
     Raises:
         ParameterError: a distance is not finite and positive.
