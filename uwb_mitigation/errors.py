@@ -1,7 +1,7 @@
-"""The errors this package raises on purpose: one base, and a subclass for each kind of input.
+"""The exceptions of this package: a base class, and a subclass for each kind of input.
 
-Each says what is wrong, where in the input, and what would be valid, and carries the three apart so
-that a caller can act on them. No other module defines exceptions.
+Each contains the problem, its location in the input, and the valid values as separate attributes for the caller.
+No other module defines exceptions.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from collections.abc import Iterable
 
 
 class UwbMitigationError(Exception):
-    """Base of every error raised on purpose.
+    """Base class of all errors of this package.
 
     Attributes:
-        what: what is wrong, with the offending value.
-        where: the place in the input (file, line, byte offset, field); may be empty.
-        valid: what would be valid, or what to do; may be empty.
+        what: the problem, with the invalid value.
+        where: location in the input (file, line, byte offset, field); may be empty.
+        valid: valid values, or the remedy; may be empty.
     """
 
     def __init__(self, what: str, *, where: str = "", valid: str = "") -> None:
@@ -41,19 +41,19 @@ def _rebuild(kind: type[UwbMitigationError], what: str, where: str, valid: str) 
 
 
 class RecordingError(UwbMitigationError):
-    """A recording is absent, is of another format, or lacks what was asked of it."""
+    """A recording is missing, has another format, or does not contain the requested data."""
 
 
 class DamagedRecordingError(RecordingError):
-    """A recording is damaged part-way; everything before the damage has been yielded."""
+    """A recording is damaged; everything before the damage has been yielded."""
 
 
 class ModelError(UwbMitigationError):
-    """A model file is absent, corrupt, or does not fit what it is to be used for."""
+    """A model file is missing, corrupt, or unsuitable for its use."""
 
 
 class DatasetError(UwbMitigationError):
-    """Labelled data does not suffice for what was asked: too few, without truth, or not finite."""
+    """Labelled data is not sufficient: too few, without truth, or not finite."""
 
 
 class ParameterError(UwbMitigationError):
@@ -61,25 +61,25 @@ class ParameterError(UwbMitigationError):
 
 
 class LinkError(UwbMitigationError):
-    """What came over the link to a board is not what the protocol allows, or its port cannot be used."""
+    """Data from a board violates the protocol, or its port cannot be used."""
 
 
 class MissingDependencyError(UwbMitigationError):
-    """An optional part of the installation is not there."""
+    """An optional dependency is not installed."""
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Return the question which of the known names was meant; empty if none is similar."""
+    """Return a did-you-mean question with similar known names; empty if none is similar."""
     close = difflib.get_close_matches(name, list(known), n=2)
     return f"did you mean {' or '.join(close)}?" if close else ""
 
 
 _DISTRIBUTIONS = {"serial": "pyserial", "sklearn": "scikit-learn", "yaml": "pyyaml"}
-"""{what is imported: what is installed}, where the two differ."""
+"""{name of the import: name of the package}, if they differ."""
 
 
 def not_imported(error: ImportError) -> MissingDependencyError | None:
-    """The error of a library that cannot be imported; None of a module of this package: that is a bug."""
+    """Return the error for a library that cannot be imported; None for a module of this package, which is a bug."""
     module = (error.name or "").partition(".")[0]
     if module in ("", "uwb_mitigation"):
         return None
@@ -96,7 +96,7 @@ def not_imported(error: ImportError) -> MissingDependencyError | None:
 
 
 def not_installed(package: str) -> MissingDependencyError:
-    """The error of a package that cannot be found."""
+    """Return the error for a package that cannot be found."""
     return MissingDependencyError(f"{package} is not installed", valid="run uwb-mitigation doctor")
 
 
@@ -106,9 +106,9 @@ def format_id(number: int) -> str:
 
 
 def parse_id(text: str) -> int:
-    """Return the id of a text as `format_id` writes it; raise ValueError for any other text.
+    """Parse an id in the format of `format_id`; raise ValueError for any other text.
 
-    A larger decimal number is refused: it is rather an address in hexadecimal digits without `0x`.
+    A larger decimal number is rejected: it is probably a hexadecimal address without `0x`.
     """
     if re.fullmatch(r"0[xX][0-9a-fA-F]{1,16}", text):
         return int(text, 16)

@@ -1,4 +1,4 @@
-"""Files that are read up to a ceiling, and files that are written whole or not at all."""
+"""Reading files up to a maximum size, and atomic writing."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from uwb_mitigation.errors import UwbMitigationError
 
 
 def read_bounded(path: Path, limit: int, error: type[UwbMitigationError], valid: str = "") -> bytes:
-    """The content of a file of at most `limit` bytes.
+    """Return the content of a file of at most `limit` bytes.
 
     Args:
-        error: what to raise.
-        valid: what to say that would be valid.
+        error: type of the error to raise.
+        valid: text for `valid` of the error.
 
     Raises:
-        UwbMitigationError: as `error`: the file is absent, cannot be read, is empty or is larger.
+        UwbMitigationError: of the type `error`: the file is missing, unreadable, empty or larger.
     """
     try:
         if not path.is_file():
@@ -35,19 +35,19 @@ def read_bounded(path: Path, limit: int, error: type[UwbMitigationError], valid:
 
 
 def partial_of(path: Path) -> Path:
-    """Where the content of `path` is until it is whole."""
+    """Return the temporary path for the content of `path` until it is complete."""
     return path.with_name(path.name + ".part")
 
 
 def write_whole(
     path: Path, content: str | bytes, error: type[UwbMitigationError] = UwbMitigationError
 ) -> None:
-    """Write a file, or leave what was there: whatever fails, and whichever process writes it too.
+    """Write a file atomically: on any error, or if another process writes it too, no partial file remains.
 
-    A link is followed, and a device or pipe written to rather than replaced.
+    Links are followed. Devices and pipes are written to instead of being replaced.
 
     Raises:
-        UwbMitigationError: as `error`: the file cannot be written.
+        UwbMitigationError: of the type `error`: the file cannot be written.
     """
     write_together({path: content}, error)
 
@@ -55,11 +55,11 @@ def write_whole(
 def write_together(
     contents: Mapping[Path, str | bytes], error: type[UwbMitigationError] = UwbMitigationError
 ) -> None:
-    """Write files that belong together, each as `write_whole` does; none takes its place before all are written.
+    """Write files that belong together like `write_whole`; none is replaced before all are written.
 
     Raises:
-        UwbMitigationError: as `error`: one of them cannot be written, and all are as they were; or it was written whole
-            but may not take its place (another user's file in a folder like /tmp), and only those before it are new.
+        UwbMitigationError: of the type `error`: one of them cannot be written, and all are unchanged; or one cannot be
+            replaced (another user's file in a folder like /tmp), and only those before it are new.
     """
     partials: dict[Path, Path] = {}
     path = Path()
@@ -74,7 +74,7 @@ def write_together(
             partials[target].write_bytes(data)
         for path, partial in partials.items():
             partial.replace(path)
-    except (OSError, RuntimeError) as problem:  # a circle of links is a RuntimeError before Python 3.13
+    except (OSError, RuntimeError) as problem:  # a cycle of links is a RuntimeError before Python 3.13
         reason = getattr(problem, "strerror", None) or problem
         raise error(f"cannot be written: {reason}", where=str(path)) from problem
     finally:

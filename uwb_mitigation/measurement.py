@@ -1,4 +1,4 @@
-"""What a UWB ranging exchange yields, and what is made of it: plain immutable values.
+"""Measurements of UWB ranging exchanges, and corrected ranges: plain immutable values.
 
 Sign convention, everywhere: error = measured - true; corrected = measured - predicted error.
 Units are SI (REP-103) unless a name says otherwise. No I/O and no ROS here.
@@ -26,21 +26,21 @@ SAMPLE_PERIOD_S = 1.0 / (2 * 499.2e6)
 
 
 LINE_OF_SIGHT_DB = 6.0
-"""A first path less than this below the receive level looks like line of sight; 10 dB below, it is obstructed (Decawave
+"""If the first path is less than this below the receive level, the link is probably LOS; at 10 dB it is NLOS (Decawave
 APS006, part 3)."""
 
 
 class Encoding(enum.IntEnum):
-    """How `Cir.samples` holds the channel impulse response; the values of `Cir.msg`."""
+    """Encoding of the channel impulse response in `Cir.samples`; the values of `Cir.msg`."""
 
     COMPLEX_INT16 = 0
     MAGNITUDE = 1
 
 
 class Status(enum.IntEnum):
-    """What a corrected range is worth; the values of `RangeCorrected.msg`.
+    """Status of a corrected range; the values of `RangeCorrected.msg`.
 
-    On anything but OK the raw range is passed through, less the offset of its radios, with a larger variance.
+    If the status is not OK, the raw range minus the offset of its radios is passed through with a larger variance.
     """
 
     OK = 0
@@ -59,11 +59,11 @@ class Origin(enum.IntEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cir:
-    """A channel impulse response as the radio's accumulator delivers it.
+    """A channel impulse response from the radio's accumulator.
 
     Attributes:
         samples: int16. COMPLEX_INT16: shape (2 n,), interleaved real, imaginary. MAGNITUDE: (n,).
-        encoding: how to read `samples`.
+        encoding: encoding of `samples`.
         start_index: accumulator index of the first sample.
         first_path_index: accumulator index of the first path, sub-sample; NaN = unknown.
         sample_period_s: spacing of the samples.
@@ -95,7 +95,7 @@ class Cir:
 
     @property
     def power_gap_db(self) -> float:
-        """Receive level less first-path level; NaN = unknown."""
+        """Receive level minus first-path level; NaN = unknown."""
         return self.rx_power_dbm - self.first_path_power_dbm
 
 
@@ -104,12 +104,12 @@ class RangeMeasurement:
     """One ranging exchange between an anchor and a tag.
 
     Attributes:
-        stamp_ns: when the exchange was received, ns since the epoch of the source's clock.
-        tag_id, anchor_id: 64-bit identities.
-        sequence: counts the exchanges of a source; 32 bits.
+        stamp_ns: reception time of the exchange, ns since the epoch of the source's clock.
+        tag_id, anchor_id: 64-bit ids.
+        sequence: 32-bit counter of the exchanges of a source.
         device_time: 40-bit DW1000 ticks (`DEVICE_TICK_HZ`), as received.
-        range_m: the measured range; NaN = the exchange gave none.
-        cir: the channel impulse response that belongs to the range; may hold no samples.
+        range_m: the measured range; NaN = invalid.
+        cir: the channel impulse response of the range; may have no samples.
         frame_id: coordinate frame of the receiving antenna; empty = the consumer's default.
     """
 
@@ -125,13 +125,13 @@ class RangeMeasurement:
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """What a surveyed recording knows beside the measurement.
+    """Ground truth of a measurement in a surveyed recording.
 
     Attributes:
         range_m: true distance.
         label: propagation condition, such as `LOS`, `NLOS` or `NDP NLOS`; may be empty.
         configuration: name of the placement of both antennas. Measurements of one configuration
-            are not independent: a split never puts one on both sides.
+            are not independent: a train/held-out split never divides it.
     """
 
     range_m: float
@@ -141,13 +141,13 @@ class Truth:
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """One measurement, with what a surveyed recording knows of the truth.
+    """One measurement with its ground truth, if known.
 
     Attributes:
-        measurement: as received.
-        truth: of the range; None = not known.
-        tag_position: where the tag's antenna truly was at the measurement's stamp, x, y, z in m in the
-            anchors' frame; None = not known.
+        measurement: the measurement.
+        truth: ground truth of the range; None = unknown.
+        tag_position: true position of the tag's antenna at the measurement's stamp, x, y, z in m in the
+            anchors' frame; None = unknown.
     """
 
     measurement: RangeMeasurement
@@ -161,12 +161,12 @@ class CorrectedRange:
 
     Attributes:
         range_m: corrected range.
-        range_raw_m: the range as measured, with whatever offset its radios have.
-        correction_m: offset of the two radios + predicted error; the offset alone on any status but OK.
-        variance_m2: variance of `range_m`; infinite where the range itself is not valid.
-        status: what the value is worth.
-        origin: who computed it.
-        model_id: identity of the model; 0 = none.
+        range_raw_m: measured range, including the offset of its radios.
+        correction_m: offset of the two radios + predicted error; only the offset if the status is not OK.
+        variance_m2: variance of `range_m`; infinite if the range is invalid.
+        status: status of the correction.
+        origin: source of the correction.
+        model_id: id of the model; 0 = none.
     """
 
     range_m: float
@@ -180,15 +180,15 @@ class CorrectedRange:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RangeColumns:
-    """n exchanges whose CIRs have one encoding and one length, field by field: what correcting them takes.
+    """Columns of n exchanges whose CIRs have the same encoding and length: the inputs of the correction.
 
     Attributes:
         tag_id, anchor_id: uint64 (n,).
-        range_m: float (n,), as in `RangeMeasurement`: float32 where messages carry it, or float64.
-        encoding: of every CIR; the fields below as in `Cir`.
+        range_m: float (n,), as in `RangeMeasurement`: float32 from messages, or float64.
+        encoding: encoding of all CIRs; the fields below are those of `Cir`.
         samples: int16 (n, m).
         start_index, preamble_count: integer or float64 (n,).
-        first_path_index, scale, rx_power_dbm, first_path_power_dbm: as `range_m`.
+        first_path_index, scale, rx_power_dbm, first_path_power_dbm: float (n,), of the type of `range_m`.
     """
 
     tag_id: NDArray[np.uint64]
@@ -205,7 +205,7 @@ class RangeColumns:
 
     @staticmethod
     def grouped(measurements: Sequence[RangeMeasurement]) -> Iterator[tuple[list[int], RangeColumns]]:
-        """Yield the columns of measurements whose CIRs have one encoding and one length, with their indices."""
+        """Yield columns of measurements whose CIRs have the same encoding and length, with their indices."""
         groups: dict[tuple[int, int], list[int]] = {}
         for index, measurement in enumerate(measurements):
             groups.setdefault((measurement.cir.encoding, len(measurement.cir.samples)), []).append(index)
@@ -251,13 +251,13 @@ class RangeColumns:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CorrectedColumns:
-    """n corrected ranges of one origin and one model, field by field as in `CorrectedRange`.
+    """Columns of n corrected ranges of one origin and one model; the fields are those of `CorrectedRange`.
 
     Attributes:
         range_m: (n,), of the type of `RangeColumns.range_m`.
         correction_m, variance_m2: float32 (n,).
         status: uint8 (n,), of `Status`.
-        origin, model_id: of every one.
+        origin, model_id: those of all ranges.
     """
 
     range_m: NDArray[Any]

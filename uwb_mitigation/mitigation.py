@@ -1,4 +1,4 @@
-"""From a measurement to a corrected range: offset, preprocessing, prior, network, and what happens when one fails."""
+"""Correction of ranges: offset, preprocessing, prior, network, and the handling of failures."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class Backend(ABC):
 
     Attributes:
         bundle: the model.
-        offsets: of the radios; may be set between two calls.
+        offsets: offsets of the radios; may be changed between two calls.
     """
 
     bundle: Bundle
@@ -116,9 +116,9 @@ class Backend(ABC):
 def passed_through(
     bundle: Bundle, ranges: RangeColumns, offset_m: NDArray[np.float32], status: NDArray[np.uint8]
 ) -> CorrectedColumns:
-    """Return the raw ranges less the offsets of their radios, with the variance of uncorrected ranges.
+    """Return the raw ranges minus the offsets of their radios, with the variance of uncorrected ranges.
 
-    The offset is known, whatever the CIR contains. A range without a CIR from which an offset was subtracted gets the
+    The offset does not depend on the CIR. A range without a CIR from which an offset was subtracted gets the
     variance of corrected ranges: that of uncorrected ranges contains the offsets of the training boards.
 
     Args:
@@ -134,14 +134,14 @@ def passed_through(
 
 
 class Mitigation(Backend):
-    """Corrects ranges with one bundle, by ONNX Runtime. Not for use by two threads at once.
+    """Corrects ranges with one bundle, by ONNX Runtime. Not thread-safe.
 
     Predicted error = prior + network, correction = offset of the radios + predicted error, and corrected = range -
-    correction, each one float32 operation, so that a microcontroller computes the same bits. The bundle sees the range
-    less the offset. No measurement is refused: if a range cannot be corrected, the raw range less the offset passes
-    through, with a status that gives the reason and a larger variance:
+    correction, each one float32 operation, so that a microcontroller computes the same bits. The bundle uses the range
+    minus the offset. No measurement is rejected: if a range cannot be corrected, the raw range minus the offset is passed
+    through with a status that gives the reason and a larger variance:
 
-    NO_CIR, BAD_CIR: see `CirFault`; a bundle that needs no CIR corrects these, too. OUT_OF_DISTRIBUTION: the range less
+    NO_CIR, BAD_CIR: see `CirFault`; a bundle that needs no CIR corrects these, too. OUT_OF_DISTRIBUTION: the range minus
     offset is negative or not finite, the predicted error is outside the bundle's limits, or the OOD score is 1 or
     more. MODEL_ERROR: the network failed, or its output is not finite.
 
@@ -149,10 +149,10 @@ class Mitigation(Backend):
     from the predicted error to the overall offset of the training data, and the larger its variance is, with status OK.
 
     Args:
-        offsets: of the radios, in addition to what the bundle predicts.
+        offsets: offsets of the radios, in addition to the bundle's prediction.
 
     Raises:
-        ModelError: ONNX Runtime refuses the bundle's network.
+        ModelError: ONNX Runtime rejects the bundle's network.
     """
 
     def __init__(self, bundle: Bundle, offsets: Offsets = NO_OFFSETS) -> None:
@@ -184,11 +184,11 @@ class Mitigation(Backend):
         if len(windows):
             try:
                 predicted[rows] += self._session.predict_m(windows)
-            except Exception:  # Whatever ONNX Runtime raises, a consumer must still get its range.
+            except Exception:  # After any error of ONNX Runtime, consumers must still receive the range.
                 predicted[rows] = np.nan
             score[rows] = self._grader.score(windows, range_m[rows], *(power[rows] for power in powers))
         if not self.bundle.card.needs_cir and len(windows) < n:
-            # If the prior has no weight for the first-path power, that power need not be known.
+            # The first-path power may be unknown if the prior has no weight for it.
             first_path = powers[1] if prior_of.per_power_gap != 0.0 else powers[0]
             alone = prior_of.predict_m(powers[0], first_path)
             by_prior = valid & ~readable & np.isfinite(alone)
@@ -214,12 +214,12 @@ class Mitigation(Backend):
 
 
 def _rows(chosen: NDArray[np.bool_]) -> slice | NDArray[np.bool_]:
-    """An index of the chosen rows; a slice, which is faster, if all are chosen."""
+    """Return an index of the selected rows: a slice, which is faster, if all are selected."""
     return _ALL if np.count_nonzero(chosen) == len(chosen) else chosen
 
 
 def _less(range_m: NDArray[np.floating], offset_m: NDArray[np.float32]) -> NDArray[np.floating]:
-    """Ranges less offsets, in float32 as boards have it; without an offset the range as it is."""
+    """Return ranges minus offsets in float32, as on boards; without an offset the unchanged range."""
     found: NDArray[np.floating] = range_m.copy()
     if np.count_nonzero(offset_m):
         with np.errstate(over="ignore"):  # A range beyond float32 is invalid, as an infinite one is.

@@ -1,13 +1,13 @@
-"""The offsets of radios: what antenna delays that nobody calibrated add to every range, whatever the channel does.
+"""Range offsets of radios, caused by uncalibrated antenna delays and independent of the channel.
 
-    default: 0.15                # m, of pairs that nothing below names
+    default: 0.15                # m, of pairs without an entry below
     anchors: {1: 0.21, 0x1f: 0.19}
     tags: {7: -0.02}
     pairs:
       - {anchor: 1, tag: 7, offset: 0.22, sd: 0.03}
 
-`sd`, how sure that is in m, may be absent. A pair's own offset counts where there is one; else the sum of its anchor's and its tag's, as the delays of two radios
-add (0 for the one that is not named); else the default. One number stands for a default alone.
+`sd` is the optional standard deviation in m. If a pair has an entry, this is its offset; otherwise the sum of the offsets of its anchor and tag
+(0 for one without an entry), because the delays of two radios add; otherwise the default. A single number is a default.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from uwb_mitigation.errors import ParameterError, format_id
 from uwb_mitigation.files import read_bounded
 
 MAX_OFFSET_M = 10.0
-"""A DW1000 whose antenna delay was never set is 154 m off: that belongs into the radio, as `antenna_delay`."""
+"""A DW1000 without any antenna delay has an offset of 154 m: set `antenna_delay` in the radio instead."""
 
 MAX_ENTRIES = 10_000
 MAX_TEXT = 1 << 20
@@ -42,13 +42,13 @@ _NONE: Mapping[Any, float] = MappingProxyType({})
 
 
 class Offsets:
-    """Offsets of pairs of radios, m, rounded to float32 as messages and boards have them; immutable.
+    """Offsets of pairs of radios, m, rounded to float32 as in messages and on boards; immutable.
 
     Args:
-        default: of pairs that nothing else names.
-        anchors, tags: {identity: m}.
+        default: offset of pairs without an entry.
+        anchors, tags: {id: m}.
         pairs: {(tag, anchor): m}.
-        pair_sd: the standard deviations of some of these, m.
+        pair_sd: standard deviations of some pairs, m.
 
     Raises:
         ParameterError: an offset is not finite or beyond `MAX_OFFSET_M`, or there are too many.
@@ -89,7 +89,7 @@ class Offsets:
         return hash((self.default, *(frozenset(o.items()) for o in (self.anchors, self.tags, self.pairs))))
 
     def __bool__(self) -> bool:
-        """Whether any is not 0."""
+        """Whether any offset is not 0."""
         return any((self.default, *self.anchors.values(), *self.tags.values(), *self.pairs.values()))
 
     def __len__(self) -> int:
@@ -118,10 +118,10 @@ class Offsets:
 
 
 def read_offsets(value: str) -> Offsets:
-    """The offsets that a parameter or option names: a number of metres, the path of a file, or nothing for 0.
+    """Return the offsets of a parameter or option: a number in metres, the path of a file, or empty for 0.
 
     Raises:
-        ParameterError: it is neither, or the file holds something else.
+        ParameterError: the text is neither, or the file is not an offsets file.
     """
     text = value.strip()
     if not text:
@@ -139,14 +139,14 @@ def read_offsets(value: str) -> Offsets:
 
 
 def parse_offsets(text: str, where: str) -> Offsets:
-    """The offsets of a file's text.
+    """Parse the text of an offsets file.
 
     Args:
-        text: YAML (so JSON too) as the module's text shows, or one number.
-        where: what to call the file in errors.
+        text: YAML (or JSON) in the format of the module docstring, or one number.
+        where: name of the file in errors.
 
     Raises:
-        ParameterError: it is no YAML, or not of that form; names the entry.
+        ParameterError: the text is not YAML or has another format; the message names the entry.
     """
     try:
         document = yaml.load(text, _Loader)
@@ -172,7 +172,7 @@ def parse_offsets(text: str, where: str) -> Offsets:
 
 
 def dump_offsets(offsets: Offsets, comment: str = "") -> str:
-    """The text of a file of offsets, which `parse_offsets` reads; `comment` goes ahead, a line a line."""
+    """Return the text of an offsets file for `parse_offsets`; each line of `comment` precedes it."""
     out = io.StringIO()
     for line in comment.splitlines():
         out.write(f"# {line}\n")
@@ -195,7 +195,7 @@ def dump_offsets(offsets: Offsets, comment: str = "") -> str:
 
 
 class _Loader(yaml.SafeLoader):
-    """Refuses a key that is there twice, of which YAML would keep the last."""
+    """Rejects duplicate keys, of which YAML would keep the last."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen = set()

@@ -1,8 +1,7 @@
-"""From a channel impulse response to the network's input: the one definition that training, host and
-firmware share.
+"""Conversion of channel impulse responses to the network's inputs, as in training and firmware.
 
 Every step is a single correctly rounded IEEE-754 binary32 operation, so that a microcontroller with
-a single-precision unit gets the same bits: exact integer power re^2 + im^2, converted to float32,
+a single-precision unit computes the same bits: exact integer power re^2 + im^2, converted to float32,
 square root, times `scale`, then the scaling. No I/O here.
 """
 
@@ -20,11 +19,11 @@ from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.measurement import Encoding, RangeColumns, RangeMeasurement
 
 WINDOW_LEAD = 5
-"""Samples of the window before floor(first path): enough to see the noise the path rises from."""
+"""Samples of the window before floor(first path): enough to include the noise before the path."""
 
 
 PREAMBLE_DIVISOR = 60
-"""Brings `magnitude / preamble_count` of the DW1000 to order one before the square root."""
+"""Scales `magnitude / preamble_count` of the DW1000 to the order of one before the square root."""
 
 MIN_SCALE, MAX_SCALE = 1e-30, 1e30
 """Accumulator units per count: any int16 magnitude times these is a normal float32."""
@@ -33,10 +32,10 @@ SATURATED = np.iinfo(np.int16).max
 
 
 class Scaling(str, enum.Enum):
-    """How a window of magnitudes becomes the network's input.
+    """Scaling of a window of magnitudes to the network's input.
 
-    MAX divides by the window's maximum, which is all that normalised amplitudes allow.
-    PREAMBLE is sqrt(magnitude / (60 preamble_count)): it keeps the received level.
+    MAX divides by the window's maximum, the only option for normalised amplitudes.
+    PREAMBLE is sqrt(magnitude / (60 preamble_count)), which preserves the received level.
     """
 
     MAX = "max"
@@ -44,7 +43,7 @@ class Scaling(str, enum.Enum):
 
 
 class CirFault(enum.IntEnum):
-    """Why a channel impulse response cannot be used; the numbers are those of `uwb_status` in the firmware."""
+    """Reason why a channel impulse response is unusable; the values of `uwb_status` in the firmware."""
 
     EMPTY = 3
     ODD_LENGTH = 4
@@ -59,7 +58,7 @@ class CirFault(enum.IntEnum):
 
     @property
     def text(self) -> str:
-        """The reason in words."""
+        """The reason as text."""
         return _FAULT_TEXTS[self]
 
 
@@ -79,11 +78,11 @@ _FAULT_TEXTS = {
 
 @dataclass(frozen=True, slots=True)
 class Preprocessing:
-    """The window and the scaling that one model was trained with.
+    """Window and scaling of a model.
 
     Attributes:
         samples: window length K, from 1 to 1016.
-        scaling: how magnitudes are scaled.
+        scaling: scaling of the magnitudes.
 
     Raises:
         ParameterError: the window length is out of its range.
@@ -160,8 +159,8 @@ class Preprocessing:
 
 
 def _content_fault(window: NDArray[np.int16], total: int, is_complex: bool) -> int:
-    """`CirFault` of the samples in a window of a CIR with `total` values; 0 if there is none."""
-    # -32768 has no negative of its own in int16: the extremes are compared, not magnitudes.
+    """Return the `CirFault` of the samples in a window of a CIR with `total` values; 0 = usable."""
+    # int16 has no +32768: compare the extremes instead of magnitudes.
     highest, lowest = int(np.maximum.reduce(window)), int(np.minimum.reduce(window))
     if is_complex and total % 2:
         return CirFault.ODD_LENGTH

@@ -1,4 +1,4 @@
-"""Links between antennas at given places: what stands between them, and which diffuse field they share."""
+"""Links between antennas at given positions: obstacles, and shared diffuse fields."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ BORDER_M = 0.2
 CLOSEST_M = 0.5
 
 Environments = tuple[Environment, Environment]
-"""Diffuse fields in line of sight and out of it."""
+"""Diffuse fields for LOS and NLOS."""
 
 
 @dataclass(frozen=True, slots=True)
 class Links:
-    """n links before the radio.
+    """n links before the radio model.
 
     Attributes:
         anchor, tag: float64 (n, 2), m.
-        path: what stands between them.
-        environments, fields: the diffuse fields in line of sight and out of it.
-        field_of: int (n,), which of the fields' rows a link has.
-        at_rest: fading is drawn once for a field; in motion, once for a link.
+        path: the obstacles between them.
+        environments, fields: the diffuse fields for LOS and NLOS.
+        field_of: int (n,), row of the fields for each link.
+        at_rest: fading is drawn once per field; in motion, once per link.
     """
 
     anchor: NDArray[np.float64]
@@ -45,12 +45,12 @@ class Links:
 
     @property
     def distance_m(self) -> NDArray[np.float64]:
-        """Of a straight line, (n,)."""
+        """Straight-line distances, (n,)."""
         distance: NDArray[np.float64] = np.hypot(*(self.tag - self.anchor).T)
         return distance
 
     def take(self, fields: NDArray[np.intp], field_of: NDArray[np.intp]) -> Links:
-        """Links over some of the fields, of which `field_of` counts anew; field k is that of link k here."""
+        """Return links over some of the fields, with new row numbers in `field_of`; field k is that of link k here."""
         links, (in_sight, blocked) = fields[field_of], self.fields
         return Links(
             self.anchor[links],
@@ -63,7 +63,7 @@ class Links:
         )
 
     def multipath(self, rng: np.random.Generator) -> Multipath:
-        """What arrives over each link: of the line-of-sight environment where nothing blocks its path."""
+        """Return the received paths of each link; a link without obstacles uses the LOS environment."""
         path, distance = self.path, self.distance_m
         rays = self.fields[0].delay_ns.shape[1]
         delay = np.empty((len(distance), 1 + rays))
@@ -88,7 +88,7 @@ class Links:
 def draw_fields(
     environments: Environments, n: int, rng: np.random.Generator, later: NDArray[np.float64] | float = 1.0
 ) -> tuple[DiffuseField, DiffuseField]:
-    """The diffuse fields of n placements, in line of sight and out of it; see `draw_diffuse_field` for `later`."""
+    """Draw the diffuse fields of n placements for LOS and NLOS; see `draw_diffuse_field` for `later`."""
     in_sight, blocked = environments
     return draw_diffuse_field(in_sight, n, rng, later), draw_diffuse_field(blocked, n, rng, later)
 
@@ -104,7 +104,7 @@ def place(size: Point, n: int, rng: np.random.Generator) -> tuple[NDArray[np.flo
 
 
 def label(blocked: bool, direct_above_threshold: bool) -> str:
-    """Propagation condition of a link."""
+    """Return the propagation condition of a link."""
     if not blocked:
         return "LOS"
     return "NLOS" if direct_above_threshold else "NDP NLOS"

@@ -1,8 +1,8 @@
-"""A DW1000-like reception: multipath to accumulator, first path, and what the radio reports beside it.
+"""DW1000-like receiver: accumulator, first path and diagnostics from multipath.
 
-Channel 2, PRF 64 MHz. The range error is not drawn from a distribution: it is where the leading-edge
-detector finds the first path, less where the straight line would have put it. What was fitted to the
-EVK1000 logs, and how well, is in docs/background/how_it_works.md.
+Channel 2, PRF 64 MHz. The range error is not drawn from a distribution: it is the difference between the first path of
+the leading-edge detector and the straight-line path. docs/background/how_it_works.md describes the parameters that
+were fitted to the EVK1000 logs, and the quality of the fit.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ TAPS = 1016
 """Accumulator length: one preamble symbol at PRF 64 MHz (DW1000 user manual, section 7.2.38)."""
 
 POWER_CONSTANT_DB = 121.74
-"""A of the manual's power estimates at PRF 64 MHz (section 4.7)."""
+"""The constant A of the manual's power estimates at PRF 64 MHz (section 4.7)."""
 
 TAP_NS = SAMPLE_PERIOD_S * 1e9
 SYMBOL_S = TAPS * SAMPLE_PERIOD_S
@@ -29,16 +29,16 @@ INDEX_STEPS = 64
 """The detector reports the first path in 1/64 of a tap (FP_INDEX, section 7.2.22)."""
 
 PULSE_WIDTH_TAPS = 2.4
-"""Full width at half amplitude of a lone path, and so near the inverse of the 499.2 MHz bandwidth."""
+"""Full width at half amplitude of a single path, about the inverse of the 499.2 MHz bandwidth."""
 
 PLACE = (739.0, 751.0)
-"""Where the straight line falls in the accumulator: the middle 90 % of the logs' first paths."""
+"""Accumulator indices of the straight-line path: the middle 90 % of the logs' first paths."""
 RAYLEIGH_VARIANCE = 1.0 - math.pi / 4.0
-"""Of the magnitude of complex noise of unit power."""
+"""Standard deviation of the magnitude of complex noise of unit power."""
 
 NOISE_TAPS = slice(64, 576)
 SEARCH_FROM = 640
-"""Noise is measured well before the first path can arrive, and the search begins after it."""
+"""The noise is measured well before the earliest first path; the search begins after this region."""
 
 _SPAN = 8
 _PHASES = 64
@@ -48,11 +48,11 @@ _KERNEL_REACH = 10
 
 
 def pulse(taps: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The accumulator's response to a lone path, at `taps` from its peak; unit energy over the taps.
+    """Return the accumulator's response to a single path, at `taps` from its peak; unit energy over the taps.
 
-    Gaussian, as wide as the first path of the EVK1000 logs in line of sight: it falls off as theirs
-    does. The raised cosine that the standard's reference pulse would give has sidelobes of 12 %,
-    which the logs do not show and which the detector would take for paths.
+    A Gaussian with the width of the first path in the LOS EVK1000 logs, whose edges it matches. The raised cosine of
+    the standard's reference pulse would have sidelobes of 12 %, which the logs do not contain and which the detector
+    would detect as paths.
     """
     x = np.asarray(taps, np.float64) / PULSE_WIDTH_TAPS
     shape: NDArray[np.float64] = np.exp(-4.0 * math.log(2.0) * x * x)
@@ -72,7 +72,7 @@ _INTERPOLATE = (
 
 
 def _half_amplitude_lead() -> float:
-    """Taps from the leading edge's half-amplitude point to the peak of a lone pulse."""
+    """Return the taps from the leading edge's half-amplitude point to the peak of a single pulse."""
     lead = np.linspace(0.0, 2.0, 20001)
     return float(np.interp(-0.5, -pulse(lead) / PULSE_PEAK, lead))
 
@@ -82,8 +82,8 @@ EDGE_LEAD_TAPS = _half_amplitude_lead()
 
 @dataclass(frozen=True, slots=True)
 class Reception:
-    """What n receptions report. Levels, index and error are NaN where the frame was not received: too
-    weak for the radio, or no path above the threshold.
+    """Results of n receptions. Levels, index and error are NaN if the frame was not received: below the
+    sensitivity, or no path above the threshold.
 
     Attributes:
         samples: int16 (n, 2 TAPS), interleaved real, imaginary.
@@ -91,7 +91,7 @@ class Reception:
         preamble_count, noise_threshold: int64 (n,), RXPACC and LDE_THRESH.
         rx_power_dbm, first_path_power_dbm: float64 (n,), by the manual's formulas.
         direct_above_threshold: bool (n,), whether the direct path alone would have been detected.
-        error_m: float64 (n,), detected less straight-line path length, plus the radio's offset.
+        error_m: float64 (n,), detected minus straight-line path length, plus the radio's offset.
     """
 
     samples: NDArray[np.int16]
@@ -106,11 +106,11 @@ class Reception:
 
 @dataclass(frozen=True, slots=True)
 class Boards:
-    """In what the boards at the two ends of n links differ from others with the same chip: float64 (n,) each.
+    """Board properties of n links (both ends) that differ between boards with the same chip: float64 (n,) each.
 
     Attributes:
-        gain_db: of transmit power and both antennas, beyond those of the `Radio`.
-        noise_figure_db, preamble_symbols: as in `Radio`, in place of its own.
+        gain_db: transmit power and both antennas, relative to the `Radio`.
+        noise_figure_db, preamble_symbols: replace those of the `Radio`.
     """
 
     gain_db: NDArray[np.float64]
@@ -118,26 +118,26 @@ class Boards:
     preamble_symbols: NDArray[np.float64]
 
     def take(self, index: NDArray[np.intp]) -> Boards:
-        """The links at `index`, in that order."""
+        """Return the links at `index`, in that order."""
         return Boards(self.gain_db[index], self.noise_figure_db[index], self.preamble_symbols[index])
 
 
 @dataclass(frozen=True, slots=True)
 class Radio:
-    """A receiver and the transmitter it hears.
+    """A receiver and its transmitter.
 
     Attributes:
         tx_power_dbm: -41.3 dBm/MHz over 500 MHz.
         noise_figure_db: receiver noise and implementation loss together; gives the logs' tap noise.
-        compression_dbm: level that strong signals are compressed towards by the receiver's gain
-            control; the manual's section 4.7.1 describes the same.
-        self_noise_db: residue of the preamble's correlation, for each tap, relative to all power.
+        compression_dbm: level towards which the receiver's gain control compresses strong signals
+            (see the manual's section 4.7.1).
+        self_noise_db: residue of the preamble's correlation in each tap, relative to the total power.
         sensitivity_dbm: frames below this are lost; the DW1000 at 850 kbit/s (datasheet, section 5.3).
-        preamble_symbols: accumulated at most (1024 sent, the first ones spent on detection).
+        preamble_symbols: maximum number of accumulated symbols (1024 are sent, the first ones are used for detection).
         accumulator_limit: accumulation stops when a component reaches this.
-        noise_multiplier: NTM of LDE_CFG1; the threshold is this times the noise's standard deviation.
-        range_offset_m: mean error of uncalibrated antenna delays, as the logs have it.
-        timestamp_std_m: scatter of a range that no change of the channel explains.
+        noise_multiplier: NTM of LDE_CFG1, the factor from the noise's standard deviation to the threshold.
+        range_offset_m: mean error of uncalibrated antenna delays, from the logs.
+        timestamp_std_m: standard deviation of ranges without changes of the channel.
 
     Raises:
         ParameterError: a value is not finite or is out of its range.
@@ -170,26 +170,26 @@ class Radio:
         check_range("radio", "preamble_symbols", self.preamble_symbols, 16, 4096, whole=True)
 
     def boards(self, n: int) -> Boards:
-        """n links between boards that are all alike."""
+        """Return the properties of n links between identical boards."""
         return Boards(np.zeros(n), np.full(n, self.noise_figure_db), np.full(n, float(self.preamble_symbols)))
 
     @staticmethod
     def noise_level_dbm(noise_figure_db: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Thermal noise of one tap over one symbol, on the scale of the paths' powers.
+        """Return the thermal noise of one tap over one symbol, on the scale of the paths' powers.
 
-        A matched filter's peak has a signal-to-noise ratio of P T / (k T0 F); a lone path's peak tap
-        holds pulse(0)^2 of its power.
+        A matched filter's peak has a signal-to-noise ratio of P T / (k T0 F); the peak tap of a single path
+        contains pulse(0)^2 of its power.
         """
         per_symbol = BOLTZMANN_290K_DBM_HZ - 10.0 * math.log10(SYMBOL_S) + 20.0 * math.log10(PULSE_PEAK)
         return per_symbol + noise_figure_db
 
     def least_dbm(self, boards: Boards) -> NDArray[np.float64]:
-        """The weakest frames that are received: as much weaker as a longer preamble and less noise allow."""
+        """Return the sensitivity of each link; a longer preamble and less noise improve it."""
         longer = 10.0 * np.log10(boards.preamble_symbols / self.preamble_symbols)
         return self.sensitivity_dbm - longer + (boards.noise_figure_db - self.noise_figure_db)
 
     def compression(self, power: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Gain, as amplitude, of frames with so much power (sum of squares for each symbol squared)."""
+        """Return the amplitude gain of frames with the given power (sum of squares for each symbol squared)."""
         limit = 10.0 ** ((self.compression_dbm + POWER_CONSTANT_DB) / 20.0)
         gain: NDArray[np.float64] = (1.0 + (np.sqrt(power) / limit) ** 1.5) ** (-1.0 / 1.5)
         return gain
@@ -197,15 +197,15 @@ class Radio:
     def direct_margin_db(
         self, direct_db: NDArray[np.float64], diffuse_db: NDArray[np.float64], boards: Boards
     ) -> NDArray[np.float64]:
-        """About how far a direct path will lie above the threshold: what `receive` finds, before it is run.
+        """Predict the level of the direct path above the threshold, without running `receive`.
 
         Args:
-            direct_db, diffuse_db: of the direct path and of all others, relative to what was sent, (n,).
+            direct_db, diffuse_db: power of the direct path and of all others relative to the transmit power, (n,).
         """
         sent = self.tx_power_dbm + boards.gain_db + POWER_CONSTANT_DB
         direct, diffuse = (10.0 ** ((sent + power) / 10.0) for power in (direct_db, diffuse_db))
         power = direct + diffuse
-        # The strongest of the other paths holds about a tenth of them.
+        # The strongest of the other paths has about a tenth of their power.
         peak = PULSE_PEAK * np.sqrt(np.maximum(direct, 0.1 * diffuse)) * self.compression(power)
         count = np.minimum(self.accumulator_limit / np.maximum(peak, 1e-9), boards.preamble_symbols)
         thermal = 10.0 ** ((self.noise_level_dbm(boards.noise_figure_db) + POWER_CONSTANT_DB) / 10.0)
@@ -236,12 +236,12 @@ class Radio:
         symbol *= gain[:, None].astype(np.float32)
 
         peak = np.maximum(components.max(axis=1), -components.min(axis=1)).astype(np.float64)
-        # A strong signal fills the accumulator in fewer symbols; at least one is always taken.
+        # A strong signal fills the accumulator in fewer symbols, but in at least one.
         most = np.minimum(self.accumulator_limit / np.maximum(peak, 1e-9), boards.preamble_symbols)
         count = np.maximum(most, 1.0).astype(np.int64)
 
         thermal = 10.0 ** ((self.noise_level_dbm(boards.noise_figure_db) + POWER_CONSTANT_DB) / 10.0)
-        # Thermal noise adds up in power over the symbols, the preamble's own residue in amplitude.
+        # Over the symbols, thermal noise adds up in power, the residue of the preamble in amplitude.
         noise = thermal * count * gain * gain + power * count**2.0 * 10.0 ** (self.self_noise_db / 10.0)
         accumulator = rng.standard_normal(components.shape, dtype=np.float32)
         accumulator *= np.sqrt(noise / 2.0).astype(np.float32)[:, None]
@@ -288,7 +288,7 @@ def _place_paths(position: NDArray[np.float64], gain: NDArray[np.complex128]) ->
 
 
 def noise_threshold(magnitude: NDArray[np.float32], multiplier: float) -> NDArray[np.int64]:
-    """LDE_THRESH of (n, TAPS) magnitudes: the noise's standard deviation times NTM, at least 1."""
+    """Return LDE_THRESH of (n, TAPS) magnitudes: the noise's standard deviation times NTM, at least 1."""
     deviation = magnitude[:, NOISE_TAPS].std(axis=1)
     threshold: NDArray[np.int64] = np.clip(np.rint(multiplier * deviation), 1, 65535).astype(np.int64)
     return threshold
@@ -297,11 +297,10 @@ def noise_threshold(magnitude: NDArray[np.float32], multiplier: float) -> NDArra
 def detect_first_path(
     taps: NDArray[np.complex64], magnitude: NDArray[np.float32], threshold: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """The first path's index for (n, TAPS) accumulators, float64 (n,); NaN where nothing is found.
+    """Return the first-path index of (n, TAPS) accumulators, float64 (n,); NaN if no path is found.
 
-    The first tap above the threshold starts the edge; on the interpolated magnitude around it, the
-    edge's first maximum is sought and the index is where the edge reaches half of it, so that the
-    index depends little on how strong the path is or on what follows it.
+    The edge starts at the first tap above the threshold. The index is where the interpolated magnitude reaches half of the
+    edge's first maximum, so that it hardly depends on the strength of the path and on later paths.
     """
     above = magnitude[:, SEARCH_FROM:] > threshold[:, None]
     found = above.any(axis=1)
@@ -311,7 +310,7 @@ def detect_first_path(
     near = taps[rows[:, None], crossing[:, None] + _NEAR]
     fine = np.hypot(near.real @ _INTERPOLATE, near.imag @ _INTERPOLATE)
 
-    # The edge may pass the threshold between the tap before and the crossing one.
+    # The edge may cross the threshold between the previous tap and the first one above it.
     rising = fine[:, 1:-1]
     peaked = (rising >= threshold[:, None]) & (rising >= fine[:, 2:])
     peaked[:, : (-1 - _EDGE_TAPS[0]) * _EDGE_STEPS] = False
@@ -332,10 +331,10 @@ def detect_first_path(
 def power_levels(
     magnitude: NDArray[np.float32], index: NDArray[np.float64], count: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Receive and first-path level, dBm (DW1000 user manual, section 4.7), NaN where index is NaN.
+    """Return receive and first-path level, dBm (DW1000 user manual, section 4.7), NaN where index is NaN.
 
     RSL = 10 log10(C 2^17 / N^2) - A and FSL = 10 log10((F1^2 + F2^2 + F3^2) / N^2) - A, with C the
-    power over all taps less that of the noise, in units of 2^17, F1 to F3 the magnitudes one to three
+    power over all taps minus the noise power, in units of 2^17, F1 to F3 the magnitudes one to three
     taps after the index, and N the preamble count.
     """
     energy = np.einsum("ij,ij->i", magnitude, magnitude, dtype=np.float64)

@@ -1,7 +1,7 @@
-"""Five environments shaped like DeepUWB's, and the obstacles that are put between antennas in them.
+"""Five environments like those of DeepUWB, with obstacles between the antennas.
 
-Sizes are those that the paper gives (section III-A) or, where it gives none, assumed; so is how often
-something stands between the antennas. Nothing here was fitted to DeepUWB or to what a network makes of it.
+Sizes come from the paper (section III-A) or are assumptions; the frequency of obstacles is an assumption.
+No value was fitted to DeepUWB or to the results of a network on it.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from uwb_mitigation.sources.simulation.scene import (
 
 @dataclass(frozen=True, slots=True)
 class Obstacle:
-    """What is put between two antennas.
+    """An obstacle between two antennas.
 
     Attributes:
-        name: as DeepUWB calls it.
-        material: of a slab that the path goes through; None = opaque, and gone around.
-        thickness_m, width_m: bounds, of which each placement draws its own.
+        name: name in DeepUWB.
+        material: of a slab that the path goes through; None = opaque, the path is diffracted around it.
+        thickness_m, width_m: bounds of the random values of each placement.
     """
 
     name: str
@@ -43,7 +43,7 @@ class Obstacle:
     width_m: tuple[float, float] = (0.8, 1.4)
 
 
-# Materials beyond ITU-R P.2040-1's are assumed: foam, hard plastic, and a box of cardboard with goods in it.
+# Materials that are not in ITU-R P.2040-1 are assumptions: foam, hard plastic, and a cardboard box with goods.
 OBSTACLES = (
     Obstacle("wall", BRICK, (0.10, 0.25), (6.0, 12.0)),
     Obstacle("polystyrene plate", Material("polystyrene", 1.03, 0.0001), (0.05, 0.20)),
@@ -56,13 +56,13 @@ OBSTACLES = (
     Obstacle("glass plate", GLASS, (0.004, 0.012)),
     Obstacle("metal window", None, width_m=(1.0, 2.0)),
 )
-"""In the order of DeepUWB's column `Obstacles`."""
+"""Obstacles in the order of DeepUWB's column `Obstacles`."""
 
 HOW_MANY = (0.35, 0.45, 0.20)
-"""Probabilities that none, one or two of them stand in a path."""
+"""Probabilities of zero, one and two obstacles in a path."""
 
 WALL = 0
-"""Of `OBSTACLES`: what divides the cross-room measurements."""
+"""Index in `OBSTACLES` of the wall in the cross-room measurements."""
 
 NEAR_END, SLANT, OFF_CENTRE = 0.2, math.radians(30.0), 0.3
 """An obstacle stands between `NEAR_END` of the path and as much before its end, at most so far from square to it,
@@ -74,9 +74,9 @@ class Room:
     """One environment.
 
     Attributes:
-        name: for people. size: m.
-        in_sight, blocked: the diffuse field where nothing stands between the antennas, and where something does.
-        divided: a wall always stands between them.
+        name: display name. size: m.
+        in_sight, blocked: the diffuse field without and with obstacles between the antennas.
+        divided: there is always a wall between them.
     """
 
     name: str
@@ -87,15 +87,15 @@ class Room:
 
 
 def _mean_free_path_m(size: Point) -> float:
-    """Of rays in a rectangle: pi area / perimeter (Kosten, 1960)."""
+    """Return the mean free path of rays in a rectangle: pi area / perimeter (Kosten, 1960)."""
     return math.pi * size[0] * size[1] / (2.0 * (size[0] + size[1]))
 
 
 def _furnished(name: str, size: Point) -> Room:
-    """A room in which decays and delays of the residential field shrink with the mean free path.
+    """Return a room whose decays and delays are the residential ones scaled with the mean free path.
 
-    An obstacle takes the direct path only: the room's reflections come as loud as without it, the first of
-    them after a delay.
+    An obstacle attenuates only the direct path: the reflections keep their power, and the first of them is
+    delayed.
     """
     share = _mean_free_path_m(size) / _mean_free_path_m(FLAT.size)
     in_sight = replace(
@@ -110,7 +110,7 @@ def _furnished(name: str, size: Point) -> Room:
 
 
 def _outdoor() -> Room:
-    """Few reflections: 4 dB less than in a room, the first of them from twice as far."""
+    """Return an environment with few reflections: 4 dB less than in a room, the first from twice the distance."""
     name = "outdoor"
     in_sight = replace(
         RESIDENTIAL_LOS, name=f"{name}, in sight", path_loss_1m_db=RESIDENTIAL_LOS.path_loss_1m_db + 4.0
@@ -127,11 +127,11 @@ ROOMS = (
     _furnished("small room", (5.0, 3.5)),
     _outdoor(),
 )
-"""In the order of DeepUWB's column `Room`."""
+"""Environments in the order of DeepUWB's column `Room`."""
 
 
 def draw_obstacles(room: Room, rng: np.random.Generator) -> tuple[int, ...]:
-    """Which of `OBSTACLES` stand between the antennas of one placement, ascending."""
+    """Draw the indices in `OBSTACLES` between the antennas of one placement, ascending."""
     count = int(rng.choice(len(HOW_MANY), p=HOW_MANY))
     chosen = set(rng.choice(len(OBSTACLES), count, replace=False).tolist())
     return tuple(sorted(chosen | {WALL} if room.divided else chosen))
@@ -140,7 +140,7 @@ def draw_obstacles(room: Room, rng: np.random.Generator) -> tuple[int, ...]:
 def obstruct(
     a: NDArray[np.float64], b: NDArray[np.float64], chosen: tuple[int, ...], rng: np.random.Generator
 ) -> DirectPath:
-    """What the straight line between antennas at `a` and `b`, float64 (2,) in m, meets: arrays of one row."""
+    """Return the obstacles on the line between antennas at `a` and `b`, float64 (2,) in m: arrays of one row."""
     walls, screens = [], []
     for number in chosen:
         obstacle = OBSTACLES[number]
@@ -154,5 +154,5 @@ def obstruct(
             screens.append(Screen(obstacle.name, start, end))
         else:
             walls.append(Wall(start, end, obstacle.material, thickness_m))
-    # Obstacles may reach beyond the room: what counts is that they cross the line.
+    # Obstacles may extend beyond the room; they only have to cross the line.
     return FloorPlan((1.0, 1.0), tuple(walls), tuple(screens)).direct_path(a[None], b[None])

@@ -1,7 +1,7 @@
-"""Where antennas are and what stands between them: a furnished flat in two dimensions.
+"""Two-dimensional floor plan with obstacles between antennas, such as a furnished flat.
 
-A wall is a lossy slab that the direct path goes through, slower and weaker; a screen (a metal
-cabinet, a person) is opaque, and what gets past it is diffracted around its nearer edge.
+A wall is a lossy slab that delays and attenuates the direct path; a screen (a metal cabinet, a person) is opaque,
+and the path is diffracted around its nearer edge.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class Wall:
 
 @dataclass(frozen=True, slots=True)
 class Screen:
-    """An opaque obstacle from `start` to `end` (m), which paths go around."""
+    """An opaque obstacle from `start` to `end` (m); paths are diffracted around it."""
 
     name: str
     start: Point
@@ -79,7 +79,7 @@ def _check_points(where: str, start: Point, end: Point) -> None:
 
 @dataclass(frozen=True, slots=True)
 class DirectPath:
-    """What n direct paths meet: float64 (n,) loss in dB and extra optical length in m; int64 (n,)
+    """Effects of obstacles on n direct paths: float64 (n,) loss in dB and extra optical length in m; int64 (n,)
     number of obstacles crossed."""
 
     loss_db: NDArray[np.float64]
@@ -87,12 +87,12 @@ class DirectPath:
     crossings: NDArray[np.int64]
 
     def take(self, index: NDArray[np.intp]) -> DirectPath:
-        """The paths at `index`, in that order."""
+        """Return the paths at `index`, in that order."""
         return DirectPath(self.loss_db[index], self.excess_m[index], self.crossings[index])
 
     @classmethod
     def joined(cls, paths: Sequence[DirectPath]) -> DirectPath:
-        """All of `paths`, one or more, one after the other."""
+        """Concatenate `paths`, one or more."""
         loss, excess, crossings = zip(*((p.loss_db, p.excess_m, p.crossings) for p in paths), strict=True)
         return cls(np.concatenate(loss), np.concatenate(excess), np.concatenate(crossings))
 
@@ -106,7 +106,7 @@ class FloorPlan:
     screens: tuple[Screen, ...] = ()
 
     def direct_path(self, a: NDArray[np.float64], b: NDArray[np.float64]) -> DirectPath:
-        """What the straight lines between antennas at `a` and `b`, float64 (n, 2) in m, meet."""
+        """Return the obstacles on straight lines between antennas at `a` and `b`, float64 (n, 2) in m."""
         loss, excess = np.zeros(len(a)), np.zeros(len(a))
         crossings = np.zeros(len(a), np.int64)
         for wall in self.walls:
@@ -125,16 +125,16 @@ class FloorPlan:
 
 
 def through_slab(wall: Wall, cosine: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Loss (dB) and extra optical length (m) of a path through a slab, `cosine` that of its incidence.
+    """Return loss (dB) and extra optical length (m) of a path through a slab; `cosine`: of the angle of incidence.
 
-    Absorption along the refracted path, plus both faces' reflection at normal incidence; the length
-    is t (sqrt(eps - sin^2) - cos), which is (sqrt(eps) - 1) t head on. Reflections inside the slab
-    are left out.
+    The loss is the absorption along the refracted path plus the reflection of both faces at normal incidence. The length
+    is t (sqrt(eps - sin^2) - cos), or (sqrt(eps) - 1) t at normal incidence. Reflections inside the slab
+    are neglected.
     """
     root = math.sqrt(wall.material.permittivity)
     sine_squared = 1.0 - cosine * cosine
     inside = np.sqrt(1.0 - sine_squared / wall.material.permittivity)
-    # 4.343 dB per neper of power, sigma Z0 / sqrt(eps) nepers of power a metre.
+    # 4.343 dB per neper of power, sigma Z0 / sqrt(eps) nepers of power per metre.
     per_metre = 4.343 * wall.material.conductivity * FREE_SPACE_IMPEDANCE_OHM / root
     reflected = ((root - 1.0) / (root + 1.0)) ** 2
     loss = per_metre * wall.thickness_m / inside - 20.0 * math.log10(1.0 - reflected)
@@ -142,7 +142,7 @@ def through_slab(wall: Wall, cosine: NDArray[np.float64]) -> tuple[NDArray[np.fl
 
 
 def knife_edge_loss_db(detour_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Diffraction loss around an edge that makes the path longer by `detour_m` (ITU-R P.526-15,
+    """Return the diffraction loss at an edge that lengthens the path by `detour_m` (ITU-R P.526-15,
     section 4.1, with v = 2 sqrt(detour / wavelength))."""
     v = 2.0 * np.sqrt(np.maximum(detour_m, 0.0) / WAVELENGTH_M) - 0.1
     loss: NDArray[np.float64] = 6.9 + 20.0 * np.log10(np.sqrt(v * v + 1.0) + v)
@@ -177,7 +177,7 @@ def _detour(a: NDArray[np.float64], b: NDArray[np.float64], edge: Point) -> NDAr
 FLAT = FloorPlan(
     size=(7.6, 6.8),
     walls=(
-        # Load-bearing concrete, with a doorway in each wall or past its end.
+        # Load-bearing concrete walls, each with a doorway in the wall or at its end.
         Wall((0.0, 3.6), (3.0, 3.6), CONCRETE, 0.24),
         Wall((3.9, 3.6), (7.6, 3.6), CONCRETE, 0.24),
         Wall((4.6, 3.6), (4.6, 5.8), CONCRETE, 0.20),
@@ -195,13 +195,13 @@ FLAT = FloorPlan(
         Screen("person", (3.9, 1.6), (4.3, 1.85)),
     ),
 )
-"""The default scene: the size of the apartment of the EVK1000 logs, in panel-built concrete, with two
-metal cabinets and a person standing."""
+"""The default scene: a concrete-panel flat of the size of the apartment in the EVK1000 logs, with two
+metal cabinets and a standing person."""
 
 ANCHORS: tuple[Point, ...] = ((1.6, 1.8), (5.9, 1.4), (5.6, 5.3), (1.3, 5.4))
 
 MORE_ANCHORS: tuple[Point, ...] = ((0.3, 0.3), (7.3, 6.5), (7.3, 0.3), (3.7, 3.4))
-"""Further ones, for drives past five to eight."""
+"""Additional anchors, for drives with five to eight."""
 
 ROUTE: tuple[Point, ...] = (
     (3.4, 0.9), (4.6, 1.0), (4.6, 3.0), (6.5, 3.1), (6.6, 1.3), (6.3, 3.0), (3.5, 2.9),
@@ -212,10 +212,10 @@ ROUTE: tuple[Point, ...] = (
 
 
 def along_route(route: tuple[Point, ...], travelled_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Positions float64 (n, 2) after `travelled_m` on a closed route, its corners rounded.
+    """Return positions float64 (n, 2) after `travelled_m` on a closed route with rounded corners.
 
-    Each position is the mean over half a metre of the polygon around it, which bends a corner into
-    a curve.
+    Each position is the mean of the polygon over half a metre around it, which rounds the
+    corners.
     """
     corners = np.asarray([*route, route[0]])
     reached = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(corners, axis=0).T))])
