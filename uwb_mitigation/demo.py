@@ -75,7 +75,7 @@ def offset_of(source: Source) -> float | None:
 
 
 def recorded(path: Path, rate: float) -> Programme:
-    """Return the programme of a recording; its default rate lets it take about 15 s."""
+    """Return the demo of a recording; at the default rate it lasts about 15 s."""
     from uwb_mitigation.sources.mcap import McapRecording
     from uwb_mitigation.sources.opening import open_recording
 

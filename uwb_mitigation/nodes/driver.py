@@ -87,11 +87,11 @@ class Driver(ManagedNode):
 
     Args:
         ended: set when a replay has ended.
-        consumer: in the same process, takes the measurements; `/uwb/range_raw` is then published only if it has subscribers.
+        consumer: in-process consumer of measurements; `/uwb/range_raw` is then published only if it has subscribers.
         foreign: see `ManagedNode`.
 
     Attributes:
-        exit_code: of the process, once `ended` is set.
+        exit_code: exit code of the process; valid when `ended` is set.
     """
 
     def __init__(
@@ -262,7 +262,7 @@ class Driver(ManagedNode):
             )
 
     def _finish(self, error: UwbMitigationError | None) -> None:
-        """End the node after everything was acknowledged."""
+        """End the node after all messages are acknowledged."""
         self._ranges.wait_for_all_acked(Duration(seconds=5))
         if self._consumer is not None:
             self._consumer.wait_for_all_acked(Duration(seconds=5))

@@ -46,7 +46,7 @@ def plain_errors(function: Callable[[Any], list[Any]]) -> Callable[[Any], list[A
 def arguments(nodes: Iterable[str]) -> dict[str, dict[str, Parameter]]:
     """Return the arguments of a launch file, {argument: {node: parameter}}.
 
-    An argument has the name of its parameter and is for every node with that parameter. If parameters of
+    An argument has the name of its parameter and applies to every node with that parameter. If parameters of
     one name differ in their defaults, they are different parameters: the later node's argument is NODE_PARAMETER.
     """
     found: dict[str, dict[str, Parameter]] = {}

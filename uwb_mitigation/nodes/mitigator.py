@@ -63,7 +63,7 @@ class Mitigator(ManagedNode):
     process with their driver, through `correct`.
 
     Args:
-        subscribe: take ranges from the topic.
+        subscribe: whether to subscribe to the topic of raw ranges.
         foreign: see `ManagedNode`.
     """
 
@@ -223,7 +223,7 @@ class Mitigator(ManagedNode):
             self._prepared = model, load(model, self.value("backend"))
 
     def _swap(self, changes: list[Any]) -> None:
-        # Called after the whole set was accepted: another callback may have refused it after `_prepare`.
+        # ROS calls this after all callbacks accepted the set; one may refuse it after `_prepare`.
         prepared, self._prepared = self._prepared, None
         offsets, self._prepared_offsets = self._prepared_offsets, None
         for change in changes:

@@ -1,4 +1,4 @@
-"""Replays a recording or the simulator for the driver: pace, pause, seek, loop, and the wait for subscribers."""
+"""Replay a recording or the simulator for the driver: timing, pause, seek, loop, and waiting for subscribers."""
 
 from __future__ import annotations
 
@@ -47,11 +47,11 @@ class Pace:
         self._offset_ns: int | None = None
 
     def now_ns(self) -> int:
-        """Return the time of the pace."""
+        """Return the time of the replay clock."""
         return self._stamp_now_ns() if self._simulated else time.monotonic_ns()
 
     def stamp_ns(self, pace_ns: int) -> int:
-        """Return the time on the node's clock for a time of the pace; intervals are the same on both."""
+        """Convert a time of the replay clock to the node's clock; intervals are the same on both."""
         if self._simulated:
             return pace_ns
         offset_ns, uncertainty_ns = self._read_both()
@@ -212,7 +212,7 @@ class ReplayFeed:
         """Play until the source ends or a seek is requested.
 
         Returns:
-            Whether the source has any record, and when the next one is due, in played time.
+            Whether the source has any record, and the played time at which the next one is due.
         """
         first_ns: int | None = None
         last_ns: int | None = None
@@ -272,11 +272,11 @@ class ReplayFeed:
             self._stopping.wait(TICK_S if self._paused else min(ahead_ns / 1e9, TICK_S))
 
     def _clock_ns(self, due_ns: int) -> int:
-        """Return when a played time is due, on the clock of the pace."""
+        """Return the time of the replay clock at which a played time is due."""
         return self._base_clock_ns + int((due_ns - self._base_ns) / self._rate)
 
     def _position_ns(self, now_ns: int) -> int:
-        """Return the played time at a time of the clock."""
+        """Return the played time at a time of the replay clock."""
         if self._paused:
             return self._base_ns
         return self._base_ns + int((now_ns - self._base_clock_ns) * self._rate)

@@ -46,7 +46,7 @@ SEARCH_S = 0.5
 """Interval of the search for new topics."""
 
 TAKE_S = 0.1
-"""Interval at which ranges are taken from their queues; only the last `_QOS.depth` are shown."""
+"""Interval at which the queued ranges are read; only the last `_QOS.depth` are shown."""
 
 
 class Viewer(ManagedNode):
@@ -133,7 +133,7 @@ class Viewer(ManagedNode):
             self._others[topic] = self.until_close(made, self.destroy_subscription)
 
     def _subscribe_ranges(self, kind: type, topic: str) -> None:
-        """Let ranges queue up until `_take_ranges`."""
+        """Subscribe to a topic of ranges; they are queued until `_take_ranges`."""
         if self._range_node is not None and topic not in self._ranges:
             # Resolve with the remapping arguments of this node.
             name = self.resolve_topic_name(topic)
@@ -172,7 +172,7 @@ class Viewer(ManagedNode):
                 self._subscribe(PoseWithCovarianceStamped, topic, partial(self._feed.pose, found[1]))
 
     def _missing(self) -> Missing:
-        """Return why the page is empty: which node is not running."""
+        """Return the reasons for an empty page, such as a node that is not running."""
         raw, corrected, anchors, poses = (
             self.resolve_topic_name(topic)
             for topic in (topics.RANGE_RAW, topics.RANGE_CORRECTED, topics.ANCHORS, topics.POSE)
