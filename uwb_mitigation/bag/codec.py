@@ -1,10 +1,10 @@
-"""Measurements to and from the CDR bytes of `RangeCir`, `RangeTruth` and `RangeCorrected`.
+"""Encode and decode `RangeCir`, `RangeTruth` and `RangeCorrected` in CDR.
 
-The layouts are fixed but for strings and one array, so each is a few packed blocks, and every length
-is checked before it is used. CDR aligns each value to its size, counted from the end of the four-byte
-encapsulation header (OMG DDSI-RTPS 2.5, section 10.2; OMG CDR, section 15.3). Little-endian plain CDR only:
-all that ROS 2 writes. Not a library's: `columns` reads hundreds of messages at once by these offsets, and nodes
-need no type store for them.
+The layouts are fixed except for strings and one array, so each consists of a few packed blocks. Every length
+is checked before use. CDR aligns each value to its size, counted from the end of the four-byte
+encapsulation header (OMG DDSI-RTPS 2.5, section 10.2; OMG CDR, section 15.3). Only little-endian plain CDR is
+supported, the format of ROS 2. A library is not used, because `columns` decodes batches of messages by these offsets, and
+nodes need no type store.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from uwb_mitigation.measurement import (
 )
 
 LITTLE_ENDIAN = b"\x00\x01"
-"""The encapsulation that is read and written (OMG DDSI-RTPS 2.5, section 10.2)."""
+"""The supported encapsulation (OMG DDSI-RTPS 2.5, section 10.2)."""
 _NANOSECONDS = 1_000_000_000
 
-# Each block starts on a multiple of 8, where `x` stands for CDR's own padding.
+# Each block starts at a multiple of 8; `x` is the padding of CDR.
 _PREFIX = struct.Struct("<4siII")  # encapsulation, seconds, nanoseconds, length of frame_id
 _RANGE_CIR = struct.Struct("<QQI4xQffifB3xfI")  # tag, anchor, sequence, ticks, range, Cir to sample count
 _CIR_COUNTS = struct.Struct("<HH")
@@ -45,7 +45,7 @@ _ORIGINS = {int(origin): origin for origin in Origin}
 
 
 class Key(NamedTuple):
-    """What truth and corrected ranges share with the measurement they belong to."""
+    """The fields that identify the measurement of a truth or corrected range."""
 
     stamp_ns: int
     tag_id: int
@@ -54,12 +54,12 @@ class Key(NamedTuple):
 
 
 def key_of(measurement: RangeMeasurement) -> Key:
-    """The key of a measurement."""
+    """Return the key of a measurement."""
     return Key(measurement.stamp_ns, measurement.tag_id, measurement.anchor_id, measurement.sequence)
 
 
 def encode_range(measurement: RangeMeasurement) -> bytes:
-    """`RangeCir` in CDR.
+    """Encode `RangeCir` in CDR.
 
     Raises:
         RecordingError: a value does not fit its field.
@@ -98,7 +98,7 @@ def encode_range(measurement: RangeMeasurement) -> bytes:
 
 
 def encode_truth(measurement: RangeMeasurement, truth: Truth) -> bytes:
-    """`RangeTruth` in CDR, for the measurement it belongs to.
+    """Encode `RangeTruth` in CDR for a measurement.
 
     Raises:
         RecordingError: a value does not fit its field.
@@ -114,7 +114,7 @@ def encode_truth(measurement: RangeMeasurement, truth: Truth) -> bytes:
 
 
 def encode_corrected(measurement: RangeMeasurement, corrected: CorrectedRange) -> bytes:
-    """`RangeCorrected` in CDR, for the measurement it belongs to.
+    """Encode `RangeCorrected` in CDR for a measurement.
 
     Raises:
         RecordingError: a value does not fit its field.
@@ -137,11 +137,11 @@ def encode_corrected(measurement: RangeMeasurement, corrected: CorrectedRange) -
 
 
 def decode_range(data: bytes) -> RangeMeasurement:
-    """A measurement from the CDR of `RangeCir`. Its samples are a read-only view into `data`.
+    """Decode a measurement from the CDR of `RangeCir`. Its samples are a read-only view of `data`.
 
     Raises:
-        RecordingError: the bytes are not a `RangeCir`; `what` is one of few phrases without values,
-            so that a caller can count by it.
+        RecordingError: the bytes are not a `RangeCir`; `what` is one of a few texts without values,
+            so that callers can count errors by it.
     """
     stamp_ns, frame_id, at = _decode_header(data)
     _require(data, at + _RANGE_CIR.size)
@@ -181,7 +181,7 @@ def decode_range(data: bytes) -> RangeMeasurement:
 
 
 def decode_truth(data: bytes) -> tuple[Key, Truth]:
-    """The truth in the CDR of `RangeTruth`, and the key of its measurement.
+    """Decode the truth from the CDR of `RangeTruth`, and the key of its measurement.
 
     Raises:
         RecordingError: the bytes are not a `RangeTruth`; `what` as for `decode_range`.
@@ -196,7 +196,7 @@ def decode_truth(data: bytes) -> tuple[Key, Truth]:
 
 
 def decode_corrected(data: bytes) -> tuple[Key, CorrectedRange]:
-    """The range in the CDR of `RangeCorrected`, and the key of its measurement.
+    """Decode the range from the CDR of `RangeCorrected`, and the key of its measurement.
 
     Raises:
         RecordingError: the bytes are not a `RangeCorrected`; `what` as for `decode_range`.
@@ -216,7 +216,7 @@ def decode_corrected(data: bytes) -> tuple[Key, CorrectedRange]:
 
 
 def after_frame(end: int) -> int:
-    """Where the first 8-byte field is, of a message whose frame_id ends at `end`."""
+    """Return the position of the first 8-byte field of a message whose frame_id ends at `end`."""
     return end + (4 - end) % 8
 
 
@@ -228,7 +228,7 @@ def _encode_header(measurement: RangeMeasurement) -> bytes:
 
 
 def _decode_header(data: bytes) -> tuple[int, str, int]:
-    """Stamp, frame_id, and where the first 8-byte field after the header starts."""
+    """Return stamp, frame_id, and the position of the first 8-byte field after the header."""
     _require(data, _PREFIX.size)
     encapsulation, seconds, nanoseconds, _ = _PREFIX.unpack_from(data)
     if not encapsulation.startswith(LITTLE_ENDIAN):
@@ -246,13 +246,13 @@ def _append_string(data: bytes, text: str) -> bytes:
 
 
 def _decode_string(data: bytes, at: int) -> tuple[str, int]:
-    """The string at `at`, and where it ends."""
+    """Return the string at `at`, and its end."""
     _require(data, at + _LENGTH.size)
     (length,) = _LENGTH.unpack_from(data, at)
     at += _LENGTH.size
     end = at + length
     _require(data, end)
-    # Some middleware sends an empty string without its terminator.
+    # Some middleware sends empty strings without the terminator.
     text = data[at:end]
     if text and text[-1] != 0:
         raise RecordingError("message with an unterminated string", where=f"byte {at}")

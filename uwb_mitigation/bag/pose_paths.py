@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 MAX_POSES = 2_000_000
 MOVES_M = 0.05
-"""An antenna whose position in the robot's frame changes more has no lever arm."""
+"""If an antenna's position in the robot's frame changes more, it has no constant lever arm."""
 
 HEIGHT_TYPES = (RANGE_SENSOR_TYPE, ODOMETRY_TYPE, POSE_TYPE)
 _READABLE_TYPES = tuple(dict.fromkeys((*POSITION_TYPES, TF_TYPE, *HEIGHT_TYPES)))
@@ -44,7 +44,7 @@ _Row = tuple[int, float, float, float, float, float, float, float]
 
 
 def read_truth(path: Path, topic: str = ODOMETRY_TRUTH) -> dict[int | None, TruePath]:
-    """Return the positions of tags on a topic, {tag id: path}; None: of another frame. Without the topic: empty.
+    """Return the positions of tags on a topic, {tag id: path}; None: another frame. Empty if the topic is missing.
 
     Raises:
         RecordingError: the bag cannot be read, or the topic has another type.
@@ -58,14 +58,14 @@ def read_truth(path: Path, topic: str = ODOMETRY_TRUTH) -> dict[int | None, True
 
 
 def read_bodies(path: Path, topic: str, frames: tuple[str, str] | None = None) -> dict[str, PosePath]:
-    """The poses of each child frame on a topic, in the anchors' frame.
+    """Return the poses of each child frame on a topic, in the anchors' frame.
 
     Args:
         topic: of `POSITION_TYPES`, or /tf.
         frames: the anchors' frame and the robot's, such as map and base_link. Needed for /tf.
 
     Returns:
-        {child frame: poses}; of a type without a child frame, the key is empty.
+        {child frame: poses}; the key is empty for a type without a child frame.
 
     Raises:
         RecordingError: the bag cannot be read, has no such topic or frame, or its messages cannot be used.
@@ -91,7 +91,7 @@ def read_bodies(path: Path, topic: str, frames: tuple[str, str] | None = None) -
 
 
 def _bodies(bag: BagReader, topic: str, where: str, *, oriented: bool = True) -> dict[str, PosePath]:
-    """{child frame: poses}; `oriented`: messages without an orientation are left out."""
+    """Return {child frame: poses}; `oriented`: skip messages without an orientation."""
     rows: dict[str, list[_Row]] = {}
     for decoded in _decoded(bag, [topic], where):
         pose = decoded.pose if hasattr(decoded.pose, "position") else decoded.pose.pose
@@ -105,7 +105,7 @@ def _bodies(bag: BagReader, topic: str, where: str, *, oriented: bool = True) ->
 
 
 def read_lever_arm(path: Path, base: str, frame: str) -> tuple[float, float, float] | None:
-    """Where a frame is in the robot's frame, from /tf_static and /tf; None: no such transforms.
+    """Return the pose of a frame in the robot's frame, from /tf_static and /tf; None: no such transforms.
 
     Raises:
         RecordingError: the frame moves relative to the robot.
@@ -126,7 +126,7 @@ def read_lever_arm(path: Path, base: str, frame: str) -> tuple[float, float, flo
 
 
 def _edges(bag: BagReader, topics: list[str], where: str) -> dict[str, dict[str, list[_Row]]]:
-    """{child frame: {parent frame: transforms}}."""
+    """Return {child frame: {parent frame: transforms}}."""
     edges: dict[str, dict[str, list[_Row]]] = {}
     for decoded in _decoded(bag, topics, where):
         for one in decoded.transforms:
@@ -214,7 +214,7 @@ def _store(channel: Channel, where: str) -> tuple[Typestore, str]:
 
 
 def _frame(name: str) -> str:
-    """Without the leading slash that ROS 1 wrote."""
+    """Return the frame without the leading slash of ROS 1."""
     return name.removeprefix("/")
 
 

@@ -1,6 +1,6 @@
-"""Estimates to and from the CDR bytes of standard messages: poses and odometry, in the frame of the anchors.
+"""Encode and decode estimates as standard messages in CDR: poses and odometry, in the frame of the anchors.
 
-Ranges do not observe the orientation: it is the identity, with a variance that says so. `pose_paths` reads poses from bags.
+The orientation is unobservable: it is the identity with a large variance. `pose_paths` reads poses from bags.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ UWB_TAG = "uwb_tag"
 """The frame of the only tag: at its antenna, with the axes of `MAP`."""
 
 UNOBSERVED = 1e6
-"""Variance of what ranges do not tell, rad^2 and rad^2/s^2."""
+"""Variance of unobservable values, rad^2 and rad^2/s^2."""
 
 POSITION_TYPES = (
     ODOMETRY_TYPE,
     "geometry_msgs/msg/PoseStamped",
     "geometry_msgs/msg/PoseWithCovarianceStamped",
 )
-"""Types that a position can be read from."""
+"""Message types with a position."""
 
 _NANOSECONDS = 1_000_000_000
 _PREFIX = struct.Struct("<4siII")
@@ -41,12 +41,12 @@ _TAG_FRAME = "tag_"
 
 
 def tag_frame(tag_id: int) -> str:
-    """The frame of a tag's antenna."""
+    """Return the frame of a tag's antenna."""
     return f"{_TAG_FRAME}{format_id(tag_id)}"
 
 
 def tag_of_frame(frame: str) -> int | None:
-    """The tag of a frame that `tag_frame` names, in any namespace; None for another frame."""
+    """Return the tag id in a frame name of `tag_frame`, in any namespace; None for another frame."""
     name = frame.rpartition("/")[2]
     try:
         return int(name.removeprefix(_TAG_FRAME), 0) if name.startswith(_TAG_FRAME) else None
@@ -55,7 +55,7 @@ def tag_of_frame(frame: str) -> int | None:
 
 
 def tag_topic(topic: str, tag_id: int | None) -> str:
-    """The topic of one tag: the plain one of the only tag (None), `/uwb/tag_7/pose` of others."""
+    """Return the topic of one tag: the plain topic for the only tag (None), otherwise such as `/uwb/tag_7/pose`."""
     if tag_id is None:
         return topic
     head, _, tail = topic.rpartition("/")
@@ -63,7 +63,7 @@ def tag_topic(topic: str, tag_id: int | None) -> str:
 
 
 def encode_pose(estimate: Estimate, frame_id: str = MAP) -> bytes:
-    """`geometry_msgs/PoseWithCovarianceStamped` in CDR."""
+    """Return `geometry_msgs/PoseWithCovarianceStamped` in CDR."""
     data = _header(estimate.stamp_ns, frame_id)
     data += bytes((4 - len(data)) % 8)
     return data + _pose(estimate)
@@ -83,13 +83,13 @@ def encode_odometry(estimate: Estimate, frame_id: str = MAP, child_frame_id: str
 
 
 def encode_place(position: tuple[float, float, float], tag_id: int, stamp_ns: int) -> bytes:
-    """`nav_msgs/Odometry` in CDR of where a tag truly was: without velocity, exact."""
+    """Return `nav_msgs/Odometry` in CDR with the true position of a tag: no velocity, zero variance."""
     place = Estimate(stamp_ns, np.array(position), np.zeros(3), np.zeros((6, 6)))
     return encode_odometry(place, child_frame_id=tag_frame(tag_id))
 
 
 def decode_place(data: bytes) -> tuple[int, int, tuple[float, float, float]] | None:
-    """Stamp, tag and position in the CDR of an Odometry such as `encode_place` makes; None = of another frame.
+    """Decode stamp, tag and position from the CDR of an Odometry of `encode_place`; None = another frame.
 
     Raises:
         RecordingError: the bytes are not an Odometry.

@@ -91,8 +91,8 @@ class _FileIndex:
         schemas, channels: by id.
         metadata: metadata records by name.
         messages: number of messages.
-        bounds_ns: first and last log time of messages that are not in chunks; None if there are none.
-        damage: (byte offset, description) of the first damage; None if none is known.
+        bounds_ns: first and last log time of messages that are not in chunks; None without such messages.
+        damage: (byte offset, description) of the first known damage, or None.
         warnings: {kind: count}.
     """
 
@@ -144,11 +144,11 @@ class BagReader:
 
     Attributes:
         files: the files of the bag, in order.
-        metadata: the MCAP metadata records, {name: {key: value}}; of several files, the first wins.
+        metadata: the MCAP metadata records, {name: {key: value}}; the first file takes precedence.
         oddities: warnings, {kind: count}.
 
     Raises:
-        RecordingError: the path is absent, unreadable, or no MCAP bag; the message says which.
+        RecordingError: the path is missing, unreadable, or not an MCAP bag.
     """
 
     def __init__(self, path: Path) -> None:
@@ -371,7 +371,7 @@ def _summary(file: _BoundedFile) -> _FileIndex | None:
         return None
     file.seek(footer.summary_start)
     data = file.read(file.size - footer.summary_start)
-    # The checksum covers the footer up to itself; 0: there is none.
+    # The checksum covers the footer before the checksum; 0: no checksum.
     if footer.summary_crc not in (0, zlib.crc32(data[: -MAGIC_SIZE - 4])):
         raise McapError("the index fails its checksum")
     found = _FileIndex()

@@ -1,4 +1,4 @@
-"""`metadata.yaml`, by which rosbag2 knows a bag: which files a folder holds, and what is in them."""
+"""`metadata.yaml` of rosbag2: the files of a bag folder and their contents."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from uwb_mitigation.files import read_bounded
 
 METADATA_NAME = "metadata.yaml"
 VERSION = 9
-"""Of rosbag2's metadata, as Jazzy writes it."""
+"""Version of rosbag2's metadata in Jazzy."""
 
 MAX_METADATA = 4 << 20
-"""Ceiling of a `metadata.yaml`, bytes."""
+"""Maximum size of a `metadata.yaml`, bytes."""
 
 NO_QOS = "[]"
-"""No recorded quality of service: `ros2 bag play` then offers its default (reliable, volatile)."""
+"""No recorded QoS: `ros2 bag play` offers its default (reliable, volatile)."""
 
 
 @dataclass(frozen=True, slots=True)
 class TopicCount:
-    """A topic of a bag and how many messages it holds."""
+    """A topic of a bag and its number of messages."""
 
     topic: str
     type_name: str
@@ -36,11 +36,11 @@ class TopicCount:
 
 
 def recorded_qos(text: str) -> list[dict[str, Any]]:
-    """The offered quality of service that a channel's metadata holds, as this metadata version spells it.
+    """Return the offered QoS in a channel's metadata, in the format of this metadata version.
 
-    Earlier versions of rosbag2 write numbers for names. Empty where nothing can be made of it.
+    Earlier versions of rosbag2 write numbers instead of names. Empty if it cannot be parsed.
     """
-    # Only where a bag is copied: it takes a quarter of the time that a driver takes to start.
+    # Import only if a bag is copied: the import takes a quarter of the start-up time of a driver.
     from rosbags.rosbag2.errors import ReaderError
     from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 
@@ -53,7 +53,7 @@ def recorded_qos(text: str) -> list[dict[str, Any]]:
 def describe(
     file_name: str, topics: Sequence[TopicCount], first_ns: int, last_ns: int, custom: Mapping[str, str]
 ) -> dict[str, Any]:
-    """What `metadata.yaml` says of a bag of one file, below its only key."""
+    """Return the content of `metadata.yaml` below its only key, for a bag of one file."""
     start = {"nanoseconds_since_epoch": first_ns}
     duration = {"nanoseconds": last_ns - first_ns}
     total = sum(topic.messages for topic in topics)
@@ -86,12 +86,12 @@ def describe(
 
 
 def dump(document: Mapping[str, Any] | Sequence[Any]) -> str:
-    """YAML in the order of the keys, without anchors, which rosbag2 does not write either."""
+    """Return YAML in the order of the keys and, like rosbag2, without YAML anchors."""
     return yaml.dump(document, Dumper=_Plain, sort_keys=False, allow_unicode=True)
 
 
 def described_files(folder: Path) -> list[str] | None:
-    """The file names that `folder/metadata.yaml` lists; None = there is no such file.
+    """Return the file names in `folder/metadata.yaml`; None = there is no such file.
 
     Raises:
         RecordingError: it cannot be read, is malformed, or describes storage other than MCAP.
@@ -120,10 +120,10 @@ def described_files(folder: Path) -> list[str] | None:
 
 
 def bag_files(path: Path) -> list[Path]:
-    """The MCAP files of a bag, in order: of a folder those that `metadata.yaml` lists, else every `*.mcap`.
+    """Return the MCAP files of a bag, in order: for a folder those in its `metadata.yaml`, otherwise every `*.mcap`.
 
     Raises:
-        RecordingError: there is nothing of that name, or no MCAP file in it.
+        RecordingError: the path does not exist or contains no MCAP file.
     """
     if not path.is_dir():
         if path.suffix == ".db3":
@@ -139,7 +139,7 @@ def bag_files(path: Path) -> list[Path]:
         names = sorted(found, key=_natural)
         if not names and any(path.glob("*.db3")):
             raise _foreign_storage(path, "sqlite3")
-    # A listed name is taken within the folder only, whatever path stands before it.
+    # Ignore the directory part of a listed name: the file must be in this folder.
     files = [path / name for name in names if name]
     if not files:
         raise RecordingError("the folder holds no MCAP file", where=str(path))
@@ -150,7 +150,7 @@ def bag_files(path: Path) -> list[Path]:
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
-    """Sorts bag_10 after bag_9."""
+    """Return a natural sort key: bag_10 follows bag_9."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"([0-9]+)", name)]
 
 

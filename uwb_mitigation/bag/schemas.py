@@ -1,7 +1,7 @@
-"""The text, hash and field layout of the message types in a bag.
+"""Text, hash and field layout of the message types in a bag.
 
-The texts are the `.msg` files of the interface package, which this package carries as data; a schema
-found in a foreign bag is compared with them field by field before a message of it is decoded.
+The texts are the `.msg` files of the interface package, which are package data. The schema of
+another bag is compared with them field by field before its messages are decoded.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 PACKAGE = "uwb_mitigation_msgs"
 SEPARATOR = "=" * 80
-"""Stands between the sections of a `ros2msg` schema (MCAP format registry, "ros2msg")."""
+"""Separator of the sections of a `ros2msg` schema (MCAP format registry, "ros2msg")."""
 
 _NESTED = {
     RANGE_CIR_TYPE: ("Cir",),
@@ -26,12 +26,12 @@ _NESTED = {
 }
 
 Layout = dict[str, list[tuple[str, str]]]
-"""The fields of a message and of every message in it: {section: [(type, name), ...]}."""
+"""Fields of a message and of its nested messages: {section: [(type, name), ...]}."""
 
 
 @lru_cache(maxsize=1)
 def typestore() -> Typestore:
-    """The types of ROS 2 Jazzy together with ours, for the `rosbags` library."""
+    """Return the types of ROS 2 Jazzy and of this project, for the `rosbags` library."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS2_JAZZY)
@@ -44,7 +44,7 @@ def typestore() -> Typestore:
 
 @lru_cache(maxsize=8)
 def definition(type_name: str) -> str:
-    """The `ros2msg` schema of one of our types, or of a standard one: its text, then that of every type it uses."""
+    """Return the `ros2msg` schema of a type of this project or a standard type: its text, then those of all nested types."""
     if type_name not in _NESTED:
         standard, _ = typestore().generate_msgdef(type_name, ros_version=2)
         return standard
@@ -57,15 +57,15 @@ def definition(type_name: str) -> str:
 
 @lru_cache(maxsize=8)
 def type_hash(type_name: str) -> str:
-    """The RIHS01 hash that ROS 2 itself computes for a type (REP-2011)."""
+    """Return the RIHS01 hash of a type, as computed by ROS 2 (REP-2011)."""
     return typestore().hash_rihs01(type_name)
 
 
 def difference(schema: str, type_name: str) -> str | None:
-    """What differs between the fields of a foreign `schema` and those of our `type_name`.
+    """Return the difference between the fields of a `schema` and those of this project's `type_name`.
 
-    Comments and constants are left aside: they do not move a byte. None means that messages of that
-    schema decode as ours do.
+    Comments and constants are ignored, because they do not change the layout. None: messages of that
+    schema can be decoded.
     """
     found = _layout(schema)
     for section, fields in _layout(definition(type_name)).items():
@@ -88,7 +88,7 @@ def _message_text(name: str) -> str:
 
 
 def _layout(schema: str) -> Layout:
-    """Sections by name; the root's name is empty, since a schema does not state it."""
+    """Return sections by name; the root's name is empty, because a schema does not contain it."""
     layout: Layout = {"": []}
     fields = layout[""]
     for line in schema.splitlines():
@@ -103,7 +103,7 @@ def _layout(schema: str) -> Layout:
 
 
 def _full_name(type_name: str) -> str:
-    """`pkg/msg/Name` and, inside our own package, a bare `Name` both become `pkg/Name`."""
+    """Return `pkg/Name` for `pkg/msg/Name`, and for `Name` inside the same package."""
     parts = [part for part in type_name.split("/") if part != "msg"]
     if len(parts) == 1 and parts[0][:1].isupper():
         return "std_msgs/Header" if parts[0] == "Header" else f"{PACKAGE}/{parts[0]}"

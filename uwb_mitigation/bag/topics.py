@@ -1,4 +1,4 @@
-"""The topics that this package writes, and their types."""
+"""Topics written by this package, and their types."""
 
 RANGE_RAW = "/uwb/range_raw"
 RANGE_TRUTH = "/uwb/range_truth"
@@ -9,7 +9,7 @@ ODOMETRY = "/uwb/odometry"
 POSE_SMOOTHED = "/uwb/pose_smoothed"
 ANCHORS = "/uwb/anchors"
 ODOMETRY_TRUTH = "/uwb/odometry_truth"
-"""Where a tag truly was, of a recording that knows; the child frame is `tag_` and its number."""
+"""True position of a tag, if the recording contains it; the child frame is `tag_` and its number."""
 
 RANGE_CIR_TYPE = "uwb_mitigation_msgs/msg/RangeCir"
 RANGE_TRUTH_TYPE = "uwb_mitigation_msgs/msg/RangeTruth"

@@ -54,7 +54,7 @@ _NO_SCHEMA = 0
 
 
 def partial_file(path: Path) -> Path:
-    """Where the data of a bag at `path` is until the bag is whole."""
+    """Return the temporary path of a bag at `path` until the bag is complete."""
     return partial_of(_bag_file(path))
 
 
@@ -63,7 +63,7 @@ def _bag_file(path: Path) -> Path:
 
 
 class BagWriter:
-    """Writes one bag; a context manager, which finishes the bag or, on any exception, removes it.
+    """Writes one bag; a context manager that completes the bag or, on any exception, removes it.
 
     Args:
         path: one file if it ends in `.mcap`, otherwise a rosbag2 folder.
@@ -96,7 +96,7 @@ class BagWriter:
 
         if self._folder is not None and path.exists() and not path.is_dir():
             raise RecordingError("is a file, where a bag folder is wanted", where=str(path))
-        # A link that leads nowhere, too, is replaced only when asked to.
+        # Without `force`, a broken link is not replaced either.
         occupied = os.path.lexists(self.file) or (
             self._folder is not None and path.is_dir() and any(path.iterdir())
         )
@@ -115,7 +115,7 @@ class BagWriter:
     def write(self, record: Record) -> None:
         """Write a measurement to `/uwb/range_raw` and, if known, its truth to `/uwb/range_truth`.
 
-        Where the tag truly was goes to `/uwb/odometry_truth`.
+        The true position of the tag is written to `/uwb/odometry_truth`.
 
         Raises:
             RecordingError: a value does not fit its field, or the bag cannot be written.
@@ -138,22 +138,22 @@ class BagWriter:
         self.write_serialized(self._our_channel(topic, type_name), data, stamp_ns, stamp_ns)
 
     def copy_channel(self, channel: Channel) -> int:
-        """Register a channel of another bag; returns its number.
+        """Register a channel of another bag; return its number.
 
-        A channel that is the same in all but its id gets the same number: files of one bag share it.
-        Its recorded quality of service comes with it, spelt as by the current rosbag2.
+        Channels that differ only in their id get the same number, so that the files of one bag share it.
+        The recorded QoS is copied in the format of the current rosbag2.
         """
         metadata = channel.metadata | {_QOS_KEY: dump(recorded_qos(channel.metadata.get(_QOS_KEY, "")))}
         return self._add_channel(replace(channel, metadata=metadata))
 
     def corrected_channel(self) -> int:
-        """Register `/uwb/range_corrected`, for messages that are serialised already; returns its number."""
+        """Register `/uwb/range_corrected`, for serialised messages; return its number."""
         return self._our_channel(RANGE_CORRECTED, RANGE_CORRECTED_TYPE)
 
     def write_serialized(
         self, channel: int, data: bytes, log_time_ns: int, publish_time_ns: int, sequence: int = 0
     ) -> None:
-        """Write the bytes of a message untouched, to a channel that `copy_channel` or `corrected_channel` gave.
+        """Write the bytes of a message unchanged to a channel of `copy_channel` or `corrected_channel`.
 
         Raises:
             RecordingError: a time is negative, or the bag cannot be written.
@@ -238,7 +238,7 @@ class BagWriter:
     def _abandon(self) -> None:
         with contextlib.suppress(OSError):
             self._close()
-        # What cannot be removed is no reason to hide the error that led here.
+        # Do not replace the original error if the file cannot be removed.
         with contextlib.suppress(OSError):
             self._partial.unlink(missing_ok=True)
         if self._made_folder and self._folder is not None:

@@ -120,12 +120,12 @@ DETECTION_SYMBOLS = 24
 
 DETOUR_M = 4.0
 DETOUR_MOST = 3.0
-"""Behind obstacles, the delay of the first cluster is proportional to the distance, because detours scale with it: first
-the distance (m) with the environment's delay, then the maximum factor, which gives 8.1 ns (the report's program:
-8.3). An assumption; it was kept because it improved the results on the real logs (docs/background/how_it_works.md)."""
+"""Behind obstacles, the delay of the first cluster is proportional to the distance, because detours scale with it. It
+equals the environment's delay at `DETOUR_M` and is at most `DETOUR_MOST` times as long: 8.1 ns (the report's program:
+8.3). An assumption, kept because it improved the results on the real logs (docs/background/how_it_works.md)."""
 
 PLACEMENTS, BUILDINGS = 256, 4
-"""Placements per block; each block has one random generator."""
+"""Placements and buildings per block; each block has one random generator."""
 
 CANDIDATES = 16
 """Candidate placements for each one that is kept."""

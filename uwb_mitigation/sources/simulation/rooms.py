@@ -65,8 +65,8 @@ WALL = 0
 """Index in `OBSTACLES` of the wall in the cross-room measurements."""
 
 NEAR_END, SLANT, OFF_CENTRE = 0.2, math.radians(30.0), 0.3
-"""An obstacle stands between `NEAR_END` of the path and as much before its end, at most so far from square to it,
-and its middle at most this share of its width from the path."""
+"""Limits of an obstacle's pose: minimum distance from both ends as a share of the path, maximum angle from the path's
+normal, and maximum distance of its centre from the path as a share of its width."""
 
 
 @dataclass(frozen=True, slots=True)
