@@ -1,4 +1,4 @@
-"""Where a tag is, from its ranges to anchors: filter, smoothers, survey of anchors, and how good they are.
+"""Positioning of tags from ranges to anchors: filter, smoothers, survey of anchors, and evaluation.
 
-Pure estimation in metres and seconds on numpy arrays: no ROS, no files. Live nodes and recordings share it.
+Estimation in metres and seconds on NumPy arrays, without ROS and files; used by live nodes and for recordings.
 """

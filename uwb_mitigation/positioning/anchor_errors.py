@@ -256,7 +256,7 @@ def position_scatter(fit: JointFit, correction_m: NDArray[np.float64]) -> float:
     """Return the error of the horizontal positions without ground truth, RMSE in m: the jackknife over the anchors.
 
     Errors of ranges that contradict each other move the track when an anchor is left out. An error that all anchors have in
-    common is not seen.
+    common is not detected.
 
     Args:
         correction_m: float64 (n,), subtracted from each range.
@@ -278,7 +278,7 @@ def seen_by_others(fit: JointFit) -> tuple[NDArray[np.float64], NDArray[np.float
     """Return for each range the distance of its anchor from the other anchors' track, and its standard deviation."""
     links, used = fit.links, np.unique(fit.links.anchor)
     distance, sd = np.full(len(links), np.nan), np.full(len(links), np.nan)
-    # With many anchors, a few are left out at once: enough others remain.
+    # With many anchors, leave out several together: enough others remain.
     for part in (used[k::MAX_REFITS] for k in range(min(MAX_REFITS, len(used)))):
         try:
             seen = fit.without_anchors(part, links.rows @ fit.parameters)
@@ -299,7 +299,7 @@ def seen_by_others(fit: JointFit) -> tuple[NDArray[np.float64], NDArray[np.float
 
 
 def _gap_s(links: Links, received: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the time from each knot to the nearest one of its segment that still has ranges; inf: there is none."""
+    """Return the time from each knot to the nearest one of its segment that still has ranges; inf without one."""
     # Segments are moved so far apart that none is near another.
     time = links.time_s + links.knot_stretch * (float(links.time_s.max(initial=0.0)) + 1e6)
     there = time[received]

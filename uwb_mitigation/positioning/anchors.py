@@ -43,7 +43,7 @@ class Anchor:
     id: 64-bit identity.
     position: x, y, z in m.
     sd: standard deviation of each coordinate, m.
-    name: what people call it; may be empty.
+    name: display name; may be empty.
     """
 
     id: int
@@ -103,7 +103,7 @@ def parse_anchors(text: str, where: str) -> AnchorMap:
     """Parse the text of an anchors file, YAML or JSON; `where`: its name in errors.
 
     Raises:
-        ParameterError: it has another form; names entry and field.
+        ParameterError: it has another format; the message names entry and field.
     """
     if len(text) > MAX_TEXT:
         raise ParameterError(f"{len(text)} characters", where=where, valid=f"{MAX_TEXT} at most")

@@ -59,7 +59,7 @@ class FixedLag:
                 kept.popleft()
 
     def clear(self) -> None:
-        """Forget everything: the tag was lost."""
+        """Reset all states: the tag was lost."""
         self._states.clear()
         self._ranges.clear()
         self._heights.clear()
@@ -128,7 +128,7 @@ class Fleet:
     Attributes:
         anchors: those of the setting.
         tags: {tag id: tag}, in the order of their first ranges.
-        strangers: ranges of anchors that are not on the map, {anchor id: count}.
+        strangers: number of ranges from anchors that are not on the map, {anchor id: count}.
         invalid: ranges that were not finite, or negative.
     """
 

@@ -30,10 +30,10 @@ FEW = 3
 
 BIN_S = 1.0
 LEAST_S = 4.0
-"""Shorter rests are part of the motion around them."""
+"""Shorter stationary parts belong to the motion around them."""
 
 RECEIVED_AT_ONCE = 3
-"""If fewer anchors are received between pauses (median), the recording is so slow that pauses mean nothing."""
+"""If fewer anchors are received between pauses (median), the rate is too low for pauses to be significant."""
 
 GAP_S = 10.0
 """After a longer pause a tag may be anywhere."""
@@ -67,14 +67,14 @@ _STATIONARY = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stretches:
-    """Ranges of all tags, one stretch after the other.
+    """Ranges of all tags, ordered by segment.
 
     Attributes:
-        ranges: in the order of the stretches, each in the order of time; `tag_id` says nothing.
-        tag: int (n,), which of the tags each is of.
-        row: int (n,), and which of that tag's ranges.
-        of: int (n,), the stretch of each, from 0.
-        at_rest: bool (s,), of each stretch.
+        ranges: in the order of the segments, each in the order of time; `tag_id` is meaningless.
+        tag: int (n,), index of the tag of each range.
+        row: int (n,), row in the ranges of that tag.
+        of: int (n,), segment of each range, from 0.
+        at_rest: bool (s,), whether each segment is stationary.
         rise: float64 (n,), the height of the tag above the common one at each range.
     """
 
@@ -86,15 +86,15 @@ class Stretches:
     rise: NDArray[np.float64]
 
     def __len__(self) -> int:
-        """The number of stretches."""
+        """The number of segments."""
         return len(self.at_rest)
 
     def keep(self, wanted: NDArray[np.bool_]) -> Stretches:
-        """Those stretches, bool (s,)."""
+        """Return only these segments, bool (s,)."""
         return self.only(wanted[self.of])
 
     def only(self, kept: NDArray[np.bool_]) -> Stretches:
-        """Only these ranges, bool (n,), and the segments that contain them."""
+        """Return only these ranges, bool (n,), and the segments that contain them."""
         numbers, of = np.unique(self.of[kept], return_inverse=True)
         columns = (self.tag[kept], self.row[kept], of, self.at_rest[numbers], self.rise[kept])
         return Stretches(self.ranges.take(kept), *columns)
@@ -121,7 +121,7 @@ def stretches(tags: Sequence[Ranges]) -> Stretches:
 def _segments(ranges: Ranges) -> list[tuple[NDArray[np.intp], bool]]:
     """Return the rows of each segment of one tag, and whether it is at rest."""
     rows = np.arange(len(ranges))
-    # Whatever the pauses: pairs may have been recorded one after the other.
+    # Ignore pauses: pairs may have been recorded one after the other.
     if _is_sparse(ranges, rows) or _is_still(ranges, rows):
         return [(rows, True)]
     parts = np.split(rows, np.flatnonzero(np.diff(ranges.stamp_ns) > GAP_S * _SECOND_NS) + 1)
@@ -129,11 +129,11 @@ def _segments(ranges: Ranges) -> list[tuple[NDArray[np.intp], bool]]:
 
 
 def _parts(ranges: Ranges, rows: NDArray[np.intp]) -> list[tuple[NDArray[np.intp], bool]]:
-    """A stretch without silence, divided where rests begin and end."""
+    """Divide a segment without gaps at the start and end of stationary parts."""
     if _is_sparse(ranges, rows) or _is_still(ranges, rows):
         return [(rows, True)]
     number = (ranges.stamp_ns[rows] - ranges.stamp_ns[rows[0]]) // round(BIN_S * _SECOND_NS)
-    # Whether a bin and the next together hold one place: ranges of each anchor alike over both.
+    # Whether the tag has one position in a bin and the next one: the ranges of each anchor are similar.
     bins = int(number[-1]) + 1
     starts = np.searchsorted(number, np.arange(bins + 1))
     alike = np.zeros(bins, np.bool_)
@@ -158,35 +158,35 @@ def _parts(ranges: Ranges, rows: NDArray[np.intp]) -> list[tuple[NDArray[np.intp
 
 
 def _is_sparse(ranges: Ranges, rows: NDArray[np.intp]) -> bool:
-    """Whether there is no motion to be followed."""
+    """Return whether there are too few ranges per anchor to track motion."""
     return float(np.median(np.unique(ranges.anchor[rows], return_counts=True)[1])) < FEW
 
 
 def _is_still(ranges: Ranges, rows: NDArray[np.intp], least: int = FEW) -> bool:
-    """Whether the ranges of most anchors scatter by no more than noise."""
+    """Return whether the ranges of most anchors scatter only by noise."""
     anchor, value = ranges.anchor[rows], ranges.range_m[rows]
     spread = []
     for one in np.unique(anchor):
         own = value[anchor == one]
         if len(own) >= least:
             spread.append(MAD_TO_SD * float(np.median(np.abs(own - np.median(own)))))
-    # Two anchors may be at a tag's side while it passes them: of three one sees it go.
+    # While a tag moves, its ranges to two anchors may be constant, but not to three.
     return len(spread) >= 3 and float(np.quantile(spread, 0.8)) < STILL_M
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Links:
-    """What is fitted: ranges in motion one by one, those at rest as one median a pair and place.
+    """Inputs of the fit: single ranges in motion, one median per pair and stationary position.
 
     Attributes:
-        knot, anchor: int (n,), where each belongs; knots of one stretch stand together.
-        ahead_s: float64 (n,), its time after the knot's.
-        range_m, share: float64 (n,), and how much of a new range each is.
+        knot, anchor: int (n,), of each link; knots of one segment are contiguous.
+        ahead_s: float64 (n,), time of the link after its knot.
+        range_m, share: float64 (n,); the share is the number of independent ranges in a link.
         rise: float64 (n,), the height of the tag above the common one.
         rows: float64 (n, q), of the parameters.
-        alike: int (n,), links that err about as much have the same number, from 0.
+        alike: int (n,), links whose errors have the same standard deviation have the same number, from 0.
         of: int (n,), the link of each of the original ranges (r,).
-        knot_stretch: int (K,). time_s: float64 (K,), of each knot in its stretch. at_rest: bool (s,).
+        knot_stretch: int (K,). time_s: float64 (K,), of each knot in its segment. at_rest: bool (s,).
     """
 
     knot: NDArray[np.intp]
@@ -207,11 +207,11 @@ class Links:
 
     @property
     def stretch(self) -> NDArray[np.intp]:
-        """The stretch of each link, int (n,)."""
+        """The segment of each link, int (n,)."""
         return self.knot_stretch[self.knot]
 
     def without(self, left_out: NDArray[np.bool_]) -> Links:
-        """The same knots, without those links (n,); `of` is not valid any more."""
+        """Return the same knots without those links (n,); `of` becomes invalid."""
         kept = ~left_out
         columns = ("knot", "anchor", "ahead_s", "range_m", "share", "rise", "rows", "alike")
         return replace(self, **{name: getattr(self, name)[kept] for name in columns})
@@ -267,7 +267,7 @@ def links_of(stretches: Stretches, parameters: Regressors, model: Model) -> Link
 
 
 def _share(anchor: NDArray[np.intp], seconds: float, persistence_s: float) -> NDArray[np.float64]:
-    """How much of a new range each is: of a Gauss-Markov process there is one new every two time constants."""
+    """Return the share of an independent range: a Gauss-Markov process has one per two time constants."""
     _, of, count = np.unique(anchor, return_inverse=True, return_counts=True)
     independent = np.maximum(seconds / (2.0 * persistence_s), 1.0)
     share: NDArray[np.float64] = np.minimum(1.0, independent / count)[of]

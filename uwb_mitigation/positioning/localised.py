@@ -41,12 +41,12 @@ SEPARATED_M = 0.1
 """A lever arm with a larger standard deviation cannot be separated from the offsets."""
 
 BLOCK_S, UNDERSTATED = 10.0, 1.5
-"""Errors of blocks of this duration count as independent. Errors that come again with each lap are not in their scatter:
-hence the factor."""
+"""Errors of blocks of this duration count as independent. The factor accounts for errors that
+recur with each lap, which are not in their scatter."""
 
 LEVER_STEPS = 5
 MIN_SD_M = 0.01
-"""Of white noise and of persisting errors."""
+"""Standard deviations of white noise and of persisting errors."""
 
 _ITERATIONS = 40
 _FIXED_SD = 1e-9
@@ -59,8 +59,8 @@ _MODEL = Model(long=1.5, short=1.5)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosePath:
-    """Where a robot's frame was: int64 (n,) stamps in order, float64 (n, 3) positions in m, and (n, 4) unit quaternions
-    x, y, z, w that turn the robot's axes into the map's."""
+    """Poses of a robot's frame: int64 (n,) stamps in order, float64 (n, 3) positions in m, and (n, 4) unit quaternions
+    x, y, z, w that rotate the robot's axes to the map's."""
 
     stamp_ns: NDArray[np.int64]
     position: NDArray[np.float64]
@@ -70,11 +70,11 @@ class PosePath:
         return len(self.stamp_ns)
 
     def shifted(self, by_ns: int) -> PosePath:
-        """At stamps that much later."""
+        """Return the poses at stamps later by the given time."""
         return PosePath(self.stamp_ns + by_ns, self.position, self.orientation)
 
     def smoothed(self) -> PosePath:
-        """Positions from a parabola through those of `SMOOTHED_S` before and after each (Savitzky and Golay, 1964)."""
+        """Return positions from parabolas through those of `SMOOTHED_S` before and after each (Savitzky and Golay, 1964)."""
         time_s = (self.stamp_ns - self.stamp_ns[0]) / _SECOND_NS
         # Sums over neighbours of 1, t, t^2, t^3, t^4, and of the positions times the first three.
         moments, right = np.zeros((len(self), 5)), np.zeros((len(self), 3, 3))
@@ -89,7 +89,7 @@ class PosePath:
             moments[here] += powers
             right[here] += powers[:, :3, None] * self.position[here + step][:, None]
         normal = moments[:, np.add.outer(np.arange(3), np.arange(3))]
-        # Poses that bags tell twice are at too few times for a parabola.
+        # With duplicate poses there are too few different times for a parabola.
         told = (moments[:, 0] >= 5.0) & (np.linalg.cond(normal) < _WORST_CONDITION)
         position = self.position.copy()
         position[told] = np.linalg.solve(normal[told], right[told])[:, 0]
@@ -97,7 +97,7 @@ class PosePath:
 
     @classmethod
     def joined(cls, paths: Sequence[PosePath]) -> PosePath:
-        """All in the order of time."""
+        """Return all poses in the order of time."""
         stamp_ns = np.concatenate([path.stamp_ns for path in paths])
         order = np.argsort(stamp_ns, kind="stable")
         return cls(
@@ -107,7 +107,7 @@ class PosePath:
         )
 
     def interpolated(self, stamp_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64], Rotation]:
-        """Return positions (k, 3) and rotations (k,) at stamps; before the first pose and after the last as there.
+        """Return positions (k, 3) and rotations (k,) at stamps; outside, those of the first or last pose.
 
         Between two poses the quaternion is interpolated linearly and normalised: rotations are small there.
         """
@@ -123,7 +123,7 @@ class PosePath:
     def at(
         self, stamp_ns: NDArray[np.int64], later_s: float
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Positions (k, 3) and rotation matrices (k, 3, 3) at stamps + `later_s`; NaN outside, and in gaps over `GAP_S`."""
+        """Return positions (k, 3) and rotation matrices (k, 3, 3) at stamps + `later_s`; NaN outside and in gaps > `GAP_S`."""
         wanted = stamp_ns + round(later_s * _SECOND_NS)
         after = np.searchsorted(self.stamp_ns, wanted).clip(1, len(self) - 1)
         gap = self.stamp_ns[after] - self.stamp_ns[after - 1] > GAP_S * _SECOND_NS
@@ -136,14 +136,14 @@ class PosePath:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Localised:
-    """What was found.
+    """The result.
 
     Attributes:
-        time_offset_s, time_offset_sd_s: what to add to a range's stamp to have the localisation's; an sd of 0 = given.
+        time_offset_s, time_offset_sd_s: added to the stamp of a range to get that of the localisation; sd 0 = given.
         lever_arm_m, lever_arm_sd_m: (T, 3), of each tag's antenna in the robot's frame; sd 0 = given, NaN = not observable,
-            so that the start value holds.
+            so that the start value is kept.
         pairs: (tag number, anchor row), and `offset_m`, `offset_sd_m` of each.
-        position: float64 (r, 3), of the antenna at each of all ranges; NaN = not known. distance_m: (r,), to the anchor.
+        position: float64 (r, 3), of the antenna at each range; NaN = unknown. distance_m: (r,), to the anchor.
     """
 
     time_offset_s: float
@@ -157,12 +157,12 @@ class Localised:
     distance_m: NDArray[np.float64]
 
     def pair(self, tag: int, row: int, anchor_sd_m: float) -> tuple[float, float]:
-        """The offset of a pair, m, and its deviation, which an anchor that is misplaced adds to."""
+        """Return the offset of a pair, m, and its standard deviation, which includes the anchor's position error."""
         at = self.pairs.index((tag, row))
         return float(self.offset_m[at]), math.hypot(float(self.offset_sd_m[at]), anchor_sd_m / math.sqrt(2.0))
 
     def as_json(self) -> dict[str, object]:
-        """Numbers; null = not observable. The arm of the first tag, and of all in the order of their ids."""
+        """Return values for JSON; null = not observable. Lever arm of the first tag, and of all tags by their ids."""
         arms = self.lever_arm_m.tolist()
         sds = [[None if math.isnan(sd) else sd for sd in own] for own in self.lever_arm_sd_m.tolist()]
         return {
@@ -188,14 +188,14 @@ def solve_localised(
     """Estimate time offset and offsets, and on request the lever arms.
 
     Args:
-        paths: of the robot that carries the tag, for each tag.
+        paths: for each tag, the path of the robot that carries it.
         known: as many rows as there are ranges, one tag after the other.
         time_offset_s: if known.
         lever_arms_m: float64 (T, 3), of each tag; None: zero.
         estimate_lever_arm: start from these arms and estimate them.
 
     Raises:
-        DatasetError: too few ranges lie within the localisation's times, or arms and offsets cannot be separated.
+        DatasetError: too few ranges are within the localisation's times, or arms and offsets cannot be separated.
     """
     ranges = Ranges.joined(tags)
     tag = np.repeat(np.arange(len(tags)), list(map(len, tags)))
@@ -248,7 +248,7 @@ def solve_localised(
 def _poses_at(
     paths: Sequence[PosePath], tag: NDArray[np.intp], stamp_ns: NDArray[np.int64], later_s: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """`PosePath.at` of the path of each tag (n,)."""
+    """Return `PosePath.at` for the path of each tag (n,)."""
     position, turn = np.zeros((len(tag), 3)), np.zeros((len(tag), 3, 3))
     for number, path in enumerate(paths):
         own = tag == number
@@ -288,7 +288,7 @@ class _Problem:
         The lever arms are estimated for each time offset again, because with a wrong one turns look like outliers.
 
         Raises:
-            DatasetError: hardly any range lies within the localisation's times.
+            DatasetError: too few ranges are within the localisation's times.
         """
         count = min(len(self.ranges), SEARCHED)
         few = self.take(np.linspace(0, len(self.ranges) - 1, count).astype(int))
@@ -332,7 +332,7 @@ class _Problem:
     def _errors(
         self, lag: float, lever: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Range minus distance and known corrections (n,), and derivatives of the distance by the lever arm (n, 3)."""
+        """Return range minus distance and known corrections (n,), and derivatives of the distance by the lever arm (n, 3)."""
         position, turn = _poses_at(self.paths, self.tag, self.ranges.stamp_ns, lag)
         unit, distance = directions(position + np.einsum("nij,nj->ni", turn, lever[self.tag]), self.anchor)
         error = self.ranges.range_m - self.known.rows @ self.known.mean - distance
@@ -341,7 +341,7 @@ class _Problem:
     def _centred(
         self, lag: float, lever: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """`_errors`, without the median error of each pair."""
+        """Return `_errors` minus the median error of each pair."""
         error, rows = self._errors(lag, lever)
         return error - self._medians(error)[self.pair], rows
 

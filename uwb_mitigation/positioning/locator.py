@@ -210,7 +210,7 @@ class TagLocator:
         return ahead.estimate(stamp_ns)
 
     def restart(self, stamp_ns: int | None = None) -> None:
-        """Forget the position, not the statistics."""
+        """Reset the position, but not the statistics."""
         self._origin_ns = stamp_ns
         self.filter = self._last_known = None
         self._candidates, self._ambiguous_with = [], []
@@ -286,7 +286,7 @@ class TagLocator:
         return 2 if self._known_height() is not None else 3
 
     def _doubt(self, known: RangeFilter) -> None:
-        """Most anchors contradict the filter: search for a position that explains their ranges much better."""
+        """Search for a position that explains the ranges much better, after most anchors contradicted the filter."""
         found = self._places()
         if not found:
             return

@@ -145,12 +145,12 @@ class Regressors:
 
     @classmethod
     def one(cls, name: str, row: NDArray[np.float64], mean: float, sd: float) -> Regressors:
-        """A single parameter with the derivatives float64 (n,); all ranges have errors of the same kind."""
+        """Return a single parameter with the derivatives float64 (n,); all ranges have errors of the same kind."""
         return cls((name,), row[:, None], np.array([mean]), np.array([sd]), np.zeros(len(row), np.intp))
 
     @classmethod
     def none(cls, ranges: int) -> Regressors:
-        """No parameters, for that number of ranges."""
+        """Return no parameters, for that number of ranges."""
         return cls((), np.zeros((ranges, 0)), np.zeros(0), np.zeros(0), np.zeros(ranges, np.intp))
 
     @property
@@ -160,16 +160,16 @@ class Regressors:
         return inverse
 
     def take(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> Regressors:
-        """Those of the ranges at `index`."""
+        """Return the parameters for the ranges at `index`."""
         return replace(self, rows=self.rows[index], alike=self.alike[index])
 
     def only(self, kept: NDArray[np.bool_]) -> Regressors:
-        """Only the parameters `kept`, bool (q,)."""
+        """Return only the parameters `kept`, bool (q,)."""
         names = tuple(name for name, is_kept in zip(self.names, kept, strict=True) if is_kept)
         return Regressors(names, self.rows[:, kept], self.mean[kept], self.sd[kept], self.alike)
 
     def joined(self, other: Regressors) -> Regressors:
-        """These parameters, then the others; kinds of errors as here."""
+        """Return these parameters followed by the others; `alike` is unchanged."""
         return Regressors(
             self.names + other.names,
             np.concatenate([self.rows, other.rows], axis=1),

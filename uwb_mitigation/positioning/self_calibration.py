@@ -1,4 +1,4 @@
-"""Offsets of radios, and what else all ranges have in common, from ranges to known anchors without ground truth.
+"""Offsets of radios and other common parameters of ranges, estimated without ground truth from known anchors.
 
 Parameters that geometry cannot separate are not estimated: an anchor, a tag or a pair gets its own offset only if this is
 significant; otherwise all share one.
@@ -74,7 +74,7 @@ class SelfCalibration:
     Attributes:
         stretches, fit: as in `joint`. Parameters: `offset`, `anchor ROW`, `tag NUMBER`, `pair NUMBER ROW`, and the
             regressors'.
-        level: `pair`, `anchor` or `one`: what has its own offset.
+        level: `pair`, `anchor` or `one`: what has a separate offset.
         notes: messages about parameters that are not observable, and about ranges that were left out.
         tag_ids: of the tags.
         unobserved_m: the estimate of a common offset that is not significant and therefore not subtracted; 0: it is.
@@ -96,7 +96,7 @@ class SelfCalibration:
     position_scatter_m: tuple[float, float] = (np.nan, np.nan)
 
     def found_without(self, left_out: NDArray[np.bool_]) -> SelfCalibration:
-        """The same parameters and tracks from all but those of `stretches.ranges`, bool (r,); the pseudo-truth stays.
+        """Fit the same parameters and tracks without some of `stretches.ranges`, bool (r,); the pseudo-truth is unchanged.
 
         Raises:
             DatasetError: the other ranges do not determine them.
@@ -106,14 +106,14 @@ class SelfCalibration:
         return replace(self, fit=self.fit.without(links_left_out))
 
     def value(self, name: str) -> tuple[float, float]:
-        """A parameter and its standard deviation; (0, 0): it was not estimated."""
+        """Return a parameter and its standard deviation; (0, 0): it was not estimated."""
         if name not in self.fit.prior.names:
             return 0.0, 0.0
         at = self.fit.prior.names.index(name)
         return float(self.fit.parameters[at]), float(np.sqrt(self.fit.covariance[at, at]))
 
     def pair(self, tag: int, row: int) -> tuple[float, float]:
-        """The offset of a tag (its number) and an anchor (its row), m, and its standard deviation."""
+        """Return the offset of a tag (its number) and an anchor (its row), m, and its standard deviation."""
         at, sd = self._columns(tag, row), self.fit.setting.anchors.sd
         # The error of an anchor's position looks like an offset. Averaged over all directions from which the tag received it,
         # about half of its variance remains.
@@ -122,7 +122,7 @@ class SelfCalibration:
         return float(self.fit.parameters[at].sum()), float(np.sqrt(variance))
 
     def applied(self, tag: int, row: int) -> tuple[float, float]:
-        """The offset to subtract from the ranges of a tag and an anchor, m, and its standard deviation.
+        """Return the offset to subtract from the ranges of a tag and an anchor, m, and its standard deviation.
 
         If the mean of all offsets is significant, it is the estimate. Otherwise only an offset that is significant by
         itself is subtracted, and the others are 0.
@@ -155,7 +155,7 @@ class SelfCalibration:
         return [i for i, name in enumerate(self.fit.prior.names) if name in wanted]
 
     def pairs(self) -> list[tuple[int, int]]:
-        """(tag number, anchor row) of all pairs that there are ranges of."""
+        """Return (tag number, anchor row) of all pairs with ranges."""
         found = np.unique(np.stack([self.stretches.tag, self.stretches.ranges.anchor]), axis=1).T
         return [(int(tag), int(row)) for tag, row in found]
 
@@ -293,7 +293,7 @@ def _held_out_scatter(fit: JointFit) -> float:
 
 
 def candidates(found: Stretches) -> list[tuple[str, dict[str, NDArray[np.bool_]]]]:
-    """Return what may have its own offset, in the order in which it is tried: {name: which ranges}."""
+    """Return candidates for separate offsets in the order of their tests: {name: which ranges}."""
     row, tag = found.ranges.anchor, found.tag
     tried = [("anchor", {f"anchor {one}": row == one for one in np.unique(row).tolist()})]
     # The offset of a tag that stays at one position can hardly be separated from this position.

@@ -1,4 +1,4 @@
-"""The track that fits all ranges of a recording best, from ranges before and after each position.
+"""Smoothing of a track with all ranges of a recording, before and after each position.
 
 `Smoother` uses the error model of the filter: white acceleration; each range error is the sum of white noise, a persisting
 error (one process per anchor), a common offset, and an offset of each anchor. Knots are 0.1 s apart where there are ranges;
@@ -63,7 +63,7 @@ class Smoother:
     """Fits a track to ranges, together with other unknowns.
 
     Args:
-        setting: anchors, error model, and what is known of the height.
+        setting: anchors, error model, and prior knowledge of the height.
         ranges: two or more, in the order of time.
         find_anchors: also estimate the positions of the anchors.
         around: prior positions of estimated anchors and their standard deviations, float64 (m, 3) both; None: those of
@@ -246,7 +246,7 @@ def smooth(setting: Setting, ranges: Ranges, live: Track) -> Track:
     """Return positions at ten stamps a second, each from all ranges before and after it.
 
     Args:
-        setting: anchors, error model, and what is known of the tag.
+        setting: anchors, error model, and prior knowledge of the tag.
         ranges: two or more.
         live: the track of a `TagLocator` from the same ranges; not empty.
     """
@@ -338,6 +338,6 @@ def _fused(
 
 
 def _regular(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Without the zero variances of a level tag."""
+    """Return the covariances without the zero variances of a level tag."""
     regular: NDArray[np.float64] = covariance + 1e-9 * np.eye(covariance.shape[-1])
     return regular

@@ -1,4 +1,4 @@
-"""Positions from a few ranges, without a start: all positions that explain them, and least squares as a baseline."""
+"""Candidate positions from a few ranges without an initial position, and least squares as a baseline."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ IMPLAUSIBLE = 9.0
 _STEPS = 40
 _STUCK = 0.01
 _WALL_SD_M = 0.02
-"""Standard deviation of the pseudo-measurement that holds a position at the wall of the area."""
+"""Standard deviation of the pseudo-measurement that keeps a position at the boundary of the area."""
 
 _NEAR_WALL_M = 0.5
 _AROUND = 24
@@ -72,7 +72,7 @@ def places(
     x = _starts(anchors, range_m, height)
     problem = _Problem.of(len(x), anchors, range_m, sd_m, model, height)
     x, cost, gradient, hessian = problem.descend(x)
-    # A start that has not converged is no solution, unless none has.
+    # Discard starts that have not converged, unless no start has converged.
     step = np.linalg.solve(hessian + 1e-9 * np.eye(3), gradient[..., None])[..., 0]
     arrived = np.einsum("ni,ni->n", step, gradient) < _STUCK
     if arrived.any():
@@ -88,7 +88,7 @@ def places(
             return []
         outside = np.flatnonzero(keep & (excess != 0.0).any(axis=1))
         if len(outside):
-            # Optima just outside, because of range errors: find the best positions on the wall.
+            # Optima just outside, because of range errors: find the best positions on the boundary.
             wall = area.clip(x[outside])
             walls = problem.with_walls(outside, wall, excess[outside] != 0.0)
             x[outside], cost[outside], *_ = walls.descend(wall)
@@ -132,20 +132,20 @@ class _Problem:
         model: Model,
         height: Height | None,
     ) -> _Problem:
-        """The problem of that number of positions."""
+        """Return the problem for that number of positions."""
         mean, information = np.zeros((2, count, 3))
         if height is not None:
             mean[:, 2], information[:, 2] = height.value, 1.0 / height.sd**2
         return cls(anchors, range_m, sd_m, model, mean, information)
 
     def at(self, rows: NDArray[np.intp]) -> _Problem:
-        """The same ranges with the priors of those positions."""
+        """Return the same ranges with the priors of those positions."""
         return replace(self, mean=self.mean[rows], information=self.information[rows])
 
     def with_walls(
         self, rows: NDArray[np.intp], wall: NDArray[np.float64], held: NDArray[np.bool_]
     ) -> _Problem:
-        """`at`, with the coordinates `held` bool (n, 3) at the walls."""
+        """Return `at`, with the coordinates `held` bool (n, 3) at the boundary."""
         own = self.at(rows)
         information = np.where(held, 1.0 / _WALL_SD_M**2, own.information)
         return replace(own, mean=np.where(held, wall, own.mean), information=information)
@@ -153,7 +153,7 @@ class _Problem:
     def descend(
         self, x: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Levenberg-Marquardt from n starts: positions, loss, gradient and Hessian."""
+        """Run Levenberg-Marquardt from n starts; return positions, loss, gradient and Hessian."""
         damping = np.full(len(x), 1e-2)
         cost, gradient, hessian, _ = self.linearised(x)
         for _ in range(_STEPS):
@@ -172,7 +172,7 @@ class _Problem:
     def linearised(
         self, x: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Loss (n,), its gradient (n, 3), a Gauss-Newton Hessian (n, 3, 3), and weighted rows (n, k, 3) at positions x."""
+        """Return loss (n,), its gradient (n, 3), a Gauss-Newton Hessian (n, 3, 3), and weighted rows (n, k, 3) at x."""
         away = x[:, None] - self.anchors
         distance = np.sqrt(np.einsum("nki,nki->nk", away, away))
         z = (self.range_m - distance) / self.sd_m
@@ -199,7 +199,7 @@ def _starts(
     found = [anchors.mean(axis=0, keepdims=True) + 0.1]
     for i in order:
         if height is not None:
-            # Not along the axes: anchors often lie in one, where two mirror images meet in a saddle.
+            # Not along the axes: anchors are often aligned with one, where two mirror images meet in a saddle point.
             angle = 0.1 + np.arange(_AROUND) * (2.0 * np.pi / _AROUND)
             up = np.zeros_like(angle)
         else:
@@ -219,7 +219,7 @@ def snapshot(anchors: AnchorMap, ranges: Ranges, height: Height | None = None) -
     """Return the baseline: least squares on the latest range of each anchor, without motion model or robust loss.
 
     A position ten times a second, if enough anchors (two, or three without a height) were received within half a second;
-    velocities and covariances are NaN. Of several solutions the one with the least squares is chosen; the descent starts at
+    velocities and covariances are NaN. The solution with the smallest sum of squares is used; the descent starts at
     the centre of the anchors, and on all sides of it.
     """
     stamps, latest = _latest(len(anchors), ranges)

@@ -23,7 +23,7 @@ MISPLACED_M = 0.3
 """An anchor is misplaced if it is further from its guess than this and than `_UNLIKELY` standard deviations."""
 
 _UNLIKELY = 2.2
-"""In a plane an error exceeds so many root mean squares once in 126 times: exp(-2.2^2)."""
+"""In a plane, an error exceeds this multiple of its RMS with a probability of 1/126: exp(-2.2^2)."""
 
 TAPE_M = 0.1
 """Accuracy of a measured height."""
@@ -37,13 +37,13 @@ UNEXPLAINED = 0.6
 _TRIAL_NS = 60_000_000_000
 _TRIAL_RANGES = 800
 _SWAP_GAIN = 0.15
-"""A swap that is right lowers the mean loss by far more, one that is wrong raises it."""
+"""A correct swap reduces the mean loss by far more; a wrong one increases it."""
 
 _MOVES_M = 1.0
 
 _AS_WELL = 1.5
 _SAME_LOSS = 0.2
-"""Mean losses of two positions of an anchor that differ by less do not decide between them."""
+"""Mean losses of two positions of an anchor that differ by less do not distinguish them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,7 +78,7 @@ class SurveyResult:
         return self.loss < UNEXPLAINED
 
     def as_json(self) -> dict[str, object]:
-        """The keys of `survey --json`; anchors by their ids."""
+        """Return the keys of `survey --json`; anchors by their ids."""
         ids = [anchor.id for anchor in self.anchors.anchors]
         return {
             "anchors": [
@@ -203,7 +203,7 @@ def _fit(setting: Setting, ranges: Ranges) -> Smoothed:
 
 
 def _misfit(found: NDArray[np.float64], guessed: NDArray[np.float64], *, mirrored: bool) -> float:
-    """RMS distance in plan between found anchors (m, 3), or their mirror image, and the guesses."""
+    """Return the horizontal RMS distance between estimated anchors (m, 3), or their mirror image, and the guesses."""
     side = -1.0 if mirrored else 1.0
     return float(np.sqrt(np.mean(displacements(found * (side, 1.0, 1.0), guessed)[:, :2] ** 2)))
 

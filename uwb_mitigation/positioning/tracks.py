@@ -36,12 +36,12 @@ class Ranges:
         return len(self.stamp_ns)
 
     def take(self, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> Ranges:
-        """The ranges at `index`."""
+        """Return the ranges at `index`."""
         return replace(self, **{name: getattr(self, name)[index] for name in _COLUMNS})
 
     @classmethod
     def joined(cls, parts: Sequence[Ranges]) -> Ranges:
-        """All ranges, one part after the other; the tag id is 0."""
+        """Concatenate ranges; the tag id is 0."""
         columns: dict[str, Any] = {
             name: np.concatenate([getattr(one, name) for one in parts]) for name in _COLUMNS
         }
@@ -100,7 +100,7 @@ class Track:
         return (Estimate(*row) for row in zip(*columns, strict=True))
 
     def take(self, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> Track:
-        """The estimates at `index`."""
+        """Return the estimates at `index`."""
         return Track(self.stamp_ns[index], self.position[index], self.velocity[index], self.covariance[index])
 
 
@@ -157,15 +157,15 @@ ELLIPSE95 = 5.991
 
 @dataclass(frozen=True, slots=True)
 class TrackErrors:
-    """Horizontal errors of a track, m unless said.
+    """Horizontal errors of a track, in m unless stated otherwise.
 
     Attributes:
-        epochs: estimates with a truth beside them.
+        epochs: number of estimates with a known true position.
         rmse, median, p95: of the horizontal distance to the truth.
         coverage95: share of truths inside the 95 % ellipses; NaN without covariances.
-        nees_per_dof: mean normalised estimation error squared, over its two degrees of freedom: 1 is honest,
+        nees_per_dof: mean normalised estimation error squared, over its two degrees of freedom: 1 is consistent,
             more is overconfident (Bar-Shalom et al., section 5.4); NaN without covariances.
-        exceeded: share of epochs where the error in x or y was beyond its protection level; NaN likewise.
+        exceeded: share of epochs with an error in x or y above its protection level; NaN without covariances.
         height_rmse: RMSE of z.
     """
 
@@ -179,7 +179,7 @@ class TrackErrors:
     height_rmse: float
 
     def as_json(self) -> dict[str, float | int | None]:
-        """The keys of `track --json`; unknown values are null."""
+        """Return the keys of `track --json`; unknown values are null."""
         values = {_JSON_KEYS.get(key, key): value for key, value in asdict(self).items()}
         return {name: value if math.isfinite(value) else None for name, value in values.items()}
 
@@ -195,12 +195,12 @@ NO_ERRORS = TrackErrors(0, *(math.nan,) * 7)
 
 
 def track_errors(track: Track, truth: TruePath, offset_ns: int = 0) -> TrackErrors:
-    """The errors of a track at its own times.
+    """Return the errors of a track at its own times.
 
     Args:
-        track: estimates; covariances that are NaN are not judged.
+        track: estimates; NaN covariances are not evaluated.
         truth: true positions.
-        offset_ns: what to add to the track's stamps to get times of the truth.
+        offset_ns: added to the track's stamps to get times of the truth.
     """
     true = truth.at(track.stamp_ns + offset_ns)
     known = np.isfinite(true).all(axis=1)
@@ -212,7 +212,7 @@ def track_errors(track: Track, truth: TruePath, offset_ns: int = 0) -> TrackErro
 def errors_of(
     position: NDArray[np.float64], covariance: NDArray[np.float64], true: NDArray[np.float64]
 ) -> TrackErrors:
-    """The errors of n positions (n, 3) with covariances (n, d, d) beside true ones (n, 3)."""
+    """Return the errors of n positions (n, 3) with covariances (n, d, d) from true positions (n, 3)."""
     error = position[:, :2] - true[:, :2]
     distance = np.hypot(*error.T)
     plane = covariance[:, :2, :2]
