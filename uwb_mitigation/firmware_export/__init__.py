@@ -1,4 +1,4 @@
-"""From an int8 model to C that computes the same bits: exact integer constants, the header, measurement.
+"""Export of int8 models to C with bit-identical results: exact integer constants, the header, measurement.
 
-Needs numpy, and for measurement a cross compiler and an emulator; neither ROS nor torch.
+Depends on numpy and, for measurements, on a cross compiler and an emulator; not on ROS or torch.
 """

@@ -1,4 +1,4 @@
-"""Finds the firmware's sources and this computer's C compiler, and runs compilers and other tools."""
+"""Search for the firmware's sources and the host's C compiler; run compilers and other tools."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def c_compiler() -> tuple[str, ...]:
 def compile_objects(
     compiler: tuple[str, ...], options: tuple[str, ...], sources: tuple[Path, ...]
 ) -> tuple[str, ...]:
-    """Compile sources once a process: many models are linked with the same library."""
+    """Compile sources once per process, because many models are linked with the same library."""
     folder = tempfile.mkdtemp(prefix="uwb_firmware_objects_")
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     objects = tuple(f"{folder}/{source.name}.o" for source in sources)
@@ -67,7 +67,7 @@ def load_library(prefix: str, objects: Sequence[str], signatures: Signatures) ->
     """Link object files into a shared library and load it into this process.
 
     Args:
-        prefix: of the functions' names.
+        prefix: prefix of the function names.
         signatures: result and arguments of the functions, {name without prefix: (result, arguments)}.
 
     Raises:
@@ -92,7 +92,7 @@ def run(command: Sequence[str], timeout_s: float = 300, folder: Path | None = No
     """Run a tool, in `folder`, and return its standard output.
 
     Raises:
-        UwbMitigationError: it fails or takes too long; carries the first line that says why.
+        UwbMitigationError: it fails or times out; the message contains its first error line.
     """
     try:
         done = subprocess.run(

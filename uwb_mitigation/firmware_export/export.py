@@ -1,4 +1,4 @@
-"""From a model bundle to `uwb_model.h`: constants only, with golden vectors to test a build against."""
+"""Export of a model bundle to `uwb_model.h`: constants, and golden vectors to test a build."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _SCALINGS = {Scaling.MAX: "UWB_SCALE_MAX", Scaling.PREAMBLE: "UWB_SCALE_PREAMBLE
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Golden:
-    """Inputs, float32 (n, K), and the network's outputs, float32 (n,), m."""
+    """Golden vectors: inputs, float32 (n, K), and the network's outputs, float32 (n,), m."""
 
     windows: NDArray[np.float32]
     outputs_m: NDArray[np.float32]
@@ -40,8 +40,8 @@ def export_bundle(bundle: Bundle, folder: Path) -> Path:
     """Write `uwb_model.h` for an int8 bundle to `folder`, and return its path.
 
     Raises:
-        ModelError: the bundle is in float, of a shape without kernels, or has a layer without exact
-            integer constants; the message says which.
+        ModelError: the bundle is not quantised, the firmware has no kernels for its shape, or a layer has no
+            exact integer constants; the message contains the reason.
         UwbMitigationError: the header cannot be written.
     """
     if not bundle.quantised:
@@ -73,7 +73,7 @@ def write_header(folder: Path, network: PackedNetwork, card: Card, model_id: int
 
 
 def golden_windows(network: PackedNetwork) -> NDArray[np.float32]:
-    """Inputs that are all zero, all saturated, and random at rising levels; the same every time."""
+    """Return inputs that are all zero, all saturated, and random at rising levels; deterministic."""
     random = np.random.default_rng(network.samples)
     levels = np.geomspace(8, 512, GOLDEN_VECTORS - 2)
     noise = random.uniform(0, 1, (GOLDEN_VECTORS - 2, network.samples)) * levels[:, None]
@@ -92,7 +92,7 @@ def compare_with_reference(bundle: Bundle) -> int:
 def render(network: PackedNetwork, card: Card, model_id: int, golden: Golden) -> str:
     """Return the text of `uwb_model.h`: `uwb_model_data`, and golden vectors under UWB_GOLDEN_VECTORS.
 
-    Floats have nine significant digits, which read back to the same bits.
+    Floats have nine significant digits, so that they are read back with the same bits.
     """
     parts = [
         f"/* {_comment(card.name)}, model {model_id:08x}, written by `uwb-mitigation board export-c`. */",
@@ -195,10 +195,10 @@ def _golden(golden: Golden) -> str:
 
 
 def number(value: float | np.floating[Any]) -> str:
-    """A float32 as a C literal that reads back to the same bits.
+    """Return a float32 as a C literal that is read back with the same bits.
 
     Raises:
-        ModelError: it is not finite, or no float32 value.
+        ModelError: the value is not finite or not a float32.
     """
     with np.errstate(over="ignore"):
         single = np.float32(value)
@@ -211,7 +211,7 @@ def number(value: float | np.floating[Any]) -> str:
 
 
 def _array(kind: str, name: str, values: NDArray[np.generic]) -> str:
-    # The assembly loads words.
+    # The assembly loads words: align the array.
     return (
         f"static const {kind} {name}[{values.size}] __attribute__((aligned(4))) = {{\n"
         f"{_wrapped(map(str, values.tolist()))}}};\n"
@@ -220,7 +220,7 @@ def _array(kind: str, name: str, values: NDArray[np.generic]) -> str:
 
 def _channels(name: str, channels: Channels) -> str:
     pairs = zip(channels.bias.tolist(), channels.multiplier.tolist(), strict=True)
-    # -2147483648 is, in C, minus a number too large for int.
+    # In C, -2147483648 is the negation of a number that is too large for int.
     texts = (f"{{{'INT32_MIN' if bias == -(2**31) else bias}, {multiplier}}}" for bias, multiplier in pairs)
     return f"static const uwb_channel {name}[{len(channels.bias)}] = {{\n{_wrapped(texts)}}};\n"
 

@@ -1,4 +1,4 @@
-"""The firmware's C, compiled for this computer: a backend in place of ONNX Runtime, and for tests of parity."""
+"""The firmware compiled for the host: a backend instead of ONNX Runtime, also used in parity tests."""
 
 from __future__ import annotations
 
@@ -85,8 +85,8 @@ class HostFirmware:
         flags: further compiler flags.
 
     Raises:
-        MissingDependencyError: there is no C compiler.
-        UwbMitigationError: it does not compile; carries the compiler's first error.
+        MissingDependencyError: no C compiler is installed.
+        UwbMitigationError: the compilation fails; the message contains the compiler's first error.
     """
 
     def __init__(self, export: Path, build: Path, flags: Sequence[str] = ()) -> None:
@@ -99,7 +99,7 @@ class HostFirmware:
         self._arena = ctypes.create_string_buffer(self._arena_bytes)
 
     def predict_m(self, windows: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The network's outputs, float32 (n,), for windows float32 (n, K), m."""
+        """Return the network's outputs, float32 (n,), m, for windows, float32 (n, K)."""
         windows = np.ascontiguousarray(windows, np.float32)
         outputs = np.empty(len(windows), np.float32)
         value = c_float()
@@ -113,7 +113,7 @@ class HostFirmware:
         return outputs
 
     def correct(self, range_m: float, cir: Cir, offset_m: float = 0.0) -> tuple[float, float, float, int]:
-        """Range, correction, variance and status, as in `CorrectedRange`."""
+        """Return range, correction, variance and status, as in `CorrectedRange`."""
         samples = np.ascontiguousarray(cir.samples, np.int16)
         values = {name: getattr(cir, name) for name, _ in _Cir._fields_[2:]}
         if not math.isfinite(cir.first_path_index):
@@ -127,7 +127,7 @@ class HostFirmware:
 def link(
     program: Path, export: Path, output: Path, flags: Sequence[str] = (), *, shared: bool = False
 ) -> Path:
-    """Link one C file, which includes the model in `export`, with the library, for this computer."""
+    """Link a C file that includes the model in `export` with the library, for the host."""
     objects = library_objects(flags)
     options = (*_OPTIONS, *flags, f"-I{firmware_folder() / 'src'}", f"-I{export}")
     kind = ("-shared",) if shared else ()
@@ -136,17 +136,17 @@ def link(
 
 
 def library_objects(flags: Sequence[str] = ()) -> tuple[str, ...]:
-    """The object files of the portable library for this computer; compiled once a process."""
+    """Return the object files of the portable library for the host, compiled once per process."""
     sources = firmware_folder() / "src"
     options = (*_OPTIONS, *flags, f"-I{sources}")
     return compile_objects(c_compiler(), options, tuple(sorted(sources.glob("*.c"))))
 
 
 class FirmwareMitigation(Backend):
-    """Corrects ranges with one bundle as `Mitigation` does, to the same bits, by the firmware.
+    """Corrects ranges with one bundle in the firmware; bit-identical to `Mitigation`.
 
     Raises:
-        MissingDependencyError: there is no C compiler, or the firmware's sources are not installed.
+        MissingDependencyError: no C compiler is installed, or the firmware's sources are not installed.
         ModelError: the firmware cannot run the bundle's network.
         UwbMitigationError: the sources do not compile.
     """
@@ -154,7 +154,7 @@ class FirmwareMitigation(Backend):
     def __init__(self, bundle: Bundle, offsets: Offsets = NO_OFFSETS) -> None:
         self.bundle = bundle
         self.offsets = offsets
-        # The loaded library does not need its file any more.
+        # The loaded library no longer needs its file.
         with tempfile.TemporaryDirectory(prefix="uwb_firmware_backend_") as name:
             folder = Path(name)
             export_bundle(bundle, folder)

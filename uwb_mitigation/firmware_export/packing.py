@@ -1,6 +1,6 @@
-"""An int8 network as the arrays that the firmware reads: layouts, integer constants, ranges checked.
+"""Conversion of an int8 network to the firmware's arrays: layouts, integer constants, range checks.
 
-The layouts are those of `firmware/src/uwb_mitigation.h` and `uwb_kernels.h`.
+The layouts are documented in `firmware/src/uwb_mitigation.h` and `uwb_kernels.h`.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _REMEDY = "quantise with `requantisation.nudge`, which moves scales by a few ulp
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Channels:
-    """int32 (n,) each: 256-fold bias with the rounding offset in it, and multiplier."""
+    """int32 (n,) each: bias times 256 including the rounding offset, and multiplier."""
 
     bias: NDArray[np.int32]
     multiplier: NDArray[np.int32]
@@ -62,7 +62,7 @@ class PackedLayer:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PackedNetwork:
-    """What `uwb_model` holds of a network: a REMNet has `modules`, an MLP has `layers`."""
+    """Network part of `uwb_model`: a REMNet has `modules`, an MLP has `layers`."""
 
     samples: int
     input_scale: np.float32
@@ -77,7 +77,7 @@ class PackedNetwork:
 
 
 def pack(weights: Int8Weights) -> PackedNetwork:
-    """Pack a network.
+    """Return the packed network.
 
     Raises:
         ModelError: the firmware has no kernels for its shape, or a layer has no exact integer
@@ -154,7 +154,7 @@ def _pack_remnet(weights: Int8Weights, shape: Remnet) -> PackedNetwork:
 
 
 def _pack_mlp(weights: Int8Weights, shape: Mlp) -> PackedNetwork:
-    """Inputs and outputs are padded with zeros to multiples of 8."""
+    """Pack an MLP; pad inputs and outputs with zeros to multiples of 8."""
     layers = []
     scale = weights.activation_scale["input"]
     for dense in shape.layers:
@@ -209,7 +209,7 @@ def _channels(
 
 
 def _channel_pairs(weight: NDArray[np.int8]) -> NDArray[np.int8]:
-    """(filters, inputs, taps) to pairs (filters * inputs / 2 * taps, 2)."""
+    """Convert (filters, inputs, taps) to pairs (filters * inputs / 2 * taps, 2)."""
     filters, inputs, taps = weight.shape
     pairs: NDArray[np.int8] = (
         weight.reshape(filters, inputs // 2, 2, taps).transpose(0, 1, 3, 2).reshape(-1, 2)
@@ -218,12 +218,12 @@ def _channel_pairs(weight: NDArray[np.int8]) -> NDArray[np.int8]:
 
 
 def _share_words(pairs: NDArray[np.int8]) -> NDArray[np.int8]:
-    """Pairs (n, 2), n even, as the bytes p0 q0 p1 q1 of each two: int8 (2 n,)."""
+    """Interleave pairs (n, 2), n even: bytes p0 q0 p1 q1 of each two pairs, int8 (2 n,)."""
     return np.ascontiguousarray(pairs.reshape(-1, 2, 2).transpose(0, 2, 1)).reshape(-1)
 
 
 def _head_in_blocks(weight: NDArray[np.int8], shape: Remnet) -> NDArray[np.int8]:
-    """The head's weights as pairs, in the order of the last module's blocks; zero past its length."""
+    """Return the head's weights as pairs, in the order of the last module's blocks, padded with zeros."""
     length = shape.lengths[-1]
     blocks = -(-length // _BLOCK)
     padded = np.zeros((FILTERS, blocks * _BLOCK), np.int8)

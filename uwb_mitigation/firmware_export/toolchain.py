@@ -15,7 +15,7 @@ APT = "apt install gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm"
 
 _PREFIX = "arm-none-eabi-"
 _CPU = ("-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16")
-# GNU C11 as Arduino builds: there the compiler may fuse float operations that the sources must prevent.
+# GNU C11 as in Arduino builds: in this mode the compiler may fuse float operations unless the sources prevent it.
 _COMMON = ("-std=gnu11", "-g0", "-ffunction-sections", "-fdata-sections", "-fno-math-errno")
 
 _UNIT_SHIFTS = {"B": 0, "KB": 10, "MB": 20, "GB": 30}
@@ -24,7 +24,7 @@ _WARNINGS = tuple(flag for flag in WARNINGS if flag != "-Wpedantic")
 
 
 class Target(str, enum.Enum):
-    """The boards that there is a start-up and a linker script for, in `firmware/boards/`."""
+    """Boards with start-up code and a linker script in `firmware/boards/`."""
 
     QEMU_MPS2 = "qemu_mps2"
     QEMU_MPS2_LINK = "qemu_mps2_link"
@@ -32,7 +32,7 @@ class Target(str, enum.Enum):
 
 
 class Kernels(str, enum.Enum):
-    """Which implementation of the layers an image holds."""
+    """Implementation of the layers in an image."""
 
     CORTEX_M4 = "cortex_m4"
     PORTABLE = "portable"
@@ -43,10 +43,10 @@ class Image:
     """A linked image.
 
     Attributes:
-        elf: its file.
+        elf: path of the image.
         flash_bytes: code, constants and initial values of variables.
-        static_bytes: variables; what they leave of the RAM is the stack's.
-        flash_room, ram_room: what the board has, bytes.
+        static_bytes: variables; the rest of the RAM is the stack.
+        flash_room, ram_room: flash and RAM of the board, bytes.
     """
 
     elf: Path
@@ -57,13 +57,13 @@ class Image:
 
 
 def missing_tools() -> list[str]:
-    """The tools that building and emulating need and that are not installed."""
+    """Return the missing tools for building and emulating images."""
     tools = [f"{_PREFIX}{tool}" for tool in ("gcc", "nm", "objcopy", "objdump")] + ["qemu-system-arm"]
     return [tool for tool in tools if shutil.which(tool) is None]
 
 
 def require_tools() -> None:
-    """Raise MissingDependencyError, with the line that installs them, where tools are missing."""
+    """Raise MissingDependencyError, with the command that installs them, if tools are missing."""
     missing = missing_tools()
     if missing:
         raise MissingDependencyError(f"{', '.join(missing)} not found", valid=APT)
@@ -79,11 +79,11 @@ def build_image(
 ) -> Image:
     """Build the board's program, or another `program`, with the model in `export`, in the folder `build`.
 
-    `-Os` is what Arduino uses; the kernels in assembly do not depend on it.
+    Arduino builds with `-Os`; the assembly kernels do not depend on the optimisation level.
 
     Raises:
         MissingDependencyError: a tool is missing, or this is not a source checkout.
-        UwbMitigationError: it does not compile, or does not fit the board.
+        UwbMitigationError: the compilation fails, or the image does not fit the board.
     """
     require_tools()
     library, boards = firmware_folder() / "src", firmware_folder() / "boards"
@@ -115,5 +115,5 @@ def build_image(
 
 
 def write_hex(image: Image, output: Path) -> None:
-    """Write an image as Intel HEX, which a J-Link's drive takes."""
+    """Write an image as Intel HEX, for the USB drive of a J-Link."""
     run([f"{_PREFIX}objcopy", "-O", "ihex", str(image.elf), str(output)])

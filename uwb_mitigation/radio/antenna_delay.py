@@ -1,4 +1,4 @@
-"""Finds the antenna delay of a pair of radios from ranges over a known distance, in line of sight."""
+"""Calibration of the antenna delay of a pair of radios from LOS ranges at a known distance."""
 
 from __future__ import annotations
 
@@ -18,34 +18,34 @@ from uwb_mitigation.radio.bus import Bus
 from uwb_mitigation.radio.port import RadioPort
 
 M_PER_TICK = 0.5 * 299_792_458.0 / DEVICE_TICK_HZ
-"""By how much ranges come out too long if one radio's delay, transmitter and receiver together, is a tick too small:
-2.35 mm (Decawave APS014)."""
+"""Range error per tick that the total TX + RX antenna delay of one radio is too small: 2.35 mm
+(Decawave APS014)."""
 
 MAX_SD_M = 0.1
-"""DW1000s in line of sight scatter by 2 to 5 cm."""
+"""Limit of the standard deviation of a range; that of DW1000s in LOS is 2 to 5 cm."""
 
 MAX_POWER_GAP_DB = 6.0
-"""Received over first-path power below which a link is likely in line of sight (DW1000 User Manual 2.09, 4.7)."""
+"""Received minus first-path power below which a link is likely LOS (DW1000 User Manual 2.09, 4.7)."""
 
 NOMINAL_TICKS = 2 * 16436
 MAX_FROM_NOMINAL_TICKS = 2000
-"""Radios differ by 100; a metre of antenna cable adds 600."""
+"""Largest plausible change. Radios differ by 100 ticks; a metre of antenna cable adds 600."""
 
 PATIENCE_S = 30.0
-"""Without a range for so long, it is given up."""
+"""Timeout: if no range arrives for this time, the calibration is aborted."""
 
 
 @dataclass(frozen=True, slots=True)
 class AntennaDelay:
-    """What was found.
+    """Result of the calibration.
 
     Attributes:
-        antenna_delay: of each radio that was calibrated, transmitter and receiver together, ticks.
-        before: what it was while it ranged; the mean, where two were calibrated.
-        offset_m: median of the ranges less the distance.
-        sd_m: of one range: half of what the middle 68 % span.
-        power_gap_db: median of received less first-path power.
-        ranges: how many.
+        antenna_delay: total TX + RX antenna delay of each calibrated radio, ticks.
+        before: antenna delay during the measurement; the mean if two radios are calibrated.
+        offset_m: median of the ranges minus the distance.
+        sd_m: standard deviation of one range, as half of the central 68 % interval.
+        power_gap_db: median of received minus first-path power.
+        ranges: number of ranges.
     """
 
     antenna_delay: int
@@ -59,15 +59,15 @@ class AntennaDelay:
 def find(
     ranges_m: ArrayLike, power_gap_db: ArrayLike, distance_m: float, before: Sequence[int]
 ) -> AntennaDelay:
-    """The delay with which the median range is the distance.
+    """Return the antenna delay for which the median range equals the distance.
 
     Args:
         ranges_m, power_gap_db: (n,), n at least 2; powers that are unknown are NaN.
-        before: delay of each radio whose delay is to be found: of both, which then share the offset, or of one.
+        before: present delay of each radio to calibrate: of both, which then share the offset, or of one.
 
     Raises:
-        UwbMitigationError: the ranges scatter, or the link does not look like line of sight, or no radio has such a
-            delay.
+        UwbMitigationError: the ranges scatter too much, the link is probably not LOS, or the resulting delay is
+            implausible.
     """
     ranges = np.asarray(ranges_m, np.float64)
     low, middle, high = (float(value) for value in np.quantile(ranges, [0.1587, 0.5, 0.8413]))
@@ -100,17 +100,17 @@ def measure(
     exchanges: int,
     on_range: Callable[[], None],
 ) -> AntennaDelay:
-    """Let a tag range with one anchor until it has so many ranges, and `find` the delay.
+    """Range with one anchor until there are enough ranges, then `find` the delay.
 
     Args:
-        openers: of the tag's bus, and of the anchor's where it is at this computer too; without it, the anchor's
-            delay stays and the tag's takes all of the offset.
-        settings: the tag's.
-        on_range: called after each.
+        openers: of the tag's bus, and of the anchor's bus if the anchor is at this computer too; otherwise the
+            anchor's delay is unchanged and the tag's delay compensates the whole offset.
+        settings: settings of the tag.
+        on_range: called after each range.
 
     Raises:
-        UwbMitigationError: as `find`; or nothing ranges, or several anchors do.
-        ParameterError, MissingDependencyError: as `RadioPort`.
+        UwbMitigationError: see `find`; or no anchor answers, or several do.
+        ParameterError, MissingDependencyError: see `RadioPort`.
     """
     wanted = settings, replace(settings, role=Role.ANCHOR, anchors=())
     with ExitStack() as stack:

@@ -1,4 +1,4 @@
-"""What joins the driver and a chip at this computer: one interface for USB and SPI."""
+"""Interface between the driver and a chip at this computer, for USB and SPI."""
 
 from __future__ import annotations
 
@@ -10,29 +10,29 @@ from uwb_mitigation.link.connection import PortAddress
 
 
 class Bus(Protocol):
-    """SPI to one DW1000. A method raises LinkError where the chip can no longer be reached, and within a second."""
+    """SPI to one DW1000. If the chip is unreachable, methods raise LinkError within a second."""
 
     @property
     def name(self) -> str:
-        """What a person calls it."""
+        """Name for users."""
         ...
 
     def transfer(self, header: bytes, out: bytes | None, count: int) -> bytes:
-        """One chip-select period: `header`, then `out`, or `count` octets that are read and returned."""
+        """Transfer in one chip-select period: write `header`, then write `out` or read and return `count` octets."""
         ...
 
     def speed(self, fast: bool) -> None:
-        """At most 3 MHz, or if `fast` at most 20 MHz."""
+        """Set the SPI clock: at most 3 MHz, or at most 20 MHz if `fast`."""
         ...
 
     @property
     def reply_us(self) -> int:
-        """That a tag on it needs from ANSWER to FINAL."""
+        """Time that a tag on this bus needs from ANSWER to FINAL."""
         ...
 
     @property
     def patience_us(self) -> int:
-        """That an anchor on it needs for its frames, at most."""
+        """Timeout of a tag for the frames of an anchor on such a bus."""
         ...
 
     @property
@@ -41,31 +41,31 @@ class Bus(Protocol):
         ...
 
     def reset(self) -> None:
-        """Pull RSTn low for a while, and let it float."""
+        """Pull RSTn low for a short time, then let it float."""
         ...
 
     def pause(self) -> None:
-        """Wait between two looks at the chip's status."""
+        """Wait between two polls of the chip's status."""
         ...
 
     def close(self) -> None:
-        """May be called twice."""
+        """Close the bus; may be called twice."""
         ...
 
 
 def opener(source: str, place: str, reset: str = "") -> Callable[[], Bus]:
-    """Return what opens the bus of one radio.
+    """Return a function that opens the bus of one radio.
 
     Args:
         source: `evb1000` or `spi`.
         place: `/dev/ttyACM0`, `usb:0483:5740`; or `/dev/spidev0.0`.
-        reset: of spi, the reset line, as `gpiochip0:25`; empty = not wired.
+        reset: for spi, the reset line, such as `gpiochip0:25`; empty = not wired.
 
     Raises:
         ParameterError: `place` is not valid.
-        MissingDependencyError: what this kind of bus needs is not installed.
+        MissingDependencyError: a dependency of this type of bus is not installed.
     """
-    # Each kind imports its own dependencies, and only when it is wanted.
+    # Import the dependencies of a type of bus only if it is used.
     if source == "spi":
         from uwb_mitigation.radio.spidev_bus import SpidevBus
 

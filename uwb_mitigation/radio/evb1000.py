@@ -1,7 +1,7 @@
-"""An EVB1000 with the firmware that it was delivered with, as a bridge from USB to its DW1000's SPI.
+"""An EVB1000 with factory firmware as a bridge from USB to the SPI of its DW1000.
 
-The firmware of EVK1000 and TREK1000 kits speaks this to Decawave's own PC programs: each request is one chip-select
-period. One request and its answer take a millisecond or two; there is no interrupt, and no reset line.
+Decawave's own PC programs use the same protocol with EVK1000 and TREK1000 kits: each request is one chip-select
+period. A request with its answer takes 1 to 2 ms; there is no interrupt and no reset line.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from uwb_mitigation.link.connection import PortAddress
 
 ANSWER_WITHIN_S = 0.4
 ASK_AT_MOST = 3
-"""After stray octets, of another program or of ModemManager, the firmware ignores the first question."""
+"""Number of tries: after stray octets from another program (ModemManager), the firmware ignores the first one."""
 
 MAX_READ_BYTES = 4093
 
@@ -33,17 +33,17 @@ class Evb1000Bus:
     """A board in USB-to-SPI mode; see `Bus`.
 
     Args:
-        address: of its port.
+        address: address of the serial port.
 
     Attributes:
-        version: what the board calls its firmware.
+        version: firmware version that the board reports.
 
     Raises:
-        LinkError: the port is absent or in use, or the board is in another mode; says what to do.
+        LinkError: the port is absent or in use, or the board is in another mode; the message contains the remedy.
     """
 
     has_reset = False
-    # Eight transactions of 1.5 to 1.8 ms each, and the time until the answer is noticed; a slower bus finds its own.
+    # Eight transactions of 1.5 to 1.8 ms and the delay of polling. On a slower bus the time is increased at run time.
     reply_us = 16_500
     patience_us = 60_000
 
@@ -78,10 +78,10 @@ class Evb1000Bus:
         self._fast = fast
 
     def reset(self) -> None:
-        """There is no reset line."""
+        """Do nothing: there is no reset line."""
 
     def pause(self) -> None:
-        """The bus is slow enough."""
+        """Do nothing: the bus is slow enough."""
 
     def close(self) -> None:
         if self._port is not None:
@@ -104,7 +104,7 @@ class Evb1000Bus:
         raise self._error(told, f"an EVB1000; {_HOW}")
 
     def _ask(self) -> str:
-        """Return the answer to `deca?`, up to its first NUL; a stale octet follows that."""
+        """Return the answer to `deca?` up to its first NUL; a stale octet follows the NUL."""
         self._drain()
         self._send(b"deca?")
         answer = b""
@@ -115,7 +115,7 @@ class Evb1000Bus:
         return answer.partition(b"\0")[0].decode("ascii", "replace")
 
     def _drain(self) -> None:
-        """Discard what is left of earlier answers."""
+        """Discard the rest of earlier answers."""
         with contextlib.suppress(LinkError):
             until = time.monotonic() + ANSWER_WITHIN_S
             while time.monotonic() < until and self._read_some(0.02):
@@ -144,7 +144,7 @@ class Evb1000Bus:
         return answer[:count]
 
     def _read_some(self, within_s: float) -> bytes:
-        """At least one octet, or none within the time."""
+        """Read at least one octet; return no octets after a timeout."""
         fd = self._fd()
         try:
             readable, _, _ = select.select([fd], [], [], max(0.0, within_s))

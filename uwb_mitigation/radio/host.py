@@ -1,4 +1,4 @@
-"""One DW1000 at this computer: the firmware's driver and exchange, compiled for it, on a `Bus`."""
+"""One DW1000 at this computer: the firmware's driver and exchange, compiled for the host, on a `Bus`."""
 
 from __future__ import annotations
 
@@ -39,16 +39,16 @@ _FAULTS = {
 
 
 class HostRadio:
-    """A radio that ranges as its settings say, one exchange a call. Not for several threads at once.
+    """A radio that performs one exchange per call, according to its settings. Not thread-safe.
 
     Args:
-        bus: to its chip; stays the caller's.
-        settings: what it is to do.
-        stamp_clock: the clock that stamps are on, ns.
+        bus: bus of the chip; the caller closes it.
+        settings: settings of the radio.
+        stamp_clock: clock for stamps, ns.
 
     Raises:
-        ParameterError: settings that no radio has.
-        MissingDependencyError: there is no C compiler.
+        ParameterError: the settings are invalid.
+        MissingDependencyError: no C compiler is installed.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class HostRadio:
         self._stamp_clock = stamp_clock
         self._settings = settings
         self._failure: BaseException | None = None
-        # The library keeps pointers to these as long as the radio lives.
+        # The library keeps pointers to these objects until the radio is closed.
         self._io = structures.Io(
             None,
             structures.TRANSFER(self._transfer),
@@ -78,10 +78,10 @@ class HostRadio:
         self._temperature_c = self._voltage = float("nan")
 
     def turn(self, at_most_s: float) -> RangeMeasurement | None:
-        """One exchange, or none within the time, which it may outlast by its own duration.
+        """Perform one exchange; return None if there is none before the timeout. An exchange may end after it.
 
         Raises:
-            LinkError: the bus is gone, or no chip answers on it; the next call tries to start the chip again.
+            LinkError: the bus is lost, or no chip answers; the next call tries to start the chip again.
         """
         self._failure = None
         until_us = time.monotonic_ns() // 1000 + round(at_most_s * 1e6)
@@ -94,14 +94,14 @@ class HostRadio:
         return self._measurement() if event == _RANGED else None
 
     def use(self, bus: Bus) -> None:
-        """Go on with another bus of the same kind, after the one before was lost; the chip is started anew."""
+        """Replace a lost bus by another one of the same type and restart the chip."""
         self._bus = bus
 
     def configure(self, settings: RadioSettings) -> None:
-        """Use other settings from the next turn on.
+        """Use other settings, starting with the next turn.
 
         Raises:
-            ParameterError: settings that no radio has, or this one cannot use.
+            ParameterError: the settings are invalid or not supported by this radio.
         """
         refusal = self._library.host_radio_configure(self._radio, ctypes.byref(self._config(settings)))
         if refusal is not None:
@@ -110,13 +110,13 @@ class HostRadio:
 
     @property
     def address(self) -> int:
-        """0 until the chip has started."""
+        """Address of the radio; 0 until the chip has started."""
         address: int = self._library.host_radio_address(self._radio)
         return address
 
     @property
     def settings(self) -> RadioSettings:
-        """In force; what was left to the chip stands here once it has started."""
+        """Active settings; contains the chip's own values once it has started."""
         chip: structures.ChipSettings = self._library.host_radio_settings(self._radio)[0]
         return replace(
             self._settings,
@@ -132,7 +132,7 @@ class HostRadio:
         """Measure the chip's temperature and voltage, for `status`.
 
         Raises:
-            LinkError: the bus is gone.
+            LinkError: the bus is lost.
         """
         temperature, voltage = c_float(), c_float()
         self._failure = None
@@ -143,7 +143,7 @@ class HostRadio:
             self._temperature_c, self._voltage = temperature.value, voltage.value
 
     def status(self) -> RadioStatus:
-        """How it fares."""
+        """Return the status: state and counts."""
         counts: structures.TwrCounts = self._library.host_radio_counts(self._radio)[0]
         count = c_size_t()
         table = self._library.host_radio_anchors(self._radio, ctypes.byref(count))
@@ -166,7 +166,7 @@ class HostRadio:
         )
 
     def close(self) -> None:
-        """Free it; the bus stays open. May be called twice."""
+        """Free the radio; the bus stays open. May be called twice."""
         if self._radio is not None:
             self._library.host_radio_free(self._radio)
             self._radio = None
@@ -212,7 +212,7 @@ class HostRadio:
 
 
 def load() -> ctypes.CDLL:
-    """The firmware's driver and exchange as a shared library of this process; compiled once.
+    """Compile the firmware's driver and exchange, once per process, and load them as a shared library.
 
     Raises:
         MissingDependencyError: there is no C compiler, or the sources are not installed.

@@ -1,4 +1,4 @@
-"""A radio at this computer, kept ranging in a thread."""
+"""A radio at this computer, operated by a thread."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from uwb_mitigation.radio.host import HostRadio, load
 
 STATUS_INTERVAL_S = 1.0
 SENSORS_INTERVAL_S = 10.0
-"""Between two readings of temperature and voltage, for which the receiver is off: over USB for 20 ms."""
+"""Interval between readings of temperature and voltage. The receiver is off meanwhile: 20 ms over USB."""
 
 _TURN_S = 0.1
 
 
 @dataclass(frozen=True, slots=True)
 class RadioLost:
-    """The radio cannot be reached any more; `text` contains why, and what to do."""
+    """The radio is unreachable; `text` contains the reason and the remedy."""
 
     text: str
 
@@ -36,12 +36,12 @@ class RadioReport:
     """The state of a radio, for diagnostics.
 
     Attributes:
-        name: of the bus in use; empty while there is none.
-        problem: what keeps the radio from ranging; empty while nothing does.
-        settings: in force; None before the chip has first started.
-        status: counts, state, anchors in reach.
+        name: name of the bus in use; empty = no bus is open.
+        problem: reason why the radio does not range; empty while it works.
+        settings: active settings; None before the first start of the chip.
+        status: counts, state, anchors in range.
         openings: how often the bus was opened.
-        overflowed: events that nobody took in time.
+        overflowed: number of events dropped because the queue was full.
     """
 
     name: str
@@ -53,18 +53,18 @@ class RadioReport:
 
 
 class RadioPort(Connection[RadioEvent]):
-    """Keeps one radio ranging until `close`, whatever happens to its bus.
+    """Operates one radio until `close`, and reopens its bus after a loss.
 
     Events are measurements, `Radio` at each start of the chip, `RadioStatus` once a second, `RadioLost`.
 
     Args:
         open_bus: opens the bus; called again after it was lost.
         settings: what the radio does.
-        stamp_clock: the clock that stamps are on, ns.
+        stamp_clock: clock for stamps, ns.
 
     Raises:
-        ParameterError: settings that no radio has.
-        MissingDependencyError: there is no C compiler.
+        ParameterError: the settings are invalid.
+        MissingDependencyError: no C compiler is installed.
     """
 
     def __init__(
@@ -88,10 +88,10 @@ class RadioPort(Connection[RadioEvent]):
         self._thread.start()
 
     def set_radio(self, settings: RadioSettings) -> None:
-        """Use other settings from the next exchange on; a `Radio` follows.
+        """Use other settings, starting with the next exchange; a `Radio` follows.
 
         Raises:
-            ParameterError: settings that no radio has.
+            ParameterError: the settings are invalid.
         """
         settings.check()
         with self._lock:
@@ -128,7 +128,7 @@ class RadioPort(Connection[RadioEvent]):
             self._put([RadioLost(text)])
 
     def _serve(self, radio: HostRadio) -> None:
-        """Range until the connection is closed, or the bus is lost, which raises."""
+        """Range until the connection is closed; raise an exception if the bus is lost."""
         started = False
         status_due = sensors_due = 0.0
         while not self.closed:

@@ -1,4 +1,4 @@
-"""A DW1000 on a Linux computer's own SPI, through spidev; its reset line, if wired, on a GPIO."""
+"""A DW1000 on the SPI of a Linux computer, through spidev, with an optional reset line on a GPIO."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from uwb_mitigation.errors import LinkError, ParameterError, not_installed
 SLOW_HZ, FAST_HZ = 2_000_000, 16_000_000
 RESET_PULSE_S = 0.001
 
-# linux/gpio.h: struct gpiohandle_request, and how it is asked for.
+# linux/gpio.h: struct gpiohandle_request and its ioctl.
 _LINES = 64
 _REQUEST = struct.Struct(f"{_LINES}I I {_LINES}s 32s I i")
 _GET_LINE = 3 << 30 | _REQUEST.size << 16 | 0xB4 << 8 | 0x03
@@ -31,12 +31,12 @@ class SpidevBus:
         reset: `CHIP:LINE` of a GPIO, such as `gpiochip0:25`; empty = not wired.
 
     Raises:
-        ParameterError: the device or the GPIO is not written so.
+        ParameterError: the device or the GPIO has another format.
         MissingDependencyError: spidev is not installed.
         LinkError: the device cannot be opened.
     """
 
-    # Linux takes a tenth of a millisecond for a transaction, and at times much longer.
+    # A transaction takes 0.1 ms in Linux, occasionally much longer.
     reply_us = 3_000
     patience_us = 15_000
 
@@ -72,7 +72,7 @@ class SpidevBus:
 
     def transfer(self, header: bytes, out: bytes | None, count: int) -> bytes:
         try:
-            # One message, and so one chip-select period: at most 4096 octets, the accumulator and 30 more.
+            # One message is one chip-select period: at most 4096 octets, the accumulator and 30 more.
             answer = self._spi.xfer2(list(header + (bytes(count) if out is None else out)))
         except OSError as error:
             raise LinkError(
@@ -101,7 +101,7 @@ class SpidevBus:
             self._spi.close()
 
     def _float(self) -> None:
-        # The chip pulls the line up itself: nobody else may drive it high.
+        # The chip pulls the line up itself: the host must not drive it high.
         if self._line is not None:
             self._held = self._request(_INPUT)
 

@@ -1,4 +1,4 @@
-"""The structures of `uwb_dw1000.h` and `uwb_twr.h` for ctypes; a test holds their sizes to the compiler's."""
+"""The structures of `uwb_dw1000.h` and `uwb_twr.h` for ctypes; a test compares their sizes with the compiler's."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class TwrCounts(ctypes.Structure):
     )
 
     def as_dict(self) -> dict[str, int]:
-        """{name: count}."""
+        """Return {name: count}."""
         return {name: int(getattr(self, name)) for name, *_ in self._fields_}
 
 
@@ -88,16 +88,16 @@ class TwrAnchor(ctypes.Structure):
 
 
 USUAL_REPLY_US, USUAL_PATIENCE_US = 1500, 6000
-"""For SPI of a microcontroller; those of `uwb_twr_defaults`."""
+"""Default times for the SPI of a microcontroller, as in `uwb_twr_defaults`."""
 
 
 def config(
     settings: RadioSettings, reply_us: int = USUAL_REPLY_US, patience_us: int = USUAL_PATIENCE_US
 ) -> Config:
-    """The settings as the firmware takes them, with these times where they leave them open; 0 = still open.
+    """Return the settings as the firmware's structure; the given times replace times of 0.
 
     Raises:
-        ParameterError: a setting that no radio has.
+        ParameterError: a setting is invalid.
     """
     settings.check()
     values = asdict(settings)
