@@ -1,1 +1,1 @@
-"""The model of the DW1000 in `chip/`, from Python: airs, chips, links, and programs for their hosts."""
+"""Python interface to the model of the DW1000 in `chip/`: air, chips, links, and host programs."""

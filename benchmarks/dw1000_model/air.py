@@ -1,4 +1,4 @@
-"""Airs and chips. A chip's host is driven from outside of the air, or by programs that run in virtual time."""
+"""Air and chips. A chip is controlled by the caller or by programs that run in virtual time."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from benchmarks.dw1000_model.links import Link
 from uwb_mitigation.errors import UwbMitigationError
 
 ANTENNA_DELAY_TICKS = 16436
-"""Of each direction, as DecaRanging assumes it at PRF 64 MHz."""
+"""Antenna delay per direction that DecaRanging assumes at PRF 64 MHz."""
 
 _LOOK_S = 1e-6
 _SPI, _DELAY, _WAIT, _RESET_PIN = range(4)
 
 
 class Host(Protocol):
-    """What a driver needs of the computer that it runs on. Times are virtual, s."""
+    """Interface of a driver to its host computer. Times are virtual, in s."""
 
     def spi(self, out: bytes, hz: int) -> bytes:
         """One chip-select period, full duplex."""
@@ -50,12 +50,12 @@ class Host(Protocol):
 
 
 class Air:
-    """Several chips in virtual time. `close`, or leaving the context, ends their programs.
+    """Several chips in virtual time. `close`, or leaving the context, stops their programs.
 
-    Not for several threads at once.
+    Not thread-safe.
 
     Args:
-        seed: of all chance: the same seed and programs give the same run.
+        seed: seed of all random numbers: the same seed and programs give the same run.
 
     Raises:
         MissingDependencyError, UwbMitigationError: the model cannot be compiled.
@@ -76,14 +76,14 @@ class Air:
         tx_delay_ticks: int = ANTENNA_DELAY_TICKS,
         rx_delay_ticks: int = ANTENNA_DELAY_TICKS,
     ) -> Chip:
-        """A new chip; `dw1000_chip_new` in C."""
+        """Add a chip; `dw1000_chip_new` in C."""
         made = self._library.dw1000_chip_new(self._air, ppm, clock_ticks, tx_delay_ticks, rx_delay_ticks)
         if made is None:
             raise UwbMitigationError("no memory for a chip")
         return Chip(self, self._library, made)
 
     def link(self, a: Chip, b: Chip, link: Link | None) -> None:
-        """Join two chips, both ways; None parts them."""
+        """Link two chips in both directions; None removes the link."""
         config = None
         if link is not None:
             samples = None if link.samples is None else np.ascontiguousarray(link.samples, np.int16)
@@ -104,10 +104,10 @@ class Air:
         )
 
     def run(self, seconds: float) -> float:
-        """Let time pass, or less if all programs end within it; returns the time reached, s.
+        """Advance the time, or stop when all programs have ended; return the time reached, s.
 
         Raises:
-            Exception: what a program raised.
+            Exception: the exception that a program raised.
         """
         reached: float = self._library.dw1000_run(self._air, seconds)
         for program in self._programs.values():
@@ -115,9 +115,9 @@ class Air:
         return reached
 
     def program(self, chip: Chip, run: Callable[[Host], None]) -> None:
-        """Give a chip's host a program, from now on, in place of the one before.
+        """Start a program on a chip's host; it replaces the previous one.
 
-        It runs in a thread of its own, but only while every other one and the air stand still.
+        It has its own thread, which runs only while the air and all other programs are paused.
         """
         old = self._programs.pop(chip.address, None)
         if old is not None:
@@ -127,7 +127,7 @@ class Air:
         self._library.dw1000_program_remote(chip.address, program.callback, None)
 
     def close(self) -> None:
-        """End all programs and free the air; may be called twice."""
+        """Stop all programs and free the air; may be called twice."""
         if self._air is not None:
             for program in self._programs.values():
                 program.end()
@@ -142,7 +142,7 @@ class Air:
 
 
 class Chip:
-    """A chip, with its host driven from outside of the air: while it is, all programs go on. A `Host`."""
+    """A chip controlled by the caller, as a `Host`; during its calls, all programs continue."""
 
     def __init__(self, air: Air, library: ctypes.CDLL, address: int) -> None:
         self.air = air
@@ -172,24 +172,24 @@ class Chip:
         self._library.dw1000_reset_pin(self.address)
 
     def reset_drive(self, level: int) -> None:
-        """Hold RSTn from now on: 0 low, 1 floating, 2 high, which destroys the chip."""
+        """Set RSTn permanently: 0 low, 1 floating, 2 high, which destroys the chip."""
         self._library.dw1000_reset_drive(self.address, level)
 
     def environment(self, celsius: float, volts: float) -> None:
-        """Set what the chip's sensors measure."""
+        """Set the values that the chip's sensors measure."""
         self._library.dw1000_environment(self.address, celsius, volts)
 
     def lose_edges(self, probability: float) -> None:
-        """Of the good frames that it receives, how many have no leading edge that its detector finds."""
+        """Set the fraction of good frames in which the detector finds no leading edge."""
         self._library.dw1000_lose_edges(self.address, probability)
 
     def program_otp(self, address: int, word: int) -> None:
-        """Set a word of the OTP memory; registers that are loaded from it change with the next reset."""
+        """Set a word of the OTP memory; registers loaded from it change at the next reset."""
         self._library.dw1000_program_otp(self.address, address, word)
 
     @property
     def sent_power_db(self) -> tuple[float, float]:
-        """Transmit power of the last frame, (preamble and data, PHR), dB above the lowest setting of TX_POWER."""
+        """Return the transmit power of the last frame, (preamble and data, PHR), dB above the lowest TX_POWER."""
         data, header = ctypes.c_double(), ctypes.c_double()
         self._library.dw1000_sent_power(self.address, ctypes.byref(data), ctypes.byref(header))
         return data.value, header.value
@@ -201,17 +201,17 @@ class Chip:
 
     @property
     def fault(self) -> str | None:
-        """What destroyed the chip; None = nothing has."""
+        """Cause of the destruction of the chip; None = the chip works."""
         told = self._library.dw1000_fault(self.address)
         return None if told is None else told.decode()
 
 
 class _Ended(BaseException):
-    """Ends a program's thread where it stands."""
+    """Raised in a program's thread to stop it."""
 
 
 class _Program:
-    """A thread that stands still but for the moments in which the model asks for its next request. A `Host`."""
+    """A `Host` whose thread runs only while the model waits for its next request."""
 
     def __init__(self, run: Callable[[Host], None]) -> None:
         self._run = run
@@ -230,7 +230,7 @@ class _Program:
         return self._read.raw
 
     def irq(self) -> bool:
-        # As in C: a program that does nothing but look still gets somewhere.
+        # As in C: polling takes time, so that a polling loop advances the virtual time.
         self._ask(_DELAY, _LOOK_S)
         return bool(self._request.line)
 
@@ -248,7 +248,7 @@ class _Program:
         return float(self._request.now_s)
 
     def end(self) -> None:
-        """End the thread, wherever the program stands."""
+        """Stop the thread."""
         self._over = True
         if self._thread is not None and self._thread is not threading.current_thread():
             self._answers.put(False)
@@ -256,7 +256,7 @@ class _Program:
             self._thread = None
 
     def raise_failure(self) -> None:
-        """Raise what the program did, once."""
+        """Raise the exception of the program, once."""
         failure, self._failure = self._failure, None
         if failure is not None:
             raise failure
@@ -271,7 +271,7 @@ class _Program:
             self._run(self)
         except _Ended:
             return
-        except BaseException as failure:  # it is raised where the air is run
+        except BaseException as failure:  # `run` raises it
             self._failure = failure
         self._requests.put(None)
 

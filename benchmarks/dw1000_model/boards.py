@@ -1,4 +1,4 @@
-"""Boards with the firmware's exchange on modelled chips, in virtual time: for the bench and the tests."""
+"""Boards with the firmware's exchange on modelled chips, in virtual time, for benchmarks and tests."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ from uwb_mitigation.link.radio import RadioSettings
 from uwb_mitigation.radio import structures
 
 NOMINAL_DELAY_TICKS = 16436
-"""Of a chip's transmitter, and of its receiver."""
+"""Antenna delay of a chip's transmitter, and of its receiver."""
 
 _STORE_VALUES = 1 << 16
-"""int16 values of CIRs that are kept between two calls of `ranges`; beyond it they are not."""
+"""Capacity of the CIR store between two calls of `ranges`, int16 values; further CIRs are dropped."""
 
 RANGE = np.dtype(
     [
@@ -51,18 +51,18 @@ RANGE = np.dtype(
         ("at", "<u4"),
     ]
 )
-"""One range that a board gave, in virtual time; `values` int16 of its CIR stand from `at` on in the store."""
+"""One range of a board, in virtual time; its CIR is `values` int16 values from index `at` of the store."""
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A serial line to a host, and the processor of a board that has one.
+    """Serial line of a board to its host, and timing of the board's processor.
 
     Attributes:
-        baud: of the line, ten bits a byte; frames leave it while the board does something else.
-        mode: what the board sends.
-        inference_s: that a correction takes.
-        overhead_s: that the processor adds to each SPI transaction.
+        baud: baud rate, ten bits a byte; frames are sent in the background.
+        mode: mode of the board.
+        inference_s: duration of a correction.
+        overhead_s: time that the processor adds to each SPI transaction.
     """
 
     baud: float = 921_600
@@ -72,13 +72,13 @@ class Line:
 
 
 class ModelledAir:
-    """Several boards on one air. One thread at a time.
+    """Several boards on one air. Not thread-safe.
 
     Args:
         seed: the same seed and calls give the same run.
 
     Raises:
-        MissingDependencyError: there is no C compiler, or no checkout.
+        MissingDependencyError: no C compiler or no source checkout is available.
     """
 
     def __init__(self, seed: int = 1) -> None:
@@ -101,9 +101,9 @@ class ModelledAir:
         delay_ticks: int = NOMINAL_DELAY_TICKS,
         line: Line | None = None,
     ) -> int:
-        """A board, whose program starts with the next `run`; its number.
+        """Add a board, whose program starts with the next `run`, and return its number.
 
-        Without a line it ranges and does nothing else.
+        Without a line, the board only ranges.
         """
         board: int = self._library.radio_air_board(
             self._air,
@@ -122,7 +122,7 @@ class ModelledAir:
         return board
 
     def link(self, a: int, b: int, channel: Link | None) -> None:
-        """Let two boards hear each other, or no longer."""
+        """Add or remove the link of two boards."""
         if channel is None:
             self._library.radio_air_unlink(self._air, a, b)
             return
@@ -144,49 +144,49 @@ class ModelledAir:
         )
 
     def reset(self, board: int) -> None:
-        """Pull the reset line of a board's chip, whatever it is doing; 1 ms passes."""
+        """Reset a board's chip with its reset line, for 1 ms."""
         self._library.radio_air_reset(self._air, board)
 
     def run(self, seconds: float) -> float:
-        """Let time pass; returns the time reached, s."""
+        """Advance the time; return the time reached, s."""
         reached: float = self._library.radio_air_run(self._air, seconds)
         return reached
 
     def ranges(self) -> tuple[NDArray[np.void], NDArray[np.int16]]:
-        """Take what was measured since the last call: rows of `RANGE`, and the store of their CIRs."""
+        """Return the ranges since the last call: rows of `RANGE`, and the store of their CIRs."""
         rows, store = c_void_p(), c_void_p()
         count = self._library.radio_air_results(self._air, ctypes.byref(rows), ctypes.byref(store))
-        # RANGE holds no pointers: copies of the bytes will do.
+        # RANGE contains no pointers, so the bytes can be copied.
         taken = np.frombuffer(ctypes.string_at(rows.value or 0, count * RANGE.itemsize), RANGE)
         values = np.frombuffer(ctypes.string_at(store.value or 0, 2 * _STORE_VALUES), "<i2")
         self._library.radio_air_forget(self._air)
         return taken, values
 
     def counts(self, board: int) -> dict[str, int]:
-        """Of exchanges; see `uwb_twr_counts`."""
+        """Return the counts of exchanges; see `uwb_twr_counts`."""
         counts: structures.TwrCounts = self._library.radio_air_counts(self._air, board)[0]
         return counts.as_dict()
 
     def address(self, board: int) -> int:
-        """In force; 0 before the board's program has started its chip."""
+        """Return the active address; 0 before the board's program has started its chip."""
         address: int = self._library.radio_air_address(self._air, board)
         return address
 
     def write(self, board: int, data: bytes) -> None:
-        """Send bytes to a board over its line; it takes them between two turns."""
+        """Send bytes to a board over its line; the board reads them between two turns."""
         if not self._library.radio_air_write(self._air, board, data, len(data)):
             raise LinkError(
                 f"{len(data)} bytes for a modelled board that has not run", valid="fewer, or run it"
             )
 
     def read(self, board: int) -> bytes:
-        """Take what a board has sent over its line."""
+        """Return the bytes that a board has sent over its line."""
         buffer = ctypes.create_string_buffer(1 << 18)
         count = self._library.radio_air_read(self._air, board, buffer)
         return buffer.raw[:count]
 
     def measurements_lost(self, board: int) -> int:
-        """Ranges that did not fit into the queue of a board's line."""
+        """Return the number of ranges dropped because the queue of a board's line was full."""
         lost: int = self._library.radio_air_line_lost(self._air, board)
         return lost
 

@@ -1,6 +1,6 @@
-"""Modelled chips as EVB1000s in USB-to-SPI mode: each on a pseudo-terminal, in wall-clock time.
+"""Emulated EVB1000s in USB-to-SPI mode, each on a pseudo-terminal, in wall-clock time.
 
-Linux and macOS only, as pseudo-terminals are.
+Linux and macOS only, because other systems have no pseudo-terminals.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from uwb_mitigation.sources.source import Source
 
 MAX_BOARDS = 33
 ROUND_TRIP_S = 1.5e-3
-"""Of a request and its answer over full-speed USB."""
+"""Round-trip time of a request over full-speed USB."""
 
 PPM = (3.0, -4.0, 7.0, -9.0, 1.0, 12.0, -2.0)
-"""By how much the boards' crystals are fast, in turn: no two that range agree."""
+"""Frequency errors of the boards' crystals, in turn; they differ between any two boards that range."""
 
 _LONGEST_WAIT_S = 0.02
 CLEAN_M = 3.0
 
 
 class _Board:
-    """One board: its chip, its bridge, its port."""
+    """One board: chip, bridge and port."""
 
     def __init__(self, chip: Chip, bridge: Bridge, link: Path | None) -> None:
         self.chip = chip
@@ -43,43 +43,43 @@ class _Board:
         self.requests = 0
 
     def plug(self) -> None:
-        """Give it power, and a port."""
+        """Power the board and create its port."""
         if self.terminal.plug():
             self.bridge.reset()
             self.backlog.clear()
 
     def unplug(self) -> None:
-        """Pull the cable: the port is gone, and the chip without power."""
+        """Pull the cable: remove the port and power off the chip."""
         if self.terminal.unplug():
             self.chip.reset_drive(0)
 
 
 class EmulatedEvb1000s:
-    """EVB1000s on one air, from the moment it is made until `close`.
+    """EVB1000s on one air, from construction until `close`.
 
-    Board 0 stands where the source's tag does, and the others where its anchors are, in the order in which they
-    appear: each record of a pair anew becomes their link. The methods may be called from any thread.
+    Board 0 is at the position of the source's tag, the others are at those of its anchors, in order of appearance.
+    Each new record of a pair replaces their link. The methods may be called from any thread.
 
     Args:
-        source: where links come from, played over and over; None = all boards `clean_m` apart, clean, as
-            those are that the source knows no anchor for.
-        boards: 2 to 33.
-        rate_hz: records a second.
-        round_trip_s: from a request to its answer.
-        ranging: these boards' switches are set for ranging, not for USB to SPI.
-        port_links: prefix of symbolic links to the ports, with the board's number behind it; None = none.
-        loss, damage: probabilities, of every frame on every link.
-        seed: of all chance.
-        antenna_delay: of each chip, transmitter and receiver together, ticks.
-        clean_m: between the tag and a board that the source knows no anchor for, and between anchors.
+        source: records for the links, played in a loop; None = clean links of `clean_m` between all boards.
+            Boards without an anchor in the source have the same clean link.
+        boards: number of boards, 2 to 33.
+        rate_hz: records per second.
+        round_trip_s: time from a request to its answer.
+        ranging: boards whose switches are set for ranging instead of USB to SPI.
+        port_links: prefix of symbolic links to the ports, followed by the board's number; None = no links.
+        loss, damage: probabilities for every frame on every link.
+        seed: seed of all random numbers.
+        antenna_delay: total TX + RX antenna delay of each chip, ticks.
+        clean_m: distance between anchors, and between the tag and boards without an anchor in the source.
 
     Raises:
-        ParameterError: an argument is out of its range, or a link would replace a file.
-        RecordingError: the source holds no range that chips could measure.
-        MissingDependencyError: there is no C compiler.
+        ParameterError: an argument is outside its range, or a link would replace a file.
+        RecordingError: the source contains no range that chips could measure.
+        MissingDependencyError: no C compiler is installed.
 
     Attributes:
-        failure: why playing ended early; None while all is well.
+        failure: error that ended the playback; None if there was no error.
     """
 
     def __init__(
@@ -133,7 +133,7 @@ class EmulatedEvb1000s:
             for one, other in itertools.combinations(self._boards, 2):
                 self._air.link(one.chip, other.chip, clean)
             self._distances_m = [clean_m] * boards
-            # Before there is a port: what holds nothing is told to who asks for boards.
+            # Read the source before the ports exist: the caller gets the error of an empty source.
             records = self._records(source)
             self._links: Iterator[tuple[int, Link]] = itertools.chain(
                 list(itertools.islice(records, boards - 1)), records
@@ -150,27 +150,27 @@ class EmulatedEvb1000s:
 
     @property
     def ports(self) -> tuple[str, ...]:
-        """The boards' ports, for the host to open; empty where unplugged."""
+        """Ports of the boards for the host to open; empty if unplugged."""
         with self._lock:
             return tuple(board.terminal.port for board in self._boards)
 
     @property
     def distances_m(self) -> tuple[float, ...]:
-        """Between the tag and each board, at the moment; meaningless for the tag itself."""
+        """Current distance between the tag and each board; undefined for the tag itself."""
         return tuple(self._distances_m)
 
     @property
     def requests(self) -> tuple[int, ...]:
-        """How many requests each board has answered."""
+        """Number of requests that each board has answered."""
         return tuple(board.requests for board in self._boards)
 
     def unplug(self, number: int) -> None:
-        """Pull a board's cable."""
+        """Unplug a board."""
         with self._lock:
             self._boards[number].unplug()
 
     def plug(self, number: int) -> None:
-        """Plug it in again: the chip starts anew."""
+        """Plug a board in again; its chip is reset."""
         with self._lock:
             board = self._boards[number]
             if board.terminal.fd is None:
@@ -178,7 +178,7 @@ class EmulatedEvb1000s:
             board.plug()
 
     def close(self) -> None:
-        """Unplug all, and end the thread; may be called twice."""
+        """Unplug all boards and stop the thread; may be called twice."""
         self._stop.set()
         self._thread.join()
         self._close()
@@ -195,7 +195,7 @@ class EmulatedEvb1000s:
         self._air.close()
 
     def _records(self, source: Source | None) -> Iterator[tuple[int, Link]]:
-        """Anchors' numbers and what joins them to the tag, without end."""
+        """Yield the number of an anchor and its link to the tag, in an endless loop."""
         numbers: dict[int, int] = {}
         while source is not None:
             usable = False
@@ -214,7 +214,7 @@ class EmulatedEvb1000s:
     def _relink(self, now: float) -> None:
         """Play the records that are due."""
         due = 1 + int((now - self._began) / self._period_s)
-        # After a pause there is no use in playing what nobody measured.
+        # After a pause, skip the records that no board has measured.
         self._relinked = max(self._relinked, due - len(self._boards))
         try:
             while self._relinked < due:
@@ -223,7 +223,7 @@ class EmulatedEvb1000s:
                     self._air.link(self._boards[0].chip, self._boards[number].chip, link)
                     self._distances_m[number] = link.distance_m
         except UwbMitigationError as error:
-            # A recording that ends in damage.
+            # The end of the recording is damaged.
             self.failure = error
             self._links = iter(())
 
@@ -248,7 +248,7 @@ class EmulatedEvb1000s:
                 self._keep_time(now)
                 for fd in {*readable, *writable}:
                     board = self._boards[fds[fd]]
-                    # While this waited, the cable may have been pulled, and plugged again.
+                    # During the wait, the cable may have been unplugged and plugged in again.
                     if board.terminal.fd == fd:
                         self._serve(fds[fd], now)
                         board.terminal.write(board.backlog)
@@ -273,5 +273,5 @@ class EmulatedEvb1000s:
             board = self._boards[number]
             if board.terminal.fd is not None:
                 board.backlog += answer
-                # The bus holds back what the host does not take yet.
+                # Keep the bytes that the host does not accept yet.
                 board.terminal.write(board.backlog)

@@ -1,4 +1,4 @@
-"""Compiles the model for this computer, and declares its functions to ctypes."""
+"""Compile the model for the host and declare its functions to ctypes."""
 
 from __future__ import annotations
 
@@ -56,11 +56,11 @@ MODEL_FOLDER = Path(__file__).with_name("chip")  # the C sources of the model
 
 
 def model_objects() -> tuple[str, ...]:
-    """Object files of the model for this computer; compiled once a process.
+    """Return the object files of the model for the host, compiled once per process.
 
     Raises:
-        MissingDependencyError: there is no C compiler.
-        UwbMitigationError: they do not compile.
+        MissingDependencyError: no C compiler is installed.
+        UwbMitigationError: the compilation fails.
     """
     sources = tuple(sorted(MODEL_FOLDER.glob("*.c")))
     return compile_objects(c_compiler(), (*_OPTIONS, f"-I{MODEL_FOLDER}"), sources)
@@ -68,10 +68,10 @@ def model_objects() -> tuple[str, ...]:
 
 @functools.cache
 def load() -> ctypes.CDLL:
-    """The model as a shared library of this process.
+    """Load the model as a shared library.
 
     Raises:
-        MissingDependencyError, UwbMitigationError: as `model_objects`.
+        MissingDependencyError, UwbMitigationError: see `model_objects`.
     """
     pointer, real, size = ctypes.c_void_p, ctypes.c_double, ctypes.c_size_t
     signatures: Signatures = {

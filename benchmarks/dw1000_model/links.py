@@ -1,4 +1,4 @@
-"""What joins two modelled chips: distance, error, accumulator; from the simulator or from a recording."""
+"""Links between two modelled chips: distance, error, accumulator; from the simulator or a recording."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ class Link:
 
     Attributes:
         distance_m: along the straight line, 0 to 100,000.
-        excess_m: by how much the detected first path is late.
+        excess_m: excess length of the detected first path.
         samples: int16 (2 n,), real and imaginary interleaved, n at most 1016; None = one path, little noise.
-        first_path_index: in samples; 0 = found in the accumulator.
-        preamble_count: RXPACC; 0 = all of the preamble and of the SFD.
+        first_path_index: in samples; 0 = detected in the accumulator.
+        preamble_count: RXPACC; 0 = complete preamble and SFD.
         noise_threshold, std_noise: LDE_THRESH and STD_NOISE; 0 = measured in the accumulator.
-        loss, damage: probabilities that a frame is not noticed, and that it is received with an error.
+        loss, damage: probabilities that a frame is not detected, and that it is received with an error.
 
     Raises:
-        ParameterError: a value is out of its range.
+        ParameterError: a value is outside its range.
     """
 
     distance_m: float
@@ -67,14 +67,14 @@ class Link:
 def link_of(
     measurement: RangeMeasurement, truth: Truth | None = None, *, loss: float = 0.0, damage: float = 0.0
 ) -> Link:
-    """A link over which chips measure what `measurement` did.
+    """Return a link over which chips reproduce `measurement`.
 
-    The true range, where known, is the link's distance, and the error its excess; else the measured range is
-    the distance. A CIR that holds a part of the accumulator is put where it was, between zeros; of magnitudes
-    the phase is 0.
+    If the true range is known, it is the link's distance, and the error is its excess; otherwise the measured
+    range is the distance. A CIR that is part of an accumulator is padded with zeros to its original position;
+    magnitudes get the phase 0.
 
     Raises:
-        ParameterError: there is no range, or no CIR, or it lies outside of the accumulator.
+        ParameterError: the range or the CIR is missing, or the CIR is outside the accumulator.
     """
     distance_m = measurement.range_m if truth is None else truth.range_m
     return Link(

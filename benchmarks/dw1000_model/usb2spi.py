@@ -1,7 +1,7 @@
-"""The EVB1000's side of its USB-to-SPI protocol, as the factory's firmware has it. No I/O, no clock.
+"""The EVB1000's side of its USB-to-SPI protocol, as in the factory firmware. No I/O, no clock.
 
 A request is 0x02, flags (1: write, 2: fast SPI), its own length and the data's (16 bits each), the DW1000's SPI
-header, the data where it writes, 0x03. The answer is 0x02, a status (0: good), the data that was read, 0x03.
+header, the data to write, 0x03. The answer is 0x02, a status (0: good), the data read, 0x03.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Bridge:
 
     Args:
         spi: one chip-select period: octets out, frequency in Hz; returns as many octets.
-        ranging: the board's switches are set for ranging: it answers the question with `n`, and nothing else.
+        ranging: the switches are set for ranging: the board answers the question with `n` and ignores the rest.
     """
 
     def __init__(self, spi: Callable[[bytes, int], bytes], *, ranging: bool = False) -> None:

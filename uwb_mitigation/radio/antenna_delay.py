@@ -29,7 +29,7 @@ MAX_POWER_GAP_DB = 6.0
 
 NOMINAL_TICKS = 2 * 16436
 MAX_FROM_NOMINAL_TICKS = 2000
-"""Largest plausible change. Radios differ by 100 ticks; a metre of antenna cable adds 600."""
+"""Largest plausible difference from nominal. Radios differ by 100 ticks; a metre of antenna cable adds 600."""
 
 PATIENCE_S = 30.0
 """Timeout: if no range arrives for this time, the calibration is aborted."""
