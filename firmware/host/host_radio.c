@@ -1,4 +1,4 @@
-/* A radio at a computer, behind functions that are easy to call from another language. */
+/* A radio connected to a computer, with functions that are easy to call from another language. */
 #include <stdlib.h>
 
 #include "uwb_twr.h"
@@ -10,7 +10,7 @@ typedef struct {
     uint64_t measurement[UWB_TWR_MEASUREMENT_BYTES(WHOLE) / sizeof(uint64_t) + 1];
 } host_radio;
 
-/* NULL: no memory. */
+/* Returns NULL if there is not enough memory. */
 host_radio *host_radio_new(const uwb_dw1000_io *io, const uwb_twr_config *config, uint64_t random) {
     host_radio *const radio = calloc(1, sizeof *radio);
     if (radio != NULL) {
@@ -23,31 +23,31 @@ void host_radio_free(host_radio *radio) {
     free(radio);
 }
 
-/* NULL, or why the configuration is refused. */
+/* Returns NULL, or the reason why the configuration is refused. */
 const char *host_radio_configure(host_radio *radio, const uwb_twr_config *config) {
     const char *const refusal = uwb_twr_refusal(&radio->twr, config);
     (void)uwb_twr_configure(&radio->twr, config);
     return refusal;
 }
 
-/* A uwb_twr_event. */
+/* Returns a uwb_twr_event. */
 int host_radio_turn(host_radio *radio, uint64_t until_us) {
     return (int)uwb_twr_turn(&radio->twr, until_us);
 }
 
-/* Of the last turn: a payload of RANGE_CIR. */
+/* Measurement of the last turn: a payload of RANGE_CIR. */
 const uint8_t *host_radio_measurement(const host_radio *radio, size_t *bytes, uint64_t *measured_us) {
     *bytes = uwb_twr_measured_bytes(&radio->twr);
     *measured_us = radio->twr.measured_us;
     return radio->twr.measurement;
 }
 
-/* A UWB_RADIO_STATE_*. */
+/* Returns a UWB_RADIO_STATE_*. */
 int host_radio_state(const host_radio *radio) {
     return uwb_twr_state(&radio->twr);
 }
 
-/* 0 until the chip has started. */
+/* Active address; 0 until the chip has started. */
 uint64_t host_radio_address(const host_radio *radio) {
     return radio->twr.address;
 }
@@ -65,7 +65,7 @@ const uwb_twr_anchor *host_radio_anchors(const host_radio *radio, size_t *count)
     return radio->twr.anchors;
 }
 
-/* Between two turns; a uwb_dw1000_status. */
+/* Call between two turns; returns a uwb_dw1000_status. */
 int host_radio_sensors(host_radio *radio, float *temperature, float *voltage) {
     if (!radio->twr.running) {
         return UWB_DW1000_ABSENT;

@@ -85,7 +85,7 @@ static int is_offset(float offset_m) {
     return offset_m >= -MAX_OFFSET_M && offset_m <= MAX_OFFSET_M;
 }
 
-/* Take the payload of a SET_OFFSETS, the host's frame `request`, and answer; returns whether it is well formed. */
+/* Process the payload of a SET_OFFSETS, the host's frame `request`, and answer; returns whether it is well formed. */
 static int set_offsets(uwb_board *board, const uint8_t *payload, size_t payload_bytes, uint32_t request,
                        uint64_t now_us) {
     uwb_set_offsets_t fixed;
@@ -128,7 +128,7 @@ void uwb_board_start(uwb_board *board, const uwb_board_config *config, uint64_t 
     hello(board, NULL, now_us);
 }
 
-/* Whether the frame was one for the board. */
+/* Returns whether the frame was for the board. */
 static int answer(uwb_board *board, const uwb_header_t *header, size_t payload_bytes, uint64_t now_us) {
     const uint8_t *const payload = board->host.body.bytes + UWB_HEADER_BYTES;
     switch (header->type) {
@@ -151,7 +151,7 @@ static int answer(uwb_board *board, const uwb_header_t *header, size_t payload_b
         memset(&reply, 0, sizeof reply);
         reply.request_sequence = header->sequence;
         reply.received_us = now_us;
-        /* Before all that waits: the shorter the round trip, the better the host knows the clock. */
+        /* Put it before all queued frames: a short round trip improves the clock estimate of the host. */
         const uwb_header_t first = {UWB_PROTOCOL_VERSION, UWB_TYPE_TIME_SYNC_REPLY, UWB_FLAG_ANSWER, 0,
                                     UWB_WHEN_IT_LEAVES};
         (void)uwb_queue_urgent(&board->queue, &first, &reply, sizeof reply);
@@ -184,7 +184,7 @@ void uwb_board_receive(uwb_board *board, const uint8_t *bytes, size_t count, uin
         }
     }
     if (board->host.foreign_versions != foreign) {
-        /* A host of another version learns from this which one the board speaks. */
+        /* This frame shows the board's version to a host of another version. */
         hello(board, NULL, now_us);
     }
 }

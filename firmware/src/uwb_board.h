@@ -1,8 +1,8 @@
-/* The board's side of the wire protocol: what a sketch and bare metal share. uwb_mitigation/link/board.py is the same
- * in Python.
+/* The board's side of the wire protocol: shared by sketches and bare metal. uwb_mitigation/link/board.py is the
+ * same in Python.
  *
- * No allocation, no globals, and nothing here waits: what the host does not read in time is lost whole frame by whole
- * frame, and counted. `now_us` is the board's uptime, of 64 bits. */
+ * No allocation, no globals, no blocking: if the host does not read in time, complete frames are dropped and
+ * counted. `now_us` is the board's uptime, of 64 bits. */
 #ifndef UWB_BOARD_H
 #define UWB_BOARD_H
 
@@ -13,19 +13,19 @@ extern "C" {
 #endif
 
 #define UWB_STATUS_INTERVAL_US 1000000u
-#define UWB_ANSWER_RESERVE_BYTES 512u /* of the queue, which measurements leave to answers and STATUS */
+#define UWB_ANSWER_RESERVE_BYTES 512u /* of the queue, reserved for answers and STATUS */
 
-/* What a board is made of. Memory stays the caller's, as long as the board is in use. */
+/* Configuration of a board. The caller owns the memory and must keep it while the board is in use. */
 typedef struct {
     uint64_t board_id;
-    uint32_t boot_id; /* differs from one start to the next */
+    uint32_t boot_id; /* differs between two boots */
     uint8_t firmware_version[3];
     uint8_t mode; /* UWB_MODE_* to start in; HOST if there is no model */
     char firmware_name[16];
-    const uwb_model *model; /* NULL = it has none */
+    const uwb_model *model; /* NULL = no model */
     void *arena;            /* as for uwb_correct */
     size_t arena_bytes;
-    uint8_t *queue; /* for frames to the host; two of the longest and the reserve are ample */
+    uint8_t *queue; /* for frames to the host; two of the longest and the reserve are enough */
     size_t queue_bytes;
     uint32_t (*clock_us)(void); /* for compute_us; NULL = it is sent as 0 */
     /* Take a frame of a type that a board without a radio of its own has not; return whether it was used. May be
@@ -51,16 +51,16 @@ typedef struct {
     uint8_t mode;
     float default_offset_m;
     uint16_t offset_count;
-    uwb_offset_t offsets[UWB_MAX_OFFSETS]; /* as the host has set them; none at the start */
+    uwb_offset_t offsets[UWB_MAX_OFFSETS]; /* set by the host; empty after boot */
 } uwb_board;
 
 /* Start, and send HELLO. */
 void uwb_board_start(uwb_board *board, const uwb_board_config *config, uint64_t now_us);
 
-/* Take bytes from the host, and answer. */
+/* Process bytes from the host, and answer. */
 void uwb_board_receive(uwb_board *board, const uint8_t *bytes, size_t count, uint64_t now_us);
 
-/* Take bytes from the radio's side: frames RANGE_CIR. Send them on, corrected or not, as the mode says. */
+/* Process frames RANGE_CIR from the radio's side. Forward them raw or corrected, according to the mode. */
 void uwb_board_measure(uwb_board *board, const uint8_t *bytes, size_t count, uint64_t now_us);
 
 /* Send a measurement on, a payload of RANGE_CIR aligned to 2 bytes that the board's own radio made at `time_us`; returns

@@ -42,7 +42,7 @@ const uwb_dw1000_settings uwb_dw1000_defaults = {5, 64, 0, 0, 6800, 128, 0, 0, 0
 
 #define COUNT(array) (sizeof(array) / sizeof(array)[0])
 
-/* Places in the tables above; the number of entries where there is none. */
+/* Indices in the tables above; the number of entries if the value is not in the table. */
 static size_t channel_at(const uwb_dw1000_settings *settings) {
     size_t i = 0;
     while (i < COUNT(channels) && channels[i].number != settings->channel) {
@@ -115,7 +115,7 @@ static uint32_t otp_antenna_delay(const uwb_dw1000 *chip, const uwb_dw1000_setti
     return total != 0xFFFFu ? total : 0;
 }
 
-/* The chip's settings with nothing left to the chip. */
+/* The complete settings: zeros are replaced by OTP values or defaults. */
 static uwb_dw1000_settings resolve(const uwb_dw1000 *chip, const uwb_dw1000_settings *settings, size_t channel) {
     uwb_dw1000_settings resolved = *settings;
     const int fast = settings->prf_mhz == 64;
@@ -154,7 +154,7 @@ uwb_dw1000_status uwb_dw1000_configure(uwb_dw1000 *chip, const uwb_dw1000_settin
     chip->settings = now;
     chip->tx_antenna_delay = (uint16_t)tx_delay;
     /* Smart power exists at 6.8 Mbit/s only: the chip boosts short frames, by the upper octets of the word. Without it,
-     * octets 1 and 2 drive PHR and data whatever the length, so that all octets get the level of long frames. */
+     * octets 1 and 2 apply to PHR and data of any length, so that all octets get the level of long frames. */
     const int smart = now.rate_kbps == 6800;
     const uint32_t power = smart ? now.tx_power : (now.tx_power & 0xFFu) * 0x01010101u;
     chip->sys_cfg = HIRQ_POL | DIS_DRXB | (smart ? 0 : DIS_STXP) | (rate == 0 ? RXM110K : 0);
@@ -340,7 +340,7 @@ uwb_dw1000_status uwb_dw1000_start(uwb_dw1000 *chip, const uwb_dw1000_io *io, co
     DW1000_TRY(load_leading_edge_detector(chip));
     DW1000_TRY(start_clock(chip));
     io->speed(io->context, 1);
-    /* The chip's own mark of a start: seen again, it was reset behind our back. */
+    /* The chip sets this flag at a start: if it is set again, the chip was reset unexpectedly. */
     DW1000_TRY(uwb_dw1000_set(chip, SYS_STATUS, 4, SLP2INIT));
     DW1000_TRY(uwb_dw1000_configure(chip, settings != NULL ? settings : &uwb_dw1000_defaults));
     const uwb_dw1000_status status = uwb_dw1000_check(chip);

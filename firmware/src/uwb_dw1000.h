@@ -26,7 +26,7 @@ typedef enum {
     UWB_DW1000_NO_CLOCK,     /* the clock PLL did not report its lock, and the chip ignores SPI at full speed */
     UWB_DW1000_RESTARTED,    /* the chip has lost its settings: it was reset, or its supply failed */
     UWB_DW1000_TIMEOUT,      /* nothing was received in time */
-    UWB_DW1000_DAMAGED,      /* something was received, and no frame: header, check sequence, decoder, leading edge */
+    UWB_DW1000_DAMAGED,      /* the received data is no valid frame: header, check sequence, decoder, leading edge */
     UWB_DW1000_LATE,         /* a delayed transmission would have begun in the past */
     UWB_DW1000_UNSENT        /* a transmission did not end in time */
 } uwb_dw1000_status;
@@ -42,7 +42,7 @@ typedef struct {
     void (*reset)(void *context); /* pull RSTn low for a while, then let it float: never high. NULL: not wired */
     uint64_t (*now_us)(void *context);
     /* Return when the IRQ line is high, at `until_us`, or earlier: the driver then looks at SYS_STATUS. Other work may
-     * be done meanwhile. With no IRQ wired, return at once, or after a pause. */
+     * be done meanwhile. If IRQ is not wired, return immediately or after a pause. */
     void (*wait)(void *context, uint64_t until_us);
     void (*sleep)(void *context, uint32_t us); /* at least for this time */
 } uwb_dw1000_io;
@@ -57,7 +57,7 @@ typedef struct {
     uint16_t preamble;       /* symbols: 64, 128, 256, 512, 1024, 1536, 2048, 4096 */
     uint32_t tx_power;       /* TX_POWER in smart-power format, as in the OTP memory: from the lowest octet on for frames
                               * of any length, up to 500, 250 and 125 us; below 6.8 Mbit/s the lowest octet is used for
-                              * all. 0 = the OTP memory's value, or the manual's if there is none */
+                              * all. 0 = the OTP memory's value, or the manual's if not programmed */
     uint32_t antenna_delay;  /* ticks of transmitter and receiver together; 0 = as in the OTP memory, else nominal */
     uint8_t anchor;          /* take a TREK1000 board's antenna delay as an anchor, not as a tag */
 } uwb_dw1000_settings;
@@ -108,13 +108,13 @@ typedef struct {
 } uwb_dw1000_quality;
 
 /* Reset the chip, set its clocks up, load the leading-edge detector, read the OTP memory, and configure. NULL settings:
- * the usual ones. */
+ * defaults. */
 uwb_dw1000_status uwb_dw1000_start(uwb_dw1000 *chip, const uwb_dw1000_io *io, const uwb_dw1000_settings *settings);
 
 /* Other settings for a chip that was started. BAD_ARGUMENT changes nothing. */
 uwb_dw1000_status uwb_dw1000_configure(uwb_dw1000 *chip, const uwb_dw1000_settings *settings);
 
-/* Whether the settings are ones that a chip has. */
+/* Whether the settings are valid for a chip. */
 int uwb_dw1000_valid(const uwb_dw1000_settings *settings);
 
 /* RESTARTED if the chip has lost its settings since. */
@@ -138,7 +138,7 @@ uint64_t uwb_dw1000_stamp_at(const uwb_dw1000 *chip, uint64_t at);
 uwb_dw1000_status uwb_dw1000_send_at(uwb_dw1000 *chip, const uint8_t *octets, size_t bytes, uint64_t stamp,
                                      uint32_t answer_us);
 
-/* Leave the clock to the chip again, after uwb_dw1000_sent. */
+/* Return the clock control to the chip, after uwb_dw1000_sent. */
 uwb_dw1000_status uwb_dw1000_release_clock(uwb_dw1000 *chip);
 
 /* Wait until what was sent has left; `stamp`, which may be NULL, becomes its TX_STAMP. The receiver goes on meanwhile. */
@@ -154,7 +154,7 @@ uwb_dw1000_status uwb_dw1000_receive(uwb_dw1000 *chip, uwb_dw1000_frame *frame, 
 /* As TIMEOUT if nothing has been received by `until_us`, but leaves the receiver on. */
 uwb_dw1000_status uwb_dw1000_receive_or_stay(uwb_dw1000 *chip, uwb_dw1000_frame *frame, uint64_t until_us);
 
-/* Transmitter and receiver off. */
+/* Turn transmitter and receiver off. */
 uwb_dw1000_status uwb_dw1000_idle(uwb_dw1000 *chip);
 
 /* Read the quality of the last frame, before the receiver is enabled again. */

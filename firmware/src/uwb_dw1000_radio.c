@@ -22,8 +22,8 @@ uwb_dw1000_status uwb_dw1000_idle(uwb_dw1000 *chip) {
     return uwb_dw1000_release_clock(chip);
 }
 
-/* Errata TX-1: a time just above the limit of what is too late would pass in silence, with the clock left to the
- * sequencer. */
+/* Errata TX-1: if the sequencer controls the clock, a start time just above the limit for HPDWARN is missed without
+ * a warning. */
 uwb_dw1000_status uwb_dw1000_force_clock(uwb_dw1000 *chip) {
     if (chip->clock_forced) {
         return UWB_DW1000_OK;
@@ -42,7 +42,7 @@ uwb_dw1000_status uwb_dw1000_release_clock(uwb_dw1000 *chip) {
     return UWB_DW1000_OK;
 }
 
-/* The receiver's own time-out; what it was set to is not written again. */
+/* Set the receiver's own timeout; write it only if it has changed. */
 static uwb_dw1000_status set_time_out(uwb_dw1000 *chip, uint32_t for_us) {
     const uint32_t units = for_us < LONGEST_WAIT_US ? (uint32_t)(for_us / WAIT_UNIT_US) + 1u : 0;
     const uint32_t sys_cfg = units != 0 ? chip->sys_cfg | RXWTOE : chip->sys_cfg & ~RXWTOE;

@@ -28,7 +28,7 @@ size_t uwb_encode_frame(uint8_t *wire, size_t payload_bytes) {
     memcpy(from + checked, &crc, sizeof crc);
 
     size_t to = 0;
-    wire[to++] = 0; /* closes whatever noise precedes */
+    wire[to++] = 0; /* terminates preceding noise */
     size_t code_at = to++;
     uint8_t code = 1;
     int open = 1; /* whether a block is being written, whose length goes to code_at */
@@ -69,7 +69,7 @@ static void store(uwb_decoder *decoder, uint8_t byte) {
     decoder->decoded++;
 }
 
-/* What lies between two delimiters is complete. */
+/* A segment between two delimiters is complete. */
 static int32_t finish(uwb_decoder *decoder, uwb_header_t *header) {
     const size_t length = decoder->decoded;
     if (decoder->remaining != 0) {

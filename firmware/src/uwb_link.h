@@ -19,16 +19,16 @@ extern "C" {
 /* Turns a stream of bytes into frames; keeps at most one. All zeros is a decoder that has seen nothing. */
 typedef struct {
     uint32_t frames;           /* intact, of this version */
-    uint32_t bad_cobs;         /* stretches between delimiters that are not COBS */
+    uint32_t bad_cobs;         /* segments between delimiters that are not COBS */
     uint32_t bad_length;       /* shorter than header and CRC, or longer than the longest frame */
     uint32_t bad_crc;
-    uint32_t oversize;         /* stretches longer than a frame can be encoded */
+    uint32_t oversize;         /* segments longer than the longest encoded frame */
     uint32_t foreign_versions; /* intact frames of another version */
-    uint16_t encoded;          /* bytes of the stretch so far */
+    uint16_t encoded;          /* bytes of the segment so far */
     uint16_t decoded;
     uint8_t code;              /* of the block that is being read */
     uint8_t remaining;         /* bytes that it still has */
-    uint8_t overrun;           /* the stretch is counted as oversize: skip to its end */
+    uint8_t overrun;           /* the segment is counted as oversize: skip to its end */
     union {
         uint64_t aligned;
         uint8_t bytes[UWB_MAX_FRAME_BYTES];

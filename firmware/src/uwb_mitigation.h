@@ -50,7 +50,7 @@ typedef struct {
     float first_path_power_dbm;
 } uwb_cir;
 
-/* What becomes of a 256-fold accumulator: clip((acc + bias) * multiplier >> 43, 0, 255). */
+/* Requantisation of a 256-fold accumulator: clip((acc + bias) * multiplier >> 43, 0, 255). */
 typedef struct {
     int32_t bias;
     int32_t multiplier;
@@ -92,7 +92,7 @@ typedef struct {
     float per_unit;
 } uwb_band;
 
-/* What the model was trained on; uwb_mitigation/model/familiarity.py says what the features are. */
+/* What the model was trained on; uwb_mitigation/model/familiarity.py defines the features. */
 typedef struct {
     float known_offset_m; /* correction of a measurement that is out of distribution */
     uwb_band bands[UWB_FEATURES];
@@ -140,7 +140,7 @@ uwb_status uwb_preprocess(const uwb_model *model, const uwb_cir *cir, float *win
 uwb_status uwb_network(const uwb_model *model, const float *window, void *arena, size_t arena_bytes,
                        float *output_m);
 
-/* What a corrected range is worth; the values of RangeCorrected.msg and of the wire protocol. */
+/* Status of a corrected range; the values of RangeCorrected.msg and of the wire protocol. */
 typedef enum {
     UWB_RANGE_OK = 0,
     UWB_RANGE_NO_CIR = 1,

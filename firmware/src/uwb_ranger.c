@@ -146,8 +146,8 @@ static void send_due(uwb_ranger *ranger) {
     }
 }
 
-/* A tag that is faster than the line to its host does not range for nothing, nor what has grown old on the way: no more
- * than a measurement waits behind the one that is being sent. */
+/* Limit the queue to one measurement behind the one being sent: if the line is slower than the tag, more measurements
+ * would be dropped or outdated. */
 static void await_room(const uwb_ranger *ranger) {
     const size_t most = UWB_TWR_MEASUREMENT_BYTES(ranger->twr.config.window);
     const uint64_t until_us = now_us(ranger) + ROOM_WITHIN_US;

@@ -1,4 +1,4 @@
-/* What the target is: Cortex-M4 or portable C, and floating point as the host computes it. For C and for the assembler. */
+/* Detection of the target, Cortex-M4 or portable C, and its floating-point arithmetic. For C and assembler. */
 #ifndef UWB_TARGET_H
 #define UWB_TARGET_H
 

@@ -28,7 +28,7 @@ extern "C" {
 /* Memory for a measurement with `samples` complex samples. */
 #define UWB_TWR_MEASUREMENT_BYTES(samples) (sizeof(uwb_range_cir_t) + 4u * (samples))
 
-/* What a tag and an anchor do; all but the first three matters to a tag alone. */
+/* Configuration of a tag or an anchor. Only tags use reply_us, patience_us, interval_us and the list of anchors. */
 typedef struct {
     uwb_dw1000_settings radio;
     uint64_t address; /* 0 = the chip's */
@@ -47,7 +47,7 @@ typedef struct {
 /* Usual radio, a tag with 157 samples that finds its anchors, and times for SPI of a microcontroller. */
 extern const uwb_twr_config uwb_twr_defaults;
 
-/* Exchanges that began, and what became of them: `tried` is the sum of those that follow. */
+/* Started exchanges and their results: `tried` is the sum of the results. */
 typedef struct {
     uint32_t tried;
     uint32_t ranged;
@@ -62,7 +62,7 @@ typedef struct {
     uint32_t restarts; /* of the chip, but for the first */
 } uwb_twr_counts;
 
-/* An anchor as a tag knows it. */
+/* State of an anchor at a tag. */
 typedef struct {
     uint64_t address;
     uint64_t heard_us;
@@ -144,7 +144,7 @@ void uwb_twr_start(uwb_twr *twr, const uwb_dw1000_io *io, const uwb_twr_config *
  * ones take on top of it. */
 void uwb_twr_fill_times(uwb_twr_config *config, uint32_t reply_us, uint32_t patience_us);
 
-/* Why a configuration is refused; NULL = it is valid. */
+/* Return the reason why a configuration is refused; NULL = it is valid. */
 const char *uwb_twr_refusal(const uwb_twr *twr, const uwb_twr_config *config);
 
 /* Use another configuration from the next turn on; returns 0 if it is refused. Counts go on, anchors are searched again. */

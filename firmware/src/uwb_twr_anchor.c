@@ -1,7 +1,7 @@
 #include "uwb_twr_common.h"
 
 enum {
-    LOOK_US = 100000,            /* between two looks whether the chip is in order */
+    LOOK_US = 100000,            /* between two checks of the chip */
     LONGEST_WINDOW_US = 100000,  /* of a SEEK */
     LONGEST_REPLY_US = 200000,   /* of a POLL */
     FINAL_MARGIN_US = 2000,

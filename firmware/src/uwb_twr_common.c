@@ -138,7 +138,7 @@ uwb_twr_event uwb_twr_lost(uwb_twr *twr, uwb_dw1000_status status, uint32_t *whe
     }
     twr->misses++;
     if (status == UWB_DW1000_TIMEOUT || status == UWB_DW1000_DAMAGED || status == UWB_DW1000_LATE) {
-        /* Nothing was wrong on this side, unless the chip has forgotten what it is to do. */
+        /* No error on this side, unless the chip has lost its settings. */
         const int hopeless = twr->misses % MISSES_TO_RESTART == 0;
         status = hopeless ? UWB_DW1000_RESTARTED : uwb_dw1000_check(&twr->chip);
         if (status == UWB_DW1000_OK) {

@@ -1,4 +1,4 @@
-/* What the two roles of an exchange share. Internal. */
+/* Functions shared by the two roles of an exchange. Internal. */
 #ifndef UWB_TWR_COMMON_H
 #define UWB_TWR_COMMON_H
 
@@ -27,7 +27,7 @@ uwb_dw1000_status uwb_twr_expect(uwb_twr *twr, const uwb_twr_frame *sent, uwb_tw
 uwb_dw1000_status uwb_twr_measure(uwb_twr *twr, const uwb_dw1000_frame *received, uint64_t tag, uint64_t anchor,
                                   double range_m, float *rx_power_dbm);
 
-/* Count an exchange that failed, and see what the chip needs. */
+/* Count a failed exchange, and restart the chip if necessary. */
 uwb_twr_event uwb_twr_lost(uwb_twr *twr, uwb_dw1000_status status, uint32_t *when_timed_out);
 
 #endif

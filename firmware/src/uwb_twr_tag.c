@@ -35,7 +35,7 @@ static void meet(uwb_twr *twr, uint64_t address, uint64_t now_us) {
     }
 }
 
-/* Found anchors that are gone for long make room; those of a list stay. */
+/* Remove discovered anchors that have not answered for long; listed anchors stay. */
 static void forget(uwb_twr *twr, uint64_t now_us) {
     for (uint8_t i = twr->known; i-- > 0 && twr->config.anchor_count == 0;) {
         if (now_us - twr->anchors[i].heard_us > FORGET_US) {
@@ -121,7 +121,7 @@ static uwb_dw1000_status poll(uwb_twr *twr, uwb_twr_anchor *anchor, uwb_twr_fram
         status = uwb_dw1000_sent(&twr->chip, until_us, &final->stamps[0]);
     }
     if (status == UWB_DW1000_OK) {
-        status = uwb_dw1000_force_clock(&twr->chip); /* while there is time */
+        status = uwb_dw1000_force_clock(&twr->chip); /* now: later there may not be enough time */
     }
     if (status == UWB_DW1000_OK) {
         status = uwb_twr_expect(twr, &frame, UWB_TWR_ANSWER, until_us, &received, &answer);
@@ -204,7 +204,7 @@ uwb_twr_event uwb_twr_tag_turn(uwb_twr *twr, uint64_t until_us) {
             twr->reply_us -= (twr->reply_us - twr->config.reply_us + 255) / 256;
         }
     } else {
-        /* Another tag may have been in the way: wait for a random while, longer from miss to miss. */
+        /* Another tag may have interfered: wait for a random time that grows with each miss. */
         event = uwb_twr_lost(twr, status, lost);
         if (status == UWB_DW1000_LATE && twr->reply_us < SLOWEST_REPLY_US) {
             twr->reply_us += twr->reply_us / 4;

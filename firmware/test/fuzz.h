@@ -1,4 +1,4 @@
-/* What the fuzz targets share: how a broken promise ends one, and inputs of its own where there is no fuzzer. */
+/* Shared by the fuzz targets: abort on a violated assertion, and generated inputs if there is no fuzzer. */
 #ifndef UWB_FUZZ_H
 #define UWB_FUZZ_H
 
@@ -19,7 +19,7 @@ static void check(int promise, const char *what) {
 #ifndef UWB_LIBFUZZER
 static uint64_t fuzz_state;
 
-/* How many inputs are asked for: PROGRAM <inputs> <seed>. */
+/* The requested number of inputs: PROGRAM <inputs> <seed>. */
 static unsigned long fuzz_inputs(int argc, char **argv) {
     if (argc != 3) {
         exit(2);

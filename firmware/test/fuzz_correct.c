@@ -1,4 +1,4 @@
-/* Feeds arbitrary CIRs to uwb_correct, and stops on whatever breaks its promises.
+/* Feeds arbitrary CIRs to uwb_correct, and aborts on violated assertions.
  *
  *     clang -fsanitize=fuzzer,address,undefined -DUWB_LIBFUZZER -Isrc -I<export> test/fuzz_correct.c src/uwb_*.c
  *
@@ -77,7 +77,7 @@ int main(int argc, char **argv) {
     const unsigned long inputs = fuzz_inputs(argc, argv);
     for (unsigned long i = 0; i < inputs; i++) {
         fuzz_fill(data, sizeof data);
-        /* Every second input has few oddities, and small samples: most of those reach the network. */
+        /* Every second input has few invalid fields and small samples: most of these reach the network. */
         if (i % 2 == 0) {
             data[0] &= (uint8_t)(data[1] & data[3]);
             for (size_t byte = FIELD_BYTES + 1; byte < sizeof data; byte += 2) {

@@ -3,7 +3,7 @@
  *
  *     clang -fsanitize=fuzzer,address,undefined -DUWB_LIBFUZZER -Isrc -I<export> test/fuzz_link.c src/uwb_*.c
  *
- * Without a fuzzer it makes its own inputs: fuzz_link <inputs> <seed>. Half of the stretches are
+ * Without a fuzzer it makes its own inputs: fuzz_link <inputs> <seed>. Half of the segments are
  * made into intact frames, so that inputs get past the CRC. */
 #include "fuzz.h"
 #include "uwb_board.h"

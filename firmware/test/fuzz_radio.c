@@ -15,7 +15,7 @@ enum { CPLOCK = 2, TXFRS = 1 << 7, LDEDONE = 1 << 10, RXFCG = 1 << 14 };
 static const uint32_t TAKEN = 0x24B7FF00u;     /* bits that the driver acts on, and that stay until then */
 static const uint32_t READ_ONLY = 0xC8100001u; /* go with the next command */
 
-/* A chip that says what the input wants. */
+/* A chip whose answers are taken from the input. */
 typedef struct {
     const uint8_t *data;
     size_t left;
@@ -55,7 +55,7 @@ static uint64_t ticks(const fake *chip) {
     return chip->now_us * 63898u & UWB_DW1000_TICK_MASK;
 }
 
-/* The other side's stamps, as of a wave that takes so long; or none that can be. */
+/* The other side's stamps for a given time of flight, or impossible ones. */
 static void stamp(fake *chip) {
     const uint64_t flight = next(chip);
     const int tag = chip->role == UWB_ROLE_TAG;
@@ -76,7 +76,7 @@ static void deliver(fake *chip, const uwb_twr_frame *frame) {
     chip->status = LDEDONE | RXFCG;
 }
 
-/* A POLL of somebody, for an anchor. */
+/* A POLL of a tag, for an anchor. */
 static uwb_twr_frame a_poll(fake *chip) {
     uwb_twr_frame frame;
     memset(&frame, 0, sizeof frame);
@@ -90,7 +90,7 @@ static uwb_twr_frame a_poll(fake *chip) {
     return frame;
 }
 
-/* What is wrong with a frame that is right but for it. */
+/* The single error of an otherwise correct frame. */
 static void spoil(uwb_twr_frame *frame, uint8_t how) {
     switch (how % 7) {
     case 0:
@@ -121,7 +121,7 @@ static void something_comes(fake *chip) {
     const uint8_t how = next(chip);
     chip->status = 0;
     switch (how % 8) {
-    case 0: /* any bytes, of any length, which the length told need not be */
+    case 0: /* any bytes; the reported length may differ from their length */
         chip->frame_bytes = next(chip) % 128u;
         for (size_t i = 0; i < chip->frame_bytes; i++) {
             chip->frame[i] = next(chip);
@@ -150,7 +150,7 @@ static void something_comes(fake *chip) {
             deliver(chip, &frame);
         }
         break;
-    case 4: /* one of before */
+    case 4: /* an earlier frame */
         if (chip->past_count != 0) {
             const unsigned kept = chip->past_count < PAST ? chip->past_count : PAST;
             deliver(chip, &chip->past[next(chip) % kept]);
@@ -168,7 +168,7 @@ static void something_comes(fake *chip) {
     }
 }
 
-/* Which frame goes on with the exchange that the last one sent is of. */
+/* The frame that continues the exchange of the last frame sent. */
 static void expect(fake *chip) {
     static const uwb_twr_kind answers[] = {0, 0, 0, UWB_TWR_ANSWER, UWB_TWR_FINAL, UWB_TWR_REPORT, 0};
     const uwb_twr_frame *const sent = &chip->sent;
@@ -210,7 +210,7 @@ static void write_register(fake *chip, uint8_t file, size_t sub, const uint8_t *
         chip->stamps[chip->role == UWB_ROLE_ANCHOR ? 1 : chip->sent.kind == UWB_TWR_FINAL ? 2 : 0] = chip->sent_at;
     }
     if (file == 0x0D && ((out[0] & 0x80u) || (bytes > 1 && (out[1] & 1u)))) {
-        chip->status = 0; /* as the receiver is enabled, at once or after a frame */
+        chip->status = 0; /* as when the receiver is enabled, immediately or after a frame */
     }
     if (file == 0x0F) {
         for (size_t i = 0; i < bytes && i < 4; i++) {

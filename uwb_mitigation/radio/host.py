@@ -78,7 +78,7 @@ class HostRadio:
         self._temperature_c = self._voltage = float("nan")
 
     def turn(self, at_most_s: float) -> RangeMeasurement | None:
-        """Perform one exchange; return None if there is none before the timeout. An exchange may end after it.
+        """Perform one exchange; return None after the timeout. An exchange may end after it.
 
         Raises:
             LinkError: the bus is lost, or no chip answers; the next call tries to start the chip again.

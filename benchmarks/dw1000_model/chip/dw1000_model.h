@@ -30,7 +30,7 @@ typedef struct {
     double damage;            /* probability that one is received with an error, of any of the kinds there are */
 } dw1000_link_config;
 
-/* NULL: no memory. Freeing an air frees its chips, and ends programs where they stand. */
+/* NULL: no memory. Freeing an air frees its chips and stops their programs. */
 dw1000_air *dw1000_air_new(uint64_t seed);
 void dw1000_air_free(dw1000_air *air);
 
@@ -44,7 +44,7 @@ dw1000_chip *dw1000_chip_new(dw1000_air *air, double ppm, uint64_t clock_ticks, 
  * keeps the link it began with. */
 void dw1000_link(dw1000_air *air, dw1000_chip *a, dw1000_chip *b, const dw1000_link_config *config);
 
-/* Give a chip's host a program, from now on, in place of the one before. */
+/* Start a program on a chip's host; it replaces the previous one. */
 void dw1000_program(dw1000_chip *chip, void (*run)(dw1000_chip *chip, void *context), void *context);
 
 /* Let `seconds` pass, or less if all programs end within them; returns the time reached, from the air's beginning. */
@@ -78,7 +78,7 @@ typedef struct {
     uint32_t hz;
 } dw1000_request;
 
-/* `next` writes the next request, and returns 0 when there is none any more. It is called on the program's stack, and
+/* `next` writes the next request, and returns 0 after the last one. It is called on the program's stack, and
  * has to return before anything else happens on the air. */
 void dw1000_program_remote(dw1000_chip *chip, int (*next)(void *context, dw1000_request *request), void *context);
 
@@ -87,15 +87,15 @@ void dw1000_program_remote(dw1000_chip *chip, int (*next)(void *context, dw1000_
 /* How the host holds RSTn from now on. The chip drives the line too: held high, it is destroyed. */
 typedef enum { DW1000_RESET_LOW, DW1000_RESET_FLOAT, DW1000_RESET_HIGH } dw1000_reset_level;
 void dw1000_reset_drive(dw1000_chip *chip, dw1000_reset_level level);
-/* What the on-chip sensors measure; 25 degrees Celsius and 3.3 V at first. */
+/* Values that the on-chip sensors measure; 25 degrees Celsius and 3.3 V at first. */
 void dw1000_environment(dw1000_chip *chip, double celsius, double volts);
-/* Of the good frames that a chip receives, how many have no leading edge that its detector finds, 0 to 1: LDEERR. */
+/* Fraction of good frames, 0 to 1, in which the chip's detector finds no leading edge: LDEERR. */
 void dw1000_lose_edges(dw1000_chip *chip, double probability);
 /* Set a word of the OTP memory, 0x00 to 0x7F; registers that are loaded from it change with the next reset. */
 void dw1000_program_otp(dw1000_chip *chip, unsigned address, uint32_t word);
 /* Transmit power of the last frame for preamble and data, and for the PHR: dB above the lowest that TX_POWER can set. */
 void dw1000_sent_power(const dw1000_chip *chip, double *data_db, double *header_db);
-/* What destroyed the chip; NULL: the chip works. */
+/* Cause of the destruction of the chip; NULL: the chip works. */
 const char *dw1000_fault(const dw1000_chip *chip);
 
 #ifdef __cplusplus

@@ -268,7 +268,7 @@ void dw1000_delay(dw1000_chip *chip, double s) {
     dw1000_pass(chip->air, chip->air->now + duration(s));
 }
 
-/* Looking takes a program a moment: one that does nothing but look still gets somewhere. */
+/* Polling takes time, so that a polling loop advances the virtual time. */
 static void look(dw1000_air *air) {
     if (air->current != air->outside) {
         dw1000_pass(air, air->now + duration(LOOK_S));

@@ -129,7 +129,7 @@ void dw1000_spi(dw1000_chip *chip, const uint8_t *out, uint8_t *in, size_t n, ui
     size_t done = to.octets;
     unsigned sub = to.sub;
     if (to.file == ACC_MEM && done < n) {
-        /* The first octet of every read is what was in the pipe before. */
+        /* The first octet of every read is a stale octet of the pipeline. */
         const uint8_t stale = (uint8_t)(0x5A ^ air->order);
         if (in != NULL) {
             in[done] = stale;

@@ -77,7 +77,7 @@ static void preamble_sent(dw1000_chip *chip, transmission *frame) {
     dw1000_schedule(chip, GROUP_TX, frame->data, take_payload, frame);
 }
 
-/* TX_POWER by its two formats: smart power has an octet for each duration of a frame, at 6.8 Mbit/s alone; without it
+/* TX_POWER by its two formats: smart power has an octet for each duration of a frame, at 6.8 Mbit/s only; without it
  * the third octet is for preamble and data, the second one for the PHR. */
 static void choose_power(dw1000_chip *chip, const transmission *frame) {
     static const double BOOST_US[] = {500, 250, 125};
@@ -201,7 +201,7 @@ void dw1000_stop_transmitter(dw1000_chip *chip) {
     if (frame != NULL && chip->tx == TX_ON) {
         frame->aborted = chip->air->now;
     } else {
-        free(frame); /* nobody knows of it yet */
+        free(frame); /* it is not referenced yet */
     }
     chip->sending = NULL;
     chip->tx = TX_OFF;

@@ -1,4 +1,4 @@
-/* Start-up of a bare-metal Cortex-M4 with FPU: vectors, memory, then main. Linker scripts give the symbols. */
+/* Start-up of a bare-metal Cortex-M4 with FPU: vectors, memory, then main. Linker scripts define the symbols. */
 #include <stdint.h>
 #include <string.h>
 
@@ -9,7 +9,7 @@ int main(void);
 void reset(void);
 void fault(void);
 
-/* What to do when main returns or the processor faults: the board says. */
+/* Called when main returns or the processor faults; each board defines it. */
 __attribute__((noreturn)) void board_exit(int code);
 
 void fault(void) {

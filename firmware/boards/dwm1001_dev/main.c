@@ -1,7 +1,7 @@
 /* Decawave DWM1001-DEV: an nRF52832 with a DW1000, on the wire to the host through the UART of its J-Link.
  *
  * It starts as an anchor, so that it can run without a host on a power bank; with the button BT2 held at the start, or when its
- * host says so, it is a tag. Never run on a board: built, its size looked at, and its exchange run on a modelled chip. */
+ * host says so, it is a tag. Not tested on a board: only built, checked for size, and its exchange run on a modelled chip. */
 #include <string.h>
 
 #include "nrf52832.h"
@@ -19,7 +19,7 @@ static uint32_t arena[12288 / 4];
 static uint8_t queue[8192];
 static uint64_t measurement[UWB_TWR_MEASUREMENT_BYTES(WHOLE) / 8 + 1];
 
-/* What the interrupt shares with the rest. Each index is written on one side only. */
+/* Shared with the interrupt handler. Each index is written on one side only. */
 static struct {
     uint8_t received[1024];
     volatile uint32_t head, tail;
@@ -57,7 +57,7 @@ void uart_interrupt(void) {
     }
     if (UART_EVENTS_ERROR != 0) {
         UART_EVENTS_ERROR = 0;
-        UART_ERRORSRC = UART_ERRORSRC; /* a damaged frame shows by its CRC */
+        UART_ERRORSRC = UART_ERRORSRC; /* the CRC detects damaged frames */
     }
     if (UART_EVENTS_TXDRDY != 0) {
         UART_EVENTS_TXDRDY = 0;
@@ -84,7 +84,7 @@ static uint32_t clock_us(void) {
     return (uint32_t)uptime_us(NULL);
 }
 
-/* Hand the next bytes to the interrupt, when it has sent those before; it goes on by itself meanwhile. */
+/* Pass the next bytes to the interrupt handler once it has sent the previous ones. Does not block. */
 static void send_waiting(void) {
     static size_t handed;
     if (line.left != 0) {
@@ -116,8 +116,8 @@ static void spim(const uint8_t *out, size_t out_bytes, uint8_t *in, size_t in_by
     }
 }
 
-/* One chip-select period of several transfers. Anomaly 58: of one that receives a single octet and sends at most one, a
- * second is clocked, so that there is none. */
+/* One chip-select period with several transfers. Workaround for anomaly 58 (a transfer that receives one octet and sends
+ * at most one clocks a second octet): avoid such transfers. */
 static int transfer(void *context, const uint8_t *header, size_t header_bytes, const uint8_t *out, uint8_t *in,
                     size_t bytes) {
     uint8_t sent[TOGETHER], received[TOGETHER];
@@ -162,7 +162,7 @@ static void sleep(void *context, uint32_t us) {
     } while (uptime_us(context) < until_us);
 }
 
-/* The chip drives the line too: it is pulled low and let go, never driven high. */
+/* The chip drives the line too: pull it low and release it, never drive it high. */
 static void reset(void *context) {
     GPIO_OUTCLR = 1u << RADIO_RESET;
     GPIO_PIN_CNF(RADIO_RESET) = PIN_OPEN_DRAIN;

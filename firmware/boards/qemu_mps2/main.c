@@ -31,7 +31,7 @@ typedef struct {
     uint32_t model_id;
     uint32_t arena_bytes;
     uint32_t stack_bytes;  /* of uwb_network */
-    uint32_t ticks_empty;  /* of a measurement of nothing */
+    uint32_t ticks_empty;  /* of an empty measurement */
     uint32_t ticks_lowest; /* of uwb_network */
     uint32_t ticks_highest;
     uint32_t ticks_correct; /* of uwb_correct, the highest; kind 1 */
@@ -44,7 +44,7 @@ typedef struct {
 
 void board_exit(int code);
 
-/* A guard follows what the library is given of it. */
+/* A guard area follows the part that the library may use. */
 static uint32_t arena[ARENA_BYTES / sizeof(uint32_t)];
 static size_t arena_bytes;
 
@@ -69,7 +69,7 @@ static uint32_t ticks_since(uint32_t start) {
     return (start - SYST_CVR) & SYST_MAX;
 }
 
-/* Stack that uwb_network takes: fill what is free below this frame, call, and see how far it reached. */
+/* Measure the stack of uwb_network: fill the free stack below this frame, call, and find the overwritten part. */
 static __attribute__((noinline)) uint32_t stack_bytes(const float *window) {
     float output_m;
     volatile uint8_t *top;

@@ -102,7 +102,7 @@ int main(void) {
     uwb_board_start(&board, &config, 0);
     for (;;) {
         uint8_t bytes[64];
-        /* Cleared before looking: what arrives from here on ends the WFI below. */
+        /* Clear before polling, so that bytes that arrive later end the WFI below. */
         for (int i = 0; i < 2; i++) {
             ports[i]->interrupt = CLEAR_ALL;
         }

@@ -9,7 +9,7 @@
 
 #include "uwb_model.h"
 
-/* The size of a USB packet: one is written whole, and only if there is room for it. */
+/* The size of a USB packet. Packets are written completely, and only if there is room. */
 static const size_t PACKET = 64;
 static const uint32_t RADIO_BAUD = 921600;
 static const uint32_t WATCHDOG_S = 4;
@@ -20,7 +20,7 @@ static uint8_t queue[16384];
 static uint64_t wraps;
 static uint32_t last_us;
 
-/* micros() wraps after 71 minutes; loop() asks far more often. */
+/* micros() wraps after 71 minutes; loop() reads it far more often. */
 static uint64_t uptime_us() {
     const uint32_t now = micros();
     if (now < last_us) {
@@ -46,7 +46,7 @@ static void feed_watchdog() {
     NRF_WDT->RR[0] = 0x6E524635u;
 }
 
-/* Take what has arrived, without waiting for more. */
+/* Read the received bytes without blocking. */
 template <typename Port> static size_t take(Port &port, uint8_t *bytes, size_t limit) {
     size_t count = 0;
     while (count < limit && port.available() > 0) {

@@ -3,8 +3,8 @@
  * 3.3 V only. D13 SPICLK, D12 SPIMISO, D11 SPIMOSI, D10 SPICSn, D2 IRQ, D9 RSTn, GND, 3V3 with 10 uF at the module: it
  * takes 150 mA at times. Serial (USB) is the host, wire protocol of docs/reference/protocol.md.
  *
- * It starts as an anchor, so that it can run without a host on a power bank; with D3 at GND at the start, or when its host says
- * so, it is a tag. For corrections on the board put uwb_model.h next to this file: uwb-mitigation board export-c -o UwbRanger.
+ * It starts as an anchor, so that it can run without a host on a power bank; with D3 at GND at the start, or when its host
+ * requests it, it is a tag. For corrections on the board put uwb_model.h next to this file: uwb-mitigation board export-c -o UwbRanger.
  *
  * SPI is done from loop() only, never from an interrupt, and in whole buffers: a byte at a time costs 20 us each. */
 #include <SPI.h>
@@ -30,7 +30,7 @@ static uint64_t measurement[UWB_TWR_MEASUREMENT_BYTES(WHOLE) / 8 + 1];
 static uint8_t exchanged[8 + 4 * WHOLE];
 static bool spi_fast;
 
-/* micros() wraps after 71 minutes; loop() asks far more often. */
+/* micros() wraps after 71 minutes; loop() reads it far more often. */
 static uint64_t uptime_us(void *) {
     static uint64_t wraps;
     static uint32_t last;
@@ -92,7 +92,7 @@ static void rest(void *, uint32_t us) {
     } while (uptime_us(nullptr) < until_us);
 }
 
-/* The chip drives the line too: it is pulled low and let go, never driven high. */
+/* The chip drives the line too: pull it low and release it, never drive it high. */
 static void reset(void *) {
     digitalWrite(RADIO_RESET, LOW);
     pinMode(RADIO_RESET, OUTPUT);
