@@ -46,7 +46,7 @@ recur with each lap, which are not in their scatter."""
 
 LEVER_STEPS = 5
 MIN_SD_M = 0.01
-"""Standard deviations of white noise and of persisting errors."""
+"""Minimum standard deviation of white noise and of persisting errors."""
 
 _ITERATIONS = 40
 _FIXED_SD = 1e-9
@@ -74,7 +74,7 @@ class PosePath:
         return PosePath(self.stamp_ns + by_ns, self.position, self.orientation)
 
     def smoothed(self) -> PosePath:
-        """Return positions from parabolas through those of `SMOOTHED_S` before and after each (Savitzky and Golay, 1964)."""
+        """Return poses with positions from parabolas through those of `SMOOTHED_S` before and after each (Savitzky and Golay, 1964)."""
         time_s = (self.stamp_ns - self.stamp_ns[0]) / _SECOND_NS
         # Sums over neighbours of 1, t, t^2, t^3, t^4, and of the positions times the first three.
         moments, right = np.zeros((len(self), 5)), np.zeros((len(self), 3, 3))

@@ -45,7 +45,7 @@ def load_truth(path: Path) -> list[Stretch]:
 
 
 def with_truth(records: Iterable[Record], stretches: Sequence[Stretch]) -> Iterator[Record]:
-    """Yield the records with the truth of the first row that covers their time, if any."""
+    """Yield the records with the truth of the first row for their pair and time, if any."""
     by_pair: dict[tuple[int, int], list[Stretch]] = {}
     for stretch in stretches:
         by_pair.setdefault((stretch.tag_id, stretch.anchor_id), []).append(stretch)

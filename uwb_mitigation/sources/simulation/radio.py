@@ -34,7 +34,7 @@ PULSE_WIDTH_TAPS = 2.4
 PLACE = (739.0, 751.0)
 """Accumulator indices of the straight-line path: the middle 90 % of the logs' first paths."""
 RAYLEIGH_VARIANCE = 1.0 - math.pi / 4.0
-"""Standard deviation of the magnitude of complex noise of unit power."""
+"""Variance of the magnitude of complex noise of unit power."""
 
 NOISE_TAPS = slice(64, 576)
 SEARCH_FROM = 640
