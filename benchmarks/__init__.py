@@ -1,1 +1,1 @@
-"""Measure what the parts of the system can do, on emulated boards and modelled chips: `python -m benchmarks`."""
+"""Benchmarks of the parts of the system on emulated boards and modelled chips: `python -m benchmarks`."""

@@ -46,7 +46,7 @@ def nodes(
 ) -> None:
     """Rate and latency of relay, mitigator and one-process pipeline.
 
-    The subjects take turns with the same ranges. One run takes about five minutes.
+    The subjects run in turns with the same ranges. One run takes about five minutes.
     """
     from benchmarks import nodes as bench
     from benchmarks import viewer as viewer_bench
@@ -76,7 +76,7 @@ def soak(
     ] = False,
     json: JsonOption = None,
 ) -> None:
-    """Memory, descriptors and threads of the nodes over many ranges."""
+    """Long run of the nodes: memory, file descriptors and threads."""
     from benchmarks import nodes as bench
 
     with console.progress() as bar:
@@ -99,7 +99,7 @@ def locator(
     seconds: Annotated[float, typer.Option(min=1.0, help="Duration of the stream.")] = 20.0,
     json: JsonOption = None,
 ) -> None:
-    """Position errors, time of the filter, latency and loss of the node."""
+    """Locator: position errors, time of the filter, latency and loss of the node."""
     from benchmarks import locator as cost
     from benchmarks import positions
 
@@ -146,7 +146,7 @@ def serial(
     unplugs: Annotated[int, typer.Option(min=1, max=1_000_000, help="Number of unplugged cables.")] = 50,
     json: JsonOption = None,
 ) -> None:
-    """The driver on the serial link of an emulated board: loss, latency, reconnection."""
+    """Driver with an emulated board on a serial link: loss, latency, reconnection."""
     from benchmarks import serial_link as bench
 
     with console.progress() as bar:
@@ -164,7 +164,7 @@ def link(
     seed: Annotated[int, typer.Option(min=0, help="Seed of payloads and damage.")] = 0,
     json: JsonOption = None,
 ) -> None:
-    """Frames through a damaging channel: losses, speed of the decoder."""
+    """Decoder with a channel that corrupts bytes: lost frames, speed."""
     from benchmarks.link import loopback
     from uwb_mitigation.link.faults import Faults
 
@@ -189,10 +189,10 @@ def radio(
     seed: Annotated[int, typer.Option(min=0, help="Seed of the soak.")] = 1,
     json: JsonOption = None,
 ) -> None:
-    """The firmware's ranging on modelled radios: error, rates, soak.
+    """Ranging of the firmware on modelled radios: error, rates, soak.
 
     The chips are modelled register by register, in virtual time. The emulated EVB1000s answer in wall-clock time: a
-    busy computer slows them down. None of this was measured on a board.
+    busy computer slows them down. No result was measured on a real board.
     """
     from benchmarks import radio as bench
     from uwb_mitigation.link.layout import Mode
@@ -236,8 +236,8 @@ def firmware(
 ) -> None:
     """The firmware in an emulated Cortex-M4: cost, equality with ONNX Runtime.
 
-    Instructions are counted exactly; cycles are estimated for zero wait states. Only a board can show wait states,
-    caches and power.
+    Instructions are counted exactly; cycles are estimated for zero wait states. The effect of wait
+    states and caches, and the power, can only be measured on a board.
     """
     from benchmarks import firmware as bench
     from uwb_mitigation.firmware_export.toolchain import Kernels, require_tools
@@ -250,7 +250,7 @@ def firmware(
         for network in networks:
             rows.append(bench.measure(network, inputs=inputs))
             if portable:
-                # Ten times slower, and compared with ONNX Runtime on the host as well.
+                # Ten times slower, and also compared with ONNX Runtime on the host.
                 rows.append(bench.measure(network, kernels=Kernels.PORTABLE, inputs=min(inputs, 100)))
             advance()
     _report({"rows": [asdict(row) for row in rows]}, json)
@@ -330,7 +330,7 @@ def _text(value: Any) -> str:
 
 
 def main() -> None:
-    """Run the command line; an error of the package or a missing library ends it with one line and exit code 1."""
+    """Run the command line; an error of the package or a missing library gives a one-line error and exit code 1."""
     try:
         app()
     except (UwbMitigationError, ImportError) as error:

@@ -57,10 +57,10 @@ def emulate_evb1000(
     seed: Annotated[int, typer.Option(help="Of all chance.")] = 1,
     json: JsonOption = None,
 ) -> None:
-    """Be EVB1000s without hardware, each on a pseudo-terminal.
+    """Emulate EVB1000s without hardware, each on a pseudo-terminal.
 
-    Modelled DW1000s behind the USB-to-SPI protocol of the factory's firmware, in wall-clock time: open the ports it
-    prints as if they were /dev/ttyACM0 and so on. Emulated only: nothing of this was compared with a board.
+    Modelled DW1000s with the USB-to-SPI protocol of the factory firmware, in wall-clock time. Use the printed ports
+    like /dev/ttyACM0. The emulation was not compared with a real board.
     """
     from benchmarks.dw1000_model.evb1000 import CLEAN_M, EmulatedEvb1000s
 
@@ -100,7 +100,7 @@ def emulate_evb1000(
 
 @contextlib.contextmanager
 def _signals() -> Iterator[list[int]]:
-    """The SIGUSR1s that have come."""
+    """Collect received SIGUSR1 signals."""
     asked: list[int] = []
     before = signal.signal(signal.SIGUSR1, lambda number, _: asked.append(number))
     try:

@@ -1,7 +1,7 @@
-"""The firmware as a board on the serial link, in an emulated Cortex-M4.
+"""Run the firmware in an emulated Cortex-M4 as a board on a serial link.
 
-`boards/qemu_mps2_link` runs the library and the board's side of the protocol; its first UART is a pseudo-terminal
-for the driver, and into the second the radio's frames are played, as an EVB1000 would send them.
+`boards/qemu_mps2_link` runs the library and the board side of the protocol. Its first UART is a pseudo-terminal for
+the driver; the second one receives frames of the radio like those of an EVB1000.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _PORT = re.compile(rb"char device redirected to (\S+)")
 
 
 def window_of(measurement: RangeMeasurement, samples: int) -> RangeMeasurement:
-    """The measurement with only the `samples` that a network reads; all of them where it lacks some of those."""
+    """Reduce a measurement to the `samples` that the network reads; keep all samples if some of these are missing."""
     cir = measurement.cir
     if not math.isfinite(cir.first_path_index):
         return measurement
@@ -45,10 +45,10 @@ def window_of(measurement: RangeMeasurement, samples: int) -> RangeMeasurement:
 
 
 class EmulatedFirmware:
-    """Builds the firmware with `bundle`'s model and starts it; `close`, or leaving the context, ends it.
+    """Builds the firmware with `bundle`'s model and starts it; `close` or leaving the context stops it.
 
     Raises:
-        MissingDependencyError: compiler or emulator are missing; names the line that installs them.
+        MissingDependencyError: compiler or emulator are missing; the message contains the command to install them.
         ModelError: the firmware cannot run the model.
         UwbMitigationError: it does not build, or does not start.
 
@@ -73,13 +73,13 @@ class EmulatedFirmware:
             raise
 
     def measure(self, measurement: RangeMeasurement) -> None:
-        """Let the board's radio measure; waits while the board is busy.
+        """Send a measurement of the radio to the board; wait while the board is busy.
 
-        As an EVB1000 does, the radio sends only the samples that the network reads: the emulated UART takes
-        byte by byte.
+        Like an EVB1000, the radio sends only the samples that the network reads, because the emulated UART
+        transfers single bytes.
 
         Raises:
-            UwbMitigationError: the emulator has ended.
+            UwbMitigationError: the emulator has exited.
         """
         assert self._radio is not None
         kind, payload = messages.encode(window_of(measurement, self._samples))
@@ -89,7 +89,7 @@ class EmulatedFirmware:
             raise UwbMitigationError(f"the emulated board is gone: {error.strerror or error}") from error
 
     def close(self) -> None:
-        """End the emulator; may be called twice."""
+        """Stop the emulator; may be called twice."""
         if self._radio is not None:
             self._radio.close()
         if self._process is not None:
@@ -120,7 +120,7 @@ class EmulatedFirmware:
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
-            # Ctrl-C is for the program that runs the board.
+            # Only the program that started the emulator handles Ctrl-C.
             start_new_session=True,
         )
         assert self._process.stdout is not None

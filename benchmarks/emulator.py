@@ -1,12 +1,12 @@
-"""Runs images for `boards/qemu_mps2` in qemu-system-arm, and counts what they execute.
+"""Run images for `boards/qemu_mps2` in qemu-system-arm, and count instructions.
 
-Instruction counts are those of the emulator's virtual time: with `-icount shift=6` an instruction takes 64 ns
-and SysTick ticks every 40 ns, so that the count is exact to one instruction. An emulator knows no wait
-states, no caches and no power.
+Instructions are counted with the virtual time of the emulator: with `-icount shift=6` an instruction takes 64 ns and
+SysTick ticks every 40 ns, so that the count is exact to one instruction. The emulator does not model wait states,
+caches and power.
 
 Cycles are estimated from the executed instructions and the instruction table of the Cortex-M4 r0p1 Technical Reference
-Manual (section 3.3.1): zero wait states, a taken branch refills the pipeline in two cycles, no load is hidden behind its
-neighbour. A board that fetches code or weights from flash with wait states, or misses its cache, takes longer.
+Manual (section 3.3.1): zero wait states, a taken branch refills the pipeline in two cycles, loads are not
+pipelined. A board that fetches code or weights from flash with wait states, or has cache misses, takes longer.
 """
 
 from __future__ import annotations
@@ -75,14 +75,14 @@ _REPORT = np.dtype(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Emulation:
-    """What a run gave.
+    """Results of a run.
 
     Attributes:
-        model_id: of the image's model.
-        records: structured array, a row for each input. Windows: `status`, `output_m`. CIRs: `status`,
+        model_id: id of the model in the image.
+        records: structured array, one row per input. Windows: `status`, `output_m`. CIRs: `status`,
             `range_m`, `correction_m`, `variance_m2`, `range_status`, `window`.
-        instructions: of one inference, the most over all windows; 0 for CIRs.
-        instructions_correct: of preprocessing, prior and inference together; 0 for windows.
+        instructions: maximum per inference over all windows; 0 for CIRs.
+        instructions_correct: maximum of preprocessing, prior and inference together; 0 for windows.
         arena_bytes, stack_bytes: memory of one inference.
     """
 
@@ -95,11 +95,11 @@ class Emulation:
 
 
 def run_windows(image: Image, windows: NDArray[np.float32]) -> Emulation:
-    """The network's outputs for windows, float32 (n, K).
+    """Run the network on windows, float32 (n, K).
 
     Raises:
         MissingDependencyError: the emulator is missing.
-        UwbMitigationError: the program fails, hangs or writes less than it should.
+        UwbMitigationError: the program fails, hangs or its output is incomplete.
     """
     record = np.dtype([("status", "<u4"), ("output_m", "<f4")])
     return _run(image, _WINDOWS, np.ascontiguousarray(windows, np.float32), record)
@@ -108,7 +108,7 @@ def run_windows(image: Image, windows: NDArray[np.float32]) -> Emulation:
 def run_measurements(
     image: Image, measurements: Sequence[RangeMeasurement], samples: int, offset_m: float = 0.0
 ) -> Emulation:
-    """Corrected ranges of measurements, of radios with this offset, and the windows of `samples` values that preprocessing gave.
+    """Correct measurements of radios with this offset; also return the preprocessed windows of `samples` values.
 
     Raises:
         ParameterError: a CIR is longer than the board's accumulator.
@@ -148,9 +148,9 @@ def run_measurements(
 
 
 def count_executed(image: Image, window: NDArray[np.float32]) -> Counter[tuple[int, bool]]:
-    """How often one inference executes each address: {(address, whether it then branched): count}.
+    """Count executions of each address in one inference: {(address, whether it then branched): count}.
 
-    Slow: the emulator writes a line for each instruction.
+    This is slow, because the emulator writes a line for each instruction.
     """
     require_tools()
     folder = image.elf.parent
@@ -183,7 +183,7 @@ def count_executed(image: Image, window: NDArray[np.float32]) -> Counter[tuple[i
 
 
 def _symbols(image: Image) -> dict[str, tuple[int, int]]:
-    """{function: (first address, one past the last)}."""
+    """Return {function: (first address, one past the last)}."""
     found = {}
     for line in run(["arm-none-eabi-nm", "--print-size", "--defined-only", str(image.elf)]).splitlines():
         fields = line.split()
@@ -239,17 +239,17 @@ def _run(image: Image, kind: int, rows: NDArray[np.generic], record: np.dtype[np
 def measure_size(
     export: Path, build: Path, kernels: Kernels = Kernels.CORTEX_M4, optimisation: str = "-Os"
 ) -> Image:
-    """Build a program that does nothing but correct a range: vectors, start-up, library, model."""
+    """Measure the size of a program that only corrects a range: vectors, start-up, library, model."""
     stub = build / "size.c"
     stub.write_text(_SIZE_STUB, encoding="utf-8")
     return build_image(export, build, Target.DWM1001_DEV, kernels, optimisation, stub)
 
 
 def estimate_cycles(image: Image, executed: Counter[tuple[int, bool]]) -> int:
-    """Cycles of {(address, whether it branched): count}, as `count_executed` gives it.
+    """Estimate the cycles of {(address, whether it branched): count} from `count_executed`.
 
     Raises:
-        UwbMitigationError: an address holds no instruction of the image.
+        UwbMitigationError: an address is not that of an instruction in the image.
     """
     instructions = {}
     for line in run(["arm-none-eabi-objdump", "-d", "-w", str(image.elf)]).splitlines():
@@ -284,7 +284,7 @@ def _cycles(mnemonic: str, operands: str) -> int:
 
 
 def _registers(operands: str) -> int:
-    """The number of registers in a list such as {r4-r11, lr}."""
+    """Return the number of registers in a list such as {r4-r11, lr}."""
     inside = operands[operands.index("{") + 1 : operands.index("}")]
     total = 0
     for part in inside.split(","):

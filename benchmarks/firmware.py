@@ -1,4 +1,4 @@
-"""Measures exported models in the emulator: instructions, estimated cycles, memory, and equality with
+"""Measure exported models in the emulator: instructions, estimated cycles, memory, and equality with
 ONNX Runtime."""
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from uwb_mitigation.paper import published
 from uwb_mitigation.preprocessing import Preprocessing, Scaling
 
 CLOCK_HZ = 64e6
-"""Of the paper's board, an Arduino Nano 33 BLE Sense."""
+"""Clock of the board in the paper, an Arduino Nano 33 BLE Sense."""
 
 DEFAULT_INPUTS = 5000
 
@@ -42,7 +42,7 @@ class Network:
     Attributes:
         network: `remnet` or `mlp`, as in `paper.published`.
         first_kernel: k0; 0 for an MLP.
-        packed: what the firmware is given.
+        packed: model in the format of the firmware.
         card, model_id: properties of the model in the header.
         onnx: the serialised ONNX model.
     """
@@ -55,7 +55,7 @@ class Network:
     onnx: bytes
 
     def expect(self, windows: NDArray[np.float32]) -> NDArray[np.float32]:
-        """ONNX Runtime's outputs for windows (n, K)."""
+        """Return the outputs of ONNX Runtime for windows (n, K)."""
         session = onnxruntime.InferenceSession(
             self.onnx, session_options(), providers=["CPUExecutionProvider"]
         )
@@ -71,12 +71,12 @@ class NetworkCost:
         model: `remnet` or `mlp`.
         k, k0: window length and first kernel; k0 is 0 for an MLP.
         kernels: `cortex_m4` (assembly) or `portable` (C, -O3).
-        instructions: of one inference from a window of floats, the most over all inputs.
+        instructions: maximum per inference from a window of floats, over all inputs.
         cycles_estimated: at zero wait states, see `cycles`.
-        ram_bytes: the arena; `stack_bytes` come on top.
-        flash_bytes: an image that does nothing but correct ranges.
-        mismatches, inputs: outputs that differ from ONNX Runtime's in any bit, of how many.
-        hz: at 64 MHz; `energy_mj` at the paper's power; `paper_hz`; None where the paper has none.
+        ram_bytes: size of the arena, without `stack_bytes`.
+        flash_bytes: size of an image that only corrects ranges.
+        mismatches, inputs: number of outputs that differ from ONNX Runtime's in any bit, and number of inputs.
+        hz: rate at 64 MHz; `energy_mj` at the power of the paper; `paper_hz`; None if the paper has no value.
     """
 
     model: str
@@ -98,7 +98,7 @@ class NetworkCost:
 def random_shapes(
     windows: Sequence[int] = published.WINDOWS, first_kernels: Sequence[int] = (3, 5), dense: bool = True
 ) -> Iterator[Network]:
-    """A random network of every shape asked for."""
+    """Return a random network of every requested shape."""
     for first_kernel in first_kernels:
         for samples in windows:
             weights = remnet(samples, first_kernel)
@@ -109,10 +109,10 @@ def random_shapes(
 
 
 def trained(bundle: Bundle) -> Network:
-    """A trained model.
+    """Return a trained model to measure.
 
     Raises:
-        ModelError: as `export_bundle`.
+        ModelError: see `export_bundle`.
     """
     return network_of(
         graph.int8_weights(bundle.model, bundle.architecture), bundle.card, bundle.model_id, bundle.model
@@ -142,11 +142,11 @@ def measure(
     kernels: Kernels = Kernels.CORTEX_M4,
     inputs: int = DEFAULT_INPUTS,
 ) -> NetworkCost:
-    """Measure one network on `windows`, float32 (n, K), or on `inputs` windows that press on every rounding.
+    """Measure one network on `windows`, float32 (n, K), or on `inputs` windows that test every rounding.
 
     Raises:
-        MissingDependencyError: compiler or emulator are missing; names the line that installs them.
-        UwbMitigationError: building or running fails.
+        MissingDependencyError: compiler or emulator are missing; the message contains the command to install them.
+        UwbMitigationError: the build or the run fails.
     """
     packed = network.packed
     if windows is None:

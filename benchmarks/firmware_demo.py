@@ -31,11 +31,11 @@ from uwb_mitigation.sources.opening import open_recording
 from uwb_mitigation.sources.simulated import SimulatedSource
 
 TIMEOUT_S = 60.0
-"""Longest wait for mode DEVICE, and for the next corrected range: then the rest counts as lost."""
+"""Timeout for mode DEVICE and for the next corrected range; after it, the remaining ranges count as lost."""
 
 
 def numbered(recording: Path | None, count: int) -> list[RangeMeasurement]:
-    """At most `count` measurements as a board holds them, in binary32, with sequences that tell them apart."""
+    """Return at most `count` measurements in binary32, as on a board, with unique sequence numbers."""
     source = SimulatedSource(seed=1, count=count) if recording is None else open_recording(recording)
     with source:
         measured = [record.measurement for record in itertools.islice(source, count)]
@@ -51,7 +51,7 @@ def numbered(recording: Path | None, count: int) -> list[RangeMeasurement]:
 
 
 def equals(expected: CorrectedRange, message: RangeCorrected) -> bool:
-    """Return whether a range that the board has corrected has the bits of the host's."""
+    """Return whether a range corrected by the board is bit-identical to that of the host."""
     values = (expected.range_m, expected.correction_m, expected.variance_m2)
     computed = (message.range, message.correction, message.variance)
     first, second = (np.array(row, np.float32).tobytes() for row in (values, computed))

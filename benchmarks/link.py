@@ -1,4 +1,4 @@
-"""Frames through a channel that damages bytes: what a decoder makes of them, and how fast it is."""
+"""Measure losses and speed of the decoder with a channel that corrupts bytes."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ _LARGEST_READ = 4096
 
 @dataclass(frozen=True, slots=True)
 class LoopbackResult:
-    """What came of sending numbered frames through a damaging channel.
+    """Result of sending numbered frames through a channel that corrupts bytes.
 
     Attributes:
         sent: frames sent.
-        intact: frames of which every byte arrived, both delimiters included.
-        delivered: frames that the decoder delivered as they were sent.
-        lost: sent, not delivered.
-        intact_lost: arrived intact, not delivered; 0 for a right decoder.
-        corrupt_delivered: delivered, though never sent so, or sent but damaged within; 0 likewise.
+        intact: frames that arrived completely and unchanged, including both delimiters.
+        delivered: frames that the decoder delivered unchanged.
+        lost: frames that were sent, but not delivered.
+        intact_lost: frames that arrived intact, but were not delivered; 0 for a correct decoder.
+        corrupt_delivered: delivered frames that were corrupted or never sent; 0 for a correct decoder.
         bytes_received: bytes fed to the decoder.
         decoder_s: processor time spent in the decoder.
     """
@@ -55,9 +55,9 @@ def loopback(
     seed: int = 0,
     advance: Callable[[int], None] = lambda _: None,
 ) -> LoopbackResult:
-    """Send `frames` frames of random payloads, up to `payload_bytes` long, and compare what arrives.
+    """Send `frames` frames of random payloads, up to `payload_bytes` long, and compare the decoded frames.
 
-    The decoder reads in pieces of random sizes. `advance` is called with the number of frames done.
+    The decoder reads chunks of random sizes. `advance` is called with the number of finished frames.
     """
     random = np.random.default_rng(seed)
     noise = random.integers(0, 256, 4 * payload_bytes + 1, dtype=np.uint8)
@@ -115,8 +115,8 @@ def loopback(
 
 
 def _untouched(arrived: Damaged, starts: NDArray[np.intp], ends: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """Which of the stretches [start, end) arrived without a change or an insertion inside."""
+    """Return the mask of segments [start, end) that arrived without a change or an insertion."""
     unchanged = np.searchsorted(arrived.changed, starts) == np.searchsorted(arrived.changed, ends)
-    # Something inserted before the first byte lies outside the stretch.
+    # An insertion before the first byte is outside of the segment.
     closed = np.searchsorted(arrived.inserted, starts + 1) == np.searchsorted(arrived.inserted, ends)
     return np.asarray(unchanged & closed)

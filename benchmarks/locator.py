@@ -1,4 +1,4 @@
-"""What the locator costs: processor time of the filter, and latency and loss of the node at a thousand ranges a second."""
+"""Measure processor time of the position filter, and latency and loss of the node at 1000 ranges per second."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ _SECOND_NS = 1_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class NodeFigures:
-    """Ranges sent, poses that came back, ranges lost between; percentiles of the latency from publishing a range
-    to having its pose, ms."""
+    """Number of sent ranges, received poses and lost ranges; percentiles of the latency from publishing a range to
+    receiving its pose, ms."""
 
     sent: int
     received: int
@@ -54,7 +54,7 @@ def _drive(n: int, rate_hz: float) -> tuple[NDArray[np.intp], NDArray[np.float64
 
 
 def filter_us() -> float:
-    """Processor time of a prediction and an update, us: the best of five rounds, four anchors."""
+    """Return the processor time of a prediction and an update, us: best of five rounds, four anchors."""
     ranges = 5000
     row, range_m = _drive(ranges, 40.0)
     rows, values = row.tolist(), range_m.tolist()
@@ -70,10 +70,10 @@ def filter_us() -> float:
 
 
 def node(rate_hz: float, seconds: float, show: Callable[[str], None]) -> NodeFigures:
-    """A locator process beside this one, which sends ranges on time and gets a pose for each.
+    """Start a locator process, send ranges at a fixed rate and receive a pose for each.
 
     Raises:
-        UwbMitigationError: it does not come up.
+        UwbMitigationError: the locator does not start.
     """
     processes.isolate()
     with tempfile.TemporaryDirectory() as folder:

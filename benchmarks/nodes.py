@@ -1,9 +1,9 @@
-"""Measures what the nodes add to what rclpy takes anyway: latency, highest rate, processor time, memory.
+"""Measure the overhead of the nodes relative to rclpy: latency, maximum rate, processor time, memory.
 
-Four subjects take the same recorded ranges, in one run and by turns, so that they share whatever else the
-machine is doing: a relay that only republishes, one that does so without looking, the mitigator, and the
-one-process pipeline. The first three have a driver process before them; all drivers loop over one bag, and
-their live parameters set the rate.
+Four subjects process the same recorded ranges in turns, so that other load on the machine affects all of them: a relay
+that republishes messages, a relay that republishes serialised messages, the mitigator, and the one-process pipeline.
+The first three have a separate driver process. All drivers loop over one bag, and their live parameters set the
+rate.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from uwb_mitigation.preprocessing import WINDOW_LEAD
 from uwb_mitigation.sources.simulated import SimulatedSource
 
 WINDOW = 157
-"""Complex samples of each range: what the network reads."""
+"""Number of complex samples per range that the network reads."""
 RANGES = 5000
 RECORDED_HZ = 1000.0
 RATES_HZ = (100, 500, 1000)
@@ -62,7 +62,7 @@ class Vitals:
 
 
 def vitals_of(pid: int) -> Vitals:
-    """Look at a process.
+    """Return the vitals of a process.
 
     Raises:
         UwbMitigationError: there is no such process.
@@ -83,7 +83,7 @@ def vitals_of(pid: int) -> Vitals:
 
 @dataclass(frozen=True, slots=True)
 class Latency:
-    """From a range's stamp, when it was due, to its arrival at the subscriber, us."""
+    """Latency from the stamp of a range (its due time) to its arrival at the subscriber, us."""
 
     p50: float
     p99: float
@@ -92,14 +92,14 @@ class Latency:
 
 @dataclass(slots=True)
 class Figures:
-    """Of one subject.
+    """Results of one subject.
 
     Attributes:
-        rates_hz: the highest rate without loss, of each search.
-        latency_us: at each rate, the median over the slices; `max` the highest of all.
-        cpu_us_per_message: of the subject's process, at the highest of the rates for latency.
-        chain_cpu_us_per_message: the same with its driver's process.
-        memory_mb: resident, of the subject's process at the end.
+        rates_hz: maximum rate without loss of each search.
+        latency_us: median over the slices at each rate; `max` is the maximum of all.
+        cpu_us_per_message: processor time of the subject at the highest rate for latency.
+        chain_cpu_us_per_message: the same including the driver process.
+        memory_mb: resident memory of the subject at the end.
     """
 
     rates_hz: list[float] = field(default_factory=list)
@@ -115,12 +115,12 @@ class Figures:
 
 @dataclass(frozen=True, slots=True)
 class RateTrial:
-    """What arrived at one rate.
+    """Result of a trial at one rate.
 
     Attributes:
-        received, lost: ranges that arrived, and that are missing between them.
-        late_ns: of each that arrived.
-        kept_up: none was lost, they came at the rate asked for, and the last ones were not late.
+        received, lost: number of received ranges and of lost ranges between them.
+        late_ns: latency of each received range.
+        kept_up: no range was lost, the requested rate was reached, and the last ranges were not late.
     """
 
     received: int
@@ -130,7 +130,7 @@ class RateTrial:
 
 
 class Subject:
-    """Processes in a namespace of their own, and what comes out of them."""
+    """Processes in a separate namespace, and their output."""
 
     def __init__(self, bench: Bench, name: str, kind: type, topic: str, *nodes: str) -> None:
         self.name = name
@@ -142,7 +142,7 @@ class Subject:
         self._counted = self._counted_hz = 0
         arrived, now_ns = self._arrivals.append, time.time_ns
         bench.probe.subscribe(kind, f"/{name}/{topic}", lambda data: arrived((now_ns(), data)), raw=True)
-        # The node that is measured comes first.
+        # The measured node is the first process.
         self.processes = [bench.start(node, name) for node in nodes]
         self.play(50.0)
         wait(lambda: len(self._arrivals) > 5, f"{name}: nothing arrives", self.processes)
@@ -152,7 +152,7 @@ class Subject:
         self._set(rate=rate_hz / RECORDED_HZ, paused=False)
 
     def pause(self) -> None:
-        """Stop, and let everything that is queued arrive."""
+        """Stop, and wait until all queued ranges have arrived."""
         self._set(paused=True)
         before = -1
         while before != len(self._arrivals):
@@ -160,13 +160,13 @@ class Subject:
             time.sleep(0.1)
 
     def forget(self) -> None:
-        """Begin to count anew."""
+        """Reset the counters."""
         self._arrivals.clear()
         self._carried = 0
 
     def count(self) -> tuple[int, int]:
-        """How many arrived since the last call, and how many are missing between them."""
-        # The last one stays, for what comes between it and the next.
+        """Return the number of received ranges since the last call, and of lost ranges between them."""
+        # Keep the last one to count losses between it and the next one.
         sequences = [read_head(data)[1] for _, data in self._arrivals]
         fresh = len(sequences) - self._carried
         self._carried = min(len(sequences), 1)
@@ -200,8 +200,8 @@ class Subject:
         after = [vitals_of(process.pid).cpu_s for process in self.processes]
         if not trial.received:
             raise UwbMitigationError(f"{self.name}: nothing arrives at {rate_hz} Hz")
-        # Added up over slices: the system counts in hundredths of a second. The settling before, and the
-        # pause after, play at the same rate and are counted along.
+        # Sum over slices, because the system counts in hundredths of a second. The sums include settling and
+        # pause, which play at the same rate.
         share = seconds / (seconds + _SETTLE_S)
         spent_s = [(b - a) * share for a, b in zip(before, after, strict=True)]
         if rate_hz != self._counted_hz:
@@ -214,14 +214,14 @@ class Subject:
         return Latency(float(p50), float(p99), max(trial.late_ns) / 1e3)
 
     def search_rate(self) -> None:
-        """Find the highest rate that is kept up with, to within a few per cent; 0 if not even the lowest."""
+        """Find the maximum rate without loss to within a few per cent; 0 if even the lowest rate is too high."""
 
         def holds(rate_hz: float) -> bool:
-            # Twice: something else on the machine may have been in the way.
+            # Try twice, because other load on the machine may have interfered.
             return self.trial(rate_hz, _TRIAL_S).kept_up or self.trial(rate_hz, _TRIAL_S).kept_up
 
         low, high = 0.0, _LOWEST_HZ
-        # Another search begins below what the ones before found.
+        # The next search begins below the previous results.
         if self.figures.rates_hz and holds(below := self.figures.max_lossless_rate_hz / _STEP):
             low, high = below, below * _STEP
         while high < _HIGHEST_HZ and holds(high):
@@ -236,7 +236,7 @@ class Subject:
 
 
 class Bench:
-    """A subscriber in this process, and the subjects in theirs."""
+    """A subscriber in this process, and the subjects in separate processes."""
 
     def __init__(self, probe: Probe, bag: Path) -> None:
         self.probe = probe
@@ -244,7 +244,7 @@ class Bench:
         self._bag = bag
 
     def start(self, node: str, namespace: str) -> subprocess.Popen[bytes]:
-        """Start a node; a driver, or a pipeline, waits to be told to play."""
+        """Start a node; a driver or a pipeline starts paused."""
         node, _, parameter = node.partition(" ")
         words = [parameter] if parameter else []
         if node in ("driver", "pipeline"):
@@ -258,7 +258,7 @@ class Bench:
 
 @contextmanager
 def open_bench() -> Iterator[Bench]:
-    """A bench on a domain of its own, with a bag to play."""
+    """Open a bench with a separate ROS domain and a bag to play."""
     processes.isolate()
     with tempfile.TemporaryDirectory() as folder, watching(Probe) as probe:
         bag = Path(folder, "ranges.mcap")
@@ -271,19 +271,19 @@ def open_bench() -> Iterator[Bench]:
 
 
 def read_head(data: bytes) -> tuple[int, int]:
-    """Stamp, ns, and sequence of a serialised RangeCir or RangeCorrected: their beginnings are the same."""
+    """Return stamp, ns, and sequence of a serialised RangeCir or RangeCorrected, which begin with the same fields."""
     seconds, nanoseconds, length = _STAMP.unpack_from(data)
     (sequence,) = _SEQUENCE.unpack_from(data, after_frame(_STAMP.size + length))
     return seconds * 10**9 + nanoseconds, sequence
 
 
 def missing_between(sequences: Sequence[int]) -> int:
-    """How many of the bag's ranges are missing between those that arrived in order."""
+    """Return the number of ranges of the bag that are missing between those that arrived."""
     return int(((np.diff(sequences) - 1) % RANGES).sum()) if len(sequences) > 1 else 0
 
 
 def write_bag(path: Path) -> None:
-    """A bag of windows of simulated CIRs, `RANGES` of them, numbered from 0, `RECORDED_HZ` a second."""
+    """Write a bag of `RANGES` simulated CIR windows, numbered from 0, at `RECORDED_HZ`."""
     records = [_cut(record) for record in islice(SimulatedSource(seed=1), _DISTINCT)]
     with BagWriter(path, {"source": "simulated windows", "simulated": "true"}) as writer:
         for sequence in range(RANGES):
@@ -300,23 +300,23 @@ def _cut(record: Record) -> Record:
 
 
 Advance = Callable[[str, float], None]
-"""Told what is measured next, and the share that is done."""
+"""Called with the next step and the finished share."""
 
 
 def measure(repeats: int, slices: int, seconds: float, advance: Advance) -> dict[str, Figures]:
-    """All figures, by subject.
+    """Return all figures by subject.
 
-    Percentiles are medians over slices of time in which the subjects take turns: what else happens on
-    the machine for a moment meets one slice of one subject, not its result.
+    Percentiles are medians over slices of time in which the subjects take turns, so that short disturbances on the
+    machine affect only one slice of one subject.
 
     Args:
-        repeats: how often each highest rate is searched.
-        slices: in how many each latency is measured.
-        seconds: of each slice.
-        advance: told how far it is.
+        repeats: number of searches for each maximum rate.
+        slices: number of slices for each latency.
+        seconds: duration of a slice.
+        advance: called with the progress.
 
     Raises:
-        UwbMitigationError: a node did not start, or nothing arrives.
+        UwbMitigationError: a node did not start, or no ranges arrive.
     """
     with open_bench() as bench:
         subjects = [
@@ -353,11 +353,11 @@ def measure(repeats: int, slices: int, seconds: float, advance: Advance) -> dict
 
 
 Step = tuple[str, float, Callable[[], None]]
-"""What is measured, about how long that takes, s, and what measures it."""
+"""Name of the step, approximate duration, s, and the function that measures."""
 
 
 def searches(subjects: Sequence[Subject], repeats: int) -> list[Step]:
-    """Of the highest rates, by turns."""
+    """Return the steps that search the maximum rates, in turns."""
     return [
         (f"highest rate of {subject.name}", _SEARCH_S, subject.search_rate)
         for _ in range(repeats)
@@ -366,7 +366,7 @@ def searches(subjects: Sequence[Subject], repeats: int) -> list[Step]:
 
 
 def take_steps(steps: Sequence[Step], advance: Advance) -> None:
-    """One after the other."""
+    """Run the steps one after the other."""
     whole_s, done_s = sum(length_s for _, length_s, _ in steps), 0.0
     for name, length_s, take in steps:
         advance(name, done_s / whole_s)
@@ -376,12 +376,12 @@ def take_steps(steps: Sequence[Step], advance: Advance) -> None:
 
 _STALLED_S = 10.0
 LOOKS = 10
-"""The processes are looked at after each such part of the ranges. Allocators fill their pools in the first."""
+"""Number of samples of the processes during a soak. Allocators fill their pools before the first."""
 
 
 @dataclass(frozen=True, slots=True)
 class Usage:
-    """Of all processes together, after so many ranges."""
+    """Sum over all processes after a number of ranges."""
 
     ranges: int
     memory_mb: float
@@ -391,12 +391,12 @@ class Usage:
 
 @dataclass(frozen=True, slots=True)
 class Soaked:
-    """Of a soak.
+    """Results of a soak.
 
     Attributes:
-        received, lost: ranges that arrived corrected, and that are missing between them.
+        received, lost: number of received corrected ranges and of lost ranges between them.
         seconds: wall time.
-        course: what was taken after each tenth of the ranges, or once a second where that is longer.
+        course: usage after each tenth of the ranges, or once per second if that is longer.
     """
 
     received: int
@@ -409,11 +409,11 @@ def soak(messages: int, rate_hz: float, *, one_process: bool, advance: Callable[
     """Play `messages` ranges at `rate_hz`.
 
     Args:
-        one_process: through the pipeline instead of two nodes.
-        advance: told how many have arrived.
+        one_process: use the pipeline instead of two nodes.
+        advance: called with the number of received ranges.
 
     Raises:
-        UwbMitigationError: a node did not start, has ended, or nothing arrives any more.
+        UwbMitigationError: a node did not start or has exited, or no more ranges arrive.
     """
     nodes = ("pipeline",) if one_process else ("mitigator", "driver")
     with open_bench() as bench:

@@ -1,6 +1,6 @@
-"""How well positions are told on real recordings and in the simulated flat. Needs neither ROS nor torch.
+"""Measure position errors on real recordings and in the simulated flat. Needs neither ROS nor torch.
 
-The real ones are not part of the repository; see `sources/hanyang.py` and `sources/decaranging.py`.
+The recordings are not part of the repository; see `sources/hanyang.py` and `sources/decaranging.py`.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ from uwb_mitigation.sources.simulated import SimulatedSource, SimulatedSurvey
 from uwb_mitigation.sources.source import Source
 
 LAG_S = 0.2
-"""By how much Hanyang's ranges lag the truth, in every run."""
+"""Time offset of the ranges relative to the ground truth in every Hanyang run."""
 
 HEIGHT = Height(ANTENNA_M, 0.2)
-"""Of the tag in Hanyang's runs."""
+"""Height of the tag in the Hanyang runs."""
 
 _SECOND_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
 class Errors:
-    """Of one recording: live, smoothed, and by snapshots of raw ranges."""
+    """Errors of one recording: live, smoothed, and from snapshots of raw ranges."""
 
     name: str
     live: TrackErrors
@@ -54,7 +54,7 @@ class Errors:
 
 
 def columns(source: Source, anchors: AnchorMap, variance_m2: float = math.nan) -> tuple[Ranges, TruePath]:
-    """The ranges of a source of one tag, and where that truly was."""
+    """Return the ranges of a source with one tag, and its true path."""
     records = list(source)
     stamps = np.array([record.measurement.stamp_ns for record in records], np.int64)
     known = [i for i, record in enumerate(records) if record.tag_position is not None]
@@ -71,7 +71,7 @@ def columns(source: Source, anchors: AnchorMap, variance_m2: float = math.nan) -
 
 
 def hanyang_run(folder: Path) -> tuple[AnchorMap, Ranges, TruePath, TruePath]:
-    """Anchors, ranges with their lag taken off, and the truth of a run: all of it, and in its authors' window.
+    """Return anchors, ranges without their time offset, and the true path of a run: complete, and in the authors' window.
 
     The window of trajectory A is from the first x > 49.3 and y > -5 to the next x <= 12 and y > 3.4; that of B from
     the first x < 8.6 and y < -7 to the next x > 8.6 and y < -7.
@@ -91,7 +91,7 @@ def hanyang_run(folder: Path) -> tuple[AnchorMap, Ranges, TruePath, TruePath]:
 
 
 def hanyang(folder: Path, model: Model | None = None) -> Errors:
-    """One run in its authors' window, the height known."""
+    """Return the errors of one run in the authors' window, with known height."""
     model = model or Model()
     anchors, ranges, _, truth = hanyang_run(folder)
     live = TagLocator(Setting(anchors, model, height=HEIGHT)).run(ranges)
@@ -110,7 +110,7 @@ def _window(path: TruePath, kind_a: bool) -> TruePath:
 
 
 def at_truths(track: Track, truth: TruePath) -> TrackErrors:
-    """Errors at the truth's times: each beside the latest estimate then."""
+    """Compare each true position with the latest estimate at its time."""
     latest = np.searchsorted(track.stamp_ns, truth.stamp_ns, side="right") - 1
     some = latest >= 0
     return errors_of(track.position[latest[some]], track.covariance[latest[some]], truth.position[some])
@@ -118,8 +118,8 @@ def at_truths(track: Track, truth: TruePath) -> TrackErrors:
 
 @dataclass(frozen=True, slots=True)
 class StaticErrors:
-    """Of tags at rest that three or more anchors saw: tags, mean horizontal errors in m of raw and corrected
-    ranges, and the mean NEES per degree of freedom of the latter."""
+    """Stationary tags with ranges to three or more anchors: number, mean horizontal error with raw and with corrected
+    ranges, m, and mean NEES per degree of freedom with corrected ranges."""
 
     tags: int
     raw_m: float
@@ -128,9 +128,9 @@ class StaticErrors:
 
 
 def apartment(folder: Path) -> StaticErrors:
-    """The EVK1000 logs: each tag's place by the line in received power that the *other* tags' logs give.
+    """Locate each tag of the EVK1000 logs with a line in received power that was fitted to the *other* tags.
 
-    A tag is in the flat, in the box of all anchors, half a metre wider: that decides between mirror images.
+    The area is the bounding box of all anchors plus half a metre, which resolves mirror images.
     """
     with DecaRangingFolder(folder) as source:
         records = [
@@ -160,7 +160,7 @@ def apartment(folder: Path) -> StaticErrors:
             np.nanmean((better - range_m + error)[~own & (configuration == c)])
             for c in np.unique(configuration[~own])
         ]
-        # Mean absolute errors, as the line is fitted by; 1.25 times that is a normal deviation.
+        # Mean absolute errors, which the line fit minimises; 1.25 times that is a normal standard deviation.
         sd = 1.2533 * float(np.nanmean(np.abs(left)))
         true = np.array(next(r.tag_position for r, mine in zip(records, own, strict=True) if mine))
         for values, spread, errors in ((range_m, model.range_sd, raw), (better, sd, corrected)):
@@ -176,8 +176,8 @@ def apartment(folder: Path) -> StaticErrors:
 
 @dataclass(frozen=True, slots=True)
 class FlatErrors:
-    """Of a drive through the simulated flat: from raw ranges, from those that a line in received power corrects, and
-    from those that the universal model does, which never saw that flat and leaves its radios' offset in."""
+    """Errors of a drive through the simulated flat: raw ranges, ranges corrected by a line in received power, and by
+    the universal model, which was not trained in this flat and does not remove the offset of the radios."""
 
     anchors: int
     raw: Errors
@@ -186,7 +186,7 @@ class FlatErrors:
 
 
 def flat(anchor_count: int, seed: int = 1, ranges: int = 3000) -> FlatErrors:
-    """Drive past 4 to 8 anchors; the line was fitted to a survey of another 150 places in the same flat."""
+    """Drive past 4 to 8 anchors; the line is fitted to a survey of 150 other placements in the same flat."""
     prior, variance = _flat_line()
     drive = SimulatedSource.with_anchors(anchor_count, seed=seed, count=ranges, rate_hz=40.0)
     records = list(drive)
@@ -216,7 +216,7 @@ def _flat_errors(name: str, anchors: AnchorMap, ranges: Ranges, truth: TruePath)
 
 
 def _flat_line() -> tuple[LinePrior, float]:
-    """The line, and the variance of what it leaves: of its mean absolute error, since it is fitted by that."""
+    """Return the line and the variance of its residuals, from the mean absolute error, which the fit minimises."""
     survey = list(SimulatedSurvey(seed=11, configurations=150, exchanges=6))
     truths = [record.truth for record in survey if record.truth is not None]
     error: NDArray[np.float64] = np.array([record.measurement.range_m for record in survey]) - [

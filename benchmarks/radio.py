@@ -1,4 +1,4 @@
-"""What the firmware's ranging does on modelled chips: error, rates, and what it stands. Virtual time but for EVB1000s."""
+"""Measure the ranging of the firmware on modelled chips: error, rates, robustness. Virtual time except for EVB1000s."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ PPM_PAIRS = ((-20.0, 20.0), (-10.0, 10.0), (0.0, 0.0), (10.0, -10.0), (20.0, -20
 DISTANCES_M = (0.3, 1.0, 5.01, 20.0, 100.0)
 
 INFERENCE_CYCLES = 458_934
-"""Estimated, of the shipped network with K = 157 (`python -m benchmarks firmware`)."""
+"""Estimated cycles of the shipped network with K = 157 (`python -m benchmarks firmware`)."""
 
 PROCESSOR_HZ = 64e6
 SPI_OVERHEAD_S = 10e-6
-"""Assumed, of a microcontroller for each SPI transaction."""
+"""Assumed overhead of a microcontroller for each SPI transaction."""
 
 WRONG_M = 0.1
 
@@ -49,7 +49,7 @@ _STARTS_WITHIN_S = 60.0
 
 @dataclass(frozen=True, slots=True)
 class Ranging:
-    """Errors of one pair of clocks at one distance; the tag's counter wraps meanwhile."""
+    """Errors of one pair of clocks at one distance; the counter of the tag wraps during the run."""
 
     ppm_a: float
     ppm_b: float
@@ -61,15 +61,15 @@ class Ranging:
 
 @dataclass(frozen=True, slots=True)
 class RadioSoak:
-    """Of a soak.
+    """Results of a soak.
 
     Attributes:
-        exchanges: that began.
-        delivered: ranges.
-        wrong: of them, those off by more than `WRONG_M`.
-        disturbances: chips reset, and anchors that vanished and returned.
-        longest_recovery_s: from a reset, or from an anchor's return, to its next range; virtual time.
-        lost: {cause: exchanges}.
+        exchanges: number of started exchanges.
+        delivered: number of ranges.
+        wrong: number of ranges with an error of more than `WRONG_M`.
+        disturbances: number of chip resets and of anchors that disappeared and returned.
+        longest_recovery_s: from a reset or the return of an anchor to its next range; virtual time.
+        lost: {cause: number of exchanges}.
         memory_growth_mb: of this process, from a tenth of the exchanges to the end.
     """
 
@@ -83,7 +83,7 @@ class RadioSoak:
 
 
 def ranging(seconds: float, advance: Callable[[], None]) -> list[Ranging]:
-    """A pair for each of `PPM_PAIRS` at each of `DISTANCES_M`, for so many seconds of virtual time."""
+    """Range with each of `PPM_PAIRS` at each of `DISTANCES_M` for a duration in virtual time."""
     rows = []
     for (ppm_a, ppm_b), distance_m in itertools.product(PPM_PAIRS, DISTANCES_M):
         with ModelledAir() as air:
@@ -99,7 +99,7 @@ def ranging(seconds: float, advance: Callable[[], None]) -> list[Ranging]:
 
 
 def line_rate_hz(mode: Mode) -> float:
-    """Ranges a second over a serial line of 921600 baud, with 157 samples each in mode HOST, virtual time."""
+    """Return the ranges per second over a serial line of 921600 baud, in mode HOST with 157 samples each; virtual time."""
     seconds = 5.0
     line = Line(mode=mode, inference_s=INFERENCE_CYCLES / PROCESSOR_HZ, overhead_s=SPI_OVERHEAD_S)
     with ModelledAir() as air:
@@ -111,10 +111,10 @@ def line_rate_hz(mode: Mode) -> float:
 
 
 def evb1000_rate_hz(seconds: float) -> float:
-    """Ranges a second with 157 samples each of two emulated EVB1000s on this computer, wall-clock time.
+    """Return the ranges per second of two emulated EVB1000s on this computer, 157 samples each; wall-clock time.
 
     Raises:
-        UwbMitigationError: they do not range.
+        UwbMitigationError: no ranges arrive.
     """
     with tempfile.TemporaryDirectory() as folder, _emulated(Path(folder) / "board") as paths:
         ports = [
@@ -134,9 +134,9 @@ def evb1000_rate_hz(seconds: float) -> float:
 
 @contextlib.contextmanager
 def _emulated(prefix: Path) -> Iterator[tuple[Path, Path]]:
-    """Two EVB1000s in a process of their own, as boards would not take of this one's time."""
+    """Run two EVB1000s in a separate process, so that they do not use processor time of this one."""
     paths = (Path(f"{prefix}0"), Path(f"{prefix}1"))
-    # On a clean link: a simulator in that process would hold up the boards now and then.
+    # Use a clean link: a simulator in that process would sometimes delay the boards.
     options = ("emulate-evb1000", "--link", str(prefix), "--distance", "5")
     process = subprocess.Popen([sys.executable, "-m", "benchmarks", *options], stdout=subprocess.DEVNULL)
     try:
@@ -152,7 +152,7 @@ def _emulated(prefix: Path) -> Iterator[tuple[Path, Path]]:
 
 
 def soak(exchanges: int, seed: int, advance: Callable[[int], None]) -> RadioSoak:
-    """A tag and four anchors, 10 % of frames lost, 1 % damaged, chips reset and anchors gone for a while."""
+    """Soak a tag and four anchors: 10 % of frames lost, 1 % damaged, chips reset, anchors temporarily absent."""
     random = np.random.default_rng(seed)
     process = psutil.Process()
     with ModelledAir(seed) as air:
@@ -200,7 +200,7 @@ def soak(exchanges: int, seed: int, advance: Callable[[int], None]) -> RadioSoak
 
 
 class _Watch:
-    """Takes a soak's ranges, and looks how long it takes from now on until an anchor is heard again."""
+    """Collects the ranges of a soak, and measures the time until an anchor ranges again."""
 
     _SLICE_S = 0.01
 
@@ -213,18 +213,18 @@ class _Watch:
         self.longest_s = 0.0
 
     def take(self, now_s: float) -> float:
-        """Count what has been measured; returns the time."""
+        """Count the new ranges; return the time."""
         self._rows()
         return now_s
 
     def await_all(self, expected: set[int]) -> float:
-        """Run until each of these anchors gave a range; returns the time.
+        """Run until each of these anchors has ranged; return the time.
 
         Raises:
-            UwbMitigationError: one gives none any more.
+            UwbMitigationError: an anchor no longer ranges.
         """
         now_s = began_s = self._air.run(0.0)
-        # What was measured before counts for nothing here.
+        # Ignore earlier ranges.
         self._rows()
         missing = set(expected)
         while missing:

@@ -1,9 +1,9 @@
-"""`make radio-demo`: the firmware's exchange on modelled DW1000s, through driver and mitigator over real ROS 2.
+"""`make radio-demo`: range with modelled DW1000s, and run driver and mitigator in ROS 2.
 
 python -m benchmarks radio-demo [--seconds S]
 
-A tag stands in the simulated flat, with four anchors; each is an emulated EVB1000 behind its USB-to-SPI protocol, in
-wall-clock time. What the chips measure, errors out of sight included, follows from the simulator's CIRs.
+A tag and four anchors are in the simulated flat; each is an emulated EVB1000 with its USB-to-SPI protocol, in wall-clock
+time. The measurements of the chips, including NLOS errors, follow from the CIRs of the simulator.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ from uwb_mitigation.sources.simulated import SimulatedSource
 from uwb_mitigation.sources.simulation.scene import ANCHORS
 
 PLACE = ((6.5, 3.1), (6.501, 3.1), (6.5, 3.101))
-"""Where the tag stands, a corner of the robot's route: one anchor in sight, the others behind concrete."""
+"""Position of the tag, a corner of the robot's route: one anchor in LOS, the others behind concrete."""
 
 RADIO = ("radio.channel:=2", "radio.preamble:=1024")
-"""As the simulator's radio."""
+"""Radio settings of the simulator."""
 
 PATIENCE_S = 60.0
-"""Until each anchor has ranged once, on a computer that has other work."""
+"""Timeout until each anchor has ranged once, on a busy computer."""
 
 
 class RadioListener:
-    """Keeps corrected ranges by anchor, and what the driver says of its radios."""
+    """Collects corrected ranges by anchor, and the state of the radios from the driver."""
 
     def __init__(self, probe: Probe) -> None:
         self.ranges: dict[int, list[tuple[float, float]]] = defaultdict(list)
@@ -63,7 +63,7 @@ class RadioListener:
                     self.boards[int(address, 16)] = number
 
     def table(self, true_m: Mapping[int, float]) -> Table:
-        """Means by anchor, m; `true_m` by board."""
+        """Return a table of means by anchor, m; `true_m` by board."""
         table = Table(title="simulated, emulated only: mean, m", title_justify="left")
         for name in ("anchor", "ranges", "raw", "corrected", "true"):
             table.add_column(name, justify="right")
@@ -76,7 +76,7 @@ class RadioListener:
 
     @property
     def silent(self) -> list[int]:
-        """Anchors that have not ranged, or are not known yet."""
+        """Return the anchors that have not ranged or are still unknown."""
         return sorted(set(range(1, 1 + len(ANCHORS))) - set(self._by_board()))
 
     def _by_board(self) -> dict[int, list[tuple[float, float]]]:
@@ -111,7 +111,7 @@ def run(console: Console, seconds: float) -> list[str]:
                         started, ends_s = True, time.monotonic() + seconds
                     live.update(listener.table(dict(enumerate(boards.distances_m))))
                     time.sleep(1 / REFRESH_HZ)
-            # A live table ends its last line on a terminal only.
+            # A live table writes the final line break only on a terminal.
             if not console.is_terminal:
                 console.line()
         failures = nodes.failures + ([] if boards.failure is None else [str(boards.failure)])

@@ -1,7 +1,7 @@
-"""Random int8 networks of any supported shape, and inputs that press on every rounding.
+"""Random int8 networks of any supported shape, and inputs that test every rounding.
 
-For measuring the firmware where no trained model of a shape exists: neither instructions nor memory depend
-on the values of weights.
+The firmware is measured with them if there is no trained model of a shape, because instructions and memory do not
+depend on the values of weights.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Measures the driver on a serial link: an emulated board, a driver process, and a subscriber.
+"""Measure the driver on a serial link with an emulated board, a driver process, and a subscriber.
 
-Two parts: a steady stream, of which every range is to arrive, and a cable that is pulled again and again,
-after which ranges are to come back at once and nothing is to be left behind.
+There are two parts: a steady stream, of which every range should arrive, and a cable that is repeatedly unplugged, after
+which ranges should resume immediately without leaked resources.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ from uwb_mitigation.sources.simulated import SimulatedSource
 from uwb_mitigation.sources.source import Source
 
 WINDOW = 157
-"""Complex samples of each range: what the network reads."""
+"""Number of complex samples per range that the network reads."""
 
 
 @dataclass(frozen=True, slots=True)
 class SteadyResult:
-    """Of the steady stream.
+    """Results of the steady stream.
 
     Attributes:
-        sent, received, lost: ranges from the board, at the subscriber, and in between.
-        seconds: of sending.
-        driver_cpu: share of one core that the driver took.
-        late_ms_p50, late_ms_p99: from the stamp to the arrival at the subscriber.
+        sent, received, lost: number of ranges from the board, at the subscriber, and lost in between.
+        seconds: duration of sending.
+        driver_cpu: share of one core that the driver used.
+        late_ms_p50, late_ms_p99: latency from the stamp to the arrival at the subscriber.
     """
 
     sent: int
@@ -52,12 +52,12 @@ class SteadyResult:
 
 @dataclass(frozen=True, slots=True)
 class UnplugResult:
-    """Of the cable that is pulled.
+    """Results of unplugging the cable.
 
     Attributes:
-        cycles: how often.
-        resumed_ms_p50, resumed_ms_max: from the port's return to the next range at the subscriber.
-        descriptors, threads: of the driver, before and after.
+        cycles: number of repetitions.
+        resumed_ms_p50, resumed_ms_max: time from the return of the port to the next range at the subscriber.
+        descriptors, threads: numbers of the driver before and after.
         memory_mb: resident memory of the driver, before and after.
     """
 
@@ -70,7 +70,7 @@ class UnplugResult:
 
 
 class _Window(Source):
-    """Simulated ranges, prepared once so that playing them costs the board little, cut to the window."""
+    """Simulated ranges cut to the window, generated in advance so that playing them takes little time."""
 
     simulated = True
     name = "simulated windows"
@@ -91,7 +91,7 @@ class _Window(Source):
 
 
 class _Listener:
-    """Counts ranges and notes how late they are."""
+    """Counts ranges and records their latencies."""
 
     def __init__(self, probe: Probe) -> None:
         self.late_ns: list[int] = []
@@ -106,7 +106,7 @@ class _Listener:
 
 @contextmanager
 def _bench(rate_hz: float) -> Iterator[tuple[EmulatedBoard, _Listener, int]]:
-    """A board, a listener, and the process id of a driver between the two."""
+    """Start a board, a driver and a listener; yield board, listener and process id of the driver."""
     processes.isolate()
     with tempfile.TemporaryDirectory() as folder, watching(Probe) as probe:
         listener = _Listener(probe)
@@ -124,10 +124,10 @@ def steady(rate_hz: float, seconds: float) -> SteadyResult:
     """Stream ranges of 157 complex samples at `rate_hz` through the driver.
 
     Raises:
-        UwbMitigationError: nothing arrives.
+        UwbMitigationError: no ranges arrive.
     """
     with _bench(rate_hz) as (board, listener, pid):
-        # Counted from rest to rest: what was sent before the driver was connected is none of the loss.
+        # Count while the stream is paused: ranges before the driver was connected are not losses.
         sent, received = _at_rest(board, listener)
         cpu_s, began_s = vitals_of(pid).cpu_s, time.monotonic()
         board.resume()
@@ -147,17 +147,17 @@ def steady(rate_hz: float, seconds: float) -> SteadyResult:
 
 
 def unplug(cycles: int, rate_hz: float = 200.0) -> UnplugResult:
-    """Pull the cable `cycles` times while ranges stream, and see them come back.
+    """Unplug the cable `cycles` times while ranges stream, and wait until they resume.
 
     Raises:
-        UwbMitigationError: they do not.
+        UwbMitigationError: the ranges do not resume.
     """
     resumed_ms = []
     with _bench(rate_hz) as (board, listener, pid):
         before = vitals_of(pid)
         for cycle in range(cycles):
             board.unplug()
-            # Long enough for the driver to be in any state of its back-off.
+            # Long enough that the driver can be in any state of its back-off.
             time.sleep(0.1 + 0.37 * (cycle % 7))
             board.plug()
             returned_ns = time.monotonic_ns()

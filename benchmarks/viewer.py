@@ -1,4 +1,4 @@
-"""What the viewer costs: processor time with and without open pages, and what the mitigator loses to it."""
+"""Measure the cost of the viewer: processor time with and without open pages, and its effect on the mitigator."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ _SETTLE_S = 3.0
 
 
 NO_VIEWER, NO_PAGE, ONE_PAGE = SUBJECTS = ("no viewer", "no open page", "an open page")
-"""A driver and a mitigator each, with what looks on."""
+"""Each subject has a driver and a mitigator, and possibly a viewer with or without a page."""
 
 
 @dataclass(frozen=True, slots=True)
 class ViewerCosts:
-    """Of a viewer beside a driver and a mitigator, all in one session as a launch has them.
+    """Cost of a viewer next to a driver and a mitigator, all in one session as in a launch.
 
     Attributes:
-        core_share: processor time of the viewer at `RATE_HZ` by seconds passed, {open pages: share of a core}.
-        range_us: processor time of driver and mitigator for a range at `SENT_HZ`, {of `SUBJECTS`: us}, by turns.
-        rates_hz: likewise the mitigator's highest rate without loss, of each search.
+        core_share: processor time of the viewer per second at `RATE_HZ`, {open pages: share of a core}.
+        range_us: processor time of driver and mitigator per range at `SENT_HZ`, {one of `SUBJECTS`: us}.
+        rates_hz: maximum rate of the mitigator without loss, {one of `SUBJECTS`: rate of each search}.
     """
 
     core_share: dict[int, float]
@@ -42,7 +42,7 @@ class ViewerCosts:
 
     @property
     def rate_ratios(self) -> dict[str, float]:
-        """The mitigator's rates, by that without a viewer."""
+        """Return the rates of the mitigator relative to that without a viewer."""
         medians_hz = {name: median(rates_hz) for name, rates_hz in self.rates_hz.items()}
         return {name: rate_hz / (medians_hz[NO_VIEWER] or 1.0) for name, rate_hz in medians_hz.items()}
 
@@ -51,12 +51,12 @@ def measure(repeats: int, seconds: float, advance: Advance) -> ViewerCosts:
     """Measure a viewer.
 
     Args:
-        repeats: how often each highest rate is searched.
-        seconds: for how long each share of a core is measured.
-        advance: told how far it is.
+        repeats: number of searches for each maximum rate.
+        seconds: duration of the measurement of each share of a core.
+        advance: called with the progress.
 
     Raises:
-        UwbMitigationError: a node did not start, or nothing arrives.
+        UwbMitigationError: a node did not start, or no ranges arrive.
     """
     with open_bench() as bench:
         subjects = [
@@ -109,7 +109,7 @@ def _measure_slice(subject: Subject) -> None:
 
 
 def _start_viewer(bench: Bench, namespace: str) -> tuple[str, int]:
-    """A viewer's page and process."""
+    """Start a viewer; return its page and process id."""
     with socket.socket() as free:
         free.bind(("localhost", 0))
         port = free.getsockname()[1]

@@ -1,4 +1,4 @@
-"""Open pages of a viewer without a browser: what a page is sent is counted and dropped. No ROS here."""
+"""Open pages of a viewer without a browser; count and discard the received messages. Does not need ROS."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ class Visitors:
     """Pages that stay open until the block ends.
 
     Args:
-        url: of the viewer's page.
-        count: how many.
+        url: URL of the viewer.
+        count: number of pages.
 
     Attributes:
-        received: messages that each page was sent; not the first of a connection.
+        received: number of messages to each page, without the first one of the connection.
 
     Raises:
-        OSError: nobody serves there.
+        OSError: there is no server at this URL.
     """
 
     def __init__(self, url: str, count: int) -> None:
@@ -50,7 +50,7 @@ class Visitors:
         self._end()
 
     async def _open(self, number: int) -> None:
-        # As Bokeh's own script connects: the token names the session.
+        # Connect like the script of Bokeh: the token identifies the session.
         token = generate_jwt_token(generate_session_id())
         request = HTTPRequest(f"ws://{self._host}/ws", headers={"Origin": f"http://{self._host}"})
         page = await websocket_connect(request, subprotocols=["bokeh", token])
@@ -70,5 +70,5 @@ class Visitors:
     def _close(self) -> None:
         for page in self._pages:
             page.close()
-        # A turn later, so that the server hears of it.
+        # One iteration later, so that the server is notified.
         self._loop.call_later(0.2, self._loop.stop)
