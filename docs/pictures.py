@@ -37,9 +37,9 @@ from uwb_mitigation.sources.site import load_anchors  # noqa: E402
 PICTURES = REPOSITORY / "docs" / "pictures"
 SIMULATED_HZ = 40.0
 WATCHED_S = 40.0
-"""Before the page is opened: a trail, and most of a strip."""
+"""Duration before the page is opened, for a trail and most of a strip chart."""
 FILLED_S = 7.0
-"""Before the pictures are taken: a waterfall."""
+"""Duration before the screenshots are taken, for a waterfall plot."""
 
 
 SHOWN_S = 60.0

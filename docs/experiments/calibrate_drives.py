@@ -48,7 +48,7 @@ from uwb_mitigation.sources.simulation.scene import ANCHORS, FLAT, MORE_ANCHORS,
 from uwb_mitigation.training import site_calibration, train
 
 UNSEEN = 7_000_000
-"""Added to the seed of a building: the universal model's begin at 0 and at 1 000 003."""
+"""Added to the seed of a building: the seeds of the universal model begin at 0 and at 1 000 003."""
 
 RATE_HZ = 40.0
 LAG_S, LEVER_M = 0.3, (0.4, 0.0, 0.0)
@@ -58,7 +58,7 @@ class Drive:
     """A drive at a simulated site; a `Source` whose pairs have offsets.
 
     Args:
-        flat: in the simulator's flat, not in a random building.
+        flat: use the flat of the simulator instead of a random building.
     """
 
     simulated = True
@@ -89,7 +89,7 @@ class Drive:
 
 
 def error_of(records: list[Record], bundle: Bundle | None, offsets: Offsets) -> float:
-    """MAE of the corrected ranges, m; without a bundle, of the raw ones."""
+    """Return the MAE of the corrected ranges, m; without a bundle, of the raw ranges."""
     truth = np.array([record.truth.range_m for record in records if record.truth is not None])
     if bundle is None:
         return float(np.abs(np.array([record.measurement.range_m for record in records]) - truth).mean())
@@ -116,7 +116,7 @@ def position_rmse(
 
 
 def trained(records: list[Record], universal: Bundle, folder: Path) -> Bundle:
-    """What `train --data` makes of the drive's true ranges, a configuration a metre and pair as the simulator names."""
+    """Run `train --data` on the true ranges of the drive; each metre of a pair is one configuration."""
     dataset = build_dataset(records, universal.preprocessing)
     from uwb_mitigation.model.architecture import Remnet
     from uwb_mitigation.training.candidates import Recipe
@@ -127,7 +127,7 @@ def trained(records: list[Record], universal: Bundle, folder: Path) -> Bundle:
 
 
 def one(seed: int, seconds: float, truth_topic: bool, with_train: bool, flat: bool) -> dict[str, object]:
-    """A site."""
+    """Calibrate and test one site."""
     universal = load_bundle(default_model_path())
     anchors = 4 + seed % 5
     drive, other = (Drive(seed, which, anchors, seconds, flat) for which in (0, 1))
@@ -136,7 +136,7 @@ def one(seed: int, seconds: float, truth_topic: bool, with_train: bool, flat: bo
     began = time.perf_counter()
     height = Height(0.0, 0.05)
     if truth_topic:
-        # The robot looks along its way; its antenna is ahead of its frame, and its localisation is late.
+        # The robot faces its direction of travel, its antenna is ahead of its frame, and its localisation is late.
         stamps = np.array([record.measurement.stamp_ns for record in records], np.int64)
         antenna = np.array([record.tag_position for record in records], float)
         heading = _headings(antenna)
@@ -208,7 +208,7 @@ def _headings(position: np.ndarray) -> np.ndarray:
 
 
 def speed(minutes: float) -> dict[str, object]:
-    """Time and memory of one long drive."""
+    """Measure time and memory for one long drive."""
     universal = load_bundle(default_model_path())
     drive = Drive(1, 0, 6, 60.0 * minutes)
     site = gather([drive], drive.anchors, universal.preprocessing)

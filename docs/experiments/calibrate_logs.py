@@ -115,7 +115,7 @@ def harm(folder: Path) -> None:
 def _against_truth(
     run: HanyangRun, records: list[Record], bundle: Bundle | None, offsets: Offsets, height: Height
 ) -> tuple[float, float, np.ndarray]:
-    """MAE of ranges, RMSE of the live track, and the median error of each anchor's ranges, m; the lag removed."""
+    """Return MAE of ranges, RMSE of the live track, and median error per anchor, m, without the time offset."""
     measured = [record.measurement for record in records]
     stamp = np.array([one.stamp_ns for one in measured], np.int64) - round(LAG_S * 1e9)
     row = np.array([run.anchors.index[one.anchor_id] for one in measured])

@@ -23,7 +23,7 @@ from uwb_mitigation.positioning.tracks import Ranges, TruePath
 def erring(
     ranges: Ranges, path: TruePath, anchors: AnchorMap, model: Model, rng: np.random.Generator
 ) -> Ranges:
-    """The same ranges with errors by the model: white, persisting, of each pair, of all, and misplaced anchors."""
+    """Replace errors by those of the model: white, persistent, per-pair, common, and from anchor positions."""
     true = path.at(ranges.stamp_ns)
     known = np.isfinite(true).all(axis=1)
     ranges, true = ranges.take(known), true[known]

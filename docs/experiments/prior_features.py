@@ -46,7 +46,7 @@ def features(data):
 
 
 def predicted(data, columns, train, test):
-    """A line through one mean of each configuration of `train`, of the ranges of `test`."""
+    """Fit a line to the means of the configurations in `train`, and predict the ranges in `test`."""
     design = np.column_stack([np.ones(len(data)), data.rx_power_dbm, *columns]).astype(float)
     parts = [train[data.configurations[train] == name] for name in np.unique(data.configurations[train])]
     means = [np.array([values[part].mean(axis=0) for part in parts]) for values in (design, data.error_m)]

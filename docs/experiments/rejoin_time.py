@@ -86,7 +86,7 @@ def wait_for(name):
 
 
 def come_back(name):
-    """Kill a node and start it again; until it is ready, and until its first range is there, s."""
+    """Kill and restart a node; return the times until it is ready and until its first range, s."""
     running[name].kill()
     running[name].wait()
     until_s = time.monotonic() + 0.5
@@ -94,7 +94,7 @@ def come_back(name):
         rclpy.spin_once(client, timeout_sec=0.01)
     began_s = time.monotonic()
     running[name] = start(name)
-    running[name].stdout.readline()  # The model is loaded, the subscription is made, the recording is open.
+    running[name].stdout.readline()  # model loaded, subscription created, recording open
     ready_s = time.monotonic() - began_s
     if name.startswith("plain"):
         running[name].stdout.readline()

@@ -1,12 +1,12 @@
 """Compare the shipped universal models with a constant offset on a simulator that no model was trained or tuned on.
 
-The figures are the MAE relative to that of a constant offset, for first-path indices that are 0, 5 and 10 taps late; each
-error is less its own median in line of sight. The aim is at most 1.02; it is missed in open rooms.
+The figures are the MAE relative to that of a constant offset, for first-path indices that are 0, 5 and 10 taps late; the
+LOS median is subtracted from the errors. The target of at most 1.02 is missed in open rooms.
 
 The training simulator draws the diffuse field from the statistics of IEEE 802.15.4a and detects the half-amplitude
 point of a Gaussian pulse above a noise threshold. Here the paths are reflections of order 0 to 3 in a
 three-dimensional room (Allen and Berkley, "Image method", JASA 1979) with carrier phases and Fresnel-like losses,
-point scatterers, and a reverberant tail (Andersen et al., "Room electromagnetics", 2007). The antennas are dipoles of
+point scatterers, and a reverberant tail (Andersen et al., "Room electromagnetics", 2007). The antennas are dipoles with
 random attitude. The receiver has a raised-cosine pulse, another gain compression and another leading-edge detector,
 which also rejects paths 24 dB below the peak. No value was fitted to a recording or to a model.
 """
@@ -26,11 +26,11 @@ from uwb_mitigation.preprocessing import Scaling
 
 LIGHT_M_PER_TAP = 299_792_458.0 * SAMPLE_PERIOD_S
 WAVELENGTH_M = 299_792_458.0 / 6489.6e6
-"""Channel 5, where the training simulator has channel 2."""
+"""Channel 5; the training simulator uses channel 2."""
 
 HARDWARE_SD_M = 0.1
-"""What differs from pair to pair and is in no CIR: antenna delays, power-dependent bias, clock drift. A constant
-offset leaves 0.13 m in line of sight on the EVK1000 logs."""
+"""Per-pair errors that the CIR does not show: antenna delays, power-dependent bias, clock drift. With a constant
+offset, 0.13 m remain in LOS in the EVK1000 logs."""
 
 TAPS, ORIGIN, OVERSAMPLING = 256, 48, 8
 NOISE_TAPS = 40
@@ -41,7 +41,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """Rooms of one use.
+    """Rooms of one type.
 
     Attributes:
         size_m: lower and upper bound of length, width and height.
@@ -66,9 +66,9 @@ SCENARIOS = {
 
 
 def draw(name: str, count: int, seed: int) -> tuple[RangeColumns, Array, NDArray[np.bool_]]:
-    """Received ranges of the scenario `name`, their errors (n,), m, and whether the direct path is blocked (n,).
+    """Return received ranges of the scenario `name`, errors (n,), m, and whether the direct path is blocked (n,).
 
-    Frames without a detected path are left out.
+    Frames without a detected path are omitted.
     """
     scenario, rng = SCENARIOS[name], np.random.default_rng([seed, sorted(SCENARIOS).index(name)])
     blocked = rng.random(count) < scenario.blocked
@@ -95,7 +95,7 @@ def draw(name: str, count: int, seed: int) -> tuple[RangeColumns, Array, NDArray
 
 
 def without_levels(columns: RangeColumns) -> RangeColumns:
-    """The same from boards that send amplitudes only."""
+    """Return the same ranges from boards that send only amplitudes."""
     parts = columns.samples.reshape(len(columns.range_m), -1, 2).astype(float)
     magnitude = np.rint(np.hypot(parts[..., 0], parts[..., 1])).clip(max=32000).astype(np.int16)
     unknown = np.full(len(magnitude), np.nan, np.float32)
@@ -110,14 +110,14 @@ def without_levels(columns: RangeColumns) -> RangeColumns:
 
 
 def late(columns: RangeColumns, taps: int) -> RangeColumns:
-    """The same with a first-path index that is `taps` too high."""
+    """Return the same ranges with a first-path index that is `taps` too high."""
     return replace(columns, first_path_index=columns.first_path_index + np.float32(taps))
 
 
 def _paths(
     scenario: Scenario, blocked: NDArray[np.bool_], rng: np.random.Generator
 ) -> tuple[Array, NDArray[np.complex128], Array]:
-    """Path lengths (n, p), m, field gains (n, p), and true distances (n,); the direct path is first."""
+    """Return path lengths (n, p), m, field gains (n, p), and true distances (n,); the direct path is first."""
     n = len(blocked)
     size = rng.uniform(*scenario.size_m, (n, 3))
     anchor = size * rng.uniform((0.02, 0.02, 0.6), (0.98, 0.98, 0.95), (n, 3))
@@ -141,7 +141,7 @@ def _paths(
     present = rng.random((n, count)) < 0.5
     scattered = present * rng.rayleigh(0.25, (n, count)) / np.maximum(legs[0] * legs[1], 0.3)
 
-    # A reverberant tail of as many paths: it starts with the direct path and holds a share of the power at 3 m.
+    # A reverberant tail with the same number of paths: it starts with the direct path and has a share of the power at 3 m.
     tail = 120
     mean_free = 2.0 * np.prod(size, axis=1) / (size[:, :2].sum(1) * size[:, 2] + size[:, 0] * size[:, 1])
     decay_m = rng.uniform(1.0, 2.5, n) * mean_free
@@ -149,7 +149,7 @@ def _paths(
     power = np.exp(-behind / decay_m[:, None]) * 5.0 / tail * (10 ** rng.uniform(-2.2, -0.7, n))[:, None]
     reverberant = np.sqrt(power / 2.0) * rng.standard_normal((n, tail))
 
-    # An obstacle: the direct path goes through it or around its edge; other paths are shadowed now and then.
+    # An obstacle: the direct path goes through it or around its edge; other paths are sometimes shadowed.
     loss_db = np.where(blocked, rng.uniform(6.0, 30.0, n), 0.0)
     detour_m = np.where(blocked, rng.exponential(0.2, n), 0.0)
     distance = length[:, 0].copy()
@@ -163,7 +163,7 @@ def _paths(
 
 
 def _dipole(direction: Array, tilt: Array) -> Array:
-    """Amplitude pattern of a short dipole, tilted from the vertical by two angles (n, 2), with a floor of -15 dB."""
+    """Return the amplitude pattern of a short dipole, tilted from the vertical by two angles (n, 2), with a floor of -15 dB."""
     axis = np.concatenate([np.sin(tilt), np.ones((len(tilt), 1))], axis=1)
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
     cosine = np.einsum("npk,nk->np", direction, axis) / np.linalg.norm(direction, axis=2)
@@ -171,7 +171,7 @@ def _dipole(direction: Array, tilt: Array) -> Array:
 
 
 def _pulse(taps: Array) -> Array:
-    """A raised cosine, roll-off 0.9, as wide at half amplitude as the inverse of 440 MHz."""
+    """Return a raised cosine with roll-off 0.9, whose width at half amplitude is 1 / 440 MHz."""
     x = taps * SAMPLE_PERIOD_S * 499.2e6
     denominator = 1.0 - (1.8 * x) ** 2
     safe = np.where(np.abs(denominator) < 1e-6, 1e-6, denominator)
@@ -181,8 +181,8 @@ def _pulse(taps: Array) -> Array:
 def _receive(
     behind_m: Array, gain: NDArray[np.complex128], phase: Array, rng: np.random.Generator
 ) -> tuple[NDArray[np.int16], Array, Array, tuple[Array, Array]]:
-    """Accumulators (n, 2 TAPS), preamble counts, first-path indices with the direct path `phase` taps behind
-    `ORIGIN`, levels, dBm."""
+    """Return accumulators (n, 2 TAPS), preamble counts, first-path indices (direct path `phase` taps after `ORIGIN`)
+    and levels, dBm."""
     n = len(gain)
     grid = np.arange(TAPS)
     sent_db = -14.3 + rng.uniform(-5.0, 5.0, n) + POWER_CONSTANT_DB
@@ -192,7 +192,7 @@ def _receive(
         symbol += gain[:, path, None] * _pulse(grid - place[:, None])
     symbol *= 10 ** (sent_db / 20)[:, None]
     power_dbm = 10 * np.log10((np.abs(symbol) ** 2).sum(1)) - POWER_CONSTANT_DB
-    # Above -82 dBm the gain control takes two thirds of what is added.
+    # Above -82 dBm the gain control removes two thirds of the excess.
     symbol *= 10 ** (-np.maximum(power_dbm + 82.0, 0.0) / 30)[:, None]
     symbols = np.minimum(rng.choice([110.0, 240.0, 500.0, 1000.0], n), 14000 / np.abs(symbol).max(1)).round()
     symbols = np.maximum(symbols, 1.0)
@@ -216,7 +216,7 @@ def _receive(
 
 
 def _leading_edge(accumulator: NDArray[np.complex128]) -> Array:
-    """Where the interpolated magnitude passes 0.4 of its first maximum above the threshold; NaN without one."""
+    """Return where the interpolated magnitude crosses 0.4 of its first maximum above the threshold, or NaN."""
     spectrum = np.fft.fft(accumulator, axis=1)
     padded = np.zeros((len(accumulator), OVERSAMPLING * TAPS), np.complex128)
     padded[:, : TAPS // 2], padded[:, -TAPS // 2 :] = spectrum[:, : TAPS // 2], spectrum[:, TAPS // 2 :]
@@ -240,7 +240,7 @@ def _leading_edge(accumulator: NDArray[np.complex128]) -> Array:
 
 _LEAD = np.linspace(0.0, 2.0, 4001)
 _EDGE_LEAD_TAPS = float(np.interp(-0.4, -_pulse(_LEAD), _LEAD))
-"""Taps from 0.4 of the leading edge of a lone pulse to its peak."""
+"""Number of taps from 0.4 of the leading edge of a single pulse to its peak."""
 
 
 def relative_mae(model: Mitigation, columns: RangeColumns, error: Array, blocked: NDArray[np.bool_]) -> float:

@@ -18,7 +18,7 @@ from uwb_mitigation.sources.simulation.radio import Boards
 from uwb_mitigation.sources.simulation.scene import FloorPlan, Point
 
 SITES = ("flat", "office")
-"""The kinds of buildings, equally often."""
+"""Types of buildings, with equal probability."""
 
 SIDE_M = (6.0, 20.0)
 HEARD = 0.75
@@ -41,9 +41,9 @@ class Site:
 
     Attributes:
         plan: the building.
-        anchors: m.
-        cells: float64 (c, 2), places where a tag can go, each from each other; `ways`: float64 (c, c) sparse, m,
-            between neighbours.
+        anchors: positions, m.
+        cells: float64 (c, 2), reachable positions of a tag; `ways`: distances between neighbours, m,
+            float64 (c, c) sparse.
     """
 
     plan: FloorPlan
@@ -52,12 +52,12 @@ class Site:
     ways: csr_array
 
     def route(self, rng: np.random.Generator) -> tuple[Point, ...]:
-        """A closed route by the shortest ways past `WAYPOINTS` random places."""
+        """Return a closed route along the shortest paths between `WAYPOINTS` random positions."""
         stops = rng.choice(len(self.cells), WAYPOINTS, replace=False)
         _, before = dijkstra(self.ways, directed=False, indices=stops, return_predecessors=True)
         found: list[int] = []
         for number in range(WAYPOINTS):
-            # From each stop's own tree: the way back from the next one.
+            # The tree of each stop gives the path back from the next one.
             here, leg = int(stops[(number + 1) % WAYPOINTS]), list[int]()
             while here != stops[number]:
                 here = int(before[number, here])
@@ -70,7 +70,7 @@ def draw_site(anchors: int, rng: np.random.Generator) -> Site:
     """Return a random site with walls, anchors that receive the tag, and doorways that connect its rooms.
 
     Args:
-        anchors: how many, evenly along the outer walls.
+        anchors: number of anchors, evenly spaced along the outer walls.
     """
     name = SITES[int(rng.integers(len(SITES)))]
     kind = next(one for one in KINDS if one.name == name)
@@ -87,7 +87,7 @@ def draw_site(anchors: int, rng: np.random.Generator) -> Site:
 
 
 def _along_walls(size: Point, count: int, rng: np.random.Generator) -> tuple[Point, ...]:
-    """Evenly, `BEFORE_WALL_M` before the outer walls."""
+    """Return evenly spaced points at `BEFORE_WALL_M` from the outer walls."""
     x, y = (side - 2.0 * BEFORE_WALL_M for side in size)
     corners = np.array([[0.0, 0.0], [x, 0.0], [x, y], [0.0, y], [0.0, 0.0]]) + BEFORE_WALL_M
     reached = np.array([0.0, x, x + y, 2.0 * x + y, 2.0 * (x + y)])
@@ -97,7 +97,7 @@ def _along_walls(size: Point, count: int, rng: np.random.Generator) -> tuple[Poi
 
 
 def _free(plan: FloorPlan) -> tuple[NDArray[np.float64], csr_array]:
-    """The largest part of a grid whose cells lead to each other, and the ways between neighbours."""
+    """Return the largest connected part of a grid, and the distances between neighbours."""
     columns, rows = (np.arange(CELL_M, side, CELL_M) for side in plan.size)
     grid = np.stack(np.meshgrid(columns, rows, indexing="ij"), axis=-1)
     free = np.all((grid > CLEARANCE_M) & (grid < np.subtract(plan.size, CLEARANCE_M)), axis=-1)
@@ -121,7 +121,7 @@ def _free(plan: FloorPlan) -> tuple[NDArray[np.float64], csr_array]:
 
 
 def _shifted(number: NDArray[np.intp], step: tuple[int, int]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Cells that have a neighbour a step away, and that neighbour."""
+    """Return the cells that have a neighbour one step away, and that neighbour."""
     along, up = step
     here = number[: len(number) - along, max(-up, 0) : number.shape[1] - max(up, 0)]
     there = number[along:, max(up, 0) : number.shape[1] + min(up, 0)]
@@ -131,7 +131,7 @@ def _shifted(number: NDArray[np.intp], step: tuple[int, int]) -> tuple[NDArray[n
 def _away(
     grid: NDArray[np.float64], start: NDArray[np.float64], end: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Distances of points (..., 2) from a line between two."""
+    """Return the distances of points (..., 2) from a line segment."""
     along = end - start
     part = np.clip((grid - start) @ along / (along @ along), 0.0, 1.0)
     away: NDArray[np.float64] = np.linalg.norm(grid - start - part[..., None] * along, axis=-1)
@@ -139,7 +139,7 @@ def _away(
 
 
 def _heard(plan: FloorPlan, anchor: Point, cells: NDArray[np.float64]) -> float:
-    """The share of places from which, by its mean level, a frame is received."""
+    """Return the share of positions from which a frame is received according to its mean level."""
     n = len(cells)
     boards = Boards(np.zeros(n), np.full(n, RADIO.noise_figure_db), np.full(n, float(RADIO.preamble_symbols)))
     here = np.tile(anchor, (n, 1))

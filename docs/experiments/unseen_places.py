@@ -25,7 +25,7 @@ with open_recording(Path(sys.argv[1])) as source:
 
 
 def median_of_placements(data, rows):
-    """The median over placements of the mean raw error in those of `rows`."""
+    """Return the median over the placements in `rows` of their mean raw error."""
     names = np.unique(data.configurations[rows])
     return np.median([data.error_m[data.configurations == name].mean() for name in names])
 
