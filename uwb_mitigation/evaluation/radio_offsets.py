@@ -48,7 +48,7 @@ class PlacementOffset:
         offset_m, sd_m: computed with medians; NaN if refused.
         noise_sd_m: the part of `sd_m` that more ranges reduce.
         power_gap_db: median of receive level minus first-path level, as reported or from the CIR; NaN: unknown.
-        predicted_m: median of the predicted errors; NaN if there are none.
+        predicted_m: median of the predicted errors; NaN if no error was predicted.
         refused: reason why the placement is not used; empty if it is.
     """
 

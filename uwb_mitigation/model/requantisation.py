@@ -174,7 +174,7 @@ def _reaching(level: NDArray[np.int64] | int, multiplier: int) -> NDArray[np.int
 def _offset_between(
     lowest: NDArray[np.int64], *, at_least: int | None, at_most: int | None, nominal: int
 ) -> int | None:
-    """Return the middle of the offsets for which every step is in its gap of width 256; None if there are none."""
+    """Return the middle of the offsets for which every step is in its gap of width 256, or None."""
     floors = [int(lowest.max())] if lowest.size else []
     ceilings = [int(lowest.min()) + 255] if lowest.size else []
     floors += [at_least] if at_least is not None else []

@@ -28,7 +28,7 @@ TRAINING_ROOMS = {PAPER: (1, 3), "all_but_room_2": (0, 1, 3, 4)}
 TEST_ROOM = 2
 SPLITS = (AUTO, CONFIGURATIONS, *TRAINING_ROOMS)
 FOLDS = 4
-"""Of data without rooms; one fold is the test part."""
+"""Number of folds of data without rooms; one fold is the test part."""
 
 
 def split_by_name(configurations: NDArray[np.str_], name: str) -> tuple[str, Split]:
@@ -57,7 +57,7 @@ def split_by_name(configurations: NDArray[np.str_], name: str) -> tuple[str, Spl
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Parts:
-    """The data of an experiment; `data` and `split` are descriptions for people."""
+    """The data of an experiment; `data` and `split` are human-readable descriptions."""
 
     data: str
     split: str

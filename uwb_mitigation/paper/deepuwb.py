@@ -45,16 +45,16 @@ _ALLOWED = {
     **{module: {"_reconstructor"} for module in ("copyreg", "copy_reg")},
     "_codecs": {"encode"},
 }
-"""What a pickled frame of arrays, lists and scalars needs. None of it runs code from the file."""
+"""Classes that a pickled frame of arrays, lists and scalars needs. None of them runs code from the file."""
 
 
 class DeepUwbRecording(Source):
     """DeepUWB's `dataset.pkl`; a `Source`. It is read and checked completely when it is opened.
 
-    Only the classes that a data frame of arrays consists of are unpickled, so that a hostile file runs nothing.
+    Only the classes that a data frame of arrays consists of are unpickled, so that a malicious file cannot run code.
 
     Raises:
-        RecordingError: the file is absent, larger than 512 MiB, not such a frame, or contains an invalid cell; the error
+        RecordingError: the file is missing, larger than 512 MiB, not such a frame, or contains an invalid cell; the error
             gives row (from 0) and column.
     """
 

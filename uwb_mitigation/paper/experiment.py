@@ -1,4 +1,4 @@
-"""The paper's experiment (section III): every network and window length, several seeds, from float to int8."""
+"""Run the paper's experiment (section III): all networks and window lengths, several seeds, float and int8."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class Task:
 
 
 def tasks(networks_: Sequence[str], windows: Sequence[int], seeds: int) -> list[Task]:
-    """Return every window length and seed; for the MLP only the longest window.
+    """Return the tasks for all window lengths and seeds; for the MLP only the longest window.
 
     Raises:
         ParameterError: unknown network, or no seeds or windows.
@@ -168,7 +168,7 @@ def train_task(task: Task, parts: Parts, folder: Path, options: FitOptions) -> T
     card = describe(task.name, architecture, parts, options)
     maes, best, integers = calibrate(weights, train.inputs, train.error_m, options.seed)
     save_bundle(files["float"], graph.float_model(weights), card)
-    # Optimisations that do not depend on the processor, so that the file runs on another one.
+    # Use only optimisations that do not depend on the processor, so that the file runs on other ones.
     settings = session_options()
     settings.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_EXTENDED
     settings.optimized_model_filepath = str(files["optimised"])
@@ -270,7 +270,7 @@ def describe(name: str, architecture: Architecture, parts: Parts, options: FitOp
     """Return the card of a float network without a prior that was fitted to the whole training part.
 
     Its variance comes from a second network, fitted to a fifth of the training configurations and tested on the others.
-    That network has less to learn from, so the variance errs on the safe side. The test part is not used.
+    That network has less training data, so the variance is conservative. The test part is not used.
 
     Raises:
         DatasetError: the training part has only one configuration; see also `fit`.

@@ -28,7 +28,7 @@ except ModuleNotFoundError as error:
 
 MAX_POINTS = 4000
 MAX_NAMED = 12
-"""With more groups there is no legend: their colours could not be told apart."""
+"""With more groups there is no legend, because the colours would be too similar."""
 
 _COLOURS = [
     "#0072B2",
@@ -51,7 +51,7 @@ _SETTINGS = {
     "grid.color": "#dddddd",
     "axes.axisbelow": True,
     "svg.hashsalt": "uwb-mitigation",
-    # Names come from files: a dollar sign is only a dollar sign.
+    # Names come from files: do not interpret dollar signs as math.
     "text.parse_math": False,
 }
 

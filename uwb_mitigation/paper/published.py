@@ -1,4 +1,4 @@
-"""The paper's own figures, as printed in its section III. Constants only."""
+"""Published results of the paper, section III. Constants only."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ class PaperModel(NamedTuple):
     """One row of Tables 1 to 3; measured on DeepUWB's medium room and on an Arduino Nano 33 BLE Sense.
 
     Attributes:
-        mae_m, size_kb: of float, optimised graph and int8 (Tables 1 and 2); kB of 1000 bytes.
+        mae_m, size_kb: values of float, optimised graph and int8 (Tables 1 and 2); kB of 1000 bytes.
         board: rate, Hz; supply, V; current, mA; power, mW; energy, mJ of one inference (Table 3).
     """
 
@@ -39,7 +39,7 @@ MODELS = {
         54401, (0.0769, 0.0777, 0.0775), (216.047, 125.885, 60.320), (184.1, 3.3, 16.2, 53.4, 0.29)
     ),
 }
-"""By network and window length K."""
+"""Published results by network and window length K."""
 
 WINDOWS = (157, 128, 64, 32, 16, 8)
 """Lengths K of the CIR that the paper compares."""

@@ -1,4 +1,4 @@
-"""The report: the paper's tables and figures for one recording, next to the published numbers."""
+"""Create a report with the tables and figures of the paper for one recording, next to the published numbers."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ class Picture:
     """One figure.
 
     Attributes:
-        alt: description for readers who do not see it.
+        alt: alternative text for screen readers.
         note: how to read it; `paper_note`: what the paper's figure shows.
-        uri: the image, as `data:`.
-        numbers: what is drawn, for programs.
+        uri: the image as a `data:` URI.
+        numbers: plotted values, machine-readable.
     """
 
     id: str
@@ -51,8 +51,8 @@ class Report:
     """The page.
 
     Attributes:
-        command: made this report.
-        lacking: {parts that are left out: command that makes their results}.
+        command: command that created this report.
+        lacking: {missing parts: command that creates their results}.
     """
 
     data: str
@@ -81,7 +81,7 @@ class Report:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Study:
-    """Labelled data with windows of the longest K, scaled by their maximum; `command` made the report from `path`."""
+    """Labelled data with windows of the largest K, scaled by their maximum; `command` created the report from `path`."""
 
     path: Path
     name: str

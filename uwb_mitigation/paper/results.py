@@ -109,7 +109,7 @@ class TrainedModel(_Entry):
     samples_per_s: Number
 
     def by_form(self, kind: str) -> list[float | None]:
-        """`mae` or `bytes` of each of `FORMS`."""
+        """Return `mae` or `bytes` of each of `FORMS`."""
         return [getattr(self, f"{kind}_{form}") for form in FORMS]
 
     @property
@@ -139,7 +139,7 @@ class ExperimentResults(_Entry):
     baselines: tuple[Baseline, ...] = ()
 
     def of(self, network: str, samples: int) -> tuple[TrainedModel, ...]:
-        """Return every seed of a network, in the order of seeds."""
+        """Return the trained models of a network in the order of seeds."""
         found = [model for model in self.models if (model.network, model.samples) == (network, samples)]
         return tuple(sorted(found, key=lambda model: model.seed))
 
@@ -180,7 +180,7 @@ def read(kind: type[Entry], path: Path) -> Entry:
 
     Raises:
         UwbMitigationError: it cannot be read, is empty or too large.
-        DatasetError: it is not such a file; `what` contains the entry.
+        DatasetError: it is not a result file of this kind; `what` contains the invalid entry.
     """
     data = read_bounded(
         path, MAX_BYTES, UwbMitigationError, "output of `paper protocol` or `benchmarks firmware`"
@@ -203,7 +203,7 @@ class Spread:
 
     @classmethod
     def of(cls, values: list[float | None]) -> Spread | None:
-        """Return the spread of the values that are not None; None if there are none."""
+        """Return the spread of the values that are not None; None if all are None."""
         known = [value for value in values if value is not None]
         if not known:
             return None

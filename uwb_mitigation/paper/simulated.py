@@ -46,7 +46,7 @@ class SimulatedDeepUwb(Simulated):
         exchanges: 1 to 1000 for each placement.
 
     Attributes:
-        rows: of each room.
+        rows: number of rows of each room.
 
     Raises:
         ParameterError: an argument is out of its range.
@@ -56,7 +56,7 @@ class SimulatedDeepUwb(Simulated):
         check_seed(seed)
         check_range("simulated DeepUWB", "ranges", ranges, 100, 1_000_000, whole=True)
         check_range("simulated DeepUWB", "exchanges", exchanges, 1, 1000, whole=True)
-        # The published raw errors leave no room for uncalibrated antenna delays.
+        # The published raw errors are too small for uncalibrated antenna delays.
         radio = Radio(range_offset_m=0.0)
         super().__init__(f"simulated like DeepUWB, seed {seed}", SURVEY_RATE_HZ, radio, 0)
         self._seed = seed
@@ -67,7 +67,7 @@ class SimulatedDeepUwb(Simulated):
     def __iter__(self) -> Iterator[Record]:
         self.skipped = Counter()
         for room, rows in enumerate(self.rows):
-            # Endless: the number of lost frames is not known in advance.
+            # The source is endless, because the number of lost frames is not known in advance.
             records = chain.from_iterable(self._records(*self._batch(room, batch)) for batch in counting())
             yield from islice(self._shaped(records), rows)
 

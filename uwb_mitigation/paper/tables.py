@@ -20,7 +20,7 @@ NAMES = {
     "cortex_m4": "Cortex-M4",
     "portable": "portable C",
 }
-"""{name in result files: name for people}."""
+"""{name in result files: human-readable name}."""
 
 _ROWS = [*(("remnet", samples) for samples in published.WINDOWS), ("mlp", max(published.WINDOWS))]
 
@@ -193,7 +193,7 @@ _Row = tuple[list[Cell], Cell, tuple[TrainedModel, ...], "published.PaperModel |
 
 
 def _networks(trainings: ExperimentResults) -> list[_Row]:
-    """Heads, parameters, models and printed values of the paper's networks and of all others that were trained."""
+    """Return heads, parameters, models and published values of the paper's networks and of all other trained ones."""
     rows = []
     for network, samples in dict.fromkeys(
         [*_ROWS, *((one.network, one.samples) for one in trainings.models)]
@@ -209,7 +209,7 @@ def _networks(trainings: ExperimentResults) -> list[_Row]:
 
 
 def _forms(models: Sequence[TrainedModel], kind: str, unit: float, digits: int) -> list[Cell]:
-    """Mean and standard deviation over seeds of each form."""
+    """Return mean and standard deviation over seeds of each form."""
     cells = []
     for values in zip(*(model.by_form(kind) for model in models), strict=True):
         spread = Spread.of([None if value is None else value / unit for value in values])

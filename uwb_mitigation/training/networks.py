@@ -58,7 +58,7 @@ class RemnetModule(nn.Module):
         return output
 
     def by_name(self) -> dict[str, nn.Module]:
-        """What holds the weights and the bias of each layer."""
+        """Return {layer: module with its weights and bias}."""
         layers = {layer.name: self.layers[_key(layer.name)] for layer in self.architecture.convolutions}
         return {**layers, HEAD: self.head}
 
@@ -85,7 +85,7 @@ class MlpModule(nn.Module):
         return output
 
     def by_name(self) -> dict[str, nn.Module]:
-        """What holds the weights and the bias of each layer."""
+        """Return {layer: module with its weights and bias}."""
         return {**self.layers, HEAD: self.head}
 
 
