@@ -105,7 +105,7 @@ enum {
 #define RX_ERRORS (RXPHE | RXFCE | RXRFSL | LDEERR | RXOVRR | RXSFDTO | AFFREJ)
 #define RX_TIMEOUTS (RXRFTO | RXPTO)
 
-/* What raises the IRQ line: a frame, or why there will be none. */
+/* Events that raise the IRQ line: a received frame, or an error. */
 #define UWB_DW1000_INTERRUPTS ((uint32_t)(RXFCG | RX_ERRORS | RX_TIMEOUTS))
 
 /* In PANADR, which nothing else uses since frames are filtered by the exchange: after a reset it reads as ones. */
@@ -131,7 +131,7 @@ uwb_dw1000_status uwb_dw1000_set_all(uwb_dw1000 *chip, const uwb_dw1000_entry *e
 uint32_t uwb_dw1000_sfd_symbols(const uwb_dw1000_settings *settings);
 uint64_t uwb_dw1000_number(const uint8_t *octets, size_t bytes);
 
-/* Return from the calling function what is not OK. */
+/* Return from the calling function if the status is not OK. */
 #define DW1000_TRY(call)                                                                                               \
     do {                                                                                                               \
         const uwb_dw1000_status tried_ = (call);                                                                       \

@@ -38,13 +38,13 @@ typedef struct {
     uint8_t bias_correction; /* APS011, on ranges given; the models were trained without */
     uint8_t anchor_count;  /* 0 = those that a broadcast finds */
     uint16_t window;       /* complex samples that a measurement takes; 0 = none */
-    uint32_t reply_us;     /* from ANSWER's reception to FINAL: what the tag's bus and processor need, and the air */
+    uint32_t reply_us;     /* from the reception of ANSWER to FINAL; depends on the tag's bus and processor, and on airtime */
     uint32_t patience_us;  /* for an anchor's frames */
     uint32_t interval_us;  /* between the beginnings of two exchanges, at least */
     uint64_t anchors[UWB_MAX_ANCHORS];
 } uwb_twr_config;
 
-/* Usual radio, a tag with 157 samples that finds its anchors, and times for SPI of a microcontroller. */
+/* Defaults: a tag with 157 samples that finds its anchors, and times for SPI of a microcontroller. */
 extern const uwb_twr_config uwb_twr_defaults;
 
 /* Started exchanges and their results: `tried` is the sum of the results. */
@@ -70,7 +70,7 @@ typedef struct {
     uint32_t tried;
     uint32_t ranged;
     uint32_t answer_us; /* from POLL to ANSWER in the last exchange; 0 = none yet */
-    uint32_t misses;    /* since its last answer */
+    uint32_t misses;    /* missed answers since its last answer */
     float rx_power_dbm;
 } uwb_twr_anchor;
 
@@ -100,7 +100,7 @@ int uwb_twr_is_known(const uwb_twr_frame *seek, uint64_t address);
 /* Write a frame, without check sequence; returns its length. */
 size_t uwb_twr_write(const uwb_twr_frame *frame, uint8_t *octets);
 
-/* Read one of any bytes; returns whether it is well formed. */
+/* Parse a frame; returns whether it is well formed. */
 int uwb_twr_read(const uint8_t *octets, size_t bytes, uwb_twr_frame *frame);
 
 /* Distance of antennas, m, from the stamps at the tag (POLL sent, ANSWER received, FINAL sent) and at the anchor (POLL
@@ -116,7 +116,7 @@ typedef struct {
     uint64_t next_us; /* when a tag may begin again, an anchor checks the chip */
     uint64_t seek_us; /* when a tag looks for anchors again */
     uint32_t reply_us; /* grows while FINAL comes late */
-    uint32_t misses;   /* in a row, of whatever anchor */
+    uint32_t misses;   /* consecutive missed answers, of any anchor */
     uwb_twr_counts counts;
     uwb_dw1000_status fault; /* why the last turn was UWB_TWR_FAULT */
     uint8_t running;
@@ -130,7 +130,7 @@ typedef struct {
 } uwb_twr;
 
 typedef enum {
-    UWB_TWR_NOTHING = 0, /* the time is over, or an exchange was lost */
+    UWB_TWR_NOTHING = 0, /* timeout, or a failed exchange */
     UWB_TWR_RANGED,      /* `measurement` is that of an exchange */
     UWB_TWR_FAULT        /* the chip does not work; the next turn tries to start it again */
 } uwb_twr_event;

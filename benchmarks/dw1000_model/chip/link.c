@@ -34,7 +34,7 @@ static void synthesise(link *path, double place) {
         const double x = ((double)i - place) / PULSE_SAMPLES;
         const double height = DEFAULT_HEIGHT * exp(-4 * log(2) * x * x);
         for (size_t part = 0; part < 2; part++) {
-            /* The sum of three uniform numbers is normal enough. */
+            /* The sum of three uniform numbers approximates a normal distribution. */
             double noise = -1.5;
             for (uint64_t k = 0; k < 3; k++) {
                 noise += dw1000_chance(dw1000_dice(path->key + k, 2 * i + part));

@@ -14,7 +14,7 @@
 
 /* Kinds of damage, by dice. */
 enum { BAD_HEADER, BAD_CODE, BAD_CHECK, NO_SFD, DAMAGES };
-/* What a frame's dice are thrown for. */
+/* Purposes of the random numbers of a frame. */
 enum { FOR_LOSS = 1, FOR_DAMAGE, FOR_KIND, FOR_CLASH, FOR_EDGE };
 
 /* The same for a frame and a receiver, however often and in whatever order it is asked. */

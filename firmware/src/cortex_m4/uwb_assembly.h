@@ -1,4 +1,4 @@
-/* What the Cortex-M4 kernels share. Weights of one filter are parked in s0 to s31, where a one-cycle
+/* Shared macros of the Cortex-M4 kernels. Weights of one filter are kept in s0 to s31, where a one-cycle
  * VMOV fetches them; r0 to r7 accumulate; a block of eight positions is 256 bytes, a channel pair's
  * row 32. */
 #ifndef UWB_ASSEMBLY_H
