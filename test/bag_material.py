@@ -56,7 +56,7 @@ def corrected(number: int) -> CorrectedRange:
 
 
 def write_corrected(bag: BagWriter, measurement: RangeMeasurement, corrected: CorrectedRange) -> None:
-    """Write what was made of a measurement, at the measurement's own time."""
+    """Write the corrected range of a measurement, with the time of the measurement."""
     data, stamp_ns = codec.encode_corrected(measurement, corrected), measurement.stamp_ns
     bag.write_serialized(bag.corrected_channel(), data, stamp_ns, stamp_ns, measurement.sequence)
 
@@ -145,7 +145,7 @@ def numbers(source: McapRecording) -> list[int]:
 
 
 def prefix(path: Path) -> tuple[list[int], RecordingError | None]:
-    """What is read of a bag, and the error that ends it; any other exception fails the test."""
+    """Return the messages read from a bag and the final error; any other exception fails the test."""
     read: list[int] = []
     try:
         for item in McapRecording(path):

@@ -28,7 +28,7 @@ class Browser:
 
     def open(self, url: str, width: int = 1280, height: int = 1000) -> None:
         self.resize(width, height)
-        # What an earlier page still complains of is none of this one's.
+        # Discard errors of an earlier page.
         self.driver.get("about:blank")
         self.driver.get_log("browser")
         self.driver.get(url)
@@ -82,7 +82,7 @@ class Browser:
         return bool(self.run("return !!(window.Bokeh && Bokeh.documents[0]?.is_idle)"))
 
     def column(self, model: str, name: str) -> list[Any]:
-        """Return a column of the source of a named table or figure; empty before the page is there."""
+        """Return a column of the source of a named table or figure; empty before the page is loaded."""
         return self.run(
             "const m = window.Bokeh?.documents[0]?.get_model_by_name(arguments[0]);"
             "const sources = !m ? [] : m.source ? [m.source] : m.renderers.map((r) => r.data_source);"
@@ -92,7 +92,7 @@ class Browser:
         )
 
     def cell(self, text: str) -> Any:
-        """The element with a text, in whatever shadow tree; None where there is none."""
+        """Return the element with a text, in any shadow tree; None if it does not exist."""
         return self.run(
             "const wanted = arguments[0], find = (root) => { for (const e of root.querySelectorAll('*')) {"
             " if (e.children.length == 0 && e.textContent == wanted) return e;"

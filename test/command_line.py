@@ -17,7 +17,7 @@ from unittest import mock
 from uwb_mitigation.commands import cli
 
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parent.parent), "COLUMNS": "160"}
-"""Of a command in a process of its own: the package of this repository, and columns to print on."""
+"""Environment of a command in its own process: the package of this repository, and the terminal width."""
 
 
 class Finished(NamedTuple):
@@ -29,7 +29,7 @@ class Finished(NamedTuple):
 
 
 def run(*arguments: object, folder: Path, columns: int = 160) -> Finished:
-    """Run the command in `folder`, on a terminal of so many columns."""
+    """Run the command in `folder`, on a terminal of the given width."""
     out, err = io.StringIO(), io.StringIO()
     before = Path.cwd()
     with (

@@ -61,7 +61,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 @pytest.fixture(scope="session")
 def browser() -> Iterator[Browser]:
-    """One for all tests of a worker: it takes seconds to come up."""
+    """One browser for all tests of a worker, because it takes seconds to start."""
     with chromium() as window:
         yield window
 

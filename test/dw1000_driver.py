@@ -94,7 +94,7 @@ class Driver:
         self.set(0x08, 0, self.fctrl | (len(data) + 2), 4)
 
     def send(self, data: bytes, bits: int = 0) -> None:
-        """Send at once, without waiting for the end."""
+        """Send immediately, without waiting for the end."""
         self.load(data)
         self.command(TXSTRT | bits)
 

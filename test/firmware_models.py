@@ -54,7 +54,7 @@ def mlp_bundle(folder: Path) -> Bundle:
 
 
 def choosy_bundle(folder: Path, samples: int = 32, scaling: Scaling = Scaling.PREAMBLE) -> Bundle:
-    """The same with a familiarity that finds random measurements familiar, strange in part, and wholly strange."""
+    """Bundle whose OOD detector rates random measurements as in distribution, between, and out of distribution."""
     lead = Band(-40.0, -12.0, 10.0)
     if scaling is Scaling.MAX:
         return exact_bundle(
@@ -142,7 +142,7 @@ class Exported:
         return random_networks.pressing_windows(samples, self.weights.activation_scale["input"], count)
 
     def real_windows(self, apartment: Path, every: int = 1) -> NDArray[np.float32]:
-        """What the network reads of the real measurements, or of every so many."""
+        """Return the network inputs of the real measurements, or of every n-th."""
         samples = self.weights.architecture.samples
         measured = real_measurements(apartment)[::every]
         faults, windows = Preprocessing(samples, Scaling.PREAMBLE).windows_of(measured)

@@ -32,7 +32,7 @@ CLOCK = SimpleNamespace(
     monotonic_ns=lambda: int(host().now() * 1e9),
     time_ns=lambda: int(host().now() * 1e9),
 )
-"""Stands in for the module `time`."""
+"""Replacement for the module `time`."""
 
 
 def begin(running: Host) -> None:

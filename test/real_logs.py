@@ -23,7 +23,7 @@ class Reading(NamedTuple):
 
 
 def read_once(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Reading:
-    """All records of a recording; whoever comes first reads it, the others take what was read."""
+    """Return all records of a recording; the first worker reads it, the others use the cached result."""
     shared = tmp_path_factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
         shared = shared.parent

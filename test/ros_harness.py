@@ -114,7 +114,7 @@ class Ros:
         return process
 
     def collect(self, kind: type, topic: str, depth: int = 10_000) -> list:
-        """A list that fills with the messages of a topic while the client spins."""
+        """Return a list to which the messages of a topic are appended while the client spins."""
         received: list = []
         self.node.create_subscription(kind, topic, received.append, QoSProfile(depth=depth))
         return received
@@ -178,7 +178,7 @@ class Ros:
         return self.call(SetParameters, f"/{node}/set_parameters", request).results[0]
 
     def diagnosis(self, node: str, matches: Callable[[DiagnosticStatus], bool]) -> DiagnosticStatus:
-        """The first diagnostic status of a node that matches."""
+        """Return the first matching diagnostic status of a node."""
         arrays = self.collect(DiagnosticArray, "/diagnostics", 100)
         found: list[DiagnosticStatus] = []
 

@@ -19,7 +19,7 @@ SYSTEM_CALL_S = 60e-6
 
 
 class FakeSpiDev:
-    """Stands in for `spidev.SpiDev`; which chip it reaches depends on the program that opens it."""
+    """Replacement for `spidev.SpiDev`; the program that opens it determines the chip."""
 
     max_speed_hz = 0
     mode = 0

@@ -51,7 +51,7 @@ def test_what_is_no_calibration_is_refused(ranges: np.ndarray, gap_db: float, sa
 
 @NEEDS_CC
 def test_the_delay_of_a_pair_is_found_and_written(tmp_path: Path):
-    # The modelled chips hold it in their memory: the radios are told to pass over that.
+    # The OTP memory of the modelled chips contains the delay: the settings override it.
     truth = NOMINAL + 173
     with EmulatedEvb1000s(boards=2, antenna_delay=truth) as boards:
         done = command_line.start(

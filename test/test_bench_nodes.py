@@ -1,4 +1,4 @@
-"""The bench of the nodes: what it counts, what it tells, and that its subjects run."""
+"""Benchmark of the nodes: its counts, its report, and that the measured nodes run."""
 
 from __future__ import annotations
 

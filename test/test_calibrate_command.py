@@ -1,4 +1,4 @@
-"""`uwb-mitigation calibrate`: a bundle and offsets from a simulated drive, and from a localisation beside it."""
+"""`uwb-mitigation calibrate`: a bundle and offsets from a simulated drive, and from an external localisation."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def site(tmp_path_factory):
                 late = stamp + 300_000_000
                 pose = Estimate(late, frame, np.zeros(3), np.zeros((6, 6)))
                 encoded = [encode_odometry(pose, child_frame_id=name) for name in ("base_link", "uwb_tag")]
-                # The orientation stands after the position in the pose, which is encoded as none.
+                # The orientation follows the position in the pose, and is encoded as unknown.
                 none = np.array([0.0, 0.0, 0.0, 1.0]).tobytes()
                 turned = np.array([0.0, 0.0, np.sin(turn[i] / 2), np.cos(turn[i] / 2)]).tobytes()
                 of_robot, of_tag = (
@@ -199,7 +199,7 @@ def test_a_localisation_needs_few_ranges_beside_it(site):
     done = run("calibrate", "few.mcap", *LEVEL, "-o", "few.onnx", "--json", "f.json", "--truth-topic", "/odom", "--estimate-lever-arm", "--force", folder=site)  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "no transform" not in done.stderr  # uwb_tag is the antenna itself
-    # Less a quarter, which is held out in turn, it is fewer than tell a lag and a lever arm.
+    # Without the held-out quarter, there are too few to estimate a time offset and a lever arm.
     assert 40 <= json.loads((site / "f.json").read_text())["labelled"] < 53
 
 

@@ -47,7 +47,7 @@ def clipped(level: int) -> Callable[[Cir], Cir]:
 
 
 def louder(decibels: float) -> Callable[[Cir], Cir]:
-    """The same channel heard by a radio that reports, and accumulates, more (or less)."""
+    """Return the same channel for a radio that reports and accumulates more (or less) power."""
     gain = 10 ** (decibels / 20)
     return lambda cir: replace(
         cir,
@@ -94,7 +94,7 @@ def test_a_surveyed_sites_model_makes_strange_measurements_no_worse(name, mitiga
 def test_a_radio_that_is_weaker_by_a_wall_or_two_is_made_worse_by_an_eighth_at_most(
     decibels, mitigation, records
 ):
-    # Of one range alone, a weaker radio in the open and walls that weaken as much cannot be told apart.
+    # A single range cannot distinguish a weaker radio in LOS from walls with the same attenuation.
     outcome = changed(mitigation, records, louder(decibels))
     # Above 1.02 too: a bundle that does better here calls for another table in docs/background/results.md.
     assert 1.02 < outcome.corrected.mae / outcome.raw.mae <= 1.12

@@ -52,7 +52,7 @@ def share(prefix: Path) -> Path:
 
 
 def files_below(folder: Path) -> dict[str, bytes]:
-    # Launching leaves bytecode beside a launch file.
+    # Launching leaves bytecode next to a launch file.
     found = [path for path in folder.rglob("*") if path.is_file() and path.suffix != ".pyc"]
     return {str(path.relative_to(folder)): path.read_bytes() for path in found}
 

@@ -64,7 +64,7 @@ def described(generate, file: str) -> tuple[dict, object]:
 
 
 def launch(generate, file: str, **said: str) -> list:
-    """The nodes that a launch file starts when it is told so."""
+    """Return the nodes that a launch file starts with the given arguments."""
     arguments, nodes_of = described(generate, file)
     assert set(said) <= set(arguments)
     return nodes_of(values_of(arguments) | said)
@@ -81,7 +81,7 @@ def values_of(arguments: dict) -> dict[str, str]:
 
 
 def settings(node) -> dict[str, object]:
-    """What a node is given beside its file."""
+    """Return the parameters of a node in addition to its file."""
     return {
         name: value for group in node.parameters if isinstance(group, dict) for name, value in group.items()
     }

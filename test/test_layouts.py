@@ -1,4 +1,4 @@
-"""What RViz and Foxglove are told to show: topics that the nodes have, of the types that the displays take, and their fields."""
+"""Layouts of RViz and Foxglove: their topics and fields exist in the nodes, with types that the displays support."""
 
 from __future__ import annotations
 

@@ -55,7 +55,7 @@ class JitteryLink:
         )
 
     def stamp_error_s(self, clock: DeviceClock, true_s: float) -> float:
-        """Of a measurement that takes the board 4 ms to read out before it is sent."""
+        """Return the stamp error of a measurement that the board reads out for 4 ms before sending it."""
         stamp = clock.stamp(self.ticks(true_s), self.ns(self.delivered_s(true_s + 4e-3)))
         return (stamp - self.ns(true_s)) / 1e9
 

@@ -1,6 +1,6 @@
 """Golden vectors of the wire protocol: the file that Python and C both test against.
 
-`python test/test_link_vectors.py` writes the file anew, for a deliberate change of the protocol only.
+`python test/test_link_vectors.py` rewrites the file; use it only for a deliberate change of the protocol.
 """
 
 from __future__ import annotations

@@ -41,7 +41,7 @@ def anchors(tmp_path: Path) -> Path:
 
 
 class Drive:
-    """Publishes a drive, stamped from now on, as fast as it is asked to."""
+    """Publishes a drive, stamped from the current time on, at a given speed."""
 
     def __init__(self, ros: Ros, **options) -> None:
         self.ranges, self.truth = drive(**options)
@@ -101,7 +101,7 @@ def test_poses_odometry_smoothed_poses_and_markers_come_of_ranges(ros: Ros, anch
     half = len(run.ranges) // 2
     run.send(range(half))
     ros.spin_until(lambda: len(smoothed) > 0)
-    # What is not right is counted, and said; it ends nothing.
+    # Invalid messages are counted and reported; the node continues.
     run.send(range(half, half + 3), range=math.nan)
     run.send(range(half, half + 3), anchor_id=4711)
     run.send(range(half, len(run.ranges)))
@@ -144,7 +144,7 @@ def test_a_silence_is_bridged_by_predictions_whose_covariance_grows(ros: Ros, an
     ros.wait_for_subscribers(CORRECTED, 1)
 
     def spread_at(row: int, silent_s: float) -> float:
-        """The variance that is told so long after a range."""
+        """Return the variance reported at the given time after a range."""
         now_ns = run.start_ns + int(run.ranges.stamp_ns[row]) + round(silent_s * NANOSECONDS)
         now = Clock(clock=Time(sec=now_ns // NANOSECONDS, nanosec=now_ns % NANOSECONDS))
 

@@ -77,7 +77,7 @@ def test_an_offset_that_was_added_is_found(universal: Mitigation, direct: list[R
     assert len(at_one_place(before)) > 1
     # What the simulator adds for the boards: docs/background/how_it_works.md.
     assert before.offset_m == pytest.approx(0.22, abs=3.0 * before.sd_m)
-    # What the mitigator has been told already does not count twice.
+    # Offsets that the mitigator already subtracts are not counted twice.
     told = Mitigation(universal.bundle, Offsets(0.625))
     assert find_offset(told, longer(direct, 0.625)).offset_m == pytest.approx(after.offset_m, abs=0.02)
 

@@ -1,4 +1,4 @@
-"""Offsets of radios: the file, which counts for a pair, what they do to a range, and a board that is told them."""
+"""Offsets of radios: the file, which counts for a pair, their effect on a range, and their transfer to a board."""
 
 from __future__ import annotations
 
@@ -149,7 +149,7 @@ CORRECTION = Correction(0, 1, 2, 3, 4, CorrectedRange(1.0, 1.0, 0.0, 1.0, Status
 
 
 class Pair:
-    """A session and a board on one wire; a board of an older firmware does not hear of offsets."""
+    """A session and a board on one wire; a board with older firmware ignores offsets."""
 
     def __init__(self, wanted: Offsets | None, *, older: bool = False) -> None:
         self.session = BoardSession()

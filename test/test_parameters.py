@@ -24,7 +24,7 @@ pytestmark = pytest.mark.ros
 
 @pytest.fixture(scope="module")
 def replaying(tmp_path_factory: pytest.TempPathFactory):
-    """A domain with a driver that waits to be told to play."""
+    """A domain with a driver that waits for the command to play."""
     with domain(tmp_path_factory.mktemp("driver")) as ros:
         ros.start("driver", "paused:=true", "wait_for_subscribers:=0", "start_delay:=0.0")
         yield ros

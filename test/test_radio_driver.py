@@ -120,7 +120,7 @@ def test_parameters_that_nobody_set_ask_nothing_of_a_boards_radio():
 
 
 class ModelledBoard:
-    """A board with a radio: the firmware on a modelled chip, an anchor beside it, its UART on a pseudo-terminal."""
+    """A board with a radio: the firmware on a modelled chip, a second chip as anchor, its UART on a pseudo-terminal."""
 
     STEP_S = 0.005
 

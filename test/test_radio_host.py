@@ -43,7 +43,7 @@ def bus(path: object) -> Callable[[], Evb1000Bus]:
 
 
 def wait_for(port: RadioPort, kind: type, count: int = 1) -> list:
-    """So many events of a kind, whatever comes between."""
+    """Wait for a number of events of one type; ignore others."""
     found: list = []
     until = time.monotonic() + GENEROUS_S
     while len(found) < count:

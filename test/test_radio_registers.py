@@ -196,7 +196,7 @@ def test_no_frame_exceeds_the_calibrated_power(air: Air, settings: RadioSettings
 
 
 class FastBus(ModelBus):
-    """A bus that notices the end of a frame at once."""
+    """A bus that detects the end of a frame immediately."""
 
     def pause(self) -> None:
         self._host.delay(5e-6)

@@ -98,7 +98,7 @@ def test_what_a_queue_has_dropped_is_told(ros: Ros):
     publisher = ros.node.create_publisher(RangeCir, RAW, 10)
 
     def told(status: DiagnosticStatus) -> bool:
-        # More at once than the queue holds.
+        # Send more than the queue can hold.
         for _ in range(300):
             publisher.publish(data)
         return status.message == DROPPED.text

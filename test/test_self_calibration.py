@@ -37,7 +37,7 @@ def solved(minute):
 
 
 def places_at_rest(count=12, seed=3, slope=-0.02):
-    """Tags at rest, each anchor heard once from each; ranges err by a line in the received power."""
+    """Stationary tags with one range to each anchor; the range error is linear in the received power."""
     rng = np.random.default_rng(seed)
     where = np.column_stack([rng.uniform(0, 20, 10), rng.uniform(0, 14, 10), rng.uniform(1, 4, 10)])
     anchors = AnchorMap([Anchor(n, tuple(place), 0.01) for n, place in enumerate(where.tolist(), 1)])
@@ -148,7 +148,7 @@ def test_a_localisation_that_jitters_is_smoothed_and_keeps_its_turns():
     left = rough.smoothed().position - true
     assert np.abs(left.mean(axis=0)).max() < 0.002
     assert left.std() < 0.012
-    # Poses that are too few for a parabola stay as they are.
+    # Too few poses for a parabola are left unchanged.
     few = PosePath(rough.stamp_ns[::10], rough.position[::10], rough.orientation[::10])
     assert (few.smoothed().position == few.position).all()
 

@@ -57,7 +57,7 @@ def write_drive(bag: Path, ranges: Ranges, truth: TruePath, too_long_m: float = 
 
 @pytest.fixture(scope="module")
 def hall(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A bag of a drive of 40 s past five anchors, raw ranges 0.6 m too long; its anchors beside it."""
+    """A bag of a drive of 40 s past five anchors, raw ranges 0.6 m too long; and a file of its anchors."""
     return write_drive(tmp_path_factory.mktemp("hall") / "hall.mcap", *drive(seconds=40), too_long_m=0.6)
 
 

@@ -1,4 +1,4 @@
-"""The node `viewer` beside a real driver, mitigator and locator: what the page shows is what they publish."""
+"""The node `viewer` with a real driver, mitigator and locator: what the page shows is what they publish."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ HOSTILE = "<img src=x onerror=window.pwned=1><script>window.pwned=1</script>$$x$
 
 
 class Clock:
-    """A clock that stands still until a test sets it."""
+    """A clock that changes only when a test sets it."""
 
     now_s = 0.0
 

@@ -1,4 +1,4 @@
-"""The rows of a model that is not fitted to the data: what each takes off, and what it must not see."""
+"""The rows of a model that is not fitted to the data: their corrections, and the data that they must not use."""
 
 from __future__ import annotations
 
