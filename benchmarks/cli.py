@@ -299,16 +299,22 @@ def nodes_result(figures: Mapping[str, Figures]) -> dict[str, Any]:
     return result
 
 
+_COLUMNS = 4
+
+
 def _report(result: Mapping[str, Any], json: Path | None) -> None:
     """Print a table for each list of rows, and one for all other values; write the JSON file."""
     scalars = Table("figure", "value", title_justify="left")
     for key, value in result.items():
         if isinstance(value, list | tuple) and value:
             rows = [_flat(row) for row in value]
-            table = Table(*rows[0], title=key)
-            for row in rows:
-                table.add_row(*map(_text, row.values()))
-            console.out.print(table)
+            for start in range(0, len(rows), _COLUMNS):
+                # One column for each row, since a terminal has no space for all figures next to each other.
+                shown = rows[start : start + _COLUMNS]
+                table = Table(key, *(str(number) for number in range(start + 1, start + 1 + len(shown))))
+                for name in rows[0]:
+                    table.add_row(name, *(_text(row.get(name, "")) for row in shown))
+                console.out.print(table)
         else:
             for name, figure in _flat({key: value}).items():
                 scalars.add_row(name, _text(figure))

@@ -27,7 +27,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from uwb_mitigation_msgs.msg import RangeCir
 
-TIMEOUT_S = 240.0
+TIMEOUT_S, RESPONSE_TIMEOUT_S = 240.0, 20.0
 
 PAUSED = ("paused:=true", "start_delay:=0.0", "longest_wait:=3600.0")
 """Of a driver that plays nothing until somebody subscribes to its ranges and `Ros.play` is called."""
@@ -159,10 +159,20 @@ class Ros:
     def call(self, kind: type, name: str, request: object) -> object:
         client = self.node.create_client(kind, name)
         self.spin_until(client.service_is_ready)
-        future = client.call_async(request)
-        self.spin_until(future.done)
+        futures = [client.call_async(request)]
+        sent = time.monotonic()
+
+        def is_answered() -> bool:
+            nonlocal sent
+            # The middleware drops a response while it does not know the client yet; transitions cannot be repeated.
+            if kind is not ChangeState and time.monotonic() > sent + RESPONSE_TIMEOUT_S:
+                futures.append(client.call_async(request))
+                sent = time.monotonic()
+            return any(future.done() for future in futures)
+
+        self.spin_until(is_answered)
         self.node.destroy_client(client)
-        return future.result()
+        return next(future.result() for future in futures if future.done())
 
     def state_of(self, node: str) -> str:
         return self.call(GetState, f"/{node}/get_state", GetState.Request()).current_state.label

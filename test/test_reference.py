@@ -34,11 +34,6 @@ ENTRIES = {
 }
 NODES = ("driver", "board", "mitigator")
 EVERY_NODE = ("/rosout", "/parameter_events", "/transition_event")
-EVERY_SERVICE = re.compile(
-    r".*/(change_state|get_state|get_available_states|get_available_transitions|get_transition_graph|"
-    r"describe_parameters|get_parameters|get_parameter_types|list_parameters|set_parameters|"
-    r"set_parameters_atomically|get_type_description)"
-)
 
 
 def rows(page: str, heading: str) -> list[list[str]]:

@@ -196,6 +196,8 @@ def _in_worker(job: Job) -> Outcome:
     try:
         return attempt(job)
     except KeyboardInterrupt:
+        # The interrupt may come between the creation of the file and the block that removes it.
+        partial_file(job.output).unlink(missing_ok=True)
         return Outcome(job, error=RecordingError("interrupted", where=str(job.source)))
     finally:
         _ignore_interrupts()
