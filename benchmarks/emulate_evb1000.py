@@ -48,13 +48,13 @@ def emulate_evb1000(
         typer.Option(help="m, between all boards, in line of sight; instead of a recording."),
     ] = None,
     antenna_delay: Annotated[
-        int, typer.Option(help="Of each chip, which holds it in its memory; ticks of both directions.")
+        int, typer.Option(help="Antenna delay in the OTP memory of each chip, ticks, TX + RX.")
     ] = 32872,
     unplug_every: Annotated[
         float | None, typer.Option(help="s between pulls of a cable, in turn; SIGUSR1 pulls one too.")
     ] = None,
     duration: Annotated[float | None, typer.Option(help="s, then end; without it, on Ctrl-C.")] = None,
-    seed: Annotated[int, typer.Option(help="Of all chance.")] = 1,
+    seed: Annotated[int, typer.Option(help="Seed of the random numbers.")] = 1,
     json: JsonOption = None,
 ) -> None:
     """Emulate EVB1000s without hardware, each on a pseudo-terminal.

@@ -90,9 +90,9 @@ def run(console: Console, measured: Sequence[RangeMeasurement]) -> list[str]:
     equal = sum(equals(expected[sequence], message) for sequence, message in arrived.items())
     lost, different = len(measured) - len(arrived), len(arrived) - equal
     statuses = Counter(result.status.name for result in expected)
-    told = ", ".join(f"{count} {name}" for name, count in statuses.items())
+    shown = ", ".join(f"{count} {name}" for name, count in statuses.items())
     console.print(f"{len(measured)} ranges measured, {len(arrived)} corrected by the board, {lost} lost")
-    console.print(f"{equal} equal to the host's to the bit, {different} different ({told})")
+    console.print(f"{equal} equal to the host's to the bit, {different} different ({shown})")
     if lost or different or len(corrected) != len(arrived):
         nodes.failures.append("board and host differ")
     return nodes.failures

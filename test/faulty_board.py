@@ -36,8 +36,10 @@ class FaultyBoard(EmulatedBoard):
             self._flood_until = time.monotonic() + seconds
 
     def reset(self) -> None:
-        super().reset()
-        self._backlog[:0] = self._random.bytes(self._boot_noise)
+        # The thread of the board must not write the backlog while it grows.
+        with self._lock:
+            super().reset()
+            self._backlog[:0] = self._random.bytes(self._boot_noise)
 
     def _boot(self) -> Board:
         return Board(

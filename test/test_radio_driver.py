@@ -110,9 +110,9 @@ def test_an_anchor_that_never_answered_was_never_heard():
     status = RadioStatus(
         anchors=(AnchorInReach(7, 9, 0, np.nan, NEVER_MS), AnchorInReach(8, 9, 9, -80.0, 1500))
     )
-    never, heard = anchor_facts(status).values()
-    assert never == "0 of 9 ranged, nan dBm, heard never"
-    assert heard == "9 of 9 ranged, -80.0 dBm, heard 1.5 s ago"
+    never, recent = anchor_facts(status).values()
+    assert never == "0 of 9 ranged, nan dBm, last seen never"
+    assert recent == "9 of 9 ranged, -80.0 dBm, last seen 1.5 s ago"
 
 
 def test_parameters_that_nobody_set_ask_nothing_of_a_boards_radio():

@@ -172,8 +172,8 @@ def refused(match, anchors, tags, **options):
 
 def test_what_cannot_be_calibrated_is_refused(minute):
     ranges = minute[0]
-    refused("3 anchors were heard", HALL, [ranges.take(ranges.anchor < 3)], height=LEVEL)
-    refused("4 anchors were heard", HALL, [ranges.take(ranges.anchor < 4)])
+    refused("3 anchors were received", HALL, [ranges.take(ranges.anchor < 3)], height=LEVEL)
+    refused("4 anchors were received", HALL, [ranges.take(ranges.anchor < 4)])
     refused("on a line", HALL.moved(HALL.position * (1, 0, 0), HALL.sd), [ranges], height=LEVEL)
     refused("in a plane", HALL.moved(HALL.position * (1, 1, 0), HALL.sd), [ranges])
     still, _ = drive(seconds=30, rate_hz=25.0, path=lambda t: circuit(0 * t))
@@ -267,7 +267,7 @@ def test_lag_and_lever_arm_are_found_beside_a_localisation(minute):
     assert np.abs(found.offset_m - 0.25 - OWN).max() < 0.08
     given = solve_localised(HALL, [ranges], [late], nothing, time_offset_s=0.3, lever_arms_m=lever[None])
     assert (given.time_offset_s, given.time_offset_sd_s) == (pytest.approx(0.3, abs=1e-6), 0.0)
-    with pytest.raises(DatasetError, match="localisation's times"):
+    with pytest.raises(DatasetError, match="time span of the localisation"):
         solve_localised(HALL, [ranges], [late.shifted(10**13)], nothing)
     still = PosePath(path.stamp_ns, path.position, np.tile([0.0, 0.0, 0.0, 1.0], (len(path), 1)))
     short, nothing = ranges.take(ranges.stamp_ns < 4 * 10**9), Regressors.none(100)

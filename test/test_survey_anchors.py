@@ -92,7 +92,7 @@ def test_what_cannot_be_surveyed_is_refused(minute):
     still, _ = drive(seconds=10, path=lambda t: circuit(0 * t))
     line = HALL.moved(HALL.position * (1, 0, 0), HALL.sd)
     for anchors, ranges, message in (
-        (HALL, minute.take(minute.anchor < 2), "2 anchors were heard"),
+        (HALL, minute.take(minute.anchor < 2), "2 anchors were received"),
         (line, minute, "on a line"),
         (HALL, still, "the tag moves by"),
     ):

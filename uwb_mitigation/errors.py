@@ -90,7 +90,7 @@ def not_imported(error: ImportError) -> MissingDependencyError | None:
     ) or module.endswith("_msgs"):
         return MissingDependencyError(
             f"ROS 2 is not set up: there is no {module}",
-            valid="source its setup.sh and that of the workspace; uwb-mitigation doctor tells more",
+            valid="source its setup.sh and that of the workspace; see uwb-mitigation doctor",
         )
     return not_installed(_DISTRIBUTIONS.get(module, module))
 

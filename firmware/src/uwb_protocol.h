@@ -68,16 +68,16 @@ typedef struct {
     uint8_t type; /* MessageType */
     uint16_t flags; /* Flag */
     uint32_t sequence; /* counts the sender's frames from 0 at its start; wraps */
-    uint64_t time_us; /* board's uptime at the event that the frame tells of; 0 from the host */
+    uint64_t time_us; /* board's uptime at the event that the frame reports; 0 from the host */
 } uwb_header_t;
 UWB_STATIC_ASSERT(sizeof(uwb_header_t) == 16);
 
 typedef struct {
-    uint64_t address; /* of the anchor */
+    uint64_t address; /* address of the anchor */
     uint32_t tried; /* exchanges that began */
     uint32_t ranged; /* exchanges that gave a range */
     float rx_power; /* dBm, of its last frame; NaN = unknown */
-    uint32_t heard_ms; /* since it was last heard; 4294967295 = never */
+    uint32_t heard_ms; /* since its last frame; 4294967295 = never */
 } uwb_radio_anchor_t;
 UWB_STATIC_ASSERT(sizeof(uwb_radio_anchor_t) == 24);
 
@@ -131,10 +131,10 @@ typedef struct {
 UWB_STATIC_ASSERT(sizeof(uwb_range_cir_t) == 72);
 
 typedef struct {
-    uint64_t tag_id; /* of the measurement */
-    uint64_t anchor_id; /* of the measurement */
-    uint64_t device_time; /* of the measurement, 40 bits */
-    uint32_t sequence; /* of the measurement */
+    uint64_t tag_id; /* as in the measurement */
+    uint64_t anchor_id; /* as in the measurement */
+    uint64_t device_time; /* as in the measurement, 40 bits */
+    uint32_t sequence; /* as in the measurement */
     uint32_t model_id; /* identity of the model that corrected; 0 = none */
     float range; /* m, corrected; NaN = no valid range */
     float range_raw; /* m, as measured */
@@ -175,13 +175,13 @@ typedef struct {
     uint32_t request_sequence; /* with ANSWER: sequence of the host's frame answered */
     uint8_t accepted; /* 0 = SET_RADIO was refused, and the text says why */
     uint8_t reserved[3];
-    uint64_t address; /* of the radio; 0 in SET_RADIO = the chip's own */
-    uint32_t antenna_delay; /* ticks, of transmitter and receiver together; 0 = as in the chip's memory */
+    uint64_t address; /* address of the radio; 0 in SET_RADIO = the chip's own */
+    uint32_t antenna_delay; /* ticks, TX + RX; 0 = OTP value */
     uint32_t tx_power; /* register TX_POWER in smart-power format; 0 = OTP value or the manual's */
     uint32_t reply_us; /* from the reception of ANSWER to FINAL; 0 in SET_RADIO = the firmware's usual */
     uint32_t patience_us; /* how long a tag waits for an anchor's frames; 0 as above */
     uint32_t interval_us; /* between the beginnings of two exchanges, at least */
-    uint16_t pan; /* network; radios of others are not heard */
+    uint16_t pan; /* network; frames of other networks are ignored */
     uint16_t rate; /* kbit/s: 110, 850, 6800 */
     uint16_t preamble; /* symbols: 64 to 4096 */
     uint16_t window; /* complex samples of a measurement; 0 = none, 1016 and more = all */
@@ -208,11 +208,11 @@ typedef struct {
     uint32_t absurd; /* lost: stamps that no exchange can have */
     uint32_t broken; /* lost: the chip was reset meanwhile, or its bus failed */
     uint32_t refused; /* frames that belonged to no exchange of this radio */
-    uint32_t restarts; /* of the chip, but for the first */
-    float temperature; /* of the chip, degrees Celsius; NaN = not measured */
-    float voltage; /* of the chip, V; NaN = not measured */
+    uint32_t restarts; /* restarts of the chip after the first */
+    float temperature; /* degrees Celsius, in the chip; NaN = not measured */
+    float voltage; /* V, supply of the chip; NaN = not measured */
     uint8_t state; /* RadioState */
-    uint8_t anchor_count; /* anchors that the tail tells of */
+    uint8_t anchor_count; /* anchors in the tail */
     uint8_t reserved[6];
     /* then anchor_count times RADIO_ANCHOR */
 } uwb_radio_status_t;
@@ -220,8 +220,8 @@ UWB_STATIC_ASSERT(sizeof(uwb_radio_status_t) == 56);
 
 typedef struct {
     uint32_t request_sequence; /* sequence of the SET_OFFSETS answered */
-    uint16_t slots; /* offsets that the board can keep beside the default */
-    uint8_t accepted; /* 0 = they were too many: those before stay in force */
+    uint16_t slots; /* offsets that the board can store in addition to the default */
+    uint8_t accepted; /* 0 = too many: the previous offsets stay in use */
     uint8_t reserved[1];
 } uwb_offsets_t;
 UWB_STATIC_ASSERT(sizeof(uwb_offsets_t) == 8);
@@ -233,13 +233,13 @@ typedef struct {
 UWB_STATIC_ASSERT(sizeof(uwb_set_mode_t) == 8);
 
 typedef struct {
-    uint64_t address; /* of the radio; 0 in SET_RADIO = the chip's own */
-    uint32_t antenna_delay; /* ticks, of transmitter and receiver together; 0 = as in the chip's memory */
+    uint64_t address; /* address of the radio; 0 in SET_RADIO = the chip's own */
+    uint32_t antenna_delay; /* ticks, TX + RX; 0 = OTP value */
     uint32_t tx_power; /* register TX_POWER in smart-power format; 0 = OTP value or the manual's */
     uint32_t reply_us; /* from the reception of ANSWER to FINAL; 0 in SET_RADIO = the firmware's usual */
     uint32_t patience_us; /* how long a tag waits for an anchor's frames; 0 as above */
     uint32_t interval_us; /* between the beginnings of two exchanges, at least */
-    uint16_t pan; /* network; radios of others are not heard */
+    uint16_t pan; /* network; frames of other networks are ignored */
     uint16_t rate; /* kbit/s: 110, 850, 6800 */
     uint16_t preamble; /* symbols: 64 to 4096 */
     uint16_t window; /* complex samples of a measurement; 0 = none, 1016 and more = all */

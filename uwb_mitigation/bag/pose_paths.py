@@ -253,7 +253,7 @@ def _composed(edges: dict[str, dict[str, list[_Row]]], root: str, leaf: str, whe
             raise RecordingError(
                 f"no transforms from {root} to {leaf}",
                 where=where,
-                valid=f"--frames of: {known or 'there are none'}",
+                valid=f"--frames of: {known or 'no frames found'}",
             )
         frame, rows = max(edges[frame].items(), key=lambda edge: len(edge[1]))
         chain.append(_path(rows, where, 1))

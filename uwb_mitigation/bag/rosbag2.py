@@ -108,7 +108,7 @@ def described_files(folder: Path) -> list[str] | None:
         names = [PurePosixPath(entry).name for entry in paths]
     except (yaml.YAMLError, RecursionError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise RecordingError(
-            "not a rosbag2 metadata file", where=str(path), valid="remove it to read every *.mcap beside it"
+            "not a rosbag2 metadata file", where=str(path), valid="remove it to read every *.mcap next to it"
         ) from error
     if storage != "mcap":
         raise _foreign_storage(folder, str(storage))

@@ -41,12 +41,12 @@ def emulate(
     ] = None,
     rate: Annotated[float, typer.Option(help="Measurements a second, Hz.")] = 50.0,
     model: Annotated[Path | None, typer.Option(help="Bundle that the board holds.")] = None,
-    mode: Annotated[str, typer.Option(help="Who corrects at the start: host or device.")] = "host",
+    mode: Annotated[str, typer.Option(help="Initial mode: host or device corrects.")] = "host",
     duration: Annotated[float | None, typer.Option(help="s, then end; without it, on Ctrl-C.")] = None,
     damage: Annotated[float, typer.Option(help="Share of bytes flipped, dropped, inserted, each.")] = 0.0,
     lose: Annotated[float, typer.Option(help="Share of messages lost.")] = 0.0,
     duplicate: Annotated[float, typer.Option(help="Share of messages that arrive twice.")] = 0.0,
-    seed: Annotated[int, typer.Option(help="Of all faults, and of simulated measurements.")] = 1,
+    seed: Annotated[int, typer.Option(help="Seed of the faults and of simulated measurements.")] = 1,
     json: JsonOption = None,
 ) -> None:
     """Emulate a board on a pseudo-terminal.
@@ -125,11 +125,13 @@ def antenna_delay(
         str,
         typer.Option(
             metavar="P[,P2]",
-            help="Of the tag, and of the anchor if it is at this computer too: /dev/ttyACM0, usb:0483:5740, "
+            help="Port of the tag, and of the anchor if it is also on this computer: /dev/ttyACM0, usb:0483:5740, "
             "/dev/spidev0.0.",
         ),
     ],
-    source: Annotated[RadioSource, typer.Option(help="As the driver's.")] = RadioSource.EVB1000,
+    source: Annotated[
+        RadioSource, typer.Option(help="Kind of radio, as in the driver.")
+    ] = RadioSource.EVB1000,
     reset: Annotated[str, typer.Option(help="The chip's reset line, as gpiochip0:25 (spi).")] = "",
     anchor: Annotated[
         str | None,

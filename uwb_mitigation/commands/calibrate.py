@@ -50,7 +50,7 @@ def calibrate(
             "-o",
             "--output",
             metavar="FILE",
-            help="Bundle to write; its offsets go beside it, X.offsets.yaml.",
+            help="Bundle to write; the offsets are written next to it as X.offsets.yaml.",
         ),
     ],
     anchors: AnchorsOption = None,
@@ -94,9 +94,11 @@ def calibrate(
     stamp_offset: OffsetOption = 0.0,
     report: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Also write a page that shows what was found: FILE.html."),
+        typer.Option(metavar="FILE", help="Also write a page with the results: FILE.html."),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Of what is held out, and of a network that is tuned.")] = 0,
+    seed: Annotated[
+        int, typer.Option(help="Seed of the held-out segments and of the tuning of a network.")
+    ] = 0,
     force: Annotated[
         bool, typer.Option("--force", help="Replace existing files, and write a calibration without gain.")
     ] = False,
@@ -182,9 +184,11 @@ def calibrate(
 
         write_whole(report, site_page(found, name))
         say(f"Wrote {report}.")
-    bundle, beside = found.write(output, source, name)
-    say(f"Wrote {output} (model {bundle.model_id:08x}) and {beside}.")
-    console.write_json(json, found.as_json() | {"model_id": bundle.model_id, "offsets_file": str(beside)})
+    bundle, offsets_path = found.write(output, source, name)
+    say(f"Wrote {output} (model {bundle.model_id:08x}) and {offsets_path}.")
+    console.write_json(
+        json, found.as_json() | {"model_id": bundle.model_id, "offsets_file": str(offsets_path)}
+    )
 
 
 def _gather(

@@ -48,7 +48,7 @@ LongestPauseOption = Annotated[
 _LONGEST_PAUSE_S = 5.0
 
 CirOption = Annotated[
-    CirChoice, typer.Option(help="Of a DecaRanging exchange, take the CIR of this frame: final or poll.")
+    CirChoice, typer.Option(help="Frame of a DecaRanging exchange whose CIR is used: final or poll.")
 ]
 
 

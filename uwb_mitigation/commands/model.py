@@ -72,11 +72,11 @@ def train(
     scaling: Annotated[str, typer.Option(help="With --data: preamble or max.")] = "preamble",
     first_kernel: Annotated[int, typer.Option(help="With --data: kernel k0 of the first convolution.")] = 3,
     epochs: Annotated[int | None, typer.Option(help="Passes over the data.")] = None,
-    learning_rate: Annotated[float | None, typer.Option(help="Of Adam.")] = None,
+    learning_rate: Annotated[float | None, typer.Option(help="Learning rate of Adam.")] = None,
     per_configuration: Annotated[
-        int, typer.Option(help="With --data: fit to at most so many of a configuration.")
+        int, typer.Option(help="With --data: maximum number of ranges of each configuration in the fit.")
     ] = 20,
-    seed: Annotated[int, typer.Option(help="Of the split, the weights and the order.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the split, the weights and the order.")] = 0,
     folds: Annotated[int, typer.Option(help="Folds of the cross-validation.")] = 6,
     json: JsonOption = None,
 ) -> None:
@@ -139,11 +139,13 @@ def quantize(
     ],
     data: Annotated[
         Path,
-        typer.Option(help="Recording with CIRs, with true ranges or without: what the bundle was made of."),
+        typer.Option(
+            help="Recording with CIRs, with or without true ranges: the training data of the bundle."
+        ),
     ],
     output: OutputOption,
     percentile: Annotated[
-        float, typer.Option(help="Of each activation, what 255 stands for; 100 = the largest seen.")
+        float, typer.Option(help="Percentile of each activation that 255 represents; 100: the maximum.")
     ] = 100.0,
     json: JsonOption = None,
 ) -> None:
@@ -189,8 +191,8 @@ def evaluate(
         str | None,
         typer.Option(
             metavar="GROUP",
-            help="Instead, fit the shipped recipe and what it must beat anew, and test them on what was held "
-            "out: configuration, tag (each location in turn) or half (of the anchors).",
+            help="Instead, fit the shipped recipe and the baselines again and test them on held-out data: "
+            "configuration, tag (each location in turn) or half (of the anchors).",
         ),
     ] = None,
     seeds: Annotated[int, typer.Option(help="With --cross-validate: splits and networks.")] = 3,

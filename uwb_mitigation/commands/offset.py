@@ -37,9 +37,7 @@ def offset(
     ] = None,
     together: Annotated[
         bool,
-        typer.Option(
-            "--together", help="Write one offset for all: where the same boards stood at several places."
-        ),
+        typer.Option("--together", help="Write one common offset: for the same boards at several positions."),
     ] = False,
     json: JsonOption = None,
 ) -> None:
@@ -78,7 +76,7 @@ def offset(
     _show(found)
     if output is not None:
         comment = (
-            f"Antenna delays, m, beside model {found.model_id:08x}, found by uwb-mitigation offset in {bag.name}.\n"
+            f"Antenna delays, m, for model {found.model_id:08x}, estimated by uwb-mitigation offset in {bag.name}.\n"
             f"Standard deviation {found.sd_m:.3f} m."
         )
         write_whole(output, dump_offsets(found.offsets(together=together), comment), ParameterError)
@@ -116,6 +114,6 @@ def _show(found: FoundOffset) -> None:
     if len(refused) > MOST_SHOWN:
         console.err.print(f"left out: {len(refused) - MOST_SHOWN} placements more")
     say(
-        f"offset {found.offset_m:.3f} m, standard deviation {found.sd_m:.3f} m, of {found.ranges} ranges, "
-        f"beside model {found.model_id:08x}"
+        f"offset {found.offset_m:.3f} m, standard deviation {found.sd_m:.3f} m, from {found.ranges} ranges, "
+        f"for model {found.model_id:08x}"
     )

@@ -19,7 +19,7 @@ MOST_BLOCKS = 10_000
 
 def train_universal(
     output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="int8 bundle to write.")],
-    seed: Annotated[int, typer.Option(help="Of the worlds and of the network.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the simulated buildings and of the network.")] = 0,
     samples: Annotated[int, typer.Option(help="Window length K.")] = 157,
     scaling: Annotated[
         str, typer.Option(help="preamble, or max for windows without preamble counts.")

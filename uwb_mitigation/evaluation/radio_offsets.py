@@ -215,7 +215,7 @@ def _combined(placements: tuple[PlacementOffset, ...], model_id: int) -> FoundOf
         more = f", and so on for {len(placements)} placements" if len(placements) > 1 else ""
         raise DatasetError(
             f"anchor {format_id(first.anchor_id)}, tag {format_id(first.tag_id)}: {first.refused}{more}",
-            valid="range with nothing between or beside the antennas",
+            valid="range with no obstacle between or next to the antennas",
         )
     if (ranges := sum(one.ranges for one in good)) < MIN_RANGES:
         raise DatasetError(

@@ -24,7 +24,7 @@ class Loss(enum.Enum):
     """Why a connection ended."""
 
     SILENT = "nothing intact was received for 3 s"
-    RESET = "the board started anew"
+    RESET = "the board restarted"
     OUT_OF_STEP = "the board's frames are numbered out of order"
     CLOSED = "the port was closed"
 

@@ -26,7 +26,7 @@ from uwb_mitigation.link.events import (
     SessionCounts,
     VersionMismatch,
 )
-from uwb_mitigation.link.framing import DecoderCounts, Frame, FrameDecoder, FrameEncoder
+from uwb_mitigation.link.framing import Frame, FrameDecoder, FrameEncoder
 from uwb_mitigation.link.layout import Flag, MessageType, Mode
 from uwb_mitigation.link.messages import (
     BoardStatus,
@@ -123,7 +123,7 @@ class BoardSession:
         hello: last HELLO of the board; None while not connected.
         radio: last RADIO of the board; None while not connected or if the board has sent none.
         foreign_version: with WRONG_VERSION, the protocol version of the board.
-        counts: of frames; `decoder_counts` contains those of damaged bytes.
+        counts: numbers of frames; `totals` also contains those of damaged bytes.
         clock: estimate of the board's clock relative to the node's.
     """
 
@@ -141,10 +141,10 @@ class BoardSession:
         self._mode = mode
         self._mode_request = _Request()
         self._radio_request = _Request(
-            "its firmware knows no settings of a radio: flash a newer one, or set none"
+            "its firmware has no radio settings: flash a newer version, or set none"
         )
         self._offsets_request = _Request(
-            "its firmware knows no offsets: flash a newer one, or correct on the host"
+            "its firmware has no offsets: flash a newer version, or correct on the host"
         )
         self._offsets_held = False
         self._boot: tuple[int, int] | None = None
@@ -156,11 +156,6 @@ class BoardSession:
         self._stale_run = 0
         self._foreign_frames = 0
         self._heard_ns = 0
-
-    @property
-    def decoder_counts(self) -> DecoderCounts:
-        """Decoder counts of the received bytes."""
-        return self._decoder.counts
 
     def totals(self) -> dict[str, int]:
         """Return the counts of frames for diagnostics, {name: count}."""

@@ -79,7 +79,7 @@ class Card:
         data, boards = (self.training.get(key) for key in ("data", "boards"))
         learnt = self.training.get("configurations")
         extent = f" ({len(learnt)} configurations)" if isinstance(learnt, list) else ""
-        return f"trained on {data or 'what it does not tell'}{extent}, boards {boards or 'as there'}"
+        return f"trained on {data or 'unknown data'}{extent}, boards {boards or 'unknown'}"
 
     def __post_init__(self) -> None:
         if self.architecture.samples != self.preprocessing.samples:

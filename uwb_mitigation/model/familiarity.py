@@ -86,9 +86,10 @@ class Band:
 
 
 LEAD, LEAD_WITHOUT_LEVELS = Band(-1000.0, -16.0, 4.0), Band(-1000.0, -20.0, 4.0)
-"""Minimum bands of `lead_level_db`. They do not follow the training data downwards, because a detector reports the first energy above its noise threshold: in
-the simulated buildings 99 % of the values are below -24 dB. Of windows that start 5 taps too late, 75 % are above
--10 dB. Without levels no other feature detects them, so the band ends earlier."""
+"""Minimum bands of `lead_level_db`. They do not follow the training data downwards, because a detector reports the
+first energy above its noise threshold: in the simulated buildings 99 % of the values are below -24 dB. 75 % of the
+windows that start 5 taps too late are above -10 dB. Without levels no other feature detects them, so the band ends
+earlier."""
 
 
 @dataclass(frozen=True, slots=True)

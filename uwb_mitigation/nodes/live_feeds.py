@@ -426,8 +426,8 @@ def anchor_facts(status: RadioStatus) -> dict[str, object]:
     """Return the values of the anchors in reach for the diagnostics."""
     values: dict[str, object] = {}
     for anchor in status.anchors:
-        heard = "never" if anchor.heard_ms == NEVER_MS else f"{anchor.heard_ms / 1000:.1f} s ago"
+        last_seen = "never" if anchor.heard_ms == NEVER_MS else f"{anchor.heard_ms / 1000:.1f} s ago"
         values[f"anchor {format_id(anchor.address)}"] = (
-            f"{anchor.ranged} of {anchor.tried} ranged, {anchor.rx_power_dbm:.1f} dBm, heard {heard}"
+            f"{anchor.ranged} of {anchor.tried} ranged, {anchor.rx_power_dbm:.1f} dBm, last seen {last_seen}"
         )
     return values

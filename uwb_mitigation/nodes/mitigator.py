@@ -115,6 +115,7 @@ class Mitigator(ManagedNode):
             mitigation, publisher = self._mitigation, self._corrected
             if mitigation is None or publisher is None:
                 return
+            offsets = mitigation.offsets  # `_swap` may replace them after the lock is released.
             results = mitigation.correct(measurements)
             for measurement, corrected in zip(measurements, results, strict=True):
                 publisher.publish(encode_corrected(measurement, corrected))
@@ -123,15 +124,14 @@ class Mitigator(ManagedNode):
                     self._sensor_ranges.publish(m.anchor_id, m.stamp_ns, m.frame_id, corrected)
         now_ns = self.now_ns()
         self.health.add_time(time.perf_counter_ns() - began_ns)
-        offsets = mitigation.offsets
         needs_count = mitigation.bundle.preprocessing.scaling is Scaling.PREAMBLE
-        offset_m = offsets.of([m.tag_id for m in measurements], [m.anchor_id for m in measurements]).tolist()
-        for measurement, corrected, offset in zip(measurements, results, offset_m, strict=True):
+        for measurement, corrected in zip(measurements, results, strict=True):
             self.health.statuses[corrected.status] += 1
             if needs_count and corrected.status is Status.BAD_CIR and measurement.cir.preamble_count <= 0:
                 self.health.uncounted += 1
             if corrected.status is Status.OK and measurement.cir.power_gap_db < LINE_OF_SIGHT_DB:
-                self.health.los_m.append(corrected.correction_m - offset)
+                (offset_m,) = offsets.of([measurement.tag_id], [measurement.anchor_id])
+                self.health.los_m.append(corrected.correction_m - float(offset_m))
             self._meter.add(now_ns - measurement.stamp_ns)
 
     def subscription_count(self) -> int:

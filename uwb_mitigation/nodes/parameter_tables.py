@@ -81,7 +81,7 @@ class Parameter:
 
 _SENSOR_RANGES = Parameter(
     "sensor_ranges", False, "Publish corrected ranges as sensor_msgs/Range as well, on uwb/range_corrected/anchor_ID; "
-    "a range that is none as +Inf. The driver does so with what the board has corrected.",
+    "an invalid range is +Inf. The driver publishes ranges that the board has corrected.",
 )  # fmt: skip
 
 
@@ -128,7 +128,7 @@ DRIVER = (
               low=0.1, high=10_000.0, unit="Hz"),
     Parameter("rate", 1.0, "Speed of a replay relative to the recording.",
               low=0.001, high=10_000.0, live=True),
-    Parameter("paused", False, "A replay stands still while this is set.", live=True),
+    Parameter("paused", False, "Pause the replay.", live=True),
     Parameter("seek_to", 0.0, "Where a replay starts, from the beginning of the recording; set while it runs, "
               "it goes on from there.", low=0.0, high=1e9, live=True, unit="s"),
     Parameter("loop", False, "Start a replay over when it ends; otherwise the node exits then."),
@@ -136,25 +136,25 @@ DRIVER = (
               low=0.0, high=1e6, unit="s"),
     Parameter("publish_clock", False, "Publish the recording's time on /clock, and stamp with it. "
               "Run the other nodes with use_sim_time."),
-    Parameter("wait_for_subscribers", 1, "A replay waits until so many subscribe to its ranges.",
+    Parameter("wait_for_subscribers", 1, "Number of subscribers that a replay waits for.",
               low=0, high=1000),
-    Parameter("longest_wait", 10.0, "A replay starts all the same after this long without them.",
+    Parameter("longest_wait", 10.0, "Timeout of this wait; then the replay starts.",
               low=0.0, high=3600.0, unit="s"),
-    Parameter("start_delay", -1.0, "Pause before the first range of a replay once they are there: time for the "
-              "rest of the graph to connect. -1 = none where wait_for_subscribers counts two or more, and all have "
-              "come; 3 s elsewhere, since one subscriber tells nothing of others.",
+    Parameter("start_delay", -1.0, "Pause before the first range of a replay, after the subscribers have connected, so that the "
+              "other nodes can connect. -1: no pause if wait_for_subscribers is two or more and all have connected, "
+              "otherwise 3 s.",
               low=-1.0, high=3600.0, unit="s"),
     Parameter("port", "", "Serial port of the board: a path such as /dev/ttyACM0, or "
               "usb:VENDOR:PRODUCT[:SERIAL] with ids in hexadecimal, wherever it is plugged in (serial, evb1000); or "
-              "/dev/spidev0.0 (spi). Of radios several, with commas between: the first has radio.role, the others "
+              "/dev/spidev0.0 (spi). Several radios are separated by commas: the first has radio.role, the others "
               "are anchors."),
-    Parameter("baud", 921_600, "Of a serial line; native USB ignores it (serial).",
+    Parameter("baud", 921_600, "Baud rate of a serial line; native USB ignores it (serial).",
               low=1200, high=12_000_000, unit="bit/s"),
     Parameter("dtr", True, "Level of DTR: boards with native USB send only while it is set; through a bridge, "
               "its change resets the board (serial)."),
     Parameter("mode", "host", "Where the model runs: on the host or on the device (serial).",
               choices=("host", "device"), live=True),
-    Parameter("offsets", "", "As the mitigator's, for a board in mode device (serial).",
+    Parameter("offsets", "", "As in the mitigator, for a board in mode device (serial).",
               live=True, or_number=True),
     Parameter("board_model", "", "Model id that the board must hold, eight hexadecimal digits; its corrections "
               "by another model are withheld. Empty = any (serial)."),
@@ -168,12 +168,12 @@ DRIVER = (
 MITIGATOR = (
     Parameter("model", "", "Model bundle to correct with: a file, or the name of a shipped one (universal, universal_amplitude, "
               "evk1000_apartment); empty = universal. A bundle that cannot be "
-              "used is refused, and the one before stays.", live=True),
-    Parameter("offsets", "", "What the radios' antenna delays add to ranges, taken off before the model: a number of "
-              "metres, or a file by anchor, tag or pair (docs/guides/calibration.md); empty = 0. What is no offset is refused, and "
-              "those before stay.", live=True, or_number=True),
-    Parameter("backend", "onnxruntime", "What computes: ONNX Runtime, or the firmware's C compiled for this "
-              "computer at activation, to the same bits.", choices=("onnxruntime", "firmware")),
+              "used is refused, and the previous one stays in use.", live=True),
+    Parameter("offsets", "", "Offset of ranges due to antenna delays, subtracted before the model: a number in "
+              "metres, or a file by anchor, tag or pair (docs/guides/calibration.md); empty = 0. Invalid offsets are refused, and "
+              "the previous ones stay in use.", live=True, or_number=True),
+    Parameter("backend", "onnxruntime", "Inference engine: ONNX Runtime, or the firmware's C, compiled for this "
+              "computer at activation (bit-identical).", choices=("onnxruntime", "firmware")),
     _SENSOR_RANGES,
     Parameter("autostart", True, "Configure and activate without a lifecycle manager."),
 )  # fmt: skip
@@ -181,11 +181,11 @@ MITIGATOR = (
 LOCATOR = (
     Parameter("anchors", "", "File with the positions of the anchors (format: docs/background/positioning.md). Required."),
     Parameter("tag", 0, "Number of the tag whose topics have the plain names; others have uwb/tag_N/pose and so "
-              "on. 0 = the one that is heard first.", low=0, high=2**63 - 1),
+              "on. 0 = the first one that is received.", low=0, high=2**63 - 1),
     Parameter("level", False, "The tag's antenna stays at one height, that of `height`."),
-    Parameter("height", 0.0, "Of the tag's antenna, in the anchors' frame, where it stays the same.",
+    Parameter("height", 0.0, "Height of the tag's antenna in the anchors' frame, if it is constant.",
               low=-1e4, high=1e4, unit="m"),
-    Parameter("height_sd", 0.1, "How well that height is known.", low=0.001, high=100.0, unit="m"),
+    Parameter("height_sd", 0.1, "Standard deviation of that height.", low=0.001, high=100.0, unit="m"),
     Parameter("area", "", "Where tags can be, X,Y,Z,X,Y,Z: two corners of a box, m. Empty = wherever ranges reach."),
     Parameter("acceleration", 1.0, "How fast tags change their speed: 1 for robots, people and drones.",
               low=0.001, high=1000.0, unit="m/s^1.5"),

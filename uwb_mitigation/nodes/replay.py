@@ -182,7 +182,7 @@ class ReplayFeed:
             error = UwbMitigationError(f"the source failed: {bug!r}", where=self._source.name)
         if not self._stopping.is_set():
             skipped = ", ".join(f"{count} x {kind}" for kind, count in sorted(self._source.skipped.items()))
-            self._logger.info(f"played {self.played} ranges" + (f"; oddities: {skipped}" if skipped else ""))
+            self._logger.info(f"played {self.played} ranges" + (f"; warnings: {skipped}" if skipped else ""))
             self._on_end(error)
 
     def _wait_for_subscribers(self) -> None:

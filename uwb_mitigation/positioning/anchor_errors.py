@@ -78,7 +78,7 @@ def check_anchors(
     needed = 4 if height is not None else 5
     if len(used) < needed:
         raise DatasetError(
-            f"{len(used)} anchors were heard",
+            f"{len(used)} anchors were received",
             valid=f"{needed} or more" + (", or four and --height" if height is None else ""),
         )
     position = anchors.position[used]

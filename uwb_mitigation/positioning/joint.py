@@ -32,9 +32,6 @@ BIN_S = 1.0
 LEAST_S = 4.0
 """Shorter stationary parts belong to the motion around them."""
 
-RECEIVED_AT_ONCE = 3
-"""If fewer anchors are received between pauses (median), the rate is too low for pauses to be significant."""
-
 GAP_S = 10.0
 """After a longer pause a tag may be anywhere."""
 

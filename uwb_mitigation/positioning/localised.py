@@ -301,7 +301,7 @@ class _Problem:
                     best = min(best, (float(np.nanmedian(left)), lag, arm), key=lambda one: one[0])
         if not math.isfinite(best[0]):
             raise DatasetError(
-                "hardly any range lies within the localisation's times",
+                "too few ranges are within the time span of the localisation",
                 valid=f"clocks that agree to {MAX_LAG_S:g} s, or --time-offset",
             )
         return best[1], best[2]

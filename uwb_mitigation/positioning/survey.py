@@ -113,9 +113,9 @@ def survey(
     """
     guesses, model, used, needed = setting.anchors, setting.model, np.unique(ranges.anchor), setting.dims + 1
     if len(used) < needed:
-        raise DatasetError(f"{len(used)} anchors were heard", valid=f"{needed} or more for a survey")
+        raise DatasetError(f"{len(used)} anchors were received", valid=f"{needed} or more for a survey")
     if shape(guesses.position[used]) is Shape.LINE:
-        raise DatasetError("the anchors are all on a line", valid="one or more beside it")
+        raise DatasetError("the anchors are all on a line", valid="at least one next to the line")
     deviations = np.array(
         [sd if row in fixed else max(off_m, sd) for row, sd in enumerate(guesses.sd.tolist())]
     )

@@ -121,7 +121,10 @@ def run_here(jobs: Sequence[Job], workers: int) -> Iterator[Outcome]:
         with _processes(1) as executor:
             for _, outcome in _run(executor, _in_worker, [job]):
                 yield outcome or Outcome(
-                    job, error=RecordingError("the process died, perhaps of no memory", where=str(job.source))
+                    job,
+                    error=RecordingError(
+                        "the process crashed, perhaps because memory ran out", where=str(job.source)
+                    ),
                 )
         partial_file(job.output).unlink(missing_ok=True)
 

@@ -98,7 +98,7 @@ def check(source: Bundle, percentile: float) -> None:
         raise ModelError("already quantised", where=str(source.path), valid="the float bundle it was made of")
     if not source.card.needs_cir:
         raise ModelError(
-            "there is no network to quantise", where=str(source.path), valid="the bundle as it is"
+            "there is no network to quantise", where=str(source.path), valid="the bundle without quantisation"
         )
     if not 90 <= percentile <= 100:
         raise ParameterError(f"percentile = {percentile}", valid="90 to 100")

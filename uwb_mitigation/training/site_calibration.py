@@ -250,13 +250,13 @@ class Calibrated:
         bundle, content = made_bundle(
             output, graph.float_model(network), replace(card, needs_cir=has_network)
         )
-        beside = offsets_file(output)
+        offsets_path = offsets_file(output)
         comment = (
-            f"Offsets of the radios, m, beside model {bundle.model_id:08x} ({output.name}): use both together.\n"
-            f"Found by uwb-mitigation calibrate in {name}, {how}."
+            f"Offsets of the radios, m, for model {bundle.model_id:08x} ({output.name}): use both together.\n"
+            f"Estimated by uwb-mitigation calibrate in {name}, {how}."
         )
-        write_together({output: content, beside: dump_offsets(self.offsets, comment)}, ModelError)
-        return bundle, beside
+        write_together({output: content, offsets_path: dump_offsets(self.offsets, comment)}, ModelError)
+        return bundle, offsets_path
 
 
 def _json_pair(pair: tuple[float, float]) -> list[float | None]:
@@ -306,7 +306,7 @@ def without_truth(
     notes = list(found.notes)
     if (unknown := int((~is_known).sum()) - outliers) > 0:
         notes.append(
-            f"{unknown} of {len(is_known)} ranges left out of the fit: the other anchors tell too little of where the tag was"
+            f"{unknown} of {len(is_known)} ranges left out of the fit: the other anchors do not determine the tag position"
         )
     used = np.flatnonzero(is_known & _has_input(site)[of_range])
     pairs = {(found.tag_ids[tag], ids[row]): found.applied(tag, row) for tag, row in found.pairs()}
@@ -446,7 +446,7 @@ def _calibrated(
     """Select the model; raises `DatasetError` for too few ranges and implausible offsets."""
     if len(solution.rows) < MIN_LABELLED:
         raise DatasetError(
-            f"{len(solution.rows)} ranges whose true length can be told: too few",
+            f"{len(solution.rows)} ranges whose true value can be estimated: too few",
             valid=f"{MIN_LABELLED} or more",
         )
     _check_offsets(solution.pairs)
