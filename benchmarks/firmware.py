@@ -1,5 +1,7 @@
-"""Measure exported models in the emulator: instructions, estimated cycles, memory, and equality with
-ONNX Runtime."""
+"""Measure exported models in the emulator.
+
+Measures instructions, estimated cycles, memory, and equality with ONNX Runtime.
+"""
 
 from __future__ import annotations
 

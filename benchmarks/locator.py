@@ -35,8 +35,10 @@ _SECOND_NS = 1_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class NodeFigures:
-    """Number of sent ranges, received poses and lost ranges; percentiles of the latency from publishing a range to
-    receiving its pose, ms."""
+    """Numbers of sent ranges, received poses and lost ranges, and latency percentiles in ms.
+
+    The latency is the time from publishing a range to receiving its pose.
+    """
 
     sent: int
     received: int

@@ -118,8 +118,11 @@ def at_truths(track: Track, truth: TruePath) -> TrackErrors:
 
 @dataclass(frozen=True, slots=True)
 class StaticErrors:
-    """Stationary tags with ranges to three or more anchors: number, mean horizontal error with raw and with corrected
-    ranges, m, and mean NEES per degree of freedom with corrected ranges."""
+    """Errors of stationary tags with ranges to three or more anchors.
+
+    Contains the number of tags, the mean horizontal error with raw and with corrected ranges in m, and the mean NEES
+    per degree of freedom with corrected ranges.
+    """
 
     tags: int
     raw_m: float
@@ -176,8 +179,11 @@ def apartment(folder: Path) -> StaticErrors:
 
 @dataclass(frozen=True, slots=True)
 class FlatErrors:
-    """Errors of a drive through the simulated flat: raw ranges, ranges corrected by a line in received power, and by
-    the universal model, which was not trained in this flat and does not remove the offset of the radios."""
+    """Errors of a drive through the simulated flat.
+
+    Compares raw ranges, ranges corrected by a line in received power, and by the universal model, which was not
+    trained in this flat and does not remove the offset of the radios.
+    """
 
     anchors: int
     raw: Errors

@@ -1,5 +1,7 @@
-"""Configuration of Sphinx for `make docs`. The pages are the Markdown files of the repository; the reference pages are
-generated when this file is read."""
+"""Configuration of Sphinx for `make docs`.
+
+The pages are the Markdown files of the repository. The reference pages are generated when this file is read.
+"""
 
 from __future__ import annotations
 
@@ -79,11 +81,8 @@ linkcheck_timeout = 20
 def as_rst(app: object, what: str, name: str, thing: object, options: object, lines: list[str]) -> None:
     """Convert Markdown in docstrings to reStructuredText.
 
-    If a docstring starts with the section Attributes, its content is not indented: indent it. An indented block below
-    a paragraph is a code example: insert `::`.
+    An indented block below a paragraph is a code example: insert `::`.
     """
-    if lines and lines[0] == "Attributes:" and not lines[1].startswith(" "):
-        lines[1:] = [f"    {line}" for line in lines[1:]]
     for at in range(len(lines) - 2, 0, -1):
         above, gap, below = lines[at - 1 : at + 2]
         if above and not above.startswith(" ") and not gap and below.startswith("    "):
@@ -91,4 +90,5 @@ def as_rst(app: object, what: str, name: str, thing: object, options: object, li
 
 
 def setup(app: Sphinx) -> None:
+    """Register the conversion of docstrings."""
     app.connect("autodoc-process-docstring", as_rst, priority=400)  # before napoleon

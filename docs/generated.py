@@ -1,5 +1,4 @@
-"""Generate the reference pages (`docs/reference`, not committed), the parameter files (`params/`) and the C header of the
-wire protocol.
+"""Generate the reference pages (not committed), the parameter files and the C header of the wire protocol.
 
     python docs/generated.py
 

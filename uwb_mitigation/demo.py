@@ -184,4 +184,5 @@ def demo(
 
 
 def main() -> None:
+    """Run the demo with the options of the command line."""
     typer.run(demo)

@@ -16,26 +16,32 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 def driver() -> None:
+    """Run the node `driver`."""
     _node("driver")
 
 
 def mitigator() -> None:
+    """Run the node `mitigator`."""
     _node("mitigator")
 
 
 def locator() -> None:
+    """Run the node `locator`."""
     _node("locator")
 
 
 def pipeline() -> None:
+    """Run `driver` and `mitigator` in one process."""
     _node("pipeline")
 
 
 def monitor() -> None:
+    """Run the node `monitor`."""
     _node("monitor")
 
 
 def viewer() -> None:
+    """Run the node `viewer`."""
     _node("viewer")
 
 

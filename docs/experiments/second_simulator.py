@@ -181,8 +181,10 @@ def _pulse(taps: Array) -> Array:
 def _receive(
     behind_m: Array, gain: NDArray[np.complex128], phase: Array, rng: np.random.Generator
 ) -> tuple[NDArray[np.int16], Array, Array, tuple[Array, Array]]:
-    """Return accumulators (n, 2 TAPS), preamble counts, first-path indices (direct path `phase` taps after `ORIGIN`)
-    and levels, dBm."""
+    """Return accumulators (n, 2 TAPS), preamble counts, first-path indices and levels in dBm.
+
+    The direct path arrives `phase` taps after `ORIGIN`.
+    """
     n = len(gain)
     grid = np.arange(TAPS)
     sent_db = -14.3 + rng.uniform(-5.0, 5.0, n) + POWER_CONSTANT_DB

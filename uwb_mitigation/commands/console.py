@@ -24,6 +24,7 @@ class Table(RichTable):
     """A table that wraps long words; rich would truncate them in a narrow terminal."""
 
     def add_column(self, *arguments: Any, **options: Any) -> None:
+        """Add a column that wraps long values."""
         super().add_column(*arguments, **{"overflow": "fold", **options})
 
 

@@ -64,6 +64,7 @@ def doctor(json: JsonOption = None) -> None:
 
 
 def examine() -> Iterator[Finding]:
+    """Yield a finding for each library, tool, model, ROS package and port."""
     for purpose, names in LIBRARIES.items():
         yield from (_check(name, partial(_version, name), name, purpose) for name in names)
     yield _check("shipped model", _compare_model)

@@ -13,10 +13,12 @@ from uwb_mitigation.errors import DatasetError
 
 @dataclass(frozen=True, slots=True)
 class ErrorStatistics:
-    """Attributes:
-    mae: mean absolute error.
-    std: standard deviation of the signed error.
-    p95: 95th percentile of the absolute error.
+    """Statistics of range errors in metres.
+
+    Attributes:
+        mae: mean absolute error.
+        std: standard deviation of the signed error.
+        p95: 95th percentile of the absolute error.
     """
 
     mae: float

@@ -43,6 +43,8 @@ class Channels:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PackedModule:
+    """Weights and requantisation of one residual reduction module."""
+
     residual_weights: NDArray[np.int8]
     residual: Channels
     residual_sum: Sum
@@ -54,6 +56,8 @@ class PackedModule:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PackedLayer:
+    """Weights and requantisation of one fully connected layer."""
+
     weights: NDArray[np.int8]
     channels: Channels
     inputs: int

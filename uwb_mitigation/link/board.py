@@ -44,7 +44,8 @@ class Corrector(Protocol):
 
     offsets: Offsets
 
-    def correct(self, measurements: Sequence[RangeMeasurement]) -> list[CorrectedRange]: ...
+    def correct(self, measurements: Sequence[RangeMeasurement]) -> list[CorrectedRange]:
+        """Return a corrected range for each measurement."""
 
 
 class Board:

@@ -196,8 +196,9 @@ class PortAddress:
 
 
 def users_of(path: str) -> list[str]:
-    """Return the other programs that have a device file open, such as `minicom (process 123)`; only those of this user
-    unless it is root.
+    """Return the other programs that have a device file open, such as `minicom (process 123)`.
+
+    Without root, only the programs of this user are visible.
     """
     device, found = os.path.realpath(path), []
     for process in os.listdir("/proc"):

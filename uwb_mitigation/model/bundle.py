@@ -132,22 +132,27 @@ class Bundle:
 
     @property
     def name(self) -> str:
+        """Name of the model."""
         return self.card.name
 
     @property
     def architecture(self) -> Architecture:
+        """Architecture of the network."""
         return self.card.architecture
 
     @property
     def preprocessing(self) -> Preprocessing:
+        """Preprocessing of the CIR."""
         return self.card.preprocessing
 
     @property
     def prior(self) -> LinePrior:
+        """Linear bias model."""
         return self.card.prior
 
     @property
     def quantised(self) -> bool:
+        """Whether the network is int8."""
         return self.card.quantised
 
 

@@ -18,8 +18,9 @@ CHUNK = 256
 
 
 def activations(weights: FloatWeights, inputs: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
-    """Return all activations of the float network for inputs (n, K), {tensor: (n, channels, length)}; for an MLP,
-    (n, outputs).
+    """Return all activations of the float network for inputs of shape (n, K).
+
+    The result is {tensor: (n, channels, length)}; for an MLP, {tensor: (n, outputs)}.
     """
     architecture = weights.architecture
     if isinstance(architecture, Mlp):

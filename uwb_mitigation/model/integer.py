@@ -39,8 +39,9 @@ class IntegerNetwork:
         return np.concatenate(outputs)
 
     def tensors(self, inputs: NDArray[np.float32]) -> dict[str, NDArray[np.uint8]]:
-        """Return all activations for inputs of shape (n, K), {tensor: uint8 (n, channels, length)}; for an MLP,
-        (n, outputs).
+        """Return all activations for inputs of shape (n, K).
+
+        The result is {tensor: uint8 (n, channels, length)}; for an MLP, {tensor: uint8 (n, outputs)}.
         """
         architecture = self.weights.architecture
         with np.errstate(over="ignore"):  # An infinite quotient saturates like any large one.

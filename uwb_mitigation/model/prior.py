@@ -32,6 +32,7 @@ class LinePrior:
 
     @property
     def needs_power(self) -> bool:
+        """Whether the model uses power levels."""
         return self.per_rx_power != 0.0 or self.per_power_gap != 0.0
 
     def predict_m(

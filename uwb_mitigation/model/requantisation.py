@@ -51,6 +51,7 @@ class Requantisation:
     offset: int
 
     def apply(self, accumulator: NDArray[np.int64]) -> NDArray[np.uint8]:
+        """Return the requantised values of int32 accumulators."""
         product = ((accumulator << WEIGHT_SCALE_BITS) + self.offset) * self.multiplier
         return saturate(product >> (32 + REQUANTISATION_SHIFT))
 

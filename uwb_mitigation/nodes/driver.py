@@ -274,4 +274,5 @@ class Driver(ManagedNode):
 
 
 def make_nodes(ended: threading.Event) -> list[Node]:
+    """Return the nodes of the process `driver`."""
     return [Driver(ended)]

@@ -284,4 +284,5 @@ class Locator(ManagedNode):
 
 
 def make_nodes(stop: threading.Event) -> list[Node]:
+    """Return the nodes of the process `locator`."""
     return [Locator()]

@@ -241,4 +241,5 @@ class Mitigator(ManagedNode):
 
 
 def make_nodes(stop: threading.Event) -> list[Node]:
+    """Return the nodes of the process `mitigator`."""
     return [Mitigator()]

@@ -193,4 +193,5 @@ class Viewer(ManagedNode):
 
 
 def make_nodes(stop: threading.Event) -> list[Node]:
+    """Return the nodes of the process `viewer`."""
     return [Viewer()]

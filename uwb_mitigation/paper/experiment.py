@@ -72,10 +72,12 @@ class Task:
 
     @property
     def name(self) -> str:
+        """File name of the training."""
         return f"{self.network}_{self.samples}_seed{self.seed}"
 
     @property
     def architecture(self) -> Architecture:
+        """Architecture of the network."""
         if self.network == "mlp":
             return Mlp(self.samples)
         return Remnet(self.samples, first_kernel=5 if self.network == "remnet_k5" else 3)

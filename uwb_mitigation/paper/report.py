@@ -91,6 +91,7 @@ class Study:
 
     @property
     def has_rooms(self) -> bool:
+        """Whether the configurations contain rooms."""
         return has_rooms(self.dataset.configurations)
 
     @property
@@ -110,6 +111,7 @@ class Study:
         return _map(self.dataset.configurations, _material) if self.has_rooms else self.labels
 
     def provenance(self, seeds: str = "none") -> Provenance:
+        """Return the provenance of a table of all measurements."""
         return Provenance(self.name, "none: all measurements", seeds, self.command)
 
 

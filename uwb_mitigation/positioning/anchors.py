@@ -39,11 +39,13 @@ SCHEMA = "anchors: a list of {id, x, y, z, and optionally sd, name}, in metres"
 
 @dataclass(frozen=True, slots=True)
 class Anchor:
-    """Attributes:
-    id: 64-bit identity.
-    position: x, y, z in m.
-    sd: standard deviation of each coordinate, m.
-    name: display name; may be empty.
+    """An anchor at a known position.
+
+    Attributes:
+        id: 64-bit identity.
+        position: x, y, z in m.
+        sd: standard deviation of each coordinate, m.
+        name: display name; may be empty.
     """
 
     id: int

@@ -25,7 +25,9 @@ _SHORTEST_M = 0.05
 
 
 class RangeFilter:
-    """Args:
+    """Extended Kalman filter of the position and velocity of a tag.
+
+    Args:
         anchors: `update` takes rows of these.
         model: motion and errors.
         time_s: of the first state.

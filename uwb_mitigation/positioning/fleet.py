@@ -101,10 +101,12 @@ class FixedLag:
 
 @dataclass(slots=True)
 class Tag:
-    """Attributes:
-    tag_id: its number.
-    locator, smoother: of this tag.
-    latest_ns: stamp of its latest range.
+    """Estimators of one tag.
+
+    Attributes:
+        tag_id: its number.
+        locator, smoother: of this tag.
+        latest_ns: stamp of its latest range.
     """
 
     tag_id: int

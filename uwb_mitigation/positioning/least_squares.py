@@ -120,8 +120,10 @@ class LeastSquares:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """Attributes:
-    x: float64 (K, b). shared: (q,). shared_covariance: (q, q).
+    """Solution of a bordered block-tridiagonal system.
+
+    Attributes:
+        x: float64 (K, b). shared: (q,). shared_covariance: (q, q).
     """
 
     x: NDArray[np.float64]

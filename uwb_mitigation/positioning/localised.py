@@ -59,8 +59,11 @@ _MODEL = Model(long=1.5, short=1.5)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosePath:
-    """Poses of a robot's frame: int64 (n,) stamps in order, float64 (n, 3) positions in m, and (n, 4) unit quaternions
-    x, y, z, w that rotate the robot's axes to the map's."""
+    """Poses of a robot's frame.
+
+    Contains int64 (n,) stamps in order, float64 (n, 3) positions in m, and (n, 4) unit quaternions x, y, z, w that
+    rotate the robot's axes to the map's.
+    """
 
     stamp_ns: NDArray[np.int64]
     position: NDArray[np.float64]

@@ -188,6 +188,7 @@ class HeldOut:
     corrected_m: float
 
     def as_json(self) -> dict[str, float | int | None]:
+        """Return the values for JSON; values that are not finite become null."""
         values = {"raw_m": self.raw_m, "corrected_m": self.corrected_m}
         return {"anchor_id": self.anchor_id, "ranges": self.ranges} | {
             name: value if np.isfinite(value) else None for name, value in values.items()

@@ -43,10 +43,12 @@ class TagRecording:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedRanges:
-    """Attributes:
-    tags: by their numbers.
-    strangers: number of ranges from anchors that are not in the map, {anchor id: count}.
-    skipped: other skipped ranges, {reason: count}.
+    """Ranges of a recording, by tag.
+
+    Attributes:
+        tags: by their numbers.
+        strangers: number of ranges from anchors that are not in the map, {anchor id: count}.
+        skipped: other skipped ranges, {reason: count}.
     """
 
     tags: list[TagRecording]

@@ -1,7 +1,6 @@
-"""Simulated measurements: a robot that drives through a flat, and static placements in that flat and in
-random buildings, with different boards for each placement.
+"""Simulated measurements of a drive through a flat, and of static placements.
 
-The same arguments give the same measurements, independent of how many are consumed: each segment of the scene
+Static placements are in the same flat or in random buildings, with different boards for each placement. The same arguments give the same measurements, independent of how many are consumed: each segment of the scene
 has its own random generator. Stamps begin at 0 and follow the rate, not a clock.
 """
 
@@ -358,4 +357,5 @@ def _check_positions(name: str, points: tuple[Point, ...], low: int, high: int) 
 
 
 def check_seed(seed: int) -> None:
+    """Raise ParameterError if the seed is out of range."""
     check_range("simulated source", "seed", seed, 0, 2**32 - 1, whole=True)

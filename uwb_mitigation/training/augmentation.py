@@ -76,8 +76,10 @@ def normalised(inputs: Tensor) -> Tensor:
 
 
 def calibration_inputs(inputs: NDArray[np.float32], scaling: Scaling) -> NDArray[np.float32]:
-    """Convert inputs that are scaled by the preamble count to `scaling` for int8 calibration. With levels, amplified copies are
-    appended, so that the activations do not saturate with a strong radio."""
+    """Convert inputs that are scaled by the preamble count to `scaling` for int8 calibration.
+
+    With levels, amplified copies are appended, so that the activations do not saturate with a strong radio.
+    """
     if scaling is Scaling.MAX:
         amplitudes: NDArray[np.float32] = normalised(torch.from_numpy(inputs)).numpy()
         return amplitudes

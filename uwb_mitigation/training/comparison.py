@@ -48,13 +48,15 @@ class ErrorRow:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Attributes:
-    rows: rows of the table.
-    coverage: coverage of the shipped recipe, over seeds.
-    rejection: (share rejected, MAE of the remaining ranges); ranges with the largest variance are rejected first.
-    passed_through: share of held-out ranges that the shipped recipe does not correct.
-    group, folds, seeds, configurations: parameters of the splits.
-    universal_coverage: coverage of `universal_los_offset`; None without a universal model.
+    """Result of `compare`.
+
+    Attributes:
+        rows: rows of the table.
+        coverage: coverage of the shipped recipe, over seeds.
+        rejection: (share rejected, MAE of the remaining ranges); ranges with the largest variance are rejected first.
+        passed_through: share of held-out ranges that the shipped recipe does not correct.
+        group, folds, seeds, configurations: parameters of the splits.
+        universal_coverage: coverage of `universal_los_offset`; None without a universal model.
     """
 
     rows: tuple[ErrorRow, ...]

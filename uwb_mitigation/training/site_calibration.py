@@ -123,6 +123,7 @@ class Calibrated:
 
     @property
     def offsets(self) -> Offsets:
+        """Offsets of the radios."""
         return self.solution.offsets
 
     @property

@@ -76,6 +76,7 @@ class TrainedBundle:
 
     @property
     def helped(self) -> bool:
+        """Whether the model has a smaller MAE than every baseline."""
         return self.after_m < min(self.before_m.values())
 
     @property

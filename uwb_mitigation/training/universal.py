@@ -40,12 +40,14 @@ RECIPE = FitOptions(epochs=10, learning_rate=1e-3, batch=64, dropout=0.1)
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Attributes:
-    seed: seed of the buildings and of the network.
-    samples: window length K.
-    scaling: preamble, or max for windows without preamble counts.
-    blocks, held_out_blocks: number of blocks of 256 placements for training and for evaluation.
-    fit: training options; the seed is that of the plan.
+    """Training plan of a universal model.
+
+    Attributes:
+        seed: seed of the buildings and of the network.
+        samples: window length K.
+        scaling: preamble, or max for windows without preamble counts.
+        blocks, held_out_blocks: number of blocks of 256 placements for training and for evaluation.
+        fit: training options; the seed is that of the plan.
     """
 
     seed: int = 0
@@ -58,10 +60,12 @@ class Plan:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Universal:
-    """Attributes:
-    card: card of the float network; for int8 only `quantised` differs.
-    network, integers: float and int8.
-    held_out: {row: {label: statistics}} of `raw`, `float` and `int8` in the held-out simulated buildings.
+    """Trained universal model and its evaluation.
+
+    Attributes:
+        card: card of the float network; for int8 only `quantised` differs.
+        network, integers: float and int8.
+        held_out: {row: {label: statistics}} of `raw`, `float` and `int8` in the held-out simulated buildings.
     """
 
     card: Card

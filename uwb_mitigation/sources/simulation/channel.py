@@ -104,8 +104,10 @@ class Environment:
             check_range(f"environment {self.name}", name, value, low, high)
 
     def path_loss_db(self, distance_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the mean path loss at channel 2, dB, by the report's section II-A: a power law in distance and
-        in frequency, and a factor of 1/2 for objects close to an antenna."""
+        """Return the mean path loss at channel 2 in dB (section II-A of the report).
+
+        It is a power law in distance and in frequency, with a factor of 1/2 for objects close to an antenna.
+        """
         frequency = 20.0 * (self.frequency_exponent + 1.0) * math.log10(CENTRE_FREQUENCY_HZ / 5e9)
         at_1m = self.path_loss_1m_db + frequency + 10.0 * math.log10(2.0)
         return at_1m + 10.0 * self.path_loss_exponent * np.log10(distance_m)

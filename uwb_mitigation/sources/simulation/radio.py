@@ -82,8 +82,10 @@ EDGE_LEAD_TAPS = _half_amplitude_lead()
 
 @dataclass(frozen=True, slots=True)
 class Reception:
-    """Results of n receptions. Levels, index and error are NaN if the frame was not received: below the
-    sensitivity, or no path above the threshold.
+    """Results of n receptions.
+
+    Levels, index and error are NaN if the frame was not received: below the sensitivity, or no path above the
+    threshold.
 
     Attributes:
         samples: int16 (n, 2 TAPS), interleaved real, imaginary.

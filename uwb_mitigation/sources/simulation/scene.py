@@ -79,8 +79,10 @@ def _check_points(where: str, start: Point, end: Point) -> None:
 
 @dataclass(frozen=True, slots=True)
 class DirectPath:
-    """Effects of obstacles on n direct paths: float64 (n,) loss in dB and extra optical length in m; int64 (n,)
-    number of obstacles crossed."""
+    """Effects of obstacles on n direct paths, arrays of shape (n,).
+
+    Contains the loss in dB and the extra optical length in m as float64, and the number of crossed obstacles as int64.
+    """
 
     loss_db: NDArray[np.float64]
     excess_m: NDArray[np.float64]
@@ -142,8 +144,10 @@ def through_slab(wall: Wall, cosine: NDArray[np.float64]) -> tuple[NDArray[np.fl
 
 
 def knife_edge_loss_db(detour_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the diffraction loss at an edge that lengthens the path by `detour_m` (ITU-R P.526-15,
-    section 4.1, with v = 2 sqrt(detour / wavelength))."""
+    """Return the diffraction loss in dB at an edge that lengthens the path by `detour_m`.
+
+    ITU-R P.526-15, section 4.1, with v = 2 sqrt(detour / wavelength).
+    """
     v = 2.0 * np.sqrt(np.maximum(detour_m, 0.0) / WAVELENGTH_M) - 0.1
     loss: NDArray[np.float64] = 6.9 + 20.0 * np.log10(np.sqrt(v * v + 1.0) + v)
     return loss
