@@ -12,44 +12,46 @@ from rich.console import Console
 
 from uwb_mitigation.bag.codec import Key
 from uwb_mitigation.measurement import CorrectedRange, Origin, Status, Truth
-from uwb_mitigation.nodes.monitor import Tally, summary
+from uwb_mitigation.nodes.monitor import RangeStatistics, summary
 
 
-def corrected(tally: Tally, sequence: int, raw: float, out: float, latency_s: float = 0.001) -> None:
+def corrected(
+    statistics: RangeStatistics, sequence: int, raw: float, out: float, latency_s: float = 0.001
+) -> None:
     result = CorrectedRange(out, raw, raw - out, 0.04, Status.OK, Origin.HOST, 1)
     key = Key(sequence * 100_000_000, 1, 7, sequence)
-    tally.add_corrected(key, result, key.stamp_ns / 1e9 + latency_s)
+    statistics.add_corrected(key, result, key.stamp_ns / 1e9 + latency_s)
 
 
 def test_counts_rate_latency_and_sigma():
-    tally = Tally()
+    statistics = RangeStatistics()
     for index in range(100):
-        tally.raw += 1
-        corrected(tally, index, 2.2, 1.9, latency_s=(1 + index % 3) / 1000)
-    tally.raw += 1
-    assert (tally.corrected, tally.missing, tally.errors) == (100, 1, {})
-    assert tally.latency_ms(50) == pytest.approx(2.0)
-    assert tally.pairs[7, 1].rate_hz() == pytest.approx(10.0, rel=1e-2)
-    assert tally.pairs[7, 1].samples[-1].sigma_m == pytest.approx(0.2)
+        statistics.raw += 1
+        corrected(statistics, index, 2.2, 1.9, latency_s=(1 + index % 3) / 1000)
+    statistics.raw += 1
+    assert (statistics.corrected, statistics.missing, statistics.errors) == (100, 1, {})
+    assert statistics.latency_ms(50) == pytest.approx(2.0)
+    assert statistics.pairs[7, 1].rate_hz() == pytest.approx(10.0, rel=1e-2)
+    assert statistics.pairs[7, 1].samples[-1].sigma_m == pytest.approx(0.2)
 
 
 def test_errors_are_absolute_and_grouped_by_label():
-    tally = Tally()
+    statistics = RangeStatistics()
     for sequence, true_m, label, raw, out in (
         (1, 2.0, "LOS", 2.2, 1.9),
         (2, 3.0, "NLOS", 4.0, 3.5),
         (3, 2.0, "LOS", math.nan, math.nan),
     ):
-        tally.add_truth(Key(sequence * 100_000_000, 1, 7, sequence), Truth(true_m, label))
-        corrected(tally, sequence, raw, out)
-    assert tally.errors["LOS"] == pytest.approx([1, 0.2, 0.1])
-    assert sum(tally.errors.values()) == pytest.approx([2, 1.2, 0.6])
-    assert tally.missing == 0  # a board that corrects sends no raw ranges
+        statistics.add_truth(Key(sequence * 100_000_000, 1, 7, sequence), Truth(true_m, label))
+        corrected(statistics, sequence, raw, out)
+    assert statistics.errors["LOS"] == pytest.approx([1, 0.2, 0.1])
+    assert sum(statistics.errors.values()) == pytest.approx([2, 1.2, 0.6])
+    assert statistics.missing == 0  # a board that corrects sends no raw ranges
 
 
 def test_a_summary_without_data_shows_no_nan():
     console = Console(width=100, record=True)
-    console.print(summary(Tally()))
+    console.print(summary(RangeStatistics()))
     shown = console.export_text()
     assert "0 ranges received" in shown
     assert "nan" not in shown

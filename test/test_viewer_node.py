@@ -30,7 +30,7 @@ def address(viewer: ros_harness.Process) -> str:
     return found[1]
 
 
-def test_the_page_shows_what_is_published(ros: ros_harness.Ros, browser: Browser, tmp_path: Path):
+def test_page_shows_published_messages(ros: ros_harness.Ros, browser: Browser, tmp_path: Path):
     published = ros.collect(RangeCorrected, "/uwb/range_corrected")
     ros.start("mitigator")
     ros.start("driver", "source:=simulated", "simulated_rate:=40.0")
@@ -68,7 +68,7 @@ def test_the_page_shows_what_is_published(ros: ros_harness.Ros, browser: Browser
     browser.wait("ranges of the new one", lambda: len(browser.column("pairs", "range")) >= 2)
 
 
-def test_nodes_that_are_killed_turn_stale_and_a_missing_node_is_named(ros: ros_harness.Ros, browser: Browser):
+def test_killed_nodes_become_stale_and_missing_nodes_are_named(ros: ros_harness.Ros, browser: Browser):
     viewer = ros.start("viewer", "port:=0")
     url = address(viewer)
     browser.open(url)
@@ -93,7 +93,7 @@ def test_nodes_that_are_killed_turn_stale_and_a_missing_node_is_named(ros: ros_h
     assert set(browser.column("pairs", "rate")) == {0}
 
 
-def test_it_shows_anchors_to_others_where_there_is_no_locator(ros: ros_harness.Ros, tmp_path: Path):
+def test_anchor_markers_are_published_without_a_locator(ros: ros_harness.Ros, tmp_path: Path):
     anchors = tmp_path / "anchors.yaml"
     anchors.write_text("anchors:\n  - {id: 5, x: 1.0, y: 2.0, z: 3.0, name: door}\n")
     shown: list[MarkerArray] = []
@@ -107,11 +107,11 @@ def test_it_shows_anchors_to_others_where_there_is_no_locator(ros: ros_harness.R
     threads = psutil.Process(viewer.pid).threads()
     assert len(threads) > 5, "the middleware's are among them"
     assert {os.getpriority(os.PRIO_PROCESS, thread.id) for thread in threads} == {min(os.nice(0) + 10, 19)}, (
-        "ranges are corrected before they are drawn"
+        "ranges are corrected before they are drawn_column"
     )
 
 
-def test_tags_of_their_own_are_found_whatever_the_names_around_are(ros: ros_harness.Ros):
+def test_tag_topics_are_found_with_remapped_names(ros: ros_harness.Ros):
     viewer = ros.start(
         "viewer", "port:=0", arguments=("-r", "__ns:=/uwb", "-r", "/uwb/uwb/pose:=/robot/pose")
     )
@@ -121,7 +121,7 @@ def test_tags_of_their_own_are_found_whatever_the_names_around_are(ros: ros_harn
     assert ros.node.count_subscribers("/robot/pose") == 1
 
 
-def test_a_viewer_that_is_put_away_subscribes_to_nothing_and_can_begin_again(ros: ros_harness.Ros):
+def test_deactivated_viewer_unsubscribes_and_can_be_activated_again(ros: ros_harness.Ros):
     corrected = ros.node.create_publisher(RangeCorrected, "/uwb/range_corrected", 10)
     viewer = ros.start("viewer", "port:=0")
     url = address(viewer)

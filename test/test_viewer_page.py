@@ -21,9 +21,9 @@ from uwb_mitigation.measurement import Cir, Encoding, Status
 from uwb_mitigation.viewer.page import Page, View
 from uwb_mitigation.viewer.scene import (
     MAX_PAIRS,
-    AnchorPlace,
+    AnchorPosition,
+    NodeStatus,
     Pose,
-    Report,
     Sample,
     Scene,
     Trace,
@@ -58,12 +58,12 @@ def server(view: View) -> Iterator[ViewerServer]:
         yield server
 
 
-def fill(view: View, upto_s: float = 5.0) -> None:
+def fill_scene(view: View, upto_s: float = 5.0) -> None:
     """Two pairs of tag 7, ten ranges a second each; anchor 2's are unfamiliar and 0.5 m too long."""
     scene = view.scene
     with view.lock:
-        scene.set_anchors({1: AnchorPlace(0, 0, 2, HOSTILE), 2: AnchorPlace(8, 0, 2)})
-        scene.add_report(HOSTILE, Report(1, HOSTILE))
+        scene.set_anchors({1: AnchorPosition(0, 0, 2, HOSTILE), 2: AnchorPosition(8, 0, 2)})
+        scene.set_node_status(HOSTILE, NodeStatus(1, HOSTILE))
         for step in range(int(upto_s * 10)):
             time_s = 1000.0 + step / 10
             for anchor in (1, 2):
@@ -76,7 +76,7 @@ def fill(view: View, upto_s: float = 5.0) -> None:
                     time_s, 5.3, 5.1 if anchor == 1 else 5.3, 0.1, status, 4.8 if anchor == 2 else 5.1
                 )
                 scene.add_sample((anchor, 7), sample)
-                scene.add_error(sample)
+                scene.count_error(sample)
             scene.add_true_position(HOSTILE, 4.0, 3.0)
             scene.add_pose("tag", Pose(4 + math.sin(step / 20), 3, 1, (0.4, 0.2, 0.3)))
 
@@ -98,14 +98,14 @@ def selected(browser: Browser, model: str) -> list[int]:
     )
 
 
-def opened(browser: Browser, server: ViewerServer, width: int = 1280, height: int = 1150) -> None:
+def open_page(browser: Browser, server: ViewerServer, width: int = 1280, height: int = 1150) -> None:
     browser.open(server.url, width, height)
     browser.wait("the page", browser.ready)
 
 
-def test_it_shows_what_the_scene_holds(browser: Browser, view: View, server: ViewerServer) -> None:
-    fill(view)
-    opened(browser, server)
+def test_page_shows_the_scene(browser: Browser, view: View, server: ViewerServer) -> None:
+    fill_scene(view)
+    open_page(browser, server)
     assert browser.column("pairs", "anchor") == ["1", "2"]
     assert browser.column("pairs", "range") == pytest.approx([5.1, 5.3])
     assert browser.column("pairs", "rate") == pytest.approx([10.0, 10.0])
@@ -119,14 +119,14 @@ def test_it_shows_what_the_scene_holds(browser: Browser, view: View, server: Vie
     assert browser.complaints() == []
 
 
-def test_pairs_tags_and_nodes_without_data_turn_grey(
+def test_pairs_tags_and_nodes_without_data_are_grey(
     browser: Browser, view: View, server: ViewerServer, clock: Clock
 ) -> None:
-    fill(view)
+    fill_scene(view)
     with view.lock:
-        view.scene.add_report("driver", Report(0, "10.0 Hz", clock()))
-        view.scene.add_report("recording", Report(2, "damaged"))
-    opened(browser, server)
+        view.scene.set_node_status("driver", NodeStatus(0, "10.0 Hz", clock()))
+        view.scene.set_node_status("recording", NodeStatus(2, "damaged"))
+    open_page(browser, server)
     assert browser.cell("10.0 Hz")
     assert not browser.cell("STALE")
     assert set(browser.column("pairs", "row_colour")) == {""}
@@ -150,7 +150,7 @@ def test_pairs_tags_and_nodes_without_data_turn_grey(
     assert not browser.cell("No ranges for 12 s.")
 
 
-def test_a_slow_pair_has_data_between_its_ranges(view: View, clock: Clock) -> None:
+def test_slow_pair_has_data_between_its_ranges(view: View, clock: Clock) -> None:
     for clock.now_s in range(0, 100, 5):
         view.scene.add_sample((1, 7), Sample(clock.now_s, 5.3, 5.1, 0.1, Status.OK))
     clock.now_s += 9.0
@@ -161,11 +161,11 @@ def test_a_slow_pair_has_data_between_its_ranges(view: View, clock: Clock) -> No
     assert source.data["rate"] == pytest.approx([0.2])
 
 
-def test_the_map_keeps_its_view_until_the_user_changes_it(
+def test_map_view_is_fixed_until_the_user_changes_it(
     browser: Browser, view: View, server: ViewerServer
 ) -> None:
-    fill(view)
-    opened(browser, server)
+    fill_scene(view)
+    open_page(browser, server)
 
     def view_of_map() -> list[float]:
         return browser.run(
@@ -201,21 +201,21 @@ def test_the_map_keeps_its_view_until_the_user_changes_it(
     )
     moved(90.0)
     with view.lock:
-        view.scene.set_anchors({5: AnchorPlace(-70, 0, 2)})
+        view.scene.set_anchors({5: AnchorPosition(-70, 0, 2)})
     browser.wait("the new anchor", lambda: "5" in browser.column("map", "id"))
     assert view_of_map() == zoomed
 
 
-def test_a_paused_page_stands_still_and_goes_on(browser: Browser, view: View, server: ViewerServer) -> None:
-    fill(view)
-    opened(browser, server)
+def test_page_can_be_paused_and_resumed(browser: Browser, view: View, server: ViewerServer) -> None:
+    fill_scene(view)
+    open_page(browser, server)
     pause = "Bokeh.documents[0].get_model_by_name('pause').active = arguments[0]"
     browser.run(pause, True)
     # The server's word: it knows.
     browser.wait("the button", lambda: browser.cell("Resume"))
     still = browser.driver.current_window_handle
     browser.driver.switch_to.new_window("tab")
-    opened(browser, server)
+    open_page(browser, server)
 
     def shown(value: float) -> bool:
         return browser.column("pairs", "range")[0] == pytest.approx(value)
@@ -231,13 +231,11 @@ def test_a_paused_page_stands_still_and_goes_on(browser: Browser, view: View, se
     browser.wait("the new range", partial(shown, 9.6))
 
 
-def test_a_row_that_is_drawn_anew_within_a_click_is_chosen(
-    browser: Browser, view: View, server: ViewerServer
-) -> None:
+def test_row_updated_during_a_click_is_selected(browser: Browser, view: View, server: ViewerServer) -> None:
     from selenium.webdriver.common.action_chains import ActionChains
 
-    fill(view)
-    opened(browser, server)
+    fill_scene(view)
+    open_page(browser, server)
     row = browser.wait("the table", lambda: browser.cell("OUT_OF_DISTRIBUTION"))
     ActionChains(browser.driver).click_and_hold(row).perform()
     with view.lock:
@@ -248,30 +246,32 @@ def test_a_row_that_is_drawn_anew_within_a_click_is_chosen(
     browser.wait("it in the table", lambda: browser.cell("9.500"))
 
 
-def test_the_newest_exchange_is_on_top(browser: Browser, view: View, server: ViewerServer) -> None:
-    fill(view, upto_s=0.5)
-    opened(browser, server)
+def test_waterfall_has_the_newest_cir_at_the_top(browser: Browser, view: View, server: ViewerServer) -> None:
+    fill_scene(view, upto_s=0.5)
+    open_page(browser, server)
     colours = browser.run(
         "const plot = Bokeh.index.find_one(Bokeh.documents[0].get_model_by_name('waterfall'));"
-        "const drawn = plot.export('png', false).canvas.getContext('2d'), {x_scale, y_scale} = plot.frame;"
-        "return [2, 40].map((ago) => Array.from(drawn.getImageData(x_scale.compute(10), y_scale.compute(ago), 1, 1).data))"
+        "const drawn_column = plot.export('png', false).canvas.getContext('2d'), {x_scale, y_scale} = plot.frame;"
+        "return [2, 40].map((ago) => Array.from(drawn_column.getImageData(x_scale.compute(10), y_scale.compute(ago), 1, 1).data))"
     )
     none, peak = [68, 1, 84, 255], [253, 231, 36, 255]
     assert colours == [peak, none]
 
 
-def test_what_no_radio_measured_spoils_nothing(browser: Browser, view: View, server: ViewerServer) -> None:
-    fill(view)
+def test_implausible_values_do_not_break_the_page(browser: Browser, view: View, server: ViewerServer) -> None:
+    fill_scene(view)
     nan, inf = math.nan, math.inf
     with view.lock:
-        view.scene.set_anchors({1: AnchorPlace(0, 0, 2), 2: AnchorPlace(8, 0, nan), 3: AnchorPlace(0, 1e300)})
+        view.scene.set_anchors(
+            {1: AnchorPosition(0, 0, 2), 2: AnchorPosition(8, 0, nan), 3: AnchorPosition(0, 1e300)}
+        )
         for pair, values in (
             ((1, 7), (3e38, -3e38, inf)),
             ((2, 7), (nan, nan, nan)),
             ((3, 7), (inf, -inf, 0.1)),
         ):
             view.scene.add_sample(pair, Sample(1005.0, *values, Status.BAD_CIR, 3e38))
-            view.scene.add_error(Sample(1005.0, *values, Status.BAD_CIR, 5.0))
+            view.scene.count_error(Sample(1005.0, *values, Status.BAD_CIR, 5.0))
             for scale, first_path, count in (
                 (3e38, nan, 200),
                 (nan, nan, 200),
@@ -284,7 +284,7 @@ def test_what_no_radio_measured_spoils_nothing(browser: Browser, view: View, ser
         view.scene.add_pose("tag", Pose(4, 3, nan, (1e300, nan, nan)))
         view.scene.add_pose("tag", Pose(1e300, 3, 0))
         view.scene.add_true_position("tag", 4.0, -1e300)
-    opened(browser, server)
+    open_page(browser, server)
     assert browser.complaints() == []
     shown = [
         cell for cell in browser.run(IN_TABLE + "return cells.map((e) => e.textContent)") if "e+" in cell
@@ -300,38 +300,38 @@ def test_what_no_radio_measured_spoils_nothing(browser: Browser, view: View, ser
     assert "mean absolute error 0.350 m raw, 0.250 m corrected" in summary
 
 
-def drawn(document: Document, figure: str, column: str) -> np.ndarray:
+def drawn_column(document: Document, figure: str, column: str) -> np.ndarray:
     """A column of the source behind a named figure of a page that no browser shows."""
     sources = [renderer.data_source for renderer in document.get_model_by_name(figure).renderers]
     return next(source.data[column] for source in sources if column in source.data)
 
 
-def test_ranges_of_a_silent_pair_grow_older_and_are_left_out(view: View, clock: Clock) -> None:
-    def heard(anchor: int, time_s: float) -> None:
+def test_ranges_of_a_stopped_pair_age_and_disappear(view: View, clock: Clock) -> None:
+    def received(anchor: int, time_s: float) -> None:
         clock.now_s = time_s
         view.scene.add_sample((anchor, 7), Sample(time_s, 5.3, 5.1, 0.1, Status.OK))
 
-    heard(1, 1000.0)
-    heard(1, 1020.0)
+    received(1, 1000.0)
+    received(1, 1020.0)
     document = Document()
     page = Page(document, view)
-    assert drawn(document, "strip", "age").tolist() == [-20.0, 0.0]
-    heard(2, 1050.0)
+    assert drawn_column(document, "strip", "age").tolist() == [-20.0, 0.0]
+    received(2, 1050.0)
     page.draw()
-    assert drawn(document, "strip", "age").tolist() == [-50.0, -30.0]
-    heard(2, 1070.0)
+    assert drawn_column(document, "strip", "age").tolist() == [-50.0, -30.0]
+    received(2, 1070.0)
     page.draw()
-    assert drawn(document, "strip", "age").tolist() == [-50.0]
+    assert drawn_column(document, "strip", "age").tolist() == [-50.0]
 
 
-def test_of_too_many_pairs_the_latest_are_kept() -> None:
+def test_only_the_latest_pairs_are_kept() -> None:
     scene = Scene()
     for anchor in range(MAX_PAIRS + 100):
         scene.add_sample((anchor, 7), Sample(1000.0, 5.3, 5.1, 0.1, Status.OK))
     assert {anchor for anchor, _ in scene.pairs} == set(range(100, MAX_PAIRS + 100))
 
 
-def test_clocks_may_differ_and_jump() -> None:
+def test_clocks_may_differ_and_jump_back() -> None:
     scene = Scene()
     for step in range(50):
         for anchor, late_s in ((1, 0.0), (2, 5.0)):
@@ -341,13 +341,13 @@ def test_clocks_may_differ_and_jump() -> None:
     scene.add_sample((1, 7), Sample(1005.0, 5.3, 5.1, 0.1, Status.OK))
     assert [pair for pair, _, _ in scene.latest()] == [(1, 7)], "a stamp of the future hides nothing for long"
     scene.add_sample((1, 7), Sample(1001.0, 5.3, 5.1, 0.1, Status.OK))
-    assert len(scene.pairs[1, 7].samples) == 1, "a replay began anew"
+    assert len(scene.pairs[1, 7].samples) == 1, "a replay starts again"
 
 
-def test_nothing_from_a_message_is_run(browser: Browser, view: View, server: ViewerServer) -> None:
-    fill(view)
-    opened(browser, server)
-    browser.wait("the diagnostics as they are", lambda: browser.cell(HOSTILE))
+def test_html_in_messages_is_escaped(browser: Browser, view: View, server: ViewerServer) -> None:
+    fill_scene(view)
+    open_page(browser, server)
+    browser.wait("the escaped text", lambda: browser.cell(HOSTILE))
     assert browser.run("return window.pwned ?? null") is None
 
 
@@ -361,7 +361,7 @@ def fetch(server: ViewerServer, path: str = "", **headers: str) -> HTTPResponse:
 
 
 @pytest.mark.parametrize("path", ["", "ws", "static/js/bokeh.min.js"])
-def test_another_host_name_is_refused(view: View, server: ViewerServer, path: str) -> None:
+def test_unknown_host_is_refused(view: View, server: ViewerServer, path: str) -> None:
     for own in ("localhost", "LocalHost", "127.0.0.1"):
         assert fetch(server, path, Host=f"{own}:{server.port}").status != 403
     for name in ("evil.example", f"evil.example:{server.port}", "localhost", f"localhost:{server.port + 1}"):
@@ -371,8 +371,10 @@ def test_another_host_name_is_refused(view: View, server: ViewerServer, path: st
         assert fetch(other, Host="robot.local:5006").status == 200
 
 
-def test_only_scripts_of_the_page_run(browser: Browser, view: View, server: ViewerServer) -> None:
-    fill(view)
+def test_content_security_policy_blocks_other_scripts(
+    browser: Browser, view: View, server: ViewerServer
+) -> None:
+    fill_scene(view)
     policies = [
         fetch(server, path, Host=f"localhost:{server.port}", **{"X-Nonce": "mine"}).headers[
             "Content-Security-Policy"
@@ -386,7 +388,7 @@ def test_only_scripts_of_the_page_run(browser: Browser, view: View, server: View
         assert "mine" not in scripts
         assert policy.startswith("default-src 'none'")
         assert "frame-ancestors 'none'" in policy
-    opened(browser, server)
+    open_page(browser, server)
     assert browser.complaints() == []
     browser.run(
         "const script = document.createElement('script');"
@@ -398,12 +400,12 @@ def test_only_scripts_of_the_page_run(browser: Browser, view: View, server: View
     assert browser.run("return window.pwned ?? null") is None
 
 
-def test_a_swipe_over_a_figure_scrolls_the_page_of_a_phone(
+def test_swipe_over_a_figure_scrolls_the_page_on_a_phone(
     browser: Browser, view: View, server: ViewerServer
 ) -> None:
-    fill(view)
+    fill_scene(view)
     with browser.touch_screen():
-        opened(browser, server, 400, 800)
+        open_page(browser, server, 400, 800)
         for name in ("map", "cir", "strip", "waterfall", "errors"):
             before = browser.scroll_to(name)
             browser.swipe(200, 400, 250 if before < 500 else -250)
@@ -415,15 +417,15 @@ def test_a_swipe_over_a_figure_scrolls_the_page_of_a_phone(
 
 
 @pytest.mark.parametrize("width", [1280, 1024, 400])
-def test_nothing_is_cut_off_on_a_narrow_screen(
+def test_content_fits_the_width_of_the_screen(
     browser: Browser, view: View, server: ViewerServer, width: int
 ) -> None:
-    fill(view)
+    fill_scene(view)
     with view.lock:
         view.scene.add_sample(
             (0xDECA010203040506, 0xDECA0102030407F8), Sample(1005.0, -9.9, 123.456, 12.345, Status.OK)
         )
-    opened(browser, server, width, 2000)
+    open_page(browser, server, width, 2000)
     browser.wait("the table", lambda: browser.run(f"{IN_TABLE} return cells.length") > 9)
     assert browser.run("return document.documentElement.scrollWidth") <= width
     assert browser.run(IN_TABLE + "return view.scrollWidth - view.clientWidth") == 0
@@ -432,9 +434,9 @@ def test_nothing_is_cut_off_on_a_narrow_screen(
     browser.screenshot(f"viewer_{width}")
 
 
-def test_a_page_that_is_left_is_forgotten(browser: Browser, view: View, server: ViewerServer) -> None:
-    fill(view)
-    opened(browser, server)
+def test_session_of_a_left_page_is_discarded(browser: Browser, view: View, server: ViewerServer) -> None:
+    fill_scene(view)
+    open_page(browser, server)
     assert view.pages == 1
     browser.open("about:blank")
     browser.wait("it to be forgotten", lambda: view.pages == 0)
@@ -442,7 +444,7 @@ def test_a_page_that_is_left_is_forgotten(browser: Browser, view: View, server: 
     browser.wait("it to be there again", lambda: view.pages == 1 and browser.ready())
 
 
-def test_a_page_at_all_addresses_accepts_those_of_this_machine(view: View) -> None:
+def test_wildcard_address_accepts_addresses_of_this_machine(view: View) -> None:
     with ViewerServer(view, "0.0.0.0", 0) as server, Visitors(server.url, 1):
         assert server.url == f"http://localhost:{server.port}/"
         assert view.pages == 1
@@ -452,7 +454,7 @@ def test_a_page_at_all_addresses_accepts_those_of_this_machine(view: View) -> No
             assert fetch(server, Host=f"{name}:{server.port}").status == 403
 
 
-def test_an_address_that_cannot_be_used_is_refused(server: ViewerServer, view: View) -> None:
+def test_unusable_address_is_refused(server: ViewerServer, view: View) -> None:
     with pytest.raises(ParameterError, match="an IPv4 address of this machine"):
         ViewerServer(view, "::1", 0)
     with pytest.raises(ParameterError, match=str(server.port)):

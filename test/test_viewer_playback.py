@@ -63,7 +63,7 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def opened(path: Path, namespace: str | None = None) -> tuple[BagPlayer, Scene]:
+def open_bag(path: Path, namespace: str | None = None) -> tuple[BagPlayer, Scene]:
     scene = Scene()
     feed = Feed(scene, threading.Lock())
     return BagPlayer(path, feed, lambda: Mitigation(load_bundle(default_model_path())), namespace), scene
@@ -73,8 +73,8 @@ def latest(scene: Scene) -> dict[tuple[int, int], float]:
     return {pair: sample.range_m for pair, _, sample in scene.latest()}
 
 
-def test_any_place_shows_what_came_until_then(bag: Path):
-    player, scene = opened(bag)
+def test_seek_shows_data_up_to_the_position(bag: Path):
+    player, scene = open_bag(bag)
     assert player.seconds == pytest.approx((COUNT - 1) * STEP_NS / 1e9)
     for last in (399, 100, 250, 0):
         player.seek(last * STEP_NS / 1e9)
@@ -83,15 +83,15 @@ def test_any_place_shows_what_came_until_then(bag: Path):
         assert latest(scene) == expected
         assert scene.now_s == pytest.approx((START_NS + last * STEP_NS) / 1e9)
         assert scene.errors == last + 1, "the truth is joined, and nothing is counted twice"
-        assert len(scene.tags["tag"].trail) == len(scene.tags["tag_9"].trail) == last // 10 + 1
-        assert len(scene.true_trails["tag_7"]) == last // 10 + 1
+        assert len(scene.tags["tag"].track) == len(scene.tags["tag_9"].track) == last // 10 + 1
+        assert len(scene.true_tracks["tag_7"]) == last // 10 + 1
     assert len(scene.pairs[1, 7].traces) == 1
 
 
-def test_it_plays_at_the_recordings_own_pace(bag: Path, monkeypatch: pytest.MonkeyPatch):
+def test_recording_plays_in_real_time(bag: Path, monkeypatch: pytest.MonkeyPatch):
     now_s = [100.0]
     monkeypatch.setattr(time, "monotonic", lambda: now_s[0])
-    player, scene = opened(bag)
+    player, scene = open_bag(bag)
     player.play(True)
     now_s[0] += 0.5
     player.advance()
@@ -111,8 +111,8 @@ def test_it_plays_at_the_recordings_own_pace(bag: Path, monkeypatch: pytest.Monk
     assert player.position_s == 0.0
 
 
-def test_raw_ranges_are_corrected_as_they_are_shown(tmp_path: Path):
-    player, scene = opened(write_bag(tmp_path / "raw.mcap", 30))
+def test_raw_ranges_are_corrected_for_display(tmp_path: Path):
+    player, scene = open_bag(write_bag(tmp_path / "raw.mcap", 30))
     assert player.corrects
     player.seek(player.seconds)
     mitigation = Mitigation(load_bundle(default_model_path()))
@@ -120,22 +120,22 @@ def test_raw_ranges_are_corrected_as_they_are_shown(tmp_path: Path):
     assert latest(scene)[2, 7] == pytest.approx(expected)
 
 
-def test_a_processed_bag_keeps_its_truth(bag: Path, tmp_path: Path):
+def test_processed_bag_shows_its_truth(bag: Path, tmp_path: Path):
     """Its truths follow the corrected ranges."""
     raw = write_bag(tmp_path / "raw.mcap", 30)
     process_bag(Job(raw, tmp_path / "out.mcap", default_model_path()))
-    player, scene = opened(tmp_path / "out.mcap")
+    player, scene = open_bag(tmp_path / "out.mcap")
     assert not player.corrects
     player.seek(player.seconds)
     assert scene.errors == 30
     assert [sample.true_m for sample in scene.pairs[1, 7].samples] == [4.0 + n for n in range(0, 30, 2)]
     assert scene.pairs[1, 7].samples[-1].label == "NDP NLOS"
-    raw_player, raw_scene = opened(raw)
+    raw_player, raw_scene = open_bag(raw)
     raw_player.seek(raw_player.seconds)
     assert scene.error_sums_m == pytest.approx(raw_scene.error_sums_m)
 
 
-def test_the_output_of_track_is_shown(tmp_path: Path):
+def test_output_of_track_is_shown(tmp_path: Path):
     ranges, truth = drive(seconds=20)
     bag, track = tmp_path / "hall.mcap", tmp_path / "track.mcap"
     with BagWriter(bag, {}) as out:
@@ -148,17 +148,17 @@ def test_the_output_of_track_is_shown(tmp_path: Path):
     anchors_file(bag).write_text(dump_anchors(HALL))
     done = run("track", bag, "-o", track, "--height", "1.0", folder=tmp_path)
     assert done.returncode == 0, done.stderr
-    player, scene = opened(track)
+    player, scene = open_bag(track)
     player.seek(player.seconds)
     assert len(scene.tags) == 4
     assert any("0x1122334455667788" in name for name in scene.tags)
     for tag in scene.tags.values():
-        assert tag.trail[-1] == pytest.approx(truth.position[-1, :2], abs=0.5)
+        assert tag.track[-1] == pytest.approx(truth.position[-1, :2], abs=0.5)
     assert "without ranges" in player.missing.ranges
     assert load_anchors(anchors_file(track)).anchors == HALL.anchors
 
 
-def test_ages_are_of_the_recording(tmp_path: Path):
+def test_ages_use_the_time_of_the_recording(tmp_path: Path):
     path = tmp_path / "one.mcap"
     with BagWriter(path, {}) as out:
         for number in (*range(100), 2100):
@@ -166,7 +166,7 @@ def test_ages_are_of_the_recording(tmp_path: Path):
             out.write(item)
             if number != 99:
                 write_corrected(out, item.measurement, corrected(number))
-    player, scene = opened(path)
+    player, scene = open_bag(path)
     player.seek(20.0)
     ages = {pair: scene.age_s(history) for pair, history, _ in scene.latest()}
     assert ages == pytest.approx({(1, 7): 20.0 - 0.98, (2, 7): 20.0 - 0.97})
@@ -175,9 +175,9 @@ def test_ages_are_of_the_recording(tmp_path: Path):
     assert max(scene.age_s(history) for _, history, _ in scene.latest()) < 0.02
 
 
-def test_of_a_crowded_minute_its_end_is_shown(bag: Path, monkeypatch: pytest.MonkeyPatch):
+def test_seek_reads_a_limited_number_of_messages(bag: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(playback, "MAX_MESSAGES", 150)
-    player, scene = opened(bag)
+    player, scene = open_bag(bag)
     player.seek(player.seconds)
     for _ in range(5):
         player.advance()
@@ -185,18 +185,18 @@ def test_of_a_crowded_minute_its_end_is_shown(bag: Path, monkeypatch: pytest.Mon
     assert scene.ranges < COUNT / 2
 
 
-def test_a_bag_that_was_cut_shows_what_is_left_and_says_so(bag: Path, tmp_path: Path):
+def test_truncated_bag_is_shown_up_to_the_damage(bag: Path, tmp_path: Path):
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(write_bag(tmp_path / "whole.mcap", 3000).read_bytes()[:-20_000])
-    player, scene = opened(cut)
+    player, scene = open_bag(cut)
     player.seek(player.seconds)
-    assert scene.reports["recording"].level == 2
-    assert "nothing beyond" in scene.reports["recording"].message
+    assert scene.node_statuses["recording"].level == 2
+    assert "nothing beyond" in scene.node_statuses["recording"].message
     player.seek(0.0)
     assert latest(scene)
 
 
-def test_an_anchor_of_no_64_bits_is_passed_over() -> None:
+def test_anchor_id_above_64_bits_is_ignored() -> None:
     scene = Scene()
     feed = Feed(scene, threading.Lock())
     pose = SimpleNamespace(position=SimpleNamespace(x=1.0, y=2.0, z=3.0))
@@ -207,15 +207,15 @@ def test_an_anchor_of_no_64_bits_is_passed_over() -> None:
     assert list(scene.anchors) == [2**64 - 1]
 
 
-def test_a_bag_without_ranges_and_tracks_is_refused(tmp_path: Path):
+def test_bag_without_ranges_and_tracks_is_refused(tmp_path: Path):
     path = tmp_path / "one.mcap"
     with BagWriter(path, {}) as out:
         out.write_message(ODOMETRY_TRUTH, ODOMETRY_TYPE, encode_place((0.0, 0.0, 0.0), 1, START_NS), START_NS)
     with pytest.raises(RecordingError, match="no ranges and no tracks"):
-        opened(path)
+        open_bag(path)
 
 
-def test_of_several_namespaces_one_is_to_be_named(tmp_path: Path):
+def test_several_namespaces_need_a_choice(tmp_path: Path):
     path = tmp_path / "two.mcap"
     with BagWriter(path, {}) as out:
         for number in range(4):
@@ -223,14 +223,14 @@ def test_of_several_namespaces_one_is_to_be_named(tmp_path: Path):
             for board in ("left", "right"):
                 out.write_message(f"/{board}/uwb/range_raw", RANGE_CIR_TYPE, data, START_NS + number)
     with pytest.raises(UwbMitigationError, match="--namespace with one of: '/left', '/right'"):
-        opened(path)
-    player, scene = opened(path, "/left")
+        open_bag(path)
+    player, scene = open_bag(path, "/left")
     player.seek(1.0)
     assert scene.ranges == 4
 
 
 @contextmanager
-def viewing(bag: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
+def serve_recording(bag: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """`uwb-mitigation view` on a bag, and its address."""
     command = [sys.executable, "-c", "from uwb_mitigation.entry import command_line; command_line()", "view"]
     running = subprocess.Popen(
@@ -238,16 +238,16 @@ def viewing(bag: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
     )
     try:
         assert running.stdout is not None
-        said = running.stdout.readline()
-        found = re.search(r"http://\S+", said)
-        assert found is not None, said + running.stdout.read()
+        first_line = running.stdout.readline()
+        found = re.search(r"http://\S+", first_line)
+        assert found is not None, first_line + running.stdout.read()
         yield running, found[0]
     finally:
         running.kill()
         running.wait()
 
 
-def test_the_slider_can_be_dragged_while_the_recording_plays(browser: Browser, tmp_path: Path):
+def test_slider_can_be_dragged_during_playback(browser: Browser, tmp_path: Path):
     from selenium.webdriver.common.action_chains import ActionChains
 
     long = tmp_path / "long.mcap"
@@ -258,7 +258,7 @@ def test_the_slider_can_be_dragged_while_the_recording_plays(browser: Browser, t
     def slider(attribute: str) -> float:
         return browser.run("return Bokeh.documents[0].get_model_by_name('slider')[arguments[0]]", attribute)
 
-    with viewing(long) as (_, url):
+    with serve_recording(long) as (_, url):
         browser.open(url)
         browser.wait("the page", browser.ready)
         browser.wait("it to play", lambda: slider("value") > 0)
@@ -284,14 +284,14 @@ def test_the_slider_can_be_dragged_while_the_recording_plays(browser: Browser, t
         assert slider("value") < 250.0
 
 
-def test_the_page_has_a_slider_and_plays(browser: Browser, bag: Path):
+def test_recording_plays_on_the_page(browser: Browser, bag: Path):
 
     def model(name: str, attribute: str) -> object:
         return browser.run(
             "return Bokeh.documents[0].get_model_by_name(arguments[0])[arguments[1]]", name, attribute
         )
 
-    with viewing(bag) as (running, url):
+    with serve_recording(bag) as (running, url):
         browser.open(url)
         browser.wait("the page", browser.ready)
         browser.wait("it to play to its end", lambda: model("pause", "label") == "Play")

@@ -118,7 +118,7 @@ def _stamped(messages: list[Any]) -> tuple[np.ndarray[Any, Any], np.ndarray[Any,
 def watch(programme: Programme, console: Console) -> list[str]:
     """Run the nodes and show their ranges; return the failures."""
     with watching(Monitor) as monitor, tempfile.TemporaryDirectory() as folder:
-        tally = monitor.tally
+        statistics = monitor.statistics
         poses: list[Any] = []
         truth: list[Any] = []
         monitor.create_subscription(PoseWithCovarianceStamped, topics.POSE, poses.append, topics.RANGES)
@@ -149,20 +149,20 @@ def watch(programme: Programme, console: Console) -> list[str]:
             nodes.start("driver", *programme.parameters, "wait_for_subscribers:=2")
             with Live(console=console, refresh_per_second=REFRESH_HZ) as live:
                 while nodes.running:
-                    live.update(live_table(tally, title))
+                    live.update(live_table(statistics, title))
                     time.sleep(1 / REFRESH_HZ)
                 # The last corrected ranges may arrive after the end of the driver.
                 settled = time.monotonic() + SETTLE_S
-                while tally.missing and time.monotonic() < settled:
+                while statistics.missing and time.monotonic() < settled:
                     time.sleep(0.05)
-                live.update(live_table(tally, title))
-        console.print(summary(tally))
+                live.update(live_table(statistics, title))
+        console.print(summary(statistics))
         if len(poses) > 1 and len(truth) > 1:
             console.print(
                 f"horizontal position error of the locator: {position_rmse(poses, truth):.3f} m RMSE"
             )
-    if tally.missing or not tally.corrected:
-        nodes.failures.append(f"{tally.corrected} of {tally.raw} ranges came back corrected")
+    if statistics.missing or not statistics.corrected:
+        nodes.failures.append(f"{statistics.corrected} of {statistics.raw} ranges came back corrected")
     return nodes.failures
 
 

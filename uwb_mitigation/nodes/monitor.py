@@ -23,7 +23,7 @@ from uwb_mitigation.measurement import CorrectedRange, Status, Truth
 from uwb_mitigation.nodes import topics
 from uwb_mitigation.nodes.processes import watching
 from uwb_mitigation.nodes.spinning import stop_event
-from uwb_mitigation.viewer.scene import MAX_TRUTHS, History, Latest, Pair, Sample
+from uwb_mitigation.viewer.scene import MAX_TRUTHS, BoundedDict, History, Pair, Sample
 
 REFRESH_HZ = 5
 
@@ -31,7 +31,7 @@ MAX_LATENCIES = 100_000
 """Number of latest latencies in the summary; bounds the memory of a monitor that runs for days."""
 
 
-class Tally:
+class RangeStatistics:
     """Counts, latencies and errors of the received ranges, by pair.
 
     Attributes:
@@ -45,7 +45,7 @@ class Tally:
         self.statuses: Counter[Status] = Counter()
         self.errors: defaultdict[str, NDArray[np.float64]] = defaultdict(lambda: np.zeros(3))
         self._latencies_s: deque[float] = deque(maxlen=MAX_LATENCIES)
-        self._truths: Latest[Key, Truth] = Latest(MAX_TRUTHS)
+        self._truths: BoundedDict[Key, Truth] = BoundedDict(MAX_TRUTHS)
 
     @property
     def missing(self) -> int:
@@ -72,11 +72,11 @@ class Tally:
 
 
 class Monitor(Node):
-    """Feeds a tally from the three range topics."""
+    """Collects statistics of the three range topics."""
 
     def __init__(self, context: Context | None = None) -> None:
         super().__init__("monitor", context=context)
-        self.tally = Tally()
+        self.statistics = RangeStatistics()
         for kind, topic, callback in (
             (RangeTruth, topics.RANGE_TRUTH, self._on_truth),
             (RangeCir, topics.RANGE_RAW, self._on_raw),
@@ -85,31 +85,31 @@ class Monitor(Node):
             self.create_subscription(kind, topic, callback, topics.RANGES, raw=True)
 
     def _on_raw(self, data: bytes) -> None:
-        self.tally.raw += 1
+        self.statistics.raw += 1
 
     def _on_truth(self, data: bytes) -> None:
         with contextlib.suppress(RecordingError):
-            self.tally.add_truth(*decode_truth(data))
+            self.statistics.add_truth(*decode_truth(data))
 
     def _on_corrected(self, data: bytes) -> None:
         now_s = self.get_clock().now().nanoseconds / 1e9
         # A malformed message counts as missing.
         with contextlib.suppress(RecordingError):
-            self.tally.add_corrected(*decode_corrected(data), now_s)
+            self.statistics.add_corrected(*decode_corrected(data), now_s)
 
 
 def _text(value: float, digits: int = 3) -> str:
     return f"{value:.{digits}f}" if math.isfinite(value) else "-"
 
 
-def live_table(tally: Tally, title: str) -> Table:
+def live_table(statistics: RangeStatistics, title: str) -> Table:
     """Return a table with one row for each anchor-tag pair."""
     table = Table(title=title, title_justify="left")
     for column in ("anchor", "tag", "Hz", "raw", "corrected", "sigma", "true", "status", "label"):
         table.add_column(
             column, justify="left" if column in ("status", "label") else "right", overflow="fold"
         )
-    for (anchor, tag), history in sorted(tally.pairs.copy().items()):
+    for (anchor, tag), history in sorted(statistics.pairs.copy().items()):
         sample = history.samples[-1]
         table.add_row(
             format_id(anchor),
@@ -122,24 +122,24 @@ def live_table(tally: Tally, title: str) -> Table:
     return table
 
 
-def summary(tally: Tally) -> Group:
+def summary(statistics: RangeStatistics) -> Group:
     """Return counts, latency, and mean absolute errors of ranges whose truth is known."""
     statuses = ", ".join(
-        f"{tally.statuses[status]} {status.name}" for status in Status if tally.statuses[status]
+        f"{statistics.statuses[status]} {status.name}" for status in Status if statistics.statuses[status]
     )
-    corrected = f"{tally.corrected} corrected" + (f" ({statuses})" if statuses else "")
+    corrected = f"{statistics.corrected} corrected" + (f" ({statuses})" if statuses else "")
     lines: list[Text | Table] = [
         Text(),
-        Text(f"{tally.raw} ranges received, {corrected}, {tally.missing} lost"),
+        Text(f"{statistics.raw} ranges received, {corrected}, {statistics.missing} lost"),
     ]
-    if tally.corrected:
-        p50, p99 = tally.latency_ms(50), tally.latency_ms(99)
+    if statistics.corrected:
+        p50, p99 = statistics.latency_ms(50), statistics.latency_ms(99)
         lines.append(Text(f"latency from stamp to corrected range: p50 {p50:.2f} ms, p99 {p99:.2f} ms"))
-    if tally.errors:
+    if statistics.errors:
         table = Table(title="mean absolute error, m", title_justify="left")
         for column in ("label", "ranges", "raw MAE", "corrected MAE", "ratio"):
             table.add_column(column, justify="left" if column == "label" else "right")
-        for label, errors in [*sorted(tally.errors.items()), ("all", sum(tally.errors.values()))]:
+        for label, errors in [*sorted(statistics.errors.items()), ("all", sum(statistics.errors.values()))]:
             if label == "all":
                 table.add_section()
             n, raw_m, corrected_m = np.asarray(errors).tolist()
@@ -159,7 +159,7 @@ def main() -> None:
         with watching(Monitor) as monitor:
             with Live(console=console, refresh_per_second=REFRESH_HZ) as live:
                 while not stop.wait(1 / REFRESH_HZ):
-                    live.update(live_table(monitor.tally, "UWB ranges"))
-            console.print(summary(monitor.tally))
+                    live.update(live_table(monitor.statistics, "UWB ranges"))
+            console.print(summary(monitor.statistics))
     except UwbMitigationError as error:
         sys.exit(f"error: {error}")

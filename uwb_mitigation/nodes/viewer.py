@@ -31,7 +31,7 @@ from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.sources.site import load_anchors
 from uwb_mitigation.viewer.feed import Feed
 from uwb_mitigation.viewer.page import View
-from uwb_mitigation.viewer.scene import MAX_TAGS, PLAIN, Missing, Scene
+from uwb_mitigation.viewer.scene import DEFAULT_TAG, MAX_TAGS, MissingData, Scene
 from uwb_mitigation.viewer.server import ViewerServer
 
 # Best effort: a publisher must not wait for a display.
@@ -42,10 +42,10 @@ _QOS = QoSProfile(
     depth=200,
 )
 
-SEARCH_S = 0.5
+DISCOVERY_PERIOD_S = 0.5
 """Interval of the search for new topics."""
 
-TAKE_S = 0.1
+READ_PERIOD_S = 0.1
 """Interval at which the queued ranges are read; only the last `_QOS.depth` are shown."""
 
 
@@ -54,7 +54,7 @@ class Viewer(ManagedNode):
 
     def __init__(self) -> None:
         super().__init__("viewer", VIEWER)
-        self._others: dict[str, Subscription] = {}
+        self._subscriptions: dict[str, Subscription] = {}
         self._range_node: Node | None = None
         self._ranges: dict[str, Subscription] = {}
         self._anchors: AnchorMap | None = None
@@ -76,7 +76,7 @@ class Viewer(ManagedNode):
         else:
             self._subscribe(MarkerArray, topics.ANCHORS, self._feed.markers, topics.LATCHED)
         self._subscribe(DiagnosticArray, topics.DIAGNOSTICS, self._feed.diagnostics)
-        self._subscribe(PoseWithCovarianceStamped, topics.POSE, partial(self._feed.pose, PLAIN))
+        self._subscribe(PoseWithCovarianceStamped, topics.POSE, partial(self._feed.pose, DEFAULT_TAG))
         self._subscribe(Odometry, topics.ODOMETRY_TRUTH, self._feed.true_position)
         # No executor spins this node: waking up for every range would take CPU time from the mitigator.
         range_node = Node(
@@ -91,7 +91,10 @@ class Viewer(ManagedNode):
         self._subscribe_ranges(RangeTruth, topics.RANGE_TRUTH)
         self._subscribe_ranges(RangeCorrected, topics.RANGE_CORRECTED)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        for period_s, callback in ((SEARCH_S, self._search), (TAKE_S, self._take_ranges)):
+        for period_s, callback in (
+            (DISCOVERY_PERIOD_S, self._discover_topics),
+            (READ_PERIOD_S, self._read_queued_ranges),
+        ):
             timer = self.create_timer(period_s, callback, clock=steady)
             self.until_close(timer, self.destroy_timer)
 
@@ -117,23 +120,23 @@ class Viewer(ManagedNode):
 
     def close(self) -> None:
         super().close()
-        self._others, self._ranges, self._anchors_out, self._range_node = {}, {}, None, None
+        self._subscriptions, self._ranges, self._anchors_out, self._range_node = {}, {}, None, None
 
     def describe(self) -> diagnostics.Description:
         pages = 0 if self._view is None else self._view.pages
         url = "" if self._server is None else self._server.url
-        facts: dict[str, object] = {"url": url, "pages": pages, "malformed": self._feed.malformed}
-        return url, diagnostics.OK, f"serving {pages} page{'' if pages == 1 else 's'}", facts
+        values: dict[str, object] = {"url": url, "pages": pages, "malformed": self._feed.malformed}
+        return url, diagnostics.OK, f"serving {pages} page{'' if pages == 1 else 's'}", values
 
     def _subscribe(
         self, kind: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile = _QOS
     ) -> None:
-        if topic not in self._others:
+        if topic not in self._subscriptions:
             made = self.create_subscription(kind, topic, callback, qos)
-            self._others[topic] = self.until_close(made, self.destroy_subscription)
+            self._subscriptions[topic] = self.until_close(made, self.destroy_subscription)
 
     def _subscribe_ranges(self, kind: type, topic: str) -> None:
-        """Subscribe to a topic of ranges; they are queued until `_take_ranges`."""
+        """Subscribe to a topic of ranges; they are queued until `_read_queued_ranges`."""
         if self._range_node is not None and topic not in self._ranges:
             # Resolve with the remapping arguments of this node.
             name = self.resolve_topic_name(topic)
@@ -141,7 +144,7 @@ class Viewer(ManagedNode):
                 kind, name, lambda _: None, _QOS, raw=True
             )
 
-    def _take_ranges(self) -> None:
+    def _read_queued_ranges(self) -> None:
         # A truth is published before its corrected range: reading truths last and adding them first misses none.
         corrected, truths, raw = (
             list(topics.queued(self._ranges[topic], _QOS.depth)) if topic in self._ranges else []
@@ -155,7 +158,7 @@ class Viewer(ManagedNode):
             for data, _ in queued:
                 take(data)
 
-    def _search(self) -> None:
+    def _discover_topics(self) -> None:
         """Subscribe to topics that have become available or necessary."""
         if self._view is not None:
             self._view.missing = self._missing()
@@ -168,10 +171,10 @@ class Viewer(ManagedNode):
         head, _, tail = self.resolve_topic_name(topics.POSE, only_expand=True).rpartition("/")
         own = re.compile(rf"{re.escape(head)}/(tag_(?:\d+|0x[0-9a-f]+))/{re.escape(tail)}")
         for topic, _ in self.get_topic_names_and_types():
-            if (found := own.fullmatch(topic)) and len(self._others) < MAX_TAGS:
+            if (found := own.fullmatch(topic)) and len(self._subscriptions) < MAX_TAGS:
                 self._subscribe(PoseWithCovarianceStamped, topic, partial(self._feed.pose, found[1]))
 
-    def _missing(self) -> Missing:
+    def _missing(self) -> MissingData:
         """Return the reasons for an empty page, such as a node that is not running."""
         raw, corrected, anchors, poses = (
             self.resolve_topic_name(topic)
@@ -183,7 +186,7 @@ class Viewer(ManagedNode):
             ranges = f"No ranges received: {raw} has a publisher, {corrected} has none. Start the mitigator."
         else:
             ranges = f"No ranges received: {raw} and {corrected} have no publisher. Start the driver and the mitigator."
-        return Missing(
+        return MissingData(
             ranges=ranges,
             anchors=f"No anchor positions: nothing received on {anchors}. Start the locator, or set the parameter anchors.",
             positions="No tag positions yet: see the diagnostics of the locator."

@@ -20,10 +20,10 @@ from uwb_mitigation.viewer.scene import (
     MAX_ID_DIGITS,
     MAX_TRUTHS,
     MAX_WITHOUT_TRUTH,
-    AnchorPlace,
-    Latest,
+    AnchorPosition,
+    BoundedDict,
+    NodeStatus,
     Pose,
-    Report,
     Sample,
     Scene,
     Trace,
@@ -46,8 +46,8 @@ class Feed:
         self.malformed = 0
         self.scene = scene
         self._lock = lock
-        self._truths: Latest[Key, Truth] = Latest(MAX_TRUTHS)
-        self._without_truth: Latest[Key, Sample] = Latest(MAX_WITHOUT_TRUTH)
+        self._truths: BoundedDict[Key, Truth] = BoundedDict(MAX_TRUTHS)
+        self._without_truth: BoundedDict[Key, Sample] = BoundedDict(MAX_WITHOUT_TRUTH)
 
     def clear(self) -> None:
         """Remove everything except the anchors."""
@@ -56,9 +56,9 @@ class Feed:
         with self._lock:
             self.scene.clear()
 
-    def report(self, name: str, report: Report) -> None:
+    def report(self, name: str, report: NodeStatus) -> None:
         with self._lock:
-            self.scene.add_report(name, report)
+            self.scene.set_node_status(name, report)
 
     def range_raw(self, data: bytes) -> None:
         if (measurement := self._decoded(decode_range, data)) is not None:
@@ -89,7 +89,7 @@ class Feed:
         sample = Sample.of(key.stamp_ns / 1e9, corrected, truth)
         with self._lock:
             self.scene.add_sample((key.anchor_id, key.tag_id), sample)
-            self.scene.add_error(sample)
+            self.scene.count_error(sample)
         if truth is None:
             self._without_truth.add(key, sample)
 
@@ -113,20 +113,20 @@ class Feed:
 
     def markers(self, message: Any) -> None:
         """Add the anchors of a visualization_msgs/MarkerArray: namespace `anchors`; the text is the anchor's id."""
-        found: dict[int, AnchorPlace] = {}
+        found: dict[int, AnchorPosition] = {}
         for marker in message.markers:
             position, text = marker.pose.position, marker.text
             if marker.ns != "anchors" or not math.isfinite(position.x + position.y):
                 continue
             if text.isascii() and text.isdigit() and len(text) <= MAX_ID_DIGITS:
-                found[int(text)] = AnchorPlace(position.x, position.y, position.z)
+                found[int(text)] = AnchorPosition(position.x, position.y, position.z)
         if found:
             with self._lock:
                 self.scene.set_anchors(found)
 
     def anchors(self, anchors: AnchorMap) -> None:
         """Set the anchors of an anchors file."""
-        places = {anchor.id: AnchorPlace(*anchor.position, anchor.name) for anchor in anchors.anchors}
+        places = {anchor.id: AnchorPosition(*anchor.position, anchor.name) for anchor in anchors.anchors}
         with self._lock:
             self.scene.set_anchors(places)
 
@@ -135,7 +135,7 @@ class Feed:
         for status in message.status:
             # An octet is bytes in rclpy and int in rosbags.
             level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
-            self.report(str(status.name), Report(level, str(status.message), self.scene.clock()))
+            self.report(str(status.name), NodeStatus(level, str(status.message), self.scene.clock()))
 
     def _decoded(self, decode: Callable[[bytes], Decoded], data: bytes) -> Decoded | None:
         try:

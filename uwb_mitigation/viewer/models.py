@@ -22,7 +22,7 @@ from bokeh.models import (
 )
 from bokeh.plotting import figure
 
-from uwb_mitigation.viewer.scene import STRIP_S, WATERFALL
+from uwb_mitigation.viewer.scene import HISTORY_S, WATERFALL
 
 TRACE_BEFORE, TRACE_AFTER = 20, 180
 """Number of samples shown before and after the first path."""
@@ -62,7 +62,7 @@ class Models:
         )
         self.anchors = _source("x", "y", "name", "id")
         self.tags = _source("x", "y", "name", "width", "height", "angle", "colour")
-        self.trails, self.true_trails = _source("xs", "ys", "colour"), _source("xs", "ys")
+        self.tracks, self.true_tracks = _source("xs", "ys", "colour"), _source("xs", "ys")
         # The map shows these corners until the user changes the view; it must not follow the data.
         self.extent = _source("x", "y")
         self.circles = _source("x", "y", "raw", "range", "colour", "x1", "y1")
@@ -73,7 +73,7 @@ class Models:
         self.errors = _source("left", "right", "raw", "corrected")
         # A figure without data has no axis ranges: invisible corners define them until data arrives.
         self.corners = {name: _source("corner_x", "corner_y") for name in ("cir", "strip")}
-        self.summary, self.notice, self.reports = (
+        self.summary, self.notice, self.node_statuses = (
             Div(text="", sizing_mode="stretch_width", disable_math=True) for _ in range(3)
         )
         self.pause = Toggle(label="Pause", width=90)
@@ -86,7 +86,7 @@ class Models:
             "pause": self.pause,
             "map": self.map_figure,
             "pairs": self._pairs_table(),
-            "reports": self.reports,
+            "node_statuses": self.node_statuses,
             "cir": self.cir_figure,
             "waterfall": self._waterfall(),
             "strip": self.strip_figure,
@@ -115,9 +115,9 @@ class Models:
         plot.segment(
             "x", "y", "x1", "y1", source=self.circles, line_color="colour", line_width=1, line_dash="dotted"
         )
-        plot.multi_line("xs", "ys", source=self.trails, line_color="colour", line_width=1.5)
+        plot.multi_line("xs", "ys", source=self.tracks, line_color="colour", line_width=1.5)
         plot.multi_line(
-            "xs", "ys", source=self.true_trails, line_color=TRUE, line_width=1, line_dash="dashed"
+            "xs", "ys", source=self.true_tracks, line_color=TRUE, line_width=1, line_dash="dashed"
         )
         plot.ellipse(
             "x", "y", width="width", height="height", angle="angle", source=self.tags,
@@ -178,7 +178,7 @@ class Models:
 
     def _strip(self) -> figure:
         plot = _figure("Range", 260, "seconds", "m")
-        plot.x_range = Range1d(-STRIP_S, 0)
+        plot.x_range = Range1d(-HISTORY_S, 0)
         for column, looks in (
             ("raw", {"line_color": RAW, "legend_label": "raw"}),
             ("range", {"line_color": CORRECTED, "line_width": 2, "legend_label": "corrected"}),

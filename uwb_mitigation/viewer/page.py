@@ -31,11 +31,11 @@ from uwb_mitigation.viewer.models import (
 )
 from uwb_mitigation.viewer.scene import (
     ERROR_EDGES_M,
+    HISTORY_S,
     MAX_RANGE_M,
     NO_DATA_S,
-    STRIP_S,
     History,
-    Missing,
+    MissingData,
     Pair,
     Scene,
     Trace,
@@ -58,14 +58,14 @@ COLOURS = {
 LEVELS = ("OK", "WARN", "ERROR", "STALE")
 LEVEL_COLOURS = ("#15803d", "#b45309", "#b91c1c", "#6b7280")
 
-SILENT = "#9ca3af"
+NO_DATA_COLOUR = "#9ca3af"
 """Colour of pairs and tags without recent data."""
 
-ROOM_M = 5.0
+MARGIN_M = 5.0
 """Margin around a tag on a map without anchors."""
 
 _NOTICE_STYLE = "background:#fef3c7;color:#78350f;padding:4px 10px;border-radius:4px;margin-bottom:4px"
-_REPORTS_STYLE = (
+_DIAGNOSTICS_STYLE = (
     "<style>td{padding:2px 10px 2px 4px;vertical-align:top;overflow-wrap:anywhere}"
     "td:first-child{min-width:90px}</style>"
 )
@@ -90,7 +90,7 @@ class View:
     title: str = "UWB ranges"
     window: int = 157
     player: BagPlayer | None = None
-    missing: Missing = field(default_factory=Missing)
+    missing: MissingData = field(default_factory=MissingData)
     pages: int = 0
 
 
@@ -159,7 +159,7 @@ class Page:
             history = None if self._selected is None else scene.pairs.get(self._selected)
             self._draw_strip(scene, history)
             self._draw_trace(() if history is None else tuple(history.traces))
-            self._draw_reports(scene)
+            self._draw_diagnostics(scene)
             if self._changed("errors", scene.errors):
                 raw, corrected = scene.error_counts.astype(float)
                 left, right = ERROR_EDGES_M[:-1], ERROR_EDGES_M[1:]
@@ -186,26 +186,26 @@ class Page:
     def _draw_pairs(self, scene: Scene) -> None:
         rows = []
         for pair, history, sample in scene.latest():
-            silent = _no_data(scene, history)
+            no_data = _no_data(scene, history)
             rows.append(
                 {
                     "anchor": format_id(pair[0]),
                     "tag": format_id(pair[1]),
-                    "rate": 0.0 if silent else history.rate_hz(scene.age_s(history)),
+                    "rate": 0.0 if no_data else history.rate_hz(scene.age_s(history)),
                     "raw": sample.raw_m,
                     "range": sample.range_m,
                     "sigma": sample.sigma_m,
                     "correction": sample.raw_m - sample.range_m,
-                    "status": silent or sample.status.name,
-                    "colour": SILENT if silent else COLOURS[sample.status],
-                    "row_colour": SILENT if silent else "",
+                    "status": no_data or sample.status.name,
+                    "colour": NO_DATA_COLOUR if no_data else COLOURS[sample.status],
+                    "row_colour": NO_DATA_COLOUR if no_data else "",
                 }
             )
         self._rows = [pair for pair, _, _ in scene.latest()]
         if self._selected is None and self._rows:
             self._selected = self._rows[0]
         _set_rows(self._models.pairs, rows)
-        _choose(self._models.pairs, self._rows, self._selected)
+        _select_row(self._models.pairs, self._rows, self._selected)
 
     def _draw_summary(self, scene: Scene) -> None:
         """Show counts, the reason for an empty page, and the pairs and tags that have stopped."""
@@ -240,30 +240,32 @@ class Page:
                 for identity, place in scene.anchors.items()
             ]
             _set_rows(models.anchors, anchors)
-        _choose(models.anchors, list(scene.anchors), None if self._selected is None else self._selected[0])
-        tags, trails = [], []
+        _select_row(
+            models.anchors, list(scene.anchors), None if self._selected is None else self._selected[0]
+        )
+        tags, tracks = [], []
         for name, tag in scene.tags.items():
             colour = SMOOTHED if name.endswith(" smoothed") else CORRECTED
-            trails.append(_line(tag.trail) | {"colour": colour})
+            tracks.append(_line(tag.track) | {"colour": colour})
             if (pose := tag.pose) is None:
                 continue
-            silent = scene.age_s(tag) > NO_DATA_S
+            no_data = scene.age_s(tag) > NO_DATA_S
             major, minor, angle = pose.ellipse
             tags.append(
                 {
                     "x": pose.x,
                     "y": pose.y,
-                    "name": f"{name}: no data for {scene.age_s(tag):.0f} s" if silent else name,
-                    "colour": SILENT if silent else colour,
+                    "name": f"{name}: no data for {scene.age_s(tag):.0f} s" if no_data else name,
+                    "colour": NO_DATA_COLOUR if no_data else colour,
                     "width": _finite(_drawable(2 * major)),
                     "height": _finite(_drawable(2 * minor)),
                     "angle": _finite(angle),
                 }
             )
         _set_rows(models.tags, tags)
-        _set_rows(models.trails, trails)
-        _set_rows(models.true_trails, [_line(trail) for trail in scene.true_trails.values()])
-        fitted = bool(scene.anchors), bool(scene.anchors or scene.tags or scene.true_trails)
+        _set_rows(models.tracks, tracks)
+        _set_rows(models.true_tracks, [_line(track) for track in scene.true_tracks.values()])
+        fitted = bool(scene.anchors), bool(scene.anchors or scene.tags or scene.true_tracks)
         # The view is set for the first content and for the first anchors, and then only by the user.
         if fitted > self._fitted or not models.extent.data["x"]:
             self._fitted = fitted
@@ -273,12 +275,12 @@ class Page:
     def _fit(self, scene: Scene) -> None:
         """Fit the view of the map to its current content."""
         places = [(place.x, place.y) for place in scene.anchors.values()]
-        for trail in (*(tag.trail for tag in scene.tags.values()), *scene.true_trails.values()):
-            places += trail
+        for track in (*(tag.track for tag in scene.tags.values()), *scene.true_tracks.values()):
+            places += track
         x, y = np.array(places or [(0.0, 0.0), (10.0, 10.0)]).T
         # Without anchors, leave a margin in which the tag can move.
-        room = 0.0 if scene.anchors or not places else ROOM_M
-        corners = {"x": [x.min() - room, x.max() + room], "y": [y.min() - room, y.max() + room]}
+        margin = 0.0 if scene.anchors or not places else MARGIN_M
+        corners = {"x": [x.min() - margin, x.max() + margin], "y": [y.min() - margin, y.max() + margin]}
         self._models.extent.data = {name: [float(value) for value in ends] for name, ends in corners.items()}
 
     def _draw_circles(self, scene: Scene) -> None:
@@ -309,7 +311,7 @@ class Page:
             return
         now_s = scene.now_s
         kept = () if history is None else tuple(history.samples)
-        samples = [sample for sample in kept if sample.time_s >= now_s - STRIP_S]
+        samples = [sample for sample in kept if sample.time_s >= now_s - HISTORY_S]
         self._models.show_empty("strip", all(math.isnan(_drawable(sample.raw_m)) for sample in samples))
         values = {
             "age": [sample.time_s - now_s for sample in samples],
@@ -349,17 +351,17 @@ class Page:
         }
         _set_rows(models.marks, [marks])
 
-    def _draw_reports(self, scene: Scene) -> None:
-        rows = [(name, report.at(scene.clock())) for name, report in sorted(scene.reports.items())]
-        if self._changed("reports", rows):
+    def _draw_diagnostics(self, scene: Scene) -> None:
+        rows = [(name, report.at(scene.clock())) for name, report in sorted(scene.node_statuses.items())]
+        if self._changed("node_statuses", rows):
             # Escape these texts: they come from messages and may contain HTML.
             cells = [
                 f"<tr><td>{html.escape(name)}</td>"
                 f"<td>{_level(report.level)}</td><td>{html.escape(report.message)}</td></tr>"
                 for name, report in rows
             ]
-            self._models.reports.text = (
-                f"{_REPORTS_STYLE}<table>{''.join(cells)}</table>" if cells else "none yet"
+            self._models.node_statuses.text = (
+                f"{_DIAGNOSTICS_STYLE}<table>{''.join(cells)}</table>" if cells else "none yet"
             )
 
     def _changed(self, name: str, value: object) -> bool:
@@ -383,7 +385,7 @@ class Page:
         if pairs and selected not in pairs:
             self.select(next((pair for pair in pairs if selected and pair[1] == selected[1]), pairs[0]))
         else:
-            _choose(source, anchors, None if selected is None else selected[0])
+            _select_row(source, anchors, None if selected is None else selected[0])
 
     def _on_reset(self, _event: Reset) -> None:
         with self._view.lock:
@@ -416,7 +418,7 @@ def _set_rows(source: ColumnDataSource, rows: list[dict[str, Any]]) -> None:
     source.data = {column: [row[column] for row in rows] for column in source.data}
 
 
-def _choose(source: ColumnDataSource, rows: list[Any], chosen: object) -> None:
+def _select_row(source: ColumnDataSource, rows: list[Any], chosen: object) -> None:
     """Select a row of a source, or clear the selection."""
     indices = [rows.index(chosen)] if chosen in rows else []
     if source.selected.indices != indices:
@@ -443,8 +445,8 @@ def _level(level: int) -> str:
     return f'<span style="color:{LEVEL_COLOURS[level]};font-weight:600;white-space:nowrap">{LEVELS[level]}</span>'
 
 
-def _line(trail: Iterable[tuple[float, float]]) -> dict[str, Any]:
-    return {"xs": [x for x, _ in trail], "ys": [y for _, y in trail]}
+def _line(track: Iterable[tuple[float, float]]) -> dict[str, Any]:
+    return {"xs": [x for x, _ in track], "ys": [y for _, y in track]}
 
 
 def _utc(time_s: float) -> str:

@@ -38,7 +38,7 @@ from uwb_mitigation.errors import ParameterError, RecordingError
 from uwb_mitigation.measurement import RangeMeasurement
 from uwb_mitigation.mitigation import Backend
 from uwb_mitigation.viewer.feed import Feed
-from uwb_mitigation.viewer.scene import MAX_MESSAGES, PLAIN, STRIP_S, Missing, Report
+from uwb_mitigation.viewer.scene import DEFAULT_TAG, HISTORY_S, MAX_MESSAGES, MissingData, NodeStatus
 
 DIAGNOSTICS = "/diagnostics"
 DIAGNOSTICS_TYPE = "diagnostic_msgs/msg/DiagnosticArray"
@@ -98,7 +98,7 @@ class BagPlayer:
         self.position_s = 0.0
         self.playing = False
         self.corrects = has_ranges and prefix + RANGE_CORRECTED not in topics
-        self.missing = Missing(
+        self.missing = MissingData(
             ranges="No ranges up to this time."
             if has_ranges
             else "The recording contains tracks without ranges.",
@@ -114,7 +114,7 @@ class BagPlayer:
         self._clock_s = 0.0
         feed.scene.clock = lambda: self._clock_s
         per_s = self._bag.message_count / max(self.seconds, 1e-9)
-        self._window_s = min(STRIP_S, MAX_MESSAGES / max(per_s, 1e-9))
+        self._window_s = min(HISTORY_S, MAX_MESSAGES / max(per_s, 1e-9))
         # Anchors are published once at the beginning.
         if (topic := prefix + ANCHORS) in self._callbacks:
             with contextlib.suppress(RecordingError):
@@ -164,7 +164,7 @@ class BagPlayer:
                 self._callbacks[message.channel.topic](message.data)
         except RecordingError as error:
             self._messages = iter(())
-            self._feed.report("recording", Report(2, f"{error.what}: nothing beyond can be shown"))
+            self._feed.report("recording", NodeStatus(2, f"{error.what}: nothing beyond can be shown"))
         self._correct()
         self._clock_s = self.position_s
 
@@ -222,7 +222,7 @@ def _positions(prefix: str, topics: Iterable[str]) -> dict[str, tuple[str, str]]
     Tracks (the output of `track`) are used only if there are no poses.
     """
     found = {
-        topic: (match[2] or PLAIN, f"/uwb/{match[3]}")
+        topic: (match[2] or DEFAULT_TAG, f"/uwb/{match[3]}")
         for topic in topics
         if (match := _POSITION_TOPIC.fullmatch(topic)) and match[1] == prefix
     }

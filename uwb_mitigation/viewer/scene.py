@@ -21,11 +21,11 @@ from uwb_mitigation.bag.poses import tag_frame
 from uwb_mitigation.measurement import Cir, CorrectedRange, Encoding, Status, Truth
 
 # Limits. Ids and texts come from the air or the network; above a limit, the oldest entries are removed.
-MAX_PAIRS, MAX_TAGS, MAX_REPORTS, MAX_ANCHORS = 256, 64, 64, 256
+MAX_PAIRS, MAX_TAGS, MAX_NODES, MAX_ANCHORS = 256, 64, 64, 256
 MAX_TRUTHS, MAX_WITHOUT_TRUTH = 10_000, 1000
 """Maximum number of truths without corrected ranges, and of corrected ranges without truths."""
-MAX_STRIP, MAX_TRAIL = 6000, 1200
-"""Maximum points of a strip chart (100 ranges per second for a minute) and of a tag's trail."""
+MAX_SAMPLES, MAX_TRACK = 6000, 1200
+"""Maximum points of a strip chart (100 ranges per second for a minute) and of a tag's track."""
 WATERFALL = 50
 """Maximum number of CIRs of each pair."""
 MAX_VALUES = 2 * 1016
@@ -42,7 +42,7 @@ MAX_MESSAGES = 40_000
 """Maximum number of messages that are read at a seek; older ones are skipped."""
 
 # Times.
-STRIP_S = 60.0
+HISTORY_S = 60.0
 """Length of the strip chart of a pair."""
 NO_DATA_S, NO_DATA_INTERVALS = 3.0, 3.0
 """A pair or a tag has no data after this time, or after this number of its mean intervals if that is longer."""
@@ -57,14 +57,14 @@ ERROR_EDGES_M = np.linspace(-1.0, 2.0, 61)
 Pair = tuple[int, int]
 """Anchor and tag."""
 
-PLAIN = "tag"
+DEFAULT_TAG = "tag"
 """Name of the tag whose topics have the plain names; the others are named as `tag_frame` does."""
 
 K = TypeVar("K")
 V = TypeVar("V")
 
 
-class Latest(OrderedDict[K, V]):
+class BoundedDict(OrderedDict[K, V]):
     """A dictionary that keeps the latest `limit` entries that were added."""
 
     def __init__(self, limit: int) -> None:
@@ -155,13 +155,13 @@ class History:
     """
 
     received_s: float = math.nan
-    samples: deque[Sample] = field(default_factory=lambda: deque(maxlen=MAX_STRIP))
+    samples: deque[Sample] = field(default_factory=lambda: deque(maxlen=MAX_SAMPLES))
     traces: deque[Trace] = field(default_factory=lambda: deque(maxlen=WATERFALL))
 
     def add(self, sample: Sample, now_s: float) -> None:
         """Add a range, and remove ranges that are older than a minute."""
         self.samples.append(sample)
-        while self.samples[0].time_s < now_s - STRIP_S:
+        while self.samples[0].time_s < now_s - HISTORY_S:
             self.samples.popleft()
 
     @property
@@ -204,15 +204,15 @@ class Pose:
 
 @dataclass(slots=True)
 class Tag:
-    """A tag's latest pose, its time of reception on the scene's clock, and its trail."""
+    """A tag's latest pose, its time of reception on the scene's clock, and its track."""
 
     pose: Pose | None = None
     received_s: float = math.nan
-    trail: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=MAX_TRAIL))
+    track: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=MAX_TRACK))
 
 
 @dataclass(frozen=True, slots=True)
-class AnchorPlace:
+class AnchorPosition:
     """An anchor on the map, m."""
 
     x: float
@@ -222,7 +222,7 @@ class AnchorPlace:
 
 
 @dataclass(frozen=True, slots=True)
-class Report:
+class NodeStatus:
     """The latest diagnostics of one node: level 0 OK, 1 WARN, 2 ERROR, 3 STALE.
 
     Attributes:
@@ -233,7 +233,7 @@ class Report:
     message: str
     received_s: float = math.nan
 
-    def at(self, now_s: float) -> Report:
+    def at(self, now_s: float) -> NodeStatus:
         """Return the report at a time: STALE with the age if the node has stopped reporting."""
         age_s = now_s - self.received_s
         if not age_s > STALE_S:
@@ -242,7 +242,7 @@ class Report:
 
 
 @dataclass(slots=True)
-class Missing:
+class MissingData:
     """Messages of the page if there are no ranges, anchors or positions; empty: no message."""
 
     ranges: str = "No ranges received."
@@ -259,7 +259,7 @@ class Scene:
         now_s: the latest stamp plus the time since then; NaN before any.
         ranges: number of ranges.
         pairs: {(anchor, tag): history of its last minute}, the latest at the end.
-        tags, true_trails, anchors, reports: {id or name: ...}.
+        tags, true_tracks, anchors, node_statuses: {id or name: ...}.
         revision: increases with every change, so that a page draws only changes.
     """
 
@@ -267,11 +267,11 @@ class Scene:
         self.clock = clock
         self._latest_s = self._received_s = math.nan
         self.ranges = 0
-        self.pairs: Latest[Pair, History] = Latest(MAX_PAIRS)
-        self.tags: Latest[str, Tag] = Latest(MAX_TAGS)
-        self.true_trails: Latest[str, deque[tuple[float, float]]] = Latest(MAX_TAGS)
-        self.anchors: dict[int, AnchorPlace] = {}
-        self.reports: Latest[str, Report] = Latest(MAX_REPORTS)
+        self.pairs: BoundedDict[Pair, History] = BoundedDict(MAX_PAIRS)
+        self.tags: BoundedDict[str, Tag] = BoundedDict(MAX_TAGS)
+        self.true_tracks: BoundedDict[str, deque[tuple[float, float]]] = BoundedDict(MAX_TAGS)
+        self.anchors: dict[int, AnchorPosition] = {}
+        self.node_statuses: BoundedDict[str, NodeStatus] = BoundedDict(MAX_NODES)
         self.error_counts = np.zeros((2, len(ERROR_EDGES_M) - 1), np.int64)
         self.error_sums_m = np.zeros(2)
         self.errors = 0
@@ -298,8 +298,8 @@ class Scene:
         """
         known = self.pairs.get(pair)
         latest = None if known is None else known.latest
-        if sample.time_s < self._latest_s - STRIP_S or (latest and sample.time_s < latest.time_s - 1.0):
-            self.rewind()
+        if sample.time_s < self._latest_s - HISTORY_S or (latest and sample.time_s < latest.time_s - 1.0):
+            self.clear_history()
         if not sample.time_s < self._latest_s:
             self._latest_s, self._received_s = sample.time_s, self.clock()
         self.ranges += 1
@@ -307,7 +307,7 @@ class Scene:
         history.add(sample, self._latest_s)
         history.received_s = self.clock()
 
-    def add_error(self, sample: Sample) -> None:
+    def count_error(self, sample: Sample) -> None:
         """Count a range in the histograms if its truth is known."""
         errors_m = np.array([sample.raw_m - sample.true_m, sample.range_m - sample.true_m])
         if not (np.abs(errors_m) <= MAX_RANGE_M).all():
@@ -320,7 +320,7 @@ class Scene:
     def set_truth(self, sample: Sample, truth: Truth) -> None:
         """Set the truth of a range that was added without it."""
         sample.true_m, sample.label = truth.range_m, truth.label
-        self.add_error(sample)
+        self.count_error(sample)
         self.revision += 1
 
     def add_trace(self, pair: Pair, trace: Trace) -> None:
@@ -330,40 +330,40 @@ class Scene:
         if _is_plausible(pose.x, pose.y):
             entry = self.tags.add(tag[:MAX_TEXT], self.tags.get(tag[:MAX_TEXT]) or Tag())
             entry.pose, entry.received_s = pose, self.clock()
-            entry.trail.append((pose.x, pose.y))
+            entry.track.append((pose.x, pose.y))
             self.revision += 1
 
     def add_true_position(self, tag: str, x: float, y: float) -> None:
         """Add the true position of a tag; `tag` is its name in the truth."""
         if _is_plausible(x, y):
-            trail = self.true_trails.get(tag[:MAX_TEXT]) or deque(maxlen=MAX_TRAIL)
-            self.true_trails.add(tag[:MAX_TEXT], trail).append((x, y))
+            track = self.true_tracks.get(tag[:MAX_TEXT]) or deque(maxlen=MAX_TRACK)
+            self.true_tracks.add(tag[:MAX_TEXT], track).append((x, y))
             self.revision += 1
 
-    def set_anchors(self, anchors: dict[int, AnchorPlace]) -> None:
+    def set_anchors(self, anchors: dict[int, AnchorPosition]) -> None:
         plausible = ((id_, place) for id_, place in anchors.items() if _is_plausible(place.x, place.y))
         self.anchors = dict(islice(plausible, MAX_ANCHORS))
         self.revision += 1
 
-    def add_report(self, name: str, report: Report) -> None:
-        self.reports.add(name[:MAX_TEXT], replace(report, message=report.message[:MAX_TEXT]))
+    def set_node_status(self, name: str, report: NodeStatus) -> None:
+        self.node_statuses.add(name[:MAX_TEXT], replace(report, message=report.message[:MAX_TEXT]))
         self.revision += 1
 
-    def rewind(self) -> None:
+    def clear_history(self) -> None:
         """Remove the last minute, but not the counts, the anchors and the diagnostics."""
         self._latest_s = self._received_s = math.nan
         for history in self.pairs.values():
             history.samples.clear()
             history.traces.clear()
         self.tags.clear()
-        self.true_trails.clear()
+        self.true_tracks.clear()
 
     def clear(self) -> None:
         """Remove everything except the anchors."""
-        self.rewind()
+        self.clear_history()
         self.pairs.clear()
         self.ranges = 0
-        self.reports.clear()
+        self.node_statuses.clear()
         self.error_counts[:] = 0
         self.error_sums_m[:] = 0
         self.errors = 0
@@ -379,7 +379,7 @@ class Scene:
         """Return the tag of a range: the tag of that name, else the plain tag if it is the only one without a name."""
         own = self.tags.get(tag_frame(tag_id))
         nameless = {tag for _, tag in self.pairs if tag_frame(tag) not in self.tags}
-        return self.tags.get(PLAIN) if own is None and nameless == {tag_id} else own
+        return self.tags.get(DEFAULT_TAG) if own is None and nameless == {tag_id} else own
 
 
 def _is_plausible(x: float, y: float) -> bool:

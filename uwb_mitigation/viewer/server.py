@@ -178,13 +178,13 @@ def accepted_hosts(host: str, port: int, more: tuple[str, ...]) -> list[str]:
     """
     names = {"localhost", "127.0.0.1"}
     if host in ALL_ADDRESSES:
-        names |= _own_names()
+        names |= _machine_names()
     else:
         names.add(host.lower())
     return [*(f"{name}:{port}" for name in sorted(names)), *(origin.lower() for origin in more)]
 
 
-def _own_names() -> set[str]:
+def _machine_names() -> set[str]:
     """Return the name and the IPv4 addresses of this machine."""
     name = socket.gethostname().lower()
     entries = [entry for interface in psutil.net_if_addrs().values() for entry in interface]
