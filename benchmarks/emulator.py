@@ -82,7 +82,7 @@ class Emulation:
         records: structured array, one row per input. Windows: `status`, `output_m`. CIRs: `status`,
             `range_m`, `correction_m`, `variance_m2`, `range_status`, `window`.
         instructions: maximum per inference over all windows; 0 for CIRs.
-        instructions_correct: maximum of preprocessing, prior and inference together; 0 for windows.
+        instructions_correct: maximum of preprocessing, linear bias model and inference together; 0 for windows.
         arena_bytes, stack_bytes: memory of one inference.
     """
 

@@ -26,7 +26,7 @@ from uwb_mitigation.firmware_export.toolchain import Kernels, Target, build_imag
 from uwb_mitigation.model import graph
 from uwb_mitigation.model.architecture import Mlp
 from uwb_mitigation.model.bundle import Bundle, Card, session_options
-from uwb_mitigation.model.prior import LinePrior
+from uwb_mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.model.weights import Int8Weights
 from uwb_mitigation.paper import published
 from uwb_mitigation.preprocessing import Preprocessing, Scaling
@@ -129,7 +129,7 @@ def network_of(weights: Int8Weights, card: Card | None, model_id: int, onnx: byt
         "random weights",
         shape,
         Preprocessing(shape.samples, Scaling.PREAMBLE),
-        LinePrior(0.0),
+        LinearBiasModel(0.0),
         quantised=True,
         variance_m2=1.0,
         variance_uncorrected_m2=1.0,

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.evaluation.lad import fit_prior
+from uwb_mitigation.evaluation.linear_fit import fit_linear_bias
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import load_bundle
-from uwb_mitigation.model.prior import LinePrior
+from uwb_mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.model.shipped import default_model_path
 from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.geometry import Area, Height
@@ -157,8 +157,8 @@ def apartment(folder: Path) -> StaticErrors:
         used = np.unique(row[own])
         if len(used) < 3:
             continue
-        prior = fit_prior(configuration[~own], power[~own], first[~own], error[~own])
-        better = range_m - prior.predict_m(power, first)
+        linear_bias = fit_linear_bias(configuration[~own], power[~own], first[~own], error[~own])
+        better = range_m - linear_bias.predict_m(power, first)
         left = [
             np.nanmean((better - range_m + error)[~own & (configuration == c)])
             for c in np.unique(configuration[~own])
@@ -193,12 +193,12 @@ class FlatErrors:
 
 def flat(anchor_count: int, seed: int = 1, ranges: int = 3000) -> FlatErrors:
     """Drive past 4 to 8 anchors; the line is fitted to a survey of 150 other placements in the same flat."""
-    prior, variance = _flat_line()
+    linear_bias, variance = _flat_line()
     drive = SimulatedSource.with_anchors(anchor_count, seed=seed, count=ranges, rate_hz=40.0)
     records = list(drive)
     raw, truth = columns(drive, drive.anchors)
     first = np.array([record.measurement.cir.first_path_power_dbm for record in records], np.float32)
-    predicted = prior.predict_m(raw.rx_power_dbm.astype(np.float32), first)
+    predicted = linear_bias.predict_m(raw.rx_power_dbm.astype(np.float32), first)
     told = Mitigation(load_bundle(default_model_path())).correct([record.measurement for record in records])
     by_line = raw.range_m - predicted, np.full(len(raw), variance)
     by_network = np.array([one.range_m for one in told]), np.array([one.variance_m2 for one in told])
@@ -221,7 +221,7 @@ def _flat_errors(name: str, anchors: AnchorMap, ranges: Ranges, truth: TruePath)
     return Errors(name, *(track_errors(track, truth) for track in tracks))
 
 
-def _flat_line() -> tuple[LinePrior, float]:
+def _flat_line() -> tuple[LinearBiasModel, float]:
     """Return the line and the variance of its residuals, from the mean absolute error, which the fit minimises."""
     survey = list(SimulatedSurvey(seed=11, configurations=150, exchanges=6))
     truths = [record.truth for record in survey if record.truth is not None]
@@ -230,6 +230,6 @@ def _flat_line() -> tuple[LinePrior, float]:
     ]
     power = np.array([record.measurement.cir.rx_power_dbm for record in survey], np.float32)
     first = np.array([record.measurement.cir.first_path_power_dbm for record in survey], np.float32)
-    prior = fit_prior(np.array([truth.configuration for truth in truths]), power, first, error)
-    left = np.abs(error - prior.predict_m(power, first))
-    return prior, (1.2533 * float(left.mean())) ** 2
+    linear_bias = fit_linear_bias(np.array([truth.configuration for truth in truths]), power, first, error)
+    left = np.abs(error - linear_bias.predict_m(power, first))
+    return linear_bias, (1.2533 * float(left.mean())) ** 2

@@ -19,9 +19,9 @@ from uwb_mitigation.firmware_export.packing import pack
 from uwb_mitigation.measurement import Cir, Encoding, RangeMeasurement
 from uwb_mitigation.model import graph
 from uwb_mitigation.model.bundle import Bundle, save_bundle
-from uwb_mitigation.model.familiarity import Band, Familiarity
 from uwb_mitigation.model.integer import IntegerNetwork
-from uwb_mitigation.model.prior import LinePrior
+from uwb_mitigation.model.linear_bias import LinearBiasModel
+from uwb_mitigation.model.ood import Band, OodBands
 from uwb_mitigation.model.weights import Int8Weights
 from uwb_mitigation.paper import published
 from uwb_mitigation.preprocessing import Preprocessing, Scaling
@@ -35,12 +35,12 @@ def write_model(folder: Path, weights: Int8Weights, **changes: object) -> Path:
     network = pack(weights)
     windows = golden_windows(network)
     golden = Golden(windows, IntegerNetwork(weights).predict_m(windows))
-    card = model_material.card(weights.architecture, **({"prior": LinePrior(0.25)} | changes))
+    card = model_material.card(weights.architecture, **({"linear_bias": LinearBiasModel(0.25)} | changes))
     return write_header(folder, network, card, MODEL_ID, golden)
 
 
 def exact_bundle(folder: Path, samples: int = 32, **changes: object) -> Bundle:
-    """A bundle of random weights, with scales that the firmware can equal, and a prior that needs powers."""
+    """A bundle of random weights, with scales that the firmware can equal, and a linear bias model that needs powers."""
     weights = random_networks.remnet(samples, 3)
     card = model_material.card(weights.architecture, correction_limits_m=(-500.0, 500.0), **changes)
     return save_bundle(folder / "exact.onnx", graph.int8_model(weights), card)
@@ -61,10 +61,10 @@ def choosy_bundle(folder: Path, samples: int = 32, scaling: Scaling = Scaling.PR
             folder,
             samples,
             variance_per_m2=0.0078125,
-            familiarity=Familiarity(0.125, Band(0.5, 3.0, 2.0), lead_level_db=lead),
+            ood_bands=OodBands(0.125, Band(0.5, 3.0, 2.0), lead_level_db=lead),
             preprocessing=Preprocessing(samples, scaling),
         )
-    familiarity = Familiarity(
+    ood_bands = OodBands(
         0.125,
         Band(0.5, 3.0, 2.0),
         Band(-90.0, -81.0, 40.0),
@@ -73,7 +73,7 @@ def choosy_bundle(folder: Path, samples: int = 32, scaling: Scaling = Scaling.PR
         Band(20.0, 101.0, 70.0),
         lead,
     )
-    return exact_bundle(folder, samples, variance_per_m2=0.0078125, familiarity=familiarity)
+    return exact_bundle(folder, samples, variance_per_m2=0.0078125, ood_bands=ood_bands)
 
 
 def random_cir(random: np.random.Generator) -> Cir:

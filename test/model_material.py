@@ -14,12 +14,12 @@ from uwb_mitigation.model import graph
 from uwb_mitigation.model.architecture import HEAD, Remnet
 from uwb_mitigation.model.bundle import Bundle, Card, save_bundle
 from uwb_mitigation.model.integer import IntegerNetwork
-from uwb_mitigation.model.prior import LinePrior
+from uwb_mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.model.weights import FloatWeights, Int8Weights
 from uwb_mitigation.preprocessing import Preprocessing, Scaling
 from uwb_mitigation.training.quantization import quantize
 
-LINE = LinePrior(*(float(np.float32(value)) for value in (-5.0, -0.0691, -0.0126)))
+LINE = LinearBiasModel(*(float(np.float32(value)) for value in (-5.0, -0.0691, -0.0126)))
 
 
 def random_weights(architecture: Remnet, seed: int = 0) -> FloatWeights:
@@ -59,7 +59,7 @@ def card(architecture: Remnet, *, quantised: bool = True, **changes: object) -> 
         "name": "material",
         "architecture": architecture,
         "preprocessing": Preprocessing(architecture.samples, Scaling.PREAMBLE),
-        "prior": LINE,
+        "linear_bias": LINE,
         "quantised": quantised,
         "variance_m2": 0.0625,
         "variance_uncorrected_m2": 0.5,

@@ -19,7 +19,7 @@ from uwb_mitigation.model import bundle as bundles
 from uwb_mitigation.model import floating, graph
 from uwb_mitigation.model.architecture import Remnet
 from uwb_mitigation.model.bundle import Session, load_bundle, parse_bundle, save_bundle, session_options
-from uwb_mitigation.model.prior import LinePrior
+from uwb_mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.model.shipped import default_model_path, shipped_model_path
 from uwb_mitigation.preprocessing import Scaling
 
@@ -64,9 +64,11 @@ def test_what_is_saved_is_what_loads(saved):
 
 def test_float32_numbers_read_back_to_the_bit(tmp_path):
     awkward = [float(np.float32(value)) for value in (0.1, -1e-7, 1 / 3)]
-    written = bundle(tmp_path, SHAPE, prior=LinePrior(*awkward), variance_m2=float(np.float32(0.3)))
+    written = bundle(
+        tmp_path, SHAPE, linear_bias=LinearBiasModel(*awkward), variance_m2=float(np.float32(0.3))
+    )
     loaded = load_bundle(written.path)
-    assert loaded.prior == LinePrior(*awkward)
+    assert loaded.linear_bias == LinearBiasModel(*awkward)
     assert loaded.card.variance_m2 == float(np.float32(0.3))
 
 
@@ -137,8 +139,8 @@ def test_inconsistent_metadata_is_refused(saved, change):
 def test_without_a_prior_the_network_predicts_alone(saved):
     data = with_metadata(saved.model, lambda metadata: metadata.update(prior=None))
     loaded = parse_bundle(data, Path("some.onnx"))
-    assert loaded.prior == LinePrior(0.0)
-    assert not loaded.prior.needs_power
+    assert loaded.linear_bias == LinearBiasModel(0.0)
+    assert not loaded.linear_bias.needs_power
 
 
 def test_a_card_that_does_not_fit_its_graph_is_not_written(tmp_path):

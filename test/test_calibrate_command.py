@@ -119,7 +119,7 @@ def test_a_drive_becomes_a_bundle_and_offsets_that_better_other_ranges(site):
     assert set(result["offsets_m"]) == {f"7-{anchor}" for anchor in range(1, 6)}
     bundle, offsets = load_bundle(site / "site.onnx"), read_offsets(str(site / "site.offsets.yaml"))
     assert bundle.card.training["calibrated"] == "without truth"
-    assert bundle.prior.per_rx_power == pytest.approx(-0.02, abs=0.006)
+    assert bundle.linear_bias.per_rx_power == pytest.approx(-0.02, abs=0.006)
     assert "without truth" in bundle.card.origin
     # Without a CIR: the line and the offset count, since the network has nothing to say.
     cir = Cir(np.zeros(0, np.int16), rx_power_dbm=-85.0)

@@ -113,7 +113,7 @@ def test_train_quantize_evaluate_from_end_to_end(tmp_path, recording):
     assert names == ["raw", "overall_median", "l1_line", "float", "int8"]
     assert run("quantize", floats, "--data", "any", "-o", integers).exit_code == 0
     assert load_bundle(integers).quantised
-    assert load_bundle(integers).prior == load_bundle(floats).prior
+    assert load_bundle(integers).linear_bias == load_bundle(floats).linear_bias
     result = run("evaluate", "--data", "any", "--model", integers, "--json", tmp_path / "e.json")
     assert result.exit_code == 0
     found = json.loads((tmp_path / "e.json").read_text())

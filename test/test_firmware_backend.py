@@ -18,7 +18,7 @@ from compilers import NEEDS_CC
 from uwb_mitigation.bag.codec import encode_range
 from uwb_mitigation.errors import MissingDependencyError
 from uwb_mitigation.firmware_export import compiling
-from uwb_mitigation.firmware_export.host import FirmwareMitigation
+from uwb_mitigation.firmware_export.compiled import FirmwareMitigation
 from uwb_mitigation.measurement import Status
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import Bundle

@@ -41,7 +41,7 @@ def test_the_shipped_model_is_exported_with_its_identity(tmp_path: Path):
     bundle = load_bundle(default_model_path())
     text = export_bundle(bundle, tmp_path / "new" / "folder").read_text()
     assert f"0x{bundle.model_id:08x}u" in text
-    assert number(bundle.prior.per_rx_power) in text
+    assert number(bundle.linear_bias.per_rx_power) in text
 
 
 def test_a_float_bundle_is_refused_with_the_remedy(tmp_path: Path):

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from compilers import NEEDS_CC
 
+from uwb_mitigation.firmware_export.compiled import link
 from uwb_mitigation.firmware_export.compiling import firmware_folder
 from uwb_mitigation.firmware_export.export import export_bundle
-from uwb_mitigation.firmware_export.host import link
 from uwb_mitigation.link import messages
 from uwb_mitigation.link.board import Board
 from uwb_mitigation.link.emulated_board import EMULATED

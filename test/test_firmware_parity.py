@@ -17,16 +17,16 @@ from firmware_models import Exported
 
 from benchmarks import random_networks
 from uwb_mitigation.errors import UwbMitigationError
+from uwb_mitigation.firmware_export.compiled import CompiledFirmware, link
 from uwb_mitigation.firmware_export.compiling import firmware_folder, run
 from uwb_mitigation.firmware_export.export import export_bundle
-from uwb_mitigation.firmware_export.host import HostFirmware, link
 from uwb_mitigation.measurement import Status
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model import graph
 from uwb_mitigation.model.architecture import HEAD
 from uwb_mitigation.model.bundle import load_bundle, save_bundle
 from uwb_mitigation.model.integer import IntegerNetwork
-from uwb_mitigation.model.prior import LinePrior
+from uwb_mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.model.shipped import default_model_path, shipped_model_path
 from uwb_mitigation.preprocessing import Preprocessing, Scaling
 
@@ -46,22 +46,24 @@ def exported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
 
 
 @pytest.fixture(scope="module")
-def compiled(exported: Exported) -> HostFirmware:
-    return HostFirmware(exported.folder, exported.folder)
+def compiled(exported: Exported) -> CompiledFirmware:
+    return CompiledFirmware(exported.folder, exported.folder)
 
 
-def check_windows(exported: Exported, compiled: HostFirmware, windows: np.ndarray) -> None:
+def check_windows(exported: Exported, compiled: CompiledFirmware, windows: np.ndarray) -> None:
     expected = bits(exported.subject.expect(windows))
     assert np.array_equal(bits(IntegerNetwork(exported.weights).predict_m(windows)), expected)
     assert np.array_equal(bits(compiled.predict_m(windows)), expected)
 
 
-def test_c_and_oracle_equal_onnx_runtime_on_five_thousand_windows(exported: Exported, compiled: HostFirmware):
+def test_c_and_oracle_equal_onnx_runtime_on_five_thousand_windows(
+    exported: Exported, compiled: CompiledFirmware
+):
     check_windows(exported, compiled, exported.windows())
 
 
 def test_c_and_oracle_equal_onnx_runtime_on_real_logs(
-    exported: Exported, compiled: HostFirmware, apartment: Path
+    exported: Exported, compiled: CompiledFirmware, apartment: Path
 ):
     windows = exported.real_windows(apartment)
     assert len(windows) > 1000
@@ -73,7 +75,7 @@ def test_any_length_and_number_of_modules(samples: int, modules: int, tmp_path: 
     weights = random_networks.remnet(samples, 3, modules)
     firmware_models.write_model(tmp_path, weights)
     windows = random_networks.pressing_windows(samples, weights.activation_scale["input"], 40)
-    computed = HostFirmware(tmp_path, tmp_path, SANITIZED).predict_m(windows)
+    computed = CompiledFirmware(tmp_path, tmp_path, SANITIZED).predict_m(windows)
     assert np.array_equal(bits(computed), bits(IntegerNetwork(weights).predict_m(windows)))
 
 
@@ -85,11 +87,11 @@ def test_a_prediction_that_overflows_is_a_failure_of_the_model_as_for_the_mitiga
     weights = random_networks.remnet(16, 3)
     scales = {**weights.weight_scale, HEAD: np.array([1e31], np.float32)}
     model = graph.int8_model(replace(weights, weight_scale=scales))
-    largest = LinePrior(sign * float(np.finfo(np.float32).max))
-    card = model_material.card(weights.architecture, prior=largest, correction_limits_m=(-500.0, 500.0))
+    largest = LinearBiasModel(sign * float(np.finfo(np.float32).max))
+    card = model_material.card(weights.architecture, linear_bias=largest, correction_limits_m=(-500.0, 500.0))
     bundle = save_bundle(tmp_path / "huge.onnx", model, card)
     export_bundle(bundle, tmp_path)
-    firmware, mitigation = HostFirmware(tmp_path, tmp_path, SANITIZED), Mitigation(bundle)
+    firmware, mitigation = CompiledFirmware(tmp_path, tmp_path, SANITIZED), Mitigation(bundle)
     measurement = model_material.measurement()
     expected = mitigation.correct([measurement])[0]
     # This network's output is large and negative: it overflows the one, and keeps the other finite.
@@ -106,7 +108,7 @@ def test_a_prediction_that_overflows_is_a_failure_of_the_model_as_for_the_mitiga
 def test_real_logs_are_corrected_as_by_the_mitigator(shipped: Path, apartment: Path, tmp_path: Path):
     bundle = load_bundle(shipped)
     export_bundle(bundle, tmp_path)
-    firmware, mitigation = HostFirmware(tmp_path, tmp_path), Mitigation(bundle)
+    firmware, mitigation = CompiledFirmware(tmp_path, tmp_path), Mitigation(bundle)
     corrected = 0
     for measurement in firmware_models.real_measurements(apartment):
         expected = mitigation.correct([measurement])[0]
@@ -147,7 +149,7 @@ def test_arbitrary_cirs_break_no_promise_under_the_sanitizers(scaling: Scaling, 
         tmp_path,
         random_networks.remnet(16, 3),
         preprocessing=Preprocessing(16, scaling),
-        prior=model_material.LINE,
+        linear_bias=model_material.LINE,
         correction_limits_m=(-1e4, 1e4),
     )
     seen = run([build_program("fuzz_correct", tmp_path, ADDRESS_SANITIZED), "4000", "1"])

@@ -10,9 +10,9 @@ import pytest
 from compilers import NEEDS_CXX
 
 from benchmarks.dw1000_model.library import MODEL_FOLDER, model_objects
+from uwb_mitigation.firmware_export.compiled import library_objects
 from uwb_mitigation.firmware_export.compiling import firmware_folder, run
 from uwb_mitigation.firmware_export.export import export_bundle
-from uwb_mitigation.firmware_export.host import library_objects
 from uwb_mitigation.link import messages
 from uwb_mitigation.link.framing import FrameDecoder, FrameEncoder
 from uwb_mitigation.link.messages import Correction, Hello

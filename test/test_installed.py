@@ -186,7 +186,7 @@ def test_what_an_executable_misses_is_one_line(tmp_path: Path, name: str, absent
 
 CORRECT_WITH_THE_FIRMWARE = """
 import uwb_mitigation
-from uwb_mitigation.firmware_export.host import FirmwareMitigation
+from uwb_mitigation.firmware_export.compiled import FirmwareMitigation
 from uwb_mitigation.firmware_export.compiling import firmware_folder
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.shipped import default_model_path

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from uwb_mitigation.commands.cli import app
-from uwb_mitigation.evaluation import baselines, lad, splits
+from uwb_mitigation.evaluation import baselines, linear_fit, splits
 from uwb_mitigation.evaluation.dataset import Dataset
 from uwb_mitigation.evaluation.splits import Group, Split
 from uwb_mitigation.model.architecture import Remnet
@@ -48,8 +48,8 @@ LEARNERS = {
     (train, "calibration_inputs"),
     (train, "quantize"),
     (train, "describe"),
-    (lad, "fit_prior"),
-    (lad, "constant"),
+    (linear_fit, "fit_linear_bias"),
+    (linear_fit, "constant"),
     (baselines, "los_median"),
     (baselines, "overall_median"),
     (baselines, "ridge"),
@@ -153,13 +153,15 @@ def in_room_2(data: Dataset) -> NDArray[np.bool_]:
 def test_no_row_of_the_comparison_has_seen_what_it_is_tested_on(data, watch):
     comparison.run(data, RECIPE, Group.CONFIGURATION, folds=2, seeds=1)
     watch.called("baselines.los_median", "baselines.overall_median", "baselines.ridge")
-    watch.called("baselines.gradient_boosting", "train.fit_with_card", "lad.fit_prior", "cards.calibrate")
+    watch.called(
+        "baselines.gradient_boosting", "train.fit_with_card", "linear_fit.fit_linear_bias", "cards.calibrate"
+    )
     watch.called("comparison.fit", "comparison.calibration_inputs", "comparison.quantize")
 
 
 def test_cross_validation_fits_and_calibrates_without_the_fold(data, watch):
     found = train.cross_validate(data, RECIPE, 3, 0)
-    watch.called("fitting.fit", "train.calibration_inputs", "train.quantize", "lad.fit_prior")
+    watch.called("fitting.fit", "train.calibration_inputs", "train.quantize", "linear_fit.fit_linear_bias")
     for split in splits.by_configuration(data.configurations, 3, 0):
         expected = data.error_m[split.test] - np.median(data.error_m[split.train])
         assert np.allclose(found.errors["overall_median"][split.test], expected)
@@ -180,7 +182,7 @@ def test_a_choice_is_told_by_folds_that_had_no_say_in_it(data, watch, monkeypatc
     own = candidates.own_models(RECIPE)
     selection.select_nested(data, [own[0], own[2]], 3, 0)
     assert nested
-    watch.called("lad.constant", "fitting.fit")
+    watch.called("linear_fit.constant", "fitting.fit")
 
 
 def parts(data: Dataset) -> Parts:
@@ -193,7 +195,7 @@ def test_the_protocol_fits_and_calibrates_on_its_training_part(data, watch, tmp_
     with watch.without(parts(data).test.names):
         experiment.run(parts(data), tmp_path, wanted, QUICK)
     watch.called("experiment.calibrate", "fitting.fit")
-    watch.called("baselines.los_median", "baselines.overall_median", "lad.fit_prior")
+    watch.called("baselines.los_median", "baselines.overall_median", "linear_fit.fit_linear_bias")
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from model_material import LINE, bundle, measurement, window_of
 from uwb_mitigation.measurement import Encoding, Origin, Status
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.architecture import Remnet
-from uwb_mitigation.model.prior import LinePrior
+from uwb_mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.offsets import Offsets
 from uwb_mitigation.preprocessing import Preprocessing
 
@@ -89,7 +89,7 @@ def test_a_bad_measurement_passes_through(mitigation, changes, range_m, status):
 
 
 def test_a_constant_prior_needs_no_power(tmp_path):
-    subject = Mitigation(bundle(tmp_path, Remnet(samples=157), prior=LinePrior(0.25)))
+    subject = Mitigation(bundle(tmp_path, Remnet(samples=157), linear_bias=LinearBiasModel(0.25)))
     result = subject.correct([measurement(rx_power_dbm=math.nan, first_path_power_dbm=math.nan)])[0]
     assert result.status is Status.OK
 
@@ -99,7 +99,7 @@ def test_a_constant_prior_needs_no_power(tmp_path):
     [{"samples": np.zeros(0, np.int16)}, {"preamble_count": 0}, {"first_path_power_dbm": math.nan}, {}],
 )
 def test_a_bundle_that_needs_no_cir_corrects_whatever_the_cir_is(tmp_path, changes):
-    made = bundle(tmp_path, Remnet(samples=157), prior=LinePrior(0.25), needs_cir=False)
+    made = bundle(tmp_path, Remnet(samples=157), linear_bias=LinearBiasModel(0.25), needs_cir=False)
     result = Mitigation(made).correct([measurement(3.0, **changes)])[0]
     assert result.status is Status.OK
     if changes.get("first_path_power_dbm") is None and changes:
@@ -113,18 +113,19 @@ def test_a_prediction_beyond_the_limits_is_out_of_distribution(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "prior", [None, LinePrior(0.25), LinePrior(-1.0, -0.015625), LinePrior(0.125, 0.0, 0.03125)]
+    "linear_bias",
+    [None, LinearBiasModel(0.25), LinearBiasModel(-1.0, -0.015625), LinearBiasModel(0.125, 0.0, 0.03125)],
 )
-def test_a_batch_has_the_bits_of_single_measurements(mitigation, tmp_path, prior):
-    if prior is not None:
-        made = bundle(tmp_path, Remnet(samples=157), prior=prior, needs_cir=False)
+def test_a_batch_has_the_bits_of_single_measurements(mitigation, tmp_path, linear_bias):
+    if linear_bias is not None:
+        made = bundle(tmp_path, Remnet(samples=157), linear_bias=linear_bias, needs_cir=False)
         mitigation = Mitigation(made, Offsets(0.125))
     subjects = [measurement(2 + 0.01 * seed, seed) for seed in range(60)]
     subjects[5:5] = [measurement(range_m, **changes) for changes, range_m, _ in BAD]
     subjects += [measurement(2.0, samples=np.zeros(0, np.int16), rx_power_dbm=-60.0 - n) for n in range(9)]
     subjects += [measurement(2.0, first_path_power_dbm=math.nan), measurement(2.0, rx_power_dbm=math.nan)] * 4
     single = [mitigation.correct([subject])[0] for subject in subjects]
-    if prior is not None:
+    if linear_bias is not None:
         assert sum(result.status is Status.OK for result in single) > 70
     assert [repr(result) for result in mitigation.correct(subjects)] == [repr(r) for r in single]
 

@@ -12,11 +12,11 @@ from typer.testing import CliRunner
 
 from uwb_mitigation.commands.cli import app
 from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError
-from uwb_mitigation.evaluation import lad
+from uwb_mitigation.evaluation import linear_fit
 from uwb_mitigation.measurement import Record, Truth
 from uwb_mitigation.model.architecture import Remnet
 from uwb_mitigation.model.bundle import load_bundle
-from uwb_mitigation.model.prior import LinePrior
+from uwb_mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.model.shipped import default_model_path
 from uwb_mitigation.sources import opening
 from uwb_mitigation.sources.truth_table import load_truth, with_truth
@@ -32,7 +32,7 @@ from uwb_mitigation.training.selection import NESTED
 SHAPE = Remnet(samples=8)
 RECIPE = Recipe(SHAPE, FitOptions(epochs=1))
 CONSTANTS = [
-    Candidate(name, lambda data, seed, offset=offset: FittedModel(LinePrior(offset)))
+    Candidate(name, lambda data, seed, offset=offset: FittedModel(LinearBiasModel(offset)))
     for name, offset in (("none", 0.0), ("half", 0.5), ("quarter", 0.25))
 ]
 
@@ -61,7 +61,7 @@ def test_a_constant_error_needs_no_line_and_an_error_that_follows_the_power_does
     data = replace(data, error_m=-5.1 - 0.069 * data.rx_power_dbm.astype(float))
     line = selection.select_nested(data, candidates.own_models(RECIPE), 3, 0)
     assert line.chosen == candidates.LINE
-    assert line.model.prior.per_rx_power == pytest.approx(-0.069, abs=1e-3)
+    assert line.model.linear_bias.per_rx_power == pytest.approx(-0.069, abs=1e-3)
 
 
 def test_the_nested_error_is_of_configurations_that_the_selection_has_not_seen():
@@ -101,7 +101,7 @@ def test_the_cold_start_fits_an_offset_and_the_mean_a_line_too(tmp_path):
     offered = candidates.with_cold_start(candidates.own_models(RECIPE), data, source)
     found = {item.name: item.fit(data, 0).correction_m(data) for item in offered if not item.trains}
     network = network_m(float_network(source), data.inputs)
-    shift = lad.constant(data.configurations, data.error_m - network).offset_m
+    shift = linear_fit.constant(data.configurations, data.error_m - network).offset_m
     assert np.std(network) > 0.01
     assert found[candidates.COLD_START] == pytest.approx(network + shift, abs=1e-5)
     mean = (found[candidates.LINE] + found[candidates.COLD_START]) / 2
@@ -133,7 +133,7 @@ def test_the_cold_start_is_preferred_with_few_configurations_only(tmp_path):
 def test_a_model_without_network_has_one_that_predicts_nothing(name):
     fitted = candidates.fit_own(dataset(8, 5, samples=8), RECIPE.of(name), 0)
     assert not network_m(fitted.network, windows(5, 8)).any()
-    assert fitted.prior.needs_power == (name == candidates.LINE)
+    assert fitted.linear_bias.needs_power == (name == candidates.LINE)
 
 
 # --- true ranges from a table ---
@@ -213,7 +213,7 @@ def loads(monkeypatch, data) -> None:
 
 def test_a_named_model_gets_the_offset_of_the_bag(tmp_path, eight_places):
     # The same shape as the universal network, which replaces no model that is named.
-    started = bundle(tmp_path, Remnet(), prior=LinePrior(5.0))
+    started = bundle(tmp_path, Remnet(), linear_bias=LinearBiasModel(5.0))
     output, result = tmp_path / "own.onnx", tmp_path / "own.json"
     run_or_raise(
         "train", "--from-bag", "bag", "--truth", write(tmp_path, *EIGHT_PLACES), "--model", started.path, "-o", output,
@@ -228,7 +228,7 @@ def test_a_named_model_gets_the_offset_of_the_bag(tmp_path, eight_places):
 
 def test_few_configurations_start_from_the_universal_network(tmp_path, monkeypatch):
     loads(monkeypatch, dataset(6, 3, samples=157))
-    far_off = Candidate("far off", lambda data, seed: FittedModel(LinePrior(9.0)))
+    far_off = Candidate("far off", lambda data, seed: FittedModel(LinearBiasModel(9.0)))
     monkeypatch.setattr(candidates, "own_models", lambda recipe: [far_off])
     output, result = tmp_path / "cold.onnx", tmp_path / "cold.json"
     told = run_or_raise("train", "--data", tmp_path, "-o", output, "--folds", 2, "--json", result)

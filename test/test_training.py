@@ -1,4 +1,4 @@
-"""Training: the line prior, the network, and the recipe that joins them."""
+"""Training: the linear bias model, the network, and the recipe that joins them."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import pytest
 from model_material import dataset, windows
 
 from uwb_mitigation.errors import DatasetError, ParameterError
-from uwb_mitigation.evaluation.lad import fit_prior, least_absolute_deviations
+from uwb_mitigation.evaluation.linear_fit import fit_linear_bias, least_absolute_deviations
 from uwb_mitigation.model import floating
 from uwb_mitigation.model.architecture import Remnet
-from uwb_mitigation.model.prior import LinePrior
+from uwb_mitigation.model.linear_bias import LinearBiasModel
 
 SHAPE = Remnet(samples=32)
 
@@ -43,7 +43,7 @@ def test_a_configuration_counts_once_however_long_it_was_recorded():
     data = dataset(8, 10)
     rows = np.concatenate([np.arange(80), np.repeat(np.arange(10), 30)])
     once, long = (
-        fit_prior(part.configurations, part.rx_power_dbm, part.first_path_power_dbm, part.error_m)
+        fit_linear_bias(part.configurations, part.rx_power_dbm, part.first_path_power_dbm, part.error_m)
         for part in (data, data.rows(rows))
     )
     assert np.allclose(
@@ -56,13 +56,13 @@ def test_a_configuration_counts_once_however_long_it_was_recorded():
 def test_without_powers_the_prior_is_the_median_over_configurations():
     names = np.array(["a", "a", "b", "c"])
     unknown = np.full(4, np.nan)
-    prior = fit_prior(names, unknown, unknown, np.array([1.0, 2.0, 0.5, 9.0]))
-    assert prior == LinePrior(1.5)
+    linear_bias = fit_linear_bias(names, unknown, unknown, np.array([1.0, 2.0, 0.5, 9.0]))
+    assert linear_bias == LinearBiasModel(1.5)
 
 
 def test_a_prior_of_nothing_is_refused():
     with pytest.raises(DatasetError, match="no measurements"):
-        fit_prior(np.array([]), np.array([]), np.array([]), np.array([]))
+        fit_linear_bias(np.array([]), np.array([]), np.array([]), np.array([]))
 
 
 torch = pytest.importorskip("torch", reason="run `make setup-training`")
@@ -129,7 +129,7 @@ def test_the_card_tells_the_errors_on_configurations_not_seen():
     data = dataset(12, 20)
     recipe = Recipe(SHAPE, FitOptions(epochs=1))
     validation = train.cross_validate(data, recipe, folds=4, seed=0)
-    card = train.describe("name", recipe, LinePrior(0.5), validation, "data")
+    card = train.describe("name", recipe, LinearBiasModel(0.5), validation, "data")
     left = validation.errors["float"]
     deviation = np.sqrt(card.variance_m2 + card.variance_per_m2 * (data.error_m - left) ** 2)
     # Of 12 configurations, 0.68 x 13: the one to come counts too.
@@ -144,5 +144,5 @@ def test_measurements_without_power_do_not_spoil_the_network():
     data = dataset(8, 20)
     data.rx_power_dbm[3] = np.nan
     fitted = fit_own(data, Recipe(SHAPE, FitOptions(epochs=1)), 0)
-    assert fitted.prior.needs_power
+    assert fitted.linear_bias.needs_power
     assert np.isfinite(floating.predict_m(fitted.network, data.inputs)).all()

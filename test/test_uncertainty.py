@@ -14,14 +14,14 @@ from uwb_mitigation.errors import ModelError
 from uwb_mitigation.measurement import Status
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.architecture import Remnet
-from uwb_mitigation.model.familiarity import Band, Familiarity, Strangeness, features
+from uwb_mitigation.model.ood import Band, OodBands, OodDetector, features
 from uwb_mitigation.preprocessing import Scaling
 
 WIDE = Band(-1000.0, 1000.0, 1.0)
 SHAPE = Remnet(samples=157)
 
 
-def bands(**changes: Band) -> Familiarity:
+def bands(**changes: Band) -> OodBands:
     every = dict.fromkeys(
         (
             "range_m",
@@ -33,11 +33,11 @@ def bands(**changes: Band) -> Familiarity:
         ),
         WIDE,
     )
-    return Familiarity(0.25, **(every | changes))
+    return OodBands(0.25, **(every | changes))
 
 
 def mitigation(folder, **changes: Band) -> Mitigation:
-    return Mitigation(bundle(folder, SHAPE, familiarity=bands(**changes), variance_per_m2=0.5))
+    return Mitigation(bundle(folder, SHAPE, ood_bands=bands(**changes), variance_per_m2=0.5))
 
 
 @pytest.fixture(autouse=True)
@@ -55,8 +55,8 @@ def test_energy_before_the_first_path_needs_no_level(scaling):
     unknown = np.float32([math.nan])
     found = features(window, scaling, np.float32([3.0]), unknown, unknown)
     assert found[0, 5] == pytest.approx(10 * math.log10(0.2), abs=0.06)
-    only = Familiarity(0.0, None, lead_level_db=Band(-50.0, -10.0, 6.0))
-    assert Strangeness(only.bands).score(found) == pytest.approx([0.5], abs=0.02)
+    only = OodBands(0.0, None, lead_level_db=Band(-50.0, -10.0, 6.0))
+    assert OodDetector(only.bands).score(found) == pytest.approx([0.5], abs=0.02)
 
 
 def test_distance_alone_is_not_strange_and_a_weaker_radio_is(tmp_path):
@@ -112,12 +112,12 @@ def test_a_card_with_an_impossible_variance_is_refused(tmp_path, change):
         bundle(tmp_path, SHAPE, **change)
 
 
-def test_familiarity_of_measurements_covers_them():
+def test_bands_contain_the_measurements_they_are_computed_from():
     windows = np.random.default_rng(0).uniform(0.1, 1, (50, 157)).astype(np.float32)
     power = np.linspace(-95, -80, 50, dtype=np.float32)
     range_m = np.linspace(1, 6, 50, dtype=np.float32)
     windows[:, :3] /= 16
     values = features(windows, Scaling.PREAMBLE, range_m, power, power - np.float32(5))
-    found = Familiarity.of(0.3, values)
-    assert (Strangeness(found.bands).score(values) <= 0).all()
+    found = OodBands.of(0.3, values)
+    assert (OodDetector(found.bands).score(values) <= 0).all()
     assert replace(found, known_offset_m=0.0).bands == found.bands

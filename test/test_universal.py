@@ -49,10 +49,10 @@ def test_the_command_writes_both_bundles(tmp_path: Path) -> None:
     assert made.quantised
     assert not floating.quantised
     assert made.preprocessing.scaling is Scaling.MAX
-    familiarity = made.card.familiarity
-    assert familiarity is not None
-    assert not familiarity.needs_levels
-    assert familiarity.lead_level_db is not None
+    ood_bands = made.card.ood_bands
+    assert ood_bands is not None
+    assert not ood_bands.needs_levels
+    assert ood_bands.lead_level_db is not None
     result = json.loads((tmp_path / "a.json").read_text())
     assert result["model_id"] == made.model_id
     assert result["simulated"]

@@ -12,12 +12,12 @@ from uwb_mitigation.evaluation import zero_shot
 from uwb_mitigation.evaluation.dataset import Dataset
 from uwb_mitigation.evaluation.zero_shot import NAMES, ZeroShot
 from uwb_mitigation.model.bundle import Bundle
-from uwb_mitigation.model.prior import LinePrior
+from uwb_mitigation.model.linear_bias import LinearBiasModel
 
 
 @pytest.fixture(scope="module")
 def model(tmp_path_factory) -> Bundle:
-    return bundle(tmp_path_factory.mktemp("zero"), prior=LinePrior(0.0))
+    return bundle(tmp_path_factory.mktemp("zero"), linear_bias=LinearBiasModel(0.0))
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +50,7 @@ def test_without_a_placement_in_line_of_sight_there_is_no_offset(model, data):
 
 
 def test_what_the_model_refuses_stays_as_measured(tmp_path, data):
-    timid = bundle(tmp_path, prior=LinePrior(0.0), correction_limits_m=(-(2.0**-20), 2.0**-20))
+    timid = bundle(tmp_path, linear_bias=LinearBiasModel(0.0), correction_limits_m=(-(2.0**-20), 2.0**-20))
     found = zero_shot.run(data, timid)
     assert found.passed.all()
     assert (found.errors["universal"] == data.error_m).all()

@@ -1,4 +1,4 @@
-"""Correction of ranges: offset, preprocessing, prior, network, and the handling of failures."""
+"""Correction of ranges: offset, preprocessing, linear bias model, network, and the handling of failures."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from uwb_mitigation.measurement import (
     Status,
 )
 from uwb_mitigation.model.bundle import Bundle, Card, Session
-from uwb_mitigation.model.familiarity import Strangeness, features
+from uwb_mitigation.model.ood import OodDetector, features
 from uwb_mitigation.offsets import NO_OFFSETS, Offsets
 
 MAX_RANGE_M = 1e6
@@ -38,10 +38,10 @@ class Grader:
         self._variance = np.float32(card.variance_m2)
         self._variance_per_m2 = np.float32(card.variance_per_m2)
         self._variance_uncorrected = np.float32(card.variance_uncorrected_m2)
-        familiarity = card.familiarity
-        self._strangeness = None if familiarity is None else Strangeness(familiarity.bands)
+        ood_bands = card.ood_bands
+        self._ood_detector = None if ood_bands is None else OodDetector(ood_bands.bands)
         self._scaling = card.preprocessing.scaling
-        self._known_offset = np.float32(0.0 if familiarity is None else familiarity.known_offset_m)
+        self._known_offset = np.float32(0.0 if ood_bands is None else ood_bands.known_offset_m)
 
     def passes(self, predicted: NDArray[np.float32], score: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Return which predicted errors are within the limits and have an OOD score below 1, bool (n,)."""
@@ -56,10 +56,10 @@ class Grader:
         first_path_power_dbm: NDArray[np.floating],
     ) -> NDArray[np.float32]:
         """Return the OOD score of n measurements, float32 (n,); 0 if the card has no bands."""
-        if self._strangeness is None:
+        if self._ood_detector is None:
             return np.zeros(len(windows), np.float32)
         values = features(windows, self._scaling, range_m, rx_power_dbm, first_path_power_dbm)
-        return self._strangeness.score(values)
+        return self._ood_detector.score(values)
 
     def grade(
         self, predicted: NDArray[np.float32], score: NDArray[np.float32]
@@ -67,7 +67,7 @@ class Grader:
         """Return corrections (m) and variances (m^2) of predicted errors that `passes` accepts, float32 (n,)."""
         correction: NDArray[np.float32] = predicted
         variance: NDArray[np.float32] = self._variance + self._variance_per_m2 * (predicted * predicted)
-        if self._strangeness is not None and np.count_nonzero(score > 0.0):
+        if self._ood_detector is not None and np.count_nonzero(score > 0.0):
             shrunk = self._known_offset + (np.float32(1.0) - score) * (predicted - self._known_offset)
             correction = np.where(score > 0.0, shrunk, predicted)
             variance = variance + np.maximum(score, np.float32(0.0)) * self._variance_uncorrected
@@ -136,7 +136,7 @@ def passed_through(
 class Mitigation(Backend):
     """Corrects ranges with one bundle, by ONNX Runtime. Not thread-safe.
 
-    Predicted error = prior + network, correction = offset of the radios + predicted error, and corrected = range -
+    Predicted error = linear bias + network, correction = offset of the radios + predicted error, and corrected = range -
     correction, each one float32 operation, so that a microcontroller computes the same bits. The bundle uses the range
     minus the offset. No measurement is rejected: if a range cannot be corrected, the raw range minus the offset is passed
     through with a status that gives the reason and a larger variance:
@@ -145,7 +145,7 @@ class Mitigation(Backend):
     offset is negative or not finite, the predicted error is outside the bundle's limits, or the OOD score is 1 or
     more. MODEL_ERROR: the network failed, or its output is not finite.
 
-    The further a measurement is outside the bundle's training data (`familiarity`), the more its correction shrinks
+    The further a measurement is outside the bundle's training data (`Card.ood_bands`), the more its correction shrinks
     from the predicted error to the overall offset of the training data, and the larger its variance is, with status OK.
 
     Args:
@@ -163,12 +163,12 @@ class Mitigation(Backend):
 
     def correct_columns(self, ranges: RangeColumns) -> CorrectedColumns:
         """See `Backend`."""
-        prior_of, n = self.bundle.prior, len(ranges)
+        linear_bias, n = self.bundle.linear_bias, len(ranges)
         offset = self.offsets.of(ranges.tag_id, ranges.anchor_id)
         range_m = _less(ranges.range_m, offset)
         valid = _valid(range_m)
         powers = (ranges.rx_power_dbm, ranges.first_path_power_dbm)
-        predicted = prior_of.predict_m(*powers)
+        predicted = linear_bias.predict_m(*powers)
         faults, windows = self.bundle.preprocessing.apply(ranges)
         usable, known = faults == 0, np.isfinite(predicted)
         readable = usable & known & valid
@@ -188,11 +188,11 @@ class Mitigation(Backend):
                 predicted[rows] = np.nan
             score[rows] = self._grader.score(windows, range_m[rows], *(power[rows] for power in powers))
         if not self.bundle.card.needs_cir and len(windows) < n:
-            # The first-path power may be unknown if the prior has no weight for it.
-            first_path = powers[1] if prior_of.per_power_gap != 0.0 else powers[0]
-            alone = prior_of.predict_m(powers[0], first_path)
-            by_prior = valid & ~readable & np.isfinite(alone)
-            predicted[by_prior], status[by_prior] = alone[by_prior], _OK
+            # The first-path power may be unknown if the linear bias model has no weight for it.
+            first_path = powers[1] if linear_bias.per_power_gap != 0.0 else powers[0]
+            alone = linear_bias.predict_m(powers[0], first_path)
+            is_biased_only = valid & ~readable & np.isfinite(alone)
+            predicted[is_biased_only], status[is_biased_only] = alone[is_biased_only], _OK
 
         passes = self._grader.passes(predicted, score)
         rows = _rows(passes)

@@ -72,7 +72,7 @@ _FAULT_TEXTS = {
     CirFault.NEGATIVE: "a magnitude is negative",
     CirFault.SATURATED: "the window holds a saturated sample",
     CirFault.NO_PREAMBLE_COUNT: "the preamble count is unknown, and the model's scaling needs it",
-    CirFault.NO_POWER: "the receive or first-path power is unknown, and the model's prior needs it",
+    CirFault.NO_POWER: "the receive or first-path power is unknown, and the linear bias model needs it",
 }
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from uwb_mitigation.evaluation import lad
+from uwb_mitigation.evaluation import linear_fit
 from uwb_mitigation.evaluation.dataset import build_dataset
 from uwb_mitigation.model.architecture import Remnet
 from uwb_mitigation.model.bundle import Session, load_bundle
@@ -19,7 +19,7 @@ from uwb_mitigation.model.shipped import default_model_path
 from uwb_mitigation.preprocessing import Preprocessing
 from uwb_mitigation.sources.decaranging import DecaRangingFolder
 from uwb_mitigation.training import candidates, selection
-from uwb_mitigation.training.candidates import Recipe, prior_m
+from uwb_mitigation.training.candidates import Recipe, linear_bias_m
 from uwb_mitigation.training.options import FitOptions
 
 data = build_dataset(DecaRangingFolder(Path(sys.argv[1])), Preprocessing())
@@ -31,9 +31,9 @@ for count in (6, 9, 12, 15, 18, 21):
     for _ in range(draws):
         seen = np.isin(data.configurations, generator.permutation(data.names)[:count])
         train, test, names = data.rows(seen), data.rows(~seen), data.configurations[seen]
-        constant = lad.constant(names, train.error_m).offset_m
-        own_line = prior_m(candidates.fit_line(train), test)
-        network = network_m[~seen] + lad.constant(names, train.error_m - network_m[seen]).offset_m
+        constant = linear_fit.constant(names, train.error_m).offset_m
+        own_line = linear_bias_m(candidates.fit_line(train), test)
+        network = network_m[~seen] + linear_fit.constant(names, train.error_m - network_m[seen]).offset_m
         predicted = (constant, own_line, network, (own_line + network) / 2)
         maes.append([np.abs(test.error_m - values).mean() for values in predicted])
     table = np.array(maes)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from uwb_mitigation.evaluation.lad import fit_prior
+from uwb_mitigation.evaluation.linear_fit import fit_linear_bias
 from uwb_mitigation.sources.decaranging import DecaRangingFolder
 from uwb_mitigation.sources.simulated import SimulatedSource, SimulatedSurvey
 
@@ -35,7 +35,7 @@ for source in (
     label, configuration = (np.array(c) for c in list(zip(*rows, strict=True))[:2])
     error, rx, gap, count, threshold, peak = np.array([r[2:] for r in rows]).T
     if line is None:
-        line = fit_prior(configuration, rx, rx - gap, error)
+        line = fit_linear_bias(configuration, rx, rx - gap, error)
         print(line)
     left = error - (line.offset_m + line.per_rx_power * rx + line.per_power_gap * gap)
     print(source.name, dict(source.skipped))

@@ -16,7 +16,7 @@ import numpy as np
 from uwb_mitigation.evaluation.accuracy import evaluate
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import load_bundle
-from uwb_mitigation.model.prior import LinePrior
+from uwb_mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.model.shipped import model_path
 from uwb_mitigation.sources.opening import open_recording
 
@@ -44,7 +44,7 @@ def heard(record, level, less_m):
 
 for name in sys.argv[3:]:
     mitigation = Mitigation(load_bundle(model_path(name)))
-    less_m = offset_m if mitigation.bundle.prior == LinePrior(0.0) else 0.0
+    less_m = offset_m if mitigation.bundle.linear_bias == LinearBiasModel(0.0) else 0.0
     print(name)
     for level in (-25, *range(-20, -8), -7, -5, 0, 3, 5, 8, 10, 15, 20):
         found = evaluate(mitigation, (heard(record, level, less_m) for record in records))

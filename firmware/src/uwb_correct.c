@@ -20,7 +20,7 @@ static float prior_m(const uwb_model *model, float rx_power_dbm, float first_pat
     return model->prior_offset_m + level + slope;
 }
 
-/* OOD score. Every step is one IEEE-754 operation, as in uwb_mitigation/model/familiarity.py; volatile prevents the
+/* OOD score. Every step is one IEEE-754 operation, as in uwb_mitigation/model/ood.py; volatile prevents the
  * compiler from fusing two. */
 
 enum { LEAD_TAPS = 3, FIRST_PATH_TAP = 6, FIRST_PATH_TAPS = 3 };

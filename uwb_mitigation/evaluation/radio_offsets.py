@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from uwb_mitigation.errors import DatasetError, ParameterError, format_id
 from uwb_mitigation.measurement import LINE_OF_SIGHT_DB, RangeMeasurement, Record, Status
 from uwb_mitigation.mitigation import Mitigation
-from uwb_mitigation.model.familiarity import FIRST_PATH_TAPS
-from uwb_mitigation.model.prior import LinePrior
+from uwb_mitigation.model.linear_bias import LinearBiasModel
+from uwb_mitigation.model.ood import FIRST_PATH_TAPS
 from uwb_mitigation.offsets import MAX_OFFSET_M, Offsets
 from uwb_mitigation.preprocessing import Preprocessing, Scaling
 
@@ -28,7 +28,7 @@ PLACEMENT_SD_M = 0.15
 logs (1.48 x median absolute deviation after `universal`), a rough estimate from seven placements."""
 
 MAX_EXCESS_M, MAX_ERROR_M = 0.25, 0.5
-"""If the predicted error is larger, the path is NLOS. The second limit is for models whose prior contains the offset."""
+"""If the predicted error is larger, the path is NLOS. The second limit is for models whose linear bias model contains the offset."""
 
 MIN_RANGES = 10
 _BATCH = 256
@@ -158,7 +158,7 @@ def find_offset(
             f"one distance for {len(pairs)} pairs ({some}{', ...' if len(pairs) > 5 else ''})",
             valid="choose one with --anchor and --tag",
         )
-    limit_m = MAX_EXCESS_M if mitigation.bundle.prior == LinePrior(0.0) else MAX_ERROR_M
+    limit_m = MAX_EXCESS_M if mitigation.bundle.linear_bias == LinearBiasModel(0.0) else MAX_ERROR_M
     placements = tuple(_placement_offset(*key, groups[key], limit_m) for key in sorted(groups))
     return _combined(placements, mitigation.bundle.model_id)
 

@@ -70,8 +70,8 @@ def run(dataset: Dataset, bundle: Bundle) -> ZeroShot:
     Raises:
         ModelError: ONNX Runtime refuses the bundle's network.
     """
-    prior = bundle.card.prior.predict_m(dataset.rx_power_dbm, dataset.first_path_power_dbm)
-    predicted = (prior + Session(bundle).predict_m(dataset.inputs)).astype(np.float32)
+    linear_bias = bundle.card.linear_bias.predict_m(dataset.rx_power_dbm, dataset.first_path_power_dbm)
+    predicted = (linear_bias + Session(bundle).predict_m(dataset.inputs)).astype(np.float32)
     graded = grade(dataset, bundle.card, predicted)
     left = dataset.error_m - graded.correction_m
 

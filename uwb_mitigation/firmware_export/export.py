@@ -16,8 +16,8 @@ from uwb_mitigation.files import write_whole
 from uwb_mitigation.firmware_export.packing import Channels, PackedNetwork, pack
 from uwb_mitigation.model import graph
 from uwb_mitigation.model.bundle import Bundle, Card, Session
-from uwb_mitigation.model.familiarity import Familiarity
 from uwb_mitigation.model.integer import IntegerNetwork
+from uwb_mitigation.model.ood import OodBands
 from uwb_mitigation.model.requantisation import Sum
 from uwb_mitigation.preprocessing import Scaling
 
@@ -101,8 +101,8 @@ def render(network: PackedNetwork, card: Card, model_id: int, golden: Golden) ->
     ]
     parts += _remnet(network) if network.modules else _mlp(network)
     parts.append(_array("int8_t", "uwb_head_weights", network.head_weights))
-    if card.familiarity is not None:
-        parts.append(_familiarity(card.familiarity))
+    if card.ood_bands is not None:
+        parts.append(_ood_bands(card.ood_bands))
     parts.append(_model(network, card, model_id))
     parts.append(_golden(golden))
     parts.append("#endif")
@@ -138,20 +138,20 @@ def _mlp(network: PackedNetwork) -> Iterable[str]:
     yield "};\n"
 
 
-def _familiarity(familiarity: Familiarity) -> str:
+def _ood_bands(ood_bands: OodBands) -> str:
     bands = "".join(
         f"    {{{number(band.low)}, {number(band.high)}, {number(np.float32(1) / np.float32(band.margin))}}},\n"
         if band
         else "    {0.0f, 0.0f, 0.0f},\n"
-        for band in familiarity.bands
+        for band in ood_bands.bands
     )
-    offset = number(familiarity.known_offset_m)
+    offset = number(ood_bands.known_offset_m)
     return f"static const uwb_familiarity uwb_familiar = {{{offset}, {{\n{bands}}}}};\n"
 
 
 def _model(network: PackedNetwork, card: Card, model_id: int) -> str:
     remnet = bool(network.modules)
-    prior, (low, high) = card.prior, card.correction_limits_m
+    linear_bias, (low, high) = card.linear_bias, card.correction_limits_m
     values = [
         f"0x{model_id:08x}u",
         f"{network.samples}u",
@@ -168,15 +168,15 @@ def _model(network: PackedNetwork, card: Card, model_id: int) -> str:
         f"{len(network.head_weights)}u",
         f"{network.head_bias}",
         number(network.head_scale),
-        number(prior.offset_m),
-        number(prior.per_rx_power),
-        number(prior.per_power_gap),
+        number(linear_bias.offset_m),
+        number(linear_bias.per_rx_power),
+        number(linear_bias.per_power_gap),
         number(low),
         number(high),
         number(card.variance_m2),
         number(card.variance_per_m2),
         number(card.variance_uncorrected_m2),
-        "NULL" if card.familiarity is None else "&uwb_familiar",
+        "NULL" if card.ood_bands is None else "&uwb_familiar",
     ]
     return f"static const uwb_model uwb_model_data = {{\n{_wrapped(values)}}};\n"
 

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from uwb_mitigation.errors import ModelError, UwbMitigationError
 from uwb_mitigation.files import read_bounded, write_whole
 from uwb_mitigation.model.architecture import Architecture, Mlp, Remnet
-from uwb_mitigation.model.familiarity import Band, Familiarity
-from uwb_mitigation.model.prior import LinePrior
+from uwb_mitigation.model.linear_bias import LinearBiasModel
+from uwb_mitigation.model.ood import Band, OodBands
 from uwb_mitigation.preprocessing import Preprocessing, Scaling
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ class Card:
         name: human-readable name.
         architecture: shape of the network.
         preprocessing: preprocessing of the input; its window length is K of the architecture.
-        prior: linear model whose residuals the network predicts.
+        linear_bias: linear model whose residuals the network predicts.
         quantised: True: int8; False: float32.
         variance_m2: variance of a corrected range whose predicted error is 0, m^2: one standard deviation covers
             68 % of the errors on unseen configurations.
@@ -55,14 +55,14 @@ class Card:
         training: data, split, seed, recipe and metrics; human-readable, JSON values only.
         variance_per_m2: increase of the variance per squared predicted error, without unit.
         interval95_sigmas: number of standard deviations that cover 95 % of the errors on unseen configurations.
-        familiarity: bands outside of which a measurement is out of distribution; None = unknown.
-        needs_cir: False = the network predicts 0, so that the prior also corrects ranges without a CIR.
+        ood_bands: bands outside of which a measurement is out of distribution; None = unknown.
+        needs_cir: False = the network predicts 0, so that the linear bias model also corrects ranges without a CIR.
     """
 
     name: str
     architecture: Architecture
     preprocessing: Preprocessing
-    prior: LinePrior
+    linear_bias: LinearBiasModel
     quantised: bool
     variance_m2: float
     variance_uncorrected_m2: float
@@ -70,7 +70,7 @@ class Card:
     training: Mapping[str, Any] = field(default_factory=dict)
     variance_per_m2: float = 0.0
     interval95_sigmas: float = 1.96
-    familiarity: Familiarity | None = None
+    ood_bands: OodBands | None = None
     needs_cir: bool = True
 
     @property
@@ -88,9 +88,9 @@ class Card:
                 f"the preprocessing makes {self.preprocessing.samples}"
             )
         numbers = {
-            "prior.offset_m": self.prior.offset_m,
-            "prior.per_rx_power": self.prior.per_rx_power,
-            "prior.per_power_gap": self.prior.per_power_gap,
+            "prior.offset_m": self.linear_bias.offset_m,
+            "prior.per_rx_power": self.linear_bias.per_rx_power,
+            "prior.per_power_gap": self.linear_bias.per_power_gap,
             "correction_limits_m[0]": self.correction_limits_m[0],
             "correction_limits_m[1]": self.correction_limits_m[1],
             "variance_m2": self.variance_m2,
@@ -111,11 +111,13 @@ class Card:
         if not 1.0 <= self.interval95_sigmas <= 1e3:
             raise ModelError(f"interval95_sigmas = {self.interval95_sigmas}", valid="1 to 1000")
         if (
-            self.familiarity is not None
-            and self.familiarity.needs_levels
+            self.ood_bands is not None
+            and self.ood_bands.needs_levels
             and self.preprocessing.scaling is not Scaling.PREAMBLE
         ):
-            raise ModelError("familiarity of windows without level", valid="the scaling preamble")
+            raise ModelError(
+                "bands of received powers for windows without a level", valid="the scaling preamble"
+            )
         if self.correction_limits_m[0] >= self.correction_limits_m[1]:
             raise ModelError(f"correction_limits_m = {self.correction_limits_m}", valid="low, high")
 
@@ -146,9 +148,9 @@ class Bundle:
         return self.card.preprocessing
 
     @property
-    def prior(self) -> LinePrior:
+    def linear_bias(self) -> LinearBiasModel:
         """Linear bias model."""
-        return self.card.prior
+        return self.card.linear_bias
 
     @property
     def quantised(self) -> bool:
@@ -251,12 +253,12 @@ def save_bundle(path: Path, graph: bytes, card: Card) -> Bundle:
     Raises:
         ModelError: the card does not fit the graph, or the file cannot be written.
     """
-    bundle, data = made_bundle(path, graph, card)
+    bundle, data = build_bundle(path, graph, card)
     write_whole(path, data, ModelError)
     return bundle
 
 
-def made_bundle(path: Path, graph: bytes, card: Card) -> tuple[Bundle, bytes]:
+def build_bundle(path: Path, graph: bytes, card: Card) -> tuple[Bundle, bytes]:
     """Return a bundle like `save_bundle`, and its bytes, which the caller must write to `path`.
 
     Raises:
@@ -271,10 +273,12 @@ def assemble_bundle(graph: bytes, card: Card) -> bytes:
     import onnx
 
     fields = asdict(card)
+    # Keys of the file format, which are older than the names in the code.
+    fields["prior"], fields["familiarity"] = fields.pop("linear_bias"), fields.pop("ood_bands")
     if card.needs_cir:
         # Older bundles do not have this field.
         del fields["needs_cir"]
-    if card.familiarity is not None and card.familiarity.lead_level_db is None:
+    if card.ood_bands is not None and card.ood_bands.lead_level_db is None:
         del fields["familiarity"]["lead_level_db"]
     metadata = fields | {
         "format": FORMAT,
@@ -307,7 +311,7 @@ def _checksum(data: bytes, digits: int) -> int:
 def _card(metadata: dict[str, Any]) -> Card:
     if metadata["format"] != FORMAT:
         raise ModelError(f"metadata format {metadata['format']!r}", valid=f"{FORMAT}")
-    prior = metadata["prior"]
+    linear_bias = metadata["prior"]
     low, high = metadata["correction_limits_m"]
     return Card(
         name=str(metadata["name"]),
@@ -316,7 +320,9 @@ def _card(metadata: dict[str, Any]) -> Card:
             _integer(metadata["preprocessing"]["samples"]),
             Scaling(metadata["preprocessing"]["scaling"]),
         ),
-        prior=LinePrior(**{key: float(value) for key, value in (prior or {"offset_m": 0}).items()}),
+        linear_bias=LinearBiasModel(
+            **{key: float(value) for key, value in (linear_bias or {"offset_m": 0}).items()}
+        ),
         quantised=metadata["quantised"] is True,
         variance_m2=float(metadata["variance_m2"]),
         variance_uncorrected_m2=float(metadata["variance_uncorrected_m2"]),
@@ -325,17 +331,17 @@ def _card(metadata: dict[str, Any]) -> Card:
         # Older bundles do not contain these fields.
         variance_per_m2=float(metadata.get("variance_per_m2", 0.0)),
         interval95_sigmas=float(metadata.get("interval95_sigmas", 1.96)),
-        familiarity=_familiarity(metadata.get("familiarity")),
+        ood_bands=_ood_bands(metadata.get("familiarity")),
         needs_cir=metadata.get("needs_cir", True) is not False,
     )
 
 
-def _familiarity(metadata: dict[str, Any] | None) -> Familiarity | None:
+def _ood_bands(metadata: dict[str, Any] | None) -> OodBands | None:
     if metadata is None:
         return None
     bands = dict(metadata)
     offset = float(bands.pop("known_offset_m"))
-    return Familiarity(offset, **{name: Band(**band) if band else None for name, band in bands.items()})
+    return OodBands(offset, **{name: Band(**band) if band else None for name, band in bands.items()})
 
 
 def _architecture_metadata(architecture: Architecture) -> dict[str, Any]:

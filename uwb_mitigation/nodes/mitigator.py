@@ -22,7 +22,7 @@ from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.measurement import LINE_OF_SIGHT_DB, Encoding, RangeMeasurement, Status
 from uwb_mitigation.mitigation import Backend, Mitigation
 from uwb_mitigation.model.bundle import load_bundle
-from uwb_mitigation.model.prior import LinePrior
+from uwb_mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.model.shipped import model_path
 from uwb_mitigation.nodes import diagnostics, topics
 from uwb_mitigation.nodes.diagnostics import MitigatorHealth
@@ -49,7 +49,7 @@ def load(model: str, backend: str = "onnxruntime") -> Backend:
     bundle = load_bundle(model_path(model))
     if backend == "firmware":
         # Import on demand: it compiles C code.
-        from uwb_mitigation.firmware_export.host import FirmwareMitigation
+        from uwb_mitigation.firmware_export.compiled import FirmwareMitigation
 
         return FirmwareMitigation(bundle)
     return Mitigation(bundle)
@@ -203,7 +203,7 @@ class Mitigator(ManagedNode):
         bundle = mitigation.bundle
         self._reset_offset_check(mitigation)
         limits = ": on other boards or behind other walls it may harm"
-        if bundle.prior == LinePrior(0.0):
+        if bundle.linear_bias == LinearBiasModel(0.0):
             limits = f"; offsets of these radios: {self._offsets}"
         self.get_logger().info(
             f"correcting with model {bundle.name}, id {diagnostics.model_id(bundle.model_id)}; "
@@ -211,8 +211,10 @@ class Mitigator(ManagedNode):
         )
 
     def _reset_offset_check(self, mitigation: Backend) -> None:
-        # A prior includes the offset of the boards of its training, unless another offset is set.
-        self.health.predicts_excess_alone = bool(self._offsets) or mitigation.bundle.prior == LinePrior(0.0)
+        # A linear bias model includes the offset of the boards of its training, unless another offset is set.
+        self.health.predicts_excess_alone = bool(
+            self._offsets
+        ) or mitigation.bundle.linear_bias == LinearBiasModel(0.0)
         self.health.los_m.clear()
 
     def _prepare(self, values: Mapping[str, Any]) -> None:

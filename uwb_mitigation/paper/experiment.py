@@ -21,7 +21,7 @@ from uwb_mitigation.model import floating, graph
 from uwb_mitigation.model.architecture import Architecture, Mlp, Remnet
 from uwb_mitigation.model.bundle import Card, save_bundle, session_options
 from uwb_mitigation.model.integer import IntegerNetwork
-from uwb_mitigation.model.prior import LinePrior
+from uwb_mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.model.weights import FloatWeights, Int8Weights
 from uwb_mitigation.paper import published
 from uwb_mitigation.paper.data import Parts, fingerprint
@@ -35,7 +35,7 @@ from uwb_mitigation.paper.results import (
     TrainedModel,
 )
 from uwb_mitigation.training import fitting
-from uwb_mitigation.training.candidates import fit_line, prior_m
+from uwb_mitigation.training.candidates import fit_line, linear_bias_m
 from uwb_mitigation.training.cards import card_of
 from uwb_mitigation.training.options import FitOptions
 from uwb_mitigation.training.quantization import MSE, quantize
@@ -260,16 +260,16 @@ def baselines_of(train: Dataset, test: Dataset) -> tuple[Baseline, ...]:
 
     medians = {"los_median": baselines.los_median, "overall_median": baselines.overall_median}
     rows = [row(name, fit(train)(test)) for name, fit in medians.items()]
-    line, reason = LinePrior(0.0), "the data has no received power"
+    line, reason = LinearBiasModel(0.0), "the data has no received power"
     if all(np.isfinite(part.rx_power_dbm - part.first_path_power_dbm).any() for part in (train, test)):
         line, reason = fit_line(train), "too few configurations, or powers that are all alike"
     if not line.needs_power:
         return (*rows, Baseline(name="line", errors=None, reason=reason))
-    return (*rows, row("line", np.nan_to_num(prior_m(line, test))))
+    return (*rows, row("line", np.nan_to_num(linear_bias_m(line, test))))
 
 
 def describe(name: str, architecture: Architecture, parts: Parts, options: FitOptions) -> Card:
-    """Return the card of a float network without a prior that was fitted to the whole training part.
+    """Return the card of a float network without a linear bias model that was fitted to the whole training part.
 
     Its variance comes from a second network, fitted to a fifth of the training configurations and tested on the others.
     That network has less training data, so the variance is conservative. The test part is not used.
@@ -292,4 +292,4 @@ def describe(name: str, architecture: Architecture, parts: Parts, options: FitOp
         "tested_on": len(parts.test),
         "variance": f"of a network fitted to 1 of {folds} parts of the training configurations, on the others",
     }
-    return card_of(name, architecture, train, LinePrior(0.0), unseen, left, training)
+    return card_of(name, architecture, train, LinearBiasModel(0.0), unseen, left, training)

@@ -14,13 +14,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.evaluation import lad, splits
+from uwb_mitigation.evaluation import linear_fit, splits
 from uwb_mitigation.evaluation.dataset import Dataset
 from uwb_mitigation.model import graph
 from uwb_mitigation.model.architecture import Remnet
 from uwb_mitigation.model.bundle import Bundle, session_options
 from uwb_mitigation.model.floating import float_network, scaled
-from uwb_mitigation.model.prior import LinePrior
+from uwb_mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.model.weights import FloatWeights
 from uwb_mitigation.training.options import FitOptions
 
@@ -52,15 +52,15 @@ _BATCH = 1024
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FittedModel:
-    """A prior, and a network or None. `factor`: the network is the universal one, multiplied by this factor."""
+    """A linear bias model, and a network or None. `factor`: the network is the universal one, multiplied by this factor."""
 
-    prior: LinePrior
+    linear_bias: LinearBiasModel
     network: FloatWeights | None = None
     factor: float | None = None
 
     def correction_m(self, data: Dataset) -> NDArray[np.float64]:
-        """Return prior + network, shape (n,), m; 0 where a power that the prior needs is unknown."""
-        predicted = prior_m(self.prior, data).astype(np.float64)
+        """Return linear bias + network, shape (n,), m; 0 where a power that the linear bias model needs is unknown."""
+        predicted = linear_bias_m(self.linear_bias, data).astype(np.float64)
         if self.factor is not None and data.headers is not None:
             predicted = predicted + self.factor * _universal_m(data)
         elif self.network is not None:
@@ -91,7 +91,7 @@ class Recipe:
         architecture: Architecture of the network.
         fit: options of a network that refines a line. alone: options of a network without a line.
         line: fit a line; otherwise the network predicts the whole error.
-        network: fit the network; otherwise it predicts 0. With neither, the prior is a constant.
+        network: fit the network; otherwise it predicts 0. With neither, the linear bias model is a constant.
         per_configuration: the network is fitted to at most this number of ranges of a configuration, so that a long
             recording of one placement does not outweigh a short one.
     """
@@ -110,11 +110,11 @@ class Recipe:
         return replace(self, line=name in (LINE, LINE_NETWORK), network=network, fit=options)
 
 
-def prior_m(prior: LinePrior, data: Dataset) -> NDArray[np.float32]:
-    """Return the prediction of a prior, shape (n,), m; NaN where it needs a power that is unknown."""
-    needs_gap = prior.per_power_gap != 0.0
+def linear_bias_m(linear_bias: LinearBiasModel, data: Dataset) -> NDArray[np.float32]:
+    """Return the prediction of a linear bias model, shape (n,), m; NaN where it needs a power that is unknown."""
+    needs_gap = linear_bias.per_power_gap != 0.0
     first_path = data.first_path_power_dbm if needs_gap else data.rx_power_dbm
-    return prior.predict_m(data.rx_power_dbm, first_path)
+    return linear_bias.predict_m(data.rx_power_dbm, first_path)
 
 
 def network_m(network: FloatWeights, inputs: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -142,41 +142,43 @@ def fit_own(
     """
     from uwb_mitigation.training import fitting, networks
 
-    prior = LinePrior(0.0)
+    linear_bias = LinearBiasModel(0.0)
     if recipe.line:
-        prior = fit_line(data)
+        linear_bias = fit_line(data)
     elif not recipe.network:
-        prior = lad.constant(data.configurations, data.error_m)
+        linear_bias = linear_fit.constant(data.configurations, data.error_m)
     if not recipe.network:
         with fitting.single_thread(seed):
-            return FittedModel(prior, networks.weights_of(networks.build(recipe.architecture, 0)))
+            return FittedModel(linear_bias, networks.weights_of(networks.build(recipe.architecture, 0)))
     options = replace(recipe.fit, seed=seed)
     start = recipe.architecture, options, on_epoch
-    return FittedModel(prior, _fit_residuals(data, prior, recipe.per_configuration, *start))
+    return FittedModel(linear_bias, _fit_residuals(data, linear_bias, recipe.per_configuration, *start))
 
 
 def _fit_residuals(
     data: Dataset,
-    prior: LinePrior,
+    linear_bias: LinearBiasModel,
     per_configuration: int,
     architecture: Remnet,
     options: FitOptions,
     on_epoch: Callable[[], None] = lambda: None,
     start: FloatWeights | None = None,
 ) -> FloatWeights:
-    """Fit a network to the residuals of a prior."""
+    """Fit a network to the residuals of a linear bias model."""
     from uwb_mitigation.training import fitting
 
     part = data.rows(splits.thinned(data.configurations, per_configuration, options.seed))
-    residual = part.error_m - prior_m(prior, part)
-    # If the prior needs a power that is unknown, the range is passed through.
+    residual = part.error_m - linear_bias_m(linear_bias, part)
+    # If the linear bias model needs a power that is unknown, the range is passed through.
     known = np.isfinite(residual)
     return fitting.fit(architecture, part.inputs[known], residual[known], options, on_epoch, start=start)
 
 
-def fit_line(data: Dataset) -> LinePrior:
-    """Fit a line in both powers (see `lad.fit_prior`)."""
-    return lad.fit_prior(data.configurations, data.rx_power_dbm, data.first_path_power_dbm, data.error_m)
+def fit_line(data: Dataset) -> LinearBiasModel:
+    """Fit a line in both powers (see `linear_fit.fit_linear_bias`)."""
+    return linear_fit.fit_linear_bias(
+        data.configurations, data.rx_power_dbm, data.first_path_power_dbm, data.error_m
+    )
 
 
 def own_models(recipe: Recipe) -> list[Candidate]:
@@ -195,7 +197,7 @@ def own_models(recipe: Recipe) -> list[Candidate]:
 
 def _constant() -> Candidate:
     return Candidate(
-        CONSTANT, lambda data, seed: FittedModel(lad.constant(data.configurations, data.error_m))
+        CONSTANT, lambda data, seed: FittedModel(linear_fit.constant(data.configurations, data.error_m))
     )
 
 
@@ -206,7 +208,7 @@ def _line() -> Candidate:
 def from_bundle(source: Bundle, options: FitOptions) -> list[Candidate]:
     """Return the unchanged model of a bundle, the same with another offset, a constant, a line, and a fine-tuned network.
 
-    The fine-tuned network is trained on the residuals of a new prior: a line if the bundle has one, otherwise an offset.
+    The fine-tuned network is trained on the residuals of a new linear_bias: a line if the bundle has one, otherwise an offset.
 
     Raises:
         ModelError: the network is not a REMNet.
@@ -214,20 +216,26 @@ def from_bundle(source: Bundle, options: FitOptions) -> list[Candidate]:
     network = float_network(source)
 
     def shifted(data: Dataset, seed: int) -> FittedModel:
-        residual = data.error_m - prior_m(source.prior, data) - network_m(network, data.inputs)
+        residual = data.error_m - linear_bias_m(source.linear_bias, data) - network_m(network, data.inputs)
         known = np.isfinite(residual)
-        shift = lad.constant(data.configurations[known], residual[known]).offset_m if known.any() else 0.0
-        prior = replace(source.prior, offset_m=float(np.float32(source.prior.offset_m + shift)))
-        return FittedModel(prior, network)
+        shift = (
+            linear_fit.constant(data.configurations[known], residual[known]).offset_m if known.any() else 0.0
+        )
+        linear_bias = replace(
+            source.linear_bias, offset_m=float(np.float32(source.linear_bias.offset_m + shift))
+        )
+        return FittedModel(linear_bias, network)
 
     def trained(data: Dataset, seed: int) -> FittedModel:
-        prior = fit_line(data) if source.prior.needs_power else _offset(data, network)
+        linear_bias = fit_line(data) if source.linear_bias.needs_power else _offset(data, network)
         assert isinstance(source.architecture, Remnet)
         start = source.architecture, replace(options, seed=seed)
-        return FittedModel(prior, _fit_residuals(data, prior, PER_CONFIGURATION, *start, start=network))
+        return FittedModel(
+            linear_bias, _fit_residuals(data, linear_bias, PER_CONFIGURATION, *start, start=network)
+        )
 
     return [
-        Candidate(AS_SHIPPED, lambda data, seed: FittedModel(source.prior, network)),
+        Candidate(AS_SHIPPED, lambda data, seed: FittedModel(source.linear_bias, network)),
         Candidate(OWN_OFFSET, shifted),
         _constant(),
         _line(),
@@ -255,7 +263,7 @@ def with_cold_start(candidates: Sequence[Candidate], data: Dataset, universal: B
     def mean(data: Dataset, seed: int) -> FittedModel:
         line, offset = fit_line(data), _offset(data, network).offset_m
         total = (line.offset_m + offset, line.per_rx_power, line.per_power_gap)
-        return FittedModel(LinePrior(*(float(np.float32(value / 2)) for value in total)), half)
+        return FittedModel(LinearBiasModel(*(float(np.float32(value / 2)) for value in total)), half)
 
     behind = {CONSTANT: [start], LINE: [Candidate(MEAN, mean)] if has_line else []}
     return [item for one in candidates for item in (one, *behind.get(one.name, ()))]
@@ -266,8 +274,8 @@ def is_few(data: Dataset) -> bool:
     return len(data.names) < ENOUGH_FOR_MEAN
 
 
-def _offset(data: Dataset, network: FloatWeights) -> LinePrior:
-    return lad.constant(data.configurations, data.error_m - network_m(network, data.inputs))
+def _offset(data: Dataset, network: FloatWeights) -> LinearBiasModel:
+    return linear_fit.constant(data.configurations, data.error_m - network_m(network, data.inputs))
 
 
 def site_models(
@@ -292,8 +300,10 @@ def site_models(
             residual = data.error_m - factor * _universal_m(data)
             # A bundle with a network passes a range through if its first-path power is unknown.
             has_line = line and _has_both_powers(data)
-            prior = _site_line(data, residual) if has_line else lad.constant(data.configurations, residual)
-            return FittedModel(prior, scaled(start, factor), factor)
+            linear_bias = (
+                _site_line(data, residual) if has_line else linear_fit.constant(data.configurations, residual)
+            )
+            return FittedModel(linear_bias, scaled(start, factor), factor)
 
         return fit
 
@@ -308,7 +318,7 @@ def site_models(
     def tuned(data: Dataset, seed: int) -> FittedModel:
         from uwb_mitigation.training import fitting
 
-        shift = lad.constant(data.configurations, data.error_m - _universal_m(data))
+        shift = linear_fit.constant(data.configurations, data.error_m - _universal_m(data))
         part = data.rows(splits.thinned(data.configurations, TUNED_PER_CONFIGURATION, seed))
         if len(part) > TUNED_INPUTS:
             chosen = np.random.default_rng(seed).choice(len(part), TUNED_INPUTS, replace=False)
@@ -333,12 +343,12 @@ def _factor(data: Dataset) -> float:
     Noise of the predictions would bias the factor towards 0, and with it the estimated offsets.
     """
     predicted, error = (
-        lad.means(data.configurations, values) for values in (_universal_m(data), data.error_m)
+        linear_fit.means(data.configurations, values) for values in (_universal_m(data), data.error_m)
     )
-    if len(predicted) < lad.MIN_CONFIGURATIONS or float(np.ptp(predicted)) < MIN_SPREAD_M:
+    if len(predicted) < linear_fit.MIN_CONFIGURATIONS or float(np.ptp(predicted)) < MIN_SPREAD_M:
         return 1.0
     design = np.column_stack([np.ones(len(predicted)), predicted])
-    factor = float(lad.least_absolute_deviations(design, error)[1])
+    factor = float(linear_fit.least_absolute_deviations(design, error)[1])
     return float(np.float32(np.clip(factor, *FACTORS)))
 
 
@@ -346,8 +356,10 @@ def _has_both_powers(data: Dataset) -> bool:
     return bool(np.isfinite(data.rx_power_dbm - data.first_path_power_dbm).mean() > 0.5)
 
 
-def _site_line(data: Dataset, error_m: NDArray[np.float64]) -> LinePrior:
+def _site_line(data: Dataset, error_m: NDArray[np.float64]) -> LinearBiasModel:
     """Fit a line in both powers if both are known, otherwise in the received power if known, otherwise a constant."""
     if _has_both_powers(data):
-        return lad.fit_prior(data.configurations, data.rx_power_dbm, data.first_path_power_dbm, error_m)
-    return lad.fit_prior(data.configurations, data.rx_power_dbm, None, error_m)
+        return linear_fit.fit_linear_bias(
+            data.configurations, data.rx_power_dbm, data.first_path_power_dbm, error_m
+        )
+    return linear_fit.fit_linear_bias(data.configurations, data.rx_power_dbm, None, error_m)

@@ -12,8 +12,8 @@ from uwb_mitigation.evaluation.dataset import Dataset
 from uwb_mitigation.evaluation.intervals import calibrate
 from uwb_mitigation.model.architecture import Architecture
 from uwb_mitigation.model.bundle import Card
-from uwb_mitigation.model.familiarity import Familiarity, features
-from uwb_mitigation.model.prior import LinePrior
+from uwb_mitigation.model.linear_bias import LinearBiasModel
+from uwb_mitigation.model.ood import OodBands, features
 from uwb_mitigation.preprocessing import Scaling
 
 
@@ -21,11 +21,11 @@ def card_of(
     name: str,
     architecture: Architecture,
     dataset: Dataset,
-    prior: LinePrior,
+    linear_bias: LinearBiasModel,
     unseen: Dataset,
     left_m: NDArray[np.floating],
     training: Mapping[str, Any],
-    familiarity: Familiarity | None = None,
+    ood_bands: OodBands | None = None,
 ) -> Card:
     """Return the card of a float model.
 
@@ -48,7 +48,7 @@ def card_of(
         name=name,
         architecture=architecture,
         preprocessing=dataset.preprocessing,
-        prior=prior,
+        linear_bias=linear_bias,
         quantised=False,
         variance_m2=corrected.variance_m2,
         variance_uncorrected_m2=raw.variance_m2,
@@ -56,11 +56,11 @@ def card_of(
         training=training,
         variance_per_m2=corrected.variance_per_m2,
         interval95_sigmas=corrected.sigmas95,
-        familiarity=familiarity,
+        ood_bands=ood_bands,
     )
 
 
-def familiarity_of(dataset: Dataset, known_offset_m: float | None = None) -> Familiarity | None:
+def ood_bands_of(dataset: Dataset, known_offset_m: float | None = None) -> OodBands | None:
     """Return the in-distribution bands of a model that was fitted to `dataset`.
 
     Without levels (scaling MAX), only features that need no levels have bands. Returns None if a model needs levels
@@ -79,6 +79,6 @@ def familiarity_of(dataset: Dataset, known_offset_m: float | None = None) -> Fam
     if with_levels and not np.isfinite(values).all(axis=1).any():
         return None
     if known_offset_m is not None:
-        return Familiarity.of(known_offset_m, values)
+        return OodBands.of(known_offset_m, values)
     means = [dataset.error_m[dataset.configurations == name].mean() for name in dataset.names]
-    return Familiarity.of(float(np.median(means)), values)
+    return OodBands.of(float(np.median(means)), values)

@@ -16,7 +16,7 @@ from uwb_mitigation.model.architecture import Mlp, Remnet
 from uwb_mitigation.model.bundle import Bundle
 from uwb_mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.training import candidates, train
-from uwb_mitigation.training.candidates import Recipe, network_m, prior_m
+from uwb_mitigation.training.candidates import Recipe, linear_bias_m, network_m
 from uwb_mitigation.training.fitting import fit
 from uwb_mitigation.training.quantization import calibration_inputs, quantize
 
@@ -189,12 +189,12 @@ def _hold_out(
             errors[name][fold.test] -= predicted
         card, network = train.fit_with_card(part, recipe, INNER_FOLDS)
         integers = quantize(network, calibration_inputs(part, seed), exact=False)
-        prior = prior_m(card.prior, test)
+        linear_bias = linear_bias_m(card.linear_bias, test)
         for name, output in (
             ("shipped_float", network_m(network, test.inputs).astype(np.float32)),
             ("shipped_int8", IntegerNetwork(integers).predict_m(test.inputs)),
         ):
-            graded = zero_shot.grade(test, card, (prior + output).astype(np.float32))
+            graded = zero_shot.grade(test, card, (linear_bias + output).astype(np.float32))
             errors[name][fold.test] -= graded.correction_m
         variance[fold.test] = graded.variance_m2
         sigmas95[fold.test] = card.interval95_sigmas
@@ -211,7 +211,7 @@ def _baselines(
     yield "ridge", baselines.ridge(part, header=False)(test)
     yield "ridge_header", baselines.ridge(part, header=True)(test)
     yield "gradient_boosting", baselines.gradient_boosting(part, seed)(test)
-    yield "l1_line", prior_m(candidates.fit_line(part), test)
+    yield "l1_line", linear_bias_m(candidates.fit_line(part), test)
     some = part.rows(splits.thinned(part.configurations, recipe.per_configuration, seed))
     options, samples = replace(candidates.ALONE, seed=seed), recipe.architecture.samples
     yield "mlp", network_m(fit(Mlp(samples=samples), some.inputs, some.error_m, options), test.inputs)

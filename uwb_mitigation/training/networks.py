@@ -118,7 +118,7 @@ def weights_of(network: Network) -> FloatWeights:
 
 def _head(features: int) -> nn.Linear:
     head = nn.Linear(features, 1)
-    # The network refines a prior, so it initially predicts no correction.
+    # The network refines a linear bias model, so it initially predicts no correction.
     nn.init.zeros_(head.weight)
     nn.init.zeros_(head.bias)
     return head

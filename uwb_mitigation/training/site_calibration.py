@@ -19,7 +19,7 @@ from uwb_mitigation.evaluation.dataset import Dataset
 from uwb_mitigation.evaluation.site_data import SiteData
 from uwb_mitigation.files import write_together
 from uwb_mitigation.model import graph
-from uwb_mitigation.model.bundle import Bundle, made_bundle
+from uwb_mitigation.model.bundle import Bundle, build_bundle
 from uwb_mitigation.model.floating import float_network, scaled
 from uwb_mitigation.offsets import Offsets, dump_offsets
 from uwb_mitigation.positioning.geometry import Area, Height
@@ -29,7 +29,7 @@ from uwb_mitigation.positioning.self_calibration import SelfCalibration, calibra
 from uwb_mitigation.training import candidates as models
 from uwb_mitigation.training import selection as selections
 from uwb_mitigation.training.anchor_check import check_anchors
-from uwb_mitigation.training.cards import card_of, familiarity_of
+from uwb_mitigation.training.cards import card_of, ood_bands_of
 from uwb_mitigation.training.selection import MUST_GAIN, Selection
 
 MAX_TRUTH_SD_M = 0.25
@@ -188,7 +188,7 @@ class Calibrated:
         """Return the result of `uwb-mitigation calibrate`."""
         solution, model = self.solution, self.selection.model
         factor = 0.0 if model.network is None else 1.0 if model.factor is None else model.factor
-        prior = model.prior
+        linear_bias = model.linear_bias
         return {
             "offsets_m": {f"{tag}-{anchor}": value for (tag, anchor), (value, _) in solution.pairs.items()},
             "offset_sd_m": {f"{tag}-{anchor}": sd for (tag, anchor), (_, sd) in solution.pairs.items()},
@@ -206,9 +206,9 @@ class Calibrated:
             "position_error_m": _json_pair(self.position_error_m),
             "network_factor": [factor, solution.network_sd],
             "line": {
-                "offset_m": prior.offset_m,
-                "per_rx_power": prior.per_rx_power,
-                "per_power_gap": prior.per_power_gap,
+                "offset_m": linear_bias.offset_m,
+                "per_rx_power": linear_bias.per_rx_power,
+                "per_power_gap": linear_bias.per_power_gap,
             },
             "places": {name: list(position) for name, position in solution.places.items()},
             "notes": list(self.notes),
@@ -236,19 +236,19 @@ class Calibrated:
             "configurations": len(self.data.names),
             "split": "held out: stretches of the track, and anchors",
             "started_from": f"{universal.model_id:08x}",
-            "recipe": {"line": model.prior.needs_power, "network": model.network is not None},
+            "recipe": {"line": model.linear_bias.needs_power, "network": model.network is not None},
             "metrics_m": {row: {"mae": round(value, 4)} for row, value in metrics.items()},
         }
         has_network = model.network is not None
         network = scaled(float_network(universal), 0.0) if model.network is None else model.network
-        familiarity = familiarity_of(self.data) if has_network else None
-        fitted = output.stem, universal.architecture, self.data, model.prior
-        card = card_of(*fitted, self.data, self.held_out_m, training, familiarity)
+        ood_bands = ood_bands_of(self.data) if has_network else None
+        fitted = output.stem, universal.architecture, self.data, model.linear_bias
+        card = card_of(*fitted, self.data, self.held_out_m, training, ood_bands)
         if has_network:
             # The drive does not cover the whole site, so the limits include those of the universal model.
             (low, high), (lowest, highest) = universal.card.correction_limits_m, card.correction_limits_m
             card = replace(card, correction_limits_m=(min(low, lowest), max(high, highest)))
-        bundle, content = made_bundle(
+        bundle, content = build_bundle(
             output, graph.float_model(network), replace(card, needs_cir=has_network)
         )
         offsets_path = offsets_file(output)

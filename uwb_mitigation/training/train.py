@@ -18,13 +18,13 @@ from uwb_mitigation.model.architecture import Remnet
 from uwb_mitigation.model.bundle import Bundle, Card, load_bundle, save_bundle
 from uwb_mitigation.model.floating import float_network, scaled
 from uwb_mitigation.model.integer import IntegerNetwork
-from uwb_mitigation.model.prior import LinePrior
+from uwb_mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.model.shipped import default_model_path
 from uwb_mitigation.model.weights import FloatWeights
 from uwb_mitigation.training import candidates as models
 from uwb_mitigation.training import selection as selections
-from uwb_mitigation.training.candidates import Candidate, Recipe, fit_own, prior_m
-from uwb_mitigation.training.cards import card_of, familiarity_of
+from uwb_mitigation.training.candidates import Candidate, Recipe, fit_own, linear_bias_m
+from uwb_mitigation.training.cards import card_of, ood_bands_of
 from uwb_mitigation.training.options import FitOptions
 from uwb_mitigation.training.quantization import calibration_inputs, quantize
 from uwb_mitigation.training.selection import NESTED, Selection
@@ -141,7 +141,7 @@ def train_own(job: Job, recipe: Recipe, wanted: str = AUTO) -> TrainedBundle:
     on_epoch = selections.counted(total, lambda share: job.on_progress("training", share))
     validation = cross_validate(dataset, recipe, folds, seed, on_epoch)
     fitted = fit_own(dataset, recipe, seed, on_epoch)
-    card = describe(job.output.stem, recipe, fitted.prior, validation, job.name)
+    card = describe(job.output.stem, recipe, fitted.linear_bias, validation, job.name)
     mae = {row: statistics["mae"] for row, statistics in validation.statistics().items()}
     after = mae["int8"] if selection is None else selection.mae()[NESTED]
     assert fitted.network is not None
@@ -187,12 +187,12 @@ def _write_selected(
     """Write a model that starts from a bundle; the intervals are from its held-out errors in the selection."""
     silent = scaled(float_network(start), 0.0)
     assert isinstance(silent.architecture, Remnet)
-    prior, network = selection.model.prior, selection.model.network
+    linear_bias, network = selection.model.linear_bias, selection.model.network
     is_trained = selection.chosen == models.TRAINED_FURTHER
-    recipe = Recipe(silent.architecture, options, line=prior.needs_power, network=is_trained)
+    recipe = Recipe(silent.architecture, options, line=linear_bias.needs_power, network=is_trained)
     errors = {**selection.errors, "float": selection.errors[selection.chosen]}
     validation = CrossValidation(job.dataset, errors, selection.folds, selection.seed)
-    card = describe(job.output.stem, recipe, prior, validation, job.name)
+    card = describe(job.output.stem, recipe, linear_bias, validation, job.name)
     training = {
         **card.training,
         "started_from": f"{start.model_id:08x}",
@@ -226,7 +226,7 @@ def cross_validate(
         train, test = dataset.rows(fold.train), dataset.rows(fold.test)
         fitted = fit_own(train, recipe, recipe.fit.seed, on_epoch)
         assert fitted.network is not None
-        residual = test.error_m - prior_m(fitted.prior, test)
+        residual = test.error_m - linear_bias_m(fitted.linear_bias, test)
         errors["overall_median"][fold.test] -= np.median(train.error_m)
         if recipe.line:
             errors["l1_line"][fold.test] = residual
@@ -247,10 +247,12 @@ def fit_with_card(dataset: Dataset, recipe: Recipe, inner_folds: int) -> tuple[C
     validation = cross_validate(dataset, recipe, folds, seed, quantised=False)
     fitted = fit_own(dataset, recipe, seed)
     assert fitted.network is not None
-    return describe("", recipe, fitted.prior, validation, ""), fitted.network
+    return describe("", recipe, fitted.linear_bias, validation, ""), fitted.network
 
 
-def describe(name: str, recipe: Recipe, prior: LinePrior, validation: CrossValidation, data: str) -> Card:
+def describe(
+    name: str, recipe: Recipe, linear_bias: LinearBiasModel, validation: CrossValidation, data: str
+) -> Card:
     """Return the card of a float model that was fitted to the dataset of `validation`."""
     dataset = validation.dataset
     options = asdict(recipe.fit) | {"per_configuration": recipe.per_configuration} if recipe.network else {}
@@ -267,8 +269,8 @@ def describe(name: str, recipe: Recipe, prior: LinePrior, validation: CrossValid
         },
     }
     left = validation.errors["float"]
-    familiarity = familiarity_of(dataset)
-    return card_of(name, recipe.architecture, dataset, prior, dataset, left, training, familiarity)
+    ood_bands = ood_bands_of(dataset)
+    return card_of(name, recipe.architecture, dataset, linear_bias, dataset, left, training, ood_bands)
 
 
 def _check_configurations(dataset: Dataset, needed: int) -> None:

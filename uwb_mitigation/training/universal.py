@@ -18,12 +18,12 @@ from uwb_mitigation.model import floating
 from uwb_mitigation.model.architecture import Remnet
 from uwb_mitigation.model.bundle import Card
 from uwb_mitigation.model.integer import IntegerNetwork
-from uwb_mitigation.model.prior import LinePrior
+from uwb_mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.model.weights import FloatWeights, Int8Weights
 from uwb_mitigation.preprocessing import Preprocessing, Scaling
 from uwb_mitigation.sources.simulation.buildings import PLACEMENTS
 from uwb_mitigation.training.augmentation import calibration_inputs, normalised, vary_channel, vary_receiver
-from uwb_mitigation.training.cards import card_of, familiarity_of
+from uwb_mitigation.training.cards import card_of, ood_bands_of
 from uwb_mitigation.training.fitting import fit
 from uwb_mitigation.training.options import FitOptions
 from uwb_mitigation.training.quantization import quantize
@@ -132,7 +132,7 @@ def _graded(plan: Plan, name: str, network: FloatWeights, integers: Int8Weights,
         name,
         network.architecture,
         test,
-        LinePrior(0.0),
+        LinearBiasModel(0.0),
         test.rows(alike),
         left["float"][alike],
         {
@@ -148,7 +148,7 @@ def _graded(plan: Plan, name: str, network: FloatWeights, integers: Int8Weights,
             },
         },
         # The correction shrinks to zero out of distribution, because an offset depends on the radio, not on the channel.
-        familiarity_of(test, known_offset_m=0.0),
+        ood_bands_of(test, known_offset_m=0.0),
     )
     return Universal(card, network, integers, statistics)
 

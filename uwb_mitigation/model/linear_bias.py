@@ -13,7 +13,7 @@ MAX_POWER_DBM = 1000.0
 
 
 @dataclass(frozen=True, slots=True)
-class LinePrior:
+class LinearBiasModel:
     """`offset_m + per_rx_power * rx_power + per_power_gap * (rx_power - first_path_power)`.
 
     Coefficients are float32 values and the line is evaluated in float32. Each product and sum is rounded once and in

@@ -15,7 +15,7 @@ import numpy as np
 
 from uwb_mitigation.evaluation import baselines, splits
 from uwb_mitigation.evaluation.dataset import build_dataset
-from uwb_mitigation.evaluation.lad import least_absolute_deviations
+from uwb_mitigation.evaluation.linear_fit import least_absolute_deviations
 from uwb_mitigation.preprocessing import Preprocessing
 from uwb_mitigation.sources.decaranging import CirOf, DecaRangingFolder
 

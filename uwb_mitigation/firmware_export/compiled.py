@@ -76,7 +76,7 @@ _SIGNATURES: Signatures = {
 }
 
 
-class HostFirmware:
+class CompiledFirmware:
     """An exported model in the portable C library.
 
     Args:
@@ -158,7 +158,7 @@ class FirmwareMitigation(Backend):
         with tempfile.TemporaryDirectory(prefix="uwb_firmware_backend_") as name:
             folder = Path(name)
             export_bundle(bundle, folder)
-            self._firmware = HostFirmware(folder, folder)
+            self._firmware = CompiledFirmware(folder, folder)
 
     def correct_columns(self, ranges: RangeColumns) -> CorrectedColumns:
         """See `Backend`."""

@@ -1,4 +1,4 @@
-"""Fit the line prior by least absolute deviations to the mean of each configuration.
+"""Fit the linear bias model by least absolute deviations to the mean of each configuration.
 
 Least absolute deviations are used because a few configurations have errors of metres (wrong survey, no direct path), and
 one mean per configuration because its measurements are not independent.
@@ -10,25 +10,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.model.prior import LinePrior
+from uwb_mitigation.model.linear_bias import LinearBiasModel
 
 MIN_CONFIGURATIONS = 6
-"""With fewer configurations, the prior is their median, because three coefficients are not observable."""
+"""With fewer configurations, the linear bias model is their median, because three coefficients are not observable."""
 
 MIN_POWER_RANGE_DB = 1.0
 """Minimum span of the received powers for fitting a line in the received power."""
 
 
-def fit_prior(
+def fit_linear_bias(
     configurations: NDArray[np.str_],
     rx_power_dbm: NDArray[np.floating],
     first_path_power_dbm: NDArray[np.floating] | None,
     error_m: NDArray[np.floating],
-) -> LinePrior:
-    """Fit the prior to measurements; all arrays have the shape (n,).
+) -> LinearBiasModel:
+    """Fit the linear bias model to measurements; all arrays have the shape (n,).
 
     Rows with an unknown power (NaN) are ignored. If too few configurations remain, or if their powers are almost equal, the
-    prior is the median over configurations.
+    linear_bias is the median over configurations.
 
     Args:
         first_path_power_dbm: None: fit a line in the received power only.
@@ -37,7 +37,7 @@ def fit_prior(
         DatasetError: there are no measurements.
     """
     if len(error_m) == 0:
-        raise DatasetError("no measurements to fit a prior to")
+        raise DatasetError("no measurements to fit a linear bias model to")
     powers = [rx_power_dbm]
     if first_path_power_dbm is not None:
         powers.append(rx_power_dbm - first_path_power_dbm)
@@ -51,7 +51,7 @@ def fit_prior(
     if is_flat or np.linalg.matrix_rank(design, tol=1e-3) < design.shape[1]:
         return constant(configurations, error_m)
     found = least_absolute_deviations(design, means(names, error_m[known]))
-    return LinePrior(*(float(np.float32(value)) for value in found))
+    return LinearBiasModel(*(float(np.float32(value)) for value in found))
 
 
 def least_absolute_deviations(
@@ -83,9 +83,9 @@ def least_absolute_deviations(
     return coefficients / np.where(size > 0, size, 1)
 
 
-def constant(configurations: NDArray[np.str_], error_m: NDArray[np.floating]) -> LinePrior:
+def constant(configurations: NDArray[np.str_], error_m: NDArray[np.floating]) -> LinearBiasModel:
     """Return the median over configurations of their mean errors; arguments of shape (n,), n > 0."""
-    return LinePrior(float(np.float32(np.median(means(configurations, error_m)))))
+    return LinearBiasModel(float(np.float32(np.median(means(configurations, error_m)))))
 
 
 def means(configurations: NDArray[np.str_], values: NDArray[np.floating]) -> NDArray[np.float64]:

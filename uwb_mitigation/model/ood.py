@@ -93,7 +93,7 @@ earlier."""
 
 
 @dataclass(frozen=True, slots=True)
-class Familiarity:
+class OodBands:
     """Bands of the training data, and the value to which the correction shrinks outside of them.
 
     Attributes:
@@ -132,7 +132,7 @@ class Familiarity:
         return any(band is not None for band in self.bands[1:-1])
 
     @classmethod
-    def of(cls, known_offset_m: float, values: NDArray[np.float32]) -> Familiarity:
+    def of(cls, known_offset_m: float, values: NDArray[np.float32]) -> OodBands:
         """Compute the bands of training data with these `features`.
 
         A feature without finite values has no band; rows in which another feature is not finite are ignored.
@@ -144,7 +144,7 @@ class Familiarity:
         known: NDArray[np.bool_] = np.any(finite, axis=0)
         rows: NDArray[np.bool_] = np.all(finite[:, known], axis=1)
         if not known.any() or not rows.any():
-            raise ModelError("no measurement has all the features of familiarity")
+            raise ModelError("no measurement has all features of the OOD score")
         bands = (
             Band.of(column, widening) if is_known else None
             for column, is_known, widening in zip(values[rows].T[:-1], known[:-1], _WIDENINGS, strict=True)
@@ -193,13 +193,13 @@ def features(
     return by_measurement
 
 
-class Strangeness:
-    """Computes OOD scores of features with the bands of a `Familiarity`."""
+class OodDetector:
+    """Computes OOD scores of features with the bands of a `OodBands`."""
 
     def __init__(self, bands: Iterable[Band | None]) -> None:
         checked = {column: astuple(band) for column, band in enumerate(bands) if band is not None}
         # A slice is faster than a list of all columns.
-        self._columns = slice(None) if len(checked) == len(fields(Familiarity)) - 1 else list(checked)
+        self._columns = slice(None) if len(checked) == len(fields(OodBands)) - 1 else list(checked)
         table = np.array(list(checked.values()), np.float32)
         self._low, self._high = table[:, 0], table[:, 1]
         self._per_unit = np.float32(1) / table[:, 2]
