@@ -295,8 +295,8 @@ def worse_position(fields):
 def test_a_calibration_without_gain_is_written_by_force_only(site, monkeypatch, change, options):
     from uwb_mitigation.training import site_calibration
 
-    make = site_calibration.Calibrated
-    monkeypatch.setattr(site_calibration, "Calibrated", lambda **fields: make(**fields | change(fields)))
+    make = site_calibration.SiteCalibration
+    monkeypatch.setattr(site_calibration, "SiteCalibration", lambda **fields: make(**fields | change(fields)))
     words = ("drive.mcap", *LEVEL, *options, "-o", "harm.onnx", "--json", "h.json")
     assert run("calibrate", *words, folder=site).returncode == 1
     assert "not written" in json.loads((site / "h.json").read_text())["refused"]

@@ -27,7 +27,7 @@ RECIPE = Recipe(Remnet(samples=8), FitOptions(epochs=1))
 def _short():
     """The network alone is trained for as long as it needs; here nothing is learnt from that."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(candidates, "ALONE", FitOptions(epochs=1))
+        patch.setattr(candidates, "NETWORK_ONLY", FitOptions(epochs=1))
         yield
 
 

@@ -81,7 +81,7 @@ def test_no_configuration_is_on_both_sides_and_each_is_tested_once(names, folds,
 
 def test_thinning_leaves_at_most_so_many_of_each():
     names = np.array(["a"] * 50 + ["b"] * 3)
-    rows = splits.thinned(names, 10, 0)
+    rows = splits.subsample(names, 10, 0)
     assert np.count_nonzero(names[rows] == "a") == 10
     assert np.count_nonzero(names[rows] == "b") == 3
     assert (np.diff(rows) > 0).all()

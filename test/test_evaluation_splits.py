@@ -11,7 +11,7 @@ from model_material import dataset
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.evaluation import baselines, splits
 from uwb_mitigation.evaluation.intervals import calibrate
-from uwb_mitigation.evaluation.metrics import bootstrap_interval, kept_mae
+from uwb_mitigation.evaluation.metrics import bootstrap_interval, mae_after_rejection
 from uwb_mitigation.evaluation.splits import Group
 
 NAMES = np.repeat([f"c{number}" for number in range(40)], 5)
@@ -65,8 +65,8 @@ def test_the_bootstrap_draws_configurations_not_ranges():
 
 def test_the_largest_variances_are_rejected_first():
     errors = np.array([1.0, -5.0, 2.0, 4.0])
-    assert kept_mae(errors, np.array([1.0, 4.0, 2.0, 3.0]), 0.5) == 1.5
-    assert kept_mae(errors, errors**2, 0.0) == 3.0
+    assert mae_after_rejection(errors, np.array([1.0, 4.0, 2.0, 3.0]), 0.5) == 1.5
+    assert mae_after_rejection(errors, errors**2, 0.0) == 3.0
 
 
 def test_intervals_cover_configurations_to_come():

@@ -42,8 +42,8 @@ LEARNERS = {
     (comparison, "calibration_inputs"),
     (comparison, "quantize"),
     (fitting, "fit"),
-    (candidates, "fit_own"),
-    (train, "fit_own"),
+    (candidates, "fit_new_model"),
+    (train, "fit_new_model"),
     (train, "fit_with_card"),
     (train, "calibration_inputs"),
     (train, "quantize"),
@@ -142,7 +142,7 @@ def watch(data: Dataset, monkeypatch: pytest.MonkeyPatch) -> Watch:
         return watch.folds(divide(names, folds, seed), names)
 
     monkeypatch.setattr(splits, "by_configuration", by_configuration)
-    monkeypatch.setattr(candidates, "ALONE", QUICK)
+    monkeypatch.setattr(candidates, "NETWORK_ONLY", QUICK)
     return watch
 
 
@@ -168,18 +168,18 @@ def test_cross_validation_fits_and_calibrates_without_the_fold(data, watch):
 
 
 def test_a_choice_is_told_by_folds_that_had_no_say_in_it(data, watch, monkeypatch):
-    prefer = selection.preferred
+    prefer = selection.select_simplest
     nested = []
 
-    def preferred(errors: dict[str, NDArray[np.float64]], must_gain: float) -> str:
+    def select_simplest(errors: dict[str, NDArray[np.float64]], min_gain: float) -> str:
         if watch.held_out:
             held_out = set().union(*watch.held_out)
             nested.append({len(error) for error in errors.values()})
             assert nested[-1] == {int((~np.isin(data.configurations, list(held_out))).sum())}
-        return prefer(errors, must_gain)
+        return prefer(errors, min_gain)
 
-    monkeypatch.setattr(selection, "preferred", preferred)
-    own = candidates.own_models(RECIPE)
+    monkeypatch.setattr(selection, "select_simplest", select_simplest)
+    own = candidates.new_models(RECIPE)
     selection.select_nested(data, [own[0], own[2]], 3, 0)
     assert nested
     watch.called("linear_fit.constant", "fitting.fit")

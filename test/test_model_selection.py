@@ -49,17 +49,17 @@ def numbered(error_of):
 
 def test_the_simplest_candidate_is_preferred_unless_a_richer_one_gains():
     errors = {"a": np.array([1.0]), "b": np.array([0.99]), "c": np.array([0.9])}
-    assert selection.preferred(errors, 0.02) == "c"
-    assert selection.preferred(errors, 0.2) == "a"
+    assert selection.select_simplest(errors, 0.02) == "c"
+    assert selection.select_simplest(errors, 0.2) == "a"
 
 
 def test_a_constant_error_needs_no_line_and_an_error_that_follows_the_power_does():
-    constant = selection.select_nested(numbered(lambda number: 0.3), candidates.own_models(RECIPE), 3, 0)
+    constant = selection.select_nested(numbered(lambda number: 0.3), candidates.new_models(RECIPE), 3, 0)
     assert constant.chosen == candidates.CONSTANT
     assert constant.mae()[NESTED] < 1e-6
     data = dataset(14, 5, samples=8)
     data = replace(data, error_m=-5.1 - 0.069 * data.rx_power_dbm.astype(float))
-    line = selection.select_nested(data, candidates.own_models(RECIPE), 3, 0)
+    line = selection.select_nested(data, candidates.new_models(RECIPE), 3, 0)
     assert line.chosen == candidates.LINE
     assert line.model.linear_bias.per_rx_power == pytest.approx(-0.069, abs=1e-3)
 
@@ -76,14 +76,14 @@ def test_a_trained_network_must_show_its_gain_in_the_nested_error(monkeypatch):
     data = numbered(lambda number: 0.3)
     offered = [replace(item, trains=item.name == "quarter") for item in CONSTANTS]
     assert selection.select_nested(data, offered, 3, 0).chosen == "quarter"
-    prefer = selection.preferred
+    prefer = selection.select_simplest
 
-    def preferred(errors, must_gain=0.02):
+    def select_simplest(errors, min_gain=0.02):
         """The inner folds prefer another one, so the selection leaves more than the candidate."""
         is_inner = len(next(iter(errors.values()))) < len(data)
-        return "half" if is_inner else prefer(errors, must_gain)
+        return "half" if is_inner else prefer(errors, min_gain)
 
-    monkeypatch.setattr(selection, "preferred", preferred)
+    monkeypatch.setattr(selection, "select_simplest", select_simplest)
     assert selection.select_nested(data, offered, 3, 0).chosen == "half"
 
 
@@ -98,7 +98,7 @@ def test_the_least_number_of_configurations_is_enough(configurations, folds):
 
 def test_the_cold_start_fits_an_offset_and_the_mean_a_line_too(tmp_path):
     data, source = dataset(20, 3, samples=32), bundle(tmp_path)
-    offered = candidates.with_cold_start(candidates.own_models(RECIPE), data, source)
+    offered = candidates.with_cold_start(candidates.new_models(RECIPE), data, source)
     found = {item.name: item.fit(data, 0).correction_m(data) for item in offered if not item.trains}
     network = network_m(float_network(source), data.inputs)
     shift = linear_fit.constant(data.configurations, data.error_m - network).offset_m
@@ -109,12 +109,12 @@ def test_the_cold_start_fits_an_offset_and_the_mean_a_line_too(tmp_path):
 
 
 def test_the_cold_start_is_preferred_with_few_configurations_only(tmp_path):
-    source, own = bundle(tmp_path), candidates.own_models(RECIPE)
+    source, own = bundle(tmp_path), candidates.new_models(RECIPE)
 
     def names(data) -> list[str]:
         return [item.name for item in candidates.with_cold_start(own, data, source)]
 
-    assert names(dataset(19, 2)) == [candidates.COLD_START, *candidates.OWN]
+    assert names(dataset(19, 2)) == [candidates.COLD_START, *candidates.NEW_MODELS]
     many = dataset(20, 2)
     assert names(many) == [
         "constant",
@@ -124,14 +124,14 @@ def test_the_cold_start_is_preferred_with_few_configurations_only(tmp_path):
         "line+network",
         "network",
     ]
-    assert names(dataset(20, 2, samples=8)) == list(candidates.OWN)
+    assert names(dataset(20, 2, samples=8)) == list(candidates.NEW_MODELS)
     many.rx_power_dbm[:2] = np.nan  # one configuration of the twenty without power levels
     assert candidates.MEAN not in names(many)
 
 
 @pytest.mark.parametrize("name", [candidates.CONSTANT, candidates.LINE])
 def test_a_model_without_network_has_one_that_predicts_nothing(name):
-    fitted = candidates.fit_own(dataset(8, 5, samples=8), RECIPE.of(name), 0)
+    fitted = candidates.fit_new_model(dataset(8, 5, samples=8), RECIPE.of(name), 0)
     assert not network_m(fitted.network, windows(5, 8)).any()
     assert fitted.linear_bias.needs_power == (name == candidates.LINE)
 
@@ -229,7 +229,7 @@ def test_a_named_model_gets_the_offset_of_the_bag(tmp_path, eight_places):
 def test_few_configurations_start_from_the_universal_network(tmp_path, monkeypatch):
     loads(monkeypatch, dataset(6, 3, samples=157))
     far_off = Candidate("far off", lambda data, seed: FittedModel(LinearBiasModel(9.0)))
-    monkeypatch.setattr(candidates, "own_models", lambda recipe: [far_off])
+    monkeypatch.setattr(candidates, "new_models", lambda recipe: [far_off])
     output, result = tmp_path / "cold.onnx", tmp_path / "cold.json"
     told = run_or_raise("train", "--data", tmp_path, "-o", output, "--folds", 2, "--json", result)
     found, made = json.loads(result.read_text()), load_bundle(output)

@@ -14,7 +14,7 @@ from model_material import amplitudes_only
 
 from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.errors import DatasetError, ParameterError
-from uwb_mitigation.evaluation.radio_offsets import FoundOffset, find_offset
+from uwb_mitigation.evaluation.radio_offsets import OffsetEstimate, estimate_offset
 from uwb_mitigation.measurement import Record
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import load_bundle
@@ -65,12 +65,12 @@ def without_levels(records: list[Record]) -> Iterator[Record]:
         yield replace(record, measurement=replace(record.measurement, cir=cir))
 
 
-def at_one_place(found: FoundOffset) -> set[str]:
+def at_one_place(found: OffsetEstimate) -> set[str]:
     return {one.placement for one in found.placements if not one.refused}
 
 
 def test_an_offset_that_was_added_is_found(universal: Mitigation, direct: list[Record]):
-    before, after = find_offset(universal, direct), find_offset(universal, longer(direct, 0.625))
+    before, after = estimate_offset(universal, direct), estimate_offset(universal, longer(direct, 0.625))
     assert after.offset_m - before.offset_m == pytest.approx(0.625, abs=0.02)
     assert after.sd_m == pytest.approx(before.sd_m, abs=0.02)
     assert before.ranges >= 20
@@ -79,15 +79,15 @@ def test_an_offset_that_was_added_is_found(universal: Mitigation, direct: list[R
     assert before.offset_m == pytest.approx(0.22, abs=3.0 * before.sd_m)
     # Offsets that the mitigator already subtracts are not counted twice.
     told = Mitigation(universal.bundle, Offsets(0.625))
-    assert find_offset(told, longer(direct, 0.625)).offset_m == pytest.approx(after.offset_m, abs=0.02)
+    assert estimate_offset(told, longer(direct, 0.625)).offset_m == pytest.approx(after.offset_m, abs=0.02)
 
 
 def test_without_receive_levels_line_of_sight_is_seen_in_the_cir(direct: list[Record]):
     amplitude = Mitigation(load_bundle(default_model_path(Scaling.MAX)))
-    found = find_offset(amplitude, without_levels(direct))
+    found = estimate_offset(amplitude, without_levels(direct))
     assert found.offset_m == pytest.approx(0.22, abs=3.0 * found.sd_m)
     assert len(at_one_place(found)) > 1
-    reported = find_offset(amplitude, direct)
+    reported = estimate_offset(amplitude, direct)
     gaps = {one.placement: one.power_gap_db for one in reported.placements}
     for one in found.placements:
         assert one.power_gap_db == pytest.approx(gaps[one.placement], abs=1.0)
@@ -97,12 +97,12 @@ def test_without_receive_levels_line_of_sight_is_seen_in_the_cir(direct: list[Re
         if record.truth is not None and record.truth.label == "NDP NLOS"
     ]
     with pytest.raises(DatasetError, match="not line of sight"):
-        find_offset(amplitude, without_levels(blocked[:1] * 20))
+        estimate_offset(amplitude, without_levels(blocked[:1] * 20))
 
 
 def test_what_is_not_line_of_sight_is_refused_with_what_shows_it(universal: Mitigation, direct: list[Record]):
     with pytest.raises(DatasetError, match=r"not line of sight: the first path is \d+\.\d dB below"):
-        find_offset(universal, weaker_first_path(direct, 9.0), 3.0)
+        estimate_offset(universal, weaker_first_path(direct, 9.0), 3.0)
     without_cir = [
         replace(
             record,
@@ -111,13 +111,13 @@ def test_what_is_not_line_of_sight_is_refused_with_what_shows_it(universal: Miti
         for record in weaker_first_path(direct, float("nan"))
     ]
     with pytest.raises(DatasetError, match="has the power of the first path"):
-        find_offset(universal, without_cir, 3.0)
+        estimate_offset(universal, without_cir, 3.0)
     with pytest.raises(DatasetError, match="m off: is the distance in metres"):
-        find_offset(universal, longer(direct, 20.0), 3.0)
+        estimate_offset(universal, longer(direct, 20.0), 3.0)
     with pytest.raises(DatasetError, match="5 ranges look like line of sight"):
-        find_offset(universal, [direct[0]] * 5, 3.0)
+        estimate_offset(universal, [direct[0]] * 5, 3.0)
     with pytest.raises(DatasetError, match="none of 20 ranges has a true distance"):
-        find_offset(universal, [replace(record, truth=None) for record in direct[:20]])
+        estimate_offset(universal, [replace(record, truth=None) for record in direct[:20]])
 
 
 def test_one_distance_is_that_of_one_pair(universal: Mitigation, direct: list[Record]):
@@ -126,11 +126,11 @@ def test_one_distance_is_that_of_one_pair(universal: Mitigation, direct: list[Re
         for n, record in enumerate(direct)
     ]
     with pytest.raises(ParameterError, match=r"2 pairs.*--anchor and --tag"):
-        find_offset(universal, two, 3.0)
-    found = find_offset(universal, two, anchor_id=3)
+        estimate_offset(universal, two, 3.0)
+    found = estimate_offset(universal, two, anchor_id=3)
     assert {one.anchor_id for one in found.placements} == {3}
     with pytest.raises(DatasetError, match="no range of that anchor"):
-        find_offset(universal, two, anchor_id=9)
+        estimate_offset(universal, two, anchor_id=9)
 
 
 def test_line_of_sight_of_the_real_logs_tells_the_boards_delay(apartment: Path, tmp_path: Path):

@@ -19,7 +19,7 @@ from uwb_mitigation.errors import DatasetError, ParameterError, UwbMitigationErr
 from uwb_mitigation.evaluation.dataset import Dataset
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.paper import experiment
-from uwb_mitigation.paper.data import Parts, narrowed
+from uwb_mitigation.paper.data import Parts, shorten_windows
 from uwb_mitigation.paper.results import RESULTS, ExperimentResults, read
 from uwb_mitigation.preprocessing import Preprocessing, Scaling
 from uwb_mitigation.training.options import FitOptions
@@ -159,12 +159,12 @@ def test_a_loss_that_diverges_ends_the_run(tmp_path, workers: int):
 def test_shorter_windows_are_scaled_by_their_own_maximum():
     data = replace(dataset(2, 5), preprocessing=Preprocessing(32, Scaling.MAX))
     data.inputs[0, 20] = 50.0
-    short = narrowed(data, 8)
+    short = shorten_windows(data, 8)
     assert short.inputs.shape == (10, 8)
     assert np.allclose(short.inputs.max(axis=1), 1.0)
     assert short.preprocessing.samples == 8
     with pytest.raises(ParameterError):
-        narrowed(data, 64)
+        shorten_windows(data, 64)
 
 
 # --- commands ---

@@ -67,7 +67,7 @@ def test_a_prior_of_nothing_is_refused():
 
 torch = pytest.importorskip("torch", reason="run `make setup-training`")
 from uwb_mitigation.training import train  # noqa: E402
-from uwb_mitigation.training.candidates import Recipe, fit_own  # noqa: E402
+from uwb_mitigation.training.candidates import Recipe, fit_new_model  # noqa: E402
 from uwb_mitigation.training.fitting import FitOptions, fit  # noqa: E402
 
 
@@ -143,6 +143,6 @@ def test_the_card_tells_the_errors_on_configurations_not_seen():
 def test_measurements_without_power_do_not_spoil_the_network():
     data = dataset(8, 20)
     data.rx_power_dbm[3] = np.nan
-    fitted = fit_own(data, Recipe(SHAPE, FitOptions(epochs=1)), 0)
+    fitted = fit_new_model(data, Recipe(SHAPE, FitOptions(epochs=1)), 0)
     assert fitted.linear_bias.needs_power
     assert np.isfinite(floating.predict_m(fitted.network, data.inputs)).all()

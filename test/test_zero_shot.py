@@ -52,6 +52,6 @@ def test_without_a_placement_in_line_of_sight_there_is_no_offset(model, data):
 def test_what_the_model_refuses_stays_as_measured(tmp_path, data):
     timid = bundle(tmp_path, linear_bias=LinearBiasModel(0.0), correction_limits_m=(-(2.0**-20), 2.0**-20))
     found = zero_shot.run(data, timid)
-    assert found.passed.all()
+    assert found.passed_through.all()
     assert (found.errors["universal"] == data.error_m).all()
     assert (found.variance_m2 == np.float32(timid.card.variance_uncorrected_m2)).all()

@@ -63,13 +63,13 @@ def simulated(rate: float) -> Programme:
 
 def offset_of(source: Source) -> float | None:
     """Return the offset of the boards (m) from LOS ranges with truth; None if it is unknown."""
-    from uwb_mitigation.evaluation.radio_offsets import find_offset
+    from uwb_mitigation.evaluation.radio_offsets import estimate_offset
     from uwb_mitigation.mitigation import Mitigation
     from uwb_mitigation.model.bundle import load_bundle
     from uwb_mitigation.model.shipped import default_model_path
 
     try:
-        return find_offset(Mitigation(load_bundle(default_model_path())), source).offset_m
+        return estimate_offset(Mitigation(load_bundle(default_model_path())), source).offset_m
     except DatasetError:
         return None
 

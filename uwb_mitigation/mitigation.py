@@ -30,7 +30,7 @@ _ALL = slice(None)
 _OK, _NO_CIR, _BAD_CIR, _OUT_OF_DISTRIBUTION, _MODEL_ERROR = _STATUSES
 
 
-class Grader:
+class CorrectionRule:
     """Computes corrections and variances from predicted errors, as the card of a bundle specifies."""
 
     def __init__(self, card: Card) -> None:
@@ -43,7 +43,7 @@ class Grader:
         self._scaling = card.preprocessing.scaling
         self._known_offset = np.float32(0.0 if ood_bands is None else ood_bands.known_offset_m)
 
-    def passes(self, predicted: NDArray[np.float32], score: NDArray[np.float32]) -> NDArray[np.bool_]:
+    def accepts(self, predicted: NDArray[np.float32], score: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Return which predicted errors are within the limits and have an OOD score below 1, bool (n,)."""
         inside: NDArray[np.bool_] = (predicted >= self._low) & (predicted <= self._high) & (score < 1.0)
         return inside
@@ -61,10 +61,10 @@ class Grader:
         values = features(windows, self._scaling, range_m, rx_power_dbm, first_path_power_dbm)
         return self._ood_detector.score(values)
 
-    def grade(
+    def apply(
         self, predicted: NDArray[np.float32], score: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return corrections (m) and variances (m^2) of predicted errors that `passes` accepts, float32 (n,)."""
+        """Return corrections (m) and variances (m^2) of predicted errors that `accepts` accepts, float32 (n,)."""
         correction: NDArray[np.float32] = predicted
         variance: NDArray[np.float32] = self._variance + self._variance_per_m2 * (predicted * predicted)
         if self._ood_detector is not None and np.count_nonzero(score > 0.0):
@@ -126,10 +126,10 @@ def passed_through(
         status: uint8 (n,), of `Status`.
     """
     card = bundle.card
-    range_m = _less(ranges.range_m, offset_m)
-    variance = np.where(_valid(range_m), np.float32(card.variance_uncorrected_m2), _INFINITE)
+    range_m = _subtract_offset(ranges.range_m, offset_m)
+    variance = np.where(_is_valid_range(range_m), np.float32(card.variance_uncorrected_m2), _INFINITE)
     if not ranges.samples.shape[1]:
-        variance[_valid(range_m) & (status == _NO_CIR) & (offset_m != 0.0)] = card.variance_m2
+        variance[_is_valid_range(range_m) & (status == _NO_CIR) & (offset_m != 0.0)] = card.variance_m2
     return CorrectedColumns(range_m, offset_m, variance, status, Origin.HOST, bundle.model_id)
 
 
@@ -159,14 +159,14 @@ class Mitigation(Backend):
         self.bundle = bundle
         self.offsets = offsets
         self._session = Session(bundle)
-        self._grader = Grader(bundle.card)
+        self._rule = CorrectionRule(bundle.card)
 
     def correct_columns(self, ranges: RangeColumns) -> CorrectedColumns:
         """See `Backend`."""
         linear_bias, n = self.bundle.linear_bias, len(ranges)
         offset = self.offsets.of(ranges.tag_id, ranges.anchor_id)
-        range_m = _less(ranges.range_m, offset)
-        valid = _valid(range_m)
+        range_m = _subtract_offset(ranges.range_m, offset)
+        valid = _is_valid_range(range_m)
         powers = (ranges.rx_power_dbm, ranges.first_path_power_dbm)
         predicted = linear_bias.predict_m(*powers)
         faults, windows = self.bundle.preprocessing.apply(ranges)
@@ -186,7 +186,7 @@ class Mitigation(Backend):
                 predicted[rows] += self._session.predict_m(windows)
             except Exception:  # After any error of ONNX Runtime, consumers must still receive the range.
                 predicted[rows] = np.nan
-            score[rows] = self._grader.score(windows, range_m[rows], *(power[rows] for power in powers))
+            score[rows] = self._rule.score(windows, range_m[rows], *(power[rows] for power in powers))
         if not self.bundle.card.needs_cir and len(windows) < n:
             # The first-path power may be unknown if the linear bias model has no weight for it.
             first_path = powers[1] if linear_bias.per_power_gap != 0.0 else powers[0]
@@ -194,15 +194,15 @@ class Mitigation(Backend):
             is_biased_only = valid & ~readable & np.isfinite(alone)
             predicted[is_biased_only], status[is_biased_only] = alone[is_biased_only], _OK
 
-        passes = self._grader.passes(predicted, score)
-        rows = _rows(passes)
-        graded, variance = self._grader.grade(predicted[rows], score[rows])
+        accepts = self._rule.accepts(predicted, score)
+        rows = _rows(accepts)
+        graded, variance = self._rule.apply(predicted[rows], score[rows])
         correction = offset[rows] + graded
         corrected_m = ranges.range_m[rows].astype(np.float32, copy=False) - correction
         if rows is _ALL:
             model_id = self.bundle.model_id
             return CorrectedColumns(corrected_m, correction, variance, status, Origin.HOST, model_id)
-        refused = (status == _OK) & ~passes
+        refused = (status == _OK) & ~accepts
         status[refused] = np.where(np.isfinite(predicted[refused]), _OUT_OF_DISTRIBUTION, _MODEL_ERROR)
         found = passed_through(self.bundle, ranges, offset, status)
         found.range_m[rows], found.correction_m[rows], found.variance_m2[rows] = (
@@ -218,7 +218,7 @@ def _rows(chosen: NDArray[np.bool_]) -> slice | NDArray[np.bool_]:
     return _ALL if np.count_nonzero(chosen) == len(chosen) else chosen
 
 
-def _less(range_m: NDArray[np.floating], offset_m: NDArray[np.float32]) -> NDArray[np.floating]:
+def _subtract_offset(range_m: NDArray[np.floating], offset_m: NDArray[np.float32]) -> NDArray[np.floating]:
     """Return ranges minus offsets in float32, as on boards; without an offset the unchanged range."""
     found: NDArray[np.floating] = range_m.copy()
     if np.count_nonzero(offset_m):
@@ -227,6 +227,6 @@ def _less(range_m: NDArray[np.floating], offset_m: NDArray[np.float32]) -> NDArr
     return found
 
 
-def _valid(range_m: NDArray[np.floating]) -> NDArray[np.bool_]:
+def _is_valid_range(range_m: NDArray[np.floating]) -> NDArray[np.bool_]:
     valid: NDArray[np.bool_] = (range_m >= 0.0) & (range_m <= MAX_RANGE_M)
     return valid

@@ -30,7 +30,7 @@ import numpy as np
 from sites import draw_site
 
 from uwb_mitigation.evaluation.dataset import build_dataset
-from uwb_mitigation.evaluation.site_data import gather
+from uwb_mitigation.evaluation.site_data import read_site
 from uwb_mitigation.measurement import Record
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import Bundle, load_bundle
@@ -123,7 +123,7 @@ def trained(records: list[Record], universal: Bundle, folder: Path) -> Bundle:
     from uwb_mitigation.training.options import FitOptions
 
     recipe = Recipe(Remnet(samples=universal.preprocessing.samples), FitOptions())
-    return train.train_own(train.Job(dataset, "drive", folder / "trained.onnx", 4), recipe).bundle
+    return train.train_new_model(train.Job(dataset, "drive", folder / "trained.onnx", 4), recipe).bundle
 
 
 def one(seed: int, seconds: float, truth_topic: bool, with_train: bool, flat: bool) -> dict[str, object]:
@@ -132,7 +132,7 @@ def one(seed: int, seconds: float, truth_topic: bool, with_train: bool, flat: bo
     anchors = 4 + seed % 5
     drive, other = (Drive(seed, which, anchors, seconds, flat) for which in (0, 1))
     records = list(drive)
-    site = gather([records], drive.anchors, universal.preprocessing)
+    site = read_site([records], drive.anchors, universal.preprocessing)
     began = time.perf_counter()
     height = Height(0.0, 0.05)
     if truth_topic:
@@ -148,11 +148,11 @@ def one(seed: int, seconds: float, truth_topic: bool, with_train: bool, flat: bo
             [np.zeros_like(heading), np.zeros_like(heading), np.sin(heading / 2), np.cos(heading / 2)], axis=1
         )
         path = PosePath(stamps + round(LAG_S * 1e9), frame + noise, quaternion)
-        found = site_calibration.with_truth(
+        found = site_calibration.calibrate_with_truth(
             site, universal, [[path]], "/odom", time_offset_s=None, estimate_lever_arm=True, seed=0
         )
     else:
-        found = site_calibration.without_truth(site, universal, height=height, area=None, seed=0)
+        found = site_calibration.calibrate_without_truth(site, universal, height=height, area=None, seed=0)
     took = time.perf_counter() - began
     test = list(other)
     off = np.array(
@@ -211,9 +211,11 @@ def speed(minutes: float) -> dict[str, object]:
     """Measure time and memory for one long drive."""
     universal = load_bundle(default_model_path())
     drive = Drive(1, 0, 6, 60.0 * minutes)
-    site = gather([drive], drive.anchors, universal.preprocessing)
+    site = read_site([drive], drive.anchors, universal.preprocessing)
     began, cpu = time.perf_counter(), time.process_time()
-    found = site_calibration.without_truth(site, universal, height=Height(0.0, 0.05), area=None, seed=0)
+    found = site_calibration.calibrate_without_truth(
+        site, universal, height=Height(0.0, 0.05), area=None, seed=0
+    )
     return {
         "minutes": minutes,
         "ranges": sum(map(len, site.tags)),

@@ -21,7 +21,7 @@ import numpy as np
 
 from benchmarks.positions import LAG_S, at_truths, hanyang_run
 from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.evaluation.site_data import gather
+from uwb_mitigation.evaluation.site_data import read_site
 from uwb_mitigation.measurement import Record
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import Bundle, load_bundle
@@ -34,13 +34,13 @@ from uwb_mitigation.positioning.smoother import Smoother
 from uwb_mitigation.positioning.tracks import Ranges, track_errors
 from uwb_mitigation.sources.decaranging import DecaRangingFolder
 from uwb_mitigation.sources.hanyang import ANTENNA_M, HanyangRun
-from uwb_mitigation.training.site_calibration import Calibrated, without_truth
+from uwb_mitigation.training.site_calibration import SiteCalibration, calibrate_without_truth
 
 HEIGHT = Height(ANTENNA_M, 0.2)
 
 
-def told(found: Calibrated) -> None:
-    print(found.sentence())
+def told(found: SiteCalibration) -> None:
+    print(found.summary())
     print(
         {f"{tag}-{anchor}": f"{v:.3f}+-{sd:.3f}" for (tag, anchor), (v, sd) in found.solution.pairs.items()}
     )
@@ -50,8 +50,8 @@ def told(found: Calibrated) -> None:
 def hanyang(folder: Path, name: str) -> None:
     source = load_bundle(default_model_path())
     run = HanyangRun(folder / name)
-    found = without_truth(
-        gather([run], run.anchors, source.preprocessing), source, height=HEIGHT, area=None, seed=0
+    found = calibrate_without_truth(
+        read_site([run], run.anchors, source.preprocessing), source, height=HEIGHT, area=None, seed=0
     )
     told(found)
     for other in sorted(path for path in folder.iterdir() if path.is_dir() and path.name != name):
@@ -85,8 +85,8 @@ def harm(folder: Path) -> None:
             raw_mae, raw_rmse, true = _against_truth(run, part, None, NO_OFFSETS, height)
             row = f"{path.name} {name}: raw MAE {raw_mae:.3f} m, live RMSE {raw_rmse:.3f} m; "
             try:
-                found = without_truth(
-                    gather([part], run.anchors, source.preprocessing),
+                found = calibrate_without_truth(
+                    read_site([part], run.anchors, source.preprocessing),
                     source,
                     height=height,
                     area=None,
@@ -104,7 +104,7 @@ def harm(folder: Path) -> None:
             ]
             print(
                 row
-                + f"calibrated MAE {mae:.3f} m, live RMSE {rmse:.3f} m; {'refused' if found.harms else 'written'}; offsets "
+                + f"calibrated MAE {mae:.3f} m, live RMSE {rmse:.3f} m; {'refused' if found.is_harmful else 'written'}; offsets "
                 f"{[f'{value:.2f} +- {sd:.2f}' for value, sd in found.solution.pairs.values()]}, median errors "
                 f"{[f'{value:.2f}' for value in true]}, {sum(covered)} of {len(covered)} within two standard deviations"
                 + "".join(f"; {note}" for note in found.notes),
@@ -138,8 +138,12 @@ def apartment(folder: Path) -> None:
     with DecaRangingFolder(folder) as logs:
         records = list(logs)
         anchors = logs.anchors
-    found = without_truth(
-        gather([records], anchors, source.preprocessing), source, height=Height(0.0, 0.05), area=None, seed=0
+    found = calibrate_without_truth(
+        read_site([records], anchors, source.preprocessing),
+        source,
+        height=Height(0.0, 0.05),
+        area=None,
+        seed=0,
     )
     told(found)
     true = {}

@@ -40,7 +40,7 @@ for count in (6, 9, 12, 15, 18, 21):
     print(count, *table.mean(axis=0).round(3), f"{np.mean(table[:, 3] < table[:, 1]):.0%}")
 
 # The candidates of `train` without networks that are trained on the logs, with 6 folds of placements.
-plain = [item for item in candidates.own_models(Recipe(Remnet(), FitOptions())) if not item.trains]
+plain = [item for item in candidates.new_models(Recipe(Remnet(), FitOptions())) if not item.trains]
 offered = candidates.with_cold_start(plain, data, load_bundle(default_model_path()))
 choice = selection.select_nested(data, offered, 6, 0)
 print({name: round(mae, 3) for name, mae in choice.mae().items()})

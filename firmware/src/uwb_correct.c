@@ -149,7 +149,7 @@ static uwb_status predict(const uwb_model *model, float range_m, const uwb_cir *
     return accepted ? UWB_OK : UWB_OUT_OF_DISTRIBUTION;
 }
 
-/* The higher the OOD score, the less of the predicted error is subtracted. As in the host's Grader, every product and
+/* The higher the OOD score, the less of the predicted error is subtracted. As in mitigation.py, every product and
  * every sum is rounded: volatile prevents the compiler from fusing them. */
 static void grade(const uwb_model *model, float range_m, float offset_m, float error_m, float score,
                   uwb_corrected *corrected) {

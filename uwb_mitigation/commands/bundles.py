@@ -14,7 +14,7 @@ from uwb_mitigation.errors import UwbMitigationError
 if TYPE_CHECKING:
     from uwb_mitigation.model.bundle import Bundle
 
-MOST_LOOKED_AT = 1000
+MAX_RECORDS_READ = 1000
 
 ModelOption = Annotated[
     Path | None,
@@ -48,7 +48,7 @@ def _lacks_counts(recording: Path) -> bool:
 
     try:
         with open_recording(recording) as source:
-            for record in islice(source, MOST_LOOKED_AT):
+            for record in islice(source, MAX_RECORDS_READ):
                 if len(record.measurement.cir.samples):
                     return record.measurement.cir.preamble_count <= 0
     except UwbMitigationError:

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from uwb_mitigation.model.bundle import Bundle
     from uwb_mitigation.positioning.anchors import AnchorMap
     from uwb_mitigation.positioning.localised import PosePath
-    from uwb_mitigation.training.site_calibration import Calibrated
+    from uwb_mitigation.training.site_calibration import SiteCalibration
 
 SAME_ARM_M = 0.01
 BASE_FRAME = "base_link"
@@ -142,7 +142,7 @@ def calibrate(
             warn(f"left out: {count} x {why}")
         with console.stage_bars() as on_progress:
             if truth_topic is None:
-                found = site_calibration.without_truth(
+                found = site_calibration.calibrate_without_truth(
                     site,
                     source,
                     height=at_height,
@@ -153,7 +153,7 @@ def calibrate(
                 )
             else:
                 paths, arms = _poses(bags, site, truth_topic, frames, arm)
-                found = site_calibration.with_truth(
+                found = site_calibration.calibrate_with_truth(
                     site,
                     source,
                     paths,
@@ -170,9 +170,9 @@ def calibrate(
         console.write_json(json, refused | {"truth": truth_topic or "none", "refused": str(error)})
         raise
     _show(found)
-    if found.harms and not force:
+    if found.is_harmful and not force:
         harm = DatasetError(
-            f"not written: {found.sentence()}" + "".join(f" {note}." for note in found.notes[:1]),
+            f"not written: {found.summary()}" + "".join(f" {note}." for note in found.notes[:1]),
             valid="a longer drive, or --force",
         )
         console.write_json(json, found.as_json() | {"refused": str(harm)})
@@ -202,12 +202,12 @@ def _gather(
     from contextlib import ExitStack
 
     from uwb_mitigation.bag.pose_paths import read_heights
-    from uwb_mitigation.evaluation.site_data import gather
+    from uwb_mitigation.evaluation.site_data import read_site
     from uwb_mitigation.sources.opening import open_recording
 
     heights = None if height_topic is None else [read_heights(bag, height_topic, height_sd) for bag in bags]
     with ExitStack() as stack, console.reading() as on_record:
-        return gather(
+        return read_site(
             [stack.enter_context(open_recording(bag)) for bag in bags],
             anchors,
             source.preprocessing,
@@ -305,7 +305,7 @@ def _lever_arm(text: str | None) -> tuple[float, float, float] | None:
     return x, y, z
 
 
-def _show(found: Calibrated) -> None:
+def _show(found: SiteCalibration) -> None:
     solution = found.solution
     if solution.localised is not None:
         one = solution.localised
@@ -331,4 +331,4 @@ def _show(found: Calibrated) -> None:
         warn(note)
     if solution.outliers:
         warn(f"{solution.outliers} outliers left out of all figures")
-    say(found.sentence())
+    say(found.summary())

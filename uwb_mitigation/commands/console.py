@@ -17,7 +17,7 @@ from rich.table import Table as RichTable
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.files import write_whole
 
-MOST_SHOWN = 40
+MAX_ROWS = 40
 
 
 class Table(RichTable):
@@ -51,7 +51,7 @@ def show_table(
     marked: str = "",
     *,
     left: int = 1,
-    most: int = MOST_SHOWN,
+    most: int = MAX_ROWS,
 ) -> None:
     """Print the first rows of a table; numbers have three decimals.
 

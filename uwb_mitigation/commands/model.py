@@ -114,8 +114,8 @@ def train(
         from uwb_mitigation.training import candidates, fitting  # noqa: F401
         from uwb_mitigation.training import train as training
 
-    if data is not None and choose not in (training.AUTO, *candidates.OWN):
-        raise ParameterError(f"recipe {choose!r}", valid=", ".join((training.AUTO, *candidates.OWN)))
+    if data is not None and choose not in (training.AUTO, *candidates.NEW_MODELS):
+        raise ParameterError(f"recipe {choose!r}", valid=", ".join((training.AUTO, *candidates.NEW_MODELS)))
     recording = data or from_bag
     assert recording is not None
     source = None if from_bag is None else bundle_for(model, from_bag)
@@ -124,9 +124,9 @@ def train(
     with console.stage_bars() as on_progress:
         job = training.Job(dataset, name, output, folds, on_progress)
         if source is None:
-            alone = replace(candidates.ALONE, **asked)
+            alone = replace(candidates.NETWORK_ONLY, **asked)
             recipe = candidates.Recipe(architecture, options, alone, per_configuration=per_configuration)
-            made = training.train_own(job, recipe, choose)
+            made = training.train_new_model(job, recipe, choose)
         else:
             made = training.train_from_bundle(job, source, options, offer_cold_start=model is None)
     model_tables.show_trained(made)

@@ -46,8 +46,8 @@ def show_trained(made: TrainedBundle) -> None:
         show_selection(made.selection)
     if made.prefers_cold_start:
         say(
-            f"With fewer than {candidates.ENOUGH_FOR_MEAN} configurations, cold start is kept unless another one is "
-            f"{selection.COLD_START_MUST_GAIN:.0%} better."
+            f"With fewer than {candidates.MIN_CONFIGURATIONS_FOR_MEAN} configurations, cold start is kept unless another one is "
+            f"{selection.COLD_START_MIN_GAIN:.0%} better."
         )
     if "int8" in made.validation.errors:
         rows = made.validation.statistics().items()
@@ -56,11 +56,11 @@ def show_trained(made: TrainedBundle) -> None:
             ("", "MAE", "std", "p95"),
             [(_ROWS[name], *values.values()) for name, values in rows],
         )
-    for name, before in made.before_m.items():
-        change = made.after_m / before - 1 if before else 0.0
-        verdict = "lower" if made.after_m < before else "higher: this did not help"
+    for name, before in made.baseline_mae_m.items():
+        change = made.mae_m / before - 1 if before else 0.0
+        verdict = "lower" if made.mae_m < before else "higher: this did not help"
         say(
-            f"on configurations not seen, {made.after_m:.3f} m against {before:.3f} m {name}: {abs(change):.0%} {verdict}"
+            f"on configurations not seen, {made.mae_m:.3f} m against {before:.3f} m {name}: {abs(change):.0%} {verdict}"
         )
     show_bundle(made.bundle)
 

@@ -13,9 +13,9 @@ from uwb_mitigation.commands.console import JsonOption
 from uwb_mitigation.errors import ParameterError, format_id
 
 if TYPE_CHECKING:
-    from uwb_mitigation.evaluation.radio_offsets import FoundOffset
+    from uwb_mitigation.evaluation.radio_offsets import OffsetEstimate
 
-FARTHEST_M = 1000.0
+MAX_DISTANCE_M = 1000.0
 
 
 def offset(
@@ -58,8 +58,8 @@ def offset(
 
     if (distance is None) == (not truth):
         raise ParameterError("which distance", valid="one of --distance and --truth")
-    if distance is not None and not 0.0 < distance <= FARTHEST_M:
-        raise ParameterError(f"distance = {distance}", valid=f"above 0, at most {FARTHEST_M:g} m")
+    if distance is not None and not 0.0 < distance <= MAX_DISTANCE_M:
+        raise ParameterError(f"distance = {distance}", valid=f"above 0, at most {MAX_DISTANCE_M:g} m")
     if output is not None and (output.is_dir() or not output.absolute().parent.is_dir()):
         raise ParameterError(
             "not a place for a file", where=str(output), valid="a file in a folder that exists"
@@ -70,7 +70,7 @@ def offset(
     )
     mitigation = Mitigation(bundle_for(model, bag))
     with open_recording(bag) as source, console.reading() as on_record:
-        found = radio_offsets.find_offset(
+        found = radio_offsets.estimate_offset(
             mitigation, source, distance, tag_id=tag_id, anchor_id=anchor_id, on_record=on_record
         )
     _show(found)
@@ -95,8 +95,8 @@ def _identity(name: str, text: str) -> int:
     return value
 
 
-def _show(found: FoundOffset) -> None:
-    from uwb_mitigation.commands.console import MOST_SHOWN, say, show_table
+def _show(found: OffsetEstimate) -> None:
+    from uwb_mitigation.commands.console import MAX_ROWS, say, show_table
 
     rows: list[tuple[object, ...]] = []
     for one in found.placements:
@@ -107,12 +107,12 @@ def _show(found: FoundOffset) -> None:
         "", ("anchor", "tag", "placement", "ranges", "offset m", "sd m", "gap dB", "predicted m"), rows
     )
     refused = [one for one in found.placements if one.refused]
-    for one in refused[:MOST_SHOWN]:
+    for one in refused[:MAX_ROWS]:
         pair = format_id(one.anchor_id), format_id(one.tag_id)
         text = f"left out: anchor {pair[0]}, tag {pair[1]} {one.placement}: {one.refused}"
         console.err.print(text, markup=False)
-    if len(refused) > MOST_SHOWN:
-        console.err.print(f"left out: {len(refused) - MOST_SHOWN} placements more")
+    if len(refused) > MAX_ROWS:
+        console.err.print(f"left out: {len(refused) - MAX_ROWS} placements more")
     say(
         f"offset {found.offset_m:.3f} m, standard deviation {found.sd_m:.3f} m, from {found.ranges} ranges, "
         f"for model {found.model_id:08x}"

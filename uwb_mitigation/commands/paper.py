@@ -185,7 +185,7 @@ def _parts(path: Path, samples: int, scaling: str, split: str) -> Parts:
     with console.reading() as on_record:
         name, _, dataset = parts.load(path, preprocessing, on_record)
     console.show_refused(dataset.refused)
-    return parts.divided(name, dataset, split)
+    return parts.split_dataset(name, dataset, split)
 
 
 def _lengths(text: str) -> list[int]:

@@ -14,7 +14,7 @@ from uwb_mitigation.commands.checks import check_output, needs_torch, scaling_of
 from uwb_mitigation.commands.console import JsonOption
 from uwb_mitigation.errors import ParameterError
 
-MOST_BLOCKS = 10_000
+MAX_BLOCKS = 10_000
 
 
 def train_universal(
@@ -50,7 +50,7 @@ def train_universal(
     preprocessing = Preprocessing(samples, scaling_of(scaling))
     for name, value, least, most in (
         ("seed", seed, 0, 2**31),
-        ("blocks", blocks, 1, MOST_BLOCKS),
+        ("blocks", blocks, 1, MAX_BLOCKS),
         ("workers", workers, 1, 256),
     ):
         if value is not None and not least <= value <= most:

@@ -18,7 +18,7 @@ from uwb_mitigation.errors import DatasetError
 GROWTH = 0.1
 """Factor of the squared predicted error in the squared scale: larger errors leave larger residuals."""
 
-LEAST_SCALE_M = 1e-3
+MIN_SCALE_M = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,10 +49,10 @@ def calibrate(
     if not known.any():
         raise DatasetError("no errors to calibrate intervals with")
     left, predicted, names = np.abs(left_m[known]), predicted_m[known], configurations[known]
-    floor = max(float(np.median(left)), LEAST_SCALE_M) ** 2
+    floor = max(float(np.median(left)), MIN_SCALE_M) ** 2
     scale = np.sqrt(floor + GROWTH * np.square(predicted))
     narrow, wide = (_quantile(left / scale, names, level) for level in (0.68, 0.95))
-    narrow = max(narrow, LEAST_SCALE_M)
+    narrow = max(narrow, MIN_SCALE_M)
     return Intervals(
         float(np.float32(floor * narrow**2)),
         float(np.float32(GROWTH * narrow**2)),

@@ -7,7 +7,7 @@ from pathlib import Path
 from uwb_mitigation.errors import MissingDependencyError
 
 
-def rendered(template: str, folder: Path = Path(__file__).parent / "templates", **values: object) -> str:
+def render_page(template: str, folder: Path = Path(__file__).parent / "templates", **values: object) -> str:
     """Render a template in `folder` with the values.
 
     Raises:

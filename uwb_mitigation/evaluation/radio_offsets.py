@@ -65,7 +65,7 @@ class PlacementOffset:
 
 
 @dataclass(frozen=True, slots=True)
-class FoundOffset:
+class OffsetEstimate:
     """The offset of a recording.
 
     Attributes:
@@ -98,7 +98,7 @@ class FoundOffset:
         return found | {"model_id": self.model_id, "pairs": rows}
 
 
-def find_offset(
+def estimate_offset(
     mitigation: Mitigation,
     records: Iterable[Record],
     distance_m: float | None = None,
@@ -106,7 +106,7 @@ def find_offset(
     tag_id: int | None = None,
     anchor_id: int | None = None,
     on_record: Callable[[], None] = lambda: None,
-) -> FoundOffset:
+) -> OffsetEstimate:
     """Estimate the offset of the radios in a recording.
 
     Args:
@@ -208,7 +208,7 @@ def _placement_offset(
     return PlacementOffset(tag_id, anchor_id, placement, count, found, sd, noise, *levels, refused)
 
 
-def _combined(placements: tuple[PlacementOffset, ...], model_id: int) -> FoundOffset:
+def _combined(placements: tuple[PlacementOffset, ...], model_id: int) -> OffsetEstimate:
     good = [one for one in placements if not one.refused]
     if not good:
         first = placements[0]
@@ -227,7 +227,7 @@ def _combined(placements: tuple[PlacementOffset, ...], model_id: int) -> FoundOf
     # The median of two or fewer is their mean.
     factor = _OF_MEDIAN if len(good) > 2 else 1.0
     sd = factor * math.hypot(spread, float(np.sqrt(np.mean(noise * noise)))) / math.sqrt(len(good))
-    return FoundOffset(float(np.median(offset)), sd, ranges, placements, model_id)
+    return OffsetEstimate(float(np.median(offset)), sd, ranges, placements, model_id)
 
 
 def _spread(values: NDArray[np.float64]) -> float:

@@ -19,16 +19,16 @@ from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.tracks import Heights, Ranges
 from uwb_mitigation.preprocessing import Preprocessing
 
-WITH_CIR = 0.5
+MIN_CIR_SHARE = 0.5
 """If the share of ranges with a usable CIR is smaller, no CIR is used."""
 
-CHUNK_S = 2.0
+CONFIGURATION_S = 2.0
 """Duration of a configuration in motion: the errors of a pair are correlated for about this time."""
 
 FOLD_S = 10.0
 """Duration of the segments of motion that are held out as a whole."""
 
-BETWEEN_NS = 3_600_000_000_000
+RECORDING_GAP_NS = 3_600_000_000_000
 _SECOND_NS = 1_000_000_000
 
 
@@ -89,7 +89,7 @@ class SiteData:
         Args:
             rows: indices, (k,), into the ranges of all tags. true_m: (k,), their true ranges.
             stretch: int (k,), segment of the track. at_rest: bool (k,), whether the tag is stationary. A configuration is a
-                pair while the tag is stationary, or for `CHUNK_S` of motion. Its name begins with the unit that is
+                pair while the tag is stationary, or for `CONFIGURATION_S` of motion. Its name begins with the unit that is
                 held out as a whole: "stretch 3.1/".
         """
         ranges = self.ranges.take(rows)
@@ -97,7 +97,7 @@ class SiteData:
         first = np.full(int(stretch.max()) + 1, np.iinfo(np.int64).max)
         np.minimum.at(first, stretch, ranges.stamp_ns)
         since = (ranges.stamp_ns - first[stretch]) / _SECOND_NS
-        chunk = np.where(at_rest, 0, since // CHUNK_S).astype(int)
+        chunk = np.where(at_rest, 0, since // CONFIGURATION_S).astype(int)
         fold = np.where(at_rest, 0, since // FOLD_S).astype(int)
         names = [
             f"stretch {s}.{f}/{c}/tag {t}/anchor {a}"
@@ -118,7 +118,7 @@ class SiteData:
         )
 
 
-def gather(
+def read_site(
     recordings: Iterable[Iterable[Record]],
     anchors: AnchorMap,
     preprocessing: Preprocessing,
@@ -152,7 +152,7 @@ def gather(
             stamp_ns = measured.stamp_ns + round(stamp_offset_s * _SECOND_NS)
             if shift is None:
                 is_later = end_of_previous is None or stamp_ns > end_of_previous
-                shift = 0 if is_later else end_of_previous - stamp_ns + BETWEEN_NS  # type: ignore[operator]
+                shift = 0 if is_later else end_of_previous - stamp_ns + RECORDING_GAP_NS  # type: ignore[operator]
             row = anchors.index.get(measured.anchor_id)
             height = math.nan if heights is None else float(heights[number].at(np.array([stamp_ns]))[0][0])
             if row is None:
@@ -196,7 +196,7 @@ def gather(
         inputs=np.stack([windows[index] for index in order]),
         rx_power_dbm=rx.astype(np.float32),
         first_path_power_dbm=first_path.astype(np.float32),
-        has_cirs=bool(with_cir.mean() >= WITH_CIR),
+        has_cirs=bool(with_cir.mean() >= MIN_CIR_SHARE),
         with_cir=with_cir,
         height_m=None if heights is None else height_m,
         frames={tag_id: tuple(own) for tag_id, own in frames.items()},

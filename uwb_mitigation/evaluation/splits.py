@@ -88,7 +88,7 @@ def by_group(dataset: Dataset, group: Group, folds: int, seed: int) -> list[Spli
     return splits
 
 
-def thinned(configurations: NDArray[np.str_], most: int, seed: int) -> NDArray[np.intp]:
+def subsample(configurations: NDArray[np.str_], most: int, seed: int) -> NDArray[np.intp]:
     """Return sorted rows, at most `most` of each configuration, drawn without replacement."""
     generator = np.random.default_rng(seed)
     chosen = []

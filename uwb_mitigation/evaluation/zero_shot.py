@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.evaluation.dataset import Dataset
-from uwb_mitigation.mitigation import Grader
+from uwb_mitigation.mitigation import CorrectionRule
 from uwb_mitigation.model.bundle import Bundle, Card, Session
 
 LOS = "LOS"
@@ -27,39 +27,41 @@ class ZeroShot:
         los_offset_m: subtracted offset; 0 without LOS placements.
         variance_m2: predicted variances, float32 (n,).
         sigmas95: number of standard deviations that should cover 95 %.
-        passed: bool (n,), not corrected.
+        passed_through: bool (n,), not corrected.
     """
 
     errors: dict[str, NDArray[np.float64]]
     los_offset_m: float
     variance_m2: NDArray[np.float32]
     sigmas95: float
-    passed: NDArray[np.bool_]
+    passed_through: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Graded:
+class CardCorrections:
     """Corrections (0 if a range is passed through) and variances from the predictions of a model, each (n,)."""
 
     correction_m: NDArray[np.float32]
     variance_m2: NDArray[np.float32]
-    passed: NDArray[np.bool_]
+    passed_through: NDArray[np.bool_]
 
 
-def grade(dataset: Dataset, card: Card, predicted_m: NDArray[np.float32]) -> Graded:
+def apply_card(dataset: Dataset, card: Card, predicted_m: NDArray[np.float32]) -> CardCorrections:
     """Apply the limits, the OOD score and the variances of a card to predictions, shape (n,)."""
-    grader = Grader(card)
-    score = grader.score(
+    rule = CorrectionRule(card)
+    score = rule.score(
         dataset.inputs,
         dataset.range_m.astype(np.float32),
         dataset.rx_power_dbm,
         dataset.first_path_power_dbm,
     )
-    corrects = grader.passes(predicted_m, score)
+    corrects = rule.accepts(predicted_m, score)
     with np.errstate(invalid="ignore"):
-        correction, variance = grader.grade(predicted_m, score)
+        correction, variance = rule.apply(predicted_m, score)
     uncorrected = np.float32(card.variance_uncorrected_m2)
-    return Graded(np.where(corrects, correction, 0.0), np.where(corrects, variance, uncorrected), ~corrects)
+    return CardCorrections(
+        np.where(corrects, correction, 0.0), np.where(corrects, variance, uncorrected), ~corrects
+    )
 
 
 def run(dataset: Dataset, bundle: Bundle) -> ZeroShot:
@@ -72,8 +74,8 @@ def run(dataset: Dataset, bundle: Bundle) -> ZeroShot:
     """
     linear_bias = bundle.card.linear_bias.predict_m(dataset.rx_power_dbm, dataset.first_path_power_dbm)
     predicted = (linear_bias + Session(bundle).predict_m(dataset.inputs)).astype(np.float32)
-    graded = grade(dataset, bundle.card, predicted)
-    left = dataset.error_m - graded.correction_m
+    corrections = apply_card(dataset, bundle.card, predicted)
+    left = dataset.error_m - corrections.correction_m
 
     names, of = np.unique(dataset.configurations, return_inverse=True)
     means = np.bincount(of, left) / np.bincount(of)
@@ -82,4 +84,4 @@ def run(dataset: Dataset, bundle: Bundle) -> ZeroShot:
     others = np.array([np.median(np.delete(means, k)) if len(means) > 1 else 0.0 for k in range(len(means))])
     errors = dict(zip(NAMES, (left, left - los_offset, left - others[of]), strict=True))
     sigmas95 = bundle.card.interval95_sigmas
-    return ZeroShot(errors, los_offset, graded.variance_m2, sigmas95, graded.passed)
+    return ZeroShot(errors, los_offset, corrections.variance_m2, sigmas95, corrections.passed_through)

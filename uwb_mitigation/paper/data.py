@@ -64,9 +64,11 @@ class Parts:
     train: Dataset
     test: Dataset
 
-    def narrowed(self, samples: int) -> Parts:
-        """Return the same parts with shorter windows; raises as `narrowed`."""
-        return replace(self, train=narrowed(self.train, samples), test=narrowed(self.test, samples))
+    def shorten_windows(self, samples: int) -> Parts:
+        """Return the same parts with shorter windows; raises as `shorten_windows`."""
+        return replace(
+            self, train=shorten_windows(self.train, samples), test=shorten_windows(self.test, samples)
+        )
 
 
 def open_data(path: Path) -> Source:
@@ -88,13 +90,13 @@ def load(
     return (f"{name} (simulated)" if simulated and "simulated" not in name else name), simulated, dataset
 
 
-def divided(name: str, dataset: Dataset, split: str) -> Parts:
+def split_dataset(name: str, dataset: Dataset, split: str) -> Parts:
     """Return training and test part by one of `SPLITS`; raises as `split_by_name`."""
     described, rows = split_by_name(dataset.configurations, split)
     return Parts(name, described, dataset.rows(rows.train), dataset.rows(rows.test))
 
 
-def narrowed(dataset: Dataset, samples: int) -> Dataset:
+def shorten_windows(dataset: Dataset, samples: int) -> Dataset:
     """Return the same measurements with shorter windows, scaled again where scaling is by the maximum.
 
     Raises:

@@ -154,7 +154,7 @@ class _Worker:
 
     def __call__(self, task: Task) -> dict[str, Any]:
         options = replace(self.options, seed=task.seed)
-        return train_task(task, self.parts.narrowed(task.samples), self.folder, options).model_dump(
+        return train_task(task, self.parts.shorten_windows(task.samples), self.folder, options).model_dump(
             mode="json"
         )
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.evaluation.baselines import scikit
 from uwb_mitigation.evaluation.dataset import Dataset
-from uwb_mitigation.evaluation.page import rendered
+from uwb_mitigation.evaluation.page import render_page
 from uwb_mitigation.paper import figures, published, tables
 from uwb_mitigation.paper.data import TEST_ROOM
 from uwb_mitigation.paper.results import Box, ExperimentResults, FirmwareRow, PartErrors, Spread
@@ -76,7 +76,7 @@ class Report:
         Raises:
             MissingDependencyError: jinja2 is not installed.
         """
-        return rendered("report.html.j2", Path(__file__).parent / "templates", report=self)
+        return render_page("report.html.j2", Path(__file__).parent / "templates", report=self)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,6 +1,6 @@
 """Candidates for model selection: models that can be fitted to labelled ranges, in order of complexity.
 
-`train` chooses between new models (`own_models`) or models that start from a bundle (`from_bundle`), both with the
+`train` chooses between new models (`new_models`) or models that start from a bundle (`from_bundle`), both with the
 universal network and an offset (`with_cold_start`); `calibrate` chooses between the models of a site (`site_models`).
 Only candidates that train a network need torch.
 """
@@ -24,7 +24,7 @@ from uwb_mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.model.weights import FloatWeights
 from uwb_mitigation.training.options import FitOptions
 
-OWN = CONSTANT, LINE, LINE_NETWORK, NETWORK = "constant", "line", "line+network", "network"
+NEW_MODELS = CONSTANT, LINE, LINE_NETWORK, NETWORK = "constant", "line", "line+network", "network"
 """Models that are fitted to the data only."""
 
 COLD_START, MEAN = "cold start", "line and cold start"
@@ -33,7 +33,7 @@ SITE_OFFSETS, SITE_LINE = "offsets", "offsets + line"
 SITE_UNIVERSAL, SITE_UNIVERSAL_LINE = "offsets + universal network", "offsets + universal network + line"
 SITE_TUNED = "fine-tuned network"
 
-ALONE = FitOptions(epochs=20, learning_rate=1e-3, dropout=0.2)
+NETWORK_ONLY = FitOptions(epochs=20, learning_rate=1e-3, dropout=0.2)
 """Options of a network without a line: it needs more training than one that refines a line."""
 
 TUNING = FitOptions(epochs=2, learning_rate=3e-4, dropout=0.2)
@@ -41,7 +41,7 @@ TUNED_PER_CONFIGURATION, TUNED_INPUTS = 6, 2500
 """The fine-tuned network of a site is fitted to at most this number of inputs per configuration, and in total."""
 
 PER_CONFIGURATION = 20
-ENOUGH_FOR_MEAN = 20
+MIN_CONFIGURATIONS_FOR_MEAN = 20
 """Number of configurations from which a line is averaged with the universal network."""
 
 FACTORS, MIN_SPREAD_M = (0.0, 1.5), 0.05
@@ -98,13 +98,13 @@ class Recipe:
 
     architecture: Remnet
     fit: FitOptions
-    alone: FitOptions = ALONE
+    alone: FitOptions = NETWORK_ONLY
     line: bool = True
     network: bool = True
     per_configuration: int = PER_CONFIGURATION
 
     def of(self, name: str) -> Recipe:
-        """Return the recipe of one of `OWN`."""
+        """Return the recipe of one of `NEW_MODELS`."""
         network = name in (LINE_NETWORK, NETWORK)
         options = self.alone if name == NETWORK else self.fit
         return replace(self, line=name in (LINE, LINE_NETWORK), network=network, fit=options)
@@ -132,7 +132,7 @@ def network_m(network: FloatWeights, inputs: NDArray[np.float32]) -> NDArray[np.
     return np.concatenate(parts).astype(np.float64)
 
 
-def fit_own(
+def fit_new_model(
     data: Dataset, recipe: Recipe, seed: int, on_epoch: Callable[[], None] = lambda: None
 ) -> FittedModel:
     """Fit a new model. Without a network, it contains the initial network, which predicts 0.
@@ -167,7 +167,7 @@ def _fit_residuals(
     """Fit a network to the residuals of a linear bias model."""
     from uwb_mitigation.training import fitting
 
-    part = data.rows(splits.thinned(data.configurations, per_configuration, options.seed))
+    part = data.rows(splits.subsample(data.configurations, per_configuration, options.seed))
     residual = part.error_m - linear_bias_m(linear_bias, part)
     # If the linear bias model needs a power that is unknown, the range is passed through.
     known = np.isfinite(residual)
@@ -181,11 +181,11 @@ def fit_line(data: Dataset) -> LinearBiasModel:
     )
 
 
-def own_models(recipe: Recipe) -> list[Candidate]:
+def new_models(recipe: Recipe) -> list[Candidate]:
     """Return a constant, a line, a network on the residuals of the line, and a network without a line."""
 
     def own(name: str) -> Callable[[Dataset, int], FittedModel]:
-        return lambda data, seed: fit_own(data, recipe.of(name), seed)
+        return lambda data, seed: fit_new_model(data, recipe.of(name), seed)
 
     return [
         _constant(),
@@ -246,7 +246,7 @@ def from_bundle(source: Bundle, options: FitOptions) -> list[Candidate]:
 def with_cold_start(candidates: Sequence[Candidate], data: Dataset, universal: Bundle) -> list[Candidate]:
     """Add the universal network with an offset of the data, if the data is preprocessed for it.
 
-    With few configurations it is the first candidate, so that it is preferred. With `ENOUGH_FOR_MEAN` or more it follows
+    With few configurations it is the first candidate, so that it is preferred. With `MIN_CONFIGURATIONS_FOR_MEAN` or more it follows
     the constant, and its mean with the line follows the line. The mean reduces both the scatter of the line and the
     site-specific errors of the network.
     """
@@ -254,11 +254,11 @@ def with_cold_start(candidates: Sequence[Candidate], data: Dataset, universal: B
         return list(candidates)
     network = float_network(universal)
     start = Candidate(COLD_START, lambda data, seed: FittedModel(_offset(data, network), network))
-    if is_few(data):
+    if has_few_configurations(data):
         return [start, *candidates]
     half = scaled(network, 0.5)
     known = np.isfinite(data.rx_power_dbm - data.first_path_power_dbm)
-    has_line = len(data.rows(known).names) >= ENOUGH_FOR_MEAN
+    has_line = len(data.rows(known).names) >= MIN_CONFIGURATIONS_FOR_MEAN
 
     def mean(data: Dataset, seed: int) -> FittedModel:
         line, offset = fit_line(data), _offset(data, network).offset_m
@@ -269,9 +269,9 @@ def with_cold_start(candidates: Sequence[Candidate], data: Dataset, universal: B
     return [item for one in candidates for item in (one, *behind.get(one.name, ()))]
 
 
-def is_few(data: Dataset) -> bool:
+def has_few_configurations(data: Dataset) -> bool:
     """Whether the cold start is preferred because there are few configurations."""
-    return len(data.names) < ENOUGH_FOR_MEAN
+    return len(data.names) < MIN_CONFIGURATIONS_FOR_MEAN
 
 
 def _offset(data: Dataset, network: FloatWeights) -> LinearBiasModel:
@@ -319,7 +319,7 @@ def site_models(
         from uwb_mitigation.training import fitting
 
         shift = linear_fit.constant(data.configurations, data.error_m - _universal_m(data))
-        part = data.rows(splits.thinned(data.configurations, TUNED_PER_CONFIGURATION, seed))
+        part = data.rows(splits.subsample(data.configurations, TUNED_PER_CONFIGURATION, seed))
         if len(part) > TUNED_INPUTS:
             chosen = np.random.default_rng(seed).choice(len(part), TUNED_INPUTS, replace=False)
             part = part.rows(np.sort(chosen))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.evaluation import baselines, splits, zero_shot
 from uwb_mitigation.evaluation.dataset import Dataset
-from uwb_mitigation.evaluation.metrics import bootstrap_interval, coverage, kept_mae
+from uwb_mitigation.evaluation.metrics import bootstrap_interval, coverage, mae_after_rejection
 from uwb_mitigation.evaluation.splits import Group
 from uwb_mitigation.model.architecture import Mlp, Remnet
 from uwb_mitigation.model.bundle import Bundle
@@ -102,7 +102,7 @@ class _HeldOut:
     errors: Mapping[str, NDArray[np.float64]]
     variance_m2: NDArray[np.float64]
     sigmas95: NDArray[np.float64]
-    passed: NDArray[np.bool_]
+    passed_through: NDArray[np.bool_]
 
 
 def run(
@@ -142,8 +142,10 @@ def run(
     return Comparison(
         rows=tuple(rows),
         coverage=_coverage(dataset.labels, final, variance, wide),
-        rejection=tuple((share, kept_mae(final.ravel(), variance.ravel(), share)) for share in REJECTED),
-        passed_through=float(np.mean([part.passed for part in held])),
+        rejection=tuple(
+            (share, mae_after_rejection(final.ravel(), variance.ravel(), share)) for share in REJECTED
+        ),
+        passed_through=float(np.mean([part.passed_through for part in held])),
         group=group,
         folds=len(splits.by_group(dataset, group, folds, 0)),
         seeds=seeds,
@@ -182,7 +184,7 @@ def _hold_out(
     recipe = replace(recipe, fit=replace(recipe.fit, seed=seed))
     errors = {name: dataset.error_m.copy() for name in NAMES}
     variance, sigmas95 = np.empty(len(dataset)), np.empty(len(dataset))
-    passed = np.zeros(len(dataset), np.bool_)
+    passed_through = np.zeros(len(dataset), np.bool_)
     for fold in splits.by_group(dataset, group, folds, seed):
         part, test = dataset.rows(fold.train), dataset.rows(fold.test)
         for name, predicted in _baselines(part, test, recipe, seed):
@@ -194,13 +196,13 @@ def _hold_out(
             ("shipped_float", network_m(network, test.inputs).astype(np.float32)),
             ("shipped_int8", IntegerNetwork(integers).predict_m(test.inputs)),
         ):
-            graded = zero_shot.grade(test, card, (linear_bias + output).astype(np.float32))
-            errors[name][fold.test] -= graded.correction_m
-        variance[fold.test] = graded.variance_m2
+            corrections = zero_shot.apply_card(test, card, (linear_bias + output).astype(np.float32))
+            errors[name][fold.test] -= corrections.correction_m
+        variance[fold.test] = corrections.variance_m2
         sigmas95[fold.test] = card.interval95_sigmas
-        passed[fold.test] = graded.passed
+        passed_through[fold.test] = corrections.passed_through
         on_fold()
-    return _HeldOut(errors, variance, sigmas95, passed)
+    return _HeldOut(errors, variance, sigmas95, passed_through)
 
 
 def _baselines(
@@ -212,8 +214,8 @@ def _baselines(
     yield "ridge_header", baselines.ridge(part, header=True)(test)
     yield "gradient_boosting", baselines.gradient_boosting(part, seed)(test)
     yield "l1_line", linear_bias_m(candidates.fit_line(part), test)
-    some = part.rows(splits.thinned(part.configurations, recipe.per_configuration, seed))
-    options, samples = replace(candidates.ALONE, seed=seed), recipe.architecture.samples
+    some = part.rows(splits.subsample(part.configurations, recipe.per_configuration, seed))
+    options, samples = replace(candidates.NETWORK_ONLY, seed=seed), recipe.architecture.samples
     yield "mlp", network_m(fit(Mlp(samples=samples), some.inputs, some.error_m, options), test.inputs)
     alone = fit(Remnet(samples=samples), some.inputs, some.error_m, options)
     yield "remnet_float", network_m(alone, test.inputs)

@@ -29,7 +29,7 @@ WEIGHT_LIMIT = 63
 MSE = None
 """Instead of a percentile: choose the scale of each activation with the least mean squared rounding error."""
 
-LEAST_RATIO = 2.0**-12
+MIN_SCALE_RATIO = 2.0**-12
 """Minimum ratio of the scales of a sum's operands: below 2^-14 of the result's scale, ONNX Runtime on ARM differs."""
 
 CALIBRATION_PER_CONFIGURATION = 40
@@ -38,7 +38,7 @@ CALIBRATION_PER_CONFIGURATION = 40
 
 def calibration_inputs(dataset: Dataset, seed: int) -> NDArray[np.float32]:
     """Return inputs of every configuration for `quantize`."""
-    rows = splits.thinned(dataset.configurations, CALIBRATION_PER_CONFIGURATION, seed)
+    rows = splits.subsample(dataset.configurations, CALIBRATION_PER_CONFIGURATION, seed)
     return dataset.inputs[rows]
 
 
@@ -168,7 +168,7 @@ def _activation_scales(
     """Return scales at which 255 represents the peaks, or more where integer arithmetic requires it.
 
     It requires that a step of a convolution's output is at least 16 steps of its accumulator, that the scales of a sum's
-    operands add up to at most twice its own scale, and that their ratio is at least `LEAST_RATIO`. This affects only
+    operands add up to at most twice its own scale, and that their ratio is at least `MIN_SCALE_RATIO`. This affects only
     tensors that are rarely active and operands that never peak together.
     """
     scale: dict[str, np.float32] = {}
@@ -178,7 +178,7 @@ def _activation_scales(
             wanted = max(wanted, 17 * float(scale[reads[tensor]]) * float(weight_scale[tensor].max()))
         elif tensor != "input":
             first, second = sum_operands(tensor)
-            least = LEAST_RATIO * float(max(scale[first], scale[second]))
+            least = MIN_SCALE_RATIO * float(max(scale[first], scale[second]))
             scale |= {name: np.float32(max(float(scale[name]), least)) for name in (first, second)}
             wanted = max(wanted, 0.501 * (float(scale[first]) + float(scale[second])))
         scale[tensor] = np.float32(wanted)

@@ -15,10 +15,10 @@ from uwb_mitigation.evaluation.dataset import Dataset
 from uwb_mitigation.evaluation.splits import Split
 from uwb_mitigation.training.candidates import Candidate, FittedModel
 
-MUST_GAIN = 0.02
+MIN_GAIN = 0.02
 """A more complex candidate must reduce the error by at least this share; smaller gains are not significant."""
 
-COLD_START_MUST_GAIN = 0.10
+COLD_START_MIN_GAIN = 0.10
 """Required gain with few configurations, where only large differences are significant."""
 
 NESTED = "chosen (nested)"
@@ -30,7 +30,7 @@ SEGMENT_FOLDS, ANCHOR_FOLDS = 4, 2
 _NOTHING: Callable[[], None] = lambda: None  # noqa: E731
 
 
-def counted(total: int, on_share: Callable[[float], None]) -> Callable[[], None]:
+def step_counter(total: int, on_share: Callable[[float], None]) -> Callable[[], None]:
     """Return a callback for each of `total` steps; it calls `on_share` with the finished share."""
     numbers = itertools.count(1)
     return lambda: on_share(next(numbers) / total)
@@ -67,12 +67,12 @@ class Selection:
         }
 
 
-def preferred(errors: Mapping[str, NDArray[np.float64]], must_gain: float = MUST_GAIN) -> str:
-    """Return the first candidate, in order of preference, that no later one improves by the share `must_gain`."""
+def select_simplest(errors: Mapping[str, NDArray[np.float64]], min_gain: float = MIN_GAIN) -> str:
+    """Return the first candidate, in order of preference, that no later one improves by the share `min_gain`."""
     best, best_mae = "", np.inf
     for name, error in errors.items():
         mae = float(np.abs(error).mean())
-        if not best or mae < (1 - must_gain) * best_mae:
+        if not best or mae < (1 - min_gain) * best_mae:
             best, best_mae = name, mae
     return best
 
@@ -108,7 +108,7 @@ def select_nested(
     seed: int,
     on_share: Callable[[float], None] = lambda share: None,
     *,
-    must_gain: float = MUST_GAIN,
+    min_gain: float = MIN_GAIN,
 ) -> Selection:
     """Select by cross-validation over configurations; estimate the error of the selection by nested cross-validation.
 
@@ -116,22 +116,22 @@ def select_nested(
         DatasetError, ParameterError: see `splits.by_configuration` and the fits.
     """
     inner_folds = max(2, folds - 2)
-    on_fit = counted(folds * len(candidates) * (1 + inner_folds), on_share)
+    on_fit = step_counter(folds * len(candidates) * (1 + inner_folds), on_share)
     names = [candidate.name for candidate in candidates]
     errors = {name: data.error_m.copy() for name in ("raw", *names, NESTED)}
     for fold in splits.by_configuration(data.configurations, folds, seed):
         outer = held_out_errors(data, candidates, [fold], seed, on_fit)
         train = data.rows(fold.train)
         inner = splits.by_configuration(train.configurations, inner_folds, seed)
-        choice = preferred(held_out_errors(train, candidates, inner, seed, on_fit), must_gain)
+        choice = select_simplest(held_out_errors(train, candidates, inner, seed, on_fit), min_gain)
         for name in names:
             errors[name][fold.test] = outer[name][fold.test]
         errors[NESTED][fold.test] = outer[choice][fold.test]
-    chosen = preferred({name: errors[name] for name in names}, must_gain)
+    chosen = select_simplest({name: errors[name] for name in names}, min_gain)
     if untrained := [item.name for item in candidates if not item.trains]:
-        fallback = preferred({name: errors[name] for name in untrained}, must_gain)
+        fallback = select_simplest({name: errors[name] for name in untrained}, min_gain)
         # The error on the folds that were used for the selection is optimistic; the nested error is not.
-        if preferred({fallback: errors[fallback], chosen: errors[NESTED]}, must_gain) == fallback:
+        if select_simplest({fallback: errors[fallback], chosen: errors[NESTED]}, min_gain) == fallback:
             chosen = fallback
     (candidate,) = (item for item in candidates if item.name == chosen)
     return Selection(chosen, errors, candidate.fit(data, seed), folds, seed, len(data.names))
@@ -167,7 +167,7 @@ def select_for_site(
         raise DatasetError(
             "one segment of ranges: nothing can be held out", valid="a longer drive, or more positions"
         )
-    on_fit = counted((len(segments) + len(anchors)) * len(candidates) + 1, on_share)
+    on_fit = step_counter((len(segments) + len(anchors)) * len(candidates) + 1, on_share)
 
     def prepare(fold: Split) -> Dataset:
         return data.shifted(without_offsets_of(fold.test))
@@ -176,7 +176,7 @@ def select_for_site(
     if anchors:
         beside = held_out_errors(data, candidates, anchors, seed, on_fit)
         errors = {name: np.concatenate([error, beside[name]]) for name, error in errors.items()}
-    chosen = preferred(errors)
+    chosen = select_simplest(errors)
     (candidate,) = (item for item in candidates if item.name == chosen)
     return Selection(chosen, errors, candidate.fit(data, seed), folds=len(segments), seed=seed)
 

@@ -1,6 +1,6 @@
 """Calibrate a site from a drive: true ranges from a joint solution or a localisation, then offsets and a model.
 
-`without_truth` and `with_truth` solve for the true ranges and the offsets; `_calibrated` selects the model for both.
+`calibrate_without_truth` and `calibrate_with_truth` solve for the true ranges and the offsets; `_select_model` selects the model for both.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from uwb_mitigation.training import candidates as models
 from uwb_mitigation.training import selection as selections
 from uwb_mitigation.training.anchor_check import check_anchors
 from uwb_mitigation.training.cards import card_of, ood_bands_of
-from uwb_mitigation.training.selection import MUST_GAIN, Selection
+from uwb_mitigation.training.selection import MIN_GAIN, Selection
 
 MAX_TRUTH_SD_M = 0.25
 """Ranges whose true range has a larger standard deviation are not used."""
@@ -59,7 +59,7 @@ Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Solution:
+class SiteSolution:
     """True ranges and offsets, before the model is selected.
 
     Attributes:
@@ -69,7 +69,7 @@ class Solution:
         pairs, offsets: offsets of the radios. level: granularity of the offsets: `pair`, `anchor` or `one`.
         outliers: number of ranges that were excluded everywhere because their errors are implausible.
         notes: unobservable quantities and excluded data.
-        change_without: returns for held-out rows of `rows` the change of the pair offsets, m, if they are estimated
+        offset_changes_without: returns for held-out rows of `rows` the change of the pair offsets, m, if they are estimated
             without these rows.
         truth: topic of the localisation; None: only ranges were used. localised: its time offset and lever arms.
         track: (k, 3), positions of the tags. track_of: (k,), their segments.
@@ -90,7 +90,7 @@ class Solution:
     level: str
     outliers: int
     notes: tuple[str, ...]
-    change_without: Callable[[NDArray[np.intp]], Mapping[tuple[int, int], float]]
+    offset_changes_without: Callable[[NDArray[np.intp]], Mapping[tuple[int, int], float]]
     truth: str | None = None
     localised: Localised | None = None
     track: NDArray[np.float64]
@@ -103,7 +103,7 @@ class Solution:
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Calibrated:
+class SiteCalibration:
     """A calibration, before it is written.
 
     Attributes:
@@ -114,7 +114,7 @@ class Calibrated:
     """
 
     site: SiteData
-    solution: Solution
+    solution: SiteSolution
     data: Dataset
     raw_m: NDArray[np.float64]
     selection: Selection
@@ -142,17 +142,17 @@ class Calibrated:
         return self.selection.mae()[self.selection.chosen]
 
     @property
-    def harms(self) -> bool:
-        """Whether held-out ranges improve by less than `MUST_GAIN`, or positions become worse."""
+    def is_harmful(self) -> bool:
+        """Whether held-out ranges improve by less than `MIN_GAIN`, or positions become worse."""
         raw, calibrated = self.solution.position_scatter_m
         scatters = calibrated > raw
         if self.solution.truth is not None:
             raw, calibrated = self.position_error_m
-            scatters = calibrated > (1.0 + MUST_GAIN) * raw
-        return self.calibrated_mae_m > (1.0 - MUST_GAIN) * self.raw_mae_m or scatters
+            scatters = calibrated > (1.0 + MIN_GAIN) * raw
+        return self.calibrated_mae_m > (1.0 - MIN_GAIN) * self.raw_mae_m or scatters
 
     @property
-    def sure_gain(self) -> float:
+    def gain_lower_bound(self) -> float:
         """Return the reduction of the held-out error (share) if the mean offset is wrong by two standard deviations.
 
         Without ground truth the held-out ranges are compared with a track that contains the error of the mean offset.
@@ -164,7 +164,7 @@ class Calibrated:
             for by in (-wrong, 0.0, wrong)
         )
 
-    def sentence(self) -> str:
+    def summary(self) -> str:
         """Return the result in one sentence."""
         truth, chosen = self.solution.truth, self.selection.chosen
         against = "residuals against the other anchors (not ground truth)"
@@ -178,9 +178,9 @@ class Calibrated:
         ):
             if not math.isnan(raw):
                 text += f"; {what} {raw:.3f} m raw, {calibrated:.3f} m calibrated"
-        if self.harms:
+        if self.is_harmful:
             return f"{text}: no gain."
-        if (gain := self.sure_gain) <= 0.0:
+        if (gain := self.gain_lower_bound) <= 0.0:
             return f"{text}. The gain is smaller than its uncertainty."
         return f"{text}: at least {gain:.0%} less."
 
@@ -269,7 +269,7 @@ def offsets_file(bundle: Path) -> Path:
     return bundle.with_suffix(".offsets.yaml")
 
 
-def without_truth(
+def calibrate_without_truth(
     site: SiteData,
     universal: Bundle,
     *,
@@ -278,7 +278,7 @@ def without_truth(
     seed: int,
     height_sd_m: float = 0.1,
     on_progress: Progress = lambda what, share: None,
-) -> Calibrated:
+) -> SiteCalibration:
     """Calibrate from ranges only, without ground truth.
 
     Args:
@@ -319,7 +319,7 @@ def without_truth(
         own = {ids[row]: found.applied(tag, row)[0] for tag, row in found.pairs()}
         offsets = Offsets(common, anchors=own)
 
-    def change_without(held_out: NDArray[np.intp]) -> dict[tuple[int, int], float]:
+    def offset_changes_without(held_out: NDArray[np.intp]) -> dict[tuple[int, int], float]:
         again = found.found_without(_whole_segments(used[held_out], used, track.of))
         return {
             (found.tag_ids[tag], ids[row]): again.pair(tag, row)[0] - found.pair(tag, row)[0]
@@ -327,7 +327,7 @@ def without_truth(
             if found.applied(tag, row)[0] != 0.0
         }
 
-    solution = Solution(
+    solution = SiteSolution(
         rows=of_range[used],
         true_m=found.pseudo_m[used],
         antenna=found.fit.position[found.fit.links.knot[found.fit.links.of]][used],
@@ -338,7 +338,7 @@ def without_truth(
         level=found.level,
         outliers=outliers,
         notes=tuple(notes),
-        change_without=change_without,
+        offset_changes_without=offset_changes_without,
         track=found.fit.position,
         track_of=found.fit.links.knot_stretch,
         places=_places(found),
@@ -347,10 +347,10 @@ def without_truth(
         common_sd_m=found.mean()[1],
         position_scatter_m=found.position_scatter_m,
     )
-    return _calibrated(site, universal, solution, seed, lambda s: on_progress("choosing", 0.4 + 0.6 * s))
+    return _select_model(site, universal, solution, seed, lambda s: on_progress("choosing", 0.4 + 0.6 * s))
 
 
-def with_truth(
+def calibrate_with_truth(
     site: SiteData,
     universal: Bundle,
     paths: Sequence[Sequence[PosePath]],
@@ -361,7 +361,7 @@ def with_truth(
     estimate_lever_arm: bool = False,
     seed: int,
     on_progress: Progress = lambda what, share: None,
-) -> Calibrated:
+) -> SiteCalibration:
     """Calibrate against the poses of a localisation.
 
     Args:
@@ -369,7 +369,7 @@ def with_truth(
         time_offset_s, lever_arms_m, estimate_lever_arm: see `solve_localised`.
 
     Raises:
-        DatasetError: as for `without_truth`; or too few ranges within the times of the localisation.
+        DatasetError: as for `calibrate_without_truth`; or too few ranges within the times of the localisation.
     """
     on_progress("time offset and lever arm", 0.05)
     joined = [
@@ -403,7 +403,7 @@ def with_truth(
     pairs = {pair: few if own[1] > MAX_TRUTH_SD_M else own for pair, own in pairs.items()}
     tag = site.tag
 
-    def change_without(held_out: NDArray[np.intp]) -> dict[tuple[int, int], float]:
+    def offset_changes_without(held_out: NDArray[np.intp]) -> dict[tuple[int, int], float]:
         rest = np.setdiff1d(rows, rows[held_out])
         own = [rest[tag[rest] == number] for number in range(len(site.tags))]
         again = solve_localised(
@@ -420,7 +420,7 @@ def with_truth(
             for number, row in again.pairs
         }
 
-    solution = Solution(
+    solution = SiteSolution(
         rows=rows,
         true_m=found.distance_m[rows],
         antenna=found.position[rows],
@@ -431,19 +431,19 @@ def with_truth(
         level="pair",
         outliers=outliers,
         notes=(),
-        change_without=change_without,
+        offset_changes_without=offset_changes_without,
         truth=topic,
         localised=found,
         track=found.position[rows],
         track_of=tag[rows],
         places={},
     )
-    return _calibrated(site, universal, solution, seed, lambda s: on_progress("choosing", 0.3 + 0.7 * s))
+    return _select_model(site, universal, solution, seed, lambda s: on_progress("choosing", 0.3 + 0.7 * s))
 
 
-def _calibrated(
-    site: SiteData, universal: Bundle, solution: Solution, seed: int, on_share: Callable[[float], None]
-) -> Calibrated:
+def _select_model(
+    site: SiteData, universal: Bundle, solution: SiteSolution, seed: int, on_share: Callable[[float], None]
+) -> SiteCalibration:
     """Select the model; raises `DatasetError` for too few ranges and implausible offsets."""
     if len(solution.rows) < MIN_LABELLED:
         raise DatasetError(
@@ -460,7 +460,7 @@ def _calibrated(
     data = raw.shifted(-solution.offsets.of(raw.tags, raw.anchors).astype(np.float64))
 
     def offset_change(held_out: NDArray[np.intp]) -> NDArray[np.float64]:
-        of_pair = solution.change_without(held_out)
+        of_pair = solution.offset_changes_without(held_out)
         return np.array([-of_pair.get(pair, 0.0) for pair in pair_of])
 
     with_network, candidates, missing = models.site_models(data, site.has_cirs, universal)
@@ -471,7 +471,7 @@ def _calibrated(
     )
     left = selection.errors[selection.chosen][: len(data)]
     raw_error, error = (position_error_m(site, solution, error_m) for error_m in (raw.error_m, left))
-    return Calibrated(
+    return SiteCalibration(
         site=site,
         solution=solution,
         data=data,
@@ -482,7 +482,7 @@ def _calibrated(
     )
 
 
-def position_error_m(site: SiteData, solution: Solution, error_m: NDArray[np.float64]) -> float:
+def position_error_m(site: SiteData, solution: SiteSolution, error_m: NDArray[np.float64]) -> float:
     """Return the RMSE of the horizontal position due to range errors, m: least squares on the ranges of each second.
 
     Args:
@@ -527,7 +527,7 @@ def regressors(site: SiteData, universal: Bundle) -> Regressors:
 
 
 def _places(found: SelfCalibration) -> dict[str, tuple[float, float, float]]:
-    """Return the positions of stationary tags, see `Solution.places`."""
+    """Return the positions of stationary tags, see `SiteSolution.places`."""
     resting = np.flatnonzero(found.fit.links.at_rest).tolist()
     tag_of = dict(zip(found.stretches.of.tolist(), found.stretches.tag.tolist(), strict=True))
     positions = Counter(tag_of[segment] for segment in resting)

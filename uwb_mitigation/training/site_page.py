@@ -6,14 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import format_id
-from uwb_mitigation.evaluation.page import rendered
-from uwb_mitigation.training.site_calibration import Calibrated
+from uwb_mitigation.evaluation.page import render_page
+from uwb_mitigation.training.site_calibration import SiteCalibration
 
 MAX_POINTS = 2000
 WIDTH, HEIGHT, MARGIN = 720.0, 480.0, 36.0
 
 
-def site_page(found: Calibrated, name: str) -> str:
+def site_page(found: SiteCalibration, name: str) -> str:
     """Return one HTML page without external resources; `name`: name of the recordings.
 
     Raises:
@@ -40,10 +40,10 @@ def site_page(found: Calibrated, name: str) -> str:
         slope, sd = (100.0 * value for value in solution.line)
         facts.append(f"Received power: {slope:.2f} +- {sd:.2f} cm of range per dB.")
     offsets = [(format_id(tag), format_id(anchor), *own) for (tag, anchor), own in solution.pairs.items()]
-    return rendered(
+    return render_page(
         "site.html.j2",
         name=name,
-        sentence=found.sentence(),
+        summary=found.summary(),
         facts=facts,
         notes=found.notes,
         by_anchor=by_anchor,
@@ -57,7 +57,7 @@ def site_page(found: Calibrated, name: str) -> str:
     )
 
 
-def _plan(found: Calibrated) -> dict[str, object]:
+def _plan(found: SiteCalibration) -> dict[str, object]:
     """Return anchors, tracks and stationary positions in pixels, and the number of pixels per metre."""
     solution = found.solution
     tracks = [solution.track[solution.track_of == one][:, :2] for one in np.unique(solution.track_of)]

@@ -23,7 +23,7 @@ from uwb_mitigation.model.shipped import default_model_path
 from uwb_mitigation.model.weights import FloatWeights
 from uwb_mitigation.training import candidates as models
 from uwb_mitigation.training import selection as selections
-from uwb_mitigation.training.candidates import Candidate, Recipe, fit_own, linear_bias_m
+from uwb_mitigation.training.candidates import Candidate, Recipe, fit_new_model, linear_bias_m
 from uwb_mitigation.training.cards import card_of, ood_bands_of
 from uwb_mitigation.training.options import FitOptions
 from uwb_mitigation.training.quantization import calibration_inputs, quantize
@@ -64,26 +64,26 @@ class TrainedBundle:
     Attributes:
         selection: None if the recipe was given.
         validation: source of the card's intervals.
-        after_m: MAE of the model, m; nested MAE of the selection if the model was selected.
-        before_m: {name: MAE of the baseline}, m.
+        mae_m: MAE of the model, m; nested MAE of the selection if the model was selected.
+        baseline_mae_m: {name: MAE of the baseline}, m.
     """
 
     bundle: Bundle
     selection: Selection | None
     validation: CrossValidation
-    after_m: float
-    before_m: dict[str, float]
+    mae_m: float
+    baseline_mae_m: dict[str, float]
 
     @property
     def helped(self) -> bool:
         """Whether the model has a smaller MAE than every baseline."""
-        return self.after_m < min(self.before_m.values())
+        return self.mae_m < min(self.baseline_mae_m.values())
 
     @property
     def prefers_cold_start(self) -> bool:
-        """Whether other candidates had to improve on the cold start by `COLD_START_MUST_GAIN`."""
+        """Whether other candidates had to improve on the cold start by `COLD_START_MIN_GAIN`."""
         names = () if self.selection is None else self.selection.errors
-        return models.COLD_START in names and models.is_few(self.validation.dataset)
+        return models.COLD_START in names and models.has_few_configurations(self.validation.dataset)
 
     def as_json(self) -> dict[str, object]:
         """Return the result of `uwb-mitigation train`."""
@@ -118,29 +118,29 @@ class Job:
     on_progress: Progress = lambda what, share: None
 
 
-def train_own(job: Job, recipe: Recipe, wanted: str = AUTO) -> TrainedBundle:
-    """Train a new model: one of `candidates.OWN`, or the best of these and the cold start (AUTO).
+def train_new_model(job: Job, recipe: Recipe, wanted: str = AUTO) -> TrainedBundle:
+    """Train a new model: one of `candidates.NEW_MODELS`, or the best of these and the cold start (AUTO).
 
     Raises:
         ParameterError: unknown model. DatasetError: too few configurations; see also `fitting.fit`.
     """
-    if wanted not in (AUTO, *models.OWN):
-        raise ParameterError(f"recipe {wanted!r}", valid=", ".join((AUTO, *models.OWN)))
+    if wanted not in (AUTO, *models.NEW_MODELS):
+        raise ParameterError(f"recipe {wanted!r}", valid=", ".join((AUTO, *models.NEW_MODELS)))
     dataset, folds = job.dataset, min(job.folds, len(job.dataset.names))
     _check_configurations(dataset, selections.min_configurations(job.folds) if wanted == AUTO else 2)
     selection, seed = None, recipe.fit.seed
     if wanted == AUTO:
         universal = load_bundle(default_model_path(dataset.preprocessing.scaling))
-        candidates = models.with_cold_start(models.own_models(recipe), dataset, universal)
+        candidates = models.with_cold_start(models.new_models(recipe), dataset, universal)
         selection = _select(job, candidates, seed)
         wanted = selection.chosen
         if wanted in (models.COLD_START, models.MEAN):
             return _write_selected(job, selection, universal, recipe.fit, ("raw",))
     recipe = recipe.of(wanted)
     total = recipe.fit.epochs * (folds + 1)
-    on_epoch = selections.counted(total, lambda share: job.on_progress("training", share))
+    on_epoch = selections.step_counter(total, lambda share: job.on_progress("training", share))
     validation = cross_validate(dataset, recipe, folds, seed, on_epoch)
-    fitted = fit_own(dataset, recipe, seed, on_epoch)
+    fitted = fit_new_model(dataset, recipe, seed, on_epoch)
     card = describe(job.output.stem, recipe, fitted.linear_bias, validation, job.name)
     mae = {row: statistics["mae"] for row, statistics in validation.statistics().items()}
     after = mae["int8"] if selection is None else selection.mae()[NESTED]
@@ -177,7 +177,7 @@ def _select(job: Job, candidates: Sequence[Candidate], seed: int) -> Selection:
         min(job.folds, len(job.dataset.names)),
         seed,
         lambda share: job.on_progress("choosing", share),
-        must_gain=selections.COLD_START_MUST_GAIN if is_cold else selections.MUST_GAIN,
+        min_gain=selections.COLD_START_MIN_GAIN if is_cold else selections.MIN_GAIN,
     )
 
 
@@ -224,7 +224,7 @@ def cross_validate(
     errors = {name: dataset.error_m.copy() for name in (*names, *(["int8"] if quantised else []))}
     for fold in splits.by_configuration(dataset.configurations, folds, seed):
         train, test = dataset.rows(fold.train), dataset.rows(fold.test)
-        fitted = fit_own(train, recipe, recipe.fit.seed, on_epoch)
+        fitted = fit_new_model(train, recipe, recipe.fit.seed, on_epoch)
         assert fitted.network is not None
         residual = test.error_m - linear_bias_m(fitted.linear_bias, test)
         errors["overall_median"][fold.test] -= np.median(train.error_m)
@@ -245,7 +245,7 @@ def fit_with_card(dataset: Dataset, recipe: Recipe, inner_folds: int) -> tuple[C
     """
     folds, seed = min(inner_folds, len(dataset.names)), recipe.fit.seed
     validation = cross_validate(dataset, recipe, folds, seed, quantised=False)
-    fitted = fit_own(dataset, recipe, seed)
+    fitted = fit_new_model(dataset, recipe, seed)
     assert fitted.network is not None
     return describe("", recipe, fitted.linear_bias, validation, ""), fitted.network
 

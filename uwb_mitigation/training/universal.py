@@ -27,7 +27,7 @@ from uwb_mitigation.training.cards import card_of, ood_bands_of
 from uwb_mitigation.training.fitting import fit
 from uwb_mitigation.training.options import FitOptions
 from uwb_mitigation.training.quantization import quantize
-from uwb_mitigation.training.selection import counted
+from uwb_mitigation.training.selection import step_counter
 from uwb_mitigation.training.simulated import building_dataset
 
 CALIBRATION_INPUTS = 512
@@ -80,7 +80,7 @@ def train(
     """Train the model of `plan`. The result does not depend on `workers`; `on_share` gets the step and its progress."""
     preprocessing = Preprocessing(plan.samples, plan.scaling)
     worlds = plan.blocks + plan.held_out_blocks
-    count_block = counted(worlds, lambda share: on_share(0.2 * share, "simulating"))
+    count_block = step_counter(worlds, lambda share: on_share(0.2 * share, "simulating"))
     # Augmentation needs the levels, even if the scaling removes them.
     leveled = Preprocessing(plan.samples)
     # With levels, other receivers and sites are detected as out of distribution. Without, train on them.
@@ -94,7 +94,7 @@ def train(
         count_block,
         wide=not is_leveled,
     )
-    count_epoch = counted(plan.fit.epochs, lambda share: on_share(0.2 + 0.75 * share, "training"))
+    count_epoch = step_counter(plan.fit.epochs, lambda share: on_share(0.2 + 0.75 * share, "training"))
     options = replace(plan.fit, seed=plan.seed)
     network = fit(
         Remnet(samples=plan.samples),
