@@ -20,7 +20,7 @@ from uwb_mitigation.nodes import processes, topics
 from uwb_mitigation.nodes.processes import Probe, wait, watching
 from uwb_mitigation.positioning.anchors import Anchor, AnchorMap, dump_anchors
 from uwb_mitigation.positioning.filter import RangeFilter
-from uwb_mitigation.positioning.model import Model
+from uwb_mitigation.positioning.noise_model import NoiseModel
 
 ANCHORS = AnchorMap(
     [
@@ -62,7 +62,7 @@ def filter_us() -> float:
     rows, values = row.tolist(), range_m.tolist()
     best = float("inf")
     for _ in range(5):
-        one = RangeFilter(ANCHORS, Model(), 0.0, np.array([7.5, 3.5, 1.0]), np.eye(3))
+        one = RangeFilter(ANCHORS, NoiseModel(), 0.0, np.array([7.5, 3.5, 1.0]), np.eye(3))
         began = time.process_time()
         for i in range(ranges):
             one.predict(i / 40.0)

@@ -20,10 +20,10 @@ from uwb_mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.model.shipped import default_model_path
 from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.geometry import Area, Height
-from uwb_mitigation.positioning.locator import Setting, TagLocator
-from uwb_mitigation.positioning.model import Model
+from uwb_mitigation.positioning.initialization import candidate_positions, snapshot
+from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.smoother import smooth
-from uwb_mitigation.positioning.start import places, snapshot
+from uwb_mitigation.positioning.tag_estimator import EstimatorConfig, TagEstimator
 from uwb_mitigation.positioning.tracks import Ranges, Track, TrackErrors, TruePath, errors_of, track_errors
 from uwb_mitigation.sources.decaranging import DecaRangingFolder
 from uwb_mitigation.sources.hanyang import ANTENNA_M, HanyangRun
@@ -90,12 +90,12 @@ def hanyang_run(folder: Path) -> tuple[AnchorMap, Ranges, TruePath, TruePath]:
     return run.anchors, shifted, run.truth, _window(run.truth, kind_a)
 
 
-def hanyang(folder: Path, model: Model | None = None) -> Errors:
+def hanyang(folder: Path, model: NoiseModel | None = None) -> Errors:
     """Return the errors of one run in the authors' window, with known height."""
-    model = model or Model()
+    model = model or NoiseModel()
     anchors, ranges, _, truth = hanyang_run(folder)
-    live = TagLocator(Setting(anchors, model, height=HEIGHT)).run(ranges)
-    smoothed = smooth(Setting(anchors, model, HEIGHT), ranges, live)
+    live = TagEstimator(EstimatorConfig(anchors, model, height=HEIGHT)).run(ranges)
+    smoothed = smooth(EstimatorConfig(anchors, model, HEIGHT), ranges, live)
     tracks = (live, smoothed, snapshot(anchors, ranges, HEIGHT))
     return Errors(folder.name, *(at_truths(track, truth) for track in tracks))
 
@@ -153,7 +153,7 @@ def apartment(folder: Path) -> StaticErrors:
     corrected: list[float] = []
     nees: list[float] = []
     for one in np.unique(tag):
-        own, model = tag == one, Model()
+        own, model = tag == one, NoiseModel()
         used = np.unique(row[own])
         if len(used) < 3:
             continue
@@ -169,8 +169,8 @@ def apartment(folder: Path) -> StaticErrors:
         for values, spread, errors in ((range_m, model.range_sd, raw), (better, sd, corrected)):
             means = np.array([np.nanmedian(values[own & (row == a)]) for a in used])
             told = anchors.position[used], means, np.full(len(used), spread), model
-            inside = places(*told, height=Height(0.0), area=area)
-            place = (inside or places(*told, height=Height(0.0)))[0]
+            inside = candidate_positions(*told, height=Height(0.0), area=area)
+            place = (inside or candidate_positions(*told, height=Height(0.0)))[0]
             off = place.position[:2] - true[:2]
             errors.append(float(np.hypot(*off)))
         nees.append(float(off @ np.linalg.solve(place.covariance[:2, :2], off)) / 2.0)
@@ -214,9 +214,9 @@ def flat(anchor_count: int, seed: int = 1, ranges: int = 3000) -> FlatErrors:
 
 
 def _flat_errors(name: str, anchors: AnchorMap, ranges: Ranges, truth: TruePath) -> Errors:
-    model, height = Model(), Height(0.0, 0.05)
-    live = TagLocator(Setting(anchors, model, height=height)).run(ranges)
-    smoothed = smooth(Setting(anchors, model, height), ranges, live)
+    model, height = NoiseModel(), Height(0.0, 0.05)
+    live = TagEstimator(EstimatorConfig(anchors, model, height=height)).run(ranges)
+    smoothed = smooth(EstimatorConfig(anchors, model, height), ranges, live)
     tracks = (live, smoothed, snapshot(anchors, ranges, height))
     return Errors(name, *(track_errors(track, truth) for track in tracks))
 

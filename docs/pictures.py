@@ -28,7 +28,7 @@ from browser import Browser, chromium  # noqa: E402
 from uwb_mitigation.nodes import processes  # noqa: E402
 from uwb_mitigation.positioning.anchors import dump_anchors  # noqa: E402
 from uwb_mitigation.positioning.geometry import Height  # noqa: E402
-from uwb_mitigation.positioning.locator import Setting  # noqa: E402
+from uwb_mitigation.positioning.tag_estimator import EstimatorConfig  # noqa: E402
 from uwb_mitigation.processing.tracking import track_tag  # noqa: E402
 from uwb_mitigation.sources.recorded_ranges import read_ranges  # noqa: E402
 from uwb_mitigation.sources.simulated import SimulatedSource  # noqa: E402
@@ -74,7 +74,7 @@ def plot_raw_and_corrected() -> None:
         subprocess.run([*command, "process", str(raw), "--offsets", "0.22", "-o", str(corrected)], check=True)
         anchors = load_anchors(folder / "drive.anchors.yaml")
         (recording,) = read_ranges(corrected, anchors).tags
-    tracks = track_tag(recording, Setting(anchors, height=Height(0.0)))
+    tracks = track_tag(recording, EstimatorConfig(anchors, height=Height(0.0)))
     truth, begin_ns = recording.truth, recording.truth.stamp_ns[0]
     shown: list[tuple[Any, dict[str, Any]]] = [
         (truth, {"color": "black", "lw": 2.5, "label": "true path"}),

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
-from uwb_mitigation.positioning.model import Model
+from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.tracks import Ranges, TruePath
 
 HALL = AnchorMap(
@@ -33,11 +33,11 @@ def drive(
     rate_hz: float = 40.0,
     seed: int = 1,
     offset_m: float = 0.1,
-    model: Model | None = None,
+    model: NoiseModel | None = None,
     path=circuit,
 ) -> tuple[Ranges, TruePath]:
     """Ranges to the anchors in turn: white noise, what persists of each pair's error, and one offset."""
-    model = model or Model()
+    model = model or NoiseModel()
     rng = np.random.default_rng(seed)
     n = round(seconds * rate_hz)
     time_s = np.arange(n) / rate_hz

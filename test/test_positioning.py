@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
 from uwb_mitigation.positioning.filter import FIRST_ERROR, OFFSET, RangeFilter
-from uwb_mitigation.positioning.fleet import Fleet
 from uwb_mitigation.positioning.geometry import Area, Height, Shape, geometry, shape
-from uwb_mitigation.positioning.locator import SILENCE_S, Setting, TagLocator
-from uwb_mitigation.positioning.model import Model
+from uwb_mitigation.positioning.initialization import candidate_positions
+from uwb_mitigation.positioning.multi_tag import MultiTagEstimator
+from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.smoother import smooth
-from uwb_mitigation.positioning.start import places
+from uwb_mitigation.positioning.tag_estimator import RANGE_TIMEOUT_S, EstimatorConfig, TagEstimator
 from uwb_mitigation.positioning.tracks import (
     Estimate,
     Heights,
@@ -29,7 +29,7 @@ from uwb_mitigation.positioning.tracks import (
     track_errors,
 )
 
-PLAIN = Model(long=100.0, short=100.0)
+PLAIN = NoiseModel(long=100.0, short=100.0)
 """No range is doubted."""
 
 FLAT = WALL.moved(WALL.position * (1, 1, 0) + np.outer([0, 0, -3, -3, 0], (1, 0, 0)) + (0, 0, 2), WALL.sd)
@@ -97,7 +97,7 @@ def test_the_filter_agrees_with_filterpy():
     learns=st.booleans(),
 )
 def test_the_covariance_stays_one_and_the_state_finite(steps, learns: bool):
-    one = RangeFilter(HALL, Model(), 0.0, np.array([6.0, 4.0, 1.0]), np.eye(3))
+    one = RangeFilter(HALL, NoiseModel(), 0.0, np.array([6.0, 4.0, 1.0]), np.eye(3))
     one.learns = learns
     now = 0.0
     for dt, row, range_m, variance in steps:
@@ -112,9 +112,9 @@ def test_the_covariance_stays_one_and_the_state_finite(steps, learns: bool):
 def test_live_estimates_of_many_drives_are_honest():
     found = []
     for seed in range(6):
-        offset = np.random.default_rng(seed).normal(0, Model().offset_sd)
+        offset = np.random.default_rng(seed).normal(0, NoiseModel().offset_sd)
         ranges, truth = drive(seconds=25, seed=seed, offset_m=offset)
-        errors = track_errors(TagLocator(Setting(HALL)).run(ranges), truth)
+        errors = track_errors(TagEstimator(EstimatorConfig(HALL)).run(ranges), truth)
         assert errors.rmse < 0.25
         found.append(errors)
     assert 0.5 < np.mean([e.nees_per_dof for e in found]) < 1.5
@@ -125,10 +125,10 @@ def test_live_estimates_of_many_drives_are_honest():
 def test_of_two_mirror_images_nothing_is_told_until_an_area_excludes_one():
     wall = AnchorMap([Anchor(1, (0, 0, 1)), Anchor(2, (10, 0, 1)), Anchor(3, (5, 0, 1.0))])
     ranges, truth = drive(wall, seconds=8)
-    locator = TagLocator(Setting(wall, height=Height(1.0)))
+    locator = TagEstimator(EstimatorConfig(wall, height=Height(1.0)))
     assert len(locator.run(ranges)) == 0
     assert locator.candidates == 2
-    inside = TagLocator(Setting(wall, height=Height(1.0), area=Area((-50, 0.1, 0), (50, 50, 3))))
+    inside = TagEstimator(EstimatorConfig(wall, height=Height(1.0), area=Area((-50, 0.1, 0), (50, 50, 3))))
     assert track_errors(inside.run(ranges), truth).rmse < 0.4
 
 
@@ -136,7 +136,7 @@ def test_of_two_mirror_images_nothing_is_told_until_an_area_excludes_one():
 def test_every_position_lies_inside_the_area(seed: int):
     area = Area((-4, -4, 0), (0.9, 4, 3))
     ranges, truth = drive(WALL, path=flight, seed=seed)
-    locator = TagLocator(Setting(WALL, area=area))
+    locator = TagEstimator(EstimatorConfig(WALL, area=area))
     track = locator.run(block(ranges, seed))
     assert len(track) > 0.9 * len(ranges)
     assert area.holds(track.position).all()
@@ -155,8 +155,8 @@ def test_measured_heights_near_the_floor_keep_the_right_solution(seed: int):
     known = np.isfinite(height)
     heights = Heights(stamps[known], height[known], np.full(known.sum(), 0.0004))
     area = Area((-4, -4, 0), (30, 4, 3))
-    live = TagLocator(Setting(FLAT, area=area, heights=heights)).run(ranges)
-    smoothed = smooth(Setting(FLAT, area=area, heights=heights), ranges, live)
+    live = TagEstimator(EstimatorConfig(FLAT, area=area, heights=heights)).run(ranges)
+    smoothed = smooth(EstimatorConfig(FLAT, area=area, heights=heights), ranges, live)
     for track in (live, smoothed):
         assert len(track) > 250
         assert area.holds(track.position).all()
@@ -172,7 +172,7 @@ def test_late_heights_correct_a_wrong_height_at_once(anchors: AnchorMap, area: A
     ranges, truth = drive(anchors, path=flight, seconds=8, seed=2)
     late = truth.stamp_ns > 4 * NANOSECONDS
     heights = Heights(truth.stamp_ns[late], truth.position[late, 2], np.full(late.sum(), 0.0004))
-    track = TagLocator(Setting(anchors, area=area, heights=heights)).run(ranges)
+    track = TagEstimator(EstimatorConfig(anchors, area=area, heights=heights)).run(ranges)
     track = track.take(track.stamp_ns > 4.1 * NANOSECONDS)
     assert len(track) > 150
     errors = track_errors(track, truth)
@@ -184,7 +184,11 @@ def lagged(
     anchors: AnchorMap, ranges: Ranges, truth: TruePath, area: Area | None = None, heights: bool = False
 ) -> tuple[Track, Track]:
     """Return the live track of a fleet, and the one that is smoothed with a lag."""
-    fleet, live, smoothed = Fleet(Setting(anchors, Model(), area=area)), list[Estimate](), list[Estimate]()
+    fleet, live, smoothed = (
+        MultiTagEstimator(EstimatorConfig(anchors, NoiseModel(), area=area)),
+        list[Estimate](),
+        list[Estimate](),
+    )
     columns = (ranges.stamp_ns, ranges.anchor, ranges.range_m)
     for i, (stamp_ns, row, range_m) in enumerate(zip(*(one.tolist() for one in columns), strict=True)):
         found = fleet.add(7, row + 1, stamp_ns, range_m, 0.01)
@@ -227,7 +231,7 @@ def test_anchors_almost_on_a_line_never_decide_by_chance(seed: int, height: Heig
     line = AnchorMap([Anchor(i, (2.5 * i, *rng.normal((0, 1), 0.03)), 0.03) for i in range(1, 6)])
     ranges, _ = drive(line, seconds=30, seed=seed)
     block(ranges, seed)
-    fleet = Fleet(Setting(line, Model(), height=height))
+    fleet = MultiTagEstimator(EstimatorConfig(line, NoiseModel(), height=height))
     for i in range(len(ranges)):
         found = fleet.add(
             7, int(ranges.anchor[i]) + 1, int(ranges.stamp_ns[i]), float(ranges.range_m[i]), 0.01
@@ -241,12 +245,12 @@ def test_anchors_almost_on_a_line_never_decide_by_chance(seed: int, height: Heig
 def test_the_covariance_grows_through_a_silence_and_the_tag_is_found_within_two_seconds_after():
     ranges, truth = drive(seconds=40)
     before = ranges.take(ranges.stamp_ns < 15 * NANOSECONDS)
-    locator = TagLocator(Setting(HALL))
+    locator = TagEstimator(EstimatorConfig(HALL))
     locator.run(before)
     spread = [locator.at((15 + s) * NANOSECONDS).covariance[0, 0] for s in range(10)]
     assert (np.diff(spread) > 0).all()
     assert spread[-1] > 10
-    assert SILENCE_S < 10
+    assert RANGE_TIMEOUT_S < 10
     after = locator.run(ranges.take(ranges.stamp_ns >= 25 * NANOSECONDS))
     late = after.take(after.stamp_ns >= 27 * NANOSECONDS)
     assert late.stamp_ns[0] < 27.1 * NANOSECONDS
@@ -262,7 +266,7 @@ def test_a_tag_that_was_carried_away_is_found_within_two_seconds():
         return position
 
     ranges, truth = drive(seconds=40, path=carried)
-    locator = TagLocator(Setting(HALL))
+    locator = TagEstimator(EstimatorConfig(HALL))
     track = locator.run(ranges)
     late = track.take(track.stamp_ns >= 22 * NANOSECONDS)
     assert len(late) > 600
@@ -272,7 +276,7 @@ def test_a_tag_that_was_carried_away_is_found_within_two_seconds():
 
 def test_bad_input_is_skipped_and_a_replay_that_starts_again_starts_the_tag_again():
     ranges, truth = drive(seconds=10)
-    locator = TagLocator(Setting(HALL))
+    locator = TagEstimator(EstimatorConfig(HALL))
     for value in (math.nan, math.inf, -1.0):
         assert locator.add(0, 0, value) is None
     assert locator.add(0, 0, 5.0, math.inf) is None
@@ -290,13 +294,17 @@ def test_all_places_that_explain_ranges_are_found():
     for _ in range(20):
         anchors = rng.uniform((0, 0, 0), (20, 20, 3), (4, 3))
         tag = np.append(rng.uniform(-5, 25, 2), 1.0)
-        found = places(
-            anchors, np.linalg.norm(anchors - tag, axis=1), np.full(4, 0.1), Model(), height=Height(1.0)
+        found = candidate_positions(
+            anchors, np.linalg.norm(anchors - tag, axis=1), np.full(4, 0.1), NoiseModel(), height=Height(1.0)
         )
         assert min(np.linalg.norm(place.position - tag) for place in found) < 0.05
     collinear = np.array([[0.0, 0, 1], [4, 0, 1], [9, 0, 1]])
-    found = places(
-        collinear, np.linalg.norm(collinear - (3, 2, 1), axis=1), np.full(3, 0.1), Model(), height=Height(1.0)
+    found = candidate_positions(
+        collinear,
+        np.linalg.norm(collinear - (3, 2, 1), axis=1),
+        np.full(3, 0.1),
+        NoiseModel(),
+        height=Height(1.0),
     )
     assert sorted(round(float(place.position[1])) for place in found) == [-2, 2]
 
@@ -329,4 +337,4 @@ def test_truth_is_not_made_up_in_gaps():
 
 def test_a_model_out_of_range_is_refused():
     with pytest.raises(ParameterError, match="range_sd"):
-        Model(range_sd=math.nan)
+        NoiseModel(range_sd=math.nan)

@@ -12,9 +12,9 @@ from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.anchor_errors import position_scatter
 from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
 from uwb_mitigation.positioning.geometry import Area, Height
-from uwb_mitigation.positioning.joint import stretches
-from uwb_mitigation.positioning.localised import PosePath, solve_localised
-from uwb_mitigation.positioning.model import SLOPE_SD, Model, Regressors
+from uwb_mitigation.positioning.motion_segments import find_segments
+from uwb_mitigation.positioning.noise_model import SLOPE_SD, NoiseModel, Regressors
+from uwb_mitigation.positioning.pose_alignment import PosePath, align_poses
 from uwb_mitigation.positioning.self_calibration import calibrate
 from uwb_mitigation.positioning.tracks import Ranges
 
@@ -81,13 +81,13 @@ def test_what_is_held_out_has_no_say_in_the_offsets(solved, minute):
     late = ranges.stamp_ns > 30 * 10**9
     spoilt = replace(ranges, range_m=ranges.range_m + np.where(late & (ranges.anchor == 2), 0.5, 0.0))
     found = calibrate(HALL, [spoilt], height=LEVEL)
-    again = found.found_without(found.stretches.ranges.stamp_ns > 30 * 10**9)
+    again = found.without_ranges(found.segments.ranges.stamp_ns > 30 * 10**9)
     before, after = (np.array([one.pair(0, row)[0] for row in range(5)]) for one in (found, again))
     assert after[2] < before[2] - 0.05
     assert np.abs(after - 0.25 - OWN).max() < 0.15
     assert (again.pseudo_m == found.pseudo_m).all()
     # Of nothing left out, as before.
-    same = solved.found_without(np.zeros(len(ranges), bool))
+    same = solved.without_ranges(np.zeros(len(ranges), bool))
     assert np.abs(same.fit.parameters - solved.fit.parameters).max() < 2e-3
 
 
@@ -107,11 +107,11 @@ def test_ranges_that_err_more_than_others_weigh_less(minute):
     spoilt = replace(ranges, range_m=late)
     nothing = Regressors.none(len(ranges))
 
-    def worst(alike):
-        found = calibrate(HALL, [spoilt], replace(nothing, alike=alike), height=LEVEL)
+    def worst(noise_group):
+        found = calibrate(HALL, [spoilt], replace(nothing, noise_group=noise_group), height=LEVEL)
         return np.abs([found.pair(0, row)[0] - 0.25 - OWN[row] for row in range(5)]).max()
 
-    assert worst(blocked.astype(int)) < 0.07 < worst(nothing.alike)
+    assert worst(blocked.astype(int)) < 0.07 < worst(nothing.noise_group)
 
 
 def test_tags_at_a_dozen_unknown_places_tell_offset_and_line():
@@ -119,7 +119,7 @@ def test_tags_at_a_dozen_unknown_places_tell_offset_and_line():
     power = np.concatenate([one.rx_power_dbm for one in tags])
     level = Regressors.one("level", power + 88, 0.0, SLOPE_SD)
     found = calibrate(anchors, tags, level, height=LEVEL)
-    assert found.stretches.at_rest.all()
+    assert found.segments.is_stationary.all()
     assert found.value("offset")[0] == pytest.approx(0.1, abs=0.06)
     assert found.value("level")[0] == pytest.approx(-0.02, abs=0.006)
     assert len(found.fit.position) == 12
@@ -131,13 +131,13 @@ def test_one_tag_that_pauses_between_positions_rests_at_each():
     carried = Ranges.joined(
         [replace(tag, stamp_ns=tag.stamp_ns + 60 * n * 10**9) for n, tag in enumerate(tags)]
     )
-    assert stretches([carried]).at_rest.tolist() == [True] * len(tags)
+    assert find_segments([carried]).is_stationary.tolist() == [True] * len(tags)
 
 
 @pytest.mark.parametrize("rate_hz", [40.0, 1.0])
 def test_a_drive_is_none_from_place_to_place(rate_hz):
     ranges, _ = drive(seconds=120, rate_hz=rate_hz)
-    assert not stretches([ranges]).at_rest.any()
+    assert not find_segments([ranges]).is_stationary.any()
 
 
 def test_a_localisation_that_jitters_is_smoothed_and_keeps_its_turns():
@@ -157,12 +157,12 @@ def test_a_rest_within_a_drive_is_one_place():
     def path(time_s):
         return circuit(np.minimum(time_s, 20.0) + np.maximum(time_s - 40.0, 0.0))
 
-    ranges, _ = drive(seconds=60, rate_hz=25.0, path=path, model=Model(range_sd=0.02))
-    found = stretches([ranges])
-    assert found.at_rest.tolist() == [False, True, False]
-    resting = found.ranges.stamp_ns[found.of == 1] / 1e9
-    assert resting[0] == pytest.approx(20.0, abs=2.0)
-    assert resting[-1] == pytest.approx(40.0, abs=2.0)
+    ranges, _ = drive(seconds=60, rate_hz=25.0, path=path, model=NoiseModel(range_sd=0.02))
+    found = find_segments([ranges])
+    assert found.is_stationary.tolist() == [False, True, False]
+    stationary = found.ranges.stamp_ns[found.of == 1] / 1e9
+    assert stationary[0] == pytest.approx(20.0, abs=2.0)
+    assert stationary[-1] == pytest.approx(40.0, abs=2.0)
 
 
 def refused(match, anchors, tags, **options):
@@ -185,7 +185,7 @@ def test_a_track_with_two_mirror_images_is_refused():
     # Anchors all but in a plane, the tag half a metre below it: as good half a metre above.
     flat = HALL.position.copy()
     flat[:, 2] = (1.1, 1.9, 1.1, 1.9, 1.5)
-    ranges, _ = drive(HALL.moved(flat, HALL.sd), seconds=40, rate_hz=25.0, model=Model(range_sd=0.3))
+    ranges, _ = drive(HALL.moved(flat, HALL.sd), seconds=40, rate_hz=25.0, model=NoiseModel(range_sd=0.3))
     refused("mirror images", HALL.moved(flat, HALL.sd), [ranges])
 
 
@@ -218,7 +218,9 @@ def test_an_offset_that_slow_errors_can_explain_is_not_subtracted():
     def around(time_s):
         return circuit(time_s) * (2.0, 2.0, 1.0) - (6.0, 4.5, 0.0)
 
-    ranges, _ = drive(near, seconds=90, rate_hz=12.5, offset_m=0.0, path=around, model=Model(range_sd=0.03))
+    ranges, _ = drive(
+        near, seconds=90, rate_hz=12.5, offset_m=0.0, path=around, model=NoiseModel(range_sd=0.03)
+    )
     slow = np.random.default_rng(1).normal(0.0, 0.07, (5, 10))
     late = slow[ranges.anchor, ranges.stamp_ns // 20_000_000_000]
     found = calibrate(near, [replace(ranges, range_m=ranges.range_m + late)], height=LEVEL)
@@ -261,18 +263,18 @@ def test_lag_and_lever_arm_are_found_beside_a_localisation(minute):
     lever = np.array([0.3, -0.25, 0.0])
     late = turning(path, lever, 300_000_000)
     nothing = Regressors.none(len(ranges))
-    found = solve_localised(HALL, [with_own(ranges)], [late], nothing, estimate_lever_arm=True)
+    found = align_poses(HALL, [with_own(ranges)], [late], nothing, estimate_lever_arm=True)
     assert found.time_offset_s == pytest.approx(0.3, abs=0.02)
     assert np.abs(found.lever_arm_m[0] - lever)[:2].max() < 0.05
     assert np.abs(found.offset_m - 0.25 - OWN).max() < 0.08
-    given = solve_localised(HALL, [ranges], [late], nothing, time_offset_s=0.3, lever_arms_m=lever[None])
+    given = align_poses(HALL, [ranges], [late], nothing, time_offset_s=0.3, lever_arms_m=lever[None])
     assert (given.time_offset_s, given.time_offset_sd_s) == (pytest.approx(0.3, abs=1e-6), 0.0)
     with pytest.raises(DatasetError, match="time span of the localisation"):
-        solve_localised(HALL, [ranges], [late.shifted(10**13)], nothing)
+        align_poses(HALL, [ranges], [late.shifted(10**13)], nothing)
     still = PosePath(path.stamp_ns, path.position, np.tile([0.0, 0.0, 0.0, 1.0], (len(path), 1)))
     short, nothing = ranges.take(ranges.stamp_ns < 4 * 10**9), Regressors.none(100)
     with pytest.raises(DatasetError, match="cannot be separated"):
-        solve_localised(HALL, [short], [still], nothing, time_offset_s=0.0, estimate_lever_arm=True)
+        align_poses(HALL, [short], [still], nothing, time_offset_s=0.0, estimate_lever_arm=True)
 
 
 def test_each_tag_has_its_own_lever_arm_and_its_own_body(minute):
@@ -282,7 +284,7 @@ def test_each_tag_has_its_own_lever_arm_and_its_own_body(minute):
     bodies = [turning(path, arms[0]), turning(path, arms[1])]
     tags = [ranges, replace(other, tag_id=8)]
     nothing = Regressors.none(sum(map(len, tags)))
-    found = solve_localised(HALL, tags, bodies, nothing, time_offset_s=0.0, estimate_lever_arm=True)
+    found = align_poses(HALL, tags, bodies, nothing, time_offset_s=0.0, estimate_lever_arm=True)
     assert np.abs(found.lever_arm_m - arms)[:, :2].max() < 0.05
     assert np.abs(found.offset_m - 0.25).max() < 0.08
     truth = np.linalg.norm(path.position - HALL.position[ranges.anchor], axis=1)
@@ -299,7 +301,7 @@ def test_two_standard_deviations_of_lag_and_arm_cover_their_errors():
         time_s = path.stamp_ns[:, None] / 1e9
         drift = np.column_stack([0.04 * np.sin(0.6 * time_s + phase), np.zeros(len(path))])
         pose = turning(replace(path, position=path.position + drift), lever, 300_000_000)
-        found = solve_localised(HALL, [ranges], [pose], Regressors.none(len(ranges)), estimate_lever_arm=True)
+        found = align_poses(HALL, [ranges], [pose], Regressors.none(len(ranges)), estimate_lever_arm=True)
         error += [found.time_offset_s - 0.3, *(found.lever_arm_m[0] - lever)[:2]]
         sd += [found.time_offset_sd_s, *found.lever_arm_sd_m[0, :2]]
     assert (np.abs(error) <= 2.0 * np.array(sd)).mean() >= 0.9
@@ -323,7 +325,7 @@ def test_measured_heights_replace_a_constant_one():
 
 def test_positions_scatter_less_if_anchors_agree(solved):
     def scatter(offset_m):
-        return position_scatter(solved.fit, np.asarray(offset_m)[solved.fit.links.anchor])
+        return position_scatter(solved.fit, np.asarray(offset_m)[solved.fit.observations.anchor])
 
     assert scatter(OWN + 0.25) < 0.6 * scatter(np.full(5, 0.25)) < scatter(0.25 - OWN)
     raw, calibrated = solved.position_scatter_m

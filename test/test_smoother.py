@@ -9,9 +9,9 @@ from scipy.optimize import least_squares
 
 from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
 from uwb_mitigation.positioning.least_squares import LeastSquares
-from uwb_mitigation.positioning.locator import Setting, TagLocator
-from uwb_mitigation.positioning.model import Model
+from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.smoother import Smoother, knots_of, smooth
+from uwb_mitigation.positioning.tag_estimator import EstimatorConfig, TagEstimator
 from uwb_mitigation.positioning.tracks import Track, TruePath, track_errors
 
 
@@ -40,11 +40,11 @@ def test_least_squares_solves_as_a_dense_matrix_does():
 
 def test_the_smoother_agrees_with_nonlinear_least_squares():
     """SciPy with numerical derivatives as an oracle: independent errors, no robust loss, no offsets."""
-    model = Model(long=100.0, short=100.0, white=1.0, offset_sd=1e-6, pair_sd=1e-6)
-    ranges, truth = drive(seconds=4, model=Model(white=1.0), offset_m=0.0)
+    model = NoiseModel(long=100.0, short=100.0, white=1.0, offset_sd=1e-6, pair_sd=1e-6)
+    ranges, truth = drive(seconds=4, model=NoiseModel(white=1.0), offset_m=0.0)
     knots_ns, of = knots_of(ranges.stamp_ns)
     ranges = ranges.take(np.flatnonzero(ranges.stamp_ns == knots_ns[of]))
-    mine = Smoother(Setting(HALL, model), ranges).fit(known_track(truth), 30)
+    mine = Smoother(EstimatorConfig(HALL, model), ranges).fit(known_track(truth), 30)
     knots_ns, of = knots_of(ranges.stamp_ns)
     sd = np.sqrt(model.range_sd**2 + HALL.sd[ranges.anchor] ** 2)
     dt = np.diff(knots_ns)[:, None] / 1e9
@@ -77,11 +77,13 @@ def test_smoothed_tracks_of_many_drives_are_honest_and_better_than_live_ones():
     live, smooth = [], []
     for seed in range(6):
         rng = np.random.default_rng(seed)
-        ranges, truth = drive(seconds=25, seed=seed, offset_m=rng.normal(0, Model().offset_sd))
-        ranges.range_m[:] += rng.normal(0, Model().pair_sd, len(HALL))[ranges.anchor]
-        first = TagLocator(Setting(HALL)).run(ranges)
+        ranges, truth = drive(seconds=25, seed=seed, offset_m=rng.normal(0, NoiseModel().offset_sd))
+        ranges.range_m[:] += rng.normal(0, NoiseModel().pair_sd, len(HALL))[ranges.anchor]
+        first = TagEstimator(EstimatorConfig(HALL)).run(ranges)
         live.append(track_errors(first, truth).rmse)
-        smooth.append(track_errors(Smoother(Setting(HALL, Model()), ranges).fit(first).track, truth))
+        smooth.append(
+            track_errors(Smoother(EstimatorConfig(HALL, NoiseModel()), ranges).fit(first).track, truth)
+        )
     assert np.mean([e.rmse for e in smooth]) < 0.95 * np.mean(live)
     assert 0.5 < np.mean([e.nees_per_dof for e in smooth]) < 1.6
 
@@ -92,9 +94,9 @@ def test_a_track_smoothed_among_obstacles_is_not_worse_than_live(seed: int):
     anchors = AnchorMap([Anchor(i, tuple(p), 0.03) for i, p in enumerate(box.tolist(), 1)])
     ranges, truth = drive(anchors, seconds=40, seed=seed)
     block(ranges, seed)
-    live = TagLocator(Setting(anchors)).run(ranges)
+    live = TagEstimator(EstimatorConfig(anchors)).run(ranges)
     of_live = track_errors(live, truth)
-    errors = track_errors(smooth(Setting(anchors), ranges, live), truth)
+    errors = track_errors(smooth(EstimatorConfig(anchors), ranges, live), truth)
     assert errors.epochs > 380
     assert errors.rmse < 1.1 * of_live.rmse
     assert errors.height_rmse < 1.2 * of_live.height_rmse

@@ -11,8 +11,8 @@ from drives import HALL, NANOSECONDS, circuit, drive
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
 from uwb_mitigation.positioning.geometry import Area, Height
-from uwb_mitigation.positioning.locator import Setting
 from uwb_mitigation.positioning.survey import displacements, survey
+from uwb_mitigation.positioning.tag_estimator import EstimatorConfig
 
 LEVEL = Height(1.0)
 
@@ -27,7 +27,9 @@ def test_anchors_are_found_from_guesses_that_are_off_by_a_metre_and_a_half(minut
     away = np.zeros((5, 3))
     away[:, :2] = rng.normal(0, 1, (5, 2))
     away *= 1.5 / np.linalg.norm(away, axis=1, keepdims=True)
-    found = survey(Setting(HALL.moved(HALL.position + away, HALL.sd), height=LEVEL), minute, off_m=1.5)
+    found = survey(
+        EstimatorConfig(HALL.moved(HALL.position + away, HALL.sd), height=LEVEL), minute, off_m=1.5
+    )
     off = displacements(found.anchors.position, HALL.position)
     assert np.sqrt((off**2).sum(axis=1).mean()) < 0.15
     assert found.swapped == []
@@ -37,21 +39,21 @@ def test_anchors_are_found_from_guesses_that_are_off_by_a_metre_and_a_half(minut
 def test_anchors_that_do_not_explain_the_ranges_say_so(minute):
     nonsense = minute.take(slice(0, 300))
     nonsense = replace(nonsense, range_m=np.random.default_rng(1).permutation(nonsense.range_m))
-    assert not survey(Setting(HALL, height=LEVEL), nonsense).explained
+    assert not survey(EstimatorConfig(HALL, height=LEVEL), nonsense).explained
 
 
 def test_an_anchor_half_a_metre_off_is_named_and_no_other(minute):
     wrong = HALL.position.copy()
     wrong[2] += (0.4, 0.3, 0.0)
-    found = survey(Setting(HALL.moved(wrong, HALL.sd), height=LEVEL), minute)
+    found = survey(EstimatorConfig(HALL.moved(wrong, HALL.sd), height=LEVEL), minute)
     assert (found.misplaced, found.swapped) == ([2], [])
-    assert survey(Setting(HALL, height=LEVEL), minute).misplaced == []
+    assert survey(EstimatorConfig(HALL, height=LEVEL), minute).misplaced == []
 
 
 def test_a_swapped_pair_is_named(minute):
     wrong = HALL.position.copy()
     wrong[[1, 3]] = wrong[[3, 1]]
-    found = survey(Setting(HALL.moved(wrong, HALL.sd), height=LEVEL), minute)
+    found = survey(EstimatorConfig(HALL.moved(wrong, HALL.sd), height=LEVEL), minute)
     assert found.swapped == [(1, 3)]
     assert sorted(found.misplaced) == [1, 3]
 
@@ -63,7 +65,7 @@ def test_the_mirror_image_of_a_square_is_not_a_swapped_pair():
     )
     ranges, _ = drive(square, seconds=40, seed=2)
     guesses = square.position + np.random.default_rng(3).normal(0, (0.4, 0.4, 0), (4, 3))
-    found = survey(Setting(square.moved(guesses, square.sd), height=LEVEL), ranges, off_m=0.4)
+    found = survey(EstimatorConfig(square.moved(guesses, square.sd), height=LEVEL), ranges, off_m=0.4)
     assert found.explained
     assert found.swapped == []
 
@@ -74,7 +76,7 @@ def test_a_mirror_image_that_fits_the_guesses_as_well_is_reported(guess_sd_m: fl
     ranges, _ = drive(narrow, seconds=20, seed=2)
     wrong = narrow.position + np.random.default_rng(4).normal(0, (guess_sd_m, guess_sd_m, 0), (4, 3))
     area = Area((-5, 1, 0), (20, 20, 3))
-    found = survey(Setting(narrow.moved(wrong, narrow.sd), height=LEVEL, area=area), ranges)
+    found = survey(EstimatorConfig(narrow.moved(wrong, narrow.sd), height=LEVEL, area=area), ranges)
     assert found.explained
     assert found.mirrored is mirrored
 
@@ -82,10 +84,10 @@ def test_a_mirror_image_that_fits_the_guesses_as_well_is_reported(guess_sd_m: fl
 def test_what_ranges_do_not_determine_is_reported(minute):
     guesses = HALL.moved(HALL.position, np.full(5, 0.5))
     level_drive = minute.take(minute.stamp_ns < 30 * NANOSECONDS)
-    found = survey(Setting(guesses), level_drive, off_m=0.5)
+    found = survey(EstimatorConfig(guesses), level_drive, off_m=0.5)
     assert found.undetermined == [0, 1, 2, 3, 4]
     assert {0, 2} <= set(found.alternatives)
-    assert not survey(Setting(HALL), level_drive, off_m=0.05).undetermined
+    assert not survey(EstimatorConfig(HALL), level_drive, off_m=0.05).undetermined
 
 
 def test_what_cannot_be_surveyed_is_refused(minute):
@@ -97,4 +99,4 @@ def test_what_cannot_be_surveyed_is_refused(minute):
         (HALL, still, "the tag moves by"),
     ):
         with pytest.raises(DatasetError, match=message):
-            survey(Setting(anchors, height=LEVEL), ranges)
+            survey(EstimatorConfig(anchors, height=LEVEL), ranges)

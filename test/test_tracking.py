@@ -22,8 +22,8 @@ from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.measurement import Cir, CorrectedRange, Origin, RangeMeasurement, Record, Status
 from uwb_mitigation.positioning.anchors import dump_anchors, parse_anchors
 from uwb_mitigation.positioning.geometry import Area, Height
-from uwb_mitigation.positioning.locator import Setting, TagLocator
-from uwb_mitigation.positioning.model import Model
+from uwb_mitigation.positioning.noise_model import NoiseModel
+from uwb_mitigation.positioning.tag_estimator import EstimatorConfig, TagEstimator
 from uwb_mitigation.positioning.tracks import Estimate, Ranges, TruePath
 from uwb_mitigation.processing import tracking
 from uwb_mitigation.processing.tracking import held_out, track_tag
@@ -94,16 +94,18 @@ def test_a_track_is_written_judged_and_read_by_evo(hall: Path, tmp_path: Path):
 
 def test_held_out_residuals_show_the_offset_of_one_anchor():
     ranges, truth = drive(seconds=40, offset_m=0.0)
-    one = track_tag(TagRecording(7, ranges, ranges, False, truth), Setting(HALL, height=Height(1.0, 0.1)))
+    one = track_tag(
+        TagRecording(7, ranges, ranges, False, truth), EstimatorConfig(HALL, height=Height(1.0, 0.1))
+    )
     wrong, worse = (replace(ranges, range_m=ranges.range_m + m * (ranges.anchor == 2)) for m in (1.0, 1.5))
     one = replace(one, recording=TagRecording(7, wrong, worse, True, truth))
-    found = held_out([one], Setting(HALL, height=Height(1.0, 0.1)))
+    found = held_out([one], EstimatorConfig(HALL, height=Height(1.0, 0.1)))
     assert found[2].raw_m == pytest.approx(1.0, abs=0.1)
     assert found[2].corrected_m - found[2].raw_m == pytest.approx(0.5, abs=1e-6), (
         "its ranges do not move the track"
     )
     few = replace(one, recording=replace(one.recording, raw=wrong.take(wrong.anchor < 3), corrected=False))
-    assert [(other.ranges, math.isnan(other.raw_m)) for other in held_out([few], Setting(HALL))] == [
+    assert [(other.ranges, math.isnan(other.raw_m)) for other in held_out([few], EstimatorConfig(HALL))] == [
         (0, True)
     ] * 6
 
@@ -164,13 +166,13 @@ def test_only_anchors_that_contradict_the_others_are_accused():
     blocked, truth = drive(seconds=60, seed=1)
     late = (blocked.anchor == 2) & (blocked.stamp_ns > 30 * NANOSECONDS)
     blocked.range_m[late] += np.random.default_rng(1).exponential(1.5, int(late.sum()))
-    locator = TagLocator(Setting(HALL, height=height))
+    locator = TagEstimator(EstimatorConfig(HALL, height=height))
     locator.run(blocked)
     assert locator.disagreeing() == [2]  # by its last ranges alone
-    assert track_tag(recording_of(blocked, truth), Setting(HALL, height=height)).disagreeing == []
+    assert track_tag(recording_of(blocked, truth), EstimatorConfig(HALL, height=height)).disagreeing == []
     wrong, truth = drive(seconds=60, seed=1)
     wrong.range_m[wrong.anchor == 2] += 1.5
-    assert track_tag(recording_of(wrong, truth), Setting(HALL, height=height)).disagreeing == [2]
+    assert track_tag(recording_of(wrong, truth), EstimatorConfig(HALL, height=height)).disagreeing == [2]
 
 
 @pytest.mark.parametrize("shift", [(1.0, 0.0, 0.0), (0.0, 0.0, 1.5)])
@@ -179,7 +181,7 @@ def test_failed_smoothing_is_reported(monkeypatch: pytest.MonkeyPatch, shift: tu
         tracking, "smooth", lambda *given: replace(given[2], position=given[2].position + shift)
     )
     ranges, truth = drive(seconds=10)
-    (warning,) = track_tag(recording_of(ranges, truth), Setting(HALL)).warnings
+    (warning,) = track_tag(recording_of(ranges, truth), EstimatorConfig(HALL)).warnings
     assert "smoothing failed" in warning
 
 
@@ -188,13 +190,13 @@ def test_a_bad_geometry_is_reported():
     ranges, truth = drive(near_line, seconds=10)
     area = Area((-50, 0, 0), (50, 50, 3))
     found = track_tag(
-        recording_of(ranges, truth), Setting(near_line, Model(range_sd=0.02), Height(1.0), area)
+        recording_of(ranges, truth), EstimatorConfig(near_line, NoiseModel(range_sd=0.02), Height(1.0), area)
     )
     assert not found.warnings
     ranges, far = drive(near_line, seconds=10, path=lambda t: np.add(circuit(t), (80, 0, 0)))
     found = track_tag(
         recording_of(ranges, far),
-        Setting(near_line, Model(range_sd=0.02), Height(1.0), Area((0, -5, 0), (200, 50, 3))),
+        EstimatorConfig(near_line, NoiseModel(range_sd=0.02), Height(1.0), Area((0, -5, 0), (200, 50, 3))),
     )
     assert "poor geometry" in found.warnings[0]
 

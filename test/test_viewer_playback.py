@@ -21,7 +21,7 @@ from command_line import run
 from drives import HALL, drive
 
 from uwb_mitigation.bag.codec import encode_range
-from uwb_mitigation.bag.poses import encode_place, encode_pose, tag_topic
+from uwb_mitigation.bag.poses import encode_pose, encode_true_position, tag_topic
 from uwb_mitigation.bag.topics import ODOMETRY_TRUTH, ODOMETRY_TYPE, POSE, POSE_TYPE, RANGE_CIR_TYPE
 from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.errors import RecordingError, UwbMitigationError
@@ -56,7 +56,7 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 place = Estimate(stamp_ns, np.array([number / 100, 1.0, 0.0]), np.zeros(3), np.eye(6) * 0.01)
                 out.write_message(POSE, POSE_TYPE, encode_pose(place), stamp_ns)
                 out.write_message(tag_topic(POSE, 9), POSE_TYPE, encode_pose(place), stamp_ns)
-                true = encode_place((number / 100, 1.5, 0.0), 7, stamp_ns)
+                true = encode_true_position((number / 100, 1.5, 0.0), 7, stamp_ns)
                 out.write_message(ODOMETRY_TRUTH, ODOMETRY_TYPE, true, stamp_ns)
     anchors = "anchors:\n  - {id: 1, x: 0, y: 0, z: 2}\n  - {id: 2, x: 5, y: 0, z: 2}\n"
     path.with_name("site.anchors.yaml").write_text(anchors)
@@ -210,7 +210,9 @@ def test_anchor_id_above_64_bits_is_ignored() -> None:
 def test_bag_without_ranges_and_tracks_is_refused(tmp_path: Path):
     path = tmp_path / "one.mcap"
     with BagWriter(path, {}) as out:
-        out.write_message(ODOMETRY_TRUTH, ODOMETRY_TYPE, encode_place((0.0, 0.0, 0.0), 1, START_NS), START_NS)
+        out.write_message(
+            ODOMETRY_TRUTH, ODOMETRY_TYPE, encode_true_position((0.0, 0.0, 0.0), 1, START_NS), START_NS
+        )
     with pytest.raises(RecordingError, match="no ranges and no tracks"):
         open_bag(path)
 

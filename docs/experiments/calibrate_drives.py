@@ -38,9 +38,9 @@ from uwb_mitigation.model.shipped import default_model_path
 from uwb_mitigation.offsets import NO_OFFSETS, Offsets
 from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.geometry import Height
-from uwb_mitigation.positioning.localised import PosePath
-from uwb_mitigation.positioning.locator import Setting, TagLocator
-from uwb_mitigation.positioning.model import Model
+from uwb_mitigation.positioning.noise_model import NoiseModel
+from uwb_mitigation.positioning.pose_alignment import PosePath
+from uwb_mitigation.positioning.tag_estimator import EstimatorConfig, TagEstimator
 from uwb_mitigation.positioning.tracks import Ranges, TruePath, track_errors
 from uwb_mitigation.sources.simulated import SimulatedSource
 from uwb_mitigation.sources.simulation.buildings import RADIO
@@ -111,7 +111,7 @@ def position_rmse(
         value = np.array([one.range_m for one in corrected])
         variance = np.array([one.variance_m2 for one in corrected])
     ranges = Ranges(stamps, row, np.maximum(value, 0.0), variance, np.full(len(value), np.nan), 101)
-    track = TagLocator(Setting(anchors, Model(), height=Height(0.0, 0.05))).run(ranges)
+    track = TagEstimator(EstimatorConfig(anchors, NoiseModel(), height=Height(0.0, 0.05))).run(ranges)
     return track_errors(track, truth).rmse
 
 
@@ -184,11 +184,11 @@ def one(seed: int, seconds: float, truth_topic: bool, with_train: bool, flat: bo
             "in_two_sd": float((np.abs(off - true) <= 2.0 * sd).mean()),
             "sd": float(sd.mean()),
         }
-        if found.solution.localised is not None:
-            row["time_offset_error"] = found.solution.localised.time_offset_s - LAG_S
-            row["lever_error"] = (found.solution.localised.lever_arm_m[0] - LEVER_M).tolist()
-            row["time_offset_sd"] = found.solution.localised.time_offset_sd_s
-            row["lever_sd"] = found.solution.localised.lever_arm_sd_m[0].tolist()
+        if found.solution.alignment is not None:
+            row["time_offset_error"] = found.solution.alignment.time_offset_s - LAG_S
+            row["lever_error"] = (found.solution.alignment.lever_arm_m[0] - LEVER_M).tolist()
+            row["time_offset_sd"] = found.solution.alignment.time_offset_sd_s
+            row["lever_sd"] = found.solution.alignment.lever_arm_sd_m[0].tolist()
         if with_train:
             bundle = trained(records, universal, Path(folder))
             row["trained_mae"] = error_of(test, bundle, NO_OFFSETS)

@@ -28,9 +28,9 @@ from uwb_mitigation.model.bundle import Bundle, load_bundle
 from uwb_mitigation.model.shipped import default_model_path
 from uwb_mitigation.offsets import NO_OFFSETS, Offsets
 from uwb_mitigation.positioning.geometry import Height
-from uwb_mitigation.positioning.locator import Setting, TagLocator
-from uwb_mitigation.positioning.model import Model
+from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.smoother import Smoother
+from uwb_mitigation.positioning.tag_estimator import EstimatorConfig, TagEstimator
 from uwb_mitigation.positioning.tracks import Ranges, track_errors
 from uwb_mitigation.sources.decaranging import DecaRangingFolder
 from uwb_mitigation.sources.hanyang import ANTENNA_M, HanyangRun
@@ -64,8 +64,10 @@ def hanyang(folder: Path, name: str) -> None:
         less = off + np.where(np.isfinite(line), line, 0.0)
         for kind, value in (("raw", ranges.range_m), ("calibrated", np.maximum(ranges.range_m - less, 0.0))):
             shifted = Ranges(ranges.stamp_ns, ranges.anchor, value, ranges.variance_m2, ranges.rx_power_dbm)
-            live = TagLocator(Setting(anchors, Model(), height=HEIGHT)).run(shifted)
-            smoothed = Smoother(Setting(anchors, Model(), height=HEIGHT), shifted).fit(live).track
+            live = TagEstimator(EstimatorConfig(anchors, NoiseModel(), height=HEIGHT)).run(shifted)
+            smoothed = (
+                Smoother(EstimatorConfig(anchors, NoiseModel(), height=HEIGHT), shifted).fit(live).track
+            )
             one, two = (at_truths(track, truth) for track in (live, smoothed))
             print(
                 f"{other.name} {kind}: live {one.rmse:.3f} m, in ellipse {one.coverage95:.1%}; "
@@ -126,7 +128,7 @@ def _against_truth(
         variance = np.array([one.variance_m2 for one in corrected])
     unknown = np.full(len(value), np.nan)
     ranges = Ranges(stamp, row, np.maximum(value, 0.0), variance, unknown, measured[0].tag_id)
-    track = TagLocator(Setting(run.anchors, Model(), height=height)).run(ranges)
+    track = TagEstimator(EstimatorConfig(run.anchors, NoiseModel(), height=height)).run(ranges)
     distance = np.linalg.norm(run.truth.at(stamp) - run.anchors.position[row], axis=1)
     error = value - distance
     true = np.array([np.nanmedian(error[row == one]) for one in range(len(run.anchors))])

@@ -14,14 +14,14 @@ import numpy as np
 
 from benchmarks.positions import HEIGHT, at_truths, hanyang_run
 from uwb_mitigation.positioning.anchors import AnchorMap
-from uwb_mitigation.positioning.locator import Setting, TagLocator
-from uwb_mitigation.positioning.model import Model
+from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.smoother import Smoother
+from uwb_mitigation.positioning.tag_estimator import EstimatorConfig, TagEstimator
 from uwb_mitigation.positioning.tracks import Ranges, TruePath
 
 
 def erring(
-    ranges: Ranges, path: TruePath, anchors: AnchorMap, model: Model, rng: np.random.Generator
+    ranges: Ranges, path: TruePath, anchors: AnchorMap, model: NoiseModel, rng: np.random.Generator
 ) -> Ranges:
     """Replace errors by those of the model: white, persistent, per-pair, common, and from anchor positions."""
     true = path.at(ranges.stamp_ns)
@@ -51,14 +51,14 @@ def erring(
 
 
 again = int(sys.argv[2]) if len(sys.argv) > 2 else 20
-model = Model()
+model = NoiseModel()
 for folder in sorted(Path(sys.argv[1]).glob("*_*")):
     anchors, ranges, path, window = hanyang_run(folder)
     found = []
     for seed in range(again):
         drawn = erring(ranges, path, anchors, model, np.random.default_rng(seed))
-        live = TagLocator(Setting(anchors, model, height=HEIGHT)).run(drawn)
-        smoothed = Smoother(Setting(anchors, model, height=HEIGHT), drawn).fit(live).track
+        live = TagEstimator(EstimatorConfig(anchors, model, height=HEIGHT)).run(drawn)
+        smoothed = Smoother(EstimatorConfig(anchors, model, height=HEIGHT), drawn).fit(live).track
         found.append([at_truths(track, window).nees_per_dof for track in (live, smoothed)])
     low, middle, high = np.percentile(found, (5, 50, 95), axis=0)
     print(

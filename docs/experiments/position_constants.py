@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.positions import HEIGHT, at_truths, hanyang_run
-from uwb_mitigation.positioning.locator import Setting, TagLocator
-from uwb_mitigation.positioning.model import Model
+from uwb_mitigation.positioning.noise_model import NoiseModel
+from uwb_mitigation.positioning.tag_estimator import EstimatorConfig, TagEstimator
 from uwb_mitigation.positioning.tracks import TrackErrors
 
 LEAST_COVERAGE = 0.85
@@ -32,12 +32,12 @@ folders = sorted(Path(sys.argv[1]).glob("*_*"))
 runs = [hanyang_run(folder) for folder in folders]
 
 
-def live(run: int, model: Model) -> TrackErrors:
+def live(run: int, model: NoiseModel) -> TrackErrors:
     anchors, ranges, _, truth = runs[run]
-    return at_truths(TagLocator(Setting(anchors, model, height=HEIGHT)).run(ranges), truth)
+    return at_truths(TagEstimator(EstimatorConfig(anchors, model, height=HEIGHT)).run(ranges), truth)
 
 
-found = [[live(run, Model(**change)) for run in range(len(folders))] for change in CHANGES]
+found = [[live(run, NoiseModel(**change)) for run in range(len(folders))] for change in CHANGES]
 rmse = np.array([[errors.rmse for errors in row] for row in found])
 coverage = np.array([[errors.coverage95 for errors in row] for row in found])
 for change, errors, covered in zip(CHANGES, rmse, coverage, strict=True):

@@ -11,8 +11,8 @@ import numpy as np
 
 from benchmarks.positions import HEIGHT, hanyang_run
 from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.positioning.locator import Setting
 from uwb_mitigation.positioning.survey import displacements, survey
+from uwb_mitigation.positioning.tag_estimator import EstimatorConfig
 
 OFF_M = 1.5
 
@@ -26,7 +26,7 @@ for folder in sorted(Path(sys.argv[1]).glob("*_*")):
         guesses = anchors.moved(anchors.position + away, anchors.sd)
         before = np.sqrt((displacements(guesses.position, anchors.position)[:, :2] ** 2).sum(axis=1).mean())
         try:
-            found = survey(Setting(guesses, height=HEIGHT), ranges, off_m=OFF_M)
+            found = survey(EstimatorConfig(guesses, height=HEIGHT), ranges, off_m=OFF_M)
         except DatasetError as error:
             print(f"{folder.name:8} guess {seed}: {error}", flush=True)
             continue

@@ -25,7 +25,7 @@ from uwb_mitigation.bag.topics import (
     TF_TYPE,
 )
 from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.positioning.localised import PosePath
+from uwb_mitigation.positioning.pose_alignment import PosePath
 from uwb_mitigation.positioning.tracks import Heights, TruePath
 
 if TYPE_CHECKING:

@@ -82,14 +82,14 @@ def encode_odometry(estimate: Estimate, frame_id: str = MAP, child_frame_id: str
     return data + _pose(estimate) + twist
 
 
-def encode_place(position: tuple[float, float, float], tag_id: int, stamp_ns: int) -> bytes:
+def encode_true_position(position: tuple[float, float, float], tag_id: int, stamp_ns: int) -> bytes:
     """Return `nav_msgs/Odometry` in CDR with the true position of a tag: no velocity, zero variance."""
     place = Estimate(stamp_ns, np.array(position), np.zeros(3), np.zeros((6, 6)))
     return encode_odometry(place, child_frame_id=tag_frame(tag_id))
 
 
-def decode_place(data: bytes) -> tuple[int, int, tuple[float, float, float]] | None:
-    """Decode stamp, tag and position from the CDR of an Odometry of `encode_place`; None = another frame.
+def decode_true_position(data: bytes) -> tuple[int, int, tuple[float, float, float]] | None:
+    """Decode stamp, tag and position from the CDR of an Odometry of `encode_true_position`; None = another frame.
 
     Raises:
         RecordingError: the bytes are not an Odometry.

@@ -21,7 +21,7 @@ from mcap.writer import Writer
 import uwb_mitigation
 from uwb_mitigation.bag import schemas
 from uwb_mitigation.bag.codec import encode_range, encode_truth
-from uwb_mitigation.bag.poses import encode_place
+from uwb_mitigation.bag.poses import encode_true_position
 from uwb_mitigation.bag.reader import Channel, Schema
 from uwb_mitigation.bag.rosbag2 import (
     METADATA_NAME,
@@ -126,7 +126,7 @@ class BagWriter:
             truth = encode_truth(measurement, record.truth)
             self._write_ours(RANGE_TRUTH, RANGE_TRUTH_TYPE, measurement, truth)
         if record.tag_position is not None:
-            odometry = encode_place(record.tag_position, measurement.tag_id, measurement.stamp_ns)
+            odometry = encode_true_position(record.tag_position, measurement.tag_id, measurement.stamp_ns)
             self.write_message(ODOMETRY_TRUTH, ODOMETRY_TYPE, odometry, measurement.stamp_ns)
 
     def write_message(self, topic: str, type_name: str, data: bytes, stamp_ns: int) -> None:

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from uwb_mitigation.evaluation.site_data import SiteData
     from uwb_mitigation.model.bundle import Bundle
     from uwb_mitigation.positioning.anchors import AnchorMap
-    from uwb_mitigation.positioning.localised import PosePath
+    from uwb_mitigation.positioning.pose_alignment import PosePath
     from uwb_mitigation.training.site_calibration import SiteCalibration
 
 SAME_ARM_M = 0.01
@@ -307,8 +307,8 @@ def _lever_arm(text: str | None) -> tuple[float, float, float] | None:
 
 def _show(found: SiteCalibration) -> None:
     solution = found.solution
-    if solution.localised is not None:
-        one = solution.localised
+    if solution.alignment is not None:
+        one = solution.alignment
         say(f"time offset {one.time_offset_s:.3f} +- {one.time_offset_sd_s:.3f} s")
         for ranges, arm, arm_sd in zip(found.site.tags, one.lever_arm_m, one.lever_arm_sd_m, strict=True):
             known = ", ".join(

@@ -110,17 +110,17 @@ def track(
     """
     from uwb_mitigation.bag.writer import BagWriter
     from uwb_mitigation.files import write_whole
-    from uwb_mitigation.positioning.locator import Setting
-    from uwb_mitigation.positioning.model import Model
+    from uwb_mitigation.positioning.noise_model import NoiseModel
+    from uwb_mitigation.positioning.tag_estimator import EstimatorConfig
     from uwb_mitigation.processing.tracking import held_out, track_tag, tum_file, write_tracks
     from uwb_mitigation.processing.tracking import tum as tum_text
     from uwb_mitigation.sources.site import anchors_file, save_anchors
 
-    model = Model(acceleration=acceleration)
+    model = NoiseModel(acceleration=acceleration)
     place, box = height_of(height, height_sd), area_of(area)
     known, recorded = _read(bag, anchors, stamp_offset)
     measured = heights_of(bag, height_topic, height_sd, height, recorded)
-    setting = Setting(known, model, place, box, measured)
+    config = EstimatorConfig(known, model, place, box, measured)
     if tum is not None and tum.exists() and not force:
         raise ParameterError("exists already", where=str(tum), valid="--force replaces it")
     tracks = []
@@ -129,13 +129,13 @@ def track(
         task = bar.add_task("tracking", total=len(recorded.tags))
         for tag in recorded.tags:
             bar.update(task, description=f"tracking tag {format_id(tag.tag_id)}: {len(tag.ranges)} ranges")
-            tracks.append(track_tag(tag, setting))
+            tracks.append(track_tag(tag, config))
             bar.advance(task)
         write_tracks(out, tracks)
     if force or not anchors_file(output).exists():
         save_anchors(anchors_file(output), known, f"anchors of the track of {bag.name}", force=True)
     _show_tracks(tracks, known)
-    residuals = held_out(tracks, setting)
+    residuals = held_out(tracks, config)
     _show_residuals(residuals, known)
     say(f"Wrote {out.counts.total()} messages to {out.file}.")
     if tum is not None:
@@ -174,9 +174,9 @@ def survey(
     not at the position in the file, and swapped pairs. Translation and rotation of all anchors are unobservable from
     ranges: they come from the guesses, or from anchors that are `--fixed`.
     """
-    from uwb_mitigation.positioning.locator import Setting
-    from uwb_mitigation.positioning.model import Model
+    from uwb_mitigation.positioning.noise_model import NoiseModel
     from uwb_mitigation.positioning.survey import survey as find
+    from uwb_mitigation.positioning.tag_estimator import EstimatorConfig
     from uwb_mitigation.sources.site import save_anchors
 
     if not 0.0 < off <= 100.0:
@@ -197,8 +197,8 @@ def survey(
     tag = max(recorded.tags, key=lambda one: len(one.ranges))
     with console.progress() as bar:
         bar.add_task(f"surveying from {len(tag.ranges)} ranges of tag {format_id(tag.tag_id)}", total=None)
-        setting = Setting(known, Model(acceleration=acceleration), place, box, measured)
-        result = find(setting, tag.ranges, off_m=off, fixed=frozenset(rows))
+        config = EstimatorConfig(known, NoiseModel(acceleration=acceleration), place, box, measured)
+        result = find(config, tag.ranges, off_m=off, fixed=frozenset(rows))
     save_anchors(
         output, result.anchors, f"surveyed from {bag.name}, tag {format_id(tag.tag_id)}", force=force
     )

@@ -24,7 +24,7 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
 
 from uwb_mitigation.bag.codec import encode_corrected, encode_range, encode_truth
-from uwb_mitigation.bag.poses import encode_place
+from uwb_mitigation.bag.poses import encode_true_position
 from uwb_mitigation.errors import ParameterError, UwbMitigationError
 from uwb_mitigation.link.connection import PortAddress
 from uwb_mitigation.link.layout import Mode
@@ -232,7 +232,7 @@ class Driver(ManagedNode):
             if record.truth is not None:
                 self._truths.publish(encode_truth(measurement, record.truth))
             if record.tag_position is not None:
-                self._places.publish(encode_place(record.tag_position, measurement.tag_id, stamp_ns))
+                self._places.publish(encode_true_position(record.tag_position, measurement.tag_id, stamp_ns))
         self._publish_measurements(measurements)
 
     def _publish_clock(self, recorded_ns: int) -> None:

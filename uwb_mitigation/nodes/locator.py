@@ -29,10 +29,10 @@ from uwb_mitigation.errors import MissingDependencyError, ParameterError, Record
 from uwb_mitigation.nodes import diagnostics, markers, topics
 from uwb_mitigation.nodes.lifecycle import ManagedNode
 from uwb_mitigation.nodes.parameter_tables import LOCATOR
-from uwb_mitigation.positioning.fleet import Fleet, Tag
 from uwb_mitigation.positioning.geometry import Area, Height
-from uwb_mitigation.positioning.locator import Setting
-from uwb_mitigation.positioning.model import Model
+from uwb_mitigation.positioning.multi_tag import MultiTagEstimator, Tag
+from uwb_mitigation.positioning.noise_model import NoiseModel
+from uwb_mitigation.positioning.tag_estimator import EstimatorConfig
 from uwb_mitigation.positioning.tracks import Estimate
 from uwb_mitigation.sources.site import load_anchors
 
@@ -79,7 +79,7 @@ class Locator(ManagedNode):
 
     def __init__(self, *, foreign: Collection[str] = ()) -> None:
         super().__init__("locator", LOCATOR, foreign)
-        self._fleet: Fleet | None = None
+        self._estimator: MultiTagEstimator | None = None
         self._ranges: Subscription | None = None
         self._anchors_out: Publisher | None = None
         self._tf: Publisher | None = None
@@ -101,9 +101,11 @@ class Locator(ManagedNode):
                 "parameter anchors is empty", valid="anchors:=FILE, as docs/background/positioning.md shows"
             )
         anchors = load_anchors(Path(path).expanduser())
-        model = Model(acceleration=self.value("acceleration"), range_sd=self.value("range_sd"))
+        model = NoiseModel(acceleration=self.value("acceleration"), range_sd=self.value("range_sd"))
         height = Height(self.value("height"), self.value("height_sd")) if self.value("level") else None
-        self._fleet = Fleet(Setting(anchors, model, height, Area.parse(self.value("area"))))
+        self._estimator = MultiTagEstimator(
+            EstimatorConfig(anchors, model, height, Area.parse(self.value("area")))
+        )
         self._period_ns = round(_NANOSECONDS / self.value("rate")) if self.value("rate") > 0 else 0
         self._offset_ns = round(self.value("stamp_offset") * _NANOSECONDS)
         self._map, self._plain_frame = self.value("map_frame"), self.value("tag_frame")
@@ -141,17 +143,17 @@ class Locator(ManagedNode):
 
     def close(self) -> None:
         super().close()
-        self._outputs, self._anchors_out, self._tf, self._fleet, self._ranges = {}, None, None, None, None
+        self._outputs, self._anchors_out, self._tf, self._estimator, self._ranges = {}, None, None, None, None
 
     def describe(self) -> diagnostics.Description:
-        fleet = self._fleet
-        if fleet is None:
+        estimator = self._estimator
+        if estimator is None:
             return "host", diagnostics.WARN, "no anchors", {}
-        warnings = fleet.warnings()
-        level, text = diagnostics.OK, "locating" if fleet.tags else "no ranges yet"
+        warnings = estimator.warnings()
+        level, text = diagnostics.OK, "locating" if estimator.tags else "no ranges yet"
         if warnings:
             level, text = diagnostics.WARN, "; ".join(warnings[:5])
-        facts = fleet.facts() | {"dropped by a queue": self._lost, "malformed": self._malformed}
+        facts = estimator.diagnostics() | {"dropped by a queue": self._lost, "malformed": self._malformed}
         facts |= self._meter.facts()
         taken, self._processing_ns = self._processing_ns, []
         facts |= diagnostics.percentiles("processing", taken)
@@ -173,12 +175,12 @@ class Locator(ManagedNode):
 
     def _on_range(self, data: bytes, number: int) -> None:
         # Subscriptions stay active while a lifecycle node is inactive.
-        if self._fleet is not None and self._ranges is not None and self.is_active:
+        if self._estimator is not None and self._ranges is not None and self.is_active:
             # Also process the queued messages; the executor then finds the queue empty.
             for each, _ in chain([(data, number)], topics.queued(self._ranges, BATCH)):
-                self._take(self._fleet, each)
+                self._take(self._estimator, each)
 
-    def _take(self, fleet: Fleet, data: bytes) -> None:
+    def _take(self, estimator: MultiTagEstimator, data: bytes) -> None:
         began_ns = time.perf_counter_ns()
         try:
             key, corrected = decode_corrected(data)
@@ -187,9 +189,9 @@ class Locator(ManagedNode):
             self.get_logger().warning(f"a message cannot be read: {error}", throttle_duration_sec=10.0)
             return
         stamp_ns = key.stamp_ns + self._offset_ns
-        found = fleet.add(key.tag_id, key.anchor_id, stamp_ns, corrected.range_m, corrected.variance_m2)
+        found = estimator.add(key.tag_id, key.anchor_id, stamp_ns, corrected.range_m, corrected.variance_m2)
         if found is None:
-            if key.anchor_id in fleet.strangers and key.anchor_id not in self._unknown_anchors:
+            if key.anchor_id in estimator.unknown_anchors and key.anchor_id not in self._unknown_anchors:
                 self._unknown_anchors.add(key.anchor_id)
                 self.get_logger().warning(
                     f"ranges of anchor {format_id(key.anchor_id)} are left out: it is not in the anchors file"
@@ -197,7 +199,7 @@ class Locator(ManagedNode):
             return
         tag, estimate = found
         outputs = self._outputs_of(tag)
-        outputs.picture.statuses[fleet.anchors.index[key.anchor_id]] = corrected.status
+        outputs.picture.statuses[estimator.anchors.index[key.anchor_id]] = corrected.status
         if estimate is not None and not 0 <= stamp_ns - outputs.published_ns < self._period_ns:
             outputs.published_ns = stamp_ns
             self._publish_estimate(outputs, estimate)
@@ -246,14 +248,14 @@ class Locator(ManagedNode):
         return replace(estimate, position=estimate.position - (0.0, 0.0, z), covariance=covariance)
 
     def _on_timer(self) -> None:
-        fleet, now_ns = self._fleet, self.now_ns()
-        if fleet is None or not self.is_active:
+        estimator, now_ns = self._estimator, self.now_ns()
+        if estimator is None or not self.is_active:
             return
-        for tag in list(fleet.tags.values()):
+        for tag in list(estimator.tags.values()):
             outputs = self._outputs_of(tag)
             age_s = (now_ns + self._offset_ns - tag.latest_ns) / _NANOSECONDS
             if PREDICT_AFTER_S < age_s < PREDICT_UNTIL_S:
-                ahead = tag.locator.at(now_ns + self._offset_ns)
+                ahead = tag.estimator.at(now_ns + self._offset_ns)
                 if ahead is not None:
                     self._publish_estimate(outputs, ahead)
             elif outputs.smoothed_ns != tag.latest_ns and outputs.smoothed.get_subscription_count():
@@ -261,25 +263,25 @@ class Locator(ManagedNode):
                 smoothed = tag.smoother.estimate()
                 if smoothed is not None:
                     outputs.smoothed.publish(encode_pose(self._at_base(smoothed), self._map))
-        if self._anchors_out is not None and fleet.tags and self._anchors_out.get_subscription_count():
+        if self._anchors_out is not None and estimator.tags and self._anchors_out.get_subscription_count():
             self._show_anchors()
 
     def _show_anchors(self) -> None:
-        fleet, publisher = self._fleet, self._anchors_out
-        if fleet is None or publisher is None:
+        estimator, publisher = self._estimator, self._anchors_out
+        if estimator is None or publisher is None:
             return
         now_ns = self.now_ns()
-        shown = markers.anchor_markers(fleet.anchors, self._map, now_ns)
-        for number, tag in enumerate(fleet.tags.values()):
+        shown = markers.anchor_markers(estimator.anchors, self._map, now_ns)
+        for number, tag in enumerate(estimator.tags.values()):
             picture = self._outputs_of(tag).picture
-            heard = tag.locator.heard()
-            shown += markers.tag_markers(picture, heard, fleet.anchors, self._map, number, now_ns)
+            received = tag.estimator.received_anchors()
+            shown += markers.tag_markers(picture, received, estimator.anchors, self._map, number, now_ns)
         publisher.publish(MarkerArray(markers=shown))
 
     def _on_height(self, message: PoseWithCovarianceStamped) -> None:
         # With several tags, it is unknown to which tag this height belongs.
-        if self._fleet is not None and len(self._fleet.tags) == 1:
-            (tag,) = self._fleet.tags.values()
+        if self._estimator is not None and len(self._estimator.tags) == 1:
+            (tag,) = self._estimator.tags.values()
             tag.add_height(float(message.pose.pose.position.z), float(message.pose.covariance[14]))
 
 

@@ -63,7 +63,7 @@ def anchor_markers(anchors: AnchorMap, frame: str, stamp_ns: int) -> list[Any]:
 
 
 def tag_markers(
-    picture: TagPicture, heard: list[int], anchors: AnchorMap, frame: str, number: int, stamp_ns: int
+    picture: TagPicture, received: list[int], anchors: AnchorMap, frame: str, number: int, stamp_ns: int
 ) -> list[Any]:
     """Return rays to the ranged anchors (blue: corrected range), the 95 % ellipse and the trail."""
     estimate = picture.estimate
@@ -72,7 +72,7 @@ def tag_markers(
     rays = _marker("rays", number, Marker.LINE_LIST, frame, stamp_ns, _GREY)
     rays.scale.x = 0.02
     here = _point(estimate.position.tolist())
-    for row in heard:
+    for row in received:
         colour = _BLUE if picture.statuses.get(row) is Status.OK else _ORANGE
         rays.points += [_point(anchors.anchors[row].position), here]
         rays.colors += [colour, colour]

@@ -17,21 +17,21 @@ from numpy.typing import NDArray
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.geometry import Area, Height, Shape, directions, shape
-from uwb_mitigation.positioning.joint import (
+from uwb_mitigation.positioning.joint_fit import (
     FAR_S,
     JointFit,
-    Links,
-    Stretches,
+    Observations,
     fit_joint,
-    links_of,
+    observations_of,
 )
-from uwb_mitigation.positioning.locator import Setting
-from uwb_mitigation.positioning.model import Regressors
+from uwb_mitigation.positioning.motion_segments import Segments
+from uwb_mitigation.positioning.noise_model import Regressors
+from uwb_mitigation.positioning.tag_estimator import EstimatorConfig
 
 MISPLACED_M = 0.4
 """A smaller displacement looks like reflections."""
 
-LIKELIER = 12.0
+MIN_LOSS_GAIN = 12.0
 """The log likelihood by which another position must explain the ranges better than an offset."""
 
 LARGER = 0.35
@@ -59,7 +59,7 @@ _STEPS = 6
 _MAX_RANGES = 1000
 
 FirstPositions = Callable[
-    [Setting, Stretches, NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.bool_]]
+    [EstimatorConfig, Segments, NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.bool_]]
 ]
 
 
@@ -106,38 +106,38 @@ def check_motion(fit: JointFit) -> None:
             f"the tag moves by {spread:.1f} m only: its position and the offset cannot be separated",
             valid=f"a drive of {MOVES_M:g} m or more, or tags at several positions",
         )
-    independent = float(fit.links.share.sum())
-    needed = MIN_INDEPENDENT + 1.5 * fit.setting.dims * int(fit.links.at_rest.sum())
+    independent = float(fit.observations.share.sum())
+    needed = MIN_INDEPENDENT + 1.5 * fit.config.dims * int(fit.observations.is_stationary.sum())
     if independent < needed:
         raise DatasetError(
-            f"{len(fit.links.of)} ranges, {independent:.0f} of them independent: too few",
+            f"{len(fit.observations.of)} ranges, {independent:.0f} of them independent: too few",
             valid=f"{needed:.0f} or more: a longer drive, or more anchors at each position",
         )
 
 
 def mirrored(fit: JointFit) -> NDArray[np.bool_]:
     """Return which segments have a mirror image beyond the anchors that explains the ranges equally well, bool (s,)."""
-    setting, links = fit.setting, fit.links
-    used = setting.anchors.position[np.unique(links.anchor)]
-    axes = slice(0, setting.dims)
+    config, observations = fit.config, fit.observations
+    used = config.anchors.position[np.unique(observations.anchor)]
+    axes = slice(0, config.dims)
     centre = used.mean(axis=0)
     normal = np.zeros(3)
     normal[axes] = np.linalg.svd(used[:, axes] - centre[axes])[2][-1]
     image = fit.position - 2.0 * ((fit.position - centre) @ normal)[:, None] * normal
-    corrected = links.range_m - links.rows @ fit.parameters
-    fixed = replace(links, range_m=corrected, rows=np.zeros((len(links), 0)))
+    corrected = observations.range_m - observations.rows @ fit.parameters
+    fixed = replace(observations, range_m=corrected, rows=np.zeros((len(observations), 0)))
     try:
-        other = fit_joint(setting, fixed, Regressors.none(len(links)), image, scale_m=fit.scale_m)
+        other = fit_joint(config, fixed, Regressors.none(len(observations)), image, scale_m=fit.scale_m)
     except DatasetError:
-        return np.zeros(len(fit.stretch_loss), np.bool_)
+        return np.zeros(len(fit.segment_loss), np.bool_)
     apart = np.linalg.norm(other.position - fit.position, axis=1) > MOVES_M
-    if setting.area is not None:
-        apart &= setting.area.holds(other.position)
-    share = np.bincount(links.knot_stretch, apart) / np.bincount(links.knot_stretch)
-    return (other.stretch_loss - fit.stretch_loss < MIRRORED) & (share > 0.5)
+    if config.area is not None:
+        apart &= config.area.holds(other.position)
+    share = np.bincount(observations.knot_segment, apart) / np.bincount(observations.knot_segment)
+    return (other.segment_loss - fit.segment_loss < MIRRORED) & (share > 0.5)
 
 
-def check_anchor_positions(found: Stretches, fit: JointFit, first_positions: FirstPositions) -> None:
+def check_anchor_positions(found: Segments, fit: JointFit, first_positions: FirstPositions) -> None:
     """Refuse ranges that other anchor positions explain much better.
 
     Args:
@@ -147,14 +147,16 @@ def check_anchor_positions(found: Stretches, fit: JointFit, first_positions: Fir
     Raises:
         DatasetError: names the anchors.
     """
-    anchors, links = fit.setting.anchors.anchors, fit.links
+    anchors, observations = fit.config.anchors.anchors, fit.observations
     fix = "their true positions in the anchors file (`uwb-mitigation survey` finds them)"
     best: tuple[float, int, float] | None = None
     for row in _suspects(fit):
         moved_m, gain = _displaced(row, found, fit)
-        if moved_m > MISPLACED_M and gain > LIKELIER and (best is None or gain > best[0]):
+        if moved_m > MISPLACED_M and gain > MIN_LOSS_GAIN and (best is None or gain > best[0]):
             best = gain, row, moved_m
-    misfit = float((links.share * (np.abs(fit.residual_m) > MISFIT_M)).sum() / links.share.sum())
+    misfit = float(
+        (observations.share * (np.abs(fit.residual_m) > MISFIT_M)).sum() / observations.share.sum()
+    )
     if misfit > MISFIT_SHARE and (pair := _swapped(found, fit, first_positions)) is not None:
         a, b = (anchors[row] for row in pair)
         raise DatasetError(
@@ -170,31 +172,31 @@ def check_anchor_positions(found: Stretches, fit: JointFit, first_positions: Fir
 
 
 def _suspects(fit: JointFit) -> list[int]:
-    links = fit.links
-    used = np.unique(links.anchor)
+    observations = fit.observations
+    used = np.unique(observations.anchor)
     own = dict(zip(fit.prior.names, fit.parameters.tolist(), strict=True))
     offset = np.array([own.get(f"anchor {row}", 0.0) for row in used])
     size = np.abs(fit.residual_m)
-    misfit = np.array([np.median(size[links.anchor == row]) for row in used])
+    misfit = np.array([np.median(size[observations.anchor == row]) for row in used])
     suspect = (np.abs(offset - np.median(offset)) > SUSPECT_OFFSET_M) | (
         misfit > SUSPECT_MISFIT * np.median(size)
     )
     return [int(row) for row in used[suspect]]
 
 
-def _displaced(row: int, found: Stretches, fit: JointFit) -> tuple[float, float]:
+def _displaced(row: int, found: Segments, fit: JointFit) -> tuple[float, float]:
     """Return the displacement of the anchor that explains the ranges best, m, and the gain in log likelihood."""
-    setting, keep = fit.setting, np.array([name != f"anchor {row}" for name in fit.prior.names])
-    base, anchors = fit.prior.only(keep), setting.anchors
-    links = links_of(found, base, setting.model)
-    own = (links.anchor == row)[:, None]
+    config, keep = fit.config, np.array([name != f"anchor {row}" for name in fit.prior.names])
+    base, anchors = fit.prior.only(keep), config.anchors
+    observations = observations_of(found, base, config.model)
+    own = (observations.anchor == row)[:, None]
     position, shared, moved = fit.position, fit.parameters[keep], anchors
     gain, axes = 0.0, slice(0, 2)
     try:
         for _ in range(_STEPS):
-            tag = position[links.knot] + links.rise[:, None] * (0.0, 0.0, 1.0)
-            unit, _ = directions(tag, moved.position[links.anchor])
-            rows = np.concatenate([links.rows, -unit[:, axes] * own], axis=1)
+            tag = position[observations.knot] + observations.relative_height[:, None] * (0.0, 0.0, 1.0)
+            unit, _ = directions(tag, moved.position[observations.anchor])
+            rows = np.concatenate([observations.rows, -unit[:, axes] * own], axis=1)
             shift = moved.position[row, axes] - anchors.position[row, axes]
             prior = replace(
                 base,
@@ -202,8 +204,8 @@ def _displaced(row: int, found: Stretches, fit: JointFit) -> tuple[float, float]
                 sd=np.concatenate([base.sd, np.full(2, _DISPLACEMENT_SD_M)]),
             )
             other = fit_joint(
-                replace(setting, anchors=moved),
-                replace(links, rows=rows),
+                replace(config, anchors=moved),
+                replace(observations, rows=rows),
                 prior,
                 position,
                 np.concatenate([shared, np.zeros(2)]),
@@ -223,26 +225,26 @@ def _displaced(row: int, found: Stretches, fit: JointFit) -> tuple[float, float]
     return float(np.linalg.norm(moved.position[row] - anchors.position[row])), gain
 
 
-def _swapped(found: Stretches, fit: JointFit, first_positions: FirstPositions) -> tuple[int, int] | None:
+def _swapped(found: Segments, fit: JointFit, first_positions: FirstPositions) -> tuple[int, int] | None:
     """Return the pair of anchors that explains the ranges best if swapped; None: no pair is much better."""
-    setting, part = fit.setting, np.arange(len(found.ranges)) < _MAX_RANGES
+    config, part = fit.config, np.arange(len(found.ranges)) < _MAX_RANGES
     few, columns = found.only(part), fit.prior.take(part)
-    links = links_of(few, columns, setting.model)
+    observations = observations_of(few, columns, config.model)
     scale = np.maximum(fit.scale_m, 0.1)
 
     def loss(order: NDArray[np.intp]) -> float:
-        anchors = setting.anchors
-        tried = replace(setting, anchors=anchors.moved(anchors.position[order], anchors.sd))
+        anchors = config.anchors
+        tried = replace(config, anchors=anchors.moved(anchors.position[order], anchors.sd))
         position, placed = first_positions(tried, few, columns.rows @ columns.mean)
         if not placed.all():
             return np.inf
         try:
-            return fit_joint(tried, links, columns, position, scale_m=scale).loss
+            return fit_joint(tried, observations, columns, position, scale_m=scale).loss
         except DatasetError:
             return np.inf
 
-    order = np.arange(len(setting.anchors))
-    limit = (1.0 - LARGER) * loss(order) - LIKELIER
+    order = np.arange(len(config.anchors))
+    limit = (1.0 - LARGER) * loss(order) - MIN_LOSS_GAIN
     best: tuple[int, int] | None = None
     for a, b in itertools.combinations(np.unique(found.ranges.anchor).tolist(), 2):
         swapped = order.copy()
@@ -264,10 +266,10 @@ def position_scatter(fit: JointFit, correction_m: NDArray[np.float64]) -> float:
     Returns:
         NaN if too few anchors remain.
     """
-    used = np.unique(fit.links.anchor)
+    used = np.unique(fit.observations.anchor)
     groups = min(MAX_GROUPS, len(used))
     parts = [used[k::groups] for k in range(groups)]
-    if len(used) - max(map(len, parts)) < fit.setting.dims + 1:
+    if len(used) - max(map(len, parts)) < fit.config.dims + 1:
         return float("nan")
     tracks = np.array([fit.without_anchors(part, correction_m).position[:, :2] for part in parts])
     squared = np.sum((tracks - tracks.mean(axis=0)) ** 2, axis=(0, 2))
@@ -276,32 +278,34 @@ def position_scatter(fit: JointFit, correction_m: NDArray[np.float64]) -> float:
 
 def seen_by_others(fit: JointFit) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return for each range the distance of its anchor from the other anchors' track, and its standard deviation."""
-    links, used = fit.links, np.unique(fit.links.anchor)
-    distance, sd = np.full(len(links), np.nan), np.full(len(links), np.nan)
+    observations, used = fit.observations, np.unique(fit.observations.anchor)
+    distance, sd = np.full(len(observations), np.nan), np.full(len(observations), np.nan)
     # With many anchors, leave out several together: enough others remain.
     for part in (used[k::MAX_REFITS] for k in range(min(MAX_REFITS, len(used)))):
         try:
-            seen = fit.without_anchors(part, links.rows @ fit.parameters)
+            seen = fit.without_anchors(part, observations.rows @ fit.parameters)
             covariance = seen.covariances()
         except (DatasetError, np.linalg.LinAlgError):
             continue
-        own = np.isin(links.anchor, part)
-        received = np.zeros(len(links.time_s), np.bool_)
-        received[links.knot[~own]] = True
-        knot = links.knot[own]
-        tag = seen.position[knot] + links.ahead_s[own][:, None] * seen.velocity[knot]
-        tag[:, 2] += links.rise[own]
-        unit, distance[own] = directions(tag, fit.setting.anchors.position[links.anchor[own]])
+        own = np.isin(observations.anchor, part)
+        received = np.zeros(len(observations.time_s), np.bool_)
+        received[observations.knot[~own]] = True
+        knot = observations.knot[own]
+        tag = seen.position[knot] + observations.ahead_s[own][:, None] * seen.velocity[knot]
+        tag[:, 2] += observations.relative_height[own]
+        unit, distance[own] = directions(tag, fit.config.anchors.position[observations.anchor[own]])
         known = np.sqrt(np.einsum("ni,nij,nj->n", unit, covariance[knot], unit))
-        known[~(_gap_s(links, received)[knot] <= FAR_S)] = np.nan
+        known[~(_gap_s(observations, received)[knot] <= FAR_S)] = np.nan
         sd[own] = known
-    return distance[links.of], sd[links.of]
+    return distance[observations.of], sd[observations.of]
 
 
-def _gap_s(links: Links, received: NDArray[np.bool_]) -> NDArray[np.float64]:
+def _gap_s(observations: Observations, received: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Return the time from each knot to the nearest one of its segment that still has ranges; inf without one."""
     # Segments are moved so far apart that none is near another.
-    time = links.time_s + links.knot_stretch * (float(links.time_s.max(initial=0.0)) + 1e6)
+    time = observations.time_s + observations.knot_segment * (
+        float(observations.time_s.max(initial=0.0)) + 1e6
+    )
     there = time[received]
     if not len(there):
         return np.full(len(time), np.inf)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.positioning.anchors import AnchorMap
-from uwb_mitigation.positioning.model import Model
+from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.tracks import Estimate
 
 OFFSET = 6
@@ -46,7 +46,7 @@ class RangeFilter:
     def __init__(
         self,
         anchors: AnchorMap,
-        model: Model,
+        model: NoiseModel,
         time_s: float,
         position: NDArray[np.float64],
         covariance: NDArray[np.float64],

@@ -24,17 +24,16 @@ from uwb_mitigation.positioning.anchor_errors import (
 )
 from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.geometry import Area, Height
-from uwb_mitigation.positioning.joint import (
+from uwb_mitigation.positioning.initialization import CandidatePosition, candidate_positions
+from uwb_mitigation.positioning.joint_fit import (
     KNOT_S,
     SLOW_S,
     JointFit,
-    Stretches,
-    fit_stretches,
-    stretches,
+    fit_segments,
 )
-from uwb_mitigation.positioning.locator import Setting, TagLocator
-from uwb_mitigation.positioning.model import Model, Regressors
-from uwb_mitigation.positioning.start import Place, places
+from uwb_mitigation.positioning.motion_segments import Segments, find_segments
+from uwb_mitigation.positioning.noise_model import NoiseModel, Regressors
+from uwb_mitigation.positioning.tag_estimator import EstimatorConfig, TagEstimator
 from uwb_mitigation.positioning.tracks import Ranges, Track
 
 MAX_COMMON_SD_M = 0.2
@@ -43,7 +42,7 @@ MAX_COMMON_SD_M = 0.2
 SEVERAL = 3.0
 """An offset is subtracted only if it is at least this number of standard deviations away from zero."""
 
-MODEL = Model(long=1.5, short=1.5)
+MODEL = NoiseModel(long=1.5, short=1.5)
 """Once offsets and predictions are subtracted, errors are as often too long as too short. Different thresholds would bias
 the offsets."""
 
@@ -72,19 +71,19 @@ class SelfCalibration:
     """The result.
 
     Attributes:
-        stretches, fit: as in `joint`. Parameters: `offset`, `anchor ROW`, `tag NUMBER`, `pair NUMBER ROW`, and the
+        segments, fit: as in `joint_fit`. Parameters: `offset`, `anchor ROW`, `tag NUMBER`, `pair NUMBER ROW`, and the
             regressors'.
         level: `pair`, `anchor` or `one`: what has a separate offset.
         notes: messages about parameters that are not observable, and about ranges that were left out.
         tag_ids: of the tags.
         unobserved_m: the estimate of a common offset that is not significant and therefore not subtracted; 0: it is.
         own_sd_m: standard deviation of own offsets about the common one, for pairs that get the common one.
-        pseudo_m, pseudo_sd_m: float64 (r,), in the order of `stretches.ranges`: the distance of each range's anchor from the
+        pseudo_m, pseudo_sd_m: float64 (r,), in the order of `segments.ranges`: the distance of each range's anchor from the
             track of the *other* anchors, and its standard deviation; NaN: unknown.
         position_scatter_m: `position_scatter` of raw ranges, and of calibrated ones on held-out parts; NaN: unknown.
     """
 
-    stretches: Stretches
+    segments: Segments
     fit: JointFit
     level: str
     notes: tuple[str, ...] = ()
@@ -95,15 +94,15 @@ class SelfCalibration:
     pseudo_sd_m: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     position_scatter_m: tuple[float, float] = (np.nan, np.nan)
 
-    def found_without(self, left_out: NDArray[np.bool_]) -> SelfCalibration:
-        """Fit the same parameters and tracks without some of `stretches.ranges`, bool (r,); the pseudo-truth is unchanged.
+    def without_ranges(self, left_out: NDArray[np.bool_]) -> SelfCalibration:
+        """Fit the same parameters and tracks without some of `segments.ranges`, bool (r,); the pseudo-truth is unchanged.
 
         Raises:
             DatasetError: the other ranges do not determine them.
         """
-        links_left_out = np.ones(len(self.fit.links), np.bool_)
-        links_left_out[self.fit.links.of[~left_out]] = False
-        return replace(self, fit=self.fit.without(links_left_out))
+        left_out_observations = np.ones(len(self.fit.observations), np.bool_)
+        left_out_observations[self.fit.observations.of[~left_out]] = False
+        return replace(self, fit=self.fit.without(left_out_observations))
 
     def value(self, name: str) -> tuple[float, float]:
         """Return a parameter and its standard deviation; (0, 0): it was not estimated."""
@@ -114,7 +113,7 @@ class SelfCalibration:
 
     def pair(self, tag: int, row: int) -> tuple[float, float]:
         """Return the offset of a tag (its number) and an anchor (its row), m, and its standard deviation."""
-        at, sd = self._columns(tag, row), self.fit.setting.anchors.sd
+        at, sd = self._columns(tag, row), self.fit.config.anchors.sd
         # The error of an anchor's position looks like an offset. Averaged over all directions from which the tag received it,
         # about half of its variance remains.
         placed = sd[row] ** 2 / 2.0 if len(at) > 1 else np.mean(sd**2) / len(sd) + self.own_sd_m**2
@@ -140,7 +139,7 @@ class SelfCalibration:
 
     def mean(self) -> tuple[float, float]:
         """The mean offset of all pairs, m, and its standard deviation."""
-        pairs, sd = self.pairs(), self.fit.setting.anchors.sd
+        pairs, sd = self.pairs(), self.fit.config.anchors.sd
         rows = np.zeros((len(pairs), len(self.fit.parameters)))
         for number, (tag, row) in enumerate(pairs):
             rows[number, self._columns(tag, row)] = 1.0
@@ -156,7 +155,7 @@ class SelfCalibration:
 
     def pairs(self) -> list[tuple[int, int]]:
         """Return (tag number, anchor row) of all pairs with ranges."""
-        found = np.unique(np.stack([self.stretches.tag, self.stretches.ranges.anchor]), axis=1).T
+        found = np.unique(np.stack([self.segments.tag, self.segments.ranges.anchor]), axis=1).T
         return [(int(tag), int(row)) for tag, row in found]
 
 
@@ -188,24 +187,24 @@ def calibrate(
     if heights_m is not None:
         # Initial positions are found with the median height.
         height = Height(float(np.median(heights_m)), max(float(np.std(heights_m)), height_sd_m))
-    setting = Setting(anchors, MODEL, height, area)
+    config = EstimatorConfig(anchors, MODEL, height, area)
     known = regressors or Regressors.none(sum(map(len, tags)))
     check_anchors(anchors, np.unique(np.concatenate([one.anchor for one in tags])), height, area)
     notes: list[str] = []
-    found = stretches(tags)
+    found = find_segments(tags)
     of_range = np.cumsum([0, *map(len, tags)])[found.tag] + found.row
     known = known.take(of_range)
     if heights_m is not None and height is not None:
-        found = replace(found, rise=heights_m[of_range] - height.value)
+        found = replace(found, relative_height=heights_m[of_range] - height.value)
     expected = known.rows @ known.mean
-    offset = likely_offset(setting, found, expected)
-    position, placed = first_positions(setting, found, expected + offset)
+    offset = likely_offset(config, found, expected)
+    position, placed = first_positions(config, found, expected + offset)
     if heights_m is not None and height is not None:
         # The spread of the heights was for the initial positions: each height has the accuracy of its measurement.
-        setting = replace(setting, height=Height(height.value, height_sd_m))
+        config = replace(config, height=Height(height.value, height_sd_m))
     if not placed.all():
         notes.append(
-            f"{int((~placed).sum())} of {len(placed)} stretches left out: no position of the tag can be determined"
+            f"{int((~placed).sum())} of {len(placed)} segments left out: no position of the tag can be determined"
         )
     if not placed.any():
         raise DatasetError(
@@ -214,10 +213,10 @@ def calibrate(
         )
     kept = placed[found.of]
     common = Regressors.one("offset", np.ones(len(kept)), offset, COMMON_SD_M)
-    shared = replace(common.joined(known), alike=known.alike).take(kept)
+    shared = replace(common.joined(known), noise_group=known.noise_group).take(kept)
     found = found.keep(placed)
     # The positions contain no knots of segments that were left out.
-    fit = fit_stretches(setting, found, shared, position)
+    fit = fit_segments(config, found, shared, position)
     ambiguous = mirrored(fit)
     if ambiguous.all():
         raise DatasetError(
@@ -226,11 +225,11 @@ def calibrate(
         )
     if ambiguous.any():
         notes.append(
-            f"{int(ambiguous.sum())} of {len(ambiguous)} stretches left out: their mirror images fit equally well"
+            f"{int(ambiguous.sum())} of {len(ambiguous)} segments left out: their mirror images fit equally well"
         )
-        position = fit.position[~ambiguous[fit.links.knot_stretch]]
+        position = fit.position[~ambiguous[fit.observations.knot_segment]]
         shared, found = shared.take(~ambiguous[found.of]), found.keep(~ambiguous)
-        fit = fit_stretches(setting, found, shared, position)
+        fit = fit_segments(config, found, shared, position)
     check_motion(fit)
     common_sd = float(np.sqrt(fit.covariance[0, 0]))
     level, own_sd = "one", 0.0
@@ -258,10 +257,10 @@ def calibrate(
     if level == "anchor" and len(np.unique(found.tag)) == 1:
         # With one tag, the offset of an anchor is that of the pair.
         level = "pair"
-    fit = fit_stretches(setting, found, fit.prior, fit.position, fit.parameters)
+    fit = fit_segments(config, found, fit.prior, fit.position, fit.parameters)
     check_anchor_positions(found, fit, first_positions)
     ids = tuple(one.tag_id for one in tags)
-    result = SelfCalibration(stretches=found, fit=fit, level=level, tag_ids=ids, own_sd_m=own_sd)
+    result = SelfCalibration(segments=found, fit=fit, level=level, tag_ids=ids, own_sd_m=own_sd)
     if common_sd > MAX_COMMON_SD_M or not any(result.applied(*pair)[0] for pair in result.pairs()):
         value, sd = result.mean()
         notes.append(
@@ -270,10 +269,10 @@ def calibrate(
         )
         zero = replace(shared, mean=np.append(0.0, shared.mean[1:]), sd=np.append(1e-4, shared.sd[1:]))
         start = np.append(0.0, fit.parameters[1 : len(zero.names)])
-        fit = fit_stretches(setting, found, zero, fit.position, start)
+        fit = fit_segments(config, found, zero, fit.position, start)
         result = replace(result, fit=fit, level="one", unobserved_m=float(np.hypot(value, sd)))
     pseudo, pseudo_sd = seen_by_others(fit)
-    scatter = position_scatter(fit, np.zeros(len(fit.links))), _held_out_scatter(fit)
+    scatter = position_scatter(fit, np.zeros(len(fit.observations))), _held_out_scatter(fit)
     return replace(
         result, notes=tuple(notes), pseudo_m=pseudo, pseudo_sd_m=pseudo_sd, position_scatter_m=scatter
     )
@@ -281,25 +280,27 @@ def calibrate(
 
 def _held_out_scatter(fit: JointFit) -> float:
     """Return the scatter of positions, with parameters from the other half of the drive."""
-    links = fit.links
-    block = (links.time_s[links.knot] // SLOW_S).astype(int) + links.stretch
-    correction = np.zeros(len(links))
+    observations = fit.observations
+    block = (observations.time_s[observations.knot] // SLOW_S).astype(int) + observations.segment
+    correction = np.zeros(len(observations))
     for half in range(2):
         held_out, parameters = block % 2 == half, fit.parameters
         if held_out.any() and not held_out.all():
             parameters = fit.without(held_out).parameters
-        correction[held_out] = links.rows[held_out] @ parameters
+        correction[held_out] = observations.rows[held_out] @ parameters
     return position_scatter(fit, correction)
 
 
-def candidates(found: Stretches) -> list[tuple[str, dict[str, NDArray[np.bool_]]]]:
+def candidates(found: Segments) -> list[tuple[str, dict[str, NDArray[np.bool_]]]]:
     """Return candidates for separate offsets in the order of their tests: {name: which ranges}."""
     row, tag = found.ranges.anchor, found.tag
     tried = [("anchor", {f"anchor {one}": row == one for one in np.unique(row).tolist()})]
     # The offset of a tag that stays at one position can hardly be separated from this position.
-    places_of = {one: len(np.unique(found.of[tag == one])) for one in np.unique(tag).tolist()}
+    num_segments = {one: len(np.unique(found.of[tag == one])) for one in np.unique(tag).tolist()}
     several = [
-        one for one, count in places_of.items() if count > 1 or not found.at_rest[found.of[tag == one][0]]
+        one
+        for one, count in num_segments.items()
+        if count > 1 or not found.is_stationary[found.of[tag == one][0]]
     ]
     if len(several) > 1:
         tried.append(("tag", {f"tag {one}": tag == one for one in several}))
@@ -313,7 +314,7 @@ def candidates(found: Stretches) -> list[tuple[str, dict[str, NDArray[np.bool_]]
 
 
 def with_own_offsets(
-    found: Stretches, fit: JointFit, members: dict[str, NDArray[np.bool_]]
+    found: Segments, fit: JointFit, members: dict[str, NDArray[np.bool_]]
 ) -> tuple[JointFit | None, list[str], float]:
     """Add offsets of these groups of ranges to a fit, if they are significant.
 
@@ -327,9 +328,9 @@ def with_own_offsets(
 
     def with_groups(names: list[str], sd: float) -> JointFit:
         rows, zero = np.column_stack([members[name].astype(float) for name in names]), np.zeros(len(names))
-        own = Regressors(tuple(names), rows, zero, np.full(len(names), sd), fit.prior.alike)
+        own = Regressors(tuple(names), rows, zero, np.full(len(names), sd), fit.prior.noise_group)
         start = np.append(fit.parameters, zero)
-        return fit_stretches(fit.setting, found, fit.prior.joined(own), fit.position, start, near=True)
+        return fit_segments(fit.config, found, fit.prior.joined(own), fit.position, start, near=True)
 
     trial = with_groups(list(members), OWN_SD_M)
     # Deviations from their mean: the mean is the common offset.
@@ -352,7 +353,7 @@ def with_own_offsets(
     return with_groups(names, sd), [name for name in members if name not in names], sd
 
 
-def likely_offset(setting: Setting, found: Stretches, expected_m: NDArray[np.float64]) -> float:
+def likely_offset(config: EstimatorConfig, found: Segments, expected_m: NDArray[np.float64]) -> float:
     """Return the one of `OFFSETS_M` with which the ranges of a few moments agree best; 0 if no moment has enough ranges.
 
     Args:
@@ -361,10 +362,10 @@ def likely_offset(setting: Setting, found: Stretches, expected_m: NDArray[np.flo
     rng = np.random.default_rng(1)
     moments = []
     window = (found.ranges.stamp_ns - found.ranges.stamp_ns[0]) // round(WINDOW_S * _SECOND_NS)
-    key = np.where(found.at_rest[found.of], -1 - found.of, window * len(found) + found.of)
+    key = np.where(found.is_stationary[found.of], -1 - found.of, window * len(found) + found.of)
     for one in rng.permutation(np.unique(key)).tolist():
         row, value = _medians(found.ranges, np.flatnonzero(key == one), expected_m)
-        if len(row) > setting.dims + 1:
+        if len(row) > config.dims + 1:
             moments.append((row, value))
         if len(moments) == MAX_WINDOWS:
             break
@@ -373,13 +374,13 @@ def likely_offset(setting: Setting, found: Stretches, expected_m: NDArray[np.flo
     loss = np.zeros(len(OFFSETS_M))
     for row, value in moments:
         for k, offset in enumerate(OFFSETS_M.tolist()):
-            possible = _places(setting, row, value - offset)
+            possible = _candidate_positions(config, row, value - offset)
             loss[k] += possible[0].loss if possible else 50.0
     return float(OFFSETS_M[int(np.argmin(loss))])
 
 
 def first_positions(
-    setting: Setting, found: Stretches, expected_m: NDArray[np.float64]
+    config: EstimatorConfig, found: Segments, expected_m: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Return initial positions float64 (K, 3) at the knots of the segments that have any; which these are, bool (s,)."""
     position: list[NDArray[np.float64]] = []
@@ -387,25 +388,27 @@ def first_positions(
     edges = np.searchsorted(found.of, np.arange(len(found) + 1))
     for number in range(len(found)):
         own = np.arange(edges[number], edges[number + 1])
-        if found.at_rest[number]:
+        if found.is_stationary[number]:
             row, value = _medians(found.ranges, own, expected_m)
-            possible = _places(setting, row, value) if len(row) > setting.dims else []
+            possible = _candidate_positions(config, row, value) if len(row) > config.dims else []
             if possible:
                 position.append(possible[0].position[None])
                 placed[number] = True
             continue
         ranges = found.ranges.take(own)
         better = replace(ranges, range_m=np.maximum(ranges.range_m - expected_m[own], 0.0))
-        track = TagLocator(setting).run(better)
+        track = TagEstimator(config).run(better)
         if len(track) >= 2:
             position.append(_at_knots(track, ranges))
             placed[number] = True
     return np.concatenate(position) if position else np.zeros((0, 3)), placed
 
 
-def _places(setting: Setting, row: NDArray[np.intp], range_m: NDArray[np.float64]) -> list[Place]:
-    where, sd = setting.anchors.position[row], np.full(len(row), START_SD_M)
-    return places(where, range_m, sd, setting.model, height=setting.height, area=setting.area)
+def _candidate_positions(
+    config: EstimatorConfig, row: NDArray[np.intp], range_m: NDArray[np.float64]
+) -> list[CandidatePosition]:
+    where, sd = config.anchors.position[row], np.full(len(row), START_SD_M)
+    return candidate_positions(where, range_m, sd, config.model, height=config.height, area=config.area)
 
 
 def _at_knots(track: Track, ranges: Ranges) -> NDArray[np.float64]:

@@ -22,7 +22,7 @@ from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.filter import FIRST_ERROR, OFFSET, RangeFilter
 from uwb_mitigation.positioning.geometry import directions
 from uwb_mitigation.positioning.least_squares import LeastSquares, Solution
-from uwb_mitigation.positioning.locator import Setting, TagLocator
+from uwb_mitigation.positioning.tag_estimator import EstimatorConfig, TagEstimator
 from uwb_mitigation.positioning.tracks import Heights, Ranges, Track
 
 KNOT_S = 0.1
@@ -63,7 +63,7 @@ class Smoother:
     """Fits a track to ranges, together with other unknowns.
 
     Args:
-        setting: anchors, error model, and prior knowledge of the height.
+        config: anchors, error model, and prior knowledge of the height.
         ranges: two or more, in the order of time.
         find_anchors: also estimate the positions of the anchors.
         around: prior positions of estimated anchors and their standard deviations, float64 (m, 3) both; None: those of
@@ -76,7 +76,7 @@ class Smoother:
 
     def __init__(
         self,
-        setting: Setting,
+        config: EstimatorConfig,
         ranges: Ranges,
         *,
         find_anchors: bool = False,
@@ -85,9 +85,9 @@ class Smoother:
     ) -> None:
         if len(ranges) < 2:
             raise DatasetError(f"{len(ranges)} ranges", valid="two or more for a track")
-        anchors, model = setting.anchors, setting.model
-        self._model, self._height, self._find, self._after = model, setting.height, find_anchors, after
-        self._d = setting.dims
+        anchors, model = config.anchors, config.model
+        self._model, self._height, self._find, self._after = model, config.height, find_anchors, after
+        self._d = config.dims
         # Anchors without ranges have no persisting errors to estimate.
         self._used, self._slot = np.unique(ranges.anchor, return_inverse=True)
         self._known = anchors.position
@@ -105,7 +105,7 @@ class Smoother:
         self._white = np.maximum(model.white * self._variance, self._variance - self._persisting[self._slot])
         # A common offset, and one of each anchor.
         self._offset_sd = np.array([model.offset_sd, *[model.pair_sd] * len(self._used)])
-        self._heights = setting.heights if setting.height is None else None
+        self._heights = config.heights if config.height is None else None
 
     def fit(self, initial: Track, iterations: int = _ITERATIONS) -> Smoothed:
         """Return the track, starting from one that is roughly right.
@@ -242,24 +242,24 @@ class Smoother:
         problem.add(np.tile(at, (len(index), 1)), root, root @ state[index], 1.0)
 
 
-def smooth(setting: Setting, ranges: Ranges, live: Track) -> Track:
+def smooth(config: EstimatorConfig, ranges: Ranges, live: Track) -> Track:
     """Return positions at ten stamps a second, each from all ranges before and after it.
 
     Args:
-        setting: anchors, error model, and prior knowledge of the tag.
+        config: anchors, error model, and prior knowledge of the tag.
         ranges: two or more.
-        live: the track of a `TagLocator` from the same ranges; not empty.
+        live: the track of a `TagEstimator` from the same ranges; not empty.
     """
     stamp_ns = int(ranges.stamp_ns[0]) + knots_of(ranges.stamp_ns)[0]
     end_ns, backwards = int(ranges.stamp_ns[-1]), slice(None, None, -1)
     reversed_ranges = ranges.take(backwards)
     mirrored = replace(reversed_ranges, stamp_ns=end_ns - reversed_ranges.stamp_ns)
-    heights = setting.heights and Heights(
-        end_ns - setting.heights.stamp_ns[backwards],
-        setting.heights.height_m[backwards],
-        setting.heights.variance_m2[backwards],
+    heights = config.heights and Heights(
+        end_ns - config.heights.stamp_ns[backwards],
+        config.heights.height_m[backwards],
+        config.heights.variance_m2[backwards],
     )
-    track = TagLocator(replace(setting, heights=heights)).run(mirrored)
+    track = TagEstimator(replace(config, heights=heights)).run(mirrored)
     later = _at(track, (end_ns - stamp_ns)[backwards])
     flip = np.diag([1.0, 1.0, 1.0, -1.0, -1.0, -1.0])
     later = later[0][backwards] @ flip, flip @ later[1][backwards] @ flip
@@ -267,13 +267,13 @@ def smooth(setting: Setting, ranges: Ranges, live: Track) -> Track:
     # Without a position of either filter the batch smoother's choice among several optima is arbitrary.
     found = np.asarray(np.isfinite(state).all(axis=1), np.bool_)
     try:
-        batch = Smoother(setting, ranges).fit(live).track
+        batch = Smoother(config, ranges).fit(live).track
     except DatasetError:
         batch = None
     if batch is not None:
         state, covariance, more = fused_with_batch(state, covariance, batch)
         spread += more
-    position = state[:, :3] if setting.area is None else setting.area.clip(state[:, :3])
+    position = state[:, :3] if config.area is None else config.area.clip(state[:, :3])
     return Track(stamp_ns, position, state[:, 3:], covariance + spread).take(found)
 
 

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.geometry import Shape, directions, shape
-from uwb_mitigation.positioning.locator import Setting, TagLocator
 from uwb_mitigation.positioning.smoother import Smoothed, Smoother
+from uwb_mitigation.positioning.tag_estimator import EstimatorConfig, TagEstimator
 from uwb_mitigation.positioning.tracks import Ranges, Track
 
 MISPLACED_M = 0.3
@@ -97,12 +97,12 @@ class SurveyResult:
 
 
 def survey(
-    setting: Setting, ranges: Ranges, *, off_m: float = 1.0, fixed: frozenset[int] = frozenset()
+    config: EstimatorConfig, ranges: Ranges, *, off_m: float = 1.0, fixed: frozenset[int] = frozenset()
 ) -> SurveyResult:
     """Estimate the positions of the anchors.
 
     Args:
-        setting: its anchors are at approximate positions.
+        config: its anchors are at approximate positions.
         ranges: of one tag that moves.
         off_m: standard deviation of each coordinate of the guesses. With a `height`, that of the heights of anchors is at
             most `TAPE_M`: a drive at constant height hardly determines them.
@@ -111,7 +111,7 @@ def survey(
     Raises:
         DatasetError: too few anchors, all on a line, or a tag that hardly moves; says which.
     """
-    guesses, model, used, needed = setting.anchors, setting.model, np.unique(ranges.anchor), setting.dims + 1
+    guesses, model, used, needed = config.anchors, config.model, np.unique(ranges.anchor), config.dims + 1
     if len(used) < needed:
         raise DatasetError(f"{len(used)} anchors were received", valid=f"{needed} or more for a survey")
     if shape(guesses.position[used]) is Shape.LINE:
@@ -123,11 +123,11 @@ def survey(
 
     def fit(order: NDArray[np.intp]) -> tuple[Smoothed, float]:
         start = guesses.moved(guesses.position[order], deviations)
-        found = _fit(replace(setting, anchors=start), ranges)
+        found = _fit(replace(config, anchors=start), ranges)
         sd = np.sqrt(model.variances(ranges.variance_m2))
         return found, float(model.loss(found.residual_m / sd).mean())
 
-    order = _unswap(setting, ranges, off_m)
+    order = _unswap(config, ranges, off_m)
     found, loss = fit(identity)
     if (order != identity).any():
         # In a square, swapped opposite anchors are the mirror image of the right ones: ranges cannot distinguish the two.
@@ -148,7 +148,7 @@ def survey(
     moved = displacements(found.anchors[used], guesses.position[used])
     distance = np.zeros(len(guesses))
     # A drive at constant height hardly determines heights: they were taken as measured.
-    axes = slice(0, setting.dims)
+    axes = slice(0, config.dims)
     distance[used] = np.linalg.norm(moved[:, axes], axis=1)
     relative = np.linalg.norm(_relative_sd(found.anchors, found.anchor_covariance)[:, axes], axis=1)
     odd = [int(row) for row in used if distance[row] > max(MISPLACED_M, _UNLIKELY * relative[row])]
@@ -156,7 +156,7 @@ def survey(
         row: other
         for row in used.tolist()
         if row not in fixed
-        for other in [_alternative(setting, found, ranges, row)]
+        for other in [_alternative(config, found, ranges, row)]
         if other is not None
     }
     plain, mirror = (
@@ -175,9 +175,9 @@ def survey(
     )
 
 
-def _fit(setting: Setting, ranges: Ranges) -> Smoothed:
-    start = setting.anchors
-    track = TagLocator(setting).run(ranges)
+def _fit(config: EstimatorConfig, ranges: Ranges) -> Smoothed:
+    start = config.anchors
+    track = TagEstimator(config).run(ranges)
     if len(track) < 2:
         raise DatasetError(
             "no position of the tag can be determined",
@@ -187,12 +187,12 @@ def _fit(setting: Setting, ranges: Ranges) -> Smoothed:
     if spread < _MOVES_M:
         raise DatasetError(f"the tag moves by {spread:.1f} m only", valid=f"{_MOVES_M:g} m or more")
     around = np.repeat(start.sd[:, None], 3, axis=1)
-    if setting.height is not None:
+    if config.height is not None:
         around[:, 2] = np.minimum(around[:, 2], TAPE_M)
-    variance, known, fit = setting.model.variances(ranges.variance_m2), start, None
+    variance, known, fit = config.model.variances(ranges.variance_m2), start, None
     for step in _STEPS_M:
         fit = Smoother(
-            replace(setting, anchors=known),
+            replace(config, anchors=known),
             replace(ranges, variance_m2=np.maximum(variance, step**2)),
             find_anchors=True,
             around=(start.position, around),
@@ -208,13 +208,15 @@ def _misfit(found: NDArray[np.float64], guessed: NDArray[np.float64], *, mirrore
     return float(np.sqrt(np.mean(displacements(found * (side, 1.0, 1.0), guessed)[:, :2] ** 2)))
 
 
-def _alternative(setting: Setting, fit: Smoothed, ranges: Ranges, row: int) -> NDArray[np.float64] | None:
+def _alternative(
+    config: EstimatorConfig, fit: Smoothed, ranges: Ranges, row: int
+) -> NDArray[np.float64] | None:
     """Return another position of an anchor that explains its ranges to the track equally well, or None.
 
     Candidate: the mirror image beyond the track's plane (with a constant height: its line in plan), refined for this track.
     """
     own = ranges.anchor == row
-    track, axes, model = fit.track, setting.dims, setting.model
+    track, axes, model = fit.track, config.dims, config.model
     tag = np.stack(
         [np.interp(ranges.stamp_ns[own], track.stamp_ns, axis) for axis in track.position.T], axis=1
     )
@@ -278,9 +280,9 @@ def _relative_sd(position: NDArray[np.float64], covariance: NDArray[np.float64])
     return sd
 
 
-def _unswap(setting: Setting, ranges: Ranges, off_m: float) -> NDArray[np.intp]:
+def _unswap(config: EstimatorConfig, ranges: Ranges, off_m: float) -> NDArray[np.intp]:
     """Return the order of guesses that explains the first minute best, of all with at most one pair swapped, int (m,)."""
-    guesses, model = setting.anchors, setting.model
+    guesses, model = config.anchors, config.model
     trial = ranges.take(ranges.stamp_ns < ranges.stamp_ns[0] + _TRIAL_NS)
     if len(trial) > _TRIAL_RANGES:
         # A random choice: with a constant stride, all might be from the same anchor.
@@ -289,8 +291,8 @@ def _unswap(setting: Setting, ranges: Ranges, off_m: float) -> NDArray[np.intp]:
     identity = np.arange(len(guesses))
 
     def loss(order: NDArray[np.intp]) -> float:
-        tried = replace(setting, anchors=guesses.moved(guesses.position[order], np.full(len(guesses), off_m)))
-        track = TagLocator(tried).run(trial)
+        tried = replace(config, anchors=guesses.moved(guesses.position[order], np.full(len(guesses), off_m)))
+        track = TagEstimator(tried).run(trial)
         if len(track) < 2:
             return np.inf
         fit = Smoother(tried, trial).fit(track, iterations=4)

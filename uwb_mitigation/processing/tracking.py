@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.bag.poses import encode_odometry, encode_place, encode_pose, tag_frame, tag_topic
+from uwb_mitigation.bag.poses import encode_odometry, encode_pose, encode_true_position, tag_frame, tag_topic
 from uwb_mitigation.bag.topics import (
     ODOMETRY,
     ODOMETRY_TRUTH,
@@ -21,9 +21,9 @@ from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.errors import DatasetError, format_id
 from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.geometry import Shape, geometry, shape
-from uwb_mitigation.positioning.locator import Setting, TagLocator
+from uwb_mitigation.positioning.initialization import snapshot
 from uwb_mitigation.positioning.smoother import Smoother, smooth
-from uwb_mitigation.positioning.start import snapshot
+from uwb_mitigation.positioning.tag_estimator import EstimatorConfig, TagEstimator
 from uwb_mitigation.positioning.tracks import (
     NO_ERRORS,
     Ranges,
@@ -86,32 +86,32 @@ class TagTracks:
         }
 
 
-def track_tag(recording: TagRecording, setting: Setting) -> TagTracks:
+def track_tag(recording: TagRecording, config: EstimatorConfig) -> TagTracks:
     """Return the tracks of one tag.
 
     Raises:
         DatasetError: no position of the tag can be determined; the message contains the reason, if the anchors show it.
     """
-    ranges, anchors = recording.ranges, setting.anchors
-    locator = TagLocator(setting)
+    ranges, anchors = recording.ranges, config.anchors
+    locator = TagEstimator(config)
     live = locator.run(ranges)
     if len(live) < 2:
-        raise _no_position(recording, setting, locator)
-    smoothed = smooth(setting, ranges, live)
-    snapshots = snapshot(anchors, recording.raw, setting.height)
+        raise _no_position(recording, config, locator)
+    smoothed = smooth(config, ranges, live)
+    snapshots = snapshot(anchors, recording.raw, config.height)
     truth = recording.truth
     tracks = zip(KINDS, (live, smoothed, snapshots), strict=True)
     errors = {kind: track_errors(track, truth) for kind, track in tracks}
     of_live, of_smoothed = errors["live"], errors["smoothed"]
     sample = smoothed.position[:: max(len(smoothed) // 200, 1)]
     used = anchors.position[np.unique(ranges.anchor)]
-    level = setting.height is not None or setting.heights is not None
+    level = config.height is not None or config.heights is not None
     hdop = float(np.median([geometry(used, place, level=level).hdop for place in sample]))
     warnings = []
     if not hdop <= POOR_HDOP:
         warnings.append(
             f"poor geometry: median HDOP {hdop:.0f}. The anchors are {shape(used).value}. "
-            "Place anchors on more sides of the tag"
+            "CandidatePosition anchors on more sides of the tag"
         )
     share = len(live) / len(ranges)
     if share < 0.9:
@@ -134,7 +134,7 @@ def track_tag(recording: TagRecording, setting: Setting) -> TagTracks:
     odd = [
         row
         for row in locator.disagreeing()
-        if contradicts(anchors, ranges, row, TagLocator(setting).run(ranges.take(ranges.anchor != row)))
+        if contradicts(anchors, ranges, row, TagEstimator(config).run(ranges.take(ranges.anchor != row)))
     ]
     return TagTracks(recording, live, smoothed, snapshots, errors, hdop, odd, warnings)
 
@@ -156,12 +156,12 @@ def contradicts(anchors: AnchorMap, ranges: Ranges, row: int, others: Track) -> 
     return abs(low) > CONTRADICTION_M
 
 
-def _no_position(recording: TagRecording, setting: Setting, locator: TagLocator) -> DatasetError:
-    used = setting.anchors.position[np.unique(recording.ranges.anchor)]
+def _no_position(recording: TagRecording, config: EstimatorConfig, locator: TagEstimator) -> DatasetError:
+    used = config.anchors.position[np.unique(recording.ranges.anchor)]
     what = f"tag {format_id(recording.tag_id)}: no position can be determined from {len(recording.ranges)} ranges"
     if locator.candidates > 1:
         what += f": {locator.candidates} positions explain them equally well"
-    level = setting.height is not None or setting.heights is not None
+    level = config.height is not None or config.heights is not None
     needed, kind = 3 if level else 4, shape(used)
     if locator.undetermined:
         what += ": the geometry is too weak"
@@ -195,7 +195,7 @@ class HeldOut:
         }
 
 
-def held_out(tracks: Sequence[TagTracks], setting: Setting) -> list[HeldOut]:
+def held_out(tracks: Sequence[TagTracks], config: EstimatorConfig) -> list[HeldOut]:
     """Return the held-out residuals of each anchor, and of all anchors last.
 
     The ranges of each anchor are compared with a track that was estimated without this anchor. This needs no ground truth,
@@ -205,26 +205,26 @@ def held_out(tracks: Sequence[TagTracks], setting: Setting) -> list[HeldOut]:
     corrected = [(one.live, one.recording.ranges) for one in tracks if one.recording.corrected]
 
     def of(row: int, kind: list[tuple[Track, Ranges]]) -> NDArray[np.float64]:
-        parts = [_residuals(live, ranges, row, setting) for live, ranges in kind]
+        parts = [_residuals(live, ranges, row, config) for live, ranges in kind]
         return np.concatenate([np.zeros(0), *parts])
 
-    by_anchor = [(of(row, raw), of(row, corrected)) for row in range(len(setting.anchors))]
+    by_anchor = [(of(row, raw), of(row, corrected)) for row in range(len(config.anchors))]
     every = [np.concatenate(kind) for kind in zip(*by_anchor, strict=True)]
-    identities = [*(anchor.id for anchor in setting.anchors.anchors), None]
+    identities = [*(anchor.id for anchor in config.anchors.anchors), None]
     return [
         HeldOut(identity, len(before), _median(before), _median(after))
         for identity, (before, after) in zip(identities, [*by_anchor, every], strict=True)
     ]
 
 
-def _residuals(initial: Track, ranges: Ranges, row: int, setting: Setting) -> NDArray[np.float64]:
+def _residuals(initial: Track, ranges: Ranges, row: int, config: EstimatorConfig) -> NDArray[np.float64]:
     """Return range minus distance of an anchor's ranges, where the track of the others is known."""
     own = ranges.anchor == row
     if len(np.unique(ranges.anchor[~own])) < MIN_OTHERS or not own.any():
         return np.zeros(0)
-    track = Smoother(setting, ranges.take(~own)).fit(initial).track
+    track = Smoother(config, ranges.take(~own)).fit(initial).track
     position = TruePath(track.stamp_ns, track.position).at(ranges.stamp_ns[own])
-    residual = ranges.range_m[own] - np.linalg.norm(position - setting.anchors.position[row], axis=1)
+    residual = ranges.range_m[own] - np.linalg.norm(position - config.anchors.position[row], axis=1)
     known: NDArray[np.float64] = residual[np.isfinite(residual)]
     return known
 
@@ -270,7 +270,7 @@ def _messages(one: TagTracks, several: bool) -> Iterator[tuple[int, str, str, by
         yield estimate.stamp_ns, tag_topic(POSE_SMOOTHED, name), POSE_TYPE, encode_pose(estimate)
     truth = one.recording.truth
     for stamp, position in zip(truth.stamp_ns.tolist(), truth.position.tolist(), strict=True):
-        yield stamp, ODOMETRY_TRUTH, ODOMETRY_TYPE, encode_place(position, tag, stamp)
+        yield stamp, ODOMETRY_TRUTH, ODOMETRY_TYPE, encode_true_position(position, tag, stamp)
 
 
 def tum(track: Track) -> str:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from uwb_mitigation.bag.codec import Key, decode_range, decode_truth, key_of
-from uwb_mitigation.bag.poses import decode_place
+from uwb_mitigation.bag.poses import decode_true_position
 from uwb_mitigation.bag.reader import BagReader, check_channel
 from uwb_mitigation.bag.topics import (
     ODOMETRY_TRUTH,
@@ -140,7 +140,7 @@ class McapRecording(Source):
                     yield decode_range(message.data)
                 elif topic == RANGE_TRUTH:
                     yield decode_truth(message.data)
-                elif (place := decode_place(message.data)) is not None:
+                elif (place := decode_true_position(message.data)) is not None:
                     stamp_ns, tag_id, position = place
                     yield At(stamp_ns, tag_id), position
             except RecordingError as error:

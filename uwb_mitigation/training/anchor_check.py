@@ -15,8 +15,8 @@ from scipy.optimize import least_squares
 
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.evaluation.site_data import SiteData
-from uwb_mitigation.positioning.anchor_errors import LARGER, LIKELIER, MISPLACED_M
-from uwb_mitigation.positioning.model import MAD_TO_SD
+from uwb_mitigation.positioning.anchor_errors import LARGER, MIN_LOSS_GAIN, MISPLACED_M
+from uwb_mitigation.positioning.noise_model import MAD_TO_SD
 
 INDEPENDENT_S = 2.0
 """Range errors of an anchor within this time count as one independent error."""
@@ -111,7 +111,7 @@ def check_anchors(site: SiteData, antenna: NDArray[np.float64], known: NDArray[n
 
 
 def _is_better(gain: float, loss: float) -> bool:
-    return gain > max(LIKELIER, LARGER * loss)
+    return gain > max(MIN_LOSS_GAIN, LARGER * loss)
 
 
 def _by_anchor(

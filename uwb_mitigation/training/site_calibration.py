@@ -23,8 +23,8 @@ from uwb_mitigation.model.bundle import Bundle, build_bundle
 from uwb_mitigation.model.floating import float_network, scaled
 from uwb_mitigation.offsets import Offsets, dump_offsets
 from uwb_mitigation.positioning.geometry import Area, Height
-from uwb_mitigation.positioning.localised import Localised, PosePath, solve_localised
-from uwb_mitigation.positioning.model import MAD_TO_SD, NETWORK_SD, SLOPE_SD, Regressors
+from uwb_mitigation.positioning.noise_model import MAD_TO_SD, NETWORK_SD, SLOPE_SD, Regressors
+from uwb_mitigation.positioning.pose_alignment import PoseAlignment, PosePath, align_poses
 from uwb_mitigation.positioning.self_calibration import SelfCalibration, calibrate
 from uwb_mitigation.training import candidates as models
 from uwb_mitigation.training import selection as selections
@@ -71,7 +71,7 @@ class SiteSolution:
         notes: unobservable quantities and excluded data.
         offset_changes_without: returns for held-out rows of `rows` the change of the pair offsets, m, if they are estimated
             without these rows.
-        truth: topic of the localisation; None: only ranges were used. localised: its time offset and lever arms.
+        truth: topic of the localisation; None: only ranges were used. alignment: its time offset and lever arms.
         track: (k, 3), positions of the tags. track_of: (k,), their segments.
         places: {tag id: position} of stationary tags; {`tag id #number`: position} of a tag with several positions.
         network_sd: standard deviation of the network's factor in the joint solution; 0: not estimated.
@@ -92,7 +92,7 @@ class SiteSolution:
     notes: tuple[str, ...]
     offset_changes_without: Callable[[NDArray[np.intp]], Mapping[tuple[int, int], float]]
     truth: str | None = None
-    localised: Localised | None = None
+    alignment: PoseAlignment | None = None
     track: NDArray[np.float64]
     track_of: NDArray[np.intp]
     places: Mapping[str, tuple[float, float, float]]
@@ -213,7 +213,7 @@ class SiteCalibration:
             "places": {name: list(position) for name, position in solution.places.items()},
             "notes": list(self.notes),
             "left_out": dict(self.site.left_out),
-            "localisation": None if solution.localised is None else solution.localised.as_json(),
+            "localisation": None if solution.alignment is None else solution.alignment.as_json(),
         }
 
     def write(self, output: Path, universal: Bundle, name: str) -> tuple[Bundle, Path]:
@@ -234,7 +234,7 @@ class SiteCalibration:
             "chosen": self.selection.chosen,
             "measurements": n,
             "configurations": len(self.data.names),
-            "split": "held out: stretches of the track, and anchors",
+            "split": "held out: segments of the track, and anchors",
             "started_from": f"{universal.model_id:08x}",
             "recipe": {"line": model.linear_bias.needs_power, "network": model.network is not None},
             "metrics_m": {row: {"mae": round(value, 4)} for row, value in metrics.items()},
@@ -300,7 +300,7 @@ def calibrate_without_truth(
         height_sd_m=height_sd_m,
     )
     on_progress("solving for track and offsets", 0.4)
-    track, ids = found.stretches, [anchor.id for anchor in site.anchors.anchors]
+    track, ids = found.segments, [anchor.id for anchor in site.anchors.anchors]
     of_range = site.begins[track.tag] + track.row
     is_known = np.isfinite(found.pseudo_m) & (found.pseudo_sd_m <= MAX_TRUTH_SD_M)
     is_known, outliers = _without_outliers(track.ranges.range_m - found.pseudo_m, is_known)
@@ -320,7 +320,7 @@ def calibrate_without_truth(
         offsets = Offsets(common, anchors=own)
 
     def offset_changes_without(held_out: NDArray[np.intp]) -> dict[tuple[int, int], float]:
-        again = found.found_without(_whole_segments(used[held_out], used, track.of))
+        again = found.without_ranges(_whole_segments(used[held_out], used, track.of))
         return {
             (found.tag_ids[tag], ids[row]): again.pair(tag, row)[0] - found.pair(tag, row)[0]
             for tag, row in found.pairs()
@@ -330,9 +330,9 @@ def calibrate_without_truth(
     solution = SiteSolution(
         rows=of_range[used],
         true_m=found.pseudo_m[used],
-        antenna=found.fit.position[found.fit.links.knot[found.fit.links.of]][used],
+        antenna=found.fit.position[found.fit.observations.knot[found.fit.observations.of]][used],
         segment=track.of[used],
-        stationary=track.at_rest,
+        stationary=track.is_stationary,
         pairs=pairs,
         offsets=offsets,
         level=found.level,
@@ -340,7 +340,7 @@ def calibrate_without_truth(
         notes=tuple(notes),
         offset_changes_without=offset_changes_without,
         track=found.fit.position,
-        track_of=found.fit.links.knot_stretch,
+        track_of=found.fit.observations.knot_segment,
         places=_places(found),
         network_sd=found.value(NETWORK)[1],
         line=found.value(LEVEL),
@@ -366,7 +366,7 @@ def calibrate_with_truth(
 
     Args:
         paths: for each tag, the poses of the robot that carries it, for each recording.
-        time_offset_s, lever_arms_m, estimate_lever_arm: see `solve_localised`.
+        time_offset_s, lever_arms_m, estimate_lever_arm: see `align_poses`.
 
     Raises:
         DatasetError: as for `calibrate_without_truth`; or too few ranges within the times of the localisation.
@@ -377,7 +377,7 @@ def calibrate_with_truth(
         for own in paths
     ]
     known = regressors(site, universal)
-    found = solve_localised(
+    found = align_poses(
         site.anchors,
         site.tags,
         joined,
@@ -406,7 +406,7 @@ def calibrate_with_truth(
     def offset_changes_without(held_out: NDArray[np.intp]) -> dict[tuple[int, int], float]:
         rest = np.setdiff1d(rows, rows[held_out])
         own = [rest[tag[rest] == number] for number in range(len(site.tags))]
-        again = solve_localised(
+        again = align_poses(
             site.anchors,
             [one.take(part - begin) for one, part, begin in zip(site.tags, own, site.begins, strict=True)],
             joined,
@@ -433,7 +433,7 @@ def calibrate_with_truth(
         notes=(),
         offset_changes_without=offset_changes_without,
         truth=topic,
-        localised=found,
+        alignment=found,
         track=found.position[rows],
         track_of=tag[rows],
         places={},
@@ -528,16 +528,16 @@ def regressors(site: SiteData, universal: Bundle) -> Regressors:
 
 def _places(found: SelfCalibration) -> dict[str, tuple[float, float, float]]:
     """Return the positions of stationary tags, see `SiteSolution.places`."""
-    resting = np.flatnonzero(found.fit.links.at_rest).tolist()
-    tag_of = dict(zip(found.stretches.of.tolist(), found.stretches.tag.tolist(), strict=True))
-    positions = Counter(tag_of[segment] for segment in resting)
+    stationary = np.flatnonzero(found.fit.observations.is_stationary).tolist()
+    tag_of = dict(zip(found.segments.of.tolist(), found.segments.tag.tolist(), strict=True))
+    positions = Counter(tag_of[segment] for segment in stationary)
     number: Counter[int] = Counter()
     places = {}
-    for segment in resting:
+    for segment in stationary:
         tag = tag_of[segment]
         number[tag] += 1
         suffix = f" #{number[tag]}" if positions[tag] > 1 else ""
-        x, y, z = found.fit.position[found.fit.links.knot_stretch == segment][0].tolist()
+        x, y, z = found.fit.position[found.fit.observations.knot_segment == segment][0].tolist()
         places[f"{found.tag_ids[tag]}{suffix}"] = (x, y, z)
     return places
 

@@ -28,10 +28,10 @@ def site_page(found: SiteCalibration, name: str) -> str:
             before, after = (float(np.abs(error[own]).mean()) for error in (found.raw_m, found.held_out_m))
             by_anchor.append((str(anchor), int(own.sum()), before, after))
     facts = []
-    if solution.localised is not None:
-        arms = "; ".join(", ".join(f"{value:.3f}" for value in own) for own in solution.localised.lever_arm_m)
+    if solution.alignment is not None:
+        arms = "; ".join(", ".join(f"{value:.3f}" for value in own) for own in solution.alignment.lever_arm_m)
         facts.append(
-            f"Localisation {solution.truth}: time offset {solution.localised.time_offset_s:.3f} s, lever arm {arms} m."
+            f"Localisation {solution.truth}: time offset {solution.alignment.time_offset_s:.3f} s, lever arm {arms} m."
         )
     if found.selection.model.factor is not None and solution.network_sd:
         factor = f"{found.selection.model.factor:.2f} +- {solution.network_sd:.2f}"

@@ -17,7 +17,7 @@ from uwb_mitigation.errors import ParameterError
 
 
 @dataclass(frozen=True, slots=True)
-class Model:
+class NoiseModel:
     """Motion and range error model.
 
     Attributes:
@@ -104,15 +104,17 @@ MIN_ALIKE = 20
 """Minimum number of errors for an estimate of their standard deviation."""
 
 
-def scatter_of(error_m: NDArray[np.float64], alike: NDArray[np.intp], kinds: int) -> NDArray[np.float64]:
+def scatter_of(
+    error_m: NDArray[np.float64], noise_group: NDArray[np.intp], kinds: int
+) -> NDArray[np.float64]:
     """Return the standard deviation of each kind of errors (n,), float64 (kinds,), m: 1.48 times the median absolute error.
 
     Args:
-        alike: int (n,), the kind of each. A kind with fewer than `MIN_ALIKE` errors gets the value of all errors.
+        noise_group: int (n,), the kind of each. A kind with fewer than `MIN_ALIKE` errors gets the value of all errors.
     """
     found = np.full(kinds, MAD_TO_SD * float(np.median(np.abs(error_m))))
     for kind in range(kinds):
-        own = error_m[alike == kind]
+        own = error_m[noise_group == kind]
         if len(own) >= MIN_ALIKE:
             found[kind] = MAD_TO_SD * float(np.median(np.abs(own)))
     return found
@@ -134,14 +136,14 @@ class Regressors:
         names: of the q parameters.
         rows: float64 (n, q), derivative of each range with respect to each parameter; 0: unknown.
         mean, sd: float64 (q,), prior knowledge; an infinite sd: none.
-        alike: int (n,), ranges whose errors have the same standard deviation have the same number, from 0.
+        noise_group: int (n,), ranges whose errors have the same standard deviation have the same number, from 0.
     """
 
     names: tuple[str, ...]
     rows: NDArray[np.float64]
     mean: NDArray[np.float64]
     sd: NDArray[np.float64]
-    alike: NDArray[np.intp]
+    noise_group: NDArray[np.intp]
 
     @classmethod
     def one(cls, name: str, row: NDArray[np.float64], mean: float, sd: float) -> Regressors:
@@ -161,19 +163,19 @@ class Regressors:
 
     def take(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> Regressors:
         """Return the parameters for the ranges at `index`."""
-        return replace(self, rows=self.rows[index], alike=self.alike[index])
+        return replace(self, rows=self.rows[index], noise_group=self.noise_group[index])
 
     def only(self, kept: NDArray[np.bool_]) -> Regressors:
         """Return only the parameters `kept`, bool (q,)."""
         names = tuple(name for name, is_kept in zip(self.names, kept, strict=True) if is_kept)
-        return Regressors(names, self.rows[:, kept], self.mean[kept], self.sd[kept], self.alike)
+        return Regressors(names, self.rows[:, kept], self.mean[kept], self.sd[kept], self.noise_group)
 
     def joined(self, other: Regressors) -> Regressors:
-        """Return these parameters followed by the others; `alike` is unchanged."""
+        """Return these parameters followed by the others; `noise_group` is unchanged."""
         return Regressors(
             self.names + other.names,
             np.concatenate([self.rows, other.rows], axis=1),
             np.concatenate([self.mean, other.mean]),
             np.concatenate([self.sd, other.sd]),
-            self.alike,
+            self.noise_group,
         )

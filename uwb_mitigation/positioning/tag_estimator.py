@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.filter import FIRST_ERROR, OFFSET, RangeFilter
 from uwb_mitigation.positioning.geometry import Area, Geometry, Height, geometry
-from uwb_mitigation.positioning.model import Model
-from uwb_mitigation.positioning.start import IMPLAUSIBLE, Place, places
+from uwb_mitigation.positioning.initialization import IMPLAUSIBLE, CandidatePosition, candidate_positions
+from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.tracks import Estimate, Heights, Ranges, Track
 
 WINDOW_S = 1.0
 """A position is searched from the ranges of this time: every anchor had its turn, and a robot has moved by a metre."""
 
-SILENCE_S = 3.0
+RANGE_TIMEOUT_S = 3.0
 """After a longer time without ranges the position is searched again: the predicted one may mislead."""
 
 OUTLIER = 3.0
@@ -43,18 +43,18 @@ _UNDETERMINED_M = 5.0
 """A position with a larger horizontal standard deviation is not determined by the ranges."""
 
 _KEPT_RANGES = 400
-_MAX_PLACES = 12
+_MAX_CANDIDATES = 12
 _RETRY_S = 0.25
 _LEARN_SPARE = 2
 _NANOSECONDS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Setting:
+class EstimatorConfig:
     """Prior knowledge: anchors, error model, and of the tags a constant height, an area or measured heights, if any."""
 
     anchors: AnchorMap
-    model: Model = field(default_factory=Model)
+    model: NoiseModel = field(default_factory=NoiseModel)
     height: Height | None = None
     area: Area | None = None
     heights: Heights | None = None
@@ -81,16 +81,16 @@ class _AnchorState:
 
 
 @dataclass(slots=True)
-class _Candidate:
+class _Hypothesis:
     filter: RangeFilter
     loss: float
 
 
-class TagLocator:
+class TagEstimator:
     """Locates one tag.
 
     Attributes:
-        anchors: those of the setting.
+        anchors: those of the config.
         counts: numbers of ranges out of order (`backwards`), and of times the tag was `found`, `lost`, and without ranges
             (`silent`).
         innovation_mean, innovation_square: running means over about a hundred ranges: of the normalised innovation, and of
@@ -101,28 +101,28 @@ class TagLocator:
 
     filter: RangeFilter | None
     _last_known: RangeFilter | None
-    _candidates: list[_Candidate]
+    _hypotheses: list[_Hypothesis]
     _ambiguous_with: list[NDArray[np.float64]]
     _origin_ns: int | None
     _time_s: float
 
-    def __init__(self, setting: Setting) -> None:
-        self.anchors = setting.anchors
+    def __init__(self, config: EstimatorConfig) -> None:
+        self.anchors = config.anchors
         self.counts: Counter[str] = Counter()
         self.innovation_mean, self.innovation_square = 0.0, 1.0
         self.undetermined = False
-        self._setting, self._model = setting, setting.model
-        self._height, self._area = setting.height, setting.area
+        self._config, self._model = config, config.model
+        self._height, self._area = config.height, config.area
         self._states = [_AnchorState() for _ in range(len(self.anchors))]
         self._heights: deque[tuple[float, float, float]] = deque(maxlen=_KEPT_RANGES)
         self._recent: deque[tuple[float, int, float, float]] = deque(maxlen=_KEPT_RANGES)
-        self._pressed = False
+        self._at_boundary = False
         self.restart()
 
     @property
     def candidates(self) -> int:
         """The number of plausible positions; 1: the tag is followed, 0: there are too few ranges."""
-        return 1 if self.filter is not None else len(self._candidates) + len(self._ambiguous_with)
+        return 1 if self.filter is not None else len(self._hypotheses) + len(self._ambiguous_with)
 
     def add(
         self, stamp_ns: int, anchor: int, range_m: float, variance_m2: float = math.nan
@@ -149,9 +149,9 @@ class TagLocator:
             else:
                 self.counts["backwards"] += 1
                 time_s = self._time_s
-        if self.filter is not None and time_s - self._time_s > SILENCE_S:
+        if self.filter is not None and time_s - self._time_s > RANGE_TIMEOUT_S:
             self.counts["silent"] += 1
-            self._seek(time_s)
+            self._restart_search(time_s)
         self._time_s = time_s
         self._recent.append((time_s, anchor, range_m, variance_m2))
         self._states[anchor].received_s = time_s
@@ -162,10 +162,10 @@ class TagLocator:
         return None if self.filter is None else self.filter.estimate(stamp_ns)
 
     def run(self, ranges: Ranges) -> Track:
-        """Process recorded ranges, and the measured heights of the setting; return an estimate for each range with one."""
+        """Process recorded ranges, and the measured heights of the config; return an estimate for each range with one."""
         estimates: list[Estimate] = []
         heights: deque[tuple[int, float, float]] = deque()
-        if (known := self._setting.heights) is not None:
+        if (known := self._config.heights) is not None:
             columns = (known.stamp_ns, known.height_m, known.variance_m2)
             heights.extend(zip(*(column.tolist() for column in columns), strict=True))
         latest_ns = None
@@ -185,9 +185,9 @@ class TagLocator:
     def add_height(self, height_m: float, variance_m2: float) -> None:
         """Update with the tag's height (finite) and its variance (positive), at the time of the latest range."""
         self._heights.append((self._time_s, height_m, variance_m2))
-        if self._height is None and any(_bends(one, height_m, variance_m2) for one in self._filters()):
-            found = self._places()
-            if found and len(found) <= _MAX_PLACES:
+        if self._height is None and any(_is_nonlinear(one, height_m, variance_m2) for one in self._filters()):
+            found = self._candidate_positions()
+            if found and len(found) <= _MAX_CANDIDATES:
                 self._last_known = self.filter or self._last_known
                 self.filter = None
                 self._start(found, self._time_s)
@@ -196,7 +196,7 @@ class TagLocator:
         for one in self._filters():
             z = one.update_height(height_m, variance_m2)
             self._confine(one)
-            for candidate in self._candidates:
+            for candidate in self._hypotheses:
                 if candidate.filter is one:
                     candidate.loss += float(self._model.loss(np.float64(z)))
 
@@ -213,28 +213,28 @@ class TagLocator:
         """Reset the position, but not the statistics."""
         self._origin_ns = stamp_ns
         self.filter = self._last_known = None
-        self._candidates, self._ambiguous_with = [], []
+        self._hypotheses, self._ambiguous_with = [], []
         self._recent.clear()
         self._heights.clear()
-        self._time_s = self._next_try_s = self._checked_s = self._sought_since_s = -math.inf
+        self._time_s = self._next_try_s = self._checked_s = self._search_began_s = -math.inf
         for state in self._states:
             state.received_s, state.outliers = -math.inf, 0.0
 
-    def heard(self, within_s: float = WINDOW_S) -> list[int]:
+    def received_anchors(self, within_s: float = WINDOW_S) -> list[int]:
         """Return the rows of the anchors that were received within that time before the latest range."""
         return [i for i, s in enumerate(self._states) if s.received_s >= self._time_s - within_s]
 
     def disagreeing(self) -> list[int]:
         """Return the rows of anchors whose ranges contradict those of most others."""
-        heard = self.heard(5.0)
-        odd = [i for i in heard if abs(self._states[i].mean_z) > DISAGREES]
-        return odd if 2 * len(odd) < len(heard) else []
+        received = self.received_anchors(5.0)
+        odd = [i for i in received if abs(self._states[i].mean_z) > DISAGREES]
+        return odd if 2 * len(odd) < len(received) else []
 
     def geometry(self) -> Geometry | None:
         """Return the geometry of the anchors that are received; None: the position is not known."""
         if self.filter is None:
             return None
-        rows = self.heard()
+        rows = self.received_anchors()
         return geometry(self.anchors.position[rows], self.filter.position, level=self._dims == 2)
 
     def _seconds(self, stamp_ns: int) -> float:
@@ -243,7 +243,7 @@ class TagLocator:
         return (stamp_ns - self._origin_ns) / _NANOSECONDS
 
     def _filters(self) -> list[RangeFilter]:
-        return [self.filter] if self.filter is not None else [c.filter for c in self._candidates]
+        return [self.filter] if self.filter is not None else [c.filter for c in self._hypotheses]
 
     def _follow(
         self, known: RangeFilter, time_s: float, anchor: int, range_m: float, variance_m2: float
@@ -251,7 +251,7 @@ class TagLocator:
         known.predict(time_s)
         z, _ = known.update(anchor, range_m, variance_m2)
         if self._area is not None and self._confine(known):
-            self._pressed = True
+            self._at_boundary = True
         limited = max(-10.0, min(10.0, z))
         self.innovation_mean += 0.01 * (limited - self.innovation_mean)
         self.innovation_square += 0.01 * (limited * limited - self.innovation_square)
@@ -260,13 +260,13 @@ class TagLocator:
         state.mean_z += 0.02 * (max(-5.0, min(5.0, z)) - state.mean_z)
         if time_s - self._checked_s >= _RETRY_S:
             self._checked_s = time_s
-            heard = self.heard()
-            known.learns = len(heard) >= self._dims + _LEARN_SPARE
-            odd = sum(self._states[i].outliers > 0.5 for i in heard)
+            received = self.received_anchors()
+            known.learns = len(received) >= self._dims + _LEARN_SPARE
+            odd = sum(self._states[i].outliers > 0.5 for i in received)
             # At the edge of the area the filter may follow a solution that is outside of it.
-            if self._pressed or (2 * odd >= len(heard) > 0 and odd):
-                self._pressed = False
-                self._doubt(known)
+            if self._at_boundary or (2 * odd >= len(received) > 0 and odd):
+                self._at_boundary = False
+                self._check_lost(known)
 
     def _confine(self, one: RangeFilter) -> bool:
         """Keep a filter inside the area; return whether it was outside."""
@@ -285,9 +285,9 @@ class TagLocator:
     def _dims(self) -> int:
         return 2 if self._known_height() is not None else 3
 
-    def _doubt(self, known: RangeFilter) -> None:
+    def _check_lost(self, known: RangeFilter) -> None:
         """Search for a position that explains the ranges much better, after most anchors contradicted the filter."""
-        found = self._places()
+        found = self._candidate_positions()
         if not found:
             return
         anchors, range_m, sd_m = self._window()
@@ -302,20 +302,20 @@ class TagLocator:
             self._start(found, self._time_s)
             self._settle()
 
-    def _seek(self, time_s: float) -> None:
+    def _restart_search(self, time_s: float) -> None:
         """Search the position again, with the present one as prior."""
         self._last_known = self.filter
         self.filter = None
-        self._candidates = []
+        self._hypotheses = []
         self._recent.clear()
-        self._sought_since_s = time_s
+        self._search_began_s = time_s
         self._next_try_s = -math.inf
 
     def _search(self, time_s: float, anchor: int, range_m: float, variance_m2: float) -> None:
-        if self._sought_since_s == -math.inf:
-            self._sought_since_s = time_s
-        if self._candidates:
-            for candidate in self._candidates:
+        if self._search_began_s == -math.inf:
+            self._search_began_s = time_s
+        if self._hypotheses:
+            for candidate in self._hypotheses:
                 candidate.filter.predict(time_s)
                 z, sd = candidate.filter.update(anchor, range_m, variance_m2)
                 self._confine(candidate.filter)
@@ -326,35 +326,38 @@ class TagLocator:
             return
         self._next_try_s = time_s + _RETRY_S
         # Wait until every anchor had its turn, or enough were received.
-        if time_s - self._sought_since_s < WINDOW_S / 2 and len(self.heard()) < self._dims + _LEARN_SPARE:
+        if (
+            time_s - self._search_began_s < WINDOW_S / 2
+            and len(self.received_anchors()) < self._dims + _LEARN_SPARE
+        ):
             return
-        found = self._places()
-        if found and len(found) <= _MAX_PLACES:
+        found = self._candidate_positions()
+        if found and len(found) <= _MAX_CANDIDATES:
             self._start(found, time_s)
             self._settle()
 
     def _settle(self) -> None:
         """Remove candidates that are implausible or equal; follow the last one."""
-        best = min(candidate.loss for candidate in self._candidates)
-        kept: list[_Candidate] = []
-        for candidate in sorted(self._candidates, key=lambda c: c.loss):
+        best = min(candidate.loss for candidate in self._hypotheses)
+        kept: list[_Hypothesis] = []
+        for candidate in sorted(self._hypotheses, key=lambda c: c.loss):
             if candidate.loss > best + IMPLAUSIBLE:
                 continue
             if all(np.linalg.norm(candidate.filter.position - other.filter.position) > 0.3 for other in kept):
                 kept.append(candidate)
-        self._candidates = kept
+        self._hypotheses = kept
         if len(kept) == 1 and self._is_unique(kept[0].filter):
             self.filter = kept[0].filter
             self._last_known = None
-            self._candidates = []
+            self._hypotheses = []
             self.counts["found"] += 1
             self._checked_s = self._time_s + WINDOW_S
             for state in self._states:
                 state.outliers = 0.0
-        elif self._time_s - self._sought_since_s > 10.0 * WINDOW_S:
+        elif self._time_s - self._search_began_s > 10.0 * WINDOW_S:
             # The candidates from one second of ranges may all be wrong: search again.
-            self._sought_since_s = self._time_s
-            self._candidates = []
+            self._search_began_s = self._time_s
+            self._hypotheses = []
 
     def _is_unique(self, one: RangeFilter) -> bool:
         """Whether the latest ranges distinguish the filter's position from every other possible one.
@@ -365,25 +368,25 @@ class TagLocator:
         if self._time_s < self._next_try_s:
             return not (self._ambiguous_with or self.undetermined)
         self._next_try_s = self._time_s + _RETRY_S
-        rows = self.heard()
+        rows = self.received_anchors()
         anchors, model = self.anchors.position[rows], self._model
         range_m = np.linalg.norm(anchors - one.position, axis=1)
         sd_m = np.sqrt(model.range_sd**2 + model.offset_sd**2 + self.anchors.sd[rows] ** 2)
         height = self._known_height()
-        found = places(anchors, range_m, sd_m, model, height=height, area=self._area)
+        found = candidate_positions(anchors, range_m, sd_m, model, height=height, area=self._area)
         self._ambiguous_with, self.undetermined = [], False
         if not found:
             return True
-        nearest = min(found, key=lambda place: float(np.linalg.norm(place.position - one.position)))
-        here = self._surprise(nearest, self._time_s)
-        for place in found:
-            z = (np.linalg.norm(anchors - place.position, axis=1) - range_m) / sd_m
-            apart = 2.0 * (self._surprise(place, self._time_s) - here) + float(z @ z)
-            if place is nearest:
-                largest = float(np.linalg.eigvalsh(place.covariance[:2, :2])[-1])
+        nearest = min(found, key=lambda candidate: float(np.linalg.norm(candidate.position - one.position)))
+        here = self._prior_loss(nearest, self._time_s)
+        for candidate in found:
+            z = (np.linalg.norm(anchors - candidate.position, axis=1) - range_m) / sd_m
+            apart = 2.0 * (self._prior_loss(candidate, self._time_s) - here) + float(z @ z)
+            if candidate is nearest:
+                largest = float(np.linalg.eigvalsh(candidate.covariance[:2, :2])[-1])
                 self.undetermined = self._last_known is None and largest > _UNDETERMINED_M**2
-            elif apart < _SEPARABLE and np.linalg.norm((place.position - one.position)[:2]) > 0.5:
-                self._ambiguous_with.append(place.position)
+            elif apart < _SEPARABLE and np.linalg.norm((candidate.position - one.position)[:2]) > 0.5:
+                self._ambiguous_with.append(candidate.position)
         return not (self._ambiguous_with or self.undetermined)
 
     def _window(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
@@ -399,21 +402,23 @@ class TagLocator:
             sds.append(math.sqrt(variance + self.anchors.sd[row] ** 2 + (self._model.speed * age) ** 2 / 3.0))
         return self.anchors.position[self._rows], np.array(ranges), np.array(sds)
 
-    def _places(self) -> list[Place]:
+    def _candidate_positions(self) -> list[CandidatePosition]:
         anchors, range_m, sd_m = self._window()
         if len(range_m) < self._dims:
             return []
-        return places(anchors, range_m, sd_m, self._model, height=self._known_height(), area=self._area)
+        return candidate_positions(
+            anchors, range_m, sd_m, self._model, height=self._known_height(), area=self._area
+        )
 
-    def _start(self, found: list[Place], time_s: float) -> None:
+    def _start(self, found: list[CandidatePosition], time_s: float) -> None:
         """Start a filter at each position, with the correlation between the position and the errors of the ranges."""
-        self._candidates, self._ambiguous_with = [], []
+        self._hypotheses, self._ambiguous_with = [], []
         # The next check whether the position is unique must not wait.
         self._next_try_s = -math.inf
         model, height = self._model, self._height
-        for place in found:
-            position, covariance = place.position.copy(), place.covariance.copy()
-            offset = place.gain.sum(axis=1)
+        for candidate in found:
+            position, covariance = candidate.position.copy(), candidate.covariance.copy()
+            offset = candidate.gain.sum(axis=1)
             covariance += np.multiply.outer(offset, offset) * model.offset_sd**2
             # The tag has moved since the middle of the window.
             covariance[[0, 1, 2], [0, 1, 2]] += (model.speed * WINDOW_S / 2.0) ** 2
@@ -423,26 +428,26 @@ class TagLocator:
                 covariance[2, 2] = height.sd**2
             one = RangeFilter(self.anchors, model, time_s, position, covariance, level=height is not None)
             errors = FIRST_ERROR + np.array(self._rows)
-            one.p[:3, errors] = place.gain * one.p[errors, errors]
+            one.p[:3, errors] = candidate.gain * one.p[errors, errors]
             one.p[:3, OFFSET] = offset * model.offset_sd**2
             if height is not None:
                 one.p[2, OFFSET:] = 0.0
             one.p[OFFSET:, :3] = one.p[:3, OFFSET:].T
-            self._candidates.append(_Candidate(one, place.loss + self._surprise(place, time_s)))
+            self._hypotheses.append(_Hypothesis(one, candidate.loss + self._prior_loss(candidate, time_s)))
 
-    def _surprise(self, place: Place, time_s: float) -> float:
+    def _prior_loss(self, candidate: CandidatePosition, time_s: float) -> float:
         """Return minus the log likelihood of a position after the last known one."""
         if self._last_known is None:
             return 0.0
         before = self._last_known.copy()
         before.predict(time_s)
-        apart = place.position[:2] - before.position[:2]
-        spread = before.p[:2, :2] + place.covariance[:2, :2]
+        apart = candidate.position[:2] - before.position[:2]
+        spread = before.p[:2, :2] + candidate.covariance[:2, :2]
         # Limited, so that a kidnapped tag is also found.
         return min(IMPLAUSIBLE, 0.5 * float(apart @ np.linalg.solve(spread, apart)))
 
 
-def _bends(one: RangeFilter, height_m: float, variance_m2: float) -> bool:
+def _is_nonlinear(one: RangeFilter, height_m: float, variance_m2: float) -> bool:
     """Return whether a height would move an estimate so far in plan that the filter's linear model is not valid."""
     share = math.hypot(one.p[0, 2], one.p[1, 2]) / (one.p[2, 2] + variance_m2)
     return bool(share * abs(height_m - float(one.x[2])) > _BENDS_M)

@@ -1,4 +1,4 @@
-"""All tags of a site: a locator and a fixed-lag smoother for each, and their diagnostics."""
+"""All tags of a site: a estimator and a fixed-lag smoother for each, and their diagnostics."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import numpy as np
 from uwb_mitigation.errors import DatasetError, format_id
 from uwb_mitigation.positioning.filter import RangeFilter
 from uwb_mitigation.positioning.geometry import Shape, protection_levels, shape
-from uwb_mitigation.positioning.locator import SILENCE_S, Setting, TagLocator
 from uwb_mitigation.positioning.smoother import Smoother, fused_with_batch
+from uwb_mitigation.positioning.tag_estimator import RANGE_TIMEOUT_S, EstimatorConfig, TagEstimator
 from uwb_mitigation.positioning.tracks import Estimate, Heights, Ranges, Track
 
 MAX_TAGS = 256
@@ -31,12 +31,12 @@ _ITERATIONS = 3
 _SECOND_NS = 1_000_000_000
 
 
-class FixedLag:
+class FixedLagSmoother:
     """Keeps the latest states of the filter and ranges of a tag, and smooths over them on request."""
 
-    def __init__(self, setting: Setting) -> None:
+    def __init__(self, config: EstimatorConfig) -> None:
         # The filter has no offsets of single anchors, and 1.5 s do not determine them.
-        self._setting = replace(setting, model=replace(setting.model, pair_sd=0.0))
+        self._config = replace(config, model=replace(config.model, pair_sd=0.0))
         self._states: deque[tuple[int, RangeFilter]] = deque()
         self._ranges: deque[tuple[int, int, float, float]] = deque()
         self._heights: deque[tuple[int, float, float]] = deque(maxlen=_MAX_RANGES)
@@ -68,7 +68,7 @@ class FixedLag:
         """Return the position `LAG_S` before the latest range; None: it is not known for that long."""
         if not self._states or len(self._ranges) < 2:
             return None
-        setting, (start_ns, known) = self._setting, self._states[0]
+        config, (start_ns, known) = self._config, self._states[0]
         wanted_ns = self._ranges[-1][0] - round(LAG_S * _SECOND_NS)
         after = [row for row in self._ranges if row[0] > start_ns]
         if start_ns > wanted_ns or len(after) < 2:
@@ -83,9 +83,9 @@ class FixedLag:
         initial = Track.of([one.estimate(at) for at, one in states])
         if self._heights:
             columns = zip(*self._heights, strict=True)
-            setting = replace(setting, heights=Heights(*(np.array(column) for column in columns)))
+            config = replace(config, heights=Heights(*(np.array(column) for column in columns)))
         try:
-            track = Smoother(setting, ranges, after=first).fit(initial, _ITERATIONS).track
+            track = Smoother(config, ranges, after=first).fit(initial, _ITERATIONS).track
         except DatasetError:
             return None
         at = int(np.abs(track.stamp_ns - wanted_ns).argmin())
@@ -95,7 +95,7 @@ class FixedLag:
         live = live.copy()
         live.predict(live.time_s + (wanted_ns - live_ns) / _SECOND_NS)
         state, covariance, spread = fused_with_batch(live.x[None, :6], live.p[None, :6, :6], batch)
-        position = state[0, :3] if setting.area is None else setting.area.clip(state[0, :3])
+        position = state[0, :3] if config.area is None else config.area.clip(state[0, :3])
         return Estimate(wanted_ns, position, state[0, 3:], (covariance + spread)[0])
 
 
@@ -105,13 +105,13 @@ class Tag:
 
     Attributes:
         tag_id: its number.
-        locator, smoother: of this tag.
+        estimator, smoother: of this tag.
         latest_ns: stamp of its latest range.
     """
 
     tag_id: int
-    locator: TagLocator
-    smoother: FixedLag
+    estimator: TagEstimator
+    smoother: FixedLagSmoother
     latest_ns: int = 0
 
     def add_height(self, height_m: float, variance_m2: float) -> None:
@@ -120,26 +120,26 @@ class Tag:
             return
         # A variance of 0 means unknown in ROS.
         variance_m2 = variance_m2 if variance_m2 > 0.0 else UNKNOWN_HEIGHT_SD_M**2
-        self.locator.add_height(height_m, variance_m2)
+        self.estimator.add_height(height_m, variance_m2)
         self.smoother.add_height(height_m, variance_m2)
 
 
-class Fleet:
+class MultiTagEstimator:
     """The tags of a site.
 
     Attributes:
-        anchors: those of the setting.
+        anchors: those of the config.
         tags: {tag id: tag}, in the order of their first ranges.
-        strangers: number of ranges from anchors that are not on the map, {anchor id: count}.
+        unknown_anchors: number of ranges from anchors that are not on the map, {anchor id: count}.
         invalid: ranges that were not finite, or negative.
     """
 
-    def __init__(self, setting: Setting) -> None:
-        self.anchors = setting.anchors
+    def __init__(self, config: EstimatorConfig) -> None:
+        self.anchors = config.anchors
         self.tags: dict[int, Tag] = {}
-        self.strangers: Counter[int] = Counter()
+        self.unknown_anchors: Counter[int] = Counter()
         self.invalid = 0
-        self._setting = setting
+        self._config = config
 
     def add(
         self, tag_id: int, anchor_id: int, stamp_ns: int, range_m: float, variance_m2: float
@@ -151,8 +151,8 @@ class Fleet:
         """
         row = self.anchors.index.get(anchor_id)
         if row is None:
-            if anchor_id in self.strangers or len(self.strangers) < MAX_TAGS:
-                self.strangers[anchor_id] += 1
+            if anchor_id in self.unknown_anchors or len(self.unknown_anchors) < MAX_TAGS:
+                self.unknown_anchors[anchor_id] += 1
             return None
         if not (math.isfinite(range_m) and range_m >= 0.0):
             self.invalid += 1
@@ -162,10 +162,10 @@ class Fleet:
             if len(self.tags) >= MAX_TAGS:
                 self.invalid += 1
                 return None
-            tag = self.tags[tag_id] = Tag(tag_id, TagLocator(self._setting), FixedLag(self._setting))
-        estimate = tag.locator.add(stamp_ns, row, range_m, variance_m2)
+            tag = self.tags[tag_id] = Tag(tag_id, TagEstimator(self._config), FixedLagSmoother(self._config))
+        estimate = tag.estimator.add(stamp_ns, row, range_m, variance_m2)
         tag.latest_ns = stamp_ns
-        known = tag.locator.filter
+        known = tag.estimator.filter
         if known is None:
             tag.smoother.clear()
         elif estimate is not None:
@@ -175,54 +175,54 @@ class Fleet:
     def warnings(self) -> list[str]:
         """Return warnings for the diagnostics; empty: none."""
         found = []
-        if self.strangers:
-            names = ", ".join(format_id(identity) for identity in sorted(self.strangers)[:5])
+        if self.unknown_anchors:
+            names = ", ".join(format_id(identity) for identity in sorted(self.unknown_anchors)[:5])
             found.append(f"ranges of anchors that are not in the anchors file: {names}")
         for tag in self.tags.values():
-            locator, name = tag.locator, f"tag {format_id(tag.tag_id)}"
-            if locator.filter is None:
-                found.append(f"{name}: {self._why(locator)}")
-            odd = [self.anchors.anchors[row] for row in locator.disagreeing()]
+            estimator, name = tag.estimator, f"tag {format_id(tag.tag_id)}"
+            if estimator.filter is None:
+                found.append(f"{name}: {self._unknown_reason(estimator)}")
+            odd = [self.anchors.anchors[row] for row in estimator.disagreeing()]
             found += [
                 f"{name}: ranges of anchor {anchor} do not fit: blocked, or wrong in the anchors file"
                 for anchor in odd
             ]
-            geometry = locator.geometry()
+            geometry = estimator.geometry()
             if geometry is not None and geometry.hdop > 10.0:
                 found.append(f"{name}: poor geometry, HDOP {geometry.hdop:.0f}")
         return found
 
-    def _why(self, locator: TagLocator) -> str:
-        rows = locator.heard(SILENCE_S)
-        needed = self._setting.dims
+    def _unknown_reason(self, estimator: TagEstimator) -> str:
+        rows = estimator.received_anchors(RANGE_TIMEOUT_S)
+        needed = self._config.dims
         if len(rows) < needed:
             return f"position unknown: {len(rows)} anchors received, {needed} or more needed"
-        kind, count = shape(self.anchors.position[rows]), locator.candidates
+        kind, count = shape(self.anchors.position[rows]), estimator.candidates
         text = f"position ambiguous: {count} candidates" if count > 1 else "position unknown"
-        if kind is Shape.LINE or (kind is Shape.PLANE and self._setting.height is None):
+        if kind is Shape.LINE or (kind is Shape.PLANE and self._config.height is None):
             text += f"; the received anchors are {kind.value}: set height, or an area that contains one candidate only"
         return text
 
-    def facts(self) -> dict[str, object]:
+    def diagnostics(self) -> dict[str, object]:
         """Return the values for the diagnostics."""
         found: dict[str, object] = {
             "anchors": len(self.anchors),
             "tags": len(self.tags),
             "ranges not valid": self.invalid,
-            "ranges of unknown anchors": self.strangers.total(),
+            "ranges of unknown anchors": self.unknown_anchors.total(),
         }
         for tag in self.tags.values():
-            locator, name = tag.locator, f"tag {format_id(tag.tag_id)}"
-            counts, known = locator.counts, locator.filter
+            estimator, name = tag.estimator, f"tag {format_id(tag.tag_id)}"
+            counts, known = estimator.counts, estimator.filter
             found |= {
-                f"{name} places": locator.candidates,
-                f"{name} anchors used": len(locator.heard()),
+                f"{name} candidates": estimator.candidates,
+                f"{name} anchors used": len(estimator.received_anchors()),
                 f"{name} found, lost, silent": f"{counts['found']}, {counts['lost']}, {counts['silent']}",
                 f"{name} out of order": counts["backwards"],
-                f"{name} innovation mean": f"{locator.innovation_mean:.2f}",
-                f"{name} innovation square": f"{locator.innovation_square:.2f}",
+                f"{name} innovation mean": f"{estimator.innovation_mean:.2f}",
+                f"{name} innovation square": f"{estimator.innovation_square:.2f}",
             }
-            geometry = locator.geometry()
+            geometry = estimator.geometry()
             if geometry is not None and known is not None:
                 levels = protection_levels(known.p)
                 found |= {

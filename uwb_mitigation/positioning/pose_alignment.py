@@ -17,16 +17,16 @@ from scipy.spatial.transform import Rotation
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.geometry import directions
-from uwb_mitigation.positioning.model import Model, Regressors, scatter_of
+from uwb_mitigation.positioning.noise_model import NoiseModel, Regressors, scatter_of
 from uwb_mitigation.positioning.tracks import Ranges
 
 GAP_S = 0.5
 """In longer gaps of the localisation the pose is unknown."""
 
-MAX_LAG_S = 2.0
-COARSE_LAGS_S = np.arange(-MAX_LAG_S, MAX_LAG_S + 0.01, 0.1)
-FINE_LAGS_S = np.arange(-0.1, 0.101, 0.02)
-LAG_SD_S, LEVER_SD_M, OFFSET_SD_M = 2.0, 1.0, 2.0
+MAX_TIME_OFFSET_S = 2.0
+COARSE_OFFSETS_S = np.arange(-MAX_TIME_OFFSET_S, MAX_TIME_OFFSET_S + 0.01, 0.1)
+FINE_OFFSETS_S = np.arange(-0.1, 0.101, 0.02)
+TIME_OFFSET_SD_S, LEVER_SD_M, OFFSET_SD_M = 2.0, 1.0, 2.0
 MIN_RANGES = 40
 MAX_RANGES, SEARCHED = 20_000, 4000
 """The fit, and the search for the time offset, use at most this number of ranges."""
@@ -40,7 +40,7 @@ SLOPE_S = 0.1
 SEPARATED_M = 0.1
 """A lever arm with a larger standard deviation cannot be separated from the offsets."""
 
-BLOCK_S, UNDERSTATED = 10.0, 1.5
+BLOCK_S, SD_INFLATION = 10.0, 1.5
 """Errors of blocks of this duration count as independent. The factor accounts for errors that
 recur with each lap, which are not in their scatter."""
 
@@ -54,7 +54,7 @@ _SMALL_M = 0.02
 _MAX_NEIGHBOURS = 20
 _WORST_CONDITION = 1e6
 _SECOND_NS = 1_000_000_000
-_MODEL = Model(long=1.5, short=1.5)
+_MODEL = NoiseModel(long=1.5, short=1.5)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,9 +93,9 @@ class PosePath:
             right[here] += powers[:, :3, None] * self.position[here + step][:, None]
         normal = moments[:, np.add.outer(np.arange(3), np.arange(3))]
         # With duplicate poses there are too few different times for a parabola.
-        told = (moments[:, 0] >= 5.0) & (np.linalg.cond(normal) < _WORST_CONDITION)
+        solvable = (moments[:, 0] >= 5.0) & (np.linalg.cond(normal) < _WORST_CONDITION)
         position = self.position.copy()
-        position[told] = np.linalg.solve(normal[told], right[told])[:, 0]
+        position[solvable] = np.linalg.solve(normal[solvable], right[solvable])[:, 0]
         return PosePath(self.stamp_ns, position, self.orientation)
 
     @classmethod
@@ -131,14 +131,14 @@ class PosePath:
         after = np.searchsorted(self.stamp_ns, wanted).clip(1, len(self) - 1)
         gap = self.stamp_ns[after] - self.stamp_ns[after - 1] > GAP_S * _SECOND_NS
         unknown = (wanted < self.stamp_ns[0]) | (wanted > self.stamp_ns[-1]) | gap
-        position, turn = self.interpolated(wanted)
-        matrices = turn.as_matrix()
+        position, rotation = self.interpolated(wanted)
+        matrices = rotation.as_matrix()
         position[unknown], matrices[unknown] = np.nan, np.nan
         return position, matrices
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Localised:
+class PoseAlignment:
     """The result.
 
     Attributes:
@@ -178,7 +178,7 @@ class Localised:
         }
 
 
-def solve_localised(
+def align_poses(
     anchors: AnchorMap,
     tags: Sequence[Ranges],
     paths: Sequence[PosePath],
@@ -187,7 +187,7 @@ def solve_localised(
     time_offset_s: float | None = None,
     lever_arms_m: NDArray[np.float64] | None = None,
     estimate_lever_arm: bool = False,
-) -> Localised:
+) -> PoseAlignment:
     """Estimate time offset and offsets, and on request the lever arms.
 
     Args:
@@ -213,10 +213,10 @@ def solve_localised(
     problem = _Problem(ranges, tag, of_pair.reshape(-1), anchor, known, smoothed, pairs.shape[1]).take(chosen)
     levers = np.zeros((len(tags), 3)) if lever_arms_m is None else lever_arms_m
     start, free = levers, np.full(levers.shape, estimate_lever_arm)
-    lag, free_lag = time_offset_s, time_offset_s is None
-    if lag is None:
-        lag, start = problem.likely(levers, estimate_lever_arm)
-    lag, lever, offset, sd = problem.solve(lag, start, levers, free_lag, free)
+    time_offset, free_time_offset = time_offset_s, time_offset_s is None
+    if time_offset is None:
+        time_offset, start = problem.likely(levers, estimate_lever_arm)
+    time_offset, lever, offset, sd = problem.solve(time_offset, start, levers, free_time_offset, free)
     if estimate_lever_arm:
         lever_sd = sd[1 : 1 + levers.size].reshape(levers.shape)
         free = lever_sd < SEPARATED_M
@@ -229,15 +229,15 @@ def solve_localised(
         if not free.all():
             # A level drive does not observe the height of the arm: it would trade off against the offsets.
             start = np.where(free, lever, levers)
-            lag, lever, offset, sd = problem.solve(lag, start, levers, free_lag, free)
-    position, turn = _poses_at(paths, tag, ranges.stamp_ns, lag)
-    antenna = position + np.einsum("nij,nj->ni", turn, lever[tag])
+            time_offset, lever, offset, sd = problem.solve(time_offset, start, levers, free_time_offset, free)
+    position, rotation = _poses_at(paths, tag, ranges.stamp_ns, time_offset)
+    antenna = position + np.einsum("nij,nj->ni", rotation, lever[tag])
     distance = np.linalg.norm(antenna - anchor, axis=1)
-    _check_enough(int(np.isfinite(distance).sum()), free_lag or estimate_lever_arm)
+    _check_enough(int(np.isfinite(distance).sum()), free_time_offset or estimate_lever_arm)
     lever_sd = np.where(free, sd[1 : 1 + levers.size].reshape(levers.shape), np.nan)
-    return Localised(
-        time_offset_s=lag,
-        time_offset_sd_s=float(sd[0]) if free_lag else 0.0,
+    return PoseAlignment(
+        time_offset_s=time_offset,
+        time_offset_sd_s=float(sd[0]) if free_time_offset else 0.0,
         lever_arm_m=lever,
         lever_arm_sd_m=lever_sd if estimate_lever_arm else np.zeros(levers.shape),
         pairs=tuple((int(a), int(b)) for a, b in pairs.T),
@@ -252,11 +252,11 @@ def _poses_at(
     paths: Sequence[PosePath], tag: NDArray[np.intp], stamp_ns: NDArray[np.int64], later_s: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return `PosePath.at` for the path of each tag (n,)."""
-    position, turn = np.zeros((len(tag), 3)), np.zeros((len(tag), 3, 3))
+    position, rotation = np.zeros((len(tag), 3)), np.zeros((len(tag), 3, 3))
     for number, path in enumerate(paths):
         own = tag == number
-        position[own], turn[own] = path.at(stamp_ns[own], later_s)
-    return position, turn
+        position[own], rotation[own] = path.at(stamp_ns[own], later_s)
+    return position, rotation
 
 
 def _check_enough(count: int, alignment_unknown: bool) -> None:
@@ -265,7 +265,7 @@ def _check_enough(count: int, alignment_unknown: bool) -> None:
     if count < least:
         raise DatasetError(
             f"{count} ranges lie within the localisation's times",
-            valid=f"{least} or more: do their clocks agree to {MAX_LAG_S:g} s?",
+            valid=f"{least} or more: do their clocks agree to {MAX_TIME_OFFSET_S:g} s?",
         )
 
 
@@ -296,23 +296,23 @@ class _Problem:
         count = min(len(self.ranges), SEARCHED)
         few = self.take(np.linspace(0, len(self.ranges) - 1, count).astype(int))
         best = (math.inf, 0.0, lever)
-        for lags in (COARSE_LAGS_S, FINE_LAGS_S):
-            for lag in (best[1] + lags).tolist():
-                arm = few._lever_arm(lag, lever) if free_lever else lever
-                left = np.abs(few._centred(lag, arm)[0])
+        for time_offsets in (COARSE_OFFSETS_S, FINE_OFFSETS_S):
+            for time_offset in (best[1] + time_offsets).tolist():
+                arm = few._lever_arm(time_offset, lever) if free_lever else lever
+                left = np.abs(few._centred(time_offset, arm)[0])
                 if np.isfinite(left).sum() >= MIN_RANGES:
-                    best = min(best, (float(np.nanmedian(left)), lag, arm), key=lambda one: one[0])
+                    best = min(best, (float(np.nanmedian(left)), time_offset, arm), key=lambda one: one[0])
         if not math.isfinite(best[0]):
             raise DatasetError(
                 "too few ranges are within the time span of the localisation",
-                valid=f"clocks that agree to {MAX_LAG_S:g} s, or --time-offset",
+                valid=f"clocks that agree to {MAX_TIME_OFFSET_S:g} s, or --time-offset",
             )
         return best[1], best[2]
 
-    def _lever_arm(self, lag: float, lever: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _lever_arm(self, time_offset: float, lever: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the lever arms for a time offset: least absolute deviations, by reweighting."""
         for _ in range(LEVER_STEPS):
-            left, rows = self._centred(lag, lever)
+            left, rows = self._centred(time_offset, lever)
             known = np.isfinite(left) & np.isfinite(rows).all(axis=1)
             if int(known.sum()) < MIN_RANGES:
                 return lever
@@ -333,34 +333,36 @@ class _Problem:
         return found
 
     def _errors(
-        self, lag: float, lever: NDArray[np.float64]
+        self, time_offset: float, lever: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return range minus distance and known corrections (n,), and derivatives of the distance by the lever arm (n, 3)."""
-        position, turn = _poses_at(self.paths, self.tag, self.ranges.stamp_ns, lag)
-        unit, distance = directions(position + np.einsum("nij,nj->ni", turn, lever[self.tag]), self.anchor)
+        position, rotation = _poses_at(self.paths, self.tag, self.ranges.stamp_ns, time_offset)
+        unit, distance = directions(
+            position + np.einsum("nij,nj->ni", rotation, lever[self.tag]), self.anchor
+        )
         error = self.ranges.range_m - self.known.rows @ self.known.mean - distance
-        return error, np.einsum("ni,nij->nj", unit, turn)
+        return error, np.einsum("ni,nij->nj", unit, rotation)
 
     def _centred(
-        self, lag: float, lever: NDArray[np.float64]
+        self, time_offset: float, lever: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return `_errors` minus the median error of each pair."""
-        error, rows = self._errors(lag, lever)
+        error, rows = self._errors(time_offset, lever)
         return error - self._medians(error)[self.pair], rows
 
     def solve(
         self,
-        lag: float,
+        time_offset: float,
         lever: NDArray[np.float64],
         expected: NDArray[np.float64],
-        free_lag: bool,
+        free_time_offset: bool,
         free_lever: NDArray[np.bool_],
     ) -> tuple[float, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Fit by Gauss-Newton, from a time offset and lever arms.
 
         Args:
             expected: prior of the lever arms.
-            free_lag, free_lever: whether the time offset is estimated, and which coordinates of the arms, bool (T, 3).
+            free_time_offset, free_lever: whether the time offset is estimated, and which coordinates of the arms, bool (T, 3).
 
         Returns:
             Time offset, lever arms, offsets of the pairs, and the standard deviations of all in this order.
@@ -370,7 +372,7 @@ class _Problem:
         size = pairs.stop + len(self.known.mean)
         prior_sd = np.concatenate(
             [
-                [LAG_SD_S if free_lag else _FIXED_SD],
+                [TIME_OFFSET_SD_S if free_time_offset else _FIXED_SD],
                 np.where(free_lever.reshape(-1), LEVER_SD_M, _FIXED_SD),
                 np.full(self.pairs, OFFSET_SD_M),
                 self.known.sd,
@@ -378,10 +380,12 @@ class _Problem:
         )
         information = 1.0 / prior_sd**2
         # The means of the regressors are subtracted already.
-        mean = np.array([0.0 if free_lag else lag, *expected.reshape(-1), *np.zeros(size - arms.stop)])
-        offsets = self._medians(self._errors(lag, lever)[0])
-        x = np.array([lag, *lever.reshape(-1), *offsets, *np.zeros(size - pairs.stop)])
-        # The errors of a pair persist for about this time (see `model`).
+        mean = np.array(
+            [0.0 if free_time_offset else time_offset, *expected.reshape(-1), *np.zeros(size - arms.stop)]
+        )
+        offsets = self._medians(self._errors(time_offset, lever)[0])
+        x = np.array([time_offset, *lever.reshape(-1), *offsets, *np.zeros(size - pairs.stop)])
+        # The errors of a pair persist for about this time (see `noise_model`).
         since = self.ranges.stamp_ns - self.ranges.stamp_ns.min()
         group = since // round(2.0 * _MODEL.persistence_s * _SECOND_NS) * self.pairs + self.pair
         every = np.arange(len(self.pair))
@@ -396,8 +400,10 @@ class _Problem:
             rows[:, pairs.stop :] = self.known.rows
             left = error - x[pairs][self.pair] - self.known.rows @ x[pairs.stop :]
             known = np.isfinite(left) & np.isfinite(rows).all(axis=1)
-            _check_enough(int(known.sum()), free_lag or bool(free_lever.any()))
-            normal, right = _normal_equations(rows[known], left[known], group[known], self.known.alike[known])
+            _check_enough(int(known.sum()), free_time_offset or bool(free_lever.any()))
+            normal, right = _normal_equations(
+                rows[known], left[known], group[known], self.known.noise_group[known]
+            )
             covariance = np.linalg.inv(normal + np.diag(information))
             step = covariance @ (right + information * (mean - x))
             step[0] = np.clip(step[0], -0.3, 0.3)
@@ -409,11 +415,11 @@ class _Problem:
         block = since // round(BLOCK_S * _SECOND_NS)
         parts = [known & (block == number) for number in np.unique(block[known])]
         scores = np.array(
-            [_normal_equations(rows[p], left[p], group[p], self.known.alike[p])[1] for p in parts]
+            [_normal_equations(rows[p], left[p], group[p], self.known.noise_group[p])[1] for p in parts]
         )
         blocks = max(len(scores), 2)
         robust = covariance @ (scores.T @ scores) @ covariance * (blocks / (blocks - 1))
-        sd = UNDERSTATED * np.sqrt(np.diag(covariance) + np.diag(robust))
+        sd = SD_INFLATION * np.sqrt(np.diag(covariance) + np.diag(robust))
         arm = np.where(free_lever, x[arms].reshape(lever.shape), expected)
         return float(x[0]), arm, x[pairs].copy(), sd
 
@@ -422,7 +428,7 @@ def _normal_equations(
     rows: NDArray[np.float64],
     left_m: NDArray[np.float64],
     group: NDArray[np.intp],
-    alike: NDArray[np.intp],
+    noise_group: NDArray[np.intp],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the normal matrix (q, q) and right side (q,) of n ranges, robust against outliers among ranges and groups.
 
@@ -434,14 +440,14 @@ def _normal_equations(
         rows: float64 (n, q), derivative of each range by each unknown.
         left_m: float64 (n,), residuals.
         group: int (n,), ranges whose errors persist together have the same number.
-        alike: int (n,), ranges whose errors have the same standard deviation have the same number, from 0.
+        noise_group: int (n,), ranges whose errors have the same standard deviation have the same number, from 0.
     """
     order = np.argsort(group, kind="stable")
-    rows, left_m, group, alike = rows[order], left_m[order], group[order], alike[order]
+    rows, left_m, group, noise_group = rows[order], left_m[order], group[order], noise_group[order]
     starts = np.flatnonzero(np.diff(group, prepend=group[0] - 1))
     count = np.diff(np.append(starts, len(group)))
     of = np.repeat(np.arange(len(starts)), count)
-    kinds = int(alike.max(initial=0)) + 1
+    kinds = int(noise_group.max(initial=0)) + 1
 
     middle = np.array([np.median(part) for part in np.split(left_m, starts[1:])])
     within = left_m - middle[of]
@@ -450,14 +456,14 @@ def _normal_equations(
     larger = np.sqrt(count / np.maximum(count - 1.0, 1.0))[of]
     white = np.full(kinds, MIN_SD_M)
     if several.any():
-        white = np.maximum(scatter_of((within * larger)[several], alike[several], kinds), MIN_SD_M)
-    weight = _MODEL.weight(within / white[alike]) / white[alike] ** 2
+        white = np.maximum(scatter_of((within * larger)[several], noise_group[several], kinds), MIN_SD_M)
+    weight = _MODEL.weight(within / white[noise_group]) / white[noise_group] ** 2
     total = np.add.reduceat(weight, starts)
     both = np.concatenate([rows, left_m[:, None]], axis=1)
     shared = np.add.reduceat(both * weight[:, None], starts) / total[:, None]
     apart = both - shared[of]
     scaled = apart * weight[:, None]
-    kind = np.array([int(np.median(part)) for part in np.split(alike, starts[1:])])
+    kind = np.array([int(np.median(part)) for part in np.split(noise_group, starts[1:])])
     spread = scatter_of(shared[:, -1], kind, kinds)[kind]
     persists = np.sqrt(np.maximum(spread**2 - 1.0 / total, MIN_SD_M**2))
     variance = persists**2 + 1.0 / total

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.geometry import Area, Height
-from uwb_mitigation.positioning.model import Model
+from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.tracks import Ranges, Track
 
 IMPLAUSIBLE = 9.0
@@ -23,14 +23,14 @@ _WALL_SD_M = 0.02
 _NEAR_WALL_M = 0.5
 _AROUND = 24
 _SPHERE = 96
-_LEAST_SQUARES = Model(long=100.0, short=100.0)
+_LEAST_SQUARES = NoiseModel(long=100.0, short=100.0)
 _FRESH_S = 0.5
 _EVERY_S = 0.1
 _SECOND_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Place:
+class CandidatePosition:
     """A candidate position.
 
     Attributes:
@@ -46,15 +46,15 @@ class Place:
     loss: float
 
 
-def places(
+def candidate_positions(
     anchors: NDArray[np.float64],
     range_m: NDArray[np.float64],
     sd_m: NDArray[np.float64],
-    model: Model,
+    model: NoiseModel,
     *,
     height: Height | None = None,
     area: Area | None = None,
-) -> list[Place]:
+) -> list[CandidatePosition]:
     """Return all plausible local optima, the best first.
 
     Levenberg-Marquardt starts on the circles (spheres, if the height is unknown) of the two shortest ranges around their
@@ -94,15 +94,15 @@ def places(
             x[outside], cost[outside], *_ = walls.descend(wall)
             x = area.clip(x)
         keep &= cost <= cost[keep].min() + IMPLAUSIBLE
-    result: list[Place] = []
+    result: list[CandidatePosition] = []
     for i in np.flatnonzero(keep)[np.argsort(cost[keep])]:
-        if any(_same(x[i], place) for place in result):
+        if any(_same(x[i], candidate) for candidate in result):
             continue
         _, _, h, rows = problem.at(np.array([i])).linearised(x[i : i + 1])
         covariance = np.linalg.inv(h[0] + 1e-6 * np.eye(3))
         # Of the damped normal equations, ranges only: their errors move the position by this much.
         gain = covariance @ (rows[0] / sd_m[:, None]).T
-        result.append(Place(x[i].copy(), covariance, gain, float(cost[i])))
+        result.append(CandidatePosition(x[i].copy(), covariance, gain, float(cost[i])))
     return result
 
 
@@ -118,7 +118,7 @@ class _Problem:
     anchors: NDArray[np.float64]
     range_m: NDArray[np.float64]
     sd_m: NDArray[np.float64]
-    model: Model
+    model: NoiseModel
     mean: NDArray[np.float64]
     information: NDArray[np.float64]
 
@@ -129,7 +129,7 @@ class _Problem:
         anchors: NDArray[np.float64],
         range_m: NDArray[np.float64],
         sd_m: NDArray[np.float64],
-        model: Model,
+        model: NoiseModel,
         height: Height | None,
     ) -> _Problem:
         """Return the problem for that number of positions."""
@@ -187,9 +187,9 @@ class _Problem:
         return cost, gradient, hessian, rows
 
 
-def _same(position: NDArray[np.float64], place: Place) -> bool:
-    apart = position - place.position
-    return bool(apart @ apart < 0.25 or apart @ np.linalg.solve(place.covariance, apart) < 4.0)
+def _same(position: NDArray[np.float64], candidate: CandidatePosition) -> bool:
+    apart = position - candidate.position
+    return bool(apart @ apart < 0.25 or apart @ np.linalg.solve(candidate.covariance, apart) < 4.0)
 
 
 def _starts(
