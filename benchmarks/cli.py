@@ -17,7 +17,7 @@ import typer
 from benchmarks.emulate_evb1000 import emulate_evb1000
 from uwb_mitigation.commands import console
 from uwb_mitigation.commands.console import JsonOption, Table
-from uwb_mitigation.errors import UwbMitigationError, not_imported
+from uwb_mitigation.errors import UwbMitigationError, missing_dependency
 
 if TYPE_CHECKING:
     from benchmarks.nodes import Figures
@@ -340,7 +340,7 @@ def main() -> None:
     try:
         app()
     except (UwbMitigationError, ImportError) as error:
-        failure = not_imported(error) if isinstance(error, ImportError) else error
+        failure = missing_dependency(error) if isinstance(error, ImportError) else error
         if failure is None:
             raise
         console.err.print(f"benchmarks: {failure}", style="red", markup=False, soft_wrap=True)

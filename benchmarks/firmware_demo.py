@@ -26,7 +26,7 @@ from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.shipped import default_model_path
 from uwb_mitigation.nodes import topics
-from uwb_mitigation.nodes.processes import Nodes, Probe, run_demo, watching
+from uwb_mitigation.nodes.processes import NodeProcesses, Probe, run_demo, spinning_node
 from uwb_mitigation.sources.opening import open_recording
 from uwb_mitigation.sources.simulated import SimulatedSource
 
@@ -70,11 +70,11 @@ def run(console: Console, measured: Sequence[RangeMeasurement]) -> list[str]:
         if any(v.key == "mode" and v.value == "device" for status in message.status for v in status.values):
             ready.set()
 
-    with EmulatedFirmware(bundle) as board, watching(Probe) as probe:
+    with EmulatedFirmware(bundle) as board, spinning_node(Probe) as probe:
         console.print(f"emulated Cortex-M4 on {board.port}")
         probe.subscribe(RangeCorrected, topics.RANGE_CORRECTED, corrected.append)
         probe.subscribe(DiagnosticArray, topics.DIAGNOSTICS, on_diagnostics)
-        with Nodes() as nodes, console.status("waiting for the corrected ranges"):
+        with NodeProcesses() as nodes, console.status("waiting for the corrected ranges"):
             nodes.start("driver", "source:=serial", f"port:={board.port}", "mode:=device")
             if not ready.wait(TIMEOUT_S):
                 raise UwbMitigationError("the driver has not brought the board into mode DEVICE")

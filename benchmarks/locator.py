@@ -17,7 +17,7 @@ from uwb_mitigation_msgs.msg import RangeCorrected
 from uwb_mitigation.bag.codec import encode_corrected
 from uwb_mitigation.measurement import Cir, CorrectedRange, Origin, RangeMeasurement, Status
 from uwb_mitigation.nodes import processes, topics
-from uwb_mitigation.nodes.processes import Probe, wait, watching
+from uwb_mitigation.nodes.processes import Probe, spinning_node, wait
 from uwb_mitigation.positioning.anchors import Anchor, AnchorMap, dump_anchors
 from uwb_mitigation.positioning.filter import RangeFilter
 from uwb_mitigation.positioning.noise_model import NoiseModel
@@ -83,7 +83,7 @@ def node(rate_hz: float, seconds: float, show: Callable[[str], None]) -> NodeFig
         path.write_text(dump_anchors(ANCHORS))
         locator = processes.start("locator", f"anchors:={path}", "rate:=0.0")
         try:
-            with watching(Probe) as probe:
+            with spinning_node(Probe) as probe:
                 return _measure(probe, locator, rate_hz, seconds, show)
         finally:
             processes.stop(locator)

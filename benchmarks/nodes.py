@@ -26,12 +26,12 @@ import psutil
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
 from benchmarks.relay import RELAYED
-from uwb_mitigation.bag.codec import after_frame
+from uwb_mitigation.bag.codec import first_field_offset
 from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.measurement import Record
 from uwb_mitigation.nodes import processes, topics
-from uwb_mitigation.nodes.processes import Probe, wait, watching
+from uwb_mitigation.nodes.processes import Probe, spinning_node, wait
 from uwb_mitigation.preprocessing import WINDOW_LEAD
 from uwb_mitigation.sources.simulated import SimulatedSource
 
@@ -260,7 +260,7 @@ class Bench:
 def open_bench() -> Iterator[Bench]:
     """Open a bench with a separate ROS domain and a bag to play."""
     processes.isolate()
-    with tempfile.TemporaryDirectory() as folder, watching(Probe) as probe:
+    with tempfile.TemporaryDirectory() as folder, spinning_node(Probe) as probe:
         bag = Path(folder, "ranges.mcap")
         write_bag(bag)
         bench = Bench(probe, bag)
@@ -273,7 +273,7 @@ def open_bench() -> Iterator[Bench]:
 def read_head(data: bytes) -> tuple[int, int]:
     """Return stamp, ns, and sequence of a serialised RangeCir or RangeCorrected, which begin with the same fields."""
     seconds, nanoseconds, length = _STAMP.unpack_from(data)
-    (sequence,) = _SEQUENCE.unpack_from(data, after_frame(_STAMP.size + length))
+    (sequence,) = _SEQUENCE.unpack_from(data, first_field_offset(_STAMP.size + length))
     return seconds * 10**9 + nanoseconds, sequence
 
 

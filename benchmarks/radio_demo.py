@@ -23,7 +23,7 @@ from uwb_mitigation_msgs.msg import RangeCorrected
 from benchmarks.dw1000_model.evb1000 import EmulatedEvb1000s
 from uwb_mitigation.nodes import topics
 from uwb_mitigation.nodes.monitor import REFRESH_HZ
-from uwb_mitigation.nodes.processes import Nodes, Probe, run_demo, watching
+from uwb_mitigation.nodes.processes import NodeProcesses, Probe, run_demo, spinning_node
 from uwb_mitigation.sources.simulated import SimulatedSource
 from uwb_mitigation.sources.simulation.scene import ANCHORS
 
@@ -92,10 +92,10 @@ def run(console: Console, seconds: float) -> list[str]:
     with (
         SimulatedSource(route=PLACE) as source,
         EmulatedEvb1000s(source, boards=1 + len(ANCHORS)) as boards,
-        watching(Probe) as probe,
+        spinning_node(Probe) as probe,
     ):
         listener = RadioListener(probe)
-        with Nodes() as nodes:
+        with NodeProcesses() as nodes:
             nodes.start("mitigator")
             corrected = probe.resolve_topic_name(topics.RANGE_CORRECTED)
             nodes.wait(

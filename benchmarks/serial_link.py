@@ -21,7 +21,7 @@ from benchmarks.nodes import vitals_of
 from uwb_mitigation.link.emulated_board import EmulatedBoard
 from uwb_mitigation.measurement import Record
 from uwb_mitigation.nodes import processes, topics
-from uwb_mitigation.nodes.processes import Probe, wait, watching
+from uwb_mitigation.nodes.processes import Probe, spinning_node, wait
 from uwb_mitigation.preprocessing import WINDOW_LEAD
 from uwb_mitigation.sources.simulated import SimulatedSource
 from uwb_mitigation.sources.source import Source
@@ -108,7 +108,7 @@ class _Listener:
 def _bench(rate_hz: float) -> Iterator[tuple[EmulatedBoard, _Listener, int]]:
     """Start a board, a driver and a listener; yield board, listener and process id of the driver."""
     processes.isolate()
-    with tempfile.TemporaryDirectory() as folder, watching(Probe) as probe:
+    with tempfile.TemporaryDirectory() as folder, spinning_node(Probe) as probe:
         listener = _Listener(probe)
         link = Path(folder, "port")
         with EmulatedBoard(_Window(500), rate_hz=rate_hz, link=link) as board:

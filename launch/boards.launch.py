@@ -29,36 +29,36 @@ OWN = {
 FILES = tuple(f"{node}_params" for node in NODES)
 
 
-@launching.plain_errors
+@launching.report_errors
 def nodes_of(context):
     names = (*PARAMETERS, *OWN, *FILES, "boards")
     launching.check_names(getattr(context, "argv", ()), names)
-    said = {name: LaunchConfiguration(name).perform(context) for name in names}
-    flag = {name: launching.choice(name, said[name]) == "true" for name in ("use_sim_time", "respawn")}
-    level = launching.choice("log_level", said["log_level"], launching.LOG_LEVELS)
-    files = {node: [said[f"{node}_params"], *filter(None, [said["params"]])] for node in NODES}
+    texts = {name: LaunchConfiguration(name).perform(context) for name in names}
+    flag_names = {name: launching.choice(name, texts[name]) == "true" for name in ("use_sim_time", "respawn")}
+    level = launching.choice("log_level", texts["log_level"], launching.LOG_LEVELS)
+    files = {node: [texts[f"{node}_params"], *filter(None, [texts["params"]])] for node in NODES}
     for node in NODES:
         launching.from_files(node, *files[node])
-    values = launching.parameters({name: said[name] for name in PARAMETERS}, NODES, NODES)
-    common = {"use_sim_time": flag["use_sim_time"]}
+    values = launching.parameters({name: texts[name] for name in PARAMETERS}, NODES, NODES)
+    common = {"use_sim_time": flag_names["use_sim_time"]}
     kept = launching.kept_parameters()
     nodes = []
-    for entry in said["boards"].split():
+    for entry in texts["boards"].split():
         name, separator, port = entry.partition("=")
         if not (separator and name.isidentifier() and port):
             raise ValueError(f"boards: {entry!r} is not NAME=PORT, such as left=/dev/ttyACM0")
         board = {"source": "serial", "port": port, "frame_id": f"{name}_uwb_antenna"}
         for node in NODES:
-            own = values[node] | board if node == "driver" else values[node]
+            node_values = values[node] | board if node == "driver" else values[node]
             nodes.append(
                 Node(
                     package="uwb_mitigation",
                     executable=node,
                     name=node,
                     namespace=name,
-                    parameters=[*files[node], own, common],
+                    parameters=[*files[node], node_values, common],
                     output="screen",
-                    respawn=flag["respawn"],
+                    respawn=flag_names["respawn"],
                     respawn_delay=0.5,
                     additional_env=kept,
                     ros_arguments=["--log-level", level],

@@ -34,18 +34,18 @@ OWN = {
 FILES = tuple(f"{node}_params" for node in NODES)
 
 
-@launching.plain_errors
+@launching.report_errors
 def nodes_of(context):
     launching.check_names(getattr(context, "argv", ()), {*PARAMETERS, *OWN, *FILES})
-    said = {name: LaunchConfiguration(name).perform(context) for name in (*PARAMETERS, *OWN, *FILES)}
-    flags = ("one_process", "locate", "viewer", "use_sim_time", "respawn")
-    flag = {name: launching.choice(name, said[name]) == "true" for name in flags}
-    level = launching.choice("log_level", said["log_level"], launching.LOG_LEVELS)
-    files = {node: [said[f"{node}_params"], *filter(None, [said["params"]])] for node in NODES}
-    given = {node: launching.from_files(node, *files[node]) for node in NODES}
-    wanted = {"locator": flag["locate"], "viewer": flag["viewer"]}
+    texts = {name: LaunchConfiguration(name).perform(context) for name in (*PARAMETERS, *OWN, *FILES)}
+    flag_names = ("one_process", "locate", "viewer", "use_sim_time", "respawn")
+    flag_names = {name: launching.choice(name, texts[name]) == "true" for name in flag_names}
+    level = launching.choice("log_level", texts["log_level"], launching.LOG_LEVELS)
+    files = {node: [texts[f"{node}_params"], *filter(None, [texts["params"]])] for node in NODES}
+    file_values = {node: launching.from_files(node, *files[node]) for node in NODES}
+    wanted = {"locator": flag_names["locate"], "viewer": flag_names["viewer"]}
     started = [node for node in wanted if wanted[node]]
-    source = said["source"] or given["driver"].get("source")
+    source = texts["source"] or file_values["driver"].get("source")
     if source:
         started = ["driver", "mitigator", *started]
     elif not started:
@@ -54,20 +54,23 @@ def nodes_of(context):
             valid="source:=serial port:=/dev/ttyACM0, source:=mcap path:=FILE, source:=decaranging path:=FILE, or "
             "source:=simulated for ranges that no radio measured",
         )
-    values = launching.parameters(said, started, NODES)
+    values = launching.parameters(texts, started, NODES)
     if source:
-        launching.check_driver(given["driver"] | values["driver"])
-    for node in started if said["params"] else ():
-        own = {n: given[node].get(n, default) for n, default in launching.others_meaning(node).items()}
-        values[node] = own | values[node]
-    common = {"use_sim_time": flag["use_sim_time"]}
-    if flag["locate"] and "viewer" in values:
+        launching.check_driver(file_values["driver"] | values["driver"])
+    for node in started if texts["params"] else ():
+        own_values = {
+            n: file_values[node].get(n, default)
+            for n, default in launching.conflicting_parameters(node).items()
+        }
+        values[node] = own_values | values[node]
+    common = {"use_sim_time": flag_names["use_sim_time"]}
+    if flag_names["locate"] and "viewer" in values:
         # The locator publishes the anchors for the viewer.
         values["viewer"].pop("anchors", None)
     settings = {node: [*files[node], values[node], common] for node in started}
-    if flag["one_process"] and source:
+    if flag_names["one_process"] and source:
         # Without a node name, because it would apply to both nodes of the process.
-        both = [said["driver_params"], *files["mitigator"], values["driver"] | values["mitigator"], common]
+        both = [texts["driver_params"], *files["mitigator"], values["driver"] | values["mitigator"], common]
         settings = {"pipeline": both} | {node: settings[node] for node in started if node in wanted}
     ends = source in ("mcap", "decaranging")
     kept = launching.kept_parameters()
@@ -76,11 +79,11 @@ def nodes_of(context):
             package="uwb_mitigation",
             executable=name,
             name=None if name == "pipeline" else name,
-            namespace=said["namespace"],
+            namespace=texts["namespace"],
             parameters=parameters,
             output="screen",
             # The driver ends after the recording and must not be respawned.
-            respawn=flag["respawn"] and not (name in ("driver", "pipeline") and ends),
+            respawn=flag_names["respawn"] and not (name in ("driver", "pipeline") and ends),
             respawn_delay=0.5,
             additional_env=kept,
             ros_arguments=["--log-level", level],

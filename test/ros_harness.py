@@ -36,9 +36,9 @@ PAUSED = ("paused:=true", "start_delay:=0.0", "longest_wait:=3600.0")
 os.environ |= {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_PYTHON_CHECK_FIELDS": "1"}
 
 
-def facts_of(status: DiagnosticStatus) -> dict[str, str]:
+def diagnostic_values(status: DiagnosticStatus) -> dict[str, str]:
     """Return the values of a diagnostic status."""
-    return {fact.key: fact.value for fact in status.values}
+    return {diagnostic_value.key: diagnostic_value.value for diagnostic_value in status.values}
 
 
 class Process:

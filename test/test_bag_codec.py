@@ -87,7 +87,7 @@ def test_messages_equal_those_of_the_rosbags_library(
     for data, type_name in zip(ours, TYPES, strict=True):
         theirs = store.serialize_cdr(store.deserialize_cdr(data, type_name), type_name)
         assert bytes(theirs) == data
-    key = codec.key_of(measurement)
+    key = codec.measurement_key(measurement)
     assert codec.encode_range(codec.decode_range(ours[0])) == ours[0]
     for decoded, expected in (
         (codec.decode_truth(ours[1]), (key, truth)),

@@ -15,10 +15,10 @@ import pytest
 from uwb_mitigation.errors import DamagedRecordingError, RecordingError
 from uwb_mitigation.measurement import DEVICE_TICK_HZ, DEVICE_TIME_WRAP, Record, Truth
 from uwb_mitigation.sources.decaranging import (
-    CirOf,
+    Anomaly,
+    CirFrame,
     DecaRangingFolder,
     DecaRangingLog,
-    Oddity,
     open_decaranging,
 )
 
@@ -102,11 +102,11 @@ def write(tmp_path: Path):
     return _write
 
 
-def read(path: Path, cir: CirOf = CirOf.FINAL) -> tuple[list[Record], Counter[str]]:
+def read(path: Path, cir: CirFrame = CirFrame.FINAL) -> tuple[list[Record], Counter[str]]:
     """Records and `skipped`, without the count of logs without truth."""
     log = DecaRangingLog(path, cir)
     records = list(log)
-    return records, log.skipped - Counter({Oddity.NO_TRUTH.value: 1})
+    return records, log.skipped - Counter({Anomaly.NO_TRUTH.value: 1})
 
 
 def read_until_damage(path: Path) -> tuple[list[Record], RecordingError | None]:
@@ -119,8 +119,8 @@ def read_until_damage(path: Path) -> tuple[list[Record], RecordingError | None]:
     return records, None
 
 
-def counts(*oddities: Oddity) -> dict[str, int]:
-    return dict(Counter(oddity.value for oddity in oddities))
+def counts(*oddities: Anomaly) -> dict[str, int]:
+    return dict(Counter(anomaly.value for anomaly in oddities))
 
 
 # ---- what an exchange becomes ----
@@ -159,7 +159,7 @@ def test_stamps_continue_when_the_radios_counter_wraps(write):
 def test_an_invalid_start_time_becomes_the_epoch(write, file):
     records, skipped = read(write(header(file), exchange(5.0)))
     assert records[0].measurement.stamp_ns == 250_000_000
-    assert skipped == counts(Oddity.NO_START_TIME)
+    assert skipped == counts(Anomaly.NO_START_TIME)
 
 
 # ---- malformed parts: each is counted, and none costs a range ----
@@ -168,18 +168,18 @@ def test_an_invalid_start_time_becomes_the_epoch(write, file):
 @pytest.mark.parametrize(
     ("text", "samples", "oddities"),
     [
-        (poll(0) + TRANSMIT + error_block("\0") + final(SECOND) + ranged(5.0), 6, [Oddity.RECEPTION_ERROR]),
-        (poll(0) + TRANSMIT + error_block("C") + final(SECOND) + ranged(5.0), 6, [Oddity.RECEPTION_ERROR]),
-        (ranged(5.0), 0, [Oddity.NO_CIR]),
-        (poll(0) + ranged(5.0), 0, [Oddity.NO_CIR]),
-        (poll(0) + poll(SECOND) + TRANSMIT + final(2 * SECOND) + ranged(5.0), 6, [Oddity.NO_RANGE]),
-        (poll(0) + final(1) + final(SECOND) + ranged(5.0), 6, [Oddity.NO_RANGE]),
-        (poll(0) + final(1) + poll(SECOND) + ranged(5.0), 0, [Oddity.NO_RANGE, Oddity.NO_CIR]),
+        (poll(0) + TRANSMIT + error_block("\0") + final(SECOND) + ranged(5.0), 6, [Anomaly.RECEPTION_ERROR]),
+        (poll(0) + TRANSMIT + error_block("C") + final(SECOND) + ranged(5.0), 6, [Anomaly.RECEPTION_ERROR]),
+        (ranged(5.0), 0, [Anomaly.NO_CIR]),
+        (poll(0) + ranged(5.0), 0, [Anomaly.NO_CIR]),
+        (poll(0) + poll(SECOND) + TRANSMIT + final(2 * SECOND) + ranged(5.0), 6, [Anomaly.NO_RANGE]),
+        (poll(0) + final(1) + final(SECOND) + ranged(5.0), 6, [Anomaly.NO_RANGE]),
+        (poll(0) + final(1) + poll(SECOND) + ranged(5.0), 0, [Anomaly.NO_RANGE, Anomaly.NO_CIR]),
         (poll(0) + final(SECOND) + TRANSMIT + ranged(5.0), 6, []),
         (poll(0) + received(0x2A, 1, dump(ramp(5))) + final(2) + ranged(5.0), 6, []),
-        (poll(0) + final(1, rsl="-001.#INF") + ranged(5.0), 6, [Oddity.NOT_A_NUMBER]),
-        (poll(0) + final(1, hlp="1024.0") + ranged(5.0), 6, [Oddity.NOT_A_NUMBER]),
-        (poll(0) + final(1, hlp="") + ranged(5.0), 6, [Oddity.NOT_A_NUMBER]),
+        (poll(0) + final(1, rsl="-001.#INF") + ranged(5.0), 6, [Anomaly.NOT_A_NUMBER]),
+        (poll(0) + final(1, hlp="1024.0") + ranged(5.0), 6, [Anomaly.NOT_A_NUMBER]),
+        (poll(0) + final(1, hlp="") + ranged(5.0), 6, [Anomaly.NOT_A_NUMBER]),
         (poll(0) + final(1).replace("NTH(03CB)", "NTH(zz)") + ranged(5.0), 0, None),
         (poll(0) + final(1).replace("PSC(0998)", "PSC(99999)") + ranged(5.0), 0, None),
         (poll(0) + final(1).replace("RX DATA: 41cc", "RX DATA: zz") + ranged(5.0), 0, None),
@@ -192,8 +192,8 @@ def test_a_malformed_exchange_keeps_its_range(write, text, samples, oddities):
     assert [record.measurement.range_m for record in records] == [5.0, 6.0]
     assert [len(record.measurement.cir) for record in records] == [samples, 6]
     if oddities is None:
-        assert skipped[Oddity.MALFORMED.value] >= 1
-        assert skipped[Oddity.NO_CIR.value] == 1
+        assert skipped[Anomaly.MALFORMED.value] >= 1
+        assert skipped[Anomaly.NO_CIR.value] == 1
     else:
         assert skipped == counts(*oddities)
 
@@ -203,7 +203,7 @@ def test_a_range_that_is_not_a_number_is_nan(write, text):
     records, skipped = read(write(header(), poll(0) + final(1) + ranged(text)))
     assert math.isnan(records[0].measurement.range_m)
     assert len(records[0].measurement.cir) == 6
-    assert skipped == counts(Oddity.NOT_A_NUMBER)
+    assert skipped == counts(Anomaly.NOT_A_NUMBER)
 
 
 @pytest.mark.parametrize(
@@ -231,7 +231,7 @@ def test_a_malformed_accumulator_costs_the_cir_and_nothing_else(write, bad):
     assert [record.measurement.range_m for record in records] == [5.0, 6.0]
     assert [len(record.measurement.cir) for record in records] == [0, 6]
     assert records[0].measurement.cir.rx_power_dbm == -79.9641
-    assert skipped == counts(Oddity.MALFORMED, Oddity.NO_CIR)
+    assert skipped == counts(Anomaly.MALFORMED, Anomaly.NO_CIR)
 
 
 # ---- damage ----
@@ -328,7 +328,7 @@ def test_a_folder_gives_truth_and_locations_in_order_of_time(surveyed, inside):
     stamps = [record.measurement.stamp_ns for record in records]
     assert stamps == sorted(stamps)
     assert [record.measurement.sequence for record in records] == [0, 1, 2, 3]
-    assert folder.skipped == counts(Oddity.MOVED)  # both state the same start
+    assert folder.skipped == counts(Anomaly.MOVED)  # both state the same start
     assert [(anchor.id, anchor.position) for anchor in folder.anchors.anchors] == [
         (1, (0.0, 0.0, 0.0)),
         (2, (3.0, 4.0, 0.0)),
@@ -345,7 +345,7 @@ def test_a_log_without_a_survey_row_keeps_its_addresses(surveyed, write):
     assert [record.measurement.range_m for record in records] == [7.0, 2.0, 2.5, 9.0]
     assert records[-1].truth is None
     assert (records[-1].measurement.tag_id, records[-1].measurement.anchor_id) == (TAG, ANCHOR)
-    assert folder.skipped[Oddity.NO_TRUTH.value] == 1
+    assert folder.skipped[Anomaly.NO_TRUTH.value] == 1
 
 
 def test_a_damaged_log_does_not_keep_the_others_from_being_read(surveyed):
@@ -357,7 +357,7 @@ def test_a_damaged_log_does_not_keep_the_others_from_being_read(surveyed):
         ranges.extend(record.measurement.range_m for record in folder)
     assert str(path) in caught.value.where
     assert ranges[-2:] == [2.0, 2.5]
-    assert folder.skipped[Oddity.UNREADABLE.value] == 1
+    assert folder.skipped[Anomaly.UNREADABLE.value] == 1
 
 
 @pytest.mark.parametrize(
@@ -400,24 +400,24 @@ def naive(data: bytes) -> tuple[Counter[str], list[tuple[float, list[bytes] | No
             continue
         if line.startswith(b"RX DATA: "):
             kind = {b"21": "P", b"29": "F"}[line[9 + 42 : 9 + 44]]
-            counts[Oddity.NO_RANGE.value] += kind == "P" and "P" in seen
+            counts[Anomaly.NO_RANGE.value] += kind == "P" and "P" in seen
             seen += kind
             if kind == "F":
                 at = i + 4
                 assert lines[i + 3] == b"Accum Len 1016"
                 samples = lines[at : at + 1016]
         elif line.startswith(b"RX E"):
-            counts[Oddity.RECEPTION_ERROR.value] += 1
+            counts[Anomaly.RECEPTION_ERROR.value] += 1
         elif line.startswith(b"Anchor ToF"):
             fields = dict(re.findall(rb"(\w+): (-?[\d.]+) m", line))
             distance, raw, bias = (float(fields[name]) for name in (b"Dist", b"DistRaw", b"Bias"))
             assert distance == pytest.approx(raw - bias, abs=1e-6)
-            counts[Oddity.NO_CIR.value] += not seen
+            counts[Anomaly.NO_CIR.value] += not seen
             exchanges.append((distance, samples))
             seen, samples = "", None
         if b"#INF" in line:
-            counts[Oddity.NOT_A_NUMBER.value] += 1
-    counts[Oddity.NO_RANGE.value] += bool(seen)
+            counts[Anomaly.NOT_A_NUMBER.value] += 1
+    counts[Anomaly.NO_RANGE.value] += bool(seen)
     return +counts, exchanges
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from uwb_mitigation.errors import ModelError
-from uwb_mitigation.files import partial_of, read_bounded, write_together, write_whole
+from uwb_mitigation.files import partial_path, read_bounded, write_all_atomically, write_atomically
 
 
 @pytest.mark.parametrize(
@@ -27,7 +27,7 @@ def test_what_holds_nothing_is_refused_by_name_and_with_what_would_be_valid(
 def test_a_link_is_followed_and_stays(tmp_path: Path) -> None:
     link, target = tmp_path / "link", tmp_path / "target"
     link.symlink_to(target)
-    write_whole(link, b"new")
+    write_atomically(link, b"new")
     assert link.is_symlink()
     assert target.read_bytes() == b"new"
 
@@ -38,7 +38,7 @@ def test_a_pipe_is_written_to_and_stays(tmp_path: Path) -> None:
     read: list[str] = []
     reader = threading.Thread(target=lambda: read.append(pipe.read_text()))
     reader.start()
-    write_whole(pipe, "new")
+    write_atomically(pipe, "new")
     reader.join(240)
     assert read == ["new"]
     assert pipe.is_fifo()
@@ -49,9 +49,9 @@ def test_a_disk_that_fills_leaves_what_was_there_and_nothing_beside_it(tmp_path:
         pytest.skip("no /dev/full on this system")
     path = tmp_path / "file"
     path.write_text("old")
-    partial_of(tmp_path / f"file.{os.getpid()}").symlink_to("/dev/full")
+    partial_path(tmp_path / f"file.{os.getpid()}").symlink_to("/dev/full")
     with pytest.raises(ModelError, match="No space left"):
-        write_whole(path, "new", ModelError)
+        write_atomically(path, "new", ModelError)
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
 
@@ -62,11 +62,11 @@ def test_of_files_that_belong_together_all_are_written_or_none(tmp_path: Path, o
     path.write_text("old")
     pair = {path: "new", tmp_path / "absent/file": b"new"}
     with pytest.raises(ModelError, match="cannot be written") as caught:
-        write_together(dict(list(pair.items())[::order]), ModelError)
+        write_all_atomically(dict(list(pair.items())[::order]), ModelError)
     assert caught.value.where == str(tmp_path / "absent/file")
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
-    write_together({path: "new", tmp_path / "other": b"new"})
+    write_all_atomically({path: "new", tmp_path / "other": b"new"})
     assert [one.read_text() for one in (path, tmp_path / "other")] == ["new", "new"]
 
 
@@ -74,5 +74,5 @@ def test_of_files_that_belong_together_all_are_written_or_none(tmp_path: Path, o
 def test_a_place_that_cannot_be_written_is_named(tmp_path: Path, place: str) -> None:
     (tmp_path / "link").symlink_to(tmp_path / "link")
     with pytest.raises(ModelError, match="cannot be written") as caught:
-        write_whole(tmp_path / place, "new", ModelError)
+        write_atomically(tmp_path / place, "new", ModelError)
     assert caught.value.where == str(tmp_path / place)

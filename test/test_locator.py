@@ -17,7 +17,7 @@ from drives import HALL, drive
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
-from ros_harness import Ros, facts_of
+from ros_harness import Ros, diagnostic_values
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
@@ -79,12 +79,12 @@ def stamp_ns(pose: PoseWithCovarianceStamped) -> int:
     return pose.header.stamp.sec * NANOSECONDS + pose.header.stamp.nanosec
 
 
-def facts(received: list[DiagnosticArray]) -> dict[str, str]:
+def values(received: list[DiagnosticArray]) -> dict[str, str]:
     """Those of the locator's latest status, and its message."""
     for array in reversed(received):
         for status in array.status:
             if status.name.startswith("locator"):
-                return facts_of(status) | {"": status.message}
+                return diagnostic_values(status) | {"": status.message}
     return {}
 
 
@@ -106,7 +106,7 @@ def test_poses_odometry_smoothed_poses_and_markers_come_of_ranges(ros: Ros, anch
     run.send(range(half, half + 3), anchor_id=4711)
     run.send(range(half, len(run.ranges)))
     run.send(range(half), tag=9)
-    ros.spin_until(lambda: len(second) > 20 and facts(diagnostics).get("ranges of unknown anchors") == "3")
+    ros.spin_until(lambda: len(second) > 20 and values(diagnostics).get("ranges of unknown anchors") == "3")
     moving = [pose for pose in poses if pose.header.stamp.sec * NANOSECONDS < run.start_ns + 19 * NANOSECONDS]
     errors = run.errors(moving)
     known = np.isfinite(errors)
@@ -117,7 +117,7 @@ def test_poses_odometry_smoothed_poses_and_markers_come_of_ranges(ros: Ros, anch
     assert {message.child_frame_id for message in odometry} == {"uwb_tag"}
     assert poses[-1].pose.covariance[35] >= 1e5
     assert poses[-1].pose.pose.orientation.w == 1.0
-    told = facts(diagnostics)
+    told = values(diagnostics)
     assert told["ranges not valid"] == "3"
     assert told["ranges of unknown anchors"] == "3"
     assert float(told["tag 7 HDOP"]) < 3
@@ -178,7 +178,7 @@ def test_an_anchors_file_that_cannot_be_used_is_said_and_the_node_stays(
     locator = ros.start("locator", f"anchors:={path}")
     locator.wait_for_output(told)
     diagnostics = ros.collect(DiagnosticArray, "/diagnostics")
-    ros.spin_until(lambda: told in facts(diagnostics).get("", ""))
+    ros.spin_until(lambda: told in values(diagnostics).get("", ""))
     assert locator.exit_code() is None
     assert locator.signal(signal.SIGINT) == 0
 

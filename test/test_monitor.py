@@ -10,7 +10,7 @@ pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
 from rich.console import Console
 
-from uwb_mitigation.bag.codec import Key
+from uwb_mitigation.bag.codec import MeasurementKey
 from uwb_mitigation.measurement import CorrectedRange, Origin, Status, Truth
 from uwb_mitigation.nodes.monitor import RangeStatistics, summary
 
@@ -19,7 +19,7 @@ def corrected(
     statistics: RangeStatistics, sequence: int, raw: float, out: float, latency_s: float = 0.001
 ) -> None:
     result = CorrectedRange(out, raw, raw - out, 0.04, Status.OK, Origin.HOST, 1)
-    key = Key(sequence * 100_000_000, 1, 7, sequence)
+    key = MeasurementKey(sequence * 100_000_000, 1, 7, sequence)
     statistics.add_corrected(key, result, key.stamp_ns / 1e9 + latency_s)
 
 
@@ -42,7 +42,7 @@ def test_errors_are_absolute_and_grouped_by_label():
         (2, 3.0, "NLOS", 4.0, 3.5),
         (3, 2.0, "LOS", math.nan, math.nan),
     ):
-        statistics.add_truth(Key(sequence * 100_000_000, 1, 7, sequence), Truth(true_m, label))
+        statistics.add_truth(MeasurementKey(sequence * 100_000_000, 1, 7, sequence), Truth(true_m, label))
         corrected(statistics, sequence, raw, out)
     assert statistics.errors["LOS"] == pytest.approx([1, 0.2, 0.1])
     assert sum(statistics.errors.values()) == pytest.approx([2, 1.2, 0.6])

@@ -346,9 +346,9 @@ def test_a_worker_that_dies_costs_its_own_bag_only(tmp_path: Path) -> None:
         "job.BagReader = killed\n"
     )
     code = (
-        "import pickle, sys; from uwb_mitigation.processing.parallel import run_here\n"
+        "import pickle, sys; from uwb_mitigation.processing.parallel import run_locally\n"
         "jobs = pickle.load(sys.stdin.buffer)\n"
-        "print({one.job.source.name: one.error is None for one in run_here(jobs, 2)})"
+        "print({one.job.source.name: one.error is None for one in run_locally(jobs, 2)})"
     )
     done = subprocess.run(
         [sys.executable, "-c", code],

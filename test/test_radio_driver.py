@@ -11,7 +11,7 @@ import pytest
 import ros_harness
 from compilers import NEEDS_CC
 from diagnostic_msgs.msg import DiagnosticStatus
-from ros_harness import facts_of
+from ros_harness import diagnostic_values
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
 from benchmarks.dw1000_model.boards import Line, ModelledAir
@@ -21,7 +21,7 @@ from uwb_mitigation.errors import ParameterError, format_id
 from uwb_mitigation.link.emulated_board import EmulatedBoard, PseudoTerminal
 from uwb_mitigation.link.layout import Role
 from uwb_mitigation.link.radio import NEVER_MS, AnchorInReach, RadioSettings, RadioStatus
-from uwb_mitigation.nodes.live_feeds import anchor_facts, settings_of
+from uwb_mitigation.nodes.live_feeds import anchor_values, settings_of
 from uwb_mitigation.nodes.parameter_tables import DRIVER
 from uwb_mitigation.sources.simulated import SimulatedSource
 
@@ -60,9 +60,9 @@ def test_a_tag_and_two_anchors_range_through_the_mitigator(
     assert message.cir.preamble_count > 0
     assert np.isfinite([message.range, message.cir.rx_power, message.cir.first_path_power]).all()
     status = ros.diagnosis("driver", lambda status: level_of(status) == 0 and "ranging" in status.message)
-    facts = facts_of(status)
-    assert int(facts["radio 0: ranged"]) > 0
-    assert sum(key.startswith("anchor ") and "dBm" in value for key, value in facts.items()) == 2
+    values = diagnostic_values(status)
+    assert int(values["radio 0: ranged"]) > 0
+    assert sum(key.startswith("anchor ") and "dBm" in value for key, value in values.items()) == 2
 
 
 def test_settings_are_applied_and_refused_live(
@@ -110,7 +110,7 @@ def test_an_anchor_that_never_answered_was_never_heard():
     status = RadioStatus(
         anchors=(AnchorInReach(7, 9, 0, np.nan, NEVER_MS), AnchorInReach(8, 9, 9, -80.0, 1500))
     )
-    never, recent = anchor_facts(status).values()
+    never, recent = anchor_values(status).values()
     assert never == "0 of 9 ranged, nan dBm, last seen never"
     assert recent == "9 of 9 ranged, -80.0 dBm, last seen 1.5 s ago"
 
@@ -160,12 +160,14 @@ def test_the_radio_of_a_board_on_a_serial_line_is_configured_and_tells_how_it_fa
         driver = ros.start("driver", "source:=serial", f"port:={tmp_path / 'board'}", "radio.window:=40")
         ros.spin_until(lambda: bool(raw) and len(raw[-1].cir.samples) == 80, 120.0)
         assert abs(raw[-1].range - 5) < 0.1
-        status = ros.diagnosis("driver", lambda status: int(facts_of(status).get("radio: ranged", 0)) > 0)
-        facts = facts_of(status)
+        status = ros.diagnosis(
+            "driver", lambda status: int(diagnostic_values(status).get("radio: ranged", 0)) > 0
+        )
+        values = diagnostic_values(status)
         assert level_of(status) == 0
-        assert (facts["radio: role"], facts["radio: antenna delay"]) == ("tag", str(2 * 16436))
+        assert (values["radio: role"], values["radio: antenna delay"]) == ("tag", str(2 * 16436))
         assert "radio" in status.hardware_id
-        assert any(key.startswith("anchor ") and "dBm" in value for key, value in facts.items())
+        assert any(key.startswith("anchor ") and "dBm" in value for key, value in values.items())
 
         driver.wait_for_output("channel 5, 6800 kbit/s")
         for name, value in (("radio.prf", 16), ("radio.channel", 2)):

@@ -32,16 +32,16 @@ from uwb_mitigation.model.shipped import default_model_path
 from uwb_mitigation.nodes.diagnostics import (
     DROPPED,
     MIN_LOS,
-    NOT_NUMBERED,
+    NO_PREAMBLE_COUNT,
+    NO_RANGES,
+    NO_SEQUENCE_NUMBER,
+    NO_USABLE_CIR,
     OFFSET,
     OUT_OF_DISTRIBUTION,
-    SILENT,
     SLOW,
-    UNCOUNTED,
-    UNUSABLE,
+    LossCounter,
     Meter,
     MitigatorHealth,
-    Numbering,
 )
 from uwb_mitigation.offsets import Offsets, read_offsets
 from uwb_mitigation.sources.simulated import SimulatedSource
@@ -178,9 +178,9 @@ def test_a_rate_is_counted_on_the_nodes_clock():
     for _ in range(50):
         meter.add(2_000_000)
     now_ns[0] = 5_000_000_000
-    assert meter.facts() == {"rate Hz": "10.0", "latency p50 ms": "2.000", "latency p99 ms": "2.000"}
+    assert meter.entries() == {"rate Hz": "10.0", "latency p50 ms": "2.000", "latency p99 ms": "2.000"}
     now_ns[0] = 1_000_000_000
-    assert meter.facts() == {"rate Hz": "unknown"}
+    assert meter.entries() == {"rate Hz": "unknown"}
 
 
 def health(statuses: dict[Status, int] | None = None, processing_ms: float = 0.1, **clock) -> MitigatorHealth:
@@ -201,7 +201,7 @@ def warnings(health: MitigatorHealth) -> list[str]:
         ({Status.OK: 100}, []),
         ({Status.OK: 79, Status.OUT_OF_DISTRIBUTION: 21}, [OUT_OF_DISTRIBUTION.text]),
         ({Status.OK: 89, Status.OUT_OF_DISTRIBUTION: 21}, []),
-        ({Status.OK: 79, Status.BAD_CIR: 11, Status.NO_CIR: 10}, [UNUSABLE.text]),
+        ({Status.OK: 79, Status.BAD_CIR: 11, Status.NO_CIR: 10}, [NO_USABLE_CIR.text]),
         ({Status.OK: 89, Status.BAD_CIR: 11, Status.NO_CIR: 10}, []),
     ],
 )
@@ -211,8 +211,8 @@ def test_many_ranges_of_a_bad_status_cause_a_warning(statuses: dict[Status, int]
 
 def test_ranges_without_a_preamble_count_cause_their_own_warning():
     lacking = health({Status.OK: 79, Status.BAD_CIR: 21})
-    lacking.uncounted = 21
-    assert warnings(lacking) == [UNCOUNTED.text]
+    lacking.without_preamble_count = 21
+    assert warnings(lacking) == [NO_PREAMBLE_COUNT.text]
     assert warnings(lacking) == []
 
 
@@ -221,7 +221,7 @@ def test_slow_correction_and_no_data_cause_a_warning():
     now_s = [100.0]
     silent = health(now_s=lambda: now_s[0])
     now_s[0] = 106.0
-    assert warnings(silent) == [SILENT.text]
+    assert warnings(silent) == [NO_RANGES.text]
 
 
 def test_a_drop_causes_one_warning():
@@ -235,13 +235,13 @@ def test_a_drop_causes_one_warning():
 def test_a_model_that_includes_an_offset_causes_a_warning_after_enough_ranges():
     health = MitigatorHealth()
     health.los_m.extend([0.3] * (MIN_LOS - 1))
-    health.predicts_excess_alone = True
+    health.excludes_offset = True
     assert OFFSET.text not in warnings(health)
     health.los_m.append(0.3)
     assert OFFSET.text in warnings(health)
-    health.predicts_excess_alone = False
+    health.excludes_offset = False
     assert OFFSET.text not in warnings(health)
-    health.predicts_excess_alone = True
+    health.excludes_offset = True
     health.los_m.extend([-0.05] * 1000)
     assert OFFSET.text not in warnings(health)
 
@@ -249,7 +249,7 @@ def test_a_model_that_includes_an_offset_causes_a_warning_after_enough_ranges():
 @pytest.mark.parametrize("count", [2, 3, 5])
 def test_drops_of_several_publishers_add_up_whoever_they_are_of(count: int):
     random = np.random.default_rng(count)
-    numbering = Numbering(lambda: count)
+    loss_counter = LossCounter(lambda: count)
     last = [int(start) for start in random.integers(0, 100_000, count)]
     lost = 0
     for step in range(3000):
@@ -257,33 +257,33 @@ def test_drops_of_several_publishers_add_up_whoever_they_are_of(count: int):
         gap = int(random.integers(50)) if step >= count and random.random() < 0.02 else 0
         last[publisher] += gap + 1
         lost += gap
-        numbering.add(last[publisher])
+        loss_counter.add(last[publisher])
     for publisher in range(count):
         last[publisher] += 1
-        numbering.add(last[publisher])
-    assert numbering.missing == lost > 0
+        loss_counter.add(last[publisher])
+    assert loss_counter.missing == lost > 0
 
 
 def test_a_publisher_that_starts_anew_beside_another_loses_nothing():
     known = [2]
-    numbering = Numbering(lambda: known[0])
+    loss_counter = LossCounter(lambda: known[0])
     for number in range(1, 100):
-        numbering.add(number)
-        numbering.add(1000 + number)
+        loss_counter.add(number)
+        loss_counter.add(1000 + number)
     known[0] = 3  # The middleware counts the one that was killed until its lease ends.
     for number in range(1, 50):
-        numbering.add(number)
-        numbering.add(1099 + number)
+        loss_counter.add(number)
+        loss_counter.add(1099 + number)
     known[0] = 2
     for number in range(50, 200):
-        numbering.add(number)
-        numbering.add(1099 + number)
-    assert numbering.missing == 0
+        loss_counter.add(number)
+        loss_counter.add(1099 + number)
+    assert loss_counter.missing == 0
 
 
 def test_a_middleware_without_numbers_may_hide_drops():
     silent = health()
-    silent.numbering.add(NOT_NUMBERED)
+    silent.loss_counter.add(NO_SEQUENCE_NUMBER)
     silent.lost += 7
     assert silent.period()[1]["dropped by a queue"] == "7 or more"
 

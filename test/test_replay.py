@@ -25,7 +25,7 @@ from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.errors import DamagedRecordingError, UwbMitigationError
 from uwb_mitigation.measurement import Cir, RangeMeasurement, Record
 from uwb_mitigation.nodes.parameter_tables import DRIVER
-from uwb_mitigation.nodes.replay import Pace, ReplayFeed
+from uwb_mitigation.nodes.replay import ReplayClock, ReplayFeed
 from uwb_mitigation.offsets import NO_OFFSETS
 from uwb_mitigation.sources.simulated import SimulatedSource
 
@@ -191,7 +191,7 @@ def test_a_wall_clock_that_is_set_neither_stops_nor_hurries_a_replay(monkeypatch
     step_ns = [0]
     wall_ns = time.time_ns
     monkeypatch.setattr(time, "time_ns", lambda: wall_ns() + step_ns[0])
-    pace = Pace(Clock(clock_type=ClockType.SYSTEM_TIME))
+    pace = ReplayClock(Clock(clock_type=ClockType.SYSTEM_TIME))
     began_ns = pace.now_ns()
     stamps = []
     for step, step_s in enumerate((0, 0, -3600, 10_800)):
@@ -215,7 +215,7 @@ def test_a_process_that_is_interrupted_between_two_clocks_does_not_take_one_for_
 
     monkeypatch.setattr(time, "monotonic_ns", lambda: steady_ns[0])
     monkeypatch.setattr(time, "time_ns", wall_ns)
-    pace = Pace(Clock(clock_type=ClockType.SYSTEM_TIME))
+    pace = ReplayClock(Clock(clock_type=ClockType.SYSTEM_TIME))
     stamps = []
     for due_ns, interrupted_ns[0] in ((0, 0), (25 * MS, 5 * MS), (50 * MS, 0)):
         stamps.append(pace.stamp_ns(due_ns))
@@ -224,8 +224,8 @@ def test_a_process_that_is_interrupted_between_two_clocks_does_not_take_one_for_
 
 def test_a_source_that_cannot_keep_its_rate_is_reported():
     player = Player(ListSource([each * 1000 for each in range(120)], slow_s=0.005)).play()
-    _, level, text, facts = player.feed.describe()
-    assert float(facts["behind s"]) > 0.5
+    _, level, text, values = player.feed.describe()
+    assert float(values["behind s"]) > 0.5
     assert level > b"\0"
     assert "simulated" in text
     assert "behind" in text

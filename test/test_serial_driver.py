@@ -17,7 +17,7 @@ pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from faulty_board import FaultyBoard
-from ros_harness import Process, Ros, facts_of
+from ros_harness import Process, Ros, diagnostic_values
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
 from uwb_mitigation.link.connection import PortAddress
@@ -59,12 +59,12 @@ def drive(ros: Ros, link: Path, *parameters: str) -> Process:
     return ros.start("driver", "source:=serial", f"port:={link}", *parameters)
 
 
-def fact(status: DiagnosticStatus, key: str) -> str:
-    return facts_of(status).get(key, "")
+def diagnostic_value(status: DiagnosticStatus, key: str) -> str:
+    return diagnostic_values(status).get(key, "")
 
 
 def fewest(status: DiagnosticStatus, *keys: str) -> int:
-    return min(int(fact(status, key) or 0) for key in keys)
+    return min(int(diagnostic_value(status, key) or 0) for key in keys)
 
 
 def test_what_the_board_measures_is_published_with_stamps_of_the_measurement(ros: Ros, link: Path):
@@ -79,15 +79,17 @@ def test_what_the_board_measures_is_published_with_stamps_of_the_measurement(ros
         # Before the driver is there, the board drops what nobody reads.
         device.pause()
         driver = drive(ros, link)
-        connected = ros.diagnosis("driver", lambda s: s.message == "connected" and fact(s, LOST) != "")
+        connected = ros.diagnosis(
+            "driver", lambda s: s.message == "connected" and diagnostic_value(s, LOST) != ""
+        )
         device.resume()
         ros.spin_until(lambda: len(received) >= 100)
         published = [(m.sequence, np.float32(m.range)) for _, m in received]
         steps = np.diff([played.index(item) for item in published]) % len(played)
         assert (steps >= 1).all()
         # None is lost but what the board drops, on a computer with much other work, and tells of.
-        lost = int(fact(connected, LOST)) + (steps - 1).sum()
-        ros.diagnosis("driver", lambda s: int(fact(s, LOST) or 0) >= lost)
+        lost = int(diagnostic_value(connected, LOST)) + (steps - 1).sum()
+        ros.diagnosis("driver", lambda s: int(diagnostic_value(s, LOST) or 0) >= lost)
     stamps = np.array([m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for _, m in received])
     assert (np.diff(stamps) > 0).all()
     assert all(arrival > stamp for (arrival, _), stamp in zip(received, stamps, strict=True))
@@ -173,7 +175,7 @@ def test_resets_noise_and_damage_cost_frames_but_not_the_driver(ros: Ros, link: 
         device.flood(0.3)
         received_before = len(received)
         ros.spin_until(lambda: len(received) >= received_before + 60)
-        status = ros.diagnosis("driver", lambda s: int(fact(s, "lost") or 0) > 0)
+        status = ros.diagnosis("driver", lambda s: int(diagnostic_value(s, "lost") or 0) > 0)
     assert all(message.range == known[message.sequence] for message in received)
     assert status.hardware_id.startswith("board")
     assert driver.signal(signal.SIGINT) == 0, driver.output

@@ -103,5 +103,5 @@ def test_behind_obstacles_what_goes_around_comes_later_the_longer_the_way(
     expected = 2.7 * np.minimum(distance[here] / 4.0, 3.0)
     assert here.sum() > 100
     assert np.mean(first[here] / expected) == pytest.approx(1.0, abs=4.0 / np.sqrt(here.sum()))
-    in_sight = np.concatenate([block.links.fields[0].delay_ns[:, 0] for block in blocks])
-    assert (in_sight == 0.0).all()
+    los = np.concatenate([block.links.fields[0].delay_ns[:, 0] for block in blocks])
+    assert (los == 0.0).all()

@@ -152,7 +152,7 @@ def test_the_page_leads_from_boards_to_a_robot_that_knows_where_it_is(terminals:
     anchors = load_anchors(folder / "anchors.yaml")
     # The page's anchors are those that its boards find.
     recorded = read_ranges(folder / "first", anchors)
-    assert not recorded.strangers
+    assert not recorded.unknown_anchors
     assert {int(row) for tag in recorded.tags for row in tag.raw.anchor} == set(range(len(anchors)))
     shown = "".join(log.read_text() for log in folder.glob("*.log"))
     assert "Residuals of held-out ranges" in shown

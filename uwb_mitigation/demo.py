@@ -21,7 +21,7 @@ from rich.live import Live
 from uwb_mitigation.errors import DatasetError, UwbMitigationError
 from uwb_mitigation.nodes import topics
 from uwb_mitigation.nodes.monitor import REFRESH_HZ, Monitor, live_table, summary
-from uwb_mitigation.nodes.processes import Nodes, run_demo, watching
+from uwb_mitigation.nodes.processes import NodeProcesses, run_demo, spinning_node
 from uwb_mitigation.positioning.anchors import AnchorMap, dump_anchors
 from uwb_mitigation.positioning.tracks import TruePath
 from uwb_mitigation.sources.simulated import SimulatedSource
@@ -35,7 +35,7 @@ SETTLE_S = 3.0
 
 
 @dataclass(frozen=True, slots=True)
-class Programme:
+class DemoPlan:
     """A demo: title, the driver's parameters, and if known the anchors and the offset of the boards."""
 
     title: str
@@ -44,11 +44,11 @@ class Programme:
     offset_m: float | None = None
 
 
-def simulated(rate: float) -> Programme:
+def simulated(rate: float) -> DemoPlan:
     """Return the demo of the simulator's default scene, in which weak signals give no range."""
     source = SimulatedSource(count=SIMULATED_EXCHANGES, rate_hz=SIMULATED_RATE_HZ)
     offset_m = offset_of(source)
-    return Programme(
+    return DemoPlan(
         f"simulated recording, {len(list(source))} ranges",
         (
             "source:=simulated",
@@ -74,7 +74,7 @@ def offset_of(source: Source) -> float | None:
         return None
 
 
-def recorded(path: Path, rate: float) -> Programme:
+def recorded(path: Path, rate: float) -> DemoPlan:
     """Return the demo of a recording; at the default rate it lasts about 15 s."""
     from uwb_mitigation.sources.mcap import McapRecording
     from uwb_mitigation.sources.opening import open_recording
@@ -92,7 +92,7 @@ def recorded(path: Path, rate: float) -> Programme:
     if not count:
         raise UwbMitigationError("the recording holds no range", where=str(path))
     rate = rate or max(1.0, length_s / TARGET_S)
-    return Programme(
+    return DemoPlan(
         f"{name}, {count} ranges, {rate:.1f} x recorded speed",
         (f"source:={kind}", f"path:={path.resolve()}", f"rate:={rate}", f"longest_pause:={LONGEST_PAUSE_S}"),
         offset_m=offset_m,
@@ -115,9 +115,9 @@ def _stamped(messages: list[Any]) -> tuple[np.ndarray[Any, Any], np.ndarray[Any,
     return np.array(stamps, np.int64), np.array([rows[stamp] for stamp in stamps], np.float64)
 
 
-def watch(programme: Programme, console: Console) -> list[str]:
+def watch(plan: DemoPlan, console: Console) -> list[str]:
     """Run the nodes and show their ranges; return the failures."""
-    with watching(Monitor) as monitor, tempfile.TemporaryDirectory() as folder:
+    with spinning_node(Monitor) as monitor, tempfile.TemporaryDirectory() as folder:
         statistics = monitor.statistics
         poses: list[Any] = []
         truth: list[Any] = []
@@ -127,16 +127,16 @@ def watch(programme: Programme, console: Console) -> list[str]:
             monitor.resolve_topic_name(name)
             for name in (topics.RANGE_RAW, topics.RANGE_CORRECTED, topics.ANCHORS)
         )
-        title, offset_m = programme.title, programme.offset_m
-        with Nodes() as nodes:
+        title, offset_m = plan.title, plan.offset_m
+        with NodeProcesses() as nodes:
             if offset_m is None:
                 nodes.start("mitigator")
             else:
                 title += f", {offset_m:.2f} m of antenna delays subtracted"
                 nodes.start("mitigator", f"offsets:={offset_m:.4f}")
-            if programme.anchors is not None:
+            if plan.anchors is not None:
                 file = Path(folder) / "anchors.yaml"
-                file.write_text(dump_anchors(programme.anchors), encoding="utf-8")
+                file.write_text(dump_anchors(plan.anchors), encoding="utf-8")
                 nodes.start("locator", f"anchors:={file}", "level:=true", "rate:=0.0")
                 nodes.wait(
                     lambda: monitor.count_publishers(anchors) > 0, "the locator did not start: see above"
@@ -146,14 +146,14 @@ def watch(programme: Programme, console: Console) -> list[str]:
                 "the mitigator did not start: see above",
             )
             # The mitigator and this process must receive the first range.
-            nodes.start("driver", *programme.parameters, "wait_for_subscribers:=2")
+            nodes.start("driver", *plan.parameters, "wait_for_subscribers:=2")
             with Live(console=console, refresh_per_second=REFRESH_HZ) as live:
                 while nodes.running:
                     live.update(live_table(statistics, title))
                     time.sleep(1 / REFRESH_HZ)
                 # The last corrected ranges may arrive after the end of the driver.
-                settled = time.monotonic() + SETTLE_S
-                while statistics.missing and time.monotonic() < settled:
+                deadline = time.monotonic() + SETTLE_S
+                while statistics.missing and time.monotonic() < deadline:
                     time.sleep(0.05)
                 live.update(live_table(statistics, title))
         console.print(summary(statistics))

@@ -89,9 +89,9 @@ def _load(module: str) -> Callable[..., Any]:
     try:
         main: Callable[..., Any] = importlib.import_module(module).main
     except ImportError as error:
-        from uwb_mitigation.errors import not_imported
+        from uwb_mitigation.errors import missing_dependency
 
-        if (absent := not_imported(error)) is None:
+        if (absent := missing_dependency(error)) is None:
             raise
         sys.exit(f"error: {absent}")
     return main

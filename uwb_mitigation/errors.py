@@ -78,7 +78,7 @@ _DISTRIBUTIONS = {"serial": "pyserial", "sklearn": "scikit-learn", "yaml": "pyya
 """{name of the import: name of the package}, if they differ."""
 
 
-def not_imported(error: ImportError) -> MissingDependencyError | None:
+def missing_dependency(error: ImportError) -> MissingDependencyError | None:
     """Return the error for a library that cannot be imported; None for a module of this package, which is a bug."""
     module = (error.name or "").partition(".")[0]
     if module in ("", "uwb_mitigation"):

@@ -34,12 +34,12 @@ def read_bounded(path: Path, limit: int, error: type[UwbMitigationError], valid:
     return data
 
 
-def partial_of(path: Path) -> Path:
+def partial_path(path: Path) -> Path:
     """Return the temporary path for the content of `path` until it is complete."""
     return path.with_name(path.name + ".part")
 
 
-def write_whole(
+def write_atomically(
     path: Path, content: str | bytes, error: type[UwbMitigationError] = UwbMitigationError
 ) -> None:
     """Write a file atomically: on any error, or if another process writes it too, no partial file remains.
@@ -49,13 +49,13 @@ def write_whole(
     Raises:
         UwbMitigationError: of the type `error`: the file cannot be written.
     """
-    write_together({path: content}, error)
+    write_all_atomically({path: content}, error)
 
 
-def write_together(
+def write_all_atomically(
     contents: Mapping[Path, str | bytes], error: type[UwbMitigationError] = UwbMitigationError
 ) -> None:
-    """Write files that belong together like `write_whole`; none is replaced before all are written.
+    """Write files that belong together like `write_atomically`; none is replaced before all are written.
 
     Raises:
         UwbMitigationError: of the type `error`: one of them cannot be written, and all are unchanged; or one cannot be
@@ -70,7 +70,7 @@ def write_together(
             if target.exists() and not target.is_file():
                 target.write_bytes(data)
                 continue
-            partials[target] = partial_of(target.with_name(f"{target.name}.{os.getpid()}"))
+            partials[target] = partial_path(target.with_name(f"{target.name}.{os.getpid()}"))
             partials[target].write_bytes(data)
         for path, partial in partials.items():
             partial.replace(path)

@@ -17,7 +17,7 @@ from uwb_mitigation.evaluation import baselines, splits
 from uwb_mitigation.evaluation.dataset import build_dataset
 from uwb_mitigation.evaluation.linear_fit import least_absolute_deviations
 from uwb_mitigation.preprocessing import Preprocessing
-from uwb_mitigation.sources.decaranging import CirOf, DecaRangingFolder
+from uwb_mitigation.sources.decaranging import CirFrame, DecaRangingFolder
 
 
 def features(data):
@@ -73,7 +73,7 @@ def last_ten(values, names):
 
 final, poll = (
     build_dataset(DecaRangingFolder(Path(sys.argv[1]), cir=cir), Preprocessing())
-    for cir in (CirOf.FINAL, CirOf.POLL)
+    for cir in (CirFrame.FINAL, CirFrame.POLL)
 )
 known = np.isfinite([data.rx_power_dbm - data.first_path_power_dbm for data in (final, poll)]).all(axis=0)
 final, poll = final.rows(known), poll.rows(known)

@@ -45,14 +45,14 @@ class Scenario:
 
     Attributes:
         size_m: lower and upper bound of length, width and height.
-        blocked: share of links with an obstacle on the direct path.
+        nlos: share of links with an obstacle on the direct path.
         reflection: bounds of the amplitude reflection coefficient of a room's surfaces.
         tilt: standard deviation of the attitude of the tag's antenna, rad.
         scatterers: mean number of point scatterers.
     """
 
     size_m: tuple[tuple[float, float, float], tuple[float, float, float]]
-    blocked: float
+    nlos: float
     reflection: tuple[float, float]
     tilt: float
     scatterers: float
@@ -71,8 +71,8 @@ def draw(name: str, count: int, seed: int) -> tuple[RangeColumns, Array, NDArray
     Frames without a detected path are omitted.
     """
     scenario, rng = SCENARIOS[name], np.random.default_rng([seed, sorted(SCENARIOS).index(name)])
-    blocked = rng.random(count) < scenario.blocked
-    delay_m, gain, distance = _paths(scenario, blocked, rng)
+    nlos = rng.random(count) < scenario.nlos
+    delay_m, gain, distance = _paths(scenario, nlos, rng)
     phase = rng.random(count)
     samples, symbols, index, levels = _receive(delay_m - distance[:, None], gain, phase, rng)
     rows = np.flatnonzero(np.isfinite(index))
@@ -91,7 +91,7 @@ def draw(name: str, count: int, seed: int) -> tuple[RangeColumns, Array, NDArray
         symbols[rows].astype(np.uint16),
         *(level[rows].astype(np.float32) for level in levels),
     )
-    return columns, error[rows], blocked[rows]
+    return columns, error[rows], nlos[rows]
 
 
 def without_levels(columns: RangeColumns) -> RangeColumns:
@@ -115,10 +115,10 @@ def late(columns: RangeColumns, taps: int) -> RangeColumns:
 
 
 def _paths(
-    scenario: Scenario, blocked: NDArray[np.bool_], rng: np.random.Generator
+    scenario: Scenario, nlos: NDArray[np.bool_], rng: np.random.Generator
 ) -> tuple[Array, NDArray[np.complex128], Array]:
     """Return path lengths (n, p), m, field gains (n, p), and true distances (n,); the direct path is first."""
-    n = len(blocked)
+    n = len(nlos)
     size = rng.uniform(*scenario.size_m, (n, 3))
     anchor = size * rng.uniform((0.02, 0.02, 0.6), (0.98, 0.98, 0.95), (n, 3))
     tag = size * rng.uniform((0.1, 0.1, 0.1), (0.9, 0.9, 0.8), (n, 3))
@@ -150,12 +150,12 @@ def _paths(
     reverberant = np.sqrt(power / 2.0) * rng.standard_normal((n, tail))
 
     # An obstacle: the direct path goes through it or around its edge; other paths are sometimes shadowed.
-    loss_db = np.where(blocked, rng.uniform(6.0, 30.0, n), 0.0)
-    detour_m = np.where(blocked, rng.exponential(0.2, n), 0.0)
+    loss_db = np.where(nlos, rng.uniform(6.0, 30.0, n), 0.0)
+    detour_m = np.where(nlos, rng.exponential(0.2, n), 0.0)
     distance = length[:, 0].copy()
     length[:, 0] += detour_m
     gain[:, 0] *= 10 ** (-loss_db / 20)
-    shadowed = blocked[:, None] & (rng.random((n, len(order) - 1)) < 0.5)
+    shadowed = nlos[:, None] & (rng.random((n, len(order) - 1)) < 0.5)
     gain[:, 1:] *= np.where(shadowed, 10 ** (-loss_db[:, None] / 40), 1.0)
     delay = np.concatenate([length, legs[0] + legs[1], distance[:, None] + behind], axis=1)
     field = np.concatenate([gain, scattered, reverberant], axis=1) * WAVELENGTH_M / (4.0 * np.pi)
@@ -245,12 +245,12 @@ _EDGE_LEAD_TAPS = float(np.interp(-0.4, -_pulse(_LEAD), _LEAD))
 """Number of taps from 0.4 of the leading edge of a single pulse to its peak."""
 
 
-def relative_mae(model: Mitigation, columns: RangeColumns, error: Array, blocked: NDArray[np.bool_]) -> float:
+def relative_mae(model: Mitigation, columns: RangeColumns, error: Array, nlos: NDArray[np.bool_]) -> float:
     """Return the MAE of corrected ranges divided by that of a constant offset."""
     answers = model.correct_columns(columns)
     correction = np.where(answers.status == Status.OK, answers.correction_m, 0.0)
     remaining, constant = (
-        np.abs(values - np.median(values[~blocked])).mean() for values in (error - correction, error)
+        np.abs(values - np.median(values[~nlos])).mean() for values in (error - correction, error)
     )
     return float(remaining / constant)
 

@@ -144,4 +144,4 @@ def _heard(plan: FloorPlan, anchor: Point, cells: NDArray[np.float64]) -> float:
     boards = Boards(np.zeros(n), np.full(n, RADIO.noise_figure_db), np.full(n, float(RADIO.preamble_symbols)))
     here = np.tile(anchor, (n, 1))
     level = mean_level_dbm(RESIDENTIAL, here, cells, plan.direct_path(here, cells), boards)
-    return float((level >= RADIO.least_dbm(boards)).mean())
+    return float((level >= RADIO.sensitivities_dbm(boards)).mean())

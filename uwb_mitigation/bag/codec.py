@@ -44,7 +44,7 @@ _STATUSES = {int(status): status for status in Status}
 _ORIGINS = {int(origin): origin for origin in Origin}
 
 
-class Key(NamedTuple):
+class MeasurementKey(NamedTuple):
     """The fields that identify the measurement of a truth or corrected range."""
 
     stamp_ns: int
@@ -53,9 +53,11 @@ class Key(NamedTuple):
     sequence: int
 
 
-def key_of(measurement: RangeMeasurement) -> Key:
+def measurement_key(measurement: RangeMeasurement) -> MeasurementKey:
     """Return the key of a measurement."""
-    return Key(measurement.stamp_ns, measurement.tag_id, measurement.anchor_id, measurement.sequence)
+    return MeasurementKey(
+        measurement.stamp_ns, measurement.tag_id, measurement.anchor_id, measurement.sequence
+    )
 
 
 def encode_range(measurement: RangeMeasurement) -> bytes:
@@ -94,7 +96,7 @@ def encode_range(measurement: RangeMeasurement) -> bytes:
             )
         )
     except (struct.error, OverflowError, UnicodeEncodeError) as error:
-        raise _misfit("RangeCir", measurement, error) from error
+        raise _encoding_error("RangeCir", measurement, error) from error
 
 
 def encode_truth(measurement: RangeMeasurement, truth: Truth) -> bytes:
@@ -110,7 +112,7 @@ def encode_truth(measurement: RangeMeasurement, truth: Truth) -> bytes:
         data = _append_string(data, truth.label)
         return _append_string(data, truth.configuration)
     except (struct.error, OverflowError, UnicodeEncodeError) as error:
-        raise _misfit("RangeTruth", measurement, error) from error
+        raise _encoding_error("RangeTruth", measurement, error) from error
 
 
 def encode_corrected(measurement: RangeMeasurement, corrected: CorrectedRange) -> bytes:
@@ -133,7 +135,7 @@ def encode_corrected(measurement: RangeMeasurement, corrected: CorrectedRange) -
             corrected.model_id,
         )
     except (struct.error, OverflowError, UnicodeEncodeError) as error:
-        raise _misfit("RangeCorrected", measurement, error) from error
+        raise _encoding_error("RangeCorrected", measurement, error) from error
 
 
 def decode_range(data: bytes) -> RangeMeasurement:
@@ -180,7 +182,7 @@ def decode_range(data: bytes) -> RangeMeasurement:
     )
 
 
-def decode_truth(data: bytes) -> tuple[Key, Truth]:
+def decode_truth(data: bytes) -> tuple[MeasurementKey, Truth]:
     """Decode the truth from the CDR of `RangeTruth`, and the key of its measurement.
 
     Raises:
@@ -192,10 +194,10 @@ def decode_truth(data: bytes) -> tuple[Key, Truth]:
     label, at = _decode_string(data, at + _TRUTH.size)
     configuration, at = _decode_string(data, at + -at % 4)
     _require_end(data, at)
-    return Key(stamp_ns, tag_id, anchor_id, sequence), Truth(range_m, label, configuration)
+    return MeasurementKey(stamp_ns, tag_id, anchor_id, sequence), Truth(range_m, label, configuration)
 
 
-def decode_corrected(data: bytes) -> tuple[Key, CorrectedRange]:
+def decode_corrected(data: bytes) -> tuple[MeasurementKey, CorrectedRange]:
     """Decode the range from the CDR of `RangeCorrected`, and the key of its measurement.
 
     Raises:
@@ -210,12 +212,12 @@ def decode_corrected(data: bytes) -> tuple[Key, CorrectedRange]:
         raise RecordingError("message with an unknown status", where=f"status {status}")
     if origin not in _ORIGINS:
         raise RecordingError("message with an unknown origin", where=f"source {origin}")
-    return Key(stamp_ns, tag_id, anchor_id, sequence), CorrectedRange(
+    return MeasurementKey(stamp_ns, tag_id, anchor_id, sequence), CorrectedRange(
         range_m, raw_m, correction_m, variance_m2, _STATUSES[status], _ORIGINS[origin], model_id
     )
 
 
-def after_frame(end: int) -> int:
+def first_field_offset(end: int) -> int:
     """Return the position of the first 8-byte field of a message whose frame_id ends at `end`."""
     return end + (4 - end) % 8
 
@@ -237,7 +239,7 @@ def _decode_header(data: bytes) -> tuple[int, str, int]:
     if nanoseconds >= _NANOSECONDS:
         raise RecordingError("message with an invalid time stamp", where=f"nanosec {nanoseconds}")
     frame_id, at = _decode_string(data, _PREFIX.size - _LENGTH.size)
-    return seconds * _NANOSECONDS + nanoseconds, frame_id, after_frame(at)
+    return seconds * _NANOSECONDS + nanoseconds, frame_id, first_field_offset(at)
 
 
 def _append_string(data: bytes, text: str) -> bytes:
@@ -274,7 +276,7 @@ def _require_end(data: bytes, size: int) -> None:
         raise RecordingError("message longer than its type", where=f"{len(data)} instead of {size} bytes")
 
 
-def _misfit(type_name: str, measurement: RangeMeasurement, error: Exception) -> RecordingError:
+def _encoding_error(type_name: str, measurement: RangeMeasurement, error: Exception) -> RecordingError:
     return RecordingError(
         f"a value does not fit {type_name}: {error}",
         where=f"exchange {measurement.sequence} of anchor {format_id(measurement.anchor_id)}, tag {format_id(measurement.tag_id)}",

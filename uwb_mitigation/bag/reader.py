@@ -37,7 +37,7 @@ MAX_PENDING = 256 << 20
 """Maximum size of the messages that are held back to sort them, in bytes."""
 
 BAD_INDEX = "index at the end missing or damaged"
-"""Kind of warning in `BagReader.oddities`; the messages are complete."""
+"""Kind of warning in `BagReader.warnings`; the messages are complete."""
 
 _LIBRARY_ERRORS = (ValueError, McapError, struct.error)
 _log_time = attrgetter("log_time_ns")
@@ -145,7 +145,7 @@ class BagReader:
     Attributes:
         files: the files of the bag, in order.
         metadata: the MCAP metadata records, {name: {key: value}}; the first file takes precedence.
-        oddities: warnings, {kind: count}.
+        warnings: warnings, {kind: count}.
 
     Raises:
         RecordingError: the path is missing, unreadable, or not an MCAP bag.
@@ -155,10 +155,10 @@ class BagReader:
         self.files = bag_files(path)
         self._indexes = [_index(file) for file in self.files]
         self.metadata: dict[str, dict[str, str]] = {}
-        self.oddities: Counter[str] = Counter()
+        self.warnings: Counter[str] = Counter()
         for found in self._indexes:
             self.metadata = found.metadata | self.metadata
-            self.oddities += found.warnings
+            self.warnings += found.warnings
 
     @property
     def message_count(self) -> int:
@@ -195,14 +195,14 @@ class BagReader:
         for path, found in zip(self.files, self._indexes, strict=True):
             try:
                 with _BoundedFile(path) as file:
-                    read = _in_file_order if found.bounds_ns else self._in_time_order
+                    read = _read_in_file_order if found.bounds_ns else self._read_in_time_order
                     for message in read(file, found, topics, start_ns):
                         if message.log_time_ns >= start_ns:
                             yield message
             except OSError as error:  # noqa: PERF203 - once a file
                 raise RecordingError(f"cannot be read: {error.strerror}", where=str(path)) from error
 
-    def _in_time_order(
+    def _read_in_time_order(
         self, file: _BoundedFile, found: _FileIndex, topics: Collection[str] | None, start_ns: int
     ) -> Iterator[RawMessage]:
         wanted = (c for c in found.chunks if c.last_ns >= start_ns and found.may_contain(c, topics))
@@ -214,26 +214,26 @@ class BagReader:
             if damage and chunk.offset > damage[0]:
                 continue
             try:
-                inside = [
+                contents = [
                     found.message(each)
                     for each in file.chunk(chunk.offset)
                     if isinstance(each, records.Message)
                 ]
             except _LIBRARY_ERRORS as error:
-                damage, inside = (chunk.offset, _description(error)), []
-            pending += (each for each in inside if topics is None or each.channel.topic in topics)
+                damage, contents = (chunk.offset, _describe_error(error)), []
+            pending += (each for each in contents if topics is None or each.channel.topic in topics)
             pending.sort(key=_log_time)
             if number + 1 == len(chunks):
                 break
             ready = bisect_right(pending, chunks[number + 1].first_ns, key=_log_time)
             if sum(len(message.data) for message in pending[ready:]) > MAX_PENDING:
-                self.oddities["chunks too far out of order to sort"] += 1
+                self.warnings["chunks too far out of order to sort"] += 1
                 ready = len(pending)
             yield from pending[:ready]
             del pending[:ready]
         yield from pending
         if damage:
-            raise _damaged(file.path, *damage)
+            raise _damage_error(file.path, *damage)
 
 
 def check_channel(channel: Channel, type_name: str, path: Path) -> None:
@@ -402,10 +402,10 @@ def _scan(file: _BoundedFile) -> _FileIndex:
         while not isinstance(record := file.record(offset), records.DataEnd):
             if isinstance(record, records.Footer):
                 raise McapError("the data ends without its end record")
-            inside = _chunk_records(record) if isinstance(record, records.Chunk) else [record]
-            for each in inside:
+            contents = _chunk_records(record) if isinstance(record, records.Chunk) else [record]
+            for each in contents:
                 found.define(each)
-            messages = [found.message(each) for each in inside if isinstance(each, records.Message)]
+            messages = [found.message(each) for each in contents if isinstance(each, records.Message)]
             if messages:
                 found.messages += len(messages)
                 times = [message.log_time_ns for message in messages]
@@ -418,11 +418,11 @@ def _scan(file: _BoundedFile) -> _FileIndex:
                     found.bounds_ns = min(known[0], bounds[0]), max(known[1], bounds[1])
             offset = file.position
     except _LIBRARY_ERRORS as error:
-        found.damage = (offset, _description(error))
+        found.damage = (offset, _describe_error(error))
     return found
 
 
-def _in_file_order(
+def _read_in_file_order(
     file: _BoundedFile, found: _FileIndex, topics: Collection[str] | None, start_ns: int
 ) -> Iterator[RawMessage]:
     """Yield the messages of a file in which some are not in chunks."""
@@ -435,15 +435,15 @@ def _in_file_order(
                 if topics is None or message.channel.topic in topics:
                     yield message
     if found.damage:
-        raise _damaged(file.path, *found.damage)
+        raise _damage_error(file.path, *found.damage)
 
 
-def _damaged(path: Path, offset: int, what: str) -> DamagedRecordingError:
+def _damage_error(path: Path, offset: int, what: str) -> DamagedRecordingError:
     return DamagedRecordingError(
         f"damaged: {what}", where=f"{path}, byte {offset}", valid="everything before that byte was read"
     )
 
 
-def _description(error: Exception) -> str:
+def _describe_error(error: Exception) -> str:
     """The library gives no reason for a record that is shorter than its fields."""
     return "a field ends beyond its record" if isinstance(error, (EndOfFile, struct.error)) else str(error)

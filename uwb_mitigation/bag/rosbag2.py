@@ -87,10 +87,10 @@ def describe(
 
 def dump(document: Mapping[str, Any] | Sequence[Any]) -> str:
     """Return YAML in the order of the keys and, like rosbag2, without YAML anchors."""
-    return yaml.dump(document, Dumper=_Plain, sort_keys=False, allow_unicode=True)
+    return yaml.dump(document, Dumper=_NoAliasDumper, sort_keys=False, allow_unicode=True)
 
 
-def described_files(folder: Path) -> list[str] | None:
+def listed_files(folder: Path) -> list[str] | None:
     """Return the file names in `folder/metadata.yaml`; None = there is no such file.
 
     Raises:
@@ -111,10 +111,10 @@ def described_files(folder: Path) -> list[str] | None:
             "not a rosbag2 metadata file", where=str(path), valid="remove it to read every *.mcap next to it"
         ) from error
     if storage != "mcap":
-        raise _foreign_storage(folder, str(storage))
+        raise _unsupported_storage(folder, str(storage))
     if str(compression).lower() == "file":
         raise RecordingError(
-            "the bag's files are compressed as a whole", where=str(path), valid=_conversion(folder)
+            "the bag's files are compressed as a whole", where=str(path), valid=_conversion_hint(folder)
         )
     return names
 
@@ -127,18 +127,18 @@ def bag_files(path: Path) -> list[Path]:
     """
     if not path.is_dir():
         if path.suffix == ".db3":
-            raise _foreign_storage(path, "sqlite3")
+            raise _unsupported_storage(path, "sqlite3")
         if not path.exists():
             raise RecordingError("no such file or folder", where=str(path))
         if not path.is_file():
             raise RecordingError("not a regular file", where=str(path))
         return [path]
-    names = described_files(path)
+    names = listed_files(path)
     if names is None:
         found = (entry.name for entry in path.glob("*.mcap") if entry.is_file())
-        names = sorted(found, key=_natural)
+        names = sorted(found, key=_natural_sort_key)
         if not names and any(path.glob("*.db3")):
-            raise _foreign_storage(path, "sqlite3")
+            raise _unsupported_storage(path, "sqlite3")
     # Ignore the directory part of a listed name: the file must be in this folder.
     files = [path / name for name in names if name]
     if not files:
@@ -149,24 +149,24 @@ def bag_files(path: Path) -> list[Path]:
     return files
 
 
-def _natural(name: str) -> list[tuple[int, str]]:
+def _natural_sort_key(name: str) -> list[tuple[int, str]]:
     """Return a natural sort key: bag_10 follows bag_9."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"([0-9]+)", name)]
 
 
-def _foreign_storage(path: Path, storage: str) -> RecordingError:
+def _unsupported_storage(path: Path, storage: str) -> RecordingError:
     return RecordingError(
-        f"the bag is stored as {storage[:32]}, not as MCAP", where=str(path), valid=_conversion(path)
+        f"the bag is stored as {storage[:32]}, not as MCAP", where=str(path), valid=_conversion_hint(path)
     )
 
 
-def _conversion(path: Path) -> str:
+def _conversion_hint(path: Path) -> str:
     return (
         f"convert it: ros2 bag convert -i {path} -o OPTIONS.yaml, where OPTIONS.yaml says "
         "output_bags: [{uri: NEW_BAG, storage_id: mcap, all_topics: true}]"
     )
 
 
-class _Plain(yaml.SafeDumper):
+class _NoAliasDumper(yaml.SafeDumper):
     def ignore_aliases(self, data: object) -> bool:
         return True

@@ -42,7 +42,7 @@ from uwb_mitigation.bag.topics import (
     RANGE_TRUTH_TYPE,
 )
 from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.files import partial_of, write_whole
+from uwb_mitigation.files import partial_path, write_atomically
 from uwb_mitigation.measurement import RangeMeasurement, Record
 
 METADATA_RECORD = "uwb_mitigation"
@@ -55,7 +55,7 @@ _NO_SCHEMA = 0
 
 def partial_file(path: Path) -> Path:
     """Return the temporary path of a bag at `path` until the bag is complete."""
-    return partial_of(_bag_file(path))
+    return partial_path(_bag_file(path))
 
 
 def _bag_file(path: Path) -> Path:
@@ -85,9 +85,9 @@ class BagWriter:
         self._partial = partial_file(path)
         self._metadata = {"version": uwb_mitigation.__version__, **metadata}
         self.counts: Counter[str] = Counter()
-        self._ours: dict[str, int] = {}
-        self._numbers: dict[tuple[object, ...], int] = {}
-        self._names: dict[int, str] = {}
+        self._own_channels: dict[str, int] = {}
+        self._channel_ids: dict[tuple[object, ...], int] = {}
+        self._topic_of_channel: dict[int, str] = {}
         self._topics: dict[str, TopicCount] = {}
         self._schemas: dict[Schema, int] = {}
         self._first_ns: int | None = None
@@ -102,8 +102,8 @@ class BagWriter:
         )
         if occupied and not force:
             raise RecordingError("exists already", where=str(path), valid="--force replaces it")
-        with self._writing():
-            self._made_folder = self._folder is not None and not self._folder.exists()
+        with self._translate_os_errors():
+            self._created_folder = self._folder is not None and not self._folder.exists()
             if self._folder is not None:
                 self._folder.mkdir(parents=True, exist_ok=True)
             self._stream = self._partial.open("wb")
@@ -121,10 +121,10 @@ class BagWriter:
             RecordingError: a value does not fit its field, or the bag cannot be written.
         """
         measurement = record.measurement
-        self._write_ours(RANGE_RAW, RANGE_CIR_TYPE, measurement, encode_range(measurement))
+        self._write_own(RANGE_RAW, RANGE_CIR_TYPE, measurement, encode_range(measurement))
         if record.truth is not None:
             truth = encode_truth(measurement, record.truth)
-            self._write_ours(RANGE_TRUTH, RANGE_TRUTH_TYPE, measurement, truth)
+            self._write_own(RANGE_TRUTH, RANGE_TRUTH_TYPE, measurement, truth)
         if record.tag_position is not None:
             odometry = encode_true_position(record.tag_position, measurement.tag_id, measurement.stamp_ns)
             self.write_message(ODOMETRY_TRUTH, ODOMETRY_TYPE, odometry, measurement.stamp_ns)
@@ -135,7 +135,7 @@ class BagWriter:
         Raises:
             RecordingError: the time is before the epoch, or the bag cannot be written.
         """
-        self.write_serialized(self._our_channel(topic, type_name), data, stamp_ns, stamp_ns)
+        self.write_serialized(self._own_channel(topic, type_name), data, stamp_ns, stamp_ns)
 
     def copy_channel(self, channel: Channel) -> int:
         """Register a channel of another bag; return its number.
@@ -148,7 +148,7 @@ class BagWriter:
 
     def corrected_channel(self) -> int:
         """Register `/uwb/range_corrected`, for serialised messages; return its number."""
-        return self._our_channel(RANGE_CORRECTED, RANGE_CORRECTED_TYPE)
+        return self._own_channel(RANGE_CORRECTED, RANGE_CORRECTED_TYPE)
 
     def write_serialized(
         self, channel: int, data: bytes, log_time_ns: int, publish_time_ns: int, sequence: int = 0
@@ -163,8 +163,8 @@ class BagWriter:
         try:
             self._mcap.add_message(channel, log_time_ns, data, publish_time_ns, sequence)
         except OSError as error:
-            raise self._unwritable(error) from error
-        self.counts[self._names[channel]] += 1
+            raise self._write_error(error) from error
+        self.counts[self._topic_of_channel[channel]] += 1
         self._first_ns = log_time_ns if self._first_ns is None else min(self._first_ns, log_time_ns)
         self._last_ns = max(self._last_ns, log_time_ns)
 
@@ -178,40 +178,40 @@ class BagWriter:
         trace: TracebackType | None,
     ) -> None:
         if kind is not None:
-            self._abandon()
+            self._discard()
             return
         try:
             self._finish()
         except BaseException:
-            self._abandon()
+            self._discard()
             raise
 
-    def _write_ours(self, topic: str, type_name: str, measurement: RangeMeasurement, data: bytes) -> None:
+    def _write_own(self, topic: str, type_name: str, measurement: RangeMeasurement, data: bytes) -> None:
         stamp_ns = measurement.stamp_ns
         self.write_serialized(
-            self._our_channel(topic, type_name), data, stamp_ns, stamp_ns, measurement.sequence
+            self._own_channel(topic, type_name), data, stamp_ns, stamp_ns, measurement.sequence
         )
 
-    def _our_channel(self, topic: str, type_name: str) -> int:
-        number = self._ours.get(topic)
+    def _own_channel(self, topic: str, type_name: str) -> int:
+        number = self._own_channels.get(topic)
         if number is None:
             schema = Schema(type_name, SchemaEncoding.ROS2, schemas.definition(type_name).encode())
             metadata = {_QOS_KEY: NO_QOS, _HASH_KEY: schemas.type_hash(type_name)}
             number = self._add_channel(Channel(0, topic, MessageEncoding.CDR, metadata, schema))
-            self._ours[topic] = number
+            self._own_channels[topic] = number
         return number
 
     def _add_channel(self, channel: Channel) -> int:
         topic, schema, metadata = channel.topic, channel.schema, channel.metadata
         key = (topic, channel.encoding, schema, *sorted(metadata.items()))
-        if key in self._numbers:
-            return self._numbers[key]
-        with self._writing():
+        if key in self._channel_ids:
+            return self._channel_ids[key]
+        with self._translate_os_errors():
             if schema is not None and schema not in self._schemas:
                 self._schemas[schema] = self._mcap.register_schema(schema.name, schema.encoding, schema.data)
             schema_id = _NO_SCHEMA if schema is None else self._schemas[schema]
             number = self._mcap.register_channel(topic, channel.encoding, schema_id, metadata)
-        self._numbers[key], self._names[number] = number, topic
+        self._channel_ids[key], self._topic_of_channel[number] = number, topic
         # A topic may have several channels, of several publishers; rosbag2 lists it once.
         kind, qos = schema.name if schema else "", recorded_qos(metadata[_QOS_KEY])
         self._topics.setdefault(topic, TopicCount(topic, kind, metadata.get(_HASH_KEY, ""), 0, qos))
@@ -221,37 +221,37 @@ class BagWriter:
         topics = [replace(topic, messages=self.counts[topic.topic]) for topic in self._topics.values()]
         first_ns = 0 if self._first_ns is None else self._first_ns
         document = describe(self.file.name, topics, first_ns, self._last_ns, self._metadata)
-        with self._writing():
+        with self._translate_os_errors():
             self._mcap.add_metadata("rosbag2", {"serialized_metadata": dump(document)})
             self._mcap.finish()  # type: ignore[no-untyped-call]
             self._close()
             self._partial.replace(self.file)
             if self._folder is not None:
                 text = dump({"rosbag2_bagfile_information": document})
-                write_whole(self.file.with_name(METADATA_NAME), text, RecordingError)
+                write_atomically(self.file.with_name(METADATA_NAME), text, RecordingError)
 
     def _close(self) -> None:
         stream, self._stream = self._stream, None
         if stream is not None:
             stream.close()
 
-    def _abandon(self) -> None:
+    def _discard(self) -> None:
         with contextlib.suppress(OSError):
             self._close()
         # Do not replace the original error if the file cannot be removed.
         with contextlib.suppress(OSError):
             self._partial.unlink(missing_ok=True)
-        if self._made_folder and self._folder is not None:
+        if self._created_folder and self._folder is not None:
             with contextlib.suppress(OSError):
                 self._folder.rmdir()
 
     @contextlib.contextmanager
-    def _writing(self) -> Iterator[None]:
+    def _translate_os_errors(self) -> Iterator[None]:
         try:
             yield
         except OSError as error:
-            raise self._unwritable(error) from error
+            raise self._write_error(error) from error
 
-    def _unwritable(self, error: OSError) -> RecordingError:
-        self._abandon()
+    def _write_error(self, error: OSError) -> RecordingError:
+        self._discard()
         return RecordingError(f"cannot be written: {error.strerror}", where=str(self.file))

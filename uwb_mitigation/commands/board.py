@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from uwb_mitigation.commands import console
-from uwb_mitigation.commands.console import JsonOption, Table, say
+from uwb_mitigation.commands.console import JsonOption, Table, print_line
 from uwb_mitigation.errors import ParameterError, parse_id
-from uwb_mitigation.files import write_whole
+from uwb_mitigation.files import write_atomically
 
 if TYPE_CHECKING:
     from uwb_mitigation.link.messages import Hello
@@ -77,7 +77,7 @@ def emulate(
             seed=seed,
         )
         with board:
-            say(f"{source.name} at {board.port}")
+            print_line(f"{source.name} at {board.port}")
             end_s = time.monotonic() + (duration or math.inf)
             while board.failure is None and time.monotonic() < end_s:
                 time.sleep(0.05)
@@ -170,22 +170,22 @@ def antenna_delay(
 
     if not 0.3 <= distance <= 100.0:
         raise ParameterError(f"--distance {distance}", valid="0.3 to 100 m")
-    places = [part.strip() for part in port.split(",") if part.strip()]
-    if not 1 <= len(places) <= 2 or len(set(places)) < len(places):
+    ports = [part.strip() for part in port.split(",") if part.strip()]
+    if not 1 <= len(ports) <= 2 or len(set(ports)) < len(ports):
         raise ParameterError(f"--port {port}", valid="the tag's, or the tag's and another one, the anchor's")
     if output is not None and (output.is_dir() or not output.absolute().parent.is_dir()):
         raise ParameterError(f"-o {output}", valid="a file, in a folder that is there")
     settings = _settings(anchor, channel, prf, preamble, data_rate, start)
-    openers = [opener(source.value, place, reset) for place in places]
+    openers = [opener(source.value, port_name, reset) for port_name in ports]
     with console.step_bar("ranging", exchanges) as advance:
         found = measure(openers, settings, distance, exchanges, advance)
-    console.out.print(_table(found, distance, len(places)))
+    console.out.print(_table(found, distance, len(ports)))
     content = _parameters(found, distance, port, settings)
     if output is None:
         console.out.print(content, end="", soft_wrap=True, highlight=False, markup=False)
     else:
-        write_whole(output, content)
-        say(
+        write_atomically(output, content)
+        print_line(
             f"{output}: radio.antenna_delay {found.antenna_delay}; "
             f"ros2 run uwb_mitigation driver --ros-args --params-file {output} ..."
         )
@@ -221,9 +221,9 @@ def _table(found: AntennaDelay, distance_m: float, radios: int) -> Table:
     table.add_row("median error, m", f"{found.offset_m:+.4f}")
     table.add_row("standard deviation of a range, m", f"{found.sd_m:.4f}")
     table.add_row("received over first-path power, dB", f"{found.power_gap_db:.1f}")
-    whose = "of both radios" if radios == 2 else "of the tag"
-    table.add_row(f"antenna delay {whose} so far, ticks", f"{found.before:g}")
-    table.add_row(f"antenna delay {whose} from now on, ticks", f"{found.antenna_delay}")
+    owner = "of both radios" if radios == 2 else "of the tag"
+    table.add_row(f"antenna delay {owner} so far, ticks", f"{found.before:g}")
+    table.add_row(f"antenna delay {owner} from now on, ticks", f"{found.antenna_delay}")
     return table
 
 
@@ -256,15 +256,15 @@ def export_c(
 
     bundle = load_bundle(model_path(model))
     header = export_bundle(bundle, output)
-    facts = {
+    result = {
         "header": str(header),
         "model_id": bundle.model_id,
         "k": bundle.architecture.samples,
         "parameters": bundle.architecture.parameters,
         "golden_vectors": GOLDEN_VECTORS,
     }
-    say(f"{header}: model {bundle.model_id:08x}, K = {facts['k']}, {facts['parameters']} parameters")
-    console.write_json(json, facts)
+    print_line(f"{header}: model {bundle.model_id:08x}, K = {result['k']}, {result['parameters']} parameters")
+    console.write_json(json, result)
 
 
 @app.command()
@@ -295,13 +295,13 @@ def build_image(
         export_bundle(bundle, Path(folder))
         image = toolchain.build_image(Path(folder), Path(folder), toolchain.Target.DWM1001_DEV)
         toolchain.write_hex(image, output)
-    say(
+    print_line(
         f"{output}: {image.flash_bytes:,} of {image.flash_room:,} bytes of flash, {image.static_bytes:,} of "
         f"{image.ram_room:,} of RAM, the rest for the stack; model {bundle.model_id:08x}"
     )
-    facts = asdict(image) | {
+    result = asdict(image) | {
         "image": str(output),
         "ram_bytes": image.static_bytes,
         "model_id": bundle.model_id,
     }
-    console.write_json(json, {name: value for name, value in facts.items() if name != "elf"})
+    console.write_json(json, {name: value for name, value in result.items() if name != "elf"})

@@ -11,7 +11,7 @@ import typer
 
 from uwb_mitigation.commands import console
 from uwb_mitigation.commands.checks import check_output
-from uwb_mitigation.commands.console import JsonOption, say, show_table, warn
+from uwb_mitigation.commands.console import JsonOption, print_line, show_table, warn
 from uwb_mitigation.commands.positioning import (
     AnchorsOption,
     AreaOption,
@@ -179,13 +179,13 @@ def calibrate(
         raise harm
     name = ", ".join(bag.resolve().name for bag in bags)
     if report is not None:
-        from uwb_mitigation.files import write_whole
+        from uwb_mitigation.files import write_atomically
         from uwb_mitigation.training.site_page import site_page
 
-        write_whole(report, site_page(found, name))
-        say(f"Wrote {report}.")
+        write_atomically(report, site_page(found, name))
+        print_line(f"Wrote {report}.")
     bundle, offsets_path = found.write(output, source, name)
-    say(f"Wrote {output} (model {bundle.model_id:08x}) and {offsets_path}.")
+    print_line(f"Wrote {output} (model {bundle.model_id:08x}) and {offsets_path}.")
     console.write_json(
         json, found.as_json() | {"model_id": bundle.model_id, "offsets_file": str(offsets_path)}
     )
@@ -309,13 +309,13 @@ def _show(found: SiteCalibration) -> None:
     solution = found.solution
     if solution.alignment is not None:
         one = solution.alignment
-        say(f"time offset {one.time_offset_s:.3f} +- {one.time_offset_sd_s:.3f} s")
+        print_line(f"time offset {one.time_offset_s:.3f} +- {one.time_offset_sd_s:.3f} s")
         for ranges, arm, arm_sd in zip(found.site.tags, one.lever_arm_m, one.lever_arm_sd_m, strict=True):
             known = ", ".join(
                 f"{value:.3f}" + ("" if sd == 0.0 or math.isnan(sd) else f" +- {sd:.3f}")
                 for value, sd in zip(arm.tolist(), arm_sd.tolist(), strict=True)
             )
-            say(f"tag {format_id(ranges.tag_id)}: lever arm {known} m")
+            print_line(f"tag {format_id(ranges.tag_id)}: lever arm {known} m")
     rows = [(format_id(tag), format_id(anchor), *own) for (tag, anchor), own in solution.pairs.items()]
     columns = ("tag", "anchor", "offset m", "standard deviation m")
     show_table("Offsets", columns, rows)
@@ -331,4 +331,4 @@ def _show(found: SiteCalibration) -> None:
         warn(note)
     if solution.outliers:
         warn(f"{solution.outliers} outliers left out of all figures")
-    say(found.summary())
+    print_line(found.summary())

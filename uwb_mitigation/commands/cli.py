@@ -26,7 +26,7 @@ from uwb_mitigation.commands import (
     universal,
     view,
 )
-from uwb_mitigation.errors import UwbMitigationError, not_imported
+from uwb_mitigation.errors import UwbMitigationError, missing_dependency
 
 PANELS: dict[str, dict[str, typer.Typer | Callable[..., None]]] = {
     "Recordings": {
@@ -60,7 +60,7 @@ PANELS: dict[str, dict[str, typer.Typer | Callable[..., None]]] = {
 first line of the docstring."""
 
 
-class _InOrder(TyperGroup):
+class _OrderedGroup(TyperGroup):
     """Shows commands in the order of `PANELS`; typer would list groups last."""
 
     def list_commands(self, ctx: object) -> list[str]:
@@ -69,7 +69,7 @@ class _InOrder(TyperGroup):
 
 app = typer.Typer(
     name="uwb-mitigation",
-    cls=_InOrder,
+    cls=_OrderedGroup,
     help="Remove the range error of ultra-wideband ranging.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -99,18 +99,18 @@ def _root(
     pass
 
 
-def _fill(command: Any) -> None:
+def _reflow_help(command: Any) -> None:
     """Wrap the help of a command and its sub-commands at the terminal's width; typer keeps a docstring's lines."""
     paragraphs = inspect.cleandoc(command.help or "").split("\n\n")
     # Style tags keep the indent of an example: typer removes the common indent of all lines but the first.
     command.help = "\n\n".join(
         f"[none]{text}[/none]" if text.startswith(" ") else text.replace("\n", " ") for text in paragraphs
     )
-    for below in getattr(command, "commands", {}).values():
-        _fill(below)
+    for subcommand in getattr(command, "commands", {}).values():
+        _reflow_help(subcommand)
 
 
-def _fail(error: UwbMitigationError) -> NoReturn:
+def _exit_with_error(error: UwbMitigationError) -> NoReturn:
     console.err.print(f"uwb-mitigation: {error}", style="red", markup=False, soft_wrap=True)
     sys.exit(1)
 
@@ -121,15 +121,15 @@ def main() -> None:
     If the reader of standard output (head, less) exits, typer and rich exit with 1 and without a message.
     """
     command = typer.main.get_command(app)
-    _fill(command)
+    _reflow_help(command)
     try:
         command()
     except UwbMitigationError as error:
-        _fail(error)
+        _exit_with_error(error)
     except ImportError as error:
-        if (absent := not_imported(error)) is None:
+        if (problem := missing_dependency(error)) is None:
             raise
-        _fail(absent)
+        _exit_with_error(problem)
     except KeyboardInterrupt:
         sys.exit(130)
 

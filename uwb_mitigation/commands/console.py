@@ -15,7 +15,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 from rich.table import Table as RichTable
 
 from uwb_mitigation.errors import UwbMitigationError
-from uwb_mitigation.files import write_whole
+from uwb_mitigation.files import write_atomically
 
 MAX_ROWS = 40
 
@@ -34,7 +34,7 @@ out = Console()
 err = Console(stderr=True)
 
 
-def say(text: str) -> None:
+def print_line(text: str) -> None:
     """Print a line without highlighted numbers or line breaks."""
     out.print(text, markup=False, highlight=False, soft_wrap=True)
 
@@ -48,27 +48,27 @@ def show_table(
     title: str,
     columns: Iterable[str],
     rows: Sequence[Iterable[object]],
-    marked: str = "",
+    bold_row: str = "",
     *,
     left: int = 1,
-    most: int = MAX_ROWS,
+    max_rows: int = MAX_ROWS,
 ) -> None:
     """Print the first rows of a table; numbers have three decimals.
 
     Args:
-        marked: the row with this name is bold.
+        bold_row: the row with this name is bold.
         left: the number of left-aligned columns; the others are right-aligned.
-        most: maximum number of rows.
+        max_rows: maximum number of rows.
     """
     table = Table(title=title, title_justify="left")
     for number, column in enumerate(columns):
         table.add_column(column, justify="left" if number < left else "right")
-    for row in rows[:most]:
+    for row in rows[:max_rows]:
         cells = [f"{cell:.3f}" if isinstance(cell, float) else str(cell) for cell in row]
-        table.add_row(*cells, style="bold" if marked and marked in cells else None)
+        table.add_row(*cells, style="bold" if bold_row and bold_row in cells else None)
     out.print(table)
-    if len(rows) > most:
-        say(f"and {len(rows) - most} rows more")
+    if len(rows) > max_rows:
+        print_line(f"and {len(rows) - max_rows} rows more")
 
 
 def progress() -> Progress:
@@ -128,7 +128,7 @@ def reading() -> Iterator[Callable[[], None]]:
         yield on_record
 
 
-def show_refused(refused: Mapping[str, int]) -> None:
+def show_skipped(refused: Mapping[str, int]) -> None:
     """Print the number of refused ranges by reason, {reason: count}."""
     for reason, count in refused.items():
         err.print(f"left out: {count} x {reason}", markup=False)
@@ -146,7 +146,7 @@ def write_json(path: Path | None, result: Mapping[str, Any]) -> None:
         text = json.dumps(result, indent=2, allow_nan=False) + "\n"
     except ValueError as error:
         raise UwbMitigationError(f"cannot write the result: {error}", where=str(path)) from error
-    write_whole(path, text)
+    write_atomically(path, text)
 
 
 def _check_json_target(path: Path | None) -> Path | None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from uwb_mitigation.commands import console
-from uwb_mitigation.commands.console import JsonOption, Table, say
+from uwb_mitigation.commands.console import JsonOption, Table, print_line
 from uwb_mitigation.errors import DamagedRecordingError, ParameterError, RecordingError, format_id
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def import_recordings(
     json: JsonOption = None,
 ) -> None:
     """Write recordings into one MCAP bag, with truth where known."""
-    opened = [_opened(path, cir) for path in sources]
+    opened = [_open(path, cir) for path in sources]
     # If a tag is known to move, its time continues during a pause.
     in_motion = any(getattr(source, "in_motion", False) for source in opened)
     _write(opened, output, math.inf if in_motion else longest_pause, force, json)
@@ -121,7 +121,7 @@ def _write(
     force: bool,
     json: Path | None,
     total: int | None = None,
-    more: dict[str, Any] | None = None,
+    extra: dict[str, Any] | None = None,
 ) -> None:
     """Write sources into one bag, and show its contents.
 
@@ -129,13 +129,13 @@ def _write(
         RecordingError: there are no ranges; or a source is damaged, after the bag was written.
     """
     from uwb_mitigation.bag.writer import BagWriter
-    from uwb_mitigation.sources.inventory import Inventory, Pauses
+    from uwb_mitigation.sources.inventory import Inventory, PauseShortener
 
     inventory = Inventory()
     kinds = {source.simulated for source in sources}
     simulated = "true" if True in kinds else "unknown" if None in kinds else "false"
     origin = {"source": "; ".join(source.name for source in sources), "simulated": simulated}
-    pauses = Pauses(longest_pause, int(time.time() // 86_400) * 86_400 * 10**9)
+    pauses = PauseShortener(longest_pause, int(time.time() // 86_400) * 86_400 * 10**9)
     damage: list[DamagedRecordingError] = []
     with BagWriter(output, origin, force=force) as bag, console.progress() as bar:
         task = bar.add_task("writing", total=total)
@@ -157,19 +157,19 @@ def _write(
     if total is None:
         _show_inventory(found)
     if pauses.cut:
-        say(
+        print_line(
             f"Cut {pauses.cut} pauses to {pauses.longest_s:g} s each, {pauses.cut_s:.0f} s in all; "
             "--longest-pause inf keeps them."
         )
     if len(sources) == 1:
         _save_anchors(sources[0], output)
     messages = bag.counts.total()
-    lost = ", ".join(f"{count} x {why}" for why, count in inventory.skipped.items())
-    say(
+    lost = ", ".join(f"{count} x {reason}" for reason, count in inventory.skipped.items())
+    print_line(
         f"Wrote {messages} messages, {inventory.ranges} ranges of {_pairs(found)}, to {bag.file}"
         + (f"; left out: {lost}." if lost and total is not None else ".")
     )
-    console.write_json(json, {"messages": messages, "output": str(bag.file), **(more or {}), **found})
+    console.write_json(json, {"messages": messages, "output": str(bag.file), **(extra or {}), **found})
     if damage:
         raise damage[0]
 
@@ -197,7 +197,7 @@ def simulated_source(like: Like, seed: int, ranges: int, exchanges: int, anchors
     return simulated.SimulatedSource.with_anchors(anchors, seed=seed, count=ranges)
 
 
-def _opened(path: Path, cir: CirChoice) -> Source:
+def _open(path: Path, cir: CirChoice) -> Source:
     """Open any recording, including DeepUWB's pickle; raises the errors of `open_recording`."""
     from uwb_mitigation.sources.opening import open_recording
 
@@ -218,7 +218,7 @@ def info(
     from uwb_mitigation.sources.inventory import Inventory
     from uwb_mitigation.sources.mcap import McapRecording
 
-    source = _opened(path, cir)
+    source = _open(path, cir)
     inventory = Inventory()
     try:
         with source, console.reading() as on_record:
@@ -236,13 +236,13 @@ def info(
 
 
 def _save_anchors(source: Source, bag: Path) -> None:
-    from uwb_mitigation.sources.site import KnowsAnchors, anchors_file, save_anchors
+    from uwb_mitigation.sources.site import HasAnchors, anchors_file, save_anchors
 
-    if isinstance(source, KnowsAnchors):
+    if isinstance(source, HasAnchors):
         path = anchors_file(bag)
         # An existing bag was already refused, unless `--force` is given.
         save_anchors(path, source.anchors, f"anchors of {source.name}", force=True)
-        say(f"Wrote {len(source.anchors)} anchors to {path}.")
+        print_line(f"Wrote {len(source.anchors)} anchors to {path}.")
 
 
 _KINDS = {

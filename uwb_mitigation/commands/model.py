@@ -162,7 +162,7 @@ def quantize(
     check_output(output)
     with console.reading() as on_record:
         dataset = recordings.load_inputs(data, source.preprocessing, on_record)
-    console.show_refused(dataset.refused)
+    console.show_skipped(dataset.refused)
     made = quantization.quantize_bundle(source, dataset, percentile, output)
     bundle, difference = made.bundle, made.difference_m
     model_tables.show_bundle(bundle)
@@ -263,7 +263,7 @@ def _dataset(data: Path, preprocessing: Preprocessing, truth: Sequence[Path] = (
 
     with console.reading() as on_record:
         name, dataset = recordings.load(data, preprocessing, truth, on_record)
-    console.show_refused(dataset.refused)
+    console.show_skipped(dataset.refused)
     return name, dataset
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from uwb_mitigation.commands.console import say, show_table
+from uwb_mitigation.commands.console import print_line, show_table
 
 if TYPE_CHECKING:
     from uwb_mitigation.evaluation.accuracy import Accuracy
@@ -45,7 +45,7 @@ def show_trained(made: TrainedBundle) -> None:
     if made.selection is not None:
         show_selection(made.selection)
     if made.prefers_cold_start:
-        say(
+        print_line(
             f"With fewer than {candidates.MIN_CONFIGURATIONS_FOR_MEAN} configurations, cold start is kept unless another one is "
             f"{selection.COLD_START_MIN_GAIN:.0%} better."
         )
@@ -59,7 +59,7 @@ def show_trained(made: TrainedBundle) -> None:
     for name, before in made.baseline_mae_m.items():
         change = made.mae_m / before - 1 if before else 0.0
         verdict = "lower" if made.mae_m < before else "higher: this did not help"
-        say(
+        print_line(
             f"on configurations not seen, {made.mae_m:.3f} m against {before:.3f} m {name}: {abs(change):.0%} {verdict}"
         )
     show_bundle(made.bundle)
@@ -97,13 +97,13 @@ def show_comparison(result: Comparison) -> None:
         ],
     )
     kept = ", ".join(f"{share:.0%}: {mae:.3f}" for share, mae in result.rejection)
-    say(
+    print_line(
         f"shipped_int8: coverage of its 68 % and 95 % intervals: {covered(result.coverage)}\n"
         f"MAE without the ranges of largest variance, by share rejected: {kept}\n"
         f"passed through as unlike the training data: {result.passed_through:.1%}"
     )
     if result.universal_coverage is not None:
-        say(
+        print_line(
             f"universal_los_offset: coverage of its 68 % and 95 % intervals: {covered(result.universal_coverage)}"
         )
 
@@ -117,7 +117,7 @@ def show_held_out(held_out: Mapping[str, Mapping[str, ErrorStatistics]]) -> None
 def show_bundle(bundle: Bundle) -> None:
     """Show file, size and id of a bundle."""
     kind = "int8" if bundle.quantised else "float32"
-    say(f"{bundle.path}: {kind}, {len(bundle.model)} bytes, model id {bundle.model_id:08x}")
+    print_line(f"{bundle.path}: {kind}, {len(bundle.model)} bytes, model id {bundle.model_id:08x}")
 
 
 def show_accuracy(result: Accuracy) -> None:
@@ -129,9 +129,9 @@ def show_accuracy(result: Accuracy) -> None:
     show_table(f"{result.n} ranges, model {result.model_id:08x}, m", columns, rows)
     for status, count in result.statuses.items():
         if status != "OK":
-            say(f"{status}: {count} ranges passed through as measured")
+            print_line(f"{status}: {count} ranges passed through as measured")
     if result.trained_on:
-        say(
+        print_line(
             f"optimistic: the model was trained on {len(result.trained_on)} of these {len(result.by_configuration)} "
             "configurations; --cross-validate shows the error on unseen ones"
         )

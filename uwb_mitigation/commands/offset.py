@@ -51,7 +51,7 @@ def offset(
         ros2 param set /mitigator offsets offsets.yaml
     """
     from uwb_mitigation.evaluation import radio_offsets
-    from uwb_mitigation.files import write_whole
+    from uwb_mitigation.files import write_atomically
     from uwb_mitigation.mitigation import Mitigation
     from uwb_mitigation.offsets import dump_offsets
     from uwb_mitigation.sources.opening import open_recording
@@ -79,7 +79,7 @@ def offset(
             f"Antenna delays, m, for model {found.model_id:08x}, estimated by uwb-mitigation offset in {bag.name}.\n"
             f"Standard deviation {found.sd_m:.3f} m."
         )
-        write_whole(output, dump_offsets(found.offsets(together=together), comment), ParameterError)
+        write_atomically(output, dump_offsets(found.offsets(together=together), comment), ParameterError)
     console.write_json(json, found.as_json())
 
 
@@ -96,7 +96,7 @@ def _identity(name: str, text: str) -> int:
 
 
 def _show(found: OffsetEstimate) -> None:
-    from uwb_mitigation.commands.console import MAX_ROWS, say, show_table
+    from uwb_mitigation.commands.console import MAX_ROWS, print_line, show_table
 
     rows: list[tuple[object, ...]] = []
     for one in found.placements:
@@ -113,7 +113,7 @@ def _show(found: OffsetEstimate) -> None:
         console.err.print(text, markup=False)
     if len(refused) > MAX_ROWS:
         console.err.print(f"left out: {len(refused) - MAX_ROWS} placements more")
-    say(
+    print_line(
         f"offset {found.offset_m:.3f} m, standard deviation {found.sd_m:.3f} m, from {found.ranges} ranges, "
         f"for model {found.model_id:08x}"
     )

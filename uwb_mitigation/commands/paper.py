@@ -147,7 +147,7 @@ def report(
 ) -> None:
     """Write one HTML page: the paper's tables and figures next to yours."""
     # Read everything before the work begins, so that a missing library or a wrong file is an early error.
-    from uwb_mitigation.files import write_whole
+    from uwb_mitigation.files import write_atomically
     from uwb_mitigation.paper import published, results
     from uwb_mitigation.paper import report as reports
     from uwb_mitigation.paper.data import load
@@ -161,7 +161,7 @@ def report(
         study = reports.Study(data, *load(data, longest, on_record), _command())
     result = reports.build(study, trainings, bench)
     page = output / "report.html"
-    write_whole(page, result.html())
+    write_atomically(page, result.html())
     console.write_json(json, result.as_json())
     gaps = [table.title.split(".")[0] for table in result.tables if table.has_gaps]
     lines = [
@@ -184,7 +184,7 @@ def _parts(path: Path, samples: int, scaling: str, split: str) -> Parts:
     preprocessing = Preprocessing(samples, scaling_of(scaling))
     with console.reading() as on_record:
         name, _, dataset = parts.load(path, preprocessing, on_record)
-    console.show_refused(dataset.refused)
+    console.show_skipped(dataset.refused)
     return parts.split_dataset(name, dataset, split)
 
 
@@ -216,7 +216,7 @@ def _make_folder(path: Path) -> None:
 
 
 def _show_experiment(result: ExperimentResults) -> None:
-    from uwb_mitigation.commands.console import say, show_table
+    from uwb_mitigation.commands.console import print_line, show_table
     from uwb_mitigation.paper import tables
 
     provenance = tables.Provenance(result.data, result.split, "", "")
@@ -231,4 +231,4 @@ def _show_experiment(result: ExperimentResults) -> None:
     )
     for baseline in result.baselines:
         if baseline.reason:
-            say(f"{baseline.name}: not available: {baseline.reason}")
+            print_line(f"{baseline.name}: not available: {baseline.reason}")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from uwb_mitigation.commands import console
-from uwb_mitigation.commands.console import JsonOption, say, show_table, warn
+from uwb_mitigation.commands.console import JsonOption, print_line, show_table, warn
 from uwb_mitigation.errors import ParameterError, RecordingError, format_id
 
 if TYPE_CHECKING:
@@ -109,7 +109,7 @@ def track(
         uwb-mitigation track a1.mcap -o track.mcap --height 1.0 --stamp-offset=-0.2
     """
     from uwb_mitigation.bag.writer import BagWriter
-    from uwb_mitigation.files import write_whole
+    from uwb_mitigation.files import write_atomically
     from uwb_mitigation.positioning.noise_model import NoiseModel
     from uwb_mitigation.positioning.tag_estimator import EstimatorConfig
     from uwb_mitigation.processing.tracking import held_out, track_tag, tum_file, write_tracks
@@ -137,10 +137,10 @@ def track(
     _show_tracks(tracks, known)
     residuals = held_out(tracks, config)
     _show_residuals(residuals, known)
-    say(f"Wrote {out.counts.total()} messages to {out.file}.")
+    print_line(f"Wrote {out.counts.total()} messages to {out.file}.")
     if tum is not None:
         for one in tracks:
-            write_whole(tum_file(tum, one.recording.tag_id, len(tracks) > 1), tum_text(one.smoothed))
+            write_atomically(tum_file(tum, one.recording.tag_id, len(tracks) > 1), tum_text(one.smoothed))
     console.write_json(
         json, _result(tracks, recorded, known) | {"held_out": [one.as_json() for one in residuals]}
     )
@@ -203,7 +203,7 @@ def survey(
         output, result.anchors, f"surveyed from {bag.name}, tag {format_id(tag.tag_id)}", force=force
     )
     _show_survey(result)
-    say(f"Wrote {len(known)} anchors to {output}.")
+    print_line(f"Wrote {len(known)} anchors to {output}.")
     console.write_json(json, {"output": str(output)} | result.as_json())
 
 
@@ -219,7 +219,7 @@ def _read(bag: Path, anchors: Path | None, stamp_offset: float) -> tuple[AnchorM
     with console.progress() as bar:
         bar.add_task("reading", total=None)
         recorded = read_ranges(bag, known, stamp_offset)
-    for identity, count in recorded.strangers.items():
+    for identity, count in recorded.unknown_anchors.items():
         warn(f"{count} ranges of anchor {format_id(identity)} left out: it is not in the anchors file")
     for why, count in recorded.skipped.items():
         warn(f"left out: {count} x {why}")
@@ -266,7 +266,7 @@ def _show_tracks(tracks: list[TagTracks], anchors: AnchorMap) -> None:
             cells = [_number(getattr(errors, field), form) for field, (_, form) in _COLUMNS.items()]
             rows.append([format_id(one.recording.tag_id), name, errors.epochs or len(track), *cells])
     columns = ("tag", "track", "epochs", *(title for title, _ in _COLUMNS.values()))
-    show_table("Horizontal errors, m", columns, rows, left=2, most=len(rows))
+    show_table("Horizontal errors, m", columns, rows, left=2, max_rows=len(rows))
     console.out.print(
         "In ellipse: true positions inside the 95 % ellipses. NEES: 1 is consistent, more is overconfident. "
         "Beyond: errors beyond the protection levels. Height: RMSE of z.",
@@ -275,7 +275,7 @@ def _show_tracks(tracks: list[TagTracks], anchors: AnchorMap) -> None:
     for one in tracks:
         name = f"tag {format_id(one.recording.tag_id)}"
         if not one.errors["live"].epochs:
-            say(f"{name}: no truth in the bag, so no errors")
+            print_line(f"{name}: no truth in the bag, so no errors")
         for warning in one.warnings:
             warn(f"{name}: {warning}.")
         for row in one.disagreeing:
@@ -295,7 +295,7 @@ def _show_residuals(residuals: list[HeldOut], anchors: AnchorMap) -> None:
         for one in residuals
     ]
     show_table(
-        "Residuals of held-out ranges, m", ("anchor", "ranges", "raw", "corrected"), rows, most=len(rows)
+        "Residuals of held-out ranges, m", ("anchor", "ranges", "raw", "corrected"), rows, max_rows=len(rows)
     )
     console.out.print(
         "Median absolute residuals. The ranges of each anchor are compared with a track of the other anchors' ranges.",
@@ -310,7 +310,7 @@ def _show_survey(result: SurveyResult) -> None:
         for anchor, moved_m in zip(anchors, result.moved_m.tolist(), strict=True)
     ]
     columns = ("anchor", "x", "y", "z", "standard deviation", "distance from guess")
-    show_table("Anchors, m", columns, rows, most=len(rows))
+    show_table("Anchors, m", columns, rows, max_rows=len(rows))
     if not result.explained:
         warn(
             f"these anchors do not explain the ranges: the mean loss is {result.loss:.1f}, but 0.5 or less if they do. Do "
@@ -349,7 +349,7 @@ def _result(tracks: list[TagTracks], recorded: RecordedRanges, anchors: AnchorMa
         **(overall if known else dict.fromkeys(KINDS)),
         "hdop_median": max(hdops) if hdops else None,
         "corrected": all(one.recording.corrected for one in tracks),
-        "unknown_anchors": {str(identity): count for identity, count in recorded.strangers.items()},
+        "unknown_anchors": {str(identity): count for identity, count in recorded.unknown_anchors.items()},
         "skipped": dict(recorded.skipped),
     }
 

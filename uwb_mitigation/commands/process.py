@@ -75,7 +75,7 @@ def process(
     elif len(jobs) == 1:
         outcomes = [_process_one(jobs[0])]
     else:
-        outcomes = _follow(jobs, parallel.run_here(jobs, workers or parallel.num_cores()))
+        outcomes = _follow(jobs, parallel.run_locally(jobs, workers or parallel.num_cores()))
     seconds = outcomes[0].seconds if len(jobs) == 1 else time.perf_counter() - started
     result = _result(outcomes, seconds, bundle.model_id)
     if any(outcome.written for outcome in outcomes):
@@ -94,11 +94,11 @@ def _make_folder(path: Path) -> None:
 
 
 def _process_one(job: Job) -> Outcome:
-    from uwb_mitigation.processing.job import attempt
+    from uwb_mitigation.processing.job import try_process
 
     with console.progress() as bar:
         task = bar.add_task(escape(job.source.name), total=None)
-        return attempt(job, lambda done, total: bar.update(task, completed=done, total=total))
+        return try_process(job, lambda done, total: bar.update(task, completed=done, total=total))
 
 
 def _follow(jobs: list[Job], outcomes: Iterable[Outcome]) -> list[Outcome]:

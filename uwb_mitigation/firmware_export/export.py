@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ModelError, UwbMitigationError
-from uwb_mitigation.files import write_whole
+from uwb_mitigation.files import write_atomically
 from uwb_mitigation.firmware_export.packing import Channels, PackedNetwork, pack
 from uwb_mitigation.model import graph
 from uwb_mitigation.model.bundle import Bundle, Card, Session
@@ -68,7 +68,7 @@ def write_header(folder: Path, network: PackedNetwork, card: Card, model_id: int
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UwbMitigationError(f"cannot be written: {error.strerror}", where=str(path)) from error
-    write_whole(path, render(network, card, model_id, golden))
+    write_atomically(path, render(network, card, model_id, golden))
     return path
 
 

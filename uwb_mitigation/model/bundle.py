@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ModelError, UwbMitigationError
-from uwb_mitigation.files import read_bounded, write_whole
+from uwb_mitigation.files import read_bounded, write_atomically
 from uwb_mitigation.model.architecture import Architecture, Mlp, Remnet
 from uwb_mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.model.ood import Band, OodBands
@@ -254,7 +254,7 @@ def save_bundle(path: Path, graph: bytes, card: Card) -> Bundle:
         ModelError: the card does not fit the graph, or the file cannot be written.
     """
     bundle, data = build_bundle(path, graph, card)
-    write_whole(path, data, ModelError)
+    write_atomically(path, data, ModelError)
     return bundle
 
 

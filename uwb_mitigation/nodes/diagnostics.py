@@ -22,12 +22,12 @@ ERROR = DiagnosticStatus.ERROR
 Description = tuple[str, bytes, str, dict[str, object]]
 """Hardware id, level, message and values of a diagnostic status."""
 
-LATENCIES = 20_000
+MAX_LATENCIES = 20_000
 """Number of latencies that are kept."""
 
 
 def report(
-    node: Node, hardware_id: str, level: bytes, message: str, facts: Mapping[str, object]
+    node: Node, hardware_id: str, level: bytes, message: str, entries: Mapping[str, object]
 ) -> DiagnosticArray:
     """Return a message with one status, stamped on the node's clock and named after the node."""
     status = DiagnosticStatus(
@@ -35,7 +35,7 @@ def report(
         name=f"{node.get_fully_qualified_name().lstrip('/')}: ranges",
         message=message,
         hardware_id=hardware_id,
-        values=[KeyValue(key=key, value=str(value)) for key, value in facts.items()],
+        values=[KeyValue(key=key, value=str(value)) for key, value in entries.items()],
     )
     array = DiagnosticArray(status=[status])
     array.header.stamp = node.get_clock().now().to_msg()
@@ -56,7 +56,7 @@ def model_id(identity: int) -> str:
 
 
 class Meter:
-    """Rate and latency since the previous call of `facts`.
+    """Rate and latency since the previous call of `entries`.
 
     Args:
         now_ns: the node's clock, ns. If it is simulated, the rate is that of the recording.
@@ -64,7 +64,7 @@ class Meter:
 
     def __init__(self, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
         # deque.append and popleft are atomic: one thread adds, another reads.
-        self._latencies_ns: deque[int] = deque(maxlen=LATENCIES)
+        self._latencies_ns: deque[int] = deque(maxlen=MAX_LATENCIES)
         self._now_ns = now_ns
         self._since_ns = now_ns()
         self._passed = self._reported = 0
@@ -73,14 +73,14 @@ class Meter:
         self._latencies_ns.append(latency_ns)
         self._passed += 1
 
-    def facts(self) -> dict[str, object]:
+    def entries(self) -> dict[str, object]:
         """Return rate and percentiles of the latency, and begin a new period."""
         now_ns = self._now_ns()
         period_s, self._since_ns = (now_ns - self._since_ns) / 1e9, now_ns
         passed, self._reported = self._passed - self._reported, self._passed
         # A simulated clock may pause, or jump back when a recording restarts.
         rate = f"{passed / period_s:.1f}" if period_s > 0 else "unknown"
-        return {"rate Hz": rate} | percentiles("latency", _drained(self._latencies_ns))
+        return {"rate Hz": rate} | percentiles("latency", _drain(self._latencies_ns))
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,12 +88,12 @@ class Threshold:
     """Threshold of a diagnostic warning.
 
     Attributes:
-        fact: the value that is compared, over the last period.
+        quantity: the value that is compared, over the last period.
         limit: the highest value that is OK.
         text: the warning above it.
     """
 
-    fact: str
+    quantity: str
     limit: float
     text: str
 
@@ -101,15 +101,15 @@ class Threshold:
 OUT_OF_DISTRIBUTION = Threshold(
     "share of ranges OUT_OF_DISTRIBUTION", 0.2, "many ranges are unlike the model's training data"
 )
-UNUSABLE = Threshold("share of ranges NO_CIR or BAD_CIR", 0.2, "many ranges have no usable CIR")
-UNCOUNTED = Threshold(
+NO_USABLE_CIR = Threshold("share of ranges NO_CIR or BAD_CIR", 0.2, "many ranges have no usable CIR")
+NO_PREAMBLE_COUNT = Threshold(
     "share of ranges without the preamble count that the model needs",
     0.2,
     "many CIRs have no preamble count, and this model needs it: set model to universal_amplitude",
 )
 DROPPED = Threshold("share of ranges dropped", 0.0, "ranges were dropped: the queue was too short")
 SLOW = Threshold("p99 of the processing time, ms", 20.0, "correcting takes long: the processor is overloaded")
-SILENT = Threshold("s without a range", 5.0, "no ranges arrive")
+NO_RANGES = Threshold("s without a range", 5.0, "no ranges arrive")
 OFFSET = Threshold(
     "size of the median predicted error of ranges that look like line of sight, m",
     0.15,
@@ -130,11 +130,12 @@ class MitigatorHealth:
     Attributes:
         statuses: number of ranges by status, since the start.
         lost: ranges that the middleware reports as lost, because the publisher's queue was too short.
-        numbering: counts the lost ranges and those dropped by the subscription's queue.
+        loss_counter: counts the lost ranges and those dropped by the subscription's queue.
         malformed: messages that could not be decoded.
-        uncounted: ranges whose CIR lacks the preamble count that the model needs, in this period.
+        without_preamble_count: ranges whose CIR lacks the preamble count that the model needs, in this period.
         los_m: predicted errors of the latest LOS ranges without the offsets of the radios.
-        predicts_excess_alone: whether the median of `los_m` should be near 0.
+        excludes_offset: whether the predicted errors do not contain the radios' offset, so that the median of `los_m`
+            is near 0.
     """
 
     def __init__(
@@ -142,20 +143,20 @@ class MitigatorHealth:
     ) -> None:
         self.statuses: Counter[Status] = Counter()
         self.lost = 0
-        self.numbering = Numbering(publishers)
+        self.loss_counter = LossCounter(publishers)
         self.malformed = 0
-        self.uncounted = 0
+        self.without_preamble_count = 0
         self.los_m: deque[float] = deque(maxlen=MAX_LOS)
-        self.predicts_excess_alone = False
-        self._processing_ns: deque[int] = deque(maxlen=LATENCIES)
+        self.excludes_offset = False
+        self._processing_ns: deque[int] = deque(maxlen=MAX_LATENCIES)
         self._now_s = now_s
         self._last_s = now_s()
-        self._before: tuple[Counter[Status], int] = (Counter(), 0)
+        self._previous: tuple[Counter[Status], int] = (Counter(), 0)
 
     @property
     def dropped(self) -> int:
         """Number of ranges that are known to have been dropped by a queue."""
-        return max(self.lost, self.numbering.missing)
+        return max(self.lost, self.loss_counter.missing)
 
     def add_time(self, processing_ns: int) -> None:
         """Add the processing time of a range or of a batch."""
@@ -168,44 +169,45 @@ class MitigatorHealth:
         Returns:
             The warnings of the period that ends, its values for the diagnostics, and whether the model failed.
         """
-        before, dropped_before = self._before
-        self._before = self.statuses.copy(), self.dropped
-        statuses = self._before[0] - before
-        dropped = self._before[1] - dropped_before
-        processing_ns = _drained(self._processing_ns)
+        previous, previous_dropped = self._previous
+        self._previous = self.statuses.copy(), self.dropped
+        statuses = self._previous[0] - previous
+        dropped = self._previous[1] - previous_dropped
+        processing_ns = _drain(self._processing_ns)
         los_m = self.los_m.copy()
         median_m = statistics.median(los_m) if los_m else math.nan
         total = max(statuses.total(), 1)
-        uncounted, self.uncounted = self.uncounted / total, 0
+        without_preamble_count, self.without_preamble_count = self.without_preamble_count / total, 0
         out_of_distribution = statuses[Status.OUT_OF_DISTRIBUTION] / total
         values = {
             OUT_OF_DISTRIBUTION: out_of_distribution,
-            UNUSABLE: (statuses[Status.NO_CIR] + statuses[Status.BAD_CIR]) / total - uncounted,
-            UNCOUNTED: uncounted,
+            NO_USABLE_CIR: (statuses[Status.NO_CIR] + statuses[Status.BAD_CIR]) / total
+            - without_preamble_count,
+            NO_PREAMBLE_COUNT: without_preamble_count,
             DROPPED: dropped / max(statuses.total() + dropped, 1),
             SLOW: float(np.percentile(processing_ns, 99)) / 1e6 if processing_ns else 0.0,
-            SILENT: self._now_s() - self._last_s,
-            OFFSET: abs(median_m) if self.predicts_excess_alone and len(los_m) >= MIN_LOS else 0.0,
+            NO_RANGES: self._now_s() - self._last_s,
+            OFFSET: abs(median_m) if self.excludes_offset and len(los_m) >= MIN_LOS else 0.0,
         }
-        facts: dict[str, object] = {f"ranges {status.name}": self.statuses[status] for status in Status}
-        facts |= {
+        entries: dict[str, object] = {f"ranges {status.name}": self.statuses[status] for status in Status}
+        entries |= {
             "out of distribution": f"{out_of_distribution:.3f}",
-            "dropped by a queue": f"{self.dropped}" + ("" if self.numbering.complete else " or more"),
+            "dropped by a queue": f"{self.dropped}" + ("" if self.loss_counter.complete else " or more"),
             "malformed": self.malformed,
             "line of sight: ranges": len(los_m),
         }
         if los_m:
-            facts["line of sight: median predicted error m"] = f"{median_m:.3f}"
-        facts |= percentiles("processing", processing_ns)
+            entries["line of sight: median predicted error m"] = f"{median_m:.3f}"
+        entries |= percentiles("processing", processing_ns)
         warnings = [threshold.text for threshold, value in values.items() if value > threshold.limit]
-        return warnings, facts, statuses[Status.MODEL_ERROR] > 0
+        return warnings, entries, statuses[Status.MODEL_ERROR] > 0
 
 
-NOT_NUMBERED = 2**64 - 1
+NO_SEQUENCE_NUMBER = 2**64 - 1
 """Sequence number of rmw if the middleware provides none (RMW_MESSAGE_INFO_SEQUENCE_NUMBER_UNSUPPORTED)."""
 
 
-class Numbering:
+class LossCounter:
     """Counts dropped messages by the sequence numbers of their publishers.
 
     A queue with keep-last drops messages silently. A message does not identify its publisher: a number that
@@ -233,7 +235,7 @@ class Numbering:
         last = self._last
         if last and last[-1] == number - 1:
             last[-1] = number
-        elif number == NOT_NUMBERED:
+        elif number == NO_SEQUENCE_NUMBER:
             self.complete = False
         elif number - 1 in last:
             last.remove(number - 1)
@@ -255,6 +257,6 @@ class Numbering:
         self._last.append(number)
 
 
-def _drained(values: deque[int]) -> list[int]:
+def _drain(values: deque[int]) -> list[int]:
     """Remove and return all values; another thread may append meanwhile."""
     return [values.popleft() for _ in range(len(values))]

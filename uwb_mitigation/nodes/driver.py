@@ -66,9 +66,9 @@ def open_source(value: Callable[[str], Any]) -> Source:
         from uwb_mitigation.sources.mcap import McapRecording
 
         return McapRecording(path, topic=value("topic"))
-    from uwb_mitigation.sources.decaranging import CirOf, open_decaranging
+    from uwb_mitigation.sources.decaranging import CirFrame, open_decaranging
 
-    return open_decaranging(path, cir=CirOf(value("cir")))
+    return open_decaranging(path, cir=CirFrame(value("cir")))
 
 
 def _model_id(digits: str) -> int | None:
@@ -88,16 +88,19 @@ class Driver(ManagedNode):
     Args:
         ended: set when a replay has ended.
         consumer: in-process consumer of measurements; `/uwb/range_raw` is then published only if it has subscribers.
-        foreign: see `ManagedNode`.
+        other_parameters: see `ManagedNode`.
 
     Attributes:
         exit_code: exit code of the process; valid when `ended` is set.
     """
 
     def __init__(
-        self, ended: threading.Event, consumer: Mitigator | None = None, foreign: Collection[str] = ()
+        self,
+        ended: threading.Event,
+        consumer: Mitigator | None = None,
+        other_parameters: Collection[str] = (),
     ) -> None:
-        super().__init__("driver", DRIVER, foreign)
+        super().__init__("driver", DRIVER, other_parameters)
         self._ended = ended
         self._consumer = consumer
         self.exit_code = 0
@@ -149,7 +152,7 @@ class Driver(ManagedNode):
         self._offsets = read_offsets(str(self.value("offsets")))
         self._corrected = self.publisher(RangeCorrected, topics.RANGE_CORRECTED)
         if self.value("sensor_ranges"):
-            self._sensor_ranges = self.until_close(topics.SensorRanges(self), topics.SensorRanges.close)
+            self._sensor_ranges = self.destroy_at_close(topics.SensorRanges(self), topics.SensorRanges.close)
 
         def make() -> BoardFeed:
             port = BoardPort(
@@ -180,13 +183,13 @@ class Driver(ManagedNode):
         return make
 
     def _prepare_replay(self) -> Callable[[], Feed]:
-        source = self.until_close(open_source(self.value), lambda source: source.close())
+        source = self.destroy_at_close(open_source(self.value), lambda source: source.close())
         self._truths = self.publisher(RangeTruth, topics.RANGE_TRUTH)
         self._places = self.publisher(Odometry, topics.ODOMETRY_TRUTH)
         own_clock = self.value("publish_clock")
         if own_clock:
             clock = self.create_publisher(ClockMessage, topics.CLOCK, 10)
-            self._clock_publisher = self.until_close(clock, self.destroy_publisher)
+            self._clock_publisher = self.destroy_at_close(clock, self.destroy_publisher)
 
         def make() -> ReplayFeed:
             subscribed = self._ranges.get_subscription_count

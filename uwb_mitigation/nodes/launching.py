@@ -27,10 +27,10 @@ _FLOAT = re.compile(r"[-+]?(\.\d+|\d+\.\d*|\d+(\.\d*)?[eE][-+]?\d+|\.\d+[eE][-+]
 """Floats of YAML 1.2; PyYAML reads YAML 1.1, in which 1e-1 is a string."""
 
 _LAUNCH_FILES = (".launch.py", ".launch.xml", ".launch.yaml", ".launch.yml")
-_OWN = ("uwb.launch.py", "boards.launch.py")
+_LAUNCH_FILES_OF_PACKAGE = ("uwb.launch.py", "boards.launch.py")
 
 
-def plain_errors(function: Callable[[Any], list[Any]]) -> Callable[[Any], list[Any]]:
+def report_errors(function: Callable[[Any], list[Any]]) -> Callable[[Any], list[Any]]:
     """Make a launch function raise RuntimeError, which `ros2 launch` reports in one line, and then stops."""
 
     @functools.wraps(function)
@@ -52,10 +52,10 @@ def arguments(nodes: Iterable[str]) -> dict[str, dict[str, Parameter]]:
     found: dict[str, dict[str, Parameter]] = {}
     for node in nodes:
         for row in TABLES[node]:
-            same = found.setdefault(row.name, {})
-            if any(other.default != row.default for other in same.values()):
-                same = found.setdefault(f"{node}_{row.name}", {})
-            same[node] = row
+            group = found.setdefault(row.name, {})
+            if any(other.default != row.default for other in group.values()):
+                group = found.setdefault(f"{node}_{row.name}", {})
+            group[node] = row
     return found
 
 
@@ -67,12 +67,12 @@ def description(rows: Mapping[str, Parameter]) -> str:
 
 
 def parameters(
-    said: Mapping[str, str], nodes: Collection[str], known: Iterable[str]
+    texts: Mapping[str, str], nodes: Collection[str], known: Iterable[str]
 ) -> dict[str, dict[str, Any]]:
     """Return the parameters that arguments set, {node: {parameter: value}}.
 
     Args:
-        said: {argument: text}; an empty text keeps the value of the files.
+        texts: {argument: text}; an empty text keeps the value of the files.
         nodes: the nodes that are started.
         known: the nodes whose parameters are arguments.
 
@@ -81,7 +81,7 @@ def parameters(
     """
     found: dict[str, dict[str, Any]] = {node: {} for node in nodes}
     for name, rows in arguments(known).items():
-        text = said.get(name, "")
+        text = texts.get(name, "")
         if not text:
             continue
         started = [node for node in rows if node in nodes]
@@ -151,7 +151,9 @@ def check_names(words: Sequence[str], known: Collection[str]) -> None:
         known: the declared arguments.
     """
     # A launch file that includes this one may declare further arguments.
-    if any(word.endswith(_LAUNCH_FILES) and Path(word).name not in _OWN for word in sys.argv):
+    if any(
+        word.endswith(_LAUNCH_FILES) and Path(word).name not in _LAUNCH_FILES_OF_PACKAGE for word in sys.argv
+    ):
         return
     for word in words:
         name, separator, _ = word.partition(":=")
@@ -188,10 +190,10 @@ def from_files(node: str, own: str, shared: str = "") -> dict[str, Any]:
         ParameterError: a file cannot be read, or a parameter in it is unknown or invalid.
     """
     given = _parameters_in(Path(own), node, ())
-    return given | _parameters_in(Path(shared), node, others_meaning(node)) if shared else given
+    return given | _parameters_in(Path(shared), node, conflicting_parameters(node)) if shared else given
 
 
-def others_meaning(node: str) -> dict[str, Value]:
+def conflicting_parameters(node: str) -> dict[str, Value]:
     """Return the parameters whose names have another meaning for an earlier node, such as the viewer's port.
 
     In the section for all nodes of a shared file they belong to that earlier node, as arguments do.
@@ -203,18 +205,18 @@ def others_meaning(node: str) -> dict[str, Value]:
     return {row.name: row.default for name, row in found if row.name != name}
 
 
-def _parameters_in(path: Path, node: str, not_shared: Collection[str]) -> dict[str, Any]:
+def _parameters_in(path: Path, node: str, excluded: Collection[str]) -> dict[str, Any]:
     try:
         tree = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         reason = "no such file" if isinstance(error, FileNotFoundError) else " ".join(str(error).split())
         raise ParameterError(f"parameter file {path}: {reason}") from error
     found: dict[str, Any] = {}
-    everyones = {row.name for table in TABLES.values() for row in table}
+    all_names = {row.name for table in TABLES.values() for row in table}
     rows = {row.name: row for row in TABLES[node]}
     for section, name, value in _entries(tree, ""):
         if section in _WILDCARDS:
-            if name in not_shared:
+            if name in excluded:
                 continue
         elif section.rpartition("/")[2] != node:
             continue
@@ -224,9 +226,9 @@ def _parameters_in(path: Path, node: str, not_shared: Collection[str]) -> dict[s
             except ParameterError as error:
                 raise ParameterError(error.what, where=str(path), valid=error.valid) from None
             found[name] = value
-        elif name not in everyones and not name.startswith(STANDARD):
+        elif name not in all_names and not name.startswith(STANDARD):
             raise ParameterError(
-                f"parameter {name} is unknown", where=str(path), valid=did_you_mean(name, everyones)
+                f"parameter {name} is unknown", where=str(path), valid=did_you_mean(name, all_names)
             )
     return found
 

@@ -22,17 +22,17 @@ from rclpy.parameter import Parameter as RosParameter
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 
-from uwb_mitigation.errors import ParameterError, UwbMitigationError, did_you_mean, not_imported
-from uwb_mitigation.files import write_whole
+from uwb_mitigation.errors import ParameterError, UwbMitigationError, did_you_mean, missing_dependency
+from uwb_mitigation.files import write_atomically
 from uwb_mitigation.nodes import diagnostics, topics
 from uwb_mitigation.nodes.parameter_tables import KEPT_PARAMETERS, TABLES, Parameter
 
-SAME_NAME_S = 40.0
+DUPLICATE_NAME_DELAY_S = 40.0
 """A second node of the same name is reported after this time: a killed node stays in the graph for up to 20 s."""
 
 _QOS = "qos_overrides."
 
-Made = TypeVar("Made")
+Resource = TypeVar("Resource")
 
 
 def clock_reader(clock: Clock) -> Callable[[], int]:
@@ -55,18 +55,18 @@ class ManagedNode(LifecycleNode):
 
     Args:
         table: the node's parameters.
-        foreign: names of parameters of other nodes in this process.
+        other_parameters: names of parameters of other nodes in this process.
 
     Attributes:
         error: the error of the latest transition; None after success.
     """
 
-    def __init__(self, name: str, table: Sequence[Parameter], foreign: Collection[str] = ()) -> None:
+    def __init__(self, name: str, table: Sequence[Parameter], other_parameters: Collection[str] = ()) -> None:
         super().__init__(name)
-        declare(self, table, foreign)
+        declare(self, table, other_parameters)
         self.error: UwbMitigationError | None = None
         self.now_ns = clock_reader(self.get_clock())
-        self._unique_name_s = time.monotonic()
+        self._last_unique_s = time.monotonic()
         self._reported: set[str] = set()
         self._opened: list[Callable[[], object]] = []
         self._diagnostics = self.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, 10)
@@ -87,18 +87,18 @@ class ManagedNode(LifecycleNode):
         while self._opened:
             self._opened.pop()()
 
-    def until_close(self, made: Made, destroy: Callable[[Made], object]) -> Made:
-        """Return `made`, and let `close` destroy it."""
-        self._opened.append(partial(destroy, made))
-        return made
+    def destroy_at_close(self, resource: Resource, destroy: Callable[[Resource], object]) -> Resource:
+        """Return `resource`, and let `close` destroy it."""
+        self._opened.append(partial(destroy, resource))
+        return resource
 
     def publisher(self, kind: type, topic: str, qos: QoSProfile | None = None) -> Publisher:
         """Return a lifecycle publisher until `close`, by default with the QoS of ranges."""
         if qos is None:
-            made = topics.create_publisher(self, kind, topic)
+            resource = topics.create_publisher(self, kind, topic)
         else:
-            made = self.create_lifecycle_publisher(kind, topic, qos)
-        return self.until_close(made, self.destroy_lifecycle_publisher)
+            resource = self.create_lifecycle_publisher(kind, topic, qos)
+        return self.destroy_at_close(resource, self.destroy_lifecycle_publisher)
 
     def describe(self) -> diagnostics.Description:
         """Return the content of the diagnostics."""
@@ -158,13 +158,13 @@ class ManagedNode(LifecycleNode):
         self.end()
         self.close()
 
-    def _attempt(self, step: Callable[[], None], undo: Callable[[], None] | None = None) -> Any:
+    def _attempt(self, step: Callable[[], None], on_failure: Callable[[], None] | None = None) -> Any:
         try:
             step()
         except UwbMitigationError as error:
             self.error = error
         except Exception as error:
-            self.error = not_imported(error) if isinstance(error, ImportError) else None
+            self.error = missing_dependency(error) if isinstance(error, ImportError) else None
             if self.error is None:
                 self.get_logger().error(traceback.format_exc())
                 self.error = UwbMitigationError(
@@ -174,18 +174,18 @@ class ManagedNode(LifecycleNode):
             self.error = None
             return TransitionCallbackReturn.SUCCESS
         self.get_logger().error(str(self.error))
-        if undo is not None:
-            undo()
+        if on_failure is not None:
+            on_failure()
         return TransitionCallbackReturn.FAILURE
 
     def _publish_diagnostics(self) -> None:
         label = self._state_machine.current_state[1]
-        hardware, level, text, facts = self.describe()
+        hardware, level, text, entries = self.describe()
         if self.error is not None:
             level, text = diagnostics.ERROR, f"{label}: {self.error}"
         elif not self.is_active:
             level, text = diagnostics.WARN, f"not active: {label}"
-        problems = topics.not_received(self) + self._same_name()
+        problems = topics.incompatible_publishers(self) + self._duplicate_name_warnings()
         for problem in problems:
             if problem not in self._reported:
                 self.get_logger().warning(problem)
@@ -193,39 +193,39 @@ class ManagedNode(LifecycleNode):
         if problems:
             text = "; ".join([*problems, text] if level > diagnostics.OK else problems)
             level = max(level, diagnostics.WARN)
-        self._diagnostics.publish(diagnostics.report(self, hardware, level, text, facts))
+        self._diagnostics.publish(diagnostics.report(self, hardware, level, text, entries))
 
-    def _same_name(self) -> list[str]:
+    def _duplicate_name_warnings(self) -> list[str]:
         """Return a warning if another node has this name: parameter and transition calls are then ambiguous."""
         own = (self.get_name(), self.get_namespace())
         if self.get_node_names_and_namespaces().count(own) < 2:
-            self._unique_name_s = time.monotonic()
-        if time.monotonic() - self._unique_name_s < SAME_NAME_S:
+            self._last_unique_s = time.monotonic()
+        if time.monotonic() - self._last_unique_s < DUPLICATE_NAME_DELAY_S:
             return []
         remedy = "set a namespace (-r __ns:=/left) or a name (-r __node:=left)"
         return [f"another node has the name {self.get_fully_qualified_name()}: {remedy}"]
 
 
-def declare(node: Node, table: Sequence[Parameter], foreign: Collection[str] = ()) -> None:
+def declare(node: Node, table: Sequence[Parameter], other_parameters: Collection[str] = ()) -> None:
     """Declare a table on a node, refuse unknown parameters, and check every later value.
 
     Args:
-        foreign: names of parameters of other nodes in this process.
+        other_parameters: names of parameters of other nodes in this process.
 
     Raises:
         ParameterError: a parameter given at start-up is unknown, or its value has the wrong type or range.
     """
     rows = {row.name: row for row in table}
-    keep = _restore_live_parameters(node, {row.name for row in table if row.live})
+    save_live_parameters = _restore_live_parameters(node, {row.name for row in table if row.live})
     for row in table:
         try:
             node.declare_parameter(row.name, row.default, _descriptor(row))
         except (InvalidParameterTypeException, InvalidParameterValueException) as error:
             raise ParameterError(f"parameter {row.name}: {error}", valid=row.valid) from error
         row.check(node.get_parameter(row.name).value)
-    _refuse_unknown(node, foreign)
-    if keep is not None:
-        node.add_post_set_parameters_callback(keep)
+    _refuse_unknown(node, other_parameters)
+    if save_live_parameters is not None:
+        node.add_post_set_parameters_callback(save_live_parameters)
 
     def check(values: Mapping[str, Any]) -> None:
         for name in values.keys() & rows.keys():
@@ -265,13 +265,13 @@ def _descriptor(row: Parameter) -> ParameterDescriptor:
     return descriptor
 
 
-def _refuse_unknown(node: Node, foreign: Collection[str]) -> None:
+def _refuse_unknown(node: Node, other_parameters: Collection[str]) -> None:
     """Raise ParameterError for an unknown parameter; log the parameters of other nodes in one line."""
     all_nodes = {row.name for table in TABLES.values() for row in table}
-    given = [name for name in _undeclared(node) if not name.startswith(_QOS) and name not in foreign]
+    given = [name for name in _undeclared(node) if not name.startswith(_QOS) and name not in other_parameters]
     for name in given:
         if name not in all_nodes:
-            known = [*foreign, *(known for known in node._parameters if not known.startswith(_QOS))]
+            known = [*other_parameters, *(known for known in node._parameters if not known.startswith(_QOS))]
             raise ParameterError(
                 f"parameter {name} is unknown", valid=did_you_mean(name, known) or "see --help"
             )
@@ -285,24 +285,24 @@ def _restore_live_parameters(node: Node, live: Collection[str]) -> Callable[[lis
     if not folder:
         return None
     path = Path(folder, node.get_fully_qualified_name().strip("/").replace("/", "."))
-    kept: dict[str, Any] = {}
+    saved: dict[str, Any] = {}
     if path.is_file():
-        kept = json.loads(path.read_text(encoding="utf-8"))
+        saved = json.loads(path.read_text(encoding="utf-8"))
         # rclpy has no public access to the parameters given at start-up.
         node._parameter_overrides.update(
-            {name: RosParameter(name, value=value) for name, value in kept.items()}
+            {name: RosParameter(name, value=value) for name, value in saved.items()}
         )
-        values = ", ".join(f"{name} = {value!r}" for name, value in kept.items())
+        values = ", ".join(f"{name} = {value!r}" for name, value in saved.items())
         node.get_logger().info(f"restored after a restart, as set while the node ran: {values}")
 
-    def keep(changes: list[Any]) -> None:
-        kept.update({change.name: change.value for change in changes if change.name in live})
+    def save_live_parameters(changes: list[Any]) -> None:
+        saved.update({change.name: change.value for change in changes if change.name in live})
         try:
-            write_whole(path, json.dumps(kept))
+            write_atomically(path, json.dumps(saved))
         except UwbMitigationError as error:
             node.get_logger().warning(f"parameters will be lost after a respawn: {error}")
 
-    return keep
+    return save_live_parameters
 
 
 def _warn_of_unknown_qos(node: Node) -> None:

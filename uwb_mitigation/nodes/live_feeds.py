@@ -40,7 +40,7 @@ EVENT_TIMEOUT_S = 0.5
 PREFIX = "radio."
 """Prefix of the parameters of radios."""
 
-_OFFSETS, _RADIO = "the offsets are not set", "the radio's settings are not used"
+_OFFSETS_PROBLEM, _RADIO_PROBLEM = "the offsets are not set", "the radio's settings are not used"
 """Settings that a board may refuse."""
 
 _STATES = {
@@ -159,17 +159,17 @@ class BoardFeed(LiveFeed):
     def apply(self, changed: Collection[str], value: Value, offsets: Offsets) -> None:
         """Send new settings to the board."""
         if any(name.startswith(PREFIX) for name in changed):
-            self._refused.pop(_RADIO, None)
+            self._refused.pop(_RADIO_PROBLEM, None)
             self._port.set_radio(settings_of(value))
         if {"mode", "offsets"} & set(changed) and value("mode") != "host":
-            self._refused.pop(_OFFSETS, None)
+            self._refused.pop(_OFFSETS_PROBLEM, None)
             self._port.set_offsets(offsets)
         if "mode" in changed:
             self._port.set_mode(Mode[value("mode").upper()])
 
     def describe(self) -> Description:
         report, radio, status = self._port.report(), self._radio, self._radio_status
-        facts: dict[str, object] = {
+        entries: dict[str, object] = {
             "port": report.port or "none",
             "ranges published": self.ranges,
             "corrections published": self._corrections,
@@ -177,29 +177,29 @@ class BoardFeed(LiveFeed):
         hardware = "no board"
         if (hello := report.hello) is not None:
             hardware = f"board {format_id(hello.board_id)}"
-            facts |= {
+            entries |= {
                 "firmware": f"{hello.firmware_name} {hello.firmware_version}",
                 "model id": diagnostics.model_id(hello.model_id),
                 "mode": hello.mode.name.lower(),
             }
-        facts |= self.meter.facts() | {
+        entries |= self.meter.entries() | {
             "clock offset s": f"{report.clock_offset_s:.6f}",
             "clock drift ppm": f"{report.clock_drift_ppm:.2f}",
             "clock uncertainty us": f"{report.clock_uncertainty_us:.1f}",
         }
-        facts |= report.counts
+        entries |= report.counts
         if self._status is not None:
-            facts |= {f"board: {name}": value for name, value in asdict(self._status).items()}
+            entries |= {f"board: {name}": value for name, value in asdict(self._status).items()}
         if radio is not None:
             hardware += f", radio {format_id(radio.address)}"
         problems = [report.problem, *(f"{what}: {text}" for what, text in self._refused.copy().items())]
         warning = ""
         if status is not None:
-            facts |= radio_facts(radio, status, "radio: ") | anchor_facts(status)
+            entries |= radio_values(radio, status, "radio: ") | anchor_values(status)
             problems.append(_STATES.get(status.state, ""))
             warning = radio_warning(radio, status)
         problem = next(filter(None, problems), "")
-        return hardware, *_level(problem, warning, "connected"), facts
+        return hardware, *_level(problem, warning, "connected"), entries
 
     def check(self, port: BoardPort) -> None:
         """Log a problem once if it lasts longer than `EVENT_TIMEOUT_S`; a handshake is shorter."""
@@ -229,8 +229,8 @@ class BoardFeed(LiveFeed):
                     log.info(f"the board's radio {format_id(settings.address)}: {settings_text(settings)}")
                 self._radio = settings
             case RadioRefused(text=text):
-                self._refused[_RADIO] = text
-                log.error(f"{_RADIO}: {text}")
+                self._refused[_RADIO_PROBLEM] = text
+                log.error(f"{_RADIO_PROBLEM}: {text}")
             case Connected(hello=hello):
                 self._refused.clear()
                 self._logged = ""
@@ -250,8 +250,8 @@ class BoardFeed(LiveFeed):
             case ModeRefused(mode=mode, wanted=wanted):
                 log.warning(f"the board stays in mode {mode.name} instead of {wanted.name}: has it a model?")
             case OffsetsRefused(text=text):
-                self._refused[_OFFSETS] = text
-                log.error(f"the board's corrections are not published: {_OFFSETS}: {text}")
+                self._refused[_OFFSETS_PROBLEM] = text
+                log.error(f"the board's corrections are not published: {_OFFSETS_PROBLEM}: {text}")
             case Log(level=level, text=text):
                 # rclpy allows only one severity for each line of code.
                 if level >= LogLevel.WARNING:
@@ -280,19 +280,19 @@ class RadioFeed(LiveFeed):
     def describe(self) -> Description:
         reports = [port.report() for port in self._ports]
         first = reports[0]
-        facts: dict[str, object] = {"ranges published": self.ranges}
-        facts |= self.meter.facts()
+        entries: dict[str, object] = {"ranges published": self.ranges}
+        entries |= self.meter.entries()
         for number, report in enumerate(reports):
             prefix = f"radio {number}: " if len(reports) > 1 else ""
-            facts[f"{prefix}port"] = report.name or "none"
-            facts |= radio_facts(report.settings, report.status, prefix)
-        facts |= anchor_facts(first.status)
+            entries[f"{prefix}port"] = report.name or "none"
+            entries |= radio_values(report.settings, report.status, prefix)
+        entries |= anchor_values(first.status)
         hardware = "no radio" if first.settings is None else f"radio {format_id(first.settings.address)}"
         problem = "; ".join(report.problem for report in reports if report.problem)
         warnings = (radio_warning(report.settings, report.status) for report in reports)
         is_tag = first.settings is not None and first.settings.role is Role.TAG
         level = _level(problem, next(filter(None, warnings), ""), "ranging" if is_tag else "answering")
-        return hardware, *level, facts
+        return hardware, *level, entries
 
     def handle(self, event: RadioEvent, port: RadioPort) -> None:
         match event:
@@ -310,27 +310,27 @@ def settings_of(value: Value) -> RadioSettings:
         ParameterError: a setting is invalid; names the parameter.
     """
 
-    def of(name: str) -> Any:
+    def get(name: str) -> Any:
         return value(PREFIX + name)
 
-    anchors = [part.strip() for part in str(of("anchors")).split(",") if part.strip()]
+    anchors = [part.strip() for part in str(get("anchors")).split(",") if part.strip()]
     settings = RadioSettings(
-        role=Role[of("role").upper()],
-        address=_address(of("address"), "address") if of("address") != "" else 0,
-        pan=of("pan"),
-        channel=of("channel"),
-        prf_mhz=int(of("prf")),
-        preamble=of("preamble"),
-        preamble_code=of("preamble_code"),
-        rate_kbps=of("data_rate"),
-        decawave_sfd=of("decawave_sfd"),
-        tx_power=of("tx_power"),
-        antenna_delay=of("antenna_delay"),
-        window=of("window"),
+        role=Role[get("role").upper()],
+        address=_address(get("address"), "address") if get("address") != "" else 0,
+        pan=get("pan"),
+        channel=get("channel"),
+        prf_mhz=int(get("prf")),
+        preamble=get("preamble"),
+        preamble_code=get("preamble_code"),
+        rate_kbps=get("data_rate"),
+        decawave_sfd=get("decawave_sfd"),
+        tx_power=get("tx_power"),
+        antenna_delay=get("antenna_delay"),
+        window=get("window"),
         anchors=tuple(_address(part, "anchors") for part in anchors),
-        interval_us=round(1e6 / of("rate")) if of("rate") else 0,
-        report=of("report"),
-        bias_correction=of("bias_correction"),
+        interval_us=round(1e6 / get("rate")) if get("rate") else 0,
+        report=get("report"),
+        bias_correction=get("bias_correction"),
     )
     try:
         settings.check()
@@ -408,7 +408,7 @@ def radio_warning(settings: RadioSettings | None, status: RadioStatus) -> str:
     return ""
 
 
-def radio_facts(settings: RadioSettings | None, status: RadioStatus, prefix: str) -> dict[str, object]:
+def radio_values(settings: RadioSettings | None, status: RadioStatus, prefix: str) -> dict[str, object]:
     """Return the values of a radio for the diagnostics, without those of the anchors."""
     values: dict[str, object] = {}
     if settings is not None:
@@ -422,7 +422,7 @@ def radio_facts(settings: RadioSettings | None, status: RadioStatus, prefix: str
     return {f"{prefix}{name}": value for name, value in values.items()}
 
 
-def anchor_facts(status: RadioStatus) -> dict[str, object]:
+def anchor_values(status: RadioStatus) -> dict[str, object]:
     """Return the values of the anchors in reach for the diagnostics."""
     values: dict[str, object] = {}
     for anchor in status.anchors:

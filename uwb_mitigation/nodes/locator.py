@@ -74,11 +74,11 @@ class Locator(ManagedNode):
     configure it again after the file is fixed.
 
     Args:
-        foreign: see `ManagedNode`.
+        other_parameters: see `ManagedNode`.
     """
 
-    def __init__(self, *, foreign: Collection[str] = ()) -> None:
-        super().__init__("locator", LOCATOR, foreign)
+    def __init__(self, *, other_parameters: Collection[str] = ()) -> None:
+        super().__init__("locator", LOCATOR, other_parameters)
         self._estimator: MultiTagEstimator | None = None
         self._ranges: Subscription | None = None
         self._anchors_out: Publisher | None = None
@@ -121,12 +121,12 @@ class Locator(ManagedNode):
         ranges = topics.create_raw_subscription(
             self, RangeCorrected, topics.RANGE_CORRECTED, self._on_range, self._on_lost
         )
-        self._ranges = self.until_close(ranges, self.destroy_subscription)
+        self._ranges = self.destroy_at_close(ranges, self.destroy_subscription)
         if topic := self.value("height_topic"):
             heights = topics.create_subscription(
                 self, PoseWithCovarianceStamped, topic, self._on_height, ReliabilityPolicy.BEST_EFFORT
             )
-            self.until_close(heights, self.destroy_subscription)
+            self.destroy_at_close(heights, self.destroy_subscription)
         self.get_logger().info(f"{len(anchors)} anchors from {path}")
 
     def begin(self) -> None:
@@ -154,7 +154,7 @@ class Locator(ManagedNode):
         if warnings:
             level, text = diagnostics.WARN, "; ".join(warnings[:5])
         facts = estimator.diagnostics() | {"dropped by a queue": self._lost, "malformed": self._malformed}
-        facts |= self._meter.facts()
+        facts |= self._meter.entries()
         taken, self._processing_ns = self._processing_ns, []
         facts |= diagnostics.percentiles("processing", taken)
         return "host", level, text, facts
@@ -177,7 +177,7 @@ class Locator(ManagedNode):
         # Subscriptions stay active while a lifecycle node is inactive.
         if self._estimator is not None and self._ranges is not None and self.is_active:
             # Also process the queued messages; the executor then finds the queue empty.
-            for each, _ in chain([(data, number)], topics.queued(self._ranges, BATCH)):
+            for each, _ in chain([(data, number)], topics.take_queued(self._ranges, BATCH)):
                 self._take(self._estimator, each)
 
     def _take(self, estimator: MultiTagEstimator, data: bytes) -> None:

@@ -64,11 +64,11 @@ class Mitigator(ManagedNode):
 
     Args:
         subscribe: whether to subscribe to the topic of raw ranges.
-        foreign: see `ManagedNode`.
+        other_parameters: see `ManagedNode`.
     """
 
-    def __init__(self, *, subscribe: bool = True, foreign: Collection[str] = ()) -> None:
-        super().__init__("mitigator", MITIGATOR, foreign)
+    def __init__(self, *, subscribe: bool = True, other_parameters: Collection[str] = ()) -> None:
+        super().__init__("mitigator", MITIGATOR, other_parameters)
         self.health = MitigatorHealth(self._publisher_count)
         self._subscribe = subscribe
         self._raw: Subscription | None = None
@@ -88,10 +88,10 @@ class Mitigator(ManagedNode):
     def open(self) -> None:
         self._corrected = self.publisher(RangeCorrected, topics.RANGE_CORRECTED)
         if self.value("sensor_ranges"):
-            self._sensor_ranges = self.until_close(topics.SensorRanges(self), topics.SensorRanges.close)
+            self._sensor_ranges = self.destroy_at_close(topics.SensorRanges(self), topics.SensorRanges.close)
         if self._subscribe:
             # Subscribe to serialised messages: decoding them here takes a third of the time of rclpy.
-            self._raw = self.until_close(
+            self._raw = self.destroy_at_close(
                 topics.create_raw_subscription(self, RangeCir, topics.RANGE_RAW, self._on_raw, self._on_lost),
                 self.destroy_subscription,
             )
@@ -128,7 +128,7 @@ class Mitigator(ManagedNode):
         for measurement, corrected in zip(measurements, results, strict=True):
             self.health.statuses[corrected.status] += 1
             if needs_count and corrected.status is Status.BAD_CIR and measurement.cir.preamble_count <= 0:
-                self.health.uncounted += 1
+                self.health.without_preamble_count += 1
             if corrected.status is Status.OK and measurement.cir.power_gap_db < LINE_OF_SIGHT_DB:
                 (offset_m,) = offsets.of([measurement.tag_id], [measurement.anchor_id])
                 self.health.los_m.append(corrected.correction_m - float(offset_m))
@@ -144,20 +144,20 @@ class Mitigator(ManagedNode):
             self._corrected.wait_for_all_acked(timeout)
 
     def describe(self) -> diagnostics.Description:
-        warnings, facts, failed = self.health.period()
+        warnings, entries, failed = self.health.period()
         level, text = diagnostics.OK, "correcting"
         if warnings:
             level, text = diagnostics.WARN, "; ".join(warnings)
         if failed:
             level, text = diagnostics.ERROR, "the model fails on some ranges"
-        facts |= self._meter.facts()
+        entries |= self._meter.entries()
         if (mitigation := self._mitigation) is not None:
-            facts |= {
+            entries |= {
                 "model": mitigation.bundle.name,
                 "model id": diagnostics.model_id(mitigation.bundle.model_id),
                 "offsets": str(mitigation.offsets),
             }
-        return "host", level, text, facts
+        return "host", level, text, entries
 
     def _publisher_count(self) -> int:
         return self._raw.get_publisher_count() if self._raw is not None else 0
@@ -168,9 +168,9 @@ class Mitigator(ManagedNode):
             return
         batch = []
         # Also process the queued messages; the executor then finds the queue empty.
-        for each, its_number in chain([(data, number)], topics.queued(self._raw, BATCH - 1)):
-            self.health.numbering.add(its_number)
-            measurement = self._decode(each)
+        for message_data, sequence in chain([(data, number)], topics.take_queued(self._raw, BATCH - 1)):
+            self.health.loss_counter.add(sequence)
+            measurement = self._decode(message_data)
             if measurement is not None:
                 batch.append(measurement)
         if batch:
@@ -212,9 +212,9 @@ class Mitigator(ManagedNode):
 
     def _reset_offset_check(self, mitigation: Backend) -> None:
         # A linear bias model includes the offset of the boards of its training, unless another offset is set.
-        self.health.predicts_excess_alone = bool(
-            self._offsets
-        ) or mitigation.bundle.linear_bias == LinearBiasModel(0.0)
+        self.health.excludes_offset = bool(self._offsets) or mitigation.bundle.linear_bias == LinearBiasModel(
+            0.0
+        )
         self.health.los_m.clear()
 
     def _prepare(self, values: Mapping[str, Any]) -> None:

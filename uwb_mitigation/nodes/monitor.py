@@ -17,11 +17,11 @@ from rich.table import Table
 from rich.text import Text
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
 
-from uwb_mitigation.bag.codec import Key, decode_corrected, decode_truth
+from uwb_mitigation.bag.codec import MeasurementKey, decode_corrected, decode_truth
 from uwb_mitigation.errors import RecordingError, UwbMitigationError, format_id
 from uwb_mitigation.measurement import CorrectedRange, Status, Truth
 from uwb_mitigation.nodes import topics
-from uwb_mitigation.nodes.processes import watching
+from uwb_mitigation.nodes.processes import spinning_node
 from uwb_mitigation.nodes.spinning import stop_event
 from uwb_mitigation.viewer.scene import MAX_TRUTHS, BoundedDict, History, Pair, Sample
 
@@ -45,7 +45,7 @@ class RangeStatistics:
         self.statuses: Counter[Status] = Counter()
         self.errors: defaultdict[str, NDArray[np.float64]] = defaultdict(lambda: np.zeros(3))
         self._latencies_s: deque[float] = deque(maxlen=MAX_LATENCIES)
-        self._truths: BoundedDict[Key, Truth] = BoundedDict(MAX_TRUTHS)
+        self._truths: BoundedDict[MeasurementKey, Truth] = BoundedDict(MAX_TRUTHS)
 
     @property
     def missing(self) -> int:
@@ -56,10 +56,10 @@ class RangeStatistics:
         """Return a percentile of the time from stamp to reception; NaN without data."""
         return float(np.percentile(self._latencies_s or [math.nan], percentile)) * 1e3
 
-    def add_truth(self, key: Key, truth: Truth) -> None:
+    def add_truth(self, key: MeasurementKey, truth: Truth) -> None:
         self._truths.add(key, truth)
 
-    def add_corrected(self, key: Key, corrected: CorrectedRange, arrival_s: float) -> None:
+    def add_corrected(self, key: MeasurementKey, corrected: CorrectedRange, arrival_s: float) -> None:
         """Add a corrected range; `arrival_s` is on the clock of its stamp."""
         sample = Sample.of(arrival_s, corrected, self._truths.pop(key, None))
         self.corrected += 1
@@ -156,7 +156,7 @@ def main() -> None:
     stop = stop_event()
     console = Console()
     try:
-        with watching(Monitor) as monitor:
+        with spinning_node(Monitor) as monitor:
             with Live(console=console, refresh_per_second=REFRESH_HZ) as live:
                 while not stop.wait(1 / REFRESH_HZ):
                     live.update(live_table(monitor.statistics, "UWB ranges"))

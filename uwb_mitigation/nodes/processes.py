@@ -31,7 +31,7 @@ from rich.console import Console
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.nodes.spinning import spin
 
-AnyNode = TypeVar("AnyNode", bound=Node)
+NodeT = TypeVar("NodeT", bound=Node)
 
 TIMEOUT_S = 30.0
 ENTRY = "uwb_mitigation.entry"
@@ -119,7 +119,7 @@ def wait(
 
 
 @contextmanager
-def watching(make_node: Callable[[Context], AnyNode]) -> Iterator[AnyNode]:
+def spinning_node(make_node: Callable[[Context], NodeT]) -> Iterator[NodeT]:
     """Yield a node in its own ROS context, spun by a thread until the block ends."""
     context = Context()
     rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
@@ -174,7 +174,7 @@ class Probe(Node):
                 raise UwbMitigationError(f"{node}: {result.reason}")
 
 
-class Nodes:
+class NodeProcesses:
     """The nodes of a demo, as processes; they are stopped at the end of the block.
 
     Attributes:
@@ -200,7 +200,7 @@ class Nodes:
     def running(self) -> bool:
         return all(process.poll() is None for process in self.processes)
 
-    def __enter__(self) -> Nodes:
+    def __enter__(self) -> NodeProcesses:
         return self
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:

@@ -31,11 +31,11 @@ CLOCK_STEP_NS = 1_000_000
 ANNOUNCEMENT_S = 3.0
 """The middleware repeats its announcements after this time, if the first ones were lost."""
 
-BEHIND_S = 0.5
+LATE_WARNING_S = 0.5
 """A delay of the replay above this is reported."""
 
 
-class Pace:
+class ReplayClock:
     """The clock that paces a replay, and its stamps on a node's clock.
 
     This is simulated time if it is active, else a steady clock: setting the system clock does not affect the replay.
@@ -50,16 +50,16 @@ class Pace:
         """Return the time of the replay clock."""
         return self._stamp_now_ns() if self._simulated else time.monotonic_ns()
 
-    def stamp_ns(self, pace_ns: int) -> int:
+    def stamp_ns(self, replay_ns: int) -> int:
         """Convert a time of the replay clock to the node's clock; intervals are the same on both."""
         if self._simulated:
-            return pace_ns
+            return replay_ns
         offset_ns, uncertainty_ns = self._read_both()
         while self._offset_ns is None and uncertainty_ns > CLOCK_STEP_NS:
             offset_ns, uncertainty_ns = self._read_both()
         if self._offset_ns is None or abs(offset_ns - self._offset_ns) > CLOCK_STEP_NS + uncertainty_ns:
             self._offset_ns = offset_ns
-        return pace_ns + self._offset_ns
+        return replay_ns + self._offset_ns
 
     def _read_both(self) -> tuple[int, int]:
         """Return the offset of the node's clock to the steady clock, and its uncertainty, ns.
@@ -111,20 +111,20 @@ class ReplayFeed:
         self.played = 0
         self.late_ns = 0
         self._source = source
-        self._clock = Pace(clock)
+        self._clock = ReplayClock(clock)
         self._value = value
         self._logger = logger
         self._subscribers = subscribers
         self._publish = publish
         self._on_time = on_time
         self._on_end = on_end
-        self._recorded_stamps = value("publish_clock")
-        self._wanted_rate = self._rate = float(value("rate"))
-        self._wants_pause, self._paused = value("paused"), False
+        self._uses_recorded_stamps = value("publish_clock")
+        self._requested_rate = self._rate = float(value("rate"))
+        self._pause_requested, self._paused = value("paused"), False
         self._seeks = deque([int(value("seek_to") * 1e9)])
         self._late: list[tuple[Record, int]] = []
-        # The played time `_base_ns` is due at `_base_clock_ns`.
-        self._base_ns = self._base_clock_ns = 0
+        # The played time `_reference_ns` is due at `_reference_clock_ns`.
+        self._reference_ns = self._reference_clock_ns = 0
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="replay", daemon=True)
 
@@ -144,30 +144,30 @@ class ReplayFeed:
     def apply(self, changed: Collection[str], value: Callable[[str], Any], offsets: Offsets) -> None:
         """Change rate, pause and position."""
         if "rate" in changed:
-            self._wanted_rate = float(value("rate"))
+            self._requested_rate = float(value("rate"))
         if "paused" in changed:
-            self._wants_pause = value("paused")
+            self._pause_requested = value("paused")
         if "seek_to" in changed:
             self._seeks.append(int(value("seek_to") * 1e9))
 
     def describe(self) -> Description:
         simulated = self._source.simulated
-        facts: dict[str, object] = {
+        entries: dict[str, object] = {
             "source": self._source.name,
             "simulated": "unknown" if simulated is None else simulated,
             "ranges published": self.played,
         }
-        facts |= {f"oddity: {kind}": count for kind, count in self._source.skipped.copy().items()}
-        level, text = diagnostics.OK, "paused" if self._wants_pause else "replaying"
+        entries |= {f"oddity: {kind}": count for kind, count in self._source.skipped.copy().items()}
+        level, text = diagnostics.OK, "paused" if self._pause_requested else "replaying"
         if simulated:
             level, text = diagnostics.WARN, f"{text} simulated ranges: no radio measured them"
         late_s = max(self.late_ns / 1e9, 0.0)
-        if late_s > BEHIND_S:
+        if late_s > LATE_WARNING_S:
             level = diagnostics.WARN
             text = f"{text}; {late_s:.1f} s behind: the rate is too high for this machine"
             self._logger.warning(text, throttle_duration_sec=10.0)
-        facts["behind s"] = f"{late_s:.3f}"
-        return "simulated" if simulated else "recording", level, text, facts
+        entries["behind s"] = f"{late_s:.3f}"
+        return "simulated" if simulated else "recording", level, text, entries
 
     def _run(self) -> None:
         error: UwbMitigationError | None = None
@@ -200,7 +200,7 @@ class ReplayFeed:
         self._stopping.wait(delay_s)
 
     def _play(self) -> None:
-        self._base_clock_ns = self._clock.now_ns()
+        self._reference_clock_ns = self._clock.now_ns()
         due_ns = 0
         while not self._stopping.is_set():
             from_ns = self._seeks.popleft() if self._seeks else 0
@@ -235,7 +235,7 @@ class ReplayFeed:
                     return True, min(due_ns, self._position_ns(self._clock.now_ns()))
                 self.late_ns = late_ns
                 stamp_ns = recorded_ns
-                if not self._recorded_stamps:
+                if not self._uses_recorded_stamps:
                     stamp_ns = self._clock.stamp_ns(self._clock_ns(due_ns))
                 self._late.append((record, stamp_ns))
                 if late_ns < LATE_NS or len(self._late) == BATCH:
@@ -258,12 +258,12 @@ class ReplayFeed:
             if self._stopping.is_set() or self._seeks:
                 return None
             now_ns = self._clock.now_ns()
-            if self._paused or self._wants_pause or self._wanted_rate != self._rate:
+            if self._paused or self._pause_requested or self._requested_rate != self._rate:
                 # Continue at the new rate, but never past the next record, so that stamps stay in order.
-                self._base_ns, self._base_clock_ns = min(self._position_ns(now_ns), due_ns), now_ns
-                self._paused, self._rate = self._wants_pause, self._wanted_rate
+                self._reference_ns, self._reference_clock_ns = min(self._position_ns(now_ns), due_ns), now_ns
+                self._paused, self._rate = self._pause_requested, self._requested_rate
             ahead_ns = self._clock_ns(due_ns) - now_ns
-            if self._recorded_stamps:
+            if self._uses_recorded_stamps:
                 # Simulated recordings start at 0, and ROS time cannot be negative.
                 self._on_time(max(recorded_ns - int(max(ahead_ns, 0) * self._rate), 0))
             if ahead_ns <= 0 and not self._paused:
@@ -273,10 +273,10 @@ class ReplayFeed:
 
     def _clock_ns(self, due_ns: int) -> int:
         """Return the time of the replay clock at which a played time is due."""
-        return self._base_clock_ns + int((due_ns - self._base_ns) / self._rate)
+        return self._reference_clock_ns + int((due_ns - self._reference_ns) / self._rate)
 
     def _position_ns(self, now_ns: int) -> int:
         """Return the played time at a time of the replay clock."""
         if self._paused:
-            return self._base_ns
-        return self._base_ns + int((now_ns - self._base_clock_ns) * self._rate)
+            return self._reference_ns
+        return self._reference_ns + int((now_ns - self._reference_clock_ns) * self._rate)

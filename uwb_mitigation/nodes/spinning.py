@@ -19,7 +19,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
-from uwb_mitigation.errors import ParameterError, UwbMitigationError, not_imported
+from uwb_mitigation.errors import ParameterError, UwbMitigationError, missing_dependency
 from uwb_mitigation.nodes.parameter_tables import TABLES
 
 SPIN_S = 0.2
@@ -79,18 +79,18 @@ def load(name: str) -> Callable[[threading.Event], list[Node]]:
         return make_nodes
     driver, mitigator, locator = modules
     # Parameters on the command line reach all nodes.
-    foreign = {row.name for part in parts for row in TABLES[part]}
+    other_parameters = {row.name for part in parts for row in TABLES[part]}
 
     def make_pipeline(stop: threading.Event) -> list[Node]:
         made: list[Node] = []
         try:
-            consumer = mitigator.Mitigator(subscribe=False, foreign=foreign)
+            consumer = mitigator.Mitigator(subscribe=False, other_parameters=other_parameters)
             made.append(consumer)
-            made.insert(0, driver.Driver(stop, consumer, foreign=foreign))
+            made.insert(0, driver.Driver(stop, consumer, other_parameters=other_parameters))
             # rclpy has no public access to the parameters given at start-up.
             anchors = consumer._parameter_overrides.get("anchors")
             if anchors is not None and anchors.value:
-                made.append(locator.Locator(foreign=foreign))
+                made.append(locator.Locator(other_parameters=other_parameters))
         except BaseException:
             for node in made:
                 node.destroy_node()
@@ -123,7 +123,7 @@ def _run(name: str) -> int:
             raise ParameterError(_first_line(error), valid="check the names given to --ros-args") from error
         spin(nodes, stop)
     except ImportError as error:
-        if (absent := not_imported(error)) is None:
+        if (absent := missing_dependency(error)) is None:
             raise
         print(f"error: {absent}", file=sys.stderr)
         return 1

@@ -47,7 +47,7 @@ MAX_SENSOR_TOPICS = 256
 """Maximum number of sensor_msgs/Range topics; bounded because ids are received over the air."""
 
 
-def _ranges(reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE) -> QoSProfile:
+def _range_qos(reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE) -> QoSProfile:
     return QoSProfile(
         reliability=reliability,
         durability=DurabilityPolicy.VOLATILE,
@@ -56,7 +56,7 @@ def _ranges(reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE) -> QoSP
     )
 
 
-RANGES = _ranges()
+RANGES = _range_qos()
 
 LATCHED = QoSProfile(
     reliability=ReliabilityPolicy.RELIABLE,
@@ -73,10 +73,10 @@ def create_publisher(node: LifecycleNode, kind: type, topic: str) -> Publisher:
     Raises:
         ParameterError: an overridden quality of service is invalid.
     """
-    with _checked(node, topic):
+    with _translate_qos_errors(node, topic):
         # rclpy writes overrides into the given profile, so each publisher needs a copy.
         return node.create_lifecycle_publisher(
-            kind, topic, _ranges(), qos_overriding_options=QoSOverridingOptions.with_default_policies()
+            kind, topic, _range_qos(), qos_overriding_options=QoSOverridingOptions.with_default_policies()
         )
 
 
@@ -94,9 +94,9 @@ def create_subscription(
         ParameterError: an overridden quality of service is invalid.
     """
     overriding = QoSOverridingOptions.with_default_policies()
-    with _checked(node, topic):
+    with _translate_qos_errors(node, topic):
         return node.create_subscription(
-            kind, topic, callback, _ranges(reliability), qos_overriding_options=overriding, **options
+            kind, topic, callback, _range_qos(reliability), qos_overriding_options=overriding, **options
         )
 
 
@@ -126,7 +126,7 @@ def create_raw_subscription(
     return subscription
 
 
-def queued(subscription: Subscription, limit: int) -> Iterator[tuple[bytes, int]]:
+def take_queued(subscription: Subscription, limit: int) -> Iterator[tuple[bytes, int]]:
     """Yield messages that wait in the queue of a raw subscription, with the publisher's sequence number.
 
     Args:
@@ -140,7 +140,7 @@ def queued(subscription: Subscription, limit: int) -> Iterator[tuple[bytes, int]
         yield data, info["publication_sequence_number"]
 
 
-def not_received(node: LifecycleNode) -> list[str]:
+def incompatible_publishers(node: LifecycleNode) -> list[str]:
     """Return a warning for each best-effort publisher from which a reliable subscription of the node receives nothing."""
     return [
         f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name} publishes by best effort and is not received: set "
@@ -201,7 +201,7 @@ class SensorRanges:
 
 
 @contextmanager
-def _checked(node: LifecycleNode, topic: str) -> Iterator[None]:
+def _translate_qos_errors(node: LifecycleNode, topic: str) -> Iterator[None]:
     # rclpy raises various exception types for invalid overrides.
     try:
         yield

@@ -26,7 +26,7 @@ from visualization_msgs.msg import MarkerArray
 from uwb_mitigation.nodes import diagnostics, markers, topics
 from uwb_mitigation.nodes.lifecycle import ManagedNode
 from uwb_mitigation.nodes.parameter_tables import VIEWER
-from uwb_mitigation.nodes.replay import Pace
+from uwb_mitigation.nodes.replay import ReplayClock
 from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.sources.site import load_anchors
 from uwb_mitigation.viewer.feed import Feed
@@ -63,7 +63,7 @@ class Viewer(ManagedNode):
         self._scene = Scene()
         self._lock = threading.Lock()
         self._feed = Feed(self._scene, self._lock)
-        pace = Pace(self.get_clock())
+        pace = ReplayClock(self.get_clock())
         self._scene.clock = lambda: pace.now_ns() / 1e9
         self._view: View | None = None
         self.autostart()
@@ -87,7 +87,7 @@ class Viewer(ManagedNode):
             enable_rosout=False,
             start_parameter_services=False,
         )
-        self._range_node = self.until_close(range_node, lambda node: node.destroy_node())
+        self._range_node = self.destroy_at_close(range_node, lambda node: node.destroy_node())
         self._subscribe_ranges(RangeTruth, topics.RANGE_TRUTH)
         self._subscribe_ranges(RangeCorrected, topics.RANGE_CORRECTED)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -96,7 +96,7 @@ class Viewer(ManagedNode):
             (READ_PERIOD_S, self._read_queued_ranges),
         ):
             timer = self.create_timer(period_s, callback, clock=steady)
-            self.until_close(timer, self.destroy_timer)
+            self.destroy_at_close(timer, self.destroy_timer)
 
     def begin(self) -> None:
         self._view = View(
@@ -133,7 +133,7 @@ class Viewer(ManagedNode):
     ) -> None:
         if topic not in self._subscriptions:
             made = self.create_subscription(kind, topic, callback, qos)
-            self._subscriptions[topic] = self.until_close(made, self.destroy_subscription)
+            self._subscriptions[topic] = self.destroy_at_close(made, self.destroy_subscription)
 
     def _subscribe_ranges(self, kind: type, topic: str) -> None:
         """Subscribe to a topic of ranges; they are queued until `_read_queued_ranges`."""
@@ -147,15 +147,15 @@ class Viewer(ManagedNode):
     def _read_queued_ranges(self) -> None:
         # A truth is published before its corrected range: reading truths last and adding them first misses none.
         corrected, truths, raw = (
-            list(topics.queued(self._ranges[topic], _QOS.depth)) if topic in self._ranges else []
+            list(topics.take_queued(self._ranges[topic], _QOS.depth)) if topic in self._ranges else []
             for topic in (topics.RANGE_CORRECTED, topics.RANGE_TRUTH, topics.RANGE_RAW)
         )
-        for take, queued in (
+        for take, take_queued in (
             (self._feed.range_truth, truths),
             (self._feed.range_raw, raw),
             (self._feed.range_corrected, corrected),
         ):
-            for data, _ in queued:
+            for data, _ in take_queued:
                 take(data)
 
     def _discover_topics(self) -> None:

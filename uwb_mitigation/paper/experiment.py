@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from uwb_mitigation.errors import DatasetError, ModelError, ParameterError, UwbMitigationError
 from uwb_mitigation.evaluation import baselines, splits
 from uwb_mitigation.evaluation.dataset import Dataset
-from uwb_mitigation.files import write_whole
+from uwb_mitigation.files import write_atomically
 from uwb_mitigation.model import floating, graph
 from uwb_mitigation.model.architecture import Architecture, Mlp, Remnet
 from uwb_mitigation.model.bundle import Card, save_bundle, session_options
@@ -142,7 +142,7 @@ def run(
         models=tuple(TrainedModel.model_validate(model) for model in trained.values()),
         baselines=baselines_of(parts.train, parts.test),
     )
-    write_whole(folder / RESULTS, result.model_dump_json(indent=1) + "\n")
+    write_atomically(folder / RESULTS, result.model_dump_json(indent=1) + "\n")
     return result
 
 

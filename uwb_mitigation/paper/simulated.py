@@ -86,7 +86,7 @@ class SimulatedDeepUwb(Simulated):
         placements = -(-BATCH // self._exchanges)
         size = placements * self._exchanges
         rng = np.random.default_rng([self._seed, number, batch])
-        environments = (room.in_sight, room.blocked)
+        environments = (room.los, room.nlos)
         fields = draw_fields(environments, placements, rng)
         anchor, tag = place(room.size, placements, rng)
         chosen = [draw_obstacles(room, rng) for _ in range(placements)]
@@ -108,7 +108,7 @@ class SimulatedDeepUwb(Simulated):
                 (FIRST_ANCHOR_ID + number) * ids,
                 FIRST_TAG_ID * ids,
                 [names[k] for k in of.tolist()],
-                Links(anchor[of], tag[of], path.take(of), environments, fields, of, at_rest=True),
+                Links(anchor[of], tag[of], path.take(of), environments, fields, of, stationary=True),
             ),
             rng,
         )

@@ -18,7 +18,12 @@ from uwb_mitigation.bag.codec import decode_range, encode_corrected
 from uwb_mitigation.bag.reader import BagReader, RawMessage, check_channel
 from uwb_mitigation.bag.topics import RANGE_CIR_TYPE, RANGE_CORRECTED, RANGE_RAW
 from uwb_mitigation.bag.writer import METADATA_RECORD, BagWriter
-from uwb_mitigation.errors import DamagedRecordingError, RecordingError, UwbMitigationError, not_imported
+from uwb_mitigation.errors import (
+    DamagedRecordingError,
+    RecordingError,
+    UwbMitigationError,
+    missing_dependency,
+)
 from uwb_mitigation.measurement import RangeMeasurement
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import load_bundle
@@ -77,14 +82,14 @@ class Outcome:
     written: bool = False
 
 
-def attempt(job: Job, report: Report | None = None) -> Outcome:
+def try_process(job: Job, report: Report | None = None) -> Outcome:
     """Run `process_bag` and return its errors in the outcome, so that one bag does not stop the others."""
     try:
         return process_bag(job, report)
     except UwbMitigationError as error:
         return Outcome(job, error=error)
     except ImportError as error:
-        if (absent := not_imported(error)) is None:
+        if (absent := missing_dependency(error)) is None:
             raise
         return Outcome(job, error=absent)
     except MemoryError:
@@ -107,10 +112,10 @@ def process_bag(job: Job, report: Report | None = None) -> Outcome:
     schemas.typestore()
     started = time.perf_counter()
     bag = BagReader(job.source)
-    known = bag.metadata.get(METADATA_RECORD, {})
+    metadata = bag.metadata.get(METADATA_RECORD, {})
     origin = {
         "source": f"{job.source.name}, corrected by model {mitigation.bundle.model_id:08x}",
-        "simulated": known.get("simulated", "unknown"),
+        "simulated": metadata.get("simulated", "unknown"),
     }
     with BagWriter(job.output, origin, force=job.force) as out:
         corrector = _Corrector(job.source, mitigation, out)
@@ -136,9 +141,9 @@ def process_bag(job: Job, report: Report | None = None) -> Outcome:
         if damage is not None and done == 0:
             raise damage
         if RANGE_RAW not in bag.topics:
-            held = ", ".join(sorted(bag.topics)) or "no topic"
+            topics = ", ".join(sorted(bag.topics)) or "no topic"
             raise RecordingError(
-                f"no topic {RANGE_RAW}", where=str(job.source), valid=f"the bag holds: {held}"
+                f"no topic {RANGE_RAW}", where=str(job.source), valid=f"the bag holds: {topics}"
             )
     seconds = time.perf_counter() - started
     return Outcome(
@@ -147,7 +152,7 @@ def process_bag(job: Job, report: Report | None = None) -> Outcome:
         ranges=corrector.statuses.total(),
         statuses=corrector.statuses,
         replaced=corrector.replaced,
-        skipped=corrector.skipped + bag.oddities,
+        skipped=corrector.skipped + bag.warnings,
         seconds=seconds,
         error=damage,
         written=True,
@@ -186,13 +191,13 @@ class _Corrector:
                 number = self._channels[id(channel)] = out.copy_channel(channel)
             out.write_serialized(number, data, log_ns, publish_ns, sequence)
             if channel.topic == RANGE_RAW:
-                answer = next(corrected)
-                if answer is not None:
-                    out.write_serialized(self._corrected, answer, log_ns, publish_ns, sequence)
+                message_data = next(corrected)
+                if message_data is not None:
+                    out.write_serialized(self._corrected, message_data, log_ns, publish_ns, sequence)
 
     def _correct(self, messages: list[bytes]) -> list[bytes | None]:
         """Return `RangeCorrected` for each message; None if it does not decode."""
-        answers: list[bytes | None] = [None] * len(messages)
+        encoded: list[bytes | None] = [None] * len(messages)
         decoded: dict[int, RangeMeasurement] = {}
         for number, message in enumerate(messages):
             try:
@@ -201,6 +206,6 @@ class _Corrector:
                 self.skipped[error.what] += 1
         corrected = self._mitigation.correct([*decoded.values()])
         for (number, measurement), result in zip(decoded.items(), corrected, strict=True):
-            answers[number] = encode_corrected(measurement, result)
+            encoded[number] = encode_corrected(measurement, result)
             self.statuses[result.status.name] += 1
-        return answers
+        return encoded

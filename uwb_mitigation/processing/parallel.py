@@ -11,14 +11,14 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
 
-from uwb_mitigation.bag.rosbag2 import described_files
+from uwb_mitigation.bag.rosbag2 import listed_files
 from uwb_mitigation.bag.writer import partial_file
 from uwb_mitigation.errors import MissingDependencyError, ParameterError, RecordingError
-from uwb_mitigation.processing.job import Job, Outcome, attempt
+from uwb_mitigation.processing.job import Job, Outcome, try_process
 
 
 @dataclass(frozen=True, slots=True)
-class Planned:
+class PlannedBag:
     """A bag and its output; `alone`: there is no other bag."""
 
     source: Path
@@ -26,7 +26,7 @@ class Planned:
     alone: bool
 
 
-def plan(sources: Sequence[Path], output: Path) -> list[Planned]:
+def plan(sources: Sequence[Path], output: Path) -> list[PlannedBag]:
     """Return every bag in `sources` with its output path.
 
     A single bag is written to `output` itself. Several bags, or a folder of bags, are written to the folder `output` with
@@ -37,12 +37,12 @@ def plan(sources: Sequence[Path], output: Path) -> list[Planned]:
         ParameterError: `output` is a file instead of a folder, or two bags have the same output path.
     """
     if len(sources) == 1 and _is_one_bag(sources[0]):
-        return [Planned(sources[0], output, True)]
+        return [PlannedBag(sources[0], output, True)]
     if output.suffix == ".mcap" or (output.exists() and not output.is_dir()):
         raise ParameterError(
             "one file for several bags", where=str(output), valid="a folder, which need not exist"
         )
-    planned: dict[Path, Planned] = {}
+    planned: dict[Path, PlannedBag] = {}
     for source in sources:
         if _is_one_bag(source):
             found = [(source, Path(source.resolve().name))]
@@ -60,7 +60,7 @@ def plan(sources: Sequence[Path], output: Path) -> list[Planned]:
                     where=str(place),
                     valid="different names, or one run for each",
                 )
-            planned[place] = Planned(bag, place, False)
+            planned[place] = PlannedBag(bag, place, False)
     return list(planned.values())
 
 
@@ -70,7 +70,7 @@ def _is_one_bag(path: Path) -> bool:
         raise RecordingError("no such file or folder", where=str(path))
     if not path.is_dir():
         return True
-    described = described_files(path)
+    described = listed_files(path)
     return described is not None and {file.name for file in path.glob("*.mcap")} <= set(described)
 
 
@@ -104,7 +104,7 @@ def num_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def run_here(jobs: Sequence[Job], workers: int) -> Iterator[Outcome]:
+def run_locally(jobs: Sequence[Job], workers: int) -> Iterator[Outcome]:
     """Process the bags in at most `workers` processes; yield each outcome when it is ready.
 
     If a process crashes, for example because memory runs out, the remaining bags are processed one at a time, so that
@@ -157,7 +157,7 @@ def run_on_dask(jobs: Sequence[Job], address: str) -> Iterator[Outcome]:
             valid="tcp://HOST:8786, as `dask scheduler` prints",
         ) from error
     with client, client.get_executor(pure=False) as executor:
-        for _, outcome in _run(executor, attempt, jobs):
+        for _, outcome in _run(executor, try_process, jobs):
             assert outcome is not None
             yield outcome
 
@@ -197,7 +197,7 @@ def _in_worker(job: Job) -> Outcome:
     """Process a bag. Ctrl-C, which a terminal sends to all processes, removes its unfinished output."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        return attempt(job)
+        return try_process(job)
     except KeyboardInterrupt:
         # The interrupt may come between the creation of the file and the block that removes it.
         partial_file(job.output).unlink(missing_ok=True)

@@ -13,23 +13,23 @@ from pathlib import Path
 from uwb_mitigation.errors import RecordingError
 
 
-def read_rows(path: Path, columns: tuple[str, ...], most_bytes: int) -> Iterator[tuple[int, dict[str, str]]]:
+def read_rows(path: Path, columns: tuple[str, ...], max_bytes: int) -> Iterator[tuple[int, dict[str, str]]]:
     """Yield line number and {column: value} of each row; blank rows are skipped.
 
     Args:
         path: the file; `.xz` is decompressed.
         columns: required columns; other columns may be missing in a short row.
-        most_bytes: maximum size after decompression.
+        max_bytes: maximum size after decompression.
 
     Raises:
         RecordingError: the file is absent, too large, not CSV, or a column or a value is missing; `where` gives the line.
     """
-    valid = f"a CSV file of at most {most_bytes} bytes with {', '.join(columns)}"
+    valid = f"a CSV file of at most {max_bytes} bytes with {', '.join(columns)}"
     where = str(path)
     try:
         with lzma.open(path) if path.suffix == ".xz" else path.open("rb") as stream:
-            data = stream.read(most_bytes + 1)
-        if len(data) > most_bytes:
+            data = stream.read(max_bytes + 1)
+        if len(data) > max_bytes:
             raise RecordingError("too large", where=where, valid=valid)
         reader = csv.DictReader(io.StringIO(data.decode("utf-8-sig"), newline=""), strict=True)
         if missing := [name for name in columns if name not in (reader.fieldnames or ())]:
@@ -43,7 +43,7 @@ def read_rows(path: Path, columns: tuple[str, ...], most_bytes: int) -> Iterator
         raise RecordingError(f"cannot be read: {error}", where=where, valid=valid) from error
 
 
-def identity(row: dict[str, str], column: str, where: str) -> int:
+def id_cell(row: dict[str, str], column: str, where: str) -> int:
     """Return the 64-bit number in a cell; raises RecordingError."""
     text = (row.get(column) or "").strip()
     if text.isascii() and text.isdigit() and len(text) <= 20 and int(text) < 1 << 64:
@@ -55,7 +55,7 @@ def identity(row: dict[str, str], column: str, where: str) -> int:
     )
 
 
-def number(
+def number_cell(
     row: dict[str, str], column: str, where: str, low: float, high: float, empty: float = math.nan
 ) -> float:
     """Return the number in a cell, or `empty`; raises RecordingError."""

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from uwb_mitigation.errors import DamagedRecordingError, RecordingError
 from uwb_mitigation.measurement import DEVICE_TICK_HZ, DEVICE_TIME_WRAP, Cir, RangeMeasurement, Record, Truth
 from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
-from uwb_mitigation.sources.csv_rows import identity, number, read_rows
+from uwb_mitigation.sources.csv_rows import id_cell, number_cell, read_rows
 from uwb_mitigation.sources.source import Source
 
 MAX_ACCUMULATOR = 1016
@@ -52,17 +52,17 @@ _NUMBER = re.compile(rb"[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?")
 _NO_SAMPLES: NDArray[np.int16] = np.zeros(0, np.int16)
 
 
-class CirOf(str, enum.Enum):
+class CirFrame(str, enum.Enum):
     """The frame whose CIR and time belong to the range."""
 
     POLL = "poll"
     FINAL = "final"
 
 
-_CODES = {0x21: CirOf.POLL, 0x29: CirOf.FINAL}
+_CODES = {0x21: CirFrame.POLL, 0x29: CirFrame.FINAL}
 
 
-class Oddity(str, enum.Enum):
+class Anomaly(str, enum.Enum):
     """Keys of `skipped`."""
 
     RECEPTION_ERROR = "reception error"
@@ -103,11 +103,13 @@ class DecaRangingLog(Source):
 
     simulated = False
 
-    def __init__(self, path: Path, cir: CirOf = CirOf.FINAL, placement: Placement | None = None) -> None:
+    def __init__(
+        self, path: Path, cir: CirFrame = CirFrame.FINAL, placement: Placement | None = None
+    ) -> None:
         self.path = path
         self.name = f"DecaRanging log {path.name}"
         self.skipped: Counter[str] = Counter()
-        self._cir_of = cir
+        self._cir_frame = cir
         self._placement = placement
 
     def __iter__(self) -> Iterator[Record]:
@@ -121,7 +123,7 @@ class DecaRangingLog(Source):
 
     def records(self, first_sequence: int = 0, not_before_ns: int = 0) -> Iterator[Record]:
         """Iterate as part of a series: continue its sequence numbers and begin no earlier than `not_before_ns`."""
-        self.skipped = Counter() if self._placement else Counter({Oddity.NO_TRUTH.value: 1})
+        self.skipped = Counter() if self._placement else Counter({Anomaly.NO_TRUTH.value: 1})
         placed = self._placement
         text, fault = _read(self.path)
         if not (_TOKEN.search(text) or fault):
@@ -135,25 +137,25 @@ class DecaRangingLog(Source):
 
     def start_ns(self) -> int:
         """Return the start time in the first line, ns since the epoch; 0 if it is missing or unreadable."""
-        with contextlib.suppress(OSError, EOFError, lzma.LZMAError), _opened(self.path) as stream:
+        with contextlib.suppress(OSError, EOFError, lzma.LZMAError), _open(self.path) as stream:
             return _start_ns(stream.readline(4096))
         return 0
 
     def _after(self, text: bytes) -> str:
         return f"{self.path}: after line {text.count(10)}"
 
-    def _count(self, oddity: Oddity) -> None:
-        self.skipped[oddity.value] += 1
+    def _count(self, anomaly: Anomaly) -> None:
+        self.skipped[anomaly.value] += 1
 
     def _measurements(self, text: bytes, not_before_ns: int) -> Iterator[RangeMeasurement]:
         start_ns = _start_ns(text)
         if not start_ns:
-            self._count(Oddity.NO_START_TIME)
+            self._count(Anomaly.NO_START_TIME)
         base_ns, ticks = max(start_ns, not_before_ns), 0
         latest: int | None = None  # device time of the latest frame
-        announced: CirOf | None = None  # kind of the frame in RX DATA
-        owner: CirOf | None = None  # kind of the frame that a CIR would belong to
-        frames: dict[CirOf, tuple[int, Cir]] = {}
+        frame_kind: CirFrame | None = None  # kind of the frame in RX DATA
+        cir_owner: CirFrame | None = None  # kind of the frame that a CIR would belong to
+        frames: dict[CirFrame, tuple[int, Cir]] = {}
         channel = prf = tag = anchor = 0
         for match in _TOKEN.finditer(text):
             kind = match.lastgroup
@@ -162,45 +164,45 @@ class DecaRangingLog(Source):
             elif kind == "frame":
                 # IEEE 802.15.4 with 64-bit addresses, then the function code
                 frame = bytes.fromhex(match["frame"].decode())
-                announced, owner = _CODES.get(frame[21]), None
+                frame_kind, cir_owner = _CODES.get(frame[21]), None
                 tag, anchor = (int.from_bytes(frame[at : at + 8], "little") for at in (13, 5))
             elif kind == "first":
-                owner, announced = announced, None
+                cir_owner, frame_kind = frame_kind, None
                 time = (int(match["high"], 16) << 32 | int(match["low"], 16)) % DEVICE_TIME_WRAP
                 ticks += 0 if latest is None else (time - latest) % DEVICE_TIME_WRAP
                 latest = time
-                if owner is not None:
-                    if owner in frames or (owner is CirOf.POLL and frames):
-                        self._count(Oddity.NO_RANGE)
-                    if owner is CirOf.POLL:
+                if cir_owner is not None:
+                    if cir_owner in frames or (cir_owner is CirFrame.POLL and frames):
+                        self._count(Anomaly.NO_RANGE)
+                    if cir_owner is CirFrame.POLL:
                         frames.clear()
-                    frames[owner] = time, self._diagnostics(match, channel, prf)
+                    frames[cir_owner] = time, self._diagnostics(match, channel, prf)
             elif kind == "pairs":
                 length, lines = int(match["length"]), match["pairs"].count(b"\n")
                 if match.end() == len(text) and lines < length:
                     what = f"ends after {lines} of {length} lines of a CIR"
                     raise DamagedRecordingError(what, where=self._after(text))
                 if lines != length or length > MAX_ACCUMULATOR:
-                    self._count(Oddity.MALFORMED)
-                elif owner is self._cir_of:
-                    time, cir = frames[owner]
-                    frames[owner] = time, self._with_samples(cir, match["pairs"])
-                owner = None
+                    self._count(Anomaly.MALFORMED)
+                elif cir_owner is self._cir_frame:
+                    time, cir = frames[cir_owner]
+                    frames[cir_owner] = time, self._with_samples(cir, match["pairs"])
+                cir_owner = None
             elif kind == "range":
                 empty = Cir(_NO_SAMPLES, channel=channel, prf_mhz=prf)
-                time, cir = frames.get(self._cir_of, (latest or 0, empty))
+                time, cir = frames.get(self._cir_frame, (latest or 0, empty))
                 if len(cir) == 0:
-                    self._count(Oddity.NO_CIR)
+                    self._count(Anomaly.NO_CIR)
                 stamp_ns = base_ns + ticks * 1_000_000_000 // int(DEVICE_TICK_HZ)
                 range_m = self._number(match["range"], -3e38, 3e38)
                 yield RangeMeasurement(stamp_ns, tag, anchor, 0, time, range_m, cir)
                 frames.clear()
-                announced = owner = None
+                frame_kind = cir_owner = None
             elif kind != "start":
-                self._count(Oddity.RECEPTION_ERROR if kind == "error" else Oddity.MALFORMED)
-                announced = owner = None
+                self._count(Anomaly.RECEPTION_ERROR if kind == "error" else Anomaly.MALFORMED)
+                frame_kind = cir_owner = None
         if frames:
-            self._count(Oddity.NO_RANGE)
+            self._count(Anomaly.NO_RANGE)
 
     def _diagnostics(self, match: re.Match[bytes], channel: int, prf: int) -> Cir:
         power, first = (self._number(match[name], -1000.0, 1000.0) for name in ("power", "first"))
@@ -219,7 +221,7 @@ class DecaRangingLog(Source):
     def _with_samples(self, cir: Cir, pairs: bytes) -> Cir:
         values = np.fromstring(pairs.replace(b",", b" "), np.int32, sep=" ")
         if values.size == 0 or values.min() < -32768 or values.max() > 32767:
-            self._count(Oddity.MALFORMED)
+            self._count(Anomaly.MALFORMED)
             return cir
         return replace(cir, samples=values.astype(np.int16))
 
@@ -227,40 +229,40 @@ class DecaRangingLog(Source):
         value = float(text) if _NUMBER.fullmatch(text) else math.nan
         if low <= value <= high:
             return value
-        self._count(Oddity.NOT_A_NUMBER)  # such as -001.#INF
+        self._count(Anomaly.NOT_A_NUMBER)  # such as -001.#INF
         return math.nan
 
 
-def _opened(path: Path) -> lzma.LZMAFile:
+def _open(path: Path) -> lzma.LZMAFile:
     return lzma.open(path) if path.suffix == ".xz" else path.open("rb")  # type: ignore[return-value]
 
 
 def _read(path: Path) -> tuple[bytes, str]:
     """Return the complete lines of a log, with line feeds only, and a description of the damage (empty: none)."""
-    pieces: list[bytes] = []
+    blocks: list[bytes] = []
     fault = ""
     try:
-        with _opened(path) as stream:
+        with _open(path) as stream:
             # Read small blocks, so that all data before a damage is kept.
-            while piece := stream.read(1 << 13):
-                pieces.append(piece)
-                if len(pieces) << 13 > MAX_BYTES:
+            while block := stream.read(1 << 13):
+                blocks.append(block)
+                if len(blocks) << 13 > MAX_BYTES:
                     raise RecordingError(f"more than {MAX_BYTES} bytes", where=str(path))
     except (OSError, EOFError, lzma.LZMAError) as error:
-        if not pieces:
+        if not blocks:
             raise RecordingError(f"cannot be read: {error}", where=str(path)) from error
         fault = str(error)
-    text = b"".join(pieces).replace(b"\r\n", b"\n")
-    whole = text[: text.rfind(b"\n") + 1]
-    return whole, fault or ("ends in the middle of a line" if len(whole) < len(text) else "")
+    text = b"".join(blocks).replace(b"\r\n", b"\n")
+    complete = text[: text.rfind(b"\n") + 1]
+    return complete, fault or ("ends in the middle of a line" if len(complete) < len(text) else "")
 
 
 def _start_ns(head: bytes) -> int:
     """Return the start time in a log's first line, as UTC; 0 if missing."""
     match = _TOKEN.match(head)
     try:
-        stated = match["start"].decode() if match is not None and match["start"] else ""
-        start = datetime.strptime(stated, "%Y%m%d-%H%M%S").replace(tzinfo=timezone.utc)
+        start_text = match["start"].decode() if match is not None and match["start"] else ""
+        start = datetime.strptime(start_text, "%Y%m%d-%H%M%S").replace(tzinfo=timezone.utc)
     except ValueError:
         return 0
     # The 64-bit nanoseconds of ROS and NumPy end in 2262.
@@ -286,19 +288,21 @@ class DecaRangingFolder(Source):
     simulated = False
     anchors: AnchorMap
 
-    def __init__(self, path: Path, cir: CirOf = CirOf.FINAL) -> None:
+    def __init__(self, path: Path, cir: CirFrame = CirFrame.FINAL) -> None:
         self.skipped: Counter[str] = Counter()
-        folder = next((one for one in (path, path / "logs") if any(one.glob("*.log*"))), path)
-        plain, packed = (
+        folder = next(
+            (candidate for candidate in (path, path / "logs") if any(candidate.glob("*.log*"))), path
+        )
+        plain, compressed = (
             {log.name.removesuffix(".xz"): log for log in folder.glob(f"*.log{end}")} for end in ("", ".xz")
         )
-        if not plain | packed:
+        if not plain | compressed:
             raise RecordingError("no logs", where=str(path), valid="*.log or *.log.xz, or logs/")
         survey = find_survey(folder)
         if survey is not None:
             self.anchors = survey[1]
-        logs = [_surveyed(log, survey, cir) for log in sorted({**packed, **plain}.values())]
-        self._logs = sorted(logs, key=lambda log: (log.start_ns(), _number_of(log.path) or 0, log.path.name))
+        logs = [_make_log(log, survey, cir) for log in sorted({**compressed, **plain}.values())]
+        self._logs = sorted(logs, key=lambda log: (log.start_ns(), _log_number(log.path) or 0, log.path.name))
         self.name = f"DecaRanging folder {path.resolve().name} ({len(logs)} logs)"
 
     def __iter__(self) -> Iterator[Record]:
@@ -308,14 +312,14 @@ class DecaRangingFolder(Source):
         sequence = last_ns = 0
         for log in self._logs:
             if log.start_ns() < last_ns:
-                self.skipped[Oddity.MOVED.value] += 1
+                self.skipped[Anomaly.MOVED.value] += 1
             try:
                 for record in log.records(sequence, last_ns):
                     last_ns = record.measurement.stamp_ns
                     sequence += 1
                     yield record
             except RecordingError as error:
-                self.skipped[Oddity.UNREADABLE.value] += 1
+                self.skipped[Anomaly.UNREADABLE.value] += 1
                 first_error = first_error or error
             finally:
                 self.skipped.update(log.skipped)
@@ -323,7 +327,9 @@ class DecaRangingFolder(Source):
             raise first_error
 
 
-def open_decaranging(path: Path | str, *, cir: CirOf = CirOf.FINAL) -> DecaRangingLog | DecaRangingFolder:
+def open_decaranging(
+    path: Path | str, *, cir: CirFrame = CirFrame.FINAL
+) -> DecaRangingLog | DecaRangingFolder:
     """Return the source for a log or a folder of logs, with surveyed truth if there is a survey.
 
     Raises:
@@ -334,7 +340,7 @@ def open_decaranging(path: Path | str, *, cir: CirOf = CirOf.FINAL) -> DecaRangi
         return DecaRangingFolder(path, cir)
     if not path.is_file():
         raise RecordingError("no such file or folder", where=str(path), valid="a log, or a folder of logs")
-    return _surveyed(path, find_survey(path.parent), cir)
+    return _make_log(path, find_survey(path.parent), cir)
 
 
 def find_survey(folder: Path) -> Survey | None:
@@ -352,7 +358,7 @@ def find_survey(folder: Path) -> Survey | None:
         seen: set[int] = set()
         for line, row in read_rows(folder / name, columns, MAX_CSV_BYTES):
             where = f"{folder / name}: line {line}"
-            key = identity(row, columns[0], where)
+            key = id_cell(row, columns[0], where)
             if key in seen:
                 raise RecordingError(f"{columns[0]} {key} is repeated", where=where)
             seen.add(key)
@@ -361,7 +367,9 @@ def find_survey(folder: Path) -> Survey | None:
     def positions(name: str) -> dict[int, tuple[float, ...]]:
         limits = -1e6, 1e6
         rows = table(name, "location", "x", "y")
-        return {key: tuple(number(row, axis, where, *limits) for axis in "xy") for where, key, row in rows}
+        return {
+            key: tuple(number_cell(row, axis, where, *limits) for axis in "xy") for where, key, row in rows
+        }
 
     labels = {}
     if (folder / "labels.csv").is_file():
@@ -369,7 +377,7 @@ def find_survey(folder: Path) -> Survey | None:
     surveyed = {kind: positions(f"{kind}s.csv") for kind in ("anchor", "tag")}
     placements = {}
     for where, log, row in table("pairs.csv", "file_number", "anchor_location", "tag_location"):
-        ids = {kind: identity(row, f"{kind}_location", where) for kind in surveyed}
+        ids = {kind: id_cell(row, f"{kind}_location", where) for kind in surveyed}
         for kind, location in ids.items():
             if location not in surveyed[kind]:
                 raise RecordingError(f"{kind} location {location} is unknown", where=where)
@@ -381,11 +389,11 @@ def find_survey(folder: Path) -> Survey | None:
     return placements, AnchorMap(anchors, str(folder / "anchors.csv"))
 
 
-def _surveyed(path: Path, survey: Survey | None, cir: CirOf) -> DecaRangingLog:
-    log = _number_of(path)
+def _make_log(path: Path, survey: Survey | None, cir: CirFrame) -> DecaRangingLog:
+    log = _log_number(path)
     return DecaRangingLog(path, cir, survey[0].get(log) if survey and log is not None else None)
 
 
-def _number_of(path: Path) -> int | None:
+def _log_number(path: Path) -> int | None:
     stem = path.name.split(".", 1)[0]
     return int(stem) if stem.isascii() and stem.isdigit() and len(stem) <= 18 else None

@@ -19,7 +19,7 @@ from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.measurement import Cir, RangeMeasurement, Record
 from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
 from uwb_mitigation.positioning.tracks import TruePath
-from uwb_mitigation.sources.csv_rows import identity, read_rows
+from uwb_mitigation.sources.csv_rows import id_cell, read_rows
 from uwb_mitigation.sources.source import Source
 
 TAG_ID = 1
@@ -91,7 +91,7 @@ class HanyangRun(Source):
     def _read_anchor(self, path: Path, anchors: dict[int, Anchor], rows: list[_Row]) -> None:
         for line, row in read_rows(path, _RANGE_COLUMNS, MAX_BYTES):
             where = f"{path}: line {line}"
-            stamp_ns, key = (identity(row, name, where) for name in ("field.stamp", "field.id"))
+            stamp_ns, key = (id_cell(row, name, where) for name in ("field.stamp", "field.id"))
             x, y, z = (_number(row[f"field.{axis}"], where) for axis in "xyz")
             anchor = Anchor(key, (x, y, z), _ANCHOR_SD_M)
             if anchors.setdefault(key, anchor) != anchor:

@@ -82,7 +82,7 @@ def _mean(values: NDArray[np.float64]) -> float | None:
 
 
 @dataclass(slots=True)
-class Pauses:
+class PauseShortener:
     """Shifts the stamps of consecutive records; ranges, ids and `device_time` are unchanged.
 
     Attributes:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from uwb_mitigation.bag.codec import Key, decode_range, decode_truth, key_of
+from uwb_mitigation.bag.codec import MeasurementKey, decode_range, decode_truth, measurement_key
 from uwb_mitigation.bag.poses import decode_true_position
 from uwb_mitigation.bag.reader import BagReader, check_channel
 from uwb_mitigation.bag.topics import (
@@ -51,8 +51,8 @@ class McapRecording(Source):
         self._closed = False
         bag = BagReader(path)
         self.message_count = bag.message_count
-        told = bag.metadata.get("uwb_mitigation", {}).get("simulated", "")
-        self.simulated = {"true": True, "false": False}.get(told)
+        simulated_text = bag.metadata.get("uwb_mitigation", {}).get("simulated", "")
+        self.simulated = {"true": True, "false": False}.get(simulated_text)
         self.name = f"MCAP bag {path}" + (" (simulated)" if self.simulated else "")
         self.skipped: Counter[str] = Counter()
 
@@ -63,7 +63,7 @@ class McapRecording(Source):
         try:
             yield from self._join(bag)
         finally:
-            self.skipped.update(bag.oddities)
+            self.skipped.update(bag.warnings)
         if not self._closed and self._topic not in bag.topics:
             known = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(bag.topics.items()))
             raise RecordingError(
@@ -78,52 +78,54 @@ class McapRecording(Source):
 
     def _join(self, bag: BagReader) -> Iterator[Record]:
         """Pair ranges with their truths, which may come before or after them; in the order of the ranges."""
-        waiting: deque[_Waiting] = deque()
-        by_key: dict[Key, _Waiting] = {}
-        early: dict[Key, Truth] = {}
-        places: dict[At, Place] = {}
-        placed = bag.topics.get(ODOMETRY_TRUTH) == ODOMETRY_TYPE
+        pending: deque[_PendingRange] = deque()
+        by_key: dict[MeasurementKey, _PendingRange] = {}
+        early_truths: dict[MeasurementKey, Truth] = {}
+        positions: dict[StampedTag, Position] = {}
+        has_positions = bag.topics.get(ODOMETRY_TRUTH) == ODOMETRY_TYPE
 
-        def leave() -> Record:
-            entry = waiting.popleft()
-            by_key.pop(key_of(entry.measurement), None)
-            return Record(entry.measurement, entry.truth, entry.place)
+        def pop_oldest() -> Record:
+            entry = pending.popleft()
+            by_key.pop(measurement_key(entry.measurement), None)
+            return Record(entry.measurement, entry.truth, entry.position)
 
         try:
             for item in self._decoded(bag):
                 if isinstance(item, RangeMeasurement):
-                    key = key_of(item)
-                    place = places.get(At(item.stamp_ns, item.tag_id))
-                    entry = _Waiting(item, early.pop(key, None), place)
-                    waiting.append(entry)
+                    key = measurement_key(item)
+                    position = positions.get(StampedTag(item.stamp_ns, item.tag_id))
+                    entry = _PendingRange(item, early_truths.pop(key, None), position)
+                    pending.append(entry)
                     by_key[key] = entry
-                elif isinstance(item[0], Key):
+                elif isinstance(item[0], MeasurementKey):
                     key, truth = item
                     if key in by_key:
                         by_key[key].truth = truth
                     else:
-                        early[key] = truth
-                        if len(early) > JOIN_WINDOW:
-                            del early[next(iter(early))]
+                        early_truths[key] = truth
+                        if len(early_truths) > JOIN_WINDOW:
+                            del early_truths[next(iter(early_truths))]
                             self.skipped["truth without its range"] += 1
                 else:
-                    _settle(*item, waiting, places)
-                while waiting and (
-                    (waiting[0].truth is not None and (waiting[0].place is not None or not placed))
-                    or len(waiting) > JOIN_WINDOW
+                    _assign_position(*item, pending, positions)
+                while pending and (
+                    (pending[0].truth is not None and (pending[0].position is not None or not has_positions))
+                    or len(pending) > JOIN_WINDOW
                 ):
-                    yield leave()
+                    yield pop_oldest()
         except RecordingError:
-            while waiting:
-                yield leave()
+            while pending:
+                yield pop_oldest()
             raise
-        while waiting and not self._closed:
-            yield leave()
-        if early:
-            self.skipped["truth without its range"] += len(early)
+        while pending and not self._closed:
+            yield pop_oldest()
+        if early_truths:
+            self.skipped["truth without its range"] += len(early_truths)
 
-    def _decoded(self, bag: BagReader) -> Iterator[RangeMeasurement | tuple[Key, Truth] | tuple[At, Place]]:
-        checked: set[int] = set()
+    def _decoded(
+        self, bag: BagReader
+    ) -> Iterator[RangeMeasurement | tuple[MeasurementKey, Truth] | tuple[StampedTag, Position]]:
+        checked_channels: set[int] = set()
         types = {self._topic: RANGE_CIR_TYPE, RANGE_TRUTH: RANGE_TRUTH_TYPE}
         if bag.topics.get(ODOMETRY_TRUTH) == ODOMETRY_TYPE:
             types[ODOMETRY_TRUTH] = ODOMETRY_TYPE
@@ -132,25 +134,25 @@ class McapRecording(Source):
                 return
             topic = message.channel.topic
             # The bag keeps references to its channels, so that an id() identifies one channel of one file.
-            if id(message.channel) not in checked and topic != ODOMETRY_TRUTH:
+            if id(message.channel) not in checked_channels and topic != ODOMETRY_TRUTH:
                 check_channel(message.channel, types[topic], self._path)
-                checked.add(id(message.channel))
+                checked_channels.add(id(message.channel))
             try:
                 if topic == self._topic:
                     yield decode_range(message.data)
                 elif topic == RANGE_TRUTH:
                     yield decode_truth(message.data)
-                elif (place := decode_true_position(message.data)) is not None:
-                    stamp_ns, tag_id, position = place
-                    yield At(stamp_ns, tag_id), position
+                elif (decoded := decode_true_position(message.data)) is not None:
+                    stamp_ns, tag_id, position = decoded
+                    yield StampedTag(stamp_ns, tag_id), position
             except RecordingError as error:
                 self.skipped[error.what] += 1
 
 
-Place = tuple[float, float, float]
+Position = tuple[float, float, float]
 
 
-class At(NamedTuple):
+class StampedTag(NamedTuple):
     """Tag and stamp of a true position."""
 
     stamp_ns: int
@@ -158,19 +160,24 @@ class At(NamedTuple):
 
 
 @dataclass(slots=True)
-class _Waiting:
+class _PendingRange:
     """A range that waits for its truth."""
 
     measurement: RangeMeasurement
     truth: Truth | None
-    place: Place | None
+    position: Position | None
 
 
-def _settle(at: At, place: Place, waiting: deque[_Waiting], places: dict[At, Place]) -> None:
+def _assign_position(
+    stamped_tag: StampedTag,
+    position: Position,
+    pending: deque[_PendingRange],
+    positions: dict[StampedTag, Position],
+) -> None:
     """Assign a true position to earlier and later ranges with the same tag and stamp."""
-    for entry in waiting:
-        if (entry.measurement.stamp_ns, entry.measurement.tag_id) == at:
-            entry.place = place
-    places[at] = place
-    if len(places) > JOIN_WINDOW:
-        del places[next(iter(places))]
+    for entry in pending:
+        if (entry.measurement.stamp_ns, entry.measurement.tag_id) == stamped_tag:
+            entry.position = position
+    positions[stamped_tag] = position
+    if len(positions) > JOIN_WINDOW:
+        del positions[next(iter(positions))]

@@ -44,9 +44,9 @@ def open_recording(path: Path, *, cir: Literal["final", "poll"] = "final") -> So
         if is_run(path):
             return HanyangRun(path)
     if path.is_dir() or path.name.endswith((".log", ".log.xz")) or _looks_like_log(path):
-        from uwb_mitigation.sources.decaranging import CirOf, open_decaranging
+        from uwb_mitigation.sources.decaranging import CirFrame, open_decaranging
 
-        return open_decaranging(path, cir=CirOf[cir.upper()])
+        return open_decaranging(path, cir=CirFrame[cir.upper()])
     raise RecordingError("not a recording that can be read", where=str(path), valid=ACCEPTED)
 
 

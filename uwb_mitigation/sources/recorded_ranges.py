@@ -47,12 +47,12 @@ class RecordedRanges:
 
     Attributes:
         tags: by their numbers.
-        strangers: number of ranges from anchors that are not in the map, {anchor id: count}.
+        unknown_anchors: number of ranges from anchors that are not in the map, {anchor id: count}.
         skipped: other skipped ranges, {reason: count}.
     """
 
     tags: list[TagRecording]
-    strangers: Counter[int]
+    unknown_anchors: Counter[int]
     skipped: Counter[str]
 
 
@@ -74,7 +74,7 @@ def read_ranges(path: Path, anchors: AnchorMap, stamp_offset_s: float = 0.0) -> 
     """
     bag, offset_ns = BagReader(path), round(stamp_offset_s * 1e9)
     raw, corrected = defaultdict[int, list[_Row]](list), defaultdict[int, list[_Row]](list)
-    strangers, skipped, checked = Counter[int](), Counter[str](), set[int]()
+    unknown_anchors, skipped, checked = Counter[int](), Counter[str](), set[int]()
     powers: dict[_Key, float] = {}
 
     def add(table: dict[int, list[_Row]], key: _Key, value: float, variance: float, power: float) -> bool:
@@ -96,37 +96,37 @@ def read_ranges(path: Path, anchors: AnchorMap, stamp_offset_s: float = 0.0) -> 
                 powers[key] = measured.cir.rx_power_dbm
                 row = (measured.range_m, math.nan, powers[key])
             else:
-                found, made = decode_corrected(message.data)
-                key = (found.stamp_ns, found.tag_id, found.anchor_id, found.sequence)
-                row = (made.range_m, made.variance_m2, powers.get(key, math.nan))
+                key_fields, corrected_range = decode_corrected(message.data)
+                key = (key_fields.stamp_ns, key_fields.tag_id, key_fields.anchor_id, key_fields.sequence)
+                row = (corrected_range.range_m, corrected_range.variance_m2, powers.get(key, math.nan))
                 if key not in powers:
                     # A bag without raw ranges: corrected ranges contain the measured ones.
-                    add(raw, key, made.range_raw_m, math.nan, math.nan)
+                    add(raw, key, corrected_range.range_raw_m, math.nan, math.nan)
         except RecordingError as error:
             skipped[error.what] += 1
             continue
         if not add(raw if is_raw else corrected, key, *row):
             is_new = is_raw or not raw
             if key[2] not in anchors.index:
-                strangers[key[2]] += is_new
+                unknown_anchors[key[2]] += is_new
             else:
                 skipped["range that is not valid"] += is_new
     if not raw and not corrected:
-        place = ", ".join(map(str, sorted(anchors.index)))
-        seen = ", ".join(map(str, sorted(strangers))) or "none"
+        map_ids = ", ".join(map(str, sorted(anchors.index)))
+        recorded_ids = ", ".join(map(str, sorted(unknown_anchors))) or "none"
         raise RecordingError(
-            f"no range of the anchors {place}",
+            f"no range of the anchors {map_ids}",
             where=str(path),
-            valid=f"the bag's ranges come from anchors: {seen}",
+            valid=f"the bag's ranges come from anchors: {recorded_ids}",
         )
     truths = read_truth(path)
-    nowhere = TruePath(np.zeros(0, np.int64), np.zeros((0, 3)))
+    no_truth = TruePath(np.zeros(0, np.int64), np.zeros((0, 3)))
     tags = []
     for tag in sorted(raw.keys() | corrected.keys()):
         measured_ranges = _columns(tag, raw.get(tag, []))
         usable = _columns(tag, corrected[tag]) if tag in corrected else measured_ranges
-        tags.append(TagRecording(tag, measured_ranges, usable, tag in corrected, truths.get(tag, nowhere)))
-    return RecordedRanges(tags, strangers, skipped + bag.oddities)
+        tags.append(TagRecording(tag, measured_ranges, usable, tag in corrected, truths.get(tag, no_truth)))
+    return RecordedRanges(tags, unknown_anchors, skipped + bag.warnings)
 
 
 def _columns(tag_id: int, rows: list[_Row]) -> Ranges:

@@ -121,7 +121,7 @@ class Simulated(Source):
             condition = label(bool(links.path.crossings[i]), bool(reception.direct_above_threshold[i]))
             truth = Truth(float(distance[i]), condition, exchanges.configuration[i])
             x, y = links.tag[i].tolist()
-            yield Record(measurement, truth, None if links.at_rest else (x, y, 0.0))
+            yield Record(measurement, truth, None if links.stationary else (x, y, 0.0))
 
 
 class SimulatedSource(Simulated):
@@ -218,14 +218,14 @@ class SimulatedSource(Simulated):
             anchor_id,
             tag_id,
             names,
-            Links(anchors, positions, path, RESIDENTIAL, fields, pair, at_rest=False),
+            Links(anchors, positions, path, RESIDENTIAL, fields, pair, stationary=False),
         )
 
 
 class SimulatedSurvey(Simulated):
     """Independent static placements with many exchanges each, like a surveyed data set; a `Source`.
 
-    Both antennas have random positions in the plan, 0.2 m from its border and at least `CLOSEST_M` apart. A
+    Both antennas have random positions in the plan, 0.2 m from its border and at least `MIN_DISTANCE_M` apart. A
     placement has one channel: its exchanges differ only in noise and sampling phase.
 
     Args:
@@ -280,7 +280,7 @@ class SimulatedSurvey(Simulated):
                     ids,
                     FIRST_TAG_ID * ids,
                     names,
-                    Links(anchor[of], tag[of], path, RESIDENTIAL, fields, of, at_rest=True),
+                    Links(anchor[of], tag[of], path, RESIDENTIAL, fields, of, stationary=True),
                 ),
                 rng,
             )

@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from uwb_mitigation.errors import ParameterError
-from uwb_mitigation.files import read_bounded, write_whole
+from uwb_mitigation.files import read_bounded, write_atomically
 from uwb_mitigation.positioning.anchors import MAX_TEXT, AnchorMap, dump_anchors, parse_anchors
 
 
 @runtime_checkable
-class KnowsAnchors(Protocol):
+class HasAnchors(Protocol):
     """A source with known anchor positions.
 
     Attributes:
@@ -50,4 +50,4 @@ def save_anchors(path: Path, anchors: AnchorMap, comment: str = "", *, force: bo
     """
     if path.exists() and not force:
         raise ParameterError("exists already", where=str(path), valid="--force replaces it")
-    write_whole(path, dump_anchors(anchors, comment), ParameterError)
+    write_atomically(path, dump_anchors(anchors, comment), ParameterError)

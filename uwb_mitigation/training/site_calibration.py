@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from uwb_mitigation.errors import DatasetError, ModelError, format_id
 from uwb_mitigation.evaluation.dataset import Dataset
 from uwb_mitigation.evaluation.site_data import SiteData
-from uwb_mitigation.files import write_together
+from uwb_mitigation.files import write_all_atomically
 from uwb_mitigation.model import graph
 from uwb_mitigation.model.bundle import Bundle, build_bundle
 from uwb_mitigation.model.floating import float_network, scaled
@@ -256,7 +256,7 @@ class SiteCalibration:
             f"Offsets of the radios, m, for model {bundle.model_id:08x} ({output.name}): use both together.\n"
             f"Estimated by uwb-mitigation calibrate in {name}, {how}."
         )
-        write_together({output: content, offsets_path: dump_offsets(self.offsets, comment)}, ModelError)
+        write_all_atomically({output: content, offsets_path: dump_offsets(self.offsets, comment)}, ModelError)
         return bundle, offsets_path
 
 

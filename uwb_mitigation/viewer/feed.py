@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from uwb_mitigation.bag.codec import Key, decode_corrected, decode_range, decode_truth
+from uwb_mitigation.bag.codec import MeasurementKey, decode_corrected, decode_range, decode_truth
 from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.measurement import CorrectedRange, RangeMeasurement, Truth
 from uwb_mitigation.positioning.anchors import AnchorMap
@@ -46,8 +46,8 @@ class Feed:
         self.malformed = 0
         self.scene = scene
         self._lock = lock
-        self._truths: BoundedDict[Key, Truth] = BoundedDict(MAX_TRUTHS)
-        self._without_truth: BoundedDict[Key, Sample] = BoundedDict(MAX_WITHOUT_TRUTH)
+        self._truths: BoundedDict[MeasurementKey, Truth] = BoundedDict(MAX_TRUTHS)
+        self._without_truth: BoundedDict[MeasurementKey, Sample] = BoundedDict(MAX_WITHOUT_TRUTH)
 
     def clear(self) -> None:
         """Remove everything except the anchors."""
@@ -84,7 +84,7 @@ class Feed:
         if (decoded := self._decoded(decode_corrected, data)) is not None:
             self.corrected(*decoded)
 
-    def corrected(self, key: Key, corrected: CorrectedRange) -> None:
+    def corrected(self, key: MeasurementKey, corrected: CorrectedRange) -> None:
         truth = self._truths.pop(key, None)
         sample = Sample.of(key.stamp_ns / 1e9, corrected, truth)
         with self._lock:

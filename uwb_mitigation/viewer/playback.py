@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from uwb_mitigation.bag import schemas
-from uwb_mitigation.bag.codec import decode_range, key_of
+from uwb_mitigation.bag.codec import decode_range, measurement_key
 from uwb_mitigation.bag.reader import BagReader, RawMessage, check_channel
 from uwb_mitigation.bag.topics import (
     ANCHORS,
@@ -213,7 +213,7 @@ class BagPlayer:
         batch, self._uncorrected = self._uncorrected, []
         results = self._backend.correct([measurement for _, measurement in batch])
         for (self._clock_s, measurement), corrected in zip(batch, results, strict=True):
-            self._feed.corrected(key_of(measurement), corrected)
+            self._feed.corrected(measurement_key(measurement), corrected)
 
 
 def _positions(prefix: str, topics: Iterable[str]) -> dict[str, tuple[str, str]]:

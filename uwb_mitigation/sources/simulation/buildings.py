@@ -96,7 +96,7 @@ DOORWAY_SHARE = 0.8
 DOORWAY_M = (0.8, 1.2)
 METAL_M = (0.5, 2.0)
 PERSON_M = 0.45
-PEOPLE = 1.0
+MEAN_PEOPLE = 1.0
 """Mean number per building."""
 
 RADIO = Radio(range_offset_m=0.0)
@@ -119,9 +119,9 @@ DETECTION_SYMBOLS = 24
 """Symbols used for preamble detection, which are not accumulated (the logs: 1000 of 1024 are)."""
 
 DETOUR_M = 4.0
-DETOUR_MOST = 3.0
+MAX_DELAY_FACTOR = 3.0
 """Behind obstacles, the delay of the first cluster is proportional to the distance, because detours scale with it. It
-equals the environment's delay at `DETOUR_M` and is at most `DETOUR_MOST` times as long: 8.1 ns (the report's program:
+equals the environment's delay at `DETOUR_M` and is at most `MAX_DELAY_FACTOR` times as long: 8.1 ns (the report's program:
 8.3). An assumption, kept because it improved the results on the real logs (docs/background/how_it_works.md)."""
 
 PLACEMENTS, BUILDINGS = 256, 4
@@ -149,7 +149,7 @@ def draw_plan(kind: Kind, rng: np.random.Generator) -> FloorPlan:
         _screen("metal", float(rng.uniform(*METAL_M)), size, rng)
         for _ in range(rng.poisson(kind.screens_per_m2 * size[0] * size[1]))
     ]
-    screens += [_screen("person", PERSON_M, size, rng) for _ in range(rng.poisson(PEOPLE))]
+    screens += [_screen("person", PERSON_M, size, rng) for _ in range(rng.poisson(MEAN_PEOPLE))]
     return FloorPlan(size, tuple(walls), tuple(screens))
 
 
@@ -257,8 +257,8 @@ def block_of(seed: int, number: int, *, wide: bool = False) -> tuple[Block, np.r
         path = replace(path, loss_db=path.loss_db + loss_db)
     chosen = _balanced(_conditions(environments, anchor, tag, path, boards), PLACEMENTS, rng)
     anchor, tag = anchor[chosen], tag[chosen]
-    later = np.minimum(np.hypot(*(tag - anchor).T) / DETOUR_M, DETOUR_MOST)
-    fields = draw_fields(environments, PLACEMENTS, rng, later)
+    delay_factor = np.minimum(np.hypot(*(tag - anchor).T) / DETOUR_M, MAX_DELAY_FACTOR)
+    fields = draw_fields(environments, PLACEMENTS, rng, delay_factor)
     links = Links(
         anchor,
         tag,
@@ -266,12 +266,12 @@ def block_of(seed: int, number: int, *, wide: bool = False) -> tuple[Block, np.r
         environments,
         fields,
         np.arange(PLACEMENTS),
-        at_rest=True,
+        stationary=True,
     )
     return Block(kind.name, chosen // each, links, boards.take(chosen)), rng
 
 
-IN_SIGHT, BLOCKED, LOST, WEAK = range(4)
+LOS, NLOS, NDP_NLOS, WEAK = range(4)
 
 
 def _conditions(
@@ -283,10 +283,10 @@ def _conditions(
 ) -> NDArray[np.int64]:
     """Predict the condition of each candidate from mean levels."""
     direct, diffuse = _mean_powers_db(environments, anchor, tag, path)
-    is_heard = RADIO.direct_margin_db(direct, diffuse, boards) > 0
-    condition = np.where(path.crossings == 0, IN_SIGHT, np.where(is_heard, BLOCKED, LOST))
+    is_detected = RADIO.direct_margin_db(direct, diffuse, boards) > 0
+    condition = np.where(path.crossings == 0, LOS, np.where(is_detected, NLOS, NDP_NLOS))
     level = mean_level_dbm(environments, anchor, tag, path, boards)
-    condition[level < RADIO.least_dbm(boards)] = WEAK
+    condition[level < RADIO.sensitivities_dbm(boards)] = WEAK
     return condition
 
 
@@ -321,7 +321,7 @@ def _balanced(conditions: NDArray[np.int64], count: int, rng: np.random.Generato
     """Return `count` rows, ascending: the three conditions in turn as long as available, weak ones last."""
     order = rng.permutation(len(conditions))
     turn = np.empty(len(conditions), np.int64)
-    for condition in (IN_SIGHT, BLOCKED, LOST, WEAK):
+    for condition in (LOS, NLOS, NDP_NLOS, WEAK):
         rows = order[conditions[order] == condition]
         turn[rows] = np.arange(len(rows)) + (len(conditions) if condition == WEAK else 0)
     chosen: NDArray[np.intp] = np.sort(order[np.argsort(turn[order], kind="stable")][:count])

@@ -240,19 +240,22 @@ class DiffuseField:
         antenna moves.
         """
         # Most rays belong to unused clusters, or have decayed by 60 dB or more.
-        heard = self.mean_power > 1e-6
-        m = self.nakagami_m[heard]
-        power = rng.standard_gamma(m) * (self.mean_power[heard] / m)
+        significant = self.mean_power > 1e-6
+        m = self.nakagami_m[significant]
+        power = rng.standard_gamma(m) * (self.mean_power[significant] / m)
         phase = rng.uniform(0.0, 2.0 * math.pi, power.shape)
-        gains = np.zeros(heard.shape, np.complex128)
-        gains[heard] = np.sqrt(power) * np.exp(1j * phase)
+        gains = np.zeros(significant.shape, np.complex128)
+        gains[significant] = np.sqrt(power) * np.exp(1j * phase)
         return gains
 
 
 def draw_diffuse_field(
-    environment: Environment, n: int, rng: np.random.Generator, later: NDArray[np.float64] | float = 1.0
+    environment: Environment,
+    n: int,
+    rng: np.random.Generator,
+    delay_factor: NDArray[np.float64] | float = 1.0,
 ) -> DiffuseField:
-    """Draw the diffuse fields of `n` independent placements; `later`, (n,): factor of the delay of the first cluster.
+    """Draw the diffuse fields of `n` independent placements; `delay_factor`, (n,): factor of the delay of the first cluster.
 
     Clusters: a Poisson number (at least one), exponential gaps, exponential decay, log-normal power.
     Rays: gaps from a mixture of two exponentials, exponential decay, log-normal Nakagami m
@@ -274,7 +277,7 @@ def draw_diffuse_field(
     ray_decay_ns = e.ray_decay_ns + e.ray_decay_growth * start[..., None]
     power = (cluster_power[..., None] * np.exp(-offset / ray_decay_ns)).reshape(n, -1)
     delay = (start[..., None] + offset).reshape(n, -1)
-    delay += (rng.exponential(1.0, n) * e.first_cluster_delay_ns * later)[:, None]
+    delay += (rng.exponential(1.0, n) * e.first_cluster_delay_ns * delay_factor)[:, None]
     m = np.maximum(np.exp(rng.normal(e.nakagami_log_mean, e.nakagami_log_std, power.shape)), 0.5)
     shadowing = rng.normal(0.0, e.shadowing_db, n)
     pattern_loss = rng.gamma(*PATTERN_LOSS_DB, n)

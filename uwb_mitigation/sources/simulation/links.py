@@ -17,7 +17,7 @@ from uwb_mitigation.sources.simulation.channel import (
 from uwb_mitigation.sources.simulation.scene import DirectPath, Point
 
 BORDER_M = 0.2
-CLOSEST_M = 0.5
+MIN_DISTANCE_M = 0.5
 
 Environments = tuple[Environment, Environment]
 """Diffuse fields for LOS and NLOS."""
@@ -32,7 +32,7 @@ class Links:
         path: the obstacles between them.
         environments, fields: the diffuse fields for LOS and NLOS.
         field_of: int (n,), row of the fields for each link.
-        at_rest: fading is drawn once per field; in motion, once per link.
+        stationary: fading is drawn once per field; in motion, once per link.
     """
 
     anchor: NDArray[np.float64]
@@ -41,7 +41,7 @@ class Links:
     environments: Environments
     fields: tuple[DiffuseField, DiffuseField]
     field_of: NDArray[np.intp]
-    at_rest: bool
+    stationary: bool
 
     @property
     def distance_m(self) -> NDArray[np.float64]:
@@ -51,15 +51,15 @@ class Links:
 
     def take(self, fields: NDArray[np.intp], field_of: NDArray[np.intp]) -> Links:
         """Return links over some of the fields, with new row numbers in `field_of`; field k is that of link k here."""
-        links, (in_sight, blocked) = fields[field_of], self.fields
+        links, (los, nlos) = fields[field_of], self.fields
         return Links(
             self.anchor[links],
             self.tag[links],
             self.path.take(links),
             self.environments,
-            (in_sight.take(fields), blocked.take(fields)),
+            (los.take(fields), nlos.take(fields)),
             field_of,
-            self.at_rest,
+            self.stationary,
         )
 
     def multipath(self, rng: np.random.Generator) -> Multipath:
@@ -68,29 +68,32 @@ class Links:
         rays = self.fields[0].delay_ns.shape[1]
         delay = np.empty((len(distance), 1 + rays))
         gain = np.empty((len(distance), 1 + rays), np.complex128)
-        for environment, field, blocked in zip(self.environments, self.fields, (False, True), strict=True):
-            (here,) = np.nonzero((path.crossings > 0) == blocked)
-            of = self.field_of[here]
-            fading = field.fade(rng)[of] if self.at_rest else field.take(of).fade(rng)
-            arriving = propagate(
-                distance[here],
-                path.loss_db[here],
-                path.excess_m[here],
+        for environment, field, nlos in zip(self.environments, self.fields, (False, True), strict=True):
+            (rows,) = np.nonzero((path.crossings > 0) == nlos)
+            field_rows = self.field_of[rows]
+            fading = field.fade(rng)[field_rows] if self.stationary else field.take(field_rows).fade(rng)
+            received = propagate(
+                distance[rows],
+                path.loss_db[rows],
+                path.excess_m[rows],
                 environment,
-                field.take(of),
+                field.take(field_rows),
                 fading,
                 rng,
             )
-            delay[here], gain[here] = arriving.delay_ns, arriving.gain
+            delay[rows], gain[rows] = received.delay_ns, received.gain
         return Multipath(delay, gain)
 
 
 def draw_fields(
-    environments: Environments, n: int, rng: np.random.Generator, later: NDArray[np.float64] | float = 1.0
+    environments: Environments,
+    n: int,
+    rng: np.random.Generator,
+    delay_factor: NDArray[np.float64] | float = 1.0,
 ) -> tuple[DiffuseField, DiffuseField]:
-    """Draw the diffuse fields of n placements for LOS and NLOS; see `draw_diffuse_field` for `later`."""
-    in_sight, blocked = environments
-    return draw_diffuse_field(in_sight, n, rng, later), draw_diffuse_field(blocked, n, rng, later)
+    """Draw the diffuse fields of n placements for LOS and NLOS; see `draw_diffuse_field` for `delay_factor`."""
+    los, nlos = environments
+    return draw_diffuse_field(los, n, rng, delay_factor), draw_diffuse_field(nlos, n, rng, delay_factor)
 
 
 def place(size: Point, n: int, rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -99,12 +102,12 @@ def place(size: Point, n: int, rng: np.random.Generator) -> tuple[NDArray[np.flo
     again = np.ones(n, np.bool_)
     while again.any():
         pair[again] = rng.uniform((BORDER_M, BORDER_M), np.subtract(size, BORDER_M), (int(again.sum()), 2, 2))
-        again = np.hypot(*(pair[:, 0] - pair[:, 1]).T) < CLOSEST_M
+        again = np.hypot(*(pair[:, 0] - pair[:, 1]).T) < MIN_DISTANCE_M
     return pair[:, 0], pair[:, 1]
 
 
-def label(blocked: bool, direct_above_threshold: bool) -> str:
+def label(nlos: bool, direct_above_threshold: bool) -> str:
     """Return the propagation condition of a link."""
-    if not blocked:
+    if not nlos:
         return "LOS"
     return "NLOS" if direct_above_threshold else "NDP NLOS"

@@ -37,7 +37,7 @@ RAYLEIGH_VARIANCE = 1.0 - math.pi / 4.0
 """Variance of the magnitude of complex noise of unit power."""
 
 NOISE_TAPS = slice(64, 576)
-SEARCH_FROM = 640
+FIRST_SEARCHED_TAP = 640
 """The noise is measured well before the earliest first path; the search begins after this region."""
 
 _SPAN = 8
@@ -62,12 +62,17 @@ def pulse(taps: NDArray[np.float64]) -> NDArray[np.float64]:
 PULSE_PEAK = float(pulse(np.zeros(1))[0])
 _OFFSETS = np.arange(1 - _SPAN, _SPAN + 1)
 _PULSE_TABLE = pulse(_OFFSETS[None, :] - np.arange(_PHASES)[:, None] / _PHASES)
-_FINE = np.arange(_EDGE_TAPS[0], _EDGE_TAPS[1], 1.0 / _EDGE_STEPS)
-_NEAR = np.arange(_EDGE_TAPS[0] - _KERNEL_REACH, _EDGE_TAPS[1] + _KERNEL_REACH)
-_LAG = _NEAR[:, None] - _FINE[None, :]
+_FINE_TAPS = np.arange(_EDGE_TAPS[0], _EDGE_TAPS[1], 1.0 / _EDGE_STEPS)
+_EDGE_WINDOW = np.arange(_EDGE_TAPS[0] - _KERNEL_REACH, _EDGE_TAPS[1] + _KERNEL_REACH)
+_OFFSET_FROM_TAP = _EDGE_WINDOW[:, None] - _FINE_TAPS[None, :]
 # At half the tap rate the pulse's spectrum is down to 1 %, so a tapered sinc interpolates it well.
 _INTERPOLATE = (
-    np.sinc(_LAG) * np.where(np.abs(_LAG) < _KERNEL_REACH, np.cos(math.pi * _LAG / (2 * _KERNEL_REACH)), 0.0)
+    np.sinc(_OFFSET_FROM_TAP)
+    * np.where(
+        np.abs(_OFFSET_FROM_TAP) < _KERNEL_REACH,
+        np.cos(math.pi * _OFFSET_FROM_TAP / (2 * _KERNEL_REACH)),
+        0.0,
+    )
 ).astype(np.float32)
 
 
@@ -185,7 +190,7 @@ class Radio:
         per_symbol = BOLTZMANN_290K_DBM_HZ - 10.0 * math.log10(SYMBOL_S) + 20.0 * math.log10(PULSE_PEAK)
         return per_symbol + noise_figure_db
 
-    def least_dbm(self, boards: Boards) -> NDArray[np.float64]:
+    def sensitivities_dbm(self, boards: Boards) -> NDArray[np.float64]:
         """Return the sensitivity of each link; a longer preamble and less noise improve it."""
         longer = 10.0 * np.log10(boards.preamble_symbols / self.preamble_symbols)
         return self.sensitivity_dbm - longer + (boards.noise_figure_db - self.noise_figure_db)
@@ -232,15 +237,15 @@ class Radio:
 
         components = symbol.view(np.float32)
         power = np.einsum("ij,ij->i", components, components).astype(np.float64)
-        audible = power >= 10.0 ** ((self.least_dbm(boards) + POWER_CONSTANT_DB) / 10.0)
+        above_sensitivity = power >= 10.0 ** ((self.sensitivities_dbm(boards) + POWER_CONSTANT_DB) / 10.0)
         gain = self.compression(power)
         power *= gain * gain
         symbol *= gain[:, None].astype(np.float32)
 
         peak = np.maximum(components.max(axis=1), -components.min(axis=1)).astype(np.float64)
         # A strong signal fills the accumulator in fewer symbols, but in at least one.
-        most = np.minimum(self.accumulator_limit / np.maximum(peak, 1e-9), boards.preamble_symbols)
-        count = np.maximum(most, 1.0).astype(np.int64)
+        max_count = np.minimum(self.accumulator_limit / np.maximum(peak, 1e-9), boards.preamble_symbols)
+        count = np.maximum(max_count, 1.0).astype(np.int64)
 
         thermal = 10.0 ** ((self.noise_level_dbm(boards.noise_figure_db) + POWER_CONSTANT_DB) / 10.0)
         # Over the symbols, thermal noise adds up in power, the residue of the preamble in amplitude.
@@ -250,7 +255,7 @@ class Radio:
         accumulator += components * count.astype(np.float32)[:, None]
         samples = np.clip(np.rint(accumulator), -32768, 32767).astype(np.int16)
         direct = np.abs(multipath.gain[:, 0]) * scale * gain * count * PULSE_PEAK
-        return self._report(samples, count, direct, place, audible, rng)
+        return self._report(samples, count, direct, place, above_sensitivity, rng)
 
     def _report(
         self,
@@ -258,14 +263,14 @@ class Radio:
         count: NDArray[np.int64],
         direct: NDArray[np.float64],
         place: NDArray[np.float64],
-        audible: NDArray[np.bool_],
+        above_sensitivity: NDArray[np.bool_],
         rng: np.random.Generator,
     ) -> Reception:
         quantised = samples.astype(np.float32)
         taps = quantised.view(np.complex64)
         magnitude = np.abs(taps)
         threshold = noise_threshold(magnitude, self.noise_multiplier)
-        index = np.where(audible, detect_first_path(taps, magnitude, threshold), np.nan)
+        index = np.where(above_sensitivity, detect_first_path(taps, magnitude, threshold), np.nan)
         rx_power, first_path_power = power_levels(magnitude, index, count)
         error = (index + EDGE_LEAD_TAPS - place) * TAP_NS * SPEED_OF_LIGHT_M_PER_NS
         error += self.range_offset_m + rng.normal(0.0, self.timestamp_std_m, len(error))
@@ -304,13 +309,13 @@ def detect_first_path(
     The edge starts at the first tap above the threshold. The index is where the interpolated magnitude reaches half of the
     edge's first maximum, so that it hardly depends on the strength of the path and on later paths.
     """
-    above = magnitude[:, SEARCH_FROM:] > threshold[:, None]
+    above = magnitude[:, FIRST_SEARCHED_TAP:] > threshold[:, None]
     found = above.any(axis=1)
-    crossing = above.argmax(axis=1) + SEARCH_FROM
-    crossing = np.minimum(crossing, TAPS - 1 - int(_NEAR[-1]))
+    crossing = above.argmax(axis=1) + FIRST_SEARCHED_TAP
+    crossing = np.minimum(crossing, TAPS - 1 - int(_EDGE_WINDOW[-1]))
     rows = np.arange(len(taps))
-    near = taps[rows[:, None], crossing[:, None] + _NEAR]
-    fine = np.hypot(near.real @ _INTERPOLATE, near.imag @ _INTERPOLATE)
+    window = taps[rows[:, None], crossing[:, None] + _EDGE_WINDOW]
+    fine = np.hypot(window.real @ _INTERPOLATE, window.imag @ _INTERPOLATE)
 
     # The edge may cross the threshold between the previous tap and the first one above it.
     rising = fine[:, 1:-1]
@@ -324,7 +329,7 @@ def detect_first_path(
     low, high = fine[rows, last], fine[rows, last + 1]
     rise = np.where(high > low, high - low, 1.0)
     fraction = np.clip((half - low) / rise, 0.0, 1.0)
-    index = crossing + _FINE[last] + fraction / _EDGE_STEPS
+    index = crossing + _FINE_TAPS[last] + fraction / _EDGE_STEPS
     index = np.rint(index * INDEX_STEPS) / INDEX_STEPS
     located: NDArray[np.float64] = np.where(found, index, np.nan)
     return located
@@ -345,8 +350,8 @@ def power_levels(
     cir_power = np.maximum(np.rint((energy - noise) / 2.0**17), 1.0)
     found = np.isfinite(index)
     first = np.floor(np.where(found, index, 0.0)).astype(np.int64)
-    near = np.rint(magnitude[np.arange(len(index))[:, None], first[:, None] + np.arange(1, 4)])
-    first_power = np.maximum((near.astype(np.float64) ** 2).sum(axis=1), 1.0)
+    window = np.rint(magnitude[np.arange(len(index))[:, None], first[:, None] + np.arange(1, 4)])
+    first_power = np.maximum((window.astype(np.float64) ** 2).sum(axis=1), 1.0)
     squared = count.astype(np.float64) ** 2
     receive = 10.0 * np.log10(cir_power * 2.0**17 / squared) - POWER_CONSTANT_DB
     first_path = 10.0 * np.log10(first_power / squared) - POWER_CONSTANT_DB

@@ -58,7 +58,7 @@ OBSTACLES = (
 )
 """Obstacles in the order of DeepUWB's column `Obstacles`."""
 
-HOW_MANY = (0.35, 0.45, 0.20)
+OBSTACLE_COUNT_SHARES = (0.35, 0.45, 0.20)
 """Probabilities of zero, one and two obstacles in a path."""
 
 WALL = 0
@@ -75,14 +75,14 @@ class Room:
 
     Attributes:
         name: display name. size: m.
-        in_sight, blocked: the diffuse field without and with obstacles between the antennas.
+        los, nlos: the diffuse field without and with obstacles between the antennas.
         divided: there is always a wall between them.
     """
 
     name: str
     size: Point
-    in_sight: Environment
-    blocked: Environment
+    los: Environment
+    nlos: Environment
     divided: bool = False
 
 
@@ -98,26 +98,26 @@ def _furnished(name: str, size: Point) -> Room:
     delayed.
     """
     share = _mean_free_path_m(size) / _mean_free_path_m(FLAT.size)
-    in_sight = replace(
+    los = replace(
         RESIDENTIAL_LOS,
         name=f"{name}, in sight",
         cluster_decay_ns=share * RESIDENTIAL_LOS.cluster_decay_ns,
         ray_decay_ns=share * RESIDENTIAL_LOS.ray_decay_ns,
     )
     delay_ns = share * RESIDENTIAL_NLOS.first_cluster_delay_ns
-    blocked = replace(in_sight, name=f"{name}, blocked", first_cluster_delay_ns=delay_ns)
-    return Room(name, size, in_sight, blocked)
+    nlos = replace(los, name=f"{name}, blocked", first_cluster_delay_ns=delay_ns)
+    return Room(name, size, los, nlos)
 
 
 def _outdoor() -> Room:
     """Return an environment with few reflections: 4 dB less than in a room, the first from twice the distance."""
     name = "outdoor"
-    in_sight = replace(
+    los = replace(
         RESIDENTIAL_LOS, name=f"{name}, in sight", path_loss_1m_db=RESIDENTIAL_LOS.path_loss_1m_db + 4.0
     )
     delay_ns = 2.0 * RESIDENTIAL_NLOS.first_cluster_delay_ns
-    blocked = replace(in_sight, name=f"{name}, blocked", first_cluster_delay_ns=delay_ns)
-    return Room(name, (12.0, 12.0), in_sight, blocked)
+    nlos = replace(los, name=f"{name}, blocked", first_cluster_delay_ns=delay_ns)
+    return Room(name, (12.0, 12.0), los, nlos)
 
 
 ROOMS = (
@@ -132,7 +132,7 @@ ROOMS = (
 
 def draw_obstacles(room: Room, rng: np.random.Generator) -> tuple[int, ...]:
     """Draw the indices in `OBSTACLES` between the antennas of one placement, ascending."""
-    count = int(rng.choice(len(HOW_MANY), p=HOW_MANY))
+    count = int(rng.choice(len(OBSTACLE_COUNT_SHARES), p=OBSTACLE_COUNT_SHARES))
     chosen = set(rng.choice(len(OBSTACLES), count, replace=False).tolist())
     return tuple(sorted(chosen | {WALL} if room.divided else chosen))
 
