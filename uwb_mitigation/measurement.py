@@ -148,11 +148,13 @@ class Record:
         truth: ground truth of the range; None = unknown.
         tag_position: true position of the tag's antenna at the measurement's stamp, x, y, z in m in the
             anchors' frame; None = unknown.
+        tag_yaw: true heading of the robot with the tag, rad; None = unknown.
     """
 
     measurement: RangeMeasurement
     truth: Truth | None = None
     tag_position: tuple[float, float, float] | None = None
+    tag_yaw: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from uwb_mitigation.bag.poses import POSITION_TYPES, tag_of_frame
 from uwb_mitigation.bag.reader import BagReader, Channel
 from uwb_mitigation.bag.topics import (
+    IMU_TYPE,
     ODOMETRY_TRUTH,
     ODOMETRY_TYPE,
     POSE_TYPE,
@@ -37,7 +38,7 @@ MOVES_M = 0.05
 """If an antenna's position in the robot's frame changes more, it has no constant lever arm."""
 
 HEIGHT_TYPES = (RANGE_SENSOR_TYPE, ODOMETRY_TYPE, POSE_TYPE)
-_READABLE_TYPES = tuple(dict.fromkeys((*POSITION_TYPES, TF_TYPE, *HEIGHT_TYPES)))
+_READABLE_TYPES = tuple(dict.fromkeys((*POSITION_TYPES, TF_TYPE, *HEIGHT_TYPES, IMU_TYPE)))
 _MAX_FRAMES = 64
 _NANOSECONDS = 1_000_000_000
 _Row = tuple[int, float, float, float, float, float, float, float]
@@ -52,7 +53,7 @@ def read_truth(path: Path, topic: str = ODOMETRY_TRUTH) -> dict[int | None, True
     bag = BagReader(path)
     if topic not in bag.topics:
         return {}
-    _check_topic(path, bag.topics, topic, POSITION_TYPES)
+    check_topic(path, bag.topics, topic, POSITION_TYPES)
     bodies = _bodies(bag, topic, f"{path}, topic {topic}", oriented=False)
     return {tag_of_frame(child): TruePath(one.stamp_ns, one.position) for child, one in bodies.items()}
 
@@ -72,7 +73,7 @@ def read_bodies(path: Path, topic: str, frames: tuple[str, str] | None = None) -
     """
     bag = BagReader(path)
     where = f"{path}, topic {topic}"
-    _check_topic(path, bag.topics, topic, (*POSITION_TYPES, TF_TYPE))
+    check_topic(path, bag.topics, topic, (*POSITION_TYPES, TF_TYPE))
     if bag.topics[topic] == TF_TYPE:
         if frames is None:
             raise RecordingError(
@@ -93,7 +94,7 @@ def read_bodies(path: Path, topic: str, frames: tuple[str, str] | None = None) -
 def _bodies(bag: BagReader, topic: str, where: str, *, oriented: bool = True) -> dict[str, PosePath]:
     """Return {child frame: poses}; `oriented`: skip messages without an orientation."""
     rows: dict[str, list[_Row]] = {}
-    for decoded in _decoded(bag, [topic], where):
+    for decoded in decode_messages(bag, [topic], where):
         pose = decoded.pose if hasattr(decoded.pose, "position") else decoded.pose.pose
         row = _row(decoded.header.stamp, pose.position, pose.orientation if oriented else None)
         child = _frame(getattr(decoded, "child_frame_id", ""))
@@ -128,7 +129,7 @@ def read_lever_arm(path: Path, base: str, frame: str) -> tuple[float, float, flo
 def _edges(bag: BagReader, topics: list[str], where: str) -> dict[str, dict[str, list[_Row]]]:
     """Return {child frame: {parent frame: transforms}}."""
     edges: dict[str, dict[str, list[_Row]]] = {}
-    for decoded in _decoded(bag, topics, where):
+    for decoded in decode_messages(bag, topics, where):
         for one in decoded.transforms:
             row = _row(one.header.stamp, one.transform.translation, one.transform.rotation)
             child = _frame(one.child_frame_id)
@@ -152,9 +153,9 @@ def read_heights(path: Path, topic: str, sd_m: float = 0.1) -> Heights:
     """
     bag = BagReader(path)
     where = f"{path}, topic {topic}"
-    _check_topic(path, bag.topics, topic, HEIGHT_TYPES)
+    check_topic(path, bag.topics, topic, HEIGHT_TYPES)
     rows: dict[int, tuple[float, float]] = {}
-    for decoded in _decoded(bag, [topic], where):
+    for decoded in decode_messages(bag, [topic], where):
         if bag.topics[topic] == RANGE_SENSOR_TYPE:
             height, variance = float(decoded.range), float(getattr(decoded, "variance", 0.0))
             valid = decoded.min_range <= height <= decoded.max_range
@@ -172,7 +173,7 @@ def read_heights(path: Path, topic: str, sd_m: float = 0.1) -> Heights:
     return Heights(np.array(stamps, np.int64), values[:, 0], values[:, 1])
 
 
-def _check_topic(path: Path, topics: dict[str, str], topic: str, types: tuple[str, ...]) -> None:
+def check_topic(path: Path, topics: dict[str, str], topic: str, types: tuple[str, ...]) -> None:
     """Raise RecordingError unless the topic exists and has one of the types."""
     if topics.get(topic) in types:
         return
@@ -182,7 +183,7 @@ def _check_topic(path: Path, topics: dict[str, str], topic: str, types: tuple[st
     raise RecordingError(what, where=str(path), valid=valid)
 
 
-def _decoded(bag: BagReader, topics: list[str], where: str) -> Iterator[Any]:
+def decode_messages(bag: BagReader, topics: list[str], where: str) -> Iterator[Any]:
     """Decode the messages of topics by the schemas of their channels."""
     stores: dict[int, tuple[Typestore, str]] = {}
     for count, message in enumerate(bag.messages(topics)):

@@ -35,7 +35,6 @@ _NANOSECONDS = 1_000_000_000
 _PREFIX = struct.Struct("<4siII")
 _LENGTH = struct.Struct("<I")
 _POSE = struct.Struct("<43d")
-_POINT = struct.Struct("<3d")
 _TWIST = struct.Struct("<42d")
 _TAG_FRAME = "tag_"
 
@@ -69,8 +68,13 @@ def encode_pose(estimate: Estimate, frame_id: str = MAP) -> bytes:
     return data + _pose(estimate)
 
 
-def encode_odometry(estimate: Estimate, frame_id: str = MAP, child_frame_id: str = UWB_TAG) -> bytes:
-    """Return `nav_msgs/Odometry` in CDR. The child frame has the axes of `frame_id`, and so has the velocity."""
+def encode_odometry(
+    estimate: Estimate, frame_id: str = MAP, child_frame_id: str = UWB_TAG, yaw: float | None = None
+) -> bytes:
+    """Return `nav_msgs/Odometry` in CDR. The child frame has the axes of `frame_id`, and so has the velocity.
+
+    With a `yaw` (rad, exact), the orientation is this heading.
+    """
     data = _header(estimate.stamp_ns, frame_id)
     child = child_frame_id.encode() + b"\0"
     data += bytes(-len(data) % 4) + _LENGTH.pack(len(child)) + child
@@ -79,17 +83,27 @@ def encode_odometry(estimate: Estimate, frame_id: str = MAP, child_frame_id: str
     covariance[:3, :3] = estimate.covariance[3:, 3:]
     covariance[[3, 4, 5], [3, 4, 5]] = UNOBSERVED
     twist = _TWIST.pack(*estimate.velocity, 0.0, 0.0, 0.0, *covariance.reshape(-1))
-    return data + _pose(estimate) + twist
+    return data + _pose(estimate, yaw) + twist
 
 
-def encode_true_position(position: tuple[float, float, float], tag_id: int, stamp_ns: int) -> bytes:
-    """Return `nav_msgs/Odometry` in CDR with the true position of a tag: no velocity, zero variance."""
+def encode_true_position(
+    position: tuple[float, float, float], tag_id: int, stamp_ns: int, yaw: float | None = None
+) -> bytes:
+    """Return `nav_msgs/Odometry` in CDR with the true position of a tag: no velocity, zero variance.
+
+    Args:
+        position: x, y, z, m. tag_id: the tag. stamp_ns: time of the position.
+        yaw: true heading, rad; None: unknown, the variance is `UNOBSERVED`.
+    """
     place = Estimate(stamp_ns, np.array(position), np.zeros(3), np.zeros((6, 6)))
-    return encode_odometry(place, child_frame_id=tag_frame(tag_id))
+    return encode_odometry(place, child_frame_id=tag_frame(tag_id), yaw=yaw)
 
 
-def decode_true_position(data: bytes) -> tuple[int, int, tuple[float, float, float]] | None:
-    """Decode stamp, tag and position from the CDR of an Odometry of `encode_true_position`; None = another frame.
+def decode_true_position(data: bytes) -> tuple[int, int, tuple[float, float, float], float | None] | None:
+    """Decode stamp, tag, position and yaw (None: unknown) from the CDR of an Odometry of `encode_true_position`.
+
+    Returns:
+        None for another frame.
 
     Raises:
         RecordingError: the bytes are not an Odometry.
@@ -103,7 +117,7 @@ def decode_true_position(data: bytes) -> tuple[int, int, tuple[float, float, flo
         child = bytes(data[at : at + length])
         at += length
         at += (4 - at) % 8
-        x, y, z = _POINT.unpack_from(data, at)
+        x, y, z, _, _, sine, cosine, *covariance = _POSE.unpack_from(data, at)
     except struct.error as error:
         raise RecordingError("an odometry message that is cut short") from error
     if encapsulation[:2] != LITTLE_ENDIAN:
@@ -111,7 +125,9 @@ def decode_true_position(data: bytes) -> tuple[int, int, tuple[float, float, flo
     tag_id = tag_of_frame(child.rstrip(b"\0").decode(errors="replace"))
     if tag_id is None or not all(map(math.isfinite, (x, y, z))):
         return None
-    return seconds * _NANOSECONDS + nanoseconds, tag_id, (x, y, z)
+    known = covariance[-1] < UNOBSERVED and math.isfinite(sine + cosine)
+    yaw = 2.0 * math.atan2(sine, cosine) if known else None
+    return seconds * _NANOSECONDS + nanoseconds, tag_id, (x, y, z), yaw
 
 
 def _header(stamp_ns: int, frame_id: str) -> bytes:
@@ -120,8 +136,11 @@ def _header(stamp_ns: int, frame_id: str) -> bytes:
     return _PREFIX.pack(LITTLE_ENDIAN + b"\0\0", seconds, nanoseconds, len(frame)) + frame
 
 
-def _pose(estimate: Estimate) -> bytes:
+def _pose(estimate: Estimate, yaw: float | None = None) -> bytes:
     covariance = np.zeros((6, 6))
     covariance[:3, :3] = estimate.covariance[:3, :3]
     covariance[[3, 4, 5], [3, 4, 5]] = UNOBSERVED
-    return _POSE.pack(*estimate.position, 0.0, 0.0, 0.0, 1.0, *covariance.reshape(-1))
+    if yaw is not None:
+        covariance[3:, 3:] = 0.0
+    turn = (0.0, 0.0, math.sin((yaw or 0.0) / 2.0), math.cos((yaw or 0.0) / 2.0))
+    return _POSE.pack(*estimate.position, *turn, *covariance.reshape(-1))

@@ -126,7 +126,9 @@ class BagWriter:
             truth = encode_truth(measurement, record.truth)
             self._write_own(RANGE_TRUTH, RANGE_TRUTH_TYPE, measurement, truth)
         if record.tag_position is not None:
-            odometry = encode_true_position(record.tag_position, measurement.tag_id, measurement.stamp_ns)
+            odometry = encode_true_position(
+                record.tag_position, measurement.tag_id, measurement.stamp_ns, record.tag_yaw
+            )
             self.write_message(ODOMETRY_TRUTH, ODOMETRY_TYPE, odometry, measurement.stamp_ns)
 
     def write_message(self, topic: str, type_name: str, data: bytes, stamp_ns: int) -> None:

@@ -6,6 +6,7 @@ import enum
 import math
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,6 +17,7 @@ from uwb_mitigation.commands.console import JsonOption, Table, print_line
 from uwb_mitigation.errors import DamagedRecordingError, ParameterError, RecordingError, format_id
 
 if TYPE_CHECKING:
+    from uwb_mitigation.positioning.tracks import Imu, Odometry
     from uwb_mitigation.sources.source import Source
 
 app = typer.Typer(help="Bring recordings into bags, simulate them, look at them.", no_args_is_help=True)
@@ -101,9 +103,12 @@ def simulate(
 ) -> None:
     """Simulate ranges with their truth, and write them to a bag.
 
-    The bag is marked as simulated.
+    The bag is marked as simulated. A drive also contains `/odom`, `/imu` and `/tf` (odom to base_link) of the robot,
+    with a scale error of 2 %, drift and slip. The antenna of the tag is at the origin of base_link.
     """
     source = simulated_source(like, seed, ranges, exchanges, anchors)
+    # The robot moves on during a pause.
+    longest_pause = math.inf if like is Like.DRIVE else longest_pause
     write_simulated(source, ranges, seed, output, longest_pause, force, json)
 
 
@@ -128,6 +133,7 @@ def _write(
     Raises:
         RecordingError: there are no ranges; or a source is damaged, after the bag was written.
     """
+    from uwb_mitigation.bag.odometry import write_robot
     from uwb_mitigation.bag.writer import BagWriter
     from uwb_mitigation.sources.inventory import Inventory, PauseShortener
 
@@ -137,13 +143,18 @@ def _write(
     origin = {"source": "; ".join(source.name for source in sources), "simulated": simulated}
     pauses = PauseShortener(longest_pause, int(time.time() // 86_400) * 86_400 * 10**9)
     damage: list[DamagedRecordingError] = []
+    robot = _motion_of(sources[0], pauses.start_ns)
+    row = 0
     with BagWriter(output, origin, force=force) as bag, console.progress() as bar:
         task = bar.add_task("writing", total=total)
         for source in sources:
             try:
                 with source:
                     for record in inventory.watch(source):
-                        bag.write(pauses.without(record))
+                        record = pauses.without(record)
+                        if robot is not None:
+                            row = write_robot(bag, *robot, row, record.measurement.stamp_ns)
+                        bag.write(record)
                         if inventory.ranges % _STRIDE == 0:
                             done = inventory.ranges
                             bar.update(task, completed=done, description=f"writing: {done} ranges")
@@ -172,6 +183,17 @@ def _write(
     console.write_json(json, {"messages": messages, "output": str(bag.file), **(extra or {}), **found})
     if damage:
         raise damage[0]
+
+
+def _motion_of(source: Source, start_ns: int) -> tuple[Odometry, Imu] | None:
+    """Return odometry and IMU data of a simulated drive that starts at `start_ns`; None for other sources."""
+    from uwb_mitigation.sources.simulated import SimulatedSource
+
+    if not isinstance(source, SimulatedSource):
+        return None
+    motion = source.motion()
+    stamps = motion.odometry.stamp_ns + start_ns
+    return replace(motion.odometry, stamp_ns=stamps), replace(motion.imu, stamp_ns=stamps)
 
 
 def simulated_source(like: Like, seed: int, ranges: int, exchanges: int, anchors: int = 4) -> Source:

@@ -235,7 +235,10 @@ class Driver(ManagedNode):
             if record.truth is not None:
                 self._truths.publish(encode_truth(measurement, record.truth))
             if record.tag_position is not None:
-                self._places.publish(encode_true_position(record.tag_position, measurement.tag_id, stamp_ns))
+                true_pose = encode_true_position(
+                    record.tag_position, measurement.tag_id, stamp_ns, record.tag_yaw
+                )
+                self._places.publish(true_pose)
         self._publish_measurements(measurements)
 
     def _publish_clock(self, recorded_ns: int) -> None:

@@ -151,6 +151,48 @@ class Heights:
         return found[:, 0], found[:, 1]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Odometry:
+    """Motion of a robot's base in the plane, measured by its wheels or by another sensor.
+
+    Attributes:
+        stamp_ns: int64 (n,), ascending.
+        pose: float64 (n, 3), x and y in m and yaw in rad, in the odometry frame, which drifts.
+        pose_covariance: float64 (n, 3, 3); zero: unknown.
+        twist: float64 (n, 3), velocities in m/s and yaw rate in rad/s, in the axes of the base.
+        twist_covariance: float64 (n, 3, 3); zero: unknown.
+    """
+
+    stamp_ns: NDArray[np.int64]
+    pose: NDArray[np.float64]
+    pose_covariance: NDArray[np.float64]
+    twist: NDArray[np.float64]
+    twist_covariance: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.stamp_ns)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Imu:
+    """Yaw rates, and if known yaws, of an IMU whose z axis points up.
+
+    Attributes:
+        stamp_ns: int64 (n,), ascending.
+        yaw_rate: float64 (n,), rad/s. yaw_rate_variance: float64 (n,), rad^2/s^2; zero: unknown.
+        yaw: float64 (n,), rad; NaN: unknown. yaw_variance: float64 (n,), rad^2; zero: unknown.
+    """
+
+    stamp_ns: NDArray[np.int64]
+    yaw_rate: NDArray[np.float64]
+    yaw_rate_variance: NDArray[np.float64]
+    yaw: NDArray[np.float64]
+    yaw_variance: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.stamp_ns)
+
+
 ELLIPSE95 = 5.991
 """95th percentile of chi-squared with two degrees of freedom."""
 

@@ -81,20 +81,20 @@ class McapRecording(Source):
         pending: deque[_PendingRange] = deque()
         by_key: dict[MeasurementKey, _PendingRange] = {}
         early_truths: dict[MeasurementKey, Truth] = {}
-        positions: dict[StampedTag, Position] = {}
-        has_positions = bag.topics.get(ODOMETRY_TRUTH) == ODOMETRY_TYPE
+        poses: dict[StampedTag, TruePose] = {}
+        has_poses = bag.topics.get(ODOMETRY_TRUTH) == ODOMETRY_TYPE
 
         def pop_oldest() -> Record:
             entry = pending.popleft()
             by_key.pop(measurement_key(entry.measurement), None)
-            return Record(entry.measurement, entry.truth, entry.position)
+            return Record(entry.measurement, entry.truth, *(entry.pose or (None, None)))
 
         try:
             for item in self._decoded(bag):
                 if isinstance(item, RangeMeasurement):
                     key = measurement_key(item)
-                    position = positions.get(StampedTag(item.stamp_ns, item.tag_id))
-                    entry = _PendingRange(item, early_truths.pop(key, None), position)
+                    pose = poses.get(StampedTag(item.stamp_ns, item.tag_id))
+                    entry = _PendingRange(item, early_truths.pop(key, None), pose)
                     pending.append(entry)
                     by_key[key] = entry
                 elif isinstance(item[0], MeasurementKey):
@@ -107,9 +107,9 @@ class McapRecording(Source):
                             del early_truths[next(iter(early_truths))]
                             self.skipped["truth without its range"] += 1
                 else:
-                    _assign_position(*item, pending, positions)
+                    _assign_pose(*item, pending, poses)
                 while pending and (
-                    (pending[0].truth is not None and (pending[0].position is not None or not has_positions))
+                    (pending[0].truth is not None and (pending[0].pose is not None or not has_poses))
                     or len(pending) > JOIN_WINDOW
                 ):
                     yield pop_oldest()
@@ -124,7 +124,7 @@ class McapRecording(Source):
 
     def _decoded(
         self, bag: BagReader
-    ) -> Iterator[RangeMeasurement | tuple[MeasurementKey, Truth] | tuple[StampedTag, Position]]:
+    ) -> Iterator[RangeMeasurement | tuple[MeasurementKey, Truth] | tuple[StampedTag, TruePose]]:
         checked_channels: set[int] = set()
         types = {self._topic: RANGE_CIR_TYPE, RANGE_TRUTH: RANGE_TRUTH_TYPE}
         if bag.topics.get(ODOMETRY_TRUTH) == ODOMETRY_TYPE:
@@ -143,13 +143,14 @@ class McapRecording(Source):
                 elif topic == RANGE_TRUTH:
                     yield decode_truth(message.data)
                 elif (decoded := decode_true_position(message.data)) is not None:
-                    stamp_ns, tag_id, position = decoded
-                    yield StampedTag(stamp_ns, tag_id), position
+                    stamp_ns, tag_id, position, yaw = decoded
+                    yield StampedTag(stamp_ns, tag_id), (position, yaw)
             except RecordingError as error:
                 self.skipped[error.what] += 1
 
 
-Position = tuple[float, float, float]
+TruePose = tuple[tuple[float, float, float], float | None]
+"""A true position and yaw."""
 
 
 class StampedTag(NamedTuple):
@@ -165,19 +166,19 @@ class _PendingRange:
 
     measurement: RangeMeasurement
     truth: Truth | None
-    position: Position | None
+    pose: TruePose | None
 
 
-def _assign_position(
+def _assign_pose(
     stamped_tag: StampedTag,
-    position: Position,
+    pose: TruePose,
     pending: deque[_PendingRange],
-    positions: dict[StampedTag, Position],
+    poses: dict[StampedTag, TruePose],
 ) -> None:
-    """Assign a true position to earlier and later ranges with the same tag and stamp."""
+    """Assign a true pose to earlier and later ranges with the same tag and stamp."""
     for entry in pending:
         if (entry.measurement.stamp_ns, entry.measurement.tag_id) == stamped_tag:
-            entry.position = position
-    positions[stamped_tag] = position
-    if len(positions) > JOIN_WINDOW:
-        del positions[next(iter(positions))]
+            entry.pose = pose
+    poses[stamped_tag] = pose
+    if len(poses) > JOIN_WINDOW:
+        del poses[next(iter(poses))]

@@ -34,6 +34,7 @@ from uwb_mitigation.sources.simulation.channel import (
     check_range,
 )
 from uwb_mitigation.sources.simulation.links import Links, draw_fields, label, place
+from uwb_mitigation.sources.simulation.odometry import RobotMotion, simulate_motion, yaw_along_route
 from uwb_mitigation.sources.simulation.radio import Boards, Radio, Reception
 from uwb_mitigation.sources.simulation.scene import (
     ANCHORS,
@@ -63,7 +64,7 @@ SURVEY_RATE_HZ = 20.0
 
 @dataclass(frozen=True, slots=True)
 class Exchanges:
-    """n exchanges before the radio model: their numbers, ids, configurations and links."""
+    """n exchanges before the radio model: their numbers, ids, configurations and links, and headings of moving tags."""
 
     sequence: NDArray[np.int64]
     anchor_id: NDArray[np.int64]
@@ -71,6 +72,7 @@ class Exchanges:
     configuration: list[str]
     links: Links
     boards: Boards | None = None
+    tag_yaw: NDArray[np.float64] | None = None
 
 
 class Simulated(Source):
@@ -121,7 +123,8 @@ class Simulated(Source):
             condition = label(bool(links.path.crossings[i]), bool(reception.direct_above_threshold[i]))
             truth = Truth(float(distance[i]), condition, exchanges.configuration[i])
             x, y = links.tag[i].tolist()
-            yield Record(measurement, truth, None if links.stationary else (x, y, 0.0))
+            yaw = None if exchanges.tag_yaw is None else float(exchanges.tag_yaw[i])
+            yield Record(measurement, truth, None if links.stationary else (x, y, 0.0), yaw)
 
 
 class SimulatedSource(Simulated):
@@ -219,7 +222,12 @@ class SimulatedSource(Simulated):
             tag_id,
             names,
             Links(anchors, positions, path, RESIDENTIAL, fields, pair, stationary=False),
+            tag_yaw=yaw_along_route(self._route, travelled),
         )
+
+    def motion(self) -> RobotMotion:
+        """Return odometry and IMU data of the robot with the first tag, for the duration of a source with a `count`."""
+        return simulate_motion(self._route, SPEED_M_PER_S, self._count / self._rate_hz, self._seed)
 
 
 class SimulatedSurvey(Simulated):
