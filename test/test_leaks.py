@@ -47,7 +47,7 @@ LEARNERS = {
     (train, "fit_with_card"),
     (train, "calibration_inputs"),
     (train, "quantize"),
-    (train, "describe"),
+    (train, "make_card"),
     (linear_fit, "fit_linear_bias"),
     (linear_fit, "constant"),
     (baselines, "los_median"),
@@ -191,7 +191,7 @@ def parts(data: Dataset) -> Parts:
 
 
 def test_the_protocol_fits_and_calibrates_on_its_training_part(data, watch, tmp_path):
-    wanted = experiment.tasks(["remnet", "mlp"], [SAMPLES], seeds=1)
+    wanted = experiment.list_tasks(["remnet", "mlp"], [SAMPLES], seeds=1)
     with watch.without(parts(data).test.names):
         experiment.run(parts(data), tmp_path, wanted, QUICK)
     watch.called("experiment.calibrate", "fitting.fit")
@@ -213,7 +213,7 @@ def calibrated(monkeypatch: pytest.MonkeyPatch) -> list[set[str]]:
 
 
 def test_the_protocols_variances_are_of_configurations_that_were_not_fitted_to(data, watch, calibrated):
-    card = experiment.describe("made up", RECIPE.architecture, parts(data), QUICK)
+    card = experiment.make_card("made up", RECIPE.architecture, parts(data), QUICK)
     fitted, (corrected, raw) = watch.seen["fitting.fit"], calibrated
     assert fitted
     assert corrected
@@ -221,7 +221,8 @@ def test_the_protocols_variances_are_of_configurations_that_were_not_fitted_to(d
     assert fitted | corrected == raw == set(parts(data).train.names)
     far_off = replace(parts(data).test, error_m=parts(data).test.error_m + 7)
     assert (
-        experiment.describe("made up", RECIPE.architecture, replace(parts(data), test=far_off), QUICK) == card
+        experiment.make_card("made up", RECIPE.architecture, replace(parts(data), test=far_off), QUICK)
+        == card
     )
 
 

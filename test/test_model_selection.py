@@ -105,7 +105,7 @@ def test_the_cold_start_fits_an_offset_and_the_mean_a_line_too(tmp_path):
     assert np.std(network) > 0.01
     assert found[candidates.COLD_START] == pytest.approx(network + shift, abs=1e-5)
     mean = (found[candidates.LINE] + found[candidates.COLD_START]) / 2
-    assert found[candidates.MEAN] == pytest.approx(mean, abs=1e-5)
+    assert found[candidates.COLD_START_MEAN] == pytest.approx(mean, abs=1e-5)
 
 
 def test_the_cold_start_is_preferred_with_few_configurations_only(tmp_path):
@@ -120,18 +120,18 @@ def test_the_cold_start_is_preferred_with_few_configurations_only(tmp_path):
         "constant",
         candidates.COLD_START,
         "line",
-        candidates.MEAN,
+        candidates.COLD_START_MEAN,
         "line+network",
         "network",
     ]
     assert names(dataset(20, 2, samples=8)) == list(candidates.NEW_MODELS)
     many.rx_power_dbm[:2] = np.nan  # one configuration of the twenty without power levels
-    assert candidates.MEAN not in names(many)
+    assert candidates.COLD_START_MEAN not in names(many)
 
 
 @pytest.mark.parametrize("name", [candidates.CONSTANT, candidates.LINE])
 def test_a_model_without_network_has_one_that_predicts_nothing(name):
-    fitted = candidates.fit_new_model(dataset(8, 5, samples=8), RECIPE.of(name), 0)
+    fitted = candidates.fit_new_model(dataset(8, 5, samples=8), RECIPE.for_candidate(name), 0)
     assert not network_m(fitted.network, windows(5, 8)).any()
     assert fitted.linear_bias.needs_power == (name == candidates.LINE)
 
@@ -222,7 +222,7 @@ def test_a_named_model_gets_the_offset_of_the_bag(tmp_path, eight_places):
     found = json.loads(result.read_text())
     assert found["helped"]
     assert candidates.COLD_START not in [row["name"] for row in found["choice"]["rows"]]
-    assert found["choice"]["chosen"] in ("own offset", "constant")
+    assert found["choice"]["chosen"] in ("new offset", "constant")
     assert load_bundle(output).card.training["started_from"] == f"{started.model_id:08x}"
 
 

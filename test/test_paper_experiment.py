@@ -34,7 +34,7 @@ def parts(seed: int = 0) -> Parts:
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("protocol")
-    wanted = experiment.tasks(["remnet", "mlp"], [32], seeds=1)
+    wanted = experiment.list_tasks(["remnet", "mlp"], [32], seeds=1)
     return folder, experiment.run(parts(), folder, wanted, QUICK)
 
 
@@ -42,7 +42,7 @@ def finished(tmp_path_factory):
 
 
 def test_tasks_are_every_window_and_seed_of_remnet_and_the_longest_of_the_rest():
-    names = [task.name for task in experiment.tasks(["remnet", "mlp"], [157, 8], seeds=2)]
+    names = [task.name for task in experiment.list_tasks(["remnet", "mlp"], [157, 8], seeds=2)]
     assert names == [
         "remnet_157_seed0",
         "remnet_157_seed1",
@@ -53,7 +53,7 @@ def test_tasks_are_every_window_and_seed_of_remnet_and_the_longest_of_the_rest()
     ]
     for networks, lengths, seeds in ((["cnn"], [8], 1), (["mlp"], [], 1), (["mlp"], [8], 0)):
         with pytest.raises(ParameterError):
-            experiment.tasks(networks, lengths, seeds)
+            experiment.list_tasks(networks, lengths, seeds)
 
 
 def test_every_form_of_a_network_is_measured(finished):
@@ -138,7 +138,7 @@ def test_finished_tasks_are_not_repeated_unless_damaged_or_of_other_data(finishe
 
 
 def test_two_processes_give_the_same_models(tmp_path):
-    wanted = experiment.tasks(["mlp"], [32], seeds=2)
+    wanted = experiment.list_tasks(["mlp"], [32], seeds=2)
     shares: list[float] = []
     alone, together = (
         experiment.run(parts(), tmp_path / str(workers), wanted, QUICK, workers, shares.append)
@@ -153,7 +153,7 @@ def test_a_loss_that_diverges_ends_the_run(tmp_path, workers: int):
     bad = parts()
     bad = replace(bad, train=replace(bad.train, error_m=bad.train.error_m + 3e38))
     with pytest.raises(DatasetError):
-        experiment.run(bad, tmp_path, experiment.tasks(["mlp"], [32], 2), QUICK, workers)
+        experiment.run(bad, tmp_path, experiment.list_tasks(["mlp"], [32], 2), QUICK, workers)
 
 
 def test_shorter_windows_are_scaled_by_their_own_maximum():

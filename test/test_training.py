@@ -129,7 +129,7 @@ def test_the_card_tells_the_errors_on_configurations_not_seen():
     data = dataset(12, 20)
     recipe = Recipe(SHAPE, FitOptions(epochs=1))
     validation = train.cross_validate(data, recipe, folds=4, seed=0)
-    card = train.describe("name", recipe, LinearBiasModel(0.5), validation, "data")
+    card = train.make_card("name", recipe, LinearBiasModel(0.5), validation, "data")
     left = validation.errors["float"]
     deviation = np.sqrt(card.variance_m2 + card.variance_per_m2 * (data.error_m - left) ** 2)
     # Of 12 configurations, 0.68 x 13: the one to come counts too.

@@ -17,24 +17,24 @@ torch = pytest.importorskip("torch", reason="training is not set up: run make se
 
 from uwb_mitigation.training import universal  # noqa: E402
 from uwb_mitigation.training.options import FitOptions  # noqa: E402
-from uwb_mitigation.training.universal import Plan, Universal  # noqa: E402
+from uwb_mitigation.training.universal import TrainingPlan, UniversalModel  # noqa: E402
 
-SMALL = Plan(seed=3, samples=32, blocks=2, held_out_blocks=1, fit=FitOptions(epochs=2, batch=64))
+SMALL = TrainingPlan(seed=3, samples=32, blocks=2, held_out_blocks=1, fit=FitOptions(epochs=2, batch=64))
 
 
 @pytest.fixture(scope="module")
-def small() -> Universal:
+def small() -> UniversalModel:
     return universal.train(SMALL, "small", workers=1)
 
 
-def test_the_same_whatever_the_number_of_workers(small: Universal) -> None:
+def test_the_same_whatever_the_number_of_workers(small: UniversalModel) -> None:
     again = universal.train(SMALL, "small", workers=2)
     assert again.card == small.card
     for name, weight in small.network.weight.items():
         assert again.network.weight[name].tobytes() == weight.tobytes()
 
 
-def test_it_is_graded_by_condition_in_another_world(small: Universal) -> None:
+def test_it_is_graded_by_condition_in_another_world(small: UniversalModel) -> None:
     for row in ("raw", "float", "int8"):
         assert set(small.held_out[row]) == {"all", "LOS", "NLOS", "NDP NLOS"}
     assert small.held_out["raw"]["LOS"].mae < small.held_out["raw"]["NDP NLOS"].mae

@@ -123,7 +123,9 @@ def trained(records: list[Record], universal: Bundle, folder: Path) -> Bundle:
     from uwb_mitigation.training.options import FitOptions
 
     recipe = Recipe(Remnet(samples=universal.preprocessing.samples), FitOptions())
-    return train.train_new_model(train.Job(dataset, "drive", folder / "trained.onnx", 4), recipe).bundle
+    return train.train_new_model(
+        train.TrainingJob(dataset, "drive", folder / "trained.onnx", 4), recipe
+    ).bundle
 
 
 def one(seed: int, seconds: float, truth_topic: bool, with_train: bool, flat: bool) -> dict[str, object]:

@@ -25,7 +25,7 @@ DataOption = Annotated[
 OutputOption = Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="Bundle to write.")]
 # Options that only one mode of `train` or `evaluate` uses; the other mode refuses them.
 _OF_DATA = {
-    "choose": "--recipe",
+    "recipe_name": "--recipe",
     "samples": "--samples",
     "scaling": "--scaling",
     "first_kernel": "--first-kernel",
@@ -65,7 +65,7 @@ def train(
             "`universal_amplitude` for CIRs without preamble counts.",
         ),
     ] = None,
-    choose: Annotated[
+    recipe_name: Annotated[
         str, typer.Option("--recipe", help="With --data: auto, constant, line, line+network, or network.")
     ] = "auto",
     samples: Annotated[int, typer.Option(help="With --data: window length K.")] = 157,
@@ -97,40 +97,44 @@ def train(
         raise ParameterError("what to train on", valid="one of --data and --from-bag")
     if from_bag is None and (truth or model):
         raise ParameterError("--truth and --model", valid="with --from-bag")
-    if from_bag is not None and (idle := _given(context, _OF_DATA)):
+    if from_bag is not None and (unused := _given(context, _OF_DATA)):
         raise ParameterError(
-            f"{idle} with --from-bag",
+            f"{unused} with --from-bag",
             valid="with --data: a bag's fit has these from the model that it starts from",
         )
     chosen_scaling = scaling_of(scaling)
     if per_configuration < 1:
         raise ParameterError(f"per-configuration = {per_configuration}", valid="1 or more")
-    asked: dict[str, Any] = {"epochs": epochs, "learning_rate": learning_rate, "seed": seed}
-    asked = {key: value for key, value in asked.items() if value is not None}
-    options = FitOptions(**asked)
+    given: dict[str, Any] = {"epochs": epochs, "learning_rate": learning_rate, "seed": seed}
+    given = {key: value for key, value in given.items() if value is not None}
+    options = FitOptions(**given)
     architecture = Remnet(samples=samples, first_kernel=first_kernel)
     check_output(output)
     with needs_torch():
         from uwb_mitigation.training import candidates, fitting  # noqa: F401
         from uwb_mitigation.training import train as training
 
-    if data is not None and choose not in (training.AUTO, *candidates.NEW_MODELS):
-        raise ParameterError(f"recipe {choose!r}", valid=", ".join((training.AUTO, *candidates.NEW_MODELS)))
+    if data is not None and recipe_name not in (training.AUTO, *candidates.NEW_MODELS):
+        raise ParameterError(
+            f"recipe {recipe_name!r}", valid=", ".join((training.AUTO, *candidates.NEW_MODELS))
+        )
     recording = data or from_bag
     assert recording is not None
     source = None if from_bag is None else bundle_for(model, from_bag)
     preprocessing = Preprocessing(samples, chosen_scaling) if source is None else source.preprocessing
     name, dataset = _dataset(recording, preprocessing, truth or ())
     with console.stage_bars() as on_progress:
-        job = training.Job(dataset, name, output, folds, on_progress)
+        job = training.TrainingJob(dataset, name, output, folds, on_progress)
         if source is None:
-            alone = replace(candidates.NETWORK_ONLY, **asked)
-            recipe = candidates.Recipe(architecture, options, alone, per_configuration=per_configuration)
-            made = training.train_new_model(job, recipe, choose)
+            network_only = replace(candidates.NETWORK_ONLY, **given)
+            recipe = candidates.Recipe(
+                architecture, options, network_only, per_configuration=per_configuration
+            )
+            trained = training.train_new_model(job, recipe, recipe_name)
         else:
-            made = training.train_from_bundle(job, source, options, offer_cold_start=model is None)
-    model_tables.show_trained(made)
-    console.write_json(json, made.as_json())
+            trained = training.train_from_bundle(job, source, options, offer_cold_start=model is None)
+    model_tables.show_trained(trained)
+    console.write_json(json, trained.as_json())
 
 
 def quantize(
@@ -163,8 +167,8 @@ def quantize(
     with console.reading() as on_record:
         dataset = recordings.load_inputs(data, source.preprocessing, on_record)
     console.show_skipped(dataset.refused)
-    made = quantization.quantize_bundle(source, dataset, percentile, output)
-    bundle, difference = made.bundle, made.difference_m
+    quantised = quantization.quantize_bundle(source, dataset, percentile, output)
+    bundle, difference = quantised.bundle, quantised.difference_m
     model_tables.show_bundle(bundle)
     console.out.print(
         f"int8 differs from float by {difference.mean():.4f} m on average, {difference.max():.4f} m at most"
@@ -214,8 +218,8 @@ def evaluate(
             )
         _compare(data, cross_validate, folds, seeds, scaling_of(scaling), json)
         return
-    if idle := _given(context, _OF_CROSS_VALIDATION):
-        raise ParameterError(idle, valid="with --cross-validate")
+    if unused := _given(context, _OF_CROSS_VALIDATION):
+        raise ParameterError(unused, valid="with --cross-validate")
     from uwb_mitigation.evaluation import accuracy
     from uwb_mitigation.mitigation import Mitigation
     from uwb_mitigation.offsets import read_offsets

@@ -38,43 +38,43 @@ _CANDIDATES = {
 }
 
 
-def show_trained(made: TrainedBundle) -> None:
+def show_trained(trained: TrainedBundle) -> None:
     """Show the selection, the cross-validation and the verdict of `train`."""
     from uwb_mitigation.training import candidates, selection
 
-    if made.selection is not None:
-        show_selection(made.selection)
-    if made.prefers_cold_start:
+    if trained.selection is not None:
+        show_selection(trained.selection)
+    if trained.prefers_cold_start:
         print_line(
             f"With fewer than {candidates.MIN_CONFIGURATIONS_FOR_MEAN} configurations, cold start is kept unless another one is "
             f"{selection.COLD_START_MIN_GAIN:.0%} better."
         )
-    if "int8" in made.validation.errors:
-        rows = made.validation.statistics().items()
+    if "int8" in trained.validation.errors:
+        rows = trained.validation.statistics().items()
         show_table(
-            f"{made.validation.folds}-fold cross-validation by configuration, m",
+            f"{trained.validation.folds}-fold cross-validation by configuration, m",
             ("", "MAE", "std", "p95"),
             [(_ROWS[name], *values.values()) for name, values in rows],
         )
-    for name, before in made.baseline_mae_m.items():
-        change = made.mae_m / before - 1 if before else 0.0
-        verdict = "lower" if made.mae_m < before else "higher: this did not help"
+    for name, before in trained.baseline_mae_m.items():
+        change = trained.mae_m / before - 1 if before else 0.0
+        verdict = "lower" if trained.mae_m < before else "higher: this did not help"
         print_line(
-            f"on configurations not seen, {made.mae_m:.3f} m against {before:.3f} m {name}: {abs(change):.0%} {verdict}"
+            f"on configurations not seen, {trained.mae_m:.3f} m against {before:.3f} m {name}: {abs(change):.0%} {verdict}"
         )
-    show_bundle(made.bundle)
+    show_bundle(trained.bundle)
 
 
-def show_selection(choice: Selection) -> None:
+def show_selection(selection: Selection) -> None:
     """Show the held-out errors of the candidates."""
     show_table(
-        f"{choice.configurations} configurations, {choice.folds} folds by configuration",
+        f"{selection.configurations} configurations, {selection.folds} folds by configuration",
         ("candidate", "MAE, m", "", ""),
         [
-            (row, mae, "<-" if row == choice.chosen else "", _CANDIDATES.get(row, ""))
-            for row, mae in choice.mae().items()
+            (row, mae, "<-" if row == selection.chosen else "", _CANDIDATES.get(row, ""))
+            for row, mae in selection.mae().items()
         ],
-        choice.chosen,
+        selection.chosen,
     )
 
 
@@ -82,9 +82,9 @@ def show_comparison(result: Comparison) -> None:
     """Show the table of `evaluate --cross-validate`."""
     labels = list(result.rows[0].by_label)
 
-    def covered(of: Coverage) -> str:
+    def covered(coverage: Coverage) -> str:
         return ", ".join(
-            f"{label or 'all'} {narrow:.1%} and {wide:.1%}" for label, (narrow, wide) in of.items()
+            f"{label or 'all'} {narrow:.1%} and {wide:.1%}" for label, (narrow, wide) in coverage.items()
         )
 
     show_table(

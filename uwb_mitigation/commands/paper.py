@@ -121,7 +121,7 @@ def protocol(
     with needs_torch():
         from uwb_mitigation.paper import experiment
 
-    wanted = experiment.tasks([name.strip() for name in networks.split(",")], lengths, seeds)
+    wanted = experiment.list_tasks([name.strip() for name in networks.split(",")], lengths, seeds)
     options = replace(experiment.PAPER, epochs=epochs, learning_rate=learning_rate)
     if output.exists() and not output.is_dir():
         raise ParameterError("not a folder", where=str(output), valid="a folder, or a new name")

@@ -60,7 +60,7 @@ def train_universal(
     with needs_torch():
         from uwb_mitigation.training import universal
 
-    plan = universal.Plan(seed=seed, samples=samples, scaling=preprocessing.scaling)
+    plan = universal.TrainingPlan(seed=seed, samples=samples, scaling=preprocessing.scaling)
     if blocks is not None:
         plan = replace(plan, blocks=blocks)
     with console.progress() as bar:

@@ -52,8 +52,8 @@ def by_configuration(configurations: NDArray[np.str_], folds: int, seed: int) ->
         )
     order = np.random.default_rng(seed).permutation(len(names))
     splits = []
-    for part in np.array_split(order, folds):
-        held_out = np.isin(configurations, names[part])
+    for held_out_indices in np.array_split(order, folds):
+        held_out = np.isin(configurations, names[held_out_indices])
         splits.append(Split(np.flatnonzero(~held_out), np.flatnonzero(held_out)))
     return splits
 
@@ -78,24 +78,24 @@ def by_group(dataset: Dataset, group: Group, folds: int, seed: int) -> list[Spli
         )
     parts = found[:, None] if group is Group.TAG else np.array_split(found, 2)
     splits = []
-    for part in parts:
-        held_out = np.isin(ids, part)
+    for held_out_ids in parts:
+        held_out = np.isin(ids, held_out_ids)
         # Measurements without a configuration name count as one configuration and must not be in both parts.
-        apart = ~np.isin(dataset.configurations, np.unique(dataset.configurations[held_out]))
-        if not apart.any():
+        is_train = ~np.isin(dataset.configurations, np.unique(dataset.configurations[held_out]))
+        if not is_train.any():
             raise DatasetError("one configuration holds every tag or anchor", valid="named configurations")
-        splits.append(Split(np.flatnonzero(apart), np.flatnonzero(held_out)))
+        splits.append(Split(np.flatnonzero(is_train), np.flatnonzero(held_out)))
     return splits
 
 
-def subsample(configurations: NDArray[np.str_], most: int, seed: int) -> NDArray[np.intp]:
-    """Return sorted rows, at most `most` of each configuration, drawn without replacement."""
+def subsample(configurations: NDArray[np.str_], max_per_configuration: int, seed: int) -> NDArray[np.intp]:
+    """Return sorted rows, at most `max_per_configuration` of each configuration, drawn without replacement."""
     generator = np.random.default_rng(seed)
-    chosen = []
-    _, of = np.unique(configurations, return_inverse=True)
-    order = np.argsort(of, kind="stable")
-    for rows in np.split(order, np.flatnonzero(np.diff(of[order])) + 1):
-        if len(rows) > most:
-            rows = generator.choice(rows, most, replace=False)
-        chosen.append(rows)
-    return np.sort(np.concatenate(chosen)) if chosen else np.zeros(0, np.intp)
+    rows_kept = []
+    _, configuration_index = np.unique(configurations, return_inverse=True)
+    order = np.argsort(configuration_index, kind="stable")
+    for rows in np.split(order, np.flatnonzero(np.diff(configuration_index[order])) + 1):
+        if len(rows) > max_per_configuration:
+            rows = generator.choice(rows, max_per_configuration, replace=False)
+        rows_kept.append(rows)
+    return np.sort(np.concatenate(rows_kept)) if rows_kept else np.zeros(0, np.intp)

@@ -45,7 +45,9 @@ def split_by_name(configurations: NDArray[np.str_], name: str) -> tuple[str, Spl
     if name == CONFIGURATIONS:
         fold = splits.by_configuration(configurations, FOLDS, seed=0)[0]
         return f"{CONFIGURATIONS}: 1 of {FOLDS} parts held out", fold
-    rooms = np.array([parse_configuration(str(one))[0] for one in configurations], np.intp)
+    rooms = np.array(
+        [parse_configuration(str(configuration))[0] for configuration in configurations], np.intp
+    )
     train, test = np.flatnonzero(np.isin(rooms, TRAINING_ROOMS[name])), np.flatnonzero(rooms == TEST_ROOM)
     if not (len(train) and len(test)):
         raise DatasetError(
@@ -92,8 +94,8 @@ def load(
 
 def split_dataset(name: str, dataset: Dataset, split: str) -> Parts:
     """Return training and test part by one of `SPLITS`; raises as `split_by_name`."""
-    described, rows = split_by_name(dataset.configurations, split)
-    return Parts(name, described, dataset.rows(rows.train), dataset.rows(rows.test))
+    description, rows = split_by_name(dataset.configurations, split)
+    return Parts(name, description, dataset.rows(rows.train), dataset.rows(rows.test))
 
 
 def shorten_windows(dataset: Dataset, samples: int) -> Dataset:
@@ -114,8 +116,8 @@ def shorten_windows(dataset: Dataset, samples: int) -> Dataset:
 
 def fingerprint(text: str, *datasets: Dataset) -> int:
     """Return a checksum of options and data, to recognise the results of an earlier run."""
-    mark = zlib.crc32(text.encode())
+    checksum = zlib.crc32(text.encode())
     for dataset in datasets:
         for array in (dataset.inputs, dataset.error_m):
-            mark = zlib.crc32(array.tobytes(), mark)
-    return mark
+            checksum = zlib.crc32(array.tobytes(), checksum)
+    return checksum

@@ -83,7 +83,7 @@ class Task:
         return Remnet(self.samples, first_kernel=5 if self.network == "remnet_k5" else 3)
 
 
-def tasks(networks_: Sequence[str], windows: Sequence[int], seeds: int) -> list[Task]:
+def list_tasks(networks: Sequence[str], windows: Sequence[int], seeds: int) -> list[Task]:
     """Return the tasks for all window lengths and seeds; for the MLP only the longest window.
 
     Raises:
@@ -93,7 +93,7 @@ def tasks(networks_: Sequence[str], windows: Sequence[int], seeds: int) -> list[
         raise ParameterError(f"{seeds} seeds, {len(windows)} windows", valid="1 or more of each")
     return [
         Task(network, samples, seed)
-        for network in networks_
+        for network in networks
         for samples in ([max(windows)] if network == "mlp" else windows)
         for seed in range(seeds)
     ]
@@ -102,7 +102,7 @@ def tasks(networks_: Sequence[str], windows: Sequence[int], seeds: int) -> list[
 def run(
     parts: Parts,
     folder: Path,
-    wanted: Sequence[Task],
+    tasks: Sequence[Task],
     options: FitOptions = PAPER,
     workers: int = 1,
     on_progress: Callable[[float], None] = lambda share: None,
@@ -122,12 +122,12 @@ def run(
     except OSError as error:
         raise UwbMitigationError(f"cannot be created: {error.strerror}", where=str(folder)) from error
     settings = replace(options, seed=0)
-    mark = fingerprint(json.dumps(asdict(settings), sort_keys=True), parts.train, parts.test)
+    run_fingerprint = fingerprint(json.dumps(asdict(settings), sort_keys=True), parts.train, parts.test)
     trained = run_jobs(
         _Worker(parts, folder, options),
-        {task.name: task for task in wanted},
+        {task.name: task for task in tasks},
         folder / JOURNAL,
-        mark,
+        run_fingerprint,
         cost=lambda task: task.architecture.multiply_accumulates,
         workers=workers,
         on_progress=on_progress,
@@ -163,11 +163,11 @@ def train_task(task: Task, parts: Parts, folder: Path, options: FitOptions) -> T
     """Train one network from random weights to int8, on parts with the task's windows; raises as `fit` and `quantize`."""
     train, test, architecture = parts.train, parts.test, task.architecture
     start = time.perf_counter()
-    found: dict[str, Any] = {}
+    fields: dict[str, Any] = {}
     weights = fitting.fit(architecture, train.inputs, train.error_m, options)
     seconds = time.perf_counter() - start
     files = {form: folder / f"{task.name}_{form}.onnx" for form in FORMS}
-    card = describe(task.name, architecture, parts, options)
+    card = make_card(task.name, architecture, parts, options)
     maes, best, integers = calibrate(weights, train.inputs, train.error_m, options.seed)
     save_bundle(files["float"], graph.float_model(weights), card)
     # Use only optimisations that do not depend on the processor, so that the file runs on other ones.
@@ -177,13 +177,13 @@ def train_task(task: Task, parts: Parts, folder: Path, options: FitOptions) -> T
     _session(files["float"], settings)
     save_bundle(files["int8"], graph.int8_model(integers), replace(card, quantised=True))
     predicted = {form: _predict_m(files[form], test.inputs, fuse=form == "int8") for form in FORMS}
-    found |= {f"bytes_{form}": path.stat().st_size for form, path in files.items()}
-    found |= {"calibration": best, "calibration_mae": maes}
+    fields |= {f"bytes_{form}": path.stat().st_size for form, path in files.items()}
+    fields |= {"calibration": best, "calibration_mae": maes}
     errors = {
         form: ErrorsByCondition.of(test.error_m, test.error_m - outputs, test.labels)
         for form, outputs in predicted.items()
     }
-    found |= {f"mae_{form}": one.all.mae for form, one in errors.items()}
+    fields |= {f"mae_{form}": one.all.mae for form, one in errors.items()}
     return TrainedModel(
         network=task.network,
         samples=task.samples,
@@ -195,7 +195,7 @@ def train_task(task: Task, parts: Parts, folder: Path, options: FitOptions) -> T
         int8_errors=errors["int8"],
         seconds=seconds,
         samples_per_s=len(train) * options.epochs / max(seconds, 1e-9),
-        **found,
+        **fields,
     )
 
 
@@ -214,13 +214,13 @@ def calibrate(
         raise DatasetError(f"{len(inputs)} inputs to calibrate and to check on", valid="at least 2")
     order = np.random.default_rng(seed).permutation(len(inputs))
     count = min(CALIBRATION_INPUTS, len(inputs) // 2)
-    seen, checked = inputs[order[:count]], order[count : count + CHECKED_INPUTS]
+    calibration, checked = inputs[order[:count]], order[count : count + CHECKED_INPUTS]
     maes = {}
     for name, percentile in CALIBRATIONS.items():
-        network = IntegerNetwork(quantize(weights, seen, percentile, exact=False))
+        network = IntegerNetwork(quantize(weights, calibration, percentile, exact=False))
         maes[name] = float(np.abs(targets[checked] - network.predict_m(inputs[checked])).mean())
     best = min(maes, key=lambda name: maes[name])
-    return maes, best, quantize(weights, seen, CALIBRATIONS[best])
+    return maes, best, quantize(weights, calibration, CALIBRATIONS[best])
 
 
 def _session(path: Path, settings: onnxruntime.SessionOptions) -> onnxruntime.InferenceSession:
@@ -268,7 +268,7 @@ def baselines_of(train: Dataset, test: Dataset) -> tuple[Baseline, ...]:
     return (*rows, row("line", np.nan_to_num(linear_bias_m(line, test))))
 
 
-def describe(name: str, architecture: Architecture, parts: Parts, options: FitOptions) -> Card:
+def make_card(name: str, architecture: Architecture, parts: Parts, options: FitOptions) -> Card:
     """Return the card of a float network without a linear bias model that was fitted to the whole training part.
 
     Its variance comes from a second network, fitted to a fifth of the training configurations and tested on the others.
@@ -280,9 +280,9 @@ def describe(name: str, architecture: Architecture, parts: Parts, options: FitOp
     train = parts.train
     folds = min(VARIANCE_FOLDS, len(train.names))
     fold = splits.by_configuration(train.configurations, folds, options.seed)[0]
-    seen, unseen = train.rows(fold.test), train.rows(fold.train)
-    network = fitting.fit(architecture, seen.inputs, seen.error_m, options)
-    left = unseen.error_m - floating.predict_m(network, unseen.inputs)
+    small_part, other_part = train.rows(fold.test), train.rows(fold.train)
+    network = fitting.fit(architecture, small_part.inputs, small_part.error_m, options)
+    residual_m = other_part.error_m - floating.predict_m(network, other_part.inputs)
     training = {
         "data": parts.data,
         "split": parts.split,
@@ -292,4 +292,4 @@ def describe(name: str, architecture: Architecture, parts: Parts, options: FitOp
         "tested_on": len(parts.test),
         "variance": f"of a network fitted to 1 of {folds} parts of the training configurations, on the others",
     }
-    return card_of(name, architecture, train, LinearBiasModel(0.0), unseen, left, training)
+    return card_of(name, architecture, train, LinearBiasModel(0.0), other_part, residual_m, training)

@@ -20,7 +20,7 @@ def run_jobs(
     work: Callable[[Job], dict[str, Any]],
     jobs: Mapping[str, Job],
     journal: Path,
-    mark: int,
+    fingerprint: int,
     *,
     cost: Callable[[Job], float],
     workers: int = 1,
@@ -30,7 +30,7 @@ def run_jobs(
 
     Args:
         work: called with each job; its result can be written as JSON. Picklable if there are several workers.
-        journal: file with one JSON object per line; lines with another `mark` (other data or options) are ignored.
+        journal: file with one JSON object per line; lines with another `fingerprint` (other data or options) are ignored.
         cost: computing time of a job, in any unit; the most expensive jobs start first.
         workers: processes; 1 runs everything in this process.
         on_progress: called with the finished share of the work, 0 to 1.
@@ -50,7 +50,7 @@ def run_jobs(
     for line in lines:
         with contextlib.suppress(ValueError, TypeError, KeyError):  # empty or incomplete line
             entry = json.loads(line)
-            if entry["mark"] == mark and entry["name"] in jobs:
+            if entry["fingerprint"] == fingerprint and entry["name"] in jobs:
                 results[entry["name"]] = dict(entry["result"])
     missing = sorted((name for name in jobs if name not in results), key=lambda name: -cost(jobs[name]))
     total = sum(map(cost, jobs.values())) or 1.0
@@ -58,7 +58,7 @@ def run_jobs(
     def finish(name: str, result: dict[str, Any]) -> None:
         results[name] = result
         # The line before may be incomplete, if its process was killed.
-        stream.write(f"\n{json.dumps({'mark': mark, 'name': name, 'result': result})}\n")
+        stream.write(f"\n{json.dumps({'fingerprint': fingerprint, 'name': name, 'result': result})}\n")
         stream.flush()
         on_progress(sum(cost(jobs[done]) for done in results) / total)
 

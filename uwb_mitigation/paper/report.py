@@ -100,22 +100,24 @@ class Study:
         return np.where(self.dataset.labels == "", "no label", self.dataset.labels)
 
     @property
-    def places(self) -> NDArray[np.str_]:
+    def rooms(self) -> NDArray[np.str_]:
         """Room of each row, or the configuration if the data has no rooms."""
         names = self.dataset.configurations
-        return _map(names, lambda name: ROOMS[parse_configuration(name)[0]]) if self.has_rooms else names
+        return (
+            _map_names(names, lambda name: ROOMS[parse_configuration(name)[0]]) if self.has_rooms else names
+        )
 
     @property
     def materials(self) -> NDArray[np.str_]:
         """Material between the antennas of each row, or the label if the data does not contain it."""
-        return _map(self.dataset.configurations, _material) if self.has_rooms else self.labels
+        return _map_names(self.dataset.configurations, _material) if self.has_rooms else self.labels
 
     def provenance(self, seeds: str = "none") -> Provenance:
         """Return the provenance of a table of all measurements."""
         return Provenance(self.name, "none: all measurements", seeds, self.command)
 
 
-def _map(names: NDArray[np.str_], shown: Callable[[str], str]) -> NDArray[np.str_]:
+def _map_names(names: NDArray[np.str_], shown: Callable[[str], str]) -> NDArray[np.str_]:
     unique, inverse = np.unique(names, return_inverse=True)
     return np.array([shown(str(name)) for name in unique])[inverse]
 
@@ -164,34 +166,34 @@ def _measured(study: Study) -> str:
 
 
 def _notices(study: Study, trainings: ExperimentResults | None) -> tuple[str, ...]:
-    found = []
-    rows = tuple(int((study.places == room).sum()) for room in ROOMS)
+    notices = []
+    rows = tuple(int((study.rooms == room).sum()) for room in ROOMS)
     if study.simulated:
-        found.append(
+        notices.append(
             "The data is simulated: no radio was involved. It does not show the accuracy at a real site."
         )
     if study.simulated or not study.has_rooms or rows != ROOM_ROWS:
-        found.append("The data is not the published DeepUWB: the paper's numbers are not a target for it.")
+        notices.append("The data is not the published DeepUWB: the paper's numbers are not a target for it.")
     if trainings is not None:
         seeds = len({model.seed for model in trainings.models})
         lengths = len({model.samples for model in trainings.models} & set(published.WINDOWS))
         epochs = trainings.options.epochs
         if epochs < published.EPOCHS or seeds < published.SEEDS or lengths < len(published.WINDOWS):
-            found.append(
+            notices.append(
                 f"Shortened training: {epochs} epochs (paper: {published.EPOCHS}), {seeds} of {published.SEEDS} seeds, "
                 f"{lengths} of {len(published.WINDOWS)} lengths of the CIR. Accuracies are not comparable with the paper's."
             )
     if study.dataset.refused:
         reasons = ", ".join(f"{count:,} x {why}" for why, count in sorted(study.dataset.refused.items()))
-        found.append(f"Measurements left out: {reasons}.")
-    return tuple(found)
+        notices.append(f"Measurements left out: {reasons}.")
+    return tuple(notices)
 
 
 def _data_table(study: Study) -> Table:
     labels = study.labels
 
-    def row(name: str, chosen: NDArray[np.bool_], published_rows: int | None = None) -> tuple[Cell, ...]:
-        part = PartErrors.of(study.dataset.error_m[chosen], study.dataset.error_m[chosen])
+    def row(name: str, selected: NDArray[np.bool_], published_rows: int | None = None) -> tuple[Cell, ...]:
+        part = PartErrors.of(study.dataset.error_m[selected], study.dataset.error_m[selected])
         is_test_room = name == ROOMS[TEST_ROOM]
         return (
             Cell(name, "head"),
@@ -207,7 +209,7 @@ def _data_table(study: Study) -> Table:
 
     rows = []
     if study.has_rooms:
-        rows = [row(room, study.places == room, count) for room, count in zip(ROOMS, ROOM_ROWS, strict=True)]
+        rows = [row(room, study.rooms == room, count) for room, count in zip(ROOMS, ROOM_ROWS, strict=True)]
     names = sorted(np.unique(labels).tolist(), key=lambda name: (name != LOS, name))
     rows += [row(f"label {name}", labels == name) for name in names]
     rows.append(row("all", np.ones(len(labels), np.bool_), sum(ROOM_ROWS) if study.has_rooms else None))
@@ -228,12 +230,12 @@ def _samples(study: Study) -> Picture:
     labels, errors = study.labels, study.dataset.error_m
     # LOS first, then the most frequent conditions.
     names = sorted(np.unique(labels).tolist(), key=lambda name: (name != LOS, -(labels == name).sum()))
-    chosen = []
+    selected = []
     for name in names[:MAX_SAMPLES]:
         rows = np.flatnonzero(labels == name)
         median = rows[np.argsort(errors[rows], kind="stable")[(len(rows) - 1) // 2]]
-        chosen.append((name, float(errors[median]), study.dataset.inputs[median]))
-    described = "; ".join(f"{name}, range error {error:+.3f} m" for name, error, _ in chosen)
+        selected.append((name, float(errors[median]), study.dataset.inputs[median]))
+    described = "; ".join(f"{name}, range error {error:+.3f} m" for name, error, _ in selected)
     return Picture(
         "fig3",
         "Fig. 3. LOS and NLOS samples",
@@ -242,8 +244,8 @@ def _samples(study: Study) -> Picture:
         "Dashed: first path reported by the radio.",
         "one LOS and one NLOS sample with normalised amplitude; in NLOS the signal arrives over many paths, "
         "and the range is biased upward.",
-        figures.samples(chosen),
-        {"samples": [{"label": name, "error_m": error} for name, error, _ in chosen]},
+        figures.samples(selected),
+        {"samples": [{"label": name, "error_m": error} for name, error, _ in selected]},
         study.provenance(),
     )
 
@@ -260,36 +262,36 @@ def principal_components(inputs: NDArray[np.floating]) -> tuple[NDArray[np.float
     points, explained = np.zeros((len(inputs), 3)), np.zeros(3)
     count = min(3, *inputs.shape)
     if np.ptp(inputs, axis=0).any():
-        found = scikit("decomposition").PCA(count, svd_solver="full")
-        points[:, :count] = found.fit_transform(inputs.astype(np.float64))
-        explained[:count] = found.explained_variance_ratio_
+        analysis = scikit("decomposition").PCA(count, svd_solver="full")
+        points[:, :count] = analysis.fit_transform(inputs.astype(np.float64))
+        explained[:count] = analysis.explained_variance_ratio_
     return points, explained
 
 
 def _components(study: Study, letter: str) -> Picture:
     points, explained = principal_components(study.dataset.inputs)
     share = " + ".join(f"{100 * part:.0f}" for part in explained)
-    chosen = np.arange(len(points))
-    if len(chosen) > figures.MAX_POINTS:
-        chosen = np.sort(np.random.default_rng(0).choice(len(chosen), figures.MAX_POINTS, replace=False))
+    selected = np.arange(len(points))
+    if len(selected) > figures.MAX_POINTS:
+        selected = np.sort(np.random.default_rng(0).choice(len(selected), figures.MAX_POINTS, replace=False))
     kinds = ("room", "material") if study.has_rooms else ("configuration", "label")
-    kind, groups = kinds["ab".index(letter)], study.places if letter == "a" else study.materials
+    kind, groups = kinds["ab".index(letter)], study.rooms if letter == "a" else study.materials
     names, counts = np.unique(groups, return_counts=True)
     numbers = dict(zip(names.tolist(), counts.tolist(), strict=True))
     return Picture(
         f"fig4{letter}",
         f"Fig. 4{letter}. Principal components, by {kind}",
-        f"Three-dimensional scatter plot of {len(chosen)} channel impulse responses along their first three principal "
+        f"Three-dimensional scatter plot of {len(selected)} channel impulse responses along their first three principal "
         f"components, from two sides, coloured by {kind}: {len(names)} of them.",
-        f"{len(chosen):,} of {len(points):,} windows of {study.dataset.inputs.shape[1]} amplitudes. "
+        f"{len(selected):,} of {len(points):,} windows of {study.dataset.inputs.shape[1]} amplitudes. "
         f"The components contain {share} % of the variance.",
         "the three indoor rooms lie close together, apart from outdoor and through-the-wall measurements."
         if letter == "a"
         else "materials lie in different regions; heavier ones, such as metal, are concentrated and distant "
         "from plastic and wood.",
-        figures.scatter(points[chosen], groups[chosen], f"By {kind}"),
-        {"explained": explained.tolist(), "groups": numbers, "points": len(chosen)},
-        study.provenance("0, of the points drawn" if len(chosen) < len(points) else "none"),
+        figures.scatter(points[selected], groups[selected], f"By {kind}"),
+        {"explained": explained.tolist(), "groups": numbers, "points": len(selected)},
+        study.provenance("0, of the points drawn" if len(selected) < len(points) else "none"),
     )
 
 
@@ -308,8 +310,8 @@ def _over_k(trainings: ExperimentResults, provenance: Provenance) -> Picture:
         }
         if models:
             spreads[samples] = {name: spread for name, spread in values.items() if spread is not None}
-        found = [model.left.all.box for model in models if model.left.all.box is not None]
-        box = tuple(np.mean(found, axis=0).tolist()) if found else None
+        model_boxes = [model.left.all.box for model in models if model.left.all.box is not None]
+        box = tuple(np.mean(model_boxes, axis=0).tolist()) if model_boxes else None
         boxes[f"K = {samples}"] = box
     paper_mae = {k: row.mae_m[2] for (network, k), row in published.MODELS.items() if network == "remnet"}
     described = "; ".join(

@@ -13,20 +13,20 @@ DECAY_NEPERS = 0.7
 """Standard deviation of the change of the amplitude decay over 100 taps: the decay of the echoes of a room contains little
 information about the first path, and the simulator has only a few environments."""
 
-FIRST_VARIED = 12
+FIRST_VARIED_TAP = 12
 """Taps before this one contain the first path and are not changed."""
 
-LOUDER_SHARE, LOUDER_DB = 0.15, 22.0
+AMPLIFIED_SHARE, MAX_GAIN_DB = 0.15, 22.0
 """Share of the inputs that are amplified, and maximum gain. No DW1000 reaches these levels, because its gain control
 compresses, but a model that was not trained with them predicts errors of metres for them."""
 
-OTHER_RECEIVERS = 0.5
+OTHER_RECEIVER_SHARE = 0.5
 """Share of the inputs that are changed to imitate another receiver."""
 
-PULSE = (-0.08, 0.15)
+NEIGHBOUR_SHARES = (-0.08, 0.15)
 """Bounds of the share of a tap's amplitude that is added to each neighbour: receivers differ in bandwidth."""
 
-EARLY_TAPS = 0.7
+MAX_SHIFT_TAPS = 0.7
 """Maximum shift of the first path in either direction, taps: first-path detectors differ."""
 
 DAMAGED_SHARE = 0.05
@@ -38,11 +38,13 @@ def vary_channel(inputs: Tensor, generator: torch.Generator) -> Tensor:
     n, samples = inputs.shape
     # The scaled inputs are square roots of amplitudes.
     nepers = torch.randn(n, 1, generator=generator) * DECAY_NEPERS / 100
-    varied = inputs * torch.exp(0.5 * nepers * (torch.arange(samples) - FIRST_VARIED).clamp(min=0))
-    is_louder = torch.rand(n, 1, generator=generator) < LOUDER_SHARE
-    level_db = torch.where(is_louder, torch.rand(n, 1, generator=generator) * LOUDER_DB, torch.zeros(n, 1))
-    louder: Tensor = varied * 10 ** (level_db / 40)
-    return louder
+    varied = inputs * torch.exp(0.5 * nepers * (torch.arange(samples) - FIRST_VARIED_TAP).clamp(min=0))
+    is_amplified = torch.rand(n, 1, generator=generator) < AMPLIFIED_SHARE
+    level_db = torch.where(
+        is_amplified, torch.rand(n, 1, generator=generator) * MAX_GAIN_DB, torch.zeros(n, 1)
+    )
+    amplified: Tensor = varied * 10 ** (level_db / 40)
+    return amplified
 
 
 def vary_receiver(inputs: Tensor, generator: torch.Generator) -> Tensor:
@@ -52,21 +54,21 @@ def vary_receiver(inputs: Tensor, generator: torch.Generator) -> Tensor:
     def uniform(low: float, high: float) -> Tensor:
         return low + (high - low) * torch.rand(n, 1, generator=generator)
 
-    place = torch.arange(samples) + uniform(-EARLY_TAPS, EARLY_TAPS)
-    before = place.floor()
-    part = place - before
-    taps = [(before.long() + step).clamp(0, samples - 1) for step in (0, 1)]
+    position = torch.arange(samples) + uniform(-MAX_SHIFT_TAPS, MAX_SHIFT_TAPS)
+    lower = position.floor()
+    fraction = position - lower
+    taps = [(lower.long() + step).clamp(0, samples - 1) for step in (0, 1)]
     amplitude = inputs * inputs
-    shifted = (1 - part) * amplitude.gather(1, taps[0]) + part * amplitude.gather(1, taps[1])
-    share = uniform(*PULSE)
+    shifted = (1 - fraction) * amplitude.gather(1, taps[0]) + fraction * amplitude.gather(1, taps[1])
+    share = uniform(*NEIGHBOUR_SHARES)
     padded = torch.nn.functional.pad(shifted, (1, 1), mode="replicate")
-    spread = (1 - 2 * share) * shifted + share * (padded[:, :-2] + padded[:, 2:])
+    filtered = (1 - 2 * share) * shifted + share * (padded[:, :-2] + padded[:, 2:])
     limit = torch.where(uniform(0, 1) < DAMAGED_SHARE, uniform(0.4, 1.0), torch.ones(n, 1))
-    clipped = torch.minimum(spread.clamp(min=0), limit * spread.amax(1, keepdim=True))
+    clipped = torch.minimum(filtered.clamp(min=0), limit * filtered.amax(1, keepdim=True))
     end = torch.where(uniform(0, 1) < DAMAGED_SHARE, uniform(0.2, 1.0) * samples, torch.full((n, 1), samples))
     received = torch.where(torch.arange(samples) < end, clipped, torch.zeros(())).sqrt()
-    either: Tensor = torch.where(uniform(0, 1) < OTHER_RECEIVERS, received, inputs)
-    return either
+    result: Tensor = torch.where(uniform(0, 1) < OTHER_RECEIVER_SHARE, received, inputs)
+    return result
 
 
 def normalised(inputs: Tensor) -> Tensor:
@@ -83,4 +85,4 @@ def calibration_inputs(inputs: NDArray[np.float32], scaling: Scaling) -> NDArray
     if scaling is Scaling.MAX:
         amplitudes: NDArray[np.float32] = normalised(torch.from_numpy(inputs)).numpy()
         return amplitudes
-    return np.concatenate([inputs, inputs * np.float32(10.0 ** (LOUDER_DB / 2.0 / 40.0))])
+    return np.concatenate([inputs, inputs * np.float32(10.0 ** (MAX_GAIN_DB / 2.0 / 40.0))])

@@ -27,24 +27,24 @@ from uwb_mitigation.training.options import FitOptions
 NEW_MODELS = CONSTANT, LINE, LINE_NETWORK, NETWORK = "constant", "line", "line+network", "network"
 """Models that are fitted to the data only."""
 
-COLD_START, MEAN = "cold start", "line and cold start"
-AS_SHIPPED, OWN_OFFSET, TRAINED_FURTHER = "as shipped", "own offset", "trained further"
+COLD_START, COLD_START_MEAN = "cold start", "mean of line and cold start"
+AS_SHIPPED, NEW_OFFSET, FINE_TUNED = "as shipped", "new offset", "fine-tuned"
 SITE_OFFSETS, SITE_LINE = "offsets", "offsets + line"
 SITE_UNIVERSAL, SITE_UNIVERSAL_LINE = "offsets + universal network", "offsets + universal network + line"
-SITE_TUNED = "fine-tuned network"
+SITE_FINE_TUNED = "fine-tuned network"
 
 NETWORK_ONLY = FitOptions(epochs=20, learning_rate=1e-3, dropout=0.2)
 """Options of a network without a line: it needs more training than one that refines a line."""
 
-TUNING = FitOptions(epochs=2, learning_rate=3e-4, dropout=0.2)
-TUNED_PER_CONFIGURATION, TUNED_INPUTS = 6, 2500
+FINE_TUNING = FitOptions(epochs=2, learning_rate=3e-4, dropout=0.2)
+FINE_TUNING_PER_CONFIGURATION, MAX_FINE_TUNING_INPUTS = 6, 2500
 """The fine-tuned network of a site is fitted to at most this number of inputs per configuration, and in total."""
 
 PER_CONFIGURATION = 20
 MIN_CONFIGURATIONS_FOR_MEAN = 20
 """Number of configurations from which a line is averaged with the universal network."""
 
-FACTORS, MIN_SPREAD_M = (0.0, 1.5), 0.05
+FACTOR_BOUNDS, MIN_SPREAD_M = (0.0, 1.5), 0.05
 """Bounds of the factor of the universal network's predictions, and the minimum spread that makes it observable."""
 
 _BATCH = 1024
@@ -89,7 +89,7 @@ class Recipe:
 
     Attributes:
         architecture: Architecture of the network.
-        fit: options of a network that refines a line. alone: options of a network without a line.
+        fit: options of a network that refines a line. network_only: options of a network without a line.
         line: fit a line; otherwise the network predicts the whole error.
         network: fit the network; otherwise it predicts 0. With neither, the linear bias model is a constant.
         per_configuration: the network is fitted to at most this number of ranges of a configuration, so that a long
@@ -98,15 +98,15 @@ class Recipe:
 
     architecture: Remnet
     fit: FitOptions
-    alone: FitOptions = NETWORK_ONLY
+    network_only: FitOptions = NETWORK_ONLY
     line: bool = True
     network: bool = True
     per_configuration: int = PER_CONFIGURATION
 
-    def of(self, name: str) -> Recipe:
+    def for_candidate(self, name: str) -> Recipe:
         """Return the recipe of one of `NEW_MODELS`."""
         network = name in (LINE_NETWORK, NETWORK)
-        options = self.alone if name == NETWORK else self.fit
+        options = self.network_only if name == NETWORK else self.fit
         return replace(self, line=name in (LINE, LINE_NETWORK), network=network, fit=options)
 
 
@@ -167,11 +167,11 @@ def _fit_residuals(
     """Fit a network to the residuals of a linear bias model."""
     from uwb_mitigation.training import fitting
 
-    part = data.rows(splits.subsample(data.configurations, per_configuration, options.seed))
-    residual = part.error_m - linear_bias_m(linear_bias, part)
+    subset = data.rows(splits.subsample(data.configurations, per_configuration, options.seed))
+    residual = subset.error_m - linear_bias_m(linear_bias, subset)
     # If the linear bias model needs a power that is unknown, the range is passed through.
     known = np.isfinite(residual)
-    return fitting.fit(architecture, part.inputs[known], residual[known], options, on_epoch, start=start)
+    return fitting.fit(architecture, subset.inputs[known], residual[known], options, on_epoch, start=start)
 
 
 def fit_line(data: Dataset) -> LinearBiasModel:
@@ -184,14 +184,14 @@ def fit_line(data: Dataset) -> LinearBiasModel:
 def new_models(recipe: Recipe) -> list[Candidate]:
     """Return a constant, a line, a network on the residuals of the line, and a network without a line."""
 
-    def own(name: str) -> Callable[[Dataset, int], FittedModel]:
-        return lambda data, seed: fit_new_model(data, recipe.of(name), seed)
+    def new_model(name: str) -> Callable[[Dataset, int], FittedModel]:
+        return lambda data, seed: fit_new_model(data, recipe.for_candidate(name), seed)
 
     return [
         _constant(),
         _line(),
-        Candidate(LINE_NETWORK, own(LINE_NETWORK), trains=True),
-        Candidate(NETWORK, own(NETWORK), trains=True),
+        Candidate(LINE_NETWORK, new_model(LINE_NETWORK), trains=True),
+        Candidate(NETWORK, new_model(NETWORK), trains=True),
     ]
 
 
@@ -215,7 +215,7 @@ def from_bundle(source: Bundle, options: FitOptions) -> list[Candidate]:
     """
     network = float_network(source)
 
-    def shifted(data: Dataset, seed: int) -> FittedModel:
+    def with_new_offset(data: Dataset, seed: int) -> FittedModel:
         residual = data.error_m - linear_bias_m(source.linear_bias, data) - network_m(network, data.inputs)
         known = np.isfinite(residual)
         shift = (
@@ -226,7 +226,7 @@ def from_bundle(source: Bundle, options: FitOptions) -> list[Candidate]:
         )
         return FittedModel(linear_bias, network)
 
-    def trained(data: Dataset, seed: int) -> FittedModel:
+    def fine_tuned(data: Dataset, seed: int) -> FittedModel:
         linear_bias = fit_line(data) if source.linear_bias.needs_power else _offset(data, network)
         assert isinstance(source.architecture, Remnet)
         start = source.architecture, replace(options, seed=seed)
@@ -236,10 +236,10 @@ def from_bundle(source: Bundle, options: FitOptions) -> list[Candidate]:
 
     return [
         Candidate(AS_SHIPPED, lambda data, seed: FittedModel(source.linear_bias, network)),
-        Candidate(OWN_OFFSET, shifted),
+        Candidate(NEW_OFFSET, with_new_offset),
         _constant(),
         _line(),
-        Candidate(TRAINED_FURTHER, trained, trains=True),
+        Candidate(FINE_TUNED, fine_tuned, trains=True),
     ]
 
 
@@ -265,8 +265,8 @@ def with_cold_start(candidates: Sequence[Candidate], data: Dataset, universal: B
         total = (line.offset_m + offset, line.per_rx_power, line.per_power_gap)
         return FittedModel(LinearBiasModel(*(float(np.float32(value / 2)) for value in total)), half)
 
-    behind = {CONSTANT: [start], LINE: [Candidate(MEAN, mean)] if has_line else []}
-    return [item for one in candidates for item in (one, *behind.get(one.name, ()))]
+    inserted = {CONSTANT: [start], LINE: [Candidate(COLD_START_MEAN, mean)] if has_line else []}
+    return [item for one in candidates for item in (one, *inserted.get(one.name, ()))]
 
 
 def has_few_configurations(data: Dataset) -> bool:
@@ -307,28 +307,28 @@ def site_models(
 
         return fit
 
-    found = [
+    candidates = [
         offsets,
         Candidate(SITE_UNIVERSAL, with_network(line=False)),
         Candidate(SITE_UNIVERSAL_LINE, with_network(line=True)),
     ]
     if importlib.util.find_spec("torch") is None:
-        return data, found, ["the fine-tuned network: torch is not installed (`make setup-training`)"]
+        return data, candidates, ["the fine-tuned network: torch is not installed (`make setup-training`)"]
 
-    def tuned(data: Dataset, seed: int) -> FittedModel:
+    def fine_tuned(data: Dataset, seed: int) -> FittedModel:
         from uwb_mitigation.training import fitting
 
         shift = linear_fit.constant(data.configurations, data.error_m - _universal_m(data))
-        part = data.rows(splits.subsample(data.configurations, TUNED_PER_CONFIGURATION, seed))
-        if len(part) > TUNED_INPUTS:
-            chosen = np.random.default_rng(seed).choice(len(part), TUNED_INPUTS, replace=False)
-            part = part.rows(np.sort(chosen))
-        options, wanted = replace(TUNING, seed=seed), part.error_m - shift.offset_m
+        subset = data.rows(splits.subsample(data.configurations, FINE_TUNING_PER_CONFIGURATION, seed))
+        if len(subset) > MAX_FINE_TUNING_INPUTS:
+            chosen = np.random.default_rng(seed).choice(len(subset), MAX_FINE_TUNING_INPUTS, replace=False)
+            subset = subset.rows(np.sort(chosen))
+        options, targets = replace(FINE_TUNING, seed=seed), subset.error_m - shift.offset_m
         return FittedModel(
-            shift, fitting.fit(universal.architecture, part.inputs, wanted, options, start=start)
+            shift, fitting.fit(universal.architecture, subset.inputs, targets, options, start=start)
         )
 
-    return data, [*found, Candidate(SITE_TUNED, tuned)], []
+    return data, [*candidates, Candidate(SITE_FINE_TUNED, fine_tuned)], []
 
 
 def _universal_m(data: Dataset) -> NDArray[np.float64]:
@@ -349,7 +349,7 @@ def _factor(data: Dataset) -> float:
         return 1.0
     design = np.column_stack([np.ones(len(predicted)), predicted])
     factor = float(linear_fit.least_absolute_deviations(design, error)[1])
-    return float(np.float32(np.clip(factor, *FACTORS)))
+    return float(np.float32(np.clip(factor, *FACTOR_BOUNDS)))
 
 
 def _has_both_powers(data: Dataset) -> bool:

@@ -148,13 +148,13 @@ def _peaks(
 
 def _mse_peak(values: NDArray[np.float32]) -> float:
     """Return the share of the maximum that quantises `values` with the least mean squared error."""
-    most = float(values.max())
-    if most <= 0:
+    maximum = float(values.max())
+    if maximum <= 0:
         return 0.0
     # A histogram makes the cost of the search independent of the number of values.
-    counts, edges = np.histogram(values, bins=2048, range=(0.0, most))
+    counts, edges = np.histogram(values, bins=2048, range=(0.0, maximum))
     centres = (edges[:-1] + edges[1:]) / 2
-    candidates = most * np.linspace(0.3, 1.0, 71)
+    candidates = maximum * np.linspace(0.3, 1.0, 71)
     errors = [
         float((counts * (centres - np.clip(np.rint(centres * 255 / peak), 0, 255) * peak / 255) ** 2).sum())
         for peak in candidates
@@ -173,13 +173,13 @@ def _activation_scales(
     """
     scale: dict[str, np.float32] = {}
     for tensor, peak in peaks.items():
-        wanted = max(peak, 1e-6) / 255
+        target = max(peak, 1e-6) / 255
         if tensor in reads and tensor != HEAD:
-            wanted = max(wanted, 17 * float(scale[reads[tensor]]) * float(weight_scale[tensor].max()))
+            target = max(target, 17 * float(scale[reads[tensor]]) * float(weight_scale[tensor].max()))
         elif tensor != "input":
             first, second = sum_operands(tensor)
             least = MIN_SCALE_RATIO * float(max(scale[first], scale[second]))
             scale |= {name: np.float32(max(float(scale[name]), least)) for name in (first, second)}
-            wanted = max(wanted, 0.501 * (float(scale[first]) + float(scale[second])))
-        scale[tensor] = np.float32(wanted)
+            target = max(target, 0.501 * (float(scale[first]) + float(scale[second])))
+        scale[tensor] = np.float32(target)
     return scale

@@ -21,7 +21,7 @@ MIN_GAIN = 0.02
 COLD_START_MIN_GAIN = 0.10
 """Required gain with few configurations, where only large differences are significant."""
 
-NESTED = "chosen (nested)"
+NESTED = "selection (nested)"
 """Name of the errors of the selection procedure, on configurations that neither a fit nor the selection used."""
 
 SEGMENT_FOLDS, ANCHOR_FOLDS = 4, 2

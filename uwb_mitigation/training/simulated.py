@@ -45,9 +45,9 @@ def _block(seed: int, preprocessing: Preprocessing, wide: bool, number: int) -> 
     block, rng = block_of(seed, number, wide=wide)
     reception = RADIO.receive(block.links.multipath(rng), rng, block.boards)
     distance = block.links.distance_m
-    heard = np.flatnonzero(np.isfinite(reception.first_path_index))
-    faults, inputs = preprocessing.apply(_columns(reception, distance, heard))
-    rows = heard[faults == 0]
+    received = np.flatnonzero(np.isfinite(reception.first_path_index))
+    faults, inputs = preprocessing.apply(_columns(reception, distance, received))
+    rows = received[faults == 0]
     is_blocked, is_direct = block.links.path.crossings > 0, reception.direct_above_threshold
     return Dataset(
         preprocessing,

@@ -102,7 +102,7 @@ class TrainedBundle:
 
 
 @dataclass(frozen=True, slots=True)
-class Job:
+class TrainingJob:
     """Input and output of a training.
 
     Attributes:
@@ -118,39 +118,39 @@ class Job:
     on_progress: Progress = lambda what, share: None
 
 
-def train_new_model(job: Job, recipe: Recipe, wanted: str = AUTO) -> TrainedBundle:
+def train_new_model(job: TrainingJob, recipe: Recipe, recipe_name: str = AUTO) -> TrainedBundle:
     """Train a new model: one of `candidates.NEW_MODELS`, or the best of these and the cold start (AUTO).
 
     Raises:
         ParameterError: unknown model. DatasetError: too few configurations; see also `fitting.fit`.
     """
-    if wanted not in (AUTO, *models.NEW_MODELS):
-        raise ParameterError(f"recipe {wanted!r}", valid=", ".join((AUTO, *models.NEW_MODELS)))
+    if recipe_name not in (AUTO, *models.NEW_MODELS):
+        raise ParameterError(f"recipe {recipe_name!r}", valid=", ".join((AUTO, *models.NEW_MODELS)))
     dataset, folds = job.dataset, min(job.folds, len(job.dataset.names))
-    _check_configurations(dataset, selections.min_configurations(job.folds) if wanted == AUTO else 2)
+    _check_configurations(dataset, selections.min_configurations(job.folds) if recipe_name == AUTO else 2)
     selection, seed = None, recipe.fit.seed
-    if wanted == AUTO:
+    if recipe_name == AUTO:
         universal = load_bundle(default_model_path(dataset.preprocessing.scaling))
         candidates = models.with_cold_start(models.new_models(recipe), dataset, universal)
         selection = _select(job, candidates, seed)
-        wanted = selection.chosen
-        if wanted in (models.COLD_START, models.MEAN):
+        recipe_name = selection.chosen
+        if recipe_name in (models.COLD_START, models.COLD_START_MEAN):
             return _write_selected(job, selection, universal, recipe.fit, ("raw",))
-    recipe = recipe.of(wanted)
+    recipe = recipe.for_candidate(recipe_name)
     total = recipe.fit.epochs * (folds + 1)
     on_epoch = selections.step_counter(total, lambda share: job.on_progress("training", share))
     validation = cross_validate(dataset, recipe, folds, seed, on_epoch)
     fitted = fit_new_model(dataset, recipe, seed, on_epoch)
-    card = describe(job.output.stem, recipe, fitted.linear_bias, validation, job.name)
+    card = make_card(job.output.stem, recipe, fitted.linear_bias, validation, job.name)
     mae = {row: statistics["mae"] for row, statistics in validation.statistics().items()}
-    after = mae["int8"] if selection is None else selection.mae()[NESTED]
+    mae_m = mae["int8"] if selection is None else selection.mae()[NESTED]
     assert fitted.network is not None
     bundle = save_bundle(job.output, graph.float_model(fitted.network), card)
-    return TrainedBundle(bundle, selection, validation, after, {"raw": mae["raw"]})
+    return TrainedBundle(bundle, selection, validation, mae_m, {"raw": mae["raw"]})
 
 
 def train_from_bundle(
-    job: Job, source: Bundle, options: FitOptions, *, offer_cold_start: bool
+    job: TrainingJob, source: Bundle, options: FitOptions, *, offer_cold_start: bool
 ) -> TrainedBundle:
     """Train a model that starts from `source`, or from the universal network with `offer_cold_start`.
 
@@ -162,48 +162,52 @@ def train_from_bundle(
     universal = load_bundle(default_model_path(job.dataset.preprocessing.scaling))
     if offer_cold_start:
         # The source is the universal model: with another offset it is the cold start.
-        candidates = [item for item in candidates if item.name != models.OWN_OFFSET]
+        candidates = [item for item in candidates if item.name != models.NEW_OFFSET]
         candidates = models.with_cold_start(candidates, job.dataset, universal)
     selection = _select(job, candidates, options.seed)
-    start = universal if selection.chosen in (models.COLD_START, models.MEAN) else source
-    return _write_selected(job, selection, start, options, ("raw", models.AS_SHIPPED))
+    start_bundle = universal if selection.chosen in (models.COLD_START, models.COLD_START_MEAN) else source
+    return _write_selected(job, selection, start_bundle, options, ("raw", models.AS_SHIPPED))
 
 
-def _select(job: Job, candidates: Sequence[Candidate], seed: int) -> Selection:
-    is_cold = candidates[0].name == models.COLD_START
+def _select(job: TrainingJob, candidates: Sequence[Candidate], seed: int) -> Selection:
+    has_cold_start = candidates[0].name == models.COLD_START
     return selections.select_nested(
         job.dataset,
         candidates,
         min(job.folds, len(job.dataset.names)),
         seed,
         lambda share: job.on_progress("choosing", share),
-        min_gain=selections.COLD_START_MIN_GAIN if is_cold else selections.MIN_GAIN,
+        min_gain=selections.COLD_START_MIN_GAIN if has_cold_start else selections.MIN_GAIN,
     )
 
 
 def _write_selected(
-    job: Job, selection: Selection, start: Bundle, options: FitOptions, before: Sequence[str]
+    job: TrainingJob,
+    selection: Selection,
+    start_bundle: Bundle,
+    options: FitOptions,
+    baselines: Sequence[str],
 ) -> TrainedBundle:
     """Write a model that starts from a bundle; the intervals are from its held-out errors in the selection."""
-    silent = scaled(float_network(start), 0.0)
-    assert isinstance(silent.architecture, Remnet)
+    zero_network = scaled(float_network(start_bundle), 0.0)
+    assert isinstance(zero_network.architecture, Remnet)
     linear_bias, network = selection.model.linear_bias, selection.model.network
-    is_trained = selection.chosen == models.TRAINED_FURTHER
-    recipe = Recipe(silent.architecture, options, line=linear_bias.needs_power, network=is_trained)
+    is_trained = selection.chosen == models.FINE_TUNED
+    recipe = Recipe(zero_network.architecture, options, line=linear_bias.needs_power, network=is_trained)
     errors = {**selection.errors, "float": selection.errors[selection.chosen]}
     validation = CrossValidation(job.dataset, errors, selection.folds, selection.seed)
-    card = describe(job.output.stem, recipe, linear_bias, validation, job.name)
+    card = make_card(job.output.stem, recipe, linear_bias, validation, job.name)
     training = {
         **card.training,
-        "started_from": f"{start.model_id:08x}",
+        "started_from": f"{start_bundle.model_id:08x}",
         "chosen": selection.chosen,
         # If the network was not fine-tuned, its training options are in the card of the source bundle.
         "recipe": {**card.training["recipe"], "network": network is not None},
     }
-    model = graph.float_model(silent if network is None else network)
+    model = graph.float_model(zero_network if network is None else network)
     bundle = save_bundle(job.output, model, replace(card, training=training))
     mae = selection.mae()
-    return TrainedBundle(bundle, selection, validation, mae[NESTED], {row: mae[row] for row in before})
+    return TrainedBundle(bundle, selection, validation, mae[NESTED], {row: mae[row] for row in baselines})
 
 
 def cross_validate(
@@ -247,10 +251,10 @@ def fit_with_card(dataset: Dataset, recipe: Recipe, inner_folds: int) -> tuple[C
     validation = cross_validate(dataset, recipe, folds, seed, quantised=False)
     fitted = fit_new_model(dataset, recipe, seed)
     assert fitted.network is not None
-    return describe("", recipe, fitted.linear_bias, validation, ""), fitted.network
+    return make_card("", recipe, fitted.linear_bias, validation, ""), fitted.network
 
 
-def describe(
+def make_card(
     name: str, recipe: Recipe, linear_bias: LinearBiasModel, validation: CrossValidation, data: str
 ) -> Card:
     """Return the card of a float model that was fitted to the dataset of `validation`."""
@@ -268,9 +272,9 @@ def describe(
             for row, statistics in validation.statistics().items()
         },
     }
-    left = validation.errors["float"]
+    residual_m = validation.errors["float"]
     ood_bands = ood_bands_of(dataset)
-    return card_of(name, recipe.architecture, dataset, linear_bias, dataset, left, training, ood_bands)
+    return card_of(name, recipe.architecture, dataset, linear_bias, dataset, residual_m, training, ood_bands)
 
 
 def _check_configurations(dataset: Dataset, needed: int) -> None:

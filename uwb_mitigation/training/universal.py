@@ -39,7 +39,7 @@ RECIPE = FitOptions(epochs=10, learning_rate=1e-3, batch=64, dropout=0.1)
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class TrainingPlan:
     """Training plan of a universal model.
 
     Attributes:
@@ -59,7 +59,7 @@ class Plan:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Universal:
+class UniversalModel:
     """Trained universal model and its evaluation.
 
     Attributes:
@@ -75,47 +75,54 @@ class Universal:
 
 
 def train(
-    plan: Plan, name: str, workers: int, on_share: Callable[[float, str], None] = lambda share, what: None
-) -> Universal:
+    plan: TrainingPlan,
+    name: str,
+    workers: int,
+    on_share: Callable[[float, str], None] = lambda share, what: None,
+) -> UniversalModel:
     """Train the model of `plan`. The result does not depend on `workers`; `on_share` gets the step and its progress."""
     preprocessing = Preprocessing(plan.samples, plan.scaling)
-    worlds = plan.blocks + plan.held_out_blocks
-    count_block = step_counter(worlds, lambda share: on_share(0.2 * share, "simulating"))
+    total_blocks = plan.blocks + plan.held_out_blocks
+    count_block = step_counter(total_blocks, lambda share: on_share(0.2 * share, "simulating"))
     # Augmentation needs the levels, even if the scaling removes them.
-    leveled = Preprocessing(plan.samples)
+    level_preprocessing = Preprocessing(plan.samples)
     # With levels, other receivers and sites are detected as out of distribution. Without, train on them.
-    is_leveled = plan.scaling is Scaling.PREAMBLE
-    world = building_dataset(plan.seed, plan.blocks, leveled, workers, count_block, wide=not is_leveled)
+    has_levels = plan.scaling is Scaling.PREAMBLE
+    train_data = building_dataset(
+        plan.seed, plan.blocks, level_preprocessing, workers, count_block, wide=not has_levels
+    )
     held_out = building_dataset(
         plan.seed + HELD_OUT_SEED,
         plan.held_out_blocks,
         preprocessing,
         workers,
         count_block,
-        wide=not is_leveled,
+        wide=not has_levels,
     )
     count_epoch = step_counter(plan.fit.epochs, lambda share: on_share(0.2 + 0.75 * share, "training"))
     options = replace(plan.fit, seed=plan.seed)
     network = fit(
         Remnet(samples=plan.samples),
-        world.inputs,
-        world.error_m,
+        train_data.inputs,
+        train_data.error_m,
         options,
         count_epoch,
         vary=vary_channel
-        if is_leveled
+        if has_levels
         else lambda inputs, generator: normalised(vary_receiver(vary_channel(inputs, generator), generator)),
     )
-    some = world.inputs[:: max(1, len(world) // CALIBRATION_INPUTS)]
-    integers = quantize(network, calibration_inputs(some, plan.scaling))
-    on_share(1.0, "grading")
-    return _graded(plan, name, network, integers, held_out)
+    subset = train_data.inputs[:: max(1, len(train_data) // CALIBRATION_INPUTS)]
+    integers = quantize(network, calibration_inputs(subset, plan.scaling))
+    on_share(1.0, "evaluating")
+    return _evaluate(plan, name, network, integers, held_out)
 
 
-def _graded(plan: Plan, name: str, network: FloatWeights, integers: Int8Weights, test: Dataset) -> Universal:
+def _evaluate(
+    plan: TrainingPlan, name: str, network: FloatWeights, integers: Int8Weights, test: Dataset
+) -> UniversalModel:
     """Return intervals, limits and in-distribution bands from the held-out buildings `test`."""
     error = test.error_m
-    left = {
+    errors = {
         "raw": error,
         "float": error - floating.predict_m(network, test.inputs).astype(float),
         "int8": error - IntegerNetwork(integers).predict_m(test.inputs).astype(float),
@@ -125,16 +132,16 @@ def _graded(plan: Plan, name: str, network: FloatWeights, integers: Int8Weights,
     }
     statistics = {
         row: {label: ErrorStatistics.of(values[rows]) for label, rows in conditions.items()}
-        for row, values in left.items()
+        for row, values in errors.items()
     }
-    alike = _alike(test.labels)
+    balanced = _balanced_rows(test.labels)
     card = card_of(
         name,
         network.architecture,
         test,
         LinearBiasModel(0.0),
-        test.rows(alike),
-        left["float"][alike],
+        test.rows(balanced),
+        errors["float"][balanced],
         {
             "data": f"simulated buildings, seed {plan.seed}: no radio was involved",
             "boards": "simulated DW1000s whose powers, antennas and preambles differ; no site",
@@ -143,17 +150,17 @@ def _graded(plan: Plan, name: str, network: FloatWeights, integers: Int8Weights,
             "seed": plan.seed,
             "recipe": asdict(replace(plan.fit, seed=plan.seed)),
             "metrics_m": {
-                row: {key: round(value, 4) for key, value in asdict(by["all"]).items()}
-                for row, by in statistics.items()
+                row: {key: round(value, 4) for key, value in asdict(by_label["all"]).items()}
+                for row, by_label in statistics.items()
             },
         },
         # The correction shrinks to zero out of distribution, because an offset depends on the radio, not on the channel.
         ood_bands_of(test, known_offset_m=0.0),
     )
-    return Universal(card, network, integers, statistics)
+    return UniversalModel(card, network, integers, statistics)
 
 
-def _alike(labels: NDArray[np.str_]) -> NDArray[np.intp]:
+def _balanced_rows(labels: NDArray[np.str_]) -> NDArray[np.intp]:
     """Return rows with each condition equally often: its frequency at a site is unknown, and intervals must hold in all."""
     conditions = [np.flatnonzero(labels == label) for label in np.unique(labels)]
     return np.concatenate([part[: min(map(len, conditions))] for part in conditions])
