@@ -15,7 +15,7 @@ anchors:
 """
 
 
-def test_ids_places_deviations_and_names_are_read():
+def test_ids_positions_standard_deviations_and_names_are_read():
     anchors = parse_anchors(GOOD, "a.yaml")
     assert [anchor.id for anchor in anchors.anchors] == [1, 31]
     np.testing.assert_array_equal(anchors.position, [[0, 0.5, 2.1], [7.6, 0, 2.1]])
@@ -23,7 +23,7 @@ def test_ids_places_deviations_and_names_are_read():
     assert [str(anchor) for anchor in anchors.anchors] == ["1", "31 (door)"]
 
 
-def test_what_is_written_is_read_again():
+def test_written_file_is_read_back():
     anchors = AnchorMap(
         [Anchor(2**64 - 1, (1.5, -2.0, 0.0), 0.1, "no: 1, 'east'"), Anchor(3, (0.0, 0.0, 1.0))]
     )
@@ -49,7 +49,7 @@ def test_what_is_written_is_read_again():
         ("anchors: [{id: 1, x: 3000000, y: 0, z: 0}]", "millimetres?"),
     ],
 )
-def test_a_file_of_another_form_is_refused_in_words(text: str, told: str):
+def test_malformed_file_is_refused(text: str, told: str):
     with pytest.raises(ParameterError) as caught:
         parse_anchors(text, "a.yaml")
     assert told in str(caught.value)

@@ -27,7 +27,7 @@ def around(middle_m: float, sd_m: float, n: int = 400) -> np.ndarray:
 
 
 @pytest.mark.parametrize("radios", [1, 2])
-def test_the_offset_is_shared_by_the_radios_that_are_calibrated(radios: int):
+def test_offset_is_divided_among_the_calibrated_radios(radios: int):
     # 1 tick too few in one radio, 2.35 mm too far (APS014).
     found = find(around(5.01 + 0.235, 0.001), np.full(400, 3.0), 5.01, [NOMINAL] * radios)
     assert abs(found.antenna_delay - NOMINAL - 100 / radios) <= 1
@@ -44,13 +44,13 @@ def test_the_offset_is_shared_by_the_radios_that_are_calibrated(radios: int):
         (around(200.0, 0.02), 3.0, "an antenna delay of"),
     ],
 )
-def test_what_is_no_calibration_is_refused(ranges: np.ndarray, gap_db: float, says: str):
+def test_invalid_calibration_is_refused(ranges: np.ndarray, gap_db: float, says: str):
     with pytest.raises(UwbMitigationError, match=says):
         find(ranges, np.full(400, gap_db), 5.01, [NOMINAL, NOMINAL])
 
 
 @NEEDS_CC
-def test_the_delay_of_a_pair_is_found_and_written(tmp_path: Path):
+def test_antenna_delay_of_a_pair_is_estimated_and_written(tmp_path: Path):
     # The OTP memory of the modelled chips contains the delay: the settings override it.
     truth = NOMINAL + 173
     with EmulatedEvb1000s(boards=2, antenna_delay=truth) as boards:
@@ -68,7 +68,7 @@ def test_the_delay_of_a_pair_is_found_and_written(tmp_path: Path):
 
 
 @NEEDS_CC
-def test_a_tag_alone_takes_all_of_the_offset(tmp_path: Path):
+def test_single_tag_compensates_the_complete_offset(tmp_path: Path):
     with EmulatedEvb1000s(boards=2, antenna_delay=NOMINAL + 60, clean_m=5.01) as boards:
         anchor = RadioPort(
             opener("evb1000", boards.ports[1]), RadioSettings(role=Role.ANCHOR, antenna_delay=NOMINAL)
@@ -97,7 +97,7 @@ def test_a_tag_alone_takes_all_of_the_offset(tmp_path: Path):
         (("--distance", "5", "--port", "/dev/a", "-o", "absent/file"), "a folder that is there"),
     ],
 )
-def test_what_cannot_be_is_refused_at_once(options: tuple[str, ...], says: str, tmp_path: Path):
+def test_implausible_options_are_refused_immediately(options: tuple[str, ...], says: str, tmp_path: Path):
     done = command_line.run("board", "antenna-delay", *options, folder=tmp_path)
     assert done.returncode == 1
     assert says in done.stderr

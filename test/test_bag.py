@@ -92,7 +92,7 @@ def test_rosbags_opens_a_bag_and_agrees_on_every_field(tmp_path: Path, name: str
             assert {name: getattr(message, name) for name in expected} == expected
 
 
-def test_the_mcap_library_reads_a_bag_with_every_checksum_tested(tmp_path: Path) -> None:
+def test_mcap_library_reads_a_bag_with_every_checksum_tested(tmp_path: Path) -> None:
     write_bag(tmp_path / "bag", 20)
     with (tmp_path / "bag" / "bag_0.mcap").open("rb") as stream:
         reader = SeekingReader(stream, validate_crcs=True)
@@ -118,7 +118,7 @@ def test_the_mcap_library_reads_a_bag_with_every_checksum_tested(tmp_path: Path)
 
 
 @pytest.mark.parametrize("name", ["bag.mcap", "folder"])
-def test_a_bag_that_is_there_is_kept_unless_forced(tmp_path: Path, name: str) -> None:
+def test_existing_bag_is_kept_without_force(tmp_path: Path, name: str) -> None:
     path = write_bag(tmp_path / name, 5)
     with pytest.raises(RecordingError, match="--force"):
         write_bag(path, 2)
@@ -128,7 +128,7 @@ def test_a_bag_that_is_there_is_kept_unless_forced(tmp_path: Path, name: str) ->
 
 
 @pytest.mark.parametrize("name", ["bag.mcap", "folder"])
-def test_an_interrupted_writer_leaves_nothing(tmp_path: Path, name: str) -> None:
+def test_interrupted_writer_leaves_no_file(tmp_path: Path, name: str) -> None:
     def interrupted() -> None:
         with BagWriter(tmp_path / name, {}) as bag:
             bag.write(record(0))
@@ -139,7 +139,7 @@ def test_an_interrupted_writer_leaves_nothing(tmp_path: Path, name: str) -> None
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_failed_rewrite_leaves_the_old_bag(tmp_path: Path) -> None:
+def test_failed_replacement_keeps_the_old_bag(tmp_path: Path) -> None:
     path = write_bag(tmp_path / "bag.mcap")
     before = path.read_bytes()
     with pytest.raises(RecordingError), BagWriter(path, {}, force=True) as bag:
@@ -148,7 +148,7 @@ def test_a_failed_rewrite_leaves_the_old_bag(tmp_path: Path) -> None:
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["bag.mcap"]
 
 
-def test_a_full_disk_is_told_in_our_own_error(tmp_path: Path) -> None:
+def test_full_disk_raises_a_recording_error(tmp_path: Path) -> None:
     if not Path("/dev/full").exists():
         pytest.skip("no /dev/full on this system")
     (tmp_path / "bag.mcap.part").symlink_to("/dev/full")
@@ -166,21 +166,21 @@ def test_a_full_disk_is_told_in_our_own_error(tmp_path: Path) -> None:
         (("MSG: uwb_mitigation_msgs/Cir", "MSG: uwb_mitigation_msgs/Other"), "Cir is not defined"),
     ],
 )
-def test_a_schema_of_other_fields_is_told_apart(change: tuple[str, str], told: str) -> None:
+def test_schema_with_other_fields_is_detected(change: tuple[str, str], told: str) -> None:
     text = schemas.definition(RANGE_CIR_TYPE)
     assert change[0] in text
     assert re.search(told, schemas.difference(text.replace(*change), RANGE_CIR_TYPE) or "")
 
 
 @pytest.mark.parametrize("type_name", TYPES)
-def test_comments_and_constants_do_not_make_another_schema(type_name: str) -> None:
+def test_comments_and_constants_do_not_change_a_schema(type_name: str) -> None:
     bare, _ = schemas.typestore().generate_msgdef(type_name, ros_version=2)
     assert bare != schemas.definition(type_name)
     assert schemas.difference(bare, type_name) is None
 
 
 @pytest.mark.parametrize("version", [8, 9])
-def test_the_quality_of_service_of_a_copied_topic_comes_with_it(tmp_path: Path, version: int) -> None:
+def test_qos_of_a_copied_topic_is_copied(tmp_path: Path, version: int) -> None:
     latched = Qos(
         QosHistory.KEEP_LAST,
         1,

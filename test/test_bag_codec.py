@@ -97,7 +97,7 @@ def test_messages_equal_those_of_the_rosbags_library(
 
 
 @given(measurements, st.data())
-def test_a_message_cut_anywhere_is_refused(measurement: RangeMeasurement, data: st.DataObject) -> None:
+def test_truncated_message_is_refused(measurement: RangeMeasurement, data: st.DataObject) -> None:
     whole = codec.encode_range(measurement)
     cut = data.draw(st.integers(0, len(whole) - 1))
     with pytest.raises(RecordingError, match="ends early"):
@@ -126,7 +126,7 @@ def test_arbitrary_bytes_decode_or_are_refused(
         (28 + 56, b"\xff\xff\xff\xff", "ends early"),
     ],
 )
-def test_a_hostile_field_is_refused_by_name(at: int, value: bytes, what: str) -> None:
+def test_invalid_field_is_refused_and_named(at: int, value: bytes, what: str) -> None:
     data = bytearray(codec.encode_range(record(0).measurement))
     data[at : at + len(value)] = value
     with pytest.raises(RecordingError, match=what):
@@ -136,6 +136,6 @@ def test_a_hostile_field_is_refused_by_name(at: int, value: bytes, what: str) ->
 @pytest.mark.parametrize(
     "field", [{"tag_id": 2**64}, {"sequence": -1}, {"stamp_ns": 2**63}, {"range_m": 1e39}]
 )
-def test_a_value_that_does_not_fit_is_refused(field: dict[str, float]) -> None:
+def test_value_that_does_not_fit_is_refused(field: dict[str, float]) -> None:
     with pytest.raises(RecordingError, match="does not fit RangeCir"):
         codec.encode_range(replace(record(0).measurement, **field))

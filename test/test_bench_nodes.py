@@ -23,7 +23,7 @@ def own_domain(ros: Ros, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("ROS_DOMAIN_ID", str(ros.domain))
 
 
-def test_ranges_that_are_missing_are_counted_across_the_bags_end():
+def test_missing_ranges_are_counted_across_a_loop_of_the_bag():
     assert missing_between([5, 6, 7]) == 0
     assert missing_between([5, 6, 9]) == 2
     assert missing_between([RANGES - 2, RANGES - 1, 0, 1]) == 0
@@ -31,7 +31,7 @@ def test_ranges_that_are_missing_are_counted_across_the_bags_end():
     assert missing_between([]) == missing_between([3]) == 0
 
 
-def test_a_soak_tells_what_the_processes_took(own_domain: None, tmp_path: Path):
+def test_soak_reports_the_resources_of_the_processes(own_domain: None, tmp_path: Path):
     result = tmp_path / "soak.json"
     command = [sys.executable, "-m", "benchmarks", "soak", "--one-process"]
     command += ["--messages", "1500", "--rate", "1000", "--json", str(result)]

@@ -14,7 +14,7 @@ from benchmarks import radio
 pytestmark = NEEDS_CC
 
 
-def test_no_range_of_a_soak_is_wrong_and_every_chip_is_back_within_a_second():
+def test_soak_yields_no_wrong_range_and_every_chip_recovers_within_a_second():
     soaked = radio.soak(2000, seed=3, advance=lambda _: None)
     assert soaked.exchanges >= 2000
     assert soaked.delivered > 800
@@ -26,7 +26,7 @@ def test_no_range_of_a_soak_is_wrong_and_every_chip_is_back_within_a_second():
     assert sum(soaked.lost.values()) + soaked.delivered >= soaked.exchanges - 1
 
 
-def test_the_benchmark_writes_what_it_measured(tmp_path: Path):
+def test_benchmark_writes_what_it_measured(tmp_path: Path):
     output = tmp_path / "radio.json"
     arguments = ["radio", "--seconds", "0.5", "--exchanges", "300", "--evb1000", "0", "--json", str(output)]
     assert CliRunner().invoke(benchmarks.app, arguments, catch_exceptions=False).exit_code == 0

@@ -55,7 +55,7 @@ def sealed(model: onnx.ModelProto) -> bytes:
     return data[:start] + b"%08x" % zlib.crc32(blank) + data[start + 8 :]
 
 
-def test_what_is_saved_is_what_loads(saved):
+def test_saved_bundle_is_loaded_unchanged(saved):
     loaded = load_bundle(saved.path)
     assert loaded.card == saved.card
     assert loaded.model_id == saved.model_id
@@ -72,12 +72,12 @@ def test_float32_numbers_read_back_to_the_bit(tmp_path):
     assert loaded.card.variance_m2 == float(np.float32(0.3))
 
 
-def test_the_id_is_the_checksum_of_the_file_with_the_id_blank(saved):
+def test_id_is_the_checksum_of_the_file_with_the_id_blank(saved):
     data = saved.model.replace(b"%08x" % saved.model_id, b"00000000")
     assert zlib.crc32(data) == saved.model_id
 
 
-def test_any_changed_byte_is_found(saved):
+def test_any_changed_byte_is_detected(saved):
     generator = random.Random(1)
     for _ in range(400):
         position = generator.randrange(len(saved.model))
@@ -86,7 +86,7 @@ def test_any_changed_byte_is_found(saved):
         assert refused(bytes(damaged))
 
 
-def test_any_truncation_is_found(saved):
+def test_any_truncation_is_detected(saved):
     for length in range(0, len(saved.model), 97):
         if length:
             assert refused(saved.model[:length])
@@ -98,7 +98,7 @@ def test_random_bytes_are_refused():
         assert refused(generator.randbytes(length))
 
 
-def test_a_huge_file_is_refused_without_reading_it_whole(tmp_path):
+def test_huge_file_is_refused_without_reading_it(tmp_path):
     path = tmp_path / "huge.onnx"
     with path.open("wb") as file:
         file.truncate(1 << 40)
@@ -106,7 +106,7 @@ def test_a_huge_file_is_refused_without_reading_it_whole(tmp_path):
         load_bundle(path)
 
 
-def test_a_graph_that_onnx_runtime_cannot_run_is_refused(saved):
+def test_graph_that_onnx_runtime_cannot_run_is_refused(saved):
     model = onnx.load_model_from_string(saved.model)
     model.graph.node[0].domain = "other"
     assert refused(sealed(model))
@@ -136,14 +136,14 @@ def test_inconsistent_metadata_is_refused(saved, change):
     assert refused(with_metadata(saved.model, change))
 
 
-def test_without_a_prior_the_network_predicts_alone(saved):
+def test_without_a_linear_bias_model_only_the_network_predicts(saved):
     data = with_metadata(saved.model, lambda metadata: metadata.update(prior=None))
     loaded = parse_bundle(data, Path("some.onnx"))
     assert loaded.linear_bias == LinearBiasModel(0.0)
     assert not loaded.linear_bias.needs_power
 
 
-def test_a_card_that_does_not_fit_its_graph_is_not_written(tmp_path):
+def test_card_that_contradicts_its_graph_is_not_written(tmp_path):
     path = tmp_path / "wrong.onnx"
     with pytest.raises(ModelError):
         save_bundle(path, graph.float_model(random_weights(SHAPE)), card(SHAPE))
@@ -169,13 +169,13 @@ def test_weights_read_back_from_either_graph():
     ],
     ids=lambda path: path.stem,
 )
-def test_the_model_card_is_of_the_shipped_model(shipped):
+def test_model_card_is_of_the_shipped_model(shipped):
     text = shipped.with_suffix(".md").read_text(encoding="utf-8")
     assert f"Model id `{load_bundle(shipped).model_id:08x}`" in text
     assert f"{shipped.stat().st_size:,} bytes" in text
 
 
-def test_the_int8_graph_fuses_to_integer_operators(tmp_path):
+def test_int8_graph_fuses_to_integer_operators(tmp_path):
     model = bundle(tmp_path, Remnet())
     options = session_options()
     options.optimized_model_filepath = str(tmp_path / "optimised.onnx")
@@ -192,7 +192,7 @@ def test_the_int8_graph_fuses_to_integer_operators(tmp_path):
 
 
 @pytest.mark.parametrize("samples", [157, 8])
-def test_the_float_graph_computes_what_numpy_computes(tmp_path, samples):
+def test_float_graph_computes_what_numpy_computes(tmp_path, samples):
     shape = Remnet(samples=samples)
     weights = random_weights(shape)
     model = save_bundle(tmp_path / "float.onnx", graph.float_model(weights), card(shape, quantised=False))
@@ -200,7 +200,7 @@ def test_the_float_graph_computes_what_numpy_computes(tmp_path, samples):
     assert np.allclose(Session(model).predict_m(inputs), floating.predict_m(weights, inputs), atol=1e-5)
 
 
-def test_the_shipped_model_is_found_beside_an_installation(tmp_path, monkeypatch):
+def test_shipped_model_of_an_installation_is_found(tmp_path, monkeypatch):
     folder = tmp_path / "share" / "uwb_mitigation" / "models"
     folder.mkdir(parents=True)
     (folder / "universal.onnx").touch()

@@ -97,7 +97,7 @@ LEVEL = ("--anchors", "anchors.yaml", "--height", 1.0)
 WITH_TRUTH = ("--truth-topic", "/odom", "--time-offset", 0.3, "--lever-arm", "0.4,0.1,0")
 
 
-def test_a_drive_becomes_a_bundle_and_offsets_that_better_other_ranges(site):
+def test_drive_yields_a_bundle_and_offsets_that_improve_other_ranges(site):
     done = run(
         "calibrate",
         "drive.mcap",
@@ -135,7 +135,7 @@ def test_a_drive_becomes_a_bundle_and_offsets_that_better_other_ranges(site):
     assert (again.returncode, "--force" in again.stderr) == (1, True)
 
 
-def test_a_localisation_that_lags_tells_the_truth(site):
+def test_delayed_localisation_provides_the_truth(site):
     done = run(
         "calibrate",
         "drive.mcap",
@@ -195,7 +195,7 @@ def test_ranges_of_unknown_truth_are_held_out_with_their_segment():
         assert np.flatnonzero(found).tolist() == gone
 
 
-def test_a_localisation_needs_few_ranges_beside_it(site):
+def test_localisation_needs_few_ranges(site):
     done = run("calibrate", "few.mcap", *LEVEL, "-o", "few.onnx", "--json", "f.json", "--truth-topic", "/odom", "--estimate-lever-arm", "--force", folder=site)  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "no transform" not in done.stderr  # uwb_tag is the antenna itself
@@ -210,7 +210,7 @@ def figures(site, bag, *options):
     return json.loads((site / "f.json").read_text()), done
 
 
-def test_nine_gross_outliers_change_no_figure(site):
+def test_nine_gross_outliers_change_no_result(site):
     clean, _ = figures(site, "drive.mcap", "--height", 1.0)
     spoilt, done = figures(site, "gross.mcap", "--height", 1.0)
     assert (clean["outliers"], spoilt["outliers"]) == (0, 9)
@@ -239,7 +239,7 @@ def test_without_a_transform_the_lever_arm_is_zero(site):
     assert "no transform from base_link" in done.stderr
 
 
-def test_a_pair_with_few_ranges_gets_the_common_offset(site):
+def test_pair_with_few_ranges_gets_the_common_offset(site):
     """Its only range is later than the last pose of the localisation."""
     result, _ = figures(site, "rare.mcap", "--height", 1.0, *WITH_TRUTH)
     others = [result["offsets_m"][f"7-{anchor}"] for anchor in range(1, 5)]
@@ -259,14 +259,14 @@ def test_offsets_above_a_metre_are_refused(site):
     assert "and anchor 2;" in json.loads((site / "far.json").read_text())["refused"]
 
 
-def test_the_lever_arm_is_the_transform_to_the_frame_of_the_ranges(site):
+def test_lever_arm_is_the_transform_to_the_frame_of_the_ranges(site):
     result, done = figures(site, "rare.mcap", "--height", 1.0, "--truth-topic", "/odom")
     assert result["localisation"]["lever_arm_m"] == LEVER.tolist()
     assert result["localisation"]["lever_arm_sd_m"] == [0.0] * 3
     assert "no transform" not in done.stderr
 
 
-def test_what_is_refused_is_said_in_the_json_and_writes_nothing(site):
+def test_refusal_is_reported_in_the_json_and_writes_no_model(site):
     done = run("calibrate", "short.mcap", *LEVEL, "-o", "short.onnx", "--json", "s.json", folder=site)
     assert done.returncode == 1
     result = json.loads((site / "s.json").read_text())
@@ -292,7 +292,7 @@ def worse_position(fields):
 @pytest.mark.parametrize(
     ("change", "options"), [(no_range_gain, ()), (worse_scatter, ()), (worse_position, WITH_TRUTH)]
 )
-def test_a_calibration_without_gain_is_written_by_force_only(site, monkeypatch, change, options):
+def test_calibration_without_gain_is_written_only_with_force(site, monkeypatch, change, options):
     from uwb_mitigation.training import site_calibration
 
     make = site_calibration.SiteCalibration
@@ -342,7 +342,7 @@ def test_anchors_at_wrong_positions_are_named_with_truth_too(site, move, named, 
     assert not (site / "wrong.onnx").exists()
 
 
-def test_a_small_displacement_and_a_long_tail_accuse_no_anchor():
+def test_small_displacement_and_heavy_tail_accuse_no_anchor():
     from drives import HALL
 
     from uwb_mitigation.training.anchor_check import check_anchors
@@ -361,7 +361,7 @@ def test_a_small_displacement_and_a_long_tail_accuse_no_anchor():
         check_anchors(site, path.position, known)
 
 
-def test_a_tag_has_the_body_of_its_own_frame_in_any_namespace():
+def test_tag_is_matched_with_its_own_frame_in_any_namespace():
     from uwb_mitigation.commands.calibrate import _body
 
     assert _body(7, ["left/tag_7", "left/tag_8"], "x") == "left/tag_7"
@@ -371,7 +371,7 @@ def test_a_tag_has_the_body_of_its_own_frame_in_any_namespace():
             _body(7, names, "x")
 
 
-def test_the_lever_arm_is_read_from_every_bag_and_must_be_the_same(site, monkeypatch):
+def test_lever_arm_is_read_from_every_bag_and_must_be_the_same(site, monkeypatch):
     from uwb_mitigation.bag import pose_paths
     from uwb_mitigation.commands.calibrate import _lever_arm_in
 
@@ -383,7 +383,7 @@ def test_the_lever_arm_is_read_from_every_bag_and_must_be_the_same(site, monkeyp
         _lever_arm_in(["b", "c"], ["base_link"] * 2, ["antenna"])
 
 
-def test_cirs_bring_the_universal_network_in(tmp_path, monkeypatch):
+def test_recording_with_cirs_uses_the_universal_network(tmp_path, monkeypatch):
     """Without torch, whose candidate takes long: then it is said."""
     from uwb_mitigation.model.floating import float_network
     from uwb_mitigation.model.shipped import default_model_path

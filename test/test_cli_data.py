@@ -28,7 +28,7 @@ def write_bag(path: Path, count: int = 6) -> Path:
     return path
 
 
-def test_info_shows_and_tells_what_a_bag_holds(tmp_path: Path) -> None:
+def test_info_shows_the_contents_of_a_bag(tmp_path: Path) -> None:
     write_bag(tmp_path / "bag.mcap")
     done = start("data", "info", "bag.mcap", "--json", "info.json", folder=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -41,7 +41,7 @@ def test_info_shows_and_tells_what_a_bag_holds(tmp_path: Path) -> None:
     assert result["simulated"] is True
 
 
-def test_import_joins_recordings_and_keeps_that_they_were_simulated(tmp_path: Path) -> None:
+def test_import_joins_recordings_and_keeps_the_simulated_mark(tmp_path: Path) -> None:
     write_bag(tmp_path / "one.mcap")
     write_bag(tmp_path / "two", 3)
     done = start("data", "import", "one.mcap", "two", "-o", "out", "--json", "import.json", folder=tmp_path)
@@ -52,7 +52,7 @@ def test_import_joins_recordings_and_keeps_that_they_were_simulated(tmp_path: Pa
     assert json.loads((tmp_path / "import.json").read_text())["ranges"] == 9
 
 
-def test_a_damaged_bag_is_shown_as_far_as_it_goes_and_exits_1(tmp_path: Path) -> None:
+def test_damaged_bag_is_shown_up_to_the_damage_and_exits_1(tmp_path: Path) -> None:
     path = write_bag(tmp_path / "bag.mcap")
     ((_, end),) = chunk_offsets(path)
     path.write_bytes(path.read_bytes()[:end] + b"\x06\xff\xff\xff")
@@ -75,7 +75,7 @@ def test_a_damaged_bag_is_shown_as_far_as_it_goes_and_exits_1(tmp_path: Path) ->
     ],
 )
 @pytest.mark.parametrize("command", ["info", "import"])
-def test_bad_input_is_one_clear_line_and_exit_1(
+def test_invalid_input_prints_one_line_and_exits_1(
     tmp_path: Path, name: str, content: bytes | None, told: str, command: str
 ) -> None:
     if content is not None:
@@ -118,7 +118,7 @@ def test_all_apartment_logs_become_one_bag_that_rosbags_agrees_with(
             assert np.array_equal(message.cir.samples, measurement.cir.samples)
 
 
-def test_import_cuts_pauses_unless_told_not_to_and_says_so(tmp_path: Path) -> None:
+def test_import_shortens_pauses_by_default_and_reports_it(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "in.mcap", {"source": "a test"}) as bag:
         for stamp_ns in (10**18, 10**18 + 10**12):
             bag.write(Record(RangeMeasurement(stamp_ns, 5, 2, 0, 0, 4.5, Cir(np.zeros(2, np.int16)))))

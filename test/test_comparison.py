@@ -41,7 +41,7 @@ def mae(result: comparison.Comparison) -> dict[str, float]:
     return {row.name: row.mae_mean for row in result.rows}
 
 
-def test_every_row_is_there_in_order(found):
+def test_all_rows_are_in_order(found):
     assert tuple(row.name for row in found.rows) == comparison.NAMES
     assert (found.folds, found.seeds, found.configurations) == (3, 2, 12)
     for row in found.rows:
@@ -49,20 +49,20 @@ def test_every_row_is_there_in_order(found):
         assert row.ci95[0] <= row.ci95[1]
 
 
-def test_the_line_finds_the_line(found):
+def test_regression_recovers_the_line(found):
     maes = mae(found)
     assert max(maes["l1_line"], maes["shipped_float"], maes["shipped_int8"]) < 0.5 * maes["overall_median"]
     assert abs(maes["shipped_float"] - maes["shipped_int8"]) < 0.01
 
 
-def test_coverage_is_of_the_intervals_that_were_promised(found):
+def test_coverage_is_computed_from_the_stated_intervals(found):
     everything, by_label = found.coverage[""], {k: v for k, v in found.coverage.items() if k}
     assert 0 <= everything[0] <= everything[1] <= 1
     counts = [np.sum(dataset(12, 6, samples=8).labels == label) for label in by_label]
     assert np.array(counts) / 72 @ np.array(list(by_label.values())) == pytest.approx(everything)
 
 
-def test_measurements_without_powers_are_left_out():
+def test_measurements_without_levels_are_skipped():
     data = dataset(8, 4, samples=8)
     data.rx_power_dbm[data.configurations == "c0"] = np.nan
     found = comparison.run(data, RECIPE, Group.CONFIGURATION, folds=2, seeds=1)
@@ -74,7 +74,7 @@ def run(*arguments: object):
     return CliRunner().invoke(app, [str(value) for value in arguments], catch_exceptions=True)
 
 
-def test_the_command_writes_the_documented_keys(tmp_path, monkeypatch, found):
+def test_command_writes_the_documented_keys(tmp_path, monkeypatch, found):
     monkeypatch.setattr(recordings, "load", lambda *_: ("made up", dataset(12, 6, samples=8)))
     monkeypatch.setattr(comparison, "run", lambda *_: found)
     result = run(

@@ -18,7 +18,7 @@ from uwb_mitigation.measurement import Truth
 from uwb_mitigation.preprocessing import CirFault, Preprocessing
 
 
-def test_a_record_becomes_a_row():
+def test_record_becomes_a_row():
     records = [record(seed, f"c{seed}") for seed in range(3)]
     built = build_dataset(records, Preprocessing(157))
     _, expected = window_of(records[1].measurement.cir, Preprocessing(157))
@@ -30,7 +30,7 @@ def test_a_record_becomes_a_row():
     assert built.labels.tolist() == ["LOS"] * 3
 
 
-def test_what_is_left_out_is_counted_by_reason():
+def test_skipped_records_are_counted_by_reason():
     records = [
         record(),
         replace(record(), truth=None),
@@ -47,12 +47,12 @@ def test_what_is_left_out_is_counted_by_reason():
     }
 
 
-def test_a_power_that_is_not_finite_is_unknown():
+def test_power_that_is_not_finite_is_unknown():
     built = build_dataset([record(rx_power_dbm=-math.inf)], Preprocessing(157))
     assert np.isnan(built.rx_power_dbm).all()
 
 
-def test_nothing_usable_is_an_error_that_says_why():
+def test_data_without_usable_records_is_refused_with_the_reason():
     with pytest.raises(DatasetError, match="1 x no true range"):
         build_dataset([replace(record(), truth=None)], Preprocessing(157))
     with pytest.raises(DatasetError, match="no measurements"):
@@ -65,7 +65,7 @@ def test_nothing_usable_is_an_error_that_says_why():
     folds=st.integers(2, 8),
     seed=st.integers(0, 1000),
 )
-def test_no_configuration_is_on_both_sides_and_each_is_tested_once(names, folds, seed):
+def test_each_configuration_is_held_out_once_and_never_in_training(names, folds, seed):
     configurations = np.array(names)
     if len(set(names)) < folds:
         with pytest.raises(DatasetError):
@@ -79,7 +79,7 @@ def test_no_configuration_is_on_both_sides_and_each_is_tested_once(names, folds,
     assert np.array_equal(np.sort(tested), np.arange(len(names)))
 
 
-def test_thinning_leaves_at_most_so_many_of_each():
+def test_thinning_keeps_a_maximum_number_per_configuration():
     names = np.array(["a"] * 50 + ["b"] * 3)
     rows = splits.subsample(names, 10, 0)
     assert np.count_nonzero(names[rows] == "a") == 10

@@ -127,7 +127,7 @@ def counts(*oddities: Anomaly) -> dict[str, int]:
 
 
 @pytest.mark.parametrize("name", ["7.log", "7.log.xz"])
-def test_an_exchange_becomes_a_measurement_with_the_finals_cir(write, name):
+def test_exchange_becomes_a_measurement_with_the_cir_of_final(write, name):
     records, skipped = read(write(header(), exchange(5.644976), name=name))
     (measurement,) = [record.measurement for record in records]
     cir = measurement.cir
@@ -156,7 +156,7 @@ def test_stamps_continue_when_the_radios_counter_wraps(write):
 @pytest.mark.parametrize(
     "file", ["File:29991399-999999_x DecaRanging", "File:x, DecaRanging", "File:99990101-000000_DecaRanging"]
 )
-def test_an_invalid_start_time_becomes_the_epoch(write, file):
+def test_invalid_start_time_becomes_the_epoch(write, file):
     records, skipped = read(write(header(file), exchange(5.0)))
     assert records[0].measurement.stamp_ns == 250_000_000
     assert skipped == counts(Anomaly.NO_START_TIME)
@@ -187,7 +187,7 @@ def test_an_invalid_start_time_becomes_the_epoch(write, file):
         ("\x00\x01\xff garbage\n" + exchange(5.0), 6, []),
     ],
 )
-def test_a_malformed_exchange_keeps_its_range(write, text, samples, oddities):
+def test_malformed_exchange_keeps_its_range(write, text, samples, oddities):
     records, skipped = read(write(header(), text, exchange(6.0, 3.0)))
     assert [record.measurement.range_m for record in records] == [5.0, 6.0]
     assert [len(record.measurement.cir) for record in records] == [samples, 6]
@@ -199,7 +199,7 @@ def test_a_malformed_exchange_keeps_its_range(write, text, samples, oddities):
 
 
 @pytest.mark.parametrize("text", ["-1.#IND", "1.#QNAN", "nan", "inf", "1e999", "1e300", "five", "1_0"])
-def test_a_range_that_is_not_a_number_is_nan(write, text):
+def test_range_that_is_not_a_number_is_nan(write, text):
     records, skipped = read(write(header(), poll(0) + final(1) + ranged(text)))
     assert math.isnan(records[0].measurement.range_m)
     assert len(records[0].measurement.cir) == 6
@@ -225,7 +225,7 @@ def test_a_range_that_is_not_a_number_is_nan(write, text):
         dump(ramp(0), length=-1),
     ],
 )
-def test_a_malformed_accumulator_costs_the_cir_and_nothing_else(write, bad):
+def test_malformed_accumulator_loses_only_the_cir(write, bad):
     text = poll(0) + received(0x29, 1, bad) + ranged(5.0) + exchange(6.0, 1.0)
     records, skipped = read(write(header(), text))
     assert [record.measurement.range_m for record in records] == [5.0, 6.0]
@@ -237,7 +237,7 @@ def test_a_malformed_accumulator_costs_the_cir_and_nothing_else(write, bad):
 # ---- damage ----
 
 
-def test_a_log_cut_at_any_byte_yields_the_exchanges_before_the_cut(write):
+def test_log_cut_at_any_byte_yields_the_exchanges_before_the_cut(write):
     path = write(header(), exchange(1.0), exchange(2.0, 1.0), exchange(3.0, 2.0))
     data = path.read_bytes()
     line_ends = [match.end() for match in re.finditer(rb"Anchor ToF.*\r\n", data)]
@@ -262,7 +262,7 @@ def _noisy(count: int) -> list[str]:
     ]
 
 
-def test_a_truncated_or_corrupt_xz_stream_yields_what_was_before(write):
+def test_truncated_or_corrupt_xz_stream_yields_everything_before(write):
     path = write(header(), *_noisy(12), name="7.log.xz")
     whole, _ = read(path)
     data = path.read_bytes()
@@ -292,7 +292,7 @@ def test_a_truncated_or_corrupt_xz_stream_yields_what_was_before(write):
         ("a.log", None),
     ],
 )
-def test_what_is_no_log_is_rejected_by_name(tmp_path, name, data):
+def test_other_file_is_refused_and_named(tmp_path, name, data):
     path = tmp_path / name
     if data is not None:
         path.write_bytes(data)
@@ -317,7 +317,7 @@ def surveyed(write, tmp_path) -> Path:
 
 
 @pytest.mark.parametrize("inside", ["", "logs"])
-def test_a_folder_gives_truth_and_locations_in_order_of_time(surveyed, inside):
+def test_folder_gives_truth_and_locations_in_order_of_time(surveyed, inside):
     folder = open_decaranging(surveyed / inside)
     records = list(folder)
     assert [record.truth for record in records[::2]] == [
@@ -336,7 +336,7 @@ def test_a_folder_gives_truth_and_locations_in_order_of_time(surveyed, inside):
     assert next(iter(open_decaranging(surveyed / "logs" / "3.log.xz"))).truth == records[0].truth
 
 
-def test_a_log_without_a_survey_row_keeps_its_addresses(surveyed, write):
+def test_log_without_a_survey_row_keeps_its_addresses(surveyed, write):
     write(header(), exchange(9.0), name="flat/logs/5.log")
     write(header(), exchange(7.0), name="flat/logs/3.log")
     folder = DecaRangingFolder(surveyed)
@@ -348,7 +348,7 @@ def test_a_log_without_a_survey_row_keeps_its_addresses(surveyed, write):
     assert folder.skipped[Anomaly.NO_TRUTH.value] == 1
 
 
-def test_a_damaged_log_does_not_keep_the_others_from_being_read(surveyed):
+def test_damaged_log_does_not_stop_the_other_logs(surveyed):
     path = surveyed / "logs" / "3.log.xz"
     path.write_bytes(path.read_bytes()[:-30])
     folder = DecaRangingFolder(surveyed)
@@ -374,7 +374,7 @@ def test_a_damaged_log_does_not_keep_the_others_from_being_read(surveyed):
         ("tags.csv", "location,x,y\n" * 100_000, None),
     ],
 )
-def test_a_malformed_survey_is_rejected_with_file_and_line(surveyed, name, text, line):
+def test_malformed_survey_is_rejected_with_file_and_line(surveyed, name, text, line):
     if text is None:
         (surveyed / name).unlink()
     else:
@@ -422,7 +422,7 @@ def naive(data: bytes) -> tuple[Counter[str], list[tuple[float, list[bytes] | No
 
 
 @pytest.mark.slow
-def test_the_real_logs_equal_a_naive_reading(apartment):
+def test_real_logs_equal_those_of_a_naive_parser(apartment):
     # Logs with malformed parts (the data's README names them), and a regular one.
     for path in (apartment / "logs" / f"{number}.log.xz" for number in (6, 11, 27, 29, 36, 37, 46, 19)):
         expected_counts, exchanges = naive(lzma.decompress(path.read_bytes()))

@@ -52,7 +52,7 @@ def links(page: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))
-def test_links_between_pages_lead_somewhere(page: Path):
+def test_links_between_pages_are_valid(page: Path):
     local = [target for target in links(page) if not re.match(r"[a-z]+:", target)]
     targets = {target: (folder_of(page) / target).resolve() for target in local}
     assert [link for link, path in targets.items() if path not in GENERATED and not path.exists()] == []
@@ -111,12 +111,12 @@ def lines_of(*start: str) -> list:
 
 
 @pytest.mark.parametrize("words", lines_of("uwb-mitigation"))
-def test_a_command_that_is_typed_exists_with_its_options(words: list[str]):
+def test_commands_on_pages_exist_with_their_options(words: list[str]):
     check_options(typer.main.get_command(cli.app), words)
 
 
 @pytest.mark.parametrize("words", lines_of("python", "-m", "benchmarks"))
-def test_a_benchmark_that_is_typed_exists_with_its_options(words: list[str]):
+def test_benchmarks_on_pages_exist_with_their_options(words: list[str]):
     check_options(typer.main.get_command(benchmarks.app), words)
 
 
@@ -129,7 +129,7 @@ def check_options(command: Any, words: list[str]) -> None:
 
 
 @pytest.mark.parametrize("words", lines_of("make"))
-def test_a_make_target_that_is_typed_exists(words: list[str]):
+def test_make_targets_on_pages_exist(words: list[str]):
     targets = re.findall(r"^([a-z-]+):", (REPOSITORY / "Makefile").read_text(), re.M)
     assert [word for word in words if "=" not in word and word not in targets] == []
 
@@ -163,12 +163,12 @@ def check_node(words: list[str]) -> None:
 
 
 @pytest.mark.parametrize("words", lines_of("ros2", "run", "uwb_mitigation"))
-def test_a_node_that_is_run_takes_the_parameters_it_is_given(words: list[str]):
+def test_nodes_on_pages_have_the_given_parameters(words: list[str]):
     check_node(words)
 
 
 @pytest.mark.parametrize("words", lines_of("ros2", "param", "set"))
-def test_a_parameter_that_is_set_changes_live(words: list[str]):
+def test_parameters_set_on_pages_are_live(words: list[str]):
     node, name, value = words
     (row,) = [row for row in TABLES[node.removeprefix("/")] if row.name == name]
     assert row.live
@@ -176,7 +176,7 @@ def test_a_parameter_that_is_set_changes_live(words: list[str]):
 
 
 @pytest.mark.parametrize("words", lines_of("ros2", "launch", "uwb_mitigation"))
-def test_a_launch_line_starts_nodes(
+def test_launch_commands_on_pages_start_nodes(
     words: list[str], generate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.chdir(tmp_path)
@@ -185,7 +185,7 @@ def test_a_launch_line_starts_nodes(
     assert launch(generate, words[0], **dict(word.split(":=", 1) for word in words[1:]))
 
 
-def test_parameter_files_on_pages_hold_known_parameters():
+def test_parameter_files_on_pages_contain_known_parameters():
     found = [
         yaml.safe_load(block)
         for page in PAGES
@@ -200,7 +200,7 @@ def test_parameter_files_on_pages_hold_known_parameters():
 # Pages and the code that they describe.
 
 
-def test_the_source_on_the_page_is_read_corrected_and_written_to_a_bag(
+def test_source_on_the_page_is_read_corrected_and_written_to_a_bag(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     page = (REPOSITORY / "docs" / "guides" / "recordings.md").read_text()
@@ -238,7 +238,7 @@ def test_committed_generated_files_are_up_to_date():
     assert not stale, "run: python docs/generated.py"
 
 
-def test_the_templates_use_everything_that_can_be_generated():
+def test_templates_use_everything_that_can_be_generated():
     templates = "\n".join(page.read_text(encoding="utf-8") for page in generated.TEMPLATES.glob("*.md"))
     assert set(re.findall(r"^<!-- generated: (\w+) -->$", templates, re.M)) == set(generated.PARTS)
     assert not [path.name for path, text in GENERATED.items() if "<!-- generated" in text]
@@ -256,7 +256,7 @@ def test_the_templates_use_everything_that_can_be_generated():
         ("Message.msg", "# fine\nfloat32 range # m, anew\n", [2]),
     ],
 )
-def test_the_language_check_finds_expressions_outside_code(
+def test_language_check_finds_expressions_outside_code(
     tmp_path: Path, name: str, text: str, lines: list[int]
 ):
     (tmp_path / name).write_text(text, encoding="utf-8")

@@ -26,7 +26,7 @@ def states() -> dict[str, str]:
     return {finding.name: finding.state for finding in doctor.examine()}
 
 
-def test_a_library_that_cannot_be_imported_is_broken_unless_it_is_optional_and_missing(monkeypatch):
+def test_library_that_cannot_be_imported_is_broken_unless_it_is_optional_and_missing(monkeypatch):
     for module in ("numpy", "mcap", "bokeh"):
         monkeypatch.setitem(sys.modules, module, None)
     installed = doctor.metadata.distributions
@@ -62,7 +62,7 @@ def test_arithmetic_that_differs_by_one_bit_is_broken(monkeypatch: pytest.Monkey
     ("vendor", "allowed", "state"),
     [(0x2341, True, "ok"), (0x2341, False, "broken"), (None, False, None)],
 )
-def test_a_usb_port_without_permission_is_broken(monkeypatch, vendor, allowed, state):
+def test_usb_port_without_permission_is_broken(monkeypatch, vendor, allowed, state):
     port = SimpleNamespace(device="/dev/ttyACM7", vid=vendor, description="Nano 33 BLE")
     monkeypatch.setattr(list_ports, "comports", lambda: [port])
     monkeypatch.setattr(doctor.os, "access", lambda path, mode: allowed)

@@ -33,7 +33,7 @@ def driver(chip: Chip) -> Driver:
     return Driver(chip)
 
 
-def test_the_interrupt_line_is_status_and_mask_with_its_polarity(driver: Driver, chip: Chip):
+def test_interrupt_line_is_status_and_mask_with_its_polarity(driver: Driver, chip: Chip):
     assert not chip.irq()
     driver.set(0x0E, 0, dw.CPLOCK)
     assert chip.irq()
@@ -45,7 +45,7 @@ def test_the_interrupt_line_is_status_and_mask_with_its_polarity(driver: Driver,
 
 
 class TestClocks:
-    def test_spi_that_is_too_fast_before_the_pll_has_locked_reads_garbage(self, driver: Driver):
+    def test_spi_faster_than_3_mhz_before_the_pll_lock_reads_garbage(self, driver: Driver):
         driver.set(0x36, 0, 0x01, 1)
         seen = {driver.read(0x00) for _ in range(8)}
         assert ID not in seen
@@ -85,7 +85,7 @@ class TestReceiver:
         assert flight_ticks(a, b) == pytest.approx(3.0 / dw.TICK_M, abs=1)
 
 
-def test_a_driver_may_define_any_name_without_the_models_prefix(tmp_path: Path):
+def test_driver_may_define_any_name_without_the_prefix_of_the_model(tmp_path: Path):
     objects = model_objects()
     defined = run(["nm", "-g", "--defined-only", "-P", *objects]).splitlines()
     names = [line.split()[0] for line in defined if not line.endswith(":")]
@@ -110,7 +110,7 @@ def compiled(source: Path, program: Path) -> Path:
     return program
 
 
-def test_the_pages_program_prints_what_the_page_says(tmp_path: Path):
+def test_program_on_the_page_prints_the_shown_output(tmp_path: Path):
     page = (MODEL_FOLDER / "README.md").read_text(encoding="utf-8")
     (text,) = re.findall(r"```c\n(.*?)```", page, re.DOTALL)
     (promise,) = re.findall(r"prints `(.*?)` twice", page)

@@ -68,7 +68,7 @@ def await_kind(driver: dw1000.DW1000, kind: int, seconds: float) -> tuple[Simple
 
 
 @pytest.mark.parametrize("distance_m", [2.0, 40.0])
-def test_our_tag_ranges_with_it_as_anchor(air: Air, distance_m: float):
+def test_tag_ranges_with_an_independent_anchor(air: Air, distance_m: float):
     tag, anchor = air.chip(ppm=12.0, clock_ticks=WRAP - 10**9), air.chip(ppm=-9.0)
     air.link(tag, anchor, Link(distance_m, excess_m=0.5))
     ranges: list[RangeMeasurement] = []
@@ -97,7 +97,7 @@ def test_our_tag_ranges_with_it_as_anchor(air: Air, distance_m: float):
     assert all(len(measured.cir) == 157 for measured in ranges)
 
 
-def test_our_anchor_ranges_with_it_as_tag(air: Air):
+def test_anchor_ranges_with_an_independent_tag(air: Air):
     """It has no delayed send, and none that listens at once: SYS_CTRL and DX_TIME are written with its registers."""
     tag, anchor = air.chip(ppm=-15.0), air.chip(ppm=15.0, clock_ticks=WRAP - 10**9)
     air.link(tag, anchor, Link(12.5))
@@ -153,7 +153,7 @@ def test_our_anchor_ranges_with_it_as_tag(air: Air):
     assert sum(found) / len(found) == pytest.approx(12.5, abs=0.005)
 
 
-def test_frames_without_a_leading_edge_give_our_driver_no_range(air: Air):
+def test_frames_without_a_leading_edge_yield_no_range(air: Air):
     tag, anchor = air.chip(), air.chip()
     air.link(tag, anchor, Link(6.0))
     for chip in (tag, anchor):
@@ -167,7 +167,7 @@ def test_frames_without_a_leading_edge_give_our_driver_no_range(air: Air):
 
 
 @pytest.mark.parametrize("preamble", [1024, 4096])
-def test_times_that_are_left_open_grow_with_the_frames(air: Air, preamble: int):
+def test_default_delays_grow_with_the_frame_length(air: Air, preamble: int):
     slow = {"rate_kbps": 110, "preamble": preamble}
     tag, anchor = air.chip(ppm=5.0), air.chip(ppm=-5.0)
     air.link(tag, anchor, Link(6.0))

@@ -55,7 +55,7 @@ def test_help_lists_every_parameter_without_ros(node: str, tables: list[str], tm
         ("benchmarks", signal.SIGINT),
     ],
 )
-def test_a_signal_while_an_executable_still_loads_ends_it_at_once(
+def test_signal_during_the_import_ends_the_process_immediately(
     executable: str, number: signal.Signals, tmp_path: Path
 ):
     for package in ("rclpy", "typer"):
@@ -69,7 +69,7 @@ def test_a_signal_while_an_executable_still_loads_ends_it_at_once(
     assert (process.returncode, told) == (128 + number, "")
 
 
-def test_a_signal_while_a_node_loads_beside_the_graph_ends_it_at_once(tmp_path: Path):
+def test_signal_during_the_start_of_a_node_ends_it_immediately(tmp_path: Path):
     pytest.importorskip("rclpy")
     (tmp_path / "cobs.py").write_text("import time\nprint('loading', flush=True)\ntime.sleep(600)\n")
     process = run("driver", path=tmp_path)

@@ -47,12 +47,12 @@ def test_statistics_of_known_errors():
 
 
 @pytest.mark.parametrize("errors", [[], [np.nan], [1.0, np.inf]])
-def test_statistics_of_nothing_are_refused(errors):
+def test_statistics_without_data_are_refused(errors):
     with pytest.raises(DatasetError):
         ErrorStatistics.of(np.array(errors))
 
 
-def test_evaluation_is_the_live_path(tmp_path, recording):
+def test_evaluation_equals_live_correction(tmp_path, recording):
     mitigation = Mitigation(bundle(tmp_path, Remnet(samples=157)))
     outcome = evaluate(mitigation, recording)
     left = [mitigation.correct([item.measurement])[0].range_m - item.truth.range_m for item in recording]
@@ -62,7 +62,7 @@ def test_evaluation_is_the_live_path(tmp_path, recording):
     assert outcome.statuses == {"OK": 48}
 
 
-def test_a_range_passed_through_counts_as_it_is(tmp_path):
+def test_passed_through_range_counts_unchanged(tmp_path):
     mitigation = Mitigation(bundle(tmp_path, Remnet(samples=157)))
     outcome = evaluate(mitigation, [record(preamble_count=0)])
     assert outcome.corrected.mae == 0.25
@@ -70,7 +70,7 @@ def test_a_range_passed_through_counts_as_it_is(tmp_path):
 
 
 @pytest.mark.parametrize(("sigmas", "covered"), [(2.0, 0.0), (3.0, 1.0)])
-def test_the_intervals_are_those_that_the_bundle_promises(tmp_path, sigmas, covered):
+def test_intervals_are_those_of_the_bundle(tmp_path, sigmas, covered):
     # Every range passes through, and errs by 0.25 m: by 2.8 deviations.
     promised = {"interval95_sigmas": sigmas, "variance_uncorrected_m2": 1 / 128}
     mitigation = Mitigation(bundle(tmp_path, Remnet(samples=157), **promised))
@@ -78,7 +78,7 @@ def test_the_intervals_are_those_that_the_bundle_promises(tmp_path, sigmas, cove
     assert (outcome.coverage68, outcome.coverage95) == (0.0, covered)
 
 
-def test_what_has_no_truth_or_no_range_is_left_out(tmp_path):
+def test_records_without_truth_or_range_are_skipped(tmp_path):
     mitigation = Mitigation(bundle(tmp_path, Remnet(samples=157)))
     without_range = replace(record(), measurement=replace(record().measurement, range_m=np.nan))
     assert evaluate(mitigation, [record(), replace(record(), truth=None), without_range]).n == 1
@@ -121,13 +121,13 @@ def test_train_quantize_evaluate_from_end_to_end(tmp_path, recording):
     assert "optimistic" in result.output
 
 
-def test_an_int8_bundle_is_not_quantised_again(tmp_path, recording):
+def test_int8_bundle_is_not_quantised_again(tmp_path, recording):
     saved = bundle(tmp_path)
     result = run("quantize", saved.path, "--data", "any", "-o", tmp_path / "y.onnx")
     assert isinstance(result.exception, ModelError)
 
 
 @pytest.mark.parametrize("output", ["nowhere/x.onnx", "x.txt", "."])
-def test_a_place_that_cannot_be_written_is_refused_before_training(tmp_path, recording, output):
+def test_unwritable_output_is_refused_before_training(tmp_path, recording, output):
     result = run("train", "--data", "any", "-o", tmp_path / output)
     assert isinstance(result.exception, ParameterError)

@@ -85,13 +85,13 @@ def changed(mitigation: Mitigation, records: list[Record], change: Callable[[Cir
 
 
 @pytest.mark.parametrize("name", PERTURBED)
-def test_a_surveyed_sites_model_makes_strange_measurements_no_worse(name, mitigation, records):
+def test_site_model_does_not_worsen_out_of_distribution_measurements(name, mitigation, records):
     outcome = changed(mitigation, records, PERTURBED[name])
     assert outcome.corrected.mae <= 1.02 * outcome.raw.mae
 
 
 @pytest.mark.parametrize("decibels", [-14, -13, -12, -11])
-def test_a_radio_that_is_weaker_by_a_wall_or_two_is_made_worse_by_an_eighth_at_most(
+def test_radio_that_is_weaker_by_a_wall_or_two_is_made_worse_by_an_eighth_at_most(
     decibels, mitigation, records
 ):
     # A single range cannot distinguish a weaker radio in LOS from walls with the same attenuation.
@@ -100,17 +100,17 @@ def test_a_radio_that_is_weaker_by_a_wall_or_two_is_made_worse_by_an_eighth_at_m
     assert 1.02 < outcome.corrected.mae / outcome.raw.mae <= 1.12
 
 
-def test_what_cannot_be_familiar_says_so(mitigation, records):
+def test_inputs_that_cannot_be_in_distribution_are_reported(mitigation, records):
     assert set(changed(mitigation, records, noise).statuses) == {"OUT_OF_DISTRIBUTION"}
 
 
-def test_the_logs_themselves_are_familiar(mitigation, records):
+def test_training_logs_are_in_distribution(mitigation, records):
     outcome = evaluate(mitigation, records)
     assert set(outcome.statuses) == {"OK"}
     assert outcome.corrected.mae < 0.4 * outcome.raw.mae
 
 
-def test_the_simulated_flat_is_still_helped(mitigation):
+def test_model_still_improves_the_simulated_flat(mitigation):
     outcome = evaluate(mitigation, SimulatedSource(seed=1, count=600, rate_hz=40.0))
     assert outcome.corrected.mae < 0.75 * outcome.raw.mae
     assert set(outcome.statuses) == {"OK"}
@@ -137,7 +137,7 @@ def calibrated(records) -> list[Record]:
 
 
 @pytest.mark.parametrize("name", DAMAGED | LATE)
-def test_strange_measurements_are_not_made_worse(name, universal, calibrated):
+def test_out_of_distribution_measurements_do_not_get_worse(name, universal, calibrated):
     outcome = changed(universal, calibrated, PERTURBED[name])
     assert outcome.corrected.mae <= 1.02 * outcome.raw.mae
 
@@ -150,19 +150,19 @@ def test_late_windows_without_levels_are_mostly_not_corrected(name, most, calibr
 
 
 @pytest.mark.parametrize("decibels", [-25, *range(-20, -8), -7, -5, 0, 3, 5, 8, 10, 15, 20])
-def test_the_universal_model_harms_at_no_level(decibels, universal, calibrated):
+def test_universal_model_does_not_harm_at_any_level(decibels, universal, calibrated):
     outcome = changed(universal, calibrated, louder(decibels))
     assert outcome.corrected.mae <= 1.02 * outcome.raw.mae
 
 
-def test_the_universal_model_helps_where_it_never_was(universal, calibrated):
+def test_universal_model_improves_unseen_sites(universal, calibrated):
     outcome = evaluate(universal, calibrated)
     assert outcome.corrected.mae < 0.6 * outcome.raw.mae
     before, after = outcome.by_label["LOS"][1:]
     assert after <= before + 0.02
 
 
-def test_the_universal_model_leaves_of_the_real_logs_what_its_card_says(apartment_reading):
+def test_universal_model_reaches_the_error_of_its_card_on_the_real_logs(apartment_reading):
     bundle = load_bundle(default_model_path())
     found = zero_shot.run(build_dataset(apartment_reading.records, bundle.preprocessing), bundle)
     left = [np.abs(found.errors[f"universal{offset}"]).mean() for offset in ("_los_offset", "_offset")]
@@ -170,7 +170,7 @@ def test_the_universal_model_leaves_of_the_real_logs_what_its_card_says(apartmen
     assert left == pytest.approx([0.212, 0.202], abs=0.001)
 
 
-def test_the_universal_model_helps_in_simulated_rooms_by_amplitude():
+def test_universal_model_helps_in_simulated_rooms_by_amplitude():
     mitigation = Mitigation(load_bundle(default_model_path(Scaling.MAX)))
     outcome = evaluate(mitigation, SimulatedDeepUwb(seed=1, ranges=2000, exchanges=1))
     errors = [

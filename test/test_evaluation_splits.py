@@ -24,7 +24,7 @@ def placed(tags: list[int], anchors: list[int]):
 
 
 @pytest.mark.parametrize("group", list(Group))
-def test_no_configuration_lies_on_both_sides(group):
+def test_no_configuration_is_in_both_parts(group):
     data = placed([1, 1, 2, 2, 3, 4], [1, 2, 1, 2, 3, 4])
     for split in splits.by_group(data, group, 3, 0):
         assert not set(data.configurations[split.train]) & set(data.configurations[split.test])
@@ -37,7 +37,7 @@ def test_each_tag_location_is_left_out_once():
     assert held == [{1}, {2}, {3}]
 
 
-def test_a_configuration_that_holds_two_tags_is_not_split():
+def test_configuration_with_two_tags_is_not_split():
     data = replace(placed([1, 2, 3, 4], [1, 1, 2, 2]))
     data.configurations[:8] = "c0"
     for split in splits.by_group(data, Group.TAG, 6, 0):
@@ -47,14 +47,14 @@ def test_a_configuration_that_holds_two_tags_is_not_split():
 
 
 @pytest.mark.parametrize("group", [Group.TAG, Group.HALF])
-def test_one_place_does_not_make_a_split(group):
+def test_single_placement_cannot_be_split(group):
     with pytest.raises(DatasetError, match="2 or more"):
         splits.by_group(placed([1, 1], [1, 1]), group, 6, 0)
     with pytest.raises(DatasetError):
         splits.by_group(dataset(4, 2, samples=8), group, 6, 0)
 
 
-def test_the_bootstrap_draws_configurations_not_ranges():
+def test_bootstrap_draws_configurations_not_ranges():
     spread = np.random.default_rng(0).normal(0, 1, 40)
     few, many = (
         bootstrap_interval(np.repeat(spread, n), np.repeat(np.arange(40).astype(str), n)) for n in (1, 50)
@@ -63,13 +63,13 @@ def test_the_bootstrap_draws_configurations_not_ranges():
     assert few[0] < np.abs(spread).mean() < few[1]
 
 
-def test_the_largest_variances_are_rejected_first():
+def test_largest_variances_are_rejected_first():
     errors = np.array([1.0, -5.0, 2.0, 4.0])
     assert mae_after_rejection(errors, np.array([1.0, 4.0, 2.0, 3.0]), 0.5) == 1.5
     assert mae_after_rejection(errors, errors**2, 0.0) == 3.0
 
 
-def test_intervals_cover_configurations_to_come():
+def test_intervals_cover_unseen_configurations():
     generator = np.random.default_rng(1)
     narrow, wide = [], []
     for _ in range(60):
@@ -82,7 +82,7 @@ def test_intervals_cover_configurations_to_come():
     assert 0.90 <= np.mean(wide) <= 0.98
 
 
-def test_a_configuration_counts_once_however_long_it_was_recorded():
+def test_configurations_have_equal_weight():
     errors = np.where(NAMES == "c0", 3.0, 0.1)
     once = calibrate(errors, np.zeros(200), NAMES)
     long = np.concatenate([errors, np.full(2000, 3.0)])
@@ -91,12 +91,12 @@ def test_a_configuration_counts_once_however_long_it_was_recorded():
     assert once.variance_m2 == pytest.approx(0.01, rel=1e-3)
 
 
-def test_intervals_of_nothing_are_refused():
+def test_intervals_without_data_are_refused():
     with pytest.raises(DatasetError):
         calibrate(np.array([np.nan]), np.array([0.0]), np.array(["a"]))
 
 
-def test_features_are_finite_whatever_a_header_leaves_out():
+def test_features_are_finite_if_header_fields_are_missing():
     data = dataset(3, 4, samples=64)
     data.rx_power_dbm[:] = np.nan
     data.inputs[0] = 0
@@ -104,7 +104,7 @@ def test_features_are_finite_whatever_a_header_leaves_out():
     assert np.isfinite(baselines.features(data, header=True)).all()
 
 
-def test_regressions_find_what_the_header_tells(monkeypatch):
+def test_regressions_use_the_header(monkeypatch):
     monkeypatch.setattr(baselines, "TREES", 20)
     pytest.importorskip("sklearn", reason="run `make setup-training`")
     data = dataset(30, 8, samples=32)

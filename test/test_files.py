@@ -15,7 +15,7 @@ from uwb_mitigation.files import partial_path, read_bounded, write_all_atomicall
 @pytest.mark.parametrize(
     ("name", "told"), [("absent", "no such file"), (".", "no such file"), ("empty", "empty")]
 )
-def test_what_holds_nothing_is_refused_by_name_and_with_what_would_be_valid(
+def test_empty_file_is_refused_with_its_name_and_the_valid_content(
     tmp_path: Path, name: str, told: str
 ) -> None:
     (tmp_path / "empty").touch()
@@ -24,7 +24,7 @@ def test_what_holds_nothing_is_refused_by_name_and_with_what_would_be_valid(
     assert caught.value.where == str(tmp_path / name)
 
 
-def test_a_link_is_followed_and_stays(tmp_path: Path) -> None:
+def test_symbolic_link_is_followed_and_kept(tmp_path: Path) -> None:
     link, target = tmp_path / "link", tmp_path / "target"
     link.symlink_to(target)
     write_atomically(link, b"new")
@@ -32,7 +32,7 @@ def test_a_link_is_followed_and_stays(tmp_path: Path) -> None:
     assert target.read_bytes() == b"new"
 
 
-def test_a_pipe_is_written_to_and_stays(tmp_path: Path) -> None:
+def test_pipe_is_written_to_and_kept(tmp_path: Path) -> None:
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
     read: list[str] = []
@@ -44,7 +44,7 @@ def test_a_pipe_is_written_to_and_stays(tmp_path: Path) -> None:
     assert pipe.is_fifo()
 
 
-def test_a_disk_that_fills_leaves_what_was_there_and_nothing_beside_it(tmp_path: Path) -> None:
+def test_full_disk_keeps_the_old_file_and_leaves_no_partial_file(tmp_path: Path) -> None:
     if not Path("/dev/full").exists():
         pytest.skip("no /dev/full on this system")
     path = tmp_path / "file"
@@ -57,7 +57,7 @@ def test_a_disk_that_fills_leaves_what_was_there_and_nothing_beside_it(tmp_path:
 
 
 @pytest.mark.parametrize("order", [1, -1])
-def test_of_files_that_belong_together_all_are_written_or_none(tmp_path: Path, order: int) -> None:
+def test_files_that_belong_together_are_written_atomically(tmp_path: Path, order: int) -> None:
     path = tmp_path / "file"
     path.write_text("old")
     pair = {path: "new", tmp_path / "absent/file": b"new"}
@@ -71,7 +71,7 @@ def test_of_files_that_belong_together_all_are_written_or_none(tmp_path: Path, o
 
 
 @pytest.mark.parametrize("place", ["absent/file", "link"])
-def test_a_place_that_cannot_be_written_is_named(tmp_path: Path, place: str) -> None:
+def test_unwritable_path_is_named(tmp_path: Path, place: str) -> None:
     (tmp_path / "link").symlink_to(tmp_path / "link")
     with pytest.raises(ModelError, match="cannot be written") as caught:
         write_atomically(tmp_path / place, "new", ModelError)

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
         firmware_models.mlp_bundle,
     ],
 )
-def test_the_firmware_gives_the_corrected_ranges_of_onnx_runtime(
+def test_firmware_gives_the_corrected_ranges_of_onnx_runtime(
     bundle_in: Callable[[Path], Bundle], tmp_path: Path
 ):
     bundle = bundle_in(tmp_path)
@@ -55,7 +55,7 @@ def test_the_firmware_gives_the_corrected_ranges_of_onnx_runtime(
     assert statuses >= {Status.OK, Status.NO_CIR, Status.BAD_CIR, Status.OUT_OF_DISTRIBUTION}
 
 
-def test_without_a_compiler_the_error_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_missing_compiler_is_named_with_the_remedy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.delenv("CC", raising=False)
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(MissingDependencyError, match="apt install gcc"):
@@ -63,7 +63,7 @@ def test_without_a_compiler_the_error_says_what_to_install(tmp_path: Path, monke
 
 
 @pytest.mark.parametrize("words", ["", "  ", "cc", "cc -O2 -g"])
-def test_cc_may_be_empty_and_may_carry_options(words: str, monkeypatch: pytest.MonkeyPatch):
+def test_cc_may_be_empty_or_contain_options(words: str, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("CC", words)
     monkeypatch.setattr(compiling.shutil, "which", lambda name: {"cc": "/usr/bin/cc"}.get(name))
     assert compiling.c_compiler() == tuple(words.split() or ["cc"])
@@ -74,7 +74,7 @@ def test_cc_may_be_empty_and_may_carry_options(words: str, monkeypatch: pytest.M
 
 @NEEDS_CC
 @pytest.mark.ros
-def test_a_mitigator_that_is_told_to_corrects_with_the_firmware(
+def test_mitigator_corrects_with_the_firmware_backend(
     ros: Ros, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     from rclpy.serialization import deserialize_message

@@ -15,7 +15,7 @@ from uwb_mitigation.errors import MissingDependencyError
 from uwb_mitigation.firmware_export import toolchain
 
 
-def test_export_c_writes_the_header_and_says_where(tmp_path: Path):
+def test_export_c_writes_the_header_and_prints_its_path(tmp_path: Path):
     bundle = firmware_models.exact_bundle(tmp_path)
     result = tmp_path / "result.json"
     arguments = ("--model", str(bundle.path), "-o", str(tmp_path / "c"), "--json", str(result))
@@ -28,7 +28,7 @@ def test_export_c_writes_the_header_and_says_where(tmp_path: Path):
 
 
 @pytest.mark.skipif(bool(toolchain.missing_tools()), reason=toolchain.APT)
-def test_bench_firmware_reports_the_promised_keys(tmp_path: Path):
+def test_bench_firmware_writes_the_documented_keys(tmp_path: Path):
     bundle = firmware_models.exact_bundle(tmp_path, 8)
     result = tmp_path / "result.json"
     arguments = ["firmware", "--model", str(bundle.path), "--inputs", "20", "--json", str(result)]
@@ -43,7 +43,7 @@ def test_bench_firmware_reports_the_promised_keys(tmp_path: Path):
         assert row["instructions"] < row["cycles_estimated"] < 2 * row["instructions"]
 
 
-def test_missing_tools_are_named_with_the_line_that_installs_them(monkeypatch: pytest.MonkeyPatch):
+def test_missing_tools_are_named_with_the_install_command(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("PATH", "/nonexistent")
     with pytest.raises(MissingDependencyError, match=r"qemu-system-arm.*apt install gcc-arm-none-eabi"):
         toolchain.require_tools()

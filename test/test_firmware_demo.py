@@ -16,7 +16,7 @@ pytestmark = pytest.mark.ros
 
 
 @pytest.mark.skipif(bool(MISSING), reason=f"{', '.join(MISSING)} not found: {toolchain.APT}")
-def test_the_demo_ends_by_itself_with_every_range_equal_to_the_hosts():
+def test_demo_ends_with_every_range_equal_to_that_of_the_host():
     command = [sys.executable, "-m", "benchmarks", "firmware-demo", "--count", "20"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=240, check=False)
     assert done.returncode == 0, done.stdout + done.stderr

@@ -141,7 +141,7 @@ def test_good_and_hostile_measurements_are_corrected_as_by_the_mitigator(tmp_pat
     assert check_corrections(firmware_models.exact_bundle(tmp_path), measurements, tmp_path) == {0, 1, 2, 3}
 
 
-def test_what_is_strange_to_the_model_is_graded_as_by_the_mitigator(tmp_path: Path):
+def test_out_of_distribution_measurements_are_corrected_as_by_the_mitigator(tmp_path: Path):
     random = np.random.default_rng(4)
     measurements = [firmware_models.random_measurement(random) for _ in range(300)]
     check_corrections(firmware_models.choosy_bundle(tmp_path), measurements, tmp_path, 0.22)
@@ -157,7 +157,7 @@ def test_real_logs_are_corrected_as_by_the_mitigator(shipped: Path, apartment: P
     assert 0 in check_corrections(load_bundle(shipped), measurements, tmp_path)
 
 
-def test_a_burst_into_the_boards_port_is_answered_whole(tmp_path: Path):
+def test_burst_into_the_serial_port_is_answered_completely(tmp_path: Path):
     bundle = firmware_models.exact_bundle(tmp_path, 8)
     measured = [window_of(model_material.measurement(seed=seed), 8) for seed in range(50)]
     encoder, decoder, answers = FrameEncoder(), FrameDecoder(), []
@@ -183,7 +183,7 @@ def test_a_burst_into_the_boards_port_is_answered_whole(tmp_path: Path):
         assert np.array_equal(bits([sent.range_m, sent.correction_m, sent.variance_m2]), bits(values))
 
 
-def test_the_shipped_model_fits_and_its_size_is_that_of_the_file(tmp_path: Path):
+def test_shipped_model_fits_and_has_the_size_of_its_file(tmp_path: Path):
     export_bundle(load_bundle(default_model_path()), tmp_path)
     image = emulator.measure_size(tmp_path, tmp_path)
     assert image.flash_bytes < 24 << 10
@@ -192,7 +192,7 @@ def test_the_shipped_model_fits_and_its_size_is_that_of_the_file(tmp_path: Path)
     assert (image.flash_bytes, image.static_bytes) == (text + data, data + bss)
 
 
-def test_the_image_of_the_dwm1001_dev_fits_it_and_is_written_as_hex(tmp_path: Path):
+def test_image_of_the_dwm1001_dev_fits_and_is_written_as_hex(tmp_path: Path):
     done = command_line.run(
         "board", "build-image", "-o", "radio.hex", "--json", "image.json", folder=tmp_path
     )
@@ -208,7 +208,7 @@ def test_the_image_of_the_dwm1001_dev_fits_it_and_is_written_as_hex(tmp_path: Pa
 
 
 @pytest.mark.parametrize("cpu", ["cortex-m0", "cortex-m3", "cortex-m7", "cortex-m33"])
-def test_the_library_compiles_without_warnings_for_other_processors(cpu: str, tmp_path: Path):
+def test_library_compiles_without_warnings_for_other_processors(cpu: str, tmp_path: Path):
     sources = firmware_folder() / "src"
     command = ("arm-none-eabi-gcc", f"-mcpu={cpu}", "-mthumb", "-std=c99", *WARNINGS, f"-I{sources}")
     # What -Os would find beyond the syntax, the Cortex-M4's images show.

@@ -32,19 +32,19 @@ def test_floats_read_back_to_the_same_bits():
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), 0.1, 1e300])
-def test_what_is_no_finite_float32_is_refused(value: float):
+def test_value_that_is_not_a_finite_float32_is_refused(value: float):
     with pytest.raises(ModelError, match="float32"):
         number(value)
 
 
-def test_the_shipped_model_is_exported_with_its_identity(tmp_path: Path):
+def test_shipped_model_is_exported_with_its_identity(tmp_path: Path):
     bundle = load_bundle(default_model_path())
     text = export_bundle(bundle, tmp_path / "new" / "folder").read_text()
     assert f"0x{bundle.model_id:08x}u" in text
     assert number(bundle.linear_bias.per_rx_power) in text
 
 
-def test_a_float_bundle_is_refused_with_the_remedy(tmp_path: Path):
+def test_float_bundle_is_refused_with_the_remedy(tmp_path: Path):
     architecture = Remnet(samples=32)
     model = graph.float_model(model_material.random_weights(architecture))
     bundle = save_bundle(tmp_path / "float.onnx", model, model_material.card(architecture, quantised=False))
@@ -69,7 +69,7 @@ def test_shapes_without_kernels_are_refused(architecture: Remnet, names: str):
         pack(model_material.random_int8(architecture))
 
 
-def test_a_scale_without_exact_integers_is_refused_by_layer_and_channel():
+def test_scale_without_exact_integers_is_refused_by_layer_and_channel():
     weights = random_networks.remnet(16, 3)
     scales = weights.weight_scale["module2.skip"].copy()
     # A requantisation by 1/64: every 64th accumulator is a tie, and ties go to even.
@@ -80,14 +80,14 @@ def test_a_scale_without_exact_integers_is_refused_by_layer_and_channel():
         pack(inexact)
 
 
-def test_a_sum_without_exact_integers_is_refused_by_name():
+def test_sum_without_exact_integers_is_refused_by_name():
     weights = random_networks.remnet(16, 3)
     scales = {**weights.activation_scale, "module1.sum": weights.activation_scale["first"] / np.float32(3)}
     with pytest.raises(ModelError, match=r"module1\.sum"):
         pack(replace(weights, activation_scale=scales))
 
 
-def test_a_hostile_name_cannot_end_the_comment(tmp_path: Path):
+def test_hostile_name_cannot_end_a_c_comment(tmp_path: Path):
     weights = random_networks.remnet(16, 3)
     name = '*/ #include "/etc/passwd" /*\n'
     text = firmware_models.write_model(tmp_path, weights, name=name).read_text()

@@ -129,7 +129,7 @@ def test_golden_frames_are_decoded_and_encoded_to_the_byte(library: ctypes.CDLL,
 
 
 @pytest.mark.parametrize("vector", words("reject"), ids=lambda vector: vector[0])
-def test_golden_rejects_raise_their_count(library: ctypes.CDLL, vector: list[str]):
+def test_rejected_golden_frames_increment_their_counter(library: ctypes.CDLL, vector: list[str]):
     _, kind, wire = vector
     frame, counts = decode(library, bytes.fromhex(wire))
     if kind in KINDS:
@@ -205,7 +205,7 @@ def damaged(payload: bytes, random: np.random.Generator) -> bytes:
 
 
 @pytest.mark.parametrize("mode", list(Mode))
-def test_a_board_in_c_sends_what_the_board_in_python_sends(library: ctypes.CDLL, bundle: Bundle, mode: Mode):
+def test_board_in_c_sends_what_the_board_in_python_sends(library: ctypes.CDLL, bundle: Bundle, mode: Mode):
     random = np.random.default_rng(5)
     python, c, host, radio = (
         python_board(bundle, mode),
@@ -243,7 +243,7 @@ def test_a_board_in_c_sends_what_the_board_in_python_sends(library: ctypes.CDLL,
     c.close()
 
 
-def test_a_host_of_another_version_is_told_this_one(library: ctypes.CDLL, bundle: Bundle):
+def test_host_of_another_version_receives_the_version_of_the_board(library: ctypes.CDLL, bundle: Bundle):
     python, c = python_board(bundle, Mode.HOST), BoardInC(library, Mode.HOST)
     python.hello(0)
     data = FrameEncoder(version=9).encode(MessageType.GET_INFO, b"")
@@ -251,7 +251,7 @@ def test_a_host_of_another_version_is_told_this_one(library: ctypes.CDLL, bundle
     c.close()
 
 
-def test_a_board_without_a_model_stays_in_host_mode(library: ctypes.CDLL):
+def test_board_without_a_model_stays_in_host_mode(library: ctypes.CDLL):
     c = BoardInC(library, Mode.DEVICE, with_model=False)
     (frame,) = FrameDecoder().feed(
         c.receive(FrameEncoder().encode(*messages.encode(SetMode(Mode.DEVICE))), 1)
@@ -262,7 +262,7 @@ def test_a_board_without_a_model_stays_in_host_mode(library: ctypes.CDLL):
     c.close()
 
 
-def test_a_host_that_does_not_read_costs_whole_measurements_and_leaves_room_for_status(library: ctypes.CDLL):
+def test_slow_host_loses_complete_measurements_but_no_status(library: ctypes.CDLL):
     c = BoardInC(library, Mode.HOST, queue=9000)
     measured = firmware_models.random_measurement(np.random.default_rng(3))
     wire = FrameEncoder().encode(*messages.encode(measured))
@@ -278,7 +278,7 @@ def test_a_host_that_does_not_read_costs_whole_measurements_and_leaves_room_for_
     c.close()
 
 
-def test_a_clock_request_is_answered_before_all_that_waits(library: ctypes.CDLL):
+def test_clock_request_is_answered_before_queued_messages(library: ctypes.CDLL):
     c = BoardInC(library, Mode.HOST)
     measured = firmware_models.random_measurement(np.random.default_rng(6))
     wire = FrameEncoder().encode(*messages.encode(measured))
@@ -299,7 +299,7 @@ def test_a_clock_request_is_answered_before_all_that_waits(library: ctypes.CDLL)
     c.close()
 
 
-def test_damage_on_the_radios_side_is_told_in_a_log(library: ctypes.CDLL):
+def test_damage_on_the_side_of_the_radio_is_logged(library: ctypes.CDLL):
     c = BoardInC(library, Mode.HOST)
     assert c.measure(b"\0\x05ab\0", 5) == b""
     status, log = FrameDecoder().feed(c.tick(1_000_000))

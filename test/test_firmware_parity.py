@@ -81,9 +81,7 @@ def test_any_length_and_number_of_modules(samples: int, modules: int, tmp_path: 
 
 @pytest.mark.filterwarnings("ignore:overflow")
 @pytest.mark.parametrize("sign", [-1, 1])
-def test_a_prediction_that_overflows_is_a_failure_of_the_model_as_for_the_mitigator(
-    sign: int, tmp_path: Path
-):
+def test_overflowing_prediction_is_a_model_error_as_in_the_mitigator(sign: int, tmp_path: Path):
     weights = random_networks.remnet(16, 3)
     scales = {**weights.weight_scale, HEAD: np.array([1e31], np.float32)}
     model = graph.int8_model(replace(weights, weight_scale=scales))
@@ -133,7 +131,7 @@ def test_golden_vectors_pass_under_the_sanitizers(tmp_path: Path):
     assert "0 of 8 golden vectors wrong" in run([program])
 
 
-def test_golden_vectors_notice_a_changed_weight(tmp_path: Path):
+def test_golden_vectors_detect_a_changed_weight(tmp_path: Path):
     header = firmware_models.write_model(tmp_path, random_networks.remnet(16, 3))
     text = header.read_text()
     start = text.index("{\n", text.index("uwb_module1_residual_weights[")) + 2
@@ -144,7 +142,7 @@ def test_golden_vectors_notice_a_changed_weight(tmp_path: Path):
 
 
 @pytest.mark.parametrize("scaling", list(Scaling))
-def test_arbitrary_cirs_break_no_promise_under_the_sanitizers(scaling: Scaling, tmp_path: Path):
+def test_arbitrary_cirs_pass_the_sanitizers(scaling: Scaling, tmp_path: Path):
     firmware_models.write_model(
         tmp_path,
         random_networks.remnet(16, 3),
@@ -157,7 +155,7 @@ def test_arbitrary_cirs_break_no_promise_under_the_sanitizers(scaling: Scaling, 
     assert {0, 4, 5, 6, 7, 9, 12, 14} <= statuses
 
 
-def test_arbitrary_bytes_break_no_promise_of_a_board_under_the_sanitizers(tmp_path: Path):
+def test_arbitrary_bytes_to_a_board_pass_the_sanitizers(tmp_path: Path):
     firmware_models.write_model(tmp_path, random_networks.remnet(16, 3))
     run([build_program("fuzz_link", tmp_path, ADDRESS_SANITIZED), "1000", "1"])
 
@@ -198,7 +196,7 @@ def test_every_source_with_float_arithmetic_refuses_fast_math(name: str):
 
 
 @NEEDS_CXX
-def test_a_sketch_in_cpp_can_include_the_model(tmp_path: Path):
+def test_sketch_in_cpp_can_include_the_model(tmp_path: Path):
     firmware_models.write_model(tmp_path, random_networks.remnet(16, 3))
     sketch = tmp_path / "sketch.cpp"
     sketch.write_text('#include "uwb_model.h"\nuint32_t id() { return uwb_model_data.model_id; }\n')

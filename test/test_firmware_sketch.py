@@ -38,14 +38,14 @@ def compile_sketch(name: str, folder: Path, compiler: tuple[str, ...], *files: s
     return program
 
 
-def test_the_sketchs_model_is_the_shipped_one(tmp_path: Path):
+def test_sketch_contains_the_shipped_model(tmp_path: Path):
     export_bundle(load_bundle(default_model_path()), tmp_path)
     expected = (tmp_path / "uwb_model.h").read_text()
     assert (SKETCH / "uwb_model.h").read_text() == expected, f"uwb-mitigation board export-c -o {SKETCH}"
 
 
 @NEEDS_CXX
-def test_the_sketch_corrects_what_the_radio_sends_in_writes_that_are_safe_on_usb(tmp_path: Path):
+def test_sketch_corrects_ranges_and_writes_blocks_that_are_safe_on_usb(tmp_path: Path):
     export_bundle(load_bundle(default_model_path()), tmp_path)
     files = (str(STUB / "main.cpp"), *library_objects(), "-lm")
     program = compile_sketch("UwbMitigation", tmp_path, ("c++", "-std=gnu++14", "-O1"), *files)
@@ -78,7 +78,7 @@ def test_the_sketch_corrects_what_the_radio_sends_in_writes_that_are_safe_on_usb
 
 @pytest.mark.skipif(shutil.which("arm-none-eabi-g++") is None, reason="apt install gcc-arm-none-eabi")
 @pytest.mark.parametrize("name", ["UwbMitigation", "UwbRanger"])
-def test_the_sketches_compile_for_the_boards_processor(tmp_path: Path, name: str):
+def test_sketches_compile_for_the_boards_processor(tmp_path: Path, name: str):
     """As the Arduino core for the nRF52840 compiles, but for its headers: sizes of types, warnings, what is inlined."""
     export_bundle(load_bundle(default_model_path()), tmp_path)
     cpu = ("-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=softfp", "-mfpu=fpv4-sp-d16")
@@ -87,7 +87,7 @@ def test_the_sketches_compile_for_the_boards_processor(tmp_path: Path, name: str
 
 @NEEDS_CXX
 @pytest.mark.parametrize("with_model", [False, True], ids=["without a model", "with one"])
-def test_the_sketch_with_a_radio_ranges_on_a_modelled_chip(tmp_path: Path, with_model: bool):
+def test_sketch_with_a_radio_ranges_on_a_modelled_chip(tmp_path: Path, with_model: bool):
     if with_model:
         export_bundle(load_bundle(default_model_path()), tmp_path)
     files = (str(STUB / "radio_main.cpp"), *library_objects(), *model_objects(), "-lm", "-lpthread")

@@ -29,7 +29,7 @@ def test_layers_hold_and_only_nodes_import_rclpy_and_only_training_torch():
 
 @NEEDS_CC
 @pytest.mark.parametrize("folder", ["firmware/src", "benchmarks/dw1000_model/chip"])
-def test_the_modules_of_the_firmware_do_not_call_each_other_in_circles(folder: str):
+def test_modules_of_the_firmware_do_not_call_each_other_in_circles(folder: str):
     sources = REPOSITORY / folder
     objects = compile_objects(("cc",), (f"-I{sources}",), tuple(sorted(sources.glob("*.c"))))
     symbols = {path: [line.split() for line in run(["nm", "-gP", path]).splitlines()] for path in objects}
@@ -68,13 +68,13 @@ def run_without(package: str, *words: object) -> subprocess.CompletedProcess[str
         ("cobs", ("board", "emulate", "--duration", "1")),
     ],
 )
-def test_a_command_that_misses_a_package_says_so_in_one_line(package: str, words: tuple[str, ...]):
+def test_missing_package_is_reported_in_one_line(package: str, words: tuple[str, ...]):
     done = run_without(package, *words)
     assert done.stderr == f"uwb-mitigation: {package} is not installed (run uwb-mitigation doctor)\n"
     assert done.returncode == 1
 
 
-def test_training_without_torch_says_how_to_install_it(tmp_path):
+def test_training_without_torch_names_the_install_command(tmp_path):
     done = run_without("torch", "train", "--data", "simulated:ranges=60", "-o", tmp_path / "x.onnx")
     assert done.returncode == 1
     assert "make setup-training" in done.stderr
@@ -89,7 +89,7 @@ def test_pure_modules_do_no_input_or_output(module: str):
 
 @pytest.mark.parametrize("machine", ["aarch64", "x86_64"])
 @pytest.mark.parametrize("system_ros", [False, True])
-def test_the_setup_stops_where_there_are_no_ros_wheels(machine: str, system_ros: bool, tmp_path: Path):
+def test_setup_stops_on_platforms_without_ros_wheels(machine: str, system_ros: bool, tmp_path: Path):
     program = shutil.copy(REPOSITORY / "bootstrap.py", tmp_path)
     prefix = tmp_path / "ros"
     prefix.mkdir()
@@ -107,7 +107,7 @@ def test_the_setup_stops_where_there_are_no_ros_wheels(machine: str, system_ros:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["bootstrap.py", "ros"]
 
 
-def test_an_environment_that_cannot_be_made_anew_stays_as_it_was(tmp_path: Path):
+def test_failed_setup_restores_the_previous_environment(tmp_path: Path):
     """Without a network, say; here what is required is nowhere."""
     program = shutil.copy(REPOSITORY / "bootstrap.py", tmp_path)
     (tmp_path / "requirements").mkdir()

@@ -62,13 +62,13 @@ def test_shared_files_are_those_of_the_sources(share: Path, folder: str):
     assert files_below(share / folder) == files_below(REPOSITORY / folder)
 
 
-def test_the_firmware_that_a_computer_compiles_is_shared(share: Path):
+def test_firmware_sources_for_the_host_are_installed(share: Path):
     library = [path for part in ("src", "host") for path in (REPOSITORY / "firmware" / part).glob("*.[ch]")]
     expected = {f"{path.parent.name}/{path.name}": path.read_bytes() for path in library}
     assert files_below(share / "firmware") == expected
 
 
-def test_the_executables_are_where_ros2_run_looks(prefix: Path):
+def test_executables_are_in_the_folder_of_ros2_run(prefix: Path):
     found = {path.name: path for path in (prefix / "lib" / NAME).iterdir()}
     assert set(found) == EXECUTABLES
     for path in found.values():
@@ -76,7 +76,7 @@ def test_the_executables_are_where_ros2_run_looks(prefix: Path):
         assert path.read_text().startswith("#!")
 
 
-def test_the_command_is_in_the_path_of_a_sourced_workspace(prefix: Path):
+def test_command_is_in_the_path_of_a_sourced_workspace(prefix: Path):
     place = shutil.which("uwb-mitigation", path=f"{prefix / 'bin'}")
     assert place is not None
     done = subprocess.run([place, "--version"], capture_output=True, text=True, check=False)
@@ -92,7 +92,7 @@ def test_the_command_is_in_the_path_of_a_sourced_workspace(prefix: Path):
         ("pipeline", "simulated_rate:=100.0", "replaying"),
     ],
 )
-def test_a_node_starts_where_it_is_installed_and_ends_on_ctrl_c(
+def test_node_starts_where_it_is_installed_and_ends_on_ctrl_c(
     prefix: Path, tmp_path: Path, name: str, parameter: str, words: str
 ):
     start_and_end([prefix / "lib" / NAME / name, "--ros-args", "-p", parameter], words, tmp_path)
@@ -108,7 +108,7 @@ def start_and_end(command: list[str | Path], words: str, folder: Path) -> None:
         assert node.signal(signal.SIGINT) == 0, node.output
 
 
-def test_the_messages_are_installed_as_an_interface_package():
+def test_messages_are_installed_as_an_interface_package():
     prefix = prefix_of(MESSAGES)
     sources = files_below(REPOSITORY / "msg_defs" / "msg")
     installed = files_below(prefix / "share" / MESSAGES / "msg")
@@ -123,7 +123,7 @@ def test_the_messages_are_installed_as_an_interface_package():
 # What follows holds of the sources, too, and needs no workspace.
 
 
-def test_a_colcon_build_that_does_not_know_of_the_messages_names_the_command_that_does(tmp_path: Path):
+def test_colcon_build_without_the_messages_names_the_right_command(tmp_path: Path):
     environment = os.environ | {"COLCON": "1", "AMENT_PREFIX_PATH": str(tmp_path)}
     command = [sys.executable, "setup.py", "-q", "build", "-b", str(tmp_path / "build")]
     refused = subprocess.run(
@@ -157,7 +157,7 @@ def without(absent: Iterable[str], name: str) -> list[str]:
         ("mitigator", {"pyyaml", "onnxruntime"}, "correcting with model"),
     ],
 )
-def test_a_node_needs_little_to_run(tmp_path: Path, name: str, needed: set[str], words: str):
+def test_node_runs_without_optional_packages(tmp_path: Path, name: str, needed: set[str], words: str):
     pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
     needless = {library for libraries in LIBRARIES.values() for library in libraries} - needed - {"numpy"}
     absent = {MODULES.get(library, library) for library in needless}
@@ -176,7 +176,7 @@ def test_a_node_needs_little_to_run(tmp_path: Path, name: str, needed: set[str],
         ("mitigator", "uwb_mitigation_msgs", "error: ROS 2 is not set up: there is no uwb_mitigation_msgs"),
     ],
 )
-def test_what_an_executable_misses_is_one_line(tmp_path: Path, name: str, absent: str, told: str):
+def test_missing_dependency_of_an_executable_is_one_line(tmp_path: Path, name: str, absent: str, told: str):
     command = without([absent], name)
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=240)
     assert done.returncode == 1
@@ -196,7 +196,7 @@ print(uwb_mitigation.__file__, default_model_path(), firmware_folder(), sep="\\n
 
 
 @NEEDS_CC
-def test_the_firmware_backend_needs_no_checkout(tmp_path: Path):
+def test_firmware_backend_needs_no_checkout(tmp_path: Path):
     packages = tmp_path / "lib" / "python3" / "site-packages"
     steps = [
         *("build", "-b", tmp_path / "build"),
@@ -214,7 +214,7 @@ def test_the_firmware_backend_needs_no_checkout(tmp_path: Path):
 
 
 @pytest.mark.parametrize("folder", ["", "msg_defs"])
-def test_the_manifest_is_valid(folder: str):
+def test_manifest_is_valid(folder: str):
     package = pytest.importorskip("catkin_pkg.package", reason="run make setup-training")
     warnings: list[str] = []
     manifest = package.parse_package(str(REPOSITORY / folder), warnings=warnings)

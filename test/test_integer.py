@@ -48,7 +48,7 @@ def test_it_equals_onnx_runtime(samples, first_kernel):
     assert np.array_equal(computed, IntegerNetwork(weights).predict_m(inputs))
 
 
-def test_the_shipped_network_equals_onnx_runtime():
+def test_shipped_network_equals_onnx_runtime():
     shipped = load_bundle(default_model_path())
     session, reference = Session(shipped), integer_network(shipped)
     inputs = np.concatenate([windows(1500, 157, 4), hostile_inputs(157, 5)])
@@ -71,7 +71,7 @@ def test_every_sum_of_a_shipped_model_is_equal_on_x86_and_arm(name):
         assert np.array_equal(sum_table(*ratios, fused=False), with_fma), tensor
 
 
-def test_a_sum_is_rounded_as_by_a_fused_multiply_add():
+def test_sum_is_rounded_as_by_a_fused_multiply_add():
     first, second = np.float32(0.87686104), np.float32(0.5873151)
     exact = Fraction(float(first)) * 47 + Fraction(float(np.float32(second * np.float32(135))))
     fused = float(np.rint(np.float32(float(exact))))

@@ -87,7 +87,7 @@ def settings(node) -> dict[str, object]:
     }
 
 
-def test_both_nodes_start_with_what_is_said_and_come_back(generate):
+def test_both_nodes_start_with_their_arguments_and_are_respawned(generate):
     said = {"source": "serial", "port": "/dev/ttyACM0", "model": "mine.onnx", "namespace": "left"}
     driver, mitigator = launch(generate, "uwb.launch.py", **said, log_level="debug", use_sim_time="True")
     assert (driver.executable, mitigator.executable) == ("driver", "mitigator")
@@ -99,7 +99,7 @@ def test_both_nodes_start_with_what_is_said_and_come_back(generate):
     assert not any(node.respawn for node in launch(generate, "uwb.launch.py", **said, respawn="false"))
 
 
-def test_one_process_takes_what_both_take(generate):
+def test_one_process_accepts_the_arguments_of_both_nodes(generate):
     (pipeline,) = launch(
         generate, "uwb.launch.py", source="serial", port="/dev/x", model="m.onnx", one_process="true"
     )
@@ -113,7 +113,7 @@ def test_one_process_takes_what_both_take(generate):
     assert [Path(file).name for file in pipeline.parameters[:2]] == ["driver.yaml", "mitigator.yaml"]
 
 
-def test_a_viewer_starts_where_it_is_asked_for(generate):
+def test_viewer_starts_if_requested(generate):
     said = {"source": "simulated", "anchors": "a.yaml", "viewer": "true"}
     *_, viewer = launch(generate, "uwb.launch.py", **said, one_process="true")
     assert (viewer.executable, viewer.name, viewer.respawn) == ("viewer", "viewer", True)
@@ -126,7 +126,7 @@ def test_a_viewer_starts_where_it_is_asked_for(generate):
 
 
 @pytest.mark.parametrize("one_process", ["false", "true"])
-def test_a_recording_that_has_ended_is_not_played_again(generate, one_process: str):
+def test_finished_recording_is_not_replayed(generate, one_process: str):
     said = {"source": "mcap", "path": "a.mcap", "one_process": one_process}
     respawning = {node.executable: node.respawn for node in launch(generate, "uwb.launch.py", **said)}
     assert respawning == (
@@ -135,7 +135,7 @@ def test_a_recording_that_has_ended_is_not_played_again(generate, one_process: s
 
 
 @pytest.mark.parametrize("text", ["0xdeca010203040506", "'0xdeca010203040506'"])
-def test_an_address_of_64_bits_reaches_the_driver_as_a_text(generate, text: str):
+def test_64_bit_address_reaches_the_driver_as_a_string(generate, text: str):
     said = {"source": "evb1000", "port": "/dev/ttyACM0", "radio.address": text, "radio.anchors": text}
     (driver,) = (node for node in launch(generate, "uwb.launch.py", **said) if node.executable == "driver")
     for name in ("radio.address", "radio.anchors"):
@@ -190,7 +190,7 @@ def test_every_parameter_is_an_argument_and_reaches_its_node_with_its_type(gener
         ({"source": "decaranging"}, "decaranging without a path"),
     ],
 )
-def test_an_argument_that_is_wrong_stops_the_launch(generate, said: dict[str, str], told: str):
+def test_invalid_argument_stops_the_launch(generate, said: dict[str, str], told: str):
     with pytest.raises(RuntimeError, match=told):
         launch(generate, "uwb.launch.py", **said)
 
@@ -202,7 +202,7 @@ class Context(dict):
 
 
 @pytest.mark.parametrize("file", ["uwb.launch.py", "boards.launch.py"])
-def test_an_argument_that_is_unknown_stops_the_launch_but_those_of_another_file_do_not(
+def test_unknown_argument_stops_the_launch_except_for_those_of_an_including_file(
     generate, file: str, monkeypatch: pytest.MonkeyPatch
 ):
     arguments, nodes_of = described(generate, file)
@@ -240,20 +240,20 @@ def test_one_file_configures_all_nodes(generate, tmp_path: Path):
         ("mitigator: [", "robot.yaml"),
     ],
 )
-def test_a_parameter_file_with_a_mistake_stops_the_launch(generate, tmp_path: Path, text: str, told: str):
+def test_invalid_parameter_file_stops_the_launch(generate, tmp_path: Path, text: str, told: str):
     robot = tmp_path / "robot.yaml"
     robot.write_text(text)
     with pytest.raises(RuntimeError, match=told):
         launch(generate, "uwb.launch.py", source="simulated", params=str(robot))
 
 
-def test_a_locator_is_started_alone_where_there_is_no_source(generate):
+def test_only_the_locator_starts_without_a_source(generate):
     (locator,) = launch(generate, "uwb.launch.py", locate="true", anchors="anchors.yaml")
     assert locator.executable == "locator"
     assert settings(locator)["anchors"] == "anchors.yaml"
 
 
-def test_nothing_is_simulated_that_was_not_asked_for(generate, tmp_path: Path):
+def test_simulation_starts_only_on_request(generate, tmp_path: Path):
     with pytest.raises(RuntimeError, match=r"source:=serial.*source:=simulated"):
         launch(generate, "uwb.launch.py")
     mine = tmp_path / "mine.yaml"
@@ -265,7 +265,7 @@ def test_nothing_is_simulated_that_was_not_asked_for(generate, tmp_path: Path):
 
 @pytest.mark.parametrize("file", ["uwb.launch.py", "boards.launch.py"])
 @pytest.mark.parametrize("argument", ["driver_params", "mitigator_params"])
-def test_a_parameter_file_that_is_not_there_ends_the_launch(generate, file: str, argument: str):
+def test_missing_parameter_file_stops_the_launch(generate, file: str, argument: str):
     source = {"source": "serial"} if file == "uwb.launch.py" else {"boards": "left=/dev/x"}
     with pytest.raises(RuntimeError, match=r"absent\.yaml: no such file"):
         launch(generate, file, **source, **{argument: "absent.yaml"})
@@ -291,6 +291,6 @@ def test_every_board_gets_a_driver_and_a_mitigator_in_its_own_namespace(generate
 
 
 @pytest.mark.parametrize("text", ["/dev/ttyACM0", "left=", "1=/dev/ttyACM0", "=/dev/ttyACM0"])
-def test_a_board_that_cannot_be_meant_is_refused(generate, text: str):
+def test_malformed_board_is_refused(generate, text: str):
     with pytest.raises(ValueError, match="NAME=PORT"):
         launch(generate, "boards.launch.py", boards=text)

@@ -47,7 +47,7 @@ def has(type_name: str, fields: str) -> bool:
     return True
 
 
-def test_rviz_shows_topics_that_are_there_by_displays_that_take_them():
+def test_rviz_displays_use_existing_topics_of_their_type():
     config = yaml.safe_load((REPOSITORY / "rviz" / "uwb.rviz").read_text())["Visualization Manager"]
     assert config["Global Options"]["Fixed Frame"] == "map"
     shown = [display for display in config["Displays"] if "Topic" in display]
@@ -63,7 +63,7 @@ def test_rviz_shows_topics_that_are_there_by_displays_that_take_them():
         assert topic["Durability Policy"] == durability, topic["Value"]
 
 
-def test_foxglove_names_topics_and_fields_that_are_there():
+def test_foxglove_layout_uses_existing_topics_and_fields():
     layout = json.loads((REPOSITORY / "foxglove" / "uwb.json").read_text())
     panels = layout["configById"]
     paths = [path["value"] for panel in panels.values() for path in panel.get("paths", ())]

@@ -150,7 +150,7 @@ def in_room_2(data: Dataset) -> NDArray[np.bool_]:
     return np.char.find(data.configurations, "room2") >= 0
 
 
-def test_no_row_of_the_comparison_has_seen_what_it_is_tested_on(data, watch):
+def test_no_row_of_the_comparison_was_fitted_on_its_test_data(data, watch):
     comparison.run(data, RECIPE, Group.CONFIGURATION, folds=2, seeds=1)
     watch.called("baselines.los_median", "baselines.overall_median", "baselines.ridge")
     watch.called(
@@ -167,7 +167,7 @@ def test_cross_validation_fits_and_calibrates_without_the_fold(data, watch):
         assert np.allclose(found.errors["overall_median"][split.test], expected)
 
 
-def test_a_choice_is_told_by_folds_that_had_no_say_in_it(data, watch, monkeypatch):
+def test_error_of_a_selection_is_from_folds_that_were_not_used_in_it(data, watch, monkeypatch):
     prefer = selection.select_simplest
     nested = []
 
@@ -190,7 +190,7 @@ def parts(data: Dataset) -> Parts:
     return Parts("made up", "by room", data.rows(~is_test), data.rows(is_test))
 
 
-def test_the_protocol_fits_and_calibrates_on_its_training_part(data, watch, tmp_path):
+def test_protocol_fits_and_calibrates_on_its_training_part(data, watch, tmp_path):
     wanted = experiment.list_tasks(["remnet", "mlp"], [SAMPLES], seeds=1)
     with watch.without(parts(data).test.names):
         experiment.run(parts(data), tmp_path, wanted, QUICK)
@@ -212,7 +212,7 @@ def calibrated(monkeypatch: pytest.MonkeyPatch) -> list[set[str]]:
     return calls
 
 
-def test_the_protocols_variances_are_of_configurations_that_were_not_fitted_to(data, watch, calibrated):
+def test_variances_of_the_protocol_are_from_held_out_configurations(data, watch, calibrated):
     card = experiment.make_card("made up", RECIPE.architecture, parts(data), QUICK)
     fitted, (corrected, raw) = watch.seen["fitting.fit"], calibrated
     assert fitted
@@ -233,7 +233,7 @@ def typed(data: Dataset, monkeypatch: pytest.MonkeyPatch, *words: object) -> Non
         raise result.exception
 
 
-def test_the_command_trains_on_the_training_part(data, watch, monkeypatch, tmp_path):
+def test_command_trains_on_the_training_part(data, watch, monkeypatch, tmp_path):
     quick = ("--networks", "remnet", "--windows", SAMPLES, "--seeds", 1, "--epochs", 1, "--workers", 1)
     with watch.without(data.rows(in_room_2(data)).names):
         typed(data, monkeypatch, "paper", "protocol", "--data", "x", "-o", tmp_path, *quick)

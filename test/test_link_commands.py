@@ -17,7 +17,7 @@ def run(*arguments: str) -> str:
     return CliRunner().invoke(app, list(arguments), catch_exceptions=False).output
 
 
-def test_an_emulated_board_plays_for_the_time_it_is_given(tmp_path):
+def test_emulated_board_runs_for_the_given_duration(tmp_path):
     result = tmp_path / "board.json"
     output = run("board", "emulate", "--duration", "0.5", "--rate", "100", "--json", str(result))
 
@@ -38,12 +38,12 @@ def test_an_emulated_board_plays_for_the_time_it_is_given(tmp_path):
     ],
     ids=" ".join,
 )
-def test_an_option_out_of_its_range_is_refused(arguments):
+def test_option_out_of_its_range_is_refused(arguments):
     with pytest.raises(ParameterError):
         run(*arguments)
 
 
-def test_an_empty_recording_is_told_instead_of_a_port(tmp_path: Path):
+def test_empty_recording_is_reported_before_a_port_is_opened(tmp_path: Path):
     bag = Foreign(tmp_path / "empty.mcap").ours().finish()
     result = CliRunner().invoke(app, ["board", "emulate", str(bag), "--duration", "1"])
 

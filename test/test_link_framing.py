@@ -32,16 +32,16 @@ def decode(data: bytes) -> list[Frame]:
 
 
 @given(frames)
-def test_a_frame_arrives_as_it_was_sent(frame):
+def test_frame_is_decoded_unchanged(frame):
     assert decode(encode_frame(frame)) == [frame]
 
 
-def test_a_longer_payload_is_refused():
+def test_longer_payload_is_refused():
     with pytest.raises(ParameterError, match="4225"):
         encode_frame(A._replace(payload=bytes(MAX_PAYLOAD_BYTES + 1)))
 
 
-def test_an_encoder_numbers_its_frames_and_wraps_at_32_bits():
+def test_encoder_numbers_its_frames_and_wraps_at_32_bits():
     encoder = FrameEncoder()
     encoder.sequence = 2**32 - 1
 
@@ -51,7 +51,7 @@ def test_an_encoder_numbers_its_frames_and_wraps_at_32_bits():
 
 
 @given(st.lists(frames, max_size=5), st.binary(max_size=300), st.lists(st.integers(1, 50), min_size=1))
-def test_how_the_stream_is_cut_changes_nothing(sent, noise, sizes):
+def test_splitting_of_the_stream_does_not_matter(sent, noise, sizes):
     stream = noise + b"".join(map(encode_frame, sent)) + noise + b"\0"
     whole, cut = FrameDecoder(), FrameDecoder()
     received, at, turn = [], 0, 0
@@ -66,7 +66,7 @@ def test_how_the_stream_is_cut_changes_nothing(sent, noise, sizes):
 
 
 @pytest.mark.parametrize("at", range(1, len(encode_frame(A)) - 1))
-def test_any_flipped_bit_costs_its_frame_and_no_other(at):
+def test_flipped_bit_loses_only_its_frame(at):
     for bit in range(8):
         wire = bytearray(encode_frame(A))
         wire[at] ^= 1 << bit
@@ -74,7 +74,7 @@ def test_any_flipped_bit_costs_its_frame_and_no_other(at):
 
 
 @pytest.mark.parametrize("chunk", [1, 1000, 10**6])
-def test_an_endless_frame_is_counted_once_and_its_end_found(chunk):
+def test_endless_frame_is_counted_once_and_decoding_resumes(chunk):
     stream = b"\1" * 20_000 + encode_frame(A)
     decoder = FrameDecoder()
     received = []
@@ -85,7 +85,7 @@ def test_an_endless_frame_is_counted_once_and_its_end_found(chunk):
     assert decoder.counts.oversize == 1
 
 
-def test_a_reset_forgets_half_a_frame():
+def test_reset_discards_a_partial_frame():
     wire = encode_frame(A)
     decoder = FrameDecoder()
     decoder.feed(wire[:10])
@@ -95,7 +95,7 @@ def test_a_reset_forgets_half_a_frame():
 
 
 @given(st.binary(max_size=5000))
-def test_no_bytes_make_the_decoder_fail(data):
+def test_arbitrary_bytes_do_not_break_the_decoder(data):
     decoder = FrameDecoder()
     decoder.feed(data)
     decoder.feed(b"\0")
@@ -105,7 +105,7 @@ def test_no_bytes_make_the_decoder_fail(data):
 
 
 @pytest.mark.parametrize("flood", [b"\0", b"\1", b"\xff", b"\1\1\0"], ids=["zeros", "ones", "ff", "short"])
-def test_a_flood_takes_no_memory(flood):
+def test_flood_does_not_grow_memory(flood):
     data = flood * (1_000_000 // len(flood))
     decoder = FrameDecoder()
     tracemalloc.start()
@@ -129,7 +129,7 @@ def test_a_flood_takes_no_memory(flood):
     ],
     ids=["clean", "flips", "drops", "insertions", "all", "storm"],
 )
-def test_through_a_damaging_channel_what_arrives_intact_is_delivered_and_nothing_else(faults):
+def test_damaging_channel_delivers_exactly_the_intact_frames(faults):
     result = loopback(6000, faults, payload_bytes=200, seed=11)
 
     assert result.intact_lost == 0

@@ -17,7 +17,7 @@ _spec.loader.exec_module(link_targets)
 
 
 @pytest.mark.parametrize("name", link_targets.TARGETS)
-def test_no_bytes_make_the_target_fail(name):
+def test_arbitrary_bytes_do_not_break_the_target(name):
     target = link_targets.TARGETS[name]
 
     @settings(max_examples=300)
@@ -28,7 +28,7 @@ def test_no_bytes_make_the_target_fail(name):
     run()
 
 
-def test_the_session_target_reaches_a_connection():
+def test_session_target_reaches_a_connection():
     # kind 1, no pause, then model, boot and request of a HELLO, and its sequence.
     script = link_targets.Script(bytes([1, 0, 0, 7, 7, 0, 0]))
     kind = script.number(1)

@@ -56,13 +56,13 @@ def round_trip(message: messages.Message) -> messages.Message | None:
     [*(message for message in SMALL if not isinstance(message, Log)), measurement([])],
     ids=lambda message: type(message).__name__,
 )
-def test_a_payload_may_grow_at_its_end_unless_its_tail_runs_to_the_end(message):
+def test_payload_may_grow_at_its_end_unless_its_tail_runs_to_the_end(message):
     kind, payload = messages.encode(message)
 
     assert type(messages.decode(kind, payload + b"later revision")) is type(message)
 
 
-def test_the_samples_are_found_behind_fields_of_a_later_revision():
+def test_samples_are_found_after_fields_of_a_later_revision():
     kind, payload = messages.encode(measurement([1, -2, 3, -4]))
     at = layout.PAYLOADS[MessageType.RANGE_CIR].offsets()["samples_offset"]
     grown = bytearray(payload[:72] + b"newfield" + payload[72:])
@@ -72,7 +72,7 @@ def test_the_samples_are_found_behind_fields_of_a_later_revision():
 
 
 @pytest.mark.parametrize("kind", [kind for kind in MessageType if layout.PAYLOADS[kind].fields])
-def test_a_payload_that_is_too_short_is_an_error_that_names_the_type(kind):
+def test_payload_that_is_too_short_is_an_error_that_names_the_type(kind):
     size = layout.PAYLOADS[kind].packing().size
 
     with pytest.raises(LinkError, match=rf"{kind.name}: .*{size - 1} bytes.*at least {size}"):
@@ -91,7 +91,7 @@ def test_a_payload_that_is_too_short_is_an_error_that_names_the_type(kind):
         ("device_time", "Q", 2**40),
     ],
 )
-def test_a_measurement_with_an_impossible_field_is_an_error(field, code, value):
+def test_measurement_with_an_impossible_field_is_an_error(field, code, value):
     kind, payload = messages.encode(measurement([1, 2]))
     broken = bytearray(payload)
     if field == "samples_offset":
@@ -106,7 +106,7 @@ def test_a_measurement_with_an_impossible_field_is_an_error(field, code, value):
     ("message", "field"),
     [(HELLO, "mode"), (SMALL[3], "mode"), (SMALL[5], "mode"), (CORRECTION, "status"), (SMALL[2], "level")],
 )
-def test_an_unknown_value_of_an_enumeration_is_an_error(message, field):
+def test_unknown_value_of_an_enumeration_is_an_error(message, field):
     kind, payload = messages.encode(message)
     broken = bytearray(payload)
     broken[layout.PAYLOADS[kind].offsets()[field]] = 250
@@ -126,18 +126,18 @@ def test_an_unknown_value_of_an_enumeration_is_an_error(message, field):
     ],
     ids=["samples", "preamble", "float", "negative", "32 bits"],
 )
-def test_what_does_not_fit_its_field_is_refused(message):
+def test_value_too_large_for_its_field_is_refused(message):
     with pytest.raises(ParameterError):
         messages.encode(message)
 
 
-def test_text_that_is_not_utf8_is_shown_as_far_as_it_goes():
+def test_text_that_is_not_utf8_is_shown_with_replacements():
     kind, payload = messages.encode(Log(layout.LogLevel.INFO, "ok"))
 
     assert messages.decode(kind, payload + b"\xff").text == "ok�"
 
 
-def test_a_long_firmware_name_is_cut_between_characters():
+def test_long_firmware_name_is_cut_between_characters():
     hello = Hello(1, 0, 0, Mode.HOST, 1, firmware_name="ü" * 8 + "é")
     assert round_trip(hello).firmware_name == "ü" * 8
     hello = Hello(1, 0, 0, Mode.HOST, 1, firmware_name="x" * 15 + "é")
@@ -155,7 +155,7 @@ def test_every_field_is_aligned_and_every_fixed_part_is_a_multiple_of_8(table):
 
 
 @pytest.mark.parametrize(("compiler", "language"), [("cc", "c"), ("c++", "c++")])
-def test_the_c_header_compiles_and_its_assertions_hold(compiler, language, tmp_path):
+def test_c_header_compiles_and_its_assertions_hold(compiler, language, tmp_path):
     if shutil.which(compiler) is None:
         pytest.skip(f"no compiler: {compiler}")
     header = tmp_path / "uwb_protocol.h"

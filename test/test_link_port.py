@@ -93,7 +93,7 @@ def test_measurements_arrive_complete_and_in_order(port):
     assert first.device_time == first.sequence * 7
 
 
-def test_a_board_that_is_unplugged_and_comes_back_under_another_name_is_found_again(board, port, tmp_path):
+def test_replugged_board_is_found_under_another_port_name(board, port, tmp_path):
     wait_for(port, of(RangeMeasurement))
     first = board.port
     board.unplug()
@@ -112,7 +112,7 @@ def test_a_board_that_is_unplugged_and_comes_back_under_another_name_is_found_ag
         holder.close()
 
 
-def test_a_board_that_resets_is_connected_again(board, port):
+def test_board_that_resets_is_connected_again(board, port):
     wait_for(port, of(RangeMeasurement))
     board.reset()
 
@@ -122,7 +122,7 @@ def test_a_board_that_resets_is_connected_again(board, port):
     wait_for(port, of(RangeMeasurement))
 
 
-def test_through_a_channel_that_damages_loses_and_repeats_only_what_was_sent_arrives(link):
+def test_faulty_channel_delivers_only_sent_messages(link):
     faults = Faults(2e-4, 2e-4, 2e-4, lose=0.05, duplicate=0.05)
     with EmulatedBoard(Recording(), rate_hz=1000, faults=faults, link=link, seed=4):
         port = BoardPort(PortAddress(str(link)))
@@ -139,7 +139,7 @@ def test_through_a_channel_that_damages_loses_and_repeats_only_what_was_sent_arr
     assert counts["stale"] > 0
 
 
-def test_a_port_that_is_not_there_is_reported_and_awaited(tmp_path):
+def test_missing_port_is_reported_and_awaited(tmp_path):
     path = tmp_path / "later"
     port = BoardPort(PortAddress(str(path)))
     assert port.get(0.01) is None
@@ -151,7 +151,7 @@ def test_a_port_that_is_not_there_is_reported_and_awaited(tmp_path):
 
 
 @pytest.mark.parametrize("exclusive", [True, False])
-def test_a_port_that_another_program_has_open_is_reported_with_its_name(exclusive: bool):
+def test_port_in_use_is_reported_with_the_program(exclusive: bool):
     controller, device = os.openpty()
     name = os.ttyname(device)
     program = (
@@ -174,7 +174,7 @@ def test_a_port_that_another_program_has_open_is_reported_with_its_name(exclusiv
     os.close(device)
 
 
-def test_closing_ends_a_wait_for_events_in_another_thread(link):
+def test_close_ends_a_wait_in_another_thread(link):
     port = BoardPort(PortAddress(str(link)))
     events = []
     reader = threading.Thread(target=lambda: events.append(port.get(60.0)))
@@ -188,7 +188,7 @@ def test_closing_ends_a_wait_for_events_in_another_thread(link):
     assert events == [None]
 
 
-def test_events_that_nobody_fetches_are_dropped_and_counted(board, link):
+def test_unread_events_are_dropped_and_counted(board, link):
     port = BoardPort(PortAddress(str(link)), capacity=5)
     wait_until(lambda: port.report().counts["overflowed"] > 20)
 
@@ -207,12 +207,12 @@ def test_events_that_nobody_fetches_are_dropped_and_counted(board, link):
         ("usb:2341:805A:AB:12", PortAddress("", 0x2341, 0x805A, "AB:12")),
     ],
 )
-def test_an_address_names_a_file_or_a_usb_device(text, address):
+def test_address_names_a_file_or_a_usb_device(text, address):
     assert PortAddress.parse(text) == address
     assert PortAddress.parse(str(address)) == address
 
 
-def test_a_usb_device_is_found_by_its_ids_and_serial_number(monkeypatch):
+def test_usb_device_is_found_by_its_ids_and_serial_number(monkeypatch):
     class Info:
         def __init__(self, device: str, vid: int | None, serial_number: str | None) -> None:
             self.device, self.vid, self.pid, self.serial_number = device, vid, 0x805A, serial_number
@@ -232,7 +232,7 @@ def test_a_usb_device_is_found_by_its_ids_and_serial_number(monkeypatch):
 @pytest.mark.parametrize(
     "error", [OSError("sysfs"), TypeError("int() argument"), ValueError("invalid literal")]
 )
-def test_a_usb_device_that_is_unplugged_while_ports_are_listed_is_awaited(monkeypatch, error: Exception):
+def test_usb_device_unplugged_during_listing_is_awaited(monkeypatch, error: Exception):
     def comports() -> list[object]:
         raise error
 

@@ -92,7 +92,7 @@ def connected(**session: object) -> Bench:
     return bench
 
 
-def test_a_session_asks_who_is_there_and_is_connected_by_the_answer():
+def test_session_sends_a_request_and_connects_on_hello():
     bench = Bench(BoardSession())
     bench.run(20)
 
@@ -101,14 +101,14 @@ def test_a_session_asks_who_is_there_and_is_connected_by_the_answer():
     assert bench.session.hello.window == 157
 
 
-def test_before_the_hello_nothing_is_delivered_but_counted():
+def test_messages_before_hello_are_counted_but_not_delivered():
     bench = Bench(BoardSession())
 
     assert bench.host_hears(b"boot: radio ok\r\n" + bench.board.measure(measurement(1), 0)) == []
     assert bench.session.counts.withheld == 1
 
 
-def test_a_measurement_arrives_with_its_stamp_on_the_nodes_clock():
+def test_measurement_arrives_with_its_stamp_on_the_nodes_clock():
     bench = connected()
     took_place = EPOCH + bench.now
 
@@ -120,11 +120,11 @@ def test_a_measurement_arrives_with_its_stamp_on_the_nodes_clock():
 
 
 @pytest.mark.parametrize(("mode", "kind"), [(Mode.HOST, RangeMeasurement), (Mode.DEVICE, Correction)])
-def test_each_mode_sends_what_it_says(mode, kind):
+def test_each_mode_sends_its_messages(mode, kind):
     assert [type(event) for event in connected(mode=mode).measure(1)] == [kind]
 
 
-def test_a_lost_request_for_a_mode_is_repeated():
+def test_lost_request_for_a_mode_is_repeated():
     bench = connected()
     bench.session.set_mode(Mode.DEVICE)
     bench.run(800, deaf=True)
@@ -133,7 +133,7 @@ def test_a_lost_request_for_a_mode_is_repeated():
     assert bench.seen(ModeChanged) == [ModeChanged(Mode.DEVICE)]
 
 
-def test_a_board_without_a_model_refuses_to_correct_and_is_asked_once():
+def test_board_without_a_model_refuses_to_correct_and_is_asked_once():
     bench = Bench(BoardSession(mode=Mode.DEVICE))
     bench.run(3000)
 
@@ -141,7 +141,7 @@ def test_a_board_without_a_model_refuses_to_correct_and_is_asked_once():
     assert [type(event) for event in bench.measure(1)] == [RangeMeasurement]
 
 
-def test_a_board_that_does_not_leave_its_mode_refuses_the_mode_of_the_host():
+def test_board_that_keeps_its_mode_is_reported_as_refusing():
     class Correcting(Board):
         mode = property(lambda board: Mode.DEVICE, lambda board, value: None)
 
@@ -153,7 +153,7 @@ def test_a_board_that_does_not_leave_its_mode_refuses_the_mode_of_the_host():
     assert bench.seen(ModeChanged) == []
 
 
-def test_after_a_reset_the_mode_is_asked_for_again():
+def test_mode_is_requested_again_after_a_reset():
     bench = connected(mode=Mode.DEVICE)
     bench.reboot()
     bench.host_hears(bench.board.hello(0))
@@ -170,7 +170,7 @@ def test_corrections_by_another_model_than_expected_are_withheld():
     assert bench.session.counts.wrong_model == 1
 
 
-def test_a_board_of_another_version_is_named_once_and_nothing_of_it_delivered():
+def test_board_of_another_version_is_reported_once_and_ignored():
     bench = Bench(BoardSession(), version=7)
     bench.run(5000)
 
@@ -181,7 +181,7 @@ def test_a_board_of_another_version_is_named_once_and_nothing_of_it_delivered():
     assert bench.measure(1) == []
 
 
-def test_a_board_that_gets_the_right_firmware_is_connected():
+def test_board_that_gets_the_right_firmware_is_connected():
     bench = Bench(BoardSession(), version=7)
     bench.run(1000)
     bench.reboot()
@@ -191,7 +191,7 @@ def test_a_board_that_gets_the_right_firmware_is_connected():
     assert bench.session.foreign_version is None
 
 
-def test_a_board_that_says_nothing_for_3_s_is_gone_and_comes_back():
+def test_board_times_out_after_3_s_and_reconnects():
     bench = connected()
     sleeping, bench.board = bench.board, Board(IDENTITY, version=1)
     for _ in range(310):
@@ -207,7 +207,7 @@ def test_a_board_that_says_nothing_for_3_s_is_gone_and_comes_back():
     assert bench.session.state is LinkState.READY
 
 
-def test_a_status_once_a_second_keeps_a_board_without_measurements_connected():
+def test_status_once_a_second_keeps_a_board_without_measurements_connected():
     bench = connected()
     bench.run(20_000)
 
@@ -215,7 +215,7 @@ def test_a_status_once_a_second_keeps_a_board_without_measurements_connected():
     assert len(bench.seen(BoardStatus)) >= 19
 
 
-def test_a_reset_is_known_by_the_boot_id_and_restarts_the_clock():
+def test_boot_id_reveals_a_reset_and_restarts_the_clock():
     bench = connected()
     bench.run(10_000)
     bench.reboot()
@@ -228,7 +228,7 @@ def test_a_reset_is_known_by_the_boot_id_and_restarts_the_clock():
     assert event.stamp_ns == pytest.approx(took_place, abs=0.1 * MS)
 
 
-def test_a_reset_whose_hello_is_lost_is_known_by_the_numbering():
+def test_frame_numbers_reveal_a_reset_whose_hello_is_lost():
     bench = connected()
     bench.run(20_000)
     bench.reboot()
@@ -252,7 +252,7 @@ def test_missing_frames_are_counted():
     assert bench.session.counts.lost == 4
 
 
-def test_a_frame_that_arrives_twice_is_delivered_once():
+def test_repeated_frame_is_delivered_once():
     bench = connected()
     data = bench.board.measure(measurement(1), bench.uptime_us)
 
@@ -260,7 +260,7 @@ def test_a_frame_that_arrives_twice_is_delivered_once():
     assert bench.session.counts.stale == 1
 
 
-def test_the_numbering_may_wrap():
+def test_frame_numbers_wrap():
     bench = connected()
     encoder = FrameEncoder()
     encoder.sequence = 2**32 - 1
@@ -297,7 +297,7 @@ def test_frames_that_are_not_delivered_are_counted(kind, flags, payload, counted
     assert {name: 1 for name in rejections if after[name] != before[name]} == counted
 
 
-def test_what_waits_to_be_sent_is_bounded():
+def test_send_queue_is_bounded():
     bench = connected()
     for _ in range(5000):  # Nobody takes what it asks for.
         bench.now += 1000 * MS
@@ -307,7 +307,7 @@ def test_what_waits_to_be_sent_is_bounded():
     assert bench.session.counts.unsent > 0
 
 
-def test_opening_the_port_anew_ends_the_connection_and_voids_half_a_frame():
+def test_reopening_the_port_ends_the_connection_and_discards_a_partial_frame():
     bench = connected()
     data = bench.board.measure(measurement(1), bench.uptime_us)
     bench.host_hears(data[:100])
@@ -316,7 +316,7 @@ def test_opening_the_port_anew_ends_the_connection_and_voids_half_a_frame():
     assert bench.host_hears(data[100:]) == []
 
 
-def test_the_clock_is_synchronised_soon_and_then_once_a_second():
+def test_clock_is_synchronised_quickly_and_then_every_second():
     bench = Bench(BoardSession())
     requests = 0
     for _ in range(1050):

@@ -245,12 +245,12 @@ def lines_of(kind: str) -> list[list[str]]:
     return [line.split() for line in FILE.read_text().splitlines() if line.startswith(kind + " ")]
 
 
-def test_the_file_is_what_the_protocol_gives():
+def test_file_equals_the_output_of_the_protocol():
     assert render() == FILE.read_text()
 
 
 @pytest.mark.parametrize("line", lines_of("frame"), ids=lambda line: line[1])
-def test_a_vector_decodes_to_its_fields(line):
+def test_vector_decodes_to_its_fields(line):
     _, _, *numbers, payload, wire = line
     expected = Frame(*map(int, numbers), bytes.fromhex(payload) if payload != "-" else b"")
 
@@ -258,7 +258,7 @@ def test_a_vector_decodes_to_its_fields(line):
 
 
 @pytest.mark.parametrize("line", lines_of("frame"), ids=lambda line: line[1])
-def test_a_vector_is_what_the_specification_says_byte_by_byte(line):
+def test_vector_equals_the_specification_byte_by_byte(line):
     _, _, kind, flags, sequence, time_us, payload, wire = line
     body = bytes([1, int(kind)]) + struct.pack("<HIQ", int(flags), int(sequence), int(time_us))
     body += bytes.fromhex(payload) if payload != "-" else b""
@@ -267,7 +267,7 @@ def test_a_vector_is_what_the_specification_says_byte_by_byte(line):
 
 
 @pytest.mark.parametrize("line", lines_of("reject"), ids=lambda line: line[1])
-def test_a_rejected_vector_raises_its_count(line):
+def test_rejected_vector_increments_its_counter(line):
     _, _, kind, wire = line
     decoder = FrameDecoder()
 
@@ -280,7 +280,7 @@ def test_a_rejected_vector_raises_its_count(line):
 
 
 @pytest.mark.parametrize("name", SENT)
-def test_a_message_is_decoded_to_what_was_encoded(name: str):
+def test_encoded_message_is_decoded_unchanged(name: str):
     kind, payload = messages.encode(SENT[name][0])
     decoded = messages.decode(kind, payload)
 

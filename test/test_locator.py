@@ -88,7 +88,7 @@ def values(received: list[DiagnosticArray]) -> dict[str, str]:
     return {}
 
 
-def test_poses_odometry_smoothed_poses_and_markers_come_of_ranges(ros: Ros, anchors: Path):
+def test_ranges_yield_poses_odometry_smoothed_poses_and_markers(ros: Ros, anchors: Path):
     locator = ros.start("locator", f"anchors:={anchors}", "rate:=0.0")
     locator.wait_for_output("locating")
     poses = ros.collect(PoseWithCovarianceStamped, "/uwb/pose")
@@ -135,7 +135,7 @@ def test_poses_odometry_smoothed_poses_and_markers_come_of_ranges(ros: Ros, anch
     assert locator.signal(signal.SIGINT) == 0, locator.output
 
 
-def test_a_silence_is_bridged_by_predictions_whose_covariance_grows(ros: Ros, anchors: Path):
+def test_gap_is_bridged_by_predictions_with_growing_covariance(ros: Ros, anchors: Path):
     locator = ros.start("locator", f"anchors:={anchors}", "rate:=0.0", "use_sim_time:=true")
     locator.wait_for_output("locating")
     poses = ros.collect(PoseWithCovarianceStamped, "/uwb/pose")
@@ -169,7 +169,7 @@ def test_a_silence_is_bridged_by_predictions_whose_covariance_grows(ros: Ros, an
     ("text", "told"),
     [(None, "no such file"), ("anchors: [{id: 1, x: 0, y: 0}]", "the field z is missing")],
 )
-def test_an_anchors_file_that_cannot_be_used_is_said_and_the_node_stays(
+def test_unusable_anchors_file_is_reported_and_the_node_keeps_running(
     ros: Ros, tmp_path: Path, text: str | None, told: str
 ):
     path = tmp_path / "anchors.yaml"
@@ -183,7 +183,7 @@ def test_an_anchors_file_that_cannot_be_used_is_said_and_the_node_stays(
     assert locator.signal(signal.SIGINT) == 0
 
 
-def test_a_best_effort_height_is_received_and_best_effort_ranges_are_reported(ros: Ros, anchors: Path):
+def test_best_effort_height_is_received_and_best_effort_ranges_are_reported(ros: Ros, anchors: Path):
     heights = ros.node.create_publisher(PoseWithCovarianceStamped, "/height", qos_profile_sensor_data)
     ros.node.create_publisher(RangeCorrected, CORRECTED, qos_profile_sensor_data)
     locator = ros.start("locator", f"anchors:={anchors}", "height_topic:=/height", "rate:=0.0")
@@ -236,13 +236,13 @@ def test_tf_contains_only_the_frames_of_the_tags_below_the_map(ros: Ros, anchors
 
 
 @pytest.mark.parametrize("frame", ["tag_9", "map"])
-def test_a_tag_frame_that_is_taken_is_refused(ros: Ros, anchors: Path, frame: str):
+def test_tag_frame_in_use_is_refused(ros: Ros, anchors: Path, frame: str):
     locator = ros.start("locator", f"anchors:={anchors}", f"tag_frame:={frame}", "tag:=7")
     locator.wait_for_output(f"tag_frame = '{frame}'")
     assert locator.exit_code() is None
 
 
-def test_the_pipeline_has_a_locator_where_anchors_are_given(ros: Ros, tmp_path: Path):
+def test_pipeline_contains_a_locator_if_anchors_are_given(ros: Ros, tmp_path: Path):
     from uwb_mitigation.sources.simulated import SimulatedSource
 
     path = tmp_path / "flat.yaml"

@@ -20,7 +20,7 @@ from uwb_mitigation.errors import DamagedRecordingError, RecordingError
 from uwb_mitigation.sources.mcap import McapRecording
 
 
-def test_a_bag_cut_anywhere_yields_what_is_whole_and_says_where(tmp_path: Path) -> None:
+def test_truncated_bag_yields_its_complete_messages_and_the_position_of_the_damage(tmp_path: Path) -> None:
     bag = Foreign(tmp_path / "whole.mcap", index_types=IndexType.ALL).ours()
     for number in range(12):
         bag.range(number)
@@ -44,7 +44,7 @@ def test_a_bag_cut_anywhere_yields_what_is_whole_and_says_where(tmp_path: Path) 
             assert "byte " in error.where
 
 
-def test_an_unfinished_recording_is_read_by_time_and_in_order(tmp_path: Path) -> None:
+def test_unfinished_recording_is_read_by_time_and_in_order(tmp_path: Path) -> None:
     bag = Foreign(tmp_path / "bag.mcap").ours()
     for group in ([4, 5], [0, 1], [2, 3]):
         for number in group:
@@ -56,7 +56,7 @@ def test_an_unfinished_recording_is_read_by_time_and_in_order(tmp_path: Path) ->
     assert first.log_time_ns == START_NS + 2 * STEP_NS
 
 
-def test_a_torn_chunk_costs_itself_only(tmp_path: Path) -> None:
+def test_damaged_chunk_loses_only_itself(tmp_path: Path) -> None:
     bag = Foreign(tmp_path / "bag.mcap").ours()
     for number in range(300):
         bag.range(number, samples=1016)
@@ -72,7 +72,7 @@ def test_a_torn_chunk_costs_itself_only(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("shift", [-(2**40), -7, 3, 2**40])
-def test_an_index_that_lies_with_a_right_checksum_is_damage_and_costs_no_memory(
+def test_false_index_with_valid_checksum_is_reported_and_allocates_little_memory(
     tmp_path: Path, shift: int
 ) -> None:
     path = write_bag(tmp_path / "bag.mcap")
@@ -93,7 +93,7 @@ def test_an_index_that_lies_with_a_right_checksum_is_damage_and_costs_no_memory(
     assert peak < 8 << 20
 
 
-def test_a_damaged_index_at_the_end_is_counted_and_costs_no_message(tmp_path: Path) -> None:
+def test_damaged_index_at_the_end_is_counted_and_loses_no_message(tmp_path: Path) -> None:
     path = write_bag(tmp_path / "bag.mcap")
     path.write_bytes(path.read_bytes()[:-20])
     source = McapRecording(path)
@@ -101,7 +101,7 @@ def test_a_damaged_index_at_the_end_is_counted_and_costs_no_message(tmp_path: Pa
     assert source.skipped == {"index at the end missing or damaged": 1}
 
 
-def test_no_flipped_bit_goes_unnoticed_in_the_data(tmp_path: Path) -> None:
+def test_every_flipped_bit_in_the_data_is_detected(tmp_path: Path) -> None:
     bag = Foreign(tmp_path / "whole.mcap").ours()
     for number in range(8):
         bag.range(number)
@@ -157,7 +157,7 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_a_hostile_record_is_refused_with_its_offset_and_little_memory(tmp_path: Path, name: str) -> None:
+def test_hostile_record_is_refused_with_its_offset_and_little_memory(tmp_path: Path, name: str) -> None:
     bag = Foreign(tmp_path / "bag.mcap").ours()
     bag.range(0)
     path = bag.cut()
@@ -173,7 +173,7 @@ def test_a_hostile_record_is_refused_with_its_offset_and_little_memory(tmp_path:
     assert peak < 8 << 20
 
 
-def test_a_long_bag_is_written_and_read_in_little_memory(tmp_path: Path) -> None:
+def test_long_bag_is_written_and_read_in_little_memory(tmp_path: Path) -> None:
     path = tmp_path / "bag.mcap"
     tracemalloc.start()
     with BagWriter(path, {}) as bag:

@@ -23,7 +23,7 @@ from uwb_mitigation.sources.opening import open_recording
 
 
 @pytest.mark.parametrize("name", ["bag.mcap", "folder"])
-def test_records_come_back_as_they_were_written(tmp_path: Path, name: str) -> None:
+def test_records_are_read_back_unchanged(tmp_path: Path, name: str) -> None:
     source = McapRecording(write_bag(tmp_path / name))
     for number, item in enumerate(source):
         expected = record(number)
@@ -50,7 +50,7 @@ def test_every_compression_is_read(tmp_path: Path, compression: CompressionType,
 
 
 @pytest.mark.parametrize("lag", [-5, -1, 0, 1, 5])
-def test_truth_finds_its_range_before_or_after_it(tmp_path: Path, lag: int) -> None:
+def test_truth_is_joined_with_an_earlier_or_later_range(tmp_path: Path, lag: int) -> None:
     bag = Foreign(tmp_path / "bag.mcap").ours()
     for number in range(-5, 25):
         for write, which in ((bag.range, number), (bag.truth, number - lag)):
@@ -67,7 +67,7 @@ def test_truth_finds_its_range_before_or_after_it(tmp_path: Path, lag: int) -> N
     assert [item.truth.configuration for item in items if item.truth] == [f"place {i}" for i in range(20)]
 
 
-def test_a_tag_is_where_the_bag_says_that_it_was(tmp_path: Path) -> None:
+def test_tag_position_is_read_from_the_bag(tmp_path: Path) -> None:
     path = tmp_path / "bag.mcap"
     places = [(1.5, float(number), -0.25) if number != 2 else None for number in range(40)]
     with BagWriter(path, {}) as out:
@@ -129,13 +129,13 @@ def test_files_of_a_folder_follow_each_other_by_number(tmp_path: Path) -> None:
     ("content", "told"),
     [(b"", "empty"), (b"\x89MCAP", "not an MCAP file"), (b"hello, this is text", "not an MCAP file")],
 )
-def test_what_is_no_mcap_file_is_refused(tmp_path: Path, content: bytes, told: str) -> None:
+def test_other_file_is_refused(tmp_path: Path, content: bytes, told: str) -> None:
     (tmp_path / "bag.mcap").write_bytes(content)
     with pytest.raises(RecordingError, match=told):
         McapRecording(tmp_path / "bag.mcap")
 
 
-def test_an_absent_topic_is_told_with_those_that_are_there(tmp_path: Path) -> None:
+def test_missing_topic_is_reported_with_the_existing_topics(tmp_path: Path) -> None:
     source = McapRecording(write_bag(tmp_path / "bag.mcap"), topic="/other")
     with pytest.raises(
         RecordingError, match=r"no topic /other.*range_raw \(uwb_mitigation_msgs/msg/RangeCir\)"
@@ -151,7 +151,7 @@ def test_an_absent_topic_is_told_with_those_that_are_there(tmp_path: Path) -> No
         ((RANGE_RAW, RANGE_CIR_TYPE, "float32 range"), "another version .* 'float32 range'"),
     ],
 )
-def test_a_topic_that_would_be_misread_is_refused(
+def test_topic_with_another_layout_is_refused(
     tmp_path: Path, channel: tuple[str, str, str | None], told: str
 ) -> None:
     bag = Foreign(tmp_path / "bag.mcap")
@@ -162,7 +162,7 @@ def test_a_topic_that_would_be_misread_is_refused(
     assert RANGE_RAW in caught.value.where
 
 
-def test_closing_ends_an_iteration(tmp_path: Path) -> None:
+def test_close_ends_an_iteration(tmp_path: Path) -> None:
     with McapRecording(write_bag(tmp_path / "bag.mcap", 50)) as source:
         read = []
         for item in source:
@@ -173,7 +173,7 @@ def test_closing_ends_an_iteration(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["old.db3", "folder"])
-def test_a_sqlite_bag_is_refused_with_the_command_that_converts_it(tmp_path: Path, name: str) -> None:
+def test_sqlite_bag_is_refused_with_the_command_that_converts_it(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
     if name == "folder":
         path.mkdir()
@@ -187,7 +187,7 @@ def test_a_sqlite_bag_is_refused_with_the_command_that_converts_it(tmp_path: Pat
 @pytest.mark.parametrize(
     "text", [" ", "[", "a: b", "rosbag2_bagfile_information: 3", "!!python/object:os.system {}", "[" * 2000]
 )
-def test_a_malformed_metadata_file_is_refused(tmp_path: Path, text: str) -> None:
+def test_malformed_metadata_file_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "metadata.yaml").write_text(text)
     with pytest.raises(RecordingError, match="not a rosbag2 metadata file"):
         BagReader(tmp_path)

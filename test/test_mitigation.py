@@ -52,7 +52,7 @@ BAD = [
 ]
 
 
-def test_the_correction_is_prior_plus_network_in_float32(mitigation):
+def test_correction_is_linear_bias_plus_network_in_float32(mitigation):
     subject = measurement(3.1)
     _, window = window_of(subject.cir, Preprocessing(157))
     powers = np.array([-82.0]), np.array([-88.0])
@@ -67,7 +67,7 @@ def test_the_correction_is_prior_plus_network_in_float32(mitigation):
     assert result.model_id == mitigation.bundle.model_id
 
 
-def test_a_range_without_a_cir_gets_the_variance_of_its_offset(tmp_path):
+def test_range_without_a_cir_gets_the_variance_of_its_offset(tmp_path):
     one = Mitigation(bundle(tmp_path), Offsets(pairs={(7, 1): 0.2}, pair_sd={(7, 1): 0.03}))
     card = one.bundle.card
     without = replace(measurement(samples=np.zeros(0, np.int16)), tag_id=7, anchor_id=1)
@@ -79,7 +79,7 @@ def test_a_range_without_a_cir_gets_the_variance_of_its_offset(tmp_path):
 
 
 @pytest.mark.parametrize(("changes", "range_m", "status"), BAD)
-def test_a_bad_measurement_passes_through(mitigation, changes, range_m, status):
+def test_invalid_measurement_passes_through(mitigation, changes, range_m, status):
     result = mitigation.correct([measurement(range_m, **changes)])[0]
     assert result.status is status
     assert result.range_m == range_m or math.isnan(range_m)
@@ -88,7 +88,7 @@ def test_a_bad_measurement_passes_through(mitigation, changes, range_m, status):
     assert result.variance_m2 == (0.5 if 0.0 <= range_m <= 1e6 else math.inf)
 
 
-def test_a_constant_prior_needs_no_power(tmp_path):
+def test_constant_bias_model_needs_no_level(tmp_path):
     subject = Mitigation(bundle(tmp_path, Remnet(samples=157), linear_bias=LinearBiasModel(0.25)))
     result = subject.correct([measurement(rx_power_dbm=math.nan, first_path_power_dbm=math.nan)])[0]
     assert result.status is Status.OK
@@ -98,7 +98,7 @@ def test_a_constant_prior_needs_no_power(tmp_path):
     "changes",
     [{"samples": np.zeros(0, np.int16)}, {"preamble_count": 0}, {"first_path_power_dbm": math.nan}, {}],
 )
-def test_a_bundle_that_needs_no_cir_corrects_whatever_the_cir_is(tmp_path, changes):
+def test_bundle_without_network_ignores_the_cir(tmp_path, changes):
     made = bundle(tmp_path, Remnet(samples=157), linear_bias=LinearBiasModel(0.25), needs_cir=False)
     result = Mitigation(made).correct([measurement(3.0, **changes)])[0]
     assert result.status is Status.OK
@@ -106,7 +106,7 @@ def test_a_bundle_that_needs_no_cir_corrects_whatever_the_cir_is(tmp_path, chang
         assert result.correction_m == 0.25
 
 
-def test_a_prediction_beyond_the_limits_is_out_of_distribution(tmp_path):
+def test_prediction_beyond_the_limits_is_out_of_distribution(tmp_path):
     subject = Mitigation(bundle(tmp_path, Remnet(samples=157), correction_limits_m=(50.0, 60.0)))
     result = subject.correct([measurement(3.0)])[0]
     assert (result.status, result.range_m) == (Status.OUT_OF_DISTRIBUTION, 3.0)
@@ -116,7 +116,7 @@ def test_a_prediction_beyond_the_limits_is_out_of_distribution(tmp_path):
     "linear_bias",
     [None, LinearBiasModel(0.25), LinearBiasModel(-1.0, -0.015625), LinearBiasModel(0.125, 0.0, 0.03125)],
 )
-def test_a_batch_has_the_bits_of_single_measurements(mitigation, tmp_path, linear_bias):
+def test_batch_has_the_bits_of_single_measurements(mitigation, tmp_path, linear_bias):
     if linear_bias is not None:
         made = bundle(tmp_path, Remnet(samples=157), linear_bias=linear_bias, needs_cir=False)
         mitigation = Mitigation(made, Offsets(0.125))
@@ -141,7 +141,7 @@ class NotANumberSession:
 
 
 @pytest.mark.parametrize("session", [FailingSession(), NotANumberSession()])
-def test_a_network_that_fails_lets_the_range_through(tmp_path, session):
+def test_failing_network_passes_the_range_through(tmp_path, session):
     subject = Mitigation(bundle(tmp_path, Remnet(samples=157)))
     subject._session = session
     results = subject.correct([measurement(3.0)] * 2)

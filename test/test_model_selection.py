@@ -47,13 +47,13 @@ def numbered(error_of):
 # --- selection ---
 
 
-def test_the_simplest_candidate_is_preferred_unless_a_richer_one_gains():
+def test_simplest_candidate_is_preferred_unless_a_richer_one_gains():
     errors = {"a": np.array([1.0]), "b": np.array([0.99]), "c": np.array([0.9])}
     assert selection.select_simplest(errors, 0.02) == "c"
     assert selection.select_simplest(errors, 0.2) == "a"
 
 
-def test_a_constant_error_needs_no_line_and_an_error_that_follows_the_power_does():
+def test_line_is_selected_only_for_errors_that_depend_on_power():
     constant = selection.select_nested(numbered(lambda number: 0.3), candidates.new_models(RECIPE), 3, 0)
     assert constant.chosen == candidates.CONSTANT
     assert constant.mae()[NESTED] < 1e-6
@@ -64,7 +64,7 @@ def test_a_constant_error_needs_no_line_and_an_error_that_follows_the_power_does
     assert line.model.linear_bias.per_rx_power == pytest.approx(-0.069, abs=1e-3)
 
 
-def test_the_nested_error_is_of_configurations_that_the_selection_has_not_seen():
+def test_nested_error_is_from_configurations_outside_the_selection():
     # The candidate that is best in each fold is worst elsewhere.
     data = numbered(lambda number: 0.5 if number < 6 else 0.0)
     found = selection.select_nested(data, CONSTANTS[:2], 2, 0)
@@ -72,7 +72,7 @@ def test_the_nested_error_is_of_configurations_that_the_selection_has_not_seen()
     assert found.mae()[NESTED] >= min(found.mae()[name] for name in ("none", "half"))
 
 
-def test_a_trained_network_must_show_its_gain_in_the_nested_error(monkeypatch):
+def test_trained_network_must_show_its_gain_in_the_nested_error(monkeypatch):
     data = numbered(lambda number: 0.3)
     offered = [replace(item, trains=item.name == "quarter") for item in CONSTANTS]
     assert selection.select_nested(data, offered, 3, 0).chosen == "quarter"
@@ -88,7 +88,7 @@ def test_a_trained_network_must_show_its_gain_in_the_nested_error(monkeypatch):
 
 
 @pytest.mark.parametrize(("configurations", "folds"), [(3, 6), (4, 2), (4, 3), (5, 4), (7, 6)])
-def test_the_least_number_of_configurations_is_enough(configurations, folds):
+def test_least_number_of_configurations_is_enough(configurations, folds):
     assert configurations >= selection.min_configurations(folds)
     selection.select_nested(dataset(configurations, 2, samples=8), CONSTANTS, min(folds, configurations), 0)
 
@@ -96,7 +96,7 @@ def test_the_least_number_of_configurations_is_enough(configurations, folds):
 # --- candidates ---
 
 
-def test_the_cold_start_fits_an_offset_and_the_mean_a_line_too(tmp_path):
+def test_cold_start_fits_an_offset_and_the_mean_a_line_too(tmp_path):
     data, source = dataset(20, 3, samples=32), bundle(tmp_path)
     offered = candidates.with_cold_start(candidates.new_models(RECIPE), data, source)
     found = {item.name: item.fit(data, 0).correction_m(data) for item in offered if not item.trains}
@@ -108,7 +108,7 @@ def test_the_cold_start_fits_an_offset_and_the_mean_a_line_too(tmp_path):
     assert found[candidates.COLD_START_MEAN] == pytest.approx(mean, abs=1e-5)
 
 
-def test_the_cold_start_is_preferred_with_few_configurations_only(tmp_path):
+def test_cold_start_is_preferred_with_few_configurations_only(tmp_path):
     source, own = bundle(tmp_path), candidates.new_models(RECIPE)
 
     def names(data) -> list[str]:
@@ -130,7 +130,7 @@ def test_the_cold_start_is_preferred_with_few_configurations_only(tmp_path):
 
 
 @pytest.mark.parametrize("name", [candidates.CONSTANT, candidates.LINE])
-def test_a_model_without_network_has_one_that_predicts_nothing(name):
+def test_model_without_network_predicts_zero(name):
     fitted = candidates.fit_new_model(dataset(8, 5, samples=8), RECIPE.for_candidate(name), 0)
     assert not network_m(fitted.network, windows(5, 8)).any()
     assert fitted.linear_bias.needs_power == (name == candidates.LINE)
@@ -149,7 +149,7 @@ def at(seconds: float) -> Record:
     return Record(replace(measurement(3.0), stamp_ns=10**18 + round(seconds * 1e9)))
 
 
-def test_a_truth_table_gives_pairs_and_times_their_ranges(tmp_path):
+def test_truth_table_assigns_ranges_by_pair_and_time(tmp_path):
     table = load_truth(write(tmp_path, "1,2,2.5,0,10,door", "1,2,3.5,10,,"))
     truths = [item.truth for item in with_truth([at(0), at(9.9), at(10), at(500)], table)]
     assert [truth.range_m for truth in truths] == [2.5, 2.5, 3.5, 3.5]
@@ -168,13 +168,13 @@ def test_a_truth_table_gives_pairs_and_times_their_ranges(tmp_path):
         ("1,2", "range_m"),
     ],
 )
-def test_a_wrong_row_is_named(tmp_path, row, named):
+def test_invalid_row_is_named(tmp_path, row, named):
     with pytest.raises(RecordingError, match=named) as caught:
         load_truth(write(tmp_path, row))
     assert "line 2" in str(caught.value)
 
 
-def test_a_file_that_is_not_a_truth_table_is_refused(tmp_path):
+def test_file_that_is_not_a_truth_table_is_refused(tmp_path):
     (tmp_path / "binary.csv").write_bytes(b"\xff\x00\xfe")
     without_anchor = write(tmp_path, "1,2", header="tag_id,range_m").rename(tmp_path / "columns.csv")
     for path in (tmp_path / "absent.csv", tmp_path / "binary.csv", write(tmp_path), without_anchor):
@@ -211,7 +211,7 @@ def loads(monkeypatch, data) -> None:
     monkeypatch.setattr(recordings, "load", lambda *_: ("made up", data))
 
 
-def test_a_named_model_gets_the_offset_of_the_bag(tmp_path, eight_places):
+def test_named_model_gets_the_offset_of_the_bag(tmp_path, eight_places):
     # The same shape as the universal network, which replaces no model that is named.
     started = bundle(tmp_path, Remnet(), linear_bias=LinearBiasModel(5.0))
     output, result = tmp_path / "own.onnx", tmp_path / "own.json"
@@ -245,7 +245,7 @@ def test_few_configurations_start_from_the_universal_network(tmp_path, monkeypat
     assert network_m(float_network(made), inputs) == pytest.approx(expected, abs=1e-6)
 
 
-def test_a_model_that_harms_is_reported(tmp_path, monkeypatch):
+def test_harmful_model_is_reported(tmp_path, monkeypatch):
     # Without one of two configurations that err by 1 m, the constant is that of the two that err by -1 m.
     data = dataset(4, 3, samples=8)
     loads(monkeypatch, replace(data, error_m=np.where(np.isin(data.configurations, ("c0", "c1")), 1.0, -1.0)))

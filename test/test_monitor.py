@@ -49,7 +49,7 @@ def test_errors_are_absolute_and_grouped_by_label():
     assert statistics.missing == 0  # a board that corrects sends no raw ranges
 
 
-def test_a_summary_without_data_shows_no_nan():
+def test_summary_without_data_shows_no_nan():
     console = Console(width=100, record=True)
     console.print(summary(RangeStatistics()))
     shown = console.export_text()

@@ -53,7 +53,7 @@ def test_remnet_has_the_papers_parameters(samples, count):
     assert parameters(RemnetModule(Remnet(samples), 0.5)) == count
 
 
-def test_the_mlp_has_the_papers_parameters():
+def test_mlp_has_the_papers_parameters():
     assert Mlp().parameters == 54_401
     assert parameters(MlpModule(Mlp())) == 54_401
     assert Mlp().multiply_accumulates == 157 * 240 + 240 * 64 + 64 * 16 + 16
@@ -89,7 +89,7 @@ def test_weights_go_in_and_out_unchanged(shape):
 
 
 @pytest.mark.parametrize("shape", [Mlp(157), Mlp(8, (5,)), Mlp(33, (64, 7, 9))])
-def test_the_int8_mlp_equals_onnx_runtime_on_every_bit(shape):
+def test_int8_mlp_equals_onnx_runtime_on_every_bit(shape):
     weights = quantize(mlp_weights(shape), windows(100, shape.samples), exact=False)
     session = onnxruntime.InferenceSession(
         graph.int8_model(weights), session_options(), providers=["CPUExecutionProvider"]
@@ -101,7 +101,7 @@ def test_the_int8_mlp_equals_onnx_runtime_on_every_bit(shape):
 
 
 @pytest.mark.parametrize("quantised", [True, False])
-def test_an_mlp_bundle_loads_and_runs(tmp_path, quantised):
+def test_mlp_bundle_loads_and_runs(tmp_path, quantised):
     shape = Mlp(16, (12, 8))
     weights = mlp_weights(shape)
     integers = quantize(weights, windows(50, 16), exact=False)
@@ -121,6 +121,6 @@ def test_an_mlp_bundle_loads_and_runs(tmp_path, quantised):
 
 
 @pytest.mark.parametrize("options", [{"samples": 0}, {"hidden": ()}, {"hidden": (0,)}, {"hidden": (1,) * 7}])
-def test_an_mlp_that_cannot_be_is_refused(options):
+def test_invalid_mlp_is_refused(options):
     with pytest.raises(ParameterError, match="MLP"):
         Mlp(**options)

@@ -66,7 +66,7 @@ def replay_through_both(ros: Ros, count: int, *driver: str) -> tuple[list[RangeC
     return raw, corrected
 
 
-def test_a_subscriber_receives_every_corrected_range_of_a_bag(ros: Ros, bag: Path):
+def test_subscriber_receives_every_corrected_range_of_a_bag(ros: Ros, bag: Path):
     raw, corrected = replay_through_both(ros, 300, "source:=mcap", f"path:={bag}", "rate:=10.0")
     assert len(corrected) == 300
     assert [(m.header, m.sequence, m.anchor_id, m.tag_id, m.range_raw) for m in corrected] == [
@@ -74,7 +74,7 @@ def test_a_subscriber_receives_every_corrected_range_of_a_bag(ros: Ros, bag: Pat
     ]
 
 
-def test_the_nodes_give_what_the_library_gives_on_a_real_log(ros: Ros, apartment: Path):
+def test_nodes_equal_the_library_on_a_real_log(ros: Ros, apartment: Path):
     log = apartment / "logs" / "19.log.xz"
     mitigation = Mitigation(load_bundle(default_model_path()))
     with open_decaranging(log) as source:
@@ -111,14 +111,14 @@ def test_stamps_are_on_the_nodes_clock_and_spaced_as_recorded(ros: Ros, bag: Pat
         (("rate:=.nan",), "rate"),
     ],
 )
-def test_a_driver_without_a_source_says_why_and_leaves(ros: Ros, parameters: tuple[str, ...], named: str):
+def test_driver_without_a_source_exits_with_an_error(ros: Ros, parameters: tuple[str, ...], named: str):
     driver = ros.start("driver", *parameters)
     assert driver.wait() == 1
     assert named in driver.output
     assert "Traceback" not in driver.output
 
 
-def test_a_damaged_bag_is_played_up_to_the_damage(ros: Ros, bag: Path, tmp_path: Path):
+def test_damaged_bag_is_replayed_up_to_the_damage(ros: Ros, bag: Path, tmp_path: Path):
     torn = tmp_path / "torn.mcap"
     torn.write_bytes(bag.read_bytes()[: bag.stat().st_size * 9 // 10])
     received = ros.collect(RangeCir, RAW)
@@ -129,7 +129,7 @@ def test_a_damaged_bag_is_played_up_to_the_damage(ros: Ros, bag: Path, tmp_path:
     assert "torn.mcap" in driver.output
 
 
-def test_a_mitigator_without_a_usable_model_stays_inactive_and_can_be_mended(ros: Ros, tmp_path: Path):
+def test_mitigator_without_a_usable_model_stays_inactive_until_it_is_fixed(ros: Ros, tmp_path: Path):
     model = tmp_path / "model.onnx"
     model.write_bytes(default_model_path().read_bytes()[:-100])
     mitigator = ros.start("mitigator", f"model:={model}")
@@ -172,7 +172,7 @@ def test_ranges_that_cannot_be_corrected_pass_through(ros: Ros):
         assert math.isinf(answer.variance) == math.isnan(message.range)
 
 
-def test_two_nodes_with_one_name_are_reported_and_a_killed_one_is_not(ros: Ros):
+def test_duplicate_node_names_are_reported_except_for_a_killed_node(ros: Ros):
     def named() -> int:
         return ros.node.get_node_names_and_namespaces().count(("mitigator", "/"))
 
@@ -195,7 +195,7 @@ def run_demo(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=240, env=environment, check=False)
 
 
-def test_the_demo_replays_a_log_and_sums_it_up(apartment: Path):
+def test_demo_replays_a_log_and_prints_a_summary(apartment: Path):
     result = run_demo("--recording", str(apartment / "logs" / "19.log.xz"), "--rate", "40")
     assert result.returncode == 0, result.stdout + result.stderr
     assert "0 lost" in result.stdout

@@ -33,7 +33,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return bag
 
 
-def test_the_heading_follows_the_route_over_all_laps():
+def test_heading_follows_the_route_over_all_laps():
     at = np.linspace(0.0, 200.0, 20_001)
     yaw = yaw_along_route(ROUTE, at)
     # A turn by less than 180 degrees takes half a metre.
@@ -75,7 +75,7 @@ def test_odometry_has_a_scale_error_of_two_percent_drift_and_slip():
     assert 0.1 < np.degrees(np.std(biases)) < 0.6
 
 
-def test_a_simulated_drive_contains_odometry_imu_tf_and_the_true_heading(drive: Path):
+def test_simulated_drive_contains_odometry_imu_tf_and_the_true_heading(drive: Path):
     odometry, imu = read_odometry(drive, "/odom"), read_imu(drive, "/imu")
     motion = SimulatedSource(seed=1, count=400).motion()
     n = len(odometry)

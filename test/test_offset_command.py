@@ -69,7 +69,7 @@ def at_one_place(found: OffsetEstimate) -> set[str]:
     return {one.placement for one in found.placements if not one.refused}
 
 
-def test_an_offset_that_was_added_is_found(universal: Mitigation, direct: list[Record]):
+def test_added_offset_is_estimated(universal: Mitigation, direct: list[Record]):
     before, after = estimate_offset(universal, direct), estimate_offset(universal, longer(direct, 0.625))
     assert after.offset_m - before.offset_m == pytest.approx(0.625, abs=0.02)
     assert after.sd_m == pytest.approx(before.sd_m, abs=0.02)
@@ -82,7 +82,7 @@ def test_an_offset_that_was_added_is_found(universal: Mitigation, direct: list[R
     assert estimate_offset(told, longer(direct, 0.625)).offset_m == pytest.approx(after.offset_m, abs=0.02)
 
 
-def test_without_receive_levels_line_of_sight_is_seen_in_the_cir(direct: list[Record]):
+def test_without_levels_los_is_detected_in_the_cir(direct: list[Record]):
     amplitude = Mitigation(load_bundle(default_model_path(Scaling.MAX)))
     found = estimate_offset(amplitude, without_levels(direct))
     assert found.offset_m == pytest.approx(0.22, abs=3.0 * found.sd_m)
@@ -100,7 +100,7 @@ def test_without_receive_levels_line_of_sight_is_seen_in_the_cir(direct: list[Re
         estimate_offset(amplitude, without_levels(blocked[:1] * 20))
 
 
-def test_what_is_not_line_of_sight_is_refused_with_what_shows_it(universal: Mitigation, direct: list[Record]):
+def test_nlos_is_refused_with_the_evidence(universal: Mitigation, direct: list[Record]):
     with pytest.raises(DatasetError, match=r"not line of sight: the first path is \d+\.\d dB below"):
         estimate_offset(universal, weaker_first_path(direct, 9.0), 3.0)
     without_cir = [
@@ -120,7 +120,7 @@ def test_what_is_not_line_of_sight_is_refused_with_what_shows_it(universal: Miti
         estimate_offset(universal, [replace(record, truth=None) for record in direct[:20]])
 
 
-def test_one_distance_is_that_of_one_pair(universal: Mitigation, direct: list[Record]):
+def test_single_distance_needs_a_single_pair(universal: Mitigation, direct: list[Record]):
     two = [
         replace(record, measurement=replace(record.measurement, anchor_id=2 + n % 2))
         for n, record in enumerate(direct)
@@ -133,7 +133,7 @@ def test_one_distance_is_that_of_one_pair(universal: Mitigation, direct: list[Re
         estimate_offset(universal, two, anchor_id=9)
 
 
-def test_line_of_sight_of_the_real_logs_tells_the_boards_delay(apartment: Path, tmp_path: Path):
+def test_los_of_the_real_logs_gives_the_offset_of_the_boards(apartment: Path, tmp_path: Path):
     outcome = command_line.run(
         "offset", apartment, "--truth", "--together", "-o", "o.yaml", "--json", "o.json",
         "--model", default_model_path(), folder=tmp_path,
@@ -152,7 +152,7 @@ def test_line_of_sight_of_the_real_logs_tells_the_boards_delay(apartment: Path, 
     assert not offsets.pairs
 
 
-def test_what_is_written_is_what_the_other_commands_read(direct: list[Record], tmp_path: Path):
+def test_written_offsets_are_read_by_the_other_commands(direct: list[Record], tmp_path: Path):
     with BagWriter(tmp_path / "los.mcap", {"source": "test", "simulated": "true"}) as bag:
         for record in longer(direct[:300], 0.5):
             bag.write(record)
@@ -187,7 +187,9 @@ def test_what_is_written_is_what_the_other_commands_read(direct: list[Record], t
         (("--truth", "--anchor", "door"), "anchor = 'door'"),
     ],
 )
-def test_what_makes_no_sense_is_refused_before_the_work(options: tuple[str, ...], said: str, tmp_path: Path):
+def test_contradictory_options_are_refused_before_the_work(
+    options: tuple[str, ...], said: str, tmp_path: Path
+):
     outcome = command_line.run("offset", "none.mcap", *options, folder=tmp_path)
     assert outcome.returncode != 0
     assert said in outcome.stderr

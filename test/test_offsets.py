@@ -31,21 +31,21 @@ pairs:
 """
 
 
-def test_the_most_specific_offset_counts_and_those_of_two_radios_add():
+def test_most_specific_offset_applies_and_radio_offsets_add_up():
     offsets = parse_offsets(TEXT, "x")
     assert offsets.of([7, 7, 8, 7, 8], [1, 31, 1, 9, 9]).tolist() == [1.5, 0.0625, 0.25, -0.0625, 0.5]
     unknown = np.array([8, 2**64 - 1], np.uint64)
     assert offsets.of(unknown, unknown).tolist() == [0.5, 0.5]
 
 
-def test_a_file_that_is_written_is_read_as_it_was():
+def test_written_offsets_are_read_back():
     offsets = parse_offsets(TEXT, "x")
     assert parse_offsets(dump_offsets(offsets, "found\nso"), "y") == offsets
     assert not parse_offsets(dump_offsets(NO_OFFSETS), "y")
     assert offsets
 
 
-def test_a_parameter_is_a_number_or_a_file(tmp_path: Path):
+def test_parameter_is_a_number_or_a_file(tmp_path: Path):
     assert read_offsets("") is NO_OFFSETS
     assert read_offsets(" 0.22 ").of([1], [2]) == np.float32(0.22)
     path = tmp_path / "offsets.yaml"
@@ -82,7 +82,7 @@ def test_a_parameter_is_a_number_or_a_file(tmp_path: Path):
         ("pairs: [{anchor: 1, tag: 2, offset: 0.1}, {anchor: 1, tag: 2, offset: 0.2}]", "entry 2.*twice"),
     ],
 )
-def test_what_is_no_file_of_offsets_is_refused_in_words(text: str, said: str):
+def test_malformed_offsets_file_is_refused(text: str, said: str):
     with pytest.raises(ParameterError, match=said) as caught:
         parse_offsets(text, "site.yaml")
     assert "site.yaml" in str(caught.value)
@@ -97,7 +97,7 @@ def with_offsets(subject: Mitigation, offsets: Offsets) -> Mitigation:
     return Mitigation(subject.bundle, offsets)
 
 
-def test_the_offset_comes_off_beside_the_predicted_error(subject: Mitigation):
+def test_offset_is_subtracted_in_addition_to_the_predicted_error(subject: Mitigation):
     offset = 0.25
     plain, moved = subject.correct([measurement(3.0)])[0], measurement(3.25)
     result = with_offsets(subject, Offsets(offset)).correct([moved])[0]
@@ -118,7 +118,7 @@ def test_the_offset_comes_off_beside_the_predicted_error(subject: Mitigation):
         (math.nan, 0.5, math.nan, False),
     ],
 )
-def test_a_range_passes_through_less_the_offset(
+def test_passed_through_range_has_the_offset_subtracted(
     subject: Mitigation, range_m: float, offset: float, expected: float, valid: bool
 ):
     bad = measurement(range_m)
@@ -188,7 +188,7 @@ def messages_in(data: bytes) -> list[tuple[int, bytes]]:
     return [(frame.type, encode_frame(frame)) for frame in FrameDecoder().feed(data)]
 
 
-def test_a_board_takes_off_what_the_host_sets_and_again_after_a_restart():
+def test_board_subtracts_the_offsets_of_the_host_also_after_a_restart():
     pair = Pair(Offsets(0.25))
     assert pair.range() == []
     assert pair.session.counts.wrong_offsets == 1
@@ -204,7 +204,7 @@ def test_a_board_takes_off_what_the_host_sets_and_again_after_a_restart():
     assert not [event for event in pair.events if isinstance(event, OffsetsRefused)]
 
 
-def test_an_older_board_is_told_of_in_words_and_its_corrections_do_not_count():
+def test_older_board_is_reported_and_its_corrections_are_ignored():
     pair = Pair(Offsets(0.25), older=True)
     for _ in range(RADIO_TRIES + 3):
         pair.turn()
@@ -213,7 +213,7 @@ def test_an_older_board_is_told_of_in_words_and_its_corrections_do_not_count():
     assert pair.range() == []
 
 
-def test_an_older_board_is_good_enough_where_there_are_no_offsets():
+def test_older_board_is_accepted_without_offsets():
     pair = Pair(NO_OFFSETS, older=True)
     assert pair.range() == [3.0]
     for _ in range(RADIO_TRIES + 3):
@@ -222,7 +222,7 @@ def test_an_older_board_is_good_enough_where_there_are_no_offsets():
     assert pair.range() == [3.0]
 
 
-def test_more_offsets_than_a_board_keeps_are_refused_with_both_numbers():
+def test_too_many_offsets_for_a_board_are_refused_with_both_numbers():
     pair = Pair(Offsets(anchors=dict.fromkeys(range(MAX_OFFSETS + 1), 0.1)))
     pair.turn()
     (refused,) = [event for event in pair.events if isinstance(event, OffsetsRefused)]

@@ -77,7 +77,7 @@ def amplitudes_of(records: list[Record]) -> np.ndarray:
         lambda data: data.set_index(pd.Index([f"r{i}" for i in range(len(data))])),
     ],
 )
-def test_a_frame_is_read_in_every_representation(
+def test_frame_is_read_in_every_representation(
     tmp_path: Path, writing: Callable[[pd.DataFrame], pd.DataFrame]
 ) -> None:
     data = frame()
@@ -131,7 +131,7 @@ def test_errors_survive_import_into_a_bag_to_a_micrometre(tmp_path: Path, error:
         ("Obstacles", 1000000000),
     ],
 )
-def test_an_invalid_cell_is_rejected_with_row_and_column(tmp_path: Path, column: str, value: object) -> None:
+def test_invalid_cell_is_rejected_with_row_and_column(tmp_path: Path, column: str, value: object) -> None:
     data = frame()
     cells = list(data[column])
     cells[7] = value
@@ -154,7 +154,7 @@ class Calls:
 
 
 @pytest.mark.parametrize("protocol", [0, 2, 4])
-def test_a_hostile_pickle_runs_nothing(tmp_path: Path, protocol: int) -> None:
+def test_hostile_pickle_runs_nothing(tmp_path: Path, protocol: int) -> None:
     mark, path = tmp_path / "ran", tmp_path / "dataset.pkl"
     data = frame().astype(object)
     for hostile in (Calls(os.system, f"touch '{mark}'"), Calls(eval, f"open({str(mark)!r}, 'w')")):
@@ -188,7 +188,7 @@ def test_other_files_are_rejected_by_name(tmp_path: Path, content: bytes) -> Non
 # --- rooms and splits ---
 
 
-def test_the_splits_have_the_published_sizes() -> None:
+def test_splits_have_the_published_sizes() -> None:
     names = np.repeat([rooms.configuration_of(room, OBSTACLES[0]) for room in range(5)], rooms.ROOM_ROWS)
     for split, sizes in (("paper", (36_023, 13_210)), ("all_but_room_2", (41_948, 13_210))):
         name, rows = experiment_data.split_by_name(names, split)
@@ -237,7 +237,7 @@ def test_simulated_rooms_and_obstacles_are_those_of_deepuwb(simulated: list[Reco
     assert SimulatedDeepUwb().simulated
 
 
-def test_a_simulated_configuration_is_one_placement(simulated: list[Record]) -> None:
+def test_simulated_configuration_is_one_placement(simulated: list[Record]) -> None:
     distance: dict[str, list[float]] = {}
     for record in simulated:
         assert record.truth is not None
@@ -259,7 +259,7 @@ def test_simulated_cirs_are_cut_and_normalised_and_powers_known(simulated: list[
     assert abs(rise - WINDOW_LEAD) <= 1
 
 
-def test_the_command_simulates_a_bag_that_can_be_played(tmp_path: Path) -> None:
+def test_command_simulates_a_bag_that_can_be_played(tmp_path: Path) -> None:
     words = ("paper", "simulate", "--ranges", "100", "-o", "sim.mcap", "--json", "sim.json")
     assert run(*words, folder=tmp_path).returncode == 0
     assert json.loads((tmp_path / "sim.json").read_text())["ranges"] == 100
@@ -299,7 +299,7 @@ def mirror(tmp_path: Path) -> Iterator[str]:
         thread.join()
 
 
-def test_a_wrong_checksum_leaves_no_file_and_a_file_with_the_checksum_is_kept(
+def test_wrong_checksum_leaves_no_file_and_a_file_with_the_checksum_is_kept(
     mirror: str, tmp_path: Path
 ) -> None:
     path = tmp_path / "a.pkl"
@@ -312,7 +312,7 @@ def test_a_wrong_checksum_leaves_no_file_and_a_file_with_the_checksum_is_kept(
     assert path.stat().st_mtime_ns == written
 
 
-def test_the_command_downloads_or_fails_with_one_line(mirror: str, tmp_path: Path) -> None:
+def test_command_downloads_or_fails_with_one_line(mirror: str, tmp_path: Path) -> None:
     words = ("--url", f"{mirror}/dataset.pkl", "--sha256", SHA256, "--json", "fetch.json")
     done = start("paper", "fetch", *words, folder=tmp_path)
     assert done.returncode == 0, done.stderr

@@ -105,7 +105,7 @@ def test_baselines_are_fitted_on_the_training_part(finished):
 
 
 @pytest.mark.parametrize("case", ["train without power", "test without power", "few configurations"])
-def test_a_line_that_the_data_does_not_allow_has_a_reason(case: str):
+def test_baseline_without_data_has_a_reason(case: str):
     train = with_line(dataset(3 if case.startswith("few") else 8, 5))
     test = with_line(dataset(4, 5, seed=1))
     if not case.startswith("few"):
@@ -149,7 +149,7 @@ def test_two_processes_give_the_same_models(tmp_path):
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_a_loss_that_diverges_ends_the_run(tmp_path, workers: int):
+def test_loss_that_diverges_ends_the_run(tmp_path, workers: int):
     bad = parts()
     bad = replace(bad, train=replace(bad.train, error_m=bad.train.error_m + 3e38))
     with pytest.raises(DatasetError):
@@ -185,7 +185,7 @@ def paper(*words: object, folder: Path) -> dict:
     return json.loads((folder / "out.json").read_text())
 
 
-def test_the_command_writes_its_results(folder):
+def test_command_writes_its_results(folder):
     quick = ("--networks", "remnet", "--windows", 8, "--seeds", 1, "--epochs", 1, "--workers", 1)
     result = paper("protocol", "--data", "rooms.mcap", "-o", "models", *quick, folder=folder)
     assert json.loads((folder / "models" / RESULTS).read_text()) == result

@@ -127,7 +127,7 @@ def no_cloud(monkeypatch):
     monkeypatch.setattr(report.figures, "scatter", lambda *_: "data:image/png;base64,")
 
 
-def test_every_table_and_figure_is_there_and_refers_to_nothing_outside(full):
+def test_page_contains_all_tables_and_figures_and_no_external_references(full):
     html = full.html()
     page = Page(html)
     assert sorted(values["id"] for values in page.all("section")) == sorted(PARTS)
@@ -151,7 +151,7 @@ def test_every_table_and_figure_is_there_and_refers_to_nothing_outside(full):
     assert "simulated data" in page.text[""]
 
 
-def test_the_same_data_gives_the_same_page_and_radio_data_is_not_called_simulated():
+def test_same_data_gives_the_same_page_and_radio_data_is_not_called_simulated():
     plain = build(study()).html().split("</style>")[1]
     assert "simulated" not in plain.lower()
     assert build(study()).html().split("</style>")[1] == plain
@@ -206,7 +206,7 @@ def test_hostile_names_are_only_text():
     assert "<script" not in page
 
 
-def test_the_command_writes_the_page_and_rejects_wrong_files(apartment, tmp_path):
+def test_command_writes_the_page_and_rejects_wrong_files(apartment, tmp_path):
     log = sorted((apartment / "logs").glob("*.log*"))[0]
     words = ("paper", "report", "--data", log, "-o", "out", "--json", "out.json")
     done = run(*words, folder=tmp_path)

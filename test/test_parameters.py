@@ -44,7 +44,7 @@ def replaying(tmp_path_factory: pytest.TempPathFactory):
         ("rate", 3, None),
     ],
 )
-def test_a_value_is_refused_by_name_value_and_range(
+def test_value_is_refused_by_name_value_and_range(
     replaying: Ros, name: str, value: object, told: tuple | None
 ):
     result = replaying.set_parameter("driver", name, value)
@@ -52,7 +52,7 @@ def test_a_value_is_refused_by_name_value_and_range(
     assert all(word in result.reason for word in told or ()), result.reason
 
 
-def test_a_parameter_that_no_node_knows_is_refused_with_what_was_meant(ros: Ros, tmp_path: Path):
+def test_unknown_parameter_is_refused_with_a_suggestion(ros: Ros, tmp_path: Path):
     file = tmp_path / "parameters.yaml"
     file.write_text("/**:\n  ros__parameters:\n    sorce: mcap\n")
     for node, words, told in (
@@ -70,9 +70,7 @@ def test_a_parameter_that_no_node_knows_is_refused_with_what_was_meant(ros: Ros,
         assert "Traceback" not in process.output
 
 
-def test_other_nodes_parameters_in_a_file_for_all_are_named_in_one_line_and_no_warning(
-    ros: Ros, tmp_path: Path
-):
+def test_parameters_of_other_nodes_in_a_shared_file_are_logged_in_one_line(ros: Ros, tmp_path: Path):
     file = tmp_path / "parameters.yaml"
     file.write_text("/**:\n  ros__parameters: {model: '', rate: 2.0, height: 1.0, anchors: a.yaml}\n")
     driver = ros.start("driver", arguments=("--params-file", str(file)))
@@ -102,14 +100,14 @@ def test_parameters_that_were_set_survive_a_respawn(
 
 
 @pytest.mark.parametrize("value", ["reliability:=perhaps", "depth:=deep"])
-def test_a_quality_of_service_that_is_none_is_refused(ros: Ros, value: str):
+def test_invalid_qos_override_is_refused(ros: Ros, value: str):
     mitigator = ros.start("mitigator", f"qos_overrides./uwb/range_raw.subscription.{value}")
     assert mitigator.wait() == 1
     assert "qos_overrides of /uwb/range_raw" in mitigator.output
     assert "Traceback" not in mitigator.output
 
 
-def test_an_override_for_a_topic_that_a_node_lacks_is_reported(ros: Ros):
+def test_override_for_a_topic_that_a_node_lacks_is_reported(ros: Ros):
     mitigator = ros.start("mitigator", "qos_overrides./uwb/range_rwa.subscription.depth:=5")
     mitigator.wait_for_output("/uwb/range_raw.subscription.depth")
 

@@ -20,24 +20,24 @@ def moved(pauses: PauseShortener, *stamps_ns: int) -> list[int]:
     return [pauses.without(item).measurement.stamp_ns for item in records]
 
 
-def test_a_pause_is_cut_to_the_longest_and_what_follows_keeps_its_spacing() -> None:
+def test_pause_is_shortened_and_later_intervals_are_kept() -> None:
     pauses = PauseShortener(5.0, TODAY_NS)
     times = moved(pauses, START_NS, START_NS + 10**9, START_NS + DAY_NS, START_NS + DAY_NS + 7)
     assert [time - START_NS for time in times] == [0, 10**9, 6 * 10**9, 6 * 10**9 + 7]
     assert (pauses.cut, pauses.cut_s) == (1, pytest.approx(86_400 - 6))
 
 
-def test_an_infinite_pause_cuts_none_and_time_that_runs_backwards_stays() -> None:
+def test_infinite_limit_and_decreasing_stamps_change_nothing() -> None:
     stamps = (START_NS, START_NS + DAY_NS, START_NS + 3)
     assert moved(PauseShortener(math.inf, TODAY_NS), *stamps) == list(stamps)
 
 
-def test_what_bears_no_date_begins_on_the_given_one_or_behind_what_has_one() -> None:
+def test_records_without_a_date_start_at_the_given_date_or_after_dated_records() -> None:
     assert moved(PauseShortener(5.0, TODAY_NS), 0, 10) == [TODAY_NS, TODAY_NS + 10]
     assert moved(PauseShortener(5.0, TODAY_NS), START_NS, 0, 10) == [START_NS, START_NS, START_NS + 10]
 
 
 @pytest.mark.parametrize("longest", [-1.0, math.nan])
-def test_a_pause_that_cannot_be_is_refused(longest: float) -> None:
+def test_invalid_limit_is_refused(longest: float) -> None:
     with pytest.raises(ParameterError, match="inf cuts none"):
         PauseShortener(longest, 0)

@@ -22,7 +22,7 @@ CORRECTED = "/uwb/range_corrected"
 PLAY = ("count:=200", "seed:=1", "simulated_rate:=400.0", *PAUSED)
 
 
-def test_the_ranges_are_those_of_the_library_to_the_bit(ros: Ros):
+def test_ranges_are_those_of_the_library_to_the_bit(ros: Ros):
     mitigation = Mitigation(load_bundle(default_model_path()))
     source = SimulatedSource(seed=1, count=200, rate_hz=400.0)
     expected = [mitigation.correct([record.measurement])[0] for record in source]
@@ -37,7 +37,7 @@ def test_the_ranges_are_those_of_the_library_to_the_bit(ros: Ros):
     assert "unknown" not in pipeline.output
 
 
-def test_the_raw_ranges_are_there_for_who_subscribes(ros: Ros):
+def test_raw_ranges_are_published_for_subscribers(ros: Ros):
     raw = ros.collect(RangeCir, "/uwb/range_raw")
     corrected = ros.collect(RangeCorrected, CORRECTED)
     ros.start("pipeline", *PLAY)
@@ -48,7 +48,7 @@ def test_the_raw_ranges_are_there_for_who_subscribes(ros: Ros):
     assert all(len(m.cir.samples) for m in raw)
 
 
-def test_several_pipelines_side_by_side_keep_to_themselves(ros: Ros):
+def test_several_pipelines_do_not_interfere(ros: Ros):
     received = {name: ros.collect(RangeCorrected, f"/{name}{CORRECTED}") for name in ("left", "right")}
     pipelines = [ros.start("pipeline", *PLAY, arguments=("-r", f"__ns:=/{name}")) for name in received]
     for name in received:

@@ -81,7 +81,7 @@ def write(folder: Path, topic: str, make: Callable[[int], Any]) -> Path:
         ("/tf", transformed, ("map", "base_link")),
     ],
 )
-def test_poses_are_read_whatever_tells_them(tmp_path, topic, make, frames):
+def test_poses_are_read_from_every_supported_type(tmp_path, topic, make, frames):
     (path,) = read_bodies(write(tmp_path, topic, make), topic, frames).values()
     assert path.stamp_ns.tolist() == [second * 10**9 for second in range(SECONDS)]
     assert np.allclose(path.position, [[second, 2.0, 0.5] for second in range(SECONDS)])
@@ -114,7 +114,7 @@ def test_each_child_frame_is_a_body_of_its_own(tmp_path):
         read_bodies(bag, "/odom", ("map", "base_link"))
 
 
-def test_the_lever_arm_is_the_transform_from_robot_to_antenna(tmp_path):
+def test_lever_arm_is_the_transform_from_robot_to_antenna(tmp_path):
     bag = write(tmp_path, "/tf", transformed)
     assert read_lever_arm(bag, "base_link", "link_3") == (0.0, 1.0, 0.25)
     assert read_lever_arm(bag, "base_link", "uwb") is None
@@ -123,7 +123,7 @@ def test_the_lever_arm_is_the_transform_from_robot_to_antenna(tmp_path):
         read_lever_arm(bag, "map", "base_link")
 
 
-def test_frames_that_are_not_there_and_none_at_all_are_told(tmp_path):
+def test_missing_frames_are_reported(tmp_path):
     bag = write(tmp_path, "/tf", transformed)
     with pytest.raises(RecordingError, match="--frames"):
         read_bodies(bag, "/tf", None)
@@ -156,7 +156,7 @@ def test_heights_are_read_from_each_type(tmp_path, make, seconds, height_m, vari
     assert np.isfinite(value).tolist() == [True, make is not measured_range, False]
 
 
-def test_a_topic_without_heights_is_refused(tmp_path):
+def test_topic_without_heights_is_refused(tmp_path):
     bag = write(tmp_path, "/pose", posed)
     with pytest.raises(RecordingError, match="no topic /height"):
         read_heights(bag, "/height")

@@ -45,7 +45,7 @@ SLOPE = AnchorMap(
 """Anchors high on one side: errors of the height and in plan are strongly correlated."""
 
 
-def test_the_filter_agrees_with_filterpy():
+def test_filter_agrees_with_filterpy():
     kalman = pytest.importorskip("filterpy.kalman")
     mine = RangeFilter(HALL, PLAIN, 0.0, np.array([6.0, 4.0, 1.0]), np.eye(3))
     mine.learns = True
@@ -96,7 +96,7 @@ def test_the_filter_agrees_with_filterpy():
     ),
     learns=st.booleans(),
 )
-def test_the_covariance_stays_one_and_the_state_finite(steps, learns: bool):
+def test_covariance_stays_valid_and_the_state_finite(steps, learns: bool):
     one = RangeFilter(HALL, NoiseModel(), 0.0, np.array([6.0, 4.0, 1.0]), np.eye(3))
     one.learns = learns
     now = 0.0
@@ -109,7 +109,7 @@ def test_the_covariance_stays_one_and_the_state_finite(steps, learns: bool):
     assert np.isfinite(one.x).all()
 
 
-def test_live_estimates_of_many_drives_are_honest():
+def test_covariances_of_live_estimates_are_consistent():
     found = []
     for seed in range(6):
         offset = np.random.default_rng(seed).normal(0, NoiseModel().offset_sd)
@@ -122,7 +122,7 @@ def test_live_estimates_of_many_drives_are_honest():
     assert np.mean([e.exceeded for e in found]) < 0.01
 
 
-def test_of_two_mirror_images_nothing_is_told_until_an_area_excludes_one():
+def test_ambiguous_position_is_not_published_until_an_area_resolves_it():
     wall = AnchorMap([Anchor(1, (0, 0, 1)), Anchor(2, (10, 0, 1)), Anchor(3, (5, 0, 1.0))])
     ranges, truth = drive(wall, seconds=8)
     locator = TagEstimator(EstimatorConfig(wall, height=Height(1.0)))
@@ -133,7 +133,7 @@ def test_of_two_mirror_images_nothing_is_told_until_an_area_excludes_one():
 
 
 @pytest.mark.parametrize("seed", [2, 3])
-def test_every_position_lies_inside_the_area(seed: int):
+def test_every_position_is_inside_the_area(seed: int):
     area = Area((-4, -4, 0), (0.9, 4, 3))
     ranges, truth = drive(WALL, path=flight, seed=seed)
     locator = TagEstimator(EstimatorConfig(WALL, area=area))
@@ -168,7 +168,7 @@ def test_measured_heights_near_the_floor_keep_the_right_solution(seed: int):
 @pytest.mark.parametrize(
     ("anchors", "area"), [(FLAT, None), (FLAT_HALL, None), (SLOPE, Area((-30, -30, 0), (30, 30, 7)))]
 )
-def test_late_heights_correct_a_wrong_height_at_once(anchors: AnchorMap, area: Area | None):
+def test_late_heights_correct_a_wrong_height_immediately(anchors: AnchorMap, area: Area | None):
     ranges, truth = drive(anchors, path=flight, seconds=8, seed=2)
     late = truth.stamp_ns > 4 * NANOSECONDS
     heights = Heights(truth.stamp_ns[late], truth.position[late, 2], np.full(late.sum(), 0.0004))
@@ -204,7 +204,7 @@ def lagged(
     return Track.of(live), Track.of(smoothed)
 
 
-def test_poses_smoothed_with_a_lag_obey_area_and_measured_heights():
+def test_fixed_lag_poses_obey_area_and_measured_heights():
     area = Area((-4, -4, 0), (0.25, 4, 3))
     ranges, truth = drive(WALL, path=flight, seconds=10, seed=2)
     block(ranges, 2)
@@ -217,7 +217,7 @@ def test_poses_smoothed_with_a_lag_obey_area_and_measured_heights():
 
 
 @pytest.mark.parametrize("seed", [1, 3])
-def test_poses_smoothed_with_a_lag_among_obstacles_are_not_worse_than_live(seed: int):
+def test_fixed_lag_poses_among_obstacles_are_not_worse_than_live(seed: int):
     ranges, truth = drive(seconds=30, seed=seed)
     live, smoothed = (track_errors(one, truth) for one in lagged(HALL, block(ranges, seed), truth))
     assert smoothed.rmse < 1.1 * live.rmse
@@ -242,7 +242,7 @@ def test_anchors_almost_on_a_line_never_decide_by_chance(seed: int, height: Heig
     assert "all on a line" in warning
 
 
-def test_the_covariance_grows_through_a_silence_and_the_tag_is_found_within_two_seconds_after():
+def test_covariance_grows_in_a_gap_and_the_tag_is_found_within_two_seconds_after_it():
     ranges, truth = drive(seconds=40)
     before = ranges.take(ranges.stamp_ns < 15 * NANOSECONDS)
     locator = TagEstimator(EstimatorConfig(HALL))
@@ -259,7 +259,7 @@ def test_the_covariance_grows_through_a_silence_and_the_tag_is_found_within_two_
     assert errors.rmse < 0.3
 
 
-def test_a_tag_that_was_carried_away_is_found_within_two_seconds():
+def test_kidnapped_tag_is_found_within_two_seconds():
     def carried(time_s):
         position = circuit(time_s)
         position[time_s >= 20] += (-5.5, 3.0, 0.0)
@@ -274,7 +274,7 @@ def test_a_tag_that_was_carried_away_is_found_within_two_seconds():
     assert track_errors(late, truth).nees_per_dof < 2
 
 
-def test_bad_input_is_skipped_and_a_replay_that_starts_again_starts_the_tag_again():
+def test_invalid_input_is_skipped_and_a_restarted_replay_resets_the_tag():
     ranges, truth = drive(seconds=10)
     locator = TagEstimator(EstimatorConfig(HALL))
     for value in (math.nan, math.inf, -1.0):
@@ -289,7 +289,7 @@ def test_bad_input_is_skipped_and_a_replay_that_starts_again_starts_the_tag_agai
     assert locator.counts["found"] == 2
 
 
-def test_all_places_that_explain_ranges_are_found():
+def test_all_candidate_positions_are_found():
     rng = np.random.default_rng(2)
     for _ in range(20):
         anchors = rng.uniform((0, 0, 0), (20, 20, 3), (4, 3))
@@ -329,12 +329,12 @@ def test_errors_of_known_size():
     assert found.exceeded < 0.006
 
 
-def test_truth_is_not_made_up_in_gaps():
+def test_truth_is_not_interpolated_across_gaps():
     path = TruePath(np.array([0, 1, 5]) * NANOSECONDS, np.array([[0.0, 0, 0], [1, 0, 0], [5, 0, 0]]))
     at = path.at(np.array([-1, 0, NANOSECONDS // 2, 3 * NANOSECONDS, 6 * NANOSECONDS]))
     np.testing.assert_array_equal(at[:, 0], [np.nan, 0, 0.5, np.nan, np.nan])
 
 
-def test_a_model_out_of_range_is_refused():
+def test_model_out_of_range_is_refused():
     with pytest.raises(ParameterError, match="range_sd"):
         NoiseModel(range_sd=math.nan)

@@ -51,7 +51,7 @@ def fault(cir: Cir, samples: int = 157, scaling: Scaling = Scaling.PREAMBLE):
 @pytest.mark.parametrize("encoding", list(Encoding))
 @settings(max_examples=25)
 @given(data=st.data())
-def test_inputs_are_the_contract_to_the_bit(scaling, encoding, data):
+def test_inputs_equal_the_specification_bit_by_bit(scaling, encoding, data):
     seed = data.draw(st.integers(0, 2**32 - 1))
     generator = np.random.default_rng(seed)
     low = -32766 if encoding == Encoding.COMPLEX_INT16 else 0
@@ -106,15 +106,15 @@ def test_inputs_are_the_contract_to_the_bit(scaling, encoding, data):
         ({"preamble_count": 0}, CirFault.NO_PREAMBLE_COUNT),
     ],
 )
-def test_each_fault_is_found(changes, expected):
+def test_each_fault_is_detected(changes, expected):
     assert fault(cir(**changes)) == expected
 
 
-def test_a_saturated_sample_outside_the_window_does_no_harm():
+def test_saturated_sample_outside_the_window_is_accepted():
     samples = cir().samples.copy()
     samples[0] = 32767
     assert fault(cir(samples=samples)) == 0
 
 
-def test_the_scaling_by_maximum_needs_no_preamble_count():
+def test_scaling_by_maximum_needs_no_preamble_count():
     assert fault(cir(preamble_count=0), scaling=Scaling.MAX) == 0

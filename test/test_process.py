@@ -133,7 +133,7 @@ def one_by_one(measurements: list[RangeMeasurement], offsets: Offsets = NO_OFFSE
     return [codec.encode_corrected(m, mitigation.correct([m])[0]) for m in measurements]
 
 
-def test_corrected_ranges_are_those_of_one_by_one_to_the_bit(tmp_path: Path) -> None:
+def test_batches_equal_single_corrections_bit_by_bit(tmp_path: Path) -> None:
     measurements = odd_exchanges() + exchanges(300)
     measurements += [exchange(n, {"samples": np.zeros(0, np.int16)}) for n in range(3)]
     measurements = [replace(m, stamp_ns=START_NS + n) for n, m in enumerate(measurements)]
@@ -144,7 +144,7 @@ def test_corrected_ranges_are_those_of_one_by_one_to_the_bit(tmp_path: Path) -> 
     assert set(outcome.statuses) >= {"OK", "NO_CIR", "BAD_CIR", "OUT_OF_DISTRIBUTION"}
 
 
-def test_everything_else_is_copied_byte_for_byte(tmp_path: Path) -> None:
+def test_other_messages_are_copied_byte_by_byte(tmp_path: Path) -> None:
     foreign = Foreign(tmp_path / "in.mcap").ours()
     foreign.channel("/picture", "sensor_msgs/msg/Image", "uint8[] data")
     foreign.channel("/notes", "", None, encoding="json")
@@ -193,7 +193,7 @@ def cut(path: Path) -> int:
     return end
 
 
-def test_a_damaged_bag_is_processed_as_far_as_it_goes(tmp_path: Path) -> None:
+def test_damaged_bag_is_processed_up_to_the_damage(tmp_path: Path) -> None:
     source = write_bag(tmp_path / "in.mcap", exchanges(400))
     end = cut(source)
     outcome = process_bag(job(source, tmp_path / "out.mcap"))
@@ -203,7 +203,7 @@ def test_a_damaged_bag_is_processed_as_far_as_it_goes(tmp_path: Path) -> None:
     assert corrected_of(tmp_path / "out.mcap") == one_by_one(exchanges(outcome.ranges))
 
 
-def test_the_command_writes_a_bag_and_its_result(tmp_path: Path) -> None:
+def test_command_writes_a_bag_and_its_result(tmp_path: Path) -> None:
     write_bag(tmp_path / "in.mcap", exchanges(40))
     done = start(
         "process", "in.mcap", "-o", "out.mcap", "--model", "evk1000_apartment", "--json", "out.json",
@@ -218,7 +218,7 @@ def test_the_command_writes_a_bag_and_its_result(tmp_path: Path) -> None:
     assert corrected_of(tmp_path / "out.mcap") == one_by_one(exchanges(40))
 
 
-def test_offsets_of_a_file_are_taken_off_each_pair(tmp_path: Path) -> None:
+def test_offsets_of_a_file_are_subtracted_for_each_pair(tmp_path: Path) -> None:
     write_bag(tmp_path / "in.mcap", exchanges(30))
     # Of the three anchors one has its own offset, one its own with this tag.
     offsets = "default: 0.2\nanchors: {2: 0.35}\npairs: [{anchor: 3, tag: 7, offset: -0.1}]\n"
@@ -233,7 +233,7 @@ def test_offsets_of_a_file_are_taken_off_each_pair(tmp_path: Path) -> None:
     assert np.subtract(more, without)[:3] == pytest.approx([0.2, 0.35, -0.1], abs=1e-6)
 
 
-def test_an_output_that_is_there_is_kept_unless_forced(tmp_path: Path) -> None:
+def test_existing_output_is_kept_without_force(tmp_path: Path) -> None:
     source = write_bag(tmp_path / "in.mcap", exchanges(4))
     output = write_bag(tmp_path / "out.mcap", exchanges(1))
     refused = run("process", source, "-o", output, folder=tmp_path)
@@ -245,7 +245,7 @@ def test_an_output_that_is_there_is_kept_unless_forced(tmp_path: Path) -> None:
     assert len(corrected_of(output)) == 4
 
 
-def test_one_bad_bag_is_reported_and_does_not_stop_the_rest(tmp_path: Path) -> None:
+def test_invalid_bag_is_reported_and_does_not_stop_the_others(tmp_path: Path) -> None:
     folder = tmp_path / "monday"
     write_bag(folder / "a.mcap", exchanges(9))
     write_bag(folder / "later" / "b", exchanges(8))
@@ -279,7 +279,7 @@ def test_one_bad_bag_is_reported_and_does_not_stop_the_rest(tmp_path: Path) -> N
         (["in.mcap", "-o", "no/such/folder.mcap"], "cannot be written"),
     ],
 )
-def test_bad_arguments_are_one_clear_line_and_exit_1(tmp_path: Path, given: list[str], told: str) -> None:
+def test_invalid_arguments_print_one_line_and_exit_1(tmp_path: Path, given: list[str], told: str) -> None:
     write_bag(tmp_path / "in.mcap", exchanges(1))
     write_bag(tmp_path / "other.mcap", exchanges(1))
     (tmp_path / "empty").mkdir()
@@ -291,7 +291,7 @@ def test_bad_arguments_are_one_clear_line_and_exit_1(tmp_path: Path, given: list
     assert not (tmp_path / "out.mcap").exists()
 
 
-def test_names_of_several_sources_are_kept_and_earlier_outputs_left_out(tmp_path: Path) -> None:
+def test_names_of_sources_are_kept_and_earlier_outputs_skipped(tmp_path: Path) -> None:
     for name in ("one/a.mcap", "one/sub/b.mcap", "two/a.mcap", "one/out/c.mcap"):
         write_bag(tmp_path / name, [])
     several = plan([tmp_path / "one", tmp_path / "two"], tmp_path / "one" / "out")
@@ -305,7 +305,7 @@ def test_names_of_several_sources_are_kept_and_earlier_outputs_left_out(tmp_path
     ]
 
 
-def test_ctrl_c_ends_cleanly_and_leaves_no_partial_file(tmp_path: Path) -> None:
+def test_ctrl_c_leaves_no_partial_file(tmp_path: Path) -> None:
     source = write_bag(tmp_path / "in.mcap", exchanges(200))
     data, ((first, end), *_) = source.read_bytes(), chunk_offsets(source)
     # The same chunk two hundred times over: more than is done before the signal.
@@ -330,7 +330,7 @@ def test_ctrl_c_ends_cleanly_and_leaves_no_partial_file(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["in.mcap"]
 
 
-def test_a_worker_that_dies_costs_its_own_bag_only(tmp_path: Path) -> None:
+def test_crashed_worker_loses_only_its_bag(tmp_path: Path) -> None:
     jobs = [
         job(write_bag(tmp_path / f"in{n}.mcap", exchanges(9)), tmp_path / f"out{n}.mcap") for n in range(3)
     ]
@@ -361,7 +361,7 @@ def test_a_worker_that_dies_costs_its_own_bag_only(tmp_path: Path) -> None:
     assert not list(tmp_path.glob("*.part"))
 
 
-def test_a_cluster_does_the_same_and_one_bad_bag_does_not_stop_it(tmp_path: Path) -> None:
+def test_dask_cluster_gives_the_same_result_and_continues_after_an_invalid_bag(tmp_path: Path) -> None:
     distributed = pytest.importorskip("distributed", reason="python -m pip install distributed")
     sources = [write_bag(tmp_path / f"in{n}.mcap", exchanges(50)) for n in range(3)]
     sources[1].write_bytes(b"nothing of the kind")
@@ -381,7 +381,7 @@ def test_a_cluster_does_the_same_and_one_bad_bag_does_not_stop_it(tmp_path: Path
         assert corrected_of(jobs[number].output) == one_by_one(exchanges(50))
 
 
-def test_a_scheduler_that_does_not_answer_is_named(tmp_path: Path) -> None:
+def test_unreachable_scheduler_is_named(tmp_path: Path) -> None:
     distributed = pytest.importorskip("distributed", reason="python -m pip install distributed")
     import dask
 

@@ -39,7 +39,7 @@ def nodes_of(pid: int) -> list[psutil.Process]:
         ("demo", signal.SIGINT, 130),
     ],
 )
-def test_nodes_end_with_who_started_them(run: str, number: signal.Signals, code: int, tmp_path: Path):
+def test_nodes_end_with_their_parent_process(run: str, number: signal.Signals, code: int, tmp_path: Path):
     # Each isolates itself.
     environment = {name: value for name, value in os.environ.items() if not name.startswith("ROS_")}
     with (tmp_path / "said").open("wb") as said:

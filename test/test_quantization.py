@@ -34,7 +34,7 @@ def test_weights_have_seven_bits():
     assert all(np.abs(weight).max() == 63 for weight in integers.weight.values())
 
 
-def test_the_integers_are_exact_for_the_firmware_already():
+def test_quantised_integers_are_exact_for_the_firmware():
     integers = quantize(random_weights(Remnet(samples=8)), windows(50, 8))
     again = nudge(integers)
     assert dict(again.activation_scale) == dict(integers.activation_scale)
@@ -43,13 +43,13 @@ def test_the_integers_are_exact_for_the_firmware_already():
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_a_shipped_model_is_what_the_nudge_makes_of_it(name, tmp_path):
+def test_shipped_model_is_unchanged_by_the_nudge(name, tmp_path):
     shipped = load_bundle(shipped_model_path(name))
     nudged = nudge(graph.int8_weights(shipped.model, shipped.architecture))
     assert save_bundle(tmp_path / "again.onnx", graph.int8_model(nudged), shipped.card).model == shipped.model
 
 
-def test_a_network_with_dead_filters_can_be_quantised():
+def test_network_with_dead_filters_can_be_quantised():
     weights = random_weights(SHAPE)
     weights.weight["module1.residual"][:] = 0
     weights.bias["module1.residual"][:] = -1
@@ -62,7 +62,7 @@ def test_a_network_with_dead_filters_can_be_quantised():
 
 
 @pytest.mark.parametrize("layer", ["module1.residual", "module2.reduce"])
-def test_a_layer_with_tiny_weights_can_be_quantised_for_all_processors(layer):
+def test_layer_with_tiny_weights_can_be_quantised_for_all_processors(layer):
     weights = random_weights(Remnet(samples=8))
     weights.weight[layer][:] *= np.float32(1e-7)
     weights.bias[layer][:] *= np.float32(1e-7)
@@ -75,6 +75,6 @@ def test_a_layer_with_tiny_weights_can_be_quantised_for_all_processors(layer):
 @pytest.mark.parametrize(
     "inputs", [np.zeros((0, 32)), np.zeros((4, 31)), np.zeros(32), np.full((2, 32), np.nan)]
 )
-def test_calibration_inputs_that_cannot_be_are_refused(inputs):
+def test_invalid_calibration_inputs_are_refused(inputs):
     with pytest.raises(DatasetError, match="calibration inputs"):
         quantize(random_weights(SHAPE), inputs.astype(np.float32))

@@ -58,7 +58,7 @@ def test_ranges_reach_the_host_with_stamps_of_their_reception():
     assert 2e9 - last.stamp_ns < 0.06e9
 
 
-def test_a_board_tells_what_its_radio_is_and_how_it_fares():
+def test_board_reports_settings_and_status_of_its_radio():
     with ModelledAir() as air:
         tag = air.add(RadioSettings(window=16), line=Line())
         anchor = air.add(RadioSettings(role=Role.ANCHOR))
@@ -84,7 +84,7 @@ def test_a_board_tells_what_its_radio_is_and_how_it_fares():
     assert in_reach.heard_ms < 500
 
 
-def test_the_host_configures_the_radio_while_it_ranges():
+def test_host_configures_the_radio_while_it_ranges():
     wanted = RadioSettings(channel=2, prf_mhz=16, window=40, pan=7)
     with ModelledAir() as air:
         tag = air.add(RadioSettings(), line=Line())
@@ -103,7 +103,7 @@ def test_the_host_configures_the_radio_while_it_ranges():
     assert (len(ranges[-1].cir), ranges[-1].cir.prf_mhz) == (40, 16)
 
 
-def test_settings_that_a_board_cannot_use_are_refused_in_words():
+def test_settings_that_a_board_does_not_support_are_refused_with_a_reason():
     with ModelledAir() as air:
         board = air.add(RadioSettings(), line=Line())
         host = Host(air, board)

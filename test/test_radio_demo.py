@@ -20,7 +20,7 @@ pytestmark = [
 COMMAND = [sys.executable, "-m", "benchmarks", "radio-demo", "--seconds"]
 
 
-def test_each_anchor_ranges_and_the_demo_ends_well():
+def test_each_anchor_ranges_and_the_demo_succeeds():
     done = subprocess.run([*COMMAND, "1"], capture_output=True, text=True, timeout=240, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.endswith("┘\n")
@@ -34,7 +34,7 @@ def test_each_anchor_ranges_and_the_demo_ends_well():
     assert any(float(corrected) != float(raw) for *_, raw, corrected, _ in rows)
 
 
-def test_ctrl_c_ends_it_with_its_nodes():
+def test_ctrl_c_ends_the_demo_and_its_nodes():
     with subprocess.Popen([*COMMAND, "600"], stdout=subprocess.PIPE, text=True) as demo:
         assert demo.stdout is not None
         assert "all emulated" in demo.stdout.readline()

@@ -43,7 +43,7 @@ def level_of(status: DiagnosticStatus) -> int:
     return status.level[0] if isinstance(status.level, bytes) else status.level
 
 
-def test_a_tag_and_two_anchors_range_through_the_mitigator(
+def test_tag_and_two_anchors_range_through_the_mitigator(
     ros: ros_harness.Ros, boards: EmulatedEvb1000s, tmp_path: Path
 ):
     raw = ros.collect(RangeCir, "/uwb/range_raw")
@@ -92,13 +92,13 @@ def test_settings_are_applied_and_refused_live(
         ("radio.preamble_code", 3, "preamble_code"),
     ],
 )
-def test_what_no_radio_has_is_refused_by_name(name: str, value: object, named: str):
+def test_unsupported_setting_is_refused_and_named(name: str, value: object, named: str):
     with pytest.raises(ParameterError, match=named):
         settings_of(lambda key: value if key == name else DEFAULTS[key])
 
 
 @pytest.mark.parametrize("address", [34, 0xDECA010203040506])
-def test_an_address_is_read_as_it_is_printed(address: int):
+def test_address_is_read_as_it_is_printed(address: int):
     values = DEFAULTS | {"radio.address": format_id(address), "radio.anchors": f"7, {format_id(address)}"}
     settings = settings_of(values.__getitem__)
     assert (settings.address, settings.anchors) == (address, (7, address))
@@ -106,7 +106,7 @@ def test_an_address_is_read_as_it_is_printed(address: int):
         assert settings_of((values | {"radio.address": address}).__getitem__).address == address
 
 
-def test_an_anchor_that_never_answered_was_never_heard():
+def test_anchor_that_never_answered_has_no_last_seen_time():
     status = RadioStatus(
         anchors=(AnchorInReach(7, 9, 0, np.nan, NEVER_MS), AnchorInReach(8, 9, 9, -80.0, 1500))
     )
@@ -115,7 +115,7 @@ def test_an_anchor_that_never_answered_was_never_heard():
     assert recent == "9 of 9 ranged, -80.0 dBm, last seen 1.5 s ago"
 
 
-def test_parameters_that_nobody_set_ask_nothing_of_a_boards_radio():
+def test_default_parameters_do_not_change_the_radio_of_a_board():
     assert settings_of(DEFAULTS.__getitem__) == RadioSettings()
 
 
@@ -151,9 +151,7 @@ class ModelledBoard:
         self._terminal.unplug()
 
 
-def test_the_radio_of_a_board_on_a_serial_line_is_configured_and_tells_how_it_fares(
-    ros: ros_harness.Ros, tmp_path: Path
-):
+def test_radio_of_a_serial_board_is_configured_and_reports_its_status(ros: ros_harness.Ros, tmp_path: Path):
     raw = ros.collect(RangeCir, "/uwb/range_raw")
     board = ModelledBoard(tmp_path / "board")
     try:
@@ -179,7 +177,7 @@ def test_the_radio_of_a_board_on_a_serial_line_is_configured_and_tells_how_it_fa
         board.close()
 
 
-def test_a_board_that_knows_no_radio_is_told_so_and_goes_on(ros: ros_harness.Ros, tmp_path: Path):
+def test_board_without_radio_support_is_reported_and_keeps_running(ros: ros_harness.Ros, tmp_path: Path):
     raw = ros.collect(RangeCir, "/uwb/range_raw")
     with EmulatedBoard(SimulatedSource(seed=4, count=50), link=tmp_path / "board"):
         driver = ros.start("driver", "source:=serial", f"port:={tmp_path / 'board'}", "radio.pan:=7")

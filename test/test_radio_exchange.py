@@ -40,7 +40,7 @@ def pair(
     return tag, anchor
 
 
-def test_the_structures_are_those_of_the_compiler():
+def test_structures_are_those_of_the_compiler():
     size = modelled._library().radio_air_size
     size.restype = structures.c_size_t
     mirrored = (
@@ -56,7 +56,7 @@ def test_the_structures_are_those_of_the_compiler():
 
 @pytest.mark.parametrize("ppm", [(-20, 20), (0, 0), (20, -20)])
 @pytest.mark.parametrize("distance_m", [0.3, 5.01, 100.0])
-def test_ranges_are_exact_whatever_the_clocks_and_across_their_wrap(ppm, distance_m: float):
+def test_ranges_are_exact_for_any_clock_error_and_across_the_wrap(ppm, distance_m: float):
     with ModelledAir() as air:
         pair(air, Link(distance_m), ppm)
         air.run(0.5)
@@ -69,7 +69,7 @@ def test_ranges_are_exact_whatever_the_clocks_and_across_their_wrap(ppm, distanc
 
 
 @pytest.mark.parametrize("window", [0, 157, 1016])
-def test_the_cir_is_that_of_the_link_bit_for_bit(window: int):
+def test_cir_equals_that_of_the_channel_bit_by_bit(window: int):
     iq = accumulator()
     with ModelledAir() as air:
         pair(air, Link(7, samples=iq, first_path_index=745.25, preamble_count=100), window=window)
@@ -133,7 +133,7 @@ def test_radios_that_differ_in_the_channel_or_the_network_do_not_range():
             assert air.counts(tag)["restarts"] <= 1
 
 
-def test_a_tag_finds_its_anchors_and_ranges_with_all_of_them_in_turn():
+def test_tag_finds_its_anchors_and_ranges_with_all_of_them_in_turn():
     with ModelledAir() as air:
         tag = air.add(RadioSettings(window=0), ppm=3)
         anchors = [air.add(RadioSettings(role=Role.ANCHOR), ppm=i - 16) for i in range(32)]
@@ -152,7 +152,7 @@ def test_a_tag_finds_its_anchors_and_ranges_with_all_of_them_in_turn():
         assert abs(row["range_m"] - heard[row["anchor"]]) < 0.02
 
 
-def test_tags_share_the_air_and_none_takes_anothers_range():
+def test_tags_share_the_channel_without_mixing_ranges():
     with ModelledAir() as air:
         anchors = [air.add(RadioSettings(role=Role.ANCHOR), ppm=i) for i in range(2)]
         tags = [air.add(RadioSettings(window=0), ppm=-i) for i in range(4)]
@@ -176,7 +176,7 @@ def test_tags_share_the_air_and_none_takes_anothers_range():
         assert (rows["board"] == tag).sum() > 50
 
 
-def test_an_anchor_with_a_host_reports_the_range_with_the_cir_of_final():
+def test_anchor_with_a_host_reports_the_range_with_the_cir_of_final():
     iq = accumulator(seed=3)
     with ModelledAir() as air:
         tag = air.add(RadioSettings(window=0))
@@ -192,7 +192,7 @@ def test_an_anchor_with_a_host_reports_the_range_with_the_cir_of_final():
     np.testing.assert_array_equal(store[told[0]["at"] : told[0]["at"] + 314], iq[2 * 740 : 2 * 897])
 
 
-def test_what_the_antenna_delay_is_short_of_appears_in_the_range():
+def test_missing_antenna_delay_appears_in_the_range():
     with ModelledAir() as air:
         tag = air.add(RadioSettings(antenna_delay=2 * 16436 - 400))
         anchor = air.add(RadioSettings(role=Role.ANCHOR))
@@ -203,7 +203,7 @@ def test_what_the_antenna_delay_is_short_of_appears_in_the_range():
     assert abs(rows["range_m"].mean() - 5 - 400 * 0.0046917639 / 2) < 0.005
 
 
-def test_the_bias_of_the_power_is_taken_off_when_asked_for():
+def test_power_dependent_bias_is_corrected_if_enabled():
     with ModelledAir() as air:
         pair(air, Link(5, samples=accumulator()), bias_correction=True)
         air.run(0.1)
@@ -215,7 +215,7 @@ def test_the_bias_of_the_power_is_taken_off_when_asked_for():
     assert abs(rows["range_m"].mean() - 5 + bias_m) < 0.005
 
 
-def test_a_chip_that_is_reset_or_out_of_reach_is_back_within_a_second_and_no_range_is_wrong():
+def test_reset_or_unreachable_chip_recovers_within_a_second_without_wrong_ranges():
     random = np.random.default_rng(4)
     channel = Link(8, loss=0.1, damage=0.01)
     with ModelledAir(7) as air:

@@ -37,7 +37,7 @@ def build(
     return program
 
 
-def test_arbitrary_frames_and_registers_give_no_range_that_is_not_ours(tmp_path: Path):
+def test_arbitrary_frames_and_registers_yield_no_false_range(tmp_path: Path):
     seen = run([str(build(tmp_path, c_compiler(), "-fsanitize=address,undefined")), "300", "1"])
     ranged, refused = (int(seen.split()[i]) for i in (0, 2))
     assert ranged > 1000
@@ -54,14 +54,14 @@ def test_arbitrary_frames_and_registers_give_no_range_that_is_not_ours(tmp_path:
     ],
     ids=lambda check: check[0],
 )
-def test_an_exchange_without_one_of_its_checks_is_found_out(tmp_path: Path, check: tuple[str, str]):
+def test_fuzzer_detects_an_exchange_without_one_of_its_checks(tmp_path: Path, check: tuple[str, str]):
     program = build(tmp_path, c_compiler(), broken=check)
     with pytest.raises(UwbMitigationError, match="exit -6"):
         run([str(program), "300", "1"])
 
 
 @pytest.mark.skipif(shutil.which("clang") is None, reason="no clang: apt install clang")
-def test_fuzzing_for_a_moment_finds_nothing(tmp_path: Path):
+def test_brief_fuzzing_finds_no_failure(tmp_path: Path):
     program = build(tmp_path, ("clang",), "-fsanitize=fuzzer,address,undefined", "-DUWB_LIBFUZZER")
     options = ("-runs=1000", "-seed=1", "-max_len=8000", "-len_control=0")
     done = subprocess.run([program, *options], cwd=tmp_path, capture_output=True, text=True, check=False)

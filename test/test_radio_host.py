@@ -68,7 +68,7 @@ def boards(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[EmulatedE
         yield emulated, prefix
 
 
-def test_a_tag_and_an_anchor_on_usb_range_are_unplugged_and_come_back(
+def test_tag_and_anchor_on_usb_recover_from_unplugging(
     boards: tuple[EmulatedEvb1000s, Path],
 ):
     emulated, prefix = boards
@@ -121,7 +121,7 @@ def test_a_tag_and_an_anchor_on_usb_range_are_unplugged_and_come_back(
         anchor.close()
 
 
-def test_a_board_that_modem_manager_has_written_to_is_opened(boards: tuple[EmulatedEvb1000s, Path]):
+def test_board_that_modem_manager_has_written_to_is_opened(boards: tuple[EmulatedEvb1000s, Path]):
     _, prefix = boards
     with serial.Serial(f"{prefix}1") as port:
         port.write(b"AT+GCAP\r")
@@ -138,7 +138,7 @@ def test_modem_manager_ignores_the_boards():
         assert any(all(match in line for match in wanted) for line in ignored), vendor
 
 
-def test_a_board_that_ranges_by_itself_is_told_with_the_switch_to_turn():
+def test_board_in_standalone_mode_is_reported_with_the_switch_to_change():
     with (
         EmulatedEvb1000s(None, boards=2, ranging=frozenset({0})) as emulated,
         pytest.raises(LinkError, match=r"ranges by itself .*S1-3 off"),
@@ -146,7 +146,7 @@ def test_a_board_that_ranges_by_itself_is_told_with_the_switch_to_turn():
         bus(emulated.ports[0])()
 
 
-def test_what_is_no_evb1000_is_told_so(tmp_path: Path):
+def test_other_usb_device_is_reported(tmp_path: Path):
     with pytest.raises(LinkError, match=r"nowhere: is not there \(plug"):
         bus(tmp_path / "nowhere")()
     (tmp_path / "file").write_text("")
@@ -242,7 +242,7 @@ class FakeGpio:
             self.chip.reset_drive(1)
 
 
-def test_a_reset_line_is_pulled_low_and_never_driven_high(monkeypatch: pytest.MonkeyPatch):
+def test_reset_line_is_pulled_low_and_never_driven_high(monkeypatch: pytest.MonkeyPatch):
     gpio = FakeGpio()
     monkeypatch.setitem(sys.modules, "spidev", types.SimpleNamespace(SpiDev=FakeSpi))
     for name in ("os", "fcntl"):
@@ -277,7 +277,7 @@ def test_a_reset_line_is_pulled_low_and_never_driven_high(monkeypatch: pytest.Mo
         SpidevBus("/dev/spidev0.0", "gpiochip0:7")
 
 
-def test_spidev_is_told_what_it_lacks(monkeypatch: pytest.MonkeyPatch):
+def test_missing_spidev_requirements_are_reported(monkeypatch: pytest.MonkeyPatch):
     for device, reset in (("/dev/ttyACM0", ""), ("/dev/spidev0.0", "25")):
         with pytest.raises(ParameterError, match=r"SPI device|reset line"):
             SpidevBus(device, reset)

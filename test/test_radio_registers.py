@@ -222,7 +222,7 @@ def test_smart_power_sends_one_frame_per_millisecond(air: Air):
         (RadioSettings(channel=2, antenna_delay=32_700), 32_700, 32_700),
     ],
 )
-def test_the_antenna_delay_of_a_trek1000_board_is_that_of_its_use_case(
+def test_antenna_delay_of_a_trek1000_board_is_that_of_its_use_case(
     air: Air, settings: RadioSettings, tag: int, anchor: int
 ):
     assert antenna_delays(air, settings, revision=2) == (anchor, tag)
@@ -253,7 +253,7 @@ def antenna_delays(air: Air, settings: RadioSettings, revision: int) -> tuple[in
 
 
 @pytest.mark.parametrize(("rate_kbps", "refused"), [(6800, True), (850, False)])
-def test_a_reply_within_the_pause_of_smart_power_is_refused(rate_kbps: int, refused: bool):
+def test_reply_within_the_pause_of_smart_power_is_refused(rate_kbps: int, refused: bool):
     """FINAL must not leave within 1 ms after POLL with more power than the average allows."""
     config = structures.config(RadioSettings(rate_kbps=rate_kbps, preamble=64))
     config.reply_us = 999
@@ -280,7 +280,7 @@ class StickyStatusBus(ModelBus):
         return answer
 
 
-def test_it_clears_the_status_of_a_reception_itself(air: Air):
+def test_driver_clears_the_reception_status(air: Air):
     run = Run(air, bus=StickyStatusBus)
     assert len(run.ranges) > 10
     assert all(measured.range_m == pytest.approx(6.0, abs=0.03) for measured in run.ranges)
@@ -307,7 +307,7 @@ class NoClockBus(NoLockBus):
         )
 
 
-def test_a_lock_that_is_not_reported_is_a_warning(air: Air):
+def test_unreported_pll_lock_is_a_warning(air: Air):
     run = Run(air, bus=NoLockBus)
     assert len(run.ranges) > 10
     for status in run.statuses:
@@ -315,7 +315,7 @@ def test_a_lock_that_is_not_reported_is_a_warning(air: Air):
         assert "PLL" in live_feeds.radio_warning(None, status)
 
 
-def test_a_clock_that_does_not_lock_is_an_error(air: Air):
+def test_unlocked_clock_is_an_error(air: Air):
     with pytest.raises(LinkError, match="clock"):
         Run(air, bus=NoClockBus)
 

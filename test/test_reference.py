@@ -65,7 +65,7 @@ def ros(tmp_path_factory: pytest.TempPathFactory):
     ("column", "of_node"),
     [(2, "get_publisher_names_and_types_by_node"), (3, "get_subscriber_names_and_types_by_node")],
 )
-def test_the_nodes_have_the_topics_of_the_page(ros: Ros, column: int, of_node: str):
+def test_nodes_have_the_topics_of_the_page(ros: Ros, column: int, of_node: str):
     documented = {
         (node, topic, row[1].strip("`"))
         for row in rows("nodes", "## Topics")
@@ -96,7 +96,7 @@ def test_the_nodes_have_the_topics_of_the_page(ros: Ros, column: int, of_node: s
         ("board", "## `driver` with a board"),
     ],
 )
-def test_the_diagnostics_have_the_keys_of_the_page(ros: Ros, node: str, heading: str):
+def test_diagnostics_have_the_keys_of_the_page(ros: Ros, node: str, heading: str):
     keys = {key for row in rows("diagnostics", heading) for key in re.findall("`([^`]+)`", row[0])}
     open_ended = tuple(key.partition(": ")[0] + ": " for key in keys if ": " in key)
     expected = {key for key in keys if ": " not in key}
@@ -115,7 +115,7 @@ def test_the_diagnostics_have_the_keys_of_the_page(ros: Ros, node: str, heading:
     assert {key for key in seen if not key.startswith(open_ended or ("none: ",))} == expected
 
 
-def test_the_node_on_the_page_about_sources_is_heard_by_the_mitigator(tmp_path: Path):
+def test_mitigator_receives_the_ranges_of_the_node_on_the_page_about_sources(tmp_path: Path):
     code = re.findall(r"^```python\n(.*?)^```", (GUIDES / "recordings.md").read_text(), re.M | re.S)[-1]
     with domain(tmp_path) as ros:
         received = ros.collect(RangeCorrected, "/uwb/range_corrected")

@@ -53,7 +53,7 @@ ENDLESS = ("simulated_rate:=100.0", "start_delay:=0.2")
 
 @pytest.mark.ros
 @pytest.mark.parametrize("killed", ["mitigator", "driver"])
-def test_a_node_that_is_killed_leaves_the_other_running_and_a_new_one_joins(ros: Ros, killed: str):
+def test_killed_node_leaves_the_other_running_and_a_new_one_joins(ros: Ros, killed: str):
     raw, corrected = ros.collect(RangeCir, RAW), ros.collect(RangeCorrected, CORRECTED)
     nodes = {"mitigator": ros.start("mitigator"), "driver": ros.start("driver", *ENDLESS)}
     ros.spin_until(lambda: len(corrected) > 20)
@@ -70,7 +70,7 @@ def test_a_node_that_is_killed_leaves_the_other_running_and_a_new_one_joins(ros:
 
 
 @pytest.mark.ros
-def test_ranges_that_queue_up_are_all_corrected_in_order_and_to_the_bit(ros: Ros):
+def test_queued_ranges_are_corrected_in_order_and_bit_identical(ros: Ros):
     mitigation = Mitigation(load_bundle(default_model_path()))
     measurements = [record.measurement for record in SimulatedSource(seed=2, count=300)]
     corrected = ros.collect(RangeCorrected, CORRECTED)
@@ -89,7 +89,7 @@ def test_ranges_that_queue_up_are_all_corrected_in_order_and_to_the_bit(ros: Ros
 
 
 @pytest.mark.ros
-def test_what_a_queue_has_dropped_is_told(ros: Ros):
+def test_ranges_dropped_by_a_queue_are_reported(ros: Ros):
     measurement = next(iter(SimulatedSource(seed=2)))
     data = encode_range(measurement.measurement)
     ros.start("mitigator", "qos_overrides./uwb/range_raw.subscription.depth:=10").wait_for_output(
@@ -108,7 +108,7 @@ def test_what_a_queue_has_dropped_is_told(ros: Ros):
 
 
 @pytest.mark.ros
-def test_a_model_is_swapped_live_without_losing_a_range_and_a_bad_one_is_refused(ros: Ros, tmp_path: Path):
+def test_model_is_swapped_live_without_losing_a_range_and_a_bad_one_is_refused(ros: Ros, tmp_path: Path):
     shipped = load_bundle(default_model_path())
     other = bundle(tmp_path)
     torn = tmp_path / "torn.onnx"
@@ -158,7 +158,7 @@ def test_every_transition_of_the_driver_can_be_repeated_and_a_replay_starts_over
 
 
 @pytest.mark.ros
-def test_diagnostics_go_on_when_simulated_time_stands_still_and_are_stamped_with_it(ros: Ros):
+def test_diagnostics_continue_while_simulated_time_is_paused(ros: Ros):
     clock = ros.node.create_publisher(Clock, "/clock", 10)
     arrays = ros.collect(DiagnosticArray, "/diagnostics")
     ros.start("mitigator", "use_sim_time:=true")
@@ -172,7 +172,7 @@ def test_diagnostics_go_on_when_simulated_time_stands_still_and_are_stamped_with
     ros.spin_until(stamped)
 
 
-def test_a_rate_is_counted_on_the_nodes_clock():
+def test_rate_is_counted_on_the_nodes_clock():
     now_ns = [0]
     meter = Meter(lambda: now_ns[0])
     for _ in range(50):
@@ -224,7 +224,7 @@ def test_slow_correction_and_no_data_cause_a_warning():
     assert warnings(silent) == [NO_RANGES.text]
 
 
-def test_a_drop_causes_one_warning():
+def test_drop_causes_one_warning():
     dropping = health()
     dropping.lost += 3
     assert warnings(dropping) == [DROPPED.text]
@@ -232,7 +232,7 @@ def test_a_drop_causes_one_warning():
     assert dropping.dropped == 3
 
 
-def test_a_model_that_includes_an_offset_causes_a_warning_after_enough_ranges():
+def test_model_that_includes_an_offset_causes_a_warning_after_enough_ranges():
     health = MitigatorHealth()
     health.los_m.extend([0.3] * (MIN_LOS - 1))
     health.excludes_offset = True
@@ -247,7 +247,7 @@ def test_a_model_that_includes_an_offset_causes_a_warning_after_enough_ranges():
 
 
 @pytest.mark.parametrize("count", [2, 3, 5])
-def test_drops_of_several_publishers_add_up_whoever_they_are_of(count: int):
+def test_drops_of_several_publishers_add_up(count: int):
     random = np.random.default_rng(count)
     loss_counter = LossCounter(lambda: count)
     last = [int(start) for start in random.integers(0, 100_000, count)]
@@ -264,7 +264,7 @@ def test_drops_of_several_publishers_add_up_whoever_they_are_of(count: int):
     assert loss_counter.missing == lost > 0
 
 
-def test_a_publisher_that_starts_anew_beside_another_loses_nothing():
+def test_restarted_publisher_counts_no_drops():
     known = [2]
     loss_counter = LossCounter(lambda: known[0])
     for number in range(1, 100):
@@ -281,7 +281,7 @@ def test_a_publisher_that_starts_anew_beside_another_loses_nothing():
     assert loss_counter.missing == 0
 
 
-def test_a_middleware_without_numbers_may_hide_drops():
+def test_middleware_without_numbers_may_hide_drops():
     silent = health()
     silent.loss_counter.add(NO_SEQUENCE_NUMBER)
     silent.lost += 7
@@ -289,7 +289,7 @@ def test_a_middleware_without_numbers_may_hide_drops():
 
 
 @pytest.mark.ros
-def test_a_publisher_by_best_effort_is_named_and_heard_where_it_is_asked_for(ros: Ros):
+def test_best_effort_publisher_is_reported_and_received_with_a_qos_override(ros: Ros):
     data = encode_range(next(iter(SimulatedSource(seed=2))).measurement)
     publisher = ros.node.create_publisher(RangeCir, RAW, qos_profile_sensor_data)
     mitigator = ros.start("mitigator")
@@ -310,7 +310,7 @@ def test_a_publisher_by_best_effort_is_named_and_heard_where_it_is_asked_for(ros
 
 
 @pytest.mark.ros
-def test_corrected_ranges_come_as_sensor_msgs_too_where_they_are_asked_for(ros: Ros):
+def test_corrected_ranges_are_published_as_sensor_msgs_on_request(ros: Ros):
     measurement = next(iter(SimulatedSource(seed=2))).measurement
     corrected = ros.collect(RangeCorrected, CORRECTED)
     plain = ros.collect(Range, f"{CORRECTED}/anchor_{measurement.anchor_id}")
@@ -332,7 +332,7 @@ def test_corrected_ranges_come_as_sensor_msgs_too_where_they_are_asked_for(ros: 
 
 
 @pytest.mark.ros
-def test_offsets_are_set_while_it_runs_and_nonsense_leaves_those_before(ros: Ros, tmp_path: Path):
+def test_offsets_are_set_live_and_invalid_ones_are_refused(ros: Ros, tmp_path: Path):
     path = tmp_path / "offsets.yaml"
     path.write_text("pairs: [{anchor: 2, tag: 1, offset: 1.5}]")
     asked = make_measurement(5.0)

@@ -146,12 +146,12 @@ def test_stamps_keep_the_recorded_intervals_divided_by_the_rate():
     assert not any(player.early)
 
 
-def test_a_long_pause_is_cut():
+def test_long_pause_is_shortened():
     player = Player(ListSource([0, 3_600_000_000_000]), longest_pause=0.05).play()
     assert player.offsets == [0, 50_000_000]
 
 
-def test_recorded_stamps_stay_and_the_clock_leads_up_to_them():
+def test_recorded_stamps_are_kept_and_the_clock_approaches_them():
     stamps = [1_000_000_000, 2_000_000_000]
     player = Player(ListSource(stamps), publish_clock=True).play()
     assert player.stamps == stamps
@@ -160,7 +160,7 @@ def test_recorded_stamps_stay_and_the_clock_leads_up_to_them():
     assert len(player.clock_times) >= 4
 
 
-def test_a_loop_goes_on_in_time_and_never_at_a_negative_one():
+def test_loop_continues_in_time_and_never_publishes_negative_times():
     player = Player(ListSource([0, 10 * MS, 20 * MS]), stop_after(7), loop=True, publish_clock=True).play()
     assert player.recorded[:7] == [step % 3 * 10 * MS for step in range(7)]
     assert min(player.clock_times) >= 0
@@ -170,14 +170,14 @@ def test_a_loop_goes_on_in_time_and_never_at_a_negative_one():
 
 
 @pytest.mark.parametrize("error", [DamagedRecordingError("torn", where="file:7"), ZeroDivisionError("a bug")])
-def test_an_error_of_the_source_is_reported_after_everything_before_it_was_played(error: Exception, capsys):
+def test_error_of_the_source_is_reported_after_everything_before_it_was_played(error: Exception, capsys):
     player = Player(ListSource([0, 1], error)).play()
     assert len(player.sequences) == 2
     assert str(error) in str(player.ends[0])
     assert len(player.ends) == 1
 
 
-def test_a_stop_during_a_pause_ends_the_thread_and_reports_no_end():
+def test_stop_during_a_pause_ends_the_thread_and_reports_no_end():
     player = Player(ListSource([0, 3_000_000_000_000]), longest_pause=1e4)
     player.feed.start()
     while not player.sequences:
@@ -187,7 +187,7 @@ def test_a_stop_during_a_pause_ends_the_thread_and_reports_no_end():
     assert player.ends == []
 
 
-def test_a_wall_clock_that_is_set_neither_stops_nor_hurries_a_replay(monkeypatch: pytest.MonkeyPatch):
+def test_step_of_the_wall_clock_does_not_affect_a_replay(monkeypatch: pytest.MonkeyPatch):
     step_ns = [0]
     wall_ns = time.time_ns
     monkeypatch.setattr(time, "time_ns", lambda: wall_ns() + step_ns[0])
@@ -202,7 +202,7 @@ def test_a_wall_clock_that_is_set_neither_stops_nor_hurries_a_replay(monkeypatch
     assert [round((b - a) / 1e9) for a, b in pairwise(stamps)] == [0, -3600, 14_400]
 
 
-def test_a_process_that_is_interrupted_between_two_clocks_does_not_take_one_for_set(
+def test_interruption_between_two_clock_readings_is_no_clock_step(
     monkeypatch: pytest.MonkeyPatch,
 ):
     steady_ns, interrupted_ns = [0], [0]
@@ -222,7 +222,7 @@ def test_a_process_that_is_interrupted_between_two_clocks_does_not_take_one_for_
     assert [b - a for a, b in pairwise(stamps)] == [25 * MS, 25 * MS]
 
 
-def test_a_source_that_cannot_keep_its_rate_is_reported():
+def test_source_that_cannot_keep_its_rate_is_reported():
     player = Player(ListSource([each * 1000 for each in range(120)], slow_s=0.005)).play()
     _, level, text, values = player.feed.describe()
     assert float(values["behind s"]) > 0.5
@@ -231,7 +231,7 @@ def test_a_source_that_cannot_keep_its_rate_is_reported():
     assert "behind" in text
 
 
-def test_a_seek_forwards_skips_records_and_stamps_go_on():
+def test_seek_forwards_skips_records_and_stamps_continue():
     player = Player(
         steps(100, 100 * MS), lambda player, sequence: player.set(seek_to=9.0) if sequence == 3 else None
     ).play()
@@ -241,7 +241,7 @@ def test_a_seek_forwards_skips_records_and_stamps_go_on():
     assert player.stamps[-1] - player.stamps[0] < 5000 * MS
 
 
-def test_a_seek_does_not_wait_for_the_record_that_was_next():
+def test_seek_does_not_wait_for_the_next_record():
     def skip(player: Player, sequence: int) -> None:
         if sequence == 0:
             player.set(seek_to=120.0)
@@ -253,14 +253,14 @@ def test_a_seek_does_not_wait_for_the_record_that_was_next():
     assert player.offsets[1] < 10_000 * MS
 
 
-def test_a_replay_can_start_anywhere_and_a_loop_then_plays_from_the_start():
+def test_replay_can_start_anywhere_and_a_loop_then_plays_from_the_start():
     assert Player(steps(20, 10 * MS), seek_to=5.0).play().sequences == []
     player = Player(steps(10, 5 * MS), stop_after(7), seek_to=0.04, loop=True).play()
     assert player.sequences[:7] == [8, 9, 0, 1, 2, 3, 4]
 
 
 @pytest.mark.parametrize("publish_clock", [False, True])
-def test_a_pause_holds_the_records_and_their_time(publish_clock: bool):
+def test_pause_holds_the_records_and_their_time(publish_clock: bool):
     resumed = threading.Event()
 
     def resume(player: Player) -> None:
@@ -284,7 +284,7 @@ def test_a_pause_holds_the_records_and_their_time(publish_clock: bool):
         assert list(gaps[2:]) == [200 * MS] * 2
 
 
-def test_another_rate_changes_the_intervals_from_there_on():
+def test_new_rate_changes_the_later_intervals():
     player = Player(
         steps(12, 50 * MS), lambda player, sequence: player.set(rate=10.0) if sequence == 2 else None
     ).play()
@@ -293,7 +293,7 @@ def test_another_rate_changes_the_intervals_from_there_on():
     assert list(gaps[4:]) == [5 * MS] * 7
 
 
-def test_late_records_come_several_at_once_and_in_order():
+def test_late_records_are_published_in_batches_and_in_order():
     player = Player(
         steps(500, 1000), lambda player, sequence: time.sleep(0.02) if sequence == 0 else None
     ).play()

@@ -26,7 +26,7 @@ def test_solved_requantisation_equals_the_float_formula_on_every_accumulator(see
     assert np.array_equal(found.apply(accumulators), requantisation.requantise(accumulators, moved))
 
 
-def test_ties_that_round_half_to_even_have_no_line():
+def test_ties_rounded_half_to_even_are_not_solved():
     # Every second accumulator is a tie, and even and odd levels round opposite ways.
     assert requantisation.solve_requantisation(np.float32(1 / 64), 0, 20_000) is None
 
@@ -37,7 +37,7 @@ def test_scales_out_of_range_are_not_solved(scale: np.float32):
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_a_nudged_sum_is_equal_in_fused_separate_and_neon_arithmetic_on_every_pair(seed: int):
+def test_nudged_sum_is_equal_in_fused_separate_and_neon_arithmetic_on_every_pair(seed: int):
     random = np.random.default_rng(seed)
     first, second = (np.float32(value) for value in random.uniform(0.01, 0.1, 2))
     total = requantisation.nudge_sum_scale(first, second, np.float32((first + second) * 0.8))
@@ -60,7 +60,7 @@ def test_a_nudged_sum_is_equal_in_fused_separate_and_neon_arithmetic_on_every_pa
         ((0.57772475, 0.5981696), (120, 124)),
     ],
 )
-def test_the_neon_formula_differs_where_an_arm_processor_was_seen_to(ratios, pair):
+def test_neon_formula_differs_where_an_arm_processor_differed(ratios, pair):
     first, second = np.float32(ratios[0]), np.float32(ratios[1])
     neon = requantisation.neon_sum_table(first, second)
     differs = np.argwhere(neon != requantisation.sum_table(first, second))
@@ -72,7 +72,7 @@ def test_the_neon_formula_differs_where_an_arm_processor_was_seen_to(ratios, pai
 @pytest.mark.parametrize(
     "ratios", [(300.0, 0.5), (1e-5, 0.5), (0.0, 0.5), (np.nextafter(np.float32(1), np.float32(0)), 0.5)]
 )
-def test_ratios_that_the_neon_kernel_leaves_to_another_formula_have_no_table(ratios: tuple[float, float]):
+def test_ratios_outside_the_neon_kernel_have_no_table(ratios: tuple[float, float]):
     assert requantisation.neon_sum_table(np.float32(ratios[0]), np.float32(ratios[1])) is None
 
 

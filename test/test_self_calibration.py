@@ -54,7 +54,7 @@ def places_at_rest(count=12, seed=3, slope=-0.02):
     return anchors, tags, np.array(truth)
 
 
-def test_offsets_of_pairs_are_found_from_a_drive_as_well_as_is_said(solved):
+def test_pair_offsets_of_a_drive_match_their_standard_deviations(solved):
     found = np.array([solved.pair(0, row) for row in range(5)])
     error = found[:, 0] - 0.25 - OWN
     assert solved.level == "pair"
@@ -62,7 +62,7 @@ def test_offsets_of_pairs_are_found_from_a_drive_as_well_as_is_said(solved):
     assert np.abs(error / found[:, 1]).max() < 3.0
 
 
-def test_pseudo_truth_comes_from_the_other_anchors_and_says_how_sure_it_is(solved, minute):
+def test_pseudo_truth_uses_the_other_anchors_and_has_a_standard_deviation(solved, minute):
     ranges, path = minute
     truth = np.linalg.norm(path.position - HALL.position[ranges.anchor], axis=1)
     error = solved.pseudo_m - truth
@@ -76,7 +76,7 @@ def test_pseudo_truth_comes_from_the_other_anchors_and_says_how_sure_it_is(solve
     assert np.abs(again.pseudo_m - truth)[own].mean() < 0.15
 
 
-def test_what_is_held_out_has_no_say_in_the_offsets(solved, minute):
+def test_held_out_ranges_do_not_affect_the_offsets(solved, minute):
     ranges = with_own(minute[0])
     late = ranges.stamp_ns > 30 * 10**9
     spoilt = replace(ranges, range_m=ranges.range_m + np.where(late & (ranges.anchor == 2), 0.5, 0.0))
@@ -91,14 +91,14 @@ def test_what_is_held_out_has_no_say_in_the_offsets(solved, minute):
     assert np.abs(same.fit.parameters - solved.fit.parameters).max() < 2e-3
 
 
-def test_one_offset_is_found_where_none_differs(minute):
+def test_common_offset_is_selected_if_pairs_do_not_differ(minute):
     found = calibrate(HALL, [minute[0]], height=LEVEL)
     assert found.level == "one"
     assert found.pair(0, 0)[0] == pytest.approx(0.25, abs=0.05)
     assert any("share one" in note for note in found.notes)
 
 
-def test_ranges_that_err_more_than_others_weigh_less(minute):
+def test_ranges_with_larger_errors_have_lower_weights(minute):
     ranges, _ = minute
     # Behind walls half of what is predicted is left: of the anchors at one side, more often.
     rng = np.random.default_rng(8)
@@ -114,7 +114,7 @@ def test_ranges_that_err_more_than_others_weigh_less(minute):
     assert worst(blocked.astype(int)) < 0.07 < worst(nothing.noise_group)
 
 
-def test_tags_at_a_dozen_unknown_places_tell_offset_and_line():
+def test_dozen_unknown_positions_determine_offset_and_line():
     anchors, tags, truth = places_at_rest()
     power = np.concatenate([one.rx_power_dbm for one in tags])
     level = Regressors.one("level", power + 88, 0.0, SLOPE_SD)
@@ -126,7 +126,7 @@ def test_tags_at_a_dozen_unknown_places_tell_offset_and_line():
     assert np.median(np.linalg.norm((found.fit.position - truth)[:, :2], axis=1)) < 0.08
 
 
-def test_one_tag_that_pauses_between_positions_rests_at_each():
+def test_stationary_segments_of_a_tag_are_found():
     _, tags, _ = places_at_rest()
     carried = Ranges.joined(
         [replace(tag, stamp_ns=tag.stamp_ns + 60 * n * 10**9) for n, tag in enumerate(tags)]
@@ -135,12 +135,12 @@ def test_one_tag_that_pauses_between_positions_rests_at_each():
 
 
 @pytest.mark.parametrize("rate_hz", [40.0, 1.0])
-def test_a_drive_is_none_from_place_to_place(rate_hz):
+def test_drive_without_stops_has_no_stationary_segments(rate_hz):
     ranges, _ = drive(seconds=120, rate_hz=rate_hz)
     assert not find_segments([ranges]).is_stationary.any()
 
 
-def test_a_localisation_that_jitters_is_smoothed_and_keeps_its_turns():
+def test_noisy_localisation_is_smoothed_and_keeps_its_turns():
     rng = np.random.default_rng(3)
     stamp = np.arange(1200) * 25_000_000 + rng.integers(0, 10_000_000, 1200)
     true = circuit(stamp / 1e9 * 3.0)
@@ -153,7 +153,7 @@ def test_a_localisation_that_jitters_is_smoothed_and_keeps_its_turns():
     assert (few.smoothed().position == few.position).all()
 
 
-def test_a_rest_within_a_drive_is_one_place():
+def test_stationary_segment_of_a_drive_is_one_position():
     def path(time_s):
         return circuit(np.minimum(time_s, 20.0) + np.maximum(time_s - 40.0, 0.0))
 
@@ -170,7 +170,7 @@ def refused(match, anchors, tags, **options):
         calibrate(anchors, tags, **options)
 
 
-def test_what_cannot_be_calibrated_is_refused(minute):
+def test_unobservable_calibration_is_refused(minute):
     ranges = minute[0]
     refused("3 anchors were received", HALL, [ranges.take(ranges.anchor < 3)], height=LEVEL)
     refused("4 anchors were received", HALL, [ranges.take(ranges.anchor < 4)])
@@ -181,7 +181,7 @@ def test_what_cannot_be_calibrated_is_refused(minute):
     refused("too few", HALL, [ranges.take(ranges.stamp_ns < 6 * 10**9)], height=LEVEL)
 
 
-def test_a_track_with_two_mirror_images_is_refused():
+def test_track_with_two_mirror_images_is_refused():
     # Anchors all but in a plane, the tag half a metre below it: as good half a metre above.
     flat = HALL.position.copy()
     flat[:, 2] = (1.1, 1.9, 1.1, 1.9, 1.5)
@@ -190,7 +190,7 @@ def test_a_track_with_two_mirror_images_is_refused():
 
 
 @pytest.mark.parametrize(("row", "by"), [(3, (3.0, -2.5, 0.0)), (4, (1.5, 0.0, 0.0))])
-def test_an_anchor_that_was_moved_is_named_by_its_id(minute, row, by):
+def test_moved_anchor_is_named_by_its_id(minute, row, by):
     wrong = HALL.position.copy()
     wrong[row] += by
     refused(f"anchor {row + 1} contradicts", HALL.moved(wrong, HALL.sd), [minute[0]], height=LEVEL)
@@ -202,7 +202,7 @@ def test_two_swapped_opposite_anchors_are_named(minute):
     refused("anchors 1 and 3 contradict", swapped, [some], height=LEVEL)
 
 
-def test_a_long_tail_accuses_no_anchor(minute):
+def test_heavy_tail_accuses_no_anchor(minute):
     """A body between the tag and one anchor makes 80 % of its ranges long."""
     ranges, _ = minute
     rng = np.random.default_rng(4)
@@ -211,7 +211,7 @@ def test_a_long_tail_accuses_no_anchor(minute):
     calibrate(HALL, [replace(ranges, range_m=ranges.range_m + tail)], height=LEVEL)
 
 
-def test_an_offset_that_slow_errors_can_explain_is_not_subtracted():
+def test_offset_that_slow_errors_can_explain_is_not_subtracted():
     """Outside of the anchors, errors that stay the same for 20 s move the estimate of the offset by 0.7 m here."""
     near = HALL.moved(HALL.position * (0.25, 0.25, 1.0) + (4.5, 3.5, 0.0), HALL.sd)
 
@@ -229,7 +229,7 @@ def test_an_offset_that_slow_errors_can_explain_is_not_subtracted():
     assert any("not significant" in note for note in found.notes)
 
 
-def test_an_anchor_with_few_ranges_gets_the_common_offset(minute):
+def test_anchor_with_few_ranges_gets_the_common_offset(minute):
     ranges = with_own(minute[0])
     few = np.isin(np.arange(len(ranges)), np.flatnonzero(ranges.anchor == 4)[:1])
     found = calibrate(HALL, [ranges.take(few | (ranges.anchor != 4))], height=LEVEL)
@@ -241,7 +241,7 @@ def test_an_anchor_with_few_ranges_gets_the_common_offset(minute):
     assert any("anchor 5" in note for note in found.notes)
 
 
-def test_an_area_excludes_the_mirror_image_in_a_plane():
+def test_area_excludes_the_mirror_image_in_a_plane():
     flat = HALL.moved(HALL.position * (1, 1, 0) + (0, 0, 2.5), HALL.sd)
     ranges, _ = drive(flat, seconds=60, rate_hz=25.0, offset_m=0.25)
     found = calibrate(flat, [ranges], area=Area((-1.0, -1.0, 0.0), (13.0, 10.0, 2.0)))
@@ -258,7 +258,7 @@ def turning(path, lever, late_ns=0):
     return PosePath(path.stamp_ns + late_ns, path.position - off, quaternion)
 
 
-def test_lag_and_lever_arm_are_found_beside_a_localisation(minute):
+def test_time_offset_and_lever_arm_are_estimated_with_a_localisation(minute):
     ranges, path = minute
     lever = np.array([0.3, -0.25, 0.0])
     late = turning(path, lever, 300_000_000)
@@ -292,7 +292,7 @@ def test_each_tag_has_its_own_lever_arm_and_its_own_body(minute):
     assert np.abs(found.distance_m - np.tile(truth, 2))[known].max() < 0.1
 
 
-def test_two_standard_deviations_of_lag_and_arm_cover_their_errors():
+def test_two_standard_deviations_cover_the_errors_of_time_offset_and_lever_arm():
     lever, error, sd = np.array([0.3, -0.2, 0.0]), [], []
     for seed in range(5):
         ranges, path = drive(seconds=60, rate_hz=20.0, seed=seed, offset_m=0.2)

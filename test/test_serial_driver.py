@@ -67,7 +67,7 @@ def fewest(status: DiagnosticStatus, *keys: str) -> int:
     return min(int(diagnostic_value(status, key) or 0) for key in keys)
 
 
-def test_what_the_board_measures_is_published_with_stamps_of_the_measurement(ros: Ros, link: Path):
+def test_measurements_of_a_board_are_published_with_their_stamps(ros: Ros, link: Path):
     received: list[tuple[int, RangeCir]] = []
     ros.node.create_subscription(RangeCir, RAW, lambda m: received.append((time.time_ns(), m)), 1000)
     # The board plays them over and over; the simulator leaves out what was too weak to be received.
@@ -96,7 +96,7 @@ def test_what_the_board_measures_is_published_with_stamps_of_the_measurement(ros
     assert driver.signal(signal.SIGINT) == 0, driver.output
 
 
-def test_a_board_that_runs_the_model_gives_what_the_host_gives(ros: Ros, link: Path):
+def test_correction_on_the_board_equals_that_on_the_host(ros: Ros, link: Path):
     raw = ros.collect(RangeCir, RAW)
     corrected = ros.collect(RangeCorrected, CORRECTED)
     host = Mitigation(load_bundle(default_model_path()))
@@ -115,7 +115,7 @@ def test_a_board_that_runs_the_model_gives_what_the_host_gives(ros: Ros, link: P
     assert len(raw) < 60
 
 
-def test_the_mode_changes_without_a_restart(ros: Ros, link: Path):
+def test_mode_changes_without_a_restart(ros: Ros, link: Path):
     corrected = ros.collect(RangeCorrected, CORRECTED)
     ros.start("mitigator").wait_for_output("correcting with model")
     with board(link, model=True, rate_hz=200.0):
@@ -131,7 +131,7 @@ def test_the_mode_changes_without_a_restart(ros: Ros, link: Path):
     assert max(keys.values()) == 1
 
 
-def test_a_board_of_another_protocol_version_is_named(ros: Ros, link: Path):
+def test_board_of_another_protocol_version_is_named(ros: Ros, link: Path):
     with board(link, version=9):
         driver = drive(ros, link)
         status = ros.diagnosis("driver", lambda s: "version" in s.message)
@@ -145,7 +145,7 @@ def open_files_and_threads(driver: Process) -> tuple[int, int]:
     return len(os.listdir(process / "fd")), len(os.listdir(process / "task"))
 
 
-def test_unplugging_costs_neither_descriptors_nor_threads(ros: Ros, link: Path):
+def test_unplugging_leaks_no_descriptors_or_threads(ros: Ros, link: Path):
     received = ros.collect(RangeCir, RAW)
     with board(link, rate_hz=200.0) as device:
         driver = drive(ros, link)
@@ -160,7 +160,7 @@ def test_unplugging_costs_neither_descriptors_nor_threads(ros: Ros, link: Path):
         assert open_files_and_threads(driver) == before
 
 
-def test_resets_noise_and_damage_cost_frames_but_not_the_driver(ros: Ros, link: Path):
+def test_driver_survives_resets_noise_and_damage(ros: Ros, link: Path):
     received = ros.collect(RangeCir, RAW)
     faults = Faults(2e-5, 2e-5, 2e-5, lose=0.05, duplicate=0.05)
     known = {
@@ -183,7 +183,7 @@ def test_resets_noise_and_damage_cost_frames_but_not_the_driver(ros: Ros, link: 
 
 
 @pytest.mark.parametrize("state", ["absent", "silent", "flooding", "measuring"])
-def test_a_signal_ends_the_driver_at_once_in_any_state(ros: Ros, link: Path, state: str):
+def test_signal_ends_the_driver_immediately_in_any_state(ros: Ros, link: Path, state: str):
     device = None
     if state != "absent":
         device = board(link) if state != "silent" else FaultyBoard(None, link=link)
@@ -211,14 +211,14 @@ def test_a_signal_ends_the_driver_at_once_in_any_state(ros: Ros, link: Path, sta
         (("source:=serial", "port:=/dev/ttyACM0", "baud:=3"), "baud"),
     ],
 )
-def test_a_port_that_cannot_be_meant_is_refused(ros: Ros, parameters: tuple[str, ...], named: str):
+def test_malformed_port_is_refused(ros: Ros, parameters: tuple[str, ...], named: str):
     driver = ros.start("driver", *parameters)
     assert driver.wait() == 1
     assert named in driver.output
     assert "Traceback" not in driver.output
 
 
-def test_a_board_takes_off_the_offsets_that_the_driver_is_told(ros: Ros, link: Path):
+def test_board_subtracts_the_offsets_of_the_driver(ros: Ros, link: Path):
     corrected = ros.collect(RangeCorrected, CORRECTED)
     host = Mitigation(load_bundle(default_model_path()))
     recorded = {r.measurement.sequence: r.measurement for r in SimulatedSource(seed=4, count=200)}
@@ -245,7 +245,7 @@ def test_a_board_takes_off_the_offsets_that_the_driver_is_told(ros: Ros, link: P
         assert "millimetres" in refused.reason
 
 
-def test_a_port_that_is_absent_or_forbidden_is_told_once_on_the_console(
+def test_missing_or_forbidden_port_is_logged_once(
     ros: Ros, link: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     driver = drive(ros, link)
@@ -260,9 +260,7 @@ def test_a_port_that_is_absent_or_forbidden_is_told_once_on_the_console(
     assert driver.output.count(absent) == 2
 
 
-def test_a_port_that_may_not_be_opened_is_told_with_what_to_do(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_port_without_permission_is_reported_with_the_remedy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     def forbidden(self) -> None:
         raise serial.SerialException(errno.EACCES, "could not open port: Permission denied")
 

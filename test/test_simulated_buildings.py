@@ -30,11 +30,11 @@ def arrays(dataset: Dataset) -> list[bytes]:
     return [column.tobytes() for column in columns]
 
 
-def test_the_same_whatever_the_number_of_workers(world: Dataset) -> None:
+def test_result_does_not_depend_on_the_number_of_workers(world: Dataset) -> None:
     assert arrays(building_dataset(5, BLOCKS, Preprocessing(), workers=1)) == arrays(world)
 
 
-def test_records_and_arrays_are_one_world(world: Dataset) -> None:
+def test_records_equal_arrays(world: Dataset) -> None:
     count = PLACEMENTS + 40
     records = build_dataset(SimulatedBuildings(seed=5, placements=count), Preprocessing())
     first = world.rows(np.arange(len(records)))
@@ -52,7 +52,7 @@ def test_conditions_are_balanced_and_few_frames_are_lost(world: Dataset) -> None
     assert len(world) > 0.85 * BLOCKS * PLACEMENTS
 
 
-def test_the_error_is_the_channels_alone(world: Dataset) -> None:
+def test_error_contains_only_the_channel(world: Dataset) -> None:
     los, nlos, ndp = (world.error_m[world.labels == name] for name in ("LOS", "NLOS", "NDP NLOS"))
     assert np.median(los) == pytest.approx(0.0, abs=0.03)
     assert 0.1 < np.median(nlos) < 0.4 < np.median(ndp)
@@ -61,7 +61,7 @@ def test_the_error_is_the_channels_alone(world: Dataset) -> None:
 
 
 @pytest.mark.parametrize("kind", WIDE_KINDS, ids=lambda kind: kind.name)
-def test_plans_hold_what_their_kind_says(kind: buildings.Kind) -> None:
+def test_plans_match_their_kind(kind: buildings.Kind) -> None:
     rng = np.random.default_rng(0)
     plans = [draw_plan(kind, rng) for _ in range(30)]
     for plan in plans:
@@ -92,7 +92,7 @@ def test_open_sites_are_in_line_of_sight_and_some_antennas_are_tilted() -> None:
 
 
 @pytest.mark.parametrize("distance_m", [(0.0, 3.0), (3.0, 8.0), (12.0, 50.0)])
-def test_behind_obstacles_what_goes_around_comes_later_the_longer_the_way(
+def test_nlos_delay_grows_with_the_distance(
     distance_m: tuple[float, float],
 ) -> None:
     blocks = [block_of(5, number)[0] for number in range(12)]

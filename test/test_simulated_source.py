@@ -53,7 +53,7 @@ def errors_of(records: list[Record], label: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize("rate_hz", [20.0, 333.0])
-def test_the_same_seed_gives_the_same_whatever_is_consumed(rate_hz: float) -> None:
+def test_same_seed_gives_the_same_measurements(rate_hz: float) -> None:
     endless = SimulatedSource(seed=5, rate_hz=rate_hz, tags=2)
     first = [values(r) for r in itertools.islice(endless, 90)]
     assert [values(r) for r in itertools.islice(endless, 90)] == first
@@ -61,7 +61,7 @@ def test_the_same_seed_gives_the_same_whatever_is_consumed(rate_hz: float) -> No
     assert counted == first[: len(counted)]
 
 
-def test_a_survey_is_the_same_however_many_placements_are_asked_for() -> None:
+def test_survey_does_not_depend_on_the_number_of_placements() -> None:
     few = [values(r) for r in SimulatedSurvey(seed=5, configurations=7, exchanges=5)]
     many = [values(r) for r in SimulatedSurvey(seed=5, configurations=80, exchanges=5)]
     assert many[: len(few)] == few
@@ -102,7 +102,7 @@ def test_obstacles_make_the_range_long_and_a_lost_direct_path_longer(
         assert nlos.mean() - 0.22 == pytest.approx(0.35, abs=0.25)
 
 
-def test_every_measurement_is_finite_and_fit_for_a_network(drive: list[Record], survey: list[Record]) -> None:
+def test_every_measurement_is_finite_and_a_valid_input(drive: list[Record], survey: list[Record]) -> None:
     for r in drive + survey:
         m = r.measurement
         assert len(m.cir) == TAPS
@@ -127,7 +127,7 @@ def test_levels_are_of_the_order_of_real_logs(survey: list[Record]) -> None:
 
 
 @pytest.mark.parametrize("like", ["buildings", "survey", "drive"])
-def test_the_command_line_writes_a_bag_that_says_it_is_simulated(tmp_path: Path, like: str) -> None:
+def test_command_writes_a_bag_marked_as_simulated(tmp_path: Path, like: str) -> None:
     ranges = 100
     words = ["data", "simulate", "--like", like, "--ranges", str(ranges), "-o", str(tmp_path / "sim.mcap")]
     done = CliRunner().invoke(app, [*words, "--json", str(tmp_path / "sim.json")])
@@ -153,7 +153,7 @@ def test_the_command_line_writes_a_bag_that_says_it_is_simulated(tmp_path: Path,
         (["--seed", "-1"], "seed"),
     ],
 )
-def test_a_simulation_that_cannot_be_is_refused_and_leaves_no_file(
+def test_invalid_simulation_is_refused_and_leaves_no_file(
     tmp_path: Path, words: list[str], told: str
 ) -> None:
     done = CliRunner().invoke(app, ["data", "simulate", "-o", str(tmp_path / "sim.mcap"), *words])
@@ -181,7 +181,7 @@ def test_a_simulation_that_cannot_be_is_refused_and_leaves_no_file(
         (lambda: SimulatedSurvey(plan=FloorPlan((1.0, 9.0))), "plan size in x", "1.0", "2 to 1000"),
     ],
 )
-def test_a_bad_parameter_is_refused_by_name_value_and_range(
+def test_bad_parameter_is_refused_by_name_value_and_range(
     make: Callable[[], object], name: str, value: str, valid: str
 ) -> None:
     with pytest.raises(ParameterError) as caught:

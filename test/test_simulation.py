@@ -50,7 +50,7 @@ def lone_paths(n: int, power_db: float, delay_ns: float = 0.0) -> Multipath:
 # --- channel ---------------------------------------------------------------------------------------
 
 
-def test_the_direct_path_loses_free_space_and_obstacles() -> None:
+def test_direct_path_loses_free_space_and_obstacles() -> None:
     power = direct_power_db(np.array([1.0, 10.0]), np.array([0.0, 6.0]))
     np.testing.assert_allclose(power, [-FREE_SPACE_LOSS_1M_DB, -FREE_SPACE_LOSS_1M_DB - 26.0])
     assert pytest.approx(44.5, abs=0.1) == FREE_SPACE_LOSS_1M_DB
@@ -59,7 +59,7 @@ def test_the_direct_path_loses_free_space_and_obstacles() -> None:
 # --- scene -----------------------------------------------------------------------------------------
 
 
-def test_a_wall_delays_by_its_optical_thickness_and_weakens() -> None:
+def test_wall_delays_by_its_optical_thickness_and_weakens() -> None:
     loss, excess = through_slab(Wall((0, 0), (0, 1), BRICK, 0.12), np.array([1.0]))
     assert excess[0] == pytest.approx((math.sqrt(BRICK.permittivity) - 1) * 0.12)
     # ITU-R P.2040-1: attenuation 1636 sigma / sqrt(eps) dB/m, and two faces that reflect 10 % each.
@@ -77,7 +77,7 @@ def test_walls_count_only_where_the_line_crosses_them() -> None:
     assert path.loss_db[1] == path.excess_m[1] == 0.0
 
 
-def test_a_screen_is_gone_around_at_its_nearer_edge() -> None:
+def test_path_is_diffracted_at_the_nearer_edge_of_a_screen() -> None:
     plan = FloorPlan((4.0, 4.0), screens=(Screen("cabinet", (2.0, 0.0), (2.0, 1.5)),))
     path = plan.direct_path(np.array([[1.0, 1.0]]), np.array([[3.0, 1.0]]))
     detour = 2 * math.hypot(1.0, 0.5) - 2.0
@@ -88,7 +88,7 @@ def test_a_screen_is_gone_around_at_its_nearer_edge() -> None:
     assert knife_edge_loss_db(np.zeros(1))[0] == pytest.approx(6.0, abs=0.1)
 
 
-def test_the_robot_stays_inside_the_flat_moves_steadily_and_drives_through_nothing() -> None:
+def test_robot_stays_inside_the_flat_moves_steadily_and_drives_through_nothing() -> None:
     travelled = np.arange(0.0, 60.0, 0.05)
     position = along_route(ROUTE, travelled)
     assert (position > 0).all()
@@ -101,7 +101,7 @@ def test_the_robot_stays_inside_the_flat_moves_steadily_and_drives_through_nothi
 # --- radio -----------------------------------------------------------------------------------------
 
 
-def test_the_pulse_has_unit_energy_over_the_taps_and_no_sidelobes() -> None:
+def test_pulse_has_unit_energy_over_the_taps_and_no_sidelobes() -> None:
     taps = np.arange(-20, 21) + 0.3
     assert (pulse(taps) ** 2).sum() == pytest.approx(1.0, abs=1e-3)
     assert pulse(np.array([3.0]))[0] < 0.02 * PULSE_PEAK
@@ -109,13 +109,13 @@ def test_the_pulse_has_unit_energy_over_the_taps_and_no_sidelobes() -> None:
 
 
 @pytest.mark.parametrize("power_db", [-50.0, -65.0, -80.0])
-def test_a_lone_pulse_is_found_within_a_tenth_of_a_tap(power_db: float) -> None:
+def test_single_pulse_is_detected_within_a_tenth_of_a_tap(power_db: float) -> None:
     error_m = QUIET.receive(lone_paths(400, power_db), rng()).error_m
     assert np.abs(error_m).max() < 0.1 * TAP_NS * 0.299792458
 
 
 @pytest.mark.parametrize(("direct_db", "late"), [(-75.0, False), (-112.0, True)])
-def test_a_direct_path_below_the_threshold_makes_the_range_long(direct_db: float, late: bool) -> None:
+def test_direct_path_below_the_threshold_makes_the_range_long(direct_db: float, late: bool) -> None:
     strong = lone_paths(200, -70.0, delay_ns=12.0)
     weak = lone_paths(200, direct_db)
     both = Multipath(np.hstack([weak.delay_ns, strong.delay_ns]), np.hstack([weak.gain, strong.gain]))
@@ -142,14 +142,14 @@ def test_levels_follow_the_manuals_formulas() -> None:
         )
 
 
-def test_a_weak_level_is_reported_as_sent_and_a_strong_one_is_compressed() -> None:
+def test_weak_level_is_reported_as_sent_and_a_strong_one_is_compressed() -> None:
     weak = QUIET.receive(lone_paths(50, -80.0), rng())
     np.testing.assert_allclose(weak.rx_power_dbm, QUIET.tx_power_dbm - 80.0, atol=1.0)
     strong = QUIET.receive(lone_paths(50, -40.0), rng())
     np.testing.assert_allclose(strong.rx_power_dbm, QUIET.compression_dbm, atol=0.5)
 
 
-def test_a_frame_below_the_sensitivity_is_not_received() -> None:
+def test_frame_below_the_sensitivity_is_not_received() -> None:
     reception = QUIET.receive(lone_paths(5, -90.0), rng())
     assert np.isnan(reception.first_path_index).all()
     assert np.isnan(reception.rx_power_dbm).all()

@@ -136,7 +136,7 @@ def test_every_command_of_the_page_is_in_a_block_that_is_run():
     assert not re.findall(r"^ {4,}(?:uwb-mitigation|ros2) .*", rest, re.MULTILINE)
 
 
-def test_the_page_leads_from_boards_to_a_robot_that_knows_where_it_is(terminals: Terminals, ros: Ros):
+def test_commands_of_the_page_lead_from_boards_to_positions(terminals: Terminals, ros: Ros):
     folder = terminals.folder
     poses = ros.collect(PoseWithCovarianceStamped, "/uwb/pose")
     for kind, text in FENCED.findall(PAGE.read_text(encoding="utf-8")):

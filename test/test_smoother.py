@@ -38,7 +38,7 @@ def test_least_squares_solves_as_a_dense_matrix_does():
     np.testing.assert_allclose(solution.reduced(rows), adapted, atol=1e-9)
 
 
-def test_the_smoother_agrees_with_nonlinear_least_squares():
+def test_smoother_agrees_with_nonlinear_least_squares():
     """SciPy with numerical derivatives as an oracle: independent errors, no robust loss, no offsets."""
     model = NoiseModel(long=100.0, short=100.0, white=1.0, offset_sd=1e-6, pair_sd=1e-6)
     ranges, truth = drive(seconds=4, model=NoiseModel(white=1.0), offset_m=0.0)
@@ -73,7 +73,7 @@ def known_track(truth: TruePath) -> Track:
     return Track(truth.stamp_ns, truth.position, np.zeros((len(truth), 3)), np.zeros((len(truth), 6, 6)))
 
 
-def test_smoothed_tracks_of_many_drives_are_honest_and_better_than_live_ones():
+def test_smoothed_tracks_are_consistent_and_better_than_live_ones():
     live, smooth = [], []
     for seed in range(6):
         rng = np.random.default_rng(seed)
@@ -89,7 +89,7 @@ def test_smoothed_tracks_of_many_drives_are_honest_and_better_than_live_ones():
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_track_smoothed_among_obstacles_is_not_worse_than_live(seed: int):
+def test_smoothed_track_among_obstacles_is_not_worse_than_live(seed: int):
     box = np.array([(x, y, z) for x in (0.0, 12.0) for y in (0.0, 9.0) for z in (0.2, 2.8)])
     anchors = AnchorMap([Anchor(i, tuple(p), 0.03) for i, p in enumerate(box.tolist(), 1)])
     ranges, truth = drive(anchors, seconds=40, seed=seed)

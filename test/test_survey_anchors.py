@@ -22,7 +22,7 @@ def minute():
     return drive(seconds=60)[0]
 
 
-def test_anchors_are_found_from_guesses_that_are_off_by_a_metre_and_a_half(minute):
+def test_anchors_are_estimated_from_guesses_with_errors_of_1_5_m(minute):
     rng = np.random.default_rng(5)
     away = np.zeros((5, 3))
     away[:, :2] = rng.normal(0, 1, (5, 2))
@@ -36,13 +36,13 @@ def test_anchors_are_found_from_guesses_that_are_off_by_a_metre_and_a_half(minut
     assert found.explained
 
 
-def test_anchors_that_do_not_explain_the_ranges_say_so(minute):
+def test_anchors_that_contradict_the_ranges_are_reported(minute):
     nonsense = minute.take(slice(0, 300))
     nonsense = replace(nonsense, range_m=np.random.default_rng(1).permutation(nonsense.range_m))
     assert not survey(EstimatorConfig(HALL, height=LEVEL), nonsense).explained
 
 
-def test_an_anchor_half_a_metre_off_is_named_and_no_other(minute):
+def test_only_the_displaced_anchor_is_named(minute):
     wrong = HALL.position.copy()
     wrong[2] += (0.4, 0.3, 0.0)
     found = survey(EstimatorConfig(HALL.moved(wrong, HALL.sd), height=LEVEL), minute)
@@ -50,7 +50,7 @@ def test_an_anchor_half_a_metre_off_is_named_and_no_other(minute):
     assert survey(EstimatorConfig(HALL, height=LEVEL), minute).misplaced == []
 
 
-def test_a_swapped_pair_is_named(minute):
+def test_swapped_pair_is_named(minute):
     wrong = HALL.position.copy()
     wrong[[1, 3]] = wrong[[3, 1]]
     found = survey(EstimatorConfig(HALL.moved(wrong, HALL.sd), height=LEVEL), minute)
@@ -58,7 +58,7 @@ def test_a_swapped_pair_is_named(minute):
     assert sorted(found.misplaced) == [1, 3]
 
 
-def test_the_mirror_image_of_a_square_is_not_a_swapped_pair():
+def test_mirror_image_of_a_square_is_not_a_swapped_pair():
     """Swapped opposite anchors of a square are its mirror image, which explains the ranges as well as the truth."""
     square = AnchorMap(
         [Anchor(i, (x, y, 2.0)) for i, (x, y) in enumerate([(2, 0), (10, 0), (10, 8), (2, 8)], 1)]
@@ -71,7 +71,7 @@ def test_the_mirror_image_of_a_square_is_not_a_swapped_pair():
 
 
 @pytest.mark.parametrize(("guess_sd_m", "mirrored"), [(0.1, False), (0.7, True)])
-def test_a_mirror_image_that_fits_the_guesses_as_well_is_reported(guess_sd_m: float, mirrored: bool):
+def test_mirror_image_that_fits_the_guesses_as_well_is_reported(guess_sd_m: float, mirrored: bool):
     narrow = AnchorMap([Anchor(i, (4.0 * i - 4.0, 0.4 * (-1) ** i, 2.0)) for i in range(1, 5)])
     ranges, _ = drive(narrow, seconds=20, seed=2)
     wrong = narrow.position + np.random.default_rng(4).normal(0, (guess_sd_m, guess_sd_m, 0), (4, 3))
@@ -81,7 +81,7 @@ def test_a_mirror_image_that_fits_the_guesses_as_well_is_reported(guess_sd_m: fl
     assert found.mirrored is mirrored
 
 
-def test_what_ranges_do_not_determine_is_reported(minute):
+def test_unobservable_directions_are_reported(minute):
     guesses = HALL.moved(HALL.position, np.full(5, 0.5))
     level_drive = minute.take(minute.stamp_ns < 30 * NANOSECONDS)
     found = survey(EstimatorConfig(guesses), level_drive, off_m=0.5)
@@ -90,7 +90,7 @@ def test_what_ranges_do_not_determine_is_reported(minute):
     assert not survey(EstimatorConfig(HALL), level_drive, off_m=0.05).undetermined
 
 
-def test_what_cannot_be_surveyed_is_refused(minute):
+def test_recording_that_cannot_be_surveyed_is_refused(minute):
     still, _ = drive(seconds=10, path=lambda t: circuit(0 * t))
     line = HALL.moved(HALL.position * (1, 0, 0), HALL.sd)
     for anchors, ranges, message in (

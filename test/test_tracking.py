@@ -61,7 +61,7 @@ def hall(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_drive(tmp_path_factory.mktemp("hall") / "hall.mcap", *drive(seconds=40), too_long_m=0.6)
 
 
-def test_a_track_is_written_judged_and_read_by_evo(hall: Path, tmp_path: Path):
+def test_track_is_written_evaluated_and_read_by_evo(hall: Path, tmp_path: Path):
     out, tum, result = tmp_path / "track.mcap", tmp_path / "track.tum", tmp_path / "track.json"
     done = run("track", hall, "-o", out, "--tum", tum, "--height", "1.0", "--json", result, folder=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -110,7 +110,7 @@ def test_held_out_residuals_show_the_offset_of_one_anchor():
     ] * 6
 
 
-def test_what_cannot_be_tracked_is_refused(hall: Path, tmp_path: Path):
+def test_recording_that_cannot_be_tracked_is_refused(hall: Path, tmp_path: Path):
     out, line, others = (tmp_path / name for name in ("track.mcap", "line.yaml", "others.yaml"))
     line.write_text(dump_anchors(HALL.moved(HALL.position * (1, 0, 0) + (0, 0, 1), HALL.sd)))
     others.write_text("anchors: [{id: 50, x: 0, y: 0, z: 0}]")
@@ -124,7 +124,7 @@ def test_what_cannot_be_tracked_is_refused(hall: Path, tmp_path: Path):
     assert not out.exists()
 
 
-def test_a_survey_writes_anchors_that_are_nearer(hall: Path, tmp_path: Path):
+def test_survey_improves_the_anchor_positions(hall: Path, tmp_path: Path):
     guesses, found, result = tmp_path / "guesses.yaml", tmp_path / "found.yaml", tmp_path / "found.json"
     off = HALL.position.copy()
     off[1] += (0.5, -0.4, 0.0)
@@ -138,7 +138,7 @@ def test_a_survey_writes_anchors_that_are_nearer(hall: Path, tmp_path: Path):
     assert run(*arguments, folder=tmp_path).returncode != 0
 
 
-def test_a_height_topic_is_used_and_excludes_a_constant_height(tmp_path: Path):
+def test_height_topic_is_used_and_excludes_a_constant_height(tmp_path: Path):
     result = tmp_path / "track.json"
 
     def up_and_down(time_s):
@@ -161,7 +161,7 @@ def recording_of(ranges: Ranges, truth: TruePath) -> TagRecording:
     return TagRecording(7, ranges, ranges, False, truth)
 
 
-def test_only_anchors_that_contradict_the_others_are_accused():
+def test_only_contradictory_anchors_are_reported():
     height = Height(1.0)
     blocked, truth = drive(seconds=60, seed=1)
     late = (blocked.anchor == 2) & (blocked.stamp_ns > 30 * NANOSECONDS)
@@ -185,7 +185,7 @@ def test_failed_smoothing_is_reported(monkeypatch: pytest.MonkeyPatch, shift: tu
     assert "smoothing failed" in warning
 
 
-def test_a_bad_geometry_is_reported():
+def test_bad_geometry_is_reported():
     near_line = HALL.moved(HALL.position * (1, 0.02, 0) + (0, -6, 1), HALL.sd)
     ranges, truth = drive(near_line, seconds=10)
     area = Area((-50, 0, 0), (50, 50, 3))
@@ -211,7 +211,7 @@ def hanyang() -> Path:
     return folder
 
 
-def test_a_real_run_is_read_with_its_anchors_and_places(hanyang: Path):
+def test_real_run_is_read_with_its_anchors_and_positions(hanyang: Path):
     source = open_recording(hanyang / "LOS_A2")
     assert isinstance(source, HanyangRun)
     records = list(source)
@@ -224,7 +224,7 @@ def test_a_real_run_is_read_with_its_anchors_and_places(hanyang: Path):
     assert 0.7 < min(heights) < max(heights) < 1.7
 
 
-def test_a_bag_of_a_real_run_keeps_its_stamps_and_anchors(hanyang: Path, tmp_path: Path):
+def test_bag_of_a_real_run_keeps_its_stamps_and_anchors(hanyang: Path, tmp_path: Path):
     done = run("data", "import", hanyang / "LOS_A2", "-o", tmp_path / "a2.mcap", folder=tmp_path)
     assert done.returncode == 0, done.stderr
     wanted = [record.measurement.stamp_ns for record in open_recording(hanyang / "LOS_A2")]
@@ -234,7 +234,7 @@ def test_a_bag_of_a_real_run_keeps_its_stamps_and_anchors(hanyang: Path, tmp_pat
 
 
 @pytest.mark.slow
-def test_real_drives_meet_what_the_documentation_says(hanyang: Path):
+def test_real_drives_reach_the_documented_errors(hanyang: Path):
     from benchmarks import positions
 
     runs = [positions.hanyang(folder) for folder in sorted(hanyang.glob("*_*"))]
@@ -252,7 +252,7 @@ def test_real_drives_meet_what_the_documentation_says(hanyang: Path):
     assert mean("snapshot", "rmse") > 2
 
 
-def test_real_tags_at_rest_are_placed_by_the_line_of_the_others(apartment: Path):
+def test_stationary_tags_are_positioned_with_the_line_of_the_others(apartment: Path):
     from benchmarks import positions
 
     found = positions.apartment(apartment)

@@ -39,7 +39,7 @@ def test_least_absolute_deviations_is_no_worse_than_any_line_through_points(seed
     assert found <= min(vertices) * (1 + 1e-6)
 
 
-def test_a_configuration_counts_once_however_long_it_was_recorded():
+def test_configurations_have_equal_weight():
     data = dataset(8, 10)
     rows = np.concatenate([np.arange(80), np.repeat(np.arange(10), 30)])
     once, long = (
@@ -53,14 +53,14 @@ def test_a_configuration_counts_once_however_long_it_was_recorded():
     )
 
 
-def test_without_powers_the_prior_is_the_median_over_configurations():
+def test_without_levels_the_bias_is_the_median_over_configurations():
     names = np.array(["a", "a", "b", "c"])
     unknown = np.full(4, np.nan)
     linear_bias = fit_linear_bias(names, unknown, unknown, np.array([1.0, 2.0, 0.5, 9.0]))
     assert linear_bias == LinearBiasModel(1.5)
 
 
-def test_a_prior_of_nothing_is_refused():
+def test_linear_bias_model_without_data_is_refused():
     with pytest.raises(DatasetError, match="no measurements"):
         fit_linear_bias(np.array([]), np.array([]), np.array([]), np.array([]))
 
@@ -71,7 +71,7 @@ from uwb_mitigation.training.candidates import Recipe, fit_new_model  # noqa: E4
 from uwb_mitigation.training.fitting import FitOptions, fit  # noqa: E402
 
 
-def test_a_seed_gives_the_same_weights():
+def test_seed_gives_the_same_weights():
     data = dataset(4, 30)
     options = FitOptions(epochs=2, seed=3)
     first, again, other = (
@@ -82,7 +82,7 @@ def test_a_seed_gives_the_same_weights():
     assert not np.array_equal(first.weight["first"], other.weight["first"])
 
 
-def test_fitting_leaves_the_callers_randomness_alone():
+def test_fitting_does_not_change_the_global_random_state():
     torch.manual_seed(5)
     expected = torch.rand(1)
     torch.manual_seed(5)
@@ -90,7 +90,7 @@ def test_fitting_leaves_the_callers_randomness_alone():
     assert torch.equal(torch.rand(1), expected)
 
 
-def test_a_network_learns_what_its_inputs_tell():
+def test_network_learns_a_function_of_its_inputs():
     inputs = windows(400, 32)
     targets = inputs[:, :8].mean(axis=1)
     weights = fit(SHAPE, inputs, targets, FitOptions(epochs=12, learning_rate=2e-3, dropout=0.1))
@@ -98,7 +98,7 @@ def test_a_network_learns_what_its_inputs_tell():
     assert left < 0.4 * np.abs(targets - np.median(targets)).mean()
 
 
-def test_a_loss_that_diverges_ends_the_training():
+def test_loss_that_diverges_ends_the_training():
     targets = np.full(64, 3e38)
     with pytest.raises(DatasetError, match="in epoch"):
         fit(SHAPE, windows(64, 32) * 1e30, targets, FitOptions(epochs=50, learning_rate=1.0))
@@ -115,7 +115,7 @@ def test_options_out_of_range_are_refused(change):
         FitOptions(**change)
 
 
-def test_cross_validation_finds_the_line_on_configurations_not_seen():
+def test_cross_validation_finds_the_line_on_held_out_configurations():
     data = dataset(12, 20)
     recipe = Recipe(SHAPE, FitOptions(epochs=1))
     validation = train.cross_validate(data, recipe, folds=4, seed=0)
@@ -125,7 +125,7 @@ def test_cross_validation_finds_the_line_on_configurations_not_seen():
     assert abs(statistics["int8"]["mae"] - statistics["float"]["mae"]) < 0.01
 
 
-def test_the_card_tells_the_errors_on_configurations_not_seen():
+def test_card_contains_the_errors_on_held_out_configurations():
     data = dataset(12, 20)
     recipe = Recipe(SHAPE, FitOptions(epochs=1))
     validation = train.cross_validate(data, recipe, folds=4, seed=0)
@@ -140,7 +140,7 @@ def test_the_card_tells_the_errors_on_configurations_not_seen():
     assert card.training["metrics_m"]["raw"]["mae"] == round(float(np.abs(data.error_m).mean()), 4)
 
 
-def test_measurements_without_power_do_not_spoil_the_network():
+def test_measurements_without_levels_do_not_harm_the_network():
     data = dataset(8, 20)
     data.rx_power_dbm[3] = np.nan
     fitted = fit_new_model(data, Recipe(SHAPE, FitOptions(epochs=1)), 0)

@@ -59,7 +59,7 @@ def test_energy_before_the_first_path_needs_no_level(scaling):
     assert OodDetector(only.bands).score(found) == pytest.approx([0.5], abs=0.02)
 
 
-def test_distance_alone_is_not_strange_and_a_weaker_radio_is(tmp_path):
+def test_weaker_radio_is_out_of_distribution_but_a_larger_distance_is_not(tmp_path):
     one = mitigation(tmp_path, power_at_1m_dbm=Band(-74.0, -70.0, 2.0))
     near, far, weak = (
         one.correct([measurement(range_m, rx_power_dbm=power, first_path_power_dbm=power - 6.0)])[0].status
@@ -68,13 +68,13 @@ def test_distance_alone_is_not_strange_and_a_weaker_radio_is(tmp_path):
     assert (near, far, weak) == (Status.OK, Status.OK, Status.OUT_OF_DISTRIBUTION)
 
 
-def test_the_variance_grows_with_the_predicted_error(tmp_path):
+def test_variance_grows_with_the_predicted_error(tmp_path):
     result = mitigation(tmp_path).correct([measurement()])[0]
     squared = np.float32(result.correction_m) * np.float32(result.correction_m)
     assert result.variance_m2 == float(np.float32(0.0625) + np.float32(0.5) * squared)
 
 
-def test_a_strange_measurement_is_corrected_less_and_has_a_larger_variance(tmp_path):
+def test_out_of_distribution_measurement_is_corrected_less_with_larger_variance(tmp_path):
     familiar = mitigation(tmp_path).correct([measurement(3.0)])[0]
     strange = mitigation(tmp_path, range_m=Band(1.0, 2.0, 4.0)).correct([measurement(3.0)])[0]
     assert strange.status is Status.OK
@@ -83,13 +83,13 @@ def test_a_strange_measurement_is_corrected_less_and_has_a_larger_variance(tmp_p
 
 
 @pytest.mark.parametrize("name", ["range_m", "power_at_1m_dbm", "power_gap_db", "cir_level_db"])
-def test_a_wholly_strange_measurement_passes_through(tmp_path, name):
+def test_fully_out_of_distribution_measurement_passes_through(tmp_path, name):
     result = mitigation(tmp_path, **{name: Band(500.0, 501.0, 1.0)}).correct([measurement(3.0)])[0]
     assert (result.status, result.range_m, result.correction_m) == (Status.OUT_OF_DISTRIBUTION, 3.0, 0.0)
     assert result.variance_m2 == 0.5
 
 
-def test_batches_grade_to_the_bit_as_single_measurements(tmp_path):
+def test_batches_equal_single_measurements_bit_by_bit(tmp_path):
     subject = mitigation(
         tmp_path, range_m=Band(1.0, 2.0, 4.0), power_at_1m_dbm=Band(-72.0, -70.0, 5.0), cir_level_db=WIDE
     )
@@ -101,13 +101,13 @@ def test_batches_grade_to_the_bit_as_single_measurements(tmp_path):
 
 
 @pytest.mark.parametrize("band", [(2.0, 1.0, 1.0), (0.0, 1.0, 0.0), (math.nan, 1.0, 1.0), (0.1, 1.0, 1.0)])
-def test_a_band_that_is_none_is_refused(band):
+def test_invalid_band_is_refused(band):
     with pytest.raises(ModelError, match="band"):
         Band(*band)
 
 
 @pytest.mark.parametrize("change", [{"variance_per_m2": -1.0}, {"interval95_sigmas": 0.5}])
-def test_a_card_with_an_impossible_variance_is_refused(tmp_path, change):
+def test_card_with_an_impossible_variance_is_refused(tmp_path, change):
     with pytest.raises(ModelError, match=next(iter(change))):
         bundle(tmp_path, SHAPE, **change)
 

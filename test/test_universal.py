@@ -27,20 +27,20 @@ def small() -> UniversalModel:
     return universal.train(SMALL, "small", workers=1)
 
 
-def test_the_same_whatever_the_number_of_workers(small: UniversalModel) -> None:
+def test_result_does_not_depend_on_the_number_of_workers(small: UniversalModel) -> None:
     again = universal.train(SMALL, "small", workers=2)
     assert again.card == small.card
     for name, weight in small.network.weight.items():
         assert again.network.weight[name].tobytes() == weight.tobytes()
 
 
-def test_it_is_graded_by_condition_in_another_world(small: UniversalModel) -> None:
+def test_evaluation_by_condition_uses_other_buildings(small: UniversalModel) -> None:
     for row in ("raw", "float", "int8"):
         assert set(small.held_out[row]) == {"all", "LOS", "NLOS", "NDP NLOS"}
     assert small.held_out["raw"]["LOS"].mae < small.held_out["raw"]["NDP NLOS"].mae
 
 
-def test_the_command_writes_both_bundles(tmp_path: Path) -> None:
+def test_command_writes_both_bundles(tmp_path: Path) -> None:
     words = ["train-universal", "-o", str(tmp_path / "a.onnx"), "--float", str(tmp_path / "b.onnx")]
     words += ["--samples", "8", "--scaling", "max", "--blocks", "1", "--json", str(tmp_path / "a.json")]
     done = CliRunner().invoke(app, words)
@@ -68,7 +68,7 @@ def test_the_command_writes_both_bundles(tmp_path: Path) -> None:
         (["--workers", "0"], "workers"),
     ],
 )
-def test_what_cannot_be_trained_is_refused(tmp_path: Path, words: list[str], told: str) -> None:
+def test_invalid_training_is_refused(tmp_path: Path, words: list[str], told: str) -> None:
     done = CliRunner().invoke(app, ["train-universal", "-o", str(tmp_path / "a.onnx"), *words])
     assert isinstance(done.exception, ParameterError)
     assert told in str(done.exception)

@@ -29,7 +29,7 @@ def maes(found: ZeroShot) -> list[float]:
     return [float(np.abs(found.errors[name]).mean()) for name in NAMES]
 
 
-def test_offsets_take_a_constant_of_the_boards_off(model, data):
+def test_offsets_remove_a_constant_of_the_boards(model, data):
     moved = zero_shot.run(replace(data, error_m=data.error_m + 3.0), model)
     still = zero_shot.run(data, model)
     assert moved.los_offset_m == pytest.approx(still.los_offset_m + 3.0)
@@ -37,19 +37,19 @@ def test_offsets_take_a_constant_of_the_boards_off(model, data):
     assert maes(moved)[0] > maes(still)[0] + 1.0
 
 
-def test_the_offset_of_a_placement_is_that_of_the_others(model, data):
+def test_offset_of_a_placement_is_from_the_other_placements(model, data):
     odd = data.configurations == data.names[0]
     moved = zero_shot.run(replace(data, error_m=data.error_m + np.where(odd, 50.0, 0.0)), model)
     assert np.abs(moved.errors["universal_offset"][odd]).min() > 45.0
 
 
-def test_without_a_placement_in_line_of_sight_there_is_no_offset(model, data):
+def test_without_a_los_placement_there_is_no_offset(model, data):
     blind = zero_shot.run(replace(data, labels=np.full(len(data), "NLOS")), model)
     assert blind.los_offset_m == 0.0
     assert (blind.errors["universal_los_offset"] == blind.errors["universal"]).all()
 
 
-def test_what_the_model_refuses_stays_as_measured(tmp_path, data):
+def test_refused_ranges_are_unchanged(tmp_path, data):
     timid = bundle(tmp_path, linear_bias=LinearBiasModel(0.0), correction_limits_m=(-(2.0**-20), 2.0**-20))
     found = zero_shot.run(data, timid)
     assert found.passed_through.all()
