@@ -87,7 +87,7 @@ setup(
         (f"share/{PACKAGE}/models", files("models", "*.onnx", "*.md")),
         # Sources that `backend:=firmware` compiles; the boards and the sketch need a checkout.
         (f"share/{PACKAGE}/firmware/src", files("firmware/src", "*.c", "*.h")),
-        (f"share/{PACKAGE}/firmware/host", files("firmware/host", "*.c")),
+        (f"share/{PACKAGE}/firmware/native", files("firmware/native", "*.c")),
     ],
     install_requires=required("runtime"),
     extras_require={

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.link.faults import Damaged, Faults, damage
+from uwb_mitigation.link.faults import DamagedData, Faults, damage
 from uwb_mitigation.link.framing import Frame, FrameDecoder, encode_frame
 from uwb_mitigation.link.layout import MessageType
 
@@ -114,7 +114,7 @@ def loopback(
     )
 
 
-def _untouched(arrived: Damaged, starts: NDArray[np.intp], ends: NDArray[np.intp]) -> NDArray[np.bool_]:
+def _untouched(arrived: DamagedData, starts: NDArray[np.intp], ends: NDArray[np.intp]) -> NDArray[np.bool_]:
     """Return the mask of segments [start, end) that arrived without a change or an insertion."""
     unchanged = np.searchsorted(arrived.changed, starts) == np.searchsorted(arrived.changed, ends)
     # An insertion before the first byte is outside of the segment.

@@ -21,10 +21,10 @@ from benchmarks.dw1000_model.links import Link
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.link.connection import PortAddress
 from uwb_mitigation.link.layout import Mode, Role
-from uwb_mitigation.link.radio import RadioSettings
+from uwb_mitigation.link.radio_settings import RadioSettings
 from uwb_mitigation.measurement import DEVICE_TIME_WRAP, RangeMeasurement
 from uwb_mitigation.radio.evb1000 import Evb1000Bus
-from uwb_mitigation.radio.port import RadioPort
+from uwb_mitigation.radio.radio_driver import RadioDriver
 
 PPM_PAIRS = ((-20.0, 20.0), (-10.0, 10.0), (0.0, 0.0), (10.0, -10.0), (20.0, -20.0))
 DISTANCES_M = (0.3, 1.0, 5.01, 20.0, 100.0)
@@ -118,7 +118,7 @@ def evb1000_rate_hz(seconds: float) -> float:
     """
     with tempfile.TemporaryDirectory() as folder, _emulated(Path(folder) / "board") as paths:
         ports = [
-            RadioPort(_opening(path), RadioSettings(role=role))
+            RadioDriver(_opening(path), RadioSettings(role=role))
             for path, role in zip(paths, (Role.TAG, Role.ANCHOR), strict=True)
         ]
         try:
@@ -187,7 +187,9 @@ def soak(exchanges: int, seed: int, advance: Callable[[int], None]) -> RadioSoak
             now_s = watch.take(air.run(float(random.uniform(0, _LONGEST_CALM_S))))
         counts = air.counts(tag)
     end_mb = process.memory_info().rss / 1e6
-    lost = {name: counts[name] for name in ("no_answer", "late", "time_out", "damaged", "absurd", "broken")}
+    lost = {
+        name: counts[name] for name in ("no_answer", "late", "timeout", "damaged", "implausible", "broken")
+    }
     return RadioSoak(
         exchanges=counts["tried"],
         delivered=watch.delivered,
@@ -249,7 +251,7 @@ def _opening(path: Path) -> Callable[[], Evb1000Bus]:
     return lambda: Evb1000Bus(PortAddress.parse(str(path)))
 
 
-def _await_range(port: RadioPort) -> None:
+def _await_range(port: RadioDriver) -> None:
     until = time.monotonic() + _STARTS_WITHIN_S
     while not isinstance(port.get(0.2), RangeMeasurement):
         if time.monotonic() > until:

@@ -286,7 +286,7 @@ def c_header() -> str:
         ("MODE", layout.Mode),
         ("ROLE", layout.Role),
         ("RADIO_STATE", layout.RadioState),
-        ("OFFSET_OF", layout.OffsetOf),
+        ("OFFSET_SCOPE", layout.OffsetScope),
         ("LOG_LEVEL", layout.LogLevel),
     ):
         lines += [f"#define UWB_{prefix}_{member.name} {member.value}" for member in members]
@@ -325,7 +325,7 @@ PARTS = {
     "wire_modes": partial(wire_values, layout.Mode),
     "wire_roles": partial(wire_values, layout.Role),
     "wire_radio_states": partial(wire_values, layout.RadioState),
-    "wire_offset_of": partial(wire_values, layout.OffsetOf),
+    "wire_offset_scope": partial(wire_values, layout.OffsetScope),
     "wire_log_levels": partial(wire_values, layout.LogLevel),
 } | {
     f"wire_{each.name}": partial(wire_layout, each)

@@ -41,7 +41,7 @@ class FaultyBoard(EmulatedBoard):
             super().reset()
             self._backlog[:0] = self._random.bytes(self._boot_noise)
 
-    def _boot(self) -> Board:
+    def _create_board(self) -> Board:
         return Board(
             self._identity, self._corrector, mode=self._mode, boot_id=self._boots, version=self._version
         )

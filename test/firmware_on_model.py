@@ -10,10 +10,10 @@ from types import SimpleNamespace
 import pytest
 
 from benchmarks.dw1000_model.air import Host
-from uwb_mitigation.link.radio import RadioSettings
+from uwb_mitigation.link.radio_settings import RadioSettings
 from uwb_mitigation.measurement import RangeMeasurement
-from uwb_mitigation.radio import host as firmware
-from uwb_mitigation.radio.host import HostRadio
+from uwb_mitigation.radio import native_radio as firmware
+from uwb_mitigation.radio.native_radio import NativeRadio
 
 REPLY_US = 3000
 
@@ -49,7 +49,7 @@ class ModelBus:
 
     name = "a modelled chip"
     reply_us = REPLY_US
-    patience_us = 15_000
+    timeout_us = 15_000
     has_reset = True
 
     def __init__(self, host: Host) -> None:
@@ -88,16 +88,16 @@ def ranging(
     seconds: float,
     *,
     bus: Callable[[Host], ModelBus] = ModelBus,
-    at_end: Callable[[HostRadio], None] = lambda _: None,
+    at_end: Callable[[NativeRadio], None] = lambda _: None,
 ) -> Callable[[Host], None]:
     """Return a program that runs the exchange for `seconds` and collects the ranges."""
 
     def run(host: Host) -> None:
         begin(host)
-        radio = HostRadio(bus(host), settings, stamp_clock=CLOCK.time_ns)
+        radio = NativeRadio(bus(host), settings, stamp_clock=CLOCK.time_ns)
         try:
             while host.now() < seconds:
-                measured = radio.turn(0.02)
+                measured = radio.exchange(0.02)
                 if measured is not None:
                     ranges.append(measured)
             at_end(radio)

@@ -14,10 +14,10 @@ from compilers import NEEDS_CC
 from benchmarks.dw1000_model.evb1000 import EmulatedEvb1000s
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.link.layout import Role
-from uwb_mitigation.link.radio import RadioSettings
-from uwb_mitigation.radio.antenna_delay import find
-from uwb_mitigation.radio.bus import opener
-from uwb_mitigation.radio.port import RadioPort
+from uwb_mitigation.link.radio_settings import RadioSettings
+from uwb_mitigation.radio.antenna_delay import delay_from_ranges
+from uwb_mitigation.radio.bus import bus_opener
+from uwb_mitigation.radio.radio_driver import RadioDriver
 
 NOMINAL = 2 * 16436
 
@@ -29,7 +29,7 @@ def around(middle_m: float, sd_m: float, n: int = 400) -> np.ndarray:
 @pytest.mark.parametrize("radios", [1, 2])
 def test_offset_is_divided_among_the_calibrated_radios(radios: int):
     # 1 tick too few in one radio, 2.35 mm too far (APS014).
-    found = find(around(5.01 + 0.235, 0.001), np.full(400, 3.0), 5.01, [NOMINAL] * radios)
+    found = delay_from_ranges(around(5.01 + 0.235, 0.001), np.full(400, 3.0), 5.01, [NOMINAL] * radios)
     assert abs(found.antenna_delay - NOMINAL - 100 / radios) <= 1
     assert abs(found.offset_m - 0.235) < 0.001
 
@@ -46,7 +46,7 @@ def test_offset_is_divided_among_the_calibrated_radios(radios: int):
 )
 def test_invalid_calibration_is_refused(ranges: np.ndarray, gap_db: float, says: str):
     with pytest.raises(UwbMitigationError, match=says):
-        find(ranges, np.full(400, gap_db), 5.01, [NOMINAL, NOMINAL])
+        delay_from_ranges(ranges, np.full(400, gap_db), 5.01, [NOMINAL, NOMINAL])
 
 
 @NEEDS_CC
@@ -70,8 +70,8 @@ def test_antenna_delay_of_a_pair_is_estimated_and_written(tmp_path: Path):
 @NEEDS_CC
 def test_single_tag_compensates_the_complete_offset(tmp_path: Path):
     with EmulatedEvb1000s(boards=2, antenna_delay=NOMINAL + 60, clean_m=5.01) as boards:
-        anchor = RadioPort(
-            opener("evb1000", boards.ports[1]), RadioSettings(role=Role.ANCHOR, antenna_delay=NOMINAL)
+        anchor = RadioDriver(
+            bus_opener("evb1000", boards.ports[1]), RadioSettings(role=Role.ANCHOR, antenna_delay=NOMINAL)
         )
         try:
             done = command_line.run(

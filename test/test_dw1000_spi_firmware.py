@@ -17,7 +17,7 @@ from spidev_on_model import dw1000, program, replace_spidev
 from benchmarks.dw1000_model.air import ANTENNA_DELAY_TICKS, Air, Host
 from benchmarks.dw1000_model.links import Link
 from uwb_mitigation.link.layout import Role
-from uwb_mitigation.link.radio import RadioSettings
+from uwb_mitigation.link.radio_settings import RadioSettings
 from uwb_mitigation.measurement import RangeMeasurement
 
 pytestmark = NEEDS_CC

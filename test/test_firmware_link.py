@@ -40,31 +40,31 @@ KINDS = ("frames", "bad_cobs", "bad_length", "bad_crc", "oversize", "foreign_ver
 
 
 class BoardInC:
-    """`firmware/test/host_board.c`; every method returns what the board then sends."""
+    """`firmware/test/native_board.c`; every method returns what the board then sends."""
 
     def __init__(self, library: ctypes.CDLL, mode: Mode, with_model: bool = True, queue: int = 16384) -> None:
         self._library = library
-        self._board = library.host_board_new(int(mode), int(with_model), queue)
+        self._board = library.native_board_new(int(mode), int(with_model), queue)
         self.sent = self._output()
 
     def receive(self, data: bytes, now_us: int, *, read: bool = True) -> bytes:
-        self._library.host_board_receive(self._board, data, len(data), now_us)
+        self._library.native_board_receive(self._board, data, len(data), now_us)
         return self._output() if read else b""
 
     def measure(self, data: bytes, now_us: int, *, read: bool = True) -> bytes:
-        self._library.host_board_measure(self._board, data, len(data), now_us)
+        self._library.native_board_receive_from_radio(self._board, data, len(data), now_us)
         return self._output() if read else b""
 
     def tick(self, now_us: int) -> bytes:
-        self._library.host_board_tick(self._board, now_us)
+        self._library.native_board_tick(self._board, now_us)
         return self._output()
 
     def close(self) -> None:
-        self._library.host_board_free(self._board)
+        self._library.native_board_free(self._board)
 
     def read(self, limit: int) -> bytes:
         out = ctypes.create_string_buffer(limit)
-        count = self._library.host_board_output(self._board, out, limit)
+        count = self._library.native_board_output(self._board, out, limit)
         return out.raw[:count]
 
     def _output(self) -> bytes:
@@ -80,27 +80,27 @@ def bundle(tmp_path_factory: pytest.TempPathFactory) -> Bundle:
 def library(bundle: Bundle, tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
     folder = tmp_path_factory.mktemp("board")
     export_bundle(bundle, folder)
-    program = firmware_folder() / "test" / "host_board.c"
+    program = firmware_folder() / "test" / "native_board.c"
     library = ctypes.CDLL(str(link(program, folder, folder / "board.so", SANITIZED, shared=True)))
     size, time, pointer = ctypes.c_size_t, ctypes.c_uint64, ctypes.c_void_p
-    library.host_board_new.restype = pointer
-    library.host_board_new.argtypes = (ctypes.c_int, ctypes.c_int, size)
-    library.host_board_free.argtypes = (pointer,)
-    library.host_board_receive.argtypes = (pointer, ctypes.c_char_p, size, time)
-    library.host_board_measure.argtypes = (pointer, ctypes.c_char_p, size, time)
-    library.host_board_tick.argtypes = (pointer, time)
-    library.host_board_output.argtypes = (pointer, pointer, size)
-    library.host_board_output.restype = size
-    library.host_decode.argtypes = (ctypes.c_char_p, size, pointer, pointer, pointer)
-    library.host_encode.argtypes = (ctypes.c_char_p, ctypes.c_char_p, size, pointer)
-    library.host_encode.restype = size
+    library.native_board_new.restype = pointer
+    library.native_board_new.argtypes = (ctypes.c_int, ctypes.c_int, size)
+    library.native_board_free.argtypes = (pointer,)
+    library.native_board_receive.argtypes = (pointer, ctypes.c_char_p, size, time)
+    library.native_board_receive_from_radio.argtypes = (pointer, ctypes.c_char_p, size, time)
+    library.native_board_tick.argtypes = (pointer, time)
+    library.native_board_output.argtypes = (pointer, pointer, size)
+    library.native_board_output.restype = size
+    library.native_decode.argtypes = (ctypes.c_char_p, size, pointer, pointer, pointer)
+    library.native_encode.argtypes = (ctypes.c_char_p, ctypes.c_char_p, size, pointer)
+    library.native_encode.restype = size
     return library
 
 
 def decode(library: ctypes.CDLL, wire: bytes) -> tuple[Frame | None, dict[str, int]]:
     header, payload = ctypes.create_string_buffer(16), ctypes.create_string_buffer(MAX_PAYLOAD_BYTES)
     counts = (ctypes.c_uint32 * len(KINDS))()
-    length = library.host_decode(wire, len(wire), header, payload, counts)
+    length = library.native_decode(wire, len(wire), header, payload, counts)
     counted = dict(zip(KINDS, counts, strict=True))
     if length < 0:
         return None, counted
@@ -111,7 +111,7 @@ def decode(library: ctypes.CDLL, wire: bytes) -> tuple[Frame | None, dict[str, i
 def encode(library: ctypes.CDLL, frame: Frame) -> bytes:
     header = HEADER.packing().pack(1, *frame[:4])
     wire = ctypes.create_string_buffer(8192)
-    count = library.host_encode(header, frame.payload, len(frame.payload), wire)
+    count = library.native_encode(header, frame.payload, len(frame.payload), wire)
     return wire.raw[:count]
 
 

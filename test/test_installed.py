@@ -63,7 +63,7 @@ def test_shared_files_are_those_of_the_sources(share: Path, folder: str):
 
 
 def test_firmware_sources_for_the_host_are_installed(share: Path):
-    library = [path for part in ("src", "host") for path in (REPOSITORY / "firmware" / part).glob("*.[ch]")]
+    library = [path for part in ("src", "native") for path in (REPOSITORY / "firmware" / part).glob("*.[ch]")]
     expected = {f"{path.parent.name}/{path.name}": path.read_bytes() for path in library}
     assert files_below(share / "firmware") == expected
 

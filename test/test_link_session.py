@@ -177,7 +177,7 @@ def test_board_of_another_version_is_reported_once_and_ignored():
     assert bench.events == [VersionMismatch(7)]
     assert bench.session.state is LinkState.WRONG_VERSION
     assert bench.session.foreign_version == 7
-    assert bench.session.silent_ns(bench.now) < 1000 * MS
+    assert bench.session.idle_ns(bench.now) < 1000 * MS
     assert bench.measure(1) == []
 
 
@@ -198,8 +198,8 @@ def test_board_times_out_after_3_s_and_reconnects():
         bench.now += 10 * MS
         bench.events += bench.session.tick(bench.now, EPOCH + bench.now)
         bench.session.outgoing()
-    assert bench.seen(Disconnected) == [Disconnected(Loss.SILENT)]
-    assert bench.session.silent_ns(bench.now) > 3000 * MS
+    assert bench.seen(Disconnected) == [Disconnected(Loss.TIMEOUT)]
+    assert bench.session.idle_ns(bench.now) > 3000 * MS
 
     bench.board = sleeping
     bench.run(600)
@@ -235,7 +235,7 @@ def test_frame_numbers_reveal_a_reset_whose_hello_is_lost():
     bench.board.hello(0)
     for sequence in range(3):
         bench.measure(sequence)
-    assert bench.seen(Disconnected) == [Disconnected(Loss.OUT_OF_STEP)]
+    assert bench.seen(Disconnected) == [Disconnected(Loss.OUT_OF_SEQUENCE)]
 
     bench.run(100)
 
@@ -282,7 +282,7 @@ CORRECTION = Correction(0, 1, 2, 3, 4, HalfMetre().correct([measurement(1)])[0])
         (99, 0, b"from the future", {"unknown_type": 1}),
         (MessageType.GET_INFO, 0, b"", {"unknown_type": 1}),
         (MessageType.RANGE_CIR, 0, b"short", {"malformed": 1}),
-        (MessageType.RANGE_CORRECTED, Flag.ANSWER, messages.encode(CORRECTION)[1], {"unasked": 1}),
+        (MessageType.RANGE_CORRECTED, Flag.ANSWER, messages.encode(CORRECTION)[1], {"unsolicited": 1}),
     ],
     ids=["unknown", "host's own", "malformed", "answer without request"],
 )
@@ -293,7 +293,7 @@ def test_frames_that_are_not_delivered_are_counted(kind, flags, payload, counted
 
     assert bench.host_hears(encode_frame(frame)) == []
     after = bench.session.totals()
-    rejections = ("unknown_type", "malformed", "unasked", "stale", "withheld", "lost")
+    rejections = ("unknown_type", "malformed", "unsolicited", "stale", "withheld", "lost")
     assert {name: 1 for name in rejections if after[name] != before[name]} == counted
 
 

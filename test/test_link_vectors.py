@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from uwb_mitigation.link import layout, messages, radio
+from uwb_mitigation.link import layout, messages, radio_settings
 from uwb_mitigation.link.framing import Frame, FrameDecoder, encode_frame
 from uwb_mitigation.link.layout import Flag, LogLevel, MessageType, Mode, RadioState, Role
 from uwb_mitigation.link.messages import OffsetsAnswer, SetOffsets
-from uwb_mitigation.link.radio import RadioSettings
+from uwb_mitigation.link.radio_settings import RadioSettings
 from uwb_mitigation.measurement import Cir, CorrectedRange, Encoding, Origin, RangeMeasurement, Status
 from uwb_mitigation.offsets import Offsets
 
@@ -132,7 +132,7 @@ SETTINGS = RadioSettings(
     window=1016,
     anchors=(1, 2**63 + 1),
     reply_us=15_000,
-    patience_us=60_000,
+    timeout_us=60_000,
     interval_us=100_000,
     report=True,
     bias_correction=True,
@@ -155,7 +155,7 @@ SENT |= {
         8_000_000,
     ),
     "radio_status": (
-        radio.RadioStatus(
+        radio_settings.RadioStatus(
             28,
             7,
             6,
@@ -170,8 +170,8 @@ SENT |= {
             3.25,
             RadioState.BUS,
             (
-                radio.AnchorInReach(1, 20, 7, -80.5, 12),
-                radio.AnchorInReach(2**64 - 2, 8, 0, math.nan, radio.NEVER_MS),
+                radio_settings.AnchorStatus(1, 20, 7, -80.5, 12),
+                radio_settings.AnchorStatus(2**64 - 2, 8, 0, math.nan, radio_settings.NEVER_MS),
             ),
         ),
         0,

@@ -16,7 +16,7 @@ from uwb_mitigation.link.board import Board
 from uwb_mitigation.link.events import OffsetsRefused
 from uwb_mitigation.link.layout import MAX_OFFSETS, MessageType, Mode
 from uwb_mitigation.link.messages import Correction, Hello
-from uwb_mitigation.link.session import RADIO_TRIES, REQUEST_INTERVAL_NS, BoardSession
+from uwb_mitigation.link.session import MAX_TRIES, REQUEST_INTERVAL_NS, BoardSession
 from uwb_mitigation.measurement import CorrectedRange, RangeMeasurement, Status
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.architecture import Remnet
@@ -206,7 +206,7 @@ def test_board_subtracts_the_offsets_of_the_host_also_after_a_restart():
 
 def test_older_board_is_reported_and_its_corrections_are_ignored():
     pair = Pair(Offsets(0.25), older=True)
-    for _ in range(RADIO_TRIES + 3):
+    for _ in range(MAX_TRIES + 3):
         pair.turn()
     (refused,) = [event for event in pair.events if isinstance(event, OffsetsRefused)]
     assert "flash a newer" in refused.text
@@ -216,7 +216,7 @@ def test_older_board_is_reported_and_its_corrections_are_ignored():
 def test_older_board_is_accepted_without_offsets():
     pair = Pair(NO_OFFSETS, older=True)
     assert pair.range() == [3.0]
-    for _ in range(RADIO_TRIES + 3):
+    for _ in range(MAX_TRIES + 3):
         pair.turn()
     assert not [event for event in pair.events if isinstance(event, OffsetsRefused)]
     assert pair.range() == [3.0]

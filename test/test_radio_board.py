@@ -12,7 +12,7 @@ from uwb_mitigation.link import messages
 from uwb_mitigation.link.events import Event, RadioRefused
 from uwb_mitigation.link.layout import RadioState, Role
 from uwb_mitigation.link.messages import SetRadio
-from uwb_mitigation.link.radio import RadioSettings, RadioStatus
+from uwb_mitigation.link.radio_settings import RadioSettings, RadioStatus
 from uwb_mitigation.link.session import BoardSession
 from uwb_mitigation.measurement import RangeMeasurement
 
@@ -74,14 +74,14 @@ def test_board_reports_settings_and_status_of_its_radio():
     status = host.seen(RadioStatus)[-1]
     assert status.state is RadioState.RUNNING
     assert status.tried >= status.ranged > 50
-    assert status.no_answer + status.time_out > 0
+    assert status.no_answer + status.timeout > 0
     assert abs(status.temperature_c - 25) < 3
     assert abs(status.voltage - 3.3) < 0.1
     (in_reach,) = status.anchors
     assert in_reach.address == addresses[1]
     assert -100 < in_reach.rx_power_dbm < -60
-    assert in_reach.heard_ms is not None
-    assert in_reach.heard_ms < 500
+    assert in_reach.age_ms is not None
+    assert in_reach.age_ms < 500
 
 
 def test_host_configures_the_radio_while_it_ranges():

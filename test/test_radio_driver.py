@@ -20,7 +20,7 @@ from benchmarks.dw1000_model.links import Link
 from uwb_mitigation.errors import ParameterError, format_id
 from uwb_mitigation.link.emulated_board import EmulatedBoard, PseudoTerminal
 from uwb_mitigation.link.layout import Role
-from uwb_mitigation.link.radio import NEVER_MS, AnchorInReach, RadioSettings, RadioStatus
+from uwb_mitigation.link.radio_settings import NEVER_MS, AnchorStatus, RadioSettings, RadioStatus
 from uwb_mitigation.nodes.live_feeds import anchor_values, settings_of
 from uwb_mitigation.nodes.parameter_tables import DRIVER
 from uwb_mitigation.sources.simulated import SimulatedSource
@@ -108,7 +108,7 @@ def test_address_is_read_as_it_is_printed(address: int):
 
 def test_anchor_that_never_answered_has_no_last_seen_time():
     status = RadioStatus(
-        anchors=(AnchorInReach(7, 9, 0, np.nan, NEVER_MS), AnchorInReach(8, 9, 9, -80.0, 1500))
+        anchors=(AnchorStatus(7, 9, 0, np.nan, NEVER_MS), AnchorStatus(8, 9, 9, -80.0, 1500))
     )
     never, recent = anchor_values(status).values()
     assert never == "0 of 9 ranged, nan dBm, last seen never"

@@ -12,13 +12,13 @@ from benchmarks.dw1000_model import boards as modelled
 from benchmarks.dw1000_model.boards import ModelledAir
 from benchmarks.dw1000_model.links import Link
 from uwb_mitigation.link.layout import Role
-from uwb_mitigation.link.radio import PREAMBLES, RadioSettings
+from uwb_mitigation.link.radio_settings import PREAMBLES, RadioSettings
 from uwb_mitigation.radio import structures
 
 pytestmark = NEEDS_CC
 
 WRAP = 1 << 40
-LOST = ("no_answer", "late", "time_out", "damaged", "absurd", "broken")
+LOST = ("no_answer", "late", "timeout", "damaged", "implausible", "broken")
 
 
 def accumulator(samples: int = 1016, first_path: int = 745, seed: int = 0) -> np.ndarray:
@@ -112,7 +112,7 @@ RADIOS = [{"channel": channel, "prf_mhz": prf} for channel in (1, 2, 3, 4, 5, 7)
 
 @pytest.mark.parametrize("radio", [*RADIOS, *({"preamble": symbols} for symbols in PREAMBLES)], ids=str)
 def test_every_channel_rate_and_preamble_ranges(radio: dict[str, object]):
-    slow = {"reply_us": 20_000, "patience_us": 60_000}
+    slow = {"reply_us": 20_000, "timeout_us": 60_000}
     with ModelledAir() as air:
         tag, _ = pair(air, Link(12), **(slow | radio))
         air.run(0.3)

@@ -15,11 +15,11 @@ from benchmarks.dw1000_model.air import Air, Chip, Host
 from benchmarks.dw1000_model.links import Link
 from uwb_mitigation.errors import LinkError
 from uwb_mitigation.link.layout import RadioState, Role
-from uwb_mitigation.link.radio import RadioSettings, RadioStatus
+from uwb_mitigation.link.radio_settings import RadioSettings, RadioStatus
 from uwb_mitigation.measurement import RangeMeasurement
 from uwb_mitigation.nodes import live_feeds
 from uwb_mitigation.radio import structures
-from uwb_mitigation.radio.host import HostRadio, load
+from uwb_mitigation.radio.native_radio import NativeRadio, load
 
 pytestmark = NEEDS_CC
 
@@ -71,7 +71,7 @@ class Run:
 
         return opened
 
-    def _at_end(self, radio: HostRadio) -> None:
+    def _at_end(self, radio: NativeRadio) -> None:
         self.radios.append(radio.settings)
         radio.read_sensors()
         self.statuses.append(radio.status())
@@ -257,9 +257,9 @@ def test_reply_within_the_pause_of_smart_power_is_refused(rate_kbps: int, refuse
     """FINAL must not leave within 1 ms after POLL with more power than the average allows."""
     config = structures.config(RadioSettings(rate_kbps=rate_kbps, preamble=64))
     config.reply_us = 999
-    radio = load().host_radio_new(ctypes.byref(structures.Io()), ctypes.byref(config), 1)
-    assert (load().host_radio_configure(radio, ctypes.byref(config)) is not None) == refused
-    load().host_radio_free(radio)
+    radio = load().native_radio_new(ctypes.byref(structures.Io()), ctypes.byref(config), 1)
+    assert (load().native_radio_configure(radio, ctypes.byref(config)) is not None) == refused
+    load().native_radio_free(radio)
 
 
 class StickyStatusBus(ModelBus):

@@ -20,11 +20,11 @@ from faulty_board import FaultyBoard
 from ros_harness import Process, Ros, diagnostic_values
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
+from uwb_mitigation.link.board_driver import BoardDriver
 from uwb_mitigation.link.connection import PortAddress
 from uwb_mitigation.link.emulated_board import EmulatedBoard
 from uwb_mitigation.link.faults import Faults
 from uwb_mitigation.link.messages import Hello
-from uwb_mitigation.link.port import BoardPort
 from uwb_mitigation.measurement import Origin
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import load_bundle
@@ -267,7 +267,7 @@ def test_port_without_permission_is_reported_with_the_remedy(tmp_path: Path, mon
     monkeypatch.setattr(serial.Serial, "open", forbidden)
     place = tmp_path / "port"
     place.touch()
-    port = BoardPort(PortAddress(str(place)))
+    port = BoardDriver(PortAddress(str(place)))
     deadline = time.monotonic() + 240
     while "cannot be opened" not in port.problem:
         assert time.monotonic() < deadline

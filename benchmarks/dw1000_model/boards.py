@@ -24,7 +24,7 @@ from uwb_mitigation.firmware_export.compiling import (
     load_library,
 )
 from uwb_mitigation.link.layout import Mode
-from uwb_mitigation.link.radio import RadioSettings
+from uwb_mitigation.link.radio_settings import RadioSettings
 from uwb_mitigation.radio import structures
 
 NOMINAL_DELAY_TICKS = 16436

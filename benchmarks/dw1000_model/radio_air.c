@@ -173,13 +173,13 @@ static void run(dw1000_chip *chip, void *context) {
         if (board->baud > 0) {
             uwb_board_receive(&board->ranger.board, board->input, board->input_bytes, now_us(board));
             board->input_bytes = 0;
-            event = uwb_ranger_turn(&board->ranger);
+            event = uwb_ranger_step(&board->ranger);
             if (event == UWB_TWR_RANGED && board->mode != UWB_MODE_HOST) {
                 dw1000_delay(chip, board->inference_s);
                 pump(board);
             }
         } else {
-            event = uwb_twr_turn(&board->ranger.twr, now_us(board) + 100000);
+            event = uwb_twr_step(&board->ranger.twr, now_us(board) + 100000);
         }
         if (event == UWB_TWR_RANGED) {
             keep(board);

@@ -38,13 +38,13 @@ static float offset_of_m(const uwb_board *board, uint64_t tag_id, uint64_t ancho
         const uwb_offset_t *const entry = &board->offsets[i];
         const int tag = entry->tag_id == tag_id;
         const int anchor = entry->anchor_id == anchor_id;
-        if (entry->of == UWB_OFFSET_OF_PAIR && tag && anchor) {
+        if (entry->of == UWB_OFFSET_SCOPE_PAIR && tag && anchor) {
             return entry->offset;
         }
-        if (entry->of == UWB_OFFSET_OF_ANCHOR && anchor) {
+        if (entry->of == UWB_OFFSET_SCOPE_ANCHOR && anchor) {
             anchor_m = entry->offset;
             named = 1;
-        } else if (entry->of == UWB_OFFSET_OF_TAG && tag) {
+        } else if (entry->of == UWB_OFFSET_SCOPE_TAG && tag) {
             tag_m = entry->offset;
             named = 1;
         }
@@ -99,7 +99,7 @@ static int set_offsets(uwb_board *board, const uint8_t *payload, size_t payload_
     for (size_t i = 0; i < fixed.count; i++) {
         uwb_offset_t entry;
         memcpy(&entry, payload + sizeof fixed + i * sizeof entry, sizeof entry);
-        if (!is_offset(entry.offset) || entry.of > UWB_OFFSET_OF_PAIR) {
+        if (!is_offset(entry.offset) || entry.of > UWB_OFFSET_SCOPE_PAIR) {
             return 0;
         }
     }
@@ -153,7 +153,7 @@ static int answer(uwb_board *board, const uwb_header_t *header, size_t payload_b
         reply.received_us = now_us;
         /* Put it before all queued frames: a short round trip improves the clock estimate of the host. */
         const uwb_header_t first = {UWB_PROTOCOL_VERSION, UWB_TYPE_TIME_SYNC_REPLY, UWB_FLAG_ANSWER, 0,
-                                    UWB_WHEN_IT_LEAVES};
+                                    UWB_TIME_OF_SENDING};
         (void)uwb_queue_urgent(&board->queue, &first, &reply, sizeof reply);
         return 1;
     }
@@ -189,7 +189,7 @@ void uwb_board_receive(uwb_board *board, const uint8_t *bytes, size_t count, uin
     }
 }
 
-int uwb_board_take(uwb_board *board, const uint8_t *payload, size_t payload_bytes, uint64_t time_us) {
+int uwb_board_process_measurement(uwb_board *board, const uint8_t *payload, size_t payload_bytes, uint64_t time_us) {
     uwb_range_cir_t fields;
     uwb_cir cir;
     int sent = 1;
@@ -209,7 +209,7 @@ int uwb_board_take(uwb_board *board, const uint8_t *payload, size_t payload_byte
     return 1;
 }
 
-void uwb_board_measure(uwb_board *board, const uint8_t *bytes, size_t count, uint64_t now_us) {
+void uwb_board_receive_from_radio(uwb_board *board, const uint8_t *bytes, size_t count, uint64_t now_us) {
     for (size_t i = 0; i < count; i++) {
         if (board->radio.encoded == 0) {
             board->radio_began_us = now_us;
@@ -219,7 +219,7 @@ void uwb_board_measure(uwb_board *board, const uint8_t *bytes, size_t count, uin
         if (payload >= 0) {
             const uint8_t *const bytes_of_payload = board->radio.body.bytes + UWB_HEADER_BYTES;
             if (header.type != UWB_TYPE_RANGE_CIR ||
-                !uwb_board_take(board, bytes_of_payload, (size_t)payload, board->radio_began_us)) {
+                !uwb_board_process_measurement(board, bytes_of_payload, (size_t)payload, board->radio_began_us)) {
                 board->radio_faults++;
             }
         }

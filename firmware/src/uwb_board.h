@@ -61,11 +61,11 @@ void uwb_board_start(uwb_board *board, const uwb_board_config *config, uint64_t 
 void uwb_board_receive(uwb_board *board, const uint8_t *bytes, size_t count, uint64_t now_us);
 
 /* Process frames RANGE_CIR from the radio's side. Forward them raw or corrected, according to the mode. */
-void uwb_board_measure(uwb_board *board, const uint8_t *bytes, size_t count, uint64_t now_us);
+void uwb_board_receive_from_radio(uwb_board *board, const uint8_t *bytes, size_t count, uint64_t now_us);
 
 /* Send a measurement on, a payload of RANGE_CIR aligned to 2 bytes that the board's own radio made at `time_us`; returns
  * whether it is well formed. */
-int uwb_board_take(uwb_board *board, const uint8_t *payload, size_t payload_bytes, uint64_t time_us);
+int uwb_board_process_measurement(uwb_board *board, const uint8_t *payload, size_t payload_bytes, uint64_t time_us);
 
 /* Send what is due: STATUS once a second. */
 void uwb_board_tick(uwb_board *board, uint64_t now_us);

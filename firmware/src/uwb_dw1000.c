@@ -75,7 +75,7 @@ static int valid_code(const uwb_dw1000_settings *settings, size_t channel) {
            (settings->preamble_code >= first && settings->preamble_code < first + (fast ? 4 : 2));
 }
 
-int uwb_dw1000_valid(const uwb_dw1000_settings *settings) {
+int uwb_dw1000_settings_valid(const uwb_dw1000_settings *settings) {
     const size_t channel = channel_at(settings);
     return channel < COUNT(channels) && preamble_at(settings) < COUNT(preambles) && rate_at(settings) < COUNT(rates) &&
            (settings->prf_mhz == 16 || settings->prf_mhz == 64) && settings->decawave_sfd <= 1 &&
@@ -92,7 +92,7 @@ static uint32_t lead_us(const uwb_dw1000_settings *settings) {
     return (uint32_t)((settings->preamble + uwb_dw1000_sfd_symbols(settings)) * symbol_us) + 1u;
 }
 
-uint32_t uwb_dw1000_air_us(const uwb_dw1000_settings *settings, size_t bytes) {
+uint32_t uwb_dw1000_airtime_us(const uwb_dw1000_settings *settings, size_t bytes) {
     const uint32_t bits = 8u * (uint32_t)(bytes + 2);
     const uint32_t coded = bits + 48u * ((bits + 329u) / 330u); /* Reed-Solomon */
     const double header_us = settings->rate_kbps == 110 ? 21 * 8.20513 : 21 * 1.02564;
@@ -141,7 +141,7 @@ static uint32_t drx_tune2(uint8_t pac, int fast) {
 }
 
 uwb_dw1000_status uwb_dw1000_configure(uwb_dw1000 *chip, const uwb_dw1000_settings *settings) {
-    if (!uwb_dw1000_valid(settings)) {
+    if (!uwb_dw1000_settings_valid(settings)) {
         return UWB_DW1000_BAD_ARGUMENT;
     }
     DW1000_TRY(uwb_dw1000_idle(chip));
@@ -195,7 +195,7 @@ uwb_dw1000_status uwb_dw1000_configure(uwb_dw1000 *chip, const uwb_dw1000_settin
         {SYS_MASK, 4, UWB_DW1000_INTERRUPTS},
         {0, 0, 0},
     };
-    return uwb_dw1000_set_all(chip, entries);
+    return uwb_dw1000_write_list(chip, entries);
 }
 
 uwb_dw1000_status uwb_dw1000_check(uwb_dw1000 *chip) {
@@ -225,7 +225,7 @@ static uwb_dw1000_status soft_reset(uwb_dw1000 *chip) {
         {PMSC_CTRL0, 1, XTI}, {PMSC_CTRL1, 2, 0}, {AON_WCFG, 2, 0}, {AON_CFG0, 1, 0},
         {AON_CTRL, 1, 0},     {AON_CTRL, 1, 2},   {PMSC_SOFTRESET, 1, 0}, {0, 0, 0},
     };
-    DW1000_TRY(uwb_dw1000_set_all(chip, before));
+    DW1000_TRY(uwb_dw1000_write_list(chip, before));
     chip->io.sleep(chip->io.context, SOFT_RESET_US);
     DW1000_TRY(uwb_dw1000_set(chip, PMSC_SOFTRESET, 1, 0xF0));
     chip->io.sleep(chip->io.context, RESET_PULSE_SETTLES_US);
@@ -248,7 +248,7 @@ static uwb_dw1000_status identify(uwb_dw1000 *chip) {
 static uwb_dw1000_status read_otp(uwb_dw1000 *chip, uint32_t address, uint32_t *word) {
     uint64_t value;
     const uwb_dw1000_entry steps[] = {{OTP_ADDR, 2, address}, {OTP_CTRL, 1, 3}, {OTP_CTRL, 1, 1}, {0, 0, 0}};
-    DW1000_TRY(uwb_dw1000_set_all(chip, steps));
+    DW1000_TRY(uwb_dw1000_write_list(chip, steps));
     DW1000_TRY(uwb_dw1000_get(chip, OTP_RDAT, 4, &value));
     *word = (uint32_t)value;
     return uwb_dw1000_set(chip, OTP_CTRL, 1, 0);
@@ -295,7 +295,7 @@ static uwb_dw1000_status read_memory(uwb_dw1000 *chip) {
 static uwb_dw1000_status load_leading_edge_detector(uwb_dw1000 *chip) {
     static const uwb_dw1000_entry begin[] = {
         {PMSC_CTRL0, 1, 0x01}, {PMSC_CTRL0 + 1, 1, 0x03}, {OTP_CTRL, 2, 0x8000}, {0, 0, 0}};
-    DW1000_TRY(uwb_dw1000_set_all(chip, begin));
+    DW1000_TRY(uwb_dw1000_write_list(chip, begin));
     chip->io.sleep(chip->io.context, LDE_LOAD_US);
     return UWB_DW1000_OK;
 }
@@ -306,7 +306,7 @@ static uwb_dw1000_status start_clock(uwb_dw1000 *chip) {
     static const uwb_dw1000_entry automatic[] = {
         {SYS_STATUS, 4, (uint32_t)CPLOCK}, {PMSC_CTRL0, 1, 0x00}, {PMSC_CTRL0 + 1, 1, 0x02}, {AON_CFG1, 2, 0},
         {0, 0, 0}};
-    DW1000_TRY(uwb_dw1000_set_all(chip, automatic));
+    DW1000_TRY(uwb_dw1000_write_list(chip, automatic));
     const uint64_t until_us = chip->io.now_us(chip->io.context) + CLOCK_LOCK_US;
     for (;;) {
         uint64_t status;

@@ -115,13 +115,13 @@ uwb_dw1000_status uwb_dw1000_start(uwb_dw1000 *chip, const uwb_dw1000_io *io, co
 uwb_dw1000_status uwb_dw1000_configure(uwb_dw1000 *chip, const uwb_dw1000_settings *settings);
 
 /* Whether the settings are valid for a chip. */
-int uwb_dw1000_valid(const uwb_dw1000_settings *settings);
+int uwb_dw1000_settings_valid(const uwb_dw1000_settings *settings);
 
 /* RESTARTED if the chip has lost its settings since. */
 uwb_dw1000_status uwb_dw1000_check(uwb_dw1000 *chip);
 
 /* Duration on the air of a frame of `bytes` octets without check sequence. */
-uint32_t uwb_dw1000_air_us(const uwb_dw1000_settings *settings, size_t bytes);
+uint32_t uwb_dw1000_airtime_us(const uwb_dw1000_settings *settings, size_t bytes);
 
 #define UWB_DW1000_NO_LIMIT UINT32_MAX /* listen without a timeout */
 
@@ -132,17 +132,17 @@ uwb_dw1000_status uwb_dw1000_send(uwb_dw1000 *chip, const uint8_t *octets, size_
 uwb_dw1000_status uwb_dw1000_force_clock(uwb_dw1000 *chip);
 
 /* TX_STAMP of a frame that shall leave at about `at`, to be written into the frame. */
-uint64_t uwb_dw1000_stamp_at(const uwb_dw1000 *chip, uint64_t at);
+uint64_t uwb_dw1000_tx_stamp(const uwb_dw1000 *chip, uint64_t at);
 
-/* Send so that TX_STAMP becomes `stamp`, one that uwb_dw1000_stamp_at gave, then listen as uwb_dw1000_send. */
+/* Send so that TX_STAMP becomes `stamp`, one that uwb_dw1000_tx_stamp gave, then listen as uwb_dw1000_send. */
 uwb_dw1000_status uwb_dw1000_send_at(uwb_dw1000 *chip, const uint8_t *octets, size_t bytes, uint64_t stamp,
                                      uint32_t answer_us);
 
-/* Return the clock control to the chip, after uwb_dw1000_sent. */
+/* Return the clock control to the chip, after uwb_dw1000_await_sent. */
 uwb_dw1000_status uwb_dw1000_release_clock(uwb_dw1000 *chip);
 
 /* Wait until what was sent has left; `stamp`, which may be NULL, becomes its TX_STAMP. The receiver goes on meanwhile. */
-uwb_dw1000_status uwb_dw1000_sent(uwb_dw1000 *chip, uint64_t until_us, uint64_t *stamp);
+uwb_dw1000_status uwb_dw1000_await_sent(uwb_dw1000 *chip, uint64_t until_us, uint64_t *stamp);
 
 /* Listen for `for_us`. */
 uwb_dw1000_status uwb_dw1000_listen(uwb_dw1000 *chip, uint32_t for_us);
@@ -152,7 +152,7 @@ uwb_dw1000_status uwb_dw1000_listen(uwb_dw1000 *chip, uint32_t for_us);
 uwb_dw1000_status uwb_dw1000_receive(uwb_dw1000 *chip, uwb_dw1000_frame *frame, uint64_t until_us);
 
 /* As TIMEOUT if nothing has been received by `until_us`, but leaves the receiver on. */
-uwb_dw1000_status uwb_dw1000_receive_or_stay(uwb_dw1000 *chip, uwb_dw1000_frame *frame, uint64_t until_us);
+uwb_dw1000_status uwb_dw1000_receive_stay_on(uwb_dw1000 *chip, uwb_dw1000_frame *frame, uint64_t until_us);
 
 /* Turn transmitter and receiver off. */
 uwb_dw1000_status uwb_dw1000_idle(uwb_dw1000 *chip);

@@ -33,7 +33,7 @@ uwb_dw1000_status uwb_dw1000_write(uwb_dw1000 *chip, uint32_t at, const uint8_t 
                                                                                          : UWB_DW1000_BUS;
 }
 
-uint64_t uwb_dw1000_number(const uint8_t *octets, size_t bytes) {
+uint64_t uwb_dw1000_from_little_endian(const uint8_t *octets, size_t bytes) {
     uint64_t value = 0;
     while (bytes != 0) {
         value = value << 8 | octets[--bytes];
@@ -44,7 +44,7 @@ uint64_t uwb_dw1000_number(const uint8_t *octets, size_t bytes) {
 uwb_dw1000_status uwb_dw1000_get(uwb_dw1000 *chip, uint32_t at, size_t bytes, uint64_t *value) {
     uint8_t octets[8];
     DW1000_TRY(uwb_dw1000_read(chip, at, octets, bytes));
-    *value = uwb_dw1000_number(octets, bytes);
+    *value = uwb_dw1000_from_little_endian(octets, bytes);
     return UWB_DW1000_OK;
 }
 
@@ -56,7 +56,7 @@ uwb_dw1000_status uwb_dw1000_set(uwb_dw1000 *chip, uint32_t at, size_t bytes, ui
     return uwb_dw1000_write(chip, at, octets, bytes);
 }
 
-uwb_dw1000_status uwb_dw1000_set_all(uwb_dw1000 *chip, const uwb_dw1000_entry *entries) {
+uwb_dw1000_status uwb_dw1000_write_list(uwb_dw1000 *chip, const uwb_dw1000_entry *entries) {
     for (; entries->bytes != 0; entries++) {
         DW1000_TRY(uwb_dw1000_set(chip, entries->at, entries->bytes, entries->value));
     }

@@ -28,9 +28,9 @@ uwb_dw1000_status uwb_dw1000_read_quality(uwb_dw1000 *chip, const uwb_dw1000_fra
     DW1000_TRY(uwb_dw1000_get(chip, LDE_THRESH, 2, &threshold));
     DW1000_TRY(uwb_dw1000_get(chip, RXPACC_NOSAT, 2, &unsaturated));
     quality->first_path_amplitude[0] = frame->first_path_amplitude;
-    quality->first_path_amplitude[1] = (uint16_t)uwb_dw1000_number(fqual + 2, 2);
-    quality->first_path_amplitude[2] = (uint16_t)uwb_dw1000_number(fqual + 4, 2);
-    quality->power = (uint16_t)uwb_dw1000_number(fqual + 6, 2);
+    quality->first_path_amplitude[1] = (uint16_t)uwb_dw1000_from_little_endian(fqual + 2, 2);
+    quality->first_path_amplitude[2] = (uint16_t)uwb_dw1000_from_little_endian(fqual + 4, 2);
+    quality->power = (uint16_t)uwb_dw1000_from_little_endian(fqual + 6, 2);
     quality->noise_threshold = (uint16_t)threshold;
 
     const uint16_t sfd = sfd_part(&chip->settings);
@@ -59,16 +59,16 @@ uwb_dw1000_status uwb_dw1000_read_cir(uwb_dw1000 *chip, size_t first, size_t cou
     /* Octet by octet: the chip may hang if both change together. Without these clocks it reads as zeros or noise. */
     static const uwb_dw1000_entry on[] = {{PMSC_CTRL0, 1, RX_CLOCK_PLL}, {PMSC_CTRL0 + 1, 1, CTRL0_DEFAULT | AMCE}, {0, 0, 0}};
     static const uwb_dw1000_entry off[] = {{PMSC_CTRL0, 1, 0}, {PMSC_CTRL0 + 1, 1, CTRL0_DEFAULT}, {0, 0, 0}};
-    DW1000_TRY(uwb_dw1000_set_all(chip, on));
+    DW1000_TRY(uwb_dw1000_write_list(chip, on));
     DW1000_TRY(uwb_dw1000_read(chip, ACC_MEM | (uint32_t)(4 * first), octets, 1 + 4 * count));
-    return uwb_dw1000_set_all(chip, off);
+    return uwb_dw1000_write_list(chip, off);
 }
 
 uwb_dw1000_status uwb_dw1000_read_sensors(uwb_dw1000 *chip, float *temperature, float *voltage) {
     static const uwb_dw1000_entry entries[] = {
         {RF_SENSOR_1, 1, 0x80}, {RF_SENSOR_2, 1, 0x0A}, {RF_SENSOR_2, 1, 0x0F}, {TC_SARC, 1, 1}, {0, 0, 0}};
     uint8_t raw[2];
-    DW1000_TRY(uwb_dw1000_set_all(chip, entries));
+    DW1000_TRY(uwb_dw1000_write_list(chip, entries));
     chip->io.sleep(chip->io.context, SENSORS_US);
     DW1000_TRY(uwb_dw1000_read(chip, TC_SARL, raw, sizeof raw));
     DW1000_TRY(uwb_dw1000_set(chip, TC_SARC, 1, 0));

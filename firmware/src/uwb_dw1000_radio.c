@@ -14,9 +14,9 @@ uwb_dw1000_status uwb_dw1000_idle(uwb_dw1000 *chip) {
     };
     /* The manual wants it after most errors (4.1.6): stamps would be wrong from then on. One may just have happened. */
     static const uwb_dw1000_entry reset_receiver[] = {{PMSC_SOFTRESET, 1, 0xE0}, {PMSC_SOFTRESET, 1, 0xF0}, {0, 0, 0}};
-    DW1000_TRY(uwb_dw1000_set_all(chip, entries));
+    DW1000_TRY(uwb_dw1000_write_list(chip, entries));
     if (chip->listening) {
-        DW1000_TRY(uwb_dw1000_set_all(chip, reset_receiver));
+        DW1000_TRY(uwb_dw1000_write_list(chip, reset_receiver));
         chip->listening = 0;
     }
     return uwb_dw1000_release_clock(chip);
@@ -86,7 +86,7 @@ uwb_dw1000_status uwb_dw1000_send(uwb_dw1000 *chip, const uint8_t *octets, size_
     return UWB_DW1000_OK;
 }
 
-uint64_t uwb_dw1000_stamp_at(const uwb_dw1000 *chip, uint64_t at) {
+uint64_t uwb_dw1000_tx_stamp(const uwb_dw1000 *chip, uint64_t at) {
     return ((at & ~(uint64_t)0x1FF) + chip->tx_antenna_delay) & UWB_DW1000_TICK_MASK;
 }
 
@@ -106,7 +106,7 @@ uwb_dw1000_status uwb_dw1000_send_at(uwb_dw1000 *chip, const uint8_t *octets, si
     return UWB_DW1000_OK;
 }
 
-uwb_dw1000_status uwb_dw1000_sent(uwb_dw1000 *chip, uint64_t until_us, uint64_t *stamp) {
+uwb_dw1000_status uwb_dw1000_await_sent(uwb_dw1000 *chip, uint64_t until_us, uint64_t *stamp) {
     for (;;) {
         uint64_t status;
         DW1000_TRY(uwb_dw1000_get(chip, SYS_STATUS, 4, &status));
@@ -156,15 +156,15 @@ static uwb_dw1000_status read_frame(uwb_dw1000 *chip, uwb_dw1000_frame *frame) {
         DW1000_TRY(uwb_dw1000_read(chip, RX_BUFFER, frame->octets, frame->bytes));
     }
     DW1000_TRY(uwb_dw1000_read(chip, RX_TIME, time, sizeof time));
-    frame->stamp = uwb_dw1000_number(time, 5);
-    frame->first_path_index = (uint16_t)uwb_dw1000_number(time + 5, 2);
-    frame->first_path_amplitude = (uint16_t)uwb_dw1000_number(time + 7, 2);
+    frame->stamp = uwb_dw1000_from_little_endian(time, 5);
+    frame->first_path_index = (uint16_t)uwb_dw1000_from_little_endian(time + 5, 2);
+    frame->first_path_amplitude = (uint16_t)uwb_dw1000_from_little_endian(time + 7, 2);
     /* The chip clears these bits at the next receiver enable; the write makes the driver independent of that. */
     return uwb_dw1000_set(chip, SYS_STATUS, 4, RX_BITS);
 }
 
 /* TIMEOUT with the receiver still on if nothing happens by `until_us`. */
-uwb_dw1000_status uwb_dw1000_receive_or_stay(uwb_dw1000 *chip, uwb_dw1000_frame *frame, uint64_t until_us) {
+uwb_dw1000_status uwb_dw1000_receive_stay_on(uwb_dw1000 *chip, uwb_dw1000_frame *frame, uint64_t until_us) {
     for (;;) {
         uint64_t status;
         DW1000_TRY(uwb_dw1000_get(chip, SYS_STATUS, 4, &status));
@@ -197,7 +197,7 @@ uwb_dw1000_status uwb_dw1000_receive_or_stay(uwb_dw1000 *chip, uwb_dw1000_frame 
 }
 
 uwb_dw1000_status uwb_dw1000_receive(uwb_dw1000 *chip, uwb_dw1000_frame *frame, uint64_t until_us) {
-    const uwb_dw1000_status status = uwb_dw1000_receive_or_stay(chip, frame, until_us);
+    const uwb_dw1000_status status = uwb_dw1000_receive_stay_on(chip, frame, until_us);
     if (status == UWB_DW1000_TIMEOUT && chip->listening) {
         DW1000_TRY(uwb_dw1000_idle(chip));
     }

@@ -125,11 +125,11 @@ typedef struct {
     uint32_t bytes;
     uint32_t value;
 } uwb_dw1000_entry;
-uwb_dw1000_status uwb_dw1000_set_all(uwb_dw1000 *chip, const uwb_dw1000_entry *entries);
+uwb_dw1000_status uwb_dw1000_write_list(uwb_dw1000 *chip, const uwb_dw1000_entry *entries);
 
 /* Symbols of the SFD, and octets as a little-endian number. */
 uint32_t uwb_dw1000_sfd_symbols(const uwb_dw1000_settings *settings);
-uint64_t uwb_dw1000_number(const uint8_t *octets, size_t bytes);
+uint64_t uwb_dw1000_from_little_endian(const uint8_t *octets, size_t bytes);
 
 /* Return from the calling function if the status is not OK. */
 #define DW1000_TRY(call)                                                                                               \

@@ -206,7 +206,7 @@ size_t uwb_queue_peek(uwb_queue *queue, uint64_t now_us, const uint8_t **bytes) 
         take(queue, &payload_bytes, sizeof payload_bytes);
         take(queue, &header, sizeof header);
         header.sequence = queue->sequence++;
-        header.time_us = header.time_us == UWB_WHEN_IT_LEAVES ? now_us : header.time_us;
+        header.time_us = header.time_us == UWB_TIME_OF_SENDING ? now_us : header.time_us;
         memcpy(queue->wire + UWB_WIRE_LEAD, &header, sizeof header);
         take(queue, queue->wire + UWB_WIRE_LEAD + sizeof header, payload_bytes);
         queue->encoded = uwb_encode_frame(queue->wire, payload_bytes);

@@ -61,7 +61,7 @@ typedef struct {
     uint8_t wire[UWB_MAX_WIRE_BYTES];
 } uwb_queue;
 
-#define UWB_WHEN_IT_LEAVES UINT64_MAX /* as a header's time_us: it becomes that of its leaving */
+#define UWB_TIME_OF_SENDING UINT64_MAX /* as a header's time_us: it becomes that of its leaving */
 
 /* Put a frame behind all others if it fits and then leaves `reserve` bytes free, else do nothing; returns whether it
  * did. The header's sequence is of no meaning. */

@@ -54,9 +54,9 @@
 #define UWB_RADIO_STATE_RESTARTED 4
 #define UWB_RADIO_STATE_LOCK_UNCONFIRMED 5
 
-#define UWB_OFFSET_OF_ANCHOR 0
-#define UWB_OFFSET_OF_TAG 1
-#define UWB_OFFSET_OF_PAIR 2
+#define UWB_OFFSET_SCOPE_ANCHOR 0
+#define UWB_OFFSET_SCOPE_TAG 1
+#define UWB_OFFSET_SCOPE_PAIR 2
 
 #define UWB_LOG_LEVEL_DEBUG 10
 #define UWB_LOG_LEVEL_INFO 20
@@ -77,7 +77,7 @@ typedef struct {
     uint32_t tried; /* exchanges that began */
     uint32_t ranged; /* exchanges that gave a range */
     float rx_power; /* dBm, of its last frame; NaN = unknown */
-    uint32_t heard_ms; /* since its last frame; 4294967295 = never */
+    uint32_t age_ms; /* since its last frame; 4294967295 = never */
 } uwb_radio_anchor_t;
 UWB_STATIC_ASSERT(sizeof(uwb_radio_anchor_t) == 24);
 
@@ -85,7 +85,7 @@ typedef struct {
     uint64_t tag_id; /* of no meaning for an anchor's */
     uint64_t anchor_id; /* of no meaning for a tag's */
     float offset; /* m, -10 to 10 */
-    uint8_t of; /* OffsetOf */
+    uint8_t of; /* OffsetScope */
     uint8_t reserved[3];
 } uwb_offset_t;
 UWB_STATIC_ASSERT(sizeof(uwb_offset_t) == 24);
@@ -179,7 +179,7 @@ typedef struct {
     uint32_t antenna_delay; /* ticks, TX + RX; 0 = OTP value */
     uint32_t tx_power; /* register TX_POWER in smart-power format; 0 = OTP value or the manual's */
     uint32_t reply_us; /* from the reception of ANSWER to FINAL; 0 in SET_RADIO = the firmware's usual */
-    uint32_t patience_us; /* how long a tag waits for an anchor's frames; 0 as above */
+    uint32_t timeout_us; /* how long a tag waits for an anchor's frames; 0 as above */
     uint32_t interval_us; /* between the beginnings of two exchanges, at least */
     uint16_t pan; /* network; frames of other networks are ignored */
     uint16_t rate; /* kbit/s: 110, 850, 6800 */
@@ -203,9 +203,9 @@ typedef struct {
     uint32_t ranged; /* exchanges that gave a range */
     uint32_t no_answer; /* lost: POLL was not answered */
     uint32_t late; /* lost: FINAL could not be sent in time */
-    uint32_t time_out; /* lost: FINAL or REPORT did not come */
+    uint32_t timeout; /* lost: FINAL or REPORT did not come */
     uint32_t damaged; /* lost: what came was no intact frame */
-    uint32_t absurd; /* lost: stamps that no exchange can have */
+    uint32_t implausible; /* lost: stamps that no exchange can have */
     uint32_t broken; /* lost: the chip was reset meanwhile, or its bus failed */
     uint32_t refused; /* frames that belonged to no exchange of this radio */
     uint32_t restarts; /* restarts of the chip after the first */
@@ -237,7 +237,7 @@ typedef struct {
     uint32_t antenna_delay; /* ticks, TX + RX; 0 = OTP value */
     uint32_t tx_power; /* register TX_POWER in smart-power format; 0 = OTP value or the manual's */
     uint32_t reply_us; /* from the reception of ANSWER to FINAL; 0 in SET_RADIO = the firmware's usual */
-    uint32_t patience_us; /* how long a tag waits for an anchor's frames; 0 as above */
+    uint32_t timeout_us; /* how long a tag waits for an anchor's frames; 0 as above */
     uint32_t interval_us; /* between the beginnings of two exchanges, at least */
     uint16_t pan; /* network; frames of other networks are ignored */
     uint16_t rate; /* kbit/s: 110, 850, 6800 */

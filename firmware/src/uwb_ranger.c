@@ -25,7 +25,7 @@ static void send_radio(uwb_ranger *ranger, const uint32_t *request, const char *
     fixed->antenna_delay = radio->antenna_delay;
     fixed->tx_power = radio->tx_power;
     fixed->reply_us = config->reply_us;
-    fixed->patience_us = config->patience_us;
+    fixed->timeout_us = config->timeout_us;
     fixed->interval_us = config->interval_us;
     fixed->pan = config->pan;
     fixed->rate = radio->rate_kbps;
@@ -59,15 +59,15 @@ static void send_status(uwb_ranger *ranger) {
     const uint8_t known = twr->config.role == UWB_ROLE_TAG ? twr->known : 0;
     memset(&message, 0, sizeof message);
     message.fixed = (uwb_radio_status_t){
-        counts->tried, counts->ranged, counts->no_answer, counts->late, counts->time_out, counts->damaged,
-        counts->absurd, counts->broken, counts->refused, counts->restarts, ranger->board.temperature, ranger->voltage,
+        counts->tried, counts->ranged, counts->no_answer, counts->late, counts->timeout, counts->damaged,
+        counts->implausible, counts->broken, counts->refused, counts->restarts, ranger->board.temperature, ranger->voltage,
         uwb_twr_state(twr), known, {0}};
     for (uint8_t i = 0; i < known; i++) {
         const uwb_twr_anchor *const anchor = &twr->anchors[i];
-        const uint64_t silent_ms = (at_us - anchor->heard_us) / 1000;
-        const uint32_t heard_ms = anchor->heard_us == 0 || silent_ms > UINT32_MAX ? UINT32_MAX : (uint32_t)silent_ms;
+        const uint64_t silent_ms = (at_us - anchor->last_seen_us) / 1000;
+        const uint32_t age_ms = anchor->last_seen_us == 0 || silent_ms > UINT32_MAX ? UINT32_MAX : (uint32_t)silent_ms;
         message.anchors[i] = (uwb_radio_anchor_t){anchor->address, anchor->tried, anchor->ranged, anchor->rx_power_dbm,
-                                                  heard_ms};
+                                                  age_ms};
     }
     const size_t bytes = sizeof message.fixed + known * sizeof message.anchors[0];
     (void)uwb_board_send(&ranger->board, UWB_TYPE_RADIO_STATUS, 0, at_us, &message, bytes, UWB_ANSWER_RESERVE_BYTES);
@@ -94,11 +94,11 @@ static const char *parse(const uwb_ranger *ranger, const uint8_t *payload, size_
     config->anchor_count = fixed.anchor_count;
     config->window = fixed.window;
     config->reply_us = fixed.reply_us;
-    config->patience_us = fixed.patience_us;
-    uwb_twr_fill_times(config, uwb_twr_defaults.reply_us, uwb_twr_defaults.patience_us);
+    config->timeout_us = fixed.timeout_us;
+    uwb_twr_set_default_times(config, uwb_twr_defaults.reply_us, uwb_twr_defaults.timeout_us);
     config->interval_us = fixed.interval_us;
     memcpy(config->anchors, payload + sizeof fixed, 8u * fixed.anchor_count);
-    return uwb_twr_refusal(&ranger->twr, config);
+    return uwb_twr_config_error(&ranger->twr, config);
 }
 
 static int take(void *context, const uwb_header_t *header, const uint8_t *payload, size_t bytes, uint64_t at_us) {
@@ -157,16 +157,16 @@ static void await_room(const uwb_ranger *ranger) {
     }
 }
 
-uwb_twr_event uwb_ranger_turn(uwb_ranger *ranger) {
+uwb_twr_event uwb_ranger_step(uwb_ranger *ranger) {
     await_room(ranger);
     if (ranger->change) {
         ranger->change = 0;
         ranger->address_sent = 0;
         (void)uwb_twr_configure(&ranger->twr, &ranger->wanted);
     }
-    const uwb_twr_event event = uwb_twr_turn(&ranger->twr, now_us(ranger) + UWB_RANGER_TURN_US);
+    const uwb_twr_event event = uwb_twr_step(&ranger->twr, now_us(ranger) + UWB_RANGER_STEP_US);
     if (event == UWB_TWR_RANGED) {
-        (void)uwb_board_take(&ranger->board, ranger->twr.measurement, uwb_twr_measured_bytes(&ranger->twr),
+        (void)uwb_board_process_measurement(&ranger->board, ranger->twr.measurement, uwb_twr_measurement_bytes(&ranger->twr),
                              ranger->twr.measured_us);
     }
     send_due(ranger);

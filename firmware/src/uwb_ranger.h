@@ -10,7 +10,7 @@
 extern "C" {
 #endif
 
-#define UWB_RANGER_TURN_US 5000u /* frames of the host are handled between two turns */
+#define UWB_RANGER_STEP_US 5000u /* frames of the host are handled between two turns */
 
 typedef struct {
     uwb_board board;
@@ -28,7 +28,7 @@ void uwb_ranger_start(uwb_ranger *ranger, const uwb_board_config *board, const u
                       const uwb_twr_config *config, uint64_t random, uint8_t *measurement, size_t measurement_bytes);
 
 /* One exchange, or a few milliseconds without; and what is due to the host. */
-uwb_twr_event uwb_ranger_turn(uwb_ranger *ranger);
+uwb_twr_event uwb_ranger_step(uwb_ranger *ranger);
 
 #ifdef __cplusplus
 }

@@ -21,29 +21,29 @@ void uwb_twr_start(uwb_twr *twr, const uwb_dw1000_io *io, const uwb_twr_config *
     }
 }
 
-void uwb_twr_fill_times(uwb_twr_config *config, uint32_t reply_us, uint32_t patience_us) {
+void uwb_twr_set_default_times(uwb_twr_config *config, uint32_t reply_us, uint32_t timeout_us) {
     uint32_t more_us = 0;
-    if (uwb_dw1000_valid(&config->radio)) {
-        const uint32_t air_us = uwb_dw1000_air_us(&config->radio, UWB_TWR_MAX_FRAME_BYTES);
-        const uint32_t usual_us = uwb_dw1000_air_us(&uwb_twr_defaults.radio, UWB_TWR_MAX_FRAME_BYTES);
+    if (uwb_dw1000_settings_valid(&config->radio)) {
+        const uint32_t air_us = uwb_dw1000_airtime_us(&config->radio, UWB_TWR_MAX_FRAME_BYTES);
+        const uint32_t usual_us = uwb_dw1000_airtime_us(&uwb_twr_defaults.radio, UWB_TWR_MAX_FRAME_BYTES);
         more_us = air_us > usual_us ? air_us - usual_us : 0;
     }
     if (config->reply_us == 0) {
         config->reply_us = reply_us + 2 * more_us; /* ANSWER's data, and FINAL's preamble */
     }
-    if (config->patience_us == 0) {
-        config->patience_us = patience_us + 4 * more_us; /* POLL, ANSWER, and what may be on the air before */
+    if (config->timeout_us == 0) {
+        config->timeout_us = timeout_us + 4 * more_us; /* POLL, ANSWER, and what may be on the air before */
     }
 }
 
-const char *uwb_twr_refusal(const uwb_twr *twr, const uwb_twr_config *config) {
-    if (!uwb_dw1000_valid(&config->radio)) {
+const char *uwb_twr_config_error(const uwb_twr *twr, const uwb_twr_config *config) {
+    if (!uwb_dw1000_settings_valid(&config->radio)) {
         return "channel, PRF, preamble, code, rate or antenna delay is none that the chip has";
     }
     if (config->role > UWB_ROLE_ANCHOR) {
         return "no such role";
     }
-    if (config->pan == 0xFFFF || config->address == UWB_TWR_EVERYBODY) {
+    if (config->pan == 0xFFFF || config->address == UWB_TWR_BROADCAST) {
         return "the address or the PAN is that of a broadcast";
     }
     if (config->anchor_count > UWB_MAX_ANCHORS) {
@@ -53,9 +53,9 @@ const char *uwb_twr_refusal(const uwb_twr *twr, const uwb_twr_config *config) {
     if (UWB_TWR_MEASUREMENT_BYTES(config->window < whole ? config->window : whole) > twr->measurement_bytes) {
         return "more samples than the board has memory for";
     }
-    const uint32_t air_us = uwb_dw1000_air_us(&config->radio, UWB_TWR_MAX_FRAME_BYTES);
-    if (config->reply_us < air_us || config->reply_us > 100000 || config->patience_us < 2 * air_us ||
-        config->patience_us > 500000 || config->interval_us > 60000000) {
+    const uint32_t air_us = uwb_dw1000_airtime_us(&config->radio, UWB_TWR_MAX_FRAME_BYTES);
+    if (config->reply_us < air_us || config->reply_us > 100000 || config->timeout_us < 2 * air_us ||
+        config->timeout_us > 500000 || config->interval_us > 60000000) {
         return "a time is shorter than its frames last, or longer than 0.1 s (reply), 0.5 s (patience), 60 s (interval)";
     }
     /* FINAL follows POLL after more than this time, so that uwb_dw1000_send_at need not wait. */
@@ -66,7 +66,7 @@ const char *uwb_twr_refusal(const uwb_twr *twr, const uwb_twr_config *config) {
 }
 
 int uwb_twr_configure(uwb_twr *twr, const uwb_twr_config *config) {
-    if (uwb_twr_refusal(twr, config) != NULL) {
+    if (uwb_twr_config_error(twr, config) != NULL) {
         return 0;
     }
     twr->config = *config;
@@ -102,17 +102,17 @@ static uwb_twr_event start_chip(uwb_twr *twr, uint64_t until_us) {
     return UWB_TWR_NOTHING;
 }
 
-uwb_twr_event uwb_twr_turn(uwb_twr *twr, uint64_t until_us) {
+uwb_twr_event uwb_twr_step(uwb_twr *twr, uint64_t until_us) {
     if (!twr->running) {
         const uwb_twr_event event = start_chip(twr, until_us);
         if (event != UWB_TWR_NOTHING) {
             return event;
         }
     }
-    return twr->config.role == UWB_ROLE_TAG ? uwb_twr_tag_turn(twr, until_us) : uwb_twr_anchor_turn(twr, until_us);
+    return twr->config.role == UWB_ROLE_TAG ? uwb_twr_tag_step(twr, until_us) : uwb_twr_anchor_step(twr, until_us);
 }
 
-size_t uwb_twr_measured_bytes(const uwb_twr *twr) {
+size_t uwb_twr_measurement_bytes(const uwb_twr *twr) {
     const uwb_range_cir_t *const fields = (const uwb_range_cir_t *)(const void *)twr->measurement;
     return sizeof *fields + 2u * fields->sample_count;
 }

@@ -28,7 +28,7 @@ extern "C" {
 /* Memory for a measurement with `samples` complex samples. */
 #define UWB_TWR_MEASUREMENT_BYTES(samples) (sizeof(uwb_range_cir_t) + 4u * (samples))
 
-/* Configuration of a tag or an anchor. Only tags use reply_us, patience_us, interval_us and the list of anchors. */
+/* Configuration of a tag or an anchor. Only tags use reply_us, timeout_us, interval_us and the list of anchors. */
 typedef struct {
     uwb_dw1000_settings radio;
     uint64_t address; /* 0 = the chip's */
@@ -39,7 +39,7 @@ typedef struct {
     uint8_t anchor_count;  /* 0 = those that a broadcast finds */
     uint16_t window;       /* complex samples that a measurement takes; 0 = none */
     uint32_t reply_us;     /* from the reception of ANSWER to FINAL; depends on the tag's bus and processor, and on airtime */
-    uint32_t patience_us;  /* for an anchor's frames */
+    uint32_t timeout_us;  /* for an anchor's frames */
     uint32_t interval_us;  /* between the beginnings of two exchanges, at least */
     uint64_t anchors[UWB_MAX_ANCHORS];
 } uwb_twr_config;
@@ -53,9 +53,9 @@ typedef struct {
     uint32_t ranged;
     uint32_t no_answer; /* to POLL */
     uint32_t late;      /* FINAL could not be sent in time */
-    uint32_t time_out;  /* FINAL or REPORT did not come */
+    uint32_t timeout;  /* FINAL or REPORT did not come */
     uint32_t damaged;   /* something was received that is not a valid frame */
-    uint32_t absurd;    /* implausible timestamps */
+    uint32_t implausible;    /* implausible timestamps */
     uint32_t broken;    /* the chip was reset meanwhile, or the bus failed */
 
     uint32_t refused;  /* frames that do not belong to the exchange */
@@ -65,7 +65,7 @@ typedef struct {
 /* State of an anchor at a tag. */
 typedef struct {
     uint64_t address;
-    uint64_t heard_us;
+    uint64_t last_seen_us;
     uint64_t due_us;
     uint32_t tried;
     uint32_t ranged;
@@ -75,25 +75,25 @@ typedef struct {
 } uwb_twr_anchor;
 
 /* Types of frames. */
-typedef enum { UWB_TWR_SEEK = 1, UWB_TWR_HERE, UWB_TWR_POLL, UWB_TWR_ANSWER, UWB_TWR_FINAL, UWB_TWR_REPORT } uwb_twr_kind;
+typedef enum { UWB_TWR_DISCOVER = 1, UWB_TWR_DISCOVER_REPLY, UWB_TWR_POLL, UWB_TWR_ANSWER, UWB_TWR_FINAL, UWB_TWR_REPORT } uwb_twr_kind;
 
 typedef struct {
     uwb_twr_kind kind;
     uint8_t sequence;
     uint16_t pan;
-    uint64_t to; /* UWB_TWR_EVERYBODY: a broadcast */
+    uint64_t to; /* UWB_TWR_BROADCAST: a broadcast */
     uint64_t from;
     uint32_t tag_number;    /* that the tag drew; its low octet is the frame's sequence number */
     uint32_t anchor_number; /* from ANSWER on */
-    uint32_t time_us;       /* SEEK: answer within; POLL: from ANSWER to FINAL */
+    uint32_t time_us;       /* DISCOVER: answer within; POLL: from ANSWER to FINAL */
     uint64_t stamps[UWB_TWR_STAMPS]; /* FINAL, REPORT */
-    uint8_t known[32];               /* SEEK: anchors that need not answer, a bit for each, and for few others */
+    uint8_t known[32];               /* DISCOVER: anchors that need not answer, a bit for each, and for few others */
 } uwb_twr_frame;
 
-#define UWB_TWR_EVERYBODY UINT64_MAX
+#define UWB_TWR_BROADCAST UINT64_MAX
 #define UWB_TWR_MAX_FRAME_BYTES 57u
 
-/* Enter an anchor to a SEEK, and whether it, or by chance another, is there. Its place differs from SEEK to SEEK. */
+/* Enter an anchor to a DISCOVER, and whether it, or by chance another, is there. Its place differs from DISCOVER to DISCOVER. */
 void uwb_twr_mark_known(uwb_twr_frame *seek, uint64_t address);
 int uwb_twr_is_known(const uwb_twr_frame *seek, uint64_t address);
 
@@ -142,22 +142,22 @@ void uwb_twr_start(uwb_twr *twr, const uwb_dw1000_io *io, const uwb_twr_config *
 
 /* Times that are 0 become what a tag's bus and processor usually need, and what frames that last longer than the usual
  * ones take on top of it. */
-void uwb_twr_fill_times(uwb_twr_config *config, uint32_t reply_us, uint32_t patience_us);
+void uwb_twr_set_default_times(uwb_twr_config *config, uint32_t reply_us, uint32_t timeout_us);
 
 /* Return the reason why a configuration is refused; NULL = it is valid. */
-const char *uwb_twr_refusal(const uwb_twr *twr, const uwb_twr_config *config);
+const char *uwb_twr_config_error(const uwb_twr *twr, const uwb_twr_config *config);
 
 /* Use another configuration from the next turn on; returns 0 if it is refused. Counts go on, anchors are searched again. */
 int uwb_twr_configure(uwb_twr *twr, const uwb_twr_config *config);
 
 /* One exchange, which may outlast `until_us` by its own duration, or none until then. */
-uwb_twr_event uwb_twr_turn(uwb_twr *twr, uint64_t until_us);
+uwb_twr_event uwb_twr_step(uwb_twr *twr, uint64_t until_us);
 
 /* Whether the radio works, a UWB_RADIO_STATE_*. */
 uint8_t uwb_twr_state(const uwb_twr *twr);
 
 /* Bytes of the measurement that the last turn gave. */
-size_t uwb_twr_measured_bytes(const uwb_twr *twr);
+size_t uwb_twr_measurement_bytes(const uwb_twr *twr);
 
 #ifdef __cplusplus
 }

@@ -2,7 +2,7 @@
 
 enum {
     LOOK_US = 100000,            /* between two checks of the chip */
-    LONGEST_WINDOW_US = 100000,  /* of a SEEK */
+    LONGEST_WINDOW_US = 100000,  /* of a DISCOVER */
     LONGEST_REPLY_US = 200000,   /* of a POLL */
     FINAL_MARGIN_US = 2000,
     SENT_US = 20000              /* a frame has left by then, on any bus */
@@ -11,13 +11,13 @@ enum {
 static uwb_dw1000_status send_and_rest(uwb_twr *twr, const uwb_twr_frame *frame) {
     uint8_t octets[UWB_TWR_MAX_FRAME_BYTES];
     const uwb_dw1000_status status = uwb_dw1000_send(&twr->chip, octets, uwb_twr_write(frame, octets), 0);
-    return status == UWB_DW1000_OK ? uwb_dw1000_sent(&twr->chip, uwb_twr_now_us(twr) + SENT_US, NULL) : status;
+    return status == UWB_DW1000_OK ? uwb_dw1000_await_sent(&twr->chip, uwb_twr_now_us(twr) + SENT_US, NULL) : status;
 }
 
 /* Answer a tag that looks for anchors, at a random time so that answers rarely collide. */
 static uwb_dw1000_status tell(uwb_twr *twr, const uwb_twr_frame *request) {
     const uint32_t window_us = request->time_us < LONGEST_WINDOW_US ? request->time_us : LONGEST_WINDOW_US;
-    const uwb_twr_frame here = uwb_twr_frame_to(twr, UWB_TWR_HERE, request->from, request->tag_number, 0);
+    const uwb_twr_frame here = uwb_twr_make_frame(twr, UWB_TWR_DISCOVER_REPLY, request->from, request->tag_number, 0);
     uwb_twr_sleep_until(twr, uwb_twr_now_us(twr) + uwb_twr_random_below(twr, window_us + 1));
     return send_and_rest(twr, &here);
 }
@@ -30,31 +30,31 @@ static uwb_dw1000_status exchange(uwb_twr *twr, const uwb_twr_frame *polled, uin
     const uint32_t reply_us = polled->time_us < LONGEST_REPLY_US ? polled->time_us : LONGEST_REPLY_US;
     const uint32_t wait_us = reply_us + FINAL_MARGIN_US + reply_us / 2;
     const uwb_twr_frame answer =
-        uwb_twr_frame_to(twr, UWB_TWR_ANSWER, polled->from, polled->tag_number, uwb_twr_random(twr));
+        uwb_twr_make_frame(twr, UWB_TWR_ANSWER, polled->from, polled->tag_number, uwb_twr_random(twr));
     uwb_twr_frame report = answer;
     report.kind = UWB_TWR_REPORT;
     report.stamps[0] = poll_received;
-    *lost = &twr->counts.time_out;
+    *lost = &twr->counts.timeout;
     uwb_dw1000_status status =
         uwb_dw1000_send(&twr->chip, octets, uwb_twr_write(&answer, octets), UWB_DW1000_NO_LIMIT);
     const uint64_t until_us = uwb_twr_now_us(twr) + wait_us;
     if (status == UWB_DW1000_OK) {
-        status = uwb_dw1000_sent(&twr->chip, until_us, &report.stamps[1]);
+        status = uwb_dw1000_await_sent(&twr->chip, until_us, &report.stamps[1]);
     }
     if (status == UWB_DW1000_OK) {
-        status = uwb_twr_expect(twr, &answer, UWB_TWR_FINAL, until_us, &received, &final);
+        status = uwb_twr_await_frame(twr, &answer, UWB_TWR_FINAL, until_us, &received, &final);
     }
     if (status != UWB_DW1000_OK) {
         return status;
     }
     report.stamps[2] = received.stamp;
     if (!uwb_twr_range_m(final.stamps, report.stamps, &range_m)) {
-        *lost = &twr->counts.absurd;
+        *lost = &twr->counts.implausible;
         status = uwb_dw1000_check(&twr->chip);
         return status == UWB_DW1000_OK ? UWB_DW1000_TIMEOUT : status;
     }
     if (twr->config.report) {
-        status = uwb_twr_measure(twr, &received, polled->from, twr->address, range_m, NULL);
+        status = uwb_twr_write_measurement(twr, &received, polled->from, twr->address, range_m, NULL);
         if (status != UWB_DW1000_OK) {
             return status;
         }
@@ -69,29 +69,29 @@ static uwb_twr_event attend(uwb_twr *twr, const uwb_dw1000_frame *received) {
     uint32_t *lost = NULL;
     uwb_dw1000_status status;
     if (!uwb_twr_read(received->octets, received->bytes, &frame) || frame.pan != twr->config.pan ||
-        (frame.kind != UWB_TWR_SEEK && (frame.kind != UWB_TWR_POLL || frame.to != twr->address)) ||
+        (frame.kind != UWB_TWR_DISCOVER && (frame.kind != UWB_TWR_POLL || frame.to != twr->address)) ||
         frame.from == twr->address) {
         twr->counts.refused++;
         return UWB_TWR_NOTHING;
     }
-    if (frame.kind == UWB_TWR_SEEK) {
+    if (frame.kind == UWB_TWR_DISCOVER) {
         if (uwb_twr_is_known(&frame, twr->address)) {
             return UWB_TWR_NOTHING;
         }
         status = tell(twr, &frame);
-        return status == UWB_DW1000_OK ? UWB_TWR_NOTHING : uwb_twr_lost(twr, status, NULL);
+        return status == UWB_DW1000_OK ? UWB_TWR_NOTHING : uwb_twr_exchange_failed(twr, status, NULL);
     }
     twr->counts.tried++;
     status = exchange(twr, &frame, received->stamp, &lost);
     if (status != UWB_DW1000_OK) {
-        return uwb_twr_lost(twr, status, lost);
+        return uwb_twr_exchange_failed(twr, status, lost);
     }
     twr->counts.ranged++;
     twr->misses = 0;
     return twr->config.report ? UWB_TWR_RANGED : UWB_TWR_NOTHING;
 }
 
-uwb_twr_event uwb_twr_anchor_turn(uwb_twr *twr, uint64_t until_us) {
+uwb_twr_event uwb_twr_anchor_step(uwb_twr *twr, uint64_t until_us) {
     uwb_dw1000_frame received;
     uwb_dw1000_status status = UWB_DW1000_OK;
     if (uwb_twr_now_us(twr) >= twr->next_us) {
@@ -103,7 +103,7 @@ uwb_twr_event uwb_twr_anchor_turn(uwb_twr *twr, uint64_t until_us) {
     }
     if (status == UWB_DW1000_OK) {
         const uint64_t look_us = twr->next_us < until_us ? twr->next_us : until_us;
-        status = uwb_dw1000_receive_or_stay(&twr->chip, &received, look_us);
+        status = uwb_dw1000_receive_stay_on(&twr->chip, &received, look_us);
     }
     if (status == UWB_DW1000_OK) {
         return attend(twr, &received);
@@ -111,5 +111,5 @@ uwb_twr_event uwb_twr_anchor_turn(uwb_twr *twr, uint64_t until_us) {
     if (status == UWB_DW1000_TIMEOUT || status == UWB_DW1000_DAMAGED) {
         return UWB_TWR_NOTHING;
     }
-    return uwb_twr_lost(twr, status, NULL);
+    return uwb_twr_exchange_failed(twr, status, NULL);
 }

@@ -28,7 +28,7 @@ uint32_t uwb_twr_random_below(uwb_twr *twr, uint32_t limit) {
     return (uint32_t)((uint64_t)uwb_twr_random(twr) * limit >> 32);
 }
 
-uwb_twr_frame uwb_twr_frame_to(const uwb_twr *twr, uwb_twr_kind kind, uint64_t to, uint32_t tag_number,
+uwb_twr_frame uwb_twr_make_frame(const uwb_twr *twr, uwb_twr_kind kind, uint64_t to, uint32_t tag_number,
                                uint32_t anchor_number) {
     uwb_twr_frame frame;
     memset(&frame, 0, sizeof frame);
@@ -44,13 +44,13 @@ uwb_twr_frame uwb_twr_frame_to(const uwb_twr *twr, uwb_twr_kind kind, uint64_t t
 
 static int belongs(const uwb_twr *twr, const uwb_twr_frame *frame, const uwb_twr_frame *sent, uwb_twr_kind kind) {
     return frame->kind == kind && frame->pan == twr->config.pan && frame->to == twr->address &&
-           (frame->from == sent->to || (sent->to == UWB_TWR_EVERYBODY && frame->from != twr->address)) &&
+           (frame->from == sent->to || (sent->to == UWB_TWR_BROADCAST && frame->from != twr->address)) &&
            frame->tag_number == sent->tag_number &&
            /* A tag learns the anchor's number from ANSWER; all later frames contain it. */
            (kind == UWB_TWR_ANSWER || frame->anchor_number == sent->anchor_number);
 }
 
-uwb_dw1000_status uwb_twr_expect(uwb_twr *twr, const uwb_twr_frame *sent, uwb_twr_kind kind, uint64_t until_us,
+uwb_dw1000_status uwb_twr_await_frame(uwb_twr *twr, const uwb_twr_frame *sent, uwb_twr_kind kind, uint64_t until_us,
                                  uwb_dw1000_frame *received, uwb_twr_frame *frame) {
     uwb_dw1000_status otherwise = UWB_DW1000_TIMEOUT;
     for (;;) {
@@ -76,7 +76,7 @@ uwb_dw1000_status uwb_twr_expect(uwb_twr *twr, const uwb_twr_frame *sent, uwb_tw
     }
 }
 
-uwb_dw1000_status uwb_twr_measure(uwb_twr *twr, const uwb_dw1000_frame *received, uint64_t tag, uint64_t anchor,
+uwb_dw1000_status uwb_twr_write_measurement(uwb_twr *twr, const uwb_dw1000_frame *received, uint64_t tag, uint64_t anchor,
                                   double range_m, float *rx_power_dbm) {
     const uwb_dw1000_settings *const radio = &twr->chip.settings;
     uwb_range_cir_t *const fields = (uwb_range_cir_t *)(void *)twr->measurement;
@@ -127,11 +127,11 @@ uwb_dw1000_status uwb_twr_measure(uwb_twr *twr, const uwb_dw1000_frame *received
     return UWB_DW1000_OK;
 }
 
-uwb_twr_event uwb_twr_lost(uwb_twr *twr, uwb_dw1000_status status, uint32_t *when_timed_out) {
+uwb_twr_event uwb_twr_exchange_failed(uwb_twr *twr, uwb_dw1000_status status, uint32_t *when_timed_out) {
     uint32_t *const counted = status == UWB_DW1000_TIMEOUT   ? when_timed_out
                               : status == UWB_DW1000_DAMAGED ? &twr->counts.damaged
                               : status == UWB_DW1000_LATE    ? &twr->counts.late
-                              : status == UWB_DW1000_UNSENT  ? &twr->counts.time_out
+                              : status == UWB_DW1000_UNSENT  ? &twr->counts.timeout
                                                              : &twr->counts.broken;
     if (when_timed_out != NULL) {
         (*counted)++; /* of an exchange */

@@ -10,9 +10,9 @@ static const uint8_t MARK = 0x75;
 
 #define KNOWN_BYTES sizeof(((uwb_twr_frame *)0)->known)
 
-/* Addresses, mark, kind, and for a SEEK the tag's number, time and `known`. All other frames have both numbers and room
+/* Addresses, mark, kind, and for a DISCOVER the tag's number, time and `known`. All other frames have both numbers and room
  * for three stamps: they have equal lengths, so that the length is written to the chip only once. */
-#define SEEK_BYTES (15u + 2u + 4u + 4u + KNOWN_BYTES)
+#define DISCOVER_BYTES (15u + 2u + 4u + 4u + KNOWN_BYTES)
 #define EXCHANGE_BYTES (21u + 2u + 4u + 4u + 5u * UWB_TWR_STAMPS)
 
 static uint32_t known_bit(const uwb_twr_frame *seek, uint64_t address) {
@@ -50,7 +50,7 @@ static int has_stamps(uwb_twr_kind kind) {
 }
 
 size_t uwb_twr_write(const uwb_twr_frame *frame, uint8_t *octets) {
-    const int broadcast = frame->kind == UWB_TWR_SEEK;
+    const int broadcast = frame->kind == UWB_TWR_DISCOVER;
     octets[0] = CONTROL[broadcast][0];
     octets[1] = CONTROL[broadcast][1];
     octets[2] = frame->sequence;
@@ -77,7 +77,7 @@ int uwb_twr_read(const uint8_t *octets, size_t bytes, uwb_twr_frame *frame) {
         return 0;
     }
     const int broadcast = octets[1] == CONTROL[1][1];
-    if ((!broadcast && octets[1] != CONTROL[0][1]) || bytes != (broadcast ? SEEK_BYTES : EXCHANGE_BYTES)) {
+    if ((!broadcast && octets[1] != CONTROL[0][1]) || bytes != (broadcast ? DISCOVER_BYTES : EXCHANGE_BYTES)) {
         return 0;
     }
     size_t at = 2;
@@ -86,12 +86,12 @@ int uwb_twr_read(const uint8_t *octets, size_t bytes, uwb_twr_frame *frame) {
     frame->to = take(octets, &at, broadcast ? 2 : 8);
     frame->from = take(octets, &at, 8);
     const uint64_t mark = take(octets, &at, 1), kind = take(octets, &at, 1);
-    if (mark != MARK || kind < UWB_TWR_SEEK || kind > UWB_TWR_REPORT || (kind == UWB_TWR_SEEK) != broadcast ||
+    if (mark != MARK || kind < UWB_TWR_DISCOVER || kind > UWB_TWR_REPORT || (kind == UWB_TWR_DISCOVER) != broadcast ||
         (broadcast && frame->to != BROADCAST)) {
         return 0;
     }
     frame->kind = (uwb_twr_kind)kind;
-    frame->to = broadcast ? UWB_TWR_EVERYBODY : frame->to;
+    frame->to = broadcast ? UWB_TWR_BROADCAST : frame->to;
     frame->tag_number = (uint32_t)take(octets, &at, 4);
     if (broadcast) {
         frame->anchor_number = 0;
@@ -104,7 +104,7 @@ int uwb_twr_read(const uint8_t *octets, size_t bytes, uwb_twr_frame *frame) {
         }
         frame->time_us = (uint32_t)frame->stamps[0];
     }
-    return frame->sequence == (uint8_t)frame->tag_number && frame->from != UWB_TWR_EVERYBODY;
+    return frame->sequence == (uint8_t)frame->tag_number && frame->from != UWB_TWR_BROADCAST;
 }
 
 static const double METRES_PER_TICK = 299792458.0 / (128 * 499.2e6);

@@ -30,7 +30,7 @@ static void meet(uwb_twr *twr, uint64_t address, uint64_t now_us) {
         *anchor = (uwb_twr_anchor){address, now_us, 0, 0, 0, 0, 0, NAN};
     }
     if (anchor != NULL) {
-        anchor->heard_us = now_us;
+        anchor->last_seen_us = now_us;
         anchor->due_us = 0;
     }
 }
@@ -38,7 +38,7 @@ static void meet(uwb_twr *twr, uint64_t address, uint64_t now_us) {
 /* Remove discovered anchors that have not answered for long; listed anchors stay. */
 static void forget(uwb_twr *twr, uint64_t now_us) {
     for (uint8_t i = twr->known; i-- > 0 && twr->config.anchor_count == 0;) {
-        if (now_us - twr->anchors[i].heard_us > FORGET_US) {
+        if (now_us - twr->anchors[i].last_seen_us > FORGET_US) {
             twr->anchors[i] = twr->anchors[--twr->known];
         }
     }
@@ -49,10 +49,10 @@ static uwb_dw1000_status send(uwb_twr *twr, const uwb_twr_frame *frame, uint32_t
     return uwb_dw1000_send(&twr->chip, octets, uwb_twr_write(frame, octets), answer_us);
 }
 
-/* Broadcast SEEK and collect the anchors that answer. */
+/* Broadcast DISCOVER and collect the anchors that answer. */
 static uwb_twr_event seek(uwb_twr *twr) {
-    uwb_twr_frame frame = uwb_twr_frame_to(twr, UWB_TWR_SEEK, UWB_TWR_EVERYBODY, uwb_twr_random(twr), 0);
-    const uint32_t window_us = SEEK_WINDOW_US + twr->config.patience_us;
+    uwb_twr_frame frame = uwb_twr_make_frame(twr, UWB_TWR_DISCOVER, UWB_TWR_BROADCAST, uwb_twr_random(twr), 0);
+    const uint32_t window_us = SEEK_WINDOW_US + twr->config.timeout_us;
     const uint64_t until_us = uwb_twr_now_us(twr) + window_us;
     uwb_dw1000_status status;
     const uint8_t known = twr->known;
@@ -62,12 +62,12 @@ static uwb_twr_event seek(uwb_twr *twr) {
     }
     status = send(twr, &frame, window_us);
     if (status == UWB_DW1000_OK) {
-        status = uwb_dw1000_sent(&twr->chip, until_us, NULL);
+        status = uwb_dw1000_await_sent(&twr->chip, until_us, NULL);
     }
     while (status == UWB_DW1000_OK) {
         uwb_dw1000_frame received;
         uwb_twr_frame here;
-        status = uwb_twr_expect(twr, &frame, UWB_TWR_HERE, until_us, &received, &here);
+        status = uwb_twr_await_frame(twr, &frame, UWB_TWR_DISCOVER_REPLY, until_us, &received, &here);
         if (status == UWB_DW1000_OK) {
             const uint64_t now_us = uwb_twr_now_us(twr);
             meet(twr, here.from, now_us);
@@ -87,7 +87,7 @@ static uwb_twr_event seek(uwb_twr *twr) {
     if (status == UWB_DW1000_TIMEOUT || status == UWB_DW1000_DAMAGED) {
         status = twr->known != 0 ? UWB_DW1000_OK : uwb_dw1000_check(&twr->chip);
     }
-    return status == UWB_DW1000_OK ? UWB_TWR_NOTHING : uwb_twr_lost(twr, status, NULL);
+    return status == UWB_DW1000_OK ? UWB_TWR_NOTHING : uwb_twr_exchange_failed(twr, status, NULL);
 }
 
 /* The next anchor in turn that is not skipped, or the one that is due first. */
@@ -110,31 +110,31 @@ static uint64_t ticks(uint32_t us) {
 static uwb_dw1000_status poll(uwb_twr *twr, uwb_twr_anchor *anchor, uwb_twr_frame *final, uint32_t **lost) {
     uwb_dw1000_frame received;
     uwb_twr_frame answer;
-    uwb_twr_frame frame = uwb_twr_frame_to(twr, UWB_TWR_POLL, anchor->address, uwb_twr_random(twr), 0);
+    uwb_twr_frame frame = uwb_twr_make_frame(twr, UWB_TWR_POLL, anchor->address, uwb_twr_random(twr), 0);
     uint32_t wait_us = 2 * anchor->answer_us + 2000;
-    wait_us = anchor->answer_us != 0 && wait_us < twr->config.patience_us ? wait_us : twr->config.patience_us;
+    wait_us = anchor->answer_us != 0 && wait_us < twr->config.timeout_us ? wait_us : twr->config.timeout_us;
     const uint64_t until_us = uwb_twr_now_us(twr) + wait_us;
     frame.time_us = twr->reply_us;
     *lost = &twr->counts.no_answer;
-    uwb_dw1000_status status = send(twr, &frame, twr->config.patience_us);
+    uwb_dw1000_status status = send(twr, &frame, twr->config.timeout_us);
     if (status == UWB_DW1000_OK) {
-        status = uwb_dw1000_sent(&twr->chip, until_us, &final->stamps[0]);
+        status = uwb_dw1000_await_sent(&twr->chip, until_us, &final->stamps[0]);
     }
     if (status == UWB_DW1000_OK) {
         status = uwb_dw1000_force_clock(&twr->chip); /* now: later there may not be enough time */
     }
     if (status == UWB_DW1000_OK) {
-        status = uwb_twr_expect(twr, &frame, UWB_TWR_ANSWER, until_us, &received, &answer);
+        status = uwb_twr_await_frame(twr, &frame, UWB_TWR_ANSWER, until_us, &received, &answer);
     }
     if (status != UWB_DW1000_OK) {
         return status;
     }
     const uint64_t polled = final->stamps[0];
-    *final = uwb_twr_frame_to(twr, UWB_TWR_FINAL, anchor->address, frame.tag_number, answer.anchor_number);
+    *final = uwb_twr_make_frame(twr, UWB_TWR_FINAL, anchor->address, frame.tag_number, answer.anchor_number);
     final->stamps[0] = polled;
     final->stamps[1] = received.stamp;
-    final->stamps[2] = uwb_dw1000_stamp_at(&twr->chip, received.stamp + ticks(twr->reply_us));
-    anchor->heard_us = received.received_us;
+    final->stamps[2] = uwb_dw1000_tx_stamp(&twr->chip, received.stamp + ticks(twr->reply_us));
+    anchor->last_seen_us = received.received_us;
     anchor->misses = 0;
     anchor->answer_us = (uint32_t)(((received.stamp - polled) & UWB_DW1000_TICK_MASK) / 63898u);
     return UWB_DW1000_OK;
@@ -150,31 +150,31 @@ static uwb_dw1000_status exchange(uwb_twr *twr, uwb_twr_anchor *anchor, uint32_t
     if (status != UWB_DW1000_OK) {
         return status;
     }
-    *lost = &twr->counts.time_out;
-    const uint64_t until_us = uwb_twr_now_us(twr) + twr->reply_us + twr->config.patience_us;
+    *lost = &twr->counts.timeout;
+    const uint64_t until_us = uwb_twr_now_us(twr) + twr->reply_us + twr->config.timeout_us;
     const size_t bytes = uwb_twr_write(&final, octets);
-    status = uwb_dw1000_send_at(&twr->chip, octets, bytes, final.stamps[2], twr->config.patience_us);
+    status = uwb_dw1000_send_at(&twr->chip, octets, bytes, final.stamps[2], twr->config.timeout_us);
     if (status == UWB_DW1000_OK) {
-        status = uwb_dw1000_sent(&twr->chip, until_us, &sent);
+        status = uwb_dw1000_await_sent(&twr->chip, until_us, &sent);
     }
     if (status == UWB_DW1000_OK) {
         status = uwb_dw1000_release_clock(&twr->chip);
     }
     if (status == UWB_DW1000_OK) {
-        status = uwb_twr_expect(twr, &final, UWB_TWR_REPORT, until_us, &received, &report);
+        status = uwb_twr_await_frame(twr, &final, UWB_TWR_REPORT, until_us, &received, &report);
     }
     if (status != UWB_DW1000_OK) {
         return status;
     }
     if (sent != final.stamps[2] || !uwb_twr_range_m(final.stamps, report.stamps, &range_m)) {
-        *lost = &twr->counts.absurd;
+        *lost = &twr->counts.implausible;
         status = uwb_dw1000_check(&twr->chip);
         return status == UWB_DW1000_OK ? UWB_DW1000_TIMEOUT : status;
     }
-    return uwb_twr_measure(twr, &received, twr->address, anchor->address, range_m, &anchor->rx_power_dbm);
+    return uwb_twr_write_measurement(twr, &received, twr->address, anchor->address, range_m, &anchor->rx_power_dbm);
 }
 
-uwb_twr_event uwb_twr_tag_turn(uwb_twr *twr, uint64_t until_us) {
+uwb_twr_event uwb_twr_tag_step(uwb_twr *twr, uint64_t until_us) {
     const uint64_t now_us = uwb_twr_now_us(twr);
     if (twr->config.anchor_count == 0 && now_us >= twr->seek_us) {
         return seek(twr);
@@ -205,14 +205,14 @@ uwb_twr_event uwb_twr_tag_turn(uwb_twr *twr, uint64_t until_us) {
         }
     } else {
         /* Another tag may have interfered: wait for a random time that grows with each miss. */
-        event = uwb_twr_lost(twr, status, lost);
+        event = uwb_twr_exchange_failed(twr, status, lost);
         if (status == UWB_DW1000_LATE && twr->reply_us < SLOWEST_REPLY_US) {
             twr->reply_us += twr->reply_us / 4;
         }
         pause_us <<= twr->misses < 5 ? twr->misses : 5;
         if (++anchor->misses >= MISSES_TO_REST) {
             const uint32_t times = anchor->misses - MISSES_TO_REST;
-            const uint32_t rest_us = twr->config.patience_us << (times < LONGEST_REST ? times : LONGEST_REST);
+            const uint32_t rest_us = twr->config.timeout_us << (times < LONGEST_REST ? times : LONGEST_REST);
             anchor->due_us = ended_us + rest_us + uwb_twr_random_below(twr, rest_us / 4);
         }
     }

@@ -58,7 +58,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
         if (how & 2) {
             uwb_board_receive(board, bytes, count, now_us);
         } else {
-            uwb_board_measure(board, bytes, count, now_us);
+            uwb_board_receive_from_radio(board, bytes, count, now_us);
         }
         now_us += 300000u;
         uwb_board_tick(board, now_us);

@@ -326,20 +326,20 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
     uwb_twr_start(twr, &io, &config, how, measurement, bytes);
     const int needed = config.role == UWB_ROLE_TAG ? 2 : 1;
     while (chip->left != 0) {
-        const uwb_twr_event event = uwb_twr_turn(twr, chip->now_us + 20000);
+        const uwb_twr_event event = uwb_twr_step(twr, chip->now_us + 20000);
         if (event == UWB_TWR_RANGED) {
             uwb_range_cir_t fields;
             memcpy(&fields, measurement, sizeof fields);
             check(chip->steps == needed, "a range comes of an exchange of ours only");
-            check(uwb_twr_measured_bytes(twr) <= bytes, "a measurement fits its memory");
+            check(uwb_twr_measurement_bytes(twr) <= bytes, "a measurement fits its memory");
             check(fields.range > -11 && fields.range < 2001, "a range is one");
             chip->steps = 0;
             ranged++;
         }
         check(twr->known <= UWB_MAX_ANCHORS, "anchors fit their table");
         const uwb_twr_counts *const counts = &twr->counts;
-        check(counts->tried == counts->ranged + counts->no_answer + counts->late + counts->time_out + counts->damaged +
-                                   counts->absurd + counts->broken,
+        check(counts->tried == counts->ranged + counts->no_answer + counts->late + counts->timeout + counts->damaged +
+                                   counts->implausible + counts->broken,
               "every exchange is counted once");
     }
     refused += twr->counts.refused;

@@ -18,7 +18,7 @@ from uwb_mitigation.files import write_atomically
 
 if TYPE_CHECKING:
     from uwb_mitigation.link.messages import Hello
-    from uwb_mitigation.link.radio import RadioSettings
+    from uwb_mitigation.link.radio_settings import RadioSettings
     from uwb_mitigation.mitigation import Mitigation
     from uwb_mitigation.radio.antenna_delay import AntennaDelay
     from uwb_mitigation.sources.source import Source
@@ -166,7 +166,7 @@ def antenna_delay(
         uwb-mitigation board antenna-delay --distance 5.01 --port /dev/ttyACM0,/dev/ttyACM1 -o antenna_delay.yaml
     """
     from uwb_mitigation.radio.antenna_delay import measure
-    from uwb_mitigation.radio.bus import opener
+    from uwb_mitigation.radio.bus import bus_opener
 
     if not 0.3 <= distance <= 100.0:
         raise ParameterError(f"--distance {distance}", valid="0.3 to 100 m")
@@ -176,7 +176,7 @@ def antenna_delay(
     if output is not None and (output.is_dir() or not output.absolute().parent.is_dir()):
         raise ParameterError(f"-o {output}", valid="a file, in a folder that is there")
     settings = _settings(anchor, channel, prf, preamble, data_rate, start)
-    openers = [opener(source.value, port_name, reset) for port_name in ports]
+    openers = [bus_opener(source.value, port_name, reset) for port_name in ports]
     with console.step_bar("ranging", exchanges) as advance:
         found = measure(openers, settings, distance, exchanges, advance)
     console.out.print(_table(found, distance, len(ports)))
@@ -195,7 +195,7 @@ def antenna_delay(
 def _settings(
     anchor: str | None, channel: int, prf: int, preamble: int, data_rate: int, start: int
 ) -> RadioSettings:
-    from uwb_mitigation.link.radio import RadioSettings
+    from uwb_mitigation.link.radio_settings import RadioSettings
 
     try:
         anchors = () if anchor is None else (parse_id(anchor),)

@@ -36,7 +36,7 @@ from uwb_mitigation.offsets import NO_OFFSETS, Offsets
 
 STATUS_INTERVAL_US = 1_000_000
 
-_UNASKED = Flag(0)
+_UNSOLICITED = Flag(0)
 
 
 class Corrector(Protocol):
@@ -97,7 +97,7 @@ class Board:
         # A board computes with the same binary32 values that it would send.
         held = messages.decode(kind, payload)
         assert isinstance(held, RangeMeasurement)
-        return self._correct(held, now_us, _UNASKED)
+        return self._correct(held, now_us, _UNSOLICITED)
 
     def tick(self, now_us: int) -> bytes:
         """Return the STATUS if it is due."""
@@ -170,8 +170,8 @@ class Board:
             request_sequence=request or 0,
             max_payload=MAX_PAYLOAD_BYTES,
         )
-        return self._send(hello, now_us, _UNASKED if request is None else Flag.ANSWER)
+        return self._send(hello, now_us, _UNSOLICITED if request is None else Flag.ANSWER)
 
-    def _send(self, message: messages.Message, now_us: int, flags: Flag = _UNASKED) -> bytes:
+    def _send(self, message: messages.Message, now_us: int, flags: Flag = _UNSOLICITED) -> bytes:
         kind, payload = messages.encode(message)
         return self._encoder.encode(kind, payload, flags=flags, time_us=now_us)

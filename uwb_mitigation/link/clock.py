@@ -18,7 +18,7 @@ _LATE_ARRIVAL_NS = 20e6
 _FIRST_ARRIVAL_NS = 1e6
 """Standard deviation of the first arrival. If it was late, the next early arrival corrects the estimate."""
 
-_START_DRIFT = 100e-6
+_INITIAL_DRIFT_SD = 100e-6
 """Twice the tolerance of a common crystal."""
 
 _DRIFT_WALK_PER_S = 1.7e-14
@@ -33,7 +33,7 @@ _STEP_NS = 100e6
 _MAX_AGE_NS = 10 * 10**9
 """If a measurement is older than this when it arrives, the board's clock is wrong."""
 
-_HISTORY = 1024
+_MAX_HISTORY = 1024
 
 
 class DeviceClock:
@@ -63,15 +63,15 @@ class DeviceClock:
         self._drift = 0.0
         self._p_offset = 0.0
         self._p_cross = 0.0
-        self._p_drift = _START_DRIFT**2
-        self._enclosed = False
+        self._p_drift = _INITIAL_DRIFT_SD**2
+        self._is_bounded = False
         self._times: list[int] = []
         self._stamps: list[int] = []
 
     @property
     def synchronised(self) -> bool:
         """True once a round trip has bounded the estimate from both sides."""
-        return self._enclosed
+        return self._is_bounded
 
     @property
     def drift(self) -> float:
@@ -111,8 +111,8 @@ class DeviceClock:
         low, high = float(earliest - self._origin), float(latest - self._origin)
         variance = (high - low) ** 2 / 12 + _FLOOR_NS**2
         self._update(at, (low + high) / 2, variance)
-        self._enclosed = True
-        self._confine(at, low, high)
+        self._is_bounded = True
+        self._clip(at, low, high)
 
     def stamp(self, ticks: int, arrived_ns: int) -> int:
         """Return the host's time, ns, at `ticks`, the event time of a frame that arrived at `arrived_ns`.
@@ -132,7 +132,7 @@ class DeviceClock:
             stamp_ns = max(stamp_ns, self._stamps[index - 1] + 1)
         self._times.insert(index, board_ns)
         self._stamps.insert(index, stamp_ns)
-        del self._times[:-_HISTORY], self._stamps[:-_HISTORY]
+        del self._times[:-_MAX_HISTORY], self._stamps[:-_MAX_HISTORY]
         return stamp_ns
 
     def _board_ns(self, ticks: int, host_ns: int) -> int:
@@ -161,8 +161,8 @@ class DeviceClock:
         high = float(arrived_ns - board_ns - self._origin)
         if late_ns < 0:
             self._update(board_ns, high, _FLOOR_NS**2)
-            self._confine(board_ns, float("-inf"), high)
-        elif not self._enclosed:
+            self._clip(board_ns, float("-inf"), high)
+        elif not self._is_bounded:
             # A late arrival has a small weight, so that a stall of seconds does not change the offset.
             self._update(board_ns, high, _LATE_ARRIVAL_NS**2 + late_ns**2)
 
@@ -175,22 +175,22 @@ class DeviceClock:
             self._p_offset += ahead * (2 * self._p_cross + ahead * self._p_drift)
             self._p_offset += _OFFSET_WALK_NS2_PER_S * ahead_s
             self._p_cross += ahead * self._p_drift
-            self._p_drift = min(self._p_drift + _DRIFT_WALK_PER_S * ahead_s, _START_DRIFT**2)
+            self._p_drift = min(self._p_drift + _DRIFT_WALK_PER_S * ahead_s, _INITIAL_DRIFT_SD**2)
             self._at = at
             ahead = 0
         # The sample may be older than the last update: the measurement matrix is H = [1, ahead].
         cross_offset = self._p_offset + ahead * self._p_cross
         cross_drift = self._p_cross + ahead * self._p_drift
         total = cross_offset + ahead * cross_drift + variance
-        surprise = offset - (self._offset + self._drift * ahead)
+        innovation = offset - (self._offset + self._drift * ahead)
         gain_offset, gain_drift = cross_offset / total, cross_drift / total
-        self._offset += gain_offset * surprise
-        self._drift += gain_drift * surprise
+        self._offset += gain_offset * innovation
+        self._drift += gain_drift * innovation
         self._p_offset -= gain_offset * cross_offset
         self._p_cross -= gain_offset * cross_drift
         self._p_drift -= gain_drift * cross_drift
 
-    def _confine(self, at: int, low: float, high: float) -> None:
+    def _clip(self, at: int, low: float, high: float) -> None:
         """Clip the estimate to its bounds; restart the filter if the correction is a clock step."""
         predicted = self._offset + self._drift * (at - self._at)
         nearest = min(max(predicted, low), high)
@@ -198,9 +198,9 @@ class DeviceClock:
             return
         if abs(nearest - predicted) > _STEP_NS:
             origin = (self._origin or 0) + round(nearest)
-            enclosed = self._enclosed
+            enclosed = self._is_bounded
             self._restart()
-            self._origin, self._at, self._enclosed = origin, at, enclosed
+            self._origin, self._at, self._is_bounded = origin, at, enclosed
             self._p_offset = _LATE_ARRIVAL_NS**2
             return
         self._offset += nearest - predicted

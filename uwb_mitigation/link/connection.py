@@ -1,6 +1,6 @@
 """A connection to hardware that a thread opens, serves, and reopens after a loss.
 
-Used for boards on serial ports (`port`) and radios of this computer (`uwb_mitigation.radio.port`).
+Used for boards on serial ports (`board_driver`) and radios of this computer (`radio.radio_driver`).
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from serial.tools import list_ports
 
 from uwb_mitigation.errors import LinkError, ParameterError, UwbMitigationError
 
-FIRST_RETRY_S = 0.1
-LAST_RETRY_S = 0.4
+MIN_RETRY_S = 0.1
+MAX_RETRY_S = 0.4
 """Hardware that was plugged in again is found within a second; the search takes little time."""
 
-CAPACITY = 1024
+QUEUE_CAPACITY = 1024
 """Default size of the event queue; if it is full, the oldest events are dropped."""
 
 _Event = TypeVar("_Event")
@@ -38,18 +38,18 @@ class Connection(ABC, Generic[_Event]):
     Args:
         name: of the thread.
         problem: value of `problem` before the first attempt.
-        capacity: see `CAPACITY`.
+        capacity: see `QUEUE_CAPACITY`.
 
     Attributes:
         openings: how often the hardware was opened.
         overflowed: number of events dropped because the queue was full.
     """
 
-    def __init__(self, name: str, problem: str, capacity: int = CAPACITY) -> None:
+    def __init__(self, name: str, problem: str, capacity: int = QUEUE_CAPACITY) -> None:
         self.openings = 0
         self.overflowed = 0
         self._problem = problem
-        self._worked = False
+        self._was_connected = False
         self._capacity = capacity
         self._events: deque[_Event] = deque()
         # Guards the state of the connection; the condition signals new events.
@@ -90,7 +90,7 @@ class Connection(ABC, Generic[_Event]):
             UwbMitigationError: it cannot be opened, or was lost.
         """
 
-    def _lost(self, text: str) -> None:
+    def _on_loss(self, text: str) -> None:
         """Handle a loss or a failed attempt; called with the lock held."""
 
     def _put(self, events: Iterable[_Event]) -> None:
@@ -102,19 +102,19 @@ class Connection(ABC, Generic[_Event]):
             self._changed.notify_all()
 
     def _run(self) -> None:
-        retry_s = FIRST_RETRY_S
+        retry_s = MIN_RETRY_S
         while not self.closed:
-            self._worked = False
+            self._was_connected = False
             try:
                 self._connect()
             except UwbMitigationError as error:
                 with self._lock:
-                    self._lost(str(error))
+                    self._on_loss(str(error))
                     self._problem = str(error)
-            if self._worked:
-                retry_s = FIRST_RETRY_S
+            if self._was_connected:
+                retry_s = MIN_RETRY_S
             self._stop.wait(retry_s)
-            retry_s = min(2 * retry_s, LAST_RETRY_S)
+            retry_s = min(2 * retry_s, MAX_RETRY_S)
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,12 +190,12 @@ class PortAddress:
         except (OSError, TypeError, ValueError) as error:
             # SerialException is an OSError; a ValueError is a baud rate that the port refuses; pyserial raises a
             # TypeError if a USB device is unplugged while it lists the ports.
-            raise LinkError(f"cannot be opened: {_why_not_opened(path, error)}", where=str(self)) from error
+            raise LinkError(f"cannot be opened: {_open_error(path, error)}", where=str(self)) from error
         os.set_blocking(port.fileno(), False)
         return port
 
 
-def users_of(path: str) -> list[str]:
+def processes_using(path: str) -> list[str]:
     """Return the other programs that have a device file open, such as `minicom (process 123)`.
 
     Without root, only the programs of this user are visible.
@@ -212,10 +212,10 @@ def users_of(path: str) -> list[str]:
     return found
 
 
-def _why_not_opened(path: str, error: Exception) -> str:
+def _open_error(path: str, error: Exception) -> str:
     code = getattr(error, "errno", None)
     if code in (errno.EAGAIN, errno.EBUSY):
-        users = ", ".join(users_of(path)) or "another program"
+        users = ", ".join(processes_using(path)) or "another program"
         return f"in use by {users} (close it; sudo fuser -v {path} lists the users)"
     remedy = " (sudo usermod -aG dialout $USER, then log in again)" if code == errno.EACCES else ""
     return f"{error}{remedy}"

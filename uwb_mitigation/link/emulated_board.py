@@ -25,7 +25,7 @@ from uwb_mitigation.link.messages import Hello
 from uwb_mitigation.measurement import RangeMeasurement, Record
 
 _READ_BYTES = 4096
-_HEALTHY = Faults()
+_NO_FAULTS = Faults()
 EMULATED = Hello(0xE0, firmware_minor=1, firmware_name="emulated")
 
 MAX_BACKLOG_BYTES = 1 << 16
@@ -52,7 +52,7 @@ class PseudoTerminal:
         self.port = ""
         self.fd: int | None = None
         self._link = link
-        self._held = -1
+        self._open_device_fd = -1
 
     def plug(self) -> bool:
         """Create the port, usually with a new name; return False if it already exists.
@@ -62,10 +62,10 @@ class PseudoTerminal:
         """
         if self.fd is not None:
             return False
-        self.fd, self._held = os.openpty()
-        tty.setraw(self._held)
+        self.fd, self._open_device_fd = os.openpty()
+        tty.setraw(self._open_device_fd)
         os.set_blocking(self.fd, False)
-        self.port = os.ttyname(self._held)
+        self.port = os.ttyname(self._open_device_fd)
         if self._link is not None:
             try:
                 self._link.unlink(missing_ok=True)
@@ -81,7 +81,7 @@ class PseudoTerminal:
         """Remove the port, as if the cable were pulled; return False if there is no port."""
         if self.fd is None:
             return False
-        for fd in (self.fd, self._held):
+        for fd in (self.fd, self._open_device_fd):
             os.close(fd)
         self.fd, self.port = None, ""
         if self._link is not None:
@@ -132,7 +132,7 @@ class EmulatedBoard:
         identity: Hello = EMULATED,
         corrector: Corrector | None = None,
         mode: Mode = Mode.HOST,
-        faults: Faults = _HEALTHY,
+        faults: Faults = _NO_FAULTS,
         link: Path | None = None,
         seed: int = 0,
     ) -> None:
@@ -144,7 +144,7 @@ class EmulatedBoard:
         self._measuring = True
         self._source = source
         # Read the source before the port exists: the caller gets the error of an empty source.
-        records = _endless(source)
+        records = _repeat(source)
         first = [] if source is None else [next(records)]
         self._records: Iterator[RangeMeasurement] = itertools.chain(first, records)
         self._period_s = 1 / rate_hz
@@ -182,12 +182,12 @@ class EmulatedBoard:
         with self._lock:
             self._boots += 1
             self._booted_ns = time.monotonic_ns()
-            self._board = self._boot()
+            self._board = self._create_board()
             # Unsent bytes of the firmware are lost, also those of a partly sent frame.
             self._backlog.clear()
             self._transmit(self._board.hello(0))
 
-    def _boot(self) -> Board:
+    def _create_board(self) -> Board:
         return Board(self._identity, self._corrector, mode=self._mode, boot_id=self._boots)
 
     def pause(self) -> None:
@@ -241,15 +241,15 @@ class EmulatedBoard:
             self.failure = error
             self._records = iter(())
 
-    def _exchange(self, patience_s: float) -> None:
-        """Read from and write to the host, for at most `patience_s`."""
+    def _exchange(self, timeout_s: float) -> None:
+        """Read from and write to the host, for at most `timeout_s`."""
         with self._lock:
             if (controller := self._terminal.fd) is None:
                 return
             sending = bool(self._backlog)
         try:
             readable, writable, _ = select.select(
-                [controller], [controller] if sending else [], [], patience_s
+                [controller], [controller] if sending else [], [], timeout_s
             )
         except (OSError, ValueError):
             return
@@ -272,7 +272,7 @@ class EmulatedBoard:
             return
         if chances[1] < faults.duplicate:
             data += data
-        if faults != _HEALTHY:
+        if faults != _NO_FAULTS:
             data = damage(data, faults, self._random).data
         self._backlog += data
 
@@ -280,7 +280,7 @@ class EmulatedBoard:
         return (time.monotonic_ns() - self._booted_ns) // 1000
 
 
-def _endless(source: Iterable[Record] | None) -> Iterator[RangeMeasurement]:
+def _repeat(source: Iterable[Record] | None) -> Iterator[RangeMeasurement]:
     empty = True
     while source is not None:
         for record in source:

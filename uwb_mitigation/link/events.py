@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 from uwb_mitigation.link.layout import Mode
 from uwb_mitigation.link.messages import BoardStatus, Correction, Hello, Log, Radio
-from uwb_mitigation.link.radio import RadioStatus
+from uwb_mitigation.link.radio_settings import RadioStatus
 from uwb_mitigation.measurement import RangeMeasurement
 
 
@@ -23,9 +23,9 @@ class LinkState(enum.Enum):
 class Loss(enum.Enum):
     """Why a connection ended."""
 
-    SILENT = "nothing intact was received for 3 s"
+    TIMEOUT = "nothing intact was received for 3 s"
     RESET = "the board restarted"
-    OUT_OF_STEP = "the board's frames are numbered out of order"
+    OUT_OF_SEQUENCE = "the board's frames are numbered out of order"
     CLOSED = "the port was closed"
 
 
@@ -108,7 +108,7 @@ class SessionCounts:
         malformed: of a known type, but with invalid contents.
         wrong_model: corrections by another model than the expected one.
         wrong_offsets: corrections before the board confirmed the requested offsets.
-        unasked: unsolicited answers.
+        unsolicited: unsolicited answers.
         unsent: requests dropped because the output queue was full.
         connections: HELLOs that started a connection.
     """
@@ -120,6 +120,6 @@ class SessionCounts:
     malformed: int = 0
     wrong_model: int = 0
     wrong_offsets: int = 0
-    unasked: int = 0
+    unsolicited: int = 0
     unsent: int = 0
     connections: int = 0

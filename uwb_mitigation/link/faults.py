@@ -37,7 +37,7 @@ class Faults:
 
 
 @dataclass(frozen=True, slots=True)
-class Damaged:
+class DamagedData:
     """Received bytes, and the positions of the damage in the sent bytes.
 
     Attributes:
@@ -51,7 +51,7 @@ class Damaged:
     inserted: NDArray[np.intp]
 
 
-def damage(data: bytes, faults: Faults, random: np.random.Generator) -> Damaged:
+def damage(data: bytes, faults: Faults, random: np.random.Generator) -> DamagedData:
     """Send `data` through a channel with `faults`."""
     sent = np.frombuffer(data, np.uint8)
     draws = random.random((3, len(sent)), dtype=np.float32)
@@ -67,4 +67,4 @@ def damage(data: bytes, faults: Faults, random: np.random.Generator) -> Damaged:
         received[~dropped], kept_before[inserted], random.integers(0, 256, len(inserted), dtype=np.uint8)
     )
     changed = np.union1d(flips, np.flatnonzero(dropped))
-    return Damaged(received.tobytes(), changed, inserted)
+    return DamagedData(received.tobytes(), changed, inserted)

@@ -138,18 +138,18 @@ class FrameDecoder:
     def _feed_slice(self, data: bytes, frames: list[Frame]) -> None:
         counts = self.counts
         counts.bytes_received += len(data)
-        stretches = data.split(DELIMITER)
+        segments = data.split(DELIMITER)
         if self._overrun:
             # The rest of a segment that is already counted as oversize.
-            if len(stretches) == 1:
+            if len(segments) == 1:
                 return
-            stretches[0] = b""
+            segments[0] = b""
             self._overrun = False
         elif self._tail:
-            stretches[0] = self._tail + stretches[0]
-        tail = stretches.pop()
-        for stretch in stretches:
-            frame = self._decode(stretch) if stretch else None
+            segments[0] = self._tail + segments[0]
+        tail = segments.pop()
+        for segment in segments:
+            frame = self._decode(segment) if segment else None
             if frame is not None:
                 frames.append(frame)
         if len(tail) > MAX_ENCODED_BYTES:
@@ -158,13 +158,13 @@ class FrameDecoder:
             tail = b""
         self._tail = tail
 
-    def _decode(self, stretch: bytes) -> Frame | None:
+    def _decode(self, segment: bytes) -> Frame | None:
         counts = self.counts
-        if len(stretch) > MAX_ENCODED_BYTES:
+        if len(segment) > MAX_ENCODED_BYTES:
             counts.oversize += 1
             return None
         try:
-            body = cobs.decode(stretch)
+            body = cobs.decode(segment)
         except cobs.DecodeError:
             counts.bad_cobs += 1
             return None

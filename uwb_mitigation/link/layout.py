@@ -90,7 +90,7 @@ class RadioState(enum.IntEnum):
     """It runs, but did not report the lock of its clock PLL (errata: the report is not reliable)."""
 
 
-class OffsetOf(enum.IntEnum):
+class OffsetScope(enum.IntEnum):
     """What an offset belongs to."""
 
     ANCHOR = 0
@@ -186,7 +186,7 @@ _RADIO_SETTINGS = (
     Field("antenna_delay", "I", "ticks, TX + RX; 0 = OTP value"),
     Field("tx_power", "I", "register TX_POWER in smart-power format; 0 = OTP value or the manual's"),
     Field("reply_us", "I", "from the reception of ANSWER to FINAL; 0 in SET_RADIO = the firmware's usual"),
-    Field("patience_us", "I", "how long a tag waits for an anchor's frames; 0 as above"),
+    Field("timeout_us", "I", "how long a tag waits for an anchor's frames; 0 as above"),
     Field("interval_us", "I", "between the beginnings of two exchanges, at least"),
     Field("pan", "H", "network; frames of other networks are ignored"),
     Field("rate", "H", "kbit/s: 110, 850, 6800", "rate_kbps"),
@@ -210,7 +210,7 @@ RADIO_ANCHOR = Layout(
     Field("tried", "I", "exchanges that began"),
     Field("ranged", "I", "exchanges that gave a range"),
     Field("rx_power", "f", "dBm, of its last frame; NaN = unknown"),
-    Field("heard_ms", "I", "since its last frame; 4294967295 = never"),
+    Field("age_ms", "I", "since its last frame; 4294967295 = never"),
 )
 """One anchor in the tail of a RADIO_STATUS."""
 
@@ -222,7 +222,7 @@ OFFSET = Layout(
     Field("tag_id", "Q", "of no meaning for an anchor's"),
     Field("anchor_id", "Q", "of no meaning for a tag's"),
     Field("offset", "f", "m, -10 to 10"),
-    Field("of", "B", "OffsetOf"),
+    Field("of", "B", "OffsetScope"),
     Field("reserved", "3x", ""),
 )
 """One offset in the tail of a SET_OFFSETS."""
@@ -330,9 +330,9 @@ _TABLES = (
         Field("ranged", "I", "exchanges that gave a range"),
         Field("no_answer", "I", "lost: POLL was not answered"),
         Field("late", "I", "lost: FINAL could not be sent in time"),
-        Field("time_out", "I", "lost: FINAL or REPORT did not come"),
+        Field("timeout", "I", "lost: FINAL or REPORT did not come"),
         Field("damaged", "I", "lost: what came was no intact frame"),
-        Field("absurd", "I", "lost: stamps that no exchange can have"),
+        Field("implausible", "I", "lost: stamps that no exchange can have"),
         Field("broken", "I", "lost: the chip was reset meanwhile, or its bus failed"),
         Field("refused", "I", "frames that belonged to no exchange of this radio"),
         Field("restarts", "I", "restarts of the chip after the first"),

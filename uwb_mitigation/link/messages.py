@@ -20,8 +20,8 @@ import numpy as np
 
 from uwb_mitigation.errors import LinkError, ParameterError
 from uwb_mitigation.link import layout
-from uwb_mitigation.link.layout import Field, LogLevel, MessageType, Mode, OffsetOf
-from uwb_mitigation.link.radio import AnchorInReach, RadioSettings, RadioStatus
+from uwb_mitigation.link.layout import Field, LogLevel, MessageType, Mode, OffsetScope
+from uwb_mitigation.link.radio_settings import AnchorStatus, RadioSettings, RadioStatus
 from uwb_mitigation.measurement import Cir, CorrectedRange, Origin, RangeMeasurement
 from uwb_mitigation.offsets import Offsets
 
@@ -291,19 +291,19 @@ def _anchors(has_text: bool) -> _Tail:
     )
 
 
-def _offset_rows(message: SetOffsets) -> Iterator[tuple[int, int, float, OffsetOf]]:
+def _offset_rows(message: SetOffsets) -> Iterator[tuple[int, int, float, OffsetScope]]:
     offsets = message.offsets
-    yield from ((tag, anchor, m, OffsetOf.PAIR) for (tag, anchor), m in offsets.pairs.items())
-    yield from ((0, anchor, m, OffsetOf.ANCHOR) for anchor, m in offsets.anchors.items())
-    yield from ((tag, 0, m, OffsetOf.TAG) for tag, m in offsets.tags.items())
+    yield from ((tag, anchor, m, OffsetScope.PAIR) for (tag, anchor), m in offsets.pairs.items())
+    yield from ((0, anchor, m, OffsetScope.ANCHOR) for anchor, m in offsets.anchors.items())
+    yield from ((tag, 0, m, OffsetScope.TAG) for tag, m in offsets.tags.items())
 
 
 def _offsets_in(rows: Iterable[tuple[Any, ...]]) -> Values:
     found: dict[str, dict[Any, float]] = {"anchors": {}, "tags": {}, "pairs": {}}
     for tag, anchor, offset_m, kind in rows:
-        if kind not in set(OffsetOf):
+        if kind not in set(OffsetScope):
             raise LinkError(f"an offset of {kind}", where="SET_OFFSETS", valid="0 to 2")
-        name = f"{OffsetOf(kind).name.lower()}s"
+        name = f"{OffsetScope(kind).name.lower()}s"
         found[name].setdefault({"anchors": anchor, "tags": tag}.get(name, (tag, anchor)), offset_m)
     return found
 
@@ -348,7 +348,7 @@ class _Codec:
             return None
         name = field.attribute or field.name
         get = attrgetter(name if name in self._own else f"{self._inner[0]}.{name}")
-        return (lambda message: _cut_utf8(get(message), int(field.code[:-1]))) if field.is_text else get
+        return (lambda message: _truncate_utf8(get(message), int(field.code[:-1]))) if field.is_text else get
 
     def encode(self, message: Any) -> bytes:
         """Return the payload; raise struct.error or OverflowError if a value does not fit its field."""
@@ -409,7 +409,7 @@ _CODECS = (
         tail=_Tail(
             layout.RADIO_ANCHOR.packing(),
             rows=lambda status: map(dataclasses.astuple, status.anchors),
-            attributes=lambda rows: {"anchors": tuple(AnchorInReach(*row) for row in rows)},
+            attributes=lambda rows: {"anchors": tuple(AnchorStatus(*row) for row in rows)},
         ),
     ),
     _Codec(MessageType.OFFSETS, OffsetsAnswer),
@@ -429,6 +429,6 @@ _by_type: dict[int, _Codec] = {codec.kind: codec for codec in _CODECS}
 _by_class = {codec.make: codec for codec in _CODECS}
 
 
-def _cut_utf8(text: str, size: int) -> bytes:
+def _truncate_utf8(text: str, size: int) -> bytes:
     """Return at most `size` bytes of UTF-8, without a partial character at the end."""
     return text.encode("utf-8", "replace")[:size].decode("utf-8", "ignore").encode()

@@ -40,7 +40,7 @@ from uwb_mitigation.link.messages import (
     SetRadio,
     TimeSyncReply,
 )
-from uwb_mitigation.link.radio import RadioSettings, RadioStatus
+from uwb_mitigation.link.radio_settings import RadioSettings, RadioStatus
 from uwb_mitigation.measurement import RangeMeasurement
 from uwb_mitigation.offsets import NO_OFFSETS, Offsets
 
@@ -55,18 +55,18 @@ FIRST_SYNC_INTERVAL_NS = 47 * _MS
 FIRST_SYNCS = 8
 """Number of round trips in quick succession after a HELLO, for a first clock estimate."""
 
-SILENCE_NS = 3000 * _MS
+LINK_TIMEOUT_NS = 3000 * _MS
 """Timeout of the link. A board sends at least one frame per second."""
 
 MAX_GAP = 1 << 20
 """Largest plausible gap in sequence numbers. A larger gap means that the board was restarted."""
 
-RADIO_TRIES = 6
+MAX_TRIES = 6
 """Number of requests for radio settings or offsets after which an unanswered request counts as unsupported."""
 
-_MAX_STALE = 3
-_MAX_AWAITED = 1024
-_GOLDEN = 0.618
+_MAX_CONSECUTIVE_STALE = 3
+_MAX_PENDING = 1024
+_GOLDEN_RATIO = 0.618
 _MAX_OUTGOING_BYTES = 1 << 16
 _SEQUENCES = 1 << 32
 _STAMPED = (MessageType.RANGE_CIR, MessageType.RANGE_CORRECTED)
@@ -79,7 +79,7 @@ class _Request:
     """A request that is repeated until the board answers it.
 
     Args:
-        unanswered: the problem if the board answers none of `RADIO_TRIES` requests; empty = repeat forever.
+        unanswered: the problem if the board answers none of `MAX_TRIES` requests; empty = repeat forever.
     """
 
     def __init__(self, unanswered: str = "") -> None:
@@ -146,16 +146,16 @@ class BoardSession:
         self._offsets_request = _Request(
             "its firmware has no offsets: flash a newer version, or correct on the host"
         )
-        self._offsets_held = False
-        self._boot: tuple[int, int] | None = None
+        self._offsets_confirmed = False
+        self._boot_key: tuple[int, int] | None = None
         self._next_request_ns = 0
         self._next_sync_ns = 0
-        self._syncs = 0
-        self._syncs_sent: dict[int, int] = {}
+        self._num_syncs = 0
+        self._sync_send_times_ns: dict[int, int] = {}
         self._next_sequence = 0
-        self._stale_run = 0
+        self._consecutive_stale = 0
         self._foreign_frames = 0
-        self._heard_ns = 0
+        self._last_received_ns = 0
 
     def totals(self) -> dict[str, int]:
         """Return the counts of frames for diagnostics, {name: count}."""
@@ -184,12 +184,12 @@ class BoardSession:
         """Discard partly received and unsent bytes after the port was lost or closed."""
         self._decoder.reset()
         self._outgoing.clear()
-        self._heard_ns = now_ns
+        self._last_received_ns = now_ns
         return self._disconnect(Loss.CLOSED, now_ns)
 
-    def silent_ns(self, now_ns: int) -> int:
+    def idle_ns(self, now_ns: int) -> int:
         """Time since the last intact frame was received."""
-        return now_ns - self._heard_ns
+        return now_ns - self._last_received_ns
 
     def set_mode(self, mode: Mode) -> None:
         """Request `mode` until the board answers; a `ModeChanged` or `ModeRefused` follows."""
@@ -213,7 +213,7 @@ class BoardSession:
         Until the board confirms them, its corrections are counted and not delivered. `OffsetsRefused` follows if it
         cannot use them, except for offsets of 0, which a board without offsets has anyway.
         """
-        self._offsets_held = False
+        self._offsets_confirmed = False
         self._offsets_request.begin(SetOffsets(offsets))
         self._next_request_ns = 0
 
@@ -228,33 +228,33 @@ class BoardSession:
         events: list[Event] = []
         frames = self._decoder.feed(data)
         if frames:
-            self._heard_ns = now_ns
+            self._last_received_ns = now_ns
         for frame in frames:
-            events += self._accept(frame, now_ns, stamp_ns)
-        events += self._notice_foreign(now_ns)
+            events += self._handle(frame, now_ns, stamp_ns)
+        events += self._check_foreign_versions(now_ns)
         return events + self.tick(now_ns, stamp_ns)
 
     def tick(self, now_ns: int, stamp_ns: int) -> list[Event]:
         """Repeat requests, synchronise the clock, and check for a timeout."""
         events: list[Event] = []
-        if self.state is LinkState.READY and self.silent_ns(now_ns) > SILENCE_NS:
-            events += self._disconnect(Loss.SILENT, now_ns)
+        if self.state is LinkState.READY and self.idle_ns(now_ns) > LINK_TIMEOUT_NS:
+            events += self._disconnect(Loss.TIMEOUT, now_ns)
         if now_ns >= self._next_request_ns:
             self._next_request_ns = now_ns + REQUEST_INTERVAL_NS
             if self.state is not LinkState.READY:
                 self._send(*messages.encode(messages.GetInfo()))
                 return events
-            if self._ask(self._offsets_request) and self._offsets:
+            if self._send_request(self._offsets_request) and self._offsets:
                 events.append(OffsetsRefused(self._offsets_request.unanswered))
             if self._mode_request.pending:
-                self._ask(self._mode_request)
-            elif self._ask(self._radio_request):
+                self._send_request(self._mode_request)
+            elif self._send_request(self._radio_request):
                 events.append(RadioRefused(self._radio_request.unanswered))
         if self.state is LinkState.READY and now_ns >= self._next_sync_ns:
-            self._sync(now_ns, stamp_ns)
+            self._send_sync(now_ns, stamp_ns)
         return events
 
-    def _accept(self, frame: Frame, now_ns: int, stamp_ns: int) -> list[Event]:
+    def _handle(self, frame: Frame, now_ns: int, stamp_ns: int) -> list[Event]:
         try:
             return self._parse(frame, now_ns, stamp_ns)
         except LinkError:
@@ -263,25 +263,29 @@ class BoardSession:
 
     def _parse(self, frame: Frame, now_ns: int, stamp_ns: int) -> list[Event]:
         if frame.type == MessageType.HELLO:
-            return self._accept_hello(frame, now_ns, stamp_ns)
+            return self._handle_hello(frame, now_ns, stamp_ns)
         if self.state is not LinkState.READY:
             self.counts.withheld += 1
             return []
-        if not self._in_step(frame):
-            return self._disconnect(Loss.OUT_OF_STEP, now_ns) if self._stale_run >= _MAX_STALE else []
+        if not self._in_sequence(frame):
+            return (
+                self._disconnect(Loss.OUT_OF_SEQUENCE, now_ns)
+                if self._consecutive_stale >= _MAX_CONSECUTIVE_STALE
+                else []
+            )
         at_ns = 0
         if frame.type in _STAMPED and not frame.flags & Flag.ANSWER:
             at_ns = self.clock.stamp(frame.time_us, stamp_ns)
         message = messages.decode(frame.type, frame.payload, stamp_ns=at_ns)
         if isinstance(message, Correction):
-            return self._accept_correction(message, bool(frame.flags & Flag.ANSWER))
+            return self._handle_correction(message, bool(frame.flags & Flag.ANSWER))
         if isinstance(message, TimeSyncReply):
-            self._accept_sync(message, frame.time_us, stamp_ns)
+            self._handle_sync(message, frame.time_us, stamp_ns)
             return []
         if isinstance(message, Radio):
-            return self._accept_radio(message, bool(frame.flags & Flag.ANSWER))
+            return self._handle_radio(message, bool(frame.flags & Flag.ANSWER))
         if isinstance(message, OffsetsAnswer):
-            return self._accept_offsets(message)
+            return self._handle_offsets(message)
         if isinstance(message, RadioStatus) and self.radio is None:
             self._send(*messages.encode(GetRadio()))
         if isinstance(message, RangeMeasurement | Log | BoardStatus | RadioStatus):
@@ -290,19 +294,19 @@ class BoardSession:
         self.counts.unknown_type[frame.type] += 1
         return []
 
-    def _accept_hello(self, frame: Frame, now_ns: int, stamp_ns: int) -> list[Event]:
+    def _handle_hello(self, frame: Frame, now_ns: int, stamp_ns: int) -> list[Event]:
         hello = messages.decode(frame.type, frame.payload)
         assert isinstance(hello, Hello)
         boot = (hello.board_id, hello.boot_id)
         events: list[Event] = []
         if self.state is LinkState.READY:
-            if boot != self._boot:
+            if boot != self._boot_key:
                 events += self._disconnect(Loss.RESET, now_ns)
-            elif not self._in_step(frame):
+            elif not self._in_sequence(frame):
                 return []
-        if boot != self._boot:
+        if boot != self._boot_key:
             self.clock.reset()
-            self._boot = boot
+            self._boot_key = boot
         self.clock.arrival(frame.time_us, stamp_ns)
         self.hello = hello
         if self.state is not LinkState.READY:
@@ -310,15 +314,15 @@ class BoardSession:
             self.counts.connections += 1
             self.foreign_version = None
             self._next_sequence = (frame.sequence + 1) % _SEQUENCES
-            self._stale_run = 0
-            self._syncs = 0
+            self._consecutive_stale = 0
+            self._num_syncs = 0
             self._next_sync_ns = now_ns
             self._mode_request.repeat(
                 None if self._mode in (None, hello.mode) else messages.SetMode(self._mode)
             )
             self._radio_request.repeat(self._radio_request.message)
             self._offsets_request.repeat(self._offsets_request.message)
-            self._offsets_held = False
+            self._offsets_confirmed = False
             self._next_request_ns = now_ns
             events.append(Connected(hello))
         elif frame.flags & Flag.ANSWER and self._mode_request.is_answered_by(hello.request_sequence):
@@ -331,65 +335,65 @@ class BoardSession:
         message = self._offsets_request.message
         return message.offsets if isinstance(message, SetOffsets) else NO_OFFSETS
 
-    def _ask(self, request: _Request) -> bool:
+    def _send_request(self, request: _Request) -> bool:
         """Send a pending request; return True if it was given up after too many unanswered tries."""
         if not request.pending or request.message is None:
             return False
         request.tries += 1
-        if request.unanswered and request.tries > RADIO_TRIES:
+        if request.unanswered and request.tries > MAX_TRIES:
             request.pending = False
             return True
         sequence = self._send(*messages.encode(request.message))
         if sequence is not None:
-            _remember(request.sent, sequence, None)
+            _add_bounded(request.sent, sequence, None)
         return False
 
-    def _accept_offsets(self, answer: OffsetsAnswer) -> list[Event]:
+    def _handle_offsets(self, answer: OffsetsAnswer) -> list[Event]:
         if not self._offsets_request.is_answered_by(answer.request_sequence):
-            self.counts.unasked += 1
+            self.counts.unsolicited += 1
             return []
-        self._offsets_held = answer.accepted
+        self._offsets_confirmed = answer.accepted
         text = f"it keeps {answer.slots} offsets, and {len(self._offsets)} were requested"
         return [] if answer.accepted else [OffsetsRefused(text)]
 
-    def _accept_radio(self, radio: Radio, answer: bool) -> list[Event]:
+    def _handle_radio(self, radio: Radio, answer: bool) -> list[Event]:
         if answer and self._radio_request.is_answered_by(radio.request_sequence) and not radio.accepted:
             return [RadioRefused(radio.text)]
         self.radio = radio
         return [radio]
 
-    def _accept_correction(self, correction: Correction, answer: bool) -> list[Event]:
+    def _handle_correction(self, correction: Correction, answer: bool) -> list[Event]:
         if not self.model_matches:
             self.counts.wrong_model += 1
             return []
-        if self._offsets and not self._offsets_held:
+        if self._offsets and not self._offsets_confirmed:
             self.counts.wrong_offsets += 1
             return []
         if answer:
             # This host never requests corrections from a board.
-            self.counts.unasked += 1
+            self.counts.unsolicited += 1
             return []
         return [correction]
 
-    def _accept_sync(self, reply: TimeSyncReply, replied_us: int, stamp_ns: int) -> None:
-        sent_ns = self._syncs_sent.pop(reply.request_sequence, None)
+    def _handle_sync(self, reply: TimeSyncReply, replied_us: int, stamp_ns: int) -> None:
+        sent_ns = self._sync_send_times_ns.pop(reply.request_sequence, None)
         if sent_ns is None:
-            self.counts.unasked += 1
+            self.counts.unsolicited += 1
         else:
             self.clock.exchange(sent_ns, reply.received_us, replied_us, stamp_ns)
 
-    def _in_step(self, frame: Frame) -> bool:
+    def _in_sequence(self, frame: Frame) -> bool:
         gap = (frame.sequence - self._next_sequence) % _SEQUENCES
         if gap > MAX_GAP:
             self.counts.stale += 1
-            self._stale_run += 1
+            self._consecutive_stale += 1
             return False
         self.counts.lost += gap
         self._next_sequence = (frame.sequence + 1) % _SEQUENCES
-        self._stale_run = 0
+        self._consecutive_stale = 0
         return True
 
-    def _notice_foreign(self, now_ns: int) -> list[Event]:
+    def _check_foreign_versions(self, now_ns: int) -> list[Event]:
         counts = self._decoder.counts
         seen = counts.foreign_versions.total()
         if seen == self._foreign_frames:
@@ -399,7 +403,7 @@ class BoardSession:
         # The buffers may still contain frames of firmware that ran before the connected board was restarted.
         if self.state is LinkState.READY or version is None:
             return []
-        self._heard_ns = now_ns
+        self._last_received_ns = now_ns
         if self.state is LinkState.WRONG_VERSION and version == self.foreign_version:
             return []
         self.state = LinkState.WRONG_VERSION
@@ -414,19 +418,21 @@ class BoardSession:
         self.foreign_version = None
         for request in (self._mode_request, self._radio_request, self._offsets_request):
             request.sent.clear()
-        self._syncs_sent.clear()
+        self._sync_send_times_ns.clear()
         self._next_request_ns = now_ns
         return [Disconnected(loss)] if was_ready else []
 
-    def _sync(self, now_ns: int, stamp_ns: int) -> None:
+    def _send_sync(self, now_ns: int, stamp_ns: int) -> None:
         request = self._send(*messages.encode(messages.TimeSync()))
         if request is not None:
-            _remember(self._syncs_sent, request, stamp_ns)
-        self._syncs += 1
-        if self._syncs < FIRST_SYNCS:
+            _add_bounded(self._sync_send_times_ns, request, stamp_ns)
+        self._num_syncs += 1
+        if self._num_syncs < FIRST_SYNCS:
             self._next_sync_ns = now_ns + FIRST_SYNC_INTERVAL_NS
         else:
-            self._next_sync_ns = now_ns + round(SYNC_INTERVAL_NS * (0.7 + self._syncs * _GOLDEN % 0.6))
+            self._next_sync_ns = now_ns + round(
+                SYNC_INTERVAL_NS * (0.7 + self._num_syncs * _GOLDEN_RATIO % 0.6)
+            )
 
     def _send(self, kind: MessageType, payload: bytes) -> int | None:
         """Queue a frame; return its sequence number, or None if the queue is full."""
@@ -438,8 +444,8 @@ class BoardSession:
         return sequence
 
 
-def _remember(memory: dict[_Key, _Value], key: _Key, value: _Value) -> None:
+def _add_bounded(memory: dict[_Key, _Value], key: _Key, value: _Value) -> None:
     """Add an entry to a dictionary of bounded size; the oldest entry is dropped."""
     memory[key] = value
-    if len(memory) > _MAX_AWAITED:
+    if len(memory) > _MAX_PENDING:
         del memory[next(iter(memory))]

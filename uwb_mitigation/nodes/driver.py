@@ -26,11 +26,11 @@ from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
 from uwb_mitigation.bag.codec import encode_corrected, encode_range, encode_truth
 from uwb_mitigation.bag.poses import encode_true_position
 from uwb_mitigation.errors import ParameterError, UwbMitigationError
+from uwb_mitigation.link.board_driver import BoardDriver
 from uwb_mitigation.link.connection import PortAddress
 from uwb_mitigation.link.layout import Mode
 from uwb_mitigation.link.messages import Correction
-from uwb_mitigation.link.port import BoardPort
-from uwb_mitigation.link.radio import RadioSettings
+from uwb_mitigation.link.radio_settings import RadioSettings
 from uwb_mitigation.measurement import Cir, RangeMeasurement, Record
 from uwb_mitigation.nodes import diagnostics, topics
 from uwb_mitigation.nodes.diagnostics import Description
@@ -155,7 +155,7 @@ class Driver(ManagedNode):
             self._sensor_ranges = self.destroy_at_close(topics.SensorRanges(self), topics.SensorRanges.close)
 
         def make() -> BoardFeed:
-            port = BoardPort(
+            port = BoardDriver(
                 address,
                 baud=self.value("baud"),
                 dtr=self.value("dtr"),

@@ -10,6 +10,7 @@ from dataclasses import asdict, fields, replace
 from typing import Any, Protocol
 
 from uwb_mitigation.errors import ParameterError, format_id, parse_id
+from uwb_mitigation.link.board_driver import BoardDriver
 from uwb_mitigation.link.connection import Connection
 from uwb_mitigation.link.events import (
     Connected,
@@ -23,14 +24,13 @@ from uwb_mitigation.link.events import (
 )
 from uwb_mitigation.link.layout import PROTOCOL_VERSION, LogLevel, Mode, RadioState, Role
 from uwb_mitigation.link.messages import BoardStatus, Correction, Log, Radio
-from uwb_mitigation.link.port import BoardPort
-from uwb_mitigation.link.radio import NEVER_MS, RadioSettings, RadioStatus
+from uwb_mitigation.link.radio_settings import NEVER_MS, RadioSettings, RadioStatus
 from uwb_mitigation.measurement import RangeMeasurement
 from uwb_mitigation.nodes import diagnostics
 from uwb_mitigation.nodes.diagnostics import Description
 from uwb_mitigation.offsets import Offsets
-from uwb_mitigation.radio.bus import opener
-from uwb_mitigation.radio.port import RadioEvent, RadioLost, RadioPort
+from uwb_mitigation.radio.bus import bus_opener
+from uwb_mitigation.radio.radio_driver import RadioDriver, RadioEvent, RadioLost
 
 Value = Callable[[str], Any]
 """Returns the value of a parameter."""
@@ -138,7 +138,7 @@ class BoardFeed(LiveFeed):
 
     def __init__(
         self,
-        port: BoardPort,
+        port: BoardDriver,
         on_range: Callable[[RangeMeasurement], None],
         on_correction: Callable[[Correction], None],
         now_ns: Callable[[], int],
@@ -201,7 +201,7 @@ class BoardFeed(LiveFeed):
         problem = next(filter(None, problems), "")
         return hardware, *_level(problem, warning, "connected"), entries
 
-    def check(self, port: BoardPort) -> None:
+    def check(self, port: BoardDriver) -> None:
         """Log a problem once if it lasts longer than `EVENT_TIMEOUT_S`; a handshake is shorter."""
         now_s = time.monotonic()
         if now_s - self._checked_s < EVENT_TIMEOUT_S:
@@ -212,7 +212,7 @@ class BoardFeed(LiveFeed):
             self._logger.warning(f"{self._problem}; waiting for the board")
             self._logged = self._problem
 
-    def handle(self, event: Event, port: BoardPort) -> None:
+    def handle(self, event: Event, port: BoardDriver) -> None:
         log = self._logger
         match event:
             case Correction():
@@ -268,7 +268,7 @@ class RadioFeed(LiveFeed):
         on_range, now_ns, logger: see `LiveFeed`.
     """
 
-    _ports: Sequence[RadioPort]
+    _ports: Sequence[RadioDriver]
 
     def apply(self, changed: Collection[str], value: Value, offsets: Offsets) -> None:
         """Use new radio settings from the next exchange on."""
@@ -294,7 +294,7 @@ class RadioFeed(LiveFeed):
         level = _level(problem, next(filter(None, warnings), ""), "ranging" if is_tag else "answering")
         return hardware, *level, entries
 
-    def handle(self, event: RadioEvent, port: RadioPort) -> None:
+    def handle(self, event: RadioEvent, port: RadioDriver) -> None:
         match event:
             case Radio(settings=settings):
                 name, text = port.report().name, settings_text(settings)
@@ -339,7 +339,7 @@ def settings_of(value: Value) -> RadioSettings:
     return settings
 
 
-def open_radios(value: Value, now_ns: Callable[[], int]) -> list[RadioPort]:
+def open_radios(value: Value, now_ns: Callable[[], int]) -> list[RadioDriver]:
     """Open the radios of `source`, `port` and `radio.*`. The first has the role of the parameter, the others are anchors.
 
     Raises:
@@ -357,11 +357,11 @@ def open_radios(value: Value, now_ns: Callable[[], int]) -> list[RadioPort]:
         raise ParameterError(
             f"parameter {PREFIX}address with {len(names)} ports", valid="empty: each has its chip's address"
         )
-    openers = [opener(value("source"), name, value(PREFIX + "reset")) for name in names]
-    ports: list[RadioPort] = []
+    openers = [bus_opener(value("source"), name, value(PREFIX + "reset")) for name in names]
+    ports: list[RadioDriver] = []
     try:
         for number, open_bus in enumerate(openers):
-            ports.append(RadioPort(open_bus, _role_of(settings, number), stamp_clock=now_ns))
+            ports.append(RadioDriver(open_bus, _role_of(settings, number), stamp_clock=now_ns))
     except Exception:
         for port in ports:
             port.close()
@@ -426,7 +426,7 @@ def anchor_values(status: RadioStatus) -> dict[str, object]:
     """Return the values of the anchors in reach for the diagnostics."""
     values: dict[str, object] = {}
     for anchor in status.anchors:
-        last_seen = "never" if anchor.heard_ms == NEVER_MS else f"{anchor.heard_ms / 1000:.1f} s ago"
+        last_seen = "never" if anchor.age_ms == NEVER_MS else f"{anchor.age_ms / 1000:.1f} s ago"
         values[f"anchor {format_id(anchor.address)}"] = (
             f"{anchor.ranged} of {anchor.tried} ranged, {anchor.rx_power_dbm:.1f} dBm, last seen {last_seen}"
         )

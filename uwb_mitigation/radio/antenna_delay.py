@@ -12,10 +12,10 @@ from numpy.typing import ArrayLike
 
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.link.layout import Role
-from uwb_mitigation.link.radio import RadioSettings
+from uwb_mitigation.link.radio_settings import RadioSettings
 from uwb_mitigation.measurement import DEVICE_TICK_HZ, RangeMeasurement
 from uwb_mitigation.radio.bus import Bus
-from uwb_mitigation.radio.port import RadioPort
+from uwb_mitigation.radio.radio_driver import RadioDriver
 
 M_PER_TICK = 0.5 * 299_792_458.0 / DEVICE_TICK_HZ
 """Range error per tick that the total TX + RX antenna delay of one radio is too small: 2.35 mm
@@ -31,7 +31,7 @@ NOMINAL_TICKS = 2 * 16436
 MAX_FROM_NOMINAL_TICKS = 2000
 """Largest plausible difference from nominal. Radios differ by 100 ticks; a metre of antenna cable adds 600."""
 
-PATIENCE_S = 30.0
+TIMEOUT_S = 30.0
 """Timeout: if no range arrives for this time, the calibration is aborted."""
 
 
@@ -56,7 +56,7 @@ class AntennaDelay:
     ranges: int
 
 
-def find(
+def delay_from_ranges(
     ranges_m: ArrayLike, power_gap_db: ArrayLike, distance_m: float, before: Sequence[int]
 ) -> AntennaDelay:
     """Return the antenna delay for which the median range equals the distance.
@@ -100,7 +100,7 @@ def measure(
     exchanges: int,
     on_range: Callable[[], None],
 ) -> AntennaDelay:
-    """Range with one anchor until there are enough ranges, then `find` the delay.
+    """Range with one anchor until there are enough ranges, then `delay_from_ranges` the delay.
 
     Args:
         openers: of the tag's bus, and of the anchor's bus if the anchor is at this computer too; otherwise the
@@ -109,51 +109,51 @@ def measure(
         on_range: called after each range.
 
     Raises:
-        UwbMitigationError: see `find`; or no anchor answers, or several do.
-        ParameterError, MissingDependencyError: see `RadioPort`.
+        UwbMitigationError: see `delay_from_ranges`; or no anchor answers, or several do.
+        ParameterError, MissingDependencyError: see `RadioDriver`.
     """
-    wanted = settings, replace(settings, role=Role.ANCHOR, anchors=())
+    settings_of_roles = settings, replace(settings, role=Role.ANCHOR, anchors=())
     with ExitStack() as stack:
         ports = [
-            stack.enter_context(closing(RadioPort(opener, of)))
-            for opener, of in zip(openers, wanted, strict=False)
+            stack.enter_context(closing(RadioDriver(open_bus, radio_settings)))
+            for open_bus, radio_settings in zip(openers, settings_of_roles, strict=False)
         ]
         return _measure(ports, distance_m, exchanges, on_range)
 
 
 def _measure(
-    ports: Sequence[RadioPort], distance_m: float, exchanges: int, on_range: Callable[[], None]
+    ports: Sequence[RadioDriver], distance_m: float, exchanges: int, on_range: Callable[[], None]
 ) -> AntennaDelay:
     ranges: list[tuple[float, float]] = []
-    heard: set[int] = set()
-    until = time.monotonic() + PATIENCE_S
+    anchors: set[int] = set()
+    until = time.monotonic() + TIMEOUT_S
     while len(ranges) < exchanges:
         event = ports[0].get(0.2)
         if isinstance(event, RangeMeasurement):
-            if len(ports) > 1 and not _is_at(event.anchor_id, ports[1]):
+            if len(ports) > 1 and not _has_address(event.anchor_id, ports[1]):
                 continue
-            heard.add(event.anchor_id)
-            if len(heard) > 1:
+            anchors.add(event.anchor_id)
+            if len(anchors) > 1:
                 raise UwbMitigationError(
-                    f"anchors {', '.join(f'0x{anchor:016x}' for anchor in sorted(heard))} answer",
+                    f"anchors {', '.join(f'0x{anchor:016x}' for anchor in sorted(anchors))} answer",
                     valid="one: name it with --anchor",
                 )
             ranges.append((event.range_m, event.cir.rx_power_dbm - event.cir.first_path_power_dbm))
-            until = time.monotonic() + PATIENCE_S
+            until = time.monotonic() + TIMEOUT_S
             on_range()
         elif time.monotonic() > until:
             problems = [report.problem for report in (port.report() for port in ports) if report.problem]
             raise UwbMitigationError(
-                f"{len(ranges)} ranges of {exchanges}, and none for {PATIENCE_S:g} s",
+                f"{len(ranges)} ranges of {exchanges}, and none for {TIMEOUT_S:g} s",
                 valid="; ".join(problems) or "an anchor in reach, with the same channel, PRF, rate and PAN",
             )
     before = [settings.antenna_delay for port in ports if (settings := port.report().settings) is not None]
     if len(before) < len(ports):
         raise UwbMitigationError("a radio was lost at the end", valid="try again")
     measured, gaps = zip(*ranges, strict=True)
-    return find(measured, gaps, distance_m, before)
+    return delay_from_ranges(measured, gaps, distance_m, before)
 
 
-def _is_at(address: int, port: RadioPort) -> bool:
+def _has_address(address: int, port: RadioDriver) -> bool:
     settings = port.report().settings
     return settings is not None and settings.address == address

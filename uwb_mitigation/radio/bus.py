@@ -31,7 +31,7 @@ class Bus(Protocol):
         ...
 
     @property
-    def patience_us(self) -> int:
+    def timeout_us(self) -> int:
         """Timeout of a tag for the frames of an anchor on such a bus."""
         ...
 
@@ -53,23 +53,23 @@ class Bus(Protocol):
         ...
 
 
-def opener(source: str, place: str, reset: str = "") -> Callable[[], Bus]:
+def bus_opener(source: str, address: str, reset: str = "") -> Callable[[], Bus]:
     """Return a function that opens the bus of one radio.
 
     Args:
         source: `evb1000` or `spi`.
-        place: `/dev/ttyACM0`, `usb:0483:5740`; or `/dev/spidev0.0`.
+        address: `/dev/ttyACM0`, `usb:0483:5740`; or `/dev/spidev0.0`.
         reset: for spi, the reset line, such as `gpiochip0:25`; empty = not wired.
 
     Raises:
-        ParameterError: `place` is not valid.
+        ParameterError: `address` is not valid.
         MissingDependencyError: a dependency of this type of bus is not installed.
     """
     # Import the dependencies of a type of bus only if it is used.
     if source == "spi":
         from uwb_mitigation.radio.spidev_bus import SpidevBus
 
-        return functools.partial(SpidevBus, place, reset)
+        return functools.partial(SpidevBus, address, reset)
     from uwb_mitigation.radio.evb1000 import Evb1000Bus
 
-    return functools.partial(Evb1000Bus, PortAddress.parse(place))
+    return functools.partial(Evb1000Bus, PortAddress.parse(address))

@@ -17,16 +17,18 @@ import serial
 from uwb_mitigation.errors import LinkError
 from uwb_mitigation.link.connection import PortAddress
 
-ANSWER_WITHIN_S = 0.4
-ASK_AT_MOST = 3
+ANSWER_TIMEOUT_S = 0.4
+MAX_TRIES = 3
 """Number of tries: after stray octets from another program (ModemManager), the firmware ignores the first one."""
 
 MAX_READ_BYTES = 4093
 
 _START, _END = 0x02, 0x03
 _WRITE, _FAST = 1, 2
-_HEAD = struct.Struct("<BBHH")
-_HOW = "DIP switch S1-3 off (TREK1000: S1-4 to S1-7 on), then power the board up again: it shows USB to SPI"
+_HEADER = struct.Struct("<BBHH")
+_REMEDY = (
+    "DIP switch S1-3 off (TREK1000: S1-4 to S1-7 on), then power the board up again: it shows USB to SPI"
+)
 
 
 class Evb1000Bus:
@@ -45,14 +47,14 @@ class Evb1000Bus:
     has_reset = False
     # Eight transactions of 1.5 to 1.8 ms and the delay of polling. On a slower bus the time is increased at run time.
     reply_us = 16_500
-    patience_us = 60_000
+    timeout_us = 60_000
 
     def __init__(self, address: PortAddress) -> None:
         self._address = address
         self._fast = False
         self._port: serial.Serial | None = address.open()
         try:
-            self.version = self._greet()
+            self.version = self._read_version()
         except LinkError:
             self.close()
             raise
@@ -67,7 +69,7 @@ class Evb1000Bus:
         data = count if out is None else len(out)
         if data > MAX_READ_BYTES:
             raise self._error(f"{data} octets in one transaction", f"{MAX_READ_BYTES}")
-        request = _HEAD.pack(_START, flags, _HEAD.size + len(payload) + 1, data) + payload + bytes([_END])
+        request = _HEADER.pack(_START, flags, _HEADER.size + len(payload) + 1, data) + payload + bytes([_END])
         self._send(request)
         answer = self._receive(3 + (count if out is None else 0))
         if answer[0] != _START or answer[-1] != _END or answer[1]:
@@ -89,41 +91,41 @@ class Evb1000Bus:
                 self._port.close()
             self._port = None
 
-    def _greet(self) -> str:
+    def _read_version(self) -> str:
         text = ""
-        for _ in range(ASK_AT_MOST):
+        for _ in range(MAX_TRIES):
             # A late answer to an earlier program or request may arrive first.
-            text = self._ask() or text
+            text = self._query() or text
             if text.startswith(("y", "n")):
                 break
         if text.startswith("y"):
             return text[1:]
         if text.startswith("n"):
             raise self._error("the board ranges by itself")
-        told = f"the board answers deca? with {text!r}" if text else "no answer to deca?"
-        raise self._error(told, f"an EVB1000; {_HOW}")
+        problem = f"the board answers deca? with {text!r}" if text else "no answer to deca?"
+        raise self._error(problem, f"an EVB1000; {_REMEDY}")
 
-    def _ask(self) -> str:
+    def _query(self) -> str:
         """Return the answer to `deca?` up to its first NUL; a stale octet follows the NUL."""
-        self._drain()
+        self._discard_input()
         self._send(b"deca?")
         answer = b""
-        until = time.monotonic() + ANSWER_WITHIN_S
+        until = time.monotonic() + ANSWER_TIMEOUT_S
         while b"\0" not in answer and time.monotonic() < until:
             answer += self._read_some(until - time.monotonic())
-        self._drain()
+        self._discard_input()
         return answer.partition(b"\0")[0].decode("ascii", "replace")
 
-    def _drain(self) -> None:
+    def _discard_input(self) -> None:
         """Discard the rest of earlier answers."""
         with contextlib.suppress(LinkError):
-            until = time.monotonic() + ANSWER_WITHIN_S
+            until = time.monotonic() + ANSWER_TIMEOUT_S
             while time.monotonic() < until and self._read_some(0.02):
                 pass
 
     def _send(self, data: bytes) -> None:
         fd = self._fd()
-        until = time.monotonic() + ANSWER_WITHIN_S
+        until = time.monotonic() + ANSWER_TIMEOUT_S
         try:
             while data:
                 _, writable, _ = select.select([], [fd], [], max(0.0, until - time.monotonic()))
@@ -135,11 +137,11 @@ class Evb1000Bus:
 
     def _receive(self, count: int) -> bytes:
         answer = b""
-        until = time.monotonic() + ANSWER_WITHIN_S
+        until = time.monotonic() + ANSWER_TIMEOUT_S
         while len(answer) < count:
             piece = self._read_some(until - time.monotonic())
             if not piece:
-                raise self._error(f"{len(answer)} octets of {count} within {ANSWER_WITHIN_S} s")
+                raise self._error(f"{len(answer)} octets of {count} within {ANSWER_TIMEOUT_S} s")
             answer += piece
         return answer[:count]
 
@@ -162,7 +164,7 @@ class Evb1000Bus:
             raise self._lost("closed")
         return int(self._port.fileno())
 
-    def _error(self, what: str, valid: str = _HOW) -> LinkError:
+    def _error(self, what: str, valid: str = _REMEDY) -> LinkError:
         return LinkError(what, where=str(self._address), valid=valid)
 
     def _lost(self, why: str) -> LinkError:

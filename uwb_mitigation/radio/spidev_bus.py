@@ -38,11 +38,11 @@ class SpidevBus:
 
     # A transaction takes 0.1 ms in Linux, occasionally much longer.
     reply_us = 3_000
-    patience_us = 15_000
+    timeout_us = 15_000
 
     def __init__(self, device: str, reset: str = "") -> None:
-        place = re.fullmatch(r"/dev/spidev(\d+)\.(\d+)", device)
-        if place is None:
+        match = re.fullmatch(r"/dev/spidev(\d+)\.(\d+)", device)
+        if match is None:
             raise ParameterError(f"the SPI device {device!r}", valid="/dev/spidevBUS.SELECT")
         line = re.fullmatch(r"(?:/dev/)?(gpiochip\d+):(\d+)", reset)
         if reset and line is None:
@@ -56,7 +56,7 @@ class SpidevBus:
         self._held: int | None = None
         self._spi: Any = spidev.SpiDev()
         try:
-            self._spi.open(int(place[1]), int(place[2]))
+            self._spi.open(int(match[1]), int(match[2]))
             self._spi.mode = 0
             self.speed(False)
             self._float()

@@ -7,7 +7,7 @@ from ctypes import c_float, c_int, c_size_t, c_uint8, c_uint16, c_uint32, c_uint
 from dataclasses import asdict
 
 from uwb_mitigation.link.layout import MAX_ANCHORS
-from uwb_mitigation.link.radio import RadioSettings
+from uwb_mitigation.link.radio_settings import RadioSettings
 
 TRANSFER = ctypes.CFUNCTYPE(c_int, c_void_p, c_void_p, c_size_t, c_void_p, c_void_p, c_size_t)
 SPEED = ctypes.CFUNCTYPE(None, c_void_p, c_int)
@@ -60,7 +60,7 @@ class Config(ctypes.Structure):
         pan=c_uint16,
         **_of(c_uint8, "role report bias_correction anchor_count"),
         window=c_uint16,
-        **_of(c_uint32, "reply_us patience_us interval_us"),
+        **_of(c_uint32, "reply_us timeout_us interval_us"),
         anchors=c_uint64 * MAX_ANCHORS,
     )
 
@@ -69,7 +69,7 @@ class TwrCounts(ctypes.Structure):
     """`uwb_twr_counts`."""
 
     _fields_ = _fields(
-        **_of(c_uint32, "tried ranged no_answer late time_out damaged absurd broken refused restarts")
+        **_of(c_uint32, "tried ranged no_answer late timeout damaged implausible broken refused restarts")
     )
 
     def as_dict(self) -> dict[str, int]:
@@ -81,18 +81,18 @@ class TwrAnchor(ctypes.Structure):
     """`uwb_twr_anchor`."""
 
     _fields_ = _fields(
-        **_of(c_uint64, "address heard_us due_us"),
+        **_of(c_uint64, "address last_seen_us due_us"),
         **_of(c_uint32, "tried ranged answer_us misses"),
         rx_power_dbm=c_float,
     )
 
 
-USUAL_REPLY_US, USUAL_PATIENCE_US = 1500, 6000
+DEFAULT_REPLY_US, DEFAULT_TIMEOUT_US = 1500, 6000
 """Default times for the SPI of a microcontroller, as in `uwb_twr_defaults`."""
 
 
 def config(
-    settings: RadioSettings, reply_us: int = USUAL_REPLY_US, patience_us: int = USUAL_PATIENCE_US
+    settings: RadioSettings, reply_us: int = DEFAULT_REPLY_US, timeout_us: int = DEFAULT_TIMEOUT_US
 ) -> Config:
     """Return the settings as the firmware's structure; the given times replace times of 0.
 
@@ -104,7 +104,7 @@ def config(
     anchors = values.pop("anchors")
     radio = {name: values.pop(name) for name, *_ in ChipSettings._fields_ if name in values}
     values["reply_us"] = settings.reply_us or reply_us
-    values["patience_us"] = settings.patience_us or patience_us
+    values["timeout_us"] = settings.timeout_us or timeout_us
     return Config(
         radio=ChipSettings(**radio),
         anchor_count=len(anchors),

@@ -249,7 +249,7 @@ int main(void) {
     for (;;) {
         WDT_RR0 = WDT_RELOAD;
         receive_waiting();
-        (void)uwb_ranger_turn(&ranger);
+        (void)uwb_ranger_step(&ranger);
         /* Green flickers with the ranges; red: the radio does not work. */
         *(ranger.twr.counts.ranged & 1u ? &GPIO_OUTCLR : &GPIO_OUTSET) = 1u << LED_GREEN;
         *(ranger.twr.running ? &GPIO_OUTSET : &GPIO_OUTCLR) = 1u << LED_RED;

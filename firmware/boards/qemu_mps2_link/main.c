@@ -113,7 +113,7 @@ int main(void) {
         /* Backpressure on the radio's side: the emulator's sender waits where a real radio would lose ranges. */
         if (board.queue.used < sizeof queue / 4) {
             const size_t count = receive(RADIO_UART, bytes, sizeof bytes);
-            uwb_board_measure(&board, bytes, count, now_us);
+            uwb_board_receive_from_radio(&board, bytes, count, now_us);
             moved += count;
         }
         uwb_board_tick(&board, now_us);

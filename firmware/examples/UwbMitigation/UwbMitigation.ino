@@ -88,7 +88,7 @@ void loop() {
     uint8_t bytes[PACKET];
     feed_watchdog();
     size_t count = take(Serial1, bytes, sizeof bytes);
-    uwb_board_measure(&board, bytes, count, uptime_us());
+    uwb_board_receive_from_radio(&board, bytes, count, uptime_us());
     count = take(Serial, bytes, sizeof bytes);
     uwb_board_receive(&board, bytes, count, uptime_us());
     uwb_board_tick(&board, uptime_us());

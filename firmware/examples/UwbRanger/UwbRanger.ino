@@ -164,7 +164,7 @@ void loop() {
         bytes[count++] = (uint8_t)Serial.read();
     }
     uwb_board_receive(&ranger.board, bytes, count, uptime_us(nullptr));
-    (void)uwb_ranger_turn(&ranger);
+    (void)uwb_ranger_step(&ranger);
     send_waiting();
     digitalWrite(LED_PWR, (bool)Serial ? HIGH : LOW);
     digitalWrite(LED_BUILTIN, (ranger.twr.counts.ranged & 1u) ? HIGH : LOW);

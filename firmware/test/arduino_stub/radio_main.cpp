@@ -123,7 +123,7 @@ static void run_anchor(dw1000_chip *its, void *context) {
     config.role = UWB_ROLE_ANCHOR;
     uwb_twr_start(&twr, &io, &config, 5, (uint8_t *)measurement, sizeof measurement);
     for (;;) {
-        (void)uwb_twr_turn(&twr, anchor_now(host) + 100000);
+        (void)uwb_twr_step(&twr, anchor_now(host) + 100000);
     }
 }
 

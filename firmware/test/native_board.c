@@ -11,10 +11,10 @@ typedef struct {
     uint32_t arena[4096];
     uint8_t queue[16384];
     uint64_t now_us;
-} host_board;
+} native_board;
 
-host_board *host_board_new(int mode, int with_model, size_t queue_bytes) {
-    host_board *const host = calloc(1, sizeof *host);
+native_board *native_board_new(int mode, int with_model, size_t queue_bytes) {
+    native_board *const host = calloc(1, sizeof *host);
     if (host == NULL || queue_bytes > sizeof host->queue) {
         abort();
     }
@@ -28,27 +28,27 @@ host_board *host_board_new(int mode, int with_model, size_t queue_bytes) {
     return host;
 }
 
-void host_board_free(host_board *host) {
+void native_board_free(native_board *host) {
     free(host);
 }
 
-void host_board_receive(host_board *host, const uint8_t *bytes, size_t count, uint64_t now_us) {
+void native_board_receive(native_board *host, const uint8_t *bytes, size_t count, uint64_t now_us) {
     host->now_us = now_us;
     uwb_board_receive(&host->board, bytes, count, now_us);
 }
 
-void host_board_measure(host_board *host, const uint8_t *bytes, size_t count, uint64_t now_us) {
+void native_board_receive_from_radio(native_board *host, const uint8_t *bytes, size_t count, uint64_t now_us) {
     host->now_us = now_us;
-    uwb_board_measure(&host->board, bytes, count, now_us);
+    uwb_board_receive_from_radio(&host->board, bytes, count, now_us);
 }
 
-void host_board_tick(host_board *host, uint64_t now_us) {
+void native_board_tick(native_board *host, uint64_t now_us) {
     host->now_us = now_us;
     uwb_board_tick(&host->board, now_us);
 }
 
 /* Take what waits to be sent, at most `limit` bytes, at the time of the last call. */
-size_t host_board_output(host_board *host, uint8_t *bytes, size_t limit) {
+size_t native_board_output(native_board *host, uint8_t *bytes, size_t limit) {
     size_t taken = 0;
     const uint8_t *piece;
     size_t count;
@@ -63,7 +63,7 @@ size_t host_board_output(host_board *host, uint8_t *bytes, size_t limit) {
 
 /* Decode one wire; returns the last frame's bytes of payload, or -1. Counts: frames, bad_cobs, bad_length, bad_crc,
  * oversize, foreign_versions. */
-int host_decode(const uint8_t *bytes, size_t count, uwb_header_t *header, uint8_t *payload, uint32_t *counts) {
+int native_decode(const uint8_t *bytes, size_t count, uwb_header_t *header, uint8_t *payload, uint32_t *counts) {
     uwb_decoder *const decoder = calloc(1, sizeof *decoder);
     if (decoder == NULL) {
         abort();
@@ -82,7 +82,7 @@ int host_decode(const uint8_t *bytes, size_t count, uwb_header_t *header, uint8_
 }
 
 /* `wire` has UWB_MAX_WIRE_BYTES. */
-size_t host_encode(const uwb_header_t *header, const uint8_t *payload, size_t payload_bytes, uint8_t *wire) {
+size_t native_encode(const uwb_header_t *header, const uint8_t *payload, size_t payload_bytes, uint8_t *wire) {
     memcpy(wire + UWB_WIRE_LEAD, header, sizeof *header);
     memcpy(wire + UWB_WIRE_LEAD + sizeof *header, payload, payload_bytes);
     return uwb_encode_frame(wire, payload_bytes);

@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 
 from uwb_mitigation.errors import LinkError
+from uwb_mitigation.link.board_driver import BoardDriver
 from uwb_mitigation.link.connection import PortAddress
 from uwb_mitigation.link.emulated_board import EmulatedBoard
 from uwb_mitigation.link.events import Connected, Disconnected, Event, Loss
 from uwb_mitigation.link.faults import Faults
 from uwb_mitigation.link.messages import Hello
-from uwb_mitigation.link.port import BoardPort
 from uwb_mitigation.measurement import Cir, RangeMeasurement, Record
 from uwb_mitigation.radio.evb1000 import Evb1000Bus
 
@@ -58,13 +58,13 @@ def board(link: Path) -> Iterator[EmulatedBoard]:
 
 
 @pytest.fixture
-def port(board: EmulatedBoard, link: Path) -> Iterator[BoardPort]:
-    opened = BoardPort(PortAddress(str(link)))
+def port(board: EmulatedBoard, link: Path) -> Iterator[BoardDriver]:
+    opened = BoardDriver(PortAddress(str(link)))
     yield opened
     opened.close()
 
 
-def wait_for(port: BoardPort, wanted: Callable[[Event], bool]) -> Event:
+def wait_for(port: BoardDriver, wanted: Callable[[Event], bool]) -> Event:
     deadline = time.monotonic() + PATIENCE_S
     while time.monotonic() < deadline:
         event = port.get(0.1)
@@ -118,14 +118,14 @@ def test_board_that_resets_is_connected_again(board, port):
 
     loss = wait_for(port, of(Disconnected))
 
-    assert loss.loss in (Loss.RESET, Loss.OUT_OF_STEP)
+    assert loss.loss in (Loss.RESET, Loss.OUT_OF_SEQUENCE)
     wait_for(port, of(RangeMeasurement))
 
 
 def test_faulty_channel_delivers_only_sent_messages(link):
     faults = Faults(2e-4, 2e-4, 2e-4, lose=0.05, duplicate=0.05)
     with EmulatedBoard(Recording(), rate_hz=1000, faults=faults, link=link, seed=4):
-        port = BoardPort(PortAddress(str(link)))
+        port = BoardDriver(PortAddress(str(link)))
         received = [wait_for(port, of(RangeMeasurement)) for _ in range(300)]
         counts = port.report().counts
         port.close()
@@ -141,7 +141,7 @@ def test_faulty_channel_delivers_only_sent_messages(link):
 
 def test_missing_port_is_reported_and_awaited(tmp_path):
     path = tmp_path / "later"
-    port = BoardPort(PortAddress(str(path)))
+    port = BoardDriver(PortAddress(str(path)))
     assert port.get(0.01) is None
     assert "is not there" in port.report().problem
 
@@ -161,7 +161,7 @@ def test_port_in_use_is_reported_with_the_program(exclusive: bool):
         [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     ) as other:
         other.stdout.readline()
-        port = BoardPort(PortAddress(name))
+        port = BoardDriver(PortAddress(name))
         place = "in use by" if exclusive else "also open in"
         wait_until(lambda: place in port.report().problem)
         assert f"(process {other.pid})" in port.report().problem
@@ -175,7 +175,7 @@ def test_port_in_use_is_reported_with_the_program(exclusive: bool):
 
 
 def test_close_ends_a_wait_in_another_thread(link):
-    port = BoardPort(PortAddress(str(link)))
+    port = BoardDriver(PortAddress(str(link)))
     events = []
     reader = threading.Thread(target=lambda: events.append(port.get(60.0)))
     reader.start()
@@ -189,7 +189,7 @@ def test_close_ends_a_wait_in_another_thread(link):
 
 
 def test_unread_events_are_dropped_and_counted(board, link):
-    port = BoardPort(PortAddress(str(link)), capacity=5)
+    port = BoardDriver(PortAddress(str(link)), capacity=5)
     wait_until(lambda: port.report().counts["overflowed"] > 20)
 
     oldest = port.get(PATIENCE_S)

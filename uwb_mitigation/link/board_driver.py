@@ -13,15 +13,15 @@ from dataclasses import dataclass
 import serial
 
 from uwb_mitigation.errors import LinkError
-from uwb_mitigation.link.connection import CAPACITY, Connection, PortAddress, users_of
+from uwb_mitigation.link.connection import QUEUE_CAPACITY, Connection, PortAddress, processes_using
 from uwb_mitigation.link.events import Event, LinkState
 from uwb_mitigation.link.layout import Mode
 from uwb_mitigation.link.messages import Hello
-from uwb_mitigation.link.radio import RadioSettings
+from uwb_mitigation.link.radio_settings import RadioSettings
 from uwb_mitigation.link.session import BoardSession
 from uwb_mitigation.offsets import Offsets
 
-REOPEN_AFTER_SILENCE_NS = 10 * 10**9
+REOPEN_TIMEOUT_NS = 10 * 10**9
 """Timeout after which the port is reopened. After a suspend, an open port may never receive data again."""
 
 _TICK_S = 0.05
@@ -29,7 +29,7 @@ _READ_BYTES = 1 << 16
 
 
 @dataclass(frozen=True, slots=True)
-class PortReport:
+class BoardReport:
     """The state of a port and its board, for diagnostics.
 
     Attributes:
@@ -51,7 +51,7 @@ class PortReport:
     counts: dict[str, int]
 
 
-class BoardPort(Connection[Event]):
+class BoardDriver(Connection[Event]):
     """Keeps a board connected until `close`; reconnects after unplugging, resets, timeouts and noise.
 
     Args:
@@ -73,7 +73,7 @@ class BoardPort(Connection[Event]):
         mode: Mode | None = None,
         expected_model_id: int | None = None,
         stamp_clock: Callable[[], int] = time.time_ns,
-        capacity: int = CAPACITY,
+        capacity: int = QUEUE_CAPACITY,
     ) -> None:
         super().__init__(f"board at {address}", f"{address} is not there", capacity)
         self._address = address
@@ -99,11 +99,11 @@ class BoardPort(Connection[Event]):
         with self._lock:
             self._session.set_offsets(offsets)
 
-    def report(self) -> PortReport:
+    def report(self) -> BoardReport:
         """Return the present state."""
         with self._lock:
             session, clock = self._session, self._session.clock
-            return PortReport(
+            return BoardReport(
                 port=self._port,
                 problem=self.problem,
                 hello=session.hello,
@@ -132,7 +132,7 @@ class BoardPort(Connection[Event]):
         with contextlib.suppress(OSError, ValueError, NotImplementedError):
             # Without this flag USB bridges delay bytes by 16 ms. Other ports do not support it.
             port.set_low_latency_mode(True)
-        others = ", ".join(users_of(port.port))
+        others = ", ".join(processes_using(port.port))
         connections = self._session.counts.connections
         with self._lock:
             self._port, self._problem, self._others = port.port, "", others
@@ -147,7 +147,7 @@ class BoardPort(Connection[Event]):
                 self._port = ""
                 self._put(self._session.closed(time.monotonic_ns()))
             port.close()
-            self._worked = self._session.counts.connections > connections
+            self._was_connected = self._session.counts.connections > connections
 
     def _serve(self, port: serial.Serial) -> None:
         fd = port.fileno()
@@ -160,7 +160,7 @@ class BoardPort(Connection[Event]):
             now_ns, stamp_ns = time.monotonic_ns(), self._stamp_clock()
             with self._lock:
                 self._put(self._session.receive(data, now_ns, stamp_ns))
-                if self._session.silent_ns(now_ns) > REOPEN_AFTER_SILENCE_NS:
+                if self._session.idle_ns(now_ns) > REOPEN_TIMEOUT_NS:
                     raise LinkError("is silent", where=str(self._address))
                 # While the port accepts no bytes, requests wait in the bounded queue of the session.
                 if not outgoing:

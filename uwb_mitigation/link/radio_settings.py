@@ -13,7 +13,7 @@ PREAMBLES = (64, 128, 256, 512, 1024, 1536, 2048, 4096)
 RATES_KBPS = (110, 850, 6800)
 PRFS_MHZ = (16, 64)
 NEVER_MS = 0xFFFFFFFF
-"""`AnchorInReach.heard_ms` of an anchor that was never received."""
+"""`AnchorStatus.age_ms` of an anchor that was never received."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +40,7 @@ class RadioSettings:
         anchors: addresses that a tag polls in turn; empty = anchors found by broadcast.
         reply_us: time from the reception of ANSWER to FINAL; 0 = default for the tag's bus and processor, plus the
             duration of long frames.
-        patience_us: timeout of a tag for an anchor's frames; 0 = default, also plus the duration of long frames.
+        timeout_us: timeout of a tag for an anchor's frames; 0 = default, also plus the duration of long frames.
         interval_us: minimum time between the starts of two exchanges.
         report: an anchor also sends its ranges to its host.
         bias_correction: correct ranges for the received power (APS011); the models were trained without it.
@@ -60,7 +60,7 @@ class RadioSettings:
     window: int = 157
     anchors: tuple[int, ...] = ()
     reply_us: int = 0
-    patience_us: int = 0
+    timeout_us: int = 0
     interval_us: int = 0
     report: bool = False
     bias_correction: bool = False
@@ -81,8 +81,8 @@ class RadioSettings:
         if self.reply_us:
             # Smart power allows one frame per millisecond; it exists at 6.8 Mbit/s only.
             _within("reply_us", self.reply_us, 1000 if self.rate_kbps == 6800 else 200, 100_000)
-        if self.patience_us:
-            _within("patience_us", self.patience_us, 400, 500_000)
+        if self.timeout_us:
+            _within("timeout_us", self.timeout_us, 400, 500_000)
         _within("interval_us", self.interval_us, 0, 60_000_000)
         _within("anchors", len(self.anchors), 0, MAX_ANCHORS)
         for anchor in self.anchors:
@@ -90,14 +90,14 @@ class RadioSettings:
 
 
 @dataclass(frozen=True, slots=True)
-class AnchorInReach:
+class AnchorStatus:
     """Exchanges of a tag with one anchor; the fields of `layout.RADIO_ANCHOR`, in the same order."""
 
     address: int
     tried: int
     ranged: int
     rx_power_dbm: float
-    heard_ms: int
+    age_ms: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,16 +108,16 @@ class RadioStatus:
     ranged: int = 0
     no_answer: int = 0
     late: int = 0
-    time_out: int = 0
+    timeout: int = 0
     damaged: int = 0
-    absurd: int = 0
+    implausible: int = 0
     broken: int = 0
     refused: int = 0
     restarts: int = 0
     temperature_c: float = math.nan
     voltage: float = math.nan
     state: RadioState = RadioState.RUNNING
-    anchors: tuple[AnchorInReach, ...] = ()
+    anchors: tuple[AnchorStatus, ...] = ()
 
 
 def preamble_codes(channel: int, prf_mhz: int) -> range:

@@ -25,12 +25,12 @@ from uwb_mitigation.errors import LinkError, MissingDependencyError, ParameterEr
 from uwb_mitigation.link.connection import PortAddress
 from uwb_mitigation.link.layout import RadioState, Role
 from uwb_mitigation.link.messages import Radio
-from uwb_mitigation.link.radio import RadioSettings
+from uwb_mitigation.link.radio_settings import RadioSettings
 from uwb_mitigation.measurement import RangeMeasurement
 from uwb_mitigation.radio import spidev_bus
 from uwb_mitigation.radio.evb1000 import Evb1000Bus
-from uwb_mitigation.radio.host import HostRadio
-from uwb_mitigation.radio.port import RadioLost, RadioPort
+from uwb_mitigation.radio.native_radio import NativeRadio
+from uwb_mitigation.radio.radio_driver import RadioDriver, RadioLost
 from uwb_mitigation.radio.spidev_bus import SpidevBus
 
 pytestmark = NEEDS_CC
@@ -42,7 +42,7 @@ def bus(path: object) -> Callable[[], Evb1000Bus]:
     return lambda: Evb1000Bus(PortAddress.parse(str(path)))
 
 
-def wait_for(port: RadioPort, kind: type, count: int = 1) -> list:
+def wait_for(port: RadioDriver, kind: type, count: int = 1) -> list:
     """Wait for a number of events of one type; ignore others."""
     found: list = []
     until = time.monotonic() + GENEROUS_S
@@ -72,8 +72,8 @@ def test_tag_and_anchor_on_usb_recover_from_unplugging(
     boards: tuple[EmulatedEvb1000s, Path],
 ):
     emulated, prefix = boards
-    anchor = RadioPort(bus(f"{prefix}1"), RadioSettings(role=Role.ANCHOR))
-    tag = RadioPort(bus(f"{prefix}0"), RadioSettings())
+    anchor = RadioDriver(bus(f"{prefix}1"), RadioSettings(role=Role.ANCHOR))
+    tag = RadioDriver(bus(f"{prefix}0"), RadioSettings())
     try:
         (radio,) = wait_for(tag, Radio)
         assert radio.settings.address
@@ -254,12 +254,12 @@ def test_reset_line_is_pulled_low_and_never_driven_high(monkeypatch: pytest.Monk
     spi.speed(True)
     spi.transfer(b"\x98", b"\x34\x12", 0)
     assert spi.transfer(b"\x18", None, 2) == b"\x34\x12"
-    radio = HostRadio(spi, RadioSettings())
+    radio = NativeRadio(spi, RadioSettings())
     try:
         until = time.monotonic() + GENEROUS_S
         while not radio.address:
             assert time.monotonic() < until
-            radio.turn(0.1)
+            radio.exchange(0.1)
         low = (25, gpio.OUTPUT | gpio.OPEN_DRAIN)
         assert gpio.requests[:3] == [(25, gpio.INPUT), low, (25, gpio.INPUT)]
         assert gpio.chip.fault is None

@@ -9,16 +9,16 @@ from dataclasses import dataclass
 from uwb_mitigation.link.connection import Connection
 from uwb_mitigation.link.layout import RadioState
 from uwb_mitigation.link.messages import Radio
-from uwb_mitigation.link.radio import RadioSettings, RadioStatus
+from uwb_mitigation.link.radio_settings import RadioSettings, RadioStatus
 from uwb_mitigation.measurement import RangeMeasurement
 from uwb_mitigation.radio.bus import Bus
-from uwb_mitigation.radio.host import HostRadio, load
+from uwb_mitigation.radio.native_radio import NativeRadio, load
 
 STATUS_INTERVAL_S = 1.0
 SENSORS_INTERVAL_S = 10.0
 """Interval between readings of temperature and voltage. The receiver is off meanwhile: 20 ms over USB."""
 
-_TURN_S = 0.1
+_EXCHANGE_TIMEOUT_S = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,7 @@ class RadioReport:
     overflowed: int
 
 
-class RadioPort(Connection[RadioEvent]):
+class RadioDriver(Connection[RadioEvent]):
     """Operates one radio until `close`, and reopens its bus after a loss.
 
     Events are measurements, `Radio` at each start of the chip, `RadioStatus` once a second, `RadioLost`.
@@ -79,12 +79,12 @@ class RadioPort(Connection[RadioEvent]):
         load()
         self._open_bus = open_bus
         self._stamp_clock = stamp_clock
-        self._wanted = settings
-        self._changed_settings = False
+        self._requested_settings = settings
+        self._settings_changed = False
         self._name = ""
         self._settings: RadioSettings | None = None
         self._status = RadioStatus(state=RadioState.BUS)
-        self._radio: HostRadio | None = None
+        self._radio: NativeRadio | None = None
         self._thread.start()
 
     def set_radio(self, settings: RadioSettings) -> None:
@@ -95,7 +95,7 @@ class RadioPort(Connection[RadioEvent]):
         """
         settings.check()
         with self._lock:
-            self._wanted, self._changed_settings = settings, True
+            self._requested_settings, self._settings_changed = settings, True
 
     def report(self) -> RadioReport:
         """Return the present state."""
@@ -113,7 +113,7 @@ class RadioPort(Connection[RadioEvent]):
         bus = self._open_bus()
         try:
             if self._radio is None:
-                self._radio = HostRadio(bus, self._wanted, stamp_clock=self._stamp_clock)
+                self._radio = NativeRadio(bus, self._requested_settings, stamp_clock=self._stamp_clock)
             self._radio.use(bus)
             with self._lock:
                 self._name = bus.name
@@ -122,26 +122,26 @@ class RadioPort(Connection[RadioEvent]):
         finally:
             bus.close()
 
-    def _lost(self, text: str) -> None:
+    def _on_loss(self, text: str) -> None:
         self._name = ""
         if self._problem != text:
             self._put([RadioLost(text)])
 
-    def _serve(self, radio: HostRadio) -> None:
+    def _serve(self, radio: NativeRadio) -> None:
         """Range until the connection is closed; raise an exception if the bus is lost."""
         started = False
         status_due = sensors_due = 0.0
         while not self.closed:
             with self._lock:
-                changed, self._changed_settings = self._changed_settings, False
-                wanted = self._wanted
+                changed, self._settings_changed = self._settings_changed, False
+                wanted = self._requested_settings
             if changed:
                 radio.configure(wanted)
                 started = False
-            measured = radio.turn(_TURN_S)
+            measured = radio.exchange(_EXCHANGE_TIMEOUT_S)
             events: list[RadioEvent] = []
             if not started and radio.address:
-                started = self._worked = True
+                started = self._was_connected = True
                 events.append(Radio(radio.settings))
             if measured is not None:
                 events.append(measured)

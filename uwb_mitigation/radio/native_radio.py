@@ -22,7 +22,7 @@ from uwb_mitigation.firmware_export.compiling import (
 )
 from uwb_mitigation.link import messages
 from uwb_mitigation.link.layout import MessageType, RadioState
-from uwb_mitigation.link.radio import NEVER_MS, AnchorInReach, RadioSettings, RadioStatus
+from uwb_mitigation.link.radio_settings import NEVER_MS, AnchorStatus, RadioSettings, RadioStatus
 from uwb_mitigation.measurement import RangeMeasurement
 from uwb_mitigation.radio import structures
 from uwb_mitigation.radio.bus import Bus
@@ -38,7 +38,7 @@ _FAULTS = {
 }
 
 
-class HostRadio:
+class NativeRadio:
     """A radio that performs one exchange per call, according to its settings. Not thread-safe.
 
     Args:
@@ -64,28 +64,28 @@ class HostRadio:
         self._io = structures.Io(
             None,
             structures.TRANSFER(self._transfer),
-            structures.SPEED(lambda _, fast: self._guard(lambda: self._bus.speed(bool(fast)))),
-            structures.RESET(lambda _: self._guard(lambda: self._bus.reset()))
+            structures.SPEED(lambda _, fast: self._catch_exception(lambda: self._bus.speed(bool(fast)))),
+            structures.RESET(lambda _: self._catch_exception(lambda: self._bus.reset()))
             if bus.has_reset
             else structures.RESET(),
             structures.NOW(lambda _: time.monotonic_ns() // 1000),
-            structures.WAIT(lambda _, until_us: self._guard(lambda: self._bus.pause())),
+            structures.WAIT(lambda _, until_us: self._catch_exception(lambda: self._bus.pause())),
             structures.SLEEP(lambda _, us: time.sleep(us * 1e-6)),
         )
-        self._radio = self._library.host_radio_new(
+        self._radio = self._library.native_radio_new(
             ctypes.byref(self._io), ctypes.byref(config), secrets.randbits(64)
         )
         self._temperature_c = self._voltage = float("nan")
 
-    def turn(self, at_most_s: float) -> RangeMeasurement | None:
+    def exchange(self, timeout_s: float) -> RangeMeasurement | None:
         """Perform one exchange; return None after the timeout. An exchange may end after it.
 
         Raises:
             LinkError: the bus is lost, or no chip answers; the next call tries to start the chip again.
         """
         self._failure = None
-        until_us = time.monotonic_ns() // 1000 + round(at_most_s * 1e6)
-        event = self._library.host_radio_turn(self._radio, until_us)
+        until_us = time.monotonic_ns() // 1000 + round(timeout_s * 1e6)
+        event = self._library.native_radio_exchange(self._radio, until_us)
         if self._failure is not None:
             raise self._failure
         if event == _FAULT:
@@ -98,12 +98,12 @@ class HostRadio:
         self._bus = bus
 
     def configure(self, settings: RadioSettings) -> None:
-        """Use other settings, starting with the next turn.
+        """Use other settings, starting with the next exchange.
 
         Raises:
             ParameterError: the settings are invalid or not supported by this radio.
         """
-        refusal = self._library.host_radio_configure(self._radio, ctypes.byref(self._config(settings)))
+        refusal = self._library.native_radio_configure(self._radio, ctypes.byref(self._config(settings)))
         if refusal is not None:
             raise ParameterError(f"radio settings: {refusal.decode()}")
         self._settings = settings
@@ -111,13 +111,13 @@ class HostRadio:
     @property
     def address(self) -> int:
         """Address of the radio; 0 until the chip has started."""
-        address: int = self._library.host_radio_address(self._radio)
+        address: int = self._library.native_radio_address(self._radio)
         return address
 
     @property
     def settings(self) -> RadioSettings:
         """Active settings; contains the chip's own values once it has started."""
-        chip: structures.ChipSettings = self._library.host_radio_settings(self._radio)[0]
+        chip: structures.ChipSettings = self._library.native_radio_settings(self._radio)[0]
         return replace(
             self._settings,
             address=self.address or self._settings.address,
@@ -125,7 +125,7 @@ class HostRadio:
             tx_power=chip.tx_power,
             antenna_delay=chip.antenna_delay,
             reply_us=self._times_us[0],
-            patience_us=self._times_us[1],
+            timeout_us=self._times_us[1],
         )
 
     def read_sensors(self) -> None:
@@ -136,7 +136,9 @@ class HostRadio:
         """
         temperature, voltage = c_float(), c_float()
         self._failure = None
-        done = self._library.host_radio_sensors(self._radio, ctypes.byref(temperature), ctypes.byref(voltage))
+        done = self._library.native_radio_sensors(
+            self._radio, ctypes.byref(temperature), ctypes.byref(voltage)
+        )
         if self._failure is not None:
             raise self._failure
         if not done:
@@ -144,9 +146,9 @@ class HostRadio:
 
     def status(self) -> RadioStatus:
         """Return the status: state and counts."""
-        counts: structures.TwrCounts = self._library.host_radio_counts(self._radio)[0]
+        counts: structures.TwrCounts = self._library.native_radio_counts(self._radio)[0]
         count = c_size_t()
-        table = self._library.host_radio_anchors(self._radio, ctypes.byref(count))
+        table = self._library.native_radio_anchors(self._radio, ctypes.byref(count))
         now_us = time.monotonic_ns() // 1000
         return RadioStatus(
             **counts.as_dict(),
@@ -154,12 +156,14 @@ class HostRadio:
             voltage=self._voltage,
             state=self._state(),
             anchors=tuple(
-                AnchorInReach(
+                AnchorStatus(
                     anchor.address,
                     anchor.tried,
                     anchor.ranged,
                     anchor.rx_power_dbm,
-                    min((now_us - anchor.heard_us) // 1000, NEVER_MS - 1) if anchor.heard_us else NEVER_MS,
+                    min((now_us - anchor.last_seen_us) // 1000, NEVER_MS - 1)
+                    if anchor.last_seen_us
+                    else NEVER_MS,
                 )
                 for anchor in table[: count.value]
             ),
@@ -168,25 +172,27 @@ class HostRadio:
     def close(self) -> None:
         """Free the radio; the bus stays open. May be called twice."""
         if self._radio is not None:
-            self._library.host_radio_free(self._radio)
+            self._library.native_radio_free(self._radio)
             self._radio = None
 
     def _config(self, settings: RadioSettings) -> structures.Config:
         config = structures.config(settings, 0, 0)
-        self._library.uwb_twr_fill_times(ctypes.byref(config), self._bus.reply_us, self._bus.patience_us)
-        self._times_us = config.reply_us, config.patience_us
+        self._library.uwb_twr_set_default_times(
+            ctypes.byref(config), self._bus.reply_us, self._bus.timeout_us
+        )
+        self._times_us = config.reply_us, config.timeout_us
         return config
 
     def _state(self) -> RadioState:
-        return RadioState(self._library.host_radio_state(self._radio))
+        return RadioState(self._library.native_radio_state(self._radio))
 
     def _measurement(self) -> RangeMeasurement:
         count, measured_us = c_size_t(), c_uint64()
-        place = self._library.host_radio_measurement(
+        data = self._library.native_radio_measurement(
             self._radio, ctypes.byref(count), ctypes.byref(measured_us)
         )
         age_ns = time.monotonic_ns() - 1000 * measured_us.value
-        payload = ctypes.string_at(place, count.value)
+        payload = ctypes.string_at(data, count.value)
         measured = messages.decode(MessageType.RANGE_CIR, payload, stamp_ns=self._stamp_clock() - age_ns)
         assert isinstance(measured, RangeMeasurement)
         return measured
@@ -204,7 +210,7 @@ class HostRadio:
             return -1
         return 0
 
-    def _guard(self, act: Callable[[], None]) -> None:
+    def _catch_exception(self, act: Callable[[], None]) -> None:
         try:
             act()
         except BaseException as error:  # nothing may pass through C
@@ -229,13 +235,13 @@ def _compiled() -> ctypes.CDLL:
         sorted([*(firmware / "src").glob("uwb_dw1000*.c"), *(firmware / "src").glob("uwb_twr*.c")])
     )
     options = (*_OPTIONS, f"-I{firmware / 'src'}")
-    objects = compile_objects(c_compiler(), options, (*sources, firmware / "host" / "host_radio.c"))
+    objects = compile_objects(c_compiler(), options, (*sources, firmware / "native" / "native_radio.c"))
     radio = c_void_p
     signatures: Signatures = {
         "new": (c_void_p, (POINTER(structures.Io), POINTER(structures.Config), c_uint64)),
         "free": (None, (radio,)),
         "configure": (c_char_p, (radio, POINTER(structures.Config))),
-        "turn": (c_int, (radio, c_uint64)),
+        "exchange": (c_int, (radio, c_uint64)),
         "measurement": (c_void_p, (radio, POINTER(c_size_t), POINTER(c_uint64))),
         "state": (c_int, (radio,)),
         "address": (c_uint64, (radio,)),
@@ -244,6 +250,6 @@ def _compiled() -> ctypes.CDLL:
         "anchors": (POINTER(structures.TwrAnchor), (radio, POINTER(c_size_t))),
         "sensors": (c_int, (radio, POINTER(c_float), POINTER(c_float))),
     }
-    library = load_library("host_radio_", objects, signatures)
-    library.uwb_twr_fill_times.argtypes = (POINTER(structures.Config), c_uint32, c_uint32)
+    library = load_library("native_radio_", objects, signatures)
+    library.uwb_twr_set_default_times.argtypes = (POINTER(structures.Config), c_uint32, c_uint32)
     return library
