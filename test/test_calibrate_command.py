@@ -186,7 +186,7 @@ def test_offsets_are_found_without_the_segments_that_are_held_out(site, truth, m
 
 
 def test_ranges_of_unknown_truth_are_held_out_with_their_segment():
-    from uwb_mitigation.training.site_calibration import _whole_segments
+    from uwb_mitigation.training.site_solution import _whole_segments
 
     segment = np.array([0, 0, 0, 0, 0, 0, 1, 1, 1, 2, 2])
     labelled = np.array([1, 2, 4, 7, 8])
@@ -278,7 +278,9 @@ def test_refusal_is_reported_in_the_json_and_writes_no_model(site):
 
 def no_range_gain(fields):
     chosen, n = fields["selection"].chosen, len(fields["data"])
-    return {"selection": replace(fields["selection"], errors={chosen: np.tile(fields["raw_m"], 2)[: 2 * n]})}
+    return {
+        "selection": replace(fields["selection"], errors={chosen: np.tile(fields["raw_error_m"], 2)[: 2 * n]})
+    }
 
 
 def worse_scatter(fields):

@@ -39,7 +39,7 @@ def test_skipped_records_are_counted_by_reason():
         record(preamble_count=0),
         record(samples=np.zeros(0, np.int16)),
     ]
-    assert build_dataset(records, Preprocessing(157)).refused == {
+    assert build_dataset(records, Preprocessing(157)).skipped == {
         "no true range": 2,
         "no valid range": 1,
         CirFault.NO_PREAMBLE_COUNT.text: 1,

@@ -45,7 +45,7 @@ from uwb_mitigation.positioning.tracks import Ranges, TruePath, track_errors
 from uwb_mitigation.sources.simulated import SimulatedSource
 from uwb_mitigation.sources.simulation.buildings import RADIO
 from uwb_mitigation.sources.simulation.scene import ANCHORS, FLAT, MORE_ANCHORS, ROUTE
-from uwb_mitigation.training import site_calibration, train
+from uwb_mitigation.training import site_calibration, site_solution, train
 
 UNSEEN = 7_000_000
 """Added to the seed of a building: the seeds of the universal model begin at 0 and at 1 000 003."""
@@ -150,11 +150,12 @@ def one(seed: int, seconds: float, truth_topic: bool, with_train: bool, flat: bo
             [np.zeros_like(heading), np.zeros_like(heading), np.sin(heading / 2), np.cos(heading / 2)], axis=1
         )
         path = PosePath(stamps + round(LAG_S * 1e9), frame + noise, quaternion)
-        found = site_calibration.calibrate_with_truth(
-            site, universal, [[path]], "/odom", time_offset_s=None, estimate_lever_arm=True, seed=0
+        solution = site_solution.solve_with_truth(
+            site, universal, [[path]], "/odom", time_offset_s=None, estimate_lever_arm=True
         )
     else:
-        found = site_calibration.calibrate_without_truth(site, universal, height=height, area=None, seed=0)
+        solution = site_solution.solve_without_truth(site, universal, height=height, area=None)
+    found = site_calibration.calibrate(site, universal, solution, seed=0)
     took = time.perf_counter() - began
     test = list(other)
     off = np.array(
@@ -173,7 +174,7 @@ def one(seed: int, seconds: float, truth_topic: bool, with_train: bool, flat: bo
             "size_m": list(drive.plan.size),
             "walls": len(drive.plan.walls),
             "chosen": found.selection.chosen,
-            "level": found.solution.level,
+            "level": found.solution.offset_level,
             "seconds": took,
             "raw_mae": error_of(test, None, NO_OFFSETS),
             "calibrated_mae": error_of(test, bundle, found.offsets),
@@ -215,9 +216,8 @@ def speed(minutes: float) -> dict[str, object]:
     drive = Drive(1, 0, 6, 60.0 * minutes)
     site = read_site([drive], drive.anchors, universal.preprocessing)
     began, cpu = time.perf_counter(), time.process_time()
-    found = site_calibration.calibrate_without_truth(
-        site, universal, height=Height(0.0, 0.05), area=None, seed=0
-    )
+    solution = site_solution.solve_without_truth(site, universal, height=Height(0.0, 0.05), area=None)
+    found = site_calibration.calibrate(site, universal, solution, seed=0)
     return {
         "minutes": minutes,
         "ranges": sum(map(len, site.tags)),

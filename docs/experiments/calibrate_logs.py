@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import sys
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,7 @@ from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import Bundle, load_bundle
 from uwb_mitigation.model.shipped import default_model_path
 from uwb_mitigation.offsets import NO_OFFSETS, Offsets
+from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.geometry import Height
 from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.smoother import Smoother
@@ -34,12 +36,21 @@ from uwb_mitigation.positioning.tag_estimator import EstimatorConfig, TagEstimat
 from uwb_mitigation.positioning.tracks import Ranges, track_errors
 from uwb_mitigation.sources.decaranging import DecaRangingFolder
 from uwb_mitigation.sources.hanyang import ANTENNA_M, HanyangRun
-from uwb_mitigation.training.site_calibration import SiteCalibration, calibrate_without_truth
+from uwb_mitigation.training.site_calibration import SiteCalibration, calibrate
+from uwb_mitigation.training.site_solution import solve_without_truth
 
 HEIGHT = Height(ANTENNA_M, 0.2)
 
 
-def told(found: SiteCalibration) -> None:
+def calibrated(
+    records: Iterable[Record], anchors: AnchorMap, source: Bundle, height: Height
+) -> SiteCalibration:
+    """Calibrate a site from one recording, without ground truth."""
+    site = read_site([records], anchors, source.preprocessing)
+    return calibrate(site, source, solve_without_truth(site, source, height=height, area=None), seed=0)
+
+
+def show(found: SiteCalibration) -> None:
     print(found.summary())
     print(
         {f"{tag}-{anchor}": f"{v:.3f}+-{sd:.3f}" for (tag, anchor), (v, sd) in found.solution.pairs.items()}
@@ -50,10 +61,8 @@ def told(found: SiteCalibration) -> None:
 def hanyang(folder: Path, name: str) -> None:
     source = load_bundle(default_model_path())
     run = HanyangRun(folder / name)
-    found = calibrate_without_truth(
-        read_site([run], run.anchors, source.preprocessing), source, height=HEIGHT, area=None, seed=0
-    )
-    told(found)
+    found = calibrated(run, run.anchors, source, HEIGHT)
+    show(found)
     for other in sorted(path for path in folder.iterdir() if path.is_dir() and path.name != name):
         test = HanyangRun(other)
         anchors, ranges, _, truth = hanyang_run(other)
@@ -87,13 +96,7 @@ def harm(folder: Path) -> None:
             raw_mae, raw_rmse, true = _against_truth(run, part, None, NO_OFFSETS, height)
             row = f"{path.name} {name}: raw MAE {raw_mae:.3f} m, live RMSE {raw_rmse:.3f} m; "
             try:
-                found = calibrate_without_truth(
-                    read_site([part], run.anchors, source.preprocessing),
-                    source,
-                    height=height,
-                    area=None,
-                    seed=0,
-                )
+                found = calibrated(part, run.anchors, source, height)
             except DatasetError as error:
                 print(row + f"refused: {error}", flush=True)
                 continue
@@ -106,7 +109,7 @@ def harm(folder: Path) -> None:
             ]
             print(
                 row
-                + f"calibrated MAE {mae:.3f} m, live RMSE {rmse:.3f} m; {'refused' if found.is_harmful else 'written'}; offsets "
+                + f"calibrated MAE {mae:.3f} m, live RMSE {rmse:.3f} m; {'refused' if found.lacks_gain else 'written'}; offsets "
                 f"{[f'{value:.2f} +- {sd:.2f}' for value, sd in found.solution.pairs.values()]}, median errors "
                 f"{[f'{value:.2f}' for value in true]}, {sum(covered)} of {len(covered)} within two standard deviations"
                 + "".join(f"; {note}" for note in found.notes),
@@ -140,14 +143,8 @@ def apartment(folder: Path) -> None:
     with DecaRangingFolder(folder) as logs:
         records = list(logs)
         anchors = logs.anchors
-    found = calibrate_without_truth(
-        read_site([records], anchors, source.preprocessing),
-        source,
-        height=Height(0.0, 0.05),
-        area=None,
-        seed=0,
-    )
-    told(found)
+    found = calibrated(records, anchors, source, Height(0.0, 0.05))
+    show(found)
     true = {}
     for record in records:
         if record.truth is not None:
@@ -160,7 +157,7 @@ def apartment(folder: Path) -> None:
     off = found.offsets.of(data.tags, data.anchors).astype(float)
     # Residuals of held-out ranges refer to the track: add the difference between track and truth.
     pseudo = data.range_m - data.error_m
-    left = found.held_out_m + pseudo - distance
+    left = found.held_out_error_m + pseudo - distance
     known = np.isfinite(distance)
     raw = (data.range_m + off - distance)[known]
     print(

@@ -115,7 +115,7 @@ def calibrate(
     """
     from uwb_mitigation.commands.bundles import bundle_for
     from uwb_mitigation.sources.site import anchors_file, load_anchors
-    from uwb_mitigation.training import site_calibration
+    from uwb_mitigation.training import site_calibration, site_solution
 
     check_output(output)
     for file in (output, site_calibration.offsets_file(output), *([report] if report else [])):
@@ -138,22 +138,21 @@ def calibrate(
         site = _gather(bags, known, source, stamp_offset, height_topic, height_sd)
         if height_topic is not None and len(site.tags) > 1:
             raise ParameterError(f"--height-topic with {len(site.tags)} tags", valid="bags with one tag")
-        for why, count in site.left_out.items():
-            warn(f"left out: {count} x {why}")
+        for reason, count in site.skipped.items():
+            warn(f"left out: {count} x {reason}")
         with console.stage_bars() as on_progress:
             if truth_topic is None:
-                found = site_calibration.calibrate_without_truth(
+                solution = site_solution.solve_without_truth(
                     site,
                     source,
                     height=at_height,
                     area=box,
-                    seed=seed,
                     height_sd_m=height_sd,
                     on_progress=on_progress,
                 )
             else:
                 paths, arms = _poses(bags, site, truth_topic, frames, arm)
-                found = site_calibration.calibrate_with_truth(
+                solution = site_solution.solve_with_truth(
                     site,
                     source,
                     paths,
@@ -161,16 +160,16 @@ def calibrate(
                     time_offset_s=time_offset,
                     lever_arms_m=arms,
                     estimate_lever_arm=estimate_lever_arm,
-                    seed=seed,
                     on_progress=on_progress,
                 )
+            found = site_calibration.calibrate(site, source, solution, seed=seed, on_progress=on_progress)
     except DatasetError as error:
         # --force does not override this: the anchors, the offsets or the geometry are wrong.
         refused: dict[str, object] = {"offsets_m": {}, "raw_mae_m": None, "calibrated_mae_m": None}
         console.write_json(json, refused | {"truth": truth_topic or "none", "refused": str(error)})
         raise
     _show(found)
-    if found.is_harmful and not force:
+    if found.lacks_gain and not force:
         harm = DatasetError(
             f"not written: {found.summary()}" + "".join(f" {note}." for note in found.notes[:1]),
             valid="a longer drive, or --force",
@@ -245,7 +244,7 @@ def _poses(
         if arm is not None:
             arms[number] = arm
         elif tag_of_frame(names[0]) is None and names[0].rpartition("/")[2] != UWB_TAG:
-            found = _lever_arm_in(bags, names, site.frames[tag.tag_id])
+            found = _lever_arm_in(bags, names, site.frame_ids[tag.tag_id])
             arms[number] = found or (0.0, 0.0, 0.0)
             if found is None:
                 warn(

@@ -166,7 +166,7 @@ def quantize(
     check_output(output)
     with console.reading() as on_record:
         dataset = recordings.load_inputs(data, source.preprocessing, on_record)
-    console.show_skipped(dataset.refused)
+    console.show_skipped(dataset.skipped)
     quantised = quantization.quantize_bundle(source, dataset, percentile, output)
     bundle, difference = quantised.bundle, quantised.difference_m
     model_tables.show_bundle(bundle)
@@ -267,7 +267,7 @@ def _dataset(data: Path, preprocessing: Preprocessing, truth: Sequence[Path] = (
 
     with console.reading() as on_record:
         name, dataset = recordings.load(data, preprocessing, truth, on_record)
-    console.show_skipped(dataset.refused)
+    console.show_skipped(dataset.skipped)
     return name, dataset
 
 

@@ -184,7 +184,7 @@ def _parts(path: Path, samples: int, scaling: str, split: str) -> Parts:
     preprocessing = Preprocessing(samples, scaling_of(scaling))
     with console.reading() as on_record:
         name, _, dataset = parts.load(path, preprocessing, on_record)
-    console.show_skipped(dataset.refused)
+    console.show_skipped(dataset.skipped)
     return parts.split_dataset(name, dataset, split)
 
 

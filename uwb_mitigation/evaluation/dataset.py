@@ -50,7 +50,7 @@ class Dataset:
     error_m: NDArray[np.float64]
     configurations: NDArray[np.str_]
     labels: NDArray[np.str_]
-    refused: Mapping[str, int] = field(default_factory=dict)
+    skipped: Mapping[str, int] = field(default_factory=dict)
     headers: NDArray[np.float32] | None = None
     tags: NDArray[np.uint64] | None = None
     anchors: NDArray[np.uint64] | None = None
@@ -64,7 +64,7 @@ class Dataset:
         part: dict[str, Any] = {
             name: None if values is None else values[chosen] for name, values in columns.items()
         }
-        return replace(self, refused={}, **part)
+        return replace(self, skipped={}, **part)
 
     def shifted(self, by_m: NDArray[np.float64]) -> Dataset:
         """Return a copy with `by_m`, shape (n,), added to ranges and errors."""
@@ -94,18 +94,18 @@ def build_dataset(
     Raises:
         DatasetError: no measurement is usable.
     """
-    refused: Counter[str] = Counter()
+    skipped: Counter[str] = Counter()
     inputs, numbers, headers, identities, configurations, labels = [], [], [], [], [], []
     for record, fault, window in _preprocessed(records, preprocessing, on_record):
         measurement, truth = record.measurement, record.truth
         if truth is None or not math.isfinite(truth.range_m):
-            refused["no true range"] += 1
+            skipped["no true range"] += 1
             continue
         if not (math.isfinite(measurement.range_m) and measurement.range_m >= 0):
-            refused["no valid range"] += 1
+            skipped["no valid range"] += 1
             continue
         if fault:
-            refused[CirFault(fault).text] += 1
+            skipped[CirFault(fault).text] += 1
             continue
         inputs.append(window)
         numbers.append(
@@ -121,7 +121,7 @@ def build_dataset(
         configurations.append(truth.configuration)
         labels.append(truth.label)
     if not inputs:
-        reasons = ", ".join(f"{count} x {why}" for why, count in refused.items()) or "no measurements"
+        reasons = ", ".join(f"{count} x {why}" for why, count in skipped.items()) or "no measurements"
         raise DatasetError(f"no labelled measurement that can be used: {reasons}")
     rx_power, first_path_power, range_m, error_m = np.array(numbers, np.float64).T
     return Dataset(
@@ -133,7 +133,7 @@ def build_dataset(
         error_m,
         np.array(configurations),
         np.array(labels),
-        dict(refused),
+        dict(skipped),
         np.array(headers, np.float32),
         *np.array(identities, np.uint64).T,
     )

@@ -56,14 +56,14 @@ class SiteData:
     rx_power_dbm: NDArray[np.float32]
     first_path_power_dbm: NDArray[np.float32]
     has_cirs: bool
-    with_cir: NDArray[np.bool_]
+    has_usable_cir: NDArray[np.bool_]
     height_m: NDArray[np.float64] | None
-    frames: dict[int, tuple[str, ...]]
-    left_out: Counter[str]
+    frame_ids: dict[int, tuple[str, ...]]
+    skipped: Counter[str]
     shift_ns: tuple[int, ...]
 
     @property
-    def begins(self) -> NDArray[np.intp]:
+    def first_rows(self) -> NDArray[np.intp]:
         """Index of the first range of each tag."""
         return np.cumsum([0, *map(len, self.tags)])[:-1].astype(np.intp)
 
@@ -77,31 +77,31 @@ class SiteData:
         """Index of the tag of each range, shape (r,)."""
         return np.repeat(np.arange(len(self.tags)), list(map(len, self.tags)))
 
-    def labelled(
+    def to_dataset(
         self,
         rows: NDArray[np.intp],
         true_m: NDArray[np.float64],
-        stretch: NDArray[np.intp],
-        at_rest: NDArray[np.bool_],
+        segment: NDArray[np.intp],
+        is_stationary: NDArray[np.bool_],
     ) -> Dataset:
         """Return a dataset of selected ranges.
 
         Args:
             rows: indices, (k,), into the ranges of all tags. true_m: (k,), their true ranges.
-            stretch: int (k,), segment of the track. at_rest: bool (k,), whether the tag is stationary. A configuration is a
+            segment: int (k,), segment of the track. is_stationary: bool (k,), whether the tag is stationary. A configuration is a
                 pair while the tag is stationary, or for `CONFIGURATION_S` of motion. Its name begins with the unit that is
-                held out as a whole: "stretch 3.1/".
+                held out as a whole: "segment 3.1/".
         """
         ranges = self.ranges.take(rows)
         tag = np.array([one.tag_id for one in self.tags], np.uint64)[self.tag[rows]]
-        first = np.full(int(stretch.max()) + 1, np.iinfo(np.int64).max)
-        np.minimum.at(first, stretch, ranges.stamp_ns)
-        since = (ranges.stamp_ns - first[stretch]) / _SECOND_NS
-        chunk = np.where(at_rest, 0, since // CONFIGURATION_S).astype(int)
-        fold = np.where(at_rest, 0, since // FOLD_S).astype(int)
+        first = np.full(int(segment.max()) + 1, np.iinfo(np.int64).max)
+        np.minimum.at(first, segment, ranges.stamp_ns)
+        since = (ranges.stamp_ns - first[segment]) / _SECOND_NS
+        chunk = np.where(is_stationary, 0, since // CONFIGURATION_S).astype(int)
+        fold = np.where(is_stationary, 0, since // FOLD_S).astype(int)
         names = [
-            f"stretch {s}.{f}/{c}/tag {t}/anchor {a}"
-            for s, f, c, t, a in zip(stretch, fold, chunk, tag, ranges.anchor, strict=True)
+            f"segment {s}.{f}/{c}/tag {t}/anchor {a}"
+            for s, f, c, t, a in zip(segment, fold, chunk, tag, ranges.anchor, strict=True)
         ]
         identities = np.array([anchor.id for anchor in self.anchors.anchors], np.uint64)
         return Dataset(
@@ -136,11 +136,11 @@ def read_site(
     Raises:
         DatasetError: no range belongs to an anchor in the map.
     """
-    left_out: Counter[str] = Counter()
+    skipped: Counter[str] = Counter()
     unknown: Counter[int] = Counter()
     rows: list[tuple[int, int, int, float, float, float, float, bool]] = []
     windows: list[NDArray[np.float32]] = []
-    frames: dict[int, dict[str, None]] = {}
+    frame_ids: dict[int, dict[str, None]] = {}
     shifts: list[int] = []
     latest: int | None = None
     for number, recording in enumerate(recordings):
@@ -158,11 +158,11 @@ def read_site(
             if row is None:
                 unknown[measured.anchor_id] += 1
             elif not (math.isfinite(measured.range_m) and 0 <= measured.range_m <= MAX_RANGE_M):
-                left_out["no valid range"] += 1
+                skipped["no valid range"] += 1
             elif heights is not None and math.isnan(height):
-                left_out["no height at that time"] += 1
+                skipped["no height at that time"] += 1
             else:
-                frames.setdefault(measured.tag_id, {}).setdefault(measured.frame_id)
+                frame_ids.setdefault(measured.tag_id, {}).setdefault(measured.frame_id)
                 (fault,), (window,) = preprocessing.windows_of([measured])
                 stamp_ns += shift
                 latest = stamp_ns if latest is None else max(latest, stamp_ns)
@@ -171,7 +171,7 @@ def read_site(
                 windows.append(window)
         shifts.append(shift or 0)
     for identity, count in unknown.items():
-        left_out[f"anchor {format_id(identity)} is not in the anchors file"] += count
+        skipped[f"anchor {format_id(identity)} is not in the anchors file"] += count
     if not rows:
         seen = ", ".join(map(format_id, sorted(unknown))) or "none"
         raise DatasetError(
@@ -183,7 +183,9 @@ def read_site(
         np.array(column, kind) for column, kind in zip(zip(*rows, strict=True), kinds, strict=True)
     ]
     order = np.lexsort((columns[1], columns[0]))
-    tag, stamp, anchor, range_m, rx, first_path, height_m, with_cir = (column[order] for column in columns)
+    tag, stamp, anchor, range_m, rx, first_path, height_m, has_usable_cir = (
+        column[order] for column in columns
+    )
     rx, first_path = (np.where(np.isfinite(power), power, np.nan) for power in (rx, first_path))
     tags = tuple(
         Ranges(stamp[own], anchor[own], range_m[own], np.full(len(own), np.nan), rx[own], int(tag[own[0]]))
@@ -196,10 +198,10 @@ def read_site(
         inputs=np.stack([windows[index] for index in order]),
         rx_power_dbm=rx.astype(np.float32),
         first_path_power_dbm=first_path.astype(np.float32),
-        has_cirs=bool(with_cir.mean() >= MIN_CIR_SHARE),
-        with_cir=with_cir,
+        has_cirs=bool(has_usable_cir.mean() >= MIN_CIR_SHARE),
+        has_usable_cir=has_usable_cir,
         height_m=None if heights is None else height_m,
-        frames={tag_id: tuple(own) for tag_id, own in frames.items()},
-        left_out=left_out,
+        frame_ids={tag_id: tuple(own) for tag_id, own in frame_ids.items()},
+        skipped=skipped,
         shift_ns=tuple(shifts),
     )

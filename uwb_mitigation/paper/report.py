@@ -183,8 +183,8 @@ def _notices(study: Study, trainings: ExperimentResults | None) -> tuple[str, ..
                 f"Shortened training: {epochs} epochs (paper: {published.EPOCHS}), {seeds} of {published.SEEDS} seeds, "
                 f"{lengths} of {len(published.WINDOWS)} lengths of the CIR. Accuracies are not comparable with the paper's."
             )
-    if study.dataset.refused:
-        reasons = ", ".join(f"{count:,} x {why}" for why, count in sorted(study.dataset.refused.items()))
+    if study.dataset.skipped:
+        reasons = ", ".join(f"{count:,} x {why}" for why, count in sorted(study.dataset.skipped.items()))
         notices.append(f"Measurements left out: {reasons}.")
     return tuple(notices)
 

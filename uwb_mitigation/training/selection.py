@@ -152,7 +152,7 @@ def select_for_site(
     """Select a model by errors on held-out segments of the track and on held-out anchors.
 
     Args:
-        data: from `SiteData.labelled`, with the offsets subtracted.
+        data: from `SiteData.to_dataset`, with the offsets subtracted.
         without_offsets_of: returns for held-out rows the change of each range's offset, shape (n,), m, if the offsets
             are estimated without these rows. Offsets are re-estimated for held-out segments, but not for held-out
             anchors, whose offsets can only be estimated from their own ranges.

@@ -25,7 +25,9 @@ def site_page(found: SiteCalibration, name: str) -> str:
     for anchor in found.site.anchors.anchors:
         own = data.anchors == anchor.id
         if own.any():
-            before, after = (float(np.abs(error[own]).mean()) for error in (found.raw_m, found.held_out_m))
+            before, after = (
+                float(np.abs(error[own]).mean()) for error in (found.raw_error_m, found.held_out_error_m)
+            )
             by_anchor.append((str(anchor), int(own.sum()), before, after))
     facts = []
     if solution.alignment is not None:

@@ -93,7 +93,7 @@ class TrainedBundle:
         return {
             "model_id": self.bundle.model_id,
             "n": len(dataset),
-            "refused": dict(dataset.refused),
+            "refused": dict(dataset.skipped),
             "helped": self.helped,
             "rows": [{"name": row, **values} for row, values in self.validation.statistics().items()],
             "by_configuration": {name: group._asdict() for name, group in groups.items()},
