@@ -7,17 +7,17 @@ static const float MAX_POWER_DBM = 1000.0f;
 
 /* The part of the predicted error that needs no network, m; NaN if a power that it needs is not finite, or beyond
  * 1000 dBm. */
-static float prior_m(const uwb_model *model, float rx_power_dbm, float first_path_power_dbm) {
-    if (model->prior_per_rx_power == 0.0f && model->prior_per_power_gap == 0.0f) {
-        return model->prior_offset_m;
+static float linear_bias_m(const uwb_model *model, float rx_power_dbm, float first_path_power_dbm) {
+    if (model->linear_bias_per_rx_power == 0.0f && model->linear_bias_per_power_gap == 0.0f) {
+        return model->linear_bias_offset_m;
     }
     if (!(fabsf(rx_power_dbm) <= MAX_POWER_DBM && fabsf(first_path_power_dbm) <= MAX_POWER_DBM)) {
         return NAN;
     }
     /* The host rounds every product and every sum. Without volatile a compiler may fuse them. */
-    const volatile float level = model->prior_per_rx_power * rx_power_dbm;
-    const volatile float slope = model->prior_per_power_gap * (rx_power_dbm - first_path_power_dbm);
-    return model->prior_offset_m + level + slope;
+    const volatile float level = model->linear_bias_per_rx_power * rx_power_dbm;
+    const volatile float slope = model->linear_bias_per_power_gap * (rx_power_dbm - first_path_power_dbm);
+    return model->linear_bias_offset_m + level + slope;
 }
 
 /* OOD score. Every step is one IEEE-754 operation, as in uwb_mitigation/model/ood.py; volatile prevents the
@@ -51,7 +51,7 @@ static float level_db(float power) {
  * distribution. */
 static float ood_score(const uwb_model *model, const float *window, float range_m, float rx_power_dbm,
                        float first_path_power_dbm) {
-    if (model->familiarity == NULL) {
+    if (model->ood_bands == NULL) {
         return 0.0f;
     }
     const volatile float level = level_db(energy(model->scaling, window, model->samples));
@@ -69,7 +69,7 @@ static float ood_score(const uwb_model *model, const float *window, float range_
     };
     float score = -INFINITY;
     for (size_t i = 0; i < UWB_FEATURES; i++) {
-        const uwb_band *const band = &model->familiarity->bands[i];
+        const uwb_band *const band = &model->ood_bands->bands[i];
         if (band->per_unit == 0.0f) {
             continue;
         }
@@ -127,13 +127,13 @@ static uwb_status predict(const uwb_model *model, float range_m, const uwb_cir *
     if (!in_limits(range_m, 0.0f, MAX_RANGE_M)) {
         return UWB_BAD_RANGE;
     }
-    const float prior = prior_m(model, cir->rx_power_dbm, cir->first_path_power_dbm);
-    if (!in_limits(prior, -FLT_MAX, FLT_MAX)) {
+    const float linear_bias = linear_bias_m(model, cir->rx_power_dbm, cir->first_path_power_dbm);
+    if (!in_limits(linear_bias, -FLT_MAX, FLT_MAX)) {
         return UWB_NO_POWER;
     }
     /* Before the network overwrites the window. */
     *score = ood_score(model, window, range_m, cir->rx_power_dbm, cir->first_path_power_dbm);
-    /* volatile: the host rounds the network's product before it adds the prior. */
+    /* volatile: the host rounds the network's product before it adds the linear bias. */
     volatile float rounded;
     float network_m;
     status = uwb_network(model, window, arena, arena_bytes, &network_m);
@@ -141,7 +141,7 @@ static uwb_status predict(const uwb_model *model, float range_m, const uwb_cir *
         return status;
     }
     rounded = network_m;
-    *error_m = prior + rounded;
+    *error_m = linear_bias + rounded;
     if (!in_limits(*error_m, -FLT_MAX, FLT_MAX)) {
         return UWB_NOT_FINITE;
     }
@@ -158,7 +158,7 @@ static void grade(const uwb_model *model, float range_m, float offset_m, float e
     float correction_m = error_m;
     float variance_m2 = model->variance_m2 + growth;
     if (score > 0.0f) {
-        const float known_m = model->familiarity->known_offset_m;
+        const float known_m = model->ood_bands->known_offset_m;
         const volatile float shrunk = (1.0f - score) * (error_m - known_m);
         const volatile float uncorrected = score * model->variance_uncorrected_m2;
         correction_m = known_m + shrunk;

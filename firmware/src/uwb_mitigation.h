@@ -28,7 +28,7 @@ typedef enum {
     UWB_NEGATIVE,            /* a magnitude is negative */
     UWB_SATURATED,           /* the window holds a saturated sample */
     UWB_NO_PREAMBLE_COUNT,   /* unknown, and the model's scaling needs it */
-    UWB_NO_POWER,            /* receive or first-path power unknown, and the model's prior needs it */
+    UWB_NO_POWER,            /* receive or first-path power unknown, and the linear bias model needs it */
     UWB_OUT_OF_DISTRIBUTION, /* the predicted error is outside the model's limits, or the OOD score is 1 or more */
     UWB_BAD_RANGE,           /* the range is not finite, negative, or beyond 1000 km */
     UWB_NOT_FINITE           /* the predicted error */
@@ -96,7 +96,7 @@ typedef struct {
 typedef struct {
     float known_offset_m; /* correction of a measurement that is out of distribution */
     uwb_band bands[UWB_FEATURES];
-} uwb_familiarity;
+} uwb_ood_bands;
 
 /* Either a REMNet (modules > 0) or dense layers, then a head with one output. */
 typedef struct {
@@ -119,15 +119,15 @@ typedef struct {
     int32_t head_bias;          /* times 256 */
     float head_scale;           /* m per unit of the accumulator */
 
-    float prior_offset_m;
-    float prior_per_rx_power; /* m per dBm */
-    float prior_per_power_gap;
+    float linear_bias_offset_m;
+    float linear_bias_per_rx_power; /* m per dBm */
+    float linear_bias_per_power_gap;
     float correction_low_m; /* a predicted error outside means an input unlike the training data */
     float correction_high_m;
     float variance_m2;
     float variance_per_m2; /* times the square of the predicted error */
     float variance_uncorrected_m2;
-    const uwb_familiarity *familiarity; /* NULL = unknown: no OOD score */
+    const uwb_ood_bands *ood_bands; /* NULL = unknown: no OOD score */
 } uwb_model;
 
 /* Bytes of arena that the other functions need for `model`; 0 if it is null or cannot be run. */
@@ -136,7 +136,7 @@ size_t uwb_arena_size(const uwb_model *model);
 /* Write the network's input for `cir`, model->samples values, to `window`; undefined on failure. */
 uwb_status uwb_preprocess(const uwb_model *model, const uwb_cir *cir, float *window);
 
-/* The network's output for a window of model->samples values, m, without the prior. */
+/* The network's output for a window of model->samples values, m, without the linear bias. */
 uwb_status uwb_network(const uwb_model *model, const float *window, void *arena, size_t arena_bytes,
                        float *output_m);
 
@@ -152,7 +152,7 @@ typedef enum {
 /* On any status but OK the raw range is passed through, less the radios' offset, and the variance is larger. */
 typedef struct {
     float range_m;
-    float correction_m; /* offset + predicted error (prior + network); the offset alone when passed through */
+    float correction_m; /* offset + predicted error (linear bias + network); the offset alone when passed through */
     float variance_m2;  /* infinite where the range is not valid */
     uwb_range_status status;
 } uwb_corrected;

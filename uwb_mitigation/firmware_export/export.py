@@ -146,7 +146,7 @@ def _ood_bands(ood_bands: OodBands) -> str:
         for band in ood_bands.bands
     )
     offset = number(ood_bands.known_offset_m)
-    return f"static const uwb_familiarity uwb_familiar = {{{offset}, {{\n{bands}}}}};\n"
+    return f"static const uwb_ood_bands uwb_model_ood_bands = {{{offset}, {{\n{bands}}}}};\n"
 
 
 def _model(network: PackedNetwork, card: Card, model_id: int) -> str:
@@ -176,7 +176,7 @@ def _model(network: PackedNetwork, card: Card, model_id: int) -> str:
         number(card.variance_m2),
         number(card.variance_per_m2),
         number(card.variance_uncorrected_m2),
-        "NULL" if card.ood_bands is None else "&uwb_familiar",
+        "NULL" if card.ood_bands is None else "&uwb_model_ood_bands",
     ]
     return f"static const uwb_model uwb_model_data = {{\n{_wrapped(values)}}};\n"
 

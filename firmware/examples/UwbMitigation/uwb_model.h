@@ -370,7 +370,7 @@ static const int8_t uwb_head_weights[384] __attribute__((aligned(4))) = {
     1, -2, 1, 1, 1, 1, -1, 0, 0, 0, 0, 0, 0, 0, 0,
 };
 
-static const uwb_familiarity uwb_familiar = {0.0f, {
+static const uwb_ood_bands uwb_model_ood_bands = {0.0f, {
     {-13.9733896f, 57.9025421f, 0.0695643127f},
     {-88.3526306f, -50.8719559f, 0.053360831f},
     {0.0581130981f, 41.6133842f, 0.0721930042f},
@@ -382,7 +382,7 @@ static const uwb_familiarity uwb_familiar = {0.0f, {
 static const uwb_model uwb_model_data = {
     0x7b0469c5u, 157u, UWB_SCALE_PREAMBLE, 0.0100363968f, 3u, 3u, uwb_first_weights, uwb_first,
     uwb_modules, 0u, NULL, uwb_head_weights, 384u, 166912, 6.12721487e-05f, 0.0f, 0.0f, 0.0f,
-    -8.72018242f, 25.2730923f, 0.0237812009f, 0.199585781f, 0.13643989f, &uwb_familiar,
+    -8.72018242f, 25.2730923f, 0.0237812009f, 0.199585781f, 0.13643989f, &uwb_model_ood_bands,
 };
 
 #ifdef UWB_GOLDEN_VECTORS
