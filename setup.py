@@ -80,6 +80,8 @@ setup(
         # Files that `doctor` names if a dependency is missing.
         (f"share/{PACKAGE}/requirements", files("requirements", "ros_*.txt")),
         (f"share/{PACKAGE}/launch", files("launch", "*.launch.py")),
+        # Settings for other packages, which docs/guides/robot_integration.md describes.
+        (f"share/{PACKAGE}/config", files("config", "*")),
         (f"share/{PACKAGE}/params", files("params", "*.yaml")),
         (f"share/{PACKAGE}/rviz", files("rviz", "*.rviz")),
         (f"share/{PACKAGE}/foxglove", files("foxglove", "*.json")),

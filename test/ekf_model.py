@@ -1,0 +1,88 @@
+"""A model of robot_localization's EKF in `two_d_mode`, which is configured by the same YAML file.
+
+State, Jacobian, default covariances and the order of prediction and correction are those of robot_localization 3.8
+(`ekf.cpp`, `filter_base.cpp`), without control, delayed messages and outlier rejection.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+PLANAR = [0, 1, 5, 6, 7, 11, 12, 13]
+"""Rows of x, y, yaw, vx, vy, vyaw, ax, ay in the vectors of 15 values."""
+
+X, Y, YAW, VX, VY, VYAW, AX, AY = range(8)
+
+KNOWN = {
+    *("frequency", "two_d_mode", "map_frame", "odom_frame", "base_link_frame", "world_frame"),
+    *("odom0", "odom0_config", "imu0", "imu0_config", "pose0", "pose0_config"),
+    *("pose0_differential", "pose0_relative", "initial_estimate_covariance", "process_noise_covariance"),
+}
+DEFAULT_NOISE = [0.05, 0.05, 0.06, 0.03, 0.03, 0.06, 0.025, 0.025, 0.04, 0.01, 0.01, 0.02, 0.01, 0.01, 0.015]
+
+
+class Ekf:
+    """The filter.
+
+    Attributes:
+        x, P: state and covariance.
+        time_s: time of the latest measurement.
+    """
+
+    def __init__(self, parameters: dict[str, Any]) -> None:
+        assert set(parameters) <= KNOWN, "the model does not know all parameters"
+        assert parameters["two_d_mode"]
+        assert not parameters.get("pose0_differential", False)
+        assert not parameters.get("pose0_relative", False)
+        self._parameters = parameters
+        self._noise = self._diagonal("process_noise_covariance", DEFAULT_NOISE)
+        self.x, self.P = np.zeros(8), np.diag(self._diagonal("initial_estimate_covariance", [1e-9] * 15))
+        self.time_s: float | None = None
+
+    def fuse(self, sensor: str, time_s: float, values: dict[int, float], R: NDArray[np.float64]) -> None:
+        """Fuse the values that the configuration of the sensor selects.
+
+        Args:
+            sensor: such as odom0.
+            time_s: stamp.
+            values: {row of the state: value}.
+            R: covariance of the values.
+        """
+        if sensor not in self._parameters:
+            return
+        config = self._parameters[f"{sensor}_config"]
+        assert len(config) == 15
+        rows = [row for row, selected in zip(range(8), np.take(config, PLANAR), strict=True) if selected]
+        assert sum(config) == len(rows), "values that are not in the plane"
+        kept = [at for at, row in enumerate(values) if row in rows]
+        assert len(kept) == len(rows), f"{sensor} does not measure all selected values"
+        if self.time_s is not None and time_s > self.time_s:
+            self._predict(time_s - self.time_s)
+        self.time_s = time_s if self.time_s is None else max(time_s, self.time_s)
+        z, R = np.array(list(values.values()))[kept], R[np.ix_(kept, kept)]
+        H = np.eye(8)[list(np.array(list(values))[kept])]
+        K = self.P @ H.T @ np.linalg.inv(H @ self.P @ H.T + R)
+        self.x = self.x + K @ (z - H @ self.x)
+        residual = np.eye(8) - K @ H
+        self.P = residual @ self.P @ residual.T + K @ R @ K.T
+
+    def _predict(self, dt: float) -> None:
+        cosine, sine, half = math.cos(self.x[YAW]), math.sin(self.x[YAW]), 0.5 * dt * dt
+        F = np.eye(8)
+        F[X, [VX, VY, AX, AY]] = cosine * dt, -sine * dt, cosine * half, -sine * half
+        F[Y, [VX, VY, AX, AY]] = sine * dt, cosine * dt, sine * half, cosine * half
+        F[YAW, VYAW] = F[VX, AX] = F[VY, AY] = dt
+        J = F.copy()
+        moved = F[:2, VX:] @ self.x[VX:]
+        J[X, YAW], J[Y, YAW] = -moved[1], moved[0]
+        self.x = F @ self.x
+        self.P = J @ self.P @ J.T + dt * np.diag(self._noise)
+
+    def _diagonal(self, name: str, default: list[float]) -> NDArray[np.float64]:
+        values = self._parameters.get(name, default)
+        assert len(values) == 15
+        return np.take(np.asarray(values, np.float64), PLANAR)
