@@ -1,4 +1,4 @@
-"""Records and bags that the tests of bags share."""
+"""Records and bags for tests."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def write_bag(path: Path, count: int = 5, simulated: str = "false") -> Path:
 
 
 def imported(source: Source, path: Path) -> Path:
-    """A bag of what a source yields."""
+    """Write the records of a source to a bag."""
     with BagWriter(path, {"source": source.name, "simulated": "false"}) as bag:
         for item in source:
             bag.write(item)
@@ -86,7 +86,7 @@ def imported(source: Source, path: Path) -> Path:
 
 
 class Foreign:
-    """A bag such as another recorder might write, message by message."""
+    """Write messages to a bag with the `mcap` library, as another recorder does."""
 
     def __init__(self, path: Path, **options: object) -> None:
         self.path = path
@@ -157,7 +157,7 @@ def prefix(path: Path) -> tuple[list[int], RecordingError | None]:
 
 
 def chunk_offsets(path: Path) -> list[tuple[int, int]]:
-    """First and last byte of the chunks of a complete file."""
+    """Return the first and last byte of each chunk of a complete file."""
     with path.open("rb") as stream:
         indexes = make_reader(stream).get_summary().chunk_indexes
     return [(one.chunk_start_offset, one.chunk_start_offset + one.chunk_length) for one in indexes]

@@ -1,4 +1,4 @@
-"""The system's Chromium, driven through Selenium, for tests of pages."""
+"""Chromium of the system, controlled by Selenium, for tests of pages."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _OPTIONS = (
 
 
 class Browser:
-    """One window."""
+    """A browser window."""
 
     def __init__(self, driver: Any) -> None:
         self.driver = driver
@@ -41,7 +41,7 @@ class Browser:
 
     @contextmanager
     def touch_screen(self) -> Iterator[None]:
-        """Pages opened meanwhile are on a phone."""
+        """Emulate a phone for the pages that are opened."""
         emulate = "Emulation.setTouchEmulationEnabled"
         self.driver.execute_cdp_cmd(emulate, {"enabled": True, "maxTouchPoints": 1})
         try:
@@ -50,7 +50,7 @@ class Browser:
             self.driver.execute_cdp_cmd(emulate, {"enabled": False})
 
     def scroll_to(self, name: str) -> float:
-        """Scroll a named figure of Bokeh's into the middle; returns where the page is then."""
+        """Scroll a named Bokeh figure into the middle; return the scroll position of the page."""
         return self.run(
             "const view = Bokeh.index.find_one(Bokeh.documents[0].get_model_by_name(arguments[0]));"
             "view.el.scrollIntoView({block: 'center'}); return scrollY",
@@ -58,7 +58,7 @@ class Browser:
         )
 
     def swipe(self, x: int, y: int, distance: int) -> None:
-        """Move a finger upwards by some pixels."""
+        """Swipe upwards by a number of pixels."""
         steps = [("touchStart", y), *(("touchMove", y - distance * step // 10) for step in range(1, 11))]
         for kind, at in steps:
             touch = {"type": kind, "touchPoints": [{"x": x, "y": at}]}
@@ -70,7 +70,7 @@ class Browser:
         return self.driver.execute_script(script, *arguments)
 
     def wait(self, what: str, condition: Callable[[], Any]) -> Any:
-        """What `condition` returns once it is true."""
+        """Wait until `condition` is true, and return its result."""
         end_s = time.monotonic() + TIMEOUT_S
         while not (found := condition()):
             assert time.monotonic() < end_s, f"not within {TIMEOUT_S} s: {what}"
@@ -78,7 +78,7 @@ class Browser:
         return found
 
     def ready(self) -> bool:
-        """Whether a page of Bokeh's is there and has drawn."""
+        """Return whether a Bokeh page is loaded and drawn."""
         return bool(self.run("return !!(window.Bokeh && Bokeh.documents[0]?.is_idle)"))
 
     def column(self, model: str, name: str) -> list[Any]:
@@ -102,11 +102,11 @@ class Browser:
         )
 
     def complaints(self) -> list[str]:
-        """What the page wrote to the console beyond information."""
+        """Return the warnings and errors in the console of the page."""
         return [line["message"] for line in self.driver.get_log("browser") if line["level"] != "INFO"]
 
     def cut_off(self, width: int) -> list[str]:
-        """What reaches beyond the right edge of a page that is `width` wide, without a bar to move it by."""
+        """Return the elements that exceed the right edge of a page of this width without a scroll bar."""
         self.resize(width, 1100)
         if self.run("return document.documentElement.scrollWidth") <= width:
             return []
@@ -125,7 +125,7 @@ class Browser:
 
 @contextmanager
 def chromium() -> Iterator[Browser]:
-    """A new browser; skips the test where the system has none."""
+    """Return a new browser; skip the test if the system has none."""
     binary, driver = shutil.which("chromium"), shutil.which("chromedriver")
     if binary is None or driver is None:
         pytest.skip("no Chromium: sudo apt-get install chromium chromium-driver")

@@ -1,6 +1,6 @@
-"""`uwb-mitigation` in the test's own process: what a process of its own does, without a second of loading.
+"""Run `uwb-mitigation` in the process of the test, which saves a second of imports.
 
-Each command has at least one test besides that does start a process (`start`).
+Each command also has at least one test that starts a process (`start`).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parent.pa
 
 
 class Finished(NamedTuple):
-    """How a command ended, and what it printed."""
+    """Exit code and output of a command."""
 
     returncode: int
     stdout: str
@@ -50,7 +50,7 @@ def run(*arguments: object, folder: Path, columns: int = 160) -> Finished:
 
 
 def start(*arguments: object, folder: Path) -> Finished:
-    """Run the command in `folder` in a process of its own."""
+    """Run the command in `folder` in a separate process."""
     done = subprocess.run(
         command(*arguments),
         cwd=folder,
@@ -64,5 +64,5 @@ def start(*arguments: object, folder: Path) -> Finished:
 
 
 def command(*arguments: object) -> list[str]:
-    """The words that start the command."""
+    """Return the command line."""
     return [sys.executable, "-m", "uwb_mitigation.commands.cli", *map(str, arguments)]

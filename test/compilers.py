@@ -1,4 +1,4 @@
-"""Marks of tests that compile C or C++; such a test is skipped, in words, where nothing can."""
+"""Marks of tests that compile C or C++; without a compiler they are skipped with a reason."""
 
 from __future__ import annotations
 

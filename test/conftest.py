@@ -1,10 +1,10 @@
-"""Fixtures that more than one test module uses."""
+"""Shared fixtures."""
 
 from __future__ import annotations
 
 import os
 
-# Before numpy is loaded. Tests run side by side: threads that wait for each other only take time from the next test.
+# Set this before numpy is imported. Tests run in parallel, so more threads do not help.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import signal
@@ -23,10 +23,10 @@ from benchmarks.dw1000_model.air import Air
 if TYPE_CHECKING:
     from ros_harness import Ros
 
-# A suite that a script starts in the background ignores SIGINT, and so would all that tests start and interrupt.
+# If a script starts pytest in the background, SIGINT is ignored, also by the processes of the tests.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# The same examples every time, however slow the computer is.
+# Use the same examples in each run, and no deadline.
 settings.register_profile(
     "suite", deadline=None, derandomize=True, database=None, suppress_health_check=[HealthCheck.too_slow]
 )
@@ -61,14 +61,14 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 @pytest.fixture(scope="session")
 def browser() -> Iterator[Browser]:
-    """One browser for all tests of a worker, because it takes seconds to start."""
+    """Return one browser for all tests of a worker, because it takes seconds to start."""
     with chromium() as window:
         yield window
 
 
 @pytest.fixture(scope="session")
 def apartment() -> Path:
-    """The folder of real EVK1000 logs; skips, and says so, where it is absent."""
+    """Return the folder of real EVK1000 logs; skip the test if it is missing."""
     root = Path(os.environ.get("UWB_MITIGATION_DATA", REPOSITORY.parent / "shared" / "data"))
     folder = root / "evk1000_apartment"
     if not (folder / "logs").is_dir():
@@ -78,20 +78,20 @@ def apartment() -> Path:
 
 @pytest.fixture(scope="session")
 def apartment_reading(apartment: Path, tmp_path_factory: pytest.TempPathFactory) -> Reading:
-    """All exchanges of the real logs, and what was odd."""
+    """Return all exchanges of the real logs and their warnings."""
     return read_once(apartment, tmp_path_factory)
 
 
 @pytest.fixture
 def air() -> Iterator[Air]:
-    """Where a test puts modelled chips; it needs a C compiler."""
+    """Return an environment for modelled chips; it needs a C compiler."""
     with Air(1) as air:
         yield air
 
 
 @pytest.fixture
 def ros(tmp_path: Path) -> Iterator[Ros]:
-    """A DDS domain of the test's own, with a client in it."""
+    """Return a separate DDS domain with a client."""
     pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
     from ros_harness import domain
 

@@ -1,4 +1,4 @@
-"""Simulated drives past anchors, for the tests of positioning: ranges as its model says that they err."""
+"""Simulated drives past anchors, with the range errors of the measurement model."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NANOSECONDS = 1_000_000_000
 
 
 def circuit(time_s: NDArray[np.float64], height_m: float = 1.0) -> NDArray[np.float64]:
-    """Positions (n, 3) on an ellipse through the hall, at about 0.8 m/s."""
+    """Return positions (n, 3) on an ellipse through the hall, at about 0.8 m/s."""
     phase = 0.2 * time_s
     return np.stack([6 + 4 * np.cos(phase), 4.5 + 3 * np.sin(phase), np.full_like(phase, height_m)], axis=1)
 
@@ -36,7 +36,7 @@ def drive(
     model: NoiseModel | None = None,
     path=circuit,
 ) -> tuple[Ranges, TruePath]:
-    """Ranges to the anchors in turn: white noise, what persists of each pair's error, and one offset."""
+    """Return ranges to the anchors in turn, with white noise, correlated errors and a common offset."""
     model = model or NoiseModel()
     rng = np.random.default_rng(seed)
     n = round(seconds * rate_hz)
@@ -71,13 +71,13 @@ WALL = AnchorMap(
 
 
 def flight(time_s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Positions (n, 3) of a drone that takes off from 0.08 m in front of `WALL`, and lands again."""
+    """Return positions (n, 3) of a drone that ascends from 0.08 m in front of `WALL` and lands."""
     height = 0.08 + 1.2 * np.sin(np.pi * np.clip(time_s / 60.0, 0.0, 1.0))
     return np.stack([-1.2 + 1.4 * np.sin(0.3 * time_s), 2.5 * np.sin(0.21 * time_s + 1.0), height], axis=1)
 
 
 def block(ranges: Ranges, seed: int = 1, share: float = 0.25, mean_m: float = 0.5, anchors=None) -> Ranges:
-    """Lengthen the ranges of each anchor (or of `anchors`) in a share of all intervals of 2 s, as a body does."""
+    """Lengthen the ranges of each anchor (or of `anchors`) in a share of intervals of 2 s."""
     rng = np.random.default_rng(seed)
     interval = (ranges.stamp_ns - ranges.stamp_ns[0]) // (2 * NANOSECONDS)
     for row in np.unique(ranges.anchor) if anchors is None else anchors:

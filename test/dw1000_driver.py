@@ -1,6 +1,6 @@
-"""A small, deliberately naive driver of the DW1000 in Python, from the facts of its manual alone: for the model's tests.
+"""A simple DW1000 driver in Python, written from the user manual, for tests of the chip model.
 
-What it leaves out when asked to is what drivers get wrong.
+It can omit the steps that drivers often forget.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ _CODE = 9
 
 @dataclass(frozen=True)
 class Mode:
-    """How the air is used, on channel 5 at PRF 64 MHz, 6.8 Mbit/s, with 128 symbols."""
+    """Radio settings: channel 5, PRF 64 MHz, 6.8 Mbit/s, 128 symbols."""
 
     long_frames: bool = False
 
 
 class Driver:
-    """Registers, and the few sequences that ranging takes, on any `Host`."""
+    """Registers and the sequences for ranging, on any `Host`."""
 
     def __init__(self, host: Host) -> None:
         self.host = host
@@ -126,7 +126,7 @@ class Driver:
         return self.get(0x15, 0, 5)
 
     def accumulator(self, first: int, samples: int, *, clocks: bool = True) -> bytes:
-        """Octets of the accumulator, its dummy taken off."""
+        """Return octets of the accumulator without its dummy octet."""
         low = self.get(0x36, 0, 2)
         if clocks:
             self.set(0x36, 0, 0x48 | (low & 0xB3), 1)
@@ -138,7 +138,7 @@ class Driver:
 
 
 def pair(air: Air, link: Link | None = None) -> tuple[Driver, Driver, Chip, Chip]:
-    """Two started chips, joined by a link of 3 m: their drivers, from outside of the air, and they themselves."""
+    """Return the drivers of two started chips at a distance of 3 m, and the chips."""
     chips = air.chip(), air.chip()
     air.link(*chips, link or Link(3.0))
     drivers = [Driver(chip) for chip in chips]
@@ -151,7 +151,7 @@ DATA = bytes.fromhex("4188") + b"\x07payload"
 
 
 def exchange(sender: Driver, receiver: Driver) -> int:
-    """Send while the other listens; the receiver's status then."""
+    """Send a frame to the other chip; return the status of the receiver."""
     receiver.listen()
     receiver.host.delay(20e-6)
     sender.send(DATA)
@@ -160,5 +160,5 @@ def exchange(sender: Driver, receiver: Driver) -> int:
 
 
 def flight_ticks(sender: Driver, receiver: Driver) -> float:
-    """From one's stamp to the other's: signed, modulo the counter."""
+    """Return the signed difference of two stamps, modulo the counter."""
     return (receiver.rx_stamp - sender.tx_stamp + WRAP // 2) % WRAP - WRAP // 2

@@ -1,4 +1,4 @@
-"""Which test files are quick: `--fast` runs only those, see `SLOW_MODULES`.
+"""Selection of the test files that `--fast` runs, see `SLOW_MODULES`.
 
 The answer follows from the imports, so that a new test file is classified without a list.
 """
@@ -15,14 +15,14 @@ SLOW_MODULES = {
     *("rclpy", "torch", "launch", "uwb_mitigation_msgs", "selenium"),
     # They compile the firmware, or start commands.
     *("uwb_mitigation.firmware_export.compiling", "compilers", "command_line"),
-    # Many drives are simulated and solved for.
+    # They simulate and solve many drives.
     *("uwb_mitigation.positioning.self_calibration", "uwb_mitigation.positioning.survey"),
 }
 SLOW_FIXTURES = {"ros", "browser", "air", "apartment", "apartment_reading"}
 
 
 def is_fast(path: Path) -> bool:
-    """Whether no module that a test file imports, directly or indirectly, is in `SLOW_MODULES`."""
+    """Return whether a test file imports no module of `SLOW_MODULES`, directly or indirectly."""
     seen: set[str] = set()
     waiting = list(_imports(path))
     while waiting:
@@ -36,7 +36,7 @@ def is_fast(path: Path) -> bool:
 
 
 def _file_of(name: str) -> Path | None:
-    """The file of a module of this repository."""
+    """Return the file of a module of this repository."""
     place = TESTS / name if "." not in name else TESTS.parent / name.replace(".", "/")
     return next((file for file in (place.with_suffix(".py"), place / "__init__.py") if file.is_file()), None)
 
@@ -47,7 +47,7 @@ def _imports(path: Path) -> tuple[str, ...]:
 
 
 def _find_imports(path: Path) -> Iterator[str]:
-    """Modules that a file imports: of the package when it is loaded, of a test also later."""
+    """Return the modules that a file imports; for a test, also imports inside functions."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     for node in ast.walk(tree) if path.parent == TESTS else tree.body:
         if isinstance(node, ast.Import):

@@ -31,7 +31,7 @@ class FaultyBoard(EmulatedBoard):
             self._backlog.clear()
 
     def flood(self, seconds: float) -> None:
-        """Send noise as fast as the port takes it."""
+        """Send noise as fast as the port accepts it."""
         with self._lock:
             self._flood_until = time.monotonic() + seconds
 

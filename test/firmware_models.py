@@ -1,4 +1,4 @@
-"""Exported random networks, measurements good and hostile, and real ones, for the firmware's tests."""
+"""Exported random networks, and valid, hostile and real measurements, for tests of the firmware."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ MODEL_ID = 0x1234ABCD
 
 
 def write_model(folder: Path, weights: Int8Weights, **changes: object) -> Path:
-    """Export a network with the card of `model_material`, but for `changes`."""
+    """Export a network with the card of `model_material` and `changes`."""
     network = pack(weights)
     windows = golden_windows(network)
     golden = Golden(windows, IntegerNetwork(weights).predict_m(windows))
@@ -40,14 +40,14 @@ def write_model(folder: Path, weights: Int8Weights, **changes: object) -> Path:
 
 
 def exact_bundle(folder: Path, samples: int = 32, **changes: object) -> Bundle:
-    """A bundle of random weights, with scales that the firmware can equal, and a linear bias model that needs powers."""
+    """Return a bundle with random weights, exportable scales, and a linear bias model that needs levels."""
     weights = random_networks.remnet(samples, 3)
     card = model_material.card(weights.architecture, correction_limits_m=(-500.0, 500.0), **changes)
     return save_bundle(folder / "exact.onnx", graph.int8_model(weights), card)
 
 
 def mlp_bundle(folder: Path) -> Bundle:
-    """The paper's MLP with random weights."""
+    """Return the MLP of the paper with random weights."""
     weights = random_networks.mlp()
     card = model_material.card(weights.architecture, correction_limits_m=(-500.0, 500.0))
     return save_bundle(folder / "mlp.onnx", graph.int8_model(weights), card)
@@ -77,7 +77,7 @@ def choosy_bundle(folder: Path, samples: int = 32, scaling: Scaling = Scaling.PR
 
 
 def random_cir(random: np.random.Generator) -> Cir:
-    """A CIR that is usable about half of the time; float fields hold binary32 values."""
+    """Draw a CIR, about half of them usable; float fields contain binary32 values."""
 
     def single(value: float) -> float:
         return float(np.float32(value))
@@ -109,7 +109,7 @@ def random_cir(random: np.random.Generator) -> Cir:
 
 
 def random_measurement(random: np.random.Generator) -> RangeMeasurement:
-    """A measurement that is hostile about half of the time."""
+    """Draw a measurement, about half of them hostile."""
     usual = model_material.cir(int(random.integers(0, 50)))
     cir = random_cir(random) if random.random() < 0.4 else usual
     powers = random.choice([-80.5, -91.25, -1e4, math.nan, math.inf], 2, p=[0.45, 0.45, 0.04, 0.03, 0.03])
@@ -120,7 +120,7 @@ def random_measurement(random: np.random.Generator) -> RangeMeasurement:
 
 @functools.cache
 def real_measurements(apartment: Path) -> tuple[RangeMeasurement, ...]:
-    """A thousand measurements, the first of each log; read once a process."""
+    """Return a thousand measurements, the first ones of each log; cached per process."""
     measured: list[RangeMeasurement] = []
     for log in sorted((apartment / "logs").iterdir()):
         with open_decaranging(log) as source:
@@ -130,14 +130,14 @@ def real_measurements(apartment: Path) -> tuple[RangeMeasurement, ...]:
 
 @dataclass(frozen=True)
 class Exported:
-    """A network of one shape, with the folder that it was exported to."""
+    """A network of one shape and the folder of its export."""
 
     weights: Int8Weights
     subject: Network
     folder: Path
 
     def windows(self, count: int = 5000) -> NDArray[np.float32]:
-        """Windows that press on every rounding; zero, saturating and random ones."""
+        """Return windows that test every rounding: zero, saturating and random ones."""
         samples = self.weights.architecture.samples
         return random_networks.pressing_windows(samples, self.weights.activation_scale["input"], count)
 
@@ -150,7 +150,7 @@ class Exported:
 
 
 SHAPES = [*itertools.product((3, 5), published.WINDOWS), (0, 157)]
-"""First kernel and length of every network that must run; 0 is the MLP."""
+"""First kernel and length of each tested network; 0: MLP."""
 
 
 def shape_name(shape: tuple[int, int]) -> str:

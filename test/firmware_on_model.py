@@ -1,4 +1,4 @@
-"""The firmware's driver and exchange on modelled chips, compiled for this computer, in virtual time."""
+"""Driver and exchange of the firmware on modelled chips, compiled natively, in virtual time."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _program = threading.local()
 
 
 def host() -> Host:
-    """Return the host of the program that asks."""
+    """Return the host of the calling program."""
     running: Host = _program.host
     return running
 
@@ -77,7 +77,7 @@ class ModelBus:
 
 
 def use_virtual_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the firmware take its time from the program in which it runs, and the same random numbers in each run."""
+    """Give the firmware the time of its program, and the same random numbers in each run."""
     monkeypatch.setattr(firmware, "time", CLOCK)
     monkeypatch.setattr(firmware, "secrets", SimpleNamespace(randbits=random.Random(1).getrandbits))
 

@@ -1,4 +1,4 @@
-"""Networks, bundles and measurements that tests of the model are made of; all seeded."""
+"""Networks, bundles and measurements for tests of models; all seeded."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LINE = LinearBiasModel(*(float(np.float32(value)) for value in (-5.0, -0.0691, -
 
 
 def random_weights(architecture: Remnet, seed: int = 0) -> FloatWeights:
-    """Weights of a freshly initialised network, with biases and a head that are not zero."""
+    """Return the weights of a new network, with nonzero biases and head."""
     generator = np.random.default_rng(seed)
     weight, bias = {}, {}
     for layer in architecture.convolutions:
@@ -37,12 +37,12 @@ def random_weights(architecture: Remnet, seed: int = 0) -> FloatWeights:
 
 
 def integer_network(bundle: Bundle) -> IntegerNetwork:
-    """The oracle of what an int8 bundle computes."""
+    """Return the expected output of an int8 bundle."""
     return IntegerNetwork(graph.int8_weights(bundle.model, bundle.architecture))
 
 
 def windows(count: int, samples: int, seed: int = 0) -> np.ndarray:
-    """Network inputs with the level and the decay of real ones, float32 (count, samples)."""
+    """Return network inputs with realistic levels and decay, float32 (count, samples)."""
     generator = np.random.default_rng(seed)
     decay = 0.1 + np.exp(-np.arange(samples) / 12)
     return (generator.gamma(2.0, 0.3, (count, samples)) * decay).astype(np.float32)
@@ -70,14 +70,14 @@ def card(architecture: Remnet, *, quantised: bool = True, **changes: object) -> 
 
 
 def bundle(folder: Path, architecture: Remnet | None = None, *, seed: int = 0, **changes: object) -> Bundle:
-    """An int8 bundle of random weights in `folder`."""
+    """Write an int8 bundle of random weights to `folder`."""
     architecture = architecture or Remnet(samples=32)
     model = graph.int8_model(random_int8(architecture, seed))
     return save_bundle(folder / "material.onnx", model, card(architecture, **changes))
 
 
 def cir(seed: int = 0, **changes: object) -> Cir:
-    """A complex CIR of 1016 samples with its first path at 745.3."""
+    """Return a complex CIR of 1016 samples with the first path at 745.3."""
     generator = np.random.default_rng(seed)
     samples = generator.normal(0, 60, 2 * 1016)
     samples[2 * 745 : 2 * 785] += generator.normal(0, 2500, 80)
@@ -95,19 +95,19 @@ def cir(seed: int = 0, **changes: object) -> Cir:
 
 
 def amplitudes_only(of: Cir, **changes: object) -> Cir:
-    """The CIR as reported by boards that send amplitudes, without a preamble count."""
+    """Return the CIR as amplitudes without a preamble count, as some boards send it."""
     magnitude = np.hypot(*of.samples.reshape(-1, 2).astype(float).T).clip(max=32000).astype(np.int16)
     return replace(of, samples=magnitude, encoding=Encoding.MAGNITUDE, preamble_count=0, **changes)  # type: ignore[arg-type]
 
 
 def window_of(of: Cir, preprocessing: Preprocessing) -> tuple[int, np.ndarray]:
-    """The fault of a CIR, 0 if there is none, and its window."""
+    """Return the fault of a CIR (0: no fault) and its window."""
     (fault,), (window,) = preprocessing.windows_of([RangeMeasurement(0, 1, 2, 0, 0, 3.0, of)])
     return fault, window
 
 
 def measurement(range_m: float = 3.0, seed: int = 0, **changes: object) -> RangeMeasurement:
-    """A measurement; `changes` are of its CIR."""
+    """Return a measurement with `changes` of its CIR."""
     return RangeMeasurement(
         stamp_ns=seed,
         tag_id=1,
@@ -120,12 +120,12 @@ def measurement(range_m: float = 3.0, seed: int = 0, **changes: object) -> Range
 
 
 def record(seed: int = 0, configuration: str = "1", **changes: object) -> Record:
-    """A measurement that errs by 0.25 m."""
+    """Return a measurement with an error of 0.25 m."""
     return Record(measurement(3.25, seed, **changes), Truth(3.0, "LOS", configuration))
 
 
 class Recorded(list):  # type: ignore[type-arg]
-    """An open recording of records in memory."""
+    """A recording in memory."""
 
     simulated = False
 
@@ -137,7 +137,7 @@ class Recorded(list):  # type: ignore[type-arg]
 
 
 def dataset(configurations: int = 12, each: int = 20, samples: int = 32, seed: int = 0) -> Dataset:
-    """A synthetic dataset: the error is a line in the powers plus the level of the first inputs."""
+    """Return a dataset whose error is linear in the levels plus the level of the first inputs."""
     generator = np.random.default_rng(seed)
     count = configurations * each
     names = np.repeat([f"c{number}" for number in range(configurations)], each)

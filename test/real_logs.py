@@ -1,4 +1,4 @@
-"""The real logs, unpacked and read once for all workers of a test run: it takes seconds."""
+"""The real logs, unpacked and read once for all workers of a test run."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from uwb_mitigation.sources.opening import open_recording
 
 
 class Reading(NamedTuple):
-    """What a source gave from its beginning to its end."""
+    """Records and warnings of a source."""
 
     records: list[Record]
     skipped: Counter[str]

@@ -1,6 +1,6 @@
-"""The `ros2` of pages where no ROS is installed: `run` of our nodes, `bag record` of ranges, `param set`.
+"""Replacement for the command `ros2` without ROS: `run` of our nodes, `bag record` of ranges, `param set`.
 
-`ros2 bag record` ends by itself after so many messages as $RECORDED_RANGES names behind the bag, as Ctrl-C would end it.
+`ros2 bag record` ends after the number of messages in $RECORDED_RANGES, as after Ctrl-C.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Real nodes for tests: a DDS domain of their own, nodes as processes, and a client to talk to them."""
+"""Real nodes for tests: a separate DDS domain, nodes as processes, and a client."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ from uwb_mitigation_msgs.msg import RangeCir
 TIMEOUT_S, RESPONSE_TIMEOUT_S = 240.0, 20.0
 
 PAUSED = ("paused:=true", "start_delay:=0.0", "longest_wait:=3600.0")
-"""Of a driver that plays nothing until somebody subscribes to its ranges and `Ros.play` is called."""
+"""Parameters of a driver that waits for a subscriber and for `Ros.play`."""
 
-# For this process and for all that it starts; read when messages are loaded and when a context is made.
+# For this process and its children; read when messages are imported and a context is created.
 os.environ |= {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_PYTHON_CHECK_FIELDS": "1"}
 
 
@@ -42,7 +42,7 @@ def diagnostic_values(status: DiagnosticStatus) -> dict[str, str]:
 
 
 class Process:
-    """A running program whose output is kept."""
+    """A running program with its output."""
 
     def __init__(self, command: list[str], domain: int, log: Path) -> None:
         self.log = log
@@ -52,7 +52,7 @@ class Process:
         self.pid = self._popen.pid
 
     def exit_code(self) -> int | None:
-        """None while it runs; negative: the signal that ended it."""
+        """Exit code; Exit code; Exit code; None while it runs; negative: the signal that ended it."""
         return self._popen.poll()
 
     @property
@@ -81,7 +81,7 @@ class Process:
             time.sleep(0.02)
 
     def end(self) -> None:
-        """Kill it if it does not end by itself."""
+        """Kill the program if it does not end."""
         try:
             self._popen.wait(10.0)
         except subprocess.TimeoutExpired:
@@ -90,7 +90,7 @@ class Process:
 
 
 class Ros:
-    """One DDS domain: starts processes in it, and is itself a node in it."""
+    """A DDS domain with processes, and a client node in it."""
 
     def __init__(self, domain: int, folder: Path) -> None:
         self.domain = domain
@@ -103,7 +103,7 @@ class Ros:
         self._executor.add_node(self.node)
 
     def start(self, node: str, *parameters: str, arguments: tuple[str, ...] = ()) -> Process:
-        """Start one of the package's nodes as its executable does."""
+        """Start a node of this package like its executable."""
         given = [word for parameter in parameters for word in ("-p", parameter)]
         command = [sys.executable, "-m", "uwb_mitigation.entry", node]
         return self.run([*command, "--ros-args", *given, *arguments])
@@ -134,7 +134,7 @@ class Ros:
         self.spin_until(lambda: self.node.count_subscribers(topic) >= count)
 
     def find_each_other(self, publisher: Publisher, question: RangeCir, answers: list) -> None:
-        """Ask until a node has answered and owes no answer any more: it is found, and finds us, one after the other."""
+        """Call a node until it has answered all calls: then both sides have discovered each other."""
         numbers = itertools.count(1)
 
         def asked() -> bool:
@@ -147,10 +147,10 @@ class Ros:
         answers.clear()
 
     def play(self, driver: str = "driver") -> None:
-        """Let a driver that was started `PAUSED` play, once whatever this client collects is connected to its publisher.
+        """Start the replay of a `PAUSED` driver when the subscriptions of this client are connected.
 
-        The nodes of the driver's process have found the client when the driver has answered it: a client announces
-        what it makes in turn, and what hears the answer is made last.
+        The process of the driver has discovered them when it answers, because a client announces its endpoints
+        in order and the receiver of the answer is created last.
         """
         self.spin_until(lambda: all(made.get_publisher_count() for made in self.node.subscriptions))
         self.spin_until(lambda: self.state_of(driver) == "active")
@@ -183,7 +183,7 @@ class Ros:
         return self.call(ChangeState, f"/{node}/change_state", request).success
 
     def set_parameter(self, node: str, name: str, value: object) -> SetParametersResult:
-        """Set a parameter as any other node would."""
+        """Set a parameter by its service."""
         request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
         return self.call(SetParameters, f"/{node}/set_parameters", request).results[0]
 
@@ -201,10 +201,10 @@ class Ros:
         return found[0]
 
     def close(self) -> None:
-        """The client leaves first, and the nodes by Ctrl-C.
+        """Destroy the client first, then stop the nodes with SIGINT.
 
-        Killed, they leave shared memory half written: Fast DDS of who writes to them then, or opens that memory in
-        a later test of this domain, can crash (eProsima/Fast-DDS issue 6501).
+        A killed node leaves partial shared memory, and Fast DDS in a process that uses it later can crash
+        (eProsima/Fast-DDS issue 6501).
         """
         self.node.destroy_node()
         rclpy.shutdown(context=self._context)
@@ -216,7 +216,7 @@ class Ros:
 
 @contextmanager
 def domain(folder: Path) -> Iterator[Ros]:
-    """A domain that no other test on this machine uses meanwhile."""
+    """A domain that no other test on this machine uses."""
     with _reserved() as number:
         ros = Ros(number, folder)
         try:
@@ -230,14 +230,14 @@ _counter = itertools.count(os.getpid())
 
 @contextmanager
 def _reserved() -> Iterator[int]:
-    """The number of a domain, held by a lock: neither another worker of this run has it, nor another run."""
+    """Yield the number of a domain that is locked against other workers and test runs."""
     for count in _counter:
         number = 101 + count % 130
         with ExitStack() as stack:
             try:
                 place = Path(tempfile.gettempdir(), f"uwb_mitigation_domain_{number}")
                 fcntl.flock(stack.enter_context(place.open("a")), fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:  # taken, or another user's
+            except OSError:  # in use, or of another user
                 continue
             yield number
             return

@@ -1,4 +1,4 @@
-"""PyPI's `dw1000-spi` on modelled chips: a `spidev` that reaches them, and the clock of the program that asks."""
+"""The PyPI package `dw1000-spi` on modelled chips: replacements for `spidev` and the clock."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ pytest.importorskip("spidev", reason="spidev is for Linux")
 dw1000 = pytest.importorskip("dw1000_spi.dw1000", reason="the develop requirements bring dw1000-spi")
 
 SYSTEM_CALL_S = 60e-6
-"""About what a transaction takes Linux and Python on a Raspberry Pi."""
+"""Approximate duration of a transaction with Python on a Raspberry Pi."""
 
 
 class FakeSpiDev:
@@ -36,7 +36,7 @@ class FakeSpiDev:
 
 
 def replace_spidev(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the driver meet the model instead of the computer."""
+    """Connect the driver to the model."""
     module = ModuleType("spidev")
     module.SpiDev = FakeSpiDev  # type: ignore[attr-defined]
     monkeypatch.setattr(dw1000, "spidev", module)
@@ -46,7 +46,7 @@ def replace_spidev(monkeypatch: pytest.MonkeyPatch) -> None:
 def program(
     run: Callable[[dw1000.DW1000, Host], None], channel: int = 5, prf: int = 64
 ) -> Callable[[Host], None]:
-    """A program that opens the driver and hands it to `run`."""
+    """Return a program that opens the driver and passes it to `run`."""
 
     def started(running: Host) -> None:
         begin(running)

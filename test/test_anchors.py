@@ -1,4 +1,4 @@
-"""The anchors file: what is in it, and what it is refused for."""
+"""The anchors file: content and errors."""
 
 from __future__ import annotations
 

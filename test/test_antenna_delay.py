@@ -1,4 +1,4 @@
-"""`uwb-mitigation board antenna-delay`: the delay of emulated boards is found again, and what is no calibration refused."""
+"""`uwb-mitigation board antenna-delay` with emulated boards."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def around(middle_m: float, sd_m: float, n: int = 400) -> np.ndarray:
 
 @pytest.mark.parametrize("radios", [1, 2])
 def test_offset_is_divided_among_the_calibrated_radios(radios: int):
-    # 1 tick too few in one radio, 2.35 mm too far (APS014).
+    # One tick less in one radio lengthens the range by 2.35 mm (APS014).
     found = delay_from_ranges(around(5.01 + 0.235, 0.001), np.full(400, 3.0), 5.01, [NOMINAL] * radios)
     assert abs(found.antenna_delay - NOMINAL - 100 / radios) <= 1
     assert abs(found.offset_m - 0.235) < 0.001

@@ -1,4 +1,4 @@
-"""Bags as written, and what the rosbags and mcap libraries make of a bag of ours."""
+"""Bag writer, compared with the libraries rosbags and mcap."""
 
 from __future__ import annotations
 

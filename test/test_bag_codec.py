@@ -1,4 +1,4 @@
-"""Measurements to CDR and back: exact, equal to rosbags, and safe against any bytes."""
+"""CDR codec: exact, equal to rosbags, and safe for arbitrary bytes."""
 
 from __future__ import annotations
 

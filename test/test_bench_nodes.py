@@ -1,4 +1,4 @@
-"""Benchmark of the nodes: its counts, its report, and that the measured nodes run."""
+"""Benchmark of the nodes."""
 
 from __future__ import annotations
 

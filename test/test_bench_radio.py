@@ -1,4 +1,4 @@
-"""The soak of modelled radios, and the benchmark's result for programs."""
+"""Soak test of modelled radios, and the JSON result of the benchmark."""
 
 from __future__ import annotations
 

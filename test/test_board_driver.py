@@ -1,4 +1,4 @@
-"""A board on a real pseudo-terminal: connected, lost, found again, closed."""
+"""A board on a real pseudo-terminal: connect, disconnect, reconnect, close."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from uwb_mitigation.measurement import Cir, RangeMeasurement, Record
 from uwb_mitigation.radio.evb1000 import Evb1000Bus
 
 PATIENCE_S = 240
-"""How long a test waits for what must come; nothing is asserted about how soon it does."""
+"""Timeout for expected events."""
 
 IDENTITY = Hello(board_id=0xB0, model_id=0xCAFE, window=157)
 
@@ -98,9 +98,9 @@ def test_replugged_board_is_found_under_another_port_name(board, port, tmp_path)
     first = board.port
     board.unplug()
     wait_for(port, lambda event: event == Disconnected(Loss.CLOSED))
-    holders = [EmulatedBoard(link=tmp_path / "other")]  # Takes the name that has become free,
+    holders = [EmulatedBoard(link=tmp_path / "other")]  # Takes the free name,
     board.plug()
-    while board.port == first:  # unless another process had it meanwhile.
+    while board.port == first:  # unless another process uses it.
         board.unplug()
         holders.append(EmulatedBoard(link=tmp_path / f"other{len(holders)}"))
         board.plug()

@@ -1,4 +1,4 @@
-"""Bundles: what is written reads back to the bit, and nothing damaged or foreign loads."""
+"""Bundles: written ones are read back, and damaged or other files are refused."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ def saved(tmp_path_factory) -> bundles.Bundle:
 
 
 def refused(data: bytes) -> bool:
-    """Whether `parse_bundle` raises ModelError that names the file."""
+    """Return whether `parse_bundle` raises a ModelError that names the file."""
     with pytest.raises(ModelError) as caught:
         parse_bundle(data, Path("some.onnx"))
     return caught.value.where == "some.onnx"
 
 
 def with_metadata(data: bytes, change) -> bytes:
-    """A bundle whose metadata was changed and whose checksum was made to fit."""
+    """Return a bundle with changed metadata and a valid checksum."""
     model = onnx.load_model_from_string(data)
     metadata = json.loads(model.metadata_props[0].value)
     change(metadata)

@@ -30,7 +30,7 @@ LEVER = np.array([0.4, 0.1, 0.0])
 
 
 def arm_to(frame):
-    """A TFMessage in CDR: a frame at `LEVER` in base_link."""
+    """Return a TFMessage in CDR: a frame at `LEVER` in base_link."""
     of = STORE.types
     header = of["std_msgs/msg/Header"](of["builtin_interfaces/msg/Time"](0, 0), "base_link")
     at = of["geometry_msgs/msg/Vector3"](*LEVER), of["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
@@ -40,7 +40,7 @@ def arm_to(frame):
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
-    """A folder with a drive past five anchors, without CIRs, and a localisation 0.3 s late; a short one, and one of few ranges."""
+    """Return a folder with drives past five anchors without CIRs and with a localisation delayed by 0.3 s."""
     from drives import HALL
 
     folder = tmp_path_factory.mktemp("a site")
@@ -121,7 +121,7 @@ def test_drive_yields_a_bundle_and_offsets_that_improve_other_ranges(site):
     assert bundle.card.training["calibrated"] == "without truth"
     assert bundle.linear_bias.per_rx_power == pytest.approx(-0.02, abs=0.006)
     assert "without truth" in bundle.card.origin
-    # Without a CIR: the line and the offset count, since the network has nothing to say.
+    # Without CIRs, only the line and the offset are used.
     cir = Cir(np.zeros(0, np.int16), rx_power_dbm=-85.0)
     corrected = Mitigation(bundle, offsets).correct([RangeMeasurement(0, 7, 1, 0, 0, 5.4, cir)])[0]
     assert corrected.status == 0
@@ -198,7 +198,7 @@ def test_ranges_of_unknown_truth_are_held_out_with_their_segment():
 def test_localisation_needs_few_ranges(site):
     done = run("calibrate", "few.mcap", *LEVEL, "-o", "few.onnx", "--json", "f.json", "--truth-topic", "/odom", "--estimate-lever-arm", "--force", folder=site)  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert "no transform" not in done.stderr  # uwb_tag is the antenna itself
+    assert "no transform" not in done.stderr  # uwb_tag is at the antenna
     # Without the held-out quarter, there are too few to estimate a time offset and a lever arm.
     assert 40 <= json.loads((site / "f.json").read_text())["labelled"] < 53
 
@@ -221,7 +221,7 @@ def test_nine_gross_outliers_change_no_result(site):
 
 def test_heights_come_from_a_topic_and_stamps_are_shifted(site):
     late, _ = figures(site, "drive.mcap", "--height-topic", "/odom")
-    # The localisation is 0.3 s late, so that it does not cover the first ranges.
+    # The localisation is delayed by 0.3 s and does not cover the first ranges.
     assert late["left_out"] == {"no height at that time": 6}
     shifted, _ = figures(site, "drive.mcap", "--height-topic", "/odom", "--stamp-offset", 0.3)
     # Now it ends one range early.
@@ -336,7 +336,7 @@ def test_anchors_at_wrong_positions_are_named_with_truth_too(site, move, named, 
         position[move[0]] += move[1]
     where = anchors_file(site, "wrong.yaml", position)
     words = ("calibrate", "drive.mcap", *where, *options, "-o", "wrong.onnx", "--json", "wrong.json")
-    # --force is for a calibration without gain only.
+    # --force applies only to a calibration without gain.
     done = run(*words, "--force", folder=site)
     assert done.returncode == 1
     refused = json.loads((site / "wrong.json").read_text())["refused"]
@@ -386,7 +386,7 @@ def test_lever_arm_is_read_from_every_bag_and_must_be_the_same(site, monkeypatch
 
 
 def test_recording_with_cirs_uses_the_universal_network(tmp_path, monkeypatch):
-    """Without torch, whose candidate takes long: then it is said."""
+    """Without torch, the candidate that needs it is skipped with a message."""
     from uwb_mitigation.model.floating import float_network
     from uwb_mitigation.model.shipped import default_model_path
     from uwb_mitigation.training import candidates
@@ -417,7 +417,7 @@ def test_recording_with_cirs_uses_the_universal_network(tmp_path, monkeypatch):
     assert predicted[0] == pytest.approx(result["network_factor"][0] * predicted[1], abs=1e-4)
     assert result["calibrated_mae_m"] < 0.7 * result["raw_mae_m"]
     assert load_bundle(tmp_path / "site.onnx").card.needs_cir
-    # The drive alone, without true ranges, does for int8, too.
+    # The drive without true ranges is sufficient for int8.
     done = run("quantize", "site.onnx", "--data", "drive.mcap", "-o", "int8.onnx", folder=tmp_path)
     assert done.returncode == 0, done.stderr
     assert load_bundle(tmp_path / "int8.onnx").quantised

@@ -1,4 +1,4 @@
-"""`data import` and `data info`, as a user runs them."""
+"""The commands `data import` and `data info`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`evaluate --cross-validate`: every row of the table on the same held-out configurations, and the JSON of it."""
+"""`evaluate --cross-validate`: rows of the table on the same held-out configurations, and its JSON."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ RECIPE = Recipe(Remnet(samples=8), FitOptions(epochs=1))
 
 @pytest.fixture(scope="module", autouse=True)
 def _short():
-    """The network alone is trained for as long as it needs; here nothing is learnt from that."""
+    """Train the network for a few epochs only, to save time."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(candidates, "NETWORK_ONLY", FitOptions(epochs=1))
         yield

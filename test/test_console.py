@@ -1,4 +1,4 @@
-"""Where results go: whole, to where they were asked for, and nowhere else."""
+"""JSON results of commands."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Datasets: what is kept, what is left out and counted, and splits that share no configuration."""
+"""Datasets: rows, skipped records, and splits by configuration."""
 
 from __future__ import annotations
 

@@ -90,7 +90,7 @@ def error_block(code: str) -> str:
 
 @pytest.fixture
 def write(tmp_path: Path):
-    """Writes a log with the format's line ends, and gives its path."""
+    """Write a log with the line ends of the format; return its path."""
 
     def _write(*parts: str, name: str = "7.log") -> Path:
         path = tmp_path / name
@@ -103,7 +103,7 @@ def write(tmp_path: Path):
 
 
 def read(path: Path, cir: CirFrame = CirFrame.FINAL) -> tuple[list[Record], Counter[str]]:
-    """Records and `skipped`, without the count of logs without truth."""
+    """Return records and `skipped`, without the count of logs without truth."""
     log = DecaRangingLog(path, cir)
     records = list(log)
     return records, log.skipped - Counter({Anomaly.NO_TRUTH.value: 1})
@@ -123,7 +123,7 @@ def counts(*oddities: Anomaly) -> dict[str, int]:
     return dict(Counter(anomaly.value for anomaly in oddities))
 
 
-# ---- what an exchange becomes ----
+# ---- exchanges ----
 
 
 @pytest.mark.parametrize("name", ["7.log", "7.log.xz"])
@@ -162,7 +162,7 @@ def test_invalid_start_time_becomes_the_epoch(write, file):
     assert skipped == counts(Anomaly.NO_START_TIME)
 
 
-# ---- malformed parts: each is counted, and none costs a range ----
+# ---- malformed parts are counted, and no range is lost ----
 
 
 @pytest.mark.parametrize(
@@ -328,7 +328,7 @@ def test_folder_gives_truth_and_locations_in_order_of_time(surveyed, inside):
     stamps = [record.measurement.stamp_ns for record in records]
     assert stamps == sorted(stamps)
     assert [record.measurement.sequence for record in records] == [0, 1, 2, 3]
-    assert folder.skipped == counts(Anomaly.MOVED)  # both state the same start
+    assert folder.skipped == counts(Anomaly.MOVED)  # both have the same start time
     assert [(anchor.id, anchor.position) for anchor in folder.anchors.anchors] == [
         (1, (0.0, 0.0, 0.0)),
         (2, (3.0, 4.0, 0.0)),
@@ -341,7 +341,7 @@ def test_log_without_a_survey_row_keeps_its_addresses(surveyed, write):
     write(header(), exchange(7.0), name="flat/logs/3.log")
     folder = DecaRangingFolder(surveyed)
     records = list(folder)
-    # Of a log that is there twice, only the plain one is read.
+    # If a log exists twice, only the uncompressed one is read.
     assert [record.measurement.range_m for record in records] == [7.0, 2.0, 2.5, 9.0]
     assert records[-1].truth is None
     assert (records[-1].measurement.tag_id, records[-1].measurement.anchor_id) == (TAG, ANCHOR)
@@ -389,7 +389,7 @@ def test_malformed_survey_is_rejected_with_file_and_line(surveyed, name, text, l
 
 
 def naive(data: bytes) -> tuple[Counter[str], list[tuple[float, list[bytes] | None]]]:
-    """An independent reader, line by line: counts, and of each exchange the range and the final's CIR."""
+    """Read a log line by line; return counts, and the range and the CIR of FINAL of each exchange."""
     counts: Counter[str] = Counter()
     exchanges: list[tuple[float, list[bytes] | None]] = []
     seen = ""
@@ -423,7 +423,7 @@ def naive(data: bytes) -> tuple[Counter[str], list[tuple[float, list[bytes] | No
 
 @pytest.mark.slow
 def test_real_logs_equal_those_of_a_naive_parser(apartment):
-    # Logs with malformed parts (the data's README names them), and a regular one.
+    # Logs with malformed parts (listed in the README of the data), and a regular one.
     for path in (apartment / "logs" / f"{number}.log.xz" for number in (6, 11, 27, 29, 36, 37, 46, 19)):
         expected_counts, exchanges = naive(lzma.decompress(path.read_bytes()))
         log = open_decaranging(path)

@@ -84,7 +84,7 @@ NODES = {
     "viewer": ("viewer",),
 }
 BLOCK = re.compile(r"^(?:```(?:console|sh|bash)?\n(.*?)^```|((?:    .*\n|\n)+))", re.MULTILINE | re.DOTALL)
-# Names of nodes also start lines of drawings.
+# Lines of drawings may start with the name of a node.
 COMMAND = re.compile(
     r"\s*(?:\.venv/bin/)?(?:(?:uwb-mitigation|make|ros2|python -m benchmarks) |(?:driver|mitigator|pipeline) --ros)"
 )
@@ -94,7 +94,7 @@ ALIKE = {f".venv/bin/{node}": ["ros2", "run", "uwb_mitigation", node] for node i
 
 
 def typed(page: Path) -> list[list[str]]:
-    """Command lines of a page's code blocks, as words; continued lines joined, comments left out."""
+    """Return the command lines in the code blocks of a page as words, without comments and line continuations."""
     blocks = BLOCK.findall(page.read_text(encoding="utf-8"))
     lines = "\n".join(fenced or indented for fenced, indented in blocks).replace("\\\n", " ").splitlines()
     found = [shlex.split(line, comments=True) for line in lines if COMMAND.match(line)]
@@ -250,10 +250,10 @@ def test_templates_use_everything_that_can_be_generated():
 @pytest.mark.parametrize(
     ("name", "text", "lines"),
     [
-        ("page.md", "Use `anew`.\n\nIt is computed anew.\n\n    anew\n", [3]),
-        ("code.py", 'anew = 1\n\nx = 1  # the same anew\nraise ValueError("it is mended now")\n', [3, 4]),
-        ("code.c", "int anew;\n/* written\n   anew */\n", [3]),
-        ("Message.msg", "# fine\nfloat32 range # m, anew\n", [2]),
+        ("page.md", "Use `absurd`.\n\nIt is computed absurd.\n\n    absurd\n", [3]),
+        ("code.py", 'absurd = 1\n\nx = 1  # the same absurd\nraise ValueError("it is absurd now")\n', [3, 4]),
+        ("code.c", "int absurd;\n/* written\n   absurd */\n", [3]),
+        ("Message.msg", "# fine\nfloat32 range # m, absurd\n", [2]),
     ],
 )
 def test_language_check_finds_expressions_outside_code(

@@ -18,7 +18,7 @@ from uwb_mitigation.model.bundle import Session
 
 @pytest.fixture(autouse=True)
 def no_ports(monkeypatch: pytest.MonkeyPatch):
-    """The ports of the computer that runs the tests do not count."""
+    """Ignore the ports of this computer."""
     monkeypatch.setattr(list_ports, "comports", list)
 
 

@@ -1,6 +1,6 @@
-"""The DW1000's model as a library, and what a wrong driver would get from it, as from the chip.
+"""The DW1000 model as a library, and its reactions to driver errors.
 
-`test_radio_exchange.py` tests frames, timestamps and accumulators through the firmware's own driver.
+`test_radio_exchange.py` tests frames, timestamps and accumulators with the firmware.
 """
 
 from __future__ import annotations

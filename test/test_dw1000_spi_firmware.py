@@ -1,6 +1,6 @@
-"""PyPI's `dw1000-spi` and the firmware range with each other, on modelled chips: neither knows of the other's code.
+"""Ranging between the PyPI package `dw1000-spi` and the firmware on modelled chips: two independent drivers.
 
-The other driver plays the part that the exchange asks for, written here from the layout of the frames.
+The exchange for the other driver is written here from the layout of the frames.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def air(monkeypatch: pytest.MonkeyPatch) -> Iterator[Air]:
 def frame(
     kind: int, pan: int, to: int, numbers: tuple[int, int], stamps: tuple[int, ...] = (0, 0, 0)
 ) -> list[int]:
-    """As `firmware/src/uwb_twr_frame.c` lays it out."""
+    """Return a frame with the layout of `firmware/src/uwb_twr_frame.c`."""
     head = b"\x41\xcc" + bytes((numbers[0] & 0xFF,)) + pan.to_bytes(2, "little")
     body = to.to_bytes(8, "little") + OTHERS.to_bytes(8, "little") + bytes((0x75, kind))
     body += b"".join(number.to_bytes(4, "little") for number in numbers)
@@ -98,7 +98,7 @@ def test_tag_ranges_with_an_independent_anchor(air: Air, distance_m: float):
 
 
 def test_anchor_ranges_with_an_independent_tag(air: Air):
-    """It has no delayed send, and none that listens at once: SYS_CTRL and DX_TIME are written with its registers."""
+    """The package cannot send with a delay or receive immediately after sending: write SYS_CTRL and DX_TIME."""
     tag, anchor = air.chip(ppm=-15.0), air.chip(ppm=15.0, clock_ticks=WRAP - 10**9)
     air.link(tag, anchor, Link(12.5))
     own = 0xA000000000000001

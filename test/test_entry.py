@@ -1,4 +1,4 @@
-"""The executables: what they answer before they load, and how a signal ends them while they do. No ROS needed."""
+"""The executables without ROS: help, and signals during imports."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from uwb_mitigation.nodes.parameter_tables import TABLES
 
 
 def run(executable: str, *words: str, path: Path | None = None) -> subprocess.Popen[str]:
-    """Start an executable, or a demo; `path` holds modules that come before those installed."""
+    """Start an executable or a demo; modules in `path` replace installed ones."""
     start = ["-c", f"from uwb_mitigation.entry import {executable}; {executable}()"]
     if executable == "benchmarks":
         start = ["-m", "benchmarks", "radio-demo"]

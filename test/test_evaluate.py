@@ -1,4 +1,4 @@
-"""Metrics, and the commands train, quantize and evaluate from data to result."""
+"""Metrics, and the commands train, quantize and evaluate."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_passed_through_range_counts_unchanged(tmp_path):
 
 @pytest.mark.parametrize(("sigmas", "covered"), [(2.0, 0.0), (3.0, 1.0)])
 def test_intervals_are_those_of_the_bundle(tmp_path, sigmas, covered):
-    # Every range passes through, and errs by 0.25 m: by 2.8 deviations.
+    # Every range passes through with an error of 0.25 m: 2.8 standard deviations.
     promised = {"interval95_sigmas": sigmas, "variance_uncorrected_m2": 1 / 128}
     mitigation = Mitigation(bundle(tmp_path, Remnet(samples=157), **promised))
     outcome = evaluate(mitigation, [record(preamble_count=0)])

@@ -1,4 +1,4 @@
-"""The shipped models on measurements that they were not made for: they may fail to help, they must not harm."""
+"""The shipped models on out-of-distribution measurements: they must not increase the error."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def clipped(level: int) -> Callable[[Cir], Cir]:
 
 
 def louder(decibels: float) -> Callable[[Cir], Cir]:
-    """Return the same channel for a radio that reports and accumulates more (or less) power."""
+    """Return the CIR of a radio with more (or less) power."""
     gain = 10 ** (decibels / 20)
     return lambda cir: replace(
         cir,
@@ -74,7 +74,7 @@ PERTURBED = {
 
 
 def changed(mitigation: Mitigation, records: list[Record], change: Callable[[Cir], Cir]) -> Accuracy:
-    """The accuracy on records whose CIRs are changed."""
+    """Return the accuracy on records with changed CIRs."""
     return evaluate(
         mitigation,
         [
@@ -96,7 +96,7 @@ def test_radio_that_is_weaker_by_a_wall_or_two_is_made_worse_by_an_eighth_at_mos
 ):
     # A single range cannot distinguish a weaker radio in LOS from walls with the same attenuation.
     outcome = changed(mitigation, records, louder(decibels))
-    # Above 1.02 too: a bundle that does better here calls for another table in docs/background/results.md.
+    # If a bundle is better, update the table in docs/background/results.md.
     assert 1.02 < outcome.corrected.mae / outcome.raw.mae <= 1.12
 
 
@@ -123,7 +123,7 @@ def universal() -> Mitigation:
 
 @pytest.fixture(scope="module")
 def calibrated(records) -> list[Record]:
-    """The records less the boards' offset, the median error of the placements in line of sight."""
+    """Return the records minus the offset of the boards, which is the median error of the LOS placements."""
     errors: dict[str, list[float]] = {}
     for record in records:
         if record.truth.label == "LOS":
@@ -144,7 +144,7 @@ def test_out_of_distribution_measurements_do_not_get_worse(name, universal, cali
 
 @pytest.mark.parametrize(("name", "most"), [("shifted by 5", 1.6), ("shifted by 10", 1.02)])
 def test_late_windows_without_levels_are_mostly_not_corrected(name, most, calibrated):
-    # Without levels, a window that starts 5 taps late and a lost direct path look alike in part: see the model card.
+    # Without levels, a window that starts 5 taps late is similar to a lost direct path: see the model card.
     outcome = changed(Mitigation(load_bundle(default_model_path(Scaling.MAX))), calibrated, LATE[name])
     assert outcome.corrected.mae <= most * outcome.raw.mae
 
@@ -166,7 +166,7 @@ def test_universal_model_reaches_the_error_of_its_card_on_the_real_logs(apartmen
     bundle = load_bundle(default_model_path())
     found = zero_shot.run(build_dataset(apartment_reading.records, bundle.preprocessing), bundle)
     left = [np.abs(found.errors[f"universal{offset}"]).mean() for offset in ("_los_offset", "_offset")]
-    # The bars are 0.215 and 0.205.
+    # The limits are 0.215 and 0.205.
     assert left == pytest.approx([0.212, 0.202], abs=0.001)
 
 

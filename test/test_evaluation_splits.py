@@ -1,4 +1,4 @@
-"""What is held out as a whole, and what the table is made of."""
+"""Splits by configuration, intervals, and baselines."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NAMES = np.repeat([f"c{number}" for number in range(40)], 5)
 
 
 def placed(tags: list[int], anchors: list[int]):
-    """A dataset of one configuration for each tag and anchor."""
+    """Return a dataset with one configuration for each tag and anchor."""
     data = dataset(len(tags), 4, samples=8)
     return replace(data, tags=np.repeat(np.uint64(tags), 4), anchors=np.repeat(np.uint64(anchors), 4))
 

@@ -1,4 +1,4 @@
-"""Files are read up to a ceiling, and written whole or not at all."""
+"""Reading files up to a maximum size, and atomic writing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The firmware's C as the mitigator's backend: the same bits, and one clear error without a compiler."""
+"""The firmware as backend of the mitigator: bit-identical results, and one error without a compiler."""
 
 from __future__ import annotations
 

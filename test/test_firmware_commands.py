@@ -1,4 +1,4 @@
-"""`export-c` and `python -m benchmarks firmware`: results for people and for programs, and one clear error on bad input."""
+"""`export-c` and `python -m benchmarks firmware`: results, JSON, and one-line errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`make firmware-demo`, short: the firmware in an emulated processor, the driver on its port, the host's bits."""
+"""A short `make firmware-demo`: bit-identical with the host."""
 
 from __future__ import annotations
 

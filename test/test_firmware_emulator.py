@@ -1,6 +1,6 @@
-"""The Cortex-M4 kernels, in an emulated processor, equal ONNX Runtime on every output bit, within their budgets.
+"""The Cortex-M4 kernels in an emulated processor equal ONNX Runtime bit by bit, within their budgets.
 
-An emulator counts instructions exactly; of wait states, caches and power it knows nothing.
+The emulator counts instructions exactly. It does not model wait states, caches and power.
 """
 
 from __future__ import annotations
@@ -68,7 +68,8 @@ def test_kernels_equal_onnx_runtime_on_thousands_of_windows_within_the_budgets(
     exported: Exported, image: toolchain.Image
 ):
     subject = exported.subject
-    # An emulated inference costs most: of the unusual first kernel, which the host runs in full, half as many.
+    # Emulated inferences take most of the time: run half as many with the unusual first kernel, which is tested
+    # natively.
     result = check_windows(exported, image, exported.windows(2500 if subject.first_kernel == 5 else 5000))
     assert result.stack_bytes <= 512
     if subject.network == "mlp":
@@ -117,7 +118,7 @@ def test_trace_and_counter_agree_and_portable_c_takes_four_times_the_instruction
 def check_corrections(
     bundle: Bundle, measurements: Sequence[RangeMeasurement], folder: Path, offset_m: float = 0.0
 ) -> set[int]:
-    """Compare the board's corrections with the mitigator's; return the statuses seen."""
+    """Compare the corrections of the board with those of the mitigator; return the statuses."""
     export_bundle(bundle, folder)
     image = toolchain.build_image(folder, folder, Target.QEMU_MPS2)
     result = emulator.run_measurements(image, measurements, bundle.architecture.samples, offset_m=offset_m)
@@ -164,7 +165,8 @@ def test_burst_into_the_serial_port_is_answered_completely(tmp_path: Path):
     waiting = b"".join(encoder.encode(*messages.encode(asked)) for asked in measured)
     with EmulatedFirmware(bundle) as board:
         port = os.open(board.port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
-        # The emulated UART takes a byte when the board has read the one before: a pseudo-terminal's buffer fills.
+        # The emulated UART accepts a byte after the board has read the previous one, so the pseudo-terminal
+        # fills up.
         deadline = time.monotonic() + 240
         while len(answers) < 50 and time.monotonic() < deadline:
             readable, writable, _ = select.select([port], [port] if waiting else [], [], 0.1)
@@ -211,6 +213,6 @@ def test_image_of_the_dwm1001_dev_fits_and_is_written_as_hex(tmp_path: Path):
 def test_library_compiles_without_warnings_for_other_processors(cpu: str, tmp_path: Path):
     sources = firmware_folder() / "src"
     command = ("arm-none-eabi-gcc", f"-mcpu={cpu}", "-mthumb", "-std=c99", *WARNINGS, f"-I{sources}")
-    # What -Os would find beyond the syntax, the Cortex-M4's images show.
+    # Check only the syntax; the Cortex-M4 images are compiled with -Os.
     run([*command, "-fsyntax-only", *map(str, sources.glob("*.c"))])
     run([*command, "-c", *map(str, (sources / "cortex_m4").glob("*.S"))], folder=tmp_path)

@@ -1,4 +1,4 @@
-"""The C header: what is refused, and floats that read back to the same bits."""
+"""The C header: errors, and exact floats."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The wire protocol and the board's logic in C: the golden vectors, and byte for byte what `link.board.Board` sends."""
+"""The wire protocol and the logic of the board in C: golden vectors, and the same bytes as `link.board.Board`."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ KINDS = ("frames", "bad_cobs", "bad_length", "bad_crc", "oversize", "foreign_ver
 
 
 class BoardInC:
-    """`firmware/test/native_board.c`; every method returns what the board then sends."""
+    """`firmware/test/native_board.c`; each method returns the bytes that the board sends."""
 
     def __init__(self, library: ctypes.CDLL, mode: Mode, with_model: bool = True, queue: int = 16384) -> None:
         self._library = library
@@ -172,7 +172,7 @@ def python_board(bundle: Bundle, mode: Mode) -> Board:
 
 
 def same(sent: bytes, expected: bytes) -> bool:
-    """Frame for frame and byte for byte, but for the time that Python measures of its own computing."""
+    """Compare frames byte by byte, except for the measured computing time."""
 
     def frames(data: bytes) -> list[Frame]:
         decoded = FrameDecoder().feed(data)
@@ -187,7 +187,7 @@ def same(sent: bytes, expected: bytes) -> bool:
 
 
 def some_offsets(random: np.random.Generator) -> Offsets:
-    """As many as a board keeps or a few more, for radios that measurements name and others."""
+    """Draw offsets, up to a few more than a board stores, for known and other radios."""
     default, *values = random.uniform(-1.0, 1.0, 4)
     most = {100 + i: 0.5 for i in range(int(random.choice([0, 3, MAX_OFFSETS - 2, MAX_OFFSETS])))}
     tags, anchors = ({}, {}) if random.random() < 0.5 else ({1: values[0]}, {2: values[1]})
@@ -196,7 +196,7 @@ def some_offsets(random: np.random.Generator) -> Offsets:
 
 
 def damaged(payload: bytes, random: np.random.Generator) -> bytes:
-    """Cut short, or with a field that holds NaN or what no field may hold."""
+    """Draw a truncated message, or one with NaN or an invalid field."""
     if random.random() < 0.5:
         return payload[: int(random.integers(0, len(payload)))]
     at = int(random.choice([0, *range(8 + 16, len(payload), 24)]))
@@ -289,7 +289,7 @@ def test_clock_request_is_answered_before_queued_messages(library: ctypes.CDLL):
     c.measure(b"", 900, read=False)
     frames = FrameDecoder().feed(sent + c.read(1 << 16))
 
-    # Of the first frame a part had left already.
+    # A part of the first frame was already sent.
     kinds = [MessageType.RANGE_CIR, MessageType.TIME_SYNC_REPLY, MessageType.RANGE_CIR, MessageType.RANGE_CIR]
     assert [frame.type for frame in frames] == kinds
     assert [frame.sequence for frame in frames] == [1, 2, 3, 4]

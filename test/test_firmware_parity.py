@@ -1,4 +1,4 @@
-"""The C library, compiled for this computer, equals the numpy oracle and ONNX Runtime on every output bit."""
+"""The natively compiled C library equals the numpy reference and ONNX Runtime bit by bit."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from uwb_mitigation.preprocessing import Preprocessing, Scaling
 
 pytestmark = NEEDS_CC
 
-# Undefined behaviour ends the process, so that a finding cannot pass unseen.
+# Undefined behaviour ends the process, so that it is always detected.
 SANITIZED = ("-O1", "-fsanitize=undefined", "-fno-sanitize-recover=all")
 
 
@@ -92,7 +92,7 @@ def test_overflowing_prediction_is_a_model_error_as_in_the_mitigator(sign: int, 
     firmware, mitigation = CompiledFirmware(tmp_path, tmp_path, SANITIZED), Mitigation(bundle)
     measurement = model_material.measurement()
     expected = mitigation.correct([measurement])[0]
-    # This network's output is large and negative: it overflows the one, and keeps the other finite.
+    # The output of this network is large and negative: one product overflows, the other is finite.
     assert expected.status is (Status.MODEL_ERROR if sign < 0 else Status.OUT_OF_DISTRIBUTION)
     computed = firmware.correct(measurement.range_m, measurement.cir)
     assert computed == (expected.range_m, 0.0, expected.variance_m2, int(expected.status))
@@ -118,7 +118,7 @@ def test_real_logs_are_corrected_as_by_the_mitigator(shipped: Path, apartment: P
 
 
 def build_program(name: str, export: Path, flags: Sequence[str] = ()) -> str:
-    """A program of `firmware/test/`, linked with the model in `export`."""
+    """Compile a program of `firmware/test/` with the model in `export`."""
     return str(link(firmware_folder() / "test" / f"{name}.c", export, export / name, flags))
 
 

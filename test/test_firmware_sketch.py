@@ -1,4 +1,4 @@
-"""The Arduino sketch, compiled against a minimal stand-in for the Arduino API; no board was at hand."""
+"""The Arduino sketch, compiled with a minimal replacement for the Arduino API."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ STUB = firmware_folder() / "test" / "arduino_stub"
 
 
 def compile_sketch(name: str, folder: Path, compiler: tuple[str, ...], *files: str) -> Path:
-    """Compile a sketch against the stand-in and the model in `folder`, if there is one; return the program."""
-    # The fresh export, not the committed header: that one has a test of its own.
+    """Compile a sketch with the replacement and the model in `folder`, if any; return the program."""
+    # Use the exported header; the committed one has a separate test.
     sketch, program = folder / f"{name}.cpp", folder / "sketch"
     sketch.write_text((EXAMPLES / name / f"{name}.ino").read_text())
     warnings = ("-Wall", "-Wextra", "-Werror", "-include", str(STUB / "Arduino.h"))
@@ -68,7 +68,7 @@ def test_sketch_corrects_ranges_and_writes_blocks_that_are_safe_on_usb(tmp_path:
     for measurement, correction in zip(sent, corrections, strict=True):
         assert isinstance(measurement, RangeMeasurement)
         expected = host.correct([measurement])[0]
-        # Through binary32, as a board holds them.
+        # Round to binary32 as on a board.
         wanted = Correction(
             0, correction.tag_id, correction.anchor_id, correction.sequence, correction.device_time,
             expected, correction.compute_us,
@@ -79,7 +79,7 @@ def test_sketch_corrects_ranges_and_writes_blocks_that_are_safe_on_usb(tmp_path:
 @pytest.mark.skipif(shutil.which("arm-none-eabi-g++") is None, reason="apt install gcc-arm-none-eabi")
 @pytest.mark.parametrize("name", ["UwbMitigation", "UwbRanger"])
 def test_sketches_compile_for_the_boards_processor(tmp_path: Path, name: str):
-    """As the Arduino core for the nRF52840 compiles, but for its headers: sizes of types, warnings, what is inlined."""
+    """Use the compiler options of the Arduino core for the nRF52840, without its headers."""
     export_bundle(load_bundle(default_model_path()), tmp_path)
     cpu = ("-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=softfp", "-mfpu=fpv4-sp-d16")
     compile_sketch(name, tmp_path, ("arm-none-eabi-g++", *cpu, "-std=gnu++14", "-Os", "-c"))

@@ -1,4 +1,4 @@
-"""The rules that keep the house in order: layers, generated files, and what an import may pull in."""
+"""Rules of the repository: layers, imports, setup and versions."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PACKAGE = REPOSITORY / "uwb_mitigation"
 
 
 def test_layers_hold_and_only_nodes_import_rclpy_and_only_training_torch():
-    """The contracts stand in pyproject.toml."""
+    """Check the contracts of pyproject.toml."""
     pytest.importorskip("importlinter", reason="run make setup-training")
     code = "import sys; from importlinter.cli import lint_imports; sys.exit(lint_imports(no_cache=True))"
     done = subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True)
@@ -52,7 +52,7 @@ def test_importing_the_package_and_its_command_line_needs_neither_ros_nor_torch(
 
 
 def run_without(package: str, *words: object) -> subprocess.CompletedProcess[str]:
-    """The command line where a package cannot be imported."""
+    """Run the command line without a package."""
     code = (
         f"import sys; sys.modules['{package}'] = None\nfrom uwb_mitigation.commands.cli import main\nmain()"
     )
@@ -97,7 +97,7 @@ def test_setup_stops_on_platforms_without_ros_wheels(machine: str, system_ros: b
         (prefix / "setup.sh").touch()
     fake = f"import platform, runpy; platform.machine = lambda: {machine!r}; "
     code = fake + f"runpy.run_path({str(program)!r}, run_name='__main__')"
-    # Without tools nothing can be installed: the next check stops the setup where this one does not.
+    # Without tools nothing is installed: the next check stops the setup if this one does not.
     environment = os.environ | {"ROS_PREFIX": str(prefix), "PATH": str(tmp_path)}
     command = [sys.executable, "-c", code]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
@@ -108,7 +108,7 @@ def test_setup_stops_on_platforms_without_ros_wheels(machine: str, system_ros: b
 
 
 def test_failed_setup_restores_the_previous_environment(tmp_path: Path):
-    """Without a network, say; here what is required is nowhere."""
+    """The requirement does not exist, as without a network."""
     program = shutil.copy(REPOSITORY / "bootstrap.py", tmp_path)
     (tmp_path / "requirements").mkdir()
     for part in ("ros", "runtime"):

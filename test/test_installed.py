@@ -1,6 +1,6 @@
-"""What `colcon build` has installed, by the conventions of `ros2 run`, `ros2 launch` and `ros2 pkg`.
+"""Files that `colcon build` installs, by the conventions of `ros2 run`, `ros2 launch` and `ros2 pkg`.
 
-`make colcon` runs this in the workspace that it has built; elsewhere there is nothing to look at.
+`make colcon` runs this in its workspace; elsewhere these tests are skipped.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ NAME = "uwb_mitigation"
 MESSAGES = "uwb_mitigation_msgs"
 EXECUTABLES = set(re.findall(r'"([\w-]+) = uwb_mitigation\.entry:', (REPOSITORY / "setup.py").read_text()))
 NOT_ON_PYPI = {"launch", "launch_ros", "tf2_msgs"}
-"""ROS packages that no index of a machine without ROS lists."""
+"""ROS packages that are not in an ament index without ROS."""
 
 
 def prefixes() -> list[Path]:
@@ -34,7 +34,7 @@ def prefixes() -> list[Path]:
 
 
 def prefix_of(package: str) -> Path:
-    """The first prefix whose ament index lists the package, as every ROS tool finds it."""
+    """Return the first prefix whose ament index contains the package."""
     for prefix in prefixes():
         if (prefix / "share" / "ament_index" / "resource_index" / "packages" / package).is_file():
             return prefix
@@ -52,7 +52,7 @@ def share(prefix: Path) -> Path:
 
 
 def files_below(folder: Path) -> dict[str, bytes]:
-    # Launching leaves bytecode next to a launch file.
+    # A launch writes bytecode next to the launch file.
     found = [path for path in folder.rglob("*") if path.is_file() and path.suffix != ".pyc"]
     return {str(path.relative_to(folder)): path.read_bytes() for path in found}
 
@@ -99,7 +99,7 @@ def test_node_starts_where_it_is_installed_and_ends_on_ctrl_c(
 
 
 def start_and_end(command: list[str | Path], words: str, folder: Path) -> None:
-    """Start a node, wait until it says `words`, and end it by Ctrl-C."""
+    """Start a node, wait until it prints `words`, and end it with SIGINT."""
     from ros_harness import domain
 
     with domain(folder) as ros:
@@ -120,7 +120,7 @@ def test_messages_are_installed_as_an_interface_package():
     assert Path(uwb_mitigation_msgs.__file__).is_relative_to(prefix)
 
 
-# What follows holds of the sources, too, and needs no workspace.
+# The following tests check the sources and need no workspace.
 
 
 def test_colcon_build_without_the_messages_names_the_right_command(tmp_path: Path):
@@ -141,7 +141,7 @@ def test_colcon_build_without_the_messages_names_the_right_command(tmp_path: Pat
 
 
 def without(absent: Iterable[str], name: str) -> list[str]:
-    """The command that runs an executable where some libraries are not installed."""
+    """Return the command that runs an executable without some libraries."""
     code = (
         f"import sys; sys.path.insert(0, {str(REPOSITORY)!r})\n"
         f"sys.modules.update(dict.fromkeys({sorted(absent)!r}))\n"
@@ -229,7 +229,7 @@ def test_manifest_is_valid(folder: str):
 
 
 def imported(paths: Iterable[Path], at_start: bool = False) -> Iterator[str]:
-    """First names of the modules that files import; `at_start`: without a condition, and not in a function."""
+    """Return the top-level packages that files import; `at_start`: only at import time."""
     for path in paths:
         tree = ast.parse(path.read_text(encoding="utf-8"))
         for node in tree.body if at_start else ast.walk(tree):
@@ -254,7 +254,7 @@ def test_every_ros_package_that_is_imported_is_declared_and_no_other():
     assert tested <= declared | {entry.name for entry in manifest.test_depends}
 
 
-# Where a rosdep key is not `python3-` and the name of the distribution; None: there is none, or it is too old.
+# rosdep keys that are not `python3-` and the name of the distribution; None: no key, or the version is too old.
 
 
 def test_every_interface_that_the_messages_use_is_declared():

@@ -1,4 +1,4 @@
-"""The integer reference and ONNX Runtime agree on every bit, on every size, on every kind of input."""
+"""The integer reference equals ONNX Runtime bit by bit for all sizes and kinds of inputs."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from uwb_mitigation.model.weights import layer_inputs, sum_operands
 
 
 def hostile_inputs(samples: int, seed: int) -> np.ndarray:
-    """Plausible, flat, saturating, sparse, tiny, zero and huge windows."""
+    """Return plausible, flat, saturating, sparse, tiny, zero and huge windows."""
     generator = np.random.default_rng(seed)
     sparse = generator.random((60, samples)) * (generator.random((60, samples)) < 0.05)
     rows = [

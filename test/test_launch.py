@@ -1,4 +1,4 @@
-"""The launch files, run against stand-ins for ROS's launch packages, which are not on PyPI."""
+"""The launch files, with replacements for the launch packages of ROS, which are not on PyPI."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LAUNCH = REPOSITORY / "launch"
 
 
 class Configuration:
-    """A launch argument's value, looked up when it is performed."""
+    """Value of a launch argument, evaluated by `perform`."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -55,7 +55,7 @@ def generate(monkeypatch: pytest.MonkeyPatch):
 
 
 def described(generate, file: str) -> tuple[dict, object]:
-    """The arguments that a launch file declares, and what makes its nodes of them."""
+    """Return the arguments that a launch file declares, and the function that creates its nodes."""
     entities = generate(file)
     (function,) = [entity for entity in entities if entity.kind == "function"]
     arguments = {entity.values[0]: entity for entity in entities if entity.kind == "argument"}
@@ -71,7 +71,7 @@ def launch(generate, file: str, **said: str) -> list:
 
 
 def values_of(arguments: dict) -> dict[str, str]:
-    """The value of each argument that is not given."""
+    """Return the default of each argument."""
     values = {name: str(REPOSITORY / "params" / f"{name.removesuffix('_params')}.yaml") for name in arguments}
     return values | {
         name: argument.default_value
@@ -120,7 +120,7 @@ def test_viewer_starts_if_requested(generate):
     assert settings(viewer) == {"anchors": "a.yaml", "use_sim_time": False}
     *_, locator, viewer = launch(generate, "uwb.launch.py", **said, locate="true")
     assert settings(locator)["anchors"] == "a.yaml"
-    assert settings(viewer) == {"use_sim_time": False}, "the locator tells it"
+    assert settings(viewer) == {"use_sim_time": False}, "the locator publishes them"
     nodes = launch(generate, "uwb.launch.py", source="simulated")
     assert "viewer" not in [node.executable for node in nodes]
 
@@ -154,7 +154,7 @@ def test_every_parameter_is_an_argument_and_reaches_its_node_with_its_type(gener
     nodes = {
         node.executable: settings(node) for node in launch(generate, "uwb.launch.py", **said, **examples)
     }
-    # launch_ros reads a text as YAML: a path that looks like a number has to stay a text.
+    # launch_ros parses strings as YAML: a path such as 1234 must stay a string.
     assert yaml.safe_load(nodes["driver"]["frame_id"]) == "1234"
     expected = {
         "driver": {
@@ -196,7 +196,7 @@ def test_invalid_argument_stops_the_launch(generate, said: dict[str, str], told:
 
 
 class Context(dict):
-    """Launch's context: the values of arguments, and the words after the file on the command line."""
+    """The launch context: values of arguments, and the command line after the launch file."""
 
     argv = ("log_level:=info", "hieght:=0.4")
 

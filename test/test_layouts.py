@@ -33,7 +33,7 @@ PATH = re.compile(
 
 
 def has(type_name: str, fields: str) -> bool:
-    """Whether a message has a field such as `.cir.samples[:]`, an array where it is taken as one."""
+    """Return whether a message has a field such as `.cir.samples[:]`, with arrays in the right places."""
     store = schemas.typestore()
     for word in fields.removeprefix(".").split("."):
         name, _, sliced = word.partition("[")

@@ -1,7 +1,7 @@
-"""What is tested was not fitted to: nothing of a test part reaches a fit, a calibration or a choice.
+"""No test data reaches a fit, a calibration or a selection.
 
-Everything that learns from data is watched. What it gets must not hold a row of a configuration that is held out at
-that moment: by a fold that is being gone through, or by the test part of a command.
+All functions that fit to data are observed. Their inputs must not contain a row of a configuration that is held
+out at that moment, by the current fold or by the test part of a command.
 """
 
 from __future__ import annotations
@@ -61,11 +61,11 @@ LEARNERS = {
 
 
 class Watch:
-    """Holds what is held out, and what each learner was called with.
+    """Held-out configurations, and inputs of each learner.
 
     Attributes:
-        seen: the configurations that each learner got at its last call.
-        held_out: the configurations of each fold that is being gone through, and of the test part.
+        seen: configurations in the last call of each learner.
+        held_out: configurations of the current folds and of the test part.
     """
 
     def __init__(self, data: Dataset) -> None:
@@ -73,10 +73,10 @@ class Watch:
         self.held_out: list[set[str]] = []
         rows = zip(data.inputs, data.configurations.tolist(), strict=True)
         self._of = {row.tobytes(): name for row, name in rows}
-        assert len(self._of) == len(data), "rows that are alike cannot be told apart"
+        assert len(self._of) == len(data), "identical rows cannot be distinguished"
 
     def called(self, *names: str) -> None:
-        """Each of these learners was called at least once: what is not called shows nothing."""
+        """Check that each of these learners was called at least once."""
         assert not set(names) - self.seen.keys()
 
     @contextmanager
@@ -86,7 +86,7 @@ class Watch:
         self.held_out.pop()
 
     def folds(self, found: list[Split], names: NDArray[np.str_]) -> list[Split]:
-        """The same splits; each is held out while it is gone through."""
+        """Yield the same splits; each is held out during its iteration."""
         watch = self
 
         class Folds(list):  # type: ignore[type-arg]
@@ -110,7 +110,7 @@ class Watch:
         return watched
 
     def names_in(self, value: Any) -> set[str]:
-        """The configurations that a learner's argument comes from."""
+        """Return the configurations of an argument of a learner."""
         if isinstance(value, train.CrossValidation):
             value = value.dataset
         if isinstance(value, Dataset):
@@ -124,7 +124,7 @@ class Watch:
 
 @pytest.fixture(scope="module")
 def data() -> Dataset:
-    """Places in five rooms, with DeepUWB's names: the medium room is what its splits test in."""
+    """Return placements in five rooms with the names of DeepUWB, whose splits test in the medium room."""
     plain = dataset(15, 6, samples=SAMPLES)
     rooms = {f"c{n}": f"simulated seed 1/deepuwb/room{n % 5}/clear/placement {n}" for n in range(15)}
     return replace(plain, configurations=np.array([rooms[name] for name in plain.configurations]))
@@ -200,7 +200,7 @@ def test_protocol_fits_and_calibrates_on_its_training_part(data, watch, tmp_path
 
 @pytest.fixture
 def calibrated(monkeypatch: pytest.MonkeyPatch) -> list[set[str]]:
-    """The configurations of each call to `cards.calibrate`."""
+    """Record the configurations of each call of `cards.calibrate`."""
     calls: list[set[str]] = []
     calibrate = cards.calibrate
 

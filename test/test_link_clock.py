@@ -1,4 +1,4 @@
-"""A board's clock on the host's: error under jitter, gaps, wraps, resets, steps."""
+"""Clock synchronisation with a board: errors with jitter, gaps, wraps, resets and steps."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ EPOCH = 1_760_000_000 * SECOND
 
 @dataclass
 class JitteryLink:
-    """Simulated: a crystal 40 ppm off that warms, and a bus that stalls for 10 ms, 25 times a second."""
+    """Simulated crystal that is 40 ppm fast and warms up, and a bus with 25 stalls of 10 ms per second."""
 
     random: np.random.Generator
     stalls: np.ndarray = field(init=False)
@@ -36,7 +36,7 @@ class JitteryLink:
         return ticks % self.wrap if self.wrap else ticks
 
     def delivered_s(self, true_s: float) -> float:
-        """When something sent at `true_s` is there: at the end of the last stall that it falls into."""
+        """Return the arrival time of data sent at `true_s`: after the stalls."""
         arrival = true_s + 150e-6 + self.random.exponential(100e-6)
         last = np.searchsorted(self.stalls, arrival) - 1
         return max(arrival, self.stalls[last] + 10e-3) if last >= 0 else arrival
@@ -61,7 +61,7 @@ class JitteryLink:
 
 
 def run(link: JitteryLink, clock: DeviceClock, begin: float, end: float) -> Iterator[float]:
-    """Errors of the stamps of measurements at 100 Hz, with a round trip a second."""
+    """Return the stamp errors of measurements at 100 Hz with one round trip per second."""
     for step in range(round(begin * 100), round(end * 100)):
         true_s = step / 100 + link.random.uniform(0, 1e-3)
         if step % 100 == 0:

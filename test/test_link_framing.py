@@ -1,4 +1,4 @@
-"""Frames through a byte stream: every intact one is delivered, damage is counted, memory is bounded."""
+"""Frames in a byte stream: intact ones are delivered, damaged ones are counted, memory is bounded."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The fuzz targets of the link, run briefly on bytes that Hypothesis makes up."""
+"""The fuzz targets of the link, run briefly with bytes from Hypothesis."""
 
 from __future__ import annotations
 

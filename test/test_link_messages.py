@@ -1,4 +1,4 @@
-"""Messages to payloads and back, and what hostile payloads get."""
+"""Messages and payloads, including hostile ones."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def test_measurement_with_an_impossible_field_is_an_error(field, code, value):
     kind, payload = messages.encode(measurement([1, 2]))
     broken = bytearray(payload)
     if field == "samples_offset":
-        broken += bytes(6)  # So that the samples still end inside.
+        broken += bytes(6)  # The samples still end inside the payload.
     struct.pack_into("<" + code, broken, layout.PAYLOADS[kind].offsets()[field], value)
 
     with pytest.raises(LinkError, match="RANGE_CIR"):

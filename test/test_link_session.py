@@ -29,7 +29,7 @@ IDENTITY = Hello(board_id=0xB0, model_id=0xCAFE, window=157, firmware_name="simu
 
 
 class HalfMetre:
-    """A model that predicts half a metre of error for everything."""
+    """A model that predicts an error of 0.5 m for every range."""
 
     def correct(self, measurements: list[RangeMeasurement]) -> list[CorrectedRange]:
         return [
@@ -45,7 +45,7 @@ def measurement(sequence: int) -> RangeMeasurement:
 
 
 class Bench:
-    """A session and a board, joined by a link without delay; the board boots at time 0."""
+    """A session and a board connected without delay; the board boots at time 0."""
 
     def __init__(self, session: BoardSession, corrector: HalfMetre | None = None, **board: object) -> None:
         self.session = session
@@ -64,7 +64,7 @@ class Bench:
         return events
 
     def run(self, milliseconds: int, deaf: bool = False) -> None:
-        """Pass time in steps of 10 ms; `deaf`: nothing of what the host sends arrives."""
+        """Advance time in steps of 10 ms; `deaf`: the board receives nothing."""
         for _ in range(milliseconds // 10):
             self.now += 10 * MS
             self.events += self.session.tick(self.now, EPOCH + self.now)
@@ -299,7 +299,7 @@ def test_frames_that_are_not_delivered_are_counted(kind, flags, payload, counted
 
 def test_send_queue_is_bounded():
     bench = connected()
-    for _ in range(5000):  # Nobody takes what it asks for.
+    for _ in range(5000):  # Its requests are not sent.
         bench.now += 1000 * MS
         bench.session.tick(bench.now, EPOCH + bench.now)
 

@@ -1,4 +1,4 @@
-"""Golden vectors of the wire protocol: the file that Python and C both test against.
+"""Golden vectors of the wire protocol, for the tests of Python and C.
 
 `python test/test_link_vectors.py` rewrites the file; use it only for a deliberate change of the protocol.
 """
@@ -185,7 +185,7 @@ def sent_frames() -> Iterator[tuple[str, Frame]]:
     for name, (message, flags, sequence, time_us) in SENT.items():
         kind, payload = messages.encode(message)
         yield name, Frame(int(kind), int(flags), sequence, time_us, payload)
-    # A receiver counts and skips a type it does not know; runs of 254 bytes are where COBS goes wrong.
+    # A receiver counts and skips unknown types; blocks of 254 bytes are a special case of COBS.
     for size in (253, 254, 255, 508):
         yield f"unknown_{size}", Frame(200, 0x8000, size, 0, bytes(1 + i % 255 for i in range(size)))
     yield "unknown_zeros", Frame(200, 0, 0, 0, bytes(300))
@@ -230,7 +230,7 @@ def crc(body: bytes) -> bytes:
 
 
 def stuffed(body: bytes) -> bytes:
-    """COBS written from its definition, apart from the library that the package uses."""
+    """Encode with COBS by its definition, independent of the library."""
     out = bytearray()
     for run in body.split(b"\0"):
         while len(run) >= 254:

@@ -41,7 +41,7 @@ def anchors(tmp_path: Path) -> Path:
 
 
 class Drive:
-    """Publishes a drive, stamped from the current time on, at a given speed."""
+    """Publishes a drive at a given speed, with stamps from the current time on."""
 
     def __init__(self, ros: Ros, **options) -> None:
         self.ranges, self.truth = drive(**options)
@@ -68,7 +68,7 @@ class Drive:
                 self._ros.spin_for(0.01)
 
     def errors(self, poses: list) -> np.ndarray:
-        """Horizontal distances of poses to the truth at their stamps."""
+        """Return the horizontal errors of poses."""
         stamps = [pose.header.stamp.sec * NANOSECONDS + pose.header.stamp.nanosec for pose in poses]
         at = self.truth.at(np.array(stamps) - self.start_ns)
         places = np.array([(pose.pose.pose.position.x, pose.pose.pose.position.y) for pose in poses])
@@ -80,7 +80,7 @@ def stamp_ns(pose: PoseWithCovarianceStamped) -> int:
 
 
 def values(received: list[DiagnosticArray]) -> dict[str, str]:
-    """Those of the locator's latest status, and its message."""
+    """Return the values of the latest status of the locator, with its message as value of an empty key."""
     for array in reversed(received):
         for status in array.status:
             if status.name.startswith("locator"):
@@ -156,7 +156,7 @@ def test_gap_is_bridged_by_predictions_with_growing_covariance(ros: Ros, anchors
 
     half = len(run.ranges) // 2
     run.send(range(half))
-    # Who is told of half a drive is told of the last of all ranges.
+    # A subscriber of half a drive receives the pose of the last range.
     spread_at(half - 1, 0.4)
     run.send(range(half, len(run.ranges)))
     ros.spin_until(lambda: stamp_ns(poses[-1]) == run.start_ns + int(run.ranges.stamp_ns[-1]))
@@ -194,7 +194,7 @@ def test_best_effort_height_is_received_and_best_effort_ranges_are_reported(ros:
 
 
 def test_tf_contains_only_the_frames_of_the_tags_below_the_map(ros: Ros, anchors: Path):
-    # One robot in a namespace, one without: their tags share the map.
+    # One robot in a namespace and one without; their tags share the map frame.
     locator = ros.start("locator", f"anchors:={anchors}", "rate:=0.0", "publish_tf:=true", "tag:=7")
     other = ros.start(
         "locator", f"anchors:={anchors}", "publish_tf:=true", arguments=("-r", "__ns:=/left", *SHARED)
@@ -226,7 +226,7 @@ def test_tf_contains_only_the_frames_of_the_tags_below_the_map(ros: Ros, anchors
     ros.spin_until(lambda: bool(poses) and ("uwb_tag", stamp_ns(poses[-1])) in links())
     found = links()
     frames = {frame for frame, _ in found}
-    # A frame has one parent: those of the robot (odom, base_link) are not published here.
+    # A frame has one parent: frames of the robot (odom, base_link) are not published.
     assert {*odometry} <= frames <= {*odometry, f"left/{long_tag}"}
     assert {one.header.frame_id for one in found.values()} == {"map"}
     for frame, messages in odometry.items():

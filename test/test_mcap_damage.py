@@ -1,4 +1,4 @@
-"""Damaged and hostile bags: what is whole is read, the error says where, and memory stays small."""
+"""Damaged and hostile bags: complete messages are read, the error has a position, and memory is bounded."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def test_every_flipped_bit_in_the_data_is_detected(tmp_path: Path) -> None:
         except RecordingError:
             assert set(read) <= set(expected)
         else:
-            # Nothing is lost: at worst a flipped time in a chunk's header changes the order.
+            # No message is lost; a flipped time in the header of a chunk may change the order.
             assert sorted(read) == sorted(expected) or source.skipped, f"byte {at}"
 
 

@@ -1,4 +1,4 @@
-"""Reading bags: truth joined, order kept, and what cannot be read refused by name."""
+"""Reading bags: joined truth, order, and errors."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_truth_is_joined_with_an_earlier_or_later_range(tmp_path: Path, lag: int
     for number in range(-5, 25):
         for write, which in ((bag.range, number), (bag.truth, number - lag)):
             if 0 <= which < 20:
-                # One log time for all, so that the file's order is what counts.
+                # All messages have the same log time, so that the order in the file is used.
                 known = record(which)
                 data = (
                     codec.encode_range(known.measurement)
@@ -73,7 +73,7 @@ def test_tag_position_is_read_from_the_bag(tmp_path: Path) -> None:
     with BagWriter(path, {}) as out:
         for number, place in enumerate(places):
             out.write(replace(record(number), tag_position=place))
-        # Another's frame, and a message that is cut short.
+        # A frame of another tag, and a truncated message.
         estimate = Estimate(record(3).measurement.stamp_ns, np.ones(3), np.ones(3), np.eye(6))
         whole = encode_odometry(estimate, child_frame_id="base_link")
         for data in (whole, whole[:50]):

@@ -1,4 +1,4 @@
-"""Measurements: what they hold, and how they count samples."""
+"""Measurements: constants and ids."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Mitigation: what a consumer gets for good measurements and for bad ones."""
+"""Correction of valid and invalid measurements."""
 
 from __future__ import annotations
 

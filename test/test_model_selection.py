@@ -1,4 +1,4 @@
-"""Model selection, and `train` with data of one's own, from data and from a bundle."""
+"""Model selection, and `train` from data and from a bundle."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ CONSTANTS = [
 
 
 def numbered(error_of):
-    """A dataset of 12 configurations whose errors are those of `error_of`(configuration number)."""
+    """Return a dataset of 12 configurations with the errors `error_of`(configuration number)."""
     data = dataset(12, 5, samples=8)
     error = np.array([error_of(int(name[1:])) for name in data.configurations], float)
     return replace(data, error_m=error, range_m=3.0 + error)
@@ -65,7 +65,7 @@ def test_line_is_selected_only_for_errors_that_depend_on_power():
 
 
 def test_nested_error_is_from_configurations_outside_the_selection():
-    # The candidate that is best in each fold is worst elsewhere.
+    # The best candidate of each fold is the worst in the others.
     data = numbered(lambda number: 0.5 if number < 6 else 0.0)
     found = selection.select_nested(data, CONSTANTS[:2], 2, 0)
     assert np.isin(np.abs(found.errors[NESTED]), (0.0, 0.5)).all()
@@ -79,7 +79,7 @@ def test_trained_network_must_show_its_gain_in_the_nested_error(monkeypatch):
     prefer = selection.select_simplest
 
     def select_simplest(errors, min_gain=0.02):
-        """The inner folds prefer another one, so the selection leaves more than the candidate."""
+        """The inner folds prefer another candidate, so that the selection has a larger error."""
         is_inner = len(next(iter(errors.values()))) < len(data)
         return "half" if is_inner else prefer(errors, min_gain)
 
@@ -197,7 +197,7 @@ EIGHT_PLACES = [f"{place},2,3.0,,,place {place}" for place in range(8)]
 
 @pytest.fixture
 def eight_places(monkeypatch) -> Recorded:
-    """A recording of ranges that err by 0.25 m."""
+    """Return a recording of ranges with an error of 0.25 m."""
     ranges = [
         Record(replace(measurement(3.25, 10 * place + number), tag_id=place))
         for place in range(8)
@@ -212,7 +212,7 @@ def loads(monkeypatch, data) -> None:
 
 
 def test_named_model_gets_the_offset_of_the_bag(tmp_path, eight_places):
-    # The same shape as the universal network, which replaces no model that is named.
+    # The same shape as the universal network, which does not replace a named model.
     started = bundle(tmp_path, Remnet(), linear_bias=LinearBiasModel(5.0))
     output, result = tmp_path / "own.onnx", tmp_path / "own.json"
     run_or_raise(
@@ -235,7 +235,7 @@ def test_few_configurations_start_from_the_universal_network(tmp_path, monkeypat
     found, made = json.loads(result.read_text()), load_bundle(output)
     start = load_bundle(default_model_path())
     assert found["choice"]["chosen"] == made.card.training["chosen"] == candidates.COLD_START
-    # The mark is in the line of the chosen one, also with 80 columns.
+    # The mark is in the line of the chosen candidate, also with 80 columns.
     assert [line for line in told.splitlines() if "<-" in line and candidates.COLD_START in line]
     mae = {row["name"]: row["mae"] for row in found["choice"]["rows"]}
     assert found["helped"] == (mae[NESTED] < mae["raw"])
@@ -246,7 +246,7 @@ def test_few_configurations_start_from_the_universal_network(tmp_path, monkeypat
 
 
 def test_harmful_model_is_reported(tmp_path, monkeypatch):
-    # Without one of two configurations that err by 1 m, the constant is that of the two that err by -1 m.
+    # Without one of the two configurations with an error of 1 m, the constant is that of the two with -1 m.
     data = dataset(4, 3, samples=8)
     loads(monkeypatch, replace(data, error_m=np.where(np.isin(data.configurations, ("c0", "c1")), 1.0, -1.0)))
     output, result = tmp_path / "x.onnx", tmp_path / "x.json"

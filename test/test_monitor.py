@@ -1,4 +1,4 @@
-"""The monitor's counts, latency and errors."""
+"""Counts, latency and errors of the monitor."""
 
 from __future__ import annotations
 

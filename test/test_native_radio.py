@@ -1,4 +1,4 @@
-"""Radios at this computer: EVB1000s behind their USB-to-SPI protocol, emulated in wall-clock time, and spidev."""
+"""Local radios: emulated EVB1000s with their USB-to-SPI protocol in real time, and spidev."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_tag_and_anchor_on_usb_recover_from_unplugging(
         wait_until(lambda: tag.report().problem == "")
 
         taken: list[int] = []
-        # Requests of 0.4 s on USB, plus the pause before a try, restart a radio within a second. A busy computer
+        # USB requests of 0.4 s and the pause before a retry restart a radio within a second. A busy computer
         # exceeds the timeout of a request and needs more than one try.
         while len(taken) < 10 and not (taken and taken[-1] < 0.4 / ROUND_TRIP_S):
             emulated.unplug(0)
@@ -165,7 +165,7 @@ def test_other_usb_device_is_reported(tmp_path: Path):
 
 @contextlib.contextmanager
 def answering(controller: int, answer: bytes) -> Iterator[None]:
-    """Whatever is written to the port of a terminal is answered so."""
+    """A terminal that answers everything with the same bytes."""
     stop = threading.Event()
 
     def run() -> None:
@@ -184,7 +184,7 @@ def answering(controller: int, answer: bytes) -> Iterator[None]:
 
 
 class FakeSpi:
-    """`spidev.SpiDev` on a modelled chip that keeps up with this computer's clock."""
+    """`spidev.SpiDev` on a modelled chip in real time."""
 
     air: Air | None = None
 
@@ -207,7 +207,7 @@ class FakeSpi:
 
 
 class FakeGpio:
-    """The kernel's side of a GPIO line that a modelled chip's RSTn hangs on (linux/gpio.h, the first version)."""
+    """The kernel interface of a GPIO line at the RSTn pin of a modelled chip (linux/gpio.h, version 1)."""
 
     INPUT, OUTPUT, OPEN_DRAIN = 1, 2, 8
     GET_LINE = 0xC16CB403

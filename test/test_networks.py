@@ -1,4 +1,4 @@
-"""The networks: counts of the paper's Table 1, and the same numbers in torch, numpy and ONNX."""
+"""The networks: parameter counts of Table 1 of the paper, and equal results in torch, numpy and ONNX."""
 
 from __future__ import annotations
 

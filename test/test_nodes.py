@@ -41,7 +41,7 @@ CORRECTED = "/uwb/range_corrected"
 
 @pytest.fixture(scope="session")
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """300 simulated ranges in a bag, 40 a second."""
+    """Return a bag of 300 simulated ranges at 40 Hz."""
     from uwb_mitigation.bag.writer import BagWriter
 
     path = tmp_path_factory.mktemp("bag") / "simulated.mcap"

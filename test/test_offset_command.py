@@ -1,4 +1,4 @@
-"""`uwb-mitigation offset`: the radios' offset from a known distance, and what of a recording is refused."""
+"""`uwb-mitigation offset`: offset of the radios from a known distance, and refused ranges."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def universal() -> Mitigation:
 
 @pytest.fixture(scope="module")
 def direct() -> list[Record]:
-    """Simulated ranges of one pair, in line of sight, with their truth."""
+    """Return simulated LOS ranges of one pair with their truth."""
     seen = [
         record
         for record in SimulatedSource(seed=11, count=1500)
@@ -58,7 +58,7 @@ def weaker_first_path(records: list[Record], by_db: float) -> Iterator[Record]:
 
 
 def without_levels(records: list[Record]) -> Iterator[Record]:
-    """The records without preamble counts and power levels."""
+    """Return the records without preamble counts and levels."""
     unknown = {"rx_power_dbm": float("nan"), "first_path_power_dbm": float("nan")}
     for record in records:
         cir = amplitudes_only(record.measurement.cir, **unknown)
@@ -75,7 +75,7 @@ def test_added_offset_is_estimated(universal: Mitigation, direct: list[Record]):
     assert after.sd_m == pytest.approx(before.sd_m, abs=0.02)
     assert before.ranges >= 20
     assert len(at_one_place(before)) > 1
-    # What the simulator adds for the boards: docs/background/how_it_works.md.
+    # The offset of simulated boards.
     assert before.offset_m == pytest.approx(0.22, abs=3.0 * before.sd_m)
     # Offsets that the mitigator already subtracts are not counted twice.
     told = Mitigation(universal.bundle, Offsets(0.625))

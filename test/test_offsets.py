@@ -1,4 +1,4 @@
-"""Offsets of radios: the file, which counts for a pair, their effect on a range, and their transfer to a board."""
+"""Offsets of radios: file, precedence, effect on a range, and transfer to a board."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def test_passed_through_range_has_the_offset_subtracted(
 
 
 class Echo:
-    """Corrects by the offset alone."""
+    """Corrects only the offset."""
 
     def __init__(self) -> None:
         self.offsets = Offsets(9.0)
@@ -149,7 +149,7 @@ CORRECTION = Correction(0, 1, 2, 3, 4, CorrectedRange(1.0, 1.0, 0.0, 1.0, Status
 
 
 class Pair:
-    """A session and a board on one wire; a board with older firmware ignores offsets."""
+    """A session connected to a board; a board with older firmware ignores offsets."""
 
     def __init__(self, wanted: Offsets | None, *, older: bool = False) -> None:
         self.session = BoardSession()

@@ -35,7 +35,7 @@ OBSTACLES = ("0000000000", "1000000000", "0000001001", "0000000001")
 
 
 def frame(count: int = 12) -> pd.DataFrame:
-    """A frame with the published columns and random values."""
+    """Return a frame with the published columns and random values."""
     generator = np.random.default_rng(5)
     amplitudes = generator.random((count, 157))
     amplitudes /= amplitudes.max(axis=1, keepdims=True)
@@ -281,7 +281,7 @@ SHA256 = hashlib.sha256(CONTENT).hexdigest()
 
 class Quiet(SimpleHTTPRequestHandler):
     def log_message(self, *_: object) -> None:
-        """Commands share this process's stderr, which the test reads."""
+        """Commands write to the stderr of this process, which the test reads."""
 
 
 @pytest.fixture

@@ -82,7 +82,7 @@ def left(baselines, name: str) -> float:
 
 
 def with_line(data: Dataset, gap_db: float = 5.0) -> Dataset:
-    """Errors that are linear in the received power, which differs between configurations."""
+    """Return a dataset whose errors are linear in the received power, which differs between configurations."""
     _, of = np.unique(data.configurations, return_inverse=True)
     power = (-80.0 - of + 0.1 * np.arange(len(data)) % 1).astype(np.float32)
     gap = (gap_db + of**2).astype(np.float32)
@@ -99,7 +99,7 @@ def test_baselines_are_fitted_on_the_training_part(finished):
     train, test = with_line(dataset(8, 5)), with_line(dataset(4, 5, seed=1), gap_db=9.0)
     baselines = experiment.baselines_of(train, test)
     assert left(baselines, "line") < 0.02 < 0.2 < left(baselines, "overall_median")
-    test.first_path_power_dbm[0] = np.nan  # without power, the range stays as measured
+    test.first_path_power_dbm[0] = np.nan  # without levels, the range is unchanged
     known = np.abs(test.error_m[0]) / len(test)
     assert left(experiment.baselines_of(train, test), "line") == pytest.approx(known, abs=0.02)
 

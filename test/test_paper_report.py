@@ -117,7 +117,7 @@ def row_of(made: Report, table: str, *heads: str) -> tuple[tables.Cell, ...]:
 
 @pytest.fixture(scope="module")
 def full() -> Report:
-    """The report of one network and one firmware measurement."""
+    """Return the report of one network and one firmware measurement."""
     return build(study(simulated=True), results(trained()), [firmware_row()])
 
 
@@ -180,7 +180,12 @@ def test_measured_numbers_are_means_over_seeds(no_cloud):
     assert (cell.kind, cell.n, cell.text) == ("measured", 3, "0.0645 ± 0.0020")
     assert (cell.value, cell.std) == (pytest.approx(0.0645), pytest.approx(0.002))
     row = row_of(made, "table2", "REMNet", "157")
-    assert [cell.text for cell in row[-3:]] == ["27.825", "28.105", "23.898 ± 0.010"]  # kB; no spread of zero
+    assert [cell.text for cell in row[-3:]] == [
+        "27.825",
+        "28.105",
+        "23.898 ± 0.010",
+    ]  # kB; a spread of zero is
+    # not shown
     boxes = made.figures[-1].numbers["boxes"]
     assert boxes["K = 157"] == pytest.approx([-0.1, 0.0, 0.0625, 0.1, 0.2])
     assert boxes["K = 64"] is None

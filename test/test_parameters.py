@@ -1,4 +1,4 @@
-"""Parameters of the nodes: refused by name, value and range; unknown ones reported; QoS overridable."""
+"""Parameters of the nodes: checks, unknown names, and QoS overrides."""
 
 from __future__ import annotations
 

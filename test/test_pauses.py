@@ -1,4 +1,4 @@
-"""A recording is made playable: no long pauses, and a date."""
+"""Shortened pauses, and dates of recordings without one."""
 
 from __future__ import annotations
 

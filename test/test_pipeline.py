@@ -1,4 +1,4 @@
-"""Driver and mitigator in one process: the same ranges, and no CIR on the wire that nobody asked for."""
+"""Driver and mitigator in one process: the same ranges, and no CIR without a subscriber."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a robot's own localisation says that it was: poses of bags that others recorded."""
+"""Poses of a robot's localisation in bags of other recorders."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def header(second: int, frame: str = "map") -> Any:
 
 
 def pose(second: int) -> Any:
-    """A metre a second along x."""
+    """Return poses that move along x at 1 m/s."""
     return of(
         "geometry_msgs/msg/Pose",
         of("geometry_msgs/msg/Point", float(second), 2.0, 0.5),
@@ -58,7 +58,7 @@ def posed_with_covariance(second: int) -> Any:
 
 
 def transformed(second: int) -> Any:
-    """Through a frame between, and beside more links than an arm has."""
+    """With an intermediate frame, and with other frames."""
     links = [step(second, "base_link", f"link_{n}", 0.0) for n in range(70)]
     chain = [step(second, "map", "odom", float(second)), step(second, "odom", "base_link", 0.0)]
     return of("tf2_msgs/msg/TFMessage", [*chain, *links])
@@ -98,7 +98,7 @@ def odometry(second: int, child: str = "base_link") -> Any:
 
 
 def of_two_tags(second: int) -> Any:
-    """An odometry of tag 7 in even seconds and of tag 8 in odd ones."""
+    """Return odometry of tag 7 in even seconds and of tag 8 in odd ones."""
     return odometry(second, f"tag_{7 + second % 2}")
 
 
@@ -134,7 +134,7 @@ def test_missing_frames_are_reported(tmp_path):
 
 
 def measured_range(second: int) -> Any:
-    """0.1 m higher each second; the sensor reports more than its maximum in second 3."""
+    """Return heights that grow by 0.1 m/s; in second 3 the sensor exceeds its maximum."""
     value = 9.0 if second == 3 else 0.5 + 0.1 * second
     return of("sensor_msgs/msg/Range", header(second), 1, 0.1, 0.0, 4.0, value, 0.0004)
 

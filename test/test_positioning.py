@@ -1,4 +1,4 @@
-"""The filter, how it starts, and how it finds a lost tag again."""
+"""The filter, its initialisation, and relocalisation of a lost tag."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from uwb_mitigation.positioning.tracks import (
 )
 
 PLAIN = NoiseModel(long=100.0, short=100.0)
-"""No range is doubted."""
+"""No range is down-weighted."""
 
 FLAT = WALL.moved(WALL.position * (1, 1, 0) + np.outer([0, 0, -3, -3, 0], (1, 0, 0)) + (0, 0, 2), WALL.sd)
 """Anchors in one plane: without a height, every position has a mirror image."""

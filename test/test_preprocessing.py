@@ -1,4 +1,4 @@
-"""Preprocessing: the window, the scalings to the bit, and every fault."""
+"""Preprocessing: window, bit-exact scaling, and every fault."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def single(value: float) -> float:
 
 
 def reference(cir: Cir, samples: int, scaling: Scaling) -> list[float]:
-    """The contract in plain Python: one rounding to float32 an operation."""
+    """The specification in plain Python: each operation is rounded to float32."""
     start = math.floor(cir.first_path_index) - 5 - cir.start_index
     values = []
     for index in range(start, start + samples):

@@ -1,4 +1,4 @@
-"""`uwb-mitigation process`: every message kept, every range corrected as one by one, and nothing half-done."""
+"""`uwb-mitigation process`: copies all messages, corrects all ranges, and leaves no partial files."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from uwb_mitigation.processing.parallel import plan, run_on_dask
 REPOSITORY = Path(__file__).parent.parent
 START_NS = 1_700_000_000_000_000_000
 
-# What a row of a batch may be: changes to the CIR, and the range.
+# Rows of a batch: changes of the CIR, and the range.
 ROWS: list[tuple[dict[str, object], float]] = [
     ({}, 3.0),
     ({"scale": 0.37}, 3.0),
@@ -84,7 +84,7 @@ ROWS: list[tuple[dict[str, object], float]] = [
 
 
 def single(value: object) -> object:
-    """As a bag holds it: float32."""
+    """Round to float32 as in a bag."""
     return float(np.float32(value)) if isinstance(value, float) else value
 
 
@@ -187,7 +187,7 @@ def test_corrected_ranges_of_the_input_are_replaced_and_counted(tmp_path: Path) 
 
 
 def cut(path: Path) -> int:
-    """Break a bag behind its first chunk; returns where."""
+    """Damage a bag after its first chunk; return the position."""
     end = chunk_offsets(path)[0][1]
     path.write_bytes(path.read_bytes()[:end] + b"\x06\xff\xff\xff")
     return end
@@ -220,7 +220,7 @@ def test_command_writes_a_bag_and_its_result(tmp_path: Path) -> None:
 
 def test_offsets_of_a_file_are_subtracted_for_each_pair(tmp_path: Path) -> None:
     write_bag(tmp_path / "in.mcap", exchanges(30))
-    # Of the three anchors one has its own offset, one its own with this tag.
+    # One of the three anchors has an offset, and one has an offset with this tag.
     offsets = "default: 0.2\nanchors: {2: 0.35}\npairs: [{anchor: 3, tag: 7, offset: -0.1}]\n"
     (tmp_path / "offsets.yaml").write_text(offsets)
     words = "process in.mcap -o out.mcap --offsets offsets.yaml --model evk1000_apartment"
@@ -308,7 +308,7 @@ def test_names_of_sources_are_kept_and_earlier_outputs_skipped(tmp_path: Path) -
 def test_ctrl_c_leaves_no_partial_file(tmp_path: Path) -> None:
     source = write_bag(tmp_path / "in.mcap", exchanges(200))
     data, ((first, end), *_) = source.read_bytes(), chunk_offsets(source)
-    # The same chunk two hundred times over: more than is done before the signal.
+    # The same chunk two hundred times: more than is processed before the signal.
     source.write_bytes(data[:end] + data[first:end] * 200)
     process = subprocess.Popen(
         command("process", source, "-o", "out.mcap"),
@@ -334,7 +334,7 @@ def test_crashed_worker_loses_only_its_bag(tmp_path: Path) -> None:
     jobs = [
         job(write_bag(tmp_path / f"in{n}.mcap", exchanges(9)), tmp_path / f"out{n}.mcap") for n in range(3)
     ]
-    # As the system does when memory runs out.
+    # As the system does if memory runs out.
     (tmp_path / "sitecustomize.py").write_text(
         "import os, signal\n"
         "from uwb_mitigation.processing import job\n"

@@ -1,4 +1,4 @@
-"""Nodes that a bench or a demo starts end with it, however it ends."""
+"""Nodes of a benchmark or demo end with it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ RUNS = {
 
 
 def nodes_of(pid: int) -> list[psutil.Process]:
-    """The nodes that a process has started."""
+    """Return the nodes that a process has started."""
     return [
         child
         for child in psutil.Process(pid).children(recursive=True)
@@ -40,7 +40,7 @@ def nodes_of(pid: int) -> list[psutil.Process]:
     ],
 )
 def test_nodes_end_with_their_parent_process(run: str, number: signal.Signals, code: int, tmp_path: Path):
-    # Each isolates itself.
+    # Each process isolates itself.
     environment = {name: value for name, value in os.environ.items() if not name.startswith("ROS_")}
     with (tmp_path / "said").open("wb") as said:
         running = subprocess.Popen(

@@ -1,4 +1,4 @@
-"""Quantisation: close to float, 7-bit weights, and scales that integer arithmetic can stand for."""
+"""Quantisation: close to float, 7-bit weights, and exact scales."""
 
 from __future__ import annotations
 

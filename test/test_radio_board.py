@@ -1,4 +1,4 @@
-"""A board with a radio of its own, on modelled chips, as a host's session sees it: settings, status, ranges."""
+"""A session with a board that has a radio, on modelled chips: settings, status and ranges."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ pytestmark = NEEDS_CC
 
 
 class Host:
-    """A session on the line of a modelled board, whose time is the air's."""
+    """A session with a modelled board in virtual time."""
 
     def __init__(self, air: ModelledAir, board: int, settings: RadioSettings | None = None) -> None:
         self.air, self.board = air, board

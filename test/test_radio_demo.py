@@ -1,4 +1,4 @@
-"""`make radio-demo`, short: emulated EVB1000s in the simulated flat, through driver and mitigator."""
+"""A short `make radio-demo`: emulated EVB1000s in the simulated flat, driver and mitigator."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_each_anchor_ranges_and_the_demo_succeeds():
         assert int(count) > 0
         assert abs(float(raw) - float(true)) < 4.0
         assert abs(float(corrected) - float(true)) < 4.0
-    # In line of sight there may be nothing to correct.
+    # LOS ranges may need no correction.
     assert any(float(corrected) != float(raw) for *_, raw, corrected, _ in rows)
 
 
@@ -46,5 +46,5 @@ def test_ctrl_c_ends_the_demo_and_its_nodes():
 
 
 def children(pid: int) -> list[str]:
-    """Processes that this one has started, Linux only."""
+    """Return the child processes (Linux only)."""
     return Path(f"/proc/{pid}/task/{pid}/children").read_text().split()

@@ -1,4 +1,4 @@
-"""The node `driver` with radios at this computer: emulated EVB1000s behind USB-to-SPI, over real ROS 2."""
+"""The node `driver` with local radios: emulated EVB1000s with USB-to-SPI, over real ROS 2."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def test_default_parameters_do_not_change_the_radio_of_a_board():
 
 
 class ModelledBoard:
-    """A board with a radio: the firmware on a modelled chip, a second chip as anchor, its UART on a pseudo-terminal."""
+    """A board with a radio on a modelled chip and its UART on a pseudo-terminal; a second chip is the anchor."""
 
     STEP_S = 0.005
 

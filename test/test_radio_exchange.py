@@ -22,7 +22,7 @@ LOST = ("no_answer", "late", "timeout", "damaged", "implausible", "broken")
 
 
 def accumulator(samples: int = 1016, first_path: int = 745, seed: int = 0) -> np.ndarray:
-    """Noise, and a path of 8,000 with a tail, int16 (2 n,)."""
+    """Return noise and a path of amplitude 8,000 with a tail, int16 (2 n,)."""
     random = np.random.default_rng(seed)
     iq = random.normal(0, 40, 2 * samples)
     tail = 8000 * np.exp(-np.arange(60) / 12)
@@ -96,7 +96,8 @@ def test_powers_are_the_manuals_formulas_of_the_registers(prf: int, reference_db
     first = np.sqrt((magnitude[746:749] ** 2).sum())
     expected = 20 * math.log10(first / 100) - reference_db
     assert rows["first_path_power_dbm"] == pytest.approx(expected, abs=20 * math.log10(1 + 2 / first))
-    # What is received is what is in the accumulator above its noise; CIR_PWR's step is 2^17 of squared magnitude.
+    # The received power is that of the accumulator above its noise; the unit of CIR_PWR is 2^17 of squared
+    # magnitude.
     energy = (magnitude**2).sum() - (magnitude[64:576] ** 2).mean() * samples
     low, high = (10 * math.log10((energy + step * 2**17) / 100**2) - reference_db for step in (-1, 1))
     assert high - low < 0.01
@@ -199,7 +200,7 @@ def test_missing_antenna_delay_appears_in_the_range():
         air.link(tag, anchor, Link(5))
         air.run(0.1)
         rows, _ = air.ranges()
-    # Half of what one device lacks, as way: 2.346 mm a tick.
+    # Half of the missing delay of one device, as distance: 2.346 mm per tick.
     assert abs(rows["range_m"].mean() - 5 - 400 * 0.0046917639 / 2) < 0.005
 
 

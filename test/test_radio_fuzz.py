@@ -1,4 +1,4 @@
-"""The received-frame parser, driver and exchange under the sanitizers: any bytes, any order, any register."""
+"""Frame parser, driver and exchange with sanitizers: arbitrary bytes, orders and registers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ pytestmark = NEEDS_CC
 def build(
     folder: Path, compiler: tuple[str, ...], *flags: str, broken: tuple[str, str] | None = None
 ) -> Path:
-    """The fuzz target; `broken` replaces a check in the exchange by another."""
+    """Return the fuzz target; `broken` replaces a check in the exchange."""
     firmware = firmware_folder()
     exchange = firmware / "src" / "uwb_twr_common.c"
     others = {*(firmware / "src").glob("uwb_dw1000*.c"), *(firmware / "src").glob("uwb_twr*.c")} - {exchange}

@@ -1,4 +1,4 @@
-"""What the firmware's driver writes to the chip, and what it must not depend on: compared with Decawave's own driver."""
+"""Register writes of the firmware's driver, compared with Decawave's driver."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def air(monkeypatch: pytest.MonkeyPatch) -> Iterator[Air]:
 
 
 class Run:
-    """A tag, or several, and an anchor that range over a link of 6 m, and what they wrote to their chips."""
+    """Run tags and an anchor at a distance of 6 m; return their register writes."""
 
     def __init__(
         self,
@@ -77,7 +77,7 @@ class Run:
         self.statuses.append(radio.status())
 
     def start_up(self) -> list[tuple[int, int, bytes]]:
-        """What the anchor wrote until its configuration was complete: SYS_MASK is not 0 from then on."""
+        """Return the writes of the anchor before its configuration is complete, which sets SYS_MASK."""
         writes = [write[1:] for write in self.buses[0].writes]
         end = next(at for at, (file, _, data) in enumerate(writes) if file == 0x0E and any(data))
         return writes[: next(at for at in range(end + 1, len(writes)) if writes[at][0] == 0x0E)]
@@ -87,8 +87,8 @@ class Run:
 class Configuration:
     """Registers of a configuration: name, register file, sub-address, octets and value of each.
 
-    The values are those of Decawave's tables and of its driver's register log, as listed in the facts about the chip;
-    the OTP memory is the modelled chip's, whose TX power words are in smart-power format.
+    The values are those of Decawave's tables and of the register log of its driver. The TX power words in the
+    OTP memory of the modelled chip are in smart-power format.
     """
 
     settings: RadioSettings
@@ -234,7 +234,7 @@ def test_only_otp_revisions_2_and_3_are_those_of_a_trek1000(air: Air, revision: 
 
 
 def antenna_delays(air: Air, settings: RadioSettings, revision: int) -> tuple[int, int]:
-    """Return the antenna delays, TX + RX, that (anchor, tag) take from this OTP memory."""
+    """Return the antenna delays, TX + RX, of (anchor, tag) with this OTP memory."""
 
     def prepare(chip: Chip) -> None:
         chip.program_otp(0x1E, revision << 8 | 0x10)
@@ -254,7 +254,7 @@ def antenna_delays(air: Air, settings: RadioSettings, revision: int) -> tuple[in
 
 @pytest.mark.parametrize(("rate_kbps", "refused"), [(6800, True), (850, False)])
 def test_reply_within_the_pause_of_smart_power_is_refused(rate_kbps: int, refused: bool):
-    """FINAL must not leave within 1 ms after POLL with more power than the average allows."""
+    """FINAL must not be sent within 1 ms after POLL with more power than the average limit."""
     config = structures.config(RadioSettings(rate_kbps=rate_kbps, preamble=64))
     config.reply_us = 999
     radio = load().native_radio_new(ctypes.byref(structures.Io()), ctypes.byref(config), 1)
@@ -263,7 +263,7 @@ def test_reply_within_the_pause_of_smart_power_is_refused(rate_kbps: int, refuse
 
 
 class StickyStatusBus(ModelBus):
-    """To a chip whose receiver enable and transmitter start leave the status bits: only a write clears them."""
+    """The chip does not clear status bits when receiver or transmitter start: only a write clears them."""
 
     def __init__(self, host: Host) -> None:
         super().__init__(host)
@@ -287,7 +287,7 @@ def test_driver_clears_the_reception_status(air: Air):
 
 
 class NoLockBus(ModelBus):
-    """To a chip that never reports CPLOCK."""
+    """The chip never reports CPLOCK."""
 
     def transfer(self, header: bytes, out: bytes | None, count: int) -> bytes:
         answer = super().transfer(header, out, count)
@@ -297,7 +297,7 @@ class NoLockBus(ModelBus):
 
 
 class NoClockBus(NoLockBus):
-    """To a chip whose PLL does not lock: it ignores SPI at full speed."""
+    """The PLL of the chip does not lock: it ignores SPI at full speed."""
 
     def transfer(self, header: bytes, out: bytes | None, count: int) -> bytes:
         return (

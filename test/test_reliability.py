@@ -1,4 +1,4 @@
-"""What a robot relies on: nodes that are killed and come back, models swapped live, diagnostics that are right."""
+"""Reliability: killed and respawned nodes, live model changes, and correct diagnostics."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_queued_ranges_are_corrected_in_order_and_bit_identical(ros: Ros):
     mitigator = ros.start("mitigator")
     publisher = ros.node.create_publisher(RangeCir, RAW, 1000)
     ros.find_each_other(publisher, deserialize_message(encode_range(measurements[0]), RangeCir), corrected)
-    # Stopped meanwhile, it finds all of them in its queue.
+    # While it is stopped, all ranges wait in its queue.
     mitigator.send(signal.SIGSTOP)
     for measurement in measurements:
         publisher.publish(encode_range(measurement))
@@ -116,7 +116,7 @@ def test_model_is_swapped_live_without_losing_a_range_and_a_bad_one_is_refused(r
     corrected = ros.collect(RangeCorrected, CORRECTED)
     mitigator = ros.start("mitigator")
     mitigator.wait_for_output("correcting with model")
-    # It answers once it has found who collects; the driver counts the mitigator itself.
+    # It answers when it has discovered the collecting client; the driver itself counts the mitigator.
     assert ros.state_of("mitigator") == "active"
     ros.start("driver", "simulated_rate:=200.0", *PAUSED)
     ros.play()
@@ -270,7 +270,7 @@ def test_restarted_publisher_counts_no_drops():
     for number in range(1, 100):
         loss_counter.add(number)
         loss_counter.add(1000 + number)
-    known[0] = 3  # The middleware counts the one that was killed until its lease ends.
+    known[0] = 3  # The middleware counts the killed publisher until its lease ends.
     for number in range(1, 50):
         loss_counter.add(number)
         loss_counter.add(1099 + number)

@@ -40,7 +40,7 @@ SILENT = SimpleNamespace(info=lambda text: None, warning=lambda text, **_: None)
 
 
 class ListSource:
-    """Records at given times, numbered from 0; may end with an error, and may be slow."""
+    """Records at given times, numbered from 0; it may be slow or end with an error."""
 
     name = "list"
     simulated = True
@@ -114,7 +114,7 @@ class Player:
         self.ended.set()
 
     def stop(self) -> None:
-        """Play no further; called from the playing thread."""
+        """Stop playing; called from the playing thread."""
         self.feed.stop()
         self.ended.set()
 
@@ -134,7 +134,7 @@ def stop_after(count: int) -> Callable[[Player, int], None]:
 
 
 def published_with(player: Player, sequence: int) -> int:
-    """Return the number of records at the end of the call with this one: late records come together."""
+    """Return the number of records after the call with this one: late records are published together."""
     ends = itertools.accumulate(player.batches)
     return next(end for end in ends if end > player.sequences.index(sequence))
 
@@ -165,7 +165,7 @@ def test_loop_continues_in_time_and_never_publishes_negative_times():
     assert player.recorded[:7] == [step % 3 * 10 * MS for step in range(7)]
     assert min(player.clock_times) >= 0
     player = Player(ListSource([0, 10 * MS, 20 * MS]), stop_after(7), loop=True).play()
-    # A late record may come in one call with the seventh.
+    # A late record may be published together with the seventh.
     assert player.offsets[:7] == [step * 10 * MS for step in range(7)]
 
 
@@ -279,7 +279,7 @@ def test_pause_holds_the_records_and_their_time(publish_clock: bool):
     assert player.clock_times == sorted(player.clock_times)
     if not publish_clock:
         gaps = np.diff(player.stamps)
-        # The rest of the wait for the next record follows the pause.
+        # The remaining wait for the next record continues after the pause.
         assert gaps[1] > 450 * MS
         assert list(gaps[2:]) == [200 * MS] * 2
 

@@ -1,4 +1,4 @@
-"""Integer constants that equal ONNX Runtime's float requantisation on every reachable value."""
+"""Integer constants that equal the float requantisation of ONNX Runtime for every value."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_solved_requantisation_equals_the_float_formula_on_every_accumulator(see
 
 
 def test_ties_rounded_half_to_even_are_not_solved():
-    # Every second accumulator is a tie, and even and odd levels round opposite ways.
+    # Every second accumulator is a tie, and even and odd levels are rounded in opposite directions.
     assert requantisation.solve_requantisation(np.float32(1 / 64), 0, 20_000) is None
 
 

@@ -1,4 +1,4 @@
-"""Offsets, lines and places found from ranges alone; synthetic geometry, whose truth is known."""
+"""Offsets, lines and positions estimated from ranges only; synthetic geometry with known truth."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_pseudo_truth_uses_the_other_anchors_and_has_a_standard_deviation(solved
     assert np.isfinite(error).all()
     assert np.abs(error).mean() < 0.1
     assert 0.3 < np.sqrt(np.mean((error / solved.pseudo_sd_m) ** 2)) < 2.0
-    # An anchor's own ranges have no say: spoilt, they leave the tag where the others see it.
+    # Ranges of the anchor itself are not used: wrong ones do not move the tag.
     spoilt = with_own(ranges, np.array([0.0, 0.0, 0.9, 0.0, 0.0]))
     again = calibrate(HALL, [spoilt], height=LEVEL)
     own = ranges.anchor == 2
@@ -86,7 +86,7 @@ def test_held_out_ranges_do_not_affect_the_offsets(solved, minute):
     assert after[2] < before[2] - 0.05
     assert np.abs(after - 0.25 - OWN).max() < 0.15
     assert (again.pseudo_m == found.pseudo_m).all()
-    # Of nothing left out, as before.
+    # Nothing is held out, as before.
     same = solved.without_ranges(np.zeros(len(ranges), bool))
     assert np.abs(same.fit.parameters - solved.fit.parameters).max() < 2e-3
 
@@ -100,7 +100,7 @@ def test_common_offset_is_selected_if_pairs_do_not_differ(minute):
 
 def test_ranges_with_larger_errors_have_lower_weights(minute):
     ranges, _ = minute
-    # Behind walls half of what is predicted is left: of the anchors at one side, more often.
+    # Behind walls, half of the predicted error remains; anchors at one side are affected more often.
     rng = np.random.default_rng(8)
     blocked = rng.random(len(ranges)) < np.array([0.8, 0.1, 0.1, 0.8, 0.4])[ranges.anchor]
     late = with_own(ranges, OWN).range_m + np.where(blocked, np.abs(rng.normal(0.0, 0.4, len(ranges))), 0.0)
@@ -182,7 +182,7 @@ def test_unobservable_calibration_is_refused(minute):
 
 
 def test_track_with_two_mirror_images_is_refused():
-    # Anchors all but in a plane, the tag half a metre below it: as good half a metre above.
+    # The anchors are almost in a plane and the tag is 0.5 m below it: 0.5 m above fits equally well.
     flat = HALL.position.copy()
     flat[:, 2] = (1.1, 1.9, 1.1, 1.9, 1.5)
     ranges, _ = drive(HALL.moved(flat, HALL.sd), seconds=40, rate_hz=25.0, model=NoiseModel(range_sd=0.3))
@@ -203,7 +203,7 @@ def test_two_swapped_opposite_anchors_are_named(minute):
 
 
 def test_heavy_tail_accuses_no_anchor(minute):
-    """A body between the tag and one anchor makes 80 % of its ranges long."""
+    """A person between the tag and one anchor lengthens 80 % of its ranges."""
     ranges, _ = minute
     rng = np.random.default_rng(4)
     blocked = (ranges.anchor == 3) & (rng.random(len(ranges)) < 0.8)
@@ -212,7 +212,7 @@ def test_heavy_tail_accuses_no_anchor(minute):
 
 
 def test_offset_that_slow_errors_can_explain_is_not_subtracted():
-    """Outside of the anchors, errors that stay the same for 20 s move the estimate of the offset by 0.7 m here."""
+    """Outside of the anchors, errors that persist for 20 s move the estimate of the offset by 0.7 m."""
     near = HALL.moved(HALL.position * (0.25, 0.25, 1.0) + (4.5, 3.5, 0.0), HALL.sd)
 
     def around(time_s):
@@ -235,7 +235,7 @@ def test_anchor_with_few_ranges_gets_the_common_offset(minute):
     found = calibrate(HALL, [ranges.take(few | (ranges.anchor != 4))], height=LEVEL)
     assert found.level == "pair"
     assert found.pair(0, 4)[0] == found.value("offset")[0]
-    # The others scatter by 0.16 m, and so may this one.
+    # The others have a standard deviation of 0.16 m, which also applies to this one.
     assert 0.15 < found.pair(0, 4)[1] < 0.3
     assert found.pair(0, 3)[0] != found.value("offset")[0]
     assert any("anchor 5" in note for note in found.notes)
@@ -250,7 +250,7 @@ def test_area_excludes_the_mirror_image_in_a_plane():
 
 
 def turning(path, lever, late_ns=0):
-    """Poses of a robot that turns and carries an antenna at `lever`."""
+    """Return poses of a turning robot with an antenna at `lever`."""
     heading = 0.7 * path.stamp_ns / 1e9
     c, s, zero = np.cos(heading), np.sin(heading), np.zeros(len(path))
     off = np.stack([c * lever[0] - s * lever[1], s * lever[0] + c * lever[1], zero + lever[2]], axis=1)
@@ -296,7 +296,7 @@ def test_two_standard_deviations_cover_the_errors_of_time_offset_and_lever_arm()
     lever, error, sd = np.array([0.3, -0.2, 0.0]), [], []
     for seed in range(5):
         ranges, path = drive(seconds=60, rate_hz=20.0, seed=seed, offset_m=0.2)
-        # The localisation drifts by 4 cm within ten seconds or so.
+        # The localisation drifts by 4 cm within about 10 s.
         phase = np.random.default_rng(seed).uniform(0, 2 * np.pi, 2)
         time_s = path.stamp_ns[:, None] / 1e9
         drift = np.column_stack([0.04 * np.sin(0.6 * time_s + phase), np.zeros(len(path))])

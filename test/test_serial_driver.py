@@ -41,7 +41,7 @@ CORRECTED = "/uwb/range_corrected"
 
 @pytest.fixture
 def link(tmp_path: Path) -> Path:
-    """Where the driver looks for the port."""
+    """Return the path of the port that the driver opens."""
     return tmp_path / "port"
 
 
@@ -70,13 +70,13 @@ def fewest(status: DiagnosticStatus, *keys: str) -> int:
 def test_measurements_of_a_board_are_published_with_their_stamps(ros: Ros, link: Path):
     received: list[tuple[int, RangeCir]] = []
     ros.node.create_subscription(RangeCir, RAW, lambda m: received.append((time.time_ns(), m)), 1000)
-    # The board plays them over and over; the simulator leaves out what was too weak to be received.
+    # The board plays them in a loop; the simulator skips frames that were too weak to be received.
     played = [
         (r.measurement.sequence, np.float32(r.measurement.range_m))
         for r in SimulatedSource(seed=4, count=200)
     ]
     with board(link) as device:
-        # Before the driver is there, the board drops what nobody reads.
+        # Before the driver connects, the board drops its messages.
         device.pause()
         driver = drive(ros, link)
         connected = ros.diagnosis(
@@ -87,7 +87,7 @@ def test_measurements_of_a_board_are_published_with_their_stamps(ros: Ros, link:
         published = [(m.sequence, np.float32(m.range)) for _, m in received]
         steps = np.diff([played.index(item) for item in published]) % len(played)
         assert (steps >= 1).all()
-        # None is lost but what the board drops, on a computer with much other work, and tells of.
+        # On a busy computer, only the messages that the board reports as dropped are lost.
         lost = int(diagnostic_value(connected, LOST)) + (steps - 1).sum()
         ros.diagnosis("driver", lambda s: int(diagnostic_value(s, LOST) or 0) >= lost)
     stamps = np.array([m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for _, m in received])
@@ -111,7 +111,7 @@ def test_correction_on_the_board_equals_that_on_the_host(ros: Ros, link: Path):
         assert message.model_id == host.bundle.model_id
         assert message.range == np.float32(expected[message.sequence].range_m)
         assert message.variance == np.float32(expected[message.sequence].variance_m2)
-    # Until the board has taken the mode it may have sent a few ranges the other way.
+    # Before the board changes its mode, it may send a few ranges in the old mode.
     assert len(raw) < 60
 
 
@@ -155,7 +155,7 @@ def test_unplugging_leaks_no_descriptors_or_threads(ros: Ros, link: Path):
             device.unplug()
             ros.spin_for(0.1)
             device.plug()
-            # Ranges of before may still be under way: the driver itself says that it is back.
+            # Older ranges may still arrive: wait until the driver reports the connection.
             ros.diagnosis("driver", lambda s, n=opening: fewest(s, "openings", "connections") >= n)
         assert open_files_and_threads(driver) == before
 
@@ -232,7 +232,7 @@ def test_board_subtracts_the_offsets_of_the_driver(ros: Ros, link: Path):
     with board(link, model=True, rate_hz=200.0):
         drive(ros, link, "mode:=device", "offsets:=0.25")
         ros.spin_until(lambda: len(corrected) >= 20)
-        # Not one without them, from the first on.
+        # All corrections include them, from the first one on.
         host.offsets = Offsets(0.25)
         first = corrected[0]
         assert np.float32(first.range) == np.float32(host.correct([recorded[first.sequence]])[0].range_m)

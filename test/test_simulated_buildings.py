@@ -1,4 +1,4 @@
-"""Random buildings: seeded, balanced over conditions, and the same as records and as arrays."""
+"""Random buildings: seeded, balanced over conditions, and equal as records and as arrays."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_error_contains_only_the_channel(world: Dataset) -> None:
     los, nlos, ndp = (world.error_m[world.labels == name] for name in ("LOS", "NLOS", "NDP NLOS"))
     assert np.median(los) == pytest.approx(0.0, abs=0.03)
     assert 0.1 < np.median(nlos) < 0.4 < np.median(ndp)
-    # Noise before the path is taken for it now and then; nothing else comes early.
+    # Noise before the path is sometimes detected as first path; nothing else is early.
     assert np.mean(world.error_m < -0.15) < 0.01
 
 
@@ -83,9 +83,9 @@ def test_open_sites_are_in_line_of_sight_and_some_antennas_are_tilted() -> None:
         kind: np.concatenate([block.links.path.crossings for block in blocks if block.kind == kind])
         for kind in ("open", "flat")
     }
-    # A block takes a third of each condition as far as a site has them.
+    # A block contains a third of each condition, if the site has enough.
     assert np.mean(crossings["open"] == 0) > 0.45 > 0.4 > np.mean(crossings["flat"] == 0)
-    # In line of sight nothing but a tilted antenna weakens the direct path.
+    # In LOS only a tilted antenna attenuates the direct path.
     loss = [block.links.path.loss_db[block.links.path.crossings == 0] for block in blocks]
     tilted = [values.max() > 0.0 for values in loss if len(values)]
     assert 0.1 < np.mean(tilted) < 0.5
@@ -99,7 +99,7 @@ def test_nlos_delay_grows_with_the_distance(
     distance = np.concatenate([block.links.distance_m for block in blocks])
     first = np.concatenate([block.links.fields[1].delay_ns[:, 0] for block in blocks])
     here = (distance >= distance_m[0]) & (distance < distance_m[1])
-    # Of the environments 2.7 ns at 4 m, and never more than three times as much.
+    # The delay of the environments is 2.7 ns at 4 m and at most three times as long.
     expected = 2.7 * np.minimum(distance[here] / 4.0, 3.0)
     assert here.sum() > 100
     assert np.mean(first[here] / expected) == pytest.approx(1.0, abs=4.0 / np.sqrt(here.sum()))

@@ -1,4 +1,4 @@
-"""Simulated measurements: seeded, honest about what they are, with a truth that fits."""
+"""Simulated measurements: seeded, marked as simulated, with the correct truth."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from uwb_mitigation.sources.simulation.scene import ROUTE, FloorPlan, along_rout
 
 
 def values(record: Record) -> tuple[object, ...]:
-    """All that a record holds, comparable: `Cir` and `RangeMeasurement` compare by identity."""
+    """Return the content of a record for comparison: `Cir` and `RangeMeasurement` compare by identity."""
     m = record.measurement
     fields = [getattr(m, name) for name in m.__slots__ if name != "cir"]
     fields += [getattr(m.cir, name) for name in m.cir.__slots__ if name != "samples"]
@@ -162,7 +162,7 @@ def test_invalid_simulation_is_refused_and_leaves_no_file(
     assert not list(tmp_path.iterdir())
 
 
-# --- what is refused --------------------------------------------------------------------------------
+# --- errors --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The simulator: its channel follows its parameters, its radio makes the error."""
+"""The simulator: channel and radio."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_path_is_diffracted_at_the_nearer_edge_of_a_screen() -> None:
     detour = 2 * math.hypot(1.0, 0.5) - 2.0
     assert path.excess_m[0] == pytest.approx(detour)
     v = 2 * math.sqrt(detour / WAVELENGTH_M)
-    # Deep in the shadow the loss is 13 + 20 log10 v.
+    # Deep in the shadow, the loss is 13 + 20 log10 v.
     assert path.loss_db[0] == pytest.approx(13 + 20 * math.log10(v), abs=0.3)
     assert knife_edge_loss_db(np.zeros(1))[0] == pytest.approx(6.0, abs=0.1)
 

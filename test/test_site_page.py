@@ -1,7 +1,7 @@
-"""docs/tutorials/your_site.md as its reader goes through it: every command, in order, with emulated boards.
+"""All commands of docs/tutorials/your_site.md in order, with emulated boards.
 
-A block of `bash` on the page is typed as it stands. Its first line may name a terminal (`# terminal: driver`): what
-is typed there stays, until the next block for that terminal interrupts it.
+A `bash` block of the page is run unchanged. Its first line may name a terminal (`# terminal: driver`): its
+command keeps running until the next block for that terminal.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ TIMEOUT_S = 240.0
 
 
 class Terminals:
-    """One shell for what ends, and one of its own for each name of what stays."""
+    """One shell for commands that end, and one for each terminal with a name."""
 
     def __init__(self, folder: Path, environment: dict[str, str]) -> None:
         self.folder = folder
@@ -48,7 +48,7 @@ class Terminals:
         self._open: dict[str, subprocess.Popen[bytes]] = {}
 
     def type(self, text: str) -> None:
-        """Wait for its end, unless it names a terminal."""
+        """Run a block; wait for its end unless it names a terminal."""
         named = TERMINAL.match(text)
         name = named.group(1) if named else "first"
         self._interrupt(name)
@@ -65,7 +65,7 @@ class Terminals:
             )
         if named:
             self._open[name] = shell
-            # As a reader waits for the ports.
+            # Wait for the ports, as a reader does.
             deadline = time.monotonic() + TIMEOUT_S
             while "--link board" in text and not (self.folder / "board1").exists():
                 assert shell.poll() is None, self._printed()
@@ -88,7 +88,7 @@ class Terminals:
             time.sleep(0.1)
 
     def _interrupt(self, name: str) -> None:
-        """Ctrl-C, and wait for the end of what was typed there."""
+        """Send SIGINT and wait for the end of the command."""
         shell = self._open.pop(name, None)
         if shell is not None:
             assert shell.poll() is None, f"{name} has ended by itself\n{self._printed()}"
@@ -131,7 +131,7 @@ def terminals(tmp_path: Path, ros: Ros) -> Iterator[Terminals]:
 
 
 def test_every_command_of_the_page_is_in_a_block_that_is_run():
-    """None is typed in prose or in an indented block, where the test below would pass it by."""
+    """Commands in prose or in indented blocks would not be tested below."""
     rest = FENCED.sub("", PAGE.read_text(encoding="utf-8"))
     assert not re.findall(r"^ {4,}(?:uwb-mitigation|ros2) .*", rest, re.MULTILINE)
 
@@ -150,7 +150,7 @@ def test_commands_of_the_page_lead_from_boards_to_positions(terminals: Terminals
         if "pipeline" in text:
             ros.spin_until(lambda: len(poses) > 5, TIMEOUT_S)
     anchors = load_anchors(folder / "anchors.yaml")
-    # The page's anchors are those that its boards find.
+    # The anchors on the page are those that its boards find.
     recorded = read_ranges(folder / "first", anchors)
     assert not recorded.unknown_anchors
     assert {int(row) for tag in recorded.tags for row in tag.raw.anchor} == set(range(len(anchors)))

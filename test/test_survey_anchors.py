@@ -1,4 +1,4 @@
-"""Anchors found by driving past them."""
+"""Anchor positions estimated from a drive."""
 
 from __future__ import annotations
 

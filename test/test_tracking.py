@@ -1,4 +1,4 @@
-"""`uwb-mitigation track` and `survey` on bags; real recordings, where they are at hand."""
+"""`uwb-mitigation track` and `survey` on bags, and on real recordings if available."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def write_drive(bag: Path, ranges: Ranges, truth: TruePath, too_long_m: float = 
 
 @pytest.fixture(scope="module")
 def hall(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A bag of a drive of 40 s past five anchors, raw ranges 0.6 m too long; and a file of its anchors."""
+    """Return a bag of a 40 s drive past five anchors with raw ranges 0.6 m too long, and its anchors file."""
     return write_drive(tmp_path_factory.mktemp("hall") / "hall.mcap", *drive(seconds=40), too_long_m=0.6)
 
 
@@ -168,7 +168,7 @@ def test_only_contradictory_anchors_are_reported():
     blocked.range_m[late] += np.random.default_rng(1).exponential(1.5, int(late.sum()))
     locator = TagEstimator(EstimatorConfig(HALL, height=height))
     locator.run(blocked)
-    assert locator.disagreeing() == [2]  # by its last ranges alone
+    assert locator.disagreeing() == [2]  # only by its last ranges
     assert track_tag(recording_of(blocked, truth), EstimatorConfig(HALL, height=height)).disagreeing == []
     wrong, truth = drive(seconds=60, seed=1)
     wrong.range_m[wrong.anchor == 2] += 1.5

@@ -1,4 +1,4 @@
-"""Training: the linear bias model, the network, and the recipe that joins them."""
+"""Training of the linear bias model and of the network."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def test_card_contains_the_errors_on_held_out_configurations():
     card = train.make_card("name", recipe, LinearBiasModel(0.5), validation, "data")
     left = validation.errors["float"]
     deviation = np.sqrt(card.variance_m2 + card.variance_per_m2 * (data.error_m - left) ** 2)
-    # Of 12 configurations, 0.68 x 13: the one to come counts too.
+    # 0.68 x 13 of 12 configurations: the unseen one counts, too.
     assert np.mean(np.abs(left) <= deviation) == pytest.approx(0.68 * 13 / 12, abs=0.01)
     assert np.mean(np.abs(left) <= card.interval95_sigmas * deviation) > 0.95
     assert card.variance_m2 < card.variance_uncorrected_m2

@@ -1,4 +1,4 @@
-"""Variance, and what happens to measurements that are unlike the training data."""
+"""Variance, and correction of out-of-distribution measurements."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The model for places that it never saw: made from the seed alone, whatever the number of processes."""
+"""The universal model: reproducible from its seed with any number of processes."""
 
 from __future__ import annotations
 

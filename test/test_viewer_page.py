@@ -59,7 +59,7 @@ def server(view: View) -> Iterator[ViewerServer]:
 
 
 def fill_scene(view: View, upto_s: float = 5.0) -> None:
-    """Two pairs of tag 7, ten ranges a second each; anchor 2's are unfamiliar and 0.5 m too long."""
+    """Two pairs of tag 7 at 10 Hz each; the ranges of anchor 2 are out of distribution and 0.5 m too long."""
     scene = view.scene
     with view.lock:
         scene.set_anchors({1: AnchorPosition(0, 0, 2, HOSTILE), 2: AnchorPosition(8, 0, 2)})
@@ -86,11 +86,11 @@ IN_TABLE = (
     "const view = table.querySelector('.slick-viewport-top.slick-viewport-left');"
     "const cells = [...table.querySelectorAll('.slick-column-name, .slick-cell')];"
 )
-"""For a script: the table's own box, and its cells and headers."""
+"""A script that returns the box of a table, its cells and headers."""
 
 
 def selected(browser: Browser, model: str) -> list[int]:
-    """The rows chosen in a named table, or among a map's anchors."""
+    """Return the selected rows of a named table or of the anchors of a map."""
     return browser.run(
         "const m = Bokeh.documents[0].get_model_by_name(arguments[0]);"
         "return (m.source ?? m.renderers.map((r) => r.data_source).find((d) => 'id' in d.data)).selected.indices",
@@ -174,7 +174,7 @@ def test_map_view_is_fixed_until_the_user_changes_it(
         )
 
     def settled() -> list[float] | None:
-        """The view, once the page has its final layout."""
+        """Return the view after the final layout of the page."""
         seen = view_of_map()
         time.sleep(0.5)
         return seen if view_of_map() == seen else None
@@ -211,7 +211,7 @@ def test_page_can_be_paused_and_resumed(browser: Browser, view: View, server: Vi
     open_page(browser, server)
     pause = "Bokeh.documents[0].get_model_by_name('pause').active = arguments[0]"
     browser.run(pause, True)
-    # The server's word: it knows.
+    # Wait for the server.
     browser.wait("the button", lambda: browser.cell("Resume"))
     still = browser.driver.current_window_handle
     browser.driver.switch_to.new_window("tab")
@@ -301,7 +301,7 @@ def test_implausible_values_do_not_break_the_page(browser: Browser, view: View, 
 
 
 def drawn_column(document: Document, figure: str, column: str) -> np.ndarray:
-    """A column of the source behind a named figure of a page that no browser shows."""
+    """Return a column of the source of a named figure, without a browser."""
     sources = [renderer.data_source for renderer in document.get_model_by_name(figure).renderers]
     return next(source.data[column] for source in sources if column in source.data)
 

@@ -1,4 +1,4 @@
-"""A recording on the viewer's page: its player over real bags, and the command in a real browser."""
+"""Playback of bags in the viewer, and the command in a real browser."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ from uwb_mitigation.viewer.playback import BagPlayer
 from uwb_mitigation.viewer.scene import Scene
 
 COUNT = 400
-"""Ranges of the bag, 10 ms apart, of two anchors by turns."""
+"""Number of ranges in the bag, at intervals of 10 ms, from two anchors in turn."""
 
 
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Corrected ranges with their truth, poses of two tags, and where one truly was."""
+    """Return a bag with corrected ranges and their truth, poses of two tags, and the true positions of one."""
     path = tmp_path_factory.mktemp("view") / "site.mcap"
     with BagWriter(path, {"source": "a test", "simulated": "true"}) as out:
         for number in range(COUNT):
@@ -121,7 +121,7 @@ def test_raw_ranges_are_corrected_for_display(tmp_path: Path):
 
 
 def test_processed_bag_shows_its_truth(bag: Path, tmp_path: Path):
-    """Its truths follow the corrected ranges."""
+    """The truth follows the corrected ranges."""
     raw = write_bag(tmp_path / "raw.mcap", 30)
     process_bag(Job(raw, tmp_path / "out.mcap", default_model_path()))
     player, scene = open_bag(tmp_path / "out.mcap")
@@ -233,7 +233,7 @@ def test_several_namespaces_need_a_choice(tmp_path: Path):
 
 @contextmanager
 def serve_recording(bag: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """`uwb-mitigation view` on a bag, and its address."""
+    """Run `uwb-mitigation view` on a bag; return the URL."""
     command = [sys.executable, "-c", "from uwb_mitigation.entry import command_line; command_line()", "view"]
     running = subprocess.Popen(
         [*command, str(bag), "--port", "0"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
@@ -310,7 +310,7 @@ def test_recording_plays_on_the_page(browser: Browser, bag: Path):
         browser.wait("it to play on", lambda: sorted(browser.column("pairs", "range"))[-1] > 4.25 + 100)
         assert browser.complaints() == []
         browser.resize(400, 2000)
-        # Figures take their new width a moment later.
+        # Figures change their width asynchronously.
         browser.wait("it to fit", lambda: browser.run("return document.documentElement.scrollWidth") <= 400)
         running.send_signal(signal.SIGINT)
         assert running.wait(240) == 130

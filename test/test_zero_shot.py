@@ -1,4 +1,4 @@
-"""The rows of a model that is not fitted to the data: their corrections, and the data that they must not use."""
+"""Evaluation of a model that was not fitted to the data."""
 
 from __future__ import annotations
 
