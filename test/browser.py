@@ -101,7 +101,7 @@ class Browser:
             text,
         )
 
-    def complaints(self) -> list[str]:
+    def console_messages(self) -> list[str]:
         """Return the warnings and errors in the console of the page."""
         return [line["message"] for line in self.driver.get_log("browser") if line["level"] != "INFO"]
 

@@ -46,11 +46,11 @@ class FaultyBoard(EmulatedBoard):
             self._identity, self._corrector, mode=self._mode, boot_id=self._boots, version=self._version
         )
 
-    def _exchange(self, patience_s: float) -> None:
+    def _exchange(self, timeout_s: float) -> None:
         with self._lock:
             if time.monotonic() < self._flood_until and len(self._backlog) < _FLOOD_BYTES:
                 self._backlog += self._random.bytes(_FLOOD_BYTES)
-        super()._exchange(patience_s)
+        super()._exchange(timeout_s)
 
     def _transmit(self, data: bytes) -> None:
         if time.monotonic() >= self._mute_until:

@@ -53,7 +53,7 @@ def mlp_bundle(folder: Path) -> Bundle:
     return save_bundle(folder / "mlp.onnx", graph.int8_model(weights), card)
 
 
-def choosy_bundle(folder: Path, samples: int = 32, scaling: Scaling = Scaling.PREAMBLE) -> Bundle:
+def strict_bundle(folder: Path, samples: int = 32, scaling: Scaling = Scaling.PREAMBLE) -> Bundle:
     """Bundle whose OOD detector rates random measurements as in distribution, between, and out of distribution."""
     lead = Band(-40.0, -12.0, 10.0)
     if scaling is Scaling.MAX:
@@ -110,8 +110,8 @@ def random_cir(random: np.random.Generator) -> Cir:
 
 def random_measurement(random: np.random.Generator) -> RangeMeasurement:
     """Draw a measurement, about half of them hostile."""
-    usual = model_material.cir(int(random.integers(0, 50)))
-    cir = random_cir(random) if random.random() < 0.4 else usual
+    plausible = model_material.cir(int(random.integers(0, 50)))
+    cir = random_cir(random) if random.random() < 0.4 else plausible
     powers = random.choice([-80.5, -91.25, -1e4, math.nan, math.inf], 2, p=[0.45, 0.45, 0.04, 0.03, 0.03])
     cir = replace(cir, rx_power_dbm=float(powers[0]), first_path_power_dbm=float(powers[1]))
     range_m = random.choice([3.25, 0.0, -1.0, math.nan, 1e7], p=[0.8, 0.05, 0.05, 0.05, 0.05])

@@ -27,8 +27,8 @@ def record(words: list[str]) -> None:
 
     storage, output, topic = words[1], words[3], words[4]
     assert (words[0], words[2], storage, len(words)) == ("-s", "-o", "mcap", 5), words
-    told = os.environ["RECORDED_RANGES"].split()
-    wanted, done = int(told[1 + told.index(output)]), threading.Event()
+    settings = os.environ["RECORDED_RANGES"].split()
+    wanted, done = int(settings[1 + settings.index(output)]), threading.Event()
     rclpy.init()
     node = rclpy.create_node("recorder")
     with BagWriter(Path(output), {}) as out:

@@ -33,7 +33,7 @@ def test_written_file_is_read_back():
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "excerpt"),
     [
         ("", "not a list of anchors"),
         ("anchors: []", "0 anchors"),
@@ -49,8 +49,8 @@ def test_written_file_is_read_back():
         ("anchors: [{id: 1, x: 3000000, y: 0, z: 0}]", "millimetres?"),
     ],
 )
-def test_malformed_file_is_refused(text: str, told: str):
+def test_malformed_file_is_refused(text: str, excerpt: str):
     with pytest.raises(ParameterError) as caught:
         parse_anchors(text, "a.yaml")
-    assert told in str(caught.value)
+    assert excerpt in str(caught.value)
     assert str(caught.value).startswith("a.yaml")

@@ -61,9 +61,9 @@ def test_antenna_delay_of_a_pair_is_estimated_and_written(tmp_path: Path):
     assert done.returncode == 0, done.stderr
     written = yaml.safe_load((tmp_path / "found.yaml").read_text())["/**"]["ros__parameters"]
     assert abs(written["radio.antenna_delay"] - truth) <= 2
-    told = json.loads((tmp_path / "found.json").read_text())
-    assert told["before"] == NOMINAL
-    assert told["antenna_delay"] == written["radio.antenna_delay"]
+    result = json.loads((tmp_path / "found.json").read_text())
+    assert result["before"] == NOMINAL
+    assert result["antenna_delay"] == written["radio.antenna_delay"]
     assert "--params-file found.yaml" in done.stdout
 
 
@@ -81,9 +81,9 @@ def test_single_tag_compensates_the_complete_offset(tmp_path: Path):
         finally:
             anchor.close()
     assert done.returncode == 0, done.stderr
-    told = json.loads((tmp_path / "found.json").read_text())
-    assert abs(told["antenna_delay"] - (NOMINAL + 120)) <= 2
-    assert f"radio.antenna_delay: {told['antenna_delay']}" in done.stdout
+    result = json.loads((tmp_path / "found.json").read_text())
+    assert abs(result["antenna_delay"] - (NOMINAL + 120)) <= 2
+    assert f"radio.antenna_delay: {result['antenna_delay']}" in done.stdout
 
 
 @pytest.mark.parametrize(

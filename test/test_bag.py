@@ -158,7 +158,7 @@ def test_full_disk_raises_a_recording_error(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "excerpt"),
     [
         (("uint64 device_time", "uint32 device_time"), "field 5 .* is 'uint32 device_time'"),
         (("Cir cir ", "Cir cir\nfloat32 extra "), "further field 'float32 extra'"),
@@ -166,10 +166,10 @@ def test_full_disk_raises_a_recording_error(tmp_path: Path) -> None:
         (("MSG: uwb_mitigation_msgs/Cir", "MSG: uwb_mitigation_msgs/Other"), "Cir is not defined"),
     ],
 )
-def test_schema_with_other_fields_is_detected(change: tuple[str, str], told: str) -> None:
+def test_schema_with_other_fields_is_detected(change: tuple[str, str], excerpt: str) -> None:
     text = schemas.definition(RANGE_CIR_TYPE)
     assert change[0] in text
-    assert re.search(told, schemas.difference(text.replace(*change), RANGE_CIR_TYPE) or "")
+    assert re.search(excerpt, schemas.difference(text.replace(*change), RANGE_CIR_TYPE) or "")
 
 
 @pytest.mark.parametrize("type_name", TYPES)

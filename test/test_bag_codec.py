@@ -98,10 +98,10 @@ def test_messages_equal_those_of_the_rosbags_library(
 
 @given(measurements, st.data())
 def test_truncated_message_is_refused(measurement: RangeMeasurement, data: st.DataObject) -> None:
-    whole = codec.encode_range(measurement)
-    cut = data.draw(st.integers(0, len(whole) - 1))
+    complete = codec.encode_range(measurement)
+    cut = data.draw(st.integers(0, len(complete) - 1))
     with pytest.raises(RecordingError, match="ends early"):
-        codec.decode_range(whole[:cut])
+        codec.decode_range(complete[:cut])
 
 
 @pytest.mark.parametrize("decode", [codec.decode_range, codec.decode_truth, codec.decode_corrected])

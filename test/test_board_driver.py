@@ -24,7 +24,7 @@ from uwb_mitigation.link.messages import Hello
 from uwb_mitigation.measurement import Cir, RangeMeasurement, Record
 from uwb_mitigation.radio.evb1000 import Evb1000Bus
 
-PATIENCE_S = 240
+TIMEOUT_S = 240
 """Timeout for expected events."""
 
 IDENTITY = Hello(board_id=0xB0, model_id=0xCAFE, window=157)
@@ -65,7 +65,7 @@ def port(board: EmulatedBoard, link: Path) -> Iterator[BoardDriver]:
 
 
 def wait_for(port: BoardDriver, wanted: Callable[[Event], bool]) -> Event:
-    deadline = time.monotonic() + PATIENCE_S
+    deadline = time.monotonic() + TIMEOUT_S
     while time.monotonic() < deadline:
         event = port.get(0.1)
         if event is not None and wanted(event):
@@ -78,7 +78,7 @@ def of(kind: type) -> Callable[[Event], bool]:
 
 
 def wait_until(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + PATIENCE_S
+    deadline = time.monotonic() + TIMEOUT_S
     while not condition():
         assert time.monotonic() < deadline
         time.sleep(0.01)
@@ -182,7 +182,7 @@ def test_close_ends_a_wait_in_another_thread(link):
     time.sleep(0.05)
 
     port.close()
-    reader.join(PATIENCE_S)
+    reader.join(TIMEOUT_S)
 
     assert not reader.is_alive()
     assert events == [None]
@@ -192,7 +192,7 @@ def test_unread_events_are_dropped_and_counted(board, link):
     port = BoardDriver(PortAddress(str(link)), capacity=5)
     wait_until(lambda: port.report().counts["overflowed"] > 20)
 
-    oldest = port.get(PATIENCE_S)
+    oldest = port.get(TIMEOUT_S)
     port.close()
 
     assert isinstance(oldest, RangeMeasurement)

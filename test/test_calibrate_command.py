@@ -212,11 +212,11 @@ def figures(site, bag, *options):
 
 def test_nine_gross_outliers_change_no_result(site):
     clean, _ = figures(site, "drive.mcap", "--height", 1.0)
-    spoilt, done = figures(site, "gross.mcap", "--height", 1.0)
-    assert (clean["outliers"], spoilt["outliers"]) == (0, 9)
+    with_outliers, done = figures(site, "gross.mcap", "--height", 1.0)
+    assert (clean["outliers"], with_outliers["outliers"]) == (0, 9)
     assert "9 outliers" in done.stderr
     for key in ("raw_mae_m", "calibrated_mae_m"):
-        assert spoilt[key] == pytest.approx(clean[key], rel=0.05)
+        assert with_outliers[key] == pytest.approx(clean[key], rel=0.05)
 
 
 def test_heights_come_from_a_topic_and_stamps_are_shifted(site):

@@ -67,7 +67,7 @@ def test_damaged_bag_is_shown_up_to_the_damage_and_exits_1(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "told"),
+    ("name", "content", "excerpt"),
     [
         ("absent.mcap", None, "no such file"),
         ("empty.mcap", b"", "empty"),
@@ -76,7 +76,7 @@ def test_damaged_bag_is_shown_up_to_the_damage_and_exits_1(tmp_path: Path) -> No
 )
 @pytest.mark.parametrize("command", ["info", "import"])
 def test_invalid_input_prints_one_line_and_exits_1(
-    tmp_path: Path, name: str, content: bytes | None, told: str, command: str
+    tmp_path: Path, name: str, content: bytes | None, excerpt: str, command: str
 ) -> None:
     if content is not None:
         (tmp_path / name).write_bytes(content)
@@ -84,7 +84,7 @@ def test_invalid_input_prints_one_line_and_exits_1(
     assert done.returncode == 1
     assert len(done.stderr.splitlines()) == 1
     assert name in done.stderr
-    assert told in done.stderr
+    assert excerpt in done.stderr
     assert not (tmp_path / "out.mcap").exists()
 
 

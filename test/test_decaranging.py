@@ -241,11 +241,11 @@ def test_log_cut_at_any_byte_yields_the_exchanges_before_the_cut(write):
     path = write(header(), exchange(1.0), exchange(2.0, 1.0), exchange(3.0, 2.0))
     data = path.read_bytes()
     line_ends = [match.end() for match in re.finditer(rb"Anchor ToF.*\r\n", data)]
-    whole, _ = read(path)
+    complete, _ = read(path)
     for size in range(0, len(data), 7):
         path.write_bytes(data[:size])
         records, error = read_until_damage(path)
-        expected = [record for record, end in zip(whole, line_ends, strict=True) if end <= size]
+        expected = [record for record, end in zip(complete, line_ends, strict=True) if end <= size]
         assert [r.measurement.range_m for r in records] == [r.measurement.range_m for r in expected]
         for got, wanted in zip(records, expected, strict=True):
             assert np.array_equal(got.measurement.cir.samples, wanted.measurement.cir.samples)
@@ -264,7 +264,7 @@ def _noisy(count: int) -> list[str]:
 
 def test_truncated_or_corrupt_xz_stream_yields_everything_before(write):
     path = write(header(), *_noisy(12), name="7.log.xz")
-    whole, _ = read(path)
+    complete, _ = read(path)
     data = path.read_bytes()
     damaged = [(size, data[:size]) for size in range(100, len(data), len(data) // 8)]
     flipped = np.random.default_rng(6).integers(len(data) // 4, len(data), 8).tolist()
@@ -275,7 +275,7 @@ def test_truncated_or_corrupt_xz_stream_yields_everything_before(write):
         assert isinstance(error, RecordingError)
         assert str(path) in error.where
         assert len(records) >= 12 * at // len(data) - 2
-        for got, expected in zip(records, whole, strict=False):
+        for got, expected in zip(records, complete, strict=False):
             assert got.measurement.range_m == expected.measurement.range_m
             assert np.array_equal(got.measurement.cir.samples, expected.measurement.cir.samples)
 

@@ -38,10 +38,10 @@ def run(executable: str, *words: str, path: Path | None = None) -> subprocess.Po
 def test_help_lists_every_parameter_without_ros(node: str, tables: list[str], tmp_path: Path):
     (tmp_path / "rclpy.py").write_text("raise ModuleNotFoundError('no rclpy here', name='rclpy')\n")
     process = run(node, "--help", path=tmp_path)
-    told, _ = process.communicate(timeout=240)
-    assert process.returncode == 0, told
-    assert f"usage: {node} " in told
-    assert all(f"\n  {row.name}:=" in told for table in tables for row in TABLES[table])
+    output, _ = process.communicate(timeout=240)
+    assert process.returncode == 0, output
+    assert f"usage: {node} " in output
+    assert all(f"\n  {row.name}:=" in output for table in tables for row in TABLES[table])
 
 
 @pytest.mark.parametrize(
@@ -65,8 +65,8 @@ def test_signal_during_the_import_ends_the_process_immediately(
     process = run(executable, path=tmp_path)
     assert process.stdout.readline() == "loading\n"
     process.send_signal(number)
-    told, _ = process.communicate(timeout=240)
-    assert (process.returncode, told) == (128 + number, "")
+    output, _ = process.communicate(timeout=240)
+    assert (process.returncode, output) == (128 + number, "")
 
 
 def test_signal_during_the_start_of_a_node_ends_it_immediately(tmp_path: Path):
@@ -75,5 +75,5 @@ def test_signal_during_the_start_of_a_node_ends_it_immediately(tmp_path: Path):
     process = run("driver", path=tmp_path)
     assert process.stdout.readline() == "loading\n"
     process.send_signal(signal.SIGINT)
-    told, _ = process.communicate(timeout=240)
-    assert (process.returncode, told) == (130, "")
+    output, _ = process.communicate(timeout=240)
+    assert (process.returncode, output) == (130, "")

@@ -33,9 +33,9 @@ if TYPE_CHECKING:
 @pytest.mark.parametrize(
     "bundle_in",
     [
-        firmware_models.choosy_bundle,
-        partial(firmware_models.choosy_bundle, samples=8),
-        partial(firmware_models.choosy_bundle, scaling=Scaling.MAX),
+        firmware_models.strict_bundle,
+        partial(firmware_models.strict_bundle, samples=8),
+        partial(firmware_models.strict_bundle, scaling=Scaling.MAX),
         firmware_models.mlp_bundle,
     ],
 )
@@ -80,7 +80,7 @@ def test_mitigator_corrects_with_the_firmware_backend(
     from rclpy.serialization import deserialize_message
     from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
-    bundle = firmware_models.choosy_bundle(tmp_path)
+    bundle = firmware_models.strict_bundle(tmp_path)
     compiler, traces = tmp_path / "cc", tmp_path / "compiled"
     compiler.write_text(f'#!/bin/sh\ntouch {traces}\nexec {shutil.which("cc")} "$@"\n')
     compiler.chmod(0o755)

@@ -145,7 +145,7 @@ def test_good_and_hostile_measurements_are_corrected_as_by_the_mitigator(tmp_pat
 def test_out_of_distribution_measurements_are_corrected_as_by_the_mitigator(tmp_path: Path):
     random = np.random.default_rng(4)
     measurements = [firmware_models.random_measurement(random) for _ in range(300)]
-    check_corrections(firmware_models.choosy_bundle(tmp_path), measurements, tmp_path, 0.22)
+    check_corrections(firmware_models.strict_bundle(tmp_path), measurements, tmp_path, 0.22)
 
 
 @pytest.mark.parametrize(
@@ -199,9 +199,9 @@ def test_image_of_the_dwm1001_dev_fits_and_is_written_as_hex(tmp_path: Path):
         "board", "build-image", "-o", "radio.hex", "--json", "image.json", folder=tmp_path
     )
     assert done.returncode == 0, done.stderr
-    told = json.loads((tmp_path / "image.json").read_text())
-    assert told["flash_bytes"] < 48 << 10
-    assert told["ram_bytes"] < 48 << 10, "the rest of 64 kB is the stack's"
+    result = json.loads((tmp_path / "image.json").read_text())
+    assert result["flash_bytes"] < 48 << 10
+    assert result["ram_bytes"] < 48 << 10, "the rest of 64 kB is the stack's"
     lines = (tmp_path / "radio.hex").read_text().splitlines()
     assert lines[0].startswith(":10000000")
     assert lines[-1] == ":00000001FF"

@@ -73,7 +73,7 @@ class BoardInC:
 
 @pytest.fixture(scope="module")
 def bundle(tmp_path_factory: pytest.TempPathFactory) -> Bundle:
-    return firmware_models.choosy_bundle(tmp_path_factory.mktemp("bundle"))
+    return firmware_models.strict_bundle(tmp_path_factory.mktemp("bundle"))
 
 
 @pytest.fixture(scope="module")

@@ -131,8 +131,8 @@ def test_colcon_build_without_the_messages_names_the_right_command(tmp_path: Pat
     )
     assert refused.returncode == 1
     (line,) = refused.stderr.splitlines()[-1:]
-    told, _, build = line.partition("; run: ")
-    assert told == "uwb_mitigation_msgs is missing"
+    problem, _, build = line.partition("; run: ")
+    assert problem == "uwb_mitigation_msgs is missing"
     assert shlex.split(build) == ["colcon", "build", "--base-paths", ".", str(REPOSITORY / "msg_defs")]
     manifest = tmp_path / "share" / MESSAGES / "package.xml"
     manifest.parent.mkdir(parents=True)
@@ -166,7 +166,7 @@ def test_node_runs_without_optional_packages(tmp_path: Path, name: str, needed: 
 
 
 @pytest.mark.parametrize(
-    ("name", "absent", "told"),
+    ("name", "absent", "excerpt"),
     [
         ("mitigator", "onnxruntime", "error: onnxruntime is not installed (run uwb-mitigation doctor)"),
         ("mitigator", "yaml", "error: pyyaml is not installed (run uwb-mitigation doctor)"),
@@ -176,12 +176,14 @@ def test_node_runs_without_optional_packages(tmp_path: Path, name: str, needed: 
         ("mitigator", "uwb_mitigation_msgs", "error: ROS 2 is not set up: there is no uwb_mitigation_msgs"),
     ],
 )
-def test_missing_dependency_of_an_executable_is_one_line(tmp_path: Path, name: str, absent: str, told: str):
+def test_missing_dependency_of_an_executable_is_one_line(
+    tmp_path: Path, name: str, absent: str, excerpt: str
+):
     command = without([absent], name)
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=240)
     assert done.returncode == 1
     (line,) = done.stderr.splitlines()
-    assert line.startswith(told)
+    assert line.startswith(excerpt)
 
 
 CORRECT_WITH_THE_FIRMWARE = """

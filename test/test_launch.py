@@ -63,11 +63,11 @@ def described(generate, file: str) -> tuple[dict, object]:
     return arguments, function.function
 
 
-def launch(generate, file: str, **said: str) -> list:
+def launch(generate, file: str, **given: str) -> list:
     """Return the nodes that a launch file starts with the given arguments."""
     arguments, nodes_of = described(generate, file)
-    assert set(said) <= set(arguments)
-    return nodes_of(values_of(arguments) | said)
+    assert set(given) <= set(arguments)
+    return nodes_of(values_of(arguments) | given)
 
 
 def values_of(arguments: dict) -> dict[str, str]:
@@ -88,15 +88,15 @@ def settings(node) -> dict[str, object]:
 
 
 def test_both_nodes_start_with_their_arguments_and_are_respawned(generate):
-    said = {"source": "serial", "port": "/dev/ttyACM0", "model": "mine.onnx", "namespace": "left"}
-    driver, mitigator = launch(generate, "uwb.launch.py", **said, log_level="debug", use_sim_time="True")
+    given = {"source": "serial", "port": "/dev/ttyACM0", "model": "mine.onnx", "namespace": "left"}
+    driver, mitigator = launch(generate, "uwb.launch.py", **given, log_level="debug", use_sim_time="True")
     assert (driver.executable, mitigator.executable) == ("driver", "mitigator")
     assert settings(driver) == {"source": "serial", "port": "/dev/ttyACM0", "use_sim_time": True}
     assert settings(mitigator) == {"model": "mine.onnx", "use_sim_time": True}
     for node in (driver, mitigator):
         assert (node.namespace, node.respawn, node.ros_arguments) == ("left", True, ["--log-level", "debug"])
         assert node.parameters[0] == str(REPOSITORY / "params" / f"{node.executable}.yaml")
-    assert not any(node.respawn for node in launch(generate, "uwb.launch.py", **said, respawn="false"))
+    assert not any(node.respawn for node in launch(generate, "uwb.launch.py", **given, respawn="false"))
 
 
 def test_one_process_accepts_the_arguments_of_both_nodes(generate):
@@ -114,11 +114,11 @@ def test_one_process_accepts_the_arguments_of_both_nodes(generate):
 
 
 def test_viewer_starts_if_requested(generate):
-    said = {"source": "simulated", "anchors": "a.yaml", "viewer": "true"}
-    *_, viewer = launch(generate, "uwb.launch.py", **said, one_process="true")
+    given = {"source": "simulated", "anchors": "a.yaml", "viewer": "true"}
+    *_, viewer = launch(generate, "uwb.launch.py", **given, one_process="true")
     assert (viewer.executable, viewer.name, viewer.respawn) == ("viewer", "viewer", True)
     assert settings(viewer) == {"anchors": "a.yaml", "use_sim_time": False}
-    *_, locator, viewer = launch(generate, "uwb.launch.py", **said, locate="true")
+    *_, locator, viewer = launch(generate, "uwb.launch.py", **given, locate="true")
     assert settings(locator)["anchors"] == "a.yaml"
     assert settings(viewer) == {"use_sim_time": False}, "the locator publishes them"
     nodes = launch(generate, "uwb.launch.py", source="simulated")
@@ -127,8 +127,8 @@ def test_viewer_starts_if_requested(generate):
 
 @pytest.mark.parametrize("one_process", ["false", "true"])
 def test_finished_recording_is_not_replayed(generate, one_process: str):
-    said = {"source": "mcap", "path": "a.mcap", "one_process": one_process}
-    respawning = {node.executable: node.respawn for node in launch(generate, "uwb.launch.py", **said)}
+    given = {"source": "mcap", "path": "a.mcap", "one_process": one_process}
+    respawning = {node.executable: node.respawn for node in launch(generate, "uwb.launch.py", **given)}
     assert respawning == (
         {"pipeline": False} if one_process == "true" else {"driver": False, "mitigator": True}
     )
@@ -136,14 +136,14 @@ def test_finished_recording_is_not_replayed(generate, one_process: str):
 
 @pytest.mark.parametrize("text", ["0xdeca010203040506", "'0xdeca010203040506'"])
 def test_64_bit_address_reaches_the_driver_as_a_string(generate, text: str):
-    said = {"source": "evb1000", "port": "/dev/ttyACM0", "radio.address": text, "radio.anchors": text}
-    (driver,) = (node for node in launch(generate, "uwb.launch.py", **said) if node.executable == "driver")
+    given = {"source": "evb1000", "port": "/dev/ttyACM0", "radio.address": text, "radio.anchors": text}
+    (driver,) = (node for node in launch(generate, "uwb.launch.py", **given) if node.executable == "driver")
     for name in ("radio.address", "radio.anchors"):
         assert yaml.safe_load(settings(driver)[name]) == "0xdeca010203040506"
 
 
 def test_every_parameter_is_an_argument_and_reaches_its_node_with_its_type(generate):
-    said = {"source": "serial", "port": "usb:2341:805a", "locate": "true", "viewer": "true"}
+    given = {"source": "serial", "port": "usb:2341:805a", "locate": "true", "viewer": "true"}
     arguments, _ = described(generate, "uwb.launch.py")
     examples = {"frame_id": "1234", "radio.address": "34", "offsets": "0.25", "level": "true", "height": "1e-1", "publish_tf": "True",
                 "viewer_port": "8080", "locator_rate": "20", "rate": "2", "radio.pan": "7", "area": "0,0,0,9,9,3"}  # fmt: skip
@@ -152,7 +152,7 @@ def test_every_parameter_is_an_argument_and_reaches_its_node_with_its_type(gener
         for row in table:
             assert {row.name, f"{node}_{row.name}"} & set(arguments), row
     nodes = {
-        node.executable: settings(node) for node in launch(generate, "uwb.launch.py", **said, **examples)
+        node.executable: settings(node) for node in launch(generate, "uwb.launch.py", **given, **examples)
     }
     # launch_ros parses strings as YAML: a path such as 1234 must stay a string.
     assert yaml.safe_load(nodes["driver"]["frame_id"]) == "1234"
@@ -175,7 +175,7 @@ def test_every_parameter_is_an_argument_and_reaches_its_node_with_its_type(gener
 
 
 @pytest.mark.parametrize(
-    ("said", "told"),
+    ("given", "excerpt"),
     [
         ({"source": "mcpa", "path": "a.mcap"}, "source = 'mcpa'"),
         ({"source": "simulated", "locate": "yess"}, "locate:=yess"),
@@ -190,9 +190,9 @@ def test_every_parameter_is_an_argument_and_reaches_its_node_with_its_type(gener
         ({"source": "decaranging"}, "decaranging without a path"),
     ],
 )
-def test_invalid_argument_stops_the_launch(generate, said: dict[str, str], told: str):
-    with pytest.raises(RuntimeError, match=told):
-        launch(generate, "uwb.launch.py", **said)
+def test_invalid_argument_stops_the_launch(generate, given: dict[str, str], excerpt: str):
+    with pytest.raises(RuntimeError, match=excerpt):
+        launch(generate, "uwb.launch.py", **given)
 
 
 class Context(dict):
@@ -232,7 +232,7 @@ def test_one_file_configures_all_nodes(generate, tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "excerpt"),
     [
         ("/**: {ros__parameters: {sorce: mcap}}", "sorce is unknown.*source"),
         ("/**: {ros__parameters: {source: mcpa}}", "source = 'mcpa'"),
@@ -240,10 +240,10 @@ def test_one_file_configures_all_nodes(generate, tmp_path: Path):
         ("mitigator: [", "robot.yaml"),
     ],
 )
-def test_invalid_parameter_file_stops_the_launch(generate, tmp_path: Path, text: str, told: str):
+def test_invalid_parameter_file_stops_the_launch(generate, tmp_path: Path, text: str, excerpt: str):
     robot = tmp_path / "robot.yaml"
     robot.write_text(text)
-    with pytest.raises(RuntimeError, match=told):
+    with pytest.raises(RuntimeError, match=excerpt):
         launch(generate, "uwb.launch.py", source="simulated", params=str(robot))
 
 

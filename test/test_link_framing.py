@@ -53,7 +53,7 @@ def test_encoder_numbers_its_frames_and_wraps_at_32_bits():
 @given(st.lists(frames, max_size=5), st.binary(max_size=300), st.lists(st.integers(1, 50), min_size=1))
 def test_splitting_of_the_stream_does_not_matter(sent, noise, sizes):
     stream = noise + b"".join(map(encode_frame, sent)) + noise + b"\0"
-    whole, cut = FrameDecoder(), FrameDecoder()
+    uncut, cut = FrameDecoder(), FrameDecoder()
     received, at, turn = [], 0, 0
     while at < len(stream):
         size = sizes[turn % len(sizes)]
@@ -61,8 +61,8 @@ def test_splitting_of_the_stream_does_not_matter(sent, noise, sizes):
         at += size
         turn += 1
 
-    assert received == whole.feed(stream)
-    assert cut.counts == whole.counts
+    assert received == uncut.feed(stream)
+    assert cut.counts == uncut.counts
 
 
 @pytest.mark.parametrize("at", range(1, len(encode_frame(A)) - 1))

@@ -117,10 +117,10 @@ def test_ranges_yield_poses_odometry_smoothed_poses_and_markers(ros: Ros, anchor
     assert {message.child_frame_id for message in odometry} == {"uwb_tag"}
     assert poses[-1].pose.covariance[35] >= 1e5
     assert poses[-1].pose.pose.orientation.w == 1.0
-    told = values(diagnostics)
-    assert told["ranges not valid"] == "3"
-    assert told["ranges of unknown anchors"] == "3"
-    assert float(told["tag 7 HDOP"]) < 3
+    reported = values(diagnostics)
+    assert reported["ranges not valid"] == "3"
+    assert reported["ranges of unknown anchors"] == "3"
+    assert float(reported["tag 7 HDOP"]) < 3
     assert "anchor 4711 are left out" in locator.output
     late = ros.node.create_subscription(
         MarkerArray,
@@ -148,11 +148,11 @@ def test_gap_is_bridged_by_predictions_with_growing_covariance(ros: Ros, anchors
         now_ns = run.start_ns + int(run.ranges.stamp_ns[row]) + round(silent_s * NANOSECONDS)
         now = Clock(clock=Time(sec=now_ns // NANOSECONDS, nanosec=now_ns % NANOSECONDS))
 
-        def told() -> list[float]:
+        def variances() -> list[float]:
             return [pose.pose.covariance[0] for pose in poses if stamp_ns(pose) == now_ns]
 
-        ros.spin_until(lambda: clock.publish(now) or bool(told()))
-        return told()[-1]
+        ros.spin_until(lambda: clock.publish(now) or bool(variances()))
+        return variances()[-1]
 
     half = len(run.ranges) // 2
     run.send(range(half))
@@ -166,19 +166,19 @@ def test_gap_is_bridged_by_predictions_with_growing_covariance(ros: Ros, anchors
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "excerpt"),
     [(None, "no such file"), ("anchors: [{id: 1, x: 0, y: 0}]", "the field z is missing")],
 )
 def test_unusable_anchors_file_is_reported_and_the_node_keeps_running(
-    ros: Ros, tmp_path: Path, text: str | None, told: str
+    ros: Ros, tmp_path: Path, text: str | None, excerpt: str
 ):
     path = tmp_path / "anchors.yaml"
     if text is not None:
         path.write_text(text)
     locator = ros.start("locator", f"anchors:={path}")
-    locator.wait_for_output(told)
+    locator.wait_for_output(excerpt)
     diagnostics = ros.collect(DiagnosticArray, "/diagnostics")
-    ros.spin_until(lambda: told in values(diagnostics).get("", ""))
+    ros.spin_until(lambda: excerpt in values(diagnostics).get("", ""))
     assert locator.exit_code() is None
     assert locator.signal(signal.SIGINT) == 0
 

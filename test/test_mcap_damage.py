@@ -21,17 +21,17 @@ from uwb_mitigation.sources.mcap import McapRecording
 
 
 def test_truncated_bag_yields_its_complete_messages_and_the_position_of_the_damage(tmp_path: Path) -> None:
-    bag = Foreign(tmp_path / "whole.mcap", index_types=IndexType.ALL).ours()
+    bag = Foreign(tmp_path / "complete.mcap", index_types=IndexType.ALL).ours()
     for number in range(12):
         bag.range(number)
         bag.truth(number)
         if number % 3 == 2:
             bag.flush()
-    whole = bag.finish().read_bytes()
-    ends = {end: 3 * (i + 1) for i, (_, end) in enumerate(chunk_offsets(tmp_path / "whole.mcap"))}
+    complete = bag.finish().read_bytes()
+    ends = {end: 3 * (i + 1) for i, (_, end) in enumerate(chunk_offsets(tmp_path / "complete.mcap"))}
     cut = tmp_path / "cut.mcap"
-    for size in [*range(0, len(whole), 37), *ends, *(end - 1 for end in ends)]:
-        cut.write_bytes(whole[:size])
+    for size in [*range(0, len(complete), 37), *ends, *(end - 1 for end in ends)]:
+        cut.write_bytes(complete[:size])
         read, error = prefix(cut)
         expected = max((count for end, count in ends.items() if end <= size), default=0)
         assert read == list(range(len(read)))
@@ -102,21 +102,21 @@ def test_damaged_index_at_the_end_is_counted_and_loses_no_message(tmp_path: Path
 
 
 def test_every_flipped_bit_in_the_data_is_detected(tmp_path: Path) -> None:
-    bag = Foreign(tmp_path / "whole.mcap").ours()
+    bag = Foreign(tmp_path / "complete.mcap").ours()
     for number in range(8):
         bag.range(number)
         if number % 2:
             bag.flush()
-    whole = bag.finish().read_bytes()
+    complete = bag.finish().read_bytes()
     expected = [codec.encode_range(record(number).measurement) for number in range(8)]
     rng = np.random.default_rng(5)
     flipped = tmp_path / "flipped.mcap"
     flips = [
-        (at, bit) for chunk in chunk_offsets(tmp_path / "whole.mcap") for at in chunk for bit in range(8)
+        (at, bit) for chunk in chunk_offsets(tmp_path / "complete.mcap") for at in chunk for bit in range(8)
     ]
-    flips += zip(rng.integers(0, len(whole), 300).tolist(), rng.integers(0, 8, 300).tolist(), strict=True)
+    flips += zip(rng.integers(0, len(complete), 300).tolist(), rng.integers(0, 8, 300).tolist(), strict=True)
     for at, bit in flips:
-        broken = bytearray(whole)
+        broken = bytearray(complete)
         broken[at] ^= 1 << bit
         flipped.write_bytes(broken)
         read: list[bytes] = []

@@ -75,8 +75,8 @@ def test_tag_position_is_read_from_the_bag(tmp_path: Path) -> None:
             out.write(replace(record(number), tag_position=place))
         # A frame of another tag, and a truncated message.
         estimate = Estimate(record(3).measurement.stamp_ns, np.ones(3), np.ones(3), np.eye(6))
-        whole = encode_odometry(estimate, child_frame_id="base_link")
-        for data in (whole, whole[:50]):
+        complete = encode_odometry(estimate, child_frame_id="base_link")
+        for data in (complete, complete[:50]):
             out.write_message(ODOMETRY_TRUTH, ODOMETRY_TYPE, data, estimate.stamp_ns)
     source = McapRecording(path)
     assert [item.tag_position for item in source] == places
@@ -126,12 +126,12 @@ def test_files_of_a_folder_follow_each_other_by_number(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "told"),
+    ("content", "excerpt"),
     [(b"", "empty"), (b"\x89MCAP", "not an MCAP file"), (b"hello, this is text", "not an MCAP file")],
 )
-def test_other_file_is_refused(tmp_path: Path, content: bytes, told: str) -> None:
+def test_other_file_is_refused(tmp_path: Path, content: bytes, excerpt: str) -> None:
     (tmp_path / "bag.mcap").write_bytes(content)
-    with pytest.raises(RecordingError, match=told):
+    with pytest.raises(RecordingError, match=excerpt):
         McapRecording(tmp_path / "bag.mcap")
 
 
@@ -144,7 +144,7 @@ def test_missing_topic_is_reported_with_the_existing_topics(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(
-    ("channel", "told"),
+    ("channel", "excerpt"),
     [
         ((RANGE_RAW, RANGE_CIR_TYPE, None), "no schema.*RangeCir"),
         ((RANGE_RAW, "std_msgs/msg/String", "string data"), "'std_msgs/msg/String'.*RangeCir"),
@@ -152,12 +152,12 @@ def test_missing_topic_is_reported_with_the_existing_topics(tmp_path: Path) -> N
     ],
 )
 def test_topic_with_another_layout_is_refused(
-    tmp_path: Path, channel: tuple[str, str, str | None], told: str
+    tmp_path: Path, channel: tuple[str, str, str | None], excerpt: str
 ) -> None:
     bag = Foreign(tmp_path / "bag.mcap")
     bag.channel(*channel)
     bag.range(0)
-    with pytest.raises(RecordingError, match=told) as caught:
+    with pytest.raises(RecordingError, match=excerpt) as caught:
         list(McapRecording(bag.finish()))
     assert RANGE_RAW in caught.value.where
 

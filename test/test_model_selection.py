@@ -231,12 +231,12 @@ def test_few_configurations_start_from_the_universal_network(tmp_path, monkeypat
     far_off = Candidate("far off", lambda data, seed: FittedModel(LinearBiasModel(9.0)))
     monkeypatch.setattr(candidates, "new_models", lambda recipe: [far_off])
     output, result = tmp_path / "cold.onnx", tmp_path / "cold.json"
-    told = run_or_raise("train", "--data", tmp_path, "-o", output, "--folds", 2, "--json", result)
+    printed = run_or_raise("train", "--data", tmp_path, "-o", output, "--folds", 2, "--json", result)
     found, made = json.loads(result.read_text()), load_bundle(output)
     start = load_bundle(default_model_path())
     assert found["choice"]["chosen"] == made.card.training["chosen"] == candidates.COLD_START
     # The mark is in the line of the chosen candidate, also with 80 columns.
-    assert [line for line in told.splitlines() if "<-" in line and candidates.COLD_START in line]
+    assert [line for line in printed.splitlines() if "<-" in line and candidates.COLD_START in line]
     mae = {row["name"]: row["mae"] for row in found["choice"]["rows"]}
     assert found["helped"] == (mae[NESTED] < mae["raw"])
     assert set(found) == {"model_id", "n", "refused", "rows", "helped", "by_configuration", "choice"}

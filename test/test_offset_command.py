@@ -78,8 +78,10 @@ def test_added_offset_is_estimated(universal: Mitigation, direct: list[Record]):
     # The offset of simulated boards.
     assert before.offset_m == pytest.approx(0.22, abs=3.0 * before.sd_m)
     # Offsets that the mitigator already subtracts are not counted twice.
-    told = Mitigation(universal.bundle, Offsets(0.625))
-    assert estimate_offset(told, longer(direct, 0.625)).offset_m == pytest.approx(after.offset_m, abs=0.02)
+    with_offset = Mitigation(universal.bundle, Offsets(0.625))
+    assert estimate_offset(with_offset, longer(direct, 0.625)).offset_m == pytest.approx(
+        after.offset_m, abs=0.02
+    )
 
 
 def test_without_levels_los_is_detected_in_the_cir(direct: list[Record]):
@@ -177,7 +179,7 @@ def test_written_offsets_are_read_by_the_other_commands(direct: list[Record], tm
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "excerpt"),
     [
         ((), "one of --distance and --truth"),
         (("--distance", "5", "--truth"), "one of --distance and --truth"),
@@ -188,8 +190,8 @@ def test_written_offsets_are_read_by_the_other_commands(direct: list[Record], tm
     ],
 )
 def test_contradictory_options_are_refused_before_the_work(
-    options: tuple[str, ...], said: str, tmp_path: Path
+    options: tuple[str, ...], excerpt: str, tmp_path: Path
 ):
     outcome = command_line.run("offset", "none.mcap", *options, folder=tmp_path)
     assert outcome.returncode != 0
-    assert said in outcome.stderr
+    assert excerpt in outcome.stderr

@@ -59,7 +59,7 @@ def test_parameter_is_a_number_or_a_file(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "excerpt"),
     [
         ("", "no offsets"),
         ("[0.2]", "no offsets"),
@@ -82,8 +82,8 @@ def test_parameter_is_a_number_or_a_file(tmp_path: Path):
         ("pairs: [{anchor: 1, tag: 2, offset: 0.1}, {anchor: 1, tag: 2, offset: 0.2}]", "entry 2.*twice"),
     ],
 )
-def test_malformed_offsets_file_is_refused(text: str, said: str):
-    with pytest.raises(ParameterError, match=said) as caught:
+def test_malformed_offsets_file_is_refused(text: str, excerpt: str):
+    with pytest.raises(ParameterError, match=excerpt) as caught:
         parse_offsets(text, "site.yaml")
     assert "site.yaml" in str(caught.value)
 

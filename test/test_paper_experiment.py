@@ -140,11 +140,11 @@ def test_finished_tasks_are_not_repeated_unless_damaged_or_of_other_data(finishe
 def test_two_processes_give_the_same_models(tmp_path):
     wanted = experiment.list_tasks(["mlp"], [32], seeds=2)
     shares: list[float] = []
-    alone, together = (
+    one_worker, together = (
         experiment.run(parts(), tmp_path / str(workers), wanted, QUICK, workers, shares.append)
         for workers in (1, 2)
     )
-    assert [m.mae_int8 for m in alone.models] == [m.mae_int8 for m in together.models]
+    assert [m.mae_int8 for m in one_worker.models] == [m.mae_int8 for m in together.models]
     assert shares == pytest.approx([0.5, 1.0, 0.5, 1.0])
 
 

@@ -31,7 +31,7 @@ def replaying(tmp_path_factory: pytest.TempPathFactory):
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "told"),
+    ("name", "value", "excerpt"),
     [
         ("rate", -1.0, ("rate", "-1.0", "0.001", "10000")),
         ("rate", 20_000, ("rate", "20000", "0.001", "10000")),
@@ -45,17 +45,17 @@ def replaying(tmp_path_factory: pytest.TempPathFactory):
     ],
 )
 def test_value_is_refused_by_name_value_and_range(
-    replaying: Ros, name: str, value: object, told: tuple | None
+    replaying: Ros, name: str, value: object, excerpt: tuple | None
 ):
     result = replaying.set_parameter("driver", name, value)
-    assert result.successful == (told is None)
-    assert all(word in result.reason for word in told or ()), result.reason
+    assert result.successful == (excerpt is None)
+    assert all(word in result.reason for word in excerpt or ()), result.reason
 
 
 def test_unknown_parameter_is_refused_with_a_suggestion(ros: Ros, tmp_path: Path):
     file = tmp_path / "parameters.yaml"
     file.write_text("/**:\n  ros__parameters:\n    sorce: mcap\n")
-    for node, words, told in (
+    for node, words, excerpt in (
         (
             "driver",
             ("--params-file", str(file)),
@@ -66,7 +66,7 @@ def test_unknown_parameter_is_refused_with_a_suggestion(ros: Ros, tmp_path: Path
     ):
         process = ros.start(node, arguments=words)
         assert process.wait() == 1
-        assert told in process.output
+        assert excerpt in process.output
         assert "Traceback" not in process.output
 
 

@@ -47,14 +47,14 @@ SLOPE = AnchorMap(
 
 def test_filter_agrees_with_filterpy():
     kalman = pytest.importorskip("filterpy.kalman")
-    mine = RangeFilter(HALL, PLAIN, 0.0, np.array([6.0, 4.0, 1.0]), np.eye(3))
-    mine.learns = True
-    n = len(mine.x)
-    theirs = kalman.ExtendedKalmanFilter(dim_x=n, dim_z=1)
-    theirs.x, theirs.P = mine.x.copy()[:, None], mine.p.copy()
+    own_filter = RangeFilter(HALL, PLAIN, 0.0, np.array([6.0, 4.0, 1.0]), np.eye(3))
+    own_filter.learns = True
+    n = len(own_filter.x)
+    filterpy_filter = kalman.ExtendedKalmanFilter(dim_x=n, dim_z=1)
+    filterpy_filter.x, filterpy_filter.P = own_filter.x.copy()[:, None], own_filter.p.copy()
     ranges, _ = drive(seconds=3)
     variance = PLAIN.range_sd**2
-    claimed = np.diag(theirs.P)[FIRST_ERROR:].copy()
+    claimed = np.diag(filterpy_filter.P)[FIRST_ERROR:].copy()
     previous = 0.0
     for stamp, row, range_m in zip(ranges.stamp_ns / 1e9, ranges.anchor, ranges.range_m, strict=True):
         dt, previous = stamp - previous, stamp
@@ -66,8 +66,8 @@ def test_filter_agrees_with_filterpy():
             f[axis, axis + 3] = dt
             block = np.ix_([axis, axis + 3], [axis, axis + 3])
             q[block] = PLAIN.acceleration**2 * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
-        theirs.F, theirs.Q = f, q
-        theirs.predict()
+        filterpy_filter.F, filterpy_filter.Q = f, q
+        filterpy_filter.predict()
 
         def slope(x, row=row):
             away = x[:3, 0] - HALL.position[row]
@@ -79,12 +79,12 @@ def test_filter_agrees_with_filterpy():
             return np.linalg.norm(x[:3, 0] - HALL.position[row]) + x[OFFSET] + x[FIRST_ERROR + row]
 
         white = max(PLAIN.white * variance, variance - claimed[row])
-        theirs.update(np.array([[range_m]]), slope, expected, R=np.array([[white]]))
+        filterpy_filter.update(np.array([[range_m]]), slope, expected, R=np.array([[white]]))
         claimed[row] += 0.1 * ((1 - PLAIN.white) * variance - claimed[row])
-        mine.predict(stamp)
-        mine.update(row, range_m, variance)
-        np.testing.assert_allclose(mine.x, theirs.x[:, 0], atol=1e-8)
-        np.testing.assert_allclose(mine.p, theirs.P, atol=1e-8)
+        own_filter.predict(stamp)
+        own_filter.update(row, range_m, variance)
+        np.testing.assert_allclose(own_filter.x, filterpy_filter.x[:, 0], atol=1e-8)
+        np.testing.assert_allclose(own_filter.p, filterpy_filter.P, atol=1e-8)
 
 
 @settings(max_examples=40)

@@ -267,7 +267,7 @@ def test_invalid_bag_is_reported_and_does_not_stop_the_others(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(
-    ("given", "told"),
+    ("given", "excerpt"),
     [
         (["absent.mcap", "-o", "out.mcap"], "absent.mcap: no such file"),
         (["in.mcap", "in.mcap", "-o", "out"], "have one name"),
@@ -279,13 +279,13 @@ def test_invalid_bag_is_reported_and_does_not_stop_the_others(tmp_path: Path) ->
         (["in.mcap", "-o", "no/such/folder.mcap"], "cannot be written"),
     ],
 )
-def test_invalid_arguments_print_one_line_and_exit_1(tmp_path: Path, given: list[str], told: str) -> None:
+def test_invalid_arguments_print_one_line_and_exit_1(tmp_path: Path, given: list[str], excerpt: str) -> None:
     write_bag(tmp_path / "in.mcap", exchanges(1))
     write_bag(tmp_path / "other.mcap", exchanges(1))
     (tmp_path / "empty").mkdir()
     done = run("process", *given, folder=tmp_path)
     assert done.returncode == 1
-    assert told in done.stderr
+    assert excerpt in done.stderr
     assert len(done.stderr.splitlines()) == 1
     assert not (tmp_path / "out").exists()
     assert not (tmp_path / "out.mcap").exists()

@@ -186,11 +186,11 @@ def test_anchor_with_a_host_reports_the_range_with_the_cir_of_final():
         air.run(0.2)
         rows, store = air.ranges()
         addresses = air.address(tag), air.address(anchor)
-    told = rows[rows["board"] == anchor]
-    assert len(told) > 20
-    assert abs(told["range_m"] - 9).max() < 0.02
-    assert {(row["tag"], row["anchor"]) for row in told} == {addresses}
-    np.testing.assert_array_equal(store[told[0]["at"] : told[0]["at"] + 314], iq[2 * 740 : 2 * 897])
+    excerpt = rows[rows["board"] == anchor]
+    assert len(excerpt) > 20
+    assert abs(excerpt["range_m"] - 9).max() < 0.02
+    assert {(row["tag"], row["anchor"]) for row in excerpt} == {addresses}
+    np.testing.assert_array_equal(store[excerpt[0]["at"] : excerpt[0]["at"] + 314], iq[2 * 740 : 2 * 897])
 
 
 def test_missing_antenna_delay_appears_in_the_range():

@@ -97,13 +97,13 @@ def test_ranges_dropped_by_a_queue_are_reported(ros: Ros):
     )
     publisher = ros.node.create_publisher(RangeCir, RAW, 10)
 
-    def told(status: DiagnosticStatus) -> bool:
+    def excerpt(status: DiagnosticStatus) -> bool:
         # Send more than the queue can hold.
         for _ in range(300):
             publisher.publish(data)
         return status.message == DROPPED.text
 
-    status = ros.diagnosis("mitigator", told)
+    status = ros.diagnosis("mitigator", excerpt)
     assert status.level == DiagnosticStatus.WARN
 
 
@@ -355,14 +355,14 @@ def test_offsets_are_set_live_and_invalid_ones_are_refused(ros: Ros, tmp_path: P
     assert answer().range == expected(Offsets(0.25))
     assert ros.set_parameter("mitigator", "offsets", str(path)).successful
     assert answer().range == expected(read_offsets(str(path)))
-    for nonsense, said in (
+    for invalid, excerpt in (
         ("220", "millimetres"),
         (str(tmp_path / "no.yaml"), "no such file"),
         (True, "number of metres"),
     ):
-        refused = ros.set_parameter("mitigator", "offsets", nonsense)
+        refused = ros.set_parameter("mitigator", "offsets", invalid)
         assert not refused.successful
-        assert said in refused.reason
+        assert excerpt in refused.reason
     assert answer().range == expected(read_offsets(str(path)))
     assert ros.set_parameter("mitigator", "offsets", 0.5).successful
     last = answer()

@@ -70,8 +70,8 @@ def test_pseudo_truth_uses_the_other_anchors_and_has_a_standard_deviation(solved
     assert np.abs(error).mean() < 0.1
     assert 0.3 < np.sqrt(np.mean((error / solved.pseudo_sd_m) ** 2)) < 2.0
     # Ranges of the anchor itself are not used: wrong ones do not move the tag.
-    spoilt = with_own(ranges, np.array([0.0, 0.0, 0.9, 0.0, 0.0]))
-    again = calibrate(HALL, [spoilt], height=LEVEL)
+    changed = with_own(ranges, np.array([0.0, 0.0, 0.9, 0.0, 0.0]))
+    again = calibrate(HALL, [changed], height=LEVEL)
     own = ranges.anchor == 2
     assert np.abs(again.pseudo_m - truth)[own].mean() < 0.15
 
@@ -79,8 +79,8 @@ def test_pseudo_truth_uses_the_other_anchors_and_has_a_standard_deviation(solved
 def test_held_out_ranges_do_not_affect_the_offsets(solved, minute):
     ranges = with_own(minute[0])
     late = ranges.stamp_ns > 30 * 10**9
-    spoilt = replace(ranges, range_m=ranges.range_m + np.where(late & (ranges.anchor == 2), 0.5, 0.0))
-    found = calibrate(HALL, [spoilt], height=LEVEL)
+    changed = replace(ranges, range_m=ranges.range_m + np.where(late & (ranges.anchor == 2), 0.5, 0.0))
+    found = calibrate(HALL, [changed], height=LEVEL)
     again = found.without_ranges(found.segments.ranges.stamp_ns > 30 * 10**9)
     before, after = (np.array([one.pair(0, row)[0] for row in range(5)]) for one in (found, again))
     assert after[2] < before[2] - 0.05
@@ -104,11 +104,11 @@ def test_ranges_with_larger_errors_have_lower_weights(minute):
     rng = np.random.default_rng(8)
     blocked = rng.random(len(ranges)) < np.array([0.8, 0.1, 0.1, 0.8, 0.4])[ranges.anchor]
     late = with_own(ranges, OWN).range_m + np.where(blocked, np.abs(rng.normal(0.0, 0.4, len(ranges))), 0.0)
-    spoilt = replace(ranges, range_m=late)
+    changed = replace(ranges, range_m=late)
     nothing = Regressors.none(len(ranges))
 
     def worst(noise_group):
-        found = calibrate(HALL, [spoilt], replace(nothing, noise_group=noise_group), height=LEVEL)
+        found = calibrate(HALL, [changed], replace(nothing, noise_group=noise_group), height=LEVEL)
         return np.abs([found.pair(0, row)[0] - 0.25 - OWN[row] for row in range(5)]).max()
 
     assert worst(blocked.astype(int)) < 0.07 < worst(nothing.noise_group)

@@ -21,7 +21,7 @@ BLOCKS = 8
 
 
 @pytest.fixture(scope="module")
-def world() -> Dataset:
+def dataset() -> Dataset:
     return building_dataset(5, BLOCKS, Preprocessing(), workers=2)
 
 
@@ -30,34 +30,34 @@ def arrays(dataset: Dataset) -> list[bytes]:
     return [column.tobytes() for column in columns]
 
 
-def test_result_does_not_depend_on_the_number_of_workers(world: Dataset) -> None:
-    assert arrays(building_dataset(5, BLOCKS, Preprocessing(), workers=1)) == arrays(world)
+def test_result_does_not_depend_on_the_number_of_workers(dataset: Dataset) -> None:
+    assert arrays(building_dataset(5, BLOCKS, Preprocessing(), workers=1)) == arrays(dataset)
 
 
-def test_records_equal_arrays(world: Dataset) -> None:
+def test_records_equal_arrays(dataset: Dataset) -> None:
     count = PLACEMENTS + 40
     records = build_dataset(SimulatedBuildings(seed=5, placements=count), Preprocessing())
-    first = world.rows(np.arange(len(records)))
+    first = dataset.rows(np.arange(len(records)))
     assert records.inputs.tobytes() == first.inputs.tobytes()
     assert (records.configurations == first.configurations).all()
     assert (records.labels == first.labels).all()
     np.testing.assert_allclose(records.error_m, first.error_m, atol=1e-12)
 
 
-def test_conditions_are_balanced_and_few_frames_are_lost(world: Dataset) -> None:
-    share = {name: np.mean(world.labels == name) for name in ("LOS", "NLOS", "NDP NLOS")}
+def test_conditions_are_balanced_and_few_frames_are_lost(dataset: Dataset) -> None:
+    share = {name: np.mean(dataset.labels == name) for name in ("LOS", "NLOS", "NDP NLOS")}
     assert sum(share.values()) == pytest.approx(1.0)
     assert min(share.values()) > 0.15
     assert max(share.values()) < 0.5
-    assert len(world) > 0.85 * BLOCKS * PLACEMENTS
+    assert len(dataset) > 0.85 * BLOCKS * PLACEMENTS
 
 
-def test_error_contains_only_the_channel(world: Dataset) -> None:
-    los, nlos, ndp = (world.error_m[world.labels == name] for name in ("LOS", "NLOS", "NDP NLOS"))
+def test_error_contains_only_the_channel(dataset: Dataset) -> None:
+    los, nlos, ndp = (dataset.error_m[dataset.labels == name] for name in ("LOS", "NLOS", "NDP NLOS"))
     assert np.median(los) == pytest.approx(0.0, abs=0.03)
     assert 0.1 < np.median(nlos) < 0.4 < np.median(ndp)
     # Noise before the path is sometimes detected as first path; nothing else is early.
-    assert np.mean(world.error_m < -0.15) < 0.01
+    assert np.mean(dataset.error_m < -0.15) < 0.01
 
 
 @pytest.mark.parametrize("kind", WIDE_KINDS, ids=lambda kind: kind.name)

@@ -145,7 +145,7 @@ def test_command_writes_a_bag_marked_as_simulated(tmp_path: Path, like: str) -> 
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "excerpt"),
     [
         (["--like", "survey", "--ranges", "30"], "a multiple of"),
         (["--like", "survey", "--exchanges", "0"], "a multiple of"),
@@ -154,11 +154,11 @@ def test_command_writes_a_bag_marked_as_simulated(tmp_path: Path, like: str) -> 
     ],
 )
 def test_invalid_simulation_is_refused_and_leaves_no_file(
-    tmp_path: Path, words: list[str], told: str
+    tmp_path: Path, words: list[str], excerpt: str
 ) -> None:
     done = CliRunner().invoke(app, ["data", "simulate", "-o", str(tmp_path / "sim.mcap"), *words])
     assert isinstance(done.exception, ParameterError)
-    assert told in str(done.exception)
+    assert excerpt in str(done.exception)
     assert not list(tmp_path.iterdir())
 
 

@@ -44,7 +44,7 @@ def test_smoother_agrees_with_nonlinear_least_squares():
     ranges, truth = drive(seconds=4, model=NoiseModel(white=1.0), offset_m=0.0)
     knots_ns, of = knots_of(ranges.stamp_ns)
     ranges = ranges.take(np.flatnonzero(ranges.stamp_ns == knots_ns[of]))
-    mine = Smoother(EstimatorConfig(HALL, model), ranges).fit(known_track(truth), 30)
+    smoothed = Smoother(EstimatorConfig(HALL, model), ranges).fit(known_track(truth), 30)
     knots_ns, of = knots_of(ranges.stamp_ns)
     sd = np.sqrt(model.range_sd**2 + HALL.sd[ranges.anchor] ** 2)
     dt = np.diff(knots_ns)[:, None] / 1e9
@@ -60,12 +60,12 @@ def test_smoother_agrees_with_nonlinear_least_squares():
 
     start = np.stack([truth.at(knots_ns), np.zeros((len(knots_ns), 3))])
     found = least_squares(residuals, start.reshape(-1), method="lm")
-    np.testing.assert_allclose(mine.track.position, found.x.reshape(2, -1, 3)[0], atol=2e-3)
+    np.testing.assert_allclose(smoothed.track.position, found.x.reshape(2, -1, 3)[0], atol=2e-3)
     covariance = np.linalg.inv(found.jac.T @ found.jac)
     for k in (0, len(knots_ns) // 2, len(knots_ns) - 1):
         own = slice(3 * k, 3 * k + 3)
         np.testing.assert_allclose(
-            mine.track.covariance[k, :3, :3], covariance[own, own], rtol=0.02, atol=1e-4
+            smoothed.track.covariance[k, :3, :3], covariance[own, own], rtol=0.02, atol=1e-4
         )
 
 

@@ -37,9 +37,9 @@ def test_anchors_are_estimated_from_guesses_with_errors_of_1_5_m(minute):
 
 
 def test_anchors_that_contradict_the_ranges_are_reported(minute):
-    nonsense = minute.take(slice(0, 300))
-    nonsense = replace(nonsense, range_m=np.random.default_rng(1).permutation(nonsense.range_m))
-    assert not survey(EstimatorConfig(HALL, height=LEVEL), nonsense).explained
+    shuffled = minute.take(slice(0, 300))
+    shuffled = replace(shuffled, range_m=np.random.default_rng(1).permutation(shuffled.range_m))
+    assert not survey(EstimatorConfig(HALL, height=LEVEL), shuffled).explained
 
 
 def test_only_the_displaced_anchor_is_named(minute):

@@ -65,19 +65,19 @@ def test_track_is_written_evaluated_and_read_by_evo(hall: Path, tmp_path: Path):
     out, tum, result = tmp_path / "track.mcap", tmp_path / "track.tum", tmp_path / "track.json"
     done = run("track", hall, "-o", out, "--tum", tum, "--height", "1.0", "--json", result, folder=tmp_path)
     assert done.returncode == 0, done.stderr
-    told = json.loads(result.read_text())
-    assert told["unknown_anchors"] == {"99": 1}
-    assert told["corrected"] is True
-    assert told["tags"][0]["tag_id"] == 7
+    excerpt = json.loads(result.read_text())
+    assert excerpt["unknown_anchors"] == {"99": 1}
+    assert excerpt["corrected"] is True
+    assert excerpt["tags"][0]["tag_id"] == 7
     for kind in ("live", "smoothed"):
-        assert told[kind]["horizontal_rmse_m"] < 0.2
-        assert 0.3 < told[kind]["nees_per_dof"] < 2
-    assert told["snapshot"]["horizontal_rmse_m"] > 1.5 * told["live"]["horizontal_rmse_m"]
-    assert told["hdop_median"] < 3
-    *anchors, every = told["held_out"]
+        assert excerpt[kind]["horizontal_rmse_m"] < 0.2
+        assert 0.3 < excerpt[kind]["nees_per_dof"] < 2
+    assert excerpt["snapshot"]["horizontal_rmse_m"] > 1.5 * excerpt["live"]["horizontal_rmse_m"]
+    assert excerpt["hdop_median"] < 3
+    *anchors, every = excerpt["held_out"]
     assert [one["anchor_id"] for one in anchors] == [1, 2, 3, 4, 5]
     assert every["anchor_id"] is None
-    for one in told["held_out"]:
+    for one in excerpt["held_out"]:
         assert one["corrected_m"] < 0.3
         assert one["raw_m"] > 0.4, "they are 0.6 m too long"
     assert anchors_file(out).read_text() == dump_anchors(HALL, "anchors of the track of hall.mcap")
@@ -133,8 +133,8 @@ def test_survey_improves_the_anchor_positions(hall: Path, tmp_path: Path):
     done = run(*arguments, folder=tmp_path)
     assert done.returncode == 0, done.stderr
     assert json.loads(result.read_text())["misplaced"] == [2]
-    told = parse_anchors(found.read_text(), "found")
-    assert np.linalg.norm(told.position[1] - HALL.position[1]) < 0.5
+    excerpt = parse_anchors(found.read_text(), "found")
+    assert np.linalg.norm(excerpt.position[1] - HALL.position[1]) < 0.5
     assert run(*arguments, folder=tmp_path).returncode != 0
 
 
@@ -148,11 +148,11 @@ def test_height_topic_is_used_and_excludes_a_constant_height(tmp_path: Path):
     arguments = ("track", bag, "-o", tmp_path / "track.mcap", "--height-topic")
     done = run(*arguments, "/height", "--json", result, folder=tmp_path)
     assert done.returncode == 0, done.stderr
-    told = json.loads(result.read_text())
+    excerpt = json.loads(result.read_text())
     for kind in ("live", "smoothed"):
-        assert told[kind]["horizontal_rmse_m"] < 0.2
-        assert told[kind]["height_rmse_m"] < 0.05
-    assert told["tags"][0]["warnings"] == []
+        assert excerpt[kind]["horizontal_rmse_m"] < 0.2
+        assert excerpt[kind]["height_rmse_m"] < 0.05
+    assert excerpt["tags"][0]["warnings"] == []
     for more in (("/height", "--height", "1.0"), ("/nothing",)):
         assert run(*arguments, *more, "--force", folder=tmp_path).returncode != 0
 

@@ -75,11 +75,15 @@ def test_variance_grows_with_the_predicted_error(tmp_path):
 
 
 def test_out_of_distribution_measurement_is_corrected_less_with_larger_variance(tmp_path):
-    familiar = mitigation(tmp_path).correct([measurement(3.0)])[0]
-    strange = mitigation(tmp_path, range_m=Band(1.0, 2.0, 4.0)).correct([measurement(3.0)])[0]
-    assert strange.status is Status.OK
-    assert strange.correction_m == pytest.approx(0.25 + 0.75 * (familiar.correction_m - 0.25), abs=1e-6)
-    assert strange.variance_m2 == pytest.approx(familiar.variance_m2 + 0.25 * 0.5, abs=1e-6)
+    in_distribution = mitigation(tmp_path).correct([measurement(3.0)])[0]
+    out_of_distribution = mitigation(tmp_path, range_m=Band(1.0, 2.0, 4.0)).correct([measurement(3.0)])[0]
+    assert out_of_distribution.status is Status.OK
+    assert out_of_distribution.correction_m == pytest.approx(
+        0.25 + 0.75 * (in_distribution.correction_m - 0.25), abs=1e-6
+    )
+    assert out_of_distribution.variance_m2 == pytest.approx(
+        in_distribution.variance_m2 + 0.25 * 0.5, abs=1e-6
+    )
 
 
 @pytest.mark.parametrize("name", ["range_m", "power_at_1m_dbm", "power_gap_db", "cir_level_db"])

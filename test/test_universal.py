@@ -59,7 +59,7 @@ def test_command_writes_both_bundles(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "excerpt"),
     [
         (["--samples", "2000"], "1016"),
         (["--scaling", "loud"], "preamble"),
@@ -68,8 +68,8 @@ def test_command_writes_both_bundles(tmp_path: Path) -> None:
         (["--workers", "0"], "workers"),
     ],
 )
-def test_invalid_training_is_refused(tmp_path: Path, words: list[str], told: str) -> None:
+def test_invalid_training_is_refused(tmp_path: Path, words: list[str], excerpt: str) -> None:
     done = CliRunner().invoke(app, ["train-universal", "-o", str(tmp_path / "a.onnx"), *words])
     assert isinstance(done.exception, ParameterError)
-    assert told in str(done.exception)
+    assert excerpt in str(done.exception)
     assert not list(tmp_path.iterdir())

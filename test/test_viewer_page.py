@@ -116,7 +116,7 @@ def test_page_shows_the_scene(browser: Browser, view: View, server: ViewerServer
     assert browser.column("map", "range") == pytest.approx([math.sqrt(5.1**2 - 1), math.sqrt(5.3**2 - 1)])
     summary = browser.run("return Bokeh.documents[0].get_model_by_name('summary').text")
     assert "mean absolute error 0.350 m raw, 0.250 m corrected" in summary
-    assert browser.complaints() == []
+    assert browser.console_messages() == []
 
 
 def test_pairs_tags_and_nodes_without_data_are_grey(
@@ -285,7 +285,7 @@ def test_implausible_values_do_not_break_the_page(browser: Browser, view: View, 
         view.scene.add_pose("tag", Pose(1e300, 3, 0))
         view.scene.add_true_position("tag", 4.0, -1e300)
     open_page(browser, server)
-    assert browser.complaints() == []
+    assert browser.console_messages() == []
     shown = [
         cell for cell in browser.run(IN_TABLE + "return cells.map((e) => e.textContent)") if "e+" in cell
     ]
@@ -389,14 +389,14 @@ def test_content_security_policy_blocks_other_scripts(
         assert policy.startswith("default-src 'none'")
         assert "frame-ancestors 'none'" in policy
     open_page(browser, server)
-    assert browser.complaints() == []
+    assert browser.console_messages() == []
     browser.run(
         "const script = document.createElement('script');"
         "script.textContent = 'window.pwned = 1'; document.body.append(script);"
         "const image = document.createElement('div'); document.body.append(image);"
         "image.innerHTML = '<img src=x: onerror=\"window.pwned = 2\">'"
     )
-    browser.wait("the refusal", lambda: "Content Security Policy" in "".join(browser.complaints()))
+    browser.wait("the refusal", lambda: "Content Security Policy" in "".join(browser.console_messages()))
     assert browser.run("return window.pwned ?? null") is None
 
 
@@ -413,7 +413,7 @@ def test_swipe_over_a_figure_scrolls_the_page_on_a_phone(
                 f"the page to scroll by {name}",
                 lambda before=before: abs(browser.run("return scrollY") - before) > 100,
             )
-        assert browser.complaints() == []
+        assert browser.console_messages() == []
 
 
 @pytest.mark.parametrize("width", [1280, 1024, 400])

@@ -308,7 +308,7 @@ def test_recording_plays_on_the_page(browser: Browser, bag: Path):
         browser.screenshot("view_1280")
         browser.wait("the button", lambda: browser.cell("Play")).click()
         browser.wait("it to play on", lambda: sorted(browser.column("pairs", "range"))[-1] > 4.25 + 100)
-        assert browser.complaints() == []
+        assert browser.console_messages() == []
         browser.resize(400, 2000)
         # Figures change their width asynchronously.
         browser.wait("it to fit", lambda: browser.run("return document.documentElement.scrollWidth") <= 400)

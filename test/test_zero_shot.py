@@ -50,8 +50,10 @@ def test_without_a_los_placement_there_is_no_offset(model, data):
 
 
 def test_refused_ranges_are_unchanged(tmp_path, data):
-    timid = bundle(tmp_path, linear_bias=LinearBiasModel(0.0), correction_limits_m=(-(2.0**-20), 2.0**-20))
-    found = zero_shot.run(data, timid)
+    narrow_limits = bundle(
+        tmp_path, linear_bias=LinearBiasModel(0.0), correction_limits_m=(-(2.0**-20), 2.0**-20)
+    )
+    found = zero_shot.run(data, narrow_limits)
     assert found.passed_through.all()
     assert (found.errors["universal"] == data.error_m).all()
-    assert (found.variance_m2 == np.float32(timid.card.variance_uncorrected_m2)).all()
+    assert (found.variance_m2 == np.float32(narrow_limits.card.variance_uncorrected_m2)).all()

@@ -73,9 +73,9 @@ def board(data: bytes) -> None:
     while script:
         kind = script.number(1)
         now += script.number(2)
-        said = _made_up(kind, script)
-        answer = firmware.receive(said, now)
-        assert len(answer) <= 4 * len(said) + 100
+        data = _made_up(kind, script)
+        answer = firmware.receive(data, now)
+        assert len(answer) <= 4 * len(data) + 100
         answers = FrameDecoder()
         answers.feed(answer)
         assert answers.counts.corrupt == 0
