@@ -49,7 +49,7 @@ LEARNERS = {
     (train, "quantize"),
     (train, "make_card"),
     (linear_fit, "fit_linear_bias"),
-    (linear_fit, "constant"),
+    (linear_fit, "fit_constant"),
     (baselines, "los_median"),
     (baselines, "overall_median"),
     (baselines, "ridge"),
@@ -182,7 +182,7 @@ def test_error_of_a_selection_is_from_folds_that_were_not_used_in_it(data, watch
     own = candidates.new_models(RECIPE)
     selection.select_nested(data, [own[0], own[2]], 3, 0)
     assert nested
-    watch.called("linear_fit.constant", "fitting.fit")
+    watch.called("linear_fit.fit_constant", "fitting.fit")
 
 
 def parts(data: Dataset) -> Parts:

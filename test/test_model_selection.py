@@ -101,7 +101,7 @@ def test_cold_start_fits_an_offset_and_the_mean_a_line_too(tmp_path):
     offered = candidates.with_cold_start(candidates.new_models(RECIPE), data, source)
     found = {item.name: item.fit(data, 0).correction_m(data) for item in offered if not item.trains}
     network = network_m(float_network(source), data.inputs)
-    shift = linear_fit.constant(data.configurations, data.error_m - network).offset_m
+    shift = linear_fit.fit_constant(data.configurations, data.error_m - network).offset_m
     assert np.std(network) > 0.01
     assert found[candidates.COLD_START] == pytest.approx(network + shift, abs=1e-5)
     mean = (found[candidates.LINE] + found[candidates.COLD_START]) / 2

@@ -112,11 +112,11 @@ def test_nlos_is_refused_with_the_evidence(universal: Mitigation, direct: list[R
         )
         for record in weaker_first_path(direct, float("nan"))
     ]
-    with pytest.raises(DatasetError, match="has the power of the first path"):
+    with pytest.raises(DatasetError, match="the first-path power is unknown"):
         estimate_offset(universal, without_cir, 3.0)
-    with pytest.raises(DatasetError, match="m off: is the distance in metres"):
+    with pytest.raises(DatasetError, match="check the distance"):
         estimate_offset(universal, longer(direct, 20.0), 3.0)
-    with pytest.raises(DatasetError, match="5 ranges look like line of sight"):
+    with pytest.raises(DatasetError, match="only 5 ranges are in line of sight"):
         estimate_offset(universal, [direct[0]] * 5, 3.0)
     with pytest.raises(DatasetError, match="none of 20 ranges has a true distance"):
         estimate_offset(universal, [replace(record, truth=None) for record in direct[:20]])
@@ -131,13 +131,13 @@ def test_single_distance_needs_a_single_pair(universal: Mitigation, direct: list
         estimate_offset(universal, two, 3.0)
     found = estimate_offset(universal, two, anchor_id=3)
     assert {one.anchor_id for one in found.placements} == {3}
-    with pytest.raises(DatasetError, match="no range of that anchor"):
+    with pytest.raises(DatasetError, match="no ranges of this anchor"):
         estimate_offset(universal, two, anchor_id=9)
 
 
 def test_los_of_the_real_logs_gives_the_offset_of_the_boards(apartment: Path, tmp_path: Path):
     outcome = command_line.run(
-        "offset", apartment, "--truth", "--together", "-o", "o.yaml", "--json", "o.json",
+        "offset", apartment, "--truth", "--common", "-o", "o.yaml", "--json", "o.json",
         "--model", default_model_path(), folder=tmp_path,
     )  # fmt: skip
     assert outcome.returncode == 0, outcome.stderr

@@ -25,8 +25,8 @@ MAX_RANGE_M = 1e6
 
 _STATUSES = {int(status): status for status in Status}
 # NumPy takes microseconds to convert a member of an enumeration.
-_INFINITE = np.float32(np.inf)
-_ALL = slice(None)
+_INFINITE_VARIANCE = np.float32(np.inf)
+_ALL_ROWS = slice(None)
 _OK, _NO_CIR, _BAD_CIR, _OUT_OF_DISTRIBUTION, _MODEL_ERROR = _STATUSES
 
 
@@ -45,8 +45,8 @@ class CorrectionRule:
 
     def accepts(self, predicted: NDArray[np.float32], score: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Return which predicted errors are within the limits and have an OOD score below 1, bool (n,)."""
-        inside: NDArray[np.bool_] = (predicted >= self._low) & (predicted <= self._high) & (score < 1.0)
-        return inside
+        accepted: NDArray[np.bool_] = (predicted >= self._low) & (predicted <= self._high) & (score < 1.0)
+        return accepted
 
     def score(
         self,
@@ -94,26 +94,26 @@ class Backend(ABC):
 
         Measurements whose CIRs have the same encoding and length are corrected in one batch.
         """
-        answers: list[CorrectedRange | None] = [None] * len(measurements)
+        results: list[CorrectedRange | None] = [None] * len(measurements)
         for indices, ranges in RangeColumns.grouped(measurements):
-            found = self.correct_columns(ranges)
-            columns = (found.range_m, found.correction_m, found.variance_m2, found.status)
+            corrected = self.correct_columns(ranges)
+            columns = (corrected.range_m, corrected.correction_m, corrected.variance_m2, corrected.status)
             for index, range_m, correction_m, variance_m2, status in zip(
                 indices, *(column.tolist() for column in columns), strict=True
             ):
-                answers[index] = CorrectedRange(
+                results[index] = CorrectedRange(
                     range_m,
                     measurements[index].range_m,
                     correction_m,
                     variance_m2,
                     _STATUSES[status],
-                    found.origin,
-                    found.model_id,
+                    corrected.origin,
+                    corrected.model_id,
                 )
-        return [answer for answer in answers if answer is not None]
+        return [result for result in results if result is not None]
 
 
-def passed_through(
+def pass_through(
     bundle: Bundle, ranges: RangeColumns, offset_m: NDArray[np.float32], status: NDArray[np.uint8]
 ) -> CorrectedColumns:
     """Return the raw ranges minus the offsets of their radios, with the variance of uncorrected ranges.
@@ -122,12 +122,19 @@ def passed_through(
     variance of corrected ranges: that of uncorrected ranges contains the offsets of the training boards.
 
     Args:
-        offset_m: float32 (n,).
-        status: uint8 (n,), of `Status`.
+        bundle: the model.
+        ranges: n measured ranges.
+        offset_m: offset of the radios of each range, m, float32 (n,).
+        status: `Status` of each range, uint8 (n,).
+
+    Returns:
+        n ranges; `status` is not copied.
     """
     card = bundle.card
     range_m = _subtract_offset(ranges.range_m, offset_m)
-    variance = np.where(_is_valid_range(range_m), np.float32(card.variance_uncorrected_m2), _INFINITE)
+    variance = np.where(
+        _is_valid_range(range_m), np.float32(card.variance_uncorrected_m2), _INFINITE_VARIANCE
+    )
     if not ranges.samples.shape[1]:
         variance[_is_valid_range(range_m) & (status == _NO_CIR) & (offset_m != 0.0)] = card.variance_m2
     return CorrectedColumns(range_m, offset_m, variance, status, Origin.HOST, bundle.model_id)
@@ -149,6 +156,7 @@ class Mitigation(Backend):
     from the predicted error to the overall offset of the training data, and the larger its variance is, with status OK.
 
     Args:
+        bundle: the model.
         offsets: offsets of the radios, in addition to the bundle's prediction.
 
     Raises:
@@ -170,17 +178,17 @@ class Mitigation(Backend):
         powers = (ranges.rx_power_dbm, ranges.first_path_power_dbm)
         predicted = linear_bias.predict_m(*powers)
         faults, windows = self.bundle.preprocessing.apply(ranges)
-        usable, known = faults == 0, np.isfinite(predicted)
-        readable = usable & known & valid
-        rows = _rows(readable)
+        has_window, has_bias = faults == 0, np.isfinite(predicted)
+        is_predictable = has_window & has_bias & valid
+        rows = _row_index(is_predictable)
         status, score = np.zeros(n, np.uint8), np.zeros(n, np.float32)
-        if rows is not _ALL:
+        if rows is not _ALL_ROWS:
             # CirFault.NO_POWER, which the preprocessing does not check
-            status[~known] = _BAD_CIR
+            status[~has_bias] = _BAD_CIR
             status[~valid] = _OUT_OF_DISTRIBUTION
-            status[~usable] = _BAD_CIR if ranges.samples.shape[1] else _NO_CIR
-            windows = windows[readable[usable]]
-            predicted[~readable] = np.nan
+            status[~has_window] = _BAD_CIR if ranges.samples.shape[1] else _NO_CIR
+            windows = windows[is_predictable[has_window]]
+            predicted[~is_predictable] = np.nan
         if len(windows):
             try:
                 predicted[rows] += self._session.predict_m(windows)
@@ -190,41 +198,41 @@ class Mitigation(Backend):
         if not self.bundle.card.needs_cir and len(windows) < n:
             # The first-path power may be unknown if the linear bias model has no weight for it.
             first_path = powers[1] if linear_bias.per_power_gap != 0.0 else powers[0]
-            alone = linear_bias.predict_m(powers[0], first_path)
-            is_biased_only = valid & ~readable & np.isfinite(alone)
-            predicted[is_biased_only], status[is_biased_only] = alone[is_biased_only], _OK
+            bias_only = linear_bias.predict_m(powers[0], first_path)
+            uses_bias_only = valid & ~is_predictable & np.isfinite(bias_only)
+            predicted[uses_bias_only], status[uses_bias_only] = bias_only[uses_bias_only], _OK
 
-        accepts = self._rule.accepts(predicted, score)
-        rows = _rows(accepts)
-        graded, variance = self._rule.apply(predicted[rows], score[rows])
-        correction = offset[rows] + graded
+        accepted = self._rule.accepts(predicted, score)
+        rows = _row_index(accepted)
+        excess, variance = self._rule.apply(predicted[rows], score[rows])
+        correction = offset[rows] + excess
         corrected_m = ranges.range_m[rows].astype(np.float32, copy=False) - correction
-        if rows is _ALL:
+        if rows is _ALL_ROWS:
             model_id = self.bundle.model_id
             return CorrectedColumns(corrected_m, correction, variance, status, Origin.HOST, model_id)
-        refused = (status == _OK) & ~accepts
-        status[refused] = np.where(np.isfinite(predicted[refused]), _OUT_OF_DISTRIBUTION, _MODEL_ERROR)
-        found = passed_through(self.bundle, ranges, offset, status)
-        found.range_m[rows], found.correction_m[rows], found.variance_m2[rows] = (
+        rejected = (status == _OK) & ~accepted
+        status[rejected] = np.where(np.isfinite(predicted[rejected]), _OUT_OF_DISTRIBUTION, _MODEL_ERROR)
+        corrected = pass_through(self.bundle, ranges, offset, status)
+        corrected.range_m[rows], corrected.correction_m[rows], corrected.variance_m2[rows] = (
             corrected_m,
             correction,
             variance,
         )
-        return found
+        return corrected
 
 
-def _rows(chosen: NDArray[np.bool_]) -> slice | NDArray[np.bool_]:
+def _row_index(mask: NDArray[np.bool_]) -> slice | NDArray[np.bool_]:
     """Return an index of the selected rows: a slice, which is faster, if all are selected."""
-    return _ALL if np.count_nonzero(chosen) == len(chosen) else chosen
+    return _ALL_ROWS if np.count_nonzero(mask) == len(mask) else mask
 
 
 def _subtract_offset(range_m: NDArray[np.floating], offset_m: NDArray[np.float32]) -> NDArray[np.floating]:
     """Return ranges minus offsets in float32, as on boards; without an offset the unchanged range."""
-    found: NDArray[np.floating] = range_m.copy()
+    corrected: NDArray[np.floating] = range_m.copy()
     if np.count_nonzero(offset_m):
         with np.errstate(over="ignore"):  # A range beyond float32 is invalid, as an infinite one is.
-            found = np.where(offset_m == 0.0, range_m, range_m.astype(np.float32, copy=False) - offset_m)
-    return found
+            corrected = np.where(offset_m == 0.0, range_m, range_m.astype(np.float32, copy=False) - offset_m)
+    return corrected
 
 
 def _is_valid_range(range_m: NDArray[np.floating]) -> NDArray[np.bool_]:

@@ -31,9 +31,9 @@ for count in (6, 9, 12, 15, 18, 21):
     for _ in range(draws):
         seen = np.isin(data.configurations, generator.permutation(data.names)[:count])
         train, test, names = data.rows(seen), data.rows(~seen), data.configurations[seen]
-        constant = linear_fit.constant(names, train.error_m).offset_m
+        constant = linear_fit.fit_constant(names, train.error_m).offset_m
         own_line = linear_bias_m(candidates.fit_line(train), test)
-        network = network_m[~seen] + linear_fit.constant(names, train.error_m - network_m[seen]).offset_m
+        network = network_m[~seen] + linear_fit.fit_constant(names, train.error_m - network_m[seen]).offset_m
         predicted = (constant, own_line, network, (own_line + network) / 2)
         maes.append([np.abs(test.error_m - values).mean() for values in predicted])
     table = np.array(maes)

@@ -35,9 +35,9 @@ def offset(
             "-o", "--output", metavar="FILE", help="Write what --offsets and the nodes' `offsets` read."
         ),
     ] = None,
-    together: Annotated[
+    common: Annotated[
         bool,
-        typer.Option("--together", help="Write one common offset: for the same boards at several positions."),
+        typer.Option("--common", help="Write one common offset: for the same boards at several positions."),
     ] = False,
     json: JsonOption = None,
 ) -> None:
@@ -79,7 +79,7 @@ def offset(
             f"Antenna delays, m, for model {found.model_id:08x}, estimated by uwb-mitigation offset in {bag.name}.\n"
             f"Standard deviation {found.sd_m:.3f} m."
         )
-        write_atomically(output, dump_offsets(found.offsets(together=together), comment), ParameterError)
+        write_atomically(output, dump_offsets(found.offsets(common=common), comment), ParameterError)
     console.write_json(json, found.as_json())
 
 

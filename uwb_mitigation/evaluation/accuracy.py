@@ -48,7 +48,7 @@ class Accuracy:
         """Return the result of `uwb-mitigation evaluate`."""
         groups = {"by_label": self.by_label, "by_configuration": self.by_configuration}
         return asdict(self) | {
-            key: {name: group._asdict() for name, group in of.items()} for key, of in groups.items()
+            key: {name: group._asdict() for name, group in by_name.items()} for key, by_name in groups.items()
         }
 
 
@@ -85,20 +85,24 @@ def evaluate(
             on_record()
     if not raw:
         raise DatasetError(f"none of {read} measurements has a valid range and a true one")
-    before, after, spread = np.array(raw), np.array(corrected), np.array(variance)
+    raw_m, corrected_m, variances = np.array(raw), np.array(corrected), np.array(variance)
     card = mitigation.bundle.card
     # This part of the card is for people and may contain any JSON value.
-    learnt = card.training.get("configurations")
-    known = {name for name in set(configurations) if isinstance(learnt, list) and name in learnt}
+    training_configurations = card.training.get("configurations")
+    trained_on = {
+        name
+        for name in set(configurations)
+        if isinstance(training_configurations, list) and name in training_configurations
+    }
     return Accuracy(
         n=len(raw),
-        raw=ErrorStatistics.of(before),
-        corrected=ErrorStatistics.of(after),
-        coverage68=coverage(after, spread, 1.0),
-        coverage95=coverage(after, spread, card.interval95_sigmas),
-        by_label=mae_by_group(np.array(labels), before, after),
-        by_configuration=mae_by_group(np.array(configurations), before, after),
+        raw=ErrorStatistics.of(raw_m),
+        corrected=ErrorStatistics.of(corrected_m),
+        coverage68=coverage(corrected_m, variances, 1.0),
+        coverage95=coverage(corrected_m, variances, card.interval95_sigmas),
+        by_label=mae_by_group(np.array(labels), raw_m, corrected_m),
+        by_configuration=mae_by_group(np.array(configurations), raw_m, corrected_m),
         statuses=dict(statuses.most_common()),
         model_id=mitigation.bundle.model_id,
-        trained_on=tuple(sorted(known)),
+        trained_on=tuple(sorted(trained_on)),
     )

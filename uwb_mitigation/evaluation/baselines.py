@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from uwb_mitigation.errors import MissingDependencyError
 from uwb_mitigation.evaluation.dataset import Dataset
 
-LINE_OF_SIGHT = "LOS"
+LOS = "LOS"
 RIDGE_PENALTY = 10.0
 TREES, LEAVES = 100, 8
 
@@ -28,8 +28,8 @@ Predict = Callable[[Dataset], NDArray[np.floating]]
 
 def los_median(train: Dataset) -> Predict:
     """Predict the median error in LOS, or of all measurements if none has the label LOS."""
-    seen = train.error_m[train.labels == LINE_OF_SIGHT]
-    return _constant(float(np.median(seen if len(seen) else train.error_m)))
+    los_errors = train.error_m[train.labels == LOS]
+    return _constant(float(np.median(los_errors if len(los_errors) else train.error_m)))
 
 
 def overall_median(train: Dataset) -> Predict:
@@ -39,21 +39,25 @@ def overall_median(train: Dataset) -> Predict:
 
 def ridge(train: Dataset, *, header: bool) -> Predict:
     """Fit a ridge regression on standardised features of the CIR and, with `header`, of the header."""
-    pipeline, linear, preprocessing = scikit("pipeline"), scikit("linear_model"), scikit("preprocessing")
+    pipeline, linear, preprocessing = (
+        scikit_learn("pipeline"),
+        scikit_learn("linear_model"),
+        scikit_learn("preprocessing"),
+    )
     model = pipeline.make_pipeline(preprocessing.StandardScaler(), linear.Ridge(RIDGE_PENALTY))
     model.fit(features(train, header=header), train.error_m, ridge__sample_weight=_weights(train))
-    return lambda part: np.asarray(model.predict(features(part, header=header)), np.float64)
+    return lambda data: np.asarray(model.predict(features(data, header=header)), np.float64)
 
 
 def gradient_boosting(train: Dataset, seed: int) -> Predict:
     """Fit gradient-boosted trees with absolute error on all features."""
-    model = scikit("ensemble").HistGradientBoostingRegressor(
+    model = scikit_learn("ensemble").HistGradientBoostingRegressor(
         loss="absolute_error", max_iter=TREES, max_leaf_nodes=LEAVES, random_state=seed
     )
     # On data this small, threads only add overhead.
     with importlib.import_module("threadpoolctl").threadpool_limits(1):
         model.fit(features(train, header=True), train.error_m, sample_weight=_weights(train))
-    return lambda part: np.asarray(model.predict(features(part, header=True)), np.float64)
+    return lambda data: np.asarray(model.predict(features(data, header=True)), np.float64)
 
 
 def features(dataset: Dataset, *, header: bool) -> NDArray[np.float64]:
@@ -87,12 +91,12 @@ def features(dataset: Dataset, *, header: bool) -> NDArray[np.float64]:
         columns += [rx_power, rx_power - dataset.first_path_power_dbm]
         headers = np.zeros((len(dataset), 2)) if dataset.headers is None else dataset.headers
         columns += [*headers.T.astype(np.float64), *np.log1p(headers.T.astype(np.float64))]
-    table: NDArray[np.float64] = np.nan_to_num(np.column_stack(columns), nan=0.0, posinf=0.0, neginf=0.0)
-    return table
+    result: NDArray[np.float64] = np.nan_to_num(np.column_stack(columns), nan=0.0, posinf=0.0, neginf=0.0)
+    return result
 
 
 def _constant(value: float) -> Predict:
-    return lambda part: np.full(len(part), value)
+    return lambda data: np.full(len(data), value)
 
 
 def _weights(train: Dataset) -> NDArray[np.float64]:
@@ -101,7 +105,7 @@ def _weights(train: Dataset) -> NDArray[np.float64]:
     return np.asarray(len(train) / (len(count) * count[of]), np.float64)
 
 
-def scikit(module: str):  # type: ignore[no-untyped-def]
+def scikit_learn(module: str):  # type: ignore[no-untyped-def]
     """Return a module of scikit-learn; raises `MissingDependencyError`."""
     try:
         return importlib.import_module(f"sklearn.{module}")

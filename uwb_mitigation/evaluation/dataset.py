@@ -58,13 +58,13 @@ class Dataset:
     def __len__(self) -> int:
         return len(self.error_m)
 
-    def rows(self, chosen: NDArray[np.intp] | NDArray[np.bool_]) -> Dataset:
+    def rows(self, selected: NDArray[np.intp] | NDArray[np.bool_]) -> Dataset:
         """Return a dataset with these rows."""
         columns = {name: getattr(self, name) for name in _COLUMNS}
-        part: dict[str, Any] = {
-            name: None if values is None else values[chosen] for name, values in columns.items()
+        selected_columns: dict[str, Any] = {
+            name: None if values is None else values[selected] for name, values in columns.items()
         }
-        return replace(self, skipped={}, **part)
+        return replace(self, skipped={}, **selected_columns)
 
     def shifted(self, by_m: NDArray[np.float64]) -> Dataset:
         """Return a copy with `by_m`, shape (n,), added to ranges and errors."""
@@ -74,7 +74,8 @@ class Dataset:
     def joined(cls, parts: Sequence[Dataset]) -> Dataset:
         """Concatenate parts with the same preprocessing, without headers and ids."""
         columns: dict[str, Any] = {
-            name: np.concatenate([getattr(part, name) for part in parts]) for name in _COLUMNS[:7]
+            name: np.concatenate([getattr(selected_columns, name) for selected_columns in parts])
+            for name in _COLUMNS[:7]
         }
         return cls(parts[0].preprocessing, **columns)
 
@@ -95,7 +96,7 @@ def build_dataset(
         DatasetError: no measurement is usable.
     """
     skipped: Counter[str] = Counter()
-    inputs, numbers, headers, identities, configurations, labels = [], [], [], [], [], []
+    inputs, values, headers, ids, configurations, labels = [], [], [], [], [], []
     for record, fault, window in _preprocessed(records, preprocessing, on_record):
         measurement, truth = record.measurement, record.truth
         if truth is None or not math.isfinite(truth.range_m):
@@ -108,7 +109,7 @@ def build_dataset(
             skipped[CirFault(fault).text] += 1
             continue
         inputs.append(window)
-        numbers.append(
+        values.append(
             (
                 measurement.cir.rx_power_dbm,
                 measurement.cir.first_path_power_dbm,
@@ -117,13 +118,13 @@ def build_dataset(
             )
         )
         headers.append((measurement.cir.preamble_count, measurement.cir.noise_threshold))
-        identities.append((measurement.tag_id, measurement.anchor_id))
+        ids.append((measurement.tag_id, measurement.anchor_id))
         configurations.append(truth.configuration)
         labels.append(truth.label)
     if not inputs:
-        reasons = ", ".join(f"{count} x {why}" for why, count in skipped.items()) or "no measurements"
+        reasons = ", ".join(f"{count} x {reason}" for reason, count in skipped.items()) or "no measurements"
         raise DatasetError(f"no labelled measurement that can be used: {reasons}")
-    rx_power, first_path_power, range_m, error_m = np.array(numbers, np.float64).T
+    rx_power, first_path_power, range_m, error_m = np.array(values, np.float64).T
     return Dataset(
         preprocessing,
         np.stack(inputs),
@@ -135,7 +136,7 @@ def build_dataset(
         np.array(labels),
         dict(skipped),
         np.array(headers, np.float32),
-        *np.array(identities, np.uint64).T,
+        *np.array(ids, np.uint64).T,
     )
 
 

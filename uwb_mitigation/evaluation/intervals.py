@@ -36,7 +36,7 @@ class Intervals:
 
 
 def calibrate(
-    left_m: NDArray[np.floating], predicted_m: NDArray[np.floating], configurations: NDArray[np.str_]
+    residual_m: NDArray[np.floating], predicted_m: NDArray[np.floating], configurations: NDArray[np.str_]
 ) -> Intervals:
     """Compute intervals from residuals and predicted errors on held-out configurations, each of shape (n,).
 
@@ -45,26 +45,26 @@ def calibrate(
     Raises:
         DatasetError: no row is finite.
     """
-    known = np.isfinite(left_m) & np.isfinite(predicted_m)
-    if not known.any():
+    finite = np.isfinite(residual_m) & np.isfinite(predicted_m)
+    if not finite.any():
         raise DatasetError("no errors to calibrate intervals with")
-    left, predicted, names = np.abs(left_m[known]), predicted_m[known], configurations[known]
-    floor = max(float(np.median(left)), MIN_SCALE_M) ** 2
+    residual, predicted, names = np.abs(residual_m[finite]), predicted_m[finite], configurations[finite]
+    floor = max(float(np.median(residual)), MIN_SCALE_M) ** 2
     scale = np.sqrt(floor + GROWTH * np.square(predicted))
-    narrow, wide = (_quantile(left / scale, names, level) for level in (0.68, 0.95))
-    narrow = max(narrow, MIN_SCALE_M)
+    quantile68, quantile95 = (_quantile(residual / scale, names, level) for level in (0.68, 0.95))
+    quantile68 = max(quantile68, MIN_SCALE_M)
     return Intervals(
-        float(np.float32(floor * narrow**2)),
-        float(np.float32(GROWTH * narrow**2)),
-        min(max(wide / narrow, 1.0), 1e3),
+        float(np.float32(floor * quantile68**2)),
+        float(np.float32(GROWTH * quantile68**2)),
+        min(max(quantile95 / quantile68, 1.0), 1e3),
     )
 
 
 def _quantile(ratio: NDArray[np.floating], configurations: NDArray[np.str_], level: float) -> float:
     """Return the conformal quantile for a new configuration: equal weights, with one additional weight for it."""
-    _, of, count = np.unique(configurations, return_inverse=True, return_counts=True)
+    _, configuration_index, count = np.unique(configurations, return_inverse=True, return_counts=True)
     order = np.argsort(ratio, kind="stable")
-    reached = np.cumsum(1 / count[of][order])
-    wanted = min(level * (len(count) + 1), math.nextafter(len(count), 0))
-    at = int(np.searchsorted(reached, wanted - 1e-9))
-    return float(ratio[order][min(at, len(ratio) - 1)])
+    cumulative_weight = np.cumsum(1 / count[configuration_index][order])
+    target_weight = min(level * (len(count) + 1), math.nextafter(len(count), 0))
+    index = int(np.searchsorted(cumulative_weight, target_weight - 1e-9))
+    return float(ratio[order][min(index, len(ratio) - 1)])

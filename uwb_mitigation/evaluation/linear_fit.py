@@ -31,7 +31,10 @@ def fit_linear_bias(
     linear_bias is the median over configurations.
 
     Args:
-        first_path_power_dbm: None: fit a line in the received power only.
+        configurations: name of the configuration of each measurement.
+        rx_power_dbm: received power, dBm.
+        first_path_power_dbm: first-path power, dBm; None: fit a line in the received power only.
+        error_m: measured - true range, m.
 
     Raises:
         DatasetError: there are no measurements.
@@ -41,17 +44,19 @@ def fit_linear_bias(
     powers = [rx_power_dbm]
     if first_path_power_dbm is not None:
         powers.append(rx_power_dbm - first_path_power_dbm)
-    known = np.isfinite(np.sum(powers, axis=0))
-    names = configurations[known]
-    columns = [means(names, values[known]) for values in powers] if known.any() else []
+    has_powers = np.isfinite(np.sum(powers, axis=0))
+    names = configurations[has_powers]
+    columns = (
+        [configuration_means(names, values[has_powers]) for values in powers] if has_powers.any() else []
+    )
     if not columns or len(columns[0]) < MIN_CONFIGURATIONS:
-        return constant(configurations, error_m)
+        return fit_constant(configurations, error_m)
     design = np.column_stack([np.ones(len(columns[0])), *columns])
-    is_flat = len(powers) == 1 and float(np.ptp(columns[0])) < MIN_POWER_RANGE_DB
-    if is_flat or np.linalg.matrix_rank(design, tol=1e-3) < design.shape[1]:
-        return constant(configurations, error_m)
-    found = least_absolute_deviations(design, means(names, error_m[known]))
-    return LinearBiasModel(*(float(np.float32(value)) for value in found))
+    has_constant_power = len(powers) == 1 and float(np.ptp(columns[0])) < MIN_POWER_RANGE_DB
+    if has_constant_power or np.linalg.matrix_rank(design, tol=1e-3) < design.shape[1]:
+        return fit_constant(configurations, error_m)
+    coefficients = least_absolute_deviations(design, configuration_means(names, error_m[has_powers]))
+    return LinearBiasModel(*(float(np.float32(value)) for value in coefficients))
 
 
 def least_absolute_deviations(
@@ -65,8 +70,8 @@ def least_absolute_deviations(
     """
     points, unknowns = design.shape
     # Scale the columns: powers are much larger than the ones of the intercept.
-    size = np.abs(design).max(axis=0)
-    scaled = design / np.where(size > 0, size, 1)
+    column_scale = np.abs(design).max(axis=0)
+    scaled = design / np.where(column_scale > 0, column_scale, 1)
     weight = np.ones(points)
     floor = max(float(np.abs(target).max()), 1e-9)
     coefficients = np.zeros(unknowns)
@@ -80,16 +85,20 @@ def least_absolute_deviations(
     vertex = np.linalg.lstsq(scaled[nearest], target[nearest], rcond=None)[0]
     if np.abs(target - scaled @ vertex).sum() < np.abs(target - scaled @ coefficients).sum():
         coefficients = vertex
-    return coefficients / np.where(size > 0, size, 1)
+    return coefficients / np.where(column_scale > 0, column_scale, 1)
 
 
-def constant(configurations: NDArray[np.str_], error_m: NDArray[np.floating]) -> LinearBiasModel:
+def fit_constant(configurations: NDArray[np.str_], error_m: NDArray[np.floating]) -> LinearBiasModel:
     """Return the median over configurations of their mean errors; arguments of shape (n,), n > 0."""
-    return LinearBiasModel(float(np.float32(np.median(means(configurations, error_m)))))
+    return LinearBiasModel(float(np.float32(np.median(configuration_means(configurations, error_m)))))
 
 
-def means(configurations: NDArray[np.str_], values: NDArray[np.floating]) -> NDArray[np.float64]:
+def configuration_means(
+    configurations: NDArray[np.str_], values: NDArray[np.floating]
+) -> NDArray[np.float64]:
     """Return the mean of each configuration, in the order of their names."""
-    _, of = np.unique(configurations, return_inverse=True)
-    means: NDArray[np.float64] = np.bincount(of, values.astype(np.float64)) / np.bincount(of)
+    _, configuration_index = np.unique(configurations, return_inverse=True)
+    means: NDArray[np.float64] = np.bincount(configuration_index, values.astype(np.float64)) / np.bincount(
+        configuration_index
+    )
     return means

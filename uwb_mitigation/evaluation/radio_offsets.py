@@ -28,12 +28,12 @@ PLACEMENT_SD_M = 0.15
 logs (1.48 x median absolute deviation after `universal`), a rough estimate from seven placements."""
 
 MAX_EXCESS_M, MAX_ERROR_M = 0.25, 0.5
-"""If the predicted error is larger, the path is NLOS. The second limit is for models whose linear bias model contains the offset."""
+"""If the predicted error is larger, the path is NLOS. The second limit is for models with a linear bias that contains the offset."""
 
 MIN_RANGES = 10
 _BATCH = 256
 _MAD_TO_SD = 1.4826
-_OF_MEDIAN = math.sqrt(math.pi / 2.0)
+_MEDIAN_SD_FACTOR = math.sqrt(math.pi / 2.0)
 
 _Sample = tuple[float, float, float, str]
 """Offset, m; predicted error, m, or NaN; power gap, dB, or NaN; status."""
@@ -81,17 +81,17 @@ class OffsetEstimate:
     placements: tuple[PlacementOffset, ...]
     model_id: int
 
-    def offsets(self, *, together: bool = False) -> Offsets:
-        """Return the median for unknown pairs and, unless `together`, the offset of each pair."""
+    def offsets(self, *, common: bool = False) -> Offsets:
+        """Return the median for unknown pairs and, unless `common`, the offset of each pair."""
         pairs: dict[tuple[int, int], list[float]] = {}
         for placement in self.placements:
-            if not placement.refused and not together:
+            if not placement.refused and not common:
                 pairs.setdefault((placement.tag_id, placement.anchor_id), []).append(placement.offset_m)
         return Offsets(self.offset_m, pairs={pair: float(np.median(found)) for pair, found in pairs.items()})
 
     def as_json(self) -> dict[str, object]:
         """Return the result of `uwb-mitigation offset`; null: unknown."""
-        rows = [asdict(one) | {"refused": one.refused or None} for one in self.placements]
+        rows = [asdict(placement) | {"refused": placement.refused or None} for placement in self.placements]
         for row in rows:
             row |= {key: None for key, value in row.items() if isinstance(value, float) and math.isnan(value)}
         found = {"offset_m": self.offset_m, "sd_m": self.sd_m, "ranges": self.ranges}
@@ -111,8 +111,10 @@ def estimate_offset(
 
     Args:
         mitigation: predicts the range error; its own offsets have no effect.
+        records: ranges.
         distance_m: distance of the antennas; None: use the true range of each record.
-        tag_id, anchor_id: use only this tag or anchor; None: all.
+        tag_id: use only this tag; None: all.
+        anchor_id: use only this anchor; None: all.
         on_record: called for each record that was read.
 
     Raises:
@@ -126,14 +128,14 @@ def estimate_offset(
     while batch := list(islice(stream, _BATCH)):
         for _ in batch:
             on_record()
-        wanted = [
+        selected = [
             record
             for record in batch
             if tag_id in (None, record.measurement.tag_id)
             and anchor_id in (None, record.measurement.anchor_id)
         ]
-        results = mitigation.correct([record.measurement for record in wanted])
-        for record, result in zip(wanted, results, strict=True):
+        results = mitigation.correct([record.measurement for record in selected])
+        for record, result in zip(selected, results, strict=True):
             measured, truth = record.measurement, record.truth
             true_m = distance_m if distance_m is not None else math.nan if truth is None else truth.range_m
             if not math.isfinite(true_m):
@@ -142,20 +144,20 @@ def estimate_offset(
             placement = truth.configuration if truth is not None and distance_m is None else ""
             predicted = math.nan
             if result.status is Status.OK:
-                known = mitigation.offsets.of([measured.tag_id], [measured.anchor_id])
-                predicted = result.correction_m - float(known[0])
+                known_offset = mitigation.offsets.of([measured.tag_id], [measured.anchor_id])
+                predicted = result.correction_m - float(known_offset[0])
             offset, gap = measured.range_m - predicted - true_m, _power_gap_db(measured, preprocessing)
             sample = offset, predicted, gap, result.status.name
             groups.setdefault((measured.tag_id, measured.anchor_id, placement), []).append(sample)
     if not groups:
         if without_truth:
-            raise DatasetError(f"none of {without_truth} ranges has a true distance", valid="give --distance")
-        raise DatasetError("no range of that anchor and tag")
+            raise DatasetError(f"none of {without_truth} ranges has a true distance", valid="set --distance")
+        raise DatasetError("no ranges of this anchor and tag")
     pairs = sorted({(tag, anchor) for tag, anchor, _ in groups})
     if distance_m is not None and len(pairs) > 1:
-        some = ", ".join(f"anchor {format_id(anchor)} tag {format_id(tag)}" for tag, anchor in pairs[:5])
+        listed = ", ".join(f"anchor {format_id(anchor)} tag {format_id(tag)}" for tag, anchor in pairs[:5])
         raise ParameterError(
-            f"one distance for {len(pairs)} pairs ({some}{', ...' if len(pairs) > 5 else ''})",
+            f"one distance for {len(pairs)} pairs ({listed}{', ...' if len(pairs) > 5 else ''})",
             valid="choose one with --anchor and --tag",
         )
     limit_m = MAX_EXCESS_M if mitigation.bundle.linear_bias == LinearBiasModel(0.0) else MAX_ERROR_M
@@ -180,53 +182,55 @@ def _placement_offset(
     tag_id: int, anchor_id: int, placement: str, samples: list[_Sample], limit_m: float
 ) -> PlacementOffset:
     offset, predicted, gap = np.array([sample[:3] for sample in samples], np.float64).T
-    known, judged = np.isfinite(gap), np.isfinite(predicted)
-    direct = known & (gap < LINE_OF_SIGHT_DB)
-    used, n = offset[direct & judged], len(offset)
-    median_gap = float(np.median(gap[known])) if known.any() else math.nan
-    median_predicted = float(np.median(predicted[judged])) if judged.any() else math.nan
+    has_gap, is_predicted = np.isfinite(gap), np.isfinite(predicted)
+    is_los = has_gap & (gap < LINE_OF_SIGHT_DB)
+    used, n = offset[is_los & is_predicted], len(offset)
+    median_gap = float(np.median(gap[has_gap])) if has_gap.any() else math.nan
+    median_predicted = float(np.median(predicted[is_predicted])) if is_predicted.any() else math.nan
     found, noise, refused = math.nan, math.nan, ""
-    if 2 * known.sum() < n:
-        refused = "neither the radio nor the CIR has the power of the first path: nothing shows line of sight"
-    elif 2 * direct.sum() < known.sum():
+    if 2 * has_gap.sum() < n:
+        refused = "the first-path power is unknown, so that line of sight cannot be checked"
+    elif 2 * is_los.sum() < has_gap.sum():
         refused = (
             f"not line of sight: the first path is {median_gap:.1f} dB below the receive level "
             f"(line of sight: less than {LINE_OF_SIGHT_DB:g} dB)"
         )
-    elif not len(used) or 2 * judged.sum() < n:
+    elif not len(used) or 2 * is_predicted.sum() < n:
         others = Counter(status for *_, status in samples if status != Status.OK.name).most_common()
         statuses = ", ".join(f"{count} {name}" for name, count in others)
-        refused = f"the model can judge {judged.sum()} of {n} ranges ({statuses})"
+        refused = f"the model corrects only {is_predicted.sum()} of {n} ranges ({statuses})"
     elif median_predicted > limit_m:
-        refused = f"not line of sight: the model predicts {median_predicted:.2f} m too long"
+        refused = f"not line of sight: the model predicts an error of {median_predicted:.2f} m"
     elif abs(float(np.median(used))) > MAX_OFFSET_M:
-        refused = f"{np.median(used):.1f} m off: is the distance in metres, the antenna delay set?"
+        refused = (
+            f"an offset of {np.median(used):.1f} m: check the distance (in metres) and the antenna delay"
+        )
     else:
-        found, noise = float(np.median(used)), _OF_MEDIAN * _spread(used) / math.sqrt(len(used))
+        found, noise = float(np.median(used)), _MEDIAN_SD_FACTOR * _spread(used) / math.sqrt(len(used))
     sd, count = math.hypot(noise, PLACEMENT_SD_M), 0 if refused else len(used)
     levels = median_gap, median_predicted
     return PlacementOffset(tag_id, anchor_id, placement, count, found, sd, noise, *levels, refused)
 
 
 def _combined(placements: tuple[PlacementOffset, ...], model_id: int) -> OffsetEstimate:
-    good = [one for one in placements if not one.refused]
-    if not good:
+    accepted = [placement for placement in placements if not placement.refused]
+    if not accepted:
         first = placements[0]
-        more = f", and so on for {len(placements)} placements" if len(placements) > 1 else ""
+        others_text = f" (and {len(placements) - 1} other placements)" if len(placements) > 1 else ""
         raise DatasetError(
-            f"anchor {format_id(first.anchor_id)}, tag {format_id(first.tag_id)}: {first.refused}{more}",
-            valid="range with no obstacle between or next to the antennas",
+            f"anchor {format_id(first.anchor_id)}, tag {format_id(first.tag_id)}: {first.refused}{others_text}",
+            valid="no obstacles between or next to the antennas",
         )
-    if (ranges := sum(one.ranges for one in good)) < MIN_RANGES:
+    if (ranges := sum(placement.ranges for placement in accepted)) < MIN_RANGES:
         raise DatasetError(
-            f"{ranges} ranges look like line of sight",
-            valid=f"{MIN_RANGES} at least, and some hundred are better",
+            f"only {ranges} ranges are in line of sight",
+            valid=f"at least {MIN_RANGES}, better some hundred",
         )
-    offset, noise = np.array([(one.offset_m, one.noise_sd_m) for one in good]).T
+    offset, noise = np.array([(placement.offset_m, placement.noise_sd_m) for placement in accepted]).T
     spread = max(_spread(offset), PLACEMENT_SD_M)
     # The median of two or fewer is their mean.
-    factor = _OF_MEDIAN if len(good) > 2 else 1.0
-    sd = factor * math.hypot(spread, float(np.sqrt(np.mean(noise * noise)))) / math.sqrt(len(good))
+    factor = _MEDIAN_SD_FACTOR if len(accepted) > 2 else 1.0
+    sd = factor * math.hypot(spread, float(np.sqrt(np.mean(noise * noise)))) / math.sqrt(len(accepted))
     return OffsetEstimate(float(np.median(offset)), sd, ranges, placements, model_id)
 
 

@@ -24,23 +24,26 @@ def load(
     """Return the name of a recording (marked "simulated" if it is) and its labelled measurements.
 
     Args:
+        path: a bag, or another recording.
+        preprocessing: preprocessing of the model.
         truth: tables of true ranges that replace those of the recording.
+        on_record: called for each record that was read.
 
     Raises:
         RecordingError, DatasetError: it cannot be read, or no measurement is usable.
     """
-    stretches = [row for table in truth for row in load_truth(table)]
+    truth_segments = [row for table in truth for row in load_truth(table)]
     with opening.open_recording(path) as source:
         try:
-            read = with_truth(source, stretches) if stretches else source
-            dataset = datasets.build_dataset(read, preprocessing, on_record)
+            records = with_truth(source, truth_segments) if truth_segments else source
+            dataset = datasets.build_dataset(records, preprocessing, on_record)
         except DatasetError as error:
             if preprocessing.scaling is Scaling.MAX or CirFault.NO_PREAMBLE_COUNT.text not in error.what:
                 raise
-            raise DatasetError(error.what, valid="--scaling max does without preamble counts") from error
+            raise DatasetError(error.what, valid="--scaling max, which needs no preamble counts") from error
         name = path.resolve().name
-        is_said = "simulated" in name or not source.simulated
-    return (name if is_said else f"{name} (simulated)"), dataset
+        is_marked = "simulated" in name or not source.simulated
+    return (name if is_marked else f"{name} (simulated)"), dataset
 
 
 def load_inputs(
@@ -54,10 +57,10 @@ def load_inputs(
         RecordingError, DatasetError: it cannot be read, or no CIR is usable.
     """
     with opening.open_recording(path) as source:
-        return datasets.build_dataset(map(_named, source), preprocessing, on_record)
+        return datasets.build_dataset(map(_with_configuration, source), preprocessing, on_record)
 
 
-def _named(record: Record) -> Record:
+def _with_configuration(record: Record) -> Record:
     if record.truth is not None:
         return record
     measured = record.measurement

@@ -39,13 +39,14 @@ class SiteData:
     Attributes:
         anchors: anchors of the site.
         tags: data of each tag, in the order of time.
-        preprocessing, inputs: float32 (r, K), zeros if there is no CIR.
+        preprocessing: preprocessing of the inputs.
+        inputs: float32 (r, K), zeros if there is no CIR.
         rx_power_dbm, first_path_power_dbm: float32 (r,), NaN = unknown.
         has_cirs: whether CIRs are used.
-        with_cir: bool (r,), ranges with a usable CIR.
+        has_usable_cir: bool (r,), ranges with a usable CIR.
         height_m: float64 (r,), measured heights of the tags; None: not measured.
-        frames: {tag id: the frame ids of its ranges}.
-        left_out: {reason: number of excluded ranges}.
+        frame_ids: {tag id: the frame ids of its ranges}.
+        skipped: {reason: number of excluded ranges}.
         shift_ns: time added to the stamps of each recording, so that recordings do not overlap.
     """
 
@@ -87,23 +88,25 @@ class SiteData:
         """Return a dataset of selected ranges.
 
         Args:
-            rows: indices, (k,), into the ranges of all tags. true_m: (k,), their true ranges.
-            segment: int (k,), segment of the track. is_stationary: bool (k,), whether the tag is stationary. A configuration is a
+            rows: indices, (k,), into the ranges of all tags.
+            true_m: (k,), their true ranges.
+            segment: int (k,), segment of the track.
+            is_stationary: bool (k,), whether the tag is stationary. A configuration is a
                 pair while the tag is stationary, or for `CONFIGURATION_S` of motion. Its name begins with the unit that is
                 held out as a whole: "segment 3.1/".
         """
         ranges = self.ranges.take(rows)
         tag = np.array([one.tag_id for one in self.tags], np.uint64)[self.tag[rows]]
-        first = np.full(int(segment.max()) + 1, np.iinfo(np.int64).max)
-        np.minimum.at(first, segment, ranges.stamp_ns)
-        since = (ranges.stamp_ns - first[segment]) / _SECOND_NS
-        chunk = np.where(is_stationary, 0, since // CONFIGURATION_S).astype(int)
-        fold = np.where(is_stationary, 0, since // FOLD_S).astype(int)
+        segment_start_ns = np.full(int(segment.max()) + 1, np.iinfo(np.int64).max)
+        np.minimum.at(segment_start_ns, segment, ranges.stamp_ns)
+        elapsed_s = (ranges.stamp_ns - segment_start_ns[segment]) / _SECOND_NS
+        part = np.where(is_stationary, 0, elapsed_s // CONFIGURATION_S).astype(int)
+        fold = np.where(is_stationary, 0, elapsed_s // FOLD_S).astype(int)
         names = [
             f"segment {s}.{f}/{c}/tag {t}/anchor {a}"
-            for s, f, c, t, a in zip(segment, fold, chunk, tag, ranges.anchor, strict=True)
+            for s, f, c, t, a in zip(segment, fold, part, tag, ranges.anchor, strict=True)
         ]
-        identities = np.array([anchor.id for anchor in self.anchors.anchors], np.uint64)
+        anchor_ids = np.array([anchor.id for anchor in self.anchors.anchors], np.uint64)
         return Dataset(
             self.preprocessing,
             self.inputs[rows],
@@ -114,7 +117,7 @@ class SiteData:
             np.array(names),
             np.full(len(rows), ""),
             tags=tag,
-            anchors=identities[ranges.anchor],
+            anchors=anchor_ids[ranges.anchor],
         )
 
 
@@ -130,6 +133,10 @@ def read_site(
     """Read recordings, without their ground truth.
 
     Args:
+        recordings: records of each recording, in the order of time.
+        anchors: anchors of the site; other anchors are skipped.
+        preprocessing: preprocessing of the model.
+        on_record: called for each record that was read.
         stamp_offset_s: time offset added to the stamps of ranges: -0.2 if they are 0.2 s late.
         heights: heights of the tags for each recording. Ranges without a height are excluded.
 
@@ -142,10 +149,10 @@ def read_site(
     windows: list[NDArray[np.float32]] = []
     frame_ids: dict[int, dict[str, None]] = {}
     shifts: list[int] = []
-    latest: int | None = None
+    last_stamp_ns: int | None = None
     for number, recording in enumerate(recordings):
         shift: int | None = None
-        end_of_previous = latest
+        end_of_previous = last_stamp_ns
         for record in recording:
             on_record()
             measured = record.measurement
@@ -165,31 +172,38 @@ def read_site(
                 frame_ids.setdefault(measured.tag_id, {}).setdefault(measured.frame_id)
                 (fault,), (window,) = preprocessing.windows_of([measured])
                 stamp_ns += shift
-                latest = stamp_ns if latest is None else max(latest, stamp_ns)
-                power = measured.cir.rx_power_dbm, measured.cir.first_path_power_dbm
-                rows.append((measured.tag_id, stamp_ns, row, measured.range_m, *power, height, fault == 0))
+                last_stamp_ns = stamp_ns if last_stamp_ns is None else max(last_stamp_ns, stamp_ns)
+                powers = measured.cir.rx_power_dbm, measured.cir.first_path_power_dbm
+                rows.append((measured.tag_id, stamp_ns, row, measured.range_m, *powers, height, fault == 0))
                 windows.append(window)
         shifts.append(shift or 0)
-    for identity, count in unknown.items():
-        skipped[f"anchor {format_id(identity)} is not in the anchors file"] += count
+    for anchor_id, count in unknown.items():
+        skipped[f"anchor {format_id(anchor_id)} is not in the anchors file"] += count
     if not rows:
-        seen = ", ".join(map(format_id, sorted(unknown))) or "none"
+        received_ids = ", ".join(map(format_id, sorted(unknown))) or "none"
         raise DatasetError(
-            f"no range of the anchors {', '.join(map(format_id, sorted(anchors.index)))}",
-            valid=f"the recording's ranges come from anchors: {seen}",
+            f"no ranges of the anchors {', '.join(map(format_id, sorted(anchors.index)))}",
+            valid=f"anchors of the recording: {received_ids}",
         )
-    kinds: list[type] = [np.uint64, np.int64, np.intp, *[np.float64] * 4, np.bool_]
+    types: list[type] = [np.uint64, np.int64, np.intp, *[np.float64] * 4, np.bool_]
     columns: list[NDArray[Any]] = [
-        np.array(column, kind) for column, kind in zip(zip(*rows, strict=True), kinds, strict=True)
+        np.array(column, kind) for column, kind in zip(zip(*rows, strict=True), types, strict=True)
     ]
     order = np.lexsort((columns[1], columns[0]))
     tag, stamp, anchor, range_m, rx, first_path, height_m, has_usable_cir = (
         column[order] for column in columns
     )
-    rx, first_path = (np.where(np.isfinite(power), power, np.nan) for power in (rx, first_path))
+    rx, first_path = (np.where(np.isfinite(powers), powers, np.nan) for powers in (rx, first_path))
     tags = tuple(
-        Ranges(stamp[own], anchor[own], range_m[own], np.full(len(own), np.nan), rx[own], int(tag[own[0]]))
-        for own in np.split(np.arange(len(tag)), np.flatnonzero(np.diff(tag)) + 1)
+        Ranges(
+            stamp[tag_rows],
+            anchor[tag_rows],
+            range_m[tag_rows],
+            np.full(len(tag_rows), np.nan),
+            rx[tag_rows],
+            int(tag[tag_rows[0]]),
+        )
+        for tag_rows in np.split(np.arange(len(tag)), np.flatnonzero(np.diff(tag)) + 1)
     )
     return SiteData(
         anchors=anchors,
@@ -201,7 +215,7 @@ def read_site(
         has_cirs=bool(has_usable_cir.mean() >= MIN_CIR_SHARE),
         has_usable_cir=has_usable_cir,
         height_m=None if heights is None else height_m,
-        frame_ids={tag_id: tuple(own) for tag_id, own in frame_ids.items()},
+        frame_ids={tag_id: tuple(names) for tag_id, names in frame_ids.items()},
         skipped=skipped,
         shift_ns=tuple(shifts),
     )

@@ -55,12 +55,12 @@ def apply_card(dataset: Dataset, card: Card, predicted_m: NDArray[np.float32]) -
         dataset.rx_power_dbm,
         dataset.first_path_power_dbm,
     )
-    corrects = rule.accepts(predicted_m, score)
+    accepted = rule.accepts(predicted_m, score)
     with np.errstate(invalid="ignore"):
         correction, variance = rule.apply(predicted_m, score)
     uncorrected = np.float32(card.variance_uncorrected_m2)
     return CardCorrections(
-        np.where(corrects, correction, 0.0), np.where(corrects, variance, uncorrected), ~corrects
+        np.where(accepted, correction, 0.0), np.where(accepted, variance, uncorrected), ~accepted
     )
 
 
@@ -75,13 +75,17 @@ def run(dataset: Dataset, bundle: Bundle) -> ZeroShot:
     linear_bias = bundle.card.linear_bias.predict_m(dataset.rx_power_dbm, dataset.first_path_power_dbm)
     predicted = (linear_bias + Session(bundle).predict_m(dataset.inputs)).astype(np.float32)
     corrections = apply_card(dataset, bundle.card, predicted)
-    left = dataset.error_m - corrections.correction_m
+    residual = dataset.error_m - corrections.correction_m
 
-    names, of = np.unique(dataset.configurations, return_inverse=True)
-    means = np.bincount(of, left) / np.bincount(of)
-    is_los = np.array([(dataset.labels[of == k] == LOS).mean() > 0.5 for k in range(len(names))])
+    names, configuration_index = np.unique(dataset.configurations, return_inverse=True)
+    means = np.bincount(configuration_index, residual) / np.bincount(configuration_index)
+    is_los = np.array(
+        [(dataset.labels[configuration_index == k] == LOS).mean() > 0.5 for k in range(len(names))]
+    )
     los_offset = float(np.median(means[is_los])) if is_los.any() else 0.0
     others = np.array([np.median(np.delete(means, k)) if len(means) > 1 else 0.0 for k in range(len(means))])
-    errors = dict(zip(NAMES, (left, left - los_offset, left - others[of]), strict=True))
+    errors = dict(
+        zip(NAMES, (residual, residual - los_offset, residual - others[configuration_index]), strict=True)
+    )
     sigmas95 = bundle.card.interval95_sigmas
     return ZeroShot(errors, los_offset, corrections.variance_m2, sigmas95, corrections.passed_through)

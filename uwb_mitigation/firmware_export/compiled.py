@@ -25,7 +25,7 @@ from uwb_mitigation.firmware_export.compiling import (
 )
 from uwb_mitigation.firmware_export.export import export_bundle
 from uwb_mitigation.measurement import Cir, CorrectedColumns, RangeColumns, Status
-from uwb_mitigation.mitigation import Backend, passed_through
+from uwb_mitigation.mitigation import Backend, pass_through
 from uwb_mitigation.model.bundle import Bundle
 from uwb_mitigation.offsets import NO_OFFSETS, Offsets
 
@@ -170,7 +170,7 @@ class FirmwareMitigation(Backend):
             ),
             strict=True,
         )
-        found = passed_through(self.bundle, ranges, offset, np.array(status, np.uint8))
+        found = pass_through(self.bundle, ranges, offset, np.array(status, np.uint8))
         is_corrected = found.status == Status.OK
         for column, computed in zip(
             (found.range_m, found.correction_m, found.variance_m2), values, strict=True

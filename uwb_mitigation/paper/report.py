@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.evaluation.baselines import scikit
+from uwb_mitigation.evaluation.baselines import scikit_learn
 from uwb_mitigation.evaluation.dataset import Dataset
 from uwb_mitigation.evaluation.page import render_page
 from uwb_mitigation.paper import figures, published, tables
@@ -262,7 +262,7 @@ def principal_components(inputs: NDArray[np.floating]) -> tuple[NDArray[np.float
     points, explained = np.zeros((len(inputs), 3)), np.zeros(3)
     count = min(3, *inputs.shape)
     if np.ptp(inputs, axis=0).any():
-        analysis = scikit("decomposition").PCA(count, svd_solver="full")
+        analysis = scikit_learn("decomposition").PCA(count, svd_solver="full")
         points[:, :count] = analysis.fit_transform(inputs.astype(np.float64))
         explained[:count] = analysis.explained_variance_ratio_
     return points, explained

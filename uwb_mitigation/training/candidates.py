@@ -146,7 +146,7 @@ def fit_new_model(
     if recipe.line:
         linear_bias = fit_line(data)
     elif not recipe.network:
-        linear_bias = linear_fit.constant(data.configurations, data.error_m)
+        linear_bias = linear_fit.fit_constant(data.configurations, data.error_m)
     if not recipe.network:
         with fitting.single_thread(seed):
             return FittedModel(linear_bias, networks.weights_of(networks.build(recipe.architecture, 0)))
@@ -197,7 +197,7 @@ def new_models(recipe: Recipe) -> list[Candidate]:
 
 def _constant() -> Candidate:
     return Candidate(
-        CONSTANT, lambda data, seed: FittedModel(linear_fit.constant(data.configurations, data.error_m))
+        CONSTANT, lambda data, seed: FittedModel(linear_fit.fit_constant(data.configurations, data.error_m))
     )
 
 
@@ -219,7 +219,9 @@ def from_bundle(source: Bundle, options: FitOptions) -> list[Candidate]:
         residual = data.error_m - linear_bias_m(source.linear_bias, data) - network_m(network, data.inputs)
         known = np.isfinite(residual)
         shift = (
-            linear_fit.constant(data.configurations[known], residual[known]).offset_m if known.any() else 0.0
+            linear_fit.fit_constant(data.configurations[known], residual[known]).offset_m
+            if known.any()
+            else 0.0
         )
         linear_bias = replace(
             source.linear_bias, offset_m=float(np.float32(source.linear_bias.offset_m + shift))
@@ -275,7 +277,7 @@ def has_few_configurations(data: Dataset) -> bool:
 
 
 def _offset(data: Dataset, network: FloatWeights) -> LinearBiasModel:
-    return linear_fit.constant(data.configurations, data.error_m - network_m(network, data.inputs))
+    return linear_fit.fit_constant(data.configurations, data.error_m - network_m(network, data.inputs))
 
 
 def site_models(
@@ -301,7 +303,9 @@ def site_models(
             # A bundle with a network passes a range through if its first-path power is unknown.
             has_line = line and _has_both_powers(data)
             linear_bias = (
-                _site_line(data, residual) if has_line else linear_fit.constant(data.configurations, residual)
+                _site_line(data, residual)
+                if has_line
+                else linear_fit.fit_constant(data.configurations, residual)
             )
             return FittedModel(linear_bias, scaled(start, factor), factor)
 
@@ -318,7 +322,7 @@ def site_models(
     def fine_tuned(data: Dataset, seed: int) -> FittedModel:
         from uwb_mitigation.training import fitting
 
-        shift = linear_fit.constant(data.configurations, data.error_m - _universal_m(data))
+        shift = linear_fit.fit_constant(data.configurations, data.error_m - _universal_m(data))
         subset = data.rows(splits.subsample(data.configurations, FINE_TUNING_PER_CONFIGURATION, seed))
         if len(subset) > MAX_FINE_TUNING_INPUTS:
             chosen = np.random.default_rng(seed).choice(len(subset), MAX_FINE_TUNING_INPUTS, replace=False)
@@ -343,7 +347,8 @@ def _factor(data: Dataset) -> float:
     Noise of the predictions would bias the factor towards 0, and with it the estimated offsets.
     """
     predicted, error = (
-        linear_fit.means(data.configurations, values) for values in (_universal_m(data), data.error_m)
+        linear_fit.configuration_means(data.configurations, values)
+        for values in (_universal_m(data), data.error_m)
     )
     if len(predicted) < linear_fit.MIN_CONFIGURATIONS or float(np.ptp(predicted)) < MIN_SPREAD_M:
         return 1.0
