@@ -10,7 +10,7 @@
 #include "uwb_model.h"
 #endif
 
-enum { MAX_BOARDS = 40, MAX_RESULTS = 1 << 16, WHOLE = 1016, SLOW_HZ = 2000000, FAST_HZ = 8000000 };
+enum { MAX_BOARDS = 40, MAX_RESULTS = 1 << 16, MAX_SAMPLES = 1016, SLOW_HZ = 2000000, FAST_HZ = 8000000 };
 
 typedef struct {
     double time_s;
@@ -38,12 +38,12 @@ typedef struct {
     double inference_s; /* for each range in mode DEVICE */
     double sent_s;      /* until when the serial line is busy */
     uint8_t mode;
-    uint64_t measurement[UWB_TWR_MEASUREMENT_BYTES(WHOLE) / 8 + 1];
+    uint64_t measurement[UWB_TWR_MEASUREMENT_BYTES(MAX_SAMPLES) / 8 + 1];
     uint8_t queue[16384];
     uint32_t arena[12288 / 4];
     uint8_t input[8192], output[1 << 18]; /* of the line, as its host has them */
     size_t input_bytes, output_bytes;
-    uint8_t sent[8 + 4 * WHOLE], received[8 + 4 * WHOLE];
+    uint8_t sent[8 + 4 * MAX_SAMPLES], received[8 + 4 * MAX_SAMPLES];
 } radio_board;
 
 struct radio_air {

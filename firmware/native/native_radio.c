@@ -3,11 +3,11 @@
 
 #include "uwb_twr.h"
 
-enum { WHOLE = 1016 };
+enum { MAX_SAMPLES = 1016 };
 
 typedef struct {
     uwb_twr twr;
-    uint64_t measurement[UWB_TWR_MEASUREMENT_BYTES(WHOLE) / sizeof(uint64_t) + 1];
+    uint64_t measurement[UWB_TWR_MEASUREMENT_BYTES(MAX_SAMPLES) / sizeof(uint64_t) + 1];
 } native_radio;
 
 /* Returns NULL if there is not enough memory. */
@@ -35,7 +35,7 @@ int native_radio_exchange(native_radio *radio, uint64_t until_us) {
     return (int)uwb_twr_step(&radio->twr, until_us);
 }
 
-/* Measurement of the last turn: a payload of RANGE_CIR. */
+/* Measurement of the last exchange: a payload of RANGE_CIR. */
 const uint8_t *native_radio_measurement(const native_radio *radio, size_t *bytes, uint64_t *measured_us) {
     *bytes = uwb_twr_measurement_bytes(&radio->twr);
     *measured_us = radio->twr.measured_us;
@@ -65,7 +65,7 @@ const uwb_twr_anchor *native_radio_anchors(const native_radio *radio, size_t *co
     return radio->twr.anchors;
 }
 
-/* Call between two turns; returns a uwb_dw1000_status. */
+/* Call between two exchanges; returns a uwb_dw1000_status. */
 int native_radio_sensors(native_radio *radio, float *temperature, float *voltage) {
     if (!radio->twr.running) {
         return UWB_DW1000_ABSENT;

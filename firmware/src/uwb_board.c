@@ -5,12 +5,13 @@
 
 int uwb_board_send(uwb_board *board, uint8_t type, uint16_t flags, uint64_t time_us, const void *payload,
                    size_t payload_bytes, size_t reserve) {
-    const uwb_header_t header = {UWB_PROTOCOL_VERSION, type, flags, 0, time_us};
+    const uwb_header_t header = {
+        .version = UWB_PROTOCOL_VERSION, .type = type, .flags = flags, .time_us = time_us};
     return uwb_queue_frame(&board->queue, &header, payload, payload_bytes, reserve);
 }
 
 /* Send HELLO: the answer to the host's frame `*request`, or unsolicited if that is NULL. */
-static void hello(uwb_board *board, const uint32_t *request, uint64_t now_us) {
+static void send_hello(uwb_board *board, const uint32_t *request, uint64_t now_us) {
     const uwb_board_config *const config = &board->config;
     uwb_hello_t message;
     memset(&message, 0, sizeof message);
@@ -33,7 +34,7 @@ static void hello(uwb_board *board, const uint32_t *request, uint64_t now_us) {
 static float offset_of_m(const uwb_board *board, uint64_t tag_id, uint64_t anchor_id) {
     float anchor_m = 0.0f;
     float tag_m = 0.0f;
-    int named = 0;
+    int found = 0;
     for (uint16_t i = 0; i < board->offset_count; i++) {
         const uwb_offset_t *const entry = &board->offsets[i];
         const int tag = entry->tag_id == tag_id;
@@ -43,17 +44,17 @@ static float offset_of_m(const uwb_board *board, uint64_t tag_id, uint64_t ancho
         }
         if (entry->of == UWB_OFFSET_SCOPE_ANCHOR && anchor) {
             anchor_m = entry->offset;
-            named = 1;
+            found = 1;
         } else if (entry->of == UWB_OFFSET_SCOPE_TAG && tag) {
             tag_m = entry->offset;
-            named = 1;
+            found = 1;
         }
     }
-    return named ? anchor_m + tag_m : board->default_offset_m;
+    return found ? anchor_m + tag_m : board->default_offset_m;
 }
 
-/* Correct a measurement and send the result; returns whether it fitted. */
-static int correct(uwb_board *board, const uwb_range_cir_t *fields, const uwb_cir *cir, uint16_t flags,
+/* Correct a measurement and send the result; returns whether the queue had space for it. */
+static int send_correction(uwb_board *board, const uwb_range_cir_t *fields, const uwb_cir *cir, uint16_t flags,
                    uint64_t time_us) {
     const uwb_board_config *const config = &board->config;
     const uint32_t began_us = config->clock_us != NULL ? config->clock_us() : 0;
@@ -80,8 +81,8 @@ static int correct(uwb_board *board, const uwb_range_cir_t *fields, const uwb_ci
 
 static const float MAX_OFFSET_M = 10.0f;
 
-/* False for NaN. */
-static int is_offset(float offset_m) {
+/* Return whether an offset is between -10 and 10 m; false for NaN. */
+static int is_valid_offset(float offset_m) {
     return offset_m >= -MAX_OFFSET_M && offset_m <= MAX_OFFSET_M;
 }
 
@@ -93,27 +94,27 @@ static int set_offsets(uwb_board *board, const uint8_t *payload, size_t payload_
         return 0;
     }
     memcpy(&fixed, payload, sizeof fixed);
-    if (!is_offset(fixed.default_offset) || (payload_bytes - sizeof fixed) / sizeof(uwb_offset_t) < fixed.count) {
+    if (!is_valid_offset(fixed.default_offset) || (payload_bytes - sizeof fixed) / sizeof(uwb_offset_t) < fixed.count) {
         return 0;
     }
     for (size_t i = 0; i < fixed.count; i++) {
         uwb_offset_t entry;
         memcpy(&entry, payload + sizeof fixed + i * sizeof entry, sizeof entry);
-        if (!is_offset(entry.offset) || entry.of > UWB_OFFSET_SCOPE_PAIR) {
+        if (!is_valid_offset(entry.offset) || entry.of > UWB_OFFSET_SCOPE_PAIR) {
             return 0;
         }
     }
-    uwb_offsets_t answer;
-    memset(&answer, 0, sizeof answer);
-    answer.request_sequence = request;
-    answer.slots = UWB_MAX_OFFSETS;
-    answer.accepted = fixed.count <= UWB_MAX_OFFSETS;
-    if (answer.accepted) {
+    const uwb_offsets_t reply = {
+        .request_sequence = request,
+        .slots = UWB_MAX_OFFSETS,
+        .accepted = fixed.count <= UWB_MAX_OFFSETS,
+    };
+    if (reply.accepted) {
         board->default_offset_m = fixed.default_offset;
         board->offset_count = fixed.count;
         memcpy(board->offsets, payload + sizeof fixed, fixed.count * sizeof(uwb_offset_t));
     }
-    (void)uwb_board_send(board, UWB_TYPE_OFFSETS, UWB_FLAG_ANSWER, now_us, &answer, sizeof answer, 0);
+    (void)uwb_board_send(board, UWB_TYPE_OFFSETS, UWB_FLAG_ANSWER, now_us, &reply, sizeof reply, 0);
     return 1;
 }
 
@@ -125,15 +126,15 @@ void uwb_board_start(uwb_board *board, const uwb_board_config *config, uint64_t 
     board->status_due_us = now_us + UWB_STATUS_INTERVAL_US;
     board->temperature = NAN;
     board->mode = config->model != NULL ? config->mode : UWB_MODE_HOST;
-    hello(board, NULL, now_us);
+    send_hello(board, NULL, now_us);
 }
 
-/* Returns whether the frame was for the board. */
-static int answer(uwb_board *board, const uwb_header_t *header, size_t payload_bytes, uint64_t now_us) {
+/* Handle a frame from the host; returns whether it was for the board. */
+static int handle_frame(uwb_board *board, const uwb_header_t *header, size_t payload_bytes, uint64_t now_us) {
     const uint8_t *const payload = board->host.body.bytes + UWB_HEADER_BYTES;
     switch (header->type) {
     case UWB_TYPE_GET_INFO:
-        hello(board, &header->sequence, now_us);
+        send_hello(board, &header->sequence, now_us);
         return 1;
     case UWB_TYPE_SET_MODE:
         if (payload_bytes < sizeof(uwb_set_mode_t) || payload[0] > UWB_MODE_DEVICE) {
@@ -142,7 +143,7 @@ static int answer(uwb_board *board, const uwb_header_t *header, size_t payload_b
         if (board->config.model != NULL || payload[0] == UWB_MODE_HOST) {
             board->mode = payload[0];
         }
-        hello(board, &header->sequence, now_us);
+        send_hello(board, &header->sequence, now_us);
         return 1;
     case UWB_TYPE_SET_OFFSETS:
         return set_offsets(board, payload, payload_bytes, header->sequence, now_us);
@@ -152,8 +153,10 @@ static int answer(uwb_board *board, const uwb_header_t *header, size_t payload_b
         reply.request_sequence = header->sequence;
         reply.received_us = now_us;
         /* Put it before all queued frames: a short round trip improves the clock estimate of the host. */
-        const uwb_header_t first = {UWB_PROTOCOL_VERSION, UWB_TYPE_TIME_SYNC_REPLY, UWB_FLAG_ANSWER, 0,
-                                    UWB_TIME_OF_SENDING};
+        const uwb_header_t first = {.version = UWB_PROTOCOL_VERSION,
+                                    .type = UWB_TYPE_TIME_SYNC_REPLY,
+                                    .flags = UWB_FLAG_ANSWER,
+                                    .time_us = UWB_TIME_OF_SENDING};
         (void)uwb_queue_urgent(&board->queue, &first, &reply, sizeof reply);
         return 1;
     }
@@ -163,14 +166,14 @@ static int answer(uwb_board *board, const uwb_header_t *header, size_t payload_b
         if (board->config.model == NULL || !uwb_read_measurement(payload, payload_bytes, &fields, &cir)) {
             return 0;
         }
-        if (!correct(board, &fields, &cir, UWB_FLAG_ANSWER, now_us)) {
+        if (!send_correction(board, &fields, &cir, UWB_FLAG_ANSWER, now_us)) {
             board->measurements_lost++;
         }
         return 1;
     }
     default:
-        return board->config.other != NULL &&
-               board->config.other(board->config.context, header, payload, payload_bytes, now_us);
+        return board->config.handle_other_frame != NULL &&
+               board->config.handle_other_frame(board->config.context, header, payload, payload_bytes, now_us);
     }
 }
 
@@ -179,13 +182,13 @@ void uwb_board_receive(uwb_board *board, const uint8_t *bytes, size_t count, uin
     for (size_t i = 0; i < count; i++) {
         uwb_header_t header;
         const int32_t payload = uwb_decoder_push(&board->host, bytes[i], &header);
-        if (payload >= 0 && !answer(board, &header, (size_t)payload, now_us)) {
+        if (payload >= 0 && !handle_frame(board, &header, (size_t)payload, now_us)) {
             board->dropped++;
         }
     }
     if (board->host.foreign_versions != foreign) {
         /* This frame shows the board's version to a host of another version. */
-        hello(board, NULL, now_us);
+        send_hello(board, NULL, now_us);
     }
 }
 
@@ -201,7 +204,7 @@ int uwb_board_process_measurement(uwb_board *board, const uint8_t *payload, size
         sent = uwb_board_send(board, UWB_TYPE_RANGE_CIR, 0, time_us, payload, payload_bytes, UWB_ANSWER_RESERVE_BYTES);
     }
     if (board->mode != UWB_MODE_HOST) {
-        sent = correct(board, &fields, &cir, 0, time_us) && sent;
+        sent = send_correction(board, &fields, &cir, 0, time_us) && sent;
     }
     if (!sent) {
         board->measurements_lost++;
@@ -212,28 +215,29 @@ int uwb_board_process_measurement(uwb_board *board, const uint8_t *payload, size
 void uwb_board_receive_from_radio(uwb_board *board, const uint8_t *bytes, size_t count, uint64_t now_us) {
     for (size_t i = 0; i < count; i++) {
         if (board->radio.encoded == 0) {
-            board->radio_began_us = now_us;
+            board->radio_frame_start_us = now_us;
         }
         uwb_header_t header;
         const int32_t payload = uwb_decoder_push(&board->radio, bytes[i], &header);
         if (payload >= 0) {
             const uint8_t *const bytes_of_payload = board->radio.body.bytes + UWB_HEADER_BYTES;
             if (header.type != UWB_TYPE_RANGE_CIR ||
-                !uwb_board_process_measurement(board, bytes_of_payload, (size_t)payload, board->radio_began_us)) {
+                !uwb_board_process_measurement(board, bytes_of_payload, (size_t)payload, board->radio_frame_start_us)) {
                 board->radio_faults++;
             }
         }
     }
 }
 
-static uint32_t corrupt(const uwb_decoder *decoder) {
+/* Number of segments that are not an intact frame of any version. */
+static uint32_t corrupt_frames(const uwb_decoder *decoder) {
     return decoder->bad_cobs + decoder->bad_length + decoder->bad_crc + decoder->oversize;
 }
 
-/* STATUS has no counter for damage on the radio's side: report it in a LOG frame. */
+/* STATUS has no counter for damaged frames from the radio: report them in a LOG frame. */
 static void log_radio_faults(uwb_board *board, uint64_t now_us) {
-    static const char text[] = "frames from the radio's side are damaged, or no measurements";
-    const uint32_t faults = board->radio_faults + corrupt(&board->radio) + board->radio.foreign_versions;
+    static const char text[] = "frames from the radio are damaged, or are no measurements";
+    const uint32_t faults = board->radio_faults + corrupt_frames(&board->radio) + board->radio.foreign_versions;
     if (faults != board->radio_faults_logged) {
         uint8_t payload[sizeof(uwb_log_t) + sizeof text - 1] = {UWB_LOG_LEVEL_WARNING};
         memcpy(payload + sizeof(uwb_log_t), text, sizeof text - 1);
@@ -250,7 +254,7 @@ void uwb_board_tick(uwb_board *board, uint64_t now_us) {
     uwb_status_t status;
     memset(&status, 0, sizeof status);
     status.frames_received = board->host.frames;
-    status.frames_dropped = corrupt(&board->host) + board->dropped;
+    status.frames_dropped = corrupt_frames(&board->host) + board->dropped;
     status.measurements = board->measurements;
     status.measurements_lost = board->measurements_lost;
     status.temperature = board->temperature;

@@ -1,4 +1,4 @@
-/* The board's side of the wire protocol: shared by sketches and bare metal. uwb_mitigation/link/board.py is the
+/* The board's side of the wire protocol, used by sketches and bare-metal programs. uwb_mitigation/link/board.py is the
  * same in Python.
  *
  * No allocation, no globals, no blocking: if the host does not read in time, complete frames are dropped and
@@ -25,12 +25,11 @@ typedef struct {
     const uwb_model *model; /* NULL = no model */
     void *arena;            /* as for uwb_correct */
     size_t arena_bytes;
-    uint8_t *queue; /* for frames to the host; two of the longest and the reserve are enough */
+    uint8_t *queue; /* for frames to the host; sufficient size: two of the longest frames and the reserve */
     size_t queue_bytes;
     uint32_t (*clock_us)(void); /* for compute_us; NULL = it is sent as 0 */
-    /* Take a frame of a type that a board without a radio of its own has not; return whether it was used. May be
-     * NULL. */
-    int (*other)(void *context, const uwb_header_t *header, const uint8_t *payload, size_t payload_bytes,
+    /* Handle a frame of another type, such as SET_RADIO; returns whether it was handled. May be NULL. */
+    int (*handle_other_frame)(void *context, const uwb_header_t *header, const uint8_t *payload, size_t payload_bytes,
                  uint64_t now_us);
     void *context;
 } uwb_board_config;
@@ -41,11 +40,11 @@ typedef struct {
     uwb_decoder radio;
     uwb_queue queue;
     uint64_t status_due_us;
-    uint64_t radio_began_us; /* when the frame from the radio that is being received began */
+    uint64_t radio_frame_start_us; /* start of the frame that is being received from the radio */
     uint32_t dropped;
     uint32_t measurements;
     uint32_t measurements_lost;
-    uint32_t radio_faults; /* frames from the radio's side that were damaged or no measurement */
+    uint32_t radio_faults; /* frames from the radio that were damaged or no measurements */
     uint32_t radio_faults_logged;
     float temperature; /* degrees Celsius, for STATUS; the caller may set it */
     uint8_t mode;
@@ -60,17 +59,17 @@ void uwb_board_start(uwb_board *board, const uwb_board_config *config, uint64_t 
 /* Process bytes from the host, and answer. */
 void uwb_board_receive(uwb_board *board, const uint8_t *bytes, size_t count, uint64_t now_us);
 
-/* Process frames RANGE_CIR from the radio's side. Forward them raw or corrected, according to the mode. */
+/* Process bytes with RANGE_CIR frames from the radio. Forward the ranges raw or corrected, according to the mode. */
 void uwb_board_receive_from_radio(uwb_board *board, const uint8_t *bytes, size_t count, uint64_t now_us);
 
-/* Send a measurement on, a payload of RANGE_CIR aligned to 2 bytes that the board's own radio made at `time_us`; returns
- * whether it is well formed. */
+/* Forward a measurement of the board's own radio: a payload of RANGE_CIR, aligned to 2 bytes, measured at `time_us`.
+ * Returns whether it is well formed. */
 int uwb_board_process_measurement(uwb_board *board, const uint8_t *payload, size_t payload_bytes, uint64_t time_us);
 
-/* Send what is due: STATUS once a second. */
+/* Send STATUS if it is due, once a second. */
 void uwb_board_tick(uwb_board *board, uint64_t now_us);
 
-/* Send one frame, if it fits and leaves `reserve` bytes of the queue free; returns whether it did. */
+/* Queue one frame if it fits and leaves `reserve` bytes of the queue free; returns whether it was queued. */
 int uwb_board_send(uwb_board *board, uint8_t type, uint16_t flags, uint64_t time_us, const void *payload,
                    size_t payload_bytes, size_t reserve);
 

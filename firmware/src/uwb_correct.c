@@ -5,8 +5,7 @@
 
 static const float MAX_POWER_DBM = 1000.0f;
 
-/* The part of the predicted error that needs no network, m; NaN if a power that it needs is not finite, or beyond
- * 1000 dBm. */
+/* Linear bias model, m; NaN if a power that it needs is not finite, or beyond 1000 dBm. */
 static float linear_bias_m(const uwb_model *model, float rx_power_dbm, float first_path_power_dbm) {
     if (model->linear_bias_per_rx_power == 0.0f && model->linear_bias_per_power_gap == 0.0f) {
         return model->linear_bias_offset_m;
@@ -38,7 +37,8 @@ static float energy(uwb_scaling scaling, const float *window, size_t count) {
 
 /* 10 log10 within 0.03 dB: the exponent is exact, and a parabola approximates the logarithm of the mantissa. */
 static float level_db(float power) {
-    const float bounded = power < 1e-30f ? 1e-30f : power > 1e30f ? 1e30f : power;
+    const float at_most = power > 1e30f ? 1e30f : power;
+    const float bounded = power < 1e-30f ? 1e-30f : at_most;
     int exponent;
     const float mantissa = frexpf(bounded, &exponent);
     const volatile float square = (-4.0f / 3.0f) * mantissa;
@@ -127,8 +127,8 @@ static uwb_status predict(const uwb_model *model, float range_m, const uwb_cir *
     if (!in_limits(range_m, 0.0f, MAX_RANGE_M)) {
         return UWB_BAD_RANGE;
     }
-    const float linear_bias = linear_bias_m(model, cir->rx_power_dbm, cir->first_path_power_dbm);
-    if (!in_limits(linear_bias, -FLT_MAX, FLT_MAX)) {
+    const float bias_m = linear_bias_m(model, cir->rx_power_dbm, cir->first_path_power_dbm);
+    if (!in_limits(bias_m, -FLT_MAX, FLT_MAX)) {
         return UWB_NO_POWER;
     }
     /* Before the network overwrites the window. */
@@ -141,7 +141,7 @@ static uwb_status predict(const uwb_model *model, float range_m, const uwb_cir *
         return status;
     }
     rounded = network_m;
-    *error_m = linear_bias + rounded;
+    *error_m = bias_m + rounded;
     if (!in_limits(*error_m, -FLT_MAX, FLT_MAX)) {
         return UWB_NOT_FINITE;
     }
@@ -149,9 +149,9 @@ static uwb_status predict(const uwb_model *model, float range_m, const uwb_cir *
     return accepted ? UWB_OK : UWB_OUT_OF_DISTRIBUTION;
 }
 
-/* The higher the OOD score, the less of the predicted error is subtracted. As in mitigation.py, every product and
+/* Subtract the predicted error, weighted by the OOD score: the higher the score, the smaller the weight. As in mitigation.py, every product and
  * every sum is rounded: volatile prevents the compiler from fusing them. */
-static void grade(const uwb_model *model, float range_m, float offset_m, float error_m, float score,
+static void write_corrected(const uwb_model *model, float range_m, float offset_m, float error_m, float score,
                   uwb_corrected *corrected) {
     const volatile float square = error_m * error_m;
     const volatile float growth = model->variance_per_m2 * square;
@@ -177,20 +177,21 @@ uwb_status uwb_correct(const uwb_model *model, float range_m, float offset_m, co
     }
     float error_m = 0.0f;
     float score = 0.0f;
-    const float less_m = offset_m != 0.0f ? range_m - offset_m : range_m;
-    const uwb_status status = predict(model, less_m, cir, arena, arena_bytes, &error_m, &score);
+    const float offset_range_m = offset_m != 0.0f ? range_m - offset_m : range_m;
+    const uwb_status status = predict(model, offset_range_m, cir, arena, arena_bytes, &error_m, &score);
     corrected->status = range_status(status);
     if (status == UWB_OK) {
-        grade(model, range_m, offset_m, error_m, score, corrected);
+        write_corrected(model, range_m, offset_m, error_m, score, corrected);
     } else {
-        const int valid = model != NULL && in_limits(less_m, 0.0f, MAX_RANGE_M);
-        corrected->range_m = less_m;
+        const int valid = model != NULL && in_limits(offset_range_m, 0.0f, MAX_RANGE_M);
+        corrected->range_m = offset_range_m;
         corrected->correction_m = offset_m;
         /* Without an offset the variance contains the offsets of the training boards. */
         const int calibrated = status == UWB_EMPTY && offset_m != 0.0f;
-        corrected->variance_m2 = !valid       ? INFINITY
-                                 : calibrated ? model->variance_m2
-                                              : model->variance_uncorrected_m2;
+        corrected->variance_m2 = INFINITY;
+        if (valid) {
+            corrected->variance_m2 = calibrated ? model->variance_m2 : model->variance_uncorrected_m2;
+        }
     }
     return status;
 }

@@ -9,14 +9,20 @@ static const struct {
     uint32_t tx_control;
     uint32_t power[2];
     uint8_t number, pll_tune, pulse_delay, rx_control;
-    uint8_t codes[2], codes_per_prf;
+    uint8_t codes[2]; /* the first preamble code */
 } channels[] = {
-    {0x09000407, 0x00005C40, {0x15355575, 0x07274767}, 1, 0x1E, 0xC9, 0xD8, {1, 9}, 2},
-    {0x08400508, 0x00045CA0, {0x15355575, 0x07274767}, 2, 0x26, 0xC2, 0xD8, {3, 9}, 2},
-    {0x08401009, 0x00086CC0, {0x0F2F4F6F, 0x2B4B6B8B}, 3, 0x56, 0xC5, 0xD8, {5, 9}, 2},
-    {0x08400508, 0x00045C80, {0x1F1F3F5F, 0x3A5A7A9A}, 4, 0x26, 0x95, 0xBC, {7, 17}, 2},
-    {0x0800041D, 0x001E3FE3, {0x0E082848, 0x25456585}, 5, 0xBE, 0xB5, 0xD8, {3, 9}, 2},
-    {0x0800041D, 0x001E7DE0, {0x32527292, 0x5171B1D1}, 7, 0xBE, 0x93, 0xBC, {7, 17}, 2},
+    {.number = 1, .pll_config = 0x09000407, .pll_tune = 0x1E, .tx_control = 0x00005C40, .rx_control = 0xD8,
+     .pulse_delay = 0xC9, .power = {0x15355575, 0x07274767}, .codes = {1, 9}},
+    {.number = 2, .pll_config = 0x08400508, .pll_tune = 0x26, .tx_control = 0x00045CA0, .rx_control = 0xD8,
+     .pulse_delay = 0xC2, .power = {0x15355575, 0x07274767}, .codes = {3, 9}},
+    {.number = 3, .pll_config = 0x08401009, .pll_tune = 0x56, .tx_control = 0x00086CC0, .rx_control = 0xD8,
+     .pulse_delay = 0xC5, .power = {0x0F2F4F6F, 0x2B4B6B8B}, .codes = {5, 9}},
+    {.number = 4, .pll_config = 0x08400508, .pll_tune = 0x26, .tx_control = 0x00045C80, .rx_control = 0xBC,
+     .pulse_delay = 0x95, .power = {0x1F1F3F5F, 0x3A5A7A9A}, .codes = {7, 17}},
+    {.number = 5, .pll_config = 0x0800041D, .pll_tune = 0xBE, .tx_control = 0x001E3FE3, .rx_control = 0xD8,
+     .pulse_delay = 0xB5, .power = {0x0E082848, 0x25456585}, .codes = {3, 9}},
+    {.number = 7, .pll_config = 0x0800041D, .pll_tune = 0xBE, .tx_control = 0x001E7DE0, .rx_control = 0xBC,
+     .pulse_delay = 0x93, .power = {0x32527292, 0x5171B1D1}, .codes = {7, 17}},
 };
 
 static const struct {
@@ -38,12 +44,13 @@ static const uint16_t replica[24] = {
     0x3AE0, 0x35C2, 0x2B84, 0x35C2, 0x3332, 0x35C2, 0x35C2, 0x47AE, 0x3AE0, 0x3850, 0x30A2, 0x3850,
 };
 
-const uwb_dw1000_settings uwb_dw1000_defaults = {5, 64, 0, 0, 6800, 128, 0, 0, 0};
+const uwb_dw1000_settings uwb_dw1000_defaults = {
+    .channel = 5, .prf_mhz = 64, .rate_kbps = 6800, .preamble = 128};
 
 #define COUNT(array) (sizeof(array) / sizeof(array)[0])
 
 /* Indices in the tables above; the number of entries if the value is not in the table. */
-static size_t channel_at(const uwb_dw1000_settings *settings) {
+static size_t channel_index(const uwb_dw1000_settings *settings) {
     size_t i = 0;
     while (i < COUNT(channels) && channels[i].number != settings->channel) {
         i++;
@@ -51,7 +58,7 @@ static size_t channel_at(const uwb_dw1000_settings *settings) {
     return i;
 }
 
-static size_t preamble_at(const uwb_dw1000_settings *settings) {
+static size_t preamble_index(const uwb_dw1000_settings *settings) {
     size_t i = 0;
     while (i < COUNT(preambles) && preambles[i].symbols != settings->preamble) {
         i++;
@@ -59,7 +66,7 @@ static size_t preamble_at(const uwb_dw1000_settings *settings) {
     return i;
 }
 
-static size_t rate_at(const uwb_dw1000_settings *settings) {
+static size_t rate_index(const uwb_dw1000_settings *settings) {
     size_t i = 0;
     while (i < COUNT(rates) && rates[i] != settings->rate_kbps) {
         i++;
@@ -68,7 +75,7 @@ static size_t rate_at(const uwb_dw1000_settings *settings) {
 }
 
 /* Two codes for each channel at 16 MHz, four at 64 MHz. */
-static int valid_code(const uwb_dw1000_settings *settings, size_t channel) {
+static int is_valid_code(const uwb_dw1000_settings *settings, size_t channel) {
     const int fast = settings->prf_mhz == 64;
     const uint8_t first = channels[channel].codes[fast];
     return settings->preamble_code == 0 ||
@@ -76,18 +83,18 @@ static int valid_code(const uwb_dw1000_settings *settings, size_t channel) {
 }
 
 int uwb_dw1000_settings_valid(const uwb_dw1000_settings *settings) {
-    const size_t channel = channel_at(settings);
-    return channel < COUNT(channels) && preamble_at(settings) < COUNT(preambles) && rate_at(settings) < COUNT(rates) &&
+    const size_t channel = channel_index(settings);
+    return channel < COUNT(channels) && preamble_index(settings) < COUNT(preambles) && rate_index(settings) < COUNT(rates) &&
            (settings->prf_mhz == 16 || settings->prf_mhz == 64) && settings->decawave_sfd <= 1 &&
-           settings->antenna_delay <= 0x1FFFEu && valid_code(settings, channel);
+           settings->antenna_delay <= 0x1FFFEu && is_valid_code(settings, channel);
 }
 
 uint32_t uwb_dw1000_sfd_symbols(const uwb_dw1000_settings *settings) {
-    return sfd_symbols[settings->decawave_sfd][rate_at(settings)];
+    return sfd_symbols[settings->decawave_sfd][rate_index(settings)];
 }
 
-/* Duration of preamble and SFD. */
-static uint32_t lead_us(const uwb_dw1000_settings *settings) {
+/* Duration of preamble and SFD, us. */
+static uint32_t preamble_us(const uwb_dw1000_settings *settings) {
     const double symbol_us = settings->prf_mhz == 16 ? 0.99359 : 1.01763;
     return (uint32_t)((settings->preamble + uwb_dw1000_sfd_symbols(settings)) * symbol_us) + 1u;
 }
@@ -96,8 +103,13 @@ uint32_t uwb_dw1000_airtime_us(const uwb_dw1000_settings *settings, size_t bytes
     const uint32_t bits = 8u * (uint32_t)(bytes + 2);
     const uint32_t coded = bits + 48u * ((bits + 329u) / 330u); /* Reed-Solomon */
     const double header_us = settings->rate_kbps == 110 ? 21 * 8.20513 : 21 * 1.02564;
-    const double bit_us = settings->rate_kbps == 110 ? 8.20513 : settings->rate_kbps == 850 ? 1.02564 : 0.128205;
-    return lead_us(settings) + (uint32_t)(header_us + coded * bit_us) + 1u;
+    double bit_us = 0.128205;
+    if (settings->rate_kbps == 110) {
+        bit_us = 8.20513;
+    } else if (settings->rate_kbps == 850) {
+        bit_us = 1.02564;
+    }
+    return preamble_us(settings) + (uint32_t)(header_us + coded * bit_us) + 1u;
 }
 
 /* TX plus RX antenna delay in the OTP memory; 0 = not programmed. A TREK1000 kit (OTP revision 2 or 3) has a delay per
@@ -116,7 +128,7 @@ static uint32_t otp_antenna_delay(const uwb_dw1000 *chip, const uwb_dw1000_setti
 }
 
 /* The complete settings: zeros are replaced by OTP values or defaults. */
-static uwb_dw1000_settings resolve(const uwb_dw1000 *chip, const uwb_dw1000_settings *settings, size_t channel) {
+static uwb_dw1000_settings resolve_settings(const uwb_dw1000 *chip, const uwb_dw1000_settings *settings, size_t channel) {
     uwb_dw1000_settings resolved = *settings;
     const int fast = settings->prf_mhz == 64;
     const uint32_t power = chip->otp_tx_power[2 * channel + (size_t)fast];
@@ -133,10 +145,14 @@ static uwb_dw1000_settings resolve(const uwb_dw1000 *chip, const uwb_dw1000_sett
     return resolved;
 }
 
+/* DRX_TUNE2 by preamble acquisition chunk and PRF. */
 static uint32_t drx_tune2(uint8_t pac, int fast) {
     static const uint32_t values[4][2] = {
         {0x311A002D, 0x313B006B}, {0x331A0052, 0x333B00BE}, {0x351A009A, 0x353B015E}, {0x371A011D, 0x373B0296}};
-    const size_t row = pac == 8 ? 0 : pac == 16 ? 1 : pac == 32 ? 2 : 3;
+    size_t row = 0; /* for 8, 16, 32, 64 symbols */
+    while (8u << row < pac) {
+        row++;
+    }
     return values[row][fast];
 }
 
@@ -145,8 +161,8 @@ uwb_dw1000_status uwb_dw1000_configure(uwb_dw1000 *chip, const uwb_dw1000_settin
         return UWB_DW1000_BAD_ARGUMENT;
     }
     DW1000_TRY(uwb_dw1000_idle(chip));
-    const size_t channel = channel_at(settings), rate = rate_at(settings), preamble = preamble_at(settings);
-    const uwb_dw1000_settings now = resolve(chip, settings, channel);
+    const size_t channel = channel_index(settings), rate = rate_index(settings), preamble = preamble_index(settings);
+    const uwb_dw1000_settings now = resolve_settings(chip, settings, channel);
     const uint32_t fast = now.prf_mhz == 64, number = now.channel, sfd = now.decawave_sfd, code = now.preamble_code;
     const uint32_t symbols = sfd_symbols[sfd][rate], pac = preambles[preamble].pac;
     const uint32_t repeat = replica[code - 1] / (rate == 0 ? 8u : 1u);
@@ -157,6 +173,10 @@ uwb_dw1000_status uwb_dw1000_configure(uwb_dw1000 *chip, const uwb_dw1000_settin
      * octets 1 and 2 apply to PHR and data of any length, so that all octets get the level of long frames. */
     const int smart = now.rate_kbps == 6800;
     const uint32_t power = smart ? now.tx_power : (now.tx_power & 0xFFu) * 0x01010101u;
+    uint32_t drx_tune1b = now.preamble == 64 ? 0x0010u : 0x0020u;
+    if (rate == 0) {
+        drx_tune1b = 0x0064u;
+    }
     chip->sys_cfg = HIRQ_POL | DIS_DRXB | (smart ? 0 : DIS_STXP) | (rate == 0 ? RXM110K : 0);
     chip->wait_units = 0;
     chip->tx_bytes = 0;
@@ -170,7 +190,7 @@ uwb_dw1000_status uwb_dw1000_configure(uwb_dw1000 *chip, const uwb_dw1000_settin
         {AGC_TUNE3, 2, 0x0035},
         {DRX_TUNE0B, 2, sfd_tune[sfd][rate]},
         {DRX_TUNE1A, 2, fast ? 0x008Du : 0x0087u},
-        {DRX_TUNE1B, 2, rate == 0 ? 0x0064u : now.preamble == 64 ? 0x0010u : 0x0020u},
+        {DRX_TUNE1B, 2, drx_tune1b},
         {DRX_TUNE2, 4, drx_tune2(preambles[preamble].pac, (int)fast)},
         {DRX_SFDTOC, 2, now.preamble + 1u + symbols - pac},
         {DRX_TUNE4H, 2, now.preamble == 64 ? 0x0010u : 0x0028u},
@@ -205,9 +225,9 @@ uwb_dw1000_status uwb_dw1000_check(uwb_dw1000 *chip) {
 }
 
 enum {
-    RESET_PULSE_SETTLES_US = 5000,
+    RESET_SETTLE_US = 5000,
     SOFT_RESET_US = 20,
-    LDE_LOAD_US = 300, /* the manual asks for 150 */
+    LDE_LOAD_US = 300, /* the manual requires 150 */
     CLOCK_LOCK_US = 5000,
     XTI = 1 /* SYSCLKS: the crystal, 19.2 MHz */
 };
@@ -220,7 +240,7 @@ enum { OTP_EUI = 0, OTP_LDOTUNE = 4, OTP_PART = 6, OTP_VOLTAGE = 8, OTP_TEMPERAT
 static const uint8_t otp_trek_delay[4] = {0x0D, 0x0E, 0x0F, 0x1D};
 
 static uwb_dw1000_status soft_reset(uwb_dw1000 *chip) {
-    /* User Manual, 7.2.50.1: on the crystal, with the sequencing and what would survive in the AON block switched off. */
+    /* User Manual, 7.2.50.1: use the crystal, and disable the sequencing and the stored configuration of the AON block. */
     static const uwb_dw1000_entry before[] = {
         {PMSC_CTRL0, 1, XTI}, {PMSC_CTRL1, 2, 0}, {AON_WCFG, 2, 0}, {AON_CFG0, 1, 0},
         {AON_CTRL, 1, 0},     {AON_CTRL, 1, 2},   {PMSC_SOFTRESET, 1, 0}, {0, 0, 0},
@@ -228,10 +248,11 @@ static uwb_dw1000_status soft_reset(uwb_dw1000 *chip) {
     DW1000_TRY(uwb_dw1000_write_list(chip, before));
     chip->io.sleep(chip->io.context, SOFT_RESET_US);
     DW1000_TRY(uwb_dw1000_set(chip, PMSC_SOFTRESET, 1, 0xF0));
-    chip->io.sleep(chip->io.context, RESET_PULSE_SETTLES_US);
+    chip->io.sleep(chip->io.context, RESET_SETTLE_US);
     return UWB_DW1000_OK;
 }
 
+/* Read DEV_ID, up to three times. */
 static uwb_dw1000_status identify(uwb_dw1000 *chip) {
     for (int attempt = 0; attempt < 3; attempt++) {
         uint64_t device;
@@ -244,7 +265,7 @@ static uwb_dw1000_status identify(uwb_dw1000 *chip) {
     return UWB_DW1000_ABSENT;
 }
 
-/* One word of the OTP memory; on the crystal's clock only. */
+/* Read one word of the OTP memory; works only with the clock of the crystal. */
 static uwb_dw1000_status read_otp(uwb_dw1000 *chip, uint32_t address, uint32_t *word) {
     uint64_t value;
     const uwb_dw1000_entry steps[] = {{OTP_ADDR, 2, address}, {OTP_CTRL, 1, 3}, {OTP_CTRL, 1, 1}, {0, 0, 0}};
@@ -255,18 +276,19 @@ static uwb_dw1000_status read_otp(uwb_dw1000 *chip, uint32_t address, uint32_t *
 }
 
 /* Memory that was never programmed reads as zeros, and on some modules as ones. */
-static int programmed(uint64_t value, uint64_t ones) {
+static int is_programmed(uint64_t value, uint64_t ones) {
     return value != 0 && value != ones;
 }
 
-static uwb_dw1000_status read_memory(uwb_dw1000 *chip) {
+/* Read address, antenna delays, powers and sensor references; load LDO tune and crystal trim. */
+static uwb_dw1000_status read_otp_memory(uwb_dw1000 *chip) {
     uint32_t eui[2], lot[2], word;
     for (uint32_t i = 0; i < 2; i++) {
         DW1000_TRY(read_otp(chip, OTP_EUI + i, &eui[i]));
         DW1000_TRY(read_otp(chip, OTP_PART + i, &lot[i]));
     }
     chip->eui = (uint64_t)eui[1] << 32 | eui[0];
-    if (!programmed(chip->eui, UINT64_MAX)) {
+    if (!is_programmed(chip->eui, UINT64_MAX)) {
         chip->eui = (uint64_t)lot[1] << 32 | lot[0];
     }
     DW1000_TRY(read_otp(chip, OTP_ANTENNA_DELAY, &chip->otp_antenna_delay));
@@ -291,7 +313,7 @@ static uwb_dw1000_status read_memory(uwb_dw1000 *chip) {
     return uwb_dw1000_set(chip, FS_XTALT, 1, 0x60u | trim);
 }
 
-/* Without its microcode the leading-edge detector gives no stamps (User Manual, 2.5.5.10). */
+/* Load the microcode of the leading-edge detector, which timestamps need (User Manual, 2.5.5.10). */
 static uwb_dw1000_status load_leading_edge_detector(uwb_dw1000 *chip) {
     static const uwb_dw1000_entry begin[] = {
         {PMSC_CTRL0, 1, 0x01}, {PMSC_CTRL0 + 1, 1, 0x03}, {OTP_CTRL, 2, 0x8000}, {0, 0, 0}};
@@ -300,8 +322,8 @@ static uwb_dw1000_status load_leading_edge_detector(uwb_dw1000 *chip) {
     return UWB_DW1000_OK;
 }
 
-/* Give the clock back to the chip and wait until the PLL has locked. CPLOCK is not reliable (errata): without it the
- * start goes on, with a warning. */
+/* Return the clock control to the chip and wait until the PLL has locked. CPLOCK is not reliable (errata): if it is
+ * missing, the start continues with a warning. */
 static uwb_dw1000_status start_clock(uwb_dw1000 *chip) {
     static const uwb_dw1000_entry automatic[] = {
         {SYS_STATUS, 4, (uint32_t)CPLOCK}, {PMSC_CTRL0, 1, 0x00}, {PMSC_CTRL0 + 1, 1, 0x02}, {AON_CFG1, 2, 0},
@@ -328,7 +350,7 @@ uwb_dw1000_status uwb_dw1000_start(uwb_dw1000 *chip, const uwb_dw1000_io *io, co
     io->speed(io->context, 0);
     if (io->reset != NULL) {
         io->reset(io->context);
-        io->sleep(io->context, RESET_PULSE_SETTLES_US);
+        io->sleep(io->context, RESET_SETTLE_US);
         DW1000_TRY(identify(chip));
     } else {
         DW1000_TRY(identify(chip));
@@ -336,7 +358,7 @@ uwb_dw1000_status uwb_dw1000_start(uwb_dw1000 *chip, const uwb_dw1000_io *io, co
     }
     DW1000_TRY(uwb_dw1000_set(chip, PMSC_CTRL0, 1, XTI));
     DW1000_TRY(uwb_dw1000_set(chip, EC_CTRL, 1, 4)); /* PLLLDT: makes CPLOCK valid */
-    DW1000_TRY(read_memory(chip));
+    DW1000_TRY(read_otp_memory(chip));
     DW1000_TRY(load_leading_edge_detector(chip));
     DW1000_TRY(start_clock(chip));
     io->speed(io->context, 1);

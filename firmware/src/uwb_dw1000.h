@@ -57,7 +57,7 @@ typedef struct {
     uint16_t preamble;       /* symbols: 64, 128, 256, 512, 1024, 1536, 2048, 4096 */
     uint32_t tx_power;       /* TX_POWER in smart-power format, as in the OTP memory: from the lowest octet on for frames
                               * of any length, up to 500, 250 and 125 us; below 6.8 Mbit/s the lowest octet is used for
-                              * all. 0 = the OTP memory's value, or the manual's if not programmed */
+                              * all. 0 = the OTP memory's value, or the manual's if not is_programmed */
     uint32_t antenna_delay;  /* ticks of transmitter and receiver together; 0 = as in the OTP memory, else nominal */
     uint8_t anchor;          /* take a TREK1000 board's antenna delay as an anchor, not as a tag */
 } uwb_dw1000_settings;
@@ -83,7 +83,7 @@ typedef struct {
     uint32_t sys_cfg;
     uint32_t tx_fctrl;   /* but for the length */
     uint8_t tx_bytes;    /* the length that it has; 0 = none yet */
-    uint64_t quiet_until_us; /* smart power is legal for one frame per millisecond */
+    uint64_t next_send_us; /* smart power is legal for one frame per millisecond */
 } uwb_dw1000;
 
 /* A frame that was received, without its check sequence. */
@@ -152,7 +152,7 @@ uwb_dw1000_status uwb_dw1000_listen(uwb_dw1000 *chip, uint32_t for_us);
 uwb_dw1000_status uwb_dw1000_receive(uwb_dw1000 *chip, uwb_dw1000_frame *frame, uint64_t until_us);
 
 /* As TIMEOUT if nothing has been received by `until_us`, but leaves the receiver on. */
-uwb_dw1000_status uwb_dw1000_receive_stay_on(uwb_dw1000 *chip, uwb_dw1000_frame *frame, uint64_t until_us);
+uwb_dw1000_status uwb_dw1000_receive_keep_on(uwb_dw1000 *chip, uwb_dw1000_frame *frame, uint64_t until_us);
 
 /* Turn transmitter and receiver off. */
 uwb_dw1000_status uwb_dw1000_idle(uwb_dw1000 *chip);

@@ -3,7 +3,7 @@
 enum { WRITE = 0x80, SUB_ADDRESS = 0x40, EXTENDED = 0x80 };
 
 /* The header of a transaction: 1 to 3 octets (User Manual, 2.2.1). */
-static size_t header_of(uint32_t at, uint8_t write, uint8_t *header) {
+static size_t encode_header(uint32_t at, uint8_t write, uint8_t *header) {
     const uint32_t sub = at & 0xFFFFu;
     header[0] = (uint8_t)(write | at >> 16);
     if (sub == 0) {
@@ -21,14 +21,14 @@ static size_t header_of(uint32_t at, uint8_t write, uint8_t *header) {
 
 uwb_dw1000_status uwb_dw1000_read(uwb_dw1000 *chip, uint32_t at, uint8_t *octets, size_t bytes) {
     uint8_t header[3];
-    const size_t length = header_of(at, 0, header);
+    const size_t length = encode_header(at, 0, header);
     return chip->io.transfer(chip->io.context, header, length, NULL, octets, bytes) == 0 ? UWB_DW1000_OK
                                                                                          : UWB_DW1000_BUS;
 }
 
 uwb_dw1000_status uwb_dw1000_write(uwb_dw1000 *chip, uint32_t at, const uint8_t *octets, size_t bytes) {
     uint8_t header[3];
-    const size_t length = header_of(at, WRITE, header);
+    const size_t length = encode_header(at, WRITE, header);
     return chip->io.transfer(chip->io.context, header, length, octets, NULL, bytes) == 0 ? UWB_DW1000_OK
                                                                                          : UWB_DW1000_BUS;
 }

@@ -8,8 +8,8 @@ enum { RX_CLOCK_PLL = 0x48, AMCE = 0x80, CTRL0_DEFAULT = 0x02 };
 /* The manual says 2.5 us, but that is too short while the PLL clocks the chip. */
 enum { SENSORS_US = 1000 };
 
-/* What the SFD adds to RXPACC where the count did not saturate (User Manual, table 18). */
-static uint16_t sfd_part(const uwb_dw1000_settings *settings) {
+/* Symbols of the SFD that RXPACC contains if it is not saturated (User Manual, table 18). */
+static uint16_t sfd_preamble_count(const uwb_dw1000_settings *settings) {
     switch (uwb_dw1000_sfd_symbols(settings)) {
     case 8:
         return settings->decawave_sfd ? 10 : 5;
@@ -33,7 +33,7 @@ uwb_dw1000_status uwb_dw1000_read_quality(uwb_dw1000 *chip, const uwb_dw1000_fra
     quality->power = (uint16_t)uwb_dw1000_from_little_endian(fqual + 6, 2);
     quality->noise_threshold = (uint16_t)threshold;
 
-    const uint16_t sfd = sfd_part(&chip->settings);
+    const uint16_t sfd = sfd_preamble_count(&chip->settings);
     uint16_t count = frame->preamble_count;
     if (count == unsaturated && count > sfd) {
         count = (uint16_t)(count - sfd);
@@ -79,7 +79,8 @@ uwb_dw1000_status uwb_dw1000_read_sensors(uwb_dw1000 *chip, float *temperature, 
 
 float uwb_dw1000_true_power_dbm(float rx_power_dbm, uint8_t prf_mhz) {
     const float over = rx_power_dbm + 88;
-    return over <= 0 ? rx_power_dbm : rx_power_dbm + over * (prf_mhz == 16 ? 2.3334f : 1.1667f);
+    const float slope = prf_mhz == 16 ? 2.3334f : 1.1667f;
+    return over <= 0 ? rx_power_dbm : rx_power_dbm + over * slope;
 }
 
 float uwb_dw1000_range_bias_m(float true_power_dbm, uint8_t channel, uint8_t prf_mhz) {
@@ -92,9 +93,10 @@ float uwb_dw1000_range_bias_m(float true_power_dbm, uint8_t channel, uint8_t prf
     };
     const int wide = channel == 4 || channel == 7;
     const int16_t *const row = bias[wide][prf_mhz == 64];
-    float place = (true_power_dbm + 61) * -0.5f;
-    place = place > 0 ? (place < 17 ? place : 17) : 0; /* NaN too */
-    const int below = place < 16 ? (int)place : 16;
-    const float mm = (float)row[below] + (place - (float)below) * (float)(row[below + 1] - row[below]);
+    float position = (true_power_dbm + 61) * -0.5f;
+    position = position > 0 ? position : 0; /* 0 for NaN */
+    position = position < 17 ? position : 17;
+    const int below = position < 16 ? (int)position : 16;
+    const float mm = (float)row[below] + (position - (float)below) * (float)(row[below + 1] - row[below]);
     return mm * (wide ? 0.002f : 0.001f);
 }

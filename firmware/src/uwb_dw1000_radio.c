@@ -1,6 +1,6 @@
 #include "uwb_dw1000_registers.h"
 
-enum { TX_CLOCK_PLL = 2 << 4, POLL_US = 100, LONGEST_WAIT_US = 60000, SMART_POWER_US = 1000 };
+enum { TX_CLOCK_PLL = 2 << 4, POLL_US = 100, MAX_TIMEOUT_US = 60000, SMART_POWER_US = 1000 };
 static const double WAIT_UNIT_US = 512 / 499.2;
 
 uwb_dw1000_status uwb_dw1000_idle(uwb_dw1000 *chip) {
@@ -43,8 +43,8 @@ uwb_dw1000_status uwb_dw1000_release_clock(uwb_dw1000 *chip) {
 }
 
 /* Set the receiver's own timeout; write it only if it has changed. */
-static uwb_dw1000_status set_time_out(uwb_dw1000 *chip, uint32_t for_us) {
-    const uint32_t units = for_us < LONGEST_WAIT_US ? (uint32_t)(for_us / WAIT_UNIT_US) + 1u : 0;
+static uwb_dw1000_status set_timeout(uwb_dw1000 *chip, uint32_t for_us) {
+    const uint32_t units = for_us < MAX_TIMEOUT_US ? (uint32_t)(for_us / WAIT_UNIT_US) + 1u : 0;
     const uint32_t sys_cfg = units != 0 ? chip->sys_cfg | RXWTOE : chip->sys_cfg & ~RXWTOE;
     if (units != 0 && units != chip->wait_units) {
         DW1000_TRY(uwb_dw1000_set(chip, RX_FWTO, 2, units));
@@ -57,7 +57,7 @@ static uwb_dw1000_status set_time_out(uwb_dw1000 *chip, uint32_t for_us) {
     return UWB_DW1000_OK;
 }
 
-static uwb_dw1000_status prepare(uwb_dw1000 *chip, const uint8_t *octets, size_t bytes, uint32_t answer_us) {
+static uwb_dw1000_status prepare_frame(uwb_dw1000 *chip, const uint8_t *octets, size_t bytes, uint32_t answer_us) {
     if (bytes + 2 > UWB_DW1000_MAX_FRAME_BYTES) {
         return UWB_DW1000_BAD_ARGUMENT;
     }
@@ -65,7 +65,7 @@ static uwb_dw1000_status prepare(uwb_dw1000 *chip, const uint8_t *octets, size_t
         DW1000_TRY(uwb_dw1000_idle(chip)); /* TXSTRT would be ignored */
     }
     if (answer_us != 0) {
-        DW1000_TRY(set_time_out(chip, answer_us));
+        DW1000_TRY(set_timeout(chip, answer_us));
     }
     DW1000_TRY(uwb_dw1000_write(chip, TX_BUFFER, octets, bytes));
     if (chip->tx_bytes != bytes) {
@@ -76,10 +76,10 @@ static uwb_dw1000_status prepare(uwb_dw1000 *chip, const uint8_t *octets, size_t
 }
 
 uwb_dw1000_status uwb_dw1000_send(uwb_dw1000 *chip, const uint8_t *octets, size_t bytes, uint32_t answer_us) {
-    DW1000_TRY(prepare(chip, octets, bytes, answer_us));
+    DW1000_TRY(prepare_frame(chip, octets, bytes, answer_us));
     const uint64_t now_us = chip->io.now_us(chip->io.context);
-    if (now_us < chip->quiet_until_us) {
-        chip->io.sleep(chip->io.context, (uint32_t)(chip->quiet_until_us - now_us));
+    if (now_us < chip->next_send_us) {
+        chip->io.sleep(chip->io.context, (uint32_t)(chip->next_send_us - now_us));
     }
     DW1000_TRY(uwb_dw1000_set(chip, SYS_CTRL, 1, TXSTRT | (answer_us != 0 ? WAIT4RESP : 0)));
     chip->listening = answer_us != 0;
@@ -93,7 +93,7 @@ uint64_t uwb_dw1000_tx_stamp(const uwb_dw1000 *chip, uint64_t at) {
 uwb_dw1000_status uwb_dw1000_send_at(uwb_dw1000 *chip, const uint8_t *octets, size_t bytes, uint64_t stamp,
                                      uint32_t answer_us) {
     uint64_t status;
-    DW1000_TRY(prepare(chip, octets, bytes, answer_us));
+    DW1000_TRY(prepare_frame(chip, octets, bytes, answer_us));
     DW1000_TRY(uwb_dw1000_set(chip, DX_TIME, 5, (stamp - chip->tx_antenna_delay) & UWB_DW1000_TICK_MASK));
     DW1000_TRY(uwb_dw1000_force_clock(chip));
     DW1000_TRY(uwb_dw1000_set(chip, SYS_CTRL, 1, TXSTRT | TXDLYS | (answer_us != 0 ? WAIT4RESP : 0)));
@@ -124,7 +124,7 @@ uwb_dw1000_status uwb_dw1000_await_sent(uwb_dw1000 *chip, uint64_t until_us, uin
         chip->io.wait(chip->io.context, until_us - now_us < POLL_US ? until_us : now_us + POLL_US);
     }
     if ((chip->sys_cfg & DIS_STXP) == 0) {
-        chip->quiet_until_us = chip->io.now_us(chip->io.context) + SMART_POWER_US;
+        chip->next_send_us = chip->io.now_us(chip->io.context) + SMART_POWER_US;
     }
     /* A delayed frame would leave TXFRS set until it starts, and it would pass for that frame's. */
     DW1000_TRY(uwb_dw1000_set(chip, SYS_STATUS, 4, TX_BITS));
@@ -135,7 +135,7 @@ uwb_dw1000_status uwb_dw1000_listen(uwb_dw1000 *chip, uint32_t for_us) {
     if (chip->listening) {
         DW1000_TRY(uwb_dw1000_idle(chip));
     }
-    DW1000_TRY(set_time_out(chip, for_us));
+    DW1000_TRY(set_timeout(chip, for_us));
     DW1000_TRY(uwb_dw1000_set(chip, SYS_CTRL, 2, RXENAB));
     chip->listening = 1;
     return UWB_DW1000_OK;
@@ -164,7 +164,7 @@ static uwb_dw1000_status read_frame(uwb_dw1000 *chip, uwb_dw1000_frame *frame) {
 }
 
 /* TIMEOUT with the receiver still on if nothing happens by `until_us`. */
-uwb_dw1000_status uwb_dw1000_receive_stay_on(uwb_dw1000 *chip, uwb_dw1000_frame *frame, uint64_t until_us) {
+uwb_dw1000_status uwb_dw1000_receive_keep_on(uwb_dw1000 *chip, uwb_dw1000_frame *frame, uint64_t until_us) {
     for (;;) {
         uint64_t status;
         DW1000_TRY(uwb_dw1000_get(chip, SYS_STATUS, 4, &status));
@@ -197,7 +197,7 @@ uwb_dw1000_status uwb_dw1000_receive_stay_on(uwb_dw1000 *chip, uwb_dw1000_frame 
 }
 
 uwb_dw1000_status uwb_dw1000_receive(uwb_dw1000 *chip, uwb_dw1000_frame *frame, uint64_t until_us) {
-    const uwb_dw1000_status status = uwb_dw1000_receive_stay_on(chip, frame, until_us);
+    const uwb_dw1000_status status = uwb_dw1000_receive_keep_on(chip, frame, until_us);
     if (status == UWB_DW1000_TIMEOUT && chip->listening) {
         DW1000_TRY(uwb_dw1000_idle(chip));
     }

@@ -6,8 +6,8 @@
  *     layer input and output:  slot of position p = p % 8
  *     residual sum:            even positions first: slot = (p % 8) / 2 + 4 * (p % 2)
  *
- * Position -1, and `length` if the layer reads it, must hold zeros. Kernels compute whole blocks:
- * what they write past `length` is of no meaning and must not be read as a value. */
+ * Position -1, and `length` if the layer reads it, must contain zeros. Kernels compute complete blocks: values that they
+ * write after `length` are undefined. */
 #ifndef UWB_KERNELS_H
 #define UWB_KERNELS_H
 
@@ -48,7 +48,8 @@ static inline int32_t uwb_weight(const int8_t *weights, uint32_t index, uint32_t
 }
 
 static inline int32_t uwb_clip(int64_t value) {
-    return (int32_t)(value < 0 ? 0 : value > 255 ? 255 : value);
+    const int64_t at_most = value > 255 ? 255 : value;
+    return (int32_t)(value < 0 ? 0 : at_most);
 }
 
 /* Right shifts of negative values: arithmetic on every compiler this runs on; C leaves it to them. */

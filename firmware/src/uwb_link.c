@@ -19,10 +19,10 @@ static uint32_t crc32(uint32_t crc, const void *data, size_t bytes) {
     return ~crc;
 }
 
-/* COBS adds at most a delimiter, a first code and one more for each 254 bytes: fewer than UWB_WIRE_LEAD, so that
+/* COBS adds at most a delimiter, a first code and one more for each 254 bytes: fewer than UWB_WIRE_HEADROOM, so that
  * nothing is written over before it is read. */
 size_t uwb_encode_frame(uint8_t *wire, size_t payload_bytes) {
-    uint8_t *const from = wire + UWB_WIRE_LEAD;
+    uint8_t *const from = wire + UWB_WIRE_HEADROOM;
     const size_t checked = UWB_HEADER_BYTES + payload_bytes;
     const uint32_t crc = crc32(0, from, checked);
     memcpy(from + checked, &crc, sizeof crc);
@@ -31,13 +31,13 @@ size_t uwb_encode_frame(uint8_t *wire, size_t payload_bytes) {
     wire[to++] = 0; /* terminates preceding noise */
     size_t code_at = to++;
     uint8_t code = 1;
-    int open = 1; /* whether a block is being written, whose length goes to code_at */
+    int block_open = 1; /* whether a block is being written, whose length goes to code_at */
     for (size_t i = 0; i < checked + sizeof crc; i++) {
         const uint8_t byte = from[i];
-        if (!open) {
+        if (!block_open) {
             code_at = to++;
             code = 1;
-            open = 1;
+            block_open = 1;
         }
         if (byte == 0) {
             wire[code_at] = code;
@@ -49,10 +49,10 @@ size_t uwb_encode_frame(uint8_t *wire, size_t payload_bytes) {
         code++;
         if (code == 0xFF) {
             wire[code_at] = code;
-            open = 0;
+            block_open = 0;
         }
     }
-    if (open) {
+    if (block_open) {
         wire[code_at] = code;
     }
     wire[to++] = 0;
@@ -62,15 +62,16 @@ size_t uwb_encode_frame(uint8_t *wire, size_t payload_bytes) {
 /* The CRC-32 of any message followed by its own CRC is this. */
 static const uint32_t CRC_RESIDUE = 0x2144DF1Cu;
 
-static void store(uwb_decoder *decoder, uint8_t byte) {
+/* Append a decoded byte; bytes beyond the longest frame are counted and discarded. */
+static void store_byte(uwb_decoder *decoder, uint8_t byte) {
     if (decoder->decoded < UWB_MAX_FRAME_BYTES) {
         decoder->body.bytes[decoder->decoded] = byte;
     }
     decoder->decoded++;
 }
 
-/* A segment between two delimiters is complete. */
-static int32_t finish(uwb_decoder *decoder, uwb_header_t *header) {
+/* Check the segment between two delimiters; returns the bytes of payload, or -1 if it is no intact frame. */
+static int32_t finish_frame(uwb_decoder *decoder, uwb_header_t *header) {
     const size_t length = decoder->decoded;
     if (decoder->remaining != 0) {
         decoder->bad_cobs++;
@@ -95,7 +96,7 @@ static int32_t finish(uwb_decoder *decoder, uwb_header_t *header) {
 
 int32_t uwb_decoder_push(uwb_decoder *decoder, uint8_t byte, uwb_header_t *header) {
     if (byte == 0) {
-        const int32_t payload = decoder->encoded != 0 && !decoder->overrun ? finish(decoder, header) : -1;
+        const int32_t payload = decoder->encoded != 0 && !decoder->overrun ? finish_frame(decoder, header) : -1;
         decoder->encoded = decoder->decoded = 0;
         decoder->code = decoder->remaining = decoder->overrun = 0;
         return payload;
@@ -111,11 +112,11 @@ int32_t uwb_decoder_push(uwb_decoder *decoder, uint8_t byte, uwb_header_t *heade
     decoder->encoded++;
     if (decoder->remaining != 0) {
         decoder->remaining--;
-        store(decoder, byte);
+        store_byte(decoder, byte);
         return -1;
     }
     if (decoder->encoded > 1 && decoder->code != 0xFF) {
-        store(decoder, 0);
+        store_byte(decoder, 0);
     }
     decoder->code = byte;
     decoder->remaining = (uint8_t)(byte - 1);
@@ -150,51 +151,53 @@ int uwb_read_measurement(const uint8_t *payload, size_t payload_bytes, uwb_range
 /* Bytes of a frame in the ring: the length of its payload, its header and its payload. */
 #define QUEUED_BYTES(payload_bytes) (sizeof(uint16_t) + UWB_HEADER_BYTES + (payload_bytes))
 
-static size_t put(uwb_queue *queue, size_t at, const void *data, size_t bytes) {
+/* Write bytes at `at`, wrapped; returns the position after them. */
+static size_t ring_write(uwb_queue *queue, size_t at, const void *data, size_t bytes) {
     const size_t to_end = queue->capacity - at;
-    const size_t piece = bytes < to_end ? bytes : to_end;
+    const size_t first_part = bytes < to_end ? bytes : to_end;
     if (bytes != 0) {
-        memcpy(queue->bytes + at, data, piece);
-        memcpy(queue->bytes, (const uint8_t *)data + piece, bytes - piece);
+        memcpy(queue->bytes + at, data, first_part);
+        memcpy(queue->bytes, (const uint8_t *)data + first_part, bytes - first_part);
     }
     return (at + bytes) % queue->capacity;
 }
 
-/* Write a frame at `at`, wrapped, if it fits and then leaves `reserve` bytes free; returns whether it did. */
-static int put_frame(uwb_queue *queue, size_t at, const uwb_header_t *header, const void *payload, size_t payload_bytes,
+/* Write a frame at `at`, wrapped, if it fits and leaves `reserve` bytes free; returns whether it was written. */
+static int ring_write_frame(uwb_queue *queue, size_t at, const uwb_header_t *header, const void *payload, size_t payload_bytes,
                      size_t reserve) {
     const uint16_t length = (uint16_t)payload_bytes;
-    const size_t room = queue->capacity - queue->used;
+    const size_t free_bytes = queue->capacity - queue->used;
     const size_t needed = QUEUED_BYTES(payload_bytes);
-    if (payload_bytes > UWB_MAX_PAYLOAD_BYTES || needed > room || reserve > room - needed) {
+    if (payload_bytes > UWB_MAX_PAYLOAD_BYTES || needed > free_bytes || reserve > free_bytes - needed) {
         return 0;
     }
-    at = put(queue, at % queue->capacity, &length, sizeof length);
-    at = put(queue, at, header, UWB_HEADER_BYTES);
-    (void)put(queue, at, payload, payload_bytes);
+    at = ring_write(queue, at % queue->capacity, &length, sizeof length);
+    at = ring_write(queue, at, header, UWB_HEADER_BYTES);
+    (void)ring_write(queue, at, payload, payload_bytes);
     queue->used += needed;
     return 1;
 }
 
 int uwb_queue_frame(uwb_queue *queue, const uwb_header_t *header, const void *payload, size_t payload_bytes,
                     size_t reserve) {
-    return put_frame(queue, queue->first + queue->used, header, payload, payload_bytes, reserve);
+    return ring_write_frame(queue, queue->first + queue->used, header, payload, payload_bytes, reserve);
 }
 
 int uwb_queue_urgent(uwb_queue *queue, const uwb_header_t *header, const void *payload, size_t payload_bytes) {
     const size_t before = queue->first + queue->capacity - QUEUED_BYTES(payload_bytes);
-    if (!put_frame(queue, before, header, payload, payload_bytes, 0)) {
+    if (!ring_write_frame(queue, before, header, payload, payload_bytes, 0)) {
         return 0;
     }
     queue->first = before % queue->capacity;
     return 1;
 }
 
-static void take(uwb_queue *queue, void *data, size_t bytes) {
+/* Remove bytes from the start of the ring. */
+static void ring_read(uwb_queue *queue, void *data, size_t bytes) {
     const size_t to_end = queue->capacity - queue->first;
-    const size_t piece = bytes < to_end ? bytes : to_end;
-    memcpy(data, queue->bytes + queue->first, piece);
-    memcpy((uint8_t *)data + piece, queue->bytes, bytes - piece);
+    const size_t first_part = bytes < to_end ? bytes : to_end;
+    memcpy(data, queue->bytes + queue->first, first_part);
+    memcpy((uint8_t *)data + first_part, queue->bytes, bytes - first_part);
     queue->first = (queue->first + bytes) % queue->capacity;
     queue->used -= bytes;
 }
@@ -203,12 +206,12 @@ size_t uwb_queue_peek(uwb_queue *queue, uint64_t now_us, const uint8_t **bytes) 
     if (queue->sent == queue->encoded && queue->used != 0) {
         uint16_t payload_bytes;
         uwb_header_t header;
-        take(queue, &payload_bytes, sizeof payload_bytes);
-        take(queue, &header, sizeof header);
+        ring_read(queue, &payload_bytes, sizeof payload_bytes);
+        ring_read(queue, &header, sizeof header);
         header.sequence = queue->sequence++;
         header.time_us = header.time_us == UWB_TIME_OF_SENDING ? now_us : header.time_us;
-        memcpy(queue->wire + UWB_WIRE_LEAD, &header, sizeof header);
-        take(queue, queue->wire + UWB_WIRE_LEAD + sizeof header, payload_bytes);
+        memcpy(queue->wire + UWB_WIRE_HEADROOM, &header, sizeof header);
+        ring_read(queue, queue->wire + UWB_WIRE_HEADROOM + sizeof header, payload_bytes);
         queue->encoded = uwb_encode_frame(queue->wire, payload_bytes);
         queue->sent = 0;
     }
@@ -217,6 +220,6 @@ size_t uwb_queue_peek(uwb_queue *queue, uint64_t now_us, const uint8_t **bytes) 
 }
 
 void uwb_queue_drop(uwb_queue *queue, size_t count) {
-    const size_t left = queue->encoded - queue->sent;
-    queue->sent += count < left ? count : left;
+    const size_t unsent = queue->encoded - queue->sent;
+    queue->sent += count < unsent ? count : unsent;
 }

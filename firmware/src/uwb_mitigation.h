@@ -1,7 +1,7 @@
 /* Removes the range error of ultra-wideband ranging with an int8 network, bit for bit as on the host.
  *
- * No allocation and no globals: a model is constant data that `uwb-mitigation board export-c` writes, and
- * memory to work in is the caller's. Functions are reentrant as long as arenas are not shared. */
+ * No allocation and no globals: a model is constant data that `uwb-mitigation board export-c` writes, and the caller
+ * provides the working memory. Functions are reentrant if arenas are not shared. */
 #ifndef UWB_MITIGATION_H
 #define UWB_MITIGATION_H
 
@@ -19,14 +19,14 @@ typedef enum {
     UWB_OK = 0,
     UWB_BAD_ARGUMENT,        /* a null pointer, or a model that this library cannot run */
     UWB_BAD_ARENA,           /* smaller than uwb_arena_size, or not aligned to 4 bytes */
-    UWB_EMPTY,               /* the CIR holds no samples */
-    UWB_ODD_LENGTH,          /* a complex CIR holds an odd number of values */
+    UWB_EMPTY,               /* the CIR contains no samples */
+    UWB_ODD_LENGTH,          /* a complex CIR contains an odd number of values */
     UWB_BAD_SCALE,           /* the CIR's scale is not between 1e-30 and 1e30 */
     UWB_NO_FIRST_PATH,       /* the first-path index is not finite */
-    UWB_OUTSIDE,             /* the window around the first path lies outside the CIR */
-    UWB_ALL_ZERO,            /* the window holds only zeros */
+    UWB_OUTSIDE,             /* the window around the first path is not inside the CIR */
+    UWB_ALL_ZERO,            /* the window contains only zeros */
     UWB_NEGATIVE,            /* a magnitude is negative */
-    UWB_SATURATED,           /* the window holds a saturated sample */
+    UWB_SATURATED,           /* the window contains a saturated sample */
     UWB_NO_PREAMBLE_COUNT,   /* unknown, and the model's scaling needs it */
     UWB_NO_POWER,            /* receive or first-path power unknown, and the linear bias model needs it */
     UWB_OUT_OF_DISTRIBUTION, /* the predicted error is outside the model's limits, or the OOD score is 1 or more */
@@ -37,7 +37,7 @@ typedef enum {
 typedef enum { UWB_COMPLEX_INT16 = 0, UWB_MAGNITUDE = 1 } uwb_encoding;
 typedef enum { UWB_SCALE_MAX = 0, UWB_SCALE_PREAMBLE = 1 } uwb_scaling;
 
-/* A channel impulse response as the radio's accumulator delivers it. */
+/* A channel impulse response from the accumulator of the radio. */
 typedef struct {
     const int16_t *samples; /* interleaved re, im, or magnitudes */
     size_t count;           /* int16 values, not samples in time */
@@ -122,7 +122,7 @@ typedef struct {
     float linear_bias_offset_m;
     float linear_bias_per_rx_power; /* m per dBm */
     float linear_bias_per_power_gap;
-    float correction_low_m; /* a predicted error outside means an input unlike the training data */
+    float correction_low_m; /* with a predicted error outside, the input is out of distribution */
     float correction_high_m;
     float variance_m2;
     float variance_per_m2; /* times the square of the predicted error */
@@ -130,13 +130,13 @@ typedef struct {
     const uwb_ood_bands *ood_bands; /* NULL = unknown: no OOD score */
 } uwb_model;
 
-/* Bytes of arena that the other functions need for `model`; 0 if it is null or cannot be run. */
+/* Return the bytes of arena that the other functions need for `model`; 0 if it is null or cannot be run. */
 size_t uwb_arena_size(const uwb_model *model);
 
 /* Write the network's input for `cir`, model->samples values, to `window`; undefined on failure. */
 uwb_status uwb_preprocess(const uwb_model *model, const uwb_cir *cir, float *window);
 
-/* The network's output for a window of model->samples values, m, without the linear bias. */
+/* Compute the network's output for a window of model->samples values, m, without the linear bias. */
 uwb_status uwb_network(const uwb_model *model, const float *window, void *arena, size_t arena_bytes,
                        float *output_m);
 
@@ -149,16 +149,16 @@ typedef enum {
     UWB_RANGE_MODEL_ERROR = 4
 } uwb_range_status;
 
-/* On any status but OK the raw range is passed through, less the radios' offset, and the variance is larger. */
+/* With any status except OK, the raw range minus the offset is passed through, with a larger variance. */
 typedef struct {
     float range_m;
-    float correction_m; /* offset + predicted error (linear bias + network); the offset alone when passed through */
+    float correction_m; /* offset + predicted error (linear bias + network); only the offset if the range is passed through */
     float variance_m2;  /* infinite where the range is not valid */
     uwb_range_status status;
 } uwb_corrected;
 
-/* Correct one range. `offset_m` is what the two radios' antenna delays add to it; 0 = nothing that is known. The result
- * is always usable; what is returned says in more detail why one was passed through. */
+/* Correct one range. `offset_m`: offset due to the antenna delays of the two radios; 0 = unknown. The result is always
+ * usable; the returned status is the detailed reason why a range was passed through. */
 uwb_status uwb_correct(const uwb_model *model, float range_m, float offset_m, const uwb_cir *cir, void *arena,
                        size_t arena_bytes, uwb_corrected *corrected);
 

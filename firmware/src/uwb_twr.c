@@ -3,12 +3,18 @@
 
 #include "uwb_twr_common.h"
 
-enum { START_AGAIN_US = 100000, SMART_POWER_REPLY_US = 1000 };
+enum { RESTART_INTERVAL_US = 100000, SMART_POWER_REPLY_US = 1000 };
 
 const uwb_twr_config uwb_twr_defaults = {
-    {5, 64, 0, 0, 6800, 128, 0, 0, 0}, 0, 0x5542, UWB_ROLE_TAG, 0, 0, 0, 157, 1500, 6000, 0, {0},
+    .radio = {.channel = 5, .prf_mhz = 64, .rate_kbps = 6800, .preamble = 128},
+    .pan = 0x5542,
+    .role = UWB_ROLE_TAG,
+    .window = 157,
+    .reply_us = 1500,
+    .timeout_us = 6000,
 };
 
+/* Initialise the state; the chip is started by the first step. */
 void uwb_twr_start(uwb_twr *twr, const uwb_dw1000_io *io, const uwb_twr_config *config, uint64_t random,
                    uint8_t *measurement, size_t measurement_bytes) {
     memset(twr, 0, sizeof *twr);
@@ -21,50 +27,53 @@ void uwb_twr_start(uwb_twr *twr, const uwb_dw1000_io *io, const uwb_twr_config *
     }
 }
 
+/* Set times that are 0, plus the additional airtime of slow or long frames. */
 void uwb_twr_set_default_times(uwb_twr_config *config, uint32_t reply_us, uint32_t timeout_us) {
-    uint32_t more_us = 0;
+    uint32_t extra_us = 0;
     if (uwb_dw1000_settings_valid(&config->radio)) {
         const uint32_t air_us = uwb_dw1000_airtime_us(&config->radio, UWB_TWR_MAX_FRAME_BYTES);
-        const uint32_t usual_us = uwb_dw1000_airtime_us(&uwb_twr_defaults.radio, UWB_TWR_MAX_FRAME_BYTES);
-        more_us = air_us > usual_us ? air_us - usual_us : 0;
+        const uint32_t default_us = uwb_dw1000_airtime_us(&uwb_twr_defaults.radio, UWB_TWR_MAX_FRAME_BYTES);
+        extra_us = air_us > default_us ? air_us - default_us : 0;
     }
     if (config->reply_us == 0) {
-        config->reply_us = reply_us + 2 * more_us; /* ANSWER's data, and FINAL's preamble */
+        config->reply_us = reply_us + 2 * extra_us; /* data of ANSWER, preamble of FINAL */
     }
     if (config->timeout_us == 0) {
-        config->timeout_us = timeout_us + 4 * more_us; /* POLL, ANSWER, and what may be on the air before */
+        config->timeout_us = timeout_us + 4 * extra_us; /* POLL, ANSWER, and frames that may precede them */
     }
 }
 
+/* Return the reason why a configuration is invalid, or NULL. */
 const char *uwb_twr_config_error(const uwb_twr *twr, const uwb_twr_config *config) {
     if (!uwb_dw1000_settings_valid(&config->radio)) {
-        return "channel, PRF, preamble, code, rate or antenna delay is none that the chip has";
+        return "the chip does not support this channel, PRF, preamble, code, rate or antenna delay";
     }
     if (config->role > UWB_ROLE_ANCHOR) {
-        return "no such role";
+        return "unknown role";
     }
     if (config->pan == 0xFFFF || config->address == UWB_TWR_BROADCAST) {
-        return "the address or the PAN is that of a broadcast";
+        return "the address or the PAN is the broadcast address";
     }
     if (config->anchor_count > UWB_MAX_ANCHORS) {
         return "more than 32 anchors";
     }
-    const size_t whole = UWB_DW1000_SAMPLES(config->radio.prf_mhz);
-    if (UWB_TWR_MEASUREMENT_BYTES(config->window < whole ? config->window : whole) > twr->measurement_bytes) {
-        return "more samples than the board has memory for";
+    const size_t max_count = UWB_DW1000_SAMPLES(config->radio.prf_mhz);
+    if (UWB_TWR_MEASUREMENT_BYTES(config->window < max_count ? config->window : max_count) > twr->measurement_bytes) {
+        return "the window needs more memory than the board has";
     }
     const uint32_t air_us = uwb_dw1000_airtime_us(&config->radio, UWB_TWR_MAX_FRAME_BYTES);
     if (config->reply_us < air_us || config->reply_us > 100000 || config->timeout_us < 2 * air_us ||
         config->timeout_us > 500000 || config->interval_us > 60000000) {
-        return "a time is shorter than its frames last, or longer than 0.1 s (reply), 0.5 s (patience), 60 s (interval)";
+        return "a time is shorter than its frames, or longer than 0.1 s (reply), 0.5 s (timeout), 60 s (interval)";
     }
-    /* FINAL follows POLL after more than this time, so that uwb_dw1000_send_at need not wait. */
+    /* The time from POLL to FINAL is longer than this, so that uwb_dw1000_send_at need not wait. */
     if (config->radio.rate_kbps == 6800 && config->reply_us < SMART_POWER_REPLY_US) {
-        return "at 6.8 Mbit/s the reply is at least 1 ms: smart power allows one frame per millisecond";
+        return "at 6.8 Mbit/s the reply time must be at least 1 ms: smart power allows one frame per millisecond";
     }
     return NULL;
 }
 
+/* Apply a configuration if it is valid; the next step starts the chip with it. */
 int uwb_twr_configure(uwb_twr *twr, const uwb_twr_config *config) {
     if (uwb_twr_config_error(twr, config) != NULL) {
         return 0;
@@ -75,14 +84,15 @@ int uwb_twr_configure(uwb_twr *twr, const uwb_twr_config *config) {
     twr->running = 0;
     twr->known = config->anchor_count;
     for (uint8_t i = 0; i < config->anchor_count; i++) {
-        twr->anchors[i] = (uwb_twr_anchor){config->anchors[i], 0, 0, 0, 0, 0, 0, NAN};
+        twr->anchors[i] = (uwb_twr_anchor){.address = config->anchors[i], .rx_power_dbm = NAN};
     }
-    twr->turn = 0;
+    twr->last_polled = 0;
     twr->next_us = 0;
-    twr->seek_us = 0;
+    twr->next_discovery_us = 0;
     return 1;
 }
 
+/* Start the chip; after a failure, wait before the next attempt. */
 static uwb_twr_event start_chip(uwb_twr *twr, uint64_t until_us) {
     const uint64_t now_us = uwb_twr_now_us(twr);
     if (twr->config.radio.channel == 0 || now_us < twr->next_us) {
@@ -91,7 +101,7 @@ static uwb_twr_event start_chip(uwb_twr *twr, uint64_t until_us) {
     }
     twr->fault = uwb_dw1000_start(&twr->chip, &twr->io, &twr->config.radio);
     if (twr->fault != UWB_DW1000_OK) {
-        twr->next_us = now_us + START_AGAIN_US;
+        twr->next_us = now_us + RESTART_INTERVAL_US;
         return UWB_TWR_FAULT;
     }
     twr->address = twr->config.address != 0 ? twr->config.address : twr->chip.eui;
@@ -102,6 +112,7 @@ static uwb_twr_event start_chip(uwb_twr *twr, uint64_t until_us) {
     return UWB_TWR_NOTHING;
 }
 
+/* Start the chip if necessary, then perform a step of the tag or the anchor. */
 uwb_twr_event uwb_twr_step(uwb_twr *twr, uint64_t until_us) {
     if (!twr->running) {
         const uwb_twr_event event = start_chip(twr, until_us);
@@ -112,17 +123,25 @@ uwb_twr_event uwb_twr_step(uwb_twr *twr, uint64_t until_us) {
     return twr->config.role == UWB_ROLE_TAG ? uwb_twr_tag_step(twr, until_us) : uwb_twr_anchor_step(twr, until_us);
 }
 
+/* Return the size of the fields and the samples. */
 size_t uwb_twr_measurement_bytes(const uwb_twr *twr) {
     const uwb_range_cir_t *const fields = (const uwb_range_cir_t *)(const void *)twr->measurement;
     return sizeof *fields + 2u * fields->sample_count;
 }
 
+/* Return the state in the terms of the wire protocol. */
 uint8_t uwb_twr_state(const uwb_twr *twr) {
     if (twr->running) {
         return twr->chip.lock_unconfirmed ? UWB_RADIO_STATE_LOCK_UNCONFIRMED : UWB_RADIO_STATE_RUNNING;
     }
-    return twr->fault == UWB_DW1000_BUS        ? UWB_RADIO_STATE_BUS
-           : twr->fault == UWB_DW1000_ABSENT   ? UWB_RADIO_STATE_ABSENT
-           : twr->fault == UWB_DW1000_NO_CLOCK ? UWB_RADIO_STATE_NO_CLOCK
-                                               : UWB_RADIO_STATE_RESTARTED;
+    switch (twr->fault) {
+    case UWB_DW1000_BUS:
+        return UWB_RADIO_STATE_BUS;
+    case UWB_DW1000_ABSENT:
+        return UWB_RADIO_STATE_ABSENT;
+    case UWB_DW1000_NO_CLOCK:
+        return UWB_RADIO_STATE_NO_CLOCK;
+    default:
+        return UWB_RADIO_STATE_RESTARTED;
+    }
 }

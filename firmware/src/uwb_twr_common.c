@@ -3,20 +3,22 @@
 #include "uwb_mitigation.h"
 #include "uwb_twr_common.h"
 
-enum { SLEEP_US = 1000, MISSES_TO_RESTART = 100 };
+enum { MAX_SLEEP_US = 1000, MISSES_TO_RESTART = 100 };
 
+/* Return the time of io.now_us. */
 uint64_t uwb_twr_now_us(const uwb_twr *twr) {
     return twr->io.now_us(twr->io.context);
 }
 
+/* Sleep in short intervals, because io.sleep takes 32 bits. */
 void uwb_twr_sleep_until(const uwb_twr *twr, uint64_t until_us) {
     for (uint64_t now_us = uwb_twr_now_us(twr); now_us < until_us; now_us = uwb_twr_now_us(twr)) {
         const uint64_t left_us = until_us - now_us;
-        twr->io.sleep(twr->io.context, left_us < SLEEP_US ? (uint32_t)left_us : SLEEP_US);
+        twr->io.sleep(twr->io.context, left_us < MAX_SLEEP_US ? (uint32_t)left_us : MAX_SLEEP_US);
     }
 }
 
-/* Marsaglia's xorshift64*. */
+/* Return 32 bits of Marsaglia's xorshift64*. */
 uint32_t uwb_twr_random(uwb_twr *twr) {
     twr->random ^= twr->random >> 12;
     twr->random ^= twr->random << 25;
@@ -24,25 +26,27 @@ uint32_t uwb_twr_random(uwb_twr *twr) {
     return (uint32_t)(twr->random * 0x2545F4914F6CDD1Du >> 32);
 }
 
+/* Scale 32 random bits to 0 to limit - 1. */
 uint32_t uwb_twr_random_below(uwb_twr *twr, uint32_t limit) {
     return (uint32_t)((uint64_t)uwb_twr_random(twr) * limit >> 32);
 }
 
-uwb_twr_frame uwb_twr_make_frame(const uwb_twr *twr, uwb_twr_kind kind, uint64_t to, uint32_t tag_number,
+/* Fill in addresses, PAN and numbers; other fields are 0. */
+uwb_twr_frame uwb_twr_make_frame(const uwb_twr *twr, uwb_twr_frame_type kind, uint64_t to, uint32_t tag_number,
                                uint32_t anchor_number) {
-    uwb_twr_frame frame;
-    memset(&frame, 0, sizeof frame);
-    frame.kind = kind;
-    frame.sequence = (uint8_t)tag_number;
-    frame.pan = twr->config.pan;
-    frame.to = to;
-    frame.from = twr->address;
-    frame.tag_number = tag_number;
-    frame.anchor_number = anchor_number;
-    return frame;
+    return (uwb_twr_frame){
+        .kind = kind,
+        .sequence = (uint8_t)tag_number,
+        .pan = twr->config.pan,
+        .to = to,
+        .from = twr->address,
+        .tag_number = tag_number,
+        .anchor_number = anchor_number,
+    };
 }
 
-static int belongs(const uwb_twr *twr, const uwb_twr_frame *frame, const uwb_twr_frame *sent, uwb_twr_kind kind) {
+/* Return whether a frame is the answer of type `kind` to `sent`. */
+static int is_expected(const uwb_twr *twr, const uwb_twr_frame *frame, const uwb_twr_frame *sent, uwb_twr_frame_type kind) {
     return frame->kind == kind && frame->pan == twr->config.pan && frame->to == twr->address &&
            (frame->from == sent->to || (sent->to == UWB_TWR_BROADCAST && frame->from != twr->address)) &&
            frame->tag_number == sent->tag_number &&
@@ -50,24 +54,25 @@ static int belongs(const uwb_twr *twr, const uwb_twr_frame *frame, const uwb_twr
            (kind == UWB_TWR_ANSWER || frame->anchor_number == sent->anchor_number);
 }
 
-uwb_dw1000_status uwb_twr_await_frame(uwb_twr *twr, const uwb_twr_frame *sent, uwb_twr_kind kind, uint64_t until_us,
+/* Receive until the expected frame or the timeout. */
+uwb_dw1000_status uwb_twr_await_frame(uwb_twr *twr, const uwb_twr_frame *sent, uwb_twr_frame_type kind, uint64_t until_us,
                                  uwb_dw1000_frame *received, uwb_twr_frame *frame) {
-    uwb_dw1000_status otherwise = UWB_DW1000_TIMEOUT;
+    uwb_dw1000_status result = UWB_DW1000_TIMEOUT;
     for (;;) {
         uwb_dw1000_status status = uwb_dw1000_receive(&twr->chip, received, until_us);
         if (status == UWB_DW1000_OK) {
-            if (uwb_twr_read(received->octets, received->bytes, frame) && belongs(twr, frame, sent, kind)) {
+            if (uwb_twr_read(received->octets, received->bytes, frame) && is_expected(twr, frame, sent, kind)) {
                 return UWB_DW1000_OK;
             }
             twr->counts.refused++;
         } else if (status == UWB_DW1000_DAMAGED) {
-            otherwise = UWB_DW1000_DAMAGED;
+            result = UWB_DW1000_DAMAGED;
         } else {
-            return status == UWB_DW1000_TIMEOUT ? otherwise : status;
+            return status == UWB_DW1000_TIMEOUT ? result : status;
         }
         const uint64_t now_us = uwb_twr_now_us(twr);
         if (now_us >= until_us) {
-            return otherwise;
+            return result;
         }
         status = uwb_dw1000_listen(&twr->chip, (uint32_t)(until_us - now_us));
         if (status != UWB_DW1000_OK) {
@@ -76,19 +81,20 @@ uwb_dw1000_status uwb_twr_await_frame(uwb_twr *twr, const uwb_twr_frame *sent, u
     }
 }
 
+/* Write fields and samples to twr->measurement; the chip is checked after the read. */
 uwb_dw1000_status uwb_twr_write_measurement(uwb_twr *twr, const uwb_dw1000_frame *received, uint64_t tag, uint64_t anchor,
                                   double range_m, float *rx_power_dbm) {
     const uwb_dw1000_settings *const radio = &twr->chip.settings;
     uwb_range_cir_t *const fields = (uwb_range_cir_t *)(void *)twr->measurement;
-    const size_t whole = UWB_DW1000_SAMPLES(radio->prf_mhz);
-    const size_t count = twr->config.window < whole ? twr->config.window : whole;
+    const size_t max_count = UWB_DW1000_SAMPLES(radio->prf_mhz);
+    const size_t count = twr->config.window < max_count ? twr->config.window : max_count;
     const size_t index = received->first_path_index / 64u;
     size_t first = index > UWB_WINDOW_LEAD ? index - UWB_WINDOW_LEAD : 0;
-    first = first < whole - count ? first : whole - count;
+    first = first < max_count - count ? first : max_count - count;
     uwb_dw1000_quality quality;
     uwb_dw1000_status status = uwb_dw1000_read_quality(&twr->chip, received, &quality);
     if (status == UWB_DW1000_OK && count != 0) {
-        /* The octet that means nothing falls on the last of the fields, which are written afterwards. */
+        /* The first octet is invalid. It overwrites the last octet of the fields, which are written afterwards. */
         status = uwb_dw1000_read_cir(&twr->chip, first, count, twr->measurement + sizeof *fields - 1);
     }
     if (status == UWB_DW1000_OK) {
@@ -127,20 +133,32 @@ uwb_dw1000_status uwb_twr_write_measurement(uwb_twr *twr, const uwb_dw1000_frame
     return UWB_DW1000_OK;
 }
 
-uwb_twr_event uwb_twr_exchange_failed(uwb_twr *twr, uwb_dw1000_status status, uint32_t *when_timed_out) {
-    uint32_t *const counted = status == UWB_DW1000_TIMEOUT   ? when_timed_out
-                              : status == UWB_DW1000_DAMAGED ? &twr->counts.damaged
-                              : status == UWB_DW1000_LATE    ? &twr->counts.late
-                              : status == UWB_DW1000_UNSENT  ? &twr->counts.timeout
-                                                             : &twr->counts.broken;
-    if (when_timed_out != NULL) {
-        (*counted)++; /* of an exchange */
+/* Return the count of a failure. */
+static uint32_t *failure_count_of(uwb_twr_counts *counts, uwb_dw1000_status status, uint32_t *timeout_count) {
+    switch (status) {
+    case UWB_DW1000_TIMEOUT:
+        return timeout_count;
+    case UWB_DW1000_DAMAGED:
+        return &counts->damaged;
+    case UWB_DW1000_LATE:
+        return &counts->late;
+    case UWB_DW1000_UNSENT:
+        return &counts->timeout;
+    default:
+        return &counts->broken;
+    }
+}
+
+/* Count the failure; check the chip, which is restarted if it has lost its settings or after too many misses. */
+uwb_twr_event uwb_twr_exchange_failed(uwb_twr *twr, uwb_dw1000_status status, uint32_t *timeout_count) {
+    if (timeout_count != NULL) {
+        (*failure_count_of(&twr->counts, status, timeout_count))++;
     }
     twr->misses++;
     if (status == UWB_DW1000_TIMEOUT || status == UWB_DW1000_DAMAGED || status == UWB_DW1000_LATE) {
         /* No error on this side, unless the chip has lost its settings. */
-        const int hopeless = twr->misses % MISSES_TO_RESTART == 0;
-        status = hopeless ? UWB_DW1000_RESTARTED : uwb_dw1000_check(&twr->chip);
+        const int restart = twr->misses % MISSES_TO_RESTART == 0;
+        status = restart ? UWB_DW1000_RESTARTED : uwb_dw1000_check(&twr->chip);
         if (status == UWB_DW1000_OK) {
             return UWB_TWR_NOTHING;
         }

@@ -9,8 +9,8 @@
 
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size);
 
-static void check(int promise, const char *what) {
-    if (!promise) {
+static void check(int condition, const char *what) {
+    if (!condition) {
         fprintf(stderr, "broken: %s\n", what);
         abort();
     }

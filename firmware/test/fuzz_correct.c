@@ -35,29 +35,29 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
         memcpy(&start_index, data + 4, sizeof start_index);
     }
     const uwb_cir cir = {
-        samples,
-        count,
-        (choice & 2) ? UWB_MAGNITUDE : UWB_COMPLEX_INT16,
-        start_index,
-        (choice & 4) ? float_at(data + 8) : (float)start_index + (float)(data[8] % 32),
-        (choice & 8) ? float_at(data + 12) : 1.0f,
-        data[2],
-        (choice & 16) ? float_at(data + 16) : -80.0f,
-        (choice & 32) ? float_at(data + 20) : -85.0f,
+        .samples = samples,
+        .count = count,
+        .encoding = (choice & 2) ? UWB_MAGNITUDE : UWB_COMPLEX_INT16,
+        .start_index = start_index,
+        .first_path_index = (choice & 4) ? float_at(data + 8) : (float)start_index + (float)(data[8] % 32),
+        .scale = (choice & 8) ? float_at(data + 12) : 1.0f,
+        .preamble_count = data[2],
+        .rx_power_dbm = (choice & 16) ? float_at(data + 16) : -80.0f,
+        .first_path_power_dbm = (choice & 32) ? float_at(data + 20) : -85.0f,
     };
     const float range_m = (choice & 64) ? float_at(data + 24) : 3.0f;
     const float offset_m = (choice & 128) ? 0.25f : 0.0f;
-    const float less_m = offset_m != 0.0f ? range_m - offset_m : range_m;
+    const float offset_range_m = offset_m != 0.0f ? range_m - offset_m : range_m;
     uwb_corrected corrected;
     const uwb_status status = uwb_correct(&uwb_model_data, range_m, offset_m, &cir, arena, arena_bytes, &corrected);
     if (status == UWB_OK) {
         check(corrected.status == UWB_RANGE_OK, "status of a corrected range");
         check(corrected.correction_m >= offset_m + uwb_model_data.correction_low_m, "lower limit");
         check(corrected.correction_m <= offset_m + uwb_model_data.correction_high_m, "upper limit");
-        check(isfinite(corrected.range_m) && less_m >= 0.0f, "range");
+        check(isfinite(corrected.range_m) && offset_range_m >= 0.0f, "range");
     } else {
         check(corrected.status != UWB_RANGE_OK, "status of a range passed through");
-        check(memcmp(&corrected.range_m, &less_m, sizeof less_m) == 0, "a range passes through, less the offset");
+        check(memcmp(&corrected.range_m, &offset_range_m, sizeof offset_range_m) == 0, "a range passes through, less the offset");
         check(corrected.correction_m == offset_m, "no correction but the offset");
     }
     check(corrected.variance_m2 > 0.0f, "variance");

@@ -10,7 +10,7 @@
 #include "uwb_model.h"
 
 /* Read at most `limit` bytes of what the board sends. */
-static void drain(uwb_board *board, uwb_decoder *host, size_t limit) {
+static void read_output(uwb_board *board, uwb_decoder *host, size_t limit) {
     const uint8_t *bytes;
     size_t count;
     while (limit != 0 && (count = uwb_queue_peek(&board->queue, 0, &bytes)) != 0) {
@@ -35,12 +35,22 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
     uint8_t *const wire = malloc(UWB_MAX_WIRE_BYTES);
     void *const arena = malloc(arena_bytes);
     check(board != NULL && host != NULL && queue != NULL && wire != NULL && arena != NULL, "memory");
-    const uwb_board_config config = {1, 2, {0, 1, 0}, UWB_MODE_DEVICE, "fuzzed", &uwb_model_data,
-                                     arena, arena_bytes, queue, 9000, NULL, NULL, NULL};
+    const uwb_board_config config = {
+        .board_id = 1,
+        .boot_id = 2,
+        .firmware_version = {0, 1, 0},
+        .mode = UWB_MODE_DEVICE,
+        .firmware_name = "fuzzed",
+        .model = &uwb_model_data,
+        .arena = arena,
+        .arena_bytes = arena_bytes,
+        .queue = queue,
+        .queue_bytes = 9000,
+    };
     uwb_board_start(board, &config, 0);
     uint64_t now_us = 0;
     while (size > 4) {
-        const uint8_t how = data[0];
+        const uint8_t choice = data[0];
         size_t length = (size_t)data[1] | (size_t)(data[2] & 15) << 8;
         const uint8_t type = data[3] % 8 < 4 ? UWB_TYPE_RANGE_CIR : data[3];
         data += 4;
@@ -48,14 +58,14 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
         length = length < size ? length : size;
         const uint8_t *bytes = data;
         size_t count = length;
-        const uwb_header_t header = {(uint8_t)((how & 4) ? 1 : how), type, 0, 7, 0};
-        if (how & 1) {
-            memcpy(wire + UWB_WIRE_LEAD, &header, sizeof header);
-            memcpy(wire + UWB_WIRE_LEAD + sizeof header, data, length);
+        const uwb_header_t header = {.version = (uint8_t)((choice & 4) ? 1 : choice), .type = type, .sequence = 7};
+        if (choice & 1) {
+            memcpy(wire + UWB_WIRE_HEADROOM, &header, sizeof header);
+            memcpy(wire + UWB_WIRE_HEADROOM + sizeof header, data, length);
             bytes = wire;
             count = uwb_encode_frame(wire, length);
         }
-        if (how & 2) {
+        if (choice & 2) {
             uwb_board_receive(board, bytes, count, now_us);
         } else {
             uwb_board_receive_from_radio(board, bytes, count, now_us);
@@ -63,13 +73,13 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
         now_us += 300000u;
         uwb_board_tick(board, now_us);
         check(board->queue.used <= board->queue.capacity && board->mode <= UWB_MODE_DEVICE, "bounds");
-        if (how & 8) {
-            drain(board, host, (how & 16) ? (size_t)how * 8 : SIZE_MAX);
+        if (choice & 8) {
+            read_output(board, host, (choice & 16) ? (size_t)choice * 8 : SIZE_MAX);
         }
         data += length;
         size -= length;
     }
-    drain(board, host, SIZE_MAX);
+    read_output(board, host, SIZE_MAX);
     free(arena);
     free(wire);
     free(queue);

@@ -14,48 +14,54 @@ typedef struct {
 } native_board;
 
 native_board *native_board_new(int mode, int with_model, size_t queue_bytes) {
-    native_board *const host = calloc(1, sizeof *host);
-    if (host == NULL || queue_bytes > sizeof host->queue) {
+    native_board *const native = calloc(1, sizeof *native);
+    if (native == NULL || queue_bytes > sizeof native->queue) {
         abort();
     }
-    uwb_board_config config = {0xE0, 1, {0, 1, 0}, (uint8_t)mode, "emulated", NULL, NULL, 0, NULL, 0, NULL, NULL, NULL};
-    config.model = with_model ? &uwb_model_data : NULL;
-    config.arena = host->arena;
-    config.arena_bytes = sizeof host->arena;
-    config.queue = host->queue;
-    config.queue_bytes = queue_bytes;
-    uwb_board_start(&host->board, &config, 0);
-    return host;
+    const uwb_board_config config = {
+        .board_id = 0xE0,
+        .boot_id = 1,
+        .firmware_version = {0, 1, 0},
+        .mode = (uint8_t)mode,
+        .firmware_name = "emulated",
+        .model = with_model ? &uwb_model_data : NULL,
+        .arena = native->arena,
+        .arena_bytes = sizeof native->arena,
+        .queue = native->queue,
+        .queue_bytes = queue_bytes,
+    };
+    uwb_board_start(&native->board, &config, 0);
+    return native;
 }
 
-void native_board_free(native_board *host) {
-    free(host);
+void native_board_free(native_board *native) {
+    free(native);
 }
 
-void native_board_receive(native_board *host, const uint8_t *bytes, size_t count, uint64_t now_us) {
-    host->now_us = now_us;
-    uwb_board_receive(&host->board, bytes, count, now_us);
+void native_board_receive(native_board *native, const uint8_t *bytes, size_t count, uint64_t now_us) {
+    native->now_us = now_us;
+    uwb_board_receive(&native->board, bytes, count, now_us);
 }
 
-void native_board_receive_from_radio(native_board *host, const uint8_t *bytes, size_t count, uint64_t now_us) {
-    host->now_us = now_us;
-    uwb_board_receive_from_radio(&host->board, bytes, count, now_us);
+void native_board_receive_from_radio(native_board *native, const uint8_t *bytes, size_t count, uint64_t now_us) {
+    native->now_us = now_us;
+    uwb_board_receive_from_radio(&native->board, bytes, count, now_us);
 }
 
-void native_board_tick(native_board *host, uint64_t now_us) {
-    host->now_us = now_us;
-    uwb_board_tick(&host->board, now_us);
+void native_board_tick(native_board *native, uint64_t now_us) {
+    native->now_us = now_us;
+    uwb_board_tick(&native->board, now_us);
 }
 
 /* Take what waits to be sent, at most `limit` bytes, at the time of the last call. */
-size_t native_board_output(native_board *host, uint8_t *bytes, size_t limit) {
+size_t native_board_output(native_board *native, uint8_t *bytes, size_t limit) {
     size_t taken = 0;
     const uint8_t *piece;
     size_t count;
-    while (taken < limit && (count = uwb_queue_peek(&host->board.queue, host->now_us, &piece)) != 0) {
+    while (taken < limit && (count = uwb_queue_peek(&native->board.queue, native->now_us, &piece)) != 0) {
         count = count < limit - taken ? count : limit - taken;
         memcpy(bytes + taken, piece, count);
-        uwb_queue_drop(&host->board.queue, count);
+        uwb_queue_drop(&native->board.queue, count);
         taken += count;
     }
     return taken;
@@ -83,7 +89,7 @@ int native_decode(const uint8_t *bytes, size_t count, uwb_header_t *header, uint
 
 /* `wire` has UWB_MAX_WIRE_BYTES. */
 size_t native_encode(const uwb_header_t *header, const uint8_t *payload, size_t payload_bytes, uint8_t *wire) {
-    memcpy(wire + UWB_WIRE_LEAD, header, sizeof *header);
-    memcpy(wire + UWB_WIRE_LEAD + sizeof *header, payload, payload_bytes);
+    memcpy(wire + UWB_WIRE_HEADROOM, header, sizeof *header);
+    memcpy(wire + UWB_WIRE_HEADROOM + sizeof *header, payload, payload_bytes);
     return uwb_encode_frame(wire, payload_bytes);
 }

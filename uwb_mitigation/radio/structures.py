@@ -81,7 +81,7 @@ class TwrAnchor(ctypes.Structure):
     """`uwb_twr_anchor`."""
 
     _fields_ = _fields(
-        **_of(c_uint64, "address last_seen_us due_us"),
+        **_of(c_uint64, "address last_seen_us next_poll_us"),
         **_of(c_uint32, "tried ranged answer_us misses"),
         rx_power_dbm=c_float,
     )

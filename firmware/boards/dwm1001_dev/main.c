@@ -11,31 +11,31 @@
 enum {
     SPI_SCK = 16, SPI_MOSI = 20, SPI_MISO = 18, SPI_CS = 17, RADIO_IRQ = 19, RADIO_RESET = 24,
     UART_TX = 5, UART_RX = 11, BUTTON = 2, LED_RED = 14, LED_GREEN = 30,
-    DMA_MOST = 255, WHOLE = 1016, RESET_US = 1000, WATCHDOG_S = 4, TOGETHER = 64
+    DMA_MAX = 255, MAX_SAMPLES = 1016, RESET_US = 1000, WATCHDOG_S = 4, SMALL_TRANSFER = 64
 };
 
 static uwb_ranger ranger;
 static uint32_t arena[12288 / 4];
 static uint8_t queue[8192];
-static uint64_t measurement[UWB_TWR_MEASUREMENT_BYTES(WHOLE) / 8 + 1];
+static uint64_t measurement[UWB_TWR_MEASUREMENT_BYTES(MAX_SAMPLES) / 8 + 1];
 
 /* Shared with the interrupt handler. Each index is written on one side only. */
 static struct {
     uint8_t received[1024];
     volatile uint32_t head, tail;
     const uint8_t *sending;
-    volatile size_t left;
+    volatile size_t remaining;
 } line;
 
 void board_exit(int code);
 void uart_interrupt(void);
 
-static void stop(void) {
+static void unexpected_interrupt(void) {
     board_exit(127);
 }
 
 __attribute__((section(".vectors.device"), used)) static void (*const vectors[16])(void) = {
-    stop, stop, uart_interrupt, stop, stop, stop, stop, stop, stop, stop, stop, stop, stop, stop, stop, stop,
+    unexpected_interrupt, unexpected_interrupt, uart_interrupt, unexpected_interrupt, unexpected_interrupt, unexpected_interrupt, unexpected_interrupt, unexpected_interrupt, unexpected_interrupt, unexpected_interrupt, unexpected_interrupt, unexpected_interrupt, unexpected_interrupt, unexpected_interrupt, unexpected_interrupt, unexpected_interrupt,
 };
 
 /* The watchdog restarts the board. */
@@ -61,7 +61,7 @@ void uart_interrupt(void) {
     }
     if (UART_EVENTS_TXDRDY != 0) {
         UART_EVENTS_TXDRDY = 0;
-        if (line.left != 0 && --line.left != 0) {
+        if (line.remaining != 0 && --line.remaining != 0) {
             UART_TXD = *++line.sending;
         }
     }
@@ -85,20 +85,20 @@ static uint32_t clock_us(void) {
 }
 
 /* Pass the next bytes to the interrupt handler once it has sent the previous ones. Does not block. */
-static void send_waiting(void) {
-    static size_t handed;
-    if (line.left != 0) {
+static void send_pending(void) {
+    static size_t passed;
+    if (line.remaining != 0) {
         return;
     }
-    uwb_queue_drop(&ranger.board.queue, handed);
-    handed = uwb_queue_peek(&ranger.board.queue, uptime_us(NULL), &line.sending);
-    if (handed != 0) {
-        line.left = handed;
+    uwb_queue_drop(&ranger.board.queue, passed);
+    passed = uwb_queue_peek(&ranger.board.queue, uptime_us(NULL), &line.sending);
+    if (passed != 0) {
+        line.remaining = passed;
         UART_TXD = *line.sending;
     }
 }
 
-static void receive_waiting(void) {
+static void receive_pending(void) {
     while (line.tail != line.head) {
         uwb_board_receive(&ranger.board, &line.received[line.tail % sizeof line.received], 1, uptime_us(NULL));
         line.tail++;
@@ -120,10 +120,10 @@ static void spim(const uint8_t *out, size_t out_bytes, uint8_t *in, size_t in_by
  * at most one clocks a second octet): avoid such transfers. */
 static int transfer(void *context, const uint8_t *header, size_t header_bytes, const uint8_t *out, uint8_t *in,
                     size_t bytes) {
-    uint8_t sent[TOGETHER], received[TOGETHER];
+    uint8_t sent[SMALL_TRANSFER], received[SMALL_TRANSFER];
     (void)context;
     GPIO_OUTCLR = 1u << SPI_CS;
-    if (header_bytes + bytes <= TOGETHER) {
+    if (header_bytes + bytes <= SMALL_TRANSFER) {
         memset(sent, 0, sizeof sent);
         memcpy(sent, header, header_bytes);
         if (out != NULL) {
@@ -137,7 +137,7 @@ static int transfer(void *context, const uint8_t *header, size_t header_bytes, c
         memcpy(sent, header, header_bytes); /* DMA reaches RAM only */
         spim(sent, header_bytes, NULL, 0);
         while (bytes != 0) {
-            size_t piece = bytes < DMA_MOST ? bytes : DMA_MOST;
+            size_t piece = bytes < DMA_MAX ? bytes : DMA_MAX;
             piece -= bytes - piece == 1;
             spim(out, out != NULL ? piece : 0, in, out != NULL ? 0 : piece);
             out = out != NULL ? out + piece : NULL;
@@ -146,7 +146,7 @@ static int transfer(void *context, const uint8_t *header, size_t header_bytes, c
         }
     }
     GPIO_OUTSET = 1u << SPI_CS;
-    send_waiting();
+    send_pending();
     return 0;
 }
 
@@ -158,7 +158,7 @@ static void speed(void *context, int fast) {
 static void sleep(void *context, uint32_t us) {
     const uint64_t until_us = uptime_us(context) + us;
     do {
-        send_waiting();
+        send_pending();
     } while (uptime_us(context) < until_us);
 }
 
@@ -172,7 +172,7 @@ static void reset(void *context) {
 
 static void wait(void *context, uint64_t until_us) {
     while (!(GPIO_IN >> RADIO_IRQ & 1u) && uptime_us(context) < until_us) {
-        send_waiting();
+        send_pending();
     }
 }
 
@@ -228,7 +228,8 @@ static void start_peripherals(void) {
 
 int main(void) {
     start_peripherals();
-    const uwb_dw1000_io io = {NULL, transfer, speed, reset, uptime_us, wait, sleep};
+    const uwb_dw1000_io io = {
+        .transfer = transfer, .speed = speed, .reset = reset, .now_us = uptime_us, .wait = wait, .sleep = sleep};
     const uint64_t random = random_number();
     const uwb_board_config board = {
         .board_id = (uint64_t)FICR_DEVICEID(1) << 32 | FICR_DEVICEID(0),
@@ -248,11 +249,11 @@ int main(void) {
     uwb_ranger_start(&ranger, &board, &io, &config, random, (uint8_t *)measurement, sizeof measurement);
     for (;;) {
         WDT_RR0 = WDT_RELOAD;
-        receive_waiting();
+        receive_pending();
         (void)uwb_ranger_step(&ranger);
         /* Green flickers with the ranges; red: the radio does not work. */
         *(ranger.twr.counts.ranged & 1u ? &GPIO_OUTCLR : &GPIO_OUTSET) = 1u << LED_GREEN;
         *(ranger.twr.running ? &GPIO_OUTSET : &GPIO_OUTCLR) = 1u << LED_RED;
-        send_waiting();
+        send_pending();
     }
 }

@@ -56,7 +56,7 @@ static uint8_t *guard(void) {
     return (uint8_t *)arena + arena_bytes;
 }
 
-static int guard_is_whole(void) {
+static int guard_is_intact(void) {
     for (const uint8_t *byte = guard(); byte < (const uint8_t *)arena + sizeof arena; byte++) {
         if (*byte != 0x5A) {
             return 0;
@@ -85,18 +85,18 @@ static __attribute__((noinline)) uint32_t stack_bytes(const float *window) {
     return (uint32_t)(top - reached);
 }
 
-static __attribute__((noinline)) void run_window(const float *window, report *seen, uint32_t answer[2]) {
+static __attribute__((noinline)) void run_window(const float *window, report *result, uint32_t answer[2]) {
     float output_m = 0.0f;
     const uint32_t start = SYST_CVR;
     const uwb_status status = uwb_network(&uwb_model_data, window, arena, arena_bytes, &output_m);
     const uint32_t ticks = ticks_since(start);
-    seen->ticks_lowest = ticks < seen->ticks_lowest ? ticks : seen->ticks_lowest;
-    seen->ticks_highest = ticks > seen->ticks_highest ? ticks : seen->ticks_highest;
+    result->ticks_lowest = ticks < result->ticks_lowest ? ticks : result->ticks_lowest;
+    result->ticks_highest = ticks > result->ticks_highest ? ticks : result->ticks_highest;
     answer[0] = (uint32_t)status;
     memcpy(&answer[1], &output_m, sizeof output_m);
 }
 
-static int run_windows(int32_t input, int32_t output, uint32_t count, report *seen) {
+static int run_windows(int32_t input, int32_t output, uint32_t count, report *result) {
     static float windows[64][MAX_WINDOW];
     static uint32_t answers[64][2];
     const uint32_t samples = uwb_model_data.samples;
@@ -108,18 +108,18 @@ static int run_windows(int32_t input, int32_t output, uint32_t count, report *se
             }
         }
         for (uint32_t i = 0; i < chunk; i++) {
-            run_window(windows[i], seen, answers[i]);
+            run_window(windows[i], result, answers[i]);
         }
         if (!semihosting_write(output, answers, chunk * sizeof answers[0])) {
             return 4;
         }
         done += chunk;
     }
-    seen->stack_bytes = stack_bytes(windows[0]);
+    result->stack_bytes = stack_bytes(windows[0]);
     return 0;
 }
 
-static int run_cirs(int32_t input, int32_t output, uint32_t count, report *seen) {
+static int run_cirs(int32_t input, int32_t output, uint32_t count, report *result) {
     static cir_record record;
     static float window[MAX_WINDOW];
     for (uint32_t i = 0; i < count; i++) {
@@ -127,9 +127,15 @@ static int run_cirs(int32_t input, int32_t output, uint32_t count, report *seen)
             return 3;
         }
         const uwb_cir cir = {
-            record.samples,         record.count,      (uwb_encoding)record.encoding,
-            record.start_index,     record.first_path_index, record.scale,
-            (uint16_t)record.preamble_count, record.rx_power_dbm, record.first_path_power_dbm,
+            .samples = record.samples,
+            .count = record.count,
+            .encoding = (uwb_encoding)record.encoding,
+            .start_index = record.start_index,
+            .first_path_index = record.first_path_index,
+            .scale = record.scale,
+            .preamble_count = (uint16_t)record.preamble_count,
+            .rx_power_dbm = record.rx_power_dbm,
+            .first_path_power_dbm = record.first_path_power_dbm,
         };
         memset(window, 0, sizeof window);
         (void)uwb_preprocess(&uwb_model_data, &cir, window);
@@ -139,7 +145,7 @@ static int run_cirs(int32_t input, int32_t output, uint32_t count, report *seen)
             (uint32_t)uwb_correct(&uwb_model_data, record.range_m, record.offset_m, &cir, arena, arena_bytes,
                                   &corrected);
         const uint32_t ticks = ticks_since(start);
-        seen->ticks_correct = ticks > seen->ticks_correct ? ticks : seen->ticks_correct;
+        result->ticks_correct = ticks > result->ticks_correct ? ticks : result->ticks_correct;
         if (!semihosting_write(output, &status, sizeof status) ||
             !semihosting_write(output, &corrected, sizeof corrected) ||
             !semihosting_write(output, window, uwb_model_data.samples * sizeof(float))) {
@@ -165,15 +171,16 @@ int main(void) {
     SYST_CVR = 0;
     SYST_CSR = 5; /* processor clock, no interrupt */
 
-    report seen = {uwb_model_data.model_id, (uint32_t)arena_bytes, 0, 0, UINT32_MAX, 0, 0};
+    report result = {
+        .model_id = uwb_model_data.model_id, .arena_bytes = (uint32_t)arena_bytes, .ticks_lowest = UINT32_MAX};
     const uint32_t start = SYST_CVR;
-    seen.ticks_empty = ticks_since(start);
-    const int code = header[0] == WINDOWS ? run_windows(input, output, header[1], &seen)
-                                          : run_cirs(input, output, header[1], &seen);
-    if (!guard_is_whole()) {
+    result.ticks_empty = ticks_since(start);
+    const int code = header[0] == WINDOWS ? run_windows(input, output, header[1], &result)
+                                          : run_cirs(input, output, header[1], &result);
+    if (!guard_is_intact()) {
         return 6;
     }
-    if (code == 0 && !semihosting_write(output, &seen, sizeof seen)) {
+    if (code == 0 && !semihosting_write(output, &result, sizeof result)) {
         return 4;
     }
     return code;

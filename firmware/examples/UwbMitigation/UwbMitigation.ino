@@ -47,7 +47,7 @@ static void feed_watchdog() {
 }
 
 /* Read the received bytes without blocking. */
-template <typename Port> static size_t take(Port &port, uint8_t *bytes, size_t limit) {
+template <typename Port> static size_t read_available(Port &port, uint8_t *bytes, size_t limit) {
     size_t count = 0;
     while (count < limit && port.available() > 0) {
         bytes[count++] = (uint8_t)port.read();
@@ -66,7 +66,7 @@ void setup() {
     NRF_RNG->TASKS_START = 1;
     for (int i = 0; i < 4; i++) {
         NRF_RNG->EVENTS_VALRDY = 0;
-        for (int patience = 0; patience < 100000 && NRF_RNG->EVENTS_VALRDY == 0; patience++) {
+        for (int tries = 0; tries < 100000 && NRF_RNG->EVENTS_VALRDY == 0; tries++) {
         }
         config.boot_id = config.boot_id << 8 | (NRF_RNG->VALUE & 0xFFu);
     }
@@ -87,9 +87,9 @@ void setup() {
 void loop() {
     uint8_t bytes[PACKET];
     feed_watchdog();
-    size_t count = take(Serial1, bytes, sizeof bytes);
+    size_t count = read_available(Serial1, bytes, sizeof bytes);
     uwb_board_receive_from_radio(&board, bytes, count, uptime_us());
-    count = take(Serial, bytes, sizeof bytes);
+    count = read_available(Serial, bytes, sizeof bytes);
     uwb_board_receive(&board, bytes, count, uptime_us());
     uwb_board_tick(&board, uptime_us());
 

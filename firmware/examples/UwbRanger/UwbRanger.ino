@@ -6,7 +6,7 @@
  * It starts as an anchor, so that it can run without a host on a power bank; with D3 at GND at the start, or when its host
  * requests it, it is a tag. For corrections on the board put uwb_model.h next to this file: uwb-mitigation board export-c -o UwbRanger.
  *
- * SPI is done from loop() only, never from an interrupt, and in whole buffers: a byte at a time costs 20 us each. */
+ * SPI is done from loop() only, never from an interrupt, and in complete buffers: single bytes cost 20 us each. */
 #include <SPI.h>
 #include <uwb_ranger.h>
 
@@ -19,15 +19,15 @@ static uint32_t arena[12288 / 4];
 #endif
 
 static const int RADIO_CS = 10, RADIO_IRQ = 2, RADIO_RESET = 9, TAG_SWITCH = 3;
-static const size_t PACKET = 64; /* of USB: one is written whole, only if there is room for it */
-static const size_t WHOLE = 1016;
+static const size_t PACKET = 64; /* size of a USB packet; packets are written completely */
+static const size_t MAX_SAMPLES = 1016;
 static const uint32_t WATCHDOG_S = 4;
 static const SPISettings SLOW(2000000, MSBFIRST, SPI_MODE0), FAST(8000000, MSBFIRST, SPI_MODE0);
 
 static uwb_ranger ranger;
 static uint8_t queue[16384];
-static uint64_t measurement[UWB_TWR_MEASUREMENT_BYTES(WHOLE) / 8 + 1];
-static uint8_t exchanged[8 + 4 * WHOLE];
+static uint64_t measurement[UWB_TWR_MEASUREMENT_BYTES(MAX_SAMPLES) / 8 + 1];
+static uint8_t spi_buffer[8 + 4 * MAX_SAMPLES];
 static bool spi_fast;
 
 /* micros() wraps after 71 minutes; loop() reads it far more often. */
@@ -46,7 +46,7 @@ static uint32_t clock_us() {
     return micros();
 }
 
-static void send_waiting() {
+static void send_pending() {
     const uint8_t *waiting;
     if (!(bool)Serial) {
         return;
@@ -61,22 +61,22 @@ static void send_waiting() {
 
 /* One chip-select period. */
 static int transfer(void *, const uint8_t *header, size_t header_bytes, const uint8_t *out, uint8_t *in, size_t bytes) {
-    const size_t whole = header_bytes + bytes;
-    if (whole > sizeof exchanged) {
+    const size_t total = header_bytes + bytes;
+    if (total > sizeof spi_buffer) {
         return -1;
     }
-    memset(exchanged, 0, whole);
-    memcpy(exchanged, header, header_bytes);
+    memset(spi_buffer, 0, total);
+    memcpy(spi_buffer, header, header_bytes);
     if (out != nullptr) {
-        memcpy(exchanged + header_bytes, out, bytes);
+        memcpy(spi_buffer + header_bytes, out, bytes);
     }
     SPI.beginTransaction(spi_fast ? FAST : SLOW);
     digitalWrite(RADIO_CS, LOW);
-    SPI.transfer(exchanged, whole);
+    SPI.transfer(spi_buffer, total);
     digitalWrite(RADIO_CS, HIGH);
     SPI.endTransaction();
     if (out == nullptr) {
-        memcpy(in, exchanged + header_bytes, bytes);
+        memcpy(in, spi_buffer + header_bytes, bytes);
     }
     return 0;
 }
@@ -85,10 +85,10 @@ static void speed(void *, int fast) {
     spi_fast = fast != 0;
 }
 
-static void rest(void *, uint32_t us) {
+static void sleep_us(void *, uint32_t us) {
     const uint64_t until_us = uptime_us(nullptr) + us;
     do {
-        send_waiting();
+        send_pending();
     } while (uptime_us(nullptr) < until_us);
 }
 
@@ -96,13 +96,13 @@ static void rest(void *, uint32_t us) {
 static void reset(void *) {
     digitalWrite(RADIO_RESET, LOW);
     pinMode(RADIO_RESET, OUTPUT);
-    rest(nullptr, 1000);
+    sleep_us(nullptr, 1000);
     pinMode(RADIO_RESET, INPUT);
 }
 
 static void wait(void *, uint64_t until_us) {
     while (digitalRead(RADIO_IRQ) == LOW && uptime_us(nullptr) < until_us) {
-        send_waiting();
+        send_pending();
     }
 }
 
@@ -111,7 +111,7 @@ static uint64_t random_number() {
     NRF_RNG->TASKS_START = 1;
     for (int i = 0; i < 8; i++) {
         NRF_RNG->EVENTS_VALRDY = 0;
-        for (int patience = 0; patience < 100000 && NRF_RNG->EVENTS_VALRDY == 0; patience++) {
+        for (int tries = 0; tries < 100000 && NRF_RNG->EVENTS_VALRDY == 0; tries++) {
         }
         value = value << 8 | (NRF_RNG->VALUE & 0xFFu);
     }
@@ -145,7 +145,7 @@ void setup() {
     board.queue = queue;
     board.queue_bytes = sizeof queue;
     board.clock_us = clock_us;
-    const uwb_dw1000_io io = {nullptr, transfer, speed, reset, uptime_us, wait, rest};
+    const uwb_dw1000_io io = {nullptr, transfer, speed, reset, uptime_us, wait, sleep_us};
     uwb_twr_config config = uwb_twr_defaults;
     config.role = digitalRead(TAG_SWITCH) == LOW ? UWB_ROLE_TAG : UWB_ROLE_ANCHOR;
     uwb_ranger_start(&ranger, &board, &io, &config, random, (uint8_t *)measurement, sizeof measurement);
@@ -165,7 +165,7 @@ void loop() {
     }
     uwb_board_receive(&ranger.board, bytes, count, uptime_us(nullptr));
     (void)uwb_ranger_step(&ranger);
-    send_waiting();
+    send_pending();
     digitalWrite(LED_PWR, (bool)Serial ? HIGH : LOW);
     digitalWrite(LED_BUILTIN, (ranger.twr.counts.ranged & 1u) ? HIGH : LOW);
 }
