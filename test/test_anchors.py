@@ -39,7 +39,7 @@ def test_written_file_is_read_back():
         ("anchors: []", "0 anchors"),
         ("anchors: [3]", "entry 1: 3 is no anchor"),
         ("anchors: [{id: 1, x: 0, y: 0}]", "entry 1: the field z is missing"),
-        ("anchors: [{id: 1, x: 0, y: 0, z: 0, colour: red}]", "the field 'colour' is unknown"),
+        ("anchors: [{id: 1, x: 0, y: 0, z: 0, colour: red}]", "unknown field 'colour'"),
         ("anchors: [{id: -1, x: 0, y: 0, z: 0}]", "id = -1"),
         ("anchors: [{id: '1', x: 0, y: 0, z: 0}]", "id = '1'"),
         ("anchors: [{id: 1, x: .nan, y: 0, z: 0}]", "x = nan"),

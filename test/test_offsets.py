@@ -69,7 +69,7 @@ def test_parameter_is_a_number_or_a_file(tmp_path: Path):
         ("default: 220", "default = 220 m: are these millimetres"),
         ("default: 1.0e+9", "-10 to 10 m"),
         ("default: '0.2'", "a number of metres"),
-        ("offset: 0.2", "'offset' is unknown.*default, anchors, tags, pairs"),
+        ("offset: 0.2", "unknown key 'offset'.*default, anchors, tags, pairs"),
         ("anchors: [1, 2]", "identity: metres"),
         ("anchors: {a: 0.2}", "identity 'a'.*64 bits"),
         ("anchors: {-1: 0.2}", "identity -1"),

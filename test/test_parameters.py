@@ -56,13 +56,9 @@ def test_unknown_parameter_is_refused_with_a_suggestion(ros: Ros, tmp_path: Path
     file = tmp_path / "parameters.yaml"
     file.write_text("/**:\n  ros__parameters:\n    sorce: mcap\n")
     for node, words, excerpt in (
-        (
-            "driver",
-            ("--params-file", str(file)),
-            "parameter sorce is unknown (did you mean source?)",
-        ),
-        ("pipeline", ("-p", "raet:=2.0"), "parameter raet is unknown (did you mean rate"),
-        ("mitigator", ("-p", "wholly_else:=1"), "parameter wholly_else is unknown"),
+        ("driver", ("--params-file", str(file)), "unknown parameter 'sorce'; did you mean 'source'?"),
+        ("pipeline", ("-p", "raet:=2.0"), "unknown parameter 'raet'; did you mean 'rate'"),
+        ("mitigator", ("-p", "wholly_else:=1"), "unknown parameter 'wholly_else' ("),
     ):
         process = ros.start(node, arguments=words)
         assert process.wait() == 1

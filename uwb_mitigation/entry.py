@@ -13,6 +13,7 @@ from collections.abc import Callable
 from typing import Any
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_NODES = ("driver", "mitigator", "locator", "pipeline", "monitor", "viewer")
 
 
 def driver() -> None:
@@ -62,6 +63,10 @@ def run_program(module: str) -> None:
 
 
 def _node(name: str) -> None:
+    if name not in _NODES:
+        from uwb_mitigation.errors import did_you_mean
+
+        sys.exit(f"error: unknown node {name!r}; {did_you_mean(name, _NODES)} (one of {', '.join(_NODES)})")
     if {"-h", "--help"} & set(sys.argv[1:]):
         from uwb_mitigation.nodes.parameter_tables import help_text
 

@@ -18,26 +18,31 @@ class UwbMitigationError(Exception):
         what: the problem, with the invalid value.
         where: location in the input (file, line, byte offset, field); may be empty.
         valid: valid values, or the remedy; may be empty.
+        suggestion: for an unknown name, the question of `did_you_mean`; may be empty.
     """
 
-    def __init__(self, what: str, *, where: str = "", valid: str = "") -> None:
-        super().__init__(what, where, valid)
+    def __init__(self, what: str, *, where: str = "", valid: str = "", suggestion: str = "") -> None:
+        super().__init__(what, where, valid, suggestion)
         self.what = what
         self.where = where
         self.valid = valid
+        self.suggestion = suggestion
 
     def __str__(self) -> str:
         place = f"{self.where}: " if self.where else ""
+        suggestion = f"; {self.suggestion}" if self.suggestion else ""
         remedy = f" ({self.valid})" if self.valid else ""
-        return f"{place}{self.what}{remedy}"
+        return f"{place}{self.what}{suggestion}{remedy}"
 
     def __reduce__(self) -> tuple[object, ...]:
         # Keyword arguments do not survive the default pickling that process pools use.
-        return (_rebuild, (type(self), self.what, self.where, self.valid))
+        return (_rebuild, (type(self), self.what, self.where, self.valid, self.suggestion))
 
 
-def _rebuild(kind: type[UwbMitigationError], what: str, where: str, valid: str) -> UwbMitigationError:
-    return kind(what, where=where, valid=valid)
+def _rebuild(
+    kind: type[UwbMitigationError], what: str, where: str, valid: str, suggestion: str
+) -> UwbMitigationError:
+    return kind(what, where=where, valid=valid, suggestion=suggestion)
 
 
 class RecordingError(UwbMitigationError):
@@ -68,10 +73,32 @@ class MissingDependencyError(UwbMitigationError):
     """An optional dependency is not installed."""
 
 
-def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Return a did-you-mean question with similar known names; empty if none is similar."""
-    close = difflib.get_close_matches(name, list(known), n=2)
-    return f"did you mean {' or '.join(close)}?" if close else ""
+def did_you_mean(name: object, known: Iterable[object]) -> str:
+    """Return a did-you-mean question with the most similar known names; empty if none is similar."""
+    by_lower_case = {str(each).lower(): str(each) for each in known}
+    close = difflib.get_close_matches(str(name)[:100].lower(), by_lower_case, n=2)
+    return f"did you mean {' or '.join(repr(by_lower_case[each]) for each in close)}?" if close else ""
+
+
+def check_name(what: str, name: object, known: Iterable[object], where: str = "", valid: str = "") -> None:
+    """Check that `name` is one of the known names.
+
+    Args:
+        what: what has the name, such as "split".
+        name: the name, which may be an untrusted value of any type.
+        known: the known names.
+        where: location in the input.
+        valid: text for `valid` of the error; default: the known names.
+
+    Raises:
+        ParameterError: the name is unknown; it suggests similar names.
+    """
+    names = list(known)
+    if name not in names:
+        valid = valid or f"one of {', '.join(map(str, names))}"
+        raise ParameterError(
+            f"unknown {what} {name!r:.60}", where=where, valid=valid, suggestion=did_you_mean(name, names)
+        )
 
 
 _DISTRIBUTIONS = {"serial": "pyserial", "sklearn": "scikit-learn", "yaml": "pyyaml"}

@@ -23,7 +23,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from uwb_mitigation.errors import ParameterError, format_id
+from uwb_mitigation.errors import ParameterError, check_name, format_id
 from uwb_mitigation.files import read_bounded
 
 MAX_OFFSET_M = 10.0
@@ -158,8 +158,7 @@ def parse_offsets(text: str, where: str) -> Offsets:
     if not isinstance(document, dict):
         raise ParameterError("no offsets", where=where, valid=SCHEMA)
     for name in document:
-        if name not in _SECTIONS:
-            raise ParameterError(f"the key {name!r:.60} is unknown", where=where, valid=", ".join(_SECTIONS))
+        check_name("key", name, _SECTIONS, where)
     pairs, deviations = _by_pair(document.get("pairs") or [], where)
     return Offsets(
         _number(document.get("default", 0.0), "default", where),
@@ -227,7 +226,9 @@ def _by_pair(
     deviations: dict[tuple[int, int], float] = {}
     for number, entry in enumerate(entries, 1):
         place = f"{where}: pairs, entry {number}"
-        if not isinstance(entry, dict) or set(entry) - {"sd"} != set(_PAIR):
+        for name in entry if isinstance(entry, dict) else ():
+            check_name("key", name, (*_PAIR, "sd"), place)
+        if not isinstance(entry, dict) or not set(entry) >= set(_PAIR):
             raise ParameterError(f"{entry!r:.80} is no pair", where=place, valid=f"{{{', '.join(_PAIR)}}}")
         pair = _identity(entry["tag"], "tag", place), _identity(entry["anchor"], "anchor", place)
         if pair in found:

@@ -25,7 +25,7 @@ from uwb_mitigation.bag.topics import (
     TF_STATIC,
     TF_TYPE,
 )
-from uwb_mitigation.errors import RecordingError
+from uwb_mitigation.errors import RecordingError, did_you_mean
 from uwb_mitigation.positioning.pose_alignment import PosePath
 from uwb_mitigation.positioning.tracks import Heights, TruePath
 
@@ -86,7 +86,10 @@ def read_bodies(path: Path, topic: str, frames: tuple[str, str] | None = None) -
         return bodies
     if (wanted := _frame(frames[1])) not in bodies:
         raise RecordingError(
-            f"no poses of {wanted}", where=where, valid=f"--frames of: {', '.join(sorted(bodies))}"
+            f"no poses of {wanted}",
+            where=where,
+            valid=f"--frames of: {', '.join(sorted(bodies))}",
+            suggestion=did_you_mean(wanted, bodies),
         )
     return {wanted: bodies[wanted]}
 
@@ -180,7 +183,8 @@ def check_topic(path: Path, topics: dict[str, str], topic: str, types: tuple[str
     usable = [f"{name} ({kind})" for name, kind in sorted(topics.items()) if kind in types]
     what = f"topic {topic} has the type {topics[topic]}" if topic in topics else f"no topic {topic}"
     valid = ", ".join(usable) or f"a topic of type {', '.join(types)}; the bag has none"
-    raise RecordingError(what, where=str(path), valid=valid)
+    suggestion = did_you_mean(topic, [name for name, kind in topics.items() if kind in types])
+    raise RecordingError(what, where=str(path), valid=valid, suggestion=suggestion)
 
 
 def decode_messages(bag: BagReader, topics: list[str], where: str) -> Iterator[Any]:

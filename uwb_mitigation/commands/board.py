@@ -13,7 +13,7 @@ import typer
 
 from uwb_mitigation.commands import console
 from uwb_mitigation.commands.console import JsonOption, Table, print_line
-from uwb_mitigation.errors import ParameterError, parse_id
+from uwb_mitigation.errors import ParameterError, check_name, parse_id
 from uwb_mitigation.files import write_atomically
 
 if TYPE_CHECKING:
@@ -57,8 +57,7 @@ def emulate(
     from uwb_mitigation.link.faults import Faults
     from uwb_mitigation.link.layout import Mode
 
-    if mode not in ("host", "device"):
-        raise ParameterError(f"mode {mode!r}", valid="host, device")
+    check_name("mode", mode, ("host", "device"))
     if duration is not None and not duration > 0:
         raise ParameterError(f"duration = {duration}", valid="above 0")
     if seed < 0:

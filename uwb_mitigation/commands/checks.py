@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from uwb_mitigation.errors import MissingDependencyError, ParameterError
+from uwb_mitigation.errors import MissingDependencyError, ParameterError, check_name
 
 if TYPE_CHECKING:
     from uwb_mitigation.preprocessing import Scaling
@@ -56,6 +56,5 @@ def scaling_of(name: str) -> Scaling:
     """
     from uwb_mitigation.preprocessing import Scaling
 
-    if name not in {kind.value for kind in Scaling}:
-        raise ParameterError(f"scaling {name!r}", valid=", ".join(kind.value for kind in Scaling))
+    check_name("scaling", name, [kind.value for kind in Scaling])
     return Scaling(name)

@@ -13,7 +13,7 @@ from uwb_mitigation.commands import console, model_tables
 from uwb_mitigation.commands.bundles import ModelOption, bundle_for
 from uwb_mitigation.commands.checks import OffsetsOption, check_output, needs_torch, scaling_of
 from uwb_mitigation.commands.console import JsonOption
-from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.errors import ParameterError, check_name
 
 if TYPE_CHECKING:
     from uwb_mitigation.evaluation.dataset import Dataset
@@ -114,10 +114,8 @@ def train(
         from uwb_mitigation.training import candidates, fitting  # noqa: F401
         from uwb_mitigation.training import train as training
 
-    if data is not None and recipe_name not in (training.AUTO, *candidates.NEW_MODELS):
-        raise ParameterError(
-            f"recipe {recipe_name!r}", valid=", ".join((training.AUTO, *candidates.NEW_MODELS))
-        )
+    if data is not None:
+        check_name("recipe", recipe_name, (training.AUTO, *candidates.NEW_MODELS))
     recording = data or from_bag
     assert recording is not None
     source = None if from_bag is None else bundle_for(model, from_bag)
@@ -238,10 +236,7 @@ def _compare(data: Path, group: str, folds: int, seeds: int, scaling: Scaling, j
     from uwb_mitigation.preprocessing import Preprocessing
     from uwb_mitigation.training.options import FitOptions
 
-    if group not in {kind.value for kind in splits.Group}:
-        raise ParameterError(
-            f"cross-validate = {group!r}", valid=", ".join(kind.value for kind in splits.Group)
-        )
+    check_name("group of --cross-validate:", group, [kind.value for kind in splits.Group])
     if not 1 <= seeds <= 100:
         raise ParameterError(f"seeds = {seeds}", valid="1 to 100")
     from uwb_mitigation.model.bundle import load_bundle

@@ -10,7 +10,7 @@ import typer
 
 from uwb_mitigation.commands import console
 from uwb_mitigation.commands.console import JsonOption, print_line, show_table, warn
-from uwb_mitigation.errors import ParameterError, RecordingError, format_id
+from uwb_mitigation.errors import ParameterError, RecordingError, check_name, format_id
 
 if TYPE_CHECKING:
     from uwb_mitigation.positioning.anchors import AnchorMap
@@ -189,9 +189,9 @@ def survey(
     ids = {
         text: row for identity, row in known.index.items() for text in (str(identity), format_id(identity))
     }
-    if unknown := [text for text in fixed or [] if text.lower() not in ids]:
-        raise ParameterError(
-            f"--fixed {unknown[0]:.40}", valid=f"one of {', '.join(map(format_id, known.index))}"
+    for text in fixed or []:
+        check_name(
+            "anchor of --fixed:", text.lower(), ids, valid=f"one of {', '.join(map(format_id, known.index))}"
         )
     rows = [ids[text.lower()] for text in fixed or []]
     tag = max(recorded.tags, key=lambda one: len(one.ranges))

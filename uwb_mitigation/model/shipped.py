@@ -36,11 +36,11 @@ def model_path(named: str | Path | None) -> Path:
         return shipped_model_path(str(named))
     path = Path(named).expanduser()
     if not path.exists():
-        hint = did_you_mean(path.stem, SHIPPED)
         raise ModelError(
             "no such file, and no shipped model",
             where=str(named),
-            valid=f"{f'{hint} ' if hint else ''}shipped models: {', '.join(SHIPPED)}",
+            valid=f"shipped models: {', '.join(SHIPPED)}",
+            suggestion=did_you_mean(path.stem, SHIPPED),
         )
     return path
 

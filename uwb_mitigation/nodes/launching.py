@@ -15,7 +15,7 @@ from typing import Any
 
 import yaml
 
-from uwb_mitigation.errors import ParameterError, UwbMitigationError, did_you_mean
+from uwb_mitigation.errors import ParameterError, UwbMitigationError, check_name, did_you_mean
 from uwb_mitigation.nodes.parameter_tables import KEPT_PARAMETERS, STANDARD, TABLES, Parameter, Value
 
 LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
@@ -139,7 +139,8 @@ def _read(text: str) -> Any:
 def choice(name: str, text: str, choices: Sequence[str] = ("true", "false")) -> str:
     """Return the value of an argument in lower case; raise ParameterError if it is not one of the choices."""
     if text.lower() not in choices:
-        raise ParameterError(f"argument {name}:={text}", valid=f"one of {', '.join(choices)}")
+        valid, suggestion = f"one of {', '.join(choices)}", did_you_mean(text, choices)
+        raise ParameterError(f"argument {name}:={text}", valid=valid, suggestion=suggestion)
     return text.lower()
 
 
@@ -157,10 +158,8 @@ def check_names(words: Sequence[str], known: Collection[str]) -> None:
         return
     for word in words:
         name, separator, _ = word.partition(":=")
-        if separator and name not in known:
-            raise ParameterError(
-                f"unknown argument {name}", valid=did_you_mean(name, known) or "--show-args lists them"
-            )
+        if separator:
+            check_name("argument", name, known, valid="--show-args lists them")
 
 
 def check_driver(values: Mapping[str, Any]) -> None:
@@ -224,12 +223,11 @@ def _parameters_in(path: Path, node: str, excluded: Collection[str]) -> dict[str
             try:
                 rows[name].check(value)
             except ParameterError as error:
-                raise ParameterError(error.what, where=str(path), valid=error.valid) from None
+                error.where = str(path)
+                raise
             found[name] = value
         elif name not in all_names and not name.startswith(STANDARD):
-            raise ParameterError(
-                f"parameter {name} is unknown", where=str(path), valid=did_you_mean(name, all_names)
-            )
+            check_name("parameter", name, all_names, str(path), "docs/reference/nodes.md lists them")
     return found
 
 

@@ -22,7 +22,13 @@ from rclpy.parameter import Parameter as RosParameter
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 
-from uwb_mitigation.errors import ParameterError, UwbMitigationError, did_you_mean, missing_dependency
+from uwb_mitigation.errors import (
+    ParameterError,
+    UwbMitigationError,
+    check_name,
+    did_you_mean,
+    missing_dependency,
+)
 from uwb_mitigation.files import write_atomically
 from uwb_mitigation.nodes import diagnostics, topics
 from uwb_mitigation.nodes.parameter_tables import KEPT_PARAMETERS, TABLES, Parameter
@@ -269,12 +275,10 @@ def _refuse_unknown(node: Node, other_parameters: Collection[str]) -> None:
     """Raise ParameterError for an unknown parameter; log the parameters of other nodes in one line."""
     all_nodes = {row.name for table in TABLES.values() for row in table}
     given = [name for name in _undeclared(node) if not name.startswith(_QOS) and name not in other_parameters]
+    own = [*other_parameters, *(known for known in node._parameters if not known.startswith(_QOS))]
     for name in given:
         if name not in all_nodes:
-            known = [*other_parameters, *(known for known in node._parameters if not known.startswith(_QOS))]
-            raise ParameterError(
-                f"parameter {name} is unknown", valid=did_you_mean(name, known) or "see --help"
-            )
+            check_name("parameter", name, own, valid="--help lists them")
     if given:
         node.get_logger().info(f"ignored parameters of other nodes: {', '.join(given)}")
 
@@ -312,7 +316,7 @@ def _warn_of_unknown_qos(node: Node) -> None:
         if name.startswith(_QOS):
             hint = did_you_mean(name, known)
             node.get_logger().warning(
-                f"parameter {name} is unknown and has no effect" + (f": {hint}" if hint else "")
+                f"unknown parameter {name!r} has no effect" + (f"; {hint}" if hint else "")
             )
 
 

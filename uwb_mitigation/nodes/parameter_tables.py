@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.errors import ParameterError, did_you_mean
 
 Value = bool | int | float | str
 
@@ -70,13 +70,15 @@ class Parameter:
         numeric |= self.or_number and type(value) in (int, float)
         if type(value) is not type(self.default) and not numeric:
             raise ParameterError(f"parameter {self.name} = {value!r}", valid=self.valid)
-        inside = True
         if self.choices:
             inside = value in self.choices
-        elif self.low is not None and self.high is not None:
-            inside = self.low <= value <= self.high
+        else:
+            inside = self.low is None or self.high is None or self.low <= value <= self.high
         if not inside:
-            raise ParameterError(f"parameter {self.name} = {value!r}", valid=self.valid)
+            suggestion = did_you_mean(value, self.choices)
+            raise ParameterError(
+                f"parameter {self.name} = {value!r}", valid=self.valid, suggestion=suggestion
+            )
 
 
 _SENSOR_RANGES = Parameter(

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.errors import DatasetError, ParameterError
+from uwb_mitigation.errors import DatasetError, ParameterError, check_name
 from uwb_mitigation.evaluation import splits
 from uwb_mitigation.evaluation.dataset import Dataset, build_dataset
 from uwb_mitigation.evaluation.splits import Split
@@ -38,8 +38,7 @@ def split_by_name(configurations: NDArray[np.str_], name: str) -> tuple[str, Spl
         ParameterError: unknown split.
         DatasetError: a part is empty, or the configurations have no rooms.
     """
-    if name not in SPLITS:
-        raise ParameterError(f"split {name!r}", valid=", ".join(SPLITS))
+    check_name("split", name, SPLITS)
     if name == AUTO:
         name = PAPER if has_rooms(configurations) else CONFIGURATIONS
     if name == CONFIGURATIONS:

@@ -13,7 +13,7 @@ import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
-from uwb_mitigation.errors import DatasetError, ModelError, ParameterError, UwbMitigationError
+from uwb_mitigation.errors import DatasetError, ModelError, ParameterError, UwbMitigationError, check_name
 from uwb_mitigation.evaluation import baselines, splits
 from uwb_mitigation.evaluation.dataset import Dataset
 from uwb_mitigation.files import write_atomically
@@ -67,8 +67,7 @@ class Task:
     seed: int
 
     def __post_init__(self) -> None:
-        if self.network not in NETWORKS:
-            raise ParameterError(f"network {self.network!r}", valid=", ".join(NETWORKS))
+        check_name("network", self.network, NETWORKS)
 
     @property
     def name(self) -> str:

@@ -20,7 +20,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from uwb_mitigation.errors import ParameterError, format_id
+from uwb_mitigation.errors import ParameterError, check_name, format_id
 
 SD_M = 0.05
 """Accuracy of a tape measure."""
@@ -147,14 +147,11 @@ def dump_anchors(anchors: AnchorMap, comment: str = "") -> str:
 def _anchor(entry: Any, where: str) -> Anchor:
     if not isinstance(entry, dict):
         raise ParameterError(f"{entry!r:.60} is no anchor", where=where, valid=SCHEMA)
+    for name in entry:
+        check_name("field", name, _FIELDS, where)
     absent = [name for name in _NEEDED if name not in entry]
     if absent:
         raise ParameterError(f"the field {absent[0]} is missing", where=where, valid=", ".join(_FIELDS))
-    strange = [name for name in entry if name not in _FIELDS]
-    if strange:
-        raise ParameterError(
-            f"the field {strange[0]!r:.60} is unknown", where=where, valid=", ".join(_FIELDS)
-        )
     x, y, z = (_number(entry, name, where, -MAX_COORDINATE_M, MAX_COORDINATE_M) for name in "xyz")
     sd = _number(entry, "sd", where, 0.0, 100.0) if "sd" in entry else SD_M
     name = entry.get("name", "")

@@ -143,7 +143,7 @@ def process_bag(job: Job, report: Report | None = None) -> Outcome:
         if RANGE_RAW not in bag.topics:
             topics = ", ".join(sorted(bag.topics)) or "no topic"
             raise RecordingError(
-                f"no topic {RANGE_RAW}", where=str(job.source), valid=f"the bag holds: {topics}"
+                f"no topic {RANGE_RAW}", where=str(job.source), valid=f"the bag contains: {topics}"
             )
     seconds = time.perf_counter() - started
     return Outcome(

@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from uwb_mitigation.errors import RecordingError
+from uwb_mitigation.errors import RecordingError, did_you_mean
 
 
 def read_rows(path: Path, columns: tuple[str, ...], max_bytes: int) -> Iterator[tuple[int, dict[str, str]]]:
@@ -32,8 +32,14 @@ def read_rows(path: Path, columns: tuple[str, ...], max_bytes: int) -> Iterator[
         if len(data) > max_bytes:
             raise RecordingError("too large", where=where, valid=valid)
         reader = csv.DictReader(io.StringIO(data.decode("utf-8-sig"), newline=""), strict=True)
-        if missing := [name for name in columns if name not in (reader.fieldnames or ())]:
-            raise RecordingError(f"no column {missing[0]}", where=where, valid=valid)
+        header = reader.fieldnames or ()
+        if missing := [name for name in columns if name not in header]:
+            what, suggestion = f"no column {missing[0]!r}", ""
+            for name in sorted(set(header) - set(columns)):
+                if suggestion := did_you_mean(name, missing[:1]):
+                    what += f", but a column {name!r}"
+                    break
+            raise RecordingError(what, where=where, valid=valid, suggestion=suggestion)
         for row in reader:
             where = f"{path}: line {reader.line_num}"
             if any(row[name] is None for name in columns):

@@ -22,7 +22,7 @@ from uwb_mitigation.bag.topics import (
     RANGE_TRUTH,
     RANGE_TRUTH_TYPE,
 )
-from uwb_mitigation.errors import RecordingError
+from uwb_mitigation.errors import RecordingError, did_you_mean
 from uwb_mitigation.measurement import RangeMeasurement, Record, Truth
 from uwb_mitigation.sources.source import Source
 
@@ -69,7 +69,8 @@ class McapRecording(Source):
             raise RecordingError(
                 f"no topic {self._topic}",
                 where=str(self._path),
-                valid=f"the bag holds: {known or 'no topic'}",
+                valid=f"the bag contains: {known or 'no topic'}",
+                suggestion=did_you_mean(self._topic, bag.topics),
             )
 
     def close(self) -> None:

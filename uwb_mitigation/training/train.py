@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.errors import DatasetError, ParameterError
+from uwb_mitigation.errors import DatasetError, check_name
 from uwb_mitigation.evaluation import splits
 from uwb_mitigation.evaluation.dataset import Dataset
 from uwb_mitigation.evaluation.metrics import ErrorStatistics, mae_by_group
@@ -124,8 +124,7 @@ def train_new_model(job: TrainingJob, recipe: Recipe, recipe_name: str = AUTO) -
     Raises:
         ParameterError: unknown model. DatasetError: too few configurations; see also `fitting.fit`.
     """
-    if recipe_name not in (AUTO, *models.NEW_MODELS):
-        raise ParameterError(f"recipe {recipe_name!r}", valid=", ".join((AUTO, *models.NEW_MODELS)))
+    check_name("recipe", recipe_name, (AUTO, *models.NEW_MODELS))
     dataset, folds = job.dataset, min(job.folds, len(job.dataset.names))
     _check_configurations(dataset, selections.min_configurations(job.folds) if recipe_name == AUTO else 2)
     selection, seed = None, recipe.fit.seed
