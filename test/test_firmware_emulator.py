@@ -189,7 +189,7 @@ def test_shipped_model_fits_and_has_the_size_of_its_file(tmp_path: Path):
     export_bundle(load_bundle(default_model_path()), tmp_path)
     image = emulator.measure_size(tmp_path, tmp_path)
     assert image.flash_bytes < 24 << 10
-    assert (image.flash_room, image.ram_room) == (512 << 10, 64 << 10)
+    assert (image.available_flash_bytes, image.available_ram_bytes) == (512 << 10, 64 << 10)
     text, data, bss = map(int, run(["arm-none-eabi-size", str(image.elf)]).splitlines()[1].split()[:3])
     assert (image.flash_bytes, image.static_bytes) == (text + data, data + bss)
 

@@ -54,15 +54,15 @@ def test_parameter_is_a_number_or_a_file(tmp_path: Path):
     with pytest.raises(ParameterError, match=r"none\.yaml: no such file.*metres"):
         read_offsets(str(tmp_path / "none.yaml"))
     path.write_bytes(b"\xff\xfe\xff")
-    with pytest.raises(ParameterError, match="not text"):
+    with pytest.raises(ParameterError, match="not a text file"):
         read_offsets(str(path))
 
 
 @pytest.mark.parametrize(
     ("text", "excerpt"),
     [
-        ("", "no offsets"),
-        ("[0.2]", "no offsets"),
+        ("", "not a file of offsets"),
+        ("[0.2]", "not a file of offsets"),
         ("{", "not YAML"),
         ("default: yes", "default = True.*metres"),
         ("default: .nan", "default = nan"),
@@ -70,16 +70,19 @@ def test_parameter_is_a_number_or_a_file(tmp_path: Path):
         ("default: 1.0e+9", "-10 to 10 m"),
         ("default: '0.2'", "a number of metres"),
         ("offset: 0.2", "unknown key 'offset'.*default, anchors, tags, pairs"),
-        ("anchors: [1, 2]", "identity: metres"),
-        ("anchors: {a: 0.2}", "identity 'a'.*64 bits"),
-        ("anchors: {-1: 0.2}", "identity -1"),
-        ("anchors: {18446744073709551616: 0.2}", "identity 18446744073709551616"),
+        ("anchors: [1, 2]", "id: metres"),
+        ("anchors: {a: 0.2}", "id 'a'.*64-bit"),
+        ("anchors: {-1: 0.2}", "id -1"),
+        ("anchors: {18446744073709551616: 0.2}", "id 18446744073709551616"),
         ("tags: {1: .inf}", "tags: 1 = inf"),
-        ("anchors: {1: 0.1, 0x1: 0.2}", "1 is there twice"),
-        ("default: 0.1\ndefault: 0.2", "twice, in line 2"),
+        ("anchors: {1: 0.1, 0x1: 0.2}", "duplicate key 1"),
+        ("default: 0.1\ndefault: 0.2", "duplicate key 'default' in line 2"),
         ("pairs: {1: 2}", "pairs = "),
-        ("pairs: [{anchor: 1, tag: 2}]", "entry 1.*no pair.*anchor, tag, offset"),
-        ("pairs: [{anchor: 1, tag: 2, offset: 0.1}, {anchor: 1, tag: 2, offset: 0.2}]", "entry 2.*twice"),
+        ("pairs: [{anchor: 1, tag: 2}]", "entry 1.*not a pair.*anchor, tag, offset"),
+        (
+            "pairs: [{anchor: 1, tag: 2, offset: 0.1}, {anchor: 1, tag: 2, offset: 0.2}]",
+            "entry 2.*duplicate pair",
+        ),
     ],
 )
 def test_malformed_offsets_file_is_refused(text: str, excerpt: str):

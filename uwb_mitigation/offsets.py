@@ -38,7 +38,7 @@ SCHEMA = (
     "default: m; anchors: {id: m}; tags: {id: m}; pairs: a list of {anchor, tag, offset, and optionally sd}"
 )
 VALID = f"a number of metres, {-MAX_OFFSET_M:g} to {MAX_OFFSET_M:g}, or a YAML file of offsets by anchor, tag or pair"
-_NONE: Mapping[Any, float] = MappingProxyType({})
+_EMPTY: Mapping[Any, float] = MappingProxyType({})
 
 
 class Offsets:
@@ -46,8 +46,10 @@ class Offsets:
 
     Args:
         default: offset of pairs without an entry.
-        anchors, tags: {id: m}.
+        anchors: {id: m}.
+        tags: {id: m}.
         pairs: {(tag, anchor): m}.
+        where: name of the file or parameter in errors.
         pair_sd: standard deviations of some pairs, m.
 
     Raises:
@@ -57,15 +59,15 @@ class Offsets:
     def __init__(
         self,
         default: float = 0.0,
-        anchors: Mapping[int, float] = _NONE,
-        tags: Mapping[int, float] = _NONE,
-        pairs: Mapping[tuple[int, int], float] = _NONE,
+        anchors: Mapping[int, float] = _EMPTY,
+        tags: Mapping[int, float] = _EMPTY,
+        pairs: Mapping[tuple[int, int], float] = _EMPTY,
         where: str = "offsets",
-        pair_sd: Mapping[tuple[int, int], float] = _NONE,
+        pair_sd: Mapping[tuple[int, int], float] = _EMPTY,
     ) -> None:
         entries = len(anchors) + len(tags) + len(pairs)
         if entries > MAX_ENTRIES:
-            raise ParameterError(f"{entries} offsets", where=where, valid=f"{MAX_ENTRIES} at most")
+            raise ParameterError(f"{entries} offsets", where=where, valid=f"at most {MAX_ENTRIES}")
         self.default = _checked(default, "default", where)
         self.anchors = {i: _checked(value, f"anchor {format_id(i)}", where) for i, value in anchors.items()}
         self.tags = {i: _checked(value, f"tag {format_id(i)}", where) for i, value in tags.items()}
@@ -77,13 +79,13 @@ class Offsets:
         for (tag, anchor), sd in self.pair_sd.items():
             if not 0.0 < sd <= MAX_OFFSET_M:
                 what = f"sd = {sd!r:.60} m of anchor {format_id(anchor)}, tag {format_id(tag)}"
-                raise ParameterError(what, where=where, valid=f"more than 0, {MAX_OFFSET_M:g} m at most")
+                raise ParameterError(what, where=where, valid=f"more than 0, at most {MAX_OFFSET_M:g} m")
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Offsets):
             return NotImplemented
-        mine, others = ((o.default, o.anchors, o.tags, o.pairs) for o in (self, other))
-        return mine == others
+        own_fields, other_fields = ((o.default, o.anchors, o.tags, o.pairs) for o in (self, other))
+        return own_fields == other_fields
 
     def __hash__(self) -> int:
         return hash((self.default, *(frozenset(o.items()) for o in (self.anchors, self.tags, self.pairs))))
@@ -93,7 +95,7 @@ class Offsets:
         return any((self.default, *self.anchors.values(), *self.tags.values(), *self.pairs.values()))
 
     def __len__(self) -> int:
-        """The number of anchors, tags and pairs named."""
+        """Number of entries for anchors, tags and pairs."""
         return len(self.anchors) + len(self.tags) + len(self.pairs)
 
     def __str__(self) -> str:
@@ -134,7 +136,7 @@ def read_offsets(value: str) -> Offsets:
         try:
             return parse_offsets(data.decode(), str(path))
         except UnicodeDecodeError as error:
-            raise ParameterError("not text", where=str(path), valid=SCHEMA) from error
+            raise ParameterError("not a text file", where=str(path), valid=SCHEMA) from error
     return Offsets(number)
 
 
@@ -149,70 +151,69 @@ def parse_offsets(text: str, where: str) -> Offsets:
         ParameterError: the text is not YAML or has another format; the message names the entry.
     """
     try:
-        document = yaml.load(text, _Loader)
+        document = yaml.load(text, _UniqueKeyLoader)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         first = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ParameterError(f"not YAML: {first}", where=where, valid=SCHEMA) from error
     if isinstance(document, int | float) and not isinstance(document, bool):
         return Offsets(document, where=where)
     if not isinstance(document, dict):
-        raise ParameterError("no offsets", where=where, valid=SCHEMA)
+        raise ParameterError("not a file of offsets", where=where, valid=SCHEMA)
     for name in document:
         check_name("key", name, _SECTIONS, where)
-    pairs, deviations = _by_pair(document.get("pairs") or [], where)
+    pairs, sd_by_pair = _by_pair(document.get("pairs") or [], where)
     return Offsets(
         _number(document.get("default", 0.0), "default", where),
-        _by_identity(document.get("anchors") or {}, "anchors", where),
-        _by_identity(document.get("tags") or {}, "tags", where),
+        _by_id(document.get("anchors") or {}, "anchors", where),
+        _by_id(document.get("tags") or {}, "tags", where),
         pairs,
         where,
-        deviations,
+        sd_by_pair,
     )
 
 
 def dump_offsets(offsets: Offsets, comment: str = "") -> str:
     """Return the text of an offsets file for `parse_offsets`; each line of `comment` precedes it."""
-    out = io.StringIO()
+    text_out = io.StringIO()
     for line in comment.splitlines():
-        out.write(f"# {line}\n")
-    out.write(f"default: {round(offsets.default, 6)}\n")
+        text_out.write(f"# {line}\n")
+    text_out.write(f"default: {round(offsets.default, 6)}\n")
     for name, entries in (("anchors", offsets.anchors), ("tags", offsets.tags)):
         if entries:
-            out.write(
+            text_out.write(
                 f"{name}:\n"
                 + "".join(f"  {format_id(i)}: {round(m, 6)}\n" for i, m in sorted(entries.items()))
             )
     if offsets.pairs:
-        out.write("pairs:\n")
+        text_out.write("pairs:\n")
         for (tag, anchor), value in sorted(offsets.pairs.items()):
             sd = offsets.pair_sd.get((tag, anchor))
-            sure = "" if sd is None else f", sd: {round(sd, 6)}"
-            out.write(
-                f"  - {{anchor: {format_id(anchor)}, tag: {format_id(tag)}, offset: {round(value, 6)}{sure}}}\n"
+            sd_text = "" if sd is None else f", sd: {round(sd, 6)}"
+            text_out.write(
+                f"  - {{anchor: {format_id(anchor)}, tag: {format_id(tag)}, offset: {round(value, 6)}{sd_text}}}\n"
             )
-    return out.getvalue()
+    return text_out.getvalue()
 
 
-class _Loader(yaml.SafeLoader):
+class _UniqueKeyLoader(yaml.SafeLoader):
     """Rejects duplicate keys, of which YAML would keep the last."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        seen = set()
+        keys = set()
         for key_node, _ in node.value:
             key = self.construct_object(key_node, deep=True)
-            if isinstance(key, int | float | str) and key in seen:
-                raise yaml.YAMLError(f"{key!r} is there twice, in line {key_node.start_mark.line + 1}")
+            if isinstance(key, int | float | str) and key in keys:
+                raise yaml.YAMLError(f"duplicate key {key!r} in line {key_node.start_mark.line + 1}")
             if isinstance(key, int | float | str):
-                seen.add(key)
+                keys.add(key)
         return super().construct_mapping(node, deep)
 
 
-def _by_identity(entries: object, name: str, where: str) -> dict[int, float]:
+def _by_id(entries: object, name: str, where: str) -> dict[int, float]:
     if not isinstance(entries, dict):
-        raise ParameterError(f"{name} = {entries!r:.60}", where=where, valid=f"{name}: {{identity: metres}}")
+        raise ParameterError(f"{name} = {entries!r:.60}", where=where, valid=f"{name}: {{id: metres}}")
     return {
-        _identity(identity, name, where): _number(value, f"{name}: {identity!r:.60}", where)
-        for identity, value in entries.items()
+        _id(id_, name, where): _number(value, f"{name}: {id_!r:.60}", where) for id_, value in entries.items()
     }
 
 
@@ -222,28 +223,30 @@ def _by_pair(
     """Return offsets and standard deviations by pair."""
     if not isinstance(entries, list):
         raise ParameterError(f"pairs = {entries!r:.60}", where=where, valid=SCHEMA)
-    found: dict[tuple[int, int], float] = {}
-    deviations: dict[tuple[int, int], float] = {}
+    offsets_by_pair: dict[tuple[int, int], float] = {}
+    sd_by_pair: dict[tuple[int, int], float] = {}
     for number, entry in enumerate(entries, 1):
-        place = f"{where}: pairs, entry {number}"
+        entry_where = f"{where}: pairs, entry {number}"
         for name in entry if isinstance(entry, dict) else ():
-            check_name("key", name, (*_PAIR, "sd"), place)
+            check_name("key", name, (*_PAIR, "sd"), entry_where)
         if not isinstance(entry, dict) or not set(entry) >= set(_PAIR):
-            raise ParameterError(f"{entry!r:.80} is no pair", where=place, valid=f"{{{', '.join(_PAIR)}}}")
-        pair = _identity(entry["tag"], "tag", place), _identity(entry["anchor"], "anchor", place)
-        if pair in found:
-            raise ParameterError("the pair is there twice", where=place, valid="one entry for each")
-        found[pair] = _number(entry["offset"], "offset", place)
+            raise ParameterError(
+                f"{entry!r:.80} is not a pair", where=entry_where, valid=f"{{{', '.join(_PAIR)}}}"
+            )
+        pair = _id(entry["tag"], "tag", entry_where), _id(entry["anchor"], "anchor", entry_where)
+        if pair in offsets_by_pair:
+            raise ParameterError("duplicate pair", where=entry_where, valid="one entry for each pair")
+        offsets_by_pair[pair] = _number(entry["offset"], "offset", entry_where)
         if "sd" in entry:
-            deviations[pair] = _number(entry["sd"], "sd", place)
-    return found, deviations
+            sd_by_pair[pair] = _number(entry["sd"], "sd", entry_where)
+    return offsets_by_pair, sd_by_pair
 
 
-def _identity(value: object, name: str, where: str) -> int:
+def _id(value: object, name: str, where: str) -> int:
     if isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= _MAX_ID:
         return value
     raise ParameterError(
-        f"{name}: identity {value!r:.60}", where=where, valid="a whole number of 64 bits, such as 3 or 0x1f"
+        f"{name}: id {value!r:.60}", where=where, valid="an unsigned 64-bit integer, such as 3 or 0x1f"
     )
 
 

@@ -63,14 +63,14 @@ class CirFault(enum.IntEnum):
 
 
 _FAULT_TEXTS = {
-    CirFault.EMPTY: "the CIR holds no samples",
-    CirFault.ODD_LENGTH: "a complex CIR holds an odd number of values",
-    CirFault.BAD_SCALE: "the CIR's scale is no positive number that float32 can multiply with",
+    CirFault.EMPTY: "the CIR has no samples",
+    CirFault.ODD_LENGTH: "a complex CIR has an odd number of values",
+    CirFault.BAD_SCALE: "the scale of the CIR is not a positive number within the range of float32",
     CirFault.NO_FIRST_PATH: "the first-path index is not finite",
-    CirFault.OUTSIDE: "the window around the first path lies outside the CIR",
-    CirFault.ALL_ZERO: "the window holds only zeros",
+    CirFault.OUTSIDE: "the window around the first path is partly outside the CIR",
+    CirFault.ALL_ZERO: "the window contains only zeros",
     CirFault.NEGATIVE: "a magnitude is negative",
-    CirFault.SATURATED: "the window holds a saturated sample",
+    CirFault.SATURATED: "the window contains a saturated sample",
     CirFault.NO_PREAMBLE_COUNT: "the preamble count is unknown, and the model's scaling needs it",
     CirFault.NO_POWER: "the receive or first-path power is unknown, and the linear bias model needs it",
 }

@@ -295,8 +295,8 @@ def build_image(
         image = toolchain.build_image(Path(folder), Path(folder), toolchain.Target.DWM1001_DEV)
         toolchain.write_hex(image, output)
     print_line(
-        f"{output}: {image.flash_bytes:,} of {image.flash_room:,} bytes of flash, {image.static_bytes:,} of "
-        f"{image.ram_room:,} of RAM, the rest for the stack; model {bundle.model_id:08x}"
+        f"{output}: {image.flash_bytes:,} of {image.available_flash_bytes:,} bytes of flash, {image.static_bytes:,} of "
+        f"{image.available_ram_bytes:,} of RAM, the rest for the stack; model {bundle.model_id:08x}"
     )
     result = asdict(image) | {
         "image": str(output),

@@ -1,4 +1,4 @@
-"""The firmware compiled for the host: a backend instead of ONNX Runtime, also used in parity tests."""
+"""The firmware compiled for this computer: a backend instead of ONNX Runtime, also used in parity tests."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ class CompiledFirmware:
                 self._model, window.ctypes.data, self._arena, self._arena_bytes, byref(value)
             )
             if status:
-                raise ModelError(f"the firmware refuses the model: status {status}")
+                raise ModelError(f"the firmware rejects the model: status {status}")
             outputs[index] = value.value
         return outputs
 
@@ -127,7 +127,7 @@ class CompiledFirmware:
 def link(
     program: Path, export: Path, output: Path, flags: Sequence[str] = (), *, shared: bool = False
 ) -> Path:
-    """Link a C file that includes the model in `export` with the library, for the host."""
+    """Link a C file that includes the model in `export` with the library, for this computer."""
     objects = library_objects(flags)
     options = (*_OPTIONS, *flags, f"-I{firmware_folder() / 'src'}", f"-I{export}")
     kind = ("-shared",) if shared else ()
@@ -136,7 +136,7 @@ def link(
 
 
 def library_objects(flags: Sequence[str] = ()) -> tuple[str, ...]:
-    """Return the object files of the portable library for the host, compiled once per process."""
+    """Return the object files of the portable library for this computer, compiled once per process."""
     sources = firmware_folder() / "src"
     options = (*_OPTIONS, *flags, f"-I{sources}")
     return compile_objects(c_compiler(), options, tuple(sorted(sources.glob("*.c"))))

@@ -1,4 +1,4 @@
-"""Search for the firmware's sources and the host's C compiler; run compilers and other tools."""
+"""Find the firmware's sources and the native C compiler; run compilers and other tools."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def firmware_folder() -> Path:
         if (folder / "src" / "uwb_mitigation.h").is_file():
             return folder
     raise MissingDependencyError(
-        "the firmware's sources are not installed",
+        "the sources of the firmware are not installed",
         where=", ".join(map(str, folders)),
         valid="install the package again",
     )
@@ -46,7 +46,7 @@ def c_compiler() -> tuple[str, ...]:
     """
     words = tuple(shlex.split(os.environ.get("CC", ""))) or ("cc" if shutil.which("cc") else "gcc",)
     if shutil.which(words[0]) is None:
-        raise MissingDependencyError(f"there is no C compiler {words[0]}", valid="apt install gcc, or set CC")
+        raise MissingDependencyError(f"C compiler {words[0]} not found", valid="apt install gcc, or set CC")
     return words
 
 
@@ -68,6 +68,7 @@ def load_library(prefix: str, objects: Sequence[str], signatures: Signatures) ->
 
     Args:
         prefix: prefix of the function names.
+        objects: paths of the object files.
         signatures: result and arguments of the functions, {name without prefix: (result, arguments)}.
 
     Raises:
@@ -105,12 +106,12 @@ def run(command: Sequence[str], timeout_s: float = 300, folder: Path | None = No
             cwd=folder,
         )
     except subprocess.TimeoutExpired as error:
-        raise UwbMitigationError(f"took more than {timeout_s} s", where=command[0]) from error
+        raise UwbMitigationError(f"timed out after {timeout_s} s", where=command[0]) from error
     except OSError as error:
         raise MissingDependencyError(f"cannot be run: {error.strerror}", where=command[0]) from error
     if done.returncode:
         lines = done.stderr.splitlines()
-        telling = (line for line in lines if re.search("error:|undefined reference", line))
-        reason = next(telling, lines[-1] if lines else "no message")
+        error_lines = (line for line in lines if re.search("error:|undefined reference", line))
+        reason = next(error_lines, lines[-1] if lines else "no message")
         raise UwbMitigationError(f"exit {done.returncode}: {reason}", where=Path(command[0]).name)
     return done.stdout

@@ -46,7 +46,7 @@ def export_bundle(bundle: Bundle, folder: Path) -> Path:
     """
     if not bundle.quantised:
         raise ModelError(
-            "the firmware runs int8 networks only",
+            "the firmware only runs int8 networks",
             where=str(bundle.path),
             valid="run `uwb-mitigation quantize`",
         )
@@ -203,7 +203,7 @@ def number(value: float | np.floating[Any]) -> str:
     with np.errstate(over="ignore"):
         single = np.float32(value)
     if not np.isfinite(single) or float(single) != float(value):
-        raise ModelError(f"{value!r} is no finite float32 value")
+        raise ModelError(f"{value!r} is not a finite float32 value")
     digits = f"{float(single):.9g}"
     if not re.search(r"[.e]", digits):
         digits += ".0"

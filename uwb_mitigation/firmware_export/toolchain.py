@@ -1,4 +1,4 @@
-"""Builds bare-metal Cortex-M4 images of the firmware with the GNU cross compiler."""
+"""Build bare-metal Cortex-M4 images of the firmware with the GNU cross compiler."""
 
 from __future__ import annotations
 
@@ -46,14 +46,14 @@ class Image:
         elf: path of the image.
         flash_bytes: code, constants and initial values of variables.
         static_bytes: variables; the rest of the RAM is the stack.
-        flash_room, ram_room: flash and RAM of the board, bytes.
+        available_flash_bytes, available_ram_bytes: flash and RAM of the board.
     """
 
     elf: Path
     flash_bytes: int
     static_bytes: int
-    flash_room: int
-    ram_room: int
+    available_flash_bytes: int
+    available_ram_bytes: int
 
 
 def missing_tools() -> list[str]:
@@ -89,7 +89,9 @@ def build_image(
     library, boards = firmware_folder() / "src", firmware_folder() / "boards"
     if not boards.is_dir():
         raise MissingDependencyError(
-            "the firmware's boards are not installed", where=str(boards), valid="run from a source checkout"
+            "the boards of the firmware are not installed",
+            where=str(boards),
+            valid="run from a source checkout",
         )
     common = boards / "cortex_m4"
     elf = build / f"{program.stem if program else board.value}_{kernels.value}.elf"
@@ -110,8 +112,8 @@ def build_image(
         region: [int(number) << _UNIT_SHIFTS[unit] for number, unit in re.findall(r"(\d+) ([KMG]?B)", line)]
         for region, line in re.findall(r"^ *(FLASH|RAM): +(.*)", usage, re.MULTILINE)
     }
-    (flash, flash_room), (ram, ram_room) = sizes["FLASH"], sizes["RAM"]
-    return Image(elf, flash, ram, flash_room, ram_room)
+    (flash, available_flash_bytes), (ram, available_ram_bytes) = sizes["FLASH"], sizes["RAM"]
+    return Image(elf, flash, ram, available_flash_bytes, available_ram_bytes)
 
 
 def write_hex(image: Image, output: Path) -> None:

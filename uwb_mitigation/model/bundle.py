@@ -35,7 +35,7 @@ MAX_BYTES = 64 << 20
 
 _MARKER = re.compile(rb'"model_id":"([0-9a-f]{8})"')
 _BLANK = b"00000000"
-_REMEDY = "write one with `uwb-mitigation train` and `quantize`"
+_REMEDY = "a bundle written by `uwb-mitigation train`, `quantize` or `calibrate`"
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,15 +77,15 @@ class Card:
     def origin(self) -> str:
         """Boards and site of the training data, human-readable."""
         data, boards = (self.training.get(key) for key in ("data", "boards"))
-        learnt = self.training.get("configurations")
-        extent = f" ({len(learnt)} configurations)" if isinstance(learnt, list) else ""
+        configurations = self.training.get("configurations")
+        extent = f" ({len(configurations)} configurations)" if isinstance(configurations, list) else ""
         return f"trained on {data or 'unknown data'}{extent}, boards {boards or 'unknown'}"
 
     def __post_init__(self) -> None:
         if self.architecture.samples != self.preprocessing.samples:
             raise ModelError(
                 f"the network reads {self.architecture.samples} samples, "
-                f"the preprocessing makes {self.preprocessing.samples}"
+                f"the preprocessing returns {self.preprocessing.samples}"
             )
         numbers = {
             "prior.offset_m": self.linear_bias.offset_m,
@@ -102,7 +102,7 @@ class Card:
                 raise ModelError(f"{name} = {value}", valid="a finite number")
             # Host and firmware compute in float32: store exactly the values that are used.
             if float(np.float32(value)) != value:
-                raise ModelError(f"{name} = {value!r} is no float32 value")
+                raise ModelError(f"{name} = {value!r} is not a float32 value")
         for name in ("variance_m2", "variance_uncorrected_m2"):
             if numbers[name] <= 0:
                 raise ModelError(f"{name} = {numbers[name]}", valid="a positive number")
@@ -192,28 +192,32 @@ def parse_bundle(data: bytes, path: Path) -> Bundle:
     where = str(path)
     markers = list(_MARKER.finditer(data))
     if len(markers) != 1:
-        raise ModelError(f"no ONNX model with the metadata {METADATA_KEY!r}", where=where, valid=_REMEDY)
+        raise ModelError(f"not an ONNX model with the metadata {METADATA_KEY!r}", where=where, valid=_REMEDY)
     model_id = int(markers[0].group(1), 16)
     actual = _checksum(data, markers[0].start(1))
     if model_id != actual:
         raise ModelError(
-            f"the model file is damaged: its checksum is {actual:08x}, it says {model_id:08x}",
+            f"the model file is damaged: its checksum is {actual:08x}, its model id {model_id:08x}",
             where=where,
-            valid="copy it again, or build it again",
+            valid="copy or build the file again",
         )
     session = _session(data, where)
     text = session.get_modelmeta().custom_metadata_map.get(METADATA_KEY, "")
     try:
         card = _card(json.loads(text))
     except (ValueError, KeyError, TypeError, RecursionError, UwbMitigationError) as error:
-        reason = f"no {error}" if isinstance(error, KeyError) else str(error)
-        raise ModelError(f"bad metadata: {reason}", where=where, valid=_REMEDY) from error
+        reason = f"missing key {error}" if isinstance(error, KeyError) else str(error)
+        raise ModelError(f"invalid metadata: {reason}", where=where, valid=_REMEDY) from error
     shapes = [tuple(tensor.shape[1:]) for tensor in (*session.get_inputs(), *session.get_outputs())]
     expected = [(1, card.architecture.samples), (1,)]
     if shapes != expected:
-        raise ModelError(f"the graph has tensors of shape {shapes}", where=where, valid=f"{expected}")
+        raise ModelError(
+            f"the inputs and outputs of the graph have the shapes {shapes}", where=where, valid=f"{expected}"
+        )
     if (b"QuantizeLinear" in data) != card.quantised:
-        raise ModelError(f"quantised = {card.quantised} in the metadata, not in the graph", where=where)
+        raise ModelError(
+            f"quantised = {card.quantised} in the metadata does not match the graph", where=where
+        )
     return Bundle(path, data, model_id, card, session)
 
 
@@ -224,7 +228,7 @@ def _session(data: bytes, where: str) -> onnxruntime.InferenceSession:
         return onnxruntime.InferenceSession(data, session_options(), providers=["CPUExecutionProvider"])
     except Exception as error:  # ONNX Runtime's errors have no common base class.
         raise ModelError(
-            f"ONNX Runtime {onnxruntime.__version__} refuses the model: {error}", where=where, valid=_REMEDY
+            f"ONNX Runtime {onnxruntime.__version__} rejects the model: {error}", where=where, valid=_REMEDY
         ) from error
 
 
@@ -248,7 +252,9 @@ def save_bundle(path: Path, graph: bytes, card: Card) -> Bundle:
     """Write a bundle atomically and return it as `load_bundle` would.
 
     Args:
+        path: file to write.
         graph: a serialised ONNX model without the metadata of a bundle.
+        card: description of the network.
 
     Raises:
         ModelError: the card does not fit the graph, or the file cannot be written.

@@ -126,16 +126,16 @@ def int8_model(weights: Int8Weights) -> bytes:
             )
         return names
 
-    copies: dict[str, Callable[[], int]] = {}
+    reader_counts: dict[str, Callable[[], int]] = {}
 
     def quantised(tensor: str, value: str) -> str:
         """Quantise `value` when it is first used, and add a dequantisation for each reader."""
         pair = [f"{tensor}.scale", zero]
-        if tensor not in copies:
+        if tensor not in reader_counts:
             graph.node("QuantizeLinear", [value, *pair], f"{tensor}.quantised")
-            copies[tensor] = itertools.count(1).__next__
-        copy = copies[tensor]()
-        return graph.node("DequantizeLinear", [f"{tensor}.quantised", *pair], f"{tensor}.dequantised{copy}")
+            reader_counts[tensor] = itertools.count(1).__next__
+        reader = reader_counts[tensor]()
+        return graph.node("DequantizeLinear", [f"{tensor}.quantised", *pair], f"{tensor}.dequantised{reader}")
 
     _write(graph, weights.architecture, parameters, quantised)
     return graph.model(weights.architecture, f"{_name(weights.architecture)}_int8")
@@ -187,8 +187,8 @@ def _constants(model: bytes) -> dict[str, NDArray[np.generic]]:
 def _take(constants: dict[str, NDArray[np.generic]], name: str, kind: type[Number]) -> NDArray[Number]:
     array = constants.get(name)
     if array is None or array.dtype != kind:
-        found = "absent" if array is None else f"of type {array.dtype}"
-        raise ModelError(f"initializer {name} is {found}", valid=np.dtype(kind).name)
+        problem = "absent" if array is None else f"of type {array.dtype}"
+        raise ModelError(f"initializer {name} is {problem}", valid=np.dtype(kind).name)
     return array.astype(kind, copy=False)
 
 

@@ -41,12 +41,12 @@ class Widening:
 
     Attributes:
         below, above: extension below the lowest and above the highest value.
-        least: minimum of the half width.
+        min_half_width: minimum of the half width.
     """
 
     below: float
     above: float
-    least: float
+    min_half_width: float
 
 
 # The model should also work at larger distances, and the error itself increases the range. A signal that is weaker
@@ -72,16 +72,16 @@ class Band:
     def __post_init__(self) -> None:
         for value in astuple(self):
             if not math.isfinite(value) or float(np.float32(value)) != value:
-                raise ModelError(f"a band with {value!r}", valid="finite float32 values")
+                raise ModelError(f"band with {value!r}", valid="finite float32 values")
         if self.low > self.high or self.margin <= 0 or not math.isfinite(np.float32(1) / self.margin):
-            raise ModelError(f"the band {astuple(self)}", valid="low <= high, and a positive margin")
+            raise ModelError(f"band {astuple(self)}", valid="low <= high, and a positive margin")
 
     @classmethod
     def of(cls, values: NDArray[np.floating], widening: Widening) -> Band:
         """Return the extended band of finite values (n,); its margin is half the width of the values."""
         low, high = float(values.min()), float(values.max())
-        half = max((high - low) / 2, widening.least)
-        bounds = (low - widening.below * half, high + widening.above * half, half)
+        half_width = max((high - low) / 2, widening.min_half_width)
+        bounds = (low - widening.below * half_width, high + widening.above * half_width, half_width)
         return cls(*(float(np.float32(value)) for value in bounds))
 
 
@@ -183,24 +183,26 @@ def features(
         sums[0], sums[1] = total[:, -1], np.add.accumulate(energy[:, FIRST_PATH_TAPS], axis=1)[:, -1]
         sums[2], sums[3] = range_m * range_m, total[:, LEAD_TAPS - 1]
         level = _level_db(sums)
-        found = np.empty((6, len(windows)), np.float32)
-        found[0] = range_m
-        np.add(rx_power_dbm, level[2], out=found[1])
-        np.subtract(rx_power_dbm, first_path_power_dbm, out=found[2])
-        np.subtract(level[:2], numbers[1:], out=found[3:5])
-        np.subtract(level[3], level[0], out=found[5])
-    by_measurement: NDArray[np.float32] = found.T
+        result = np.empty((6, len(windows)), np.float32)
+        result[0] = range_m
+        np.add(rx_power_dbm, level[2], out=result[1])
+        np.subtract(rx_power_dbm, first_path_power_dbm, out=result[2])
+        np.subtract(level[:2], numbers[1:], out=result[3:5])
+        np.subtract(level[3], level[0], out=result[5])
+    by_measurement: NDArray[np.float32] = result.T
     return by_measurement
 
 
 class OodDetector:
-    """Computes OOD scores of features with the bands of a `OodBands`."""
+    """Computes OOD scores of features with the bands of an `OodBands`."""
 
     def __init__(self, bands: Iterable[Band | None]) -> None:
-        checked = {column: astuple(band) for column, band in enumerate(bands) if band is not None}
+        bands_of_columns = {column: astuple(band) for column, band in enumerate(bands) if band is not None}
         # A slice is faster than a list of all columns.
-        self._columns = slice(None) if len(checked) == len(fields(OodBands)) - 1 else list(checked)
-        table = np.array(list(checked.values()), np.float32)
+        self._columns = (
+            slice(None) if len(bands_of_columns) == len(fields(OodBands)) - 1 else list(bands_of_columns)
+        )
+        table = np.array(list(bands_of_columns.values()), np.float32)
         self._low, self._high = table[:, 0], table[:, 1]
         self._per_unit = np.float32(1) / table[:, 2]
 

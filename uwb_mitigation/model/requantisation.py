@@ -130,8 +130,8 @@ def _thresholds(scale: np.float32, low: int, high: int) -> NDArray[np.int64]:
     candidates = np.clip(candidates, -(1 << 24), 1 << 24)
     reached = np.rint(candidates.astype(np.float32) * np.float32(scale)) >= steps[:, None]
     first = candidates[np.arange(_LEVELS), reached.argmax(axis=1)]
-    in_reach: NDArray[np.int64] = first[reached.any(axis=1) & (first > low) & (first <= high)]
-    return in_reach
+    thresholds: NDArray[np.int64] = first[reached.any(axis=1) & (first > low) & (first <= high)]
+    return thresholds
 
 
 def solve_requantisation(scale: np.float32, low: int, high: int) -> Requantisation | None:
@@ -148,10 +148,10 @@ def solve_requantisation(scale: np.float32, low: int, high: int) -> Requantisati
     level = int(requantise(np.array([low]), scale)[0])
     k = np.arange(level + 1, level + 1 + len(steps), dtype=np.int64)
     # With larger values the last step is always outside of its gap.
-    reach = max(1.0, nominal / max(1, abs(low), abs(high)))
-    trials = np.unique(np.rint(nominal + np.linspace(-reach, reach, 129)).astype(np.int64))
-    trials = trials[(trials > 0) & (trials < 2**31)]
-    for multiplier in trials[np.argsort(np.abs(trials - nominal), kind="stable")].tolist():
+    search_width = max(1.0, nominal / max(1, abs(low), abs(high)))
+    multipliers = np.unique(np.rint(nominal + np.linspace(-search_width, search_width, 129)).astype(np.int64))
+    multipliers = multipliers[(multipliers > 0) & (multipliers < 2**31)]
+    for multiplier in multipliers[np.argsort(np.abs(multipliers - nominal), kind="stable")].tolist():
         # Accumulator t reaches level k when 256 t + offset >= ceil(k D / multiplier).
         offset = _offset_between(
             _reaching(k, multiplier) - (steps << WEIGHT_SCALE_BITS),
@@ -205,17 +205,17 @@ def solve_sum(first: np.float32, second: np.float32) -> Sum | None:
     critical = np.abs(exact - np.rint(exact)) < 2.0**-9
     a, b, k = (values[critical].astype(np.int64) for values in (a, b, table))
     unit = np.int64(1) << SUM_SHIFT
-    spread = np.arange(-16, 17)
-    spread = spread[np.argsort(np.abs(spread), kind="stable")]
+    steps_around = np.arange(-16, 17)
+    steps_around = steps_around[np.argsort(np.abs(steps_around), kind="stable")]
     alpha, beta = (round(ratio * int(unit)) for ratio in ratios)
-    for shift in spread.tolist():
+    for shift in steps_around.tolist():
         base = (alpha + shift) * a - k * unit
-        scaled = base[None, :] + (beta + spread)[:, None] * b[None, :]
+        scaled = base[None, :] + (beta + steps_around)[:, None] * b[None, :]
         floor = np.where(k > 0, -scaled, -(2**40)).max(axis=1, initial=-(2**40))
         ceiling = np.where(k < _LEVELS, unit - 1 - scaled, 2**40).min(axis=1, initial=2**40)
         for index in np.flatnonzero(floor <= ceiling).tolist():
             offset = min(max(int(unit) // 2, int(floor[index])), int(ceiling[index]))
-            found = Sum(alpha + shift, beta + int(spread[index]), offset)
+            found = Sum(alpha + shift, beta + int(steps_around[index]), offset)
             if np.array_equal(found.table(), table):
                 return found
     return None

@@ -37,7 +37,7 @@ def model_path(named: str | Path | None) -> Path:
     path = Path(named).expanduser()
     if not path.exists():
         raise ModelError(
-            "no such file, and no shipped model",
+            "neither a file nor a shipped model",
             where=str(named),
             valid=f"shipped models: {', '.join(SHIPPED)}",
             suggestion=did_you_mean(path.stem, SHIPPED),
@@ -58,7 +58,7 @@ def shipped_model_path(name: str) -> Path:
     raise ModelError(
         f"the shipped model {name} is not installed",
         where=", ".join(str(candidate.parent) for candidate in candidates),
-        valid="install the package again, or name a model",
+        valid="install the package again, or give the path of a model",
     )
 
 

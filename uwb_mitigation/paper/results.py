@@ -32,7 +32,7 @@ class _Entry(BaseModel):
 class PartErrors(_Entry):
     """Errors on a part of the test data, m: MAE, standard deviation and quantiles before (`raw`) and after correction.
 
-    If `n` is 0, everything else is None.
+    If `n` is 0, all other fields have the value None.
     """
 
     n: Count
@@ -78,7 +78,7 @@ class ErrorsByCondition(_Entry):
 
 
 class TrainedModel(_Entry):
-    """One network, trained with one seed. None where a network has no such form.
+    """One network, trained with one seed. Forms that a network does not have are omitted (None).
 
     Attributes:
         samples: window length K.
@@ -195,7 +195,7 @@ def read(kind: type[Entry], path: Path) -> Entry:
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """Mean and standard deviation (n - 1) over seeds; the latter is None for a single seed."""
+    """Mean and standard deviation (n - 1) over seeds; the latter is omitted (None) for a single seed."""
 
     mean: float
     std: float | None

@@ -208,7 +208,7 @@ def _line() -> Candidate:
 def from_bundle(source: Bundle, options: FitOptions) -> list[Candidate]:
     """Return the unchanged model of a bundle, the same with another offset, a constant, a line, and a fine-tuned network.
 
-    The fine-tuned network is trained on the residuals of a new linear_bias: a line if the bundle has one, otherwise an offset.
+    The fine-tuned network is trained on the residuals of a new linear bias model: a line if the bundle has one, otherwise an offset.
 
     Raises:
         ModelError: the network is not a REMNet.
