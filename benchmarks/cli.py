@@ -200,7 +200,7 @@ def radio(
     with console.progress() as bar:
         task = bar.add_task("ranging", total=len(bench.PPM_PAIRS) * len(bench.DISTANCES_M))
         rows = bench.ranging(seconds, lambda: bar.advance(task))
-        host_hz, device_hz = bench.line_rate_hz(Mode.HOST), bench.line_rate_hz(Mode.DEVICE)
+        host_hz, device_hz = bench.serial_rate_hz(Mode.HOST), bench.serial_rate_hz(Mode.DEVICE)
         evb1000_hz = None
         if evb1000:
             task = bar.add_task("EVB1000s", total=None)

@@ -62,7 +62,7 @@ def emulate_evb1000(
     Modelled DW1000s with the USB-to-SPI protocol of the factory firmware, in wall-clock time. Use the printed ports
     like /dev/ttyACM0. The emulation was not compared with a real board.
     """
-    from benchmarks.dw1000_model.evb1000 import CLEAN_M, EmulatedEvb1000s
+    from benchmarks.dw1000_model.evb1000 import DEFAULT_DISTANCE_M, EmulatedEvb1000s
 
     for name, value in (("duration", duration), ("unplug-every", unplug_every)):
         if value is not None and not value > 0:
@@ -86,7 +86,7 @@ def emulate_evb1000(
             damage=damage,
             seed=seed,
             antenna_delay=antenna_delay,
-            clean_m=CLEAN_M if distance is None else distance,
+            distance_m=DEFAULT_DISTANCE_M if distance is None else distance,
         )
         with emulated, _signals() as asked:
             for number, port in enumerate(emulated.ports):

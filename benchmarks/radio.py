@@ -16,8 +16,8 @@ import numpy as np
 import psutil
 from numpy.typing import NDArray
 
-from benchmarks.dw1000_model.boards import Line, ModelledAir
-from benchmarks.dw1000_model.links import Link
+from benchmarks.dw1000_model.boards import ModelledAir, SerialLink
+from benchmarks.dw1000_model.pairs import Pair
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.link.connection import PortAddress
 from uwb_mitigation.link.layout import Mode, Role
@@ -89,7 +89,7 @@ def ranging(seconds: float, advance: Callable[[], None]) -> list[Ranging]:
         with ModelledAir() as air:
             tag = air.add(RadioSettings(), ppm=ppm_a, clock_ticks=DEVICE_TIME_WRAP - _BEFORE_WRAP_TICKS)
             anchor = air.add(RadioSettings(role=Role.ANCHOR), ppm=ppm_b)
-            air.link(tag, anchor, Link(distance_m))
+            air.set_pair(tag, anchor, Pair(distance_m))
             air.run(seconds)
             measured, _ = air.ranges()
         errors = measured["range_m"] - distance_m
@@ -98,13 +98,15 @@ def ranging(seconds: float, advance: Callable[[], None]) -> list[Ranging]:
     return rows
 
 
-def line_rate_hz(mode: Mode) -> float:
+def serial_rate_hz(mode: Mode) -> float:
     """Return the ranges per second over a serial line of 921600 baud, in mode HOST with 157 samples each; virtual time."""
     seconds = 5.0
-    line = Line(mode=mode, inference_s=INFERENCE_CYCLES / PROCESSOR_HZ, overhead_s=SPI_OVERHEAD_S)
+    serial_link = SerialLink(
+        mode=mode, inference_s=INFERENCE_CYCLES / PROCESSOR_HZ, overhead_s=SPI_OVERHEAD_S
+    )
     with ModelledAir() as air:
-        tag = air.add(RadioSettings(), line=line)
-        air.link(tag, air.add(RadioSettings(role=Role.ANCHOR)), Link(5))
+        tag = air.add(RadioSettings(), serial_link=serial_link)
+        air.set_pair(tag, air.add(RadioSettings(role=Role.ANCHOR)), Pair(5))
         air.run(seconds)
         rows, _ = air.ranges()
         return (len(rows) - air.measurements_lost(tag)) / seconds
@@ -158,11 +160,11 @@ def soak(exchanges: int, seed: int, advance: Callable[[int], None]) -> RadioSoak
     with ModelledAir(seed) as air:
         tag = air.add(RadioSettings(window=0), ppm=11)
         anchors = {
-            air.add(RadioSettings(role=Role.ANCHOR), ppm=ppm): Link(distance_m, loss=_LOSS, damage=_DAMAGE)
+            air.add(RadioSettings(role=Role.ANCHOR), ppm=ppm): Pair(distance_m, loss=_LOSS, damage=_DAMAGE)
             for distance_m, ppm in zip(_ANCHORS_M, (-20, -7, 5, 19), strict=True)
         }
         for anchor, path in anchors.items():
-            air.link(tag, anchor, path)
+            air.set_pair(tag, anchor, path)
         now_s = air.run(1.0)
         watch = _Watch(air, anchors)
         watch.take(now_s)
@@ -176,9 +178,9 @@ def soak(exchanges: int, seed: int, advance: Callable[[int], None]) -> RadioSoak
             what = random.integers(0, 3)
             anchor = int(random.choice(list(anchors)))
             if what == 0:
-                air.link(tag, anchor, None)
+                air.set_pair(tag, anchor, None)
                 watch.take(air.run(float(random.uniform(0.05, 1.0))))
-                air.link(tag, anchor, anchors[anchor])
+                air.set_pair(tag, anchor, anchors[anchor])
                 expected = {anchor}
             else:
                 air.reset(tag if what == 1 else anchor)
@@ -206,7 +208,7 @@ class _Watch:
 
     _SLICE_S = 0.01
 
-    def __init__(self, air: ModelledAir, anchors: dict[int, Link]) -> None:
+    def __init__(self, air: ModelledAir, anchors: dict[int, Pair]) -> None:
         self._air = air
         self._by_address = {air.address(anchor): anchor for anchor in anchors}
         self._distances_m = {anchor: path.distance_m for anchor, path in anchors.items()}

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from benchmarks.dw1000_model.air import ANTENNA_DELAY_TICKS, Air, Chip, Host
-from benchmarks.dw1000_model.links import Link
+from benchmarks.dw1000_model.pairs import Pair
 
 SLOW_HZ, FAST_HZ = 2_000_000, 16_000_000
 WRAP = 1 << 40
@@ -137,10 +137,10 @@ class Driver:
         return data
 
 
-def pair(air: Air, link: Link | None = None) -> tuple[Driver, Driver, Chip, Chip]:
+def pair(air: Air, channel: Pair | None = None) -> tuple[Driver, Driver, Chip, Chip]:
     """Return the drivers of two started chips at a distance of 3 m, and the chips."""
     chips = air.chip(), air.chip()
-    air.link(*chips, link or Link(3.0))
+    air.set_pair(*chips, channel or Pair(3.0))
     drivers = [Driver(chip) for chip in chips]
     for driver in drivers:
         driver.start()

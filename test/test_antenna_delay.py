@@ -69,7 +69,7 @@ def test_antenna_delay_of_a_pair_is_estimated_and_written(tmp_path: Path):
 
 @NEEDS_CC
 def test_single_tag_compensates_the_complete_offset(tmp_path: Path):
-    with EmulatedEvb1000s(boards=2, antenna_delay=NOMINAL + 60, clean_m=5.01) as boards:
+    with EmulatedEvb1000s(boards=2, antenna_delay=NOMINAL + 60, distance_m=5.01) as boards:
         anchor = RadioDriver(
             bus_opener("evb1000", boards.ports[1]), RadioSettings(role=Role.ANCHOR, antenna_delay=NOMINAL)
         )

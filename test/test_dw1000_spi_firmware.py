@@ -15,7 +15,7 @@ from firmware_on_model import REPLY_US, ranging, use_virtual_time
 from spidev_on_model import dw1000, program, replace_spidev
 
 from benchmarks.dw1000_model.air import ANTENNA_DELAY_TICKS, Air, Host
-from benchmarks.dw1000_model.links import Link
+from benchmarks.dw1000_model.pairs import Pair
 from uwb_mitigation.link.layout import Role
 from uwb_mitigation.link.radio_settings import RadioSettings
 from uwb_mitigation.measurement import RangeMeasurement
@@ -70,7 +70,7 @@ def await_kind(driver: dw1000.DW1000, kind: int, seconds: float) -> tuple[Simple
 @pytest.mark.parametrize("distance_m", [2.0, 40.0])
 def test_tag_ranges_with_an_independent_anchor(air: Air, distance_m: float):
     tag, anchor = air.chip(ppm=12.0, clock_ticks=WRAP - 10**9), air.chip(ppm=-9.0)
-    air.link(tag, anchor, Link(distance_m, excess_m=0.5))
+    air.set_pair(tag, anchor, Pair(distance_m, excess_m=0.5))
     ranges: list[RangeMeasurement] = []
 
     def attend(driver: dw1000.DW1000, host: Host) -> None:
@@ -100,7 +100,7 @@ def test_tag_ranges_with_an_independent_anchor(air: Air, distance_m: float):
 def test_anchor_ranges_with_an_independent_tag(air: Air):
     """The package cannot send with a delay or receive immediately after sending: write SYS_CTRL and DX_TIME."""
     tag, anchor = air.chip(ppm=-15.0), air.chip(ppm=15.0, clock_ticks=WRAP - 10**9)
-    air.link(tag, anchor, Link(12.5))
+    air.set_pair(tag, anchor, Pair(12.5))
     own = 0xA000000000000001
     found: list[float] = []
 
@@ -155,9 +155,9 @@ def test_anchor_ranges_with_an_independent_tag(air: Air):
 
 def test_frames_without_a_leading_edge_yield_no_range(air: Air):
     tag, anchor = air.chip(), air.chip()
-    air.link(tag, anchor, Link(6.0))
+    air.set_pair(tag, anchor, Pair(6.0))
     for chip in (tag, anchor):
-        chip.lose_edges(0.2)
+        chip.set_edge_loss(0.2)
     ranges: list[RangeMeasurement] = []
     air.program(tag, ranging(RadioSettings(), ranges, 0.3))
     air.program(anchor, ranging(RadioSettings(role=Role.ANCHOR), [], 0.3))
@@ -170,7 +170,7 @@ def test_frames_without_a_leading_edge_yield_no_range(air: Air):
 def test_default_delays_grow_with_the_frame_length(air: Air, preamble: int):
     slow = {"rate_kbps": 110, "preamble": preamble}
     tag, anchor = air.chip(ppm=5.0), air.chip(ppm=-5.0)
-    air.link(tag, anchor, Link(6.0))
+    air.set_pair(tag, anchor, Pair(6.0))
     ranges: list[RangeMeasurement] = []
     air.program(tag, ranging(RadioSettings(**slow), ranges, 0.6))
     air.program(anchor, ranging(RadioSettings(role=Role.ANCHOR, **slow), [], 0.6))

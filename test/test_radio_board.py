@@ -6,8 +6,8 @@ import itertools
 
 from compilers import NEEDS_CC
 
-from benchmarks.dw1000_model.boards import Line, ModelledAir
-from benchmarks.dw1000_model.links import Link
+from benchmarks.dw1000_model.boards import ModelledAir, SerialLink
+from benchmarks.dw1000_model.pairs import Pair
 from uwb_mitigation.link import messages
 from uwb_mitigation.link.events import Event, RadioRefused
 from uwb_mitigation.link.layout import RadioState, Role
@@ -41,9 +41,9 @@ class Host:
 
 def test_ranges_reach_the_host_with_stamps_of_their_reception():
     with ModelledAir() as air:
-        tag = air.add(RadioSettings(), line=Line())
+        tag = air.add(RadioSettings(), serial_link=SerialLink())
         anchor = air.add(RadioSettings(role=Role.ANCHOR))
-        air.link(tag, anchor, Link(6))
+        air.set_pair(tag, anchor, Pair(6))
         host = Host(air, tag)
         host.run(2)
         ranges = host.seen(RangeMeasurement)
@@ -60,9 +60,9 @@ def test_ranges_reach_the_host_with_stamps_of_their_reception():
 
 def test_board_reports_settings_and_status_of_its_radio():
     with ModelledAir() as air:
-        tag = air.add(RadioSettings(window=16), line=Line())
+        tag = air.add(RadioSettings(window=16), serial_link=SerialLink())
         anchor = air.add(RadioSettings(role=Role.ANCHOR))
-        air.link(tag, anchor, Link(6, loss=0.05))
+        air.set_pair(tag, anchor, Pair(6, loss=0.05))
         host = Host(air, tag)
         host.run(3)
         addresses = air.address(tag), air.address(anchor)
@@ -87,9 +87,9 @@ def test_board_reports_settings_and_status_of_its_radio():
 def test_host_configures_the_radio_while_it_ranges():
     wanted = RadioSettings(channel=2, prf_mhz=16, window=40, pan=7)
     with ModelledAir() as air:
-        tag = air.add(RadioSettings(), line=Line())
+        tag = air.add(RadioSettings(), serial_link=SerialLink())
         anchor = air.add(RadioSettings(role=Role.ANCHOR, channel=2, prf_mhz=16, pan=7))
-        air.link(tag, anchor, Link(6))
+        air.set_pair(tag, anchor, Pair(6))
         host = Host(air, tag)
         host.run(0.5)
         assert not host.seen(RangeMeasurement)
@@ -105,7 +105,7 @@ def test_host_configures_the_radio_while_it_ranges():
 
 def test_settings_that_a_board_does_not_support_are_refused_with_a_reason():
     with ModelledAir() as air:
-        board = air.add(RadioSettings(), line=Line())
+        board = air.add(RadioSettings(), serial_link=SerialLink())
         host = Host(air, board)
         host.run(0.5)
         _, payload = messages.encode(SetRadio(RadioSettings(channel=6)))

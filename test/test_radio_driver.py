@@ -14,9 +14,9 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from ros_harness import diagnostic_values
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
-from benchmarks.dw1000_model.boards import Line, ModelledAir
+from benchmarks.dw1000_model.boards import ModelledAir, SerialLink
 from benchmarks.dw1000_model.evb1000 import EmulatedEvb1000s
-from benchmarks.dw1000_model.links import Link
+from benchmarks.dw1000_model.pairs import Pair
 from uwb_mitigation.errors import ParameterError, format_id
 from uwb_mitigation.link.emulated_board import EmulatedBoard, PseudoTerminal
 from uwb_mitigation.link.layout import Role
@@ -133,11 +133,11 @@ class ModelledBoard:
 
     def _run(self) -> None:
         with ModelledAir() as air:
-            tag = air.add(RadioSettings(), line=Line())
+            tag = air.add(RadioSettings(), serial_link=SerialLink())
             near = air.add(RadioSettings(role=Role.ANCHOR))
             far = air.add(RadioSettings(role=Role.ANCHOR, channel=2, prf_mhz=16))
-            air.link(tag, near, Link(5))
-            air.link(tag, far, Link(9))
+            air.set_pair(tag, near, Pair(5))
+            air.set_pair(tag, far, Pair(9))
             waiting = bytearray()
             while not self._stop.wait(self.STEP_S):
                 air.write(tag, self._terminal.read())

@@ -10,7 +10,7 @@ from compilers import NEEDS_CC
 
 from benchmarks.dw1000_model import boards as modelled
 from benchmarks.dw1000_model.boards import ModelledAir
-from benchmarks.dw1000_model.links import Link
+from benchmarks.dw1000_model.pairs import Pair
 from uwb_mitigation.link.layout import Role
 from uwb_mitigation.link.radio_settings import PREAMBLES, RadioSettings
 from uwb_mitigation.radio import structures
@@ -32,11 +32,11 @@ def accumulator(samples: int = 1016, first_path: int = 745, seed: int = 0) -> np
 
 
 def pair(
-    air: ModelledAir, path: Link, /, ppm: tuple[float, float] = (20, -20), **settings: object
+    air: ModelledAir, channel: Pair, /, ppm: tuple[float, float] = (20, -20), **settings: object
 ) -> tuple[int, int]:
     tag = air.add(RadioSettings(**settings), ppm=ppm[0], clock_ticks=WRAP - 3 * 10**9)
     anchor = air.add(RadioSettings(**settings | {"role": Role.ANCHOR}), ppm=ppm[1], clock_ticks=12345)
-    air.link(tag, anchor, path)
+    air.set_pair(tag, anchor, channel)
     return tag, anchor
 
 
@@ -58,7 +58,7 @@ def test_structures_are_those_of_the_compiler():
 @pytest.mark.parametrize("distance_m", [0.3, 5.01, 100.0])
 def test_ranges_are_exact_for_any_clock_error_and_across_the_wrap(ppm, distance_m: float):
     with ModelledAir() as air:
-        pair(air, Link(distance_m), ppm)
+        pair(air, Pair(distance_m), ppm)
         air.run(0.5)
         rows, _ = air.ranges()
     assert len(rows) > 100
@@ -72,7 +72,7 @@ def test_ranges_are_exact_for_any_clock_error_and_across_the_wrap(ppm, distance_
 def test_cir_equals_that_of_the_channel_bit_by_bit(window: int):
     iq = accumulator()
     with ModelledAir() as air:
-        pair(air, Link(7, samples=iq, first_path_index=745.25, preamble_count=100), window=window)
+        pair(air, Pair(7, samples=iq, first_path_index=745.25, preamble_count=100), window=window)
         air.run(0.05)
         rows, store = air.ranges()
     assert len(rows) > 2
@@ -89,7 +89,7 @@ def test_cir_equals_that_of_the_channel_bit_by_bit(window: int):
 def test_powers_are_the_manuals_formulas_of_the_registers(prf: int, reference_db: float, samples: int):
     iq = accumulator(samples)
     with ModelledAir() as air:
-        pair(air, Link(7, samples=iq, first_path_index=745.0, preamble_count=100), prf_mhz=prf, window=0)
+        pair(air, Pair(7, samples=iq, first_path_index=745.0, preamble_count=100), prf_mhz=prf, window=0)
         air.run(0.05)
         rows, _ = air.ranges()
     magnitude = np.hypot(*iq.reshape(-1, 2).T.astype(float))
@@ -115,7 +115,7 @@ RADIOS = [{"channel": channel, "prf_mhz": prf} for channel in (1, 2, 3, 4, 5, 7)
 def test_every_channel_rate_and_preamble_ranges(radio: dict[str, object]):
     slow = {"reply_us": 20_000, "timeout_us": 60_000}
     with ModelledAir() as air:
-        tag, _ = pair(air, Link(12), **(slow | radio))
+        tag, _ = pair(air, Pair(12), **(slow | radio))
         air.run(0.3)
         rows, _ = air.ranges()
         counts = air.counts(tag)
@@ -128,7 +128,7 @@ def test_radios_that_differ_in_the_channel_or_the_network_do_not_range():
         with ModelledAir() as air:
             tag = air.add(RadioSettings())
             anchor = air.add(RadioSettings(role=Role.ANCHOR, **other))
-            air.link(tag, anchor, Link(3))
+            air.set_pair(tag, anchor, Pair(3))
             air.run(0.3)
             assert air.counts(tag)["tried"] == 0
             assert air.counts(tag)["restarts"] <= 1
@@ -139,7 +139,7 @@ def test_tag_finds_its_anchors_and_ranges_with_all_of_them_in_turn():
         tag = air.add(RadioSettings(window=0), ppm=3)
         anchors = [air.add(RadioSettings(role=Role.ANCHOR), ppm=i - 16) for i in range(32)]
         for i, anchor in enumerate(anchors):
-            air.link(tag, anchor, Link(1.0 + i))
+            air.set_pair(tag, anchor, Pair(1.0 + i))
         air.run(6)
         air.ranges()
         air.run(1)
@@ -159,10 +159,10 @@ def test_tags_share_the_channel_without_mixing_ranges():
         tags = [air.add(RadioSettings(window=0), ppm=-i) for i in range(4)]
         for i, tag in enumerate(tags):
             for j, anchor in enumerate(anchors):
-                air.link(tag, anchor, Link(3.0 + 10 * i + 5 * j))
+                air.set_pair(tag, anchor, Pair(3.0 + 10 * i + 5 * j))
             for other in tags[:i]:
-                air.link(tag, other, Link(2))
-        air.link(*anchors, Link(4))
+                air.set_pair(tag, other, Pair(2))
+        air.set_pair(*anchors, Pair(4))
         air.run(10)
         rows, _ = air.ranges()
         truth = {
@@ -182,7 +182,7 @@ def test_anchor_with_a_host_reports_the_range_with_the_cir_of_final():
     with ModelledAir() as air:
         tag = air.add(RadioSettings(window=0))
         anchor = air.add(RadioSettings(role=Role.ANCHOR, report=True))
-        air.link(tag, anchor, Link(9, samples=iq, first_path_index=745.0))
+        air.set_pair(tag, anchor, Pair(9, samples=iq, first_path_index=745.0))
         air.run(0.2)
         rows, store = air.ranges()
         addresses = air.address(tag), air.address(anchor)
@@ -197,7 +197,7 @@ def test_missing_antenna_delay_appears_in_the_range():
     with ModelledAir() as air:
         tag = air.add(RadioSettings(antenna_delay=2 * 16436 - 400))
         anchor = air.add(RadioSettings(role=Role.ANCHOR))
-        air.link(tag, anchor, Link(5))
+        air.set_pair(tag, anchor, Pair(5))
         air.run(0.1)
         rows, _ = air.ranges()
     # Half of the missing delay of one device, as distance: 2.346 mm per tick.
@@ -206,7 +206,7 @@ def test_missing_antenna_delay_appears_in_the_range():
 
 def test_power_dependent_bias_is_corrected_if_enabled():
     with ModelledAir() as air:
-        pair(air, Link(5, samples=accumulator()), bias_correction=True)
+        pair(air, Pair(5, samples=accumulator()), bias_correction=True)
         air.run(0.1)
         rows, _ = air.ranges()
     power_dbm = rows["rx_power_dbm"][0]
@@ -218,16 +218,16 @@ def test_power_dependent_bias_is_corrected_if_enabled():
 
 def test_reset_or_unreachable_chip_recovers_within_a_second_without_wrong_ranges():
     random = np.random.default_rng(4)
-    channel = Link(8, loss=0.1, damage=0.01)
+    channel = Pair(8, loss=0.1, damage=0.01)
     with ModelledAir(7) as air:
         tag, anchor = pair(air, channel, window=0)
         air.run(1)
         for step in range(30):
             what = step % 3
             if what == 2:
-                air.link(tag, anchor, None)
+                air.set_pair(tag, anchor, None)
                 air.run(random.uniform(0.05, 1))
-                air.link(tag, anchor, channel)
+                air.set_pair(tag, anchor, channel)
             else:
                 air.reset((tag, anchor)[what])
             air.ranges()

@@ -12,7 +12,7 @@ from compilers import NEEDS_CC
 from firmware_on_model import ModelBus, ranging, use_virtual_time
 
 from benchmarks.dw1000_model.air import Air, Chip, Host
-from benchmarks.dw1000_model.links import Link
+from benchmarks.dw1000_model.pairs import Pair
 from uwb_mitigation.errors import LinkError
 from uwb_mitigation.link.layout import RadioState, Role
 from uwb_mitigation.link.radio_settings import RadioSettings, RadioStatus
@@ -59,7 +59,7 @@ class Run:
         for number, chip in enumerate(self.chips):
             prepare(chip)
             for other in self.chips[:number]:
-                air.link(chip, other, Link(6.0))
+                air.set_pair(chip, other, Pair(6.0))
             wanted = tag if number else anchor
             air.program(chip, ranging(wanted, self.ranges, seconds, bus=self._bus(bus), at_end=self._at_end))
         air.run(2 * seconds)
@@ -321,7 +321,7 @@ def test_unlocked_clock_is_an_error(air: Air):
 
 
 def test_temperature_and_voltage_are_read_when_they_are_ready(air: Air):
-    run = Run(air, seconds=0.05, prepare=lambda chip: chip.environment(41.0, 3.1))
+    run = Run(air, seconds=0.05, prepare=lambda chip: chip.set_environment(41.0, 3.1))
     assert len(run.statuses) == 2
     for status in run.statuses:
         assert status.temperature_c == pytest.approx(41.0, abs=0.6)

@@ -10,14 +10,14 @@ from typing import Protocol
 
 import numpy as np
 
-from benchmarks.dw1000_model.library import LinkConfig, NextRequest, Request, load
-from benchmarks.dw1000_model.links import Link
+from benchmarks.dw1000_model.library import NextRequest, PairConfig, Request, load
+from benchmarks.dw1000_model.pairs import Pair
 from uwb_mitigation.errors import UwbMitigationError
 
 ANTENNA_DELAY_TICKS = 16436
 """Antenna delay per direction that DecaRanging assumes at PRF 64 MHz."""
 
-_LOOK_S = 1e-6
+_POLL_S = 1e-6
 _SPI, _DELAY, _WAIT, _RESET_PIN = range(4)
 
 
@@ -32,7 +32,7 @@ class Host(Protocol):
         """The level of the IRQ line."""
         ...
 
-    def wait(self, at_most_s: float) -> None:
+    def wait(self, timeout_s: float) -> None:
         """Wait until the IRQ line is high."""
         ...
 
@@ -45,7 +45,7 @@ class Host(Protocol):
         ...
 
     def now(self) -> float:
-        """Seconds since the air's beginning."""
+        """Time since the start of the air, s."""
         ...
 
 
@@ -77,29 +77,29 @@ class Air:
         rx_delay_ticks: int = ANTENNA_DELAY_TICKS,
     ) -> Chip:
         """Add a chip; `dw1000_chip_new` in C."""
-        made = self._library.dw1000_chip_new(self._air, ppm, clock_ticks, tx_delay_ticks, rx_delay_ticks)
-        if made is None:
+        chip = self._library.dw1000_chip_new(self._air, ppm, clock_ticks, tx_delay_ticks, rx_delay_ticks)
+        if chip is None:
             raise UwbMitigationError("no memory for a chip")
-        return Chip(self, self._library, made)
+        return Chip(self, self._library, chip)
 
-    def link(self, a: Chip, b: Chip, link: Link | None) -> None:
-        """Link two chips in both directions; None removes the link."""
+    def set_pair(self, a: Chip, b: Chip, pair: Pair | None) -> None:
+        """Set the radio channel of two chips; with None they do not receive each other."""
         config = None
-        if link is not None:
-            samples = None if link.samples is None else np.ascontiguousarray(link.samples, np.int16)
-            config = LinkConfig(
-                link.distance_m,
-                link.excess_m,
+        if pair is not None:
+            samples = None if pair.samples is None else np.ascontiguousarray(pair.samples, np.int16)
+            config = PairConfig(
+                pair.distance_m,
+                pair.excess_m,
                 None if samples is None else samples.ctypes.data,
                 0 if samples is None else len(samples) // 2,
-                link.first_path_index,
-                link.preamble_count,
-                link.noise_threshold,
-                link.std_noise,
-                link.loss,
-                link.damage,
+                pair.first_path_index,
+                pair.preamble_count,
+                pair.noise_threshold,
+                pair.std_noise,
+                pair.loss,
+                pair.damage,
             )
-        self._library.dw1000_link(
+        self._library.dw1000_set_pair(
             self._air, a.address, b.address, None if config is None else ctypes.byref(config)
         )
 
@@ -159,9 +159,9 @@ class Chip:
         """The level of the IRQ line."""
         return bool(self._library.dw1000_irq(self.address))
 
-    def wait(self, at_most_s: float) -> None:
+    def wait(self, timeout_s: float) -> None:
         """Wait until the IRQ line is high."""
-        self._library.dw1000_wait(self.address, at_most_s)
+        self._library.dw1000_wait(self.address, timeout_s)
 
     def delay(self, seconds: float) -> None:
         """Let time pass."""
@@ -175,13 +175,13 @@ class Chip:
         """Set RSTn permanently: 0 low, 1 floating, 2 high, which destroys the chip."""
         self._library.dw1000_reset_drive(self.address, level)
 
-    def environment(self, celsius: float, volts: float) -> None:
+    def set_environment(self, celsius: float, volts: float) -> None:
         """Set the values that the chip's sensors measure."""
-        self._library.dw1000_environment(self.address, celsius, volts)
+        self._library.dw1000_set_environment(self.address, celsius, volts)
 
-    def lose_edges(self, probability: float) -> None:
+    def set_edge_loss(self, probability: float) -> None:
         """Set the fraction of good frames in which the detector finds no leading edge."""
-        self._library.dw1000_lose_edges(self.address, probability)
+        self._library.dw1000_set_edge_loss(self.address, probability)
 
     def program_otp(self, address: int, word: int) -> None:
         """Set a word of the OTP memory; registers loaded from it change at the next reset."""
@@ -195,15 +195,15 @@ class Chip:
         return data.value, header.value
 
     def now(self) -> float:
-        """Seconds since the air's beginning."""
+        """Time since the start of the air, s."""
         now: float = self._library.dw1000_now(self.address)
         return now
 
     @property
     def fault(self) -> str | None:
         """Cause of the destruction of the chip; None = the chip works."""
-        told = self._library.dw1000_fault(self.address)
-        return None if told is None else told.decode()
+        fault = self._library.dw1000_fault(self.address)
+        return None if fault is None else fault.decode()
 
 
 class _Ended(BaseException):
@@ -218,38 +218,38 @@ class _Program:
         self._requests: queue.SimpleQueue[tuple[int, float, bytes, int] | None] = queue.SimpleQueue()
         self._answers: queue.SimpleQueue[bool] = queue.SimpleQueue()
         self._request = Request()
-        self._kept: list[object] = []
+        self._references: list[object] = []
         self._read = ctypes.create_string_buffer(0)
         self._failure: BaseException | None = None
-        self._over = False
+        self._ended = False
         self._thread: threading.Thread | None = None
-        self.callback = NextRequest(self._next)
+        self.callback = NextRequest(self._next_request)
 
     def spi(self, out: bytes, hz: int) -> bytes:
-        self._ask(_SPI, 0.0, bytes(out), hz)
+        self._send_request(_SPI, 0.0, bytes(out), hz)
         return self._read.raw
 
     def irq(self) -> bool:
         # As in C: polling takes time, so that a polling loop advances the virtual time.
-        self._ask(_DELAY, _LOOK_S)
+        self._send_request(_DELAY, _POLL_S)
         return bool(self._request.line)
 
-    def wait(self, at_most_s: float) -> None:
-        self._ask(_WAIT, at_most_s)
+    def wait(self, timeout_s: float) -> None:
+        self._send_request(_WAIT, timeout_s)
 
     def delay(self, seconds: float) -> None:
-        self._ask(_DELAY, seconds)
+        self._send_request(_DELAY, seconds)
 
     def reset_pin(self) -> None:
-        self._ask(_RESET_PIN, 0.0)
+        self._send_request(_RESET_PIN, 0.0)
 
     def now(self) -> float:
-        self._ask(_DELAY, _LOOK_S)
+        self._send_request(_DELAY, _POLL_S)
         return float(self._request.now_s)
 
     def end(self) -> None:
         """Stop the thread."""
-        self._over = True
+        self._ended = True
         if self._thread is not None and self._thread is not threading.current_thread():
             self._answers.put(False)
             self._thread.join()
@@ -261,12 +261,12 @@ class _Program:
         if failure is not None:
             raise failure
 
-    def _ask(self, kind: int, seconds: float, out: bytes = b"", hz: int = 0) -> None:
+    def _send_request(self, kind: int, seconds: float, out: bytes = b"", hz: int = 0) -> None:
         self._requests.put((kind, seconds, out, hz))
         if not self._answers.get():
             raise _Ended
 
-    def _body(self) -> None:
+    def _run_thread(self) -> None:
         try:
             self._run(self)
         except _Ended:
@@ -275,26 +275,26 @@ class _Program:
             self._failure = failure
         self._requests.put(None)
 
-    def _next(self, _context: object, request: ctypes._Pointer[Request]) -> int:
-        if self._over:
+    def _next_request(self, _context: object, request: ctypes._Pointer[Request]) -> int:
+        if self._ended:
             return 0
-        told = request.contents
-        self._request.line, self._request.now_s = told.line, told.now_s
+        c_request = request.contents
+        self._request.line, self._request.now_s = c_request.line, c_request.now_s
         if self._thread is None:
-            self._thread = threading.Thread(target=self._body, name="dw1000 host", daemon=True)
+            self._thread = threading.Thread(target=self._run_thread, name="dw1000 host", daemon=True)
             self._thread.start()
         else:
             self._answers.put(True)
-        wanted = self._requests.get()
-        if wanted is None:
+        next_request = self._requests.get()
+        if next_request is None:
             self._thread.join()
             self._thread = None
-            self._over = True
+            self._ended = True
             return 0
-        told.kind, told.seconds, out, told.hz = wanted
+        c_request.kind, c_request.seconds, out, c_request.hz = next_request
         self._read = ctypes.create_string_buffer(len(out))
-        self._kept = [out]
-        told.out = ctypes.cast(ctypes.c_char_p(out), ctypes.c_void_p)
-        told.in_ = ctypes.cast(self._read, ctypes.c_void_p)
-        told.n = len(out)
+        self._references = [out]
+        c_request.out = ctypes.cast(ctypes.c_char_p(out), ctypes.c_void_p)
+        c_request.in_ = ctypes.cast(self._read, ctypes.c_void_p)
+        c_request.n = len(out)
         return 1

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.dw1000_model.library import MODEL_FOLDER, model_objects
-from benchmarks.dw1000_model.links import Link
+from benchmarks.dw1000_model.pairs import Pair
 from uwb_mitigation.errors import LinkError
 from uwb_mitigation.firmware_export.compiling import (
     WARNINGS,
@@ -55,8 +55,8 @@ RANGE = np.dtype(
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
-    """Serial line of a board to its host, and timing of the board's processor.
+class SerialLink:
+    """Serial link of a board to its host, and timing of the board's processor.
 
     Attributes:
         baud: baud rate, ten bits a byte; frames are sent in the background.
@@ -99,13 +99,13 @@ class ModelledAir:
         ppm: float = 0.0,
         clock_ticks: int = 0,
         delay_ticks: int = NOMINAL_DELAY_TICKS,
-        line: Line | None = None,
+        serial_link: SerialLink | None = None,
     ) -> int:
         """Add a board, whose program starts with the next `run`, and return its number.
 
-        Without a line, the board only ranges.
+        Without a serial link, the board only ranges.
         """
-        board: int = self._library.radio_air_board(
+        board: int = self._library.radio_air_add_board(
             self._air,
             ppm,
             clock_ticks,
@@ -115,32 +115,37 @@ class ModelledAir:
             0x9E3779B97F4A7C15 * (self._boards + 1) % 2**64,
         )
         self._boards += 1
-        if line is not None:
-            self._library.radio_air_line(
-                self._air, board, line.baud, int(line.mode), line.inference_s, line.overhead_s
+        if serial_link is not None:
+            self._library.radio_air_set_serial_link(
+                self._air,
+                board,
+                serial_link.baud,
+                int(serial_link.mode),
+                serial_link.inference_s,
+                serial_link.overhead_s,
             )
         return board
 
-    def link(self, a: int, b: int, channel: Link | None) -> None:
-        """Add or remove the link of two boards."""
-        if channel is None:
-            self._library.radio_air_unlink(self._air, a, b)
+    def set_pair(self, a: int, b: int, pair: Pair | None) -> None:
+        """Set the radio channel of two boards; with None they do not receive each other."""
+        if pair is None:
+            self._library.radio_air_remove_pair(self._air, a, b)
             return
-        samples = None if channel.samples is None else np.ascontiguousarray(channel.samples, np.int16)
-        self._library.radio_air_link(
+        samples = None if pair.samples is None else np.ascontiguousarray(pair.samples, np.int16)
+        self._library.radio_air_set_pair(
             self._air,
             a,
             b,
-            channel.distance_m,
-            channel.excess_m,
+            pair.distance_m,
+            pair.excess_m,
             None if samples is None else samples.ctypes.data,
             0 if samples is None else len(samples) // 2,
-            channel.first_path_index,
-            channel.preamble_count,
-            channel.noise_threshold,
-            channel.std_noise,
-            channel.loss,
-            channel.damage,
+            pair.first_path_index,
+            pair.preamble_count,
+            pair.noise_threshold,
+            pair.std_noise,
+            pair.loss,
+            pair.damage,
         )
 
     def reset(self, board: int) -> None:
@@ -159,7 +164,7 @@ class ModelledAir:
         # RANGE contains no pointers, so the bytes can be copied.
         taken = np.frombuffer(ctypes.string_at(rows.value or 0, count * RANGE.itemsize), RANGE)
         values = np.frombuffer(ctypes.string_at(store.value or 0, 2 * _STORE_VALUES), "<i2")
-        self._library.radio_air_forget(self._air)
+        self._library.radio_air_clear_results(self._air)
         return taken, values
 
     def counts(self, board: int) -> dict[str, int]:
@@ -173,21 +178,21 @@ class ModelledAir:
         return address
 
     def write(self, board: int, data: bytes) -> None:
-        """Send bytes to a board over its line; the board reads them between two turns."""
+        """Send bytes to a board over its serial link; the board reads them between two exchanges."""
         if not self._library.radio_air_write(self._air, board, data, len(data)):
             raise LinkError(
                 f"{len(data)} bytes for a modelled board that has not run", valid="fewer, or run it"
             )
 
     def read(self, board: int) -> bytes:
-        """Return the bytes that a board has sent over its line."""
+        """Return the bytes that a board has sent over its serial link."""
         buffer = ctypes.create_string_buffer(1 << 18)
         count = self._library.radio_air_read(self._air, board, buffer)
         return buffer.raw[:count]
 
     def measurements_lost(self, board: int) -> int:
-        """Return the number of ranges dropped because the queue of a board's line was full."""
-        lost: int = self._library.radio_air_line_lost(self._air, board)
+        """Return the number of ranges dropped because the queue of a board's serial link was full."""
+        lost: int = self._library.radio_air_measurements_lost(self._air, board)
         return lost
 
 
@@ -201,12 +206,12 @@ def _library() -> ctypes.CDLL:
     signatures: Signatures = {
         "new": (c_void_p, (c_uint64, c_size_t)),
         "free": (None, (air,)),
-        "board": (
+        "add_board": (
             c_int,
             (air, c_double, c_uint64, c_uint16, c_uint16, POINTER(structures.Config), c_uint64),
         ),
-        "line": (None, (air, board, c_double, c_int, c_double, c_double)),
-        "link": (
+        "set_serial_link": (None, (air, board, c_double, c_int, c_double, c_double)),
+        "set_pair": (
             None,
             (
                 air,
@@ -222,15 +227,15 @@ def _library() -> ctypes.CDLL:
                 c_double,
             ),
         ),
-        "unlink": (None, (air, board, board)),
+        "remove_pair": (None, (air, board, board)),
         "reset": (None, (air, board)),
         "run": (c_double, (air, c_double)),
         "results": (c_uint32, (air, POINTER(c_void_p), POINTER(c_void_p))),
-        "forget": (None, (air,)),
+        "clear_results": (None, (air,)),
         "counts": (POINTER(structures.TwrCounts), (air, board)),
         "address": (c_uint64, (air, board)),
         "write": (c_int, (air, board, ctypes.c_char_p, c_size_t)),
         "read": (c_size_t, (air, board, c_void_p)),
-        "line_lost": (c_uint64, (air, board)),
+        "measurements_lost": (c_uint64, (air, board)),
     }
     return load_library("radio_air_", (*objects, *model_objects()), signatures)

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from benchmarks.dw1000_model.air import ANTENNA_DELAY_TICKS, Air, Chip
-from benchmarks.dw1000_model.links import Link, link_of
+from benchmarks.dw1000_model.pairs import Pair, pair_of
 from benchmarks.dw1000_model.usb2spi import Bridge
 from uwb_mitigation.errors import ParameterError, RecordingError, UwbMitigationError
 from uwb_mitigation.link.emulated_board import PseudoTerminal
@@ -28,8 +28,8 @@ ROUND_TRIP_S = 1.5e-3
 PPM = (3.0, -4.0, 7.0, -9.0, 1.0, 12.0, -2.0)
 """Frequency errors of the boards' crystals, in turn; they differ between any two boards that range."""
 
-_LONGEST_WAIT_S = 0.02
-CLEAN_M = 3.0
+_MAX_WAIT_S = 0.02
+DEFAULT_DISTANCE_M = 3.0
 
 
 class _Board:
@@ -58,20 +58,20 @@ class EmulatedEvb1000s:
     """EVB1000s on one air, from construction until `close`.
 
     Board 0 is at the position of the source's tag, the others are at those of its anchors, in order of appearance.
-    Each new record of a pair replaces their link. The methods may be called from any thread.
+    Each new record of a pair replaces their radio channel. The methods may be called from any thread.
 
     Args:
-        source: records for the links, played in a loop; None = clean links of `clean_m` between all boards.
-            Boards without an anchor in the source have the same clean link.
+        source: records for the pairs, played in a loop; None = undisturbed pairs at `distance_m`.
+            Boards without an anchor in the source have the same pair.
         boards: number of boards, 2 to 33.
         rate_hz: records per second.
         round_trip_s: time from a request to its answer.
         ranging: boards whose switches are set for ranging instead of USB to SPI.
         port_links: prefix of symbolic links to the ports, followed by the board's number; None = no links.
-        loss, damage: probabilities for every frame on every link.
+        loss, damage: probabilities for every frame of every pair.
         seed: seed of all random numbers.
         antenna_delay: total TX + RX antenna delay of each chip, ticks.
-        clean_m: distance between anchors, and between the tag and boards without an anchor in the source.
+        distance_m: distance between anchors, and between the tag and boards without an anchor in the source.
 
     Raises:
         ParameterError: an argument is outside its range, or a link would replace a file.
@@ -95,7 +95,7 @@ class EmulatedEvb1000s:
         damage: float = 0.0,
         seed: int = 1,
         antenna_delay: int = 2 * ANTENNA_DELAY_TICKS,
-        clean_m: float = CLEAN_M,
+        distance_m: float = DEFAULT_DISTANCE_M,
     ) -> None:
         for name, value, low, high in (
             ("boards", boards, 2, MAX_BOARDS),
@@ -129,17 +129,17 @@ class EmulatedEvb1000s:
                 if port_links is not None:
                     link = port_links.with_name(f"{port_links.name}{number}")
                 self._boards.append(_Board(chip, Bridge(chip.spi, ranging=number in ranging), link))
-            clean = Link(clean_m, loss=loss, damage=damage)
+            clean_pair = Pair(distance_m, loss=loss, damage=damage)
             for one, other in itertools.combinations(self._boards, 2):
-                self._air.link(one.chip, other.chip, clean)
-            self._distances_m = [clean_m] * boards
+                self._air.set_pair(one.chip, other.chip, clean_pair)
+            self._distances_m = [distance_m] * boards
             # Read the source before the ports exist: the caller gets the error of an empty source.
-            records = self._records(source)
-            self._links: Iterator[tuple[int, Link]] = itertools.chain(
+            records = self._read_pairs(source)
+            self._records: Iterator[tuple[int, Pair]] = itertools.chain(
                 list(itertools.islice(records, boards - 1)), records
             )
-            self._relinked = 0
-            self._began = time.monotonic()
+            self._num_played = 0
+            self._start_s = time.monotonic()
             for board in self._boards:
                 board.plug()
         except BaseException:
@@ -194,38 +194,38 @@ class EmulatedEvb1000s:
             board.unplug()
         self._air.close()
 
-    def _records(self, source: Source | None) -> Iterator[tuple[int, Link]]:
-        """Yield the number of an anchor and its link to the tag, in an endless loop."""
+    def _read_pairs(self, source: Source | None) -> Iterator[tuple[int, Pair]]:
+        """Yield the number of an anchor and its pair with the tag, in an endless loop."""
         numbers: dict[int, int] = {}
         while source is not None:
             usable = False
             for record in source:
                 try:
-                    link = link_of(record.measurement, record.truth, loss=self._loss, damage=self._damage)
+                    pair = pair_of(record.measurement, record.truth, loss=self._loss, damage=self._damage)
                 except ParameterError:
                     continue
                 usable = True
                 number = numbers.setdefault(record.measurement.anchor_id, 1 + len(numbers))
                 if number < len(self._boards):
-                    yield number, link
+                    yield number, pair
             if not usable:
                 raise RecordingError("no range with a CIR that chips could measure", where=source.name)
 
-    def _relink(self, now: float) -> None:
+    def _update_pairs(self, now: float) -> None:
         """Play the records that are due."""
-        due = 1 + int((now - self._began) / self._period_s)
+        due = 1 + int((now - self._start_s) / self._period_s)
         # After a pause, skip the records that no board has measured.
-        self._relinked = max(self._relinked, due - len(self._boards))
+        self._num_played = max(self._num_played, due - len(self._boards))
         try:
-            while self._relinked < due:
-                self._relinked += 1
-                for number, link in itertools.islice(self._links, 1):
-                    self._air.link(self._boards[0].chip, self._boards[number].chip, link)
-                    self._distances_m[number] = link.distance_m
+            while self._num_played < due:
+                self._num_played += 1
+                for number, pair in itertools.islice(self._records, 1):
+                    self._air.set_pair(self._boards[0].chip, self._boards[number].chip, pair)
+                    self._distances_m[number] = pair.distance_m
         except UwbMitigationError as error:
             # The end of the recording is damaged.
             self.failure = error
-            self._links = iter(())
+            self._records = iter(())
 
     def _run(self) -> None:
         while not self._stop.is_set():
@@ -237,25 +237,25 @@ class EmulatedEvb1000s:
                 }
                 full = [fd for fd, number in fds.items() if self._boards[number].backlog]
                 due = self._answers[0][0] if self._answers else math.inf
-            patience_s = min(max(due - time.monotonic(), 0.0), _LONGEST_WAIT_S)
+            timeout_s = min(max(due - time.monotonic(), 0.0), _MAX_WAIT_S)
             try:
-                readable, writable, _ = select.select(list(fds), full, [], patience_s)
+                readable, writable, _ = select.select(list(fds), full, [], timeout_s)
             except (OSError, ValueError):
                 continue
             with self._lock:
                 now = time.monotonic()
-                self._relink(now)
-                self._keep_time(now)
+                self._update_pairs(now)
+                self._advance_air(now)
                 for fd in {*readable, *writable}:
                     board = self._boards[fds[fd]]
                     # During the wait, the cable may have been unplugged and plugged in again.
                     if board.terminal.fd == fd:
                         self._serve(fds[fd], now)
                         board.terminal.write(board.backlog)
-                self._answer(time.monotonic())
+                self._send_due_answers(time.monotonic())
 
-    def _keep_time(self, now: float) -> None:
-        late = now - self._began - self._boards[0].chip.now()
+    def _advance_air(self, now: float) -> None:
+        late = now - self._start_s - self._boards[0].chip.now()
         if late > 0:
             self._air.run(late)
 
@@ -264,10 +264,10 @@ class EmulatedEvb1000s:
         for answer in board.bridge.receive(board.terminal.read()):
             board.requests += 1
             # A long transaction at the slow speed takes longer than the bus.
-            due = max(now + self._round_trip_s, self._began + board.chip.now())
+            due = max(now + self._round_trip_s, self._start_s + board.chip.now())
             heapq.heappush(self._answers, (due, next(self._counter), number, answer))
 
-    def _answer(self, now: float) -> None:
+    def _send_due_answers(self, now: float) -> None:
         while self._answers and self._answers[0][0] <= now:
             _, _, number, answer = heapq.heappop(self._answers)
             board = self._boards[number]

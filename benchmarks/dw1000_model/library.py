@@ -17,8 +17,8 @@ from uwb_mitigation.firmware_export.compiling import (
 _OPTIONS = ("-std=c11", "-O2", "-fPIC", *WARNINGS)
 
 
-class LinkConfig(ctypes.Structure):
-    """`dw1000_link_config`."""
+class PairConfig(ctypes.Structure):
+    """`dw1000_pair_config`."""
 
     _fields_ = (
         ("distance_m", ctypes.c_double),
@@ -78,7 +78,7 @@ def load() -> ctypes.CDLL:
         "air_new": (pointer, (ctypes.c_uint64,)),
         "air_free": (None, (pointer,)),
         "chip_new": (pointer, (pointer, real, ctypes.c_uint64, ctypes.c_uint16, ctypes.c_uint16)),
-        "link": (None, (pointer, pointer, pointer, ctypes.POINTER(LinkConfig))),
+        "set_pair": (None, (pointer, pointer, pointer, ctypes.POINTER(PairConfig))),
         "program": (None, (pointer, pointer, pointer)),
         "program_remote": (None, (pointer, NextRequest, pointer)),
         "run": (real, (pointer, real)),
@@ -88,8 +88,8 @@ def load() -> ctypes.CDLL:
         "delay": (None, (pointer, real)),
         "reset_pin": (None, (pointer,)),
         "reset_drive": (None, (pointer, ctypes.c_int)),
-        "environment": (None, (pointer, real, real)),
-        "lose_edges": (None, (pointer, real)),
+        "set_environment": (None, (pointer, real, real)),
+        "set_edge_loss": (None, (pointer, real)),
         "program_otp": (None, (pointer, ctypes.c_uint, ctypes.c_uint32)),
         "sent_power": (None, (pointer, ctypes.POINTER(real), ctypes.POINTER(real))),
         "now": (real, (pointer,)),

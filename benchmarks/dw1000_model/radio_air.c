@@ -29,19 +29,19 @@ typedef struct radio_air radio_air;
 typedef struct {
     radio_air *air;
     dw1000_chip *chip;
-    uwb_ranger ranger; /* of which a board without a serial line uses `twr` alone */
+    uwb_ranger ranger; /* a board without a serial link uses only `twr` */
     uwb_twr_config config;
     uint64_t random;
     uint32_t spi_hz;
     double overhead_s;  /* of the processor, for each transaction */
-    double baud;        /* 0 = no serial line */
+    double baud;        /* 0 = no serial link */
     double inference_s; /* for each range in mode DEVICE */
-    double sent_s;      /* until when the serial line is busy */
+    double sent_s;      /* time until which the serial link is busy */
     uint8_t mode;
     uint64_t measurement[UWB_TWR_MEASUREMENT_BYTES(MAX_SAMPLES) / 8 + 1];
     uint8_t queue[16384];
     uint32_t arena[12288 / 4];
-    uint8_t input[8192], output[1 << 18]; /* of the line, as its host has them */
+    uint8_t input[8192], output[1 << 18]; /* of the serial link, at the host's end */
     size_t input_bytes, output_bytes;
     uint8_t sent[8 + 4 * MAX_SAMPLES], received[8 + 4 * MAX_SAMPLES];
 } radio_board;
@@ -61,8 +61,8 @@ static uint64_t now_us(void *context) {
     return (uint64_t)(dw1000_now(((radio_board *)context)->chip) * 1e6);
 }
 
-/* What a UART with DMA sends meanwhile. */
-static void pump(radio_board *board) {
+/* Send the bytes that a UART with DMA has sent since the last call. */
+static void send_pending(radio_board *board) {
     const double now_s = dw1000_now(board->chip);
     while (board->baud > 0 && board->sent_s <= now_s) {
         const uint8_t *bytes;
@@ -76,7 +76,7 @@ static void pump(radio_board *board) {
             board->output_bytes += count;
         }
         uwb_queue_drop(&board->ranger.board.queue, count);
-        /* The line goes on without a pause between two frames. */
+        /* There is no pause between two frames. */
         board->sent_s += (double)count * 10 / board->baud;
     }
 }
@@ -100,7 +100,7 @@ static int transfer(void *context, const uint8_t *header, size_t header_bytes, c
     if (out == NULL) {
         memcpy(in, board->received + header_bytes, bytes);
     }
-    pump(board);
+    send_pending(board);
     return 0;
 }
 
@@ -116,16 +116,17 @@ static void wait(void *context, uint64_t until_us) {
     radio_board *const board = context;
     const double left_s = (double)until_us * 1e-6 - dw1000_now(board->chip);
     dw1000_wait(board->chip, left_s > 1e-6 ? left_s : 1e-6);
-    pump(board);
+    send_pending(board);
 }
 
 static void sleep(void *context, uint32_t us) {
     radio_board *const board = context;
     dw1000_delay(board->chip, us * 1e-6);
-    pump(board);
+    send_pending(board);
 }
 
-static void keep(radio_board *board) {
+/* Store a range and its CIR. */
+static void store_range(radio_board *board) {
     radio_air *const air = board->air;
     uwb_range_cir_t fields;
     memcpy(&fields, board->measurement, sizeof fields);
@@ -134,10 +135,21 @@ static void keep(radio_board *board) {
         return;
     }
     radio_result *const result = &air->results[air->results_count++];
-    *result = (radio_result){dw1000_now(board->chip), 0,      fields.sample_count,    fields.range,
-                             fields.tag_id,           fields.anchor_id,       fields.device_time,
-                             fields.rx_power,         fields.first_path_power, fields.first_path_index,
-                             fields.start_index,      fields.preamble_count,  fields.noise_threshold, air->store_used};
+    *result = (radio_result){
+        .time_s = dw1000_now(board->chip),
+        .values = fields.sample_count,
+        .range_m = fields.range,
+        .tag = fields.tag_id,
+        .anchor = fields.anchor_id,
+        .device_time = fields.device_time,
+        .rx_power = fields.rx_power,
+        .first_path_power = fields.first_path_power,
+        .first_path_index = fields.first_path_index,
+        .start_index = fields.start_index,
+        .preamble_count = fields.preamble_count,
+        .noise_threshold = fields.noise_threshold,
+        .at = air->store_used,
+    };
     while (air->boards[result->board] != board) {
         result->board++;
     }
@@ -150,7 +162,15 @@ static void keep(radio_board *board) {
 
 static void run(dw1000_chip *chip, void *context) {
     radio_board *const board = context;
-    const uwb_dw1000_io io = {board, transfer, speed, reset, now_us, wait, sleep};
+    const uwb_dw1000_io io = {
+        .context = board,
+        .transfer = transfer,
+        .speed = speed,
+        .reset = reset,
+        .now_us = now_us,
+        .wait = wait,
+        .sleep = sleep,
+    };
     uint8_t *const measurement = (uint8_t *)board->measurement;
     if (board->baud > 0) {
         uwb_board_config config;
@@ -176,13 +196,13 @@ static void run(dw1000_chip *chip, void *context) {
             event = uwb_ranger_step(&board->ranger);
             if (event == UWB_TWR_RANGED && board->mode != UWB_MODE_HOST) {
                 dw1000_delay(chip, board->inference_s);
-                pump(board);
+                send_pending(board);
             }
         } else {
             event = uwb_twr_step(&board->ranger.twr, now_us(board) + 100000);
         }
         if (event == UWB_TWR_RANGED) {
-            keep(board);
+            store_range(board);
         }
     }
 }
@@ -207,7 +227,7 @@ void radio_air_free(radio_air *air) {
     free(air);
 }
 
-int radio_air_board(radio_air *air, double ppm, uint64_t clock_ticks, uint16_t tx_delay, uint16_t rx_delay,
+int radio_air_add_board(radio_air *air, double ppm, uint64_t clock_ticks, uint16_t tx_delay, uint16_t rx_delay,
                     const uwb_twr_config *config, uint64_t random) {
     radio_board *const board = calloc(1, sizeof *board);
     if (board == NULL || air->count == MAX_BOARDS) {
@@ -222,23 +242,33 @@ int radio_air_board(radio_air *air, double ppm, uint64_t clock_ticks, uint16_t t
     return air->count++;
 }
 
-void radio_air_line(radio_air *air, int board, double baud, int mode, double inference_s, double overhead_s) {
+void radio_air_set_serial_link(radio_air *air, int board, double baud, int mode, double inference_s, double overhead_s) {
     air->boards[board]->baud = baud;
     air->boards[board]->mode = (uint8_t)mode;
     air->boards[board]->inference_s = inference_s;
     air->boards[board]->overhead_s = overhead_s;
 }
 
-void radio_air_link(radio_air *air, int a, int b, double distance_m, double excess_m, const int16_t *iq,
+void radio_air_set_pair(radio_air *air, int a, int b, double distance_m, double excess_m, const int16_t *iq,
                     size_t samples, double first_path_index, uint16_t preamble_count, uint16_t noise_threshold,
                     uint16_t std_noise, double loss, double damage) {
-    const dw1000_link_config config = {distance_m, excess_m, iq, samples, first_path_index, preamble_count,
-                                       noise_threshold, std_noise, loss, damage};
-    dw1000_link(air->air, air->boards[a]->chip, air->boards[b]->chip, &config);
+    const dw1000_pair_config config = {
+        .distance_m = distance_m,
+        .excess_m = excess_m,
+        .iq = iq,
+        .samples = samples,
+        .first_path_index = first_path_index,
+        .preamble_count = preamble_count,
+        .noise_threshold = noise_threshold,
+        .std_noise = std_noise,
+        .loss = loss,
+        .damage = damage,
+    };
+    dw1000_set_pair(air->air, air->boards[a]->chip, air->boards[b]->chip, &config);
 }
 
-void radio_air_unlink(radio_air *air, int a, int b) {
-    dw1000_link(air->air, air->boards[a]->chip, air->boards[b]->chip, NULL);
+void radio_air_remove_pair(radio_air *air, int a, int b) {
+    dw1000_set_pair(air->air, air->boards[a]->chip, air->boards[b]->chip, NULL);
 }
 
 void radio_air_reset(radio_air *air, int board) {
@@ -255,7 +285,7 @@ uint32_t radio_air_results(radio_air *air, const radio_result **results, const i
     return air->results_count;
 }
 
-void radio_air_forget(radio_air *air) {
+void radio_air_clear_results(radio_air *air) {
     air->results_count = 0;
     air->store_used = 0;
 }
@@ -268,11 +298,11 @@ uint64_t radio_air_address(const radio_air *air, int board) {
     return air->boards[board]->ranger.twr.address;
 }
 
-uint64_t radio_air_line_lost(const radio_air *air, int board) {
+uint64_t radio_air_measurements_lost(const radio_air *air, int board) {
     return air->boards[board]->ranger.board.measurements_lost;
 }
 
-/* The host's end of a board's line. Returns 0 where too much waits. */
+/* Write bytes to a board's serial link; returns 0 if the buffer has no space for them. */
 int radio_air_write(radio_air *air, int board, const uint8_t *bytes, size_t count) {
     radio_board *const to = air->boards[board];
     if (to->input_bytes + count > sizeof to->input) {
@@ -283,7 +313,7 @@ int radio_air_write(radio_air *air, int board, const uint8_t *bytes, size_t coun
     return 1;
 }
 
-/* Take what has arrived, at most 1 << 18 bytes. */
+/* Read the bytes that a board has sent, at most 1 << 18. */
 size_t radio_air_read(radio_air *air, int board, uint8_t *bytes) {
     radio_board *const from = air->boards[board];
     const size_t count = from->output_bytes;
@@ -292,7 +322,7 @@ size_t radio_air_read(radio_air *air, int board, uint8_t *bytes) {
     return count;
 }
 
-/* What another language takes the structures for. */
+/* Return the size of a structure, to check bindings. */
 size_t radio_air_size(int which) {
     const size_t sizes[] = {sizeof(uwb_dw1000_io), sizeof(uwb_dw1000_settings), sizeof(uwb_twr_config),
                             sizeof(uwb_twr_counts), sizeof(uwb_twr_anchor), sizeof(radio_result)};

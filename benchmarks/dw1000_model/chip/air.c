@@ -7,10 +7,10 @@
 
 dw1000_air *dw1000_air_new(uint64_t seed) {
     dw1000_air *const air = calloc(1, sizeof *air);
-    dw1000_prepare_map();
+    dw1000_init_register_map();
     if (air != NULL) {
         air->seed = seed;
-        if (!dw1000_start_outside(air)) {
+        if (!dw1000_create_caller(air)) {
             free(air);
             return NULL;
         }
@@ -27,14 +27,14 @@ void dw1000_air_free(dw1000_air *air) {
         dw1000_stop_transmitter(chip);
         dw1000_stop_receiver(chip);
         for (size_t j = 0; j < air->chip_count; j++) {
-            dw1000_drop_link(chip->links[j]);
+            dw1000_release_pair(chip->pairs[j]);
         }
-        free(chip->links);
+        free(chip->pairs);
         free(chip);
     }
-    while (air->flying != NULL) {
-        transmission *const frame = air->flying;
-        air->flying = frame->next;
+    while (air->frames_on_air != NULL) {
+        transmission *const frame = air->frames_on_air;
+        air->frames_on_air = frame->next;
         free(frame);
     }
     dw1000_free_programs(air);
@@ -53,13 +53,13 @@ dw1000_chip *dw1000_chip_new(dw1000_air *air, double ppm, uint64_t clock_ticks, 
         return NULL;
     }
     for (size_t i = 0; i < count; i++) {
-        link **const links = dw1000_memory(count * sizeof(link *));
+        radio_pair **const pairs = dw1000_allocate(count * sizeof(radio_pair *));
         dw1000_chip *const other = i + 1 < count ? air->chips[i] : chip;
-        if (other->links != NULL) {
-            memcpy(links, other->links, (count - 1) * sizeof(link *));
+        if (other->pairs != NULL) {
+            memcpy(pairs, other->pairs, (count - 1) * sizeof(radio_pair *));
         }
-        free(other->links);
-        other->links = links;
+        free(other->pairs);
+        other->pairs = pairs;
         chips[i] = other;
     }
     free(air->chips);
@@ -81,6 +81,6 @@ dw1000_chip *dw1000_chip_new(dw1000_air *air, double ppm, uint64_t clock_ticks, 
     return chip;
 }
 
-void dw1000_lose_edges(dw1000_chip *chip, double probability) {
-    chip->edges_lost = probability;
+void dw1000_set_edge_loss(dw1000_chip *chip, double probability) {
+    chip->edge_loss = probability;
 }

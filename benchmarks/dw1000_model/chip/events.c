@@ -13,8 +13,8 @@
 #endif
 
 #define STACK_BYTES ((size_t)512 * 1024)
-#define LONGEST_S 1e6
-#define LOOK_S 1e-7
+#define MAX_DURATION_S 1e6
+#define POLL_S 1e-7
 
 struct coroutine {
     ucontext_t context;
@@ -24,7 +24,7 @@ struct coroutine {
     void (*run)(dw1000_chip *, void *);
     void *argument;
     void *stack;
-    uint32_t epoch; /* of its event: one that carries another is void */
+    uint32_t epoch; /* of its event; events with another epoch are cancelled */
     bool ended;
 #if defined(__SANITIZE_ADDRESS__)
     void *fake_stack;
@@ -33,34 +33,34 @@ struct coroutine {
 #endif
 };
 
-static void *or_end(void *fresh) {
-    if (fresh == NULL) {
+static void *check_memory(void *memory) {
+    if (memory == NULL) {
         fputs("dw1000_model: no memory\n", stderr);
         abort();
     }
-    return fresh;
+    return memory;
 }
 
-void *dw1000_memory(size_t bytes) {
-    return or_end(calloc(1, bytes));
+void *dw1000_allocate(size_t bytes) {
+    return check_memory(calloc(1, bytes));
 }
 
-static bool sooner(const event *a, const event *b) {
+static bool is_before(const event *a, const event *b) {
     return a->at != b->at ? a->at < b->at : a->order < b->order;
 }
 
 static void insert(dw1000_air *air, event added) {
     size_t at = air->event_count++;
-    for (; at > 0 && sooner(&added, &air->events[(at - 1) / 2]); at = (at - 1) / 2) {
+    for (; at > 0 && is_before(&added, &air->events[(at - 1) / 2]); at = (at - 1) / 2) {
         air->events[at] = air->events[(at - 1) / 2];
     }
     air->events[at] = added;
 }
 
 static void push(dw1000_air *air, event added) {
-    if (air->event_count == air->event_room) {
-        air->event_room = air->event_room ? 2 * air->event_room : 64;
-        air->events = or_end(realloc(air->events, air->event_room * sizeof *air->events));
+    if (air->event_count == air->event_capacity) {
+        air->event_capacity = air->event_capacity ? 2 * air->event_capacity : 64;
+        air->events = check_memory(realloc(air->events, air->event_capacity * sizeof *air->events));
     }
     added.order = air->order++;
     insert(air, added);
@@ -71,10 +71,10 @@ static event pop(dw1000_air *air) {
     const size_t count = air->event_count;
     size_t at = 0;
     for (size_t child = 1; child < count; child = 2 * at + 1) {
-        if (child + 1 < count && sooner(&air->events[child + 1], &air->events[child])) {
+        if (child + 1 < count && is_before(&air->events[child + 1], &air->events[child])) {
             child++;
         }
-        if (!sooner(&air->events[child], &last)) {
+        if (!is_before(&air->events[child], &last)) {
             break;
         }
         air->events[at] = air->events[child];
@@ -86,7 +86,14 @@ static event pop(dw1000_air *air) {
 
 void dw1000_schedule(dw1000_chip *chip, event_group group, instant at, handler *fire, transmission *frame) {
     dw1000_air *const air = chip->air;
-    const event added = {at > air->now ? at : air->now, 0, fire, chip, frame, NULL, chip->epoch[group], group};
+    const event added = {
+        .at = at > air->now ? at : air->now,
+        .fire = fire,
+        .chip = chip,
+        .frame = frame,
+        .epoch = chip->epoch[group],
+        .group = group,
+    };
     push(air, added);
 }
 
@@ -95,7 +102,7 @@ void dw1000_cancel(dw1000_chip *chip, event_group group) {
 }
 
 static void resume_at(coroutine *program, instant at) {
-    const event added = {at, 0, NULL, NULL, NULL, program, ++program->epoch, GROUP_POWER};
+    const event added = {.at = at, .program = program, .epoch = ++program->epoch, .group = GROUP_POWER};
     push(program->air, added);
 }
 
@@ -110,7 +117,7 @@ static void switch_to(coroutine *from, coroutine *to) {
 #endif
 }
 
-/* Handle events, and let others run, until the current coroutine is to go on. */
+/* Handle events and run other coroutines until the current coroutine is due. */
 static void dispatch(dw1000_air *air) {
     coroutine *const self = air->current;
     for (;;) {
@@ -132,12 +139,12 @@ static void dispatch(dw1000_air *air) {
     }
 }
 
-void dw1000_pass(dw1000_air *air, instant until) {
+void dw1000_advance(dw1000_air *air, instant until) {
     if (until < air->now) {
         until = air->now;
     }
     if (air->event_count == 0 || air->events[0].at > until) {
-        if (air->current != air->outside || !air->running) {
+        if (air->current != air->caller || !air->running) {
             air->now = until;
             return;
         }
@@ -146,53 +153,53 @@ void dw1000_pass(dw1000_air *air, instant until) {
     dispatch(air);
 }
 
-static void finish(coroutine *self) {
+static void finish_program(coroutine *self) {
     dw1000_air *const air = self->air;
     self->ended = true;
     if (self->chip->program == self) {
         self->chip->program = NULL;
     }
-    if (--air->alive == 0 && air->running) {
-        resume_at(air->outside, air->now);
+    if (--air->running_programs == 0 && air->running) {
+        resume_at(air->caller, air->now);
     }
     dispatch(air);
     abort(); /* an ended program is never resumed */
 }
 
-static void enter(unsigned high, unsigned low) {
+static void program_entry(unsigned high, unsigned low) {
     coroutine *const self = (coroutine *)(((uintptr_t)high << 16 << 16) | (uintptr_t)low);
 #if defined(__SANITIZE_ADDRESS__)
-    coroutine *const outside = self->air->outside;
+    coroutine *const caller = self->air->caller;
     const void *bottom;
     size_t size;
     __sanitizer_finish_switch_fiber(NULL, &bottom, &size);
-    if (outside->bottom == NULL) {
-        outside->bottom = bottom;
-        outside->size = size;
+    if (caller->bottom == NULL) {
+        caller->bottom = bottom;
+        caller->size = size;
     }
 #endif
     self->run(self->chip, self->argument);
-    finish(self);
+    finish_program(self);
 }
 
-bool dw1000_start_outside(dw1000_air *air) {
-    air->outside = calloc(1, sizeof *air->outside);
-    if (air->outside == NULL) {
+bool dw1000_create_caller(dw1000_air *air) {
+    air->caller = calloc(1, sizeof *air->caller);
+    if (air->caller == NULL) {
         return false;
     }
-    air->outside->air = air;
-    air->current = air->outside;
+    air->caller->air = air;
+    air->current = air->caller;
     return true;
 }
 
-/* Forget programs that have ended, and what was scheduled for them; or all. */
-static void sweep(dw1000_air *air, bool all) {
+/* Free programs that have ended, and their events; or all programs. */
+static void free_programs(dw1000_air *air, bool all) {
     const size_t count = air->event_count;
     air->event_count = 0;
     for (size_t i = 0; i < count; i++) {
         const event kept = air->events[i];
         if (kept.program == NULL || !kept.program->ended) {
-            insert(air, kept); /* never overtakes the one that is read */
+            insert(air, kept); /* the write position is never after the read position */
         }
     }
     for (coroutine **at = &air->programs; *at != NULL;) {
@@ -208,8 +215,8 @@ static void sweep(dw1000_air *air, bool all) {
 }
 
 void dw1000_free_programs(dw1000_air *air) {
-    sweep(air, true);
-    free(air->outside);
+    free_programs(air, true);
+    free(air->caller);
     free(air->events);
 }
 
@@ -218,10 +225,10 @@ void dw1000_program(dw1000_chip *chip, void (*run)(dw1000_chip *, void *), void 
     if (chip->program != NULL) {
         chip->program->ended = true;
         chip->program = chip->waiter = NULL;
-        air->alive--;
+        air->running_programs--;
     }
-    sweep(air, false);
-    coroutine *const program = dw1000_memory(sizeof *program);
+    free_programs(air, false);
+    coroutine *const program = dw1000_allocate(sizeof *program);
     program->air = air;
     program->chip = chip;
     program->run = run;
@@ -229,7 +236,7 @@ void dw1000_program(dw1000_chip *chip, void (*run)(dw1000_chip *, void *), void 
     program->stack =
         mmap(NULL, STACK_BYTES, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS | MAP_NORESERVE, -1, 0);
     if (program->stack == MAP_FAILED || getcontext(&program->context) != 0) {
-        or_end(NULL);
+        check_memory(NULL);
     }
 #if defined(__SANITIZE_ADDRESS__)
     program->bottom = program->stack;
@@ -237,20 +244,20 @@ void dw1000_program(dw1000_chip *chip, void (*run)(dw1000_chip *, void *), void 
 #endif
     program->context.uc_stack.ss_sp = program->stack;
     program->context.uc_stack.ss_size = STACK_BYTES;
-    makecontext(&program->context, (void (*)(void))enter, 2, (unsigned)((uintptr_t)program >> 16 >> 16),
+    makecontext(&program->context, (void (*)(void))program_entry, 2, (unsigned)((uintptr_t)program >> 16 >> 16),
                 (unsigned)(uintptr_t)program);
     program->next = air->programs;
     air->programs = chip->program = program;
-    air->alive++;
+    air->running_programs++;
     resume_at(program, air->now);
 }
 
-/* Seconds to units; what is negative or no number is 0. */
-static instant duration(double seconds) {
+/* Convert seconds to units; 0 for negative values and NaN. */
+static instant seconds_to_units(double seconds) {
     if (!(seconds > 0)) {
         return 0;
     }
-    return (instant)llround(fmin(seconds, LONGEST_S) * (double)UNITS_PER_SECOND);
+    return (instant)llround(fmin(seconds, MAX_DURATION_S) * (double)UNITS_PER_SECOND);
 }
 
 double dw1000_seconds_now(const dw1000_air *air) {
@@ -258,30 +265,30 @@ double dw1000_seconds_now(const dw1000_air *air) {
 }
 
 double dw1000_run(dw1000_air *air, double seconds) {
-    air->running = air->alive != 0;
-    dw1000_pass(air, air->now + duration(seconds));
+    air->running = air->running_programs != 0;
+    dw1000_advance(air, air->now + seconds_to_units(seconds));
     air->running = false;
     return dw1000_seconds_now(air);
 }
 
 void dw1000_delay(dw1000_chip *chip, double s) {
-    dw1000_pass(chip->air, chip->air->now + duration(s));
+    dw1000_advance(chip->air, chip->air->now + seconds_to_units(s));
 }
 
 /* Polling takes time, so that a polling loop advances the virtual time. */
-static void look(dw1000_air *air) {
-    if (air->current != air->outside) {
-        dw1000_pass(air, air->now + duration(LOOK_S));
+static void poll_delay(dw1000_air *air) {
+    if (air->current != air->caller) {
+        dw1000_advance(air, air->now + seconds_to_units(POLL_S));
     }
 }
 
 double dw1000_now(dw1000_chip *chip) {
-    look(chip->air);
+    poll_delay(chip->air);
     return dw1000_seconds_now(chip->air);
 }
 
 int dw1000_irq(dw1000_chip *chip) {
-    look(chip->air);
+    poll_delay(chip->air);
     return chip->line;
 }
 
@@ -290,28 +297,28 @@ void dw1000_wait(dw1000_chip *chip, double at_most_s) {
         return;
     }
     chip->waiter = chip->air->current;
-    dw1000_pass(chip->air, chip->air->now + duration(at_most_s));
+    dw1000_advance(chip->air, chip->air->now + seconds_to_units(at_most_s));
     chip->waiter = NULL;
 }
 
-static void wake(dw1000_chip *chip) {
+static void wake_waiter(dw1000_chip *chip) {
     if (chip->waiter != NULL) {
         resume_at(chip->waiter, chip->air->now);
         chip->waiter = NULL;
     }
 }
 
-uint64_t dw1000_status_of(const dw1000_chip *chip) {
+uint64_t dw1000_status(const dw1000_chip *chip) {
     const uint64_t mask = dw1000_get(chip, SYS_MASK, 0, 4) & UINT64_C(0x3FFFFFFE);
     return chip->status & mask ? chip->status | ST_IRQS : chip->status;
 }
 
 void dw1000_update_line(dw1000_chip *chip) {
-    const bool asserted = (dw1000_status_of(chip) & ST_IRQS) != 0;
+    const bool asserted = (dw1000_status(chip) & ST_IRQS) != 0;
     const bool active_high = (dw1000_get(chip, SYS_CFG, 0, 4) & CFG_HIRQ_POL) != 0;
     const bool line = asserted == active_high;
     if (line && !chip->line) {
-        wake(chip);
+        wake_waiter(chip);
     }
     chip->line = line;
 }

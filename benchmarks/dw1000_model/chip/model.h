@@ -1,5 +1,5 @@
-/* Types and functions shared by the model's files, not for users of the library. All symbols have the prefix, so that a
- * driver can define `get` or `control`. */
+/* Types and functions shared by the files of the model, not for users of the library. All symbols have the prefix, so
+ * that they do not collide with those of a driver. */
 #ifndef DW1000_MODEL_INTERNAL_H
 #define DW1000_MODEL_INTERNAL_H
 
@@ -18,7 +18,7 @@ typedef int64_t instant;
 
 #define ACCUMULATOR_SAMPLES 1016
 #define FRAME_OCTETS 1024
-#define LONGEST_LINK_M 100000.0
+#define MAX_DISTANCE_M 100000.0
 
 /* Register files. */
 enum {
@@ -91,8 +91,8 @@ typedef void handler(dw1000_chip *chip, transmission *frame);
 
 typedef struct {
     instant at;
-    uint64_t order; /* of those at the same time, the first to be scheduled comes first */
-    handler *fire;  /* NULL = a coroutine goes on */
+    uint64_t order; /* events at the same time are handled in the order of scheduling */
+    handler *fire;  /* NULL = resume a coroutine */
     dw1000_chip *chip;
     transmission *frame;
     coroutine *program;
@@ -100,17 +100,17 @@ typedef struct {
     event_group group;
 } event;
 
-/* A link, and the receiver's register values for it. Shared by both directions. */
+/* A pair, and the receiver's register values for it. Shared by both directions. */
 typedef struct {
     unsigned users;
-    uint64_t key; /* of its dice */
+    uint64_t key; /* of its random numbers */
     instant flight, excess;
     double loss, damage, level; /* level: received power, linear */
     uint16_t fp_index, fp_ampl[3], cir_pwr, std_noise, threshold, preamble_count;
     int16_t iq[2 * ACCUMULATOR_SAMPLES];
-} link;
+} radio_pair;
 
-/* What sender and receiver must agree in. */
+/* Settings in which sender and receiver must agree. */
 typedef struct {
     unsigned channel, prf, code;
     bool tuned; /* the synthesiser's registers are those of the channel */
@@ -121,7 +121,7 @@ typedef struct {
 /* One frame on the air; instants are those at the sender's antenna. */
 struct transmission {
     transmission *next;
-    unsigned receivers; /* that hold on to it */
+    unsigned receivers; /* number of receivers that reference it */
     uint64_t serial;
     dw1000_chip *sender;
     air_interface mode;
@@ -143,7 +143,7 @@ typedef enum { RX_OFF, RX_WAIT, RX_WARMUP, RX_SEARCH, RX_PREAMBLE, RX_HEADER, RX
 struct dw1000_chip {
     dw1000_air *air;
     size_t index;
-    link **links; /* by the other's index */
+    radio_pair **pairs; /* by the other's index */
     const char *fault;
     uint32_t epoch[GROUPS];
     coroutine *program, *waiter;
@@ -151,7 +151,7 @@ struct dw1000_chip {
 
     uint64_t clock_offset; /* units */
     int64_t clock_rate;    /* 2^44 = without error */
-    double ppm, celsius, volts, edges_lost;
+    double ppm, celsius, volts, edge_loss;
     uint16_t tx_delay, rx_delay;
     uint32_t otp[0x80];
 
@@ -167,11 +167,11 @@ struct dw1000_chip {
     uint8_t data_power, header_power; /* of the frame sent last: octets of TX_POWER */
 
     rx_state rx;
-    bool rx_in_reset, stale; /* stale: an error was not followed by a receiver reset */
+    bool rx_in_reset, needs_rx_reset; /* an error was not followed by a receiver reset */
     transmission *frame;     /* that is being received */
-    link *path;              /* of that frame */
+    radio_pair *pair;              /* of that frame */
     unsigned symbols;        /* of its preamble that are accumulated */
-    bool clashed;
+    bool collided;
     uint64_t receptions;
     int16_t accumulator[2 * ACCUMULATOR_SAMPLES];
 };
@@ -180,54 +180,54 @@ struct dw1000_air {
     uint64_t seed, order, serial;
     instant now;
     event *events;
-    size_t event_count, event_room;
+    size_t event_count, event_capacity;
     dw1000_chip **chips;
     size_t chip_count;
-    transmission *flying;
-    coroutine *outside, *current, *programs;
+    transmission *frames_on_air;
+    coroutine *caller, *current, *programs;
     bool running; /* within dw1000_run */
-    size_t alive;
+    size_t running_programs;
 };
 
 /* The layers, lowest first: each calls only those above it in this list. */
 
-/* registers.c: the register map, the clocks, chance, and how the registers set the air interface. */
-void dw1000_prepare_map(void);
+/* registers.c: the register map, clocks, random numbers, and the air interface set by the registers. */
+void dw1000_init_register_map(void);
 void dw1000_reset_registers(dw1000_chip *chip);
 uint64_t dw1000_get(const dw1000_chip *chip, unsigned file, unsigned sub, unsigned octets);
 void dw1000_put(dw1000_chip *chip, unsigned file, unsigned sub, unsigned octets, uint64_t value);
-uint8_t dw1000_octet(const dw1000_chip *chip, unsigned file, unsigned sub);
+uint8_t dw1000_read_octet(const dw1000_chip *chip, unsigned file, unsigned sub);
 void dw1000_write_octet(dw1000_chip *chip, unsigned file, unsigned sub, uint8_t octet);
-uint64_t dw1000_local_units(const dw1000_chip *chip, instant at); /* of the chip's counter, in 1/64 tick */
+uint64_t dw1000_counter_units(const dw1000_chip *chip, instant at); /* of the chip's counter, in 1/64 tick */
 instant dw1000_air_time(const dw1000_chip *chip, uint64_t units);
-uint64_t dw1000_dice(uint64_t a, uint64_t b);
-double dw1000_chance(uint64_t bits);
+uint64_t dw1000_random_bits(uint64_t a, uint64_t b);
+double dw1000_uniform(uint64_t bits);
 air_interface dw1000_transmit_mode(const dw1000_chip *chip);
 air_interface dw1000_receive_mode(const dw1000_chip *chip);
 instant dw1000_symbol_units(unsigned prf);
 
 /* events.c: virtual time, programs, SYS_STATUS and the IRQ line. */
-void *dw1000_memory(size_t bytes); /* zeroed; aborts if memory is exhausted */
+void *dw1000_allocate(size_t bytes); /* zeroed; aborts if memory is exhausted */
 void dw1000_schedule(dw1000_chip *chip, event_group group, instant at, handler *fire, transmission *frame);
 void dw1000_cancel(dw1000_chip *chip, event_group group);
-void dw1000_pass(dw1000_air *air, instant until);
+void dw1000_advance(dw1000_air *air, instant until);
 double dw1000_seconds_now(const dw1000_air *air);
-bool dw1000_start_outside(dw1000_air *air);
+bool dw1000_create_caller(dw1000_air *air);
 void dw1000_free_programs(dw1000_air *air);
-uint64_t dw1000_status_of(const dw1000_chip *chip);
+uint64_t dw1000_status(const dw1000_chip *chip);
 void dw1000_update_line(dw1000_chip *chip);
 void dw1000_raise_status(dw1000_chip *chip, uint64_t bits);
 void dw1000_clear_status(dw1000_chip *chip, uint64_t bits);
 
-/* link.c: what a link's accumulator makes the registers say. */
-void dw1000_drop_link(link *path);
+/* pair.c: the register values that follow from a pair's accumulator. */
+void dw1000_release_pair(radio_pair *pair);
 
 /* receiver.c */
 void dw1000_enable_receiver(dw1000_chip *chip, instant at);
 void dw1000_stop_receiver(dw1000_chip *chip);
-void dw1000_consider(dw1000_chip *chip, transmission *frame); /* whether the receiver will notice it */
-void dw1000_disturb(dw1000_chip *chip, const transmission *frame); /* by another frame than the one being received */
-void dw1000_late_event(dw1000_chip *chip);
+void dw1000_try_detect(dw1000_chip *chip, transmission *frame); /* whether the receiver will detect it */
+void dw1000_check_collision(dw1000_chip *chip, const transmission *frame); /* by another frame than the one being received */
+void dw1000_schedule_late_event(dw1000_chip *chip);
 uint16_t dw1000_frame_check(const uint8_t *octets, size_t count);
 
 /* transmitter.c */
@@ -236,9 +236,9 @@ void dw1000_stop_transmitter(dw1000_chip *chip);
 
 /* power.c: commands, resets, clocks, memories, sensors. */
 bool dw1000_spi_works(dw1000_chip *chip, uint32_t hz);
-bool dw1000_clocks_listen(const dw1000_chip *chip, uint32_t hz);
-void dw1000_control(dw1000_chip *chip, uint32_t command);
-void dw1000_power_written(dw1000_chip *chip, unsigned file, unsigned sub, size_t count);
+bool dw1000_accepts_pmsc_writes(const dw1000_chip *chip, uint32_t hz);
+void dw1000_handle_sys_ctrl(dw1000_chip *chip, uint32_t command);
+void dw1000_handle_register_write(dw1000_chip *chip, unsigned file, unsigned sub, size_t count);
 void dw1000_fill_otp(dw1000_chip *chip);
 
 #endif

@@ -6,16 +6,16 @@
 
 #define SLOW_SPI_HZ 3000000u
 #define FAST_SPI_HZ 20000000u
-#define LDE_LOAD_US 120.0 /* the manual asks drivers for 150; Decawave's own wait for as long as this */
+#define LDE_LOAD_US 120.0 /* the manual requires 150; Decawave's driver waits for this time */
 #define LOCK_US 5.0
 #define RESET_PULSE_S 1e-3
-#define CRYSTAL_RUNS_US 1000.0 /* after RSTn, while the crystal swings */
+#define CRYSTAL_START_US 1000.0 /* start-up time of the crystal after RSTn */
 #define SENSORS_XTI_US 2.5
 #define SENSORS_PLL_US 1000.0
 
 enum { SYSCLKS_AUTO = 0, SYSCLKS_XTI = 1 };
 #define LDE_CLOCKS 0x0301u
-#define OF_LDE_CLOCKS 0x0303u /* SYSCLKS, and the two bits that the manual has for the loading */
+#define LDE_CLOCKS_MASK 0x0303u /* SYSCLKS, and the two bits for the loading in the manual */
 #define ACCESS_OTP 0x3u
 #define READ_OTP 0x2u
 #define LDE_LOAD 0x8000u
@@ -31,19 +31,19 @@ bool dw1000_spi_works(dw1000_chip *chip, uint32_t hz) {
     return hz <= (chip->power == POWER_IDLE ? FAST_SPI_HZ : SLOW_SPI_HZ);
 }
 
-/* Drivers reset chips in the field by writing PMSC as fast as ever while the crystal is the clock, and it works:
- * what they read then is garbage all the same, and other registers lose what is written. */
-bool dw1000_clocks_listen(const dw1000_chip *chip, uint32_t hz) {
+/* While the crystal is the clock, writes to PMSC work at full SPI speed: drivers use them to reset chips. Reads return
+ * random data, and writes to other registers are lost. */
+bool dw1000_accepts_pmsc_writes(const dw1000_chip *chip, uint32_t hz) {
     return chip->fault == NULL && chip->power == POWER_INIT && hz <= FAST_SPI_HZ;
 }
 
-static void lock(dw1000_chip *chip, transmission *none) {
-    (void)none;
+static void pll_locked(dw1000_chip *chip, transmission *unused) {
+    (void)unused;
     chip->power = POWER_IDLE;
     dw1000_raise_status(chip, ST_CPLOCK);
 }
 
-static void choose_clock(dw1000_chip *chip) {
+static void update_clock(dw1000_chip *chip) {
     if (chip->power < POWER_INIT || chip->in_reset) {
         return;
     }
@@ -52,18 +52,18 @@ static void choose_clock(dw1000_chip *chip) {
         chip->power = POWER_INIT;
     } else if (chip->power == POWER_INIT) {
         dw1000_cancel(chip, GROUP_POWER);
-        dw1000_schedule(chip, GROUP_POWER, chip->air->now + MICROSECONDS(LOCK_US), lock, NULL);
+        dw1000_schedule(chip, GROUP_POWER, chip->air->now + MICROSECONDS(LOCK_US), pll_locked, NULL);
     }
 }
 
-static void initialise(dw1000_chip *chip, transmission *none) {
-    (void)none;
+static void enter_init(dw1000_chip *chip, transmission *unused) {
+    (void)unused;
     chip->power = POWER_INIT;
     dw1000_raise_status(chip, ST_SLP2INIT);
-    choose_clock(chip);
+    update_clock(chip);
 }
 
-static void silence(dw1000_chip *chip) {
+static void stop_all(dw1000_chip *chip) {
     dw1000_stop_transmitter(chip);
     dw1000_stop_receiver(chip);
     dw1000_cancel(chip, GROUP_LATE);
@@ -73,33 +73,33 @@ static void silence(dw1000_chip *chip) {
 }
 
 static void reset_chip(dw1000_chip *chip, instant until_init) {
-    silence(chip);
+    stop_all(chip);
     dw1000_reset_registers(chip);
     chip->status = 0;
-    chip->lde_loaded = chip->in_reset = chip->rx_in_reset = chip->stale = false;
+    chip->lde_loaded = chip->in_reset = chip->rx_in_reset = chip->needs_rx_reset = false;
     dw1000_update_line(chip);
     chip->power = POWER_WAKEUP;
     if (until_init > 0) {
-        dw1000_schedule(chip, GROUP_POWER, chip->air->now + until_init, initialise, NULL);
+        dw1000_schedule(chip, GROUP_POWER, chip->air->now + until_init, enter_init, NULL);
     } else {
-        initialise(chip, NULL);
+        enter_init(chip, NULL);
     }
 }
 
 void dw1000_reset_drive(dw1000_chip *chip, dw1000_reset_level level) {
     if (level == DW1000_RESET_HIGH) {
         chip->fault = "RSTn driven high against the chip's own output: pull it low, then let it float";
-        silence(chip);
+        stop_all(chip);
         dw1000_reset_registers(chip);
         chip->status = 0;
         chip->power = POWER_WAKEUP;
         dw1000_update_line(chip);
     } else if (level == DW1000_RESET_LOW) {
-        reset_chip(chip, MICROSECONDS(CRYSTAL_RUNS_US));
+        reset_chip(chip, MICROSECONDS(CRYSTAL_START_US));
         dw1000_cancel(chip, GROUP_POWER);
     } else if (chip->power == POWER_WAKEUP && chip->fault == NULL) {
         dw1000_cancel(chip, GROUP_POWER);
-        dw1000_schedule(chip, GROUP_POWER, chip->air->now + MICROSECONDS(CRYSTAL_RUNS_US), initialise, NULL);
+        dw1000_schedule(chip, GROUP_POWER, chip->air->now + MICROSECONDS(CRYSTAL_START_US), enter_init, NULL);
     }
 }
 
@@ -113,8 +113,8 @@ const char *dw1000_fault(const dw1000_chip *chip) {
     return chip->fault;
 }
 
-/* What a write of PMSC_CTRL0's octets asks of resets and clocks. */
-static void clocks_written(dw1000_chip *chip, bool whole_reset_octet) {
+/* Apply a write to PMSC_CTRL0: resets and clocks. */
+static void handle_pmsc_write(dw1000_chip *chip, bool whole_reset_octet) {
     const uint32_t clocks = (uint32_t)dw1000_get(chip, PMSC, PMSC_CTRL0, 4);
     if (whole_reset_octet) {
         const unsigned lines = clocks >> 28;
@@ -132,29 +132,29 @@ static void clocks_written(dw1000_chip *chip, bool whole_reset_octet) {
         const bool held = (lines & 1) == 0;
         if (held) {
             dw1000_stop_receiver(chip);
-            chip->stale = false;
+            chip->needs_rx_reset = false;
         }
         chip->rx_in_reset = held;
     }
-    if ((clocks & OF_LDE_CLOCKS) != LDE_CLOCKS) {
-        dw1000_cancel(chip, GROUP_LOAD); /* too early: what was loaded so far is worth nothing */
+    if ((clocks & LDE_CLOCKS_MASK) != LDE_CLOCKS) {
+        dw1000_cancel(chip, GROUP_LOAD); /* too early: the microcode is not loaded */
     }
-    choose_clock(chip);
+    update_clock(chip);
 }
 
-static void microcode_loaded(dw1000_chip *chip, transmission *none) {
-    (void)none;
+static void microcode_loaded(dw1000_chip *chip, transmission *unused) {
+    (void)unused;
     chip->lde_loaded = true;
     dw1000_put(chip, OTP_IF, OTP_CTRL, 2, dw1000_get(chip, OTP_IF, OTP_CTRL, 2) & ~LDE_LOAD);
 }
 
-static void otp_written(dw1000_chip *chip) {
+static void handle_otp_write(dw1000_chip *chip) {
     const unsigned command = (unsigned)dw1000_get(chip, OTP_IF, OTP_CTRL, 2);
     const unsigned clocks = (unsigned)dw1000_get(chip, PMSC, PMSC_CTRL0, 2);
     if (command & LDE_LOAD) {
         chip->lde_loaded = false;
         dw1000_cancel(chip, GROUP_LOAD);
-        if ((clocks & OF_LDE_CLOCKS) == LDE_CLOCKS) {
+        if ((clocks & LDE_CLOCKS_MASK) == LDE_CLOCKS) {
             dw1000_schedule(chip, GROUP_LOAD, chip->air->now + MICROSECONDS(LDE_LOAD_US), microcode_loaded, NULL);
         }
     }
@@ -162,36 +162,36 @@ static void otp_written(dw1000_chip *chip) {
         const unsigned at = (unsigned)dw1000_get(chip, OTP_IF, OTP_ADDR, 2) & 0x7FF;
         uint32_t value = at < sizeof chip->otp / sizeof *chip->otp ? chip->otp[at] : 0;
         if (system_clock(chip) != SYSCLKS_XTI) {
-            value = (uint32_t)dw1000_dice(chip->air->seed ^ (uint64_t)chip->air->now, at);
+            value = (uint32_t)dw1000_random_bits(chip->air->seed ^ (uint64_t)chip->air->now, at);
         }
         dw1000_put(chip, OTP_IF, OTP_RDAT, 4, value);
-        dw1000_put(chip, OTP_IF, OTP_CTRL, 2, command & ~READ_OTP); /* it clears itself */
+        dw1000_put(chip, OTP_IF, OTP_CTRL, 2, command & ~READ_OTP); /* the bit clears itself */
     }
 }
 
-static uint64_t converted(double value) {
+static uint64_t to_octet(double value) {
     return (uint64_t)fmax(0.0, fmin(255.0, rint(value)));
 }
 
 /* Voltage and temperature, an octet each. */
-static void measure_to(dw1000_chip *chip, unsigned sub) {
+static void write_sensor_values(dw1000_chip *chip, unsigned sub) {
     const double at_3v3 = chip->otp[8] & 0xFF, at_23c = chip->otp[9] & 0xFF;
-    dw1000_put(chip, TX_CAL, sub, 1, converted(at_3v3 + (chip->volts - 3.3) * 173.0));
-    dw1000_put(chip, TX_CAL, sub + 1, 1, converted(at_23c + (chip->celsius - 23.0) / 1.14));
+    dw1000_put(chip, TX_CAL, sub, 1, to_octet(at_3v3 + (chip->volts - 3.3) * 173.0));
+    dw1000_put(chip, TX_CAL, sub + 1, 1, to_octet(at_23c + (chip->celsius - 23.0) / 1.14));
 }
 
-void dw1000_environment(dw1000_chip *chip, double celsius, double volts) {
+void dw1000_set_environment(dw1000_chip *chip, double celsius, double volts) {
     chip->celsius = celsius;
     chip->volts = volts;
 }
 
-static void sensors_ready(dw1000_chip *chip, transmission *none) {
-    (void)none;
-    measure_to(chip, TC_SARL);
+static void sensors_ready(dw1000_chip *chip, transmission *unused) {
+    (void)unused;
+    write_sensor_values(chip, TC_SARL);
 }
 
 /* The manual's 2.5 us are not enough while the PLL clocks the chip: Decawave's driver waits for 1 ms. */
-static void sensors_written(dw1000_chip *chip) {
+static void handle_sensor_write(dw1000_chip *chip) {
     const bool on = dw1000_get(chip, RF_CONF, RF_SAR_BIAS, 1) == 0x80 &&
                     dw1000_get(chip, RF_CONF, RF_SAR_SWITCH, 1) == 0x0F;
     if (on && (dw1000_get(chip, TX_CAL, TC_SARC, 1) & 1)) {
@@ -200,17 +200,17 @@ static void sensors_written(dw1000_chip *chip) {
     }
 }
 
-static bool touched(unsigned sub, size_t count, unsigned at, unsigned octets) {
+static bool overlaps_register(unsigned sub, size_t count, unsigned at, unsigned octets) {
     return sub < at + octets && at < sub + count;
 }
 
-void dw1000_power_written(dw1000_chip *chip, unsigned file, unsigned sub, size_t count) {
-    if (file == PMSC && touched(sub, count, PMSC_CTRL0, 4)) {
-        clocks_written(chip, touched(sub, count, PMSC_CTRL0 + 3, 1));
-    } else if (file == OTP_IF && touched(sub, count, OTP_CTRL, 2)) {
-        otp_written(chip);
-    } else if (file == TX_CAL && touched(sub, count, TC_SARC, 1)) {
-        sensors_written(chip);
+void dw1000_handle_register_write(dw1000_chip *chip, unsigned file, unsigned sub, size_t count) {
+    if (file == PMSC && overlaps_register(sub, count, PMSC_CTRL0, 4)) {
+        handle_pmsc_write(chip, overlaps_register(sub, count, PMSC_CTRL0 + 3, 1));
+    } else if (file == OTP_IF && overlaps_register(sub, count, OTP_CTRL, 2)) {
+        handle_otp_write(chip);
+    } else if (file == TX_CAL && overlaps_register(sub, count, TC_SARC, 1)) {
+        handle_sensor_write(chip);
     }
 }
 
@@ -226,7 +226,7 @@ void dw1000_fill_otp(dw1000_chip *chip) {
     const uint32_t delay = (uint32_t)chip->tx_delay + chip->rx_delay;
     const uint32_t number = (uint32_t)chip->index + 1;
     chip->otp[0x00] = 0x00000000u | number;
-    chip->otp[0x01] = 0xDECA0100u | (uint32_t)(dw1000_dice(chip->air->seed, number) & 0xFF);
+    chip->otp[0x01] = 0xDECA0100u | (uint32_t)(dw1000_random_bits(chip->air->seed, number) & 0xFF);
     chip->otp[0x04] = 0x88888828;
     chip->otp[0x05] = 0x00000088;
     chip->otp[0x06] = 0x10000000u | number;
@@ -240,10 +240,10 @@ void dw1000_fill_otp(dw1000_chip *chip) {
     chip->otp[0x1E] = 0x0110;
 }
 
-/* One write to SYS_CTRL: its octets together, those that were not written as 0. */
-void dw1000_control(dw1000_chip *chip, uint32_t command) {
+/* Handle one write to SYS_CTRL; octets that were not written are 0. */
+void dw1000_handle_sys_ctrl(dw1000_chip *chip, uint32_t command) {
     if (command & CTRL_TRXOFF) {
-        dw1000_late_event(chip);
+        dw1000_schedule_late_event(chip);
         dw1000_stop_transmitter(chip);
         dw1000_stop_receiver(chip);
         dw1000_clear_status(chip, ST_HPDWARN | ST_TXPUTE);
@@ -259,7 +259,7 @@ void dw1000_control(dw1000_chip *chip, uint32_t command) {
         return;
     }
     if (chip->tx != TX_OFF) {
-        chip->wait_for_response = true; /* it comes after the frame */
+        chip->wait_for_response = true; /* after the frame */
     } else {
         dw1000_enable_receiver(chip, chip->air->now);
     }

@@ -14,8 +14,8 @@ typedef struct {
     uint64_t reset;
 } entry;
 
-/* DW1000 user manual 2.09, section 7.2; in the order of addresses. The buffers, ACC_MEM and what is computed when
- * it is read are in spi.c. */
+/* DW1000 user manual 2.09, section 7.2; in the order of addresses. The buffers, ACC_MEM and registers that are
+ * computed on reading are in spi.c. */
 static const entry MAP[] = {
     {DEV_ID, 0x00, 4, RO, 0xDECA0130},
     {EUI, 0x00, 8, RW, 0},
@@ -87,7 +87,7 @@ static const entry MAP[] = {
 static const entry *first_of[64];
 static uint16_t base_of[ENTRIES];
 
-static void lay_out(void) {
+static void build_register_map(void) {
     size_t base = 0;
     for (size_t i = 0; i < ENTRIES; i++) {
         base_of[i] = (uint16_t)base;
@@ -98,9 +98,9 @@ static void lay_out(void) {
     }
 }
 
-void dw1000_prepare_map(void) {
+void dw1000_init_register_map(void) {
     static pthread_once_t once = PTHREAD_ONCE_INIT;
-    (void)pthread_once(&once, lay_out);
+    (void)pthread_once(&once, build_register_map);
 }
 
 /* The entry that contains an octet, or NULL; `*at` becomes its index in the chip's octets. */
@@ -133,7 +133,7 @@ void dw1000_put(dw1000_chip *chip, unsigned file, unsigned sub, unsigned octets,
 }
 
 /* An octet as the host reads it: reserved registers read 0xDEADDEAD. */
-uint8_t dw1000_octet(const dw1000_chip *chip, unsigned file, unsigned sub) {
+uint8_t dw1000_read_octet(const dw1000_chip *chip, unsigned file, unsigned sub) {
     size_t at;
     if (locate(file, sub, &at) == NULL) {
         return sub & 1 ? 0xDE : 0xAD;
@@ -159,13 +159,13 @@ void dw1000_reset_registers(dw1000_chip *chip) {
     dw1000_put(chip, EUI, 4, 4, chip->otp[1]);
 }
 
-/* Clocks and chance. */
+/* Clocks and random numbers. */
 
 __extension__ typedef __int128 wide;
 
 #define RATE_BITS 44
 
-uint64_t dw1000_local_units(const dw1000_chip *chip, instant at) {
+uint64_t dw1000_counter_units(const dw1000_chip *chip, instant at) {
     return chip->clock_offset + (uint64_t)(((wide)at * chip->clock_rate) >> RATE_BITS);
 }
 
@@ -181,11 +181,11 @@ static uint64_t mix(uint64_t x) {
     return x ^ (x >> 31);
 }
 
-uint64_t dw1000_dice(uint64_t a, uint64_t b) {
+uint64_t dw1000_random_bits(uint64_t a, uint64_t b) {
     return mix(mix(a + UINT64_C(0x9E3779B97F4A7C15)) + b + UINT64_C(0x9E3779B97F4A7C15));
 }
 
-double dw1000_chance(uint64_t bits) {
+double dw1000_uniform(uint64_t bits) {
     return (double)(bits >> 11) * 0x1p-53;
 }
 
@@ -202,7 +202,7 @@ static bool tuned(const dw1000_chip *chip, unsigned channel) {
            dw1000_get(chip, FS_CTRL, FS_PLLCFG, 4) == PLL[channel];
 }
 
-static void choose_sfd(const dw1000_chip *chip, air_interface *mode, bool decawave, bool user) {
+static void set_sfd(const dw1000_chip *chip, air_interface *mode, bool decawave, bool user) {
     mode->decawave_sfd = decawave || user;
     if (mode->slow) {
         mode->sfd_symbols = 64;
@@ -217,18 +217,18 @@ static void choose_sfd(const dw1000_chip *chip, air_interface *mode, bool decawa
 air_interface dw1000_transmit_mode(const dw1000_chip *chip) {
     const uint32_t channel = (uint32_t)dw1000_get(chip, CHAN_CTRL, 0, 4);
     const uint32_t frame = (uint32_t)dw1000_get(chip, TX_FCTRL, 0, 4);
-    air_interface mode = {channel & 15, frame >> 16 & 3, channel >> 22 & 31, false, 8, false, false};
+    air_interface mode = {.channel = channel & 15, .prf = frame >> 16 & 3, .code = channel >> 22 & 31};
     mode.tuned = tuned(chip, mode.channel);
     mode.slow = (frame >> 13 & 3) == 0;
-    choose_sfd(chip, &mode, channel >> 17 & 1, channel >> 20 & 1);
+    set_sfd(chip, &mode, channel >> 17 & 1, channel >> 20 & 1);
     return mode;
 }
 
 air_interface dw1000_receive_mode(const dw1000_chip *chip) {
     const uint32_t channel = (uint32_t)dw1000_get(chip, CHAN_CTRL, 0, 4);
-    air_interface mode = {channel >> 4 & 15, channel >> 18 & 3, channel >> 27, false, 8, false, false};
+    air_interface mode = {.channel = channel >> 4 & 15, .prf = channel >> 18 & 3, .code = channel >> 27};
     mode.tuned = tuned(chip, mode.channel);
     mode.slow = (dw1000_get(chip, SYS_CFG, 0, 4) & CFG_RXM110K) != 0;
-    choose_sfd(chip, &mode, channel >> 17 & 1, channel >> 21 & 1);
+    set_sfd(chip, &mode, channel >> 17 & 1, channel >> 21 & 1);
     return mode;
 }

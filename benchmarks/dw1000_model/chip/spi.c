@@ -1,21 +1,21 @@
-/* The serial interface: header, data, and the time that they take; and programs in other languages that use it. */
+/* The SPI: header, data and duration; and programs in other languages that use it. */
 #include <string.h>
 
 #include "model.h"
 
 /* Chip select to first clock, last clock to chip select, chip select idle (datasheet 2.12, table 18). */
 #define FRAMING_NS 96.0
-/* Registers may change during a read: long reads are done in pieces. */
-#define PIECE 64
+/* Registers may change during a read: long reads are done in chunks. */
+#define READ_CHUNK 64
 
 typedef struct {
     bool write;
     unsigned file, sub;
-    size_t octets; /* of the header; 0 = cut off */
+    size_t octets; /* of the header; 0 = incomplete */
 } header;
 
 static header decode(const uint8_t *out, size_t n) {
-    header read = {(out[0] & 0x80) != 0, out[0] & 0x3F, 0, 1};
+    header read = {.write = (out[0] & 0x80) != 0, .file = out[0] & 0x3F, .octets = 1};
     if (out[0] & 0x40) {
         read.octets = n >= 2 ? 2 : 0;
         read.sub = n >= 2 ? out[1] & 0x7Fu : 0;
@@ -37,18 +37,30 @@ static uint8_t accumulator_octet(const dw1000_chip *chip, unsigned sub) {
     return (uint8_t)(sub & 1 ? value >> 8 : value);
 }
 
-/* What is computed when it is read, 5 octets; returns whether the register is such a one. */
-static bool computed(const dw1000_chip *chip, unsigned file, uint64_t *value) {
-    const uint64_t counter = dw1000_local_units(chip, chip->air->now) / UNITS_PER_TICK & COUNTER_MASK;
-    *value = file == SYS_TIME     ? counter & ~(uint64_t)(COUNTER_GRID - 1)
-             : file == SYS_STATUS ? dw1000_status_of(chip)
-                                  : 0;
-    return file == SYS_TIME || file == SYS_STATUS || file == SYS_CTRL;
+/* Return whether a register is computed on reading, and set its value. */
+static bool computed_register(const dw1000_chip *chip, unsigned file, uint64_t *value) {
+    const uint64_t counter = dw1000_counter_units(chip, chip->air->now) / UNITS_PER_TICK & COUNTER_MASK;
+    switch (file) {
+    case SYS_TIME:
+        *value = counter & ~(uint64_t)(COUNTER_GRID - 1);
+        return true;
+    case SYS_STATUS:
+        *value = dw1000_status(chip);
+        return true;
+    case SYS_CTRL:
+        *value = 0;
+        return true;
+    default:
+        return false;
+    }
 }
 
 static void read_octets(const dw1000_chip *chip, unsigned file, unsigned sub, uint8_t *to, size_t count) {
-    uint64_t value;
-    const unsigned octets = computed(chip, file, &value) ? file == SYS_CTRL ? 4 : 5 : 0;
+    uint64_t value = 0;
+    unsigned octets = 0;
+    if (computed_register(chip, file, &value)) {
+        octets = file == SYS_CTRL ? 4 : 5;
+    }
     for (size_t i = 0; i < count; i++, sub++) {
         if (sub < octets) {
             to[i] = (uint8_t)(value >> (8 * sub));
@@ -57,7 +69,7 @@ static void read_octets(const dw1000_chip *chip, unsigned file, unsigned sub, ui
         } else if (file == RX_BUFFER && sub < FRAME_OCTETS) {
             to[i] = chip->rx_buffer[sub];
         } else {
-            to[i] = dw1000_octet(chip, file, sub);
+            to[i] = dw1000_read_octet(chip, file, sub);
         }
     }
 }
@@ -71,7 +83,7 @@ static void write_octets(dw1000_chip *chip, unsigned file, unsigned sub, const u
         if (file == SYS_STATUS) {
             dw1000_clear_status(chip, value & ~ST_READ_ONLY);
         } else {
-            dw1000_control(chip, (uint32_t)value);
+            dw1000_handle_sys_ctrl(chip, (uint32_t)value);
         }
         return;
     }
@@ -85,7 +97,7 @@ static void write_octets(dw1000_chip *chip, unsigned file, unsigned sub, const u
     if (file == SYS_CFG || file == SYS_MASK) {
         dw1000_update_line(chip);
     }
-    dw1000_power_written(chip, file, sub, count);
+    dw1000_handle_register_write(chip, file, sub, count);
 }
 
 void dw1000_spi(dw1000_chip *chip, const uint8_t *out, uint8_t *in, size_t n, uint32_t hz) {
@@ -99,30 +111,30 @@ void dw1000_spi(dw1000_chip *chip, const uint8_t *out, uint8_t *in, size_t n, ui
     if (!dw1000_spi_works(chip, hz)) {
         if (in != NULL) {
             for (size_t i = 0; i < n; i++) {
-                in[i] = chip->power == POWER_WAKEUP ? 0 : (uint8_t)dw1000_dice(air->seed ^ (uint64_t)began, i);
+                in[i] = chip->power == POWER_WAKEUP ? 0 : (uint8_t)dw1000_random_bits(air->seed ^ (uint64_t)began, i);
             }
         }
-        dw1000_pass(air, ends);
-        if (to.write && to.file == PMSC && n > to.octets && to.octets != 0 && dw1000_clocks_listen(chip, hz)) {
+        dw1000_advance(air, ends);
+        if (to.write && to.file == PMSC && n > to.octets && to.octets != 0 && dw1000_accepts_pmsc_writes(chip, hz)) {
             write_octets(chip, to.file, to.sub, out + to.octets, n - to.octets);
         }
         return;
     }
     if (to.octets == 0) {
-        dw1000_pass(air, ends);
+        dw1000_advance(air, ends);
         return;
     }
     if (to.write) {
         if (in != NULL) {
             memset(in, 0, n);
         }
-        dw1000_pass(air, ends);
+        dw1000_advance(air, ends);
         if (n > to.octets && (!chip->in_reset || to.file == PMSC)) {
             write_octets(chip, to.file, to.sub, out + to.octets, n - to.octets);
         }
         return;
     }
-    uint8_t unwanted[PIECE];
+    uint8_t discarded[READ_CHUNK];
     if (in != NULL) {
         memset(in, 0, to.octets);
     }
@@ -137,19 +149,19 @@ void dw1000_spi(dw1000_chip *chip, const uint8_t *out, uint8_t *in, size_t n, ui
         done++;
     }
     while (done < n) {
-        const size_t piece = n - done < PIECE ? n - done : PIECE;
-        read_octets(chip, to.file, sub, in != NULL ? in + done : unwanted, piece);
-        done += piece;
-        sub += (unsigned)piece;
+        const size_t chunk = n - done < READ_CHUNK ? n - done : READ_CHUNK;
+        read_octets(chip, to.file, sub, in != NULL ? in + done : discarded, chunk);
+        done += chunk;
+        sub += (unsigned)chunk;
         if (done < n) {
-            dw1000_pass(air, began + (instant)(octet * (double)done));
+            dw1000_advance(air, began + (instant)(octet * (double)done));
         }
     }
-    dw1000_pass(air, ends);
+    dw1000_advance(air, ends);
 }
 
 static void run_remote(dw1000_chip *chip, void *context) {
-    dw1000_request request = {DW1000_DELAY, 0, 0, 0, NULL, NULL, 0, 0};
+    dw1000_request request = {.kind = DW1000_DELAY};
     for (;;) {
         request.line = chip->line;
         request.now_s = dw1000_seconds_now(chip->air);

@@ -6,15 +6,16 @@
 #include "model.h"
 
 #define POWER_UP_US 10.0
-#define LOST_US 0.4 /* errata TX-1 */
+#define ERRATA_TX1_US 0.4 /* errata TX-1 */
 #define PHR_SYMBOLS 21
 #define TURNAROUND_US 6.5
-#define KEPT_US 1000.0 /* longer than any flight, and what a receiver does at a frame's end */
+#define FRAME_LIFETIME_US 1000.0 /* longer than any time of flight and the handling of the end of a frame */
 enum { TXCLKS_PLL = 2 };
 
 /* A tick of the chip is 1/64 units of a perfect clock; over a frame the difference does not matter. */
 static instant bit_units(unsigned rate) {
-    return (instant)(rate == 0 ? 524288 : rate == 1 ? 65536 : 8192) * UNITS_PER_TICK;
+    static const instant TICKS[] = {524288, 65536, 8192, 8192};
+    return TICKS[rate] * UNITS_PER_TICK;
 }
 
 static unsigned preamble_symbols(unsigned code) {
@@ -31,10 +32,10 @@ static unsigned preamble_symbols(unsigned code) {
     }
 }
 
-static void forget_old(dw1000_air *air) {
-    for (transmission **at = &air->flying; *at != NULL;) {
+static void free_old_frames(dw1000_air *air) {
+    for (transmission **at = &air->frames_on_air; *at != NULL;) {
         transmission *const frame = *at;
-        if (frame->receivers == 0 && frame->end + MICROSECONDS(KEPT_US) < air->now) {
+        if (frame->receivers == 0 && frame->end + MICROSECONDS(FRAME_LIFETIME_US) < air->now) {
             *at = frame->next;
             free(frame);
         } else {
@@ -43,7 +44,7 @@ static void forget_old(dw1000_air *air) {
     }
 }
 
-static void finished(dw1000_chip *chip, transmission *frame) {
+static void frame_sent(dw1000_chip *chip, transmission *frame) {
     (void)frame;
     chip->tx = TX_OFF;
     chip->sending = NULL;
@@ -54,8 +55,8 @@ static void finished(dw1000_chip *chip, transmission *frame) {
     }
 }
 
-/* Only now are octets taken from the buffer: what is written while a frame is being sent ends up in it (errata TX-2). */
-static void take_payload(dw1000_chip *chip, transmission *frame) {
+/* The payload is read from the buffer only now: writes during the transmission change the frame (errata TX-2). */
+static void read_payload(dw1000_chip *chip, transmission *frame) {
     const uint32_t control = (uint32_t)dw1000_get(chip, TX_FCTRL, 0, 4);
     const size_t offset = control >> 22;
     for (size_t i = 0; i < frame->length; i++) {
@@ -69,17 +70,17 @@ static void take_payload(dw1000_chip *chip, transmission *frame) {
     dw1000_put(chip, TX_TIME, TX_RAWST, 5, frame->counter);
     dw1000_put(chip, TX_TIME, 0, 5, (frame->counter + dw1000_get(chip, TX_ANTD, 0, 2)) & COUNTER_MASK);
     dw1000_raise_status(chip, ST_TXPHS);
-    dw1000_schedule(chip, GROUP_TX, frame->end, finished, frame);
+    dw1000_schedule(chip, GROUP_TX, frame->end, frame_sent, frame);
 }
 
 static void preamble_sent(dw1000_chip *chip, transmission *frame) {
     dw1000_raise_status(chip, ST_TXPRS);
-    dw1000_schedule(chip, GROUP_TX, frame->data, take_payload, frame);
+    dw1000_schedule(chip, GROUP_TX, frame->data, read_payload, frame);
 }
 
 /* TX_POWER by its two formats: smart power has an octet for each duration of a frame, at 6.8 Mbit/s only; without it
  * the third octet is for preamble and data, the second one for the PHR. */
-static void choose_power(dw1000_chip *chip, const transmission *frame) {
+static void set_power(dw1000_chip *chip, const transmission *frame) {
     static const double BOOST_US[] = {500, 250, 125};
     unsigned data = 0;
     while (frame->rate == 2 && data < 3 && frame->end - frame->start <= MICROSECONDS(BOOST_US[data])) {
@@ -91,36 +92,36 @@ static void choose_power(dw1000_chip *chip, const transmission *frame) {
 }
 
 /* Bits 7:5: 18 dB in steps of -3, or nothing; bits 4:0: steps of 0.5 dB. */
-static double decibels(unsigned octet) {
+static double power_db(unsigned octet) {
     return octet >> 5 == 7 ? -INFINITY : 18 - 3.0 * (octet >> 5) + 0.5 * (octet & 31u);
 }
 
 void dw1000_sent_power(const dw1000_chip *chip, double *data_db, double *header_db) {
-    *data_db = decibels(chip->data_power);
-    *header_db = decibels(chip->header_power);
+    *data_db = power_db(chip->data_power);
+    *header_db = power_db(chip->header_power);
 }
 
-static void on_air(dw1000_chip *chip, transmission *frame) {
+static void start_frame(dw1000_chip *chip, transmission *frame) {
     dw1000_air *const air = chip->air;
-    choose_power(chip, frame);
+    set_power(chip, frame);
     chip->tx = TX_ON;
-    chip->status &= ~ST_TX; /* of a delayed frame only now: while it waits, those of the frame before stand */
+    chip->status &= ~ST_TX; /* for a delayed frame only now: until then, the flags of the previous frame stay set */
     dw1000_raise_status(chip, ST_TXFRB);
-    frame->next = air->flying;
-    air->flying = frame;
+    frame->next = air->frames_on_air;
+    air->frames_on_air = frame;
     for (size_t i = 0; i < air->chip_count; i++) {
-        if (chip->links[i] != NULL) {
-            dw1000_consider(air->chips[i], frame);
-            dw1000_disturb(air->chips[i], frame);
+        if (chip->pairs[i] != NULL) {
+            dw1000_try_detect(air->chips[i], frame);
+            dw1000_check_collision(air->chips[i], frame);
         }
     }
     dw1000_schedule(chip, GROUP_TX, frame->sfd, preamble_sent, frame);
 }
 
-/* A frame as TX_FCTRL describes it, but for its times. */
-static transmission *describe(dw1000_chip *chip) {
+/* Create a frame according to TX_FCTRL, without its times. */
+static transmission *create_frame(dw1000_chip *chip) {
     const uint32_t control = (uint32_t)dw1000_get(chip, TX_FCTRL, 0, 4);
-    transmission *const frame = dw1000_memory(sizeof *frame);
+    transmission *const frame = dw1000_allocate(sizeof *frame);
     frame->serial = chip->air->serial++;
     frame->sender = chip;
     frame->mode = dw1000_transmit_mode(chip);
@@ -134,65 +135,65 @@ static transmission *describe(dw1000_chip *chip) {
     return frame;
 }
 
-static instant header_units(const transmission *frame) {
+static instant shr_units(const transmission *frame) {
     return (instant)(frame->preamble_symbols + frame->mode.sfd_symbols) * frame->symbol;
 }
 
-/* Send a frame whose marker leaves the transmitter when the counter is at `marker` units, on its grid of 512 ticks. */
-static void send_at(dw1000_chip *chip, transmission *frame, uint64_t marker) {
+/* Schedule a frame whose marker leaves the transmitter when the counter is at `marker` units, a multiple of 512 ticks. */
+static void schedule_frame(dw1000_chip *chip, transmission *frame, uint64_t marker) {
     const instant bit = bit_units(frame->rate), coded = frame->rate == 0 ? bit : bit_units(1);
     const size_t bits = 8 * frame->length;
     frame->marker = dw1000_air_time(chip, marker + (uint64_t)chip->tx_delay * UNITS_PER_TICK);
     frame->sfd = frame->marker - (instant)frame->mode.sfd_symbols * frame->symbol;
-    frame->start = frame->marker - header_units(frame);
+    frame->start = frame->marker - shr_units(frame);
     frame->data = frame->marker + PHR_SYMBOLS * coded;
     frame->end = frame->data + (instant)(bits + 48 * ((bits + 329) / 330)) * bit;
     frame->aborted = INT64_MAX;
     frame->counter = (marker / UNITS_PER_TICK) & COUNTER_MASK;
     chip->sending = frame;
     chip->tx = TX_WAIT;
-    dw1000_schedule(chip, GROUP_TX, frame->start, on_air, frame);
+    dw1000_schedule(chip, GROUP_TX, frame->start, start_frame, frame);
 }
 
-static uint64_t next_grid(uint64_t units) {
+static uint64_t ceil_to_grid(uint64_t units) {
     const uint64_t grid = (uint64_t)COUNTER_GRID * UNITS_PER_TICK;
     return (units + grid - 1) / grid * grid;
 }
 
-static void give_up(dw1000_chip *chip, transmission *frame) {
+static void discard_frame(dw1000_chip *chip, transmission *frame) {
     (void)chip;
     free(frame);
 }
 
 void dw1000_start_transmission(dw1000_chip *chip, uint32_t command) {
-    forget_old(chip->air);
+    free_old_frames(chip->air);
     dw1000_cancel(chip, GROUP_TX);
     chip->status &= ~(ST_HPDWARN | ST_TXPUTE | (command & CTRL_TXDLYS ? 0 : ST_TX));
     dw1000_update_line(chip);
     chip->wait_for_response = (command & CTRL_WAIT4RESP) != 0;
-    transmission *const frame = describe(chip);
-    const uint64_t now = dw1000_local_units(chip, chip->air->now), power_up = (uint64_t)MICROSECONDS(POWER_UP_US);
+    transmission *const frame = create_frame(chip);
+    const uint64_t now = dw1000_counter_units(chip, chip->air->now), power_up = (uint64_t)MICROSECONDS(POWER_UP_US);
     if (!(command & CTRL_TXDLYS)) {
-        send_at(chip, frame, next_grid(now + power_up + (uint64_t)header_units(frame)));
+        schedule_frame(chip, frame, ceil_to_grid(now + power_up + (uint64_t)shr_units(frame)));
         return;
     }
     const uint64_t wanted = dw1000_get(chip, DX_TIME, 0, 5) & ~(uint64_t)(COUNTER_GRID - 1);
-    const uint64_t header = (uint64_t)header_units(frame) / UNITS_PER_TICK, ticks = now / UNITS_PER_TICK;
+    const uint64_t header = (uint64_t)shr_units(frame) / UNITS_PER_TICK, ticks = now / UNITS_PER_TICK;
     const uint64_t lead = (wanted - header - ticks) & COUNTER_MASK; /* to the start of the preamble */
     const uint64_t lead_units = lead * UNITS_PER_TICK;
     const bool clock_held = (dw1000_get(chip, PMSC, PMSC_CTRL0, 1) >> 4 & 3) == TXCLKS_PLL;
     if (lead > COUNTER_MASK / 2) {
-        dw1000_raise_status(chip, ST_HPDWARN); /* and it waits for a whole turn of the counter */
+        dw1000_raise_status(chip, ST_HPDWARN); /* the frame is sent after the counter has wrapped */
     } else if (lead_units < power_up) {
         dw1000_raise_status(chip, ST_TXPUTE);
-        give_up(chip, frame);
+        discard_frame(chip, frame);
         return;
-    } else if (lead_units < power_up + (uint64_t)MICROSECONDS(LOST_US) && !clock_held) {
-        chip->tx = TX_WAIT; /* and there it stays: errata TX-1 */
-        give_up(chip, frame);
+    } else if (lead_units < power_up + (uint64_t)MICROSECONDS(ERRATA_TX1_US) && !clock_held) {
+        chip->tx = TX_WAIT; /* the frame is never sent: errata TX-1 */
+        discard_frame(chip, frame);
         return;
     }
-    send_at(chip, frame, (ticks + lead + header) * UNITS_PER_TICK);
+    schedule_frame(chip, frame, (ticks + lead + header) * UNITS_PER_TICK);
 }
 
 void dw1000_stop_transmitter(dw1000_chip *chip) {
@@ -201,7 +202,7 @@ void dw1000_stop_transmitter(dw1000_chip *chip) {
     if (frame != NULL && chip->tx == TX_ON) {
         frame->aborted = chip->air->now;
     } else {
-        free(frame); /* it is not referenced yet */
+        free(frame); /* it has no references yet */
     }
     chip->sending = NULL;
     chip->tx = TX_OFF;

@@ -104,20 +104,20 @@ static uint64_t anchor_now(void *context) {
 }
 
 static void anchor_wait(void *context, uint64_t until_us) {
-    dw1000_chip *const its = ((anchor_host *)context)->chip;
-    const double left_s = (double)until_us * 1e-6 - dw1000_now(its);
-    dw1000_wait(its, left_s > 1e-6 ? left_s : 1e-6);
+    dw1000_chip *const chip_of_anchor = ((anchor_host *)context)->chip;
+    const double left_s = (double)until_us * 1e-6 - dw1000_now(chip_of_anchor);
+    dw1000_wait(chip_of_anchor, left_s > 1e-6 ? left_s : 1e-6);
 }
 
 static void anchor_sleep(void *context, uint32_t us) {
     dw1000_delay(((anchor_host *)context)->chip, us * 1e-6);
 }
 
-static void run_anchor(dw1000_chip *its, void *context) {
+static void run_anchor(dw1000_chip *anchor, void *context) {
     static uwb_twr twr;
     static uint64_t measurement[1024];
     anchor_host *const host = (anchor_host *)context;
-    host->chip = its;
+    host->chip = anchor;
     const uwb_dw1000_io io = {host, anchor_transfer, anchor_speed, NULL, anchor_now, anchor_wait, anchor_sleep};
     uwb_twr_config config = uwb_twr_defaults;
     config.role = UWB_ROLE_ANCHOR;
@@ -136,8 +136,9 @@ int main(int argc, char **argv) {
     dw1000_air *const air = dw1000_air_new(1);
     chip = dw1000_chip_new(air, 8, 0, 16436, 16436);
     dw1000_chip *const anchor = dw1000_chip_new(air, -5, 77, 16436, 16436);
-    const dw1000_link_config link = {7, 0, NULL, 0, 0, 0, 0, 0, 0, 0};
-    dw1000_link(air, chip, anchor, &link);
+    dw1000_pair_config pair = {};
+    pair.distance_m = 7;
+    dw1000_set_pair(air, chip, anchor, &pair);
     dw1000_program(chip, run_sketch, NULL);
     dw1000_program(anchor, run_anchor, &host);
     dw1000_run(air, atof(argv[1]));

@@ -1,4 +1,4 @@
-"""Links between two modelled chips: distance, error, accumulator; from the simulator or a recording."""
+"""Radio channels of pairs of modelled chips: distance, error, accumulator; from the simulator or a recording."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ SAMPLES = 1016
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Link:
-    """A link between two chips, the same in both directions; `dw1000_link_config` in C.
+class Pair:
+    """The radio channel of a pair of chips, the same in both directions; `dw1000_pair_config` in C.
 
     Attributes:
         distance_m: along the straight line, 0 to 100,000.
@@ -55,21 +55,21 @@ class Link:
         ):
             value = getattr(self, name)
             if not low <= value <= high:
-                raise ParameterError(f"{name} = {value}", where="link", valid=f"{low} to {high}")
+                raise ParameterError(f"{name} = {value}", where="pair", valid=f"{low} to {high}")
         if self.samples is not None:
             shape = np.shape(self.samples)
             if len(shape) != 1 or shape[0] % 2 or not 0 < shape[0] <= 2 * SAMPLES:
                 raise ParameterError(
-                    f"samples of shape {shape}", where="link", valid=f"(2 n,), n from 1 to {SAMPLES}"
+                    f"samples of shape {shape}", where="pair", valid=f"(2 n,), n from 1 to {SAMPLES}"
                 )
 
 
-def link_of(
+def pair_of(
     measurement: RangeMeasurement, truth: Truth | None = None, *, loss: float = 0.0, damage: float = 0.0
-) -> Link:
-    """Return a link over which chips reproduce `measurement`.
+) -> Pair:
+    """Return a pair with which chips reproduce `measurement`.
 
-    If the true range is known, it is the link's distance, and the error is its excess; otherwise the measured
+    If the true range is known, it is the distance of the pair, and the error is its excess; otherwise the measured
     range is the distance. A CIR that is part of an accumulator is padded with zeros to its original position;
     magnitudes get the phase 0.
 
@@ -77,7 +77,7 @@ def link_of(
         ParameterError: the range or the CIR is missing, or the CIR is outside the accumulator.
     """
     distance_m = measurement.range_m if truth is None else truth.range_m
-    return Link(
+    return Pair(
         distance_m=distance_m,
         excess_m=measurement.range_m - distance_m,
         samples=_accumulator(measurement.cir),
