@@ -68,6 +68,7 @@ setup(
         PACKAGE: [
             "py.typed",
             "interfaces/*.msg",
+            "mappings/*.yaml",
             "evaluation/templates/*.j2",
             "paper/templates/*.j2",
             "viewer/templates/*.j2",
@@ -96,6 +97,7 @@ setup(
         "training": [*required("training"), "torch"],
         "viewer": required("viewer"),
         "dask": required("dask"),
+        "formats": required("formats"),
         "spi": required("spi"),
         # colcon reads this to detect that pytest runs the tests.
         "test": ["pytest"],
