@@ -26,14 +26,14 @@ from uwb_mitigation.positioning.smoother import smooth
 from uwb_mitigation.positioning.tag_estimator import EstimatorConfig, TagEstimator
 from uwb_mitigation.positioning.tracks import Ranges, Track, TrackErrors, TruePath, errors_of, track_errors
 from uwb_mitigation.sources.decaranging import DecaRangingFolder
-from uwb_mitigation.sources.hanyang import ANTENNA_M, HanyangRun
+from uwb_mitigation.sources.opening import open_mapped
 from uwb_mitigation.sources.simulated import SimulatedSource, SimulatedSurvey
 from uwb_mitigation.sources.source import Source
 
 LAG_S = 0.2
 """Time offset of the ranges relative to the ground truth in every Hanyang run."""
 
-HEIGHT = Height(ANTENNA_M, 0.2)
+HEIGHT = Height(1.0, 0.2)
 """Height of the tag in the Hanyang runs."""
 
 _SECOND_NS = 1_000_000_000
@@ -76,7 +76,7 @@ def hanyang_run(folder: Path) -> tuple[AnchorMap, Ranges, TruePath, TruePath]:
     The window of trajectory A is from the first x > 49.3 and y > -5 to the next x <= 12 and y > 3.4; that of B from
     the first x < 8.6 and y < -7 to the next x > 8.6 and y < -7.
     """
-    run = HanyangRun(folder)
+    run = open_mapped(folder, "hanyang")
     ranges, _ = columns(run, run.anchors)
     shifted = Ranges(
         ranges.stamp_ns - round(LAG_S * _SECOND_NS),

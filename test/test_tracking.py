@@ -27,7 +27,7 @@ from uwb_mitigation.positioning.tag_estimator import EstimatorConfig, TagEstimat
 from uwb_mitigation.positioning.tracks import Estimate, Ranges, TruePath
 from uwb_mitigation.processing import tracking
 from uwb_mitigation.processing.tracking import held_out, track_tag
-from uwb_mitigation.sources.hanyang import HanyangRun
+from uwb_mitigation.sources.mapped import MappedRecording
 from uwb_mitigation.sources.opening import open_recording
 from uwb_mitigation.sources.recorded_ranges import TagRecording
 from uwb_mitigation.sources.site import anchors_file
@@ -213,13 +213,13 @@ def hanyang() -> Path:
 
 def test_real_run_is_read_with_its_anchors_and_positions(hanyang: Path):
     source = open_recording(hanyang / "LOS_A2")
-    assert isinstance(source, HanyangRun)
+    assert isinstance(source, MappedRecording)
     records = list(source)
     assert len(records) == 8219
     assert [anchor.id for anchor in source.anchors.anchors] == [3, 5, 9, 12]
     stamps = [record.measurement.stamp_ns for record in records]
     assert stamps == sorted(stamps)
-    assert source.skipped["place without GNSS"] > 100
+    assert source.skipped["dropped: pose z from_median 0.5"] > 100
     heights = [record.tag_position[2] for record in records if record.tag_position is not None]
     assert 0.7 < min(heights) < max(heights) < 1.7
 
@@ -230,7 +230,7 @@ def test_bag_of_a_real_run_keeps_its_stamps_and_anchors(hanyang: Path, tmp_path:
     wanted = [record.measurement.stamp_ns for record in open_recording(hanyang / "LOS_A2")]
     assert [record.measurement.stamp_ns for record in open_recording(tmp_path / "a2.mcap")] == wanted
     anchors = parse_anchors((tmp_path / "a2.anchors.yaml").read_text(), "a2")
-    assert anchors.anchors == HanyangRun(hanyang / "LOS_A2").anchors.anchors
+    assert anchors.anchors == open_recording(hanyang / "LOS_A2").anchors.anchors
 
 
 @pytest.mark.slow

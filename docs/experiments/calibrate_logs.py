@@ -35,11 +35,12 @@ from uwb_mitigation.positioning.smoother import Smoother
 from uwb_mitigation.positioning.tag_estimator import EstimatorConfig, TagEstimator
 from uwb_mitigation.positioning.tracks import Ranges, track_errors
 from uwb_mitigation.sources.decaranging import DecaRangingFolder
-from uwb_mitigation.sources.hanyang import ANTENNA_M, HanyangRun
+from uwb_mitigation.sources.mapped import MappedRecording
+from uwb_mitigation.sources.opening import open_mapped
 from uwb_mitigation.training.site_calibration import SiteCalibration, calibrate
 from uwb_mitigation.training.site_solution import solve_without_truth
 
-HEIGHT = Height(ANTENNA_M, 0.2)
+HEIGHT = Height(1.0, 0.2)
 
 
 def calibrated(
@@ -60,11 +61,11 @@ def show(found: SiteCalibration) -> None:
 
 def hanyang(folder: Path, name: str) -> None:
     source = load_bundle(default_model_path())
-    run = HanyangRun(folder / name)
+    run = open_mapped(folder / name, "hanyang")
     found = calibrated(run, run.anchors, source, HEIGHT)
     show(found)
     for other in sorted(path for path in folder.iterdir() if path.is_dir() and path.name != name):
-        test = HanyangRun(other)
+        test = open_mapped(other, "hanyang")
         anchors, ranges, _, truth = hanyang_run(other)
         ids = np.array([anchor.id for anchor in anchors.anchors], np.uint64)
         off = found.offsets.of(np.full(len(ranges), ranges.tag_id), ids[ranges.anchor]).astype(float)
@@ -87,9 +88,9 @@ def hanyang(folder: Path, name: str) -> None:
 
 def harm(folder: Path) -> None:
     source = load_bundle(default_model_path())
-    height = Height(ANTENNA_M, 0.1)
+    height = Height(1.0, 0.1)
     for path in sorted(path for path in folder.iterdir() if path.is_dir()):
-        run = HanyangRun(path)
+        run = open_mapped(path, "hanyang")
         records = list(run)
         half = len(records) // 2
         for name, part in (("all", records), ("first half", records[:half]), ("second half", records[half:])):
@@ -118,7 +119,7 @@ def harm(folder: Path) -> None:
 
 
 def _against_truth(
-    run: HanyangRun, records: list[Record], bundle: Bundle | None, offsets: Offsets, height: Height
+    run: MappedRecording, records: list[Record], bundle: Bundle | None, offsets: Offsets, height: Height
 ) -> tuple[float, float, np.ndarray]:
     """Return MAE of ranges, RMSE of the live track, and median error per anchor, m, without the time offset."""
     measured = [record.measurement for record in records]

@@ -89,8 +89,8 @@ def encode_transform_row(odometry: Odometry, row: int, frame_id: str = ODOM, chi
     return _serialize(_make(TF_TYPE, transforms=[transform]), TF_TYPE)
 
 
-def write_robot(bag: BagWriter, odometry: Odometry, imu: Imu, row: int, until_ns: int) -> int:
-    """Write odometry, IMU data (with the same stamps) and the transform from odom to base_link, from a row up to a time.
+def write_robot(bag: BagWriter, odometry: Odometry, imu: Imu | None, row: int, until_ns: int) -> int:
+    """Write odometry, IMU data (with the same stamps, if known) and the transform from odom to base_link, from a row up to a time.
 
     Returns:
         The first row that was not written.
@@ -100,7 +100,8 @@ def write_robot(bag: BagWriter, odometry: Odometry, imu: Imu, row: int, until_ns
     """
     while row < len(odometry) and (stamp_ns := int(odometry.stamp_ns[row])) <= until_ns:
         bag.write_message(ROBOT_ODOMETRY, ODOMETRY_TYPE, encode_odometry_row(odometry, row), stamp_ns)
-        bag.write_message(ROBOT_IMU, IMU_TYPE, encode_imu_row(imu, row), stamp_ns)
+        if imu is not None:
+            bag.write_message(ROBOT_IMU, IMU_TYPE, encode_imu_row(imu, row), stamp_ns)
         bag.write_message(TF, TF_TYPE, encode_transform_row(odometry, row), stamp_ns)
         row += 1
     return row

@@ -66,17 +66,50 @@ ForceOption = Annotated[bool, typer.Option("--force", help="Replace OUT if it ex
 @app.command("import")
 def import_recordings(
     sources: Annotated[list[Path], typer.Argument(metavar="SRC...", help="Recordings: logs, folders, bags.")],
-    output: OutputOption,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "-o", "--output", metavar="OUT", help="OUT.mcap for one file, any other name for a bag folder."
+        ),
+    ] = None,
+    mapping: Annotated[
+        str,
+        typer.Option(
+            "--map", metavar="FILE", help="Mapping file for other formats, or name of a shipped one."
+        ),
+    ] = "",
+    dry_run: Annotated[
+        bool,
+        typer.Option(
+            "--dry-run", help="Show how the recording is understood, and write nothing (with --map)."
+        ),
+    ] = False,
     cir: CirOption = CirChoice.FINAL,
     longest_pause: LongestPauseOption = _LONGEST_PAUSE_S,
     force: ForceOption = False,
     json: JsonOption = None,
 ) -> None:
     """Write recordings into one MCAP bag, with truth where known."""
-    opened = [_open(path, cir) for path in sources]
+    from uwb_mitigation.commands import mapped_report
+    from uwb_mitigation.sources.opening import open_mapped
+
+    if dry_run and not mapping:
+        raise ParameterError("--dry-run needs --map", valid="--map FILE")
+    if output is None and not dry_run:
+        raise ParameterError("no output", valid="-o OUT, or --dry-run with --map")
+    opened: Sequence[Source]
+    extra: dict[str, Any] = {}
+    if mapping:
+        opened = mapped = [open_mapped(path, mapping) for path in sources]
+        extra = mapped_report.show(mapped, preview=dry_run)
+    else:
+        opened = [_open(path, cir) for path in sources]
+    if output is None or dry_run:
+        console.write_json(json, extra)
+        return
     # If a tag is known to move, its time continues during a pause.
     in_motion = any(getattr(source, "in_motion", False) for source in opened)
-    _write(opened, output, math.inf if in_motion else longest_pause, force, json)
+    _write(opened, output, math.inf if in_motion else longest_pause, force, json, extra=extra)
 
 
 @app.command()
@@ -180,15 +213,22 @@ def _write(
         f"Wrote {messages} messages, {inventory.ranges} ranges of {_pairs(found)}, to {bag.file}"
         + (f"; left out: {lost}." if lost and total is not None else ".")
     )
-    console.write_json(json, {"messages": messages, "output": str(bag.file), **(extra or {}), **found})
+    console.write_json(json, {"messages": messages, "output": str(bag.file), **found, **(extra or {})})
     if damage:
         raise damage[0]
 
 
-def _motion_of(source: Source, start_ns: int) -> tuple[Odometry, Imu] | None:
-    """Return odometry and IMU data of a simulated drive that starts at `start_ns`; None for other sources."""
+def _motion_of(source: Source, start_ns: int) -> tuple[Odometry, Imu | None] | None:
+    """Return odometry and IMU data of a simulated drive that starts at `start_ns`, or the odometry of a mapping."""
+    from uwb_mitigation.sources.inventory import FIRST_DATE_NS
+    from uwb_mitigation.sources.mapped import MappedRecording
     from uwb_mitigation.sources.simulated import SimulatedSource
 
+    if isinstance(source, MappedRecording) and (odometry := source.motion) is not None:
+        # Without a date, the first range starts at `start_ns`.
+        first_ns = int(source.values.stamp_ns[0])
+        shift_ns = start_ns - first_ns if first_ns < FIRST_DATE_NS else 0
+        return replace(odometry, stamp_ns=odometry.stamp_ns + shift_ns), None
     if not isinstance(source, SimulatedSource):
         return None
     motion = source.motion()

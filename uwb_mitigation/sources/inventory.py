@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from array import array
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -32,7 +34,7 @@ class Inventory:
     def __init__(self) -> None:
         self.ranges = self.with_truth = 0
         self.skipped: Counter[str] = Counter()
-        self._rows: dict[tuple[int, int, str], list[tuple[int, float, float]]] = {}
+        self._rows: dict[tuple[int, int, str], tuple[array[int], array[float], array[float]]] = {}
 
     def watch(self, source: Source) -> Iterator[Record]:
         """Yield and count the records of `source`; its warnings are added even if reading ends in an error."""
@@ -40,38 +42,44 @@ class Inventory:
             for record in source:
                 measured, truth = record.measurement, record.truth
                 key = (measured.anchor_id, measured.tag_id, truth.label if truth else "")
-                row = (measured.stamp_ns, measured.range_m, truth.range_m if truth else np.nan)
-                self._rows.setdefault(key, []).append(row)
+                true_m = truth.range_m if truth else math.nan
+                if key not in self._rows:
+                    self._rows[key] = array("q"), array("d"), array("d")
+                stamps, ranges_m, truths_m = self._rows[key]
+                stamps.append(measured.stamp_ns)
+                ranges_m.append(measured.range_m)
+                truths_m.append(true_m)
                 self.ranges += 1
-                self.with_truth += truth is not None
+                self.with_truth += math.isfinite(true_m)
                 yield record
         finally:
             self.skipped += source.skipped
 
     def as_json(self) -> dict[str, Any]:
         """Return the result for JSON, with null for unknown values; pairs in the order of their first exchange."""
-        stamps = [row[0] for rows in self._rows.values() for row in rows]
+        first = min((min(stamps) for stamps, _, _ in self._rows.values()), default=0)
+        last = max((max(stamps) for stamps, _, _ in self._rows.values()), default=0)
         return {
             "ranges": self.ranges,
             "with_truth": self.with_truth,
             "pairs": len({key[:2] for key in self._rows}),
-            "duration_s": (max(stamps) - min(stamps)) / _SECOND_NS if stamps else 0.0,
+            "duration_s": (last - first) / _SECOND_NS,
             "skipped": dict(self.skipped),
             "by_pair": [_pair(*key, rows) for key, rows in self._rows.items()],
         }
 
 
-def _pair(anchor_id: int, tag_id: int, label: str, rows: list[tuple[int, float, float]]) -> dict[str, Any]:
-    stamps = [row[0] for row in rows]
+def _pair(anchor_id: int, tag_id: int, label: str, rows: tuple[Any, Any, Any]) -> dict[str, Any]:
+    stamps, ranges_m, true_m = rows
     span_ns = max(stamps) - min(stamps)
     return {
         "anchor_id": anchor_id,
         "tag_id": tag_id,
         "label": label,
-        "ranges": len(rows),
-        "rate_hz": (len(rows) - 1) * _SECOND_NS / span_ns if span_ns > 0 else None,
-        "mean_range_m": _mean(np.array([row[1] for row in rows])),
-        "mean_true_range_m": _mean(np.array([row[2] for row in rows])),
+        "ranges": len(stamps),
+        "rate_hz": (len(stamps) - 1) * _SECOND_NS / span_ns if span_ns > 0 else None,
+        "mean_range_m": _mean(np.array(ranges_m)),
+        "mean_true_range_m": _mean(np.array(true_m)),
     }
 
 

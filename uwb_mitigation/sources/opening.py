@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.sources.source import Source
 
+if TYPE_CHECKING:
+    from uwb_mitigation.sources.mapped import MappedRecording
+
 ACCEPTED = (
     "an MCAP bag (.mcap, or a folder with metadata.yaml), "
-    "DecaRanging logs (.log, .log.xz, or a folder of them), or a folder of a Hanyang run; `data import` makes a bag of DeepUWB's pickle"
+    "DecaRanging logs (.log, .log.xz, or a folder of them), or a folder of a Hanyang run; `data import` makes a bag of DeepUWB's pickle, "
+    "and with --map of other formats"
 )
 
+_HANYANG_ANCHOR = re.compile(r"A\d{1,4}\.csv(\.xz)?")
 _MCAP_MAGIC = b"\x89MCAP0\r\n"
 _XZ_MAGIC = b"\xfd7zXZ\x00"
 _SQLITE_MAGIC = b"SQLite format 3\x00"
@@ -39,15 +45,27 @@ def open_recording(path: Path, *, cir: Literal["final", "poll"] = "final") -> So
 
         return McapRecording(path)
     if path.is_dir():
-        from uwb_mitigation.sources.hanyang import HanyangRun, is_run
-
-        if is_run(path):
-            return HanyangRun(path)
+        names = {entry.name for entry in path.iterdir()}
+        if names & {"trajectory.csv", "trajectory.csv.xz"} and any(map(_HANYANG_ANCHOR.fullmatch, names)):
+            return open_mapped(path, "hanyang")
     if path.is_dir() or path.name.endswith((".log", ".log.xz")) or _looks_like_log(path):
         from uwb_mitigation.sources.decaranging import CirFrame, open_decaranging
 
         return open_decaranging(path, cir=CirFrame[cir.upper()])
     raise RecordingError("not a recording that can be read", where=str(path), valid=ACCEPTED)
+
+
+def open_mapped(path: Path, mapping: str) -> MappedRecording:
+    """Return the source for `path` with a mapping file, or with a shipped mapping by its name.
+
+    Raises:
+        ParameterError: The mapping is invalid.
+        RecordingError: The recording cannot be read with it.
+    """
+    from uwb_mitigation.sources.mapped import MappedRecording
+    from uwb_mitigation.sources.mapping import load_mapping
+
+    return MappedRecording(load_mapping(mapping), path)
 
 
 def _is_bag(path: Path) -> bool:

@@ -1,0 +1,612 @@
+"""Mapping files for recordings: formats, shipped data sets, errors and warnings. All files are generated here."""
+
+from __future__ import annotations
+
+import json
+import os
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from command_line import run
+
+from uwb_mitigation.bag.odometry import read_odometry
+from uwb_mitigation.errors import DamagedRecordingError, ParameterError, RecordingError
+from uwb_mitigation.measurement import Encoding
+from uwb_mitigation.sources.mapped import MappedRecording
+from uwb_mitigation.sources.mapping import Mapping, load_mapping, shipped_mappings
+from uwb_mitigation.sources.mcap import McapRecording
+from uwb_mitigation.sources.opening import open_mapped
+
+DATA = Path(os.environ.get("UWB_MITIGATION_DATA", Path(__file__).parents[2] / "shared" / "data"))
+TEN_LINES = """
+name: my radio
+separator: ";"
+fields:
+  stamp: {column: time, unit: s}
+  anchor: anchor
+  range: {column: range_mm, unit: mm}
+"""
+PLAIN = {"name": "test", "fields": {"stamp": "t", "anchor": "a", "range": "r"}}
+
+
+def read(document: dict[str, Any], path: Path) -> MappedRecording:
+    return MappedRecording(Mapping.model_validate(document), path)
+
+
+def write(path: Path, text: str) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def with_fields(**changes: Any) -> dict[str, Any]:
+    fields = dict(PLAIN["fields"]) | changes  # type: ignore[call-overload]
+    return PLAIN | {"fields": fields}
+
+
+def ranges_of(source: MappedRecording) -> list[float]:
+    return [round(record.measurement.range_m, 6) for record in source]
+
+
+def test_ten_lines_import_a_csv_file(tmp_path: Path):
+    write(tmp_path / "map.yaml", TEN_LINES)
+    rows = "".join(f"{1000 + 10 * n};{n % 3};{1.7e9 + n / 10:.1f}\n" for n in range(30))
+    write(tmp_path / "log.csv", "range_mm;anchor;time\n" + rows)
+    done = run(
+        "data",
+        "import",
+        "log.csv",
+        "--map",
+        "map.yaml",
+        "-o",
+        "out.mcap",
+        "--json",
+        "out.json",
+        folder=tmp_path,
+    )
+    assert done.returncode == 0, done.stderr
+    result = json.loads((tmp_path / "out.json").read_text())
+    assert {name: result[name] for name in ("ranges", "with_cir", "with_truth", "anchors", "tags", "dropped")} == {
+        "ranges": 30, "with_cir": 0, "with_truth": 0, "anchors": 3, "tags": 1, "dropped": {},
+    }  # fmt: skip
+    found = [record.measurement for record in McapRecording(tmp_path / "out.mcap")]
+    assert [round(each.range_m, 3) for each in found] == [round(1 + 0.01 * n, 3) for n in range(30)]
+    assert [each.stamp_ns for each in found] == [
+        1_700_000_000_000_000_000 + n * 100_000_000 for n in range(30)
+    ]
+
+
+def test_a_dry_run_shows_units_errors_and_what_is_missing(tmp_path: Path):
+    write(
+        tmp_path / "map.yaml", yaml.safe_dump(PLAIN | {"truth": {"range": {"column": "true", "unit": "cm"}}})
+    )
+    write(tmp_path / "log.csv", "t,a,r,true\n" + "".join(f"{n},1,{2 + n / 100},190\n" for n in range(40)))
+    done = run("data", "import", "log.csv", "--map", "map.yaml", "--dry-run", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "true range, m" in done.stdout
+    assert "1.900" in done.stdout
+    assert "Errors (measured - true) of 40 ranges" in done.stdout
+    assert "40 of 40 ranges have no CIR" in done.stdout
+    assert "no positions of the anchors" in done.stdout
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["log.csv", "map.yaml"]
+
+
+TABLE = {
+    "t": np.arange(5) * 0.1,
+    "a": np.array([3, 4, 3, 4, 3]),
+    "r": np.arange(5) + 1.5,
+    "cir": np.ones((5, 8)),
+}
+
+
+def _hdf5(path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(path, "w") as file:
+        for name, values in TABLE.items():
+            file[f"log/{name}"] = values
+
+
+def _parquet(path: Path) -> None:
+    pa = pytest.importorskip("pyarrow")
+    import pyarrow.parquet as parquet
+
+    parquet.write_table(pa.table({name: list(values) for name, values in TABLE.items()}), path)
+
+
+def _matlab(path: Path) -> None:
+    from scipy.io import savemat
+
+    savemat(path, {"log": TABLE})
+
+
+@pytest.mark.parametrize(
+    ("name", "make", "group"),
+    [
+        ("x.npz", lambda path: np.savez(path, **TABLE), ""),
+        ("x.mat", _matlab, "log"),
+        ("x.h5", _hdf5, "log"),
+        ("x.parquet", _parquet, ""),
+    ],
+)
+def test_array_formats_give_the_same_ranges_and_cirs(name: str, make: Any, group: str, tmp_path: Path):
+    make(tmp_path / name)
+    source = read(PLAIN | {"group": group, "cir": {"column": "cir"}}, tmp_path / name)
+    records = list(source)
+    assert [record.measurement.range_m for record in records] == [1.5, 2.5, 3.5, 4.5, 5.5]
+    assert [record.measurement.anchor_id for record in records] == [3, 4, 3, 4, 3]
+    assert all(record.measurement.cir.samples.tolist() == [1] * 8 for record in records)
+    assert source.with_cir == 5
+
+
+def test_a_matrix_needs_names_for_its_columns(tmp_path: Path):
+    np.save(tmp_path / "x.npy", np.array([[0.0, 7.0, 2.5], [0.1, 7.0, 2.6]]))
+    assert ranges_of(read(PLAIN | {"columns": ["t", "a", "r"]}, tmp_path / "x.npy")) == [2.5, 2.6]
+    with pytest.raises(RecordingError, match="no column t"):
+        read(PLAIN, tmp_path / "x.npy")
+
+
+def test_a_pickle_in_a_numpy_file_is_not_loaded(tmp_path: Path):
+    np.save(tmp_path / "x.npy", np.array([{"t": 1}], object), allow_pickle=True)
+    with pytest.raises(RecordingError, match="Python objects"):
+        read(PLAIN, tmp_path / "x.npy")
+
+
+@pytest.mark.parametrize("form", ["magnitude", "complex", "interleaved"])
+def test_cirs_in_text_keep_their_values(form: str, tmp_path: Path):
+    text = {"magnitude": "[3, 4]", "complex": "[(3-1j); 4+2i]", "interleaved": "3 -1 4 2"}[form]
+    write(tmp_path / "x.csv", f't,a,r,c\n0,1,2,"{text}"\n')
+    (record,) = read(PLAIN | {"cir": {"column": "c", "samples": form}}, tmp_path / "x.csv")
+    expected = [3, 4] if form == "magnitude" else [3, -1, 4, 2]
+    assert record.measurement.cir.samples.tolist() == expected
+    assert record.measurement.cir.encoding == (
+        Encoding.MAGNITUDE if form == "magnitude" else Encoding.COMPLEX_INT16
+    )
+
+
+def test_large_and_fractional_cirs_are_scaled(tmp_path: Path):
+    write(tmp_path / "x.csv", "t,a,r,C0,C1\n0,1,2,65534,32767\n1,1,2,0.5,1.0\n")
+    big, small = (
+        record.measurement.cir for record in read(PLAIN | {"cir": {"column": "C{0..1}"}}, tmp_path / "x.csv")
+    )
+    assert (big.samples * big.scale).tolist() == pytest.approx([65534, 32767], rel=1e-4)
+    assert (small.samples * small.scale).tolist() == pytest.approx([0.5, 1.0], rel=1e-4)
+
+
+def test_a_cir_of_another_file_is_joined_by_row(tmp_path: Path):
+    write(tmp_path / "x.csv", "t,a,r,ok\n0,1,2,1\n1,1,3,0\n2,1,4,1\n")
+    np.save(tmp_path / "cirs.npy", np.arange(6).reshape(3, 2))
+    rule = {"column": "ok", "equals": 0}
+    source = read(PLAIN | {"drop": [rule], "cir": {"files": "cirs.npy", "column": ""}}, tmp_path / "x.csv")
+    assert [record.measurement.cir.samples.tolist() for record in source] == [[0, 1], [4, 5]]
+    assert source.dropped == {"ok equals 0.0": 1}
+
+
+def test_ids_are_read_from_texts_hexadecimal_numbers_and_names(tmp_path: Path):
+    write(
+        tmp_path / "x.csv",
+        't,a,r,pair,room\n0,0xdeca,2,"(11, 2)",hall\n1,de:ca,3,"(10, 5)",lab\n2,7,3,"(10, 5)",hall\n',
+    )
+    assert [record.measurement.anchor_id for record in read(PLAIN, tmp_path / "x.csv")] == [0xDECA, 0xDECA, 7]
+    pair = with_fields(
+        tag={"column": "pair", "pattern": r"\((\d+),"}, anchor={"column": "pair", "pattern": r", (\d+)\)"}
+    )
+    found = [(one.measurement.tag_id, one.measurement.anchor_id) for one in read(pair, tmp_path / "x.csv")]
+    assert found == [(11, 2), (10, 5), (10, 5)]
+    named = read(with_fields(anchor={"column": "room", "names": True}), tmp_path / "x.csv")
+    assert [record.measurement.anchor_id for record in named] == [1, 2, 1]
+
+
+@pytest.mark.parametrize(
+    ("unit", "text", "stamp_ns"),
+    [
+        ("s", "1700000000.123456", 1_700_000_000_123_456_000),
+        ("ms", "1700000000123", 1_700_000_000_123_000_000),
+        ("us", "1700000000123456", 1_700_000_000_123_456_000),
+        ("ns", "1700000000123456789", 1_700_000_000_123_456_789),
+        ("iso8601", "2023-11-14T22:13:20.123456789Z", 1_700_000_000_123_456_789),
+        ("iso8601", "2023-11-15 00:13:20.5+02:00", 1_700_000_000_500_000_000),
+    ],
+)
+def test_stamps_of_every_unit(unit: str, text: str, stamp_ns: int, tmp_path: Path):
+    write(tmp_path / "x.csv", f"t,a,r\n{text},1,2\n")
+    (record,) = read(with_fields(stamp={"column": "t", "unit": unit}), tmp_path / "x.csv")
+    assert abs(record.measurement.stamp_ns - stamp_ns) < 500
+
+
+def test_files_are_merged_by_time_and_their_names_give_ids(tmp_path: Path):
+    write(tmp_path / "a1.csv", "t,r\n0,1\n2,3\n")
+    write(tmp_path / "a2.csv", "t,r\n1,2\n3,4\n")
+    document = with_fields(anchor={"file_name": r"a(\d)"}) | {"files": "a*.csv"}
+    found = [(one.measurement.anchor_id, one.measurement.range_m) for one in read(document, tmp_path)]
+    assert found == [(1, 1.0), (2, 2.0), (1, 3.0), (2, 4.0)]
+
+
+def test_a_lever_arm_turns_with_the_robot(tmp_path: Path):
+    write(tmp_path / "x.csv", "t,a,r\n0.5,1,2\n")
+    half = np.sqrt(0.5)
+    write(
+        tmp_path / "pose.txt", f"t,x,y,z,qx,qy,qz,qw\n0,1,2,3,0,0,{half},{half}\n1,1,2,3,0,0,{half},{half}\n"
+    )
+    poses = {
+        "files": "pose.txt", "stamp": "t", "position": ["x", "y", "z"], "orientation": ["qx", "qy", "qz", "qw"],
+        "lever_arm": [0.5, 0, 0.1],
+    }  # fmt: skip
+    (record,) = read(PLAIN | {"truth": {"poses": poses}}, tmp_path / "x.csv")
+    assert record.tag_position == pytest.approx((1.0, 2.5, 3.1))
+
+
+def test_a_bag_is_read_by_topic_and_field_path(tmp_path: Path):
+    store, kind = _message_store()
+    for path in (tmp_path / "one.bag", tmp_path / "two"):
+        _write_bag(path, store, kind)
+        source = open_mapped(path, "nlink_nodeframe2")
+        found = [(one.measurement.anchor_id, round(one.measurement.range_m, 2)) for one in source]
+        assert found == [(1, 2.5), (2, 3.5)] * 3
+        assert source.tags == [9]
+        assert next(iter(source)).measurement.cir.rx_power_dbm == pytest.approx(-80.5)
+
+
+NODE2 = "uint8 role\nuint8 id\nfloat32 dis\nfloat32 fp_rssi\nfloat32 rx_rssi\n"
+FRAME2 = (
+    "std_msgs/Header header\nint64 unix_timestamp\nuint8 role\nuint8 id\nuint32 local_time\nuint32 system_time\n"
+    "float32 voltage\nfloat32[3] pos_3d\nfloat32[3] eop_3d\nfloat32[3] vel_3d\nfloat32[3] angle_3d\n"
+    "float32[4] quaternion\nfloat32[3] imu_gyro_3d\nfloat32[3] imu_acc_3d\nLinktrackNode2[] nodes\n"
+)
+
+
+def _message_store() -> tuple[Any, str]:
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS2_JAZZY)
+    store.register(get_types_from_msg(NODE2, "nlink_parser/msg/LinktrackNode2"))
+    store.register(get_types_from_msg(FRAME2, "nlink_parser/msg/LinktrackNodeframe2"))
+    return store, "nlink_parser/msg/LinktrackNodeframe2"
+
+
+def _write_bag(path: Path, store: Any, kind: str) -> None:
+    from rosbags.rosbag1 import Writer as Writer1
+    from rosbags.rosbag2 import StoragePlugin
+    from rosbags.rosbag2 import Writer as Writer2
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    if ros1 := path.suffix == ".bag":
+        store = get_typestore(Stores.ROS1_NOETIC)
+        store.register(get_types_from_msg(NODE2, "nlink_parser/msg/LinktrackNode2"))
+        store.register(get_types_from_msg(FRAME2, kind))
+    writer = Writer1(path) if ros1 else Writer2(path, version=9, storage_plugin=StoragePlugin.SQLITE3)
+    types = store.types
+    zero = np.zeros(3, np.float32)
+    with writer as bag:
+        topic = bag.add_connection("/nlink_linktrack_nodeframe2", kind, typestore=store)
+        for second in range(3):
+            time = types["builtin_interfaces/msg/Time"](sec=1000 + second, nanosec=0)
+            sequence = {"seq": 0} if ros1 else {}
+            header = types["std_msgs/msg/Header"](**sequence, stamp=time, frame_id="")
+            node = types["nlink_parser/msg/LinktrackNode2"]
+            nodes = [node(1, each, each + 1.5, -85.0, -80.5) for each in (1, 2)]
+            four = np.zeros(4, np.float32)
+            message = types[kind](header, 0, 2, 9, 0, 0, 5.0, zero, zero, zero, zero, four, zero, zero, nodes)
+            raw = store.serialize_ros1(message, kind) if ros1 else store.serialize_cdr(message, kind)
+            bag.write(topic, (1000 + second) * 10**9, raw)
+
+
+# Shipped mappings ------------------------------------------------------------------------------------------------
+
+
+def test_every_shipped_mapping_is_valid_and_names_its_source():
+    names = shipped_mappings()
+    assert {"ewine", "miluv", "rcv", "ghent_office", "ghent_industrial", "ghent_university"} <= set(names)
+    for name in names:
+        assert load_mapping(name).source.startswith("https://"), name
+
+
+def test_ewine(tmp_path: Path):
+    head = "NLOS,RANGE,FP_IDX,FP_AMP1,FP_AMP2,FP_AMP3,STDEV_NOISE,CIR_PWR,MAX_NOISE,RXPACC,CH,FRAME_LEN,PREAM_LEN,BITRATE,PRFR,"
+    head += ",".join(f"CIR{n}" for n in range(1016))
+    row = "{},6.18,749.0,4889.0,13876.0,10464.0,240.0,9048.0,1668.0,1024.0,2.0,39.0,1024.0,110.0,64.0,"
+    row += ",".join(str(float(n)) for n in range(1016))
+    for part in (1, 2):
+        write(
+            tmp_path / f"dataset/uwb_dataset_part{part}.csv",
+            "\n".join([head, row.format("1.0"), row.format("0.0")]),
+        )
+    source = open_mapped(tmp_path, "ewine")
+    records = list(source)
+    assert [record.truth.label for record in records if record.truth] == ["NLOS", "LOS", "NLOS", "LOS"]
+    assert not source.warnings
+    assert source.with_cir == 4
+    cir = records[0].measurement.cir
+    assert (len(cir), cir.first_path_index, cir.preamble_count, cir.channel) == (1016, 749.0, 1024, 2)
+    # DW1000 user manual, section 4.7, with A = 121.74.
+    assert cir.rx_power_dbm == pytest.approx(10 * np.log10(9048 * 2**17 / 1024**2) - 121.74)
+    squares = 4889.0**2 + 13876.0**2 + 10464.0**2
+    assert cir.first_path_power_dbm == pytest.approx(10 * np.log10(squares / 1024**2) - 121.74)
+    assert source.errors_m.size == 0
+
+
+def test_miluv(tmp_path: Path):
+    folder = tmp_path / "data" / "default_3_random_0"
+    anchors = {"0": {str(n): f"[{3.0 + n}, 0.5, 1.8]" for n in range(6)}}
+    write(tmp_path / "config/uwb/anchors.yaml", yaml.safe_dump(anchors))
+    write(
+        folder / "ifo001/uwb_range.csv",
+        "from_id,to_id,range,gt_range,fpp1,fpp2,range_raw,timestamp\n"
+        "10,2,4.9,4.8,-82,-84,5.1,0.50\n10,21,1.9,1.8,-80,-80,2.0,0.55\n10,2,4.9,4.8,-82,-84,5.2,0.60\n",
+    )
+    pose = (
+        ",".join(f"pose.position.{axis}" for axis in "xyz")
+        + ","
+        + ",".join(f"pose.orientation.{axis}" for axis in "xyzw")
+    )
+    write(folder / "ifo001/mocap.csv", f"timestamp,{pose}\n0,0,0.6,1.8,0,0,0,1\n1,0,0.6,1.8,0,0,0,1\n")
+    write(
+        folder / "ifo001/uwb_cir.csv",
+        f'timestamp,my_id,from_id,to_id,idx,cir\n0.51,10,10,2,747.2,"{list(range(1016))}"\n',
+    )
+    source = open_mapped(folder, "miluv")
+    first, second = list(source)
+    assert (first.measurement.tag_id, first.measurement.anchor_id, first.measurement.range_m) == (10, 2, 5.1)
+    assert first.measurement.cir.first_path_power_dbm == -83.0
+    assert len(first.measurement.cir) == 1016
+    assert first.measurement.cir.first_path_index == 747.2
+    assert len(second.measurement.cir) == 0
+    assert first.tag_position == pytest.approx((0.13189, 0.6 - 0.17245, 1.8 - 0.05249))
+    assert source.dropped == {"to_id above 9.0": 1}
+    assert not source.warnings
+    assert source.anchors.position[2].tolist() == [5.0, 0.5, 1.8]
+
+
+def test_rcv(tmp_path: Path):
+    turn = "Orientation X,Orientation Y,Orientation Z,Orientation W"
+    for anchor, place in ((1, (3.0, 4.0, 0.0)), (2, (0.0, 2.0, 0.0))):
+        distance = np.linalg.norm(place)
+        write(
+            tmp_path / f"sequence1/anchor_{anchor}.csv",
+            f"Time,Address,Range,Rxpower,Position X,Position Y,Position Z,{turn}\n"
+            f"2024-06-09 19:39:13.4387{anchor},8{anchor},{distance + 0.1},-62.67,0,0,0,0,0,0,1\n"
+            f"2024-06-09 19:39:14.43874,8{anchor},-12.6,-69.7,0,0,0,0,0,0,1\n",
+        )
+    write(
+        tmp_path / "sequence1/anchor.yaml",
+        "anchor1:\n  - position:\n      data: [3.0, 4.0, 0.0]\n  - orientation:\n      data: [0, 0, 0, 1]\n"
+        "anchor2:\n  - position:\n      data: [0.0, 2.0, 0.0]\n  - orientation:\n      data: [0, 0, 0, 1]\n",
+    )
+    source = open_mapped(tmp_path / "sequence1", "rcv")
+    assert source.anchor_ids == [81, 82]
+    assert source.dropped == {"Range below 0.0": 2}
+    assert source.errors_m.tolist() == pytest.approx([0.1, 0.1])
+    assert next(iter(source)).measurement.stamp_ns == 1_717_961_953_438_710_000
+
+
+@pytest.mark.parametrize(
+    ("mapping", "file"), [("ghent_industrial", "meta_IIoT_19.csv"), ("ghent_office", "meta_Office.csv")]
+)
+def test_ghent_industrial_and_office(mapping: str, file: str, tmp_path: Path):
+    write(
+        tmp_path / file,
+        ",channel,prf,anchorNumber,LOS,RXPACC,fpindex,RX_power,FP_power,timestamp,estimated_range,actual_range,error,loc_tag,NLOS\n"
+        "0,1,64,10.0,-,1518.0,46350.0,-91.274,-111.719,2707697285.0,4485.0,4704.247,-219,10-10,NLOS\n"
+        "1,1,64,12.0,-,-,46350.0,-,-,105933948.0,5485.0,5404.0,81,10-12,LOS\n",
+    )
+    first, second = open_mapped(tmp_path, mapping)
+    assert first.truth is not None
+    assert second.truth is not None
+    assert (first.measurement.range_m, first.truth.range_m) == pytest.approx((4.485, 4.704247))
+    assert (first.truth.label, first.truth.configuration, second.truth.label) == ("NLOS", "10-10", "LOS")
+    cir = first.measurement.cir
+    assert (cir.first_path_index, cir.preamble_count) == (46350 / 64, 1518)
+    assert (cir.rx_power_dbm, cir.first_path_power_dbm) == (-91.274, -111.719)
+    assert np.isnan(second.measurement.cir.rx_power_dbm)
+    assert second.measurement.cir.preamble_count == 0
+
+
+def test_ghent_university(tmp_path: Path):
+    write(
+        tmp_path / "meta_University.csv",
+        ",real_rng,rng,rssi,fp_idx,fp_power,pacc_cnt,condition,location_from,location_to,error,env\n"
+        "1,6.269,8.045,-80.136,743,-93.968,101,nlos,hw,hw,1.7639,hwhw\n"
+        "2,2.707,2.545,-79.895,751,-82.755,101,los,3edvl,1_hw,-0.0852,3edvl1_hw\n",
+    )
+    source = open_mapped(tmp_path, "ghent_university")
+    first, second = source
+    assert first.truth is not None
+    assert first.truth.configuration == "hwhw"
+    assert first.truth.label == "NLOS"
+    assert source.errors_m.tolist() == pytest.approx([1.776, -0.162])
+    assert (second.measurement.tag_id, second.measurement.anchor_id) == (2, 2)
+
+
+def test_starloc(tmp_path: Path):
+    write(tmp_path / "mocap/uwb_markers_v3.csv", ",x,y,z\n9,3.0,4.0,0.0\n12,0.0,2.0,0.0\n")
+    write(tmp_path / "mocap/uwb_markers_v1.csv", ",x,y,z\n9,9.0,9.0,9.0\n")
+    session = tmp_path / "data/loop-2d_s5"
+    write(
+        session / "uwb.csv",
+        "time_s,to_id,range,from_id,x,y,z,tag_pos_x,tag_pos_y,tag_pos_z,bias,gt_range\n"
+        "0.0209,9,5.11,1,0,0,0,0,0,0,0.11,5.0\n0.0214,12,2.1,1,0,0,0,0,0,0,0.1,2.0\n",
+    )
+    source = open_mapped(session, "starloc")
+    assert source.anchors.position.tolist() == [[3.0, 4.0, 0.0], [0.0, 2.0, 0.0]]
+    assert source.errors_m.tolist() == pytest.approx([0.11, 0.1])
+    assert not source.warnings
+    assert open_mapped(session / "uwb.csv", "starloc").anchors.index == {9: 0, 12: 1}
+
+
+def test_librsf_simulation(tmp_path: Path):
+    rows = [f"range2 {t} {2.0 + t} 0.01 {1.0 + t} 0 7 " for t in (0.0,)] + [
+        "odom2 0.0 1.0 0.0 0.1 1 1 1 ",
+        "odom2 0.5 1.0 0.0 0.1 1 1 1 ",
+    ]
+    write(tmp_path / "M3500_skewed_Input.txt", "\n".join(rows))
+    write(tmp_path / "M3500_GT.txt", "point2 0.0 3.0 0.0 0 0 0 0 \npoint2 1.0 3.0 0.0 0 0 0 0 \n")
+    write(tmp_path / "W3500_GT.txt", "point2 0.0 9.0 0.0 0 0 0 0 \npoint2 1.0 9.0 0.0 0 0 0 0 \n")
+    source = open_mapped(tmp_path / "M3500_skewed_Input.txt", "librsf_simulation")
+    (record,) = source
+    assert record.truth is not None
+    assert record.truth.range_m == 2.0
+    assert source.simulated
+    assert source.motion is not None
+    assert source.motion.pose[1] == pytest.approx([0.5, 0.0, 0.05], abs=0.02)
+
+
+def test_the_real_labyrinth_is_imported_with_its_odometry(tmp_path: Path):
+    folder = DATA / "chemnitz_labyrinth"
+    if not folder.is_dir():
+        pytest.skip(f"{folder} is absent: set UWB_MITIGATION_DATA to run this test")
+    done = run("data", "import", folder, "--map", "labyrinth", "-o", "out.mcap", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    records = list(McapRecording(tmp_path / "out.mcap"))
+    assert len(records) == 233
+    assert all(record.truth and record.tag_position for record in records)
+    errors = {}
+    for record in records:
+        assert record.truth is not None
+        errors.setdefault(record.measurement.anchor_id, []).append(
+            record.measurement.range_m - record.truth.range_m
+        )
+    # README of the data: 0.07 to 0.15 m too long by anchor, here over the whole run.
+    assert all(0.07 < np.mean(each) < 0.16 for each in errors.values())
+    assert set(errors) == {
+        105,
+        107,
+        108,
+        109,
+    }
+    odometry = read_odometry(tmp_path / "out.mcap", "/odom")
+    assert len(odometry) > 200
+    assert np.abs(odometry.twist[:, 0]).max() < 1.0
+    moved = np.linalg.norm(np.diff([record.tag_position for record in records], axis=0), axis=1).sum()
+    driven = np.linalg.norm(np.diff(odometry.pose[:, :2], axis=0), axis=1).sum()
+    assert driven == pytest.approx(moved, rel=0.1)
+
+
+# Errors and warnings ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "changes", "message"),
+    [
+        ("t,a,rng\n0,1,2\n", {}, r"no column r \(did you mean 'rng'\?\)|no column r .*columns: t, a, rng"),
+        ("t,a,r\n0,1,2\n0.1,A7,2\n", {}, r"row 2: anchor = 'A7' is not an id"),
+        ("t,a,r\n0,-1,2\n", {}, "anchor = -1 is not an id"),
+        ("t,a,r\n0,1,4700\n1,1,4800\n", {}, "median range is 4,750 m .*set unit: mm"),
+        (
+            "t,a,r\n0,1,2\n",
+            {"range": {"column": "r", "unit": "mm"}},
+            "median range is 0.0020 m .*set unit: m",
+        ),
+        ("t,a,r\n0,1,two\n", {}, "row 1: range = 'two' is not a number"),
+        ("t,a,r,i\n0,1,2,46350\n", {"first_path_index": "i"}, "first-path index is 46,350.*unit: '10.6'"),
+        ("t;a;r\n0;1;2\n", {}, "there is one column 't;a;r'; set separator: ';'"),
+        ('t,a,r\n0,1,"4,7"\n', {}, "range = '4,7' is not a number .*decimal: ','"),
+        ("t,a,r\n0,1,nan\n", {}, "no ranges .*range is not a number"),
+        (
+            "t,a,r\nyesterday,1,2\n",
+            {"stamp": {"column": "t", "unit": "iso8601"}},
+            "stamp = 'yesterday' is not a date",
+        ),
+        ("", {}, "the file is empty"),
+    ],
+)
+def test_a_file_that_does_not_fit_is_an_error_with_a_remedy(
+    text: str, changes: Any, message: str, tmp_path: Path
+):
+    write(tmp_path / "x.csv", text)
+    with pytest.raises(RecordingError, match=message):
+        read(with_fields(**changes), tmp_path / "x.csv")
+
+
+def test_millimetres_of_the_truth_are_an_error(tmp_path: Path):
+    write(tmp_path / "x.csv", "t,a,r,true\n0,1,2,1900\n1,1,3,2900\n")
+    with pytest.raises(RecordingError, match=r"median true range is 2,400 m .*unit: mm"):
+        read(PLAIN | {"truth": {"range": "true"}}, tmp_path / "x.csv")
+
+
+def test_an_error_column_of_the_opposite_sign_is_reported(tmp_path: Path):
+    errors = np.random.default_rng(0).exponential(0.5, 200) + 0.05
+    rows = [f"{n},1,{5 + error:.3f},{-error:.3f},5" for n, error in enumerate(errors)]
+    write(tmp_path / "x.csv", "t,a,r,e,true\n" + "\n".join(rows))
+    (warning,) = read(PLAIN | {"truth": {"error": "e"}}, tmp_path / "x.csv").warnings
+    assert "set scale: -1" in warning
+    with pytest.raises(RecordingError, match="the error is true - measured"):
+        read(PLAIN | {"truth": {"error": "e", "range": "true"}}, tmp_path / "x.csv")
+    turned = {"error": {"column": "e", "scale": -1}, "range": "true"}
+    assert not read(PLAIN | {"truth": turned}, tmp_path / "x.csv").warnings
+
+
+def test_unsorted_and_repeated_stamps_and_nan_are_reported(tmp_path: Path):
+    write(tmp_path / "x.csv", "t,a,r\n2,1,3\n1,1,2\n1,1,2\n1,2,9\n3,1,nan\n4,1,-1\n")
+    source = read(PLAIN, tmp_path / "x.csv")
+    assert ranges_of(source) == [2.0, 2.0, 9.0, 3.0, -1.0]
+    assert source.dropped == {"range is not a number": 1}
+    assert [warning.split(" ", 1)[1] for warning in source.warnings] == [
+        "stamps are earlier than the one before; the ranges were sorted",
+        "ranges repeat the stamp of another range of the same pair",
+        "ranges are negative",
+    ]
+    assert any("sorted" in kind for kind in _after_reading(source))
+
+
+def _after_reading(source: MappedRecording) -> list[str]:
+    list(source)
+    return list(source.skipped)
+
+
+def test_a_decimal_comma_is_read(tmp_path: Path):
+    write(tmp_path / "x.csv", "t;a;r\n0,5;1;4,7\n")
+    assert ranges_of(read(PLAIN | {"separator": ";", "decimal": ","}, tmp_path / "x.csv")) == [4.7]
+
+
+def test_a_truncated_compressed_file_gives_what_is_before_the_damage(tmp_path: Path):
+    import lzma
+
+    rows = "t,a,r\n" + "".join(f"{n},1,{np.sin(n) + 3}\n" for n in range(150_000))
+    data = lzma.compress(rows.encode())
+    (tmp_path / "x.csv.xz").write_bytes(data[: len(data) - 1000])
+    records = iter(read(PLAIN, tmp_path / "x.csv.xz"))
+    assert len(list(islice(records, 100_000))) == 100_000
+    with pytest.raises(DamagedRecordingError, match="after row 100000"):
+        next(records)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("name: x\nfields: {anchor: a, rang: r}\n", "fields.range: Field required"),
+        (
+            "name: x\nfields: {anchor: a, range: r, rng: r}\n",
+            r"fields.rng: unknown field \(did you mean 'range'",
+        ),
+        (
+            "name: x\nfields: {anchor: a, range: {column: r, unit: inch}}\n",
+            "range: unit 'inch'; valid: m, cm, mm",
+        ),
+        ("name: x\nfields: {anchor: a, range: {column: r, constant: 1}}\n", "give one of column"),
+        ("name: x\nfields: {anchor: {column: a, pattern: '(('}, range: r}\n", "not a regular expression"),
+        ("name: x\nfields: {anchor: {column: a, pattern: 'a'}, range: r}\n", "has no group"),
+        ("!!python/object/apply:os.system ['true']\n", "not YAML"),
+        ("[" * 5000, "not YAML"),
+        ("7\n", "valid dictionary|should be"),
+    ],
+)
+def test_an_invalid_mapping_is_an_error_that_names_the_field(text: str, message: str, tmp_path: Path):
+    with pytest.raises(ParameterError, match=message):
+        load_mapping(str(write(tmp_path / "map.yaml", text)))
+
+
+def test_an_unknown_mapping_is_answered_with_a_similar_one():
+    with pytest.raises(ParameterError, match="did you mean 'starloc'"):
+        load_mapping("starlok")
+
+
+@pytest.mark.parametrize("name", ["x.mat", "x.h5", "x.npy", "x.npz", "x.parquet", "x.bag", "x.csv.xz"])
+def test_garbage_in_any_format_is_a_typed_error(name: str, tmp_path: Path):
+    for module in {"x.h5": ["h5py"], "x.parquet": ["pyarrow"]}.get(name, []):
+        pytest.importorskip(module)
+    (tmp_path / name).write_bytes(b"\x93NUMPY garbage \x00\xff" * 40)
+    with pytest.raises(RecordingError):
+        read(PLAIN | {"topics": ["/x"]}, tmp_path / name)

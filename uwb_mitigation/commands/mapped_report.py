@@ -1,0 +1,122 @@
+"""Tables of `data import --map`: the first ranges as they were understood, errors, and what is missing for a model."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from uwb_mitigation.commands import console
+from uwb_mitigation.commands.console import print_line, show_table
+from uwb_mitigation.errors import format_id
+
+if TYPE_CHECKING:
+    from uwb_mitigation.sources.mapped import MappedRecording
+
+_ROWS = 5
+_BAR = 40
+_FIELDS = (
+    ("range, m", "range", 3),
+    ("true range, m", "true range", 3),
+    ("receive level, dBm", "rx_power", 1),
+    ("first-path level, dBm", "first_path_power", 1),
+    ("first-path index", "first_path_index", 2),
+    ("preamble count", "preamble_count", 0),
+)
+
+
+def show(sources: Sequence[MappedRecording], *, preview: bool) -> dict[str, Any]:
+    """Print dropped rows, warnings and on request the first ranges; return the counts for JSON."""
+    dropped = sum((source.dropped for source in sources), Counter[str]())
+    warnings = [warning for source in sources for warning in source.warnings]
+    for rule, count in dropped.items():
+        print_line(f"Dropped {count} rows: {rule}")
+    for warning in warnings:
+        console.warn(f"warning: {warning}")
+    for source in sources if preview else ():
+        show_preview(source)
+    return {
+        "ranges": sum(len(source.values) for source in sources),
+        "with_cir": sum(source.with_cir for source in sources),
+        "with_truth": sum(len(source.errors_m) for source in sources),
+        "anchors": len({anchor for source in sources for anchor in source.anchor_ids}),
+        "tags": len({tag for source in sources for tag in source.tags}),
+        "dropped": dict(dropped),
+        "warnings": warnings,
+    }
+
+
+def show_preview(source: MappedRecording) -> None:
+    """Print the first ranges with units, a histogram of the errors, and what is missing."""
+    values, numbers = source.values, source.values.numbers
+    shown = range(min(_ROWS, len(values)))
+    stamps = (values.stamp_ns[: len(shown)] - values.stamp_ns[0]) / 1e9
+    cirs = [source.cir(row) for row in shown]
+    rows = [
+        ["time s", *(f"{stamp:.3f}" for stamp in stamps)],
+        ["tag", *(format_id(int(values.tag_id[row])) for row in shown)],
+        ["anchor", *(format_id(int(values.anchor_id[row])) for row in shown)],
+        *(
+            [name, *(_cell(float(numbers[key][row]), digits) for row in shown)]
+            for name, key, digits in _FIELDS
+        ),
+        ["CIR samples", *("-" if cir is None else str(len(cir)) for cir in cirs)],
+        ["label", *(values.label[row] or "-" for row in shown)],
+        ["placement", *(values.configuration[row] or "-" for row in shown)],
+    ]
+    first = np.datetime64(int(values.stamp_ns[0]) // 1_000_000, "ms")
+    show_table(
+        f"The first of {len(values)} ranges, from {first} UTC", ("", *(str(row + 1) for row in shown)), rows
+    )
+    _show_errors(source.errors_m)
+    for line in missing(source):
+        print_line(line)
+
+
+def missing(source: MappedRecording) -> list[str]:
+    """Return what a model or command will be missing, and the reason."""
+    numbers, count = source.values.numbers, len(source.values)
+
+    def unknown(name: str) -> bool:
+        return not np.isfinite(numbers[name]).any()
+
+    found = []
+    if source.with_cir < count:
+        found.append(
+            f"{count - source.with_cir} of {count} ranges have no CIR: networks pass them through with status NO_CIR; "
+            "constants and linear models can correct them"
+        )
+    if source.with_cir and unknown("first_path_index"):
+        found.append("no first-path index: networks need it (status BAD_CIR)")
+    if source.with_cir and unknown("preamble_count"):
+        found.append("no preamble count: `universal` needs it; use `universal_amplitude`")
+    if unknown("rx_power") or unknown("first_path_power"):
+        found.append(
+            "no receive or first-path level: no linear model, no out-of-distribution check of levels"
+        )
+    if not len(source.errors_m):
+        found.append(
+            "no true range: `evaluate`, `train` and `offset` cannot use it; `calibrate` needs a drive and anchors"
+        )
+    if not hasattr(source, "anchors"):
+        found.append("no positions of the anchors: `track` and `calibrate` need --anchors")
+    return found
+
+
+def _cell(value: float, digits: int) -> str:
+    return f"{value:.{digits}f}" if math.isfinite(value) else "-"
+
+
+def _show_errors(errors: Any) -> None:
+    if not len(errors):
+        return
+    low, high = np.percentile(errors, (1, 99))
+    counts, edges = np.histogram(np.clip(errors, low, high), bins=10)
+    rows = [
+        [f"{start:+.2f} to {stop:+.2f}", str(count), "#" * round(_BAR * count / max(counts.max(), 1))]
+        for count, start, stop in zip(counts.tolist(), edges[:-1], edges[1:], strict=True)
+    ]
+    show_table(f"Errors (measured - true) of {len(errors)} ranges", ("error m", "ranges", ""), rows, left=1)

@@ -1,0 +1,423 @@
+"""Mapping files: where the values of ranges are in the files or messages of other software, and in which unit.
+
+A mapping is a YAML file. `data import --map` reads recordings with it, and the driver (`source:=topic`) live topics.
+The mappings in `uwb_mitigation/mappings` are found by their names. docs/guides/recordings.md describes the format.
+"""
+
+from __future__ import annotations
+
+import re
+from functools import cache
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+
+from uwb_mitigation.errors import ParameterError, did_you_mean
+from uwb_mitigation.files import read_bounded
+
+MAX_BYTES = 1 << 20
+
+TIME = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000, "iso8601": 1}
+"""Nanoseconds per unit of time."""
+
+LENGTH = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+INDEX = {"samples": 1.0, "10.6": 1 / 64}
+"""Units of the first-path index: samples, or the fixed-point number of the DW1000."""
+
+LEVEL = {"dBm": 1.0}
+NUMBER = {"": 1.0}
+
+LIST_INDEX = "#"
+"""Column with the index of an element in the list of a message."""
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Value(_Strict):
+    """Where one value is: exactly one of the first seven fields; a text is short for a column, a number for a constant.
+
+    Attributes:
+        column: name of a column, or path of a message's field, such as `nodes[].dis`; `#`: index in the list.
+        constant: the value itself.
+        sum: {column: factor}.
+        file_name, topic_name: regular expression; its first group in the path of the file or topic.
+        rate_hz: row number divided by this (stamps only).
+        pattern: regular expression; its first group in the text of the value is used.
+        values: {text: other value}; any other text is kept.
+        names: texts are numbered from 1 in the order of their appearance (ids only).
+        unit: see the tables above.
+        scale, offset: value * scale + offset, after the unit.
+        optional: if the column is absent, the value is unknown.
+    """
+
+    column: str = ""
+    constant: float | int | str | None = None
+    sum: dict[str, float] = {}
+    file_name: str = ""
+    topic_name: str = ""
+    rate_hz: float = Field(default=0.0, ge=0.0)
+    pattern: str = ""
+    values: dict[str, str] = {}
+    names: bool = False
+    unit: str = ""
+    scale: float = 1.0
+    offset: float = 0.0
+    optional: bool = False
+
+    @model_validator(mode="after")
+    def _check(self) -> Value:
+        sources = (self.column, self.sum, self.file_name, self.topic_name, self.rate_hz)
+        if sum(map(bool, sources)) + (self.constant is not None) != 1:
+            raise ValueError("give one of column, constant, sum, file_name, topic_name, rate_hz")
+        for text in filter(None, (self.pattern, self.file_name, self.topic_name)):
+            if _compiled(text).groups < 1:
+                raise ValueError(f"the pattern {text!r} has no group (...)")
+        return self
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Return the columns that it reads."""
+        return (*self.sum, *([self.column] if self.column and self.column != LIST_INDEX else ()))
+
+
+@cache
+def _compiled(pattern: str) -> re.Pattern[str]:
+    try:
+        return re.compile(pattern)
+    except re.error as error:
+        raise ValueError(f"not a regular expression: {pattern!r}: {error}") from error
+
+
+def _value(given: Any) -> Any:
+    if isinstance(given, str):
+        return {"column": given}
+    return {"constant": given} if isinstance(given, int | float) else given
+
+
+V = Annotated[Value, BeforeValidator(_value)]
+
+
+def _keys_as_text(given: Any) -> Any:
+    """YAML reads the keys 0 and 1 as numbers."""
+    if isinstance(given, dict) and isinstance(given.get("values"), dict):
+        return given | {"values": {str(key): str(value) for key, value in given["values"].items()}}
+    return {"column": given} if isinstance(given, str) else given
+
+
+Label = Annotated[Value, BeforeValidator(_keys_as_text)]
+Point = tuple[V, V, V]
+
+
+class Drop(_Strict):
+    """Rule for rows that are not used: `column` and one or more conditions, of which one is sufficient.
+
+    Attributes:
+        equals, differs: text or number; or list of them.
+        below, above: limits of a number in the unit of the file.
+        from_median: largest distance from the median of the column.
+    """
+
+    column: str
+    equals: list[str | float] | str | float | None = None
+    differs: list[str | float] | str | float | None = None
+    below: float | None = None
+    above: float | None = None
+    from_median: float | None = None
+
+    def __str__(self) -> str:
+        rules = self.model_dump(exclude_none=True, exclude={"column"})
+        return f"{self.column} " + ", ".join(f"{name} {value}" for name, value in rules.items())
+
+
+class Table(_Strict):
+    r"""Files that contain rows.
+
+    Attributes:
+        format: empty: detected from the name of each file.
+        files: glob, below the folder that is imported, or next to the file of the ranges; or {pattern: glob}, of which
+            the first is used whose regular expression is found in the path of the recording.
+        separator, decimal: of CSV; the separator may be a regular expression, such as `\\s+`.
+        columns: names of the columns of files without header.
+        group: name of the array, variable or group (NumPy, MATLAB, HDF5), or key of the mapping (YAML).
+        topics, type: topics of messages, and their type.
+        text, text_field: the field of the message contains JSON, or `key:value` pairs.
+        definitions: {type: text of its .msg file}, for bags that contain no definitions.
+        drop: rules for rows that are not used.
+    """
+
+    format: Literal["", "csv", "parquet", "numpy", "matlab", "hdf5", "messages", "yaml"] = ""
+    files: str | dict[str, str] = "*"
+    separator: str = ","
+    decimal: Literal[".", ","] = "."
+    columns: list[str] = []
+    group: str = ""
+    topics: list[str] = []
+    type: str = ""
+    text: Literal["", "json", "pairs"] = ""
+    text_field: str = "data"
+    definitions: dict[str, str] = {}
+    drop: list[Drop] = []
+
+
+class Fields(_Strict):
+    """The values of a range. Required: `anchor` and `range`; without a stamp the time of the message is used."""
+
+    stamp: V | None = None
+    tag: V = Value(constant=1)
+    anchor: V
+    range: V
+    sequence: V | None = None
+    rx_power: V | None = None
+    first_path_power: V | None = None
+    first_path_index: V | None = None
+    preamble_count: V | None = None
+    channel: V | None = None
+
+
+class Registers(_Strict):
+    """Registers of a DW1000, from which both levels are computed (user manual, section 4.7).
+
+    Attributes:
+        cir_power: CIR_PWR.
+        amplitudes: FP_AMPL1, FP_AMPL2, FP_AMPL3.
+        prf: 16 or 64 (MHz).
+    """
+
+    cir_power: V
+    amplitudes: Point
+    prf: V = Value(constant=64)
+
+
+class Join(_Strict):
+    """Stamp and ids of a CIR in another file; the nearest range of the pair within the tolerance gets it."""
+
+    stamp: V
+    tag: V | None = None
+    anchor: V
+    tolerance_s: float = Field(default=0.02, gt=0.0)
+
+
+class CirSource(Table):
+    """The channel impulse response: `column` or `columns` of the ranges, or another file (`files`).
+
+    Attributes:
+        column: a column with lists, an array, or `NAME{0..1015}` for one column a sample.
+        samples: magnitude, complex (complex numbers or pairs), or interleaved (real, imaginary, real, ...).
+        start_index: accumulator index of the first sample.
+        join: of another file; without it, its rows are those of the ranges.
+        first_path_index: in the other file.
+        optional: the files may be absent.
+    """
+
+    files: str | dict[str, str] = ""
+    column: str = ""
+    samples: Literal["magnitude", "complex", "interleaved"] = "magnitude"
+    start_index: int = Field(default=0, ge=0, le=65535)
+    join: Join | None = None
+    first_path_index: V | None = None
+    optional: bool = False
+
+
+class Poses(Table):
+    """True poses of the tag or robot in another file or on a topic; interpolated at the stamps of the ranges.
+
+    Attributes:
+        stamp, position: of a pose.
+        orientation: quaternion x, y, z, w; needed for a lever arm that is not vertical.
+        lever_arm: position of the antenna in the robot's frame, m; or {tag: position}.
+    """
+
+    stamp: V
+    position: Point
+    orientation: tuple[V, V, V, V] | None = None
+    lever_arm: tuple[float, float, float] | dict[int, tuple[float, float, float]] = (0.0, 0.0, 0.0)
+
+
+class TruthSource(_Strict):
+    """Ground truth.
+
+    Attributes:
+        range: true range.
+        error: measured - true.
+        label: LOS, NLOS or any other text.
+        configuration: name of the placement.
+        tag_position: true position of the tag.
+        poses: of the tag.
+        range_from_positions: compute the true range from the positions of tag and anchor.
+    """
+
+    range: V | None = None
+    error: V | None = None
+    label: Label | None = None
+    configuration: Label | None = None
+    tag_position: Point | None = None
+    poses: Poses | None = None
+    range_from_positions: bool = False
+
+
+class AnchorSource(Table):
+    """Positions of the anchors: in columns of the ranges, in the mapping, or in another file (`files`).
+
+    Attributes:
+        id, position: of an anchor; without `files`, columns of the ranges.
+        sd: standard deviation of each coordinate, m.
+        optional: the files may be absent.
+    """
+
+    files: str | dict[str, str] = ""
+    id: V | None = None
+    position: Point | None = None
+    sd: float = Field(default=0.02, gt=0.0)
+    optional: bool = False
+
+
+class Motion(Table):
+    """Wheel odometry, written to the topic `/odom`: speeds in the robot's frame.
+
+    Attributes:
+        files: empty: the file of the ranges.
+        stamp: of a row.
+        forward, left: speeds, m/s.
+        yaw_rate: rad/s.
+    """
+
+    files: str | dict[str, str] = ""
+    stamp: V
+    forward: V
+    left: V = Value(constant=0.0)
+    yaw_rate: V
+
+
+class Mapping(Table):
+    """A mapping file.
+
+    Attributes:
+        name, source: name of the data set or radio, and where its format is described.
+        simulated: whether the data is simulated.
+        moving: the tag moves during pauses, so they are kept.
+        range_sd: standard deviation of a range, m (data sheet); 0: unknown.
+        fields: values of a range.
+        registers: levels of a DW1000.
+        cir, truth, anchors, odometry: see there.
+    """
+
+    name: str
+    source: str = ""
+    simulated: bool = False
+    moving: bool = True
+    range_sd: float = Field(default=0.0, ge=0.0)
+    fields: Fields
+    registers: Registers | None = None
+    cir: CirSource | None = None
+    truth: TruthSource = TruthSource()
+    anchors: AnchorSource | None = None
+    odometry: Motion | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> Mapping:
+        for name, value, units in self.measured():
+            if value is not None and value.unit and value.unit not in units:
+                raise ValueError(
+                    f"{name}: unit {value.unit!r}; valid: {', '.join(filter(None, units)) or 'none'}"
+                )
+        if self.registers and not self.fields.preamble_count:
+            raise ValueError("registers: needs fields.preamble_count")
+        return self
+
+    def measured(self) -> list[tuple[str, Value | None, dict[str, Any]]]:
+        """Return name, value and valid units of everything that is in a row of the ranges."""
+        fields, truth, registers = self.fields, self.truth, self.registers
+        rows: list[tuple[str, Value | None, dict[str, Any]]] = [
+            ("stamp", fields.stamp, TIME),
+            ("tag", fields.tag, NUMBER),
+            ("anchor", fields.anchor, NUMBER),
+            ("range", fields.range, LENGTH),
+            ("sequence", fields.sequence, NUMBER),
+            ("rx_power", fields.rx_power, LEVEL),
+            ("first_path_power", fields.first_path_power, LEVEL),
+            ("first_path_index", fields.first_path_index, INDEX),
+            ("preamble_count", fields.preamble_count, NUMBER),
+            ("channel", fields.channel, NUMBER),
+            ("true range", truth.range, LENGTH),
+            ("error", truth.error, LENGTH),
+            ("label", truth.label, NUMBER),
+            ("configuration", truth.configuration, NUMBER),
+        ]
+        if registers:
+            rows += [("cir_power", registers.cir_power, NUMBER), ("prf", registers.prf, NUMBER)]
+            rows += [(f"amplitude {n}", value, NUMBER) for n, value in enumerate(registers.amplitudes, 1)]
+        for name, point in (("tag", truth.tag_position), ("anchor", self.anchor_columns)):
+            rows += [
+                (f"{name} {axis}", value, LENGTH) for axis, value in zip("xyz", point or (), strict=False)
+            ]
+        return rows
+
+    @property
+    def anchor_columns(self) -> Point | None:
+        """Return the columns of the ranges that contain the position of the anchor."""
+        return self.anchors.position if self.anchors and not self.anchors.files else None
+
+
+def shipped_mappings() -> list[str]:
+    """Return the names of the mappings of this package."""
+    return sorted(
+        entry.name.removesuffix(".yaml") for entry in _folder().iterdir() if entry.name.endswith(".yaml")
+    )
+
+
+def _folder() -> Any:
+    return resources.files("uwb_mitigation") / "mappings"
+
+
+def load_mapping(name: str) -> Mapping:
+    """Read a mapping file, or a shipped mapping by its name.
+
+    Raises:
+        ParameterError: it cannot be read, or is not a mapping; the message names the field and what is valid.
+    """
+    path = Path(name).expanduser()
+    known = shipped_mappings()
+    if name in known:
+        path = Path(str(_folder() / f"{name}.yaml"))
+    elif not path.exists():
+        valid = did_you_mean(name, known) or f"a file, or one of {', '.join(known)}"
+        raise ParameterError(f"no mapping {name!r}", valid=valid)
+    try:
+        document = yaml.safe_load(read_bounded(path, MAX_BYTES, ParameterError))
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        first = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ParameterError(f"not YAML: {first}", where=str(path)) from error
+    try:
+        return Mapping.model_validate(document)
+    except ValidationError as error:
+        problem = error.errors()[0]
+        where = ".".join(str(part) for part in problem["loc"])
+        known_keys = _keys_at(problem["loc"][:-1])
+        last = str(problem["loc"][-1]) if problem["loc"] else ""
+        hint = did_you_mean(last, known_keys) if problem["type"] == "extra_forbidden" else ""
+        what = (
+            "unknown field"
+            if problem["type"] == "extra_forbidden"
+            else problem["msg"].removeprefix("Value error, ")
+        )
+        raise ParameterError(
+            f"{where}: {what}" if where else what,
+            where=str(path),
+            valid=hint or ", ".join(known_keys) if problem["type"] == "extra_forbidden" else "",
+        ) from error
+
+
+def _keys_at(location: tuple[int | str, ...]) -> list[str]:
+    """Return the fields of the part of a mapping at `location`."""
+    kinds: dict[str, type[BaseModel]] = {
+        "fields": Fields, "registers": Registers, "cir": CirSource, "truth": TruthSource, "poses": Poses,
+        "anchors": AnchorSource, "odometry": Motion, "join": Join, "drop": Drop,
+    }  # fmt: skip
+    names = [part for part in location if isinstance(part, str)]
+    kind = kinds.get(names[-1], Value) if names else Mapping
+    return list(kind.model_fields)
