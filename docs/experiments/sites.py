@@ -71,6 +71,7 @@ def draw_site(anchors: int, rng: np.random.Generator) -> Site:
 
     Args:
         anchors: number of anchors, evenly spaced along the outer walls.
+        rng: random generator.
     """
     name = SITES[int(rng.integers(len(SITES)))]
     kind = next(one for one in KINDS if one.name == name)

@@ -56,6 +56,9 @@ def show_table(
     """Print the first rows of a table; numbers have three decimals.
 
     Args:
+        title: title above the table; may be empty.
+        columns: heads of the columns.
+        rows: cells of each row.
         bold_row: the row with this name is bold.
         left: the number of left-aligned columns; the others are right-aligned.
         max_rows: maximum number of rows.
@@ -68,7 +71,7 @@ def show_table(
         table.add_row(*cells, style="bold" if bold_row and bold_row in cells else None)
     out.print(table)
     if len(rows) > max_rows:
-        print_line(f"and {len(rows) - max_rows} rows more")
+        print_line(f"and {len(rows) - max_rows} more rows")
 
 
 def progress() -> Progress:

@@ -15,6 +15,7 @@ def fetch_deepuwb(target: Path, url: str | None = None, sha256: str | None = Non
     """Download `dataset.pkl` to `target` and return its checksum. A file with this checksum is kept.
 
     Args:
+        target: file to write.
         url: a mirror; by default the DOI.
         sha256: expected checksum; by default the MD5 that Zenodo publishes.
 
@@ -29,7 +30,7 @@ def fetch_deepuwb(target: Path, url: str | None = None, sha256: str | None = Non
         checksum = str(pup.registry[NAME] if sha256 is None else f"sha256:{sha256}").lower()
         algorithm, _, digest = checksum.partition(":")
         if target.exists() and pooch.file_hash(str(target), algorithm) != digest:
-            raise RecordingError("another file is here", where=str(target), valid="delete or rename it")
+            raise RecordingError("a different file exists", where=str(target), valid="delete or rename it")
         pup.registry, pup.urls = {target.name: checksum}, {target.name: url or f"{DOI}/{NAME}"}
         pup.fetch(target.name)
     except (OSError, ValueError, LookupError, TypeError) as error:

@@ -30,7 +30,9 @@ def run_jobs(
 
     Args:
         work: called with each job; its result can be written as JSON. Picklable if there are several workers.
-        journal: file with one JSON object per line; lines with another `fingerprint` (other data or options) are ignored.
+        jobs: {name: job}.
+        journal: file with one JSON object per line; lines with another fingerprint are ignored.
+        fingerprint: checksum of data and options.
         cost: computing time of a job, in any unit; the most expensive jobs start first.
         workers: processes; 1 runs everything in this process.
         on_progress: called with the finished share of the work, 0 to 1.

@@ -53,7 +53,7 @@ class _AnchorRanges:
         """Return the negative log likelihood (Cauchy) for an anchor at `position`, with per-tag offsets."""
         return float(self.weight * np.log1p((self.residual_m(position) / sd_m) ** 2).sum())
 
-    def displaced(self, position: NDArray[np.float64], sd_m: float) -> NDArray[np.float64]:
+    def best_displacement(self, position: NDArray[np.float64], sd_m: float) -> NDArray[np.float64]:
         """Return the horizontal displacement from `position` that fits the ranges best, m, shape (3,)."""
         found = least_squares(
             lambda shift: self.residual_m(position + np.append(shift, 0.0)),
@@ -68,8 +68,9 @@ def check_anchors(site: SiteData, antenna: NDArray[np.float64], known: NDArray[n
     """Raise an error if other anchor positions fit the ranges much better.
 
     Args:
-        antenna: (r, 3), the position of the tag's antenna at each range of the site. known: bool (r,), whether it is
-            known and the range is no outlier.
+        site: recorded ranges.
+        antenna: (r, 3), position of the tag's antenna at each range of the site, m.
+        known: bool (r,), whether the position is known and the range is not an outlier.
 
     Raises:
         DatasetError: names the anchors.
@@ -78,34 +79,46 @@ def check_anchors(site: SiteData, antenna: NDArray[np.float64], known: NDArray[n
     ranges = _by_anchor(site, antenna, known)
     if not ranges:
         return
-    spread = np.concatenate([own.residual_m(anchors.position[row]) for row, own in ranges.items()])
+    spread = np.concatenate(
+        [anchor_ranges.residual_m(anchors.position[row]) for row, anchor_ranges in ranges.items()]
+    )
     sd_m = max(MIN_SD_M, MAD_TO_SD * float(np.median(np.abs(spread))))
-    now = {row: own.loss(anchors.position[row], sd_m) for row, own in ranges.items()}
-    shift = {row: own.displaced(anchors.position[row], sd_m) for row, own in ranges.items()}
-    gain = {row: now[row] - own.loss(anchors.position[row] + shift[row], sd_m) for row, own in ranges.items()}
+    current_loss = {
+        row: anchor_ranges.loss(anchors.position[row], sd_m) for row, anchor_ranges in ranges.items()
+    }
+    shift = {
+        row: anchor_ranges.best_displacement(anchors.position[row], sd_m)
+        for row, anchor_ranges in ranges.items()
+    }
+    gain = {
+        row: current_loss[row] - anchor_ranges.loss(anchors.position[row] + shift[row], sd_m)
+        for row, anchor_ranges in ranges.items()
+    }
     suspects = [
-        row for row in ranges if np.linalg.norm(shift[row]) > MISPLACED_M and _is_better(gain[row], now[row])
+        row
+        for row in ranges
+        if np.linalg.norm(shift[row]) > MISPLACED_M and _is_better(gain[row], current_loss[row])
     ]
-    fix = "their true positions in the anchors file (`uwb-mitigation survey` finds them)"
-    best: tuple[float, int, int] | None = None
+    fix = "the true positions in the anchors file (`uwb-mitigation survey` finds them)"
+    best_swap: tuple[float, int, int] | None = None
     for a, b in itertools.combinations(suspects, 2):
         swapped = ranges[a].loss(anchors.position[b], sd_m) + ranges[b].loss(anchors.position[a], sd_m)
-        swap_gain = now[a] + now[b] - swapped
+        swap_gain = current_loss[a] + current_loss[b] - swapped
         # Two free displacements always fit better than a swap, but only slightly better if the anchors are swapped.
         is_swap = swap_gain > (1.0 - LARGER) * (gain[a] + gain[b])
-        if is_swap and (best is None or swap_gain > best[0]):
-            best = swap_gain, a, b
-    if best is not None:
-        first, second = (anchors.anchors[row] for row in best[1:])
+        if is_swap and (best_swap is None or swap_gain > best_swap[0]):
+            best_swap = swap_gain, a, b
+    if best_swap is not None:
+        first, second = (anchors.anchors[row] for row in best_swap[1:])
         raise DatasetError(
-            f"anchors {first} and {second} contradict the localisation: swapped, they explain the ranges",
+            f"anchors {first} and {second} contradict the localisation: the ranges fit if these anchors are swapped",
             valid=fix,
         )
     if suspects:
         row = max(suspects, key=lambda one: gain[one])
         raise DatasetError(
-            f"anchor {anchors.anchors[row]} contradicts the localisation: {float(np.linalg.norm(shift[row])):.1f} m from its "
-            "position in the anchors file, it explains the ranges",
+            f"anchor {anchors.anchors[row]} contradicts the localisation: the ranges fit a position "
+            f"{float(np.linalg.norm(shift[row])):.1f} m from that in the anchors file",
             valid=fix,
         )
 
@@ -117,16 +130,16 @@ def _is_better(gain: float, loss: float) -> bool:
 def _by_anchor(
     site: SiteData, antenna: NDArray[np.float64], known: NDArray[np.bool_]
 ) -> dict[int, _AnchorRanges]:
-    tag, every = site.tag, site.ranges
-    row, stamp_ns, range_m = every.anchor, every.stamp_ns, every.range_m
+    tag, all_ranges = site.tag, site.ranges
+    row, stamp_ns, range_m = all_ranges.anchor, all_ranges.stamp_ns, all_ranges.range_m
     ranges = {}
     for anchor in np.unique(row).tolist():
-        own = np.flatnonzero(known & (row == anchor))
-        group = stamp_ns[own] // round(INDEPENDENT_S * 1e9)
-        independent = len(np.unique(np.stack([group, tag[own]]), axis=1).T) if len(own) else 0
+        own_rows = np.flatnonzero(known & (row == anchor))
+        group = stamp_ns[own_rows] // round(INDEPENDENT_S * 1e9)
+        independent = len(np.unique(np.stack([group, tag[own_rows]]), axis=1).T) if len(own_rows) else 0
         if independent < MIN_GROUPS:
             continue
-        chosen = own[:: math.ceil(len(own) / MAX_RANGES)]
-        weight = min(1.0, independent / len(chosen))
-        ranges[anchor] = _AnchorRanges(antenna[chosen], range_m[chosen], tag[chosen], weight)
+        selected = own_rows[:: math.ceil(len(own_rows) / MAX_RANGES)]
+        weight = min(1.0, independent / len(selected))
+        ranges[anchor] = _AnchorRanges(antenna[selected], range_m[selected], tag[selected], weight)
     return ranges

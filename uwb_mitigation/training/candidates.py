@@ -292,7 +292,7 @@ def site_models(
     offsets = Candidate(SITE_OFFSETS, _constant().fit)
     if not has_cirs:
         line = Candidate(SITE_LINE, lambda data, seed: FittedModel(_site_line(data, data.error_m)))
-        return data, [offsets, line], ["networks: the recording has no CIRs"]
+        return data, [offsets, line], ["no networks: the recording has no CIRs"]
     start = float_network(universal)
     data = replace(data, headers=network_m(start, data.inputs)[:, None].astype(np.float32))
 
@@ -317,7 +317,7 @@ def site_models(
         Candidate(SITE_UNIVERSAL_LINE, with_network(line=True)),
     ]
     if importlib.util.find_spec("torch") is None:
-        return data, candidates, ["the fine-tuned network: torch is not installed (`make setup-training`)"]
+        return data, candidates, ["no fine-tuned network: torch is not installed (`make setup-training`)"]
 
     def fine_tuned(data: Dataset, seed: int) -> FittedModel:
         from uwb_mitigation.training import fitting

@@ -22,8 +22,8 @@ def card_of(
     architecture: Architecture,
     dataset: Dataset,
     linear_bias: LinearBiasModel,
-    unseen: Dataset,
-    left_m: NDArray[np.floating],
+    held_out: Dataset,
+    residual_m: NDArray[np.floating],
     training: Mapping[str, Any],
     ood_bands: OodBands | None = None,
 ) -> Card:
@@ -33,17 +33,22 @@ def card_of(
     on held-out configurations, the variance of passed-through ranges from the raw errors.
 
     Args:
+        name: human-readable name.
+        architecture: shape of the network.
         dataset: training data of the model.
-        unseen: held-out measurements, whose residuals are `left_m` (n,), m.
+        linear_bias: linear bias model.
+        held_out: n held-out measurements.
+        residual_m: errors of the held-out measurements after correction, (n,), m.
         training: human-readable origin of the model.
+        ood_bands: in-distribution bands; None: unknown.
 
     Raises:
         DatasetError: no error is finite.
     """
     low, high = float(dataset.error_m.min()), float(dataset.error_m.max())
     margin = max(high - low, 0.1) / 2
-    corrected = calibrate(left_m, unseen.error_m - left_m, unseen.configurations)
-    raw = calibrate(dataset.error_m, np.zeros(len(dataset)), dataset.configurations)
+    corrected = calibrate(residual_m, held_out.error_m - residual_m, held_out.configurations)
+    uncorrected = calibrate(dataset.error_m, np.zeros(len(dataset)), dataset.configurations)
     return Card(
         name=name,
         architecture=architecture,
@@ -51,7 +56,7 @@ def card_of(
         linear_bias=linear_bias,
         quantised=False,
         variance_m2=corrected.variance_m2,
-        variance_uncorrected_m2=raw.variance_m2,
+        variance_uncorrected_m2=uncorrected.variance_m2,
         correction_limits_m=(float(np.float32(low - margin)), float(np.float32(high + margin))),
         training=training,
         variance_per_m2=corrected.variance_per_m2,

@@ -74,18 +74,18 @@ class Comparison:
 
         def table(coverage: Coverage) -> dict[str, dict[str, float]]:
             return {
-                label: {"coverage68": narrow, "coverage95": wide}
-                for label, (narrow, wide) in coverage.items()
+                label: {"coverage68": coverage68, "coverage95": coverage95}
+                for label, (coverage68, coverage95) in coverage.items()
             }
 
-        universal, (narrow, wide) = self.universal_coverage, self.coverage[""]
+        universal, (coverage68, coverage95) = self.universal_coverage, self.coverage[""]
         return {
             "split": f"{self.folds} splits by {self.group.value}",
             "seeds": self.seeds,
             "configurations": self.configurations,
             "rows": [asdict(row) for row in self.rows],
-            "coverage68": narrow,
-            "coverage95": wide,
+            "coverage68": coverage68,
+            "coverage95": coverage95,
             "coverage_by_label": {label: row for label, row in table(self.coverage).items() if label},
             "rejection": [{"rejected": share, "mae": mae} for share, mae in self.rejection],
             "passed_through": self.passed_through,
@@ -123,40 +123,42 @@ def run(
     """
     known = np.isfinite(dataset.rx_power_dbm) & np.isfinite(dataset.first_path_power_dbm)
     dataset = dataset.rows(known) if known.any() else dataset
-    held = [_hold_out(dataset, recipe, group, folds, seed, on_fold) for seed in range(seeds)]
-    found = {name: np.array([part.errors[name] for part in held]) for name in NAMES}
-    unfitted = None
+    held_out_by_seed = [_hold_out(dataset, recipe, group, folds, seed, on_fold) for seed in range(seeds)]
+    errors_by_row = {
+        name: np.array([seed_result.errors[name] for seed_result in held_out_by_seed]) for name in NAMES
+    }
+    zero_shot_result = None
     if universal is not None and universal.preprocessing == dataset.preprocessing:
-        unfitted = zero_shot.run(dataset, universal)
-        found |= {name: error[None] for name, error in unfitted.errors.items()}
+        zero_shot_result = zero_shot.run(dataset, universal)
+        errors_by_row |= {name: error[None] for name, error in zero_shot_result.errors.items()}
     labels = list(dict.fromkeys(dataset.labels.tolist()))
     rows = []
-    for name, errors in found.items():
+    for name, errors in errors_by_row.items():
         maes = np.abs(errors).mean(axis=1)
         by_label = {label: float(np.abs(errors[:, dataset.labels == label]).mean()) for label in labels}
         interval = bootstrap_interval(errors[0], dataset.configurations)
         rows.append(ErrorRow(name, float(maes.mean()), float(maes.std()), by_label, interval))
-    final = np.array([part.errors["shipped_int8"] for part in held])
-    variance = np.array([part.variance_m2 for part in held])
-    wide = variance * np.array([part.sigmas95 for part in held]) ** 2
+    final = np.array([seed_result.errors["shipped_int8"] for seed_result in held_out_by_seed])
+    variance = np.array([seed_result.variance_m2 for seed_result in held_out_by_seed])
+    wide_variance = variance * np.array([seed_result.sigmas95 for seed_result in held_out_by_seed]) ** 2
     return Comparison(
         rows=tuple(rows),
-        coverage=_coverage(dataset.labels, final, variance, wide),
+        coverage=_coverage(dataset.labels, final, variance, wide_variance),
         rejection=tuple(
             (share, mae_after_rejection(final.ravel(), variance.ravel(), share)) for share in REJECTED
         ),
-        passed_through=float(np.mean([part.passed_through for part in held])),
+        passed_through=float(np.mean([seed_result.passed_through for seed_result in held_out_by_seed])),
         group=group,
         folds=len(splits.by_group(dataset, group, folds, 0)),
         seeds=seeds,
         configurations=len(dataset.names),
         universal_coverage=None
-        if unfitted is None
+        if zero_shot_result is None
         else _coverage(
             dataset.labels,
-            unfitted.errors["universal_los_offset"][None],
-            unfitted.variance_m2[None].astype(np.float64),
-            unfitted.variance_m2[None].astype(np.float64) * unfitted.sigmas95**2,
+            zero_shot_result.errors["universal_los_offset"][None],
+            zero_shot_result.variance_m2[None].astype(np.float64),
+            zero_shot_result.variance_m2[None].astype(np.float64) * zero_shot_result.sigmas95**2,
         ),
     )
 
@@ -168,14 +170,14 @@ def _coverage(
     wide_m2: NDArray[np.float64],
 ) -> Coverage:
     """Return the coverage by label (n,) of errors (seeds, n) and their variances."""
-    found = {}
+    coverages = {}
     for label in ("", *dict.fromkeys(labels.tolist())):
-        own = (labels == label) | (label == "")
-        found[label] = (
-            coverage(error_m[:, own], variance_m2[:, own], 1.0),
-            coverage(error_m[:, own], wide_m2[:, own], 1.0),
+        label_rows = (labels == label) | (label == "")
+        coverages[label] = (
+            coverage(error_m[:, label_rows], variance_m2[:, label_rows], 1.0),
+            coverage(error_m[:, label_rows], wide_m2[:, label_rows], 1.0),
         )
-    return found
+    return coverages
 
 
 def _hold_out(
@@ -186,11 +188,11 @@ def _hold_out(
     variance, sigmas95 = np.empty(len(dataset)), np.empty(len(dataset))
     passed_through = np.zeros(len(dataset), np.bool_)
     for fold in splits.by_group(dataset, group, folds, seed):
-        part, test = dataset.rows(fold.train), dataset.rows(fold.test)
-        for name, predicted in _baselines(part, test, recipe, seed):
+        train_data, test = dataset.rows(fold.train), dataset.rows(fold.test)
+        for name, predicted in _baselines(train_data, test, recipe, seed):
             errors[name][fold.test] -= predicted
-        card, network = train.fit_with_card(part, recipe, INNER_FOLDS)
-        integers = quantize(network, calibration_inputs(part, seed), exact=False)
+        card, network = train.fit_with_card(train_data, recipe, INNER_FOLDS)
+        integers = quantize(network, calibration_inputs(train_data, seed), exact=False)
         linear_bias = linear_bias_m(card.linear_bias, test)
         for name, output in (
             ("shipped_float", network_m(network, test.inputs).astype(np.float32)),
@@ -206,18 +208,18 @@ def _hold_out(
 
 
 def _baselines(
-    part: Dataset, test: Dataset, recipe: Recipe, seed: int
+    train_data: Dataset, test: Dataset, recipe: Recipe, seed: int
 ) -> Iterator[tuple[str, NDArray[np.floating]]]:
-    yield "los_median", baselines.los_median(part)(test)
-    yield "overall_median", baselines.overall_median(part)(test)
-    yield "ridge", baselines.ridge(part, header=False)(test)
-    yield "ridge_header", baselines.ridge(part, header=True)(test)
-    yield "gradient_boosting", baselines.gradient_boosting(part, seed)(test)
-    yield "l1_line", linear_bias_m(candidates.fit_line(part), test)
-    some = part.rows(splits.subsample(part.configurations, recipe.per_configuration, seed))
+    yield "los_median", baselines.los_median(train_data)(test)
+    yield "overall_median", baselines.overall_median(train_data)(test)
+    yield "ridge", baselines.ridge(train_data, header=False)(test)
+    yield "ridge_header", baselines.ridge(train_data, header=True)(test)
+    yield "gradient_boosting", baselines.gradient_boosting(train_data, seed)(test)
+    yield "l1_line", linear_bias_m(candidates.fit_line(train_data), test)
+    subset = train_data.rows(splits.subsample(train_data.configurations, recipe.per_configuration, seed))
     options, samples = replace(candidates.NETWORK_ONLY, seed=seed), recipe.architecture.samples
-    yield "mlp", network_m(fit(Mlp(samples=samples), some.inputs, some.error_m, options), test.inputs)
-    alone = fit(Remnet(samples=samples), some.inputs, some.error_m, options)
-    yield "remnet_float", network_m(alone, test.inputs)
-    integers = quantize(alone, calibration_inputs(part, seed), exact=False)
+    yield "mlp", network_m(fit(Mlp(samples=samples), subset.inputs, subset.error_m, options), test.inputs)
+    network_only = fit(Remnet(samples=samples), subset.inputs, subset.error_m, options)
+    yield "remnet_float", network_m(network_only, test.inputs)
+    integers = quantize(network_only, calibration_inputs(train_data, seed), exact=False)
     yield "remnet_int8", IntegerNetwork(integers).predict_m(test.inputs)

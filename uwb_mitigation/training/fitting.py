@@ -20,7 +20,7 @@ from uwb_mitigation.training.options import FitOptions
 STAGES = ((0.6, 1.0), (0.9, 0.3), (1.0, 0.1))
 """Schedule of `fit` with `vary`: (share of the steps until which it applies, factor of the learning rate)."""
 
-MEAN_KEEPS = 0.999
+MEAN_DECAY = 0.999
 """Decay of the running mean of the weights per step."""
 
 
@@ -34,11 +34,16 @@ def fit(
     start: FloatWeights | None = None,
     vary: Callable[[Tensor, torch.Generator], Tensor] | None = None,
 ) -> FloatWeights:
-    """Fit a network to `targets` (n,), m, from `inputs` (n, K), by mean absolute error.
+    """Fit a network to `targets` by mean absolute error.
 
-    The same seed gives the same weights on the same machine. `on_epoch` is called after each pass.
+    The same seed gives the same weights on the same machine.
 
     Args:
+        architecture: shape of the network.
+        inputs: float32 (n, K).
+        targets: (n,), m.
+        options: training options.
+        on_epoch: called after each pass over the data.
         start: initial weights; by default random.
         vary: augments each batch. The learning rate then decreases in `STAGES`, and the result is a running mean of the
             weights, which removes the scatter of the last steps.
@@ -49,7 +54,7 @@ def fit(
     if len(inputs) == 0 or not (np.isfinite(inputs).all() and np.isfinite(targets).all()):
         raise DatasetError(f"cannot fit to {len(inputs)} inputs", valid="one or more, all finite")
     source = torch.from_numpy(np.ascontiguousarray(inputs))
-    wanted = torch.from_numpy(targets.astype(np.float32))
+    target_values = torch.from_numpy(targets.astype(np.float32))
     with single_thread(options.seed):
         # A separate generator, so that augmentation changes neither the order nor the dropout.
         generator = torch.Generator().manual_seed(options.seed + 77)
@@ -58,34 +63,34 @@ def fit(
         optimizer = torch.optim.AdamW(
             network.parameters(), options.learning_rate, weight_decay=options.weight_decay, fused=True
         )
-        means = [weight.detach().clone() for weight in network.parameters()]
+        mean_weights = [weight.detach().clone() for weight in network.parameters()]
         network.train()
-        steps, done = options.epochs * -(-len(source) // options.batch), 0
+        steps, step = options.epochs * -(-len(source) // options.batch), 0
         for epoch in range(1, options.epochs + 1):
             for rows in torch.randperm(len(source)).split(options.batch):
                 batch = source[rows]
                 if vary is not None:
-                    factor = next(factor for until, factor in STAGES if done < until * steps)
+                    factor = next(factor for until, factor in STAGES if step < until * steps)
                     optimizer.param_groups[0]["lr"] = options.learning_rate * factor
                     batch = vary(batch, generator)
                 optimizer.zero_grad()
-                loss = nn.functional.l1_loss(network(batch), wanted[rows])
+                loss = nn.functional.l1_loss(network(batch), target_values[rows])
                 loss.backward()
                 optimizer.step()
                 if not math.isfinite(loss.item()):
                     raise DatasetError(
                         f"the loss is {loss.item()} in epoch {epoch}", valid="try a lower learning rate"
                     )
-                done += 1
+                step += 1
                 if vary is not None:
                     # The mean adapts faster during the first steps, so that the initial weights have no effect.
-                    kept = min(MEAN_KEEPS, (1 + done) / (10 + done))
-                    for mean, weight in zip(means, network.parameters(), strict=True):
-                        mean.lerp_(weight.detach(), 1.0 - kept)
+                    decay = min(MEAN_DECAY, (1 + step) / (10 + step))
+                    for mean, weight in zip(mean_weights, network.parameters(), strict=True):
+                        mean.lerp_(weight.detach(), 1.0 - decay)
             on_epoch()
         if vary is not None:
             with torch.no_grad():
-                for mean, weight in zip(means, network.parameters(), strict=True):
+                for mean, weight in zip(mean_weights, network.parameters(), strict=True):
                     weight.copy_(mean)
         return networks.weights_of(network)
 

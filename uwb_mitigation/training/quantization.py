@@ -49,9 +49,11 @@ def quantize(
     *,
     exact: bool = True,
 ) -> Int8Weights:
-    """Quantise `weights` to int8 with calibration inputs, float32 (n, K).
+    """Quantise a network to int8.
 
     Args:
+        weights: float network.
+        calibration: inputs from which the scales are computed, float32 (n, K).
         percentile: percentile of each activation that maps to the largest integer; 100 is the maximum. `MSE`
             minimises the sum of clipping and rounding errors.
         exact: move scales by a few ulps where the integer arithmetic of the firmware needs it for bit-exact
@@ -68,7 +70,7 @@ def quantize(
             valid=f"at least one of {architecture.samples} samples",
         )
     if not np.isfinite(calibration).all():
-        raise DatasetError("calibration inputs hold values that are not finite")
+        raise DatasetError("calibration inputs with values that are not finite")
     weight_scale = {name: _weight_scale(name, weight) for name, weight in weights.weight.items()}
     reads = layer_inputs(architecture)
     scale = _activation_scales(_peaks(weights, calibration, percentile), weight_scale, reads)

@@ -27,7 +27,7 @@ NESTED = "selection (nested)"
 SEGMENT_FOLDS, ANCHOR_FOLDS = 4, 2
 """Number of folds of site data over segments of the track and over anchors."""
 
-_NOTHING: Callable[[], None] = lambda: None  # noqa: E731
+_NO_CALLBACK: Callable[[], None] = lambda: None  # noqa: E731
 
 
 def step_counter(total: int, on_share: Callable[[float], None]) -> Callable[[], None]:
@@ -82,7 +82,7 @@ def held_out_errors(
     candidates: Sequence[Candidate],
     folds: Iterable[Split],
     seed: int,
-    on_fit: Callable[[], None] = _NOTHING,
+    on_fit: Callable[[], None] = _NO_CALLBACK,
     *,
     prepare: Callable[[Split], Dataset] | None = None,
 ) -> dict[str, NDArray[np.float64]]:
@@ -92,11 +92,11 @@ def held_out_errors(
     """
     errors = {candidate.name: data.error_m.copy() for candidate in candidates}
     for fold in folds:
-        part = data if prepare is None else prepare(fold)
-        train, test = part.rows(fold.train), part.rows(fold.test)
+        fold_data = data if prepare is None else prepare(fold)
+        train, test = fold_data.rows(fold.train), fold_data.rows(fold.test)
         for candidate in candidates:
-            left = test.error_m - candidate.fit(train, seed).correction_m(test)
-            errors[candidate.name][fold.test] = left
+            residuals = test.error_m - candidate.fit(train, seed).correction_m(test)
+            errors[candidate.name][fold.test] = residuals
             on_fit()
     return errors
 
@@ -123,10 +123,10 @@ def select_nested(
         outer = held_out_errors(data, candidates, [fold], seed, on_fit)
         train = data.rows(fold.train)
         inner = splits.by_configuration(train.configurations, inner_folds, seed)
-        choice = select_simplest(held_out_errors(train, candidates, inner, seed, on_fit), min_gain)
+        inner_choice = select_simplest(held_out_errors(train, candidates, inner, seed, on_fit), min_gain)
         for name in names:
             errors[name][fold.test] = outer[name][fold.test]
-        errors[NESTED][fold.test] = outer[choice][fold.test]
+        errors[NESTED][fold.test] = outer[inner_choice][fold.test]
     chosen = select_simplest({name: errors[name] for name in names}, min_gain)
     if untrained := [item.name for item in candidates if not item.trains]:
         fallback = select_simplest({name: errors[name] for name in untrained}, min_gain)
@@ -153,9 +153,12 @@ def select_for_site(
 
     Args:
         data: from `SiteData.to_dataset`, with the offsets subtracted.
+        candidates: models in order of complexity.
+        seed: seed of the splits and of the fits.
         without_offsets_of: returns for held-out rows the change of each range's offset, shape (n,), m, if the offsets
             are estimated without these rows. Offsets are re-estimated for held-out segments, but not for held-out
             anchors, whose offsets can only be estimated from their own ranges.
+        on_share: called with the finished share, 0 to 1.
 
     Raises:
         DatasetError: one segment cannot be divided.
@@ -165,7 +168,8 @@ def select_for_site(
     anchors = _folds(data.anchors.astype(str), ANCHOR_FOLDS, seed)
     if not segments:
         raise DatasetError(
-            "one segment of ranges: nothing can be held out", valid="a longer drive, or more positions"
+            "only one segment of ranges, so that no segment can be held out",
+            valid="a longer drive, or more positions",
         )
     on_fit = step_counter((len(segments) + len(anchors)) * len(candidates) + 1, on_share)
 
@@ -174,8 +178,8 @@ def select_for_site(
 
     errors = held_out_errors(data, candidates, segments, seed, on_fit, prepare=prepare)
     if anchors:
-        beside = held_out_errors(data, candidates, anchors, seed, on_fit)
-        errors = {name: np.concatenate([error, beside[name]]) for name, error in errors.items()}
+        anchor_errors = held_out_errors(data, candidates, anchors, seed, on_fit)
+        errors = {name: np.concatenate([error, anchor_errors[name]]) for name, error in errors.items()}
     chosen = select_simplest(errors)
     (candidate,) = (item for item in candidates if item.name == chosen)
     return Selection(chosen, errors, candidate.fit(data, seed), folds=len(segments), seed=seed)

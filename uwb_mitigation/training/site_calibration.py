@@ -149,6 +149,8 @@ class SiteCalibration:
         """Write the bundle and the offsets (`X.offsets.yaml`) atomically.
 
         Args:
+            output: path of the bundle.
+            universal: bundle that the candidates started from.
             name: human-readable name of the recordings.
 
         Raises:
@@ -220,8 +222,8 @@ def calibrate(
     """
     if len(solution.rows) < MIN_LABELLED:
         raise DatasetError(
-            f"{len(solution.rows)} ranges whose true value can be estimated: too few",
-            valid=f"{MIN_LABELLED} or more",
+            f"too few ranges whose true value can be estimated: {len(solution.rows)}",
+            valid=f"at least {MIN_LABELLED}",
         )
     _check_offsets(solution.pairs)
     raw = site.to_dataset(
@@ -242,7 +244,9 @@ def calibrate(
     )
     without_cir = int((~usable_ranges(site)).sum())
     notes = (
-        [f"{without_cir} ranges without a usable CIR: used for track and offsets only"] if without_cir else []
+        [f"{without_cir} ranges without a usable CIR are only used for track and offsets"]
+        if without_cir
+        else []
     )
     residual = selection.errors[selection.chosen][: len(data)]
     raw_error, error = (position_error_m(site, solution, error_m) for error_m in (raw.error_m, residual))
@@ -261,6 +265,8 @@ def position_error_m(site: SiteData, solution: SiteSolution, error_m: NDArray[np
     """Return the RMSE of the horizontal position due to range errors, m: least squares on the ranges of each second.
 
     Args:
+        site: recorded ranges.
+        solution: positions of the tags.
         error_m: (n,), errors of the ranges of `solution.rows`.
 
     Returns:
@@ -286,7 +292,7 @@ def position_error_m(site: SiteData, solution: SiteSolution, error_m: NDArray[np
 def _check_offsets(pairs: Pairs) -> None:
     median = float(np.median([value for value, _ in pairs.values()]))
     for (tag, anchor), (value, _) in pairs.items():
-        what = f"an offset of {value:.2f} m of tag {format_id(tag)} and anchor {format_id(anchor)}"
+        what = f"offset of {value:.2f} m of tag {format_id(tag)} and anchor {format_id(anchor)}"
         if abs(value - median) > MAX_OFFSET_M:
             raise DatasetError(
                 f"{what}; the median of all pairs is {median:.2f} m",
@@ -296,5 +302,5 @@ def _check_offsets(pairs: Pairs) -> None:
         if abs(value) > MAX_OFFSET_M:
             raise DatasetError(
                 what,
-                valid=f"{MAX_OFFSET_M:g} m at most: set the antenna delay first (`uwb-mitigation board antenna-delay`)",
+                valid=f"at most {MAX_OFFSET_M:g} m: set the antenna delay first (`uwb-mitigation board antenna-delay`)",
             )

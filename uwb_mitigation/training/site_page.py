@@ -13,72 +13,75 @@ MAX_POINTS = 2000
 WIDTH, HEIGHT, MARGIN = 720.0, 480.0, 36.0
 
 
-def site_page(found: SiteCalibration, name: str) -> str:
+def site_page(calibration: SiteCalibration, name: str) -> str:
     """Return one HTML page without external resources; `name`: name of the recordings.
 
     Raises:
         MissingDependencyError: jinja2 is not installed.
     """
-    solution, data = found.solution, found.data
+    solution, data = calibration.solution, calibration.data
     assert data.anchors is not None
     by_anchor: list[tuple[str, int, float, float]] = []
-    for anchor in found.site.anchors.anchors:
-        own = data.anchors == anchor.id
-        if own.any():
+    for anchor in calibration.site.anchors.anchors:
+        anchor_rows = data.anchors == anchor.id
+        if anchor_rows.any():
             before, after = (
-                float(np.abs(error[own]).mean()) for error in (found.raw_error_m, found.held_out_error_m)
+                float(np.abs(error[anchor_rows]).mean())
+                for error in (calibration.raw_error_m, calibration.held_out_error_m)
             )
-            by_anchor.append((str(anchor), int(own.sum()), before, after))
-    facts = []
+            by_anchor.append((str(anchor), int(anchor_rows.sum()), before, after))
+    details = []
     if solution.alignment is not None:
-        arms = "; ".join(", ".join(f"{value:.3f}" for value in own) for own in solution.alignment.lever_arm_m)
-        facts.append(
+        arms = "; ".join(", ".join(f"{value:.3f}" for value in arm) for arm in solution.alignment.lever_arm_m)
+        details.append(
             f"Localisation {solution.truth}: time offset {solution.alignment.time_offset_s:.3f} s, lever arm {arms} m."
         )
-    if found.selection.model.factor is not None and solution.network_sd:
-        factor = f"{found.selection.model.factor:.2f} +- {solution.network_sd:.2f}"
-        facts.append(f"Factor of the universal network's predictions: {factor}.")
+    if calibration.selection.model.factor is not None and solution.network_sd:
+        factor = f"{calibration.selection.model.factor:.2f} +- {solution.network_sd:.2f}"
+        details.append(f"Factor of the universal network's predictions: {factor}.")
     if solution.line[1]:
         slope, sd = (100.0 * value for value in solution.line)
-        facts.append(f"Received power: {slope:.2f} +- {sd:.2f} cm of range per dB.")
-    offsets = [(format_id(tag), format_id(anchor), *own) for (tag, anchor), own in solution.pairs.items()]
+        details.append(f"Received power: {slope:.2f} +- {sd:.2f} cm of range per dB.")
+    offsets = [
+        (format_id(tag), format_id(anchor), *values) for (tag, anchor), values in solution.pairs.items()
+    ]
     return render_page(
         "site.html.j2",
         name=name,
-        summary=found.summary(),
-        facts=facts,
-        notes=found.notes,
+        summary=calibration.summary(),
+        details=details,
+        notes=calibration.notes,
         by_anchor=by_anchor,
         worst=max([max(row[2:]) for row in by_anchor] + [1e-9]),
         offsets=offsets,
-        candidates={"raw": found.raw_mae_m, **found.selection.mae()},
-        chosen=found.selection.chosen,
+        candidates={"raw": calibration.raw_mae_m, **calibration.selection.mae()},
+        chosen=calibration.selection.chosen,
         width=WIDTH,
         height=HEIGHT,
-        plan=_plan(found),
+        plan=_plan(calibration),
     )
 
 
-def _plan(found: SiteCalibration) -> dict[str, object]:
+def _plan(calibration: SiteCalibration) -> dict[str, object]:
     """Return anchors, tracks and stationary positions in pixels, and the number of pixels per metre."""
-    solution = found.solution
+    solution = calibration.solution
     tracks = [solution.track[solution.track_of == one][:, :2] for one in np.unique(solution.track_of)]
-    anchors = found.site.anchors.position[:, :2]
-    every = np.concatenate([anchors, *tracks])
-    every = every[np.isfinite(every).all(axis=1)]
-    low, high = every.min(axis=0), every.max(axis=0)
-    room = np.array([WIDTH, HEIGHT]) - 2 * MARGIN
-    scale = float((room / np.maximum(high - low, 1.0)).min())
+    anchors = calibration.site.anchors.position[:, :2]
+    all_points = np.concatenate([anchors, *tracks])
+    all_points = all_points[np.isfinite(all_points).all(axis=1)]
+    low, high = all_points.min(axis=0), all_points.max(axis=0)
+    available_px = np.array([WIDTH, HEIGHT]) - 2 * MARGIN
+    scale = float((available_px / np.maximum(high - low, 1.0)).min())
 
     def pixels(position: NDArray[np.float64]) -> list[list[float]]:
-        flat = position[np.isfinite(position).all(axis=1)]
-        away = (flat - low) * scale + MARGIN
-        away[:, 1] = HEIGHT - away[:, 1]
-        points: list[list[float]] = away[:: max(1, len(away) // MAX_POINTS)].round(1).tolist()
+        finite = position[np.isfinite(position).all(axis=1)]
+        pixel = (finite - low) * scale + MARGIN
+        pixel[:, 1] = HEIGHT - pixel[:, 1]
+        points: list[list[float]] = pixel[:: max(1, len(pixel) // MAX_POINTS)].round(1).tolist()
         return points
 
     shown = list(map(pixels, tracks))
-    names = map(str, found.site.anchors.anchors)
+    names = map(str, calibration.site.anchors.anchors)
     return {
         "scale": scale,
         "anchors": list(zip(names, pixels(anchors), strict=True)),
