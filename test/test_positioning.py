@@ -48,10 +48,10 @@ SLOPE = AnchorMap(
 def test_filter_agrees_with_filterpy():
     kalman = pytest.importorskip("filterpy.kalman")
     own_filter = RangeFilter(HALL, PLAIN, 0.0, np.array([6.0, 4.0, 1.0]), np.eye(3))
-    own_filter.learns = True
+    own_filter.updates_consider_states = True
     n = len(own_filter.x)
     filterpy_filter = kalman.ExtendedKalmanFilter(dim_x=n, dim_z=1)
-    filterpy_filter.x, filterpy_filter.P = own_filter.x.copy()[:, None], own_filter.p.copy()
+    filterpy_filter.x, filterpy_filter.P = own_filter.x.copy()[:, None], own_filter.P.copy()
     ranges, _ = drive(seconds=3)
     variance = PLAIN.range_sd**2
     claimed = np.diag(filterpy_filter.P)[FIRST_ERROR:].copy()
@@ -84,7 +84,7 @@ def test_filter_agrees_with_filterpy():
         own_filter.predict(stamp)
         own_filter.update(row, range_m, variance)
         np.testing.assert_allclose(own_filter.x, filterpy_filter.x[:, 0], atol=1e-8)
-        np.testing.assert_allclose(own_filter.p, filterpy_filter.P, atol=1e-8)
+        np.testing.assert_allclose(own_filter.P, filterpy_filter.P, atol=1e-8)
 
 
 @settings(max_examples=40)
@@ -94,18 +94,18 @@ def test_filter_agrees_with_filterpy():
         min_size=1,
         max_size=60,
     ),
-    learns=st.booleans(),
+    updates_consider_states=st.booleans(),
 )
-def test_covariance_stays_valid_and_the_state_finite(steps, learns: bool):
+def test_covariance_stays_valid_and_the_state_finite(steps, updates_consider_states: bool):
     one = RangeFilter(HALL, NoiseModel(), 0.0, np.array([6.0, 4.0, 1.0]), np.eye(3))
-    one.learns = learns
+    one.updates_consider_states = updates_consider_states
     now = 0.0
     for dt, row, range_m, variance in steps:
         now += dt
         one.predict(now)
         one.update(row, range_m, variance)
-    np.testing.assert_allclose(one.p, one.p.T, atol=1e-9 * np.abs(one.p).max())
-    assert np.linalg.eigvalsh((one.p + one.p.T) / 2).min() > -1e-9 * np.abs(one.p).max()
+    np.testing.assert_allclose(one.P, one.P.T, atol=1e-9 * np.abs(one.P).max())
+    assert np.linalg.eigvalsh((one.P + one.P.T) / 2).min() > -1e-9 * np.abs(one.P).max()
     assert np.isfinite(one.x).all()
 
 

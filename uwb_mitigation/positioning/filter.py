@@ -20,7 +20,7 @@ from uwb_mitigation.positioning.tracks import Estimate
 
 OFFSET = 6
 FIRST_ERROR = 7
-_SHORTEST_M = 0.05
+SHORTEST_M = 0.05
 """Closer to an anchor, a range has no defined direction."""
 
 
@@ -37,11 +37,21 @@ class RangeFilter:
 
     Attributes:
         time_s: of the state, s.
-        x, p: state float64 (n,) and its covariance (n, n).
-        learns: whether ranges also change offset and errors, which are only considered otherwise.
+        x, P: state float64 (n,) and its covariance (n, n).
+        updates_consider_states: whether ranges also change offset and errors, which are only considered otherwise.
     """
 
-    __slots__ = ("_anchors", "_claimed", "_h", "_level", "_model", "learns", "p", "time_s", "x")
+    __slots__ = (
+        "P",
+        "_H",
+        "_anchors",
+        "_error_variance",
+        "_level",
+        "_model",
+        "time_s",
+        "updates_consider_states",
+        "x",
+    )
 
     def __init__(
         self,
@@ -57,29 +67,32 @@ class RangeFilter:
         self._anchors = anchors.position
         self._model = model
         self._level = level
-        self._h = np.zeros(n)
+        self._H = np.zeros(n)
         # The unconditional variance of each pair's persisting error: what its last ranges' variances claim.
-        self._claimed = (1.0 - model.white) * model.range_sd**2 + anchors.sd**2
-        self.learns = False
+        self._error_variance = (1.0 - model.white) * model.range_sd**2 + anchors.sd**2
+        self.updates_consider_states = False
         self.time_s = time_s
         self.x = np.zeros(n)
         self.x[:3] = position
-        self.p = np.zeros((n, n))
-        self.p[:3, :3] = covariance
+        self.P = np.zeros((n, n))
+        self.P[:3, :3] = covariance
         for axis in range(2 if level else 3):
-            self.p[3 + axis, 3 + axis] = model.speed**2
-        self.p[OFFSET, OFFSET] = model.offset_sd**2
+            self.P[3 + axis, 3 + axis] = model.speed**2
+        self.P[OFFSET, OFFSET] = model.offset_sd**2
         errors = np.arange(FIRST_ERROR, n)
-        self.p[errors, errors] = self._claimed
+        self.P[errors, errors] = self._error_variance
 
     def copy(self) -> RangeFilter:
         """Return an independent copy."""
         other = object.__new__(RangeFilter)
-        for name in ("_anchors", "_level", "_model", "learns", "time_s"):
-            setattr(other, name, getattr(self, name))
-        for name in ("_claimed", "_h", "p", "x"):
-            setattr(other, name, getattr(self, name).copy())
+        other._copy_from(self)
         return other
+
+    def _copy_from(self, other: RangeFilter) -> None:
+        for name in ("_anchors", "_level", "_model", "time_s", "updates_consider_states"):
+            setattr(self, name, getattr(other, name))
+        for name in ("P", "_H", "_error_variance", "x"):
+            setattr(self, name, getattr(other, name).copy())
 
     def predict(self, time_s: float) -> None:
         """Predict the state at a later time; an earlier time has no effect."""
@@ -87,23 +100,28 @@ class RangeFilter:
         if dt <= 0.0:
             return
         self.time_s = time_s
-        x, p, model = self.x, self.p, self._model
+        x, P, model = self.x, self.P, self._model
         x[:3] += dt * x[3:6]
-        p[:3] += dt * p[3:6]
-        p[:, :3] += dt * p[:, 3:6]
-        decay = math.exp(-dt / model.persistence_s)
-        x[FIRST_ERROR:] *= decay
-        p[FIRST_ERROR:] *= decay
-        p[:, FIRST_ERROR:] *= decay
-        diagonal = p.reshape(-1)[:: len(x) + 1]
-        diagonal[FIRST_ERROR:] += (1.0 - decay * decay) * self._claimed
+        P[:3] += dt * P[3:6]
+        P[:, :3] += dt * P[:, 3:6]
+        self._predict_errors(dt / model.persistence_s)
         q = model.acceleration**2 * dt
         for axis in range(2 if self._level else 3):
-            p[axis, axis] += q * dt * dt / 3.0
+            P[axis, axis] += q * dt * dt / 3.0
             cross = q * dt / 2.0
-            p[axis, axis + 3] += cross
-            p[axis + 3, axis] += cross
-            p[axis + 3, axis + 3] += q
+            P[axis, axis + 3] += cross
+            P[axis + 3, axis] += cross
+            P[axis + 3, axis + 3] += q
+
+    def _predict_errors(self, elapsed: float) -> None:
+        """Predict the persisting errors after `elapsed` time constants."""
+        decay = math.exp(-elapsed)
+        self.x[FIRST_ERROR:] *= decay
+        P = self.P
+        P[FIRST_ERROR:] *= decay
+        P[:, FIRST_ERROR:] *= decay
+        diagonal = P.reshape(-1)[:: len(P) + 1]
+        diagonal[FIRST_ERROR:] += (1.0 - decay * decay) * self._error_variance
 
     def update(self, anchor: int, range_m: float, variance_m2: float) -> tuple[float, float]:
         """Update with a range at the time of the state.
@@ -116,24 +134,29 @@ class RangeFilter:
         Returns:
             The innovation divided by its standard deviation, and this standard deviation in m.
         """
-        model, x, h, row = self._model, self.x, self._h, FIRST_ERROR + anchor
+        model, x, H, row = self._model, self.x, self._H, FIRST_ERROR + anchor
         variance = model.variance(variance_m2)
-        claimed = self._claimed[anchor]
+        error_variance = self._error_variance[anchor]
         # The part of the variance that the pair's persisting error does not explain is white noise.
-        white = max(model.white * variance, variance - claimed)
-        self._claimed[anchor] += 0.1 * ((1.0 - model.white) * variance - claimed)
-        h[FIRST_ERROR:] = 0.0
-        away = x[:3] - self._anchors[anchor]
+        white = max(model.white * variance, variance - error_variance)
+        self._error_variance[anchor] += 0.1 * ((1.0 - model.white) * variance - error_variance)
+        H[FIRST_ERROR:] = 0.0
+        H[OFFSET] = H[row] = 1.0
+        distance = self._linearize(self._anchors[anchor])
+        return self._correct(H, float(range_m - distance - x[OFFSET] - x[row]), white)
+
+    def _linearize(self, anchor: NDArray[np.float64]) -> float:
+        """Set the derivatives of the distance in H; return the distance."""
+        away = self.x[:3] - anchor
         distance = math.sqrt(away @ away)
-        h[:3] = away / max(distance, _SHORTEST_M)
-        h[OFFSET] = h[row] = 1.0
-        return self._correct(h, float(range_m - distance - x[OFFSET] - x[row]), white)
+        self._H[:3] = away / max(distance, SHORTEST_M)
+        return distance
 
     def update_height(self, height_m: float, variance_m2: float) -> float:
         """Update with the height of the tag; return the normalised innovation."""
-        h = np.zeros(len(self.x))
-        h[2] = 1.0
-        return self._correct(h, height_m - float(self.x[2]), variance_m2)[0]
+        H = np.zeros(len(self.x))
+        H[2] = 1.0
+        return self._correct(H, height_m - float(self.x[2]), variance_m2)[0]
 
     def confine(self, low: Sequence[float], high: Sequence[float]) -> bool:
         """Project the position onto a box; return whether it was outside.
@@ -150,35 +173,35 @@ class RangeFilter:
             beyond = x[axis] - min(max(x[axis], low[axis]), high[axis])
             if beyond == 0.0:
                 continue
-            gain = self.p[:, axis] / max(self.p[axis, axis], 1e-12)
+            gain = self.P[:, axis] / max(self.P[axis, axis], 1e-12)
             # If the correlation with another coordinate is steep, the linear model is not valid.
             gain[:3] = np.clip(gain[:3], -1.0, 1.0)
-            if not self.learns:
+            if not self.updates_consider_states:
                 gain[OFFSET:] = 0.0
             x -= gain * beyond
         x[:3] = np.clip(x[:3], low, high)
         return True
 
-    def _correct(self, h: NDArray[np.float64], innovation: float, noise: float) -> tuple[float, float]:
-        """Robust update with a measurement with Jacobian h (n,) and noise variance; return as `update`."""
-        ph = self.p @ h
-        predicted = float(h @ ph)
-        sd = math.sqrt(predicted + noise)
+    def _correct(self, H: NDArray[np.float64], innovation: float, R: float) -> tuple[float, float]:
+        """Robust update with a measurement with Jacobian H (n,) and noise variance R; return as `update`."""
+        PH = self.P @ H
+        HPH = float(H @ PH)
+        sd = math.sqrt(HPH + R)
         z = innovation / sd
-        s = (predicted + noise) * self._model.inflation(z)
-        k = ph / s
-        if not self.learns:
-            k[OFFSET:] = 0.0
-        self.x += k * innovation
+        S = (HPH + R) * self._model.inflation(z)
+        K = PH / S
+        if not self.updates_consider_states:
+            K[OFFSET:] = 0.0
+        self.x += K * innovation
         # Joseph's form (I - K H) P (I - K H)' + K R K', as updates of rank one.
-        a = self.p - np.multiply.outer(k, ph)
-        a -= np.multiply.outer(a @ h - (s - predicted) * k, k)
-        self.p = a
+        P = self.P - np.multiply.outer(K, PH)
+        P -= np.multiply.outer(P @ H - (S - HPH) * K, K)
+        self.P = P
         return z, sd
 
     def estimate(self, stamp_ns: int) -> Estimate:
         """Return position and velocity, at the stamp that the state is for."""
-        return Estimate(stamp_ns, self.x[:3].copy(), self.x[3:6].copy(), self.p[:6, :6].copy())
+        return Estimate(stamp_ns, self.x[:3].copy(), self.x[3:6].copy(), self.P[:6, :6].copy())
 
     @property
     def position(self) -> NDArray[np.float64]:
@@ -188,4 +211,4 @@ class RangeFilter:
     @property
     def horizontal_sd(self) -> float:
         """Root of the larger of the two horizontal variances, m."""
-        return math.sqrt(max(self.p[0, 0], self.p[1, 1]))
+        return math.sqrt(max(self.P[0, 0], self.P[1, 1]))

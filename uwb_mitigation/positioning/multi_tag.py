@@ -94,7 +94,7 @@ class FixedLagSmoother:
         live_ns, live = [state for state in self._states if state[0] <= wanted_ns][-1]
         live = live.copy()
         live.predict(live.time_s + (wanted_ns - live_ns) / _SECOND_NS)
-        state, covariance, spread = fused_with_batch(live.x[None, :6], live.p[None, :6, :6], batch)
+        state, covariance, spread = fused_with_batch(live.x[None, :6], live.P[None, :6, :6], batch)
         position = state[0, :3] if config.area is None else config.area.clip(state[0, :3])
         return Estimate(wanted_ns, position, state[0, 3:], (covariance + spread)[0])
 
@@ -224,7 +224,7 @@ class MultiTagEstimator:
             }
             geometry = estimator.geometry()
             if geometry is not None and known is not None:
-                levels = protection_levels(known.p)
+                levels = protection_levels(known.P)
                 found |= {
                     f"{name} HDOP": f"{geometry.hdop:.2f}",
                     f"{name} VDOP": f"{geometry.vdop:.2f}",

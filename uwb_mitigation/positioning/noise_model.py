@@ -87,6 +87,12 @@ class NoiseModel:
         )
         return loss
 
+    def loss_of(self, z: float, sd: float) -> float:
+        """Return minus the log likelihood of an innovation of `z` standard deviations `sd`, without its constant."""
+        limit = self.long if z > 0.0 else self.short
+        ratio = abs(z) / limit
+        return math.log(sd) + (0.5 * z * z if ratio <= 1.0 else limit**2 * (0.5 + math.log(ratio)))
+
     def variance(self, published_m2: float) -> float:
         """Return the variance of a range: the published one, or the default if that is unknown."""
         if math.isfinite(published_m2) and published_m2 > 0.0:

@@ -237,7 +237,7 @@ class Smoother:
         if self._height is not None:
             index, at = [*index, 2], [*at, problem.of_shared(p)]
             state[2] -= self._height.value
-        information = np.linalg.inv(self._after.p[np.ix_(index, index)] + 1e-9 * np.eye(len(index)))
+        information = np.linalg.inv(self._after.P[np.ix_(index, index)] + 1e-9 * np.eye(len(index)))
         root = np.linalg.cholesky((information + information.T) / 2.0).T
         problem.add(np.tile(at, (len(index), 1)), root, root @ state[index], 1.0)
 

@@ -17,7 +17,7 @@ from uwb_mitigation.positioning.filter import FIRST_ERROR, OFFSET, RangeFilter
 from uwb_mitigation.positioning.geometry import Area, Geometry, Height, geometry
 from uwb_mitigation.positioning.initialization import IMPLAUSIBLE, CandidatePosition, candidate_positions
 from uwb_mitigation.positioning.noise_model import NoiseModel
-from uwb_mitigation.positioning.tracks import Estimate, Heights, Ranges, Track
+from uwb_mitigation.positioning.tracks import Estimate, Heights, Imu, Odometry, Ranges, Track
 
 WINDOW_S = 1.0
 """A position is searched from the ranges of this time: every anchor had its turn, and a robot has moved by a metre."""
@@ -45,19 +45,40 @@ _UNDETERMINED_M = 5.0
 _KEPT_RANGES = 400
 _MAX_CANDIDATES = 12
 _RETRY_S = 0.25
-_LEARN_SPARE = 2
+_SPARE_ANCHORS = 2
 _NANOSECONDS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class RobotData:
+    """Recorded motion of a robot, and its antenna.
+
+    Attributes:
+        odometry, imu: recorded; None: none, or live.
+        lever_arm: the antenna in the frame of the base, m.
+        imu_orientation: use differences of the IMU's orientation instead of its yaw rate.
+    """
+
+    odometry: Odometry | None = None
+    imu: Imu | None = None
+    lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    imu_orientation: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class EstimatorConfig:
-    """Prior knowledge: anchors, error model, and of the tags a constant height, an area or measured heights, if any."""
+    """Prior knowledge: anchors, error model, and of the tags a constant height, an area or measured heights, if any.
+
+    Attributes:
+        robot: motion of the robot that carries the tag, if it has odometry.
+    """
 
     anchors: AnchorMap
     model: NoiseModel = field(default_factory=NoiseModel)
     height: Height | None = None
     area: Area | None = None
     heights: Heights | None = None
+    robot: RobotData | None = None
 
     @property
     def dims(self) -> int:
@@ -117,6 +138,7 @@ class TagEstimator:
         self._heights: deque[tuple[float, float, float]] = deque(maxlen=_KEPT_RANGES)
         self._recent: deque[tuple[float, int, float, float]] = deque(maxlen=_KEPT_RANGES)
         self._at_boundary = False
+        self._latest_loss = math.nan
         self.restart()
 
     @property
@@ -138,8 +160,9 @@ class TagEstimator:
         Returns:
             The estimate; None: the position is not known.
         """
-        if not (math.isfinite(range_m) and range_m >= 0.0) or variance_m2 == math.inf:
+        if not is_valid(range_m, variance_m2):
             return None
+        self._latest_loss = math.nan
         time_s = self._seconds(stamp_ns)
         if time_s < self._time_s:
             if time_s < self._time_s - WINDOW_S:
@@ -249,7 +272,8 @@ class TagEstimator:
         self, known: RangeFilter, time_s: float, anchor: int, range_m: float, variance_m2: float
     ) -> None:
         known.predict(time_s)
-        z, _ = known.update(anchor, range_m, variance_m2)
+        z, sd = known.update(anchor, range_m, variance_m2)
+        self._latest_loss = self._model.loss_of(z, sd)
         if self._area is not None and self._confine(known):
             self._at_boundary = True
         limited = max(-10.0, min(10.0, z))
@@ -261,7 +285,7 @@ class TagEstimator:
         if time_s - self._checked_s >= _RETRY_S:
             self._checked_s = time_s
             received = self.received_anchors()
-            known.learns = len(received) >= self._dims + _LEARN_SPARE
+            known.updates_consider_states = len(received) >= self._dims + _SPARE_ANCHORS
             odd = sum(self._states[i].outliers > 0.5 for i in received)
             # At the edge of the area the filter may follow a solution that is outside of it.
             if self._at_boundary or (2 * odd >= len(received) > 0 and odd):
@@ -319,7 +343,7 @@ class TagEstimator:
                 candidate.filter.predict(time_s)
                 z, sd = candidate.filter.update(anchor, range_m, variance_m2)
                 self._confine(candidate.filter)
-                candidate.loss += float(self._model.loss(np.float64(z))) + math.log(sd)
+                candidate.loss += self._model.loss_of(z, sd)
             self._settle()
             return
         if time_s < self._next_try_s:
@@ -328,7 +352,7 @@ class TagEstimator:
         # Wait until every anchor had its turn, or enough were received.
         if (
             time_s - self._search_began_s < WINDOW_S / 2
-            and len(self.received_anchors()) < self._dims + _LEARN_SPARE
+            and len(self.received_anchors()) < self._dims + _SPARE_ANCHORS
         ):
             return
         found = self._candidate_positions()
@@ -428,11 +452,11 @@ class TagEstimator:
                 covariance[2, 2] = height.sd**2
             one = RangeFilter(self.anchors, model, time_s, position, covariance, level=height is not None)
             errors = FIRST_ERROR + np.array(self._rows)
-            one.p[:3, errors] = candidate.gain * one.p[errors, errors]
-            one.p[:3, OFFSET] = offset * model.offset_sd**2
+            one.P[:3, errors] = candidate.gain * one.P[errors, errors]
+            one.P[:3, OFFSET] = offset * model.offset_sd**2
             if height is not None:
-                one.p[2, OFFSET:] = 0.0
-            one.p[OFFSET:, :3] = one.p[:3, OFFSET:].T
+                one.P[2, OFFSET:] = 0.0
+            one.P[OFFSET:, :3] = one.P[:3, OFFSET:].T
             self._hypotheses.append(_Hypothesis(one, candidate.loss + self._prior_loss(candidate, time_s)))
 
     def _prior_loss(self, candidate: CandidatePosition, time_s: float) -> float:
@@ -442,12 +466,17 @@ class TagEstimator:
         before = self._last_known.copy()
         before.predict(time_s)
         apart = candidate.position[:2] - before.position[:2]
-        spread = before.p[:2, :2] + candidate.covariance[:2, :2]
+        spread = before.P[:2, :2] + candidate.covariance[:2, :2]
         # Limited, so that a kidnapped tag is also found.
         return min(IMPLAUSIBLE, 0.5 * float(apart @ np.linalg.solve(spread, apart)))
 
 
+def is_valid(range_m: float, variance_m2: float) -> bool:
+    """Return whether the range can be used."""
+    return math.isfinite(range_m) and range_m >= 0.0 and variance_m2 != math.inf
+
+
 def _is_nonlinear(one: RangeFilter, height_m: float, variance_m2: float) -> bool:
     """Return whether a height would move an estimate so far in plan that the filter's linear model is not valid."""
-    share = math.hypot(one.p[0, 2], one.p[1, 2]) / (one.p[2, 2] + variance_m2)
+    share = math.hypot(one.P[0, 2], one.P[1, 2]) / (one.P[2, 2] + variance_m2)
     return bool(share * abs(height_m - float(one.x[2])) > _BENDS_M)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -52,6 +52,19 @@ _COLUMNS = ("stamp_ns", "anchor", "range_m", "variance_m2", "rx_power_dbm")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Heading:
+    """Heading of the robot that carries a tag.
+
+    Attributes:
+        yaw: rad, in the anchors' frame.
+        covariance: float64 (4,), of the yaw with the x, y and z of the tag (m rad), and its variance (rad^2).
+    """
+
+    yaw: float
+    covariance: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
     """Position and velocity of a tag at one time.
 
@@ -59,12 +72,17 @@ class Estimate:
         stamp_ns: its time.
         position, velocity: float64 (3,), m and m/s, in the anchors' frame.
         covariance: float64 (6, 6), of position and velocity.
+        heading: None: unknown.
     """
 
     stamp_ns: int
     position: NDArray[np.float64]
     velocity: NDArray[np.float64]
     covariance: NDArray[np.float64]
+    heading: Heading | None = None
+
+
+_UNKNOWN_HEADING = (math.nan,) * 5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,12 +93,18 @@ class Track:
         stamp_ns: int64 (n,).
         position, velocity: float64 (n, 3).
         covariance: float64 (n, 6, 6), of position and velocity.
+        yaw: float64 (n, 5), heading of the robot (rad) and its covariance as in `Heading`; NaN: unknown.
     """
 
     stamp_ns: NDArray[np.int64]
     position: NDArray[np.float64]
     velocity: NDArray[np.float64]
     covariance: NDArray[np.float64]
+    yaw: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 5)))
+
+    def __post_init__(self) -> None:
+        if len(self.yaw) != len(self.stamp_ns):
+            object.__setattr__(self, "yaw", np.full((len(self.stamp_ns), 5), np.nan))
 
     def __len__(self) -> int:
         return len(self.stamp_ns)
@@ -93,15 +117,24 @@ class Track:
             np.array([e.position for e in estimates], np.float64).reshape(-1, 3),
             np.array([e.velocity for e in estimates], np.float64).reshape(-1, 3),
             np.array([e.covariance for e in estimates], np.float64).reshape(-1, 6, 6),
+            np.array(
+                [
+                    _UNKNOWN_HEADING if e.heading is None else (e.heading.yaw, *e.heading.covariance)
+                    for e in estimates
+                ],
+                np.float64,
+            ).reshape(-1, 5),
         )
 
     def __iter__(self) -> Iterator[Estimate]:
-        columns = (self.stamp_ns.tolist(), self.position, self.velocity, self.covariance)
-        return (Estimate(*row) for row in zip(*columns, strict=True))
+        columns = (self.stamp_ns.tolist(), self.position, self.velocity, self.covariance, self.yaw)
+        for stamp_ns, position, velocity, covariance, yaw in zip(*columns, strict=True):
+            heading = Heading(float(yaw[0]), yaw[1:]) if np.isfinite(yaw[0]) else None
+            yield Estimate(stamp_ns, position, velocity, covariance, heading)
 
     def take(self, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> Track:
         """Return the estimates at `index`."""
-        return Track(self.stamp_ns[index], self.position[index], self.velocity[index], self.covariance[index])
+        return Track(*(getattr(self, name)[index] for name in self.__slots__))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -172,6 +205,12 @@ class Odometry:
     def __len__(self) -> int:
         return len(self.stamp_ns)
 
+    def reversed(self, end_ns: int) -> Odometry:
+        """Return the motion backwards in time, that starts at `end_ns`."""
+        back = slice(None, None, -1)
+        columns = (self.pose[back], self.pose_covariance[back], -self.twist[back])
+        return Odometry(end_ns - self.stamp_ns[back], *columns, self.twist_covariance[back])
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Imu:
@@ -191,6 +230,12 @@ class Imu:
 
     def __len__(self) -> int:
         return len(self.stamp_ns)
+
+    def reversed(self, end_ns: int) -> Imu:
+        """Return the rotation backwards in time, that starts at `end_ns`."""
+        back = slice(None, None, -1)
+        rates = (-self.yaw_rate[back], self.yaw_rate_variance[back])
+        return Imu(end_ns - self.stamp_ns[back], *rates, self.yaw[back], self.yaw_variance[back])
 
 
 ELLIPSE95 = 5.991

@@ -1,0 +1,217 @@
+"""Motion of a robot's base in the plane, integrated from odometry and optionally from the yaw rates of an IMU."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from typing import NamedTuple
+
+ODOMETRY_TIMEOUT_S = 0.5
+"""Motion is extrapolated by at most this time; a longer gap is missing odometry."""
+
+IMU_TIMEOUT_S = 0.1
+"""After a longer gap of the IMU, the yaw of the odometry is used."""
+
+SPEED_SD, YAW_RATE_SD = 0.05, 0.05
+"""White noise of velocities (m/s) and yaw rates (rad/s) of messages without a covariance."""
+
+MOTION_SHARE, CORRELATION_S = 0.05, 1.0
+"""Wheels slip and floors are uneven: velocities and yaw rates have random errors of this share, for about this time."""
+
+WHEEL_DRIFT, GYRO_DRIFT = 0.02, 0.01
+"""Standard deviation of the constant yaw drift of wheels (rad/m) and of an IMU (rad/s, 0.6 degrees per second)."""
+
+MAX_SPEED, MAX_YAW_RATE = 50.0, 50.0
+"""m/s, rad/s: faster odometry is invalid."""
+
+JUMP_SPEED, JUMP_YAW_RATE = 3.0, 10.0
+"""If the pose of the odometry moves by this much faster than its twist, it was reset: the twist is used (m/s, rad/s)."""
+
+_MAX_VARIANCE = 1e3
+_NUM_SAMPLES = 512
+_SECOND_NS = 1_000_000_000
+
+
+class PathPoint(NamedTuple):
+    """A point of the integrated path, with sums since its beginning.
+
+    Attributes:
+        part: points of different parts have no known relative motion.
+        x, y, yaw: pose in the frame of the path, m and rad.
+        distance_m: distance driven.
+        drift: standard deviation of the yaw error by a constant drift, rad.
+        position_variance, yaw_variance: variances of the random errors, m^2 and rad^2.
+    """
+
+    part: int
+    x: float = 0.0
+    y: float = 0.0
+    yaw: float = 0.0
+    distance_m: float = 0.0
+    drift: float = 0.0
+    position_variance: float = 0.0
+    yaw_variance: float = 0.0
+
+
+class _Sample(NamedTuple):
+    stamp_ns: int
+    point: PathPoint
+    rates: tuple[float, ...]
+    """Change of each value of the point per second."""
+
+
+class DeadReckoning:
+    """The path of a robot's base.
+
+    The increments of the poses of the odometry are used, or its twists if the poses jump or have no orientation. If there is an
+    IMU, its yaw rates replace those of the odometry.
+
+    Attributes:
+        rejected: number of messages that were invalid or out of order.
+        twist: velocity in the axes of the base (m/s) and yaw rate (rad/s) of the latest interval.
+        twist_variance: of x and y, and of the yaw rate.
+    """
+
+    def __init__(self) -> None:
+        self.rejected = 0
+        self.twist = (0.0, 0.0, 0.0)
+        self.twist_variance = (SPEED_SD**2, YAW_RATE_SD**2)
+        self._samples: deque[_Sample] = deque(maxlen=_NUM_SAMPLES)
+        self._part = 0
+        self._pose: Sequence[float] | None = None
+        self._imu: tuple[int, float, float, float] | None = None
+        self._imu_yaw: float | None = None
+
+    def add(
+        self,
+        stamp_ns: int,
+        pose: Sequence[float] | None,
+        twist: Sequence[float],
+        twist_variance: Sequence[float] = (0.0, 0.0, 0.0),
+    ) -> None:
+        """Add a message of odometry.
+
+        Args:
+            stamp_ns: later than the latest one, otherwise it is rejected.
+            pose: x and y in m and yaw in rad, in a frame that drifts; None or NaN: unknown.
+            twist: velocities x and y in m/s and yaw rate in rad/s, in the axes of the base.
+            twist_variance: of each; 0: unknown.
+        """
+        vx, vy, yaw_rate = twist
+        speed = math.hypot(vx, vy)
+        # Also false for NaN.
+        if not (speed <= MAX_SPEED and abs(yaw_rate) <= MAX_YAW_RATE):
+            self.rejected += 1
+            return
+        if pose is not None and not all(map(math.isfinite, pose)):
+            pose = None
+        last = self._samples[-1] if self._samples else None
+        gap_ns = 0 if last is None else stamp_ns - last.stamp_ns
+        if last is not None and -_SECOND_NS <= gap_ns <= 0:
+            self.rejected += 1
+            return
+        imu_yaw = self._yaw_of_imu(stamp_ns)
+        if last is None or not 0 < gap_ns <= ODOMETRY_TIMEOUT_S * _SECOND_NS:
+            self._part += 1
+            self._samples.clear()
+            self._samples.append(_Sample(stamp_ns, PathPoint(self._part), (0.0,) * 7))
+            self._pose, self._imu_yaw = pose, imu_yaw
+            return
+        dt = gap_ns / _SECOND_NS
+        if pose is not None and self._pose is not None:
+            moved = _relative(self._pose, pose)
+            poses = (moved[0] / dt, moved[1] / dt, moved[2] / dt)
+            if (
+                math.hypot(poses[0], poses[1]) <= 2.0 * speed + JUMP_SPEED
+                and abs(poses[2]) <= 2.0 * abs(yaw_rate) + JUMP_YAW_RATE
+            ):
+                vx, vy, yaw_rate = poses
+                speed = math.hypot(vx, vy)
+        of_speed, of_yaw_rate = (
+            value if 0.0 < value < _MAX_VARIANCE else default**2
+            for value, default in (
+                (max(twist_variance[:2]), SPEED_SD),
+                (twist_variance[2], YAW_RATE_SD),
+            )
+        )
+        drift = WHEEL_DRIFT * speed
+        share = 2.0 * CORRELATION_S * MOTION_SHARE**2
+        yaw_density = of_yaw_rate * dt + share * yaw_rate**2
+        if imu_yaw is not None and self._imu_yaw is not None and self._imu is not None:
+            yaw_rate, of_yaw_rate = (imu_yaw - self._imu_yaw) / dt, self._imu[2]
+            drift, yaw_density = GYRO_DRIFT, of_yaw_rate * dt
+        self._pose, self._imu_yaw = pose, imu_yaw
+        self.twist, self.twist_variance = (vx, vy, yaw_rate), (of_speed, of_yaw_rate)
+        middle = last.point.yaw + 0.5 * yaw_rate * dt
+        cosine, sine = math.cos(middle), math.sin(middle)
+        rates = (
+            cosine * vx - sine * vy,
+            sine * vx + cosine * vy,
+            yaw_rate,
+            speed,
+            drift,
+            of_speed * dt + share * speed**2,
+            yaw_density,
+        )
+        self._samples.append(_Sample(stamp_ns, _moved(last.point, rates, dt), rates))
+
+    def add_yaw_rate(self, stamp_ns: int, yaw_rate: float, variance: float = 0.0) -> None:
+        """Add a yaw rate of an IMU, rad/s, and its variance (0: unknown); an invalid one is rejected."""
+        if not abs(yaw_rate) <= MAX_YAW_RATE or (
+            self._imu is not None and 0 <= self._imu[0] - stamp_ns < _SECOND_NS
+        ):
+            self.rejected += 1
+            return
+        yaw = 0.0
+        if self._imu is not None:
+            before_ns, before, _, yaw = self._imu
+            yaw += 0.5 * (before + yaw_rate) * (stamp_ns - before_ns) / _SECOND_NS
+        self._set_imu(stamp_ns, yaw_rate, variance, yaw)
+
+    def add_imu_yaw(self, stamp_ns: int, yaw: float, yaw_rate: float, variance: float = 0.0) -> None:
+        """Add the yaw of an IMU in a frame of its own, rad, of which only differences are used, as `add_yaw_rate`."""
+        if self._imu is not None and math.isfinite(yaw):
+            yaw = self._imu[3] + math.remainder(yaw - self._imu[3], math.tau)
+        if not (math.isfinite(yaw) and abs(yaw_rate) <= MAX_YAW_RATE):
+            self.rejected += 1
+            return
+        self._set_imu(stamp_ns, yaw_rate, variance, yaw)
+
+    def _set_imu(self, stamp_ns: int, yaw_rate: float, variance: float, yaw: float) -> None:
+        known = 0.0 < variance < _MAX_VARIANCE
+        self._imu = stamp_ns, yaw_rate, variance if known else YAW_RATE_SD**2, yaw
+
+    def at(self, stamp_ns: int) -> PathPoint | None:
+        """Return the path at a time, by interpolation, or by extrapolation of the latest motion; None: unknown."""
+        samples = self._samples
+        if not samples or stamp_ns > samples[-1].stamp_ns + ODOMETRY_TIMEOUT_S * _SECOND_NS:
+            return None
+        later: _Sample | None = None
+        for sample in reversed(samples):
+            if sample.stamp_ns <= stamp_ns:
+                rates = samples[-1].rates if later is None else later.rates
+                return _moved(sample.point, rates, (stamp_ns - sample.stamp_ns) / _SECOND_NS)
+            later = sample
+        return None
+
+    def _yaw_of_imu(self, stamp_ns: int) -> float | None:
+        if self._imu is None:
+            return None
+        at_ns, rate, _, yaw = self._imu
+        dt = (stamp_ns - at_ns) / _SECOND_NS
+        return yaw + rate * dt if abs(dt) <= IMU_TIMEOUT_S else None
+
+
+def _relative(before: Sequence[float], after: Sequence[float]) -> tuple[float, float, float]:
+    """Return the displacement in the axes halfway between two poses, and the rotation."""
+    dyaw = math.remainder(after[2] - before[2], math.tau)
+    middle = before[2] + 0.5 * dyaw
+    dx, dy = after[0] - before[0], after[1] - before[1]
+    cosine, sine = math.cos(middle), math.sin(middle)
+    return cosine * dx + sine * dy, cosine * dy - sine * dx, dyaw
+
+
+def _moved(point: PathPoint, rates: tuple[float, ...], dt: float) -> PathPoint:
+    part, *values = point
+    return PathPoint(part, *(value + rate * dt for value, rate in zip(values, rates, strict=True)))
