@@ -95,10 +95,10 @@ class OdometryFilter(RangeFilter):
         x[YAW] += point.yaw - before.yaw + drift * float(x[DRIFT])
         if distance or drift:
             # The transition matrix is the identity with these elements.
-            F = np.array([[-dy, dx], [dx, dy]])
+            F = np.array([[-scale * dy, dx], [scale * dx, dy]])
             P[:2] += F @ P[YAW:DRIFT]
             P[YAW] += drift * P[DRIFT]
-            P[:, :2] += P[:, YAW:DRIFT] @ F
+            P[:, :2] += P[:, YAW:DRIFT] @ F.T
             P[:, YAW] += drift * P[:, DRIFT]
         q = max(point.position_variance - before.position_variance, 0.0)
         P[0, 0] += q

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from uwb_mitigation.positioning.dead_reckoning import DeadReckoning, PathPoint
 from uwb_mitigation.positioning.initialization import IMPLAUSIBLE
@@ -83,7 +83,7 @@ class RobotEstimator(TagEstimator):
             self._add_recorded(*self._recorded.popleft())
         estimate = super().add(stamp_ns, anchor, range_m, variance_m2)
         self._update_robot(anchor, range_m, variance_m2)
-        return estimate if self._known is None else self._known.estimate_robot(stamp_ns, self.odometry)
+        return estimate if self._known is None else self._estimate(self._known, stamp_ns)
 
     def add_height(self, height_m: float, variance_m2: float) -> None:
         """Update with the antenna's height; see `TagEstimator.add_height`."""
@@ -99,12 +99,18 @@ class RobotEstimator(TagEstimator):
         ahead = self._known.copy()
         ahead.advance(self._seconds(stamp_ns), point)
         self._confine(ahead)
-        return ahead.estimate_robot(stamp_ns, self.odometry)
+        return self._estimate(ahead, stamp_ns)
 
     def restart(self, stamp_ns: int | None = None) -> None:
         """Reset position and heading, but not the statistics."""
         super().restart(stamp_ns)
         self._forget(None)
+
+    def _estimate(self, known: OdometryFilter, stamp_ns: int) -> Estimate:
+        estimate = known.estimate_robot(stamp_ns, self.odometry)
+        if self._area is None:
+            return estimate
+        return replace(estimate, position=self._area.clip(estimate.position))
 
     def _add_recorded(self, stamp_ns: int, kind: int, row: int) -> None:
         odometry, imu = self._robot.odometry, self._robot.imu

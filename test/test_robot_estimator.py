@@ -1,0 +1,363 @@
+"""Position and heading of a robot with odometry."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from drives import HALL, NANOSECONDS, circuit, drive
+
+from uwb_mitigation.positioning.dead_reckoning import ODOMETRY_TIMEOUT_S, DeadReckoning, PathPoint
+from uwb_mitigation.positioning.filter import FIRST_ERROR, RangeFilter
+from uwb_mitigation.positioning.geometry import Area, Height
+from uwb_mitigation.positioning.noise_model import NoiseModel
+from uwb_mitigation.positioning.odometry_filter import OdometryFilter
+from uwb_mitigation.positioning.robot_estimator import RobotEstimator
+from uwb_mitigation.positioning.tag_estimator import EstimatorConfig, RobotData, TagEstimator
+from uwb_mitigation.positioning.tracks import Imu, Odometry, Ranges, Track
+
+RATE_HZ = 50.0
+LEVEL = Height(1.0, 0.05)
+TWIST_COVARIANCE = np.diag([0.02**2] * 3)
+
+
+def wrapped(angle):
+    return np.angle(np.exp(1j * np.asarray(angle)))
+
+
+class Robot:
+    """A robot on an ellipse, whose wheels measure 2 % too much and drift by 0.01 rad/m.
+
+    Args:
+        facing: the angle between its x axis and its direction of travel.
+        slip: seconds between which the wheels turn at an additional 1 m/s.
+        stand: seconds between which it stands.
+    """
+
+    def __init__(self, *, facing=0.0, lever=(0.0, 0.0, 0.0), slip=(0.0, 0.0), stand=(0.0, 0.0), seconds=60.0):
+        self.facing, self.lever, self.stand = facing, lever, stand
+        time_s = np.arange(round(seconds * RATE_HZ) + 1) / RATE_HZ
+        pose = np.column_stack([self.base(time_s)[:, :2], self.yaw(time_s)])
+        step = np.diff(pose, axis=0)
+        cosine, sine = np.cos(pose[:-1, 2]), np.sin(pose[:-1, 2])
+        twist = np.zeros_like(pose)
+        twist[1:, 0] = cosine * step[:, 0] + sine * step[:, 1]
+        twist[1:, 1] = cosine * step[:, 1] - sine * step[:, 0]
+        twist[1:, 2] = step[:, 2]
+        twist *= RATE_HZ * 1.02
+        twist[:, 2] += 0.01 * np.hypot(*twist[:, :2].T)
+        twist[(time_s >= slip[0]) & (time_s < slip[1]), 0] += 1.0
+        yaw = np.concatenate([[0.0], np.cumsum(twist[1:, 2] / RATE_HZ)])
+        before = np.concatenate([[0.0], yaw[:-1]])
+        cosine, sine = np.cos(before) / RATE_HZ, np.sin(before) / RATE_HZ
+        x = np.cumsum(cosine * twist[:, 0] - sine * twist[:, 1])
+        y = np.cumsum(sine * twist[:, 0] + cosine * twist[:, 1])
+        n = len(time_s)
+        covariance = np.broadcast_to(TWIST_COVARIANCE, (n, 3, 3))
+        stamps = np.rint(time_s * NANOSECONDS).astype(np.int64)
+        self.odometry = Odometry(stamps, np.column_stack([x, y, yaw]), np.zeros((n, 3, 3)), twist, covariance)
+        self.config = EstimatorConfig(
+            HALL, NoiseModel(), LEVEL, robot=RobotData(self.odometry, lever_arm=lever)
+        )
+
+    def _moving(self, time_s):
+        begin, end = self.stand
+        return np.where(time_s < begin, time_s, np.maximum(time_s - (end - begin), begin))
+
+    def base(self, time_s):
+        return circuit(self._moving(time_s))
+
+    def yaw(self, time_s):
+        phase = 0.2 * self._moving(time_s)
+        return np.unwrap(np.arctan2(3 * np.cos(phase), -4 * np.sin(phase))) + self.facing
+
+    def antenna(self, time_s):
+        yaw = self.yaw(time_s)
+        x, y, z = self.lever
+        arm = np.column_stack(
+            [np.cos(yaw) * x - np.sin(yaw) * y, np.sin(yaw) * x + np.cos(yaw) * y, np.full_like(yaw, z)]
+        )
+        return self.base(time_s) + arm
+
+    def ranges(self, seconds=60.0, seed=1) -> Ranges:
+        return drive(seconds=seconds, seed=seed, path=self.antenna)[0]
+
+    def errors(self, track: Track, after_s=0.0):
+        """Return the errors of antenna and yaw after a time, and the standard deviations of the yaw."""
+        late = track.take(track.stamp_ns >= after_s * NANOSECONDS)
+        time_s = late.stamp_ns / NANOSECONDS
+        error = late.position[:, :2] - self.antenna(time_s)[:, :2]
+        known = np.isfinite(late.yaw[:, 0])
+        of_yaw = wrapped(late.yaw[known, 0] - self.yaw(time_s)[known])
+        return np.hypot(*error.T), of_yaw, np.sqrt(late.yaw[known, 4])
+
+
+def rms(values) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+@pytest.mark.parametrize("facing", [0.0, 1.1, 2.2, 3.3, 4.4, 5.5])
+def test_heading_is_found_from_any_start(facing: float):
+    robot = Robot(facing=facing)
+    estimator = RobotEstimator(robot.config)
+    track = estimator.run(robot.ranges())
+    found_s = track.stamp_ns[np.isfinite(track.yaw[:, 0])][0] / NANOSECONDS
+    distance, of_yaw, sd = robot.errors(track, 12.0)
+    assert found_s < 15.0
+    assert len(of_yaw) == len(distance), "the heading is not lost again"
+    assert rms(of_yaw) < math.radians(3.0)
+    assert np.mean(np.abs(of_yaw) < 1.96 * sd) > 0.9
+    assert estimator.counts["odometry wrong"] == 0
+
+
+def test_odometry_reduces_the_position_error():
+    robot = Robot()
+    plain = replace(robot.config, robot=None)
+    results = [
+        (rms(robot.errors(RobotEstimator(robot.config).run(ranges), 5.0)[0]),
+         rms(robot.errors(TagEstimator(plain).run(ranges), 5.0)[0]))
+        for ranges in (robot.ranges(seed=seed) for seed in range(4))
+    ]  # fmt: skip
+    with_odometry, without = np.mean(results, axis=0)
+    assert with_odometry < 0.8 * without
+
+
+def test_lever_arm_is_rotated_by_the_heading():
+    robot = Robot(lever=(0.5, 0.2, 0.3))
+    distance, of_yaw, _ = robot.errors(RobotEstimator(robot.config).run(robot.ranges()), 12.0)
+    wrong = replace(robot.config, robot=RobotData(robot.odometry, lever_arm=(-0.5, -0.2, 0.3)))
+    reversed_arm = robot.errors(RobotEstimator(wrong).run(robot.ranges()), 12.0)
+    assert rms(of_yaw) < math.radians(3.0)
+    assert rms(distance) < 0.2
+    assert rms(reversed_arm[1]) > 2.0 * rms(of_yaw)
+
+
+def test_heading_of_a_stationary_robot_is_unknown():
+    robot = Robot(stand=(0.0, 30.0))
+    track = RobotEstimator(robot.config).run(robot.ranges())
+    known = np.isfinite(track.yaw[:, 0])
+    assert not known[track.stamp_ns < 30 * NANOSECONDS].any()
+    assert known[track.stamp_ns > 45 * NANOSECONDS].all()
+
+
+def test_slipping_wheels_are_detected():
+    robot = Robot(slip=(20.0, 26.0))
+    estimator = RobotEstimator(robot.config)
+    track = estimator.run(robot.ranges())
+    assert estimator.counts["odometry wrong"] >= 1
+    distance, of_yaw, _ = robot.errors(track, 40.0)
+    assert len(of_yaw) == len(distance)
+    assert rms(of_yaw) < math.radians(4.0)
+    slipping = (track.stamp_ns > 20 * NANOSECONDS) & (track.stamp_ns < 27 * NANOSECONDS)
+    # The wheels measure 6 m too much.
+    assert robot.errors(track.take(slipping))[0].max() < 1.5
+
+
+def test_missing_odometry_leaves_ranges_only():
+    robot = Robot()
+    kept = np.flatnonzero(
+        (robot.odometry.stamp_ns < 20 * NANOSECONDS) | (robot.odometry.stamp_ns > 30 * NANOSECONDS)
+    )
+    columns = (robot.odometry.pose, robot.odometry.pose_covariance, robot.odometry.twist)
+    odometry = Odometry(
+        robot.odometry.stamp_ns[kept],
+        *(column[kept] for column in columns),
+        robot.odometry.twist_covariance[kept],
+    )
+    estimator = RobotEstimator(replace(robot.config, robot=RobotData(odometry)))
+    ranges = robot.ranges()
+    track = estimator.run(ranges)
+    known = np.isfinite(track.yaw[:, 0])
+    missing = (track.stamp_ns > 21 * NANOSECONDS) & (track.stamp_ns < 30 * NANOSECONDS)
+    assert not known[missing].any()
+    assert known[(track.stamp_ns > 15 * NANOSECONDS) & (track.stamp_ns < 20 * NANOSECONDS)].all()
+    assert known[track.stamp_ns > 42 * NANOSECONDS].all()
+    assert estimator.counts["odometry missing"] == 1
+    alone = TagEstimator(replace(robot.config, robot=None)).run(ranges)
+    np.testing.assert_allclose(
+        track.position[missing], alone.position[np.isin(alone.stamp_ns, track.stamp_ns[missing])]
+    )
+
+
+def test_kidnapped_robot_is_found_again():
+    robot = Robot()
+    ranges = robot.ranges()
+    moved = ranges.stamp_ns > 30 * NANOSECONDS
+    # It is now on the other side of the hall, and faces another direction; its wheels did not turn.
+    other = drive(seconds=60.0, path=lambda time_s: (12.0, 9.0, 2.0) + robot.antenna(time_s) * (-1, -1, 1))[0]
+    ranges = replace(ranges, range_m=np.where(moved, other.range_m, ranges.range_m))
+    estimator = RobotEstimator(robot.config)
+    track = estimator.run(ranges)
+    late = track.take(track.stamp_ns > 45 * NANOSECONDS)
+    time_s = late.stamp_ns / NANOSECONDS
+    true = (12.0, 9.0, 2.0) + robot.antenna(time_s) * (-1, -1, 1)
+    assert estimator.counts["odometry wrong"] >= 1
+    assert rms(np.linalg.norm((late.position - true)[:, :2], axis=1)) < 0.3
+    assert rms(wrapped(late.yaw[:, 0] - robot.yaw(time_s) - math.pi)) < math.radians(5.0)
+
+
+def test_robot_position_is_predicted_with_odometry_without_ranges():
+    robot = Robot()
+    ranges = robot.ranges()
+    kept = ranges.take((ranges.stamp_ns < 20 * NANOSECONDS) | (ranges.stamp_ns > 28 * NANOSECONDS))
+    track = RobotEstimator(robot.config).run(kept)
+    first = track.take(track.stamp_ns > 28 * NANOSECONDS).take(slice(0, 5))
+    assert np.isfinite(first.yaw[:, 0]).all()
+    assert robot.errors(first)[0].max() < 0.6
+
+
+def test_estimates_stay_inside_the_area():
+    robot = Robot(lever=(0.5, 0.0, 0.0))
+    area = Area((2.0, 1.5, 0.0), (10.0, 7.5, 2.0))
+    track = RobotEstimator(replace(robot.config, area=area)).run(robot.ranges())
+    assert np.isfinite(track.yaw[:, 0]).any()
+    assert area.holds(track.position).all()
+
+
+def test_prediction_after_the_last_range_uses_the_motion():
+    robot = Robot()
+    estimator = RobotEstimator(replace(robot.config, robot=None))
+    ranges = robot.ranges(seconds=20.0)
+    rows = iter(range(len(robot.odometry)))
+    for stamp, row, range_m in zip(*(one.tolist() for one in (ranges.stamp_ns, ranges.anchor, ranges.range_m)), strict=True):  # fmt: skip
+        for one in rows:
+            estimator.odometry.add(
+                int(robot.odometry.stamp_ns[one]),
+                robot.odometry.pose[one].tolist(),
+                robot.odometry.twist[one].tolist(),
+            )
+            if robot.odometry.stamp_ns[one] >= stamp:
+                break
+        estimate = estimator.add(stamp, row, range_m)
+    ahead = estimator.at(int(ranges.stamp_ns[-1]) + 300_000_000)
+    assert ahead.heading is not None
+    true = robot.antenna(np.array([ahead.stamp_ns / NANOSECONDS]))[0]
+    assert np.linalg.norm((ahead.position - true)[:2]) < np.linalg.norm((estimate.position - true)[:2])
+    # Without odometry for longer, only the ranges-only estimate is left.
+    late = estimator.at(int(ranges.stamp_ns[-1]) + 2 * NANOSECONDS)
+    assert late is not None
+    assert late.heading is None
+
+
+def _filter(lever=(0.4, -0.3, 0.2), yaw=0.7) -> OdometryFilter:
+    rng = np.random.default_rng(3)
+    start = RangeFilter(HALL, NoiseModel(), 0.0, np.array([5.0, 4.0, 1.0]), np.diag([0.04, 0.09, 0.01]))
+    start.P[FIRST_ERROR:, FIRST_ERROR:] += 0.001
+    one = OdometryFilter(start, PathPoint(1, 0.3, 0.2, 0.5), lever, yaw, 0.2)
+    one.x[:] += 0.01 * rng.normal(size=len(one.x))
+    return one
+
+
+def test_derivatives_of_the_filter_are_those_of_its_equations():
+    point = PathPoint(1, 0.8, 0.1, 0.9, 0.6, 0.012)
+
+    def after(x):
+        one = _filter()
+        one.x[:] = x
+        one.advance(1e-9, point)
+        return one.x.copy()
+
+    one = _filter()
+    x = one.x.copy()
+    n, step = len(x), 1e-6
+    F = np.column_stack([(after(x + step * e) - after(x - step * e)) / (2 * step) for e in np.eye(n)])
+    before = one.P.copy()
+    one.advance(1e-9, point)
+    noise = one.P - F @ before @ F.T
+    # Only the height is uncertain: the floor may be a slope.
+    np.testing.assert_allclose(noise[[0, 1, 3, 4, 5, 6], :FIRST_ERROR], 0.0, atol=1e-8)
+
+    def distance(x):
+        other = _filter()
+        other.x[:] = x
+        return other._linearize(HALL.position[1])
+
+    x = one.x.copy()
+    one._linearize(HALL.position[1])
+    H = np.array([(distance(x + step * e) - distance(x - step * e)) / (2 * step) for e in np.eye(n)])
+    np.testing.assert_allclose(one._H[:4], H[:4], atol=1e-6)
+
+
+def test_filter_starts_with_the_antenna_of_the_range_filter():
+    start = RangeFilter(HALL, NoiseModel(), 0.0, np.array([5.0, 4.0, 1.0]), np.diag([0.04, 0.09, 0.01]))
+    one = OdometryFilter(start, PathPoint(1), (0.4, -0.3, 0.2), 0.7, 0.2)
+    estimate = one.estimate_robot(0, DeadReckoning())
+    np.testing.assert_allclose(estimate.position, start.position)
+    np.testing.assert_allclose(estimate.covariance[:3, :3], start.P[:3, :3], atol=1e-12)
+
+
+def _add_all(path: DeadReckoning, odometry: Odometry, *, poses: bool) -> None:
+    for stamp, pose, twist in zip(odometry.stamp_ns.tolist(), odometry.pose.tolist(), odometry.twist.tolist(), strict=True):  # fmt: skip
+        path.add(stamp, pose if poses else None, twist)
+
+
+@pytest.mark.parametrize("poses", [True, False])
+def test_path_follows_poses_or_twists(poses: bool):
+    odometry = Robot(seconds=5.0).odometry
+    path = DeadReckoning()
+    _add_all(path, odometry, poses=poses)
+    for row in (60, 200, 249):
+        point = path.at(int(odometry.stamp_ns[row]))
+        np.testing.assert_allclose((point.x, point.y, point.yaw), odometry.pose[row], atol=0.01)
+    between = path.at(int(odometry.stamp_ns[100]) + 10_000_000)
+    np.testing.assert_allclose((between.x, between.y), odometry.pose[100:102, :2].mean(axis=0), atol=0.005)
+    end_ns = int(odometry.stamp_ns[-1])
+    assert path.at(end_ns + round(0.9 * ODOMETRY_TIMEOUT_S * NANOSECONDS)) is not None
+    assert path.at(end_ns + round(1.1 * ODOMETRY_TIMEOUT_S * NANOSECONDS)) is None
+
+
+def test_path_survives_a_reset_of_the_odometry_frame():
+    odometry = Robot(seconds=5.0).odometry
+    pose = odometry.pose.copy()
+    pose[150:] += (7.0, -3.0, 0.0)
+    path = DeadReckoning()
+    _add_all(path, replace(odometry, pose=pose), poses=True)
+    point = path.at(int(odometry.stamp_ns[-1]))
+    assert math.hypot(*(np.array([point.x, point.y]) - odometry.pose[-1, :2])) < 0.05
+
+
+def test_yaw_rates_of_the_imu_replace_those_of_the_wheels():
+    robot = Robot(seconds=5.0)
+    path = DeadReckoning()
+    for stamp, pose, twist in zip(robot.odometry.stamp_ns.tolist(), robot.odometry.pose.tolist(), robot.odometry.twist.tolist(), strict=True):  # fmt: skip
+        path.add_yaw_rate(stamp, 0.25, 1e-4)
+        path.add(stamp, pose, twist)
+    assert path.at(robot.odometry.stamp_ns[-1].item()).yaw == pytest.approx(1.25, abs=0.01)
+
+
+def test_orientation_of_the_imu_counts_by_its_differences():
+    robot = Robot(seconds=5.0)
+    n = len(robot.odometry)
+    yaw = wrapped(3.0 + 0.3 * robot.odometry.stamp_ns / NANOSECONDS)
+    imu = Imu(robot.odometry.stamp_ns, np.zeros(n), np.full(n, 1e-4), yaw, np.full(n, 1e-4))
+    data = RobotData(robot.odometry, imu, imu_orientation=True)
+    estimator = RobotEstimator(replace(robot.config, robot=data))
+    estimator.run(robot.ranges(seconds=5.0))
+    assert estimator.odometry.at(4_900_000_000).yaw == pytest.approx(0.3 * 4.9, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    "twist", [(math.nan, 0.0, 0.0), (0.0, math.inf, 0.0), (1e9, 0.0, 0.0), (0.0, 0.0, 99.0)]
+)
+def test_invalid_odometry_is_rejected(twist):
+    path = DeadReckoning()
+    path.add(0, None, (0.1, 0.0, 0.0))
+    path.add(20_000_000, None, twist)
+    path.add(20_000_000, (math.nan, 0.0, 0.0), (0.1, 0.0, 0.0), (math.nan, -1.0, math.inf))
+    path.add(10_000_000, None, (0.1, 0.0, 0.0))
+    path.add_yaw_rate(0, twist[2] + twist[0] + twist[1])
+    assert path.rejected == 3
+    assert path.at(20_000_000).x == pytest.approx(0.002)
+
+
+def test_motion_backwards_in_time_returns_to_the_start():
+    odometry = Robot(seconds=5.0).odometry
+    back = odometry.reversed(int(odometry.stamp_ns[-1]))
+    ahead, path = DeadReckoning(), DeadReckoning()
+    _add_all(ahead, odometry, poses=False)
+    _add_all(path, back, poses=True)
+    end, start = ahead.at(5 * NANOSECONDS), path.at(5 * NANOSECONDS)
+    assert start.yaw == pytest.approx(-end.yaw, abs=0.01)
+    assert math.hypot(start.x, start.y) == pytest.approx(math.hypot(end.x, end.y), abs=0.05)
