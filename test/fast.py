@@ -56,4 +56,5 @@ def _find_imports(path: Path) -> Iterator[str]:
             yield node.module
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
         elif isinstance(node, ast.Call) and ast.unparse(node.func) == "pytest.importorskip":
-            yield str(ast.literal_eval(node.args[0]))
+            # A variable names an optional library, not a file of the project.
+            yield from (str(argument.value) for argument in node.args if isinstance(argument, ast.Constant))

@@ -54,7 +54,7 @@ class Viewer(ManagedNode):
 
     def __init__(self) -> None:
         super().__init__("viewer", VIEWER)
-        self._subscriptions: dict[str, Subscription] = {}
+        self._subscribed: dict[str, Subscription] = {}
         self._range_node: Node | None = None
         self._ranges: dict[str, Subscription] = {}
         self._anchors: AnchorMap | None = None
@@ -120,7 +120,7 @@ class Viewer(ManagedNode):
 
     def close(self) -> None:
         super().close()
-        self._subscriptions, self._ranges, self._anchors_out, self._range_node = {}, {}, None, None
+        self._subscribed, self._ranges, self._anchors_out, self._range_node = {}, {}, None, None
 
     def describe(self) -> diagnostics.Description:
         pages = 0 if self._view is None else self._view.pages
@@ -131,9 +131,9 @@ class Viewer(ManagedNode):
     def _subscribe(
         self, kind: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile = _QOS
     ) -> None:
-        if topic not in self._subscriptions:
+        if topic not in self._subscribed:
             made = self.create_subscription(kind, topic, callback, qos)
-            self._subscriptions[topic] = self.destroy_at_close(made, self.destroy_subscription)
+            self._subscribed[topic] = self.destroy_at_close(made, self.destroy_subscription)
 
     def _subscribe_ranges(self, kind: type, topic: str) -> None:
         """Subscribe to a topic of ranges; they are queued until `_read_queued_ranges`."""
@@ -171,7 +171,7 @@ class Viewer(ManagedNode):
         head, _, tail = self.resolve_topic_name(topics.POSE, only_expand=True).rpartition("/")
         own = re.compile(rf"{re.escape(head)}/(tag_(?:\d+|0x[0-9a-f]+))/{re.escape(tail)}")
         for topic, _ in self.get_topic_names_and_types():
-            if (found := own.fullmatch(topic)) and len(self._subscriptions) < MAX_TAGS:
+            if (found := own.fullmatch(topic)) and len(self._subscribed) < MAX_TAGS:
                 self._subscribe(PoseWithCovarianceStamped, topic, partial(self._feed.pose, found[1]))
 
     def _missing(self) -> MissingData:
