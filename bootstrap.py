@@ -18,7 +18,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent
@@ -122,22 +122,22 @@ def create_environment() -> None:
     (VENV / "environment.sh").write_text(f". {ros}\nexport {exported}\n" if SYSTEM_ROS else "")
 
 
-def build_messages() -> None:
-    """Build the message packages with CMake and install them into the environment."""
+def build_messages(packages: Sequence[Path] = (), prefix: Path | None = None) -> None:
+    """Build message packages with CMake, by default those of this project, and install them, by default into the environment."""
     # ROS's macros reject apostrophes and non-ASCII letters in paths: build through a link with a plain path.
     with tempfile.TemporaryDirectory(prefix="uwb_messages_") as folder:
         checkout = Path(folder, "checkout")
         checkout.symlink_to(ROOT)
         environment = checkout / VENV.name
-        packages = [checkout / "msg_defs"]
-        if not (SYSTEM_ROS and (ROS_PREFIX / "share" / "tf2_msgs").is_dir()):
-            packages.append(checkout / "cmake" / "tf2_msgs")
+        packages = packages or [checkout / "msg_defs"]
+        if prefix is None and not (SYSTEM_ROS and (ROS_PREFIX / "share" / "tf2_msgs").is_dir()):
+            packages = [*packages, checkout / "cmake" / "tf2_msgs"]
         script = (
             f'. "{environment}/environment.sh"; export PATH="{environment}/bin:$PATH" '
             f'AMENT_PREFIX_PATH="${{AMENT_PREFIX_PATH:-{environment}}}"; exec "$@"'
         )
         options = [
-            f"-DCMAKE_INSTALL_PREFIX={environment}",
+            f"-DCMAKE_INSTALL_PREFIX={prefix or environment}",
             f"-DPython3_EXECUTABLE={environment / 'bin' / 'python'}",
             f"-DCMAKE_PROJECT_INCLUDE={checkout / 'cmake' / 'ros_wheels.cmake'}",
             *("-DBUILD_TESTING=OFF", "-DCMAKE_BUILD_TYPE=Release"),

@@ -120,6 +120,7 @@ setup(
             "locator = uwb_mitigation.entry:locator",
             "pipeline = uwb_mitigation.entry:pipeline",
             "monitor = uwb_mitigation.entry:monitor",
+            "px4 = uwb_mitigation.entry:px4",
             "viewer = uwb_mitigation.entry:viewer",
             "uwb-mitigation = uwb_mitigation.entry:command_line",
         ],

@@ -81,6 +81,7 @@ NODES = {
     "locator": ("locator",),
     "pipeline": ("driver", "mitigator", "locator"),
     "monitor": (),
+    "px4": (),
     "viewer": ("viewer",),
 }
 BLOCK = re.compile(r"^(?:```(?:console|sh|bash)?\n(.*?)^```|((?:    .*\n|\n)+))", re.MULTILINE | re.DOTALL)

@@ -41,6 +41,11 @@ def monitor() -> None:
     _node("monitor")
 
 
+def px4() -> None:
+    """Run the node `px4`."""
+    _node("px4")
+
+
 def viewer() -> None:
     """Run the node `viewer`."""
     _node("viewer")
