@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from benchmarks.emulate_evb1000 import emulate_evb1000
+from benchmarks.emulate_uci import emulate_uci
 from uwb_mitigation.commands import console
 from uwb_mitigation.commands.console import JsonOption, Table
 from uwb_mitigation.errors import UwbMitigationError, missing_dependency
@@ -30,6 +31,7 @@ app = typer.Typer(
     add_completion=False,
 )
 app.command("emulate-evb1000")(emulate_evb1000)
+app.command("emulate-uci")(emulate_uci)
 
 
 @app.command()

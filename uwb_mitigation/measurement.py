@@ -37,6 +37,23 @@ class Encoding(enum.IntEnum):
     MAGNITUDE = 1
 
 
+class Radio(enum.IntEnum):
+    """Type of the radio that measured a CIR; the values of `Cir.msg`."""
+
+    UNKNOWN = 0
+    DW1000 = 1
+    DW3000 = 2
+    QM35 = 3
+
+
+class Segment(enum.IntEnum):
+    """Part of the frame on which a CIR was measured; the values of `Cir.msg`."""
+
+    UNKNOWN = 0
+    IPATOV = 1
+    STS = 2
+
+
 class Status(enum.IntEnum):
     """Status of a corrected range; the values of `RangeCorrected.msg`.
 
@@ -74,6 +91,8 @@ class Cir:
         first_path_power_dbm: first-path signal level; NaN = unknown.
         channel: UWB channel number; 0 = unknown.
         prf_mhz: pulse repetition frequency, 16 or 64; 0 = unknown.
+        radio: type of the radio; UNKNOWN in recordings of earlier versions, which contain only the DW1000.
+        segment: part of the frame; UNKNOWN as for `radio`.
     """
 
     samples: NDArray[np.int16]
@@ -88,6 +107,8 @@ class Cir:
     first_path_power_dbm: float = math.nan
     channel: int = 0
     prf_mhz: int = 0
+    radio: Radio = Radio.UNKNOWN
+    segment: Segment = Segment.UNKNOWN
 
     def __len__(self) -> int:
         """The number of samples in time (a complex sample counts once)."""

@@ -38,6 +38,7 @@ from uwb_mitigation.nodes.lifecycle import ManagedNode, refuse_errors
 from uwb_mitigation.nodes.live_feeds import PREFIX, BoardFeed, Feed, RadioFeed, open_radios, settings_of
 from uwb_mitigation.nodes.parameter_tables import DRIVER
 from uwb_mitigation.nodes.replay import ReplayFeed
+from uwb_mitigation.nodes.uci_feed import UciFeed, uci_settings
 from uwb_mitigation.offsets import NO_OFFSETS, read_offsets
 from uwb_mitigation.sources.source import Source
 
@@ -62,6 +63,10 @@ def open_source(value: Callable[[str], Any]) -> Source:
     if not value("path"):
         raise ParameterError("parameter path is empty", valid="the recording to replay, as -p path:=FILE")
     path = Path(value("path")).expanduser()
+    if value("source") == "uci":
+        from uwb_mitigation.radio.uci.capture import UciCapture
+
+        return UciCapture(path)
     if value("source") == "mcap":
         from uwb_mitigation.sources.mcap import McapRecording
 
@@ -126,6 +131,8 @@ class Driver(ManagedNode):
             "evb1000": self._prepare_radios,
             "spi": self._prepare_radios,
         }
+        if not self.value("path"):
+            prepare["uci"] = self._prepare_uci
         self._make_feed = prepare.get(self.value("source"), self._prepare_replay)()
         self._ranges = self.publisher(RangeCir, topics.RANGE_RAW)
 
@@ -182,6 +189,10 @@ class Driver(ManagedNode):
 
         return make
 
+    def _prepare_uci(self) -> Callable[[], Feed]:
+        uci_settings(self.value)
+        return lambda: UciFeed(self.value, self._publish_range, self.now_ns, self.get_logger())
+
     def _prepare_replay(self) -> Callable[[], Feed]:
         source = self.destroy_at_close(open_source(self.value), lambda source: source.close())
         self._truths = self.publisher(RangeTruth, topics.RANGE_TRUTH)
@@ -210,7 +221,8 @@ class Driver(ManagedNode):
     def _check(self, values: Mapping[str, Any]) -> None:
         """Raise for radio settings that contradict each other, and for offsets that cannot be read."""
         if any(name.startswith(PREFIX) for name in values):
-            settings_of(lambda name: values.get(name, self.value(name)))
+            check = uci_settings if self.value("source") == "uci" else settings_of
+            check(lambda name: values.get(name, self.value(name)))
         if "offsets" in values:
             self._prepared_offsets = read_offsets(str(values["offsets"]))
 

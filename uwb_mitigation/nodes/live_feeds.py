@@ -318,7 +318,7 @@ def settings_of(value: Value) -> RadioSettings:
         role=Role[get("role").upper()],
         address=_address(get("address"), "address") if get("address") != "" else 0,
         pan=get("pan"),
-        channel=get("channel"),
+        channel=get("channel") or RadioSettings().channel,
         prf_mhz=int(get("prf")),
         preamble=get("preamble"),
         preamble_code=get("preamble_code"),

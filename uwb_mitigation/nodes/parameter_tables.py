@@ -88,39 +88,44 @@ _SENSOR_RANGES = Parameter(
 
 
 def _radio(name: str, default: Value, description: str, **options: Any) -> Parameter:
-    text = f"{description} (serial, evb1000, spi)."
-    return Parameter(f"radio.{name}", default, text, live=True, **options)
+    sources = "serial, evb1000, spi, uci" if name in _UCI else "serial, evb1000, spi"
+    return Parameter(f"radio.{name}", default, f"{description} ({sources}).", live=True, **options)
+
+
+_UCI = ("role", "address", "channel", "preamble_code", "window", "anchors", "rate", "report")
+"""Parameters of radios that UCI boards use, too."""
 
 
 RADIO = (
     _radio("role", "tag", "What the first radio is: a tag, which ranges with anchors, or an anchor, which answers",
            choices=("tag", "anchor")),
-    _radio("address", "", "Its address, such as 34 or '0xdeca010203040506'; empty = the chip's own", or_number=True),
+    _radio("address", "", "Its address, such as 34 or '0xdeca010203040506'; empty = the chip's own; with uci a number below "
+           "65535, 1 for a tag and 2 for an anchor if empty, and each further port has the next one", or_number=True),
     _radio("pan", 0x5542, "Network; frames of others are refused", low=0, high=0xFFFE),
-    _radio("channel", 5, "UWB channel: 1 to 5, or 7", low=1, high=7),
+    _radio("channel", 0, "UWB channel: 1 to 5, or 7; 5 or 9 with uci. 0 = 5, or 9 with uci", low=0, high=9),
     _radio("prf", 64, "Pulse repetition frequency: 16 or 64", low=16, high=64, unit="MHz"),
     _radio("preamble", 128, "Preamble: 64, 128, 256, 512, 1024, 1536, 2048 or 4096 symbols; a longer one increases range "
            "and air time", low=64, high=4096, unit="symbols"),
-    _radio("preamble_code", 0, "0 = the first code of the standard for channel and PRF", low=0, high=24),
+    _radio("preamble_code", 0, "0 = the first code of the standard for channel and PRF, or 10 with uci", low=0, high=24),
     _radio("data_rate", 6800, "110, 850 or 6800", low=110, high=6800, unit="kbit/s"),
     _radio("decawave_sfd", False, "Decawave's start-of-frame delimiter instead of the standard's"),
     _radio("tx_power", 0, "Register TX_POWER in smart-power format (lowest octet: frames of any length; below 6.8 Mbit/s "
            "it is used for all). 0: value from OTP, or the manual's", low=0, high=0xFFFFFFFF),
     _radio("antenna_delay", 0, "Total TX + RX antenna delay. 0: value from OTP, or 2 x 16436",
            low=0, high=0x1FFFE, unit="ticks"),
-    _radio("window", 157, "Samples of the CIR of each range; 1016 = all", low=0, high=1016),
-    _radio("anchors", "", "Addresses that a tag polls in turn, with commas between; empty = those that it finds",
-           or_number=True),
-    _radio("rate", 0.0, "Highest number of exchanges per second; 0 = as fast as possible",
-           low=0.0, high=1000.0, unit="Hz"),
+    _radio("window", 157, "Samples of the CIR of each range; 1016 = all, or 255 with uci", low=0, high=1016),
+    _radio("anchors", "", "Addresses that a tag polls in turn, with commas between; empty = those that it finds, or with "
+           "uci those at the other ports", or_number=True),
+    _radio("rate", 0.0, "Highest number of exchanges per second; 0 = as fast as possible; with uci 0 = 55 with a "
+           "window of 16, 11 with 157, the same at all boards", low=0.0, high=1000.0, unit="Hz"),
     _radio("report", False, "An anchor publishes its ranges here too"),
     _radio("bias_correction", False, "Correct ranges for the received power (APS011); the models were trained without"),
 )  # fmt: skip
 
 DRIVER = (
     Parameter("source", "simulated", "Where measurements come from.",
-              choices=("mcap", "decaranging", "simulated", "serial", "evb1000", "spi"), filed=False),
-    Parameter("path", "", "Recording to replay: a bag (mcap), a log or a folder of logs (decaranging)."),
+              choices=("mcap", "decaranging", "simulated", "serial", "evb1000", "spi", "uci"), filed=False),
+    Parameter("path", "", "Recording to replay: a bag (mcap), a log or a folder of logs (decaranging), or a capture (uci)."),
     Parameter("topic", "/uwb/range_raw", "Topic of the ranges inside the bag (mcap)."),
     Parameter("cir", "final", "Which frame's CIR belongs to a range (decaranging).",
               choices=("final", "poll")),
@@ -147,7 +152,7 @@ DRIVER = (
               "otherwise 3 s.",
               low=-1.0, high=3600.0, unit="s"),
     Parameter("port", "", "Serial port of the board: a path such as /dev/ttyACM0, or "
-              "usb:VENDOR:PRODUCT[:SERIAL] with ids in hexadecimal, wherever it is plugged in (serial, evb1000); or "
+              "usb:VENDOR:PRODUCT[:SERIAL] with ids in hexadecimal, wherever it is plugged in (serial, evb1000, uci); or "
               "/dev/spidev0.0 (spi). Several radios are separated by commas: the first has radio.role, the others "
               "are anchors."),
     Parameter("baud", 921_600, "Baud rate of a serial line; native USB ignores it (serial).",
@@ -161,6 +166,9 @@ DRIVER = (
     Parameter("board_model", "", "Model id that the board must hold, eight hexadecimal digits; its corrections "
               "by another model are withheld. Empty = any (serial)."),
     *RADIO,
+    Parameter("radio.tags", "", "Addresses of the tags of an anchor, separated by commas; empty = 1 (uci).",
+              live=True, or_number=True),
+    Parameter("capture", "", "File for the raw bytes of the boards, which path replays; it is replaced. Empty = none (uci)."),
     Parameter("radio.reset", "", "The chip's reset line, as gpiochip0:25; empty = not wired (spi)."),
     Parameter("frame_id", "uwb_antenna", "Frame of the receiving antenna, where the source names none."),
     _SENSOR_RANGES,

@@ -1,0 +1,398 @@
+"""UCI boards: packets, sessions and joins on byte streams, without ports."""
+
+from __future__ import annotations
+
+import contextlib
+import struct
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from benchmarks.uci_board import FIRST_PATH, UciBoardModel, UciFaults, taps_of
+from uwb_mitigation.errors import DamagedRecordingError, LinkError, ParameterError, RecordingError
+from uwb_mitigation.link.layout import Role
+from uwb_mitigation.measurement import Radio, RangeMeasurement, Segment
+from uwb_mitigation.radio.uci import messages
+from uwb_mitigation.radio.uci.capture import FIRST_LINE, CaptureWriter, UciCapture
+from uwb_mitigation.radio.uci.cir import read_cir
+from uwb_mitigation.radio.uci.messages import Diagnostics, Kind
+from uwb_mitigation.radio.uci.packets import MAX_GAP_NS, PacketDecoder, encode
+from uwb_mitigation.radio.uci.session import UciSession, UciSettings
+
+MS = 10**6
+RANGE = bytes.fromhex(
+    # seq 7, handle 1, rfu, 200 ms, two-way, rfu, short, primary session, rfu, 1 record
+    "07000000 01000000 00 c8000000 01 00 00 00000000 00000000 01"
+    # peer 2, ok, NLOS unknown, 210 cm, AoA, slot, RSSI 78 dBm, rfu
+    "0200 00 ff d200 000000000000000000000000 00 9c 0000000000000000000000"
+)
+WORKING_CONFIG = bytes.fromhex(
+    "2103006a 01000000 1b 000101 110101 030100 010102 06020000 040109 220101 020100 120103 2e010b"
+    "27020807 2806010203040506 0d0101 2b080000000000000000 14010a 150102 08026009 0904c8000000 1b0119"
+    "32020000 2c0100 130100 2d0100 050101 07020100 240100 350101"
+)
+
+
+class Bench:
+    """A session and a board model, connected in virtual time."""
+
+    def __init__(self, board: UciBoardModel | None = None, **settings: object) -> None:
+        self.board = board or UciBoardModel()
+        self.session = UciSession(UciSettings(**{"window": 16, **settings}))
+        self.now_ns = 0
+        self.found: list[RangeMeasurement] = []
+        self.sent = b""
+        self.session.opened(0)
+
+    def step(self, data: bytes = b"", ms: float = 5.0) -> None:
+        self.now_ns += round(ms * MS)
+        self.found += self.session.receive(data, self.now_ns, self.now_ns)
+        sent = self.session.outgoing()
+        self.sent += sent
+        answer = self.board.receive(sent, self.now_ns / 1e9)
+        if answer:
+            self.found += self.session.receive(answer, self.now_ns, self.now_ns)
+
+    def start(self, steps: int = 2000) -> Bench:
+        for _ in range(steps):
+            self.step()
+            if not self.session.state:
+                return self
+        raise AssertionError(self.session.state)
+
+    def exchange(self, sequence: int, distance_m: float = 3.0) -> None:
+        (handle,) = self.board.sessions
+        self.step(self.board.exchange(handle, sequence, distance_m), 18.0)
+
+
+def bench(**faults: object) -> Bench:
+    return Bench(UciBoardModel(faults=UciFaults(**faults)))
+
+
+def test_a_range_notification_of_a_real_board_is_parsed():
+    (message,) = PacketDecoder().feed(bytes.fromhex("62000038") + RANGE, 0)
+    (record,) = message.content.records
+    assert (message.content.handle, message.content.sequence) == (1, 7)
+    assert (record.peer, record.status, record.range_m, record.rssi_dbm) == (2, 0, 2.10, -78.0)
+
+
+@pytest.mark.parametrize(("at", "value"), [(27, 0x21), (29, 0xFFFF)])
+def test_a_failed_or_invalid_range_has_no_distance(at: int, value: int):
+    data = bytearray(RANGE)
+    data[at : at + 2] = struct.pack("<H", value) if at == 29 else bytes([value, 0xFF])
+    assert np.isnan(messages.parse_ranges(bytes(data)).records[0].range_m)
+
+
+def test_the_settings_of_a_session_are_those_that_worked_on_a_real_board():
+    commands = Bench(address=0x1111, peers=(1,), interval_ms=200).start().sent
+    packet = commands[commands.index(bytes.fromhex("21030070")) :][: 4 + 0x70]
+    expected = WORKING_CONFIG.replace(b"\x06\x02\x00\x00", b"\x06\x02\x11\x11").replace(
+        b"\x1b\x01\x19", b"\x1b\x01\x06"
+    )
+    assert packet[:3] + b"\x6a" + packet[4:8] + b"\x1b" + packet[9:-6] == expected
+    assert packet[8] == 0x1D
+    assert packet[-6:] == bytes.fromhex("e80101e90178")
+
+
+def test_the_cir_has_the_taps_of_the_exchange():
+    run = Bench(window=157).start()
+    for sequence in range(1, 4):
+        run.exchange(sequence)
+    assert run.session.window == (157, 5)
+    measured = run.found[1]
+    cir = measured.cir
+    assert (measured.tag_id, measured.anchor_id, measured.sequence, measured.range_m) == (1, 2, 2, 3.0)
+    assert np.array_equal(cir.samples.reshape(-1, 2), taps_of(2, 157, 5))
+    assert (cir.start_index, cir.first_path_index) == (FIRST_PATH - 5, FIRST_PATH + 2 / 64)
+    assert (cir.radio, cir.segment, cir.rx_power_dbm, cir.channel) == (Radio.DW3000, Segment.STS, -80.5, 9)
+
+
+@pytest.mark.parametrize("tap_bytes", [4, 6, 8])
+@pytest.mark.parametrize("max_taps", [16, 64])
+def test_a_smaller_window_and_other_taps_are_used_as_delivered(tap_bytes: int, max_taps: int):
+    run = Bench(UciBoardModel(max_taps=max_taps, tap_bytes=tap_bytes), window=157).start()
+    run.exchange(1)
+    assert run.session.window == (max_taps, 5)
+    assert np.array_equal(run.found[0].cir.samples.reshape(-1, 2), taps_of(1, max_taps, 5))
+
+
+def test_firmware_with_a_count_of_one_byte_gets_its_window():
+    assert Bench(UciBoardModel(count_bytes=1), window=157).start().session.window == (157, 5)
+
+
+def test_taps_of_18_bits_are_scaled_to_16_bits():
+    taps = np.array([[0, 0], [131071, -131072], [-2, 2]], np.int32)
+    block = messages.CirBlock(0, 1, True, -1, taps)
+    frame = messages.FrameReport(1, True, None, 0.0, (), (block,), False)
+    cir = read_cir(Diagnostics(1, 1, (frame,)), 9, -70.0).cir
+    assert np.all(np.abs(cir.samples.astype(int)) < 32767)
+    assert np.abs(cir.samples.reshape(-1, 2) * cir.scale - taps).max() < cir.scale
+    assert (cir.first_path_index, cir.rx_power_dbm) == (1.0, -70.0)
+
+
+@pytest.mark.parametrize(("offset", "consistent"), [(-5, True), (5, True), (-9, False), (120, False)])
+def test_the_first_path_is_checked_against_the_peak(offset: int, consistent: bool):
+    block = messages.CirBlock(0, 1, True, offset, taps_of(1, 64, 5))
+    metrics = messages.SegmentMetrics(0, 1, True, -80.0, -84.0, 362, 362.5, 363)
+    frame = messages.FrameReport(2, True, None, 0.0, (metrics,), (block,), False)
+    reading = read_cir(Diagnostics(1, 1, (frame,)), 9, np.nan)
+    assert reading.consistent is consistent
+    assert np.isfinite(reading.cir.first_path_index) == consistent
+
+
+def test_an_anchor_uses_the_final_frame_and_ranges_with_its_tag():
+    run = Bench(role=Role.ANCHOR, address=2, peers=(1,)).start()
+    run.exchange(1)
+    assert (run.found[0].tag_id, run.found[0].anchor_id) == (1, 2)
+    assert len(run.found[0].cir) == 16
+
+
+@pytest.mark.parametrize(
+    "faults", [{"swap": 1.0}, {"late": 0.2}, {"garbage": 0.3}, {"garbage": 0.2, "swap": 0.2, "late": 0.1}]
+)
+def test_every_range_arrives_with_its_own_cir_or_without(faults: dict):
+    run = bench(**faults).start()
+    for sequence in range(1, 400):
+        run.exchange(sequence, 1.0 + sequence / 100)
+    run.step(ms=500)
+    assert len({m.sequence for m in run.found}) > 370
+    assert sum(len(m.cir) > 0 for m in run.found) > 250
+    for measured in run.found:
+        assert measured.range_m == pytest.approx(1.0 + measured.sequence / 100)
+        if len(measured.cir):
+            assert np.array_equal(measured.cir.samples.reshape(-1, 2), taps_of(measured.sequence, 16, 5))
+
+
+def test_diagnostics_after_the_next_range_are_joined_on_a_good_link():
+    run = bench(late=1.0).start()
+    for sequence in range(1, 50):
+        run.exchange(sequence)
+    assert all(len(m.cir) == 16 for m in run.found)
+    assert len(run.found) >= 47
+
+
+def test_a_damaged_sequence_number_is_not_joined():
+    run = Bench().start()
+    (handle,) = run.board.sessions
+    for sequence in range(1, 101):
+        run.exchange(sequence)
+    count = len(run.found)
+    # The range of exchange 101 claims to be 102, whose own range and the diagnostics of 101 are lost.
+    run.step(run.board.range_packet(handle, 102, 9.0), 18)
+    run.step(run.board.diagnostics_packet(handle, 102), 18)
+    run.step(ms=500)
+    assert [(m.range_m, len(m.cir)) for m in run.found[count:]] == [(9.0, 0)]
+
+
+def test_halves_of_two_notifications_are_not_assembled():
+    run = Bench(window=64).start()
+    (handle,) = run.board.sessions
+    for sequence in range(1, 20):
+        run.exchange(sequence)
+    first, second = (run.board.diagnostics_packet(handle, number) for number in (20, 21))
+    assert len(first) > 2 * 259 - 100
+    run.step(run.board.range_packet(handle, 20, 3.0), 18)
+    run.step(first[:259], 0.1)
+    run.step(run.board.range_packet(handle, 21, 3.0) + second[259:], 20)
+    run.step(ms=500)
+    assert [len(m.cir) for m in run.found[-2:]] == [0, 0]
+
+
+def test_a_range_of_another_session_or_peer_is_ignored():
+    run = Bench().start()
+    (handle,) = run.board.sessions
+    swapped = UciFaults(swapped_ids=True)
+    for number in (handle, handle + 7):
+        run.board.sessions[number] = run.board.sessions[handle]
+        run.board.faults = swapped if number == handle else UciFaults()
+        run.step(run.board.range_packet(number, 1, 3.0) + run.board.diagnostics_packet(number, 1), 18)
+    run.step(ms=500)
+    assert not run.found
+    assert run.session.counts["unknown_session"] >= 2
+
+
+def test_error_answers_are_repeated_until_the_board_ranges():
+    run = bench(errors=0.15).start(20_000)
+    assert run.session.counts["error_answers"] > 0
+
+
+def test_rejected_optional_settings_are_left_out():
+    class Old(UciBoardModel):
+        def _command(self, name, payload, now_s):
+            if name == messages.SET_APP_CONFIG and bytes([0x35, 1, 1]) in payload:
+                return self._respond(name, bytes([0x04, 1, 0x35, 0x04]))
+            return super()._command(name, payload, now_s)
+
+    run = Bench(Old()).start()
+    (session,) = run.board.sessions.values()
+    assert 0x35 not in session.config
+    assert 0xE9 in session.config
+
+
+def test_firmware_that_sends_no_handle_uses_the_number_of_the_session():
+    class Later(UciBoardModel):
+        def _command(self, name, payload, now_s):
+            answer = super()._command(name, payload, now_s)
+            if name == messages.SESSION_INIT:
+                (number,) = struct.unpack_from("<I", payload)
+                self.sessions[number] = self.sessions.pop(self._handles)
+                answer = self._respond(name, b"\0")
+            return answer
+
+    run = Bench(Later()).start()
+    run.exchange(1)
+    assert len(run.found) == 1
+
+
+def test_a_board_that_restarts_by_itself_ranges_again():
+    run = Bench().start()
+    run.step(run.board.boot())
+    run.start()
+    run.exchange(1)
+    assert run.session.starts == 2
+    assert run.found
+
+
+def test_a_silent_board_is_started_again_but_a_waiting_anchor_is_not():
+    run = Bench(role=Role.ANCHOR, address=2, peers=(1,)).start()
+    for _ in range(2000):
+        run.step()
+    assert run.session.starts == 1
+    run.board.receive = lambda data, now_s: b""
+    for _ in range(2000):
+        run.step()
+    assert run.session.state
+
+
+def test_ranges_without_diagnostics_are_published_without_delay():
+    run = Bench().start()
+    (handle,) = run.board.sessions
+    for sequence in range(100):
+        run.step(run.board.range_packet(handle, sequence, 3.0), 18)
+    assert len(run.found) == 100
+    assert run.found[-1].stamp_ns == run.now_ns
+
+
+@given(st.binary(max_size=600), st.integers(1, 40))
+@settings(max_examples=300)
+def test_no_bytes_make_a_session_fail(data: bytes, piece: int):
+    run = Bench().start()
+    (handle,) = run.board.sessions
+    good = run.board.range_packet(handle, 1, 3.0)
+    for at in range(0, len(data), piece):
+        run.step(data[at : at + piece])
+    # A damaged length may hide up to 255 bytes; after a timeout the decoder searches inside of them.
+    for _ in range(300):
+        run.step(ms=2 * MAX_GAP_NS / MS)
+    counts = run.session._decoder.counts
+    before = counts["messages"]
+    run.step(good)
+    assert counts["messages"] > before
+
+
+@given(st.binary(max_size=300))
+@settings(max_examples=300)
+def test_no_payload_makes_a_parser_fail(data: bytes):
+    for parse in (messages.parse_ranges, messages.parse_diagnostics):
+        with contextlib.suppress(LinkError):
+            parse(data)
+    messages.calibration_values(data)
+    messages.rejected_tags(data)
+
+
+@given(st.data())
+@settings(max_examples=200)
+def test_damaged_diagnostics_are_parsed_or_refused(data: st.DataObject):
+    board = UciBoardModel()
+    run = Bench(board, window=16).start()
+    (handle,) = board.sessions
+    whole = bytearray(board.diagnostics_packet(handle, 1)[4:])
+    for _ in range(data.draw(st.integers(1, 4))):
+        whole[data.draw(st.integers(0, len(whole) - 1))] = data.draw(st.integers(0, 255))
+    try:
+        content = messages.parse_diagnostics(bytes(whole))
+    except LinkError:
+        return
+    reading = read_cir(content, 9, np.nan)
+    assert len(reading.cir.samples) % 2 == 0
+    assert run.session.state == ""
+
+
+def test_intact_packets_between_damaged_ones_are_found():
+    good = bytes.fromhex("62000038") + RANGE
+    random = np.random.default_rng(3)
+    decoder, count = PacketDecoder(), 0
+    for _ in range(200):
+        damaged = bytearray(good)
+        damaged[3] = int(random.integers(0, 256))
+        count += len(decoder.feed(random.bytes(20) + good + bytes(damaged) + good, 0))
+    # A header among the random bytes can hide the packet after it.
+    assert count > 300
+
+
+def test_a_long_command_is_sent_in_fragments():
+    sent = encode(1, 3, bytes(600))
+    assert [sent[0], sent[254], sent[508]] == [0x31, 0x31, 0x21]
+    assert len(sent) == 600 + 3 * 4
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [{"address": 0}, {"peers": ()}, {"peers": (1,)}, {"channel": 4}, {"window": 256}, {"interval_ms": 5}, {"preamble_code": 3}],
+)  # fmt: skip
+def test_invalid_settings_are_refused(bad: dict):
+    with pytest.raises(ParameterError):
+        UciSession(replace(UciSettings(), **bad))
+
+
+def test_a_capture_replays_the_same_measurements(tmp_path):
+    run = Bench()
+    writer = CaptureWriter(tmp_path / "session.txt")
+    writer.add_board(0, run.session.settings)
+    receive = run.session.receive
+
+    def recorded(data: bytes, now_ns: int, stamp_ns: int) -> list[RangeMeasurement]:
+        writer.add(0, data, sent=False)
+        return receive(data, now_ns, stamp_ns)
+
+    run.session.receive = recorded
+    run.start()
+    for sequence in range(1, 30):
+        run.exchange(sequence)
+    writer.close()
+    capture = UciCapture(tmp_path / "session.txt")
+    for _ in range(2):
+        replayed = [record.measurement for record in capture]
+        assert [m.sequence for m in replayed] == [m.sequence for m in run.found]
+        assert all(
+            np.array_equal(a.cir.samples, b.cir.samples) for a, b in zip(replayed, run.found, strict=True)
+        )
+
+
+@pytest.mark.parametrize(
+    ("text", "error"),
+    [
+        ("", RecordingError),
+        ("0.1 0 < 00", RecordingError),
+        (f"{FIRST_LINE}\n0.1 0 < 00", DamagedRecordingError),
+        (f"{FIRST_LINE}\nboard 0 {{", DamagedRecordingError),
+        (f'{FIRST_LINE}\nboard 0 {{"role": "TAG", "peers": [1]}}', DamagedRecordingError),
+        (f'{FIRST_LINE}\nboard 0 {{"role": "TAG", "peers": [2]}}\ninf 0 < 00', DamagedRecordingError),
+        (f'{FIRST_LINE}\nboard 0 {{"role": "TAG", "peers": [2]}}\n1 0 < 0g', DamagedRecordingError),
+        (f"{FIRST_LINE}\n" + "9" * 400_000, DamagedRecordingError),
+    ],
+)
+def test_a_capture_that_is_damaged_is_refused(tmp_path, text: str, error: type):
+    path = tmp_path / "session.txt"
+    path.write_text(text)
+    with pytest.raises(error):
+        list(UciCapture(path))
+
+
+def test_responses_have_no_effect_before_their_command():
+    run = Bench()
+    run.step(encode(*messages.RANGE_START, b"\0", Kind.RESPONSE) * 10)
+    assert run.session.state

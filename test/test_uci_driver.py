@@ -1,0 +1,94 @@
+"""The node `driver` with emulated UCI boards on pseudo-terminals, over real ROS 2."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import ros_harness
+from ros_harness import diagnostic_values
+from uwb_mitigation_msgs.msg import RangeCir
+
+from benchmarks.uci_board import EmulatedUciBoards, UciFaults
+from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.link.layout import Role
+from uwb_mitigation.nodes.parameter_tables import DRIVER
+from uwb_mitigation.nodes.uci_feed import uci_settings
+
+DEFAULTS = {row.name: row.default for row in DRIVER}
+
+
+@pytest.fixture
+def boards(tmp_path: Path) -> Iterator[EmulatedUciBoards]:
+    with EmulatedUciBoards(boards=3, links=tmp_path / "uci") as emulated:
+        yield emulated
+
+
+@pytest.mark.ros
+def test_two_anchors_range_through_a_capture_and_an_unplugged_cable(
+    ros: ros_harness.Ros, boards: EmulatedUciBoards, tmp_path: Path
+):
+    raw = ros.collect(RangeCir, "/uwb/range_raw")
+    ports = ",".join(str(tmp_path / f"uci{number}") for number in range(3))
+    capture = tmp_path / "capture.txt"
+    node = ros.start("driver", "source:=uci", f"port:={ports}", "radio.window:=16", f"capture:={capture}")
+    ros.spin_until(lambda: {2, 3} == {message.anchor_id for message in raw} and len(raw) > 20, 60.0)
+    assert {len(message.cir.samples) for message in raw} == {32}
+    assert all(abs(message.range - 3.0) < 0.2 for message in raw)
+
+    status = ros.diagnosis("driver", lambda status: "ranging" in status.message)
+    assert diagnostic_values(status)["board 0: CIR taps"] == "16"
+
+    boards.unplug(1)
+    ros.diagnosis("driver", lambda status: "uci1" in status.message)
+    ros.spin_until(lambda: raw[-1].anchor_id == 3 and len({m.anchor_id for m in raw[-10:]}) == 1, 30.0)
+    boards.plug(1)
+    ros.spin_until(lambda: len({m.anchor_id for m in raw[-10:]}) == 2, 30.0)
+    boards.set_faults(UciFaults(empty_cir=True))
+    ros.spin_until(lambda: not raw[-1].cir.samples, 30.0)
+    assert node.signal(signal.SIGINT) == 0
+
+    measured = {(m.anchor_id, m.sequence): m.range for m in raw}
+    raw.clear()
+    ros.start("driver", "source:=uci", f"path:={capture}", "rate:=50.0")
+    ros.spin_until(lambda: len(raw) > 50, 60.0)
+    assert all(measured.get((m.anchor_id, m.sequence), m.range) == m.range for m in raw)
+
+
+def value_of(**changes: object):
+    values = DEFAULTS | {name.replace("__", "."): value for name, value in changes.items()}
+    return values.__getitem__
+
+
+def test_the_first_board_is_the_tag_of_the_others():
+    tag, anchor, other = uci_settings(value_of(port="/dev/a,/dev/b,/dev/c", radio__rate=20.0))
+    assert (tag.role, tag.address, tag.peers, tag.channel) == (Role.TAG, 1, (2, 3), 9)
+    assert (other.role, other.address, other.peers) == (Role.ANCHOR, 3, (1,))
+    assert tag.effective_interval_ms == anchor.effective_interval_ms == 100
+    assert tag.session_id(3) == other.session_id(1)
+
+
+def test_boards_at_two_computers_have_matching_settings():
+    (tag,) = uci_settings(value_of(port="/dev/a"))
+    (anchor,) = uci_settings(value_of(port="/dev/a", radio__role="anchor"))
+    assert tag.session_id(2) == anchor.session_id(1)
+    assert tag.effective_interval_ms == anchor.effective_interval_ms == 88
+    assert (anchor.address, anchor.peers) == (2, (1,))
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"radio__channel": 2},
+        {"radio__address": "0x12345"},
+        {"radio__anchors": "x"},
+        {"radio__window": 1016},
+        {"radio__rate": 200.0},
+        {"radio__role": "anchor", "port": "/dev/a,/dev/b"},
+    ],
+)
+def test_settings_that_no_board_can_have_are_refused(bad: dict):
+    with pytest.raises(ParameterError, match=r"radio\."):
+        uci_settings(value_of(**{"port": "/dev/a"} | bad))

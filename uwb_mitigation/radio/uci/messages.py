@@ -1,0 +1,345 @@
+"""Contents of UCI packets: commands, range notifications and range diagnostics. No I/O.
+
+The layouts are public facts about Qorvo's firmware. No real diagnostics notification was available: its parser
+skips unknown fields by their size, and takes the sizes of taps and windows from the notification.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.errors import LinkError
+
+
+class Kind(enum.IntEnum):
+    """Message type (MT) of a packet."""
+
+    COMMAND = 1
+    RESPONSE = 2
+    NOTIFICATION = 3
+
+
+class Group(enum.IntEnum):
+    """Group identifier (GID) of a packet."""
+
+    CORE = 0x0
+    SESSION = 0x1
+    RANGING = 0x2
+    VENDOR = 0xB
+    ANDROID = 0xC
+    TEST = 0xD
+    CALIBRATION = 0xE
+
+
+RESET = (Group.CORE, 0)
+DEVICE_STATUS = (Group.CORE, 1)
+DEVICE_INFO = (Group.CORE, 2)
+GENERIC_ERROR = (Group.CORE, 7)
+SESSION_INIT = (Group.SESSION, 0)
+SESSION_DEINIT = (Group.SESSION, 1)
+SESSION_STATUS = (Group.SESSION, 2)
+SET_APP_CONFIG = (Group.SESSION, 3)
+GET_SESSION_STATE = (Group.SESSION, 6)
+RANGE_START = (Group.RANGING, 0)
+"""The command that starts a session; the notification of this number contains ranges."""
+RANGE_STOP = (Group.RANGING, 1)
+RANGE_DIAGNOSTICS = (Group.VENDOR, 3)
+BOOT = (Group.VENDOR, 0x31)
+SET_CALIBRATION = (Group.CALIBRATION, 0x2A)
+GET_CALIBRATION = (Group.CALIBRATION, 0x2B)
+
+STATUS_OK = 0
+DEVICE_READY = 1
+
+
+class SessionState(enum.IntEnum):
+    """State of a session in `SESSION_STATUS`."""
+
+    INIT = 0
+    DEINIT = 1
+    ACTIVE = 2
+    IDLE = 3
+
+
+RANGE_STATUSES = {
+    0x1B: "negative distance",
+    0x20: "transmission failed",
+    0x21: "reception timeout",
+    0x22: "PHY decoding error",
+    0x23: "no time of arrival",
+    0x24: "STS error",
+}
+
+
+class Frame(enum.IntEnum):
+    """Frames of an exchange on which the radio reports a CIR (`msg_id`)."""
+
+    INITIATION = 0
+    RESPONSE = 1
+    FINAL = 2
+
+
+@dataclass(frozen=True, slots=True)
+class RangeRecord:
+    """One range of a notification.
+
+    Attributes:
+        peer: address of the other board.
+        status: 0 or a key of `RANGE_STATUSES`.
+        range_m: NaN = invalid.
+        rssi_dbm: receive level; NaN = unknown.
+    """
+
+    peer: int
+    status: int
+    range_m: float
+    rssi_dbm: float
+
+
+@dataclass(frozen=True, slots=True)
+class RangeNotification:
+    """The ranges of one round of a session."""
+
+    handle: int
+    sequence: int
+    records: tuple[RangeRecord, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class SegmentMetrics:
+    """Levels and positions of one segment of a received frame.
+
+    Attributes:
+        receiver: antenna port.
+        segment: 0 = Ipatov, 1 to 4 = STS0 to STS3.
+        primary: the segment that the range is based on.
+        rx_dbm, first_path_dbm: levels.
+        first_path_index, peak_index: whole taps of the segment's accumulator.
+        first_path: fractional tap index.
+    """
+
+    receiver: int
+    segment: int
+    primary: bool
+    rx_dbm: float
+    first_path_dbm: float
+    first_path_index: int
+    first_path: float
+    peak_index: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CirBlock:
+    """A window of the accumulator.
+
+    Attributes:
+        receiver, segment, primary: see `SegmentMetrics`.
+        offset: as received: start of the window relative to the first path, or index of the first path in the window.
+        taps: int32 (n, 2), real and imaginary parts.
+    """
+
+    receiver: int
+    segment: int
+    primary: bool
+    offset: int
+    taps: NDArray[np.int32]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameReport:
+    """Diagnostics of one frame of an exchange.
+
+    Attributes:
+        frame: `msg_id`; see `Frame`.
+        received: the board received the frame; otherwise it transmitted it.
+        emitter: address of the transmitter; None = unknown.
+        clock_offset_ppm: carrier frequency offset; NaN = unknown.
+        confidence: the report has confidence values, which only a QM35 sends.
+    """
+
+    frame: int
+    received: bool
+    emitter: int | None
+    clock_offset_ppm: float
+    metrics: tuple[SegmentMetrics, ...]
+    cirs: tuple[CirBlock, ...]
+    confidence: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Diagnostics:
+    """Diagnostics of the frames of one round of a session."""
+
+    handle: int
+    sequence: int
+    frames: tuple[FrameReport, ...]
+
+
+_RANGE_HEADER = struct.Struct("<IIxIBxBI4xB")
+_RANGE_RECORD_BYTES = 31
+_DIAGNOSTICS_HEADER = struct.Struct("<IIB")
+_REPORT = struct.Struct("<4B")
+_FIELD = struct.Struct("<BH")
+_METRICS = struct.Struct("<BhHHHHHHH")
+_CIR = struct.Struct("<BbBB")
+_TAP_BYTES = (4, 6, 8)
+_INVALID_CM = 0xFFFF
+
+
+def parse_ranges(payload: bytes) -> RangeNotification:
+    """Parse a range notification.
+
+    Raises:
+        LinkError: its length does not fit its number of ranges.
+    """
+    if len(payload) < _RANGE_HEADER.size:
+        raise LinkError(f"range notification of {len(payload)} bytes", valid=f"{_RANGE_HEADER.size} or more")
+    sequence, handle, _, _, extended, _, count = _RANGE_HEADER.unpack_from(payload)
+    expected = _RANGE_HEADER.size + count * _RANGE_RECORD_BYTES
+    if len(payload) != expected:
+        raise LinkError(f"range notification of {len(payload)} bytes", valid=f"{expected}")
+    width = 8 if extended == 1 else 2
+    records = []
+    for at in range(_RANGE_HEADER.size, expected, _RANGE_RECORD_BYTES):
+        status, _, distance_cm = struct.unpack_from("<BBH", payload, at + width)
+        rssi = payload[at + width + 17]
+        valid = status == STATUS_OK and distance_cm != _INVALID_CM
+        records.append(
+            RangeRecord(
+                int.from_bytes(payload[at : at + width], "little"),
+                status,
+                distance_cm / 100 if valid else math.nan,
+                -rssi / 2 if rssi else math.nan,
+            )
+        )
+    return RangeNotification(handle, sequence, tuple(records))
+
+
+def parse_diagnostics(payload: bytes) -> Diagnostics:
+    """Parse a diagnostics notification, assembled from its fragments.
+
+    Raises:
+        LinkError: it ends early, or has bytes after its last report.
+    """
+    try:
+        handle, sequence, count = _DIAGNOSTICS_HEADER.unpack_from(payload)
+        at, frames = _DIAGNOSTICS_HEADER.size, []
+        for _ in range(count):
+            frame, action, _, fields = _REPORT.unpack_from(payload, at)
+            at += _REPORT.size
+            found: dict[int, bytes] = {}
+            for _ in range(fields):
+                kind, size = _FIELD.unpack_from(payload, at)
+                at += _FIELD.size
+                if at + size > len(payload):
+                    raise LinkError(f"diagnostics field {kind} of {size} bytes ends after the notification")
+                found[kind] = payload[at : at + size]
+                at += size
+            frames.append(_frame(frame, action, found))
+    except struct.error as error:
+        raise LinkError(f"diagnostics notification of {len(payload)} bytes ends early") from error
+    if any(payload[at:]):
+        raise LinkError(f"diagnostics notification with {len(payload) - at} further bytes")
+    return Diagnostics(handle, sequence, tuple(frames))
+
+
+def _frame(frame: int, action: int, fields: Mapping[int, bytes]) -> FrameReport:
+    # A field of a size that its type does not have is skipped, like a field of an unknown type.
+    emitter, offset, metrics = fields.get(5, b""), fields.get(4, b""), fields.get(6, b"")
+    return FrameReport(
+        frame,
+        action == 0,
+        int.from_bytes(emitter, "little") if len(emitter) == 2 else None,
+        int.from_bytes(offset, "little", signed=True) / (1 << 26) * 1e6 if len(offset) == 4 else math.nan,
+        tuple(_metrics(metrics, at) for at in range(0, len(metrics), _METRICS.size))
+        if len(metrics) % _METRICS.size == 0
+        else (),
+        _cir_blocks(fields.get(7, b"")),
+        8 in fields or 9 in fields,
+    )
+
+
+def _metrics(data: bytes, at: int) -> SegmentMetrics:
+    receiver, _, rx, index, level, position, peak, _, _ = _METRICS.unpack_from(data, at)
+    return SegmentMetrics(
+        receiver >> 4,
+        receiver & 7,
+        bool(receiver & 8),
+        -rx / 256 if rx else math.nan,
+        -level / 256 if level else math.nan,
+        index,
+        position / 64,
+        peak,
+    )
+
+
+def _cir_blocks(data: bytes) -> tuple[CirBlock, ...]:
+    blocks, at = [], 0
+    while at < len(data):
+        receiver, offset, count, tap_bytes = _CIR.unpack_from(data, at)
+        at += _CIR.size
+        if tap_bytes not in _TAP_BYTES or at + count * tap_bytes > len(data):
+            raise LinkError(f"CIR of {count} taps of {tap_bytes} bytes", valid="taps of 4, 6 or 8 bytes")
+        taps = _taps(data[at : at + count * tap_bytes], tap_bytes // 2)
+        at += count * tap_bytes
+        blocks.append(CirBlock(receiver >> 4, receiver & 7, bool(receiver & 8), offset, taps))
+    return tuple(blocks)
+
+
+def _taps(data: bytes, width: int) -> NDArray[np.int32]:
+    """Return signed little-endian numbers of `width` bytes, int32 (n, 2)."""
+    octets = np.frombuffer(data, np.uint8).reshape(-1, width)
+    filled = np.zeros((len(octets), 4), np.uint8)
+    filled[:, 4 - width :] = octets
+    numbers: NDArray[np.int32] = filled.view("<i4")[:, 0] >> (8 * (4 - width))
+    return numbers.reshape(-1, 2)
+
+
+def app_config(handle: int, entries: Sequence[tuple[int, bytes]]) -> bytes:
+    """Return the payload of SET_APP_CONFIG."""
+    packed = b"".join(bytes([tag, len(value)]) + value for tag, value in entries)
+    return struct.pack("<IB", handle, len(entries)) + packed
+
+
+def rejected_tags(payload: bytes) -> dict[int, int]:
+    """Return the parameters that a response to SET_APP_CONFIG rejects, {tag: status}."""
+    count = payload[1] if len(payload) > 1 else 0
+    pairs = payload[2 : 2 + 2 * count]
+    return dict(zip(pairs[::2], pairs[1::2], strict=False))
+
+
+def set_calibration(values: Mapping[str, int], count_bytes: int) -> bytes:
+    """Return the payload of SET_CALIBRATION for 16-bit values; firmware versions differ in the size of the count."""
+    packed = b"".join(
+        bytes([len(key)]) + key.encode() + b"\2" + value.to_bytes(2, "little")
+        for key, value in values.items()
+    )
+    return len(values).to_bytes(count_bytes, "little") + packed
+
+
+def get_calibration(keys: Sequence[str]) -> bytes:
+    """Return the payload of GET_CALIBRATION."""
+    packed = b"".join(bytes([len(key)]) + key.encode() for key in keys)
+    return len(keys).to_bytes(2, "little") + packed
+
+
+def calibration_values(payload: bytes) -> dict[str, int]:
+    """Return the values in a response to GET_CALIBRATION that the board knows, {key: value}."""
+    values: dict[str, int] = {}
+    at = 3
+    while at < len(payload):
+        key = payload[at + 1 : at + 1 + payload[at]]
+        at += 1 + len(key)
+        status, length = (*payload[at : at + 2], 0, 0)[:2]
+        value = payload[at + 2 : at + 2 + length]
+        at += 2 + length
+        if status == STATUS_OK and len(value) == length > 0:
+            values[key.decode("ascii", "replace")] = int.from_bytes(value, "little")
+    return values
