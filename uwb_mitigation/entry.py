@@ -13,7 +13,7 @@ from collections.abc import Callable
 from typing import Any
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-_NODES = ("driver", "mitigator", "locator", "pipeline", "monitor", "viewer")
+_NODES = ("driver", "mitigator", "locator", "pipeline", "monitor", "px4", "viewer")
 
 
 def driver() -> None:
