@@ -21,7 +21,7 @@ from uwb_mitigation.commands.console import JsonOption, Table
 from uwb_mitigation.errors import UwbMitigationError, missing_dependency
 
 if TYPE_CHECKING:
-    from benchmarks.nodes import Figures
+    from benchmarks.nodes import SubjectResult
 
 app = typer.Typer(
     name="python -m benchmarks",
@@ -167,7 +167,7 @@ def link(
     json: JsonOption = None,
 ) -> None:
     """Decoder with a channel that corrupts bytes: lost frames, speed."""
-    from benchmarks.link import loopback
+    from benchmarks.decoder import loopback
     from uwb_mitigation.link.faults import Faults
 
     faults = Faults(damage, damage, damage)
@@ -284,7 +284,7 @@ def firmware_demo(
     raise typer.Exit(demo.main(recording, count))
 
 
-def nodes_result(figures: Mapping[str, Figures]) -> dict[str, Any]:
+def nodes_result(figures: Mapping[str, SubjectResult]) -> dict[str, Any]:
     """Return figures by subject as plain values, with the ratios between the subjects under `ratios`."""
     result: dict[str, Any] = {}
     for name, of in figures.items():

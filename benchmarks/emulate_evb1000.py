@@ -1,4 +1,4 @@
-"""`python -m benchmarks emulate-evb1000`: radios without hardware, behind the EVB1000's USB-to-SPI protocol."""
+"""`python -m benchmarks emulate-evb1000`: radios without hardware, with the USB-to-SPI protocol of the EVB1000."""
 
 from __future__ import annotations
 
@@ -20,41 +20,51 @@ from uwb_mitigation.errors import ParameterError
 if TYPE_CHECKING:
     from benchmarks.dw1000_model.evb1000 import EmulatedEvb1000s
 
-_UNPLUGGED_S = 0.5
+_UNPLUG_DURATION_S = 0.5
 
 
 def emulate_evb1000(
     recording: Annotated[
         Path | None,
         typer.Argument(
-            metavar="[RECORDING]", help="Its CIRs and errors are the links'; without it, simulated."
+            metavar="[RECORDING]",
+            help="Recording with the CIRs and errors of the radio channels. Default: simulated.",
         ),
     ] = None,
-    boards: Annotated[int, typer.Option(help="How many: the first is the tag, the others anchors.")] = 2,
+    boards: Annotated[
+        int, typer.Option(help="Number of boards: the first is the tag, the others are anchors.")
+    ] = 2,
     link: Annotated[
         Path | None,
         typer.Option(metavar="PREFIX", help="Symbolic links to the ports: PREFIX0, PREFIX1, ..."),
     ] = None,
-    round_trip: Annotated[float, typer.Option(help="s, from a request to its answer over USB.")] = 1.5e-3,
-    rate: Annotated[float, typer.Option(help="How often a link changes to the next CIR, Hz.")] = 20.0,
+    round_trip: Annotated[
+        float, typer.Option(help="Time from a request to its answer over USB, s.")
+    ] = 1.5e-3,
+    rate: Annotated[
+        float, typer.Option(help="Rate at which the radio channels change to the next CIR, Hz.")
+    ] = 20.0,
     ranging: Annotated[
         list[int] | None,
-        typer.Option(metavar="BOARD", help="Switched to ranging, not USB to SPI; may be repeated."),
+        typer.Option(
+            metavar="BOARD", help="Board whose switches select ranging instead of USB to SPI; repeatable."
+        ),
     ] = None,
-    loss: Annotated[float, typer.Option(help="Share of frames lost on the air.")] = 0.0,
-    damage: Annotated[float, typer.Option(help="Share of frames damaged on the air.")] = 0.0,
+    loss: Annotated[float, typer.Option(help="Share of frames that are lost, 0 to 1.")] = 0.0,
+    damage: Annotated[float, typer.Option(help="Share of frames that are damaged, 0 to 1.")] = 0.0,
     distance: Annotated[
         float | None,
-        typer.Option(help="m, between all boards, in line of sight; instead of a recording."),
+        typer.Option(help="Distance between all boards in LOS, m; replaces the recording."),
     ] = None,
     antenna_delay: Annotated[
-        int, typer.Option(help="Antenna delay in the OTP memory of each chip, ticks, TX + RX.")
+        int, typer.Option(help="Total TX + RX antenna delay of each chip, also in its OTP memory, ticks.")
     ] = 32872,
     unplug_every: Annotated[
-        float | None, typer.Option(help="s between pulls of a cable, in turn; SIGUSR1 pulls one too.")
+        float | None,
+        typer.Option(help="Interval at which a cable is unplugged, s. SIGUSR1 also unplugs one."),
     ] = None,
-    duration: Annotated[float | None, typer.Option(help="s, then end; without it, on Ctrl-C.")] = None,
-    seed: Annotated[int, typer.Option(help="Seed of the random numbers.")] = 1,
+    duration: Annotated[float | None, typer.Option(help="Duration, s. Default: until Ctrl-C.")] = None,
+    seed: Annotated[int, typer.Option(help="Seed of all random numbers.")] = 1,
     json: JsonOption = None,
 ) -> None:
     """Emulate EVB1000s without hardware, each on a pseudo-terminal.
@@ -69,9 +79,11 @@ def emulate_evb1000(
             raise ParameterError(f"{name} = {value}", valid="above 0")
     if seed < 0:
         raise ParameterError(f"seed = {seed}", valid="0 or more")
-    switched = frozenset(ranging or ())
-    if not all(0 <= number < boards for number in switched):
-        raise ParameterError(f"ranging = {sorted(switched)}", valid=f"numbers of boards, 0 to {boards - 1}")
+    ranging_boards = frozenset(ranging or ())
+    if not all(0 <= number < boards for number in ranging_boards):
+        raise ParameterError(
+            f"ranging = {sorted(ranging_boards)}", valid=f"numbers of boards, 0 to {boards - 1}"
+        )
     if distance is not None and recording is not None:
         raise ParameterError(f"--distance {distance} with a recording", valid="one of both")
     with open_source(recording, rate, seed) as source:
@@ -80,7 +92,7 @@ def emulate_evb1000(
             boards=boards,
             rate_hz=rate,
             round_trip_s=round_trip,
-            ranging=switched,
+            ranging=ranging_boards,
             port_links=link,
             loss=loss,
             damage=damage,
@@ -88,11 +100,11 @@ def emulate_evb1000(
             antenna_delay=antenna_delay,
             distance_m=DEFAULT_DISTANCE_M if distance is None else distance,
         )
-        with emulated, _signals() as asked:
+        with emulated, _signals() as received_signals:
             for number, port in enumerate(emulated.ports):
                 what = "tag" if number == 0 else f"anchor {number}"
                 console.out.print(f"{what} at {port}", soft_wrap=True, highlight=False)
-            _keep_running(emulated, asked, duration, unplug_every)
+            _keep_running(emulated, received_signals, duration, unplug_every)
     console.write_json(json, {"requests": list(emulated.requests)})
     if emulated.failure is not None:
         raise emulated.failure
@@ -101,27 +113,30 @@ def emulate_evb1000(
 @contextlib.contextmanager
 def _signals() -> Iterator[list[int]]:
     """Collect received SIGUSR1 signals."""
-    asked: list[int] = []
-    before = signal.signal(signal.SIGUSR1, lambda number, _: asked.append(number))
+    received_signals: list[int] = []
+    before = signal.signal(signal.SIGUSR1, lambda number, _: received_signals.append(number))
     try:
-        yield asked
+        yield received_signals
     finally:
         signal.signal(signal.SIGUSR1, before)
 
 
 def _keep_running(
-    emulated: EmulatedEvb1000s, asked: list[int], duration: float | None, unplug_every: float | None
+    emulated: EmulatedEvb1000s,
+    received_signals: list[int],
+    duration: float | None,
+    unplug_every: float | None,
 ) -> None:
-    began = pulled = time.monotonic()
-    turns = itertools.cycle(range(len(emulated.ports)))
-    while emulated.failure is None and (duration is None or time.monotonic() - began < duration):
+    started_s = unplugged_s = time.monotonic()
+    board_numbers = itertools.cycle(range(len(emulated.ports)))
+    while emulated.failure is None and (duration is None or time.monotonic() - started_s < duration):
         time.sleep(0.05)
-        if asked or (unplug_every is not None and time.monotonic() - pulled > unplug_every):
-            asked.clear()
-            number = next(turns)
+        if received_signals or (unplug_every is not None and time.monotonic() - unplugged_s > unplug_every):
+            received_signals.clear()
+            number = next(board_numbers)
             emulated.unplug(number)
-            time.sleep(_UNPLUGGED_S)
+            time.sleep(_UNPLUG_DURATION_S)
             emulated.plug(number)
-            pulled = time.monotonic()
+            unplugged_s = time.monotonic()
             port = emulated.ports[number]
             console.out.print(f"board {number} plugged in again at {port}", soft_wrap=True, highlight=False)

@@ -30,7 +30,7 @@ _START_TIMEOUT_S = 60.0
 _PORT = re.compile(rb"char device redirected to (\S+)")
 
 
-def window_of(measurement: RangeMeasurement, samples: int) -> RangeMeasurement:
+def cut_to_window(measurement: RangeMeasurement, samples: int) -> RangeMeasurement:
     """Reduce a measurement to the `samples` that the network reads; keep all samples if some of these are missing."""
     cir = measurement.cir
     if not math.isfinite(cir.first_path_index):
@@ -82,11 +82,11 @@ class EmulatedFirmware:
             UwbMitigationError: the emulator has exited.
         """
         assert self._radio is not None
-        kind, payload = messages.encode(window_of(measurement, self._samples))
+        kind, payload = messages.encode(cut_to_window(measurement, self._samples))
         try:
             self._radio.sendall(self._encoder.encode(kind, payload))
         except OSError as error:
-            raise UwbMitigationError(f"the emulated board is gone: {error.strerror or error}") from error
+            raise UwbMitigationError(f"the emulated board has exited: {error.strerror or error}") from error
 
     def close(self) -> None:
         """Stop the emulator; may be called twice."""
@@ -124,14 +124,14 @@ class EmulatedFirmware:
             start_new_session=True,
         )
         assert self._process.stdout is not None
-        said = b""
+        output = b""
         deadline = time.monotonic() + _START_TIMEOUT_S
         os.set_blocking(self._process.stdout.fileno(), False)
-        while not (found := _PORT.search(said)):
-            said += self._process.stdout.read() or b""
+        while not (found := _PORT.search(output)):
+            output += self._process.stdout.read() or b""
             if self._process.poll() is not None or time.monotonic() > deadline:
                 raise UwbMitigationError(
-                    f"the emulator did not start: {said.decode(errors='replace').strip()[-300:]}"
+                    f"the emulator did not start: {output.decode(errors='replace').strip()[-300:]}"
                 )
             time.sleep(0.02)
         self.port = found.group(1).decode()
@@ -141,5 +141,5 @@ class EmulatedFirmware:
                 self._radio.connect(str(radio))
                 return
             if time.monotonic() > deadline:
-                raise UwbMitigationError("the emulator does not accept the radio's side")
+                raise UwbMitigationError("the emulator does not accept the connection of the radio")
             time.sleep(0.02)

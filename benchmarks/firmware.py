@@ -15,7 +15,7 @@ import onnxruntime
 from numpy.typing import NDArray
 
 from benchmarks import emulator
-from benchmarks.random_networks import mlp, pressing_windows, remnet
+from benchmarks.random_networks import mlp, remnet, rounding_windows
 from uwb_mitigation.firmware_export.export import (
     Golden,
     golden_windows,
@@ -152,7 +152,7 @@ def measure(
     """
     packed = network.packed
     if windows is None:
-        windows = pressing_windows(packed.samples, packed.input_scale, inputs)
+        windows = rounding_windows(packed.samples, packed.input_scale, inputs)
     expected = network.expect(windows)
     examples = golden_windows(packed)
     with tempfile.TemporaryDirectory(prefix="uwb_firmware_") as name:
@@ -165,7 +165,7 @@ def measure(
         result = emulator.run_windows(image, windows)
         cycles = emulator.estimate_cycles(image, emulator.count_executed(image, windows[len(windows) // 2]))
         flash = emulator.measure_size(folder, folder, kernels, optimisation).flash_bytes
-    printed = published.MODELS.get((network.network, packed.samples))
+    published_model = published.MODELS.get((network.network, packed.samples))
     hz = CLOCK_HZ / cycles
     wrong = (result.records["output_m"].view(np.uint32) != expected.view(np.uint32)) | (
         result.records["status"] != 0
@@ -183,6 +183,6 @@ def measure(
         mismatches=int(np.count_nonzero(wrong)),
         inputs=len(windows),
         hz=hz,
-        energy_mj=None if printed is None else printed.board[3] / hz,
-        paper_hz=None if printed is None else printed.board[0],
+        energy_mj=None if published_model is None else published_model.board[3] / hz,
+        paper_hz=None if published_model is None else published_model.board[0],
     )

@@ -34,23 +34,23 @@ TIMEOUT_S = 60.0
 """Timeout for mode DEVICE and for the next corrected range; after it, the remaining ranges count as lost."""
 
 
-def numbered(recording: Path | None, count: int) -> list[RangeMeasurement]:
+def read_measurements(recording: Path | None, count: int) -> list[RangeMeasurement]:
     """Return at most `count` measurements in binary32, as on a board, with unique sequence numbers."""
     source = SimulatedSource(seed=1, count=count) if recording is None else open_recording(recording)
     with source:
         measured = [record.measurement for record in itertools.islice(source, count)]
     if not measured:
-        raise UwbMitigationError("the recording holds no range", where=str(recording))
-    held = []
+        raise UwbMitigationError("the recording contains no ranges", where=str(recording))
+    measurements = []
     for sequence, measurement in enumerate(measured):
         kind, payload = wire.encode(measurement)
         decoded = wire.decode(kind, payload)
         assert isinstance(decoded, RangeMeasurement)
-        held.append(replace(decoded, sequence=sequence))
-    return held
+        measurements.append(replace(decoded, sequence=sequence))
+    return measurements
 
 
-def equals(expected: CorrectedRange, message: RangeCorrected) -> bool:
+def is_identical(expected: CorrectedRange, message: RangeCorrected) -> bool:
     """Return whether a range corrected by the board is bit-identical to that of the host."""
     values = (expected.range_m, expected.correction_m, expected.variance_m2)
     computed = (message.range, message.correction, message.variance)
@@ -77,7 +77,7 @@ def run(console: Console, measured: Sequence[RangeMeasurement]) -> list[str]:
         with NodeProcesses() as nodes, console.status("waiting for the corrected ranges"):
             nodes.start("driver", "source:=serial", f"port:={board.port}", "mode:=device")
             if not ready.wait(TIMEOUT_S):
-                raise UwbMitigationError("the driver has not brought the board into mode DEVICE")
+                raise UwbMitigationError("the board did not change to mode DEVICE")
             for measurement in measured:
                 board.measure(measurement)
             seen, since_s = -1, time.monotonic()
@@ -87,17 +87,17 @@ def run(console: Console, measured: Sequence[RangeMeasurement]) -> list[str]:
                 time.sleep(0.05)
     expected = Mitigation(bundle).correct(measured)
     arrived = {message.sequence: message for message in corrected}
-    equal = sum(equals(expected[sequence], message) for sequence, message in arrived.items())
+    equal = sum(is_identical(expected[sequence], message) for sequence, message in arrived.items())
     lost, different = len(measured) - len(arrived), len(arrived) - equal
     statuses = Counter(result.status.name for result in expected)
     shown = ", ".join(f"{count} {name}" for name, count in statuses.items())
     console.print(f"{len(measured)} ranges measured, {len(arrived)} corrected by the board, {lost} lost")
-    console.print(f"{equal} equal to the host's to the bit, {different} different ({shown})")
+    console.print(f"{equal} bit-identical to those of the host, {different} different ({shown})")
     if lost or different or len(corrected) != len(arrived):
-        nodes.failures.append("board and host differ")
+        nodes.failures.append("the corrections of board and host differ")
     return nodes.failures
 
 
 def main(recording: Path | None, count: int) -> int:
     """Run the demonstration and return its exit code."""
-    return run_demo("firmware-demo", lambda console: run(console, numbered(recording, count)))
+    return run_demo("firmware-demo", lambda console: run(console, read_measurements(recording, count)))

@@ -24,8 +24,8 @@ from uwb_mitigation.positioning.noise_model import NoiseModel
 
 ANCHORS = AnchorMap(
     [
-        Anchor(n, place)
-        for n, place in enumerate([(0.0, 0.0, 2.0), (9.0, 0.0, 1.0), (9.0, 7.0, 2.0), (0.0, 7.0, 1.0)], 1)
+        Anchor(n, position)
+        for n, position in enumerate([(0.0, 0.0, 2.0), (9.0, 0.0, 1.0), (9.0, 7.0, 2.0), (0.0, 7.0, 1.0)], 1)
     ]
 )
 _NOISE_M = 0.03
@@ -49,10 +49,10 @@ class NodeFigures:
 
 def _drive(n: int, rate_hz: float) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
     time_s = np.arange(n) / rate_hz
-    place = np.stack([4.5 + 3 * np.cos(0.3 * time_s), 3.5 + 2 * np.sin(0.3 * time_s), np.ones(n)], axis=1)
+    position = np.stack([4.5 + 3 * np.cos(0.3 * time_s), 3.5 + 2 * np.sin(0.3 * time_s), np.ones(n)], axis=1)
     row = np.arange(n) % len(ANCHORS)
     noise = np.random.default_rng(1).normal(0.0, _NOISE_M, n)
-    return row, np.linalg.norm(place - ANCHORS.position[row], axis=1) + noise
+    return row, np.linalg.norm(position - ANCHORS.position[row], axis=1) + noise
 
 
 def filter_us() -> float:
@@ -62,11 +62,11 @@ def filter_us() -> float:
     rows, values = row.tolist(), range_m.tolist()
     best = float("inf")
     for _ in range(5):
-        one = RangeFilter(ANCHORS, NoiseModel(), 0.0, np.array([7.5, 3.5, 1.0]), np.eye(3))
+        range_filter = RangeFilter(ANCHORS, NoiseModel(), 0.0, np.array([7.5, 3.5, 1.0]), np.eye(3))
         began = time.process_time()
         for i in range(ranges):
-            one.predict(i / 40.0)
-            one.update(rows[i], values[i], 0.01)
+            range_filter.predict(i / 40.0)
+            range_filter.update(rows[i], values[i], 0.01)
         best = min(best, (time.process_time() - began) / ranges * 1e6)
     return best
 
@@ -100,20 +100,22 @@ def _measure(
     row, range_m = _drive(n, rate_hz)
     arrived: dict[int, int] = {}
 
-    def take(message: PoseWithCovarianceStamped) -> None:
+    def on_pose(message: PoseWithCovarianceStamped) -> None:
         stamp = message.header.stamp
         arrived.setdefault(stamp.sec * _SECOND_NS + stamp.nanosec, time.time_ns())
 
-    probe.subscribe(PoseWithCovarianceStamped, topics.POSE, take)
+    probe.subscribe(PoseWithCovarianceStamped, topics.POSE, on_pose)
     publisher = probe.publisher(RangeCorrected, topics.RANGE_CORRECTED)
-    wait(lambda: publisher.get_subscription_count() > 0, "the locator did not come up", [locator])
-    show(f"{rate_hz:.0f} ranges a second for {seconds:.0f} s")
+    wait(
+        lambda: publisher.get_subscription_count() > 0, "the locator does not subscribe to ranges", [locator]
+    )
+    show(f"{rate_hz:.0f} ranges per second for {seconds:.0f} s")
     empty = Cir(np.zeros(0, np.int16))
     sent: list[int] = []
     start_s = time.perf_counter() + 0.1
     for i in range(n):
-        while (left := start_s + i / rate_hz - time.perf_counter()) > 0:
-            time.sleep(min(left, 0.001))
+        while (remaining_s := start_s + i / rate_hz - time.perf_counter()) > 0:
+            time.sleep(min(remaining_s, 0.001))
         stamp_ns = time.time_ns()
         measured = RangeMeasurement(stamp_ns, 1, ANCHORS.anchors[row[i]].id, i, 0, float(range_m[i]), empty)
         corrected = CorrectedRange(float(range_m[i]), float(range_m[i]), 0.0, 0.01, Status.OK, Origin.HOST, 1)

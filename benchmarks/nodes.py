@@ -41,18 +41,18 @@ RANGES = 5000
 RECORDED_HZ = 1000.0
 RATES_HZ = (100, 500, 1000)
 
-_DISTINCT = 500
+_DISTINCT_RANGES = 500
 _SETTLE_S = 0.3
 _TRIAL_S = 1.0
-_LATE_NS = 100_000_000
-_LOWEST_HZ, _STEP, _HALVINGS, _HIGHEST_HZ = 1000.0, 1.5, 3, 50_000.0
+_MAX_LATENCY_NS = 100_000_000
+_MIN_HZ, _STEP, _BISECTIONS, _MAX_HZ = 1000.0, 1.5, 3, 50_000.0
 _SEARCH_S = 12.0
 _STAMP = struct.Struct("<4xiII")
 _SEQUENCE = struct.Struct("<16xI")
 
 
 @dataclass(frozen=True, slots=True)
-class Vitals:
+class ProcessUsage:
     """Processor time so far, s, of all threads; resident memory, MB; open file descriptors; threads."""
 
     cpu_s: float
@@ -61,8 +61,8 @@ class Vitals:
     threads: int
 
 
-def vitals_of(pid: int) -> Vitals:
-    """Return the vitals of a process.
+def process_usage(pid: int) -> ProcessUsage:
+    """Return the resources that a process uses.
 
     Raises:
         UwbMitigationError: there is no such process.
@@ -71,14 +71,14 @@ def vitals_of(pid: int) -> Vitals:
         process = psutil.Process(pid)
         with process.oneshot():
             times = process.cpu_times()
-            return Vitals(
+            return ProcessUsage(
                 times.user + times.system,
                 process.memory_info().rss / 2**20,
                 process.num_fds(),
                 process.num_threads(),
             )
     except psutil.Error as error:
-        raise UwbMitigationError(f"process {pid} has ended", valid="its last words are above") from error
+        raise UwbMitigationError(f"process {pid} has ended", valid="see its output above") from error
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +91,7 @@ class Latency:
 
 
 @dataclass(slots=True)
-class Figures:
+class SubjectResult:
     """Results of one subject.
 
     Attributes:
@@ -120,13 +120,13 @@ class RateTrial:
     Attributes:
         received, lost: number of received ranges and of lost ranges between them.
         late_ns: latency of each received range.
-        kept_up: no range was lost, the requested rate was reached, and the last ranges were not late.
+        sustained: no range was lost, the requested rate was reached, and the last ranges were not late.
     """
 
     received: int
     lost: int
     late_ns: list[int]
-    kept_up: bool
+    sustained: bool
 
 
 class Subject:
@@ -134,18 +134,18 @@ class Subject:
 
     def __init__(self, bench: Bench, name: str, kind: type, topic: str, *nodes: str) -> None:
         self.name = name
-        self.figures = Figures()
+        self.figures = SubjectResult()
         self._bench = bench
-        self._arrivals: list[tuple[int, bytes]] = []
-        self._carried = 0
+        self._received: list[tuple[int, bytes]] = []
+        self._num_kept = 0
         self._cpu_s = self._chain_cpu_s = 0.0
         self._counted = self._counted_hz = 0
-        arrived, now_ns = self._arrivals.append, time.time_ns
+        arrived, now_ns = self._received.append, time.time_ns
         bench.probe.subscribe(kind, f"/{name}/{topic}", lambda data: arrived((now_ns(), data)), raw=True)
         # The measured node is the first process.
         self.processes = [bench.start(node, name) for node in nodes]
         self.play(50.0)
-        wait(lambda: len(self._arrivals) > 5, f"{name}: nothing arrives", self.processes)
+        wait(lambda: len(self._received) > 5, f"{name}: no ranges arrive", self.processes)
         self.pause()
 
     def play(self, rate_hz: float) -> None:
@@ -155,51 +155,53 @@ class Subject:
         """Stop, and wait until all queued ranges have arrived."""
         self._set(paused=True)
         before = -1
-        while before != len(self._arrivals):
-            before = len(self._arrivals)
+        while before != len(self._received):
+            before = len(self._received)
             time.sleep(0.1)
 
-    def forget(self) -> None:
+    def reset_counts(self) -> None:
         """Reset the counters."""
-        self._arrivals.clear()
-        self._carried = 0
+        self._received.clear()
+        self._num_kept = 0
 
     def count(self) -> tuple[int, int]:
         """Return the number of received ranges since the last call, and of lost ranges between them."""
         # Keep the last one to count losses between it and the next one.
-        sequences = [read_head(data)[1] for _, data in self._arrivals]
-        fresh = len(sequences) - self._carried
-        self._carried = min(len(sequences), 1)
-        del self._arrivals[:-1]
-        return fresh, missing_between(sequences)
+        sequences = [read_stamp_and_sequence(data)[1] for _, data in self._received]
+        fresh = len(sequences) - self._num_kept
+        self._num_kept = min(len(sequences), 1)
+        del self._received[:-1]
+        return fresh, count_missing(sequences)
 
     def trial(self, rate_hz: float, seconds: float) -> RateTrial:
         self.play(rate_hz)
         time.sleep(_SETTLE_S)
-        self._arrivals.clear()
+        self._received.clear()
         began_ns = time.time_ns()
         time.sleep(seconds)
         passed_s = (time.time_ns() - began_ns) / 1e9
-        arrivals = self._arrivals.copy()
+        arrivals = self._received.copy()
         self.pause()
         late_ns, sequences = [], []
         for arrived_ns, data in arrivals:
-            stamp_ns, sequence = read_head(data)
+            stamp_ns, sequence = read_stamp_and_sequence(data)
             late_ns.append(arrived_ns - stamp_ns)
             sequences.append(sequence)
-        lost = missing_between(sequences)
-        kept_up = lost == 0 and len(arrivals) >= 0.97 * rate_hz * passed_s and max(late_ns[-20:]) < _LATE_NS
-        return RateTrial(len(arrivals), lost, late_ns, kept_up)
+        lost = count_missing(sequences)
+        sustained = (
+            lost == 0 and len(arrivals) >= 0.97 * rate_hz * passed_s and max(late_ns[-20:]) < _MAX_LATENCY_NS
+        )
+        return RateTrial(len(arrivals), lost, late_ns, sustained)
 
     def warm_up(self) -> None:
         self.trial(RECORDED_HZ, _TRIAL_S)
 
     def measure_latency(self, rate_hz: int, seconds: float) -> Latency:
-        before = [vitals_of(process.pid).cpu_s for process in self.processes]
+        before = [process_usage(process.pid).cpu_s for process in self.processes]
         trial = self.trial(rate_hz, seconds)
-        after = [vitals_of(process.pid).cpu_s for process in self.processes]
+        after = [process_usage(process.pid).cpu_s for process in self.processes]
         if not trial.received:
-            raise UwbMitigationError(f"{self.name}: nothing arrives at {rate_hz} Hz")
+            raise UwbMitigationError(f"{self.name}: no ranges arrive at {rate_hz} Hz")
         # Sum over slices, because the system counts in hundredths of a second. The sums include settling and
         # pause, which play at the same rate.
         share = seconds / (seconds + _SETTLE_S)
@@ -216,19 +218,19 @@ class Subject:
     def search_rate(self) -> None:
         """Find the maximum rate without loss to within a few per cent; 0 if even the lowest rate is too high."""
 
-        def holds(rate_hz: float) -> bool:
+        def is_lossless(rate_hz: float) -> bool:
             # Try twice, because other load on the machine may have interfered.
-            return self.trial(rate_hz, _TRIAL_S).kept_up or self.trial(rate_hz, _TRIAL_S).kept_up
+            return self.trial(rate_hz, _TRIAL_S).sustained or self.trial(rate_hz, _TRIAL_S).sustained
 
-        low, high = 0.0, _LOWEST_HZ
+        low, high = 0.0, _MIN_HZ
         # The next search begins below the previous results.
-        if self.figures.rates_hz and holds(below := self.figures.max_lossless_rate_hz / _STEP):
+        if self.figures.rates_hz and is_lossless(below := self.figures.max_lossless_rate_hz / _STEP):
             low, high = below, below * _STEP
-        while high < _HIGHEST_HZ and holds(high):
+        while high < _MAX_HZ and is_lossless(high):
             low, high = high, high * _STEP
-        for _ in range(_HALVINGS if low else 0):
+        for _ in range(_BISECTIONS if low else 0):
             middle = math.sqrt(low * high)
-            low, high = (middle, high) if holds(middle) else (low, middle)
+            low, high = (middle, high) if is_lossless(middle) else (low, middle)
         self.figures.rates_hz.append(low)
 
     def _set(self, **values: object) -> None:
@@ -270,40 +272,40 @@ def open_bench() -> Iterator[Bench]:
             processes.stop(*bench.processes)
 
 
-def read_head(data: bytes) -> tuple[int, int]:
+def read_stamp_and_sequence(data: bytes) -> tuple[int, int]:
     """Return stamp, ns, and sequence of a serialised RangeCir or RangeCorrected, which begin with the same fields."""
     seconds, nanoseconds, length = _STAMP.unpack_from(data)
     (sequence,) = _SEQUENCE.unpack_from(data, first_field_offset(_STAMP.size + length))
     return seconds * 10**9 + nanoseconds, sequence
 
 
-def missing_between(sequences: Sequence[int]) -> int:
+def count_missing(sequences: Sequence[int]) -> int:
     """Return the number of ranges of the bag that are missing between those that arrived."""
     return int(((np.diff(sequences) - 1) % RANGES).sum()) if len(sequences) > 1 else 0
 
 
 def write_bag(path: Path) -> None:
     """Write a bag of `RANGES` simulated CIR windows, numbered from 0, at `RECORDED_HZ`."""
-    records = [_cut(record) for record in islice(SimulatedSource(seed=1), _DISTINCT)]
+    records = [_cut_to_window(record) for record in islice(SimulatedSource(seed=1), _DISTINCT_RANGES)]
     with BagWriter(path, {"source": "simulated windows", "simulated": "true"}) as writer:
         for sequence in range(RANGES):
-            measurement = records[sequence % _DISTINCT].measurement
+            measurement = records[sequence % _DISTINCT_RANGES].measurement
             stamp_ns = int(sequence * 1e9 / RECORDED_HZ)
             writer.write(Record(replace(measurement, stamp_ns=stamp_ns, sequence=sequence)))
 
 
-def _cut(record: Record) -> Record:
+def _cut_to_window(record: Record) -> Record:
     cir = record.measurement.cir
     start = int(cir.first_path_index) - WINDOW_LEAD
     samples = cir.samples[2 * start : 2 * (start + WINDOW)]
     return Record(replace(record.measurement, cir=replace(cir, samples=samples, start_index=start)))
 
 
-Advance = Callable[[str, float], None]
+ProgressCallback = Callable[[str, float], None]
 """Called with the next step and the finished share."""
 
 
-def measure(repeats: int, slices: int, seconds: float, advance: Advance) -> dict[str, Figures]:
+def measure(repeats: int, slices: int, seconds: float, advance: ProgressCallback) -> dict[str, SubjectResult]:
     """Return all figures by subject.
 
     Percentiles are medians over slices of time in which the subjects take turns, so that short disturbances on the
@@ -329,17 +331,17 @@ def measure(repeats: int, slices: int, seconds: float, advance: Advance) -> dict
             subject.warm_up()
         latencies: dict[tuple[str, int], list[Latency]] = {}
 
-        def take_slice(subject: Subject, rate_hz: int) -> None:
+        def measure_slice(subject: Subject, rate_hz: int) -> None:
             latency = subject.measure_latency(rate_hz, seconds)
             latencies.setdefault((subject.name, rate_hz), []).append(latency)
 
         steps: list[Step] = [
-            (f"latency of {subject.name} at {rate_hz} Hz", seconds, partial(take_slice, subject, rate_hz))
+            (f"latency of {subject.name} at {rate_hz} Hz", seconds, partial(measure_slice, subject, rate_hz))
             for rate_hz in RATES_HZ
             for _ in range(slices)
             for subject in subjects
         ]
-        take_steps([*steps, *searches(subjects, repeats)], advance)
+        run_steps([*steps, *searches(subjects, repeats)], advance)
         for subject in subjects:
             for rate_hz in RATES_HZ:
                 of_rate = latencies[subject.name, rate_hz]
@@ -348,7 +350,7 @@ def measure(repeats: int, slices: int, seconds: float, advance: Advance) -> dict
                     median(latency.p99 for latency in of_rate),
                     max(latency.max for latency in of_rate),
                 )
-            subject.figures.memory_mb = vitals_of(subject.processes[0].pid).memory_mb
+            subject.figures.memory_mb = process_usage(subject.processes[0].pid).memory_mb
         return {subject.name: subject.figures for subject in subjects}
 
 
@@ -365,17 +367,17 @@ def searches(subjects: Sequence[Subject], repeats: int) -> list[Step]:
     ]
 
 
-def take_steps(steps: Sequence[Step], advance: Advance) -> None:
+def run_steps(steps: Sequence[Step], advance: ProgressCallback) -> None:
     """Run the steps one after the other."""
-    whole_s, done_s = sum(length_s for _, length_s, _ in steps), 0.0
-    for name, length_s, take in steps:
-        advance(name, done_s / whole_s)
-        take()
-        done_s += length_s
+    total_s, done_s = sum(duration_s for _, duration_s, _ in steps), 0.0
+    for name, duration_s, measure_step in steps:
+        advance(name, done_s / total_s)
+        measure_step()
+        done_s += duration_s
 
 
-_STALLED_S = 10.0
-LOOKS = 10
+_STALL_TIMEOUT_S = 10.0
+SOAK_SAMPLES = 10
 """Number of samples of the processes during a soak. Allocators fill their pools before the first."""
 
 
@@ -390,7 +392,7 @@ class Usage:
 
 
 @dataclass(frozen=True, slots=True)
-class Soaked:
+class SoakResult:
     """Results of a soak.
 
     Attributes:
@@ -405,7 +407,7 @@ class Soaked:
     course: tuple[Usage, ...]
 
 
-def soak(messages: int, rate_hz: float, *, one_process: bool, advance: Callable[[int], None]) -> Soaked:
+def soak(messages: int, rate_hz: float, *, one_process: bool, advance: Callable[[int], None]) -> SoakResult:
     """Play `messages` ranges at `rate_hz`.
 
     Args:
@@ -420,8 +422,8 @@ def soak(messages: int, rate_hz: float, *, one_process: bool, advance: Callable[
         subject = Subject(bench, "soak", RangeCorrected, topics.RANGE_CORRECTED, *nodes)
         pids = [process.pid for process in subject.processes]
 
-        def look(ranges: int) -> Usage:
-            seen = [vitals_of(pid) for pid in pids]
+        def sample_usage(ranges: int) -> Usage:
+            seen = [process_usage(pid) for pid in pids]
             return Usage(
                 ranges,
                 sum(of.memory_mb for of in seen),
@@ -429,7 +431,7 @@ def soak(messages: int, rate_hz: float, *, one_process: bool, advance: Callable[
                 sum(of.threads for of in seen),
             )
 
-        subject.forget()
+        subject.reset_counts()
         subject.play(rate_hz)
         began_s = moved_s = time.monotonic()
         received = lost = 0
@@ -438,13 +440,13 @@ def soak(messages: int, rate_hz: float, *, one_process: bool, advance: Callable[
             time.sleep(1.0)
             arrived, missing = subject.count()
             received, lost = received + arrived, lost + missing
-            if received * LOOKS >= messages * (len(course) + 1):
-                course.append(look(received))
+            if received * SOAK_SAMPLES >= messages * (len(course) + 1):
+                course.append(sample_usage(received))
             if arrived:
                 moved_s = time.monotonic()
-            elif time.monotonic() - moved_s > _STALLED_S:
-                raise UwbMitigationError(f"nothing arrives any more after {received} ranges")
+            elif time.monotonic() - moved_s > _STALL_TIMEOUT_S:
+                raise UwbMitigationError(f"no more ranges arrive after {received} ranges")
             advance(received)
         seconds = time.monotonic() - began_s
         subject.pause()
-    return Soaked(received, lost, seconds, tuple(course))
+    return SoakResult(received, lost, seconds, tuple(course))

@@ -30,7 +30,7 @@ from uwb_mitigation.sources.opening import open_mapped
 from uwb_mitigation.sources.simulated import SimulatedSource, SimulatedSurvey
 from uwb_mitigation.sources.source import Source
 
-LAG_S = 0.2
+TIME_OFFSET_S = 0.2
 """Time offset of the ranges relative to the ground truth in every Hanyang run."""
 
 HEIGHT = Height(1.0, 0.2)
@@ -79,7 +79,7 @@ def hanyang_run(folder: Path) -> tuple[AnchorMap, Ranges, TruePath, TruePath]:
     run = open_mapped(folder, "hanyang")
     ranges, _ = columns(run, run.anchors)
     shifted = Ranges(
-        ranges.stamp_ns - round(LAG_S * _SECOND_NS),
+        ranges.stamp_ns - round(TIME_OFFSET_S * _SECOND_NS),
         ranges.anchor,
         ranges.range_m,
         ranges.variance_m2,
@@ -152,28 +152,33 @@ def apartment(folder: Path) -> StaticErrors:
     raw: list[float] = []
     corrected: list[float] = []
     nees: list[float] = []
-    for one in np.unique(tag):
-        own, model = tag == one, NoiseModel()
-        used = np.unique(row[own])
+    for tag_id in np.unique(tag):
+        is_tag, model = tag == tag_id, NoiseModel()
+        used = np.unique(row[is_tag])
         if len(used) < 3:
             continue
-        linear_bias = fit_linear_bias(configuration[~own], power[~own], first[~own], error[~own])
-        better = range_m - linear_bias.predict_m(power, first)
-        left = [
-            np.nanmean((better - range_m + error)[~own & (configuration == c)])
-            for c in np.unique(configuration[~own])
+        linear_bias = fit_linear_bias(configuration[~is_tag], power[~is_tag], first[~is_tag], error[~is_tag])
+        corrected_range_m = range_m - linear_bias.predict_m(power, first)
+        residual = [
+            np.nanmean((corrected_range_m - range_m + error)[~is_tag & (configuration == c)])
+            for c in np.unique(configuration[~is_tag])
         ]
-        # Mean absolute errors, which the line fit minimises; 1.25 times that is a normal standard deviation.
-        sd = 1.2533 * float(np.nanmean(np.abs(left)))
-        true = np.array(next(r.tag_position for r, mine in zip(records, own, strict=True) if mine))
-        for values, spread, errors in ((range_m, model.range_sd, raw), (better, sd, corrected)):
-            means = np.array([np.nanmedian(values[own & (row == a)]) for a in used])
-            told = anchors.position[used], means, np.full(len(used), spread), model
-            inside = candidate_positions(*told, height=Height(0.0), area=area)
-            place = (inside or candidate_positions(*told, height=Height(0.0)))[0]
-            off = place.position[:2] - true[:2]
-            errors.append(float(np.hypot(*off)))
-        nees.append(float(off @ np.linalg.solve(place.covariance[:2, :2], off)) / 2.0)
+        # The line fit minimises the mean absolute error; 1.25 times it is the standard deviation of a normal error.
+        sd = 1.2533 * float(np.nanmean(np.abs(residual)))
+        true_position = np.array(
+            next(r.tag_position for r, is_own in zip(records, is_tag, strict=True) if is_own)
+        )
+        for values, range_sd_m, errors in (
+            (range_m, model.range_sd, raw),
+            (corrected_range_m, sd, corrected),
+        ):
+            means = np.array([np.nanmedian(values[is_tag & (row == a)]) for a in used])
+            inputs = anchors.position[used], means, np.full(len(used), range_sd_m), model
+            inside = candidate_positions(*inputs, height=Height(0.0), area=area)
+            estimate = (inside or candidate_positions(*inputs, height=Height(0.0)))[0]
+            difference = estimate.position[:2] - true_position[:2]
+            errors.append(float(np.hypot(*difference)))
+        nees.append(float(difference @ np.linalg.solve(estimate.covariance[:2, :2], difference)) / 2.0)
     return StaticErrors(len(raw), float(np.mean(raw)), float(np.mean(corrected)), float(np.mean(nees)))
 
 
@@ -199,9 +204,14 @@ def flat(anchor_count: int, seed: int = 1, ranges: int = 3000) -> FlatErrors:
     raw, truth = columns(drive, drive.anchors)
     first = np.array([record.measurement.cir.first_path_power_dbm for record in records], np.float32)
     predicted = linear_bias.predict_m(raw.rx_power_dbm.astype(np.float32), first)
-    told = Mitigation(load_bundle(default_model_path())).correct([record.measurement for record in records])
+    corrections = Mitigation(load_bundle(default_model_path())).correct(
+        [record.measurement for record in records]
+    )
     by_line = raw.range_m - predicted, np.full(len(raw), variance)
-    by_network = np.array([one.range_m for one in told]), np.array([one.variance_m2 for one in told])
+    by_network = (
+        np.array([result.range_m for result in corrections]),
+        np.array([result.variance_m2 for result in corrections]),
+    )
     lines, networks = (
         replace(raw, range_m=np.maximum(range_m, 0.0), variance_m2=variance_m2)
         for range_m, variance_m2 in (by_line, by_network)
@@ -231,5 +241,5 @@ def _flat_line() -> tuple[LinearBiasModel, float]:
     power = np.array([record.measurement.cir.rx_power_dbm for record in survey], np.float32)
     first = np.array([record.measurement.cir.first_path_power_dbm for record in survey], np.float32)
     linear_bias = fit_linear_bias(np.array([truth.configuration for truth in truths]), power, first, error)
-    left = np.abs(error - linear_bias.predict_m(power, first))
-    return linear_bias, (1.2533 * float(left.mean())) ** 2
+    residual = np.abs(error - linear_bias.predict_m(power, first))
+    return linear_bias, (1.2533 * float(residual.mean())) ** 2

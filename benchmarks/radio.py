@@ -41,10 +41,10 @@ WRONG_M = 0.1
 _BEFORE_WRAP_TICKS = 3 * 10**9
 _LOSS, _DAMAGE = 0.1, 0.01
 _ANCHORS_M = (2.0, 5.5, 9.0, 14.0)
-_LONGEST_CALM_S = 0.25
-_PATIENCE_S = 20.0
-_STATIONARY_S = 3.0
-_STARTS_WITHIN_S = 60.0
+_MAX_PAUSE_S = 0.25
+_TIMEOUT_S = 20.0
+_WARM_UP_S = 3.0
+_START_TIMEOUT_S = 60.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,12 +120,12 @@ def evb1000_rate_hz(seconds: float) -> float:
     """
     with tempfile.TemporaryDirectory() as folder, _emulated(Path(folder) / "board") as paths:
         ports = [
-            RadioDriver(_opening(path), RadioSettings(role=role))
+            RadioDriver(_bus_opener(path), RadioSettings(role=role))
             for path, role in zip(paths, (Role.TAG, Role.ANCHOR), strict=True)
         ]
         try:
             _await_range(ports[0])
-            time.sleep(_STATIONARY_S)
+            time.sleep(_WARM_UP_S)
             before, began = ports[0].report().status.ranged, time.monotonic()
             time.sleep(seconds)
             return (ports[0].report().status.ranged - before) / (time.monotonic() - began)
@@ -142,7 +142,7 @@ def _emulated(prefix: Path) -> Iterator[tuple[Path, Path]]:
     options = ("emulate-evb1000", "--link", str(prefix), "--distance", "5")
     process = subprocess.Popen([sys.executable, "-m", "benchmarks", *options], stdout=subprocess.DEVNULL)
     try:
-        until = time.monotonic() + _STARTS_WITHIN_S
+        until = time.monotonic() + _START_TIMEOUT_S
         while not all(path.exists() for path in paths):
             if process.poll() is not None or time.monotonic() > until:
                 raise UwbMitigationError("emulated EVB1000s do not start")
@@ -166,8 +166,8 @@ def soak(exchanges: int, seed: int, advance: Callable[[int], None]) -> RadioSoak
         for anchor, path in anchors.items():
             air.set_pair(tag, anchor, path)
         now_s = air.run(1.0)
-        watch = _Watch(air, anchors)
-        watch.take(now_s)
+        monitor = _SoakMonitor(air, anchors)
+        monitor.count_ranges(now_s)
         memory_mb: float | None = None
         disturbances = 0
         while (tried := air.counts(tag)["tried"]) < exchanges:
@@ -175,18 +175,18 @@ def soak(exchanges: int, seed: int, advance: Callable[[int], None]) -> RadioSoak
             if memory_mb is None and tried > exchanges / 10:
                 memory_mb = process.memory_info().rss / 1e6
             disturbances += 1
-            what = random.integers(0, 3)
+            disturbance = random.integers(0, 3)
             anchor = int(random.choice(list(anchors)))
-            if what == 0:
+            if disturbance == 0:
                 air.set_pair(tag, anchor, None)
-                watch.take(air.run(float(random.uniform(0.05, 1.0))))
+                monitor.count_ranges(air.run(float(random.uniform(0.05, 1.0))))
                 air.set_pair(tag, anchor, anchors[anchor])
                 expected = {anchor}
             else:
-                air.reset(tag if what == 1 else anchor)
-                expected = set(anchors) if what == 1 else {anchor}
-            now_s = watch.await_all(expected)
-            now_s = watch.take(air.run(float(random.uniform(0, _LONGEST_CALM_S))))
+                air.reset(tag if disturbance == 1 else anchor)
+                expected = set(anchors) if disturbance == 1 else {anchor}
+            now_s = monitor.await_all(expected)
+            now_s = monitor.count_ranges(air.run(float(random.uniform(0, _MAX_PAUSE_S))))
         counts = air.counts(tag)
     end_mb = process.memory_info().rss / 1e6
     lost = {
@@ -194,16 +194,16 @@ def soak(exchanges: int, seed: int, advance: Callable[[int], None]) -> RadioSoak
     }
     return RadioSoak(
         exchanges=counts["tried"],
-        delivered=watch.delivered,
-        wrong=watch.wrong,
+        delivered=monitor.delivered,
+        wrong=monitor.wrong,
         disturbances=disturbances,
-        longest_recovery_s=watch.longest_s,
+        longest_recovery_s=monitor.longest_s,
         lost=lost,
         memory_growth_mb=end_mb - (memory_mb if memory_mb is not None else end_mb),
     )
 
 
-class _Watch:
+class _SoakMonitor:
     """Collects the ranges of a soak, and measures the time until an anchor ranges again."""
 
     _SLICE_S = 0.01
@@ -216,7 +216,7 @@ class _Watch:
         self.wrong = 0
         self.longest_s = 0.0
 
-    def take(self, now_s: float) -> float:
+    def count_ranges(self, now_s: float) -> float:
         """Count the new ranges; return the time."""
         self._rows()
         return now_s
@@ -232,8 +232,8 @@ class _Watch:
         self._rows()
         missing = set(expected)
         while missing:
-            if now_s - began_s > _PATIENCE_S:
-                raise UwbMitigationError(f"no range within {_PATIENCE_S} s of virtual time")
+            if now_s - began_s > _TIMEOUT_S:
+                raise UwbMitigationError(f"no range within {_TIMEOUT_S} s of virtual time")
             now_s = self._air.run(self._SLICE_S)
             for row in self._rows():
                 missing.discard(self._by_address[int(row["anchor"])])
@@ -249,12 +249,12 @@ class _Watch:
         return rows
 
 
-def _opening(path: Path) -> Callable[[], Evb1000Bus]:
+def _bus_opener(path: Path) -> Callable[[], Evb1000Bus]:
     return lambda: Evb1000Bus(PortAddress.parse(str(path)))
 
 
 def _await_range(port: RadioDriver) -> None:
-    until = time.monotonic() + _STARTS_WITHIN_S
+    until = time.monotonic() + _START_TIMEOUT_S
     while not isinstance(port.get(0.2), RangeMeasurement):
         if time.monotonic() > until:
             raise UwbMitigationError(

@@ -27,13 +27,13 @@ from uwb_mitigation.nodes.processes import NodeProcesses, Probe, run_demo, spinn
 from uwb_mitigation.sources.simulated import SimulatedSource
 from uwb_mitigation.sources.simulation.scene import ANCHORS
 
-PLACE = ((6.5, 3.1), (6.501, 3.1), (6.5, 3.101))
+TAG_POSITIONS = ((6.5, 3.1), (6.501, 3.1), (6.5, 3.101))
 """Position of the tag, a corner of the robot's route: one anchor in LOS, the others behind concrete."""
 
-RADIO = ("radio.channel:=2", "radio.preamble:=1024")
+RADIO_PARAMETERS = ("radio.channel:=2", "radio.preamble:=1024")
 """Radio settings of the simulator."""
 
-PATIENCE_S = 60.0
+TIMEOUT_S = 60.0
 """Timeout until each anchor has ranged once, on a busy computer."""
 
 
@@ -42,7 +42,7 @@ class RadioListener:
 
     def __init__(self, probe: Probe) -> None:
         self.ranges: dict[int, list[tuple[float, float]]] = defaultdict(list)
-        self.problem = "the driver says nothing"
+        self.problem = "the driver publishes no diagnostics"
         self.boards: dict[int, int] = {}
         probe.subscribe(RangeCorrected, topics.RANGE_CORRECTED, self._on_corrected)
         probe.subscribe(DiagnosticArray, topics.DIAGNOSTICS, self._on_diagnostics)
@@ -55,16 +55,16 @@ class RadioListener:
         for status in message.status:
             if not status.name.startswith("driver"):
                 continue
-            self.problem = f"the driver says: {status.message}"
-            facts = {fact.key: fact.value for fact in status.values}
+            self.problem = f"driver: {status.message}"
+            values = {value.key: value.value for value in status.values}
             for number in range(1, 1 + len(ANCHORS)):
-                address = facts.get(f"radio {number}: address")
+                address = values.get(f"radio {number}: address")
                 if address is not None:
                     self.boards[int(address, 16)] = number
 
     def table(self, true_m: Mapping[int, float]) -> Table:
         """Return a table of means by anchor, m; `true_m` by board."""
-        table = Table(title="simulated, emulated only: mean, m", title_justify="left")
+        table = Table(title="simulated ranges of emulated radios: mean, m", title_justify="left")
         for name in ("anchor", "ranges", "raw", "corrected", "true"):
             table.add_column(name, justify="right")
         for number, rows in self._by_board().items():
@@ -75,7 +75,7 @@ class RadioListener:
         return table
 
     @property
-    def silent(self) -> list[int]:
+    def missing_anchors(self) -> list[int]:
         """Return the anchors that have not ranged or are still unknown."""
         return sorted(set(range(1, 1 + len(ANCHORS))) - set(self._by_board()))
 
@@ -90,7 +90,7 @@ class RadioListener:
 def run(console: Console, seconds: float) -> list[str]:
     """Start boards and nodes, and show their ranges; return the failures."""
     with (
-        SimulatedSource(route=PLACE) as source,
+        SimulatedSource(route=TAG_POSITIONS) as source,
         EmulatedEvb1000s(source, boards=1 + len(ANCHORS)) as boards,
         spinning_node(Probe) as probe,
     ):
@@ -102,12 +102,12 @@ def run(console: Console, seconds: float) -> list[str]:
                 lambda: probe.count_publishers(corrected) > 0, "the mitigator did not start: see above"
             )
             ports = ",".join(boards.ports)
-            nodes.start("driver", "source:=evb1000", f"port:={ports}", *RADIO)
+            nodes.start("driver", "source:=evb1000", f"port:={ports}", *RADIO_PARAMETERS)
             console.print(f"a tag and {len(ANCHORS)} anchors, all emulated: {ports}", soft_wrap=True)
-            ends_s, started = time.monotonic() + PATIENCE_S, False
+            ends_s, started = time.monotonic() + TIMEOUT_S, False
             with Live(console=console, refresh_per_second=REFRESH_HZ) as live:
                 while time.monotonic() < ends_s and nodes.running:
-                    if not started and not listener.silent:
+                    if not started and not listener.missing_anchors:
                         started, ends_s = True, time.monotonic() + seconds
                     live.update(listener.table(dict(enumerate(boards.distances_m))))
                     time.sleep(1 / REFRESH_HZ)
@@ -116,9 +116,11 @@ def run(console: Console, seconds: float) -> list[str]:
                 console.line()
         failures = nodes.failures + ([] if boards.failure is None else [str(boards.failure)])
     if not listener.ranges:
-        failures.append(f"no range within {PATIENCE_S:g} s; {listener.problem}")
-    elif listener.silent:
-        failures.append(f"no range with anchors {', '.join(map(str, listener.silent))}; {listener.problem}")
+        failures.append(f"no range within {TIMEOUT_S:g} s; {listener.problem}")
+    elif listener.missing_anchors:
+        failures.append(
+            f"no range with anchors {', '.join(map(str, listener.missing_anchors))}; {listener.problem}"
+        )
     return failures
 
 

@@ -20,9 +20,9 @@ def remnet(samples: int, first_kernel: int, modules: int = 3, seed: int = 0) -> 
     architecture = Remnet(samples, first_kernel=first_kernel, modules=modules)
     weight, bias = {}, {}
     for layer in architecture.convolutions:
-        deviation = np.sqrt(2 / (layer.inputs * layer.kernel))
+        sd = np.sqrt(2 / (layer.inputs * layer.kernel))
         shape = (layer.filters, layer.inputs, layer.kernel)
-        weight[layer.name] = random.normal(0.1, deviation, shape).astype(np.float32)
+        weight[layer.name] = random.normal(0.1, sd, shape).astype(np.float32)
         bias[layer.name] = random.normal(0, 0.1, layer.filters).astype(np.float32)
     weight[HEAD] = random.normal(0, 0.05, (architecture.features, 1)).astype(np.float32)
     bias[HEAD] = random.normal(0, 0.1, 1).astype(np.float32)
@@ -36,8 +36,8 @@ def mlp(samples: int = 157, seed: int = 0) -> Int8Weights:
     architecture = Mlp(samples)
     weight, bias = {}, {}
     for layer in architecture.layers:
-        deviation = np.sqrt(2 / layer.inputs)
-        weight[layer.name] = random.normal(0, deviation, (layer.outputs, layer.inputs)).astype(np.float32)
+        sd = np.sqrt(2 / layer.inputs)
+        weight[layer.name] = random.normal(0, sd, (layer.outputs, layer.inputs)).astype(np.float32)
         bias[layer.name] = random.normal(0, 0.1, layer.outputs).astype(np.float32)
     weight[HEAD] = random.normal(0, 0.2, (architecture.features, 1)).astype(np.float32)
     bias[HEAD] = random.normal(0, 0.1, 1).astype(np.float32)
@@ -45,7 +45,7 @@ def mlp(samples: int = 157, seed: int = 0) -> Int8Weights:
     return quantize(FloatWeights(architecture, weight, bias), calibration)
 
 
-def pressing_windows(samples: int, input_scale: np.float32, count: int, seed: int = 1) -> NDArray[np.float32]:
+def rounding_windows(samples: int, input_scale: np.float32, count: int, seed: int = 1) -> NDArray[np.float32]:
     """Windows, float32 (count, samples): noise at every level, impulses, zeros, saturation, ties of rounding."""
     random = np.random.default_rng([seed, samples])
     levels = np.exp(random.uniform(np.log(2), np.log(600), count))

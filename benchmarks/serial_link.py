@@ -17,7 +17,7 @@ from pathlib import Path
 
 from uwb_mitigation_msgs.msg import RangeCir
 
-from benchmarks.nodes import vitals_of
+from benchmarks.nodes import process_usage
 from uwb_mitigation.link.emulated_board import EmulatedBoard
 from uwb_mitigation.measurement import Record
 from uwb_mitigation.nodes import processes, topics
@@ -77,10 +77,10 @@ class _Window(Source):
 
     def __init__(self, count: int) -> None:
         self.skipped: Counter[str] = Counter()
-        self._records = [self._cut(record) for record in islice(SimulatedSource(seed=1), count)]
+        self._records = [self._cut_to_window(record) for record in islice(SimulatedSource(seed=1), count)]
 
     @staticmethod
-    def _cut(record: Record) -> Record:
+    def _cut_to_window(record: Record) -> Record:
         cir = record.measurement.cir
         start = int(cir.first_path_index) - WINDOW_LEAD
         cut = replace(cir, samples=cir.samples[2 * start : 2 * (start + WINDOW)], start_index=start)
@@ -128,12 +128,12 @@ def steady(rate_hz: float, seconds: float) -> SteadyResult:
     """
     with _bench(rate_hz) as (board, listener, pid):
         # Count while the stream is paused: ranges before the driver was connected are not losses.
-        sent, received = _at_rest(board, listener)
-        cpu_s, began_s = vitals_of(pid).cpu_s, time.monotonic()
+        sent, received = _pause_and_count(board, listener)
+        cpu_s, began_s = process_usage(pid).cpu_s, time.monotonic()
         board.resume()
         time.sleep(seconds)
-        cpu_s, passed_s = vitals_of(pid).cpu_s - cpu_s, time.monotonic() - began_s
-        all_sent, all_received = _at_rest(board, listener)
+        cpu_s, passed_s = process_usage(pid).cpu_s - cpu_s, time.monotonic() - began_s
+        all_sent, all_received = _pause_and_count(board, listener)
     late_ms = sorted(late / 1e6 for late in listener.late_ns[received:])
     return SteadyResult(
         sent=all_sent - sent,
@@ -154,7 +154,7 @@ def unplug(cycles: int, rate_hz: float = 200.0) -> UnplugResult:
     """
     resumed_ms = []
     with _bench(rate_hz) as (board, listener, pid):
-        before = vitals_of(pid)
+        before = process_usage(pid)
         for cycle in range(cycles):
             board.unplug()
             # Long enough that the driver can be in any state of its back-off.
@@ -167,7 +167,7 @@ def unplug(cycles: int, rate_hz: float = 200.0) -> UnplugResult:
 
             wait(resumed, "no range after the port's return")
             resumed_ms.append((listener.last_ns - returned_ns) / 1e6)
-        after = vitals_of(pid)
+        after = process_usage(pid)
     resumed_ms.sort()
     return UnplugResult(
         cycles=cycles,
@@ -179,7 +179,7 @@ def unplug(cycles: int, rate_hz: float = 200.0) -> UnplugResult:
     )
 
 
-def _at_rest(board: EmulatedBoard, listener: _Listener) -> tuple[int, int]:
+def _pause_and_count(board: EmulatedBoard, listener: _Listener) -> tuple[int, int]:
     board.pause()
     time.sleep(1.0)
     return board.sent_measurements, len(listener.late_ns)

@@ -10,8 +10,17 @@ from statistics import median
 
 from uwb_mitigation_msgs.msg import RangeCorrected
 
-from benchmarks.nodes import Advance, Bench, Step, Subject, open_bench, searches, take_steps, vitals_of
-from benchmarks.visitors import Visitors
+from benchmarks.nodes import (
+    Bench,
+    ProgressCallback,
+    Step,
+    Subject,
+    open_bench,
+    process_usage,
+    run_steps,
+    searches,
+)
+from benchmarks.page_clients import PageClients
 from uwb_mitigation.nodes import topics
 from uwb_mitigation.nodes.processes import wait
 
@@ -47,7 +56,7 @@ class ViewerCosts:
         return {name: rate_hz / (medians_hz[NO_VIEWER] or 1.0) for name, rate_hz in medians_hz.items()}
 
 
-def measure(repeats: int, seconds: float, advance: Advance) -> ViewerCosts:
+def measure(repeats: int, seconds: float, advance: ProgressCallback) -> ViewerCosts:
     """Measure a viewer.
 
     Args:
@@ -70,23 +79,23 @@ def measure(repeats: int, seconds: float, advance: Advance) -> ViewerCosts:
         watched_url, _ = _start_viewer(bench, watched.name)
         core_share: dict[int, float] = {}
 
-        def look(pages: int) -> None:
-            with Visitors(url, pages):
+        def measure_pages(pages: int) -> None:
+            with PageClients(url, pages):
                 time.sleep(_SETTLE_S)
-                before_s, began_s = vitals_of(pid).cpu_s, time.monotonic()
+                before_s, began_s = process_usage(pid).cpu_s, time.monotonic()
                 time.sleep(seconds)
                 passed_s = time.monotonic() - began_s
-                core_share[pages] = (vitals_of(pid).cpu_s - before_s) / passed_s
+                core_share[pages] = (process_usage(pid).cpu_s - before_s) / passed_s
 
         unwatched.play(RATE_HZ)
-        looks: list[Step] = [
-            (f"the viewer with {pages} open pages", _SETTLE_S + seconds, partial(look, pages))
+        page_steps: list[Step] = [
+            (f"the viewer with {pages} open pages", _SETTLE_S + seconds, partial(measure_pages, pages))
             for pages in PAGES
         ]
-        take_steps(
-            [*looks, ("resting", 0.1, unwatched.pause)], lambda text, share: advance(text, 0.3 * share)
+        run_steps(
+            [*page_steps, ("pausing", 0.1, unwatched.pause)], lambda text, share: advance(text, 0.3 * share)
         )
-        with Visitors(watched_url, 1):
+        with PageClients(watched_url, 1):
             for subject in subjects:
                 subject.warm_up()
             slices: list[Step] = [
@@ -95,7 +104,7 @@ def measure(repeats: int, seconds: float, advance: Advance) -> ViewerCosts:
                 for name, subject in zip(SUBJECTS, subjects, strict=True)
             ]
             steps = [*slices, *searches(subjects, repeats)]
-            take_steps(steps, lambda text, share: advance(text, 0.3 + 0.7 * share))
+            run_steps(steps, lambda text, share: advance(text, 0.3 + 0.7 * share))
     figures = {name: subject.figures for name, subject in zip(SUBJECTS, subjects, strict=True)}
     return ViewerCosts(
         core_share,

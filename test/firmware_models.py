@@ -139,7 +139,7 @@ class Exported:
     def windows(self, count: int = 5000) -> NDArray[np.float32]:
         """Return windows that test every rounding: zero, saturating and random ones."""
         samples = self.weights.architecture.samples
-        return random_networks.pressing_windows(samples, self.weights.activation_scale["input"], count)
+        return random_networks.rounding_windows(samples, self.weights.activation_scale["input"], count)
 
     def real_windows(self, apartment: Path, every: int = 1) -> NDArray[np.float32]:
         """Return the network inputs of the real measurements, or of every n-th."""

@@ -21,5 +21,5 @@ def test_demo_ends_with_every_range_equal_to_that_of_the_host():
     done = subprocess.run(command, capture_output=True, text=True, timeout=240, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "20 corrected by the board, 0 lost" in done.stdout
-    assert "20 equal to the host's to the bit, 0 different" in done.stdout
+    assert "20 bit-identical to those of the host, 0 different" in done.stdout
     assert "gone" not in done.stdout + done.stderr, "the driver's own end is no loss of the board"

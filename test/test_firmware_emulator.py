@@ -20,7 +20,7 @@ import pytest
 from firmware_models import Exported
 
 from benchmarks import emulator, random_networks
-from benchmarks.emulated_firmware import EmulatedFirmware, window_of
+from benchmarks.emulated_firmware import EmulatedFirmware, cut_to_window
 from uwb_mitigation.firmware_export import toolchain
 from uwb_mitigation.firmware_export.compiling import WARNINGS, firmware_folder, run
 from uwb_mitigation.firmware_export.export import export_bundle
@@ -92,7 +92,7 @@ def test_kernels_equal_onnx_runtime_on_real_logs(exported: Exported, image: tool
 def test_any_length_and_number_of_modules(samples: int, modules: int, tmp_path: Path):
     weights = random_networks.remnet(samples, 3, modules)
     firmware_models.write_model(tmp_path, weights)
-    windows = random_networks.pressing_windows(samples, weights.activation_scale["input"], 200)
+    windows = random_networks.rounding_windows(samples, weights.activation_scale["input"], 200)
     image = toolchain.build_image(tmp_path, tmp_path, Target.QEMU_MPS2)
     result = emulator.run_windows(image, windows)
     assert np.array_equal(bits(result.records["output_m"]), bits(IntegerNetwork(weights).predict_m(windows)))
@@ -101,7 +101,7 @@ def test_any_length_and_number_of_modules(samples: int, modules: int, tmp_path: 
 def test_trace_and_counter_agree_and_portable_c_takes_four_times_the_instructions(tmp_path: Path):
     weights = random_networks.remnet(8, 3)
     firmware_models.write_model(tmp_path, weights)
-    windows = random_networks.pressing_windows(8, weights.activation_scale["input"], 200)
+    windows = random_networks.rounding_windows(8, weights.activation_scale["input"], 200)
     kernels = toolchain.build_image(tmp_path, tmp_path, Target.QEMU_MPS2)
     portable = toolchain.build_image(tmp_path, tmp_path, Target.QEMU_MPS2, Kernels.PORTABLE, "-O3")
     results = [emulator.run_windows(image, windows) for image in (kernels, portable)]
@@ -160,7 +160,7 @@ def test_real_logs_are_corrected_as_by_the_mitigator(shipped: Path, apartment: P
 
 def test_burst_into_the_serial_port_is_answered_completely(tmp_path: Path):
     bundle = firmware_models.exact_bundle(tmp_path, 8)
-    measured = [window_of(model_material.measurement(seed=seed), 8) for seed in range(50)]
+    measured = [cut_to_window(model_material.measurement(seed=seed), 8) for seed in range(50)]
     encoder, decoder, answers = FrameEncoder(), FrameDecoder(), []
     waiting = b"".join(encoder.encode(*messages.encode(asked)) for asked in measured)
     with EmulatedFirmware(bundle) as board:

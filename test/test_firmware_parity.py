@@ -74,7 +74,7 @@ def test_c_and_oracle_equal_onnx_runtime_on_real_logs(
 def test_any_length_and_number_of_modules(samples: int, modules: int, tmp_path: Path):
     weights = random_networks.remnet(samples, 3, modules)
     firmware_models.write_model(tmp_path, weights)
-    windows = random_networks.pressing_windows(samples, weights.activation_scale["input"], 40)
+    windows = random_networks.rounding_windows(samples, weights.activation_scale["input"], 40)
     computed = CompiledFirmware(tmp_path, tmp_path, SANITIZED).predict_m(windows)
     assert np.array_equal(bits(computed), bits(IntegerNetwork(weights).predict_m(windows)))
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from benchmarks.link import loopback
+from benchmarks.decoder import loopback
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.link.faults import Faults
 from uwb_mitigation.link.framing import Frame, FrameDecoder, FrameEncoder, encode_frame

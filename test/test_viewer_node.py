@@ -16,7 +16,7 @@ from lifecycle_msgs.msg import Transition
 from uwb_mitigation_msgs.msg import RangeCorrected
 from visualization_msgs.msg import MarkerArray
 
-from benchmarks.visitors import Visitors
+from benchmarks.page_clients import PageClients
 from uwb_mitigation.nodes import topics
 
 pytestmark = pytest.mark.ros
@@ -125,7 +125,7 @@ def test_deactivated_viewer_unsubscribes_and_can_be_activated_again(ros: ros_har
     corrected = ros.node.create_publisher(RangeCorrected, "/uwb/range_corrected", 10)
     viewer = ros.start("viewer", "port:=0")
     url = address(viewer)
-    with Visitors(url, 1):
+    with PageClients(url, 1):
         ros.spin_until(lambda: ros.node.count_subscribers("/uwb/range_raw") == 1)
         assert ros.change_state("viewer", Transition.TRANSITION_DEACTIVATE)
         ros.spin_until(lambda: ros.node.count_subscribers("/uwb/range_raw") == 0)

@@ -15,7 +15,7 @@ import pytest
 from bokeh.document import Document
 from browser import Browser
 
-from benchmarks.visitors import Visitors
+from benchmarks.page_clients import PageClients
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.measurement import Cir, Encoding, Status
 from uwb_mitigation.viewer.page import Page, View
@@ -445,7 +445,7 @@ def test_session_of_a_left_page_is_discarded(browser: Browser, view: View, serve
 
 
 def test_wildcard_address_accepts_addresses_of_this_machine(view: View) -> None:
-    with ViewerServer(view, "0.0.0.0", 0) as server, Visitors(server.url, 1):
+    with ViewerServer(view, "0.0.0.0", 0) as server, PageClients(server.url, 1):
         assert server.url == f"http://localhost:{server.port}/"
         assert view.pages == 1
         for name in (socket.gethostname(), "127.0.0.1"):

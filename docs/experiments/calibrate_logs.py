@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.positions import LAG_S, at_truths, hanyang_run
+from benchmarks.positions import TIME_OFFSET_S, at_truths, hanyang_run
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.evaluation.site_data import read_site
 from uwb_mitigation.measurement import Record
@@ -123,7 +123,7 @@ def _against_truth(
 ) -> tuple[float, float, np.ndarray]:
     """Return MAE of ranges, RMSE of the live track, and median error per anchor, m, without the time offset."""
     measured = [record.measurement for record in records]
-    stamp = np.array([one.stamp_ns for one in measured], np.int64) - round(LAG_S * 1e9)
+    stamp = np.array([one.stamp_ns for one in measured], np.int64) - round(TIME_OFFSET_S * 1e9)
     row = np.array([run.anchors.index[one.anchor_id] for one in measured])
     value, variance = np.array([one.range_m for one in measured]), np.full(len(measured), np.nan)
     if bundle is not None:

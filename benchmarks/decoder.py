@@ -78,29 +78,29 @@ def loopback(
         ends = np.cumsum([len(wire) for wire in wires])
         starts = ends - [len(wire) for wire in wires]
         arrived = damage(b"".join(wires), faults, random)
-        whole = _untouched(arrived, starts, ends)
-        body_whole = _untouched(arrived, starts + 1, ends - 1)
+        is_intact = _is_unchanged(arrived, starts, ends)
+        body_is_intact = _is_unchanged(arrived, starts + 1, ends - 1)
 
         received: list[Frame] = []
         at = 0
         while at < len(arrived.data):
             size = int(random.integers(1, _LARGEST_READ + 1))
-            piece = arrived.data[at : at + size]
+            chunk = arrived.data[at : at + size]
             began = time.thread_time()
-            received += decoder.feed(piece)
+            received += decoder.feed(chunk)
             decoder_s += time.thread_time() - began
             at += size
 
         seen = np.zeros(count, dtype=bool)
         for frame in received:
             i = frame.sequence - first
-            if 0 <= i < count and frame == sent[i] and body_whole[i] and not seen[i]:
+            if 0 <= i < count and frame == sent[i] and body_is_intact[i] and not seen[i]:
                 seen[i] = True
             else:
                 corrupt += 1
-        intact += int(whole.sum())
+        intact += int(is_intact.sum())
         delivered += int(seen.sum())
-        intact_lost += int((whole & ~seen).sum())
+        intact_lost += int((is_intact & ~seen).sum())
         advance(first + count)
     return LoopbackResult(
         sent=frames,
@@ -114,7 +114,9 @@ def loopback(
     )
 
 
-def _untouched(arrived: DamagedData, starts: NDArray[np.intp], ends: NDArray[np.intp]) -> NDArray[np.bool_]:
+def _is_unchanged(
+    arrived: DamagedData, starts: NDArray[np.intp], ends: NDArray[np.intp]
+) -> NDArray[np.bool_]:
     """Return the mask of segments [start, end) that arrived without a change or an insertion."""
     unchanged = np.searchsorted(arrived.changed, starts) == np.searchsorted(arrived.changed, ends)
     # An insertion before the first byte is outside of the segment.

@@ -11,10 +11,10 @@ from bokeh.util.token import generate_jwt_token, generate_session_id
 from tornado.httpclient import HTTPRequest
 from tornado.websocket import WebSocketClientConnection, websocket_connect
 
-_PATIENCE_S = 30.0
+_TIMEOUT_S = 30.0
 
 
-class Visitors:
+class PageClients:
     """Pages that stay open until the block ends.
 
     Args:
@@ -33,14 +33,14 @@ class Visitors:
         self._host = urlsplit(url).netloc
         self._pages: list[WebSocketClientConnection] = []
         self._loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self._loop.run_forever, name="visitors", daemon=True)
+        self._thread = threading.Thread(target=self._loop.run_forever, name="page_clients", daemon=True)
 
-    def __enter__(self) -> Visitors:
+    def __enter__(self) -> PageClients:
         self._thread.start()
         try:
             for number in range(len(self.received)):
                 opening: Future[None] = asyncio.run_coroutine_threadsafe(self._open(number), self._loop)
-                opening.result(_PATIENCE_S)
+                opening.result(_TIMEOUT_S)
         except BaseException:
             self._end()
             raise
