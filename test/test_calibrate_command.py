@@ -230,7 +230,7 @@ def test_heights_come_from_a_topic_and_stamps_are_shifted(site):
     for pair, value in given["offsets_m"].items():
         assert shifted["offsets_m"][pair] == pytest.approx(value, abs=0.02)
     both = run("calibrate", "drive.mcap", *LEVEL, "--height-topic", "/odom", "-o", "x.onnx", folder=site)
-    assert (both.returncode, "one of them" in both.stderr) == (1, True)
+    assert (both.returncode, "either of them" in both.stderr) == (1, True)
 
 
 def test_without_a_transform_the_lever_arm_is_zero(site):
@@ -364,13 +364,13 @@ def test_small_displacement_and_heavy_tail_accuse_no_anchor():
 
 
 def test_tag_is_matched_with_its_own_frame_in_any_namespace():
-    from uwb_mitigation.commands.calibrate import _body
+    from uwb_mitigation.commands.calibrate import _body_of_tag
 
-    assert _body(7, ["left/tag_7", "left/tag_8"], "x") == "left/tag_7"
-    assert _body(7, ["base_link"], "x") == "base_link"
+    assert _body_of_tag(7, ["left/tag_7", "left/tag_8"], "x") == "left/tag_7"
+    assert _body_of_tag(7, ["base_link"], "x") == "base_link"
     for names in (["tag_8"], ["base_link", "camera"], ["left/tag_7", "right/tag_7"]):
         with pytest.raises(RecordingError):
-            _body(7, names, "x")
+            _body_of_tag(7, names, "x")
 
 
 def test_lever_arm_is_read_from_every_bag_and_must_be_the_same(site, monkeypatch):

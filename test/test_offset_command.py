@@ -181,11 +181,11 @@ def test_written_offsets_are_read_by_the_other_commands(direct: list[Record], tm
 @pytest.mark.parametrize(
     ("options", "excerpt"),
     [
-        ((), "one of --distance and --truth"),
-        (("--distance", "5", "--truth"), "one of --distance and --truth"),
+        ((), "either --distance or --truth"),
+        (("--distance", "5", "--truth"), "either --distance or --truth"),
         (("--distance", "-5"), "distance = -5.0"),
         (("--distance", "nan"), "distance = nan"),
-        (("--truth", "-o", "none/o.yaml"), "a file in a folder that exists"),
+        (("--truth", "-o", "none/o.yaml"), "a file in an existing folder"),
         (("--truth", "--anchor", "door"), "anchor = 'door'"),
     ],
 )

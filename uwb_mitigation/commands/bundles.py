@@ -20,7 +20,7 @@ ModelOption = Annotated[
     Path | None,
     typer.Option(
         metavar="FILE|NAME",
-        help="Bundle, or the name of a shipped one; without it `universal`, or `universal_amplitude` where the "
+        help="Bundle, or the name of a shipped one. Default: `universal`, or `universal_amplitude` if the "
         "first CIR of the recording has no preamble count.",
         show_default=False,
     ),
@@ -37,7 +37,7 @@ def bundle_for(named: Path | None, recording: Path) -> Bundle:
     from uwb_mitigation.model.shipped import AMPLITUDE, model_path
 
     if named is None and _lacks_counts(recording):
-        console.err.print(f"the CIRs have no preamble count: model {AMPLITUDE}", style="yellow")
+        console.err.print(f"the CIRs have no preamble count: using the model {AMPLITUDE}", style="yellow")
         named = Path(AMPLITUDE)
     return load_bundle(model_path(named))
 

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from uwb_mitigation.positioning.pose_alignment import PosePath
     from uwb_mitigation.training.site_calibration import SiteCalibration
 
-SAME_ARM_M = 0.01
+MAX_LEVER_ARM_DIFFERENCE_M = 0.01
 BASE_FRAME = "base_link"
 """The robot's frame if the poses do not name it."""
 
@@ -42,7 +42,10 @@ BASE_FRAME = "base_link"
 def calibrate(
     bags: Annotated[
         list[Path],
-        typer.Argument(metavar="BAG...", help="Drives past the anchors: bags, or what `data import` reads."),
+        typer.Argument(
+            metavar="BAG...",
+            help="Recordings of drives past the anchors: bags, or other formats that `data import` reads.",
+        ),
     ],
     output: Annotated[
         Path,
@@ -61,18 +64,20 @@ def calibrate(
         str | None,
         typer.Option(
             metavar="TOPIC",
-            help="Take the truth from the robot's localisation: nav_msgs/Odometry, geometry_msgs/PoseStamped or "
+            help="Topic of the robot's localisation, used as ground truth: nav_msgs/Odometry, geometry_msgs/PoseStamped or "
             "PoseWithCovarianceStamped, or /tf.",
         ),
     ] = None,
     frames: Annotated[
         tuple[str, str] | None,
-        typer.Option(metavar="MAP BASE", help="With --truth-topic /tf: the anchors' frame, and the robot's."),
+        typer.Option(
+            metavar="MAP BASE", help="With --truth-topic /tf: frame of the anchors and frame of the robot."
+        ),
     ] = None,
     time_offset: Annotated[
         float | None,
         typer.Option(
-            help="With --truth-topic: what to add to ranges' stamps, s; without it, it is estimated."
+            help="With --truth-topic: time offset added to the stamps of the ranges, s. Default: estimated."
         ),
     ] = None,
     lever_arm: Annotated[
@@ -87,20 +92,21 @@ def calibrate(
         bool,
         typer.Option(
             "--estimate-lever-arm",
-            help="With --truth-topic: estimate the lever arm, starting from that value. Needs a drive with turns.",
+            help="With --truth-topic: estimate the lever arm, starting from the given one. Needs a drive with turns.",
         ),
     ] = False,
     height_topic: HeightTopicOption = None,
     stamp_offset: OffsetOption = 0.0,
     report: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Also write a page with the results: FILE.html."),
+        typer.Option(metavar="FILE", help="Also write an HTML page with the results."),
     ] = None,
-    seed: Annotated[
-        int, typer.Option(help="Seed of the held-out segments and of the tuning of a network.")
-    ] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the held-out segments and of the training.")] = 0,
     force: Annotated[
-        bool, typer.Option("--force", help="Replace existing files, and write a calibration without gain.")
+        bool,
+        typer.Option(
+            "--force", help="Replace existing files, and write a calibration that does not reduce the errors."
+        ),
     ] = False,
     json: JsonOption = None,
 ) -> None:
@@ -120,73 +126,80 @@ def calibrate(
     check_output(output)
     for file in (output, site_calibration.offsets_file(output), *([report] if report else [])):
         if file.exists() and not force:
-            raise ParameterError("exists already", where=str(file), valid="--force replaces it")
-    with_poses = (frames, time_offset, lever_arm, estimate_lever_arm or None)
-    if truth_topic is None and any(option is not None for option in with_poses):
+            raise ParameterError("the file exists", where=str(file), valid="--force replaces it")
+    pose_options = (frames, time_offset, lever_arm, estimate_lever_arm or None)
+    if truth_topic is None and any(option is not None for option in pose_options):
         raise ParameterError(
-            "--frames, --time-offset, --lever-arm and --estimate-lever-arm", valid="with --truth-topic"
+            "--frames, --time-offset, --lever-arm or --estimate-lever-arm without --truth-topic",
+            valid="with --truth-topic",
         )
     if height is not None and height_topic is not None:
-        raise ParameterError("--height and --height-topic", valid="one of them")
-    for what, seconds in (("stamp offset", stamp_offset), ("time offset", time_offset)):
+        raise ParameterError("--height and --height-topic", valid="either of them")
+    for option, seconds in (("stamp offset", stamp_offset), ("time offset", time_offset)):
         if seconds is not None and not abs(seconds) <= 3600.0:
-            raise ParameterError(f"{what} {seconds}", valid="-3600 to 3600 s")
-    at_height, box, arm = height_of(height, height_sd), area_of(area), _lever_arm(lever_arm)
-    known = load_anchors(anchors or anchors_file(bags[0]))
+            raise ParameterError(f"{option} {seconds}", valid="-3600 to 3600 s")
+    height_prior, area_bounds, lever_arm_m = (
+        height_of(height, height_sd),
+        area_of(area),
+        _lever_arm(lever_arm),
+    )
+    anchor_map = load_anchors(anchors or anchors_file(bags[0]))
     source = bundle_for(None, bags[0])
     try:
-        site = _gather(bags, known, source, stamp_offset, height_topic, height_sd)
+        site = _gather(bags, anchor_map, source, stamp_offset, height_topic, height_sd)
         if height_topic is not None and len(site.tags) > 1:
             raise ParameterError(f"--height-topic with {len(site.tags)} tags", valid="bags with one tag")
         for reason, count in site.skipped.items():
-            warn(f"left out: {count} x {reason}")
+            warn(f"skipped: {count} x {reason}")
         with console.stage_bars() as on_progress:
             if truth_topic is None:
                 solution = site_solution.solve_without_truth(
                     site,
                     source,
-                    height=at_height,
-                    area=box,
+                    height=height_prior,
+                    area=area_bounds,
                     height_sd_m=height_sd,
                     on_progress=on_progress,
                 )
             else:
-                paths, arms = _poses(bags, site, truth_topic, frames, arm)
+                paths, lever_arms_m = _poses(bags, site, truth_topic, frames, lever_arm_m)
                 solution = site_solution.solve_with_truth(
                     site,
                     source,
                     paths,
                     truth_topic,
                     time_offset_s=time_offset,
-                    lever_arms_m=arms,
+                    lever_arms_m=lever_arms_m,
                     estimate_lever_arm=estimate_lever_arm,
                     on_progress=on_progress,
                 )
-            found = site_calibration.calibrate(site, source, solution, seed=seed, on_progress=on_progress)
+            calibration = site_calibration.calibrate(
+                site, source, solution, seed=seed, on_progress=on_progress
+            )
     except DatasetError as error:
         # --force does not override this: the anchors, the offsets or the geometry are wrong.
         refused: dict[str, object] = {"offsets_m": {}, "raw_mae_m": None, "calibrated_mae_m": None}
         console.write_json(json, refused | {"truth": truth_topic or "none", "refused": str(error)})
         raise
-    _show(found)
-    if found.lacks_gain and not force:
-        harm = DatasetError(
-            f"not written: {found.summary()}" + "".join(f" {note}." for note in found.notes[:1]),
-            valid="a longer drive, or --force",
+    _show(calibration)
+    if calibration.lacks_gain and not force:
+        no_gain = DatasetError(
+            f"not written: {calibration.summary()}" + "".join(f" {note}." for note in calibration.notes[:1]),
+            valid="a longer drive, or --force to write it anyway",
         )
-        console.write_json(json, found.as_json() | {"refused": str(harm)})
-        raise harm
+        console.write_json(json, calibration.as_json() | {"refused": str(no_gain)})
+        raise no_gain
     name = ", ".join(bag.resolve().name for bag in bags)
     if report is not None:
         from uwb_mitigation.files import write_atomically
         from uwb_mitigation.training.site_page import site_page
 
-        write_atomically(report, site_page(found, name))
+        write_atomically(report, site_page(calibration, name))
         print_line(f"Wrote {report}.")
-    bundle, offsets_path = found.write(output, source, name)
+    bundle, offsets_path = calibration.write(output, source, name)
     print_line(f"Wrote {output} (model {bundle.model_id:08x}) and {offsets_path}.")
     console.write_json(
-        json, found.as_json() | {"model_id": bundle.model_id, "offsets_file": str(offsets_path)}
+        json, calibration.as_json() | {"model_id": bundle.model_id, "offsets_file": str(offsets_path)}
     )
 
 
@@ -221,7 +234,7 @@ def _poses(
     site: SiteData,
     topic: str,
     frames: tuple[str, str] | None,
-    arm: tuple[float, float, float] | None,
+    lever_arm_m: tuple[float, float, float] | None,
 ) -> tuple[list[list[PosePath]], NDArray[np.float64]]:
     """Return, for each tag, the poses of its body in each bag; and the lever arms, (T, 3)."""
     import numpy as np
@@ -229,45 +242,46 @@ def _poses(
     from uwb_mitigation.bag.pose_paths import read_bodies
     from uwb_mitigation.bag.poses import UWB_TAG, tag_of_frame
 
-    if arm is not None and len(site.tags) > 1:
+    if lever_arm_m is not None and len(site.tags) > 1:
         raise ParameterError(
             f"one --lever-arm for {len(site.tags)} tags",
             valid="transforms to the frames of the tags in the bag",
         )
     bodies = [read_bodies(bag, topic, frames) for bag in bags]
-    paths, arms = [], np.zeros((len(site.tags), 3))
+    paths, lever_arms_m = [], np.zeros((len(site.tags), 3))
     for number, tag in enumerate(site.tags):
         names = [
-            _body(tag.tag_id, known, f"{bag}, topic {topic}") for bag, known in zip(bags, bodies, strict=True)
+            _body_of_tag(tag.tag_id, paths_of_bag, f"{bag}, topic {topic}")
+            for bag, paths_of_bag in zip(bags, bodies, strict=True)
         ]
-        paths.append([known[name] for name, known in zip(names, bodies, strict=True)])
-        if arm is not None:
-            arms[number] = arm
+        paths.append([paths_of_bag[name] for name, paths_of_bag in zip(names, bodies, strict=True)])
+        if lever_arm_m is not None:
+            lever_arms_m[number] = lever_arm_m
         elif tag_of_frame(names[0]) is None and names[0].rpartition("/")[2] != UWB_TAG:
-            found = _lever_arm_in(bags, names, site.frame_ids[tag.tag_id])
-            arms[number] = found or (0.0, 0.0, 0.0)
-            if found is None:
+            from_bags = _lever_arm_in(bags, names, site.frame_ids[tag.tag_id])
+            lever_arms_m[number] = from_bags or (0.0, 0.0, 0.0)
+            if from_bags is None:
                 warn(
-                    f"tag {format_id(tag.tag_id)}: no transform from {names[0] or BASE_FRAME} to its antenna in the bag, so "
-                    "that the lever arm is 0; set --lever-arm"
+                    f"tag {format_id(tag.tag_id)}: the bag contains no transform from {names[0] or BASE_FRAME} to the "
+                    "antenna; the lever arm is 0. Set --lever-arm"
                 )
-    return paths, arms
+    return paths, lever_arms_m
 
 
-def _body(tag_id: int, bodies: Iterable[str], where: str) -> str:
+def _body_of_tag(tag_id: int, bodies: Iterable[str], where: str) -> str:
     """Return the body of a tag: its own frame in any namespace, otherwise the only body that is not a tag."""
     from uwb_mitigation.bag.poses import tag_frame, tag_of_frame
 
     names = sorted(bodies)
-    own = [name for name in names if tag_of_frame(name) == tag_id]
+    tag_frames = [name for name in names if tag_of_frame(name) == tag_id]
     # Poses of another tag's own frame are not those of a robot that carries this tag.
-    if len(own) != 1 and not (len(names) == 1 and tag_of_frame(names[0]) is None):
+    if len(tag_frames) != 1 and not (len(names) == 1 and tag_of_frame(names[0]) is None):
         raise RecordingError(
-            f"{'several bodies' if own else 'no body'} for tag {format_id(tag_id)}: poses of {', '.join(names)}",
+            f"{'several frames' if tag_frames else 'no frame'} for tag {format_id(tag_id)}: poses of {', '.join(names)}",
             where=where,
             valid=f"--frames MAP CHILD, or poses of {tag_frame(tag_id)}",
         )
-    return own[0] if own else names[0]
+    return tag_frames[0] if tag_frames else names[0]
 
 
 def _lever_arm_in(
@@ -276,20 +290,20 @@ def _lever_arm_in(
     """Return the transform from robot to antenna from the bags that contain it; None if no bag does."""
     from uwb_mitigation.bag.pose_paths import read_lever_arm
 
-    read = [
+    arms = [
         (bag, read_lever_arm(bag, body or BASE_FRAME, frame))
         for bag, body in zip(bags, bodies, strict=True)
         for frame in frames
     ]
-    found = [(bag, arm) for bag, arm in read if arm is not None]
-    for bag, arm in found[1:]:
-        if math.dist(arm, found[0][1]) > SAME_ARM_M:
+    known = [(bag, arm) for bag, arm in arms if arm is not None]
+    for bag, arm in known[1:]:
+        if math.dist(arm, known[0][1]) > MAX_LEVER_ARM_DIFFERENCE_M:
             raise RecordingError(
-                f"the lever arm differs from that in {found[0][0]}",
+                f"the lever arm differs from that in {known[0][0]}",
                 where=str(bag),
                 valid="--lever-arm, or bags with the antenna at one position",
             )
-    return found[0][1] if found else None
+    return known[0][1] if known else None
 
 
 def _lever_arm(text: str | None) -> tuple[float, float, float] | None:
@@ -304,30 +318,32 @@ def _lever_arm(text: str | None) -> tuple[float, float, float] | None:
     return x, y, z
 
 
-def _show(found: SiteCalibration) -> None:
-    solution = found.solution
+def _show(calibration: SiteCalibration) -> None:
+    solution = calibration.solution
     if solution.alignment is not None:
-        one = solution.alignment
-        print_line(f"time offset {one.time_offset_s:.3f} +- {one.time_offset_sd_s:.3f} s")
-        for ranges, arm, arm_sd in zip(found.site.tags, one.lever_arm_m, one.lever_arm_sd_m, strict=True):
-            known = ", ".join(
+        alignment = solution.alignment
+        print_line(f"time offset {alignment.time_offset_s:.3f} +- {alignment.time_offset_sd_s:.3f} s")
+        for ranges, lever_arm_m, arm_sd in zip(
+            calibration.site.tags, alignment.lever_arm_m, alignment.lever_arm_sd_m, strict=True
+        ):
+            values = ", ".join(
                 f"{value:.3f}" + ("" if sd == 0.0 or math.isnan(sd) else f" +- {sd:.3f}")
-                for value, sd in zip(arm.tolist(), arm_sd.tolist(), strict=True)
+                for value, sd in zip(lever_arm_m.tolist(), arm_sd.tolist(), strict=True)
             )
-            print_line(f"tag {format_id(ranges.tag_id)}: lever arm {known} m")
-    rows = [(format_id(tag), format_id(anchor), *own) for (tag, anchor), own in solution.pairs.items()]
+            print_line(f"tag {format_id(ranges.tag_id)}: lever arm {values} m")
+    rows = [(format_id(tag), format_id(anchor), *values) for (tag, anchor), values in solution.pairs.items()]
     columns = ("tag", "anchor", "offset m", "standard deviation m")
     show_table("Offsets", columns, rows)
-    chosen = found.selection.chosen
-    errors = {"raw": found.raw_mae_m, **found.selection.mae()}
+    chosen = calibration.selection.chosen
+    errors = {"raw": calibration.raw_mae_m, **calibration.selection.mae()}
     show_table(
         "On held-out segments and anchors",
         ("model", "MAE m", ""),
         [(name, mae, "<-" if name == chosen else "") for name, mae in errors.items()],
         chosen,
     )
-    for note in found.notes:
+    for note in calibration.notes:
         warn(note)
     if solution.outliers:
-        warn(f"{solution.outliers} outliers left out of all figures")
-    print_line(found.summary())
+        warn(f"{solution.outliers} outliers are not included in any result")
+    print_line(calibration.summary())

@@ -1,4 +1,4 @@
-"""Checks that commands make before the work."""
+"""Checks of arguments before a command starts its work."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ OffsetsOption = Annotated[
     typer.Option(
         "--offsets",
         metavar="M|FILE",
-        help="What the radios' antenna delays add: metres, or a file as `uwb-mitigation offset` writes.",
+        help="Range offsets of the radios due to antenna delays: metres, or a file written by `uwb-mitigation offset`.",
     ),
 ]
 
@@ -44,7 +44,7 @@ def check_output(output: Path) -> None:
     """
     if output.suffix != ".onnx" or output.is_dir() or not output.resolve().parent.is_dir():
         raise ParameterError(
-            "not a place for a bundle", where=str(output), valid="a file .onnx in a folder that exists"
+            "not a path for a bundle", where=str(output), valid="a file .onnx in an existing folder"
         )
 
 

@@ -134,7 +134,7 @@ def reading() -> Iterator[Callable[[], None]]:
 def show_skipped(refused: Mapping[str, int]) -> None:
     """Print the number of refused ranges by reason, {reason: count}."""
     for reason, count in refused.items():
-        err.print(f"left out: {count} x {reason}", markup=False)
+        err.print(f"skipped: {count} x {reason}", markup=False)
 
 
 def write_json(path: Path | None, result: Mapping[str, Any]) -> None:

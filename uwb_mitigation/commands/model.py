@@ -23,15 +23,15 @@ DataOption = Annotated[
     Path, typer.Option(help="Recording with true ranges: a bag, or a folder of DecaRanging logs.")
 ]
 OutputOption = Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="Bundle to write.")]
-# Options that only one mode of `train` or `evaluate` uses; the other mode refuses them.
-_OF_DATA = {
+# Options for one mode of `train` or `evaluate`; they are errors in the other mode.
+_DATA_OPTIONS = {
     "recipe_name": "--recipe",
     "samples": "--samples",
     "scaling": "--scaling",
     "first_kernel": "--first-kernel",
     "per_configuration": "--per-configuration",
 }
-_OF_CROSS_VALIDATION = {"seeds": "--seeds", "folds": "--folds", "scaling": "--scaling"}
+_CROSS_VALIDATION_OPTIONS = {"seeds": "--seeds", "folds": "--folds", "scaling": "--scaling"}
 
 
 def train(
@@ -45,8 +45,8 @@ def train(
         Path | None,
         typer.Option(
             metavar="BAG",
-            help="Instead: start from a model, and fit it to the boards and walls of this bag. What is "
-            "marked `with --data` is that model's then, and refused here.",
+            help="Instead of --data: fit an existing model to this recording. Its architecture and preprocessing are "
+            "kept, so that the options marked `with --data` are not allowed.",
         ),
     ] = None,
     truth: Annotated[
@@ -61,7 +61,7 @@ def train(
         Path | None,
         typer.Option(
             metavar="FILE|NAME",
-            help="With --from-bag: bundle to start from, or the name of a shipped one; without it `universal`, or "
+            help="With --from-bag: bundle to start from, or the name of a shipped one. Default: `universal`, or "
             "`universal_amplitude` for CIRs without preamble counts.",
         ),
     ] = None,
@@ -76,35 +76,37 @@ def train(
     per_configuration: Annotated[
         int, typer.Option(help="With --data: maximum number of ranges of each configuration in the fit.")
     ] = 20,
-    seed: Annotated[int, typer.Option(help="Seed of the split, the weights and the order.")] = 0,
-    folds: Annotated[int, typer.Option(help="Folds of the cross-validation.")] = 6,
+    seed: Annotated[
+        int, typer.Option(help="Seed of the splits, the initial weights and the order of the data.")
+    ] = 0,
+    folds: Annotated[int, typer.Option(help="Number of folds of the cross-validation.")] = 6,
     json: JsonOption = None,
 ) -> None:
-    """Train a float bundle of a complexity that the data supports.
+    """Train a float bundle; the amount of data determines the complexity of the model.
 
     Cross-validation over configurations selects the model, which is then trained on all of the data.
 
-    One candidate is `cold start`, a network trained in simulated buildings, with an offset estimated from these data.
-    With fewer than 20 configurations it is preferred; with more, its mean with the line is a candidate too. It is not
-    used with --recipe or --model. A network trained on the data is kept only if its selection improves held-out
-    errors.
+    One candidate is `cold start`, a network trained in simulated buildings, with an offset estimated from the data.
+    It is preferred with fewer than 20 configurations. With 20 or more, its mean with the linear bias model is another
+    candidate. It is not used with --recipe or --model. A network trained on the data is selected only if it reduces
+    the error on held-out data.
     """
     from uwb_mitigation.model.architecture import Remnet
     from uwb_mitigation.preprocessing import Preprocessing
     from uwb_mitigation.training.options import FitOptions
 
     if (data is None) == (from_bag is None):
-        raise ParameterError("what to train on", valid="one of --data and --from-bag")
+        raise ParameterError("no training data, or two sources of it", valid="either --data or --from-bag")
     if from_bag is None and (truth or model):
-        raise ParameterError("--truth and --model", valid="with --from-bag")
-    if from_bag is not None and (unused := _given(context, _OF_DATA)):
+        raise ParameterError("--truth or --model without --from-bag", valid="with --from-bag")
+    if from_bag is not None and (unused := _options_given(context, _DATA_OPTIONS)):
         raise ParameterError(
             f"{unused} with --from-bag",
-            valid="with --data: a bag's fit has these from the model that it starts from",
+            valid="only with --data: with --from-bag the source model determines these options",
         )
     chosen_scaling = scaling_of(scaling)
     if per_configuration < 1:
-        raise ParameterError(f"per-configuration = {per_configuration}", valid="1 or more")
+        raise ParameterError(f"per-configuration = {per_configuration}", valid="at least 1")
     given: dict[str, Any] = {"epochs": epochs, "learning_rate": learning_rate, "seed": seed}
     given = {key: value for key, value in given.items() if value is not None}
     options = FitOptions(**given)
@@ -137,17 +139,17 @@ def train(
 
 def quantize(
     model: Annotated[
-        Path, typer.Argument(metavar="MODEL_FLOAT", help="Float bundle, of `train` or `calibrate`.")
+        Path, typer.Argument(metavar="MODEL_FLOAT", help="Float bundle, written by `train` or `calibrate`.")
     ],
     data: Annotated[
         Path,
         typer.Option(
-            help="Recording with CIRs, with or without true ranges: the training data of the bundle."
+            help="Recording with CIRs, with or without true ranges; best the training data of the bundle."
         ),
     ],
     output: OutputOption,
     percentile: Annotated[
-        float, typer.Option(help="Percentile of each activation that 255 represents; 100: the maximum.")
+        float, typer.Option(help="Percentile of each activation that is quantised to 255; 100: the maximum.")
     ] = 100.0,
     json: JsonOption = None,
 ) -> None:
@@ -193,31 +195,31 @@ def evaluate(
         str | None,
         typer.Option(
             metavar="GROUP",
-            help="Instead, fit the shipped recipe and the baselines again and test them on held-out data: "
+            help="Instead of evaluating a model: fit the shipped recipe and the baselines, and test them on held-out data: "
             "configuration, tag (each location in turn) or half (of the anchors).",
         ),
     ] = None,
-    seeds: Annotated[int, typer.Option(help="With --cross-validate: splits and networks.")] = 3,
-    folds: Annotated[int, typer.Option(help="With --cross-validate configuration.")] = 6,
+    seeds: Annotated[
+        int, typer.Option(help="With --cross-validate: number of repetitions with other splits and networks.")
+    ] = 3,
+    folds: Annotated[int, typer.Option(help="With --cross-validate configuration: number of folds.")] = 6,
     scaling: Annotated[
         str, typer.Option(help="With --cross-validate: preamble, or max for data without preamble counts.")
     ] = "preamble",
     json: JsonOption = None,
 ) -> None:
-    """Compute the raw and corrected errors of a recording with truth."""
+    """Compute the errors of raw and corrected ranges in a recording with ground truth."""
     if cross_validate is not None:
         if offsets is not None:
-            raise ParameterError(
-                "--offsets with --cross-validate", valid="with --model, or the shipped model"
-            )
+            raise ParameterError("--offsets with --cross-validate", valid="without --cross-validate")
         if model is not None:
             raise ParameterError(
-                "--model with --cross-validate", valid="one of them: cross-validation fits models of its own"
+                "--model with --cross-validate", valid="one of them: cross-validation fits new models"
             )
         _compare(data, cross_validate, folds, seeds, scaling_of(scaling), json)
         return
-    if unused := _given(context, _OF_CROSS_VALIDATION):
-        raise ParameterError(unused, valid="with --cross-validate")
+    if unused := _options_given(context, _CROSS_VALIDATION_OPTIONS):
+        raise ParameterError(f"{unused} without --cross-validate", valid="only with --cross-validate")
     from uwb_mitigation.evaluation import accuracy
     from uwb_mitigation.mitigation import Mitigation
     from uwb_mitigation.offsets import read_offsets
@@ -236,7 +238,7 @@ def _compare(data: Path, group: str, folds: int, seeds: int, scaling: Scaling, j
     from uwb_mitigation.preprocessing import Preprocessing
     from uwb_mitigation.training.options import FitOptions
 
-    check_name("group of --cross-validate:", group, [kind.value for kind in splits.Group])
+    check_name("group of --cross-validate", group, [kind.value for kind in splits.Group])
     if not 1 <= seeds <= 100:
         raise ParameterError(f"seeds = {seeds}", valid="1 to 100")
     from uwb_mitigation.model.bundle import load_bundle
@@ -257,7 +259,7 @@ def _compare(data: Path, group: str, folds: int, seeds: int, scaling: Scaling, j
 
 
 def _dataset(data: Path, preprocessing: Preprocessing, truth: Sequence[Path] = ()) -> tuple[str, Dataset]:
-    """Return name and measurements of a recording; print the number of refused ranges."""
+    """Return name and measurements of a recording; print the number of skipped ranges by reason."""
     from uwb_mitigation.evaluation import recordings
 
     with console.reading() as on_record:
@@ -266,7 +268,7 @@ def _dataset(data: Path, preprocessing: Preprocessing, truth: Sequence[Path] = (
     return name, dataset
 
 
-def _given(context: typer.Context, flags: Mapping[str, str]) -> str:
+def _options_given(context: typer.Context, flags: Mapping[str, str]) -> str:
     """Return the options of `flags`, {parameter: option}, in the command line, separated by commas."""
     sources = {flag: context.get_parameter_source(name) for name, flag in flags.items()}
     return ", ".join(flag for flag, source in sources.items() if source and source.name == "COMMANDLINE")

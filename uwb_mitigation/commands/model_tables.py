@@ -24,17 +24,17 @@ _ROWS = {
 }
 
 _CANDIDATES = {
-    "raw": "as measured",
-    "as shipped": "the model that was started from",
-    "own offset": "the same with another offset",
-    "cold start": "a simulator-trained network with an offset of these",
-    "line and cold start": "mean of the line and that",
-    "trained further": "the network that was started from, trained on these",
-    "constant": "less one offset",
-    "line": "less a line in the received power",
-    "line+network": "the network on what the line leaves",
-    "network": "the network alone",
-    "chosen (nested)": "of choosing, on what no choice has seen",
+    "raw": "measured ranges",
+    "as shipped": "the source model, unchanged",
+    "new offset": "the source model with a new offset",
+    "cold start": "network trained in simulation, with an offset of this data",
+    "mean of line and cold start": "average of both predictions",
+    "fine-tuned": "the source network, trained further on this data",
+    "constant": "one constant offset",
+    "line": "linear bias model in the received powers",
+    "line+network": "linear bias model, and a network for its residuals",
+    "network": "a network only",
+    "selection (nested)": "error of the selection, on data that it did not use",
 }
 
 
@@ -46,7 +46,7 @@ def show_trained(trained: TrainedBundle) -> None:
         show_selection(trained.selection)
     if trained.prefers_cold_start:
         print_line(
-            f"With fewer than {candidates.MIN_CONFIGURATIONS_FOR_MEAN} configurations, cold start is kept unless another one is "
+            f"With fewer than {candidates.MIN_CONFIGURATIONS_FOR_MEAN} configurations, cold start is selected unless another candidate is "
             f"{selection.COLD_START_MIN_GAIN:.0%} better."
         )
     if "int8" in trained.validation.errors:
@@ -58,9 +58,9 @@ def show_trained(trained: TrainedBundle) -> None:
         )
     for name, before in trained.baseline_mae_m.items():
         change = trained.mae_m / before - 1 if before else 0.0
-        verdict = "lower" if trained.mae_m < before else "higher: this did not help"
+        verdict = "lower" if trained.mae_m < before else "higher, no improvement"
         print_line(
-            f"on configurations not seen, {trained.mae_m:.3f} m against {before:.3f} m {name}: {abs(change):.0%} {verdict}"
+            f"MAE on held-out configurations: {trained.mae_m:.3f} m, {name} {before:.3f} m: {abs(change):.0%} {verdict}"
         )
     show_bundle(trained.bundle)
 
@@ -98,20 +98,20 @@ def show_comparison(result: Comparison) -> None:
     )
     kept = ", ".join(f"{share:.0%}: {mae:.3f}" for share, mae in result.rejection)
     print_line(
-        f"shipped_int8: coverage of its 68 % and 95 % intervals: {covered(result.coverage)}\n"
-        f"MAE without the ranges of largest variance, by share rejected: {kept}\n"
-        f"passed through as unlike the training data: {result.passed_through:.1%}"
+        f"shipped_int8: coverage of the 68 % and 95 % intervals: {covered(result.coverage)}\n"
+        f"MAE after rejecting the share of ranges with the largest variances: {kept}\n"
+        f"not corrected, because out of distribution: {result.passed_through:.1%}"
     )
     if result.universal_coverage is not None:
         print_line(
-            f"universal_los_offset: coverage of its 68 % and 95 % intervals: {covered(result.universal_coverage)}"
+            f"universal_los_offset: coverage of the 68 % and 95 % intervals: {covered(result.universal_coverage)}"
         )
 
 
 def show_held_out(held_out: Mapping[str, Mapping[str, ErrorStatistics]]) -> None:
     """Show the table of `train-universal`."""
     rows = [(row, *(statistics.mae for statistics in by.values())) for row, by in held_out.items()]
-    show_table("MAE in a simulated world that was held out, m", ("", *held_out["raw"]), rows)
+    show_table("MAE in held-out simulated buildings, m", ("", *held_out["raw"]), rows)
 
 
 def show_bundle(bundle: Bundle) -> None:
@@ -129,9 +129,9 @@ def show_accuracy(result: Accuracy) -> None:
     show_table(f"{result.n} ranges, model {result.model_id:08x}, m", columns, rows)
     for status, count in result.statuses.items():
         if status != "OK":
-            print_line(f"{status}: {count} ranges passed through as measured")
+            print_line(f"{status}: {count} ranges not corrected")
     if result.trained_on:
         print_line(
-            f"optimistic: the model was trained on {len(result.trained_on)} of these {len(result.by_configuration)} "
-            "configurations; --cross-validate shows the error on unseen ones"
+            f"The result is optimistic: {len(result.trained_on)} of {len(result.by_configuration)} configurations are in the "
+            "training data of the model. --cross-validate shows the error on held-out configurations."
         )

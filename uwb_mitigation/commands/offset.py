@@ -10,7 +10,7 @@ import typer
 from uwb_mitigation.commands import console
 from uwb_mitigation.commands.bundles import ModelOption, bundle_for
 from uwb_mitigation.commands.console import JsonOption
-from uwb_mitigation.errors import ParameterError, format_id
+from uwb_mitigation.errors import ParameterError, format_id, parse_id
 
 if TYPE_CHECKING:
     from uwb_mitigation.evaluation.radio_offsets import OffsetEstimate
@@ -19,12 +19,18 @@ MAX_DISTANCE_M = 1000.0
 
 
 def offset(
-    bag: Annotated[Path, typer.Argument(metavar="BAG", help="Ranges in line of sight: a bag or logs.")],
+    bag: Annotated[
+        Path,
+        typer.Argument(
+            metavar="BAG",
+            help="Recording of ranges in line of sight: a bag, or a folder of DecaRanging logs.",
+        ),
+    ],
     distance: Annotated[
         float | None, typer.Option(metavar="M", help="True distance between the antennas, m.")
     ] = None,
     truth: Annotated[
-        bool, typer.Option("--truth", help="Instead: take the true distances that the recording holds.")
+        bool, typer.Option("--truth", help="Instead of --distance: use the true distances in the recording.")
     ] = False,
     anchor: Annotated[str | None, typer.Option(metavar="ID", help="Only ranges of this anchor.")] = None,
     tag: Annotated[str | None, typer.Option(metavar="ID", help="Only ranges of this tag.")] = None,
@@ -32,19 +38,24 @@ def offset(
     output: Annotated[
         Path | None,
         typer.Option(
-            "-o", "--output", metavar="FILE", help="Write what --offsets and the nodes' `offsets` read."
+            "-o",
+            "--output",
+            metavar="FILE",
+            help="File of offsets to write, for --offsets and the parameter `offsets` of the nodes.",
         ),
     ] = None,
     common: Annotated[
         bool,
-        typer.Option("--common", help="Write one common offset: for the same boards at several positions."),
+        typer.Option(
+            "--common", help="Write one common offset, if the same boards were at several positions."
+        ),
     ] = False,
     json: JsonOption = None,
 ) -> None:
     """Estimate the range offset due to the antenna delays.
 
     Place tag and anchor at a known distance of two metres or more, without obstacles between or next to them, and
-    record some hundred ranges. NLOS ranges are refused. More placements reduce the uncertainty; more ranges of
+    record some hundred ranges. NLOS ranges are rejected. More placements reduce the uncertainty; more ranges of
     one placement have little effect.
 
         uwb-mitigation offset los.mcap --distance 5.00 -o offsets.yaml
@@ -57,16 +68,13 @@ def offset(
     from uwb_mitigation.sources.opening import open_recording
 
     if (distance is None) == (not truth):
-        raise ParameterError("which distance", valid="one of --distance and --truth")
+        raise ParameterError("no distance, or two sources of it", valid="either --distance or --truth")
     if distance is not None and not 0.0 < distance <= MAX_DISTANCE_M:
         raise ParameterError(f"distance = {distance}", valid=f"above 0, at most {MAX_DISTANCE_M:g} m")
     if output is not None and (output.is_dir() or not output.absolute().parent.is_dir()):
-        raise ParameterError(
-            "not a place for a file", where=str(output), valid="a file in a folder that exists"
-        )
+        raise ParameterError("cannot be written", where=str(output), valid="a file in an existing folder")
     anchor_id, tag_id = (
-        _identity(name, text) if text is not None else None
-        for name, text in (("anchor", anchor), ("tag", tag))
+        _id(name, text) if text is not None else None for name, text in (("anchor", anchor), ("tag", tag))
     )
     mitigation = Mitigation(bundle_for(model, bag))
     with open_recording(bag) as source, console.reading() as on_record:
@@ -83,16 +91,13 @@ def offset(
     console.write_json(json, found.as_json())
 
 
-def _identity(name: str, text: str) -> int:
+def _id(name: str, text: str) -> int:
     try:
-        value = int(text, 0)
-    except ValueError:
-        value = -1
-    if not 0 <= value < 1 << 64:
+        return parse_id(text)
+    except ValueError as error:
         raise ParameterError(
-            f"{name} = {text!r}", valid="a whole number of 64 bits, such as 3 or 0x1f"
-        ) from None
-    return value
+            f"{name} = {text!r}", valid="an id, such as 3 or 0x1f; more than 65535: hexadecimal"
+        ) from error
 
 
 def _show(found: OffsetEstimate) -> None:
@@ -104,15 +109,17 @@ def _show(found: OffsetEstimate) -> None:
         values = ("", "") if one.refused else (one.offset_m, one.sd_m)
         rows.append((*pair, one.placement, one.ranges, *values, f"{one.power_gap_db:.1f}", one.predicted_m))
     show_table(
-        "", ("anchor", "tag", "placement", "ranges", "offset m", "sd m", "gap dB", "predicted m"), rows
+        "",
+        ("anchor", "tag", "placement", "ranges", "offset, m", "sd, m", "power gap, dB", "predicted error, m"),
+        rows,
     )
     refused = [one for one in found.placements if one.refused]
     for one in refused[:MAX_ROWS]:
         pair = format_id(one.anchor_id), format_id(one.tag_id)
-        text = f"left out: anchor {pair[0]}, tag {pair[1]} {one.placement}: {one.refused}"
+        text = f"skipped: anchor {pair[0]}, tag {pair[1]} {one.placement}: {one.refused}"
         console.err.print(text, markup=False)
     if len(refused) > MAX_ROWS:
-        console.err.print(f"left out: {len(refused) - MAX_ROWS} placements more")
+        console.err.print(f"skipped: {len(refused) - MAX_ROWS} more placements")
     print_line(
         f"offset {found.offset_m:.3f} m, standard deviation {found.sd_m:.3f} m, from {found.ranges} ranges, "
         f"for model {found.model_id:08x}"

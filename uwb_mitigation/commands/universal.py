@@ -24,18 +24,20 @@ def train_universal(
     scaling: Annotated[
         str, typer.Option(help="preamble, or max for windows without preamble counts.")
     ] = "preamble",
-    blocks: Annotated[int | None, typer.Option(help="Of 256 placements, to train on.")] = None,
+    blocks: Annotated[
+        int | None, typer.Option(help="Number of blocks of 256 placements for training.")
+    ] = None,
     float_output: Annotated[
-        Path | None, typer.Option("--float", metavar="FILE", help="Write the float bundle too.")
+        Path | None, typer.Option("--float", metavar="FILE", help="Also write the float bundle.")
     ] = None,
     workers: Annotated[
-        int | None, typer.Option(help="Processes that simulate; without it, one a processor.")
+        int | None, typer.Option(help="Number of processes for the simulation; default: one per processor.")
     ] = None,
     json: JsonOption = None,
 ) -> None:
     """Train a model for unknown sites in simulated buildings.
 
-    Simulates, trains, quantises, and evaluates the int8 network in a simulated world that it was not trained on.
+    Simulates buildings, trains a network, quantises it, and evaluates the int8 network in held-out simulated buildings.
 
     The same seed gives the same bundle on the same machine.
 
@@ -48,13 +50,13 @@ def train_universal(
     from uwb_mitigation.preprocessing import Preprocessing
 
     preprocessing = Preprocessing(samples, scaling_of(scaling))
-    for name, value, least, most in (
+    for name, value, low, high in (
         ("seed", seed, 0, 2**31),
         ("blocks", blocks, 1, MAX_BLOCKS),
         ("workers", workers, 1, 256),
     ):
-        if value is not None and not least <= value <= most:
-            raise ParameterError(f"{name} = {value}", valid=f"{least} to {most}")
+        if value is not None and not low <= value <= high:
+            raise ParameterError(f"{name} = {value}", valid=f"{low} to {high}")
     for path in (output, *([float_output] if float_output else [])):
         check_output(path)
     with needs_torch():
@@ -65,16 +67,18 @@ def train_universal(
         plan = replace(plan, blocks=blocks)
     with console.progress() as bar:
         task = bar.add_task("simulating", total=1.0)
-        made = universal.train(
+        trained = universal.train(
             plan,
             output.stem,
             workers or os.cpu_count() or 1,
             lambda share, what: bar.update(task, completed=share, description=what),
         )
     if float_output is not None:
-        save_bundle(float_output, graph.float_model(made.network), replace(made.card, name=float_output.stem))
-    bundle = save_bundle(output, graph.int8_model(made.integers), replace(made.card, quantised=True))
-    model_tables.show_held_out(made.held_out)
+        save_bundle(
+            float_output, graph.float_model(trained.network), replace(trained.card, name=float_output.stem)
+        )
+    bundle = save_bundle(output, graph.int8_model(trained.integers), replace(trained.card, quantised=True))
+    model_tables.show_held_out(trained.held_out)
     model_tables.show_bundle(bundle)
     console.write_json(
         json,
@@ -84,7 +88,7 @@ def train_universal(
             "simulated": True,
             "held_out": {
                 row: {label: asdict(statistics) for label, statistics in by.items()}
-                for row, by in made.held_out.items()
+                for row, by in trained.held_out.items()
             },
         },
     )
