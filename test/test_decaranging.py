@@ -119,8 +119,8 @@ def read_until_damage(path: Path) -> tuple[list[Record], RecordingError | None]:
     return records, None
 
 
-def counts(*oddities: Anomaly) -> dict[str, int]:
-    return dict(Counter(anomaly.value for anomaly in oddities))
+def counts(*anomalies: Anomaly) -> dict[str, int]:
+    return dict(Counter(anomaly.value for anomaly in anomalies))
 
 
 # ---- exchanges ----
@@ -166,7 +166,7 @@ def test_invalid_start_time_becomes_the_epoch(write, file):
 
 
 @pytest.mark.parametrize(
-    ("text", "samples", "oddities"),
+    ("text", "samples", "anomalies"),
     [
         (poll(0) + TRANSMIT + error_block("\0") + final(SECOND) + ranged(5.0), 6, [Anomaly.RECEPTION_ERROR]),
         (poll(0) + TRANSMIT + error_block("C") + final(SECOND) + ranged(5.0), 6, [Anomaly.RECEPTION_ERROR]),
@@ -187,15 +187,15 @@ def test_invalid_start_time_becomes_the_epoch(write, file):
         ("\x00\x01\xff garbage\n" + exchange(5.0), 6, []),
     ],
 )
-def test_malformed_exchange_keeps_its_range(write, text, samples, oddities):
+def test_malformed_exchange_keeps_its_range(write, text, samples, anomalies):
     records, skipped = read(write(header(), text, exchange(6.0, 3.0)))
     assert [record.measurement.range_m for record in records] == [5.0, 6.0]
     assert [len(record.measurement.cir) for record in records] == [samples, 6]
-    if oddities is None:
+    if anomalies is None:
         assert skipped[Anomaly.MALFORMED.value] >= 1
         assert skipped[Anomaly.NO_CIR.value] == 1
     else:
-        assert skipped == counts(*oddities)
+        assert skipped == counts(*anomalies)
 
 
 @pytest.mark.parametrize("text", ["-1.#IND", "1.#QNAN", "nan", "inf", "1e999", "1e300", "five", "1_0"])

@@ -272,7 +272,7 @@ def test_invalid_bag_is_reported_and_does_not_stop_the_others(tmp_path: Path) ->
         (["absent.mcap", "-o", "out.mcap"], "absent.mcap: no such file"),
         (["in.mcap", "in.mcap", "-o", "out"], "have one name"),
         (["in.mcap", "other.mcap", "-o", "out.mcap"], "one file for several bags"),
-        (["empty", "-o", "out"], "holds no MCAP bag"),
+        (["empty", "-o", "out"], "contains no MCAP bag"),
         (["in.mcap", "-o", "out.mcap", "--jobs", "0"], "jobs = 0"),
         (["in.mcap", "-o", "out.mcap", "--model", "absent.onnx"], "absent.onnx"),
         (["in.mcap", "-o", "out.mcap", "--offsets", "absent.yaml"], "absent.yaml"),

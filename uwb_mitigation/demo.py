@@ -90,7 +90,7 @@ def recorded(path: Path, rate: float) -> DemoPlan:
         name = source.name
         kind = "mcap" if isinstance(source, McapRecording) else "decaranging"
     if not count:
-        raise UwbMitigationError("the recording holds no range", where=str(path))
+        raise UwbMitigationError("the recording contains no ranges", where=str(path))
     rate = rate or max(1.0, length_s / TARGET_S)
     return DemoPlan(
         f"{name}, {count} ranges, {rate:.1f} x recorded speed",
@@ -162,7 +162,7 @@ def watch(plan: DemoPlan, console: Console) -> list[str]:
                 f"horizontal position error of the locator: {position_rmse(poses, truth):.3f} m RMSE"
             )
     if statistics.missing or not statistics.corrected:
-        nodes.failures.append(f"{statistics.corrected} of {statistics.raw} ranges came back corrected")
+        nodes.failures.append(f"{statistics.corrected} of {statistics.raw} ranges were corrected")
     return nodes.failures
 
 
@@ -172,7 +172,12 @@ def demo(
         typer.Option(help="DecaRanging log, folder of logs, or MCAP bag. Default: a simulated recording."),
     ] = None,
     rate: Annotated[
-        float, typer.Option(min=0.0, max=10_000.0, help="Speed of the replay; 0 = about 15 s in all.")
+        float,
+        typer.Option(
+            min=0.0,
+            max=10_000.0,
+            help="Speed of the replay relative to the recording; 0: total duration of about 15 s.",
+        ),
     ] = 0.0,
 ) -> None:
     """Replay a recording through driver and mitigator, show it live, and print a summary."""

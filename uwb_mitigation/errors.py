@@ -116,8 +116,8 @@ def missing_dependency(error: ImportError) -> MissingDependencyError | None:
         ("rcl", "rosidl", "builtin_interfaces", "lifecycle_msgs", "ament")
     ) or module.endswith("_msgs"):
         return MissingDependencyError(
-            f"ROS 2 is not set up: there is no {module}",
-            valid="source its setup.sh and that of the workspace; see uwb-mitigation doctor",
+            f"ROS 2 is not set up: {module} is missing",
+            valid="source the setup.sh of ROS and of the workspace; see uwb-mitigation doctor",
         )
     return not_installed(_DISTRIBUTIONS.get(module, module))
 

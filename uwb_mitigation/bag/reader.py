@@ -244,7 +244,7 @@ def check_channel(channel: Channel, type_name: str, path: Path) -> None:
     """
     place = f"{path}, topic {channel.topic}"
     if channel.schema is None:
-        raise RecordingError("the bag holds no schema for it", where=place, valid=type_name)
+        raise RecordingError("the bag contains no schema for this topic", where=place, valid=type_name)
     if channel.schema.name.replace("/msg/", "/") != type_name.replace("/msg/", "/"):
         raise RecordingError(f"messages of type {channel.schema.name!r}", where=place, valid=type_name)
     if channel.encoding != "cdr" or channel.schema.encoding != "ros2msg":
@@ -258,7 +258,7 @@ def check_channel(channel: Channel, type_name: str, path: Path) -> None:
         raise RecordingError(
             f"another version of {type_name}: {differs}",
             where=place,
-            valid="record again, or read it with the version that wrote it",
+            valid="record again, or read it with the version of uwb_mitigation that wrote it",
         )
 
 
@@ -286,7 +286,9 @@ class _BoundedFile:
 
     def read(self, length: int) -> bytes:
         if not 0 <= length <= min(self.size - self.position, MAX_RECORD):
-            raise McapError(f"{length} bytes are expected where {max(self.size - self.position, 0)} are left")
+            raise McapError(
+                f"{length} bytes are expected but only {max(self.size - self.position, 0)} remain"
+            )
         self.position += length
         return self._file.read(length)
 
@@ -440,7 +442,7 @@ def _read_in_file_order(
 
 def _damage_error(path: Path, offset: int, what: str) -> DamagedRecordingError:
     return DamagedRecordingError(
-        f"damaged: {what}", where=f"{path}, byte {offset}", valid="everything before that byte was read"
+        f"damaged: {what}", where=f"{path}, byte {offset}", valid="all messages before this byte were read"
     )
 
 

@@ -114,7 +114,9 @@ def listed_files(folder: Path) -> list[str] | None:
         raise _unsupported_storage(folder, str(storage))
     if str(compression).lower() == "file":
         raise RecordingError(
-            "the bag's files are compressed as a whole", where=str(path), valid=_conversion_hint(folder)
+            "the files of the bag are compressed in file mode",
+            where=str(path),
+            valid=_conversion_hint(folder),
         )
     return names
 
@@ -142,10 +144,10 @@ def bag_files(path: Path) -> list[Path]:
     # Ignore the directory part of a listed name: the file must be in this folder.
     files = [path / name for name in names if name]
     if not files:
-        raise RecordingError("the folder holds no MCAP file", where=str(path))
+        raise RecordingError("the folder contains no MCAP file", where=str(path))
     for file in files:
         if not file.is_file():
-            raise RecordingError(f"{METADATA_NAME} lists a file that is not there", where=str(file))
+            raise RecordingError(f"{METADATA_NAME} lists a missing file", where=str(file))
     return files
 
 

@@ -79,7 +79,7 @@ def difference(schema: str, type_name: str) -> str | None:
                 return f"field {number + 1} of {place} is {shown!r}, expected {' '.join(wanted)!r}"
         if len(found[section]) > len(fields):
             extra = " ".join(found[section][len(fields)])
-            return f"{place} has a further field {extra!r}"
+            return f"{place} has an additional field {extra!r}"
     return None
 
 

@@ -95,7 +95,7 @@ class BagWriter:
         self._stream: BinaryIO | None = None
 
         if self._folder is not None and path.exists() and not path.is_dir():
-            raise RecordingError("is a file, where a bag folder is wanted", where=str(path))
+            raise RecordingError("a file instead of a bag folder", where=str(path))
         # Without `force`, a broken link is not replaced either.
         occupied = os.path.lexists(self.file) or (
             self._folder is not None and path.is_dir() and any(path.iterdir())

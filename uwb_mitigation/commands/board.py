@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from uwb_mitigation.sources.source import Source
 
 ModelOption = Annotated[
-    Path | None, typer.Option(help="Int8 bundle; the shipped one if left out.", show_default=False)
+    Path | None, typer.Option(help="Int8 bundle. Default: the shipped one.", show_default=False)
 ]
 
 app = typer.Typer(help="Emulate a board, calibrate radios, build firmware.", no_args_is_help=True)
@@ -34,18 +34,20 @@ app = typer.Typer(help="Emulate a board, calibrate radios, build firmware.", no_
 def emulate(
     recording: Annotated[
         Path | None,
-        typer.Argument(metavar="[RECORDING]", help="Played over and over; without it, simulated."),
+        typer.Argument(
+            metavar="[RECORDING]", help="Recording that is played in a loop. Default: simulated ranges."
+        ),
     ] = None,
-    link: Annotated[
-        Path | None, typer.Option(help="Symbolic link to the port, kept while the board runs.")
-    ] = None,
-    rate: Annotated[float, typer.Option(help="Measurements a second, Hz.")] = 50.0,
-    model: Annotated[Path | None, typer.Option(help="Bundle that the board holds.")] = None,
-    mode: Annotated[str, typer.Option(help="Initial mode: host or device corrects.")] = "host",
-    duration: Annotated[float | None, typer.Option(help="s, then end; without it, on Ctrl-C.")] = None,
-    damage: Annotated[float, typer.Option(help="Share of bytes flipped, dropped, inserted, each.")] = 0.0,
-    lose: Annotated[float, typer.Option(help="Share of messages lost.")] = 0.0,
-    duplicate: Annotated[float, typer.Option(help="Share of messages that arrive twice.")] = 0.0,
+    link: Annotated[Path | None, typer.Option(help="Symbolic link to the port while the board runs.")] = None,
+    rate: Annotated[float, typer.Option(help="Rate of the measurements, Hz.")] = 50.0,
+    model: Annotated[Path | None, typer.Option(help="Bundle on the board.")] = None,
+    mode: Annotated[str, typer.Option(help="Initial mode: host or device.")] = "host",
+    duration: Annotated[float | None, typer.Option(help="Duration, s. Default: until Ctrl-C.")] = None,
+    damage: Annotated[
+        float, typer.Option(help="Share of bytes that are flipped, dropped and inserted, each.")
+    ] = 0.0,
+    lose: Annotated[float, typer.Option(help="Share of lost messages.")] = 0.0,
+    duplicate: Annotated[float, typer.Option(help="Share of duplicated messages.")] = 0.0,
     seed: Annotated[int, typer.Option(help="Seed of the faults and of simulated measurements.")] = 1,
     json: JsonOption = None,
 ) -> None:
@@ -119,7 +121,9 @@ class RadioSource(str, Enum):
 
 @app.command()
 def antenna_delay(
-    distance: Annotated[float, typer.Option(help="m, between the antennas, measured to the centimetre.")],
+    distance: Annotated[
+        float, typer.Option(help="Distance between the antennas, m, measured to the centimetre.")
+    ],
     port: Annotated[
         str,
         typer.Option(
@@ -131,28 +135,30 @@ def antenna_delay(
     source: Annotated[
         RadioSource, typer.Option(help="Kind of radio, as in the driver.")
     ] = RadioSource.EVB1000,
-    reset: Annotated[str, typer.Option(help="The chip's reset line, as gpiochip0:25 (spi).")] = "",
+    reset: Annotated[str, typer.Option(help="Reset line of the chip, such as gpiochip0:25 (spi).")] = "",
     anchor: Annotated[
         str | None,
         typer.Option(
             metavar="ADDRESS",
-            help="Address of the anchor if several answer, as the tools print it: 34 or 0xdeca010203040506.",
+            help="Address of the anchor if several answer: 34 or 0xdeca010203040506.",
         ),
     ] = None,
-    exchanges: Annotated[int, typer.Option(min=20, max=100_000, help="Ranges to measure.")] = 200,
-    channel: Annotated[int, typer.Option(help="1 to 5, or 7: a delay holds for one channel and PRF.")] = 5,
-    prf: Annotated[int, typer.Option(help="16 or 64 MHz.")] = 64,
-    preamble: Annotated[int, typer.Option(help="Symbols.")] = 128,
-    data_rate: Annotated[int, typer.Option(help="110, 850 or 6800 kbit/s.")] = 6800,
+    exchanges: Annotated[int, typer.Option(min=20, max=100_000, help="Number of ranges.")] = 200,
+    channel: Annotated[
+        int, typer.Option(help="Channel, 1 to 5 or 7; a delay is valid for one channel and PRF.")
+    ] = 5,
+    prf: Annotated[int, typer.Option(help="Pulse repetition frequency, 16 or 64 MHz.")] = 64,
+    preamble: Annotated[int, typer.Option(help="Preamble length, symbols.")] = 128,
+    data_rate: Annotated[int, typer.Option(help="Data rate: 110, 850 or 6800 kbit/s.")] = 6800,
     start: Annotated[
         int,
-        typer.Option(
-            help="Delay to range with meanwhile, ticks; 0 = as in the chip's memory, else 2 x 16436."
-        ),
+        typer.Option(help="Antenna delay during the measurement, ticks; 0: value from OTP, or 2 x 16436."),
     ] = 0,
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", metavar="FILE", help="Parameter file for the driver, to write."),
+        typer.Option(
+            "-o", "--output", metavar="FILE", help="Parameter file for the driver, which is written."
+        ),
     ] = None,
     json: JsonOption = None,
 ) -> None:
@@ -171,9 +177,11 @@ def antenna_delay(
         raise ParameterError(f"--distance {distance}", valid="0.3 to 100 m")
     ports = [part.strip() for part in port.split(",") if part.strip()]
     if not 1 <= len(ports) <= 2 or len(set(ports)) < len(ports):
-        raise ParameterError(f"--port {port}", valid="the tag's, or the tag's and another one, the anchor's")
+        raise ParameterError(
+            f"--port {port}", valid="the port of the tag, or the different ports of tag and anchor"
+        )
     if output is not None and (output.is_dir() or not output.absolute().parent.is_dir()):
-        raise ParameterError(f"-o {output}", valid="a file, in a folder that is there")
+        raise ParameterError(f"-o {output}", valid="a file in an existing folder")
     settings = _settings(anchor, channel, prf, preamble, data_rate, start)
     openers = [bus_opener(source.value, port_name, reset) for port_name in ports]
     with console.step_bar("ranging", exchanges) as advance:
@@ -219,10 +227,10 @@ def _table(found: AntennaDelay, distance_m: float, radios: int) -> Table:
     table.columns[1].justify = "right"
     table.add_row("median error, m", f"{found.offset_m:+.4f}")
     table.add_row("standard deviation of a range, m", f"{found.sd_m:.4f}")
-    table.add_row("received over first-path power, dB", f"{found.power_gap_db:.1f}")
+    table.add_row("receive level minus first-path level, dB", f"{found.power_gap_db:.1f}")
     owner = "of both radios" if radios == 2 else "of the tag"
-    table.add_row(f"antenna delay {owner} so far, ticks", f"{found.before:g}")
-    table.add_row(f"antenna delay {owner} from now on, ticks", f"{found.antenna_delay}")
+    table.add_row(f"previous antenna delay {owner}, ticks", f"{found.before:g}")
+    table.add_row(f"new antenna delay {owner}, ticks", f"{found.antenna_delay}")
     return table
 
 
@@ -240,7 +248,10 @@ def _parameters(found: AntennaDelay, distance_m: float, port: str, settings: Rad
 @app.command()
 def export_c(
     output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for uwb_model.h; made if need be.")
+        Path,
+        typer.Option(
+            "-o", "--output", metavar="DIR", help="Folder for uwb_model.h; created if it does not exist."
+        ),
     ],
     model: ModelOption = None,
     json: JsonOption = None,
@@ -269,7 +280,10 @@ def export_c(
 @app.command()
 def build_image(
     output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="FILE.hex", help="Drag it onto the board's drive.")
+        Path,
+        typer.Option(
+            "-o", "--output", metavar="FILE.hex", help="Image file; copy it to the USB drive of the board."
+        ),
     ] = Path("dwm1001-dev.hex"),
     model: ModelOption = None,
     json: JsonOption = None,
@@ -288,7 +302,7 @@ def build_image(
     from uwb_mitigation.model.shipped import model_path
 
     if not output.absolute().parent.is_dir():
-        raise ParameterError(f"--output {output}", valid="a file in a folder that is there")
+        raise ParameterError(f"--output {output}", valid="a file in an existing folder")
     bundle = load_bundle(model_path(model))
     with tempfile.TemporaryDirectory() as folder:
         export_bundle(bundle, Path(folder))

@@ -155,7 +155,7 @@ def write_json(path: Path | None, result: Mapping[str, Any]) -> None:
 def _check_json_target(path: Path | None) -> Path | None:
     """Refuse a path that cannot be written, before the work begins."""
     if path is not None and (path.is_dir() or not path.absolute().parent.is_dir()):
-        raise typer.BadParameter(f"{path} is a folder, or lies in one that is not there")
+        raise typer.BadParameter(f"{path} is a folder, or its folder does not exist")
     return path
 
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from uwb_mitigation.positioning.tracks import Imu, Odometry
     from uwb_mitigation.sources.source import Source
 
-app = typer.Typer(help="Bring recordings into bags, simulate them, look at them.", no_args_is_help=True)
+app = typer.Typer(help="Import, simulate and show recordings.", no_args_is_help=True)
 
 _STRIDE = 100
 """Number of ranges between two updates of a progress bar."""
@@ -43,9 +43,7 @@ class Like(str, enum.Enum):
 
 LongestPauseOption = Annotated[
     float,
-    typer.Option(
-        metavar="SECONDS", help="Pauses are cut to this, so that the bag can be played; inf cuts none."
-    ),
+    typer.Option(metavar="SECONDS", help="Longer pauses are shortened to this; inf: never."),
 ]
 _LONGEST_PAUSE_S = 5.0
 
@@ -122,14 +120,14 @@ def simulate(
             "in random buildings, with different boards. `paper simulate`: DeepUWB's rooms."
         ),
     ] = Like.DRIVE,
-    seed: Annotated[
-        int, typer.Option(help="The same seed gives the same ranges, from today 0:00 UTC on.")
-    ] = 1,
+    seed: Annotated[int, typer.Option(help="Seed. Stamps start today at 0:00 UTC.")] = 1,
     ranges: Annotated[
         int, typer.Option(help="Number of ranges, including those that are too weak to be received.")
     ] = 20_000,
-    exchanges: Annotated[int, typer.Option(help="For each placement at rest; a drive has none.")] = 20,
-    anchors: Annotated[int, typer.Option(help="That a drive goes past, 4 to 8.")] = 4,
+    exchanges: Annotated[
+        int, typer.Option(help="Exchanges of each static placement (survey, buildings).")
+    ] = 20,
+    anchors: Annotated[int, typer.Option(help="Number of anchors of a drive, 4 to 8.")] = 4,
     longest_pause: LongestPauseOption = _LONGEST_PAUSE_S,
     force: ForceOption = False,
     json: JsonOption = None,
@@ -194,7 +192,11 @@ def _write(
             except DamagedRecordingError as error:  # noqa: PERF203 - once a source
                 damage.append(error)
         if inventory.ranges == 0:
-            raise damage[0] if damage else RecordingError("no ranges in it", where=origin["source"])
+            raise (
+                damage[0]
+                if damage
+                else RecordingError("the recording contains no ranges", where=origin["source"])
+            )
     found = inventory.as_json()
     for source in sources:
         _show_source(source)
@@ -202,7 +204,7 @@ def _write(
         _show_inventory(found)
     if pauses.cut:
         print_line(
-            f"Cut {pauses.cut} pauses to {pauses.longest_s:g} s each, {pauses.cut_s:.0f} s in all; "
+            f"Shortened {pauses.cut} pauses to {pauses.longest_s:g} s, {pauses.cut_s:.0f} s in total; "
             "--longest-pause inf keeps them."
         )
     if len(sources) == 1:
@@ -211,7 +213,7 @@ def _write(
     lost = ", ".join(f"{count} x {reason}" for reason, count in inventory.skipped.items())
     print_line(
         f"Wrote {messages} messages, {inventory.ranges} ranges of {_pairs(found)}, to {bag.file}"
-        + (f"; left out: {lost}." if lost and total is not None else ".")
+        + (f"; skipped: {lost}." if lost and total is not None else ".")
     )
     console.write_json(json, {"messages": messages, "output": str(bag.file), **found, **(extra or {})})
     if damage:
@@ -255,7 +257,7 @@ def simulated_source(like: Like, seed: int, ranges: int, exchanges: int, anchors
             return SimulatedBuildings(seed=seed, placements=placements, exchanges=exchanges)
         return simulated.SimulatedSurvey(seed=seed, configurations=placements, exchanges=exchanges)
     if ranges < 1:
-        raise ParameterError(f"{ranges} ranges", valid="1 or more: a drive has no end of its own")
+        raise ParameterError(f"{ranges} ranges", valid="1 or more: a drive is endless")
     return simulated.SimulatedSource.with_anchors(anchors, seed=seed, count=ranges)
 
 
@@ -308,9 +310,9 @@ def _save_anchors(source: Source, bag: Path) -> None:
 
 
 _KINDS = {
-    True: "simulated: no radio was involved",
+    True: "simulated",
     False: "measured by radios",
-    None: "unknown whether radios measured it or a simulator made it",
+    None: "unknown whether measured or simulated",
 }
 
 
@@ -332,7 +334,7 @@ def _show_inventory(found: dict[str, Any]) -> None:
         pairs.add_row(*ids, pair["label"], str(pair["ranges"]), _number(pair["rate_hz"], 1), *means)
     console.out.print(pairs)
     if found["skipped"]:
-        oddities = Table("oddity", title="Oddities", title_justify="left")
+        oddities = Table("warning", title="Warnings", title_justify="left")
         oddities.add_column("count", justify="right")
         for kind, count in sorted(found["skipped"].items(), key=lambda item: -item[1]):
             oddities.add_row(kind, str(count))

@@ -30,19 +30,21 @@ def process(
             "-o",
             "--output",
             metavar="OUT",
-            help="Of one bag: OUT.mcap for one file, any other name for a bag folder. Of several: a folder.",
+            help="For one bag: OUT.mcap for one file, any other name for a bag folder. For several bags: a "
+            "folder.",
         ),
     ],
     model: ModelOption = None,
     offsets: OffsetsOption = None,
     workers: Annotated[
-        int | None, typer.Option("-j", "--jobs", help="Bags at a time; without it, one for each core.")
+        int | None,
+        typer.Option(
+            "-j", "--jobs", help="Bags that are processed at the same time. Default: number of cores."
+        ),
     ] = None,
     scheduler: Annotated[
         str | None,
-        typer.Option(
-            metavar="ADDRESS", help="Let the Dask cluster of this scheduler do it: tcp://HOST:8786."
-        ),
+        typer.Option(metavar="ADDRESS", help="Address of the scheduler of a Dask cluster: tcp://HOST:8786."),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace outputs that exist.")] = False,
     json: JsonOption = None,
@@ -89,7 +91,7 @@ def _make_folder(path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ParameterError(
-            f"cannot be made: {error.strerror}", where=str(path), valid="a folder"
+            f"cannot be created: {error.strerror}", where=str(path), valid="a folder"
         ) from error
 
 

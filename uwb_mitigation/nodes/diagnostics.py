@@ -99,7 +99,9 @@ class Threshold:
 
 
 OUT_OF_DISTRIBUTION = Threshold(
-    "share of ranges OUT_OF_DISTRIBUTION", 0.2, "many ranges are unlike the model's training data"
+    "share of ranges OUT_OF_DISTRIBUTION",
+    0.2,
+    "many ranges are out of distribution: the model was trained on other data",
 )
 NO_USABLE_CIR = Threshold("share of ranges NO_CIR or BAD_CIR", 0.2, "many ranges have no usable CIR")
 NO_PREAMBLE_COUNT = Threshold(
@@ -108,12 +110,13 @@ NO_PREAMBLE_COUNT = Threshold(
     "many CIRs have no preamble count, and this model needs it: set model to universal_amplitude",
 )
 DROPPED = Threshold("share of ranges dropped", 0.0, "ranges were dropped: the queue was too short")
-SLOW = Threshold("p99 of the processing time, ms", 20.0, "correcting takes long: the processor is overloaded")
-NO_RANGES = Threshold("s without a range", 5.0, "no ranges arrive")
+SLOW = Threshold("p99 of the processing time, ms", 20.0, "correction is slow: the processor is overloaded")
+NO_RANGES = Threshold("s without a range", 5.0, "no ranges received")
 OFFSET = Threshold(
-    "size of the median predicted error of ranges that look like line of sight, m",
+    "absolute median predicted error of LOS ranges, m",
     0.15,
-    "the model takes much off ranges that look like line of sight: it holds other boards' offset",
+    "the median correction of LOS ranges is large: the model probably includes the antenna delay of other "
+    "boards; calibrate offsets",
 )
 
 MAX_LOS, MIN_LOS = 1000, 200

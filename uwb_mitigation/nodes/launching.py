@@ -121,7 +121,7 @@ def for_launch(value: Value) -> Value:
         return value
     if _FLOAT.fullmatch(value) and yaml.safe_load(value) == value:
         raise ParameterError(
-            f"text {value} is read as a number by ROS", valid="another notation, such as 0x12e4"
+            f"ROS parses the text {value} as a number", valid="another notation, such as 0x12e4"
         )
     return json.dumps(value)
 

@@ -174,7 +174,7 @@ class ManagedNode(LifecycleNode):
             if self.error is None:
                 self.get_logger().error(traceback.format_exc())
                 self.error = UwbMitigationError(
-                    f"{type(error).__name__}: {error}", valid="see the log: a bug"
+                    f"{type(error).__name__}: {error}", valid="this is a bug: see the log"
                 )
         else:
             self.error = None
@@ -297,7 +297,7 @@ def _restore_live_parameters(node: Node, live: Collection[str]) -> Callable[[lis
             {name: RosParameter(name, value=value) for name, value in saved.items()}
         )
         values = ", ".join(f"{name} = {value!r}" for name, value in saved.items())
-        node.get_logger().info(f"restored after a restart, as set while the node ran: {values}")
+        node.get_logger().info(f"restored parameters after a respawn: {values}")
 
     def save_live_parameters(changes: list[Any]) -> None:
         saved.update({change.name: change.value for change in changes if change.name in live})

@@ -46,7 +46,7 @@ _OFFSETS_PROBLEM, _RADIO_PROBLEM = "the offsets are not set", "the radio's setti
 _STATES = {
     RadioState.ABSENT: "no DW1000 answers the board: check wiring and supply",
     RadioState.BUS: "the board's SPI fails",
-    RadioState.NO_CLOCK: "the DW1000's clock PLL does not lock: check its supply",
+    RadioState.NO_CLOCK: "the clock PLL of the DW1000 does not lock: check its supply",
 }
 _COUNTS = tuple(row.name for row in fields(RadioStatus) if row.type == "int")
 
@@ -239,7 +239,7 @@ class BoardFeed(LiveFeed):
                 log.info(f"connected to board {format_id(hello.board_id)}, model {model}, mode {mode}")
             case Disconnected(loss=loss):
                 if not port.closed:
-                    log.warning(f"the board is gone: {loss.value}; waiting for it")
+                    log.warning(f"disconnected from the board: {loss.value}; waiting for it")
             case VersionMismatch(version=version):
                 log.error(
                     f"the board uses version {version} of the protocol, this driver version {PROTOCOL_VERSION}: "
@@ -248,7 +248,9 @@ class BoardFeed(LiveFeed):
             case ModeChanged(mode=mode):
                 log.info(f"the board is in mode {mode.name}")
             case ModeRefused(mode=mode, wanted=wanted):
-                log.warning(f"the board stays in mode {mode.name} instead of {wanted.name}: has it a model?")
+                log.warning(
+                    f"the board stays in mode {mode.name} instead of {wanted.name}: does it have a model?"
+                )
             case OffsetsRefused(text=text):
                 self._refused[_OFFSETS_PROBLEM] = text
                 log.error(f"the board's corrections are not published: {_OFFSETS_PROBLEM}: {text}")
@@ -355,7 +357,8 @@ def open_radios(value: Value, now_ns: Callable[[], int]) -> list[RadioDriver]:
         raise ParameterError("parameter port is empty", valid=valid)
     if settings.address and len(names) > 1:
         raise ParameterError(
-            f"parameter {PREFIX}address with {len(names)} ports", valid="empty: each has its chip's address"
+            f"parameter {PREFIX}address with {len(names)} ports",
+            valid="empty: each radio uses the address of its chip",
         )
     openers = [bus_opener(value("source"), name, value(PREFIX + "reset")) for name in names]
     ports: list[RadioDriver] = []
@@ -404,7 +407,7 @@ def radio_warning(settings: RadioSettings | None, status: RadioStatus) -> str:
     if status.state is RadioState.LOCK_UNCONFIRMED:
         return "the DW1000 has not reported that its clock PLL locked; if it does not range, check its supply"
     if settings is not None and settings.role is Role.TAG and not status.anchors:
-        return "no anchor in reach: are they on, with the same channel, rate and PAN?"
+        return "no anchor answers: check their power, channel, data rate and PAN id"
     return ""
 
 

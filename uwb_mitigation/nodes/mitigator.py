@@ -202,7 +202,7 @@ class Mitigator(ManagedNode):
             self._mitigation = mitigation
         bundle = mitigation.bundle
         self._reset_offset_check(mitigation)
-        limits = ": on other boards or behind other walls it may harm"
+        limits = "; it may increase errors of other boards and at other sites"
         if bundle.linear_bias == LinearBiasModel(0.0):
             limits = f"; offsets of these radios: {self._offsets}"
         self.get_logger().info(

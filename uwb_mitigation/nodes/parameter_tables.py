@@ -97,51 +97,52 @@ _UCI = ("role", "address", "channel", "preamble_code", "window", "anchors", "rat
 
 
 RADIO = (
-    _radio("role", "tag", "What the first radio is: a tag, which ranges with anchors, or an anchor, which answers",
+    _radio("role", "tag", "Role of the first radio: a tag ranges with anchors, an anchor answers",
            choices=("tag", "anchor")),
-    _radio("address", "", "Its address, such as 34 or '0xdeca010203040506'; empty = the chip's own; with uci a number below "
-           "65535, 1 for a tag and 2 for an anchor if empty, and each further port has the next one", or_number=True),
-    _radio("pan", 0x5542, "Network; frames of others are refused", low=0, high=0xFFFE),
-    _radio("channel", 0, "UWB channel: 1 to 5, or 7; 5 or 9 with uci. 0 = 5, or 9 with uci", low=0, high=9),
+    _radio("address", "", "Address, such as 34 or '0xdeca010203040506'; empty: address of the chip. With uci, a number below "
+           "65535; empty: 1 for a tag, 2 for an anchor; each additional port has the next number", or_number=True),
+    _radio("pan", 0x5542, "PAN id; frames of other networks are rejected", low=0, high=0xFFFE),
+    _radio("channel", 0, "UWB channel: 1 to 5, or 7; 5 or 9 with uci. 0: 5, or 9 with uci", low=0, high=9),
     _radio("prf", 64, "Pulse repetition frequency: 16 or 64", low=16, high=64, unit="MHz"),
     _radio("preamble", 128, "Preamble: 64, 128, 256, 512, 1024, 1536, 2048 or 4096 symbols; a longer one increases range "
            "and air time", low=64, high=4096, unit="symbols"),
-    _radio("preamble_code", 0, "0 = the first code of the standard for channel and PRF, or 10 with uci", low=0, high=24),
-    _radio("data_rate", 6800, "110, 850 or 6800", low=110, high=6800, unit="kbit/s"),
-    _radio("decawave_sfd", False, "Decawave's start-of-frame delimiter instead of the standard's"),
+    _radio("preamble_code", 0, "Preamble code; 0: first code of the standard for channel and PRF, or 10 with uci", low=0, high=24),
+    _radio("data_rate", 6800, "Data rate: 110, 850 or 6800", low=110, high=6800, unit="kbit/s"),
+    _radio("decawave_sfd", False, "Use Decawave's start-of-frame delimiter instead of the standard one"),
     _radio("tx_power", 0, "Register TX_POWER in smart-power format (lowest octet: frames of any length; below 6.8 Mbit/s "
-           "it is used for all). 0: value from OTP, or the manual's", low=0, high=0xFFFFFFFF),
+           "it is used for all). 0: value from OTP, or from the manual", low=0, high=0xFFFFFFFF),
     _radio("antenna_delay", 0, "Total TX + RX antenna delay. 0: value from OTP, or 2 x 16436",
            low=0, high=0x1FFFE, unit="ticks"),
-    _radio("window", 157, "Samples of the CIR of each range; 1016 = all, or 255 with uci", low=0, high=1016),
-    _radio("anchors", "", "Addresses that a tag polls in turn, with commas between; empty = those that it finds, or with "
-           "uci those at the other ports", or_number=True),
-    _radio("rate", 0.0, "Highest number of exchanges per second; 0 = as fast as possible; with uci 0 = 55 with a "
-           "window of 16, 11 with 157, the same at all boards", low=0.0, high=1000.0, unit="Hz"),
-    _radio("report", False, "An anchor publishes its ranges here too"),
-    _radio("bias_correction", False, "Correct ranges for the received power (APS011); the models were trained without"),
+    _radio("window", 157, "Number of CIR samples of each range; 1016: all, or 255 with uci", low=0, high=1016),
+    _radio("anchors", "", "Addresses that a tag polls in turn, separated by commas; empty: all anchors that answer; with "
+           "uci, those at the other ports", or_number=True),
+    _radio("rate", 0.0, "Maximum rate of exchanges; 0: as fast as possible; with uci, 55 for a "
+           "window of 16 and 11 for 157. All uci boards need the same rate", low=0.0, high=1000.0, unit="Hz"),
+    _radio("report", False, "An anchor also publishes its ranges"),
+    _radio("bias_correction", False, "Correct the range bias over received power (APS011); the models were "
+           "trained without this correction"),
 )  # fmt: skip
 
 DRIVER = (
-    Parameter("source", "simulated", "Where measurements come from.",
+    Parameter("source", "simulated", "Source of the measurements.",
               choices=("mcap", "decaranging", "simulated", "serial", "evb1000", "spi", "uci"), filed=False),
     Parameter("path", "", "Recording to replay: a bag (mcap), a log or a folder of logs (decaranging), or a capture (uci)."),
     Parameter("topic", "/uwb/range_raw", "Topic of the ranges inside the bag (mcap)."),
-    Parameter("cir", "final", "Which frame's CIR belongs to a range (decaranging).",
+    Parameter("cir", "final", "Frame whose CIR belongs to a range (decaranging).",
               choices=("final", "poll")),
     Parameter("seed", 1, "Seed of the simulated measurements.", low=0, high=2**31 - 1),
-    Parameter("count", 0, "Simulated measurements before the end; 0 = endless.", low=0, high=2**31 - 1),
-    Parameter("simulated_rate", 40.0, "Simulated exchanges a second, over all pairs.",
+    Parameter("count", 0, "Number of simulated measurements; 0: endless.", low=0, high=2**31 - 1),
+    Parameter("simulated_rate", 40.0, "Rate of simulated exchanges, over all pairs.",
               low=0.1, high=10_000.0, unit="Hz"),
     Parameter("rate", 1.0, "Speed of a replay relative to the recording.",
               low=0.001, high=10_000.0, live=True),
     Parameter("paused", False, "Pause the replay.", live=True),
-    Parameter("seek_to", 0.0, "Where a replay starts, from the beginning of the recording; set while it runs, "
-              "it goes on from there.", low=0.0, high=1e9, live=True, unit="s"),
-    Parameter("loop", False, "Start a replay over when it ends; otherwise the node exits then."),
-    Parameter("longest_pause", 5.0, "Pauses of a recording longer than this are cut to it, in recorded time.",
+    Parameter("seek_to", 0.0, "Start position of a replay in the recording. If it is set during the replay, "
+              "the replay continues from there.", low=0.0, high=1e9, live=True, unit="s"),
+    Parameter("loop", False, "Restart a replay at its end; otherwise the node exits."),
+    Parameter("longest_pause", 5.0, "Longer pauses of a recording are shortened to this (recorded time).",
               low=0.0, high=1e6, unit="s"),
-    Parameter("publish_clock", False, "Publish the recording's time on /clock, and stamp with it. "
+    Parameter("publish_clock", False, "Publish the time of the recording on /clock, and use it for stamps. "
               "Run the other nodes with use_sim_time."),
     Parameter("wait_for_subscribers", 1, "Number of subscribers that a replay waits for.",
               low=0, high=1000),
@@ -152,7 +153,7 @@ DRIVER = (
               "otherwise 3 s.",
               low=-1.0, high=3600.0, unit="s"),
     Parameter("port", "", "Serial port of the board: a path such as /dev/ttyACM0, or "
-              "usb:VENDOR:PRODUCT[:SERIAL] with ids in hexadecimal, wherever it is plugged in (serial, evb1000, uci); or "
+              "usb:VENDOR:PRODUCT[:SERIAL] with hexadecimal ids for any USB port (serial, evb1000, uci); or "
               "/dev/spidev0.0 (spi). Several radios are separated by commas: the first has radio.role, the others "
               "are anchors."),
     Parameter("baud", 921_600, "Baud rate of a serial line; native USB ignores it (serial).",
@@ -161,26 +162,27 @@ DRIVER = (
               "its change resets the board (serial)."),
     Parameter("mode", "host", "Where the model runs: on the host or on the device (serial).",
               choices=("host", "device"), live=True),
-    Parameter("offsets", "", "As in the mitigator, for a board in mode device (serial).",
+    Parameter("offsets", "", "Offsets for a board in mode device, as in the mitigator (serial).",
               live=True, or_number=True),
-    Parameter("board_model", "", "Model id that the board must hold, eight hexadecimal digits; its corrections "
-              "by another model are withheld. Empty = any (serial)."),
+    Parameter("board_model", "", "Expected model id of the board, eight hexadecimal digits; corrections by "
+              "another model are not published. Empty: any (serial)."),
     *RADIO,
-    Parameter("radio.tags", "", "Addresses of the tags of an anchor, separated by commas; empty = 1 (uci).",
+    Parameter("radio.tags", "", "Addresses of the tags of an anchor, separated by commas; empty: 1 (uci).",
               live=True, or_number=True),
-    Parameter("capture", "", "File for the raw bytes of the boards, which path replays; it is replaced. Empty = none (uci)."),
-    Parameter("radio.reset", "", "The chip's reset line, as gpiochip0:25; empty = not wired (spi)."),
-    Parameter("frame_id", "uwb_antenna", "Frame of the receiving antenna, where the source names none."),
+    Parameter("capture", "", "File for the raw bytes of the boards, which `path` replays; an existing file is replaced. Empty: none (uci)."),
+    Parameter("radio.reset", "", "Reset line of the chip, such as gpiochip0:25; empty: not connected (spi)."),
+    Parameter("frame_id", "uwb_antenna", "Frame id of the receiving antenna, if the source contains none."),
     _SENSOR_RANGES,
     Parameter("autostart", True, "Configure and activate without a lifecycle manager."),
 )  # fmt: skip
 
 MITIGATOR = (
     Parameter("model", "", "Model bundle to correct with: a file, or the name of a shipped one (universal, universal_amplitude, "
-              "evk1000_apartment); empty = universal. A bundle that cannot be "
-              "used is refused, and the previous one stays in use.", live=True),
+              "evk1000_apartment); empty: universal. An invalid bundle is refused, and the previous one "
+              "stays in use.", live=True),
     Parameter("offsets", "", "Offset of ranges due to antenna delays, subtracted before the model: a number in "
-              "metres, or a file by anchor, tag or pair (docs/guides/calibration.md); empty = 0. Invalid offsets are refused, and "
+              "metres, or a file by anchor, tag or pair (docs/guides/calibration.md); empty: 0. Invalid "
+              "offsets are refused, and "
               "the previous ones stay in use.", live=True, or_number=True),
     Parameter("backend", "onnxruntime", "Inference engine: ONNX Runtime, or the firmware's C, compiled for this "
               "computer at activation (bit-identical).", choices=("onnxruntime", "firmware")),
@@ -190,27 +192,26 @@ MITIGATOR = (
 
 LOCATOR = (
     Parameter("anchors", "", "File with the positions of the anchors (format: docs/background/positioning.md). Required."),
-    Parameter("tag", 0, "Number of the tag whose topics have the plain names; others have uwb/tag_N/pose and so "
-              "on. 0 = the first one that is received.", low=0, high=2**63 - 1),
-    Parameter("level", False, "The tag's antenna stays at one height, that of `height`."),
-    Parameter("height", 0.0, "Height of the tag's antenna in the anchors' frame, if it is constant.",
+    Parameter("tag", 0, "Number of the tag whose topics have the plain names; others use uwb/tag_N/pose and "
+              "so on. 0: the first received tag.", low=0, high=2**63 - 1),
+    Parameter("level", False, "The antenna of the tag has the constant height `height`."),
+    Parameter("height", 0.0, "Height of the antenna of the tag in the frame of the anchors, if it is constant.",
               low=-1e4, high=1e4, unit="m"),
     Parameter("height_sd", 0.1, "Standard deviation of that height.", low=0.001, high=100.0, unit="m"),
-    Parameter("area", "", "Where tags can be, X,Y,Z,X,Y,Z: two corners of a box, m. Empty = wherever ranges reach."),
-    Parameter("acceleration", 1.0, "How fast tags change their speed: 1 for robots, people and drones.",
+    Parameter("area", "", "Area of possible tag positions, X,Y,Z,X,Y,Z: two corners of a box, m. Empty: unlimited."),
+    Parameter("acceleration", 1.0, "Process noise: change of the speed of tags; 1 for robots, people and drones.",
               low=0.001, high=1000.0, unit="m/s^1.5"),
-    Parameter("range_sd", 0.1, "Standard deviation of a range that comes without a variance.",
+    Parameter("range_sd", 0.1, "Standard deviation of ranges without a variance.",
               low=0.001, high=100.0, unit="m"),
-    Parameter("stamp_offset", 0.0, "Added to the stamps of ranges: -0.2 where they lag by 0.2 s.",
+    Parameter("stamp_offset", 0.0, "Offset that is added to the stamps of ranges: -0.2 if they are 0.2 s late.",
               low=-10.0, high=10.0, unit="s"),
-    Parameter("rate", 50.0, "Most estimates of a tag a second; 0 = one with each range.",
+    Parameter("rate", 50.0, "Maximum rate of estimates of a tag; 0: one for each range.",
               low=0.0, high=10_000.0, unit="Hz"),
-    Parameter("height_topic", "", "Topic of the only tag's height, a PoseWithCovarianceStamped; its z counts. "
-              "Empty = none."),
+    Parameter("height_topic", "", "Topic with the height of the only tag: z of a PoseWithCovarianceStamped. Empty: none."),
     Parameter("map_frame", "map", "Frame of the anchors."),
     Parameter("tag_frame", "uwb_tag", "Frame of the tag with the plain topic names: child frame of uwb/odometry and "
-              "/tf. It is at the antenna and has the axes of map_frame. Other tags use tag_N. The namespace of the node "
-              "is put before it. Do not use a frame of the robot such as base_link: its heading is unknown here, and a "
+              "/tf. It is at the antenna and has the axes of map_frame. Other tags use tag_N. The namespace "
+              "of the node is prepended. Do not use a frame of the robot such as base_link: its heading is unknown here, and a "
               "frame has only one parent in tf."),
     Parameter("lever_arm_x", 0.0, "Position of the antenna in the robot's frame, x. With a lever arm, uwb/pose and "
               "uwb/pose_smoothed are the position of the robot's origin. The heading is unknown: a horizontal arm only "
@@ -223,13 +224,13 @@ LOCATOR = (
 )  # fmt: skip
 
 VIEWER = (
-    Parameter("host", "localhost", "Address to serve the page at; 0.0.0.0 = every address of this machine."),
-    Parameter("port", 5006, "Port of the page; 0 = a free one, named in the log.", low=0, high=65535),
-    Parameter("origins", "", "Further HOST:PORT that are accepted in the HTTP headers Host and Origin, separated by commas."),
-    Parameter("anchors", "", "Anchors file, for a map without a locator: shown, and published as markers for RViz and "
-              "Foxglove. Empty = those of a locator's markers."),
+    Parameter("host", "localhost", "Address of the web server; 0.0.0.0: all addresses of this machine."),
+    Parameter("port", 5006, "Port of the web server; 0: a free port, which is logged.", low=0, high=65535),
+    Parameter("origins", "", "Additional HOST:PORT that are accepted in the HTTP headers Host and Origin, separated by commas."),
+    Parameter("anchors", "", "Anchors file for a map without a locator; the anchors are also published as "
+              "markers for RViz and Foxglove. Empty: markers of a locator."),
     Parameter("map_frame", "map", "Frame of the anchors."),
-    Parameter("window", 157, "Samples that the network reads, to be marked in the CIR.", low=1, high=1016),
+    Parameter("window", 157, "Window of the network, which is marked in the CIR.", low=1, high=1016),
     Parameter("autostart", True, "Configure and activate without a lifecycle manager."),
 )  # fmt: skip
 

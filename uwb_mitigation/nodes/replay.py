@@ -130,7 +130,7 @@ class ReplayFeed:
 
     def start(self) -> None:
         if self._source.simulated:
-            self._logger.warning(f"replaying simulated ranges, which no radio measured: {self._source.name}")
+            self._logger.warning(f"replaying simulated ranges: {self._source.name}")
         else:
             self._logger.info(f"replaying {self._source.name}")
         self._thread.start()
@@ -157,10 +157,10 @@ class ReplayFeed:
             "simulated": "unknown" if simulated is None else simulated,
             "ranges published": self.played,
         }
-        entries |= {f"oddity: {kind}": count for kind, count in self._source.skipped.copy().items()}
+        entries |= {f"warning: {kind}": count for kind, count in self._source.skipped.copy().items()}
         level, text = diagnostics.OK, "paused" if self._pause_requested else "replaying"
         if simulated:
-            level, text = diagnostics.WARN, f"{text} simulated ranges: no radio measured them"
+            level, text = diagnostics.WARN, f"{text} simulated ranges"
         late_s = max(self.late_ns / 1e9, 0.0)
         if late_s > LATE_WARNING_S:
             level = diagnostics.WARN
@@ -190,7 +190,7 @@ class ReplayFeed:
         wanted, started_s = self._value("wait_for_subscribers"), time.monotonic()
         while (count := self._subscribers()) < wanted:
             if time.monotonic() - started_s >= self._value("longest_wait"):
-                self._logger.warning(f"{count} of {wanted} subscribers are there; the replay starts")
+                self._logger.warning(f"{count} of {wanted} subscribers connected; the replay starts")
                 return
             if self._stopping.wait(TICK_S):
                 return

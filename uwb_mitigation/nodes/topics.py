@@ -144,7 +144,8 @@ def take_queued(subscription: Subscription, limit: int) -> Iterator[tuple[bytes,
 def incompatible_publishers(node: LifecycleNode) -> list[str]:
     """Return a warning for each best-effort publisher from which a reliable subscription of the node receives nothing."""
     return [
-        f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name} publishes by best effort and is not received: set "
+        f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name} publishes with best-effort reliability "
+        f"and is not received: set "
         f"qos_overrides.{subscription.topic_name}.subscription.reliability:=best_effort"
         for subscription in node.subscriptions
         if subscription.qos_profile.reliability == ReliabilityPolicy.RELIABLE

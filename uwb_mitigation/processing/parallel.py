@@ -40,7 +40,9 @@ def plan(sources: Sequence[Path], output: Path) -> list[PlannedBag]:
         return [PlannedBag(sources[0], output, True)]
     if output.suffix == ".mcap" or (output.exists() and not output.is_dir()):
         raise ParameterError(
-            "one file for several bags", where=str(output), valid="a folder, which need not exist"
+            "one output file for several bags",
+            where=str(output),
+            valid="a folder, which is created if it does not exist",
         )
     planned: dict[Path, PlannedBag] = {}
     for source in sources:
@@ -51,14 +53,14 @@ def plan(sources: Sequence[Path], output: Path) -> list[PlannedBag]:
             root = Path() if len(sources) == 1 else Path(source.resolve().name)
             found = [(bag, root / bag.relative_to(source)) for bag in _bags(source, output.resolve())]
             if not found:
-                raise RecordingError("the folder holds no MCAP bag", where=str(source))
+                raise RecordingError("the folder contains no MCAP bag", where=str(source))
         for bag, name in found:
             place = output / name
             if place in planned:
                 raise ParameterError(
-                    f"{planned[place].source} and {bag} have one name",
+                    f"{planned[place].source} and {bag} have the same name",
                     where=str(place),
-                    valid="different names, or one run for each",
+                    valid="different names, or separate runs",
                 )
             planned[place] = PlannedBag(bag, place, False)
     return list(planned.values())
@@ -144,7 +146,7 @@ def run_on_dask(jobs: Sequence[Job], address: str) -> Iterator[Outcome]:
         from distributed.comm import get_address_host
     except ModuleNotFoundError as error:
         raise MissingDependencyError(
-            "a scheduler needs Dask", valid="python -m pip install distributed"
+            "--scheduler needs Dask", valid="python -m pip install distributed"
         ) from error
     try:
         # If the client itself tries an invalid address, closing it takes a minute.

@@ -72,8 +72,8 @@ class Anomaly(str, enum.Enum):
     MALFORMED = "malformed line"
     NO_START_TIME = "log without a start time"
     NO_TRUTH = "log without surveyed truth"
-    MOVED = "log moved later, not to overlap the one before"
-    UNREADABLE = "log that could not be read to its end"
+    MOVED = "log shifted in time to start after the previous one"
+    UNREADABLE = "log that was not read completely"
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +127,9 @@ class DecaRangingLog(Source):
         placed = self._placement
         text, fault = _read(self.path)
         if not (_TOKEN.search(text) or fault):
-            raise RecordingError("not a DecaRanging log", where=str(self.path), valid="'RX DATA:' and so on")
+            raise RecordingError(
+                "not a DecaRanging log", where=str(self.path), valid="lines such as 'RX DATA:'"
+            )
         for sequence, measured in enumerate(self._measurements(text, not_before_ns), first_sequence):
             tag, anchor = (placed.tag, placed.anchor) if placed else (measured.tag_id, measured.anchor_id)
             numbered = replace(measured, sequence=sequence & 0xFFFFFFFF, tag_id=tag, anchor_id=anchor)

@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 
 ACCEPTED = (
     "an MCAP bag (.mcap, or a folder with metadata.yaml), "
-    "DecaRanging logs (.log, .log.xz, or a folder of them), or a folder of a Hanyang run; `data import` makes a bag of DeepUWB's pickle, "
-    "and with --map of other formats"
+    "DecaRanging logs (.log, .log.xz, or a folder of them), or a folder of a Hanyang run; `data import` "
+    "converts DeepUWB's pickle and, with --map, other formats to a bag"
 )
 
 _HANYANG_ANCHOR = re.compile(r"A\d{1,4}\.csv(\.xz)?")
@@ -52,7 +52,7 @@ def open_recording(path: Path, *, cir: Literal["final", "poll"] = "final") -> So
         from uwb_mitigation.sources.decaranging import CirFrame, open_decaranging
 
         return open_decaranging(path, cir=CirFrame[cir.upper()])
-    raise RecordingError("not a recording that can be read", where=str(path), valid=ACCEPTED)
+    raise RecordingError("unknown kind of recording", where=str(path), valid=ACCEPTED)
 
 
 def open_mapped(path: Path, mapping: str) -> MappedRecording:

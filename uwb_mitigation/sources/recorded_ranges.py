@@ -110,7 +110,7 @@ def read_ranges(path: Path, anchors: AnchorMap, stamp_offset_s: float = 0.0) -> 
             if key[2] not in anchors.index:
                 unknown_anchors[key[2]] += is_new
             else:
-                skipped["range that is not valid"] += is_new
+                skipped["invalid range"] += is_new
     if not raw and not corrected:
         map_ids = ", ".join(map(str, sorted(anchors.index)))
         recorded_ids = ", ".join(map(str, sorted(unknown_anchors))) or "none"

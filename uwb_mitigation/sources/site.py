@@ -33,7 +33,7 @@ def load_anchors(path: Path) -> AnchorMap:
         ParameterError: it cannot be read, or does not have the format of `positioning.anchors`.
     """
     data = read_bounded(
-        path, MAX_TEXT, ParameterError, "an anchors file, as docs/background/positioning.md shows"
+        path, MAX_TEXT, ParameterError, "an anchors file (format: docs/background/positioning.md)"
     )
     try:
         text = data.decode("utf-8-sig")

@@ -40,7 +40,9 @@ def load_truth(path: Path) -> list[TruthSegment]:
     """
     found = [_segment(row, path, line) for line, row in read_rows(path, _REQUIRED, MAX_CSV_BYTES)]
     if not found:
-        raise RecordingError("the truth holds no rows", where=str(path), valid="one for each configuration")
+        raise RecordingError(
+            "the truth table has no rows", where=str(path), valid="one row for each configuration"
+        )
     return found
 
 

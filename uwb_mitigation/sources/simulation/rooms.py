@@ -100,23 +100,21 @@ def _furnished(name: str, size: Point) -> Room:
     share = _mean_free_path_m(size) / _mean_free_path_m(FLAT.size)
     los = replace(
         RESIDENTIAL_LOS,
-        name=f"{name}, in sight",
+        name=f"{name}, LOS",
         cluster_decay_ns=share * RESIDENTIAL_LOS.cluster_decay_ns,
         ray_decay_ns=share * RESIDENTIAL_LOS.ray_decay_ns,
     )
     delay_ns = share * RESIDENTIAL_NLOS.first_cluster_delay_ns
-    nlos = replace(los, name=f"{name}, blocked", first_cluster_delay_ns=delay_ns)
+    nlos = replace(los, name=f"{name}, NLOS", first_cluster_delay_ns=delay_ns)
     return Room(name, size, los, nlos)
 
 
 def _outdoor() -> Room:
     """Return an environment with few reflections: 4 dB less than in a room, the first from twice the distance."""
     name = "outdoor"
-    los = replace(
-        RESIDENTIAL_LOS, name=f"{name}, in sight", path_loss_1m_db=RESIDENTIAL_LOS.path_loss_1m_db + 4.0
-    )
+    los = replace(RESIDENTIAL_LOS, name=f"{name}, LOS", path_loss_1m_db=RESIDENTIAL_LOS.path_loss_1m_db + 4.0)
     delay_ns = 2.0 * RESIDENTIAL_NLOS.first_cluster_delay_ns
-    nlos = replace(los, name=f"{name}, blocked", first_cluster_delay_ns=delay_ns)
+    nlos = replace(los, name=f"{name}, NLOS", first_cluster_delay_ns=delay_ns)
     return Room(name, (12.0, 12.0), los, nlos)
 
 
