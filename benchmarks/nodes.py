@@ -411,6 +411,8 @@ def soak(messages: int, rate_hz: float, *, one_process: bool, advance: Callable[
     """Play `messages` ranges at `rate_hz`.
 
     Args:
+        messages: number of ranges to play.
+        rate_hz: rate of the replay, Hz.
         one_process: use the pipeline instead of two nodes.
         advance: called with the number of received ranges.
 

@@ -90,11 +90,11 @@ def test_single_tag_compensates_the_complete_offset(tmp_path: Path):
     ("options", "says"),
     [
         (("--distance", "0", "--port", "/dev/a"), "0.3 to 100 m"),
-        (("--distance", "5", "--port", "/dev/a,/dev/a"), "anchor's"),
-        (("--distance", "5", "--port", ","), "anchor's"),
+        (("--distance", "5", "--port", "/dev/a,/dev/a"), "tag and anchor"),
+        (("--distance", "5", "--port", ","), "tag and anchor"),
         (("--distance", "5", "--port", "/dev/a", "--channel", "6"), "channel"),
         (("--distance", "5", "--port", "/dev/a", "--anchor", "xyz"), "hexadecimal"),
-        (("--distance", "5", "--port", "/dev/a", "-o", "absent/file"), "a folder that is there"),
+        (("--distance", "5", "--port", "/dev/a", "-o", "absent/file"), "an existing folder"),
     ],
 )
 def test_implausible_options_are_refused_immediately(options: tuple[str, ...], says: str, tmp_path: Path):

@@ -161,7 +161,7 @@ def test_full_disk_raises_a_recording_error(tmp_path: Path) -> None:
     ("change", "excerpt"),
     [
         (("uint64 device_time", "uint32 device_time"), "field 5 .* is 'uint32 device_time'"),
-        (("Cir cir ", "Cir cir\nfloat32 extra "), "further field 'float32 extra'"),
+        (("Cir cir ", "Cir cir\nfloat32 extra "), "additional field 'float32 extra'"),
         (("uint64 anchor_id", "# uint64 anchor_id"), "field 3 .* is 'uint32 sequence'"),
         (("MSG: uwb_mitigation_msgs/Cir", "MSG: uwb_mitigation_msgs/Other"), "Cir is not defined"),
     ],

@@ -126,7 +126,7 @@ def test_import_shortens_pauses_by_default_and_reports_it(tmp_path: Path) -> Non
     def span_s(*options: str) -> float:
         done = run("data", "import", "in.mcap", "-o", "out.mcap", "--force", *options, folder=tmp_path)
         assert done.returncode == 0, done.stderr
-        assert ("Cut 1 pauses to 5 s each, 995 s in all" in done.stdout) is not bool(options)
+        assert ("Shortened 1 pauses to 5 s, 995 s in total" in done.stdout) is not bool(options)
         first, last = BagReader(tmp_path / "out.mcap").messages()
         assert BagReader(tmp_path / "out.mcap").metadata["uwb_mitigation"]["simulated"] == "unknown"
         return (last.log_time_ns - first.log_time_ns) / 1e9

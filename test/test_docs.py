@@ -261,7 +261,7 @@ def test_language_check_finds_expressions_outside_code(
     tmp_path: Path, name: str, text: str, lines: list[int]
 ):
     (tmp_path / name).write_text(text, encoding="utf-8")
-    command = [sys.executable, generated.DOCS / "style" / "check_words.py", "--code", tmp_path / name]
+    command = [sys.executable, generated.DOCS / "style" / "check_words.py", tmp_path / name]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 1
     found = re.findall(rf"{re.escape(name)}:(\d+): ", done.stdout)

@@ -187,7 +187,9 @@ def test_best_effort_height_is_received_and_best_effort_ranges_are_reported(ros:
     heights = ros.node.create_publisher(PoseWithCovarianceStamped, "/height", qos_profile_sensor_data)
     ros.node.create_publisher(RangeCorrected, CORRECTED, qos_profile_sensor_data)
     locator = ros.start("locator", f"anchors:={anchors}", "height_topic:=/height", "rate:=0.0")
-    locator.wait_for_output(f"publishes by best effort and is not received: set qos_overrides.{CORRECTED}")
+    locator.wait_for_output(
+        f"publishes with best-effort reliability and is not received: set qos_overrides.{CORRECTED}"
+    )
     ros.spin_until(lambda: heights.get_subscription_count() == 1)
     (subscription,) = ros.node.get_subscriptions_info_by_topic("/height")
     assert subscription.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT

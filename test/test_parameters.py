@@ -88,7 +88,7 @@ def test_parameters_that_were_set_survive_a_respawn(
     mitigator.signal(signal.SIGKILL)
     respawned = ros.start("mitigator", "offsets:=0.1")
     respawned.wait_for_output("correcting with model evk1000_apartment")
-    assert "restored after a restart" in respawned.output
+    assert "restored parameters after a respawn" in respawned.output
     status = ros.diagnosis(
         "mitigator", lambda one: any(v.key == "offsets" and "0.22" in v.value for v in one.values)
     )

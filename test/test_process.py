@@ -270,8 +270,8 @@ def test_invalid_bag_is_reported_and_does_not_stop_the_others(tmp_path: Path) ->
     ("given", "excerpt"),
     [
         (["absent.mcap", "-o", "out.mcap"], "absent.mcap: no such file"),
-        (["in.mcap", "in.mcap", "-o", "out"], "have one name"),
-        (["in.mcap", "other.mcap", "-o", "out.mcap"], "one file for several bags"),
+        (["in.mcap", "in.mcap", "-o", "out"], "have the same name"),
+        (["in.mcap", "other.mcap", "-o", "out.mcap"], "one output file for several bags"),
         (["empty", "-o", "out"], "contains no MCAP bag"),
         (["in.mcap", "-o", "out.mcap", "--jobs", "0"], "jobs = 0"),
         (["in.mcap", "-o", "out.mcap", "--model", "absent.onnx"], "absent.onnx"),

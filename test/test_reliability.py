@@ -295,7 +295,7 @@ def test_best_effort_publisher_is_reported_and_received_with_a_qos_override(ros:
     mitigator = ros.start("mitigator")
     status = ros.diagnosis("mitigator", lambda status: "best effort" in status.message)
     assert status.level == DiagnosticStatus.WARN
-    assert "/test_client publishes by best effort and is not received" in status.message
+    assert "/test_client publishes with best-effort reliability and is not received" in status.message
     (parameter,) = re.findall(r"qos_overrides\S+", status.message)
     mitigator.wait_for_output("incompatible QoS")
     assert mitigator.signal(signal.SIGINT) == 0

@@ -253,7 +253,7 @@ def test_missing_or_forbidden_port_is_logged_once(
     driver.wait_for_output(absent)
     with board(link):
         driver.wait_for_output("connected to board")
-    driver.wait_for_output("the board is gone")
+    driver.wait_for_output("disconnected from the board")
     ros.diagnosis("driver", lambda status: status.message.startswith(f"{link}: is not there"))
     ros.spin_until(lambda: driver.output.count(absent) == 2)
     assert driver.signal(signal.SIGINT) == 0

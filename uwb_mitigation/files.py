@@ -14,6 +14,8 @@ def read_bounded(path: Path, limit: int, error: type[UwbMitigationError], valid:
     """Return the content of a file of at most `limit` bytes.
 
     Args:
+        path: the file.
+        limit: maximum size, bytes.
         error: type of the error to raise.
         valid: text for `valid` of the error.
 

@@ -1,6 +1,6 @@
 """Check texts for the expressions in `docs/style/words.txt`.
 
-    python docs/style/check_words.py [--code] [--all] [PATH ...]
+    python docs/style/check_words.py [--all] [PATH ...]
 
 Reads Markdown and reStructuredText (without code), docstrings, comments and messages in Python, comments in C, shell scripts
 and ROS messages. Prints each expression with its position and a replacement. The exit code is 1 if a kind of text (documents
@@ -22,9 +22,6 @@ from pathlib import Path
 
 WORDS = Path(__file__).with_name("words.txt")
 REPOSITORY = WORDS.parents[2]
-
-CHECK_CODE = False
-"""Whether `make lint` checks code in addition to documents. Set it to True when `--code` passes."""
 
 LIMIT = 0.5
 """Allowed expressions per 1,000 words."""
@@ -145,15 +142,12 @@ def main(arguments: list[str] | None = None) -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("paths", nargs="*", type=Path, help="files or folders (default: the repository)")
-    parser.add_argument("--code", action="store_true", default=CHECK_CODE, help="check code, too")
     parser.add_argument("--all", action="store_true", help="print findings below the limit, too")
     given = parser.parse_args(arguments)
     expressions = load()
     failed = False
     files = [path for path in tracked(given.paths or [REPOSITORY]) if path.is_file() and path != WORDS]
-    for kind, readers in (
-        (("documents", DOCUMENTS), ("code", CODE)) if given.code else (("documents", DOCUMENTS),)
-    ):
+    for kind, readers in (("documents", DOCUMENTS), ("code", CODE)):
         words, lines = 0, []
         for path in files:
             if reader := readers.get(path.suffix):

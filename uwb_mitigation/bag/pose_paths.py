@@ -62,6 +62,7 @@ def read_bodies(path: Path, topic: str, frames: tuple[str, str] | None = None) -
     """Return the poses of each child frame on a topic, in the anchors' frame.
 
     Args:
+        path: the bag.
         topic: of `POSITION_TYPES`, or /tf.
         frames: the anchors' frame and the robot's, such as map and base_link. Needed for /tf.
 

@@ -92,7 +92,9 @@ def encode_true_position(
     """Return `nav_msgs/Odometry` in CDR with the true position of a tag: no velocity, zero variance.
 
     Args:
-        position: x, y, z, m. tag_id: the tag. stamp_ns: time of the position.
+        position: x, y, z, m.
+        tag_id: id of the tag.
+        stamp_ns: time of the position.
         yaw: true heading, rad; None: unknown, the variance is `UNOBSERVED`.
     """
     place = Estimate(stamp_ns, np.array(position), np.zeros(3), np.zeros((6, 6)))

@@ -182,6 +182,7 @@ def from_files(node: str, own: str, shared: str = "") -> dict[str, Any]:
     """Return the parameters that the files of a node set.
 
     Args:
+        node: name of the node.
         own: path of the file for this node.
         shared: path of a file for all nodes, which overrides the other; may be empty.
 

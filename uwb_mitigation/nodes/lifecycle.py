@@ -216,6 +216,8 @@ def declare(node: Node, table: Sequence[Parameter], other_parameters: Collection
     """Declare a table on a node, refuse unknown parameters, and check every later value.
 
     Args:
+        node: the node.
+        table: its parameters.
         other_parameters: names of parameters of other nodes in this process.
 
     Raises:

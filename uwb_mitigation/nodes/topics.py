@@ -131,7 +131,8 @@ def take_queued(subscription: Subscription, limit: int) -> Iterator[tuple[bytes,
     """Yield messages that wait in the queue of a raw subscription, with the publisher's sequence number.
 
     Args:
-        limit: maximum number of messages, since they may arrive as fast as they are processed.
+        subscription: from `create_raw_subscription`.
+        limit: maximum number of messages, since more may arrive during processing.
     """
     take, kind = subscription.handle.take_message, subscription.msg_type
     for _ in range(limit):

@@ -69,7 +69,9 @@ def check_anchors(
     """Refuse anchors that do not determine positions and offsets.
 
     Args:
+        anchors: anchors of the file.
         used: rows of the received anchors.
+        height: height of the tags, if constant.
         area: of the tags; it can exclude the mirror image of a track at a plane of anchors.
 
     Raises:
@@ -141,7 +143,8 @@ def check_anchor_positions(found: Segments, fit: JointFit, first_positions: Firs
     """Refuse ranges that other anchor positions explain much better.
 
     Args:
-        found, fit: the solution with the positions of the file.
+        found: ranges of the solution.
+        fit: solution with the positions of the file.
         first_positions: as in `self_calibration`.
 
     Raises:
@@ -261,6 +264,7 @@ def position_scatter(fit: JointFit, correction_m: NDArray[np.float64]) -> float:
     common is not detected.
 
     Args:
+        fit: solution of n ranges.
         correction_m: float64 (n,), subtracted from each range.
 
     Returns:

@@ -110,7 +110,8 @@ def geometry(anchors: NDArray[np.float64], position: NDArray[np.float64], *, lev
     """Return the dilution of precision for anchors float64 (m, 3) at a position float64 (3,).
 
     Args:
-        anchors, position: m.
+        anchors: positions of the anchors, float64 (m, 3), m.
+        position: position of the tag, float64 (3,), m.
         level: the height is known: only x and y are estimated, and VDOP is 0.
     """
     slope = directions(position, anchors)[0][:, : 2 if level else 3]

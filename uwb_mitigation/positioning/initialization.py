@@ -62,9 +62,11 @@ def candidate_positions(
 
     Args:
         anchors: float64 (k, 3), m, of each range.
-        range_m, sd_m: float64 (k,), m.
+        range_m: measured ranges, float64 (k,), m.
+        sd_m: standard deviations of the ranges, float64 (k,), m.
         model: how robust.
-        height, area: where the tag can be.
+        height: known height of the tag.
+        area: area of the tag.
     """
     dims = 2 if height is not None else 3
     if len(range_m) < dims:

@@ -242,6 +242,7 @@ def fit_joint(
     """Fit positions, tracks and parameters to observations.
 
     Args:
+        config: anchors, noise model, height and area.
         observations: each knot has one or more.
         prior: mean and standard deviation of the parameters; its rows are those of the observations.
         position: float64 (K, 3), roughly right, to start from.

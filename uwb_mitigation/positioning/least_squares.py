@@ -79,6 +79,7 @@ class LeastSquares:
         """Connect knots (n,) to their successors by white acceleration.
 
         Args:
+            knot: rows of the knots, int (n,).
             dt: float64 (n,), s, positive.
             axes: d: the first d unknowns of a knot are its position, the next d its velocity.
             density: spectral density of the acceleration, m^2/s^3.

@@ -116,7 +116,9 @@ def scatter_of(
     """Return the standard deviation of each kind of errors (n,), float64 (kinds,), m: 1.48 times the median absolute error.
 
     Args:
+        error_m: errors, float64 (n,), m.
         noise_group: int (n,), the kind of each. A kind with fewer than `MIN_ALIKE` errors gets the value of all errors.
+        kinds: number of kinds.
     """
     found = np.full(kinds, MAD_TO_SD * float(np.median(np.abs(error_m))))
     for kind in range(kinds):

@@ -191,6 +191,8 @@ def align_poses(
     """Estimate time offset and offsets, and on request the lever arms.
 
     Args:
+        anchors: positions of the anchors.
+        tags: ranges of each tag.
         paths: for each tag, the path of the robot that carries it.
         known: as many rows as there are ranges, one tag after the other.
         time_offset_s: if known.
@@ -361,8 +363,11 @@ class _Problem:
         """Fit by Gauss-Newton, from a time offset and lever arms.
 
         Args:
+            time_offset: start value, s.
+            lever: start values of the lever arms, float64 (T, 3), m.
             expected: prior of the lever arms.
-            free_time_offset, free_lever: whether the time offset is estimated, and which coordinates of the arms, bool (T, 3).
+            free_time_offset: whether the time offset is estimated.
+            free_lever: whether each coordinate of the arms is estimated, bool (T, 3).
 
         Returns:
             Time offset, lever arms, offsets of the pairs, and the standard deviations of all in this order.

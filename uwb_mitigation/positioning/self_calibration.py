@@ -178,8 +178,8 @@ def calibrate(
         regressors: as many rows as there are ranges.
         height: of all tags, if constant.
         area: of the tags.
-        heights_m: float64 (r,), the measured height at each range, instead of `height`; `height_sd_m`: their standard
-            deviation.
+        heights_m: measured height at each range, float64 (r,), m, instead of `height`.
+        height_sd_m: standard deviation of `heights_m`, m.
 
     Raises:
         DatasetError: the geometry does not determine the solution; the message says what is missing.
@@ -357,6 +357,8 @@ def likely_offset(config: EstimatorConfig, found: Segments, expected_m: NDArray[
     """Return the one of `OFFSETS_M` with which the ranges of a few moments agree best; 0 if no moment has enough ranges.
 
     Args:
+        config: anchors, noise model, height and area.
+        found: ranges, r in total.
         expected_m: float64 (r,), also subtracted from the ranges.
     """
     rng = np.random.default_rng(1)

@@ -266,6 +266,7 @@ def _relative_sd(position: NDArray[np.float64], covariance: NDArray[np.float64])
     """Return standard deviations (m, 3) of anchors (m, 3), except for translation and rotation of the whole.
 
     Args:
+        position: positions of the anchors, float64 (m, 3), m.
         covariance: float64 (m, 3, m, 3).
     """
     m = len(position)

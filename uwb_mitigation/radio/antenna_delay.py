@@ -62,7 +62,9 @@ def delay_from_ranges(
     """Return the antenna delay for which the median range equals the distance.
 
     Args:
-        ranges_m, power_gap_db: (n,), n at least 2; powers that are unknown are NaN.
+        ranges_m: measured ranges, float64 (n,), m, two or more.
+        power_gap_db: receive level minus first-path level, float64 (n,), dB; NaN: unknown.
+        distance_m: true distance, m.
         before: present delay of each radio to calibrate: of both, which then share the offset, or of one.
 
     Raises:
@@ -106,6 +108,8 @@ def measure(
         openers: of the tag's bus, and of the anchor's bus if the anchor is at this computer too; otherwise the
             anchor's delay is unchanged and the tag's delay compensates the whole offset.
         settings: settings of the tag.
+        distance_m: true distance, m.
+        exchanges: number of ranges.
         on_range: called after each range.
 
     Raises:

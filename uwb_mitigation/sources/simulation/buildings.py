@@ -237,6 +237,8 @@ def block_of(seed: int, number: int, *, wide: bool = False) -> tuple[Block, np.r
     sensitivity are used only if there are no others.
 
     Args:
+        seed: seed of all blocks.
+        number: number of the block, from 0.
         wide: also open sites, tilted antennas, and wider gains and noise figures.
     """
     rng = np.random.default_rng([seed, number])

@@ -318,9 +318,13 @@ def propagate(
     NLOS, the environment's path loss is that of the diffuse field itself.
 
     Args:
-        distance_m, loss_db, excess_m: (n,), straight-line distance; loss and extra optical length of
-            the direct path (`simulation.scene`).
-        environment, field, fading: (n, ...), all of one environment; see `draw_diffuse_field`.
+        distance_m: straight-line distance, float64 (n,).
+        loss_db: loss of the direct path (`simulation.scene`), float64 (n,).
+        excess_m: extra optical length of the direct path, float64 (n,).
+        environment: environment of all links.
+        field: diffuse fields of n links; see `draw_diffuse_field`.
+        fading: gains of the rays, complex128 (n, rays).
+        rng: source of the phase of the direct path.
 
     Raises:
         ParameterError: a distance is not finite and positive.

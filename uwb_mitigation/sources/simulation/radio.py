@@ -207,7 +207,12 @@ class Radio:
         """Predict the level of the direct path above the threshold, without running `receive`.
 
         Args:
-            direct_db, diffuse_db: power of the direct path and of all others relative to the transmit power, (n,).
+            direct_db: power of the direct path relative to the transmit power, float64 (n,).
+            diffuse_db: power of all other paths relative to the transmit power, float64 (n,).
+            boards: properties of the boards.
+
+        Returns:
+            Level above the threshold in dB, float64 (n,).
         """
         sent = self.tx_power_dbm + boards.gain_db + POWER_CONSTANT_DB
         direct, diffuse = (10.0 ** ((sent + power) / 10.0) for power in (direct_db, diffuse_db))
