@@ -94,6 +94,8 @@ def find_files(table: Table, root: Path, ranges: Path | None = None) -> list[Pat
     """Return the files of a table below a folder, or the file `root` itself, in the order of their names.
 
     Args:
+        table: description of the files.
+        root: the folder, or the only file.
         ranges: the file of the ranges, if the table contains other values; a pattern in `files` is searched in its path.
 
     Raises:
@@ -123,7 +125,10 @@ def read_chunks(
     """Yield the rows of a file, only the given columns.
 
     Args:
-        columns: names; all must exist, except those in `optional`, which are left out if they are missing.
+        table: format of the file.
+        path: the file.
+        columns: names of the columns; all must exist, except those in `optional`.
+        optional: columns that are left out if they are missing.
 
     Raises:
         RecordingError: the file cannot be read, or a column is missing; the message names similar columns.

@@ -37,6 +37,7 @@ def read_cir(diagnostics: Diagnostics | None, channel: int, rssi_dbm: float) -> 
     """Return the CIR of the last received frame of an exchange that has one.
 
     Args:
+        diagnostics: diagnostics of the exchange; None: not received.
         channel: UWB channel.
         rssi_dbm: receive level for an exchange without segment metrics.
     """

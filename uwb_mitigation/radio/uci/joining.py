@@ -101,7 +101,10 @@ class Joiner:
         """Add a range.
 
         Args:
+            sequence: sequence number of the exchange.
+            arrival: the range.
             damages: number of damaged places in the stream so far.
+            now_ns: time of the arrival.
 
         Returns:
             Ranges that are complete, or have waited too long.
